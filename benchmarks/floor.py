@@ -68,13 +68,13 @@ def main() -> None:
 def measured(packed: kernels.Packed, size: int, belief: str) -> dict:
     """One moment-matched Jacobian of six GPs over ``size`` points, beside its floor."""
     S = BELIEFS[belief] * (np.eye(STATES) + 0.1)
-    asked = packed, np.zeros(STATES), S, np.zeros(INPUTS)
-    kernels.moments_with_jacobian(*asked)
+    asked = packed, np.zeros((1, STATES)), S[None], np.zeros((1, INPUTS)), False, True
+    kernels.moments(*asked)
     times, rates, began = [], [], time.process_time()
     while time.process_time() - began < TIMES["seconds"] or len(times) < TIMES["least"]:
         rates.append(issue_rate())
         start = time.process_time()
-        kernels.moments_with_jacobian(*asked)
+        kernels.moments(*asked)
         times.append(time.process_time() - start)
     middle, general = float(np.median(times)), instructions(packed, reduced=True) / max(rates)
     floor = general if belief == "wide" else instructions(packed, reduced=False) / max(rates)

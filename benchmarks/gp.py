@@ -36,9 +36,10 @@ def main() -> None:
     torch.set_default_dtype(torch.float64)
     here, results, began = machine(), [], time.perf_counter()
     gps, at, u = posterior(8).packed, belief(), np.zeros(INPUTS)
-    kernels.linearize(gps, at.mean.numpy()[None], u[None], False, np.zeros(STATES), False)
-    kernels.point_with_jacobian(gps, at.mean.numpy(), u)
-    kernels.moments_with_jacobian(gps, at.mean.numpy(), at.covariance.numpy(), u)
+    mu, S = at.mean.numpy()[None], at.covariance.numpy()[None]
+    kernels.linearize(gps, mu, u[None], False, np.zeros(STATES), False)
+    kernels.point_with_jacobian(gps, mu, u[None])
+    kernels.moments(gps, mu, S, u[None], derivatives=True)
     first = time.perf_counter() - began
     print(f"{describe(here)}\nfirst calls of the three kernels: {first:.2f} s (compiled, or read from the cache)\n")
     for size in arguments.sizes:
@@ -84,7 +85,8 @@ def linearisation_groups(gp: GPPosterior, belief: Gaussian, control: torch.Tenso
             products of all pairs of outputs.
     """
     n, packed = gp.state_dim, gp.packed
-    mu, S, u = belief.mean.numpy(), belief.covariance.numpy(), control.numpy()
+    at = belief.mean.numpy()[None], belief.covariance.numpy()[None], control.numpy()[None]
+    mu, _, u = at
     query = torch.cat([belief.mean, control])
 
     def by_torch(mean, covariance, control):
@@ -95,8 +97,8 @@ def linearisation_groups(gp: GPPosterior, belief: Gaussian, control: torch.Tenso
         return [dM[0], (dM[1] + dM[1].mT) / 2, dM[2], dV[0], (dV[1] + dV[1].mT) / 2, dV[2]]
 
     def jacobian():
-        d = kernels.moments_with_jacobian(packed, mu, S, u)
-        return [d.J, d.dM_dS, d.dM_du, d.dV_dmu, d.dV_dS, d.dV_du]
+        d = kernels.moments(packed, *at, derivatives=True)
+        return [part[0] for part in (d.J, d.dM_dS, d.dM_du, d.dV_dmu, d.dV_dS, d.dV_du)]
 
     frozen = to_gpytorch(gp).requires_grad_(False)
     trained = to_gpytorch(gp)  # as it comes from training
@@ -116,16 +118,16 @@ def linearisation_groups(gp: GPPosterior, belief: Gaussian, control: torch.Tenso
     zeros = np.zeros(gp.output_dim)
     groups: list[Group] = [
         {
-            "moments": lambda: kernels.moments(packed, mu, S, u)[:2],
+            "moments": lambda: [part[0] for part in kernels.moments(packed, *at)[:2]],
             "moments, torch": lambda: by_torch(belief.mean, belief.covariance, control),
         },
         {"moments with Jacobians": jacobian},
-        {"moments, diagonal": lambda: kernels.moments(packed, mu, S, u, diagonal=True)},
-        {"diagonal with Jacobians": lambda: kernels.moments_with_jacobian(packed, mu, S, u, diagonal=True)[:8]},
-        {"linearised": lambda: kernels.point_with_jacobian(packed, mu, u)[:8]},
+        {"moments, diagonal": lambda: kernels.moments(packed, *at, diagonal=True)},
+        {"diagonal with Jacobians": lambda: kernels.moments(packed, *at, diagonal=True, derivatives=True)},
+        {"linearised": lambda: kernels.point_with_jacobian(packed, mu, u)},
         {
             "mean with Jacobian": lambda: [
-                part[0] for part in kernels.linearize(packed, mu[None], u[None], False, zeros, False)[1:3]
+                part[0] for part in kernels.linearize(packed, mu, u, False, zeros, False)[1:3]
             ],
             "mean with Jacobian, torch jacrev": by_jacrev,
             "mean with Jacobian, GPyTorch, frozen": by_gpytorch,

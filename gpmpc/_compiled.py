@@ -18,14 +18,14 @@ import hashlib
 import re
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 from functools import cache, partial
+from pathlib import Path
 from threading import Lock
 from typing import Any
 
 import numba
 from numba.extending import register_jitable
-
-REORDERED = frozenset({"reassoc", "contract", "nsz"})
 
 _compiling = Lock()
 
@@ -33,7 +33,6 @@ _compiling = Lock()
 def compiled(
     function: Callable | None = None,
     *,
-    fastmath: frozenset[str] = REORDERED,
     allocates: bool = True,
     kernel: bool = True,
     inline: bool = False,
@@ -43,7 +42,6 @@ def compiled(
 
     Args:
         function: The function; this is a decorator.
-        fastmath: LLVM's flags for it.
         allocates: False if it, and all that it calls, make no array but views of those they are given. numba then
             counts no references: an atomic operation for each view, which is 40 % of a solve of two microseconds.
         kernel: Whether Python calls its machine code. Otherwise only other compiled functions do, which is cheaper to
@@ -54,11 +52,9 @@ def compiled(
             it at once and can share its workspace. To let go of the lock takes a fortieth of a microsecond.
     """
     if function is None:
-        return partial(compiled, fastmath=fastmath, allocates=allocates, kernel=kernel, inline=inline, locked=locked)
-    options = {"nogil": not locked, "fastmath": set(fastmath), "forceinline": inline}
-    options |= _PRIVATE_OPTIONS[kernel]
-    if not allocates and _NRT_OPTION:
-        options["_nrt"] = False
+        return partial(compiled, allocates=allocates, kernel=kernel, inline=inline, locked=locked)
+    options = {"nogil": not locked, "fastmath": {"reassoc", "contract", "nsz"}, "forceinline": inline}
+    options |= _PRIVATE_OPTIONS[kernel] | ({} if allocates else {"_nrt": False})
     return _jit_cached(function, options) if kernel else register_jitable(**options)(function)
 
 
@@ -75,15 +71,10 @@ inline_njit = partial(njit_noalloc, inline=True)
 # which contains it all. No public interface prevents that, nor does one prevent a kernel from running another kernel's
 # copy of what both call. Where a numba without these private parts is installed, kernels are compiled as it does by
 # itself: slower to start, and their last digits depend on what was loaded before. ``tests/test_compiled.py`` notices.
-try:
+_PRIVATE_OPTIONS: dict[bool, dict[str, Any]] = {True: {}, False: {}}
+with suppress(ImportError):
     from numba.core.codegen import JITCodeLibrary
     from numba.core.compiler import Compiler
-    from numba.core.cpu import CPUTargetOptions
-except ImportError:
-    _NRT_OPTION = False
-    _PRIVATE_OPTIONS: dict[bool, dict[str, Any]] = {True: {}, False: {}}
-else:
-    _NRT_OPTION = hasattr(CPUTargetOptions, "_nrt")
 
     class _KernelLibrary(JITCodeLibrary):
         """A kernel's machine code, with its own copies of all that it calls.
@@ -102,10 +93,8 @@ else:
         """LLVM's intermediate code of a part of kernels: linked into them, neither optimised nor assembled before."""
 
         class _NoEngine:
-            """Stands for the code generator where numba would tell loaded machine code its environment."""
-
             def set_env(self, name, environment):
-                """Does nothing: there is no machine code."""
+                """Does nothing: there is no machine code to tell its environment."""
 
         codegen = _NoEngine()  # pyright: ignore[reportIncompatibleMethodOverride, reportAssignmentType]
 
@@ -121,8 +110,6 @@ else:
             return 0
 
     class _KernelCompiler(Compiler):
-        """numba's compiler for ``_KernelLibrary``."""
-
         library: Any = _KernelLibrary
 
         def define_pipelines(self):
@@ -132,14 +119,11 @@ else:
             return super().define_pipelines()
 
     class _InnerCompiler(_KernelCompiler):
-        """numba's compiler for ``_InnerLibrary``."""
-
         library = _InnerLibrary
 
-    _PRIVATE_OPTIONS = {  # nothing in C calls a kernel, and Python no inner function: ways in take a tenth of the time
-        True: {"pipeline_class": _KernelCompiler, "no_cfunc_wrapper": True},
-        False: {"pipeline_class": _InnerCompiler, "no_cfunc_wrapper": True, "no_cpython_wrapper": True},
-    }
+    # nothing in C calls a kernel, and Python no inner function: ways in take a tenth of the time
+    _PRIVATE_OPTIONS[True] = {"pipeline_class": _KernelCompiler, "no_cfunc_wrapper": True}
+    _PRIVATE_OPTIONS[False] = {"pipeline_class": _InnerCompiler, "no_cfunc_wrapper": True, "no_cpython_wrapper": True}
 
 
 def _jit_cached(function: Callable, options: dict) -> Callable:
@@ -147,18 +131,11 @@ def _jit_cached(function: Callable, options: dict) -> Callable:
         kernel: Any = numba.njit(cache=True, **options)(function)
     except RuntimeError:  # "cannot cache function ...: no locator available"
         return numba.njit(**options)(function)
-    try:
+    with suppress(AttributeError):  # another numba: edits of other files go unseen
         index = kernel._cache._cache_file
         # compared before anything else in the index is read, which may name modules that are gone
         index._version = f"{index._version} {sources_stamp(function.__module__).hex()}"
-    except AttributeError:  # another numba: edits of other files go unseen
-        pass
     return kernel
-
-
-IMPORT = re.compile(
-    rb"^[ \t]*(?:from[ \t]+([\w.]+)[ \t]+import[ \t]+(\([^)]*\)|.*)|import[ \t]+([\w., \t]+))", re.MULTILINE
-)
 
 
 def sources_stamp(module: str) -> bytes:
@@ -176,22 +153,21 @@ def sources_stamp(module: str) -> bytes:
     return hashlib.sha256(b"".join(seen[name] for name in sorted(seen))).digest()
 
 
+_IMPORT = re.compile(r"^[ \t]*(?:from[ \t]+([\w.]+)[ \t]+)?import[ \t]+(\([^)]*\)|.*)", re.MULTILINE)
+
+
 @cache
 def _read_source(path: str | None) -> tuple[bytes, list[str]]:
     """The hash of a file, and the names in its import statements that can be modules."""
     try:
-        with open(path or "", "rb") as file:
-            source = file.read()
+        source = Path(path or "").read_text(encoding="utf-8")
     except OSError:  # in an archive, or no file at all
         return b"", []
     imported = []
-    for parent, names, plain in IMPORT.findall(source):
-        imported += re.findall(r"[\w.]+", plain.decode())
-        if parent:
-            parts = [f"{parent.decode()}.{name}" for name in re.findall(r"\w+", names.decode())]
-            modules = [part for part in parts if part in sys.modules]
-            imported += modules if len(modules) == len(parts) else [parent.decode(), *modules]
-    return hashlib.sha256(source).digest(), imported
+    for parent, names in _IMPORT.findall(source):
+        parts = [f"{parent}.{name}" if parent else name for name in re.findall(r"[\w.]+", names)]
+        imported += [part if part in sys.modules else parent for part in parts]
+    return hashlib.sha256(source.encode()).digest(), imported
 
 
 def compile_for(kernel: Any, signature: str) -> None:
@@ -206,15 +182,18 @@ def compile_for(kernel: Any, signature: str) -> None:
 
 
 def unchecked_entry_point(kernel: Any) -> Callable:
-    """The machine code of a kernel that ``compile_for`` has compiled, called without numba's look at the arguments.
+    """The machine code of a compiled kernel, called without numba's look at the arguments, a quarter of a microsecond.
 
-    That look takes a quarter of a microsecond. The caller has to see to it that each argument is a NumPy array of the
-    right dtype; other objects and other numbers of axes raise ``TypeError``, strides are the kernel's business.
+    The caller has to see to it that each argument is a NumPy array of the right dtype; other objects and other numbers
+    of axes raise ``TypeError``, strides are the kernel's business.
     """
     try:
         return next(iter(kernel.overloads.values())).entry_point
     except (AttributeError, StopIteration):  # another numba
         return kernel
+
+
+_entry_points: dict[Callable, Callable] = {}
 
 
 def call_unchecked(kernel: Callable, *arguments: Any) -> Any:
@@ -228,6 +207,3 @@ def call_unchecked(kernel: Callable, *arguments: Any) -> Any:
     found = kernel(*arguments)
     _entry_points[kernel] = unchecked_entry_point(kernel)
     return found
-
-
-_entry_points: dict[Callable, Callable] = {}

@@ -9,10 +9,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
-from torch.autograd import forward_ad
 
 from gpmpc.exceptions import SettingError, ShapeError
-from gpmpc.gaussian import Gaussian, check_tensors
+from gpmpc.gaussian import Gaussian, check_tensors, constant_arrays
 
 Array = NDArray[np.float64]
 
@@ -182,16 +181,6 @@ def predict_by_autograd(model: Any, state: Tensor, input: Tensor) -> tuple[Gauss
 
     (mean, covariance), (A, B) = batched_jacobian(prediction, (state, input))
     return Gaussian(mean, covariance), A, B
-
-
-def constant_arrays(*tensors: Tensor) -> list[Array] | None:
-    """Tensors as arrays; None where one is on another device, or autograd or a function transform follows it."""
-    try:
-        arrays = [tensor.numpy() for tensor in tensors]
-    except (RuntimeError, TypeError):
-        return None
-    followed = any(forward_ad.unpack_dual(tensor).tangent is not None for tensor in tensors)
-    return None if followed else arrays
 
 
 def check_next_states(model: Any) -> tuple[int, int]:

@@ -47,11 +47,7 @@ def remove_partial(folder: Path) -> None:
 
 def existing_file(path: str | Path, expected: str) -> Path:
     """The path of a file that is there; ``DataError`` where none is, ``SettingError`` of what is no path."""
-    try:
-        found = _path(path).is_file()
-    except OSError as error:
-        raise DataError(f"{path}: cannot be looked at ({error.strerror}); expected {expected}") from error
-    if not found:
+    if not os.path.isfile(_path(path)):
         raise DataError(f"{path}: no such file; expected {expected}")
     return Path(path)
 

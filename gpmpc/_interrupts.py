@@ -8,31 +8,29 @@ import signal
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
-from types import FrameType
+from typing import Any
 
 
 @contextmanager
 def interrupts_after() -> Iterator[None]:
-    """A Ctrl-C inside is raised at the end of the block; the second one at once.
+    """Raises a Ctrl-C inside at the end of the block, and the second one at once.
 
     Raises:
         KeyboardInterrupt: Or what else the process does about the signal.
     """
-    usual = signal.getsignal(signal.SIGINT)
+    usual, first = signal.getsignal(signal.SIGINT), []
     if threading.current_thread() is not threading.main_thread() or not callable(usual):
         yield  # nothing is raised here, or the signal is ignored
         return
-    waiting: list[tuple[int, FrameType | None]] = []
 
-    def listen(number: int, frame: FrameType | None) -> None:
-        waiting.append((number, frame))
-        if len(waiting) > 1:
-            usual(number, frame)
+    def listen(*met: Any) -> None:
+        first.append(met)
+        signal.signal(signal.SIGINT, usual)
 
     signal.signal(signal.SIGINT, listen)
     try:
         yield
     finally:
         signal.signal(signal.SIGINT, usual)
-    if waiting:
-        usual(*waiting[0])
+    if first:
+        usual(*first[0])

@@ -7,6 +7,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from datetime import datetime, timezone
+from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -52,12 +53,11 @@ def environment() -> dict[str, str | None]:
 
 def processor() -> str:
     """The processor's name, where the system tells it; else its architecture."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
-    except OSError:
-        lines = []
-    named = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
-    return next(named, "") or platform.processor() or platform.machine()
+    with suppress(OSError), open("/proc/cpuinfo", encoding="utf-8", errors="replace") as file:
+        for line in file:
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    return platform.processor() or platform.machine()
 
 
 def now() -> str:
@@ -79,13 +79,10 @@ def _git_commit() -> dict | None:
     root = Path(__file__).resolve().parents[1]
     if not (root / "pyproject.toml").exists():
         return None
+    # Without the lock that refreshes the index: a run that is killed would leave it, and git would refuse to commit.
+    git = ["git", "--no-optional-locks", "-C", str(root)]
+    run = partial(subprocess.check_output, stderr=subprocess.DEVNULL, text=True, timeout=10)
     try:
-        return {"commit": _git(root, "rev-parse", "HEAD"), "dirty": bool(_git(root, "status", "--porcelain"))}
+        return {"commit": run([*git, "rev-parse", "HEAD"]).strip(), "dirty": bool(run([*git, "status", "--porcelain"]))}
     except (OSError, subprocess.SubprocessError):
         return None
-
-
-def _git(root: Path, *arguments: str) -> str:
-    # Without the lock that refreshes the index: a run that is killed would leave it, and git would refuse to commit.
-    command = ["git", "--no-optional-locks", "-C", str(root), *arguments]
-    return subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout.strip()

@@ -108,11 +108,12 @@ def calibrate(
     propagator: Propagator | None = None,
     horizon: int = 10,
     levels: Sequence[float] = (0.5, 0.9, 0.95),
-    start_covariance: Tensor | None = None,
-    observation_noise: bool = True,
     names: Sequence[str] = (),
 ) -> Calibration:
     """Predicts held-out recordings from every state, and compares.
+
+    The model's noise is added to each predicted variance, because what it is compared with was measured; it does not
+    enter the propagation.
 
     Args:
         model: What was learned, from other recordings.
@@ -120,13 +121,10 @@ def calibrate(
         propagator: How the belief moves; as ``best_propagator`` of ``gpmpc.propagation`` does by default.
         horizon: H, the longest prediction in steps.
         levels: Of the central intervals.
-        start_covariance: How uncertain the measured start is (n, n); certain by default.
-        observation_noise: Adds the model's noise to each predicted variance, because what it is compared with was
-            measured. It does not enter the propagation.
         names: Of the states; x1, x2, ... by default.
 
     Raises:
-        ShapeError: Recordings, model, covariance or names do not belong together.
+        ShapeError: Recordings, model or names do not belong together.
         SettingError: A level is not between 0 and 1, or no recording is as long as the horizon.
     """
     recordings = [recordings] if isinstance(recordings, Recording) else list(recordings)
@@ -134,31 +132,22 @@ def calibrate(
     names = tuple(names) or tuple(f"x{i + 1}" for i in range(model.state_dim))
     check_number("horizon", horizon, least=1, whole=True)
     _check(model, recordings, horizon, levels, names)
-    n = model.state_dim
-    like: dict[str, Any] = {"dtype": model.dtype, "device": model.device}
-    S = torch.zeros(n, n, **like) if start_covariance is None else start_covariance.to(**like)
-    if S.shape != (n, n):
-        raise ShapeError(f"start_covariance must be ({n}, {n}); got {tuple(S.shape)}")
-    noise = model.noise_covariance.diagonal() if observation_noise else torch.zeros(n, **like)
+    n, like = model.state_dim, {"dtype": model.dtype, "device": model.device}
+    noise, certain = model.noise_covariance.diagonal(), torch.zeros(n, n, **like)
 
-    # Every start by its recording and its time, those that last longest first: at each step the first few go on.
-    starts = [(r, t) for r, recording in enumerate(recordings) for t in range(len(recording))]
-    starts.sort(key=lambda start: start[1] - len(recordings[start[0]]))
     found: list[list[tuple[Tensor, ...]]] = [[] for _ in range(horizon)]
     with torch.no_grad():
-        for first in range(0, len(starts), CHUNK):
-            alive = starts[first : first + CHUNK]
-            mean = torch.stack([recordings[r].states[t] for r, t in alive]).to(**like)
-            belief = Gaussian(mean, S.expand(len(alive), n, n))
-            for k in range(horizon):
-                alive = [(r, t) for r, t in alive if t + k < len(recordings[r])]
-                if not alive:
-                    break
-                count = len(alive)
-                inputs = torch.stack([recordings[r].inputs[t + k] for r, t in alive]).to(**like)
-                belief = propagator(model, Gaussian(belief.mean[:count], belief.covariance[:count]), inputs)
-                observed = torch.stack([recordings[r].states[t + k + 1] for r, t in alive])
-                found[k].append((belief.mean.double().cpu(), (belief.variance + noise).double().cpu(), observed))
+        for recording in recordings:
+            x, u, K = recording.states.to(**like), recording.inputs.to(**like), len(recording)
+            for first in range(0, K, CHUNK):
+                mean = x[first : min(first + CHUNK, K)]
+                belief = Gaussian(mean, certain.expand(len(mean), n, n))
+                for k in range(min(horizon, K - first)):
+                    last = min(first + CHUNK, K - k)  # from here on k + 1 steps would outlast the recording
+                    belief = Gaussian(belief.mean[: last - first], belief.covariance[: last - first])
+                    belief = propagator(model, belief, u[first + k : last + k])
+                    observed = recording.states[first + k + 1 : last + k + 1]
+                    found[k].append((belief.mean.double().cpu(), (belief.variance + noise).double().cpu(), observed))
     steps = [tuple(torch.cat(parts) for parts in zip(*step, strict=True)) for step in found]
     columns = [[[part[:, i : i + 1] for part in step] for i in range(n)] for step in steps]
 
@@ -184,19 +173,13 @@ def _check(
     n, m = model.state_dim, model.input_dim
     if model.output_dim != n:
         raise ShapeError(f"the model must predict its {n} states; it has {model.output_dim} outputs")
-    if not recordings:
-        raise ShapeError("at least one recording is needed; got none")
-    for recording in recordings:
-        states, inputs = recording.states.shape[1], recording.inputs.shape[1]
-        if (states, inputs) != (n, m):
-            raise ShapeError(f"the model has {n} states and {m} inputs; got a recording with {states} and {inputs}")
-    longest = max(len(recording) for recording in recordings)
+    sizes = {(recording.states.shape[1], recording.inputs.shape[1]) for recording in recordings}
+    if sizes != {(n, m)}:
+        raise ShapeError(f"recordings must have the model's {n} states and {m} inputs; got {sizes or 'no recording'}")
+    longest = max(map(len, recordings))
     if horizon > longest:
         raise SettingError("horizon", f"must be at most {longest} steps, the longest recording; got {horizon}")
     if len(names) != n:
         raise ShapeError(f"names must name {n} states; got {len(names)}")
-    if not levels:
-        raise SettingError("levels", "must hold at least one level; got none")
-    for level in levels:
-        if not 0 < level < 1:
-            raise SettingError("levels", f"must lie between 0 and 1; got {level}")
+    if not levels or not all(0 < level < 1 for level in levels):
+        raise SettingError("levels", f"must be one or more between 0 and 1; got {levels}")

@@ -4,7 +4,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
+from torch.autograd import forward_ad
 
 from gpmpc.exceptions import SettingError, ShapeError
 
@@ -15,6 +17,16 @@ def check_tensors(**given: Any) -> None:
         if not isinstance(value, Tensor):
             got = type(value).__name__
             raise SettingError(key, f"must be a torch tensor; got {got} (torch.as_tensor(..., dtype=torch.float64))")
+
+
+def constant_arrays(*tensors: Tensor) -> list[NDArray[Any]] | None:
+    """Tensors as arrays; None where one is on another device, or autograd or a function transform follows it."""
+    try:
+        arrays = [tensor.numpy() for tensor in tensors]
+    except (RuntimeError, TypeError):
+        return None
+    followed = any(forward_ad.unpack_dual(tensor).tangent is not None for tensor in tensors)
+    return None if followed else arrays
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +91,8 @@ def nearest_positive_semidefinite(covariance: Tensor) -> tuple[Tensor, Tensor]:
     positive semidefinite already, which is then returned unchanged.
     """
     symmetric = (covariance + covariance.mT) / 2
-    if _plain(symmetric) and not bool(torch.linalg.cholesky_ex(symmetric).info.any()):  # the usual case, cheaply
+    plain = constant_arrays(symmetric) is not None
+    if plain and not bool(torch.linalg.cholesky_ex(symmetric).info.any()):  # the usual case, cheaply
         return symmetric, torch.zeros_like(symmetric[..., 0, 0])
     deficit = (-torch.linalg.eigvalsh(symmetric.detach())[..., 0]).clamp_min(0)
     negative = deficit[..., None, None] > 0
@@ -122,12 +135,3 @@ def _congruent(U: Tensor, matrices: Tensor) -> Tensor:
     shape = matrices.shape[-2:]
     half = U @ matrices.flatten(-2)  # its rows are of U X, one X beside the other
     return (U @ half.unflatten(-1, shape).transpose(-3, -2).flatten(-2)).unflatten(-1, shape)
-
-
-def _plain(value: Tensor) -> bool:
-    """Whether a tensor's values may decide what is done next: in host memory, in no graph and in no transform."""
-    try:
-        value.numpy()
-    except (RuntimeError, TypeError):
-        return False
-    return True

@@ -31,14 +31,10 @@ def negative_log_predictive_density(mean: Tensor, variance: Tensor, observed: Te
 def interval_coverage(mean: Tensor, variance: Tensor, observed: Tensor, level: float = 0.95) -> float:
     """Computes the part of observations inside the central interval of a level; all (N, n). Ideal: the level."""
     _check_alike(mean=mean, variance=variance, observed=observed)
-    _check_level(level)
-    half_width = torch.special.ndtri(torch.tensor((1 + level) / 2, dtype=variance.dtype)) * variance.sqrt()
-    return float(((observed - mean).abs() <= half_width).double().mean())
-
-
-def _check_level(level: float) -> None:
     if not 0 < level < 1:
         raise SettingError("level", f"must lie between 0 and 1; got {level}")
+    half_width = torch.special.ndtri(torch.tensor((1 + level) / 2, dtype=variance.dtype)) * variance.sqrt()
+    return float(((observed - mean).abs() <= half_width).double().mean())
 
 
 def _check_alike(**given: Tensor) -> None:
@@ -61,11 +57,8 @@ def tracking_error(
 ) -> _TrackingError:
     """Computes how far a flight was from its references, the initial state left out: nobody steered there.
 
-    Args:
-        states: x[0] .. x[K] (K + 1, n), K of 1 or more.
-        references: r[0] .. r[K] (K + 1, n).
-        axes: Which states to look at, all in one unit.
-        angles: Those of them whose errors are taken within half a turn [rad].
+    States and references are (K + 1, n), K of 1 or more; ``axes`` are the states to look at, all in one unit, and
+    ``angles`` those of them whose errors are taken within half a turn [rad].
     """
     with np.errstate(over="ignore", invalid="ignore"):
         squares = np.square(_errors(states, references, axes, angles))[1:].mean(axis=0)
@@ -102,17 +95,8 @@ def find_loss(
     """Finds where a flight is farther from its reference than the reference ever goes from where the flight began.
 
     There the system would have been nearer had it never moved: it no longer follows. That holds for any system and any
-    units; a reference that hardly moves needs a ``least``, such as ``System.lost``.
-
-    Args:
-        states: x[0] .. x[K] (K + 1, n).
-        references: r[0] .. r[K] (K + 1, n).
-        axes: Which states to look at, all in one unit.
-        least: No flight is lost that is nearer than this.
-        angles: Those of them whose errors are taken within half a turn [rad].
-
-    Returns:
-        The first such step; None where there is none.
+    units; a reference that hardly moves needs a ``least``, such as ``System.lost``: no flight is lost that is nearer.
+    Arguments are those of ``tracking_error``. Returns the first such step, or None.
     """
     with np.errstate(over="ignore", invalid="ignore"):
         distances = np.linalg.norm(_errors(states, references, axes, angles), axis=1)
@@ -139,20 +123,12 @@ class _ViolationRate:
         return self.violations / self.steps
 
 
-def violation_rate(
-    values: np.ndarray, lower: np.ndarray, upper: np.ndarray, level: float = 0.95, tolerance: float = 1e-9
-) -> _ViolationRate:
-    """Counts how often states or inputs were outside their bounds, with the interval of Clopper and Pearson (1934).
+def violation_rate(values: np.ndarray, lower: np.ndarray, upper: np.ndarray, tolerance: float = 1e-9) -> _ViolationRate:
+    """Counts how often states or inputs were outside their bounds, with the 95 % interval of ``binomial_interval``.
 
     The interval takes steps for independent. Those of one flight are not: pool several seeds, and read it as a lower
-    limit of the doubt.
-
-    Args:
-        values: One row a step (K, d).
-        lower: (d,); -inf where there is none.
-        upper: (d,); inf where there is none.
-        level: Of the interval, two-sided.
-        tolerance: What a solver's round-off may be outside.
+    limit of the doubt. Values are (K, d), one row a step, and bounds (d,), infinite where there is none; a solver's
+    round-off may be ``tolerance`` outside.
     """
     values, lower, upper = (np.asarray(a, dtype=float) for a in (values, lower, upper))
     if values.ndim != 2 or not len(values) or lower.shape != values.shape[1:] or upper.shape != values.shape[1:]:
@@ -165,12 +141,11 @@ def violation_rate(
     inside = (values >= lower - tolerance) & (values <= upper + tolerance)
     violations = int((~inside.all(axis=1)).sum())
     outside = np.fmax.reduce(np.maximum(lower - values, values - upper), axis=None, initial=0.0)
-    return _ViolationRate(violations, len(values), float(outside), *binomial_interval(violations, len(values), level))
+    return _ViolationRate(violations, len(values), float(outside), *binomial_interval(violations, len(values)))
 
 
 def binomial_interval(successes: int, trials: int, level: float = 0.95) -> tuple[float, float]:
     """Computes the exact interval for a probability from ``successes`` of ``trials`` (Clopper and Pearson, 1934)."""
-    _check_level(level)
     if not 0 <= successes <= trials or trials < 1:
         raise SettingError("successes", f"must lie between 0 and trials, 1 or more; got {successes} of {trials}")
     low, high = stats.binomtest(successes, trials).proportion_ci(level, "exact")
@@ -195,13 +170,8 @@ def tracking_cost(
 ) -> float:
     """Computes the cost of a flight per step: 1/K (sum_k |x_k - r_k|^2_Q + sum_k |u_k - u_{k-1}|^2_R).
 
-    Args:
-        Q: Weights of the states (n, n).
-        R: Weights of the increments of the inputs (m, m).
-        states: x_0 .. x_K (K + 1, n); the initial one costs nothing.
-        references: r_0 .. r_K (K + 1, n).
-        inputs: u_0 .. u_{K-1} (K, m).
-        previous_input: u_{-1} (m,).
+    Q is (n, n) and R (m, m); states and references are (K + 1, n), of which the first cost nothing, inputs (K, m), and
+    the previous input u_{-1} (m,).
     """
     errors, increments = states[1:] - references[1:], np.diff(inputs, axis=0, prepend=np.atleast_2d(previous_input))
     cost = np.einsum("ki,ij,kj", errors, Q, errors) + np.einsum("ki,ij,kj", increments, R, increments)

@@ -58,12 +58,9 @@ def cores() -> int:
 
 
 def end_with(parent: int) -> None:
-    """Ends this process soon after its parent, whatever ended that.
+    """Ends this process soon after its parent, whose id the parent itself states: it may be gone before this call.
 
     An orphan would compute what nobody reads, or wait for jobs that do not come, and hold the terminal's pipe open.
-
-    Args:
-        parent: The parent's process id, which the parent itself states: it may be gone before this is called.
     """
 
     def watch() -> None:
@@ -91,13 +88,11 @@ def children_ignore_interrupts() -> Iterator[None]:
 @contextmanager
 def _one_thread_each() -> Iterator[None]:
     """Worker processes started inside use one thread each, whatever library asks."""
-    before = {name: os.environ.get(name) for name in THREADS}
+    before = {name: os.environ[name] for name in THREADS if name in os.environ}
     os.environ.update(dict.fromkeys(THREADS, "1"))
     try:
         yield
     finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
+        for name in THREADS:
+            del os.environ[name]
+        os.environ.update(before)

@@ -150,8 +150,7 @@ class Step:
 
     def __call__(self, time: np.ndarray) -> np.ndarray:
         """Positions (..., d) at times (...) [s]."""
-        reached = np.asarray(time, dtype=float)[..., None] >= self.at
-        return np.where(reached, np.array(self.after, float), np.array(self.before, float))
+        return np.where(np.asarray(time)[..., None] >= self.at, np.array(self.after, float), self.before)
 
     def velocity(self, time: np.ndarray) -> np.ndarray:
         """Zero (..., d): the jump has no velocity."""
@@ -169,7 +168,7 @@ class Hover:
 
     def __call__(self, time: np.ndarray) -> np.ndarray:
         """Positions (..., d) at times (...) [s]."""
-        return np.broadcast_to(np.asarray(self.position, dtype=float), (*np.shape(time), len(self.position))).copy()
+        return np.tile(np.asarray(self.position, dtype=float), (*np.shape(time), 1))
 
     def velocity(self, time: np.ndarray) -> np.ndarray:
         """Zero (..., d)."""
@@ -188,11 +187,9 @@ class Waypoints:
 
     def __post_init__(self) -> None:
         _check_positions("positions", self.positions)
-        count, positions = len(self.times), len(self.positions)
-        if count < 2 or count != positions:
-            raise SettingError(
-                "times", f"must be two or more, one a position; got {count} times, {positions} positions"
-            )
+        got = f"{len(self.times)} times, {len(self.positions)} positions"
+        if not 2 <= len(self.times) == len(self.positions):
+            raise SettingError("times", f"must be two or more, one a position; got {got}")
         if not np.all(np.diff(np.asarray(self.times, dtype=float)) > 0):
             raise SettingError("times", f"must be strictly increasing [s]; got {list(self.times)}")
 

@@ -190,7 +190,6 @@ def test_numba_still_has_the_private_parts_that_are_used_here():
 
 def test_without_numbas_private_parts_kernels_compile_in_its_own_way(monkeypatch):
     monkeypatch.setattr(gpmpc._compiled, "_PRIVATE_OPTIONS", {True: {}, False: {}})
-    monkeypatch.setattr(gpmpc._compiled, "_NRT_OPTION", False)
 
     @gpmpc._compiled.njit_noalloc
     def inner(x):

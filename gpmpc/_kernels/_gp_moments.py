@@ -51,8 +51,6 @@ from gpmpc._kernels.linalg import (
     symmetrize,
 )
 
-VALUE, JACOBIAN, CROSS = 0, 1, 2  # derivatives of nothing, of M and V, of J as well
-
 
 class _Belief(NamedTuple):
     """A belief, and the GPs with their points relative to its mean and input."""
@@ -81,8 +79,8 @@ class _OutputTerms(NamedTuple):
     e_second: ndarray  # sum_i e_i z_i z_i' (k, n, n)
 
 
-class _PairTerms(NamedTuple):
-    """What the sum over pairs of points reads, and the sums."""
+class _Work(NamedTuple):
+    """What the sum over pairs of points reads, the sums, and memory to work in."""
 
     rise: ndarray  # (P,)
     fall: ndarray  # (P,)
@@ -91,32 +89,24 @@ class _PairTerms(NamedTuple):
     p_i: ndarray  # row sums (P,)
     p_j: ndarray  # column sums (P,)
     g: ndarray  # (n, P)
-
-
-class _Scratch(NamedTuple):
-    """Memory to work in: matrices (n, n) and rows (P,)."""
-
-    G_ab: ndarray
+    row: ndarray  # (P,)
+    other: ndarray  # (P,)
+    G_ab: ndarray  # (n, n), like those that follow
     F: ndarray
     x: ndarray
     y: ndarray
     H: ndarray
-    row: ndarray
-    other: ndarray
 
 
 @compiled
-def evaluate_moments(order, diagonal, gp, precision, mu, S, u, out):
+def evaluate_moments(derivatives, diagonal, gp, precision, mu, S, u, out):
     """Writes the arrays of ``gpmpc._kernels.Moments`` at mu (H, n), S (H, n, n) and u (H, m).
 
-    ``order`` is ``VALUE``, ``JACOBIAN`` or ``CROSS``; the arrays of ``out`` are full of zeros, or empty beyond that.
+    The arrays of ``out`` are full of zeros; those of derivatives are empty where these are not wanted.
     """
     use_widest_registers()
     (k, padded), n, m = gp.weights.shape, mu.shape[1], u.shape[1]
-    rows = aligned_rows(n + m + 2, padded)
-    terms, pair = _make_terms(k, n, padded)
-    matrices = np.empty((5, n, n))
-    scratch = _Scratch(matrices[0], matrices[1], matrices[2], matrices[3], matrices[4], rows[n + m], rows[n + m + 1])
+    rows, (terms, work) = aligned_rows(n + m, padded), _make_terms(k, n, padded)
     for h in range(len(mu)):
         belief = _Belief(gp, S[h], rows[:n], rows[n : n + m])
         for d in range(n + m):
@@ -124,29 +114,28 @@ def evaluate_moments(order, diagonal, gp, precision, mu, S, u, out):
             for j in range(padded):
                 row[j] = point[j] - at
         for a in range(k):
-            _evaluate_output(belief, a, terms, scratch)
+            _evaluate_output(belief, a, terms, work)
             out.M[h, a] = terms.M[a]
             multiply_transposed(terms.G[a], terms.first[a], out.J[h, a])
-            if order >= JACOBIAN:
+            if derivatives:
                 to, sums = (out.J[h, a], out.dM_dS[h, a], out.dM_du[h, a]), (terms.first[a], terms.second[a])
-                _differentiate_sum(terms.weighted[a], 1.0, belief, a, terms, sums, scratch, to)
-            if order == CROSS:
+                _differentiate_sum(terms.weighted[a], 1.0, belief, a, terms, sums, work, to)
                 _differentiate_J(belief, a, terms, out.J[h, a], out.dJ_dS[h, a], out.dJ_du[h, a])
         for a in range(k):
-            reduction = reduce_variance(precision.inverse_cholesky[a], terms.q[a], scratch.row)
+            reduction = reduce_variance(precision.inverse_cholesky[a], terms.q[a], work.row)
             out.V[h, a, a] = np.exp(gp.log_signal[a]) - reduction
-            if order >= JACOBIAN:
+            if derivatives:
                 to = out.dV_dmu[h, a, a], out.dV_dS[h, a, a], out.dV_du[h, a, a]
                 sums = terms.e_first[a], terms.e_second[a]
-                multiply(scratch.row, terms.q[a], scratch.row)  # (K_a + sn2_a I)^-1 q_a becomes e
-                terms.e[a] = _differentiate_sum(scratch.row, -2.0, belief, a, terms, sums, scratch, to)
+                multiply(work.row, terms.q[a], work.row)  # (K_a + sn2_a I)^-1 q_a becomes e
+                terms.e[a] = _differentiate_sum(work.row, -2.0, belief, a, terms, sums, work, to)
             for b in range(a, a + 1 if diagonal else k):
-                P_sum = _evaluate_pair(belief, a, b, terms, pair, precision.centred[a], order >= JACOBIAN, scratch)
+                P_sum = _evaluate_pair(belief, a, b, terms, precision.centred[a], derivatives, work)
                 out.V[h, a, b] += P_sum
                 out.V[h, b, a] = out.V[h, a, b]
-                if order >= JACOBIAN:
+                if derivatives:
                     to = out.dV_dmu[h, a, b], out.dV_dS[h, a, b], out.dV_du[h, a, b]
-                    _differentiate_pair(belief, a, b, terms, pair, P_sum, scratch, to)
+                    _differentiate_pair(belief, a, b, terms, P_sum, work, to)
                     out.dV_dmu[h, b, a], out.dV_dS[h, b, a], out.dV_du[h, b, a] = to
 
 
@@ -154,18 +143,18 @@ def evaluate_moments(order, diagonal, gp, precision, mu, S, u, out):
 def _make_terms(k, n, padded):
     vectors, rows = aligned_rows(2 * k * n, padded).reshape(2, k, n, padded), aligned_rows(2 * k, padded)
     squares, sums, numbers = np.zeros((4, k, n, n)), np.zeros((2, k, n)), np.zeros((3, k))
-    G, T, second, e_second = squares[0], squares[1], squares[2], squares[3]
-    single = vectors[0], vectors[1], rows[:k], rows[k:], G, T, numbers[0], numbers[1]
-    pair = aligned_rows(3 * n + 4, padded)
-    blocks = pair[4 : 4 + n], pair[4 + n : 4 + 2 * n], pair[2], pair[3], pair[4 + 2 * n :]
-    return _OutputTerms(*single, sums[0], second, numbers[2], sums[1], e_second), _PairTerms(pair[0], pair[1], *blocks)
+    single = vectors[0], vectors[1], rows[:k], rows[k:], squares[0], squares[1], numbers[0], numbers[1]
+    terms = _OutputTerms(*single, sums[0], squares[2], numbers[2], sums[1], squares[3])
+    w, square = aligned_rows(3 * n + 6, padded), np.empty((5, n, n))
+    of_points = w[0], w[1], w[6 : 6 + n], w[6 + n : 6 + 2 * n], w[2], w[3], w[6 + 2 * n :], w[4], w[5]
+    return terms, _Work(*of_points, square[0], square[1], square[2], square[3], square[4])
 
 
 @njit_inner
-def _evaluate_output(belief, a, terms, scratch):
+def _evaluate_output(belief, a, terms, work):
     """Fills the terms of output a, but for ``second`` and the sums over e."""
     use_widest_registers()
-    gp, n, log_q, whiten = belief.gp, len(belief.S), scratch.row, scratch.x
+    gp, n, log_q, whiten = belief.gp, len(belief.S), work.row, work.x
     D, D_u = gp.inverse_squares[a, :n], gp.inverse_squares[a, n:]
     # log q_i = log sf2 - 1/2 log|I + S D| - 1/2 |W (x_i - mu)|^2 - 1/2 (u_i - u)' D_u (u_i - u)
     terms.half_logdet[a] = condition(belief.S, D, whiten, terms.G[a])
@@ -188,14 +177,14 @@ def _evaluate_output(belief, a, terms, scratch):
 
 
 @njit_noalloc
-def _differentiate_sum(v, factor, belief, a, terms, sums, scratch, to):
+def _differentiate_sum(v, factor, belief, a, terms, sums, work, to):
     """Writes ``factor`` sum_i v_i dlog q_ai; fills the sums of v_i z_i and v_i z_i z_i', and returns that of v_i."""
     (first, second), (dmu, dS, du) = sums, to
-    n, total, G, D, x = len(belief.S), row_sum(v), terms.G[a], belief.gp.inverse_squares[a], scratch.x
+    n, total, G, D, x = len(belief.S), row_sum(v), terms.G[a], belief.gp.inverse_squares[a], work.x
     project(v, terms.z[a], first)
     project(v, belief.u, du)
-    second_moments(v, terms.z[a], scratch.other, second)
-    congruence(G, second, scratch.y, x)
+    second_moments(v, terms.z[a], work.other, second)
+    congruence(G, second, work.y, x)
     multiply_transposed(G, first, dmu)
     for c in range(n):
         dmu[c] *= factor
@@ -231,68 +220,68 @@ def _differentiate_J(belief, a, terms, J, dJ_dS, dJ_du):
 
 
 @njit_inner
-def _evaluate_pair(belief, a, b, terms, pair, E, derivatives, scratch):
-    """Returns sum_ij P_ij; its parts go to ``pair``, G_ab to ``scratch``."""
-    gp, n, T_ab, whiten = belief.gp, len(belief.S), scratch.F, scratch.x
+def _evaluate_pair(belief, a, b, terms, E, derivatives, work):
+    """Returns sum_ij P_ij; its parts go to ``work``, and so does G_ab."""
+    gp, n, T_ab, whiten = belief.gp, len(belief.S), work.F, work.x
     D_a, D_b = gp.inverse_squares[a, :n], gp.inverse_squares[b, :n]
-    r = terms.half_logdet[a] + terms.half_logdet[b] - condition(belief.S, D_a + D_b, whiten, scratch.G_ab)
-    product(scratch.G_ab, belief.S, T_ab)
+    r = terms.half_logdet[a] + terms.half_logdet[b] - condition(belief.S, D_a + D_b, whiten, work.G_ab)
+    product(work.G_ab, belief.S, T_ab)
     symmetrize(T_ab)
     # rise_i = r - 1/2 z_ai' T_ab D_b T_a z_ai,   fall_j = -1/2 z_bj' T_ab D_a T_b z_bj
-    pair.fall[:] = 0.0
-    transform(T_ab, terms.z[b], pair.left)
-    add_products(D_a * -0.5, pair.left, terms.Tz[b], pair.fall)
-    pair.rise[:] = r
-    transform(T_ab, terms.z[a], pair.left)
-    add_products(D_b * -0.5, pair.left, terms.Tz[a], pair.rise)
+    work.fall[:] = 0.0
+    transform(T_ab, terms.z[b], work.left)
+    add_products(D_a * -0.5, work.left, terms.Tz[b], work.fall)
+    work.rise[:] = r
+    transform(T_ab, terms.z[a], work.left)
+    add_products(D_b * -0.5, work.left, terms.Tz[a], work.rise)
     weights_i, weights_j = (terms.q[a], terms.q[b]) if a == b else (terms.weighted[a], terms.weighted[b])
     for d in range(n):
-        multiply(weights_i, terms.z[a, d], pair.weighted_z[d])
-    across = math.sqrt(largest_square(pair.left) * largest_square(terms.z[b]))  # Cauchy and Schwarz
-    near = largest_size(pair.rise) + largest_size(pair.fall) + across <= NEAR_ZERO
-    _sum_pairs(gp.size, a == b, near, derivatives, pair, (weights_i, weights_j), terms.z[b], E)
-    multiply(pair.p_i, weights_i, pair.p_i)
-    multiply(pair.p_j, weights_j, pair.p_j)
+        multiply(weights_i, terms.z[a, d], work.weighted_z[d])
+    across = math.sqrt(largest_square(work.left) * largest_square(terms.z[b]))  # Cauchy and Schwarz
+    near = largest_size(work.rise) + largest_size(work.fall) + across <= NEAR_ZERO
+    _sum_pairs(gp.size, a == b, near, derivatives, work, (weights_i, weights_j), terms.z[b], E)
+    multiply(work.p_i, weights_i, work.p_i)
+    multiply(work.p_j, weights_j, work.p_j)
     if derivatives:
         for d in range(n):
-            multiply(pair.g[d], weights_j, pair.g[d])
-    return row_sum(pair.p_j)
+            multiply(work.g[d], weights_j, work.g[d])
+    return row_sum(work.p_j)
 
 
 @njit_noalloc
-def _sum_pairs(size, same, near, derivatives, pair, weights, z, E):
-    """Writes the sums over i and j of ``pair`` before they are multiplied by the weight of their own point."""
+def _sum_pairs(size, same, near, derivatives, work, weights, z, E):
+    """Writes the sums over i and j of ``work`` before they are multiplied by the weight of their own point."""
     use_widest_registers()
     (n, padded), (weights_i, weights_j) = z.shape, weights
-    pair.p_j[:] = 0.0
+    work.p_j[:] = 0.0
     if derivatives:
-        pair.p_i[:], pair.g[:] = 0.0, 0.0
+        work.p_i[:], work.g[:] = 0.0, 0.0
     at = 0
     for i in range(0, size, 4):
         w0, w1, w2, w3 = weights_i[i], weights_i[i + 1], weights_i[i + 2], weights_i[i + 3]
         s0 = s1 = s2 = s3 = zeros()
         for j in range(0, i // 16 * 16 + 16 if same else padded, 16):
-            P = _expm1_of_block(near, pair.rise, pair.fall, pair.left, z, i, j)
+            P = _expm1_of_block(near, work.rise, work.fall, work.left, z, i, j)
             if same:
                 R, P = _multiply_block(P, E, at)
                 at += 64
             else:
                 R = P
             (a0, b0), (a1, b1), (a2, b2), (a3, b3) = P
-            store(pair.p_j, j, load(pair.p_j, j) + w0 * a0 + w1 * a1 + w2 * a2 + w3 * a3)
-            store(pair.p_j, j + 8, load(pair.p_j, j + 8) + w0 * b0 + w1 * b1 + w2 * b2 + w3 * b3)
+            store(work.p_j, j, load(work.p_j, j) + w0 * a0 + w1 * a1 + w2 * a2 + w3 * a3)
+            store(work.p_j, j + 8, load(work.p_j, j + 8) + w0 * b0 + w1 * b1 + w2 * b2 + w3 * b3)
             if derivatives:
                 u, v = load(weights_j, j), load(weights_j, j + 8)
                 s0, s1 = s0 + a0 * u + b0 * v, s1 + a1 * u + b1 * v
                 s2, s3 = s2 + a2 * u + b2 * v, s3 + a3 * u + b3 * v
                 (a0, b0), (a1, b1), (a2, b2), (a3, b3) = R
                 for d in range(n):
-                    g, y = pair.g[d], pair.weighted_z[d]
+                    g, y = work.g[d], work.weighted_z[d]
                     y0, y1, y2, y3 = y[i], y[i + 1], y[i + 2], y[i + 3]
                     store(g, j, load(g, j) + y0 * a0 + y1 * a1 + y2 * a2 + y3 * a3)
                     store(g, j + 8, load(g, j + 8) + y0 * b0 + y1 * b1 + y2 * b2 + y3 * b3)
         if derivatives:
-            pair.p_i[i], pair.p_i[i + 1], pair.p_i[i + 2], pair.p_i[i + 3] = total(s0), total(s1), total(s2), total(s3)
+            work.p_i[i], work.p_i[i + 1], work.p_i[i + 2], work.p_i[i + 3] = total(s0), total(s1), total(s2), total(s3)
 
 
 @inline_njit
@@ -327,18 +316,18 @@ def _multiply_block(values, E, at):
 
 
 @njit_inner
-def _differentiate_pair(belief, a, b, terms, pair, P_sum, scratch, to):
+def _differentiate_pair(belief, a, b, terms, P_sum, work, to):
     """Adds the derivatives of the pair's sum to those of V_ab."""
     dmu, dS, du = to
     n, same = len(belief.S), a == b
-    G_ab, x, y, H = scratch.G_ab, scratch.x, scratch.y, scratch.H
+    G_ab, x, y, H = work.G_ab, work.x, work.y, work.H
     D_a, D_b = belief.gp.inverse_squares[a], belief.gp.inverse_squares[b]
     sums, controls = np.empty((2, n)), np.empty((2, len(du)))
     # y = sum_ij P_ij (z_ai + z_bj) (z_ai + z_bj)' + U_ij (z_ai z_bj' + z_bj z_ai')
-    second_moments(pair.p_i, terms.z[a], scratch.row, x)
-    second_moments(pair.p_j, terms.z[b], scratch.row, y)
+    second_moments(work.p_i, terms.z[a], work.row, x)
+    second_moments(work.p_j, terms.z[b], work.row, y)
     for c in range(n):
-        project(pair.g[c], terms.z[b], H[c])
+        project(work.g[c], terms.z[b], H[c])
         for d in range(n if not same else 0):  # in g of a = b is R, not P
             H[c, d] += terms.first[a, c] * terms.first[b, d]
     for c in range(n):
@@ -346,8 +335,8 @@ def _differentiate_pair(belief, a, b, terms, pair, P_sum, scratch, to):
             y[c, d] += x[c, d] + H[c, d] + H[d, c]
     congruence(G_ab, y, x, H)
     # dmu: sum_ij P_ij y_ij
-    project(pair.p_i, terms.z[a], sums[0])
-    project(pair.p_j, terms.z[b], sums[1])
+    project(work.p_i, terms.z[a], sums[0])
+    project(work.p_j, terms.z[b], sums[1])
     for c in range(n):
         sums[0, c] += sums[1, c]
     multiply_transposed(G_ab, sums[0], sums[1])
@@ -358,10 +347,10 @@ def _differentiate_pair(belief, a, b, terms, pair, P_sum, scratch, to):
     # U_ij = beta_ai beta_bj q_ai q_bj, or E_ij q_ai q_aj: what F_a and F_b make of the sums of each output alone
     e_share = 1.0 if same else 0.0
     U_sum = terms.M[a] * terms.M[b] - e_share * terms.e[a]
-    _add_difference((dmu, H), terms, a, U_sum, terms.M[b], e_share, (D_a, D_b), scratch)
-    _add_difference((dmu, H), terms, b, U_sum, terms.M[a], e_share, (D_b, D_a), scratch)
-    project(pair.p_i, belief.u, controls[0])
-    project(pair.p_j, belief.u, controls[1])
+    _add_difference((dmu, H), terms, a, U_sum, terms.M[b], e_share, (D_a, D_b), work)
+    _add_difference((dmu, H), terms, b, U_sum, terms.M[a], e_share, (D_b, D_a), work)
+    project(work.p_i, belief.u, controls[0])
+    project(work.p_j, belief.u, controls[1])
     for c in range(len(du)):
         du[c] += controls[0, c] * D_a[n + c] + controls[1, c] * D_b[n + c]
     for c in range(n):
@@ -371,13 +360,13 @@ def _differentiate_pair(belief, a, b, terms, pair, P_sum, scratch, to):
 
 
 @njit_noalloc
-def _add_difference(to, terms, a, U_sum, M, e_share, scales, scratch):
+def _add_difference(to, terms, a, U_sum, M, e_share, scales, work):
     """Adds sum_i U_i F z_i to dmu and sum_i U_i (y_i y_i' - w_i w_i') - sum_ij U_ij F D to dS, F = G_ab' - G_a'.
 
     U_i = sum_j U_ij = M beta_i q_i - e_share e_i, y_i = G_ab' z_i, w_i = G_a' z_i.
     """
     (dmu, dS), (D, D_other) = to, scales
-    F, moment, x, G_a, G_ab = scratch.F, scratch.y, scratch.x, terms.G[a], scratch.G_ab
+    F, moment, x, G_a, G_ab = work.F, work.y, work.x, terms.G[a], work.G_ab
     n = len(F)
     for c in range(n):
         for d in range(n):

@@ -50,17 +50,11 @@ def _write_kernel(log_signal, D, squares, weights, k, weighted):
 
 @compiled(allocates=False)
 def linearize_points(gp, columns, outer, x, u, memory, out):
-    """Writes the mean, its derivatives and the covariance at K points.
+    """Writes M (K, k), A (K, k, n), B (K, k, m) and the diagonal of the covariance (K, k, k), or none to (0, k, k).
 
-    Args:
-        gp: ``GPArrays``.
-        columns: L_a by columns (k, N, N), or with more behind; not read where no covariance is wanted.
-        outer: The prior means (k,), and whether the state is added to the prediction.
-        x: States (K, n).
-        u: Inputs (K, m).
-        memory: Lent to work in, eight numbers more than 2 (n + m) + 1 rows of P, and for covariances k rows for each
-            point, K rounded up to a multiple of 4: counting references to own arrays costs a third of a short call.
-        out: M (K, k), A (K, k, n), B (K, k, m), and the covariance (K, k, k), whose diagonal is written, or (0, k, k).
+    L_a by ``columns`` (k, N, N), or with more behind, is read for covariances only. ``outer`` are the prior means (k,)
+    and whether the state is added. ``memory`` is lent, since counting references to own arrays costs a third of a short
+    call: eight numbers more than 2 (n + m) + 1 rows of P, and for covariances k rows a point, K rounded up to fours.
     """
     use_widest_registers()
     (M, A, B, covariance), (offset, adds_state) = out, outer

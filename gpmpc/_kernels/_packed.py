@@ -13,7 +13,8 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
 
-from gpmpc.exceptions import SettingError, ShapeError
+from gpmpc._kernels.linalg import aligned_rows
+from gpmpc.exceptions import ShapeError
 
 Array = NDArray[np.float64]
 
@@ -63,30 +64,21 @@ class Packed:
     @cached_property
     def precision(self) -> Precision:
         """What exact moments and derivatives of the variance read."""
-        padded, size = self.arrays.points.shape[1], self.arrays.size
-        inverse, centred = [], []
-        for a in range(self.output_dim):
-            triangle = np.zeros((padded, padded))
-            triangle[:size, :size], _ = scipy.linalg.lapack.dtrtri(self.cholesky[a], lower=1)
-            lengths = [i // 8 * 8 + 8 for i in range(0, padded, ROWS)]
-            rows = zip(range(0, padded, ROWS), lengths, strict=True)
-            inverse.append(np.concatenate([triangle[i : i + ROWS, :length].ravel() for i, length in rows]))
-            square, blocks = self._centred_square(a), []
-            for i in range(0, padded, ROWS):
-                row = square[i : i + ROWS, : i // COLUMNS * COLUMNS + COLUMNS]
-                blocks.append(row.reshape(ROWS, -1, COLUMNS).swapaxes(0, 1).ravel())
-            centred.append(np.concatenate(blocks))
-        found = Precision(aligned((len(inverse), len(inverse[0]))), aligned((len(centred), len(centred[0]))))
+        (k, padded), size = self.arrays.weights.shape, self.arrays.size
+        starts, inverse, centred = range(0, padded, ROWS), [], []
+        for factor, beta in zip(self.cholesky, self.arrays.weights[:, :size], strict=True):
+            square = np.zeros((padded, padded))
+            square[:size, :size], _ = scipy.linalg.lapack.dtrtri(factor, lower=1)
+            inverse.append(np.concatenate([square[i : i + ROWS, : i // 8 * 8 + 8].ravel() for i in starts]))
+            precision, _ = scipy.linalg.lapack.dpotri(factor, lower=1)  # the lower triangle
+            square[:size, :size] = np.tril(np.multiply.outer(2 * beta, beta) - 2 * precision)
+            np.fill_diagonal(square, square.diagonal() / 2)
+            rows = (square[i : i + ROWS, : i // COLUMNS * COLUMNS + COLUMNS] for i in starts)
+            blocks = (row.reshape(ROWS, -1, COLUMNS).swapaxes(0, 1).ravel() for row in rows)
+            centred.append(np.concatenate(list(blocks)))
+        found = Precision(aligned((k, len(inverse[0]))), aligned((k, len(centred[0]))))
         found.inverse_cholesky[:], found.centred[:] = inverse, centred
         return found
-
-    def _centred_square(self, a: int) -> Array:
-        padded, size = self.arrays.points.shape[1], self.arrays.size
-        precision, _ = scipy.linalg.lapack.dpotri(self.cholesky[a], lower=1)  # the lower triangle
-        beta, square = self.arrays.weights[a, :size], np.zeros((padded, padded))
-        square[:size, :size] = np.tril(np.multiply.outer(2 * beta, beta) - 2 * precision)
-        np.fill_diagonal(square, square.diagonal() / 2)
-        return square
 
 
 def pack(
@@ -94,49 +86,23 @@ def pack(
 ) -> Packed:
     """Lays out exact SE-ARD GPs for the compiled kernels.
 
-    Args:
-        features: x~ = (x, u) of the training points (N, n + m).
-        lengthscales: l (k, n + m).
-        signal_variance: sf2 (k,).
-        cholesky: Lower factor L of K + sn2 I (k, N, N); kept, not copied.
-        weights: beta = (K + sn2 I)^-1 y (k, N).
-        state_dim: n.
-
-    Raises:
-        ShapeError: The shapes do not belong together.
-        SettingError: ``state_dim`` is not between 1 and n + m, or a hyperparameter is not positive.
+    From points x~ (N, n + m), l (k, n + m), sf2 (k,), the lower factor L of K + sn2 I (k, N, N), which is kept and not
+    copied, and beta = (K + sn2 I)^-1 y (k, N). Raises ShapeError where the shapes do not belong together.
     """
-    features, lengthscales, signal_variance, weights = (
-        np.ascontiguousarray(v, dtype=np.float64) for v in (features, lengthscales, signal_variance, weights)
-    )
-    cholesky = np.asarray(cholesky, dtype=np.float64)
-    (size, d), outputs = features.shape, len(weights)
-    expected = {
-        "lengthscales": (lengthscales, (outputs, d)),
-        "signal_variance": (signal_variance, (outputs,)),
-        "cholesky": (cholesky, (outputs, size, size)),
-        "weights": (weights, (outputs, size)),
-    }
-    for name, (value, shape) in expected.items():
-        if value.shape != shape:
-            raise ShapeError(f"{name} must have shape {shape}; got {value.shape}")
-    if not 1 <= state_dim <= d:
-        raise SettingError("state_dim", f"must be between 1 and the inputs' {d} columns; got {state_dim}")
-    for name, value in (("lengthscales", lengthscales), ("signal_variance", signal_variance)):
-        if not (value > 0).all():
-            raise SettingError(name, f"must be positive; got {value.tolist()}")
-
+    (size, d), k = features.shape, len(weights)
+    got = lengthscales.shape, signal_variance.shape, cholesky.shape, weights.shape
+    if got != ((k, d), (k,), (k, size, size), (k, size)):
+        raise ShapeError(f"l (k, d), sf2 (k,), L (k, N, N) and beta (k, N) of points {features.shape}; got {got}")
     padded = -(-size // COLUMNS) * COLUMNS
-    points, padded_weights = aligned((d, padded)), aligned((outputs, padded))
+    points, padded_weights = aligned((d, padded)), aligned((k, padded))
     points[:, :size], points[:, size:] = features.T, features[-1:].T
     padded_weights[:, :size] = weights
-    arrays = GPArrays(points, lengthscales**-2.0, np.log(signal_variance), padded_weights, size)
+    arrays = GPArrays(points, np.ascontiguousarray(lengthscales**-2.0), np.log(signal_variance), padded_weights, size)
     return Packed(arrays, cholesky, state_dim, d - state_dim)
 
 
 def aligned(shape: tuple[int, int]) -> Array:
     """Zeros whose rows start on cache lines where they are multiples of 8."""
-    size = shape[0] * shape[1]
-    memory = np.zeros(size + 8)
-    skip = -(memory.ctypes.data // memory.itemsize) % 8
-    return memory[skip : skip + size].reshape(shape)
+    rows = aligned_rows(*shape)
+    rows[:] = 0.0
+    return rows

@@ -77,15 +77,9 @@ def _write_means(f, offset, at, memory, means):
 
 @compiled
 def roll_out_gps(model, feedback, start, disturbance, states, inputs):
-    """Writes the states (T, H + 1, n) and the inputs (T, H, m) of T roll-outs.
+    """Writes the states (T, H + 1, n) and the inputs (T, H, m) of T roll-outs of ``AffineGPs`` from x_0 (T, n) on.
 
-    Args:
-        model: ``AffineGPs``.
-        feedback: ``Feedback``.
-        start: x_0 (T, n).
-        disturbance: Added to every next state (n,).
-        states: To write to.
-        inputs: To write to.
+    A disturbance (n,) is added to every next state.
     """
     use_widest_registers()
     f, offset, A, G, c, B, columns, kinds, chosen, tape = model
@@ -114,7 +108,7 @@ def roll_out_gps(model, feedback, start, disturbance, states, inputs):
                 for i in range(n):
                     point[i, t - first] = x[i]
             if tape.size > 0:
-                run_tape(tape, point, places, known)
+                run_tape(tape, point, places, known, None)
             for t in together:
                 x, u, after = states[t, k], inputs[t, k], states[t, k + 1]
                 for i in range(d):

@@ -1,7 +1,6 @@
 """Dense linear algebra for compiled loops: small vectors and matrices, for which a library call costs too much.
 
-All but ``aligned_rows`` write into arrays of their caller and allocate nothing. Sizes come from the
-arrays; where rows are padded, a caller passes the number of entries that count.
+Sizes come from the arrays; where rows are padded, a caller passes the number of entries that count.
 """
 
 import math
@@ -73,8 +72,7 @@ def multiply(A, count, x, size, out):
 def combine_rows(rows, count, factors, start, width, out):
     """Writes sum_j factors[j] rows[j] over ``count`` rows, columns from ``start`` on, ``width`` of them.
 
-    Rows and ``out`` are padded: what lies between the last and the next whole register is written too. Several sums
-    at a time hide the latency of one.
+    Rows and ``out`` are padded: what lies between the last and the next whole register is written too.
     """
     at, end = start, start + width
     while at + 8 < end:

@@ -27,8 +27,8 @@ OPERATIONS = frozenset({*range(16), ATAN, FABS, FMIN, FMAX, INV, TANH, ATAN2, CO
 class Tape(NamedTuple):
     """A function of a vector z (d,)."""
 
-    #: operation, place of the result and places of up to two operands (K, 4). Of an ``INPUT`` the operand is an index
-    #: into z, of an ``OUTPUT`` the result is an index into the value
+    #: operation, place of the result (an index into the value of an ``OUTPUT``) and places of up to two operands (an
+    #: index into z of an ``INPUT``) (K, 4)
     code: NDArray[np.int64]
     constants: Array  #: of the operations ``CONST``, by row (K,)
     work: int  #: number of places
@@ -39,62 +39,57 @@ NO_TAPE = Tape(np.empty((0, 4), dtype=np.int64), np.empty(0), 0, 0)
 
 
 @njit_noalloc
-def run_tape(tape, z, work, value):
-    """Writes the values (size, 8) at eight points z (d, 8); ``work`` (places + 5, 8) is lent to work in."""
+def run_tape(tape, z, work, value, slopes):
+    """Writes the values (size, 8) at eight points z (d, 8); ``work`` (places + 5, 8) is lent to work in.
+
+    ``slopes`` is None, or the derivatives (size, d, 8) to be written and memory for those of the places (places, d, 8).
+    """
     use_widest_registers()
-    z, work, value = z.reshape(-1), work.reshape(-1), value.reshape(-1)
+    d, z, work, value = len(z), z.reshape(-1), work.reshape(-1), value.reshape(-1)
     for i in range(tape.size):
         store(value, 8 * i, zeros())
     for k in range(len(tape.code)):
         operation, i, j, last = tape.code[k, 0], 8 * tape.code[k, 1], 8 * tape.code[k, 2], 8 * tape.code[k, 3]
         if operation == OUTPUT:
             store(value, i, load(work, j))
-        elif operation == INPUT:
-            store(work, i, load(z, j))
-        elif operation == CONST:
-            store(work, i, zeros() + tape.constants[k])
+            if slopes is not None:
+                for c in range(0, 8 * d, 8):
+                    store(slopes[0], i * d + c, load(slopes[1], j * d + c))
+        elif operation in (INPUT, CONST):
+            store(work, i, load(z, j) if operation == INPUT else zeros() + tape.constants[k])
+            if slopes is not None:
+                for c in range(0, 8 * d, 8):
+                    store(slopes[1], i * d + c, zeros() + (1.0 if operation == INPUT and c == j else 0.0))
         else:
-            store(work, i, _operate(operation, load(work, j), load(work, last), work, 8 * tape.work)[0])
+            found, by_first, by_second = _operate(operation, load(work, j), load(work, last), work, 8 * tape.work)
+            store(work, i, found)
+            if slopes is not None:
+                both = operation in TWO_OPERANDS
+                for c in range(0, 8 * d, 8):
+                    tangent = by_first * load(slopes[1], j * d + c)
+                    if both:
+                        tangent = tangent + by_second * load(slopes[1], last * d + c)
+                    store(slopes[1], i * d + c, tangent)
 
 
 @compiled
 def linearize_tape(tape, points, values, jacobians):
     """Writes the values (K, size) at K points z (K, d), and their derivatives (K, size, d)."""
     use_widest_registers()
-    K, d = points.shape
-    sizes = 8 * np.array([d, tape.work + 5, tape.work * d, tape.size, tape.size * d])
-    memory, ends = aligned_rows(1, sizes.sum())[0], np.cumsum(sizes)
-    z, work, tangents = memory[: ends[0]], memory[ends[0] : ends[1]], memory[ends[1] : ends[2]]
-    value, derivative = memory[ends[2] : ends[3]], memory[ends[3] :]
-    memory[:] = 0.0
+    (K, d), size = points.shape, tape.size
+    z, work, value = aligned_rows(d, 8), aligned_rows(tape.work + 5, 8), aligned_rows(size, 8)
+    derivative, tangents = aligned_rows(size * d, 8), aligned_rows(tape.work * d, 8)
+    derivative[:] = 0.0
     for first in range(0, K, 8):
         for lane in range(8):
             for c in range(d):
-                z[8 * c + lane] = points[min(first + lane, K - 1), c]
-        for k in range(len(tape.code)):
-            operation, i, j, last = tape.code[k, 0], 8 * tape.code[k, 1], 8 * tape.code[k, 2], 8 * tape.code[k, 3]
-            if operation == OUTPUT:
-                store(value, i, load(work, j))
-                for c in range(0, 8 * d, 8):
-                    store(derivative, i * d + c, load(tangents, j * d + c))
-            elif operation in (INPUT, CONST):
-                store(work, i, load(z, j) if operation == INPUT else zeros() + tape.constants[k])
-                for c in range(0, 8 * d, 8):
-                    store(tangents, i * d + c, zeros() + (1.0 if operation == INPUT and c == j else 0.0))
-            else:
-                found, by_first, by_second = _operate(operation, load(work, j), load(work, last), work, 8 * tape.work)
-                store(work, i, found)
-                both = operation in TWO_OPERANDS
-                for c in range(0, 8 * d, 8):
-                    tangent = by_first * load(tangents, j * d + c)
-                    if both:
-                        tangent = tangent + by_second * load(tangents, last * d + c)
-                    store(tangents, i * d + c, tangent)
+                z[c, lane] = points[min(first + lane, K - 1), c]
+        run_tape(tape, z, work, value, (derivative.reshape(-1), tangents.reshape(-1)))
         for lane in range(min(8, K - first)):
-            for i in range(tape.size):
-                values[first + lane, i] = value[8 * i + lane]
+            for i in range(size):
+                values[first + lane, i] = value[i, lane]
                 for c in range(d):
-                    jacobians[first + lane, i, c] = derivative[8 * (i * d + c) + lane]
+                    jacobians[first + lane, i, c] = derivative[i * d + c, lane]
 
 
 @inline_njit

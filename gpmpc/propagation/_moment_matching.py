@@ -60,24 +60,21 @@ class MomentMatching(NoisyPropagator):
         (seen, control), gp, cross = composition.seen(belief, input), composition.f, composition.A is not None
         arrays = host_arrays(gp.weights, seen.mean, seen.covariance, control)
         if arrays is not None:
-            f = self._compiled(gp, seen.mean.shape[:-1], arrays[1:], cross if derivatives else None)
+            f = self._compiled(gp, seen.mean.shape[:-1], arrays[1:], derivatives)
         elif derivatives:
             f = moments_with_jacobian(gp, seen, control, self.diagonal, cross)
         else:
             f = Latent(*moments(gp, seen, control, self.diagonal))
         return self._projected(model, *composition.moments(belief, input, f)), composition, f
 
-    def _compiled(self, f: GPPosterior, batch: torch.Size, arrays: Sequence[Any], cross: bool | None = None) -> Latent:
-        """The moments of f by ``gpmpc._kernels``; ``cross`` adds derivatives, with those of J or without."""
+    def _compiled(self, f: GPPosterior, batch: torch.Size, arrays: Sequence[Any], derivatives: bool) -> Latent:
+        """The moments of f by ``gpmpc._kernels``."""
         from gpmpc import _kernels as kernels  # loads numba
 
         (mean, S, u), n, count = arrays, f.state_dim, batch.numel()
         flat = mean.reshape(count, n), S.reshape(count, n, n), u.reshape(count, f.input_dim)
-        if cross is None:
-            found = kernels.moments(f.packed, *flat, self.diagonal)
-        else:
-            found = kernels.moments_with_jacobian(f.packed, *flat, self.diagonal, cross)
-        parts: list[Any] = [p if p is None else torch.from_numpy(p.reshape(*batch, *p.shape[1:])) for p in found]
+        found = kernels.moments(f.packed, *flat, self.diagonal, derivatives)
+        parts: list[Any] = [torch.from_numpy(part.reshape(*batch, *part.shape[1:])) for part in found]
         parts[0] += f.offset
         return Latent(*parts)
 

@@ -7,9 +7,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gpmpc._dynamics import check_query, constant_arrays
+from gpmpc._dynamics import check_query
 from gpmpc.exceptions import DataError, SettingError
-from gpmpc.gaussian import Gaussian, check_tensors, nearest_positive_semidefinite
+from gpmpc.gaussian import Gaussian, check_tensors, constant_arrays, nearest_positive_semidefinite
 
 
 @dataclass(frozen=True)

@@ -17,14 +17,8 @@ def check_model(
     """Checks a model against the protocol ``gpmpc.models.DynamicsModel``.
 
     ``predict`` is called alone and in batches, twice, with arrays in awkward layouts; ``linearize`` is compared with it
-    and with its finite differences.
-
-    Args:
-        model: The object to check.
-        states: Where to evaluate it (K, n), K of 2 or more; standard normal numbers by default, so give some of yours
-            where the states are of another size.
-        inputs: Likewise (K, m).
-        seed: Of the default states and inputs.
+    and with its finite differences: at states (K, n) and inputs (K, m), K of 2 or more, by default standard normal
+    numbers of a seed, so give some of yours where they are of another size.
 
     Raises:
         AssertionError: The model breaks a promise; the message says which, and by how much.

@@ -14,30 +14,22 @@ def require_close(
     promise: str, got: Tensor, expected: Tensor, tolerance: float, what: str = "it", floor: float = 1.0
 ) -> None:
     """Raises unless two tensors differ by at most a part of the expected one's size (of ``floor`` if that is more)."""
-    shapes = tuple(got.shape), tuple(expected.shape)
-    require(shapes[0] == shapes[1], promise, f"{what} has shape {shapes[0]}, should be {shapes[1]}")
-    if not got.numel():
-        return
-    error = float((got.detach().double() - expected.detach().double()).abs().max())
-    bound = tolerance * max(floor, float(expected.detach().abs().max()))
-    text = f"{what} is off by {error:.2e} (allowed {bound:.1e}):\ngot      {_text(got)}\nexpected {_text(expected)}"
-    require(error <= bound, promise, text)  # false for NaN as well
+    got, expected = got.detach().double(), expected.detach().double()
+    require(got.shape == expected.shape, promise, f"{what} has shape {[*got.shape]}, should be {[*expected.shape]}")
+    error, size = (part.abs().amax() if part.numel() else 0.0 for part in (got - expected, expected))
+    bound = tolerance * max(floor, float(size))
+    text = f"{what} is off by {float(error):.2e} (allowed {bound:.1e}):\ngot      {got}\nexpected {expected}"
+    require(float(error) <= bound, promise, text)  # false for NaN as well
 
 
 def require_covariance(name: str, covariance: Tensor) -> None:
     """Raises unless covariances (*batch, k, k) are finite, symmetric and positive semidefinite up to round-off."""
-    finite = bool(torch.isfinite(covariance).all())
-    require(finite, f"{name}: the covariance is finite", f"it holds {_text(covariance)}")
+    require(bool(torch.isfinite(covariance).all()), f"{name}: the covariance is finite", f"it holds {covariance}")
     size = max(float(covariance.abs().max()), 1e-300) if covariance.numel() else 1.0
     round_off = torch.finfo(covariance.dtype).eps * size
     lopsided = float((covariance - covariance.mT).abs().max())
-    text = f"an entry and its mirror image differ by {lopsided:.2e}: {_text(covariance)}"
+    text = f"an entry and its mirror image differ by {lopsided:.2e}: {covariance}"
     require(lopsided <= 100 * round_off, f"{name}: the covariance is symmetric", text)
     lowest = float(torch.linalg.eigvalsh(covariance.double()).min())
     text = f"its lowest eigenvalue is {lowest:.2e}, its largest entry {size:.2e}"
     require(lowest >= -1000 * round_off, f"{name}: the covariance is positive semidefinite", text)
-
-
-def _text(tensor: Tensor) -> str:
-    tensor = tensor.detach()
-    return str(tensor.tolist()) if tensor.numel() <= 20 else f"{tensor.ravel()[:20].tolist()} and more"

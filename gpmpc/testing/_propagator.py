@@ -1,6 +1,5 @@
 """Check of a propagator of your own: ``check_propagator``."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,13 +17,6 @@ from gpmpc.testing._promise import require, require_close, require_covariance
 
 _DRAWS = 100_000  # of the Monte Carlo reference
 _STEP = 1e-5  # of the finite differences, in units of the belief
-
-_PARTS: dict[str, Callable[[Propagation], Tensor]] = {
-    "mean": lambda result: result.belief.mean,
-    "covariance": lambda result: result.belief.covariance,
-    "cross covariance": lambda result: result.cross_covariance,
-    "deficit": lambda result: result.deficit,
-}
 
 
 @dataclass(frozen=True)
@@ -126,18 +118,35 @@ def _linear_model() -> ResidualModel:
     return ResidualModel(nominal, gp, torch.eye(2, dtype=torch.float64), [0, 1], [0], 1)
 
 
+def _parts(result: Propagation) -> dict[str, Tensor]:
+    return {
+        "mean": result.belief.mean,
+        "covariance": result.belief.covariance,
+        "cross covariance": result.cross_covariance,
+        "deficit": result.deficit,
+    }
+
+
+def _check_parts(
+    promise: str, got: dict[str, Tensor], expected: dict[str, Tensor], tolerance: float, **at: Any
+) -> None:
+    """Raises unless the parts that are expected are close."""
+    for name, value in expected.items():
+        require_close(promise, got[name], value, tolerance, f"the {name}", **at)
+
+
 def _check_result(case: _Case) -> None:
     at, n, k = case.belief, case.model.state_dim, case.model.output_dim
     before = at.mean.clone(), at.covariance.clone(), case.input.clone()
     result = case()
-    after = at.mean, at.covariance, case.input
-    for name, old, new in zip(("mean", "covariance", "input"), before, after, strict=True):
+    for name, old, new in zip(
+        ("mean", "covariance", "input"), before, (at.mean, at.covariance, case.input), strict=True
+    ):
         require(torch.equal(old, new), f"the caller's {name} is left as it is", f"{old.tolist()} became {new.tolist()}")
     shapes = {"mean": (k,), "covariance": (k, k), "cross covariance": (n, k), "deficit": ()}
-    for name, shape in shapes.items():
-        value = _PARTS[name](result)
-        require(tuple(value.shape) == shape, f"{name} has shape {shape} for one belief", f"got {tuple(value.shape)}")
-        require(value.dtype == at.mean.dtype, f"{name} has the belief's type, {at.mean.dtype}", f"got {value.dtype}")
+    for name, value in _parts(result).items():
+        right, got = tuple(value.shape) == shapes[name] and value.dtype == at.mean.dtype, f"{tuple(value.shape)}"
+        require(right, f"{name} has shape {shapes[name]} for one belief, and its type", f"got {got}, {value.dtype}")
         require(bool(torch.isfinite(value).all()), f"{name} is finite", f"got {value.tolist()}")
     require_covariance("propagate", result.belief.covariance)
     require(float(result.deficit) >= 0, "deficit is not negative", f"got {float(result.deficit)}")
@@ -152,40 +161,34 @@ def _check_result(case: _Case) -> None:
 
 def _check_without_covariance(case: _Case) -> None:
     at, plain = case.belief, case.model.predict(case.belief.mean, case.input)
-    expected = case.comparable(plain.covariance)
-    certain = case(Gaussian(at.mean, torch.zeros_like(at.covariance)))
-    promise, zero = "without covariance it is the plain prediction", torch.zeros_like(certain.cross_covariance)
-    require_close(promise, certain.belief.mean, plain.mean, 1e-8, "the mean")
-    require_close(promise, certain.belief.covariance, expected, 1e-8, "the covariance")
-    require_close("a certain state correlates with nothing", certain.cross_covariance, zero, 1e-10)
+    expected = {"mean": plain.mean, "covariance": case.comparable(plain.covariance)}
 
-    def gap(scale: float) -> list[float]:
-        belief = case(Gaussian(at.mean, scale * at.covariance)).belief
-        return [float((belief.mean - plain.mean).abs().max()), float((belief.covariance - expected).abs().max())]
+    def result(scale: float) -> dict[str, Tensor]:
+        return _parts(case(Gaussian(at.mean, scale * at.covariance)))
 
-    # A draw's error falls as the root of the covariance's scale, and so slower.
-    rate = 5e-2 if case.samples else 1e-3
-    for name, wide, narrow in zip(("mean", "covariance"), gap(1e-2), gap(1e-6), strict=True):
+    certain, wide, narrow = result(0.0), result(1e-2), result(1e-6)
+    _check_parts("without covariance it is the plain prediction", certain, expected, 1e-8)
+    zero = torch.zeros_like(certain["cross covariance"])
+    require_close("a certain state correlates with nothing", certain["cross covariance"], zero, 1e-10)
+    rate = 5e-2 if case.samples else 1e-3  # a draw's error falls as the root of the covariance's scale, and so slower
+    for name, value in expected.items():
+        far, near = (float((found[name] - value).abs().max()) for found in (wide, narrow))
         promise = f"the {name} approaches the plain prediction as the covariance vanishes"
-        text = f"with the covariance times 1e-2 it is {wide:.2e} away, times 1e-6 still {narrow:.2e}"
-        require(narrow <= rate * wide + 1e-9, promise, text)
+        text = f"with the covariance times 1e-2 it is {far:.2e} away, times 1e-6 still {near:.2e}"
+        require(near <= rate * far + 1e-9, promise, text)
 
 
 def _check_batch(case: _Case) -> None:
     at = case.belief
     shifts = torch.linspace(-0.5, 0.5, 4, dtype=at.mean.dtype, device=at.mean.device)
     parts = at.mean + shifts[:, None], at.covariance * (1 + shifts)[:, None, None], case.input + shifts[:, None]
-    batched = {
-        "a batch is the loop over its members": parts,
-        "two batch dimensions are the loop over their members": [part.unflatten(0, (2, 2)) for part in parts],
-    }
-    for promise, (means, covariances, inputs) in batched.items():
-        together = case(Gaussian(means, covariances), inputs)
-        for j, (mean, covariance, input) in enumerate(zip(*parts, strict=True)):
-            alone = case(Gaussian(mean, covariance), input)
-            for name, take in _PARTS.items():
-                got, floor = take(together).flatten(0, means.dim() - 2)[j], 1.0 if name == "mean" else 1e-4
-                require_close(promise, got, take(alone), 1e-9, f"the {name} of member {j}", floor)
+    alone = [_parts(case(Gaussian(mean, S), input)) for mean, S, input in zip(*parts, strict=True)]
+    for batch in ((4,), (2, 2)):
+        means, covariances, inputs = (part.unflatten(0, batch) for part in parts)
+        for name, got in _parts(case(Gaussian(means, covariances), inputs)).items():
+            expected, floor = torch.stack([each[name] for each in alone]).unflatten(0, batch), 1e-4
+            promise = f"a batch is the loop over its members, here of shape {batch}"
+            require_close(promise, got, expected, 1e-9, f"the {name}", 1.0 if name == "mean" else floor)
 
 
 def _check_single_precision(case: _Case) -> None:
@@ -193,34 +196,34 @@ def _check_single_precision(case: _Case) -> None:
         return
     model, at = case.model.to(dtype=torch.float32), case.belief
     belief = Gaussian(at.mean.float(), at.covariance.float())
-    single, double = case.propagator.propagate(model, belief, case.input.float()), case()
-    for name, take in _PARTS.items():
-        got = take(single)
+    single = _parts(case.propagator.propagate(model, belief, case.input.float()))
+    for name, got in single.items():
         require(got.dtype == torch.float32, f"a float32 model and belief give a float32 {name}", f"got {got.dtype}")
-        require_close("float32 agrees with float64 to two digits", got, take(double), 1e-2, f"the {name}", floor=0.1)
+    _check_parts("float32 agrees with float64 to two digits", single, _parts(case()), 1e-2, floor=0.1)
 
 
 def _check_monte_carlo(case: _Case) -> None:
     """The claimed moments against the sample means that they are, in standard errors."""
-    at, result = case.belief, case()
+    at, claimed = case.belief, _parts(case())
     generator = torch.Generator().manual_seed(1)
     normal = torch.randn(_DRAWS, at.dim, generator=generator, dtype=torch.float64).to(at.mean)
     steps = normal @ square_root(at.covariance)
     moved = [case.model.predict(at.mean + part, case.input.expand(len(part), -1)) for part in steps.split(10_000)]
-    centred = torch.cat([each.mean for each in moved]) - result.belief.mean
+    means = torch.cat([each.mean for each in moved])
+    centred = means - claimed["mean"]
     products = centred[:, :, None] * centred[:, None, :] + torch.cat([each.covariance for each in moved])
-    claimed = {
-        "mean": (torch.zeros_like(result.belief.mean), centred),
-        "covariance": (result.belief.covariance, case.comparable(products)),
-        "cross covariance": (result.cross_covariance, steps[:, :, None] * centred[:, None, :]),
+    drawn = {
+        "mean": means,
+        "covariance": case.comparable(products),
+        "cross covariance": steps[:, :, None] * centred[:, None, :],
     }
     own = 1 + _DRAWS / case.samples if case.samples else 1.0
-    for name, (claim, draws) in claimed.items():
+    for name, draws in drawn.items():
         error = (draws.std(0) ** 2 * own / _DRAWS).sqrt()
-        off = (draws.mean(0) - claim).abs()
+        off = (draws.mean(0) - claimed[name]).abs()
         worst = float((off / (error + 1e-9 * draws.abs().max() + 1e-300)).max())
         promise = f"an exact method's {name} agrees with {_DRAWS} draws of Monte Carlo"
-        text = f"it is {worst:.1f} standard errors away:\n{claim.tolist()} is off by {off.tolist()}"
+        text = f"it is {worst:.1f} standard errors away:\n{claimed[name].tolist()} is off by {off.tolist()}"
         require(worst < 5, promise, text)
 
 
@@ -239,14 +242,9 @@ def _check_linear(case: _Case) -> None:
     except UnsupportedModel:
         return  # a method may take other models only
     S, A = case.belief.covariance, case.model.nominal.A
-    expected = {
-        "mean": case.model.nominal(case.belief.mean, case.input),
-        "covariance": case.comparable(A @ S @ A.mT),
-        "cross covariance": S @ A.mT,
-    }
-    for name, value in expected.items():
-        got, tolerance = _PARTS[name](result), 1e-8 + case.sampling_error
-        require_close("on a linear model it is exact", got, value, tolerance, f"the {name}", floor=0.1)
+    mean, covariance = case.model.nominal(case.belief.mean, case.input), case.comparable(A @ S @ A.mT)
+    expected = {"mean": mean, "covariance": covariance, "cross covariance": S @ A.mT}
+    _check_parts("on a linear model it is exact", _parts(result), expected, 1e-8 + case.sampling_error, floor=0.1)
 
 
 def _check_derivatives(case: _Case) -> None:
@@ -254,20 +252,14 @@ def _check_derivatives(case: _Case) -> None:
     at, u = case.belief, case.input
     moved, d = differentiate(case.propagator, case.model, at, u)
     require_close("differentiate: the belief is propagate's", moved.belief.mean, case().belief.mean, 1e-9, "the mean")
-    generator = torch.Generator().manual_seed(2)
-    for by, shape in 2 * [("mean", at.mean.shape), ("covariance", at.covariance.shape), ("input", u.shape)]:
-        direction = torch.randn(shape, generator=generator, dtype=torch.float64).to(at.mean)
+    generator, start = torch.Generator().manual_seed(2), {"mean": at.mean, "covariance": at.covariance, "input": u}
+    for by, value in 2 * list(start.items()):
+        direction = torch.randn(value.shape, generator=generator, dtype=torch.float64).to(at.mean)
         if by == "covariance":
             direction = (direction + direction.mT) / 2
-
-        def shifted(size: float, by: str = by, direction: Tensor = direction) -> Gaussian:
-            start = {"mean": at.mean, "covariance": at.covariance, "input": u}
-            start[by] = start[by] + size * direction
-            return case(Gaussian(start["mean"], start["covariance"]), start["input"]).belief
-
-        above, below = shifted(_STEP), shifted(-_STEP)
+        shifted = (start | {by: value + size * direction} for size in (_STEP, -_STEP))
+        above, below = (_parts(case(Gaussian(s["mean"], s["covariance"]), s["input"])) for s in shifted)
         for of in ("mean", "covariance"):
-            derivative = getattr(d, f"{of}_by_{by}")
-            along = (derivative * direction).sum(tuple(range(-direction.dim(), 0)))
-            numeric = (getattr(above, of) - getattr(below, of)) / (2 * _STEP)
+            along = (getattr(d, f"{of}_by_{by}") * direction).sum(tuple(range(-direction.dim(), 0)))
+            numeric = (above[of] - below[of]) / (2 * _STEP)
             require_close(f"differentiate: {of}_by_{by} agrees with finite differences", along, numeric, 1e-5)

@@ -26,11 +26,8 @@ def check_qp_solver(solver: QPSolver, tolerance: float = 1e-6) -> None:
     """Checks a solver against the protocol ``gpmpc.qp.QPSolver``.
 
     It solves problems whose minimisers and multipliers are known and problems without a solution, from warm starts that
-    are right, wrong and absurd, and from arrays in awkward layouts.
-
-    Args:
-        solver: The object to check.
-        tolerance: Largest error in x, multipliers (relative to their size) and scaled residuals.
+    are right, wrong and absurd, and from arrays in awkward layouts. ``tolerance`` is the largest error in x and
+    multipliers (relative to their size) and in scaled residuals.
 
     Raises:
         AssertionError: The solver breaks a promise; the message says which, on which problem.
@@ -139,9 +136,7 @@ def _awkward(problem: QuadraticProgram) -> QuadraticProgram:
     """Copies a problem into every other element of larger arrays, P into Fortran order."""
 
     def strided(array: np.ndarray) -> np.ndarray:
-        if array.ndim == 1:
-            return np.repeat(array, 2)[::2]
-        return np.repeat(np.repeat(array, 2, axis=0), 2, axis=1)[::2, ::2]
+        return np.repeat(array, 2, axis=-1)[..., ::2]
 
     return QuadraticProgram(np.asfortranarray(problem.P), *(strided(getattr(problem, field)) for field in _FIELDS[1:]))
 

@@ -141,7 +141,7 @@ def squeezed(model, belief, input):
         (five_per_cent_too_sure, {}, "on a linear model it is exact; the covariance is off by"),
         (noise_that_nobody_asked_for, {}, "without covariance it is the plain prediction; the covariance is off by"),
         (standard_deviations_for_variances, {}, "the mean approaches the plain prediction as the covariance vanishes"),
-        (one_covariance_for_the_batch, {}, "a batch is the loop over its members; the .* of member"),
+        (one_covariance_for_the_batch, {}, "a batch is the loop over its members, here of shape .*; the .* is off by"),
         (a_triangle, {}, "the covariance is symmetric"),
         (indefinite, {}, "the covariance is positive semidefinite"),
         (scribbles, {}, "the caller's covariance is left as it is"),
@@ -151,7 +151,7 @@ def squeezed(model, belief, input):
         (forgets_the_correlation, {"exact": True}, "cross covariance agrees with .* Monte Carlo"),
         (slightly_tilted, {"exact": True}, "mean agrees with .* Monte Carlo"),
         (slightly_tilted, {}, "on a linear model it is exact; the mean is off by"),
-        (squeezed, {}, r"deficit has shape \(\) for one belief; got \(1,\)"),
+        (squeezed, {}, r"deficit has shape \(\) for one belief, and its type; got \(1,\)"),
     ],
 )
 def test_each_broken_promise_is_found_and_named(flaw, claims, message):
