@@ -28,7 +28,7 @@ from torch import Tensor
 from gpmpc._kernels._window import drop_point
 from gpmpc.exceptions import DataError, SettingError, ShapeError, UnsupportedModel, check_choice, check_number
 from gpmpc.gaussian import check_tensors
-from gpmpc.gp._kernel import check_positive_definite, kernel_matrix
+from gpmpc.gp._kernel import check_positive_definite, check_posterior, kernel_matrix
 from gpmpc.gp._posterior import GPPosterior
 from gpmpc.gp._transitions import Transitions, check_transitions
 
@@ -50,7 +50,12 @@ def append_transitions(posterior: GPPosterior, transitions: Transitions) -> GPPo
 
 def append_points(posterior: GPPosterior, features: Tensor, targets: Tensor) -> GPPosterior:
     """Appends points x~ = (x, u) (p, n + m) with targets (p, k) to a posterior's data, in O(N^2) a point."""
-    features, targets = _checked_points(posterior, features, targets)
+    check_tensors(features=features, targets=targets)
+    features, targets = features.to(posterior.features), targets.to(posterior.features)
+    given = {"features": features, "targets": targets}
+    check_posterior(given, posterior.input_dim, posterior.predicts, posterior.dtype)
+    if (got := (features.shape[1], targets.shape[1])) != (posterior.features.shape[1], posterior.output_dim):
+        raise ShapeError(f"points must have features and targets like those of {posterior}; got {got[0]} and {got[1]}")
     size, p = len(posterior), len(features)
     scales, sf2 = posterior.lengthscales, posterior.signal_variance
     old_targets = (posterior.targets - posterior.offset).mT[..., None]  # (k, N, 1)
@@ -138,17 +143,14 @@ class SlidingWindow:
 
     def append(self, posterior: GPPosterior, features: Tensor, targets: Tensor) -> GPPosterior:
         """The posterior with points x~ (p, n + m) and their targets (p, k), held to ``points`` points."""
-        larger = append_points(posterior, features, targets)
-        excess, removable = len(larger) - self.points, len(posterior)
-        if excess <= 0:
-            return larger
+        larger, removable = append_points(posterior, features, targets), len(posterior)
         if len(features) > self.points:
             _log.warning("%d new points exceed the window of %d: some are removed too", len(features), self.points)
-            larger, excess = remove_points(larger, range(len(posterior))), len(features) - self.points
-            removable = len(larger)
-        if self.remove == "oldest":
-            return remove_points(larger, range(excess))
-        return remove_points(larger, least_informative(larger, excess, removable))
+            larger, removable = remove_points(larger, range(removable)), len(features)
+        if (excess := len(larger) - self.points) <= 0:
+            return larger
+        oldest = self.remove == "oldest"
+        return remove_points(larger, range(excess) if oldest else least_informative(larger, excess, removable))
 
 
 def least_informative(posterior: GPPosterior, count: int, candidates: int | None = None) -> list[int]:
@@ -185,29 +187,12 @@ def _noise_variances(posterior: GPPosterior) -> Tensor:
     return diagonal.clamp_min(torch.finfo(posterior.dtype).eps)
 
 
-def _checked_points(posterior: GPPosterior, features: Tensor, targets: Tensor) -> tuple[Tensor, Tensor]:
-    """New points (p, d) and their targets (p, k) in a posterior's type and on its device, after a look at them."""
-    check_tensors(features=features, targets=targets)
-    if features.dim() != 2 or targets.dim() != 2 or len(features) != len(targets) or not len(features):
-        raise ShapeError(
-            "features (p, d) and targets (p, k) need two dimensions and the same number of rows, one or more; "
-            f"got {tuple(features.shape)} and {tuple(targets.shape)}"
-        )
-    for name, value, own in (("features", features, posterior.features), ("targets", targets, posterior.targets)):
-        if value.shape[1] != own.shape[1]:
-            raise ShapeError(f"{name} must have {own.shape[1]} columns like the posterior's; got {value.shape[1]}")
-        if not bool(torch.isfinite(value).all()):
-            raise DataError(f"{name} must be finite; got {value[~torch.isfinite(value)][0]}")
-    return features.to(posterior.features), targets.to(posterior.features)
-
-
 def _indices(indices: Sequence[int] | Tensor, size: int) -> list[int]:
     """Different indices from 0 to size - 1 in ascending order; negative ones count from the end, as everywhere."""
-    given = indices.tolist() if isinstance(indices, Tensor | np.ndarray) else indices
-    given = [given] if isinstance(given, int) else list(given)
-    if any(isinstance(i, bool) or not isinstance(i, int | np.integer) or not -size <= i < size for i in given):
+    given = np.atleast_1d(np.asarray(indices)).tolist()
+    if any(isinstance(i, bool) or not isinstance(i, int) or not -size <= i < size for i in given):
         raise SettingError("indices", f"must be whole numbers from {-size} to {size - 1}; got {given}")
-    found = sorted({int(i) % size for i in given})
+    found = sorted({i % size for i in given})
     if len(found) != len(given):
         raise SettingError("indices", f"must be different; got {given}")
     return found

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from gpmpc._files import existing_file, new_file, write_whole
 from gpmpc.exceptions import DataError, GpmpcError, SettingError, ShapeError, UnsupportedModel, check_number
-from gpmpc.gp._archive import read_npz, write_npz
+from gpmpc.gp._storage import read_npz, write_npz
 
 _NAMES = ("states", "inputs", "next_states")
 _EXPECTED = "a file of transitions"
