@@ -31,8 +31,7 @@ def kernel_matrix(points: Tensor, others: Tensor, lengthscales: Tensor, signal_v
 def centred(points: Any) -> Any:
     """Points (N, d), NumPy's or torch's, moved to mean zero: elsewhere distances from a matrix product cancel.
 
-    A stationary kernel does not depend on it. The first point is subtracted first, which is exact between near numbers:
-    so a shift of all points changes no bit of the result.
+    The first point is subtracted first, which is exact between near numbers: a shift of all points changes no bit.
     """
     away = points - points[0]
     return away - away.mean(0)

@@ -1,19 +1,18 @@
-r"""Points that come and go while a controller runs, without factorising K + sn2 I anew, which is cubic in them.
+r"""Points that come and go while a controller runs, in O(N^2) each: K + sn2 I is not factorised anew.
 
 Adding points extends the Cholesky factor by rows, L21' = L^-1 K(X, X*), L22 L22' = K(X*, X*) + sn2 I - L21 L21';
-removing one changes only the block below it (``gpmpc._kernels._window``): both O(N^2) a point. The weights are solved
-for from the factor each time, two triangular systems, so that no error is carried along with them.
+removing one changes only the block below it (``gpmpc._kernels._window``). The weights are solved for from the factor
+each time, so that no error is carried along with them.
 
 The least informative point is the one whose removal changes the posterior over functions least, in Kullback-Leibler
 divergence. With and without y_i the two posteriors differ by one factor of the likelihood, which depends on f(x~_i)
-alone; so their divergence is that of two one-dimensional Gaussians, and the leave-one-out formulas (Rasmussen and
-Williams, 2006, eq. (5.12)) give it from P = (K + sn2 I)^-1 and beta = P (y - offset):
+alone; so the leave-one-out formulas (Rasmussen and Williams, 2006, eq. (5.12)) give their divergence from
+P = (K + sn2 I)^-1 and beta = P (y - offset):
 
     KL_i = 1/2 sum_a [ e_ai - 1 - log e_ai + beta_ai^2 (1 / P_aii - sn2_a) ],     e_ai = sn2_a P_aii
 
-(e is the variance of f(x~_i) with y_i over that without.) Csato and Opper (2002, section 3.3) score |beta_i| / P_ii
-instead, the change of the mean, for one output; this score counts the variance too and adds up over outputs of any
-unit. Of the pseudo-observations of a sparse model, whose noise is correlated, only the variances are counted.
+(e is the variance of f(x~_i) with y_i over that without.) Of the pseudo-observations of a sparse model, whose noise is
+correlated, only the variances are counted.
 """
 
 import logging
@@ -37,7 +36,7 @@ _MANY = 0.2  # where more than this part of the points is removed, one factorisa
 
 
 def append_transitions(posterior: GPPosterior, transitions: Transitions) -> GPPosterior:
-    """Appends transitions to a posterior's data, in O(N^2) a point; the hyperparameters stay (``Trainer.refit``).
+    """Appends transitions to a posterior's data; the hyperparameters stay (``Trainer.refit`` trains them).
 
     Raises:
         ShapeError: The transitions have other dimensions.
@@ -49,7 +48,7 @@ def append_transitions(posterior: GPPosterior, transitions: Transitions) -> GPPo
 
 
 def append_points(posterior: GPPosterior, features: Tensor, targets: Tensor) -> GPPosterior:
-    """Appends points x~ = (x, u) (p, n + m) with targets (p, k) to a posterior's data, in O(N^2) a point."""
+    """Appends points x~ = (x, u) (p, n + m) with targets (p, k) to a posterior's data."""
     check_tensors(features=features, targets=targets)
     features, targets = features.to(posterior.features), targets.to(posterior.features)
     given = {"features": features, "targets": targets}
@@ -78,7 +77,7 @@ def append_points(posterior: GPPosterior, features: Tensor, targets: Tensor) -> 
 
 
 def remove_points(posterior: GPPosterior, indices: Sequence[int] | Tensor) -> GPPosterior:
-    """Removes points (rows of ``features``) from a posterior's data, in O(N^2) a point.
+    """Removes points (rows of ``features``) from a posterior's data.
 
     Raises:
         SettingError: An index is out of range or stands there twice.
@@ -174,6 +173,7 @@ def least_informative(posterior: GPPosterior, count: int, candidates: int | None
 
 
 def _divergence(P: Tensor, beta: Tensor, noise: Tensor) -> Tensor:
+    """KL_i (N,) from the diagonals of P, beta and the noise variances (k, N)."""
     e = (noise * P).clamp(max=1.0)
     return (e - 1 - e.log() + beta**2 * (1 - e) / P).sum(0) / 2
 

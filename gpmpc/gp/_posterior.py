@@ -4,9 +4,8 @@ One GP per output with the squared exponential kernel with automatic relevance d
 
     k_a(x~, x~') = sf2_a exp(-1/2 sum_d (x~_d - x~'_d)^2 / l_ad^2),   x~ = (x, u)
 
-Rasmussen and Williams (2006), eqs. (2.25)-(2.26), Algorithm 2.1; the GP model of Cao, Lai and Alam (2017). An affine
-scaling of the data is only another parametrisation of such a GP (length-scales in the units of the inputs, standard
-deviations in those of the output, and a constant prior mean), so a posterior is in physical units.
+Rasmussen and Williams (2006), eqs. (2.25)-(2.26), Algorithm 2.1; the GP model of Cao, Lai and Alam (2017). A posterior
+is in physical units: an affine scaling of the data is only another parametrisation of such a GP.
 """
 
 from dataclasses import dataclass, fields, replace

@@ -1,11 +1,10 @@
 """The search for one output's hyperparameters by maximum marginal likelihood, which has many local optima.
 
 They differ by a factor of a hundred in prediction error. So the search explores a few iterations of L-BFGS (Byrd, Lu,
-Nocedal and Zhu, 1995; scipy's L-BFGS-B) from the paper's starting point and from random ones, and goes on to
-convergence from the best two. (Measured on the paper's data: a single start without exploration reached the best known
-optimum for about 75 % of the outputs; four starts and two finalists for about 98 %, at two and a half times the
-evaluations.) Of many points a random subset is searched first; one more search goes on from what it found over all of
-them, with some twenty evaluations of O(N^3) instead of some hundred and fifty.
+Nocedal and Zhu, 1995) from the paper's starting point and from random ones, and goes on to convergence from the best
+two. (On the paper's data a single start reached the best known optimum for about 75 % of the outputs; four starts and
+two finalists for about 98 %, at two and a half times the evaluations.) Of many points a random subset is searched
+first; one more search goes on from what it found over all of them.
 
 theta = (log length-scales, log sf, log(sf / sn)), in a wide box around the data's standard deviations.
 """

@@ -6,9 +6,8 @@ With inducing points Z, Kzz = Lz Lz' and the correlations Kzx with the data, the
     mean = k' beta,   variance = sf2 - k' C k,       k = k(Z, x~)
     C    = Kzz^-1 - (Kzz + Kzx Lam^-1 Kxz)^-1,       Lam = sn2 I  (SGPR)   or   diag(Kxx - Qxx) + sn2 I  (FITC)
 
-which is an exact GP on M pseudo-observations with correlated noise, K + R = C^-1. So it is frozen to a ``GPPosterior``
-on Z, and all that works with one (moment matching, appending, removing) works at the cost of M points. With
-A = Lz^-1 Kzx Lam^-1/2 and A A' = U diag(b) U',
+which is an exact GP on M pseudo-observations with correlated noise, K + R = C^-1, and frozen to a ``GPPosterior`` on
+Z. With A = Lz^-1 Kzx Lam^-1/2 and A A' = U diag(b) U',
 
     C = Lz^-T U diag(b / (1 + b)) U' Lz^-1,   beta = Lz^-T U diag(1 / (1 + b)) U' A Lam^-1/2 (y - offset)
     cholesky of C^-1:  R', where Q R = diag(sqrt((1 + b) / b)) U' Lz'    (never squared: C^-1 is huge where b is small)
@@ -18,9 +17,8 @@ The collapsed bound of Titsias (2009, eq. (9)), for FITC without its last term, 
     log N(y | 0, Q + Lam) - tr(Kxx - Qxx) / (2 sn2),     Q = A~' A~,  A~ = Lz^-1 Kzx
 
 It depends on the data through sums over the points alone: with r = Lam^-1/2 y they are A A', A r, r'r and log|Lam|. So
-the points come in blocks that fit the cache, output after output, each computed once more for the derivatives
-(automatic differentiation with checkpoints, Griewank and Walther, 2008, chapter 12): memory stays that of a block, for
-any N. A jitter on Kzz makes u = f(Z) + noise; the bound stays one.
+the points come in blocks that fit the cache, each computed once more for the derivatives (checkpoints: Griewank and
+Walther, 2008, chapter 12): memory stays that of a block, for any N.
 """
 
 import math
@@ -115,10 +113,8 @@ def collapsed_bound(
 ) -> Tensor:
     """The bound on the log marginal likelihood (SGPR), or FITC's own log marginal likelihood, of every output (k,).
 
-    Arguments are as for ``sparse_posterior``; ``backward`` differentiates it by inducing points and hyperparameters.
-
-    Raises:
-        SettingError: Kzz is not positive definite, or the method is unknown.
+    Arguments and errors are as for ``sparse_posterior``; ``backward`` differentiates it by inducing points and
+    hyperparameters.
     """
     check_choice("method", method, get_args(Method))
     bounds = []
@@ -131,10 +127,7 @@ def collapsed_bound(
 
 
 def data_sums(Lz: Tensor, Z: Tensor, x: Tensor, y: Tensor, kernel: Hyperparameters, method: Method) -> _Sums:
-    """The sums over all points, of every output, in blocks.
-
-    tr(A A') is, in units of the noise, the variance of the data that the inducing points explain.
-    """
+    """The sums over all points, of every output, in blocks."""
     step, outputs = max(_ENTRIES // len(Z), 64), []
     for a in range(y.shape[1]):
         total: Any = 0.0, 0.0, 0.0, 0.0

@@ -2,9 +2,8 @@
 
 The hyperparameters start where exact training on a random subset ends; the inducing points start greedily, each where
 the outputs' conditional variances given those before it, in units of their noise, add up to the most (Burt, Rasmussen
-and van der Wilk, 2020, section 4: this is the step that closes most of the bound's gap tr(Kxx - Qxx) / sn2). What they
-leave unexplained, on average, is added to the noise. Then L-BFGS maximises the collapsed bound over all of it. One
-evaluation costs O(N M^2) an output.
+and van der Wilk, 2020, section 4). What they leave unexplained, on average, is added to the noise. Then L-BFGS
+maximises the collapsed bound over all of it, in O(N M^2) an output and evaluation.
 """
 
 import logging
@@ -30,14 +29,13 @@ from gpmpc.gp._transitions import Transitions, check_transitions
 
 _log = logging.getLogger(__name__)
 _EVERY = 10  # iterations between two lines of the log
+_TOLERANCE = 1e-7  # relative decrease of the objective at which L-BFGS stops
+_SIGNAL_TO_NOISE = 1e4  # the box holds sf / sn within this factor of one, as that of ``Trainer``
 
 
 @dataclass(frozen=True)
 class SparseTrainer:
-    """Fits one sparse SE-ARD GP per output, over inducing points that all share.
-
-    Six outputs of nine features, 5000 transitions and 100 inducing points take 0.3 s an iteration on one
-    core; progress is logged.
+    """Fits one sparse SE-ARD GP per output, over inducing points that all share; progress is logged.
 
     Raises:
         SettingError: A setting is out of range.
@@ -53,15 +51,11 @@ class SparseTrainer:
     iterations: int = 100  #: of L-BFGS, at most
     subset: int = 200  #: number of random transitions in the first, exact, training
     restarts: int = 1  #: random starts of that one
-    tolerance: float = 1e-7  #: relative decrease of the objective at which L-BFGS stops
-    signal_to_noise_limit: float = 1e4  #: the box holds sf / sn within this factor of one
-    jitter: float = JITTER  #: added to the diagonal of Kzz, in units of sf2
 
     def __post_init__(self) -> None:
         for key in ("inducing", "subset"):
             check_number(key, getattr(self, key), least=1, whole=True)
         check_number("iterations", self.iterations, least=0, whole=True)
-        check_number("jitter", self.jitter, least=0)
         check_choice("method", self.method, get_args(Method))
         replace(self._exact(), scaling=self.scaling)  # which checks the others
 
@@ -99,11 +93,11 @@ class SparseTrainer:
         initial = bound.values()
         bound.maximize()
         if failed := np.flatnonzero(~np.isfinite(objective := bound.values())).tolist():
-            raise TrainingError(failed, "the inducing points' kernel matrix is not positive definite: raise jitter")
+            raise TrainingError(failed, "the inducing points' kernel matrix is not positive definite: take fewer")
         self._check_learned(_noise_alone(y) - objective, _noise_alone(y[chosen]) - exact.objective, x.shape[1] + 2)
         theta, Z = bound.parts(torch.from_numpy(bound.best))
         kernel = Hyperparameters.from_theta(theta)
-        scaled = sparse_posterior(Z, x, y, kernel, input_dim, predicts, method=self.method, jitter=self.jitter)
+        scaled = sparse_posterior(Z, x, y, kernel, input_dim, predicts, self.method, JITTER)
         posterior = scaled.unscaled(feature_scaling, target_scaling)
         theta = restored_theta(theta.numpy(), feature_scaling, target_scaling)
         return Training(posterior, theta, objective, initial[:, None], bound.evaluations, time.perf_counter() - begin)
@@ -118,7 +112,7 @@ class SparseTrainer:
         kernel = Hyperparameters.from_theta(torch.from_numpy(theta))
         _, sf2, sn2 = kernel
         with torch.no_grad():
-            sums = data_sums(inducing_factor(Z, kernel, self.jitter), Z, x, y, kernel, self.method)
+            sums = data_sums(inducing_factor(Z, kernel, JITTER), Z, x, y, kernel, self.method)
         explained = sums.gram.diagonal(dim1=-2, dim2=-1).sum(-1)
         sn2 = sn2 + (sf2 - explained * sn2 / len(x)).clamp_min(0)
         return np.column_stack([theta[:, :-1], (sf2 / sn2).log().numpy() / 2])
@@ -145,8 +139,7 @@ class SparseTrainer:
             predicts=self.predicts,
             scaling=identity,
             restarts=self.restarts,
-            tolerance=self.tolerance,
-            signal_to_noise_limit=self.signal_to_noise_limit,
+            tolerance=_TOLERANCE,
         )
 
 
@@ -193,9 +186,7 @@ class _Bound:
     def maximize(self) -> None:
         """Searches by L-BFGS in a box around the data that holds the start."""
         log_inputs, trainer = self._unit.log().numpy(), self._trainer
-        boxes = [
-            search_box(log_inputs, own, trainer.signal_to_noise_limit) for own in np.log(column_std(self._y.numpy()))
-        ]
+        boxes = [search_box(log_inputs, own, _SIGNAL_TO_NOISE) for own in np.log(column_std(self._y.numpy()))]
         smallest, largest = ((edge / self._unit).numpy() for edge in (self._x.amin(0), self._x.amax(0)))
         margin, count = 0.1 * (largest - smallest), (len(self.best) - self._shape[0] * self._shape[1]) // len(smallest)
         lower, upper = (np.concatenate(side) for side in zip(*boxes, strict=True))
@@ -211,7 +202,7 @@ class _Bound:
                 method="L-BFGS-B",
                 bounds=np.column_stack([lower, upper]),
                 callback=self._report,
-                options={"ftol": trainer.tolerance, "gtol": 1e-6, **limits},
+                options={"ftol": _TOLERANCE, "gtol": 1e-6, **limits},
             )
 
     def parts(self, vector: Tensor) -> tuple[Tensor, Tensor]:
@@ -249,6 +240,6 @@ class _Bound:
         theta, Z = self.parts(vector)
         try:
             kernel = Hyperparameters.from_theta(theta)
-            return -collapsed_bound(Z, self._x, self._y, kernel, self._trainer.method, self._trainer.jitter)
+            return -collapsed_bound(Z, self._x, self._y, kernel, self._trainer.method, JITTER)
         except (SettingError, torch.linalg.LinAlgError):  # pyright: ignore[reportPrivateImportUsage]
             return torch.full(self._shape[:1], torch.inf, dtype=torch.float64)

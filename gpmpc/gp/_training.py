@@ -1,8 +1,6 @@
 """Training of one exact GP per output by maximum marginal likelihood (Cao, Lai and Alam, 2017, eq. (9)).
 
-Each output is fitted on its own, over theta = (log length-scales, log sf, log(sf / sn)) inside a wide box; see
-``gpmpc.gp._search``. Exact GPs are cubic in time and square in memory over the points: one factor of 200 MB an output
-at N = 5000. What cannot fit is refused before the work.
+Each output is fitted on its own; see ``gpmpc.gp._search``. What cannot fit the memory is refused before the work.
 """
 
 import time
@@ -168,10 +166,8 @@ class Trainer:
         converged = start is not None and not self.restarts  # a subset could not improve on where the search begins
         if self.subset is not None and size > self.subset and not converged:
             rows = np.sort(rng.permutation(size)[: self.subset])
-        std, constant = (
-            column_std(features.numpy()) / feature_scaling.factor.numpy(),
-            constant_columns(features.numpy()),
-        )
+        std, constant = column_std(features.numpy()), constant_columns(features.numpy())
+        std = std / feature_scaling.factor.numpy()
         found, evaluations = [], 0
         for a in range(outputs):
             deadline = np.inf if self.time_limit is None else begin + self.time_limit * (a + 1) / outputs

@@ -207,7 +207,6 @@ def test_fewer_points_than_inducing_points_are_all_taken():
     [
         ({"inducing": 0}, "inducing: must be a whole number, 1 or more; got 0"),
         ({"method": "dtc"}, "'sgpr', 'fitc'; got 'dtc'"),
-        ({"jitter": -1.0}, "jitter: must be a number, 0 or more; got -1.0"),
         ({"predicts": "delta"}, "'next_state', 'difference', 'value'; got 'delta'"),
         ({"scaling": "standardize"}, "scaling: must be a function such as standardize"),
         ({"iterations": 1.5}, "iterations: must be a whole number, 0 or more; got 1.5"),
