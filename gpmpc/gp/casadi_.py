@@ -75,7 +75,7 @@ def _residual(model: Any, x: casadi.MX, u: casadi.MX) -> tuple[casadi.MX, casadi
         A, G, c = (_numbers(getattr(nominal, part)) for part in "ABc")
         moved = A @ x + G @ u + c
     else:
-        moved = known(x, u)
+        moved = nominal.function(x, u)
     return moved + matrix @ mean, matrix**2 @ variance
 
 
