@@ -102,13 +102,8 @@ class Trainer:
     def refit(self, posterior: GPPosterior, transitions: Transitions | None = None, seed: int = 0) -> Training:
         """Trains on the points a posterior holds, and on new ones, from its hyperparameters on.
 
-        With ``restarts=0`` only from them on. The prior mean is that of this trainer's scaling, as in any training;
-        what the posterior predicts and its number of inputs stay.
-
-        Raises:
-            UnsupportedModel: It is no ``GPPosterior``, or stands on a sparse model's pseudo-observations.
-            ShapeError: The transitions have other dimensions.
-            TrainingError: Every start failed for an output, which is named.
+        With ``restarts=0`` only from them on. The prior mean is that of this trainer's scaling, as in any training.
+        Errors are as of ``fit``; ``UnsupportedModel`` of a sparse model's pseudo-observations, too.
         """
         _check_start("posterior", posterior)
         if not posterior.has_observation_noise:
@@ -141,9 +136,8 @@ class Trainer:
             start: Its hyperparameters are the first start instead; the random ones stay where they are.
 
         Raises:
-            ShapeError: Features and targets do not belong together, or ``start`` has other dimensions.
-            SettingError: They are no float64 tensors in host memory, or the seed is no whole number.
-            UnsupportedModel: ``start`` is no ``GPPosterior``.
+            ShapeError, SettingError, UnsupportedModel: Features, targets and ``start`` do not belong together, or are
+                not in float64 and in host memory.
             DataError: An entry is not finite, or the kernel matrices would not fit the memory that is available.
             TrainingError: Every start failed for an output, which is named.
         """

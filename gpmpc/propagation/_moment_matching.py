@@ -10,6 +10,7 @@ an affine nominal model, whose f depends on some states and inputs only. With C 
 Derivatives follow by the product rule; those by S are kept symmetric in their last two indices.
 """
 
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -46,8 +47,14 @@ class MomentMatching(NoisyPropagator):
         input = checked_input(model, belief, input)
         form, f = self._latent(model, belief, input, derivatives=True)
         d = _derivatives(form, belief.covariance, f)
-        moved = self._projected(model, *_next_moments(form, belief, input, f))
-        return moved, d.of_variances() if self.diagonal else d
+        if self.diagonal:
+            of = torch.eye(d.covariance_by_mean.shape[-2], dtype=f.M.dtype, device=f.M.device)[..., None]
+            by_mean, by_input = of * d.covariance_by_mean, of * d.covariance_by_input
+            by_covariance = of[..., None] * d.covariance_by_covariance
+            d = replace(
+                d, covariance_by_mean=by_mean, covariance_by_covariance=by_covariance, covariance_by_input=by_input
+            )
+        return self._projected(model, *_next_moments(form, belief, input, f)), d
 
     def _moved(self, model: Any, belief: Gaussian, input: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         form, f = self._latent(model, belief, input, derivatives=False)

@@ -1,6 +1,6 @@
 """A Gaussian belief over the state moved one step on through a model, and the derivatives of that step."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
@@ -37,17 +37,6 @@ class Sensitivity:
     covariance_by_mean: Tensor  #: (*batch, k, k, n)
     covariance_by_covariance: Tensor  #: (*batch, k, k, n, n)
     covariance_by_input: Tensor  #: (*batch, k, k, m)
-
-    def of_variances(self) -> "Sensitivity":
-        """The derivatives where only the diagonal of the next covariance is kept."""
-        k = self.covariance_by_mean.shape[-2]
-        keep = torch.eye(k, dtype=self.mean_by_mean.dtype, device=self.mean_by_mean.device)
-        return replace(
-            self,
-            covariance_by_mean=self.covariance_by_mean * keep[:, :, None],
-            covariance_by_covariance=self.covariance_by_covariance * keep[:, :, None, None],
-            covariance_by_input=self.covariance_by_input * keep[:, :, None],
-        )
 
 
 class Propagator(Protocol):
