@@ -1,8 +1,7 @@
 """Gaussian process models of dynamics: data, training, and the frozen posterior that predicts."""
 
 from gpmpc.gp._backend import backend
-from gpmpc.gp._gpytorch import exact_inference, to_gpytorch
-from gpmpc.gp._gpytorch_posteriors import KernelPosterior, from_gpytorch
+from gpmpc.gp._gpytorch import KernelPosterior, exact_inference, from_gpytorch, to_gpytorch
 from gpmpc.gp._kernel import Hyperparameters
 from gpmpc.gp._online import SlidingWindow, append_points, append_transitions, remove_points
 from gpmpc.gp._posterior import GPPosterior

@@ -2,7 +2,7 @@
 
 The loops of ``gpmpc._kernels`` are many times faster, on one thread, for float64 numbers in host memory. Torch
 evaluates everything else: other devices and types, and whatever autograd or a function transform follows. The two give
-the same numbers; ``backend`` forces one of them.
+the same numbers.
 """
 
 from collections.abc import Iterator
@@ -10,12 +10,12 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from typing import Literal, get_args
 
-import numpy as np
 import torch
 from torch import Tensor
-from torch.autograd import forward_ad
 
+from gpmpc._dynamics import Array
 from gpmpc.exceptions import SettingError, check_choice
+from gpmpc.gaussian import constant_arrays
 
 _Backend = Literal["auto", "compiled", "torch"]
 
@@ -37,23 +37,15 @@ def backend(choice: _Backend) -> Iterator[None]:
         _chosen.reset(token)
 
 
-def host_arrays(*tensors: Tensor) -> list[np.ndarray] | None:
+def host_arrays(*tensors: Tensor) -> list[Array] | None:
     """Returns the tensors as arrays for the compiled loops; None where torch has to evaluate."""
     choice = _chosen.get()
     if choice == "torch":
         return None
-    reason, arrays = "", []
-    try:
-        for tensor in tensors:  # in microseconds: a step of control asks several times
-            arrays.append(tensor.numpy())
-            if forward_ad.unpack_dual(tensor).tangent is not None:
-                reason = "forward-mode differentiation is under way"
-            elif tensor.dtype is not torch.float64:
-                reason = "a tensor is not float64"
-    except (RuntimeError, TypeError):
-        reason = "a tensor is on another device, part of a graph, or inside a function transform"
-    if not reason:
+    arrays = constant_arrays(*tensors)
+    if arrays is not None and all(tensor.dtype is torch.float64 for tensor in tensors):
         return arrays
     if choice == "compiled":
-        raise SettingError("backend", f"the compiled loops cannot evaluate this: {reason}")
+        rule = "the compiled loops take float64 in host memory that is no part of a graph or a function transform"
+        raise SettingError("backend", rule)
     return None

@@ -10,8 +10,6 @@ from gpmpc.gaussian import check_tensors
 Predicts = Literal["next_state", "difference", "value"]
 PREDICTS = ("next_state", "difference", "value")
 IGNORED = 1e8  # length-scale of an input that drops out of a kernel, in units of its magnitude
-_MANY = 1000  # points: from here on kernel matrices are made and factorised one after another, in place
-_ROWS = 64  # of such a matrix at a time: they fit the cache
 _FEW = 16  # columns of a kernel matrix whose differences, all at once, fit the cache
 
 
@@ -26,30 +24,35 @@ def kernel_matrix(points: Tensor, others: Tensor, lengthscales: Tensor, signal_v
         return signal_variance[:, None, None] * (squares.movedim(-1, 0) / -2).exp()
     total = zeros(len(lengthscales), len(points), len(others), dtype=points.dtype, device=points.device)
     for ours, theirs, scale in zip(points.T, others.T, lengthscales.T, strict=True):
-        total.addcmul_((ours[:, None] - theirs).square(), scale[:, None, None] ** -2)
-    return signal_variance[:, None, None] * (total / -2).exp()
+        total.addcmul_((ours[:, None] - theirs).square_(), scale[:, None, None] ** -2)
+    return signal_variance[:, None, None] * total.div_(-2).exp_()
 
 
 def centred(points: Any) -> Any:
     """Points (N, d), NumPy's or torch's, moved to mean zero: elsewhere distances from a matrix product cancel.
 
-    A stationary kernel does not depend on it. The first point is subtracted first, which is exact between near numbers:
-    so a shift of all points changes no bit of the result.
+    The first point is subtracted first, which is exact between near numbers: a shift of all points changes no bit.
     """
     away = points - points[0]
     return away - away.mean(0)
 
 
 def factorize(inputs: Tensor, lengthscales: Tensor, signal_variance: Tensor, noise_variance: Tensor) -> Tensor:
-    """The lower Cholesky factors of K + sn2 I (k, N, N); ``SettingError`` where one is not positive definite."""
-    if len(inputs) > _MANY and not any(
-        t.requires_grad for t in (inputs, lengthscales, signal_variance, noise_variance)
-    ):
-        cholesky, info = _factorize_in_place(inputs, lengthscales, signal_variance, noise_variance)
-    else:
-        kernel = kernel_matrix(inputs, inputs, lengthscales, signal_variance)
-        kernel.diagonal(dim1=-2, dim2=-1).add_(noise_variance[:, None])
-        cholesky, info = linalg.cholesky_ex(kernel)
+    """The lower Cholesky factors of K + sn2 I (k, N, N); ``SettingError`` where one is not positive definite.
+
+    One after another, so that there are no more than two matrices (N, N) besides.
+    """
+    size, outputs = len(inputs), len(lengthscales)
+    cholesky = inputs.new_empty(outputs, size, size).mT  # columns contiguous, as LAPACK wants them
+    info = zeros(outputs, dtype=int32, device=inputs.device)
+
+    def factor(a: int) -> tuple[Tensor, Tensor]:
+        kernel = kernel_matrix(inputs, inputs, lengthscales[a, None], signal_variance[a, None])[0]
+        kernel.diagonal().add_(noise_variance[a])
+        return linalg.cholesky_ex(kernel)
+
+    for a in range(outputs):
+        cholesky[a], info[a] = factor(a)
     check_positive_definite(info, signal_variance, noise_variance)
     return cholesky
 
@@ -65,25 +68,8 @@ def check_positive_definite(failed: Tensor, signal_variance: Tensor, noise_varia
         )
 
 
-def _factorize_in_place(
-    inputs: Tensor, lengthscales: Tensor, signal_variance: Tensor, noise_variance: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Factorises in the memory of the result (k, N, N) and little more; returns LAPACK's info (k,) too."""
-    (size, _), outputs = inputs.shape, len(lengthscales)
-    info = zeros(outputs, dtype=int32, device=inputs.device)
-    cholesky = inputs.new_empty(outputs, size, size).mT  # columns contiguous, as LAPACK wants them
-    for a, factor in enumerate(cholesky):
-        for end in range(_ROWS, size + _ROWS, _ROWS):  # the lower triangle
-            rows, columns = slice(end - _ROWS, end), slice(0, end)
-            scales = lengthscales[a, None], signal_variance[a, None]
-            factor[rows, columns] = kernel_matrix(inputs[rows], inputs[columns], *scales)[0]
-        factor.diagonal().add_(noise_variance[a])
-        linalg.cholesky_ex(factor, out=(factor, info[a]))
-    return cholesky, info
-
-
-def check_posterior(given: dict[str, Tensor], input_dim: int, predicts: str) -> None:
-    """Raises unless the arguments of ``GPPosterior.from_hyperparameters`` belong together; its docstring has the rules.
+def check_posterior(given: dict[str, Tensor], input_dim: int, predicts: str, dtype: Any = float64) -> None:
+    """Raises unless these fields of a ``GPPosterior`` belong together; ``from_hyperparameters`` has the rules.
 
     The features come first, under any name; before training there are only they and the targets.
     """
@@ -96,16 +82,19 @@ def check_posterior(given: dict[str, Tensor], input_dim: int, predicts: str) -> 
         )
     (size, d), k = inputs.shape, targets.shape[1]
     shapes = {first: (size, d), "targets": (size, k), "lengthscales": (k, d)}
+    shapes |= {"cholesky": (k, size, size), "weights": (k, size)}
     for name, value in given.items():
-        shape = shapes.get(name, (k,))
-        if tuple(value.shape) != shape:
+        if tuple(value.shape) != (shape := shapes.get(name, (k,))):
             raise ShapeError(f"{name} must have shape {shape}; got {tuple(value.shape)}")
-        if value.dtype != float64:
-            raise SettingError(name, f"must be float64 (convert after: posterior.to(dtype=...)); got {value.dtype}")
+        if value.dtype != dtype:
+            raise SettingError(
+                name, f"must be {str(dtype)[6:]} (convert after: posterior.to(dtype=...)); got {value.dtype}"
+            )
         if value.device != inputs.device:
             raise SettingError(name, f"must be on the device of {first}, {inputs.device}; got {value.device}")
-        if not bool(isfinite(value).all()):
-            raise DataError(f"{name} must be finite; got {value[~isfinite(value)][0]}")
+        for part in value if value.dim() == 3 else [value]:  # of a factor no second copy is made
+            if not bool(isfinite(part).all()):
+                raise DataError(f"{name} must be finite; got {float(part[~isfinite(part)][0])}")
     check_columns(first, d, k, input_dim, predicts)
     for name in ("lengthscales", "signal_variance", "noise_variance"):
         if name in given and not bool((given[name] > 0).all()):

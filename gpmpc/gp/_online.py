@@ -1,19 +1,18 @@
-r"""Points that come and go while a controller runs, without factorising K + sn2 I anew, which is cubic in them.
+r"""Points that come and go while a controller runs, in O(N^2) each: K + sn2 I is not factorised anew.
 
 Adding points extends the Cholesky factor by rows, L21' = L^-1 K(X, X*), L22 L22' = K(X*, X*) + sn2 I - L21 L21';
-removing one changes only the block below it (``gpmpc._kernels._window``): both O(N^2) a point. The weights are solved
-for from the factor each time, two triangular systems, so that no error is carried along with them.
+removing one changes only the block below it (``gpmpc._kernels._window``). The weights are solved for from the factor
+each time, so that no error is carried along with them.
 
 The least informative point is the one whose removal changes the posterior over functions least, in Kullback-Leibler
 divergence. With and without y_i the two posteriors differ by one factor of the likelihood, which depends on f(x~_i)
-alone; so their divergence is that of two one-dimensional Gaussians, and the leave-one-out formulas (Rasmussen and
-Williams, 2006, eq. (5.12)) give it from P = (K + sn2 I)^-1 and beta = P (y - offset):
+alone; so the leave-one-out formulas (Rasmussen and Williams, 2006, eq. (5.12)) give their divergence from
+P = (K + sn2 I)^-1 and beta = P (y - offset):
 
     KL_i = 1/2 sum_a [ e_ai - 1 - log e_ai + beta_ai^2 (1 / P_aii - sn2_a) ],     e_ai = sn2_a P_aii
 
-(e is the variance of f(x~_i) with y_i over that without.) Csato and Opper (2002, section 3.3) score |beta_i| / P_ii
-instead, the change of the mean, for one output; this score counts the variance too and adds up over outputs of any
-unit. Of the pseudo-observations of a sparse model, whose noise is correlated, only the variances are counted.
+(e is the variance of f(x~_i) with y_i over that without.) Of the pseudo-observations of a sparse model, whose noise is
+correlated, only the variances are counted.
 """
 
 import logging
@@ -28,7 +27,7 @@ from torch import Tensor
 from gpmpc._kernels._window import drop_point
 from gpmpc.exceptions import DataError, SettingError, ShapeError, UnsupportedModel, check_choice, check_number
 from gpmpc.gaussian import check_tensors
-from gpmpc.gp._kernel import check_positive_definite, kernel_matrix
+from gpmpc.gp._kernel import check_positive_definite, check_posterior, kernel_matrix
 from gpmpc.gp._posterior import GPPosterior
 from gpmpc.gp._transitions import Transitions, check_transitions
 
@@ -37,7 +36,7 @@ _MANY = 0.2  # where more than this part of the points is removed, one factorisa
 
 
 def append_transitions(posterior: GPPosterior, transitions: Transitions) -> GPPosterior:
-    """Appends transitions to a posterior's data, in O(N^2) a point; the hyperparameters stay (``Trainer.refit``).
+    """Appends transitions to a posterior's data; the hyperparameters stay (``Trainer.refit`` trains them).
 
     Raises:
         ShapeError: The transitions have other dimensions.
@@ -49,8 +48,13 @@ def append_transitions(posterior: GPPosterior, transitions: Transitions) -> GPPo
 
 
 def append_points(posterior: GPPosterior, features: Tensor, targets: Tensor) -> GPPosterior:
-    """Appends points x~ = (x, u) (p, n + m) with targets (p, k) to a posterior's data, in O(N^2) a point."""
-    features, targets = _checked_points(posterior, features, targets)
+    """Appends points x~ = (x, u) (p, n + m) with targets (p, k) to a posterior's data."""
+    check_tensors(features=features, targets=targets)
+    features, targets = features.to(posterior.features), targets.to(posterior.features)
+    given = {"features": features, "targets": targets}
+    check_posterior(given, posterior.input_dim, posterior.predicts, posterior.dtype)
+    if (got := (features.shape[1], targets.shape[1])) != (posterior.features.shape[1], posterior.output_dim):
+        raise ShapeError(f"points must have features and targets like those of {posterior}; got {got[0]} and {got[1]}")
     size, p = len(posterior), len(features)
     scales, sf2 = posterior.lengthscales, posterior.signal_variance
     old_targets = (posterior.targets - posterior.offset).mT[..., None]  # (k, N, 1)
@@ -73,7 +77,7 @@ def append_points(posterior: GPPosterior, features: Tensor, targets: Tensor) -> 
 
 
 def remove_points(posterior: GPPosterior, indices: Sequence[int] | Tensor) -> GPPosterior:
-    """Removes points (rows of ``features``) from a posterior's data, in O(N^2) a point.
+    """Removes points (rows of ``features``) from a posterior's data.
 
     Raises:
         SettingError: An index is out of range or stands there twice.
@@ -138,17 +142,14 @@ class SlidingWindow:
 
     def append(self, posterior: GPPosterior, features: Tensor, targets: Tensor) -> GPPosterior:
         """The posterior with points x~ (p, n + m) and their targets (p, k), held to ``points`` points."""
-        larger = append_points(posterior, features, targets)
-        excess, removable = len(larger) - self.points, len(posterior)
-        if excess <= 0:
-            return larger
+        larger, removable = append_points(posterior, features, targets), len(posterior)
         if len(features) > self.points:
             _log.warning("%d new points exceed the window of %d: some are removed too", len(features), self.points)
-            larger, excess = remove_points(larger, range(len(posterior))), len(features) - self.points
-            removable = len(larger)
-        if self.remove == "oldest":
-            return remove_points(larger, range(excess))
-        return remove_points(larger, least_informative(larger, excess, removable))
+            larger, removable = remove_points(larger, range(removable)), len(features)
+        if (excess := len(larger) - self.points) <= 0:
+            return larger
+        oldest = self.remove == "oldest"
+        return remove_points(larger, range(excess) if oldest else least_informative(larger, excess, removable))
 
 
 def least_informative(posterior: GPPosterior, count: int, candidates: int | None = None) -> list[int]:
@@ -172,6 +173,7 @@ def least_informative(posterior: GPPosterior, count: int, candidates: int | None
 
 
 def _divergence(P: Tensor, beta: Tensor, noise: Tensor) -> Tensor:
+    """KL_i (N,) from the diagonals of P, beta and the noise variances (k, N)."""
     e = (noise * P).clamp(max=1.0)
     return (e - 1 - e.log() + beta**2 * (1 - e) / P).sum(0) / 2
 
@@ -185,29 +187,12 @@ def _noise_variances(posterior: GPPosterior) -> Tensor:
     return diagonal.clamp_min(torch.finfo(posterior.dtype).eps)
 
 
-def _checked_points(posterior: GPPosterior, features: Tensor, targets: Tensor) -> tuple[Tensor, Tensor]:
-    """New points (p, d) and their targets (p, k) in a posterior's type and on its device, after a look at them."""
-    check_tensors(features=features, targets=targets)
-    if features.dim() != 2 or targets.dim() != 2 or len(features) != len(targets) or not len(features):
-        raise ShapeError(
-            "features (p, d) and targets (p, k) need two dimensions and the same number of rows, one or more; "
-            f"got {tuple(features.shape)} and {tuple(targets.shape)}"
-        )
-    for name, value, own in (("features", features, posterior.features), ("targets", targets, posterior.targets)):
-        if value.shape[1] != own.shape[1]:
-            raise ShapeError(f"{name} must have {own.shape[1]} columns like the posterior's; got {value.shape[1]}")
-        if not bool(torch.isfinite(value).all()):
-            raise DataError(f"{name} must be finite; got {value[~torch.isfinite(value)][0]}")
-    return features.to(posterior.features), targets.to(posterior.features)
-
-
 def _indices(indices: Sequence[int] | Tensor, size: int) -> list[int]:
     """Different indices from 0 to size - 1 in ascending order; negative ones count from the end, as everywhere."""
-    given = indices.tolist() if isinstance(indices, Tensor | np.ndarray) else indices
-    given = [given] if isinstance(given, int) else list(given)
-    if any(isinstance(i, bool) or not isinstance(i, int | np.integer) or not -size <= i < size for i in given):
+    given = np.atleast_1d(np.asarray(indices)).tolist()
+    if any(isinstance(i, bool) or not isinstance(i, int) or not -size <= i < size for i in given):
         raise SettingError("indices", f"must be whole numbers from {-size} to {size - 1}; got {given}")
-    found = sorted({int(i) % size for i in given})
+    found = sorted({i % size for i in given})
     if len(found) != len(given):
         raise SettingError("indices", f"must be different; got {given}")
     return found

@@ -4,9 +4,8 @@ One GP per output with the squared exponential kernel with automatic relevance d
 
     k_a(x~, x~') = sf2_a exp(-1/2 sum_d (x~_d - x~'_d)^2 / l_ad^2),   x~ = (x, u)
 
-Rasmussen and Williams (2006), eqs. (2.25)-(2.26), Algorithm 2.1; the GP model of Cao, Lai and Alam (2017). An affine
-scaling of the data is only another parametrisation of such a GP (length-scales in the units of the inputs, standard
-deviations in those of the output, and a constant prior mean), so a posterior is in physical units.
+Rasmussen and Williams (2006), eqs. (2.25)-(2.26), Algorithm 2.1; the GP model of Cao, Lai and Alam (2017). A posterior
+is in physical units: an affine scaling of the data is only another parametrisation of such a GP.
 """
 
 from dataclasses import dataclass, fields, replace
@@ -94,10 +93,10 @@ class GPPosterior(TensorModel):
         check_tensors(targets=targets)
         offset = torch.zeros_like(targets[:1].flatten()) if offset is None else offset
         kernel = Hyperparameters(lengthscales, signal_variance, noise_variance)
-        given = {"inputs": inputs, "targets": targets, **kernel._asdict(), "offset": offset}
+        given: dict[str, Tensor] = {"inputs": inputs, "targets": targets, **kernel._asdict(), "offset": offset}
         check_posterior(given, input_dim, predicts)
-        inputs, targets, offset = inputs.clone(), targets.clone(), offset.clone()
-        kernel = Hyperparameters(*(value.clone() for value in kernel))
+        inputs, targets, *scales, offset = (value.clone() for value in given.values())
+        kernel = Hyperparameters(*scales)
         cholesky = factorize(inputs, *kernel)
         rights = (targets - offset).mT[..., None]  # one after another: torch copies the factors it is given
         weights = torch.stack([torch.cholesky_solve(b, L)[:, 0] for b, L in zip(rights, cholesky, strict=True)])
@@ -149,9 +148,8 @@ class GPPosterior(TensorModel):
         """The arrays of the compiled loops, for a float64 model in host memory."""
         from gpmpc._kernels import pack  # loads numba
 
-        parts = (self.features, self.lengthscales, self.signal_variance, self.cholesky, self.weights)
-        features, lengthscales, signal_variance, cholesky, weights = (part.numpy() for part in parts)
-        return pack(features, lengthscales, signal_variance, cholesky, weights, self.state_dim)
+        kernel = self.lengthscales.numpy(), self.signal_variance.numpy()
+        return pack(self.features.numpy(), *kernel, self.cholesky.numpy(), self.weights.numpy(), self.state_dim)
 
     @cached_property
     def _prior(self) -> tuple[Array, bool]:
@@ -161,8 +159,11 @@ class GPPosterior(TensorModel):
     @property
     def affine_form(self) -> AffineForm:
         """Next states (A = 0) or differences (A = I) as moments are composed of them."""
-        adds_state = self.predicts == "difference"
-        return AffineForm(self, torch.eye(self.state_dim, dtype=self.dtype, device=self.device) if adds_state else None)
+        return AffineForm(self, self._eye if self.predicts == "difference" else None)
+
+    @property
+    def _eye(self) -> Tensor:
+        return torch.eye(self.state_dim, dtype=self.dtype, device=self.device)
 
     @property
     def has_observation_noise(self) -> bool:
@@ -175,8 +176,7 @@ class GPPosterior(TensorModel):
         """Copies the posterior to another device, or to another type: float32 or float64."""
         check_destination(device, dtype)
         tensors = {f.name: v for f in fields(self) if isinstance(v := getattr(self, f.name), Tensor)}
-        moved: dict[str, Any] = {name: value.to(device=device, dtype=dtype) for name, value in tensors.items()}
-        return replace(self, **moved)
+        return replace(self, **{name: value.to(device=device, dtype=dtype) for name, value in tensors.items()})
 
     def predict(self, state: Tensor, input: Tensor | None = None) -> Gaussian:
         """The next state's distribution at a certain state and input (Rasmussen and Williams, 2006, eq. (2.25)).
@@ -221,11 +221,6 @@ class GPPosterior(TensorModel):
         squares = torch.linalg.solve_triangular(self.cholesky[outputs], columns, upper=False).square().sum(-2)
         return squares.mT.reshape(k.shape[:-1])
 
-    def solve(self, k: Tensor) -> Tensor:
-        """(K_a + sn2_a I)^-1 k_a (*batch, k, N) of k (*batch, k, N); the batch becomes columns as above."""
-        columns = k.unsqueeze(0).flatten(0, -3).movedim(0, -1)  # (k, N, batch)
-        return torch.cholesky_solve(columns, self.cholesky).movedim(-1, 0).reshape(k.shape)
-
     def _correlations(self, state: Tensor, input: Tensor | None) -> tuple[Tensor, Tensor]:
         """k(x~_i, x~) (*batch, k, N) and (x~_i - x~) / l (*batch, k, N, d)."""
         input = state[..., :0] if input is None else input
@@ -248,5 +243,5 @@ class GPPosterior(TensorModel):
         jacobian = (weighted @ (difference / self.lengthscales[:, None, :]))[..., 0, :]
         by_state, by_input = jacobian[..., : self.state_dim], jacobian[..., self.state_dim :]
         if self.predicts == "difference":
-            by_state = by_state + torch.eye(self.state_dim, dtype=self.dtype, device=self.device)
+            by_state = by_state + self._eye
         return by_state, by_input

@@ -1,8 +1,4 @@
-"""Affine scalings of data columns of very different ranges, before training and back.
-
-A ``Scaling`` is one affine map a column, scaled = (value - offset) / factor. The four in use: none at all, zero mean,
-zero mean and unit standard deviation, and a range onto an interval (the paper's rotational data: [0.1, 0.9]).
-"""
+"""Affine scalings of data columns of very different ranges, before training and back."""
 
 import logging
 from collections.abc import Sequence
@@ -19,7 +15,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Scaling:
-    """One affine map a column."""
+    """One affine map a column, scaled = (value - offset) / factor."""
 
     offset: Tensor  #: (d,), in the units of the data
     factor: Tensor  #: (d,), in the units of the data; positive
@@ -64,10 +60,9 @@ def standardize(columns: Tensor, names: Sequence[str], resolution: float = 0.0) 
 def min_max(
     columns: Tensor, names: Sequence[str], low: float = 0.1, high: float = 0.9, resolution: float = 0.0
 ) -> Scaling:
-    """Maps the range of each column (N, d) onto [low, high]; a constant column to the middle.
+    """Maps the range of each column (N, d) onto [low, high]; a constant column, as in ``standardize``, to the middle.
 
-    A column whose range is at most ``resolution``, in the units of the data, counts as constant, and the log names it.
-    Without it, a solver's round-off in a channel at rest would be blown up to the full interval.
+    Else a solver's round-off in a channel at rest would be blown up to the full interval.
 
     Raises:
         SettingError: low is not below high.
@@ -75,7 +70,7 @@ def min_max(
     if not low < high:
         raise SettingError("low, high", f"low must be below high; got {low}, {high}")
     constant = _constant(columns, names, resolution)
-    smallest, largest = columns.min(dim=0).values, columns.max(dim=0).values
+    smallest, largest = columns.aminmax(dim=0)
     # A constant column keeps its unit, so that what little it moves stays as little.
     factor = torch.where(constant, 1.0, (largest - smallest) / (high - low))
     middle = (smallest + largest) / 2 - (low + high) / 2
@@ -86,9 +81,8 @@ def _constant(columns: Tensor, names: Sequence[str], resolution: float) -> Tenso
     """Which columns (d,) do not move; a note in the log names them."""
     if columns.dim() != 2 or len(names) != columns.shape[1]:
         raise ShapeError(f"columns (N, d) need d names; got {tuple(columns.shape)} and {len(names)} names")
-    moved = columns.max(dim=0).values - columns.min(dim=0).values
-    constant = moved <= resolution
-    if bool(constant.any()):
-        which = ", ".join(f"{name} (moves by {m:.0e})" for name, m, c in zip(names, moved, constant, strict=True) if c)
+    moved = columns.amax(dim=0) - columns.amin(dim=0)
+    if bool((moved <= resolution).any()):
+        which = ", ".join(f"{n} (moves by {m:.0e})" for n, m in zip(names, moved, strict=True) if m <= resolution)
         _log.info("constant columns are centred, not scaled: %s", which)
-    return constant
+    return moved <= resolution

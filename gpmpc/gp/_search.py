@@ -1,11 +1,10 @@
 """The search for one output's hyperparameters by maximum marginal likelihood, which has many local optima.
 
 They differ by a factor of a hundred in prediction error. So the search explores a few iterations of L-BFGS (Byrd, Lu,
-Nocedal and Zhu, 1995; scipy's L-BFGS-B) from the paper's starting point and from random ones, and goes on to
-convergence from the best two. (Measured on the paper's data: a single start without exploration reached the best known
-optimum for about 75 % of the outputs; four starts and two finalists for about 98 %, at two and a half times the
-evaluations.) Of many points a random subset is searched first; one more search goes on from what it found over all of
-them, with some twenty evaluations of O(N^3) instead of some hundred and fifty.
+Nocedal and Zhu, 1995) from the paper's starting point and from random ones, and goes on to convergence from the best
+two. (On the paper's data a single start reached the best known optimum for about 75 % of the outputs; four starts and
+two finalists for about 98 %, at two and a half times the evaluations.) Of many points a random subset is searched
+first; one more search goes on from what it found over all of them.
 
 theta = (log length-scales, log sf, log(sf / sn)), in a wide box around the data's standard deviations.
 """
@@ -14,7 +13,7 @@ import logging
 import math
 import time
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -65,62 +64,102 @@ class SoftLimits:
         return (position**self.power).sum(), self.power * position ** (self.power - 1) / width
 
 
-class SearchProblem(NamedTuple):
-    """One output to be fitted, in scaled units."""
+class OutputSearch:
+    """The search for one output's hyperparameters, in scaled units, with a ``Trainer``'s settings.
 
-    name: str  # for the log, such as "output 2 of 6"
-    inputs: np.ndarray  # x~ (N, d)
-    targets: np.ndarray  # (N,)
-    first: np.ndarray | None  # theta of the first start (d + 2,); None takes l = std(x~), sf = std(y), sn = std(y) / 10
-    perturbations: np.ndarray  # standard normal (restarts + 1, d + 2); the first row is not used
-    rows: np.ndarray | None  # the subset that the search begins with; None for all points from the start
-    std: np.ndarray  # of the inputs (d,), see ``column_std``
-    constant: np.ndarray  # which inputs are (d,)
-    deadline: float = math.inf  # on ``time.perf_counter``'s clock, from which on the best found so far is taken [s]
+    ``std`` (d,) is of the inputs (N, d), see ``column_std``; ``constant`` (d,) which of them are. From the deadline on,
+    by the clock of ``time.perf_counter`` [s], the best found so far is taken.
+    """
 
-    def is_late(self) -> bool:
-        """Whether the deadline has passed."""
-        return time.perf_counter() >= self.deadline
+    def __init__(
+        self,
+        name: str,
+        inputs: np.ndarray,
+        targets: np.ndarray,
+        std: np.ndarray,
+        constant: np.ndarray,
+        settings: Any,
+        deadline: float,
+    ):
+        self._name, self._inputs, self._targets = name, inputs, targets
+        self._settings, self._deadline = settings, deadline
+        self._log_std, self._constant = np.log(std), constant
+        self._log_output = np.log(column_std(targets[:, None])[0])
+        self._box = search_box(self._log_std, self._log_output, settings.signal_to_noise_limit)
+        self.evaluations, self._last_log = 0, time.perf_counter()
 
+    def __call__(
+        self, first: np.ndarray | None, perturbations: np.ndarray, rows: np.ndarray | None
+    ) -> tuple[np.ndarray, float, list[float]]:
+        """Gives theta, its objective (FAILED or more where every start failed), and those where the exploration ended.
 
-class SearchResult(NamedTuple):
-    """The end of the search for one output; see ``Training``."""
+        Args:
+            first: theta of the first start (d + 2,); None takes l = std(x~), sf = std(y), sn = std(y) / 10.
+            perturbations: Standard normal (restarts + 1, d + 2); the first row is not used.
+            rows: The subset that the search begins with; None for all points from the start.
+        """
+        plain = np.append(self._log_std, [self._log_output, np.log(10.0)])
+        longer = np.append(np.full(len(self._log_std), _LONGER), [0.0, 0.0])
+        starts = [plain if first is None else first, *(plain + longer + shift for shift in perturbations[1:])]
+        self._see(slice(None) if rows is None else rows)
+        ends: list[tuple[np.ndarray, float]] = []
+        for start in starts:
+            ends.append(self._minimize(start, _EXPLORATION))
+            if self._is_late() and min(value for _, value in ends) < FAILED:
+                break
+        best = sorted(ends, key=lambda end: end[1])[:_FINALISTS]
+        if not self._is_late():
+            best = [self._minimize(theta, _ITERATIONS) for theta, _ in best]
+        theta, value = min(best, key=lambda end: end[1])
+        if rows is not None:
+            self._see(slice(None))
+            theta, value = self._minimize(theta, _ITERATIONS)
+        if self._is_late():
+            _log.info("training: %s: its share of time_limit=%g s is over", self._name, self._settings.time_limit)
+        # Nothing can be learned about an input that never moved, and nothing is: it drops out of the kernel.
+        theta[:-2][self._constant] = self._log_std[self._constant] + np.log(IGNORED)
+        return theta, value, [end[1] for end in ends] + [math.nan] * (len(starts) - len(ends))
 
-    theta: np.ndarray
-    objective: float  # FAILED or more where every start failed
-    explored: list[float]
-    evaluations: int
-    seconds: float  # [s]
+    def _see(self, rows: Any) -> None:
+        """Takes the likelihood of some of the points."""
+        self._likelihood = NegativeLogMarginalLikelihood(self._inputs[rows], self._targets[rows])
+        self._size = len(self._targets[rows])
 
+    def _minimize(self, start: np.ndarray, iterations: int) -> tuple[np.ndarray, float]:
+        """The end point of L-BFGS and its objective."""
+        outcome = minimize(
+            self._objective,
+            np.clip(start, *self._box),
+            jac=True,
+            method="L-BFGS-B",
+            bounds=np.column_stack(self._box),
+            callback=self._look_at_clock,
+            options={"ftol": self._settings.tolerance, "gtol": 1e-6, "maxiter": iterations, "maxfun": 5 * iterations},
+        )
+        return outcome.x, float(outcome.fun)
 
-def find_hyperparameters(problem: SearchProblem, settings: Any) -> SearchResult:
-    """Searches for one output's hyperparameters with a ``Trainer``'s settings."""
-    begin = time.perf_counter()
-    log_inputs, log_output = np.log(problem.std), np.log(column_std(problem.targets[:, None])[0])
-    first = np.append(log_inputs, [log_output, np.log(10.0)])
-    longer = np.append(np.full(len(log_inputs), _LONGER), [0.0, 0.0])
-    starts = [first if problem.first is None else problem.first]
-    starts += [first + longer + shift for shift in problem.perturbations[1:]]
-    box = search_box(log_inputs, log_output, settings.signal_to_noise_limit)
+    def _is_late(self) -> bool:
+        return time.perf_counter() >= self._deadline
 
-    search = _Search(problem, slice(None) if problem.rows is None else problem.rows, box, settings)
-    ends: list[tuple[np.ndarray, float]] = []
-    for start in starts:
-        ends.append(search(start, _EXPLORATION))
-        if problem.is_late() and min(end[1] for end in ends) < FAILED:
-            break
-    best = sorted(ends, key=lambda end: end[1])[:_FINALISTS]
-    finalists = best if problem.is_late() else [search(end, _ITERATIONS) for end, _ in best]
-    theta, value = min(finalists, key=lambda end: end[1])
-    evaluations = search.evaluations
-    if problem.rows is not None:
-        search = _Search(problem, slice(None), box, settings)
-        theta, value = search(theta, _ITERATIONS)
-        evaluations += search.evaluations
-    # Nothing can be learned about an input that never moved, and nothing is: it drops out of the kernel.
-    theta[:-2][problem.constant] = log_inputs[problem.constant] + np.log(IGNORED)
-    explored = [end[1] for end in ends] + [math.nan] * (len(starts) - len(ends))
-    return SearchResult(theta, value, explored, evaluations, time.perf_counter() - begin)
+    def _look_at_clock(self, _: np.ndarray) -> None:
+        if self._is_late():
+            raise StopIteration  # which ends scipy's search where it is
+
+    def _objective(self, theta: np.ndarray) -> tuple[float, np.ndarray]:
+        """Negative log marginal likelihood plus penalty, and the gradient."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            value, gradient = self._likelihood(theta)
+        self.evaluations += 1
+        if not (np.isfinite(value) and np.isfinite(gradient).all()):
+            value, gradient = FAILED, np.zeros_like(theta)
+        elif self._settings.penalty is not None:
+            wall, slope = self._settings.penalty(theta, self._log_std)
+            value, gradient = value + wall, gradient + slope
+        if time.perf_counter() - self._last_log > _LOG_INTERVAL:
+            self._last_log = time.perf_counter()
+            text = "training: %s, %d points: evaluation %d, minus log evidence %.8g"
+            _log.info(text, self._name, self._size, self.evaluations, value)
+        return value, gradient
 
 
 def search_box(log_inputs: np.ndarray, log_output: float, signal_to_noise_limit: float) -> tuple[np.ndarray, ...]:
@@ -129,48 +168,6 @@ def search_box(log_inputs: np.ndarray, log_output: float, signal_to_noise_limit:
     reach[-2:] = np.log(1e6), np.log(signal_to_noise_limit)
     centre = np.append(log_inputs, [log_output, 0.0])
     return centre - reach, centre + reach
-
-
-class _Search:
-    """L-BFGS over some rows; counts the evaluations, and logs them where they take long."""
-
-    def __init__(self, problem: SearchProblem, rows: Any, box: tuple[np.ndarray, ...], settings: Any):
-        self.problem, self.box, self.settings = problem, box, settings
-        self.likelihood = NegativeLogMarginalLikelihood(problem.inputs[rows], problem.targets[rows])
-        self.size, self.evaluations, self.last_log = len(problem.targets[rows]), 0, time.perf_counter()
-
-    def __call__(self, start: np.ndarray, iterations: int) -> tuple[np.ndarray, float]:
-        """The end point and its objective."""
-        outcome = minimize(
-            self._objective,
-            np.clip(start, *self.box),
-            jac=True,
-            method="L-BFGS-B",
-            bounds=np.column_stack(self.box),
-            callback=self._look_at_clock,
-            options={"ftol": self.settings.tolerance, "gtol": 1e-6, "maxiter": iterations, "maxfun": 5 * iterations},
-        )
-        return outcome.x, float(outcome.fun)
-
-    def _look_at_clock(self, _: np.ndarray) -> None:
-        if self.problem.is_late():
-            raise StopIteration  # which ends scipy's search where it is
-
-    def _objective(self, theta: np.ndarray) -> tuple[float, np.ndarray]:
-        """Negative log marginal likelihood plus penalty, and the gradient."""
-        with np.errstate(over="ignore", invalid="ignore"):
-            value, gradient = self.likelihood(theta)
-        self.evaluations += 1
-        if not (np.isfinite(value) and np.isfinite(gradient).all()):
-            value, gradient = FAILED, np.zeros_like(theta)
-        elif self.settings.penalty is not None:
-            wall, slope = self.settings.penalty(theta, np.log(self.problem.std))
-            value, gradient = value + wall, gradient + slope
-        if time.perf_counter() - self.last_log > _LOG_INTERVAL:
-            self.last_log = time.perf_counter()
-            text = "training: %s, %d points: evaluation %d, minus log evidence %.8g"
-            _log.info(text, self.problem.name, self.size, self.evaluations, value)
-        return value, gradient
 
 
 def column_std(columns: np.ndarray) -> np.ndarray:

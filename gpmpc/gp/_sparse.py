@@ -6,9 +6,8 @@ With inducing points Z, Kzz = Lz Lz' and the correlations Kzx with the data, the
     mean = k' beta,   variance = sf2 - k' C k,       k = k(Z, x~)
     C    = Kzz^-1 - (Kzz + Kzx Lam^-1 Kxz)^-1,       Lam = sn2 I  (SGPR)   or   diag(Kxx - Qxx) + sn2 I  (FITC)
 
-which is an exact GP on M pseudo-observations with correlated noise, K + R = C^-1. So it is frozen to a ``GPPosterior``
-on Z, and all that works with one (moment matching, appending, removing) works at the cost of M points. With
-A = Lz^-1 Kzx Lam^-1/2 and A A' = U diag(b) U',
+which is an exact GP on M pseudo-observations with correlated noise, K + R = C^-1, and frozen to a ``GPPosterior`` on
+Z. With A = Lz^-1 Kzx Lam^-1/2 and A A' = U diag(b) U',
 
     C = Lz^-T U diag(b / (1 + b)) U' Lz^-1,   beta = Lz^-T U diag(1 / (1 + b)) U' A Lam^-1/2 (y - offset)
     cholesky of C^-1:  R', where Q R = diag(sqrt((1 + b) / b)) U' Lz'    (never squared: C^-1 is huge where b is small)
@@ -18,22 +17,19 @@ The collapsed bound of Titsias (2009, eq. (9)), for FITC without its last term, 
     log N(y | 0, Q + Lam) - tr(Kxx - Qxx) / (2 sn2),     Q = A~' A~,  A~ = Lz^-1 Kzx
 
 It depends on the data through sums over the points alone: with r = Lam^-1/2 y they are A A', A r, r'r and log|Lam|. So
-the points come in blocks that fit the cache, output after output, each computed once more for the derivatives
-(automatic differentiation with checkpoints, Griewank and Walther, 2008, chapter 12): memory stays that of a block, for
-any N. A jitter on Kzz makes u = f(Z) + noise; the bound stays one.
+the points come in blocks that fit the cache, each computed once more for the derivatives (checkpoints: Griewank and
+Walther, 2008, chapter 12): memory stays that of a block, for any N.
 """
 
 import math
-from dataclasses import replace
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from gpmpc.exceptions import SettingError, ShapeError, check_choice, check_number
-from gpmpc.gaussian import check_tensors
-from gpmpc.gp._kernel import Hyperparameters, Predicts, kernel_matrix
+from gpmpc.exceptions import SettingError
+from gpmpc.gp._kernel import Hyperparameters, Predicts, check_posterior, kernel_matrix
 from gpmpc.gp._posterior import GPPosterior
 
 Method = Literal["sgpr", "fitc"]
@@ -74,19 +70,8 @@ def sparse_posterior(
         jitter: Added to the diagonal of Kzz, in units of sf2; by default only where it is needed. ``SettingError``
             where Kzz is not positive definite.
     """
-    if jitter is not None:
-        check_number("jitter", jitter, least=0)
-    check_choice("method", method, get_args(Method))
-    check_tensors(inducing=inducing, features=features, targets=targets)
-    if inducing.dim() != 2 or inducing.shape[1:] != features.shape[1:] or not len(inducing):
-        raise ShapeError(f"inducing must be (M, {features.shape[-1]}), M > 0; got {tuple(inducing.shape)}")
-    if len(features) != len(targets):
-        raise ShapeError(f"features and targets need the same number of rows; got {len(features)} and {len(targets)}")
-    # Of one row, for its checks of everything else; the data themselves are checked by their sum.
-    shell = GPPosterior.from_hyperparameters(features[:1], targets[:1], *hyperparameters, input_dim, predicts)
-    for name, value in (("inducing", inducing), ("features", features), ("targets", targets)):
-        if value.dtype != torch.float64 or not bool(torch.isfinite(value).all()):
-            raise SettingError(name, "must be finite and in float64")
+    given = {"features": features, "targets": targets, **hyperparameters._asdict()}
+    check_posterior(given, input_dim, predicts)
     try:
         Lz = inducing_factor(inducing, hyperparameters, jitter or 0.0)
     except SettingError:
@@ -102,7 +87,11 @@ def sparse_posterior(
     projections = U.mT @ sums.projections[..., None]
     weights = torch.linalg.solve_triangular(Lz.mT, U @ (projections / (1 + b)[..., None]), upper=True)
     pseudo_targets = (cholesky @ (cholesky.mT @ weights))[..., 0].mT
-    return replace(shell, features=inducing.clone(), targets=pseudo_targets, cholesky=cholesky, weights=weights[..., 0])
+    kernel = Hyperparameters(*(value.clone() for value in hyperparameters))
+    offset = torch.zeros_like(pseudo_targets[0])
+    return GPPosterior(
+        inducing.clone(), pseudo_targets, *kernel, offset, cholesky, weights[..., 0], input_dim, predicts
+    )
 
 
 def collapsed_bound(
@@ -115,26 +104,24 @@ def collapsed_bound(
 ) -> Tensor:
     """The bound on the log marginal likelihood (SGPR), or FITC's own log marginal likelihood, of every output (k,).
 
-    Arguments are as for ``sparse_posterior``; ``backward`` differentiates it by inducing points and hyperparameters.
-
-    Raises:
-        SettingError: Kzz is not positive definite, or the method is unknown.
+    Arguments and errors are as for ``sparse_posterior``; ``backward`` differentiates it by inducing points and
+    hyperparameters.
     """
-    check_choice("method", method, get_args(Method))
-    bounds = []
-    for a in range(targets.shape[1]):
-        kernel = hyperparameters.output(a)
-        Lz = inducing_factor(inducing, kernel, jitter)
-        sums = data_sums(Lz, inducing, features, targets[:, a, None], kernel, method)
-        bounds.append(_bound(sums, len(features), kernel, method))
-    return torch.cat(bounds)
+    Lz = inducing_factor(inducing, hyperparameters, jitter)
+    sums = data_sums(Lz, inducing, features, targets, hyperparameters, method)
+    LB = torch.linalg.cholesky(sums.gram + torch.eye(len(inducing), dtype=Lz.dtype, device=Lz.device))
+    explained = torch.linalg.solve_triangular(LB, sums.projections[..., None], upper=False).square().sum((-2, -1))
+    logdet = 2 * LB.diagonal(dim1=-2, dim2=-1).log().sum(-1) + sums.logdet
+    bound = -(len(features) * math.log(2 * math.pi) + logdet + sums.squares - explained) / 2
+    if method == "fitc":
+        return bound
+    trace = sums.gram.diagonal(dim1=-2, dim2=-1).sum(-1)
+    ratio = hyperparameters.signal_variance / hyperparameters.noise_variance
+    return bound - (len(features) * ratio - trace) / 2
 
 
 def data_sums(Lz: Tensor, Z: Tensor, x: Tensor, y: Tensor, kernel: Hyperparameters, method: Method) -> _Sums:
-    """The sums over all points, of every output, in blocks.
-
-    tr(A A') is, in units of the noise, the variance of the data that the inducing points explain.
-    """
+    """The sums over all points, of every output, in blocks."""
     step, outputs = max(_ENTRIES // len(Z), 64), []
     for a in range(y.shape[1]):
         total: Any = 0.0, 0.0, 0.0, 0.0
@@ -174,18 +161,6 @@ def _block_sums(Lz: Tensor, Z: Tensor, x: Tensor, y: Tensor, *kernel_and_method:
     root = Lam.sqrt()
     A, r = whitened / root[:, None, :], y.mT / root
     return _Sums(A @ A.mT, (A @ r[..., None])[..., 0], r.square().sum(-1), Lam.log().sum(-1))
-
-
-def _bound(sums: _Sums, size: int, kernel: Hyperparameters, method: Method) -> Tensor:
-    eye = torch.eye(sums.gram.shape[-1], dtype=sums.gram.dtype, device=sums.gram.device)
-    LB = torch.linalg.cholesky(sums.gram + eye)
-    explained = torch.linalg.solve_triangular(LB, sums.projections[..., None], upper=False).square().sum((-2, -1))
-    logdet = 2 * LB.diagonal(dim1=-2, dim2=-1).log().sum(-1) + sums.logdet
-    bound = -(size * math.log(2 * math.pi) + logdet + sums.squares - explained) / 2
-    if method == "sgpr":
-        trace = sums.gram.diagonal(dim1=-2, dim2=-1).sum(-1)
-        bound = bound - (size * kernel.signal_variance / kernel.noise_variance - trace) / 2
-    return bound
 
 
 def _cross(inducing: Tensor, features: Tensor, kernel: Hyperparameters) -> Tensor:

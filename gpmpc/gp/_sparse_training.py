@@ -2,9 +2,8 @@
 
 The hyperparameters start where exact training on a random subset ends; the inducing points start greedily, each where
 the outputs' conditional variances given those before it, in units of their noise, add up to the most (Burt, Rasmussen
-and van der Wilk, 2020, section 4: this is the step that closes most of the bound's gap tr(Kxx - Qxx) / sn2). What they
-leave unexplained, on average, is added to the noise. Then L-BFGS maximises the collapsed bound over all of it. One
-evaluation costs O(N M^2) an output.
+and van der Wilk, 2020, section 4). What they leave unexplained, on average, is added to the noise. Then L-BFGS
+maximises the collapsed bound over all of it, in O(N M^2) an output and evaluation.
 """
 
 import logging
@@ -30,14 +29,13 @@ from gpmpc.gp._transitions import Transitions, check_transitions
 
 _log = logging.getLogger(__name__)
 _EVERY = 10  # iterations between two lines of the log
+_TOLERANCE = 1e-7  # relative decrease of the objective at which L-BFGS stops
+_SIGNAL_TO_NOISE = 1e4  # the box holds sf / sn within this factor of one, as that of ``Trainer``
 
 
 @dataclass(frozen=True)
 class SparseTrainer:
-    """Fits one sparse SE-ARD GP per output, over inducing points that all share.
-
-    Six outputs of nine features, 5000 transitions and 100 inducing points take 0.3 s an iteration on one
-    core; progress is logged.
+    """Fits one sparse SE-ARD GP per output, over inducing points that all share; progress is logged.
 
     Raises:
         SettingError: A setting is out of range.
@@ -53,15 +51,11 @@ class SparseTrainer:
     iterations: int = 100  #: of L-BFGS, at most
     subset: int = 200  #: number of random transitions in the first, exact, training
     restarts: int = 1  #: random starts of that one
-    tolerance: float = 1e-7  #: relative decrease of the objective at which L-BFGS stops
-    signal_to_noise_limit: float = 1e4  #: the box holds sf / sn within this factor of one
-    jitter: float = JITTER  #: added to the diagonal of Kzz, in units of sf2
 
     def __post_init__(self) -> None:
         for key in ("inducing", "subset"):
             check_number(key, getattr(self, key), least=1, whole=True)
         check_number("iterations", self.iterations, least=0, whole=True)
-        check_number("jitter", self.jitter, least=0)
         check_choice("method", self.method, get_args(Method))
         replace(self._exact(), scaling=self.scaling)  # which checks the others
 
@@ -88,38 +82,25 @@ class SparseTrainer:
         # A stationary kernel depends on differences; those from one of the points are exact, wherever the data lie.
         feature_scaling = Scaling(features[0], feature_scaling.factor)
         x, y = feature_scaling.scale(features), target_scaling.scale(targets)
-
         chosen = np.random.default_rng(seed).permutation(len(x))[: self.subset]
         exact = self._exact().fit(features[chosen], y[chosen], input_dim, "value", seed)
         theta = log_hyperparameters(exact.posterior, feature_scaling, identity(y))
         Z = x[informative_points(x, Hyperparameters.from_theta(torch.from_numpy(theta)), self.inducing)]
         text = "sparse training: %d inducing points chosen among %d after %.1f s"
         _log.info(text, len(Z), len(x), time.perf_counter() - begin)
-        bound = _Bound(self, x, y, torch.from_numpy(column_std(features.numpy())) / feature_scaling.factor, len(Z))
-        start = bound.best = bound.vector(self._with_unexplained(theta, Z, x, y), Z)
-        if self.iterations:  # of none L-BFGS-B makes one
-            limits = {"maxiter": self.iterations, "maxfun": 3 * self.iterations + 1}
-            options = {"ftol": self.tolerance, "gtol": 1e-6, **limits}
-            minimize(
-                bound, start, jac=True, method="L-BFGS-B", bounds=bound.box, callback=bound.report, options=options
-            )
-        initial, objective = bound.values(start), bound.values(bound.best)
-        if not np.isfinite(objective).all():
-            failed = [a for a, value in enumerate(objective) if not np.isfinite(value)]
-            raise TrainingError(failed, "the inducing points' kernel matrix is not positive definite: raise jitter")
+        unit = torch.from_numpy(column_std(features.numpy())) / feature_scaling.factor
+        bound = _Bound(self, x, y, unit, self._with_unexplained(theta, Z, x, y), Z)
+        initial = bound.values()
+        bound.maximize()
+        if failed := np.flatnonzero(~np.isfinite(objective := bound.values())).tolist():
+            raise TrainingError(failed, "the inducing points' kernel matrix is not positive definite: take fewer")
         self._check_learned(_noise_alone(y) - objective, _noise_alone(y[chosen]) - exact.objective, x.shape[1] + 2)
         theta, Z = bound.parts(torch.from_numpy(bound.best))
-        scaled = sparse_posterior(
-            Z, x, y, Hyperparameters.from_theta(theta), input_dim, predicts, method=self.method, jitter=self.jitter
-        )
-        return Training(
-            scaled.unscaled(feature_scaling, target_scaling),
-            restored_theta(theta.numpy(), feature_scaling, target_scaling),
-            objective,
-            initial[:, None],
-            bound.evaluations,
-            time.perf_counter() - begin,
-        )
+        kernel = Hyperparameters.from_theta(theta)
+        scaled = sparse_posterior(Z, x, y, kernel, input_dim, predicts, self.method, JITTER)
+        posterior = scaled.unscaled(feature_scaling, target_scaling)
+        theta = restored_theta(theta.numpy(), feature_scaling, target_scaling)
+        return Training(posterior, theta, objective, initial[:, None], bound.evaluations, time.perf_counter() - begin)
 
     def _with_unexplained(self, theta: np.ndarray, Z: Tensor, x: Tensor, y: Tensor) -> np.ndarray:
         """Adds to the noise what the inducing points leave unexplained of the signal, on average.
@@ -131,7 +112,7 @@ class SparseTrainer:
         kernel = Hyperparameters.from_theta(torch.from_numpy(theta))
         _, sf2, sn2 = kernel
         with torch.no_grad():
-            sums = data_sums(inducing_factor(Z, kernel, self.jitter), Z, x, y, kernel, self.method)
+            sums = data_sums(inducing_factor(Z, kernel, JITTER), Z, x, y, kernel, self.method)
         explained = sums.gram.diagonal(dim1=-2, dim2=-1).sum(-1)
         sn2 = sn2 + (sf2 - explained * sn2 / len(x)).clamp_min(0)
         return np.column_stack([theta[:, :-1], (sf2 / sn2).log().numpy() / 2])
@@ -158,8 +139,7 @@ class SparseTrainer:
             predicts=self.predicts,
             scaling=identity,
             restarts=self.restarts,
-            tolerance=self.tolerance,
-            signal_to_noise_limit=self.signal_to_noise_limit,
+            tolerance=_TOLERANCE,
         )
 
 
@@ -196,32 +176,44 @@ def informative_points(features: Tensor, hyperparameters: Sequence[Tensor], coun
 class _Bound:
     """Minus the collapsed bound of all outputs over one vector: their theta, and Z in units of the features' spread."""
 
-    def __init__(self, trainer: SparseTrainer, features: Tensor, targets: Tensor, unit: Tensor, count: int):
-        self.trainer, self.x, self.y, self.unit, self.count = trainer, features, targets, unit, count
-        self.evaluations, self.iteration, self._last, self._least = 0, 0, np.nan, np.inf
-        self.shape = (targets.shape[1], features.shape[1] + 2)
-        log_inputs, limit = unit.log().numpy(), trainer.signal_to_noise_limit
-        boxes = [search_box(log_inputs, own, limit) for own in np.log(column_std(targets.numpy()))]
-        # A feature that the subset saw at rest has a length-scale beyond any box (IGNORED); it stays there.
-        smallest, largest = ((edge / unit).numpy() for edge in (features.amin(0), features.amax(0)))
-        margin = 0.1 * (largest - smallest)
-        edges = np.tile(smallest - margin, count), np.tile(largest + margin, count)
-        sides = [
-            np.append(np.concatenate(side), edge) for side, edge in zip(zip(*boxes, strict=True), edges, strict=True)
-        ]
-        self.box = np.column_stack(sides)
+    def __init__(self, trainer: SparseTrainer, x: Tensor, y: Tensor, unit: Tensor, theta: np.ndarray, Z: Tensor):
+        self._trainer, self._x, self._y, self._unit, self._shape = trainer, x, y, unit, theta.shape
+        self.best = np.append(
+            theta.ravel(), (Z / unit).numpy().ravel()
+        )  #: the start, or the best point evaluated since
+        self.evaluations, self._least, self._iterations = 0, np.inf, 0
 
-    def vector(self, theta: np.ndarray, Z: Tensor) -> np.ndarray:
-        """The start; it widens the box where it must."""
-        start = np.append(theta.ravel(), (Z / self.unit).numpy().ravel())
-        self.box[:, 0] = np.minimum(self.box[:, 0], start)
-        self.box[:, 1] = np.maximum(self.box[:, 1], start)
-        return start
+    def maximize(self) -> None:
+        """Searches by L-BFGS in a box around the data that holds the start."""
+        log_inputs, trainer = self._unit.log().numpy(), self._trainer
+        boxes = [search_box(log_inputs, own, _SIGNAL_TO_NOISE) for own in np.log(column_std(self._y.numpy()))]
+        smallest, largest = ((edge / self._unit).numpy() for edge in (self._x.amin(0), self._x.amax(0)))
+        margin, count = 0.1 * (largest - smallest), (len(self.best) - self._shape[0] * self._shape[1]) // len(smallest)
+        lower, upper = (np.concatenate(side) for side in zip(*boxes, strict=True))
+        # A feature that the subset saw at rest has a length-scale beyond any box (IGNORED); it stays there.
+        lower = np.minimum(np.append(lower, np.tile(smallest - margin, count)), self.best)
+        upper = np.maximum(np.append(upper, np.tile(largest + margin, count)), self.best)
+        if self._trainer.iterations:  # of none L-BFGS-B makes one
+            limits = {"maxiter": trainer.iterations, "maxfun": 3 * trainer.iterations + 1}
+            minimize(
+                self,
+                self.best,
+                jac=True,
+                method="L-BFGS-B",
+                bounds=np.column_stack([lower, upper]),
+                callback=self._report,
+                options={"ftol": _TOLERANCE, "gtol": 1e-6, **limits},
+            )
 
     def parts(self, vector: Tensor) -> tuple[Tensor, Tensor]:
         """Rows of theta (k, d + 2) and Z (M, d)."""
-        split = self.shape[0] * self.shape[1]
-        return vector[:split].reshape(self.shape), vector[split:].reshape(self.count, -1) * self.unit
+        split = self._shape[0] * self._shape[1]
+        return vector[:split].reshape(self._shape), vector[split:].reshape(-1, len(self._unit)) * self._unit
+
+    def values(self) -> np.ndarray:
+        """Minus the bound of every output (k,) at the best point; infinite where a matrix is not positive definite."""
+        with torch.no_grad():
+            return self._bounds(torch.from_numpy(self.best)).numpy()
 
     def __call__(self, vector: np.ndarray) -> tuple[float, np.ndarray]:
         """The sum over the outputs, and its gradient."""
@@ -235,26 +227,19 @@ class _Bound:
                 gradient = torch.as_tensor(variables.grad).numpy()
         if not np.isfinite(gradient).all():
             return FAILED, np.zeros_like(vector)
-        self._last = value
         if value < self._least:
             self.best, self._least = vector.copy(), value
         return value, gradient
 
-    def values(self, vector: np.ndarray) -> np.ndarray:
-        """Minus the bound of every output (k,); infinite where a matrix is not positive definite."""
-        with torch.no_grad():
-            return self._bounds(torch.from_numpy(vector)).numpy()
-
-    def report(self, _: np.ndarray) -> None:
-        """One line of the log every ``_EVERY`` iterations."""
-        self.iteration += 1
-        if self.iteration % _EVERY == 0:
-            _log.info("sparse training: iteration %d, minus the bound %.6g", self.iteration, self._last)
+    def _report(self, _: np.ndarray) -> None:
+        self._iterations += 1
+        if self._iterations % _EVERY == 0:
+            _log.info("sparse training: iteration %d, minus the bound %.6g", self._iterations, self._least)
 
     def _bounds(self, vector: Tensor) -> Tensor:
         theta, Z = self.parts(vector)
-        kernel, trainer = Hyperparameters.from_theta(theta), self.trainer
         try:
-            return -collapsed_bound(Z, self.x, self.y, kernel, trainer.method, trainer.jitter)
+            kernel = Hyperparameters.from_theta(theta)
+            return -collapsed_bound(Z, self._x, self._y, kernel, self._trainer.method, JITTER)
         except (SettingError, torch.linalg.LinAlgError):  # pyright: ignore[reportPrivateImportUsage]
-            return torch.full(self.shape[:1], torch.inf, dtype=torch.float64)
+            return torch.full(self._shape[:1], torch.inf, dtype=torch.float64)

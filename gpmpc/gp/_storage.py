@@ -2,17 +2,22 @@
 
 The metadata entry ``gpmpc`` holds the header as JSON: kind, dimensions, versions, names and units where they are known,
 and a checksum of everything; any safetensors library opens the file where gpmpc is not installed. Reading runs no code,
-and the declared sizes are compared with the file's before memory is allocated. Older ``.npz`` files are read too.
+and the declared sizes are compared with the file's before memory is allocated.
 
 The Cholesky factor is stored (its lower triangle): factorising again would give other last digits, and the factor of a
 posterior that was updated or made sparse does not follow from its hyperparameters at all. The header also keeps the
 order in which a tensor's dimensions lie in memory, because BLAS rounds differently for each; so a loaded model predicts
 bit by bit what the saved one does.
+
+Transitions, and the models of gpmpc 1, are ``.npz``: a zip of ``.npy`` arrays, each with its own CRC-32, and mostly of
+a ``header.json`` with a checksum of itself and of the arrays' names, sizes and CRCs.
 """
 
 import hashlib
+import io
 import json
 import math
+import zipfile
 from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
@@ -27,13 +32,14 @@ from torch import Tensor
 from gpmpc._files import existing_file, new_file, write_whole
 from gpmpc._provenance import now, versions
 from gpmpc.exceptions import DataError, GpmpcError, SettingError, UnsupportedModel
-from gpmpc.gp._archive import read_npz
 from gpmpc.gp._kernel import check_posterior
 from gpmpc.gp._posterior import GPPosterior
 
 _FORMAT, _VERSION = "gpmpc model", 2
 _DTYPES = {torch.float64: "float64", torch.float32: "float32"}
 _LONGEST = 2**20  # characters of a header
+_HEADER = "header.json"
+_EXPANSION = 20  # times what a file holds: more than numbers shrink by
 
 
 def save_posterior(posterior: GPPosterior, path: str | Path, metadata: Mapping[str, Any] | None = None) -> None:
@@ -65,8 +71,7 @@ def load_posterior(path: str | Path) -> GPPosterior:
 
 def load_metadata(path: str | Path) -> dict[str, Any]:
     """Reads the header of a model file: kind, dimensions, versions, and the metadata it was saved with."""
-    path = existing_file(path, "a saved model")
-    return _checked_header(path, "model", _content(path, "model", header_only=True)[0])
+    return _content(existing_file(path, "a saved model"), "model", header_only=True)[0]
 
 
 def posterior_parts(path: Path, posterior: GPPosterior) -> tuple[dict[str, Any], dict[str, Tensor]]:
@@ -92,22 +97,11 @@ def posterior_of_parts(path: Path, header: Any, tensors: Mapping[str, Tensor]) -
     if missing:
         raise DataError(f"{path}: array {missing[0]!r} is missing; expected {', '.join(names)}")
     found = {name: tensors[name] for name in names}
-    for name, value in found.items():
-        if value.dtype != found["features"].dtype:
-            raise DataError(f"{path}: {name} must be {found['features'].dtype}; got {value.dtype}")
-        for part in value if value.dim() == 3 else [value]:  # a factor takes no second copy of itself
-            if not bool(torch.isfinite(part).all()):
-                raise DataError(f"{path}: {name} must be finite; got {float(part[~torch.isfinite(part)][0])}")
-    small = {name: value.double() for name, value in found.items() if name not in ("cholesky", "weights")}
     try:
         predicts, m = header["predicts"], header["input_dim"]
-        check_posterior(small, m, predicts)
+        check_posterior(found, m, predicts, found["features"].dtype)
     except (GpmpcError, KeyError, TypeError) as error:
         raise DataError(f"{path}: not a consistent posterior ({error})") from error
-    (size, _), k = found["features"].shape, found["targets"].shape[1]
-    for name, shape in (("cholesky", (k, size, size)), ("weights", (k, size))):
-        if tuple(found[name].shape) != shape:
-            raise DataError(f"{path}: {name} must have shape {shape}; got {tuple(found[name].shape)}")
     if not bool((found["cholesky"].diagonal(dim1=-2, dim2=-1) > 0).all()):
         raise DataError(f"{path}: the diagonal of cholesky must be positive")
     return GPPosterior(**found, input_dim=m, predicts=predicts)
@@ -145,20 +139,62 @@ def write_model(
 def read_model(path: Path, kind: str) -> tuple[dict[str, Any], dict[str, Tensor]]:
     """Reads the header and the tensors of a model file of a kind, in host memory; errors are of ``load_posterior``."""
     header, arrays = _content(path, kind)
-    _checked_header(path, kind, header)
-    if header.get("kind") != kind:
-        raise DataError(f"{path}: holds a {header.get('kind')}; expected a {kind}")
-    if header.get("kernel") != "SE-ARD":
-        raise DataError(f"{path}: has the kernel {header.get('kernel')!r}; expected 'SE-ARD'")
+    for got, expected in ((header.get("kind"), kind), (header.get("kernel"), "SE-ARD")):
+        if got != expected:
+            raise DataError(f"{path}: holds a {got}; expected a {expected}")
     try:
         if not _is_npz(path) and header["checksum"] != _checksum(header, arrays):
             raise ValueError("the checksum of its parts differs from the one in its header")
         return header, {name: _restored(name, arrays.pop(name), header["memory_order"][name]) for name in list(arrays)}
     except Exception as error:
-        raise DataError(f"{path}: damaged; expected a saved {kind} ({_line(error)})") from error
+        raise DataError(f"{path}: damaged; expected a saved {kind} ({' '.join(str(error).split())})") from error
 
 
-def _checked_header(path: Path, kind: str, header: Any) -> dict[str, Any]:
+def write_npz(header: dict[str, Any], arrays: Mapping[str, np.ndarray]) -> bytes:
+    """The content of a ``.npz`` file that holds a header and named arrays, uncompressed."""
+    content = io.BytesIO()
+    np.savez(content, allow_pickle=False, **arrays)
+    with zipfile.ZipFile(content, "a") as archive:
+        archive.writestr(_HEADER, json.dumps(header | {"checksum": _npz_checksum(header, archive)}, indent=2))
+    return content.getvalue()
+
+
+def read_npz(path: Path, names: tuple[str, ...] | None = None) -> tuple[Any, dict[str, np.ndarray]]:
+    """The header, None where there is none, and the arrays of a file, all of them or those of the given names.
+
+    Damage makes zipfile, json and NumPy raise whatever they come upon first: callers take any exception for one and
+    name the file.
+    """
+    size = path.stat().st_size
+    with zipfile.ZipFile(path) as archive:
+        declared = sum(info.file_size for info in archive.infolist())
+        if declared > _EXPANSION * size:
+            raise ValueError(f"declares {declared} bytes, more than a file of {size} bytes can hold")
+        header = json.loads(archive.read(_HEADER)) if _HEADER in archive.namelist() else None
+        if isinstance(header, dict) and header.get("checksum", expected := _npz_checksum(header, archive)) != expected:
+            raise ValueError("the checksum of its parts differs from the one in its header")
+        if (damaged := archive.testzip()) is not None:  # compares the CRCs
+            raise ValueError(f"{damaged} is damaged")
+    with np.load(path, allow_pickle=False) as file:
+        return header, {name: file[name] for name in file.files if name != _HEADER and (not names or name in names)}
+
+
+def _content(path: Path, kind: str, header_only: bool = False) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """The header and the arrays of a model file; damage makes libraries raise whatever they meet first."""
+    try:
+        if _is_npz(path):
+            header, arrays = read_npz(path)
+        else:
+            with safetensors.safe_open(path, framework="numpy") as file:
+                text = (file.metadata() or {}).get("gpmpc", "null")
+                if len(text) > _LONGEST:
+                    raise ValueError(f"its header is longer than {_LONGEST} characters")
+                header = json.loads(text)
+                wanted = [] if header_only or not isinstance(header, dict) else file.keys()
+                arrays = {name: file.get_tensor(name) for name in wanted}
+    except Exception as error:
+        what = f"damaged, or not a file of this package; expected a saved {kind}"
+        raise DataError(f"{path}: {what} ({' '.join(str(error).split())})") from error
     if not isinstance(header, dict) or header.get("format") != _FORMAT:
         raise DataError(f"{path}: a file of something else; expected a saved {kind}")
     version = header.get("format_version")
@@ -167,24 +203,7 @@ def _checked_header(path: Path, kind: str, header: Any) -> dict[str, Any]:
             f"{path}: written in format {version!r} (versions {header.get('versions')}); this version reads up to "
             f"{_VERSION}: update gpmpc"
         )
-    return header
-
-
-def _content(path: Path, kind: str, header_only: bool = False) -> tuple[Any, dict[str, np.ndarray]]:
-    """The header and the arrays of a file of either format; damage makes libraries raise whatever they meet first."""
-    try:
-        if _is_npz(path):
-            return read_npz(path)
-        with safetensors.safe_open(path, framework="numpy") as file:
-            text = (file.metadata() or {}).get("gpmpc", "null")
-            if len(text) > _LONGEST:
-                raise ValueError(f"its header is longer than {_LONGEST} characters")
-            header = json.loads(text)
-            of_package = isinstance(header, dict) and not header_only
-            return header, {name: file.get_tensor(name) for name in file.keys()} if of_package else {}  # noqa: SIM118
-    except Exception as error:
-        what = f"damaged, or not a file of this package; expected a saved {kind}"
-        raise DataError(f"{path}: {what} ({_line(error)})") from error
+    return header, arrays
 
 
 def _is_npz(path: Path) -> bool:
@@ -192,13 +211,17 @@ def _is_npz(path: Path) -> bool:
         return file.read(2) == b"PK"
 
 
-def _line(error: Exception) -> str:
-    return " ".join(str(error).split())
+def _without_checksum(header: dict[str, Any]) -> dict[str, Any]:
+    return {key: value for key, value in header.items() if key != "checksum"}
+
+
+def _npz_checksum(header: dict[str, Any], archive: zipfile.ZipFile) -> str:
+    parts = sorted((i.filename, i.file_size, i.CRC) for i in archive.infolist() if i.filename.endswith(".npy"))
+    return hashlib.sha256(json.dumps([_without_checksum(header), parts], sort_keys=True).encode()).hexdigest()
 
 
 def _checksum(header: dict[str, Any], arrays: Mapping[str, np.ndarray]) -> str:
-    said = {key: value for key, value in header.items() if key != "checksum"}
-    found = hashlib.sha256(json.dumps(said, sort_keys=True).encode())
+    found = hashlib.sha256(json.dumps(_without_checksum(header), sort_keys=True).encode())
     for name in sorted(arrays):
         found.update(f"{name} {arrays[name].dtype} {arrays[name].shape}".encode())
         found.update(arrays[name].data if arrays[name].size else b"")

@@ -1,14 +1,13 @@
 """Training of one exact GP per output by maximum marginal likelihood (Cao, Lai and Alam, 2017, eq. (9)).
 
-Each output is fitted on its own, over theta = (log length-scales, log sf, log(sf / sn)) inside a wide box; see
-``gpmpc.gp._search``. Exact GPs are cubic in time and square in memory over the points: one factor of 200 MB an output
-at N = 5000. What cannot fit is refused before the work.
+Each output is fitted on its own; see ``gpmpc.gp._search``. What cannot fit the memory is refused before the work.
 """
 
-import logging
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,24 +18,21 @@ from torch import Tensor
 from gpmpc.exceptions import DataError, SettingError, TrainingError, UnsupportedModel, check_choice, check_number
 from gpmpc.gp._kernel import PREDICTS, Hyperparameters, Predicts
 from gpmpc.gp._likelihood import FAILED
-from gpmpc.gp._memory import GIB, available_memory
 from gpmpc.gp._online import targets_of
 from gpmpc.gp._posterior import GPPosterior
 from gpmpc.gp._scaling import Scaling, centre
 from gpmpc.gp._search import (
-    SearchProblem,
+    OutputSearch,
     column_std,
     constant_columns,
-    find_hyperparameters,
     log_hyperparameters,
     restored_theta,
     training_data,
 )
 from gpmpc.gp._transitions import Transitions, check_transitions
 
-_log = logging.getLogger(__name__)
 _ONE_THREAD = 1000  # points below which LAPACK's threads wait for each other longer than they work
-_MANY = 1000  # points: from here on the log has a line an output
+_GIB = 2**30
 
 
 @dataclass(frozen=True)
@@ -106,13 +102,8 @@ class Trainer:
     def refit(self, posterior: GPPosterior, transitions: Transitions | None = None, seed: int = 0) -> Training:
         """Trains on the points a posterior holds, and on new ones, from its hyperparameters on.
 
-        With ``restarts=0`` only from them on. The prior mean is that of this trainer's scaling, as in any training;
-        what the posterior predicts and its number of inputs stay.
-
-        Raises:
-            UnsupportedModel: It is no ``GPPosterior``, or stands on a sparse model's pseudo-observations.
-            ShapeError: The transitions have other dimensions.
-            TrainingError: Every start failed for an output, which is named.
+        With ``restarts=0`` only from them on. The prior mean is that of this trainer's scaling, as in any training.
+        Errors are as of ``fit``; ``UnsupportedModel`` of a sparse model's pseudo-observations, too.
         """
         _check_start("posterior", posterior)
         if not posterior.has_observation_noise:
@@ -145,9 +136,8 @@ class Trainer:
             start: Its hyperparameters are the first start instead; the random ones stay where they are.
 
         Raises:
-            ShapeError: Features and targets do not belong together, or ``start`` has other dimensions.
-            SettingError: They are no float64 tensors in host memory, or the seed is no whole number.
-            UnsupportedModel: ``start`` is no ``GPPosterior``.
+            ShapeError, SettingError, UnsupportedModel: Features, targets and ``start`` do not belong together, or are
+                not in float64 and in host memory.
             DataError: An entry is not finite, or the kernel matrices would not fit the memory that is available.
             TrainingError: Every start failed for an output, which is named.
         """
@@ -170,30 +160,25 @@ class Trainer:
         converged = start is not None and not self.restarts  # a subset could not improve on where the search begins
         if self.subset is not None and size > self.subset and not converged:
             rows = np.sort(rng.permutation(size)[: self.subset])
-        std = column_std(features.numpy()) / feature_scaling.factor.numpy()
-        found, constant = [], constant_columns(features.numpy())
+        std, constant = column_std(features.numpy()), constant_columns(features.numpy())
+        std = std / feature_scaling.factor.numpy()
+        found, evaluations = [], 0
         for a in range(outputs):
-            name = f"output {a + 1} of {outputs}"
             deadline = np.inf if self.time_limit is None else begin + self.time_limit * (a + 1) / outputs
-            problem = SearchProblem(name, x, y[:, a], first[a], perturbations[a], rows, std, constant, deadline)
+            search = OutputSearch(f"output {a + 1} of {outputs}", x, y[:, a], std, constant, self, deadline)
             with threadpool_limits(1 if size < _ONE_THREAD else None, user_api="blas"):
-                found.append(find_hyperparameters(problem, self))
-            if problem.is_late():
-                _log.info("training: %s: its share of time_limit=%g s is over", name, self.time_limit)
-            if size > _MANY:
-                _log.info("training: %s: %d evaluations, %.1f s", name, found[-1].evaluations, found[-1].seconds)
-        failed = [a for a, one in enumerate(found) if one.objective >= FAILED]
-        if failed:
+                found.append(search(first[a], perturbations[a], rows))
+            evaluations += search.evaluations
+        theta, objective, explored = map(np.array, zip(*found, strict=True))
+        if failed := np.flatnonzero(objective >= FAILED).tolist():
             raise TrainingError(
                 failed,
-                f"no start of {len(found[0].explored)} led to a positive definite kernel matrix for output "
-                f"{', '.join(str(a) for a in failed)}: lower signal_to_noise_limit, or remove duplicate rows",
+                f"no start of {explored.shape[1]} led to a positive definite kernel matrix for output "
+                f"{', '.join(map(str, failed))}: lower signal_to_noise_limit, or remove duplicate rows",
             )
-        theta = restored_theta(np.array([one.theta for one in found]), feature_scaling, target_scaling)
+        theta = restored_theta(theta, feature_scaling, target_scaling)
         kernel, offset = Hyperparameters.from_theta(torch.from_numpy(theta)), target_scaling.offset
         posterior = GPPosterior.from_hyperparameters(features, targets, *kernel, input_dim, predicts, offset)
-        objective, explored = (np.array([getattr(one, key) for one in found]) for key in ("objective", "explored"))
-        evaluations = sum(one.evaluations for one in found)
         return Training(posterior, theta, objective, explored, evaluations, time.perf_counter() - begin)
 
 
@@ -214,7 +199,28 @@ def _check_memory(size: int, outputs: int) -> None:
     if free is None or needed <= free:
         return
     raise DataError(
-        f"exact GPs of {size} points and {outputs} outputs need {needed / GIB:.3g} GiB, {8 * size**2 / GIB:.3g} GiB a "
-        f"kernel matrix; {free / GIB:.3g} GiB are available: train on {int((free / needed) ** 0.5 * size)} points or "
-        "fewer, or sparse GPs (SparseTrainer)"
+        f"exact GPs of {size} points and {outputs} outputs need {needed / _GIB:.3g} GiB, {8 * size**2 / _GIB:.3g} GiB "
+        f"a kernel matrix; {free / _GIB:.3g} GiB are available: train on {int((free / needed) ** 0.5 * size)} points "
+        "or fewer, or sparse GPs (SparseTrainer)"
     )
+
+
+def available_memory(system: Path = Path("/")) -> int | None:
+    """Bytes that this process may still take without swapping; None where the system does not say.
+
+    What Linux calls available, or what the process's control groups (v2; a container, a Slurm job) leave, whichever is
+    less; file pages that can be dropped count as free.
+    """
+    groups, left = system / "sys/fs/cgroup", []
+    with suppress(OSError):
+        lines = (system / "proc/meminfo").read_text().splitlines()
+        left += [1024 * int(line.split()[1]) for line in lines if line.startswith("MemAvailable:")]
+    with suppress(OSError):
+        lines = (system / "proc/self/cgroup").read_text().splitlines()
+        own = [groups / line[3:].strip("/") for line in lines if line.startswith("0::")]
+        for folder in {folder for group in own for folder in (group, *group.parents)}:
+            with suppress(OSError, ValueError):  # "max" where there is no limit
+                pages = dict(line.split() for line in (folder / "memory.stat").read_text().splitlines())
+                used = int((folder / "memory.current").read_text()) - int(pages.get("inactive_file", 0))
+                left.append(int((folder / "memory.max").read_text()) - used)
+    return max(min(left), 0) if left else None

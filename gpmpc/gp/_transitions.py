@@ -17,7 +17,7 @@ from torch import Tensor
 
 from gpmpc._files import existing_file, new_file, write_whole
 from gpmpc.exceptions import DataError, GpmpcError, SettingError, ShapeError, UnsupportedModel, check_number
-from gpmpc.gp._archive import read_npz, write_npz
+from gpmpc.gp._storage import read_npz, write_npz
 
 _NAMES = ("states", "inputs", "next_states")
 _EXPECTED = "a file of transitions"
@@ -52,20 +52,18 @@ class Transitions:
                 raise DataError(f"{name} must be numbers in rows and columns; {error}") from error
             if value.dim() != 2:
                 raise ShapeError(f"{name} must have two dimensions (rows, columns); got shape {tuple(value.shape)}")
+            for row, column in torch.nonzero(~torch.isfinite(value))[:1].tolist():
+                got = f"{float(value[row, column])} in row {row + 1}, column {column + 1}"
+                raise DataError(f"{name} must be finite; got {got}")
             object.__setattr__(self, name, value)
-        if not len(self.states) == len(self.inputs) == len(self.next_states):
-            raise ShapeError(
-                "states, inputs and next_states must have the same number of rows; "
-                f"got {len(self.states)}, {len(self.inputs)} and {len(self.next_states)}"
-            )
+        sizes = len(self.states), len(self.inputs), len(self.next_states)
+        if len(set(sizes)) > 1:
+            text = "states, inputs and next_states must have the same number of rows"
+            raise ShapeError(f"{text}; got {sizes[0]}, {sizes[1]} and {sizes[2]}")
         if (n := self.states.shape[1]) != (found := self.next_states.shape[1]):
             raise ShapeError(f"states and next_states must have the same number of columns; got {n} and {found}")
         if not len(self.states):
             raise DataError("transitions need at least one row; got none")
-        for name in _NAMES:
-            for row, column in torch.nonzero(~torch.isfinite(values := getattr(self, name)))[:1].tolist():
-                value = float(values[row, column])
-                raise DataError(f"{name} must be finite; got {value} in row {row + 1}, column {column + 1}")
 
     def __len__(self) -> int:
         return len(self.states)
@@ -136,12 +134,10 @@ class Transitions:
         """
         check_number("state_dim", state_dim, least=1, whole=True)
         check_number("input_dim", input_dim, least=0, whole=True)
-        path, n, m = existing_file(path, _EXPECTED), state_dim, input_dim
+        n, width = state_dim, 2 * state_dim + input_dim
         lines = enumerate(map(str.split, _text(path).splitlines()), start=1)
-        columns = {number: number - 1 for number in range(1, 2 * n + m + 1)}
-        said = f"{2 * n + m} ({n} states, {m} inputs, {n} next states)"
-        table = _table(path, lines, columns, 2 * n + m, said, least=1)
-        return _with_path(path, table[:, :n], table[:, n : n + m], table[:, n + m :])
+        table = _table(path, lines, {number: number - 1 for number in range(1, width + 1)}, width)
+        return _with_path(path, table[:, :n], table[:, n:-n], table[:, -n:])
 
     @classmethod
     def from_csv(
@@ -160,27 +156,26 @@ class Transitions:
             SettingError: One name was given where a list of them belongs.
             DataError: The file or a column is missing, or an entry is no finite number.
         """
-        for key, names in (("states", states), ("inputs", inputs), ("next_states", next_states)):
-            if isinstance(names, str) or not (isinstance(names, Iterable) or (key == "next_states" and names is None)):
-                single = "the single name " if isinstance(names, str) else ""
-                raise SettingError(key, f"must be a list of column names; got {single}{names!r}")
-        path = existing_file(path, _EXPECTED)
+        for key, names in (("states", states), ("inputs", inputs), ("next_states", next_states or ())):
+            if isinstance(names, str) or not isinstance(names, Iterable):
+                raise SettingError(key, f"must be a list of column names; got {names!r}")
         text = _text(path)
         reader = csv.reader(io.StringIO(text), delimiter=max(",;\t", key=text.partition("\n")[0].count))
         try:
             (_, header), *lines = [(reader.line_num, fields) for fields in reader] or [(1, [])]
         except csv.Error as error:
             raise DataError(f"{path}: row {reader.line_num} cannot be read ({error})") from error
-        names = [name.strip() for name in header]
-        wanted = [*states, *inputs, *(next_states or ())]
+        header, wanted = [name.strip() for name in header], [*states, *inputs, *(next_states or ())]
         for name in wanted:
-            if names.count(name) != 1:
-                problem = "is missing" if name not in names else "stands there twice"
-                raise DataError(f"{path}: column {name!r} {problem}; the header has {', '.join(names) or 'no columns'}")
-        places = {name: names.index(name) for name in wanted}
-        table = _table(path, lines, places, len(names), f"{len(names)} as in the header", least=1 if next_states else 2)
-        parts = (states, inputs, next_states or states)
-        x, u, after = (table[:, [list(places).index(name) for name in part]] for part in parts)
+            if header.count(name) != 1:
+                problem = "stands there twice" if name in header else "is missing"
+                raise DataError(
+                    f"{path}: column {name!r} {problem}; the header has {', '.join(header) or 'no columns'}"
+                )
+        places = {name: header.index(name) for name in wanted}
+        table = _table(path, lines, places, len(header), least=1 if next_states else 2)
+        column = list(places).index
+        x, u, after = (table[:, list(map(column, part))] for part in (states, inputs, next_states or states))
         return _with_path(path, x, u, after) if next_states else _with_path(path, x[:-1], u[:-1], after[1:])
 
 
@@ -206,7 +201,8 @@ def _real(values: Any) -> Tensor:
     return values.to(torch.float64)
 
 
-def _text(path: Path) -> str:
+def _text(path: str | Path) -> str:
+    path = existing_file(path, _EXPECTED)
     try:
         return path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
@@ -214,18 +210,13 @@ def _text(path: Path) -> str:
 
 
 def _table(
-    path: Path,
-    lines: Iterable[tuple[int, list[str]]],
-    columns: Mapping[Any, int],
-    width: int,
-    expected: str,
-    least: int,
+    path: str | Path, lines: Iterable[tuple[int, list[str]]], columns: Mapping[Any, int], width: int, least: int = 1
 ) -> np.ndarray:
     """The numbers in the columns, at the places by their names, of ``least`` or more lines that are not empty."""
     rows = []
     for line, fields in lines:
         if fields and len(fields) != width:
-            raise DataError(f"{path}: row {line} has {len(fields)} columns; expected {expected}")
+            raise DataError(f"{path}: row {line} has {len(fields)} columns; expected {width}")
         if fields:
             rows.append([_number(path, line, name, fields[place]) for name, place in columns.items()])
     if len(rows) < least:
@@ -233,7 +224,7 @@ def _table(
     return np.array(rows)
 
 
-def _number(path: Path, row: int, column: int | str, field: str) -> float:
+def _number(path: str | Path, row: int, column: int | str, field: str) -> float:
     try:
         value = float(field)
     except ValueError:
@@ -243,7 +234,7 @@ def _number(path: Path, row: int, column: int | str, field: str) -> float:
     return value
 
 
-def _with_path(path: Path, states: Any, inputs: Any, next_states: Any) -> Transitions:
+def _with_path(path: str | Path, states: Any, inputs: Any, next_states: Any) -> Transitions:
     try:
         return Transitions(states, inputs, next_states)
     except GpmpcError as error:

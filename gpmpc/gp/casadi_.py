@@ -2,11 +2,8 @@
 
     mean_a = offset_a + sum_i beta_ai k_ai (+ x_a),   variance_a = sf2_a - |L_a^-1 k_a|^2,   k_ai = k_a(x~_i, x~)
 
-is written with a dozen matrix nodes of CasADi's MX: one for all squared distances, one triangular product an output. So
-the graph stays as small with 189 points as with 10, evaluates at the speed of its loops, and CasADi derives exact
-Jacobians and Hessians from it (Andersson, Gillis, Horn, Rawlings and Diehl, 2019).
-
-Importing this file loads CasADi; ``gpmpc.gp`` does not import it.
+is written with a dozen matrix nodes of CasADi's MX, whatever N, from which CasADi derives exact Jacobians and Hessians
+(Andersson, Gillis, Horn, Rawlings and Diehl, 2019). Importing this file loads CasADi; ``gpmpc.gp`` does not.
 """
 
 from collections.abc import Sequence
@@ -41,13 +38,12 @@ def casadi_function(model: Any, name: str = "gp") -> casadi.Function:
     Raises:
         UnsupportedModel: The nominal model or the effect is a Python function, or it is another model.
     """
-    form = getattr(model, "affine_form", None)
     x, u = casadi.MX.sym("state", model.state_dim), casadi.MX.sym("input", model.input_dim)
-    if form is None or form.B is not None:
+    if isinstance(model, GPPosterior):
+        mean, variance = _moments(model, x, u)
+        mean = mean + x if model.predicts == "difference" else mean
+    else:
         mean, variance = _residual(model, x, u)
-    else:  # GPs alone, of next states or of differences
-        mean, variance = _moments(form.f, x, u)
-        mean = mean if form.A is None else mean + x
     return casadi.Function(name, [x, u], [mean, variance], ["state", "input"], ["mean", "variance"])
 
 
@@ -69,8 +65,11 @@ def _residual(model: Any, x: casadi.MX, u: casadi.MX) -> tuple[casadi.MX, casadi
         raise UnsupportedModel(
             f"CasADi can take a GPPosterior, or a ResidualModel of Affine, CasadiFunction and numbers; got {got}"
         )
-    features = _features(x, model.states, model.angles)
-    mean, variance = _moments(model.residual, features, _selected(u, model.inputs))
+    seen: list[Any] = []  # angles as sine and cosine
+    for i in model.states:
+        seen += [casadi.sin(x[i]), casadi.cos(x[i])] if i in model.angles else [x[i]]
+    features, selected = (casadi.vertcat(casadi.MX(0, 1), *some) for some in (seen, [u[i] for i in model.inputs]))
+    mean, variance = _moments(model.residual, features, selected)
     matrix = _numbers(B) if effect is None else effect(x)
     if affine:
         A, G, c = (_numbers(getattr(nominal, part)) for part in "ABc")
@@ -78,19 +77,6 @@ def _residual(model: Any, x: casadi.MX, u: casadi.MX) -> tuple[casadi.MX, casadi
     else:
         moved = nominal.function(x, u)
     return moved + matrix @ mean, matrix**2 @ variance
-
-
-def _features(x: casadi.MX, states: Sequence[int], angles: Sequence[int]) -> casadi.MX:
-    """Some states, angles among them as sine and cosine."""
-    entries = []
-    for i in states:
-        entries += [casadi.sin(x[i]), casadi.cos(x[i])] if i in angles else [x[i]]
-    return casadi.vertcat(*entries) if entries else casadi.MX(0, 1)
-
-
-def _selected(vector: casadi.MX, entries: Sequence[int]) -> casadi.MX:
-    """Some entries of a vector, perhaps none."""
-    return vector[list(entries)] if len(entries) else casadi.MX(0, 1)
 
 
 def _moments(gp: GPPosterior, x: casadi.MX, u: casadi.MX) -> tuple[casadi.MX, casadi.MX]:

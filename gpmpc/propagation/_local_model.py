@@ -21,8 +21,7 @@ from torch import Tensor
 from gpmpc._dynamics import Array, tensors_for, to_array
 from gpmpc.exceptions import ShapeError
 from gpmpc.gaussian import Gaussian, check_tensors
-from gpmpc.propagation._propagator import Propagator
-from gpmpc.propagation._sensitivity import differentiate
+from gpmpc.propagation._propagator import Propagator, differentiate
 
 
 @dataclass(frozen=True)

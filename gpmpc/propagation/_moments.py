@@ -34,11 +34,26 @@ from torch import Tensor
 
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior
-from gpmpc.propagation._composition import Latent
 
 _ENTRIES = 2**18  # of what is made at once of each kind, for one pair of outputs at least
 _Pairs = tuple[list[int], list[int]]
+_NOT_WANTED: Any = None
 _LARGEST = {torch.float64: 300.0, torch.float32: 80.0}  # delta
+
+
+class Latent(NamedTuple):
+    """Moments of f at x_s ~ N(mu_s, S_s), with derivatives by mu_s, S_s and u_s where they are wanted."""
+
+    M: Tensor  # E[f] (*batch, k)
+    V: Tensor  # Cov[f] (*batch, k, k)
+    J: Tensor  # E[df/dx_s] (*batch, k, n_s)
+    dM_dS: Tensor = _NOT_WANTED  # (*batch, k, n_s, n_s); half of dJ/dmu (Price, 1958)
+    dM_du: Tensor = _NOT_WANTED  # (*batch, k, m_s)
+    dV_dmu: Tensor = _NOT_WANTED  # (*batch, k, k, n_s)
+    dV_dS: Tensor = _NOT_WANTED  # (*batch, k, k, n_s, n_s)
+    dV_du: Tensor = _NOT_WANTED  # (*batch, k, k, m_s)
+    dJ_dS: Tensor = _NOT_WANTED  # (*batch, k, n_s, n_s, n_s); needed where A is not zero
+    dJ_du: Tensor = _NOT_WANTED  # (*batch, k, n_s, m_s); needed where A is not zero
 
 
 class _OutputTerms(NamedTuple):

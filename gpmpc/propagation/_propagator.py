@@ -1,4 +1,4 @@
-"""The protocol of propagation: a Gaussian belief over the state moved one step on through a model."""
+"""A Gaussian belief over the state moved one step on through a model, and the derivatives of that step."""
 
 from dataclasses import dataclass
 from typing import Any, Protocol
@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gpmpc._dynamics import check_query
+from gpmpc._dynamics import batched_jacobian, check_query
 from gpmpc.exceptions import DataError, SettingError
 from gpmpc.gaussian import Gaussian, check_tensors, constant_arrays, nearest_positive_semidefinite
 
@@ -21,6 +21,22 @@ class Propagation:
     #: how far below zero the covariance's smallest eigenvalue was before the projection (*batch,). More than round-off
     #: of the largest entry: the model is too nearly noise-free for double precision
     deficit: Tensor
+
+
+@dataclass(frozen=True)
+class Sensitivity:
+    """Derivatives of the next belief N(mu+, Sigma+) at a belief N(mu, Sigma) and an input u; k outputs, mostly k = n.
+
+    Those by Sigma are symmetric in their last two indices: d mu+_a = sum_cd mean_by_covariance[a, c, d] dSigma[c, d]
+    for symmetric dSigma.
+    """
+
+    mean_by_mean: Tensor  #: (*batch, k, n)
+    mean_by_covariance: Tensor  #: (*batch, k, n, n)
+    mean_by_input: Tensor  #: (*batch, k, m)
+    covariance_by_mean: Tensor  #: (*batch, k, k, n)
+    covariance_by_covariance: Tensor  #: (*batch, k, k, n, n)
+    covariance_by_input: Tensor  #: (*batch, k, k, m)
 
 
 class Propagator(Protocol):
@@ -59,14 +75,70 @@ class NoisyPropagator(Propagator):
     def __init__(self, process_noise: bool = False):
         self.process_noise = process_noise
 
+    def propagate(self, model: Any, belief: Gaussian, input: Tensor | None = None) -> Propagation:
+        """Moves a belief one step on; see ``Propagator.propagate``."""
+        return self._projected(model, *self._moved(model, belief, checked_input(model, belief, input)))
+
+    def _moved(self, model: Any, belief: Gaussian, input: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Mean, covariance and Cov[x, x+] of the next state, without process noise."""
+        raise NotImplementedError
+
     def _projected(self, model: Any, mean: Tensor, covariance: Tensor, cross: Tensor) -> Propagation:
-        """Adds the process noise, if any, and projects the covariance; ``cross`` is Cov[x, x+]."""
+        """Adds the process noise, if any, and projects the covariance."""
         if self.process_noise:
             covariance = covariance + model.noise_covariance
         if self.diagonal:
             covariance = torch.diag_embed(covariance.diagonal(dim1=-2, dim2=-1))
         covariance, deficit = nearest_positive_semidefinite(covariance)
         return Propagation(Gaussian(mean, covariance), cross, deficit)
+
+
+def differentiate(
+    propagator: Propagator, model: Any, belief: Gaussian, input: Tensor | None = None
+) -> tuple[Propagation, Sensitivity]:
+    """Moves a belief one step on, with its derivatives.
+
+    Args:
+        propagator: How.
+        model: A ``DynamicsModel``.
+        belief: Mean (*batch, n), covariance (*batch, n, n).
+        input: (*batch, m); may be left out where m = 0.
+
+    Returns:
+        What ``propagator.propagate`` returns, and the derivatives. Where the covariance had to be projected they are
+        those of the projection (autograd) or of what was projected (closed form).
+    """
+    closed_form = getattr(propagator, "differentiate", None)
+    if closed_form is not None and (found := closed_form(model, belief, input)) is not None:
+        return found
+    return by_autograd(propagator, model, belief, input)
+
+
+def by_autograd(
+    propagator: Propagator, model: Any, belief: Gaussian, input: Tensor | None = None
+) -> tuple[Propagation, Sensitivity]:
+    """``differentiate`` by torch autograd, for any propagator and model that torch can follow."""
+    input, n, k = checked_input(model, belief, input), belief.dim, model.output_dim
+    with torch.inference_mode(False):  # inference tensors, constants too, could not be saved for backward
+        rows, columns = torch.tril_indices(k, k, device=belief.mean.device)
+    batch = belief.mean.shape[:-1]
+
+    def step(mean: Tensor, covariance: Tensor, control: Tensor) -> tuple[Tensor, ...]:
+        out = propagator.propagate(model, Gaussian(mean, covariance.unflatten(-1, (n, n))), control)
+        entries = torch.cat([out.belief.mean, out.belief.covariance[..., rows, columns]], dim=-1)
+        return entries, out.belief.mean, out.belief.covariance, out.cross_covariance, out.deficit
+
+    values, (by_mean, by_covariance, by_input) = batched_jacobian(
+        step, (belief.mean, belief.covariance.flatten(-2), input.expand(*batch, input.shape[-1]))
+    )
+    by_covariance = by_covariance.unflatten(-1, (n, n))
+    by_covariance = (by_covariance + by_covariance.mT) / 2
+    whole = torch.zeros(k, k, dtype=torch.long, device=rows.device)
+    whole[rows, columns] = whole[columns, rows] = torch.arange(len(rows), device=rows.device) + k
+    of_mean = by_mean[..., :k, :], by_covariance[..., :k, :, :], by_input[..., :k, :]
+    of_covariance = by_mean[..., whole, :], by_covariance[..., whole, :, :], by_input[..., whole, :]
+    moved = Propagation(Gaussian(values[1], values[2]), values[3], values[4])
+    return moved, Sensitivity(*of_mean, *of_covariance)
 
 
 def checked_input(model: Any, belief: Gaussian, input: Tensor | None) -> Tensor:
@@ -93,17 +165,15 @@ def checked_input(model: Any, belief: Gaussian, input: Tensor | None) -> Tensor:
 
 
 def _check_semidefinite(covariance: np.ndarray) -> None:
-    if not (largest := np.abs(covariance).max(initial=0.0)):
-        return
+    largest = np.abs(covariance).max(initial=0.0)
     round_off = np.finfo(covariance.dtype).eps ** 0.5 * largest
-    gap = np.abs(covariance - np.swapaxes(covariance, -1, -2)).max()
+    gap = np.abs(covariance - np.swapaxes(covariance, -1, -2)).max(initial=0.0)
     if gap > round_off:
         raise DataError(f"the belief's covariance must be symmetric; got entries that differ by {float(gap):.3g}")
     try:
         np.linalg.cholesky(covariance + round_off * np.eye(covariance.shape[-1], dtype=covariance.dtype))
     except np.linalg.LinAlgError:
-        lowest = float(np.linalg.eigvalsh(covariance).min())
-        if lowest < -round_off:
+        if (lowest := float(np.linalg.eigvalsh(covariance).min())) < -round_off:
             raise DataError(
                 f"the belief's covariance must be positive semidefinite; got an eigenvalue of {lowest:.3g} "
                 f"(largest entry {float(largest):.3g})"

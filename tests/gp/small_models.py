@@ -2,7 +2,7 @@
 
 import torch
 
-from gpmpc.gp import GPPosterior, _archive, _storage, load_posterior, save_posterior
+from gpmpc.gp import GPPosterior, _storage, load_posterior, save_posterior
 from gpmpc.models import Affine, ResidualModel, load_model, save_model
 
 SAVE = {GPPosterior: save_posterior, ResidualModel: save_model}
@@ -39,4 +39,4 @@ def as_before(model, path):
     SAVE[type(model)](model, new)
     header, arrays = _storage._content(new, "model")
     header = {key: value for key, value in header.items() if key not in ("checksum", "metadata")}
-    path.write_bytes(_archive.write_npz(header | {"format_version": 1}, arrays))
+    path.write_bytes(_storage.write_npz(header | {"format_version": 1}, arrays))

@@ -1,57 +1,48 @@
 import pytest
 
 from gpmpc.exceptions import DataError
-from gpmpc.gp import _memory as memory
 from gpmpc.gp import _training
+from gpmpc.gp._training import available_memory
+
+
+def write(path, text):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text)
+
+
+def write_group(path, limit, used, pages):
+    write(path / "memory.max", f"{limit}\n")
+    write(path / "memory.current", f"{used}\n")
+    write(path / "memory.stat", f"anon 1\ninactive_file {pages}\nactive_file 7\n")
 
 
 def test_a_running_process_has_some_memory_left():
-    free = memory.available_memory()
+    free = available_memory()
     assert free is None or free > 2**20
 
 
 def test_the_tightest_control_group_above_the_process_counts_and_file_pages_are_free(tmp_path):
-    own = tmp_path / "own"
-    own.write_text("1:cpu:/x\n0::/job/step\n")
+    groups = tmp_path / "sys/fs/cgroup"
+    write(tmp_path / "proc/self/cgroup", "1:cpu:/x\n0::/job/step\n")
     for folder, limit, used, pages in (("job/step", "max", 0, 0), ("job", "1000", 700, 200), (".", "5000", 4900, 0)):
-        (tmp_path / "groups" / folder).mkdir(parents=True, exist_ok=True)
-        (tmp_path / "groups" / folder / "memory.max").write_text(f"{limit}\n")
-        (tmp_path / "groups" / folder / "memory.current").write_text(f"{used}\n")
-        statistics = f"anon 1\ninactive_file {pages}\nactive_file 7\n"
-        (tmp_path / "groups" / folder / "memory.stat").write_text(statistics)
-    assert memory._by_control_group(tmp_path / "groups", own) == 100
-    (tmp_path / "groups" / "memory.max").unlink()
-    assert memory._by_control_group(tmp_path / "groups", own) == 500
-    assert memory._by_control_group(tmp_path / "groups", tmp_path / "none") is None
-
-
-def test_the_kernels_word_is_read_and_may_be_missing(tmp_path):
-    (tmp_path / "meminfo").write_text("MemTotal: 9 kB\nMemAvailable:     3 kB\n")
-    assert memory._by_kernel(tmp_path / "meminfo") == 3 * 1024
-    assert memory._by_kernel(tmp_path / "nothing") is None
+        write_group(groups / folder, limit, used, pages)
+    assert available_memory(tmp_path) == 100
+    (groups / "memory.max").unlink()
+    assert available_memory(tmp_path) == 500
+    write_group(groups / "job", 1000, 1009, 0)
+    assert available_memory(tmp_path) == 0
 
 
 @pytest.mark.parametrize(
-    ("by_kernel", "by_group", "free"),
-    [(700, 500, 500), (500, 700, 500), (None, 300, 300), (900, None, 900), (9, -9, 0)],
+    ("by_kernel", "by_group", "free"), [(7, 5, 5), (5, 7, 5), (None, 3, 3), (9, None, 9), (None, None, None)]
 )
-def test_what_is_left_is_the_least_that_anybody_leaves(by_kernel, by_group, free, monkeypatch):
-    monkeypatch.setattr(memory, "_by_kernel", lambda: by_kernel)
-    monkeypatch.setattr(memory, "_by_control_group", lambda: by_group)
-    assert memory.available_memory() == free
-
-
-def test_where_the_kernel_says_nothing_all_physical_memory_counts_or_nothing_is_known(monkeypatch):
-    monkeypatch.setattr(memory, "_by_kernel", lambda: None)
-    monkeypatch.setattr(memory, "_by_control_group", lambda: None)
-    monkeypatch.setattr(memory.os, "sysconf", {"SC_PHYS_PAGES": 30, "SC_PAGE_SIZE": 4096}.__getitem__, raising=False)
-    assert memory.available_memory() == 30 * 4096
-
-    def unknown(_):
-        raise ValueError
-
-    monkeypatch.setattr(memory.os, "sysconf", unknown)
-    assert memory.available_memory() is None
+def test_what_is_left_is_the_least_that_anybody_leaves(by_kernel, by_group, free, tmp_path):
+    if by_kernel is not None:
+        write(tmp_path / "proc/meminfo", f"MemTotal: 9 kB\nMemAvailable:     {by_kernel} kB\n")
+    if by_group is not None:
+        write(tmp_path / "proc/self/cgroup", "0::/\n")
+        write_group(tmp_path / "sys/fs/cgroup", 1024 * by_group, 0, 0)
+    assert available_memory(tmp_path) == (None if free is None else 1024 * free)
 
 
 def test_a_training_that_does_not_fit_is_refused_with_the_points_that_would(monkeypatch):

@@ -1,5 +1,7 @@
 """Conditioning and dropping against a fresh factorisation of the same points."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -155,12 +157,17 @@ def test_more_points_than_the_noise_allows_are_refused():
         (
             lambda gp: append_points(gp, torch.zeros(2, 5), torch.zeros(1, 3)),
             ShapeError,
-            r"same number of rows, one or more; got \(2, 5\) and \(1, 3\)",
+            r"targets must have shape \(2, 3\); got \(1, 3\)",
         ),
         (
             lambda gp: append_points(gp, torch.zeros(2, 4), torch.zeros(2, 3)),
             ShapeError,
-            "features must have 5 columns like the posterior's; got 4",
+            "features must have n . m columns, .* got 4 columns and 3 outputs",
+        ),
+        (
+            lambda gp: append_points(replace(gp, predicts="value"), torch.zeros(2, 4), torch.zeros(2, 3)),
+            ShapeError,
+            "features and targets like those of GPPosterior.*; got 4 and 3",
         ),
         (
             lambda gp: append_points(gp, torch.zeros(1, 5), torch.full((1, 3), torch.nan)),

@@ -275,23 +275,17 @@ def test_a_refit_and_a_start_need_a_posterior_and_transitions_that_fit_it():
         SparseTrainer()(1)
 
 
-def test_a_training_of_many_points_tells_of_every_output_what_it_took(caplog, monkeypatch):
+def test_what_takes_long_tells_where_it_is(caplog, monkeypatch):
     data = pendulum(12)
     train(data, restarts=0)
     assert not caplog.records
-    monkeypatch.setattr(_training, "_MANY", 11)
+    monkeypatch.setattr(_search, "_LOG_INTERVAL", 0.0)
     with caplog.at_level(logging.INFO, "gpmpc"):
         found = train(data, restarts=0)
-    told = [
-        re.fullmatch(r"training: output (\d) of 2: (\d+) evaluations, \d+\.\d s", r.message) for r in caplog.records
-    ]
-    assert [one[1] for one in told] == ["1", "2"]
-    assert sum(int(one[2]) for one in told) == found.evaluations
-    caplog.clear()
-    monkeypatch.setattr(_training, "_MANY", 12)
-    with caplog.at_level(logging.INFO, "gpmpc"):
-        train(data, restarts=0)
-    assert not caplog.records
+    text = r"training: output (\d) of 2, 12 points: evaluation (\d+), minus log evidence .*"
+    told = [re.fullmatch(text, record.message) for record in caplog.records]
+    assert [one[1] for one in told] == sorted(one[1] for one in told)
+    assert len(told) == found.evaluations
 
 
 def test_a_time_limit_ends_every_outputs_search_with_the_best_found_so_far(caplog, monkeypatch):
@@ -316,24 +310,24 @@ def test_a_time_limit_ends_every_outputs_search_with_the_best_found_so_far(caplo
 
 @pytest.mark.parametrize(("failing", "late_after", "explored"), [(0, 0, 2), (1, 0, 1), (1, 2, 2)])
 def test_a_time_limit_waits_for_one_start_that_succeeds(monkeypatch, failing, late_after, explored):
-    starts, search = count(), _search._Search.__call__
+    starts, search = count(), _search.OutputSearch._minimize
 
     def one_fails(self, start, iterations):
         number = next(starts)
-        monkeypatch.setattr(self.problem.__class__, "is_late", lambda problem: number + 1 >= late_after)
+        monkeypatch.setattr(self.__class__, "_is_late", lambda _: number + 1 >= late_after)
         return (start, 2 * _search.FAILED) if number == failing else search(self, start, iterations)
 
-    monkeypatch.setattr(_search._Search, "__call__", one_fails)
+    monkeypatch.setattr(_search.OutputSearch, "_minimize", one_fails)
     found = train(pendulum(20), time_limit=60.0)
     assert np.isfinite(found.explored[0]).tolist() == [True] * explored + [False] * (4 - explored)
     assert (found.explored[0] >= _search.FAILED).tolist() == [k == failing and k < explored for k in range(4)]
 
 
 def test_a_time_limit_leaves_one_start_on_the_subset_and_an_iteration_over_all_points(monkeypatch):
-    data, search, sizes = pendulum(60, noise=1e-2), _search._Search.__call__, []
+    data, search, sizes = pendulum(60, noise=1e-2), _search.OutputSearch._minimize, []
     converged = train(data, subset=20)
     monkeypatch.setattr(
-        _search._Search, "__call__", lambda self, *given: sizes.append(self.size) or search(self, *given)
+        _search.OutputSearch, "_minimize", lambda self, *given: sizes.append(self._size) or search(self, *given)
     )
     found = train(data, subset=20, time_limit=1e-9)
     assert sizes == [20, 60, 20, 60]

@@ -9,7 +9,7 @@ from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior, backend, remove_points
 from gpmpc.models import Affine, ResidualModel
 from gpmpc.propagation import Linearization, MeanEquivalence, MomentMatching, Unscented, differentiate, linearize
-from gpmpc.propagation._sensitivity import by_autograd
+from gpmpc.propagation._propagator import by_autograd
 from tests.propagation.test_moment_matching import belief, model
 
 generator = torch.Generator().manual_seed(1)

@@ -161,7 +161,7 @@ def test_each_broken_promise_is_found_and_named(flaw, claims, message):
 
 class WrongDerivative(MomentMatching):
     def differentiate(self, model, belief, input=None):
-        from gpmpc.propagation._sensitivity import by_autograd
+        from gpmpc.propagation._propagator import by_autograd
 
         moved, d = by_autograd(MomentMatching(), model, belief, input)
         return moved, replace(d, covariance_by_covariance=1.01 * d.covariance_by_covariance)
