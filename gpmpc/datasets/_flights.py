@@ -34,7 +34,7 @@ from gpmpc.gp import Transitions
 from gpmpc.mpc import problem as mpc
 from gpmpc.mpc.baselines import NMPC
 from gpmpc.simulation import Noise, Rollout, closed_loop
-from gpmpc.systems import ATTITUDES, Plant, System, attitude_for_thrust_direction, translational
+from gpmpc.systems import ATTITUDES, System, attitude_for_thrust_direction, translational
 from gpmpc.systems._quadrotor import approach_attitudes
 from gpmpc.trajectories import Trajectory
 
@@ -80,7 +80,7 @@ class Tracking:
         SettingError: A weight has another length than the plant's states or inputs.
     """
 
-    plant: Plant  #: the true system
+    plant: System  #: the true system
     Q: Sequence[float]  #: state weights, the diagonal (n,)
     R: Sequence[float]  #: input weights, the diagonal (m,)
     initial_input: Sequence[float]  #: first guess of the solver (m,)

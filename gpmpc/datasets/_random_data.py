@@ -48,7 +48,7 @@ class RandomData:
         for name, *limits in zip(system.input_names, system.input_lower, system.input_upper, strict=True):
             if not np.isfinite(limits).all():
                 raise SettingError("data", f"random inputs need limits; {name} of {system.name} has none")
-        stateful = getattr(system.dynamics, "stateful", False)
+        stateful = system.stateful
         if system.region is None and self.starts == "region" and not stateful:
             raise SettingError("data.starts", f"{system.name} has no region; take starts=start, or give it one")
         if self.noise is not None and len(self.noise) != len(system.state_names):
@@ -89,7 +89,7 @@ class RandomData:
         raise DataError(f"{system.name}: only {len(rows)} of {self.samples} random steps stayed near the region")
 
     def _start(self, system: System, random: np.random.Generator) -> np.ndarray:
-        if getattr(system.dynamics, "stateful", False):
+        if system.stateful:
             return system.dynamics.reset(int(random.integers(2**31)))
         if self.starts == "start":
             return np.array(system.goal if system.start is None else system.start)

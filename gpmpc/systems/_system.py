@@ -35,19 +35,6 @@ class Dynamics(Protocol):
     def input_names(self) -> Sequence[str]: ...
 
 
-class Plant(Protocol):
-    """A discrete-time system; a ``System`` is one.
-
-    Names and motion, the time of one step [s], and the n entries of x[k+1], symbolic or numeric.
-    """
-
-    @property
-    def dynamics(self) -> Dynamics: ...
-    @property
-    def time_step(self) -> float: ...
-    def successor(self, x: Any, u: Any) -> Sequence[Any]: ...
-
-
 @dataclass(frozen=True, eq=False)
 class System:
     """A discrete-time system, with everything that is said of it.
@@ -149,6 +136,11 @@ class System:
         return tuple(self.dynamics.input_names)
 
     @property
+    def stateful(self) -> bool:
+        """Whether it is a simulator under way, which a step moves on."""
+        return getattr(self.dynamics, "stateful", False)
+
+    @property
     def unit(self) -> str:
         """The unit of the tracked states."""
         return self.units[self.tracked[0]]
@@ -214,7 +206,7 @@ class System:
         if not (hasattr(self.dynamics, "derivative") or hasattr(self.dynamics, "successor")):
             what = "must have derivative(x, u), or successor(x, u) for the next state"
             raise SettingError("dynamics", f"{what}; got {type(self.dynamics).__name__}")
-        if getattr(self.dynamics, "stateful", False):  # a simulator under way: a step would move it
+        if self.stateful:
             return
         x, u = list(self.goal if self.start is None else self.start), list(self.initial_input)
         try:
@@ -229,7 +221,7 @@ class System:
                 raise SettingError("dynamics", f"must be finite at state {x}, input {u}; {name} is {entry} after it")
 
 
-def step(plant: Plant, state: Array, input: Array) -> Array:
+def step(plant: System, state: Array, input: Array) -> Array:
     """The next state (n,) of a plant from a state (n,) and an input (m,).
 
     >>> from gpmpc.systems import pendulum
@@ -247,7 +239,7 @@ def step(plant: Plant, state: Array, input: Array) -> Array:
     return np.array(plant.successor(state, input), dtype=float)
 
 
-def step_many(plant: Plant, states: Array, inputs: Array) -> Array:
+def step_many(plant: System, states: Array, inputs: Array) -> Array:
     """The next states (T, n) of T copies of a plant, from states (T, n) and inputs (T, m), in one evaluation."""
     entries = plant.successor(states.T, inputs.T)
     return np.stack([np.broadcast_to(np.asarray(entry, dtype=float), len(states)) for entry in entries], axis=1)

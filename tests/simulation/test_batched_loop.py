@@ -12,7 +12,7 @@ from gpmpc.mpc.gp_mpc import GPMPC
 from gpmpc.mpc.problem import Box, Problem, Tracking
 from gpmpc.propagation import Linearization, MomentMatching
 from gpmpc.simulation import Dropout, Gust, ModelLoop, Noise, closed_loop, closed_loops
-from gpmpc.simulation._closed_loop import chunk_size
+from gpmpc.simulation._loop import chunk_size
 from gpmpc.status import Status
 from gpmpc.systems import Coupled, Map, Rotational, System, Translational, step, step_many
 from tests.mpc.systems import HOVER, QUADROTOR, linear_gaussian, quadrotor_gp

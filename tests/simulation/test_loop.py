@@ -284,15 +284,17 @@ def test_a_wrong_setting_is_refused_at_construction(build, message):
         build()
 
 
-def test_a_gust_on_a_plant_of_ones_own_is_refused_with_what_is_possible():
-    class Own:
-        dynamics, time_step = Cart(), 0.1
+def test_a_gust_on_a_simulator_is_refused_with_what_is_possible():
+    class UnderWay(Cart):
+        stateful = True
 
         def successor(self, x, u):
             return [x[0], x[1]]
 
     with pytest.raises(UnsupportedModel, match="Possible with any plant: Replaced"):
-        fly(plant=Own(), disturbances=[Gust({"v": 1.0})])
+        fly(plant=System(UnderWay(), 0.1), disturbances=[Gust({"v": 1.0})])
+    with pytest.raises(SettingError, match=r"system: must be a plant, such as System\(dynamics, 0.1\).*got UnderWay"):
+        fly(plant=UnderWay())
 
 
 def test_nothing_disturbs_a_model_loop(model):
