@@ -55,8 +55,8 @@ class Features:
     @cached_property
     def sines(self) -> NDArray[np.intp]:
         """Where the sines stand among the features, each before its cosine (a,)."""
-        places = [k for k, i in enumerate(self.columns) if i in self.angles and (k == 0 or self.columns[k - 1] != i)]
-        return np.array(places, dtype=np.intp)
+        first = np.diff(self.columns, prepend=-1) != 0
+        return np.flatnonzero(first & np.isin(self.columns, self.angles))
 
     @cached_property
     def _selected(self) -> NDArray[np.intp]:
@@ -66,28 +66,24 @@ class Features:
     @cached_property
     def _by_column(self) -> Array:
         """One in the column of each feature's state (d, n)."""
-        matrix = np.zeros((self.dim, self.state_dim))
-        matrix[np.arange(self.dim), self.columns] = 1.0
-        return matrix
+        return np.eye(self.state_dim)[self.columns]
 
     def __call__(self, state: Tensor, input: Tensor) -> tuple[Tensor, Tensor]:
         """The features (*batch, d) of a state (*batch, n), and the selected inputs (*batch, m_s)."""
-        if not self.angles:
-            return state[..., list(self.states)], input[..., list(self.inputs)]
+        z, selected, sines = state[..., self.columns.tolist()], input[..., list(self.inputs)], self.sines.tolist()
+        if not sines:
+            return z, selected
         parts = [
-            part
-            for i in self.states
-            for part in ((state[..., i].sin(), state[..., i].cos()) if i in self.angles else (state[..., i],))
+            part.sin() if k in sines else part.cos() if k - 1 in sines else part for k, part in enumerate(z.unbind(-1))
         ]
-        return torch.stack(parts, dim=-1), input[..., list(self.inputs)]
+        return torch.stack(parts, dim=-1), selected
 
     def linearize(self, states: Array, inputs: Array) -> tuple[Array, Array, Array | None]:
         """Features (K, d), selected inputs (K, m_s), each feature's derivative (K, d) by its state, None for one."""
         z, v, sines = states[:, self.columns], inputs[:, self._selected], self.sines
         if not self.angles:
             return z, v, None
-        angle = z[:, sines]
-        sine, cosine, slope = np.sin(angle), np.cos(angle), np.ones_like(z)
+        sine, cosine, slope = np.sin(z[:, sines]), np.cos(z[:, sines]), np.ones_like(z)
         z[:, sines], z[:, sines + 1] = sine, cosine
         slope[:, sines], slope[:, sines + 1] = cosine, -sine
         return z, v, slope
@@ -128,11 +124,10 @@ class Lags:
     @cached_property
     def nominal(self) -> Affine:
         """The nominal model for ``ResidualModel``: x stays where it is, and earlier values move on by a place."""
-        n, m, shifted = self.state_dim, self.input_dim, self.state_dim * self.states
+        n, m, first = self.state_dim, self.input_dim, self.state_dim * (1 + self.states)
         A, B = torch.zeros(self.dim, self.dim, dtype=torch.float64), torch.zeros(self.dim, m, dtype=torch.float64)
         A[:n, :n] = torch.eye(n)
-        A[n : n + shifted, :shifted] = torch.eye(shifted)
-        first = n + shifted
+        A[n:first, : first - n] = torch.eye(first - n)
         if self.inputs:
             B[first : first + m] = torch.eye(m)
             A[first + m :, first : self.dim - m] = torch.eye(self.dim - first - m)

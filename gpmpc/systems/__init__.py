@@ -11,7 +11,7 @@ from gpmpc.systems._quadrotor import (
     rotational,
     translational,
 )
-from gpmpc.systems._system import GRAVITY, Dynamics, System, cos, exp, sin, step, step_many
+from gpmpc.systems._system import GRAVITY, System, cos, exp, sin, step, step_many
 from gpmpc.systems._textbook import (
     acrobot,
     cart_pole,
@@ -26,7 +26,6 @@ __all__ = [
     "ATTITUDES",
     "GRAVITY",
     "Coupled",
-    "Dynamics",
     "Map",
     "Rotational",
     "System",

@@ -59,10 +59,8 @@ class _Joints(_Model):
         self.substeps, q, v = substeps, model.jnt_qposadr[found], model.jnt_dofadr[found]
         # Where the states stand in MuJoCo's own: time, qpos, qvel, act.
         self._order = np.concatenate([1 + q, 1 + model.nq + v, 1 + model.nq + model.nv + np.arange(model.na)])
-        activated = [self.mujoco.mj_id2name(model, self.mujoco.mjtObj.mjOBJ_ACTUATOR, i) for i in range(model.nu)]
-        activated = [name for name, address in zip(activated, model.actuator_actadr, strict=True) if address >= 0]
-        rates = [f"{name}_rate" for name in joints]
-        self.state_names = (*joints, *rates, *(f"{name}_activation" for name in activated))
+        lagging = [f"{model.actuator(i).name}_activation" for i in range(model.nu) if model.actuator_actadr[i] >= 0]
+        self.state_names = (*joints, *(f"{name}_rate" for name in joints), *lagging)
         self.input_names = tuple(actuators)
 
     def positions(self, state: Array) -> Array:
@@ -107,14 +105,13 @@ class _Sensors(_Model, Simulator):
         super().__init__(path, actuators)
         model = self.model
         found = self.indices("sensors", self.mujoco.mjtObj.mjOBJ_SENSOR, model.nsensor, sensors)
-        sizes = [int(model.sensor_dim[i]) for i in found]
-        places = [np.arange(d) + model.sensor_adr[i] for i, d in zip(found, sizes, strict=True)]
+        sizes = model.sensor_dim[found].tolist()
+        places = [model.sensor_adr[i] + np.arange(d) for i, d in zip(found, sizes, strict=True)]
         self._places, self._observe, self.substeps, self._delay = np.concatenate(places), observe, substeps, input_delay
         own = [f"{name}{k + 1}" if d > 1 else name for name, d in zip(sensors, sizes, strict=True) for k in range(d)]
-        self.state_names = tuple(state_names or own)
-        self.input_names = tuple(actuators)
-        if len(self.reset(0)) != len(self.state_names):
-            raise SettingError("state_names", f"must be {len(self.reset(0))} names; got {len(self.state_names)}")
+        self.state_names, self.input_names = tuple(state_names or own), tuple(actuators)
+        if (n := len(self.reset(0))) != len(self.state_names):
+            raise SettingError("state_names", f"must be {n} names; got {len(self.state_names)}")
 
     def _reset(self, seed: int) -> Array:
         if self.model.nkey:
