@@ -1,8 +1,4 @@
-"""Features that a GP sees of a state and an input: selected columns, angles as sine and cosine, and lagged values.
-
-Leaving a column out makes a model invariant to it; the sine and cosine of an angle make it periodic, so that one turn
-more changes nothing. Lagged states and inputs stand in the state of a model (``Lags``), where columns select them.
-"""
+"""Features that a GP sees of a state and an input: selected columns, angles as sine and cosine, and lagged values."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -22,6 +18,8 @@ from gpmpc.models._nominal import Affine
 @dataclass(frozen=True)
 class Features:
     """Maps a state and an input to what a GP sees of them.
+
+    Leaving a column out makes a model invariant to it; the sine and cosine of an angle make it periodic.
 
     Raises:
         SettingError: An index is out of range or stands there twice, or an angle is not selected.
@@ -141,20 +139,14 @@ class Lags:
     def augmented(self, states: Array, inputs: Array) -> Array:
         """States with their earlier values (T - l, dim) of a log; l = max(p, q) rows at its start have none.
 
-        Args:
-            states: x_0 .. x_{T-1} (T, n).
-            inputs: u_0 .. u_{T-2} or more (T - 1 or T, m), each applied from the time of its row on.
-
-        Raises:
-            ShapeError: The two do not belong together, or hold too few rows.
+        Of states x_0 .. x_{T-1} (T, n) and inputs (T - 1 or T, m), each applied from the time of its row on;
+        ``ShapeError`` where the two do not belong together, or hold too few rows.
         """
         T, first = len(states), max(self.states, self.inputs)
-        wide = np.shape(states)[1:] == (self.state_dim,) and np.shape(inputs)[1:] == (self.input_dim,)
-        if not wide or len(inputs) not in (T - 1, T) or first >= T:
-            raise ShapeError(
-                f"states (T, {self.state_dim}) and inputs (T or T - 1, {self.input_dim}) need T above {first}; "
-                f"got {np.shape(states)} and {np.shape(inputs)}"
-            )
+        found, shapes = (np.shape(states), np.shape(inputs)), [(k, self.input_dim) for k in (T - 1, T)]
+        if found[0] != (T, self.state_dim) or found[1] not in shapes or first >= T:
+            what = f"states (T, {self.state_dim}) and inputs (T or T - 1, {self.input_dim}) need T above {first}"
+            raise ShapeError(f"{what}; got {found[0]} and {found[1]}")
         before = [states[first - lag : T - lag] for lag in range(self.states + 1)]
         before += [inputs[first - lag : T - lag] for lag in range(1, self.inputs + 1)]
         return np.concatenate(before, axis=1)

@@ -8,11 +8,11 @@ numbers (``gpmpc._kernels.tape``). Reading imports the module that the file name
 file from someone else is read where their module is installed on purpose.
 """
 
-import importlib
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
 from functools import partial
 from pathlib import Path
+from pkgutil import resolve_name
 from types import FunctionType
 from typing import Any
 
@@ -133,15 +133,15 @@ def _described(key: str, function: Any, tensors: dict[str, Tensor]) -> dict[str,
     elif is_dataclass(function) and not isinstance(function, type):
         kind, source = "dataclass", type(function)
         parameters = {field.name: getattr(function, field.name) for field in fields(function) if field.init}
-    module, name = getattr(source, "__module__", ""), getattr(source, "__qualname__", "")
-    found = _imported(module, name) if module and module != "__main__" and name else None
+    path = f"{getattr(source, '__module__', '')}:{getattr(source, '__qualname__', '')}"
+    found = None if path.startswith("__main__") else _imported(path)
     if found is None or found is not source or any(isinstance(value, Tensor) for value in parameters.values()):
         raise UnsupportedModel(
             f"{key} is code that a file cannot name: {function!r}. It can be saved as a function of a module, a "
             "functools.partial of one with keyword arguments, a dataclass of numbers with __call__, or "
             "CasadiFunction(function that makes it, ...)"
         )
-    return {"kind": kind, "path": f"{module}:{name}", "parameters": parameters}
+    return {"kind": kind, "path": path, "parameters": parameters}
 
 
 def _function(key: str, entry: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> Any:
@@ -152,8 +152,7 @@ def _function(key: str, entry: Mapping[str, Any], tensors: Mapping[str, Tensor])
         code, constants = (tensors[part].numpy() for part in ("code", "constants"))
         return CasadiFunction(function_of_tape(code, constants, entry["sizes"], entry["shape"]))
     kind, parameters = entry["kind"], entry["parameters"]
-    module, _, name = entry["path"].partition(":")
-    source: Any = _imported(module, name)
+    source: Any = _imported(entry["path"])
     right = isinstance(source, type) and is_dataclass(source) if kind == "dataclass" else type(source) is FunctionType
     if not right or kind not in ("function", "partial", "dataclass", "casadi") or not isinstance(parameters, dict):
         raise DataError(f"{key} {entry['path']!r} is no {kind} that can be imported here")
@@ -162,12 +161,9 @@ def _function(key: str, entry: Mapping[str, Any], tensors: Mapping[str, Tensor])
     return source(**parameters) if kind == "dataclass" else source
 
 
-def _imported(module: str, name: str) -> Any:
-    """A module's object by its qualified name; None where there is none."""
+def _imported(path: str) -> Any:
+    """A module's object by ``module:qualified name``; None where there is none."""
     try:
-        found: Any = importlib.import_module(module)
-        for part in name.split("."):
-            found = getattr(found, part)
+        return resolve_name(path)
     except (ImportError, AttributeError, ValueError):
         return None
-    return found

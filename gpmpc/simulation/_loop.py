@@ -84,9 +84,9 @@ class Flight:
     def add(
         self, state: tuple[Array, Array], belief: Gaussian, input: Array, last: Command, reference: Any = None
     ) -> None:
-        """Adds a step: mean and covariance where it began, what was measured, what was applied, and the command.
+        """Adds a step: mean and covariance where it began, what was measured, what was applied, the command.
 
-        It was to be at the reference state (n,) of its number where no other is given.
+        By default its reference state (n,) is that of its number.
         """
         part, k, decision = self._states, len(self.rows), last.decision
         learned = None if decision is None else decision.learned
@@ -108,11 +108,10 @@ class Flight:
         )
         if self._on_step is not None:
             self._on_step(step)
-        n = len(step.state)
-        expected: Any = (np.full(n, np.nan), np.full((n, n), np.nan))
+        expected: Any = (np.full_like(step.state, np.nan), np.full_like(step.belief_covariance, np.nan))
         if decision is not None and not last.failed:
             expected = np.array(decision.means[1]), np.array(decision.covariances[1])
-        spent: Any = (0, Timing(0.0, 0.0, 0.0), False)
+        spent: Any = (0, Timing(), False)
         if decision is not None:
             spent = decision.iterations, decision.timing, decision.far_from_data
         self.rows.append((replace(step, decision=None), *expected, *spent))

@@ -63,8 +63,7 @@ class Noise:
 class PlantSimulator:
     """Simulates a plant with noise and disturbances, each of which changes what the one before left.
 
-    ``initial`` is a state (n,), or a belief that it is drawn from; None where the plant is a simulator, which then
-    starts an episode.
+    ``initial`` is a state (n,), or a belief that it is drawn from; None for a simulator, which starts an episode.
     """
 
     def __init__(self, plant: System, initial: Any, disturbances: Any = (), noise: Noise | None = None, seed: int = 0):
@@ -84,8 +83,8 @@ class PlantSimulator:
                 raise ShapeError(f"noise.{key} must have {length} standard deviations; got {len(values)}")
         # One stream a source: whether states are measured with noise changes nothing about the wind.
         sources = "initial", "process", "measurement", "input"
-        streams = np.random.SeedSequence(seed).spawn(4)
-        self._streams = {source: np.random.default_rng(s) for source, s in zip(sources, streams, strict=True)}
+        streams = map(np.random.default_rng, np.random.SeedSequence(seed).spawn(len(sources)))
+        self._streams: dict[str, np.random.Generator] = dict(zip(sources, streams, strict=True))
         if initial is None:
             if not plant.stateful:
                 raise SettingError("initial", "must be a state; a simulator alone starts by itself")
@@ -93,8 +92,7 @@ class PlantSimulator:
         drawn = isinstance(initial, Gaussian)
         self.mean, self.covariance = _check_state(initial.mean if drawn else initial, n), np.zeros((n, n))
         if drawn:
-            covariance = np.asarray(initial.covariance, dtype=float)
-            self.mean = self._streams["initial"].multivariate_normal(self.mean, covariance)
+            self.mean = self._streams["initial"].multivariate_normal(self.mean, to_array(initial.covariance))
         self._disturbed_plant(0.0)  # a disturbance that does not fit is found before the first step
 
     def measure(self, time: float) -> Gaussian:
@@ -110,7 +108,7 @@ class PlantSimulator:
             plant = disturbance.disturb_plant(plant, time)
         return plant
 
-    def _applied_input(self, input: Array) -> Array:
+    def _applied(self, input: Array) -> Array:
         if np.shape(input) != (shape := (len(self.plant.input_names),)):
             raise ShapeError(f"the plant takes inputs of shape {shape}; got {np.shape(input)}")
         return self._add_noise("input", input)
@@ -177,8 +175,8 @@ def step_together(simulators: Sequence[Any], time: float, inputs: Sequence[Array
     Returns the inputs that were applied, or why a simulator cannot go on.
     """
     if not simulators or isinstance(simulators[0], ModelSimulator):
-        return [simulator.step(input) for simulator, input in zip(simulators, inputs, strict=True)]
-    applied = [simulator._applied_input(input) for simulator, input in zip(simulators, inputs, strict=True)]
+        return [s.step(input) for s, input in zip(simulators, inputs, strict=True)]
+    applied = [s._applied(input) for s, input in zip(simulators, inputs, strict=True)]
     plant = simulators[0]._disturbed_plant(time)  # disturbances look at the time, not at a trial
     with np.errstate(over="ignore", invalid="ignore"):
         if len(simulators) == 1:

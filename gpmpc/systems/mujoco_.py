@@ -1,8 +1,7 @@
 """Takes a MuJoCo model as a system: the state is that of named joints, or what named sensors measure.
 
-The joints' positions, then their velocities, then the activations of the actuators that have one, are a state that the
-model can be set to, so that many are stepped at once by ``mujoco.rollout``. Sensors show a part of it: the model then
-moves on by itself, from where it stands. Needs the extra ``sim``.
+Joints, with the activations of the actuators that have one, are a state that the model can be set to; many are stepped
+at once by ``mujoco.rollout``. Sensors show a part of it: the model then moves on by itself. Needs the extra ``sim``.
 """
 
 from collections.abc import Callable, Sequence
@@ -36,11 +35,9 @@ class _Model:
     def indices(self, key: str, kind: Any, count: int, names: Sequence[str]) -> list[int]:
         """Finds named parts of the model; ``SettingError`` where none is named, or one is not there."""
         known = [self.mujoco.mj_id2name(self.model, kind, i) for i in range(count)]
-        if not names:
-            raise SettingError(key, f"name at least one of {', '.join(map(str, known)) or 'none'} of {self.path}")
-        for name in names:
-            if name not in known:
-                raise SettingError(key, f"must be among {', '.join(map(str, known))} of {self.path}; got {name!r}")
+        if not names or not set(names) <= set(known):
+            listed = ", ".join(map(str, known)) or "none"
+            raise SettingError(key, f"must be one or more of those of {self.path}, {listed}; got {list(names)}")
         return [known.index(name) for name in names]
 
 
@@ -51,11 +48,12 @@ class _Joints(_Model):
         super().__init__(path, actuators)
         model, joint = self.model, self.mujoco.mjtJoint
         found = self.indices("joints", self.mujoco.mjtObj.mjOBJ_JOINT, model.njnt, joints)
-        for name, i in zip(joints, found, strict=True):
-            if joint(int(model.jnt_type[i])) not in (joint.mjJNT_SLIDE, joint.mjJNT_HINGE):
-                raise SettingError("joints", f"must be hinges or slides; {name!r} of {path} is neither; name sensors")
-        if model.nv != len(found):
-            raise SettingError("joints", f"must name all {model.njnt} joints of {path}; got {len(found)}")
+        if model.njnt != len(found) or not set(model.jnt_type.tolist()) <= {
+            int(joint.mjJNT_SLIDE),
+            int(joint.mjJNT_HINGE),
+        }:
+            what = f"must name all {model.njnt} joints of {path}, hinges and slides; name sensors of other models"
+            raise SettingError("joints", f"{what}; got {list(joints)}")
         self.substeps, q, v = substeps, model.jnt_qposadr[found], model.jnt_dofadr[found]
         # Where the states stand in MuJoCo's own: time, qpos, qvel, act.
         self._order = np.concatenate([1 + q, 1 + model.nq + v, 1 + model.nq + model.nv + np.arange(model.na)])
