@@ -99,29 +99,20 @@ class CasadiFunction:
     is no expression. It serves as nominal model, (state (n,), input (m,)) to the next state (n,), and as effect B(x),
     state (n,) to (n, k). It is evaluated in double precision on the CPU, and torch cannot differentiate it.
 
-    Args:
-        source: The CasADi function, or an importable Python function that makes one, which a saved model names.
-        parameters: Of the function that makes it.
-
     Raises:
-        UnsupportedModel: The function has no argument, or more than one value.
+        UnsupportedModel: It is no CasADi function, or has no argument, or more than one value.
     """
 
-    def __init__(self, source: Any, **parameters: Any):
+    def __init__(self, function: Any):
         from gpmpc.gp.casadi_ import tape_of  # loads CasADi
 
-        is_casadi = hasattr(source, "n_in")
-        if is_casadi and parameters:
-            raise UnsupportedModel(f"parameters {list(parameters)} are for a function that makes a CasADi function")
-        function: Any = source if is_casadi else source(**parameters)
         if not hasattr(function, "n_in") or function.n_out() != 1 or not function.n_in():
             raise UnsupportedModel(f"CasadiFunction takes a CasADi function of one value; got {function!r}")
         if any(function.size2_in(i) != 1 for i in range(function.n_in())):
             raise UnsupportedModel(f"a CasADi function takes vectors (column by column); got {function!r}")
-        self.function, self.source, self.parameters = function, None if is_casadi else source, parameters
+        self.function, self.tape, self._mapped = function, tape_of(function), {}
         self.shape = function.size1_out(0), function.size2_out(0)
         self.sizes = [function.size1_in(i) for i in range(function.n_in())]
-        self.tape, self._mapped = tape_of(function), {}
 
     @cached_property
     def _expansion(self) -> Any:

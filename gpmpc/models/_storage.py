@@ -1,11 +1,11 @@
 """Files of models that are made of a known part and a learned one, in the format of ``gpmpc.gp._storage``.
 
 A model is its fields: tensors are stored as arrays, numbers in the header, a model inside as a header in the header. A
-function is stored as the path it is imported by and its parameters, which JSON can hold: an importable function, alone
-or in a ``functools.partial`` with keyword arguments, an importable dataclass, or a ``CasadiFunction`` of an importable
-function that makes it; one that no function makes, such as a system's nominal model, as its operations, which are
-numbers (``gpmpc._kernels.tape``). Reading imports the module that the file names, as Python's own ``import`` does: a
-file from someone else is read where their module is installed on purpose.
+function in CasADi, such as a system's nominal model, is stored as its operations, which are numbers
+(``gpmpc._kernels.tape``); any other as the path it is imported by and its parameters, in JSON: an importable
+function, alone or in a ``functools.partial`` with keyword arguments, or an importable dataclass. Reading imports the
+module that the file names, as Python's own ``import`` does: a file from someone else is read where their module is
+installed on purpose.
 """
 
 from collections.abc import Mapping
@@ -121,14 +121,12 @@ def _built(path: Path, header: Any, tensors: Mapping[str, Tensor]) -> Any:
 
 def _described(key: str, function: Any, tensors: dict[str, Tensor]) -> dict[str, Any]:
     """A function's header: its operations, which go to the tensors, or where it is imported from."""
-    tape = function.tape if isinstance(function, CasadiFunction) and function.source is None else None
+    tape = function.tape if isinstance(function, CasadiFunction) else None
     if tape is not None and np.isfinite(tape.constants).all():
         tensors |= {part: torch.as_tensor(getattr(tape, part)).double() for part in ("code", "constants")}
         return {"kind": "operations", "sizes": function.sizes, "shape": function.shape}
     kind, source, parameters = "function", function, {}
-    if isinstance(function, CasadiFunction):
-        kind, source, parameters = "casadi", function.source, function.parameters
-    elif isinstance(function, partial) and not function.args:
+    if isinstance(function, partial) and not function.args:
         kind, source, parameters = "partial", function.func, dict(function.keywords)
     elif is_dataclass(function) and not isinstance(function, type):
         kind, source = "dataclass", type(function)
@@ -138,8 +136,8 @@ def _described(key: str, function: Any, tensors: dict[str, Tensor]) -> dict[str,
     if found is None or found is not source or any(isinstance(value, Tensor) for value in parameters.values()):
         raise UnsupportedModel(
             f"{key} is code that a file cannot name: {function!r}. It can be saved as a function of a module, a "
-            "functools.partial of one with keyword arguments, a dataclass of numbers with __call__, or "
-            "CasadiFunction(function that makes it, ...)"
+            "functools.partial of one with keyword arguments, a dataclass of numbers with __call__, or a "
+            "CasadiFunction of expressions"
         )
     return {"kind": kind, "path": path, "parameters": parameters}
 
@@ -156,9 +154,10 @@ def _function(key: str, entry: Mapping[str, Any], tensors: Mapping[str, Tensor])
     right = isinstance(source, type) and is_dataclass(source) if kind == "dataclass" else type(source) is FunctionType
     if not right or kind not in ("function", "partial", "dataclass", "casadi") or not isinstance(parameters, dict):
         raise DataError(f"{key} {entry['path']!r} is no {kind} that can be imported here")
-    if kind in ("partial", "casadi"):
-        return (partial if kind == "partial" else CasadiFunction)(source, **parameters)
-    return source(**parameters) if kind == "dataclass" else source
+    if kind in ("function", "partial"):
+        return partial(source, **parameters) if kind == "partial" else source
+    made = source(**parameters)
+    return made if kind == "dataclass" else CasadiFunction(made)  # as older files name what makes it
 
 
 def _imported(path: str) -> Any:

@@ -171,7 +171,7 @@ class DelayedModel(_LinearWrapper):
     @property
     def lead(self) -> int:
         """By how many steps ``ahead`` looks ahead; a reference begins as much later."""
-        return self.pending if self._share == 1 else self.pending - 1
+        return math.floor(self.delay)
 
     def ahead(self, propagator: Any, belief: Gaussian, inputs: Any) -> Gaussian:
         """The belief over the state of ``remaining`` after the inputs u_{k-D} .. u_{k-1} (D, m), the oldest first.
@@ -181,10 +181,10 @@ class DelayedModel(_LinearWrapper):
         Raises:
             ShapeError: Another number of inputs.
         """
-        queue, w, rest = self._queue(belief, inputs), self._share, self.remaining
+        queue, w = self._queue(belief, inputs), self._share
         for k in range(self.lead):
             belief = propagator(self.model, belief, queue[k] if w == 1 else w * queue[k] + (1 - w) * queue[k + 1])
-        return rest.augmented(belief, queue[-1:]) if isinstance(rest, DelayedModel) and w < 1 else belief
+        return belief if w == 1 else DelayedModel(self.model, w).augmented(belief, queue[-1:])
 
     def _queue(self, belief: Gaussian, inputs: Any) -> Tensor:
         given = np.asarray(inputs) if not isinstance(inputs, Tensor) else inputs

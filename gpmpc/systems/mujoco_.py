@@ -27,18 +27,19 @@ class _Model:
         except (ValueError, OSError) as error:
             raise DataError(f"{path}: is no MJCF model ({' '.join(str(error).split())})") from error
         self.path, self.data = path, self.mujoco.MjData(self.model)
-        self.controls = self.indices("actuators", self.mujoco.mjtObj.mjOBJ_ACTUATOR, self.model.nu, actuators)
+        self.controls = self.indices("actuator", actuators)
         limited = self.model.actuator_ctrllimited.astype(bool)[self.controls]
         low, high = self.model.actuator_ctrlrange[self.controls].T
         self.limits = np.where(limited, low, -np.inf), np.where(limited, high, np.inf)
 
-    def indices(self, key: str, kind: Any, count: int, names: Sequence[str]) -> list[int]:
-        """Finds named parts of the model; ``SettingError`` where none is named, or one is not there."""
-        known = [self.mujoco.mj_id2name(self.model, kind, i) for i in range(count)]
-        if not names or not set(names) <= set(known):
-            listed = ", ".join(map(str, known)) or "none"
-            raise SettingError(key, f"must be one or more of those of {self.path}, {listed}; got {list(names)}")
-        return [known.index(name) for name in names]
+    def indices(self, kind: str, names: Sequence[str]) -> list[int]:
+        """Finds named parts of the model of a kind; ``SettingError`` where none is named, or one is not there."""
+        if not names:
+            raise SettingError(f"{kind}s", f"name at least one of {self.path}")
+        try:
+            return [getattr(self.model, kind)(name).id for name in names]
+        except KeyError as error:
+            raise SettingError(f"{kind}s", f"{error.args[0]} in {self.path}") from error
 
 
 class _Joints(_Model):
@@ -47,11 +48,9 @@ class _Joints(_Model):
     def __init__(self, path: str | Path, joints: Sequence[str], actuators: Sequence[str], substeps: int = 1):
         super().__init__(path, actuators)
         model, joint = self.model, self.mujoco.mjtJoint
-        found = self.indices("joints", self.mujoco.mjtObj.mjOBJ_JOINT, model.njnt, joints)
-        if model.njnt != len(found) or not set(model.jnt_type.tolist()) <= {
-            int(joint.mjJNT_SLIDE),
-            int(joint.mjJNT_HINGE),
-        }:
+        kinds = {int(joint.mjJNT_SLIDE), int(joint.mjJNT_HINGE)}
+        found = self.indices("joint", joints)
+        if model.njnt != len(found) or not set(model.jnt_type.tolist()) <= kinds:
             what = f"must name all {model.njnt} joints of {path}, hinges and slides; name sensors of other models"
             raise SettingError("joints", f"{what}; got {list(joints)}")
         self.substeps, q, v = substeps, model.jnt_qposadr[found], model.jnt_dofadr[found]
@@ -102,7 +101,7 @@ class _Sensors(_Model, Simulator):
     ):
         super().__init__(path, actuators)
         model = self.model
-        found = self.indices("sensors", self.mujoco.mjtObj.mjOBJ_SENSOR, model.nsensor, sensors)
+        found = self.indices("sensor", sensors)
         sizes = model.sensor_dim[found].tolist()
         places = [model.sensor_adr[i] + np.arange(d) for i, d in zip(found, sizes, strict=True)]
         self._places, self._observe, self.substeps, self._delay = np.concatenate(places), observe, substeps, input_delay
