@@ -248,16 +248,11 @@ class DisturbedModel(_LinearWrapper):
         L[:n, n:], L[n:, n:] = to_array(self.effect), np.diag(self.decay)
         return np.zeros((m, k)), np.eye(m), L, np.zeros((k, m))
 
-    def augmented(self, belief: Gaussian, std: Sequence[float] | None = None) -> Gaussian:
-        """The belief over (x, d), from one over x (*batch, n), before anything was estimated: d is zero, independent.
+    def augmented(self, belief: Gaussian, std: Sequence[float]) -> Gaussian:
+        """The belief over (x, d), from one over x (*batch, n), before anything was estimated.
 
-        Prior standard deviations of d (q,) are by default those that an AR(1) process has in the long run. A constant
-        has none: without them it raises ``SettingError``.
+        d is zero, independent, with prior standard deviations ``std`` (q,).
         """
-        if std is None:
-            if any(abs(phi) == 1 for phi in self.decay):
-                raise SettingError("std", "must be given for disturbances with decay 1; got None")
-            std = [q / (1 - phi**2) ** 0.5 for q, phi in zip(self.std, self.decay, strict=True)]
         check_numbers("std", std, q := self.effect.shape[1], least=0)
         own = self._diagonal([0.0] * self.model.state_dim + list(std))
         return Gaussian(pad(belief.mean, (0, q)), self._padded(belief.covariance) + own)

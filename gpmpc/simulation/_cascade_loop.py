@@ -15,7 +15,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from gpmpc.exceptions import Diverged, ShapeError, check_choice, check_number
+from gpmpc.exceptions import Diverged, ShapeError, check_number
 from gpmpc.gaussian import Gaussian
 from gpmpc.mpc import Controller, Reference
 from gpmpc.mpc._policy import OnFailure, check_policy, command
@@ -23,7 +23,7 @@ from gpmpc.simulation._disturbances import Disturbance
 from gpmpc.simulation._loop import Flight, Rollout, check_references, window
 from gpmpc.simulation._simulator import Noise, PlantSimulator, step_together
 from gpmpc.step import Step
-from gpmpc.systems import ATTITUDES, Coupled, System, attitude_for_thrust_direction
+from gpmpc.systems import Coupled, System, attitude_for_thrust_direction
 
 _OUTER, _INNER = slice(0, 6), slice(6, 12)
 
@@ -33,18 +33,16 @@ class Cascade:
     """An outer and an inner controller, and how the one's inputs are the other's references.
 
     Raises:
-        SettingError: A ratio below 1, an unknown attitude, or a response time that is not positive.
+        SettingError: A ratio below 1, or a response time that is not positive.
     """
 
     outer: Controller  #: on states x, vx, y, vy, z, vz [m, m/s] and inputs U1 [N], ux, uy [-]
     inner: Controller  #: on states phi, p, theta, q, psi, r [rad, rad/s] and inputs U2, U3, U4 [N]
     ratio: int = 20  #: inner steps an outer step
-    attitude: str = "exact"  #: ``"exact"`` or ``"paper"``; see ``attitude_for_thrust_direction``
     response_time: float = 0.1  #: of the approach to a new attitude [s]
 
     def __post_init__(self) -> None:
         check_number("ratio", self.ratio, least=1, whole=True)
-        check_choice("attitude", self.attitude, ATTITUDES)
         check_number("response_time", self.response_time, above=0, unit="[s]")
 
     def attitude_reference(self, planned: np.ndarray, angles: np.ndarray, phase: int) -> Reference:
@@ -58,7 +56,7 @@ class Cascade:
         direction = planned[np.minimum(ahead // self.ratio, len(planned) - 1)]
         states = np.zeros((len(ahead), 6))
         ux, uy = direction[:, 1:].T
-        states[:, [0, 2]] = attitude_for_thrust_direction(ux, uy, angles[2], self.attitude)
+        states[:, [0, 2]] = attitude_for_thrust_direction(ux, uy, angles[2])
         states[:, 1::2] = (states[:, ::2] - angles) / self.response_time
         return Reference(states, np.zeros((self.inner.horizon, 3)))
 

@@ -213,7 +213,6 @@ def closed_loop(
 class Trial:
     """The result of one seed."""
 
-    name: str  # such as "seed 3"
     seed: int
     result: Rollout | None  # None where it failed
     error: str | None  # why it failed, with the kind of the error; None where it did not
@@ -262,9 +261,9 @@ def closed_loops(
         _fly(flights, controller, references, steps, on_failure)
         for seed, flight in zip(some, flights, strict=True):
             if (error := flight.error) is None:
-                finished.append(Trial(f"seed {seed}", seed, flight.rollout(), None))
+                finished.append(Trial(seed, flight.rollout(), None))
             else:
-                finished.append(Trial(f"seed {seed}", seed, None, f"{type(error).__name__}: {error}"))
+                finished.append(Trial(seed, None, f"{type(error).__name__}: {error}"))
     return finished
 
 

@@ -26,18 +26,15 @@ class ModelLoop:
     """A learned model rolled on itself.
 
     Raises:
-        SettingError: A time step that is not positive, or a negative deviation.
+        SettingError: A time step that is not positive.
     """
 
     model: DynamicsModel  #: it predicts the next state
     propagator: Propagator  #: how the belief is carried on
     time_step: float = 1.0  #: time that one step stands for [s]
-    #: standard deviation of every state at the start where only its mean is given; the paper's 0.1
-    initial_std: float = 0.1
 
     def __post_init__(self) -> None:
         check_number("time_step", self.time_step, above=0, unit="[s]")
-        check_number("initial_std", self.initial_std, least=0)
 
 
 @dataclass(frozen=True)
@@ -131,13 +128,13 @@ class PlantSimulator:
 
 
 class ModelSimulator:
-    """Simulates a model loop from a mean (n,) with covariance ``initial_std``^2 I, or from a belief."""
+    """Simulates a model loop from a belief, or from a mean (n,) with the paper's standard deviation of 0.1."""
 
     def __init__(self, loop: ModelLoop, initial: Any):
         self.loop, self._steps = loop, 0
         model, n = loop.model, loop.model.state_dim
         to: Any = {"device": model.device, "dtype": model.dtype}
-        mean, covariance = initial, loop.initial_std**2 * torch.eye(n, **to)
+        mean, covariance = initial, 0.1**2 * torch.eye(n, **to)
         if isinstance(initial, Gaussian):
             mean, covariance = initial.mean, initial.covariance
         self._belief = Gaussian(torch.as_tensor(_check_state(mean, n), **to), covariance.to(**to))

@@ -193,9 +193,9 @@ class System:
             raise SettingError("dynamics", f"{what}; got {type(self.dynamics).__name__}")
         if self.stateful:
             return
-        x, u = self.goal if self.start is None else self.start, self.initial_input
+        x, u = list(self.goal if self.start is None else self.start), list(self.initial_input)
         try:
-            entries = [float(entry) for entry in self.successor(list(x), list(u))]
+            entries = [float(entry) for entry in self.successor(x, u)]
         except GpmpcError:
             raise
         except Exception as error:

@@ -276,7 +276,7 @@ def test_misuse_is_refused_with_the_rule(settings, error, message):
         (lambda: Gust({"v": "strong"}), "rates.v: must be a number; got 'strong'"),
         (lambda: Gust({}), "rates: must map names of states to numbers"),
         (lambda: Dropout(1.0, 1.0), "stop: must be a number above 1.0"),
-        (lambda: ModelLoop(None, None, initial_std=-1), "initial_std: must be a number, 0 or more; got -1"),
+        (lambda: ModelLoop(None, None, time_step=-1), r"time_step: must be a number above 0 \[s\]; got -1"),
     ],
 )
 def test_a_wrong_setting_is_refused_at_construction(build, message):
