@@ -130,7 +130,8 @@ def _parameters(system: System) -> Array:
 
 def _with_parameters(robot: str, values: Array) -> System:
     m1, m2, length, c1, c2, i1, i2 = map(float, values)
-    return double_pendulum(ACTUATED[robot], (m1, m2), length, (c1, c2), (i1, i2))
+    parts = {"masses": (m1, m2), "first_length": length, "centres": (c1, c2), "inertias": (i1, i2)}
+    return double_pendulum(ACTUATED[robot], **parts)
 
 
 @dataclass

@@ -52,7 +52,6 @@ CASES = [
     (convex, "problem", (None, "tracking")),
     (lambda **settings: Cascade(nmpc(), nmpc(), **settings), "ratio", (0, 0.5)),
     (lambda **settings: Cascade(nmpc(), nmpc(), **settings), "response_time", (0.0, -1.0)),
-    (lambda **settings: Cascade(nmpc(), nmpc(), **settings), "attitude", ("level",)),
     (flown, "Q", ([1] * 5, [1] * 5 + [-1], [1] * 5 + [math.nan])),
     (flown, "R", ([1] * 2, [1, 1, -1])),
     (excited, "Q", ([1] * 7, [-1] * 6)),

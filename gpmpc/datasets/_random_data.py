@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gpmpc.datasets._flights import check_data
-from gpmpc.exceptions import DataError, SettingError, ShapeError, check_number
+from gpmpc.exceptions import DataError, SettingError, ShapeError, check_choice, check_number
 from gpmpc.gp import Transitions
 from gpmpc.systems import System, step
 from gpmpc.trajectories import Trajectory
@@ -37,9 +37,8 @@ class RandomData:
     def __post_init__(self) -> None:
         check_data(self, samples=1, episode=1, hold=1, seed=0)
         check_number("data.amplitude", self.amplitude, above=0)
-        for key, words in (("starts", ("region", "start")), ("around", ("middle", "initial_input"))):
-            if getattr(self, key) not in words:
-                raise SettingError(f"data.{key}", f"must be {' or '.join(words)}; got {getattr(self, key)!r}")
+        check_choice("data.starts", self.starts, ("region", "start"))
+        check_choice("data.around", self.around, ("middle", "initial_input"))
         for value in self.noise or ():
             check_number("data.noise", value, least=0)
 
@@ -48,8 +47,7 @@ class RandomData:
         for name, *limits in zip(system.input_names, system.input_lower, system.input_upper, strict=True):
             if not np.isfinite(limits).all():
                 raise SettingError("data", f"random inputs need limits; {name} of {system.name} has none")
-        stateful = getattr(system.dynamics, "stateful", False)
-        if system.region is None and self.starts == "region" and not stateful:
+        if system.region is None and self.starts == "region" and not system.stateful:
             raise SettingError("data.starts", f"{system.name} has no region; take starts=start, or give it one")
         if self.noise is not None and len(self.noise) != len(system.state_names):
             raise ShapeError(f"data.noise must have {len(system.state_names)} deviations; got {len(self.noise)}")
@@ -68,7 +66,10 @@ class RandomData:
         lower, upper = np.array(system.input_lower), np.array(system.input_upper)
         middle = (lower + upper) / 2 if self.around == "middle" else np.array(system.initial_input)
         half = self.amplitude * (upper - lower) / 2
-        centre, reach = _surroundings(system)
+        centre, reach = 0.0, np.finfo(float).max
+        if system.region is not None:
+            low, high = np.array(system.region)
+            centre, reach = (low + high) / 2, 1.5 * (high - low)
         rows: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
         for _ in range(100 + 2 * self.samples):
             state, input = self._start(system, random), middle
@@ -89,16 +90,8 @@ class RandomData:
         raise DataError(f"{system.name}: only {len(rows)} of {self.samples} random steps stayed near the region")
 
     def _start(self, system: System, random: np.random.Generator) -> np.ndarray:
-        if getattr(system.dynamics, "stateful", False):
+        if system.stateful:
             return system.dynamics.reset(int(random.integers(2**31)))
         if self.starts == "start":
             return np.array(system.goal if system.start is None else system.start)
         return random.uniform(*system.region)
-
-
-def _surroundings(system: System) -> tuple[np.ndarray, np.ndarray]:
-    """Middle of the region (n,), and the distance from it within which steps count (n,)."""
-    if system.region is None:
-        return np.zeros(len(system.state_names)), np.full(len(system.state_names), np.finfo(float).max)
-    lower, upper = np.array(system.region)
-    return (lower + upper) / 2, 1.5 * (upper - lower)

@@ -1,8 +1,4 @@
-"""Features that a GP sees of a state and an input: selected columns, angles as sine and cosine, and lagged values.
-
-Leaving a column out makes a model invariant to it; the sine and cosine of an angle make it periodic, so that one turn
-more changes nothing. Lagged states and inputs stand in the state of a model (``Lags``), where columns select them.
-"""
+"""Features that a GP sees of a state and an input: selected columns, angles as sine and cosine, and lagged values."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -22,6 +18,8 @@ from gpmpc.models._nominal import Affine
 @dataclass(frozen=True)
 class Features:
     """Maps a state and an input to what a GP sees of them.
+
+    Leaving a column out makes a model invariant to it; the sine and cosine of an angle make it periodic.
 
     Raises:
         SettingError: An index is out of range or stands there twice, or an angle is not selected.
@@ -55,8 +53,8 @@ class Features:
     @cached_property
     def sines(self) -> NDArray[np.intp]:
         """Where the sines stand among the features, each before its cosine (a,)."""
-        places = [k for k, i in enumerate(self.columns) if i in self.angles and (k == 0 or self.columns[k - 1] != i)]
-        return np.array(places, dtype=np.intp)
+        first = np.diff(self.columns, prepend=-1) != 0
+        return np.flatnonzero(first & np.isin(self.columns, self.angles))
 
     @cached_property
     def _selected(self) -> NDArray[np.intp]:
@@ -66,28 +64,24 @@ class Features:
     @cached_property
     def _by_column(self) -> Array:
         """One in the column of each feature's state (d, n)."""
-        matrix = np.zeros((self.dim, self.state_dim))
-        matrix[np.arange(self.dim), self.columns] = 1.0
-        return matrix
+        return np.eye(self.state_dim)[self.columns]
 
     def __call__(self, state: Tensor, input: Tensor) -> tuple[Tensor, Tensor]:
         """The features (*batch, d) of a state (*batch, n), and the selected inputs (*batch, m_s)."""
-        if not self.angles:
-            return state[..., list(self.states)], input[..., list(self.inputs)]
+        z, selected, sines = state[..., self.columns.tolist()], input[..., list(self.inputs)], self.sines.tolist()
+        if not sines:
+            return z, selected
         parts = [
-            part
-            for i in self.states
-            for part in ((state[..., i].sin(), state[..., i].cos()) if i in self.angles else (state[..., i],))
+            part.sin() if k in sines else part.cos() if k - 1 in sines else part for k, part in enumerate(z.unbind(-1))
         ]
-        return torch.stack(parts, dim=-1), input[..., list(self.inputs)]
+        return torch.stack(parts, dim=-1), selected
 
     def linearize(self, states: Array, inputs: Array) -> tuple[Array, Array, Array | None]:
         """Features (K, d), selected inputs (K, m_s), each feature's derivative (K, d) by its state, None for one."""
         z, v, sines = states[:, self.columns], inputs[:, self._selected], self.sines
         if not self.angles:
             return z, v, None
-        angle = z[:, sines]
-        sine, cosine, slope = np.sin(angle), np.cos(angle), np.ones_like(z)
+        sine, cosine, slope = np.sin(z[:, sines]), np.cos(z[:, sines]), np.ones_like(z)
         z[:, sines], z[:, sines + 1] = sine, cosine
         slope[:, sines], slope[:, sines + 1] = cosine, -sine
         return z, v, slope
@@ -128,11 +122,10 @@ class Lags:
     @cached_property
     def nominal(self) -> Affine:
         """The nominal model for ``ResidualModel``: x stays where it is, and earlier values move on by a place."""
-        n, m, shifted = self.state_dim, self.input_dim, self.state_dim * self.states
+        n, m, first = self.state_dim, self.input_dim, self.state_dim * (1 + self.states)
         A, B = torch.zeros(self.dim, self.dim, dtype=torch.float64), torch.zeros(self.dim, m, dtype=torch.float64)
         A[:n, :n] = torch.eye(n)
-        A[n : n + shifted, :shifted] = torch.eye(shifted)
-        first = n + shifted
+        A[n:first, : first - n] = torch.eye(first - n)
         if self.inputs:
             B[first : first + m] = torch.eye(m)
             A[first + m :, first : self.dim - m] = torch.eye(self.dim - first - m)
@@ -146,20 +139,14 @@ class Lags:
     def augmented(self, states: Array, inputs: Array) -> Array:
         """States with their earlier values (T - l, dim) of a log; l = max(p, q) rows at its start have none.
 
-        Args:
-            states: x_0 .. x_{T-1} (T, n).
-            inputs: u_0 .. u_{T-2} or more (T - 1 or T, m), each applied from the time of its row on.
-
-        Raises:
-            ShapeError: The two do not belong together, or hold too few rows.
+        Of states x_0 .. x_{T-1} (T, n) and inputs (T - 1 or T, m), each applied from the time of its row on;
+        ``ShapeError`` where the two do not belong together, or hold too few rows.
         """
         T, first = len(states), max(self.states, self.inputs)
-        wide = np.shape(states)[1:] == (self.state_dim,) and np.shape(inputs)[1:] == (self.input_dim,)
-        if not wide or len(inputs) not in (T - 1, T) or first >= T:
-            raise ShapeError(
-                f"states (T, {self.state_dim}) and inputs (T or T - 1, {self.input_dim}) need T above {first}; "
-                f"got {np.shape(states)} and {np.shape(inputs)}"
-            )
+        found, shapes = (np.shape(states), np.shape(inputs)), [(k, self.input_dim) for k in (T - 1, T)]
+        if found[0] != (T, self.state_dim) or found[1] not in shapes or first >= T:
+            what = f"states (T, {self.state_dim}) and inputs (T or T - 1, {self.input_dim}) need T above {first}"
+            raise ShapeError(f"{what}; got {found[0]} and {found[1]}")
         before = [states[first - lag : T - lag] for lag in range(self.states + 1)]
         before += [inputs[first - lag : T - lag] for lag in range(1, self.inputs + 1)]
         return np.concatenate(before, axis=1)

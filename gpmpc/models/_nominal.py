@@ -30,9 +30,8 @@ class Affine:
 
     def __post_init__(self) -> None:
         check_tensors(A=self.A, B=self.B, c=self.c)
-        shapes = [tuple(part.shape) for part in (self.A, self.B, self.c)]
-        n = len(self.A) if self.A.dim() else 0
-        if shapes[0] != (n, n) or self.B.dim() != 2 or len(self.B) != n or shapes[2] != (n,):
+        shapes, n = [tuple(part.shape) for part in (self.A, self.B, self.c)], self.c.numel()
+        if shapes != [(n, n), (n, *shapes[1][1:2]), (n,)] or self.B.dim() != 2:
             raise ShapeError(f"A, B and c must be (n, n), (n, m) and (n,); got {', '.join(map(str, shapes))}")
 
     @classmethod
@@ -47,8 +46,7 @@ class Affine:
 
     def linearize(self, states: Array, inputs: Array) -> tuple[Array, Array, Array]:
         """The nominal next states (K, n) and their constant derivatives (K, n, n) and (K, n, m)."""
-        A, B, c = self._arrays
-        K = len(states)
+        (A, B, c), K = self._arrays, len(states)
         return states @ A.T + inputs @ B.T + c, np.tile(A, (K, 1, 1)), np.tile(B, (K, 1, 1))
 
     @cached_property
@@ -98,39 +96,29 @@ class CasadiFunction:
     """A function that is written in CasADi, linearised at all points in one call.
 
     Its operations are read once and run by compiled loops (``gpmpc._kernels.tape``), or by CasADi where it calls what
-    is no expression.
-
-    It serves as nominal model, (state (n,), input (m,)) to the next state (n,), and as effect B(x), state (n,) to
-    (n, k). It is evaluated in double precision on the CPU, and torch cannot differentiate it.
-
-    Args:
-        source: The CasADi function, or an importable Python function that makes one, which a saved model names.
-        parameters: Of the function that makes it.
+    is no expression. It serves as nominal model, (state (n,), input (m,)) to the next state (n,), and as effect B(x),
+    state (n,) to (n, k). It is evaluated in double precision on the CPU, and torch cannot differentiate it.
 
     Raises:
-        UnsupportedModel: The function has no argument, or more than one value.
+        UnsupportedModel: It is no CasADi function, or has no argument, or more than one value.
     """
 
-    def __init__(self, source: Any, **parameters: Any):
+    def __init__(self, function: Any):
         from gpmpc.gp.casadi_ import tape_of  # loads CasADi
 
-        is_casadi = hasattr(source, "n_in")
-        if is_casadi and parameters:
-            raise UnsupportedModel(f"parameters {list(parameters)} are for a function that makes a CasADi function")
-        function: Any = source if is_casadi else source(**parameters)
         if not hasattr(function, "n_in") or function.n_out() != 1 or not function.n_in():
             raise UnsupportedModel(f"CasadiFunction takes a CasADi function of one value; got {function!r}")
-        names, self._value = function.name_in(), function.name_out(0)
-        if any(function.size2_in(i) != 1 for i in range(len(names))):
+        if any(function.size2_in(i) != 1 for i in range(function.n_in())):
             raise UnsupportedModel(f"a CasADi function takes vectors (column by column); got {function!r}")
-        self.function, self.source, self.parameters = function, None if is_casadi else source, parameters
-        jacobians = [f"jac:{self._value}:{name}" for name in names]
-        self.tape = tape_of(function)
-        if self.tape is None:
-            self._expansion = function.factory("expansion", names, [self._value, *jacobians])
+        self.function, self.tape, self._mapped = function, tape_of(function), {}
         self.shape = function.size1_out(0), function.size2_out(0)
-        self.sizes = [function.size1_in(i) for i in range(len(names))]
-        self._mapped: dict[int, Any] = {}
+        self.sizes = [function.size1_in(i) for i in range(function.n_in())]
+
+    @cached_property
+    def _expansion(self) -> Any:
+        """Value and derivatives as a CasADi function."""
+        names, value = self.function.name_in(), self.function.name_out(0)
+        return self.function.factory("expansion", names, [value, *(f"jac:{value}:{name}" for name in names)])
 
     def check_sizes(self, arguments: tuple[int, ...], value: tuple[int, int]) -> None:
         """Raises ``UnsupportedModel`` unless arguments and value have these sizes."""
@@ -140,49 +128,38 @@ class CasadiFunction:
 
     def __call__(self, *arguments: Tensor) -> Tensor:
         """The value (*batch, rows), or (*batch, rows, columns) of a matrix, at arguments (*batch, d_i)."""
-        batch = arguments[0].shape[:-1]
-        flat = [to_array(a).reshape(-1, size).T for a, size in zip(arguments, self.sizes, strict=True)]
-        value = self.function.map(flat[0].shape[1])(*flat).full()
-        value = torch.as_tensor(self._split(value, batch.numel()), dtype=arguments[0].dtype, device=arguments[0].device)
-        return value.reshape(*batch, *value.shape[1:])
+        like = arguments[0]
+        flat = (to_array(a).reshape(-1, size) for a, size in zip(arguments, self.sizes, strict=True))
+        value = torch.as_tensor(self.linearize(*flat)[0], dtype=like.dtype, device=like.device)
+        return value.reshape(*like.shape[:-1], *value.shape[1:])
 
     def linearize(self, *arguments: Array) -> tuple[Array, ...]:
         """The values at K points, and their derivatives by each argument (K, rows, d_i) or (K, rows, columns, d_i)."""
         K, (rows, columns) = len(arguments[0]), self.shape
+        size = rows * columns  # a matrix goes column by column
         if self.tape is not None:
             from gpmpc._kernels.tape import linearize_tape  # loads numba
 
             points = np.ascontiguousarray(np.hstack(arguments))
-            values, jacobians = np.empty((K, rows * columns)), np.empty((K, rows * columns, points.shape[1]))
+            values, jacobians = np.empty((K, size)), np.empty((K, size, points.shape[1]))
             call_unchecked(linearize_tape, self.tape, points, values, jacobians)
-            parts = np.split(jacobians, np.cumsum(self.sizes)[:-1], axis=2)
-            if columns == 1:
-                return values, *(np.ascontiguousarray(part) for part in parts)
-            value, *parts = (p.reshape(K, columns, rows, *p.shape[2:]).swapaxes(1, 2) for p in (values, *parts))
-            return tuple(np.ascontiguousarray(part) for part in (value, *parts))
-        if K not in self._mapped:
-            self._mapped[K] = self._expansion.map(K)
-        expanded: Any = self._mapped[K](*(argument.T for argument in arguments))
-        listed = expanded if isinstance(expanded, tuple | list) else [expanded]
-        value, *jacobians = (part.full() for part in listed)
-        found = [self._split(value, K)]
-        for jacobian in jacobians:  # rows of a derivative go through a matrix column by column
-            by = jacobian.reshape(columns, rows, K, -1).transpose(2, 1, 0, 3)
-            found.append(np.ascontiguousarray(by[:, :, 0] if columns == 1 else by))
-        return tuple(found)
-
-    def _split(self, value: Array, K: int) -> Array:
-        rows, columns = self.shape
-        split = value.reshape(rows, K, columns).transpose(1, 0, 2)
-        return np.ascontiguousarray(split[..., 0] if columns == 1 else split)
+            parts = [values, *np.split(jacobians, np.cumsum(self.sizes)[:-1], axis=2)]
+        else:
+            if K not in self._mapped:
+                self._mapped[K] = self._expansion.map(K)
+            value, *jacobians = (part.full() for part in self._mapped[K].call([a.T for a in arguments]))
+            parts = [value.reshape(rows, K, columns).transpose(1, 2, 0).reshape(K, size)]
+            parts += [jacobian.reshape(size, K, -1).swapaxes(0, 1) for jacobian in jacobians]
+        if columns > 1:
+            parts = [part.reshape(K, columns, rows, *part.shape[2:]).swapaxes(1, 2) for part in parts]
+        return tuple(np.ascontiguousarray(part) for part in parts)
 
 
 def linearize_function(function: Callable[..., Tensor], model: Any, *arguments: Array) -> tuple[Array, ...]:
     """Value and derivatives by each argument of a batched function at K points, arguments (K, d_i).
 
-    By the function's own method ``linearize``, such as that of ``Affine`` and ``CasadiFunction``; else by one batched
-    call of torch autograd, with tensors of the model's type on its device: from (*batch, d_i) to (*batch, k) or
-    (*batch, n, k).
+    By the function's own method ``linearize``; else by one batched call of torch autograd, with tensors of the model's
+    type on its device: from (*batch, d_i) to (*batch, k) or (*batch, n, k).
     """
     if (method := getattr(function, "linearize", None)) is not None:
         return method(*arguments)

@@ -15,7 +15,7 @@ from typing import Any, cast
 import torch
 from torch import Tensor
 
-from gpmpc._dynamics import Array, Linearized, TensorModel, check_destination, check_query, tensors_for, to_array
+from gpmpc._dynamics import Array, Linearized, TensorModel, check_query, tensors_for, to_array
 from gpmpc.exceptions import SettingError, ShapeError
 from gpmpc.gaussian import Gaussian, check_tensors
 from gpmpc.gp import GPPosterior, SlidingWindow, Trainer, Training, Transitions, append_points
@@ -23,6 +23,7 @@ from gpmpc.gp._posterior import AffineForm
 from gpmpc.gp._transitions import check_transitions
 from gpmpc.models._features import Features
 from gpmpc.models._nominal import Affine, CasadiFunction, linearize_function
+from gpmpc.models._wrapper import check_like, move
 
 Nominal = Callable[[Tensor, Tensor], Tensor]
 Effect = Tensor | Callable[[Tensor], Tensor]
@@ -51,38 +52,34 @@ class ResidualModel(TensorModel):
     noise: Tensor | None = None
 
     _part = property(lambda self: self.residual)
+    to = move
 
     def __post_init__(self) -> None:
-        gp, nominal = self.residual, self.nominal
-        parts: dict[str, tuple[Any, tuple[int, ...]]] = {}
+        gp, nominal, n, m = self.residual, self.nominal, self.state_dim, self.input_dim
         if getattr(gp, "predicts", None) != "value":
             raise SettingError("residual", f"must be a GP with predicts='value'; got {getattr(gp, 'predicts', gp)!r}")
-        if not callable(self.B):
-            check_tensors(B=self.B)
-            parts["B"] = self.B, (len(self.B) if self.B.dim() else 0, gp.output_dim)
-        elif self.noise is None:
+        if callable(self.B) and self.noise is None:
             raise SettingError("noise", "must be given (n, n) where B is a function of the state; got None")
         if (self.features.dim, len(self.inputs)) != (gp.state_dim, gp.input_dim):
-            raise ShapeError(
-                f"the residual has {gp.state_dim} states and {gp.input_dim} inputs; "
-                f"got {self.features.dim} and {len(self.inputs)} selected"
-            )
-        n, m = self.state_dim, self.input_dim
+            got = f"{self.features.dim} and {len(self.inputs)} selected"
+            raise ShapeError(f"the residual has {gp.state_dim} states and {gp.input_dim} inputs; got {got}")
         if isinstance(nominal, CasadiFunction):
             nominal.check_sizes((n, m), (n, 1))
         if isinstance(self.B, CasadiFunction):
             self.B.check_sizes((n,), (n, gp.output_dim))
+        parts: dict[str, tuple[Any, tuple[int, ...]]] = {}
+        if not callable(self.B):
+            parts["B"] = self.B, (n, gp.output_dim)
         if self.noise is not None:
-            check_tensors(noise=self.noise)
-            parts["noise"] = (self.noise, (n, n))
+            parts["noise"] = self.noise, (n, n)
         if isinstance(nominal, Affine):
             shapes = {"A": (n, n), "B": (n, m), "c": (n,)}
             parts |= {f"nominal.{name}": (getattr(nominal, name), shape) for name, shape in shapes.items()}
         for name, (value, shape) in parts.items():
+            check_tensors(**{name: value})
             if tuple(value.shape) != shape:
                 raise ShapeError(f"{name} must have shape {shape}; got {tuple(value.shape)}")
-            if value.dtype != gp.dtype or value.device != gp.device:
-                raise SettingError(name, f"must be {gp.dtype} on {gp.device}; got {value.dtype} on {value.device}")
+            check_like(name, value, gp)
 
     @classmethod
     def train(
@@ -98,15 +95,8 @@ class ResidualModel(TensorModel):
     ) -> "ResidualModel":
         """Learns d from transitions: the part of x[k+1] - f0(x[k], u[k]) that B reaches (least squares).
 
-        Args:
-            nominal: f0; ``Affine.identity(n, m)`` where nothing is known.
-            transitions: What was observed.
-            B: Where d acts (n, k), or a function of the state; on every state by default.
-            states: The states that d depends on; all by default.
-            inputs: The inputs that d depends on; all by default.
-            trainer: A ``Trainer`` or ``SparseTrainer``; its ``predicts`` is not read.
-            seed: Of the random starts.
-            angles: The states that d sees as sine and cosine.
+        Where nothing is known, ``nominal`` is ``Affine.identity(n, m)``. By default B acts on every state, d depends on
+        all states and inputs. The ``trainer`` is a ``Trainer`` or ``SparseTrainer``, whose ``predicts`` is not read.
 
         Raises:
             ShapeError: ``nominal`` or B do not fit the transitions.
@@ -114,7 +104,7 @@ class ResidualModel(TensorModel):
             TrainingError: An output could not be trained.
         """
         trainer = Trainer() if trainer is None else trainer
-        return _train(nominal, transitions, B, (states, inputs, angles), trainer, seed)[0]
+        return cast(Any, train_residual(trainer, transitions, angles, nominal, seed, B, states, inputs).posterior)
 
     def __len__(self) -> int:
         return len(self.residual)
@@ -139,7 +129,7 @@ class ResidualModel(TensorModel):
     def state_dim(self) -> int:
         """Number of states, n."""
         known = self.noise if callable(self.B) else self.B
-        return 0 if known is None else len(known)
+        return len(known) if isinstance(known, Tensor) and known.dim() else 0
 
     @property
     def output_dim(self) -> int:
@@ -206,16 +196,6 @@ class ResidualModel(TensorModel):
         states, inputs, angles = list(self.states), list(self.inputs), tuple(self.angles)
         return AffineForm(self.residual, A, G, c, self.B, states, inputs, angles, tape)
 
-    def to(self, device: Any = None, dtype: torch.dtype | None = None) -> "ResidualModel":
-        """Copies the model to another device or type; functions (nominal model, effect) are taken as they are."""
-        check_destination(device, dtype)
-        nominal = self.nominal
-        if isinstance(nominal, Affine):
-            nominal = Affine(*(part.to(device=device, dtype=dtype) for part in (nominal.A, nominal.B, nominal.c)))
-        B = self.B if callable(self.B) else self.B.to(device=device, dtype=dtype)
-        noise = None if self.noise is None else self.noise.to(device=device, dtype=dtype)
-        return replace(self, nominal=nominal, residual=self.residual.to(device, dtype), B=B, noise=noise)
-
 
 def _nominal(nominal: Nominal, state: Tensor, input: Tensor) -> Tensor:
     """f0 (*batch, n), held against the rule that a wrong number of states would otherwise be broadcast."""
@@ -223,57 +203,50 @@ def _nominal(nominal: Nominal, state: Tensor, input: Tensor) -> Tensor:
     if not isinstance(value, Tensor):
         raise SettingError("nominal", f"must give a torch tensor; got {type(value).__name__}")
     if value.shape != state.shape:
-        raise ShapeError(
-            f"nominal must give next states of the states' shape {tuple(state.shape)}; got {tuple(value.shape)}"
-        )
+        what = f"nominal must give next states of the states' shape {tuple(state.shape)}"
+        raise ShapeError(f"{what}; got {tuple(value.shape)}")
     return value
 
 
 def _effect(B: Effect, state: Tensor) -> Tensor:
-    """B (*batch, n, k) at states (*batch, n), checked."""
-    n = state.shape[-1]
-    if not callable(B):
-        check_tensors(B=B)
-        if B.dim() != 2 or len(B) != n:
-            raise ShapeError(f"B must be ({n}, k), a row a state; got {tuple(B.shape)}")
-        return B
-    value = B(state)
+    """B (n, k), or of a function (*batch, n, k), at states (*batch, n), checked."""
+    value, rows = (B(state), state.shape) if callable(B) else (B, state.shape[-1:])
     check_tensors(B=value)
-    value = value[..., None] if value.shape == state.shape else value  # one output
-    if value.shape[:-1] != state.shape:
-        raise ShapeError(f"B must give (*batch, {n}, k) at {tuple(state.shape)}; got {tuple(value.shape)}")
+    if callable(B) and value.shape == rows:  # one output
+        value = value[..., None]
+    if value.shape[:-1] != rows:
+        raise ShapeError(f"B must be ({', '.join(map(str, rows))}, k), a row a state; got {tuple(value.shape)}")
     return value
 
 
 def train_residual(
-    trainer: Any, transitions: Transitions, angles: Sequence[int] = (), nominal: Nominal | None = None, seed: int = 0
+    trainer: Any,
+    transitions: Transitions,
+    angles: Sequence[int] = (),
+    nominal: Nominal | None = None,
+    seed: int = 0,
+    B: Effect | None = None,
+    states: Sequence[int] | None = None,
+    inputs: Sequence[int] | None = None,
 ) -> Training:
-    """Trains a residual model of all states and inputs, and returns the whole training.
+    """Trains a residual model, and returns the whole training; arguments and errors are those of its ``train``.
 
-    Arguments and errors are those of ``ResidualModel.train``; without a nominal model the difference of two states is
-    learned.
+    Without a nominal model the difference of two states is learned.
     """
-    known = Affine.identity(transitions.state_dim, transitions.input_dim) if nominal is None else nominal
-    model, training = _train(known, transitions, None, (None, None, angles), trainer, seed)
-    return replace(training, posterior=cast(Any, model))
-
-
-def _train(
-    nominal: Nominal, transitions: Transitions, B: Effect | None, seen: tuple[Any, Any, Any], trainer: Any, seed: int
-) -> tuple[ResidualModel, Training]:
-    """The model that ``ResidualModel.train`` makes, and the training of its GP; ``seen`` are states, inputs, angles."""
     check_transitions(transitions)
     if not hasattr(trainer, "fit"):
         raise SettingError("trainer", f"must be a Trainer or SparseTrainer; got {trainer!r}")
     n, m = transitions.state_dim, transitions.input_dim
-    states, inputs = (list(range(k)) if some is None else list(some) for some, k in zip(seen, (n, m), strict=False))
-    B, angles = torch.eye(n, dtype=torch.float64) if B is None else B, list(seen[2])
-    observed = _residuals(nominal, B, Features(states, inputs, angles, n, m), transitions)
+    nominal = Affine.identity(n, m) if nominal is None else nominal
+    B = torch.eye(n, dtype=torch.float64) if B is None else B
+    states, inputs = (list(range(k) if some is None else some) for some, k in ((states, n), (inputs, m)))
+    observed = _residuals(nominal, B, Features(states, inputs, list(angles), n, m), transitions)
     training, noise = trainer.fit(*observed, len(inputs), "value", seed), None
     if callable(B):  # one covariance for all states: its mean over those that were observed
         effect = _effect(B, transitions.states)
         noise = (effect @ training.posterior.noise_covariance @ effect.mT).mean(0)
-    return ResidualModel(nominal, training.posterior, B, states, inputs, m, angles, noise), training
+    model = ResidualModel(nominal, training.posterior, B, states, inputs, m, list(angles), noise)
+    return replace(training, posterior=cast(Any, model))
 
 
 def _residuals(

@@ -16,13 +16,10 @@ from gpmpc.models._features import Features
 
 
 class RollOut:
-    """Rolls out the mean of one model, from any number of starts in one call.
+    """Rolls out the mean of one model of next states, from any number of starts in one call.
 
     A model whose ``affine_form`` or ``tape`` is not None takes one compiled call; any other one call for each stage,
     of its ``predict_mean`` where it has that method, else of ``linearize``.
-
-    Args:
-        model: Predicts next states.
     """
 
     def __init__(self, model: DynamicsModel):
@@ -48,22 +45,21 @@ class RollOut:
             u = feedback.inputs[:, k] + (gains[:, k] @ (states[:, k] - feedback.states[:, k])[..., None])[..., 0]
             u = np.minimum(np.maximum(u, last + feedback.rate_lower[k]), last + feedback.rate_upper[k])
             last = inputs[:, k] = np.minimum(np.maximum(u, feedback.lower[k]), feedback.upper[k])
-            states[:, k + 1] = _mean(self._model, np.ascontiguousarray(states[:, k]), last) + added
+            states[:, k + 1] = self._mean(np.ascontiguousarray(states[:, k]), last) + added
         return states, inputs
 
     def open_loop(self, start: Array, inputs: Array, disturbance: Array | None = None) -> Array:
         """Returns the states (T, H + 1, n) that inputs (T, H, m) lead to from x_0 (T, n), without bounds."""
         (T, H, m), n = inputs.shape, start.shape[1]
         gains, free = np.zeros((1, H, m, n)), np.full((H, m), np.inf)
-        law = Feedback(
-            np.zeros((T, H, n)), np.ascontiguousarray(inputs, dtype=float), gains, -free, free, -free, free, np.zeros(m)
-        )
+        planned, inputs = np.zeros((T, H, n)), np.ascontiguousarray(inputs, dtype=float)
+        law = Feedback(planned, inputs, gains, -free, free, -free, free, np.zeros(m))
         return self(start, law, disturbance)[0]
 
-
-def _mean(model: Any, states: Array, inputs: Array) -> Array:
-    method = getattr(model, "predict_mean", None)
-    return linearize(model, states, inputs, covariance=False).mean if method is None else method(states, inputs)
+    def _mean(self, states: Array, inputs: Array) -> Array:
+        if (method := getattr(self._model, "predict_mean", None)) is not None:
+            return method(states, inputs)
+        return linearize(self._model, states, inputs, covariance=False).mean
 
 
 def _compiled_form(form: AffineForm, n: int, m: int) -> AffineGPs:

@@ -44,7 +44,7 @@ from gpmpc.mpc.problem import Problem
 from gpmpc.propagation import Linearization, Propagator
 from gpmpc.qp._cvxpy import STATUSES, TIGHT
 from gpmpc.status import Status
-from gpmpc.systems import Plant
+from gpmpc.systems import System
 
 Array = np.ndarray
 
@@ -70,7 +70,7 @@ class NMPC:
     """
 
     def __init__(
-        self, plant: Plant, problem: Problem, horizon: int, initial_input: Sequence[float], tolerance: float = 1e-10
+        self, plant: System, problem: Problem, horizon: int, initial_input: Sequence[float], tolerance: float = 1e-10
     ):
         n, m = len(plant.dynamics.state_names), len(plant.dynamics.input_names)
         self.initial_input = check_controller(problem, n, m, horizon, initial_input)
@@ -225,7 +225,7 @@ class StateFormMPC:
 
 
 def _build(
-    plant: Plant, problem: Problem, horizon: int, tolerance: float
+    plant: System, problem: Problem, horizon: int, tolerance: float
 ) -> tuple[casadi.Function, list[dict[str, np.ndarray]]]:
     """IPOPT on the unknowns (x_1 .. x_H, u_0 .. u_{H-1}, slacks), and the bounds of unknowns and constraints."""
     problem.check_plain("NMPC")

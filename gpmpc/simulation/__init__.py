@@ -1,9 +1,9 @@
 """Closed loops: a controller on a plant or on a model, with noise, disturbances and many seeds."""
 
 from gpmpc.simulation._cascade_loop import Cascade, cascade_loop
-from gpmpc.simulation._closed_loop import Trial, closed_loop, closed_loops, rehearse
-from gpmpc.simulation._loop import Rollout
-from gpmpc.simulation._simulator import Disturbance, Dropout, Gust, ModelLoop, Noise, Replaced
+from gpmpc.simulation._disturbances import Disturbance, Dropout, Gust, Replaced
+from gpmpc.simulation._loop import Rollout, Trial, closed_loop, closed_loops, rehearse
+from gpmpc.simulation._simulator import ModelLoop, Noise
 from gpmpc.step import Step
 
 __all__ = [

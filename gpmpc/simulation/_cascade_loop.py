@@ -11,18 +11,19 @@ its last plan, the inner one keeps the vehicle upright, and the other way round.
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 
-from gpmpc.exceptions import ShapeError, check_choice, check_number
+from gpmpc.exceptions import Diverged, ShapeError, check_number
 from gpmpc.gaussian import Gaussian
 from gpmpc.mpc import Controller, Reference
-from gpmpc.mpc._policy import Command, OnFailure, check_policy, command
-from gpmpc.simulation._loop import Flight, History, Moment, Rollout, check_references, fly, window
-from gpmpc.simulation._simulator import Disturbance, Noise, PlantSimulator
+from gpmpc.mpc._policy import OnFailure, check_policy, command
+from gpmpc.simulation._disturbances import Disturbance
+from gpmpc.simulation._loop import Flight, Rollout, check_references, window
+from gpmpc.simulation._simulator import Noise, PlantSimulator, step_together
 from gpmpc.step import Step
-from gpmpc.systems import ATTITUDES, Coupled, Plant, attitude_for_thrust_direction
+from gpmpc.systems import Coupled, System, attitude_for_thrust_direction
 
 _OUTER, _INNER = slice(0, 6), slice(6, 12)
 
@@ -32,18 +33,16 @@ class Cascade:
     """An outer and an inner controller, and how the one's inputs are the other's references.
 
     Raises:
-        SettingError: A ratio below 1, an unknown attitude, or a response time that is not positive.
+        SettingError: A ratio below 1, or a response time that is not positive.
     """
 
     outer: Controller  #: on states x, vx, y, vy, z, vz [m, m/s] and inputs U1 [N], ux, uy [-]
     inner: Controller  #: on states phi, p, theta, q, psi, r [rad, rad/s] and inputs U2, U3, U4 [N]
     ratio: int = 20  #: inner steps an outer step
-    attitude: str = "exact"  #: ``"exact"`` or ``"paper"``; see ``attitude_for_thrust_direction``
     response_time: float = 0.1  #: of the approach to a new attitude [s]
 
     def __post_init__(self) -> None:
         check_number("ratio", self.ratio, least=1, whole=True)
-        check_choice("attitude", self.attitude, ATTITUDES)
         check_number("response_time", self.response_time, above=0, unit="[s]")
 
     def attitude_reference(self, planned: np.ndarray, angles: np.ndarray, phase: int) -> Reference:
@@ -57,7 +56,7 @@ class Cascade:
         direction = planned[np.minimum(ahead // self.ratio, len(planned) - 1)]
         states = np.zeros((len(ahead), 6))
         ux, uy = direction[:, 1:].T
-        states[:, [0, 2]] = attitude_for_thrust_direction(ux, uy, angles[2], self.attitude)
+        states[:, [0, 2]] = attitude_for_thrust_direction(ux, uy, angles[2])
         states[:, 1::2] = (states[:, ::2] - angles) / self.response_time
         return Reference(states, np.zeros((self.inner.horizon, 3)))
 
@@ -73,7 +72,7 @@ class CascadeRollout:
 
 
 def cascade_loop(
-    plant: Plant,
+    plant: System,
     cascade: Cascade,
     references: Reference | np.ndarray,
     initial: Any,
@@ -98,62 +97,38 @@ def cascade_loop(
         Diverged: Its step is an inner one.
     """
     check_policy(on_failure)
-    names = (tuple(plant.dynamics.state_names), tuple(plant.dynamics.input_names))
-    if names != (Coupled.state_names, Coupled.input_names):
+    if (names := (plant.state_names, plant.input_names)) != (Coupled.state_names, Coupled.input_names):
         raise ShapeError(f"a cascade flies the states and inputs of Coupled; got {names}")
-    references, ratio = check_references(references, steps, cascade.outer.horizon), cascade.ratio
+    horizon, ratio = cascade.outer.horizon, cascade.ratio
+    references = check_references(references, steps, horizon)
     simulator = PlantSimulator(plant, initial, disturbances, noise, seed)
     calls: Any = (None, None) if on_step is None else [partial(on_step, loop) for loop in ("outer", "inner")]
-    outer = History(simulator, references, ratio * plant.time_step, _OUTER, calls[0])
-    inner = History(simulator, references, plant.time_step, _INNER, calls[1])
-    states, inputs = [simulator.mean], []
-
-    def decide(j: int, beliefs: Sequence[Gaussian], last: Sequence[_Decided | None]) -> list[_Decided]:
-        return [_decide(cascade, references, on_failure, j, beliefs[0], last[0])]
-
-    def record(moment: Moment, decided: _Decided) -> None:
-        k, phase = divmod(moment.k, ratio)
+    outer = Flight(simulator, references, ratio * plant.time_step, calls[0], _OUTER)
+    inner = Flight(simulator, references, plant.time_step, calls[1], _INNER)
+    states, inputs, angles = [simulator.mean], [], np.zeros(3)
+    thrust: Any = None  # the command of the outer step under way
+    attitude: Any = None  # what the inner controller is to follow
+    for j in range(steps * ratio):
+        (k, phase), time, before = divmod(j, ratio), round(j * plant.time_step, 9), (states[-1], simulator.covariance)
+        belief = simulator.measure(time)
         if phase == 0:
-            outer.add(moment._replace(k=k, input=decided.outer.input), decided.outer)
-        inner.add(moment._replace(input=moment.input[1:]), decided.inner, decided.attitude.states[0])
+            ahead = window(references, k, horizon)
+            thrust = command(cascade.outer, _part(belief, _OUTER), ahead, outer.last, on_failure, k)
+        # Attitudes start from where the vehicle is, or was when that was last known.
+        measured = belief.mean.numpy()[6::2]
+        angles = measured if np.isfinite(measured).all() else angles
+        planned = thrust.input[None] if thrust.plan is None else thrust.plan.inputs
+        attitude = cascade.attitude_reference(planned, angles, phase)
+        moments = command(cascade.inner, _part(belief, _INNER), attitude, inner.last, on_failure, j)
+        (applied,) = step_together([simulator], time, [np.append(thrust.input[:1], moments.input)])
+        if isinstance(applied, Diverged):
+            raise applied
+        if phase == 0:
+            outer.add(before, belief, thrust.input, thrust)
+        inner.add(before, belief, applied[1:], moments, attitude.states[0])
         states.append(simulator.mean)
-        inputs.append(moment.input)
-
-    flight = Flight(simulator, record)
-    fly([flight], decide, steps * ratio, plant.time_step)
-    if flight.error is not None:
-        raise flight.error
-    last = flight.last.attitude.states[1]
-    return CascadeRollout(np.array(states), np.array(inputs), outer.rollout(), inner.rollout(last))
-
-
-class _Decided(NamedTuple):
-    """What one inner step applies, and what the next one starts from."""
-
-    input: np.ndarray  # U1 .. U4 [N]
-    outer: Command  # of the outer step under way
-    inner: Command
-    attitude: Reference  # of the inner controller
-    angles: np.ndarray  # roll, pitch, yaw as they were last measured [rad]
-
-
-def _decide(
-    cascade: Cascade, references: Reference, on_failure: OnFailure, j: int, belief: Gaussian, last: _Decided | None
-) -> _Decided:
-    k, phase = divmod(j, cascade.ratio)
-    if last is None or phase == 0:
-        ahead, before = window(references, k, cascade.outer.horizon), last and last.outer
-        outer = command(cascade.outer, _part(belief, _OUTER), ahead, before, on_failure, k)
-    else:
-        outer = last.outer
-    measured = belief.mean.cpu().numpy().astype(float)[6::2]
-    # Attitudes start from where the vehicle is, or was when that was last known.
-    angles = np.zeros(3) if last is None else last.angles
-    angles = measured if np.isfinite(measured).all() else angles
-    planned = outer.input[None] if outer.plan is None else outer.plan.inputs
-    attitude = cascade.attitude_reference(planned, angles, phase)
-    inner = command(cascade.inner, _part(belief, _INNER), attitude, last and last.inner, on_failure, j)
-    return _Decided(np.append(outer.input[:1], inner.input), outer, inner, attitude, angles)
+        inputs.append(applied)
+    return CascadeRollout(np.array(states), np.array(inputs), outer.rollout(), inner.rollout(attitude.states[1]))
 
 
 def _part(belief: Gaussian, states: slice) -> Gaussian:

@@ -1,25 +1,30 @@
-"""The loop of every simulation, and the history of its steps.
+"""The loop of simulations, of one seed or of many at once, and the history of its steps.
 
     measure -> decide (by the policy where the controller fails) -> step -> record
 
-One seed, many at once, and a cascade, which is a controller at the inner rate, differ in what decides.
+Many seeds are measured, decided for (``control_many``, where the controller has that) and stepped together; a trial's
+numbers are those of ``closed_loop`` with its seed. What grows with their number is memory, so they fly in chunks.
 """
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from gpmpc.exceptions import Diverged, ShapeError, SolverFailure, check_number
+from gpmpc.exceptions import Diverged, GpmpcError, SettingError, ShapeError, SolverFailure, check_number
 from gpmpc.gaussian import Gaussian
-from gpmpc.mpc import Reference, Timing
-from gpmpc.mpc._policy import Command
-from gpmpc.simulation._simulator import Simulator, step_together
+from gpmpc.mpc import Controller, Reference, Timing
+from gpmpc.mpc._policy import Command, OnFailure, check_policy, command, commands
+from gpmpc.simulation._disturbances import Disturbance
+from gpmpc.simulation._simulator import ModelLoop, ModelSimulator, Noise, PlantSimulator, Simulator, step_together
 from gpmpc.status import Status
 from gpmpc.step import Step
+from gpmpc.systems import System
 
 Array = np.ndarray
+_MEMORY = 2**30  # [bytes] that the controller may take for all that fly at a time
 
 
 @dataclass(frozen=True)
@@ -57,110 +62,65 @@ class Rollout:
         return tuple((k, s) for k, s in enumerate(self.statuses) if not s.solved and k not in applied)
 
 
-class Moment(NamedTuple):
-    """Where a step began, and what was applied."""
-
-    k: int
-    time: float  # [s]
-    state: Array  # (n,)
-    covariance: Array  # (n, n)
-    measured: Array  # (n,)
-    input: Array  # (m,)
-
-
 class Flight:
-    """One simulator under way; ``record`` is called after every step with its ``Moment`` and what was decided."""
-
-    def __init__(self, simulator: Simulator, record: Callable[[Moment, Any], None]):
-        self.simulator, self.record = simulator, record
-        self.last: Any = None
-        self.error: SolverFailure | Diverged | None = None
-
-
-def fly(
-    flights: Sequence[Flight],
-    decide: Callable[[int, Sequence[Gaussian], Sequence[Any]], Sequence[Any]],
-    steps: int,
-    time_step: float,
-) -> None:
-    """Runs the loop of all flights of one plant in step; one that fails ends with its error, and the others go on.
-
-    ``decide`` is called with the number of the step, what is known of the states, and what was decided one step ago
-    (None at the first); it returns what is to be applied, its ``input`` (m,), or a ``SolverFailure``.
-    """
-    for k in range(steps):
-        time, moving = round(k * time_step, 9), []
-        flying = [flight for flight in flights if flight.error is None]
-        beliefs = [flight.simulator.measure(time) for flight in flying]
-        decisions = decide(k, beliefs, [flight.last for flight in flying]) if flying else ()
-        for flight, belief, decided in zip(flying, beliefs, decisions, strict=True):
-            if isinstance(decided, SolverFailure):
-                flight.error = decided
-            else:
-                moving.append((flight, belief, decided, flight.simulator.mean, flight.simulator.covariance))
-        applied = step_together([flight.simulator for flight, *_ in moving], time, [each[2].input for each in moving])
-        for (flight, belief, decided, state, covariance), input in zip(moving, applied, strict=True):
-            if isinstance(input, Diverged):
-                flight.error = input
-            else:
-                measured = belief.mean.cpu().numpy().astype(float)
-                flight.last = decided
-                flight.record(Moment(k, time, state, covariance, measured, input), decided)
-
-
-class History:
-    """Collects the steps of one loop, of some of the simulator's ``states``, for its ``Rollout``."""
+    """The loop of some of a simulator's ``states`` under way: its steps so far, its last command, and what ended it."""
 
     def __init__(
         self,
         simulator: Simulator,
         references: Reference,
         time_step: float,
-        states: slice = slice(None),
         on_step: Callable[[Step], None] | None = None,
+        states: slice = slice(None),
     ):
         # Of every step, without its decision and its quadratic program: mean and covariance expected of the next state,
         # NaN where no plan was applied; iterations, timing, and whether the plan left the data.
         self.rows: list[tuple[Step, Array, Array, int, Timing, bool]] = []
-        self._simulator, self._references, self._time_step = simulator, references, time_step
+        self.last: Command | None = None
+        self.error: SolverFailure | Diverged | None = None
+        self.simulator, self._references, self.time_step = simulator, references, time_step
         self._states, self._on_step = states, on_step
 
-    def add(self, moment: Moment, decided: Command, reference: Array | None = None) -> None:
-        """Adds a step; it was to be at the reference state (n,) of its number where no other is given."""
-        decision, part = decided.decision, self._states
-        reference = self._references.states[moment.k] if reference is None else reference
+    def add(
+        self, state: tuple[Array, Array], belief: Gaussian, input: Array, last: Command, reference: Any = None
+    ) -> None:
+        """Adds a step: mean and covariance where it began, what was measured, what was applied, the command.
+
+        By default its reference state (n,) is that of its number.
+        """
+        part, k, decision = self._states, len(self.rows), last.decision
         learned = None if decision is None else decision.learned
-        measured = moment.measured[part]
+        measured = belief.mean.cpu().numpy().astype(float)[part]
         step = Step(
-            time=moment.time,
-            k=moment.k,
-            reference=np.asarray(reference, dtype=float),
-            state=moment.state[part],
+            time=round(k * self.time_step, 9),
+            k=k,
+            reference=np.asarray(self._references.states[k] if reference is None else reference, dtype=float),
+            state=state[0][part],
             measured=measured,
-            input=np.asarray(moment.input, dtype=float),
+            input=np.asarray(input, dtype=float),
             decision=decision,
             innovation=measured - (self.rows[-1][1] if self.rows else np.nan),
-            belief_covariance=moment.covariance[part, part],
+            belief_covariance=state[1][part, part],
             gp_size=0 if learned is None else learned.size,
             gp_version=0 if learned is None else learned.version,
-            failed=decided.failed,
-            status=decided.status,
+            failed=last.failed,
+            status=last.status,
         )
         if self._on_step is not None:
             self._on_step(step)
-        n = len(step.state)
-        expected: Any = (np.full(n, np.nan), np.full((n, n), np.nan))
-        if decision is not None and not decided.failed:
+        expected: Any = (np.full_like(step.state, np.nan), np.full_like(step.belief_covariance, np.nan))
+        if decision is not None and not last.failed:
             expected = np.array(decision.means[1]), np.array(decision.covariances[1])
-        spent: Any = (0, Timing(0.0, 0.0, 0.0), False)
+        spent: Any = (0, Timing(), False)
         if decision is not None:
             spent = decision.iterations, decision.timing, decision.far_from_data
         self.rows.append((replace(step, decision=None), *expected, *spent))
+        self.last = last
 
     def rollout(self, last: Array | None = None) -> Rollout:
         """Makes the arrays of all steps; ``last`` is the reference state of the end, by default that of its number."""
         steps, means, covariances, iterations, timings, far = zip(*self.rows, strict=True)
-        part, end = self._states, self._simulator
+        part, end = self._states, self.simulator
         if last is None:
             last = self._references.states[: len(steps) + 1][-1]
         return Rollout(
@@ -171,12 +131,12 @@ class History:
             references=np.array([*(step.reference for step in steps), last], dtype=float),
             predicted_means=np.array(means),
             predicted_covariances=np.array(covariances),
-            statuses=tuple(step.status for step in steps if step.status is not None),
+            statuses=tuple(step.status for step in steps),
             iterations=np.array(iterations),
             timings=timings,
-            time_step=self._time_step,
-            suboptimal=tuple(s.k for s in steps if not (s.failed or s.status is None or s.status.solved)),
-            far_from_data=tuple(s.k for s, left in zip(steps, far, strict=True) if left),
+            time_step=self.time_step,
+            suboptimal=tuple(step.k for step in steps if not (step.failed or step.status.solved)),
+            far_from_data=tuple(step.k for step, left in zip(steps, far, strict=True) if left),
         )
 
 
@@ -194,3 +154,187 @@ def check_references(references: Reference | Array | Sequence[float], steps: int
     if len(references.states) < needed:
         raise ShapeError(f"{steps} steps with horizon {horizon} need {needed} references; got {len(references.states)}")
     return references
+
+
+def closed_loop(
+    system: System | ModelLoop,
+    controller: Controller,
+    references: Reference | Array | Sequence[float],
+    initial: Any,
+    steps: int,
+    *,
+    noise: Noise | None = None,
+    disturbances: Sequence[Disturbance] = (),
+    on_failure: OnFailure = "raise",
+    seed: int = 0,
+    on_step: Callable[[Step], None] | None = None,
+) -> Rollout:
+    """Runs a controller on a plant, or on a learned model that is rolled on itself.
+
+    Args:
+        system: What is steered.
+        controller: Its feedback law; it sees the next ``controller.horizon`` references.
+        references: Reference states r[0] .. (steps + horizon, n) or more, one a time step, or a set point (n,); as a
+            ``Reference`` with the inputs that belong to them.
+        initial: The state (n,). A ``Gaussian`` is the belief that a model loop starts from, and what a plant's state is
+            drawn from.
+        steps: K.
+        noise: On a plant's states, measurements and inputs.
+        disturbances: Gusts, other plants, dropouts: what the controller does not know of.
+        on_failure: What is applied where a solve fails: ``"previous_plan"``, ``"hold"`` or ``"raise"``; see
+            ``ControlLoop``.
+        seed: Of all random numbers; equal seeds give equal numbers.
+        on_step: Called after every step and outside of everything that is timed, such as a recorder's ``record``.
+
+    Raises:
+        ShapeError: Too few references for the steps and the horizon, or a state of the wrong length.
+        SettingError: An unknown policy, negative noise, or noise in a model loop.
+        SolverFailure: A solve failed, and the policy is ``"raise"`` or there was nothing to fall back on.
+        Diverged: The system left the finite numbers; ``flown`` holds the steps before.
+    """
+    check_policy(on_failure)
+    references = check_references(references, steps, controller.horizon)
+    if not isinstance(system, ModelLoop):
+        simulator: Simulator = PlantSimulator(system, initial, disturbances, noise, seed)
+    elif disturbances or noise is not None:
+        raise SettingError("disturbances, noise", "need a plant in the loop; got a ModelLoop")
+    else:
+        simulator = ModelSimulator(system, initial)
+    flight = Flight(simulator, references, system.time_step, on_step)
+    _fly([flight], controller, references, steps, on_failure)
+    if isinstance(flight.error, Diverged) and flight.rows:
+        flight.error.flown = flight.rollout()
+    if flight.error is not None:
+        raise flight.error
+    return flight.rollout()
+
+
+@dataclass(frozen=True)
+class Trial:
+    """The result of one seed."""
+
+    seed: int
+    result: Rollout | None  # None where it failed
+    error: str | None  # why it failed, with the kind of the error; None where it did not
+
+
+def closed_loops(
+    plant: System,
+    controller: Controller,
+    references: Reference | Array,
+    initial: Any,
+    steps: int,
+    seeds: int | Sequence[int],
+    *,
+    noise: Noise | None = None,
+    disturbances: Sequence[Disturbance] = (),
+    on_failure: OnFailure = "raise",
+    chunk: int | None = None,
+) -> list[Trial]:
+    """Flies a controller on a plant with many seeds at once; arguments are those of ``closed_loop``, and two more.
+
+    ``seeds`` are one a trial; a number stands for 0 .. seeds - 1. ``chunk`` says how many trials fly at a time, by
+    default as many as the controller has a gigabyte for. The plant's right-hand side is evaluated on arrays, an entry a
+    trial; a ``GPMPC`` decides for all trials together, any other controller one by one.
+
+    Returns:
+        One ``Trial`` a seed, in their order; those whose solve failed (with ``on_failure="raise"``) or whose plant
+        diverged have an error instead of a ``Rollout``, and the others fly on.
+
+    Raises:
+        SettingError: No seeds or equal ones; a model loop, in which a seed changes nothing; or no ``chunk`` where the
+            controller cannot say how much memory a trial takes.
+    """
+    if isinstance(plant, ModelLoop):
+        raise SettingError("plant", "a model loop draws no random numbers, all seeds are one flight; take closed_loop")
+    if isinstance(plant, System) and plant.stateful:
+        raise SettingError("plant", "a simulator flies one seed after another; take closed_loop")
+    check_policy(on_failure)
+    seeds = _check_seeds(seeds)
+    references = check_references(references, steps, controller.horizon)
+    size = chunk_size(controller, len(seeds), chunk=chunk)
+    finished: list[Trial] = []
+    for start in range(0, len(seeds), size):
+        some = seeds[start : start + size]
+        simulators = [PlantSimulator(plant, initial, disturbances, noise, seed) for seed in some]
+        flights = [Flight(simulator, references, plant.time_step) for simulator in simulators]
+        _fly(flights, controller, references, steps, on_failure)
+        for seed, flight in zip(some, flights, strict=True):
+            if (error := flight.error) is None:
+                finished.append(Trial(seed, flight.rollout(), None))
+            else:
+                finished.append(Trial(seed, None, f"{type(error).__name__}: {error}"))
+    return finished
+
+
+def _fly(
+    flights: Sequence[Flight], controller: Controller, references: Reference, steps: int, on_failure: OnFailure
+) -> None:
+    """Runs the loop of all flights of one plant in step; one that fails ends with its error, and the others go on."""
+    for k in range(steps):
+        if not (flying := [flight for flight in flights if flight.error is None]):
+            return
+        time, moving = round(k * flights[0].time_step, 9), []
+        beliefs = [flight.simulator.measure(time) for flight in flying]
+        ahead = window(references, k, controller.horizon)
+        decided = _decide(controller, beliefs, ahead, [flight.last for flight in flying], on_failure, k)
+        for flight, belief, outcome in zip(flying, beliefs, decided, strict=True):
+            if isinstance(outcome, SolverFailure):
+                flight.error = outcome
+            else:
+                moving.append((flight, (flight.simulator.mean, flight.simulator.covariance), belief, outcome))
+        applied = step_together([flight.simulator for flight, *_ in moving], time, [each[3].input for each in moving])
+        for (flight, state, belief, outcome), input in zip(moving, applied, strict=True):
+            if isinstance(input, Diverged):
+                flight.error = input
+            else:
+                flight.add(state, belief, input, outcome)
+
+
+def _decide(controller: Controller, beliefs: Sequence[Gaussian], *rest: Any) -> list[Command | SolverFailure]:
+    """``commands``, where one belief alone takes the controller's method for one."""
+    if len(beliefs) > 1:
+        return commands(controller, beliefs, *rest)
+    ahead, (last,), *policy = rest
+    try:
+        return [command(controller, beliefs[0], ahead, last, *policy)]
+    except SolverFailure as failure:
+        return [failure]
+
+
+def chunk_size(controller: Controller, trials: int, memory: int = _MEMORY, chunk: int | None = None) -> int:
+    """Says how many trials fly at a time: ``chunk`` where it is given, else what fits the memory [bytes].
+
+    A controller with ``control_many`` says what a trial takes (``bytes_per_question``), else ``SettingError``.
+    """
+    if chunk is not None:
+        check_number("chunk", chunk, least=1, whole=True)
+        return min(chunk, trials)
+    if not hasattr(controller, "control_many"):
+        return trials
+    each = getattr(controller, "bytes_per_question", None)
+    if each is None:
+        raise SettingError("chunk", "the memory that this model takes is not known: say how many trials fly at a time")
+    return min(trials, max(1, int(memory // each)))
+
+
+def rehearse(system: System | ModelLoop, controller: Controller, references: Reference, initial: Any) -> None:
+    """Flies the first two steps, without noise, and forgets them: a flight's times then hold no compiling and loading.
+
+    Two, since the second one starts from a plan. What fails here fails again in the flight, and is raised there.
+    """
+    with suppress(GpmpcError):
+        closed_loop(system, controller, references, initial, 2, on_failure="previous_plan")
+
+
+def _check_seeds(seeds: int | Sequence[int]) -> list[int]:
+    """Returns the seeds one by one."""
+    listed: Any = np.asarray(seeds).tolist()
+    if not isinstance(listed, list):
+        check_number("seeds", listed, least=1, whole=True)
+        listed = list(range(listed))
+    for seed in listed:
+        check_number("seeds", seed, least=0, whole=True)
+    if not listed or len(set(listed)) < len(listed):
+        raise SettingError("seeds", f"must be one or more different whole numbers; got {listed}")
+    return listed

@@ -11,7 +11,7 @@ from gpmpc.systems._quadrotor import (
     rotational,
     translational,
 )
-from gpmpc.systems._system import GRAVITY, Dynamics, Plant, System, cos, exp, sin, step, step_many
+from gpmpc.systems._system import GRAVITY, System, cos, exp, sin, step, step_many
 from gpmpc.systems._textbook import (
     acrobot,
     cart_pole,
@@ -26,9 +26,7 @@ __all__ = [
     "ATTITUDES",
     "GRAVITY",
     "Coupled",
-    "Dynamics",
     "Map",
-    "Plant",
     "Rotational",
     "System",
     "Translational",

@@ -2,15 +2,9 @@
 
 Parameters are decoded from the authors' data. The z axis points downwards. The translational subsystem is driven by the
 total thrust U1 and by the direction (ux, uy) of the thrust, which the attitude has to provide; the rotational subsystem
-provides it, driven by the moments' forces U2, U3, U4. Their eq. (2) joins the two: with roll phi, pitch theta and yaw
-psi the thrust points along
-
-    ux = cos(phi) sin(theta) cos(psi) + sin(phi) sin(psi)
-    uy = cos(phi) sin(theta) sin(psi) - sin(phi) cos(psi)
-
-and lifts by cos(phi) cos(theta); the three squares sum to one. The paper's x and y accelerate *along* (ux, uy), so they
-point against those of the aerospace convention. As in the paper, the angles' rates are taken for the body rates, which
-is good for small angles.
+provides it, driven by the moments' forces U2, U3, U4. The paper's x and y accelerate *along* (ux, uy), so they point
+against those of the aerospace convention, and its angles' rates are taken for the body rates, which is good for small
+angles.
 """
 
 import math
@@ -96,8 +90,7 @@ class Rotational:
 
     def derivative(self, x: Any, u: Any) -> list[Any]:
         """d/dt (phi, p, theta, q, psi, r) [rad/s, rad/s^2]."""
-        p, q, r = x[1], x[3], x[5]
-        ixx, iyy, izz = self.inertia
+        (p, q, r), (ixx, iyy, izz) = (x[1], x[3], x[5]), self.inertia
         a1, a3, a5 = (iyy - izz) / ixx, (izz - ixx) / iyy, (ixx - iyy) / izz  # [-]
         a2, a4 = self.gyroscopic  # a2 W, a4 W [1/s]
         b1, b2, b3 = self.arm / ixx, self.arm / iyy, self.arm / izz  # [1/(kg m)]
@@ -145,10 +138,7 @@ class Map:
 
 
 def translational(time_step: float = 1.0, substeps: int = 1, **parameters: Any) -> System:
-    """Makes the translational subsystem with ``parameters`` of ``Translational``; time step [s].
-
-    One Runge-Kutta substep is exact, since its acceleration depends on the input alone.
-    """
+    """Makes the translational subsystem; one Runge-Kutta substep is exact, its acceleration follows from the input."""
     return System(
         Translational(**parameters),
         time_step,
@@ -165,10 +155,7 @@ def translational(time_step: float = 1.0, substeps: int = 1, **parameters: Any) 
 
 
 def rotational(time_step: float = 0.05, substeps: int = 10, **parameters: Any) -> System:
-    """Makes the rotational subsystem at 20 Hz with ``parameters`` of ``Rotational``; time step [s].
-
-    A trajectory prescribes the attitudes that a flight along it needs.
-    """
+    """Makes the rotational subsystem at 20 Hz; a trajectory prescribes the attitudes that a flight along it needs."""
     return System(
         Rotational(**parameters),
         time_step,
@@ -188,10 +175,7 @@ def rotational(time_step: float = 0.05, substeps: int = 10, **parameters: Any) -
 
 
 def coupled(mass: float = 0.74, time_step: float = 0.05, substeps: int = 2, **parameters: Any) -> System:
-    """Makes the whole quadrotor at the rate of its inner loop; ``gpmpc.simulation.cascade_loop`` flies it.
-
-    Mass [kg], time step [s], Runge-Kutta substeps, and ``parameters`` of ``Rotational``.
-    """
+    """Makes the whole quadrotor at the rate of its inner loop, of a mass [kg] and ``parameters`` of ``Rotational``."""
     return System(
         Coupled(mass, Rotational(**parameters)),
         time_step,
@@ -208,7 +192,7 @@ def coupled(mass: float = 0.74, time_step: float = 0.05, substeps: int = 2, **pa
 
 
 def thrust_direction(phi: Any, theta: Any, psi: Any) -> tuple[Any, Any, Any]:
-    """(ux, uy) and cos(phi) cos(theta) [-] of an attitude [rad]; Cao, Lai and Alam (2017), eq. (2)."""
+    """The unit vector along the thrust (ux, uy, lift) [-] of roll, pitch and yaw [rad]; Cao et al. (2017), eq. (2)."""
     ux = cos(phi) * sin(theta) * cos(psi) + sin(phi) * sin(psi)
     uy = cos(phi) * sin(theta) * sin(psi) - sin(phi) * cos(psi)
     return ux, uy, cos(phi) * cos(theta)
@@ -217,14 +201,11 @@ def thrust_direction(phi: Any, theta: Any, psi: Any) -> tuple[Any, Any, Any]:
 def attitude_for_thrust_direction(
     ux: np.ndarray, uy: np.ndarray, psi: np.ndarray | float = 0.0, convention: str = "exact"
 ) -> np.ndarray:
-    """Roll and pitch that point the thrust along (ux, uy) at a yaw psi; Cao, Lai and Alam (2017), eq. (2) inverted.
+    """Roll and pitch (*batch, 2) [rad] that point the thrust along (ux, uy) at a yaw psi, by eq. (2) inverted.
 
     Turned by -psi, eq. (2) is that of psi = 0, where ux = cos(phi) sin(theta) and uy = -sin(phi) give phi = -asin(uy)
     and theta = asin(ux / cos(phi)). The authors' data hold theta = sign(phi) asin(ux) instead, which the convention
-    ``"paper"`` takes in the place of ``"exact"``.
-
-    ux and uy [-] are of one shape, and saturate at 1 and -1; psi is in [rad]. The result is roll and pitch [rad], along
-    a new last axis of length 2. ``SettingError`` where the convention is neither of the two.
+    ``"paper"`` takes in the place of ``"exact"``; any other is a ``SettingError``. ux and uy saturate at 1 and -1.
     """
     check_choice("attitude", convention, ATTITUDES)
     ux, uy = ux * np.cos(psi) + uy * np.sin(psi), uy * np.cos(psi) - ux * np.sin(psi)
@@ -253,8 +234,7 @@ def attitudes_along(trajectory: Trajectory, count: int, outer_step: float = OUTE
 def approach_attitudes(angles: np.ndarray, count: int, hold: int, time_step: float, response_time: float) -> np.ndarray:
     """Rotational states (count, 6) that approach attitudes one after another at first order, as ``Cascade`` asks it to.
 
-    Roll and pitch (K, 2) [rad], of which the first is where it begins, are asked for ``hold`` inner steps each; times
-    [s].
+    Roll and pitch (K, 2) [rad], from the first of them on, are asked for ``hold`` inner steps each; times [s].
     """
     left = np.exp(-time_step / response_time)  # of the way, after one step
     states, at = np.zeros((count, 6)), angles[0]

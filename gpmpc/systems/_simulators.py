@@ -28,7 +28,7 @@ def numbers(x: Any, u: Any) -> tuple[Array, Array]:
 
 
 class Simulator:
-    """Dynamics that a simulator steps: a subclass has ``_reset``, ``_step`` and, where it can be set, ``_set``."""
+    """Dynamics that a simulator steps from where it stands."""
 
     stateful = True  #: a step moves the simulator
     ended = False  #: whether the simulator has ended its episode
@@ -59,6 +59,7 @@ class Simulator:
         raise NotImplementedError
 
     def _step(self, input: Array) -> tuple[Array, bool]:
+        """The next state, and whether the episode has ended."""
         raise NotImplementedError
 
     def _set(self, state: Array) -> bool:

@@ -1,16 +1,10 @@
-"""Describes a system that is controlled: how it moves, what its states and inputs are called, how it is flown.
-
-A right-hand side f(x, u) is written once, with plain arithmetic on the entries of x and u, so that floats, NumPy arrays
-and CasADi expressions all pass through the same formula; ``gpmpc.systems`` has ``sin``, ``cos`` and ``exp`` for all of
-them. It is integrated over the time step with the input held constant. Whatever a run, a report, a recording or a
-figure says of a system comes from its ``System``.
-"""
+"""Describes a system that is controlled: how it moves, what its states and inputs are called, how it is flown."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from math import inf, isfinite
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -22,37 +16,15 @@ GRAVITY = 9.81  # [m/s^2]
 UNKNOWN = "?"  # the unit of a state or an input that has none given
 
 
-class Dynamics(Protocol):
-    """How a system moves, with the names of its n states and m inputs, in order.
-
-    Besides the names it has one method of two: ``derivative(x, u)``, the n entries of dx/dt, or ``successor(x, u)``,
-    the n entries of the next state. x and u are indexed from 0 and know arithmetic.
-    """
-
-    @property
-    def state_names(self) -> Sequence[str]: ...
-    @property
-    def input_names(self) -> Sequence[str]: ...
-
-
-class Plant(Protocol):
-    """A discrete-time system; a ``System`` is one.
-
-    Names and motion, the time of one step [s], and the n entries of x[k+1], symbolic or numeric.
-    """
-
-    @property
-    def dynamics(self) -> Dynamics: ...
-    @property
-    def time_step(self) -> float: ...
-    def successor(self, x: Any, u: Any) -> Sequence[Any]: ...
-
-
 @dataclass(frozen=True, eq=False)
 class System:
-    """A discrete-time system, with everything that is said of it.
+    """A discrete-time system; whatever a run, a report, a recording or a figure says of it comes from here.
 
-    A right-hand side is integrated by the classical Runge-Kutta method of order four on equal substeps.
+    Its ``dynamics`` have the names of the n states and m inputs, in order (``state_names``, ``input_names``), and one
+    method of two: ``derivative(x, u)``, the n entries of dx/dt, or ``successor(x, u)``, those of the next state. They
+    are written once, with plain arithmetic on the entries of x and u, so that floats, NumPy arrays and CasADi
+    expressions all pass through the same formula; ``sin``, ``cos`` and ``exp`` are for all of them. A right-hand side
+    is integrated with the input held constant, by the Runge-Kutta method of order four on equal substeps.
 
     Raises:
         SettingError: A number out of range, an unknown name, tracked states of several units, or dynamics without a
@@ -60,7 +32,7 @@ class System:
         ShapeError: A list has another length than there are states or inputs, or the dynamics have.
     """
 
-    dynamics: Any  #: names of states and inputs, and ``derivative(x, u)`` or ``successor(x, u)``; see ``Dynamics``
+    dynamics: Any  #: names of states and inputs, and how it moves
     time_step: float = 1.0  #: sampling time [s]
     substeps: int = 10  #: Runge-Kutta steps per sampling time
     name: str = ""  #: what it is called; by default as the class of its dynamics
@@ -92,14 +64,15 @@ class System:
     def __post_init__(self) -> None:
         check_number("time_step", self.time_step, above=0, unit="[s]")
         check_number("substeps", self.substeps, least=1, whole=True)
-        states, inputs = _names(self.dynamics, "state_names"), _names(self.dynamics, "input_names")
+        states, inputs = (_names(self.dynamics, key) for key in ("state_names", "input_names"))
+        n, m, every = len(states), len(inputs), (*states, *inputs)
         self._set("name", self.name or type(self.dynamics).__name__)
-        if unknown := set(self.units) - {*states, *inputs}:
-            known = ", ".join([*states, *inputs])
-            raise SettingError("units", f"must be of {known}; got {', '.join(sorted(unknown))}")
-        self._set("units", {name: self.units.get(name, UNKNOWN) for name in (*states, *inputs)})
-        if not self.tracked:
-            self._set("tracked", [name for name in states if self.units[name] == self.units[states[0]]])
+        if unknown := set(self.units) - {*every}:
+            raise SettingError("units", f"must be of {', '.join(every)}; got {', '.join(sorted(unknown))}")
+        self._set("units", {name: self.units.get(name, UNKNOWN) for name in every})
+        tracked = self.tracked or [name for name in states if self.units[name] == self.units[states[0]]]
+        for key, names in (("angles", self.angles), ("tracked", tracked)):
+            self._set(key, tuple(names))
         named = {"angles": self.angles, "tracked": self.tracked, "rates": self.rates, "pose": self.pose.values()}
         for key, names in named.items():
             for name in names:
@@ -108,23 +81,22 @@ class System:
         for name in self.rates.values():
             if name not in self.tracked:
                 raise SettingError("rates", f"must be of tracked states, {', '.join(self.tracked)}; got {name!r}")
-        for key in ("angles", "tracked"):
-            self._set(key, tuple(getattr(self, key)))
         if len(found := {self.units[name] for name in self.tracked}) > 1:
             raise SettingError("tracked", f"must be states of one unit; got {', '.join(sorted(found))}")
         if self.lost != inf:
             check_number("lost", self.lost, above=0)
-        n, m = len(states), len(inputs)
-        for key, length, default in (
-            ("input_lower", m, (-inf,) * m),
-            ("input_upper", m, (inf,) * m),
-            ("initial_input", m, (0.0,) * m),
-            ("goal", n, (0.0,) * n),
-            ("start", n, None),
+        for key, default in (
+            ("input_lower", (-inf,) * m),
+            ("input_upper", (inf,) * m),
+            ("initial_input", (0.0,) * m),
+            ("goal", (0.0,) * n),
         ):
-            self._set(key, default if getattr(self, key) is None else _floats(key, getattr(self, key), length))
+            given = getattr(self, key)
+            self._set(key, default if given is None else _floats(key, given, len(default)))
         if any(low > high for low, high in zip(self.input_lower, self.input_upper, strict=True)):
             raise SettingError("input_lower, input_upper", f"must not cross; got {self.input_lower, self.input_upper}")
+        if self.start is not None:
+            self._set("start", _floats("start", self.start, n))
         if self.region is not None:
             if len(self.region) != 2:
                 raise SettingError("region", f"must be the smallest and the largest states; got {self.region!r}")
@@ -147,6 +119,11 @@ class System:
     def input_names(self) -> tuple[str, ...]:
         """Names of the m inputs."""
         return tuple(self.dynamics.input_names)
+
+    @property
+    def stateful(self) -> bool:
+        """Whether it is a simulator under way, which a step moves on."""
+        return getattr(self.dynamics, "stateful", False)
 
     @property
     def unit(self) -> str:
@@ -210,11 +187,11 @@ class System:
         return entries
 
     def _check_dynamics(self) -> None:
-        """Evaluates the dynamics once, where the system starts."""
+        """Evaluates the dynamics once, where the system starts; a simulator under way a step would move."""
         if not (hasattr(self.dynamics, "derivative") or hasattr(self.dynamics, "successor")):
             what = "must have derivative(x, u), or successor(x, u) for the next state"
             raise SettingError("dynamics", f"{what}; got {type(self.dynamics).__name__}")
-        if getattr(self.dynamics, "stateful", False):  # a simulator under way: a step would move it
+        if self.stateful:
             return
         x, u = list(self.goal if self.start is None else self.start), list(self.initial_input)
         try:
@@ -229,7 +206,7 @@ class System:
                 raise SettingError("dynamics", f"must be finite at state {x}, input {u}; {name} is {entry} after it")
 
 
-def step(plant: Plant, state: Array, input: Array) -> Array:
+def step(plant: System, state: Array, input: Array) -> Array:
     """The next state (n,) of a plant from a state (n,) and an input (m,).
 
     >>> from gpmpc.systems import pendulum
@@ -240,14 +217,12 @@ def step(plant: Plant, state: Array, input: Array) -> Array:
         ShapeError: State or input are of another length.
     """
     shapes = ((len(plant.dynamics.state_names),), (len(plant.dynamics.input_names),))
-    if (np.shape(state), np.shape(input)) != shapes:
-        raise ShapeError(
-            f"state and input must have shapes {shapes[0]} and {shapes[1]}; got {np.shape(state)} and {np.shape(input)}"
-        )
+    if (found := (np.shape(state), np.shape(input))) != shapes:
+        raise ShapeError(f"state and input must have shapes {shapes[0]} and {shapes[1]}; got {found[0]} and {found[1]}")
     return np.array(plant.successor(state, input), dtype=float)
 
 
-def step_many(plant: Plant, states: Array, inputs: Array) -> Array:
+def step_many(plant: System, states: Array, inputs: Array) -> Array:
     """The next states (T, n) of T copies of a plant, from states (T, n) and inputs (T, m), in one evaluation."""
     entries = plant.successor(states.T, inputs.T)
     return np.stack([np.broadcast_to(np.asarray(entry, dtype=float), len(states)) for entry in entries], axis=1)
@@ -278,10 +253,11 @@ def _names(dynamics: Any, key: str) -> tuple[str, ...]:
 
 def _floats(key: str, values: Any, length: int) -> tuple[float, ...]:
     """Numbers as floats; None stays for an infinite bound."""
-    absent = {"input_lower": -inf, "input_upper": inf}.get(key)
     values = values.tolist() if isinstance(values, np.ndarray) else values
-    if absent is not None and hasattr(values, "__len__"):
-        check_numbers(key, [0.0 if value is None or value == absent else value for value in values], length)
-        return tuple(absent if value is None else float(value) for value in values)
-    check_numbers(key, values, length)
+    infinite = {"input_lower": -inf, "input_upper": inf}.get(key)
+    finite = values
+    if infinite is not None and isinstance(values, Sequence):
+        values = [infinite if value is None else value for value in values]
+        finite = [0.0 if value == infinite else value for value in values]
+    check_numbers(key, finite, length)
     return tuple(float(value) for value in values)

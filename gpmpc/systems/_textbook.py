@@ -4,6 +4,7 @@ Angles are zero where a pole or a link stands upright, positive anticlockwise. E
 step [s]; its other arguments are the attributes of the right-hand side.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from math import pi
 from typing import Any, Literal
@@ -13,14 +14,17 @@ from gpmpc.systems._system import GRAVITY, System, cos, exp, sin
 
 
 class _Body:
-    """Checks that every attribute is a positive number, or none below zero where its name stands in ``may_be_zero``."""
+    """Checks that every number is positive, or none below zero where its name stands in ``may_be_zero``."""
 
     may_be_zero: tuple[str, ...] = ()
+    words: tuple[str, ...] = ()  # attributes that are no numbers
 
     def __post_init__(self) -> None:
         for key, value in vars(self).items():
-            limits: dict[str, Any] = {"least": 0} if key in self.may_be_zero else {"above": 0}
-            check_number(key, value, **limits)
+            limits: dict[str, Any] = {"least" if key in self.may_be_zero else "above": 0}
+            numbers = value if isinstance(value, tuple | list) else [value]
+            for number in () if key in self.words else numbers:
+                check_number(key, number, **limits)
 
 
 @dataclass(frozen=True)
@@ -125,25 +129,25 @@ def cart_pole(time_step: float = 0.05, **parameters: float) -> System:
 
 
 @dataclass(frozen=True)
-class DoublePendulum:
+class DoublePendulum(_Body):
     """Two links in a vertical plane with a torque at one joint (Spong, 1995, eqs. (1)-(2)).
 
-    ``shoulder`` is the angle of the first link from upright, ``elbow`` that of the second from the first.
+    ``shoulder`` is the angle of the first link from upright, ``elbow`` that of the second from the first. The numbers
+    are those identified for design C.1, model 1.1 of the RealAIGym league (Wiebe et al., 2024; inertias were published
+    about the joints, 0.031887 and 0.050870), whose second link is 0.3 m long; there is no friction.
     """
 
-    masses: tuple[float, float]  #: of the links [kg]
-    first_length: float  #: of the first link [m]
-    centres: tuple[float, float]  #: from each link's joint to its centre of mass [m]
-    inertias: tuple[float, float]  #: of the links about their centres of mass [kg m^2]
+    masses: Sequence[float] = (0.5234602302, 0.6255677234)  #: of the links [kg]
+    first_length: float = 0.2  #: of the first link [m]
+    centres: Sequence[float] = (0.2, 0.2556930544)  #: from each link's joint to its centre of mass [m]
+    inertias: Sequence[float] = (0.0109487904, 0.0099708947)  #: of the links about their centres of mass [kg m^2]
     actuated: Literal["elbow", "shoulder"] = "elbow"  #: an acrobot, or a pendubot
 
     state_names, input_names = ("shoulder", "shoulder_rate", "elbow", "elbow_rate"), ("torque",)
+    words = ("actuated",)
 
     def __post_init__(self) -> None:
-        check_number("first_length", self.first_length, above=0)
-        for key in ("masses", "centres", "inertias"):
-            for value in getattr(self, key):
-                check_number(key, value, above=0)
+        super().__post_init__()
         check_choice("actuated", self.actuated, ("elbow", "shoulder"))
 
     def derivative(self, x: Any, u: Any) -> list[Any]:
@@ -164,30 +168,19 @@ class DoublePendulum:
 
 
 def acrobot(
-    masses: tuple[float, float] = (1.0, 1.0), first_length: float = 1.0, time_step: float = 0.05, torque: float = 10.0
+    masses: Sequence[float] = (1.0, 1.0), first_length: float = 1.0, time_step: float = 0.05, torque: float = 10.0
 ) -> System:
     """Makes an acrobot that hangs at first (Spong, 1995, and its table); ``torque`` is its largest [N m]."""
-    links = DoublePendulum((masses[0], masses[1]), first_length, (0.5, 1.0), (0.083, 0.33))
+    links = DoublePendulum(masses, first_length, (0.5, 1.0), (0.083, 0.33))
     return _two_links("acrobot", links, time_step, 10, torque, (4.0, 6.0))
 
 
 def double_pendulum(
-    actuated: Literal["elbow", "shoulder"] = "elbow",
-    masses: tuple[float, float] = (0.5234602302, 0.6255677234),
-    first_length: float = 0.2,
-    centres: tuple[float, float] = (0.2, 0.2556930544),
-    inertias: tuple[float, float] = (0.0109487904, 0.0099708947),
-    time_step: float = 0.02,
-    torque: float = 6.0,
+    actuated: Literal["elbow", "shoulder"] = "elbow", time_step: float = 0.02, torque: float = 6.0, **parameters: Any
 ) -> System:
-    """Makes the double pendulum of the RealAIGym league, which hangs at first (Wiebe et al., 2024).
-
-    Masses, lengths and inertias are those identified for its design C.1, model 1.1 (inertias were published about the
-    joints, 0.031887 and 0.050870); the second link is 0.3 m long, there is no friction. ``torque`` is its largest
-    [N m].
-    """
-    links = (masses[0], masses[1]), first_length, (centres[0], centres[1]), (inertias[0], inertias[1])
-    return _two_links("double_pendulum", DoublePendulum(*links, actuated), time_step, 2, torque, (20.0, 30.0))
+    """Makes the double pendulum of the RealAIGym league, which hangs at first; ``torque`` is its largest [N m]."""
+    links = DoublePendulum(actuated=actuated, **parameters)
+    return _two_links("double_pendulum", links, time_step, 2, torque, (20.0, 30.0))
 
 
 def _two_links(

@@ -1,4 +1,4 @@
-"""Takes a gymnasium environment as a system, and offers this package's systems as gymnasium environments.
+"""Takes a gymnasium environment as a system.
 
 An environment moves on by itself: it is stepped from where it stands, and set to another state only where it can be (a
 MuJoCo environment whose observation is qpos, qvel). Where it ends an episode, a flight is lost. Needs ``gpmpc[sim]``.
@@ -9,18 +9,15 @@ from typing import Any
 
 import numpy as np
 
-from gpmpc import systems
 from gpmpc.exceptions import SettingError, ShapeError
 from gpmpc.systems._simulators import Simulator, library
-from gpmpc.systems._system import System, step
+from gpmpc.systems._system import System
 
 Array = np.ndarray
-OURS = ("acrobot", "cart_pole", "double_integrator", "double_pendulum", "pendulum", "planar_quadrotor")
-OURS += ("stirred_tank", "translational")
 
 
 class _Environment(Simulator):
-    """The dynamics of a gymnasium environment; see ``gymnasium_system``."""
+    """The dynamics of a gymnasium environment."""
 
     def __init__(self, name: Any, observe: Any, state_names: Sequence[str], input_names: Sequence[str], settings: Any):
         gymnasium = library("gymnasium")
@@ -31,33 +28,28 @@ class _Environment(Simulator):
                 self.environment = gymnasium.make(name, **made)
             except (gymnasium.error.Error, ImportError, TypeError) as error:
                 raise SettingError("environment", f"{name!r}: {' '.join(str(error).split())}") from error
-        action = self._check_box("action", self.environment.action_space)
+        spaces = {"action": self.environment.action_space}
         if observe is None:
-            self._check_box("observation", self.environment.observation_space)
+            spaces["observation"] = self.environment.observation_space
+        for kind, space in spaces.items():
+            if not isinstance(space, gymnasium.spaces.Box) or len(space.shape) != 1:
+                remedy = "; name a function with observe" if kind == "observation" else ""
+                what = f"the {kind} space must be a Box of one dimension"
+                raise SettingError("environment", f"{what}; got {space}{remedy}")
+        action = spaces["action"]
         self._observe, self.limits = observe, (action.low.astype(float), action.high.astype(float))
-        state = self.reset(0)
-        states = state_names or [f"x{i + 1}" for i in range(len(state))]
-        inputs = input_names or [f"u{i + 1}" for i in range(len(action.low))]
-        for key, names, count in (("state_names", states, len(state)), ("input_names", inputs, len(action.low))):
-            if len(names) != count:
-                raise ShapeError(f"{key} must be {count} names; got {len(names)}")
-        self.state_names, self.input_names = tuple(states), tuple(inputs)
-
-    @staticmethod
-    def _check_box(kind: str, space: Any) -> Any:
-        if not isinstance(space, library("gymnasium").spaces.Box) or len(space.shape) != 1:
-            what = f"the {kind} space must be a Box of one dimension"
-            remedy = "; name a function with observe" if kind == "observation" else ""
-            raise SettingError("environment", f"{what}; got {space}{remedy}")
-        return space
+        n, m = len(self.reset(0)), len(action.low)
+        self.state_names = tuple(state_names or [f"x{i + 1}" for i in range(n)])
+        self.input_names = tuple(input_names or [f"u{i + 1}" for i in range(m)])
+        if (found := (len(self.state_names), len(self.input_names))) != (n, m):
+            raise ShapeError(f"state_names and input_names must be {n} and {m} names; got {found[0]} and {found[1]}")
 
     def _reset(self, seed: int) -> Array:
-        observation, _ = self.environment.reset(seed=seed)
-        return self._state(observation)
+        return self._state(self.environment.reset(seed=seed)[0])
 
     def _step(self, input: Array) -> tuple[Array, bool]:
-        space = self.environment.action_space
-        observation, _, terminated, _, _ = self.environment.step(np.clip(input, *self.limits).astype(space.dtype))
+        action = np.clip(input, *self.limits).astype(self.environment.action_space.dtype)
+        observation, _, terminated, _, _ = self.environment.step(action)
         return self._state(observation), bool(terminated)
 
     def _set(self, state: Array) -> bool:
@@ -107,60 +99,3 @@ def gymnasium_system(
     lower, upper = dynamics.limits
     given = {"name": str(environment), "input_lower": lower, "input_upper": upper} | settings
     return System(dynamics, float(time_step), 1, **given)
-
-
-def make_environment(system: System | str, **settings: Any) -> Any:
-    """Makes a gymnasium environment of a system, or of one of this package's by name and settings.
-
-    The observation is the state. The reward is minus the squared distance of the tracked states from the goal; an
-    episode ends where they are farther from it than at the start, and than ``System.lost``.
-    """
-    gymnasium = library("gymnasium")
-    flown: System = getattr(systems, system)(**settings) if isinstance(system, str) else system
-
-    class Environment(gymnasium.Env):  # type: ignore[name-defined]
-        """A system as an environment."""
-
-        metadata: Any = {"render_modes": []}  # noqa: RUF012
-
-        def __init__(self) -> None:
-            n = len(flown.state_names)
-            lower, upper = np.array(flown.input_lower), np.array(flown.input_upper)
-            self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (n,), np.float64)
-            self.action_space = gymnasium.spaces.Box(lower, upper, dtype=np.float64)
-            self.state = np.array(flown.goal)
-
-        def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Array, dict]:
-            """Starts where the system starts, or from its region."""
-            super().reset(seed=seed)
-            region: Any = flown.region if flown.start is None else None
-            start: Any = flown.start or flown.goal if region is None else self.np_random.uniform(*region)
-            self.state = np.array(start, dtype=float)
-            self._limit = max(flown.lost, 1.001 * self._distance())
-            return self.state.copy(), {}
-
-        def step(self, action: Array) -> tuple[Array, float, bool, bool, dict]:
-            """Takes one step; the action is clipped."""
-            action = np.clip(np.asarray(action, dtype=float), flown.input_lower, flown.input_upper)
-            with np.errstate(over="ignore", invalid="ignore"):
-                self.state = step(flown, self.state, action)
-            distance = self._distance()
-            return self.state.copy(), -(distance**2), not distance <= self._limit, False, {}
-
-        def _distance(self) -> float:
-            errors = self.state - flown.goal
-            errors[flown.angle_indices] = (errors[flown.angle_indices] + np.pi) % (2 * np.pi) - np.pi
-            return float(np.linalg.norm(errors[flown.tracked_indices]))
-
-    return Environment()
-
-
-def register_environments() -> list[str]:
-    """Registers this package's systems as gymnasium environments, such as ``gpmpc/cart_pole-v0``; returns the names."""
-    gymnasium = library("gymnasium")
-    names = [f"gpmpc/{name}-v0" for name in OURS]
-    for name, system in zip(names, OURS, strict=True):
-        if name not in gymnasium.registry:
-            entry = f"{__name__}:make_environment"
-            gymnasium.register(name, entry_point=entry, max_episode_steps=500, kwargs={"system": system})
-    return names

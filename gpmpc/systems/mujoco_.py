@@ -1,8 +1,7 @@
 """Takes a MuJoCo model as a system: the state is that of named joints, or what named sensors measure.
 
-The joints' positions, then their velocities, then the activations of the actuators that have one, are a state that the
-model can be set to, so that many are stepped at once by ``mujoco.rollout``. Sensors show a part of it: the model then
-moves on by itself, from where it stands. Needs the extra ``sim``.
+Joints, with the activations of the actuators that have one, are a state that the model can be set to; many are stepped
+at once by ``mujoco.rollout``. Sensors show a part of it: the model then moves on by itself. Needs the extra ``sim``.
 """
 
 from collections.abc import Callable, Sequence
@@ -28,20 +27,19 @@ class _Model:
         except (ValueError, OSError) as error:
             raise DataError(f"{path}: is no MJCF model ({' '.join(str(error).split())})") from error
         self.path, self.data = path, self.mujoco.MjData(self.model)
-        self.controls = self.indices("actuators", self.mujoco.mjtObj.mjOBJ_ACTUATOR, self.model.nu, actuators)
+        self.controls = self.indices("actuator", actuators)
         limited = self.model.actuator_ctrllimited.astype(bool)[self.controls]
         low, high = self.model.actuator_ctrlrange[self.controls].T
         self.limits = np.where(limited, low, -np.inf), np.where(limited, high, np.inf)
 
-    def indices(self, key: str, kind: Any, count: int, names: Sequence[str]) -> list[int]:
-        """Finds named parts of the model; ``SettingError`` where none is named, or one is not there."""
-        known = [self.mujoco.mj_id2name(self.model, kind, i) for i in range(count)]
+    def indices(self, kind: str, names: Sequence[str]) -> list[int]:
+        """Finds named parts of the model of a kind; ``SettingError`` where none is named, or one is not there."""
         if not names:
-            raise SettingError(key, f"name at least one of {', '.join(map(str, known)) or 'none'} of {self.path}")
-        for name in names:
-            if name not in known:
-                raise SettingError(key, f"must be among {', '.join(map(str, known))} of {self.path}; got {name!r}")
-        return [known.index(name) for name in names]
+            raise SettingError(f"{kind}s", f"name at least one of {self.path}")
+        try:
+            return [getattr(self.model, kind)(name).id for name in names]
+        except KeyError as error:
+            raise SettingError(f"{kind}s", f"{error.args[0]} in {self.path}") from error
 
 
 class _Joints(_Model):
@@ -50,19 +48,16 @@ class _Joints(_Model):
     def __init__(self, path: str | Path, joints: Sequence[str], actuators: Sequence[str], substeps: int = 1):
         super().__init__(path, actuators)
         model, joint = self.model, self.mujoco.mjtJoint
-        found = self.indices("joints", self.mujoco.mjtObj.mjOBJ_JOINT, model.njnt, joints)
-        for name, i in zip(joints, found, strict=True):
-            if joint(int(model.jnt_type[i])) not in (joint.mjJNT_SLIDE, joint.mjJNT_HINGE):
-                raise SettingError("joints", f"must be hinges or slides; {name!r} of {path} is neither; name sensors")
-        if model.nv != len(found):
-            raise SettingError("joints", f"must name all {model.njnt} joints of {path}; got {len(found)}")
+        kinds = {int(joint.mjJNT_SLIDE), int(joint.mjJNT_HINGE)}
+        found = self.indices("joint", joints)
+        if model.njnt != len(found) or not set(model.jnt_type.tolist()) <= kinds:
+            what = f"must name all {model.njnt} joints of {path}, hinges and slides; name sensors of other models"
+            raise SettingError("joints", f"{what}; got {list(joints)}")
         self.substeps, q, v = substeps, model.jnt_qposadr[found], model.jnt_dofadr[found]
         # Where the states stand in MuJoCo's own: time, qpos, qvel, act.
         self._order = np.concatenate([1 + q, 1 + model.nq + v, 1 + model.nq + model.nv + np.arange(model.na)])
-        activated = [self.mujoco.mj_id2name(model, self.mujoco.mjtObj.mjOBJ_ACTUATOR, i) for i in range(model.nu)]
-        activated = [name for name, address in zip(activated, model.actuator_actadr, strict=True) if address >= 0]
-        rates = [f"{name}_rate" for name in joints]
-        self.state_names = (*joints, *rates, *(f"{name}_activation" for name in activated))
+        lagging = [f"{model.actuator(i).name}_activation" for i in range(model.nu) if model.actuator_actadr[i] >= 0]
+        self.state_names = (*joints, *(f"{name}_rate" for name in joints), *lagging)
         self.input_names = tuple(actuators)
 
     def positions(self, state: Array) -> Array:
@@ -106,15 +101,14 @@ class _Sensors(_Model, Simulator):
     ):
         super().__init__(path, actuators)
         model = self.model
-        found = self.indices("sensors", self.mujoco.mjtObj.mjOBJ_SENSOR, model.nsensor, sensors)
-        sizes = [int(model.sensor_dim[i]) for i in found]
-        places = [np.arange(d) + model.sensor_adr[i] for i, d in zip(found, sizes, strict=True)]
+        found = self.indices("sensor", sensors)
+        sizes = model.sensor_dim[found].tolist()
+        places = [model.sensor_adr[i] + np.arange(d) for i, d in zip(found, sizes, strict=True)]
         self._places, self._observe, self.substeps, self._delay = np.concatenate(places), observe, substeps, input_delay
         own = [f"{name}{k + 1}" if d > 1 else name for name, d in zip(sensors, sizes, strict=True) for k in range(d)]
-        self.state_names = tuple(state_names or own)
-        self.input_names = tuple(actuators)
-        if len(self.reset(0)) != len(self.state_names):
-            raise SettingError("state_names", f"must be {len(self.reset(0))} names; got {len(self.state_names)}")
+        self.state_names, self.input_names = tuple(state_names or own), tuple(actuators)
+        if (n := len(self.reset(0))) != len(self.state_names):
+            raise SettingError("state_names", f"must be {n} names; got {len(self.state_names)}")
 
     def _reset(self, seed: int) -> Array:
         if self.model.nkey:

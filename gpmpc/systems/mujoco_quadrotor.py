@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from gpmpc.exceptions import check_number, check_numbers
 from gpmpc.systems._system import GRAVITY, System, cos, sin
@@ -106,17 +107,12 @@ def mujoco_quadrotor(
 
 def _joint_positions(state: np.ndarray) -> np.ndarray:
     """The positions of the model's joints (7,) in a state (12,)."""
-    (s1, s2, s3), (c1, c2, c3) = (f(np.asarray(state)[6::2] / 2) for f in (np.sin, np.cos))
-    turn = [c1 * c2 * c3 + s1 * s2 * s3, s1 * c2 * c3 - c1 * s2 * s3, c1 * s2 * c3 + s1 * c2 * s3]
-    return np.array([state[0], state[2], state[4] - 1, *turn, c1 * c2 * s3 - s1 * s2 * c3])
+    turn = Rotation.from_euler("ZYX", np.asarray(state)[10:5:-2]).as_quat()
+    return np.array([state[0], state[2], state[4] - 1, turn[3], *turn[:3]])  # the quaternion's scalar first
 
 
 def _state(measured: np.ndarray) -> np.ndarray:
     """The states of position, velocity, quaternion and body rates."""
-    position, velocity, (w, x, y, z), rates = np.split(measured, (3, 6, 10))
-    angles = [
-        np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)),
-        np.arcsin(np.clip(2 * (w * y - z * x), -1, 1)),
-        np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)),
-    ]
+    position, velocity, quaternion, rates = np.split(measured, (3, 6, 10))
+    angles = Rotation.from_quat(quaternion[[1, 2, 3, 0]]).as_euler("ZYX")[::-1]  # scalar last
     return np.stack([position, velocity, angles, rates]).reshape(2, 2, 3).swapaxes(1, 2).ravel()

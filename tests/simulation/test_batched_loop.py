@@ -12,7 +12,7 @@ from gpmpc.mpc.gp_mpc import GPMPC
 from gpmpc.mpc.problem import Box, Problem, Tracking
 from gpmpc.propagation import Linearization, MomentMatching
 from gpmpc.simulation import Dropout, Gust, ModelLoop, Noise, closed_loop, closed_loops
-from gpmpc.simulation._closed_loop import chunk_size
+from gpmpc.simulation._loop import chunk_size
 from gpmpc.status import Status
 from gpmpc.systems import Coupled, Map, Rotational, System, Translational, step, step_many
 from tests.mpc.systems import HOVER, QUADROTOR, linear_gaussian, quadrotor_gp
@@ -79,14 +79,13 @@ def test_a_trial_gives_the_same_numbers_in_a_crowd_and_alone(covariance, propaga
 def test_the_size_of_a_chunk_changes_no_number(chunk):
     asked, seeds = controller("full", MomentMatching()), [7, 0, 3, 12, 5]
     for ours, theirs in zip(fly(asked, seeds, chunk=chunk), fly(asked, seeds), strict=True):
-        assert ours.name == theirs.name
+        assert ours.seed == theirs.seed
         assert_same(ours.result, theirs.result)
 
 
 def test_trials_come_in_the_order_of_their_seeds_and_differ():
     flown = fly(controller("none"), [4, 2, 9])
     assert [trial.seed for trial in flown] == [4, 2, 9]
-    assert [trial.name for trial in flown] == ["seed 4", "seed 2", "seed 9"]
     assert not np.allclose(flown[0].result.states, flown[1].result.states)
 
 

@@ -139,7 +139,6 @@ def test_the_attitudes_asked_for_change_with_the_plan_and_are_approached_at_firs
     ("build", "error", "message"),
     [
         (lambda: Cascade(OUTER, INNER, ratio=0), SettingError, "ratio: must be a whole number, 1 or more; got 0"),
-        (lambda: Cascade(OUTER, INNER, attitude="exakt"), SettingError, "one of 'paper', 'exact'; got 'exakt'"),
         (lambda: Cascade(OUTER, INNER, response_time=0), SettingError, "response_time: must be a number above 0"),
         (
             lambda: fly(Elliptical(), 2, plant=System(Map(Rotational()))),

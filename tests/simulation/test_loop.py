@@ -276,7 +276,7 @@ def test_misuse_is_refused_with_the_rule(settings, error, message):
         (lambda: Gust({"v": "strong"}), "rates.v: must be a number; got 'strong'"),
         (lambda: Gust({}), "rates: must map names of states to numbers"),
         (lambda: Dropout(1.0, 1.0), "stop: must be a number above 1.0"),
-        (lambda: ModelLoop(None, None, initial_std=-1), "initial_std: must be a number, 0 or more; got -1"),
+        (lambda: ModelLoop(None, None, time_step=-1), r"time_step: must be a number above 0 \[s\]; got -1"),
     ],
 )
 def test_a_wrong_setting_is_refused_at_construction(build, message):
@@ -284,15 +284,17 @@ def test_a_wrong_setting_is_refused_at_construction(build, message):
         build()
 
 
-def test_a_gust_on_a_plant_of_ones_own_is_refused_with_what_is_possible():
-    class Own:
-        dynamics, time_step = Cart(), 0.1
+def test_a_gust_on_a_simulator_is_refused_with_what_is_possible():
+    class UnderWay(Cart):
+        stateful = True
 
         def successor(self, x, u):
             return [x[0], x[1]]
 
     with pytest.raises(UnsupportedModel, match="Possible with any plant: Replaced"):
-        fly(plant=Own(), disturbances=[Gust({"v": 1.0})])
+        fly(plant=System(UnderWay(), 0.1), disturbances=[Gust({"v": 1.0})])
+    with pytest.raises(SettingError, match=r"system: must be a plant, such as System\(dynamics, 0.1\).*got UnderWay"):
+        fly(plant=UnderWay())
 
 
 def test_nothing_disturbs_a_model_loop(model):

@@ -1,0 +1,140 @@
+"""Disturbances: wind, another payload, a sensor that drops out.
+
+A disturbance says, step by step, which plant really acts and what is really measured. Times are those at which a step
+begins: a window that opens within a step acts from the next one on.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from math import inf
+from types import SimpleNamespace
+from typing import Any, Protocol
+
+import numpy as np
+
+from gpmpc.exceptions import SettingError, ShapeError, UnsupportedModel, check_number
+from gpmpc.systems import System
+
+
+class Disturbance(Protocol):
+    """Something that a controller does not know of."""
+
+    def disturb_plant(self, plant: System, time: float) -> System:
+        """Returns the plant that acts in the step from a time [s] on, in the place of the given one."""
+        return plant
+
+    def disturb_measurement(self, state: np.ndarray, time: float) -> np.ndarray:
+        """Returns what is measured of a state (n,) at a time [s], in the place of the given one."""
+        return state
+
+
+class _Window(Disturbance):
+    """A disturbance from ``start`` to ``stop`` [s]."""
+
+    start: float
+    stop: float
+
+    def __post_init__(self) -> None:
+        check_number("start", self.start, unit="[s]")
+        if self.stop != inf:
+            check_number("stop", self.stop, above=self.start, unit="[s]")
+
+    def acts(self, time: float) -> bool:
+        """Whether it acts in the step from a time [s] on."""
+        return self.start <= time < self.stop
+
+
+@dataclass(frozen=True)
+class Gust(_Window):
+    """A constant push on single states over a time window, integrated by the plant like any other force.
+
+    (Where the dynamics give the next state, it is added to that.)
+    """
+
+    #: what is added to the derivative of a state, by its name: ``{"vx": 2.0}`` is an acceleration of 2 m/s^2, the force
+    #: over the mass [unit of the state / s]
+    rates: Mapping[str, float]
+    start: float = 0.0  #: when it begins [s]
+    stop: float = inf  #: when it ends [s]
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not isinstance(self.rates, Mapping) or not self.rates:
+            raise SettingError("rates", f"must map names of states to numbers, like {{'vx': 2.0}}; got {self.rates!r}")
+        for name, rate in self.rates.items():
+            check_number(f"rates.{name}", rate)
+
+    def disturb_plant(self, plant: System, time: float) -> System:
+        """Returns the plant with the push, inside the window; raises where it has no such state, or no equations."""
+        for name in self.rates:
+            if name not in plant.state_names:
+                known = ", ".join(plant.state_names)
+                raise SettingError("rates", f"must name states of the plant, {known}; got {name!r}")
+        if not self.acts(time):
+            return plant
+        return _pushed(plant, tuple(float(self.rates.get(name, 0.0)) for name in plant.state_names))
+
+
+@dataclass(frozen=True)
+class Replaced(_Window):
+    """Another plant over a time window: another mass, a broken arm."""
+
+    plant: System  #: what acts then
+    start: float = 0.0  #: when it begins [s]
+    stop: float = inf  #: when it ends [s]
+
+    def disturb_plant(self, plant: System, time: float) -> System:
+        """Returns the other plant, inside the window; raises where it has other states, inputs or time steps."""
+        ours, theirs = ((p.state_names, p.input_names, p.time_step) for p in (plant, self.plant))
+        if ours != theirs:
+            raise ShapeError(f"a plant must be replaced by one of the same states, inputs, step {ours}; got {theirs}")
+        return self.plant if self.acts(time) else plant
+
+
+@dataclass(frozen=True)
+class Dropout(_Window):
+    """Nothing is measured over a time window: entries of the state are NaN."""
+
+    start: float  #: when it begins [s]
+    stop: float  #: when it ends [s]
+    #: which ones, from 0; all by default. Without position, for one: 0 to 5 of a ``Coupled`` plant
+    entries: Sequence[int] | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.entries is not None:
+            object.__setattr__(self, "entries", tuple(np.asarray(self.entries).tolist()))
+        for entry in self.entries or ():
+            check_number("entries", entry, least=0, whole=True)
+
+    def disturb_plant(self, plant: System, time: float) -> System:
+        """Returns the plant; raises where it has no such entry."""
+        n = len(plant.state_names)
+        for entry in self.entries or ():
+            if entry >= n:
+                raise SettingError("entries", f"must be indices of states, 0 to {n - 1}; got {entry!r}")
+        return plant
+
+    def disturb_measurement(self, state: np.ndarray, time: float) -> np.ndarray:
+        """Returns NaN inside the window."""
+        if not self.acts(time):
+            return state
+        lost = state.copy()
+        lost[slice(None) if self.entries is None else list(self.entries)] = np.nan
+        return lost
+
+
+@lru_cache(maxsize=8)
+def _pushed(plant: System, rates: tuple[float, ...]) -> System:
+    """A system with constants (n,) added to its right-hand side, or to its next state."""
+    if plant.stateful:
+        raise UnsupportedModel("a gust needs equations, which a simulator has not. Possible with any plant: Replaced")
+    method = "successor" if hasattr(plant.dynamics, "successor") else "derivative"
+    of = getattr(plant.dynamics, method)
+
+    def pushed(x: Any, u: Any) -> list[Any]:
+        return [entry + rate for entry, rate in zip(of(x, u), rates, strict=True)]
+
+    names = {"state_names": plant.state_names, "input_names": plant.input_names}
+    return replace(plant, dynamics=SimpleNamespace(**names, **{method: pushed}))
