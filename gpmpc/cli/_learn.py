@@ -1,29 +1,23 @@
 """``gpmpc learn``: from log files and a mapping to a saved model, a report on held-out runs, and a model card."""
 
 import argparse
-import json
-from contextlib import suppress
-from pathlib import Path
-from typing import Any
 
 import pandas as pd
 from rich.console import Console
 
 from gpmpc import logs
-from gpmpc._files import write_whole
 from gpmpc._provenance import provenance
 from gpmpc.cli._commands import Result
 from gpmpc.cli._settings import write_files, writing
 from gpmpc.logs import Judgement, Learned, Log
 from gpmpc.plotting import judgement_figure, png
 from gpmpc.studies._document import Document, Table, number, terminal
-from gpmpc.studies.study import fingerprint
 
 _MODEL = "model.safetensors"
 
 
 def learn(given: argparse.Namespace) -> Result:
-    """Learns from logs, judges on held-out runs, and writes model, report and card; goes on where it stopped."""
+    """Learns from logs, judges on held-out runs, and writes model, report and card."""
     console, folder = Console(soft_wrap=True, highlight=False, markup=False), given.to
     log = logs.read_log(given.files, given.mapping, given.partial)
     console.print(repr(log))
@@ -32,16 +26,13 @@ def learn(given: argparse.Namespace) -> Result:
     train, held_out = _split(log, given.held_out)
     with writing(folder, "to"):
         folder.mkdir(parents=True, exist_ok=True)
-        settings = repr((train.mapping, given.points, given.steps, given.seed, given.for_control))
-        rows = (array for run in train for array in (run.states, run.inputs, run.context))
-        memory = _FileMemory(folder / "progress.json", fingerprint(settings, *rows))
         with console.status("learning") as status:
 
             def show(stage: str) -> None:
                 status.update(stage)
                 console.print(f"  {stage}")
 
-            learned = logs.learn(train, given.points, given.steps, given.seed, show, memory, given.for_control)
+            learned = logs.learn(train, given.points, given.steps, given.seed, show, given.for_control)
             status.update("judging on held-out runs")
             steps = sorted({step for step in (1, 10, 50) if step <= given.steps} | {given.steps})
             judgement = logs.judge(learned, held_out, train, steps)
@@ -63,20 +54,6 @@ def _split(log: Log, held_out: list[str]) -> tuple[Log, Log]:
     if len(names) == 1:
         return log.split_by_time(0.8)
     return log.split(names[:: max(len(names) // max(len(names) // 5, 1), 1)][: max(len(names) // 5, 1)])
-
-
-class _FileMemory(dict[str, Any]):
-    """Outcomes of stages, kept in a JSON file; other data or other settings begin it anew."""
-
-    def __init__(self, path: Path, fingerprint: str):
-        self._path, self._fingerprint = path, fingerprint
-        with suppress(OSError, ValueError, KeyError, TypeError):  # nothing there, or nothing whole
-            found = json.loads(path.read_text())
-            super().__init__(found["stages"] if found["fingerprint"] == fingerprint else {})
-
-    def __setitem__(self, key: str, value: Any) -> None:
-        super().__setitem__(key, value)
-        write_whole(self._path, json.dumps({"fingerprint": self._fingerprint, "stages": self}))
 
 
 def _report(learned: Learned, judgement: Judgement, train: Log, held_out: Log) -> Document:
@@ -119,8 +96,6 @@ def _report(learned: Learned, judgement: Judgement, train: Log, held_out: Log) -
 def _card(learned: Learned, judgement: Judgement, train: Log, held_out: Log) -> Document:
     """Makes the model card: data, ranges, what was left out, what is learned and why, and what must not be trusted."""
     names, outputs = [*train.space.names, *train.input_names], learned.model.kinematics.output_names
-    # An affine map has many parameters, and no standard errors.
-    parameters = [row for row in learned.fit.to_rows() if row[2] == row[2]]
     left_out = [f"{f.run}: {f.kind}: {f.text}" for f in train.findings if f.run in learned.runs]
     with_gp = {outputs[i] for gp in learned.model.gps for i in gp.outputs}
     without = "nominal only; a GP did not make held-out rollouts better"
@@ -148,7 +123,7 @@ def _card(learned: Learned, judgement: Judgement, train: Log, held_out: Log) -> 
         "Model card",
         [
             Table(["", ""], [*facts.items()], "What it is"),
-            Table(["parameter", "value", "standard error"], parameters, "Parameters"),
+            Table(["parameter", "value", "standard error"], learned.fit.to_rows(), "Parameters"),
             Table(["channel", "lowest", "highest"], [*zip(names, *learned.ranges, strict=True)], "Ranges of the data"),
         ],
         pd.DataFrame(),
