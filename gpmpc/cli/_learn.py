@@ -119,8 +119,6 @@ def _report(learned: Learned, judgement: Judgement, train: Log, held_out: Log) -
 def _card(learned: Learned, judgement: Judgement, train: Log, held_out: Log) -> Document:
     """Makes the model card: data, ranges, what was left out, what is learned and why, and what must not be trusted."""
     names, outputs = [*train.space.names, *train.input_names], learned.model.kinematics.output_names
-    # An affine map has many parameters, and no standard errors.
-    parameters = [row for row in learned.fit.to_rows() if row[2] == row[2]]
     left_out = [f"{f.run}: {f.kind}: {f.text}" for f in train.findings if f.run in learned.runs]
     with_gp = {outputs[i] for gp in learned.model.gps for i in gp.outputs}
     without = "nominal only; a GP did not make held-out rollouts better"
@@ -148,7 +146,7 @@ def _card(learned: Learned, judgement: Judgement, train: Log, held_out: Log) -> 
         "Model card",
         [
             Table(["", ""], [*facts.items()], "What it is"),
-            Table(["parameter", "value", "standard error"], parameters, "Parameters"),
+            Table(["parameter", "value", "standard error"], learned.fit.to_rows(), "Parameters"),
             Table(["channel", "lowest", "highest"], [*zip(names, *learned.ranges, strict=True)], "Ranges of the data"),
         ],
         pd.DataFrame(),

@@ -107,24 +107,22 @@ def _inspect(file: Path, output: Path, mapping_file: Path | None) -> Result:
 
     mapping = LogMapping.load(mapping_file) if mapping_file else None
     found = inspect_log(file, mapping)
-    streams = ["stream", "rows", "rate [Hz]", "jitter", "gaps", "longest gap [s]", "repeated stamps", "backward stamps"]
-    about = ["channel", "lowest", "highest", "std", "white noise", "repeated", "longest [rows]", "smoothness"]
-    late = ["channel", "later channel", "rows", "lowest", "highest", "agreement", "correlation"]
-    channels = [
-        [c.name, c.low, c.high, c.std, c.noise, f"{c.repeated:.0%}", c.longest, c.smoothness] for c in found.channels
-    ]
-    delays = [[d.first, d.second, d.rows, *d.range, f"{d.agreement:.0%}", d.correlation] for d in found.delays]
-    shares = [[name, f"{share:.0%}"] for name, share in found.follows.items()]
+    follows = pd.DataFrame([*found.follows.items()], columns=["input", "explained by the states"])
+    frames = {
+        "Streams": found.streams,
+        "Channels": found.channels.reset_index(),
+        "Delays between correlated channels": found.delays,
+        "Excitation": follows,
+    }
     tables = [
-        Table(streams, found.streams, "Streams"),
-        Table(about, channels, "Channels"),
-        Table(late, delays, "Delays between correlated channels"),
-        Table(["input", "explained by the states"], shares, "Excitation"),
+        Table([*frame], frame.to_numpy(object).tolist(), title)
+        for title, frame in frames.items()
+        if title in ("Streams", "Channels") or len(frame)
     ]
     page = Document(
         found.title,
-        [*tables[:2], *(table for table in tables[2:] if table.rows)],
-        pd.DataFrame([vars(channel) for channel in found.channels]).drop(columns=["time", "values"]),
+        tables,
+        frames["Channels"],
         lists={"Beware": found.warnings or ["nothing was found"]},
         images={"inspection.png": png(inspection_figure(found), dpi=100)},
     )

@@ -3,10 +3,14 @@
 from gpmpc.estimation._conformal import AdaptiveTube, ConformalTube
 from gpmpc.estimation._consistency import Consistency, autocorrelation, estimation_errors, normalized_errors
 from gpmpc.estimation._delay import DelayEstimate, estimate_delay
-from gpmpc.estimation._kalman import FilterRun, KalmanFilter, LateMeasurements, Update, smooth
-from gpmpc.estimation._measurement import Measurement
-from gpmpc.estimation._noise import ProcessNoise, estimate_process_noise, with_process_noise
-from gpmpc.estimation._varying_noise import VaryingNoise, estimate_varying_noise
+from gpmpc.estimation._kalman import FilterRun, KalmanFilter, LateMeasurements, Measurement, Update, smooth
+from gpmpc.estimation._noise import (
+    ProcessNoise,
+    VaryingNoise,
+    estimate_process_noise,
+    estimate_varying_noise,
+    with_process_noise,
+)
 
 __all__ = [
     "AdaptiveTube",

@@ -6,17 +6,16 @@ wrong in ways that their covariance does not say. Here kappa of each stage k is 
     s = max_g g'(x_k - mu_k) / sqrt(g' Sigma_k g)
 
 of held-out k-step predictions: the ceil((N + 1) eta)-th smallest of N scores holds a new one with probability eta or
-more, whatever their distribution (split conformal prediction: Vovk, Gammerman and Shafer, 2005; Lei et al., 2018).
-**Guaranteed** where the new score and the N are exchangeable: windows that do not overlap, flown as the plant will be.
-In a closed loop with another controller it is a measured number, no more.
+more, whatever their distribution (split conformal prediction: Vovk, Gammerman and Shafer, 2005; Lei et al., 2018),
+where the new score and the N are exchangeable: windows that do not overlap, flown as the plant will be.
 
 ``AdaptiveTube`` corrects it while it runs (Gibbs and Candes, 2021): with err = 1 where a prediction did not hold,
 
     alpha <- alpha + rate (1 - eta - err),    kappa = quantile of the scores at 1 - alpha
 
 Whatever the plant does, of T predictions of stage k no more than T a + a / rate + k + 1 do not hold, a = 1 - eta the
-share it aims at, **guaranteed** as long as no score exceeds ``largest``: alpha begins at a, and below zero, where kappa
-is the largest, only predictions made before can miss. That is a promise of the long run, not of a moment.
+share it aims at, as long as no score exceeds ``largest``: alpha begins at a, and below zero, where kappa is the
+largest, only predictions made before can miss.
 
 To be at or below 1 - eta with confidence it has to aim lower. Of T decisions m may be misses, m the largest number
 whose exact upper 95 % limit (Clopper and Pearson, 1934) is at or below 1 - eta; so ``decisions=T`` aims at
@@ -33,7 +32,7 @@ import torch
 from scipy.stats import beta
 
 from gpmpc._compiled import call_unchecked, compiled
-from gpmpc._dynamics import Array, DynamicsModel
+from gpmpc._dynamics import Array, DynamicsModel, to_array
 from gpmpc.exceptions import DataError, SettingError, ShapeError, check_number
 from gpmpc.gaussian import Gaussian
 from gpmpc.propagation import Propagator, rollout
@@ -74,37 +73,17 @@ class ConformalTube:
         if x.dim() != 2 or u.dim() != 2 or len(u) not in (len(x) - 1, len(x)):
             got = f"{tuple(x.shape)} and {tuple(u.shape)}"
             raise ShapeError(f"states (T + 1, n) and inputs (T, m) must be one log; got {got}")
-        starts = range(0, len(x) - horizon, horizon)
-        if not len(starts):
+        at, n = np.arange(0, len(x) - horizon, horizon)[:, None] + np.arange(1, horizon + 1), x.shape[1]
+        if not len(at):
             raise DataError(f"a log of {len(x)} states has no window of {horizon} steps")
-        begin = Gaussian.certain(torch.stack([x[k] for k in starts]))
-        predicted = rollout(propagator, model, begin, torch.stack([u[k : k + horizon] for k in starts]))
-        after = torch.stack([x[k + 1 : k + horizon + 1] for k in starts])
-        return cls.of_predictions(predicted, after, rows)
-
-    @classmethod
-    def of_predictions(cls, predicted: Gaussian, states: Any, rows: Any = None) -> "ConformalTube":
-        """Compares predictions of any kind with what happened, such as the plans of a flight.
-
-        Args:
-            predicted: Mean (N, H, n), covariance (N, H, n, n) with the process noise.
-            states: What the states were then (N, H, n).
-            rows: As for ``calibrate``.
-
-        Raises:
-            ShapeError: The shapes do not belong together.
-            DataError: A score is not finite, or a direction has no variance.
-        """
-        mean, covariance = (part.detach().cpu().double().numpy() for part in (predicted.mean, predicted.covariance))
-        after, n = np.asarray(states, dtype=float), mean.shape[-1]
         G = np.vstack([np.eye(n), -np.eye(n)]) if rows is None else np.atleast_2d(np.asarray(rows, dtype=float))
-        if mean.ndim != 3 or after.shape != mean.shape or G.shape[1] != n:
-            got = f"{mean.shape}, {after.shape} and {G.shape}"
-            raise ShapeError(f"predictions and states (N, H, n) and rows (r, n) must fit; got {got}")
-        deviation = np.sqrt(np.einsum("ri,khij,rj->khr", G, covariance, G))
+        if G.shape[1] != n:
+            raise ShapeError(f"rows must be (r, {n}); got {G.shape}")
+        predicted = rollout(propagator, model, Gaussian.certain(x[at[:, 0] - 1]), u[at - 1])
+        deviation = np.sqrt(np.einsum("ri,khij,rj->khr", G, to_array(predicted.covariance), G))
         if not (deviation > 0).all():
             raise DataError("a direction has no variance: predict with the process noise")
-        scores = ((after - mean) @ G.T / deviation).max(-1)
+        scores = (to_array(x[at] - predicted.mean) @ G.T / deviation).max(-1)
         if not np.isfinite(scores).all():
             raise DataError("a score is not finite: a prediction or a state is not")
         return cls(scores, G)
@@ -122,10 +101,10 @@ class ConformalTube:
             DataError: There are fewer than eta / (1 - eta) scores: no number of them says so much.
         """
         _check_probability(probability)
-        rank, N = math.ceil((len(self.scores) + 1) * probability - 1e-9), len(self.scores)
-        if rank > N:
+        rank = math.ceil((len(self.scores) + 1) * probability - 1e-9)
+        if rank > len(self.scores):
             need = math.ceil(probability / (1 - probability) - 1e-9)
-            raise DataError(f"a probability of {probability:g} needs {need} windows or more; got {N}")
+            raise DataError(f"a probability of {probability:g} needs {need} windows or more; got {len(self.scores)}")
         return self.scores[rank - 1].copy()
 
 
@@ -184,8 +163,7 @@ class AdaptiveTube:
         """Compares a state (n,) with what the plans before it said; returns kappa of each stage (H,)."""
         state = np.ascontiguousarray(state, dtype=np.float64)
         self._step += 1
-        numbers = self.rate, self.allowed, self.largest
-        parts = self.kappas, self.alphas, self.counts, self.misses
+        numbers, parts = (self.rate, self.allowed, self.largest), (self.kappas, self.alphas, self.counts, self.misses)
         call_unchecked(_observe, state, self.tube.rows, self._bounds, self._step, numbers, self.tube.scores, parts)
         return self.kappas
 
@@ -214,7 +192,6 @@ class AdaptiveTube:
 
 
 def _check_probability(probability: float) -> None:
-    check_number("probability", probability)
     if not 0 < probability < 1:
         raise SettingError("probability", f"must lie between 0 and 1; got {probability}")
 

@@ -26,7 +26,6 @@ class Consistency:
     values: np.ndarray  #: one an error (N,); errors without a finite entry are left out
     degrees: np.ndarray  #: degrees of freedom of each: how many entries were finite (N,)
     band: tuple[float, float]  #: limits of the mean, per degree of freedom, for independent errors
-    level: float  #: probability of the band
 
     @property
     def mean(self) -> float:
@@ -70,7 +69,7 @@ def normalized_errors(
     degrees = (~missing).sum(-1).numpy()
     total = float(degrees.mean()) * (len(values) if independent is None else independent)
     low, high = chi2.ppf([(1 - level) / 2, (1 + level) / 2], total) / total
-    return Consistency(values, degrees, (float(low), float(high)), level)
+    return Consistency(values, degrees, (float(low), float(high)))
 
 
 def estimation_errors(belief: Gaussian, states: Any, angles: Any = ()) -> Tensor:

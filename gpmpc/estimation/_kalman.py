@@ -3,25 +3,106 @@
     predict:   N(mu-, Sigma-) = propagator(model, N(mu, Sigma), u)
     update:    K = Cov[x, y] (Cov[y] + R)^-1,   mu = mu- + K (y - E[y]),   Sigma = Sigma- - K (Cov[y] + R) K'
 
-with the moments of y = h(x) by a propagator as well. By first-order linearisation this is the extended Kalman filter,
-by the unscented transform the unscented one (Julier and Uhlmann, 2004), by moment matching the assumed-density filter
-of Deisenroth, Huber and Hanebeck (2009). Entries of y that are not finite are missing, and the others are used.
+with the moments of y = h(x) + v, v ~ N(0, R), by a propagator as well: a measurement is a ``DynamicsModel`` without
+inputs. By first-order linearisation this is the extended Kalman filter, by the unscented transform the unscented one
+(Julier and Uhlmann, 2004), by moment matching the assumed-density filter of Deisenroth, Huber and Hanebeck (2009).
+Entries of y that are not finite are missing, and the others are used.
 """
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from gpmpc._dynamics import DynamicsModel
+from gpmpc._dynamics import Array, DynamicsModel, Linearized, TensorModel, check_query
 from gpmpc.estimation._consistency import wrapped
-from gpmpc.estimation._measurement import Measurement
-from gpmpc.exceptions import SettingError, ShapeError, check_number
-from gpmpc.gaussian import Gaussian, nearest_positive_semidefinite
+from gpmpc.exceptions import SettingError, ShapeError, check_number, check_numbers
+from gpmpc.gaussian import Gaussian, check_tensors, nearest_positive_semidefinite
+from gpmpc.models._nominal import linearize_function
 from gpmpc.propagation import Linearization, Propagator, Unscented
+
+
+@dataclass(frozen=True)
+class Measurement(TensorModel):
+    """A measurement model that is a function of the state.
+
+    Raises:
+        ShapeError: R is not square.
+        SettingError: R is no tensor, or an angle is no entry of y.
+    """
+
+    state_dim: int  #: n, of the state
+    noise_covariance: Tensor  #: R (p, p)
+    function: Callable[[Tensor], Tensor]  #: h, from x (*batch, n) to y (*batch, p), in torch
+    angles: Sequence[int] = ()  #: entries of y that are angles [rad]: their differences are wrapped to [-pi, pi)
+    input_dim = 0
+    _part = property(lambda self: self.noise_covariance)
+
+    def __post_init__(self) -> None:
+        check_number("state_dim", self.state_dim, least=1, whole=True)
+        check_tensors(noise_covariance=self.noise_covariance)
+        R = self.noise_covariance
+        if R.dim() != 2 or len(R) != R.shape[1]:
+            raise ShapeError(f"noise_covariance must be (p, p); got {tuple(R.shape)}")
+        if not callable(self.function):
+            raise SettingError("function", f"must be a function of the state; got {self.function!r}")
+        if any(not 0 <= i < len(R) for i in self.angles):
+            raise SettingError("angles", f"must be entries of y from 0 to {len(R) - 1}; got {list(self.angles)}")
+
+    @classmethod
+    def of_states(
+        cls, state_dim: int, states: Sequence[int], std: Sequence[float], angles: Sequence[int] = ()
+    ) -> "Measurement":
+        """A measurement of some of n states, whose noise has these standard deviations.
+
+        ``angles`` are those of the measured states that sensors show modulo one turn, by their place among them.
+
+        Raises:
+            SettingError: A state is out of range, or a standard deviation is negative.
+        """
+        if any(not 0 <= i < state_dim for i in states) or not len(states):
+            raise SettingError("states", f"must be indices from 0 to {state_dim - 1}; got {list(states)}")
+        check_numbers("std", std, len(states), least=0)
+        R = torch.diag(torch.tensor(list(std), dtype=torch.float64) ** 2)
+        return cls(state_dim, R, _Selection(states, state_dim), angles)
+
+    @property
+    def output_dim(self) -> int:
+        """Number of measured values, p."""
+        return len(self.noise_covariance)
+
+    def predict(self, state: Tensor, input: Tensor | None = None) -> Gaussian:
+        """What is measured at a certain state (*batch, p), without the noise."""
+        check_query(self, state, state[..., :0] if input is None else input)
+        value = self.function(state)
+        if not isinstance(value, Tensor) or value.shape != (*state.shape[:-1], self.output_dim):
+            got = tuple(value.shape) if isinstance(value, Tensor) else type(value).__name__
+            at = f"(*batch, {self.output_dim}) at {tuple(state.shape)}"
+            raise ShapeError(f"the measurement must give {at}; got {got}")
+        return Gaussian(value, value.new_zeros(*value.shape, self.output_dim))
+
+    def linearize(self, states: Array, inputs: Array, covariance: bool = True) -> Linearized:
+        """Linearises h at K points (K, n); ``inputs`` is (K, 0)."""
+        value, A = linearize_function(self.function, self, states)
+        K, p = value.shape
+        return Linearized(value, A, np.zeros((K, p, 0)), np.zeros((K, p, p)) if covariance else None)
+
+
+class _Selection:
+    """h(x) = x[states], with its expansion."""
+
+    def __init__(self, states: Sequence[int], state_dim: int):
+        self.states, self.matrix = list(states), np.eye(state_dim)[list(states)]
+
+    def __call__(self, state: Tensor) -> Tensor:
+        return state[..., self.states]
+
+    def linearize(self, states: Array) -> tuple[Array, Array]:
+        return np.ascontiguousarray(states[:, self.states]), np.tile(self.matrix, (len(states), 1, 1))
 
 
 @dataclass(frozen=True)
@@ -77,7 +158,7 @@ class KalmanFilter:
     @classmethod
     def extended(cls, model: DynamicsModel, measurement: Measurement) -> "KalmanFilter":
         """The extended Kalman filter: first-order linearisation of model and measurement."""
-        return cls(model, measurement, Linearization(process_noise=True))
+        return cls(model, measurement)
 
     @classmethod
     def unscented(cls, model: DynamicsModel, measurement: Measurement) -> "KalmanFilter":
@@ -86,28 +167,21 @@ class KalmanFilter:
 
     def predict(self, belief: Gaussian, input: Any) -> Gaussian:
         """Moves a belief (*batch, n) on by a step with the input that was applied (*batch, m)."""
-        return self.propagator(self.model, belief, self._tensor(input, belief))
+        return self.propagator(self.model, belief, _like(belief, input))
 
-    def update(self, belief: Gaussian, measured: Any, measurement: Measurement | None = None) -> Update:
-        """Corrects a belief by a measurement.
-
-        Args:
-            belief: Before it (*batch, n).
-            measured: y (*batch, p); entries that are not finite are missing.
-            measurement: Of another sensor than the filter's.
+    def update(self, belief: Gaussian, measured: Any) -> Update:
+        """Corrects a belief (*batch, n) by a measurement y (*batch, p), whose entries that are not finite are missing.
 
         Raises:
             ShapeError: y has another number of entries.
         """
-        measurement = self.measurement if measurement is None else measurement
-        y, R = self._tensor(measured, belief), measurement.noise_covariance
-        if y.shape != (*belief.mean.shape[:-1], len(R)):
-            expected = (*belief.mean.shape[:-1], len(R))
+        y, R = _like(belief, measured), self.measurement.noise_covariance
+        expected = (*belief.mean.shape[:-1], len(R))
+        if y.shape != expected:
             raise ShapeError(f"a measurement must have shape {expected}; got {tuple(y.shape)}")
-        seen = self.observer.propagate(measurement, belief)
+        seen = self.observer.propagate(self.measurement, belief)
         S, missing = seen.belief.covariance + R, ~torch.isfinite(y)
-        innovation = y - seen.belief.mean
-        angles = list(measurement.angles)
+        innovation, angles = y - seen.belief.mean, list(self.measurement.angles)
         if angles:
             innovation[..., angles] = wrapped(innovation[..., angles])
         # A missing entry is one of variance one that has nothing to do with the state.
@@ -119,32 +193,23 @@ class KalmanFilter:
         return Update(Gaussian(mean, covariance), torch.where(missing, torch.nan, innovation), S)
 
     def run(self, belief: Gaussian, inputs: Any, measured: Any) -> FilterRun:
-        """Filters a log.
-
-        Args:
-            belief: Before the first measurement (n,).
-            inputs: u_0 .. u_{T-1} (T, m).
-            measured: y_0 .. y_T (T + 1, p).
+        """Filters a log of inputs (T, m) and measurements (T + 1, p) from a belief before the first of them (n,).
 
         Raises:
             ShapeError: There is not one measurement more than inputs.
         """
-        inputs, measured = self._tensor(inputs, belief), self._tensor(measured, belief)
+        inputs, measured = _like(belief, inputs), _like(belief, measured)
         if len(measured) != len(inputs) + 1:
             raise ShapeError(f"T inputs belong to T + 1 measurements; got {len(inputs)} and {len(measured)}")
-        predicted, updates, crosses = [belief], [self.update(belief, measured[0])], []
-        for input, y in zip(inputs, measured[1:], strict=True):
+        predicted, updates = [belief], [self.update(belief, measured[0])]
+        crosses = belief.covariance.new_zeros(len(inputs), *belief.covariance.shape)
+        for k, input in enumerate(inputs):
             moved = self.propagator.propagate(self.model, updates[-1].belief, input)
             predicted.append(moved.belief)
-            crosses.append(moved.cross_covariance)
-            updates.append(self.update(moved.belief, y))
+            crosses[k] = moved.cross_covariance
+            updates.append(self.update(moved.belief, measured[k + 1]))
         innovations, covariances = (torch.stack([getattr(u, k) for u in updates]) for k in ("innovation", "covariance"))
-        n = belief.dim
-        cross = torch.stack(crosses) if crosses else belief.mean.new_zeros(0, n, n)
-        return FilterRun(_stacked(predicted), _stacked([u.belief for u in updates]), cross, innovations, covariances)
-
-    def _tensor(self, value: Any, belief: Gaussian) -> Tensor:
-        return torch.as_tensor(value, dtype=belief.mean.dtype, device=belief.mean.device)
+        return FilterRun(_stacked(predicted), _stacked([u.belief for u in updates]), crosses, innovations, covariances)
 
 
 def smooth(run: FilterRun) -> Gaussian:
@@ -179,11 +244,10 @@ class LateMeasurements:
 
     def __init__(self, filter: KalmanFilter, belief: Gaussian, longest: int = 10):
         check_number("longest", longest, least=0, whole=True)
-        self.filter = filter
+        self.filter, self.belief = filter, belief
         self._before: deque[Gaussian] = deque([belief], longest + 1)  # beliefs before the measurements of each step
         self._inputs: deque[Any] = deque(maxlen=longest)
         self._measured: deque[list[Any]] = deque([[]], longest + 1)
-        self.belief = belief
 
     def step(self, input: Any) -> Gaussian:
         """Goes on by a step, in which an input (m,) was applied; returns the belief over the state then."""
@@ -194,11 +258,7 @@ class LateMeasurements:
         return self.belief
 
     def measure(self, measured: Any, age: int = 0) -> Gaussian:
-        """Takes a measurement (p,) of a state some steps ago; returns the belief over the state now.
-
-        Args:
-            measured: y.
-            age: How many steps ago it was taken.
+        """Takes a measurement (p,) of the state ``age`` steps ago; returns the belief over the state now.
 
         Raises:
             SettingError: It is older than the filter remembers, or from the future.
@@ -207,19 +267,17 @@ class LateMeasurements:
         if age >= len(self._before):
             raise SettingError("age", f"must be at most {len(self._before) - 1} steps, which are remembered; got {age}")
         self._measured[-1 - age].append(measured)
-        if not age:
-            self.belief = self.filter.update(self.belief, measured).belief
-            return self.belief
-        first = len(self._before) - 1 - age
-        belief = self._before[first]
-        for k in range(first, len(self._before)):
-            if k > first:
-                belief = self.filter.predict(belief, self._inputs[k - len(self._before)])
-                self._before[k] = belief
+        for k in range(-1 - age, 0):
+            if k > -1 - age:
+                self._before[k] = self.filter.predict(self.belief, self._inputs[k])
+            self.belief = self._before[k]
             for y in self._measured[k]:
-                belief = self.filter.update(belief, y).belief
-        self.belief = belief
-        return belief
+                self.belief = self.filter.update(self.belief, y).belief
+        return self.belief
+
+
+def _like(belief: Gaussian, value: Any) -> Tensor:
+    return torch.as_tensor(value, dtype=belief.mean.dtype, device=belief.mean.device)
 
 
 def _right_solved(C: Tensor, S: Tensor) -> Tensor:

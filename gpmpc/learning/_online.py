@@ -1,37 +1,237 @@
-"""Learns while flying: every step teaches a GP of the change, and a check decides whether it may steer.
+"""Learns while flying: every step teaches a GP of what has changed, and a check decides whether it may steer.
 
-A ``LearningController`` plans with the model that was learned before, or with it and its change (``ChangedModel``).
-Each step of the flight becomes a point of the change, whether that is used or not; the oldest points, or those that
-explain least, make room. Both predict the step before they see it, and
+    x[k+1] = f(x[k], u[k]) + B d(phi(x[k], u[k]), t[k])
+
+f was learned before, d is the change: a GP over what the model's own GP sees, phi, and over the time t, so that it
+forgets in its kernel (a product of kernels in space and time: Bartels, Lahr, Carron and Zeilinger, 2026),
+
+    k_a = share^2 sf2_a exp(-1/2 sum_d (phi_d - phi'_d)^2 / l_ad^2) exp(-1/2 (t - t')^2 / memory^2).
+
+Length-scales and signal variances are the model's: the plant may differ by a share of what was learned. Where nothing
+was seen lately d is zero, and with one point it is the estimate of a constant disturbance.
+
+Each step of the flight becomes a point of the change, whether that is used or not. The model with its change and the
+one without predict the step before they see it, and
 
 * the change is **used** once its predictions have won: their log densities, summed over a window of steps, exceed those
   of the model alone by a margin;
 * it is **no longer used** once they have lost, or where a decision could not be applied;
 * a step that neither chance nor the noise of late explains is a **surprise**: the plant is another one. What was seen
-  before is forgotten, and the change is used at once: a GP with one point is an estimate of a constant disturbance.
+  before is forgotten, and the change is used at once.
 
 Noise may be larger than the model believes: it is scaled by what successive errors differ by, in the median.
 """
 
-from dataclasses import dataclass, replace
-from functools import cache
+from dataclasses import dataclass, field, fields, replace
+from functools import cache, cached_property
 from time import perf_counter
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import numpy as np
+import torch
 from scipy.stats import chi2
+from torch import Tensor
 
-from gpmpc._dynamics import Array, to_array
-from gpmpc.exceptions import DataError, SettingError, check_number
+from gpmpc._dynamics import Array, DynamicsModel, Linearized, linearize, to_array
+from gpmpc._kernels import Window
+from gpmpc._kernels import linearize as linearize_gps
+from gpmpc.exceptions import DataError, SettingError, UnsupportedModel, check_number
 from gpmpc.gaussian import Gaussian
-from gpmpc.gp import SlidingWindow
-from gpmpc.learning._change import ChangedModel
+from gpmpc.gp import GPPosterior, SlidingWindow, Transitions
+from gpmpc.gp._online import least_informative
+from gpmpc.models import Features
+from gpmpc.models._wrapper import Wrapper
 from gpmpc.mpc import Decision, Reference
 from gpmpc.mpc._controller import check_method
 from gpmpc.mpc.gp_mpc import GPMPC
+from gpmpc.simulation import Rollout
 
 _FEW, _MANY = 3, 100  # differences of errors that say how large the noise is
 _LARGEST = 10.0  # difference of log densities that one step counts for: no outlier decides alone
+
+
+@dataclass(frozen=True)
+class OnlineLearning:
+    """How a change is learned while flying; ``SettingError`` where a number is out of range or a rule unknown."""
+
+    points: int = 40  #: of the change, at most; where there would be more, a fifth goes
+    #: which go: ``"oldest"`` or ``"least_informative"``; see ``SlidingWindow``
+    remove: Literal["oldest", "least_informative"] = "oldest"
+    share: float = 0.1  #: by how much the plant may differ, as a share of what was learned
+    memory: float = 5000.0  #: length-scale of time in the kernel [steps]
+    window: int = 20  #: steps over which predictions are compared
+    margin: float = 20.0  #: lead of the summed log densities from which on the change is used
+    surprise: float = 30.0  #: squared error over its expectation, from which on a plant is another one
+
+    def __post_init__(self) -> None:
+        SlidingWindow(self.points, self.remove)
+        check_number("window", self.window, least=1, whole=True)
+        for key in ("share", "memory", "surprise"):
+            check_number(key, getattr(self, key), above=0)
+        check_number("margin", self.margin, least=0)
+
+    def learn(self, learned: "Learned", input: Array, state: Array) -> "Learned":
+        """Learns from one step: the input that was applied (m,), and the state measured after it (n,)."""
+        model, spread = learned.model, learned.spread
+        point, error, latent = model.error(learned.state, np.asarray(input, dtype=float), state)
+        moved = float(((error - learned.error) ** 2 / model.arrays[2]).mean()) / 2.0
+        if np.isfinite(moved):
+            spread = np.append(spread, moved)[-_MANY:]
+        found: dict[str, Any] = {"state": state, "error": error, "spread": spread}
+        if len(spread) < _FEW:
+            return replace(learned, model=model.later(1.0), **found)
+        # What changes slowly has no part in differences of successive errors, and a jump no weight in their median.
+        ratio = float(np.sort(spread)[len(spread) // 2]) * len(error) / _median(len(error))
+        noise = model.arrays[2] * max(1.0, ratio)
+        larger, alone = model.with_point(point, error, noise), noise + latent
+        missed, variance = larger.last_innovation()
+        variance = variance + latent
+        lead = _log_density(missed, variance) - _log_density(error, alone)
+        leads = np.append(learned.leads, max(-_LARGEST, min(lead, _LARGEST)))[-self.window :]
+        total = float(leads.sum())
+        active = total >= 0 if learned.active else total > self.margin
+        squares = missed**2 / variance if learned.active else error**2 / alone
+        if float(squares.mean()) > self.surprise:
+            active, leads = True, leads[:0]
+            larger = replace(model).with_point(point, error, noise)
+        version = learned.version + (active or learned.active)
+        return replace(learned, model=larger.later(1.0), leads=leads, active=active, version=version, **found)
+
+
+@dataclass(frozen=True)
+class ChangedModel(Wrapper):
+    """A model and its change.
+
+    Raises:
+        UnsupportedModel: Another model, or a ``ResidualModel`` whose B is a function of the state.
+    """
+
+    model: DynamicsModel  #: f: a ``GPPosterior`` of next states, or a ``ResidualModel``
+    learning: OnlineLearning = field(default_factory=OnlineLearning)  #: how d is learned
+    time: float = 0.0  #: t of all predictions [steps]
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.gp, GPPosterior) or self.gp.device.type != "cpu" or callable(self.B):
+            rule = "learning while flying needs a GPPosterior or a ResidualModel with a constant B, in host memory"
+            raise UnsupportedModel(f"{rule}; got {type(self.model).__name__}")
+
+    @cached_property
+    def gp(self) -> GPPosterior:
+        """The GP that the model was learned with."""
+        known: Any = getattr(self.model, "residual", self.model)
+        return known
+
+    @cached_property
+    def features(self) -> Features:
+        """What d sees of the state and the input."""
+        n, m, model = self.model.state_dim, self.model.input_dim, cast(Any, self.model)
+        return Features(list(range(n)), list(range(m)), [], n, m) if self.gp is model else model.features
+
+    @cached_property
+    def B(self) -> Tensor:
+        """Where d acts (n, k)."""
+        model = cast(Any, self.model)
+        return torch.eye(self.gp.output_dim, dtype=self.gp.dtype) if self.gp is model else model.B
+
+    @cached_property
+    def arrays(self) -> tuple[Array, Array, Array]:
+        """B (n, k), its pseudo-inverse, the part of an error of f that d can explain, and the noise of the GP (k,)."""
+        B = to_array(self.B)
+        return B, np.asarray(np.linalg.pinv(B), dtype=np.float64), to_array(self.gp.noise_variance)
+
+    @cached_property
+    def change(self) -> tuple[Window, Window | None]:
+        """d: GPs over (phi, u, t), at first without points; and in the making those without the points that go next."""
+        gp = self.gp
+        scales = np.column_stack([to_array(gp.lengthscales), np.full(gp.output_dim, self.learning.memory)])
+        signal = self.learning.share**2 * to_array(gp.signal_variance)
+        return Window.empty(scales, signal, gp.state_dim, self.learning.points), None
+
+    def __len__(self) -> int:
+        return self.change[0].arrays.size
+
+    def later(self, steps: float) -> "ChangedModel":
+        """The model some steps later."""
+        return self._replaced(time=self.time + steps)
+
+    def _replaced(self, **changes: Any) -> "ChangedModel":
+        other = object.__new__(type(self))
+        other.__dict__.update(self.__dict__ | changes)
+        return other
+
+    def error(self, state: Array, input: Array, next_state: Array) -> tuple[Array, Array, Array]:
+        """The point (phi, u, t) (d,) of a transition, what d was there (k,), and the variance of f there (k,)."""
+        states, inputs, reach = state[None], input[None], self.arrays[1]
+        alone = linearize(self.model, states, inputs)
+        z, v, _ = self.features.linearize(states, inputs)
+        variance = ((reach @ cast(Array, alone.covariance)[0]) * reach).sum(1)
+        return np.concatenate([z[0], v[0], [self.time]]), reach @ (next_state - alone.mean[0]), variance
+
+    def with_point(self, point: Array, target: Array, noise: Array) -> "ChangedModel":
+        """The model with a further point (phi, u, t) (d,) of the change, its target (k,) and its noise's variance (k,).
+
+        Raises SettingError where the noise is too small.
+        """
+        (now, coming), new, most = self.change, (point, target, noise), self.learning.points
+        gone = max(1, most // 5)
+        step = len(self) - (most - gone)  # of ``gone`` in which the factor without them is made
+        if step > 0 and coming is None:
+            oldest = self.learning.remove == "oldest"
+            coming = now.without(range(gone) if oldest else least_informative(self.posterior, gone))
+        if coming is not None and step == gone:
+            now, coming = coming, None
+        elif coming is not None:  # rows are as much work as their number's square: all steps have the same share
+            coming = coming.append(*new, rows=int((most - gone) * (step / gone) ** (1 / 3)))
+        return self._replaced(change=(now.append(*new), coming))
+
+    def last_innovation(self) -> tuple[Array, Array]:
+        """Error and variance (k,) of the prediction of the last point of the change by those before, with its noise.
+
+        With L the factor and v = L^-1 y, L_NN^2 is the variance, and v_N L_NN the error.
+        """
+        last = self.change[0].columns[:, len(self) - 1]
+        root = last[:, len(self) - 1]
+        return last[:, -1] * root, root**2
+
+    @property
+    def posterior(self) -> GPPosterior:
+        """The GPs of d as tensors."""
+        gp, now, size = self.gp, self.change[0], len(self)
+        arrays, (k, d) = now.arrays, now.arrays.inverse_squares.shape
+        parts = arrays.points[:, :size].T, now.data[d : d + k, :size].T, arrays.inverse_squares**-0.5
+        factor = now.columns[:, :size, :size].transpose(0, 2, 1)
+        rest = np.exp(arrays.log_signal), self.arrays[2], np.zeros(k), factor, arrays.weights[:, :size]
+        names = [field.name for field in fields(GPPosterior)]
+        given: dict[str, Any] = dict(zip(names, map(torch.from_numpy, parts + rest), strict=False))
+        return GPPosterior(**given, input_dim=gp.input_dim + 1, predicts="value")
+
+    @property
+    def noise_covariance(self) -> Tensor:
+        return self.model.noise_covariance
+
+    def predict(self, state: Tensor, input: Tensor) -> Gaussian:
+        """The next state's distribution at x (*batch, n) and u (*batch, m), without the noise."""
+        belief = self.model.predict(state, input)
+        if not len(self):
+            return belief
+        z, v = self.features(state, input)
+        d = self.posterior.predict(z, torch.cat([v, torch.full_like(state[..., :1], self.time)], dim=-1))
+        return Gaussian(belief.mean + d.mean @ self.B.mT, belief.covariance + self.B @ d.covariance @ self.B.mT)
+
+    def linearize(self, states: Array, inputs: Array, covariance: bool = True) -> Linearized:
+        """Linearises at K points (K, n), (K, m), the model and its change each by a method of their own."""
+        found, change = linearize(self.model, states, inputs, covariance), self.change[0]
+        if not len(self):
+            return found
+        z, v, slope = self.features.linearize(states, inputs)
+        at = np.empty((len(v), v.shape[1] + 1))
+        at[:, :-1], at[:, -1] = v, self.time
+        offset = np.zeros(self.gp.output_dim)
+        mean, by_state, by_input, variance = linearize_gps(change, z, at, covariance, offset, False)
+        by_state, by_input = self.features.chain(by_state, by_input[..., :-1], slope)
+        B, V = self.arrays[0], found.covariance
+        V = None if V is None or variance is None else V + B @ variance @ B.T
+        return Linearized(found.mean + mean @ B.T, found.A + B @ by_state, found.B + B @ by_input, V)
 
 
 @dataclass(frozen=True)
@@ -52,65 +252,11 @@ class Learned:
         return len(self.model.gp) + (len(self.model) if self.active else 0)
 
 
-@dataclass(frozen=True)
-class OnlineLearning:
-    """How a change is learned while flying.
-
-    Raises:
-        SettingError: A number out of range, or an unknown rule.
-    """
-
-    points: int = 40  #: of the change, at most; where there would be more, a fifth goes
-    #: which go: ``"oldest"`` or ``"least_informative"``; see ``SlidingWindow``
-    remove: Literal["oldest", "least_informative"] = "oldest"
-    share: float = 0.1  #: by how much the plant may differ, as a share of what was learned
-    memory: float = 5000.0  #: length-scale of time in the kernel [steps]
-    window: int = 20  #: steps over which predictions are compared
-    margin: float = 20.0  #: lead of the summed log densities from which on the change is used
-    surprise: float = 30.0  #: squared error over its expectation, from which on a plant is another one
-
-    def __post_init__(self) -> None:
-        SlidingWindow(self.points, self.remove)
-        check_number("window", self.window, least=1, whole=True)
-        for key in ("share", "memory", "surprise"):
-            check_number(key, getattr(self, key), above=0)
-        check_number("margin", self.margin, least=0)
-
-    def learn(self, learned: Learned, input: Array, state: Array) -> Learned:
-        """Learns from one step: the input that was applied (m,), and the state measured after it (n,)."""
-        model, spread = learned.model, learned.spread
-        point, error, latent = model.error(learned.state, np.asarray(input, dtype=float), state)
-        moved = float(((error - learned.error) ** 2 / model.arrays[2]).mean()) / 2.0
-        if np.isfinite(moved):
-            spread = np.append(spread, moved)[-_MANY:]
-        found: dict[str, Any] = {"state": state, "error": error, "spread": spread}
-        if len(spread) < _FEW:
-            return replace(learned, model=model.later(1.0), **found)
-        noise = model.arrays[2] * noise_ratio(spread, len(error))
-        larger, alone = model.with_point(point, error, noise), noise + latent
-        missed, variance = larger.last_innovation()
-        variance = variance + latent
-        lead = log_density(missed, variance) - log_density(error, alone)
-        leads = np.append(learned.leads, max(-_LARGEST, min(lead, _LARGEST)))[-self.window :]
-        total = float(leads.sum())
-        active = total >= 0 if learned.active else total > self.margin
-        squares = missed**2 / variance if learned.active else error**2 / alone
-        if float(squares.mean()) > self.surprise:
-            active, leads = True, leads[:0]
-            larger = replace(model).with_point(point, error, noise)
-        version = learned.version + (active or learned.active)
-        return replace(learned, model=larger.later(1.0), leads=leads, active=active, version=version, **found)
-
-
 class LearningController:
-    """Controls by a model and by what the flight teaches about its change.
+    """Controls by the model of a controller and by what the flight teaches about its change.
 
-    What was learned travels with the decisions (``Decision.learned``): one controller active any number of flights, and
+    What was learned travels with the decisions (``Decision.learned``): one controller flies any number of flights, and
     a flight begins where there is no decision before.
-
-    Args:
-        controller: On the model that was learned before.
-        learning: How.
 
     Raises:
         SettingError: The controller cannot change its model.
@@ -122,8 +268,7 @@ class LearningController:
         self.controller, self.learning = controller, OnlineLearning() if learning is None else learning
         self.problem, self.horizon = controller.problem, controller.horizon
         self.initial_input = controller.initial_input
-        known, model = self.learning, controller.prediction.model
-        self._model = ChangedModel(model, known.share, known.memory, known.points, known.remove)
+        self._model = ChangedModel(controller.prediction.model, self.learning)
 
     def control(
         self, belief: Gaussian, reference: Reference, previous: Decision | None = None, parameters: Any = None
@@ -155,16 +300,7 @@ class LearningController:
         return Learned(self._model, state, unknown, np.empty(0), np.empty(0), version=version)
 
 
-def noise_ratio(spread: Array, outputs: int) -> float:
-    """How much larger the noise is than a model of k outputs believes, 1 at least.
-
-    ``spread`` has half the squared differences of successive errors over the model's noise, mean over the outputs (w,):
-    what changes slowly has no part in them, and a jump no weight in their median.
-    """
-    return max(1.0, float(np.sort(spread)[len(spread) // 2]) * outputs / _median(outputs))
-
-
-def log_density(error: Array, variance: Array) -> float:
+def _log_density(error: Array, variance: Array) -> float:
     """Of independent Gaussians, but for a constant."""
     return -0.5 * float((error**2 / variance + np.log(variance)).sum())
 
@@ -172,3 +308,27 @@ def log_density(error: Array, variance: Array) -> float:
 @cache
 def _median(degrees: int) -> float:
     return float(chi2.median(degrees))
+
+
+@dataclass(frozen=True)
+class EpisodicLearning:
+    """Learns from one flight to the next: its transitions join the data, and a model is trained anew.
+
+    Flights alone teach little of the derivatives that a controller needs (``gpmpc.datasets.Excitation``), so the
+    earlier data stay. A model that predicts better may control worse, so the one whose flight had the smallest error
+    flies the flight that counts. Where the plant is another one than that of the data, these contradict the flights:
+    there ``OnlineLearning`` helps.
+    """
+
+    episodes: int = 2  #: flights before the one that counts: the first with the model of the data, two at least
+
+    def __post_init__(self) -> None:
+        check_number("learning.episodes", self.episodes, least=2, whole=True)
+
+    def with_flight(self, data: Transitions, flight: Rollout) -> Transitions:
+        """The data and the transitions of a flight, as far as they were measured."""
+        known = np.all(np.isfinite(flight.measured), axis=1)
+        rows = np.flatnonzero(np.logical_and(known[:-1], known[1:]))
+        states, inputs, after = flight.measured[rows], flight.inputs[rows], flight.measured[rows + 1]
+        parts = (data.states, states), (data.inputs, inputs), (data.next_states, after)
+        return Transitions(*(torch.cat([first, torch.from_numpy(second)]) for first, second in parts))

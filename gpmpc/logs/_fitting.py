@@ -23,7 +23,7 @@ from scipy.optimize import least_squares, nnls
 from gpmpc.exceptions import DataError, ShapeError, check_number
 from gpmpc.logs._kinematics import Array, Kinematics
 from gpmpc.logs._log import Log, Windows
-from gpmpc.logs._rollouts import PAST, STEPS, AffineNominal, LogModel, choose_stride, finite_errors, rollout_errors
+from gpmpc.logs._rollouts import PAST, STEPS, AffineNominal, LogModel, finite_errors, rollout_errors
 
 WINDOWS = 300
 EVALUATIONS = 15
@@ -42,14 +42,11 @@ class NominalFit:
 
     model: LogModel  #: with its parameters
     standard_errors: Array  #: of the parameters (P,), robust to the correlation of neighbouring windows
-    cost: float  #: of the loss, per residual
-    start_cost: float  #: at the start
-    evaluations: int  #: of the rollouts
 
     def to_rows(self) -> list[tuple[str, float, float]]:
-        """Name, value and standard error of every parameter."""
+        """Name, value and standard error of every parameter that has a name."""
         names = self.model.nominal.parameter_names
-        return list(zip(names, self.model.theta.tolist(), self.standard_errors.tolist(), strict=True))
+        return list(zip(names, self.model.theta.tolist(), self.standard_errors.tolist(), strict=False))
 
 
 def fit_nominal(model: LogModel, theta0: Array | None, log: Log, steps: int = STEPS) -> NominalFit:
@@ -69,10 +66,9 @@ def fit_nominal(model: LogModel, theta0: Array | None, log: Log, steps: int = ST
     theta0 = model.nominal.start if theta0 is None else np.asarray(theta0, dtype=float)
     if theta0.shape != (len(model.nominal.parameter_names),):
         raise ShapeError(f"theta0 must have {len(model.nominal.parameter_names)} entries; got {theta0.shape}")
-    past = max(model.past, PAST)
-    cut = log.windows(steps, past, choose_stride(log, steps + past, WINDOWS))
+    cut = log.windows(steps, max(model.past, PAST), most=WINDOWS)
     if not len(theta0):
-        return NominalFit(replace(model, theta=theta0), theta0, 0.0, 0.0, 0)
+        return NominalFit(replace(model, theta=theta0), theta0)
     at = np.unique(np.geomspace(1, steps, 8).round().astype(int))
     scale = _still_error(cut, at)
 
@@ -88,18 +84,16 @@ def fit_nominal(model: LogModel, theta0: Array | None, log: Log, steps: int = ST
         around = residuals(np.concatenate([theta + np.diag(h), theta[None]]))
         return ((around[:-1] - around[-1]) / h[:, None, None, None]).reshape(len(theta), -1).T
 
+    def flat(theta: Array) -> Array:
+        return residuals(theta[None])[0].ravel()
+
     with np.errstate(over="ignore", invalid="ignore"):
-        first = residuals(theta0[None])[0]
-        if not (np.abs(first) < 1e6).all():
+        if not (np.abs(flat(theta0)) < 1e6).all():
             raise DataError("the rollouts at theta0 are not finite: begin nearer, or with fewer steps")
-        options: dict[str, Any] = {"loss": "soft_l1", "x_scale": "jac", "max_nfev": EVALUATIONS}
-        found = least_squares(
-            lambda theta: residuals(theta[None])[0].ravel(), theta0, jacobian, xtol=1e-4, ftol=1e-4, **options
-        )
-    start_cost = float((np.sqrt(1 + first**2) - 1).sum() / first.size)
+        tolerances: dict[str, Any] = {"xtol": 1e-4, "ftol": 1e-4, "max_nfev": EVALUATIONS}
+        found = least_squares(flat, theta0, jacobian, loss="soft_l1", x_scale="jac", **tolerances)
     errors = _standard_errors(found.x, jacobian(found.x), residuals(found.x[None])[0])
-    fitted, cost = replace(model, theta=found.x), float(found.cost / first.size)
-    return NominalFit(fitted, errors, cost, start_cost, found.nfev + found.njev)
+    return NominalFit(replace(model, theta=found.x), errors)
 
 
 def _still_error(windows: Windows, at: np.ndarray) -> Array:
@@ -127,8 +121,7 @@ def fit_least_squares(kinematics: Kinematics, log: Log) -> LogModel:
     z = kinematics.features(x, u, c)
     y = kinematics.outputs(x, cut.states[:, 1], log.time_step)
     solution: Any = np.linalg.lstsq(np.column_stack([z, np.ones(len(z))]), y, rcond=1e-8)[0]
-    nominal = AffineNominal(kinematics, y.shape[1], z.shape[1])
-    return LogModel(kinematics, nominal, solution.T.ravel(), (0,) * y.shape[1])
+    return LogModel(kinematics, AffineNominal(kinematics), solution.T.ravel(), (0,) * y.shape[1])
 
 
 @dataclass(frozen=True)
@@ -175,9 +168,8 @@ def fit_noise(models: Sequence[LogModel], logs: Sequence[Log], most: int) -> Out
     steps = [step for step in FITTED if step <= most]
     found: list[tuple[Array, Array, Array]] = []
     for model, log in zip(models, logs, strict=True):
-        past = max(model.past, PAST)
-        cut = log.windows(most, past, choose_stride(log, most + past, NOISE_WINDOWS))
-        few = cut[:: -(-len(cut) // LINEARIZED)]  # derivatives are slow, and vary little
+        cut = log.windows(most, max(model.past, PAST), most=NOISE_WINDOWS)
+        few, past = cut[:: -(-len(cut) // LINEARIZED)], cut.past  # derivatives are slow, and vary little
         x, after = cut.states[:, past], cut.states[:, past + 1]
         y = model.outputs(x, cut.inputs[:, past - model.lag], cut.context[:, past]) + model.disturbance(cut)
         residuals = model.kinematics.outputs(x, after, cut.time_step) - y

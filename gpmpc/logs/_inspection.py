@@ -9,6 +9,7 @@ the share of its variance that the states explain linearly; what only follows th
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -26,86 +27,27 @@ BLOCKS, BLOCK, REACH = 16, 4096, 50  # rows in which delays are sought, and how 
 SHARP = 10  # rows within which a peak falls by a fifth
 CORRELATED = 0.5  # from which a delay says something
 PAIRS = 20  # most delays that are listed
+_DELAYS = ["channel", "later channel", "rows", "lowest", "highest", "agreement", "correlation"]
 FOLLOWS = 0.95  # share of an input's variance that the states explain
 
 
 @dataclass(frozen=True)
-class Channel:
-    """One channel: its numbers, and a line to draw."""
-
-    name: str  #: with its topic
-    time: Array  #: [s] (P,)
-    values: Array  #: (P,)
-    missing: float  #: share of the rows without a value
-    repeated: float  #: share of the rows whose value is that of the row before
-    longest: int  #: rows of the longest stretch of one value
-    low: float  #: smallest value
-    high: float  #: largest value
-    std: float  #: standard deviation
-    noise: float  #: standard deviation of white noise that the second differences hold
-    smoothness: float  #: correlation of neighbouring second differences
-
-    @property
-    def remark(self) -> str:
-        """What to beware of, in words."""
-        remark = ""
-        if self.std == 0:
-            remark = "never changes"
-        elif self.repeated > 0.5:
-            remark = f"a new value every {1 / max(1 - self.repeated, 1e-9):.1f} rows"
-        elif self.smoothness > 0.3:
-            remark = "smoothed: its errors hang together over rows"
-        missing = f"{self.missing:.1%} missing" if self.missing else ""
-        return ", ".join(filter(None, (remark, missing)))
-
-
-@dataclass(frozen=True)
-class Delay:
-    """How many rows one channel comes after another."""
-
-    first: str  #: name of the channel that comes first where ``rows`` is positive
-    second: str  #: name of the other
-    rows: float  #: median over the blocks
-    range: tuple[float, float]  #: lowest and highest of the blocks
-    agreement: float  #: share of the blocks within a row of the median
-    correlation: float  #: median, of the channels' differences
-
-
-@dataclass(frozen=True)
 class Inspection:
-    """What is in a log file."""
+    """What is in a log file; shares lie between 0 and 1."""
 
     title: str  #: the file and its size in words
-    #: name, rows, rate [Hz], jitter (standard deviation over the time step), gaps, longest gap [s], repeated and
-    #: backward stamps of each
-    streams: tuple[tuple[str, int, float, float, int, float, int, int], ...]
-    channels: tuple[Channel, ...]  #: of all streams
-    gaps: tuple[tuple[float, float], ...]  #: begin and end [s] of each, of all streams
-    delays: tuple[Delay, ...]  #: the strongest pairs first
+    streams: pd.DataFrame  #: a row a stream; its jitter is the standard deviation over the time step
+    #: a row a channel, by name; "white noise" is the standard deviation of the one that second differences hold,
+    #: "repeated" the share of the rows with the value of the row before, "smoothness" the correlation of neighbouring
+    #: second differences
+    channels: pd.DataFrame
+    #: a row a pair, the strongest first: by how many rows the later channel is late (median, with its range over the
+    #: blocks), which share of the blocks agrees to a row, and the correlation of the differences
+    delays: pd.DataFrame
     follows: dict[str, float]  #: share of the variance that the states explain, by input; only with a mapping
-
-    @property
-    def warnings(self) -> tuple[str, ...]:
-        """What to beware of, in words."""
-        found = []
-        for name, _, _, jitter, gaps, longest, repeated, backwards in self.streams:
-            where = f" of {name}" if name else ""
-            found += [f"{gaps} gaps{where}, up to {longest:.3g} s"] if gaps else []
-            found += [f"{repeated} stamps{where} repeat"] if repeated else []
-            found += [f"{backwards} stamps{where} run backwards"] if backwards else []
-            found += [f"stamps{where} jitter by {jitter:.0%} of the time step: state a rate"] if jitter > 0.1 else []
-        found += [f"{channel.name}: {channel.remark}" for channel in self.channels if channel.remark]
-        for delay in self.delays:
-            low, high = delay.range
-            if abs(delay.rows) >= 1 or high - low > 2:
-                agree = f"{low:g} to {high:g}; {delay.agreement:.0%} of the blocks agree"
-                found.append(f"{delay.second} comes {delay.rows:g} rows after {delay.first} ({agree})")
-        found += [
-            f"{name} follows the states ({share:.0%} of its variance): its own effect cannot be learned"
-            for name, share in self.follows.items()
-            if share > FOLLOWS
-        ]
-        return tuple(found)
+    lines: dict[str, tuple[Array, Array]]  #: time [s] and values to draw, by channel
+    gaps: tuple[tuple[float, float], ...]  #: begin and end [s] of each, of all streams
+    warnings: tuple[str, ...]  #: what to beware of, in words
 
 
 def inspect_log(path: str | Path, mapping: LogMapping | None = None) -> Inspection:
@@ -118,31 +60,48 @@ def inspect_log(path: str | Path, mapping: LogMapping | None = None) -> Inspecti
     Raises:
         DataError: The file cannot be read, or no column holds the time.
     """
-    topics = {signal.topic for signal in mapping.signals} if mapping else ()
-    streams = read_streams(path, topics)
-    channels, gaps, delays, tables, rows = [], [], [], [], 0
+    streams = read_streams(path, {signal.topic for signal in mapping.signals} if mapping else ())
+    tables, channels, delays, lines, gaps, warnings = [], {}, [], {}, [], []
     for topic, table in streams.items():
         time_name, time = _time(path, table, mapping)
         stamps = ordered_stamps(time, f"{path}{f', {topic}' if topic else ''}")
         steps = np.diff(stamps.time)
         if not len(steps):
             continue
-        step = float(np.median(steps))
+        step, where = float(np.median(steps)), f" of {topic}" if topic else ""
         wide = np.flatnonzero(steps > 1.5 * step)
         gaps += [(float(stamps.time[i]), float(stamps.time[i + 1])) for i in wide]
-        longest = float(steps[wide].max(initial=0))
-        jitter = float(steps[steps <= 1.5 * step].std() / step)
-        tables.append((topic, len(table), 1 / step, jitter, len(wide), longest, stamps.repeated, stamps.backwards))
-        wanted = {c for s in mapping.signals if s.topic == topic for c in s.columns} if mapping else None
-        names = [c for c in table.select_dtypes("number").columns if c != time_name and (wanted is None or c in wanted)]
-        titles, values = [f"{topic}.{n}" if topic else str(n) for n in names], table[names].to_numpy(float)[stamps.rows]
-        channels += [_channel(name, stamps.time, column) for name, column in zip(titles, values.T, strict=True)]
+        longest, jitter = float(steps[wide].max(initial=0)), float(steps[steps <= 1.5 * step].std() / step)
+        counts = {"repeated stamps": stamps.repeated, "backward stamps": stamps.backwards}
+        row = {"stream": topic, "rows": len(table), "rate [Hz]": 1 / step, "jitter": jitter, "gaps": len(wide)}
+        tables.append(row | {"longest gap [s]": longest} | counts)
+        warnings += [f"{len(wide)} gaps{where}, up to {longest:.3g} s"] if len(wide) else []
+        warnings += [f"{count} {what}{where}" for what, count in counts.items() if count]
+        warnings += [f"stamps{where} jitter by {jitter:.0%} of the time step: state a rate"] if jitter > 0.1 else []
+        wanted = {c for s in mapping.signals if s.topic == topic for c in s.columns} if mapping else set(table)
+        names = [c for c in table.select_dtypes("number") if c != time_name and c in wanted]
+        values = table[names].to_numpy(float)[stamps.rows]
+        titles = [f"{topic}.{name}" if topic else str(name) for name in names]
+        channels |= {name: _channel(column) for name, column in zip(titles, values.T, strict=True)}
+        stride = max(len(values) // DRAWN, 1)
+        lines |= {name: (stamps.time[::stride], v[::stride]) for name, v in zip(titles, values.T, strict=True)}
         delays += _delays(titles, values)
-        rows += len(table)
-    size = f"{Path(path).name}: {rows} rows, {len(channels)} channels"
-    delays = sorted(delays, key=lambda delay: -abs(delay.correlation))[:PAIRS]
+    warnings += [f"{name}: {remark}" for name, numbers in channels.items() if (remark := _remark(numbers))]
+    delays = sorted(delays, key=lambda delay: -abs(delay[-1]))[:PAIRS]
+    for first, second, rows, low, high, agreement, _ in delays:
+        if abs(rows) >= 1 or high - low > 2:
+            agree = f"{low:g} to {high:g}; {agreement:.0%} of the blocks agree"
+            warnings.append(f"{second} comes {rows:g} rows after {first} ({agree})")
     follows = _dependence(read_log(path, mapping)) if mapping else {}
-    return Inspection(size, tuple(tables), tuple(channels), tuple(gaps), tuple(delays), follows)
+    warnings += [
+        f"{name} follows the states ({share:.0%} of its variance): its own effect cannot be learned"
+        for name, share in follows.items()
+        if share > FOLLOWS
+    ]
+    size = f"{Path(path).name}: {sum(row['rows'] for row in tables)} rows, {len(channels)} channels"
+    table = pd.DataFrame.from_dict(channels, orient="index").rename_axis("channel")
+    frames = pd.DataFrame(tables), table, pd.DataFrame(delays, columns=_DELAYS)
+    return Inspection(size, *frames, follows, lines, tuple(gaps), tuple(warnings))
 
 
 def _time(path: str | Path, table: pd.DataFrame, mapping: LogMapping | None) -> tuple[str, Array]:
@@ -153,26 +112,39 @@ def _time(path: str | Path, table: pd.DataFrame, mapping: LogMapping | None) -> 
     return names[0], table[names[0]].to_numpy(float) * (TIME_UNITS[mapping.time_unit] if mapping else 1.0)
 
 
-def _channel(name: str, time: Array, values: Array) -> Channel:
+def _channel(values: Array) -> dict[str, float]:
     known = values[np.isfinite(values)]
-    stride = max(len(values) // DRAWN, 1)
-    line, missing = (time[::stride], values[::stride]), 1 - len(known) / len(values)
-    if not len(known):
-        return Channel(name, *line, missing, 0.0, 0, np.nan, np.nan, 0.0, 0.0, 0.0)
-    same = np.diff(known) == 0
-    changes = np.flatnonzero(np.r_[True, ~same, True])
-    second = np.diff(known, 2)
+    low, high, std = (float(f(known)) if len(known) else np.nan for f in (np.min, np.max, np.std))
+    same, second = np.diff(known) == 0, np.diff(known, 2)
     # The median is deaf to manoeuvres; 1.4826 makes it the standard deviation of a normal distribution.
     noise = 1.4826 * float(np.median(np.abs(second - np.median(second)))) / np.sqrt(6) if len(second) else 0.0
     power = float(second @ second)
-    smoothness = float(second[1:] @ second[:-1]) / power if power > 0 else 0.0
-    repeated, longest = float(same.mean()) if len(same) else 0.0, int(np.diff(changes).max())
-    low, high, std = float(known.min()), float(known.max()), float(known.std())
-    return Channel(name, *line, missing, repeated, longest, low, high, std, noise, smoothness)
+    return {
+        "lowest": low,
+        "highest": high,
+        "std": std,
+        "white noise": noise,
+        "missing": 1 - len(known) / len(values),
+        "repeated": float(same.mean()) if len(same) else 0.0,
+        "longest [rows]": int(np.diff(np.flatnonzero(np.r_[True, ~same, True])).max()),
+        "smoothness": float(second[1:] @ second[:-1]) / power if power > 0 else 0.0,
+    }
 
 
-def _delays(names: list[str], values: Array) -> list[Delay]:
-    """Delays of all pairs whose differences are correlated, from blocks spread over the rows."""
+def _remark(channel: dict[str, float]) -> str:
+    """What to beware of, in words."""
+    remarks = [f"{channel['missing']:.1%} missing"] if channel["missing"] else []
+    if channel["std"] == 0:
+        remarks.insert(0, "never changes")
+    elif channel["repeated"] > 0.5:
+        remarks.insert(0, f"a new value every {1 / max(1 - channel['repeated'], 1e-9):.1f} rows")
+    elif channel["smoothness"] > 0.3:
+        remarks.insert(0, "smoothed: its errors hang together over rows")
+    return ", ".join(remarks)
+
+
+def _delays(names: list[str], values: Array) -> list[tuple[Any, ...]]:
+    """Rows of ``_DELAYS`` for all pairs whose differences are correlated, from blocks spread over the rows."""
     length = min(BLOCK, len(values) // 8)
     if length < 4 * REACH:
         return []
@@ -196,9 +168,9 @@ def _delays(names: list[str], values: Array) -> list[Delay]:
             # A slow oscillation is correlated with any other at some delay; a delay has a sharp peak.
             if abs(correlation) >= CORRELATED and around.max() < 0.8 * abs(correlation):
                 lags = peak[:, j] - REACH
-                delay, reach = float(np.median(lags)), (float(lags.min()), float(lags.max()))
-                agreement = float((np.abs(lags - delay) <= 1).mean())
-                found.append(Delay(names[usable[i]], names[usable[i + 1 + j]], delay, reach, agreement, correlation))
+                delay, agreement = float(np.median(lags)), float((np.abs(lags - np.median(lags)) <= 1).mean())
+                pair = names[usable[i]], names[usable[i + 1 + j]]
+                found.append((*pair, delay, float(lags.min()), float(lags.max()), agreement, correlation))
     return found
 
 

@@ -16,7 +16,7 @@ from gpmpc.logs._fitting import error_variances, fit_least_squares, follow_error
 from gpmpc.logs._kinematics import Array, Kinematics
 from gpmpc.logs._learning import Learned
 from gpmpc.logs._log import Log, Windows
-from gpmpc.logs._rollouts import PAST, choose_stride, rollout_errors
+from gpmpc.logs._rollouts import PAST, rollout_errors
 from gpmpc.metrics import binomial_interval
 
 STEPS, LEVEL = (1, 10, 50), 0.95
@@ -26,7 +26,6 @@ LAGS = (1, 2, 3, 5, 8, 12, 20)  # rows of the past that it sees
 BINS = 5  # means of the future inputs that it sees
 PENALTY = 0.01  # of its squared coefficients of standardised columns, per row
 CHUNK = 100  # windows linearised at once
-NEEDED = ("constant state", "constant velocity", "least squares")  # a model must beat them
 
 
 @dataclass(frozen=True)
@@ -81,10 +80,8 @@ def judge(learned: Learned, held_out: Log, train: Log, steps: Sequence[int] = ST
     """
     model, space, kinematics = learned.model, held_out.space, learned.model.kinematics
     past, longest = max(model.past, PAST), max(steps)
-    stride = choose_stride(held_out, longest + past, WINDOWS)
-    cut = held_out.windows(longest, past, stride)
-    start = cut.states[:, past]
-    seen = train.windows(longest, PAST, choose_stride(train, longest + PAST, RIDGE_WINDOWS))
+    cut = held_out.windows(longest, past, most=WINDOWS)
+    start, seen = cut.states[:, past], train.windows(longest, PAST, most=RIDGE_WINDOWS)
     own = rollout_errors(cut, model.rollout(cut), steps)
     with np.errstate(over="ignore", invalid="ignore"):
         affine = rollout_errors(cut, fit_least_squares(kinematics, train).rollout(cut), steps)
@@ -108,10 +105,9 @@ def judge(learned: Learned, held_out: Log, train: Log, steps: Sequence[int] = ST
         return np.stack([values[..., at].mean(axis=(0, 2)) for at in space.error_columns], axis=-1)
 
     coverage = of_groups(np.abs(own) <= ndtri((1 + LEVEL) / 2) * np.sqrt(variances))
-    independent = [max(len(cut) * stride // max(step, stride), 1) for step in steps]  # windows that do not overlap
-    intervals = [
-        [binomial_interval(round(c * n), n, LEVEL) for c in row] for row, n in zip(coverage, independent, strict=True)
-    ]
+    independent = [max(len(cut) * cut.stride // max(step, cut.stride), 1) for step in steps]  # do not overlap
+    pairs = zip(coverage, independent, strict=True)
+    intervals = [[binomial_interval(round(share * n), n, LEVEL) for share in row] for row, n in pairs]
     return Judgement(
         groups=tuple(group.name for group in space.groups),
         units=tuple("rad" if group.kind == "quaternion" else group.unit for group in space.groups),

@@ -4,20 +4,19 @@ The difference of two states is taken in the tangent space (Sola, Deray and Atch
 one, an angle's is wrapped to [-pi, pi), and an attitude's is the rotation vector log(q_b^-1 q_a) in the body frame, so
 a quaternion of four numbers has an error of three. Quaternions are scalar last (x, y, z, w), body to world.
 
-Kinematics are exact, with nothing to learn: x[k+1] = step(x[k], y[k]) and y[k] = outputs(x[k], x[k+1]) are inverse to
-each other as far as the outputs y, such as accelerations, reach. All functions take any batch of states (..., n).
+Kinematics have nothing to learn: x[k+1] = step(x[k], y[k]) and y[k] = outputs(x[k], x[k+1]) are inverse to each other
+as far as the outputs y, such as accelerations, reach. All functions take any batch of states (..., n).
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal, Protocol
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
-Kind = Literal["vector", "angle", "quaternion"]
 GRAVITY = np.array([0.0, 0.0, -9.80665])  # [m/s2], world
 
 
@@ -28,7 +27,7 @@ class StateGroup:
     name: str  #: such as "position"
     entries: tuple[str, ...]  #: names of the entries; four of a quaternion, x, y, z, w
     unit: str = ""  #: of the entries; a quaternion's errors are in rad
-    kind: Kind = "vector"  #: how differences are taken
+    kind: Literal["vector", "angle", "quaternion"] = "vector"  #: how differences are taken
 
     @property
     def error_dim(self) -> int:
@@ -42,7 +41,7 @@ class StateSpace:
 
     groups: tuple[StateGroup, ...]
 
-    @cached_property
+    @property
     def names(self) -> tuple[str, ...]:
         return tuple(entry for group in self.groups for entry in group.entries)
 
@@ -59,12 +58,12 @@ class StateSpace:
     @property
     def dim(self) -> int:
         """Number of entries of a state, n."""
-        return len(self.names)
+        return self.columns[-1].stop
 
     @property
     def error_dim(self) -> int:
         """Number of entries of a difference, e."""
-        return sum(group.error_dim for group in self.groups)
+        return self.error_columns[-1].stop
 
     def difference(self, a: Array, b: Array) -> Array:
         """Computes a - b (..., e) of states (..., n)."""
@@ -75,7 +74,7 @@ class StateSpace:
                 parts.append(rotation_vector(quaternion_product(quaternion_inverse(other), one)))
             else:
                 parts.append(wrap(one - other) if group.kind == "angle" else one - other)
-        return np.concatenate(np.broadcast_arrays(*parts) if len(parts) == 1 else parts, axis=-1)
+        return np.concatenate(parts, axis=-1)
 
     def displace(self, state: Array, error: Array) -> Array:
         """Computes the state (..., n) whose difference from ``state`` is ``error`` (..., e)."""
@@ -103,6 +102,7 @@ def wrap(angle: Array) -> Array:
     return np.mod(angle + np.pi, 2 * np.pi) - np.pi
 
 
+# scipy's Rotation does the same, several times slower for the small batches of a rollout's step.
 def quaternion_product(a: Array, b: Array) -> Array:
     """Computes the Hamilton product (..., 4) of quaternions (x, y, z, w)."""
     ax, ay, az, aw = a[..., 0], a[..., 1], a[..., 2], a[..., 3]
@@ -145,32 +145,6 @@ def _cross(a: Array, b: Array) -> Array:  # several times faster than np.cross
     return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=-1)
 
 
-def quaternion_from_euler(angles: Array) -> Array:
-    """Computes the quaternions (..., 4) of roll, pitch and yaw (..., 3) [rad], turned about z, then y, then x."""
-    (sx, sy, sz), (cx, cy, cz) = np.moveaxis(np.sin(angles / 2), -1, 0), np.moveaxis(np.cos(angles / 2), -1, 0)
-    x, y = sx * cy * cz - cx * sy * sz, cx * sy * cz + sx * cy * sz
-    return np.stack([x, y, cx * cy * sz - sx * sy * cz, cx * cy * cz + sx * sy * sz], axis=-1)
-
-
-class Kinematics(Protocol):
-    """How outputs move a state of a space: ``step`` and its inverse ``outputs`` [s].
-
-    ``output_groups`` are learned, or not, together; ``features`` are what their GPs see (..., d), and ``coast`` goes on
-    at constant velocities for a time [s].
-    """
-
-    @property
-    def space(self) -> StateSpace: ...
-    @property
-    def output_names(self) -> tuple[str, ...]: ...
-    @property
-    def output_groups(self) -> dict[str, tuple[int, ...]]: ...
-    def step(self, states: Array, outputs: Array, time_step: float) -> Array: ...
-    def outputs(self, states: Array, next_states: Array, time: float) -> Array: ...
-    def features(self, states: Array, inputs: Array, context: Array) -> Array: ...
-    def coast(self, states: Array, time: float) -> Array: ...
-
-
 @dataclass(frozen=True)
 class Increments:
     """The outputs are the rates of change of every state, of any system."""
@@ -184,6 +158,7 @@ class Increments:
 
     @property
     def output_groups(self) -> dict[str, tuple[int, ...]]:
+        """Outputs that are learned, or not, together."""
         groups = zip(self.space.groups, self.space.error_columns, strict=True)
         return {group.name: tuple(range(at.start, at.stop)) for group, at in groups}
 
@@ -194,7 +169,7 @@ class Increments:
         return self.space.difference(next_states, states) / time
 
     def features(self, states: Array, inputs: Array, context: Array) -> Array:
-        """The states, of angles sine and cosine, inputs and context."""
+        """What models see (..., d): the states, of angles sine and cosine, inputs and context."""
         parts: list[Array] = []
         for group, at in zip(self.space.groups, self.space.columns, strict=True):
             own = states[..., at]
@@ -226,7 +201,7 @@ class RigidBody:
         return {"force": (0, 1, 2), "torque": (3, 4, 5)}
 
     def step(self, states: Array, outputs: Array, time_step: float) -> Array:
-        p, q, v, w = states[..., 0:3], states[..., 3:7], states[..., 7:10], states[..., 10:13]
+        p, q, v, w = _parts(states)
         force, alpha = outputs[..., 0:3], outputs[..., 3:6]
         half_turn = rotation_quaternion((w + alpha * (time_step / 2)) * (time_step / 2))
         middle = quaternion_product(q, half_turn)
@@ -236,20 +211,27 @@ class RigidBody:
 
     def outputs(self, states: Array, next_states: Array, time: float) -> Array:
         """The mean force and angular acceleration of the changes of velocity and rate."""
-        q, after = states[..., 3:7], next_states[..., 3:7]
-        turn = rotation_vector(quaternion_product(quaternion_inverse(q), after))
+        (_, q, v, w), (_, q_after, v_after, w_after) = _parts(states), _parts(next_states)
+        turn = rotation_vector(quaternion_product(quaternion_inverse(q), q_after))
         middle = quaternion_product(q, rotation_quaternion(turn / 2))
-        a = (next_states[..., 7:10] - states[..., 7:10]) / time - GRAVITY
-        force = rotate(quaternion_inverse(middle), a)
-        return np.concatenate([force, (next_states[..., 10:13] - states[..., 10:13]) / time], axis=-1)
+        force = rotate(quaternion_inverse(middle), (v_after - v) / time - GRAVITY)
+        return np.concatenate([force, (w_after - w) / time], axis=-1)
 
     def features(self, states: Array, inputs: Array, context: Array) -> Array:
         """Velocity and direction of gravity in body axes, rate, inputs and context, without place and heading."""
-        to_body = quaternion_inverse(states[..., 3:7])
-        down = rotate(to_body, np.broadcast_to(-GRAVITY / 9.80665, states[..., 0:3].shape))
-        parts = [rotate(to_body, states[..., 7:10]), down[..., :2], states[..., 10:13]]
-        return np.concatenate([*parts, inputs, context], axis=-1)
+        _, q, v, w = _parts(states)
+        to_body = quaternion_inverse(q)
+        down = rotate(to_body, np.broadcast_to(-GRAVITY / 9.80665, v.shape))
+        return np.concatenate([rotate(to_body, v), down[..., :2], w, inputs, context], axis=-1)
 
     def coast(self, states: Array, time: float) -> Array:
-        p, q, v, w = states[..., 0:3], states[..., 3:7], states[..., 7:10], states[..., 10:13]
+        """Goes on at constant velocity and rate for a time [s]."""
+        p, q, v, w = _parts(states)
         return np.concatenate([p + v * time, quaternion_product(q, rotation_quaternion(w * time)), v, w], axis=-1)
+
+
+def _parts(states: Array) -> tuple[Array, Array, Array, Array]:
+    return states[..., 0:3], states[..., 3:7], states[..., 7:10], states[..., 10:13]
+
+
+Kinematics = Increments | RigidBody

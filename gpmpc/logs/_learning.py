@@ -6,7 +6,7 @@ rollouts as well.
 """
 
 import warnings
-from collections.abc import Callable, MutableMapping, Sequence
+from collections.abc import Callable, MutableMapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -18,20 +18,9 @@ from scipy.spatial import cKDTree
 from gpmpc.exceptions import DataError, check_number
 from gpmpc.gp import Trainer, standardize
 from gpmpc.logs._fitting import NominalFit, OutputNoise, fit_least_squares, fit_noise, fit_nominal
-from gpmpc.logs._kinematics import Array, Increments, Kinematics, RigidBody
+from gpmpc.logs._kinematics import Array, Increments, RigidBody
 from gpmpc.logs._log import Log
-from gpmpc.logs._rollouts import (
-    PAST,
-    STEPS,
-    AffineNominal,
-    LogModel,
-    MultirotorNominal,
-    Nominal,
-    OutputGP,
-    Still,
-    choose_stride,
-    finite_errors,
-)
+from gpmpc.logs._rollouts import PAST, STEPS, AffineNominal, LogModel, MultirotorNominal, OutputGP, finite_errors
 
 AVERAGES = (1, 5, 10)  # rows over which the targets of a GP are averaged
 LATE = 3  # rows by which motors may act late
@@ -40,9 +29,7 @@ JUDGED = (10, 50)  # steps whose errors decide
 GAIN = 0.01  # least relative improvement for which a model may grow
 LOSS = 0.05  # most relative loss in any group at any step
 WINDOWS = 200  # of a fold
-Progress = Callable[[str], None]
 Grow = Callable[[Any], LogModel | None]
-Memory = MutableMapping[str, Any]  # from a stage's name to plain data; for example of a file
 
 
 @dataclass(frozen=True)
@@ -63,7 +50,6 @@ class Learned:
     fit: NominalFit  #: of the nominal part, to all runs
     candidates: tuple[Candidate, ...]  #: every structure that was tried, in order
     ranges: Array  #: smallest and largest value (2, n + m) of the states and inputs in the log
-    rows: int  #: of the log
     runs: tuple[str, ...]  #: names of the runs
     state_names: tuple[str, ...]  #: as the file's columns are called (n,)
     input_names: tuple[str, ...]  #: likewise (m,)
@@ -71,28 +57,13 @@ class Learned:
     time_step: float  #: [s]
 
 
-class _Folds:
-    """Splits of a log by run, with held-out windows."""
-
-    def __init__(self, parts: list[tuple[Log, Log]], steps: int):
-        self.parts, self._at, past = parts, [min(step, steps) for step in JUDGED], PAST + LATE
-        logs = [held_out for _, held_out in parts]
-        self._windows = [log.windows(steps, past, choose_stride(log, steps + past, WINDOWS)) for log in logs]
-
-    def judge(self, name: str, models: Sequence[LogModel]) -> Candidate:
-        """Mean error of each group at the steps that decide."""
-        pairs = zip(self._windows, models, strict=True)
-        errors = np.concatenate([finite_errors(cut, model, self._at) for cut, model in pairs])
-        return Candidate(name, self._windows[0].space.distances(errors).mean(axis=0))
-
-
 def learn(
     log: Log,
     points: int = 300,
     steps: int = STEPS,
     seed: int = 0,
-    progress: Progress = lambda text: None,
-    memory: Memory | None = None,
+    progress: Callable[[str], None] = lambda text: None,
+    memory: MutableMapping[str, Any] | None = None,
     for_control: bool = False,
 ) -> Learned:
     """Learns a model of the outputs behind a log.
@@ -103,7 +74,8 @@ def learn(
         steps: Of the rollouts.
         seed: Of every random number.
         progress: Called with a line at each stage.
-        memory: Holds the outcome of stages that an earlier call with equal arguments went through.
+        memory: Holds what the stages came to, as plain data: those of an earlier call with equal arguments are not
+            computed again.
         for_control: Leaves out what predicts such runs and no controller can plan with: the feedback of the controller
             that flew, and inputs that act late.
 
@@ -113,51 +85,58 @@ def learn(
     """
     check_number("points", points, least=10, whole=True)
     check_number("steps", steps, least=2, whole=True)
-    kinematics: Kinematics = RigidBody(log.space) if log.mapping.model == "rigid_body" else Increments(log.space)
-    folds = _Folds(_split(log, 2), steps)
+    folds = _split(log)
+    cuts = [held_out.windows(steps, PAST + LATE, most=WINDOWS) for _, held_out in folds]
     memory = {} if memory is None else memory
-    name, structure, options = _structures(kinematics, log)
-    if for_control:
-        options = {words: grow for words, grow in options.items() if words not in (FEEDBACK, LATE_INPUTS)}
     candidates: list[Candidate] = []
-    models: list[LogModel] = []
-    best = 0
-    for words, grow in [("", lambda model: model), *options.items()]:
+    best, models = 0, []  # the number and the models, one a fold, of the best candidate
+
+    def errors(trained: list[LogModel]) -> Array:
+        at = [min(step, steps) for step in JUDGED]
+        found = np.concatenate([finite_errors(cut, model, at) for cut, model in zip(cuts, trained, strict=True)])
+        return log.space.distances(found).mean(axis=0)
+
+    def is_best(name: str, errors: Array) -> bool:
+        nonlocal best
+        candidates.append(Candidate(name, errors))
+        better = len(candidates) == 1 or _is_better(candidates[-1], candidates[best])
+        best = len(candidates) - 1 if better else best
+        return better
+
+    name, structure, options = _structures(log)
+    for words, grow in options.items():
         trial = grow(structure)
-        if trial is None:
+        if trial is None or (for_control and words in (FEEDBACK, LATE_INPUTS)):
             continue
         trial_name = f"{name}, {words}" if words else name
         progress(f"{trial_name}: fitted on rollouts of {steps} steps")
         if trial_name not in memory:
-            starts = models or [structure] * len(folds.parts)
-            pairs = zip(starts, folds.parts, strict=True)
-            memory[trial_name] = [_fit(trial, m, train, steps).model.theta.tolist() for m, (train, _) in pairs]
-        fitted = [_with_parameters(trial, theta) for theta in memory[trial_name]]
-        candidates.append(folds.judge(trial_name, fitted))
-        if not models or _is_better(candidates[-1], candidates[best]):
-            best, models, name, structure = len(candidates) - 1, fitted, trial_name, trial
+            starts = zip(models or [structure] * len(folds), folds, strict=True)
+            memory[trial_name] = [_fit(trial, model, train, steps).model.theta.tolist() for model, (train, _) in starts]
+        fitted = [replace(trial, theta=np.array(theta, dtype=float)) for theta in memory[trial_name]]
+        if is_best(trial_name, errors(fitted)):
+            models, name, structure = fitted, trial_name, trial
     choice: dict[str, int] = {}
-    for group, outputs in kinematics.output_groups.items():
-        base = [(model, train) for model, (train, _) in zip(models, folds.parts, strict=True)]
+    groups = structure.kinematics.output_groups
+    for group, outputs in groups.items():
+        base = [(model, train) for model, (train, _) in zip(models, folds, strict=True)]
         for average in AVERAGES:
             averages = {**choice, group: average}.items()
             words = f"{name}, GP on {' and '.join(f'{of} (averaged over {rows})' for of, rows in averages)}"
             progress(words)
-            trained: list[LogModel] = []
+            trained, learning = [], (outputs, average, points, seed)
             if words not in memory:
-                trained = _with_gps(base, outputs, average, points, seed)
-                memory[words] = folds.judge(words, trained).errors.tolist()
-            candidates.append(Candidate(words, np.array(memory[words])))
-            if _is_better(candidates[-1], candidates[best]):
-                models = trained or _with_gps(base, outputs, average, points, seed)
-                best, choice[group] = len(candidates) - 1, average
+                trained = [_with_gp(model, train, *learning) for model, train in base]
+                memory[words] = errors(trained).tolist()
+            if is_best(words, np.array(memory[words])):
+                models = trained or [_with_gp(model, train, *learning) for model, train in base]
+                choice[group] = average
     progress(f"chosen: {candidates[best].name}")
     candidates[best] = replace(candidates[best], chosen=True)
     progress("noise from the errors of held-out rollouts")
-    noise = fit_noise(models, [held_out for _, held_out in folds.parts], steps)
+    noise = fit_noise(models, [held_out for _, held_out in folds], steps)
     progress("the chosen structure, fitted to all runs")
     fit = _fit(structure, models[0], log, steps)
-    groups = kinematics.output_groups
     gps = tuple(_train(fit.model, log, groups[group], average, points, seed) for group, average in choice.items())
     values = np.concatenate([np.hstack([run.states, run.inputs]) for run in log])
     return Learned(
@@ -166,7 +145,6 @@ def learn(
         fit=fit,
         candidates=tuple(candidates),
         ranges=np.stack([values.min(axis=0), values.max(axis=0)]),
-        rows=len(log),
         runs=tuple(run.name for run in log),
         state_names=log.mapping.column_names("states"),
         input_names=log.mapping.column_names("inputs"),
@@ -181,21 +159,19 @@ def _is_better(candidate: Candidate, incumbent: Candidate) -> bool:
     return bool(ratio.mean() < -GAIN and ratio.max() < LOSS)
 
 
-def _structures(kinematics: Kinematics, log: Log) -> tuple[str, LogModel, dict[str, Grow]]:
-    """The simplest model, and what may be added to it one after the other; None where an addition makes no sense."""
-    o = len(kinematics.output_names)
-
-    def simplest(nominal: Nominal) -> LogModel:
-        return LogModel(kinematics, nominal, np.empty(0), (0,) * o)
-
-    options: dict[str, Grow]
+def _structures(log: Log) -> tuple[str, LogModel, dict[str, Grow]]:
+    """A name, the simplest model, and what is added to it one after the other; None where an addition has no sense."""
     if log.mapping.model != "rigid_body":
-        options = {
-            "least squares": lambda model: replace(model, nominal=AffineNominal(kinematics, o)),
+        kinematics, o = Increments(log.space), log.space.error_dim
+        options: dict[str, Grow] = {
+            "": lambda model: model,
+            "least squares": lambda model: replace(model, nominal=AffineNominal(kinematics)),
             "disturbance": lambda model: replace(model, history=(PAST,) * o),
         }
-        return "increments", simplest(Still(o)), options
+        zero = AffineNominal(kinematics, fitted=False)
+        return "increments", LogModel(kinematics, zero, np.empty(0), (0,) * o), options
     options = {
+        "": lambda model: model,
         "force disturbance": lambda model: replace(model, history=(PAST,) * 3 + (0,) * 3),
         "motor torque": lambda model: replace(model, nominal=replace(model.nominal, torque=True)),
         FEEDBACK: lambda model: replace(model, nominal=replace(model.nominal, feedback=True)),
@@ -204,43 +180,34 @@ def _structures(kinematics: Kinematics, log: Log) -> tuple[str, LogModel, dict[s
             replace(model, history=model.history[:3] + (PAST,) * 3) if model.nominal.torque else None
         ),
     }
-    volts = bool(log.context_names) and log.mapping.of("context")[0].unit in ("V", "mV")
+    volts = [signal.unit for signal in log.mapping.of("context")][:1] in (["V"], ["mV"])
     voltage = float(np.median(np.concatenate([run.context[:, 0] for run in log]))) if volts else 0.0
     thrusts = all(signal.unit == "N" for signal in log.mapping.of("inputs"))
-    return "rigid body", simplest(MultirotorNominal(len(log.input_names), voltage=voltage, thrusts=thrusts)), options
+    nominal = MultirotorNominal(len(log.input_names), voltage=voltage, thrusts=thrusts)
+    return "rigid body", LogModel(RigidBody(log.space), nominal, np.empty(0), (0,) * 6), options
 
 
-def _split(log: Log, count: int) -> list[tuple[Log, Log]]:
-    """Folds by run; of a single run by time."""
+def _split(log: Log) -> list[tuple[Log, Log]]:
+    """Two folds by run; of a single run by time."""
     if len(log.runs) == 1:
         halves = log.split_by_time(0.5)
         log = replace(log, runs=tuple(half.runs[0] for half in halves))
     names = [run.name for run in sorted(log.runs, key=len)]
-    return [log.split(names[i::count]) for i in range(count)]
+    return [log.split(names[i::2]) for i in range(2)]
 
 
 def _fit(structure: LogModel, simpler: LogModel, log: Log, steps: int) -> NominalFit:
     """Fits a structure's nominal part, from the parameters that a simpler model has in common with it."""
-    if not isinstance(structure.nominal, AffineNominal):
-        known = dict(zip(simpler.nominal.parameter_names, simpler.theta, strict=False))
-        pairs = zip(structure.nominal.parameter_names, structure.nominal.start, strict=True)
-        return fit_nominal(structure, np.array([known.get(name, start) for name, start in pairs]), log, steps)
-    affine = fit_least_squares(structure.kinematics, log)  # linear in its many parameters
-    unknown = np.full(len(affine.theta), np.nan)
-    return NominalFit(replace(affine, history=structure.history), unknown, np.nan, np.nan, 1)
-
-
-def _with_parameters(structure: LogModel, theta: Sequence[float]) -> LogModel:
     nominal = structure.nominal
-    if isinstance(nominal, AffineNominal):
-        structure = replace(structure, nominal=replace(nominal, feature_dim=len(theta) // nominal.output_dim - 1))
-    return replace(structure, theta=np.array(theta, dtype=float))
+    if isinstance(nominal, AffineNominal) and nominal.fitted:  # linear in its many parameters
+        return NominalFit(replace(fit_least_squares(nominal.kinematics, log), history=structure.history), np.empty(0))
+    known = dict(zip(simpler.nominal.parameter_names, simpler.theta, strict=False))
+    pairs = zip(nominal.parameter_names, nominal.start, strict=True)
+    return fit_nominal(structure, np.array([known.get(name, start) for name, start in pairs]), log, steps)
 
 
-def _with_gps(
-    base: Sequence[tuple[LogModel, Log]], outputs: tuple[int, ...], average: int, points: int, seed: int
-) -> list[LogModel]:
-    return [replace(m, gps=(*m.gps, _train(m, log, outputs, average, points, seed))) for m, log in base]
+def _with_gp(model: LogModel, log: Log, *learning: Any) -> LogModel:
+    return replace(model, gps=(*model.gps, _train(model, log, *learning)))
 
 
 def _train(model: LogModel, log: Log, outputs: tuple[int, ...], average: int, points: int, seed: int) -> OutputGP:

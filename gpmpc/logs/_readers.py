@@ -45,45 +45,34 @@ def read_streams(path: str | Path, topics: Iterable[str] = (), partial: bool = F
 
 
 def _read_csv(path: Path, topics: tuple[str, ...], partial: bool) -> Streams:
-    import gzip
+    options: dict[str, Any] = {"encoding": "utf-8-sig", "skipinitialspace": True}
 
-    opened = gzip.open if path.suffix.lower() == ".gz" else open
-    with opened(path, "rt", encoding="utf-8-sig") as file:
-        header = file.readline()
-    delimiter = max(",;\t", key=header.count)
-    names = [name.strip().strip('"') for name in header.strip().split(delimiter)]
-    if pd.to_numeric(pd.Series(names), errors="coerce").notna().any():
-        raise DataError(f"{path}: the first line holds numbers; expected a header with the names of the columns")
-    twice = [name for name in names if names.count(name) > 1]
-    if twice:
-        raise DataError(f"{path}: column {twice[0]!r} stands there twice")
+    def first_line(delimiter: str) -> pd.Series:
+        return pd.read_csv(path, sep=delimiter, header=None, nrows=1, dtype=str, **options).iloc[0]
+
+    delimiter = max(",;\t", key=lambda candidate: len(first_line(candidate)))
+    names = first_line(delimiter).str.strip()
+    if pd.to_numeric(names, errors="coerce").notna().any() or names.duplicated().any():
+        raise DataError(f"{path}: the first line must name every column differently; got {', '.join(map(str, names))}")
     with warnings.catch_warnings():  # of rows that are longer than the header
         warnings.simplefilter("error", pd.errors.ParserWarning)
-        table = pd.read_csv(path, sep=delimiter, encoding="utf-8-sig", skipinitialspace=True, index_col=False)
+        table = pd.read_csv(path, sep=delimiter, index_col=False, **options)
     return {"": table.rename(columns=str.strip)}
 
 
 def _read_npz(path: Path, topics: tuple[str, ...], partial: bool) -> Streams:
     with np.load(path, allow_pickle=False) as archive:
         arrays = {name: archive[name] for name in archive.files if archive[name].ndim in (1, 2)}
-    lengths = {name: len(values) for name, values in arrays.items()}
-    if len(set(lengths.values())) > 1:
-        raise DataError(f"{path}: arrays must have the same number of rows; got {lengths}")
-    tables = [
-        pd.DataFrame(a, columns=[name] if a.ndim == 1 else [f"{name}[{i}]" for i in range(a.shape[1])])
-        for name, a in arrays.items()
-    ]
-    return {"": pd.concat(tables, axis=1) if tables else pd.DataFrame()}
+    columns: dict[str, np.ndarray] = {}  # pandas names arrays of different lengths
+    for name, values in arrays.items():
+        columns |= {name: values} if values.ndim == 1 else {f"{name}[{i}]": v for i, v in enumerate(values.T)}
+    return {"": pd.DataFrame(columns)}
 
 
 def _read_mcap(path: Path, topics: tuple[str, ...], partial: bool) -> Streams:
     with path.open("rb") as file:
-        head = file.read(512)
-    if head[:5] != b"\x89MCAP":
-        raise DataError(f"{path}: not an MCAP file")
-    length = int.from_bytes(head[17:21], "little")  # of the profile, the first field of the first record
-    if head[21 : 21 + length] == b"ros2":
-        return _read_ros2(path, topics, partial)
+        if file.read(25)[17:] == b"\4\0\0\0ros2":  # the profile, with its length, is the first field of an MCAP file
+            return _read_ros2(path, topics, partial)
     from gpmpc.recording import read_run
 
     run = read_run(path)

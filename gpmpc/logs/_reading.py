@@ -1,6 +1,11 @@
-"""Makes runs of tables: applies a mapping, resamples, and finds gaps, repeated samples and parts at rest."""
+"""Makes runs of tables: applies a mapping, resamples, and leaves out what is no measurement of a moving system.
 
-from collections.abc import Mapping, Sequence
+What is wrong with a file is found, counted and named. A velocity in other units than stated, a rate in degrees or an
+attitude in another order makes every model wrong, and each is visible from the log alone: the signal is compared with
+the other's finite differences by least squares.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -8,19 +13,19 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 from scipy.ndimage import binary_dilation, maximum_filter1d, minimum_filter1d
+from scipy.spatial.transform import Rotation
 
 from gpmpc.exceptions import DataError
 from gpmpc.logs._kinematics import (
     Array,
-    quaternion_from_euler,
     quaternion_inverse,
     quaternion_product,
     rotate,
     rotation_quaternion,
     rotation_vector,
 )
-from gpmpc.logs._log import Findings, Log, LogRun, check_plausible
-from gpmpc.logs._mapping import ROLES, TIME_UNITS, UNITS, LogMapping, Signal
+from gpmpc.logs._log import Finding, Log, LogRun
+from gpmpc.logs._mapping import ROLES, TIME_UNITS, LogMapping, Signal
 from gpmpc.logs._readers import STAMP, Streams, read_streams
 
 REST_TIME = 0.5  # [s] for which nothing moves at rest
@@ -28,6 +33,12 @@ REST_SHARE = 0.1  # of a state's usual spread that counts as no movement
 MOST_HELD = 0.5  # of the rows; beyond, a signal has another rate than its table
 MOST_OUT_OF_ORDER = 0.05  # of the rows; beyond, the file does not hold one run in the order of time
 RESOLUTION = 1e-6  # [s] of stamps: float64 seconds since 1970 resolve a quarter of it
+SPAN = 4  # rows on each side of a finite difference: above the noise of one row
+SLOPES = (0.5, 2.0)  # of a signal over the derivative that it should be
+FIT = 0.7  # correlation from which a slope says something
+MOST_ROWS = 20_000
+_RIGID_BODY = [("vector", 3), ("quaternion", 3), ("vector", 3), ("vector", 3)]
+_Note = Callable[[str, Any, str], None]  # takes the kind, the count and the text of a finding
 
 
 class _Table(NamedTuple):
@@ -38,6 +49,7 @@ class _Table(NamedTuple):
     values: dict[str, Array]  # by role, (K, c)
     outside: np.ndarray  # (K,) rows that the mapping leaves out
     breaks: np.ndarray  # (K,) rows before which time ran backwards
+    note: _Note
 
 
 def read_log(
@@ -59,70 +71,65 @@ def read_log(
     if not isinstance(mapping, LogMapping):
         mapping = LogMapping.load(mapping) if isinstance(mapping, str | Path) else LogMapping.from_dict(mapping)
     files = [files] if isinstance(files, str | Path) else list(files)
-    if not files:
-        raise DataError("no log file was given")
-    findings, tables = Findings(), []
+    findings: list[Finding] = []
+    tables: list[_Table] = []
     for file in map(Path, files):
         streams = read_streams(file, {signal.topic for signal in mapping.signals}, partial)
-        name = file.name.removesuffix(".gz").rsplit(".", 1)[0]
-        for run, parts in _split_runs(file, name, streams, mapping):
-            tables.append(_tabulate(file, run, parts, mapping, findings))
-    names = [table.name for table in tables]
-    if len(set(names)) < len(names):
-        twice = next(name for name in names if names.count(name) > 1)
-        raise DataError(f"run {twice!r} comes from two files: give the files different names")
+        runs = [(file.name.removesuffix(".gz").rsplit(".", 1)[0], streams)]
+        if mapping.run:
+            table = streams.get("", pd.DataFrame())
+            _check_column(str(file), table, mapping.run)
+            runs = [(f"{runs[0][0]}:{run}", {"": part}) for run, part in table.groupby(mapping.run, sort=False)]
+        for name, parts in runs:
+            if name in {table.name for table in tables}:
+                raise DataError(f"run {name!r} comes from two files: give the files different names")
+
+            def note(kind: str, count: Any, text: str, name: str = name) -> None:
+                if count:
+                    findings.append(Finding(kind, name, int(count), text))
+
+            tables.append(_tabulate(f"{file}, run {name}" if mapping.run else str(file), name, parts, mapping, note))
+    if not tables:
+        raise DataError("no log file was given")
     step = 1 / mapping.rate if mapping.rate else float(np.median(np.concatenate([np.diff(t.time) for t in tables])))
     spread = _spread(tables)
-    runs = [_make_run(table, step, spread, mapping, findings) for table in tables]
-    usable = tuple(run for run in runs if run is not None)
+    usable = [run for table in tables if (run := _make_run(table, step, spread, mapping)) is not None]
     if not usable:
         said = "; ".join(f"{f.run}: {f.text}" for f in findings[-3:])
         raise DataError(f"{files[0]}{' and others' * (len(files) > 1)}: no row can be used ({said})")
-    check_plausible(usable, step, mapping)
+    inputs = [run.inputs for run in usable]
+    if inputs[0].shape[1] and all(np.ptp(u, axis=0).max() == 0 for u in inputs):
+        raise DataError("no input changes in any row: the system is at rest, and nothing can be learned of it")
     if mapping.model == "rigid_body":
-        usable = tuple(_in_one_frame(run, mapping) for run in usable)
-    return Log(mapping, step, usable, tuple(findings))
+        usable = _rigid_bodies(usable, step, mapping)
+    return Log(mapping, step, tuple(usable), tuple(findings))
 
 
-def _in_one_frame(run: LogRun, mapping: LogMapping) -> LogRun:
-    """Turns a rigid body's velocity to world axes and its rate to body axes."""
-    _, _, velocity, rate = mapping.of("states")
-    states, q = run.states.copy(), run.states[:, 3:7]
-    if velocity.frame == "body":
-        states[:, 7:10] = rotate(q, states[:, 7:10])
-    if rate.frame == "world":
-        states[:, 10:13] = rotate(quaternion_inverse(q), states[:, 10:13])
-    return replace(run, states=states)
-
-
-def _split_runs(file: Path, name: str, streams: Streams, mapping: LogMapping) -> list[tuple[str, Streams]]:
-    if not mapping.run:
-        return [(name, streams)]
-    table = streams.get("")
-    if table is None or mapping.run not in table:
-        raise DataError(f"{file}: column {mapping.run!r} of the runs is missing")
-    return [(f"{name}:{run}", {"": part}) for run, part in table.groupby(mapping.run, sort=False)]
-
-
-def _tabulate(file: Path, name: str, streams: Streams, mapping: LogMapping, findings: Findings) -> _Table:
+def _tabulate(where: str, name: str, streams: Streams, mapping: LogMapping, note: _Note) -> _Table:
     """Puts the signals of a run on one grid of times, in the units and conventions of ``gpmpc.logs``."""
-    stamps, tables = {}, {}
+    stamps: dict[str, Stamps] = {}
+    samples: dict[tuple[str, str], Array] = {}
+    outside: list[tuple[str, Array]] = []
     for topic in dict.fromkeys(signal.topic for signal in mapping.signals):
-        table = streams[topic]
-        label = f"{file}{f', {topic}' if topic else ''}{f', run {name}' if mapping.run else ''}"
-        stamps[topic] = found = ordered_stamps(_time(label, table, mapping), label)
-        tables[topic] = table.iloc[found.rows]
-        for kind, count in (("repeated stamp", found.repeated), ("stamp runs backwards", found.backwards)):
-            findings.note(kind, name, count, f"{count} rows{f' of {topic}' if topic else ''}: left out")
-    samples = {s.role + s.name: _values(file, tables[s.topic], s, name, findings) for s in mapping.signals}
-    outside = {topic: _outside(file, table, mapping) for topic, table in tables.items()}
+        label, of_topic = (f"{where}, {topic}", f" of {topic}") if topic else (where, "")
+        stamps[topic] = found = ordered_stamps(_time(label, streams[topic], mapping), label)
+        note("repeated stamp", found.repeated, f"{found.repeated} rows{of_topic}: left out")
+        note("stamp runs backwards", found.backwards, f"{found.backwards} rows{of_topic}: left out")
+        table = streams[topic].iloc[found.rows]
+        for signal in mapping.signals:
+            if signal.topic == topic:
+                samples[signal.role, signal.name] = _values(label, table, signal, note)
+        for column, (low, high) in mapping.keep.items():
+            if column in table or topic == "":
+                kept = _numbers(label, table, column)
+                outside.append((topic, np.where((kept >= low) & (kept <= high), 0.0, 1.0)))
     if mapping.rate is None:
         ((grid, breaks),) = ((found.time, found.after_reversal) for found in stamps.values())
     else:
         begin = max(found.time[0] for found in stamps.values())
         end = min(found.time[-1] for found in stamps.values())
         if not end > begin:
-            raise DataError(f"{file}: the topics {', '.join(stamps)} have no time in common")
+            raise DataError(f"{where}: the topics {', '.join(stamps)} have no time in common")
         grid = begin + np.arange(int(np.floor((end - begin) * mapping.rate * (1 + 1e-12))) + 1) / mapping.rate
         breaks = np.zeros(len(grid), dtype=bool)
 
@@ -135,30 +142,28 @@ def _tabulate(file: Path, name: str, streams: Streams, mapping: LogMapping, find
 
     values: dict[str, Array] = {}
     for role in ROLES:
-        parts = [on_grid(s.topic, samples[s.role + s.name], s.rule, mapping.max_gap) for s in mapping.of(role)]
+        parts = [on_grid(s.topic, samples[role, s.name], s.rule, mapping.max_gap) for s in mapping.of(role)]
         values[role] = np.concatenate([np.empty((len(grid), 0)), *parts], axis=1)
     left_out = np.zeros(len(grid), dtype=bool)
-    for topic, rows in outside.items():
-        left_out |= on_grid(topic, rows[:, None].astype(float), "hold", np.inf)[:, 0] > 0
-    return _Table(name, grid, values, left_out, breaks)
+    for topic, rows in outside:
+        left_out |= on_grid(topic, rows[:, None], "hold", np.inf)[:, 0] > 0
+    return _Table(name, grid, values, left_out, breaks, note)
 
 
 def _time(label: str, table: pd.DataFrame, mapping: LogMapping) -> Array:
-    column = mapping.time or STAMP
+    if not mapping.time and STAMP not in table and mapping.rate:  # rows without stamps, at a rate that is declared
+        return np.arange(len(table)) / mapping.rate
+    return _numbers(label, table, mapping.time or STAMP) * (TIME_UNITS[mapping.time_unit] if mapping.time else 1.0)
+
+
+def _check_column(label: str, table: pd.DataFrame, column: str) -> None:
     if column not in table:
-        if not mapping.time and mapping.rate:  # rows without stamps, at a rate that is declared
-            return np.arange(len(table)) / mapping.rate
-        raise DataError(f"{label}: column {column!r} of the time is missing; there are {_some(table)}")
-    scale = TIME_UNITS[mapping.time_unit] if mapping.time else 1.0
-    return _numbers(label, table, column) * scale
-
-
-def _some(table: pd.DataFrame) -> str:
-    names = [str(name) for name in table.columns]
-    return ", ".join(names[:12]) + (f" and {len(names) - 12} others" if len(names) > 12 else "")
+        known = ", ".join(map(str, table.columns[:12]))
+        raise DataError(f"{label}: column {column!r} is missing; it has {known}{', ...' * (len(table.columns) > 12)}")
 
 
 def _numbers(label: str, table: pd.DataFrame, column: str) -> Array:
+    _check_column(label, table, column)
     values = table[column]
     numbers = pd.to_numeric(values, errors="coerce").to_numpy(dtype=float)
     wrong = np.isnan(numbers) & ~values.isna().to_numpy()
@@ -168,26 +173,25 @@ def _numbers(label: str, table: pd.DataFrame, column: str) -> Array:
     return numbers
 
 
-def _values(file: Path, table: pd.DataFrame, signal: Signal, run: str, findings: Findings) -> Array:
+def _values(label: str, table: pd.DataFrame, signal: Signal, note: _Note) -> Array:
     """A signal (K, c) in the units and conventions of ``gpmpc.logs``; NaN where it is missing."""
-    missing = [column for column in signal.columns if column not in table]
-    if missing:
-        where = f" of {signal.topic}" if signal.topic else ""
-        raise DataError(f"{file}: column {missing[0]!r}{where} is missing; there are {_some(table)}")
-    values = np.column_stack([_numbers(str(file), table, column) for column in signal.columns]) * signal.scale
+    values = np.column_stack([_numbers(label, table, column) for column in signal.columns]) * signal.factor
     values[~np.isfinite(values)] = np.nan
-    absent = np.isnan(values).any(axis=1).sum()
-    findings.note("missing value", run, absent, f"{absent} rows of {signal.name} without a value: left out")
+    absent = np.isnan(values).any(axis=1)
+    note("missing value", absent.sum(), f"{absent.sum()} rows of {signal.name} without a value: left out")
     if signal.kind == "quaternion":
-        return _quaternions(file, values, signal, run, findings)
-    values *= UNITS.get(signal.unit, ("", 1.0))[1]
+        return _quaternions(label, values, signal, note)
     largest = float(np.nanmax(np.abs(values), initial=0.0))
     if signal.kind in ("angle", "euler") and signal.unit == "rad" and largest > 4 * np.pi:
-        raise DataError(f"{file}: {signal.name} reaches {largest:.4g} rad: are these degrees? (unit: deg)")
-    return quaternion_from_euler(values) if signal.kind == "euler" else values
+        raise DataError(f"{label}: {signal.name} reaches {largest:.4g} rad: are these degrees? (unit: deg)")
+    if signal.kind == "euler":
+        turned = np.full((len(values), 4), np.nan)
+        turned[~absent] = Rotation.from_euler("ZYX", values[~absent, ::-1]).as_quat()
+        return turned
+    return values
 
 
-def _quaternions(file: Path, values: Array, signal: Signal, run: str, findings: Findings) -> Array:
+def _quaternions(label: str, values: Array, signal: Signal, note: _Note) -> Array:
     """Unit quaternions (x, y, z, w) whose sign does not flip."""
     if signal.order == "wxyz":
         values = values[:, [1, 2, 3, 0]]
@@ -195,24 +199,13 @@ def _quaternions(file: Path, values: Array, signal: Signal, run: str, findings: 
     off = np.abs(norms - 1) > 0.05
     if off.any():
         row = int(np.argmax(off))
-        raise DataError(f"{file}: {signal.name} in row {row + 1} has norm {norms[row]:.4g}; expected unit quaternions")
+        raise DataError(f"{label}: {signal.name} in row {row + 1} has norm {norms[row]:.4g}; expected unit quaternions")
     values = values / norms[:, None]
     present = np.flatnonzero(np.isfinite(norms))
     flips = np.einsum("ij,ij->i", values[present[1:]], values[present[:-1]]) < 0
-    findings.note("quaternion flips its sign", run, flips.sum(), f"{flips.sum()} times: turned back")
+    note("quaternion flips its sign", flips.sum(), f"{flips.sum()} times: turned back")
     values[present[1:]] *= np.where(np.cumsum(flips) % 2, -1.0, 1.0)[:, None]
     return values
-
-
-def _outside(file: Path, table: pd.DataFrame, mapping: LogMapping) -> np.ndarray:
-    outside = np.zeros(len(table), dtype=bool)
-    for column, (low, high) in mapping.keep.items():
-        if column in table:
-            values = _numbers(str(file), table, column)
-            outside |= ~((values >= low) & (values <= high))
-        elif not any(signal.topic for signal in mapping.signals):
-            raise DataError(f"{file}: column {column!r} of keep is missing; there are {_some(table)}")
-    return outside
 
 
 def _spread(tables: Sequence[_Table]) -> Array:
@@ -225,14 +218,14 @@ def _spread(tables: Sequence[_Table]) -> Array:
     return (high - low) / 2
 
 
-def _make_run(table: _Table, step: float, spread: Array, mapping: LogMapping, findings: Findings) -> LogRun | None:
+def _make_run(table: _Table, step: float, spread: Array, mapping: LogMapping) -> LogRun | None:
     """Leaves out what cannot be used, and marks where a new piece begins; None where nothing is left."""
     states, inputs, context = (table.values[role] for role in ROLES)
-    usable = np.ones(len(table.time), dtype=bool)
+    usable, note = np.ones(len(table.time), dtype=bool), table.note
 
     def leave_out(rows: np.ndarray, kind: str, text: str) -> None:
         count = (rows & usable).sum()
-        findings.note(kind, table.name, count, f"{count} of {len(rows)} rows {text}: left out")
+        note(kind, count, f"{count} of {len(rows)} rows {text}: left out")
         usable[rows] = False
 
     leave_out(table.outside, "outside of keep", "outside the ranges of keep")
@@ -240,29 +233,27 @@ def _make_run(table: _Table, step: float, spread: Array, mapping: LogMapping, fi
         leave_out(_at_rest(states, inputs, spread, step), "at rest", "where nothing moves")
     absent = np.asarray(np.isnan(np.concatenate([states, inputs, context], axis=1)).any(axis=1))
     leave_out(absent, "missing value", "in a gap or without a value")
-    if mapping.held == "drop":
-        for signal, at in zip(mapping.of("states"), mapping.space.columns, strict=True):
-            if len(signal.columns) < 2:  # a single one may repeat by its resolution
-                continue
-            same = np.r_[False, (states[1:, at] == states[:-1, at]).all(axis=1)] & usable
-            if same.sum() > MOST_HELD * max(usable.sum(), 1):
-                raise DataError(
-                    f"run {table.name}: {signal.name} changes in {(usable & ~same).sum()} of {usable.sum()} rows only: "
-                    "its own rate is lower; state a lower rate, or held: use"
-                )
-            leave_out(same, "held value", f"where {signal.name} repeats the row before")
+    for signal, at in zip(mapping.of("states"), mapping.space.columns, strict=True):
+        if mapping.held == "use" or len(signal.columns) < 2:  # a single one may repeat by its resolution
+            continue
+        same = np.r_[False, (states[1:, at] == states[:-1, at]).all(axis=1)] & usable
+        if same.sum() > MOST_HELD * max(usable.sum(), 1):
+            raise DataError(
+                f"run {table.name}: {signal.name} changes in {(usable & ~same).sum()} of {usable.sum()} rows only: "
+                "its own rate is lower; state a lower rate, or held: use"
+            )
+        leave_out(same, "held value", f"where {signal.name} repeats the row before")
     rows = np.flatnonzero(usable)
     if len(rows) < 2:
-        findings.note("nothing left", table.name, len(table.time), "no row can be used: the run is left out")
+        note("nothing left", len(table.time), "no row can be used: the run is left out")
         return None
     times = np.diff(table.time[rows])
     gaps = times > (mapping.max_gap if mapping.max_gap and not mapping.rate else 1.5 * step)
     inner = gaps & (np.diff(rows) == 1)
-    longest = float(times[inner].max(initial=0))
-    findings.note("gap", table.name, inner.sum(), f"{inner.sum()} gaps, up to {longest:.3g} s: boundaries")
+    note("gap", inner.sum(), f"{inner.sum()} gaps, up to {times[inner].max(initial=0):.3g} s: boundaries")
     early = times < 0.5 * step
     text = f"{early.sum()} rows less than half a time step after the row before: boundaries (state a rate)"
-    findings.note("jitter", table.name, early.sum(), text)
+    note("jitter", early.sum(), text)
     breaks = gaps | (np.diff(rows) > 1) | table.breaks[rows[1:]] | early
     begins = (0, *(np.flatnonzero(breaks) + 1).tolist())
     return LogRun(table.name, table.time[rows], states[rows], inputs[rows], context[rows], begins)
@@ -276,8 +267,61 @@ def _at_rest(states: Array, inputs: Array, spread: Array, step: float) -> np.nda
     limit = np.concatenate([REST_SHARE * spread, np.zeros(inputs.shape[1])])
     both = np.nan_to_num(np.concatenate([states, inputs], axis=1))
     moved = maximum_filter1d(both, size, axis=0) - minimum_filter1d(both, size, axis=0)
-    still = (moved <= limit).all(axis=1)
-    return binary_dilation(still, np.ones(2 * (size // 2) + 1))
+    return binary_dilation((moved <= limit).all(axis=1), np.ones(2 * (size // 2) + 1))
+
+
+def _rigid_bodies(runs: Sequence[LogRun], step: float, mapping: LogMapping) -> list[LogRun]:
+    """Turns velocities to world axes and rates to body axes, and checks that they are the derivatives of the others.
+
+    Raises:
+        DataError: The states are others, or a velocity or rate contradicts the mapping in unit or axes.
+    """
+    signals = mapping.of("states")
+    if [(s.group.kind, s.group.error_dim) for s in signals] != _RIGID_BODY:
+        raise DataError(
+            "a rigid body's states are position (3), attitude (quaternion or Euler angles), velocity (3) and angular "
+            f"rate (3), in this order; the mapping has {', '.join(s.name for s in signals)}"
+        )
+    frames = [signals[2].frame or "world", signals[3].frame or "body"]
+    before, now, after = (
+        np.concatenate([run.states[run.starts(SPAN, SPAN) + shift] for run in runs]) for shift in (-SPAN, 0, SPAN)
+    )
+    before, now, after = (states[:: max(len(now) // MOST_ROWS, 1)] for states in (before, now, after))
+    q, time = now[:, 3:7], 2 * SPAN * step
+    speed = (after[:, 0:3] - before[:, 0:3]) / time
+    turn = rotation_vector(quaternion_product(quaternion_inverse(before[:, 3:7]), after[:, 3:7])) / time
+    found = (
+        (now[:, 7:10], {"world": speed, "body": rotate(quaternion_inverse(q), speed)}),
+        (now[:, 10:13], {"world": rotate(q, turn), "body": turn}),
+    )
+    for (measured, derivatives), frame, of, signal in zip(found, frames, signals, signals[2:], strict=False):
+        other = "world" if frame == "body" else "body"
+        (slope, fit), (_, fit_other) = (_regression(measured, derivatives[axes]) for axes in (frame, other))
+        what = f"the derivative of {of.name}"
+        if fit_other > max(FIT, fit + 0.1):
+            axes = f"in {other} axes (correlation {fit_other:.2f}), not in {frame} axes"
+            raise DataError(f"{signal.name} is {what} {axes}, as the mapping says")
+        if fit > FIT and not SLOPES[0] < slope < SLOPES[1]:
+            text = f"{slope:.3g} times {what} (correlation {fit:.2f})"
+            raise DataError(f"{signal.name} is {text}; is its unit right? (degrees for radians make a factor of 57)")
+    turned = []
+    for run in runs:
+        states, q = run.states.copy(), run.states[:, 3:7]
+        if frames[0] == "body":
+            states[:, 7:10] = rotate(q, states[:, 7:10])
+        if frames[1] == "world":
+            states[:, 10:13] = rotate(quaternion_inverse(q), states[:, 10:13])
+        turned.append(replace(run, states=states))
+    return turned
+
+
+def _regression(signal: Array, derivative: Array) -> tuple[float, float]:
+    """Slope of the signal over the derivative, and the absolute correlation of the two; none of less than 50 rows."""
+    if len(signal) < 50:
+        return 1.0, 0.0
+    a, b = (x - x.mean(axis=0) for x in (signal, derivative))
+    aa, bb, ab = float((a * a).sum()), float((b * b).sum()), float((a * b).sum())
+    return (ab / bb, abs(ab) / np.sqrt(aa * bb)) if aa > 0 and bb > 0 else (1.0, 0.0)
 
 
 class Stamps(NamedTuple):

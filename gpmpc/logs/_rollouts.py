@@ -19,7 +19,7 @@ import numpy as np
 from gpmpc.exceptions import SettingError
 from gpmpc.gp import GPPosterior
 from gpmpc.logs._kinematics import Array, Kinematics, quaternion_inverse, rotate
-from gpmpc.logs._log import Log, Windows
+from gpmpc.logs._log import Windows
 
 STEPS = 50  # of the rollouts that models are judged by
 PAST = 20  # rows before them
@@ -33,21 +33,6 @@ class Nominal(Protocol):
     @property
     def start(self) -> Array: ...
     def outputs(self, theta: Any, states: Array, inputs: Array, context: Array) -> Array: ...
-
-
-@dataclass(frozen=True)
-class Still:
-    """Outputs that are zero: nothing is known."""
-
-    output_dim: int
-    parameter_names: tuple[str, ...] = ()
-
-    @property
-    def start(self) -> Array:
-        return np.empty(0)
-
-    def outputs(self, theta: Any, states: Array, inputs: Array, context: Array) -> Array:
-        return np.zeros((*states.shape[:-1], self.output_dim))
 
 
 @dataclass(frozen=True)
@@ -111,24 +96,19 @@ class MultirotorNominal:
 
 @dataclass(frozen=True)
 class AffineNominal:
-    """Outputs A z + b of the features z: parameters enter linearly, so least squares one step ahead find them."""
+    """Outputs A z + b of the features z, whose many nameless parameters least squares one step ahead find, or zero."""
 
     kinematics: Any  #: has the features
-    output_dim: int  #: o
-    feature_dim: int = 0  #: d, their number; known once it is fitted
-
-    @property
-    def parameter_names(self) -> tuple[str, ...]:
-        return tuple(f"A_{i}_{j}" for i in range(self.output_dim) for j in range(self.feature_dim + 1))
-
-    @property
-    def start(self) -> Array:
-        return np.zeros(len(self.parameter_names))
+    fitted: bool = True  #: otherwise the outputs are zero
+    parameter_names = ()
+    start = np.empty(0)
 
     def outputs(self, theta: Any, states: Array, inputs: Array, context: Array) -> Array:
-        z = self.kinematics.features(states, inputs, context)
-        A = np.asarray(theta, dtype=float).reshape(self.output_dim, self.feature_dim + 1)
-        return z @ A[:, :-1].T + A[:, -1]
+        o = len(self.kinematics.output_names)
+        if not self.fitted:
+            return np.zeros((*states.shape[:-1], o))
+        A = np.asarray(theta, dtype=float).reshape(o, -1)
+        return self.kinematics.features(states, inputs, context) @ A[:, :-1].T + A[:, -1]
 
 
 @dataclass(frozen=True)
@@ -221,9 +201,3 @@ def finite_errors(windows: Windows, model: LogModel, steps: Any = None) -> Array
     with np.errstate(over="ignore", invalid="ignore"):
         errors = rollout_errors(windows, model.rollout(windows), steps)
     return np.nan_to_num(errors, nan=1e9, posinf=1e9, neginf=-1e9)
-
-
-def choose_stride(log: Log, rows: int, most: int) -> int:
-    """The stride at which windows of that many rows are ``most`` at most."""
-    count = sum(max(b - a - rows, 0) for run in log.runs for a, b in run.pieces)
-    return max(-(-count // most), 1)

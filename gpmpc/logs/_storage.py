@@ -5,8 +5,9 @@ its derivatives are central differences, all stages in one batch; the disturbanc
 controller's own estimate.
 """
 
+import re
 from dataclasses import asdict, dataclass
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -21,14 +22,14 @@ from gpmpc.gaussian import Gaussian
 from gpmpc.gp import load_metadata
 from gpmpc.gp._storage import posterior_of_parts, posterior_parts, read_model, write_model
 from gpmpc.logs._fitting import NominalFit, OutputNoise
-from gpmpc.logs._kinematics import Array, Increments, Kinematics, RigidBody, StateGroup, StateSpace, wrap
+from gpmpc.logs._kinematics import Array, Increments, RigidBody, StateGroup, StateSpace, wrap
 from gpmpc.logs._learning import Candidate, Learned
-from gpmpc.logs._rollouts import AffineNominal, LogModel, MultirotorNominal, Nominal, OutputGP, Still
+from gpmpc.logs._rollouts import AffineNominal, LogModel, MultirotorNominal, Nominal, OutputGP
 from gpmpc.models import load_model
 from gpmpc.systems import System
 
 KIND = "LogModel"
-_NAMES = ("state_names", "input_names", "context_names", "runs")
+_TEXTS = ("state_names", "input_names", "context_names", "runs")
 _NOISE = ("outputs", "measurement")
 DIFFERENCE = 1e-5  # of central differences, relative to entries above one
 
@@ -41,26 +42,26 @@ def save_learned(learned: Learned, path: str | Path) -> None:
         DataError: The folder does not exist.
     """
     path, model, nominal = new_file(path), learned.model, learned.model.nominal
-    if not isinstance(nominal, MultirotorNominal | AffineNominal | Still):
+    if not isinstance(nominal, MultirotorNominal | AffineNominal):
         raise SettingError("nominal", f"only models of gpmpc.logs can be saved; got {type(nominal).__name__}")
-    gps = [posterior_parts(path, gp.posterior) for gp in model.gps]
+    arrays = {"theta": model.theta, "standard_errors": learned.fit.standard_errors, "ranges": learned.ranges}
+    arrays |= {f"noise/{key}": getattr(learned.noise, key) for key in _NOISE}
+    tensors, gps = {key: torch.from_numpy(value) for key, value in arrays.items()}, []
+    for i, gp in enumerate(model.gps):
+        described, own = posterior_parts(path, gp.posterior)
+        gps.append([gp.outputs, described])
+        tensors |= {f"gp{i}/{key}": value for key, value in own.items()}
     header = {
         "groups": [asdict(group) for group in model.kinematics.space.groups],
         "kinematics": type(model.kinematics).__name__,
         "nominal": [type(nominal).__name__, {k: v for k, v in vars(nominal).items() if isinstance(v, int | float)}],
         "history": model.history,
         "lag": model.lag,
-        "gps": [[gp.outputs, described] for gp, (described, _) in zip(model.gps, gps, strict=True)],
-        "fit": [learned.fit.cost, learned.fit.start_cost, learned.fit.evaluations],
+        "gps": gps,
         "candidates": [[c.name, c.errors.tolist(), c.chosen] for c in learned.candidates],
-        "names": [getattr(learned, key) for key in _NAMES],
-        "rows": learned.rows,
+        "names": [getattr(learned, key) for key in _TEXTS],
         "time_step": learned.time_step,
     }
-    arrays = {"theta": model.theta, "standard_errors": learned.fit.standard_errors, "ranges": learned.ranges}
-    arrays |= {f"noise/{key}": getattr(learned.noise, key) for key in _NOISE}
-    tensors = {key: torch.from_numpy(value) for key, value in arrays.items()}
-    tensors |= {f"gp{i}/{key}": value for i, (_, own) in enumerate(gps) for key, value in own.items()}
     write_model(path, KIND, header, tensors)
 
 
@@ -79,15 +80,13 @@ def load_learned(path: str | Path) -> Learned:
 
 
 def _learned(path: Path, header: dict[str, Any], tensors: dict[str, Tensor]) -> Learned:
-    groups = (StateGroup(g["name"], tuple(g["entries"]), g["unit"], g["kind"]) for g in header["groups"])
-    space = StateSpace(tuple(groups))
-    kinematics: Kinematics = RigidBody(space) if header["kinematics"] == "RigidBody" else Increments(space)
+    space = StateSpace(tuple(StateGroup(**g | {"entries": tuple(g["entries"])}) for g in header["groups"]))
+    kinematics = RigidBody(space) if header["kinematics"] == "RigidBody" else Increments(space)
     name, settings = header["nominal"]
-    kinds: dict[str, Any] = {
-        "MultirotorNominal": MultirotorNominal,
-        "AffineNominal": partial(AffineNominal, kinematics),
-    }
-    nominal: Nominal = kinds.get(name, Still)(**settings)
+    if name == "MultirotorNominal":
+        nominal: Nominal = MultirotorNominal(**settings)
+    else:  # older files have a Still
+        nominal = AffineNominal(kinematics, settings.get("fitted", name != "Still"))
     gps = []
     for i, (outputs, described) in enumerate(header["gps"]):
         own = {key.removeprefix(f"gp{i}/"): value for key, value in tensors.items() if key.startswith(f"gp{i}/")}
@@ -97,12 +96,11 @@ def _learned(path: Path, header: dict[str, Any], tensors: dict[str, Tensor]) -> 
     return Learned(
         model=model,
         noise=OutputNoise(*(arrays[f"noise/{key}"] for key in _NOISE)),
-        fit=NominalFit(model, arrays["standard_errors"], *header["fit"]),
+        fit=NominalFit(model, arrays["standard_errors"]),
         candidates=tuple(Candidate(name, np.array(errors), chosen) for name, errors, chosen in header["candidates"]),
         ranges=arrays["ranges"],
-        rows=header["rows"],
         time_step=header["time_step"],
-        **{key: tuple(names) for key, names in zip(_NAMES, header["names"], strict=True)},
+        **{key: tuple(names) for key, names in zip(_TEXTS, header["names"], strict=True)},
     )
 
 
@@ -114,21 +112,17 @@ class LogDynamics:
         SettingError: Its inputs act late, or it has a term of the controller that flew.
     """
 
-    model: LogModel  #: without context and without late inputs
+    model: LogModel  #: without context
     input_dim: int  #: number of inputs, m
     time_step: float  #: [s]
     noise: OutputNoise | None = None  #: of its outputs; none by default
-
-    dtype = torch.float64
-    device = torch.device("cpu")
+    dtype, device = torch.float64, torch.device("cpu")
 
     def __post_init__(self) -> None:
-        for wrong, what in (
-            (self.model.lag, f"has inputs that act {self.model.lag} rows late"),
-            (getattr(self.model.nominal, "feedback", False), "holds the feedback of the controller that flew"),
-        ):
-            if wrong:
-                raise SettingError("model", f"{what}, which no controller can plan with: gpmpc learn --for-control")
+        late = f"has inputs that act {self.model.lag} rows late" if self.model.lag else ""
+        if late or getattr(self.model.nominal, "feedback", False):
+            what = late or "holds the feedback of the controller that flew"
+            raise SettingError("model", f"{what}, which no controller can plan with: gpmpc learn --for-control")
 
     @property
     def state_dim(self) -> int:
@@ -212,16 +206,12 @@ class SavedModel:
     time_step: float | None = None  #: [s]; None where the file has none
 
     def check(self, system: System) -> None:
-        """Raises unless states, inputs and time step are a system's.
-
-        Raises:
-            SettingError: They are others.
-        """
+        """Raises ``SettingError`` unless states, inputs and time step are a system's."""
         for key, dim, names, wanted in (
             ("states", self.model.state_dim, self.state_names, system.state_names),
             ("inputs", self.model.input_dim, self.input_names, system.input_names),
         ):
-            own = [name.removeprefix("state.").removeprefix("measured.").removeprefix("input.") for name in names]
+            own = [re.sub(r"^(state|measured|input)\.", "", name) for name in names]
             if dim != len(wanted) or (own and own != list(wanted)):
                 found = f"the {key} {', '.join(own) or dim}; {system.name} has {', '.join(wanted)}"
                 raise SettingError("model", f"{self.path} has {found}")

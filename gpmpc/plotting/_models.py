@@ -112,15 +112,15 @@ def judgement_figure(judgement: "Judgement") -> Figure:
 @styled
 def inspection_figure(inspection: "Inspection") -> Figure:
     """Draws each channel over the time, with its gaps, on one page."""
-    channels = inspection.channels[:_PER_PAGE]
+    channels = [*inspection.lines.items()][:_PER_PAGE]
     columns = 2 if len(channels) > 6 else 1
     rows = -(-len(channels) // columns)
     figure, axes = make_figure(10, 1.1 * rows + 1, rows, columns, sharex=True)
-    for axis, channel in zip(axes.T.flat, channels, strict=False):
-        axis.plot(channel.time, channel.values, color=BLUE, linewidth=0.7)
+    for axis, (name, line) in zip(axes.T.flat, channels, strict=False):
+        axis.plot(*line, color=BLUE, linewidth=0.7)
         for begin, end in inspection.gaps[:200]:
             axis.axvspan(begin, end, color=ORANGE, alpha=0.4, linewidth=0)
-        axis.set_ylabel(channel.name, rotation=0, ha="right", va="center", fontsize=7)
+        axis.set_ylabel(name, rotation=0, ha="right", va="center", fontsize=7)
         axis.tick_params(labelsize=7)
     for axis in axes[-1]:
         axis.set_xlabel("time [s]")

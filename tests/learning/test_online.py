@@ -179,7 +179,9 @@ def check_exact(model):
 @pytest.mark.parametrize("rule", ["oldest", "least_informative"])
 @pytest.mark.parametrize("most", [1, 2, 9, 50])
 def test_a_change_is_the_exact_gp_of_its_points_and_drops_some_when_they_are_too_many(most, rule):
-    models = taught(ChangedModel(MODEL, points=most, remove=rule), 2 * most + 20, np.random.default_rng(3))
+    models = taught(
+        ChangedModel(MODEL, OnlineLearning(points=most, remove=rule)), 2 * most + 20, np.random.default_rng(3)
+    )
     for before, after in pairwise(models):
         check_exact(after)
         assert 0.8 * most <= len(after) <= most if len(before) == most else len(after) == len(before) + 1
@@ -190,7 +192,7 @@ def test_a_change_is_the_exact_gp_of_its_points_and_drops_some_when_they_are_too
 
 
 def test_an_older_change_stays_what_it_was_and_can_go_another_way():
-    models = taught(ChangedModel(MODEL, points=30), 60, np.random.default_rng(4))
+    models = taught(ChangedModel(MODEL, OnlineLearning(points=30)), 60, np.random.default_rng(4))
     kept = [[array.copy() for array in (m.posterior.cholesky.numpy(), m.posterior.weights.numpy())] for m in models[1:]]
     for k in (20, 29, 30, 47, 59):
         again, other = (taught(models[k], 12, np.random.default_rng(seed))[-1] for seed in (5, 6))

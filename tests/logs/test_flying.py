@@ -14,7 +14,7 @@ from gpmpc.gp import GPPosterior
 from gpmpc.logs import LogDynamics, LogModel, MultirotorNominal, RigidBody
 from gpmpc.logs._fitting import OutputNoise
 from gpmpc.logs._kinematics import Increments, StateGroup, StateSpace, rotation_quaternion
-from gpmpc.logs._rollouts import OutputGP, Still
+from gpmpc.logs._rollouts import AffineNominal, OutputGP
 from gpmpc.testing import check_model
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))
@@ -43,7 +43,8 @@ def test_what_was_learned_obeys_the_protocol_of_models():
     x = np.hstack([rng.normal(size=(5, 3)), rotation_quaternion(rng.normal(size=(5, 3))), rng.normal(size=(5, 6))])
     check_model(body, torch.from_numpy(x), torch.from_numpy(rng.uniform(0.2, 0.8, (5, 4))))
     space = StateSpace((StateGroup("a", ("a",), "rad", "angle"), StateGroup("b", ("b",))))
-    turning = dynamics(Increments(space), Still(2), np.empty(0), 1, 4)
+    zero = AffineNominal(Increments(space), fitted=False)
+    turning = dynamics(zero.kinematics, zero, np.empty(0), 1, 4)
     states = torch.tensor([[3.1415, 60.0], [-7.0, 1.0]], dtype=torch.float64)  # a turn is counted, not taken back
     check_model(turning, states, torch.ones(2, 1, dtype=torch.float64))
     assert abs(turning.predict(states, states[:, :1]).mean - states).max() < 0.1

@@ -41,18 +41,18 @@ def test_what_was_put_in_is_found(table, tmp_path):
     table.loc[7000, "t"] = table.loc[6999, "t"]
     table.to_csv(tmp_path / "log.csv", index=False)
     found = inspect_log(tmp_path / "log.csv")
-    ((_, rows, rate, jitter, gaps, longest, repeated, backwards),) = found.streams
+    ((_, rows, rate, jitter, gaps, longest, repeated, backwards),) = found.streams.to_numpy(object)
     assert (rows, gaps, repeated, backwards) == (11_925, 2, 1, 0)  # a row that is left out leaves a gap
     assert (rate, longest) == (pytest.approx(250), pytest.approx(0.304))
     assert jitter < 0.1
-    channels = {channel.name: channel for channel in found.channels}
-    assert channels["noisy"].noise == pytest.approx(0.5, rel=0.05)
-    assert channels["noisy"].smoothness == pytest.approx(-2 / 3, abs=0.03)
-    assert "smoothed" in channels["a"].remark
-    assert "a new value every 10.0 rows" in channels["slow"].remark
-    delays = {(d.first, d.second): d for d in found.delays}
-    assert delays["a", "late"].rows == 7
-    assert delays["a", "late"].agreement > 0.9
+    noisy = found.channels.loc["noisy"]
+    assert noisy["white noise"] == pytest.approx(0.5, rel=0.05)
+    assert noisy["smoothness"] == pytest.approx(-2 / 3, abs=0.03)
+    assert "a: smoothed: its errors hang together over rows" in found.warnings
+    assert "slow: a new value every 10.0 rows" in found.warnings
+    delay = found.delays.set_index(["channel", "later channel"]).loc[("a", "late")]
+    assert delay["rows"] == 7
+    assert delay["agreement"] > 0.9
     assert len(png(inspection_figure(found), dpi=50)) > 5000
 
 
@@ -92,7 +92,7 @@ def test_learn_writes_a_model_a_report_and_a_card_and_names_mistakes(tmp_path):
     assert "loses: " in result.stdout or "ridge" in result.stdout
     written = {path.name for path in (tmp_path / "learned").iterdir()}
     documents = {"report.md", "report.csv", "report.tex", "report.html", "report.png", "card.md"}
-    assert written == documents | {"model.safetensors", "progress.json"}
+    assert written == documents | {"model.safetensors"}
     card = (tmp_path / "learned" / "card.md").read_text()
     assert "What must not be trusted" in card
     assert "| thrust |" in card
