@@ -251,40 +251,6 @@ class PredictionModel:
             c[n:] = stages.c[0, n:]
         return stages._replace(c=c[None])
 
-    @property
-    def evaluates(self) -> bool:
-        """Whether plans are compared without derivatives: where the means are all that is predicted."""
-        return self.linearizer.covariance == "none"
-
-    def obeying(
-        self, towards: Sequence[Plan], at: Prediction, feedback: Array, request: Request
-    ) -> list[tuple[Plan, Array]]:
-        """The plans that obey the dynamics under a feedback towards others, see ``roll_out``, in one call.
-
-        With where the dynamics lead from their points (H, n).
-        """
-        states, inputs = (np.stack(parts) for parts in list(zip(*towards, strict=True))[:2])
-        gains = self._towards(at, feedback)[None]
-        law = Feedback(states, inputs, gains, *self._limits, request.references.previous_input)
-        rolled = self._roll_out(states[:, 0], law, request.disturbance)
-        plans = [Plan(x, u, plan.covariances) for x, u, plan in zip(*rolled, towards, strict=True)]
-        return [(plan, plan.states[1:]) for plan in plans]
-
-    def leading(self, plans: Sequence[Plan], request: Request) -> list[tuple[Plan, Array]]:
-        """The plans, and where the dynamics lead from their points (H, n), in one call."""
-        states, inputs = (
-            np.concatenate(parts) for parts in zip(*[(p.states[:-1], p.inputs) for p in plans], strict=True)
-        )
-        after = self._roll_out.open_loop(states, inputs[:, None], request.disturbance)[:, 1]
-        parts = np.ascontiguousarray(after).reshape(len(plans), self.horizon, -1)
-        return list(zip(plans, parts, strict=True))
-
-    def without_derivatives(self, plan: Plan, after: Array, at: Prediction, request: Request) -> Prediction:
-        """The prediction at a plan whose points lead to ``after`` (H, n), with the derivatives of ``at``."""
-        rows = self.constraints.at(plan, plan.covariances, self.points, request.parameters, request.kappas)
-        stages, cost = at.stages._replace(next=after), self.costs.at(plan, request.parameters)
-        return Prediction(plan, stages, plan.covariances, rows, cost)
-
     def roll_out(self, towards: Plan, prediction: Prediction, feedback: Array, request: Request) -> Prediction:
         """The prediction at the plan that obeys the dynamics under a feedback towards another one, within its bounds.
 
