@@ -17,7 +17,7 @@ matched beliefs, damped BFGS updates put it into the program (Nocedal and Wright
 
 import math
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from itertools import product
 
 import numpy as np
@@ -103,7 +103,8 @@ class Globalization:
         if settled or size <= self._tolerance or size * slower <= self._tolerance * (1.0 - slower):
             return at._replace(plan=proposed), Status.SOLVED
         slope = promised - curvature - merit
-        far = size > _NEAR and not (first and self._request.continues)
+        continued = self._request.previous is not None and self._request.states is None  # the last plan, one step on
+        far = size > _NEAR and not (first and continued)
         for length, trial in self._trials(at, plan, proposed, program.feedback, far):
             bound = merit + _SUFFICIENT_DECREASE * length * min(slope, 0.0) + _ROUND_OFF * abs(merit)
             rows = trial.rows if self._model.constraints.smooth else at.rows._replace(E=trial.rows.E)
