@@ -80,7 +80,7 @@ def groups() -> list[tuple]:
     held = controllers(gp, HORIZON)
     steps = record_steps(gp, held["mean only"], RECORDED_STEPS)
     stepping = {f"step, {name}": WarmStarted(controller, steps) for name, controller in held.items()}
-    programs = [held["zero order"].build(*step) for step in steps]
+    programs = [held["zero order"].control(*step).problem for step in steps]
     return [
         (
             "exp",

@@ -40,40 +40,27 @@ from gpmpc.mpc._linear_quadratic import (
     optimal_feedback,
     weight_of_stage,
 )
-from gpmpc.mpc.problem import Problem
 
 Array = np.ndarray
 
 _LARGEST_GROWTH = 3e7  # quadrotors over 100 stages have 2e7; in doubled precision a solve from 1e8 on takes 20 ms
 
 
-class Condenser:
-    """Condenses the stages of one problem over H stages; ``blocks`` is p / n."""
-
-    def __init__(self, problem: Problem, horizon: int, blocks: int):
-        rated = horizon if problem.input_rates.finite else 0
-        self.bounds = InputBounds(
-            *problem.inputs.by_stage(horizon), *[side[:rated] for side in problem.input_rates.by_stage(horizon)]
-        )
-        n, m = problem.state_dim, problem.input_dim
-        self._size, self._rates, self._plain = horizon * m, rated * m, np.empty((0, m, blocks * n + m + 1))
-
-    def condense(
-        self, cost: QuadraticCost, stages: Stages, start: Array, references: References, rows: StageRows
-    ) -> CondensedProgram:
-        """Makes the program in the coordinates that suit it; ``expand`` gives inputs and states of its solution."""
-        arrays = *stages, start, rows.E, rows.D, references.states, cost.squares
-        for array in arrays:  # the kernel does not look at their strides
-            if not array.flags.c_contiguous:
-                raise ShapeError("stages, rows and references must be contiguous arrays")
-        size, count = self._size, self._rates + rows.lower.size
-        lower, upper = np.empty((2, size + count))
-        P, q, G = np.empty((size, size)), np.empty(size), np.empty((count, size))
-        program = CondensedProgram(P, q, G, lower, upper, self._plain)
-        given = cost, self.bounds, stages, start, references, rows
-        if call_unchecked(_condense, *given, program) <= _LARGEST_GROWTH:
-            return program
-        return call_unchecked(condense_with_feedback, *given)
+def condense(
+    cost: QuadraticCost, bounds: InputBounds, stages: Stages, start: Array, references: References, rows: StageRows
+) -> CondensedProgram:
+    """Makes the program in the coordinates that suit it; ``expand`` gives inputs and states of its solution."""
+    for array in (*stages, start, rows.E, rows.D, references.states, cost.squares):  # the kernel ignores strides
+        if not array.flags.c_contiguous:
+            raise ShapeError("stages, rows and references must be contiguous arrays")
+    (p, m), size, count = stages.B.shape[1:], bounds.lower.size, bounds.rate_lower.size + rows.lower.size
+    lower, upper = np.empty((2, size + count))
+    P, q, G = np.empty((size, size)), np.empty(size), np.empty((count, size))
+    program = CondensedProgram(P, q, G, lower, upper, np.empty((0, m, p + m + 1)))
+    given = cost, bounds, stages, start, references, rows
+    if call_unchecked(_condense, *given, program) <= _LARGEST_GROWTH:
+        return program
+    return call_unchecked(condense_with_feedback, *given)
 
 
 @compiled

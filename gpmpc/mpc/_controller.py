@@ -216,11 +216,6 @@ class Request(NamedTuple):
         return cls(state, covariance, references, guess, finite[0], **more)
 
     @property
-    def continues(self) -> bool:
-        """Whether the first guess is the last plan, one step on."""
-        return self.previous is not None and self.states is None
-
-    @property
     def constant_guess(self) -> Array:
         """The previous input over the whole horizon (H, m)."""
         return np.tile(self.references.previous_input, (len(self.initial_guess), 1))

@@ -46,7 +46,7 @@ from gpmpc.mpc._controller import (
     full_turns,
     read_parameters,
 )
-from gpmpc.mpc._linear_quadratic import QuadraticCost, StageRows, Stages, finite_horizon_lqr
+from gpmpc.mpc._linear_quadratic import InputBounds, QuadraticCost, StageRows, Stages, finite_horizon_lqr
 from gpmpc.mpc._stages import COVARIANCES, ConstraintRows, Covariance, Plan, StageCosts, StageLinearizer, keep_rates
 from gpmpc.mpc.problem import Problem
 from gpmpc.propagation import Linearization, Propagator
@@ -124,8 +124,9 @@ class PredictionModel:
         self.propagator, self.problem, self.horizon = propagator, problem, horizon
         self.settings, self.points = settings, horizon if settings.form == "trajectory" else 1
         self._set_model(model)
-        (low, high), (down, up) = (box.by_stage(horizon) for box in (problem.inputs, problem.input_rates))
-        self._limits = low, high, down, up
+        inputs, rates = problem.inputs.by_stage(horizon), problem.input_rates.by_stage(horizon)
+        self._limits, rated = (*inputs, *rates), horizon if problem.input_rates.finite else 0
+        self.bounds = InputBounds(*inputs, *[side[:rated] for side in rates])
         self.constraints = ConstraintRows(problem, horizon, settings.covariance)
         self.costs = StageCosts(problem, horizon, self.linearizer)
 
@@ -161,11 +162,13 @@ class PredictionModel:
         if self.settings.disturbance_gain and request.finite:
             request = request._replace(disturbance=self._disturbance(request))
         if plan is not None and request.states is None and request.finite:  # those that the inputs lead to
-            start = request.state[None], request.initial_guess[None], request.disturbance
-            states = self._roll_out.open_loop(*start)[0]
-            known = np.isfinite(states).all()
-            request = request._replace(states=states if known else np.tile(request.state, (H + 1, 1)))
+            request = request._replace(states=self.lead(request.state, request.initial_guess, request.disturbance))
         return request
+
+    def lead(self, state: Array, inputs: Array, disturbance: Array | None = None) -> Array:
+        """The states (H + 1, n) that inputs (H, m) lead to; all of them the first one where these are not finite."""
+        states = self._roll_out.open_loop(state[None], inputs[None], disturbance)[0]
+        return states if np.isfinite(states).all() else np.tile(state, (len(states), 1))
 
     def initial_guess(self, request: Request) -> Plan:
         """The plan handed over, or the last plan, shifted by a stage.
@@ -199,8 +202,11 @@ class PredictionModel:
         if problem.input_rates.finite:
             inputs = inputs.copy()
             keep_rates(inputs, request.references.previous_input, *problem.input_rates.sides)
-        if not self.linearizer.at_points:
-            covariances[1:] = self._first_covariances(means, inputs, request) if last is None else last.covariances[1:]
+        if last is not None and not self.linearizer.at_points:
+            covariances[1:] = last.covariances[1:]
+        elif not self.linearizer.at_points:  # of the stages at the points
+            stages = self._at_points(means[:-1], inputs, covariances[1:])
+            covariances[1:] = self._covariances(stages, self.costs.quadratic, request.covariance)[1:]
         return Plan(self.linearizer.state(means, covariances), inputs, covariances)
 
     def linearize(self, plan: Plan, request: Request) -> Prediction:
@@ -232,8 +238,7 @@ class PredictionModel:
         covariances, mode = plan.covariances, self.linearizer.covariance
         cost = self.costs.at(plan, request.parameters)
         if mode == "zero_order":
-            covariances, K = np.empty_like(covariances), self.gains(stages.A[:1], stages.B[:1], cost)[0]
-            call_unchecked(_predict_covariances, *stages[:2], stages.V, request.covariance, K, covariances)
+            covariances = self._covariances(stages, cost, request.covariance)
         elif self.settings.form == "velocity" and mode != "none":
             covariances = np.repeat(self.linearizer.moments(stages.next, covariances)[1], self.horizon + 1, axis=0)
             covariances[0] = request.covariance
@@ -250,40 +255,6 @@ class PredictionModel:
             n = self.problem.state_dim
             c[n:] = stages.c[0, n:]
         return stages._replace(c=c[None])
-
-    @property
-    def evaluates(self) -> bool:
-        """Whether plans are compared without derivatives: where the means are all that is predicted."""
-        return self.linearizer.covariance == "none"
-
-    def obeying(
-        self, towards: Sequence[Plan], at: Prediction, feedback: Array, request: Request
-    ) -> list[tuple[Plan, Array]]:
-        """The plans that obey the dynamics under a feedback towards others, see ``roll_out``, in one call.
-
-        With where the dynamics lead from their points (H, n).
-        """
-        states, inputs = (np.stack(parts) for parts in list(zip(*towards, strict=True))[:2])
-        gains = self._towards(at, feedback)[None]
-        law = Feedback(states, inputs, gains, *self._limits, request.references.previous_input)
-        rolled = self._roll_out(states[:, 0], law, request.disturbance)
-        plans = [Plan(x, u, plan.covariances) for x, u, plan in zip(*rolled, towards, strict=True)]
-        return [(plan, plan.states[1:]) for plan in plans]
-
-    def leading(self, plans: Sequence[Plan], request: Request) -> list[tuple[Plan, Array]]:
-        """The plans, and where the dynamics lead from their points (H, n), in one call."""
-        states, inputs = (
-            np.concatenate(parts) for parts in zip(*[(p.states[:-1], p.inputs) for p in plans], strict=True)
-        )
-        after = self._roll_out.open_loop(states, inputs[:, None], request.disturbance)[:, 1]
-        parts = np.ascontiguousarray(after).reshape(len(plans), self.horizon, -1)
-        return list(zip(plans, parts, strict=True))
-
-    def without_derivatives(self, plan: Plan, after: Array, at: Prediction, request: Request) -> Prediction:
-        """The prediction at a plan whose points lead to ``after`` (H, n), with the derivatives of ``at``."""
-        rows = self.constraints.at(plan, plan.covariances, self.points, request.parameters, request.kappas)
-        stages, cost = at.stages._replace(next=after), self.costs.at(plan, request.parameters)
-        return Prediction(plan, stages, plan.covariances, rows, cost)
 
     def roll_out(self, towards: Plan, prediction: Prediction, feedback: Array, request: Request) -> Prediction:
         """The prediction at the plan that obeys the dynamics under a feedback towards another one, within its bounds.
@@ -327,13 +298,12 @@ class PredictionModel:
             Q, R, terminal = Q + Z[:1, :n, :n], R + Z[:1, n:-1, n:-1], terminal + Z[-1, :n, :n]
         return call_unchecked(finite_horizon_lqr, A, B, Q, R, terminal, self.horizon)[0]
 
-    def _first_covariances(self, means: Array, inputs: Array, request: Request) -> Array:
-        """Sigma_1 .. Sigma_H (H, n, n) along a first guess, linearised at its points."""
-        stages = self._at_points(means[:-1], inputs, np.zeros((self.horizon, *request.covariance.shape)))
-        covariances = np.empty((self.horizon + 1, *request.covariance.shape))
-        K = self.gains(stages.A[:1], stages.B[:1], self.costs.quadratic)[0]
-        _predict_covariances(stages.A, stages.B, stages.V, request.covariance, K, covariances)
-        return covariances[1:]
+    def _covariances(self, stages: Stages, cost: QuadraticCost, start: Array) -> Array:
+        """Sigma_0 .. Sigma_H (H + 1, n, n) of stages under their feedback."""
+        covariances = np.empty((self.horizon + 1, *start.shape))
+        K = self.gains(stages.A[:1], stages.B[:1], cost)[0]
+        call_unchecked(_predict_covariances, stages.A, stages.B, stages.V, start, K, covariances)
+        return covariances
 
     def _disturbance(self, request: Request) -> Array:
         """d_k (n,), from the estimate of the last decision and the state that its input led to; at first zero."""

@@ -17,7 +17,7 @@ matched beliefs, damped BFGS updates put it into the program (Nocedal and Wright
 
 import math
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from itertools import product
 
 import numpy as np
@@ -39,7 +39,6 @@ _TORCH_FAILURE = torch.linalg.LinAlgError  # pyright: ignore[reportPrivateImport
 FAILURES = (DataError, ProblemError, np.linalg.LinAlgError, _TORCH_FAILURE)  # no finite numbers
 _SUFFICIENT_DECREASE = 1e-4  # of what the program promised (Armijo)
 _SHARES = [2.0**-k for k in range(11)]  # of a step
-_TOGETHER = 1, 3, 8  # shares of a step are compared in one call each up to these
 _ROUND_OFF = 1e-8  # share of the cost below which a difference says nothing: posteriors with sf2 >> y^2 lose that much
 _NOISE = 1e-10  # the square of an offset that a model with that round-off need not get below
 _SMALL = 1e-3  # share of an input's size whose cost counts where the cost itself vanishes
@@ -104,14 +103,14 @@ class Globalization:
         if settled or size <= self._tolerance or size * slower <= self._tolerance * (1.0 - slower):
             return at._replace(plan=proposed), Status.SOLVED
         slope = promised - curvature - merit
-        far = size > _NEAR and not (first and self._request.continues)
+        continued = self._request.previous is not None and self._request.states is None  # the last plan, one step on
+        far = size > _NEAR and not (first and continued)
         for length, trial in self._trials(at, plan, proposed, program.feedback, far):
             bound = merit + _SUFFICIENT_DECREASE * length * min(slope, 0.0) + _ROUND_OFF * abs(merit)
             rows = trial.rows if self._model.constraints.smooth else at.rows._replace(E=trial.rows.E)
             points = trial.stages.next, rows, trial.plan
             if call_unchecked(_merit, trial.cost, terms, self._defect_prices, *points) <= bound:
-                bare = far and self._model.evaluates
-                return self._model.linearize(trial.plan, self._request) if bare else trial, None
+                return trial, None
         if size**2 <= _ROUND_OFF:  # size^2 of the cost is what could still be gained
             return at._replace(plan=proposed), Status.SOLVED
         return at, Status.NUMERICAL_TROUBLE
@@ -130,21 +129,6 @@ class Globalization:
         be: the plan there will be taken.
         """
         model, request = self._model, self._request
-        if far and model.evaluates:  # without derivatives
-            for together in np.split(_SHARES, _TOGETHER):
-                towards = [_between(plan, proposed, share) for share in together]
-                rolled = _each(lambda plans: model.obeying(plans, at, feedback, request), towards)
-                direct: list[list] = []
-                for t, share in enumerate(together.tolist()):
-                    for found in (rolled, direct):
-                        if found is direct and not direct:
-                            direct += _each(lambda plans: model.leading(plans, request), towards)
-                        try:
-                            for there, after in found[t]:
-                                yield share, model.without_derivatives(there, after, at, request)
-                        except FAILURES:
-                            continue
-            return
         for share, first in product(_SHARES, (True, False)):
             towards = _between(plan, proposed, share)
             try:
@@ -154,14 +138,6 @@ class Globalization:
                     yield share, model.linearize(model.canonical(towards), request)
             except FAILURES:  # a trial plan may lead the model out of its numbers
                 continue
-
-
-def _each(predict: Callable[[list[Plan]], list], plans: list[Plan]) -> list[list]:
-    """What is predicted of plans together, each in a list of its own, which is empty where the model fails."""
-    try:
-        return [[found] for found in predict(plans)]
-    except FAILURES:  # one of them spoils the others
-        return [[]] if len(plans) == 1 else [_each(predict, [plan])[0] for plan in plans]
 
 
 def _between(plan: Plan, other: Plan, share: float) -> Plan:

@@ -222,16 +222,10 @@ class ConstraintRows:
         self.per_stage, self.soft = len(kappa), bool(np.isfinite(self.prices).any())
         margins = self._kappa if covariance == "zero_order" else np.zeros(self.per_stage)
         self._margins = np.tile(margins, (horizon, 1))
-        moves = (
-            bool((np.count_nonzero(self._F, axis=1) > 1).any())
-            if covariance == "diagonal"
-            else covariance == "full" and self.per_stage > 0
-        )
-        self.smooth, moves = bool(self._smooth), moves or bool(self._smooth)
-        self._constant = None if moves else self._rows(self._F[None], np.zeros((1, n, n)))
-        self._fixed = None
-        if self._constant is not None and not self._margins.any():
-            self._fixed = StageRows(self._constant, self._plain, self._lower, self._upper)
+        self.smooth, self._fixed = bool(self._smooth), None
+        if not (self.smooth or margins.any() or (self.per_stage and covariance in ("full", "diagonal"))):
+            E = self._rows(self._F[None], np.zeros((1, n, n)))
+            self._fixed = StageRows(E, self._plain, self._lower, self._upper)
 
     def at(
         self, plan: Plan, covariances: Array, stages: int, parameters: Array | None = None, kappas: Array | None = None
@@ -256,7 +250,7 @@ class ConstraintRows:
                 upper[:, where] += np.einsum("kri,ki->kr", D[:, where], plan.inputs)
         margins = self._margins if kappas is None else np.where(self._margins > 0, kappas[:, None], 0.0)
         call_unchecked(_tighten, F, margins, covariances, lower, upper)
-        E = self._rows(F, covariances[1 : stages + 1]) if self._constant is None else self._constant
+        E = self._rows(F, covariances[1 : stages + 1])
         return StageRows(np.ascontiguousarray(E), D, lower, upper)
 
     def all_prices(self, hard_rows: int) -> Array | None:

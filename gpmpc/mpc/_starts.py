@@ -18,7 +18,6 @@ import torch
 
 from gpmpc.exceptions import SettingError, ShapeError, check_number
 from gpmpc.gaussian import Gaussian
-from gpmpc.models import RollOut
 from gpmpc.mpc._controller import Array, Decision, Reference, full_turns
 from gpmpc.mpc._linear_quadratic import References, evaluate_cost
 from gpmpc.mpc._stages import StageCosts, StageLinearizer
@@ -81,7 +80,6 @@ class ManyStarts:
         linearizer = StageLinearizer(controller.prediction.model, Linearization(), "none")
         self._weights = StageCosts(self.problem, H, linearizer).quadratic
         self.limit, self.budget = limit, budget
-        self._rolled_out = RollOut(self.planner.prediction.model)
 
     def control(
         self, belief: Gaussian, reference: Reference, previous: Decision | None = None, parameters: Any = None
@@ -151,8 +149,7 @@ class ManyStarts:
                 shares, targets = np.linspace(1.0, 0.0, H + 1)[:, None], goal.states
                 yield goal, (np.tile(self.initial_input, (H, 1)), targets + shares * (state - targets[0]))
             else:
-                states = self._rolled_out.open_loop(state[None], np.asarray(guess, dtype=float)[None])[0]
-                yield goal, (guess, states if np.isfinite(states).all() else np.tile(state, (H + 1, 1)))
+                yield goal, (guess, self.planner.prediction.lead(state, np.asarray(guess, dtype=float)))
 
     def _goals(self, state: Array, reference: Reference) -> Iterator[Reference]:
         angles, moves = list(self.problem.cost.angles), []

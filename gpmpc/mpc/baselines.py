@@ -188,7 +188,7 @@ class StateFormMPC:
         self.initial_input, self.problem, self.horizon = self.prediction.initial_input, problem, horizon
         self.solver, self.options = solver, TIGHT.get(solver, {}) if options is None else options
         problem.check_plain("StateFormMPC")
-        self._program = _Program(self.prediction, constraints)
+        self._build(constraints)
 
     def control(self, belief: Gaussian, reference: Reference, previous: Decision | None = None) -> Decision:
         """Decides the input for one step; see ``GPMPC.control``."""
@@ -204,8 +204,8 @@ class StateFormMPC:
         except FAILURES:
             return request.failed_decision(Status.NUMERICAL_TROUBLE, timing=Timing(perf_counter() - began, 0.0, 0.0))
         modelled = perf_counter()
-        self._program.set(prediction, request)
-        built, program = perf_counter(), self._program.problem
+        self._set(prediction, request)
+        built, program = perf_counter(), self._program
         try:
             with warnings.catch_warnings():  # that a solution is inaccurate is said by its status
                 warnings.simplefilter("ignore")
@@ -215,13 +215,67 @@ class StateFormMPC:
             status = Status.NUMERICAL_TROUBLE
         timing = Timing(modelled - began, built - modelled, perf_counter() - built)
         iterations = (program.solver_stats.num_iters or 0) if program.solver_stats else 0
-        suboptimal = status is Status.ITERATION_LIMIT and self._program.feasible
+        values = [variable.value for variable in program.variables()]
+        stopped = status is Status.ITERATION_LIMIT and all(v is not None and np.isfinite(v).all() for v in values)
+        suboptimal = stopped and all(np.max(rule.violation()) <= FEASIBLE for rule in program.constraints)
         if not (status.solved or suboptimal):
             return request.failed_decision(status, iterations, timing)
-        inputs, states = np.array(self._program.inputs.value), np.array(self._program.states.value)
+        inputs, states = np.array(self._inputs.value), np.array(self._states.value)
         beliefs = self.prediction.linearizer.moments(states, prediction.covariances)
         ended: Any = {"disturbance": request.disturbance, "suboptimal": suboptimal}
         return Decision(inputs[0], inputs, *beliefs, status, iterations, timing, **ended)
+
+    def _build(self, constraints: Callable[[Any, Any], list] | None) -> None:
+        """Makes the CVXPY problem with its parameters."""
+        import cvxpy
+
+        model, problem, H, m = self.prediction, self.problem, self.horizon, self.problem.input_dim
+        (Q, R), rows = problem.cost.by_stage(H), model.constraints
+        weights = [_factor(blocks) for blocks in model.linearizer.weight(Q)]
+        p, K, r = len(weights[0]), model.points, rows.per_stage
+        self._states, self._inputs = s, u = cvxpy.Variable((H + 1, p)), cvxpy.Variable((H, m))
+        self._stages = [[cvxpy.Parameter(shape) for shape in ((p, p), (p, m), (p,))] for _ in range(K)]
+        self._start, self._targets = cvxpy.Parameter(p), cvxpy.Parameter((H, p), value=np.zeros((H, p)))
+        self._wanted, self._last = cvxpy.Parameter((H, m)), cvxpy.Parameter(m)
+        rates = u - cvxpy.vstack([cvxpy.reshape(self._last, (1, m), order="C"), *([u[:-1]] if H > 1 else [])])
+        penalized = {"inputs": u, "deviations": u - self._wanted, "increments": rates}[problem.cost.penalized]
+        cost = sum(cvxpy.sum_squares(penalized[k] @ _factor(R[k : k + 1])) for k in range(H))
+        cost += sum(cvxpy.sum_squares((s[k + 1] - self._targets[k]) @ weights[k]) for k in range(H))
+        rules = [s[0] == self._start, *_within(u, *problem.inputs.by_stage(H))]
+        rules += _within(rates, *problem.input_rates.by_stage(H))
+        for k in range(H):
+            A, B, c = self._stages[min(k, K - 1)]
+            rules.append(s[k + 1] == A @ s[k] + B @ u[k] + c)
+        self._rows = [cvxpy.Parameter((r, p)) for _ in range(K if r else 0)]
+        if r:
+            self._bounds, hard, applies = cvxpy.Parameter((H, r)), np.isinf(rows.prices), rows.applies
+            slack = np.zeros((H, r))
+            if rows.soft:
+                slack = cvxpy.multiply(cvxpy.Variable((H, r), nonneg=True), np.tile(np.where(hard, 0.0, 1.0), (H, 1)))
+                cost += cvxpy.sum(slack @ np.where(hard, 0.0, rows.prices))
+            # Every bound as an upper one: the rows of lower bounds are handed over with their sign turned.
+            at = [self._rows[min(k, K - 1)] @ s[k + 1] - self._bounds[k] - slack[k] for k in range(H)]
+            rules += [at[k][np.flatnonzero(applies[k])] <= 0.0 for k in range(H) if applies[k].any()]
+        rules += [] if constraints is None else list(constraints(s, u))
+        self._program = cvxpy.Problem(cvxpy.Minimize(cost), rules)
+        if not self._program.is_dpp():
+            raise SettingError("constraints", "must be convex, and parametrised as CVXPY's rules (DPP) ask")
+
+    def _set(self, prediction: Prediction, request: Request) -> None:
+        """Gives all parameters their values of this step."""
+        for parameters, values in zip(self._stages, zip(*prediction.stages[:3], strict=True), strict=True):
+            for parameter, value in zip(parameters, values, strict=True):
+                parameter.value = value
+        targets = np.zeros(self._targets.shape)
+        targets[:, : self.problem.state_dim] = request.references.states
+        self._start.value, self._targets.value = prediction.plan.states[0], targets
+        self._wanted.value, self._last.value = request.references.inputs, request.references.previous_input
+        if self._rows:
+            (E, _, lower, upper), sign = prediction.rows, self.prediction.constraints.signs
+            for parameter, value in zip(self._rows, np.broadcast_to(E, (len(self._rows), *E.shape[1:])), strict=True):
+                parameter.value = sign[:, None] * value
+            bounds = np.where(sign > 0, upper, -lower)
+            self._bounds.value = np.where(np.isfinite(bounds), bounds, 0.0)
 
 
 def _build(
@@ -263,70 +317,6 @@ def _build(
     options: dict[str, Any] = {"print_time": False, "show_eval_warnings": False, "ipopt": ipopt}
     bounds = [{"x": np.hstack(box)[side], "g": np.hstack(g)[side]} for side in (0, 1)]
     return casadi.nlpsol("nmpc", "ipopt", nlp, options), bounds
-
-
-class _Program:
-    """The CVXPY problem with its parameters."""
-
-    def __init__(self, model: PredictionModel, constraints: Callable[[Any, Any], list] | None):
-        import cvxpy
-
-        problem, H, m, rows = model.problem, model.horizon, model.problem.input_dim, model.constraints
-        Q, R = problem.cost.by_stage(H)
-        weights = [_factor(blocks) for blocks in model.linearizer.weight(Q)]
-        p, K, r = len(weights[0]), model.points, rows.per_stage
-        self.states, self.inputs = s, u = cvxpy.Variable((H + 1, p)), cvxpy.Variable((H, m))
-        self._stages = [[cvxpy.Parameter(shape) for shape in ((p, p), (p, m), (p,))] for _ in range(K)]
-        self._start, self._targets = cvxpy.Parameter(p), cvxpy.Parameter((H, p), value=np.zeros((H, p)))
-        self._wanted, self._last = cvxpy.Parameter((H, m)), cvxpy.Parameter(m)
-        rates = u - cvxpy.vstack([cvxpy.reshape(self._last, (1, m), order="C"), *([u[:-1]] if H > 1 else [])])
-        penalized = {"inputs": u, "deviations": u - self._wanted, "increments": rates}[problem.cost.penalized]
-        cost = sum(cvxpy.sum_squares(penalized[k] @ _factor(R[k : k + 1])) for k in range(H))
-        cost += sum(cvxpy.sum_squares((s[k + 1] - self._targets[k]) @ weights[k]) for k in range(H))
-        rules = [s[0] == self._start, *_within(u, *problem.inputs.by_stage(H))]
-        rules += _within(rates, *problem.input_rates.by_stage(H))
-        for k in range(H):
-            A, B, c = self._stages[min(k, K - 1)]
-            rules.append(s[k + 1] == A @ s[k] + B @ u[k] + c)
-        self._rows, self._signs = [cvxpy.Parameter((r, p)) for _ in range(K if r else 0)], rows.signs
-        if r:
-            self._bounds, hard, applies = cvxpy.Parameter((H, r)), np.isinf(rows.prices), rows.applies
-            slack = np.zeros((H, r))
-            if rows.soft:
-                slack = cvxpy.multiply(cvxpy.Variable((H, r), nonneg=True), np.tile(np.where(hard, 0.0, 1.0), (H, 1)))
-                cost += cvxpy.sum(slack @ np.where(hard, 0.0, rows.prices))
-            # Every bound as an upper one: the rows of lower bounds are handed over with their sign turned.
-            at = [self._rows[min(k, K - 1)] @ s[k + 1] - self._bounds[k] - slack[k] for k in range(H)]
-            rules += [at[k][np.flatnonzero(applies[k])] <= 0.0 for k in range(H) if applies[k].any()]
-        rules += [] if constraints is None else list(constraints(s, u))
-        self.problem = cvxpy.Problem(cvxpy.Minimize(cost), rules)
-        if not self.problem.is_dpp():
-            raise SettingError("constraints", "must be convex, and parametrised as CVXPY's rules (DPP) ask")
-
-    @property
-    def feasible(self) -> bool:
-        """Whether the last iterate keeps all constraints."""
-        values = [variable.value for variable in self.problem.variables()]
-        if not all(value is not None and np.isfinite(value).all() for value in values):
-            return False
-        return all(np.max(rule.violation()) <= FEASIBLE for rule in self.problem.constraints)
-
-    def set(self, prediction: Prediction, request: Request) -> None:
-        """Gives all parameters their values of this step."""
-        for parameters, values in zip(self._stages, zip(*prediction.stages[:3], strict=True), strict=True):
-            for parameter, value in zip(parameters, values, strict=True):
-                parameter.value = value
-        self._start.value, self._last.value = prediction.plan.states[0], request.references.previous_input
-        self._wanted.value, targets = request.references.inputs, np.zeros(self._targets.shape)
-        targets[:, : request.references.states.shape[1]] = request.references.states
-        self._targets.value = targets
-        if self._rows:
-            E, _, lower, upper = prediction.rows
-            sign = self._signs
-            for parameter, value in zip(self._rows, np.broadcast_to(E, (len(self._rows), *E.shape[1:])), strict=True):
-                parameter.value = sign[:, None] * value
-            bounds = np.where(sign > 0, upper, -lower)
-            self._bounds.value = np.where(np.isfinite(bounds), bounds, 0.0)
 
 
 def _factor(blocks: Array) -> Array:

@@ -25,7 +25,7 @@ from gpmpc._compiled import call_unchecked, compiled
 from gpmpc._dynamics import DynamicsModel, linearize
 from gpmpc.exceptions import SettingError, check_number
 from gpmpc.gaussian import Gaussian
-from gpmpc.mpc._condense import Condenser
+from gpmpc.mpc._condense import condense
 from gpmpc.mpc._controller import FEASIBLE, Decision, Reference, Request, Timing, check_method
 from gpmpc.mpc._cost import FunctionNotFinite
 from gpmpc.mpc._linear_quadratic import CondensedProgram, expand
@@ -83,11 +83,9 @@ class GPMPC:
         self.iterations, self.tolerance = iterations, tolerance
         self.solver = DualActiveSet() if solver is None else solver
         check_method("solver", self.solver, "solve", "DualActiveSet()")
-        self._condenser = Condenser(problem, horizon, len(self.prediction.costs.quadratic.terminal))
         self._prior = self.prediction.linearizer.prior_variances()
-        self._rates = self._condenser.bounds.rate_lower.size
         self._hard = np.where(np.isinf(self.prediction.constraints.prices), np.inf, 0.0)  # prices: of hard rows alone
-        self._prices = self.prediction.constraints.all_prices(self._rates)
+        self._prices = self.prediction.constraints.all_prices(self.prediction.bounds.rate_lower.size)
         if self._prices is not None and not isinstance(self.solver, DualActiveSet):
             rule = "soft constraints need DualActiveSet (penalty=None makes them hard)"
             raise SettingError("solver", f"{rule}; got {type(self.solver).__name__}")
@@ -134,15 +132,17 @@ class GPMPC:
         solved_at, status, count = None, None, 0
         while True:
             clock.lap("model")
-            program = self._condense(prediction, request)
+            at = prediction.stages, prediction.plan.states[0], request.references
+            program = condense(prediction.cost, self.prediction.bounds, *at, prediction.rows)
             program = program if search is None else search.correct(program, prediction.plan)
             clock.lap("build")
             solution = self._solve(program, solution)
             clock.lap("solve")
             count, status = count + 1, solution.status
             if _is_usable(program, solution, prediction.plan):
+                unknowns = np.ascontiguousarray(solution.x, dtype=np.float64)
                 at = prediction.stages, prediction.plan.states[0], program.feedback, request.references.previous_input
-                inputs, states = call_unchecked(expand, *at, np.ascontiguousarray(solution.x, dtype=np.float64))
+                inputs, states = call_unchecked(expand, *at, unknowns)
                 proposed = Plan(states, inputs, prediction.covariances)
                 solved_at = prediction, program.feedback
                 if search is None:  # the real-time iteration takes the whole step
@@ -227,26 +227,6 @@ class GPMPC:
         if not linearizer.at_points:
             each += 8 * N * N + 12 * n * n * (N * (n + 1) + n * n + d)
         return 8 * (self.prediction.points * each + 4 * size * (size + n * self.horizon))
-
-    def build(
-        self, belief: Gaussian, reference: Reference, previous: Decision | None = None, parameters: Any = None
-    ) -> QuadraticProgram:
-        """The (first) quadratic program of a step, checked; the arguments are those of ``control``.
-
-        Its unknowns are the inputs u_0 .. u_{H-1}, one after the other. Rows of G: increments u_k - u_{k-1} where they
-        are bounded, then the bounded states of the stages 1 to H, upper bounds first.
-
-        Raises:
-            DataError: The belief is not finite, or it does not stay so.
-            ProblemError: The program is malformed, numerically.
-        """
-        request = self.prediction.read(belief, reference, previous, parameters)
-        prediction = self.prediction.linearize(self.prediction.initial_guess(request), request)
-        return QuadraticProgram.from_stacked(*self._condense(prediction, request)[:5])
-
-    def _condense(self, prediction: Prediction, request: Request) -> CondensedProgram:
-        parts = prediction.stages, prediction.plan.states[0], request.references, prediction.rows
-        return self._condenser.condense(prediction.cost, *parts)
 
     def _solve(self, program: CondensedProgram, warm: QPSolution | None) -> QPSolution:
         if isinstance(self.solver, DualActiveSet):

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from gpmpc.exceptions import ShapeError
-from gpmpc.mpc._condense import Condenser, condense_with_feedback
+from gpmpc.mpc._condense import condense, condense_with_feedback
 from gpmpc.mpc._cost import PENALIZED
-from gpmpc.mpc._linear_quadratic import QuadraticCost, References, StageRows, Stages, evaluate_cost, expand
+from gpmpc.mpc._linear_quadratic import InputBounds, QuadraticCost, References, StageRows, Stages, evaluate_cost, expand
 from gpmpc.mpc.problem import Box, Problem, Tracking
 from gpmpc.qp import DualActiveSet, QuadraticProgram
 from gpmpc.status import Status
@@ -29,11 +29,12 @@ def random_references(rng, H, n, m):
     return References(rng.normal(size=(H, n)), rng.normal(size=(H, m)), 0.1 * rng.normal(size=m))
 
 
-class Condensing(Condenser):
-    """A condenser with the cost of an extended state of so many blocks, and of squares of outputs."""
+class Condensing:
+    """Condenses with a problem's bounds, the cost of an extended state of so many blocks, and squares of outputs."""
 
     def __init__(self, problem, H, blocks=1, squares=None):
-        super().__init__(problem, H, blocks)
+        rates = problem.input_rates.by_stage(H) if problem.input_rates.finite else np.empty((2, 0, problem.input_dim))
+        self.bounds = InputBounds(*problem.inputs.by_stage(H), *rates)
         (Q, R), cost, z = problem.cost.by_stage(H), problem.cost, problem.state_dim + problem.input_dim + 1
         W = np.repeat(Q[:, None], blocks, axis=1)
         squares = np.empty((0, z, z)) if squares is None else squares
@@ -41,7 +42,7 @@ class Condensing(Condenser):
         self.cost = QuadraticCost(*weights, PENALIZED.index(cost.penalized), squares)
 
     def condense(self, *arguments):
-        return super().condense(self.cost, *arguments)
+        return condense(self.cost, self.bounds, *arguments)
 
 
 def no_rows(p, H):

@@ -344,12 +344,11 @@ def test_a_warm_start_changes_the_time_and_not_the_answer(form):
     assert np.allclose(warm.inputs, other.inputs, atol=1e-9)
 
 
-def test_build_is_the_problem_that_control_solves():
+def test_a_decision_holds_the_problem_that_it_solves():
     controller = GPMPC(gp(), Linearization(), quadrotor_problem(), 3, HOVER)
     belief = Gaussian.certain(np.full(6, 0.3))
-    program, decision = controller.build(belief, at_origin(3)), controller.control(belief, at_origin(3))
-    assert np.allclose(program.P, decision.problem.P)
-    assert np.allclose(program.lower, decision.problem.lower)
+    decision = controller.control(belief, at_origin(3))
+    program = decision.problem
     assert np.array_equal(program.P, program.P.T)
     assert np.allclose(DualActiveSet().solve(program).x, decision.inputs.ravel(), atol=1e-9)
 

@@ -14,7 +14,6 @@ from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior, backend
 from gpmpc.models import CasadiFunction, KnownModel
 from gpmpc.mpc import Decision, PredictionSettings, Reference, Timing
-from gpmpc.mpc._sqp import _each
 from gpmpc.mpc.gp_mpc import GPMPC
 from gpmpc.mpc.problem import Box, Problem, Tracking
 from gpmpc.propagation import Linearization
@@ -271,22 +270,12 @@ def test_a_step_that_leads_the_model_out_of_its_numbers_is_shortened(start):
     assert decision.iterations > 4
 
 
-def test_a_plan_that_a_model_cannot_predict_leaves_those_beside_it():
-    def predict(plans):
-        if 0 in plans:
-            raise DataError("beyond the table")
-        return [1 / plan for plan in plans]
-
-    assert _each(predict, [2, 0, 4]) == [[0.5], [], [0.25]]
-    assert _each(predict, [4, 2]) == [[0.25], [0.5]]
-
-
 def test_the_first_step_from_the_last_plan_needs_no_roll_out_and_ends_where_others_do(quadrotor, monkeypatch):
     problem = Problem(Tracking([1.0] * 6, [1.0] * 3), **BOX)
     settings = PredictionSettings(covariance="none")
     controller = GPMPC(quadrotor, Linearization(), problem, 10, HOVER, settings, iterations=20)
-    obeying, rolled = controller.prediction.obeying, []
-    monkeypatch.setattr(controller.prediction, "obeying", lambda *given: rolled.append(1) or obeying(*given))
+    roll_out, rolled = controller.prediction.roll_out, []
+    monkeypatch.setattr(controller.prediction, "roll_out", lambda *given: rolled.append(1) or roll_out(*given))
     reference, moved = Reference(np.tile([0.5, 0.0] * 3, (11, 1))), Gaussian.certain(np.array([-0.3, 0.2] * 3))
     last = controller.control(Gaussian.certain(np.zeros(6)), reference)
     assert rolled
@@ -308,7 +297,7 @@ def test_inputs_that_lead_a_model_out_of_its_numbers_begin_a_plan_at_the_state()
     belief, reference = Gaussian.certain(np.array([0.5])), Reference(np.zeros((13, 1)))
     last = controller.control(belief, reference)
     request = controller.prediction.read(belief, reference, last, plan=np.full((12, 1), 50.0))
-    assert not request.continues
+    assert request.states is not None
     assert controller.prediction.initial_guess(request).states.ravel().tolist() == [0.5] * 13
     decision = controller.control(belief, reference, last, plan=np.full((12, 1), 50.0))
     assert decision.status is Status.SOLVED
