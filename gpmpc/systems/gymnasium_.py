@@ -1,4 +1,4 @@
-"""Takes a gymnasium environment as a system.
+"""Takes a gymnasium environment as a system, and offers this package's systems as gymnasium environments.
 
 An environment moves on by itself: it is stepped from where it stands, and set to another state only where it can be (a
 MuJoCo environment whose observation is qpos, qvel). Where it ends an episode, a flight is lost. Needs ``gpmpc[sim]``.
@@ -9,11 +9,14 @@ from typing import Any
 
 import numpy as np
 
+from gpmpc import systems
 from gpmpc.exceptions import SettingError, ShapeError
 from gpmpc.systems._simulators import Simulator, library
-from gpmpc.systems._system import System
+from gpmpc.systems._system import System, step
 
 Array = np.ndarray
+OURS = ("acrobot", "cart_pole", "double_integrator", "double_pendulum", "pendulum", "planar_quadrotor")
+OURS += ("stirred_tank", "translational")
 
 
 class _Environment(Simulator):
@@ -99,3 +102,60 @@ def gymnasium_system(
     lower, upper = dynamics.limits
     given = {"name": str(environment), "input_lower": lower, "input_upper": upper} | settings
     return System(dynamics, float(time_step), 1, **given)
+
+
+def make_environment(system: System | str, **settings: Any) -> Any:
+    """Makes a gymnasium environment of a system, or of one of this package's by name and settings.
+
+    The observation is the state. The reward is minus the squared distance of the tracked states from the goal; an
+    episode ends where they are farther from it than at the start, and than ``System.lost``.
+    """
+    gymnasium = library("gymnasium")
+    flown: System = getattr(systems, system)(**settings) if isinstance(system, str) else system
+
+    class Environment(gymnasium.Env):  # type: ignore[name-defined]
+        """A system as an environment."""
+
+        metadata: Any = {"render_modes": []}  # noqa: RUF012
+
+        def __init__(self) -> None:
+            n = len(flown.state_names)
+            lower, upper = np.array(flown.input_lower), np.array(flown.input_upper)
+            self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (n,), np.float64)
+            self.action_space = gymnasium.spaces.Box(lower, upper, dtype=np.float64)
+            self.state = np.array(flown.goal)
+
+        def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Array, dict]:
+            """Starts where the system starts, or from its region."""
+            super().reset(seed=seed)
+            region: Any = flown.region if flown.start is None else None
+            start: Any = flown.start or flown.goal if region is None else self.np_random.uniform(*region)
+            self.state = np.array(start, dtype=float)
+            self._limit = max(flown.lost, 1.001 * self._distance())
+            return self.state.copy(), {}
+
+        def step(self, action: Array) -> tuple[Array, float, bool, bool, dict]:
+            """Takes one step; the action is clipped."""
+            action = np.clip(np.asarray(action, dtype=float), flown.input_lower, flown.input_upper)
+            with np.errstate(over="ignore", invalid="ignore"):
+                self.state = step(flown, self.state, action)
+            distance = self._distance()
+            return self.state.copy(), -(distance**2), not distance <= self._limit, False, {}
+
+        def _distance(self) -> float:
+            errors = self.state - flown.goal
+            errors[flown.angle_indices] = (errors[flown.angle_indices] + np.pi) % (2 * np.pi) - np.pi
+            return float(np.linalg.norm(errors[flown.tracked_indices]))
+
+    return Environment()
+
+
+def register_environments() -> list[str]:
+    """Registers this package's systems as gymnasium environments, such as ``gpmpc/cart_pole-v0``; returns the names."""
+    gymnasium = library("gymnasium")
+    names = [f"gpmpc/{name}-v0" for name in OURS]
+    for name, system in zip(names, OURS, strict=True):
+        if name not in gymnasium.registry:
+            entry = f"{__name__}:make_environment"
+            gymnasium.register(name, entry_point=entry, max_episode_steps=500, kwargs={"system": system})
+    return names

@@ -1,4 +1,4 @@
-"""Foreign simulators are systems like any other."""
+"""Foreign simulators are systems like any other, and this package's systems are environments."""
 
 import sys
 from functools import partial
@@ -14,8 +14,8 @@ from gpmpc.mpc.problem import Box, Problem, Tracking
 from gpmpc.propagation import Linearization
 from gpmpc.simulation import closed_loop, closed_loops
 from gpmpc.studies.flight import Experiment, run_trial
-from gpmpc.systems import step, step_many
-from gpmpc.systems.gymnasium_ import gymnasium_system
+from gpmpc.systems import planar_quadrotor, step, step_many
+from gpmpc.systems.gymnasium_ import OURS, gymnasium_system, make_environment, register_environments
 from gpmpc.systems.mujoco_ import mujoco_system
 
 gymnasium = pytest.importorskip("gymnasium")
@@ -63,19 +63,30 @@ def lagging(tmp_path):
     return path
 
 
-class Rolling(gymnasium.Env):
-    """A mass of 1 kg on a line, whose episodes end ten metres off."""
+@pytest.mark.parametrize("name", OURS)
+@pytest.mark.filterwarnings("ignore:.*we recommend using a symmetric and normalized space.*:UserWarning")
+@pytest.mark.filterwarnings("ignore:.*A Box observation space m.*imum value is -?infinity.*:UserWarning")
+def test_our_systems_are_environments_that_pass_gymnasiums_checker(name):
+    from gymnasium.utils.env_checker import check_env
 
-    action_space = gymnasium.spaces.Box(-1, 1, (1,), np.float64)
-    observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (2,), np.float64)
+    assert f"gpmpc/{name}-v0" in register_environments()
+    check_env(gymnasium.make(f"gpmpc/{name}-v0").unwrapped, skip_render_check=True)
 
-    def reset(self, *, seed=None, options=None):
-        self.state = np.array([1.0, 0.0])
-        return self.state, {}
 
-    def step(self, action):
-        self.state = self.state + 0.1 * np.array([self.state[1], action[0]])
-        return self.state, 0.0, abs(self.state[0]) > 10, False, {}
+def test_an_environment_of_ours_moves_as_its_system_and_ends_where_it_is_lost():
+    environment, system = make_environment("planar_quadrotor"), planar_quadrotor()
+    state, _ = environment.reset(seed=0)
+    assert np.array_equal(state, system.start)
+    for _ in range(200):
+        expected = step(system, state, np.zeros(2))
+        state, reward, terminated, truncated, _ = environment.step(np.zeros(2))
+        assert np.array_equal(state, expected)
+        assert reward == pytest.approx(-(np.hypot(state[0], state[2]) ** 2))
+        assert not truncated
+        if terminated:
+            break
+    assert terminated
+    assert np.hypot(state[0], state[2]) > 10
 
 
 def taken(**settings):
@@ -112,7 +123,7 @@ class Pushing:
 
 
 def test_where_an_environment_ends_its_episode_the_flight_ends_as_lost():
-    system = gymnasium_system(Rolling(), time_step=0.1, tracked=["x1"])
+    system = gymnasium_system(make_environment("double_integrator"), time_step=0.1, tracked=["x1"])
     with pytest.raises(Diverged, match="the simulator has ended its episode, at state") as caught:
         closed_loop(system, Pushing(), np.zeros((203, 2)), None, 200)
     assert np.abs(caught.value.flown.states[-1, 0]) < 10
