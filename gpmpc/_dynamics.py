@@ -196,16 +196,10 @@ def check_next_states(model: Any) -> tuple[int, int]:
 def check_query(model: Any, state: Tensor, input: Tensor) -> None:
     """Raises unless a state (*batch, n) and an input (*batch, m) are tensors of a model's shape, type and device."""
     check_tensors(state=state, input=input)
-    if state.shape[-1:] != (model.state_dim,) or input.shape[-1:] != (model.input_dim,):
-        got = [tensor.shape[-1] if tensor.dim() else "a scalar" for tensor in (state, input)]
-        raise ShapeError(
-            f"the model has {model.state_dim} states and {model.input_dim} inputs; got {got[0]} and {got[1]}"
-        )
-    if state.shape[:-1] != input.shape[:-1]:
-        raise ShapeError(
-            "state (*batch, n) and input (*batch, m) must have the same batch; "
-            f"got {tuple(state.shape[:-1])} and {tuple(input.shape[:-1])}"
-        )
+    n, m = model.state_dim, model.input_dim
+    if state.shape[-1:] != (n,) or input.shape != (*state.shape[:-1], m):
+        got = f"{tuple(state.shape)} and {tuple(input.shape)}"
+        raise ShapeError(f"the model takes a state (*batch, {n}) and an input (*batch, {m}); got {got}")
     for name, value in (("state", state), ("input", input)):
         if value.dtype != model.dtype or value.device != model.device:
             got = f"{value.dtype} on {value.device}"
@@ -214,11 +208,10 @@ def check_query(model: Any, state: Tensor, input: Tensor) -> None:
 
 def check_destination(device: Any, dtype: Any) -> None:
     """Raises unless torch finds the device, and the type is float32 or float64; None stays where it is."""
-    if device is not None:
-        try:
-            torch.empty(0, device=device)
-        except (AssertionError, RuntimeError, TypeError) as error:
-            reason = str(error).partition("\n")[0]
-            raise SettingError("device", f"must be one that torch finds here; got {device!r} ({reason})") from error
+    try:
+        torch.empty(0, device=device)
+    except (AssertionError, RuntimeError, TypeError) as error:
+        reason = str(error).partition("\n")[0]
+        raise SettingError("device", f"must be one that torch finds here; got {device!r} ({reason})") from error
     if dtype not in (None, torch.float32, torch.float64):
         raise SettingError("dtype", f"must be torch.float32 or torch.float64; got {dtype!r}")

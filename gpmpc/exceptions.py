@@ -83,18 +83,9 @@ class RecordingError(GpmpcError, RuntimeError):
 def check_number(
     key: str, value: Any, *, above: float | None = None, least: float | None = None, whole: bool = False, unit: str = ""
 ) -> None:
-    """Raises unless a setting is one finite number (not a truth value) of the kind and in the range asked for.
+    """Raises ``SettingError`` unless a setting is one finite number (not a truth value) as asked for.
 
-    Args:
-        key: The setting's name.
-        value: What was given.
-        above: It must be larger than this.
-        least: It must be this or more.
-        whole: It must be an integer.
-        unit: Named in the message, such as "[kg]".
-
-    Raises:
-        SettingError: It is not.
+    Larger than ``above``, ``least`` or more, ``whole`` or not; the unit, such as "[kg]", is named in the message.
     """
     right_type = isinstance(value, int) if whole else isinstance(value, int | float)
     if (

@@ -37,7 +37,8 @@ def in_processes(
     """
     if not jobs:
         return
-    workers, before = min(workers or cores(), len(jobs)), set(active_children())
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    workers, before = min(workers or cores, len(jobs)), set(active_children())
     mine: dict[str, Any] = {"initializer": end_with, "initargs": (os.getpid(),)}
     with _one_thread_each(), ProcessPoolExecutor(workers, get_context("spawn"), **mine) as pool:
         try:  # around the start as well: leaving the pool waits for what was begun
@@ -50,11 +51,6 @@ def in_processes(
             for child in set(active_children()) - before:
                 child.terminate()
             raise
-
-
-def cores() -> int:
-    """Cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def end_with(parent: int) -> None:

@@ -32,7 +32,7 @@ def check_qp_solver(solver: QPSolver, tolerance: float = 1e-6) -> None:
     Raises:
         AssertionError: The solver breaks a promise; the message says which, on which problem.
     """
-    for known in (*_textbook(), *_degenerate(), *_constructed()):
+    for known in (*_small(), *_constructed()):
         solution = _solve(solver, known.name, known.problem, None)
         _check(solution, known, tolerance)
         first, n, right = solution.x.copy(), len(solution.x), solution.active_set
@@ -56,8 +56,8 @@ def check_qp_solver(solver: QPSolver, tolerance: float = 1e-6) -> None:
             require(status is Status.INFEASIBLE, name, f"expected INFEASIBLE, got {status.name}")
 
 
-def _textbook() -> list[_Known]:
-    """Small problems that can be solved by hand."""
+def _small() -> list[_Known]:
+    """Problems that can be solved by hand; some have more active constraints than variables, or repeat rows."""
     book, centre = "Nocedal and Wright, Numerical Optimization (2006), example", np.array([3.0, -0.5, -7.0])
     P, G = [[6.0, 2.0, 1.0], [2.0, 5.0, 2.0], [1.0, 2.0, 4.0]], [[1.0, 0.0, 1.0], [0.0, 1.0, 1.0]]
     equalities = QuadraticProgram(P, [-8.0, -3.0, -3.0], G, [3.0, 0.0], [3.0, 0.0])
@@ -65,17 +65,6 @@ def _textbook() -> list[_Known]:
     inequalities = QuadraticProgram(2.0 * np.eye(2), [-2.0, -5.0], rows, lower, upper, lb=[0.0, 0.0])
     box = QuadraticProgram(np.eye(3), -centre, lb=[-1.0, -1.0, -1.0], ub=[1.0, 1.0, 1e20])
     redundant = QuadraticProgram([[2.0]], [-4.0], [[1.0], [2.0]], [-_INF, -_INF], [1.5, 2.0])
-    return [
-        _Known("no constraints", QuadraticProgram(np.diag([2.0, 4.0]), [-2.0, -8.0]), [1.0, 2.0], [0.0, 0.0]),
-        _Known("projection on a box", box, [1.0, -0.5, -1.0], [2.0, 0.0, -6.0]),
-        _Known(f"{book} 16.2 (equalities)", equalities, [2.0, -1.0, 1.0], [0.0, 0.0, 0.0, -3.0, 2.0]),
-        _Known(f"{book} 16.4 (inequalities)", inequalities, [1.4, 1.7], [0.0, 0.0, 0.8, 0.0, 0.0]),
-        _Known("one variable, one redundant and one active row", redundant, [1.0], [0.0, 0.0, 1.0]),
-    ]
-
-
-def _degenerate() -> list[_Known]:
-    """Vertices with more constraints than variables; repeated, scaled and zero rows."""
     fan, apex = np.array([[np.cos(a), np.sin(a)] for a in np.linspace(0.1, 1.4, 7)]), np.array([1.0, 2.0])
     lines = QuadraticProgram(np.diag([1.0, 3.0]), [-9.0, -20.0], fan, np.full(7, -_INF), fan @ apex)
     rows = np.outer([1.0, 1e-4, 1e4, 1.0, -3.0], [1.0, 1.0])
@@ -84,6 +73,11 @@ def _degenerate() -> list[_Known]:
     rows = [[1.0, 1.0], [1.0, -1.0], [2.0, 0.0]]
     equal = QuadraticProgram(np.eye(2), [5.0, -5.0], rows, [3.0, 1.0, 4.0], [3.0, 1.0, 4.0])
     return [
+        _Known("no constraints", QuadraticProgram(np.diag([2.0, 4.0]), [-2.0, -8.0]), [1.0, 2.0], [0.0, 0.0]),
+        _Known("projection on a box", box, [1.0, -0.5, -1.0], [2.0, 0.0, -6.0]),
+        _Known(f"{book} 16.2 (equalities)", equalities, [2.0, -1.0, 1.0], [0.0, 0.0, 0.0, -3.0, 2.0]),
+        _Known(f"{book} 16.4 (inequalities)", inequalities, [1.4, 1.7], [0.0, 0.0, 0.8, 0.0, 0.0]),
+        _Known("one variable, one redundant and one active row", redundant, [1.0], [0.0, 0.0, 1.0]),
         _Known("seven lines through the solution", lines, apex),
         _Known("the same row five times, at five scales", scales, [0.5, 0.5]),
         _Known("a zero row, and a row that repeats the box", zero, [1.0, 0.0]),

@@ -201,7 +201,7 @@ def test_a_frozen_model_knows_its_sizes_noise_and_type_and_can_be_moved():
     assert single.dtype == torch.float32
     assert torch.allclose(single.predict(x.float(), u.float()).mean.double(), gp.predict(x, u).mean, atol=1e-3)
     assert gp.dtype == torch.float64
-    with pytest.raises(ShapeError, match="2 states and 1 inputs; got 2 and 2"):
+    with pytest.raises(ShapeError, match=r"an input \(\*batch, 1\); got \(5, 2\) and \(5, 2\)"):
         gp.predict(x, torch.zeros(5, 2))
 
 

@@ -152,5 +152,5 @@ def test_a_posterior_in_single_precision_predicts_nearly_the_same():
 
 
 def test_a_query_of_other_dimensions_is_refused():
-    with pytest.raises(ShapeError, match="2 states and 1 inputs; got 2 and 0"):
+    with pytest.raises(ShapeError, match=r"an input \(\*batch, 1\); got \(2,\) and \(0,\)"):
         posterior().predict(torch.zeros(2))
