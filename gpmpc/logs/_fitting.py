@@ -63,7 +63,7 @@ def fit_nominal(model: LogModel, theta0: Array | None, log: Log, steps: int = ST
         DataError: No piece of the log is long enough, or the rollouts at theta0 are not finite.
     """
     check_number("steps", steps, least=1, whole=True)
-    theta0 = model.nominal.start if theta0 is None else np.asarray(theta0, dtype=float)
+    theta0 = np.asarray(model.nominal.start if theta0 is None else theta0, dtype=float)
     if theta0.shape != (len(model.nominal.parameter_names),):
         raise ShapeError(f"theta0 must have {len(model.nominal.parameter_names)} entries; got {theta0.shape}")
     cut = log.windows(steps, max(model.past, PAST), most=WINDOWS)
@@ -209,13 +209,11 @@ def _responses(model: LogModel, windows: Windows, steps: Sequence[int]) -> Array
             G[i] = P @ B[:, i]
             P = P @ A[:, i]
         for t, constant in enumerate(TIME_CONSTANTS):
-            if constant == 0:
-                total = np.square(G).sum(axis=0)
-            else:  # sum over i, j of rho^|i - j| G_i G_j, in one pass
-                rho, (tail, total) = np.exp(-windows.time_step / constant), np.zeros((2, *G[0].shape))
-                for g in G:
-                    total += g * (g + 2 * tail)
-                    tail = rho * (tail + g)
+            rho = np.exp(-windows.time_step / max(constant, 1e-9))
+            tail, total = np.zeros((2, *G[0].shape))
+            for g in G:  # the sum over i, j of rho^|i - j| G_i G_j, in one pass
+                total += g * (g + 2 * tail)
+                tail = rho * (tail + g)
             found[:, s, :, t * o : (t + 1) * o] = total
         found[:, s, :, len(TIME_CONSTANTS) * o :] = np.square(P) + np.eye(e)
     return found

@@ -1,10 +1,9 @@
 """Looks at a log before anything is learned from it: what can be learned, and what its rows hide.
 
-For each stream: rate, jitter, gaps, stamps that repeat or run backwards. For each channel: missing and repeated values,
-the floor of white noise (second differences; their variance is six times that of the noise), and smoothing (second
-differences of white noise have a correlation of -2/3 with the ones before, those of a smoothed signal a positive one).
-For pairs of channels: the delay, block by block, so that clocks that wander are seen. With a mapping, for each input:
-the share of its variance that the states explain linearly; what only follows the states teaches nothing of its own.
+White noise is found by second differences, whose variance is six times that of the noise, and smoothing by their
+correlation with the ones before: -2/3 for white noise, positive for a smoothed signal. Delays between channels are
+found block by block, so that clocks that wander are seen. An input of which the states explain most of the variance,
+linearly, teaches nothing of its own.
 """
 
 from dataclasses import dataclass

@@ -12,7 +12,7 @@ import numpy as np
 import yaml
 
 from gpmpc.exceptions import SettingError, check_choice, check_number
-from gpmpc.logs._kinematics import StateGroup, StateSpace
+from gpmpc.logs._kinematics import Array, StateGroup, StateSpace
 
 Role = Literal["states", "inputs", "context"]
 ROLES: tuple[Role, ...] = ("states", "inputs", "context")
@@ -123,6 +123,11 @@ class LogMapping:
     def of(self, role: Role) -> tuple[Signal, ...]:
         """The signals of one role."""
         return tuple(signal for signal in self.signals if signal.role == role)
+
+    def split(self, values: Array) -> list[Array]:
+        """Splits rows of all signals (K, n + m + c) into those of states, inputs and context."""
+        sizes = [sum(len(signal.group.entries) for signal in self.of(role)) for role in ROLES]
+        return [np.ascontiguousarray(part) for part in np.split(values, np.cumsum(sizes[:-1]), axis=1)]
 
     def column_names(self, role: Role) -> tuple[str, ...]:
         """The columns of one role in the order that they come out in, with what was done to their values."""

@@ -25,7 +25,7 @@ from gpmpc.logs._kinematics import (
     rotation_vector,
 )
 from gpmpc.logs._log import Finding, Log, LogRun
-from gpmpc.logs._mapping import ROLES, TIME_UNITS, LogMapping, Signal
+from gpmpc.logs._mapping import TIME_UNITS, LogMapping, Signal
 from gpmpc.logs._readers import STAMP, Streams, read_streams
 
 REST_TIME = 0.5  # [s] for which nothing moves at rest
@@ -46,7 +46,7 @@ class _Table(NamedTuple):
 
     name: str
     time: Array
-    values: dict[str, Array]  # by role, (K, c)
+    values: Array  # states, inputs and context (K, n + m + c)
     outside: np.ndarray  # (K,) rows that the mapping leaves out
     breaks: np.ndarray  # (K,) rows before which time ran backwards
     note: _Note
@@ -92,7 +92,7 @@ def read_log(
     if not tables:
         raise DataError("no log file was given")
     step = 1 / mapping.rate if mapping.rate else float(np.median(np.concatenate([np.diff(t.time) for t in tables])))
-    spread = _spread(tables)
+    spread = _spread([mapping.split(table.values)[0] for table in tables])
     usable = [run for table in tables if (run := _make_run(table, step, spread, mapping)) is not None]
     if not usable:
         said = "; ".join(f"{f.run}: {f.text}" for f in findings[-3:])
@@ -107,22 +107,13 @@ def read_log(
 
 def _tabulate(where: str, name: str, streams: Streams, mapping: LogMapping, note: _Note) -> _Table:
     """Puts the signals of a run on one grid of times, in the units and conventions of ``gpmpc.logs``."""
-    stamps: dict[str, Stamps] = {}
-    samples: dict[tuple[str, str], Array] = {}
-    outside: list[tuple[str, Array]] = []
-    for topic in dict.fromkeys(signal.topic for signal in mapping.signals):
-        label, of_topic = (f"{where}, {topic}", f" of {topic}") if topic else (where, "")
+    stamps, tables = {}, {}
+    labels = {signal.topic: f"{where}, {signal.topic}" if signal.topic else where for signal in mapping.signals}
+    for topic, label in labels.items():
         stamps[topic] = found = ordered_stamps(_time(label, streams[topic], mapping), label)
+        tables[topic], of_topic = streams[topic].iloc[found.rows], f" of {topic}" if topic else ""
         note("repeated stamp", found.repeated, f"{found.repeated} rows{of_topic}: left out")
         note("stamp runs backwards", found.backwards, f"{found.backwards} rows{of_topic}: left out")
-        table = streams[topic].iloc[found.rows]
-        for signal in mapping.signals:
-            if signal.topic == topic:
-                samples[signal.role, signal.name] = _values(label, table, signal, note)
-        for column, (low, high) in mapping.keep.items():
-            if column in table or topic == "":
-                kept = _numbers(label, table, column)
-                outside.append((topic, np.where((kept >= low) & (kept <= high), 0.0, 1.0)))
     if mapping.rate is None:
         ((grid, breaks),) = ((found.time, found.after_reversal) for found in stamps.values())
     else:
@@ -140,14 +131,17 @@ def _tabulate(where: str, name: str, streams: Streams, mapping: LogMapping, note
         usual = max(float(np.median(np.diff(time))), 1 / mapping.rate)
         return resample(time, values, grid, rule, max_gap or 1.5 * usual)
 
-    values: dict[str, Array] = {}
-    for role in ROLES:
-        parts = [on_grid(s.topic, samples[role, s.name], s.rule, mapping.max_gap) for s in mapping.of(role)]
-        values[role] = np.concatenate([np.empty((len(grid), 0)), *parts], axis=1)
-    left_out = np.zeros(len(grid), dtype=bool)
-    for topic, rows in outside:
-        left_out |= on_grid(topic, rows[:, None], "hold", np.inf)[:, 0] > 0
-    return _Table(name, grid, values, left_out, breaks, note)
+    parts = []
+    for s in mapping.signals:
+        parts.append(on_grid(s.topic, _values(labels[s.topic], tables[s.topic], s, note), s.rule, mapping.max_gap))
+    outside = np.zeros(len(grid), dtype=bool)
+    for column, (low, high) in mapping.keep.items():
+        for topic, table in tables.items():
+            if column in table or topic == "":
+                kept = _numbers(labels[topic], table, column)[:, None]
+                left_out = np.where((kept >= low) & (kept <= high), 0.0, 1.0)
+                outside |= on_grid(topic, left_out, "hold", np.inf)[:, 0] > 0
+    return _Table(name, grid, np.concatenate(parts, axis=1), outside, breaks, note)
 
 
 def _time(label: str, table: pd.DataFrame, mapping: LogMapping) -> Array:
@@ -208,10 +202,9 @@ def _quaternions(label: str, values: Array, signal: Signal, note: _Note) -> Arra
     return values
 
 
-def _spread(tables: Sequence[_Table]) -> Array:
+def _spread(states: Sequence[Array]) -> Array:
     """Usual spread of each state (n,) over all runs: half of the range of 80 % of the rows."""
-    states = np.concatenate([table.values["states"] for table in tables])
-    present = states[np.isfinite(states).all(axis=1)]
+    present = np.concatenate([rows[np.isfinite(rows).all(axis=1)] for rows in states])
     if not len(present):
         raise DataError("no row has a value of every state")
     low, high = np.quantile(present, [0.1, 0.9], axis=0)
@@ -220,10 +213,10 @@ def _spread(tables: Sequence[_Table]) -> Array:
 
 def _make_run(table: _Table, step: float, spread: Array, mapping: LogMapping) -> LogRun | None:
     """Leaves out what cannot be used, and marks where a new piece begins; None where nothing is left."""
-    states, inputs, context = (table.values[role] for role in ROLES)
+    states, inputs, _ = mapping.split(table.values)
     usable, note = np.ones(len(table.time), dtype=bool), table.note
 
-    def leave_out(rows: np.ndarray, kind: str, text: str) -> None:
+    def leave_out(rows: Any, kind: str, text: str) -> None:
         count = (rows & usable).sum()
         note(kind, count, f"{count} of {len(rows)} rows {text}: left out")
         usable[rows] = False
@@ -231,8 +224,7 @@ def _make_run(table: _Table, step: float, spread: Array, mapping: LogMapping) ->
     leave_out(table.outside, "outside of keep", "outside the ranges of keep")
     if mapping.rest == "drop":
         leave_out(_at_rest(states, inputs, spread, step), "at rest", "where nothing moves")
-    absent = np.asarray(np.isnan(np.concatenate([states, inputs, context], axis=1)).any(axis=1))
-    leave_out(absent, "missing value", "in a gap or without a value")
+    leave_out(np.isnan(table.values).any(axis=1), "missing value", "in a gap or without a value")
     for signal, at in zip(mapping.of("states"), mapping.space.columns, strict=True):
         if mapping.held == "use" or len(signal.columns) < 2:  # a single one may repeat by its resolution
             continue
@@ -248,15 +240,14 @@ def _make_run(table: _Table, step: float, spread: Array, mapping: LogMapping) ->
         note("nothing left", len(table.time), "no row can be used: the run is left out")
         return None
     times = np.diff(table.time[rows])
-    gaps = times > (mapping.max_gap if mapping.max_gap and not mapping.rate else 1.5 * step)
-    inner = gaps & (np.diff(rows) == 1)
-    note("gap", inner.sum(), f"{inner.sum()} gaps, up to {times[inner].max(initial=0):.3g} s: boundaries")
-    early = times < 0.5 * step
-    text = f"{early.sum()} rows less than half a time step after the row before: boundaries (state a rate)"
-    note("jitter", early.sum(), text)
-    breaks = gaps | (np.diff(rows) > 1) | table.breaks[rows[1:]] | early
+    uneven = (times > (mapping.max_gap if mapping.max_gap and not mapping.rate else 1.5 * step)) | (times < 0.5 * step)
+    inner = times[uneven & (np.diff(rows) == 1)]
+    if len(inner):
+        text = f"{len(inner)} steps of {inner.min():.3g} to {inner.max():.3g} s: boundaries (a rate resamples)"
+        note("gap", len(inner), text)
+    breaks = uneven | (np.diff(rows) > 1) | table.breaks[rows[1:]]
     begins = (0, *(np.flatnonzero(breaks) + 1).tolist())
-    return LogRun(table.name, table.time[rows], states[rows], inputs[rows], context[rows], begins)
+    return LogRun(table.name, table.time[rows], *mapping.split(table.values[rows]), begins=begins)
 
 
 def _at_rest(states: Array, inputs: Array, spread: Array, step: float) -> np.ndarray:

@@ -6,13 +6,13 @@ The disturbance d of an output is the mean, over the last rows before a predicti
 model says; it is held through the prediction, and so is the context c (a battery's voltage reacts to the inputs, and
 its future is not known).
 
-A nominal model has ``parameter_names``, a starting point ``start`` and a method ``outputs(theta, states, inputs,
-context)``; theta unpacks into one array a parameter, which broadcasts against ``states[..., 0]``, so that many
-parameter vectors are rolled out at once.
+A nominal model has ``parameter_names`` (P), ``start`` (P,) at which a fit begins, and a method ``outputs(theta, states,
+inputs, context)`` (..., o); theta unpacks into one array a parameter, which broadcasts against ``states[..., 0]``, so
+that many parameter vectors are rolled out at once.
 """
 
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -23,16 +23,6 @@ from gpmpc.logs._log import Windows
 
 STEPS = 50  # of the rollouts that models are judged by
 PAST = 20  # rows before them
-
-
-class Nominal(Protocol):
-    """Outputs (..., o) as a function of P named parameters, with the point (P,) at which a fit begins."""
-
-    @property
-    def parameter_names(self) -> tuple[str, ...]: ...
-    @property
-    def start(self) -> Array: ...
-    def outputs(self, theta: Any, states: Array, inputs: Array, context: Array) -> Array: ...
 
 
 @dataclass(frozen=True)
@@ -130,7 +120,7 @@ class LogModel:
     """A model of the outputs behind a log."""
 
     kinematics: Kinematics  #: what the outputs do
-    nominal: Nominal  #: the part with parameters
+    nominal: Any  #: the part with parameters, such as a ``MultirotorNominal``
     theta: Array  #: its parameters (P,)
     history: tuple[int, ...]  #: rows over which each output's disturbance is averaged (o,); zero for none
     lag: int = 0  #: rows by which the inputs act late
@@ -146,7 +136,7 @@ class LogModel:
         return max(self.history) + self.lag
 
     def outputs(self, states: Array, inputs: Array, context: Array, theta: Any = None) -> Array:
-        """Computes the outputs (..., o) without disturbance; ``theta`` as of ``Nominal`` instead of the own one."""
+        """Computes the outputs (..., o) without disturbance; ``theta`` (unpacked) instead of the own one."""
         y = self.nominal.outputs(self.theta if theta is None else theta, states, inputs, context)
         if self.gps:
             whole = np.broadcast_to(context, (*states.shape[:-1], context.shape[-1]))

@@ -24,7 +24,7 @@ from gpmpc.gp._storage import posterior_of_parts, posterior_parts, read_model, w
 from gpmpc.logs._fitting import NominalFit, OutputNoise
 from gpmpc.logs._kinematics import Array, Increments, RigidBody, StateGroup, StateSpace, wrap
 from gpmpc.logs._learning import Candidate, Learned
-from gpmpc.logs._rollouts import AffineNominal, LogModel, MultirotorNominal, Nominal, OutputGP
+from gpmpc.logs._rollouts import AffineNominal, LogModel, MultirotorNominal, OutputGP
 from gpmpc.models import load_model
 from gpmpc.systems import System
 
@@ -84,7 +84,7 @@ def _learned(path: Path, header: dict[str, Any], tensors: dict[str, Tensor]) -> 
     kinematics = RigidBody(space) if header["kinematics"] == "RigidBody" else Increments(space)
     name, settings = header["nominal"]
     if name == "MultirotorNominal":
-        nominal: Nominal = MultirotorNominal(**settings)
+        nominal = MultirotorNominal(**settings)
     else:  # older files have a Still
         nominal = AffineNominal(kinematics, settings.get("fitted", name != "Still"))
     gps = []

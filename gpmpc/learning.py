@@ -11,15 +11,10 @@ Length-scales and signal variances are the model's: the plant may differ by a sh
 was seen lately d is zero, and with one point it is the estimate of a constant disturbance.
 
 Each step of the flight becomes a point of the change, whether that is used or not. The model with its change and the
-one without predict the step before they see it, and
-
-* the change is **used** once its predictions have won: their log densities, summed over a window of steps, exceed those
-  of the model alone by a margin;
-* it is **no longer used** once they have lost, or where a decision could not be applied;
-* a step that neither chance nor the noise of late explains is a **surprise**: the plant is another one. What was seen
-  before is forgotten, and the change is used at once.
-
-Noise may be larger than the model believes: it is scaled by what successive errors differ by, in the median.
+one without predict each step before they see it: the change is used once its log densities, summed over a window of
+steps, lead by a margin, and no longer once they trail, or where a decision could not be applied. After a step that
+neither chance nor the noise of late explains, what was seen before is forgotten and the change is used at once. The
+model's noise is scaled by what successive errors differ by, in the median, where that is more.
 """
 
 from dataclasses import dataclass, field, fields, replace
@@ -207,6 +202,7 @@ class ChangedModel(Wrapper):
 
     @property
     def noise_covariance(self) -> Tensor:
+        """Of the observations (n, n)."""
         return self.model.noise_covariance
 
     def predict(self, state: Tensor, input: Tensor) -> Gaussian:
