@@ -109,7 +109,6 @@ def measured(gp: GPPosterior, mode: dict, trials: int, arguments: argparse.Names
         "trials_per_second": {name: trials / float(np.median(values)) for name, values in taken.items()},
         "over_alone": {name: float(np.median(values)) for name, values in ratios.items()},
         "over_alone_least": {name: float(values.min()) for name, values in ratios.items()},
-        "chunk": None if there.bytes_per_question is None else int(2**30 // there.bytes_per_question),
     }
 
 

@@ -66,18 +66,7 @@ def condense(
 @compiled
 def _condense(cost, bounds, stages, start, references, rows, program):
     """Writes the program in input coordinates, and returns the growth of A: P_ii over the last stage's, summed."""
-    growth, m = 0.0, bounds.lower.shape[1]
-    write_hessian_and_rows(cost, bounds, stages, rows, program)
-    for i in range(len(program.P)):
-        growth += program.P[i, i] / program.P[len(program.P) - m + i % m, len(program.P) - m + i % m]
-    write_gradient_and_bounds(cost, bounds, stages, start, references, rows, program)
-    return growth
-
-
-@njit_inner
-def write_hessian_and_rows(cost, bounds, stages, rows, program):
-    """Writes P and G in input coordinates, which do not depend on where the state is."""
-    (H, m), first, P, G = bounds.lower.shape, bounds.rate_lower.size, program.P, program.G
+    (H, m), first, P, G, growth = bounds.lower.shape, bounds.rate_lower.size, program.P, program.G, 0.0
     P[:], G[:] = 0.0, 0.0
     for k in range(H):
         R, following = cost.input[min(k, len(cost.input) - 1)], cost.input[min(k + 1, len(cost.input) - 1)]
@@ -96,6 +85,10 @@ def write_hessian_and_rows(cost, bounds, stages, rows, program):
         _add_constant_stages(cost, stages, rows.E[0], H, P, G[first:])
     else:
         _add_varying_stages(cost, stages, rows, H, P, G[first:])
+    for i in range(H * m):
+        growth += P[i, i] / P[(H - 1) * m + i % m, (H - 1) * m + i % m]
+    _write_gradient_and_bounds(cost, bounds, stages, start, references, rows, program)
+    return growth
 
 
 @njit_inner
@@ -202,7 +195,7 @@ def _add_constant_stages(cost, stages, E, H, P, G):
 
 
 @njit_inner
-def write_gradient_and_bounds(cost, bounds, stages, start, references, rows, program):
+def _write_gradient_and_bounds(cost, bounds, stages, start, references, rows, program):
     """Writes q by the adjoint recursion, and the bounds of the stacked constraints, in input coordinates."""
     A, B, Z, targets, last = stages.A, stages.B, cost.squares, references.states, len(stages.A) - 1
     (H, m), n, p = references.inputs.shape, targets.shape[1], len(start)

@@ -259,10 +259,11 @@ class PredictionModel:
     def roll_out(self, towards: Plan, prediction: Prediction, feedback: Array, request: Request) -> Prediction:
         """The prediction at the plan that obeys the dynamics under a feedback towards another one, within its bounds.
 
-        The feedback is a program's, F_k (H, m, p + m + 1), or that of the stages of ``prediction`` where there is none
-        (0, m, p + m + 1).
+        The feedback is a program's, F_k (H, m, p + m + 1), or that of the stages of ``prediction`` where that is empty.
         """
-        n, linearizer, gains = self.problem.state_dim, self.linearizer, self._towards(prediction, feedback)
+        n, linearizer = self.problem.state_dim, self.linearizer
+        gains = feedback if len(feedback) else -self.gains(*prediction.stages[:2], prediction.cost)
+        gains = np.ascontiguousarray(gains[:, :, :n])
         last, disturbance = request.references.previous_input, request.disturbance
         if linearizer.at_points:
             law = Feedback(towards.states[None], towards.inputs[None], gains[None], *self._limits, last)
@@ -281,11 +282,6 @@ class PredictionModel:
             parts.append(stage)
         stages = Stages(*map(np.concatenate, zip(*parts, strict=True)))
         return self.predict(Plan(states, inputs, covariances), stages, request)
-
-    def _towards(self, prediction: Prediction, feedback: Array) -> Array:
-        """The gains (H, m, n) of ``roll_out``."""
-        gains = feedback if len(feedback) else -self.gains(*prediction.stages[:2], prediction.cost)
-        return np.ascontiguousarray(gains[:, :, : self.problem.state_dim])
 
     def gains(self, A: Array, B: Array, cost: QuadraticCost) -> Array:
         """K_0 .. K_{H-1} (H, m, n) of the feedback u = u_k - K_k (x - mu_k), weighed as at the first stage; or zero."""

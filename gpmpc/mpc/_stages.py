@@ -190,9 +190,6 @@ class ConstraintRows:
         signs: 1 where a row has upper bounds, -1 where it has lower ones (r,).
         applies: Whether a row has a bound at a stage (H, r).
         smooth: Whether there is any ``Inequality``.
-
-    Raises:
-        SettingError: Sides or stages that the horizon does not have.
     """
 
     def __init__(self, problem: Problem, horizon: int, covariance: Covariance):
@@ -233,10 +230,6 @@ class ConstraintRows:
         """The rows, tightened by the covariances (H + 1, n, n), at a plan where smooth constraints are linearised.
 
         ``kappas`` by stage (H,) take the place of those of the constraints that have some.
-
-        Raises:
-            ShapeError: A smooth constraint gives another shape.
-            DataError: It is not finite.
         """
         if self._fixed is not None:
             return self._fixed
@@ -253,10 +246,6 @@ class ConstraintRows:
         E = self._rows(F, covariances[1 : stages + 1])
         return StageRows(np.ascontiguousarray(E), D, lower, upper)
 
-    def all_prices(self, hard_rows: int) -> Array | None:
-        """The prices of all rows of a program's G, after ``hard_rows`` that have none; None where all are hard."""
-        return np.concatenate([np.full(hard_rows, np.inf), np.tile(self.prices, self._horizon)]) if self.soft else None
-
     def _rows(self, F: Array, covariances: Array) -> Array:
         """E (K, r, p) of gradients F (K, r, n) at covariances of the states (K, n, n); one of either stands for all."""
         K, n, weight = max(len(F), len(covariances)), F.shape[2], self.signs * self._kappa
@@ -268,7 +257,10 @@ class ConstraintRows:
             norms = np.linalg.norm(moved, axis=-1, keepdims=True)
             slopes = np.divide(F * moved, norms, out=np.abs(F), where=norms > 0)
             return np.concatenate([F, weight[:, None] * slopes], axis=2)
-        slopes = F[..., None] * _directions(F, covariances)[:, :, None, :]  # of |S g| by S (K, r, n, n)
+        moved = F @ square_roots(covariances)[0]
+        norms = np.linalg.norm(moved, axis=-1, keepdims=True)
+        directions = np.divide(moved, norms, out=np.zeros_like(moved), where=norms > 0)  # S g / |S g|
+        slopes = F[..., None] * directions[:, :, None, :]  # of |S g| by S (K, r, n, n)
         return np.concatenate([F, (weight[:, None, None] * slopes).reshape(K, -1, n * n)], axis=2)
 
 
@@ -300,13 +292,6 @@ def price_violations(prices, rows, plan, hard_price):
             outside = max(0.0, value - upper[k, e], lower[k, e] - value)
             total += (hard_price if prices[e] == np.inf else prices[e]) * outside
     return total
-
-
-def _directions(F: Array, covariances: Array) -> Array:
-    """S g / |S g| (K, r, n) for rows g of F (K, r, n) and the symmetric roots S of covariances (K, n, n)."""
-    moved = F @ square_roots(covariances)[0]
-    norms = np.linalg.norm(moved, axis=-1, keepdims=True)
-    return np.divide(moved, norms, out=np.zeros_like(moved), where=norms > 0)
 
 
 @compiled

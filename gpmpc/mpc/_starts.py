@@ -77,8 +77,8 @@ class ManyStarts:
         if budget is not None:
             check_number("budget", budget, above=0, unit="[s]")
         self.criterion = self._cost if criterion is None else criterion
-        linearizer = StageLinearizer(controller.prediction.model, Linearization(), "none")
-        self._weights = StageCosts(self.problem, H, linearizer).quadratic
+        means = StageLinearizer(controller.prediction.model, Linearization(), "none")
+        self._weights = StageCosts(self.problem, H, means).quadratic
         self.limit, self.budget = limit, budget
 
     def control(
@@ -114,9 +114,9 @@ class ManyStarts:
         parameters: Any = None,
         first: int = 0,
     ) -> Iterator[tuple[Decision, float]]:
-        """The decisions of all starts from the ``first`` on, each with its criterion: infinite if not applicable.
+        """Makes the decisions of ``len(self)`` starts, from the ``first`` on, one by one.
 
-        They are made one by one, for those who compare them in their own time. There are ``len(self)`` starts.
+        Each comes with its criterion, infinite if it is not applicable.
         """
         candidates = self._candidates(belief.mean.numpy(), reference.over(self.horizon))
         for goal, guess in islice(candidates, first, None):

@@ -138,13 +138,11 @@ class LQR:
         inputs: Any = request.constant_guess if reference.inputs is None else wanted
         stages = self._linearize(states, inputs, np.empty((0, *request.covariance.shape)))
         modelled = perf_counter()
-        if not all(np.isfinite(part).all() for part in stages[:3]):
-            return request.failed_decision(Status.NUMERICAL_TROUBLE)
         feedback, _ = optimal_feedback(self._cost, stages, request.references)
         if not np.isfinite(feedback).all():
             return request.failed_decision(Status.NUMERICAL_TROUBLE)
-        states, inputs, box, rates = [x], [], self.problem.inputs, self.problem.input_rates
-        (low, high), (down, up) = (bounds.by_stage(self.horizon) for bounds in (box, rates))
+        states, inputs, boxes = [x], [], (self.problem.inputs, self.problem.input_rates)
+        (low, high), (down, up) = (box.by_stage(self.horizon) for box in boxes)
         for k, (A, B, offset, F) in enumerate(zip(*stages[:3], feedback, strict=True)):
             u = F @ np.concatenate([x, last, [1.0]])
             # The box last: where it and the rates contradict each other, the input must at least exist.

@@ -16,6 +16,7 @@ nonlinear problem itself. Where the iteration ends, in the covariance modes of `
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import replace
+from itertools import pairwise
 from time import perf_counter
 from typing import Any
 
@@ -84,8 +85,9 @@ class GPMPC:
         self.solver = DualActiveSet() if solver is None else solver
         check_method("solver", self.solver, "solve", "DualActiveSet()")
         self._prior = self.prediction.linearizer.prior_variances()
-        self._hard = np.where(np.isinf(self.prediction.constraints.prices), np.inf, 0.0)  # prices: of hard rows alone
-        self._prices = self.prediction.constraints.all_prices(self.prediction.bounds.rate_lower.size)
+        rows, hard = self.prediction.constraints, np.full(self.prediction.bounds.rate_lower.size, np.inf)
+        self._hard = np.where(np.isinf(rows.prices), np.inf, 0.0)  # prices: of hard rows alone
+        self._prices = np.concatenate([hard, np.tile(rows.prices, horizon)]) if rows.soft else None  # of rows of G
         if self._prices is not None and not isinstance(self.solver, DualActiveSet):
             rule = "soft constraints need DualActiveSet (penalty=None makes them hard)"
             raise SettingError("solver", f"{rule}; got {type(self.solver).__name__}")
@@ -101,8 +103,7 @@ class GPMPC:
         """Decides the input for one step; see ``Controller.control``.
 
         A belief that is not finite gives ``INVALID_MEASUREMENT``. ``iterations`` of the decision counts quadratic
-        programs; with more than one allowed, ``ITERATION_LIMIT`` says that the tolerance was not reached, and the plan
-        is the best that was: ``suboptimal``.
+        programs; ``ITERATION_LIMIT`` says that the tolerance was not reached: the plan is the best there was.
 
         Args:
             belief: What is known of the state.
@@ -116,28 +117,34 @@ class GPMPC:
             ShapeError: Belief, reference, parameters or plan have other dimensions, or reference inputs are missing.
             DataError: Reference, parameters or plan are not finite.
         """
-        request, clock = self.prediction.read(belief, reference, previous, parameters, plan), _Stopwatch()
+        return self._decide(self.prediction.read(belief, reference, previous, parameters, plan), [perf_counter()])
+
+    def _decide(self, request: Request, laps: list[float], prediction: Prediction | None = None) -> Decision:
+        """The decision on a request from the prediction at its first guess: failed where numbers are not finite."""
         if not request.finite:
             return request.failed_decision(Status.INVALID_MEASUREMENT)
         try:
-            prediction = self.prediction.linearize(self.prediction.initial_guess(request), request)
-            return self._improve(prediction, request, clock)
+            if prediction is None:
+                prediction = self.prediction.linearize(self.prediction.initial_guess(request), request)
+            return self._improve(prediction, request, laps)
         except FAILURES as error:
-            return request.failed_decision(_status_of(error), timing=clock.timing)
+            at_function = isinstance(error, FunctionNotFinite)
+            status = Status.FUNCTION_NOT_FINITE if at_function else Status.NUMERICAL_TROUBLE
+            return request.failed_decision(status, timing=_timing(laps))
 
-    def _improve(self, prediction: Prediction, request: Request, clock: "_Stopwatch") -> Decision:
-        """The decision from the prediction at a first guess: program by program, up to a KKT point or the last one."""
+    def _improve(self, prediction: Prediction, request: Request, laps: list[float]) -> Decision:
+        """The decision from a prediction: program by program, up to a KKT point or the last one."""
         guess, solution = prediction.plan, None if request.previous is None else request.previous.solution
         search = Globalization(self.prediction, request, self.tolerance) if self.iterations > 1 else None
         solved_at, status, count = None, None, 0
         while True:
-            clock.lap("model")
+            laps.append(perf_counter())
             at = prediction.stages, prediction.plan.states[0], request.references
             program = condense(prediction.cost, self.prediction.bounds, *at, prediction.rows)
             program = program if search is None else search.correct(program, prediction.plan)
-            clock.lap("build")
+            laps.append(perf_counter())
             solution = self._solve(program, solution)
-            clock.lap("solve")
+            laps.append(perf_counter())
             count, status = count + 1, solution.status
             if _is_usable(program, solution, prediction.plan):
                 unknowns = np.ascontiguousarray(solution.x, dtype=np.float64)
@@ -154,17 +161,18 @@ class GPMPC:
         if solved_at is not None and self.prediction.settings.rolled_out:
             obeying = self.prediction.roll_out(prediction.plan, *solved_at, request)
             prediction = obeying if np.isfinite(obeying.plan.states).all() else prediction
-        clock.lap("model")
+        laps.append(perf_counter())
+        timing = _timing(laps)
         program, status = QuadraticProgram.unchecked(*program[:5]), Status.ITERATION_LIMIT if status is None else status
         suboptimal = not status.solved and prediction.plan is not guess
         suboptimal = suboptimal and price_violations(self._hard, prediction.rows, prediction.plan, 1.0) <= FEASIBLE
         if not (status.solved or suboptimal):
-            return replace(request.failed_decision(status, count, clock.timing), problem=program, solution=solution)
+            return replace(request.failed_decision(status, count, timing), problem=program, solution=solution)
         plan = prediction.plan
         means, covariances = self.prediction.linearizer.moments(plan.states, prediction.covariances)
         novelty = call_unchecked(_largest_ratio, prediction.stages.V, self._prior)
         inputs, found = plan.inputs.copy(), (program, solution, request.disturbance, suboptimal, novelty)
-        return Decision(inputs[0], inputs, means, covariances, status, count, clock.timing, *found)
+        return Decision(inputs[0], inputs, means, covariances, status, count, timing, *found)
 
     def with_model(self, model: DynamicsModel) -> "GPMPC":
         """Returns the controller for another model of as many states and inputs, in microseconds."""
@@ -179,54 +187,26 @@ class GPMPC:
         previous: Sequence[Decision | None],
         parameters: Sequence[Any] | None = None,
     ) -> list[Decision]:
-        """``control`` for T questions, with the first stages of all of them linearised in one call.
+        """``control`` for lists of its arguments, with the first stages of all of them linearised in one call.
 
-        The quadratic programs are solved one by one. The model's time is shared out equally. The arguments are lists of
-        those of ``control``, as long as one another.
+        The quadratic programs are solved one by one; the model's time is shared out equally.
         """
         own = [None] * len(beliefs) if parameters is None else parameters
-        asked = list(zip(beliefs, references, previous, own, strict=True))
-        requests = [self.prediction.read(*question) for question in asked]
-        known, clock = [t for t, request in enumerate(requests) if request.finite], _Stopwatch()
-        decisions = [request.failed_decision(Status.INVALID_MEASUREMENT) for request in requests]
+        asked = zip(beliefs, references, previous, own, strict=True)
+        requests, began = [self.prediction.read(*question) for question in asked], perf_counter()
+        known = [request for request in requests if request.finite]
         try:
-            made = self.prediction.linearize_many([requests[t] for t in known])
+            made = iter(self.prediction.linearize_many(known))
         except FAILURES:  # one of them spoils the batch: which one, they say alone
-            return [self.control(*question) for question in asked]
-        clock.lap("model", len(known))
-        for t, prediction in zip(known, made, strict=True):
-            try:
-                decisions[t] = self._improve(prediction, requests[t], _Stopwatch(clock.timing.model))
-            except FAILURES as error:
-                decisions[t] = requests[t].failed_decision(_status_of(error), timing=clock.timing)
-        return decisions
+            return [self._decide(request, [perf_counter()]) for request in requests]
+        share = (perf_counter() - began) / max(1, len(known))
+        return [self._decide(r, [perf_counter() - share], next(made) if r.finite else None) for r in requests]
 
     def gains(self, decision: Decision, parameters: Array | None = None) -> Array:
-        """K_0 .. K_{H-1} (H, m, n) of the feedback u = u_k - K_k (x - x_k) along a decision's plan.
-
-        They are those of the linear-quadratic regulator of the stages, linearised at the plan.
-        """
+        """K_0 .. K_{H-1} (H, m, n) of u = u_k - K_k (x - x_k), the regulator of the stages along a decision's plan."""
         found = linearize(self.prediction.model, decision.means[:-1], decision.inputs, covariance=False)
         cost = self.prediction.costs.at(Plan(decision.means, decision.inputs, decision.covariances), parameters)
         return self.prediction.gains(found.A, found.B, cost)
-
-    @property
-    def bytes_per_question(self) -> int | None:
-        """Memory that ``control_many`` takes for each question at most [bytes]; None where it cannot be known.
-
-        It is known for GPs and derivatives in closed form: by torch a point takes some arrays (outputs, N, n + m + 1),
-        and a belief of which moments are matched some matrices (N, N) as well. The compiled kernels take far less.
-        """
-        model, linearizer = self.prediction.model, self.prediction.linearizer
-        features = getattr(model, "features", None)
-        if features is None:
-            return None
-        (N, d), n, size = features.shape, model.state_dim, self.horizon * self.problem.input_dim
-        p = len(self.prediction.costs.quadratic.terminal) * n
-        each = 8 * n * N * (d + 1) + 4 * p * (p + d)
-        if not linearizer.at_points:
-            each += 8 * N * N + 12 * n * n * (N * (n + 1) + n * n + d)
-        return 8 * (self.prediction.points * each + 4 * size * (size + n * self.horizon))
 
     def _solve(self, program: CondensedProgram, warm: QPSolution | None) -> QPSolution:
         if isinstance(self.solver, DualActiveSet):
@@ -236,10 +216,6 @@ class GPMPC:
             return self.solver.solve(QuadraticProgram.unchecked(*program[:5]), warm, prices)
         fits = warm is not None and warm.arrays[2].shape == program.G.shape
         return self.solver.solve(QuadraticProgram.from_stacked(*program[:5]), warm if fits else None)
-
-
-def _status_of(error: Exception) -> Status:
-    return Status.FUNCTION_NOT_FINITE if isinstance(error, FunctionNotFinite) else Status.NUMERICAL_TROUBLE
 
 
 class NonlinearGPMPC(GPMPC):
@@ -279,20 +255,10 @@ def _violation(solution: QPSolution) -> float:
     return float(solution.violation()[np.isinf(solution.caps)].max(initial=0.0))
 
 
-class _Stopwatch:
-    """Where the time goes: each lap adds the time since the last one to its part."""
-
-    def __init__(self, model: float = 0.0) -> None:
-        self._parts, self._last = {"model": model, "build": 0.0, "solve": 0.0}, perf_counter()
-
-    def lap(self, part: str, shares: int = 1) -> None:
-        now = perf_counter()
-        self._parts[part] += (now - self._last) / max(1, shares)
-        self._last = now
-
-    @property
-    def timing(self) -> Timing:
-        return Timing(**self._parts)
+def _timing(laps: list[float]) -> Timing:
+    """Sums the times between laps, of the model, of building and of solving in turns."""
+    parts = [end - begin for begin, end in pairwise(laps)]
+    return Timing(sum(parts[::3]), sum(parts[1::3]), sum(parts[2::3]))
 
 
 @compiled

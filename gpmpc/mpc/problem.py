@@ -67,11 +67,6 @@ class Constraint:
                 raise SettingError("stages", f"must be whole numbers from 1 on; got {self.stages!r}")
             object.__setattr__(self, "stages", stages)
 
-    @property
-    def size(self) -> int | None:
-        """Number of states that it is for; None where any will do."""
-        return None
-
     def rows(self, horizon: int) -> tuple[Array, Array, Array]:
         """Returns F (r, n), lower and upper (H, r) of rows lower <= F x <= upper, of which each has one side only."""
         raise NotImplementedError
@@ -89,12 +84,6 @@ class Box(Constraint):
 
     Raises:
         SettingError: Crossed bounds, or as for ``Constraint``.
-
-    >>> Box(lower=[-2.0], upper=[1.0]).upper
-    array([1.])
-    >>> Box(lower=[2.0], upper=[1.0])
-    Traceback (most recent call last):
-    gpmpc.exceptions.SettingError
     """
 
     #: list or array (d,), or (H, d) by stage, kept as an array; -inf where there is none; None: none at all

@@ -24,7 +24,6 @@ from gpmpc.step import Step
 from gpmpc.systems import System
 
 Array = np.ndarray
-_MEMORY = 2**30  # [bytes] that the controller may take for all that fly at a time
 
 
 @dataclass(frozen=True)
@@ -229,21 +228,20 @@ def closed_loops(
     noise: Noise | None = None,
     disturbances: Sequence[Disturbance] = (),
     on_failure: OnFailure = "raise",
-    chunk: int | None = None,
+    chunk: int = 200,
 ) -> list[Trial]:
     """Flies a controller on a plant with many seeds at once; arguments are those of ``closed_loop``, and two more.
 
-    ``seeds`` are one a trial; a number stands for 0 .. seeds - 1. ``chunk`` says how many trials fly at a time, by
-    default as many as the controller has a gigabyte for. The plant's right-hand side is evaluated on arrays, an entry a
-    trial; a ``GPMPC`` decides for all trials together, any other controller one by one.
+    ``seeds`` are one a trial; a number stands for 0 .. seeds - 1. ``chunk`` trials fly at a time, which bounds the
+    memory. The plant's right-hand side is evaluated on arrays, an entry a trial; a ``GPMPC`` decides for all trials
+    together, any other controller one by one.
 
     Returns:
         One ``Trial`` a seed, in their order; those whose solve failed (with ``on_failure="raise"``) or whose plant
         diverged have an error instead of a ``Rollout``, and the others fly on.
 
     Raises:
-        SettingError: No seeds or equal ones; a model loop, in which a seed changes nothing; or no ``chunk`` where the
-            controller cannot say how much memory a trial takes.
+        SettingError: No seeds or equal ones; a model loop, in which a seed changes nothing; or a ``chunk`` below 1.
     """
     if isinstance(plant, ModelLoop):
         raise SettingError("plant", "a model loop draws no random numbers, all seeds are one flight; take closed_loop")
@@ -252,10 +250,10 @@ def closed_loops(
     check_policy(on_failure)
     seeds = _check_seeds(seeds)
     references = check_references(references, steps, controller.horizon)
-    size = chunk_size(controller, len(seeds), chunk=chunk)
+    check_number("chunk", chunk, least=1, whole=True)
     finished: list[Trial] = []
-    for start in range(0, len(seeds), size):
-        some = seeds[start : start + size]
+    for start in range(0, len(seeds), chunk):
+        some = seeds[start : start + chunk]
         simulators = [PlantSimulator(plant, initial, disturbances, noise, seed) for seed in some]
         flights = [Flight(simulator, references, plant.time_step) for simulator in simulators]
         _fly(flights, controller, references, steps, on_failure)
@@ -300,22 +298,6 @@ def _decide(controller: Controller, beliefs: Sequence[Gaussian], *rest: Any) -> 
         return [command(controller, beliefs[0], ahead, last, *policy)]
     except SolverFailure as failure:
         return [failure]
-
-
-def chunk_size(controller: Controller, trials: int, memory: int = _MEMORY, chunk: int | None = None) -> int:
-    """Says how many trials fly at a time: ``chunk`` where it is given, else what fits the memory [bytes].
-
-    A controller with ``control_many`` says what a trial takes (``bytes_per_question``), else ``SettingError``.
-    """
-    if chunk is not None:
-        check_number("chunk", chunk, least=1, whole=True)
-        return min(chunk, trials)
-    if not hasattr(controller, "control_many"):
-        return trials
-    each = getattr(controller, "bytes_per_question", None)
-    if each is None:
-        raise SettingError("chunk", "the memory that this model takes is not known: say how many trials fly at a time")
-    return min(trials, max(1, int(memory // each)))
 
 
 def rehearse(system: System | ModelLoop, controller: Controller, references: Reference, initial: Any) -> None:

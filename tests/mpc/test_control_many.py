@@ -1,12 +1,8 @@
-"""Many questions at once get the answers that each gets alone, on any device and in bounded memory."""
-
-import weakref
+"""Many questions at once get the answers that each gets alone, on any device."""
 
 import numpy as np
 import pytest
 import torch
-from torch.utils._python_dispatch import TorchDispatchMode
-from torch.utils._pytree import tree_leaves
 
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import backend
@@ -143,43 +139,3 @@ def test_a_model_on_a_gpu_gives_the_same_answers(form, covariance, propagator):
     assert_same(there.control_many(beliefs(4), [REFERENCE] * 4, before), first)
     second = here.control_many(beliefs(4, seed=1), [REFERENCE] * 4, first)
     assert_same(there.control_many(beliefs(4, seed=1), [REFERENCE] * 4, first), second)
-
-
-class Held(TorchDispatchMode):
-    """Counts the bytes of the tensors that are alive at a time."""
-
-    def __init__(self):
-        super().__init__()
-        self.sizes, self.now, self.most = {}, 0, 0
-
-    def __torch_dispatch__(self, function, types, arguments=(), keywords=None):
-        out = function(*arguments, **(keywords or {}))
-        for tensor in tree_leaves(out):
-            if isinstance(tensor, torch.Tensor) and (memory := tensor.untyped_storage())._cdata not in self.sizes:
-                self.sizes[memory._cdata] = memory.nbytes()
-                self.now += memory.nbytes()
-                self.most = max(self.most, self.now)
-                weakref.finalize(memory, self.gone, memory._cdata)
-        return out
-
-    def gone(self, key):
-        self.now -= self.sizes.pop(key, 0)
-
-
-@pytest.mark.parametrize("size", [10, 120])
-@pytest.mark.parametrize(
-    ("covariance", "propagator"), MODES, ids=lambda v: v if isinstance(v, str) else type(v).__name__
-)
-def test_no_question_takes_more_memory_than_it_is_said_to(covariance, propagator, size):
-    gp, T = quadrotor_gp(size), 6
-    _ = gp.precision  # belongs to the model
-    asked, held = controller("trajectory", covariance, propagator, gp), Held()
-    with backend("torch"):
-        said = asked.bytes_per_question
-        with held:
-            asked.control_many(beliefs(T), [REFERENCE] * T, [None] * T)
-    assert 0.03 * T * said < held.most < T * said
-
-
-def test_what_is_differentiated_by_autograd_takes_an_unknown_amount():
-    assert controller("trajectory", "none", Linearization(), linear_gaussian(6, 3)).bytes_per_question is None

@@ -12,10 +12,9 @@ from gpmpc.mpc.gp_mpc import GPMPC
 from gpmpc.mpc.problem import Box, Problem, Tracking
 from gpmpc.propagation import Linearization, MomentMatching
 from gpmpc.simulation import Dropout, Gust, ModelLoop, Noise, closed_loop, closed_loops
-from gpmpc.simulation._loop import chunk_size
 from gpmpc.status import Status
 from gpmpc.systems import Coupled, Map, Rotational, System, Translational, step, step_many
-from tests.mpc.systems import HOVER, QUADROTOR, linear_gaussian, quadrotor_gp
+from tests.mpc.systems import HOVER, QUADROTOR, quadrotor_gp
 
 H, STEPS = 3, 8
 GP = quadrotor_gp(20)
@@ -184,17 +183,6 @@ def test_many_plants_step_as_one_does(plant, rng):
     assert np.allclose(step_many(plant, states, inputs), expected, rtol=1e-14, atol=1e-15)
 
 
-def test_chunks_keep_within_the_memory_that_is_given():
-    with backend("torch"):
-        asked = controller("full", MomentMatching())
-        each = asked.bytes_per_question
-        for memory, size in ((10 * each, 10), (10.5 * each, 10), (each // 2, 1), (10**15, 200)):
-            assert chunk_size(asked, 200, memory) == size
-        larger = controller("full", MomentMatching(), quadrotor_gp(40))
-        assert larger.bytes_per_question > each
-    assert chunk_size(Proportional(), 200, 1) == 200
-
-
 @pytest.mark.parametrize(
     ("settings", "error", "message"),
     [
@@ -210,13 +198,6 @@ def test_chunks_keep_within_the_memory_that_is_given():
 def test_misuse_is_refused_before_the_first_step(settings, error, message):
     with pytest.raises(error, match=message):
         fly(controller("none"), **settings)
-
-
-def test_what_takes_an_unknown_amount_of_memory_needs_a_chunk():
-    asked = controller("none", model=linear_gaussian(6, 3), bound=1e3)
-    with pytest.raises(SettingError, match="chunk: the memory that this model takes is not known: say how many"):
-        fly(asked)
-    assert len(fly(asked, 2, chunk=2)) == 2
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")

@@ -98,8 +98,6 @@ def test_in_a_cascade_no_lie_is_applied_by_either_controller():
 @pytest.mark.parametrize("kind", LIES)
 def test_many_at_once_are_looked_at_one_by_one(kind):
     class Crowd(Liar):
-        bytes_per_question = 1
-
         def control_many(self, beliefs, references, previous):
             return [self.control(*question) for question in zip(beliefs, references, previous, strict=True)]
 
