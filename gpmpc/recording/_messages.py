@@ -8,9 +8,11 @@ Packed ``repeated double`` has the wire format of ``bytes`` that hold the little
 reads and writes its messages with ``bytes`` in these places: a thousand numbers then cost one copy.
 """
 
+import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import foxglove
@@ -149,7 +151,7 @@ _NUMBERS = {status: number for number, status in enumerate(Status)}
 
 
 class StepCopy:
-    """A step with copies of its arrays by name: those of ``step`` itself may have changed since.
+    """A step with copies of its arrays in one piece of memory: those of ``step`` itself may have changed since.
 
     ``ShapeError`` where an array does not fit n states and m inputs.
     """
@@ -174,10 +176,18 @@ class StepCopy:
                 arrays |= {name: getattr(program, name) for name in QP_ARRAYS[:5]}
                 arrays["caps"] = np.full(len(program.lower), np.inf)
         self.step = step
-        self.arrays = {name: np.array(array, dtype=float) for name, array in arrays.items()}
+        arrays = {name: np.ascontiguousarray(array, dtype=float) for name, array in arrays.items()}
         for name, shape in shapes.items():
-            if self.arrays[name].shape != shape:
-                raise ShapeError(f"step {step.k}: {name} must be {shape}; got {self.arrays[name].shape}")
+            if arrays[name].shape != shape:
+                raise ShapeError(f"step {step.k}: {name} must be {shape}; got {arrays[name].shape}")
+        self.data, self._shapes = b"".join(arrays.values()), {name: array.shape for name, array in arrays.items()}
+
+    @cached_property
+    def arrays(self) -> dict[str, Array]:
+        """Views of the copy by name: of the step, and where there are any of its plan, solution and program."""
+        ends = np.cumsum([math.prod(shape) for shape in self._shapes.values()])
+        parts = np.split(np.frombuffer(self.data), ends[:-1])
+        return {name: part.reshape(shape) for part, (name, shape) in zip(parts, self._shapes.items(), strict=True)}
 
     @property
     def status(self) -> Status:

@@ -105,7 +105,7 @@ class McapRecorder:
         if self._error is not None:
             raise RecordingError(self._error)
         copy = StepCopy(step, self._n, self._m, self._record_problems)
-        size = sum(array.nbytes for array in copy.arrays.values())
+        size = len(copy.data)
         if 4 * size > LARGEST:
             raise RecordingError(f"{self.path}: a step of {size} bytes is too large; at most {LARGEST // 4}")
         self._waiting.append(copy)

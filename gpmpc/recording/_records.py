@@ -78,10 +78,10 @@ def _sound_records(file: BinaryIO, path: Path) -> Iterator[McapRecord]:
                 if not isinstance(record, Chunk):
                     yield record
                     continue
+                inside = BytesIO(_unfolded(record))
                 left -= record.uncompressed_size
                 if left < 0:
                     raise RecordingError(f"{path}: its chunks unfold to more than {room(path) / 1e6:.0f} MB")
-                inside = BytesIO(_unfolded(record))
                 while inside.tell() < record.uncompressed_size:
                     head, content = _frame(inside, record.uncompressed_size)
                     if head[0] in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE):

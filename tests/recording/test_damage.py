@@ -242,3 +242,15 @@ def test_metadata_and_configuration_may_stand_behind_the_messages(recorded, tmp_
     assert run.finished
     assert (run.metadata, run.config) == (expected.metadata, expected.config)
     np.testing.assert_array_equal(run.states, expected.states)
+
+
+@pytest.mark.parametrize("size", [0, 2**20, 2**40, 2**63])
+def test_a_chunk_that_says_another_size_ends_what_is_read(recorded, tmp_path, size):
+    path, found = tmp_path / "changed.mcap", damage.section(recorded[0].read_bytes())
+    chunks = [i for i, (kind, _) in enumerate(found) if kind == damage.CHUNK]
+    content = found[chunks[2]][1]
+    found[chunks[2]] = damage.CHUNK, content[:16] + struct.pack("<Q", size) + content[24:]
+    path.write_bytes(damage.sealed(found))
+    run = read_run(path)
+    assert not run.finished
+    assert 0 < len(run.times) < len(recorded[1])
