@@ -1,5 +1,8 @@
 """``gpmpc run``: one flight, from its settings to its folder; ``gpmpc run -m`` (``sweep``) flies many of them."""
 
+import math
+import os
+import re
 import shlex
 import sys
 import time
@@ -7,6 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from hashlib import sha256
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +23,7 @@ from omegaconf.errors import OmegaConfBaseException
 from rich.console import Console
 
 from gpmpc._compiling import report_compilation
+from gpmpc._provenance import flattened
 from gpmpc.cli._command import Result
 from gpmpc.cli._settings import folder_of, one_line, writing
 from gpmpc.cli._terminal import print_error
@@ -32,11 +37,12 @@ from gpmpc.studies.flight import Experiment, metrics, run_trial, summary
 from gpmpc.studies.study import one_thread
 from gpmpc.systems import System
 
-_ASIDE = ("launcher", "folder", "live")  # settings that a result does not depend on
+ASIDE = ("launcher", "folder", "live", "tracker")  # settings that a result does not depend on
 _GROUPS = ("data", "trajectory", "system", "model", "controller", "propagation", "solver", "learning")
 _MISTAKES = (SettingError, ShapeError, DataError, InstantiationException, OmegaConfBaseException)
-_CHOICES = {"recorder": ("mcap", "none"), "live": (True, False)}
+_CHOICES = {"recorder": ("mcap", "none"), "tracker": ("mlflow", "none"), "live": (True, False)}
 _LOST = 3  # exit code of a run that is finished, and whose flight was lost
+_LONGEST = 6000  # characters of a parameter that MLflow takes
 
 
 def run(config: DictConfig) -> Result:
@@ -74,6 +80,11 @@ def run_one(config: DictConfig, wait: bool = True) -> dict[str, Any]:
                 raise KeyboardInterrupt from error
             folder.fail(error, about)
             return outcome | {"error": one_line(error), "mistake": isinstance(error, _MISTAKES)}
+        if config.tracker == "mlflow":
+            try:
+                log_to_mlflow(folder.path, result)
+            except Exception as error:  # the run stays finished
+                print_error(f"{folder.path} is not in MLflow: {one_line(error)}")
     return outcome | {"result": result}
 
 
@@ -171,6 +182,8 @@ def _check(config: DictConfig) -> None:
     for key, choices in _CHOICES.items():
         if config[key] not in (*choices, None):
             raise SettingError(key, f"must be {' or '.join(map(repr, choices))}; got {config[key]!r}")
+    if config.tracker == "mlflow" and find_spec("mlflow") is None:
+        raise SettingError("tracker", "needs MLflow: pip install mlflow")
     if config.live and config.recorder != "mcap":
         raise SettingError("live", f"needs recorder=mcap; got recorder={config.recorder}")
     for group in ("data", "trajectory", "system", "model", "controller"):
@@ -202,7 +215,7 @@ def plain_settings(config: DictConfig, chosen: Mapping[str, Any]) -> dict[str, A
     if path := settings["model"].get("path"):
         settings["model"]["sha256"] = sha256(Path(path).read_bytes()).hexdigest()
     options = {group: chosen.get(group) for group in _GROUPS}
-    return {key: value for key, value in settings.items() if key not in _ASIDE} | {"options": options}
+    return {key: value for key, value in settings.items() if key not in ASIDE} | {"options": options}
 
 
 def plain_data(config: DictConfig) -> dict[str, Any]:
@@ -216,6 +229,28 @@ def choices(overrides: Sequence[str]) -> list[str]:
     found = {}
     for override in OverridesParser.create().parse_overrides(list(overrides)):
         key = override.get_key_element()
-        if key not in _ASIDE and not key.lstrip("+~").startswith(("hydra.", "hydra/")):
+        if key not in ASIDE and not key.lstrip("+~").startswith(("hydra.", "hydra/")):
             found[key] = key if override.is_delete() else f"{key}={override.get_value_element_as_str()}"
     return sorted(found.values())
+
+
+def log_to_mlflow(folder: Path, result: Mapping[str, Any]) -> None:
+    """Writes a finished run to MLflow: settings as parameters, numbers as metrics, files as artifacts.
+
+    Where it goes is said as MLflow says it, by ``MLFLOW_TRACKING_URI`` and ``MLFLOW_EXPERIMENT_NAME``; else into the
+    experiment ``gpmpc`` of the default store.
+    """
+    import mlflow  # pyright: ignore[reportMissingImports]
+
+    def name(key: str) -> str:  # in letters that MLflow takes
+        return re.sub(r"[^\w\-. /]", "_", key, flags=re.ASCII)
+
+    found = flattened({key: value for key, value in result.items() if key not in ("settings", "provenance", "choices")})
+    numbers = {key: float(value) for key, value in found.items() if isinstance(value, int | float)}
+    settings = {name(key): str(value)[:_LONGEST] for key, value in flattened(result["settings"]).items()}
+    if "MLFLOW_EXPERIMENT_NAME" not in os.environ and "MLFLOW_EXPERIMENT_ID" not in os.environ:
+        mlflow.set_experiment("gpmpc")
+    with mlflow.start_run(run_name=folder.name):
+        mlflow.log_params(settings)
+        mlflow.log_metrics({name(key): value for key, value in numbers.items() if math.isfinite(value)})
+        mlflow.log_artifacts(str(folder))

@@ -1,0 +1,84 @@
+"""Finished runs are written to MLflow, where one is installed."""
+
+import contextlib
+import json
+import sys
+import types
+from importlib.util import find_spec
+
+import pytest
+
+from gpmpc.cli._run import log_to_mlflow
+from tests.cli.command import forked
+
+TINY = ["steps=3", "data.samples=25", "model.restarts=0", "tracker=mlflow"]
+RESULT = {"settings": {"R": [1.0], "data": {"note": "x" * 9000}}, "rmse": {"total": 0.5, "x [m]": float("inf"), "n": 2}}
+
+
+class Store(types.ModuleType):
+    """Takes what MLflow's functions of these names take, and holds it to MLflow's documented limits."""
+
+    def __init__(self):
+        super().__init__("mlflow")
+        self.__spec__ = types.SimpleNamespace(name="mlflow")
+        self.seen = {}
+
+    @contextlib.contextmanager
+    def start_run(self, run_name):
+        self.seen["name"] = run_name
+        yield
+
+    def set_experiment(self, name):
+        self.seen["experiment"] = name
+
+    def log_params(self, params):
+        assert all(len(value) <= 6000 for value in params.values())
+        self.seen["params"] = params
+
+    def log_metrics(self, metrics):
+        self.seen["metrics"] = metrics
+
+    def log_artifacts(self, folder):
+        self.seen["artifacts"] = folder
+
+
+def test_settings_become_parameters_numbers_metrics_and_files_artifacts(monkeypatch, tmp_path):
+    for name in ("MLFLOW_EXPERIMENT_NAME", "MLFLOW_EXPERIMENT_ID"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setitem(sys.modules, "mlflow", store := Store())
+    log_to_mlflow(tmp_path, RESULT)
+    assert store.seen["params"] == {"R": "[1.0]", "data.note": "x" * 6000}
+    assert store.seen["metrics"] == {"rmse.total": 0.5, "rmse.n": 2.0}
+    assert (store.seen["experiment"], store.seen["name"]) == ("gpmpc", tmp_path.name)
+    assert store.seen["artifacts"] == str(tmp_path)
+
+
+def test_a_tracker_that_is_unknown_or_not_installed_is_named_before_anything_flies(tmp_path):
+    wrong = [("comet", "tracker: must be 'mlflow' or 'none'; got 'comet'")]
+    if find_spec("mlflow") is None:
+        wrong.append(("mlflow", "tracker: needs MLflow: pip install mlflow"))
+    for tracker, message in wrong:
+        done = forked("run", f"tracker={tracker}", cwd=tmp_path)
+        assert (done.returncode, done.stderr) == (2, f"gpmpc: {message}\n")
+        assert not list(tmp_path.iterdir())
+
+
+def test_a_run_is_found_in_mlflow_with_its_numbers_and_files(tmp_path):
+    mlflow = pytest.importorskip("mlflow")
+    store = f"sqlite:///{tmp_path}/store.db"
+    run = forked("run", *TINY, cwd=tmp_path, MLFLOW_TRACKING_URI=store)
+    assert run.returncode == 0, run.stderr
+    mlflow.set_tracking_uri(store)
+    (found,) = mlflow.search_runs(experiment_names=["gpmpc"], output_format="list")
+    (path,) = tmp_path.glob("outputs/run/*/metrics.json")
+    assert found.data.metrics["rmse.total"] == json.loads(path.read_text())["rmse"]["total"]
+    assert found.data.params["controller.horizon"] == "10"
+    assert found.info.status == "FINISHED"
+
+
+def test_a_tracker_that_fails_leaves_the_run_finished_and_says_so(tmp_path):
+    pytest.importorskip("mlflow")
+    run = forked("run", *TINY, cwd=tmp_path, MLFLOW_TRACKING_URI="nowhere://x")
+    assert run.returncode == 0
+    assert "is not in MLflow" in run.stderr
+    assert list(tmp_path.glob("outputs/run/*/metrics.json"))
