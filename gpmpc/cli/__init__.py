@@ -17,9 +17,19 @@ def main() -> None:
         interrupts.append(number)
         raise KeyboardInterrupt
 
-    heard = signal.getsignal(signal.SIGINT) is signal.default_int_handler  # not under nohup
-    if heard:
+    def interrupt_again(lost: "sys.UnraisableHookArgs") -> None:
+        """Interrupts once more what was interrupted inside a finaliser: Python would print a traceback and go on."""
+        if issubclass(lost.exc_type, KeyboardInterrupt):
+            signal.setitimer(signal.ITIMER_REAL, 0.05)  # once this call is over
+        else:
+            sys.__unraisablehook__(lost)
+
+    ignored = signal.getsignal(signal.SIGINT) is not signal.default_int_handler  # as under nohup
+    if not ignored:
         signal.signal(signal.SIGINT, interrupt)
+        if hasattr(signal, "setitimer"):  # not on Windows
+            signal.signal(signal.SIGALRM, interrupt)
+            sys.unraisablehook = interrupt_again
     try:
         from gpmpc.cli._terminal import usable_streams
 
@@ -35,5 +45,5 @@ def main() -> None:
             print(f"\ninterrupted{advice}", file=sys.stderr)
         sys.exit(130)
     finally:
-        if heard:
+        if not ignored:
             signal.signal(signal.SIGINT, signal.SIG_DFL)  # ends what is still being tidied up, without a traceback

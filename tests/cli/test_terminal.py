@@ -78,6 +78,14 @@ try:
 except KeyboardInterrupt:
     raise ImportError("multiarray failed to import")
 """,
+    "inside a finaliser": f"""
+class Library:
+    def __del__(self):
+        {INTERRUPT}
+Library()
+import time
+time.sleep(5)
+""",
 }
 
 
