@@ -58,7 +58,7 @@ class Transitions:
             object.__setattr__(self, name, value)
         x, u, after = (tuple(getattr(self, name).shape) for name in _NAMES)
         if x != after or x[0] != u[0] or not x[0]:
-            rule = "states (N, n), inputs (N, m) and next_states (N, n) need the same n and the same number N of rows, one or more"
+            rule = "states (N, n), inputs (N, m), next_states (N, n) need the same n and number N of rows, one or more"
             raise ShapeError(f"{rule}; got {x}, {u} and {after}")
 
     def __len__(self) -> int:

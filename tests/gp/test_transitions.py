@@ -37,7 +37,7 @@ def test_features_are_states_beside_inputs_and_rows_can_be_chosen(transitions):
         (
             ((4, 2), (3, 1), (4, 2)),
             ShapeError,
-            r"same number N of rows, one or more; got \(4, 2\), \(3, 1\) and \(4, 2\)",
+            r"same n and number N of rows, one or more; got \(4, 2\), \(3, 1\) and \(4, 2\)",
         ),
         (((4, 2), (4, 1), (4, 3)), ShapeError, r"need the same n .*; got \(4, 2\), \(4, 1\) and \(4, 3\)"),
         (((4,), (4, 1), (4, 2)), ShapeError, r"states must have two dimensions \(rows, columns\); got shape \(4,\)"),
