@@ -123,7 +123,3 @@ class Hyperparameters(NamedTuple):
     def from_theta(cls, theta: Tensor) -> "Hyperparameters":
         """Of rows (log l, log sf, log(sf / sn)), one an output (k, d + 2)."""
         return cls(theta[:, :-2].exp(), (2 * theta[:, -2]).exp(), (2 * (theta[:, -2] - theta[:, -1])).exp())
-
-    def output(self, a: int) -> "Hyperparameters":
-        """Of output a alone (k = 1)."""
-        return Hyperparameters(*(value[a, None] for value in self))

@@ -93,15 +93,12 @@ def posterior_parts(path: Path, posterior: GPPosterior) -> tuple[dict[str, Any],
 def posterior_of_parts(path: Path, header: Any, tensors: Mapping[str, Tensor]) -> GPPosterior:
     """Builds a posterior of a file's header and tensors, after a check of everything."""
     names = [f.name for f in fields(GPPosterior) if f.name not in ("input_dim", "predicts")]
-    missing = [name for name in names if name not in tensors]
-    if missing:
-        raise DataError(f"{path}: array {missing[0]!r} is missing; expected {', '.join(names)}")
-    found = {name: tensors[name] for name in names}
     try:
+        found = {name: tensors[name] for name in names}
         predicts, m = header["predicts"], header["input_dim"]
         check_posterior(found, m, predicts, found["features"].dtype)
     except (GpmpcError, KeyError, TypeError) as error:
-        raise DataError(f"{path}: not a consistent posterior ({error})") from error
+        raise DataError(f"{path}: not a consistent posterior of {', '.join(names)} ({error})") from error
     if not bool((found["cholesky"].diagonal(dim1=-2, dim2=-1) > 0).all()):
         raise DataError(f"{path}: the diagonal of cholesky must be positive")
     return GPPosterior(**found, input_dim=m, predicts=predicts)

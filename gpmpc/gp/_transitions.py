@@ -28,8 +28,8 @@ class Transitions:
     """N observed transitions of a system with n states and m inputs, as float64.
 
     Raises:
-        ShapeError: The three do not belong together.
-        DataError: There is no row, or an entry is not finite (its row and column are named, from 1).
+        ShapeError: The three do not belong together, or there is no row.
+        DataError: An entry is not finite (its row and column are named, from 1), or no number.
 
     >>> data = Transitions(states=[[0.0], [1.0]], inputs=[[0.5], [0.5]], next_states=[[1.0], [2.0]])
     >>> len(data), data[1:].states.tolist()
@@ -56,14 +56,10 @@ class Transitions:
                 got = f"{float(value[row, column])} in row {row + 1}, column {column + 1}"
                 raise DataError(f"{name} must be finite; got {got}")
             object.__setattr__(self, name, value)
-        sizes = len(self.states), len(self.inputs), len(self.next_states)
-        if len(set(sizes)) > 1:
-            text = "states, inputs and next_states must have the same number of rows"
-            raise ShapeError(f"{text}; got {sizes[0]}, {sizes[1]} and {sizes[2]}")
-        if (n := self.states.shape[1]) != (found := self.next_states.shape[1]):
-            raise ShapeError(f"states and next_states must have the same number of columns; got {n} and {found}")
-        if not len(self.states):
-            raise DataError("transitions need at least one row; got none")
+        x, u, after = (tuple(getattr(self, name).shape) for name in _NAMES)
+        if x != after or x[0] != u[0] or not x[0]:
+            rule = "states (N, n), inputs (N, m), next_states (N, n) need the same n and number N of rows, one or more"
+            raise ShapeError(f"{rule}; got {x}, {u} and {after}")
 
     def __len__(self) -> int:
         return len(self.states)

@@ -19,7 +19,7 @@ from gpmpc.gp._backend import host_arrays
 from gpmpc.propagation._propagator import NoisyPropagator, Propagation, Sensitivity, checked_input
 
 
-class Expansion(NamedTuple):
+class _Expansion(NamedTuple):
     """The model around a certain state and input."""
 
     belief: Gaussian  # the prediction there
@@ -31,7 +31,7 @@ class Expansion(NamedTuple):
     mean_by_state_input: Tensor  # (*batch, k, n, m)
 
 
-def expand(model: Any, state: Tensor, input: Tensor) -> Expansion | None:
+def expand(model: Any, state: Tensor, input: Tensor) -> _Expansion | None:
     """The expansion of GPs alone by the compiled loops; None for other models, and where those cannot evaluate."""
     form = getattr(model, "affine_form", None)
     if form is None or form.B is not None or (arrays := host_arrays(form.f.weights, state, input)) is None:
@@ -45,7 +45,7 @@ def expand(model: Any, state: Tensor, input: Tensor) -> Expansion | None:
     mean, A = parts[0] + gp.offset, parts[2]
     if form.A is not None:
         mean, A = mean + state, A + form.A
-    return Expansion(Gaussian(mean, torch.diag_embed(parts[1])), A, *parts[3:])
+    return _Expansion(Gaussian(mean, torch.diag_embed(parts[1])), A, *parts[3:])
 
 
 class Linearization(NoisyPropagator):

@@ -18,9 +18,9 @@ import torch
 from torch import Tensor
 
 from gpmpc.exceptions import SettingError, check_number
-from gpmpc.gaussian import Gaussian, square_root
-from gpmpc.propagation._linearization import Expansion, expand
-from gpmpc.propagation._propagator import NoisyPropagator, Propagation, Sensitivity, by_autograd, checked_input
+from gpmpc.gaussian import Gaussian, square_root, square_root_differential
+from gpmpc.propagation._linearization import expand
+from gpmpc.propagation._propagator import NoisyPropagator, Propagation, Sensitivity, checked_input
 
 _CHUNK = 1000  # samples predicted at once: bounds the memory at about chunk * N * outputs numbers
 
@@ -52,26 +52,42 @@ class Unscented(NoisyPropagator):
 
         Where Sigma is singular its root has no derivative in the null space; zero is taken there.
         """
-        input = checked_input(model, belief, input)
-        _, points, controls = self._points(belief, input)
-        with torch.inference_mode(False):  # of inference tensors nothing could be saved for backward
-            expansion = expand(model, points, controls)
-        if expansion is None:
+        input, n = checked_input(model, belief, input), belief.dim
+        r, U = torch.linalg.eigh(belief.covariance)
+        r = r.clamp_min(0).sqrt()
+        steps, points, controls = self._points(belief, U @ (r[..., :, None] * U.mT), input)
+        if (expansion := expand(model, points, controls)) is None:
             return None
-        return by_autograd(self, _FirstOrder(model, points, controls, expansion), belief, input)
+        of_mean, of_covariance = self._weights(belief)
 
-    def _moved(self, model: Any, belief: Gaussian, input: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        n, (steps, points, controls) = belief.dim, self._points(belief, input)
-        spread = self._spread(n)
-        of_mean = belief.mean.new_full((2 * n + 1,), 1 / (2 * spread))
-        of_covariance = of_mean.clone()
-        of_mean[0], of_covariance[0] = 1 - n / spread, 2 - n / spread - self.alpha**2 + self.beta
-        moved = model.predict(points, controls)
-        mean = of_mean @ moved.mean
-        centred = moved.mean - mean[..., None, :]
-        covariance = centred.mT @ (of_covariance[:, None] * centred)
-        covariance = covariance + (of_mean[:, None, None] * moved.covariance).sum(-3)
-        return mean, covariance, steps.mT @ (of_mean[1] * centred)
+        # Of every point by [mu, vec(root), u] (*batch, 2n + 1, k, p): point 1 + j moves with column j of the root.
+        one = math.sqrt(self._spread(n)) * torch.eye(n, dtype=steps.dtype, device=steps.device)
+        ways = torch.cat([torch.zeros_like(one[:1]), one, -one])[:, None, None, :]
+
+        def by_parameters(by_state: Tensor, by_input: Tensor) -> Tensor:
+            by_root = by_state[..., :, None] * ways
+            return torch.cat([by_state, by_root.flatten(-2), by_input], dim=-1)
+
+        moves = by_parameters(expansion.A, expansion.B)
+        mean_by = torch.einsum("i,...iap->...ap", of_mean, moves)
+        mean = torch.einsum("i,...ia->...a", of_mean, expansion.belief.mean)
+        centred = expansion.belief.mean - mean[..., None, :]
+        half = torch.einsum("i,...iap,...ib->...abp", of_covariance, moves - mean_by[..., None, :, :], centred)
+        spread_by = by_parameters(expansion.variance_by_state, expansion.variance_by_input)
+        own = torch.diag_embed(torch.einsum("i,...iap->...pa", of_mean, spread_by)).movedim(-3, -1)
+        covariance_by = half + half.transpose(-3, -2) + own
+
+        def parts(by: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+            by_root = by[..., n : n + n * n].unflatten(-1, (n, n))
+            count = by_root.dim() - belief.mean.dim() - 1  # dimensions of what is differentiated
+            columns = ((by_root + by_root.mT) / 2).flatten(-2 - count, -3).movedim(-3, -1)
+            # dR = L(dSigma) is linear, and L its own adjoint.
+            by_covariance = square_root_differential(r, U, columns).movedim(-1, -3)
+            return by[..., :n], by_covariance.reshape(by_root.shape), by[..., n + n * n :]
+
+        of_means, of_covariances = parts(mean_by), parts(covariance_by)
+        moved = self._projected(model, *self._moments(belief, steps, expansion.belief))
+        return moved, Sensitivity(*of_means, *of_covariances)
 
     def _spread(self, n: int) -> float:
         """The square of the distance of the points in units of the root: n + lambda."""
@@ -79,28 +95,32 @@ class Unscented(NoisyPropagator):
             raise SettingError("kappa", f"n + kappa must be positive; got {n} states and {self.kappa}")
         return self.alpha**2 * (n + self.kappa)
 
-    def _points(self, belief: Gaussian, input: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def _weights(self, belief: Gaussian) -> tuple[Tensor, Tensor]:
+        """Of the points in the mean and in the covariance (2n + 1,)."""
+        n, spread = belief.dim, self._spread(belief.dim)
+        of_mean = belief.mean.new_full((2 * n + 1,), 1 / (2 * spread))
+        of_covariance = of_mean.clone()
+        of_mean[0], of_covariance[0] = 1 - n / spread, 2 - n / spread - self.alpha**2 + self.beta
+        return of_mean, of_covariance
+
+    def _points(self, belief: Gaussian, root: Tensor, input: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Steps from the mean, points (*batch, 2n + 1, n), and the input at each."""
-        columns = math.sqrt(self._spread(belief.dim)) * square_root(belief.covariance)  # symmetric: rows are columns
+        columns = math.sqrt(self._spread(belief.dim)) * root  # symmetric: rows are columns
         steps = torch.cat([torch.zeros_like(columns[..., :1, :]), columns, -columns], dim=-2)
         points = belief.mean[..., None, :] + steps
         return steps, points, input[..., None, :].expand(*points.shape[:-1], input.shape[-1])
 
+    def _moved(self, model: Any, belief: Gaussian, input: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        steps, points, controls = self._points(belief, square_root(belief.covariance), input)
+        return self._moments(belief, steps, model.predict(points, controls))
 
-class _FirstOrder:
-    """A model's expansion at points, as a model that torch can differentiate once at these points."""
-
-    def __init__(self, model: Any, points: Tensor, inputs: Tensor, expansion: Expansion):
-        self._model, self._points, self._inputs, self._at = model, points, inputs, expansion
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._model, name)
-
-    def predict(self, state: Tensor, input: Tensor) -> Gaussian:
-        at, x, u = self._at, (state - self._points)[..., None], (input - self._inputs)[..., None]
-        mean = at.belief.mean + (at.A @ x + at.B @ u)[..., 0]
-        change = (at.variance_by_state @ x + at.variance_by_input @ u)[..., 0]
-        return Gaussian(mean, at.belief.covariance + torch.diag_embed(change))
+    def _moments(self, belief: Gaussian, steps: Tensor, moved: Gaussian) -> tuple[Tensor, Tensor, Tensor]:
+        of_mean, of_covariance = self._weights(belief)
+        mean = of_mean @ moved.mean
+        centred = moved.mean - mean[..., None, :]
+        covariance = centred.mT @ (of_covariance[:, None] * centred)
+        covariance = covariance + (of_mean[:, None, None] * moved.covariance).sum(-3)
+        return mean, covariance, steps.mT @ (of_mean[1] * centred)
 
 
 class MonteCarlo(NoisyPropagator):

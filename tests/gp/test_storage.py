@@ -171,7 +171,7 @@ def rewritten(path, header=None, **arrays):
         ({"header": {"input_dim": 2}}, "2 controls; got 3 columns and 2 outputs"),
         ({"header": {"input_dim": None}}, "input_dim: must be a whole number"),
         ({"header": {"memory_order": {}}}, "damaged; expected a saved GPPosterior"),
-        ({"weights": None}, "array 'weights' is missing; expected features, targets"),
+        ({"weights": None}, r"not a consistent posterior of features, targets.* \('weights'\)"),
         ({"weights": np.ones((2, 3))}, r"weights must have shape \(2, 12\); got \(2, 3\)"),
         ({"offset": np.ones(2, dtype=np.float32)}, "offset: must be float64 .*got torch.float32"),
         ({"targets": np.full((12, 2), np.nan)}, "targets must be finite; got nan"),

@@ -34,10 +34,14 @@ def test_features_are_states_beside_inputs_and_rows_can_be_chosen(transitions):
 @pytest.mark.parametrize(
     ("shapes", "error", "message"),
     [
-        (((4, 2), (3, 1), (4, 2)), ShapeError, "same number of rows; got 4, 3 and 4"),
-        (((4, 2), (4, 1), (4, 3)), ShapeError, "same number of columns; got 2 and 3"),
+        (
+            ((4, 2), (3, 1), (4, 2)),
+            ShapeError,
+            r"same n and number N of rows, one or more; got \(4, 2\), \(3, 1\) and \(4, 2\)",
+        ),
+        (((4, 2), (4, 1), (4, 3)), ShapeError, r"need the same n .*; got \(4, 2\), \(4, 1\) and \(4, 3\)"),
         (((4,), (4, 1), (4, 2)), ShapeError, r"states must have two dimensions \(rows, columns\); got shape \(4,\)"),
-        (((0, 2), (0, 1), (0, 2)), DataError, "at least one row; got none"),
+        (((0, 2), (0, 1), (0, 2)), ShapeError, r"one or more; got \(0, 2\)"),
     ],
 )
 def test_shapes_that_do_not_belong_together_are_refused(shapes, error, message):
