@@ -122,8 +122,8 @@ def collapsed_bound(
     if method == "fitc":
         return bound
     trace = sums.gram.diagonal(dim1=-2, dim2=-1).sum(-1)
-    ratio = hyperparameters.signal_variance / hyperparameters.noise_variance
-    return bound - (len(features) * ratio - trace) / 2
+    prior = len(features) * hyperparameters.signal_variance / hyperparameters.noise_variance
+    return bound - (prior - trace) / 2
 
 
 def data_sums(Lz: Tensor, Z: Tensor, x: Tensor, y: Tensor, kernel: Hyperparameters, method: Method) -> _Sums:
