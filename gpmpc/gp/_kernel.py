@@ -10,6 +10,8 @@ from gpmpc.gaussian import check_tensors
 Predicts = Literal["next_state", "difference", "value"]
 PREDICTS = ("next_state", "difference", "value")
 IGNORED = 1e8  # length-scale of an input that drops out of a kernel, in units of its magnitude
+_MANY = 1000  # points: from here on kernel matrices are made and factorised one after another, in place
+_ROWS = 64  # of such a matrix at a time: they fit the cache
 _FEW = 16  # columns of a kernel matrix whose differences, all at once, fit the cache
 
 
@@ -24,35 +26,30 @@ def kernel_matrix(points: Tensor, others: Tensor, lengthscales: Tensor, signal_v
         return signal_variance[:, None, None] * (squares.movedim(-1, 0) / -2).exp()
     total = zeros(len(lengthscales), len(points), len(others), dtype=points.dtype, device=points.device)
     for ours, theirs, scale in zip(points.T, others.T, lengthscales.T, strict=True):
-        total.addcmul_((ours[:, None] - theirs).square_(), scale[:, None, None] ** -2)
-    return signal_variance[:, None, None] * total.div_(-2).exp_()
+        total.addcmul_((ours[:, None] - theirs).square(), scale[:, None, None] ** -2)
+    return signal_variance[:, None, None] * (total / -2).exp()
 
 
 def centred(points: Any) -> Any:
     """Points (N, d), NumPy's or torch's, moved to mean zero: elsewhere distances from a matrix product cancel.
 
-    The first point is subtracted first, which is exact between near numbers: a shift of all points changes no bit.
+    A stationary kernel does not depend on it. The first point is subtracted first, which is exact between near numbers:
+    so a shift of all points changes no bit of the result.
     """
     away = points - points[0]
     return away - away.mean(0)
 
 
 def factorize(inputs: Tensor, lengthscales: Tensor, signal_variance: Tensor, noise_variance: Tensor) -> Tensor:
-    """The lower Cholesky factors of K + sn2 I (k, N, N); ``SettingError`` where one is not positive definite.
-
-    One after another, so that there are no more than two matrices (N, N) besides.
-    """
-    size, outputs = len(inputs), len(lengthscales)
-    cholesky = inputs.new_empty(outputs, size, size).mT  # columns contiguous, as LAPACK wants them
-    info = zeros(outputs, dtype=int32, device=inputs.device)
-
-    def factor(a: int) -> tuple[Tensor, Tensor]:
-        kernel = kernel_matrix(inputs, inputs, lengthscales[a, None], signal_variance[a, None])[0]
-        kernel.diagonal().add_(noise_variance[a])
-        return linalg.cholesky_ex(kernel)
-
-    for a in range(outputs):
-        cholesky[a], info[a] = factor(a)
+    """The lower Cholesky factors of K + sn2 I (k, N, N); ``SettingError`` where one is not positive definite."""
+    if len(inputs) > _MANY and not any(
+        t.requires_grad for t in (inputs, lengthscales, signal_variance, noise_variance)
+    ):
+        cholesky, info = _factorize_in_place(inputs, lengthscales, signal_variance, noise_variance)
+    else:
+        kernel = kernel_matrix(inputs, inputs, lengthscales, signal_variance)
+        kernel.diagonal(dim1=-2, dim2=-1).add_(noise_variance[:, None])
+        cholesky, info = linalg.cholesky_ex(kernel)
     check_positive_definite(info, signal_variance, noise_variance)
     return cholesky
 
@@ -66,6 +63,23 @@ def check_positive_definite(failed: Tensor, signal_variance: Tensor, noise_varia
             f"the kernel matrix of output {output} is not positive definite in {signal_variance.dtype}; "
             f"signal-to-noise ratio {float((signal_variance / noise_variance)[output]):.1e}: raise the noise",
         )
+
+
+def _factorize_in_place(
+    inputs: Tensor, lengthscales: Tensor, signal_variance: Tensor, noise_variance: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Factorises in the memory of the result (k, N, N) and little more; returns LAPACK's info (k,) too."""
+    (size, _), outputs = inputs.shape, len(lengthscales)
+    info = zeros(outputs, dtype=int32, device=inputs.device)
+    cholesky = inputs.new_empty(outputs, size, size).mT  # columns contiguous, as LAPACK wants them
+    for a, factor in enumerate(cholesky):
+        for end in range(_ROWS, size + _ROWS, _ROWS):  # the lower triangle
+            rows, columns = slice(end - _ROWS, end), slice(0, end)
+            scales = lengthscales[a, None], signal_variance[a, None]
+            factor[rows, columns] = kernel_matrix(inputs[rows], inputs[columns], *scales)[0]
+        factor.diagonal().add_(noise_variance[a])
+        linalg.cholesky_ex(factor, out=(factor, info[a]))
+    return cholesky, info
 
 
 def check_posterior(given: dict[str, Tensor], input_dim: int, predicts: str, dtype: Any = float64) -> None:

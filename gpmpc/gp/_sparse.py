@@ -107,6 +107,12 @@ def collapsed_bound(
     Arguments and errors are as for ``sparse_posterior``; ``backward`` differentiates it by inducing points and
     hyperparameters.
     """
+    if (outputs := targets.shape[1]) > 1:
+        kernels = [Hyperparameters(*(value[a, None] for value in hyperparameters)) for a in range(outputs)]
+        columns = targets.split(1, dim=1)
+        return torch.cat(
+            [collapsed_bound(inducing, features, *of, method, jitter) for of in zip(columns, kernels, strict=True)]
+        )
     Lz = inducing_factor(inducing, hyperparameters, jitter)
     sums = data_sums(Lz, inducing, features, targets, hyperparameters, method)
     LB = torch.linalg.cholesky(sums.gram + torch.eye(len(inducing), dtype=Lz.dtype, device=Lz.device))
@@ -116,8 +122,8 @@ def collapsed_bound(
     if method == "fitc":
         return bound
     trace = sums.gram.diagonal(dim1=-2, dim2=-1).sum(-1)
-    ratio = hyperparameters.signal_variance / hyperparameters.noise_variance
-    return bound - (len(features) * ratio - trace) / 2
+    prior = len(features) * hyperparameters.signal_variance / hyperparameters.noise_variance
+    return bound - (prior - trace) / 2
 
 
 def data_sums(Lz: Tensor, Z: Tensor, x: Tensor, y: Tensor, kernel: Hyperparameters, method: Method) -> _Sums:
