@@ -243,8 +243,9 @@ def _make_run(table: _Table, step: float, spread: Array, mapping: LogMapping) ->
     uneven = (times > (mapping.max_gap if mapping.max_gap and not mapping.rate else 1.5 * step)) | (times < 0.5 * step)
     inner = times[uneven & (np.diff(rows) == 1)]
     if len(inner):
-        text = f"{len(inner)} steps of {inner.min():.3g} to {inner.max():.3g} s: boundaries (a rate resamples)"
-        note("gap", len(inner), text)
+        shortest, longest = inner.min(), inner.max()
+        text = f"gaps, up to {longest:.3g} s" if shortest > step else f"steps of {shortest:.3g} to {longest:.3g} s"
+        note("gap", len(inner), f"{len(inner)} {text}: boundaries" + ("" if shortest > step else " (a rate resamples)"))
     breaks = uneven | (np.diff(rows) > 1) | table.breaks[rows[1:]]
     begins = (0, *(np.flatnonzero(breaks) + 1).tolist())
     return LogRun(table.name, table.time[rows], *mapping.split(table.values[rows]), begins=begins)

@@ -54,6 +54,9 @@ class Noise:
         for key, values in vars(self).items():
             if values is not None:
                 listed = np.asarray(values, dtype=object).tolist()
+                if not isinstance(listed, list):
+                    what = f"must be a list of standard deviations, one for every {key if key == 'input' else 'state'}"
+                    raise SettingError(f"noise.{key}", f"{what}; got {values!r}")
                 check_numbers(f"noise.{key}", listed, np.size(listed), least=0)
 
 

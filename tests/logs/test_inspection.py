@@ -92,7 +92,7 @@ def test_learn_writes_a_model_a_report_and_a_card_and_names_mistakes(tmp_path):
     assert "loses: " in result.stdout or "ridge" in result.stdout
     written = {path.name for path in (tmp_path / "learned").iterdir()}
     documents = {"report.md", "report.csv", "report.tex", "report.html", "report.png", "card.md"}
-    assert written == documents | {"model.safetensors"}
+    assert written == documents | {"model.safetensors", "progress.json"}
     card = (tmp_path / "learned" / "card.md").read_text()
     assert "What must not be trusted" in card
     assert "| thrust |" in card
