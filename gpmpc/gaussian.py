@@ -21,12 +21,15 @@ def check_tensors(**given: Any) -> None:
 
 def constant_arrays(*tensors: Tensor) -> list[NDArray[Any]] | None:
     """Tensors as arrays; None where one is on another device, or autograd or a function transform follows it."""
+    arrays = []
     try:
-        arrays = [tensor.numpy() for tensor in tensors]
+        for tensor in tensors:  # in microseconds: a step of control calls this several times
+            arrays.append(tensor.numpy())
+            if forward_ad.unpack_dual(tensor).tangent is not None:
+                return None
     except (RuntimeError, TypeError):
         return None
-    followed = any(forward_ad.unpack_dual(tensor).tangent is not None for tensor in tensors)
-    return None if followed else arrays
+    return arrays
 
 
 @dataclass(frozen=True, eq=False)

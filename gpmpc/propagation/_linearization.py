@@ -90,7 +90,7 @@ class MeanEquivalence(NoisyPropagator):
         self, model: Any, belief: Gaussian, input: Tensor | None = None
     ) -> tuple[Propagation, Sensitivity] | None:
         """``propagate`` with all derivatives in closed form; None where there is none."""
-        certain = Gaussian(belief.mean, torch.zeros_like(belief.covariance))
+        input, certain = checked_input(model, belief, input), Gaussian(belief.mean, torch.zeros_like(belief.covariance))
         if (found := Linearization(self.process_noise).differentiate(model, certain, input)) is None:
             return None
         moved, d = found
