@@ -28,10 +28,9 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve, qr, solve_triangular
 from scipy.optimize import linprog
 
-from gpmpc.exceptions import ProblemError
 from gpmpc.qp import _record as layout
 from gpmpc.qp._dual_rescue import rescue
-from gpmpc.qp._problem import ABSENT, QuadraticProgram
+from gpmpc.qp._problem import ABSENT, QuadraticProgram, check_positive
 from gpmpc.qp._solution import QPSolution, WarmStart, as_record, make_solution, proves_infeasibility
 from gpmpc.status import Status
 
@@ -70,10 +69,7 @@ class PrimalActiveSet:
     iteration_limit: int | None = None
 
     def __post_init__(self):
-        for name in ("tolerance", "iteration_limit"):
-            value = getattr(self, name)
-            if value is not None and not value > 0:
-                raise ProblemError(f"{name} must be positive; got {value}")
+        check_positive(self, "tolerance", "iteration_limit")
 
     @np.errstate(over="ignore", invalid="ignore")  # what is not finite is seen below
     def solve(self, problem: QuadraticProgram, warm_start: WarmStart = None) -> QPSolution:

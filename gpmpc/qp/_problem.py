@@ -201,3 +201,11 @@ def multiplier_caps(prices: ArrayLike | None, variables: int, rows: int) -> Arra
             i = int(np.argmin(caps > 0.0))
             raise ProblemError(f"price of row {i - variables} must be positive; got {caps[i]:.6g}")
     return caps
+
+
+def check_positive(settings: object, *names: str) -> None:
+    """Raises ``ProblemError`` unless each of these settings of a solver is positive, or None."""
+    for name in names:
+        value = getattr(settings, name)
+        if value is not None and not value > 0:
+            raise ProblemError(f"{name} must be positive; got {value}")
