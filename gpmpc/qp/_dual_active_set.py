@@ -107,7 +107,9 @@ class DualActiveSet:
     def _limit(self, M: int) -> int:
         return self.iteration_limit or 100 + _ITERATIONS_PER_CONSTRAINT * M
 
-    def _solve_again(self, problem, warm_start, plan, status, record, began) -> tuple[QuadraticProgram, Array]:
+    def _solve_again(
+        self, problem: QuadraticProgram, warm_start: WarmStart, plan: tuple, status: int, record: Array, began: float
+    ) -> tuple[QuadraticProgram, Array]:
         """Continues a solve that did not end as ``SOLVED``: checks the problem, goes on, accepts or tries again.
 
         Returns:

@@ -340,5 +340,5 @@ def add_multipliers(work, k):
         p = n + i if work.soft else abs(work.indices[NAME, i]) - 1
         if p >= n and mu[p] != 0.0:
             weight, row = mu[p], work.G[p - n]
-            for j in range(int(work.vectors[END, p])):
-                slope[j] += weight * row[j]
+            for j in range(0, int(work.vectors[END, p]), 8):
+                store(slope, j, load(slope, j) + weight * load_some(row, j))

@@ -53,7 +53,6 @@ from gpmpc.qp._workspace import (
     V,
     Y,
     open_workspace,
-    round_end,
 )
 
 SIGNATURE = "i8(f8[:, ::1], f8[::1], f8[:, ::1], f8[::1], f8[::1], f8[::1], f8[:, ::1], f8[::1])"
@@ -150,10 +149,8 @@ def _solve_opened(work, guess, least, pivots, out):
     if unsure and status == SOLVED and _worst_violation(work, least) > _NOISE:
         status = NUMERICAL_TROUBLE
     out[STATUS], out[ITERATIONS], out[WORKING], out[VARIABLES], out[CONSTRAINTS] = status, iterations, k, n, M
-    for i in range(n):
-        out[HEADER + i] = y[i]
-    for i in range(M):
-        out[HEADER + n + i] = mu[i]
+    scale(1.0, y, out[HEADER:], n)
+    scale(1.0, mu, out[HEADER + n :], M)
     for i in range(k):
         out[HEADER + n + M + i] = names[i]
     return status
@@ -211,34 +208,21 @@ def _measure_rows(work):
 
     Returns what cancellation left of the pivots of P, as a share of P_ii; zero if a length is not finite.
     """
-    n, G, units, scale, ends = len(work.q), work.G, work.vectors[SCRATCH], work.vectors[SCALE], work.vectors[END]
-    cancelled, undefined, end = 1.0, 0.0, 0
+    n, G, units, ends = len(work.q), work.G, work.vectors[SCRATCH], work.vectors[END]
+    scale_of, cancelled, undefined = work.vectors[SCALE], 1.0, 0.0
+    store(units, n // 8 * 8, zeros())
     for i in range(n):
-        scale[i] = units[i] = 1.0 / math.sqrt(work.P[i, i])
+        scale_of[i] = units[i] = 1.0 / math.sqrt(work.P[i, i])
         cancelled = max(cancelled, work.L[i, i] * work.L[i, i] * work.P[i, i])
-    for i in range(n, n + 8):
-        units[i] = 0.0
     for p in range(len(G)):
-        row, near, far = G[p], zeros(), zeros()
-        head, tail, rest = row[:end], row[end:], units[end:]
-        for j in range(0, end - 7, 8):
-            values = load(head, j) * load(units, j)
-            near = near + values * values
-        values = load_some(head, end // 8 * 8) * load(units, end // 8 * 8)
-        near = near + values * values
-        for j in range(0, n - end - 7, 8):
-            values = load(tail, j) * load(rest, j)
-            far = far + values * values
-        values = load_some(tail, (n - end) // 8 * 8) * load(rest, (n - end) // 8 * 8)
-        far = far + values * values
-        if any_nonzero(far):  # longer than the row before
-            end = n
-            while end > 0 and row[end - 1] == 0.0:
-                end -= 1
-            end = round_end(end, n)
-        length = math.sqrt(total(near + far))
+        row, squares, end = G[p], zeros(), 0
+        for j in range(0, n, 8):
+            values = load_some(row, j) * load(units, j)
+            squares = squares + values * values
+            end = j + 8 if any_nonzero(values) else end
+        length = math.sqrt(total(squares))
         undefined += length * 0.0
-        scale[n + p], ends[n + p] = (length if length > 0.0 else 1.0), end
+        scale_of[n + p], ends[n + p] = (length if length > 0.0 else 1.0), min(end, n)
     return 1.0 / cancelled if undefined == 0.0 else 0.0
 
 
@@ -319,8 +303,8 @@ def _take_newton_step(work, k):
     scale(-1.0, change, subtract, n)  # -(change + sum trial_i w_i)
     subtract_rows(subtract, work.rows, places, trial, k, n)
     solve_lower(work.L, n, subtract)
-    for i in range(n):
-        y[i] += subtract[i]
+    for i in range(0, n, 8):
+        store(y, i, load(y, i) + load(subtract, i))
     for i in range(k):
         p = abs(work.indices[NAME, i]) - 1
         vectors[MU, p] = min(max(vectors[MU, p] + trial[i], vectors[LEAST, i]), vectors[MOST, i])

@@ -26,7 +26,7 @@ NO_RECORD: NDArray[np.float64] = np.zeros(0)
 
 def record_size(variables: int, constraints: int) -> int:
     """Returns the length of a record for M stacked constraints."""
-    return HEADER + variables + 2 * constraints
+    return HEADER + variables + 2 * constraints + 8  # kernels write whole registers
 
 
 def warm_record(active_set: NDArray, variables: int) -> NDArray[np.float64]:

@@ -121,8 +121,7 @@ def solve_transposed(L, end, a):
 def append_row(L, k, solved, pivot):
     """Writes row k of ``L L' = K_WW``: ``solved = L^-1 K_Wp`` and ``pivot = K_pp - |solved|^2 > 0``."""
     row = L[k]
-    for j in range(k):
-        row[j] = solved[j]
+    scale(1.0, solved, row, k)
     row[k] = 1.0 / math.sqrt(pivot)
 
 

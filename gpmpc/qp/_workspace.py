@@ -21,7 +21,7 @@ LOWER, UPPER, ALLOWED_LOW, ALLOWED_HIGH = range(4)
 NEGLIGIBLE = 4  # violation of a bound of zero that is none
 SCALE = 5  # length of c_p in the metric of the inverse of P's diagonal
 CAP = 6  # price of a violation: the largest size of a multiplier
-END = 7  # leading entries of c_p that may not be zero
+END = 7  # leading entries of c_p that may not be zero, in steps of a register
 MU, Y, EXCESS = 8, 9, 10  # multipliers; C x, so that the first n are the point; violations in units of ``SCALE``
 # by variable (n,): -L^-T q, so that L x = v without working constraints; q + C'mu; P x + q + C'mu
 V, SLOPE, GRADIENT, SCRATCH = 11, 12, 13, 14
@@ -35,7 +35,6 @@ REST, SOLVED_K, R, COSINES, SINES, _VECTORS = range(20, 26)  # residual; L_K^-1 
 NAME, PLACE, VIOLATED, CANDIDATES, _INDICES = range(5)
 
 _SETTINGS = 3  # in the first row of memory: limit, tolerance, soft
-_END_STEP = 4  # ends are rounded up to a multiple of it: sums without a remainder are faster
 
 
 class Workspace(NamedTuple):
@@ -66,7 +65,7 @@ def new_memory(caps: Array, n: int, limit: int, tolerance: float, soft: bool) ->
     box = np.arange(M) < n
     memory[0, :_SETTINGS] = limit, tolerance, soft
     memory[1 + CAP, :M] = caps
-    memory[1 + END, :M] = box * np.minimum(n, (np.arange(M) // _END_STEP + 1) * _END_STEP)
+    memory[1 + END, :M] = box * np.minimum(n, (np.arange(M) // 8 + 1) * 8)
     return memory
 
 
@@ -74,12 +73,6 @@ def new_memory(caps: Array, n: int, limit: int, tolerance: float, soft: bool) ->
 def padded(size):
     """Returns the next multiple of eight."""
     return (size + 7) // 8 * 8
-
-
-@inline_njit
-def round_end(end, n):
-    """Returns the number of leading entries that are read where ``end`` may not be zero."""
-    return min(n, (end + _END_STEP - 1) // _END_STEP * _END_STEP)
 
 
 @inline_njit
