@@ -37,17 +37,25 @@ CACHES = np.zeros(12_000_000)  # 96 MB, more than any cache of the machine
 Solve = Callable[[SequenceProblem], tuple[np.ndarray, np.ndarray]]
 
 
-def ours(first: SequenceProblem) -> Solve:
-    """A warm-started ``DualActiveSet``."""
-    solver, last = DualActiveSet(), None
+def ours(changing: bool) -> Callable[[SequenceProblem], Solve]:
+    """A warm-started ``DualActiveSet``, with a prepared program where P and G stay."""
 
-    def solve(problem: SequenceProblem):
-        nonlocal last
-        P, q, G, lower, upper = problem.P, problem.q, problem.G, problem.lower, problem.upper
-        last = solver.solve(QuadraticProgram.unchecked(P, q, G, lower, upper), last)
-        return last.x, last
+    def begin(first: SequenceProblem) -> Solve:
+        solver, last = DualActiveSet(), None
+        prepared = None if changing else solver.prepare(first.P, first.G)
 
-    return solve
+        def solve(problem: SequenceProblem):
+            nonlocal last
+            P, q, G, lower, upper = problem.P, problem.q, problem.G, problem.lower, problem.upper
+            if changing:
+                last = solver.solve(QuadraticProgram.unchecked(P, q, G, lower, upper), last)
+            else:
+                last = prepared.solve(q, lower, upper, last)
+            return last.x, last
+
+        return solve
+
+    return begin
 
 
 def daqp_warm(changing: bool) -> Callable[[SequenceProblem], Solve]:
@@ -147,7 +155,7 @@ def measure_cell(horizon: int, mode: str, settings: argparse.Namespace) -> dict:
         problems = flight_sequence(mode, horizon, settings.length)
     else:
         problems = list(quadrotor_sequence(horizon, changing, settings.length, close_loop))
-    fast = {OURS: ours, DAQP_WARM: daqp_warm(changing), DAQP_COLD: daqp_cold}
+    fast = {OURS: ours(changing), DAQP_WARM: daqp_warm(changing), DAQP_COLD: daqp_cold}
     slow = {PRIMAL: by_protocol(PrimalActiveSet()), CVXPY: by_protocol(CvxpySolver("CLARABEL", {}))}
     cell = {
         "horizon": horizon,

@@ -12,12 +12,13 @@ from gpmpc.qp._solution import QPSolution, QPSolver, Residuals, make_solution
 
 if TYPE_CHECKING:
     from gpmpc.qp._cvxpy import CvxpySolver
-    from gpmpc.qp._dual_active_set import DualActiveSet
+    from gpmpc.qp._dual_active_set import DualActiveSet, Prepared
     from gpmpc.qp._primal_active_set import PrimalActiveSet
 
 __all__ = [
     "CvxpySolver",
     "DualActiveSet",
+    "Prepared",
     "PrimalActiveSet",
     "QPSolution",
     "QPSolver",
@@ -29,6 +30,7 @@ __all__ = [
 _SOLVERS = {
     "CvxpySolver": "_cvxpy",
     "DualActiveSet": "_dual_active_set",
+    "Prepared": "_dual_active_set",
     "PrimalActiveSet": "_primal_active_set",
 }
 

@@ -2,7 +2,8 @@
 
 In model predictive control one QP follows another and little changes in between, so the working set of the last
 solution is nearly that of the next. A dual method can start from any guess: it needs no feasible point, only
-multipliers of the right sign (``gpmpc.qp._dual_iteration``).
+multipliers of the right sign (``gpmpc.qp._dual_iteration``). What depends on P and G only can be done beforehand:
+``prepared = solver.prepare(P, G)`` once, then ``prepared.solve(q, lower, upper, last_solution)``.
 
 A solution that its own residuals do not support, one whose factors lost too many digits, and an infeasibility without
 Farkas' proof are tried again with doubled digits (``gpmpc.qp._dual_rescue``); what still fails is reported as
@@ -21,7 +22,7 @@ from gpmpc.qp._dual_kernels import SIGNATURE, solve
 from gpmpc.qp._dual_rescue import rescue
 from gpmpc.qp._problem import QuadraticProgram, check_positive, multiplier_caps
 from gpmpc.qp._solution import QPSolution, WarmStart, as_record, proves_infeasibility
-from gpmpc.qp._workspace import new_memory
+from gpmpc.qp._workspace import new_memory, prepare_memory
 
 Array = NDArray[np.float64]
 
@@ -92,15 +93,29 @@ class DualActiveSet:
             problem, record = self._solve_again(problem, warm_start, plan, status, record, began)
         return _new(QPSolution, (record[where], problem, caps, record, 0.0, perf_counter() - began))
 
-    def _plan(self, shape: tuple, prices: ArrayLike | None) -> tuple[Array, Array, int, slice]:
+    def prepare(self, P: ArrayLike, G: ArrayLike | None = None, prices: ArrayLike | None = None) -> "Prepared":
+        """Does once what depends on P, G and prices only.
+
+        Args:
+            P: (n, n) symmetric positive definite.
+            G: (m, n); none if omitted.
+            prices: As for ``solve``.
+
+        Raises:
+            ProblemError: As for ``solve``.
+        """
+        return Prepared(self, QuadraticProgram(P, np.zeros(len(np.atleast_1d(P))), G), prices)
+
+    def _plan(self, shape: tuple, prices: ArrayLike | None, prepared: bool = False) -> tuple[Array, Array, int, slice]:
         """Returns caps, memory, the record's length, and where x is in it, for a shape of G."""
         m, n = shape
         caps, limit = multiplier_caps(prices, n, m), self._limit(n + m)
         if self.time_limit is not None:
             limit = min(limit, _ITERATIONS_PER_LOOK)
-        memory = new_memory(caps, n, limit, self.tolerance, prices is not None)
-        plan = caps, memory, layout.record_size(n, n + m), slice(layout.HEADER, layout.HEADER + n)
-        if prices is None:
+        memory = new_memory(caps, n, limit, self.tolerance, prices is not None, prepared)
+        size = layout.record_size(n, n + m, n if prepared else 0)
+        plan = caps, memory, size, slice(layout.HEADER, layout.HEADER + n)
+        if prices is None and not prepared:
             self._plans[m, n] = plan
         return plan
 
@@ -139,11 +154,52 @@ class DualActiveSet:
         stopped = status == layout.ITERATION_LIMIT and self.iteration_limit is not None
         if not stopped and not _is_certain(record, problem):
             guess, record = record, record.copy()
+            guess[layout.TAG] = 0.0  # the factor is computed anew
             solve(*problem, guess, memory, record)
             record[layout.ITERATIONS] += done
             if not _is_certain(record, problem):
                 record = rescue(problem, caps, record, self._limit(M), late)
         return problem, record
+
+
+class Prepared:
+    """A problem whose P and G stay; made by ``DualActiveSet.prepare``. Read-only, and may serve many threads."""
+
+    __slots__ = ("_G", "_P", "_plan", "_solver")
+
+    def __init__(self, solver: DualActiveSet, problem: QuadraticProgram, prices: ArrayLike | None):
+        self._P, self._G, self._solver = problem.P, problem.G, solver
+        _, memory, size, _ = self._plan = solver._plan(problem.G.shape, prices, prepared=True)
+        # factorises P and measures the rows of G; where numbers overflow, every solve is to find that out by itself
+        if solve(*problem, layout.NO_RECORD, memory, np.empty(size)) == layout.SOLVED:
+            prepare_memory(memory, problem.G)
+
+    def solve(self, q: Array, lower: Array, upper: Array, warm_start: WarmStart = None) -> QPSolution:
+        """Solves for one q and one set of bounds.
+
+        Args:
+            q: (n,).
+            lower: (n + m,) lower bounds of x, then of the rows of G; infinite or below -1e20 where absent.
+            upper: (n + m,) upper bounds likewise.
+            warm_start: The last solution, or an active set; any guess is safe.
+
+        Raises:
+            ProblemError: Shapes that do not match, NaN, crossed bounds.
+        """
+        began = perf_counter()  # line by line as in ``DualActiveSet.solve``: a call costs a tenth of a small solve
+        P, G, (caps, memory, size, where) = self._P, self._G, self._plan
+        record, status = _empty(size), _MISUSE
+        try:
+            guess = _NO_RECORD if warm_start is None else warm_start.record  # type: ignore[union-attr]
+            if q.dtype is lower.dtype is upper.dtype is _FLOAT:
+                status = _run(P, q, G, lower, upper, guess, memory, record)
+        except (AttributeError, TypeError):
+            pass
+        problem = P, q, G, lower, upper
+        if status:
+            problem = QuadraticProgram.unchecked(*problem)
+            problem, record = self._solver._solve_again(problem, warm_start, self._plan, status, record, began)
+        return _new(QPSolution, (record[where], problem, caps, record, 0.0, perf_counter() - began))
 
 
 def _is_certain(record: Array, problem: QuadraticProgram) -> bool:

@@ -13,7 +13,7 @@ import numpy as np
 
 from gpmpc._compiled import inline_njit
 from gpmpc._kernels._simd import load, load_some, store, zeros
-from gpmpc._kernels.linalg import dot
+from gpmpc._kernels.linalg import dot, multiply
 from gpmpc.qp._record import INFEASIBLE, ITERATION_LIMIT, SOLVED
 from gpmpc.qp._triangular import (
     append_row,
@@ -53,6 +53,7 @@ from gpmpc.qp._workspace import (
     PLACE,
     SCALE,
     SCRATCH,
+    SEEN,
     SINES,
     SLOPE,
     SOLVED_K,
@@ -95,6 +96,8 @@ def iterate(work, k, count, margin, iterations, batches):
             if complete and batches < _BATCHES:
                 chosen = choose_bad(vectors, indices, _BAD * vectors[EXCESS, p], count, n - k)
                 batches += chosen > 0
+        if work.tag != 0.0:
+            scale(1.0, vectors[MU], vectors[SEEN], M)
         before = k
         k = add_constraints(work, k, chosen)
         if not begins:
@@ -116,19 +119,25 @@ def iterate(work, k, count, margin, iterations, batches):
                 batches = _BATCHES  # caps may have changed x_u
         if unsettled:
             k = _drop_wrong_multipliers(work, k)
-        _minimise(work, k)
-        complete = several or work.soft or count == 1 or iterations >= work.limit
-        if not complete:  # first satisfy those that were seen to be violated, then look at all
-            count = keep_violated(work, margin, count)
-            complete = count == 0
+        if work.tag != 0.0 and not begins:
+            _follow_multipliers(work, M)
+        else:
+            _minimise(work, k)
+            complete = several or work.soft or count == 1 or iterations >= work.limit
+            if not complete:  # first satisfy those that were seen to be violated, then look at all
+                count = keep_violated(work, margin, count)
+                complete = count == 0
+            if complete:
+                multiply_constraints(work)
         if complete:
-            multiply_constraints(work)
             count = list_violated(vectors, indices, M, margin)
         begins = False
     if violated:
         for i in range(k):  # rounding can take multipliers out of their ranges
             p = abs(indices[NAME, i]) - 1
             vectors[MU, p] = min(max(vectors[MU, p], vectors[LEAST, i]), vectors[MOST, i])
+        if work.tag != 0.0:
+            multiply_constraints(work)  # which x has, but for rounding
     return SOLVED, k, iterations, batches, passed, violated
 
 
@@ -144,6 +153,7 @@ def _satisfy_constraint(work, k, p):
     above = mu[p] > 0.0 or (mu[p] == 0.0 and vectors[Y, p] > vectors[UPPER, p])
     sense = 1.0 if above == (mu[p] == 0.0) else -1.0  # the direction of mu_p, which comes back from a cap
     _write_slot(work, k, p, above)
+    _solve_slot(work, k, p)
     violation, K_pp = (vectors[Y, p] - vectors[BOUND, k]) * sense, vectors[DIAGONAL, k]
     while True:
         # step direction:  r = K_WW^-1 K_Wp,  d = K_pp - K_pW r;  mu_p moves by t, mu_W by -t r and y_p by -t d
@@ -231,8 +241,9 @@ def add_constraints(work, k, count):
         name = work.indices[CANDIDATES, i]
         p = abs(name) - 1
         outside = vectors[ALLOWED_LOW, p] > -np.inf or vectors[ALLOWED_HIGH, p] < np.inf  # of the working set
-        if outside and vectors[MU, p] == 0.0 and k < len(work.q):
+        if outside and k < len(work.q):
             _write_slot(work, k, p, name > 0)
+            _solve_slot(work, k, p)
             pivot = vectors[DIAGONAL, k] - dot(solved, solved, k)
             if pivot > _GUESSED_PIVOT * vectors[DIAGONAL, k]:
                 append_row(work.factor, k, solved, pivot)
@@ -243,25 +254,54 @@ def add_constraints(work, k, count):
 
 @inline_njit
 def _write_slot(work, k, p, above):
-    """Writes constraint p, at its upper bound (``above``) or its lower one, to slot k, and L_K^-1 K_Wp."""
+    """Writes constraint p, at its upper bound (``above``) or its lower one, to slot k."""
     vectors, places, n = work.vectors, work.indices[PLACE], len(work.q)
-    row, size, solved = work.rows[places[k]], int(vectors[END, p]), vectors[SOLVED_K]
-    if p >= n:
-        for i in range(0, n, 8):
-            store(row, i, load_some(work.G[p - n], i))
+    if work.tag != 0.0:
+        places[k], row = p, work.rows[n + len(work.G) + p]
+        vectors[DIAGONAL, k] = row[p]
     else:
-        for i in range(0, n, 8):
-            store(row, i, zeros())
-        row[p] = 1.0
-    solve_transposed(work.L, size, row)
-    multiply_rows(work.rows, places, k, row, size, solved)
-    solve_lower(work.factor, k, solved)
+        row, size = work.rows[places[k]], int(vectors[END, p])
+        if p >= n:
+            for i in range(0, n, 8):
+                store(row, i, load_some(work.G[p - n], i))
+        else:
+            for i in range(0, n, 8):
+                store(row, i, zeros())
+            row[p] = 1.0
+        solve_transposed(work.L, size, row)
+        vectors[DIAGONAL, k] = dot(row, row, size)
     low, high, cap = vectors[LOWER, p], vectors[UPPER, p], vectors[CAP, p]
     work.indices[NAME, k] = p + 1 if above else -(p + 1)
     vectors[BOUND, k] = high if above else low
     vectors[LEAST, k] = -cap if low == high or not above else 0.0
     vectors[MOST, k] = cap if low == high or above else 0.0
-    vectors[FREE_VALUE, k], vectors[DIAGONAL, k] = dot(row, vectors[V], n), dot(row, row, size)
+    vectors[FREE_VALUE, k] = dot(row, vectors[V], n)
+
+
+@inline_njit
+def _solve_slot(work, k, p):
+    """Writes L_K^-1 K_Wp for constraint p in slot k."""
+    solved, places = work.vectors[SOLVED_K], work.indices[PLACE]
+    if work.tag != 0.0:
+        row = work.rows[len(work.q) + len(work.G) + p]
+        for i in range(k):
+            solved[i] = row[places[i]]
+    else:
+        multiply_rows(work.rows, places, k, work.rows[places[k]], int(work.vectors[END, p]), solved)
+    solve_lower(work.factor, k, solved)
+
+
+@inline_njit
+def restore_constraints(work, count, factor):
+    """Makes the candidates of a prepared program the working set, whose factor is known."""
+    at = 0
+    for i in range(count):
+        name = work.indices[CANDIDATES, i]
+        p = abs(name) - 1
+        _write_slot(work, i, p, name > 0)
+        ignore_violations(work.vectors, p)
+        scale(1.0, factor[at:], work.factor[i], i + 1)
+        at += i + 1
 
 
 @inline_njit
@@ -311,6 +351,11 @@ def _drop_wrong_multipliers(work, k):
 def _minimise(work, k):
     """Writes the minimiser of the Lagrangian, ``P x = -(q + C'mu)``, to the first n entries of y."""
     n, vectors, y = len(work.q), work.vectors, work.vectors[Y]
+    if work.tag != 0.0:
+        add_multipliers(work, k)
+        scale(-1.0, vectors[SLOPE], vectors[SCRATCH], n)
+        multiply(work.rows[n + len(work.G) :], n, vectors[SCRATCH], n, y)
+        return
     if work.soft:  # constraints at their caps have multipliers, too
         add_multipliers(work, k)
         scale(-1.0, vectors[SLOPE], y, n)
@@ -321,6 +366,17 @@ def _minimise(work, k):
             vectors[SCRATCH, i] = vectors[MU, abs(work.indices[NAME, i]) - 1]
         subtract_rows(y, work.rows, work.indices[PLACE], vectors[SCRATCH], k, n)
     solve_lower(work.L, n, y)
+
+
+@inline_njit
+def _follow_multipliers(work, M):
+    """Moves y of a prepared program by the rows of K whose multipliers have changed."""
+    vectors, places, count = work.vectors, work.indices[CANDIDATES], 0
+    for p in range(M):
+        change = vectors[MU, p] - vectors[SEEN, p]
+        places[count], vectors[EXCESS, count] = M + p, change
+        count += change != 0.0
+    subtract_rows(vectors[Y], work.rows, places, vectors[EXCESS], count, M)
 
 
 @inline_njit

@@ -14,8 +14,9 @@ import numpy as np
 from gpmpc._compiled import compiled, inline_njit
 from gpmpc._kernels._simd import any_nonzero, clip, larger, largest, load, load_some, store, total, zeros
 from gpmpc._kernels.linalg import dot, multiply
-from gpmpc.qp._dual_iteration import NONE, add_multipliers, iterate, multiply_constraints
+from gpmpc.qp._dual_iteration import NONE, add_multipliers, iterate, multiply_constraints, restore_constraints
 from gpmpc.qp._record import (
+    AGE,
     CONSTRAINTS,
     HEADER,
     ITERATION_LIMIT,
@@ -24,6 +25,7 @@ from gpmpc.qp._record import (
     NUMERICAL_TROUBLE,
     SOLVED,
     STATUS,
+    TAG,
     VARIABLES,
     WORKING,
 )
@@ -47,6 +49,7 @@ from gpmpc.qp._workspace import (
     REST,
     SCALE,
     SCRATCH,
+    SHARE,
     SLOPE,
     UPPER,
     R,
@@ -65,6 +68,7 @@ _REFINEMENTS = 3
 _FINE, _FINEST = 2e-10, 1e-15  # residuals at which refinement stops
 _DOUBT = 3e-7  # times the shares that cancellation left of the pivots: the largest residual of a solution
 _ILL = 5e-4  # such a share: what else x violates is seen of the best x only
+_OLD = 1000  # changes after which a factor is computed anew
 _BATCHES = 4  # see ``iterate``
 _TINY = 1e-300
 _UNDEFINED = 1e300  # a residual that overflowed; less than infinity, so that refinement is tried
@@ -79,7 +83,9 @@ def solve(P, q, G, lower, upper, guess, memory, out):
     if not (shaped and dense and _is_dense_matrix(P) and _is_dense_matrix(G)):
         return MISUSE
     work = open_workspace(P, q, G, memory)
-    share = _measure_rows(work) if factorise(P, work.L) else 0.0
+    if work.tag == 0.0:
+        memory[0, SHARE] = _measure_rows(work) if factorise(P, work.L) else 0.0
+    share = memory[0, SHARE]
     longest = undefined = zeros()
     for i in range(0, n, 8):
         length = load_some(q, i) * load(work.vectors[SCALE], i)
@@ -109,9 +115,9 @@ def _solve_opened(work, guess, least, pivots, out):
     """Solves the program in the workspace, and writes the record ``out``."""
     vectors, names, factor, n = work.vectors, work.indices[NAME], work.factor, len(work.q)
     M, y, mu = n + len(work.G), vectors[Y], vectors[MU]
-    guessed = _start(work, guess)
+    k, guessed = _start(work, guess, out)
     margin, fine = _LATER / NONE * least, _FINE
-    iterations, k, rounds = np.int64(0), np.int64(0), 0  # for a literal numba compiles callees anew
+    iterations, rounds = np.int64(0), 0  # for a literal numba compiles callees anew
     status, passed, moved = NUMERICAL_TROUBLE, False, False
     interrupted = len(guess) > 0 and guess[STATUS] == ITERATION_LIMIT
     batches = np.int64(_BATCHES if interrupted else 0)  # with single steps only the dual objective cannot fall
@@ -149,18 +155,28 @@ def _solve_opened(work, guess, least, pivots, out):
     if unsure and status == SOLVED and _worst_violation(work, least) > _NOISE:
         status = NUMERICAL_TROUBLE
     out[STATUS], out[ITERATIONS], out[WORKING], out[VARIABLES], out[CONSTRAINTS] = status, iterations, k, n, M
+    out[TAG], out[AGE] = work.tag if status == SOLVED else 0.0, out[AGE] + iterations
     scale(1.0, y, out[HEADER:], n)
     scale(1.0, mu, out[HEADER + n :], M)
     for i in range(k):
         out[HEADER + n + M + i] = names[i]
+    at = HEADER + n + 2 * M
+    for i in range(k if work.tag != 0.0 else 0):
+        scale(1.0, factor[i], out[at:], i + 1)
+        at += i + 1
     return status
 
 
 @inline_njit
-def _start(work, guess):
-    """Starts from a guess: x_u, soft rows that stay violated, and candidates for the working set; returns how many."""
+def _start(work, guess, out):
+    """Starts from a guess: x_u, soft rows that stay violated, and the working set.
+
+    Returns:
+        How many constraints work already, and how many are guessed to, and are candidates.
+    """
     n, vectors, mu = len(work.q), work.vectors, work.vectors[MU]
     M = n + len(work.G)
+    out[AGE] = 0.0
     for i in range(n + 1):
         work.indices[PLACE, i] = i
     if work.soft and len(guess) > 0:
@@ -171,11 +187,19 @@ def _start(work, guess):
                 restore_limits(vectors, p)
     add_multipliers(work, np.int64(0))
     scale(-1.0, vectors[SLOPE], vectors[V], n)
-    solve_transposed(work.L, n, vectors[V])
+    if work.tag == 0.0:
+        solve_transposed(work.L, n, vectors[V])
     if len(guess) == 0:
-        return np.int64(0)
+        return np.int64(0), np.int64(0)
     first = HEADER + n + M
-    return choose_guess(vectors, work.indices, M, guess[first : first + int(guess[WORKING])])
+    names = guess[first : first + int(guess[WORKING])]
+    chosen = choose_guess(vectors, work.indices, M, names)
+    known = work.tag != 0.0 and guess[TAG] == work.tag and guess[AGE] < _OLD and len(guess) == len(out)
+    if known and chosen == len(names) and chosen <= n:
+        out[AGE] = guess[AGE]
+        restore_constraints(work, chosen, guess[first + M :])
+        return chosen, np.int64(0)
+    return np.int64(0), chosen
 
 
 @inline_njit

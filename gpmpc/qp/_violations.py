@@ -109,10 +109,12 @@ def choose_bad(vectors, indices, threshold, count, room):
 
 @inline_njit
 def choose_guess(vectors, indices, M, names):
-    """Makes candidates of the guessed constraints whose bound is there; returns how many."""
+    """Makes candidates of the guessed constraints, at no cap, whose bound is there; returns how many."""
     candidates, chosen = indices[CANDIDATES], 0
     for name in names:
-        if 1.0 <= abs(name) <= M and abs(vectors[UPPER if name > 0.0 else LOWER, int(abs(name)) - 1]) < np.inf:
-            candidates[chosen] = int(name)
-            chosen += 1
+        if 1.0 <= abs(name) <= M:
+            p = int(abs(name)) - 1
+            if vectors[MU, p] == 0.0 and abs(vectors[UPPER if name > 0.0 else LOWER, p]) < np.inf:
+                candidates[chosen] = int(name)
+                chosen += 1
     return chosen

@@ -56,7 +56,11 @@ def distance(problem: QuadraticProgram, x: np.ndarray, other: np.ndarray) -> flo
     return float(np.sqrt((x - other) @ problem.P @ (x - other)) / size)
 
 
-def dual(problem, warm_start=None):
+def prepared(problem, warm_start=None):
+    return DualActiveSet().prepare(problem.P, problem.G).solve(problem.q, problem.lower, problem.upper, warm_start)
+
+
+def changing(problem, warm_start=None):
     return DualActiveSet().solve(problem, warm_start)
 
 

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from gpmpc.qp import CvxpySolver, PrimalActiveSet, QuadraticProgram
 from gpmpc.status import Status
-from tests.qp.problems import distance, dual, feasible_problem, integer_problem, worst_residual
+from tests.qp.problems import changing, distance, feasible_problem, integer_problem, prepared, worst_residual
 
 DAQP_SOLVED, DAQP_INFEASIBLE = (1, 2), (-1, -6)  # -6: infeasible by its presolve of equal or crossed bounds
 
@@ -34,11 +34,12 @@ def test_no_disagreement_with_daqp_on_integer_problems_feasible_and_infeasible(b
         guess = rng.integers(-1, 2, len(problem.lower)) if rng.random() < 0.5 else None
         x, solved = daqp_solution(problem)
         outcomes.add(solved)
-        solution = dual(problem, guess)
-        assert solution.status is (Status.SOLVED if solved else Status.INFEASIBLE)
-        if solved:
-            assert distance(problem, solution.x, x) < 1e-6
-            assert worst_residual(solution) < 1e-9
+        for solve in (prepared, changing):
+            solution = solve(problem, guess)
+            assert solution.status is (Status.SOLVED if solved else Status.INFEASIBLE)
+            if solved:
+                assert distance(problem, solution.x, x) < 1e-6
+                assert worst_residual(solution) < 1e-9
     assert outcomes == ({True} if feasible else {True, False})
 
 
@@ -47,7 +48,7 @@ def test_no_disagreement_with_clarabel_on_integer_problems(feasible):
     rng, clarabel = np.random.default_rng([7, bool(feasible)]), CvxpySolver()
     for _ in range(60):
         problem = integer_problem(rng, feasible)
-        theirs, ours = clarabel.solve(problem), dual(problem)
+        theirs, ours = clarabel.solve(problem), changing(problem)
         assert ours.status is theirs.status
         if ours.status.solved:
             assert distance(problem, ours.x, theirs.x) < 1e-6
@@ -59,11 +60,11 @@ def test_the_papers_algorithm_finds_what_the_dual_method_finds(feasible):
     for _ in range(600):
         problem = integer_problem(rng, feasible)
         guess = rng.integers(-1, 2, len(problem.lower)) if rng.random() < 0.5 else None
-        expected, solution = dual(problem), primal.solve(problem, guess)
-        assert solution.status is expected.status
-        if expected.status.solved:
+        dual, solution = changing(problem), primal.solve(problem, guess)
+        assert solution.status is dual.status
+        if dual.status.solved:
             assert worst_residual(solution) < 1e-9
-            assert distance(problem, solution.x, expected.x) < 1e-8
+            assert distance(problem, solution.x, dual.x) < 1e-8
 
 
 numbers = st.integers(-3, 3).map(float)
@@ -88,9 +89,9 @@ def small_problems(draw):
 
 @given(small_problems())
 @settings(max_examples=400, deadline=None, derandomize=True)
-def test_both_methods_agree_on_whatever_hypothesis_invents(case):
+def test_three_methods_agree_on_whatever_hypothesis_invents(case):
     problem, guess = case
-    solutions = [dual(problem, guess), PrimalActiveSet().solve(problem, guess)]
+    solutions = [prepared(problem, guess), changing(problem, guess), PrimalActiveSet().solve(problem, guess)]
     assert len({solution.status for solution in solutions}) == 1
     assert solutions[0].status in (Status.SOLVED, Status.INFEASIBLE)
     if solutions[0].status.solved:
@@ -99,12 +100,13 @@ def test_both_methods_agree_on_whatever_hypothesis_invents(case):
             assert distance(problem, solutions[0].x, solution.x) < 1e-8
 
 
+@pytest.mark.parametrize("solve", [prepared, changing])
 @pytest.mark.parametrize("condition", [1.0, 1e4, 1e8])
 @pytest.mark.parametrize("n", [1, 2, 3, 7, 20, 50, 150])
-def test_every_size_and_conditioning_is_solved_to_1e_9(n, condition, rng):
+def test_every_size_and_conditioning_is_solved_to_1e_9(solve, n, condition, rng):
     for m in (0, n, 2 * n):
         problem = feasible_problem(rng, n, m, condition)
-        solution = dual(problem)
+        solution = solve(problem)
         assert solution.status is Status.SOLVED
         assert worst_residual(solution) < 1e-9
         x, _ = daqp_solution(problem)
@@ -114,4 +116,5 @@ def test_every_size_and_conditioning_is_solved_to_1e_9(n, condition, rng):
 @pytest.mark.parametrize("n", range(1, 151, 7))
 def test_every_number_of_variables_from_1_to_150_without_rows(n, rng):
     problem = feasible_problem(rng, n, 0)
-    assert dual(problem).is_optimal(1e-9)
+    for solution in (prepared(problem), changing(problem)):
+        assert solution.is_optimal(1e-9)

@@ -35,7 +35,10 @@ def test_an_odd_array_is_read_as_what_it_is(odd, position, rng):
     given = list(arrays)
     given[position] = odd(arrays[position])
     expected = solve_stacked(*arrays)
-    for solution in (solve_stacked(*given), solve_stacked(*given, expected)):
+    solutions = [solve_stacked(*given), solve_stacked(*given, expected)]
+    prepared = DualActiveSet().prepare(given[0], given[2])
+    solutions += [prepared.solve(given[1], *given[3:]), prepared.solve(given[1], *given[3:], expected)]
+    for solution in solutions:
         assert solution.status is expected.status
         if expected.status.solved:
             assert worst_residual(solution) < 1e-9
@@ -61,14 +64,16 @@ def test_eight_bytes_of_another_kind_are_not_taken_for_a_float(kind, rng):
     rest = problem.lower, problem.upper
     q = np.arange(3).astype(kind)
     expected = solve_stacked(problem.P, np.arange(3.0), problem.G, *rest)
-    solution = solve_stacked(problem.P, q, problem.G, *rest, expected)
-    np.testing.assert_allclose(solution.x, expected.x, atol=1e-9)
+    prepared = DualActiveSet().prepare(problem.P, problem.G)
+    for solution in (prepared.solve(q, *rest, expected), solve_stacked(problem.P, q, problem.G, *rest)):
+        np.testing.assert_allclose(solution.x, expected.x, atol=1e-9)
 
 
 def test_a_record_with_gaps_is_a_warm_start_too(rng):
     problem = feasible_problem(rng, 6, 9)
     cold = DualActiveSet().solve(problem)
     gappy = cold._replace(record=np.repeat(cold.record, 2)[::2])
-    solution = DualActiveSet().solve(problem, gappy)
-    assert solution.status.solved
-    np.testing.assert_allclose(solution.x, cold.x, atol=1e-9)
+    prepared, vectors = DualActiveSet().prepare(problem.P, problem.G), (problem.q, problem.lower, problem.upper)
+    for solution in (DualActiveSet().solve(problem, gappy), prepared.solve(*vectors, gappy)):
+        assert solution.status.solved
+        np.testing.assert_allclose(solution.x, cold.x, atol=1e-9)

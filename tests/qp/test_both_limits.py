@@ -8,12 +8,16 @@ from gpmpc.status import Status
 from tests.qp.problems import feasible_problem
 
 
+@pytest.mark.parametrize("mode", ["prepared", "changing"])
 @pytest.mark.parametrize("limit", [10, 40, 80])
-def test_a_solve_stops_at_its_iteration_limit_however_much_time_there_is(limit, rng):
+def test_a_solve_stops_at_its_iteration_limit_however_much_time_there_is(mode, limit, rng):
     for _ in range(4):
         problem = feasible_problem(rng, 40, 80)
         solver = DualActiveSet(iteration_limit=limit, time_limit=60.0)
-        solution = solver.solve(problem)
+        if mode == "prepared":
+            solution = solver.prepare(problem.P, problem.G).solve(problem.q, problem.lower, problem.upper)
+        else:
+            solution = solver.solve(problem)
         assert solution.status is Status.ITERATION_LIMIT
         assert limit <= solution.iterations <= limit + 50  # it looks at its count now and then
         residuals = solution.residuals()

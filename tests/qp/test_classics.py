@@ -6,9 +6,10 @@ from scipy.linalg import hilbert
 
 from gpmpc.qp import QuadraticProgram
 from gpmpc.status import Status
-from tests.qp.problems import dual, feasible_problem, primal, stacked_rows, worst_residual
+from tests.qp.problems import changing, feasible_problem, prepared, primal, stacked_rows, worst_residual
 
-ALL = pytest.mark.parametrize("solve", [dual, primal])
+ALL = pytest.mark.parametrize("solve", [prepared, changing, primal])
+DUAL = pytest.mark.parametrize("solve", [prepared, changing])
 
 
 @ALL
@@ -91,9 +92,10 @@ def test_dependent_equalities_that_agree_are_solved_and_those_that_do_not_are_in
     assert solve(QuadraticProgram(np.eye(n), np.ones(n), G, b, b)).status is Status.INFEASIBLE
 
 
-def test_infeasibility_comes_with_a_farkas_proof(rng):
+@DUAL
+def test_infeasibility_comes_with_a_farkas_proof(solve, rng):
     problem = QuadraticProgram(np.eye(3), np.ones(3), rng.random((4, 3)), h_lower=np.full(4, 9.0), ub=np.ones(3))
-    solution = dual(problem)
+    solution = solve(problem)
     assert solution.status is Status.INFEASIBLE
     ray = solution.multipliers
     np.testing.assert_allclose(stacked_rows(problem).T @ ray, 0.0, atol=1e-12)
@@ -101,18 +103,20 @@ def test_infeasibility_comes_with_a_farkas_proof(rng):
     assert np.sum(ray[ray != 0] * bounds[ray != 0]) < -1e-6
 
 
+@DUAL
 @pytest.mark.parametrize("gap", [1e-3, 1e-5, 1e-6])
-def test_a_thin_but_real_feasible_set_is_not_called_infeasible(gap):
+def test_a_thin_but_real_feasible_set_is_not_called_infeasible(solve, gap):
     # two nearly parallel rows leave a sliver between them
     G = np.array([[1.0, 1.0], [1.0 + gap, 1.0], [0.0, 1.0]])
     problem = QuadraticProgram(np.eye(2), [-1.0, -1.0], G, [1.0, -np.inf, -np.inf], [np.inf, 1.0, 5.0])
-    solution = dual(problem)
+    solution = solve(problem)
     assert solution.status is Status.SOLVED
     assert worst_residual(solution) < 1e-9
 
 
+@DUAL
 @pytest.mark.parametrize("scale", [1e-4, 1e4])
-def test_badly_scaled_variables_are_no_reason_for_a_false_infeasible(scale, rng):
+def test_badly_scaled_variables_are_no_reason_for_a_false_infeasible(solve, scale, rng):
     for _ in range(20):
         problem = feasible_problem(rng, 6, 10)
         D = scale ** rng.uniform(-1.0, 1.0, 6)
@@ -120,16 +124,17 @@ def test_badly_scaled_variables_are_no_reason_for_a_false_infeasible(scale, rng)
             problem.P * np.outer(D, D), problem.q * D, problem.G * D, problem.h_lower, problem.h_upper,
             problem.lb / D, problem.ub / D,
         )  # fmt: skip
-        solution = dual(scaled)
+        solution = solve(scaled)
         assert solution.status is Status.SOLVED
-        np.testing.assert_allclose(solution.x * D, dual(problem).x, atol=1e-6)
+        np.testing.assert_allclose(solution.x * D, solve(problem).x, atol=1e-6)
 
 
-def test_a_fixed_variable_stays_where_it_is_put(rng):
+@DUAL
+def test_a_fixed_variable_stays_where_it_is_put(solve, rng):
     problem = feasible_problem(rng, 5, 0)
     lb, ub = problem.lb.copy(), problem.ub.copy()
     lb[2] = ub[2] = 0.7
-    solution = dual(QuadraticProgram(problem.P, problem.q, lb=lb, ub=ub))
+    solution = solve(QuadraticProgram(problem.P, problem.q, lb=lb, ub=ub))
     assert solution.x[2] == pytest.approx(0.7, abs=1e-12)
     assert solution.is_optimal(1e-9)
 

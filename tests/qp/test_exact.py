@@ -10,7 +10,7 @@ from gpmpc.qp._solution import zero_row_size
 from gpmpc.status import Status
 from tests.qp.exact import exact_solution, rational
 from tests.qp.families import FAMILIES
-from tests.qp.problems import dual, primal
+from tests.qp.problems import changing, prepared, primal
 
 SLICE, STUDY, UNSOLVED = 60, 2000, 1e-3
 ROUNDING = Fraction(1, 10**14)
@@ -18,7 +18,7 @@ ROUNDING = Fraction(1, 10**14)
 
 def guessed(problem):
     guess = np.random.default_rng(len(problem.lower)).integers(-1, 2, len(problem.lower))
-    return dual(problem, guess)
+    return prepared(problem, guess)
 
 
 def error(problem, x, exact):
@@ -89,7 +89,7 @@ def unsolved(family, solve, count):
     return left
 
 
-@pytest.mark.parametrize("solve", [dual, guessed])
+@pytest.mark.parametrize("solve", [changing, prepared, guessed])
 @pytest.mark.parametrize("family", FAMILIES)
 def test_no_answer_of_the_dual_method_is_wrong(family, solve):
     assert unsolved(family, solve, SLICE) == 0
@@ -101,7 +101,7 @@ def test_no_answer_of_the_primal_method_is_wrong(family):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("solve", [dual, guessed])
+@pytest.mark.parametrize("solve", [changing, prepared, guessed])
 @pytest.mark.parametrize("family", FAMILIES)
 def test_no_answer_of_two_thousand_is_wrong(family, solve):
     assert unsolved(family, solve, STUDY) <= UNSOLVED * STUDY
@@ -112,17 +112,20 @@ def test_rows_at_prices_beyond_their_multipliers_have_the_exact_solution_of_hard
     rng, solver, feasible = np.random.default_rng([15, list(FAMILIES).index(family)]), DualActiveSet(), 0
     for number in range(20):
         problem = FAMILIES[family](rng)
-        exact, hard = exact_solution(problem), dual(problem)
+        exact, hard = exact_solution(problem), changing(problem)
         if exact is not None and hard.status.solved:
             prices = np.full(len(problem.G), 2.0 * max(np.abs(hard.z).max(initial=0.0), np.finfo(float).tiny))
-            solution = solver.solve(problem, prices=prices)
-            assert solution.status is Status.SOLVED, (family, number)
-            assert error(problem, solution.x, exact) < 1e-6, (family, number)
+            for solution in (
+                solver.solve(problem, prices=prices),
+                solver.prepare(problem.P, problem.G, prices).solve(problem.q, problem.lower, problem.upper),
+            ):
+                assert solution.status is Status.SOLVED, (family, number)
+                assert error(problem, solution.x, exact) < 1e-6, (family, number)
             feasible += 1
     assert feasible > 5
 
 
-@pytest.mark.parametrize("solve", [dual, primal])
+@pytest.mark.parametrize("solve", [changing, prepared, primal])
 @pytest.mark.parametrize("size", [1e3, 1e6, 1e9, 1e12, 1e15, 1e19])
 @pytest.mark.parametrize("place", ["box", "row"])
 @pytest.mark.parametrize("sign", [-1.0, 1.0])
@@ -134,16 +137,17 @@ def test_a_large_bound_on_one_side_leaves_the_other_as_it_is(solve, size, place,
     assert solution.x[0] == sign
 
 
+@pytest.mark.parametrize("solve", [changing, prepared])
 @pytest.mark.parametrize("share", [1e-3, 1e-6, 1e-9, 1e-12])
-def test_what_only_looks_like_a_contradiction_is_solved(share):
+def test_what_only_looks_like_a_contradiction_is_solved(solve, share):
     G = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [1.0, 1.0, share]])
     b = np.array([0.0, 0.0, 1e3 * share])
-    solution = dual(QuadraticProgram(np.eye(3), np.zeros(3), G, b, b))
+    solution = solve(QuadraticProgram(np.eye(3), np.zeros(3), G, b, b))
     assert solution.status is Status.SOLVED
     np.testing.assert_allclose(solution.x, [0.0, 0.0, 1e3], rtol=1e-9, atol=1e-9)
 
 
-@pytest.mark.parametrize("solve", [dual, primal])
+@pytest.mark.parametrize("solve", [changing, prepared, primal])
 def test_a_zero_row_that_misses_zero_by_rounding_proves_nothing_and_one_that_misses_it_by_more_does(solve):
     for bound, status in ((-1e-17, Status.SOLVED), (-1e-6, Status.INFEASIBLE)):
         problem = QuadraticProgram(np.eye(2), [-1.0, 2.0], np.zeros((1, 2)), h_upper=[bound])

@@ -18,14 +18,19 @@ from tests.qp.problems import feasible_problem, integer_problem
 PACKAGE = Path(__file__).resolve().parents[2] / "gpmpc"
 
 
-def test_the_iteration_limit_returns_a_dual_iterate_from_which_the_next_solve_goes_on(rng):
+@pytest.mark.parametrize("mode", ["prepared", "changing"])
+def test_the_iteration_limit_returns_a_dual_iterate_from_which_the_next_solve_goes_on(mode, rng):
     problem = feasible_problem(rng, 20, 30)
     full = DualActiveSet().solve(problem)
     assert full.iterations > 6
     limited = DualActiveSet(iteration_limit=3)
+    prepared = limited.prepare(problem.P, problem.G)
     solution, objectives = None, []
     for _ in range(full.iterations):
-        solution = limited.solve(problem, solution)
+        if mode == "prepared":
+            solution = prepared.solve(problem.q, problem.lower, problem.upper, solution)
+        else:
+            solution = limited.solve(problem, solution)
         objectives.append(solution.objective)
         assert solution.residuals().dual < 1e-9
         if solution.status.solved:
@@ -39,15 +44,22 @@ def test_the_iteration_limit_returns_a_dual_iterate_from_which_the_next_solve_go
     assert len(objectives) > 2
 
 
-def test_the_time_limit_stops_a_long_solve_and_does_not_touch_a_short_one(rng):
+@pytest.mark.parametrize("mode", ["prepared", "changing"])
+def test_the_time_limit_stops_a_long_solve_and_does_not_touch_a_short_one(mode, rng):
     problem = feasible_problem(rng, 120, 300)
     full = DualActiveSet().solve(problem)
     assert full.iterations > 50
-    hurried = DualActiveSet(time_limit=1e-7).solve(problem)
+
+    def solve(solver):
+        if mode == "prepared":
+            return solver.prepare(problem.P, problem.G).solve(problem.q, problem.lower, problem.upper)
+        return solver.solve(problem)
+
+    hurried = solve(DualActiveSet(time_limit=1e-7))
     assert hurried.status is Status.TIME_LIMIT
     assert hurried.iterations < full.iterations
     assert hurried.residuals().dual < 1e-9
-    patient = DualActiveSet(time_limit=60.0).solve(problem)
+    patient = solve(DualActiveSet(time_limit=60.0))
     assert patient.status is Status.SOLVED
     assert patient.iterations > 2 * hurried.iterations
     np.testing.assert_allclose(patient.x, full.x, atol=1e-9)
@@ -58,14 +70,23 @@ def test_the_primal_method_says_when_it_stops_early(rng):
     assert solution.status is Status.ITERATION_LIMIT
 
 
-def test_one_solver_serves_many_threads(rng):
+def test_one_solver_and_one_prepared_problem_serve_many_threads(rng):
     problems = [feasible_problem(rng, 12, 20) for _ in range(8)]
+    shared = problems[0]
     solver = DualActiveSet()
-    expected = [solver.solve(p).x for p in problems]
+    prepared = solver.prepare(shared.P, shared.G)
+    gradients = [shared.q + rng.standard_normal(12) for _ in range(8)]
+    expected = [
+        [solver.solve(p).x for p in problems],
+        [prepared.solve(q, shared.lower, shared.upper).x for q in gradients],
+    ]
 
     def work(_):
         own = DualActiveSet()
-        return [[s.solve(p).x for p in problems] for _ in range(50) for s in (own, solver)]
+        return [
+            [[own.solve(p).x for p in problems], [prepared.solve(q, shared.lower, shared.upper).x for q in gradients]]
+            for _ in range(50)
+        ]
 
     with ThreadPoolExecutor(4) as pool:
         for results in pool.map(work, range(4)):
@@ -75,10 +96,9 @@ def test_one_solver_serves_many_threads(rng):
 
 START = """
 import numpy as np
-from gpmpc.qp import DualActiveSet, QuadraticProgram
+from gpmpc.qp import DualActiveSet
 from gpmpc.qp._dual_kernels import solve
-half = np.full(4, 0.5)
-solution = DualActiveSet().solve(QuadraticProgram.from_stacked(np.eye(3), np.ones(3), np.ones((1, 3)), -half, half))
+solution = DualActiveSet().prepare(np.eye(3), np.ones((1, 3))).solve(np.ones(3), np.full(4, -0.5), np.full(4, 0.5))
 assert solution.is_optimal(1e-12), solution
 print(sum(solve.stats.cache_misses.values()))
 """
@@ -107,7 +127,7 @@ def copy_of_the_package(folder):
 
 
 def test_a_new_process_takes_its_kernels_from_the_cache_of_the_last_one():
-    DualActiveSet()  # fills the cache beside the source, unless it is there already
+    DualActiveSet().prepare(np.eye(2))  # fills the cache beside the source, unless it is there already
     assert first_solve(PACKAGE.parent) == 0
 
 
@@ -141,11 +161,15 @@ def crowded_vertex(rng):
     return QuadraticProgram((P + P.T) / 2, q, G, h_upper=G @ vertex), vertex
 
 
-def test_vertices_where_many_rows_meet_are_found_without_cycling(rng):
+@pytest.mark.parametrize("mode", ["prepared", "changing"])
+def test_vertices_where_many_rows_meet_are_found_without_cycling(mode, rng):
     solver = DualActiveSet()
     for _ in range(30):
         problem, vertex = crowded_vertex(rng)
-        solution = solver.solve(problem)
+        prepared = solver.prepare(problem.P, problem.G)
+        solution = (
+            prepared.solve(problem.q, problem.lower, problem.upper) if mode == "prepared" else solver.solve(problem)
+        )
         assert solution.status is Status.SOLVED
         x, _, flag, _ = daqp.solve(
             problem.P.copy(), problem.q.copy(), problem.G.copy(), np.minimum(problem.upper, 1e30),
@@ -155,7 +179,8 @@ def test_vertices_where_many_rows_meet_are_found_without_cycling(rng):
         np.testing.assert_allclose(solution.x, x, atol=1e-7 * np.abs(vertex).max())
 
 
-def test_rows_that_depend_on_each_other_but_for_rounding_are_no_obstacle(rng):
+@pytest.mark.parametrize("mode", ["prepared", "changing"])
+def test_rows_that_depend_on_each_other_but_for_rounding_are_no_obstacle(mode, rng):
     """Two to six times as many rows as variables meet in a vertex, and span half of the space."""
     solver = DualActiveSet()
     for _ in range(20):
@@ -166,7 +191,10 @@ def test_rows_that_depend_on_each_other_but_for_rounding_are_no_obstacle(rng):
         G = rng.standard_normal((m, n // 2)) @ rng.standard_normal((n // 2, n))
         multipliers = rng.uniform(0, 1, m) * (rng.random(m) < 0.5)
         problem = QuadraticProgram((P + P.T) / 2, -P @ vertex - G.T @ multipliers, G, h_upper=G @ vertex)
-        solution = solver.solve(problem)
+        prepared = solver.prepare(problem.P, problem.G)
+        solution = (
+            prepared.solve(problem.q, problem.lower, problem.upper) if mode == "prepared" else solver.solve(problem)
+        )
         assert solution.status is Status.SOLVED
         np.testing.assert_allclose(solution.x, vertex, atol=1e-6 * np.abs(vertex).max())
 

@@ -26,12 +26,18 @@ def near_dependent_problem(rng, feasible=True):
 
 @pytest.mark.parametrize("soft", [False, True])
 @pytest.mark.parametrize("feasible", [True, False])
-def test_what_is_called_solved_is_optimal_and_what_is_called_infeasible_is(feasible, soft, rng):
+@pytest.mark.parametrize("mode", ["prepared", "changing"])
+def test_what_is_called_solved_is_optimal_and_what_is_called_infeasible_is(mode, feasible, soft, rng):
     solver, solved = DualActiveSet(), 0
     for _ in range(250):
         problem = near_dependent_problem(rng, feasible)
         prices = 10.0 ** rng.uniform(-3, 10, len(problem.G))
-        solution = solver.solve(problem, None, prices if soft else None)
+        charged = prices if soft else None
+        if mode == "prepared":
+            prepared = solver.prepare(problem.P, problem.G, charged)
+            solution = prepared.solve(problem.q, problem.lower, problem.upper)
+        else:
+            solution = solver.solve(problem, None, charged)
         if solution.status is Status.SOLVED:
             assert solution.is_optimal(1e-9), solution.residuals()
             assert np.isfinite(solution.x).all()

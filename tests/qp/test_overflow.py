@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from gpmpc.qp import PrimalActiveSet, QuadraticProgram
+from gpmpc.qp import DualActiveSet, PrimalActiveSet, QuadraticProgram
 from gpmpc.status import Status
 from tests.qp.problems import solve_stacked
 
@@ -16,12 +16,14 @@ PROBLEMS = {  # the minimum is at -P^-1 q, which float64 cannot hold
 
 
 def solve_in(mode, P, q, G, lower, upper):
-    if mode == "dual":
+    if mode == "prepared":
+        return DualActiveSet().prepare(P, G).solve(q, lower, upper)
+    if mode == "changing":
         return solve_stacked(P, q, G, lower, upper)
     return PrimalActiveSet().solve(QuadraticProgram.from_stacked(P, q, G, lower, upper))
 
 
-@pytest.mark.parametrize("mode", ["dual", "primal"])
+@pytest.mark.parametrize("mode", ["prepared", "changing", "primal"])
 @pytest.mark.parametrize("name", PROBLEMS)
 @pytest.mark.parametrize("rows", [0, 2])
 def test_a_minimiser_that_is_not_finite_is_never_called_a_solution(mode, name, rows):
@@ -32,23 +34,25 @@ def test_a_minimiser_that_is_not_finite_is_never_called_a_solution(mode, name, r
     assert solution.status is Status.NUMERICAL_TROUBLE
 
 
+@pytest.mark.parametrize("mode", ["prepared", "changing"])
 @pytest.mark.parametrize("name", PROBLEMS)
-def test_bounds_that_keep_it_finite_give_the_solution(name):
+def test_bounds_that_keep_it_finite_give_the_solution(mode, name):
     P, q = PROBLEMS[name]
     bound = np.ones(len(q))
-    solution = solve_stacked(P, q, np.zeros((0, len(q))), -bound, bound)
+    solution = solve_in(mode, P, q, np.zeros((0, len(q))), -bound, bound)
     assert solution.status.solved
     np.testing.assert_allclose(solution.x, -bound)
     assert solution.is_optimal(1e-9)
 
 
 @pytest.mark.parametrize("size", [1, 3, 4, 5, 8, 9, 13])
-def test_one_overflowing_entry_is_seen_wherever_it_stands(size):
+@pytest.mark.parametrize("mode", ["prepared", "changing"])
+def test_one_overflowing_entry_is_seen_wherever_it_stands(size, mode):
     for place in range(size):
         P, q = np.ones(size), np.ones(size)
         P[place], q[place] = 1e-155, -1e155
         free = np.full(size, np.inf)
-        solution = solve_stacked(np.diag(P), q, np.zeros((0, size)), -free, free)
+        solution = solve_in(mode, np.diag(P), q, np.zeros((0, size)), -free, free)
         assert solution.status is Status.NUMERICAL_TROUBLE
 
 
@@ -56,13 +60,16 @@ def test_a_proper_problem_that_the_kernel_refuses_is_not_answered_by_what_memory
     """A row whose norm overflows; zeros in memory read as SOLVED, with x = 0."""
     monkeypatch.setattr(np, "empty", np.zeros)
     rows = np.full((1, 3), 2e300)
-    solution = solve_stacked(np.eye(3), np.ones(3), rows, np.full(4, -np.inf), np.array([*np.full(3, np.inf), -1.0]))
+    solution = solve_in(
+        "changing", np.eye(3), np.ones(3), rows, np.full(4, -np.inf), np.array([*np.full(3, np.inf), -1.0])
+    )
     assert solution.is_optimal(1e-9) or not solution.status.solved
 
 
-def test_a_row_whose_norm_overflows_is_not_taken_for_one_that_is_kept():
+@pytest.mark.parametrize("mode", ["prepared", "changing"])
+def test_a_row_whose_norm_overflows_is_not_taken_for_one_that_is_kept(mode):
     q, upper = np.array([1.0, -2.0, 1.0]), np.array([np.inf, np.inf, np.inf, -1.0])
-    solution = solve_stacked(np.eye(3), q, np.array([[1e300, 2e300, 0.0]]), np.full(4, -np.inf), upper)
+    solution = solve_in(mode, np.eye(3), q, np.array([[1e300, 2e300, 0.0]]), np.full(4, -np.inf), upper)
     assert solution.is_optimal(1e-9) or not solution.status.solved
 
 

@@ -67,10 +67,12 @@ GOOD = {"P": EYE, "q": np.zeros(2), "G": np.ones((1, 2)), "lower": -np.ones(3), 
         ("upper", np.ones(4), "shape"),
     ],
 )
-def test_the_fast_entry_refuses_the_same_misuse(name, value, message):
+def test_the_fast_entries_refuse_the_same_misuse(name, value, message):
     arguments = GOOD | {name: value}
     with pytest.raises(ProblemError, match=message):
         solve_stacked(**arguments)
+    with pytest.raises(ProblemError, match=message):
+        DualActiveSet().prepare(arguments.pop("P"), arguments.pop("G")).solve(**arguments)
 
 
 def test_the_good_problem_of_these_tests_is_good():
@@ -115,6 +117,8 @@ def test_unstacking_and_stacking_bounds_are_inverse(rng):
 def test_prices_are_positive_numbers_one_for_each_row(prices, message):
     with pytest.raises(ProblemError, match=message):
         DualActiveSet().solve(QuadraticProgram(EYE, [0.0, 0.0], EYE), prices=prices)
+    with pytest.raises(ProblemError, match=message):
+        DualActiveSet().prepare(EYE, EYE, prices)
 
 
 @pytest.mark.parametrize("solver", [DualActiveSet, PrimalActiveSet])

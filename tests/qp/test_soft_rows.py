@@ -8,8 +8,16 @@ from gpmpc.status import Status
 from tests.qp.problems import feasible_problem, worst_residual
 
 
-def solve(problem, prices, warm_start=None):
+def prepared(problem, prices, warm_start=None):
+    prepared = DualActiveSet().prepare(problem.P, problem.G, prices)
+    return prepared.solve(problem.q, problem.lower, problem.upper, warm_start)
+
+
+def changing(problem, prices, warm_start=None):
     return DualActiveSet().solve(problem, warm_start, prices)
+
+
+DUAL = pytest.mark.parametrize("solve", [prepared, changing])
 
 
 def with_slacks(problem, prices, curvature=1e-6):
@@ -37,9 +45,10 @@ def conflicting_problem(rng, n, m):
     )
 
 
+@DUAL
 @pytest.mark.parametrize("hard", [0, 2])
 @pytest.mark.parametrize(("n", "m"), [(1, 1), (4, 6), (10, 25)])
-def test_soft_rows_solve_the_problem_written_out_with_slacks(hard, n, m, rng):
+def test_soft_rows_solve_the_problem_written_out_with_slacks(solve, hard, n, m, rng):
     violated = 0
     for _ in range(10):
         problem = conflicting_problem(rng, n, m)
@@ -60,9 +69,10 @@ def test_soft_rows_solve_the_problem_written_out_with_slacks(hard, n, m, rng):
     assert violated > 0
 
 
-def test_an_exact_penalty_above_the_multipliers_leaves_a_feasible_problem_as_it_is(rng):
+@DUAL
+def test_an_exact_penalty_above_the_multipliers_leaves_a_feasible_problem_as_it_is(solve, rng):
     problem = feasible_problem(rng, 6, 9)
-    hard = solve(problem, None)
+    hard = changing(problem, None)
     assert np.abs(hard.z).max() > 0.1
     exact = solve(problem, np.full(9, 1.01 * np.abs(hard.z).max()))
     np.testing.assert_allclose(exact.x, hard.x, atol=1e-10)
@@ -70,12 +80,14 @@ def test_an_exact_penalty_above_the_multipliers_leaves_a_feasible_problem_as_it_
     assert cheap.violation().max() > 1e-6
 
 
-def test_rows_of_infinite_price_are_hard(rng):
+@DUAL
+def test_rows_of_infinite_price_are_hard(solve, rng):
     problem = feasible_problem(rng, 6, 9)
     np.testing.assert_allclose(solve(problem, np.full(9, np.inf)).x, solve(problem, None).x, atol=1e-10)
 
 
-def test_rows_that_contradict_each_other_have_a_solution_once_they_are_soft():
+@DUAL
+def test_rows_that_contradict_each_other_have_a_solution_once_they_are_soft(solve):
     G = np.array([[1.0, 1.0], [1.0, 1.0]])
     problem = QuadraticProgram(np.eye(2), np.zeros(2), G, [2.0, -np.inf], [np.inf, 1.0])
     assert DualActiveSet().solve(problem).status is Status.INFEASIBLE
@@ -84,14 +96,16 @@ def test_rows_that_contradict_each_other_have_a_solution_once_they_are_soft():
     np.testing.assert_allclose(solution.z, [-4.0, 3.0], atol=1e-12)
 
 
-def test_a_hard_box_stays_hard_however_dear_the_soft_rows():
+@DUAL
+def test_a_hard_box_stays_hard_however_dear_the_soft_rows(solve):
     problem = QuadraticProgram(np.eye(1), [0.0], [[1.0]], [5.0], [np.inf], [-1.0], [1.0])
     solution = solve(problem, [1e6])
     assert solution.status is Status.SOLVED
     assert solution.x[0] == pytest.approx(1.0, abs=1e-12)
 
 
-def test_soft_problems_in_a_row_have_the_same_answers_warm_and_cold(rng):
+@DUAL
+def test_soft_problems_in_a_row_have_the_same_answers_warm_and_cold(solve, rng):
     n, m = 8, 20
     problem = conflicting_problem(rng, n, m)
     prices = 10.0 ** rng.uniform(-1.0, 1.0, m)
@@ -110,9 +124,10 @@ def test_soft_problems_in_a_row_have_the_same_answers_warm_and_cold(rng):
     assert at_caps > 0
 
 
+@DUAL
 @pytest.mark.parametrize("side", [-1.0, 1.0])
 @pytest.mark.parametrize("price", [0.5, 40.0])
-def test_a_multiplier_beyond_what_its_row_may_pay_is_a_dual_residual(side, price):
+def test_a_multiplier_beyond_what_its_row_may_pay_is_a_dual_residual(solve, side, price):
     """min 1/2 x^2 with the row |x| >= 100 at the price w a unit: x = w. At any other x the multiplier is no price."""
     bounds = ([100.0], [np.inf]) if side > 0 else ([-np.inf], [-100.0])
     solution = solve(QuadraticProgram(np.eye(1), [0.0], [[1.0]], *bounds), [price])

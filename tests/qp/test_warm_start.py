@@ -3,18 +3,21 @@
 import numpy as np
 import pytest
 
+from gpmpc.qp import DualActiveSet
 from gpmpc.qp import _record as layout
 from gpmpc.status import Status
 from tests.qp.problems import (
-    dual,
+    changing,
     feasible_problem,
     integer_problem,
+    prepared,
     primal,
     solve_stacked,
     worst_residual,
 )
 
-ALL = pytest.mark.parametrize("solve", [dual, primal])
+ALL = pytest.mark.parametrize("solve", [prepared, changing, primal])
+DUAL = pytest.mark.parametrize("solve", [prepared, changing])
 
 
 @ALL
@@ -32,23 +35,25 @@ def test_the_answer_does_not_depend_on_the_warm_start(solve, n, m, rng):
         np.testing.assert_allclose(warm.x, cold.x, atol=1e-9 * max(1.0, np.abs(cold.x).max()))
 
 
-def test_the_right_guess_needs_no_iteration(rng):
+@DUAL
+def test_the_right_guess_needs_no_iteration(solve, rng):
     problem = feasible_problem(rng, 15, 20)
-    cold = dual(problem)
+    cold = solve(problem)
     assert cold.iterations > 0
-    assert dual(problem, cold).iterations == 0
-    assert dual(problem, cold.active_set).iterations == 0
+    assert solve(problem, cold).iterations == 0
+    assert solve(problem, cold.active_set).iterations == 0
 
 
-def test_a_record_full_of_nonsense_is_a_harmless_warm_start(rng):
+@DUAL
+def test_a_record_full_of_nonsense_is_a_harmless_warm_start(solve, rng):
     problem = feasible_problem(rng, 6, 8)
-    cold = dual(problem)
+    cold = solve(problem)
     for filling in (np.nan, np.inf, -np.inf, 1e300, -7.5, 0.0, 3.0):
         record = np.full_like(cold.record, filling)
         for count in (0.0, 3.0, 14.0, np.nan, -1.0, 1e9):
             record[layout.WORKING] = count
             nonsense = cold._replace(record=record)
-            np.testing.assert_allclose(dual(problem, nonsense).x, cold.x, atol=1e-10)
+            np.testing.assert_allclose(solve(problem, nonsense).x, cold.x, atol=1e-10)
 
 
 @ALL
@@ -74,19 +79,45 @@ def test_strided_fortran_read_only_and_integer_inputs_give_the_same_bits(rng):
         array.flags.writeable = False
         return array
 
-    expected = solve_stacked(P, q, G, lower, upper)
+    prepared = DualActiveSet().prepare(P, G)
+    expected = prepared.solve(q, lower, upper)
+    expected_lazy = solve_stacked(P, q, G, lower, upper)
     for change in (strided, np.asfortranarray, frozen):
         arrays = [change(array) for array in (P, q, G, lower, upper)]
         kept = [array.copy() for array in arrays]
-        np.testing.assert_array_equal(solve_stacked(*arrays).x, expected.x)
+        again = DualActiveSet().prepare(arrays[0], arrays[2]).solve(arrays[1], arrays[3], arrays[4])
+        np.testing.assert_array_equal(again.x, expected.x)
+        again = solve_stacked(*arrays)
+        np.testing.assert_array_equal(again.x, expected_lazy.x)
         for array, copy in zip(arrays, kept, strict=True):
             np.testing.assert_array_equal(array, copy)
-    np.testing.assert_array_equal(solve_stacked(P, q.astype(int), G, lower.tolist(), upper).x, expected.x)
+    np.testing.assert_array_equal(prepared.solve(q.astype(int), lower.tolist(), upper).x, expected.x)
+    np.testing.assert_array_equal(
+        prepared.solve(q, lower, upper, expected).x, prepared.solve(q, lower, upper, expected).x
+    )
 
 
-def test_a_solution_is_a_copy_that_later_solves_leave_alone(rng):
+@DUAL
+def test_a_solution_is_a_copy_that_later_solves_leave_alone(solve, rng):
     problem = feasible_problem(rng, 5, 5)
-    first = dual(problem)
+    first = solve(problem)
     kept = first.x.copy()
-    dual(feasible_problem(rng, 5, 5), first)
+    solve(feasible_problem(rng, 5, 5), first)
     np.testing.assert_array_equal(first.x, kept)
+
+
+@pytest.mark.parametrize(("n", "m"), [(1, 1), (6, 9), (20, 40)])
+def test_a_prepared_program_that_has_solved_others_gives_the_bits_of_a_new_one(n, m, rng):
+    """The factor of the working set comes with the guess, not from the memory of the solver."""
+    problem = feasible_problem(rng, n, m)
+    used, last, changes = DualActiveSet().prepare(problem.P, problem.G), None, 0
+    for k in range(60):
+        q = problem.q + (0.0 if k % 3 == 0 else 2.0) * rng.standard_normal(n)
+        guess = rng.integers(-1, 2, n + m) if k % 7 == 6 else last
+        new = DualActiveSet().prepare(problem.P, problem.G).solve(q, problem.lower, problem.upper, guess)
+        last = used.solve(q, problem.lower, problem.upper, guess)
+        assert last.status is new.status is Status.SOLVED
+        np.testing.assert_array_equal(last.x, new.x)
+        np.testing.assert_array_equal(last.multipliers, new.multipliers)
+        changes += last.iterations > 0
+    assert changes > 0
