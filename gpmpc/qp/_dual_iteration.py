@@ -53,7 +53,6 @@ from gpmpc.qp._workspace import (
     PLACE,
     SCALE,
     SCRATCH,
-    SEEN,
     SINES,
     SLOPE,
     SOLVED_K,
@@ -96,8 +95,6 @@ def iterate(work, k, count, margin, iterations, batches):
             if complete and batches < _BATCHES:
                 chosen = choose_bad(vectors, indices, _BAD * vectors[EXCESS, p], count, n - k)
                 batches += chosen > 0
-        if work.tag != 0.0:
-            scale(1.0, vectors[MU], vectors[SEEN], M)
         before = k
         k = add_constraints(work, k, chosen)
         if not begins:
@@ -119,25 +116,19 @@ def iterate(work, k, count, margin, iterations, batches):
                 batches = _BATCHES  # caps may have changed x_u
         if unsettled:
             k = _drop_wrong_multipliers(work, k)
-        if work.tag != 0.0 and not begins:
-            _follow_multipliers(work, M)
-        else:
-            _minimise(work, k)
-            complete = several or work.soft or count == 1 or iterations >= work.limit
-            if not complete:  # first satisfy those that were seen to be violated, then look at all
-                count = keep_violated(work, margin, count)
-                complete = count == 0
-            if complete:
-                multiply_constraints(work)
+        _minimise(work, k)
+        complete = several or work.soft or count == 1 or iterations >= work.limit
+        if not complete:  # first satisfy those that were seen to be violated, then look at all
+            count = keep_violated(work, margin, count)
+            complete = count == 0
         if complete:
+            multiply_constraints(work)
             count = list_violated(vectors, indices, M, margin)
         begins = False
     if violated:
         for i in range(k):  # rounding can take multipliers out of their ranges
             p = abs(indices[NAME, i]) - 1
             vectors[MU, p] = min(max(vectors[MU, p], vectors[LEAST, i]), vectors[MOST, i])
-        if work.tag != 0.0:
-            multiply_constraints(work)  # which x has, but for rounding
     return SOLVED, k, iterations, batches, passed, violated
 
 
@@ -351,32 +342,21 @@ def _drop_wrong_multipliers(work, k):
 def _minimise(work, k):
     """Writes the minimiser of the Lagrangian, ``P x = -(q + C'mu)``, to the first n entries of y."""
     n, vectors, y = len(work.q), work.vectors, work.vectors[Y]
-    if work.tag != 0.0:
-        add_multipliers(work, k)
-        scale(-1.0, vectors[SLOPE], vectors[SCRATCH], n)
-        multiply(work.rows[n + len(work.G) :], n, vectors[SCRATCH], n, y)
-        return
     if work.soft:  # constraints at their caps have multipliers, too
         add_multipliers(work, k)
         scale(-1.0, vectors[SLOPE], y, n)
         solve_transposed(work.L, n, y)
+    elif work.tag != 0.0:
+        add_multipliers(work, k)
+        scale(-1.0, vectors[SLOPE], vectors[SCRATCH], n)
+        multiply(work.rows[n + len(work.G) :], n, vectors[SCRATCH], n, y)
+        return
     else:  # L x = v - sum mu_i w_i
         scale(1.0, vectors[V], y, n)
         for i in range(k):
             vectors[SCRATCH, i] = vectors[MU, abs(work.indices[NAME, i]) - 1]
         subtract_rows(y, work.rows, work.indices[PLACE], vectors[SCRATCH], k, n)
     solve_lower(work.L, n, y)
-
-
-@inline_njit
-def _follow_multipliers(work, M):
-    """Moves y of a prepared program by the rows of K whose multipliers have changed."""
-    vectors, places, count = work.vectors, work.indices[CANDIDATES], 0
-    for p in range(M):
-        change = vectors[MU, p] - vectors[SEEN, p]
-        places[count], vectors[EXCESS, count] = M + p, change
-        count += change != 0.0
-    subtract_rows(vectors[Y], work.rows, places, vectors[EXCESS], count, M)
 
 
 @inline_njit

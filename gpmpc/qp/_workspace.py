@@ -31,8 +31,7 @@ V, SLOPE, GRADIENT, SCRATCH = 11, 12, 13, 14
 # and by slot of the working set (k,): b_p; c_p'x at the unconstrained minimiser; the range of the multiplier, which is
 # [0, cap] at an upper bound, [-cap, 0] at a lower one and [-cap, cap] for an equality; K_pp
 BOUND, FREE_VALUE, LEAST, MOST, DIAGONAL = range(15, 20)
-REST, SOLVED_K, R, COSINES, SINES = range(20, 25)  # residual; L_K^-1 K_Wp; K_WW^-1 K_Wp; of rotations
-SEEN, _VECTORS = 25, 26  # multipliers that y belongs to
+REST, SOLVED_K, R, COSINES, SINES, _VECTORS = range(20, 26)  # residual; L_K^-1 K_Wp; K_WW^-1 K_Wp; of rotations
 
 # Rows of ``Workspace.indices``: in the slots of the working set p + 1 at the upper bound or -(p + 1) at the lower one,
 # and the place of w_p in ``rows`` (those of slots from k on are free); the constraints with an excess; those to enter.
