@@ -40,7 +40,3 @@ def __getattr__(name: str) -> Any:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     value = globals()[name] = getattr(importlib.import_module(f"{__name__}.{_SOLVERS[name]}"), name)
     return value
-
-
-def __dir__() -> list[str]:
-    return sorted(__all__)

@@ -10,15 +10,16 @@ Hanson, 1974, chapter 23): with P = L L' and the free minimiser x_f = -P^-1 q,
 It has the same multipliers. The cost of tracking, which no input changes, is gone: an interior-point method that weighs
 its duality gap against a cost of 6e5 stopped 1e-3 away from inputs of 0.1.
 
-The compiled problem is kept per shape and per pattern of absent bounds and equalities, one set per thread. The duals
-come back signed as this package signs them. The answer is ``SOLVED`` only if its own residuals say so, ``INFEASIBLE``
+Compiled problems are kept by thread, shape, and pattern of absent bounds and equalities. The duals come back signed as
+this package signs them. The answer is ``SOLVED`` only if its own residuals say so, ``INFEASIBLE``
 only with Farkas' proof.
 """
 
 import threading
 import warnings
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import lru_cache
 from time import perf_counter
 from typing import Any
 
@@ -36,7 +37,6 @@ from gpmpc.status import Status
 
 Array = NDArray[np.float64]
 
-_STORED = 16  # compiled problems per thread
 STATUSES = {
     "optimal": Status.SOLVED,
     "optimal_inaccurate": Status.SOLVED,
@@ -64,7 +64,6 @@ class CvxpySolver:
     name: str = "CLARABEL"
     options: dict | None = None
     tolerance: float = 1e-6
-    _compiled: threading.local = field(default_factory=threading.local, init=False, repr=False, compare=False)
 
     def __post_init__(self):
         import cvxpy
@@ -80,7 +79,9 @@ class CvxpySolver:
         began = perf_counter()
         P, q, G, lower, upper = problem
         n, M = len(q), len(lower)
-        program, y, sides = self._form(n, lower, upper)
+        equal = (lower == upper) & (upper < ABSENT)
+        kinds = (equal, (upper < ABSENT) & ~equal, (lower > -ABSENT) & ~equal)
+        program, y, sides = _compile(threading.get_ident(), n, *(kind.tobytes() for kind in kinds))
         factor = np.linalg.cholesky(P).T
         free, back = -cho_solve((factor, False), q), solve_triangular(factor, np.eye(n))  # back = L^-T
         columns, offset = np.concatenate([back, G @ back]), np.concatenate([free, G @ free])
@@ -130,28 +131,22 @@ class CvxpySolver:
                 best.record[:] = rescue(problem, best.caps, best.record)
         return best
 
-    def _form(self, n: int, lower: Array, upper: Array) -> tuple[Any, Any, list]:
-        """The problem compiled for this pattern of bounds, its variable, and its constraints by kind.
 
-        Of each kind (equalities and upper bounds have the sign +1, lower bounds -1): which of the stacked constraints
-        it holds, the sign, the parameters for their rows and bounds, and CVXPY's constraint.
-        """
-        import cvxpy
+@lru_cache(maxsize=64)
+def _compile(thread: int, n: int, equal: bytes, above: bytes, below: bytes) -> tuple[Any, Any, list]:
+    """Returns the problem of a thread for a pattern of bounds, its variable, and its constraints by kind.
 
-        forms = self._compiled.__dict__.setdefault("forms", {})
-        equal = (lower == upper) & (upper < ABSENT)
-        below, above = (lower > -ABSENT) & ~equal, (upper < ABSENT) & ~equal
-        key = (n, equal.tobytes(), below.tobytes(), above.tobytes())
-        if key not in forms:
-            if len(forms) == _STORED:
-                del forms[next(iter(forms))]
-            y, sides = cvxpy.Variable(n), []
-            for members, sign in ((equal, 1.0), (above, 1.0), (below, -1.0)):
-                if members.any():
-                    rows, bound = cvxpy.Parameter((members.sum(), n)), cvxpy.Parameter(members.sum())
-                    at = rows @ y
-                    constraint = at == bound if members is equal else at <= bound if sign > 0 else bound <= at
-                    sides.append((members, sign, rows, bound, constraint))
-            program = cvxpy.Problem(cvxpy.Minimize(0.5 * cvxpy.sum_squares(y)), [side[-1] for side in sides])
-            forms[key] = program, y, sides
-        return forms[key]
+    Of each kind (equalities and upper bounds have the sign +1, lower bounds -1): which of the stacked constraints
+    it holds, the sign, the parameters for their rows and bounds, and CVXPY's constraint.
+    """
+    import cvxpy
+
+    y, sides = cvxpy.Variable(n), []
+    for kind, sign in ((equal, 1.0), (above, 1.0), (below, -1.0)):
+        members = np.frombuffer(kind, dtype=bool)
+        if members.any():
+            rows, bound = cvxpy.Parameter((members.sum(), n)), cvxpy.Parameter(members.sum())
+            at = rows @ y
+            constraint = at == bound if kind is equal else at <= bound if sign > 0 else bound <= at
+            sides.append((members, sign, rows, bound, constraint))
+    return cvxpy.Problem(cvxpy.Minimize(0.5 * cvxpy.sum_squares(y)), [side[-1] for side in sides]), y, sides

@@ -17,16 +17,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from gpmpc._compiled import compile_for, unchecked_entry_point
-from gpmpc.exceptions import ProblemError
 from gpmpc.qp import _record as layout
 from gpmpc.qp._dual_kernels import SIGNATURE, solve
 from gpmpc.qp._dual_rescue import rescue
-from gpmpc.qp._problem import QuadraticProgram, multiplier_caps
+from gpmpc.qp._problem import QuadraticProgram, check_positive, multiplier_caps
 from gpmpc.qp._solution import QPSolution, WarmStart, as_record, proves_infeasibility
 from gpmpc.qp._workspace import new_memory, prepare_memory
 
 Array = NDArray[np.float64]
-_Arrays = tuple[Array, Array, Array, Array, Array]  # P, q, G, lower, upper
 
 # Local names save look-ups; ``tuple.__new__`` takes half the time of a named tuple's own constructor.
 _NO_RECORD, _MISUSE, _FLOAT, _empty, _new = layout.NO_RECORD, layout.MISUSE, np.dtype(float), np.empty, tuple.__new__
@@ -54,10 +52,7 @@ class DualActiveSet:
     _plans: dict = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def __post_init__(self):
-        for name in ("tolerance", "iteration_limit", "time_limit"):
-            value = getattr(self, name)
-            if value is not None and not value > 0:
-                raise ProblemError(f"{name} must be positive; got {value}")
+        check_positive(self, "tolerance", "iteration_limit", "time_limit")
         global _run
         compile_for(solve, SIGNATURE)
         _run = unchecked_entry_point(solve)
@@ -92,11 +87,11 @@ class DualActiveSet:
             guess = _NO_RECORD if warm_start is None else warm_start.record  # type: ignore[union-attr]
             if P.dtype is q.dtype is G.dtype is lower.dtype is upper.dtype is _FLOAT:
                 status = _run(P, q, G, lower, upper, guess, memory, record)
-                if not status:
-                    return _new(QPSolution, (record[where], problem, caps, record, 0.0, perf_counter() - began))
         except (AttributeError, TypeError):  # not contiguous float64, or a warm start that is no solution of ours
             pass
-        return _solve_again(problem, warm_start, plan, self, status, record, began)
+        if status:
+            problem, record = self._solve_again(problem, warm_start, plan, status, record, began)
+        return _new(QPSolution, (record[where], problem, caps, record, 0.0, perf_counter() - began))
 
     def prepare(self, P: ArrayLike, G: ArrayLike | None = None, prices: ArrayLike | None = None) -> "Prepared":
         """Does once what depends on P, G and prices only.
@@ -114,11 +109,11 @@ class DualActiveSet:
     def _plan(self, shape: tuple, prices: ArrayLike | None, prepared: bool = False) -> tuple[Array, Array, int, slice]:
         """Returns caps, memory, the record's length, and where x is in it, for a shape of G."""
         m, n = shape
-        caps, M, limit = multiplier_caps(prices, n, m), n + m, self._limit(n + m)
+        caps, limit = multiplier_caps(prices, n, m), self._limit(n + m)
         if self.time_limit is not None:
             limit = min(limit, _ITERATIONS_PER_LOOK)
         memory = new_memory(caps, n, limit, self.tolerance, prices is not None, prepared)
-        size = layout.record_size(n, M, n if prepared else 0)
+        size = layout.record_size(n, n + m, n if prepared else 0)
         plan = caps, memory, size, slice(layout.HEADER, layout.HEADER + n)
         if prices is None and not prepared:
             self._plans[m, n] = plan
@@ -126,6 +121,45 @@ class DualActiveSet:
 
     def _limit(self, M: int) -> int:
         return self.iteration_limit or 100 + _ITERATIONS_PER_CONSTRAINT * M
+
+    def _solve_again(
+        self, problem: QuadraticProgram, warm_start: WarmStart, plan: tuple, status: int, record: Array, began: float
+    ) -> tuple[QuadraticProgram, Array]:
+        """Continues a solve that did not end as ``SOLVED``: checks the problem, goes on, accepts or tries again.
+
+        Returns:
+            The problem as it was solved, and the record.
+
+        Raises:
+            ProblemError: The problem breaks a rule of ``QuadraticProgram``.
+        """
+        caps, memory = plan[:2]
+        if status == layout.MISUSE:
+            problem = QuadraticProgram.from_stacked(*problem)  # raises if it is misuse indeed
+            record[:] = 0.0  # of a proper problem, too: rows that overflow, P at the edge of definiteness
+            record[layout.STATUS] = layout.NUMERICAL_TROUBLE
+            status = solve(*problem, as_record(warm_start, len(problem.q), len(problem.lower)), memory, record)
+        M, done = len(problem.lower), record[layout.ITERATIONS]
+
+        def late() -> bool:
+            return self.time_limit is not None and perf_counter() - began > self.time_limit
+
+        while status == layout.ITERATION_LIMIT and not late() and done < self._limit(M):
+            guess, record = record, np.empty_like(record)
+            status = solve(*problem, guess, memory, record)
+            done += record[layout.ITERATIONS]
+        record[layout.ITERATIONS] = done
+        if status == layout.ITERATION_LIMIT and late():
+            record[layout.STATUS] = layout.TIME_LIMIT
+        stopped = status == layout.ITERATION_LIMIT and self.iteration_limit is not None
+        if not stopped and not _is_certain(record, problem):
+            guess, record = record, record.copy()
+            guess[layout.TAG] = 0.0  # the factor is computed anew
+            solve(*problem, guess, memory, record)
+            record[layout.ITERATIONS] += done
+            if not _is_certain(record, problem):
+                record = rescue(problem, caps, record, self._limit(M), late)
+        return problem, record
 
 
 class Prepared:
@@ -159,64 +193,18 @@ class Prepared:
             guess = _NO_RECORD if warm_start is None else warm_start.record  # type: ignore[union-attr]
             if q.dtype is lower.dtype is upper.dtype is _FLOAT:
                 status = _run(P, q, G, lower, upper, guess, memory, record)
-                if not status:
-                    problem = P, q, G, lower, upper
-                    return _new(QPSolution, (record[where], problem, caps, record, 0.0, perf_counter() - began))
         except (AttributeError, TypeError):
             pass
-        return _solve_again((P, q, G, lower, upper), warm_start, self._plan, self._solver, status, record, began)
+        problem = P, q, G, lower, upper
+        if status:
+            problem = QuadraticProgram.unchecked(*problem)
+            problem, record = self._solver._solve_again(problem, warm_start, self._plan, status, record, began)
+        return _new(QPSolution, (record[where], problem, caps, record, 0.0, perf_counter() - began))
 
 
-def _solve_again(problem: _Arrays, warm_start, plan, solver, status, record, began) -> QPSolution:
-    """Continues a solve that did not end as ``SOLVED``: checks the problem, goes on, accepts the status or tries again.
-
-    Raises:
-        ProblemError: The problem breaks a rule of ``QuadraticProgram``.
-    """
-    caps, memory, _, where = plan
-    if status == layout.MISUSE:
-        problem = QuadraticProgram.from_stacked(*problem)  # raises if it is misuse indeed
-    P, q, G, lower, upper = problem
-    n, M = len(q), len(lower)
-
-    def solution(record: Array) -> QPSolution:
-        return QPSolution(record[where], problem, caps, record, 0.0, perf_counter() - began)
-
-    def late() -> bool:
-        return solver.time_limit is not None and perf_counter() - began > solver.time_limit
-
-    if status == layout.MISUSE:
-        status = solve(P, q, G, lower, upper, as_record(warm_start, n, M), memory, record)
-        if status == layout.MISUSE:  # a proper problem: rows that overflow, P at the edge of definiteness
-            record[:] = 0.0
-            record[[layout.STATUS, layout.VARIABLES, layout.CONSTRAINTS]] = layout.NUMERICAL_TROUBLE, n, M
-        elif status == layout.SOLVED:
-            return solution(record)
-    done, limit = record[layout.ITERATIONS], solver._limit(M)
-    while record[layout.STATUS] == layout.ITERATION_LIMIT and solver.time_limit is not None:
-        if late() or done >= limit:
-            record[layout.STATUS] = layout.TIME_LIMIT if late() else layout.ITERATION_LIMIT
-            break
-        guess, record = record, np.empty_like(record)
-        solve(P, q, G, lower, upper, guess, memory, record)
-        done += record[layout.ITERATIONS]
-    record[layout.ITERATIONS] = done
-    stopped = record[layout.STATUS] == layout.ITERATION_LIMIT and solver.iteration_limit is not None
-    if stopped or _is_certain(record, G, lower, upper):
-        return solution(record)
-    guess, record = record, np.empty_like(record)
-    guess[layout.TAG] = 0.0  # the factor is computed anew
-    if solve(P, q, G, lower, upper, guess, memory, record) == layout.MISUSE:
-        record = guess
-    record[layout.ITERATIONS] += done
-    if not _is_certain(record, G, lower, upper):
-        record = rescue(problem, caps, record, limit, late)
-    return solution(record)
-
-
-def _is_certain(record: Array, G: Array, lower: Array, upper: Array) -> bool:
+def _is_certain(record: Array, problem: QuadraticProgram) -> bool:
     """Returns whether a record needs no second look; an infeasibility needs Farkas' proof."""
     if record[layout.STATUS] == layout.INFEASIBLE:
-        start = layout.HEADER + G.shape[1]
-        return proves_infeasibility(record[start : start + len(lower)], G, lower, upper)
+        ray = record[layout.HEADER + len(problem.q) :][: len(problem.lower)]
+        return proves_infeasibility(ray, problem.G, problem.lower, problem.upper)
     return record[layout.STATUS] in (layout.SOLVED, layout.TIME_LIMIT)

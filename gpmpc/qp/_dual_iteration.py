@@ -6,34 +6,63 @@ x_u is the unconstrained minimiser, y = C x_u and K = C P^-1 C'. The method of G
 violated. A multiplier at its cap, the price of a soft row, leaves with a constraint that stays violated; then mu_p is
 not zero outside the working set.
 
-The functions take a ``Workspace``, a ``WorkingSet`` and the number k of its constraints; those that change k return it.
+The functions take a ``Workspace`` and the number k of its working constraints; those that change k return it.
 """
 
 import numpy as np
 
 from gpmpc._compiled import inline_njit
-from gpmpc._kernels.linalg import combine_rows, dot
+from gpmpc._kernels._simd import load, load_some, store, zeros
+from gpmpc._kernels.linalg import dot, multiply
 from gpmpc.qp._record import INFEASIBLE, ITERATION_LIMIT, SOLVED
 from gpmpc.qp._triangular import (
     append_row,
     delete_row,
     multiply_rows,
     multiply_to_ends,
+    scale,
     solve_lower,
     solve_transposed,
     subtract_rows,
 )
 from gpmpc.qp._violations import (
     choose_bad,
-    count_bad,
     ignore_violations,
     keep_violated,
     list_violated,
     most_violated,
     restore_limits,
 )
+from gpmpc.qp._workspace import (
+    ALLOWED_HIGH,
+    ALLOWED_LOW,
+    BOUND,
+    CANDIDATES,
+    CAP,
+    COSINES,
+    DIAGONAL,
+    END,
+    EXCESS,
+    FREE_VALUE,
+    LEAST,
+    LOWER,
+    MOST,
+    MU,
+    NAME,
+    NEGLIGIBLE,
+    PLACE,
+    SCALE,
+    SCRATCH,
+    SINES,
+    SLOPE,
+    SOLVED_K,
+    UPPER,
+    R,
+    V,
+    Y,
+)
 
-NEGLIGIBLE = 1e-26  # share of the length of q below which x, and a violation of a bound of zero, is none
+NONE = 1e-26  # share of the length of q below which x, and a violation of a bound of zero, is none
 _GUESSED_PIVOT = 1e-9  # share of K_pp: a guessed constraint that depends on the others by more is left out
 _DEPENDENT = 1e-12  # d below this share of K_pp: the constraint depends on the working ones
 _DOUBTFUL = 1e-4  # d below this share of K_pp is computed again without cancellation
@@ -44,8 +73,8 @@ _BAD = 0.5  # those violated by more than this share of the worst
 
 
 @inline_njit
-def iterate(work, active, k, count, margin, iterations, batches):
-    """Changes the working set until no constraint is violated by more than ``margin``, in units of ``scale``.
+def iterate(work, k, count, margin, iterations, batches):
+    """Changes the working set until no constraint is violated by more than ``margin``, in units of ``SCALE``.
 
     ``count`` are, and listed; ``-1 - g`` says that y is not known yet and that g guessed candidates enter first.
 
@@ -54,339 +83,298 @@ def iterate(work, active, k, count, margin, iterations, batches):
         whether a constraint was passed over because it contradicts others by what may be rounding, and whether any was
         violated.
     """
+    vectors, indices, n = work.vectors, work.indices, len(work.q)
+    M = n + len(work.G)
     p, chosen, begins, violated, passed = 0, -1 - count, count < 0, False, False
     complete = True  # whether y and the list are those of all constraints
     while count != 0:
         if not begins:
             if iterations >= work.limit:
                 return ITERATION_LIMIT, k, iterations, batches, passed, True
-            p, chosen, violated = most_violated(work, count), 0, True
-            if complete and batches < _BATCHES and count_bad(work, _BAD * work.excess[p], count) > 1:
-                batches += 1
-                chosen = choose_bad(work, _BAD * work.excess[p], count, work.capacity - k)
+            p, chosen, violated = most_violated(vectors, indices, count), 0, True
+            if complete and batches < _BATCHES:
+                chosen = choose_bad(vectors, indices, _BAD * vectors[EXCESS, p], count, n - k)
+                batches += chosen > 0
         before = k
-        k = add_constraints(work, active, k, chosen)
+        k = add_constraints(work, k, chosen)
         if not begins:
             iterations += k - before
         several = unsettled = begins or k > before
         if not several:
-            mu_p, scale = work.mu[p], work.scale[p]
-            satisfied, k, changes = _satisfy_constraint(work, active, k, p)
+            mu_p = vectors[MU, p]
+            satisfied, k, changes = _satisfy_constraint(work, k, p)
             iterations += changes
             if not satisfied:
-                size = max(abs(work.y[p]), work.negligible[p] / NEGLIGIBLE)
-                if work.excess[p] * scale > _HOPELESS * size:
-                    _write_ray(work, active, k, p)
+                size = max(abs(vectors[Y, p]), vectors[NEGLIGIBLE, p] / NONE)
+                if vectors[EXCESS, p] * vectors[SCALE, p] > _HOPELESS * size:
+                    _write_ray(work, k, p)
                     return INFEASIBLE, k, iterations, batches, passed, True
-                work.mu[p], passed = mu_p, True  # what it gained on the way belongs to no working set
-                ignore_violations(work, p)
+                vectors[MU, p], passed = mu_p, True  # what it gained on the way belongs to no working set
+                ignore_violations(vectors, p)
                 unsettled = not work.soft  # else refinement has to do
             if work.soft:
                 batches = _BATCHES  # caps may have changed x_u
         if unsettled:
-            k = drop_wrong_multipliers(work, active, k)
-        if work.prepared and not begins:
-            _follow_multipliers(work)
-        else:
-            _minimise(work, active, k)
-            complete = several or work.soft or work.prepared or count == 1 or iterations >= work.limit
-            if not complete:  # first satisfy those that were seen to be violated, then look at all
-                count = keep_violated(work, margin, count)
-                complete = count == 0
-            if complete:
-                multiply_constraints(work)
-            for i in range(len(work.mu) if work.prepared else 0):
-                work.seen[i] = work.mu[i]
+            k = _drop_wrong_multipliers(work, k)
+        _minimise(work, k)
+        complete = several or work.soft or count == 1 or iterations >= work.limit
+        if not complete:  # first satisfy those that were seen to be violated, then look at all
+            count = keep_violated(work, margin, count)
+            complete = count == 0
         if complete:
-            count = list_violated(work, margin)
+            multiply_constraints(work)
+            count = list_violated(vectors, indices, M, margin)
         begins = False
     if violated:
         for i in range(k):  # rounding can take multipliers out of their ranges
-            p = abs(active.name[i]) - 1
-            work.mu[p] = min(max(work.mu[p], active.least[i]), active.most[i])
-        if work.prepared:
-            multiply_constraints(work)  # which x has, but for rounding
+            p = abs(indices[NAME, i]) - 1
+            vectors[MU, p] = min(max(vectors[MU, p], vectors[LEAST, i]), vectors[MOST, i])
     return SOLVED, k, iterations, batches, passed, violated
 
 
 @inline_njit
-def _satisfy_constraint(work, active, k, p):
+def _satisfy_constraint(work, k, p):
     """Moves multipliers until constraint p is satisfied: steps 1 and 2 of Goldfarb and Idnani's algorithm.
 
     Returns:
         False if it contradicts the working ones, the size of the working set, and how many entered or left.
     """
-    mu, r, solved, changes = work.mu, work.r, work.solved, 0
-    above = mu[p] > 0.0 or (mu[p] == 0.0 and work.y[p] > work.upper[p])
+    vectors, names, factor, changes = work.vectors, work.indices[NAME], work.factor, 0
+    mu, r, solved, least, most = vectors[MU], vectors[R], vectors[SOLVED_K], vectors[LEAST], vectors[MOST]
+    above = mu[p] > 0.0 or (mu[p] == 0.0 and vectors[Y, p] > vectors[UPPER, p])
     sense = 1.0 if above == (mu[p] == 0.0) else -1.0  # the direction of mu_p, which comes back from a cap
-    violation = (work.y[p] - (work.upper[p] if above else work.lower[p])) * sense
-    place = _make_row(work, active, k, p)
-    row, size = work.rows[place], int(work.end[p])
-    free_value, K_pp = _measure_row(work, p, row, size)
-    _multiply_working_rows(work, active, k, p, row)
-    solve_lower(active.factor, k, solved)
+    _write_slot(work, k, p, above)
+    _solve_slot(work, k, p)
+    violation, K_pp = (vectors[Y, p] - vectors[BOUND, k]) * sense, vectors[DIAGONAL, k]
     while True:
-        _write_slot(work, active, k, p, above)
-        active.place[k], active.free_value[k], active.diagonal[k] = place, free_value, K_pp
         # step direction:  r = K_WW^-1 K_Wp,  d = K_pp - K_pW r;  mu_p moves by t, mu_W by -t r and y_p by -t d
-        for i in range(k):
-            r[i] = solved[i]
-        solve_transposed(active.factor, k, r)
+        scale(1.0, solved, r, k)
+        solve_transposed(factor, k, r)
         d = K_pp - dot(solved, solved, k)
         if d < _DOUBTFUL * K_pp:
-            d = _distance_to_span(work, active, k, row)
+            d = _distance_to_span(work, k)
         # ratio test:  t = min(t1, t2);  t2 = violation / d makes p hold,  t1 takes a multiplier to the end of its range
-        step = max(0.0, violation) / d if d > _DEPENDENT * K_pp and k < work.capacity else np.inf
-        room = active.most[k] - mu[p] if sense > 0.0 else mu[p] - active.least[k]
+        step = max(0.0, violation) / d if d > _DEPENDENT * K_pp and k < len(work.q) else np.inf
+        room = most[k] - mu[p] if sense > 0.0 else mu[p] - least[k]
         capped = room < step
-        step, blocking = _first_blocking(work, active, k, sense, room if capped else step)
+        step, blocking = _first_blocking(vectors, names, k, sense, room if capped else step)
         if step == np.inf:  # no step ends: (r, -1) is Farkas' proof, unless rounding made the violation
             for i in range(k):
-                work.negligible[p] += _ROUNDING * abs(r[i] * active.bound[i])
+                vectors[NEGLIGIBLE, p] += _ROUNDING * abs(r[i] * vectors[BOUND, i])
             return False, k, changes
         # take the step
         for i in range(k):
-            mu[abs(active.name[i]) - 1] -= sense * step * r[i]
+            mu[abs(names[i]) - 1] -= sense * step * r[i]
         mu[p] += sense * step
         changes += 1
         if blocking < k:  # partial step: the blocking constraint leaves, and p is tried again
-            leaving = abs(active.name[blocking]) - 1
-            mu[leaving] = active.least[blocking] if sense * r[blocking] > 0.0 else active.most[blocking]
-            _drop_constraint(work, active, k, blocking)
+            leaving = abs(names[blocking]) - 1
+            mu[leaving] = least[blocking] if sense * r[blocking] > 0.0 else most[blocking]
+            _drop_constraint(work, k, blocking)
             k -= 1
-            active.place[k + 1] = active.place[k]  # the entering row keeps its place in slot k
-            restore_limits(work, leaving)
+            restore_limits(vectors, leaving)
             violation -= step * d
         elif capped:  # a soft row that stays violated
-            mu[p] = active.most[k] if sense > 0.0 else active.least[k]
-            restore_limits(work, p)
+            mu[p] = most[k] if sense > 0.0 else least[k]
+            restore_limits(vectors, p)
             return True, k, changes
         else:  # full step: p enters
-            append_row(active.factor, k, solved, d)
-            ignore_violations(work, p)
+            append_row(factor, k, solved, d)
+            ignore_violations(vectors, p)
             return True, k + 1, changes
 
 
 @inline_njit
-def _first_blocking(work, active, k, sense, step):
+def _first_blocking(vectors, names, k, sense, step):
     """Returns the longest step up to ``step`` that keeps the multipliers in range, and the slot that ends it (or k)."""
-    r, size = work.r, 0.0
+    r, size = vectors[R], 0.0
     for i in range(k):
         size = max(size, abs(r[i]))
     blocking = k
     for i in range(k):
         rate = sense * r[i]
         if abs(rate) > 1e-12 * size:
-            room = (work.mu[abs(active.name[i]) - 1] - (active.least[i] if rate > 0.0 else active.most[i])) / rate
+            end = vectors[LEAST, i] if rate > 0.0 else vectors[MOST, i]
+            room = (vectors[MU, abs(names[i]) - 1] - end) / rate
             if room < step:
                 step, blocking = max(room, 0.0), i
     return step, blocking
 
 
 @inline_njit
-def _distance_to_span(work, active, k, row):
-    """Returns ``d = |w_p - sum r_i w_i|^2`` as a sum of squares, which cannot cancel."""
-    rest, n = work.scratch, len(work.x)
-    for j in range(n):
-        rest[j] = row[j]
-    subtract_rows(rest, work.rows, active.place, work.r, k, n)
+def _distance_to_span(work, k):
+    """Returns ``d = |w_p - sum r_i w_i|^2``, p in slot k, as a sum of squares, which cannot cancel."""
+    rest, row, places, n = work.vectors[SCRATCH], work.rows[work.indices[PLACE, k]], work.indices[PLACE], len(work.q)
+    scale(1.0, row, rest, n)
+    subtract_rows(rest, work.rows, places, work.vectors[R], k, n)
     return dot(rest, rest, n)
 
 
 @inline_njit
-def _write_ray(work, active, k, p):
+def _write_ray(work, k, p):
     """Writes Farkas' proof that p contradicts the working constraints to mu: ``C' ray = 0``, ``ray' bounds < 0``."""
-    sense = 1.0 if work.y[p] > work.upper[p] else -1.0
-    for i in range(len(work.mu)):
-        work.mu[i] = 0.0
+    vectors, names = work.vectors, work.indices[NAME]
+    mu, sense = vectors[MU], 1.0 if vectors[Y, p] > vectors[UPPER, p] else -1.0
+    for i in range(len(mu)):
+        mu[i] = 0.0
     for i in range(k):
-        w = abs(active.name[i]) - 1
-        ray = -sense * work.r[i]
-        if ray * active.name[i] >= 0.0 or work.lower[w] == work.upper[w]:  # else rounding: it cannot pull that way
-            work.mu[w] = ray
-    work.mu[p] = sense
+        w, ray = abs(names[i]) - 1, -sense * vectors[R, i]
+        if ray * names[i] >= 0.0 or vectors[LOWER, w] == vectors[UPPER, w]:  # else rounding: it cannot pull that way
+            mu[w] = ray
+    mu[p] = sense
 
 
 @inline_njit
-def add_constraints(work, active, k, count):
+def add_constraints(work, k, count):
     """Adds the first ``count`` candidates to the working set, but for those that depend on others; returns its size."""
-    first, solved = k, work.solved
+    vectors, solved = work.vectors, work.vectors[SOLVED_K]
     for i in range(count):
-        p = abs(work.candidates[i]) - 1
-        place = _make_row(work, active, first + i, p)
-        row, size = work.rows[place], int(work.end[p])
-        _multiply_working_rows(work, active, k, p, row)
-        solve_lower(active.factor, k, solved)
-        free_value, K_pp = _measure_row(work, p, row, size)
-        pivot = K_pp - dot(solved, solved, k)
-        if pivot > _GUESSED_PIVOT * K_pp:
-            active.place[first + i] = active.place[k]
-            _write_slot(work, active, k, p, work.candidates[i] > 0)
-            active.place[k], active.free_value[k], active.diagonal[k] = place, free_value, K_pp
-            append_row(active.factor, k, solved, pivot)
-            k += 1
+        name = work.indices[CANDIDATES, i]
+        p = abs(name) - 1
+        outside = vectors[ALLOWED_LOW, p] > -np.inf or vectors[ALLOWED_HIGH, p] < np.inf  # of the working set
+        if outside and k < len(work.q):
+            _write_slot(work, k, p, name > 0)
+            _solve_slot(work, k, p)
+            pivot = vectors[DIAGONAL, k] - dot(solved, solved, k)
+            if pivot > _GUESSED_PIVOT * vectors[DIAGONAL, k]:
+                append_row(work.factor, k, solved, pivot)
+                ignore_violations(vectors, p)
+                k += 1
+    return k
+
+
+@inline_njit
+def _write_slot(work, k, p, above):
+    """Writes constraint p, at its upper bound (``above``) or its lower one, to slot k."""
+    vectors, places, n = work.vectors, work.indices[PLACE], len(work.q)
+    if work.tag != 0.0:
+        places[k], row = p, work.rows[n + len(work.G) + p]
+        vectors[DIAGONAL, k] = row[p]
+    else:
+        row, size = work.rows[places[k]], int(vectors[END, p])
+        if p >= n:
+            for i in range(0, n, 8):
+                store(row, i, load_some(work.G[p - n], i))
         else:
-            restore_limits(work, p)
-    return k
+            for i in range(0, n, 8):
+                store(row, i, zeros())
+            row[p] = 1.0
+        solve_transposed(work.L, size, row)
+        vectors[DIAGONAL, k] = dot(row, row, size)
+    low, high, cap = vectors[LOWER, p], vectors[UPPER, p], vectors[CAP, p]
+    work.indices[NAME, k] = p + 1 if above else -(p + 1)
+    vectors[BOUND, k] = high if above else low
+    vectors[LEAST, k] = -cap if low == high or not above else 0.0
+    vectors[MOST, k] = cap if low == high or above else 0.0
+    vectors[FREE_VALUE, k] = dot(row, vectors[V], n)
 
 
 @inline_njit
-def restore_constraints(work, active, names, factor):
-    """Makes the named constraints of a prepared problem the working set, whose factor is known; returns its size."""
-    k, at = len(names), 0
-    for i in range(k):
-        p, row = int(abs(names[i])) - 1, active.factor[i]
-        active.place[i] = p
-        active.free_value[i], active.diagonal[i] = _measure_row(work, p, work.rows[p], 0)
-        _write_slot(work, active, i, p, names[i] > 0.0)
-        ignore_violations(work, p)
-        for j in range(i + 1):
-            row[j] = factor[at + j]
-        at += i + 1
-    return k
-
-
-@inline_njit
-def _make_row(work, active, slot, p):
-    """Returns the place of ``w_p = L^-T c_p``, computed in the place that the slot has free if it is not known."""
-    if work.prepared:
-        return p
-    place, n = active.place[slot], len(work.x)
-    row = work.rows[place]
-    if p >= n:
-        c = work.G[p - n]
-        for i in range(n):
-            row[i] = c[i]
-    else:
-        for i in range(n):
-            row[i] = 0.0
-        row[p] = 1.0
-    solve_transposed(work.L, int(work.end[p]), row)
-    return place
-
-
-@inline_njit
-def _measure_row(work, p, row, size):
-    """Returns c_p'x at the unconstrained minimiser, and K_pp; ``row`` is w_p."""
-    n = len(work.x)
-    if work.prepared:
-        return dot(work.gram[p], work.v, n), work.gram[p, p]
-    return dot(row, work.v, n), dot(row, row, size)
-
-
-@inline_njit
-def _multiply_working_rows(work, active, k, p, row):
-    """Writes K_Wp to ``solved``, where ``row`` is w_p."""
-    if work.prepared:
+def _solve_slot(work, k, p):
+    """Writes L_K^-1 K_Wp for constraint p in slot k."""
+    solved, places = work.vectors[SOLVED_K], work.indices[PLACE]
+    if work.tag != 0.0:
+        row = work.rows[len(work.q) + len(work.G) + p]
         for i in range(k):
-            work.solved[i] = work.gram[p, active.place[i]]
+            solved[i] = row[places[i]]
     else:
-        multiply_rows(work.rows, active.place, k, row, int(work.end[p]), work.solved)
+        multiply_rows(work.rows, places, k, work.rows[places[k]], int(work.vectors[END, p]), solved)
+    solve_lower(work.factor, k, solved)
 
 
 @inline_njit
-def _write_slot(work, active, k, p, above):
-    """Writes constraint p, at its upper bound (``above``) or its lower one, and its multiplier's range to slot k."""
-    cap, equality = work.cap[p], work.lower[p] == work.upper[p]
-    active.name[k] = p + 1 if above else -(p + 1)
-    active.bound[k] = work.upper[p] if above else work.lower[p]
-    active.least[k] = -cap if equality or not above else 0.0
-    active.most[k] = cap if equality or above else 0.0
+def restore_constraints(work, count, factor):
+    """Makes the candidates of a prepared program the working set, whose factor is known."""
+    at = 0
+    for i in range(count):
+        name = work.indices[CANDIDATES, i]
+        p = abs(name) - 1
+        _write_slot(work, i, p, name > 0)
+        ignore_violations(work.vectors, p)
+        scale(1.0, factor[at:], work.factor[i], i + 1)
+        at += i + 1
 
 
 @inline_njit
-def _drop_constraint(work, active, k, slot):
-    """Drops the constraint in a slot from the working set of k, and from ``work.solved``; its place becomes free."""
-    delete_row(active.factor, k, slot, work.solved, work.cosines, work.sines)
-    place = active.place[slot]
-    for i in range(slot, k - 1):
-        active.name[i], active.place[i], active.bound[i] = active.name[i + 1], active.place[i + 1], active.bound[i + 1]
-        active.least[i], active.most[i] = active.least[i + 1], active.most[i + 1]
-        active.free_value[i], active.diagonal[i] = active.free_value[i + 1], active.diagonal[i + 1]
-    active.place[k - 1] = place
+def _drop_constraint(work, k, slot):
+    """Drops the constraint in a slot from the working set of k, and from ``SOLVED``; those behind move up, k too."""
+    vectors, names, places = work.vectors, work.indices[NAME], work.indices[PLACE]
+    delete_row(work.factor, k, slot, vectors[SOLVED_K], vectors[COSINES], vectors[SINES])
+    place = places[slot]
+    for i in range(slot, k):
+        names[i], places[i] = names[i + 1], places[i + 1]
+        for j in range(BOUND, DIAGONAL + 1):
+            vectors[j, i] = vectors[j, i + 1]
+    places[k] = place
 
 
 @inline_njit
-def drop_wrong_multipliers(work, active, k):
+def _drop_wrong_multipliers(work, k):
     """Solves ``K_WW mu = y_W - b_W``; drops the most wrong multiplier until all are in range. Returns the size.
 
     Any working set is a valid start of a dual method once this is done.
     """
-    solved, trial = work.solved, work.r
+    vectors, names, solved, trial = work.vectors, work.indices[NAME], work.vectors[SOLVED_K], work.vectors[R]
     for i in range(k):
-        solved[i] = active.free_value[i] - active.bound[i]
-    solve_lower(active.factor, k, solved)
+        solved[i] = vectors[FREE_VALUE, i] - vectors[BOUND, i]
+    solve_lower(work.factor, k, solved)
     while True:
-        for i in range(k):
-            trial[i] = solved[i]
-        solve_transposed(active.factor, k, trial)
+        scale(1.0, solved, trial, k)
+        solve_transposed(work.factor, k, trial)
         worst, slot = 0.0, k
         for i in range(k):
-            outside = max(trial[i] - active.most[i], active.least[i] - trial[i])
+            outside = max(trial[i] - vectors[MOST, i], vectors[LEAST, i] - trial[i])
             if outside > worst:
                 worst, slot = outside, i
         if slot == k:
             break
-        p = abs(active.name[slot]) - 1
-        _drop_constraint(work, active, k, slot)
+        p = abs(names[slot]) - 1
+        _drop_constraint(work, k, slot)
         k -= 1
-        work.mu[p] = 0.0
-        restore_limits(work, p)
+        vectors[MU, p] = 0.0
+        restore_limits(vectors, p)
     for i in range(k):
-        work.mu[abs(active.name[i]) - 1] = trial[i]
+        vectors[MU, abs(names[i]) - 1] = trial[i]
     return k
 
 
 @inline_njit
-def _minimise(work, active, k):
+def _minimise(work, k):
     """Writes the minimiser of the Lagrangian, ``P x = -(q + C'mu)``, to the first n entries of y."""
-    n, y = len(work.x), work.y
-    if work.prepared or work.soft:  # constraints at their caps have multipliers, too
-        add_multipliers(work, active, k)
-        if work.prepared:
-            combine_rows(work.gram, n, work.slope, 0, n, y)
-        for i in range(n):
-            y[i] = -y[i] if work.prepared else -work.slope[i]
-        if work.prepared:
-            return
+    n, vectors, y = len(work.q), work.vectors, work.vectors[Y]
+    if work.soft:  # constraints at their caps have multipliers, too
+        add_multipliers(work, k)
+        scale(-1.0, vectors[SLOPE], y, n)
         solve_transposed(work.L, n, y)
+    elif work.tag != 0.0:
+        add_multipliers(work, k)
+        scale(-1.0, vectors[SLOPE], vectors[SCRATCH], n)
+        multiply(work.rows[n + len(work.G) :], n, vectors[SCRATCH], n, y)
+        return
     else:  # L x = v - sum mu_i w_i
-        for i in range(n):
-            y[i] = work.v[i]
+        scale(1.0, vectors[V], y, n)
         for i in range(k):
-            work.scratch[i] = work.mu[abs(active.name[i]) - 1]
-        subtract_rows(y, work.rows, active.place, work.scratch, k, n)
+            vectors[SCRATCH, i] = vectors[MU, abs(work.indices[NAME, i]) - 1]
+        subtract_rows(y, work.rows, work.indices[PLACE], vectors[SCRATCH], k, n)
     solve_lower(work.L, n, y)
-
-
-@inline_njit
-def _follow_multipliers(work):
-    """Moves y of a prepared program by the rows of K whose multipliers have changed."""
-    mu, seen, amounts, count, M = work.mu, work.seen, work.excess, 0, len(work.mu)
-    for p in range(M):
-        work.candidates[count] = p
-        amounts[count] = mu[p] - seen[p]
-        count += amounts[count] != 0.0
-        seen[p] = mu[p]
-    subtract_rows(work.y, work.gram, work.candidates, amounts, count, M)
 
 
 @inline_njit
 def multiply_constraints(work):
     """Writes ``y[n:] = G y[:n]``."""
-    n = len(work.x)
-    multiply_to_ends(work.G, work.end[n:], work.y, work.y[n:])
+    y, n = work.vectors[Y], len(work.q)
+    multiply_to_ends(work.G, work.vectors[END][n:], y, y[n:])
 
 
 @inline_njit
-def add_multipliers(work, active, k):
-    """Writes ``slope = q + C' mu``; only where rows are soft can others than the working ones have a multiplier."""
-    n, mu, slope = len(work.x), work.mu, work.slope
-    for i in range(n):
-        slope[i] = work.q[i] + mu[i]
+def add_multipliers(work, k):
+    """Writes ``SLOPE = q + C' mu``; only where rows are soft can others than the working ones have a multiplier."""
+    n, mu, slope = len(work.q), work.vectors[MU], work.vectors[SLOPE]
+    for i in range(0, n, 8):
+        store(slope, i, load_some(work.q, i) + load(mu, i))
     for i in range(len(work.G) if work.soft else k):
-        p = n + i if work.soft else abs(active.name[i]) - 1
+        p = n + i if work.soft else abs(work.indices[NAME, i]) - 1
         if p >= n and mu[p] != 0.0:
             weight, row = mu[p], work.G[p - n]
-            for j in range(int(work.end[p])):
-                slope[j] += weight * row[j]
+            for j in range(0, int(work.vectors[END, p]), 8):
+                store(slope, j, load(slope, j) + weight * load_some(row, j))

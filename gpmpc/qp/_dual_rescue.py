@@ -62,7 +62,7 @@ def rescue(
 
 
 class _Solve:
-    """One program, scaled, and the state of the iteration: the working set, x, and the multipliers."""
+    """One program, scaled, and the state of the iteration: the working set (+1 at an upper bound), x, multipliers."""
 
     def __init__(self, problem: tuple, caps: Array, dependent: float, late: Callable):
         P, q, G, lower, upper = problem
@@ -77,8 +77,7 @@ class _Solve:
         self.columns = solve_triangular(self.L, self.C.T, lower=True)  # L^-1 C'
         self.norms = np.sqrt((self.columns**2).sum(axis=0))
         self.dependent = dependent / np.diagonal(self.L).min()
-        self.members: list[int] = []
-        self.sides: list[int] = []
+        self.working: dict[int, int] = {}
         self.x, self.mu = np.zeros((2, n)), np.zeros((2, M))
         self.iterations, self.ray = 0, None
 
@@ -98,20 +97,21 @@ class _Solve:
             if not self._step_to(p, side, sense, violation, rounding):
                 if self._prove(p, sense):
                     return layout.INFEASIBLE
-                terms = [self._terms_of(w, s) for w, s in zip(self.members, self.sides, strict=True)]
-                if violation > rounding + _ROUNDING * np.abs(self.r) @ np.array(terms):
+                if violation > rounding + _ROUNDING * np.abs(self.r) @ [
+                    self._terms_of(*w) for w in self.working.items()
+                ]:
                     return layout.NUMERICAL_TROUBLE
                 passed.add(p)
 
     def write(self, record: Array) -> None:
         """Writes x, multipliers (or Farkas' ray) and working set to a record."""
-        n, M, k = self.n, len(self.E), len(self.members)
+        n, M, k = self.n, len(self.E), len(self.working)
         multipliers = self.mu.sum(axis=0) * self.E if self.ray is None else self.ray
         x = self.x.sum(axis=0) * self.D
         if not (np.isfinite(x).all() and np.isfinite(multipliers).all()):
             raise OverflowError
         record[layout.HEADER : layout.HEADER + n + M] = np.concatenate([x, multipliers])
-        record[layout.HEADER + n + M :][:k] = [side * (p + 1) for p, side in zip(self.members, self.sides, strict=True)]
+        record[layout.HEADER + n + M :][:k] = [side * (p + 1) for p, side in self.working.items()]
         record[[layout.WORKING, layout.VARIABLES, layout.CONSTRAINTS]] = k, n, M
         record[layout.ITERATIONS] += self.iterations
 
@@ -130,21 +130,12 @@ class _Solve:
         if some:
             R, order = qr(self.columns[:, some] / self.norms[some], mode="r", pivoting=True)
             good = np.abs(np.diagonal(R)) > 1e6 * self.dependent
-            self.members = [some[i] for i in order[: len(good)][good]]
-            self.sides = [guess[p] for p in self.members]
+            self.working = {some[i]: guess[some[i]] for i in order[: len(good)][good]}
 
     def _factorise(self) -> None:
         if self.late():
             raise TimeoutError
-        self.Q, self.R = qr(self.columns[:, self.members], mode="economic")
-
-    def _distance(self, p: int) -> tuple[Array, float]:
-        """The combination r of the working columns nearest to that of constraint p, and its distance."""
-        rest, r = self.columns[:, p], np.zeros(len(self.members))
-        for _ in range(2):  # twice is enough
-            part = self.Q.T @ rest
-            rest, r = rest - self.Q @ part, r + solve_triangular(self.R, part)
-        return r, float(np.sqrt(rest @ rest))
+        self.Q, self.R = qr(self.columns[:, list(self.working)], mode="economic")
 
     def _settle(self) -> bool:
         """Finds x and the multipliers of the working set; drops the most wrong one until all are in range."""
@@ -152,32 +143,27 @@ class _Solve:
             self._factorise()
             if not self._refine():
                 return False
-            worst, slot = 0.0, -1
-            for i, (p, side) in enumerate(zip(self.members, self.sides, strict=True)):
+            worst, wrong, end = 0.0, -1, 0.0
+            for p, side in self.working.items():
                 least, most = self._range(p, side)
                 outside = max(self.mu[0, p] - most, least - self.mu[0, p]) * self.norms[p]
                 if outside > worst:
-                    worst, slot = outside, i
-            if slot < 0:
+                    worst, wrong, end = outside, p, most if self.mu[0, p] > most else least
+            if wrong < 0:
                 return True
-            p = self.members[slot]
-            least, most = self._range(p, self.sides[slot])
-            at_cap = most if self.mu[0, p] > most else least
-            self._drop(slot, at_cap if np.isfinite(at_cap) else 0.0)
+            self._drop(wrong, end if np.isfinite(end) else 0.0)
 
-    def _drop(self, slot: int, value: float) -> None:
-        self.mu[:, self.members[slot]] = value, 0.0
-        del self.members[slot], self.sides[slot]
+    def _drop(self, p: int, multiplier: float) -> None:
+        self.mu[:, p] = multiplier, 0.0
+        del self.working[p]
         self.iterations += 1
 
     def _refine(self) -> bool:
         """Newton's method on the working set with residuals free of rounding; False if it does not converge."""
-        W, n = self.members, self.n
-        C, b = self.C[W], np.array([self._bound(p, side) for p, side in zip(W, self.sides, strict=True)])
-        pulling = np.flatnonzero(self.mu[0])
-        others = np.setdiff1d(pulling, W)  # soft rows at their caps
+        W, x, mu = np.array(list(self.working), dtype=int), self.x, self.mu
+        C, b = self.C[W], np.array([self._bound(*w) for w in self.working.items()])
+        others = np.setdiff1d(np.flatnonzero(mu[0]), W)  # soft rows at their caps
         for _ in range(_CORRECTIONS):
-            x, mu = self.x, self.mu
             r1 = _sum_products(
                 [(self.P, x[0]), (self.P, x[1]), (C.T, mu[0, W]), (C.T, mu[1, W]), (self.C[others].T, mu[0, others])],
                 self.q,
@@ -185,17 +171,15 @@ class _Solve:
             r2, slope = _sum_products([(C, x[0]), (C, x[1])], -b), solve_triangular(self.L, r1, lower=True)
             along = solve_triangular(self.R, r2, trans="T")
             part = self.Q.T @ slope
-            a = self.Q @ (part - along) - slope
-            dx = solve_triangular(self.L, a, trans="T", lower=True)
-            dmu = solve_triangular(self.R, along - part)
+            dx = solve_triangular(self.L, self.Q @ (part - along) - slope, trans="T", lower=True)
             _add(x, slice(None), dx)
-            _add(mu, W, dmu)
+            _add(mu, W, solve_triangular(self.R, along - part))
             size = max(np.abs(x[0]).max(), NEGLIGIBLE * np.abs(self.q).max())
             if not np.isfinite(size):
                 return False
             if np.abs(dx).max() <= _CONVERGED * size:
-                box = [i for i, p in enumerate(W) if p < n]  # bounds of variables hold exactly
-                x[0, np.array(W, dtype=int)[box]], x[1, np.array(W, dtype=int)[box]] = b[box], 0.0
+                box = self.n > W  # bounds of variables hold exactly
+                x[0, W[box]], x[1, W[box]] = b[box], 0.0
                 return True
         return False
 
@@ -208,7 +192,7 @@ class _Solve:
         # one at a cap must stay outside its bound: it is violated where it is not
         excess = np.where(mu > 0.0, -above, np.where(mu < 0.0, -below, np.maximum(above, below)))
         excess -= NEGLIGIBLE * np.maximum(sizes, np.abs(self.q).max())
-        excess[[*self.members, *passed]] = -np.inf
+        excess[[*self.working, *passed]] = -np.inf
         p = int(np.argmax(np.where(self.norms > 0.0, excess / self.norms, excess)))
         if not excess[p] > 0.0:
             return -1, 0, 0, 0.0
@@ -230,54 +214,53 @@ class _Solve:
         start = mu[p]
         while True:
             self._factorise()
-            r, distance = self._distance(p)
-            free = distance > self.dependent * self.norms[p]
-            step = violation / distance**2 if free else np.inf
+            W, rest, r = list(self.working), self.columns[:, p], np.zeros(len(self.working))
+            for _ in range(2):  # the combination r of the working columns nearest to p's; twice is enough
+                part = self.Q.T @ rest
+                rest, r = rest - self.Q @ part, r + solve_triangular(self.R, part)
+            square = rest @ rest
+            free = np.sqrt(square) > self.dependent * self.norms[p]
+            step = violation / square if free else np.inf
             least, most = self._range(p, side)
             room = most - mu[p] if sense > 0 else mu[p] - least
-            capped, leaving = room < step, -1
+            capped, leaving, end = room < step, -1, 0.0
             step = min(step, room)
-            noise = 1e-14 * np.abs(r * self.norms[self.members]).max(initial=0.0)
-            for i, w in enumerate(self.members):
-                least, most = self._range(w, self.sides[i])
-                rate = sense * r[i]
+            noise = 1e-14 * np.abs(r * self.norms[W]).max(initial=0.0)
+            for w, rate in zip(W, sense * r, strict=True):
+                least, most = self._range(w, self.working[w])
                 if abs(rate) * self.norms[w] > noise:
                     room = max(0.0, (mu[w] - (least if rate > 0.0 else most)) / rate)
                     if room < step:
-                        step, leaving = room, i
+                        step, leaving, end = room, w, least if rate > 0.0 else most
             if step == np.inf or (not free and violation <= rounding):
                 self.r = r
                 self.mu[:, p] = start, 0.0
                 return False
-            mu[self.members] -= sense * step * r
+            mu[W] -= sense * step * r
             mu[p] += sense * step
-            violation -= step * distance**2
+            violation -= step * square
             if leaving < 0:
                 self.mu[:, p] = mu[p], 0.0
                 self.iterations += 1
                 if not capped:
-                    self.members.append(p)
-                    self.sides.append(side)
+                    self.working[p] = side
                 return True
-            w = self.members[leaving]
-            least, most = self._range(w, self.sides[leaving])
-            mu[w] = least if sense * r[leaving] > 0.0 else most
-            self._drop(leaving, mu[w])
+            mu[leaving] = end
+            self._drop(leaving, end)
 
     def _prove(self, p: int, sense: int) -> bool:
         """Whether the last contradiction has Farkas' proof, which becomes the ray."""
-        used = np.abs(self.r) * self.norms[self.members] > self.dependent * self.norms[p]
-        W, sides = np.array(self.members, dtype=int)[used], np.array(self.sides)[used]
+        W, sides = np.array(list(self.working), dtype=int), np.array(list(self.working.values()), dtype=int)
+        used = np.abs(self.r) * self.norms[W] > self.dependent * self.norms[p]
+        W, sides, r = W[used], sides[used], self.r[used]
         Q, R = qr(self.columns[:, W], mode="economic")
-        r = self.r[used]
         for _ in range(3):
             rest = _sum_products([(self.C[W].T, -r)], self.C[p])
             r = r + solve_triangular(R, Q.T @ solve_triangular(self.L, rest, lower=True))
+        # where a bound cannot pull that way it is rounding
+        wrong = (-sense * r * sides < 0.0) & (self.lower[W] < self.upper[W])
         ray = np.zeros(len(self.E))
-        ray[W], ray[p] = -sense * r, sense
-        for w, side in zip(W, sides, strict=True):
-            if ray[w] * side < 0.0 and self.lower[w] < self.upper[w]:
-                ray[w] = 0.0  # rounding: this bound cannot pull that way
+        ray[W], ray[p] = np.where(wrong, 0.0, -sense * r), sense
         proven = proves_infeasibility(ray * self.E, self.G, *self.bounds)
         self.ray = ray * self.E if proven else None
         return proven

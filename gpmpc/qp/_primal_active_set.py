@@ -28,10 +28,9 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve, qr, solve_triangular
 from scipy.optimize import linprog
 
-from gpmpc.exceptions import ProblemError
 from gpmpc.qp import _record as layout
 from gpmpc.qp._dual_rescue import rescue
-from gpmpc.qp._problem import ABSENT, QuadraticProgram
+from gpmpc.qp._problem import ABSENT, QuadraticProgram, check_positive
 from gpmpc.qp._solution import QPSolution, WarmStart, as_record, make_solution, proves_infeasibility
 from gpmpc.status import Status
 
@@ -70,18 +69,18 @@ class PrimalActiveSet:
     iteration_limit: int | None = None
 
     def __post_init__(self):
-        for name in ("tolerance", "iteration_limit"):
-            value = getattr(self, name)
-            if value is not None and not value > 0:
-                raise ProblemError(f"{name} must be positive; got {value}")
+        check_positive(self, "tolerance", "iteration_limit")
 
     @np.errstate(over="ignore", invalid="ignore")  # what is not finite is seen below
     def solve(self, problem: QuadraticProgram, warm_start: WarmStart = None) -> QPSolution:
         """The minimiser, from a warm start of any kind; see ``QPSolver``."""
         began = perf_counter()
         n, M = len(problem.q), len(problem.lower)
-        rows = _one_sided(problem)
-        start, guess = _read_warm_start(warm_start, n, M)
+        rows, start, names = _one_sided(problem), np.zeros(n), np.zeros(0)
+        given = as_record(warm_start, n, M)
+        if len(given) and (given[layout.VARIABLES], given[layout.CONSTRAINTS]) == (n, M):
+            names = layout.working_names(given, n, M)
+            start = np.nan_to_num(given[layout.HEADER : layout.HEADER + n], posinf=0.0, neginf=0.0)
 
         def finish(status, x, multipliers, active, iterations):
             solution = make_solution(problem, status, x, multipliers, active_set=active, iterations=iterations)
@@ -97,7 +96,9 @@ class PrimalActiveSet:
             proven = proves_infeasibility(ray, *problem[2:])
             return finish(Status.INFEASIBLE if proven else Status.NUMERICAL_TROUBLE, x, ray, nothing, 0)
         limit = self.iteration_limit or 200 + 20 * len(rows.h)
-        working = list(np.flatnonzero(rows.equality | _close_to_guess(rows, x, guess)))
+        guessed = np.isin((rows.stacked + 1) * np.sign(rows.factor), names)  # and they hold with equality at x
+        guessed &= np.abs(rows.A @ x - rows.h) <= _INSIDE * np.maximum(1.0, np.abs(rows.h))
+        working = list(np.flatnonzero(rows.equality | guessed))
         still = full_steps = 0
         for iteration in range(limit):
             A, d, multipliers = rows.A[working], np.full(n, np.nan), nothing
@@ -138,15 +139,6 @@ def _one_sided(problem: QuadraticProgram) -> _Rows:
     return _Rows(C[stacked] * factor[:, None], h, equal[stacked], stacked, factor)
 
 
-def _read_warm_start(warm_start: WarmStart, n: int, M: int) -> tuple[Array, Array]:
-    """A point to start near, and an active set (M,) to start with; zeros where the warm start says nothing."""
-    record, x, active = as_record(warm_start, n, M), np.zeros(n), np.zeros(M)
-    if len(record) and (record[layout.VARIABLES], record[layout.CONSTRAINTS]) == (n, M):
-        x, names = record[layout.HEADER : layout.HEADER + n], layout.working_names(record, n, M)
-        x, active[np.abs(names).astype(int) - 1] = np.where(np.isfinite(x), x, 0.0), np.sign(names)
-    return x, active
-
-
 def _phase_1(rows: _Rows, start: Array, M: int) -> tuple[Array, Array | None]:
     """A feasible point (``start`` if it is one) and None, or ``start`` and a ray (M,) that may prove there is none."""
     A, h = np.vstack([rows.A, -rows.A[rows.equality]]), np.concatenate([rows.h, -rows.h[rows.equality]])
@@ -175,12 +167,6 @@ def farkas_ray(problem: QuadraticProgram) -> Array | None:
     """Farkas' proof (M,) that no point is feasible, from phase 1; None if it finds none."""
     _, ray = _phase_1(_one_sided(problem), np.zeros(len(problem.q)), len(problem.lower))
     return None if ray is None or not proves_infeasibility(ray, *problem[2:]) else ray
-
-
-def _close_to_guess(rows: _Rows, x: Array, guess: Array) -> NDArray[np.bool_]:
-    """Which guessed rows hold with equality at x."""
-    guessed = np.sign(guess[rows.stacked]) == np.sign(rows.factor)
-    return guessed & (np.abs(rows.A @ x - rows.h) <= _INSIDE * np.maximum(1.0, np.abs(rows.h)))
 
 
 def _minimise_on_rows(P: Array, gradient: Array, A: Array, gap: Array) -> tuple[Array, Array]:

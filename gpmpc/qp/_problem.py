@@ -35,12 +35,10 @@ def _as_float_array(name: str, value: ArrayLike, shape: tuple[int, ...], finite:
         array = array.copy()
     if array.shape != shape:
         raise ProblemError(f"{name} must have shape {shape}; got {array.shape}")
-    for wrong, rule in (
-        (np.isnan(array), "not contain NaN; it does"),
-        (np.isinf(array) & finite, "be finite; it is not"),
-    ):
-        if wrong.any():
-            raise ProblemError(f"{name} must {rule} at index {', '.join(str(i) for i in np.argwhere(wrong)[0])}")
+    wrong = np.argwhere(~np.isfinite(array) if finite else np.isnan(array))
+    if len(wrong):
+        rule = "not contain NaN; it does" if np.isnan(array).any() else "be finite; it is not"
+        raise ProblemError(f"{name} must {rule} at index {', '.join(map(str, wrong[0]))}")
     return array
 
 
@@ -63,15 +61,15 @@ def _check_hessian(P: Array) -> None:
         )
 
 
-def _check_bounds(kind: str, low: Array, high: Array, names: tuple[str, str]) -> None:
-    crossed = low > high
-    if crossed.any():
-        i = int(np.argmax(crossed))
-        raise ProblemError(f"{kind} {i}: {names[0]} must not exceed {names[1]}; got {low[i]:.6g} > {high[i]:.6g}")
-    for name, impossible, array in ((names[0], low >= ABSENT, low), (names[1], high <= -ABSENT, high)):
-        if impossible.any():
-            i = int(np.argmax(impossible))
-            raise ProblemError(f"{kind} {i}: no number satisfies {name} = {array[i]:.6g}")
+def _check_bounds(n: int, lower: Array, upper: Array, names: tuple[str, str, str, str]) -> None:
+    """Raises ``ProblemError`` where stacked bounds are crossed or cannot be met; names of the box's come first."""
+    for i in np.flatnonzero((lower > upper) | (lower >= ABSENT) | (upper <= -ABSENT)):
+        low, high = names[:2] if i < n else names[2:]
+        place = f"variable {i}" if i < n else f"row {i - n}"
+        if lower[i] > upper[i]:
+            raise ProblemError(f"{place}: {low} must not exceed {high}; got {lower[i]:.6g} > {upper[i]:.6g}")
+        name, value = (low, lower[i]) if lower[i] >= ABSENT else (high, upper[i])
+        raise ProblemError(f"{place}: no number satisfies {name} = {value:.6g}")
 
 
 class _Arrays(NamedTuple):
@@ -127,11 +125,10 @@ class QuadraticProgram(_Arrays):
         def bound(name: str, value: ArrayLike | None, size: int, absent: float) -> Array:
             return _as_float_array(name, np.full(size, absent) if value is None else value, (size,))
 
-        low, row_low = bound("lb", lb, n, -np.inf), bound("h_lower", h_lower, m, -np.inf)
-        high, row_high = bound("ub", ub, n, np.inf), bound("h_upper", h_upper, m, np.inf)
-        _check_bounds("row", row_low, row_high, ("h_lower", "h_upper"))
-        _check_bounds("variable", low, high, ("lb", "ub"))
-        return cls.unchecked(P, q, G, np.concatenate([low, row_low]), np.concatenate([high, row_high]))
+        lower = np.concatenate([bound("lb", lb, n, -np.inf), bound("h_lower", h_lower, m, -np.inf)])
+        upper = np.concatenate([bound("ub", ub, n, np.inf), bound("h_upper", h_upper, m, np.inf)])
+        _check_bounds(n, lower, upper, ("lb", "ub", "h_lower", "h_upper"))
+        return cls.unchecked(P, q, G, lower, upper)
 
     @classmethod
     def from_stacked(
@@ -140,8 +137,7 @@ class QuadraticProgram(_Arrays):
         """Checks a program with bounds (M,) on the stacked constraints ``[x; Gx]``."""
         (n, m), P, q, G = _check_matrices(P, q, G)
         lower, upper = _as_float_array("lower", lower, (n + m,)), _as_float_array("upper", upper, (n + m,))
-        _check_bounds("row", lower[n:], upper[n:], ("lower", "upper"))
-        _check_bounds("variable", lower[:n], upper[:n], ("lower", "upper"))
+        _check_bounds(n, lower, upper, ("lower", "upper", "lower", "upper"))
         return cls.unchecked(P, q, G, lower, upper)
 
     @staticmethod
@@ -152,25 +148,10 @@ class QuadraticProgram(_Arrays):
     def __reduce__(self):
         return QuadraticProgram.unchecked, tuple(self)
 
-    @property
-    def h_lower(self) -> Array:
-        """(m,) lower bounds of the rows."""
-        return self.lower[len(self.q) :]
-
-    @property
-    def h_upper(self) -> Array:
-        """(m,) upper bounds of the rows."""
-        return self.upper[len(self.q) :]
-
-    @property
-    def lb(self) -> Array:
-        """(n,) lower bounds of x."""
-        return self.lower[: len(self.q)]
-
-    @property
-    def ub(self) -> Array:
-        """(n,) upper bounds of x."""
-        return self.upper[: len(self.q)]
+    h_lower = property(lambda self: self.lower[len(self.q) :], doc="(m,) lower bounds of the rows.")
+    h_upper = property(lambda self: self.upper[len(self.q) :], doc="(m,) upper bounds of the rows.")
+    lb = property(lambda self: self.lower[: len(self.q)], doc="(n,) lower bounds of x.")
+    ub = property(lambda self: self.upper[: len(self.q)], doc="(n,) upper bounds of x.")
 
 
 def _check_matrices(P: ArrayLike, q: ArrayLike, G: ArrayLike | None) -> tuple[tuple[int, int], Array, Array, Array]:
@@ -197,7 +178,14 @@ def multiplier_caps(prices: ArrayLike | None, variables: int, rows: int) -> Arra
     caps = np.full(variables + rows, np.inf)
     if prices is not None:
         caps[variables:] = _as_float_array("prices of rows", prices, (rows,))
-        if not (caps > 0.0).all():
-            i = int(np.argmin(caps > 0.0))
-            raise ProblemError(f"price of row {i - variables} must be positive; got {caps[i]:.6g}")
+    for i in np.flatnonzero(caps <= 0.0):
+        raise ProblemError(f"price of row {i - variables} must be positive; got {caps[i]:.6g}")
     return caps
+
+
+def check_positive(settings: object, *names: str) -> None:
+    """Raises ``ProblemError`` unless each of these settings of a solver is positive, or None."""
+    for name in names:
+        value = getattr(settings, name)
+        if value is not None and not value > 0:
+            raise ProblemError(f"{name} must be positive; got {value}")

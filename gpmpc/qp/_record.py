@@ -7,9 +7,9 @@ dual active set therefore writes all it found into a single record, which the ne
 
 Constraints are stacked, box first: ``C = [I; G]``, M = n + m. A multiplier is positive at an upper and negative at a
 lower bound, so that ``P x + q + C' multipliers = 0``. The working set lists signed numbers: ``+(p + 1)`` for
-constraint p at its upper bound, ``-(p + 1)`` at its lower one. Entries past the number of working constraints are
-undefined. The record of a prepared program ends with the factor of the working set, by rows; the tag says of which
-program it is (zero: none), the age how many constraints have entered or left since the factor was computed.
+constraint p at its upper bound, ``-(p + 1)`` at its lower one; what comes after them is undefined. The record of a
+prepared program ends with the factor of the working set, by rows; the tag says of which program it is (zero: none), the
+age how many constraints have entered or left since the factor was computed.
 """
 
 import numpy as np
@@ -20,13 +20,7 @@ from gpmpc.status import Status
 STATUS, ITERATIONS, VARIABLES, CONSTRAINTS, WORKING, TAG, AGE, HEADER = range(8)
 
 SOLVED, INFEASIBLE, ITERATION_LIMIT, TIME_LIMIT, NUMERICAL_TROUBLE = range(5)
-STATUSES = (
-    Status.SOLVED,
-    Status.INFEASIBLE,
-    Status.ITERATION_LIMIT,
-    Status.TIME_LIMIT,
-    Status.NUMERICAL_TROUBLE,
-)
+STATUSES = tuple(Status)[:5]
 MISUSE = 5  # found by a kernel: the caller constructs a QuadraticProgram, whose error says what is wrong
 
 NO_RECORD: NDArray[np.float64] = np.zeros(0)
@@ -34,27 +28,20 @@ NO_RECORD: NDArray[np.float64] = np.zeros(0)
 
 def record_size(variables: int, constraints: int, working: int = 0) -> int:
     """Returns the length of a record for M stacked constraints and a factor of up to ``working`` rows."""
-    return HEADER + variables + 2 * constraints + working * (working + 1) // 2
+    return HEADER + variables + 2 * constraints + working * (working + 1) // 2 + 8  # kernels write whole registers
 
 
 def warm_record(active_set: NDArray, variables: int) -> NDArray[np.float64]:
-    """Returns a record that carries nothing but a working set.
-
-    Args:
-        active_set: (M,) -1 at a lower bound, +1 at an upper bound, 0 otherwise.
-        variables: n.
-    """
+    """Returns a record of n variables with nothing but an active set (M,): -1 at a lower bound, +1 at an upper one."""
     constraints = len(active_set)
     record = np.zeros(record_size(variables, constraints))
     members = np.flatnonzero(active_set)
-    record[VARIABLES], record[CONSTRAINTS], record[WORKING] = variables, constraints, len(members)
-    start = HEADER + variables + constraints
-    record[start : start + len(members)] = np.sign(active_set[members]) * (members + 1)
+    record[[VARIABLES, CONSTRAINTS, WORKING]] = variables, constraints, len(members)
+    record[HEADER + variables + constraints :][: len(members)] = np.sign(active_set[members]) * (members + 1)
     return record
 
 
 def working_names(record: NDArray, variables: int, constraints: int) -> NDArray[np.float64]:
     """Returns the working set of a record, without what is no bound."""
-    start = HEADER + variables + constraints
-    names = record[start : start + int(np.clip(np.nan_to_num(record[WORKING]), 0, constraints))]
+    names = record[HEADER + variables + constraints :][: int(np.clip(np.nan_to_num(record[WORKING]), 0, constraints))]
     return names[(np.abs(names) >= 1.0) & (np.abs(names) <= constraints)]

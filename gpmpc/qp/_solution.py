@@ -54,8 +54,7 @@ class QPSolution(NamedTuple):
     @property
     def multipliers(self) -> Array:
         """(M,) multipliers of the stacked constraints; Farkas' proof if the status is ``INFEASIBLE``."""
-        start = layout.HEADER + len(self.x)
-        return self.record[start : start + len(self.caps)]
+        return self.record[layout.HEADER + len(self.x) :][: len(self.caps)]
 
     @property
     def z(self) -> Array:
@@ -80,10 +79,9 @@ class QPSolution(NamedTuple):
     @property
     def active_set(self) -> NDArray[np.int8]:
         """(M,) -1 where a stacked constraint works at its lower bound, +1 at its upper bound, 0 elsewhere."""
-        M = len(self.caps)
-        active, start = np.zeros(M, dtype=np.int8), layout.HEADER + len(self.x) + M
-        codes = self.record[start : start + int(self.record[layout.WORKING])]
-        active[np.abs(codes).astype(int) - 1] = np.sign(codes)
+        active = np.zeros(len(self.caps), dtype=np.int8)
+        names = layout.working_names(self.record, len(self.x), len(self.caps))
+        active[np.abs(names).astype(int) - 1] = np.sign(names)
         return active
 
     @property
@@ -95,9 +93,8 @@ class QPSolution(NamedTuple):
     def violation(self) -> Array:
         """(M,) how far each stacked constraint lies outside its bounds, in the constraint's own unit; soft ones too."""
         values, (lower, upper) = np.concatenate([self.x, self.arrays[2] @ self.x]), self.arrays[3:]
-        above = np.where(upper < ABSENT, values - upper, 0.0)
-        below = np.where(lower > -ABSENT, lower - values, 0.0)
-        return np.maximum(0.0, np.maximum(above, below))
+        outside = np.where(upper < ABSENT, values - upper, 0.0), np.where(lower > -ABSENT, lower - values, 0.0)
+        return np.maximum(0.0, np.maximum(*outside))
 
     @np.errstate(all="ignore")  # the multipliers of a failed solve may be anything
     def residuals(self, zero: float = 1e-12) -> Residuals:
@@ -169,17 +166,17 @@ def make_solution(
     build_seconds: float = 0.0,
     solve_seconds: float = 0.0,
 ) -> QPSolution:
-    """A solution from the parts that any solver has.
+    """Makes a solution of the parts that any solver has, see ``QPSolution``; all rows are hard.
 
     Args:
-        problem: What was solved; its rows are hard.
+        problem: What was solved.
         status: How it ended.
         x: (n,).
         multipliers: (M,) box first, positive at upper and negative at lower bounds.
         active_set: (M,) -1, 0, +1; the signs of the multipliers if omitted.
         iterations: The solver's own count.
-        build_seconds: [s].
-        solve_seconds: [s].
+        build_seconds: Time spent on building or compiling the problem [s].
+        solve_seconds: Time spent on solving it [s].
     """
     x, multipliers = np.asarray(x, dtype=float), np.asarray(multipliers, dtype=float)
     n, M = len(problem.q), sum(problem.G.shape)
@@ -187,13 +184,11 @@ def make_solution(
         raise ProblemError(
             f"a solution needs x of shape {(n,)} and multipliers {(M,)}; got {x.shape}, {multipliers.shape}"
         )
-    active = np.sign(multipliers) if active_set is None else np.asarray(active_set)
-    record = layout.warm_record(np.nan_to_num(active), n)
-    record[layout.STATUS] = layout.STATUSES.index(status)
-    record[layout.ITERATIONS] = iterations
+    record = layout.warm_record(np.nan_to_num(np.sign(multipliers) if active_set is None else active_set), n)
+    record[[layout.STATUS, layout.ITERATIONS]] = layout.STATUSES.index(status), iterations
     record[layout.HEADER : layout.HEADER + n + M] = np.concatenate([x, multipliers])
-    hard = np.full(M, np.inf)
-    return QPSolution(record[layout.HEADER : layout.HEADER + n], problem, hard, record, build_seconds, solve_seconds)
+    x = record[layout.HEADER : layout.HEADER + n]
+    return QPSolution(x, problem, np.full(M, np.inf), record, build_seconds, solve_seconds)
 
 
 def as_record(warm_start: WarmStart, n: int, M: int) -> Array:

@@ -16,6 +16,13 @@ _ROUNDING = 2.3e-16  # times n: share of P_ii below which a pivot is rounding
 _SKEW = 1e-10  # largest |P - P'| accepted, as a share of the largest diagonal entry
 
 
+@inline_njit
+def scale(factor, x, y, size):
+    """Writes ``y = factor x``; both are padded, and whole registers are written."""
+    for i in range(0, size, _LANES):
+        store(y, i, factor * load(x, i))
+
+
 @njit_noalloc
 def multiply_to_ends(A, ends, vector, product):
     """Writes ``product = A vector`` for rows of which ``ends`` leading entries may not be zero."""
@@ -114,8 +121,7 @@ def solve_transposed(L, end, a):
 def append_row(L, k, solved, pivot):
     """Writes row k of ``L L' = K_WW``: ``solved = L^-1 K_Wp`` and ``pivot = K_pp - |solved|^2 > 0``."""
     row = L[k]
-    for j in range(k):
-        row[j] = solved[j]
+    scale(1.0, solved, row, k)
     row[k] = 1.0 / math.sqrt(pivot)
 
 
@@ -149,52 +155,18 @@ def factorise(P, L):
     predictive control where no state depends on later inputs, then has as short a row L^-T c. Rows of L are padded to a
     multiple of eight; its upper triangle is undefined.
     """
-    n = len(P)
-    if not _is_symmetric(P, L):
-        return False
+    n, largest, skewed = len(P), 0.0, 0
+    for i in range(n):
+        largest = max(largest, abs(P[i, i]))
+    for i in range(n):
+        for j in range(i):
+            skewed += not abs(P[i, j] - P[j, i]) <= _SKEW * largest
     top = n // _BLOCK * _BLOCK
-    if top < n and not _finish_last_rows(P, L, top):
-        return False
-    good = True
+    good = skewed == 0 and _finish_last_rows(P, L, top)
     while good and top > 0:
         top -= _BLOCK
         good = _finish_four_rows(P, L, top)
     return good
-
-
-@inline_njit
-def _is_symmetric(P, L):
-    """Returns whether P equals its transpose but for rounding: by its product with one vector, else entry by entry.
-
-    (P - P') u = 0 for a vector u without structure leaves no doubt (Freivalds, 1977). Rows of L are its scratch.
-    """
-    n, largest, skewed, u, difference = len(P), 0.0, 0, L[0], L[len(P) - 1]
-    if n == 1:
-        return True
-    for i in range(n):
-        largest = max(largest, abs(P[i, i]))
-    for j in range(len(u)):
-        u[j], difference[j] = math.sqrt(j + 2.0), 0.0
-    whole = n // _LANES * _LANES
-    for i in range(n):
-        row, product, weight = P[i], zeros(), u[i]
-        for j in range(0, whole, _LANES):
-            entries = load(row, j)
-            product = product + entries * load(u, j)
-            store(difference, j, load(difference, j) - weight * entries)
-        if whole < n:
-            entries = load_some(row, whole)
-            product = product + entries * load(u, whole)
-            store(difference, whole, load(difference, whole) - weight * entries)
-        difference[i] += total(product)
-    for i in range(n):
-        skewed += not abs(difference[i]) <= _SKEW * largest
-    if skewed > 0:
-        skewed = 0
-        for i in range(n):
-            for j in range(i):
-                skewed += not abs(P[i, j] - P[j, i]) <= _SKEW * largest
-    return skewed == 0
 
 
 @inline_njit
@@ -205,64 +177,43 @@ def _is_pivot(pivot, diagonal, n):
 
 @inline_njit
 def _finish_last_rows(P, L, top):
-    """Writes the rows from ``top`` on, fewer than four."""
+    """Writes the rows from ``top`` on, fewer than four; returns False where a pivot is none."""
     n = len(P)
     for i in range(top, n):
-        for j in range(i + 1):
-            L[i, j] = P[i, j]
+        for j in range(0, n, _LANES):
+            store(L[i], j, load_some(P[i], j))
     for i in range(n - 1, top - 1, -1):
         row, pivot = L[i], L[i, i]
         if not _is_pivot(pivot, P[i, i], n):
             return False
         reciprocal = 1.0 / math.sqrt(pivot)
-        for j in range(i):
-            row[j] *= reciprocal
+        for j in range(0, i, _LANES):
+            store(row, j, load(row, j) * reciprocal)
         row[i] = reciprocal
         for k in range(top, i):
-            factor, target = row[k], L[k]
-            for j in range(k + 1):
-                target[j] -= factor * row[j]
+            target, factor = L[k], row[k]
+            for j in range(0, k + 1, _LANES):
+                store(target, j, load(target, j) - factor * load(row, j))
     return True
-
-
-@inline_njit
-def _subtract_below(P, L, top, j):
-    """Returns eight columns of four rows of P less what the rows of L below take off: registers hold all of it."""
-    a0, a1 = load_some(P[top], j), load_some(P[top + 1], j)
-    a2, a3 = load_some(P[top + 2], j), load_some(P[top + 3], j)
-    for s in range(top + _BLOCK, len(P)):
-        row = L[s]
-        x = load(row, j)
-        a0, a1 = a0 - row[top] * x, a1 - row[top + 1] * x
-        a2, a3 = a2 - row[top + 2] * x, a3 - row[top + 3] * x
-    return a0, a1, a2, a3
-
-
-@inline_njit
-def _eliminate(targets, j, sums, multipliers, factors):
-    """Writes eight columns of four rows, given what the rows below have left of them."""
-    (t0, t1, t2, t3), (a0, a1, a2, a3) = targets, sums
-    (m01, m02, m03, m12, m13, m23), (g0, g1, g2, g3) = multipliers, factors
-    a2 = a2 - m23 * a3
-    a1 = a1 - m13 * a3 - m12 * a2
-    a0 = a0 - m03 * a3 - m02 * a2 - m01 * a1
-    store(t0, j, g0 * a0)
-    store(t1, j, g1 * a1)
-    store(t2, j, g2 * a2)
-    store(t3, j, g3 * a3)
 
 
 @inline_njit
 def _finish_four_rows(P, L, top):
     """Writes rows ``top`` to ``top + 3``, given those below; returns False where a pivot is none."""
-    n = len(P)
+    n, end = len(P), top + _BLOCK
+    p0, p1, p2, p3 = P[top], P[top + 1], P[top + 2], P[top + 3]
     t0, t1, t2, t3 = L[top], L[top + 1], L[top + 2], L[top + 3]
-    j = top // _LANES * _LANES  # the piece with the diagonal comes first
-    a0, a1, a2, a3 = _subtract_below(P, L, top, j)
-    store(t0, j, a0)
-    store(t1, j, a1)
-    store(t2, j, a2)
-    store(t3, j, a3)
+    for j in range(0, end, _LANES):  # P less what the rows of L below take off: registers hold all of it
+        a0, a1, a2, a3 = load_some(p0, j), load_some(p1, j), load_some(p2, j), load_some(p3, j)
+        for s in range(end, n):
+            row = L[s]
+            x = load(row, j)
+            a0, a1 = a0 - row[top] * x, a1 - row[top + 1] * x
+            a2, a3 = a2 - row[top + 2] * x, a3 - row[top + 3] * x
+        store(t0, j, a0)
+        store(t1, j, a1)
+        store(t2, j, a2)
+        store(t3, j, a3)
     # the block of four by four: its pivots d, and what of which row to subtract from which
     d3 = t3[top + 3]
     r3 = 1.0 / d3
@@ -276,14 +227,18 @@ def _finish_four_rows(P, L, top):
     e10 = t1[top] - m13 * t3[top] - m12 * e20
     m01 = e10 * r1
     d0 = t0[top] - m03 * t3[top] - m02 * e20 - m01 * e10
-    good = _is_pivot(d3, P[top + 3, top + 3], n) & _is_pivot(d2, P[top + 2, top + 2], n)
-    if not (good & _is_pivot(d1, P[top + 1, top + 1], n) & _is_pivot(d0, P[top, top], n)):
+    good = _is_pivot(d3, p3[top + 3], n) & _is_pivot(d2, p2[top + 2], n)
+    if not (good & _is_pivot(d1, p1[top + 1], n) & _is_pivot(d0, p0[top], n)):
         return False
     g3, g2, g1, g0 = math.sqrt(r3), math.sqrt(r2), math.sqrt(r1), 1.0 / math.sqrt(d0)
-    targets, multipliers, factors = (t0, t1, t2, t3), (m01, m02, m03, m12, m13, m23), (g0, g1, g2, g3)
-    _eliminate(targets, j, (a0, a1, a2, a3), multipliers, factors)
-    while j > 0:
-        j -= _LANES
-        _eliminate(targets, j, _subtract_below(P, L, top, j), multipliers, factors)
+    for j in range(0, end, _LANES):
+        a3 = load(t3, j)
+        a2 = load(t2, j) - m23 * a3
+        a1 = load(t1, j) - m13 * a3 - m12 * a2
+        a0 = load(t0, j) - m03 * a3 - m02 * a2 - m01 * a1
+        store(t0, j, g0 * a0)
+        store(t1, j, g1 * a1)
+        store(t2, j, g2 * a2)
+        store(t3, j, g3 * a3)
     t0[top], t1[top + 1], t2[top + 2], t3[top + 3] = g0, g1, g2, g3
     return True
