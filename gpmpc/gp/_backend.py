@@ -38,7 +38,7 @@ def backend(choice: _Backend) -> Iterator[None]:
 
 
 def host_arrays(*tensors: Tensor) -> list[Array] | None:
-    """Returns the tensors as arrays for the compiled loops; None where torch has to evaluate."""
+    """Returns the tensors as arrays for the compiled loops; None where torch has to evaluate, or is to."""
     choice = _chosen.get()
     if choice == "torch":
         return None

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from gpmpc._dynamics import Array, Linearized, TensorModel, check_destination, check_query, tensors_for, to_array
-from gpmpc.gaussian import Gaussian, check_tensors
+from gpmpc.gaussian import Gaussian, check_tensors, constant_arrays
 from gpmpc.gp._backend import host_arrays
 from gpmpc.gp._kernel import Hyperparameters, Predicts, check_posterior, factorize
 from gpmpc.gp._scaling import Scaling
@@ -152,6 +152,11 @@ class GPPosterior(TensorModel):
         return pack(self.features.numpy(), *kernel, self.cholesky.numpy(), self.weights.numpy(), self.state_dim)
 
     @cached_property
+    def _on_host(self) -> bool:
+        """Whether the compiled loops can evaluate it: float64 in host memory."""
+        return constant_arrays(self.weights) is not None and self.dtype is torch.float64
+
+    @cached_property
     def _prior(self) -> tuple[Array, bool]:
         """The prior means (k,) in host memory, and whether the state is added to a prediction."""
         return self.offset.numpy(), self.predicts == "difference"
@@ -197,7 +202,7 @@ class GPPosterior(TensorModel):
 
     def linearize(self, states: Array, inputs: Array, covariance: bool = True) -> Linearized:
         """Linearises the mean at K points (K, n), (K, m): by the compiled kernels where they can, else by torch."""
-        if host_arrays(self.weights) is not None:
+        if (host_arrays() if self._on_host else host_arrays(self.weights)) is not None:
             from gpmpc import _kernels as kernels  # loads numba
 
             return Linearized(*kernels.linearize(self.packed, states, inputs, covariance, *self._prior))
