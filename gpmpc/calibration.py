@@ -132,7 +132,8 @@ def calibrate(
     names = tuple(names) or tuple(f"x{i + 1}" for i in range(model.state_dim))
     check_number("horizon", horizon, least=1, whole=True)
     _check(model, recordings, horizon, levels, names)
-    n, like = model.state_dim, {"dtype": model.dtype, "device": model.device}
+    n = model.state_dim
+    like: dict[str, Any] = {"dtype": model.dtype, "device": model.device}
     noise, certain = model.noise_covariance.diagonal(), torch.zeros(n, n, **like)
 
     found: list[list[tuple[Tensor, ...]]] = [[] for _ in range(horizon)]

@@ -90,7 +90,7 @@ HOUSE = House(ROOT)
 @pytest.mark.parametrize(
     ("what", "count", "most"),
     [
-        ("lines of gpmpc/", HOUSE.lines, 26_510),
+        ("lines of gpmpc/", HOUSE.lines, 26_516),
         ("public functions and classes", len(HOUSE.public_names + HOUSE.exported_names), 279),
         ("functions with more than 10 arguments", len(HOUSE.functions_above(10)), 0),
         ("files of mpc/", HOUSE.mpc_files, 13),

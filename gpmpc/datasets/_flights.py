@@ -153,7 +153,8 @@ def _transitions(flight: Rollout, samples: int) -> Transitions:
 
 def _attitudes(flight: Rollout, convention: str) -> np.ndarray:
     """Roll and pitch (K, 2) [rad] of the thrust directions that were decided in a flight."""
-    return attitude_for_thrust_direction(*flight.inputs[:, 1:].T, convention=convention)
+    ux, uy = flight.inputs[:, 1:].T
+    return attitude_for_thrust_direction(ux, uy, convention=convention)
 
 
 @dataclass(frozen=True)

@@ -95,7 +95,7 @@ def check_posterior(given: dict[str, Tensor], input_dim: int, predicts: str, dty
             f"got {tuple(inputs.shape)} and {tuple(targets.shape)}"
         )
     (size, d), k = inputs.shape, targets.shape[1]
-    shapes = {first: (size, d), "targets": (size, k), "lengthscales": (k, d)}
+    shapes: dict[str, tuple[int, ...]] = {first: (size, d), "targets": (size, k), "lengthscales": (k, d)}
     shapes |= {"cholesky": (k, size, size), "weights": (k, size)}
     for name, value in given.items():
         if tuple(value.shape) != (shape := shapes.get(name, (k,))):

@@ -181,7 +181,8 @@ class GPPosterior(TensorModel):
         """Copies the posterior to another device, or to another type: float32 or float64."""
         check_destination(device, dtype)
         tensors = {f.name: v for f in fields(self) if isinstance(v := getattr(self, f.name), Tensor)}
-        return replace(self, **{name: value.to(device=device, dtype=dtype) for name, value in tensors.items()})
+        moved: dict[str, Any] = {name: value.to(device=device, dtype=dtype) for name, value in tensors.items()}
+        return replace(self, **moved)
 
     def predict(self, state: Tensor, input: Tensor | None = None) -> Gaussian:
         """The next state's distribution at a certain state and input (Rasmussen and Williams, 2006, eq. (2.25)).

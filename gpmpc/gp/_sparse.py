@@ -132,7 +132,7 @@ def data_sums(Lz: Tensor, Z: Tensor, x: Tensor, y: Tensor, kernel: Hyperparamete
     for a in range(y.shape[1]):
         total: Any = 0.0, 0.0, 0.0, 0.0
         for rows in (slice(begin, begin + step) for begin in range(0, len(x), step)):
-            block = Lz[a, None], Z, x[rows], y[rows, a, None], *(value[a, None] for value in kernel), method
+            block: Any = Lz[a, None], Z, x[rows], y[rows, a, None], *(value[a, None] for value in kernel), method
             if torch.is_grad_enabled() and step < len(x):
                 part: Any = checkpoint(_block_sums, *block, use_reentrant=True, preserve_rng_state=False)
             else:

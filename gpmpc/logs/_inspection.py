@@ -60,7 +60,10 @@ def inspect_log(path: str | Path, mapping: LogMapping | None = None) -> Inspecti
         DataError: The file cannot be read, or no column holds the time.
     """
     streams = read_streams(path, {signal.topic for signal in mapping.signals} if mapping else ())
-    tables, channels, delays, lines, gaps, warnings = [], {}, [], {}, [], []
+    tables: list[dict[str, Any]] = []
+    channels: dict[str, Any] = {}
+    lines: dict[str, Any] = {}
+    delays, gaps, warnings = [], [], []
     for topic, table in streams.items():
         time_name, time = _time(path, table, mapping)
         stamps = ordered_stamps(time, f"{path}{f', {topic}' if topic else ''}")

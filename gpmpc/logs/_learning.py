@@ -89,7 +89,8 @@ def learn(
     cuts = [held_out.windows(steps, PAST + LATE, most=WINDOWS) for _, held_out in folds]
     memory = {} if memory is None else memory
     candidates: list[Candidate] = []
-    best, models = 0, []  # the number and the models, one a fold, of the best candidate
+    best = 0  # the number of the best candidate
+    models: list[LogModel] = []  # of it, one a fold
 
     def errors(trained: list[LogModel]) -> Array:
         at = [min(step, steps) for step in JUDGED]

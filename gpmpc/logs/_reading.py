@@ -248,7 +248,8 @@ def _make_run(table: _Table, step: float, spread: Array, mapping: LogMapping) ->
         note("gap", len(inner), f"{len(inner)} {text}: boundaries" + ("" if shortest > step else " (a rate resamples)"))
     breaks = uneven | (np.diff(rows) > 1) | table.breaks[rows[1:]]
     begins = (0, *(np.flatnonzero(breaks) + 1).tolist())
-    return LogRun(table.name, table.time[rows], *mapping.split(table.values[rows]), begins=begins)
+    states, inputs, context = mapping.split(table.values[rows])
+    return LogRun(table.name, table.time[rows], states, inputs, context, begins)
 
 
 def _at_rest(states: Array, inputs: Array, spread: Array, step: float) -> np.ndarray:

@@ -110,7 +110,8 @@ class CasadiFunction:
             raise UnsupportedModel(f"CasadiFunction takes a CasADi function of one value; got {function!r}")
         if any(function.size2_in(i) != 1 for i in range(function.n_in())):
             raise UnsupportedModel(f"a CasADi function takes vectors (column by column); got {function!r}")
-        self.function, self.tape, self._mapped = function, tape_of(function), {}
+        self.function, self.tape = function, tape_of(function)
+        self._mapped: dict[int, Any] = {}
         self.shape = function.size1_out(0), function.size2_out(0)
         self.sizes = [function.size1_in(i) for i in range(function.n_in())]
 

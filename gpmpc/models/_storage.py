@@ -74,8 +74,8 @@ def _parts(path: Path, model: Any) -> tuple[dict[str, Any], dict[str, Tensor]]:
     if type(model) not in _MODELS.values():
         raise UnsupportedModel(f"only {', '.join(_MODELS)} can be saved; got {kind}")
     if isinstance(model, GPPosterior):
-        described, tensors = posterior_parts(path, model)
-        return {"kind": kind, **described}, tensors
+        described, own = posterior_parts(path, model)
+        return {"kind": kind, **described}, own
     header: dict[str, Any] = {"kind": kind}
     tensors: dict[str, Tensor] = {}
     for name in (field.name for field in fields(model)):

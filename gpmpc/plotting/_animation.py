@@ -106,7 +106,7 @@ def _scene(run: "Run") -> tuple[Figure, Callable[[int], None]]:
             squared, directions = np.linalg.eigh(spread)
             minor, major = 4 * factor * np.sqrt(squared.clip(0)).T  # whole axes of the 2-sigma ellipses
             angles = np.degrees(np.arctan2(directions[:, 1, 1], directions[:, 0, 1]))
-            look = {"facecolors": TUBE, "edgecolors": FLOWN, "alpha": 0.45, "linewidths": 0.6, "zorder": 1}
+            look: Any = {"facecolors": TUBE, "edgecolors": FLOWN, "alpha": 0.45, "linewidths": 0.6, "zorder": 1}
             where: Any = {"units": "xy", "offsets": stages, "transOffset": near.transData}
             tubes.append(near.add_collection(EllipseCollection(major, minor, angles, **where, **look)))
         distance = 100 * np.linalg.norm((run.states - run.references)[k, [*plane, up]])

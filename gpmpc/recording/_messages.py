@@ -219,10 +219,10 @@ class Encoder:
         """Yields topics and messages of a step."""
         step, decision, arrays = copy.step, copy.step.decision, copy.arrays
         head = {"time": step.time, "k": step.k}
-        solution = decision and decision.solution
+        solution = None if decision is None else decision.solution
         if solution is not None:
             solution = solution._replace(x=arrays["x"], record=arrays["record"])
-        timing = decision and decision.timing
+        timing = None if decision is None else decision.timing
         times = (0.0, 0.0, 0.0) if timing is None else (timing.model, timing.build, timing.solve)
         message = self._step(
             **head,

@@ -108,7 +108,7 @@ class Run:
         values["residuals"] = self.residuals.reshape(-1, 3)
         values["status"] = np.array([status.name for status in self.statuses], dtype=object)
         names = {"State": self.state_names, "Input": self.input_names, "Timing": TIMING, "": RESIDUALS}
-        found = {}
+        found: dict[str, Array] = {}
         for field, kind in FIELDS["Step"].items():
             if field in values and kind in names:
                 columns = zip(names[kind], values[field].T, strict=True)

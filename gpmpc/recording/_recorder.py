@@ -82,7 +82,7 @@ class McapRecorder:
         described = {"run": about, "units": system.field_units, "frames": frames, "pose": dict(system.pose)}
         for name, pairs in described.items():
             self._writer.write_metadata(name, pairs)
-        attached = {"media_type": "application/yaml", "log_time": 0, "create_time": 0}
+        attached: Any = {"media_type": "application/yaml", "log_time": 0, "create_time": 0}
         self._writer.attach(name=CONFIG, data=config.encode(), **attached)
         self._writer.flush()
         self._save(sync=True)

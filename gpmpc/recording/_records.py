@@ -11,7 +11,7 @@ import zlib
 from collections.abc import Iterator
 from io import BytesIO
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import lz4.frame
 import zstandard
@@ -27,8 +27,8 @@ CONFIG, RECOVERED = "config.yaml", "recovered"  # an attachment; metadata of a f
 LARGEST = 32 * 2**20  # of a record or an unfolded chunk [bytes]
 _ROOM, _RATIO = 64 * 2**20, 300  # [bytes], and bytes a byte of the file; runs are compressed 2 to 10 times
 _HEAD = struct.Struct("<BQ")  # kind and length
-_KINDS = {Opcode.SCHEMA: Schema, Opcode.CHANNEL: Channel, Opcode.MESSAGE: Message, Opcode.CHUNK: Chunk}
-_KINDS |= {Opcode.ATTACHMENT: Attachment, Opcode.METADATA: Metadata}
+_PARSED = Schema, Channel, Message, Chunk, Attachment, Metadata
+_KINDS: dict[Opcode, Any] = {Opcode[one.__name__.upper()]: one for one in _PARSED}
 _BROKEN = (McapError, struct.error, UnicodeDecodeError, OverflowError, zstandard.ZstdError, RuntimeError)
 
 

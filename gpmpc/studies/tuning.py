@@ -60,7 +60,7 @@ class Search:
         self._space: dict[str, Any] = {}
         for key, values in space.items():
             if isinstance(values, Interval):
-                kind = kinds.IntDistribution if values.whole else kinds.FloatDistribution
+                kind: Any = kinds.IntDistribution if values.whole else kinds.FloatDistribution
                 self._space[key] = kind(values.low, values.high, log=values.logarithmic)
             else:
                 self._space[key] = kinds.CategoricalDistribution([*values])
