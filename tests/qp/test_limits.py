@@ -115,11 +115,11 @@ def first_solve(folder, **environment):
 
 
 def copy_of_the_package(folder):
-    modules = ("__init__", "status", "exceptions", "compiled")
+    modules = ("__init__", "status", "exceptions", "_compiled")
     for source in [
         *(PACKAGE / f"{name}.py" for name in modules),
         *PACKAGE.glob("qp/*.py"),
-        *PACKAGE.glob("kernels/*.py"),
+        *PACKAGE.glob("_kernels/*.py"),
     ]:
         target = folder / source.relative_to(PACKAGE.parent)
         target.parent.mkdir(parents=True, exist_ok=True)
