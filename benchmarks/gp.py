@@ -122,7 +122,7 @@ def linearisation_groups(gp: GPPosterior, belief: Gaussian, control: torch.Tenso
             "moments, torch": lambda: by_torch(belief.mean, belief.covariance, control),
         },
         {"moments with Jacobians": jacobian},
-        {"moments, diagonal": lambda: kernels.moments(packed, *at, diagonal=True)},
+        {"moments, diagonal": lambda: kernels.moments(packed, *at, diagonal=True)[:2]},
         {"diagonal with Jacobians": lambda: kernels.moments(packed, *at, diagonal=True, derivatives=True)},
         {"linearised": lambda: kernels.point_with_jacobian(packed, mu, u)},
         {
