@@ -2,8 +2,8 @@
 
     .venv/bin/python -m benchmarks.agreement [--steps 200] [--recorded 500]
 
-1. ``trajectory`` iterated to tolerance against ``NonlinearGPMPC`` on sampled steps of flights, full covariances: the
-   nonlinear objective at the one's plan over that at the other's.
+1. ``trajectory`` iterated to tolerance against SLSQP (``gpmpc.experiments.slsqp``) on sampled steps of flights, full
+   covariances: the nonlinear cost at the one's plan over that at the other's.
 2. The condensed program by our dual active set, the paper's primal one and Clarabel, and the state form in CVXPY, on
    recorded steps with active bounds of inputs and increments, and half as many with state bounds at a price (dual
    active set and state form): the largest difference of an input, in its own unit.
@@ -22,9 +22,9 @@ import torch
 from benchmarks.quadrotor import HOVER, STATE_BOUNDS, TRAJECTORIES, problem, recorded, trained
 from benchmarks.quadrotor_sequences import TIGHT
 from benchmarks.timing import write_results
-from gpmpc.mpc import PredictionSettings
+from gpmpc.experiments.slsqp import SLSQP
+from gpmpc.mpc import GPMPC, PredictionSettings, Request
 from gpmpc.mpc.baselines import StateFormMPC
-from gpmpc.mpc.gp_mpc import GPMPC, NonlinearGPMPC
 from gpmpc.mpc.problem import Box
 from gpmpc.propagation import Linearization, MomentMatching
 from gpmpc.qp import CvxpySolver, PrimalActiveSet
@@ -50,8 +50,8 @@ def main() -> None:
 
 
 def optimality(posteriors: dict, propagation: str, arguments: argparse.Namespace) -> dict:
-    """The nonlinear objective at the plan of iterated quadratic programs, relative to that of the nonlinear method."""
-    propagator, gaps, times, failed = PROPAGATIONS[propagation], [], [[], []], {"convex": 0, "nonlinear": 0}
+    """The nonlinear cost at the plan of iterated quadratic programs, relative to that at the plan of SLSQP."""
+    propagator, gaps, times, failed = PROPAGATIONS[propagation], [], [[], []], {"convex": 0, "slsqp": 0}
     for trajectory, gp in posteriors.items():
         asked = (problem(), arguments.horizon, HOVER)
         convex = GPMPC(
@@ -62,19 +62,19 @@ def optimality(posteriors: dict, propagation: str, arguments: argparse.Namespace
             iterations=100,
             tolerance=1e-7,
         )
-        nonlinear = NonlinearGPMPC(gp, propagator, *asked, tolerance=1e-6, max_iterations=300)
+        slsqp = SLSQP(gp, propagator, *asked, tolerance=1e-6)
         count = arguments.steps // len(posteriors)
         flown = recorded(GPMPC(gp, Linearization(), *asked), trajectory, count, std=0.01)
         for step in flown:
             plans = []
-            for controller, spent in zip((convex, nonlinear), times, strict=True):
+            for controller, spent in zip((convex, slsqp), times, strict=True):
                 began = time.process_time()
                 plans.append(controller.control(step.belief, step.reference, step.previous))
                 spent.append(time.process_time() - began)
             failed["convex"] += not plans[0].status.solved
-            failed["nonlinear"] += not plans[1].status.solved
-            last = HOVER if step.previous is None else step.previous.input
-            values = [nonlinear.objective(plan.inputs, step.belief, step.reference, last)[0] for plan in plans]
+            failed["slsqp"] += not plans[1].status.solved
+            request = Request.read(problem(), arguments.horizon, HOVER, step.belief, step.reference, step.previous)
+            values = [slsqp.evaluate(plan.inputs, request).cost for plan in plans]
             gaps.append(values[0] / values[1] - 1)
     gaps = np.array(gaps)
     result = {
