@@ -19,7 +19,14 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from benchmarks.quadrotor import HOVER, STATE_BOUNDS, TRAJECTORIES, problem, recorded, trained
+from benchmarks.quadrotor import (
+    HOVER,
+    STATE_BOUNDS,
+    TRAJECTORIES,
+    problem,
+    recorded,
+    trained,
+)
 from benchmarks.quadrotor_sequences import TIGHT
 from benchmarks.timing import write_results
 from gpmpc.experiments.slsqp import SLSQP
@@ -35,23 +42,42 @@ PROPAGATIONS = {"linearization": Linearization(), "moment_matching": MomentMatch
 def main() -> None:
     """Measures and prints."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--steps", type=int, default=200, help="sampled steps a propagation")
-    parser.add_argument("--recorded", type=int, default=500, help="steps for solvers and forms")
-    parser.add_argument("--horizon", type=int, default=5, help="of the first comparison")
+    parser.add_argument(
+        "--steps", type=int, default=200, help="sampled steps a propagation"
+    )
+    parser.add_argument(
+        "--recorded", type=int, default=500, help="steps for solvers and forms"
+    )
+    parser.add_argument(
+        "--horizon", type=int, default=5, help="of the first comparison"
+    )
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     posteriors = {name: trained(name) for name in TRAJECTORIES}
     results = {
-        "optimality": [optimality(posteriors, name, arguments) for name in PROPAGATIONS],
+        "optimality": [
+            optimality(posteriors, name, arguments) for name in PROPAGATIONS
+        ],
         "solvers": solvers(posteriors, arguments.recorded),
-        "long_horizon": [long_horizon(posteriors[name], name, l1) for name in TRAJECTORIES for l1 in (None, 1e4)],
+        "long_horizon": [
+            long_horizon(posteriors[name], name, l1)
+            for name in TRAJECTORIES
+            for l1 in (None, 1e4)
+        ],
     }
     write_results("agreement", results)
 
 
-def optimality(posteriors: dict, propagation: str, arguments: argparse.Namespace) -> dict:
+def optimality(
+    posteriors: dict, propagation: str, arguments: argparse.Namespace
+) -> dict:
     """The nonlinear cost at the plan of iterated quadratic programs, relative to that at the plan of SLSQP."""
-    propagator, gaps, times, failed = PROPAGATIONS[propagation], [], [[], []], {"convex": 0, "slsqp": 0}
+    propagator, gaps, times, failed = (
+        PROPAGATIONS[propagation],
+        [],
+        [[], []],
+        {"convex": 0, "slsqp": 0},
+    )
     for trajectory, gp in posteriors.items():
         asked = (problem(), arguments.horizon, HOVER)
         convex = GPMPC(
@@ -64,16 +90,27 @@ def optimality(posteriors: dict, propagation: str, arguments: argparse.Namespace
         )
         slsqp = SLSQP(gp, propagator, *asked, tolerance=1e-6)
         count = arguments.steps // len(posteriors)
-        flown = recorded(GPMPC(gp, Linearization(), *asked), trajectory, count, std=0.01)
+        flown = recorded(
+            GPMPC(gp, Linearization(), *asked), trajectory, count, std=0.01
+        )
         for step in flown:
             plans = []
             for controller, spent in zip((convex, slsqp), times, strict=True):
                 began = time.process_time()
-                plans.append(controller.control(step.belief, step.reference, step.previous))
+                plans.append(
+                    controller.control(step.belief, step.reference, step.previous)
+                )
                 spent.append(time.process_time() - began)
             failed["convex"] += not plans[0].status.solved
             failed["slsqp"] += not plans[1].status.solved
-            request = Request.read(problem(), arguments.horizon, HOVER, step.belief, step.reference, step.previous)
+            request = Request.read(
+                problem(),
+                arguments.horizon,
+                HOVER,
+                step.belief,
+                step.reference,
+                step.previous,
+            )
             values = [slsqp.evaluate(plan.inputs, request).cost for plan in plans]
             gaps.append(values[0] / values[1] - 1)
     gaps = np.array(gaps)
@@ -98,16 +135,33 @@ def solvers(posteriors: dict, count: int) -> dict:
     active, unsolved = 0, dict.fromkeys(found, 0)
     for trajectory, gp in posteriors.items():
         # Bounds that bite: of the inputs and their increments, and of positions.
-        bounds = Box(*(0.95 * np.asarray(side) for side in STATE_BOUNDS[trajectory]), probability=0.95, penalty=1e3)
+        bounds = Box(
+            *(0.95 * np.asarray(side) for side in STATE_BOUNDS[trajectory]),
+            probability=0.95,
+            penalty=1e3,
+        )
         tilt, rate = TIGHT[trajectory]
-        hard = (replace(problem(tilt=tilt), input_rates=Box(np.negative(rate), rate)), 10, HOVER)
+        hard = (
+            replace(problem(tilt=tilt), input_rates=Box(np.negative(rate), rate)),
+            10,
+            HOVER,
+        )
         soft = (problem(bounds), 10, HOVER)
-        for asked, kinds, steps in ((hard, tuple(found), count // 2), (soft, ("state_form",), count // 4)):
+        for asked, kinds, steps in (
+            (hard, tuple(found), count // 2),
+            (soft, ("state_form",), count // 4),
+        ):
             ours = GPMPC(gp, Linearization(), *asked)
             others = {
-                "primal_active_set": lambda a=asked, g=gp: GPMPC(g, Linearization(), *a, solver=PrimalActiveSet()),
-                "clarabel": lambda a=asked, g=gp: GPMPC(g, Linearization(), *a, solver=CvxpySolver()),
-                "state_form": lambda a=asked, g=gp: StateFormMPC(g, Linearization(), *a),
+                "primal_active_set": lambda a=asked, g=gp: GPMPC(
+                    g, Linearization(), *a, solver=PrimalActiveSet()
+                ),
+                "clarabel": lambda a=asked, g=gp: GPMPC(
+                    g, Linearization(), *a, solver=CvxpySolver()
+                ),
+                "state_form": lambda a=asked, g=gp: StateFormMPC(
+                    g, Linearization(), *a
+                ),
             }
             others = {kind: others[kind]() for kind in kinds}
             for step in recorded(ours, trajectory, steps):
@@ -115,9 +169,13 @@ def solvers(posteriors: dict, count: int) -> dict:
                     continue
                 active += bool(len(step.decision.solution.active_set))
                 for kind, controller in others.items():
-                    again = controller.control(step.belief, step.reference, step.previous)
+                    again = controller.control(
+                        step.belief, step.reference, step.previous
+                    )
                     if again.status.solved:
-                        found[kind].append(float(np.abs(again.inputs - step.decision.inputs).max()))
+                        found[kind].append(
+                            float(np.abs(again.inputs - step.decision.inputs).max())
+                        )
                     else:
                         unsolved[kind] += 1
     result = {
@@ -137,7 +195,9 @@ def solvers(posteriors: dict, count: int) -> dict:
 def long_horizon(gp, trajectory: str, l1: float | None) -> dict:
     """H = 50 with state bounds that the reference breaks, hard or at a price."""
     limits = Box(*STATE_BOUNDS[trajectory], probability=0.95, penalty=l1)
-    flown = recorded(GPMPC(gp, Linearization(), problem(limits), 50, HOVER), trajectory, 189)
+    flown = recorded(
+        GPMPC(gp, Linearization(), problem(limits), 50, HOVER), trajectory, 189
+    )
     statuses = [step.decision.status.name for step in flown]
     times = [step.decision.timing.total for step in flown]
     result = {

@@ -32,9 +32,15 @@ from gpmpc.trajectories import states_along
 HORIZON = 10
 TORCH_LIMIT = 2_000_000  # T N^2 of exact moments above which torch on the CPU is left out: minutes a flight
 MODES = {
-    "mean": {"propagator": Linearization(), "prediction": PredictionSettings(covariance="none")},
+    "mean": {
+        "propagator": Linearization(),
+        "prediction": PredictionSettings(covariance="none"),
+    },
     "linearised": {"propagator": Linearization(), "prediction": PredictionSettings()},
-    "moment-matched": {"propagator": MomentMatching(), "prediction": PredictionSettings("velocity", "full")},
+    "moment-matched": {
+        "propagator": MomentMatching(),
+        "prediction": PredictionSettings("velocity", "full"),
+    },
 }
 
 
@@ -51,14 +57,19 @@ def main() -> None:
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     results = []
-    print("trials a second (median); over alone: median of paired ratios, and its least")
-    print(f"{'':16}{'N':>5}{'T':>5}{'alone':>10}{'together':>10}{'torch':>10}{'over alone: together':>24}{'torch':>16}")
+    print(
+        "trials a second (median); over alone: median of paired ratios, and its least"
+    )
+    print(
+        f"{'':16}{'N':>5}{'T':>5}{'alone':>10}{'together':>10}{'torch':>10}{'over alone: together':>24}{'torch':>16}"
+    )
     for name in arguments.modes:
         for size in arguments.sizes:
             gp = trained("elliptical", size=size)
             for trials in arguments.trials:
                 results.append(
-                    {"mode": name, "size": size, "trials": trials} | measured(gp, MODES[name], trials, arguments)
+                    {"mode": name, "size": size, "trials": trials}
+                    | measured(gp, MODES[name], trials, arguments)
                 )
                 show(results[-1])
     meta = {"device": arguments.device, "horizon": HORIZON, "steps": arguments.steps}
@@ -67,15 +78,26 @@ def main() -> None:
     write_results(f"batched-{arguments.device.replace(':', '')}", results, **meta)
 
 
-def measured(gp: GPPosterior, mode: dict, trials: int, arguments: argparse.Namespace) -> dict:
+def measured(
+    gp: GPPosterior, mode: dict, trials: int, arguments: argparse.Namespace
+) -> dict:
     """Trials a second and ratios to those alone at one number of trials."""
-    states = states_along(TRAJECTORIES["elliptical"], np.arange(arguments.steps + HORIZON + 1.0))
-    flight = {"references": states, "initial": states[0], "steps": arguments.steps, "noise": NOISE}
+    states = states_along(
+        TRAJECTORIES["elliptical"], np.arange(arguments.steps + HORIZON + 1.0)
+    )
+    flight = {
+        "references": states,
+        "initial": states[0],
+        "steps": arguments.steps,
+        "noise": NOISE,
+    }
     here = GPMPC(gp, problem=problem(), horizon=HORIZON, initial_input=HOVER, **mode)
     there = here
     if arguments.device != "cpu":
         moved = gp.to(arguments.device)
-        there = GPMPC(moved, problem=problem(), horizon=HORIZON, initial_input=HOVER, **mode)
+        there = GPMPC(
+            moved, problem=problem(), horizon=HORIZON, initial_input=HOVER, **mode
+        )
 
     def alone() -> float:
         flown = range(min(trials, arguments.alone))
@@ -93,7 +115,9 @@ def measured(gp: GPPosterior, mode: dict, trials: int, arguments: argparse.Names
 
     ways = {"alone": alone, "together": together}
     exact = isinstance(mode["propagator"], MomentMatching)
-    if arguments.device == "cpu" and not (exact and trials * len(gp) ** 2 > TORCH_LIMIT):
+    if arguments.device == "cpu" and not (
+        exact and trials * len(gp) ** 2 > TORCH_LIMIT
+    ):
         ways["torch"] = lambda: together("torch")
     clock = time.process_time if arguments.device == "cpu" else time.perf_counter
     seconds = {name: [] for name in ways}
@@ -104,11 +128,21 @@ def measured(gp: GPPosterior, mode: dict, trials: int, arguments: argparse.Names
             if repeat:  # the first compiles, or loads
                 seconds[name].append((clock() - began) * share)
     taken = {name: np.array(values) for name, values in seconds.items()}
-    ratios = {name: taken["alone"] / values for name, values in taken.items() if name != "alone"}
+    ratios = {
+        name: taken["alone"] / values
+        for name, values in taken.items()
+        if name != "alone"
+    }
     return {
-        "trials_per_second": {name: trials / float(np.median(values)) for name, values in taken.items()},
-        "over_alone": {name: float(np.median(values)) for name, values in ratios.items()},
-        "over_alone_least": {name: float(values.min()) for name, values in ratios.items()},
+        "trials_per_second": {
+            name: trials / float(np.median(values)) for name, values in taken.items()
+        },
+        "over_alone": {
+            name: float(np.median(values)) for name, values in ratios.items()
+        },
+        "over_alone_least": {
+            name: float(values.min()) for name, values in ratios.items()
+        },
     }
 
 
@@ -118,7 +152,9 @@ def show(result: dict) -> None:
     for name in ("alone", "together", "torch"):
         row += f"{result['trials_per_second'].get(name, np.nan):10.1f}"
     for name, width in (("together", 14), ("torch", 6)):
-        middle, least = (result[key].get(name, np.nan) for key in ("over_alone", "over_alone_least"))
+        middle, least = (
+            result[key].get(name, np.nan) for key in ("over_alone", "over_alone_least")
+        )
         row += f"{middle:{width + 4}.2f} ({least:4.2f})"[: width + 12]
     print(row, flush=True)
 

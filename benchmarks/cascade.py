@@ -50,32 +50,54 @@ def main() -> None:
         outer, inner = trained(trajectory), trained(trajectory, "rotational")
         cascades = {
             "true model": Cascade(
-                NMPC(OUTER, problem(), 1, HOVER), NMPC(INNER, INNER_PROBLEM, 1, [0.0] * 3, tolerance=1e-8)
+                NMPC(OUTER, problem(), 1, HOVER),
+                NMPC(INNER, INNER_PROBLEM, 1, [0.0] * 3, tolerance=1e-8),
             ),
         }
         inner_gp = GPMPC(
-            inner, Linearization(), INNER_PROBLEM, 1, [0.0] * 3, prediction=PredictionSettings(covariance="none")
+            inner,
+            Linearization(),
+            INNER_PROBLEM,
+            1,
+            [0.0] * 3,
+            prediction=PredictionSettings(covariance="none"),
         )
         for name, gain in (("GP", 0.0), ("GP, error estimated", 1.0)):
             outer_gp = GPMPC(
-                outer, Linearization(), problem(), 1, HOVER, prediction=PredictionSettings(disturbance_gain=gain)
+                outer,
+                Linearization(),
+                problem(),
+                1,
+                HOVER,
+                prediction=PredictionSettings(disturbance_gain=gain),
             )
             cascades[name] = Cascade(outer_gp, inner_gp)
         for case in CASES:
-            flown = {name: flights(cascade, trajectory, case, arguments) for name, cascade in cascades.items()}
+            flown = {
+                name: flights(cascade, trajectory, case, arguments)
+                for name, cascade in cascades.items()
+            }
             truth = flown["true model"]["rmse"]
             ratios = {name: flight["rmse"] / truth for name, flight in flown.items()}
-            results.append({"trajectory": trajectory, "case": case, "ratios": ratios} | flown)
+            results.append(
+                {"trajectory": trajectory, "case": case, "ratios": ratios} | flown
+            )
             print(json.dumps(results[-1]), flush=True)
     write_results("cascade", results)
 
 
-def flights(cascade: Cascade, trajectory: str, case: str, arguments: argparse.Namespace) -> dict:
+def flights(
+    cascade: Cascade, trajectory: str, case: str, arguments: argparse.Namespace
+) -> dict:
     """Pooled tracking error over the seeds, lost flights, failed solves, and times of a step."""
-    references = states_along(TRAJECTORIES[trajectory], np.arange(arguments.steps + 2.0))
+    references = states_along(
+        TRAJECTORIES[trajectory], np.arange(arguments.steps + 2.0)
+    )
     start = np.concatenate([references[0], np.zeros(6)])
     squares, lost, failures, outer, inner, worst = [], 0, 0, [], [], 0.0
-    cascade_loop(PLANT, cascade, references, start, 2, on_failure="previous_plan")  # compiles and loads
+    cascade_loop(
+        PLANT, cascade, references, start, 2, on_failure="previous_plan"
+    )  # compiles and loads
     for seed in range(arguments.seeds):
         try:
             flight = cascade_loop(
@@ -86,7 +108,12 @@ def flights(cascade: Cascade, trajectory: str, case: str, arguments: argparse.Na
             print(f"lost: {error}")
             lost += 1
             continue
-        squares.append(tracking_error(flight.outer.states, flight.outer.references, (0, 2, 4)).total ** 2)
+        squares.append(
+            tracking_error(
+                flight.outer.states, flight.outer.references, (0, 2, 4)
+            ).total
+            ** 2
+        )
         away = (flight.outer.states - flight.outer.references)[:, ::2]
         worst = max(worst, float(np.linalg.norm(away, axis=1).max()))
         failures += len(flight.outer.failures) + len(flight.inner.failures)

@@ -44,7 +44,12 @@ from scipy.stats import beta, t
 from benchmarks.estimation import HORIZON, LIMIT, NOISE, pendulum, random_motion
 from benchmarks.hummingbird import compiled_hummingbird
 from benchmarks.timing import RESULTS, write_results
-from gpmpc.estimation import AdaptiveTube, ConformalTube, estimate_process_noise, estimate_varying_noise
+from gpmpc.estimation import (
+    AdaptiveTube,
+    ConformalTube,
+    estimate_process_noise,
+    estimate_varying_noise,
+)
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import Trainer, Transitions
 from gpmpc.models import Affine, ResidualModel
@@ -52,7 +57,13 @@ from gpmpc.mpc import GPMPC, Box, Problem, Reference, Tracking
 from gpmpc.propagation import Linearization
 from gpmpc.systems.gymnasium_ import gymnasium_system
 
-WAYS = ("learned noise", "estimated noise", "varying noise", "estimated noise, adaptive", "true noise")
+WAYS = (
+    "learned noise",
+    "estimated noise",
+    "varying noise",
+    "estimated noise, adaptive",
+    "true noise",
+)
 ALLOWED, ROWS, SCORES = (10.0, 5.0, 1.0), 600, 399
 RATE = 0.4  # of velocity commands, from one to the next [m/s]
 QUADROTOR = Path(__file__).parents[1] / "gpmpc" / "systems" / "quadrotor.xml"
@@ -117,9 +128,14 @@ def pendulum_plant(kind: str) -> Plant:
 
     def log() -> tuple[Array, Array, Array]:
         _, inputs = random_motion(ROWS, 0)
-        return logged(successor, np.zeros(2), inputs, noise(ROWS, np.random.default_rng(1)))
+        return logged(
+            successor, np.zeros(2), inputs, noise(ROWS, np.random.default_rng(1))
+        )
 
-    heavy, normal = (lambda eta: float(t.ppf(eta, 3) / np.sqrt(3))), NormalDist().inv_cdf
+    heavy, normal = (
+        (lambda eta: float(t.ppf(eta, 3) / np.sqrt(3))),
+        NormalDist().inv_cdf,
+    )
     return Plant(
         successor, noise, lambda: np.array([0.5, 0.0]), log, goal=[0.9, 0.0], bound=(0, 0.6),
         weights=([10.0, 0.1], [1e-2]), limits=[LIMIT], noise=NOISE, angles=[0], stages=[1],
@@ -138,7 +154,9 @@ def pendulum_of_rate() -> Plant:
 
     def log() -> tuple[Array, Array, Array]:
         inputs = 0.17 * random_motion(2 * ROWS, 0)[1]
-        return logged(successor, np.zeros(2), inputs, noise(2 * ROWS, np.random.default_rng(1)))
+        return logged(
+            successor, np.zeros(2), inputs, noise(2 * ROWS, np.random.default_rng(1))
+        )
 
     return Plant(
         successor, noise, lambda: np.zeros(2), log, goal=[0.9, 0.0], bound=(1, 2.5), sides=(1, -1), turn=20,
@@ -149,7 +167,10 @@ def pendulum_of_rate() -> Plant:
 
 def cart_pole() -> Plant:
     """Gymnasium's cart with a pole, learned from single steps all over its region."""
-    environment, scale = gymnasium_system("InvertedPendulum-v5").dynamics, np.array([1e-3, 1e-3, 0.01, 0.01])
+    environment, scale = (
+        gymnasium_system("InvertedPendulum-v5").dynamics,
+        np.array([1e-3, 1e-3, 0.01, 0.01]),
+    )
     environment.reset(0)
 
     def successor(x: Array, u: Array, w: Array) -> Array:
@@ -162,7 +183,10 @@ def cart_pole() -> Plant:
         rng = np.random.default_rng(1)
         states = rng.uniform(-1, 1, (ROWS, 4)) * [0.8, 0.3, 1.5, 2.0]
         inputs = rng.uniform(-1, 1, (ROWS, 1))
-        after = [successor(x, u, w) for x, u, w in zip(states, inputs, noise(ROWS, rng), strict=True)]
+        after = [
+            successor(x, u, w)
+            for x, u, w in zip(states, inputs, noise(ROWS, rng), strict=True)
+        ]
         return states, inputs, np.array(after)
 
     return Plant(
@@ -172,7 +196,9 @@ def cart_pole() -> Plant:
     )  # fmt: skip
 
 
-def climbing(begin: Callable[[], Array], move: Callable[[Array, Array], Array]) -> Plant:
+def climbing(
+    begin: Callable[[], Array], move: Callable[[Array, Array], Array]
+) -> Plant:
     """A quadrotor's velocities, steered by velocity commands at 5 Hz, in a changing wind."""
 
     def wind(steps: int, rng: np.random.Generator) -> Array:
@@ -201,7 +227,9 @@ def mujoco_quadrotor() -> Plant:
 
     model = mujoco.MjModel.from_xml_path(str(QUADROTOR))
     data, lever = mujoco.MjData(model), 0.12
-    signs = np.array([[1, 1, 1, 1], [1, -1, -1, 1], [-1, -1, 1, 1], [-1, 1, -1, 1]])  # of thrust, roll, pitch, yaw
+    signs = np.array(
+        [[1, 1, 1, 1], [1, -1, -1, 1], [-1, -1, 1, 1], [-1, 1, -1, 1]]
+    )  # of thrust, roll, pitch, yaw
     mixer = np.linalg.inv(signs * np.array([1, lever, lever, 0.016])[:, None])
 
     def state() -> Array:
@@ -215,13 +243,24 @@ def mujoco_quadrotor() -> Plant:
 
     def move(command: Array, wind: Array) -> Array:
         for _ in range(40):
-            attitude, rate = Rotation.from_quat(data.sensordata[[4, 5, 6, 3]]), data.sensordata[10:13]
+            attitude, rate = (
+                Rotation.from_quat(data.sensordata[[4, 5, 6, 3]]),
+                data.sensordata[10:13],
+            )
             force = 0.5 * (4.0 * (command - data.sensordata[7:10]) + [0, 0, 9.81])
             up = force / np.linalg.norm(force)
-            error = np.cross(attitude.inv().apply(up), [0, 0, 1]) * -1.0 - [0, 0, 0.2 * attitude.as_rotvec()[2]]
+            error = np.cross(attitude.inv().apply(up), [0, 0, 1]) * -1.0 - [
+                0,
+                0,
+                0.2 * attitude.as_rotvec()[2],
+            ]
             torque = np.array([0.0032, 0.0032, 0.0055]) * (150.0 * error - 20.0 * rate)
-            data.ctrl[:] = np.clip(mixer @ np.r_[force @ attitude.apply([0, 0, 1]), torque], 0, 3)
-            data.qfrc_applied[:3] = model.dof_damping[:3] * wind  # linear drag acts on the air's velocity
+            data.ctrl[:] = np.clip(
+                mixer @ np.r_[force @ attitude.apply([0, 0, 1]), torque], 0, 3
+            )
+            data.qfrc_applied[:3] = (
+                model.dof_damping[:3] * wind
+            )  # linear drag acts on the air's velocity
             mujoco.mj_step(model, data)
         return state()
 
@@ -263,7 +302,9 @@ def correlated(steps: int, rng: np.random.Generator, rho: float, scale: Array) -
     return noise
 
 
-def logged(successor: Callable, x: Array, inputs: Array, disturbances: Array) -> tuple[Array, Array, Array]:
+def logged(
+    successor: Callable, x: Array, inputs: Array, disturbances: Array
+) -> tuple[Array, Array, Array]:
     """States, inputs and next states of one run."""
     states = [x]
     for u, w in zip(inputs, disturbances, strict=True):
@@ -282,35 +323,72 @@ class Flights:
     errors: Array  # of the predictions of the next bounded state, in their standard deviations (T,)
 
 
-def fly(plant: Plant, model: ResidualModel, eta: float, quantile: float | None, steps: int, seeds: int) -> Flights:
+def fly(
+    plant: Plant,
+    model: ResidualModel,
+    eta: float,
+    quantile: float | None,
+    steps: int,
+    seeds: int,
+) -> Flights:
     """Flies with a fixed quantile, or with an adaptive tube."""
     i, upper = plant.bound
     n, m = model.state_dim, model.input_dim
     top, sides = np.where(np.arange(n) == i, upper, np.inf), np.array(plant.sides)
-    box = Box(-top if -1 in sides else [-np.inf] * n, top, probability=eta, stages=plant.stages)
+    box = Box(
+        -top if -1 in sides else [-np.inf] * n,
+        top,
+        probability=eta,
+        stages=plant.stages,
+    )
     cost = Tracking(*plant.weights, penalized="increments")
     problem = Problem(
-        cost, Box([-u for u in plant.limits], list(plant.limits)), Box([-plant.rate] * m, [plant.rate] * m), [box]
+        cost,
+        Box([-u for u in plant.limits], list(plant.limits)),
+        Box([-plant.rate] * m, [plant.rate] * m),
+        [box],
     )
-    controller = GPMPC(model, Linearization(process_noise=True), problem, HORIZON, [0.0] * m)
+    controller = GPMPC(
+        model, Linearization(process_noise=True), problem, HORIZON, [0.0] * m
+    )
     tube, rows = None, sides[:, None] * np.eye(n)[i]
     if quantile is None:
-        quantiles = [NormalDist().inv_cdf((j + 1) / (SCORES + 1)) for j in range(SCORES)]
-        scores, decisions = np.tile(quantiles, (HORIZON, 1)).T, int(plant.share * steps * seeds)
-        tube = AdaptiveTube(ConformalTube(scores, rows), eta, plant.adaptation, decisions=decisions)
+        quantiles = [
+            NormalDist().inv_cdf((j + 1) / (SCORES + 1)) for j in range(SCORES)
+        ]
+        scores, decisions = (
+            np.tile(quantiles, (HORIZON, 1)).T,
+            int(plant.share * steps * seeds),
+        )
+        tube = AdaptiveTube(
+            ConformalTube(scores, rows), eta, plant.adaptation, decisions=decisions
+        )
     goal, Q = np.array(plant.goal), np.array(plant.weights[0])
     violations, distances, costs, errors = 0, [], [0.0] * seeds, []
     for seed in range(seeds):
         x, last = plant.begin(), None
-        for _ in range(HORIZON * (tube is not None)):  # no plan of the flight before is compared with this one
+        for _ in range(
+            HORIZON * (tube is not None)
+        ):  # no plan of the flight before is compared with this one
             tube.observe(np.full(n, np.nan))
-        for k, w in enumerate(plant.disturbances(steps + 50, np.random.default_rng(seed))):
+        for k, w in enumerate(
+            plant.disturbances(steps + 50, np.random.default_rng(seed))
+        ):
             ahead = np.arange(k, k + HORIZON + 1)[:, None]
-            target = goal * (-1.0) ** (0 * ahead if plant.turn is None else ahead // plant.turn)
-            kappas = np.full(HORIZON, quantile) if tube is None else tube.observe(x).copy()
-            last = controller.control(Gaussian.certain(x), Reference(target, kappas=kappas), last)
+            target = goal * (-1.0) ** (
+                0 * ahead if plant.turn is None else ahead // plant.turn
+            )
+            kappas = (
+                np.full(HORIZON, quantile) if tube is None else tube.observe(x).copy()
+            )
+            last = controller.control(
+                Gaussian.certain(x), Reference(target, kappas=kappas), last
+            )
             deviations = np.sqrt(last.covariances[1:, i, i])
-            touches = sides * last.means[1:, [i]] >= upper - (kappas * deviations)[:, None] - 1e-5
+            touches = (
+                sides * last.means[1:, [i]]
+                >= upper - (kappas * deviations)[:, None] - 1e-5
+            )
             if tube is not None:
                 tube.remember(last.means, last.covariances, touches)
             x = plant.successor(x, last.input, w)
@@ -321,7 +399,9 @@ def fly(plant: Plant, model: ResidualModel, eta: float, quantile: float | None, 
             if touches[0].any():
                 distances.append(upper - max(sides[touches[0]] * x[i]))
                 violations += int(distances[-1] < 0)
-    return Flights(violations, len(distances), float(np.mean(distances)), costs, np.array(errors))
+    return Flights(
+        violations, len(distances), float(np.mean(distances)), costs, np.array(errors)
+    )
 
 
 def main() -> None:
@@ -329,40 +409,82 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--plants", nargs="+", default=list(PLANTS), choices=PLANTS)
     parser.add_argument("--ways", nargs="+", default=list(WAYS), choices=WAYS)
-    parser.add_argument("--allowed", nargs="+", type=float, default=ALLOWED, help="[%%]")
+    parser.add_argument(
+        "--allowed", nargs="+", type=float, default=ALLOWED, help="[%%]"
+    )
     parser.add_argument("--seeds", type=int, default=20)
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     path = RESULTS / "chance_constraints.json"
     results = json.loads(path.read_text())["results"] if path.exists() else []
-    print(f"{'plant':23}{'way':26}" + "".join(f"{w:>9}" for w in ("allowed", "%", "limit", "10^-3", "cost", "active")))
+    print(
+        f"{'plant':23}{'way':26}"
+        + "".join(
+            f"{w:>9}" for w in ("allowed", "%", "limit", "10^-3", "cost", "active")
+        )
+    )
     for name in arguments.plants:
         plant = PLANTS[name]()
         rows = Transitions(*plant.log())
-        picked = rows[sorted(np.random.default_rng(0).permutation(len(rows))[:200].tolist())]
+        picked = rows[
+            sorted(np.random.default_rng(0).permutation(len(rows))[:200].tolist())
+        ]
         nominal = Affine.identity(rows.state_dim, rows.input_dim)
-        learned = ResidualModel.train(nominal, picked, angles=plant.angles, trainer=Trainer(restarts=1))
-        estimated = replace(learned, noise=torch.diag(estimate_process_noise(learned, rows).variance))
-        varying = estimate_varying_noise(learned, rows).model if "varying noise" in arguments.ways else estimated
+        learned = ResidualModel.train(
+            nominal, picked, angles=plant.angles, trainer=Trainer(restarts=1)
+        )
+        estimated = replace(
+            learned, noise=torch.diag(estimate_process_noise(learned, rows).variance)
+        )
+        varying = (
+            estimate_varying_noise(learned, rows).model
+            if "varying noise" in arguments.ways
+            else estimated
+        )
         for way, allowed in itertools.product(arguments.ways, arguments.allowed):
             eta = 1 - allowed / 100
             quantile = None if "adaptive" in way else NormalDist().inv_cdf(eta)
-            model = {"learned noise": learned, "varying noise": varying}.get(way, estimated)
-            if way == "true noise" and plant.noise is not None and plant.quantile is not None:
+            model = {"learned noise": learned, "varying noise": varying}.get(
+                way, estimated
+            )
+            if (
+                way == "true noise"
+                and plant.noise is not None
+                and plant.quantile is not None
+            ):
                 model = replace(learned, noise=torch.diag(torch.tensor(plant.noise**2)))
                 quantile = plant.quantile(eta)
             elif way == "true noise":  # of flights with other disturbances
-                other = replace(plant, disturbances=lambda T, rng, p=plant: p.disturbances(T, rng.spawn(1)[0]))
-                quantile = float(np.quantile(fly(other, model, eta, quantile, plant.steps, 4).errors, eta))
+                other = replace(
+                    plant,
+                    disturbances=lambda T, rng, p=plant: p.disturbances(
+                        T, rng.spawn(1)[0]
+                    ),
+                )
+                quantile = float(
+                    np.quantile(
+                        fly(other, model, eta, quantile, plant.steps, 4).errors, eta
+                    )
+                )
             found = fly(plant, model, eta, quantile, plant.steps, arguments.seeds)
             bad, active = found.violations, found.active
-            limit = float(beta.ppf(0.95, bad + 1, active - bad)) if bad < active else 1.0
+            limit = (
+                float(beta.ppf(0.95, bad + 1, active - bad)) if bad < active else 1.0
+            )
             cell = {"plant": name, "way": way, "eta": eta, "seeds": arguments.seeds}
             numbers = {"violations": bad, "active": active, "upper_limit": limit}
-            numbers |= {"distance": found.distance, "cost": float(np.mean(found.costs)), "costs": found.costs}
-            results = [row for row in results if row.items() & cell.items() != cell.items()] + [cell | numbers]
+            numbers |= {
+                "distance": found.distance,
+                "cost": float(np.mean(found.costs)),
+                "costs": found.costs,
+            }
+            results = [
+                row for row in results if row.items() & cell.items() != cell.items()
+            ] + [cell | numbers]
             text = f"{allowed:9g}{100 * bad / max(active, 1):9.2f}{100 * limit:9.2f}{1e3 * found.distance:9.2f}"
-            print(f"{name:23}{way:26}{text}{numbers['cost']:9.4f}{active:9}", flush=True)
+            print(
+                f"{name:23}{way:26}{text}{numbers['cost']:9.4f}{active:9}", flush=True
+            )
             write_results("chance_constraints", results)
 
 

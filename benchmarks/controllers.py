@@ -35,9 +35,20 @@ STD = 0.01  # [m, m/s] of the belief: the full covariance is differentiated, as 
 def main() -> None:
     """Measures and prints."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--steps", type=int, default=14, help="of the rivals; ten times as many of the convex ones")
+    parser.add_argument(
+        "--steps",
+        type=int,
+        default=14,
+        help="of the rivals; ten times as many of the convex ones",
+    )
     parser.add_argument("--horizons", type=int, nargs="+", default=[1, 10, 20, 50])
-    parser.add_argument("--rivals", type=int, nargs="*", default=[1, 10], help="horizons at which they fly as well")
+    parser.add_argument(
+        "--rivals",
+        type=int,
+        nargs="*",
+        default=[1, 10],
+        help="horizons at which they fly as well",
+    )
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     results = []
@@ -45,9 +56,13 @@ def main() -> None:
         gp = trained(trajectory)
         for horizon in arguments.horizons:
             convex, rivals = ways(gp, horizon)
-            results.append(measured(gp, convex, trajectory, horizon, 10 * arguments.steps))
+            results.append(
+                measured(gp, convex, trajectory, horizon, 10 * arguments.steps)
+            )
             if horizon in arguments.rivals:
-                results.append(measured(gp, rivals, trajectory, horizon, arguments.steps))
+                results.append(
+                    measured(gp, rivals, trajectory, horizon, arguments.steps)
+                )
     write_results("controllers", results)
 
 
@@ -58,15 +73,27 @@ def ways(gp: GPPosterior, horizon: int) -> list[dict]:
     """
     exact, asked = MomentMatching(), (problem(), horizon, HOVER)
     paper = {
-        "paper's form": GPMPC(gp, exact, *asked, prediction=PredictionSettings(form="velocity", covariance="full"))
+        "paper's form": GPMPC(
+            gp,
+            exact,
+            *asked,
+            prediction=PredictionSettings(form="velocity", covariance="full"),
+        )
     }
     convex = {
         "trajectory, linearised": GPMPC(gp, Linearization(), *asked),
-        "trajectory, mean": GPMPC(gp, Linearization(), *asked, prediction=PredictionSettings(covariance="none")),
+        "trajectory, mean": GPMPC(
+            gp,
+            Linearization(),
+            *asked,
+            prediction=PredictionSettings(covariance="none"),
+        ),
     }
     rivals = {}
     for start in ("", COLD):
-        rivals[f"nonlinear, sqp{start}"] = NonlinearGPMPC(gp, exact, *asked, iterations=300, tolerance=1e-6)
+        rivals[f"nonlinear, sqp{start}"] = NonlinearGPMPC(
+            gp, exact, *asked, iterations=300, tolerance=1e-6
+        )
         rivals[f"nonlinear, slsqp{start}"] = SLSQP(gp, exact, *asked, tolerance=1e-6)
     rivals[f"nonlinear, plain slsqp{COLD}"] = PlainSLSQP(gp, exact, *asked)
     return [paper | convex, paper | rivals]
@@ -78,7 +105,9 @@ class PlainSLSQP(SLSQP):
     def control(self, belief, reference, previous=None) -> Decision:
         """From hover, until the cost changes by less than a millionth of that of hovering."""
         began = time.perf_counter()
-        request = Request.read(self.problem, self.horizon, self.initial_input, belief, reference, previous)
+        request = Request.read(
+            self.problem, self.horizon, self.initial_input, belief, reference, previous
+        )
         memory = [self.evaluate(np.tile(HOVER, self.horizon), request)]
         start, cost = memory[0].plan, memory[0].cost
 
@@ -87,31 +116,54 @@ class PlainSLSQP(SLSQP):
                 memory[0] = self.evaluate(plan, request)
             return memory[0]
 
-        box = list(zip(self.problem.inputs.lower, self.problem.inputs.upper, strict=True)) * self.horizon
+        box = (
+            list(zip(self.problem.inputs.lower, self.problem.inputs.upper, strict=True))
+            * self.horizon
+        )
         options = {"ftol": 1e-6 * cost, "maxiter": 300}
         gradient = {"jac": lambda U: at(U).gradient, "bounds": box, "options": options}
         result = minimize(lambda U: at(U).cost, start, method="SLSQP", **gradient)
-        found, status = at(result.x), Status.SOLVED if result.success else Status.ITERATION_LIMIT
-        inputs, spent = result.x.reshape(self.horizon, -1), Timing(0.0, 0.0, time.perf_counter() - began)
-        return Decision(inputs[0], inputs, found.means, found.covariances, status, result.nit, spent)
+        found, status = (
+            at(result.x),
+            Status.SOLVED if result.success else Status.ITERATION_LIMIT,
+        )
+        inputs, spent = (
+            result.x.reshape(self.horizon, -1),
+            Timing(0.0, 0.0, time.perf_counter() - began),
+        )
+        return Decision(
+            inputs[0], inputs, found.means, found.covariances, status, result.nit, spent
+        )
 
 
-def measured(gp: GPPosterior, controllers: dict, trajectory: str, horizon: int, steps: int) -> dict:
+def measured(
+    gp: GPPosterior, controllers: dict, trajectory: str, horizon: int, steps: int
+) -> dict:
     """Median times [ms] and ratios of some controllers at one horizon."""
-    flown: list[Asked] = recorded(GPMPC(gp, Linearization(), problem(), horizon, HOVER), trajectory, steps, STD)
+    flown: list[Asked] = recorded(
+        GPMPC(gp, Linearization(), problem(), horizon, HOVER), trajectory, steps, STD
+    )
     exact = MomentMatching()
     taken = {name: [] for name in ["jacobian", *controllers]}
     unsolved, last = dict.fromkeys(controllers, 0), dict.fromkeys(controllers)
     for count, step in enumerate(flown):
         input = torch.tensor(step.decision.input)
-        spent = {"jacobian": _time(lambda s=step, u=input: differentiate(exact, gp, s.belief, u))[0]}
+        spent = {
+            "jacobian": _time(
+                lambda s=step, u=input: differentiate(exact, gp, s.belief, u)
+            )[0]
+        }
         for name, controller in controllers.items():
             before = last[name]
             if before is not None and name.endswith(COLD):
                 before = replace(
                     before, status=Status.ITERATION_LIMIT
                 )  # its input is known, its plan is not to be used
-            spent[name], decision = _time(lambda c=controller, s=step, p=before: c.control(s.belief, s.reference, p))
+            spent[name], decision = _time(
+                lambda c=controller, s=step, p=before: c.control(
+                    s.belief, s.reference, p
+                )
+            )
             unsolved[name] += not decision.status.solved
             last[name] = decision
         if count >= 2:  # what is compiled or loaded at a first call is left out
@@ -124,15 +176,28 @@ def measured(gp: GPPosterior, controllers: dict, trajectory: str, horizon: int, 
         "horizon": horizon,
         "steps": len(ours),
         "ms_median": {name: 1e3 * float(np.median(t)) for name, t in times.items()},
-        "ms_p95": {name: 1e3 * float(np.quantile(t, 0.95)) for name, t in times.items()},
-        "over_jacobian": {name: float(np.median(t / times["jacobian"])) for name, t in times.items()},
-        "over_papers_form": {name: float(np.median(t / ours)) for name, t in times.items()},
+        "ms_p95": {
+            name: 1e3 * float(np.quantile(t, 0.95)) for name, t in times.items()
+        },
+        "over_jacobian": {
+            name: float(np.median(t / times["jacobian"])) for name, t in times.items()
+        },
+        "over_papers_form": {
+            name: float(np.median(t / ours)) for name, t in times.items()
+        },
         "unsolved": unsolved,
     }
     print(f"{trajectory}, H = {horizon} ({len(ours)} steps)")
     for name in times:
-        row = [result[key][name] for key in ("ms_median", "ms_p95", "over_jacobian", "over_papers_form")]
-        print(f"  {name:24}" + "".join(f"{value:10.3f}" for value in row), unsolved.get(name, ""), flush=True)
+        row = [
+            result[key][name]
+            for key in ("ms_median", "ms_p95", "over_jacobian", "over_papers_form")
+        ]
+        print(
+            f"  {name:24}" + "".join(f"{value:10.3f}" for value in row),
+            unsolved.get(name, ""),
+            flush=True,
+        )
     return result
 
 

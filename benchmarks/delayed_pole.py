@@ -48,29 +48,48 @@ def learned(steps: int = 600) -> ResidualModel:
             seed += 1
             after = pole.reset(seed)
         state = after
-    picked = [rows[i] for i in sorted(np.random.default_rng(0).permutation(steps)[:200])]
+    picked = [
+        rows[i] for i in sorted(np.random.default_rng(0).permutation(steps)[:200])
+    ]
     data = Transitions(*map(np.array, zip(*picked, strict=True)))
-    return ResidualModel.train(Affine.identity(4, 1), data, angles=[1], trainer=Trainer(restarts=1))
+    return ResidualModel.train(
+        Affine.identity(4, 1), data, angles=[1], trainer=Trainer(restarts=1)
+    )
 
 
-def fly(model: Any, delay: int, believed: int, moved: bool, seed: int, steps: int) -> Array | None:
+def fly(
+    model: Any, delay: int, believed: int, moved: bool, seed: int, steps: int
+) -> Array | None:
     """Errors of cart and pole (steps, 2) of one episode; None where it is lost."""
     delayed = DelayedModel(model, believed) if believed else None
     planned = model if delayed is None else delayed
     weights = np.zeros(planned.state_dim)
     weights[:4] = 1.0, 3.0, 0.3, 0.3
-    problem = Problem(Tracking(weights.tolist(), [20.0]), Box(*(limit.tolist() for limit in pole.limits)))
-    controller = GPMPC(planned, Linearization(), problem, HORIZON, [0.0], PredictionSettings())
-    reference, errors, decision = np.zeros((steps + HORIZON + 1, planned.state_dim)), [], None
+    problem = Problem(
+        Tracking(weights.tolist(), [20.0]),
+        Box(*(limit.tolist() for limit in pole.limits)),
+    )
+    controller = GPMPC(
+        planned, Linearization(), problem, HORIZON, [0.0], PredictionSettings()
+    )
+    reference, errors, decision = (
+        np.zeros((steps + HORIZON + 1, planned.state_dim)),
+        [],
+        None,
+    )
     if moved:
         reference[:, 0] = np.where(np.arange(len(reference)) // TURN % 2, -SIDE, SIDE)
     state = pole.reset(seed)
-    acting, on_their_way = (deque([np.zeros(1)] * count, count) for count in (delay, believed))
+    acting, on_their_way = (
+        deque([np.zeros(1)] * count, count) for count in (delay, believed)
+    )
     for k in range(steps):
         belief = Gaussian.certain(state)
         if delayed is not None:
             belief = delayed.augmented(belief, np.array(on_their_way))
-        decision = controller.control(belief, Reference(reference[k : k + HORIZON + 1]), decision)
+        decision = controller.control(
+            belief, Reference(reference[k : k + HORIZON + 1]), decision
+        )
         state = pole.successor(state, acting[0] if delay else decision.input)
         acting.append(decision.input)
         on_their_way.append(decision.input)
@@ -88,18 +107,48 @@ def main() -> None:
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     model, results = learned(), []
-    print(f"{'':38}{'cart [m]':>10}{'ratio':>7}{'pole [rad]':>12}{'ratio':>7}{'lost':>6}")
+    print(
+        f"{'':38}{'cart [m]':>10}{'ratio':>7}{'pole [rad]':>12}{'ratio':>7}{'lost':>6}"
+    )
     for task, moved in (("from side to side", True), ("standing", False)):
         against = np.full(2, np.nan)
         for name, (delay, believed) in LOOPS.items():
-            flown = [fly(model, delay, believed, moved, seed, arguments.steps) for seed in range(arguments.seeds)]
-            kept = [errors if moved else errors[SECOND:] for errors in flown if errors is not None]
-            rmse = np.sqrt(np.mean(np.concatenate(kept) ** 2, axis=0)) if kept else np.full(2, np.nan)
+            flown = [
+                fly(model, delay, believed, moved, seed, arguments.steps)
+                for seed in range(arguments.seeds)
+            ]
+            kept = [
+                errors if moved else errors[SECOND:]
+                for errors in flown
+                if errors is not None
+            ]
+            rmse = (
+                np.sqrt(np.mean(np.concatenate(kept) ** 2, axis=0))
+                if kept
+                else np.full(2, np.nan)
+            )
             against = rmse if name == "no delay" else against
-            (cart, angle), (one, other), lost = rmse, rmse / against, len(flown) - len(kept)
-            print(f"{task + ', ' + name:38}{cart:10.4f}{one:7.2f}{angle:12.5f}{other:7.2f}{lost:6}", flush=True)
-            row = {"task": task, "loop": name, "cart": cart, "pole": angle, "cart_ratio": one, "pole_ratio": other}
-            results.append({key: v if isinstance(v, str) else float(v) for key, v in row.items()} | {"lost": lost})
+            (cart, angle), (one, other), lost = (
+                rmse,
+                rmse / against,
+                len(flown) - len(kept),
+            )
+            print(
+                f"{task + ', ' + name:38}{cart:10.4f}{one:7.2f}{angle:12.5f}{other:7.2f}{lost:6}",
+                flush=True,
+            )
+            row = {
+                "task": task,
+                "loop": name,
+                "cart": cart,
+                "pole": angle,
+                "cart_ratio": one,
+                "pole_ratio": other,
+            }
+            results.append(
+                {key: v if isinstance(v, str) else float(v) for key, v in row.items()}
+                | {"lost": lost}
+            )
     write_results("delayed_pole", results)
 
 

@@ -30,7 +30,11 @@ from gpmpc.mpc.problem import Tracking
 from gpmpc.propagation import Linearization
 
 GAINS, CHANGES, STATES = (0.0, 0.3, 1.0), (0.01, 0.1), 6
-SENSORS = {"process 0.01": 1e-3, "measured 0.01": 0.01, "measured 0.03": 0.03}  # what the filter is told
+SENSORS = {
+    "process 0.01": 1e-3,
+    "measured 0.01": 0.01,
+    "measured 0.03": 0.03,
+}  # what the filter is told
 CONSTANTS = 1.0  # prior standard deviation
 
 
@@ -48,28 +52,49 @@ class FilteredControl:
         self.model, self.sensor = DisturbedModel(model, eye, [change] * n), sensor
         self.problem, self.horizon = problem(), HORIZON
         cost = Tracking([1] * n + [0] * n, [1] * 3)
-        self.inner = GPMPC(self.model, Linearization(), replace(self.problem, cost=cost), HORIZON, HOVER)
+        self.inner = GPMPC(
+            self.model,
+            Linearization(),
+            replace(self.problem, cost=cost),
+            HORIZON,
+            HOVER,
+        )
         self.initial_input = self.inner.initial_input
-        self.filter = KalmanFilter.extended(self.model, Measurement.of_states(2 * n, range(n), [sensor] * n))
+        self.filter = KalmanFilter.extended(
+            self.model, Measurement.of_states(2 * n, range(n), [sensor] * n)
+        )
         self.seconds: list[tuple[float, float]] = []
         self._belief, self._last = None, None
 
-    def control(self, belief: Gaussian, reference: Reference, previous: Decision | None = None) -> Decision:
+    def control(
+        self, belief: Gaussian, reference: Reference, previous: Decision | None = None
+    ) -> Decision:
         """Estimates, and decides; a flight begins where there is no previous decision."""
         begin = perf_counter()
         if previous is None or self._belief is None:
             covariance = self.sensor**2 * torch.eye(STATES, dtype=torch.float64)
-            self._belief, last = self.model.augmented(Gaussian(belief.mean, covariance), [CONSTANTS] * STATES), None
+            self._belief, last = (
+                self.model.augmented(
+                    Gaussian(belief.mean, covariance), [CONSTANTS] * STATES
+                ),
+                None,
+            )
         else:
             moved = self.filter.predict(self._belief, previous.input)
             self._belief = self.filter.update(moved, belief.mean).belief
             last = replace(self._last, input=previous.input)
         estimated = perf_counter()
-        wide = Reference(np.hstack([reference.states, np.zeros_like(reference.states)]), reference.inputs)
+        wide = Reference(
+            np.hstack([reference.states, np.zeros_like(reference.states)]),
+            reference.inputs,
+        )
         found = self._last = self.inner.control(self._belief, wide, last)
         self.seconds.append((estimated - begin, perf_counter() - estimated))
         return replace(
-            found, means=found.means[:, :STATES], covariances=found.covariances[:, :STATES, :STATES], disturbance=None
+            found,
+            means=found.means[:, :STATES],
+            covariances=found.covariances[:, :STATES, :STATES],
+            disturbance=None,
         )
 
 
@@ -91,17 +116,45 @@ def main() -> None:
                 for noise in NOISES:
                     if isinstance(way, float):
                         prediction = PredictionSettings(disturbance_gain=way)
-                        controller = GPMPC(model, Linearization(), problem(), HORIZON, HOVER, prediction)
+                        controller = GPMPC(
+                            model,
+                            Linearization(),
+                            problem(),
+                            HORIZON,
+                            HOVER,
+                            prediction,
+                        )
                     else:
-                        controller = FilteredControl(model, float(way.partition(", ")[2]), SENSORS[noise])
-                    row.append(pooled(flights(controller, trajectory, mass, noise, arguments)))
+                        controller = FilteredControl(
+                            model, float(way.partition(", ")[2]), SENSORS[noise]
+                        )
+                    row.append(
+                        pooled(flights(controller, trajectory, mass, noise, arguments))
+                    )
                     times += getattr(controller, "seconds", [])
                     results.append(
-                        {"trajectory": trajectory, "way": way, "mass": mass, "noise": noise, "rmse": row[-1]}
+                        {
+                            "trajectory": trajectory,
+                            "way": way,
+                            "mass": mass,
+                            "noise": noise,
+                            "rmse": row[-1],
+                        }
                     )
             name = f"L = {way}" if isinstance(way, float) else way
-            spent = " filter {:.2f}, control {:.2f} ms".format(*1e3 * np.median(times, axis=0)) if times else ""
-            print(f"{trajectory:12}{name:20}" + "".join(f"{rmse:14.4f}" for rmse in row) + spent, flush=True)
+            spent = (
+                " filter {:.2f}, control {:.2f} ms".format(
+                    *1e3 * np.median(times, axis=0)
+                )
+                if times
+                else ""
+            )
+            print(
+                f"{trajectory:12}{name:20}"
+                + "".join(f"{rmse:14.4f}" for rmse in row)
+                + spent,
+                flush=True,
+            )
     write_results("disturbance_states", results)
 
 

@@ -58,38 +58,67 @@ def pendulum(x: Array, u: Array, substeps: int = 5) -> Array:
 class Exact:
     """The pendulum itself as a model: what a controller could know at most."""
 
-    state_dim, input_dim, output_dim, dtype, device = 2, 1, 2, torch.float64, torch.device("cpu")
+    state_dim, input_dim, output_dim, dtype, device = (
+        2,
+        1,
+        2,
+        torch.float64,
+        torch.device("cpu"),
+    )
     noise_covariance = torch.diag(torch.from_numpy(NOISE**2))
 
     def predict(self, state: torch.Tensor, input: torch.Tensor) -> Gaussian:
         """The next state, which is certain."""
         moved = pendulum_many(state.numpy(), input.numpy())[0]
-        return Gaussian(torch.from_numpy(moved), torch.zeros(*state.shape, 2, dtype=torch.float64))
+        return Gaussian(
+            torch.from_numpy(moved), torch.zeros(*state.shape, 2, dtype=torch.float64)
+        )
 
-    def linearize(self, states: Array, inputs: Array, covariance: bool = True) -> Linearized:
+    def linearize(
+        self, states: Array, inputs: Array, covariance: bool = True
+    ) -> Linearized:
         """Next states and their derivatives."""
         mean, A, B = pendulum_many(states, inputs)
-        return Linearized(mean, A, B, np.zeros((len(states), 2, 2)) if covariance else None)
+        return Linearized(
+            mean, A, B, np.zeros((len(states), 2, 2)) if covariance else None
+        )
 
 
-def pendulum_many(states: Array, inputs: Array, substeps: int = 5) -> tuple[Array, Array, Array]:
+def pendulum_many(
+    states: Array, inputs: Array, substeps: int = 5
+) -> tuple[Array, Array, Array]:
     """``pendulum`` for states (*batch, 2), with derivatives by state and input."""
     h = STEP / substeps
-    slope = np.zeros((*states.shape[:-1], 2, 3))  # of angle and rate by both and the torque
+    slope = np.zeros(
+        (*states.shape[:-1], 2, 3)
+    )  # of angle and rate by both and the torque
     slope[..., 0, 0] = slope[..., 1, 1] = 1.0
     angle, rate = states[..., 0], states[..., 1]
     for _ in range(substeps):
-        pull = -9.81 * np.cos(angle)[..., None] * slope[..., 0, :] - 0.1 * slope[..., 1, :] + np.array([0.0, 0.0, 1.0])
+        pull = (
+            -9.81 * np.cos(angle)[..., None] * slope[..., 0, :]
+            - 0.1 * slope[..., 1, :]
+            + np.array([0.0, 0.0, 1.0])
+        )
         rate = rate + h * (-9.81 * np.sin(angle) - 0.1 * rate + inputs[..., 0])
         slope[..., 1, :] += h * pull
-        angle, slope[..., 0, :] = angle + h * rate, slope[..., 0, :] + h * slope[..., 1, :]
-    return np.stack([angle, rate], axis=-1), slope[..., :2].copy(), slope[..., 2:].copy()
+        angle, slope[..., 0, :] = (
+            angle + h * rate,
+            slope[..., 0, :] + h * slope[..., 1, :],
+        )
+    return (
+        np.stack([angle, rate], axis=-1),
+        slope[..., :2].copy(),
+        slope[..., 2:].copy(),
+    )
 
 
 def random_motion(steps: int, delay: int, seed: int = 0) -> tuple[Array, Array]:
     """A log (steps + 1, 2), (steps, 1) with torques that change every fourth step."""
     rng = np.random.default_rng(seed)
-    inputs = np.repeat(rng.uniform(-LIMIT, LIMIT, (steps // 4 + 1, 1)), 4, axis=0)[:steps]
+    inputs = np.repeat(rng.uniform(-LIMIT, LIMIT, (steps // 4 + 1, 1)), 4, axis=0)[
+        :steps
+    ]
     states = [np.zeros(2)]
     for k in range(steps):
         moved = pendulum(states[-1], inputs[k - delay] if k >= delay else np.zeros(1))
@@ -99,12 +128,28 @@ def random_motion(steps: int, delay: int, seed: int = 0) -> tuple[Array, Array]:
 
 def learned(states: Array, inputs: Array, delay: int) -> ResidualModel:
     """A model of the undelayed pendulum, from a log whose inputs act late, with the noise of all rows."""
-    rows = Transitions(states[delay:-1], inputs[: len(inputs) - delay], states[delay + 1 :])
-    picked = rows[sorted(np.random.default_rng(0).permutation(len(rows))[:200].tolist())]
-    model = ResidualModel.train(Affine.identity(2, 1), picked, angles=[0], trainer=Trainer(restarts=1))
+    rows = Transitions(
+        states[delay:-1], inputs[: len(inputs) - delay], states[delay + 1 :]
+    )
+    picked = rows[
+        sorted(np.random.default_rng(0).permutation(len(rows))[:200].tolist())
+    ]
+    model = ResidualModel.train(
+        Affine.identity(2, 1), picked, angles=[0], trainer=Trainer(restarts=1)
+    )
     noise = estimate_process_noise(model, rows)
-    print(f"noise of a step {noise.variance.sqrt().tolist()} (true {NOISE.tolist()}), correlation {noise.correlation}")
-    parts = model.nominal, model.residual, model.B, model.states, model.inputs, model.input_dim, model.angles
+    print(
+        f"noise of a step {noise.variance.sqrt().tolist()} (true {NOISE.tolist()}), correlation {noise.correlation}"
+    )
+    parts = (
+        model.nominal,
+        model.residual,
+        model.B,
+        model.states,
+        model.inputs,
+        model.input_dim,
+        model.angles,
+    )
     return ResidualModel(*parts, noise=torch.diag(noise.variance))
 
 
@@ -166,16 +211,22 @@ LOOPS = {
     f"{LATE}, believed {DELAY - 1}": Loop(DELAY, DELAY - 1, augmented=True),
     f"{LATE}, believed {DELAY + 1}": Loop(DELAY, DELAY + 1, augmented=True),
     "no noise": Loop(noise=0.0),
-    f"no noise, {LATE}": Loop(DELAY, DELAY, augmented=True, noise=0.0, against="no noise"),
+    f"no noise, {LATE}": Loop(
+        DELAY, DELAY, augmented=True, noise=0.0, against="no noise"
+    ),
     "steps": Loop(task="steps"),
     f"steps, {LATE}, ignored": Loop(DELAY, task="steps", against="steps"),
     f"steps, {LATE}, compensated": Loop(DELAY, DELAY, task="steps", against="steps"),
-    f"steps, {LATE}, planned with": Loop(DELAY, DELAY, augmented=True, task="steps", against="steps"),
+    f"steps, {LATE}, planned with": Loop(
+        DELAY, DELAY, augmented=True, task="steps", against="steps"
+    ),
     "noisy, as measured": Loop(measures=all_states),
     FULL: Loop(measures=all_states, filtered=True),
     "angle only, filtered": Loop(measures=angle_only, filtered=True, against=FULL),
     "20 % lost, filtered": Loop(measures=one_in_five_lost, filtered=True, against=FULL),
-    "angle only, with a disturbance": Loop(measures=angle_only, filtered=True, against=FULL, drift=1e-3),
+    "angle only, with a disturbance": Loop(
+        measures=angle_only, filtered=True, against=FULL, drift=1e-3
+    ),
     f"angle only, {LATE}": Loop(DELAY, DELAY, angle_only, True, True, against=FULL),
 }
 
@@ -184,8 +235,12 @@ def reference_states(task: str, steps: int) -> Array:
     """Angles and rates (steps, 2) [rad, rad/s]."""
     time = STEP * np.arange(steps)
     if task == "swing":
-        return np.stack([math.pi + 0.5 * np.sin(1.5 * time), 0.75 * np.cos(1.5 * time)], axis=1)
-    return np.stack([np.where(np.arange(steps) // 50 % 2, 0.8, -0.8), np.zeros(steps)], axis=1)
+        return np.stack(
+            [math.pi + 0.5 * np.sin(1.5 * time), 0.75 * np.cos(1.5 * time)], axis=1
+        )
+    return np.stack(
+        [np.where(np.arange(steps) // 50 % 2, 0.8, -0.8), np.zeros(steps)], axis=1
+    )
 
 
 class Flown(NamedTuple):
@@ -214,7 +269,14 @@ def fly(model: Any, loop: Loop, steps: int, seed: int) -> Flown:
     cost = Tracking([10.0, 0.1] + [0.0] * extra, [1e-2])
     problem = Problem(cost, Box([-LIMIT], [LIMIT]))
     propagator = Linearization(process_noise=True)
-    controller = GPMPC(planned, propagator, problem, HORIZON, [0.0], PredictionSettings(disturbance_gain=loop.gain))
+    controller = GPMPC(
+        planned,
+        propagator,
+        problem,
+        HORIZON,
+        [0.0],
+        PredictionSettings(disturbance_gain=loop.gain),
+    )
     estimated: Any = model
     if loop.drift:
         effect = torch.tensor([[STEP], [1.0]], dtype=torch.float64)
@@ -226,7 +288,10 @@ def fly(model: Any, loop: Loop, steps: int, seed: int) -> Flown:
     x = references[0].copy()
     queue = deque([np.zeros(1)] * loop.delay, loop.delay)
     believed = deque([np.zeros(1)] * loop.assumed, loop.assumed)
-    belief = Gaussian(torch.from_numpy(x.copy()), torch.diag(torch.tensor([0.01, 0.1], dtype=torch.float64) ** 2))
+    belief = Gaussian(
+        torch.from_numpy(x.copy()),
+        torch.diag(torch.tensor([0.01, 0.1], dtype=torch.float64) ** 2),
+    )
     if loop.drift:
         belief = estimated.augmented(belief, [5 * loop.drift])
     decision, errors, decisions, filters, wrong, doubts = None, [], [], [], [], []
@@ -236,12 +301,20 @@ def fly(model: Any, loop: Loop, steps: int, seed: int) -> Flown:
             belief = Gaussian.certain(x)
         else:
             measured = x + rng.normal(0, SENSOR) + loop.measures(rng)
-            belief = kalman.update(belief, measured).belief if loop.filtered else Gaussian.certain(measured)
+            belief = (
+                kalman.update(belief, measured).belief
+                if loop.filtered
+                else Gaussian.certain(measured)
+            )
         at = perf_counter()
         start = Gaussian(belief.mean[:2], belief.covariance[:2, :2])
         if delayed is not None:
             pending = np.array(believed)
-            start = delayed.augmented(start, pending) if loop.augmented else delayed.ahead(propagator, start, pending)
+            start = (
+                delayed.augmented(start, pending)
+                if loop.augmented
+                else delayed.ahead(propagator, start, pending)
+            )
         window = references[k + lead : k + lead + HORIZON + 1]
         reference = Reference(np.hstack([window, np.zeros((HORIZON + 1, extra))]))
         decision = controller.control(start, reference, decision)
@@ -262,7 +335,12 @@ def fly(model: Any, loop: Loop, steps: int, seed: int) -> Flown:
         errors.append(x[0] - references[k + 1, 0])
         if abs(errors[-1]) > FALLEN:
             break
-    return Flown(np.array(errors), (np.array(wrong), np.array(doubts)), np.array(decisions), np.array(filters))
+    return Flown(
+        np.array(errors),
+        (np.array(wrong), np.array(doubts)),
+        np.array(decisions),
+        np.array(filters),
+    )
 
 
 def main() -> None:
@@ -275,15 +353,23 @@ def main() -> None:
     states, inputs = random_motion(600, DELAY)
     found = estimate_delay(states, inputs)
     low, high = found.interval
-    print(f"delay found in the random motion: {found.steps:.1f} steps, 95 % interval {low:.2f} to {high:.2f}")
+    print(
+        f"delay found in the random motion: {found.steps:.1f} steps, 95 % interval {low:.2f} to {high:.2f}"
+    )
     model = learned(states, inputs, round(found.steps))
-    columns = f"{'RMSE':>9}  {'ratio':24}fell  {'NEES (95 % band)':22}{'ms':>8}{'filter':>8}"
+    columns = (
+        f"{'RMSE':>9}  {'ratio':24}fell  {'NEES (95 % band)':22}{'ms':>8}{'filter':>8}"
+    )
     print(f"{'':30}{columns}")
     results, rmse = [], {}
     for name, loop in LOOPS.items():
-        flown = [fly(model, loop, arguments.steps, seed) for seed in range(arguments.seeds)]
+        flown = [
+            fly(model, loop, arguments.steps, seed) for seed in range(arguments.seeds)
+        ]
         fallen = sum(len(flight.errors) < arguments.steps for flight in flown)
-        rmse[name] = float(np.sqrt(np.mean(np.concatenate([flight.errors for flight in flown]) ** 2)))
+        rmse[name] = float(
+            np.sqrt(np.mean(np.concatenate([flight.errors for flight in flown]) ** 2))
+        )
         over = rmse[name] / rmse[loop.against]
         row: dict[str, Any] = {
             "loop": name,
@@ -292,18 +378,28 @@ def main() -> None:
             "against": loop.against,
             "fallen": fallen,
         }
-        row["decision_ms"] = 1e3 * float(np.median(np.concatenate([flight.decisions for flight in flown])))
-        row["filter_ms"] = 1e3 * float(np.median(np.concatenate([flight.filters for flight in flown])))
+        row["decision_ms"] = 1e3 * float(
+            np.median(np.concatenate([flight.decisions for flight in flown]))
+        )
+        row["filter_ms"] = 1e3 * float(
+            np.median(np.concatenate([flight.filters for flight in flown]))
+        )
         text = ""
         if loop.filtered:
             nees = normalized_errors(
-                *(np.concatenate(part) for part in zip(*(f.estimates for f in flown), strict=True))
+                *(
+                    np.concatenate(part)
+                    for part in zip(*(f.estimates for f in flown), strict=True)
+                )
             )
             row |= {"nees": nees.mean, "band": nees.band}
             text = f"{nees.mean:.2f} ({nees.band[0]:.2f} to {nees.band[1]:.2f})"
         ratio = f"{over:.2f} [{loop.against}]"
         numbers = f"{row['decision_ms']:8.2f}{row['filter_ms']:8.3f}"
-        print(f"{name:30}{rmse[name]:9.4f}  {ratio:24}{fallen:4}  {text:22}{numbers}", flush=True)
+        print(
+            f"{name:30}{rmse[name]:9.4f}  {ratio:24}{fallen:4}  {text:22}{numbers}",
+            flush=True,
+        )
         results.append(row)
     write_results("estimation", results)
 

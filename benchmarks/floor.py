@@ -31,19 +31,26 @@ from gpmpc.gp import GPPosterior
 STATES, INPUTS, LANES = 6, 3, 8
 # Vector instructions for eight pairs of points, R states:
 DELTA = STATES + 1  # rise + fall + left . right
-REDUCTION = 8  # of expm1: two bounds, rounding and its inverse, reduction, the scaling (3)
+REDUCTION = (
+    8  # of expm1: two bounds, rounding and its inverse, reduction, the scaling (3)
+)
 EXPM1 = 11  # 9 of the polynomial and r^2 and the last
 SUMS = 2 + STATES  # of columns, of rows, of the vectors z
 WEIGHT = 2  # a = b: P_ij, R_ij
 EXPLAINED = 2  # an entry of L^-1: L^-1 q, and L^-T of it
 TIMES = {"seconds": 1.0, "least": 7}  # of one size and belief
-BELIEFS = {"narrow": 0.01, "wide": 3.0}  # variances, of points of variance 1 and length-scales of 2 to 3
+BELIEFS = {
+    "narrow": 0.01,
+    "wide": 3.0,
+}  # variances, of points of variance 1 and length-scales of 2 to 3
 
 
 def main() -> None:
     """Measures and prints."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--sizes", type=int, nargs="+", default=[100, 189, 300, 500, 1000, 2000])
+    parser.add_argument(
+        "--sizes", type=int, nargs="+", default=[100, 189, 300, 500, 1000, 2000]
+    )
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     print(
@@ -76,9 +83,19 @@ def measured(packed: kernels.Packed, size: int, belief: str) -> dict:
         start = time.process_time()
         kernels.moments(*asked)
         times.append(time.process_time() - start)
-    middle, general = float(np.median(times)), instructions(packed, reduced=True) / max(rates)
-    floor = general if belief == "wide" else instructions(packed, reduced=False) / max(rates)
-    factor, centred = summed(packed.precision.inverse_cholesky), summed(packed.precision.centred)
+    middle, general = (
+        float(np.median(times)),
+        instructions(packed, reduced=True) / max(rates),
+    )
+    floor = (
+        general
+        if belief == "wide"
+        else instructions(packed, reduced=False) / max(rates)
+    )
+    factor, centred = (
+        summed(packed.precision.inverse_cholesky),
+        summed(packed.precision.centred),
+    )
     return {
         "N": size,
         "belief": belief,
@@ -119,12 +136,37 @@ def multiply_add(values, count):
     i, j, k, m = load(values, 64), load(values, 72), load(values, 80), load(values, 88)
     added, factor = load(values, 96), values[104]
     for _ in range(count):
-        a, b, c, d = added + factor * a, added + factor * b, added + factor * c, added + factor * d
-        e, f, g, h = added + factor * e, added + factor * f, added + factor * g, added + factor * h
-        i, j, k, m = added + factor * i, added + factor * j, added + factor * k, added + factor * m
+        a, b, c, d = (
+            added + factor * a,
+            added + factor * b,
+            added + factor * c,
+            added + factor * d,
+        )
+        e, f, g, h = (
+            added + factor * e,
+            added + factor * f,
+            added + factor * g,
+            added + factor * h,
+        )
+        i, j, k, m = (
+            added + factor * i,
+            added + factor * j,
+            added + factor * k,
+            added + factor * m,
+        )
     store(values, 0, a), store(values, 8, b), store(values, 16, c), store(values, 24, d)
-    store(values, 32, e), store(values, 40, f), store(values, 48, g), store(values, 56, h)
-    store(values, 64, i), store(values, 72, j), store(values, 80, k), store(values, 88, m)
+    (
+        store(values, 32, e),
+        store(values, 40, f),
+        store(values, 48, g),
+        store(values, 56, h),
+    )
+    (
+        store(values, 64, i),
+        store(values, 72, j),
+        store(values, 80, k),
+        store(values, 88, m),
+    )
 
 
 def summed(array: np.ndarray) -> float:
@@ -140,11 +182,17 @@ def summed(array: np.ndarray) -> float:
 def posterior(size: int, seed: int = 0) -> GPPosterior:
     """Six GPs over random points; what they learned does not matter for the time."""
     generator = torch.Generator().manual_seed(seed)
-    features = torch.randn(size, STATES + INPUTS, generator=generator, dtype=torch.float64)
+    features = torch.randn(
+        size, STATES + INPUTS, generator=generator, dtype=torch.float64
+    )
     targets = torch.randn(size, STATES, generator=generator, dtype=torch.float64)
-    lengthscales = 2.0 + torch.rand(STATES, STATES + INPUTS, generator=generator, dtype=torch.float64)
+    lengthscales = 2.0 + torch.rand(
+        STATES, STATES + INPUTS, generator=generator, dtype=torch.float64
+    )
     ones = torch.ones(STATES, dtype=torch.float64)
-    return GPPosterior.from_hyperparameters(features, targets, lengthscales, ones, 1e-2 * ones, INPUTS)
+    return GPPosterior.from_hyperparameters(
+        features, targets, lengthscales, ones, 1e-2 * ones, INPUTS
+    )
 
 
 if __name__ == "__main__":

@@ -16,7 +16,13 @@ import gpytorch
 import numpy as np
 import torch
 
-from benchmarks.timing import describe, machine, markdown_table, time_interleaved, write_results
+from benchmarks.timing import (
+    describe,
+    machine,
+    markdown_table,
+    time_interleaved,
+    write_results,
+)
 from gpmpc import _kernels as kernels
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior, exact_inference, to_gpytorch
@@ -29,8 +35,15 @@ Group = dict[str, Callable[[], list | tuple]]
 def main() -> None:
     """Measures and prints."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--sizes", type=int, nargs="+", default=[10, 50, 100, 189, 500, 1000, 2000])
-    parser.add_argument("--seconds", type=float, default=2.0, help="processor time of a group and size [s]")
+    parser.add_argument(
+        "--sizes", type=int, nargs="+", default=[10, 50, 100, 189, 500, 1000, 2000]
+    )
+    parser.add_argument(
+        "--seconds",
+        type=float,
+        default=2.0,
+        help="processor time of a group and size [s]",
+    )
     parser.add_argument("--torch-jacobian-up-to", type=int, default=500)
     arguments = parser.parse_args()
     torch.set_default_dtype(torch.float64)
@@ -41,40 +54,80 @@ def main() -> None:
     kernels.point_with_jacobian(gps, mu, u[None])
     kernels.moments(gps, mu, S, u[None], derivatives=True)
     first = time.perf_counter() - began
-    print(f"{describe(here)}\nfirst calls of the three kernels: {first:.2f} s (compiled, or read from the cache)\n")
+    print(
+        f"{describe(here)}\nfirst calls of the three kernels: {first:.2f} s (compiled, or read from the cache)\n"
+    )
     for size in arguments.sizes:
         gp, control = posterior(size), torch.linspace(-0.3, 0.3, INPUTS)
         rows = []
-        for group in linearisation_groups(gp, belief(), control, size <= arguments.torch_jacobian_up_to):
+        for group in linearisation_groups(
+            gp, belief(), control, size <= arguments.torch_jacobian_up_to
+        ):
             own = next(iter(group))
-            times, found = time_interleaved(group, arguments.seconds), {name: call() for name, call in group.items()}
+            times, found = (
+                time_interleaved(group, arguments.seconds),
+                {name: call() for name, call in group.items()},
+            )
             for name, taken in times.items():
-                row = {"N": size, "what": name} | taken.summary() | {"ratio": taken.over(times[own])}
+                row = (
+                    {"N": size, "what": name}
+                    | taken.summary()
+                    | {"ratio": taken.over(times[own])}
+                )
                 rows.append(row | {"difference": difference(found[name], found[own])})
         keys = ("what", "median", "p99", "ratio", "difference", "samples")
-        header = (f"N = {size}", "ms, median", "99 %", "times ours", "difference", "calls")
-        print(markdown_table(header, [[row[key] for key in keys] for row in rows]), "\n", flush=True)
+        header = (
+            f"N = {size}",
+            "ms, median",
+            "99 %",
+            "times ours",
+            "difference",
+            "calls",
+        )
+        print(
+            markdown_table(header, [[row[key] for key in keys] for row in rows]),
+            "\n",
+            flush=True,
+        )
         results += rows
-    write_results("gp", results, machine=here, first_calls=first, states=STATES, inputs=INPUTS)
+    write_results(
+        "gp", results, machine=here, first_calls=first, states=STATES, inputs=INPUTS
+    )
 
 
 def posterior(size: int) -> GPPosterior:
     """Builds six GPs on smooth functions of nine inputs."""
     generator = torch.Generator().manual_seed(size)
     features = 4 * torch.rand(size, STATES + INPUTS, generator=generator) - 2
-    targets = torch.stack([torch.sin(features[:, a]) + features[:, -1] * features[:, a - 1] for a in range(STATES)], 1)
+    targets = torch.stack(
+        [
+            torch.sin(features[:, a]) + features[:, -1] * features[:, a - 1]
+            for a in range(STATES)
+        ],
+        1,
+    )
     scales = 2 + 2 * torch.rand(STATES, STATES + INPUTS, generator=generator)
     signal = 1 + torch.rand(STATES, generator=generator)
-    return GPPosterior.from_hyperparameters(features, targets, scales, signal, 1e-3 * signal, INPUTS)
+    return GPPosterior.from_hyperparameters(
+        features, targets, scales, signal, 1e-3 * signal, INPUTS
+    )
 
 
 def belief() -> Gaussian:
     """Builds a belief near the middle of the data with standard deviations near 0.3."""
-    root = 0.3 * torch.randn(STATES, STATES, generator=torch.Generator().manual_seed(1)) / STATES**0.5
-    return Gaussian(torch.linspace(-0.5, 0.5, STATES), root @ root.T + 0.01 * torch.eye(STATES))
+    root = (
+        0.3
+        * torch.randn(STATES, STATES, generator=torch.Generator().manual_seed(1))
+        / STATES**0.5
+    )
+    return Gaussian(
+        torch.linspace(-0.5, 0.5, STATES), root @ root.T + 0.01 * torch.eye(STATES)
+    )
 
 
-def linearisation_groups(gp: GPPosterior, belief: Gaussian, control: torch.Tensor, reverse_mode: bool) -> list[Group]:
+def linearisation_groups(
+    gp: GPPosterior, belief: Gaussian, control: torch.Tensor, reverse_mode: bool
+) -> list[Group]:
     """Builds the calls that predict one step of the latent functions, grouped by what they compute.
 
     Args:
@@ -85,7 +138,11 @@ def linearisation_groups(gp: GPPosterior, belief: Gaussian, control: torch.Tenso
             products of all pairs of outputs.
     """
     n, packed = gp.state_dim, gp.packed
-    at = belief.mean.numpy()[None], belief.covariance.numpy()[None], control.numpy()[None]
+    at = (
+        belief.mean.numpy()[None],
+        belief.covariance.numpy()[None],
+        control.numpy()[None],
+    )
     mu, _, u = at
     query = torch.cat([belief.mean, control])
 
@@ -93,8 +150,17 @@ def linearisation_groups(gp: GPPosterior, belief: Gaussian, control: torch.Tenso
         return moments(gp, Gaussian(mean, covariance), control)[:2]
 
     def jacobian_by_torch():
-        dM, dV = torch.func.jacrev(by_torch, argnums=(0, 1, 2))(belief.mean, belief.covariance, control)
-        return [dM[0], (dM[1] + dM[1].mT) / 2, dM[2], dV[0], (dV[1] + dV[1].mT) / 2, dV[2]]
+        dM, dV = torch.func.jacrev(by_torch, argnums=(0, 1, 2))(
+            belief.mean, belief.covariance, control
+        )
+        return [
+            dM[0],
+            (dM[1] + dM[1].mT) / 2,
+            dM[2],
+            dV[0],
+            (dV[1] + dV[1].mT) / 2,
+            dV[2],
+        ]
 
     def jacobian():
         d = kernels.moments(packed, *at, derivatives=True)
@@ -104,14 +170,23 @@ def linearisation_groups(gp: GPPosterior, belief: Gaussian, control: torch.Tenso
     trained = to_gpytorch(gp)  # as it comes from training
 
     def by_gpytorch():
-        with exact_inference(), gpytorch.settings.skip_posterior_variances():  # the mean alone, from its cache
-            return torch.autograd.functional.jacobian(lambda x: frozen(x[None]).mean[:, 0], query).split(n, dim=1)
+        with (
+            exact_inference(),
+            gpytorch.settings.skip_posterior_variances(),
+        ):  # the mean alone, from its cache
+            return torch.autograd.functional.jacobian(
+                lambda x: frozen(x[None]).mean[:, 0], query
+            ).split(n, dim=1)
 
     def by_gpytorch_as_usual():
-        return torch.autograd.functional.jacobian(lambda x: trained(x[None]).mean[:, 0], query).split(n, dim=1)
+        return torch.autograd.functional.jacobian(
+            lambda x: trained(x[None]).mean[:, 0], query
+        ).split(n, dim=1)
 
     def by_jacrev():
-        adds = torch.eye(n, len(query), dtype=query.dtype) * (gp.predicts == "difference")
+        adds = torch.eye(n, len(query), dtype=query.dtype) * (
+            gp.predicts == "difference"
+        )
         whole = torch.func.jacrev(lambda x: gp.predict(x[:n], x[n:]).mean)(query)
         return (whole - adds).split(n, dim=1)
 
@@ -123,11 +198,16 @@ def linearisation_groups(gp: GPPosterior, belief: Gaussian, control: torch.Tenso
         },
         {"moments with Jacobians": jacobian},
         {"moments, diagonal": lambda: kernels.moments(packed, *at, diagonal=True)[:2]},
-        {"diagonal with Jacobians": lambda: kernels.moments(packed, *at, diagonal=True, derivatives=True)},
+        {
+            "diagonal with Jacobians": lambda: kernels.moments(
+                packed, *at, diagonal=True, derivatives=True
+            )
+        },
         {"linearised": lambda: kernels.point_with_jacobian(packed, mu, u)},
         {
             "mean with Jacobian": lambda: [
-                part[0] for part in kernels.linearize(packed, mu, u, False, zeros, False)[1:3]
+                part[0]
+                for part in kernels.linearize(packed, mu, u, False, zeros, False)[1:3]
             ],
             "mean with Jacobian, torch jacrev": by_jacrev,
             "mean with Jacobian, GPyTorch, frozen": by_gpytorch,
@@ -141,7 +221,9 @@ def linearisation_groups(gp: GPPosterior, belief: Gaussian, control: torch.Tenso
 
 def difference(result, reference) -> float:
     """Largest difference of two lists of arrays, relative to each array's largest entry."""
-    pairs = [(np.asarray(a), np.asarray(b)) for a, b in zip(result, reference, strict=True)]
+    pairs = [
+        (np.asarray(a), np.asarray(b)) for a, b in zip(result, reference, strict=True)
+    ]
     return max(float(np.abs(a - b).max() / np.abs(b).max()) for a, b in pairs)
 
 

@@ -35,12 +35,19 @@ SECONDS = 2.0  # a group
 def main() -> None:
     """Measures and judges."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--record", action="store_true", help="writes the ratios as the new record")
+    parser.add_argument(
+        "--record", action="store_true", help="writes the ratios as the new record"
+    )
     arguments = parser.parse_args()
     use_one_thread()
     measured = ratios()
     if arguments.record:
-        RECORD.write_text(json.dumps({name: round(ratio, 4) for name, ratio in measured.items()}, indent=1) + "\n")
+        RECORD.write_text(
+            json.dumps(
+                {name: round(ratio, 4) for name, ratio in measured.items()}, indent=1
+            )
+            + "\n"
+        )
         print(f"written to {RECORD.name}")
         return
     record = json.loads(RECORD.read_text())
@@ -51,22 +58,32 @@ def main() -> None:
         measured = {name: min(ratio, again[name]) for name, ratio in measured.items()}
     for name, ratio in measured.items():
         mark = "SLOWER" if name in slower(measured, record) else ""
-        print(f"{name:44}{ratio:9.3f}   recorded {record.get(name, float('nan')):9.3f}   {mark}".rstrip())
+        print(
+            f"{name:44}{ratio:9.3f}   recorded {record.get(name, float('nan')):9.3f}   {mark}".rstrip()
+        )
     if set(measured) != set(record):
-        print(f"not the same as recorded: {', '.join(sorted(set(measured) ^ set(record)))}; --record anew")
+        print(
+            f"not the same as recorded: {', '.join(sorted(set(measured) ^ set(record)))}; --record anew"
+        )
     sys.exit(bool(slower(measured, record)) or set(measured) != set(record))
 
 
 def slower(measured: dict[str, float], record: dict[str, float]) -> list[str]:
     """What exceeds its record by more than the margin."""
-    return [name for name, ratio in measured.items() if ratio > MARGIN * record.get(name, np.inf)]
+    return [
+        name
+        for name, ratio in measured.items()
+        if ratio > MARGIN * record.get(name, np.inf)
+    ]
 
 
 def ratios() -> dict[str, float]:
     """Median ratio of everything that is guarded to its reference kernel."""
     found = {}
     for reference, kernel, contenders in groups():
-        times = time_interleaved({"reference": kernel} | contenders, SECONDS, min_rounds=50, max_rounds=400)
+        times = time_interleaved(
+            {"reference": kernel} | contenders, SECONDS, min_rounds=50, max_rounds=400
+        )
         for name in contenders:
             found[f"{name} / {reference}"] = times[name].over(times["reference"])
     return found
@@ -76,17 +93,25 @@ def groups() -> list[tuple]:
     """(name of the reference, the reference, what is compared with it)."""
     gp = pendulum_gp(STATES, SIZE)
     exact, input = MomentMatching(), torch.zeros(gp.state_dim // 2, dtype=torch.float64)
-    belief = Gaussian(torch.zeros(STATES, dtype=torch.float64), STD**2 * torch.eye(STATES, dtype=torch.float64))
+    belief = Gaussian(
+        torch.zeros(STATES, dtype=torch.float64),
+        STD**2 * torch.eye(STATES, dtype=torch.float64),
+    )
     held = controllers(gp, HORIZON)
     steps = record_steps(gp, held["mean only"], RECORDED_STEPS)
-    stepping = {f"step, {name}": WarmStarted(controller, steps) for name, controller in held.items()}
+    stepping = {
+        f"step, {name}": WarmStarted(controller, steps)
+        for name, controller in held.items()
+    }
     programs = [held["zero order"].control(*step).problem for step in steps]
     return [
         (
             "exp",
             exponentials(),
             {
-                "exact moments, all Jacobians": lambda: differentiate(exact, gp, belief, input),
+                "exact moments, all Jacobians": lambda: differentiate(
+                    exact, gp, belief, input
+                ),
                 "exact moments": lambda: exact(gp, belief, input),
                 "step, paper's form": stepping.pop("step, paper's form"),
             },

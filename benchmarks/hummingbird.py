@@ -15,7 +15,9 @@ from numba import njit
 
 Array = np.ndarray
 STEP, SUBSTEPS, GRAVITY = 0.01, 4, 9.81
-HOVER = np.array([0, 0, 1.0] + [0.0] * 3 + [0, 0, 0, 1.0] + [0.0] * 10)  # without the rotors' speeds
+HOVER = np.array(
+    [0, 0, 1.0] + [0.0] * 3 + [0, 0, 0, 1.0] + [0.0] * 10
+)  # without the rotors' speeds
 
 
 class Parameters(NamedTuple):
@@ -60,7 +62,11 @@ def commanded_speeds(s, velocity, p):
     S = 0.5 * (wanted @ R - R.T @ wanted.T)
     error = np.array([-S[1, 2], S[0, 2], -S[0, 1]])
     torque = p.inertia @ (-k_p * error - k_d * w) + np.cross(w, p.inertia @ w)
-    squares = p.allocation @ np.array([(force * R[:, 2]).sum(), torque[0], torque[1], torque[2]]) / p.coefficients[0]
+    squares = (
+        p.allocation
+        @ np.array([(force * R[:, 2]).sum(), torque[0], torque[1], torque[2]])
+        / p.coefficients[0]
+    )
     return np.sign(squares) * np.sqrt(np.abs(squares))
 
 
@@ -98,7 +104,9 @@ def advance(s, velocity, wind, p, steps):
     s, h = s.copy(), STEP / SUBSTEPS
     s[13:16] = wind
     for _ in range(steps):
-        commands = np.minimum(np.maximum(commanded_speeds(s, velocity, p), p.speeds[0]), p.speeds[1])
+        commands = np.minimum(
+            np.maximum(commanded_speeds(s, velocity, p), p.speeds[0]), p.speeds[1]
+        )
         for _ in range(SUBSTEPS):
             k1 = derivative(s, commands, p)
             k2 = derivative(s + 0.5 * h * k1, commands, p)
@@ -130,14 +138,23 @@ def compiled_hummingbird() -> tuple[Array, Callable[[Array, Array, Array, int], 
     hover, rng = HOVER.copy(), np.random.default_rng(0)
     hover[16:] = math.sqrt(p.mass * GRAVITY / (4 * theirs.k_eta))
     for _ in range(20):
-        s = hover + rng.normal(0, 1, 20) * np.repeat([1.0, 0.2, 1.0, 2.0, 100.0], [6, 4, 3, 3, 4])
+        s = hover + rng.normal(0, 1, 20) * np.repeat(
+            [1.0, 0.2, 1.0, 2.0, 100.0], [6, 4, 3, 3, 4]
+        )
         s[6:10] /= np.linalg.norm(s[6:10])
         velocity, commands = rng.normal(0, 1, 3), rng.uniform(300, 900, 4)
-        wanted = theirs.get_cmd_motor_speeds(Multirotor._unpack_state(s), {"cmd_v": velocity})
+        wanted = theirs.get_cmd_motor_speeds(
+            Multirotor._unpack_state(s), {"cmd_v": velocity}
+        )
         pairs = (
             (commanded_speeds(s, velocity, p), wanted),
             (derivative(s, commands, p), theirs._s_dot_fn(0, s, commands)),
         )
-        if any(np.abs(one - other).max() > 1e-9 * np.abs(other).max() for one, other in pairs):
-            raise RuntimeError("the equations of the installed RotorPy are others than those of benchmarks/hummingbird")
+        if any(
+            np.abs(one - other).max() > 1e-9 * np.abs(other).max()
+            for one, other in pairs
+        ):
+            raise RuntimeError(
+                "the equations of the installed RotorPy are others than those of benchmarks/hummingbird"
+            )
     return hover, lambda s, velocity, wind, steps: advance(s, velocity, wind, p, steps)

@@ -57,7 +57,9 @@ class Instance:
         return self.reference.states[1:]
 
 
-def kkt_residual(model: DynamicsModel, problem: Problem, instance: Instance, inputs: Array) -> float:
+def kkt_residual(
+    model: DynamicsModel, problem: Problem, instance: Instance, inputs: Array
+) -> float:
     """Computes how far a plan is from a KKT point; see the module's text.
 
     Args:
@@ -70,11 +72,19 @@ def kkt_residual(model: DynamicsModel, problem: Problem, instance: Instance, inp
         SettingError: The problem bounds more than inputs, or weighs deviations.
         ShapeError: The plan has another shape.
     """
-    if problem.constraints or problem.input_rates.finite or problem.cost.penalized == "deviations":
-        raise SettingError("problem", "must bound nothing but inputs, and weigh inputs or increments")
+    if (
+        problem.constraints
+        or problem.input_rates.finite
+        or problem.cost.penalized == "deviations"
+    ):
+        raise SettingError(
+            "problem", "must bound nothing but inputs, and weigh inputs or increments"
+        )
     H, m = len(instance.targets), problem.input_dim
     if np.shape(inputs) != (H, m):
-        raise ShapeError(f"a plan of {H} stages and {m} inputs must have shape ({H}, {m}); got {np.shape(inputs)}")
+        raise ShapeError(
+            f"a plan of {H} stages and {m} inputs must have shape ({H}, {m}); got {np.shape(inputs)}"
+        )
     if not np.isfinite(inputs).all():
         return np.inf
     states, A, B = _rollout(model, instance.state, np.asarray(inputs, dtype=float))
@@ -92,14 +102,23 @@ def kkt_residual(model: DynamicsModel, problem: Problem, instance: Instance, inp
         for i in range(k, H):
             response = response if i == k else A[i] @ response
             curvature[k] += 2 * np.einsum("aj,ab,bj->j", response, weights[i], response)
-    above, below = curvature * (inputs - problem.inputs.lower), curvature * (inputs - problem.inputs.upper)
+    above, below = (
+        curvature * (inputs - problem.inputs.lower),
+        curvature * (inputs - problem.inputs.upper),
+    )
     left = np.abs(np.maximum(below, np.minimum(gradient, above)))
-    sizes = np.minimum(np.maximum(1.0, np.abs(inputs)), problem.inputs.upper - problem.inputs.lower)
+    sizes = np.minimum(
+        np.maximum(1.0, np.abs(inputs)), problem.inputs.upper - problem.inputs.lower
+    )
     most = np.sqrt(2 * curvature * (cost + 0.5 * curvature * (SMALL * sizes) ** 2))
-    return float(np.divide(left, most, out=np.where(left > 0, np.inf, 0.0), where=most > 0).max())
+    return float(
+        np.divide(left, most, out=np.where(left > 0, np.inf, 0.0), where=most > 0).max()
+    )
 
 
-def _rollout(model: DynamicsModel, state: Array, inputs: Array) -> tuple[Array, Array, Array]:
+def _rollout(
+    model: DynamicsModel, state: Array, inputs: Array
+) -> tuple[Array, Array, Array]:
     """States (H + 1, n), and the Jacobians (H, n, n) and (H, n, m) of every step."""
     x, states, A, B = torch.tensor(state), [state], [], []
     for u in torch.from_numpy(np.array(inputs)):
@@ -111,10 +130,16 @@ def _rollout(model: DynamicsModel, state: Array, inputs: Array) -> tuple[Array, 
     return np.array(states), np.array(A), np.array(B)
 
 
-def _of_the_inputs(problem: Problem, last: Array, inputs: Array) -> tuple[float, Array, Array]:
+def _of_the_inputs(
+    problem: Problem, last: Array, inputs: Array
+) -> tuple[float, Array, Array]:
     """Value, gradient and diagonal of the Hessian (H, m) of sum_i |v_i|^2_R."""
     curvature = np.tile(2 * problem.cost.R.diagonal(), (len(inputs), 1))
-    v = inputs if problem.cost.penalized == "inputs" else np.diff(inputs, axis=0, prepend=last[None])
+    v = (
+        inputs
+        if problem.cost.penalized == "inputs"
+        else np.diff(inputs, axis=0, prepend=last[None])
+    )
     slopes = 2 * v @ problem.cost.R
     cost = float(np.sum(slopes * v)) / 2
     if problem.cost.penalized == "increments":

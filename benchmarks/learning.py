@@ -21,7 +21,16 @@ import numpy as np
 import torch
 from matplotlib.figure import Figure
 
-from benchmarks.quadrotor import DATA, HOVER, NOISE, OUTER, TRAINER, TRAJECTORIES, problem, trained
+from benchmarks.quadrotor import (
+    DATA,
+    HOVER,
+    NOISE,
+    OUTER,
+    TRAINER,
+    TRAJECTORIES,
+    problem,
+    trained,
+)
 from benchmarks.timing import write_results
 from gpmpc._files import write_whole
 from gpmpc.gp import GPPosterior
@@ -40,7 +49,10 @@ HEAVY = translational(mass=1.2 * 0.74)
 CHANGES: dict[str, tuple] = {
     "none": (),
     "20 % heavier": (Replaced(HEAVY, CHANGE),),
-    "wind": (Gust({"vx": 0.5, "vy": -0.3}, CHANGE, TURN), Gust({"vx": -0.4, "vz": 0.3}, TURN)),
+    "wind": (
+        Gust({"vx": 0.5, "vy": -0.3}, CHANGE, TURN),
+        Gust({"vx": -0.4, "vz": 0.3}, TURN),
+    ),
 }
 NOISES = {"process 0.01": NOISE, "measured 0.01": Noise(measurement=[0.01] * 6)}
 WAYS = ("as learned", "disturbance estimate", "online", "trained on the new plant")
@@ -50,11 +62,20 @@ STORE = Path("outputs/benchmarks/learning.json")
 def controller_of(way: str, model: GPPosterior) -> Controller:
     """One way to control with a model."""
     gain = 0.5 if way == "disturbance estimate" else 0.0
-    plain = GPMPC(model, Linearization(), problem(), HORIZON, HOVER, PredictionSettings(disturbance_gain=gain))
+    plain = GPMPC(
+        model,
+        Linearization(),
+        problem(),
+        HORIZON,
+        HOVER,
+        PredictionSettings(disturbance_gain=gain),
+    )
     return LearningController(plain, OnlineLearning()) if way == "online" else plain
 
 
-def flights(way: str, trajectory: str, change: str, noise: str, seeds: int) -> list[Rollout]:
+def flights(
+    way: str, trajectory: str, change: str, noise: str, seeds: int
+) -> list[Rollout]:
     """One a seed."""
     disturbances, model = CHANGES[change], trained(trajectory)
     if way == "trained on the new plant":
@@ -64,7 +85,9 @@ def flights(way: str, trajectory: str, change: str, noise: str, seeds: int) -> l
         else:
             disturbances = ()
     controller = controller_of(way, model)
-    references = states_along(TRAJECTORIES[trajectory], np.arange(STEPS + HORIZON + 1.0))
+    references = states_along(
+        TRAJECTORIES[trajectory], np.arange(STEPS + HORIZON + 1.0)
+    )
     return [
         closed_loop(
             OUTER, controller, references, references[0], STEPS,
@@ -83,11 +106,19 @@ def later(change: str) -> np.ndarray:
 
 def measured(flown: list[Rollout], change: str) -> dict[str, Any]:
     """RMSE [m], lost flights, and median time of a decision [ms]."""
-    away = np.array([np.linalg.norm((f.states - f.references)[later(change)][:, POSITION], axis=1) for f in flown])
+    away = np.array(
+        [
+            np.linalg.norm(
+                (f.states - f.references)[later(change)][:, POSITION], axis=1
+            )
+            for f in flown
+        ]
+    )
     return {
         "rmse": float(np.sqrt(np.mean(away**2))),
         "lost": int((away.max(1) > LOST).sum()),
-        "decision_ms": 1e3 * float(np.median(np.concatenate([f.seconds for f in flown]))),
+        "decision_ms": 1e3
+        * float(np.median(np.concatenate([f.seconds for f in flown]))),
         "fastest_ms": 1e3 * float(min(f.seconds[5:].min() for f in flown)),
     }
 
@@ -96,7 +127,9 @@ def main() -> None:
     """Flies, prints and draws."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--seeds", type=int, default=20)
-    parser.add_argument("--figure", type=Path, default=Path("outputs/benchmarks/learning.png"))
+    parser.add_argument(
+        "--figure", type=Path, default=Path("outputs/benchmarks/learning.png")
+    )
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     rows = json.loads(STORE.read_text())["results"] if STORE.exists() else []
@@ -106,24 +139,40 @@ def main() -> None:
             for change in CHANGES:
                 cell: dict[str, dict] = {}
                 for way in WAYS:
-                    key: dict[str, Any] = {"trajectory": trajectory, "noise": noise, "change": change, "way": way}
+                    key: dict[str, Any] = {
+                        "trajectory": trajectory,
+                        "noise": noise,
+                        "change": change,
+                        "way": way,
+                    }
                     key["seeds"] = arguments.seeds
-                    found = next((row for row in rows if key.items() <= row.items()), None)
+                    found = next(
+                        (row for row in rows if key.items() <= row.items()), None
+                    )
                     if found is None:
-                        found = key | measured(flights(*(way, trajectory, change, noise, arguments.seeds)), change)
+                        found = key | measured(
+                            flights(*(way, trajectory, change, noise, arguments.seeds)),
+                            change,
+                        )
                         rows.append(found)
                         write_results("learning", rows)
                     cell[way] = found
                 best = cell[WAYS[-1]]["rmse"]
                 text = "".join(
-                    f"{one['rmse']:10.4f} x{one['rmse'] / best:7.3f} lost {one['lost']:2}" for one in cell.values()
+                    f"{one['rmse']:10.4f} x{one['rmse'] / best:7.3f} lost {one['lost']:2}"
+                    for one in cell.values()
                 )
                 print(f"{trajectory:12}{noise:16}{change:18}{text}", flush=True)
     keys = "fastest_ms", "decision_ms"
     unchanged = [row for row in rows if row["change"] == "none"]
-    plain, online = ([min(row[key] for row in unchanged if row["way"] == way) for key in keys] for way in WAYS[::2])
+    plain, online = (
+        [min(row[key] for row in unchanged if row["way"] == way) for key in keys]
+        for way in WAYS[::2]
+    )
     more = [after - before for before, after in zip(plain, online, strict=True)]
-    print(f"a decision with online learning takes {more[0]:.2f} ms more (fastest), {more[1]:.2f} ms (median)")
+    print(
+        f"a decision with online learning takes {more[0]:.2f} ms more (fastest), {more[1]:.2f} ms (median)"
+    )
     arguments.figure.parent.mkdir(parents=True, exist_ok=True)
     write_whole(arguments.figure, png(figure()))
     print(f"written to {arguments.figure}")
@@ -136,11 +185,15 @@ def figure() -> Figure:
     for axis, change in zip(panels, ("20 % heavier", "wind"), strict=True):
         for way, look in zip(WAYS, ("C6-.", "C1", "C0", "C2:"), strict=True):
             (flown,) = flights(way, "elliptical", change, "process 0.01", 1)
-            away = np.linalg.norm((flown.states - flown.references)[:, POSITION], axis=1)
+            away = np.linalg.norm(
+                (flown.states - flown.references)[:, POSITION], axis=1
+            )
             axis.semilogy(flown.times[1:], away[1:], look, label=way)
         axis.set(title=f"at 20 s: {change}", xlabel="time [s]")
     panels[0].set_ylabel("distance to the reference [m]")
-    drawn.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
+    drawn.legend(
+        *panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=4
+    )
     return drawn
 
 

@@ -28,7 +28,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--size", type=int, default=2000)
     parser.add_argument("--horizon", type=int, default=20)
-    parser.add_argument("--child", nargs=2, metavar=("FILE", "COVARIANCE"), help=argparse.SUPPRESS)
+    parser.add_argument(
+        "--child", nargs=2, metavar=("FILE", "COVARIANCE"), help=argparse.SUPPRESS
+    )
     arguments = parser.parse_args()
     if arguments.child:
         print(json.dumps(flown(*arguments.child, arguments.horizon)))
@@ -51,9 +53,15 @@ def main() -> None:
                 str(model),
                 covariance,
             ]
-            for _ in range(2):  # the first may have to compile, which is not a step's memory
-                answer = subprocess.run(command, check=True, capture_output=True, text=True).stdout
-            result = {"N": arguments.size, "horizon": arguments.horizon} | json.loads(answer)
+            for _ in range(
+                2
+            ):  # the first may have to compile, which is not a step's memory
+                answer = subprocess.run(
+                    command, check=True, capture_output=True, text=True
+                ).stdout
+            result = {"N": arguments.size, "horizon": arguments.horizon} | json.loads(
+                answer
+            )
             results.append(result)
             print(
                 f"N = {arguments.size}, H = {arguments.horizon}, {covariance}: peak {result['peak_mib']:.0f} MiB "
@@ -83,13 +91,19 @@ def flown(file: str, covariance: str, horizon: int) -> dict:
     box = {"inputs": Box([-1] * m, [1] * m)}
     problem = Problem(Tracking([1] * n, [1] * m), **box)
     settings = PredictionSettings(covariance=covariance)
-    controller = GPMPC(gp, Linearization(), problem, horizon, [0.0] * m, prediction=settings)
+    controller = GPMPC(
+        gp, Linearization(), problem, horizon, [0.0] * m, prediction=settings
+    )
     reference = Reference(np.zeros((horizon + 1, n)))
     eye, generator = torch.eye(n, dtype=torch.float64), torch.Generator().manual_seed(0)
     decision, steady, risen, peak = None, 0, 0.0, 0.0
     for step in range(WARM + 2 * STEADY):
-        belief = Gaussian(0.1 * torch.randn(n, generator=generator, dtype=torch.float64), 1e-4 * eye)
-        traced = WARM <= step < WARM + STEADY  # tracing itself takes memory: the resident set is looked at without
+        belief = Gaussian(
+            0.1 * torch.randn(n, generator=generator, dtype=torch.float64), 1e-4 * eye
+        )
+        traced = (
+            WARM <= step < WARM + STEADY
+        )  # tracing itself takes memory: the resident set is looked at without
         if traced:
             tracemalloc.start()
         elif step >= WARM:
@@ -119,7 +133,9 @@ def resident(entry: str = "VmRSS") -> float:
         lines = Path("/proc/self/status").read_text().splitlines()
     except OSError:
         return float("nan")
-    return next(float(line.split()[1]) / 1024 for line in lines if line.startswith(entry))
+    return next(
+        float(line.split()[1]) / 1024 for line in lines if line.startswith(entry)
+    )
 
 
 def forget_peak() -> None:

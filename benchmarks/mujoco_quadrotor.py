@@ -33,13 +33,25 @@ from gpmpc.systems.mujoco_quadrotor import RigidBody, mujoco_quadrotor
 from gpmpc.trajectories import Elliptical, Lorenz
 
 PATHS = {"ellipse": Elliptical(climb_rate=0.25), "Lorenz": Lorenz()}
-VEHICLES = {"as learned": {}, "0.1 kg more, wind of 4 m/s": {"mass": 0.6, "wind": (4.0, 0.0, 0.0)}}
-CONTROLLERS = ("NMPC", "fitted", 0.0), ("body, estimate", "fitted", 0.3), ("learned", "learned", 0.3)
+VEHICLES = {
+    "as learned": {},
+    "0.1 kg more, wind of 4 m/s": {"mass": 0.6, "wind": (4.0, 0.0, 0.0)},
+}
+CONTROLLERS = (
+    ("NMPC", "fitted", 0.0),
+    ("body, estimate", "fitted", 0.3),
+    ("learned", "learned", 0.3),
+)
 HORIZON, STEPS, STEP, RAMP = 20, 300, 0.04, 2.0  # stages, [-], [s], [s]
-MEASURED = np.tile([0.003, 0.01], 3).tolist() + np.tile([0.002, 0.02], 3).tolist()  # [m, m/s], [rad, rad/s]
+MEASURED = (
+    np.tile([0.003, 0.01], 3).tolist() + np.tile([0.002, 0.02], 3).tolist()
+)  # [m, m/s], [rad, rad/s]
 HOVER = [0.5 * 9.81 / 4] * 4  # [N]
 MOVED = [1, 3, 5, 7, 9, 11]  # velocities and rates, which forces and moments act on
-PROBLEM = Problem(Tracking([10, 1, 10, 1, 10, 1, 0.3, 0.3, 0.3, 0.3, 1, 0.3], [5.0] * 4), Box([0.0] * 4, [3.0] * 4))
+PROBLEM = Problem(
+    Tracking([10, 1, 10, 1, 10, 1, 0.3, 0.3, 0.3, 0.3, 1, 0.3], [5.0] * 4),
+    Box([0.0] * 4, [3.0] * 4),
+)
 Array = np.ndarray
 
 
@@ -60,7 +72,9 @@ def along(path: str) -> Array:
 def excitation(rng: np.random.Generator) -> Array:
     """States of a sum of sines, 8 s long."""
     t = STEP * np.arange(200 + HORIZON + 1)[:, None]
-    return reference(np.minimum(t / RAMP, 1) * [2.0, 2.0, 0.8] * np.sin(rng.uniform(0.6, 2.0, 3) * t))
+    return reference(
+        np.minimum(t / RAMP, 1) * [2.0, 2.0, 0.8] * np.sin(rng.uniform(0.6, 2.0, 3) * t)
+    )
 
 
 def known(body: System) -> KnownModel:
@@ -68,15 +82,39 @@ def known(body: System) -> KnownModel:
     return KnownModel(CasadiFunction(successor_function(body)), 12, 4)
 
 
-def fly(vehicle: System, model, states: Array, seed: int, gain: float = 0.0, dither: float = 0.0) -> Rollout:
+def fly(
+    vehicle: System,
+    model,
+    states: Array,
+    seed: int,
+    gain: float = 0.0,
+    dither: float = 0.0,
+) -> Rollout:
     """One flight: with a rigid body and neither estimate nor dither by NMPC, else by one program a step."""
     known, solved = isinstance(model, KnownModel), gain == dither == 0.0
-    settings = PredictionSettings(covariance="none" if known else "zero_order", disturbance_gain=gain)
-    controller = GPMPC(model, Linearization(), PROBLEM, HORIZON, HOVER, settings, iterations=30 if solved else 1)
+    settings = PredictionSettings(
+        covariance="none" if known else "zero_order", disturbance_gain=gain
+    )
+    controller = GPMPC(
+        model,
+        Linearization(),
+        PROBLEM,
+        HORIZON,
+        HOVER,
+        settings,
+        iterations=30 if solved else 1,
+    )
     noise = Noise(measurement=MEASURED, input=[dither] * 4)
     steps = len(states) - HORIZON - 1
     return closed_loop(
-        vehicle, controller, Reference(states), None, steps, noise=noise, on_failure="previous_plan", seed=seed
+        vehicle,
+        controller,
+        Reference(states),
+        None,
+        steps,
+        noise=noise,
+        on_failure="previous_plan",
+        seed=seed,
     )
 
 
@@ -84,12 +122,16 @@ def learn(seed: int) -> tuple[System, ResidualModel]:
     """The rigid body that is fitted to three flights, and the GPs on what it misses."""
     rng, vehicle, rows = np.random.default_rng(seed), mujoco_quadrotor(), []
     for k in range(3):
-        flown = fly(vehicle, known(vehicle.nominal), excitation(rng), 100 * seed + k, dither=0.1)
+        flown = fly(
+            vehicle, known(vehicle.nominal), excitation(rng), 100 * seed + k, dither=0.1
+        )
         rows.append((flown.measured[:-1], flown.inputs[:-1], flown.measured[1:]))
     x, u, after = (np.concatenate(part) for part in zip(*rows, strict=True))
 
     def body(numbers: Array) -> System:
-        return replace(vehicle.nominal, dynamics=RigidBody(numbers[0], tuple(numbers[1:])))
+        return replace(
+            vehicle.nominal, dynamics=RigidBody(numbers[0], tuple(numbers[1:]))
+        )
 
     def missed(logarithms: Array) -> Array:
         error = step_many(body(np.exp(logarithms)), x, u) - after
@@ -102,7 +144,9 @@ def learn(seed: int) -> tuple[System, ResidualModel]:
     trainer = Trainer(predicts="difference", scaling=standardize, restarts=0)
     seen = [1, 3, 5, 6, 7, 8, 9, 10, 11]
     data = Transitions(x[chosen], u[chosen], after[chosen])
-    return fitted, ResidualModel.train(known(fitted).function, data, B, seen, trainer=trainer, seed=seed)
+    return fitted, ResidualModel.train(
+        known(fitted).function, data, B, seen, trainer=trainer, seed=seed
+    )
 
 
 def flights(seed: int) -> list[dict]:
@@ -136,7 +180,11 @@ def summary(rows: list[dict]) -> str:
     """A line for each vehicle and path: errors [m], their ratio (median, worst seed) and times [ms]."""
     table = pandas.DataFrame(rows)
     table["failures"] = table.groupby(["vehicle", "path"])["failures"].transform("sum")
-    wide = table.pivot(index=["vehicle", "path", "seed", "failures"], columns="controller", values="rmse").reset_index()
+    wide = table.pivot(
+        index=["vehicle", "path", "seed", "failures"],
+        columns="controller",
+        values="rmse",
+    ).reset_index()
     wide["ratio"] = wide["learned"] / wide["NMPC"]
     lines = wide.groupby(["vehicle", "path"]).agg(
         seeds=("seed", "count"),
@@ -158,7 +206,11 @@ def main() -> None:
     given = parser.parse_args()
     RESULTS.mkdir(parents=True, exist_ok=True)
     path = RESULTS / "mujoco_quadrotor.jsonl"
-    rows = [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+    rows = (
+        [json.loads(line) for line in path.read_text().splitlines()]
+        if path.exists()
+        else []
+    )
     for seed in sorted(set(range(given.seeds)) - {row["seed"] for row in rows}):
         with one_thread():
             found = flights(seed)

@@ -27,9 +27,19 @@ from gpmpc.mpc import GPMPC, Box, ControlLoop, Decision, Inequality, Problem, Tr
 from gpmpc.propagation import Linearization
 
 HORIZON, STEPS, STEP = 20, 60, 0.1  # stages, [-], [s]
-NOISE = np.array([0.004, 0.02, 0.004, 0.02])  # standard deviations a step [m, m/s, m, m/s]
+NOISE = np.array(
+    [0.004, 0.02, 0.004, 0.02]
+)  # standard deviations a step [m, m/s, m, m/s]
 GOAL = np.array([4.0, 0.0, 0.0, 0.0])
-COUNTS = "active", "inside", "inside of active", "infeasible", "flagged", "unflagged", "failed"
+COUNTS = (
+    "active",
+    "inside",
+    "inside of active",
+    "infeasible",
+    "flagged",
+    "unflagged",
+    "failed",
+)
 TOUCHES, MISSED = 1e-6, 1e-6  # [m] of a bound, of a violation
 Array = np.ndarray
 
@@ -39,7 +49,15 @@ def successor(x: Array, u: Array) -> Array:
     v = x[..., [1, 3]]
     a = u - 0.3 * v * np.linalg.norm(v, axis=-1, keepdims=True)
     moved = x[..., [0, 2]] + STEP * v + STEP**2 / 2 * a
-    return np.stack([moved[..., 0], v[..., 0] + STEP * a[..., 0], moved[..., 1], v[..., 1] + STEP * a[..., 1]], axis=-1)
+    return np.stack(
+        [
+            moved[..., 0],
+            v[..., 0] + STEP * a[..., 0],
+            moved[..., 1],
+            v[..., 1] + STEP * a[..., 1],
+        ],
+        axis=-1,
+    )
 
 
 def learn(samples: int = 250) -> GPPosterior:
@@ -48,13 +66,19 @@ def learn(samples: int = 250) -> GPPosterior:
     states = rng.uniform([-0.5, -2.5, -2.0, -2.5], [4.5, 2.5, 2.0, 2.5], (samples, 4))
     inputs = rng.uniform(-3, 3, (samples, 2))
     after = successor(states, inputs) + rng.normal(0, NOISE, (samples, 4))
-    return train(Transitions(states, inputs, after), predicts="difference", scaling=standardize).posterior
+    return train(
+        Transitions(states, inputs, after), predicts="difference", scaling=standardize
+    ).posterior
 
 
 def discs() -> casadi.Function:
     """By how far the point is inside each disc; parameters: x, y and radius of each."""
     x, u, p = casadi.SX.sym("x", 4), casadi.SX.sym("u", 2), casadi.SX.sym("p", 9)
-    inside = [p[3 * i + 2] - casadi.norm_2(casadi.vertcat(x[0] - p[3 * i], x[2] - p[3 * i + 1])) for i in range(3)]
+    inside = [
+        p[3 * i + 2]
+        - casadi.norm_2(casadi.vertcat(x[0] - p[3 * i], x[2] - p[3 * i + 1]))
+        for i in range(3)
+    ]
     return casadi.Function("discs", [x, u, p], [casadi.vertcat(*inside)])
 
 
@@ -65,7 +89,8 @@ def scene(seed: int) -> tuple[Array, Array]:
         found = rng.uniform([0.9, -0.6, 0.25], [3.1, 0.6, 0.5], (3, 3))
         velocity = rng.uniform(-0.3, 0.3, 2)
         gaps = [
-            np.linalg.norm(found[i, :2] - found[j, :2]) - found[i, 2] - found[j, 2] for i, j in ((0, 1), (0, 2), (1, 2))
+            np.linalg.norm(found[i, :2] - found[j, :2]) - found[i, 2] - found[j, 2]
+            for i, j in ((0, 1), (0, 2), (1, 2))
         ]
         if min(gaps) > 0.3:
             return found, velocity
@@ -79,7 +104,9 @@ def fly(model: GPPosterior, probability: float, seed: int) -> dict:
         Box([-3.0] * 2, [3.0] * 2),
         constraints=[constraint],
     )
-    loop = ControlLoop(GPMPC(model, Linearization(process_noise=True), problem, HORIZON, [0.0, 0.0]))
+    loop = ControlLoop(
+        GPMPC(model, Linearization(process_noise=True), problem, HORIZON, [0.0, 0.0])
+    )
     (places, velocity), rng = scene(seed), np.random.default_rng([seed, 1])
     ahead = STEP * np.arange(1, HORIZON + 1)[:, None]
     x, milliseconds = np.zeros(4), []
@@ -93,17 +120,32 @@ def fly(model: GPPosterior, probability: float, seed: int) -> dict:
         decision = loop.last.decision
         x = successor(x, u) + rng.normal(0, NOISE)
         now = p[0].reshape(3, 3)
-        inside = bool((np.linalg.norm(now[:, :2] - x[[0, 2]], axis=1) < now[:, 2]).any())
+        inside = bool(
+            (np.linalg.norm(now[:, :2] - x[[0, 2]], axis=1) < now[:, 2]).any()
+        )
         active = decision.applicable and margins(decision).max() > -TOUCHES
         infeasible, flagged = (
             least_violation(decision) > MISSED,
             decision.violation > MISSED or not decision.status.solved,
         )
-        found = active, inside, inside and active, infeasible, flagged, infeasible and not flagged, loop.last.failed
+        found = (
+            active,
+            inside,
+            inside and active,
+            infeasible,
+            flagged,
+            infeasible and not flagged,
+            loop.last.failed,
+        )
         for key, value in zip(counts, found, strict=True):
             counts[key] += int(value)
     reached = float(np.linalg.norm(x[[0, 2]] - GOAL[[0, 2]]))
-    return {"seed": seed, "probability": probability, "ms": milliseconds[2:], "from goal": reached} | counts
+    return {
+        "seed": seed,
+        "probability": probability,
+        "ms": milliseconds[2:],
+        "from goal": reached,
+    } | counts
 
 
 def margins(decision: Decision) -> Array:
@@ -122,7 +164,12 @@ def least_violation(decision: Decision) -> float:
         np.append(program.upper[:size], np.full(rows, np.inf)),
     )
     return float(
-        linprog(costs, np.hstack([program.G, -np.eye(rows)]), program.upper[size:], bounds=np.transpose(sides)).fun
+        linprog(
+            costs,
+            np.hstack([program.G, -np.eye(rows)]),
+            program.upper[size:],
+            bounds=np.transpose(sides),
+        ).fun
     )
 
 
@@ -130,12 +177,19 @@ def main() -> None:
     """Flies what is missing, and prints the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--scenes", type=int, default=200)
-    parser.add_argument("--probability", type=float, default=0.95, help="of missing each disc, at each stage")
+    parser.add_argument(
+        "--probability",
+        type=float,
+        default=0.95,
+        help="of missing each disc, at each stage",
+    )
     arguments = parser.parse_args()
     RESULTS.mkdir(parents=True, exist_ok=True)
     path, eta = RESULTS / "obstacles.jsonl", arguments.probability
     lines = path.read_text().splitlines() if path.exists() else []
-    done = {row["seed"]: row for row in map(json.loads, lines) if row["probability"] == eta}
+    done = {
+        row["seed"]: row for row in map(json.loads, lines) if row["probability"] == eta
+    }
     model = learn()
     for seed in sorted(set(range(arguments.scenes)) - set(done)):
         done[seed] = fly(model, eta, seed)
@@ -151,18 +205,30 @@ def summary(scenes: list[dict], eta: float) -> str:
     low = beta.ppf(0.025, hits, active - hits + 1) if hits else 0.0
     high = beta.ppf(0.975, hits + 1, active - hits) if hits < active else 1.0
     times = np.concatenate([scene["ms"] for scene in scenes])
-    touched, reached = sum(scene["inside"] > 0 for scene in scenes), sum(scene["from goal"] < 0.3 for scene in scenes)
+    touched, reached = (
+        sum(scene["inside"] > 0 for scene in scenes),
+        sum(scene["from goal"] < 0.3 for scene in scenes),
+    )
     rows = [
         ("scenes, and steps", f"{len(scenes)}, {len(scenes) * STEPS}"),
-        (f"inside a disc, of {active} decisions at a bound", f"{hits / max(1, active):.2%} ({low:.2%} .. {high:.2%})"),
+        (
+            f"inside a disc, of {active} decisions at a bound",
+            f"{hits / max(1, active):.2%} ({low:.2%} .. {high:.2%})",
+        ),
         ("allowed", f"{1 - eta:.2%}"),
-        ("steps inside a disc, of all", f"{total['inside']} ({total['inside'] / len(scenes) / STEPS:.2%})"),
+        (
+            "steps inside a disc, of all",
+            f"{total['inside']} ({total['inside'] / len(scenes) / STEPS:.2%})",
+        ),
         ("scenes with one such step or more", f"{touched}"),
         ("scenes that end within 0.3 m of the goal", f"{reached}"),
         ("programs without a plan that keeps all bounds", f"{total['infeasible']}"),
         ("of these not flagged", f"{total['unflagged']}"),
         ("decisions that failed", f"{total['failed']}"),
-        ("a decision, median and 99 % [ms]", f"{np.median(times):.2f}, {np.quantile(times, 0.99):.2f}"),
+        (
+            "a decision, median and 99 % [ms]",
+            f"{np.median(times):.2f}, {np.quantile(times, 0.99):.2f}",
+        ),
     ]
     return "\n".join(f"{name:50} {value}" for name, value in rows)
 

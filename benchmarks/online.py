@@ -30,8 +30,20 @@ def main() -> None:
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     results = []
-    print("six outputs, one thread; medians of process time in ms; ratio: from hyperparameters over + 1 (paired)")
-    columns = ("N", "fresh N+1", "+ 1", "+ 10", "- oldest", "oldest", "least inf.", "ratio", "cold ratio")
+    print(
+        "six outputs, one thread; medians of process time in ms; ratio: from hyperparameters over + 1 (paired)"
+    )
+    columns = (
+        "N",
+        "fresh N+1",
+        "+ 1",
+        "+ 10",
+        "- oldest",
+        "oldest",
+        "least inf.",
+        "ratio",
+        "cold ratio",
+    )
     print("".join(f"{column:>12}" for column in columns))
     for size in arguments.sizes:
         x, y, settings = problem(size + 10)
@@ -39,12 +51,16 @@ def main() -> None:
         one, ten = (x[size : size + 1], y[size : size + 1]), (x[size:], y[size:])
         oldest, least = SlidingWindow(size), SlidingWindow(size, "least_informative")
         ways: dict[str, Callable[[], GPPosterior]] = {
-            "fresh": lambda s=size, x=x, y=y, h=settings: GPPosterior.from_hyperparameters(x[: s + 1], y[: s + 1], **h),
+            "fresh": lambda s=size, x=x, y=y, h=settings: (
+                GPPosterior.from_hyperparameters(x[: s + 1], y[: s + 1], **h)
+            ),
             "add_one": lambda gp=gp, new=one: append_points(gp, *new),
             "add_ten": lambda gp=gp, new=ten: append_points(gp, *new),
             "drop_oldest": lambda gp=gp: remove_points(gp, 0),
             "budget_oldest": lambda gp=gp, new=one, b=oldest: b.append(gp, *new),
-            "budget_least_informative": lambda gp=gp, new=one, b=least: b.append(gp, *new),
+            "budget_least_informative": lambda gp=gp, new=one, b=least: b.append(
+                gp, *new
+            ),
         }
         cold, warming, taken = ({name: [] for name in ways} for _ in range(3))
         for repeat in range(arguments.repeats + 1):
@@ -63,7 +79,11 @@ def main() -> None:
         ratios = np.array(taken["fresh"]) / taken["add_one"]
         medians = {name: float(np.median(seconds)) for name, seconds in taken.items()}
         after = float(np.median(np.array(cold["fresh"]) / cold["add_one"]))
-        found = {"ratio": float(np.median(ratios)), "least": ratios.min(), "ratio_after_other_work": after}
+        found = {
+            "ratio": float(np.median(ratios)),
+            "least": ratios.min(),
+            "ratio_after_other_work": after,
+        }
         results.append({"size": size, "seconds": medians} | found)
         row = "".join(f"{1e3 * median:12.2f}" for median in medians.values())
         print(f"{size:12}{row}{np.median(ratios):12.1f}{after:12.1f}", flush=True)
@@ -74,12 +94,17 @@ def problem(rows: int) -> tuple[torch.Tensor, torch.Tensor, dict]:
     """Points, targets and hyperparameters of smooth functions of nine features."""
     generator = torch.Generator().manual_seed(0)
     x = 4 * torch.rand(rows, FEATURES, generator=generator, dtype=torch.float64) - 2
-    y = torch.stack([torch.sin(x[:, a] + x[:, -1]) + x[:, 0] * x[:, 1] for a in range(OUTPUTS)], dim=1)
+    y = torch.stack(
+        [torch.sin(x[:, a] + x[:, -1]) + x[:, 0] * x[:, 1] for a in range(OUTPUTS)],
+        dim=1,
+    )
     return (
         x,
         y,
         {
-            "lengthscales": 1.5 + 2 * torch.rand(OUTPUTS, FEATURES, generator=generator, dtype=torch.float64),
+            "lengthscales": 1.5
+            + 2
+            * torch.rand(OUTPUTS, FEATURES, generator=generator, dtype=torch.float64),
             "signal_variance": torch.ones(OUTPUTS, dtype=torch.float64),
             "noise_variance": torch.full((OUTPUTS,), 1e-4, dtype=torch.float64),
             "input_dim": INPUTS,

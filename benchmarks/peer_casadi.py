@@ -94,19 +94,31 @@ class Casadi:
         cost, gaps, unknowns = 0, [], []
         for k in range(H):
             before = x[n:, k] if carried and k else u[:, k - 1] if k else last
-            following = casadi.vertcat(step(x[:n, k], u[:, k]), u[:, k] if carried else [])
+            following = casadi.vertcat(
+                step(x[:n, k], u[:, k]), u[:, k] if carried else []
+            )
             error = x[:n, k + 1] - r[:, k]
-            cost += casadi.bilin(R, u[:, k] - before) + casadi.bilin(terminal if k == H - 1 else Q, error)
+            cost += casadi.bilin(R, u[:, k] - before) + casadi.bilin(
+                terminal if k == H - 1 else Q, error
+            )
             gaps.append(
-                following - x[:, k + 1] if plugin == "sqpmethod" else x[:, k + 1] - following
+                following - x[:, k + 1]
+                if plugin == "sqpmethod"
+                else x[:, k + 1] - following
             )  # as they want it
             unknowns += [u[:, k], x[:, k + 1]]
-        w, p, g = casadi.vertcat(*unknowns), casadi.veccat(x[:n, 0], last, r), casadi.vertcat(*gaps)
+        w, p, g = (
+            casadi.vertcat(*unknowns),
+            casadi.veccat(x[:n, 0], last, r),
+            casadi.vertcat(*gaps),
+        )
         hessian = _gauss_newton(w, p, g, cost, triangle=plugin == "ipopt")
         options = _options(plugin, H, n + m, m, tolerance)
         if method in ("ipopt, gauss-newton", "sqpmethod"):
             options["hess_lag"] = hessian
-        self._solver = casadi.nlpsol("peer", plugin, {"x": w, "p": p, "f": cost, "g": g}, options)
+        self._solver = casadi.nlpsol(
+            "peer", plugin, {"x": w, "p": p, "f": cost, "g": g}, options
+        )
         free = np.full(n + carried, np.inf)
         self._lower = np.tile(np.concatenate([problem.inputs.lower, -free]), H)
         self._upper = np.tile(np.concatenate([problem.inputs.upper, free]), H)
@@ -117,7 +129,11 @@ class Casadi:
         H, _, m = self._shape
         if last is None:
             inputs = np.tile(instance.last, (H, 1))
-            start = np.hstack([inputs, instance.targets, inputs] if self._stagewise else [inputs, instance.targets])
+            start = np.hstack(
+                [inputs, instance.targets, inputs]
+                if self._stagewise
+                else [inputs, instance.targets]
+            )
             multipliers = {}
         else:
             start = _shifted(last.unknowns)
@@ -128,35 +144,60 @@ class Casadi:
         with interrupts_after():
             found = self._solver(
                 x0=start.ravel(),
-                p=np.concatenate([instance.state, instance.last, instance.targets.ravel()]),
+                p=np.concatenate(
+                    [instance.state, instance.last, instance.targets.ravel()]
+                ),
                 lbx=self._lower,
                 ubx=self._upper,
                 lbg=0.0,
                 ubg=0.0,
                 **multipliers,
             )
-        unknowns, of_bounds, of_dynamics = (np.array(found[key]).reshape(H, -1) for key in ("x", "lam_x", "lam_g"))
+        unknowns, of_bounds, of_dynamics = (
+            np.array(found[key]).reshape(H, -1) for key in ("x", "lam_x", "lam_g")
+        )
         return Solution(unknowns[:, :m].copy(), unknowns, of_bounds, of_dynamics)
 
 
 def check_problem(problem: Problem) -> None:
     """Raises where a problem has what the peers' formulations do not hand on."""
-    if problem.cost.penalized != "increments" or problem.constraints or problem.input_rates.finite:
-        raise SettingError("problem", "must weigh increments, and bound nothing but inputs")
+    if (
+        problem.cost.penalized != "increments"
+        or problem.constraints
+        or problem.input_rates.finite
+    ):
+        raise SettingError(
+            "problem", "must weigh increments, and bound nothing but inputs"
+        )
 
 
 def mean_function(gp: GPPosterior) -> casadi.Function:
     """The GPs' mean of the next state as scalar expressions, (state, input) -> mean."""
     x, u = casadi.MX.sym("state", gp.state_dim), casadi.MX.sym("input", gp.input_dim)
-    return casadi.Function("mean", [x, u], [casadi_function(gp)(x, u)[0]], ["state", "input"], ["mean"]).expand()
+    return casadi.Function(
+        "mean", [x, u], [casadi_function(gp)(x, u)[0]], ["state", "input"], ["mean"]
+    ).expand()
 
 
 def _gauss_newton(w: Any, p: Any, g: Any, cost: Any, triangle: bool) -> casadi.Function:
     """Hessian of the cost alone, which is that of Gauss and Newton for a quadratic cost of the unknowns."""
-    weight, multipliers = casadi.SX.sym("weight"), casadi.SX.sym("multipliers", g.numel())
+    weight, multipliers = (
+        casadi.SX.sym("weight"),
+        casadi.SX.sym("multipliers", g.numel()),
+    )
     hessian = weight * casadi.hessian(cost, w)[0]
-    name, value = ("triu_hess_gamma_x_x", casadi.triu(hessian)) if triangle else ("hess_gamma_x_x", hessian)
-    return casadi.Function("nlp_hess_l", [w, p, weight, multipliers], [value], ["x", "p", "lam_f", "lam_g"], [name])
+    name, value = (
+        ("triu_hess_gamma_x_x", casadi.triu(hessian))
+        if triangle
+        else ("hess_gamma_x_x", hessian)
+    )
+    return casadi.Function(
+        "nlp_hess_l",
+        [w, p, weight, multipliers],
+        [value],
+        ["x", "p", "lam_f", "lam_g"],
+        [name],
+    )
 
 
 def _options(plugin: str, H: int, n: int, m: int, tolerance: float) -> dict[str, Any]:
@@ -164,16 +205,38 @@ def _options(plugin: str, H: int, n: int, m: int, tolerance: float) -> dict[str,
     options: dict[str, Any] = {"print_time": False, "error_on_fail": False}
     if plugin == "ipopt":
         return options | {
-            "ipopt": {"print_level": 0, "sb": "yes", "tol": tolerance, "max_iter": MAX_ITERATIONS, **IPOPT_WARM}
+            "ipopt": {
+                "print_level": 0,
+                "sb": "yes",
+                "tol": tolerance,
+                "max_iter": MAX_ITERATIONS,
+                **IPOPT_WARM,
+            }
         }
     stages = {"N": H, "nx": [0] + [n] * H, "nu": [m] * H + [0], "ng": [0] * (H + 1)}
     if plugin == "sqpmethod":
-        quiet = dict.fromkeys(("print_header", "print_iteration", "print_status"), False)
-        hpipm = {"print_time": False, "error_on_fail": False, **stages, "hpipm": {"iter_max": 100}}
-        found = {"qpsol": "hpipm", "qpsol_options": hpipm, "tol_du": tolerance, "tol_pr": tolerance}
+        quiet = dict.fromkeys(
+            ("print_header", "print_iteration", "print_status"), False
+        )
+        hpipm = {
+            "print_time": False,
+            "error_on_fail": False,
+            **stages,
+            "hpipm": {"iter_max": 100},
+        }
+        found = {
+            "qpsol": "hpipm",
+            "qpsol_options": hpipm,
+            "tol_du": tolerance,
+            "tol_pr": tolerance,
+        }
         return options | quiet | found | {"max_iter": MAX_ITERATIONS}
     fatrop = {"print_level": 0, "tol": tolerance, "mu_init": IPOPT_WARM["mu_init"]}
-    structure = {"structure_detection": "manual", "equality": [True] * (H * n), **stages}
+    structure = {
+        "structure_detection": "manual",
+        "equality": [True] * (H * n),
+        **stages,
+    }
     return options | structure | {"fatrop": fatrop}
 
 

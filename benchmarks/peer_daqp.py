@@ -14,7 +14,12 @@ from gpmpc.qp import QPSolution, QuadraticProgram, make_solution
 from gpmpc.qp._problem import ABSENT
 from gpmpc.status import Status
 
-STATUSES = {1: Status.SOLVED, 2: Status.SOLVED, -1: Status.INFEASIBLE, -4: Status.ITERATION_LIMIT}  # of its exit flags
+STATUSES = {
+    1: Status.SOLVED,
+    2: Status.SOLVED,
+    -1: Status.INFEASIBLE,
+    -4: Status.ITERATION_LIMIT,
+}  # of its exit flags
 
 
 def installed() -> bool:
@@ -39,8 +44,13 @@ class Daqp:
         import daqp
 
         # Strided arrays are read wrongly by DAQP 0.11, and nothing is said.
-        P, q, G = (np.ascontiguousarray(part) for part in (problem.P, problem.q, problem.G))
-        lower, upper = np.clip(problem.lower, -ABSENT, ABSENT), np.clip(problem.upper, -ABSENT, ABSENT)
+        P, q, G = (
+            np.ascontiguousarray(part) for part in (problem.P, problem.q, problem.G)
+        )
+        lower, upper = (
+            np.clip(problem.lower, -ABSENT, ABSENT),
+            np.clip(problem.upper, -ABSENT, ABSENT),
+        )
         model = self._models.get(G.shape)
         if model is None:
             model = self._models[G.shape] = daqp.Model()
@@ -52,4 +62,6 @@ class Daqp:
         status = STATUSES.get(int(flag), Status.NUMERICAL_TROUBLE)
         if not status.solved:
             del self._models[G.shape]  # the next one starts afresh
-        return make_solution(problem, status, x, found["lam"], iterations=int(found["iterations"]))
+        return make_solution(
+            problem, status, x, found["lam"], iterations=int(found["iterations"])
+        )

@@ -13,7 +13,12 @@ import casadi
 import numpy as np
 
 from benchmarks.kkt import Instance
-from benchmarks.peer_casadi import IPOPT_WARM, MAX_ITERATIONS, check_problem, mean_function
+from benchmarks.peer_casadi import (
+    IPOPT_WARM,
+    MAX_ITERATIONS,
+    check_problem,
+    mean_function,
+)
 from gpmpc._interrupts import interrupts_after
 from gpmpc.exceptions import SettingError
 from gpmpc.gp import GPPosterior
@@ -46,14 +51,20 @@ class DoMpc:
         SettingError: do-mpc is not installed, or the problem has what this file does not hand on.
     """
 
-    def __init__(self, gp: GPPosterior, problem: Problem, horizon: int, tolerance: float):
+    def __init__(
+        self, gp: GPPosterior, problem: Problem, horizon: int, tolerance: float
+    ):
         if not installed():
             raise SettingError("peers", f"do-mpc is {MISSING}")
         check_problem(problem)
         if np.count_nonzero(problem.cost.R - np.diag(problem.cost.R.diagonal())):
-            raise SettingError("R", "must be diagonal: do-mpc's penalty of the increments is")
+            raise SettingError(
+                "R", "must be diagonal: do-mpc's penalty of the increments is"
+            )
         self._horizon = horizon
-        with warnings.catch_warnings():  # about what else could be installed, and about CasADi's next version
+        with (
+            warnings.catch_warnings()
+        ):  # about what else could be installed, and about CasADi's next version
             warnings.simplefilter("ignore")
             self._set_up(gp, problem, tolerance)
 
@@ -61,18 +72,30 @@ class DoMpc:
         toolbox = importlib.import_module("do_mpc")
         model = _model(toolbox, gp)
         self._mpc = mpc = toolbox.controller.MPC(model)
-        mpc.settings.n_horizon, mpc.settings.t_step, mpc.settings.store_full_solution = self._horizon, 1.0, False
+        (
+            mpc.settings.n_horizon,
+            mpc.settings.t_step,
+            mpc.settings.store_full_solution,
+        ) = self._horizon, 1.0, False
         settings = {
             "tol": tolerance,
             "max_iter": MAX_ITERATIONS,
         } | IPOPT_WARM  # it hands on the last multipliers, but no such option
-        mpc.settings.nlpsol_opts = {f"ipopt.{name}": value for name, value in settings.items()}
+        mpc.settings.nlpsol_opts = {
+            f"ipopt.{name}": value for name, value in settings.items()
+        }
         mpc.settings.supress_ipopt_output()
         x, r = model.x["x"], model.tvp["r"]
         Q, terminal = casadi.DM(problem.cost.Q), casadi.DM(problem.cost.terminal)
-        mpc.set_objective(mterm=casadi.bilin(terminal, x - r, x - r), lterm=casadi.bilin(Q, x - r, x - r))
+        mpc.set_objective(
+            mterm=casadi.bilin(terminal, x - r, x - r),
+            lterm=casadi.bilin(Q, x - r, x - r),
+        )
         mpc.set_rterm(u=problem.cost.R.diagonal())
-        mpc.bounds["lower", "_u", "u"], mpc.bounds["upper", "_u", "u"] = problem.inputs.lower, problem.inputs.upper
+        mpc.bounds["lower", "_u", "u"], mpc.bounds["upper", "_u", "u"] = (
+            problem.inputs.lower,
+            problem.inputs.upper,
+        )
         self._references = mpc.get_tvp_template()
         mpc.set_tvp_fun(lambda time: self._references)
         mpc.setup()
@@ -89,7 +112,9 @@ class DoMpc:
             mpc.set_initial_guess()
         with interrupts_after():
             mpc.make_step(instance.state)
-        inputs = [np.array(mpc.opt_x_num["_u", k, 0]).ravel() for k in range(self._horizon)]
+        inputs = [
+            np.array(mpc.opt_x_num["_u", k, 0]).ravel() for k in range(self._horizon)
+        ]
         return Planned(np.array(inputs))
 
 

@@ -37,21 +37,31 @@ class GPyTorchSlsqp:
         SettingError: The problem weighs something else than increments, or bounds more than inputs.
     """
 
-    def __init__(self, gp: GPPosterior, problem: Problem, horizon: int, tolerance: float):
+    def __init__(
+        self, gp: GPPosterior, problem: Problem, horizon: int, tolerance: float
+    ):
         check_problem(problem)
-        self._model, self._adds_state = to_gpytorch(gp).requires_grad_(False), gp.predicts == "difference"
+        self._model, self._adds_state = (
+            to_gpytorch(gp).requires_grad_(False),
+            gp.predicts == "difference",
+        )
         self._horizon, self._tolerance = horizon, tolerance
         self._Q, self._R, self._terminal = map(
             torch.from_numpy, (problem.cost.Q, problem.cost.R, problem.cost.terminal)
         )
-        self._bounds = list(zip(problem.inputs.lower, problem.inputs.upper, strict=True)) * horizon
+        self._bounds = (
+            list(zip(problem.inputs.lower, problem.inputs.upper, strict=True)) * horizon
+        )
 
     def __call__(self, instance: Instance, last: Plan | None) -> Plan:
         """The plan from a state along a reference, started from the last one, shifted."""
         start = np.tile(instance.last, (self._horizon, 1))
         if last is not None:
             start = np.concatenate([last.inputs[1:], last.inputs[-1:]])
-        targets, before = torch.from_numpy(instance.targets), torch.from_numpy(np.array(instance.last))
+        targets, before = (
+            torch.from_numpy(instance.targets),
+            torch.from_numpy(np.array(instance.last)),
+        )
 
         def cost(plan: np.ndarray) -> tuple[float, np.ndarray]:
             inputs = torch.tensor(plan.reshape(start.shape), requires_grad=True)
@@ -61,14 +71,29 @@ class GPyTorchSlsqp:
 
         options = {"maxiter": 200, "ftol": self._tolerance}
         with exact_inference(), gpytorch.settings.skip_posterior_variances():
-            found = minimize(cost, start.ravel(), jac=True, method="SLSQP", bounds=self._bounds, options=options)
+            found = minimize(
+                cost,
+                start.ravel(),
+                jac=True,
+                method="SLSQP",
+                bounds=self._bounds,
+                options=options,
+            )
         return Plan(found.x.reshape(start.shape))
 
-    def _cost(self, x: torch.Tensor, last: torch.Tensor, inputs: torch.Tensor, targets: torch.Tensor) -> torch.Tensor:
+    def _cost(
+        self,
+        x: torch.Tensor,
+        last: torch.Tensor,
+        inputs: torch.Tensor,
+        targets: torch.Tensor,
+    ) -> torch.Tensor:
         increments = torch.diff(inputs, dim=0, prepend=last[None])
         total = (increments @ self._R * increments).sum()
         for k, target in enumerate(targets):
             moved = self._model(torch.cat([x, inputs[k]])[None]).mean[:, 0]
             x = x + moved if self._adds_state else moved
-            total = total + (x - target) @ (self._terminal if k + 1 == len(targets) else self._Q) @ (x - target)
+            total = total + (x - target) @ (
+                self._terminal if k + 1 == len(targets) else self._Q
+            ) @ (x - target)
         return total

@@ -48,7 +48,13 @@ from gpmpc.status import Status
 
 TRAJECTORY, STEPS = "lorenz", 150
 ACCURACY = 1e-5  # of the common KKT residual
-IPOPT, SQP, FATROP, SLSQP, OURS = 1e-7, 1e-4, 1e-7, 1e-12, 1e-3  # tolerances of the solvers' own tests
+IPOPT, SQP, FATROP, SLSQP, OURS = (
+    1e-7,
+    1e-4,
+    1e-7,
+    1e-12,
+    1e-3,
+)  # tolerances of the solvers' own tests
 IN_A_ROW = 10
 MIN_ROUNDS = 2  # where a solver takes seconds
 SLOW_ABOVE = 10  # horizon above which SLSQP is left out: minutes
@@ -64,9 +70,15 @@ def main() -> None:
     """Measures and prints."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--horizons", type=int, nargs="*", default=[1, 10, 20])
-    parser.add_argument("--alone", type=int, nargs="*", default=[50], help="horizons for gpmpc only")
-    parser.add_argument("--seconds", type=float, default=20.0, help="processor time of each table [s]")
-    parser.add_argument("--starts", nargs="+", choices=["warm", "cold"], default=["warm", "cold"])
+    parser.add_argument(
+        "--alone", type=int, nargs="*", default=[50], help="horizons for gpmpc only"
+    )
+    parser.add_argument(
+        "--seconds", type=float, default=20.0, help="processor time of each table [s]"
+    )
+    parser.add_argument(
+        "--starts", nargs="+", choices=["warm", "cold"], default=["warm", "cold"]
+    )
     arguments = parser.parse_args()
     use_one_thread()
     here, rows, sections = machine(), [], []
@@ -74,17 +86,26 @@ def main() -> None:
     print(f"{describe(here)}\n")
     for horizon in (*arguments.horizons, *arguments.alone):
         instances = record_instances(gp, task, horizon, STEPS)
-        tables = {("converged", start): converged(gp, task, horizon) for start in arguments.starts}
+        tables = {
+            ("converged", start): converged(gp, task, horizon)
+            for start in arguments.starts
+        }
         if horizon in arguments.alone:
             tables = {key: {OWN: cases[OWN]} for key, cases in tables.items()}
         elif horizon <= SLOW_ABOVE:
             tables["converged by torch", "warm"] = slow(gp, task, horizon)
         tables["one program", "warm"] = one_program(gp, task, horizon)
         for (kind, start), cases in tables.items():
-            found = measure(cases, gp, task, instances, arguments.seconds, cold=start == "cold")
-            sections.append(f"H = {horizon}, {kind}, started {start}\n\n{table(found)}\n")
+            found = measure(
+                cases, gp, task, instances, arguments.seconds, cold=start == "cold"
+            )
+            sections.append(
+                f"H = {horizon}, {kind}, started {start}\n\n{table(found)}\n"
+            )
             print(sections[-1], flush=True)
-            rows += [{"kind": kind, "start": start, "H": horizon} | row for row in found]
+            rows += [
+                {"kind": kind, "start": start, "H": horizon} | row for row in found
+            ]
     write_results("peers", rows, machine=here)
     (RESULTS / "peers.md").write_text("\n".join([f"{describe(here)}\n", *sections]))
 
@@ -94,15 +115,30 @@ def peers_problem() -> Problem:
     return problem(thrust=(6.0, 8.0), tilt=0.05)
 
 
-def record_instances(gp: GPPosterior, task: Problem, horizon: int, steps: int) -> list[Instance]:
+def record_instances(
+    gp: GPPosterior, task: Problem, horizon: int, steps: int
+) -> list[Instance]:
     """Flies with one program per step and returns the optimal control problems of the flight."""
     flown = recorded(
-        GPMPC(gp, Linearization(), task, horizon, HOVER, prediction=PredictionSettings(covariance="none")),
+        GPMPC(
+            gp,
+            Linearization(),
+            task,
+            horizon,
+            HOVER,
+            prediction=PredictionSettings(covariance="none"),
+        ),
         TRAJECTORY,
         steps,
     )
-    before = [np.array(HOVER) if step.previous is None else step.previous.input for step in flown]
-    return [Instance(step.belief, step.reference, last) for step, last in zip(flown, before, strict=True)]
+    before = [
+        np.array(HOVER) if step.previous is None else step.previous.input
+        for step in flown
+    ]
+    return [
+        Instance(step.belief, step.reference, last)
+        for step, last in zip(flown, before, strict=True)
+    ]
 
 
 def converged(gp: GPPosterior, task: Problem, horizon: int) -> Cases:
@@ -111,16 +147,26 @@ def converged(gp: GPPosterior, task: Problem, horizon: int) -> Cases:
     def ours() -> Solve:
         settings = PredictionSettings(covariance="none")
         problem = task, horizon, HOVER
-        return by_controller(GPMPC(gp, Linearization(), *problem, settings, iterations=50, tolerance=OURS))
+        return by_controller(
+            GPMPC(
+                gp, Linearization(), *problem, settings, iterations=50, tolerance=OURS
+            )
+        )
 
     def do_mpc() -> Solve:
         return peer_do_mpc.DoMpc(gp, task, horizon, IPOPT)
 
     cases: Cases = {
         OWN: ours,
-        "CasADi, IPOPT, exact Hessian": lambda: Casadi(gp, task, horizon, "ipopt", IPOPT),
-        "CasADi, IPOPT, Gauss-Newton": lambda: Casadi(gp, task, horizon, "ipopt, gauss-newton", IPOPT),
-        "CasADi, sqpmethod + HPIPM": lambda: Casadi(gp, task, horizon, "sqpmethod", SQP),
+        "CasADi, IPOPT, exact Hessian": lambda: Casadi(
+            gp, task, horizon, "ipopt", IPOPT
+        ),
+        "CasADi, IPOPT, Gauss-Newton": lambda: Casadi(
+            gp, task, horizon, "ipopt, gauss-newton", IPOPT
+        ),
+        "CasADi, sqpmethod + HPIPM": lambda: Casadi(
+            gp, task, horizon, "sqpmethod", SQP
+        ),
         "CasADi, FATROP": lambda: Casadi(gp, task, horizon, "fatrop", FATROP),
         "do-mpc, IPOPT": do_mpc if peer_do_mpc.installed() else None,
     }
@@ -140,11 +186,19 @@ def one_program(gp: GPPosterior, task: Problem, horizon: int) -> Cases:
     """Builds the real-time iterations, with our QP solver and with DAQP."""
     cases: Cases = {}
     for name, covariance in (("mean only", "none"), ("zero order", "zero_order")):
-        settings: dict[str, Any] = {"prediction": PredictionSettings(covariance=covariance)}
+        settings: dict[str, Any] = {
+            "prediction": PredictionSettings(covariance=covariance)
+        }
         common = (gp, Linearization(), task, horizon, HOVER)
-        cases[f"gpmpc, {name}"] = lambda a=common, s=settings: by_controller(GPMPC(*a, **s))
-        daqp = settings | {"solver": peer_daqp.Daqp()} if peer_daqp.installed() else None
-        cases[f"gpmpc, {name}, DAQP inside"] = daqp and (lambda a=common, s=daqp: by_controller(GPMPC(*a, **s)))
+        cases[f"gpmpc, {name}"] = lambda a=common, s=settings: by_controller(
+            GPMPC(*a, **s)
+        )
+        daqp = (
+            settings | {"solver": peer_daqp.Daqp()} if peer_daqp.installed() else None
+        )
+        cases[f"gpmpc, {name}, DAQP inside"] = daqp and (
+            lambda a=common, s=daqp: by_controller(GPMPC(*a, **s))
+        )
     return cases
 
 
@@ -152,7 +206,9 @@ def by_controller(controller: Controller) -> Solve:
     """Wraps a controller of this package as a solver."""
 
     def solve(instance: Instance, last: Decision | None) -> Decision:
-        return controller.control(instance.belief, instance.reference, _previous(instance, last))
+        return controller.control(
+            instance.belief, instance.reference, _previous(instance, last)
+        )
 
     return solve
 
@@ -180,7 +236,12 @@ class Run:
     """
 
     def __init__(self, solve: Solve, instances: Sequence[Instance], cold: bool = False):
-        self._solve, self._instances, self._cold, self._last = solve, instances, cold, None
+        self._solve, self._instances, self._cold, self._last = (
+            solve,
+            instances,
+            cold,
+            None,
+        )
         self.plans: list[tuple[int, np.ndarray]] = []
 
     def __call__(self) -> None:
@@ -192,21 +253,45 @@ class Run:
 
 
 def measure(
-    cases: Cases, gp: GPPosterior, task: Problem, instances: Sequence[Instance], seconds: float, cold: bool
+    cases: Cases,
+    gp: GPPosterior,
+    task: Problem,
+    instances: Sequence[Instance],
+    seconds: float,
+    cold: bool,
 ) -> list[dict]:
     """Times the solvers in turns and judges their plans."""
-    runs = {name: Run(make(), instances, cold) for name, make in cases.items() if make is not None}
+    runs = {
+        name: Run(make(), instances, cold)
+        for name, make in cases.items()
+        if make is not None
+    }
     taken = time_interleaved(runs, seconds, min_rounds=MIN_ROUNDS, in_a_row=IN_A_ROW)
-    first, later = ({name: times.split(IN_A_ROW)[part] for name, times in taken.items()} for part in (0, 1))
+    first, later = (
+        {name: times.split(IN_A_ROW)[part] for name, times in taken.items()}
+        for part in (0, 1)
+    )
     rows = []
     for name, make in cases.items():
         if make is None:
             rows.append({"what": name, "note": peer_do_mpc.MISSING})
             continue
-        residuals = [kkt_residual(gp, task, instances[k], plan) for k, plan in runs[name].plans[WARM_UP_CALLS:]]
-        ours = OWN if OWN in cases else name.removesuffix(", DAQP inside")  # or its own controller
-        row = {"what": name} | later[name].summary() | {"evicted": 1e3 * first[name].median}
-        row |= {"times_ours": later[name].over(later[ours]), "times_ours_evicted": first[name].over(first[ours])}
+        residuals = [
+            kkt_residual(gp, task, instances[k], plan)
+            for k, plan in runs[name].plans[WARM_UP_CALLS:]
+        ]
+        ours = (
+            OWN if OWN in cases else name.removesuffix(", DAQP inside")
+        )  # or its own controller
+        row = (
+            {"what": name}
+            | later[name].summary()
+            | {"evicted": 1e3 * first[name].median}
+        )
+        row |= {
+            "times_ours": later[name].over(later[ours]),
+            "times_ours_evicted": first[name].over(first[ours]),
+        }
         row |= {"kkt": float(np.median(residuals)), "kkt_worst": float(max(residuals))}
         row["within"] = float((np.array(residuals) <= ACCURACY).mean())
         rows.append(row)
@@ -221,7 +306,13 @@ def table(rows: Sequence[Mapping[str, Any]]) -> str:
         "within": f"within {ACCURACY:g}", "samples": "calls", "note": "note",
     }  # fmt: skip
     used = [key for key in columns if any(key in row for row in rows)]
-    cells = [[f"{row[key]:.0%}" if key == "within" and key in row else row.get(key) for key in used] for row in rows]
+    cells = [
+        [
+            f"{row[key]:.0%}" if key == "within" and key in row else row.get(key)
+            for key in used
+        ]
+        for row in rows
+    ]
     return markdown_table([columns[key] for key in used], cells)
 
 

@@ -66,17 +66,27 @@ def pendulum_plant(state_dim: int) -> System:
 
 def pendulum_gp(state_dim: int, size: int, seed: int = 0) -> GPPosterior:
     """GPs on ``size`` transitions from all over the region that ``pendulum_references`` crosses."""
-    random, plant = np.random.default_rng([seed, state_dim, size]), pendulum_plant(state_dim)
+    random, plant = (
+        np.random.default_rng([seed, state_dim, size]),
+        pendulum_plant(state_dim),
+    )
     n, m = state_dim, state_dim // 2
-    states = random.uniform(-1.0, 1.0, (size, n)) * np.tile([1.2, 2.5], m)  # [rad, rad/s]
+    states = random.uniform(-1.0, 1.0, (size, n)) * np.tile(
+        [1.2, 2.5], m
+    )  # [rad, rad/s]
     inputs = random.uniform(-6.0, 6.0, (size, m))  # [1/s^2]
-    changes = np.array([step(plant, x, u) for x, u in zip(states, inputs, strict=True)]) - states
+    changes = (
+        np.array([step(plant, x, u) for x, u in zip(states, inputs, strict=True)])
+        - states
+    )
     features = np.concatenate([states, inputs], axis=1)
     # Wider than the data, as for a smooth system, and every feature counts in every output.
     scales = np.tile(6.0 * (features.std(0) + 1e-3), (n, 1))
     signal = 100.0 * (changes.var(0) + 1e-6)
     parts = (features, changes, scales, signal, NOISE_SHARE * signal)
-    return GPPosterior.from_hyperparameters(*map(torch.from_numpy, parts), m, predicts="difference")
+    return GPPosterior.from_hyperparameters(
+        *map(torch.from_numpy, parts), m, predicts="difference"
+    )
 
 
 def pendulum_references(state_dim: int, steps: int) -> np.ndarray:

@@ -25,9 +25,19 @@ import daqp
 import numpy as np
 
 from benchmarks.quadrotor import TRAJECTORIES
-from benchmarks.quadrotor_sequences import SequenceProblem, flight_sequence, quadrotor_sequence
+from benchmarks.quadrotor_sequences import (
+    SequenceProblem,
+    flight_sequence,
+    quadrotor_sequence,
+)
 from benchmarks.timing import write_results
-from gpmpc.qp import CvxpySolver, DualActiveSet, PrimalActiveSet, QuadraticProgram, make_solution
+from gpmpc.qp import (
+    CvxpySolver,
+    DualActiveSet,
+    PrimalActiveSet,
+    QuadraticProgram,
+    make_solution,
+)
 from gpmpc.status import Status
 
 OURS, DAQP_WARM, DAQP_COLD = "DualActiveSet", "DAQP update + solve", "DAQP solve"
@@ -46,9 +56,17 @@ def ours(changing: bool) -> Callable[[SequenceProblem], Solve]:
 
         def solve(problem: SequenceProblem):
             nonlocal last
-            P, q, G, lower, upper = problem.P, problem.q, problem.G, problem.lower, problem.upper
+            P, q, G, lower, upper = (
+                problem.P,
+                problem.q,
+                problem.G,
+                problem.lower,
+                problem.upper,
+            )
             if changing:
-                last = solver.solve(QuadraticProgram.unchecked(P, q, G, lower, upper), last)
+                last = solver.solve(
+                    QuadraticProgram.unchecked(P, q, G, lower, upper), last
+                )
             else:
                 last = prepared.solve(q, lower, upper, last)
             return last.x, last
@@ -68,7 +86,13 @@ def daqp_warm(changing: bool) -> Callable[[SequenceProblem], Solve]:
 
         def solve(problem: SequenceProblem):
             if changing:
-                model.update(H=problem.P, f=problem.q, A=problem.G, bupper=problem.upper, blower=problem.lower)
+                model.update(
+                    H=problem.P,
+                    f=problem.q,
+                    A=problem.G,
+                    bupper=problem.upper,
+                    blower=problem.lower,
+                )
             else:
                 model.update(f=problem.q, bupper=problem.upper, blower=problem.lower)
             x, _, _, info = model.solve()
@@ -84,7 +108,9 @@ def daqp_cold(first: SequenceProblem) -> Solve:
     sense = np.zeros(len(first.lower), dtype=np.int32)
 
     def solve(problem: SequenceProblem):
-        x, _, _, info = daqp.solve(problem.P, problem.q, problem.G, problem.upper, problem.lower, sense)
+        x, _, _, info = daqp.solve(
+            problem.P, problem.q, problem.G, problem.upper, problem.lower, sense
+        )
         return x, info
 
     return solve
@@ -106,10 +132,14 @@ def by_protocol(solver) -> Callable[[SequenceProblem], Solve]:
     return begin
 
 
-def run_pass(begin, problems: list[SequenceProblem], flush: bool, as_program: bool) -> tuple[np.ndarray, list]:
+def run_pass(
+    begin, problems: list[SequenceProblem], flush: bool, as_program: bool
+) -> tuple[np.ndarray, list]:
     """Seconds per QP of one pass over the sequence, and what the solver returned for each."""
     first = problems[0]
-    buffer = SequenceProblem(*(np.array(a) for a in (first.P, first.q, first.G, first.lower, first.upper)))
+    buffer = SequenceProblem(
+        *(np.array(a) for a in (first.P, first.q, first.G, first.lower, first.upper))
+    )
     solve = begin(buffer)
     seconds, answers = np.empty(len(problems)), []
     gc.collect()
@@ -117,14 +147,23 @@ def run_pass(begin, problems: list[SequenceProblem], flush: bool, as_program: bo
     for i, problem in enumerate(problems):
         for name in ("P", "q", "G", "lower", "upper"):
             np.copyto(getattr(buffer, name), getattr(problem, name))
-        given = QuadraticProgram.from_stacked(*vars(buffer).values()) if as_program else buffer
+        given = (
+            QuadraticProgram.from_stacked(*vars(buffer).values())
+            if as_program
+            else buffer
+        )
         if flush:
             CACHES[:] = i
         began = perf_counter()
         answer = solve(given)
         seconds[i] = perf_counter() - began
         x, rest = answer  # copied, so that no solver's memory grows with the sequence
-        answers.append((x.copy(), np.array(rest["lam"] if isinstance(rest, dict) else rest.multipliers)))
+        answers.append(
+            (
+                x.copy(),
+                np.array(rest["lam"] if isinstance(rest, dict) else rest.multipliers),
+            )
+        )
     gc.enable()
     return seconds, answers
 
@@ -139,7 +178,9 @@ def worst_residual(problem: SequenceProblem, answer) -> float:
 
 def active_rows(problem: SequenceProblem) -> int:
     """Number of active constraints at the minimiser."""
-    solution = DualActiveSet().solve(QuadraticProgram.unchecked(*vars(problem).values()))
+    solution = DualActiveSet().solve(
+        QuadraticProgram.unchecked(*vars(problem).values())
+    )
     return int(np.count_nonzero(solution.active_set))
 
 
@@ -154,9 +195,14 @@ def measure_cell(horizon: int, mode: str, settings: argparse.Namespace) -> dict:
     if mode in TRAJECTORIES:
         problems = flight_sequence(mode, horizon, settings.length)
     else:
-        problems = list(quadrotor_sequence(horizon, changing, settings.length, close_loop))
+        problems = list(
+            quadrotor_sequence(horizon, changing, settings.length, close_loop)
+        )
     fast = {OURS: ours(changing), DAQP_WARM: daqp_warm(changing), DAQP_COLD: daqp_cold}
-    slow = {PRIMAL: by_protocol(PrimalActiveSet()), CVXPY: by_protocol(CvxpySolver("CLARABEL", {}))}
+    slow = {
+        PRIMAL: by_protocol(PrimalActiveSet()),
+        CVXPY: by_protocol(CvxpySolver("CLARABEL", {})),
+    }
     cell = {
         "horizon": horizon,
         "mode": mode,
@@ -166,7 +212,10 @@ def measure_cell(horizon: int, mode: str, settings: argparse.Namespace) -> dict:
         "active rows": float(np.mean([active_rows(p) for p in problems])),
         "solvers": {},
     }
-    for condition, passes in (("hot", settings.passes), ("flushed", min(settings.passes, 2))):
+    for condition, passes in (
+        ("hot", settings.passes),
+        ("flushed", min(settings.passes, 2)),
+    ):
         flush = condition == "flushed"
         some = problems[: max(20, len(problems) // 4)] if flush else problems
         seconds = {name: np.full(len(some), np.inf) for name in fast}
@@ -175,7 +224,9 @@ def measure_cell(horizon: int, mode: str, settings: argparse.Namespace) -> dict:
                 taken, answers = run_pass(begin, some, flush, False)
                 seconds[name] = np.minimum(seconds[name], taken)
                 if not flush:
-                    cell["solvers"].setdefault(name, {})["residual"] = max(map(worst_residual, some, answers))
+                    cell["solvers"].setdefault(name, {})["residual"] = max(
+                        map(worst_residual, some, answers)
+                    )
         for name, values in seconds.items():
             cell["solvers"][name][condition] = quantiles(values)
     for name, begin in slow.items():
@@ -185,7 +236,9 @@ def measure_cell(horizon: int, mode: str, settings: argparse.Namespace) -> dict:
             cell["solvers"][name] = {
                 "residual": max(map(worst_residual, some, answers)), "hot": quantiles(taken[1:]),
             }  # fmt: skip
-    best = min((DAQP_WARM, DAQP_COLD), key=lambda name: cell["solvers"][name]["hot"]["median"])
+    best = min(
+        (DAQP_WARM, DAQP_COLD), key=lambda name: cell["solvers"][name]["hot"]["median"]
+    )
     cell["best DAQP path"] = best
     for condition in ("hot", "flushed"):
         mine, theirs = (cell["solvers"][name][condition] for name in (OURS, best))
@@ -216,13 +269,22 @@ def main() -> None:
     """Measures the cells asked for and writes what was found."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--horizons", default="1,5,10,20,50", help="comma-separated")
-    parser.add_argument("--modes", default="constant,changing,elliptical,lorenz", help="comma-separated")
+    parser.add_argument(
+        "--modes", default="constant,changing,elliptical,lorenz", help="comma-separated"
+    )
     parser.add_argument("--length", type=int, default=340, help="QPs per cell")
     parser.add_argument("--passes", type=int, default=3, help="turns of each solver")
-    parser.add_argument("--slow-solvers", type=int, default=30, help="QPs for Algorithm 1 and CVXPY; 0 leaves them out")
+    parser.add_argument(
+        "--slow-solvers",
+        type=int,
+        default=30,
+        help="QPs for Algorithm 1 and CVXPY; 0 leaves them out",
+    )
     settings = parser.parse_args()
     cells = []
-    for mode, horizon in product(settings.modes.split(","), map(int, settings.horizons.split(","))):
+    for mode, horizon in product(
+        settings.modes.split(","), map(int, settings.horizons.split(","))
+    ):
         cells.append(measure_cell(horizon, mode, settings))
         print(describe(cells[-1]), flush=True)
     write_results("qp", cells, unit="microseconds", numpy=np.__version__)

@@ -33,13 +33,18 @@ DRAG = 0.2  # [1/s]
 STATE_WEIGHT = np.diag([20.0, 1.0, 20.0, 1.0, 20.0, 1.0])
 INPUT_WEIGHT = np.diag([0.05, 2.0, 2.0])
 INPUT_LIMIT = np.array([4.0, 0.45, 0.45])  # deviation from hover: thrust [N], tilts [-]
-WIDE = np.array([5.0, 6.0] * 3)  # bounds on positions [m] and velocities [m/s] outside the corridor
+WIDE = np.array(
+    [5.0, 6.0] * 3
+)  # bounds on positions [m] and velocities [m/s] outside the corridor
 NARROW = np.array([2.5, 2.5] * 3)  # and inside it
 POSITION_NOISE, VELOCITY_NOISE = 0.01, 0.05  # standard deviations per step [m], [m/s]
 
 
 # Bounds that are active at about one step in ten: of ux and uy [-], and of the increments of U1 [N], ux, uy.
-TIGHT = {"elliptical": (0.015, [0.014, 0.004, 0.004]), "lorenz": (0.04, [0.2, 0.02, 0.03])}
+TIGHT = {
+    "elliptical": (0.015, [0.014, 0.004, 0.004]),
+    "lorenz": (0.04, [0.2, 0.02, 0.03]),
+}
 
 
 @dataclass(frozen=True)
@@ -57,14 +62,21 @@ def _reference(times: Array) -> Array:
     """Positions and velocities of the curve, one row of six per time."""
     frequencies, amplitudes = np.array([0.9, 1.3, 0.7]), np.array([4.0, 3.0, 2.0])
     phase = times[:, None] * frequencies
-    positions, velocities = amplitudes * np.sin(phase), amplitudes * frequencies * np.cos(phase)
+    positions, velocities = (
+        amplitudes * np.sin(phase),
+        amplitudes * frequencies * np.cos(phase),
+    )
     return np.stack([positions, velocities], axis=2).reshape(len(times), 6)
 
 
 def _linear_model(thrust: float, tilt: Array) -> tuple[Array, Array]:
     """Discrete A, B (explicit in velocity, exact in position) at a thrust [N] and two tilts [-]."""
     acceleration = np.array(
-        [[tilt[0] / MASS, thrust / MASS, 0.0], [tilt[1] / MASS, 0.0, thrust / MASS], [-1.0 / MASS, 0.0, 0.0]]
+        [
+            [tilt[0] / MASS, thrust / MASS, 0.0],
+            [tilt[1] / MASS, 0.0, thrust / MASS],
+            [-1.0 / MASS, 0.0, 0.0],
+        ]
     )
     A, B = np.eye(6), np.zeros((6, 3))
     A[[0, 2, 4], [1, 3, 5]] = TIME_STEP
@@ -93,7 +105,9 @@ def _state_limits(times: Array) -> Array:
     return np.where(inside[:, None], NARROW, WIDE).ravel()
 
 
-def quadrotor_sequence(horizon: int, changing: bool, length: int, solve, seed: int = 0) -> Iterator[SequenceProblem]:
+def quadrotor_sequence(
+    horizon: int, changing: bool, length: int, solve, seed: int = 0
+) -> Iterator[SequenceProblem]:
     """The QPs of ``length`` closed-loop steps; ``solve(problem) -> x`` closes the loop."""
     rng = np.random.default_rng(seed)
     weight = np.kron(np.eye(horizon), STATE_WEIGHT)
@@ -103,10 +117,18 @@ def quadrotor_sequence(horizon: int, changing: bool, length: int, solve, seed: i
     for step in range(length):
         now = step * TIME_STEP
         if changing or prepared is None:
-            motion = np.array([np.sin(0.8 * now), np.cos(0.6 * now), np.sin(0.5 * now)]) if changing else np.zeros(3)
-            A, B = _linear_model(MASS * GRAVITY * (1.0 + 0.2 * motion[0]), 0.3 * motion[1:])
+            motion = (
+                np.array([np.sin(0.8 * now), np.cos(0.6 * now), np.sin(0.5 * now)])
+                if changing
+                else np.zeros(3)
+            )
+            A, B = _linear_model(
+                MASS * GRAVITY * (1.0 + 0.2 * motion[0]), 0.3 * motion[1:]
+            )
             free, forced = _condense(A, B, horizon)
-            P = 2.0 * (forced.T @ weight @ forced + np.kron(np.eye(horizon), INPUT_WEIGHT))
+            P = 2.0 * (
+                forced.T @ weight @ forced + np.kron(np.eye(horizon), INPUT_WEIGHT)
+            )
             prepared = 0.5 * (P + P.T), forced, 2.0 * forced.T @ weight
         P, forced, gradient = prepared
         G = np.ascontiguousarray(forced)
@@ -124,19 +146,32 @@ def quadrotor_sequence(horizon: int, changing: bool, length: int, solve, seed: i
         state = A @ state + B @ plan[:3] + noise
 
 
-def flight_sequence(trajectory: str, horizon: int, length: int) -> list[SequenceProblem]:
+def flight_sequence(
+    trajectory: str, horizon: int, length: int
+) -> list[SequenceProblem]:
     """The QPs of a flight of the learned quadrotor with the plant in the loop, those without a solution left out."""
     states = states_along(TRAJECTORIES[trajectory], np.arange(length + horizon + 1.0))
-    margin = 0.05 + 0.02 * np.ptp(states, axis=0)  # [m, m/s] around all that the reference visits
-    bounds = Box(states.min(axis=0) - margin, states.max(axis=0) + margin, probability=0.95, penalty=None)
+    margin = 0.05 + 0.02 * np.ptp(
+        states, axis=0
+    )  # [m, m/s] around all that the reference visits
+    bounds = Box(
+        states.min(axis=0) - margin,
+        states.max(axis=0) + margin,
+        probability=0.95,
+        penalty=None,
+    )
     bounded = problem(bounds, tilt=TIGHT[trajectory][0])
     controller = GPMPC(trained(trajectory), Linearization(), bounded, horizon, HOVER)
     steps = recorded(controller, trajectory, length)
     programs = [step.decision.problem for step in steps if step.decision.status.solved]
-    return [_two_sided(*(np.array(part) for part in program[:5])) for program in programs]
+    return [
+        _two_sided(*(np.array(part) for part in program[:5])) for program in programs
+    ]
 
 
-def _two_sided(P: Array, q: Array, G: Array, lower: Array, upper: Array) -> SequenceProblem:
+def _two_sided(
+    P: Array, q: Array, G: Array, lower: Array, upper: Array
+) -> SequenceProblem:
     """Merges rows that are equal, such as an upper and a lower bound of one state: other solvers have fewer to scan."""
     n = len(q)
     rows, first, group = np.unique(G, axis=0, return_index=True, return_inverse=True)
@@ -145,4 +180,6 @@ def _two_sided(P: Array, q: Array, G: Array, lower: Array, upper: Array) -> Sequ
     np.minimum.at(high, group.ravel(), upper[n:])
     order = np.argsort(first)
     G, low, high = np.ascontiguousarray(rows[order]), low[order], high[order]
-    return SequenceProblem(P, q, G, np.concatenate([lower[:n], low]), np.concatenate([upper[:n], high]))
+    return SequenceProblem(
+        P, q, G, np.concatenate([lower[:n], low]), np.concatenate([upper[:n], high])
+    )

@@ -63,11 +63,27 @@ def make_steps(horizon: int, count: int) -> list[Step]:
         )
         vectors = [rng.standard_normal(n) for _ in range(4)]
         reference, state, measured, innovation = vectors
-        steps.append(Step(0.0, 0, reference, state, measured, inputs[0], decision, innovation, 0.1 * np.eye(n), 100, k))
+        steps.append(
+            Step(
+                0.0,
+                0,
+                reference,
+                state,
+                measured,
+                inputs[0],
+                decision,
+                innovation,
+                0.1 * np.eye(n),
+                100,
+                k,
+            )
+        )
     return steps
 
 
-def loop(steps: list[Step], count: int, apart: float, recorder: McapRecorder | None) -> tuple[np.ndarray, float]:
+def loop(
+    steps: list[Step], count: int, apart: float, recorder: McapRecorder | None
+) -> tuple[np.ndarray, float]:
     """Runs a loop; the times of ``record`` (count,) [s], and of the whole loop [s]."""
     seconds, began = np.zeros(count), perf_counter()
     for k in range(count):
@@ -82,16 +98,22 @@ def loop(steps: list[Step], count: int, apart: float, recorder: McapRecorder | N
     return seconds, perf_counter() - began
 
 
-def measure(horizon: int, seconds: float, apart: float, record_problems: bool, turns: int) -> dict:
+def measure(
+    horizon: int, seconds: float, apart: float, record_problems: bool, turns: int
+) -> dict:
     """Measures one line of the table."""
     steps, count = make_steps(horizon, 16), round(seconds / 1e-3 / turns)
-    system = RecordedSystem(STATES, INPUTS, time_step=apart, pose={axis: axis for axis in "xyz"})
+    system = RecordedSystem(
+        STATES, INPUTS, time_step=apart, pose={axis: axis for axis in "xyz"}
+    )
     records, with_recorder, without = [], [], []
     with tempfile.TemporaryDirectory() as folder:
         for turn in range(turns):
             path = Path(folder) / f"{turn}.mcap"
             without.append(loop(steps, count, apart, None)[1])
-            with McapRecorder(path, system, record_problems=record_problems) as recorder:
+            with McapRecorder(
+                path, system, record_problems=record_problems
+            ) as recorder:
                 took, total = loop(steps, count, apart, recorder)
             records.append(took)
             with_recorder.append(total)
@@ -115,14 +137,23 @@ def main() -> None:
     """Measures and prints."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--horizon", type=int, nargs="+", default=[10, 20])
-    parser.add_argument("--seconds", type=float, default=3.0, help="of loop a line, each way")
-    parser.add_argument("--apart", type=float, default=0.001, help="time between two steps of the plant [s]")
+    parser.add_argument(
+        "--seconds", type=float, default=3.0, help="of loop a line, each way"
+    )
+    parser.add_argument(
+        "--apart",
+        type=float,
+        default=0.001,
+        help="time between two steps of the plant [s]",
+    )
     parser.add_argument("--turns", type=int, default=3)
     given = parser.parse_args()
     rows = []
     for horizon in given.horizon:
         for record_problems in (True, False):
-            row = measure(horizon, given.seconds, given.apart, record_problems, given.turns)
+            row = measure(
+                horizon, given.seconds, given.apart, record_problems, given.turns
+            )
             rows.append(row)
             print(
                 f"H {horizon:3d}, problems {'kept' if record_problems else 'not kept':8s}: record() median "

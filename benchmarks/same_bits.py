@@ -19,7 +19,16 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from benchmarks.quadrotor import HOVER, INNER, NOISE, OUTER, STATE_BOUNDS, TRAJECTORIES, problem, trained
+from benchmarks.quadrotor import (
+    HOVER,
+    INNER,
+    NOISE,
+    OUTER,
+    STATE_BOUNDS,
+    TRAJECTORIES,
+    problem,
+    trained,
+)
 from gpmpc.mpc import Controller, PredictionSettings
 from gpmpc.mpc.baselines import LQR, NMPC, StateFormMPC
 from gpmpc.mpc.gp_mpc import GPMPC, NonlinearGPMPC
@@ -43,10 +52,19 @@ CONTROLLERS: dict[str, Callable[[], Controller | Cascade]] = {
         prediction=PredictionSettings(form="velocity", covariance="diagonal"),
     ),
     "full": lambda: GPMPC(
-        trained("lorenz"), MATCHED, problem(), H, HOVER, prediction=PredictionSettings(covariance="full")
+        trained("lorenz"),
+        MATCHED,
+        problem(),
+        H,
+        HOVER,
+        prediction=PredictionSettings(covariance="full"),
     ),
-    "iterated": lambda: GPMPC(trained("lorenz"), LINEARIZED, problem(BOUNDS), H, HOVER, iterations=30),
-    "nonlinear": lambda: NonlinearGPMPC(trained("lorenz"), MATCHED, problem(), H, HOVER),
+    "iterated": lambda: GPMPC(
+        trained("lorenz"), LINEARIZED, problem(BOUNDS), H, HOVER, iterations=30
+    ),
+    "nonlinear": lambda: NonlinearGPMPC(
+        trained("lorenz"), MATCHED, problem(), H, HOVER
+    ),
     "state form": lambda: StateFormMPC(trained("lorenz"), MATCHED, problem(), H, HOVER),
     "lqr": lambda: LQR(trained("lorenz"), problem(), H, HOVER),
     "nmpc": lambda: NMPC(OUTER, problem(), H, HOVER),
@@ -66,7 +84,9 @@ CONTROLLERS: dict[str, Callable[[], Controller | Cascade]] = {
 def main() -> int:
     """Flies in every state of the cache, and compares."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--only", nargs="+", choices=CONTROLLERS, default=list(CONTROLLERS))
+    parser.add_argument(
+        "--only", nargs="+", choices=CONTROLLERS, default=list(CONTROLLERS)
+    )
     parser.add_argument("--into", type=Path, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.into:
@@ -93,14 +113,36 @@ def main() -> int:
             into = folder / f"{number}.npz"
             environment = {"NUMBA_CACHE_DIR": str(cache), "PYTHONHASHSEED": str(number)}
             subprocess.run(
-                [sys.executable, "-m", "benchmarks.same_bits", "--into", into, "--only", *order],
+                [
+                    sys.executable,
+                    "-m",
+                    "benchmarks.same_bits",
+                    "--into",
+                    into,
+                    "--only",
+                    *order,
+                ],
                 check=True,
                 env=os.environ | environment,
             )
             flown[state] = dict(np.load(into))
-            differing = [key for key, value in flown["empty"].items() if value.tobytes() != flown[state][key].tobytes()]
-            print(f"{state:16} {len(flown[state])} arrays, {len(differing)} differ", *differing, flush=True)
-    return int(any(v.tobytes() != of[k].tobytes() for of in flown.values() for k, v in flown["empty"].items()))
+            differing = [
+                key
+                for key, value in flown["empty"].items()
+                if value.tobytes() != flown[state][key].tobytes()
+            ]
+            print(
+                f"{state:16} {len(flown[state])} arrays, {len(differing)} differ",
+                *differing,
+                flush=True,
+            )
+    return int(
+        any(
+            v.tobytes() != of[k].tobytes()
+            for of in flown.values()
+            for k, v in flown["empty"].items()
+        )
+    )
 
 
 def fly(names: list[str]) -> dict[str, np.ndarray]:
@@ -109,12 +151,24 @@ def fly(names: list[str]) -> dict[str, np.ndarray]:
     for name in names:
         controller = CONTROLLERS[name]()
         if isinstance(controller, Cascade):
-            plant, start = System(Coupled(), INNER.time_step, 1), np.concatenate([references[0], np.zeros(6)])
-            flight = cascade_loop(plant, controller, references, start, 2, on_failure="previous_plan")
+            plant, start = (
+                System(Coupled(), INNER.time_step, 1),
+                np.concatenate([references[0], np.zeros(6)]),
+            )
+            flight = cascade_loop(
+                plant, controller, references, start, 2, on_failure="previous_plan"
+            )
             arrays = {"states": flight.states, "inputs": flight.inputs}
         else:
             flight = closed_loop(
-                OUTER, controller, references, references[0], STEPS, noise=NOISE, seed=1, on_failure="previous_plan"
+                OUTER,
+                controller,
+                references,
+                references[0],
+                STEPS,
+                noise=NOISE,
+                seed=1,
+                on_failure="previous_plan",
             )
             keys = ("states", "inputs", "predicted_means", "predicted_covariances")
             arrays = {key: getattr(flight, key) for key in keys}

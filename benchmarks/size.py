@@ -24,18 +24,37 @@ def main() -> None:
     """Counts and prints."""
     house = House(ROOT)
     print(f"lines of {PACKAGE}/: {house.lines}, files of mpc/: {house.mpc_files}")
-    print(f"public names: {len(house.public_names)}, and constants: {len(house.public_constants)}")
-    print(f"names that packages export from private modules: {len(house.exported_names)}")
+    print(
+        f"public names: {len(house.public_names)}, and constants: {len(house.public_constants)}"
+    )
+    print(
+        f"names that packages export from private modules: {len(house.exported_names)}"
+    )
     print(f"\n{'room':16}{'lines':>8}{'files':>8}{'names':>8}{'constants':>11}")
-    names, constants = (Counter(map(_room, found)) for found in (house.public_names, house.public_constants))
-    for room, modules in sorted(house.rooms.items(), key=lambda item: -house.lines_of(item[1])):
-        print(f"{room:16}{house.lines_of(modules):8}{len(modules):8}{names[room]:8}{constants[room]:11}")
+    names, constants = (
+        Counter(map(_room, found))
+        for found in (house.public_names, house.public_constants)
+    )
+    for room, modules in sorted(
+        house.rooms.items(), key=lambda item: -house.lines_of(item[1])
+    ):
+        print(
+            f"{room:16}{house.lines_of(modules):8}{len(modules):8}{names[room]:8}{constants[room]:11}"
+        )
     for most in (10, 8):
         found = house.functions_above(most)
         print(f"\nfunctions with more than {most} arguments: {len(found)}")
         if most == 10:
-            print("\n".join(f"  {count:3}  {name}" for name, count in sorted(found.items(), key=lambda item: -item[1])))
-    for kind, circles in (("rooms", house.room_circles), ("modules", house.module_circles)):
+            print(
+                "\n".join(
+                    f"  {count:3}  {name}"
+                    for name, count in sorted(found.items(), key=lambda item: -item[1])
+                )
+            )
+    for kind, circles in (
+        ("rooms", house.room_circles),
+        ("modules", house.module_circles),
+    ):
         print(f"\ncircles of {kind}: {len(circles)}")
         for circle in circles:
             print(f"  {', '.join(circle)}")
@@ -60,7 +79,9 @@ class House:
         found = {}
         for path in sorted((self.root / PACKAGE).rglob("*.py")):
             parts = path.relative_to(self.root).with_suffix("").parts
-            found[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path.read_text()
+            found[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = (
+                path.read_text()
+            )
         return found
 
     @cached_property
@@ -114,11 +135,26 @@ class House:
         found = []
         for module, tree in self.trees.items():
             if not _is_private(module):
-                exported = {node.value for part in tree.body if _assigns_all(part) for node in _strings(part)}
+                exported = {
+                    node.value
+                    for part in tree.body
+                    if _assigns_all(part)
+                    for node in _strings(part)
+                }
                 for part in _import_statements(tree.body):
-                    source = self.trees.get(part.module or "") if _is_private(part.module or "") else None
-                    defined = {*_functions_and_classes(source.body)} if source else set()
-                    found += [f"{module}.{alias.name}" for alias in part.names if alias.name in defined & exported]
+                    source = (
+                        self.trees.get(part.module or "")
+                        if _is_private(part.module or "")
+                        else None
+                    )
+                    defined = (
+                        {*_functions_and_classes(source.body)} if source else set()
+                    )
+                    found += [
+                        f"{module}.{alias.name}"
+                        for alias in part.names
+                        if alias.name in defined & exported
+                    ]
         return found
 
     @cached_property
@@ -129,8 +165,15 @@ class House:
             for function in ast.walk(tree):
                 if isinstance(function, ast.FunctionDef):
                     given = function.args
-                    names = [a.arg for a in (*given.posonlyargs, *given.args, *given.kwonlyargs)]
-                    count = len([n for n in names if n not in ("self", "cls")]) + bool(given.vararg) + bool(given.kwarg)
+                    names = [
+                        a.arg
+                        for a in (*given.posonlyargs, *given.args, *given.kwonlyargs)
+                    ]
+                    count = (
+                        len([n for n in names if n not in ("self", "cls")])
+                        + bool(given.vararg)
+                        + bool(given.kwarg)
+                    )
                     found[f"{module}.{function.name}:{function.lineno}"] = count
         return found
 
@@ -143,7 +186,9 @@ class House:
         """Modules of the package that every module imports."""
         found: dict[str, set[str]] = {}
         for module, tree in self.trees.items():
-            found[module] = {name for name in _imported(tree, self.sources) if name != module}
+            found[module] = {
+                name for name in _imported(tree, self.sources) if name != module
+            }
         return found
 
     @property
@@ -156,7 +201,9 @@ class House:
         """Rooms that import each other."""
         graph: dict[str, set[str]] = {room: set() for room in self.rooms}
         for module, imported in self.imports.items():
-            graph[_room(module)] |= {_room(name) for name in imported if name != PACKAGE} - {_room(module)}
+            graph[_room(module)] |= {
+                _room(name) for name in imported if name != PACKAGE
+            } - {_room(module)}
         return _circles(graph)
 
     @property
@@ -181,18 +228,26 @@ def _is_private(name: str) -> bool:
 
 
 def _assigns_all(part: ast.stmt) -> bool:
-    return isinstance(part, ast.Assign) and any(isinstance(t, ast.Name) and t.id == "__all__" for t in part.targets)
+    return isinstance(part, ast.Assign) and any(
+        isinstance(t, ast.Name) and t.id == "__all__" for t in part.targets
+    )
 
 
 def _strings(part: ast.stmt) -> Iterator[ast.Constant]:
-    return (node for node in ast.walk(part) if isinstance(node, ast.Constant) and isinstance(node.value, str))
+    return (
+        node
+        for node in ast.walk(part)
+        if isinstance(node, ast.Constant) and isinstance(node.value, str)
+    )
 
 
 def _import_statements(body: list[ast.stmt]) -> Iterator[ast.ImportFrom]:
     for part in body:
         if isinstance(part, ast.ImportFrom):
             yield part
-        elif isinstance(part, ast.If):  # for type checkers alone: what a package loads at its first use
+        elif isinstance(
+            part, ast.If
+        ):  # for type checkers alone: what a package loads at its first use
             yield from _import_statements(part.body)
 
 
@@ -207,8 +262,12 @@ def _functions_and_classes(body: list[ast.stmt]) -> Iterator[str]:
 def _constants(body: list[ast.stmt]) -> Iterator[str]:
     for item in body:
         if isinstance(item, ast.Assign | ast.AnnAssign):
-            for target in item.targets if isinstance(item, ast.Assign) else [item.target]:
-                yield from (node.id for node in ast.walk(target) if isinstance(node, ast.Name))
+            for target in (
+                item.targets if isinstance(item, ast.Assign) else [item.target]
+            ):
+                yield from (
+                    node.id for node in ast.walk(target) if isinstance(node, ast.Name)
+                )
 
 
 def _imported(tree: ast.Module, known: Mapping[str, object]) -> Iterator[str]:

@@ -19,7 +19,14 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, NullLocator
 
 from benchmarks.pendulums import pendulum_gp, pendulum_plant, pendulum_references
-from benchmarks.timing import RESULTS, describe, machine, markdown_table, time_interleaved, write_results
+from benchmarks.timing import (
+    RESULTS,
+    describe,
+    machine,
+    markdown_table,
+    time_interleaved,
+    write_results,
+)
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior
 from gpmpc.mpc import Controller, Decision, PredictionSettings, Reference
@@ -31,18 +38,35 @@ from gpmpc.simulation import closed_loop
 
 RECORDED_STEPS = 40
 STD = 0.01  # [rad, rad/s] of the beliefs: a full covariance is propagated, as with an estimator in the loop
-FIGURE_SIZE, FIGURE_HORIZON = 189, 10  # N and H that the panels hold, or the nearest ones measured
-LOOKS = {"paper's form": ("C1", "o"), "zero order": ("C0", "s"), "mean only": ("C2", "^")}
+FIGURE_SIZE, FIGURE_HORIZON = (
+    189,
+    10,
+)  # N and H that the panels hold, or the nearest ones measured
+LOOKS = {
+    "paper's form": ("C1", "o"),
+    "zero order": ("C0", "s"),
+    "mean only": ("C2", "^"),
+}
 
 
 def main() -> None:
     """Measures, prints and draws."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--states", type=int, nargs="+", default=[2, 6, 12], help="n, even")
-    parser.add_argument("--sizes", type=int, nargs="+", default=[10, 50, 189, 500, 2000], help="N")
-    parser.add_argument("--horizons", type=int, nargs="+", default=[1, 10, 50], help="H")
-    parser.add_argument("--caches", nargs="+", choices=["hot", "flushed"], default=["hot"])
-    parser.add_argument("--seconds", type=float, default=0.5, help="processor time a cell [s]")
+    parser.add_argument(
+        "--states", type=int, nargs="+", default=[2, 6, 12], help="n, even"
+    )
+    parser.add_argument(
+        "--sizes", type=int, nargs="+", default=[10, 50, 189, 500, 2000], help="N"
+    )
+    parser.add_argument(
+        "--horizons", type=int, nargs="+", default=[1, 10, 50], help="H"
+    )
+    parser.add_argument(
+        "--caches", nargs="+", choices=["hot", "flushed"], default=["hot"]
+    )
+    parser.add_argument(
+        "--seconds", type=float, default=0.5, help="processor time a cell [s]"
+    )
     arguments = parser.parse_args()
     here, rows, sections = machine(), [], []
     print(f"{describe(here)}\n")
@@ -50,10 +74,17 @@ def main() -> None:
         found = [
             row
             for size in arguments.sizes
-            for row in measure_size(pendulum_gp(n, size), arguments.horizons, arguments.seconds, cache == "flushed")
+            for row in measure_size(
+                pendulum_gp(n, size),
+                arguments.horizons,
+                arguments.seconds,
+                cache == "flushed",
+            )
         ]
         rows += [row | {"cache": cache} for row in found]
-        sections.append(f"n = {n}, m = {n // 2}, {cache} caches: median (99 %) in ms\n\n{table(found)}\n")
+        sections.append(
+            f"n = {n}, m = {n // 2}, {cache} caches: median (99 %) in ms\n\n{table(found)}\n"
+        )
         print(sections[-1], flush=True)
     write_results("steps", rows, machine=here)
     (RESULTS / "steps.md").write_text("\n".join([f"{describe(here)}\n", *sections]))
@@ -63,14 +94,25 @@ def main() -> None:
 def controllers(gp: GPPosterior, horizon: int) -> dict[str, Controller]:
     """Builds the convex controllers that are compared."""
     m = gp.state_dim // 2
-    problem = Problem(Tracking([10.0, 1.0] * m, [0.1] * m, penalized="inputs"), inputs=Box([-6.0] * m, [6.0] * m))
+    problem = Problem(
+        Tracking([10.0, 1.0] * m, [0.1] * m, penalized="inputs"),
+        inputs=Box([-6.0] * m, [6.0] * m),
+    )
     common = (problem, horizon, [0.0] * m)
     return {
         "paper's form": GPMPC(
-            gp, MomentMatching(), *common, prediction=PredictionSettings(form="velocity", covariance="full")
+            gp,
+            MomentMatching(),
+            *common,
+            prediction=PredictionSettings(form="velocity", covariance="full"),
         ),
         "zero order": GPMPC(gp, Linearization(), *common),
-        "mean only": GPMPC(gp, Linearization(), *common, prediction=PredictionSettings(covariance="none")),
+        "mean only": GPMPC(
+            gp,
+            Linearization(),
+            *common,
+            prediction=PredictionSettings(covariance="none"),
+        ),
     }
 
 
@@ -98,7 +140,9 @@ class WarmStarted:
         return self._previous
 
 
-def record_steps(gp: GPPosterior, controller: Controller, steps: int) -> list[tuple[Gaussian, Reference]]:
+def record_steps(
+    gp: GPPosterior, controller: Controller, steps: int
+) -> list[tuple[Gaussian, Reference]]:
     """Flies the pendulums with a controller and returns the beliefs and references of its steps."""
     n, found = gp.state_dim, []
 
@@ -111,11 +155,20 @@ def record_steps(gp: GPPosterior, controller: Controller, steps: int) -> list[tu
             return controller.control(belief, reference, previous)
 
     references = pendulum_references(n, steps + controller.horizon + 1)
-    closed_loop(pendulum_plant(n), Recorder(), references, references[0], steps, on_failure="previous_plan")
+    closed_loop(
+        pendulum_plant(n),
+        Recorder(),
+        references,
+        references[0],
+        steps,
+        on_failure="previous_plan",
+    )
     return found
 
 
-def measure_size(gp: GPPosterior, horizons: Sequence[int], seconds: float, flushed: bool) -> Iterator[dict]:
+def measure_size(
+    gp: GPPosterior, horizons: Sequence[int], seconds: float, flushed: bool
+) -> Iterator[dict]:
     """Yields the rows of one model: its predictions, and the controllers at every horizon."""
     times = time_interleaved(predictions(gp), seconds, min_rounds=10, flushed=flushed)
     size = {"n": gp.state_dim, "N": len(gp)}
@@ -124,36 +177,64 @@ def measure_size(gp: GPPosterior, horizons: Sequence[int], seconds: float, flush
     for horizon in horizons:
         compared = controllers(gp, horizon)
         steps = record_steps(gp, compared["mean only"], RECORDED_STEPS)
-        cases = {name: WarmStarted(controller, steps) for name, controller in compared.items()}
-        for name, taken in time_interleaved(cases, seconds, min_rounds=10, flushed=flushed).items():
-            yield size | {"H": horizon, "what": name} | taken.summary() | {"unsolved": cases[name].unsolved}
+        cases = {
+            name: WarmStarted(controller, steps)
+            for name, controller in compared.items()
+        }
+        for name, taken in time_interleaved(
+            cases, seconds, min_rounds=10, flushed=flushed
+        ).items():
+            yield (
+                size
+                | {"H": horizon, "what": name}
+                | taken.summary()
+                | {"unsolved": cases[name].unsolved}
+            )
 
 
 def predictions(gp: GPPosterior) -> dict[str, Callable[[], object]]:
     """Builds the calls that predict one step of the GPs: mean, exact moments, exact moments with all derivatives."""
     n, exact = gp.state_dim, MomentMatching()
     references = torch.from_numpy(pendulum_references(n, RECORDED_STEPS))
-    covariance, input = STD**2 * torch.eye(n, dtype=torch.float64), torch.zeros(n // 2, dtype=torch.float64)
+    covariance, input = (
+        STD**2 * torch.eye(n, dtype=torch.float64),
+        torch.zeros(n // 2, dtype=torch.float64),
+    )
 
     def along(predict: Callable[[Gaussian], object]) -> Callable[[], object]:
         beliefs = cycle([Gaussian(mean, covariance) for mean in references])
         return lambda: predict(next(beliefs))
 
     return {
-        "mean": along(lambda belief: gp.linearize(belief.mean[None].numpy(), input[None].numpy(), covariance=False)),
+        "mean": along(
+            lambda belief: gp.linearize(
+                belief.mean[None].numpy(), input[None].numpy(), covariance=False
+            )
+        ),
         "exact moments": along(lambda belief: exact(gp, belief, input)),
-        "exact moments, all Jacobians": along(lambda belief: differentiate(exact, gp, belief, input)),
+        "exact moments, all Jacobians": along(
+            lambda belief: differentiate(exact, gp, belief, input)
+        ),
     }
 
 
 def table(rows: Sequence[Mapping]) -> str:
     """Formats the rows of one n: cases down, sizes across."""
     sizes = list(dict.fromkeys(row["N"] for row in rows))
-    cases = sorted(dict.fromkeys((row["what"], row["H"]) for row in rows), key=lambda case: case[1] is not None)
+    cases = sorted(
+        dict.fromkeys((row["what"], row["H"]) for row in rows),
+        key=lambda case: case[1] is not None,
+    )
     cases.sort(key=lambda case: case[0] if case[1] else "")
-    found = {(row["what"], row["H"], row["N"]): f"{row['median']:.3g} ({row['p99']:.3g})" for row in rows}
+    found = {
+        (row["what"], row["H"], row["N"]): f"{row['median']:.3g} ({row['p99']:.3g})"
+        for row in rows
+    }
     lines = [
-        [what if H is None else f"{what}, H = {H}", *(found.get((what, H, size), "") for size in sizes)]
+        [
+            what if H is None else f"{what}, H = {H}",
+            *(found.get((what, H, size), "") for size in sizes),
+        ]
         for what, H in cases
     ]
     return markdown_table(["", *(f"N = {size}" for size in sizes)], lines)
@@ -170,18 +251,42 @@ def speed_figure(rows: Sequence[Mapping]) -> Figure:
     horizon = min({row["H"] for row in rows}, key=lambda H: abs(H - FIGURE_HORIZON))
     dims = sorted({row["n"] for row in rows})
     plt.style.use("gpmpc.plotting.gpmpc")
-    figure, axes = plt.subplots(2, len(dims), sharey=True, squeeze=False, figsize=(2.6 * len(dims) + 0.8, 5.6))
+    figure, axes = plt.subplots(
+        2, len(dims), sharey=True, squeeze=False, figsize=(2.6 * len(dims) + 0.8, 5.6)
+    )
     for column, n in enumerate(dims):
         here = [row for row in rows if row["n"] == n]
-        upper = [row for row in here if row["H"] == horizon], "N", f"training points N (H = {horizon})"
-        lower = [row for row in here if row["N"] == size], "H", f"horizon H (N = {size})"
-        for axis, (panel, key, label) in zip(axes[:, column], (upper, lower), strict=True):
+        upper = (
+            [row for row in here if row["H"] == horizon],
+            "N",
+            f"training points N (H = {horizon})",
+        )
+        lower = (
+            [row for row in here if row["N"] == size],
+            "H",
+            f"horizon H (N = {size})",
+        )
+        for axis, (panel, key, label) in zip(
+            axes[:, column], (upper, lower), strict=True
+        ):
             for what in dict.fromkeys(row["what"] for row in panel):
-                line = sorted((row for row in panel if row["what"] == what), key=lambda row: row[key])
+                line = sorted(
+                    (row for row in panel if row["what"] == what),
+                    key=lambda row: row[key],
+                )
                 at, median = [row[key] for row in line], [row["median"] for row in line]
                 colour, marker = LOOKS[what]
-                axis.plot(at, median, color=colour, marker=marker, markersize=3.5, label=what)
-                axis.fill_between(at, median, [row["p99"] for row in line], color=colour, alpha=0.15, lw=0)
+                axis.plot(
+                    at, median, color=colour, marker=marker, markersize=3.5, label=what
+                )
+                axis.fill_between(
+                    at,
+                    median,
+                    [row["p99"] for row in line],
+                    color=colour,
+                    alpha=0.15,
+                    lw=0,
+                )
             axis.set(xscale="log", yscale="log", xlabel=label)
             ticks = sorted({row[key] for row in panel})
             axis.set_xticks(ticks, [str(tick) for tick in ticks], rotation=45)
@@ -192,8 +297,12 @@ def speed_figure(rows: Sequence[Mapping]) -> Figure:
         axes[0, column].set_title(f"{n} states, {n // 2} inputs")
     for axis in axes[:, 0]:
         axis.set_ylabel("time per control step [ms]")
-    figure.suptitle("Decisions of the convex controllers: median, shaded to the 99th percentile")
-    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
+    figure.suptitle(
+        "Decisions of the convex controllers: median, shaded to the 99th percentile"
+    )
+    figure.legend(
+        *axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3
+    )
     return figure
 
 

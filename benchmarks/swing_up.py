@@ -56,7 +56,9 @@ def experiment(name: str, seed: int) -> Experiment:
     """Returns one flight with the settings of a system's file."""
     word = "pendulum" if name == "circle" else name
     with settings():
-        chosen = experiment_of(compose("run", [f"system={word}", f"seed={seed}", f"data.seed={seed}"]))
+        chosen = experiment_of(
+            compose("run", [f"system={word}", f"seed={seed}", f"data.seed={seed}"])
+        )
     if name != "circle":
         return chosen
     make: Any = chosen.controller
@@ -71,9 +73,16 @@ def experiment(name: str, seed: int) -> Experiment:
         goal=[1.0, 0.0, 0.0],
     )
     angle, rate = np.diag(problem.cost.Q)
-    cost = Tracking([angle, angle, rate], problem.cost.R, penalized=problem.cost.penalized)
+    cost = Tracking(
+        [angle, angle, rate], problem.cost.R, penalized=problem.cost.penalized
+    )
     controller = partial(make, problem=replace(problem, cost=cost))
-    return replace(chosen, data=CircleData(chosen.data, flown), system=system, controller=controller)
+    return replace(
+        chosen,
+        data=CircleData(chosen.data, flown),
+        system=system,
+        controller=controller,
+    )
 
 
 class CircleData:
@@ -93,7 +102,9 @@ class CircleData:
         """Returns them; the system that is asked for is this one."""
         found = self.data.transitions(self.pendulum)
         both = (found.states, found.next_states)
-        states, after = (torch.stack([x[:, 0].cos(), x[:, 0].sin(), x[:, 1]], dim=1) for x in both)
+        states, after = (
+            torch.stack([x[:, 0].cos(), x[:, 0].sin(), x[:, 1]], dim=1) for x in both
+        )
         return Transitions(states, found.inputs, after)
 
 
@@ -117,7 +128,9 @@ def fly(name: str, seed: int) -> dict[str, Any]:
         "up": bool(settled <= len(largest) - last),
         "seconds_until_up": settled * system.time_step,
         "largest_error": float(largest[-last:].max()),
-        "data_seconds": len(flown.training.posterior) * system.time_step if flown.training else None,
+        "data_seconds": len(flown.training.posterior) * system.time_step
+        if flown.training
+        else None,
         "in_time": float((rollout.seconds <= system.time_step).mean()),
         "median_ms": 1e3 * float(np.median(rollout.seconds)),
         "p99_ms": 1e3 * float(np.quantile(rollout.seconds, 0.99)),
@@ -133,7 +146,10 @@ def table(flights: list[dict[str, Any]]) -> Table:
         if not own:
             continue
         up = [flight for flight in own if flight["up"]]
-        times, errors = [f["seconds_until_up"] for f in up], [f["largest_error"] for f in up]
+        times, errors = (
+            [f["seconds_until_up"] for f in up],
+            [f["largest_error"] for f in up],
+        )
         rows.append(
             (
                 name,
@@ -146,7 +162,15 @@ def table(flights: list[dict[str, Any]]) -> Table:
                 str(sum(f["failures"] for f in own)),
             )
         )
-    head = ("system", "data [s]", "up and held", "up after [s] (worst)", "error then [rad]", "decision [ms]", "in time")
+    head = (
+        "system",
+        "data [s]",
+        "up and held",
+        "up after [s] (worst)",
+        "error then [rad]",
+        "decision [ms]",
+        "in time",
+    )
     return Table((*head, "failed solves"), rows)
 
 
@@ -157,7 +181,11 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=20)
     given = parser.parse_args()
     FLIGHTS.parent.mkdir(parents=True, exist_ok=True)
-    flights = [json.loads(line) for line in FLIGHTS.read_text().splitlines()] if FLIGHTS.exists() else []
+    flights = (
+        [json.loads(line) for line in FLIGHTS.read_text().splitlines()]
+        if FLIGHTS.exists()
+        else []
+    )
     finished = {(flight["system"], flight["seed"]) for flight in flights}
     for seed in range(given.seeds):
         for name in given.systems:

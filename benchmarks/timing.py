@@ -22,7 +22,9 @@ from threadpoolctl import threadpool_info, threadpool_limits
 from gpmpc._provenance import processor, provenance
 from gpmpc.exceptions import check_number
 
-FLUSH_BYTES = 64 * 2**20  # walked through before a flushed call: more than any core's own caches
+FLUSH_BYTES = (
+    64 * 2**20
+)  # walked through before a flushed call: more than any core's own caches
 WARM_UP_CALLS = 2  # not counted: what is compiled, loaded or allocated once
 MATRIX_SIDE = 1000  # of the product that measures the machine's rate
 WALK_BYTES = 128 * 2**20  # summed to measure the rate of memory: more than any cache
@@ -57,7 +59,11 @@ class Times:
     def summary(self) -> dict[str, float | int]:
         """Median and 99 % quantile in milliseconds, and the number of calls."""
         median, p99 = 1e3 * np.quantile(self.seconds, [0.5, 0.99])
-        return {"median": float(median), "p99": float(p99), "samples": len(self.seconds)}
+        return {
+            "median": float(median),
+            "p99": float(p99),
+            "samples": len(self.seconds),
+        }
 
 
 def time_interleaved(
@@ -128,7 +134,9 @@ def machine() -> dict:
         "cores": os.cpu_count(),
         "threads": max((pool["num_threads"] for pool in threadpool_info()), default=1),
         "load": round(os.getloadavg()[0], 2),
-        "dgemm_gflops": round(2e-9 * MATRIX_SIDE**3 / _shortest(lambda: left @ left), 1),
+        "dgemm_gflops": round(
+            2e-9 * MATRIX_SIDE**3 / _shortest(lambda: left @ left), 1
+        ),
         "memory_gb_per_s": round(1e-9 * WALK_BYTES / _shortest(numbers.sum), 1),
     }
 
@@ -154,10 +162,19 @@ def describe(machine: Mapping[str, Any]) -> str:
 def markdown_table(header: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
     """Formats rows as a Markdown table; columns but the first are aligned to the right."""
     cells = [[_cell(value) for value in row] for row in rows]
-    widths = [max(len(row[i]) for row in [list(header), *cells]) for i in range(len(header))]
-    lines = [header, ["-" * widths[0], *("-" * (width - 1) + ":" for width in widths[1:])], *cells]
+    widths = [
+        max(len(row[i]) for row in [list(header), *cells]) for i in range(len(header))
+    ]
+    lines = [
+        header,
+        ["-" * widths[0], *("-" * (width - 1) + ":" for width in widths[1:])],
+        *cells,
+    ]
     padded = [
-        [f"{text:<{w}}" if i == 0 else f"{text:>{w}}" for i, (text, w) in enumerate(zip(line, widths, strict=True))]
+        [
+            f"{text:<{w}}" if i == 0 else f"{text:>{w}}"
+            for i, (text, w) in enumerate(zip(line, widths, strict=True))
+        ]
         for line in lines
     ]
     return "\n".join("| " + " | ".join(line) + " |" for line in padded)
@@ -175,6 +192,11 @@ def write_results(name: str, results: Any, **meta: Any) -> Path:
     """Writes results with what made them to ``outputs/benchmarks/NAME.json`` and prints where."""
     path = RESULTS / f"{name}.json"
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps({"meta": provenance() | {"threads": 1} | meta, "results": results}, indent=1) + "\n")
+    path.write_text(
+        json.dumps(
+            {"meta": provenance() | {"threads": 1} | meta, "results": results}, indent=1
+        )
+        + "\n"
+    )
     print(f"written to {path}")
     return path

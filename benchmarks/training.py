@@ -29,13 +29,18 @@ PAPER_SECONDS = {10: 1.12, 189: 4.01}  # stated by Cao, Lai and Alam (2017)
 def main() -> None:
     """Measures and prints."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--repeats", type=int, default=15, help="runs of the closed form a cell")
+    parser.add_argument(
+        "--repeats", type=int, default=15, help="runs of the closed form a cell"
+    )
     parser.add_argument("--sizes", type=int, nargs="+", default=[10, 50, 100, 189])
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     with initialize_config_dir(version_base="1.3", config_dir=str(config_folder())):
         config = compose("tables")
-    parts = {key: instantiate(config[key], _convert_="all") for key in ("data", "trajectory", "model")}
+    parts = {
+        key: instantiate(config[key], _convert_="all")
+        for key in ("data", "trajectory", "model")
+    }
     trainer = parts["model"]
     experiment = Tables(
         parts["data"],
@@ -47,15 +52,26 @@ def main() -> None:
         draws=1,
     )
     results = []
-    print("six GPs, one thread; process time in seconds; ratio: GPyTorch's likelihood over the closed form")
-    print(f"{'data':28}{'N':>5}{'median':>9}{'p99':>9}{'GPyTorch':>10}{'ratio':>8}{'paper':>8}")
+    print(
+        "six GPs, one thread; process time in seconds; ratio: GPyTorch's likelihood over the closed form"
+    )
+    print(
+        f"{'data':28}{'N':>5}{'median':>9}{'p99':>9}{'GPyTorch':>10}{'ratio':>8}{'paper':>8}"
+    )
     for trial in experiment.trials():
         everything, size = trial.condition.data, trial.labels["size"]
         data = everything[random_rows(len(everything), size, trial.seed)]
         trainer(data, seed=0)
-        seconds = [process_seconds(trainer, data, seed) for seed in range(arguments.repeats)]
-        with patch("gpmpc.gp._search.NegativeLogMarginalLikelihood", GPyTorchLikelihood):
-            other = [process_seconds(trainer, data, seed) for seed in range(min(3, arguments.repeats))]
+        seconds = [
+            process_seconds(trainer, data, seed) for seed in range(arguments.repeats)
+        ]
+        with patch(
+            "gpmpc.gp._search.NegativeLogMarginalLikelihood", GPyTorchLikelihood
+        ):
+            other = [
+                process_seconds(trainer, data, seed)
+                for seed in range(min(3, arguments.repeats))
+            ]
         ratio = float(np.median([b / a for a, b in zip(seconds, other, strict=False)]))
         name = f"{trial.labels['trajectory']} {trial.labels['subsystem']}"
         result = {

@@ -21,7 +21,12 @@ import sys
 import time
 from pathlib import Path
 
-EXACT, GPYTORCH, SPARSE, GPYTORCH_SPARSE = "exact", "GPyTorch", "sparse", "GPyTorch sparse"
+EXACT, GPYTORCH, SPARSE, GPYTORCH_SPARSE = (
+    "exact",
+    "GPyTorch",
+    "sparse",
+    "GPyTorch sparse",
+)
 D, NOISE = 9, 0.05
 TEST_ROWS = 2000
 COLOURS = {EXACT: "C0", GPYTORCH: "C1", SPARSE: "C2", GPYTORCH_SPARSE: "C4"}
@@ -32,7 +37,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="to 1000 points")
     parser.add_argument("--threads", type=int, default=1)
-    parser.add_argument("--minutes", type=float, default=15, help="after them no other case is begun")
+    parser.add_argument(
+        "--minutes", type=float, default=15, help="after them no other case is begun"
+    )
     parser.add_argument("--out", type=Path, default=Path("outputs/benchmarks"))
     parser.add_argument("--case", help=argparse.SUPPRESS)
     settings = parser.parse_args()
@@ -43,23 +50,41 @@ def main() -> None:
     for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
         environment[variable] = str(settings.threads)
     results, left_out, began = [], [], time.monotonic()
-    print(f"{'case':38}{'median [s]':>12}{'p99 [s]':>12}{'ratio':>8}{'memory [MB]':>13}{'test RMSE':>11}")
+    print(
+        f"{'case':38}{'median [s]':>12}{'p99 [s]':>12}{'ratio':>8}{'memory [MB]':>13}{'test RMSE':>11}"
+    )
     for case in cases(settings.quick):
         if time.monotonic() - began > 60 * settings.minutes:
             left_out.append(case)
             continue
-        command = [sys.executable, "-m", "benchmarks.training_scale", "--case", json.dumps(case)]
-        finished = subprocess.run(command, env=environment, check=True, stdout=subprocess.PIPE, text=True)
+        command = [
+            sys.executable,
+            "-m",
+            "benchmarks.training_scale",
+            "--case",
+            json.dumps(case),
+        ]
+        finished = subprocess.run(
+            command, env=environment, check=True, stdout=subprocess.PIPE, text=True
+        )
         results.append(case | json.loads(finished.stdout.splitlines()[-1]))
         print(described(results[-1]), flush=True)
     from gpmpc._provenance import provenance
 
     settings.out.mkdir(parents=True, exist_ok=True)
-    meta = provenance() | {"threads": settings.threads, "load": os.getloadavg()[0], "left out": left_out}
-    (settings.out / "training_scale.json").write_text(json.dumps({"meta": meta, "results": results}, indent=1))
+    meta = provenance() | {
+        "threads": settings.threads,
+        "load": os.getloadavg()[0],
+        "left out": left_out,
+    }
+    (settings.out / "training_scale.json").write_text(
+        json.dumps({"meta": meta, "results": results}, indent=1)
+    )
     draw(results, settings.out / "training_scale.png", settings.threads)
     if left_out:
-        print(f"{len(left_out)} cases left out after {settings.minutes:g} minutes, the largest")
+        print(
+            f"{len(left_out)} cases left out after {settings.minutes:g} minutes, the largest"
+        )
     print(f"written to {settings.out}")
 
 
@@ -69,12 +94,29 @@ def cases(quick: bool) -> list[dict]:
     if not quick:
         sizes, many = (*sizes, 2000, 5000), (*many, 5000, 20000)
     found = [{"what": "evaluation", "route": EXACT, "size": size} for size in sizes]
-    found += [{"what": "evaluation", "route": GPYTORCH, "size": size} for size in sizes if size <= 2000]
-    found += [{"what": "evaluation", "route": SPARSE, "size": size, "inducing": M} for M in (200, 500) for size in many]
-    found += [{"what": "evaluation", "route": GPYTORCH_SPARSE, "size": size, "inducing": 200} for size in many]
+    found += [
+        {"what": "evaluation", "route": GPYTORCH, "size": size}
+        for size in sizes
+        if size <= 2000
+    ]
+    found += [
+        {"what": "evaluation", "route": SPARSE, "size": size, "inducing": M}
+        for M in (200, 500)
+        for size in many
+    ]
+    found += [
+        {"what": "evaluation", "route": GPYTORCH_SPARSE, "size": size, "inducing": 200}
+        for size in many
+    ]
     found += [{"what": "training", "route": EXACT, "size": size} for size in sizes]
-    found += [{"what": "training", "route": SPARSE, "size": size, "inducing": 200} for size in many]
-    return [*sorted(found, key=lambda case: case["size"]), {"what": "posterior", "route": EXACT, "size": sizes[-1]}]
+    found += [
+        {"what": "training", "route": SPARSE, "size": size, "inducing": 200}
+        for size in many
+    ]
+    return [
+        *sorted(found, key=lambda case: case["size"]),
+        {"what": "posterior", "route": EXACT, "size": sizes[-1]},
+    ]
 
 
 def measure(what: str, route: str, size: int, inducing: int = 0) -> dict:
@@ -101,7 +143,11 @@ def measure(what: str, route: str, size: int, inducing: int = 0) -> dict:
     ours()
     turns = [(seconds_of(evaluate), seconds_of(ours)) for _ in range(count)]
     ratio = quantiles([theirs / own for theirs, own in turns])
-    return quantiles([theirs for theirs, _ in turns]) | {"ratio": ratio["median"], "ratio p99": ratio["p99"]} | found
+    return (
+        quantiles([theirs for theirs, _ in turns])
+        | {"ratio": ratio["median"], "ratio p99": ratio["p99"]}
+        | found
+    )
 
 
 def data(size: int, seed: int = 0):
@@ -110,12 +156,16 @@ def data(size: int, seed: int = 0):
 
     generator = torch.Generator().manual_seed(seed)
     x = torch.randn(size, D, generator=generator, dtype=torch.float64)
-    return x, function(x) + NOISE * torch.randn(size, 1, generator=generator, dtype=torch.float64)
+    return x, function(x) + NOISE * torch.randn(
+        size, 1, generator=generator, dtype=torch.float64
+    )
 
 
 def function(x):
     """What is learned (N, 1)."""
-    return (x[:, 0].sin() + 0.5 * x[:, 0] * x[:, 1] + 0.3 * (x[:, 2] + x[:, 3]).cos())[:, None]
+    return (x[:, 0].sin() + 0.5 * x[:, 0] * x[:, 1] + 0.3 * (x[:, 2] + x[:, 3]).cos())[
+        :, None
+    ]
 
 
 def evaluation(route: str, x, y, inducing: int):
@@ -135,9 +185,15 @@ def evaluation(route: str, x, y, inducing: int):
     if route == GPYTORCH:
         likelihood = GPyTorchLikelihood(x.numpy(), y[:, 0].numpy())
         return lambda: likelihood(theta)
-    scales, sf2 = torch.from_numpy(np.exp(theta[None, :D])), torch.tensor([np.exp(1.0)], dtype=torch.float64)
+    scales, sf2 = (
+        torch.from_numpy(np.exp(theta[None, :D])),
+        torch.tensor([np.exp(1.0)], dtype=torch.float64),
+    )
     if route == SPARSE:
-        leaves = [part.requires_grad_() for part in (x[:inducing].clone(), scales, sf2.clone(), sf2 / 900)]
+        leaves = [
+            part.requires_grad_()
+            for part in (x[:inducing].clone(), scales, sf2.clone(), sf2 / 900)
+        ]
 
         def bound():
             value = collapsed_bound(leaves[0], x, y, Hyperparameters(*leaves[1:]))
@@ -160,12 +216,18 @@ def gpytorch_sparse(x, y, inducing: int, scales, sf2):
         def __init__(self):
             super().__init__(x, y[:, 0], likelihood)
             self.mean_module = gpytorch.means.ZeroMean()
-            base = gpytorch.kernels.ScaleKernel(gpytorch.kernels.RBFKernel(ard_num_dims=D)).double()
+            base = gpytorch.kernels.ScaleKernel(
+                gpytorch.kernels.RBFKernel(ard_num_dims=D)
+            ).double()
             base.base_kernel.lengthscale, base.outputscale = scales, sf2[0]
-            self.covar_module = gpytorch.kernels.InducingPointKernel(base, x[:inducing].clone(), likelihood)
+            self.covar_module = gpytorch.kernels.InducingPointKernel(
+                base, x[:inducing].clone(), likelihood
+            )
 
         def forward(self, z):
-            return gpytorch.distributions.MultivariateNormal(self.mean_module(z), self.covar_module(z))
+            return gpytorch.distributions.MultivariateNormal(
+                self.mean_module(z), self.covar_module(z)
+            )
 
     model = Sparse().train()
     bound = gpytorch.mlls.ExactMarginalLogLikelihood(likelihood, model)
@@ -189,7 +251,9 @@ def training(route: str, x, y, inducing: int, imported: float) -> dict:
     trained = trainer.fit(x, y, 0, "value")
     seconds, megabytes = time.process_time() - begin, peak_megabytes() - imported
     queries = data(TEST_ROWS, seed=1)[0].split(100)
-    error = torch.cat([trained.posterior.predict(query).mean - function(query) for query in queries])
+    error = torch.cat(
+        [trained.posterior.predict(query).mean - function(query) for query in queries]
+    )
     return {
         "median": seconds,
         "megabytes": megabytes,
@@ -210,13 +274,20 @@ def posterior(x, y, imported: float) -> dict:
     k, begin, size = 6, time.process_time(), len(x)
     scales = torch.linspace(2, 4, D, dtype=torch.float64).expand(k, D)
     one = torch.ones(k, dtype=torch.float64)
-    gp = GPPosterior.from_hyperparameters(x, y.expand(size, k), scales, one, 1e-3 * one, input_dim=3)
-    found = {"median": time.process_time() - begin, "built megabytes": peak_megabytes() - imported}
+    gp = GPPosterior.from_hyperparameters(
+        x, y.expand(size, k), scales, one, 1e-3 * one, input_dim=3
+    )
+    found = {
+        "median": time.process_time() - begin,
+        "built megabytes": peak_megabytes() - imported,
+    }
     belief = Gaussian(x[0, :6], 0.01 * torch.eye(6, dtype=torch.float64))
     for propagator in (Linearization(), MomentMatching()):
         name = type(propagator).__name__
         linearize(propagator, gp, belief, x[0, 6:])
-        found[name] = seconds_of(lambda propagator=propagator: linearize(propagator, gp, belief, x[0, 6:]))
+        found[name] = seconds_of(
+            lambda propagator=propagator: linearize(propagator, gp, belief, x[0, 6:])
+        )
         found[f"{name} megabytes"] = peak_megabytes() - imported
     return found | {"megabytes": peak_megabytes() - imported}
 
@@ -237,7 +308,10 @@ def quantiles(seconds: list[float]) -> dict[str, float]:
     """Median and 99th percentile."""
     import numpy as np
 
-    return {"median": float(np.median(seconds)), "p99": float(np.quantile(seconds, 0.99))}
+    return {
+        "median": float(np.median(seconds)),
+        "p99": float(np.quantile(seconds, 0.99)),
+    }
 
 
 def peak_megabytes() -> float:
@@ -249,9 +323,18 @@ def described(result: dict) -> str:
     """One line of the table."""
     name = f"{result['route']} {result['what']}, N = {result['size']}"
     name += f", M = {result['inducing']}" if "inducing" in result else ""
-    cells = [(result.get("median"), 12, ".4g"), (result.get("p99"), 12, ".4g"), (result.get("ratio"), 8, ".3g")]
-    cells += [(result.get("megabytes"), 13, ".0f"), (result.get("test RMSE"), 11, ".3g")]
-    return f"{name:38}" + "".join(" " * width if v is None else f"{v:{width}{form}}" for v, width, form in cells)
+    cells = [
+        (result.get("median"), 12, ".4g"),
+        (result.get("p99"), 12, ".4g"),
+        (result.get("ratio"), 8, ".3g"),
+    ]
+    cells += [
+        (result.get("megabytes"), 13, ".0f"),
+        (result.get("test RMSE"), 11, ".3g"),
+    ]
+    return f"{name:38}" + "".join(
+        " " * width if v is None else f"{v:{width}{form}}" for v, width, form in cells
+    )
 
 
 def draw(results: list[dict], path: Path, threads: int) -> None:
@@ -263,25 +346,44 @@ def draw(results: list[dict], path: Path, threads: int) -> None:
     lines: dict[tuple, list[dict]] = {}
     for result in results:
         if result["what"] in ("evaluation", "training"):
-            lines.setdefault((result["what"], result["route"], result.get("inducing")), []).append(result)
+            lines.setdefault(
+                (result["what"], result["route"], result.get("inducing")), []
+            ).append(result)
     for (what, route, inducing), line in lines.items():
         label = f"{route}, {what}" + (f", M = {inducing}" if inducing else "")
         marker = {"evaluation": "o", "training": "s"}[what]
         style = ":" if what == "training" else "--" if inducing == 500 else "-"
-        look = {"color": COLOURS[route], "marker": marker, "linestyle": style, "markersize": 4, "label": label}
+        look = {
+            "color": COLOURS[route],
+            "marker": marker,
+            "linestyle": style,
+            "markersize": 4,
+            "label": label,
+        }
         x = [one["size"] for one in line]
         times.loglog(x, [one["median"] for one in line], **look)
         if what == "evaluation":
             memory.loglog(x, [max(one["megabytes"], 0.1) for one in line], **look)
     sizes = sorted({one["size"] for one in results if one["route"] == EXACT})
-    memory.loglog(sizes, [8 * size**2 / 2**20 for size in sizes], color="C7", zorder=0, label="one N x N matrix")
+    memory.loglog(
+        sizes,
+        [8 * size**2 / 2**20 for size in sizes],
+        color="C7",
+        zorder=0,
+        label="one N x N matrix",
+    )
     times.set(ylabel=f"processor time [s], {threads} thread(s)", title="time")
     memory.set(ylabel="peak beyond the imports [MB]", title="memory of one evaluation")
     for axis in (times, memory):
         axis.set_xlabel("training points N")
-    figure.suptitle("One output of nine features: the likelihood with its gradient, and whole trainings")
+    figure.suptitle(
+        "One output of nine features: the likelihood with its gradient, and whole trainings"
+    )
     handles, labels = (
-        a + b[-1:] for a, b in zip(*(x.get_legend_handles_labels() for x in (times, memory)), strict=True)
+        a + b[-1:]
+        for a, b in zip(
+            *(x.get_legend_handles_labels() for x in (times, memory)), strict=True
+        )
     )
     figure.legend(handles, labels, loc="outside lower center", ncols=3)
     figure.savefig(path)

@@ -51,7 +51,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--steps", type=int, default=189)
     parser.add_argument("--seeds", type=int, default=5)
-    parser.add_argument("--figure", type=Path, default=Path("outputs/benchmarks/wrong_mass.png"))
+    parser.add_argument(
+        "--figure", type=Path, default=Path("outputs/benchmarks/wrong_mass.png")
+    )
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     results, shown = [], {}
@@ -60,25 +62,49 @@ def main() -> None:
     for trajectory in TRAJECTORIES:
         model = trained(trajectory)
         for way, settings in WAYS.items():
-            controller = GPMPC(model, Linearization(), problem(), HORIZON, HOVER, settings)
+            controller = GPMPC(
+                model, Linearization(), problem(), HORIZON, HOVER, settings
+            )
             row = []
             for mass in MASSES:
                 for noise in NOISES:
                     flown = flights(controller, trajectory, mass, noise, arguments)
                     row.append(pooled(flown))
                     shown[trajectory, way, mass, noise] = flown[0]
-                    keys = {"trajectory": trajectory, "way": way, "mass": mass, "noise": noise}
-                    results.append(keys | {"rmse": row[-1], "failures": sum(len(flight.failures) for flight in flown)})
-            print(f"{trajectory:12}{way:22}" + "".join(f"{rmse:14.4f}" for rmse in row), flush=True)
+                    keys = {
+                        "trajectory": trajectory,
+                        "way": way,
+                        "mass": mass,
+                        "noise": noise,
+                    }
+                    results.append(
+                        keys
+                        | {
+                            "rmse": row[-1],
+                            "failures": sum(len(flight.failures) for flight in flown),
+                        }
+                    )
+            print(
+                f"{trajectory:12}{way:22}" + "".join(f"{rmse:14.4f}" for rmse in row),
+                flush=True,
+            )
     write_results("wrong_model", results)
     arguments.figure.parent.mkdir(parents=True, exist_ok=True)
     write_whole(arguments.figure, png(altitudes(shown)))
     print(f"written to {arguments.figure}")
 
 
-def flights(controller: GPMPC, trajectory: str, mass: str, noise: str, arguments: argparse.Namespace) -> list[Rollout]:
+def flights(
+    controller: GPMPC,
+    trajectory: str,
+    mass: str,
+    noise: str,
+    arguments: argparse.Namespace,
+) -> list[Rollout]:
     """One a seed."""
-    references = states_along(TRAJECTORIES[trajectory], np.arange(arguments.steps + HORIZON + 1.0))
+    references = states_along(
+        TRAJECTORIES[trajectory], np.arange(arguments.steps + HORIZON + 1.0)
+    )
     return [
         closed_loop(
             OUTER, controller, references, references[0], arguments.steps,
@@ -90,7 +116,10 @@ def flights(controller: GPMPC, trajectory: str, mass: str, noise: str, arguments
 
 def pooled(flown: list[Rollout]) -> float:
     """RMSE over all flights [m]."""
-    squares = [tracking_error(flight.states, flight.references, (0, 2, 4)).total ** 2 for flight in flown]
+    squares = [
+        tracking_error(flight.states, flight.references, (0, 2, 4)).total ** 2
+        for flight in flown
+    ]
     return float(np.sqrt(np.mean(squares)))
 
 
@@ -106,8 +135,12 @@ def altitudes(shown: dict[tuple, Rollout]) -> Figure:
         axis.axhline(0, color="black", linewidth=0.5)
         axis.set(title=trajectory, xlabel="time [s]")
     axes[0].set_ylabel("error of z, downwards [m]")
-    figure.suptitle("A quadrotor a fifth heavier than its model; L: gain of the disturbance estimate")
-    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
+    figure.suptitle(
+        "A quadrotor a fifth heavier than its model; L: gain of the disturbance estimate"
+    )
+    figure.legend(
+        *axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4
+    )
     return figure
 
 

@@ -12,7 +12,9 @@ myst_enable_extensions = ["colon_fence"]
 myst_heading_anchors = 3
 exclude_patterns = ["_build"]
 highlight_language = "none"  # of blocks that name none: commands and what they print
-suppress_warnings = ["ref.python"]  # a word of an attribute's text, such as "states", is another attribute's name
+suppress_warnings = [
+    "ref.python"
+]  # a word of an attribute's text, such as "states", is another attribute's name
 
 autodoc_member_order = "bysource"
 autodoc_typehints = "signature"
@@ -35,7 +37,9 @@ def mark_formulas(app, what, name, obj, options, lines):
             marked += ["::", ""]
         if not formula:
             parts = line.split("``")
-            parts[::2] = [part.replace("*", r"\*").replace("|", r"\|") for part in parts[::2]]
+            parts[::2] = [
+                part.replace("*", r"\*").replace("|", r"\|") for part in parts[::2]
+            ]
             line = "``".join(parts)
             if line.startswith(r"\* "):  # a list
                 line = line[1:]

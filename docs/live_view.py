@@ -40,14 +40,21 @@ class Site(SimpleHTTPRequestHandler):
             return self._answer((HERE / "live_view.html").read_bytes(), "text/html")
         if path == "/layout":
             return self._answer(self.server.layout, "application/json")
-        if path.endswith("/assets/index.js"):  # of 2023, when the protocol had another name; its messages stayed
+        if path.endswith(
+            "/assets/index.js"
+        ):  # of 2023, when the protocol had another name; its messages stayed
             text = Path(self.translate_path(path)).read_bytes()
-            return self._answer(text.replace(b"foxglove.websocket.v1", b"foxglove.sdk.v1"), "text/javascript")
+            return self._answer(
+                text.replace(b"foxglove.websocket.v1", b"foxglove.sdk.v1"),
+                "text/javascript",
+            )
         return super().do_GET()
 
     def do_POST(self):
         """Keeps the text that the page shows."""
-        self.server.seen = json.loads(self.rfile.read(int(self.headers["Content-Length"])))
+        self.server.seen = json.loads(
+            self.rfile.read(int(self.headers["Content-Length"]))
+        )
         self._answer(b"", "text/plain")
 
     def _answer(self, content, kind):
@@ -65,39 +72,88 @@ def main():
     """Installs the viewer, flies, and writes the picture."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--out", type=Path, default=HERE / "figures" / "live.png")
-    parser.add_argument("--folder", type=Path, default=HERE.parent / "outputs" / "live_view")
+    parser.add_argument(
+        "--folder", type=Path, default=HERE.parent / "outputs" / "live_view"
+    )
     parser.add_argument("--tab", choices=TABS, default=TABS[0], help="of the layout")
-    parser.add_argument("--steps", type=int, default=40, help="that the viewer has received before the picture")
+    parser.add_argument(
+        "--steps",
+        type=int,
+        default=40,
+        help="that the viewer has received before the picture",
+    )
     options = parser.parse_args()
-    chromium = shutil.which("chromium") or shutil.which("google-chrome") or sys.exit("needs chromium")
+    chromium = (
+        shutil.which("chromium")
+        or shutil.which("google-chrome")
+        or sys.exit("needs chromium")
+    )
     folder = options.folder.resolve()
     folder.mkdir(parents=True, exist_ok=True)
     if not (folder / "node_modules").exists():
-        subprocess.run(["npm", "install", "--silent", "--prefix", folder, "--ignore-scripts", *PACKAGES], check=True)
+        subprocess.run(
+            [
+                "npm",
+                "install",
+                "--silent",
+                "--prefix",
+                folder,
+                "--ignore-scripts",
+                *PACKAGES,
+            ],
+            check=True,
+        )
     layout = json.loads((HERE / "foxglove-layout.json").read_text())
     layout["configById"]["Tab!plots"]["activeTabIdx"] = TABS.index(options.tab)
 
-    server = ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(Site, directory=folder / "node_modules"))
-    server.due, server.seen, server.layout = threading.Event(), {}, json.dumps(layout).encode()
+    server = ThreadingHTTPServer(
+        ("127.0.0.1", 0), functools.partial(Site, directory=folder / "node_modules")
+    )
+    server.due, server.seen, server.layout = (
+        threading.Event(),
+        {},
+        json.dumps(layout).encode(),
+    )
     threading.Thread(target=server.serve_forever, daemon=True).start()
-    command = ["run", "live=true", "trajectory=lorenz", "steps=200", "data.size=40", f"folder={folder / 'runs'}"]
+    command = [
+        "run",
+        "live=true",
+        "trajectory=lorenz",
+        "steps=200",
+        "data.size=40",
+        f"folder={folder / 'runs'}",
+    ]
     program = [sys.executable, "-c", "from gpmpc.cli import main; main()", *command]
-    with subprocess.Popen(program, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True) as flight:
+    with subprocess.Popen(
+        program, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True
+    ) as flight:
         try:
-            address = next(found[0] for line in flight.stderr if (found := re.search(r"ws://[\d.:]+", line)))
+            address = next(
+                found[0]
+                for line in flight.stderr
+                if (found := re.search(r"ws://[\d.:]+", line))
+            )
             threading.Thread(target=flight.stderr.read, daemon=True).start()
             url = f"http://127.0.0.1:{server.server_port}/?address={address}"
-            flags = ["--headless=new", "--no-sandbox", "--hide-scrollbars", "--enable-unsafe-swiftshader"]
+            flags = [
+                "--headless=new",
+                "--no-sandbox",
+                "--hide-scrollbars",
+                "--enable-unsafe-swiftshader",
+            ]
             flags += [
                 "--use-angle=swiftshader",
                 f"--window-size={SIZE[0]},{SIZE[1]}",
                 f"--user-data-dir={folder}/profile",
             ]
             browser = subprocess.Popen(
-                [chromium, *flags, f"--screenshot={options.out.resolve()}", url], stderr=subprocess.DEVNULL
+                [chromium, *flags, f"--screenshot={options.out.resolve()}", url],
+                stderr=subprocess.DEVNULL,
             )
             deadline = time.monotonic() + PATIENCE
-            while (steps := received(server.seen)) < options.steps and time.monotonic() < deadline:
+            while (
+                steps := received(server.seen)
+            ) < options.steps and time.monotonic() < deadline:
                 time.sleep(1)
             server.due.set()
             browser.wait(60)
@@ -105,7 +161,9 @@ def main():
             flight.terminate()
     if steps < options.steps or server.seen["failures"]:
         sys.exit(f"the viewer received {steps} steps, and shows: {server.seen}")
-    print(f"{options.out}: {steps} steps received, {options.out.stat().st_size / 1e3:.0f} kB")
+    print(
+        f"{options.out}: {steps} steps received, {options.out.stat().st_size / 1e3:.0f} kB"
+    )
 
 
 def received(seen):

@@ -48,7 +48,9 @@ flights = {"as learned": fly(plain), "online learning": fly(LearningController(p
 plt.style.use("gpmpc.plotting.gpmpc")
 for (name, flight), line in zip(flights.items(), ("--", "-"), strict=True):
     away = np.linalg.norm((flight.states - flight.references)[:, [0, 2, 4]], axis=1)
-    print(f"{name:16} {away[26:].max():.2f} m away at most, from 5 s after the change on")
+    print(
+        f"{name:16} {away[26:].max():.2f} m away at most, from 5 s after the change on"
+    )
     plt.semilogy(flight.times[1:], away[1:], line, label=name)
 plt.axvline(20.0, color="black", linestyle=":", label="a fifth heavier from here")
 plt.xlabel("time [s]")

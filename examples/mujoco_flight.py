@@ -45,8 +45,15 @@ MAPPING = {
     },
     "inputs": {"thrusts": {"columns": ROTORS, "unit": "N"}},
 }
-MASS, INERTIA, ARM, YAW = 0.4, (0.0025, 0.0025, 0.0045), 0.12, 0.016  # of the data sheet [kg], [kg m2], [m], [m]
-SIGNS = np.array([[1, -1, -1, 1], [-1, -1, 1, 1], [-1, 1, -1, 1]])  # of each rotor's roll, pitch and yaw
+MASS, INERTIA, ARM, YAW = (
+    0.4,
+    (0.0025, 0.0025, 0.0045),
+    0.12,
+    0.016,
+)  # of the data sheet [kg], [kg m2], [m], [m]
+SIGNS = np.array(
+    [[1, -1, -1, 1], [-1, -1, 1, 1], [-1, 1, -1, 1]]
+)  # of each rotor's roll, pitch and yaw
 
 
 def quadrotor() -> System:
@@ -56,7 +63,10 @@ def quadrotor() -> System:
         actuators=ROTORS,
         sensors=["position", "quaternion", "velocity", "rate"],
         substeps=4,
-        observation={"state_names": STATES, "observe": lambda s: np.r_[s[:3], s[4:7], s[3], s[7:]]},
+        observation={
+            "state_names": STATES,
+            "observe": lambda s: np.r_[s[:3], s[4:7], s[3], s[7:]],
+        },
         tracked=["px", "py", "pz"],
         goal=[0, 0, 1, 0, 0, 0, 1, 0, 0, 0, 0, 0, 0],
         initial_input=[0.5 * 9.81 / 4] * 4,
@@ -68,7 +78,13 @@ def data_sheet() -> LogDynamics:
     lever = np.array([[ARM], [ARM], [YAW]]) / np.array(INERTIA)[:, None]
     theta = np.r_[4 / MASS, 0.0, 0.0, 0.0, 0.0, 0.0, (lever * SIGNS).ravel()]
     body = RigidBody(LogMapping.from_dict(MAPPING).space)
-    return LogDynamics(LogModel(body, MultirotorNominal(4, torque=True, thrusts=True), theta, (0,) * 6), 4, STEP)
+    return LogDynamics(
+        LogModel(
+            body, MultirotorNominal(4, torque=True, thrusts=True), theta, (0,) * 6
+        ),
+        4,
+        STEP,
+    )
 
 
 def curve(frequencies: np.ndarray, steps: int) -> np.ndarray:
@@ -76,21 +92,38 @@ def curve(frequencies: np.ndarray, steps: int) -> np.ndarray:
     t = STEP * np.arange(steps)[:, None]
     reference = np.zeros((steps, 13))
     reference[:, 6], ramp = 1.0, np.minimum(t / 2, 1)
-    reference[:, :3] = [0, 0, 1] + ramp * np.array([1.0, 1.0, 0.4]) * np.sin(frequencies * t)
+    reference[:, :3] = [0, 0, 1] + ramp * np.array([1.0, 1.0, 0.4]) * np.sin(
+        frequencies * t
+    )
     reference[:, 7:10] = np.gradient(reference[:, :3], STEP, axis=0)
     return reference
 
 
-def fly(model, reference: np.ndarray, dither: float = 0.0, gain: float = 0.0, seed: int = 0) -> Rollout:
+def fly(
+    model, reference: np.ndarray, dither: float = 0.0, gain: float = 0.0, seed: int = 0
+) -> Rollout:
     """Flies a curve with a model."""
-    cost = Tracking([10, 10, 10, 1, 1, 1, 0.1, 1, 1, 1, 0.05, 0.05, 0.05], [0.02] * 4, penalized="increments")
+    cost = Tracking(
+        [10, 10, 10, 1, 1, 1, 0.1, 1, 1, 1, 0.05, 0.05, 0.05],
+        [0.02] * 4,
+        penalized="increments",
+    )
     problem = Problem(cost, inputs=Box([0.0] * 4, [3.0] * 4))
     settings = PredictionSettings(disturbance_gain=gain)
-    controller = GPMPC(model, Linearization(), problem, 20, [MASS * 9.81 / 4] * 4, settings)
+    controller = GPMPC(
+        model, Linearization(), problem, 20, [MASS * 9.81 / 4] * 4, settings
+    )
     noise = Noise(input=[dither] * 4) if dither else None
     steps = len(reference) - 21
     return closed_loop(
-        quadrotor(), controller, reference, None, steps, noise=noise, on_failure="previous_plan", seed=seed
+        quadrotor(),
+        controller,
+        reference,
+        None,
+        steps,
+        noise=noise,
+        on_failure="previous_plan",
+        seed=seed,
     )
 
 
@@ -100,18 +133,25 @@ def main(folder: Path) -> dict[str, float]:
         frequencies = np.random.default_rng(seed).uniform(0.6, 2.0, 3)
         flown = fly(data_sheet(), curve(frequencies, 400), dither=0.12, seed=seed)
         table = np.column_stack([flown.times[:-1], flown.states[:-1], flown.inputs])
-        pandas.DataFrame(table, columns=["t", *STATES, *ROTORS]).to_csv(folder / f"flight_{seed}.csv", index=False)
+        pandas.DataFrame(table, columns=["t", *STATES, *ROTORS]).to_csv(
+            folder / f"flight_{seed}.csv", index=False
+        )
     log = read_log(sorted(folder.glob("flight_*.csv")), MAPPING)
     learned = learn(log, points=100, steps=25, for_control=True, progress=print)
     save_learned(learned, folder / "model.safetensors")
-    models = {"data sheet": data_sheet(), "learned": load_flyable(folder / "model.safetensors").model}
+    models = {
+        "data sheet": data_sheet(),
+        "learned": load_flyable(folder / "model.safetensors").model,
+    }
     reference = curve(np.array([1.3, 1.7, 0.9]), 421)
     found = {}
     for gain in (0.0, 0.3):
         for name, model in models.items():
             flown = fly(model, reference, gain=gain)
             error = (flown.states - flown.references)[:, :3]
-            found[f"{name}, disturbance_gain {gain:g}"] = float(np.sqrt((error**2).sum(axis=1).mean()))
+            found[f"{name}, disturbance_gain {gain:g}"] = float(
+                np.sqrt((error**2).sum(axis=1).mean())
+            )
     for name, rmse in found.items():
         print(f"{name}: {rmse:.3f} m")
     return found

@@ -24,22 +24,41 @@ from gpmpc.systems import planar_quadrotor, step_many
 HORIZON, STEPS = 30, 110
 NOISE = [0.002, 0.02, 0.002, 0.02, 0.002, 0.02]  # standard deviations a step
 RADII = np.array([0.35, 0.3, 0.3])  # [m]
-PLACES, VELOCITIES = np.array([[0.9, 0.1], [1.9, -1.0], [2.9, 1.0]]), np.array([[0.0, 0.0], [0.0, 0.5], [0.0, -0.4]])
+PLACES, VELOCITIES = (
+    np.array([[0.9, 0.1], [1.9, -1.0], [2.9, 1.0]]),
+    np.array([[0.0, 0.0], [0.0, 0.5], [0.0, -0.4]]),
+)
 GOAL = np.array([4.0, 0.0, 0.0, 0.0, 0.0, 0.0])
 
 quadrotor, rng = planar_quadrotor(), np.random.default_rng(0)
-lowest, highest = np.array([-0.5, -2.5, -1.5, -2.0, -0.8, -4.0]), np.array([4.5, 2.5, 1.5, 2.0, 0.8, 4.0])
-states, thrusts = rng.uniform(lowest, highest, (500, 6)), rng.uniform(2.0, 6.0, (500, 2))
+lowest, highest = (
+    np.array([-0.5, -2.5, -1.5, -2.0, -0.8, -4.0]),
+    np.array([4.5, 2.5, 1.5, 2.0, 0.8, 4.0]),
+)
+states, thrusts = (
+    rng.uniform(lowest, highest, (500, 6)),
+    rng.uniform(2.0, 6.0, (500, 2)),
+)
 after = step_many(quadrotor, states, thrusts) + rng.normal(0, NOISE, (500, 6))
 kinematics = torch.eye(6, dtype=torch.float64)  # what is known: rates move positions
 kinematics[[0, 2, 4], [1, 3, 5]] = quadrotor.time_step
 nominal = replace(Affine.identity(6, 2), A=kinematics)
-data, trainer = Transitions(states, thrusts, after), Trainer(scaling=standardize, restarts=0)
-model = ResidualModel.train(nominal, data, states=[4, 5], inputs=[0, 1], trainer=trainer)  # by tilt, its rate, thrusts
+data, trainer = (
+    Transitions(states, thrusts, after),
+    Trainer(scaling=standardize, restarts=0),
+)
+model = ResidualModel.train(
+    nominal, data, states=[4, 5], inputs=[0, 1], trainer=trainer
+)  # by tilt, its rate, thrusts
 
-x, u, p = casadi.SX.sym("x", 6), casadi.SX.sym("u", 2), casadi.SX.sym("p", 6)  # p: the discs' centres
+x, u, p = (
+    casadi.SX.sym("x", 6),
+    casadi.SX.sym("u", 2),
+    casadi.SX.sym("p", 6),
+)  # p: the discs' centres
 inside = [
-    radius - casadi.norm_2(casadi.vertcat(x[0] - p[2 * i], x[2] - p[2 * i + 1])) for i, radius in enumerate(RADII)
+    radius - casadi.norm_2(casadi.vertcat(x[0] - p[2 * i], x[2] - p[2 * i + 1]))
+    for i, radius in enumerate(RADII)
 ]
 discs = casadi.Function("discs", [x, u, p], [casadi.vertcat(*inside)])
 TILT = Box([-np.inf] * 4 + [-0.6, -3.0], [np.inf] * 4 + [0.6, 3.0])
@@ -48,7 +67,9 @@ problem = Problem(
     inputs=Box([2.4, 2.4], [5.4, 5.4]),
     constraints=[Inequality(discs, count=3, probability=0.95), TILT],
 )
-controller = GPMPC(model, Linearization(process_noise=True), problem, HORIZON, quadrotor.initial_input)
+controller = GPMPC(
+    model, Linearization(process_noise=True), problem, HORIZON, quadrotor.initial_input
+)
 
 
 def centres(times: np.ndarray) -> np.ndarray:
@@ -59,12 +80,20 @@ def centres(times: np.ndarray) -> np.ndarray:
 loop, flown, gaps = ControlLoop(controller), [np.zeros(6)], []
 times = quadrotor.time_step * np.arange(STEPS + HORIZON + 1)
 for k in range(STEPS):
-    thrust = loop.input(flown[-1], GOAL, centres(times[k + 1 : k + 1 + HORIZON]).reshape(HORIZON, 6))
-    flown.append(step_many(quadrotor, flown[-1][None], thrust[None])[0] + rng.normal(0, NOISE))
-    gaps.append(np.linalg.norm(centres(times[k + 1]) - flown[-1][[0, 2]], axis=1) - RADII)
+    thrust = loop.input(
+        flown[-1], GOAL, centres(times[k + 1 : k + 1 + HORIZON]).reshape(HORIZON, 6)
+    )
+    flown.append(
+        step_many(quadrotor, flown[-1][None], thrust[None])[0] + rng.normal(0, NOISE)
+    )
+    gaps.append(
+        np.linalg.norm(centres(times[k + 1]) - flown[-1][[0, 2]], axis=1) - RADII
+    )
 path, nearest = np.array(flown), float(np.min(gaps))
 away = float(np.linalg.norm(path[-1, [0, 2]] - GOAL[[0, 2]]))
-print(f"{away:.2f} m from the goal, never nearer than {nearest:.3f} m to a disc, {loop.failures} failures")
+print(
+    f"{away:.2f} m from the goal, never nearer than {nearest:.3f} m to a disc, {loop.failures} failures"
+)
 
 
 def figure() -> Figure:
@@ -72,14 +101,28 @@ def figure() -> Figure:
     plt.style.use("gpmpc.plotting.gpmpc")
     drawn, axes = plt.subplots(2, 2, sharex=True, sharey=True, figsize=(7, 5))
     for axis, k in zip(axes.flat, (10, 21, 32, STEPS), strict=True):
-        for place, radius, velocity in zip(centres(times[k]), RADII, VELOCITIES, strict=True):
-            axis.add_patch(Circle((place[0], place[1]), radius, color="C1" if velocity.any() else "C7", alpha=0.6))
+        for place, radius, velocity in zip(
+            centres(times[k]), RADII, VELOCITIES, strict=True
+        ):
+            axis.add_patch(
+                Circle(
+                    (place[0], place[1]),
+                    radius,
+                    color="C1" if velocity.any() else "C7",
+                    alpha=0.6,
+                )
+            )
         axis.plot(path[: k + 1, 0], path[: k + 1, 2], color="C0")
         tilt, at = path[k, 4], path[k, [0, 2]]
         arm = 0.1 * np.array([np.cos(tilt), np.sin(tilt)])
         axis.plot(*np.transpose([at - arm, at + arm]), color="black", linewidth=3)
         axis.plot(*GOAL[[0, 2]], "+", color="black", markersize=9)
-        axis.set(title=f"{times[k]:.1f} s", aspect="equal", xlim=(-0.5, 4.5), ylim=(-1.5, 1.5))
+        axis.set(
+            title=f"{times[k]:.1f} s",
+            aspect="equal",
+            xlim=(-0.5, 4.5),
+            ylim=(-1.5, 1.5),
+        )
     drawn.suptitle("A planar quadrotor's centre among discs; those in vermilion move")
     drawn.supxlabel("x [m]", fontsize="medium")
     drawn.supylabel("y, upwards [m]", fontsize="medium")

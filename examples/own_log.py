@@ -16,10 +16,31 @@ from gpmpc.logs import judge, learn, read_log
 from gpmpc.plotting import judgement_figure
 
 STEP, THRUST, DRAG = 0.01, 20.0, 0.3  # [s], [m/s2] of all motors at full signal, [1/s]
-MIXER = np.array([[1, 1, -1], [1, -1, 1], [-1, -1, -1], [-1, 1, 1]]) / 4  # motors' u^2 by roll, pitch, yaw
+MIXER = (
+    np.array([[1, 1, -1], [1, -1, 1], [-1, -1, -1], [-1, 1, 1]]) / 4
+)  # motors' u^2 by roll, pitch, yaw
 TORQUE = np.array([120.0, 120.0, 40.0])  # [rad/s2] by that mixture
 FORCE_NOISE, TORQUE_NOISE = 0.6, 6.0  # [m/s2], [rad/s2], white at every step
-NAMES = ["t", "px", "py", "pz", "qx", "qy", "qz", "qw", "vx", "vy", "vz", "wx", "wy", "wz", "m1", "m2", "m3", "m4"]
+NAMES = [
+    "t",
+    "px",
+    "py",
+    "pz",
+    "qx",
+    "qy",
+    "qz",
+    "qw",
+    "vx",
+    "vy",
+    "vz",
+    "wx",
+    "wy",
+    "wz",
+    "m1",
+    "m2",
+    "m3",
+    "m4",
+]
 MAPPING = {
     "time": "t",
     "max_gap": 0.015,
@@ -39,20 +60,35 @@ def simulate_flights(flights: int, rows: int, seed: int = 0) -> list[pandas.Data
     rng = np.random.default_rng(seed)
     p, v, w = (np.zeros((flights, 3)) for _ in range(3))
     attitude = Rotation.identity(flights)
-    frequencies, phases = rng.uniform(0.5, 2.0, (2, flights, 3)), rng.uniform(0, 6, (2, flights, 3))
+    frequencies, phases = (
+        rng.uniform(0.5, 2.0, (2, flights, 3)),
+        rng.uniform(0, 6, (2, flights, 3)),
+    )
     tables = np.empty((flights, rows, len(NAMES)))
     for k in range(rows):
         target = 0.7 * np.sin(frequencies * k * STEP + phases).sum(axis=0)
         force = 2.0 * (target - p) - 2.5 * v + [0, 0, 9.81]
         up = attitude.inv().apply(force / np.linalg.norm(force, axis=1, keepdims=True))
         rates = 6 * np.column_stack([-up[:, 1], up[:, 0], np.zeros(flights)])
-        moment = (12 * (rates - w) + rng.normal(0, 8, (flights, 3))) / TORQUE  # the noise makes the motors informative
-        collective = np.clip(np.linalg.norm(force, axis=1, keepdims=True) / THRUST, 0.1, 0.9)
+        moment = (
+            12 * (rates - w) + rng.normal(0, 8, (flights, 3))
+        ) / TORQUE  # the noise makes the motors informative
+        collective = np.clip(
+            np.linalg.norm(force, axis=1, keepdims=True) / THRUST, 0.1, 0.9
+        )
         motors = np.sqrt(np.clip(collective + moment @ MIXER.T, 0.01, 1))
-        tables[:, k] = np.column_stack([np.full(flights, k * STEP), p, attitude.as_quat(), v, w, motors])
-        body_force = np.column_stack([np.zeros((flights, 2)), THRUST * (motors**2).mean(axis=1)])
-        body_force += rng.normal(0, FORCE_NOISE, (flights, 3)) - DRAG * attitude.inv().apply(v)
-        torque = motors**2 @ MIXER * 4 * TORQUE / 4 + rng.normal(0, TORQUE_NOISE, (flights, 3))
+        tables[:, k] = np.column_stack(
+            [np.full(flights, k * STEP), p, attitude.as_quat(), v, w, motors]
+        )
+        body_force = np.column_stack(
+            [np.zeros((flights, 2)), THRUST * (motors**2).mean(axis=1)]
+        )
+        body_force += rng.normal(
+            0, FORCE_NOISE, (flights, 3)
+        ) - DRAG * attitude.inv().apply(v)
+        torque = motors**2 @ MIXER * 4 * TORQUE / 4 + rng.normal(
+            0, TORQUE_NOISE, (flights, 3)
+        )
         for _ in range(4):
             w = w + STEP / 4 * torque
             attitude = attitude * Rotation.from_rotvec(STEP / 4 * w)
@@ -65,17 +101,23 @@ def spoil(table: pandas.DataFrame, rng: np.random.Generator) -> pandas.DataFrame
     """Makes a log of a flight: missing rows, stamps that jitter, samples that repeat, a start on the ground."""
     table = table.assign(t=table["t"] + rng.uniform(-5e-4, 5e-4, len(table)) + 5)
     for row in rng.choice(len(table) - 100, 8, replace=False):
-        table.loc[row + 1, ["px", "py", "pz"]] = table.loc[row, ["px", "py", "pz"]].to_numpy(dtype=float)
+        table.loc[row + 1, ["px", "py", "pz"]] = table.loc[
+            row, ["px", "py", "pz"]
+        ].to_numpy(dtype=float)
     for row in np.arange(400, len(table), 700):
         table = table.drop(index=range(row, row + 30))
-    ground = pandas.DataFrame(0.0, index=range(50), columns=NAMES).assign(t=4.4 + STEP * np.arange(50), qw=1.0)
+    ground = pandas.DataFrame(0.0, index=range(50), columns=NAMES).assign(
+        t=4.4 + STEP * np.arange(50), qw=1.0
+    )
     return pandas.concat([ground, table])
 
 
 def main(folder: Path) -> None:
     """Writes the log, learns from two flights and judges on the third."""
     for number, flight in enumerate(simulate_flights(3, 1500), start=1):
-        spoil(flight, np.random.default_rng(number)).to_csv(folder / f"flight_{number}.csv", index=False)
+        spoil(flight, np.random.default_rng(number)).to_csv(
+            folder / f"flight_{number}.csv", index=False
+        )
 
     # With a log of one's own it starts here.
     log = read_log(sorted(folder.glob("flight_*.csv")), MAPPING)
@@ -88,7 +130,12 @@ def main(folder: Path) -> None:
     print(next(candidate.name for candidate in learned.candidates if candidate.chosen))
     for name, value, error in learned.fit.to_rows()[:3]:
         print(f"  {name} {value:.3f} +- {error:.3f}")
-    print(judgement.to_pandas().query("predictor == 'model'").round(4).to_string(index=False))
+    print(
+        judgement.to_pandas()
+        .query("predictor == 'model'")
+        .round(4)
+        .to_string(index=False)
+    )
 
     figure = judgement_figure(judgement)
     figure.savefig(folder / "own_log.png", dpi=150)

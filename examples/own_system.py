@@ -45,20 +45,34 @@ def arm(mass: float = 1.0) -> System:
 
 
 system = arm()
-problem = Problem(Tracking(Q=[10.0, 0.1], R=[0.01]), inputs=Box(system.input_lower, system.input_upper))
+problem = Problem(
+    Tracking(Q=[10.0, 0.1], R=[0.01]),
+    inputs=Box(system.input_lower, system.input_upper),
+)
 flight = Experiment(
     data=RandomData(samples=200),
     trajectory=Waypoints([0.0, 1.5, 3.0, 4.5], [[0.0], [1.2], [-1.2], [0.5]]),
     system=system,
     train=Trainer(predicts="difference", scaling=standardize),
-    controller=partial(GPMPC, propagator=Linearization(), problem=problem, horizon=15, initial_input=[0.0]),
+    controller=partial(
+        GPMPC,
+        propagator=Linearization(),
+        problem=problem,
+        horizon=15,
+        initial_input=[0.0],
+    ),
     steps=120,
 )
 flown = run_trial(flight)
 result = metrics(flight, flown)
 fresh = RandomData(samples=200, seed=1).transitions(system)
 assert flown.training is not None
-calibration = calibrate(flown.training.posterior, Recording.chained(fresh), horizon=3, names=system.state_names)
+calibration = calibrate(
+    flown.training.posterior,
+    Recording.chained(fresh),
+    horizon=3,
+    names=system.state_names,
+)
 
 print(f"RMSE {result['rmse']['total']:.3f} {system.unit}, lost: {result['lost']}")
 print(calibration.to_pandas().round(3).to_string(index=False))
@@ -66,7 +80,9 @@ rollout = flown.rollout
 plt.style.use("gpmpc.plotting.gpmpc")
 plt.plot(rollout.times, rollout.references[:, 0], "--", color="C6", label="reference")
 plt.plot(rollout.times, rollout.states[:, 0], label="angle [rad]")
-plt.step(rollout.times[1:], rollout.inputs[:, 0] / 8, label="torque / 8 N m", linewidth=0.8)
+plt.step(
+    rollout.times[1:], rollout.inputs[:, 0] / 8, label="torque / 8 N m", linewidth=0.8
+)
 plt.xlabel("time [s]")
 plt.title("An arm on a joint, flown through its waypoints")
 plt.figlegend(loc="outside lower center", ncols=3)

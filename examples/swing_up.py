@@ -23,14 +23,26 @@ plant, rng = System(Pendulum(), time_step=0.05), np.random.default_rng(0)
 angles, torques = rng.uniform(-np.pi, np.pi, 400), rng.uniform(-2, 2, (400, 1))
 states = np.column_stack([np.cos(angles), np.sin(angles), rng.uniform(-8, 8, 400)])
 measured = step_many(plant, states, torques) + rng.normal(0, 0.001, (400, 3))
-gp = train(Transitions(states, torques, measured), predicts="difference", scaling=standardize).posterior
+gp = train(
+    Transitions(states, torques, measured), predicts="difference", scaling=standardize
+).posterior
 
-problem = Problem(Tracking([1.0, 1.0, 0.01], [0.01], penalized="inputs"), inputs=Box([-2.0], [2.0]))
+problem = Problem(
+    Tracking([1.0, 1.0, 0.01], [0.01], penalized="inputs"), inputs=Box([-2.0], [2.0])
+)
 controller = GPMPC(gp, Linearization(), problem, horizon=30, initial_input=[0.0])
 flight = closed_loop(plant, controller, [1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], steps=100)
 
-print("upright after", flight.times[np.abs(flight.states[:, 0] - 1) > 0.01][-1].round(2), "s")
+print(
+    "upright after",
+    flight.times[np.abs(flight.states[:, 0] - 1) > 0.01][-1].round(2),
+    "s",
+)
 plt.style.use("gpmpc.plotting.gpmpc")
-plt.legend(plt.plot(flight.times, flight.states), Pendulum.state_names, title="over time [s]; dashed: torque")
+plt.legend(
+    plt.plot(flight.times, flight.states),
+    Pendulum.state_names,
+    title="over time [s]; dashed: torque",
+)
 plt.step(flight.times[1:], flight.inputs, "k--")
 plt.savefig("swing_up.png")

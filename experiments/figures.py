@@ -47,10 +47,25 @@ from gpmpc.studies.study import (
 from gpmpc.systems import GRAVITY
 from gpmpc.trajectories import Trajectory
 
-ROOMS = ("gp", "models", "propagation", "kernels", "qp", "mpc", "simulation", "datasets", "systems")
+ROOMS = (
+    "gp",
+    "models",
+    "propagation",
+    "kernels",
+    "qp",
+    "mpc",
+    "simulation",
+    "datasets",
+    "systems",
+)
 CODE = ("gaussian.py", "metrics.py", *(f"{room}/*.py" for room in ROOMS), __file__)
 PROPAGATIONS = {"moment_matching": MomentMatching, "linearization": Linearization}
-CONTROLLERS = {"nmpc": NMPC, "nonlinear": NonlinearGPMPC, "slsqp": SLSQP, "convex": GPMPC}
+CONTROLLERS = {
+    "nmpc": NMPC,
+    "nonlinear": NonlinearGPMPC,
+    "slsqp": SLSQP,
+    "convex": GPMPC,
+}
 LOOPS = ("model", "plant")
 PLANT = SYSTEMS["translational"]  # the plant in the loop
 AT_BOUND = 1e-6  # [m, m/s] distance of a plan to a bound that counts as none
@@ -101,16 +116,32 @@ class Row:
     title: str = ""
 
     def __post_init__(self) -> None:
-        known = (("loop", LOOPS), ("controller", CONTROLLERS), ("propagation", PROPAGATIONS))
+        known = (
+            ("loop", LOOPS),
+            ("controller", CONTROLLERS),
+            ("propagation", PROPAGATIONS),
+        )
         for key, possible in known:
             if getattr(self, key) not in possible:
-                raise SettingError(key, f"must be one of {', '.join(possible)}; got {getattr(self, key)!r}")
+                raise SettingError(
+                    key,
+                    f"must be one of {', '.join(possible)}; got {getattr(self, key)!r}",
+                )
         if self.loop == "model" and self.controller == "nmpc":
-            raise SettingError("controller", "nmpc knows the true plant and needs it in the loop; got loop model")
-        parameters = {*inspect.signature(CONTROLLERS[self.controller]).parameters, "penalty"}
+            raise SettingError(
+                "controller",
+                "nmpc knows the true plant and needs it in the loop; got loop model",
+            )
+        parameters = {
+            *inspect.signature(CONTROLLERS[self.controller]).parameters,
+            "penalty",
+        }
         for key in self.settings:
             if key not in parameters:
-                raise SettingError(f"settings.{key}", f"controller {self.controller} takes no such setting")
+                raise SettingError(
+                    f"settings.{key}",
+                    f"controller {self.controller} takes no such setting",
+                )
         check_subsystems("subsystems", self.subsystems)
         for key, least in (("horizon", 1), ("size", 0)):
             for value in _several(getattr(self, key)):
@@ -119,8 +150,13 @@ class Row:
     def variants(self) -> list["Row"]:
         """Returns one row for every combination of the settings that are given as lists."""
         keys = ("horizon", "size", "confidence")
-        combinations = itertools.product(*(_several(getattr(self, key)) for key in keys))
-        return [replace(self, **dict(zip(keys, values, strict=True))) for values in combinations]
+        combinations = itertools.product(
+            *(_several(getattr(self, key)) for key in keys)
+        )
+        return [
+            replace(self, **dict(zip(keys, values, strict=True)))
+            for values in combinations
+        ]
 
 
 @dataclass(frozen=True)
@@ -160,17 +196,30 @@ class Condition:
     def controller(self) -> Controller:
         """Makes the controller."""
         row, problem = self.row, tracking_problem(self.row, self.inputs, self.states)
-        settings = {key: value for key, value in row.settings.items() if key != "penalty"}
+        settings = {
+            key: value for key, value in row.settings.items() if key != "penalty"
+        }
         if "prediction" in settings:
             settings["prediction"] = PredictionSettings(**settings["prediction"])
         known = self.reference.inputs
-        at_first = np.array([PLANT.dynamics.mass * GRAVITY, 0.0, 0.0]) if known is None else known[0]
+        at_first = (
+            np.array([PLANT.dynamics.mass * GRAVITY, 0.0, 0.0])
+            if known is None
+            else known[0]
+        )
         at_first = np.clip(at_first, problem.inputs.lower, problem.inputs.upper)
         if self.model is None:
             return NMPC(PLANT, problem, row.horizon, at_first, **settings)
         propagator = PROPAGATIONS[row.propagation](process_noise=row.process_noise)
         make = CONTROLLERS[row.controller]
-        return make(read_model(self.model), propagator, problem, row.horizon, at_first, **settings)
+        return make(
+            read_model(self.model),
+            propagator,
+            problem,
+            row.horizon,
+            at_first,
+            **settings,
+        )
 
 
 @dataclass(frozen=True)
@@ -220,18 +269,28 @@ class Figures:
             check_number(key, getattr(self, key), least=least, whole=True)
         check_number("trials", self.number, least=1, whole=True)
         check_number("noise", self.noise, least=0)
-        check_number("workers", 1 if self.workers is None else self.workers, least=1, whole=True)
+        check_number(
+            "workers", 1 if self.workers is None else self.workers, least=1, whole=True
+        )
         for key, chosen in (("rows", self.rows), ("trajectory", self.trajectories)):
             if not chosen:
                 raise SettingError(key, "choose at least one")
         for name, row in self.rows.items():
             if row.data not in self.data:
-                raise SettingError(f"rows.{name}.data", f"must be one of {', '.join(self.data)}; got {row.data!r}")
-        object.__setattr__(self, "subsystems", check_subsystems("subsystem", self.subsystems))
+                raise SettingError(
+                    f"rows.{name}.data",
+                    f"must be one of {', '.join(self.data)}; got {row.data!r}",
+                )
+        object.__setattr__(
+            self, "subsystems", check_subsystems("subsystem", self.subsystems)
+        )
         for _, row, trajectory, subsystem in self._flown:
             tracking_problem(row, *self._bounds(row, trajectory, subsystem))
         if not self._flown:
-            raise SettingError("subsystem", f"no row flies it in the chosen loops; got {', '.join(self.subsystems)}")
+            raise SettingError(
+                "subsystem",
+                f"no row flies it in the chosen loops; got {', '.join(self.subsystems)}",
+            )
 
     @cached_property
     def _flown(self) -> list[tuple[str, Row, str, str]]:
@@ -239,8 +298,12 @@ class Figures:
         return [
             (name, row, trajectory, subsystem)
             for name, template in self.rows.items()
-            for trajectory, row in itertools.product(self.trajectories, template.variants())
-            for subsystem in (row.subsystems if row.loop == "model" else ("translational",))
+            for trajectory, row in itertools.product(
+                self.trajectories, template.variants()
+            )
+            for subsystem in (
+                row.subsystems if row.loop == "model" else ("translational",)
+            )
             if subsystem in self.subsystems
         ]
 
@@ -257,40 +320,95 @@ class Figures:
             SettingError: The data are fewer than are asked for.
             TrainingError: GPs could not be trained.
         """
-        for _, row, trajectory, subsystem in self._flown:  # what the data do not hold is found before any training
+        for (
+            _,
+            row,
+            trajectory,
+            subsystem,
+        ) in self._flown:  # what the data do not hold is found before any training
             self._data(row, trajectory, subsystem)
         trials = []
         for name, row, trajectory, subsystem in self._flown:
             condition = self._condition(row, trajectory, subsystem, folder)
-            reference, bounds = condition.reference, [condition.inputs, condition.states]
-            settings = [name, asdict(row), trajectory, subsystem, repr(PLANT), self.noise, self.steps]
-            settings += [condition.model and condition.model.name, *(box and asdict(box) for box in bounds)]
+            reference, bounds = (
+                condition.reference,
+                [condition.inputs, condition.states],
+            )
+            settings = [
+                name,
+                asdict(row),
+                trajectory,
+                subsystem,
+                repr(PLANT),
+                self.noise,
+                self.steps,
+            ]
+            settings += [
+                condition.model and condition.model.name,
+                *(box and asdict(box) for box in bounds),
+            ]
             arrays = reference.states, reference.inputs, condition.scaling.factor
             named = fingerprint(settings, *arrays, code=CODE)
-            labels = {"name": row.title or name, "trajectory": trajectory, "subsystem": subsystem}
-            labels |= {k: getattr(row, k) for k in ("loop", "controller", "horizon", "size", "confidence", "bounded")}
+            labels = {
+                "name": row.title or name,
+                "trajectory": trajectory,
+                "subsystem": subsystem,
+            }
+            labels |= {
+                k: getattr(row, k)
+                for k in (
+                    "loop",
+                    "controller",
+                    "horizon",
+                    "size",
+                    "confidence",
+                    "bounded",
+                )
+            }
             for trial in range(1 if row.loop == "model" else row.trials or self.number):
-                seed = derived_seed(self.seed, trial)  # all rows have the same seeds: their differences are paired
+                seed = derived_seed(
+                    self.seed, trial
+                )  # all rows have the same seeds: their differences are paired
                 flown = replace(condition, drawn=trial == 0)
-                trials.append(Trial(labels | {"trial": trial}, flown, seed, fingerprint([named, trial, seed])))
+                trials.append(
+                    Trial(
+                        labels | {"trial": trial},
+                        flown,
+                        seed,
+                        fingerprint([named, trial, seed]),
+                    )
+                )
         return trials
 
-    def _bounds(self, row: Row, trajectory: str, subsystem: str) -> tuple[Bounds, Bounds | None]:
+    def _bounds(
+        self, row: Row, trajectory: str, subsystem: str
+    ) -> tuple[Bounds, Bounds | None]:
         """Returns the bounds of the inputs and of the states."""
         of_inputs = self.bounds.get(row.loop) or {}
         if row.loop == "model":
             of_inputs = of_inputs.get(subsystem) or of_inputs.get(trajectory) or {}
-        of_states = None if row.confidence is None else (self.state_bounds or {}).get(trajectory) or {}
+        of_states = (
+            None
+            if row.confidence is None
+            else (self.state_bounds or {}).get(trajectory) or {}
+        )
         for key, box in (("bounds", of_inputs), ("state_bounds", of_states)):
             if box is not None and not {"lower", "upper"} <= set(box):
                 what = f"must hold lower and upper of the {row.loop} on {trajectory}, {subsystem}; got {box or 'none'}"
                 raise SettingError(key, what)
         if of_states is not None:
             absent = {"lower": -np.inf, "upper": np.inf}
-            of_states = Bounds(**{k: [absent[k] if v is None else float(v) for v in of_states[k]] for k in absent})
+            of_states = Bounds(
+                **{
+                    k: [absent[k] if v is None else float(v) for v in of_states[k]]
+                    for k in absent
+                }
+            )
         return Bounds(of_inputs["lower"], of_inputs["upper"]), of_states
 
-    def _data(self, row: Row, trajectory: str, subsystem: str) -> tuple[Transitions | None, list[int]]:
+    def _data(
+        self, row: Row, trajectory: str, subsystem: str
+    ) -> tuple[Transitions | None, list[int]]:
         """Returns the transitions of a row, and those that its GP learns from; None for the true model's controller."""
         if row.controller == "nmpc":
             return None, []
@@ -299,28 +417,54 @@ class Figures:
         source = replace(self.data[row.data], samples=count)
         key = f"{source!r} {trajectory} {self.trajectories[trajectory]!r} {subsystem}"
         if key not in self._flights:
-            self._flights[key] = source.transitions(SYSTEMS[subsystem], self.trajectories[trajectory], trajectory)
+            self._flights[key] = source.transitions(
+                SYSTEMS[subsystem], self.trajectories[trajectory], trajectory
+            )
         data = self._flights[key]
-        return data, random_rows(len(data) if row.loop == "plant" else needed, size, self.seed)
+        return data, random_rows(
+            len(data) if row.loop == "plant" else needed, size, self.seed
+        )
 
-    def _condition(self, row: Row, trajectory: str, subsystem: str, folder: Path) -> Condition:
+    def _condition(
+        self, row: Row, trajectory: str, subsystem: str, folder: Path
+    ) -> Condition:
         def trained(learned: Transitions) -> Path:
             settings = self.model_settings[row.loop]
-            return trained_model(self.models[row.loop], settings, learned[chosen], self.seed, folder)
+            return trained_model(
+                self.models[row.loop], settings, learned[chosen], self.seed, folder
+            )
 
-        n_ahead, (data, chosen) = self.steps + row.horizon, self._data(row, trajectory, subsystem)
+        n_ahead, (data, chosen) = (
+            self.steps + row.horizon,
+            self._data(row, trajectory, subsystem),
+        )
         rest = {"noise": self.noise, "steps": self.steps}
         bounds = self._bounds(row, trajectory, subsystem)
         if row.loop == "plant":
-            reference = Reference(PLANT.reference_states(self.trajectories[trajectory], n_ahead + 1))
-            unscaled, model = Scaling(torch.zeros(6), torch.ones(6)), None if data is None else trained(data)
+            reference = Reference(
+                PLANT.reference_states(self.trajectories[trajectory], n_ahead + 1)
+            )
+            unscaled, model = (
+                Scaling(torch.zeros(6), torch.ones(6)),
+                None if data is None else trained(data),
+            )
             return Condition(row, model, reference, unscaled, *bounds, **rest)
         system, scaling = SYSTEMS[subsystem], SCALINGS[subsystem]
         # States and next states share one scaling, so that a prediction can be fed back in.
         visited = torch.cat([data.states, data.next_states[-1:]])
-        states, inputs = scaling(visited, system.state_names), scaling(data.inputs, system.input_names)
-        learned = Transitions(states.scale(data.states), inputs.scale(data.inputs), states.scale(data.next_states))
-        reference = Reference(states.scale(visited)[: n_ahead + 1].numpy(), learned.inputs[:n_ahead].numpy())
+        states, inputs = (
+            scaling(visited, system.state_names),
+            scaling(data.inputs, system.input_names),
+        )
+        learned = Transitions(
+            states.scale(data.states),
+            inputs.scale(data.inputs),
+            states.scale(data.next_states),
+        )
+        reference = Reference(
+            states.scale(visited)[: n_ahead + 1].numpy(),
+            learned.inputs[:n_ahead].numpy(),
+        )
         return Condition(row, trained(learned), reference, states, *bounds, **rest)
 
     @staticmethod
@@ -329,7 +473,10 @@ class Figures:
         condition = trial.condition
         controller, reference = condition.controller(), condition.reference
         if condition.row.loop == "model":
-            system, noise = ModelLoop(read_model(condition.model), MomentMatching()), None
+            system, noise = (
+                ModelLoop(read_model(condition.model), MomentMatching()),
+                None,
+            )
         else:
             system, noise = PLANT, Noise(process=[condition.noise] * 6)
         rehearse(system, controller, reference, reference.states[0])
@@ -345,10 +492,14 @@ class Figures:
 
     def document(self, records: Sequence[dict]) -> Document:
         """Returns the tables and figures."""
-        return tables.document(tables.summarise(records), records, self.data["data"].note)
+        return tables.document(
+            tables.summarise(records), records, self.data["data"].note
+        )
 
 
-def from_settings(made: Mapping[str, Any], settings: Mapping[str, Any], flight: Any) -> Figures:
+def from_settings(
+    made: Mapping[str, Any], settings: Mapping[str, Any], flight: Any
+) -> Figures:
     """Makes the flights that ``conf/figures.yaml`` describes; arguments as in ``gpmpc.experiments.tables``.
 
     Raises:
@@ -357,13 +508,17 @@ def from_settings(made: Mapping[str, Any], settings: Mapping[str, Any], flight: 
     loops, rows = _several(settings["loop"]), {}
     for loop in loops:
         if loop not in LOOPS:
-            raise SettingError("loop", f"must be among {', '.join(LOOPS)}; got {loop!r}")
+            raise SettingError(
+                "loop", f"must be among {', '.join(LOOPS)}; got {loop!r}"
+            )
     for name, row in settings["rows"].items():
         if row is not None:  # left out on the command line
             try:
                 rows[name] = Row(**row)
             except TypeError as error:
-                raise SettingError(f"rows.{name}", str(error).removeprefix("Row.__init__() ")) from error
+                raise SettingError(
+                    f"rows.{name}", str(error).removeprefix("Row.__init__() ")
+                ) from error
     numbers = ("bounds", "state_bounds", "steps", "samples", "noise", "seed", "workers")
     return Figures(
         rows={name: row for name, row in rows.items() if row.loop in loops},
@@ -383,14 +538,23 @@ def tracking_problem(row: Row, inputs: Bounds, states: Bounds | None) -> Problem
     limits = []
     if states is not None:
         price = row.settings.get("penalty")
-        limits = [Box(states.lower, states.upper, probability=row.confidence, penalty=price)]
-    return Problem(Tracking(row.Q, row.R, penalized=row.penalized), box, constraints=limits)
+        limits = [
+            Box(states.lower, states.upper, probability=row.confidence, penalty=price)
+        ]
+    return Problem(
+        Tracking(row.Q, row.R, penalized=row.penalized), box, constraints=limits
+    )
 
 
-def measure(rollout: Rollout, condition: Condition, constraints: Sequence[Constraint]) -> dict:
+def measure(
+    rollout: Rollout, condition: Condition, constraints: Sequence[Constraint]
+) -> dict:
     """Returns the record of a flight."""
     scale, inputs = condition.scaling, condition.inputs
-    states, references = (scale.restore(torch.from_numpy(x)).numpy() for x in (rollout.states, rollout.references))
+    states, references = (
+        scale.restore(torch.from_numpy(x)).numpy()
+        for x in (rollout.states, rollout.references)
+    )
     error = tracking_error(states, references, PLANT.tracked_indices)
     inside = violation_rate(rollout.inputs, inputs.lower, inputs.upper, tolerance=1e-8)
     measured = {
@@ -405,20 +569,32 @@ def measure(rollout: Rollout, condition: Condition, constraints: Sequence[Constr
         after, expected = rollout.states[1:], rollout.predicted_means
         std = np.sqrt(rollout.predicted_covariances.diagonal(axis1=1, axis2=2))
         beyond = np.maximum(limits.lower - after, after - limits.upper).max(axis=1)
-        planned = limits.standard_deviations() * std + np.maximum(limits.lower - expected, expected - limits.upper)
-        margin = planned.max(axis=1)  # of the program's own promise; NaN where nothing was solved
+        planned = limits.standard_deviations() * std + np.maximum(
+            limits.lower - expected, expected - limits.upper
+        )
+        margin = planned.max(
+            axis=1
+        )  # of the program's own promise; NaN where nothing was solved
         at_bound = np.abs(margin) <= AT_BOUND
         measured["violations"] = [int((beyond > 0).sum()), len(after)]
-        measured["at_bound"] = [int(((beyond > 0) & at_bound).sum()), int(at_bound.sum())]
+        measured["at_bound"] = [
+            int(((beyond > 0) & at_bound).sum()),
+            int(at_bound.sum()),
+        ]
         measured["paid"] = int((margin > AT_BOUND).sum())
         measured["worst"] = float(beyond.max())
     if condition.drawn:
         shown = {"states": states, "references": references, "inputs": rollout.inputs}
         if rollout.covariances.any():
-            shown["deviations"] = np.sqrt(rollout.covariances.diagonal(axis1=1, axis2=2)) * scale.factor.numpy()
+            shown["deviations"] = (
+                np.sqrt(rollout.covariances.diagonal(axis1=1, axis2=2))
+                * scale.factor.numpy()
+            )
         if condition.reference.inputs is not None:
             shown["reference_inputs"] = condition.reference.inputs[: condition.steps]
-        measured["drawn"] = {key: np.round(value, 9).tolist() for key, value in shown.items()}
+        measured["drawn"] = {
+            key: np.round(value, 9).tolist() for key, value in shown.items()
+        }
         measured["bounds"] = [list(inputs.lower), list(inputs.upper)]
     return measured
 

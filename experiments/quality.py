@@ -31,13 +31,30 @@ from gpmpc.gaussian import Gaussian
 from gpmpc.metrics import tracking_cost, tracking_error
 from gpmpc.mpc import Controller, Decision, Reference
 from gpmpc.plotting import png
-from gpmpc.plotting._style import BLACK, COLOURS, DASHED, make_figure, plain_numbers, styled
+from gpmpc.plotting._style import (
+    BLACK,
+    COLOURS,
+    DASHED,
+    make_figure,
+    plain_numbers,
+    styled,
+)
 from gpmpc.studies._document import MISSING, Document, Table, number
 from gpmpc.studies.flight import Experiment, run_trial
 from gpmpc.studies.study import Trial, fingerprint, read_model, trained_model
 from gpmpc.trajectories import Trajectory
 
-ROOMS = ("gp", "models", "propagation", "kernels", "qp", "mpc", "simulation", "datasets", "systems")
+ROOMS = (
+    "gp",
+    "models",
+    "propagation",
+    "kernels",
+    "qp",
+    "mpc",
+    "simulation",
+    "datasets",
+    "systems",
+)
 CODE = ("gaussian.py", *(f"{room}/*.py" for room in ROOMS), __file__)
 LOST = 5.0  # [m] from the reference, some hundred times what is usual: nothing to compare costs with
 SAME = 1e-3  # difference of two costs below which the seeds' noise hides it: it buys no time
@@ -77,7 +94,11 @@ CONVEX, FULL, DIAGONAL = (
     "controller.prediction.covariance=full",
     "controller.prediction.covariance=diagonal",
 )
-NONE, EXACT, POINTS = "controller.prediction.covariance=none", "propagation=moment_matching", "propagation=unscented"
+NONE, EXACT, POINTS = (
+    "controller.prediction.covariance=none",
+    "propagation=moment_matching",
+    "propagation=unscented",
+)
 MORE = "controller.iterations=100 controller.tolerance=1e-6"
 FIRST_ORDER = "propagation=linearization"
 FAMILIES = (
@@ -140,13 +161,21 @@ class Quality:
 
     def __post_init__(self) -> None:
         if not isinstance(self.horizons, list | tuple) or not self.horizons:
-            raise SettingError("horizons", f"must be a list with something in it; got {self.horizons!r}")
+            raise SettingError(
+                "horizons",
+                f"must be a list with something in it; got {self.horizons!r}",
+            )
         for horizon in self.horizons:
             check_number("horizons", horizon, least=1, whole=True)
         check_number("steps", self.steps, least=1, whole=True)
         check_number("seeds", self.seeds, least=1, whole=True)
-        check_number("workers", 1 if self.workers is None else self.workers, least=1, whole=True)
-        for key, chosen in (("trajectory", self.trajectories), ("families", self.experiments)):
+        check_number(
+            "workers", 1 if self.workers is None else self.workers, least=1, whole=True
+        )
+        for key, chosen in (
+            ("trajectory", self.trajectories),
+            ("families", self.experiments),
+        ):
             if not chosen:
                 raise SettingError(key, "choose at least one")
 
@@ -164,17 +193,37 @@ class Quality:
             learning = next((e for e in self.experiments.values() if e.learns), None)
             if learning is not None:
                 learning = replace(learning, trajectory=trajectory, name=name, seed=0)
-                models[name] = trained_model(learning.learn, self.settings, learning.training_rows(), 0, folder)
+                models[name] = trained_model(
+                    learning.learn, self.settings, learning.training_rows(), 0, folder
+                )
         trials = []
         for seed, (name, trajectory), (family, horizon) in product(
             range(self.seeds), self.trajectories.items(), self.cases
         ):
             experiment = self.experiments[family]
             make = experiment.controller
-            flown = replace(experiment, trajectory=trajectory, name=name, seed=seed, steps=self.steps)
-            flown = replace(flown, controller=At(make, horizon) if experiment.learns else AtPlant(make, horizon))
-            labels = {"family": family.name, "what": family.words, "H": horizon, "trajectory": name}
-            named = fingerprint([labels, self.settings, repr(trajectory), seed, self.steps], code=CODE)
+            flown = replace(
+                experiment,
+                trajectory=trajectory,
+                name=name,
+                seed=seed,
+                steps=self.steps,
+            )
+            flown = replace(
+                flown,
+                controller=At(make, horizon)
+                if experiment.learns
+                else AtPlant(make, horizon),
+            )
+            labels = {
+                "family": family.name,
+                "what": family.words,
+                "H": horizon,
+                "trajectory": name,
+            }
+            named = fingerprint(
+                [labels, self.settings, repr(trajectory), seed, self.steps], code=CODE
+            )
             condition = Condition(flown, models[name] if experiment.learns else None)
             trials.append(Trial(labels, condition, seed, named))
         return trials
@@ -187,11 +236,18 @@ class Quality:
             GpmpcError: The vehicle has left its path.
         """
         experiment, model = trial.condition
-        flown = run_trial(replace(experiment, model=None if model is None else read_model(model)))
+        flown = run_trial(
+            replace(experiment, model=None if model is None else read_model(model))
+        )
         rollout, controller = flown.rollout, flown.controller
-        distance = np.linalg.norm((rollout.states - rollout.references)[:, experiment.system.tracked_indices], axis=1)
+        distance = np.linalg.norm(
+            (rollout.states - rollout.references)[:, experiment.system.tracked_indices],
+            axis=1,
+        )
         if not distance.max() <= LOST:
-            raise GpmpcError(f"{LOST:g} m off its path after {int(np.argmax(~(distance <= LOST)))} steps")
+            raise GpmpcError(
+                f"{LOST:g} m off its path after {int(np.argmax(~(distance <= LOST)))} steps"
+            )
         before = controller.initial_input
         return {
             "cost": tracking_cost(
@@ -202,7 +258,13 @@ class Quality:
                 rollout.inputs,
                 before,
             ),
-            "rmse": float(tracking_error(rollout.states, rollout.references, experiment.system.tracked_indices).total),
+            "rmse": float(
+                tracking_error(
+                    rollout.states,
+                    rollout.references,
+                    experiment.system.tracked_indices,
+                ).total
+            ),
             "seconds": controller.seconds[-len(rollout.inputs) :],
             "failed": len(rollout.failures),
         }
@@ -219,10 +281,20 @@ class Quality:
             case = flown.setdefault((record["what"], record["H"]), {})
             case.setdefault(record["trajectory"], []).append(record)
         truth = flown[TRUTH.words, max(self.horizons)]
-        cases = [case for case in self.cases if case[0] in self.experiments and case[1] in self.horizons]
+        cases = [
+            case
+            for case in self.cases
+            if case[0] in self.experiments and case[1] in self.horizons
+        ]
         rows = [_row(family, H, flown[family.words, H], truth) for family, H in cases]
-        candidates = [row for row in rows if row["lost"] is None and row["family"] != TRUTH.name]
-        members = pareto_front([row["median"] for row in candidates], [row["cost"] for row in candidates], SAME)
+        candidates = [
+            row for row in rows if row["lost"] is None and row["family"] != TRUTH.name
+        ]
+        members = pareto_front(
+            [row["median"] for row in candidates],
+            [row["cost"] for row in candidates],
+            SAME,
+        )
         for row, member in zip(candidates, members, strict=True):
             row["front"] = member
         return rows
@@ -234,7 +306,11 @@ class Quality:
     def document(self, records: Sequence[dict]) -> Document:
         """Returns the table and the figure."""
         rows = self.rows(records)
-        lost = [f"{row['what']} horizon={row['H']}: {row['lost']}" for row in rows if row["lost"]]
+        lost = [
+            f"{row['what']} horizon={row['H']}: {row['lost']}"
+            for row in rows
+            if row["lost"]
+        ]
         return Document(
             "Quality over time",
             [_table(rows)],
@@ -246,7 +322,9 @@ class Quality:
 
 
 def from_settings(
-    made: Mapping[str, Any], settings: Mapping[str, Any], flight: Callable[[str], tuple[Experiment, Any]]
+    made: Mapping[str, Any],
+    settings: Mapping[str, Any],
+    flight: Callable[[str], tuple[Experiment, Any]],
 ) -> Quality:
     """Makes the flights that ``conf/quality.yaml`` describes; arguments as in ``gpmpc.experiments.tables``.
 
@@ -255,12 +333,24 @@ def from_settings(
         settings: See there.
         flight: From what is typed after ``gpmpc run`` to the flight and its settings.
     """
-    noise, only = f"noise.process=[{','.join([str(settings['noise'])] * 6)}]", settings["only"]
-    chosen = [family for family in FAMILIES if family is TRUTH or only is None or str(only) in family.words]
+    noise, only = (
+        f"noise.process=[{','.join([str(settings['noise'])] * 6)}]",
+        settings["only"],
+    )
+    chosen = [
+        family
+        for family in FAMILIES
+        if family is TRUTH or only is None or str(only) in family.words
+    ]
     flown = {family: flight(f"{family.words} {noise}") for family in chosen}
     experiments = {family: experiment for family, (experiment, _) in flown.items()}
     numbers = {key: settings[key] for key in ("horizons", "steps", "seeds", "workers")}
-    return Quality(experiments, made["trajectory"], {f.words: plain for f, (_, plain) in flown.items()}, **numbers)
+    return Quality(
+        experiments,
+        made["trajectory"],
+        {f.words: plain for f, (_, plain) in flown.items()},
+        **numbers,
+    )
 
 
 class Clocked:
@@ -272,7 +362,9 @@ class Clocked:
     def __getattr__(self, name: str) -> Any:
         return getattr(self._controller, name)
 
-    def control(self, belief: Gaussian, reference: Reference, previous: Decision | None = None) -> Decision:
+    def control(
+        self, belief: Gaussian, reference: Reference, previous: Decision | None = None
+    ) -> Decision:
         """Decides as the controller does."""
         began = time.thread_time_ns()
         decision = self._controller.control(belief, reference, previous)
@@ -302,7 +394,9 @@ class AtPlant(NamedTuple):
         return Clocked(self.make(plant, horizon=self.horizon))
 
 
-def pareto_front(times: Sequence[float], costs: Sequence[float], least: float = 0.0) -> list[bool]:
+def pareto_front(
+    times: Sequence[float], costs: Sequence[float], least: float = 0.0
+) -> list[bool]:
     """Returns which cases are not dominated: none is at least as good in both and better in one.
 
     Args:
@@ -320,24 +414,49 @@ def pareto_front(times: Sequence[float], costs: Sequence[float], least: float = 
     return members
 
 
-def _row(family: Family, horizon: int, flown: Mapping[str, list[dict]], truth: Mapping[str, list[dict]]) -> dict:
+def _row(
+    family: Family,
+    horizon: int,
+    flown: Mapping[str, list[dict]],
+    truth: Mapping[str, list[dict]],
+) -> dict:
     """Returns the row of a case, from records by trajectory."""
     records = [record for of in flown.values() for record in of]
     lost = next((_why(record) for record in records if "error" in record), None)
-    if lost is None and (astray := next((r for of in truth.values() for r in of if "error" in r), None)):
+    if lost is None and (
+        astray := next((r for of in truth.values() for r in of if "error" in r), None)
+    ):
         lost = f"nothing to compare with: NMPC on the true model, {_why(astray)}"
-    row = {"family": family.name, "what": family.words, "H": horizon, "lost": lost, "front": False}
+    row = {
+        "family": family.name,
+        "what": family.words,
+        "H": horizon,
+        "lost": lost,
+        "front": False,
+    }
     row["flights"] = sum("error" not in record for record in records)
     if lost is not None:
         return row
-    sums = [{name: sum(r["cost"] for r in group) for name, group in of.items()} for of in (flown, truth)]
+    sums = [
+        {name: sum(r["cost"] for r in group) for name, group in of.items()}
+        for of in (flown, truth)
+    ]
     costs = {name: cost / sums[1][name] for name, cost in sums[0].items()}
     seconds = [second for record in records for second in record["seconds"]]
-    row |= {"median": 1e3 * float(np.median(seconds)), "p99": 1e3 * float(np.quantile(seconds, 0.99))}
+    row |= {
+        "median": 1e3 * float(np.median(seconds)),
+        "p99": 1e3 * float(np.quantile(seconds, 0.99)),
+    }
     row |= {"cost": float(np.exp(np.mean(np.log(list(costs.values())))))}
     row |= {f"cost {name}": float(ratio) for name, ratio in costs.items()}
-    row |= {f"rmse {name}": float(np.sqrt(np.mean([r["rmse"] ** 2 for r in of]))) for name, of in flown.items()}
-    return row | {"failed": sum(record["failed"] for record in records), "samples": len(seconds)}
+    row |= {
+        f"rmse {name}": float(np.sqrt(np.mean([r["rmse"] ** 2 for r in of])))
+        for name, of in flown.items()
+    }
+    return row | {
+        "failed": sum(record["failed"] for record in records),
+        "samples": len(seconds),
+    }
 
 
 def _why(record: Mapping[str, Any]) -> str:
@@ -348,11 +467,22 @@ def _table(rows: Sequence[Mapping[str, Any]]) -> Table:
     lines = []
     for row in rows:
         if row["lost"] is None:
-            figures = [f"{row['cost']:.4f}", number(row["median"]), number(row["p99"]), str(row["failed"])]
+            figures = [
+                f"{row['cost']:.4f}",
+                number(row["median"]),
+                number(row["p99"]),
+                str(row["failed"]),
+            ]
         else:
             figures = ["lost", *[MISSING] * 3]
-        lines.append([row["what"], str(row["H"]), *figures, "●" if row["front"] else ""])
-    return Table(["gpmpc run", "H", "cost", "ms: median", "99 %", "failed", "front"], lines, "Quality over time")
+        lines.append(
+            [row["what"], str(row["H"]), *figures, "●" if row["front"] else ""]
+        )
+    return Table(
+        ["gpmpc run", "H", "cost", "ms: median", "99 %", "failed", "front"],
+        lines,
+        "Quality over time",
+    )
 
 
 @styled
@@ -366,28 +496,83 @@ def front_figure(rows: Sequence[Mapping]) -> Figure:
     Args:
         rows: Of the quality study; lost ones are counted in the corner.
     """
-    flown = [{**row, "excess": 100 * (row["cost"] - 1)} for row in rows if row["lost"] is None]
-    markers = {horizon: MARKERS[i % len(MARKERS)] for i, horizon in enumerate(sorted({row["H"] for row in rows}))}
-    figure, ((axis,),) = make_figure(9.0, 6.2)  # at 100 dots an inch as wide as a README
-    axis.set_title(f"gpmpc quality: {len({row['what'] for row in rows})} choices of settings over the horizon")
+    flown = [
+        {**row, "excess": 100 * (row["cost"] - 1)}
+        for row in rows
+        if row["lost"] is None
+    ]
+    markers = {
+        horizon: MARKERS[i % len(MARKERS)]
+        for i, horizon in enumerate(sorted({row["H"] for row in rows}))
+    }
+    figure, ((axis,),) = make_figure(
+        9.0, 6.2
+    )  # at 100 dots an inch as wide as a README
+    axis.set_title(
+        f"gpmpc quality: {len({row['what'] for row in rows})} choices of settings over the horizon"
+    )
     axis.axhline(0, color=BLACK, linewidth=0.8, linestyle=DASHED, zorder=1)
     for row in flown:
-        axis.plot(row["median"], row["excess"], markers[row["H"]], color=OTHERS, markersize=4, zorder=2)
+        axis.plot(
+            row["median"],
+            row["excess"],
+            markers[row["H"]],
+            color=OTHERS,
+            markersize=4,
+            zorder=2,
+        )
     plain: dict[str, Any] = {"linestyle": "none", "markersize": 5.5}
     handles = []
     for (what, line), colour in zip(_curves(flown).items(), COLOURS, strict=False):
-        axis.plot([row["median"] for row in line], [row["excess"] for row in line], color=colour, zorder=3)
+        axis.plot(
+            [row["median"] for row in line],
+            [row["excess"] for row in line],
+            color=colour,
+            zorder=3,
+        )
         for row in line:
-            axis.plot(row["median"], row["excess"], markers[row["H"]], color=colour, markersize=6, zorder=3)
-        handles.append(Line2D([], [], color=colour, marker="o", markersize=5.5, label=what))
-    handles.append(Line2D([], [], color=OTHERS, marker="o", **plain, label="other settings"))
-    handles.append(Line2D([], [], color=FRONT, linewidth=1.4, label="front: none is better and faster"))
-    handles += [Line2D([], [], color="0.4", marker=kind, **plain, label=f"H = {H}") for H, kind in markers.items()]
+            axis.plot(
+                row["median"],
+                row["excess"],
+                markers[row["H"]],
+                color=colour,
+                markersize=6,
+                zorder=3,
+            )
+        handles.append(
+            Line2D([], [], color=colour, marker="o", markersize=5.5, label=what)
+        )
+    handles.append(
+        Line2D([], [], color=OTHERS, marker="o", **plain, label="other settings")
+    )
+    handles.append(
+        Line2D(
+            [], [], color=FRONT, linewidth=1.4, label="front: none is better and faster"
+        )
+    )
+    handles += [
+        Line2D([], [], color="0.4", marker=kind, **plain, label=f"H = {H}")
+        for H, kind in markers.items()
+    ]
     _scales(axis, flown)
-    _front(axis, sorted((row for row in flown if row["front"]), key=lambda row: (row["median"], -row["cost"])))
+    _front(
+        axis,
+        sorted(
+            (row for row in flown if row["front"]),
+            key=lambda row: (row["median"], -row["cost"]),
+        ),
+    )
     figure.legend(handles=handles, loc="outside upper center", ncols=3, fontsize=8.5)
     if lost := len(rows) - len(flown):
-        axis.text(0.99, 0.98, f"lost: {lost}", transform=axis.transAxes, ha="right", va="top", color=FRONT)
+        axis.text(
+            0.99,
+            0.98,
+            f"lost: {lost}",
+            transform=axis.transAxes,
+            ha="right",
+            va="top",
+            color=FRONT,
+        )
     return figure
 
 
@@ -399,7 +584,9 @@ def _curves(rows: Sequence[Mapping]) -> dict[str, list[Mapping]]:
 
     def merit(what: str) -> tuple[float, float]:
         cost = min(round(row["cost"], 3) for row in lines[what])
-        return cost, min(row["median"] for row in lines[what] if round(row["cost"], 3) == cost)
+        return cost, min(
+            row["median"] for row in lines[what] if round(row["cost"], 3) == cost
+        )
 
     best: dict[str, str] = {}
     for what in sorted(lines, key=merit):
@@ -413,7 +600,10 @@ def _scales(axis: Axes, rows: Sequence[Mapping]) -> None:
     axis.set_xlabel("median time of a decision [ms], one thread")
     axis.set_ylabel("closed-loop cost above NMPC on the true model")
     plain_numbers(axis.xaxis, few=True)
-    values, times = [row["excess"] for row in rows] or [0.0], [row["median"] for row in rows] or [1.0]
+    values, times = (
+        [row["excess"] for row in rows] or [0.0],
+        [row["median"] for row in rows] or [1.0],
+    )
     low, high = min(values), max(values)
     reach = [tick for tick in TICKS if low * 1.5 - 1 <= tick <= high * 1.5 + 1]
     axis.set_yticks(reach, [f"{tick:+d} %" if tick else "0" for tick in reach])
@@ -428,15 +618,38 @@ def _front(axis: Axes, members: Sequence[Mapping]) -> None:
         return
     x, y = [row["median"] for row in members], [row["excess"] for row in members]
     right, top = axis.get_xlim()[1], axis.get_ylim()[1]
-    stair: Any = {"color": FRONT, "linewidth": 1.4, "zorder": 1.5, "drawstyle": "steps-post"}
+    stair: Any = {
+        "color": FRONT,
+        "linewidth": 1.4,
+        "zorder": 1.5,
+        "drawstyle": "steps-post",
+    }
     axis.plot([x[0], *x, right], [top, *y, y[-1]], **stair)
     axis.set_xlim(right=right)
     axis.set_ylim(top=top)
     for i, place in enumerate(zip(x, y, strict=True), 1):
-        axis.plot(*place, "o", markersize=11, markerfacecolor="none", markeredgecolor=FRONT, markeredgewidth=1.2)
-        beside: Any = {"textcoords": "offset points", "ha": "right", "va": "center", "weight": "bold"}
-        axis.annotate(str(i), place, (-9 - 9 * (i % 2), -9), **beside)  # nobody is below and left of it
-    names = [f"{i}  {row['what']} horizon={row['H']}" for i, row in enumerate(members, 1)]
+        axis.plot(
+            *place,
+            "o",
+            markersize=11,
+            markerfacecolor="none",
+            markeredgecolor=FRONT,
+            markeredgewidth=1.2,
+        )
+        beside: Any = {
+            "textcoords": "offset points",
+            "ha": "right",
+            "va": "center",
+            "weight": "bold",
+        }
+        axis.annotate(
+            str(i), place, (-9 - 9 * (i % 2), -9), **beside
+        )  # nobody is below and left of it
+    names = [
+        f"{i}  {row['what']} horizon={row['H']}" for i, row in enumerate(members, 1)
+    ]
     handles = [Line2D([], [], linestyle="none", label=name) for name in names]
     font: Any = {"family": "monospace", "size": 8.5}
-    axis.figure.legend(handles=handles, loc="outside lower left", handlelength=0, prop=font)
+    axis.figure.legend(
+        handles=handles, loc="outside lower left", handlelength=0, prop=font
+    )

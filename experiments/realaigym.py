@@ -34,8 +34,23 @@ from scipy.optimize import least_squares
 from gpmpc._files import write_whole
 from gpmpc._provenance import provenance
 from gpmpc.exceptions import GpmpcError, SettingError
-from gpmpc.gp import Trainer, Transitions, informative_points, load_metadata, standardize
-from gpmpc.models import Affine, CasadiFunction, Features, KnownModel, ResidualModel, RollOut, load_model, save_model
+from gpmpc.gp import (
+    Trainer,
+    Transitions,
+    informative_points,
+    load_metadata,
+    standardize,
+)
+from gpmpc.models import (
+    Affine,
+    CasadiFunction,
+    Features,
+    KnownModel,
+    ResidualModel,
+    RollOut,
+    load_model,
+    save_model,
+)
 from gpmpc.mpc import (
     GPMPC,
     Box,
@@ -53,12 +68,28 @@ from gpmpc.systems import System, double_pendulum, step, step_many
 
 Array = np.ndarray
 
-ACTUATED, JOINTS = {"acrobot": "elbow", "pendubot": "shoulder"}, {"acrobot": 1, "pendubot": 0}
+ACTUATED, JOINTS = (
+    {"acrobot": "elbow", "pendubot": "shoulder"},
+    {"acrobot": 1, "pendubot": 0},
+)
 RATES = {"acrobot": 0.1, "pendubot": 0.02}  # weights of rates [s^2/rad^2]
-TURNS = {"acrobot": (2, 3), "pendubot": (3, 4)}  # of both joints, that a search without a clock takes for goals
+TURNS = {
+    "acrobot": (2, 3),
+    "pendubot": (3, 4),
+}  # of both joints, that a search without a clock takes for goals
 PUBLISHED = {  # simulation board of 2025: mean score of the best entries, acados with the true model, and MC-PILCO (GP)
-    "acrobot": {"AR-EAPO": 0.658, "VIMPPI": 0.648, "acados MPC": 0.630, "MC-PILCO": 0.307},
-    "pendubot": {"VIMPPI": 0.799, "AR-EAPO": 0.759, "acados MPC": 0.726, "MC-PILCO": 0.509},
+    "acrobot": {
+        "AR-EAPO": 0.658,
+        "VIMPPI": 0.648,
+        "acados MPC": 0.630,
+        "MC-PILCO": 0.307,
+    },
+    "pendubot": {
+        "VIMPPI": 0.799,
+        "AR-EAPO": 0.759,
+        "acados MPC": 0.726,
+        "MC-PILCO": 0.509,
+    },
 }
 INSTALL = (
     "the league's simulator is not installed: git clone https://github.com/dfki-ric-underactuated-lab/double_pendulum, "
@@ -66,7 +97,11 @@ INSTALL = (
 )
 PLAN, INPUT = 0.02, 0.002  # time steps of plans and of torques [s]
 TICKS = round(PLAN / INPUT)  # inputs in a plan's time step
-TORQUE, LINE, DURATION = 6.0, 0.45, 60.0  # limit [N m], height to be above [m], length of a test [s]
+TORQUE, LINE, DURATION = (
+    6.0,
+    0.45,
+    60.0,
+)  # limit [N m], height to be above [m], length of a test [s]
 LENGTHS = 0.2, 0.3  # [m]
 WILD = 25.0, 38.0  # rates beyond which transitions are not learned from [rad/s]
 REPLAN = 5.0  # predicted time below the line above which a plan is given up [s]
@@ -81,7 +116,9 @@ def state_of(x: Any) -> Array:
 
 def heights(states: Array) -> Array:
     """Height of the tip (...,) over the shoulder [m]."""
-    return LENGTHS[0] * np.cos(states[..., 0]) + LENGTHS[1] * np.cos(states[..., 0] + states[..., 2])
+    return LENGTHS[0] * np.cos(states[..., 0]) + LENGTHS[1] * np.cos(
+        states[..., 0] + states[..., 2]
+    )
 
 
 def upright(states: Array) -> Reference:
@@ -93,13 +130,22 @@ def upright(states: Array) -> Reference:
 
 def casadi_model(system: System) -> CasadiFunction:
     """The step of a system as a function that can be linearised."""
-    x, u = casadi.SX.sym("x", len(system.state_names)), casadi.SX.sym("u", len(system.input_names))
-    return CasadiFunction(casadi.Function("successor", [x, u], [casadi.vertcat(*system.successor(x, u))]))
+    x, u = (
+        casadi.SX.sym("x", len(system.state_names)),
+        casadi.SX.sym("u", len(system.input_names)),
+    )
+    return CasadiFunction(
+        casadi.Function("successor", [x, u], [casadi.vertcat(*system.successor(x, u))])
+    )
 
 
 def fine_model(robot: str, body: list[float] | None = None) -> KnownModel:
     """A rigid body over 2 ms; by default the true one."""
-    system = double_pendulum(ACTUATED[robot]) if body is None else _with_parameters(robot, np.array(body))
+    system = (
+        double_pendulum(ACTUATED[robot])
+        if body is None
+        else _with_parameters(robot, np.array(body))
+    )
     return KnownModel(casadi_model(replace(system, time_step=INPUT, substeps=1)), 4, 1)
 
 
@@ -118,9 +164,13 @@ def fit_body(robot: str, start: System, data: Transitions) -> System:
     x, u, after = data.states.numpy(), data.inputs.numpy(), data.next_states.numpy()
 
     def errors(logarithms: Array) -> Array:
-        return (step_many(_with_parameters(robot, np.exp(logarithms)), x, u) - after).ravel()
+        return (
+            step_many(_with_parameters(robot, np.exp(logarithms)), x, u) - after
+        ).ravel()
 
-    return _with_parameters(robot, np.exp(least_squares(errors, np.log(_parameters(start))).x))
+    return _with_parameters(
+        robot, np.exp(least_squares(errors, np.log(_parameters(start))).x)
+    )
 
 
 def _parameters(system: System) -> Array:
@@ -130,7 +180,12 @@ def _parameters(system: System) -> Array:
 
 def _with_parameters(robot: str, values: Array) -> System:
     m1, m2, length, c1, c2, i1, i2 = map(float, values)
-    parts = {"masses": (m1, m2), "first_length": length, "centres": (c1, c2), "inertias": (i1, i2)}
+    parts = {
+        "masses": (m1, m2),
+        "first_length": length,
+        "centres": (c1, c2),
+        "inertias": (i1, i2),
+    }
     return double_pendulum(ACTUATED[robot], **parts)
 
 
@@ -169,7 +224,9 @@ class Pilot:
         if self._count == 0:
             torque = self._held = self._decide(state)
         elif self._loop is not None and self.gain > 0:
-            between = float(self._loop.input_between(state, self._count * INPUT / PLAN)[0])
+            between = float(
+                self._loop.input_between(state, self._count * INPUT / PLAN)[0]
+            )
             torque += self.gain * (between - torque)
         self._count = (self._count + 1) % TICKS
         out = np.zeros(2)
@@ -184,10 +241,16 @@ class Pilot:
             return brake
         begin, without = perf_counter(), self._loop is None
         loop = ControlLoop(self.controller) if self._loop is None else self._loop
-        torque, plan = float(loop.input(state, Reference(np.zeros(4)))[0]), loop.last.decision
+        torque, plan = (
+            float(loop.input(state, Reference(np.zeros(4)))[0]),
+            loop.last.decision,
+        )
         self.seconds.append(perf_counter() - begin)
         self.searched.append(without)
-        if not plan.applicable or self.controller.criterion(plan, upright(plan.means)) > REPLAN:
+        if (
+            not plan.applicable
+            or self.controller.criterion(plan, upright(plan.means)) > REPLAN
+        ):
             self._loop, self._pause = None, PAUSE - 1
             return brake
         self._loop = loop
@@ -241,7 +304,11 @@ DESCRIBED = {
 
 def read_model(robot: str, kind: str, path: Path) -> Any:
     """The model of a file, or the true one."""
-    return KnownModel(casadi_model(double_pendulum(ACTUATED[robot])), 4, 1) if kind == "true" else load_model(path)
+    return (
+        KnownModel(casadi_model(double_pendulum(ACTUATED[robot])), 4, 1)
+        if kind == "true"
+        else load_model(path)
+    )
 
 
 def write_entry(robot: str, kind: str, seed: int, folder: Path) -> Path:
@@ -250,14 +317,20 @@ def write_entry(robot: str, kind: str, seed: int, folder: Path) -> Path:
     Returns the path of the controller file, ``con_gpmpc_*.py``.
     """
     name = f"gpmpc_{kind}_{seed}"
-    model, entry = folder / robot / f"{name}.safetensors", folder / robot / f"con_{name}.py"
+    model, entry = (
+        folder / robot / f"{name}.safetensors",
+        folder / robot / f"con_{name}.py",
+    )
     entry.parent.mkdir(parents=True, exist_ok=True)
     if kind != "true" and not model.exists():
         begin = perf_counter()
         learned, body = learned_model(robot, kind, seed)
         save_model(learned, model, {"robot": robot, "seed": seed, "body": body})
         _say(f"  learned in {perf_counter() - begin:.0f} s: {model}")
-    write_whole(entry, ENTRY.format(robot=robot, kind=kind, name=name, described=DESCRIBED[kind]))
+    write_whole(
+        entry,
+        ENTRY.format(robot=robot, kind=kind, name=name, described=DESCRIBED[kind]),
+    )
     return entry
 
 
@@ -274,13 +347,21 @@ def play_robustness(entry: Path, robot: str, kind: str, size: int) -> str:
 
     path = beside(entry, ".safetensors")
     model = read_model(robot, kind, path)
-    fine = fine_model(robot, None if kind == "true" else load_metadata(path)["metadata"]["body"])
+    fine = fine_model(
+        robot, None if kind == "true" else load_metadata(path)["metadata"]["body"]
+    )
     who = Watchful(_real_time_pilot(model, robot), RollOut(fine), JOINTS[robot])
     store = beside(entry, f"_robustness_{size}.json")
     found = robustness(league_controller(AbstractController, who), robot, size, store)
     shares = {part: float(np.mean(successes)) for part, successes in found.items()}
-    lines = [f"| {robot}, robustness 2, {kind} model | flights | up after 10 s |", "|---|---|---|"]
-    lines += [f"| {part} | {len(found[part])} | {share:.3f} |" for part, share in shares.items()]
+    lines = [
+        f"| {robot}, robustness 2, {kind} model | flights | up after 10 s |",
+        "|---|---|---|",
+    ]
+    lines += [
+        f"| {part} | {len(found[part])} | {share:.3f} |"
+        for part, share in shares.items()
+    ]
     return "\n".join([*lines, f"| mean | | {np.mean(list(shares.values())):.3f} |"])
 
 
@@ -288,7 +369,10 @@ def play_film(entry: Path, robot: str, kind: str) -> Path:
     """Writes the first 8 s of draw 100 as a GIF beside an entry."""
     from gpmpc.experiments.realaigym_film import film
 
-    path, model = beside(entry, ".gif"), read_model(robot, kind, beside(entry, ".safetensors"))
+    path, model = (
+        beside(entry, ".gif"),
+        read_model(robot, kind, beside(entry, ".safetensors")),
+    )
     film(play(pilot(model, robot), robot, 100, 8.0), JOINTS[robot], path)
     return path
 
@@ -296,18 +380,40 @@ def play_film(entry: Path, robot: str, kind: str) -> Path:
 def play_script(entry: Path, robot: str) -> float:
     """The score by the league's unmodified script, which draws its disturbances without a seed."""
     found = find_spec("double_pendulum")
-    where = Path(str(found and found.origin)).resolve().parents[3] / "leaderboard" / robot / "simulation_v3"
+    where = (
+        Path(str(found and found.origin)).resolve().parents[3]
+        / "leaderboard"
+        / robot
+        / "simulation_v3"
+    )
     if not where.is_dir():
-        raise SettingError("simulator", f"board=script needs the repository, not only its package: {INSTALL}")
+        raise SettingError(
+            "simulator",
+            f"board=script needs the repository, not only its package: {INSTALL}",
+        )
     if which("ffmpeg") is None:
-        raise SettingError("simulator", "board=script needs ffmpeg on PATH: the league's script draws a video")
+        raise SettingError(
+            "simulator",
+            "board=script needs ffmpeg on PATH: the league's script draws a video",
+        )
     results = where / "data" / beside(entry, "").name
-    (results / "sim_swingup.csv").unlink(missing_ok=True)  # the script would score it again
+    (results / "sim_swingup.csv").unlink(
+        missing_ok=True
+    )  # the script would score it again
     given = filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))
-    paths = [str(Path(path).resolve()) for path in (entry.parent, *given)]  # the script runs in its own folder
+    paths = [
+        str(Path(path).resolve()) for path in (entry.parent, *given)
+    ]  # the script runs in its own folder
     command = [sys.executable, "calculate_leaderboard_score.py", entry.name]
-    subprocess.run(command, cwd=where, env=os.environ | {"PYTHONPATH": os.pathsep.join(paths)}, check=True)
-    return float(pandas.read_csv(results / "leaderboard_entry.csv")["RealAI Score"].iloc[0])
+    subprocess.run(
+        command,
+        cwd=where,
+        env=os.environ | {"PYTHONPATH": os.pathsep.join(paths)},
+        check=True,
+    )
+    return float(
+        pandas.read_csv(results / "leaderboard_entry.csv")["RealAI Score"].iloc[0]
+    )
 
 
 class Parts(NamedTuple):
@@ -316,11 +422,18 @@ class Parts(NamedTuple):
     controller: GPMPC  #: improves a plan from decision to decision
     planner: GPMPC  #: takes several programs a start, with the fitted body alone where there is one
     guesses: list[Array | None]  #: to start from: the straight line, the drift, kicks
-    criterion: Callable[[Decision, Reference], float]  #: predicted time below the line, more where the end is off [s]
+    criterion: Callable[
+        [Decision, Reference], float
+    ]  #: predicted time below the line, more where the end is off [s]
 
 
 def make_parts(
-    model: Any, rate: float, horizon: int = 40, programs: int = 20, wild: bool = True, kept: int = 1
+    model: Any,
+    rate: float,
+    horizon: int = 40,
+    programs: int = 20,
+    wild: bool = True,
+    kept: int = 1,
 ) -> Parts:
     """Makes the parts of a pilot.
 
@@ -335,7 +448,10 @@ def make_parts(
     Q, R = np.diag([10.0, rate, 10.0, rate]), np.array([[0.01]])
     still = model.linearize(np.zeros((1, 4)), np.zeros((1, 1)), False)
     P = _cost_to_go(still.A[0], still.B[0], Q, R)
-    problem = Problem(Tracking(Q, R, 10.0 * P, penalized="inputs", angles=(0, 2)), inputs=Box([-TORQUE], [TORQUE]))
+    problem = Problem(
+        Tracking(Q, R, 10.0 * P, penalized="inputs", angles=(0, 2)),
+        inputs=Box([-TORQUE], [TORQUE]),
+    )
 
     def time_below(decision: Decision, reference: Reference) -> float:
         off = decision.means[-1] - reference.states[-1]
@@ -344,23 +460,43 @@ def make_parts(
 
     def make(iterations: int) -> GPMPC:
         settings = PredictionSettings(covariance="none", rolled_out=True)
-        return GPMPC(model, Linearization(), problem, horizon, [0.0], settings, iterations=iterations, tolerance=1e-2)
+        return GPMPC(
+            model,
+            Linearization(),
+            problem,
+            horizon,
+            [0.0],
+            settings,
+            iterations=iterations,
+            tolerance=1e-2,
+        )
 
     guesses: list[Array | None] = [None, np.zeros((horizon, 1))]
     if wild:
         for sign in (0.5, -0.5):
             kick = np.zeros((horizon, 1))
-            kick[: horizon // 6], kick[horizon // 6 : horizon // 3] = sign * TORQUE, -sign * TORQUE
+            kick[: horizon // 6], kick[horizon // 6 : horizon // 3] = (
+                sign * TORQUE,
+                -sign * TORQUE,
+            )
             guesses.append(kick)
     nominal = getattr(model, "nominal", None)
-    quick = model if getattr(nominal, "tape", None) is None else KnownModel(nominal, 4, 1)
+    quick = (
+        model if getattr(nominal, "tape", None) is None else KnownModel(nominal, 4, 1)
+    )
     return Parts(make(kept), make(programs).with_model(quick), guesses, time_below)
 
 
 def pilot(model: Any, robot: str, gain: float = 1.0, **settings: Any) -> Pilot:
     """Makes the pilot of a model that takes all the time it likes; settings are those of ``make_parts``."""
-    controller, planner, guesses, criterion = make_parts(model, RATES[robot], **settings)
-    return Pilot(ManyStarts(controller, planner, guesses, TURNS[robot], criterion, REPLAN), JOINTS[robot], gain)
+    controller, planner, guesses, criterion = make_parts(
+        model, RATES[robot], **settings
+    )
+    return Pilot(
+        ManyStarts(controller, planner, guesses, TURNS[robot], criterion, REPLAN),
+        JOINTS[robot],
+        gain,
+    )
 
 
 def _cost_to_go(A: Array, B: Array, Q: Array, R: Array) -> Array:
@@ -386,7 +522,13 @@ class Play:
     torques: Array
 
 
-def play(who: Flies, robot: str, seed: int, seconds: float = DURATION, unmodified: bool = False) -> Play:
+def play(
+    who: Flies,
+    robot: str,
+    seed: int,
+    seconds: float = DURATION,
+    unmodified: bool = False,
+) -> Play:
     """Runs the league's simulation and disturbances, drawn from a seed.
 
     Args:
@@ -398,11 +540,15 @@ def play(who: Flies, robot: str, seed: int, seconds: float = DURATION, unmodifie
     """
     from double_pendulum.analysis.leaderboard import get_uptime
     from double_pendulum.controller.abstract_controller import AbstractController
-    from double_pendulum.controller.global_policy_testing_controller import GlobalPolicyTestingControllerV2
+    from double_pendulum.controller.global_policy_testing_controller import (
+        GlobalPolicyTestingControllerV2,
+    )
     from double_pendulum.model.plant import DoublePendulumPlant
     from double_pendulum.simulation.simulation import Simulator
 
-    limited, unlimited = (league_parameters(limits) for limits in (torque_limits(robot), [TORQUE, TORQUE]))
+    limited, unlimited = (
+        league_parameters(limits) for limits in (torque_limits(robot), [TORQUE, TORQUE])
+    )
     plant = DoublePendulumPlant(model_pars=unlimited)
     if not unmodified:
         plant.rhs = right_hand_side()
@@ -415,9 +561,15 @@ def play(who: Flies, robot: str, seed: int, seconds: float = DURATION, unmodifie
         reset_length=0.2,
         mpar=unlimited,
     )
-    times, states, torques = Simulator(plant=plant).simulate(0.0, [0.0] * 4, seconds, INPUT, controller, "runge_kutta")
+    times, states, torques = Simulator(plant=plant).simulate(
+        0.0, [0.0] * 4, seconds, INPUT, controller, "runge_kutta"
+    )
     times, states = np.array(times), np.array(states)
-    return Play(get_uptime(times, states, mpar=limited) / seconds, states, np.array(torques)[:, :2])
+    return Play(
+        get_uptime(times, states, mpar=limited) / seconds,
+        states,
+        np.array(torques)[:, :2],
+    )
 
 
 def league_parameters(limits: list[float]) -> Any:
@@ -428,7 +580,9 @@ def league_parameters(limits: list[float]) -> Any:
     found.set_mass(list(d.masses))
     found.set_length(list(LENGTHS))
     found.set_com(list(d.centres))
-    found.set_inertia([i + m * r * r for i, m, r in zip(d.inertias, d.masses, d.centres, strict=True)])
+    found.set_inertia(
+        [i + m * r * r for i, m, r in zip(d.inertias, d.masses, d.centres, strict=True)]
+    )
     found.set_gravity(9.81)
     found.set_motor_inertia(0.0)
     found.set_damping([0.0, 0.0])
@@ -444,13 +598,20 @@ def torque_limits(robot: str) -> list[float]:
 
 def right_hand_side() -> Callable[[float, Array, Array], Array]:
     """d/dt of the league's state under two torques, by our own equations."""
-    shoulder, elbow = (double_pendulum(ACTUATED[robot]).dynamics for robot in ("pendubot", "acrobot"))
+    shoulder, elbow = (
+        double_pendulum(ACTUATED[robot]).dynamics for robot in ("pendubot", "acrobot")
+    )
 
     def derivative(t: float, x: Array, tau: Array) -> Array:
         state = [x[0] - np.pi, float(x[2]), float(x[1]), float(x[3])]
-        first, second = shoulder.derivative(state, [float(tau[0])]), elbow.derivative(state, [0.0])
+        first, second = (
+            shoulder.derivative(state, [float(tau[0])]),
+            elbow.derivative(state, [0.0]),
+        )
         moved = elbow.derivative(state, [float(tau[1])])
-        return np.array([x[2], x[3], *(first[i] + moved[i] - second[i] for i in (1, 3))])
+        return np.array(
+            [x[2], x[3], *(first[i] + moved[i] - second[i] for i in (1, 3))]
+        )
 
     return derivative
 
@@ -477,38 +638,70 @@ def transitions(records: list[Play], robot: str, spread: float = 0.05) -> Transi
     states, inputs, after = [], [], []
     for record in records:
         for i in range(0, len(record.torques) - count, count // 2):
-            u, ends = record.torques[i : i + count], [state_of(record.states[j]) for j in (i, i + count)]
+            u, ends = (
+                record.torques[i : i + count],
+                [state_of(record.states[j]) for j in (i, i + count)],
+            )
             calm = np.abs(ends)[:, [1, 3]].max(axis=0) < WILD
-            if np.ptp(u[:, joint]) <= spread and not u[:, 1 - joint].any() and calm.all():
+            if (
+                np.ptp(u[:, joint]) <= spread
+                and not u[:, 1 - joint].any()
+                and calm.all()
+            ):
                 states.append(ends[0])
                 inputs.append([u[:, joint].mean()])
                 after.append(ends[1])
     return Transitions(np.array(states), np.array(inputs), np.array(after))
 
 
-def learn(data: Transitions, nominal: Any, before: Any = None, points: int = 700) -> ResidualModel:
+def learn(
+    data: Transitions, nominal: Any, before: Any = None, points: int = 700
+) -> ResidualModel:
     """Learns what a nominal model misses from the most informative transitions.
 
     The hyperparameters are trained from those of the model ``before`` on.
     """
-    scales = torch.tensor([1.5, 1.5, 9.0, 1.5, 1.5, 9.0, 9.0], dtype=torch.float64)  # sine, cosine, rate, ..., torque
+    scales = torch.tensor(
+        [1.5, 1.5, 9.0, 1.5, 1.5, 9.0, 9.0], dtype=torch.float64
+    )  # sine, cosine, rate, ..., torque
     trainer = Trainer(
-        predicts="value", scaling=standardize, restarts=0, subset=None, tolerance=1e-6, signal_to_noise_limit=3e3
+        predicts="value",
+        scaling=standardize,
+        restarts=0,
+        subset=None,
+        tolerance=1e-6,
+        signal_to_noise_limit=3e3,
     )
     x, u = data.states, data.inputs
-    seen = torch.cat(Features(range(4), [0], (0, 2), 4, 1)(x, u), dim=1), data.next_states - nominal(x, u)
-    one, noise = torch.ones(1, dtype=torch.float64), torch.full((1,), 1e-8, dtype=torch.float64)
+    seen = (
+        torch.cat(Features(range(4), [0], (0, 2), 4, 1)(x, u), dim=1),
+        data.next_states - nominal(x, u),
+    )
+    one, noise = (
+        torch.ones(1, dtype=torch.float64),
+        torch.full((1,), 1e-8, dtype=torch.float64),
+    )
     rows = informative_points(seen[0], (scales[None], one, noise), points)
     features, targets = (part[rows] for part in seen)
-    posterior = trainer.fit(features, targets, 1, start=None if before is None else before.residual).posterior
-    return ResidualModel(nominal, posterior, torch.eye(4, dtype=torch.float64), range(4), [0], 1, (0, 2))
+    posterior = trainer.fit(
+        features, targets, 1, start=None if before is None else before.residual
+    ).posterior
+    return ResidualModel(
+        nominal, posterior, torch.eye(4, dtype=torch.float64), range(4), [0], 1, (0, 2)
+    )
 
 
-def learned_model(robot: str, kind: str, seed: int, error: float = 0.15) -> tuple[Any, list[float]]:
+def learned_model(
+    robot: str, kind: str, seed: int, error: float = 0.15
+) -> tuple[Any, list[float]]:
     """The model, and its body, of 20 s of random torque and four times 10 s of the league's test."""
     nominal: Any = Affine.identity(4, 1)
     nominal.A[[0, 2], [1, 3]] = PLAN  # an angle moves by its rate
-    body, model, records = wrong_system(robot, error, seed), None, random_record(robot, 20.0, seed)
+    body, model, records = (
+        wrong_system(robot, error, seed),
+        None,
+        random_record(robot, 20.0, seed),
+    )
     for round_ in range(5):
         data = transitions(records, robot)
         if kind == "residual":
@@ -518,12 +711,19 @@ def learned_model(robot: str, kind: str, seed: int, error: float = 0.15) -> tupl
         if round_ < 4:
             who = pilot(model, robot, wild=False, gain=0.0)
             records.append(play(who, robot, 5000 + 100 * seed + round_, 10.0))
-            _say(f"  round {round_ + 1}: {30 + 10 * round_} s of interaction, score {records[-1].score:.3f}")
+            _say(
+                f"  round {round_ + 1}: {30 + 10 * round_} s of interaction, score {records[-1].score:.3f}"
+            )
     return model, _parameters(body).tolist()
 
 
 def board(
-    robot: str, kind: str, seeds: list[int], draws: list[int], folder: Path, real_time: bool = False
+    robot: str,
+    kind: str,
+    seeds: list[int],
+    draws: list[int],
+    folder: Path,
+    real_time: bool = False,
 ) -> list[dict[str, Any]]:
     """Plays a number of draws with the model of each seed; prints and returns one row for each play.
 
@@ -537,11 +737,29 @@ def board(
         model = read_model(robot, kind, beside(entry, ".safetensors"))
         for draw in draws:
             if not any(row["draw"] == draw for row in played):
-                played.append({"robot": robot, "model": kind, "seed": seed, "draw": draw, "version": _version()})
-                played[-1] |= _play_in_real_time(model, robot, draw) if real_time else _play(model, robot, draw)
+                played.append(
+                    {
+                        "robot": robot,
+                        "model": kind,
+                        "seed": seed,
+                        "draw": draw,
+                        "version": _version(),
+                    }
+                )
+                played[-1] |= (
+                    _play_in_real_time(model, robot, draw)
+                    if real_time
+                    else _play(model, robot, draw)
+                )
                 write_whole(store, json.dumps(played, indent=1))
             rows += [row for row in played if row["draw"] == draw]
-            _say("  " + "  ".join(f"{k} {v:.3f}" if isinstance(v, float) else f"{k} {v}" for k, v in rows[-1].items()))
+            _say(
+                "  "
+                + "  ".join(
+                    f"{k} {v:.3f}" if isinstance(v, float) else f"{k} {v}"
+                    for k, v in rows[-1].items()
+                )
+            )
     return rows
 
 
@@ -553,7 +771,11 @@ def _version() -> str:
 
 def _play(model: Any, robot: str, draw: int) -> dict[str, Any]:
     who = pilot(model, robot)
-    found, ms, search = play(who, robot, draw), 1e3 * np.array(who.seconds), np.array(who.searched)
+    found, ms, search = (
+        play(who, robot, draw),
+        1e3 * np.array(who.seconds),
+        np.array(who.searched),
+    )
     return {
         "score": found.score,
         "searches": int(search.sum()),
@@ -565,7 +787,11 @@ def _play(model: Any, robot: str, draw: int) -> dict[str, Any]:
 
 def _play_in_real_time(model: Any, robot: str, draw: int) -> dict[str, Any]:
     who = _real_time_pilot(model, robot)
-    found, ms, between = play(who, robot, draw), 1e3 * np.array(who.seconds), 1e3 * np.array(who.between)
+    found, ms, between = (
+        play(who, robot, draw),
+        1e3 * np.array(who.seconds),
+        1e3 * np.array(who.between),
+    )
     return {
         "score": found.score,
         "searches": len(who.searched),
@@ -603,12 +829,24 @@ def table(robot: str, rows: list[dict[str, Any]]) -> str:
             f"{scores.mean():.3f}",
             f"{scores.min():.3f}",
         )
-        times = [np.median([row[key] for row in mine]) for key in ("median", "p99", "search")]
-        cells += f"{100 * np.mean(scores > best):.0f} %", f"{times[0]:.1f}, {times[1]:.1f}", f"{times[2]:.0f}"
+        times = [
+            np.median([row[key] for row in mine]) for key in ("median", "p99", "search")
+        ]
+        cells += (
+            f"{100 * np.mean(scores > best):.0f} %",
+            f"{times[0]:.1f}, {times[1]:.1f}",
+            f"{times[2]:.0f}",
+        )
         ours[f"gpmpc, {kind} model"] = scores.mean(), cells
-    every = [(score, name, ("published", f"{score:.3f}", "", "", "", "")) for name, score in PUBLISHED[robot].items()]
+    every = [
+        (score, name, ("published", f"{score:.3f}", "", "", "", ""))
+        for name, score in PUBLISHED[robot].items()
+    ]
     every += [(score, name, cells) for name, (score, cells) in ours.items()]
-    lines += [f"| {name} | {' | '.join(cells)} |" for _, name, cells in sorted(every, reverse=True)]
+    lines += [
+        f"| {name} | {' | '.join(cells)} |"
+        for _, name, cells in sorted(every, reverse=True)
+    ]
     return "\n".join(lines)
 
 
@@ -617,7 +855,10 @@ def main(arguments: list[str]) -> int:
     given = {"robot": "acrobot", "model": "true", "seeds": "0", "draws": "3"}
     given |= {"board": "simulation", "time": "free", "folder": "outputs/realaigym"}
     choices = {"robot": tuple(ACTUATED), "model": tuple(DESCRIBED)}
-    choices |= {"board": ("simulation", "script", "robustness", "film"), "time": ("free", "real")}
+    choices |= {
+        "board": ("simulation", "script", "robustness", "film"),
+        "time": ("free", "real"),
+    }
     try:
         for argument in arguments:
             key, _, value = argument.partition("=")
@@ -626,23 +867,45 @@ def main(arguments: list[str]) -> int:
             given[key] = value
         for key, names in choices.items():
             if given[key] not in names:
-                raise SettingError(key, f"must be one of {', '.join(names)}; got {given[key]!r}")
-        if not all(number.isdigit() for number in (*given["seeds"].split(","), given["draws"])):
-            raise SettingError("seeds, draws", "must be numbers such as 0,1 and a number of draws such as 3")
+                raise SettingError(
+                    key, f"must be one of {', '.join(names)}; got {given[key]!r}"
+                )
+        if not all(
+            number.isdigit() for number in (*given["seeds"].split(","), given["draws"])
+        ):
+            raise SettingError(
+                "seeds, draws",
+                "must be numbers such as 0,1 and a number of draws such as 3",
+            )
         robot, kind, folder = given["robot"], given["model"], Path(given["folder"])
         if given["board"] == "robustness" and kind == "gp":
-            raise SettingError("model", "must be true or residual for board=robustness, which predicts over 2 ms")
+            raise SettingError(
+                "model",
+                "must be true or residual for board=robustness, which predicts over 2 ms",
+            )
         if given["board"] in ("script", "film") and given["time"] == "real":
             raise SettingError("time", "must be free for board=script and board=film")
         if find_spec("double_pendulum") is None:
             raise SettingError("simulator", INSTALL)
-        seeds, draws = [int(seed) for seed in given["seeds"].split(",")], int(given["draws"])
+        seeds, draws = (
+            [int(seed) for seed in given["seeds"].split(",")],
+            int(given["draws"]),
+        )
         if given["board"] == "simulation":
-            rows = board(robot, kind, seeds, [100 + i for i in range(draws)], folder, given["time"] == "real")
+            rows = board(
+                robot,
+                kind,
+                seeds,
+                [100 + i for i in range(draws)],
+                folder,
+                given["time"] == "real",
+            )
             _say(table(robot, rows))
             others = sum(row.get("version") != _version() for row in rows)
             if others:
-                _say(f"{others} of {len(rows)} draws were kept from another version of gpmpc ({folder})")
+                _say(
+                    f"{others} of {len(rows)} draws were kept from another version of gpmpc ({folder})"
+                )
             return 0
         for seed in seeds:
             entry = write_entry(robot, kind, seed, folder)

@@ -20,12 +20,16 @@ def film(flight: Play, joint: int, path: Path) -> None:
     tip = elbow + np.stack([second * np.sin(both), -second * np.cos(both)], axis=1)
     figure = Figure(figsize=(4, 4.4))
     FigureCanvasAgg(figure)
-    axes = figure.add_axes((0.02, 0.12, 0.96, 0.86), xlim=(-0.56, 0.56), ylim=(-0.56, 0.56), aspect="equal")
+    axes = figure.add_axes(
+        (0.02, 0.12, 0.96, 0.86), xlim=(-0.56, 0.56), ylim=(-0.56, 0.56), aspect="equal"
+    )
     axes.axis("off")
     axes.axhline(LINE, color="0.6", linestyle="--")
     (path_line,) = axes.plot([], [], color="tab:orange", linewidth=1)
     (links,) = axes.plot([], [], "o-", color="tab:blue", linewidth=5, markersize=9)
-    gauge = figure.add_axes((0.3, 0.05, 0.65, 0.04), xlim=(-TORQUE, TORQUE), ylim=(-0.5, 0.5), yticks=[])
+    gauge = figure.add_axes(
+        (0.3, 0.05, 0.65, 0.04), xlim=(-TORQUE, TORQUE), ylim=(-0.5, 0.5), yticks=[]
+    )
     gauge.tick_params(labelsize=7)
     (bar,) = gauge.barh([0], [0.0], height=1.0, color="tab:green")
     clock, name = figure.text(0.03, 0.94, ""), "elbow" if joint else "shoulder"
@@ -39,4 +43,6 @@ def film(flight: Play, joint: int, path: Path) -> None:
         return []
 
     frames = range(0, len(flight.torques), round(1 / RATE / INPUT))
-    FuncAnimation(figure, draw, frames=frames, cache_frame_data=False).save(path, writer=PillowWriter(RATE), dpi=70)
+    FuncAnimation(figure, draw, frames=frames, cache_frame_data=False).save(
+        path, writer=PillowWriter(RATE), dpi=70
+    )

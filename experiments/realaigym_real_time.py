@@ -16,7 +16,18 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gpmpc._kernels.gp_rollout import Feedback
-from gpmpc.experiments.realaigym import BRAKE, INPUT, PLAN, REPLAN, TICKS, TORQUE, Array, Parts, state_of, upright
+from gpmpc.experiments.realaigym import (
+    BRAKE,
+    INPUT,
+    PLAN,
+    REPLAN,
+    TICKS,
+    TORQUE,
+    Array,
+    Parts,
+    state_of,
+    upright,
+)
 from gpmpc.gaussian import Gaussian
 from gpmpc.models import RollOut
 from gpmpc.mpc import GPMPC, ControlLoop, Decision, ManyStarts, Reference
@@ -68,7 +79,16 @@ class RealTimePilot:
         self._roll_out, H = RollOut(self.search.planner.prediction.model), self.lead
         limit, free = np.full((H, 1), TORQUE), np.full((H, 1), np.inf)
         gains = np.tile(-BRAKE * np.eye(4)[1 + 2 * self.joint], (1, H, 1, 1))
-        self._brake = Feedback(np.zeros((1, H, 4)), np.zeros((1, H, 1)), gains, -limit, limit, -free, free, np.zeros(1))
+        self._brake = Feedback(
+            np.zeros((1, H, 4)),
+            np.zeros((1, H, 1)),
+            gains,
+            -limit,
+            limit,
+            -free,
+            free,
+            np.zeros(1),
+        )
 
     def torques(self, x: Any, t: float) -> Array:
         """The torques of both joints (2,) at a state in the league's order and a time [s]."""
@@ -84,13 +104,19 @@ class RealTimePilot:
                 self._flight = self._decided
             self._decided = None
         if self._found is not None and now >= self._found.known:
-            flown = REPLAN if self._flight is None else self._value(self._flight, self._found.start) - PLAN
+            flown = (
+                REPLAN
+                if self._flight is None
+                else self._value(self._flight, self._found.start) - PLAN
+            )
             if self._found.value < flown:
                 self._flight, self._decided = self._found, None
             self._found = None
         begin, torque = process_time(), -BRAKE * float(state[1 + 2 * self.joint])
         if self._flight is not None:
-            torque = self._flight.loop.input_between(state, (now - self._flight.start) / TICKS)[0]
+            torque = self._flight.loop.input_between(
+                state, (now - self._flight.start) / TICKS
+            )[0]
         self.between.append(process_time() - begin)
         if now % TICKS == 0:
             self._think(state, now)
@@ -104,12 +130,16 @@ class RealTimePilot:
         flight = self._flight
         if flight is not None and self._decided is None and now > flight.start:
             self._decided = self._decide(state, now, flight)
-        if self._found is None and (flight is None or (flight.value > GOOD and self._turn < len(self.search))):
+        if self._found is None and (
+            flight is None or (flight.value > GOOD and self._turn < len(self.search))
+        ):
             self._found = self._search(state, now, flight)
 
     def _value(self, flight: Flight, start: int) -> float:
         """The criterion of what is left of a flight from a time on."""
-        means = flight.plan.means[min(max(0, start - flight.start) // TICKS, len(flight.plan.means) - 2) :]
+        means = flight.plan.means[
+            min(max(0, start - flight.start) // TICKS, len(flight.plan.means) - 2) :
+        ]
         return self.criterion(replace(flight.plan, means=means), upright(means))
 
     def _search(self, state: Array, now: int, flight: Flight | None) -> Flight:
@@ -119,7 +149,9 @@ class RealTimePilot:
             expected = self._roll_out(state[None], self._brake)[0][0, -1]
         else:
             means = flight.plan.means
-            expected = means[min((now - flight.start) // TICKS + self.lead, len(means) - 1)]
+            expected = means[
+                min((now - flight.start) // TICKS + self.lead, len(means) - 1)
+            ]
         expected = expected if np.isfinite(expected).all() else state
         start = Gaussian.certain(expected), Reference(np.zeros(4))
         best, lowest, first = None, inf, self._turn % len(self.search)
@@ -131,16 +163,24 @@ class RealTimePilot:
                 break
         assert best is not None
         found = self._timed(best, begin, now, now + self.lead * TICKS, self.searched)
-        return found if found.known == found.start else found._replace(value=inf)  # too late to begin with
+        return (
+            found if found.known == found.start else found._replace(value=inf)
+        )  # too late to begin with
 
     def _decide(self, state: Array, now: int, flight: Flight) -> Flight:
         begin, passed = process_time(), (now - flight.start) // TICKS
-        inputs, states = (_later(part, passed) for part in (flight.plan.inputs, flight.plan.means))
+        inputs, states = (
+            _later(part, passed) for part in (flight.plan.inputs, flight.plan.means)
+        )
         previous = flight.plan if passed == 1 else None
-        plan = self.step.control(Gaussian.certain(state), upright(states), previous, None, (inputs, states))
+        plan = self.step.control(
+            Gaussian.certain(state), upright(states), previous, None, (inputs, states)
+        )
         return self._timed(plan, begin, now, now, self.seconds)
 
-    def _timed(self, plan: Decision, begin: float, now: int, start: int, times: list[float]) -> Flight:
+    def _timed(
+        self, plan: Decision, begin: float, now: int, start: int, times: list[float]
+    ) -> Flight:
         """The flight of a plan whose making began at a processor time; its value is infinite where it is of no use."""
         loop, value = ControlLoop(self.step), inf
         if plan.applicable:
@@ -149,14 +189,20 @@ class RealTimePilot:
             value = self.criterion(plan, upright(plan.means))
         times.append(process_time() - begin)
         done = now + max(1, ceil(times[-1] / INPUT))
-        return Flight(loop, plan, value, start, max(start, done) if value < inf else done)
+        return Flight(
+            loop, plan, value, start, max(start, done) if value < inf else done
+        )
 
 
 def real_time_pilot(parts: Parts, joint: int) -> RealTimePilot:
     """Makes a real-time pilot from parts."""
-    search = ManyStarts(parts.planner, parts.planner, parts.guesses, (2, 3), parts.criterion)
+    search = ManyStarts(
+        parts.planner, parts.planner, parts.guesses, (2, 3), parts.criterion
+    )
     made = RealTimePilot(parts.controller, search, parts.criterion, joint)
-    for k in range((made.lead + 4) * TICKS):  # compiles everything before the clock counts
+    for k in range(
+        (made.lead + 4) * TICKS
+    ):  # compiles everything before the clock counts
         made.torques(np.array([np.pi, 0.2, 0.0, 0.0]), INPUT * k)
     return RealTimePilot(parts.controller, search, parts.criterion, joint)
 

@@ -17,12 +17,27 @@ import torch
 
 from gpmpc._files import write_whole
 from gpmpc.estimation import KalmanFilter, Measurement, estimate_delay
-from gpmpc.experiments.realaigym import INPUT, TORQUE, Array, Flies, league_parameters, state_of, torque_limits
+from gpmpc.experiments.realaigym import (
+    INPUT,
+    TORQUE,
+    Array,
+    Flies,
+    league_parameters,
+    state_of,
+    torque_limits,
+)
 from gpmpc.gaussian import Gaussian
 from gpmpc.models import Affine, DisturbedModel, KnownModel, RollOut
 
-ANGLE, RATE, JERK = 1e-6, 0.3, 40.0  # deviations of measured angles and rates, and of accelerations' changes in 2 ms
-PROBES, LONGEST = 150, 25  # inputs that are random, to estimate the delay, and its longest
+ANGLE, RATE, JERK = (
+    1e-6,
+    0.3,
+    40.0,
+)  # deviations of measured angles and rates, and of accelerations' changes in 2 ms
+PROBES, LONGEST = (
+    150,
+    25,
+)  # inputs that are random, to estimate the delay, and its longest
 PROBE = 3.0  # their size [N m]
 
 
@@ -34,8 +49,13 @@ class RateFilter:
         moves.A[[0, 2], [1, 3]] = INPUT
         effect[[0, 2], [0, 1]], effect[[1, 3], [0, 1]] = INPUT**2 / 2, INPUT
         model = DisturbedModel(KnownModel(moves, 4, 1), effect, [JERK, JERK])
-        kalman = KalmanFilter.extended(model, Measurement.of_states(6, range(4), [ANGLE, RATE, ANGLE, RATE]))
-        zero, belief = np.zeros((1, 6)), Gaussian(torch.zeros(6).double(), torch.eye(6).double())
+        kalman = KalmanFilter.extended(
+            model, Measurement.of_states(6, range(4), [ANGLE, RATE, ANGLE, RATE])
+        )
+        zero, belief = (
+            np.zeros((1, 6)),
+            Gaussian(torch.zeros(6).double(), torch.eye(6).double()),
+        )
         for _ in range(100):
             update = kalman.update(belief, zero[0, :4])
             gain = torch.linalg.solve(update.covariance, belief.covariance[:4]).T
@@ -61,8 +81,12 @@ def identify(states: list[Array], inputs: list[float]) -> tuple[int, float]:
         acting = np.array(inputs)
         for k in range(1, len(acting)):
             acting[k] = acting[k - 1] + response * (inputs[k] - acting[k - 1])
-        estimate = estimate_delay(states, acting[:, None], LONGEST, resolution=1.0, resamples=1)
-        found.append((estimate.correlations.max(), round(estimate.steps), float(response)))
+        estimate = estimate_delay(
+            states, acting[:, None], LONGEST, resolution=1.0, resamples=1
+        )
+        found.append(
+            (estimate.correlations.max(), round(estimate.steps), float(response))
+        )
     return max(found)[1:]
 
 
@@ -80,14 +104,20 @@ class Watchful:
     ahead: RollOut
     joint: int
     delay: int = 0  #: that was found [inputs]
-    response: float = 1.0  #: that was found: share of a change of the torque that acts at once
+    response: float = (
+        1.0  #: that was found: share of a change of the torque that acts at once
+    )
     _filter: RateFilter = field(default_factory=RateFilter)
     _states: list[Array] = field(default_factory=list)
-    _acting: list[float] = field(default_factory=list)  #: torques that the motor is believed to have given
+    _acting: list[float] = field(
+        default_factory=list
+    )  #: torques that the motor is believed to have given
     _last: float = np.inf
 
     def __post_init__(self) -> None:
-        self._probes = (PROBE * np.random.default_rng(0).choice([-1.0, 1.0], PROBES // 5)).repeat(5)
+        self._probes = (
+            PROBE * np.random.default_rng(0).choice([-1.0, 1.0], PROBES // 5)
+        ).repeat(5)
 
     def torques(self, x: Any, t: float) -> Array:
         """The torques of both joints (2,) at what is measured, in the league's order, and a time [s]."""
@@ -105,15 +135,29 @@ class Watchful:
         if count == PROBES:
             self.delay, self.response = identify(self._states, self._acting)
         if self.delay:
-            state = self.ahead.open_loop(state[None], np.array(self._acting[-self.delay :])[None, :, None])[0, -1]
-        wanted = self.pilot.torques([state[0] + np.pi, state[2], state[1], state[3]], t)[self.joint]
+            state = self.ahead.open_loop(
+                state[None], np.array(self._acting[-self.delay :])[None, :, None]
+            )[0, -1]
+        wanted = self.pilot.torques(
+            [state[0] + np.pi, state[2], state[1], state[3]], t
+        )[self.joint]
         last = self._acting[-1]
-        torques[self.joint] = np.clip(last + (wanted - last) / self.response, -TORQUE, TORQUE)
-        self._acting.append(float(np.clip(last + self.response * (torques[self.joint] - last), -TORQUE, TORQUE)))
+        torques[self.joint] = np.clip(
+            last + (wanted - last) / self.response, -TORQUE, TORQUE
+        )
+        self._acting.append(
+            float(
+                np.clip(
+                    last + self.response * (torques[self.joint] - last), -TORQUE, TORQUE
+                )
+            )
+        )
         return torques
 
 
-def robustness(controller: Any, robot: str, size: int, store: Path) -> dict[str, list[bool]]:
+def robustness(
+    controller: Any, robot: str, size: int, store: Path
+) -> dict[str, list[bool]]:
     """Which flights of each part ended upright; those of a part that the file has are read, not flown again.
 
     Args:
@@ -126,13 +170,21 @@ def robustness(controller: Any, robot: str, size: int, store: Path) -> dict[str,
 
     parameters = league_parameters(torque_limits(robot))
     flights = benchmarker(
-        controller, [0.0] * 4, INPUT, 10.0, [np.pi, 0.0, 0.0, 0.0], [0.35, 0.35, 1.0, 1.0], check_only_final_state=True
+        controller,
+        [0.0] * 4,
+        INPUT,
+        10.0,
+        [np.pi, 0.0, 0.0, 0.0],
+        [0.35, 0.35, 1.0, 1.0],
+        check_only_final_state=True,
     )
     flights.set_model_parameter(model_pars=parameters)
     masses, centres, inertias = parameters.m, parameters.r, parameters.I
     nominal = {"m1r1": masses[0] * centres[0], "I1": inertias[0]}
     nominal |= {"m2r2": masses[1] * centres[1], "m2": masses[1], "I2": inertias[1]}
-    values = {name: np.linspace(0.75, 1.25, size) * value for name, value in nominal.items()}
+    values = {
+        name: np.linspace(0.75, 1.25, size) * value for name, value in nominal.items()
+    }
     values |= {"Ir": np.linspace(0.0, 1e-4, size)}
     values |= {name: np.linspace(-0.1, 0.1, size) for name in ("b1", "b2")}
     values |= {name: np.linspace(-0.2, 0.2, size) for name in ("cf1", "cf2")}
@@ -148,13 +200,25 @@ def robustness(controller: Any, robot: str, size: int, store: Path) -> dict[str,
     noises = np.linspace(0.0, 0.5, size), np.linspace(0.0, 1.1, size)
     fly = {
         "model": model,
-        "rate noise": lambda: most(flights.check_meas_noise_robustness(repeated, "vel", noises[0])["None"]),
-        "torque noise": lambda: most(flights.check_unoise_robustness(repeated, noises[1])),
-        "responsiveness": lambda: flights.check_uresponsiveness_robustness(np.linspace(0.1, 2.0, size))["successes"],
-        "delay": lambda: flights.check_delay_robustness("posvel", np.linspace(0.0, 0.04, size))["successes"],
-        "pulses": lambda: flights.check_perturbation_robustness(pulses, 3, 1.0, [0.05, 0.1], [0.5, 5.0])["successes"],
+        "rate noise": lambda: most(
+            flights.check_meas_noise_robustness(repeated, "vel", noises[0])["None"]
+        ),
+        "torque noise": lambda: most(
+            flights.check_unoise_robustness(repeated, noises[1])
+        ),
+        "responsiveness": lambda: flights.check_uresponsiveness_robustness(
+            np.linspace(0.1, 2.0, size)
+        )["successes"],
+        "delay": lambda: flights.check_delay_robustness(
+            "posvel", np.linspace(0.0, 0.04, size)
+        )["successes"],
+        "pulses": lambda: flights.check_perturbation_robustness(
+            pulses, 3, 1.0, [0.05, 0.1], [0.5, 5.0]
+        )["successes"],
     }
-    done: dict[str, list[bool]] = json.loads(store.read_text()) if store.exists() else {}
+    done: dict[str, list[bool]] = (
+        json.loads(store.read_text()) if store.exists() else {}
+    )
     for part, successes in fly.items():
         if part not in done:
             np.random.seed(0)  # noqa: NPY002 (the league draws from it)

@@ -85,41 +85,83 @@ class SLSQP:
         tolerance: float = 1e-5,
         iterations: int = 300,
     ):
-        self.initial_input = check_controller(problem, *check_next_states(model), horizon, initial_input)
+        self.initial_input = check_controller(
+            problem, *check_next_states(model), horizon, initial_input
+        )
         H, m, cost = horizon, problem.input_dim, problem.cost
-        boxes = [box for box in problem.constraints if isinstance(box, Box) and box.penalty is None and not box.joint]
-        if len(boxes) < len(problem.constraints) or any(box.lower.ndim > 1 or box.stages for box in boxes):
-            raise SettingError("problem", "must have hard boxes (penalty=None) at all stages, or no constraints")
+        boxes = [
+            box
+            for box in problem.constraints
+            if isinstance(box, Box) and box.penalty is None and not box.joint
+        ]
+        if len(boxes) < len(problem.constraints) or any(
+            box.lower.ndim > 1 or box.stages for box in boxes
+        ):
+            raise SettingError(
+                "problem",
+                "must have hard boxes (penalty=None) at all stages, or no constraints",
+            )
         problem.check_plain("SLSQP")
-        self.model, self.propagator, self.problem, self.horizon = model, propagator, problem, horizon
+        self.model, self.propagator, self.problem, self.horizon = (
+            model,
+            propagator,
+            problem,
+            horizon,
+        )
         self.tolerance, self.iterations = tolerance, iterations
-        self._differences = np.kron(np.eye(H) - np.eye(H, k=-1), np.eye(m))  # U -> u_i - u_{i-1}, without u_{-1}
-        self._penalized = self._differences if cost.penalized == "increments" else np.eye(H * m)
+        self._differences = np.kron(
+            np.eye(H) - np.eye(H, k=-1), np.eye(m)
+        )  # U -> u_i - u_{i-1}, without u_{-1}
+        self._penalized = (
+            self._differences if cost.penalized == "increments" else np.eye(H * m)
+        )
         self._weights, R = cost.by_stage(H)
         self._R = block_diag(*R)
-        sides = [(side, sign, box) for box in boxes for side, sign in ((box.lower, -1.0), (box.upper, 1.0))]
+        sides = [
+            (side, sign, box)
+            for box in boxes
+            for side, sign in ((box.lower, -1.0), (box.upper, 1.0))
+        ]
         entries = [
             (j, sign, bound[j], box.standard_deviations())
             for bound, sign, box in sides
             for j in np.flatnonzero(np.isfinite(bound))
         ]
-        state, self._sign, self._bound, self._kappa = np.array(entries, dtype=float).reshape(-1, 4).T
+        state, self._sign, self._bound, self._kappa = (
+            np.array(entries, dtype=float).reshape(-1, 4).T
+        )
         self._state = state.astype(int)
 
-    def control(self, belief: Gaussian, reference: Reference, previous: Decision | None = None) -> Decision:
+    def control(
+        self, belief: Gaussian, reference: Reference, previous: Decision | None = None
+    ) -> Decision:
         """Solves the problem from a belief along a reference; see ``Controller.control``."""
         began = time.perf_counter()
-        request = Request.read(self.problem, self.horizon, self.initial_input, belief, reference, previous)
+        request = Request.read(
+            self.problem, self.horizon, self.initial_input, belief, reference, previous
+        )
         if not request.finite:
             return request.failed_decision(Status.INVALID_MEASUREMENT)
         try:
             found, status, count = self._minimize(request)
-        except (DataError, np.linalg.LinAlgError, RuntimeError):  # a trial plan led the model out of its numbers
+        except (
+            DataError,
+            np.linalg.LinAlgError,
+            RuntimeError,
+        ):  # a trial plan led the model out of its numbers
             return request.failed_decision(Status.NUMERICAL_TROUBLE)
-        inputs, timing = found.plan.reshape(self.horizon, -1), Timing(0.0, 0.0, time.perf_counter() - began)
+        inputs, timing = (
+            found.plan.reshape(self.horizon, -1),
+            Timing(0.0, 0.0, time.perf_counter() - began),
+        )
         kept = bool((found.margins <= 1e3 * FEASIBLE).all())
         predicted = found.means, found.covariances, status, count, timing
-        return Decision(inputs[0], inputs, *predicted, suboptimal=kept and status is Status.ITERATION_LIMIT)
+        return Decision(
+            inputs[0],
+            inputs,
+            *predicted,
+            suboptimal=kept and status is Status.ITERATION_LIMIT,
+        )
 
     def evaluate(self, inputs: Array, request: Request) -> Evaluation:
         """Cost, margins and derivatives of a plan (H, m), whose input bounds are not looked at."""
@@ -136,15 +178,26 @@ class SLSQP:
             "increments": self._first(request.references.previous_input),
         }
         v = self._penalized @ plan - offset[self.problem.cost.penalized]
-        cost = (errors * weighted).sum() + (self._weights * covariances[1:]).sum() + v @ self._R @ v
-        sd = np.sqrt(covariances[1:].diagonal(axis1=-2, axis2=-1)[:, self._state].clip(0))  # (H, r)
+        cost = (
+            (errors * weighted).sum()
+            + (self._weights * covariances[1:]).sum()
+            + v @ self._R @ v
+        )
+        sd = np.sqrt(
+            covariances[1:].diagonal(axis1=-2, axis2=-1)[:, self._state].clip(0)
+        )  # (H, r)
         slope = np.divide(self._kappa / 2, sd, out=np.zeros_like(sd), where=sd > 0)
-        seeds = np.zeros((H, 1 + H * n + H * r, n + n * n))  # by stage, row (cost, means, margins), and s
+        seeds = np.zeros(
+            (H, 1 + H * n + H * r, n + n * n)
+        )  # by stage, row (cost, means, margins), and s
         seeds[:, 0, :n], seeds[:, 0, n:] = 2 * weighted, self._weights.reshape(H, -1)
         for i in range(H):
             seeds[i, 1 + i * n : 1 + (i + 1) * n, :n] = np.eye(n)
             rows = 1 + H * n + i * r + np.arange(r)
-            seeds[i, rows, self._state], seeds[i, rows, n + self._state * (n + 1)] = self._sign, slope[i]
+            seeds[i, rows, self._state], seeds[i, rows, n + self._state * (n + 1)] = (
+                self._sign,
+                slope[i],
+            )
         jacobian = _adjoint(by_state, by_input, seeds)
         J = jacobian[1 : 1 + H * n].reshape(H, n, -1)
         hessian = 2 * np.einsum("iaj,iab,ibk->jk", J, self._weights, J, optimize=True)
@@ -152,35 +205,80 @@ class SLSQP:
         gradient = jacobian[0] + 2 * self._penalized.T @ (self._R @ v)
         margins = self._sign * (means[1:, self._state] - self._bound) + self._kappa * sd
         return Evaluation(
-            plan, float(cost), gradient, margins.ravel(), jacobian[1 + H * n :], hessian, means, covariances
+            plan,
+            float(cost),
+            gradient,
+            margins.ravel(),
+            jacobian[1 + H * n :],
+            hessian,
+            means,
+            covariances,
         )
 
     def _minimize(self, request: Request) -> tuple[Evaluation, Status, int]:
         """Rounds of SLSQP, each in inputs scaled by the Gauss-Newton Hessian, from the better of two plans."""
-        lower, upper = (side.ravel() for side in self.problem.inputs.by_stage(self.horizon))
-        starts = [plan.ravel().clip(lower, upper) for plan in (request.constant_guess, request.initial_guess)]
-        found, used = min((self.evaluate(plan, request) for plan in starts), key=_rank), 0
+        lower, upper = (
+            side.ravel() for side in self.problem.inputs.by_stage(self.horizon)
+        )
+        starts = [
+            plan.ravel().clip(lower, upper)
+            for plan in (request.constant_guess, request.initial_guess)
+        ]
+        found, used = (
+            min((self.evaluate(plan, request) for plan in starts), key=_rank),
+            0,
+        )
         for _ in range(ROUNDS):
-            scale = abs(found.cost) + found.plan @ found.hessian @ found.plan + np.finfo(float).tiny
-            T = solve_triangular(np.linalg.cholesky(found.hessian), np.eye(len(found.plan)), lower=True).T
-            last, result = found, self._round(found, T, scale, lower, upper, request, self.iterations - used)
-            found = self.evaluate((last.plan + T @ result.x).clip(lower, upper), request)
+            scale = (
+                abs(found.cost)
+                + found.plan @ found.hessian @ found.plan
+                + np.finfo(float).tiny
+            )
+            T = solve_triangular(
+                np.linalg.cholesky(found.hessian), np.eye(len(found.plan)), lower=True
+            ).T
+            last, result = (
+                found,
+                self._round(
+                    found, T, scale, lower, upper, request, self.iterations - used
+                ),
+            )
+            found = self.evaluate(
+                (last.plan + T @ result.x).clip(lower, upper), request
+            )
             used += int(result.nit)
             settled = abs(last.cost - found.cost) <= self.tolerance**2 * scale
-            if settled and (found.margins <= FEASIBLE).all() and self._keeps_rates(found.plan, request):
+            if (
+                settled
+                and (found.margins <= FEASIBLE).all()
+                and self._keeps_rates(found.plan, request)
+            ):
                 return found, Status.SOLVED, used
             if used >= self.iterations:
                 return min(found, last, key=_rank), Status.ITERATION_LIMIT, used
-        kept = (found.margins <= FEASIBLE).all() and self._keeps_rates(found.plan, request)
+        kept = (found.margins <= FEASIBLE).all() and self._keeps_rates(
+            found.plan, request
+        )
         return found, Status.NUMERICAL_TROUBLE if kept else Status.INFEASIBLE, used
 
     def _keeps_rates(self, plan: Array, request: Request) -> bool:
-        rates = (self._differences @ plan - self._first(request.references.previous_input)).reshape(self.horizon, -1)
+        rates = (
+            self._differences @ plan - self._first(request.references.previous_input)
+        ).reshape(self.horizon, -1)
         bounds = self.problem.input_rates
-        return bool((np.maximum(rates - bounds.upper, bounds.lower - rates) <= FEASIBLE).all())
+        return bool(
+            (np.maximum(rates - bounds.upper, bounds.lower - rates) <= FEASIBLE).all()
+        )
 
     def _round(
-        self, start: Evaluation, T: Array, scale: float, lower: Array, upper: Array, request: Request, limit: int
+        self,
+        start: Evaluation,
+        T: Array,
+        scale: float,
+        lower: Array,
+        upper: Array,
+        request: Request,
+        limit: int,
     ):
         """One run in w, U = U_0 + T w."""
         memory = [start]
@@ -227,12 +325,22 @@ class SLSQP:
         for u in tensors_for(self.model, plan.reshape(-1, m))[0]:
             moved, d = differentiate(self.propagator, self.model, beliefs[-1], u)
             beliefs.append(moved.belief)
-            means = torch.cat([d.mean_by_mean, d.mean_by_covariance.reshape(n, -1)], dim=1)
-            spreads = [d.covariance_by_mean.reshape(-1, n), d.covariance_by_covariance.reshape(n * n, -1)]
+            means = torch.cat(
+                [d.mean_by_mean, d.mean_by_covariance.reshape(n, -1)], dim=1
+            )
+            spreads = [
+                d.covariance_by_mean.reshape(-1, n),
+                d.covariance_by_covariance.reshape(n * n, -1),
+            ]
             by_state.append(to_array(torch.cat([means, torch.cat(spreads, dim=1)])))
-            by_input.append(to_array(torch.cat([d.mean_by_input, d.covariance_by_input.reshape(-1, m)])))
+            by_input.append(
+                to_array(
+                    torch.cat([d.mean_by_input, d.covariance_by_input.reshape(-1, m)])
+                )
+            )
         means, covariances = (
-            [to_array(part) for part in parts] for parts in zip(*[(b.mean, b.covariance) for b in beliefs], strict=True)
+            [to_array(part) for part in parts]
+            for parts in zip(*[(b.mean, b.covariance) for b in beliefs], strict=True)
         )
         return tuple(map(np.array, (means, covariances, by_state, by_input)))
 

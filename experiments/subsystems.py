@@ -10,7 +10,10 @@ from gpmpc.systems import rotational, translational
 
 SYSTEMS = {"translational": translational(), "rotational": rotational()}
 # A column that moves less is at rest; the tolerance of the NMPC solver is 1e-10.
-SCALINGS = {"translational": identity, "rotational": partial(min_max, low=0.1, high=0.9, resolution=1e-9)}
+SCALINGS = {
+    "translational": identity,
+    "rotational": partial(min_max, low=0.1, high=0.9, resolution=1e-9),
+}
 
 
 def check_subsystems(key: str, chosen: Any) -> tuple[str, ...]:
@@ -19,7 +22,13 @@ def check_subsystems(key: str, chosen: Any) -> tuple[str, ...]:
     Raises:
         SettingError: There is none, or an unknown one.
     """
-    names = (chosen,) if isinstance(chosen, str) else tuple(chosen) if isinstance(chosen, Sequence) else ()
+    names = (
+        (chosen,)
+        if isinstance(chosen, str)
+        else tuple(chosen)
+        if isinstance(chosen, Sequence)
+        else ()
+    )
     if not names:
         raise SettingError(key, "choose at least one")
     for name in names:

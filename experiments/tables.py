@@ -33,7 +33,11 @@ from gpmpc.exceptions import DataError, SettingError, check_number
 from gpmpc.experiments.subsystems import SCALINGS, SYSTEMS, check_subsystems
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior, Scaling, Training, Transitions
-from gpmpc.metrics import interval_coverage, mean_squared_error, negative_log_predictive_density
+from gpmpc.metrics import (
+    interval_coverage,
+    mean_squared_error,
+    negative_log_predictive_density,
+)
 from gpmpc.plotting import Series, png
 from gpmpc.plotting._style import VERMILION, legend_below, make_figure, styled
 from gpmpc.plotting._sweeps import draw_quartiles
@@ -42,8 +46,20 @@ from gpmpc.studies._document import MISSING, Document, Table, number, with_range
 from gpmpc.studies.study import Trial, derived_seed, fingerprint, random_rows
 from gpmpc.trajectories import Trajectory
 
-CODE = ("gaussian.py", "metrics.py", "gp/*.py", "models/*.py", "propagation/*.py", "kernels/*.py", __file__)
-MEASURES = {"training_mse": "training MSE", "test_mse": "test MSE", "average_variance": "average variance"}
+CODE = (
+    "gaussian.py",
+    "metrics.py",
+    "gp/*.py",
+    "models/*.py",
+    "propagation/*.py",
+    "kernels/*.py",
+    __file__,
+)
+MEASURES = {
+    "training_mse": "training MSE",
+    "test_mse": "test MSE",
+    "average_variance": "average variance",
+}
 CALIBRATION = {
     "plain_training_mse": "training MSE",
     "plain_test_mse": "test MSE",
@@ -94,15 +110,22 @@ class Tables:
     def __post_init__(self) -> None:
         sizes = (self.sizes,) if isinstance(self.sizes, int) else self.sizes
         if not isinstance(sizes, list | tuple) or not sizes:
-            raise SettingError("sizes", f"must be a list of whole numbers such as [10,50]; got {sizes!r}")
+            raise SettingError(
+                "sizes",
+                f"must be a list of whole numbers such as [10,50]; got {sizes!r}",
+            )
         for size in sizes:
             check_number("sizes", size, least=1, whole=True)
         object.__setattr__(self, "sizes", tuple(dict.fromkeys(sizes)))
         check_number("draws", self.draws, least=1, whole=True)
         check_number("seed", self.seed, least=0, whole=True)
-        check_number("workers", 1 if self.workers is None else self.workers, least=1, whole=True)
+        check_number(
+            "workers", 1 if self.workers is None else self.workers, least=1, whole=True
+        )
         check_number("state_std", self.state_std, least=0)
-        object.__setattr__(self, "subsystems", check_subsystems("subsystem", self.subsystems))
+        object.__setattr__(
+            self, "subsystems", check_subsystems("subsystem", self.subsystems)
+        )
         if not self.trajectories:
             raise SettingError("trajectory", "choose at least one")
 
@@ -120,46 +143,92 @@ class Tables:
                 for size in self.sizes:
                     if size > len(data):
                         rows = f"{len(data)}, the rows of {trajectory} {subsystem}"
-                        raise SettingError("sizes", f"must be at most {rows}; got {size}")
-                    fit = Fit(data, scaling, reported, size, self.model, float(self.state_std))
+                        raise SettingError(
+                            "sizes", f"must be at most {rows}; got {size}"
+                        )
+                    fit = Fit(
+                        data, scaling, reported, size, self.model, float(self.state_std)
+                    )
                     for draw in range(self.draws):
                         seed = derived_seed(
-                            self.seed, *(crc32(n.encode()) for n in (trajectory, subsystem)), size, draw
+                            self.seed,
+                            *(crc32(n.encode()) for n in (trajectory, subsystem)),
+                            size,
+                            draw,
                         )
-                        settings = [self.model_settings, self.state_std, reported, size, seed]
+                        settings = [
+                            self.model_settings,
+                            self.state_std,
+                            reported,
+                            size,
+                            seed,
+                        ]
                         arrays = data.features, data.next_states, scaling.factor
                         table = {"elliptical": 1, "lorenz": 2}.get(trajectory)
-                        labels = {"table": table, "trajectory": trajectory, "subsystem": subsystem, "size": size}
+                        labels = {
+                            "table": table,
+                            "trajectory": trajectory,
+                            "subsystem": subsystem,
+                            "size": size,
+                        }
                         name = fingerprint(settings, *arrays, code=CODE)
                         trials.append(Trial(labels | {"draw": draw}, fit, seed, name))
         return trials
 
-    def _scaled(self, trajectory: str, name: str) -> tuple[Transitions, Scaling, tuple[int, ...]]:
+    def _scaled(
+        self, trajectory: str, name: str
+    ) -> tuple[Transitions, Scaling, tuple[int, ...]]:
         """Returns the data in the units of the model, the scaling of the next states, the indices that are reported."""
-        system, raw = SYSTEMS[name], self.data.transitions(SYSTEMS[name], self.trajectories[trajectory], trajectory)
+        system, raw = (
+            SYSTEMS[name],
+            self.data.transitions(
+                SYSTEMS[name], self.trajectories[trajectory], trajectory
+            ),
+        )
         n, m, states = raw.state_dim, raw.input_dim, system.state_names
         columns = [*states, *system.input_names, *(f"{state}+" for state in states)]
         if len(columns) != 2 * n + m:
-            named = f"the data have {2 * n + m} columns; the subsystem names {len(columns)}"
+            named = (
+                f"the data have {2 * n + m} columns; the subsystem names {len(columns)}"
+            )
             raise DataError(f"{trajectory} {name}: {named}")
-        scaling = SCALINGS[name](torch.cat([raw.features, raw.next_states], dim=1), columns)
+        scaling = SCALINGS[name](
+            torch.cat([raw.features, raw.next_states], dim=1), columns
+        )
         pieces = [slice(0, n), slice(n, n + m), slice(n + m, None)]
-        states, inputs, next_states = (Scaling(scaling.offset[piece], scaling.factor[piece]) for piece in pieces)
-        data = Transitions(states.scale(raw.states), inputs.scale(raw.inputs), next_states.scale(raw.next_states))
+        states, inputs, next_states = (
+            Scaling(scaling.offset[piece], scaling.factor[piece]) for piece in pieces
+        )
+        data = Transitions(
+            states.scale(raw.states),
+            inputs.scale(raw.inputs),
+            next_states.scale(raw.next_states),
+        )
         return data, next_states, tuple(system.tracked_indices)
 
     @staticmethod
     def run_trial(trial: Trial) -> dict:
         """Trains and scores one draw."""
-        fit, data, restore = trial.condition, trial.condition.data, trial.condition.scaling.restore
+        fit, data, restore = (
+            trial.condition,
+            trial.condition.data,
+            trial.condition.scaling.restore,
+        )
         subset = random_rows(len(data), fit.size, trial.seed)
         training_rows = data[subset]
         training = fit.model(training_rows, seed=trial.seed)
         posterior = training.posterior
         means, fed, projected = predict_all(posterior, data, fit.state_std)
-        own = means if fit.size == len(data) else predict_all(posterior, training_rows, fit.state_std)[0]
+        own = (
+            means
+            if fit.size == len(data)
+            else predict_all(posterior, training_rows, fit.state_std)[0]
+        )
         plain = posterior.predict(data.states, data.inputs)
-        mean, variance = restore(plain.mean), (plain.variance + posterior.noise_variance) * fit.scaling.factor**2
+        mean, variance = (
+            restore(plain.mean),
+            (plain.variance + posterior.noise_variance) * fit.scaling.factor**2,
+        )
         observed = restore(data.next_states)
         held_out = np.setdiff1d(np.arange(len(data)), subset).tolist()
         return {
@@ -172,7 +241,11 @@ class Tables:
             "nlpd": negative_log_predictive_density(mean, variance, observed),
             "coverage_95": interval_coverage(mean, variance, observed),
             "held_out_coverage_95": (
-                interval_coverage(mean[held_out], variance[held_out], observed[held_out]) if held_out else None
+                interval_coverage(
+                    mean[held_out], variance[held_out], observed[held_out]
+                )
+                if held_out
+                else None
             ),
             "largest_projection": projected,
             "negative_log_evidence": training.objective.tolist(),
@@ -182,9 +255,19 @@ class Tables:
     def summary(self, records: Sequence[dict]) -> tuple[list[Table], list[str]]:
         """Returns both tables, and the calibration of plain predictions, for a terminal of 80 columns."""
         rows = summarise(records)
-        header = ["", "N", *(f"{label}\nours     paper" for label in MEASURES.values()), "time\n[s]"]
+        header = [
+            "",
+            "N",
+            *(f"{label}\nours     paper" for label in MEASURES.values()),
+            "time\n[s]",
+        ]
         tables = [
-            Table(header, [_compact(row) for row in rows if row.trajectory == name], _title(name), sections=True)
+            Table(
+                header,
+                [_compact(row) for row in rows if row.trajectory == name],
+                _title(name),
+                sections=True,
+            )
             for name in dict.fromkeys(row.trajectory for row in rows)
         ]
         return [*tables, _calibration(rows, medians=True)], [*LEGEND, self.data.note]
@@ -192,9 +275,19 @@ class Tables:
     def document(self, records: Sequence[dict]) -> Document:
         """Returns the tables with the paper's figures in columns of their own, and what lies outside our range."""
         rows = summarise(records)
-        header = ["subsystem", "N", *(name for label in MEASURES.values() for name in (label, "paper")), "time [s]"]
+        header = [
+            "subsystem",
+            "N",
+            *(name for label in MEASURES.values() for name in (label, "paper")),
+            "time [s]",
+        ]
         tables = [
-            Table(header, [_full(row) for row in rows if row.trajectory == name], _title(name), sections=True)
+            Table(
+                header,
+                [_full(row) for row in rows if row.trajectory == name],
+                _title(name),
+                sections=True,
+            )
             for name in dict.fromkeys(row.trajectory for row in rows)
         ]
         return Document(
@@ -208,7 +301,9 @@ class Tables:
         )
 
 
-def from_settings(made: Mapping[str, Any], settings: Mapping[str, Any], flight: Any) -> Tables:
+def from_settings(
+    made: Mapping[str, Any], settings: Mapping[str, Any], flight: Any
+) -> Tables:
     """Makes the tables that ``conf/tables.yaml`` describes.
 
     Args:
@@ -216,7 +311,9 @@ def from_settings(made: Mapping[str, Any], settings: Mapping[str, Any], flight: 
         settings: The same as plain data.
         flight: Not needed.
     """
-    numbers = {key: settings[key] for key in ("sizes", "draws", "seed", "state_std", "workers")}
+    numbers = {
+        key: settings[key] for key in ("sizes", "draws", "seed", "state_std", "workers")
+    }
     objects = made["data"], made["trajectory"], made["subsystem"], made["model"]
     return Tables(*objects, model_settings=settings["model"], **numbers)
 
@@ -233,7 +330,9 @@ class Fit:
     state_std: float
 
 
-def predict_all(posterior: GPPosterior, data: Transitions, state_std: float) -> tuple[Tensor, Tensor, float]:
+def predict_all(
+    posterior: GPPosterior, data: Transitions, state_std: float
+) -> tuple[Tensor, Tensor, float]:
     """Predicts one step ahead along the rows of ``data``, as the tables do.
 
     Returns:
@@ -273,7 +372,9 @@ class Statistic:
         half_a_digit = float(Decimal(5).scaleb(int(self.paper.as_tuple().exponent) - 1))
         if float(self.paper) + half_a_digit < min(self.values):
             return "below"
-        return "above" if float(self.paper) - half_a_digit > max(self.values) else "within"
+        return (
+            "above" if float(self.paper) - half_a_digit > max(self.values) else "within"
+        )
 
     @property
     def printed(self) -> str:
@@ -300,7 +401,9 @@ def paper_figures() -> dict[tuple[str, str, int], dict[str, Decimal]]:
     """Returns the figures printed in the paper's Tables 1 and 2, digit by digit."""
     with Path(__file__).with_name("paper_tables.csv").open(encoding="utf-8") as file:
         return {
-            (line["trajectory"], line["subsystem"], int(line["size"])): {name: Decimal(line[name]) for name in MEASURES}
+            (line["trajectory"], line["subsystem"], int(line["size"])): {
+                name: Decimal(line[name]) for name in MEASURES
+            }
             for line in csv.DictReader(file)
         }
 
@@ -309,13 +412,27 @@ def summarise(records: Sequence[dict]) -> list[Row]:
     """Returns one row a trajectory, subsystem and size, in the order in which they come."""
     groups: dict[tuple[str, str, int], list[dict]] = {}
     for record in records:
-        groups.setdefault((record["trajectory"], record["subsystem"], record["size"]), []).append(record)
+        groups.setdefault(
+            (record["trajectory"], record["subsystem"], record["size"]), []
+        ).append(record)
     rows = []
     for key, group in groups.items():
-        good, printed = [record for record in group if "error" not in record], paper_figures().get(key, {})
-        values = {name: tuple(r[name] for r in good if r[name] is not None) for name in [*MEASURES, *CALIBRATION]}
-        statistics = {name: Statistic(numbers, printed.get(name)) for name, numbers in values.items() if numbers}
-        seconds = median(record["training_seconds"] for record in good) if good else None
+        good, printed = (
+            [record for record in group if "error" not in record],
+            paper_figures().get(key, {}),
+        )
+        values = {
+            name: tuple(r[name] for r in good if r[name] is not None)
+            for name in [*MEASURES, *CALIBRATION]
+        }
+        statistics = {
+            name: Statistic(numbers, printed.get(name))
+            for name, numbers in values.items()
+            if numbers
+        }
+        seconds = (
+            median(record["training_seconds"] for record in good) if good else None
+        )
         rows.append(Row(*key, statistics, seconds, len(group) - len(good)))
     return rows
 
@@ -323,11 +440,15 @@ def summarise(records: Sequence[dict]) -> list[Row]:
 def differences(rows: Sequence[Row]) -> list[str]:
     """Returns one line for every figure of the paper that lies outside our range."""
     lines = []
-    for row, (name, label) in ((row, measure) for row in rows for measure in MEASURES.items()):
+    for row, (name, label) in (
+        (row, measure) for row in rows for measure in MEASURES.items()
+    ):
         statistic = row.statistics.get(name)
         if statistic and statistic.position in ("below", "above"):
             low, _, high = statistic.range
-            end, nearest = ("low", low) if statistic.position == "below" else ("high", high)
+            end, nearest = (
+                ("low", low) if statistic.position == "below" else ("high", high)
+            )
             ratio = float(statistic.paper) / nearest
             distance = f"a factor {number(max(ratio, 1 / ratio))}"
             if 0.9 < ratio < 1.1:
@@ -352,39 +473,69 @@ def _compact(row: Row) -> list[str]:
             cells.append(MISSING)
             continue
         low, middle, high = map(number, statistic.range)
-        cells.append(f"{middle:8} {statistic.printed if statistic.paper else ''}".rstrip() + f"\n[{low}, {high}]")
+        cells.append(
+            f"{middle:8} {statistic.printed if statistic.paper else ''}".rstrip()
+            + f"\n[{low}, {high}]"
+        )
     return [row.subsystem, str(row.size), *cells, _seconds(row)]
 
 
 def _full(row: Row) -> list[str]:
     found = [row.statistics.get(name) for name in MEASURES]
-    cells = [cell for s in found for cell in ((with_range(*s.range), s.printed) if s else (MISSING, MISSING))]
+    cells = [
+        cell
+        for s in found
+        for cell in ((with_range(*s.range), s.printed) if s else (MISSING, MISSING))
+    ]
     return [row.subsystem, str(row.size), *cells, _seconds(row)]
 
 
 def _calibration(rows: Sequence[Row], medians: bool = False) -> Table:
     """Returns the table of plain predictions, with the ranges or with medians alone."""
-    header = ["", "N", *(label.replace(", ", "\n") if medians else label for label in CALIBRATION.values())]
+    header = [
+        "",
+        "N",
+        *(
+            label.replace(", ", "\n") if medians else label
+            for label in CALIBRATION.values()
+        ),
+    ]
     lines = []
     for row in rows:
-        found = [row.statistics[name].range if name in row.statistics else None for name in CALIBRATION]
-        texts = [MISSING if of is None else number(of[1]) if medians else with_range(*of) for of in found]
+        found = [
+            row.statistics[name].range if name in row.statistics else None
+            for name in CALIBRATION
+        ]
+        texts = [
+            MISSING if of is None else number(of[1]) if medians else with_range(*of)
+            for of in found
+        ]
         lines.append([f"{row.trajectory} {row.subsystem}", str(row.size), *texts])
     over = ": medians over the draws" if medians else ""
-    return Table(header, lines, f"Plain predictions (no input covariance){over}", sections=True)
+    return Table(
+        header, lines, f"Plain predictions (no input covariance){over}", sections=True
+    )
 
 
 def _numbers(row: Row) -> dict[str, Any]:
     """Returns median, min, max, the paper's figure and its position for every measure."""
     done = max((len(s.values) for s in row.statistics.values()), default=0)
-    numbers = {"trajectory": row.trajectory, "subsystem": row.subsystem, "size": row.size, "draws": done}
+    numbers = {
+        "trajectory": row.trajectory,
+        "subsystem": row.subsystem,
+        "size": row.size,
+        "draws": done,
+    }
     numbers |= {"failed": row.failed, "training_seconds_median": row.seconds}
     for name in [*MEASURES, *CALIBRATION]:
         s = row.statistics.get(name)
         low, middle, high = s.range if s else (None, None, None)
         numbers |= {f"{name}_median": middle, f"{name}_min": low, f"{name}_max": high}
         if name in MEASURES:
-            numbers |= {f"{name}_paper": s and s.paper, f"{name}_paper_is": s and s.position}
+            numbers |= {
+                f"{name}_paper": s and s.paper,
+                f"{name}_paper_is": s and s.position,
+            }
     return numbers
 
 
@@ -400,20 +551,35 @@ def _figure(records: Sequence[dict]) -> Figure:
         if printed := paper_figures().get((*name, record["size"])):
             paper[record["size"]] = float(printed["test_mse"])
     columns, rows = min(2, len(panels)), -(-len(panels) // 2)
-    title, height = "Tables 1 and 2: error of held-out predictions", 3.4 * rows + 0.8 * (rows > 1)
+    title, height = (
+        "Tables 1 and 2: error of held-out predictions",
+        3.4 * rows + 0.8 * (rows > 1),
+    )
     figure, axes = make_figure(4.6 * columns, height, rows, columns, title)
     for axis in axes.flat[len(panels) :]:
         axis.set_visible(False)
-    for axis, (heading, (errors, paper)) in zip(axes.flat, panels.items(), strict=False):
+    for axis, (heading, (errors, paper)) in zip(
+        axes.flat, panels.items(), strict=False
+    ):
         sizes = sorted(errors)
         axis.set(title=heading, xlabel="training points N")
         if not sizes:  # every fit failed
             axis.set_axis_off()
             continue
-        draws = Series("our draws, with their quartiles", [errors[size] for size in sizes])
+        draws = Series(
+            "our draws, with their quartiles", [errors[size] for size in sizes]
+        )
         draw_quartiles(axis, [draws], [str(size) for size in sizes])
         if known := {size: paper[size] for size in sizes if size in paper}:
-            axis.plot([*known], [*known.values()], "o", color=VERMILION, markersize=6, zorder=3, label="paper")
+            axis.plot(
+                [*known],
+                [*known.values()],
+                "o",
+                color=VERMILION,
+                markersize=6,
+                zorder=3,
+                label="paper",
+            )
         axis.set_yscale("log")
         axis.yaxis.set_minor_locator(NullLocator())
     legend_below(figure, axes.flat)

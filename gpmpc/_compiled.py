@@ -52,10 +52,20 @@ def compiled(
             it at once and can share its workspace. To let go of the lock takes a fortieth of a microsecond.
     """
     if function is None:
-        return partial(compiled, allocates=allocates, kernel=kernel, inline=inline, locked=locked)
-    options = {"nogil": not locked, "fastmath": {"reassoc", "contract", "nsz"}, "forceinline": inline}
+        return partial(
+            compiled, allocates=allocates, kernel=kernel, inline=inline, locked=locked
+        )
+    options = {
+        "nogil": not locked,
+        "fastmath": {"reassoc", "contract", "nsz"},
+        "forceinline": inline,
+    }
     options |= _PRIVATE_OPTIONS[kernel] | ({} if allocates else {"_nrt": False})
-    return _jit_cached(function, options) if kernel else register_jitable(**options)(function)
+    return (
+        _jit_cached(function, options)
+        if kernel
+        else register_jitable(**options)(function)
+    )
 
 
 njit_inner = partial(compiled, kernel=False)
@@ -114,7 +124,9 @@ with suppress(ImportError):
 
         def define_pipelines(self):
             if self.state.library is None:
-                self.state.library = self.library(self.state.targetctx.codegen(), self.state.func_id.func_qualname)
+                self.state.library = self.library(
+                    self.state.targetctx.codegen(), self.state.func_id.func_qualname
+                )
                 self.state.library.enable_object_caching()  # as numba does where it makes a library of its own
             return super().define_pipelines()
 
@@ -122,8 +134,15 @@ with suppress(ImportError):
         library = _InnerLibrary
 
     # nothing in C calls a kernel, and Python no inner function: ways in take a tenth of the time
-    _PRIVATE_OPTIONS[True] = {"pipeline_class": _KernelCompiler, "no_cfunc_wrapper": True}
-    _PRIVATE_OPTIONS[False] = {"pipeline_class": _InnerCompiler, "no_cfunc_wrapper": True, "no_cpython_wrapper": True}
+    _PRIVATE_OPTIONS[True] = {
+        "pipeline_class": _KernelCompiler,
+        "no_cfunc_wrapper": True,
+    }
+    _PRIVATE_OPTIONS[False] = {
+        "pipeline_class": _InnerCompiler,
+        "no_cfunc_wrapper": True,
+        "no_cpython_wrapper": True,
+    }
 
 
 def _jit_cached(function: Callable, options: dict) -> Callable:
@@ -147,13 +166,21 @@ def sources_stamp(module: str) -> bytes:
     pending, seen = [module], {}
     while pending:
         name = pending.pop()
-        if name not in seen and name.partition(".")[0] in packages and name in sys.modules:
-            seen[name], imported = _read_source(getattr(sys.modules[name], "__file__", None))
+        if (
+            name not in seen
+            and name.partition(".")[0] in packages
+            and name in sys.modules
+        ):
+            seen[name], imported = _read_source(
+                getattr(sys.modules[name], "__file__", None)
+            )
             pending += imported
     return hashlib.sha256(b"".join(seen[name] for name in sorted(seen))).digest()
 
 
-_IMPORT = re.compile(r"^[ \t]*(?:from[ \t]+([\w.]+)[ \t]+)?import[ \t]+(\([^)]*\)|.*)", re.MULTILINE)
+_IMPORT = re.compile(
+    r"^[ \t]*(?:from[ \t]+([\w.]+)[ \t]+)?import[ \t]+(\([^)]*\)|.*)", re.MULTILINE
+)
 
 
 @cache
@@ -165,7 +192,10 @@ def _read_source(path: str | None) -> tuple[bytes, list[str]]:
         return b"", []
     imported = []
     for parent, names in _IMPORT.findall(source):
-        parts = [f"{parent}.{name}" if parent else name for name in re.findall(r"[\w.]+", names)]
+        parts = [
+            f"{parent}.{name}" if parent else name
+            for name in re.findall(r"[\w.]+", names)
+        ]
         imported += [part if part in sys.modules else parent for part in parts]
     return hashlib.sha256(source.encode()).digest(), imported
 

@@ -18,7 +18,10 @@ def report_compilation() -> Iterator[None]:
         def on_start(self, event: Any) -> None:
             if not self.began:
                 self.began = True
-                print("compiling numerical kernels: once on this machine, about half a minute", flush=True)
+                print(
+                    "compiling numerical kernels: once on this machine, about half a minute",
+                    flush=True,
+                )
             super().on_start(event)
 
     with events.install_listener("numba:compile", Clock()) as clock:

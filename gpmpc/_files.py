@@ -25,7 +25,9 @@ def whole_file(path: str | Path) -> Iterator[BinaryIO]:
         os.replace(partial, path)
     finally:
         partial.unlink(missing_ok=True)
-    if os.name == "posix":  # elsewhere a folder cannot be opened, and needs not be flushed
+    if (
+        os.name == "posix"
+    ):  # elsewhere a folder cannot be opened, and needs not be flushed
         folder = os.open(path.parent, os.O_RDONLY)
         try:
             os.fsync(folder)

@@ -23,7 +23,11 @@ def provenance() -> dict:
         "git": _git_commit(),
         "python": platform.python_version(),
         "versions": versions(),
-        "machine": {"system": platform.system(), "processor": processor(), "cores": os.cpu_count()},
+        "machine": {
+            "system": platform.system(),
+            "processor": processor(),
+            "cores": os.cpu_count(),
+        },
     }
 
 
@@ -31,7 +35,11 @@ def flattened(data: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     """Returns nested data as one dictionary, keys dotted."""
     leaves: dict[str, Any] = {}
     for key, value in data.items():
-        leaves |= flattened(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {f"{prefix}{key}": value}
+        leaves |= (
+            flattened(value, f"{prefix}{key}.")
+            if isinstance(value, Mapping)
+            else {f"{prefix}{key}": value}
+        )
     return leaves
 
 
@@ -53,7 +61,10 @@ def environment() -> dict[str, str | None]:
 
 def processor() -> str:
     """The processor's name, where the system tells it; else its architecture."""
-    with suppress(OSError), open("/proc/cpuinfo", encoding="utf-8", errors="replace") as file:
+    with (
+        suppress(OSError),
+        open("/proc/cpuinfo", encoding="utf-8", errors="replace") as file,
+    ):
         for line in file:
             if line.startswith("model name"):
                 return line.partition(":")[2].strip()
@@ -81,8 +92,13 @@ def _git_commit() -> dict | None:
         return None
     # Without the lock that refreshes the index: a run that is killed would leave it, and git would refuse to commit.
     git = ["git", "--no-optional-locks", "-C", str(root)]
-    run = partial(subprocess.check_output, stderr=subprocess.DEVNULL, text=True, timeout=10)
+    run = partial(
+        subprocess.check_output, stderr=subprocess.DEVNULL, text=True, timeout=10
+    )
     try:
-        return {"commit": run([*git, "rev-parse", "HEAD"]).strip(), "dirty": bool(run([*git, "status", "--porcelain"]))}
+        return {
+            "commit": run([*git, "rev-parse", "HEAD"]).strip(),
+            "dirty": bool(run([*git, "status", "--porcelain"])),
+        }
     except (OSError, subprocess.SubprocessError):
         return None

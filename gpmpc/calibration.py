@@ -22,7 +22,12 @@ from gpmpc._dynamics import DynamicsModel
 from gpmpc.exceptions import DataError, SettingError, ShapeError, check_number
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import Transitions
-from gpmpc.metrics import binomial_interval, interval_coverage, mean_squared_error, negative_log_predictive_density
+from gpmpc.metrics import (
+    binomial_interval,
+    interval_coverage,
+    mean_squared_error,
+    negative_log_predictive_density,
+)
 from gpmpc.propagation import Propagator, best_propagator
 
 if TYPE_CHECKING:
@@ -45,8 +50,14 @@ class Recording:
 
     def __post_init__(self) -> None:
         for name in ("states", "inputs"):
-            object.__setattr__(self, name, torch.as_tensor(getattr(self, name), dtype=torch.float64))
-        if self.states.dim() != 2 or self.inputs.dim() != 2 or not 0 < len(self.inputs) == len(self.states) - 1:
+            object.__setattr__(
+                self, name, torch.as_tensor(getattr(self, name), dtype=torch.float64)
+            )
+        if (
+            self.states.dim() != 2
+            or self.inputs.dim() != 2
+            or not 0 < len(self.inputs) == len(self.states) - 1
+        ):
             raise ShapeError(
                 "a recording has states (K + 1, n) and inputs (K, m), K of 1 or more; "
                 f"got {tuple(self.states.shape)} and {tuple(self.inputs.shape)}"
@@ -61,10 +72,19 @@ class Recording:
     @classmethod
     def chained(cls, transitions: Transitions) -> list["Recording"]:
         """Finds the runs in transitions: one goes on while a row's next state is the following row's state."""
-        goes_on = (transitions.next_states[:-1] == transitions.states[1:]).all(dim=1).tolist()
-        ends = [0, *(k + 1 for k, same in enumerate(goes_on) if not same), len(transitions)]
+        goes_on = (
+            (transitions.next_states[:-1] == transitions.states[1:]).all(dim=1).tolist()
+        )
+        ends = [
+            0,
+            *(k + 1 for k, same in enumerate(goes_on) if not same),
+            len(transitions),
+        ]
         runs = [transitions[begin:end] for begin, end in pairwise(ends)]
-        return [cls(torch.cat([run.states, run.next_states[-1:]]), run.inputs) for run in runs]
+        return [
+            cls(torch.cat([run.states, run.next_states[-1:]]), run.inputs)
+            for run in runs
+        ]
 
 
 @dataclass(frozen=True)
@@ -80,10 +100,14 @@ class Calibration:
     width: Tensor  # (H, n) root mean predicted variance over the RMSE: one is honest, less claims too much
     independent: Tensor  # (H,) predictions that do not overlap, at most
 
-    def coverage_interval(self, step: int, state: int, level: int) -> tuple[float, float]:
+    def coverage_interval(
+        self, step: int, state: int, level: int
+    ) -> tuple[float, float]:
         """Computes the exact 95 % interval of a coverage (Clopper and Pearson, 1934), from its three indices."""
         trials = int(self.independent[step])
-        return binomial_interval(round(float(self.coverage[step, state, level]) * trials), trials)
+        return binomial_interval(
+            round(float(self.coverage[step, state, level]) * trials), trials
+        )
 
     @property
     def horizon(self) -> int:
@@ -95,10 +119,20 @@ class Calibration:
         import pandas
 
         n = len(self.names)
-        steps, samples = (t.repeat_interleave(n) for t in (torch.arange(1, self.horizon + 1), self.samples))
-        table: dict[str, Any] = {"step": steps, "state": self.names * self.horizon, "samples": samples}
+        steps, samples = (
+            t.repeat_interleave(n)
+            for t in (torch.arange(1, self.horizon + 1), self.samples)
+        )
+        table: dict[str, Any] = {
+            "step": steps,
+            "state": self.names * self.horizon,
+            "samples": samples,
+        }
         table |= {key: getattr(self, key).ravel() for key in ("rmse", "nlpd", "width")}
-        table |= {f"coverage_{level:g}": self.coverage[..., j].ravel() for j, level in enumerate(self.levels)}
+        table |= {
+            f"coverage_{level:g}": self.coverage[..., j].ravel()
+            for j, level in enumerate(self.levels)
+        }
         return pandas.DataFrame(table)
 
 
@@ -139,21 +173,42 @@ def calibrate(
     found: list[list[tuple[Tensor, ...]]] = [[] for _ in range(horizon)]
     with torch.no_grad():
         for recording in recordings:
-            x, u, K = recording.states.to(**like), recording.inputs.to(**like), len(recording)
+            x, u, K = (
+                recording.states.to(**like),
+                recording.inputs.to(**like),
+                len(recording),
+            )
             for first in range(0, K, CHUNK):
                 mean = x[first : min(first + CHUNK, K)]
                 belief = Gaussian(mean, certain.expand(len(mean), n, n))
                 for k in range(min(horizon, K - first)):
-                    last = min(first + CHUNK, K - k)  # from here on k + 1 steps would outlast the recording
-                    belief = Gaussian(belief.mean[: last - first], belief.covariance[: last - first])
+                    last = min(
+                        first + CHUNK, K - k
+                    )  # from here on k + 1 steps would outlast the recording
+                    belief = Gaussian(
+                        belief.mean[: last - first], belief.covariance[: last - first]
+                    )
                     belief = propagator(model, belief, u[first + k : last + k])
                     observed = recording.states[first + k + 1 : last + k + 1]
-                    found[k].append((belief.mean.double().cpu(), (belief.variance + noise).double().cpu(), observed))
-    steps = [tuple(torch.cat(parts) for parts in zip(*step, strict=True)) for step in found]
-    columns = [[[part[:, i : i + 1] for part in step] for i in range(n)] for step in steps]
+                    found[k].append(
+                        (
+                            belief.mean.double().cpu(),
+                            (belief.variance + noise).double().cpu(),
+                            observed,
+                        )
+                    )
+    steps = [
+        tuple(torch.cat(parts) for parts in zip(*step, strict=True)) for step in found
+    ]
+    columns = [
+        [[part[:, i : i + 1] for part in step] for i in range(n)] for step in steps
+    ]
 
     def table(measure: Callable[[Tensor, Tensor, Tensor], Any]) -> Tensor:
-        return torch.tensor([[measure(*column) for column in step] for step in columns], dtype=torch.float64)
+        return torch.tensor(
+            [[measure(*column) for column in step] for step in columns],
+            dtype=torch.float64,
+        )
 
     rmse = table(lambda m, v, y: math.sqrt(mean_squared_error(m, y)))
     return Calibration(
@@ -164,23 +219,44 @@ def calibrate(
         table(negative_log_predictive_density),
         table(lambda m, v, y: [interval_coverage(m, v, y, level) for level in levels]),
         table(lambda m, v, y: math.sqrt(v.mean())) / rmse,
-        torch.tensor([sum(len(recording) // k for recording in recordings) for k in range(1, horizon + 1)]),
+        torch.tensor(
+            [
+                sum(len(recording) // k for recording in recordings)
+                for k in range(1, horizon + 1)
+            ]
+        ),
     )
 
 
 def _check(
-    model: DynamicsModel, recordings: list[Recording], horizon: int, levels: Sequence[float], names: tuple[str, ...]
+    model: DynamicsModel,
+    recordings: list[Recording],
+    horizon: int,
+    levels: Sequence[float],
+    names: tuple[str, ...],
 ) -> None:
     n, m = model.state_dim, model.input_dim
     if model.output_dim != n:
-        raise ShapeError(f"the model must predict its {n} states; it has {model.output_dim} outputs")
-    sizes = {(recording.states.shape[1], recording.inputs.shape[1]) for recording in recordings}
+        raise ShapeError(
+            f"the model must predict its {n} states; it has {model.output_dim} outputs"
+        )
+    sizes = {
+        (recording.states.shape[1], recording.inputs.shape[1])
+        for recording in recordings
+    }
     if sizes != {(n, m)}:
-        raise ShapeError(f"recordings must have the model's {n} states and {m} inputs; got {sizes or 'no recording'}")
+        raise ShapeError(
+            f"recordings must have the model's {n} states and {m} inputs; got {sizes or 'no recording'}"
+        )
     longest = max(map(len, recordings))
     if horizon > longest:
-        raise SettingError("horizon", f"must be at most {longest} steps, the longest recording; got {horizon}")
+        raise SettingError(
+            "horizon",
+            f"must be at most {longest} steps, the longest recording; got {horizon}",
+        )
     if len(names) != n:
         raise ShapeError(f"names must name {n} states; got {len(names)}")
     if not levels or not all(0 < level < 1 for level in levels):
-        raise SettingError("levels", f"must be one or more between 0 and 1; got {levels}")
+        raise SettingError(
+            "levels", f"must be one or more between 0 and 1; got {levels}"
+        )

@@ -38,7 +38,9 @@ class TrainingError(GpmpcError, RuntimeError):
 
     def __init__(self, outputs: list[int], message: str):
         super().__init__(outputs, message)
-        self.outputs = outputs  #: indices of the outputs (from 0) that could not be trained
+        self.outputs = (
+            outputs  #: indices of the outputs (from 0) that could not be trained
+        )
 
     def __str__(self) -> str:
         return self.args[1]
@@ -81,7 +83,13 @@ class RecordingError(GpmpcError, RuntimeError):
 
 
 def check_number(
-    key: str, value: Any, *, above: float | None = None, least: float | None = None, whole: bool = False, unit: str = ""
+    key: str,
+    value: Any,
+    *,
+    above: float | None = None,
+    least: float | None = None,
+    whole: bool = False,
+    unit: str = "",
 ) -> None:
     """Raises ``SettingError`` unless a setting is one finite number (not a truth value) as asked for.
 
@@ -97,19 +105,33 @@ def check_number(
     ):
         return
     kind = "a whole number" if whole else "a number"
-    limit = f" above {above}" if above is not None else f", {least} or more" if least is not None else ""
-    raise SettingError(key, f"must be {kind}{limit}{' ' + unit if unit else ''}; got {value!r}")
+    limit = (
+        f" above {above}"
+        if above is not None
+        else f", {least} or more"
+        if least is not None
+        else ""
+    )
+    raise SettingError(
+        key, f"must be {kind}{limit}{' ' + unit if unit else ''}; got {value!r}"
+    )
 
 
 def check_choice(key: str, value: Any, choices: Sequence[str]) -> None:
     """Raises ``SettingError`` unless a setting is one of several words."""
     if value not in choices:
-        raise SettingError(key, f"must be one of {', '.join(map(repr, choices))}; got {value!r}")
+        raise SettingError(
+            key, f"must be one of {', '.join(map(repr, choices))}; got {value!r}"
+        )
 
 
 def check_numbers(key: str, values: Any, length: int, **limits: Any) -> None:
     """Raises unless a setting is a list of ``length`` numbers, each as ``check_number`` asks for."""
-    if isinstance(values, str) or not hasattr(values, "__len__") or len(values) != length:
+    if (
+        isinstance(values, str)
+        or not hasattr(values, "__len__")
+        or len(values) != length
+    ):
         raise SettingError(key, f"must be a list of {length} numbers; got {values!r}")
     for value in values:
         check_number(key, value, **limits)

@@ -16,14 +16,19 @@ def check_tensors(**given: Any) -> None:
     for key, value in given.items():
         if not isinstance(value, Tensor):
             got = type(value).__name__
-            raise SettingError(key, f"must be a torch tensor; got {got} (torch.as_tensor(..., dtype=torch.float64))")
+            raise SettingError(
+                key,
+                f"must be a torch tensor; got {got} (torch.as_tensor(..., dtype=torch.float64))",
+            )
 
 
 def constant_arrays(*tensors: Tensor) -> list[NDArray[Any]] | None:
     """Tensors as arrays; None where one is on another device, or autograd or a function transform follows it."""
     arrays = []
     try:
-        for tensor in tensors:  # in microseconds: a step of control calls this several times
+        for (
+            tensor
+        ) in tensors:  # in microseconds: a step of control calls this several times
             arrays.append(tensor.numpy())
             if forward_ad.unpack_dual(tensor).tangent is not None:
                 return None
@@ -68,13 +73,24 @@ class Gaussian:
         mean = value
         if not isinstance(value, Tensor):
             try:
-                mean = torch.as_tensor(value, dtype=None if hasattr(value, "dtype") else torch.float64)
+                mean = torch.as_tensor(
+                    value, dtype=None if hasattr(value, "dtype") else torch.float64
+                )
             except (TypeError, ValueError) as error:
-                raise ShapeError(f"a state must be numbers (*batch, n); got {value!r}") from error
+                raise ShapeError(
+                    f"a state must be numbers (*batch, n); got {value!r}"
+                ) from error
         mean = mean if mean.is_floating_point() else mean.to(torch.float64)
         if not mean.dim():
-            raise ShapeError(f"a state must be numbers (*batch, n); got the single number {value!r}")
-        return cls(mean, torch.zeros(*mean.shape, mean.shape[-1], dtype=mean.dtype, device=mean.device))
+            raise ShapeError(
+                f"a state must be numbers (*batch, n); got the single number {value!r}"
+            )
+        return cls(
+            mean,
+            torch.zeros(
+                *mean.shape, mean.shape[-1], dtype=mean.dtype, device=mean.device
+            ),
+        )
 
     @property
     def dim(self) -> int:
@@ -95,12 +111,16 @@ def nearest_positive_semidefinite(covariance: Tensor) -> tuple[Tensor, Tensor]:
     """
     symmetric = (covariance + covariance.mT) / 2
     plain = constant_arrays(symmetric) is not None
-    if plain and not bool(torch.linalg.cholesky_ex(symmetric).info.any()):  # the usual case, cheaply
+    if plain and not bool(
+        torch.linalg.cholesky_ex(symmetric).info.any()
+    ):  # the usual case, cheaply
         return symmetric, torch.zeros_like(symmetric[..., 0, 0])
     deficit = (-torch.linalg.eigvalsh(symmetric.detach())[..., 0]).clamp_min(0)
     negative = deficit[..., None, None] > 0
     # The derivative of eigh divides by differences of eigenvalues; where nothing is projected it gets distinct ones.
-    distinct = torch.arange(1, symmetric.shape[-1] + 1, dtype=symmetric.dtype, device=symmetric.device).diag()
+    distinct = torch.arange(
+        1, symmetric.shape[-1] + 1, dtype=symmetric.dtype, device=symmetric.device
+    ).diag()
     eigenvalues, vectors = torch.linalg.eigh(torch.where(negative, symmetric, distinct))
     projected = vectors @ (eigenvalues.clamp_min(0)[..., None] * vectors.mT)
     return torch.where(negative, (projected + projected.mT) / 2, symmetric), deficit
@@ -119,7 +139,9 @@ def square_root(covariance: Tensor) -> Tensor:
     r = eigenvalues.clamp_min(0).sqrt()
     R = U @ (r[..., :, None] * U.mT)
     # One step of Newton's method from R, which is the solution already: it changes no value and carries the derivative.
-    return R + square_root_differential(r, U, (covariance - constant)[..., None])[..., 0]
+    return (
+        R + square_root_differential(r, U, (covariance - constant)[..., None])[..., 0]
+    )
 
 
 def square_root_differential(r: Tensor, U: Tensor, change: Tensor) -> Tensor:
@@ -130,11 +152,15 @@ def square_root_differential(r: Tensor, U: Tensor, change: Tensor) -> Tensor:
     total = (r[..., :, None] + r[..., None, :])[..., None]
     rotated = _congruent(U.mT, change)
     positive = total > 0
-    return _congruent(U, torch.where(positive, rotated / torch.where(positive, total, 1.0), 0.0))
+    return _congruent(
+        U, torch.where(positive, rotated / torch.where(positive, total, 1.0), 0.0)
+    )
 
 
 def _congruent(U: Tensor, matrices: Tensor) -> Tensor:
     """U X U' for symmetric X, as many as wanted along the last dimension (*batch, n, n, j)."""
     shape = matrices.shape[-2:]
     half = U @ matrices.flatten(-2)  # its rows are of U X, one X beside the other
-    return (U @ half.unflatten(-1, shape).transpose(-3, -2).flatten(-2)).unflatten(-1, shape)
+    return (U @ half.unflatten(-1, shape).transpose(-3, -2).flatten(-2)).unflatten(
+        -1, shape
+    )

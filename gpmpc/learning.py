@@ -52,10 +52,14 @@ class OnlineLearning:
     points: int = 40  #: of the change, at most; where there would be more, a fifth goes
     #: which go: ``"oldest"`` or ``"least_informative"``; see ``SlidingWindow``
     remove: Literal["oldest", "least_informative"] = "oldest"
-    share: float = 0.1  #: by how much the plant may differ, as a share of what was learned
+    share: float = (
+        0.1  #: by how much the plant may differ, as a share of what was learned
+    )
     memory: float = 5000.0  #: length-scale of time in the kernel [steps]
     window: int = 20  #: steps over which predictions are compared
-    margin: float = 20.0  #: lead of the summed log densities from which on the change is used
+    margin: float = (
+        20.0  #: lead of the summed log densities from which on the change is used
+    )
     surprise: float = 30.0  #: squared error over its expectation, from which on a plant is another one
 
     def __post_init__(self) -> None:
@@ -68,7 +72,9 @@ class OnlineLearning:
     def learn(self, learned: "Learned", input: Array, state: Array) -> "Learned":
         """Learns from one step: the input that was applied (m,), and the state measured after it (n,)."""
         model, spread = learned.model, learned.spread
-        point, error, latent = model.error(learned.state, np.asarray(input, dtype=float), state)
+        point, error, latent = model.error(
+            learned.state, np.asarray(input, dtype=float), state
+        )
         moved = float(((error - learned.error) ** 2 / model.arrays[2]).mean()) / 2.0
         if np.isfinite(moved):
             spread = np.append(spread, moved)[-_MANY:]
@@ -76,13 +82,17 @@ class OnlineLearning:
         if len(spread) < _FEW:
             return replace(learned, model=model.later(1.0), **found)
         # What changes slowly has no part in differences of successive errors, and a jump no weight in their median.
-        ratio = float(np.sort(spread)[len(spread) // 2]) * len(error) / _median(len(error))
+        ratio = (
+            float(np.sort(spread)[len(spread) // 2]) * len(error) / _median(len(error))
+        )
         noise = model.arrays[2] * max(1.0, ratio)
         larger, alone = model.with_point(point, error, noise), noise + latent
         missed, variance = larger.last_innovation()
         variance = variance + latent
         lead = _log_density(missed, variance) - _log_density(error, alone)
-        leads = np.append(learned.leads, max(-_LARGEST, min(lead, _LARGEST)))[-self.window :]
+        leads = np.append(learned.leads, max(-_LARGEST, min(lead, _LARGEST)))[
+            -self.window :
+        ]
         total = float(leads.sum())
         active = total >= 0 if learned.active else total > self.margin
         squares = missed**2 / variance if learned.active else error**2 / alone
@@ -90,7 +100,14 @@ class OnlineLearning:
             active, leads = True, leads[:0]
             larger = replace(model).with_point(point, error, noise)
         version = learned.version + (active or learned.active)
-        return replace(learned, model=larger.later(1.0), leads=leads, active=active, version=version, **found)
+        return replace(
+            learned,
+            model=larger.later(1.0),
+            leads=leads,
+            active=active,
+            version=version,
+            **found,
+        )
 
 
 @dataclass(frozen=True)
@@ -102,11 +119,17 @@ class ChangedModel(Wrapper):
     """
 
     model: DynamicsModel  #: f: a ``GPPosterior`` of next states, or a ``ResidualModel``
-    learning: OnlineLearning = field(default_factory=OnlineLearning)  #: how d is learned
+    learning: OnlineLearning = field(
+        default_factory=OnlineLearning
+    )  #: how d is learned
     time: float = 0.0  #: t of all predictions [steps]
 
     def __post_init__(self) -> None:
-        if not isinstance(self.gp, GPPosterior) or self.gp.device.type != "cpu" or callable(self.B):
+        if (
+            not isinstance(self.gp, GPPosterior)
+            or self.gp.device.type != "cpu"
+            or callable(self.B)
+        ):
             rule = "learning while flying needs a GPPosterior or a ResidualModel with a constant B, in host memory"
             raise UnsupportedModel(f"{rule}; got {type(self.model).__name__}")
 
@@ -120,25 +143,39 @@ class ChangedModel(Wrapper):
     def features(self) -> Features:
         """What d sees of the state and the input."""
         n, m, model = self.model.state_dim, self.model.input_dim, cast(Any, self.model)
-        return Features(list(range(n)), list(range(m)), [], n, m) if self.gp is model else model.features
+        return (
+            Features(list(range(n)), list(range(m)), [], n, m)
+            if self.gp is model
+            else model.features
+        )
 
     @cached_property
     def B(self) -> Tensor:
         """Where d acts (n, k)."""
         model = cast(Any, self.model)
-        return torch.eye(self.gp.output_dim, dtype=self.gp.dtype) if self.gp is model else model.B
+        return (
+            torch.eye(self.gp.output_dim, dtype=self.gp.dtype)
+            if self.gp is model
+            else model.B
+        )
 
     @cached_property
     def arrays(self) -> tuple[Array, Array, Array]:
         """B (n, k), its pseudo-inverse, the part of an error of f that d can explain, and the noise of the GP (k,)."""
         B = to_array(self.B)
-        return B, np.asarray(np.linalg.pinv(B), dtype=np.float64), to_array(self.gp.noise_variance)
+        return (
+            B,
+            np.asarray(np.linalg.pinv(B), dtype=np.float64),
+            to_array(self.gp.noise_variance),
+        )
 
     @cached_property
     def change(self) -> tuple[Window, Window | None]:
         """d: GPs over (phi, u, t), at first without points; and in the making those without the points that go next."""
         gp = self.gp
-        scales = np.column_stack([to_array(gp.lengthscales), np.full(gp.output_dim, self.learning.memory)])
+        scales = np.column_stack(
+            [to_array(gp.lengthscales), np.full(gp.output_dim, self.learning.memory)]
+        )
         signal = self.learning.share**2 * to_array(gp.signal_variance)
         return Window.empty(scales, signal, gp.state_dim, self.learning.points), None
 
@@ -154,29 +191,47 @@ class ChangedModel(Wrapper):
         other.__dict__.update(self.__dict__ | changes)
         return other
 
-    def error(self, state: Array, input: Array, next_state: Array) -> tuple[Array, Array, Array]:
+    def error(
+        self, state: Array, input: Array, next_state: Array
+    ) -> tuple[Array, Array, Array]:
         """The point (phi, u, t) (d,) of a transition, what d was there (k,), and the variance of f there (k,)."""
         states, inputs, reach = state[None], input[None], self.arrays[1]
         alone = linearize(self.model, states, inputs)
         z, v, _ = self.features.linearize(states, inputs)
         variance = ((reach @ cast(Array, alone.covariance)[0]) * reach).sum(1)
-        return np.concatenate([z[0], v[0], [self.time]]), reach @ (next_state - alone.mean[0]), variance
+        return (
+            np.concatenate([z[0], v[0], [self.time]]),
+            reach @ (next_state - alone.mean[0]),
+            variance,
+        )
 
     def with_point(self, point: Array, target: Array, noise: Array) -> "ChangedModel":
         """The model with a further point (phi, u, t) (d,) of the change, its target (k,) and its noise's variance (k,).
 
         Raises SettingError where the noise is too small.
         """
-        (now, coming), new, most = self.change, (point, target, noise), self.learning.points
+        (now, coming), new, most = (
+            self.change,
+            (point, target, noise),
+            self.learning.points,
+        )
         gone = max(1, most // 5)
-        step = len(self) - (most - gone)  # of ``gone`` in which the factor without them is made
+        step = len(self) - (
+            most - gone
+        )  # of ``gone`` in which the factor without them is made
         if step > 0 and coming is None:
             oldest = self.learning.remove == "oldest"
-            coming = now.without(range(gone) if oldest else least_informative(self.posterior, gone))
+            coming = now.without(
+                range(gone) if oldest else least_informative(self.posterior, gone)
+            )
         if coming is not None and step == gone:
             now, coming = coming, None
-        elif coming is not None:  # rows are as much work as their number's square: all steps have the same share
-            coming = coming.append(*new, rows=int((most - gone) * (step / gone) ** (1 / 3)))
+        elif (
+            coming is not None
+        ):  # rows are as much work as their number's square: all steps have the same share
+            coming = coming.append(
+                *new, rows=int((most - gone) * (step / gone) ** (1 / 3))
+            )
         return self._replaced(change=(now.append(*new), coming))
 
     def last_innovation(self) -> tuple[Array, Array]:
@@ -193,11 +248,23 @@ class ChangedModel(Wrapper):
         """The GPs of d as tensors."""
         gp, now, size = self.gp, self.change[0], len(self)
         arrays, (k, d) = now.arrays, now.arrays.inverse_squares.shape
-        parts = arrays.points[:, :size].T, now.data[d : d + k, :size].T, arrays.inverse_squares**-0.5
+        parts = (
+            arrays.points[:, :size].T,
+            now.data[d : d + k, :size].T,
+            arrays.inverse_squares**-0.5,
+        )
         factor = now.columns[:, :size, :size].transpose(0, 2, 1)
-        rest = np.exp(arrays.log_signal), self.arrays[2], np.zeros(k), factor, arrays.weights[:, :size]
+        rest = (
+            np.exp(arrays.log_signal),
+            self.arrays[2],
+            np.zeros(k),
+            factor,
+            arrays.weights[:, :size],
+        )
         names = [field.name for field in fields(GPPosterior)]
-        given: dict[str, Any] = dict(zip(names, map(torch.from_numpy, parts + rest), strict=False))
+        given: dict[str, Any] = dict(
+            zip(names, map(torch.from_numpy, parts + rest), strict=False)
+        )
         return GPPosterior(**given, input_dim=gp.input_dim + 1, predicts="value")
 
     @property
@@ -211,23 +278,37 @@ class ChangedModel(Wrapper):
         if not len(self):
             return belief
         z, v = self.features(state, input)
-        d = self.posterior.predict(z, torch.cat([v, torch.full_like(state[..., :1], self.time)], dim=-1))
-        return Gaussian(belief.mean + d.mean @ self.B.mT, belief.covariance + self.B @ d.covariance @ self.B.mT)
+        d = self.posterior.predict(
+            z, torch.cat([v, torch.full_like(state[..., :1], self.time)], dim=-1)
+        )
+        return Gaussian(
+            belief.mean + d.mean @ self.B.mT,
+            belief.covariance + self.B @ d.covariance @ self.B.mT,
+        )
 
-    def linearize(self, states: Array, inputs: Array, covariance: bool = True) -> Linearized:
+    def linearize(
+        self, states: Array, inputs: Array, covariance: bool = True
+    ) -> Linearized:
         """Linearises at K points (K, n), (K, m), the model and its change each by a method of their own."""
-        found, change = linearize(self.model, states, inputs, covariance), self.change[0]
+        found, change = (
+            linearize(self.model, states, inputs, covariance),
+            self.change[0],
+        )
         if not len(self):
             return found
         z, v, slope = self.features.linearize(states, inputs)
         at = np.empty((len(v), v.shape[1] + 1))
         at[:, :-1], at[:, -1] = v, self.time
         offset = np.zeros(self.gp.output_dim)
-        mean, by_state, by_input, variance = linearize_gps(change, z, at, covariance, offset, False)
+        mean, by_state, by_input, variance = linearize_gps(
+            change, z, at, covariance, offset, False
+        )
         by_state, by_input = self.features.chain(by_state, by_input[..., :-1], slope)
         B, V = self.arrays[0], found.covariance
         V = None if V is None or variance is None else V + B @ variance @ B.T
-        return Linearized(found.mean + mean @ B.T, found.A + B @ by_state, found.B + B @ by_input, V)
+        return Linearized(
+            found.mean + mean @ B.T, found.A + B @ by_state, found.B + B @ by_input, V
+        )
 
 
 @dataclass(frozen=True)
@@ -261,18 +342,29 @@ class LearningController:
 
     def __init__(self, controller: GPMPC, learning: OnlineLearning | None = None):
         check_method("controller", controller, "with_model", "GPMPC(...)")
-        self.controller, self.learning = controller, OnlineLearning() if learning is None else learning
+        self.controller, self.learning = (
+            controller,
+            OnlineLearning() if learning is None else learning,
+        )
         self.problem, self.horizon = controller.problem, controller.horizon
         self.initial_input = controller.initial_input
         self._model = ChangedModel(controller.prediction.model, self.learning)
 
     def control(
-        self, belief: Gaussian, reference: Reference, previous: Decision | None = None, parameters: Any = None
+        self,
+        belief: Gaussian,
+        reference: Reference,
+        previous: Decision | None = None,
+        parameters: Any = None,
     ) -> Decision:
         """Learns from the last step, and decides; see ``Controller.control``."""
         begin = perf_counter()
         learned = self._learned(to_array(belief.mean).copy(), previous)
-        controller = self.controller.with_model(learned.model) if learned.active else self.controller
+        controller = (
+            self.controller.with_model(learned.model)
+            if learned.active
+            else self.controller
+        )
         known = {} if parameters is None else {"parameters": parameters}
         spent = perf_counter() - begin
         decision = controller.control(belief, reference, previous, **known)
@@ -283,17 +375,30 @@ class LearningController:
         before = None if previous is None else previous.learned
         if previous is None or before is None or not np.isfinite(state).all():
             return self._begin(state)
-        if not np.array_equal(previous.means[0], before.state):  # the decision between them was not applied
+        if not np.array_equal(
+            previous.means[0], before.state
+        ):  # the decision between them was not applied
             version = before.version + before.active
-            return replace(before, model=before.model.later(1.0), state=state, active=False, version=version)
+            return replace(
+                before,
+                model=before.model.later(1.0),
+                state=state,
+                active=False,
+                version=version,
+            )
         try:
             return self.learning.learn(before, previous.input, state)
-        except (SettingError, DataError):  # the points contradict each other beyond double precision
+        except (
+            SettingError,
+            DataError,
+        ):  # the points contradict each other beyond double precision
             return self._begin(state, before.version + 1)
 
     def _begin(self, state: Array, version: int = 0) -> Learned:
         unknown = np.full(len(self._model.arrays[2]), np.nan)
-        return Learned(self._model, state, unknown, np.empty(0), np.empty(0), version=version)
+        return Learned(
+            self._model, state, unknown, np.empty(0), np.empty(0), version=version
+        )
 
 
 def _log_density(error: Array, variance: Array) -> float:
@@ -325,6 +430,12 @@ class EpisodicLearning:
         """The data and the transitions of a flight, as far as they were measured."""
         known = np.all(np.isfinite(flight.measured), axis=1)
         rows = np.flatnonzero(np.logical_and(known[:-1], known[1:]))
-        states, inputs, after = flight.measured[rows], flight.inputs[rows], flight.measured[rows + 1]
+        states, inputs, after = (
+            flight.measured[rows],
+            flight.inputs[rows],
+            flight.measured[rows + 1],
+        )
         parts = (data.states, states), (data.inputs, inputs), (data.next_states, after)
-        return Transitions(*(torch.cat([first, torch.from_numpy(second)]) for first, second in parts))
+        return Transitions(
+            *(torch.cat([first, torch.from_numpy(second)]) for first, second in parts)
+        )

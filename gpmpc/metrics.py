@@ -19,21 +19,31 @@ def mean_squared_error(predicted: Tensor, observed: Tensor) -> float:
     return float((predicted - observed).square().sum(dim=-1).mean())
 
 
-def negative_log_predictive_density(mean: Tensor, variance: Tensor, observed: Tensor) -> float:
+def negative_log_predictive_density(
+    mean: Tensor, variance: Tensor, observed: Tensor
+) -> float:
     """Computes -log N(observed; mean, variance), averaged over samples and outputs; all (N, n). Lower is better.
 
     Quinonero-Candela et al. (2006), "Evaluating predictive uncertainty challenge".
     """
     _check_alike(mean=mean, variance=variance, observed=observed)
-    return float(((2 * math.pi * variance).log() + (observed - mean).square() / variance).mean() / 2)
+    return float(
+        ((2 * math.pi * variance).log() + (observed - mean).square() / variance).mean()
+        / 2
+    )
 
 
-def interval_coverage(mean: Tensor, variance: Tensor, observed: Tensor, level: float = 0.95) -> float:
+def interval_coverage(
+    mean: Tensor, variance: Tensor, observed: Tensor, level: float = 0.95
+) -> float:
     """Computes the part of observations inside the central interval of a level; all (N, n). Ideal: the level."""
     _check_alike(mean=mean, variance=variance, observed=observed)
     if not 0 < level < 1:
         raise SettingError("level", f"must lie between 0 and 1; got {level}")
-    half_width = torch.special.ndtri(torch.tensor((1 + level) / 2, dtype=variance.dtype)) * variance.sqrt()
+    half_width = (
+        torch.special.ndtri(torch.tensor((1 + level) / 2, dtype=variance.dtype))
+        * variance.sqrt()
+    )
     return float(((observed - mean).abs() <= half_width).double().mean())
 
 
@@ -49,11 +59,16 @@ class _TrackingError:
     """Root mean squared distance from the references."""
 
     axes: np.ndarray  # (j,) of every state looked at, in its unit
-    total: float  # root of the mean of their summed squares: over x, y, z the distance [m]
+    total: (
+        float  # root of the mean of their summed squares: over x, y, z the distance [m]
+    )
 
 
 def tracking_error(
-    states: np.ndarray, references: np.ndarray, axes: Sequence[int], angles: Sequence[int] = ()
+    states: np.ndarray,
+    references: np.ndarray,
+    axes: Sequence[int],
+    angles: Sequence[int] = (),
 ) -> _TrackingError:
     """Computes how far a flight was from its references, the initial state left out: nobody steered there.
 
@@ -65,11 +80,22 @@ def tracking_error(
         return _TrackingError(np.sqrt(squares), float(np.sqrt(squares.sum())))
 
 
-def _errors(states: np.ndarray, references: np.ndarray, axes: Sequence[int], angles: Sequence[int]) -> np.ndarray:
+def _errors(
+    states: np.ndarray,
+    references: np.ndarray,
+    axes: Sequence[int],
+    angles: Sequence[int],
+) -> np.ndarray:
     """Differences on some axes (K + 1, j), those of angles in [-pi, pi)."""
-    if np.ndim(states) != 2 or np.shape(states) != np.shape(references) or len(states) < 2:
+    if (
+        np.ndim(states) != 2
+        or np.shape(states) != np.shape(references)
+        or len(states) < 2
+    ):
         got = f"{np.shape(states)} and {np.shape(references)}"
-        raise ShapeError(f"states and references must both be (K + 1, n), K of 1 or more; got {got}")
+        raise ShapeError(
+            f"states and references must both be (K + 1, n), K of 1 or more; got {got}"
+        )
     n = np.shape(states)[1]
     if not all(-n <= axis < n for axis in axes):
         raise ShapeError(f"axes must be states from 0 to {n - 1}; got {tuple(axes)}")
@@ -90,7 +116,11 @@ class _Loss:
 
 
 def find_loss(
-    states: np.ndarray, references: np.ndarray, axes: Sequence[int], least: float = 0.0, angles: Sequence[int] = ()
+    states: np.ndarray,
+    references: np.ndarray,
+    axes: Sequence[int],
+    least: float = 0.0,
+    angles: Sequence[int] = (),
 ) -> _Loss | None:
     """Finds where a flight is farther from its reference than the reference ever goes from where the flight began.
 
@@ -100,8 +130,15 @@ def find_loss(
     """
     with np.errstate(over="ignore", invalid="ignore"):
         distances = np.linalg.norm(_errors(states, references, axes, angles), axis=1)
-        still = np.broadcast_to(np.asarray(states)[0], np.shape(references))  # had it never moved
-        limit = max(least, float(np.linalg.norm(_errors(still, references, axes, angles), axis=1).max()))
+        still = np.broadcast_to(
+            np.asarray(states)[0], np.shape(references)
+        )  # had it never moved
+        limit = max(
+            least,
+            float(
+                np.linalg.norm(_errors(still, references, axes, angles), axis=1).max()
+            ),
+        )
     beyond = ~(distances <= limit)  # what is no number is nowhere near
     k = int(np.argmax(beyond))
     return _Loss(k, float(distances[k]), limit) if beyond[k] else None
@@ -113,7 +150,9 @@ class _ViolationRate:
 
     violations: int  # steps at which any entry was outside
     steps: int  # all of them
-    worst: float  # largest distance outside, in the entry's unit; 0 where there was none
+    worst: (
+        float  # largest distance outside, in the entry's unit; 0 where there was none
+    )
     low: float  # lower end of the interval for the probability of a violation
     high: float  # its upper end
 
@@ -123,7 +162,9 @@ class _ViolationRate:
         return self.violations / self.steps
 
 
-def violation_rate(values: np.ndarray, lower: np.ndarray, upper: np.ndarray, tolerance: float = 1e-9) -> _ViolationRate:
+def violation_rate(
+    values: np.ndarray, lower: np.ndarray, upper: np.ndarray, tolerance: float = 1e-9
+) -> _ViolationRate:
     """Counts how often states or inputs were outside their bounds, with the 95 % interval of ``binomial_interval``.
 
     The interval takes steps for independent. Those of one flight are not: pool several seeds, and read it as a lower
@@ -131,23 +172,45 @@ def violation_rate(values: np.ndarray, lower: np.ndarray, upper: np.ndarray, tol
     round-off may be ``tolerance`` outside.
     """
     values, lower, upper = (np.asarray(a, dtype=float) for a in (values, lower, upper))
-    if values.ndim != 2 or not len(values) or lower.shape != values.shape[1:] or upper.shape != values.shape[1:]:
+    if (
+        values.ndim != 2
+        or not len(values)
+        or lower.shape != values.shape[1:]
+        or upper.shape != values.shape[1:]
+    ):
         got = f"{values.shape}, {lower.shape}, {upper.shape}"
-        raise ShapeError(f"values must be (K, d) with bounds (d,), K of 1 or more; got {got}")
+        raise ShapeError(
+            f"values must be (K, d) with bounds (d,), K of 1 or more; got {got}"
+        )
     if (lower > upper).any():
         j = int(np.argmax(lower > upper))
-        raise SettingError("lower, upper", f"must not cross; entry {j} has {lower[j]:g} above {upper[j]:g}")
+        raise SettingError(
+            "lower, upper",
+            f"must not cross; entry {j} has {lower[j]:g} above {upper[j]:g}",
+        )
     # A value that is no number keeps no bound.
     inside = (values >= lower - tolerance) & (values <= upper + tolerance)
     violations = int((~inside.all(axis=1)).sum())
-    outside = np.fmax.reduce(np.maximum(lower - values, values - upper), axis=None, initial=0.0)
-    return _ViolationRate(violations, len(values), float(outside), *binomial_interval(violations, len(values)))
+    outside = np.fmax.reduce(
+        np.maximum(lower - values, values - upper), axis=None, initial=0.0
+    )
+    return _ViolationRate(
+        violations,
+        len(values),
+        float(outside),
+        *binomial_interval(violations, len(values)),
+    )
 
 
-def binomial_interval(successes: int, trials: int, level: float = 0.95) -> tuple[float, float]:
+def binomial_interval(
+    successes: int, trials: int, level: float = 0.95
+) -> tuple[float, float]:
     """Computes the exact interval for a probability from ``successes`` of ``trials`` (Clopper and Pearson, 1934)."""
     if not 0 <= successes <= trials or trials < 1:
-        raise SettingError("successes", f"must lie between 0 and trials, 1 or more; got {successes} of {trials}")
+        raise SettingError(
+            "successes",
+            f"must lie between 0 and trials, 1 or more; got {successes} of {trials}",
+        )
     low, high = stats.binomtest(successes, trials).proportion_ci(level, "exact")
     return float(low), float(high)
 
@@ -155,7 +218,9 @@ def binomial_interval(successes: int, trials: int, level: float = 0.95) -> tuple
 def time_quantiles(seconds: np.ndarray) -> dict[str, float]:
     """Computes "median", "p95" and "p99" (95 % and 99 % quantile), and the "largest" of wall times (K,) [s]."""
     if np.ndim(seconds) != 1 or not len(seconds):
-        raise ShapeError(f"seconds must be (K,), K of 1 or more; got {np.shape(seconds)}")
+        raise ShapeError(
+            f"seconds must be (K,), K of 1 or more; got {np.shape(seconds)}"
+        )
     quantiles = np.quantile(seconds, [0.5, 0.95, 0.99, 1.0]).tolist()
     return dict(zip(("median", "p95", "p99", "largest"), quantiles, strict=True))
 
@@ -173,6 +238,11 @@ def tracking_cost(
     Q is (n, n) and R (m, m); states and references are (K + 1, n), of which the first cost nothing, inputs (K, m), and
     the previous input u_{-1} (m,).
     """
-    errors, increments = states[1:] - references[1:], np.diff(inputs, axis=0, prepend=np.atleast_2d(previous_input))
-    cost = np.einsum("ki,ij,kj", errors, Q, errors) + np.einsum("ki,ij,kj", increments, R, increments)
+    errors, increments = (
+        states[1:] - references[1:],
+        np.diff(inputs, axis=0, prepend=np.atleast_2d(previous_input)),
+    )
+    cost = np.einsum("ki,ij,kj", errors, Q, errors) + np.einsum(
+        "ki,ij,kj", increments, R, increments
+    )
     return float(cost / len(inputs))

@@ -37,13 +37,22 @@ def in_processes(
     """
     if not jobs:
         return
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    cores = (
+        len(os.sched_getaffinity(0))
+        if hasattr(os, "sched_getaffinity")
+        else os.cpu_count() or 1
+    )
     workers, before = min(workers or cores, len(jobs)), set(active_children())
     mine: dict[str, Any] = {"initializer": end_with, "initargs": (os.getpid(),)}
-    with _one_thread_each(), ProcessPoolExecutor(workers, get_context("spawn"), **mine) as pool:
+    with (
+        _one_thread_each(),
+        ProcessPoolExecutor(workers, get_context("spawn"), **mine) as pool,
+    ):
         try:  # around the start as well: leaving the pool waits for what was begun
             with children_ignore_interrupts():
-                running = {pool.submit(function, job): index for index, job in enumerate(jobs)}
+                running = {
+                    pool.submit(function, job): index for index, job in enumerate(jobs)
+                }
             for done in as_completed(running):
                 yield running[done], done.result()
         except BaseException:  # a failed job, Ctrl-C, or a caller that wants no more

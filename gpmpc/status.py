@@ -13,9 +13,13 @@ class Status(Enum):
     SOLVED = "solved to the requested tolerance"
     INFEASIBLE = "no point satisfies the constraints: soften state constraints, or loosen the bounds"
     ITERATION_LIMIT = "stopped at the iteration limit: raise the limit, or check the scaling of the problem"
-    TIME_LIMIT = "stopped at the time limit: raise the limit, shorten the horizon, or warm-start"
+    TIME_LIMIT = (
+        "stopped at the time limit: raise the limit, shorten the horizon, or warm-start"
+    )
     NUMERICAL_TROUBLE = "the residuals could not be brought to the tolerance: check the scaling of the problem"
-    INVALID_MEASUREMENT = "the state is not finite: check the estimator; the last plan can bridge a gap"
+    INVALID_MEASUREMENT = (
+        "the state is not finite: check the estimator; the last plan can bridge a gap"
+    )
     FUNCTION_NOT_FINITE = "a constraint or output, or its gradient, is not finite along the plan: check it at its start"
 
     @property

@@ -51,14 +51,20 @@ class Elliptical:
     def __call__(self, time: np.ndarray) -> np.ndarray:
         """Positions (..., 3) [m] at times (...) [s]."""
         t = np.asarray(time, dtype=float)
-        x, y = self.radius_x * np.sin(self.rate * t), self.radius_y * np.cos(self.rate * t)
+        x, y = (
+            self.radius_x * np.sin(self.rate * t),
+            self.radius_y * np.cos(self.rate * t),
+        )
         return np.stack([x, y, self.start_z + self.climb_rate * t], axis=-1)
 
     def velocity(self, time: np.ndarray) -> np.ndarray:
         """Velocities (..., 3) [m/s] at times (...) [s]."""
         t = np.asarray(time, dtype=float)
         angle = self.rate * t
-        along_x, along_y = self.radius_x * self.rate * np.cos(angle), -self.radius_y * self.rate * np.sin(angle)
+        along_x, along_y = (
+            self.radius_x * self.rate * np.cos(angle),
+            -self.radius_y * self.rate * np.sin(angle),
+        )
         return np.stack([along_x, along_y, np.full_like(t, self.climb_rate)], axis=-1)
 
 
@@ -75,8 +81,14 @@ class Lorenz:
     rho: float = 28.0  #: Rayleigh number of the Lorenz system
     beta: float = 8 / 3  #: geometric factor of the Lorenz system
     start: tuple[float, float, float] = (-1.79, -3.13, 12.74)  #: (X, Y, Z) at time zero
-    scale: tuple[float, float, float] = (0.7, -0.7, 1.0)  #: factors from (X, Y, Z) to metres [m]
-    relative_tolerance: float = 1e-3  #: of the adaptive integration; it sets the sampling
+    scale: tuple[float, float, float] = (
+        0.7,
+        -0.7,
+        1.0,
+    )  #: factors from (X, Y, Z) to metres [m]
+    relative_tolerance: float = (
+        1e-3  #: of the adaptive integration; it sets the sampling
+    )
     samples_per_step: int = 4  #: output points of one accepted integration step
     sampling_time: float = 1.0  #: flight time from one output point to the next [s]
     duration: float = 400.0  #: flight time that the trajectory is defined for [s]
@@ -97,19 +109,32 @@ class Lorenz:
     def velocity(self, time: np.ndarray) -> np.ndarray:
         """Velocities (..., 3) [m/s] at times (...) [s]; at a sample, that of the interval that begins there."""
         lorenz_time, speed = self._lorenz_time(time)
-        rate = np.moveaxis(self._derivative(0.0, np.moveaxis(self._state(lorenz_time), -1, 0)), 0, -1)
+        rate = np.moveaxis(
+            self._derivative(0.0, np.moveaxis(self._state(lorenz_time), -1, 0)), 0, -1
+        )
         return rate * speed[..., None] * np.array(self.scale)
 
     def _derivative(self, _: float, state: np.ndarray) -> np.ndarray:
         x, y, z = state
-        return np.array([self.sigma * (y - x), x * (self.rho - z) - y, x * y - self.beta * z])
+        return np.array(
+            [self.sigma * (y - x), x * (self.rho - z) - y, x * y - self.beta * z]
+        )
 
     @cached_property
     def _path(self) -> OdeSolution:
         """The dense output of every accepted step."""
-        solver = RK45(self._derivative, 0.0, np.array(self.start), np.inf, rtol=self.relative_tolerance, atol=1e-6)
+        solver = RK45(
+            self._derivative,
+            0.0,
+            np.array(self.start),
+            np.inf,
+            rtol=self.relative_tolerance,
+            atol=1e-6,
+        )
         ends, pieces = [0.0], []
-        for _ in range(int(np.ceil(self.duration / self.sampling_time / self.samples_per_step))):
+        for _ in range(
+            int(np.ceil(self.duration / self.sampling_time / self.samples_per_step))
+        ):
             solver.step()
             ends.append(solver.t)
             pieces.append(solver.dense_output())
@@ -119,10 +144,14 @@ class Lorenz:
     def _samples(self) -> np.ndarray:
         """Lorenz times of the samples."""
         ends, each = self._path.ts, self.samples_per_step
-        return np.interp(np.arange(each * (len(ends) - 1) + 1) / each, np.arange(len(ends)), ends)
+        return np.interp(
+            np.arange(each * (len(ends) - 1) + 1) / each, np.arange(len(ends)), ends
+        )
 
     def _state(self, lorenz_time: np.ndarray) -> np.ndarray:
-        return np.reshape([self._path(t) for t in np.ravel(lorenz_time)], (*np.shape(lorenz_time), 3))
+        return np.reshape(
+            [self._path(t) for t in np.ravel(lorenz_time)], (*np.shape(lorenz_time), 3)
+        )
 
     def _lorenz_time(self, time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Lorenz time at flight times, and its rate of change."""
@@ -133,7 +162,9 @@ class Lorenz:
         samples, position = self._samples, t / self.sampling_time
         index = np.minimum(position.astype(int), len(samples) - 2)
         spacing = samples[index + 1] - samples[index]
-        return samples[index] + (position - index) * spacing, spacing / self.sampling_time
+        return samples[index] + (
+            position - index
+        ) * spacing, spacing / self.sampling_time
 
 
 @dataclass(frozen=True)
@@ -150,7 +181,11 @@ class Step:
 
     def __call__(self, time: np.ndarray) -> np.ndarray:
         """Positions (..., d) at times (...) [s]."""
-        return np.where(np.asarray(time)[..., None] >= self.at, np.array(self.after, float), self.before)
+        return np.where(
+            np.asarray(time)[..., None] >= self.at,
+            np.array(self.after, float),
+            self.before,
+        )
 
     def velocity(self, time: np.ndarray) -> np.ndarray:
         """Zero (..., d): the jump has no velocity."""
@@ -189,13 +224,19 @@ class Waypoints:
         _check_positions("positions", self.positions)
         got = f"{len(self.times)} times, {len(self.positions)} positions"
         if not 2 <= len(self.times) == len(self.positions):
-            raise SettingError("times", f"must be two or more, one a position; got {got}")
+            raise SettingError(
+                "times", f"must be two or more, one a position; got {got}"
+            )
         if not np.all(np.diff(np.asarray(self.times, dtype=float)) > 0):
-            raise SettingError("times", f"must be strictly increasing [s]; got {list(self.times)}")
+            raise SettingError(
+                "times", f"must be strictly increasing [s]; got {list(self.times)}"
+            )
 
     @cached_property
     def _path(self) -> PchipInterpolator:
-        return PchipInterpolator(np.asarray(self.times, dtype=float), np.asarray(self.positions, dtype=float))
+        return PchipInterpolator(
+            np.asarray(self.times, dtype=float), np.asarray(self.positions, dtype=float)
+        )
 
     def __call__(self, time: np.ndarray) -> np.ndarray:
         """Positions (..., d) at times (...) [s]."""
@@ -205,19 +246,28 @@ class Waypoints:
         """Velocities (..., d) at times (...) [s]; zero before the first and after the last waypoint."""
         t = np.asarray(time, dtype=float)
         inside = (t >= self.times[0]) & (t <= self.times[-1])
-        return self._path.derivative()(np.clip(t, self.times[0], self.times[-1])) * inside[..., None]
+        return (
+            self._path.derivative()(np.clip(t, self.times[0], self.times[-1]))
+            * inside[..., None]
+        )
 
 
 def states_along(trajectory: Trajectory, time: np.ndarray) -> np.ndarray:
     """Translational states x, vx, y, vy, z, vz (..., 6) [m, m/s] of a flight along a trajectory at times (...) [s]."""
     positions = trajectory(time)
-    return np.stack([positions, trajectory.velocity(time)], axis=-1).reshape(*positions.shape[:-1], 6)
+    return np.stack([positions, trajectory.velocity(time)], axis=-1).reshape(
+        *positions.shape[:-1], 6
+    )
 
 
 def _check_positions(key: str, positions: Sequence[Sequence[float]]) -> None:
     """Raises unless all are lists of one length of finite numbers."""
     for position in positions:
-        length = len(positions[0]) if hasattr(positions[0], "__len__") and len(positions[0]) else -1
+        length = (
+            len(positions[0])
+            if hasattr(positions[0], "__len__") and len(positions[0])
+            else -1
+        )
         try:
             check_numbers(key, position, length)
         except SettingError:

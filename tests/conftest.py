@@ -2,7 +2,11 @@
 
 import os
 
-for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):  # read when the libraries load
+for variable in (
+    "OMP_NUM_THREADS",
+    "OPENBLAS_NUM_THREADS",
+    "MKL_NUM_THREADS",
+):  # read when the libraries load
     os.environ.setdefault(variable, "1")
 
 import signal
@@ -16,7 +20,9 @@ import torch
 
 from tests.pages import follow, forget_modules_of
 
-if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # started in the background: commands would not end at Ctrl-C
+if (
+    signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+):  # started in the background: commands would not end at Ctrl-C
     signal.signal(signal.SIGINT, signal.default_int_handler)
 torch.set_num_threads(1)
 torch.set_default_dtype(torch.float64)

@@ -9,7 +9,9 @@ from tests.cli.command import forked
 
 ROOT = Path(__file__).resolve().parents[1]
 BLOCK = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
-FILE = re.compile(r"(?:# @package [\w.]+\n)?(?:#|<!--) ([\w/]+\.(?:py|yaml|xml))(?: -->)?\n")
+FILE = re.compile(
+    r"(?:# @package [\w.]+\n)?(?:#|<!--) ([\w/]+\.(?:py|yaml|xml))(?: -->)?\n"
+)
 INSTALLATION = ("git ", "pip ", "gpmpc warmup")  # what a test has done already
 
 
@@ -28,7 +30,9 @@ def follow(path, folder, given="", section=""):
     names: dict = {"__name__": "page"}
     exec(given, names)
     printed = []
-    for language, text in BLOCK.findall(read(path).partition(section)[2] if section else read(path)):
+    for language, text in BLOCK.findall(
+        read(path).partition(section)[2] if section else read(path)
+    ):
         if written := FILE.match(text):
             (folder / written[1]).parent.mkdir(exist_ok=True)
             (folder / written[1]).write_text(text)
@@ -48,8 +52,14 @@ def _run(text, folder):
         if program == "cd" and not text.startswith(INSTALLATION):
             folder /= arguments[0]
         elif program == "gpmpc" and not line.startswith(INSTALLATION):
-            paths = [sorted(folder.glob(argument)) if "/*/" in argument else [] for argument in arguments]
-            arguments = [str(*path) if path else argument for path, argument in zip(paths, arguments, strict=True)]
+            paths = [
+                sorted(folder.glob(argument)) if "/*/" in argument else []
+                for argument in arguments
+            ]
+            arguments = [
+                str(*path) if path else argument
+                for path, argument in zip(paths, arguments, strict=True)
+            ]
             done = forked(*arguments, cwd=folder)
             assert done.returncode == 0, f"{line}\n{done.stdout}{done.stderr}"
             printed.append(done.stdout)

@@ -22,7 +22,13 @@ def flight(folder, failed=()):
     plans = np.stack([along[k : k + HORIZON + 1] for k in range(STEPS)])
     plans[list(failed)] = 1e6
     astray = np.isin(np.arange(STEPS), failed)
-    return replace(run, states=along[:STEPS], references=along[:STEPS], plan_means=plans, failed=astray)
+    return replace(
+        run,
+        states=along[:STEPS],
+        references=along[:STEPS],
+        plan_means=plans,
+        failed=astray,
+    )
 
 
 def left_views(run):

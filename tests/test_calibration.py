@@ -16,7 +16,11 @@ from gpmpc.metrics import binomial_interval
 from gpmpc.plotting import calibration_figure
 from gpmpc.propagation import Linearization, MeanEquivalence
 
-A, B, Q = torch.tensor([[0.9, 0.2], [-0.3, 0.8]]), torch.tensor([[0.0], [0.5]]), torch.diag(torch.tensor([0.04, 0.01]))
+A, B, Q = (
+    torch.tensor([[0.9, 0.2], [-0.3, 0.8]]),
+    torch.tensor([[0.0], [0.5]]),
+    torch.diag(torch.tensor([0.04, 0.01])),
+)
 NOISE = torch.diag(torch.tensor([0.01, 0.09]))
 
 CPU = torch.device("cpu")
@@ -41,7 +45,11 @@ class LinearGaussian:
 
     def predict_with_jacobian(self, state, input=None):
         at = self.predict(state, input)
-        return at, self.A.expand(*state.shape[:-1], 2, 2), B.expand(*state.shape[:-1], 2, 1)
+        return (
+            at,
+            self.A.expand(*state.shape[:-1], 2, 2),
+            B.expand(*state.shape[:-1], 2, 1),
+        )
 
 
 noiseless = partial(LinearGaussian, noise_covariance=0 * NOISE)
@@ -72,32 +80,48 @@ def exact_covariances(steps):
 def test_the_true_model_is_calibrated_at_every_step_and_level():
     count, levels = 400, (0.5, 0.9, 0.95)
     # Without noise every start is exact; the recordings' starts overlap, hence the generous bound.
-    found = calibrate(noiseless(), runs(count, 8, noisy=False), Linearization(), 6, levels)
+    found = calibrate(
+        noiseless(), runs(count, 8, noisy=False), Linearization(), 6, levels
+    )
     assert found.samples.tolist() == [count * (8 - k) for k in range(6)]
     for j, level in enumerate(levels):
         error = math.sqrt(level * (1 - level) / count)
         assert float((found.coverage[:, :, j] - level).abs().max()) < 4 * error
     variance = exact_covariances(6).diagonal(dim1=-2, dim2=-1)
     assert torch.allclose(found.rmse, variance.sqrt(), rtol=0.15)
-    assert torch.allclose(found.nlpd, ((2 * math.pi * variance).log() + 1) / 2, atol=0.15)
+    assert torch.allclose(
+        found.nlpd, ((2 * math.pi * variance).log() + 1) / 2, atol=0.15
+    )
 
 
 def test_observations_are_calibrated_with_their_noise():
-    recordings, arguments = runs(800, 1), {"propagator": Linearization(), "horizon": 1, "levels": (0.9,)}
+    recordings, arguments = (
+        runs(800, 1),
+        {"propagator": Linearization(), "horizon": 1, "levels": (0.9,)},
+    )
     told = calibrate(LinearGaussian(), recordings, **arguments)
     assert float((told.coverage - 0.9).abs().max()) < 0.04
-    assert bool((calibrate(noiseless(), recordings, **arguments).coverage < told.coverage - 0.04).all())
+    assert bool(
+        (
+            calibrate(noiseless(), recordings, **arguments).coverage
+            < told.coverage - 0.04
+        ).all()
+    )
 
 
 def test_false_confidence_shows():
     recordings = runs(100, 8, noisy=False)
     honest = calibrate(noiseless(), recordings, Linearization(), 5, (0.9,))
-    overconfident = calibrate(noiseless(Q=Q / 9), recordings, Linearization(), 5, (0.9,))
+    overconfident = calibrate(
+        noiseless(Q=Q / 9), recordings, Linearization(), 5, (0.9,)
+    )
     forgetful = calibrate(noiseless(), recordings, MeanEquivalence(), 5, (0.9,))
     biased = calibrate(noiseless(A=0.8 * A), recordings, Linearization(), 5, (0.9,))
     assert float(overconfident.coverage.max()) < 0.6
     assert bool((overconfident.nlpd > honest.nlpd).all())
-    assert torch.equal(forgetful.coverage[0], honest.coverage[0])  # one step ahead there is nothing to forget
+    assert torch.equal(
+        forgetful.coverage[0], honest.coverage[0]
+    )  # one step ahead there is nothing to forget
     assert float(forgetful.coverage[4].max()) < float(honest.coverage[4].min())
     assert bool((biased.rmse > honest.rmse).all())
 
@@ -110,19 +134,31 @@ def test_the_batch_of_all_starts_is_the_loop_over_them():
         for t in range(len(recording) - k + 1):
             belief = Gaussian(recording.states[t], torch.zeros(2, 2))
             for step in range(k):
-                belief = Linearization()(LinearGaussian(), belief, recording.inputs[t + step])
+                belief = Linearization()(
+                    LinearGaussian(), belief, recording.inputs[t + step]
+                )
             errors.append(recording.states[t + k] - belief.mean)
     assert int(found.samples[k - 1]) == len(errors)
-    assert torch.allclose(found.rmse[k - 1], torch.stack(errors).square().mean(0).sqrt())
+    assert torch.allclose(
+        found.rmse[k - 1], torch.stack(errors).square().mean(0).sqrt()
+    )
 
 
 def test_a_posterior_in_float32_is_calibrated_by_moment_matching():
     features = torch.rand(30, 3)
     gp = GPPosterior.from_hyperparameters(
-        features, features[:, :2].sin(), torch.ones(2, 3), torch.ones(2), torch.full((2,), 1e-2), 1
+        features,
+        features[:, :2].sin(),
+        torch.ones(2, 3),
+        torch.ones(2),
+        torch.full((2,), 1e-2),
+        1,
     )
     recordings = runs(2, 5)
-    double, single = (calibrate(each, recordings, horizon=3) for each in (gp, gp.to(dtype=torch.float32)))
+    double, single = (
+        calibrate(each, recordings, horizon=3)
+        for each in (gp, gp.to(dtype=torch.float32))
+    )
     assert double.rmse.dtype == single.rmse.dtype == torch.float64
     assert torch.allclose(double.rmse, single.rmse, rtol=1e-3)
 
@@ -142,8 +178,26 @@ def example():
 
 def test_the_report_is_a_data_frame():
     frame = example().to_pandas()
-    assert list(frame.columns) == ["step", "state", "samples", "rmse", "nlpd", "width", "coverage_0.5", "coverage_0.95"]
-    assert frame.iloc[1].tolist() == [1, "rate", 20, pytest.approx(0.2), 2.0, 1.1, pytest.approx(0.6), 1.0]
+    assert list(frame.columns) == [
+        "step",
+        "state",
+        "samples",
+        "rmse",
+        "nlpd",
+        "width",
+        "coverage_0.5",
+        "coverage_0.95",
+    ]
+    assert frame.iloc[1].tolist() == [
+        1,
+        "rate",
+        20,
+        pytest.approx(0.2),
+        2.0,
+        1.1,
+        pytest.approx(0.6),
+        1.0,
+    ]
     assert frame.iloc[3].tolist() == [
         2,
         "rate",
@@ -163,7 +217,9 @@ def test_a_coverages_interval_is_exact_and_counts_what_does_not_overlap():
     found = calibrate(LinearGaussian(), [*runs(3, 7), *runs(2, 3)], Linearization(), 4)
     assert found.independent.tolist() == [27, 11, 8, 3]
     same = runs(300, 5, noisy=False)
-    honest, narrow = (calibrate(noiseless(Q=noise), same, Linearization(), 5) for noise in (Q, Q / 9))
+    honest, narrow = (
+        calibrate(noiseless(Q=noise), same, Linearization(), 5) for noise in (Q, Q / 9)
+    )
     assert honest.width.numpy() == pytest.approx(1.0, abs=0.2)
     assert (narrow.width / honest.width).numpy() == pytest.approx(1 / 3)
 
@@ -178,7 +234,9 @@ def test_the_figure_has_a_column_for_each_state_and_a_row_for_each_measure():
 
 def test_transitions_fall_apart_into_recordings():
     data = Transitions(
-        torch.tensor([[0.0], [1.0], [5.0], [6.0]]), torch.arange(4.0)[:, None], torch.tensor([[1.0], [2.0], [6.0], [7]])
+        torch.tensor([[0.0], [1.0], [5.0], [6.0]]),
+        torch.arange(4.0)[:, None],
+        torch.tensor([[1.0], [2.0], [6.0], [7]]),
     )
     first, second = Recording.chained(data)
     assert first.states.ravel().tolist() == [0, 1, 2]
@@ -189,21 +247,51 @@ def test_transitions_fall_apart_into_recordings():
 def test_misuse_is_refused_with_the_rule():
     model, recording = LinearGaussian(), runs(1, 4)
     for change, error, message in (
-        ({"horizon": 5}, SettingError, "horizon: must be at most 4 steps, the longest recording; got 5"),
-        ({"horizon": 0}, SettingError, "horizon: must be a whole number, 1 or more; got 0"),
-        ({"horizon": 1, "levels": (95,)}, SettingError, r"levels: must be one or more between 0 and 1; got \(95,\)"),
-        ({"horizon": 1, "levels": ()}, SettingError, r"one or more between 0 and 1; got \(\)"),
+        (
+            {"horizon": 5},
+            SettingError,
+            "horizon: must be at most 4 steps, the longest recording; got 5",
+        ),
+        (
+            {"horizon": 0},
+            SettingError,
+            "horizon: must be a whole number, 1 or more; got 0",
+        ),
+        (
+            {"horizon": 1, "levels": (95,)},
+            SettingError,
+            r"levels: must be one or more between 0 and 1; got \(95,\)",
+        ),
+        (
+            {"horizon": 1, "levels": ()},
+            SettingError,
+            r"one or more between 0 and 1; got \(\)",
+        ),
         ({"horizon": 1, "names": ["a"]}, ShapeError, "names must name 2 states; got 1"),
         ({"horizon": 1, "recordings": []}, ShapeError, "got no recording"),
         (
-            {"horizon": 1, "recordings": Recording(torch.zeros(3, 1), torch.zeros(2, 1))},
+            {
+                "horizon": 1,
+                "recordings": Recording(torch.zeros(3, 1), torch.zeros(2, 1)),
+            },
             ShapeError,
             r"the model's 2 states and 1 inputs; got \{\(1, 1\)\}",
         ),
     ):
         with pytest.raises(error, match=message):
-            calibrate(**({"model": model, "recordings": recording, "propagator": Linearization()} | change))
-    with pytest.raises(ShapeError, match=r"inputs \(K, m\), K of 1 or more; got \(3, 2\) and \(3, 1\)"):
+            calibrate(
+                **(
+                    {
+                        "model": model,
+                        "recordings": recording,
+                        "propagator": Linearization(),
+                    }
+                    | change
+                )
+            )
+    with pytest.raises(
+        ShapeError, match=r"inputs \(K, m\), K of 1 or more; got \(3, 2\) and \(3, 1\)"
+    ):
         Recording(torch.zeros(3, 2), torch.zeros(3, 1))
     with pytest.raises(DataError, match="inputs of a recording must be finite"):
         Recording(torch.zeros(3, 2), torch.full((2, 1), torch.nan))

@@ -36,7 +36,13 @@ def package(tmp_path):
     """A package of a kernel, the function that it calls, the constant which that reads, and a file of no concern."""
     folder = tmp_path / "tiny"
     folder.mkdir()
-    texts = {"__init__": "", "kernel": KERNEL, "callee": CALLEE, "constants": "FACTOR = 2.0\n", "other": "A = 1\n"}
+    texts = {
+        "__init__": "",
+        "kernel": KERNEL,
+        "callee": CALLEE,
+        "constants": "FACTOR = 2.0\n",
+        "other": "A = 1\n",
+    }
     for name, text in texts.items():
         (folder / f"{name}.py").write_text(text)
     return folder
@@ -100,10 +106,14 @@ def first(x):
 @compiled
 def second(x):
     return callee(x) + callee(2.0 * x)
-""".format(lines="\n".join(f"    y += math.cos(x + {i}.0) * math.sin(y)" for i in range(40)))
+""".format(
+    lines="\n".join(f"    y += math.cos(x + {i}.0) * math.sin(y)" for i in range(40))
+)
 
 
-def test_a_kernel_runs_its_own_copy_of_what_it_calls_whatever_was_loaded_or_compiled_before(tmp_path):
+def test_a_kernel_runs_its_own_copy_of_what_it_calls_whatever_was_loaded_or_compiled_before(
+    tmp_path,
+):
     """Copies of one function differ by rounding; here by a factor, so that it is seen on any machine."""
     (tmp_path / "own.py").write_text(OWN)
 
@@ -127,7 +137,9 @@ def test_where_nothing_can_be_kept_kernels_are_compiled_all_the_same(package):
     (package / "__pycache__").write_text("in the way of the cache beside the source")
     nowhere = str(package / "other.py")  # a file: no folder can be made below it
     for _ in range(2):
-        assert run(package, HOME=nowhere, XDG_CACHE_HOME=nowhere, NUMBA_CACHE_DIR="") == (2.0, False)
+        assert run(
+            package, HOME=nowhere, XDG_CACHE_HOME=nowhere, NUMBA_CACHE_DIR=""
+        ) == (2.0, False)
 
 
 def test_the_stamp_of_a_kernel_covers_constants_and_callees_and_spares_the_rest():
@@ -153,9 +165,15 @@ def test_the_stamp_of_a_kernel_covers_constants_and_callees_and_spares_the_rest(
         return changed
 
     kernels = covered("gpmpc.qp._dual_kernels")
-    assert {f"gpmpc.qp._{name}" for name in ("dual_iteration", "triangular", "workspace", "record")} <= kernels
+    assert {
+        f"gpmpc.qp._{name}"
+        for name in ("dual_iteration", "triangular", "workspace", "record")
+    } <= kernels
     assert {"gpmpc._compiled", "gpmpc._kernels._simd"} <= kernels
-    assert not {"gpmpc.qp", "gpmpc.qp._dual_active_set", "gpmpc.qp._primal_active_set"} & kernels
+    assert (
+        not {"gpmpc.qp", "gpmpc.qp._dual_active_set", "gpmpc.qp._primal_active_set"}
+        & kernels
+    )
 
 
 def test_numba_still_has_the_private_parts_that_are_used_here():
@@ -164,11 +182,19 @@ def test_numba_still_has_the_private_parts_that_are_used_here():
     from numba.core.compiler import Compiler
     from numba.core.cpu import CPUTargetOptions
 
-    hooks = ("_optimize_final_module", "_finalize_final_module", "_finalize_dynamic_globals", "get_pointer_to_function")
+    hooks = (
+        "_optimize_final_module",
+        "_finalize_final_module",
+        "_finalize_dynamic_globals",
+        "get_pointer_to_function",
+    )
     assert all(callable(getattr(JITCodeLibrary, hook)) for hook in hooks)
     assert isinstance(JITCodeLibrary.codegen, property)
     assert callable(Compiler.define_pipelines)
-    assert all(hasattr(CPUTargetOptions, option) for option in ("_nrt", "no_cfunc_wrapper", "no_cpython_wrapper"))
+    assert all(
+        hasattr(CPUTargetOptions, option)
+        for option in ("_nrt", "no_cfunc_wrapper", "no_cpython_wrapper")
+    )
 
     @gpmpc._compiled.njit_noalloc
     def inner(x):
@@ -179,13 +205,23 @@ def test_numba_still_has_the_private_parts_that_are_used_here():
         return inner(x) + 1.0
 
     assert kernel._cache._cache_file._version.startswith(f"{numba.__version__} ")
-    assert (kernel(1.0), inner(1.0)) == (3.0, 2.0)  # as a part of the kernel, and in Python
-    anew = numba.njit(**gpmpc._compiled._PRIVATE_OPTIONS[True])(kernel.py_func)  # ``kernel`` may have been loaded
+    assert (kernel(1.0), inner(1.0)) == (
+        3.0,
+        2.0,
+    )  # as a part of the kernel, and in Python
+    anew = numba.njit(**gpmpc._compiled._PRIVATE_OPTIONS[True])(
+        kernel.py_func
+    )  # ``kernel`` may have been loaded
     anew(1.0)
     library = anew.overloads[anew.signatures[0]].library
     assert type(library) is gpmpc._compiled._KernelLibrary
-    assert gpmpc._compiled._InnerLibrary in {type(part) for part in library._linking_libraries}
-    assert gpmpc._compiled.unchecked_entry_point(kernel) is kernel.overloads[kernel.signatures[0]].entry_point
+    assert gpmpc._compiled._InnerLibrary in {
+        type(part) for part in library._linking_libraries
+    }
+    assert (
+        gpmpc._compiled.unchecked_entry_point(kernel)
+        is kernel.overloads[kernel.signatures[0]].entry_point
+    )
 
 
 def test_without_numbas_private_parts_kernels_compile_in_its_own_way(monkeypatch):

@@ -44,7 +44,20 @@ def test_eleven_tasks_of_a_newcomer_are_done_from_an_empty_folder(page, tmp_path
     names, printed = page("docs/how_to.md")
     assert read("docs/how_to.md").count("\n## ") == 11
     assert "(docs/how_to.md)" in read("README.md")
-    weights, waypoints, own_path, _, own_system, _, _, bounded, swept, report, compared, calibrated = printed
+    (
+        weights,
+        waypoints,
+        own_path,
+        _,
+        own_system,
+        _,
+        _,
+        bounded,
+        swept,
+        report,
+        compared,
+        calibrated,
+    ) = printed
     assert "20 steps of translational along elliptical with convex" in weights
     assert "along waypoints" in waypoints
     assert "along figure_eight" in own_path
@@ -61,20 +74,32 @@ def test_eleven_tasks_of_a_newcomer_are_done_from_an_empty_folder(page, tmp_path
     assert run.references[:, 0].max() > 14
     assert 10 < run.states[:, 0].max() < 12.5
     (recording,) = tmp_path.glob("outputs/run/*figure_eight*/run.mcap")
-    assert np.abs(read_run(recording).states[10:, :3:2]).max() < 3.5  # of width 3, not 4
+    assert (
+        np.abs(read_run(recording).states[10:, :3:2]).max() < 3.5
+    )  # of width 3, not 4
     (recording,) = tmp_path.glob("arm/outputs/run/*/run.mcap")
     assert abs(read_run(recording).states[-1, 0] - 1) < 0.1
     assert float(names["errors"].abs().max()) < 0.2
     assert names["table"].shape[0] == 60
     assert np.allclose(names["decision"].x, names["run"].problems[17].x, atol=1e-6)
-    predictions = [names[key].predict(names["data"].states, names["data"].inputs).mean for key in ("gp", "model")]
+    predictions = [
+        names[key].predict(names["data"].states, names["data"].inputs).mean
+        for key in ("gp", "model")
+    ]
     assert torch.equal(*predictions)
 
 
 def test_the_first_five_minutes_print_what_the_readme_shows_and_end_at_a_goal(page):
     names, (flown, drawn, info, _) = page("docs/start.md")
-    (shown,) = [text for _, text in BLOCK.findall(read("README.md")) if text.startswith(" flight ")]
-    times = re.compile(r"(?<=, in )[\d.]+(?= s)|(?<=decision \[ms\]).*(?=written to)|compil.*(?=flight  )", re.DOTALL)
+    (shown,) = [
+        text
+        for _, text in BLOCK.findall(read("README.md"))
+        if text.startswith(" flight ")
+    ]
+    times = re.compile(
+        r"(?<=, in )[\d.]+(?= s)|(?<=decision \[ms\]).*(?=written to)|compil.*(?=flight  )",
+        re.DOTALL,
+    )
     assert times.sub("", shown).split() == times.sub("", flown).split()
     assert "tracking.png" in drawn
     assert "/step" in info
@@ -82,7 +107,9 @@ def test_the_first_five_minutes_print_what_the_readme_shows_and_end_at_a_goal(pa
 
 
 def test_the_recording_of_the_gallery_is_replayed(page):
-    names, printed = page("docs/gallery.md", section="## A recording, read and replayed")
+    names, printed = page(
+        "docs/gallery.md", section="## A recording, read and replayed"
+    )
     assert len(printed) == 2
     assert len(names["run"].times) == 100
 
@@ -93,19 +120,25 @@ def test_the_whole_gallery_runs(page, tmp_path):
     assert (tmp_path / "outputs/sweep/report/report.html").exists()
 
 
-@pytest.mark.parametrize("path", ["docs/gp.md", "docs/simulation.md", "docs/recording.md"])
+@pytest.mark.parametrize(
+    "path", ["docs/gp.md", "docs/simulation.md", "docs/recording.md"]
+)
 def test_the_python_of_a_page_runs_in_its_order(path, page):
     text = read(path)
     assert text.count("```python") > 0
     page(path, given=GIVEN)
 
 
-EXAMPLES = [path for path in sorted(ROOT.glob("gpmpc/**/*.py")) if ">>> " in path.read_text()]
+EXAMPLES = [
+    path for path in sorted(ROOT.glob("gpmpc/**/*.py")) if ">>> " in path.read_text()
+]
 
 
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
 def test_the_examples_in_docstrings_print_what_they_show(path):
-    module = importlib.import_module(".".join(path.relative_to(ROOT).with_suffix("").parts))
+    module = importlib.import_module(
+        ".".join(path.relative_to(ROOT).with_suffix("").parts)
+    )
     done = doctest.testmod(module, optionflags=doctest.IGNORE_EXCEPTION_DETAIL)
     assert done.attempted
     assert not done.failed
@@ -113,14 +146,20 @@ def test_the_examples_in_docstrings_print_what_they_show(path):
 
 def test_every_page_with_python_is_followed_by_a_test():
     tests = [path.read_text() for path in ROOT.glob("tests/**/*.py")]
-    followed = {path.name for path in PAGES if any(f'{path.name}"' in text for text in tests)}
+    followed = {
+        path.name for path in PAGES if any(f'{path.name}"' in text for text in tests)
+    }
     assert {path.name for path in PAGES if "```python" in path.read_text()} <= followed
 
 
 def test_the_settings_that_pages_name_are_there():
     with settings():
         known = {*setting_names("run")}
-    named = {(path.name, name) for path in PAGES for name in re.findall(r"`(controller\.[\w.]+)=", path.read_text())}
+    named = {
+        (path.name, name)
+        for path in PAGES
+        for name in re.findall(r"`(controller\.[\w.]+)=", path.read_text())
+    }
     assert named
     assert not {entry for entry in named if entry[1] not in known}
 
@@ -129,45 +168,78 @@ def anchors(path):
     """The anchors of a page's headings, as GitHub and MyST make them."""
     text = BLOCK.sub("", path.read_text())
     titles = re.findall(r"^#+ (.*)$", text, re.MULTILINE)
-    return {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles}
+    return {
+        re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles
+    }
 
 
 def test_every_link_leads_to_a_file_and_a_heading():
     broken = []
     for path in PAGES:
-        for file, anchor in re.findall(r"\]\(([^)#:\s]*)(?:#([^)\s]*))?\)", BLOCK.sub("", path.read_text())):
+        for file, anchor in re.findall(
+            r"\]\(([^)#:\s]*)(?:#([^)\s]*))?\)", BLOCK.sub("", path.read_text())
+        ):
             target = path.parent / file if file else path
-            if not target.exists() or (anchor and target.suffix == ".md" and anchor not in anchors(target)):
+            if not target.exists() or (
+                anchor and target.suffix == ".md" and anchor not in anchors(target)
+            ):
                 broken.append(f"{path.name}: {file}#{anchor}")
     assert not broken
 
 
 def test_no_page_is_long_and_every_page_is_in_the_site():
-    counts = {path.name: len(re.findall(r"\S*[^\W_]\S*", BLOCK.sub("", path.read_text()))) for path in PAGES}
+    counts = {
+        path.name: len(re.findall(r"\S*[^\W_]\S*", BLOCK.sub("", path.read_text())))
+        for path in PAGES
+    }
     counts.pop("mathematics.md")
-    assert max(counts.values()) <= 1500, sorted(counts.items(), key=lambda item: -item[1])[:3]
+    assert max(counts.values()) <= 1500, sorted(
+        counts.items(), key=lambda item: -item[1]
+    )[:3]
     assert len(read("README.md").split()) <= 900
     listed = re.findall(r"^[\w]+$", read("docs/index.md"), re.MULTILINE)
-    assert sorted(listed) == sorted({path.stem for path in ROOT.glob("docs/*.md")} - {"index"})
+    assert sorted(listed) == sorted(
+        {path.stem for path in ROOT.glob("docs/*.md")} - {"index"}
+    )
 
 
 def public(module):
     """The names that a module offers: those of ``__all__``, else the classes and functions that it defines."""
     names = getattr(module, "__all__", None)
     if names is None:
-        names = [key for key, value in vars(module).items() if getattr(value, "__module__", None) == module.__name__]
+        names = [
+            key
+            for key, value in vars(module).items()
+            if getattr(value, "__module__", None) == module.__name__
+        ]
     return {key: getattr(module, key) for key in names if not key.startswith("_")}
 
 
 def test_every_name_that_a_room_offers_or_that_settings_pages_and_examples_use_is_documented():
-    listed = [importlib.import_module(name) for name in re.findall(r"automodule:: (\S+)", read("docs/api.md"))]
+    listed = [
+        importlib.import_module(name)
+        for name in re.findall(r"automodule:: (\S+)", read("docs/api.md"))
+    ]
     documented = {id(value) for module in listed for value in public(module).values()}
-    rooms = [module.name for module in pkgutil.iter_modules(gpmpc.__path__, "gpmpc.") if module.ispkg]
+    rooms = [
+        module.name
+        for module in pkgutil.iter_modules(gpmpc.__path__, "gpmpc.")
+        if module.ispkg
+    ]
     found = [room for room in rooms if not room.startswith("gpmpc._")]
-    offered = {(room, key) for room in found for key in getattr(importlib.import_module(room), "__all__", [])}
-    texts = [path.read_text() for path in (*PAGES, *ROOT.glob("examples/*.py"), *ROOT.glob("conf/**/*.yaml"))]
+    offered = {
+        (room, key)
+        for room in found
+        for key in getattr(importlib.import_module(room), "__all__", [])
+    }
+    texts = [
+        path.read_text()
+        for path in (*PAGES, *ROOT.glob("examples/*.py"), *ROOT.glob("conf/**/*.yaml"))
+    ]
     for text in texts:
-        for module, names in re.findall(r"^from (gpmpc[\w.]*) import (\([^)]*\)|.*)", text, re.MULTILINE):
+        for module, names in re.findall(
+            r"^from (gpmpc[\w.]*) import (\([^)]*\)|.*)", text, re.MULTILINE
+        ):
             offered |= {(module, name) for name in re.findall(r"\w+", names)}
         offered |= set(re.findall(r"_target_: (gpmpc[\w.]*)\.(\w+)", text))
     missing = [

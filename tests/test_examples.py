@@ -15,32 +15,51 @@ EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
 def test_the_gp_example_leaves_a_recording_a_model_and_a_figure(tmp_path, monkeypatch):
     monkeypatch.setattr(sys, "argv", ["reuse_gp.py", str(tmp_path)])
     names = runpy.run_path(str(EXAMPLES / "reuse_gp.py"), run_name="__main__")
-    assert {path.name for path in tmp_path.iterdir()} == {"pendulum.csv", "pendulum.safetensors", "tube.png"}
-    data = Transitions.from_csv(tmp_path / "pendulum.csv", states=["angle", "rate"], inputs=["torque"])
+    assert {path.name for path in tmp_path.iterdir()} == {
+        "pendulum.csv",
+        "pendulum.safetensors",
+        "tube.png",
+    }
+    data = Transitions.from_csv(
+        tmp_path / "pendulum.csv", states=["angle", "rate"], inputs=["torque"]
+    )
     gp = load_posterior(tmp_path / "pendulum.safetensors")
-    assert float((gp.predict(data.states, data.inputs).mean - data.next_states).abs().max()) < 0.1
+    assert (
+        float(
+            (gp.predict(data.states, data.inputs).mean - data.next_states).abs().max()
+        )
+        < 0.1
+    )
     assert names["forecast"].mean.shape == (20, 2)
     # The tube holds what happens: 15 runs of 20 steps, two states.
     runs = torch.tensor([run[1:].tolist() for run in names["runs"]])
-    inside = (runs - names["forecast"].mean).abs() <= 1.96 * names["forecast"].variance.sqrt()
+    inside = (runs - names["forecast"].mean).abs() <= 1.96 * names[
+        "forecast"
+    ].variance.sqrt()
     assert 0.85 < float(inside.double().mean()) <= 1.0
     assert (tmp_path / "tube.png").stat().st_size > 10_000
 
 
 def test_the_example_of_the_readme_swings_a_pendulum_up(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("matplotlib.pyplot.savefig", lambda path: (tmp_path / path).touch())
+    monkeypatch.setattr(
+        "matplotlib.pyplot.savefig", lambda path: (tmp_path / path).touch()
+    )
     names = runpy.run_path(str(EXAMPLES / "swing_up.py"), run_name="__main__")
     assert float(abs(names["flight"].states[-1] - [1.0, 0.0, 0.0]).max()) < 1e-3
     readme = (EXAMPLES.parent / "README.md").read_text()
-    assert (EXAMPLES / "swing_up.py").read_text().partition('"""\n\n')[2].strip() in readme
+    assert (EXAMPLES / "swing_up.py").read_text().partition('"""\n\n')[
+        2
+    ].strip() in readme
     printed = capsys.readouterr().out.strip()
     assert printed == "upright after 3.0 s"
     assert f"`{printed}`" in readme
     assert (tmp_path / "swing_up.png").exists()
 
 
-def test_the_example_of_a_system_of_ones_own_follows_its_waypoints(tmp_path, monkeypatch, capsys):
+def test_the_example_of_a_system_of_ones_own_follows_its_waypoints(
+    tmp_path, monkeypatch, capsys
+):
     monkeypatch.setattr(sys, "argv", ["own_system.py", str(tmp_path)])
     names = runpy.run_path(str(EXAMPLES / "own_system.py"), run_name="__main__")
     assert names["result"]["rmse"]["total"] < 0.05
@@ -50,10 +69,15 @@ def test_the_example_of_a_system_of_ones_own_follows_its_waypoints(tmp_path, mon
     assert (tmp_path / "own_system.png").stat().st_size > 10_000
 
 
-def test_the_example_of_a_log_learns_from_its_own_files_and_leaves_a_figure(tmp_path, capsys):
+def test_the_example_of_a_log_learns_from_its_own_files_and_leaves_a_figure(
+    tmp_path, capsys
+):
     names = runpy.run_path(str(EXAMPLES / "own_log.py"))
     names["main"](tmp_path)
-    assert {path.name for path in tmp_path.iterdir()} == {*(f"flight_{i}.csv" for i in (1, 2, 3)), "own_log.png"}
+    assert {path.name for path in tmp_path.iterdir()} == {
+        *(f"flight_{i}.csv" for i in (1, 2, 3)),
+        "own_log.png",
+    }
     printed = capsys.readouterr().out
     assert "gaps, up to 0.3" in printed
     assert "held value" in printed
@@ -62,17 +86,31 @@ def test_the_example_of_a_log_learns_from_its_own_files_and_leaves_a_figure(tmp_
 
 
 @pytest.mark.slow
-def test_a_quadrotor_in_mujoco_flies_better_with_what_its_logs_teach_than_with_its_data_sheet(tmp_path):
+def test_a_quadrotor_in_mujoco_flies_better_with_what_its_logs_teach_than_with_its_data_sheet(
+    tmp_path,
+):
     pytest.importorskip("mujoco")
     found = runpy.run_path(str(EXAMPLES / "mujoco_flight.py"))["main"](tmp_path)
-    assert found["learned, disturbance_gain 0"] < 0.3 * found["data sheet, disturbance_gain 0"]
-    assert found["learned, disturbance_gain 0"] < 0.7 * found["data sheet, disturbance_gain 0.3"]
+    assert (
+        found["learned, disturbance_gain 0"]
+        < 0.3 * found["data sheet, disturbance_gain 0"]
+    )
+    assert (
+        found["learned, disturbance_gain 0"]
+        < 0.7 * found["data sheet, disturbance_gain 0.3"]
+    )
 
 
-def test_the_example_of_a_payload_learns_from_flights_and_corrects_what_is_new(tmp_path, monkeypatch):
+def test_the_example_of_a_payload_learns_from_flights_and_corrects_what_is_new(
+    tmp_path, monkeypatch
+):
     pytest.importorskip("mujoco")
     monkeypatch.setattr(sys, "argv", ["payload.py", str(tmp_path)])
-    errors = [*runpy.run_path(str(EXAMPLES / "payload.py"), run_name="__main__")["rmse"].values()]
+    errors = [
+        *runpy.run_path(str(EXAMPLES / "payload.py"), run_name="__main__")[
+            "rmse"
+        ].values()
+    ]
     assert errors[2] < 0.05
     assert errors[2] < errors[1] / 3 < errors[0] / 3
     assert (tmp_path / "payload.png").stat().st_size > 10_000
@@ -80,16 +118,23 @@ def test_the_example_of_a_payload_learns_from_flights_and_corrects_what_is_new(t
     assert not film.exists() or film.stat().st_size > 100_000
 
 
-def test_the_example_of_a_wall_keeps_the_cart_behind_it_as_often_as_it_says(tmp_path, monkeypatch, capsys):
+def test_the_example_of_a_wall_keeps_the_cart_behind_it_as_often_as_it_says(
+    tmp_path, monkeypatch, capsys
+):
     monkeypatch.setattr(sys, "argv", ["wall.py", str(tmp_path)])
     names = runpy.run_path(str(EXAMPLES / "wall.py"), run_name="__main__")
-    beyond = [float((flight.states[1:, 0] > names["WALL"]).mean()) for flight in names["flights"].values()]
+    beyond = [
+        float((flight.states[1:, 0] > names["WALL"]).mean())
+        for flight in names["flights"].values()
+    ]
     assert beyond[1] <= 0.05 < beyond[0]
     assert "beyond the wall in 12.0% of the steps" in capsys.readouterr().out
     assert (tmp_path / "wall.png").stat().st_size > 10_000
 
 
-def test_the_example_of_a_reactor_earns_more_than_at_its_operating_point_and_stays_cool(tmp_path, monkeypatch):
+def test_the_example_of_a_reactor_earns_more_than_at_its_operating_point_and_stays_cool(
+    tmp_path, monkeypatch
+):
     monkeypatch.setattr(sys, "argv", ["reactor.py", str(tmp_path)])
     names = runpy.run_path(str(EXAMPLES / "reactor.py"), run_name="__main__")
     economic, held = (flight.states for flight in names["flights"].values())
@@ -98,7 +143,9 @@ def test_the_example_of_a_reactor_earns_more_than_at_its_operating_point_and_sta
     assert (tmp_path / "reactor.png").stat().st_size > 10_000
 
 
-def test_the_example_of_moving_obstacles_reaches_its_goal_and_touches_none(tmp_path, monkeypatch):
+def test_the_example_of_moving_obstacles_reaches_its_goal_and_touches_none(
+    tmp_path, monkeypatch
+):
     monkeypatch.setattr(sys, "argv", ["obstacles.py", str(tmp_path)])
     names = runpy.run_path(str(EXAMPLES / "obstacles.py"), run_name="__main__")
     assert names["away"] < 0.2
@@ -107,10 +154,15 @@ def test_the_example_of_moving_obstacles_reaches_its_goal_and_touches_none(tmp_p
     assert (tmp_path / "obstacles.png").stat().st_size > 10_000
 
 
-def test_the_example_of_learning_while_flying_finds_the_heavier_vehicle(tmp_path, monkeypatch, capsys):
+def test_the_example_of_learning_while_flying_finds_the_heavier_vehicle(
+    tmp_path, monkeypatch, capsys
+):
     monkeypatch.setattr(sys, "argv", ["learning.py", str(tmp_path)])
     names = runpy.run_path(str(EXAMPLES / "learning.py"), run_name="__main__")
-    away = {name: abs(f.states - f.references)[26:, [0, 2, 4]].max() for name, f in names["flights"].items()}
+    away = {
+        name: abs(f.states - f.references)[26:, [0, 2, 4]].max()
+        for name, f in names["flights"].items()
+    }
     assert away["online learning"] < 0.2 < 2.0 < away["as learned"]
     assert "online learning" in capsys.readouterr().out
     assert (tmp_path / "learning.png").stat().st_size > 10_000

@@ -12,7 +12,9 @@ def test_mean_and_covariance_must_belong_together():
 
 def test_the_variance_is_the_diagonal_of_every_covariance_in_a_batch():
     covariance = torch.randn(4, 3, 3)
-    assert torch.equal(Gaussian(torch.zeros(4, 3), covariance).variance[2], covariance[2].diagonal())
+    assert torch.equal(
+        Gaussian(torch.zeros(4, 3), covariance).variance[2], covariance[2].diagonal()
+    )
 
 
 @pytest.mark.parametrize("batch", [(), (5,), (2, 3)])
@@ -25,7 +27,9 @@ def test_the_projection_is_semidefinite_nearest_and_says_how_far_it_went(batch):
     assert torch.linalg.eigvalsh(projected).min() > -1e-14
     assert torch.allclose(deficit, (-eigenvalues[..., 0]).clamp_min(0))
     distance = (projected - symmetric).square().sum((-2, -1))
-    assert torch.allclose(distance, eigenvalues.clamp_max(0).square().sum(-1))  # Higham (1988), theorem 2.1
+    assert torch.allclose(
+        distance, eigenvalues.clamp_max(0).square().sum(-1)
+    )  # Higham (1988), theorem 2.1
 
 
 def test_a_semidefinite_matrix_is_returned_unchanged():

@@ -10,26 +10,44 @@ from tests.cli.command import forked
 from tests.pages import BLOCK, read
 
 
-def test_a_system_of_ones_own_is_flown_learned_swept_reported_recorded_and_calibrated(page, tmp_path):
-    names, (flown, *_, calibrated, heavier, swept, report) = page("docs/guide_system.md")
+def test_a_system_of_ones_own_is_flown_learned_swept_reported_recorded_and_calibrated(
+    page, tmp_path
+):
+    names, (flown, *_, calibrated, heavier, swept, report) = page(
+        "docs/guide_system.md"
+    )
     assert abs(names["flown"].rollout.states[-20:] - [1.0, 0.0]).max() < 0.05
     recorded = names["run"]
-    assert (recorded.finished, recorded.metadata["units"]["state.angle"], len(recorded.states)) == (True, "rad", 60)
-    assert (recorded.metadata["frames"]["z axis"], recorded.input_bounds.tolist()) == ("up", [[-8.0], [8.0]])
+    assert (
+        recorded.finished,
+        recorded.metadata["units"]["state.angle"],
+        len(recorded.states),
+    ) == (True, "rad", 60)
+    assert (recorded.metadata["frames"]["z axis"], recorded.input_bounds.tolist()) == (
+        "up",
+        [[-8.0], [8.0]],
+    )
     assert "100 steps of arm with convex" in flown
     assert "200 rows of random data" in flown
     assert "RMSE [rad]" in flown
     assert "10 ahead" in calibrated
     assert "rate [rad/s]" in calibrated
-    frame = pandas.read_csv(tmp_path / "outputs/run/system=arm/calibration/calibration.csv")
+    frame = pandas.read_csv(
+        tmp_path / "outputs/run/system=arm/calibration/calibration.csv"
+    )
     assert frame["samples"].tolist()[:2] == [99, 99]
     assert frame["rmse"].max() < 0.01
     assert "mass 1.2 (learned: 1.0)" in heavier
     assert "4 flown" in swept
     assert "RMSE" in report
-    figures = {path.name for path in (tmp_path / "outputs/run/system=arm/figures").iterdir()}
+    figures = {
+        path.name for path in (tmp_path / "outputs/run/system=arm/figures").iterdir()
+    }
     assert figures == {"tracking.png", "inputs.png", "timing.png"}
-    assert "state.angle" in (tmp_path / "outputs/run/system=arm/run.layout.json").read_text()
+    assert (
+        "state.angle"
+        in (tmp_path / "outputs/run/system=arm/run.layout.json").read_text()
+    )
 
 
 def test_simulators_are_systems(page):
@@ -40,7 +58,13 @@ def test_simulators_are_systems(page):
     assert "flight.gif" in filmed
     assert abs(names["flown"].rollout.states[-20:] - [1.0, 0.0, 0.0]).max() < 0.05
     assert "5 steps of gymnasium with convex" in flown
-    assert names["cart"].state_names == ("slider", "hinge", "slider_rate", "hinge_rate", "push_activation")
+    assert names["cart"].state_names == (
+        "slider",
+        "hinge",
+        "slider_rate",
+        "hinge_rate",
+        "push_activation",
+    )
     assert names["seen"].state_names == ("position", "angle")
 
 
@@ -75,7 +99,9 @@ def test_a_new_project_runs_at_once(tmp_path, monkeypatch):
         "test_arm.py",
         "system/arm.yaml",
     }
-    command = next(line for line in done.stdout.splitlines() if line.startswith("gpmpc run"))
+    command = next(
+        line for line in done.stdout.splitlines() if line.startswith("gpmpc run")
+    )
     run = forked(*shlex.split(command)[1:], cwd=project)
     assert run.returncode == 0, run.stderr
     assert "100 steps of arm with convex" in run.stdout
@@ -89,32 +115,65 @@ def test_a_new_project_runs_at_once(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["new", "2arms"], "NAME: must be letters, digits and _, a letter first; got '2arms'"),
+        (
+            ["new", "2arms"],
+            "NAME: must be letters, digits and _, a letter first; got '2arms'",
+        ),
         (["new", "class"], "NAME: must be letters"),
-        (["new", "arm", "--to", "."], "to: . is not an empty folder; nothing was written"),
+        (
+            ["new", "arm", "--to", "."],
+            "to: . is not an empty folder; nothing was written",
+        ),
         (["run", "--config-dir", ".", "system=hand"], "system: no such option 'hand'"),
-        (["run", "--config-dir", ".", "system=short"], "derivative must give 2 entries, one for each of state_names"),
-        (["run", "--config-dir", ".", "system=hollow"], "must be finite at state [0.0, 0.0]"),
-        (["run", "--config-dir", ".", "system=weights"], "controller.problem: weighs 3 states and 1 inputs; nan has 2"),
-        (["run", "--config-dir", ".", "system=root"], "h or its gradient is not finite at x = [0. 0.], u = [0.]"),
-        (["run", "system=pendulum", "nominal={mass: 0.8}", "model=exact_gp"], "nominal: needs model=difference_gp"),
-        (["run", "system=gymnasium"], "system.environment: this setting has no default"),
+        (
+            ["run", "--config-dir", ".", "system=short"],
+            "derivative must give 2 entries, one for each of state_names",
+        ),
+        (
+            ["run", "--config-dir", ".", "system=hollow"],
+            "must be finite at state [0.0, 0.0]",
+        ),
+        (
+            ["run", "--config-dir", ".", "system=weights"],
+            "controller.problem: weighs 3 states and 1 inputs; nan has 2",
+        ),
+        (
+            ["run", "--config-dir", ".", "system=root"],
+            "h or its gradient is not finite at x = [0. 0.], u = [0.]",
+        ),
+        (
+            ["run", "system=pendulum", "nominal={mass: 0.8}", "model=exact_gp"],
+            "nominal: needs model=difference_gp",
+        ),
+        (
+            ["run", "system=gymnasium"],
+            "system.environment: this setting has no default",
+        ),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )
 def test_a_mistake_is_one_clear_line(arguments, message, tmp_path):
     (tmp_path / "system").mkdir()
-    rows = {"short": "[x[1]]", "hollow": "[x[1], 0 * float('nan')]", "weights": "[x[1], u[0]]", "root": "[x[1], u[0]]"}
+    rows = {
+        "short": "[x[1]]",
+        "hollow": "[x[1], 0 * float('nan')]",
+        "weights": "[x[1], u[0]]",
+        "root": "[x[1], u[0]]",
+    }
     for name, rates in rows.items():
         text = f"state_names, input_names = ('a', 'b'), ('u',)\n    def derivative(self, x, u): return {rates}\n"
-        limits = "name='nan', input_lower=[-1], input_upper=[1], region=[[-1, -1], [1, 1]]"
+        limits = (
+            "name='nan', input_lower=[-1], input_upper=[1], region=[[-1, -1], [1, 1]]"
+        )
         made = (
             f"from gpmpc.systems import System\nclass D:\n    {text}\ndef make(): return System(D(), 0.1, {limits})\n"
             "def h(x): return (x[:, 0] - 1).sqrt()\n"
         )
         (tmp_path / f"{name}_module.py").write_text(made)
         h = "{_target_: hydra.utils.get_method, path: root_module.h}"
-        kept = f"[{{_target_: gpmpc.mpc.Inequality, h: {h}}}]" if name == "root" else "[]"
+        kept = (
+            f"[{{_target_: gpmpc.mpc.Inequality, h: {h}}}]" if name == "root" else "[]"
+        )
         weights = "[1, 1, 1]" if name == "weights" else "[1, 1]"
         problem = f"{{cost: {{Q: {weights}, R: [1]}}, constraints: {kept}}}"
         (tmp_path / "system" / f"{name}.yaml").write_text(
@@ -125,4 +184,6 @@ def test_a_mistake_is_one_clear_line(arguments, message, tmp_path):
     done = forked(*arguments, cwd=tmp_path)
     assert (done.returncode, done.stderr.count("\n")) == (2, 1), done.stderr
     assert message in done.stderr
-    assert [path for path in sorted(tmp_path.rglob("*.*")) if "__pycache__" not in str(path)] == before
+    assert [
+        path for path in sorted(tmp_path.rglob("*.*")) if "__pycache__" not in str(path)
+    ] == before

@@ -61,7 +61,12 @@ def test_an_error_inside_is_that_error():
 
 def test_ipopt_ends_a_solve_that_an_interrupt_meets_and_nmpc_passes_it_on():
     plant = System(Translational(), time_step=1.0, substeps=1)
-    controller = NMPC(plant, Problem(Tracking([1.0] * 6, [1.0] * 3, penalized="inputs")), 5, [7.26, 0.0, 0.0])
+    controller = NMPC(
+        plant,
+        Problem(Tracking([1.0] * 6, [1.0] * 3, penalized="inputs")),
+        5,
+        [7.26, 0.0, 0.0],
+    )
     solver, statuses = controller._solver, []
 
     class Met:
@@ -69,7 +74,9 @@ def test_ipopt_ends_a_solve_that_an_interrupt_meets_and_nmpc_passes_it_on():
 
         def __call__(self, **arguments):
             sent = threading.Event()
-            timer = threading.Timer(0.05, lambda: (os.kill(os.getpid(), signal.SIGINT), sent.set()))
+            timer = threading.Timer(
+                0.05, lambda: (os.kill(os.getpid(), signal.SIGINT), sent.set())
+            )
             timer.start()
             while not sent.is_set():
                 found = solver(**arguments)
@@ -79,5 +86,7 @@ def test_ipopt_ends_a_solve_that_an_interrupt_meets_and_nmpc_passes_it_on():
 
     controller._solver = Met()
     with pytest.raises(KeyboardInterrupt):
-        controller.control(Gaussian.certain(torch.zeros(6)), Reference(np.full((6, 6), 0.5)))
+        controller.control(
+            Gaussian.certain(torch.zeros(6)), Reference(np.full((6, 6), 0.5))
+        )
     assert set(statuses) == {"Solve_Succeeded"}

@@ -21,20 +21,31 @@ AXES = (0, 2, 4)  # x, y, z of the translational states
 
 
 def test_the_mean_squared_error_sums_over_outputs_and_averages_over_samples():
-    assert mean_squared_error(torch.tensor([[1.0, 2.0], [0.0, 0.0]]), torch.zeros(2, 2)) == 2.5
+    assert (
+        mean_squared_error(torch.tensor([[1.0, 2.0], [0.0, 0.0]]), torch.zeros(2, 2))
+        == 2.5
+    )
 
 
 def test_the_predictive_density_is_the_gaussians():
-    mean, variance, observed = torch.randn(5, 3), torch.rand(5, 3) + 0.1, torch.randn(5, 3)
+    mean, variance, observed = (
+        torch.randn(5, 3),
+        torch.rand(5, 3) + 0.1,
+        torch.randn(5, 3),
+    )
     exact = -torch.distributions.Normal(mean, variance.sqrt()).log_prob(observed).mean()
-    assert negative_log_predictive_density(mean, variance, observed) == pytest.approx(float(exact))
+    assert negative_log_predictive_density(mean, variance, observed) == pytest.approx(
+        float(exact)
+    )
 
 
 @pytest.mark.parametrize("level", [0.5, 0.9, 0.95])
 def test_samples_of_the_prediction_are_covered_at_the_level(level):
     mean, variance = torch.randn(20_000, 2), torch.rand(20_000, 2) + 0.1
     observed = mean + variance.sqrt() * torch.randn(20_000, 2)
-    assert abs(interval_coverage(mean, variance, observed, level) - level) < 4 * math.sqrt(level * (1 - level) / 40_000)
+    assert abs(
+        interval_coverage(mean, variance, observed, level) - level
+    ) < 4 * math.sqrt(level * (1 - level) / 40_000)
     assert interval_coverage(mean, variance / 4, observed, level) < level - 0.1
 
 
@@ -56,28 +67,50 @@ def test_the_tracking_error_is_that_of_the_axes_and_of_the_distance_without_the_
 
 @pytest.mark.parametrize("scale", [1e-9, 1.0, 1e9])
 @pytest.mark.parametrize("shift", [0.0, -3.0])
-def test_a_flight_is_lost_where_it_would_have_been_nearer_had_it_never_moved(scale, shift):
-    references = np.outer(np.arange(6.0), [3, 0, 4]) + shift  # 25 from its start in the end
+def test_a_flight_is_lost_where_it_would_have_been_nearer_had_it_never_moved(
+    scale, shift
+):
+    references = (
+        np.outer(np.arange(6.0), [3, 0, 4]) + shift
+    )  # 25 from its start in the end
     away = references + np.outer([0, 10, 24, 26, 200, 1], [0, 1, 0])
     loss = find_loss(scale * away, scale * references, axes=range(3))
-    assert (loss.step, loss.distance, loss.limit) == (3, pytest.approx(26 * scale), pytest.approx(25 * scale))
+    assert (loss.step, loss.distance, loss.limit) == (
+        3,
+        pytest.approx(26 * scale),
+        pytest.approx(25 * scale),
+    )
     staying = np.tile(references[:1], (6, 1))
-    for near in (references, staying, references + np.outer([0, 24, 24, 24, 24, 24], [0, 1, 0])):
+    for near in (
+        references,
+        staying,
+        references + np.outer([0, 24, 24, 24, 24, 24], [0, 1, 0]),
+    ):
         assert find_loss(scale * near, scale * references, axes=range(3)) is None
 
 
 def test_what_hovers_is_lost_beyond_the_least_distance_and_what_is_no_number_is_lost_anyway():
     references = np.zeros((4, 6))
-    drifting = np.outer(np.arange(4.0), [1, 50, 0, 50, 0, 50])  # velocities are not looked at
+    drifting = np.outer(
+        np.arange(4.0), [1, 50, 0, 50, 0, 50]
+    )  # velocities are not looked at
     assert find_loss(drifting, references, AXES, least=3.0) is None
     assert find_loss(drifting, references, AXES, least=1.5).step == 2
     drifting[1, 0] = np.nan
     assert find_loss(drifting, references, AXES, least=1.5).step == 1
-    assert find_loss(np.outer([0, 1, 1e300, 1e308], np.ones(6)), references, AXES, least=2.0).step == 2
+    assert (
+        find_loss(
+            np.outer([0, 1, 1e300, 1e308], np.ones(6)), references, AXES, least=2.0
+        ).step
+        == 2
+    )
 
 
 def test_errors_of_angles_are_taken_within_half_a_turn():
-    turned, upright = np.array([[3.0, 0.0], [2 * np.pi + 0.1, 0.0], [-2 * np.pi - 0.1, 0.0]]), np.zeros((3, 2))
+    turned, upright = (
+        np.array([[3.0, 0.0], [2 * np.pi + 0.1, 0.0], [-2 * np.pi - 0.1, 0.0]]),
+        np.zeros((3, 2)),
+    )
     assert tracking_error(turned, upright, [0], angles=[0]).total == pytest.approx(0.1)
     assert find_loss(turned, upright, [0], angles=[0]) is None
     assert find_loss(turned, upright, [0]).step == 1
@@ -86,11 +119,15 @@ def test_errors_of_angles_are_taken_within_half_a_turn():
 def test_coming_back_from_a_distant_start_is_no_loss():
     approaching = np.outer([9.0, 5.0, -2.0, 0.5], np.ones(6))
     assert find_loss(approaching, np.zeros((4, 6)), AXES) is None
-    assert find_loss(-approaching * [[1], [1], [5], [1]], np.zeros((4, 6)), AXES).step == 2
+    assert (
+        find_loss(-approaching * [[1], [1], [5], [1]], np.zeros((4, 6)), AXES).step == 2
+    )
 
 
 def test_a_violation_is_a_step_with_any_entry_outside():
-    values = np.array([[0.0, 0.0], [1.5, -3.0], [1.0 + 1e-12, 0.0], [np.nan, 0.0], [0.0, 5.0]])
+    values = np.array(
+        [[0.0, 0.0], [1.5, -3.0], [1.0 + 1e-12, 0.0], [np.nan, 0.0], [0.0, 5.0]]
+    )
     rate = violation_rate(values, [-1.0, -2.0], [1.0, np.inf])
     assert (rate.violations, rate.steps, rate.rate) == (2, 5, 0.4)
     assert rate.worst == 1.0
@@ -118,10 +155,26 @@ def test_the_quantiles_of_times_are_in_order():
 @pytest.mark.parametrize(
     ("call", "error", "message"),
     [
-        (lambda: find_loss(np.zeros((3, 6)), np.zeros((2, 6)), AXES), ShapeError, "states and references must both be"),
-        (lambda: tracking_error(np.zeros((3, 6)), np.zeros((2, 6)), AXES), ShapeError, r"got \(3, 6\) and \(2, 6\)"),
-        (lambda: violation_rate(np.zeros((3, 2)), [0], [1]), ShapeError, r"bounds \(d,\).*got \(3, 2\), \(1,\)"),
-        (lambda: binomial_interval(3, 2), SettingError, "successes: must lie between 0 and trials"),
+        (
+            lambda: find_loss(np.zeros((3, 6)), np.zeros((2, 6)), AXES),
+            ShapeError,
+            "states and references must both be",
+        ),
+        (
+            lambda: tracking_error(np.zeros((3, 6)), np.zeros((2, 6)), AXES),
+            ShapeError,
+            r"got \(3, 6\) and \(2, 6\)",
+        ),
+        (
+            lambda: violation_rate(np.zeros((3, 2)), [0], [1]),
+            ShapeError,
+            r"bounds \(d,\).*got \(3, 2\), \(1,\)",
+        ),
+        (
+            lambda: binomial_interval(3, 2),
+            SettingError,
+            "successes: must lie between 0 and trials",
+        ),
         (lambda: time_quantiles(np.zeros(0)), ShapeError, r"seconds must be \(K,\)"),
     ],
 )
@@ -150,16 +203,48 @@ def test_the_interval_of_a_violation_rate_is_the_binomial_one():
 @pytest.mark.parametrize(
     ("call", "error", "message"),
     [
-        (lambda: violation_rate(np.zeros((3, 2)), [0, 1], [1, 0]), SettingError, "entry 1 has 1 above 0"),
-        (lambda: violation_rate(np.zeros((0, 2)), [0, 0], [1, 1]), ShapeError, "K of 1 or more"),
-        (lambda: violation_rate(np.zeros((3, 2)), [0, 0], [1]), ShapeError, r"got \(3, 2\), \(2,\), \(1,\)"),
-        (lambda: tracking_error(np.zeros((3, 6)), np.zeros((3, 6)), [6]), ShapeError, r"from 0 to 5; got \(6,\)"),
-        (lambda: tracking_error(np.zeros((3, 6)), np.zeros((3, 6)), [-7]), ShapeError, r"from 0 to 5; got \(-7,\)"),
-        (lambda: tracking_error(np.zeros((1, 6)), np.zeros((1, 6)), AXES), ShapeError, "K of 1 or more"),
+        (
+            lambda: violation_rate(np.zeros((3, 2)), [0, 1], [1, 0]),
+            SettingError,
+            "entry 1 has 1 above 0",
+        ),
+        (
+            lambda: violation_rate(np.zeros((0, 2)), [0, 0], [1, 1]),
+            ShapeError,
+            "K of 1 or more",
+        ),
+        (
+            lambda: violation_rate(np.zeros((3, 2)), [0, 0], [1]),
+            ShapeError,
+            r"got \(3, 2\), \(2,\), \(1,\)",
+        ),
+        (
+            lambda: tracking_error(np.zeros((3, 6)), np.zeros((3, 6)), [6]),
+            ShapeError,
+            r"from 0 to 5; got \(6,\)",
+        ),
+        (
+            lambda: tracking_error(np.zeros((3, 6)), np.zeros((3, 6)), [-7]),
+            ShapeError,
+            r"from 0 to 5; got \(-7,\)",
+        ),
+        (
+            lambda: tracking_error(np.zeros((1, 6)), np.zeros((1, 6)), AXES),
+            ShapeError,
+            "K of 1 or more",
+        ),
         (lambda: binomial_interval(0, 0), SettingError, "got 0 of 0"),
         (lambda: binomial_interval(-1, 3), SettingError, "got -1 of 3"),
-        (lambda: mean_squared_error(torch.zeros(2, 1), torch.zeros(2, 2)), ShapeError, r"predicted \(2, 1\)"),
-        (lambda: interval_coverage(*[torch.ones(1, 1)] * 3, 0), SettingError, "must lie between 0 and 1; got 0"),
+        (
+            lambda: mean_squared_error(torch.zeros(2, 1), torch.zeros(2, 2)),
+            ShapeError,
+            r"predicted \(2, 1\)",
+        ),
+        (
+            lambda: interval_coverage(*[torch.ones(1, 1)] * 3, 0),
+            SettingError,
+            "must lie between 0 and 1; got 0",
+        ),
     ],
 )
 def test_what_has_no_answer_is_refused_with_the_rule(call, error, message):
@@ -170,4 +255,6 @@ def test_what_has_no_answer_is_refused_with_the_rule(call, error, message):
 def test_axes_may_be_counted_from_the_end():
     states = np.arange(18.0).reshape(3, 6)
     last = tracking_error(states, np.zeros((3, 6)), [-1, 0])
-    assert np.array_equal(last.axes, tracking_error(states, np.zeros((3, 6)), [5, 0]).axes)
+    assert np.array_equal(
+        last.axes, tracking_error(states, np.zeros((3, 6)), [5, 0]).axes
+    )

@@ -26,7 +26,10 @@ F = torch.float64
 
 def data():
     generator = torch.Generator().manual_seed(0)
-    x, u = torch.randn(12, 2, generator=generator, dtype=F), torch.randn(12, 1, generator=generator, dtype=F)
+    x, u = (
+        torch.randn(12, 2, generator=generator, dtype=F),
+        torch.randn(12, 1, generator=generator, dtype=F),
+    )
     return Transitions(x, u, x + 0.1 * u)
 
 
@@ -101,7 +104,9 @@ def test_a_certain_belief_of_no_vector_is_refused(value):
     ],
 )
 def test_what_is_no_tensor_is_named(call):
-    with pytest.raises(SettingError, match="must be a torch tensor; got (list|ndarray|float)"):
+    with pytest.raises(
+        SettingError, match="must be a torch tensor; got (list|ndarray|float)"
+    ):
         call()
 
 
@@ -112,7 +117,9 @@ def test_a_mean_in_the_place_of_a_belief_is_refused():
 
 @pytest.mark.parametrize("input_dim", [1.0, True, -1])
 def test_the_number_of_inputs_is_a_whole_number(input_dim):
-    with pytest.raises(SettingError, match="input_dim: must be a whole number, 0 or more; got"):
+    with pytest.raises(
+        SettingError, match="input_dim: must be a whole number, 0 or more; got"
+    ):
         posterior(input_dim=input_dim)
 
 
@@ -122,41 +129,78 @@ def residual():
 
 @pytest.mark.parametrize("model", [posterior, residual], ids=["posterior", "residual"])
 def test_a_model_goes_only_where_torch_can_take_it(model):
-    with pytest.raises(SettingError, match="device: must be one that torch finds here; got 'gpu'"):
+    with pytest.raises(
+        SettingError, match="device: must be one that torch finds here; got 'gpu'"
+    ):
         model().to("gpu")
-    with pytest.raises(SettingError, match=r"dtype: must be torch.float32 or torch.float64; got torch.int64"):
+    with pytest.raises(
+        SettingError,
+        match=r"dtype: must be torch.float32 or torch.float64; got torch.int64",
+    ):
         model().to(dtype=torch.int64)
     if not torch.cuda.is_available():
-        with pytest.raises(SettingError, match="device: must be one that torch finds here; got 'cuda'"):
+        with pytest.raises(
+            SettingError, match="device: must be one that torch finds here; got 'cuda'"
+        ):
             model().to("cuda")
 
 
 def test_models_and_data_say_what_they_are_in_one_line():
-    assert repr(posterior()) == ("GPPosterior(12 points, n=2, m=1, k=2, predicts='next_state', torch.float64 on cpu)")
+    assert repr(posterior()) == (
+        "GPPosterior(12 points, n=2, m=1, k=2, predicts='next_state', torch.float64 on cpu)"
+    )
     assert repr(data()) == "Transitions(12 rows, n=2, m=1)"
 
 
 @pytest.mark.parametrize(
     ("call", "rule"),
     [
-        (lambda: train(data(), scaling="standardize"), "scaling: must be a function such as standardize"),
-        (lambda: train(data(), penalty="soft"), "penalty: must be a function such as SoftLimits"),
-        (lambda: train(data(), seed=-1), "seed: must be a whole number, 0 or more; got -1"),
-        (lambda: train(data(), seed=1.5), "seed: must be a whole number, 0 or more; got 1.5"),
-        (lambda: train((1, 2)), r"transitions: must be Transitions\(...\); got tuple"),
-        (lambda: Transitions.from_csv("any.csv", "angle", []), "states: must be a list of column names; got .*'angle'"),
         (
-            lambda: Problem(Tracking([1.0], [1.0], penalized="inputs"), inputs=Box([np.inf])),
+            lambda: train(data(), scaling="standardize"),
+            "scaling: must be a function such as standardize",
+        ),
+        (
+            lambda: train(data(), penalty="soft"),
+            "penalty: must be a function such as SoftLimits",
+        ),
+        (
+            lambda: train(data(), seed=-1),
+            "seed: must be a whole number, 0 or more; got -1",
+        ),
+        (
+            lambda: train(data(), seed=1.5),
+            "seed: must be a whole number, 0 or more; got 1.5",
+        ),
+        (lambda: train((1, 2)), r"transitions: must be Transitions\(...\); got tuple"),
+        (
+            lambda: Transitions.from_csv("any.csv", "angle", []),
+            "states: must be a list of column names; got .*'angle'",
+        ),
+        (
+            lambda: Problem(
+                Tracking([1.0], [1.0], penalized="inputs"), inputs=Box([np.inf])
+            ),
             "lower: no number keeps it",
         ),
         (
-            lambda: Problem(Tracking([1.0], [1.0], penalized="inputs"), constraints=[(-1, 1)]),
+            lambda: Problem(
+                Tracking([1.0], [1.0], penalized="inputs"), constraints=[(-1, 1)]
+            ),
             r"must be Box\(...\), Halfspaces\(...\) or Inequality\(...\); got tuple",
         ),
-        (lambda: Box([0.0], 1), "upper: must be a list of numbers, infinite where unbounded; got 1"),
+        (
+            lambda: Box([0.0], 1),
+            "upper: must be a list of numbers, infinite where unbounded; got 1",
+        ),
         (lambda: Box([0.0, 0.0], [1.0]), "upper: must be a list of 2 numbers"),
-        (lambda: controller(model="gp.npz"), "model: must be a DynamicsModel, such as GPPosterior; got str"),
-        (lambda: controller(problem={"Q": [1]}), r"problem: must be Problem\(...\); got dict"),
+        (
+            lambda: controller(model="gp.npz"),
+            "model: must be a DynamicsModel, such as GPPosterior; got str",
+        ),
+        (
+            lambda: controller(problem={"Q": [1]}),
+            r"problem: must be Problem\(...\); got dict",
+        ),
         (
             lambda: controller(propagator=Linearization),
             "propagator: .*such as Linearization.*got the class Linearization",
@@ -165,9 +209,18 @@ def test_models_and_data_say_what_they_are_in_one_line():
             lambda: controller(StateFormMPC, propagator=Linearization),
             "propagator: .*such as Linearization.*got the class Linearization",
         ),
-        (lambda: controller(NonlinearGPMPC, propagator="linear"), "propagator: .*such as Linearization.*got 'linear'"),
-        (lambda: controller(solver=DualActiveSet), "solver: .*such as DualActiveSet.*got the class DualActiveSet"),
-        (lambda: metrics.violation_rate(np.zeros((3, 1)), [1], [-1]), "must not cross; entry 0 has 1 above -1"),
+        (
+            lambda: controller(NonlinearGPMPC, propagator="linear"),
+            "propagator: .*such as Linearization.*got 'linear'",
+        ),
+        (
+            lambda: controller(solver=DualActiveSet),
+            "solver: .*such as DualActiveSet.*got the class DualActiveSet",
+        ),
+        (
+            lambda: metrics.violation_rate(np.zeros((3, 1)), [1], [-1]),
+            "must not cross; entry 0 has 1 above -1",
+        ),
     ],
 )
 def test_a_setting_of_another_kind_is_refused_where_it_is_given(call, rule):
@@ -184,21 +237,45 @@ def test_rows_that_are_no_table_of_numbers_are_refused(rows):
 @pytest.mark.parametrize(
     ("settings", "error", "rule"),
     [
-        ({"nominal": lambda x, u: x[..., :1]}, ShapeError, r"nominal must give .*\(12, 2\); got \(12, 1\)"),
-        ({"nominal": lambda x, u: x.numpy()}, SettingError, "nominal: must give a torch tensor; got ndarray"),
-        ({"B": torch.eye(3, dtype=F)}, ShapeError, r"B must be \(2, k\), a row a state; got \(3, 3\)"),
-        ({"B": torch.ones(2, 2, dtype=F)}, SettingError, "B: must have linearly independent columns"),
-        ({"states": [5]}, SettingError, r"states: must be different indices from 0 to 1; got \[5\]"),
+        (
+            {"nominal": lambda x, u: x[..., :1]},
+            ShapeError,
+            r"nominal must give .*\(12, 2\); got \(12, 1\)",
+        ),
+        (
+            {"nominal": lambda x, u: x.numpy()},
+            SettingError,
+            "nominal: must give a torch tensor; got ndarray",
+        ),
+        (
+            {"B": torch.eye(3, dtype=F)},
+            ShapeError,
+            r"B must be \(2, k\), a row a state; got \(3, 3\)",
+        ),
+        (
+            {"B": torch.ones(2, 2, dtype=F)},
+            SettingError,
+            "B: must have linearly independent columns",
+        ),
+        (
+            {"states": [5]},
+            SettingError,
+            r"states: must be different indices from 0 to 1; got \[5\]",
+        ),
     ],
 )
 def test_a_nominal_model_that_does_not_fit_is_not_broadcast(settings, error, rule):
     with pytest.raises(error, match=rule):
-        ResidualModel.train(**{"nominal": lambda x, u: x, "transitions": data()} | settings)
+        ResidualModel.train(
+            **{"nominal": lambda x, u: x, "transitions": data()} | settings
+        )
 
 
 def test_a_residual_model_refuses_a_nominal_of_another_size_when_it_predicts():
     model = residual()
-    wrong = ResidualModel(lambda x, u: x[..., :1], model.residual, model.B, model.states, model.inputs, 1)
+    wrong = ResidualModel(
+        lambda x, u: x[..., :1], model.residual, model.B, model.states, model.inputs, 1
+    )
     x, u = torch.zeros(2, dtype=F), torch.zeros(1, dtype=F)
     for ask in (wrong.predict, partial(predict_with_jacobian, wrong)):
         with pytest.raises(ShapeError, match="nominal must give next states"):
@@ -206,7 +283,9 @@ def test_a_residual_model_refuses_a_nominal_of_another_size_when_it_predicts():
 
 
 def test_an_affine_model_checks_its_shapes():
-    with pytest.raises(ShapeError, match=r"A, B and c must be \(n, n\), \(n, m\) and \(n,\); got"):
+    with pytest.raises(
+        ShapeError, match=r"A, B and c must be \(n, n\), \(n, m\) and \(n,\); got"
+    ):
         Affine(torch.eye(2), torch.zeros(1, 2), torch.zeros(2))
 
 
@@ -214,16 +293,25 @@ def test_an_affine_model_checks_its_shapes():
 def test_a_controller_says_what_it_takes(kind):
     asked, reference = controller(kind), np.zeros((4, 2))
     for given in ((belief(), reference), (np.zeros(2), Reference(reference))):
-        with pytest.raises(ShapeError, match=r"control takes a Gaussian .* and a Reference\(states\); got"):
+        with pytest.raises(
+            ShapeError,
+            match=r"control takes a Gaussian .* and a Reference\(states\); got",
+        ):
             asked.control(*given)
 
 
 @pytest.mark.parametrize(
     ("settings", "rule"),
     [
-        ({"system": Oscillator()}, "system: must be a plant, such as System.*; got Oscillator"),
+        (
+            {"system": Oscillator()},
+            "system: must be a plant, such as System.*; got Oscillator",
+        ),
         ({"noise": 0.1}, r"noise: must be Noise\(...\); got 0.1"),
-        ({"disturbances": Gust({"velocity": 1.0})}, "disturbances: must be a list of them; got Gust"),
+        (
+            {"disturbances": Gust({"velocity": 1.0})},
+            "disturbances: must be a list of them; got Gust",
+        ),
     ],
 )
 def test_a_closed_loop_says_what_it_takes(settings, rule):
@@ -241,22 +329,36 @@ def test_a_closed_loop_says_what_it_takes(settings, rule):
 def test_a_step_of_other_lengths_is_refused():
     plant = System(Oscillator(), 0.1)
     for state, input in ((np.zeros(3), np.zeros(1)), (np.zeros(2), 0.0)):
-        with pytest.raises(ShapeError, match=r"state and input must have shapes \(2,\) and \(1,\); got"):
+        with pytest.raises(
+            ShapeError, match=r"state and input must have shapes \(2,\) and \(1,\); got"
+        ):
             step(plant, state, input)
-    with pytest.raises(ShapeError, match="derivative must give 2 entries, one for each of state_names; got 1"):
+    with pytest.raises(
+        ShapeError,
+        match="derivative must give 2 entries, one for each of state_names; got 1",
+    ):
         step(System(Short(), 0.1), np.zeros(2), np.zeros(1))
 
 
 @pytest.mark.parametrize(
-    "measure", [metrics.negative_log_predictive_density, metrics.interval_coverage, metrics.mean_squared_error]
+    "measure",
+    [
+        metrics.negative_log_predictive_density,
+        metrics.interval_coverage,
+        metrics.mean_squared_error,
+    ],
 )
 def test_predictions_of_another_shape_are_not_broadcast(measure):
     tall, wide = torch.ones(3, 1, dtype=F), torch.ones(3, 2, dtype=F)
-    given = (tall, wide) if measure is metrics.mean_squared_error else (tall, tall, wide)
+    given = (
+        (tall, wide) if measure is metrics.mean_squared_error else (tall, tall, wide)
+    )
     with pytest.raises(ShapeError, match=r"all must have one shape \(N, n\); got"):
         measure(*given)
 
 
 def test_tracking_errors_of_axes_that_are_not_there_are_refused():
-    with pytest.raises(ShapeError, match=r"axes must be states from 0 to 1; got \(0, 2, 4\)"):
+    with pytest.raises(
+        ShapeError, match=r"axes must be states from 0 to 1; got \(0, 2, 4\)"
+    ):
         metrics.tracking_error(np.zeros((3, 2)), np.zeros((3, 2)), (0, 2, 4))

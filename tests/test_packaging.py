@@ -15,7 +15,16 @@ ROOT = Path(__file__).resolve().parents[1]
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory):
     folder = tmp_path_factory.mktemp("wheel")
-    command = [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(folder)]
+    command = [
+        sys.executable,
+        "-m",
+        "hatchling",
+        "build",
+        "-t",
+        "wheel",
+        "-d",
+        str(folder),
+    ]
     subprocess.run(command, cwd=ROOT, check=True, capture_output=True)
     (path,) = folder.glob("*.whl")
     return path
@@ -27,13 +36,20 @@ def test_the_wheel_carries_the_settings_the_printed_figures_and_its_types(wheel)
     assert {f"gpmpc/{name}" for name in settings} <= set(names)
     assert "gpmpc/py.typed" in names
     results = {path.name for path in (ROOT / "experiments").iterdir() if path.is_file()}
-    assert {"paper_tables.csv", "paper_timings.csv", "tables.py", "figures.py"} <= results
+    assert {
+        "paper_tables.csv",
+        "paper_timings.csv",
+        "tables.py",
+        "figures.py",
+    } <= results
     assert {f"gpmpc/experiments/{name}" for name in results} <= set(names)
     assert not [name for name in names if "__pycache__" in name]
     assert not [name for name in names if name.startswith(("tests/", "benchmarks/"))]
 
 
-def test_an_installed_package_finds_its_settings_from_an_empty_directory(wheel, tmp_path):
+def test_an_installed_package_finds_its_settings_from_an_empty_directory(
+    wheel, tmp_path
+):
     site, empty = tmp_path / "site", tmp_path / "empty"
     empty.mkdir()
     zipfile.ZipFile(wheel).extractall(site)
@@ -56,8 +72,14 @@ def test_every_file_that_the_documentation_names_is_there():
         r"\b(?:gpmpc|benchmarks|experiments|examples|conf|docs|tests)/[\w/.-]+\.(?:py|yaml|json|md|png|gif)\b"
     )
     pages = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *ROOT.glob("docs/*.md")]
-    missing = {f"{page.name}: {name}" for page in pages for name in named.findall(page.read_text())}
-    missing = {entry for entry in missing if not (ROOT / entry.partition(": ")[2]).exists()}
+    missing = {
+        f"{page.name}: {name}"
+        for page in pages
+        for name in named.findall(page.read_text())
+    }
+    missing = {
+        entry for entry in missing if not (ROOT / entry.partition(": ")[2]).exists()
+    }
     assert not missing
     links = {
         f"{page.name}: {link}"

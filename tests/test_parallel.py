@@ -54,7 +54,9 @@ def test_an_interrupt_between_the_starts_of_two_workers_ends_the_first(monkeypat
 
 
 def test_ctrl_c_ends_everything_at_once(tmp_path):
-    (tmp_path / "slow_trial.py").write_text("import time\ndef slow(seed):\n    time.sleep(60)\n")
+    (tmp_path / "slow_trial.py").write_text(
+        "import time\ndef slow(seed):\n    time.sleep(60)\n"
+    )
     program = """
         import multiprocessing, os, signal, threading, time
         from slow_trial import slow
@@ -69,7 +71,13 @@ def test_ctrl_c_ends_everything_at_once(tmp_path):
     """
     (tmp_path / "fly.py").write_text(textwrap.dedent(program))
     begin = time.perf_counter()
-    done = subprocess.run([sys.executable, "fly.py"], cwd=tmp_path, capture_output=True, text=True, timeout=50)
+    done = subprocess.run(
+        [sys.executable, "fly.py"],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=50,
+    )
     assert done.stdout.strip() == "interrupted, left: 0", done.stderr
     assert done.stderr == ""
     assert time.perf_counter() - begin < 30

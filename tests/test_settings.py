@@ -28,16 +28,32 @@ def nmpc(**settings):
 
 def convex(**settings):
     problem = Problem(Tracking([1.0, 1.0], [1.0], penalized="inputs"))
-    given = {"propagator": Linearization(), "problem": problem, "horizon": 2, "initial_input": [0.0]}
+    given = {
+        "propagator": Linearization(),
+        "problem": problem,
+        "horizon": 2,
+        "initial_input": [0.0],
+    }
     return GPMPC(double_integrator(), **(given | settings))
 
 
 def flown(**settings):
-    return datasets.Tracking(**({"plant": PLANT, "Q": [1] * 6, "R": [1] * 3, "initial_input": [0] * 3} | settings))
+    return datasets.Tracking(
+        **(
+            {"plant": PLANT, "Q": [1] * 6, "R": [1] * 3, "initial_input": [0] * 3}
+            | settings
+        )
+    )
 
 
 def excited(**settings):
-    given = {"Q": [1] * 6, "R": [1] * 3, "initial_input": [0] * 3, "dither": [0] * 3, "noise": [0] * 6}
+    given = {
+        "Q": [1] * 6,
+        "R": [1] * 3,
+        "initial_input": [0] * 3,
+        "dither": [0] * 3,
+        "noise": [0] * 6,
+    }
     return Excitation(**(given | settings))
 
 
@@ -51,13 +67,25 @@ CASES = [
     (convex, "propagator", (None, "linear", Linearization)),
     (convex, "problem", (None, "tracking")),
     (lambda **settings: Cascade(nmpc(), nmpc(), **settings), "ratio", (0, 0.5)),
-    (lambda **settings: Cascade(nmpc(), nmpc(), **settings), "response_time", (0.0, -1.0)),
+    (
+        lambda **settings: Cascade(nmpc(), nmpc(), **settings),
+        "response_time",
+        (0.0, -1.0),
+    ),
     (flown, "Q", ([1] * 5, [1] * 5 + [-1], [1] * 5 + [math.nan])),
     (flown, "R", ([1] * 2, [1, 1, -1])),
     (excited, "Q", ([1] * 7, [-1] * 6)),
     (excited, "R", ([1] * 4, [-1] * 3)),
-    (lambda **settings: System(Map(Rotational()), **settings), "time_step", (0.0, -1.0, math.inf)),
-    (lambda **settings: System(Rotational(), **settings), "time_step", (0.0, -1.0, math.nan)),
+    (
+        lambda **settings: System(Map(Rotational()), **settings),
+        "time_step",
+        (0.0, -1.0, math.inf),
+    ),
+    (
+        lambda **settings: System(Rotational(), **settings),
+        "time_step",
+        (0.0, -1.0, math.nan),
+    ),
     (lambda **settings: System(Rotational(), **settings), "substeps", (0, 1.5, -2)),
     (Translational, "mass", (0.0, -0.74, math.nan)),
     (Translational, "frozen_attitude", ((1.0, math.nan), (1.0, 2.0, 3.0))),
@@ -72,15 +100,33 @@ CASES = [
     (Elliptical, "climb_rate", (-math.inf,)),
     (Step, "at", (math.nan,)),
     (Step, "before", ((0.0, 0.0), (0.0, 0.0, math.nan))),
-    (lambda **settings: Waypoints(positions=np.zeros((2, 3)), **settings), "times", ([0.0], [1.0, 0.0])),
-    (lambda **settings: Gust({"vx": 1.0}, **({"start": 0.0, "stop": 1.0} | settings)), "stop", (0.0, -1.0)),
+    (
+        lambda **settings: Waypoints(positions=np.zeros((2, 3)), **settings),
+        "times",
+        ([0.0], [1.0, 0.0]),
+    ),
+    (
+        lambda **settings: Gust(
+            {"vx": 1.0}, **({"start": 0.0, "stop": 1.0} | settings)
+        ),
+        "stop",
+        (0.0, -1.0),
+    ),
     (Gust, "rates", ({"vx": math.nan}, {}, [1.0])),
-    (lambda **settings: Dropout(**({"start": 0.0, "stop": 1.0} | settings)), "start", (math.nan,)),
+    (
+        lambda **settings: Dropout(**({"start": 0.0, "stop": 1.0} | settings)),
+        "start",
+        (math.nan,),
+    ),
     (lambda **settings: Dropout(0.0, 1.0, **settings), "entries", ((0, -1), (0.5,))),
 ]
 
 
-@pytest.mark.parametrize(("make", "setting", "values"), CASES, ids=[f"{i}-{case[1]}" for i, case in enumerate(CASES)])
+@pytest.mark.parametrize(
+    ("make", "setting", "values"),
+    CASES,
+    ids=[f"{i}-{case[1]}" for i, case in enumerate(CASES)],
+)
 def test_a_setting_out_of_its_range_is_refused_by_its_name(make, setting, values):
     for value in values:
         with pytest.raises(SettingError, match=setting):

@@ -19,28 +19,37 @@ def test_positions_and_velocities_follow_the_shape_of_the_times(trajectory):
 
 @pytest.mark.parametrize("trajectory", ALL, ids=lambda t: type(t).__name__)
 def test_the_velocity_is_the_derivative_of_the_position(trajectory):
-    times = np.array([0.37, 1.63, 4.41, 7.77])  # off the samples of Lorenz, off the jump, off the waypoints
+    times = np.array(
+        [0.37, 1.63, 4.41, 7.77]
+    )  # off the samples of Lorenz, off the jump, off the waypoints
     step = 1e-6
     numeric = (trajectory(times + step) - trajectory(times - step)) / (2 * step)
     scale = 1 + np.abs(numeric).max()
     # Lorenz: the dense output of an integration at tolerance 1e-3 obeys the equation to about that.
     assert (
-        np.abs(trajectory.velocity(times) - numeric).max() < (2e-3 if isinstance(trajectory, Lorenz) else 1e-7) * scale
+        np.abs(trajectory.velocity(times) - numeric).max()
+        < (2e-3 if isinstance(trajectory, Lorenz) else 1e-7) * scale
     )
 
 
 def test_the_elliptical_trajectory_is_the_papers():
     j = np.arange(50.0)
-    expected = np.column_stack([15 * np.sin(0.1 * j), 15 * np.cos(0.1 * j), -5 - 0.25 * j])
+    expected = np.column_stack(
+        [15 * np.sin(0.1 * j), 15 * np.cos(0.1 * j), -5 - 0.25 * j]
+    )
     assert np.allclose(Elliptical()(j), expected, atol=1e-13)
 
 
 def test_lorenz_is_sampled_four_times_an_accepted_step_of_an_adaptive_integration():
     times = Lorenz()._samples
     spacing = np.diff(times)[:188].reshape(-1, 4)
-    assert np.allclose(spacing, spacing[:, :1], rtol=1e-9)  # four equal parts of each step
+    assert np.allclose(
+        spacing, spacing[:, :1], rtol=1e-9
+    )  # four equal parts of each step
     assert len(np.unique(spacing[:, 0].round(9))) > 20  # and the steps adapt
-    assert 0.008 < spacing.min() < spacing.max() < 0.035  # the authors' data: 0.011 to 0.028
+    assert (
+        0.008 < spacing.min() < spacing.max() < 0.035
+    )  # the authors' data: 0.011 to 0.028
     path = Lorenz()(np.arange(189.0))
     assert np.abs(path[:, 0]).max() < 14
     assert path[:, 2].min() > 5
@@ -59,7 +68,10 @@ def test_lorenz_outside_its_duration_is_refused():
 def test_waypoints_are_passed_never_overshot_and_held_outside():
     for time, position in zip(WAYPOINTS.times, WAYPOINTS.positions, strict=True):
         assert np.allclose(WAYPOINTS(np.array(time)), position)
-    assert np.allclose(WAYPOINTS(np.array([-5.0, 99.0])), [WAYPOINTS.positions[0], WAYPOINTS.positions[-1]])
+    assert np.allclose(
+        WAYPOINTS(np.array([-5.0, 99.0])),
+        [WAYPOINTS.positions[0], WAYPOINTS.positions[-1]],
+    )
     path = WAYPOINTS(np.linspace(0, 10, 500))
     assert path[:, 0].max() <= 1 + 1e-12
     assert not WAYPOINTS.velocity(np.array([-1.0, 11.0])).any()
@@ -73,11 +85,17 @@ def test_a_step_jumps_at_its_time():
 @pytest.mark.parametrize(
     ("build", "message"),
     [
-        (lambda: Hover([]), "position: a position is a list of finite numbers, one per tracked state"),
+        (
+            lambda: Hover([]),
+            "position: a position is a list of finite numbers, one per tracked state",
+        ),
         (lambda: Hover([1, 2, np.nan]), "list of finite numbers"),
         (lambda: Step(after=[1]), "before, after: a position"),
         (lambda: Waypoints([0, 1], [[0, 0, 0]]), "got 2 times, 1 positions"),
-        (lambda: Waypoints([0, 0], [[0, 0, 0], [1, 1, 1]]), r"strictly increasing \[s\]; got \[0, 0\]"),
+        (
+            lambda: Waypoints([0, 0], [[0, 0, 0], [1, 1, 1]]),
+            r"strictly increasing \[s\]; got \[0, 0\]",
+        ),
     ],
 )
 def test_misuse_is_refused_with_the_rule(build, message):
@@ -87,14 +105,20 @@ def test_misuse_is_refused_with_the_rule(build, message):
 
 def test_lorenz_by_default_is_the_papers_with_its_second_axis_turned():
     """(0.7 X, -0.7 Y, Z) from (-1.79, -3.13, 12.74), Cao, Lai and Alam (2017), (27)."""
-    assert np.allclose(Lorenz()(np.array(0.0)), [0.7 * -1.79, -0.7 * -3.13, 12.74], rtol=1e-14)
+    assert np.allclose(
+        Lorenz()(np.array(0.0)), [0.7 * -1.79, -0.7 * -3.13, 12.74], rtol=1e-14
+    )
 
 
 @pytest.mark.parametrize("samples", [1, 2, 4])
-def test_lorenz_passes_the_ends_of_the_accepted_steps_whatever_the_samples_between_them(samples):
+def test_lorenz_passes_the_ends_of_the_accepted_steps_whatever_the_samples_between_them(
+    samples,
+):
     """Of K samples a step, every K-th is the end of one: the same points of the same integration."""
     ends = Lorenz(samples_per_step=samples, duration=40.0)(samples * np.arange(10.0))
-    assert np.allclose(ends, Lorenz(samples_per_step=4, duration=40.0)(4.0 * np.arange(10)), rtol=1e-12)
+    assert np.allclose(
+        ends, Lorenz(samples_per_step=4, duration=40.0)(4.0 * np.arange(10)), rtol=1e-12
+    )
 
 
 @pytest.mark.parametrize(
@@ -114,5 +138,8 @@ def test_lorenz_is_defined_from_its_start_to_its_duration_both_included(time):
     trajectory = Lorenz(duration=20.0)
     assert np.isfinite(trajectory(np.array([0.0, 20.0]))).all()
     for call in (trajectory, trajectory.velocity):
-        with pytest.raises(SettingError, match="duration: this Lorenz trajectory is defined from 0 to 20 s"):
+        with pytest.raises(
+            SettingError,
+            match="duration: this Lorenz trajectory is defined from 0 to 20 s",
+        ):
             call(np.array([1.0, time]))

@@ -63,7 +63,12 @@ class Moments(NamedTuple):
 
 
 def linearize(
-    packed: Packed | Window, x: Array, u: Array, covariance: bool, offset: Array, adds_state: bool
+    packed: Packed | Window,
+    x: Array,
+    u: Array,
+    covariance: bool,
+    offset: Array,
+    adds_state: bool,
 ) -> tuple[Array, Array, Array, Array | None]:
     """Linearises k GPs with prior means ``offset`` (k,) at K states x (K, n) and inputs u (K, m).
 
@@ -73,15 +78,29 @@ def linearize(
     """
     K, k, n, m = len(x), len(packed.arrays.weights), packed.state_dim, packed.input_dim
     if x.shape != (K, n) or u.shape != (K, m):
-        raise ShapeError(f"the model takes states (K, {n}) and inputs (K, {m}); got {x.shape} and {u.shape}")
-    x, u = np.ascontiguousarray(x, dtype=np.float64), np.ascontiguousarray(u, dtype=np.float64)
+        raise ShapeError(
+            f"the model takes states (K, {n}) and inputs (K, {m}); got {x.shape} and {u.shape}"
+        )
+    x, u = (
+        np.ascontiguousarray(x, dtype=np.float64),
+        np.ascontiguousarray(u, dtype=np.float64),
+    )
     M, A, B = np.empty((K, k)), np.empty((K, k, n)), np.empty((K, k, m))
     V = np.zeros((K if covariance else 0, k, k))
     kept = k * (-(-K // 4) * 4) if covariance else 0
     memory = np.empty((2 * (n + m) + 1 + kept) * packed.arrays.points.shape[1] + 8)
     columns = packed.columns if covariance else V
     offset = np.ascontiguousarray(offset, dtype=np.float64)
-    call_unchecked(linearize_points, packed.arrays, columns, (offset, adds_state), x, u, memory, (M, A, B, V))
+    call_unchecked(
+        linearize_points,
+        packed.arrays,
+        columns,
+        (offset, adds_state),
+        x,
+        u,
+        memory,
+        (M, A, B, V),
+    )
     return M, A, B, V if covariance else None
 
 
@@ -91,12 +110,19 @@ def point_with_jacobian(packed: Packed, x: Array, u: Array) -> Expansion:
     k, n, m = packed.output_dim, packed.state_dim, packed.input_dim
     shapes = [(k,), (k,), (k, n), (k, m), (k, n), (k, m), (k, n, n), (k, n, m)]
     out = Expansion(*[np.empty((len(x), *shape)) for shape in shapes])
-    call_unchecked(expand_points, packed.arrays, packed.precision.inverse_cholesky, x, u, out)
+    call_unchecked(
+        expand_points, packed.arrays, packed.precision.inverse_cholesky, x, u, out
+    )
     return out
 
 
 def moments(
-    packed: Packed, mu: Array, S: Array, u: Array, diagonal: bool = False, derivatives: bool = False
+    packed: Packed,
+    mu: Array,
+    S: Array,
+    u: Array,
+    diagonal: bool = False,
+    derivatives: bool = False,
 ) -> Moments:
     """The exact moments of f, x ~ N(mu, S) with mu (H, n) and positive semidefinite S (H, n, n), at inputs u (H, m).
 
@@ -109,16 +135,42 @@ def moments(
     if S.shape != (H, n, n):
         raise ShapeError(f"S must have shape {(H, n, n)}; got {S.shape}")
     d = k if derivatives else 0
-    shapes = [(k,), (k, k), (k, n), (d, n, n), (d, m), (d, k, n), (d, k, n, n), (d, k, m), (d, n, n, n), (d, n, m)]
+    shapes = [
+        (k,),
+        (k, k),
+        (k, n),
+        (d, n, n),
+        (d, m),
+        (d, k, n),
+        (d, k, n, n),
+        (d, k, m),
+        (d, n, n, n),
+        (d, n, m),
+    ]
     out = Moments(*[np.zeros((H, *shape)) for shape in shapes])
-    call_unchecked(evaluate_moments, derivatives, bool(diagonal), packed.arrays, packed.precision, mu, S, u, out)
+    call_unchecked(
+        evaluate_moments,
+        derivatives,
+        bool(diagonal),
+        packed.arrays,
+        packed.precision,
+        mu,
+        S,
+        u,
+        out,
+    )
     return out
 
 
 def _points(packed: Packed, x: Array, u: Array) -> tuple[Array, Array]:
     """Fresh contiguous (H, n) and (H, m), the one type the kernels are compiled for."""
-    x, u = np.array(x, dtype=np.float64, order="C"), np.array(u, dtype=np.float64, order="C")
+    x, u = (
+        np.array(x, dtype=np.float64, order="C"),
+        np.array(u, dtype=np.float64, order="C"),
+    )
     H, n, m = len(x), packed.state_dim, packed.input_dim
     if x.shape != (H, n) or u.shape != (H, m):
-        raise ShapeError(f"the model takes states (H, {n}) and inputs (H, {m}); got {x.shape} and {u.shape}")
+        raise ShapeError(
+            f"the model takes states (H, {n}) and inputs (H, {m}); got {x.shape} and {u.shape}"
+        )
     return x, u

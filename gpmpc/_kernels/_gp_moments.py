@@ -40,7 +40,17 @@ from gpmpc._kernels._rows import (
     second_moments,
     transform,
 )
-from gpmpc._kernels._simd import NEAR_ZERO, exp, expm1, expm1_near_zero, load, store, total, use_widest_registers, zeros
+from gpmpc._kernels._simd import (
+    NEAR_ZERO,
+    exp,
+    expm1,
+    expm1_near_zero,
+    load,
+    store,
+    total,
+    use_widest_registers,
+    zeros,
+)
 from gpmpc._kernels.linalg import (
     add_product,
     aligned_rows,
@@ -118,19 +128,34 @@ def evaluate_moments(derivatives, diagonal, gp, precision, mu, S, u, out):
             out.M[h, a] = terms.M[a]
             multiply_transposed(terms.G[a], terms.first[a], out.J[h, a])
             if derivatives:
-                to, sums = (out.J[h, a], out.dM_dS[h, a], out.dM_du[h, a]), (terms.first[a], terms.second[a])
-                _differentiate_sum(terms.weighted[a], 1.0, belief, a, terms, sums, work, to)
-                _differentiate_J(belief, a, terms, out.J[h, a], out.dJ_dS[h, a], out.dJ_du[h, a])
+                to, sums = (
+                    (out.J[h, a], out.dM_dS[h, a], out.dM_du[h, a]),
+                    (terms.first[a], terms.second[a]),
+                )
+                _differentiate_sum(
+                    terms.weighted[a], 1.0, belief, a, terms, sums, work, to
+                )
+                _differentiate_J(
+                    belief, a, terms, out.J[h, a], out.dJ_dS[h, a], out.dJ_du[h, a]
+                )
         for a in range(k):
-            reduction = reduce_variance(precision.inverse_cholesky[a], terms.q[a], work.row)
+            reduction = reduce_variance(
+                precision.inverse_cholesky[a], terms.q[a], work.row
+            )
             out.V[h, a, a] = np.exp(gp.log_signal[a]) - reduction
             if derivatives:
                 to = out.dV_dmu[h, a, a], out.dV_dS[h, a, a], out.dV_du[h, a, a]
                 sums = terms.e_first[a], terms.e_second[a]
-                multiply(work.row, terms.q[a], work.row)  # (K_a + sn2_a I)^-1 q_a becomes e
-                terms.e[a] = _differentiate_sum(work.row, -2.0, belief, a, terms, sums, work, to)
+                multiply(
+                    work.row, terms.q[a], work.row
+                )  # (K_a + sn2_a I)^-1 q_a becomes e
+                terms.e[a] = _differentiate_sum(
+                    work.row, -2.0, belief, a, terms, sums, work, to
+                )
             for b in range(a, a + 1 if diagonal else k):
-                P_sum = _evaluate_pair(belief, a, b, terms, precision.centred[a], derivatives, work)
+                P_sum = _evaluate_pair(
+                    belief, a, b, terms, precision.centred[a], derivatives, work
+                )
                 out.V[h, a, b] += P_sum
                 out.V[h, b, a] = out.V[h, a, b]
                 if derivatives:
@@ -141,13 +166,41 @@ def evaluate_moments(derivatives, diagonal, gp, precision, mu, S, u, out):
 
 @njit_inner
 def _make_terms(k, n, padded):
-    vectors, rows = aligned_rows(2 * k * n, padded).reshape(2, k, n, padded), aligned_rows(2 * k, padded)
-    squares, sums, numbers = np.zeros((4, k, n, n)), np.zeros((2, k, n)), np.zeros((3, k))
-    single = vectors[0], vectors[1], rows[:k], rows[k:], squares[0], squares[1], numbers[0], numbers[1]
+    vectors, rows = (
+        aligned_rows(2 * k * n, padded).reshape(2, k, n, padded),
+        aligned_rows(2 * k, padded),
+    )
+    squares, sums, numbers = (
+        np.zeros((4, k, n, n)),
+        np.zeros((2, k, n)),
+        np.zeros((3, k)),
+    )
+    single = (
+        vectors[0],
+        vectors[1],
+        rows[:k],
+        rows[k:],
+        squares[0],
+        squares[1],
+        numbers[0],
+        numbers[1],
+    )
     terms = _OutputTerms(*single, sums[0], squares[2], numbers[2], sums[1], squares[3])
     w, square = aligned_rows(3 * n + 6, padded), np.empty((5, n, n))
-    of_points = w[0], w[1], w[6 : 6 + n], w[6 + n : 6 + 2 * n], w[2], w[3], w[6 + 2 * n :], w[4], w[5]
-    return terms, _Work(*of_points, square[0], square[1], square[2], square[3], square[4])
+    of_points = (
+        w[0],
+        w[1],
+        w[6 : 6 + n],
+        w[6 + n : 6 + 2 * n],
+        w[2],
+        w[3],
+        w[6 + 2 * n :],
+        w[4],
+        w[5],
+    )
+    return terms, _Work(
+        *of_points, square[0], square[1], square[2], square[3], square[4]
+    )
 
 
 @njit_inner
@@ -180,7 +233,13 @@ def _evaluate_output(belief, a, terms, work):
 def _differentiate_sum(v, factor, belief, a, terms, sums, work, to):
     """Writes ``factor`` sum_i v_i dlog q_ai; fills the sums of v_i z_i and v_i z_i z_i', and returns that of v_i."""
     (first, second), (dmu, dS, du) = sums, to
-    n, total, G, D, x = len(belief.S), row_sum(v), terms.G[a], belief.gp.inverse_squares[a], work.x
+    n, total, G, D, x = (
+        len(belief.S),
+        row_sum(v),
+        terms.G[a],
+        belief.gp.inverse_squares[a],
+        work.x,
+    )
     project(v, terms.z[a], first)
     project(v, belief.u, du)
     second_moments(v, terms.z[a], work.other, second)
@@ -189,7 +248,11 @@ def _differentiate_sum(v, factor, belief, a, terms, sums, work, to):
     for c in range(n):
         dmu[c] *= factor
         for d in range(c + 1):
-            value = factor * (x[c, d] + x[d, c] - total * (G[d, c] * D[d] + G[c, d] * D[c])) / 4
+            value = (
+                factor
+                * (x[c, d] + x[d, c] - total * (G[d, c] * D[d] + G[c, d] * D[c]))
+                / 4
+            )
             dS[c, d] = dS[d, c] = value
     for c in range(len(du)):
         du[c] *= factor * D[n + c]
@@ -200,7 +263,12 @@ def _differentiate_sum(v, factor, belief, a, terms, sums, work, to):
 def _differentiate_J(belief, a, terms, J, dJ_dS, dJ_du):
     """dJ/dS = 1/2 sum beta q (w w w - three times G'D with w), dJ/du = sum beta q w c'."""
     (n, padded), G, D = belief.x.shape, terms.G[a], belief.gp.inverse_squares[a]
-    w, work, sums, A = aligned_rows(n, padded), aligned_rows(2, padded), np.empty(n), np.empty((n, n))
+    w, work, sums, A = (
+        aligned_rows(n, padded),
+        aligned_rows(2, padded),
+        np.empty(n),
+        np.empty((n, n)),
+    )
     for c in range(n):
         for d in range(n):
             A[c, d] = G[d, c] * D[d]
@@ -224,7 +292,11 @@ def _evaluate_pair(belief, a, b, terms, E, derivatives, work):
     """Returns sum_ij P_ij; its parts go to ``work``, and so does G_ab."""
     gp, n, T_ab, whiten = belief.gp, len(belief.S), work.F, work.x
     D_a, D_b = gp.inverse_squares[a, :n], gp.inverse_squares[b, :n]
-    r = terms.half_logdet[a] + terms.half_logdet[b] - condition(belief.S, D_a + D_b, whiten, work.G_ab)
+    r = (
+        terms.half_logdet[a]
+        + terms.half_logdet[b]
+        - condition(belief.S, D_a + D_b, whiten, work.G_ab)
+    )
     product(work.G_ab, belief.S, T_ab)
     symmetrize(T_ab)
     # rise_i = r - 1/2 z_ai' T_ab D_b T_a z_ai,   fall_j = -1/2 z_bj' T_ab D_a T_b z_bj
@@ -234,12 +306,18 @@ def _evaluate_pair(belief, a, b, terms, E, derivatives, work):
     work.rise[:] = r
     transform(T_ab, terms.z[a], work.left)
     add_products(D_b * -0.5, work.left, terms.Tz[a], work.rise)
-    weights_i, weights_j = (terms.q[a], terms.q[b]) if a == b else (terms.weighted[a], terms.weighted[b])
+    weights_i, weights_j = (
+        (terms.q[a], terms.q[b]) if a == b else (terms.weighted[a], terms.weighted[b])
+    )
     for d in range(n):
         multiply(weights_i, terms.z[a, d], work.weighted_z[d])
-    across = math.sqrt(largest_square(work.left) * largest_square(terms.z[b]))  # Cauchy and Schwarz
+    across = math.sqrt(
+        largest_square(work.left) * largest_square(terms.z[b])
+    )  # Cauchy and Schwarz
     near = largest_size(work.rise) + largest_size(work.fall) + across <= NEAR_ZERO
-    _sum_pairs(gp.size, a == b, near, derivatives, work, (weights_i, weights_j), terms.z[b], E)
+    _sum_pairs(
+        gp.size, a == b, near, derivatives, work, (weights_i, weights_j), terms.z[b], E
+    )
     multiply(work.p_i, weights_i, work.p_i)
     multiply(work.p_j, weights_j, work.p_j)
     if derivatives:
@@ -258,7 +336,12 @@ def _sum_pairs(size, same, near, derivatives, work, weights, z, E):
         work.p_i[:], work.g[:] = 0.0, 0.0
     at = 0
     for i in range(0, size, 4):
-        w0, w1, w2, w3 = weights_i[i], weights_i[i + 1], weights_i[i + 2], weights_i[i + 3]
+        w0, w1, w2, w3 = (
+            weights_i[i],
+            weights_i[i + 1],
+            weights_i[i + 2],
+            weights_i[i + 3],
+        )
         s0 = s1 = s2 = s3 = zeros()
         for j in range(0, i // 16 * 16 + 16 if same else padded, 16):
             P = _expm1_of_block(near, work.rise, work.fall, work.left, z, i, j)
@@ -268,8 +351,14 @@ def _sum_pairs(size, same, near, derivatives, work, weights, z, E):
             else:
                 R = P
             (a0, b0), (a1, b1), (a2, b2), (a3, b3) = P
-            store(work.p_j, j, load(work.p_j, j) + w0 * a0 + w1 * a1 + w2 * a2 + w3 * a3)
-            store(work.p_j, j + 8, load(work.p_j, j + 8) + w0 * b0 + w1 * b1 + w2 * b2 + w3 * b3)
+            store(
+                work.p_j, j, load(work.p_j, j) + w0 * a0 + w1 * a1 + w2 * a2 + w3 * a3
+            )
+            store(
+                work.p_j,
+                j + 8,
+                load(work.p_j, j + 8) + w0 * b0 + w1 * b1 + w2 * b2 + w3 * b3,
+            )
             if derivatives:
                 u, v = load(weights_j, j), load(weights_j, j + 8)
                 s0, s1 = s0 + a0 * u + b0 * v, s1 + a1 * u + b1 * v
@@ -279,9 +368,16 @@ def _sum_pairs(size, same, near, derivatives, work, weights, z, E):
                     g, y = work.g[d], work.weighted_z[d]
                     y0, y1, y2, y3 = y[i], y[i + 1], y[i + 2], y[i + 3]
                     store(g, j, load(g, j) + y0 * a0 + y1 * a1 + y2 * a2 + y3 * a3)
-                    store(g, j + 8, load(g, j + 8) + y0 * b0 + y1 * b1 + y2 * b2 + y3 * b3)
+                    store(
+                        g, j + 8, load(g, j + 8) + y0 * b0 + y1 * b1 + y2 * b2 + y3 * b3
+                    )
         if derivatives:
-            work.p_i[i], work.p_i[i + 1], work.p_i[i + 2], work.p_i[i + 3] = total(s0), total(s1), total(s2), total(s3)
+            work.p_i[i], work.p_i[i + 1], work.p_i[i + 2], work.p_i[i + 3] = (
+                total(s0),
+                total(s1),
+                total(s2),
+                total(s3),
+            )
 
 
 @inline_njit
@@ -292,11 +388,31 @@ def _expm1_of_block(near, rise, fall, left, z, i, j):
     b0, b1, b2, b3 = b + rise[i], b + rise[i + 1], b + rise[i + 2], b + rise[i + 3]
     for d in range(len(z)):
         a, b, x = load(z[d], j), load(z[d], j + 8), left[d]
-        a0, a1, a2, a3 = a0 + x[i] * a, a1 + x[i + 1] * a, a2 + x[i + 2] * a, a3 + x[i + 3] * a
-        b0, b1, b2, b3 = b0 + x[i] * b, b1 + x[i + 1] * b, b2 + x[i + 2] * b, b3 + x[i + 3] * b
+        a0, a1, a2, a3 = (
+            a0 + x[i] * a,
+            a1 + x[i + 1] * a,
+            a2 + x[i + 2] * a,
+            a3 + x[i + 3] * a,
+        )
+        b0, b1, b2, b3 = (
+            b0 + x[i] * b,
+            b1 + x[i + 1] * b,
+            b2 + x[i + 2] * b,
+            b3 + x[i + 3] * b,
+        )
     if near:
-        a0, a1, a2, a3 = expm1_near_zero(a0), expm1_near_zero(a1), expm1_near_zero(a2), expm1_near_zero(a3)
-        b0, b1, b2, b3 = expm1_near_zero(b0), expm1_near_zero(b1), expm1_near_zero(b2), expm1_near_zero(b3)
+        a0, a1, a2, a3 = (
+            expm1_near_zero(a0),
+            expm1_near_zero(a1),
+            expm1_near_zero(a2),
+            expm1_near_zero(a3),
+        )
+        b0, b1, b2, b3 = (
+            expm1_near_zero(b0),
+            expm1_near_zero(b1),
+            expm1_near_zero(b2),
+            expm1_near_zero(b3),
+        )
     else:
         a0, a1, a2, a3 = expm1(a0), expm1(a1), expm1(a2), expm1(a3)
         b0, b1, b2, b3 = expm1(b0), expm1(b1), expm1(b2), expm1(b3)
@@ -308,11 +424,21 @@ def _multiply_block(values, E, at):
     """E exp(delta) and E expm1(delta), from expm1(delta); ``at`` is where E of these rows and columns stands."""
     (a0, b0), (a1, b1), (a2, b2), (a3, b3) = values
     e0, e1, e2, e3 = load(E, at), load(E, at + 16), load(E, at + 32), load(E, at + 48)
-    f0, f1, f2, f3 = load(E, at + 8), load(E, at + 24), load(E, at + 40), load(E, at + 56)
+    f0, f1, f2, f3 = (
+        load(E, at + 8),
+        load(E, at + 24),
+        load(E, at + 40),
+        load(E, at + 56),
+    )
     a0, a1, a2, a3 = a0 * e0, a1 * e1, a2 * e2, a3 * e3
     b0, b1, b2, b3 = b0 * f0, b1 * f1, b2 * f2, b3 * f3
     P = (a0, b0), (a1, b1), (a2, b2), (a3, b3)
-    return ((a0 + e0, b0 + f0), (a1 + e1, b1 + f1), (a2 + e2, b2 + f2), (a3 + e3, b3 + f3)), P
+    return (
+        (a0 + e0, b0 + f0),
+        (a1 + e1, b1 + f1),
+        (a2 + e2, b2 + f2),
+        (a3 + e3, b3 + f3),
+    ), P
 
 
 @njit_inner

@@ -24,7 +24,12 @@ def _write_offsets(points, x, u, offsets, squares):
     """Writes x~_i - x~ and its squares."""
     n = len(x)
     for d in range(len(points)):
-        at, point, offset, square = x[d] if d < n else u[d - n], points[d], offsets[d], squares[d]
+        at, point, offset, square = (
+            x[d] if d < n else u[d - n],
+            points[d],
+            offsets[d],
+            squares[d],
+        )
         for j in range(len(point)):
             difference = point[j] - at
             offset[j] = difference
@@ -60,7 +65,9 @@ def linearize_points(gp, columns, outer, x, u, memory, out):
     (M, A, B, covariance), (offset, adds_state) = out, outer
     (d, padded), n, outputs = gp.points.shape, x.shape[1], len(gp.weights)
     skip = (-(memory.ctypes.data >> 3)) % 8  # rows start on cache lines
-    memory = memory[skip : skip + (len(memory) - 8) // padded * padded].reshape(-1, padded)
+    memory = memory[skip : skip + (len(memory) - 8) // padded * padded].reshape(
+        -1, padded
+    )
     offsets, squares, weighted = memory[:d], memory[d : 2 * d], memory[2 * d]
     K = len(covariance)
     blocks = (K + 3) // 4 * 4 if K > 1 else K  # points whose k_a are kept, padded
@@ -69,7 +76,9 @@ def linearize_points(gp, columns, outer, x, u, memory, out):
         for a in range(outputs):
             D = gp.inverse_squares[a]
             k = memory[2 * d + 1 + a * blocks + h] if blocks > 0 else weighted
-            M[h, a] = offset[a] + _write_kernel(gp.log_signal[a], D, squares, gp.weights[a], k, weighted)
+            M[h, a] = offset[a] + _write_kernel(
+                gp.log_signal[a], D, squares, gp.weights[a], k, weighted
+            )
             project(weighted, offsets[:n], A[h, a])
             project(weighted, offsets[n:], B[h, a])
             for c in range(n):
@@ -86,7 +95,9 @@ def linearize_points(gp, columns, outer, x, u, memory, out):
             for h in range(len(x), blocks):
                 kept[h, :] = 0.0
             signal = np.exp(gp.log_signal[a])
-            for first in range(0, blocks, 16):  # these and the columns of L stay in the first cache together
+            for first in range(
+                0, blocks, 16
+            ):  # these and the columns of L stay in the first cache together
                 totals[:16] = 0.0
                 reduce_variances(columns[a], gp.size, kept[first : first + 16], totals)
                 for h in range(first, min(first + 16, len(x))):
@@ -100,14 +111,21 @@ def expand_points(gp, inverse_cholesky, x, u, out):
     d, (K, n) = len(gp.points), x.shape
     padded = gp.points.shape[1]
     memory = aligned_rows(2 * d + 4, padded)
-    offsets, squares, k, weighted = memory[:d], memory[d : 2 * d], memory[2 * d], memory[2 * d + 1]
+    offsets, squares, k, weighted = (
+        memory[:d],
+        memory[d : 2 * d],
+        memory[2 * d],
+        memory[2 * d + 1],
+    )
     solved, once = memory[2 * d + 2], memory[2 * d + 3]
     sums, moment = np.empty(d), np.empty(d)
     for h in range(K):
         _write_offsets(gp.points, x[h], u[h], offsets, squares)
         for a in range(len(gp.weights)):
             D = gp.inverse_squares[a]
-            out.M[h, a] = _write_kernel(gp.log_signal[a], D, squares, gp.weights[a], k, weighted)
+            out.M[h, a] = _write_kernel(
+                gp.log_signal[a], D, squares, gp.weights[a], k, weighted
+            )
             reduction = reduce_variance(inverse_cholesky[a], k, solved)
             out.variance[h, a] = max(np.exp(gp.log_signal[a]) - reduction, 0.0)
             # dvar = -2 sum_i [(K_a + sn2_a I)^-1 k_a]_i k_i z_i
@@ -129,6 +147,8 @@ def expand_points(gp, inverse_cholesky, x, u, out):
                 multiply(weighted, offsets[c], once)
                 project(once, offsets, moment)
                 for e in range(n):
-                    out.d2M_dx2[h, a, c, e] = D[c] * D[e] * moment[e] - (D[c] * out.M[h, a] if c == e else 0.0)
+                    out.d2M_dx2[h, a, c, e] = D[c] * D[e] * moment[e] - (
+                        D[c] * out.M[h, a] if c == e else 0.0
+                    )
                 for e in range(n, d):
                     out.d2M_dxdu[h, a, c, e - n] = D[c] * D[e] * moment[e]

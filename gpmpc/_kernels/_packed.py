@@ -66,15 +66,29 @@ class Packed:
         """What exact moments and derivatives of the variance read."""
         (k, padded), size = self.arrays.weights.shape, self.arrays.size
         starts, inverse, centred = range(0, padded, ROWS), [], []
-        for factor, beta in zip(self.cholesky, self.arrays.weights[:, :size], strict=True):
+        for factor, beta in zip(
+            self.cholesky, self.arrays.weights[:, :size], strict=True
+        ):
             square = np.zeros((padded, padded))
             square[:size, :size], _ = scipy.linalg.lapack.dtrtri(factor, lower=1)
-            inverse.append(np.concatenate([square[i : i + ROWS, : i // 8 * 8 + 8].ravel() for i in starts]))
-            precision, _ = scipy.linalg.lapack.dpotri(factor, lower=1)  # the lower triangle
-            square[:size, :size] = np.tril(np.multiply.outer(2 * beta, beta) - 2 * precision)
+            inverse.append(
+                np.concatenate(
+                    [square[i : i + ROWS, : i // 8 * 8 + 8].ravel() for i in starts]
+                )
+            )
+            precision, _ = scipy.linalg.lapack.dpotri(
+                factor, lower=1
+            )  # the lower triangle
+            square[:size, :size] = np.tril(
+                np.multiply.outer(2 * beta, beta) - 2 * precision
+            )
             np.fill_diagonal(square, square.diagonal() / 2)
-            rows = (square[i : i + ROWS, : i // COLUMNS * COLUMNS + COLUMNS] for i in starts)
-            blocks = (row.reshape(ROWS, -1, COLUMNS).swapaxes(0, 1).ravel() for row in rows)
+            rows = (
+                square[i : i + ROWS, : i // COLUMNS * COLUMNS + COLUMNS] for i in starts
+            )
+            blocks = (
+                row.reshape(ROWS, -1, COLUMNS).swapaxes(0, 1).ravel() for row in rows
+            )
             centred.append(np.concatenate(list(blocks)))
         found = Precision(aligned((k, len(inverse[0]))), aligned((k, len(centred[0]))))
         found.inverse_cholesky[:], found.centred[:] = inverse, centred
@@ -82,7 +96,12 @@ class Packed:
 
 
 def pack(
-    features: Array, lengthscales: Array, signal_variance: Array, cholesky: Array, weights: Array, state_dim: int
+    features: Array,
+    lengthscales: Array,
+    signal_variance: Array,
+    cholesky: Array,
+    weights: Array,
+    state_dim: int,
 ) -> Packed:
     """Lays out exact SE-ARD GPs for the compiled kernels.
 
@@ -92,12 +111,20 @@ def pack(
     (size, d), k = features.shape, len(weights)
     got = lengthscales.shape, signal_variance.shape, cholesky.shape, weights.shape
     if got != ((k, d), (k,), (k, size, size), (k, size)):
-        raise ShapeError(f"l (k, d), sf2 (k,), L (k, N, N) and beta (k, N) of points {features.shape}; got {got}")
+        raise ShapeError(
+            f"l (k, d), sf2 (k,), L (k, N, N) and beta (k, N) of points {features.shape}; got {got}"
+        )
     padded = -(-size // COLUMNS) * COLUMNS
     points, padded_weights = aligned((d, padded)), aligned((k, padded))
     points[:, :size], points[:, size:] = features.T, features[-1:].T
     padded_weights[:, :size] = weights
-    arrays = GPArrays(points, np.ascontiguousarray(lengthscales**-2.0), np.log(signal_variance), padded_weights, size)
+    arrays = GPArrays(
+        points,
+        np.ascontiguousarray(lengthscales**-2.0),
+        np.log(signal_variance),
+        padded_weights,
+        size,
+    )
     return Packed(arrays, cholesky, state_dim, d - state_dim)
 
 

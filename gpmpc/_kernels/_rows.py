@@ -1,7 +1,14 @@
 """Sums and products of vectors over the training points: rows of P numbers, P a multiple of 16."""
 
 from gpmpc._compiled import inline_njit, njit_noalloc
-from gpmpc._kernels._simd import larger, largest, load, store, use_widest_registers, zeros
+from gpmpc._kernels._simd import (
+    larger,
+    largest,
+    load,
+    store,
+    use_widest_registers,
+    zeros,
+)
 from gpmpc._kernels.linalg import dot
 
 
@@ -104,7 +111,10 @@ def reduce_variance(triangle, q, solved):
     for i in range(0, len(q), 4):
         length = i // 8 * 8 + 8
         row0, row1 = triangle[at : at + length], triangle[at + length : at + 2 * length]
-        row2, row3 = triangle[at + 2 * length : at + 3 * length], triangle[at + 3 * length : at + 4 * length]
+        row2, row3 = (
+            triangle[at + 2 * length : at + 3 * length],
+            triangle[at + 3 * length : at + 4 * length],
+        )
         v0 = v1 = v2 = v3 = 0.0
         for j in range(length):
             v0 += row0[j] * q[j]
@@ -112,7 +122,9 @@ def reduce_variance(triangle, q, solved):
             v2 += row2[j] * q[j]
             v3 += row3[j] * q[j]
         for j in range(length):
-            solved[j] = solved[j] + v0 * row0[j] + v1 * row1[j] + v2 * row2[j] + v3 * row3[j]
+            solved[j] = (
+                solved[j] + v0 * row0[j] + v1 * row1[j] + v2 * row2[j] + v3 * row3[j]
+            )
         total += v0 * v0 + v1 * v1 + v2 * v2 + v3 * v3
         at += 4 * length
     return total
@@ -128,10 +140,19 @@ def reduce_variances(columns, size, q, totals):
     j = 0
     while j + 4 <= size:
         c0, c1, c2, c3 = columns[j], columns[j + 1], columns[j + 2], columns[j + 3]
-        at = max(0, size - (size - j - 4 + 7) // 8 * 8)  # whole registers; what comes before j + 4 is done with
+        at = max(
+            0, size - (size - j - 4 + 7) // 8 * 8
+        )  # whole registers; what comes before j + 4 is done with
         d0, d1, d2, d3 = c0[at:], c1[at:], c2[at:], c3[at:]
-        for h in range(0, len(q) - 3, 4):  # with a bound of len(q) // 4 * 4 LLVM makes loops that take twice as long
-            r0, r1, r2, r3 = q[h, at:size], q[h + 1, at:size], q[h + 2, at:size], q[h + 3, at:size]
+        for h in range(
+            0, len(q) - 3, 4
+        ):  # with a bound of len(q) // 4 * 4 LLVM makes loops that take twice as long
+            r0, r1, r2, r3 = (
+                q[h, at:size],
+                q[h + 1, at:size],
+                q[h + 2, at:size],
+                q[h + 3, at:size],
+            )
             e0, e1, e2, e3 = _solve_four(c0, c1, c2, c3, j, q[h])
             f0, f1, f2, f3 = _solve_four(c0, c1, c2, c3, j, q[h + 1])
             g0, g1, g2, g3 = _solve_four(c0, c1, c2, c3, j, q[h + 2])

@@ -13,7 +13,13 @@ from typing import Any
 
 from llvmlite import ir
 from numba.core import cgutils, types
-from numba.extending import intrinsic, lower_builtin, models, register_model, type_callable
+from numba.extending import (
+    intrinsic,
+    lower_builtin,
+    models,
+    register_model,
+    type_callable,
+)
 
 from gpmpc._compiled import inline_njit
 
@@ -21,7 +27,10 @@ _WIDTH = 8
 
 _VECTOR = ir.VectorType(ir.DoubleType(), _WIDTH)
 _INTEGERS = ir.VectorType(ir.IntType(64), _WIDTH)
-_FLAGS = ("contract", "nsz")  # not "reassoc": it would cancel the constant that rounds in ``exp``
+_FLAGS = (
+    "contract",
+    "nsz",
+)  # not "reassoc": it would cancel the constant that rounds in ``exp``
 
 
 class Lanes(types.Type):
@@ -48,11 +57,16 @@ def _define(result: types.Type, *operands: Any) -> Callable[[Callable], Any]:
 
     def make(write: Callable) -> Any:
         def typed(typing_context, *given):
-            kinds = [own if kind is types.Array else kind for kind, own in zip(operands, given, strict=True)]
+            kinds = [
+                own if kind is types.Array else kind
+                for kind, own in zip(operands, given, strict=True)
+            ]
 
             def generate(context, builder, signature, arguments):
                 values = [
-                    context.make_array(kind)(context, builder, value) if isinstance(kind, types.Array) else value
+                    context.make_array(kind)(context, builder, value)
+                    if isinstance(kind, types.Array)
+                    else value
                     for kind, value in zip(kinds, arguments, strict=True)
                 ]
                 value = write(builder, *values)
@@ -61,7 +75,9 @@ def _define(result: types.Type, *operands: Any) -> Callable[[Callable], Any]:
             return result(*kinds), generate
 
         typed.__name__, typed.__doc__ = write.__name__, write.__doc__
-        signature: Any = typed  # numba reads from it the names of the arguments after the first
+        signature: Any = (
+            typed  # numba reads from it the names of the arguments after the first
+        )
         signature.__signature__ = inspect.signature(write)
         return intrinsic(typed)
 
@@ -73,13 +89,19 @@ def _constant(value, kind=_VECTOR):
 
 
 def _spread(builder, value, kind=_VECTOR):
-    first = builder.insert_element(ir.Constant(kind, ir.Undefined), value, ir.IntType(32)(0))
-    return builder.shuffle_vector(first, first, ir.Constant(ir.VectorType(ir.IntType(32), _WIDTH), [0] * _WIDTH))
+    first = builder.insert_element(
+        ir.Constant(kind, ir.Undefined), value, ir.IntType(32)(0)
+    )
+    return builder.shuffle_vector(
+        first, first, ir.Constant(ir.VectorType(ir.IntType(32), _WIDTH), [0] * _WIDTH)
+    )
 
 
 def _rotate(builder, values, distance):
     order = [(i + distance) % _WIDTH for i in range(_WIDTH)]
-    return builder.shuffle_vector(values, values, ir.Constant(ir.VectorType(ir.IntType(32), _WIDTH), order))
+    return builder.shuffle_vector(
+        values, values, ir.Constant(ir.VectorType(ir.IntType(32), _WIDTH), order)
+    )
 
 
 def _pointer(builder, array, index):
@@ -88,7 +110,10 @@ def _pointer(builder, array, index):
 
 def _larger(builder, values, others):
     kind = ir.FunctionType(_VECTOR, [_VECTOR])
-    size = builder.call(cgutils.get_or_insert_function(builder.module, kind, "llvm.fabs.v8f64"), [others])
+    size = builder.call(
+        cgutils.get_or_insert_function(builder.module, kind, "llvm.fabs.v8f64"),
+        [others],
+    )
     return builder.select(builder.fcmp_ordered(">", size, values), size, values)
 
 
@@ -103,13 +128,19 @@ def _define_operator(function, instruction):
     def type_operator(context):
         def typer(left, right):
             operands = {left, right}
-            return LANES if LANES in operands and operands <= {LANES, types.float64} else None
+            return (
+                LANES
+                if LANES in operands and operands <= {LANES, types.float64}
+                else None
+            )
 
         return typer
 
     def generate(context, builder, signature, arguments):
         pairs = zip(arguments, signature.args, strict=True)
-        operands = [value if kind == LANES else _spread(builder, value) for value, kind in pairs]
+        operands = [
+            value if kind == LANES else _spread(builder, value) for value, kind in pairs
+        ]
         return getattr(builder, instruction)(*operands, flags=_FLAGS)
 
     for kinds in ((LANES, LANES), (LANES, types.float64), (types.float64, LANES)):
@@ -139,9 +170,13 @@ def load_some(builder, array, index):
     """The entries ``array[index : index + 8]``; zeros where the array has ended."""
     place = _pointer(builder, array, index)
     left = _spread(builder, builder.sub(array.nitems, index), _INTEGERS)
-    present = builder.icmp_signed("<", ir.Constant(_INTEGERS, list(range(_WIDTH))), left)
+    present = builder.icmp_signed(
+        "<", ir.Constant(_INTEGERS, list(range(_WIDTH))), left
+    )
     kind = ir.FunctionType(_VECTOR, [place.type, ir.IntType(32), present.type, _VECTOR])
-    function = cgutils.get_or_insert_function(builder.module, kind, "llvm.masked.load.v8f64.p0v8f64")
+    function = cgutils.get_or_insert_function(
+        builder.module, kind, "llvm.masked.load.v8f64.p0v8f64"
+    )
     return builder.call(function, [place, ir.IntType(32)(8), present, _constant(0.0)])
 
 
@@ -169,7 +204,9 @@ def clip(builder, values, low, high):
 def any_nonzero(builder, values):
     """Whether an entry is not zero, as NaN is not."""
     nonzero = builder.fcmp_unordered("!=", values, _constant(0.0))
-    return builder.icmp_unsigned("!=", builder.bitcast(nonzero, ir.IntType(_WIDTH)), ir.IntType(_WIDTH)(0))
+    return builder.icmp_unsigned(
+        "!=", builder.bitcast(nonzero, ir.IntType(_WIDTH)), ir.IntType(_WIDTH)(0)
+    )
 
 
 @_define(LANES, LANES)
@@ -279,7 +316,9 @@ def sine(x, quarters=0.0):
     c = c * z + -0.0013888888888888887
     c = (c * z + 0.041666666666666664) * (z * z) + (1.0 - z * 0.5)
     n = n + quarters
-    half = _floor_of_half(n)  # an odd n takes the cosine of r, and an odd half of it is negative
+    half = _floor_of_half(
+        n
+    )  # an odd n takes the cosine of r, and an odd half of it is negative
     odd, negative = n - half * 2.0, half - _floor_of_half(half) * 2.0
     return clip((s * (1.0 - odd) + c * odd) * (1.0 - negative * 2.0), -1.0, 1.0)
 

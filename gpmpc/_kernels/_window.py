@@ -35,28 +35,45 @@ class Window:
     state_dim: int  #: n
     input_dim: int  #: m
     rows: int = 0  #: of L that there are, N where the GPs are to predict
-    _free: list[None] = field(default_factory=lambda: [None])  #: has an item until a later window writes to ``columns``
+    _free: list[None] = field(
+        default_factory=lambda: [None]
+    )  #: has an item until a later window writes to ``columns``
 
     @classmethod
-    def empty(cls, lengthscales: Array, signal_variance: Array, state_dim: int, capacity: int) -> "Window":
+    def empty(
+        cls, lengthscales: Array, signal_variance: Array, state_dim: int, capacity: int
+    ) -> "Window":
         """GPs with length-scales (k, d) and sf2 (k,), for ``capacity`` points, without any."""
         k, d = lengthscales.shape
         data = np.zeros((d + 3 * k, 0))
-        arrays = GPArrays(data[:d], lengthscales**-2.0, np.log(signal_variance), data[:k], 0)
+        arrays = GPArrays(
+            data[:d], lengthscales**-2.0, np.log(signal_variance), data[:k], 0
+        )
         return cls(arrays, data, _no_columns(k, capacity), state_dim, d - state_dim)
 
     def without(self, gone: Sequence[int]) -> "Window":
         """The GPs without some points, and as yet without a row of the factor."""
-        data = np.ascontiguousarray(np.delete(self.data[:, : self.arrays.size], gone, axis=1))
-        arrays, columns = self.arrays._replace(size=data.shape[1]), _no_columns(*self.columns.shape[:2])
+        data = np.ascontiguousarray(
+            np.delete(self.data[:, : self.arrays.size], gone, axis=1)
+        )
+        arrays, columns = (
+            self.arrays._replace(size=data.shape[1]),
+            _no_columns(*self.columns.shape[:2]),
+        )
         return Window(arrays, data, columns, self.state_dim, self.input_dim)
 
-    def append(self, point: Array, target: Array, noise: Array, rows: int | None = None) -> "Window":
+    def append(
+        self, point: Array, target: Array, noise: Array, rows: int | None = None
+    ) -> "Window":
         """The GPs with a further point (d,), its target (k,) and the variance of its noise (k,).
 
         ``rows`` says how many rows of the factor there are to be. Raises SettingError where it does not exist.
         """
-        (k, d), N, columns = self.arrays.inverse_squares.shape, self.arrays.size + 1, self.columns
+        (k, d), N, columns = (
+            self.arrays.inverse_squares.shape,
+            self.arrays.size + 1,
+            self.columns,
+        )
         P = -(-N // COLUMNS) * COLUMNS
         data = aligned((d + 3 * k, P))
         arrays = self.arrays._replace(points=data[:d], weights=data[-k:], size=N)
@@ -64,17 +81,27 @@ class Window:
             self._free.pop()
         except IndexError:  # another window has followed on this one
             own, known = _no_columns(*columns.shape[:2]), slice(self.rows)
-            own[:, known, known], own[:, known, -2:] = columns[:, known, known], columns[:, known, -2:]
+            own[:, known, known], own[:, known, -2:] = (
+                columns[:, known, known],
+                columns[:, known, -2:],
+            )
             columns = own
         rows, new = N if rows is None else rows, np.concatenate([point, target, noise])
-        if not call_unchecked(_append, self.data, new, data, arrays, columns, self.rows, rows):
-            raise SettingError("noise", "is too small beside the signal: a kernel matrix is not positive definite")
+        if not call_unchecked(
+            _append, self.data, new, data, arrays, columns, self.rows, rows
+        ):
+            raise SettingError(
+                "noise",
+                "is too small beside the signal: a kernel matrix is not positive definite",
+            )
         return Window(arrays, data, columns, self.state_dim, self.input_dim, rows)
 
 
 def _no_columns(outputs: int, capacity: int) -> Array:
     capacity = -(-capacity // COLUMNS) * COLUMNS
-    return aligned((outputs * capacity, capacity + 8)).reshape(outputs, capacity, capacity + 8)
+    return aligned((outputs * capacity, capacity + 8)).reshape(
+        outputs, capacity, capacity + 8
+    )
 
 
 @compiled
@@ -87,23 +114,37 @@ def _append(before, new, data, gps, columns, first, last):
     memory = aligned_rows(d + 2, P)
     squares, q, sums = memory[:d], memory[d], memory[d + 1]
     for a in range(k):
-        factor, targets, noises, beta = columns[a], data[d + a], data[d + k + a], gps.weights[a]
+        factor, targets, noises, beta = (
+            columns[a],
+            data[d + a],
+            data[d + k + a],
+            gps.weights[a],
+        )
         for i in range(first, last):
             size = i // 8 * 8 + 8
             for c in range(d):
                 point, square, at = gps.points[c], squares[c], gps.points[c, i]
                 for j in range(size):
                     square[j] = (point[j] - at) * (point[j] - at)
-            _write_kernel(gps.log_signal[a], gps.inverse_squares[a], squares, beta, q[:size], sums)
+            _write_kernel(
+                gps.log_signal[a], gps.inverse_squares[a], squares, beta, q[:size], sums
+            )
             rest, y = q[i] + noises[i], targets[i]
             for j in range(0, i, 4):  # columns from i on have zeros yet
                 c0, c1, c2, c3 = factor[j], factor[j + 1], factor[j + 2], factor[j + 3]
                 w0 = q[j] * c0[-2]
                 w1 = (q[j + 1] - w0 * c0[j + 1]) * c1[-2]
                 w2 = (q[j + 2] - w0 * c0[j + 2] - w1 * c1[j + 2]) * c2[-2]
-                w3 = (q[j + 3] - w0 * c0[j + 3] - w1 * c1[j + 3] - w2 * c2[j + 3]) * c3[-2]
+                w3 = (q[j + 3] - w0 * c0[j + 3] - w1 * c1[j + 3] - w2 * c2[j + 3]) * c3[
+                    -2
+                ]
                 for m in range((j + 4) // 8 * 8, size, 8):
-                    known = w0 * load(c0, m) + w1 * load(c1, m) + w2 * load(c2, m) + w3 * load(c3, m)
+                    known = (
+                        w0 * load(c0, m)
+                        + w1 * load(c1, m)
+                        + w2 * load(c2, m)
+                        + w3 * load(c3, m)
+                    )
                     store(q, m, load(q, m) - known)
                 rest -= w0 * w0 + w1 * w1 + w2 * w2 + w3 * w3
                 y -= w0 * c0[-1] + w1 * c1[-1] + w2 * c2[-1] + w3 * c3[-1]
@@ -114,11 +155,18 @@ def _append(before, new, data, gps, columns, first, last):
             factor[i, i], factor[i, -2], factor[i, -1] = root, 1.0 / root, y / root
         for j in range((N - 1) // 4 * 4, -1 if last == N else N, -4):  # L' beta = v
             c0, c1, c2, c3 = factor[j], factor[j + 1], factor[j + 2], factor[j + 3]
-            four_dots((c0[j + 4 :], c1[j + 4 :], c2[j + 4 :], c3[j + 4 :]), beta[j + 4 :], N - j - 4, sums)
+            four_dots(
+                (c0[j + 4 :], c1[j + 4 :], c2[j + 4 :], c3[j + 4 :]),
+                beta[j + 4 :],
+                N - j - 4,
+                sums,
+            )
             w3 = (c3[-1] - sums[3]) * c3[-2]
             w2 = (c2[-1] - sums[2] - c2[j + 3] * w3) * c2[-2]
             w1 = (c1[-1] - sums[1] - c1[j + 3] * w3 - c1[j + 2] * w2) * c1[-2]
-            w0 = (c0[-1] - sums[0] - c0[j + 3] * w3 - c0[j + 2] * w2 - c0[j + 1] * w1) * c0[-2]
+            w0 = (
+                c0[-1] - sums[0] - c0[j + 3] * w3 - c0[j + 2] * w2 - c0[j + 1] * w1
+            ) * c0[-2]
             beta[j], beta[j + 1], beta[j + 2], beta[j + 3] = w0, w1, w2, w3
     return True
 
@@ -134,7 +182,10 @@ def drop_point(columns, gone, after):
             row = after[a, j]
             row[:j] = 0.0
             if j < gone:
-                row[j:gone], row[gone:] = columns[a, j, j:gone], columns[a, j, gone + 1 :]
+                row[j:gone], row[gone:] = (
+                    columns[a, j, j:gone],
+                    columns[a, j, gone + 1 :],
+                )
                 continue
             old = columns[a, j + 1]
             radius = np.hypot(old[j + 1], moved[j])

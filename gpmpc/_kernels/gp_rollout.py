@@ -58,7 +58,12 @@ def _write_means(f, offset, at, memory, means):
     """
     use_widest_registers()
     (dimensions, count), outputs = f.points.shape, len(offset)
-    points, weights, D, first = f.points.reshape(-1), f.weights.reshape(-1), f.inverse_squares, 8 * dimensions
+    points, weights, D, first = (
+        f.points.reshape(-1),
+        f.weights.reshape(-1),
+        f.inverse_squares,
+        8 * dimensions,
+    )
     for a in range(outputs):
         store(memory, first + 8 * a, zeros())
     for j in range(0, count, 8):
@@ -70,7 +75,11 @@ def _write_means(f, offset, at, memory, means):
             for d in range(dimensions):
                 exponent = exponent - (0.5 * D[a, d]) * load(memory, 8 * d)
             place = first + 8 * a
-            store(memory, place, load(memory, place) + exp(exponent) * load(weights, a * count + j))
+            store(
+                memory,
+                place,
+                load(memory, place) + exp(exponent) * load(weights, a * count + j),
+            )
     for a in range(outputs):
         means[a] = offset[a] + total(load(memory, first + 8 * a))
 
@@ -85,9 +94,19 @@ def roll_out_gps(model, feedback, start, disturbance, states, inputs):
     f, offset, A, G, c, B, columns, kinds, chosen, tape = model
     (T, H, m), n, d, k_dim = inputs.shape, start.shape[1], len(columns), len(offset)
     work = aligned_rows(2, 8 + d + len(chosen) + k_dim)
-    at, value, sums = work[0], work[1], aligned_rows(d + len(chosen) + k_dim, 8).reshape(-1)
-    memory = aligned_rows(2 * n + m + tape.work + 5, 8)  # eight roll-outs side by side, for the tape
-    point, known, places = memory[: n + m], memory[n + m : 2 * n + m], memory[2 * n + m :]
+    at, value, sums = (
+        work[0],
+        work[1],
+        aligned_rows(d + len(chosen) + k_dim, 8).reshape(-1),
+    )
+    memory = aligned_rows(
+        2 * n + m + tape.work + 5, 8
+    )  # eight roll-outs side by side, for the tape
+    point, known, places = (
+        memory[: n + m],
+        memory[n + m : 2 * n + m],
+        memory[2 * n + m :],
+    )
     memory[: 2 * n + m] = 0.0
     for t in range(T):
         copy(start[t], states[t, 0])
@@ -102,7 +121,10 @@ def roll_out_gps(model, feedback, start, disturbance, states, inputs):
                     for j in range(n):
                         wanted += gains[i, j] * (x[j] - planned[j])
                     last = inputs[t, k - 1, i] if k > 0 else feedback.previous_input[i]
-                    wanted = min(max(wanted, last + feedback.rate_lower[k, i]), last + feedback.rate_upper[k, i])
+                    wanted = min(
+                        max(wanted, last + feedback.rate_lower[k, i]),
+                        last + feedback.rate_upper[k, i],
+                    )
                     u[i] = min(max(wanted, feedback.lower[k, i]), feedback.upper[k, i])
                     point[n + i, t - first] = u[i]
                 for i in range(n):
@@ -113,11 +135,22 @@ def roll_out_gps(model, feedback, start, disturbance, states, inputs):
                 x, u, after = states[t, k], inputs[t, k], states[t, k + 1]
                 for i in range(d):
                     z = x[columns[i]]
-                    at[i] = math.sin(z) if kinds[i] == SINE else math.cos(z) if kinds[i] == COSINE else z
+                    at[i] = (
+                        math.sin(z)
+                        if kinds[i] == SINE
+                        else math.cos(z)
+                        if kinds[i] == COSINE
+                        else z
+                    )
                 for i in range(len(chosen)):
                     at[d + i] = u[chosen[i]]
                 if k_dim > 0:
                     _write_means(f, offset, at, sums, value)
                 for i in range(n):
                     added = known[i, t - first] + c[i] + disturbance[i]
-                    after[i] = added + dot(A[i], x, n) + dot(G[i], u, m) + dot(B[i], value, k_dim)
+                    after[i] = (
+                        added
+                        + dot(A[i], x, n)
+                        + dot(G[i], u, m)
+                        + dot(B[i], value, k_dim)
+                    )

@@ -87,7 +87,10 @@ def combine_rows(rows, count, factors, start, width, out):
             g, h = g + f3 * load(r3, at), h + f3 * load(r3, at + 8)
             j += 4
         while j < count:
-            a, b = a + factors[j] * load(rows[j], at), b + factors[j] * load(rows[j], at + 8)
+            a, b = (
+                a + factors[j] * load(rows[j], at),
+                b + factors[j] * load(rows[j], at + 8),
+            )
             j += 1
         store(out, at, (a + c) + (e + g))
         store(out, at + 8, (b + d) + (f + h))
@@ -96,8 +99,14 @@ def combine_rows(rows, count, factors, start, width, out):
         a = b = c = d = zeros()
         j = 0
         while j + 4 <= count:
-            a, b = a + factors[j] * load(rows[j], at), b + factors[j + 1] * load(rows[j + 1], at)
-            c, d = c + factors[j + 2] * load(rows[j + 2], at), d + factors[j + 3] * load(rows[j + 3], at)
+            a, b = (
+                a + factors[j] * load(rows[j], at),
+                b + factors[j + 1] * load(rows[j + 1], at),
+            )
+            c, d = (
+                c + factors[j + 2] * load(rows[j + 2], at),
+                d + factors[j + 3] * load(rows[j + 3], at),
+            )
             j += 4
         while j < count:
             a = a + factors[j] * load(rows[j], at)

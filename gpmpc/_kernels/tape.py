@@ -18,10 +18,40 @@ from gpmpc._kernels.linalg import aligned_rows
 Array = NDArray[np.float64]
 
 # The operations, by CasADi's numbers for them.
-ASSIGN, ADD, SUB, MUL, DIV, NEG, EXP, LOG, POW, CONSTPOW, SQRT, SQ, TWICE, SIN, COS, TAN = range(16)
-ATAN, FABS, FMIN, FMAX, INV, TANH, ATAN2, CONST, INPUT, OUTPUT = 18, 29, 34, 35, 36, 39, 43, 44, 45, 46
+(
+    ASSIGN,
+    ADD,
+    SUB,
+    MUL,
+    DIV,
+    NEG,
+    EXP,
+    LOG,
+    POW,
+    CONSTPOW,
+    SQRT,
+    SQ,
+    TWICE,
+    SIN,
+    COS,
+    TAN,
+) = range(16)
+ATAN, FABS, FMIN, FMAX, INV, TANH, ATAN2, CONST, INPUT, OUTPUT = (
+    18,
+    29,
+    34,
+    35,
+    36,
+    39,
+    43,
+    44,
+    45,
+    46,
+)
 TWO_OPERANDS = (ADD, SUB, MUL, DIV, POW, CONSTPOW, FMIN, FMAX, ATAN2)
-OPERATIONS = frozenset({*range(16), ATAN, FABS, FMIN, FMAX, INV, TANH, ATAN2, CONST, INPUT, OUTPUT})
+OPERATIONS = frozenset(
+    {*range(16), ATAN, FABS, FMIN, FMAX, INV, TANH, ATAN2, CONST, INPUT, OUTPUT}
+)
 
 
 class Tape(NamedTuple):
@@ -49,19 +79,34 @@ def run_tape(tape, z, work, value, slopes):
     for i in range(tape.size):
         store(value, 8 * i, zeros())
     for k in range(len(tape.code)):
-        operation, i, j, last = tape.code[k, 0], 8 * tape.code[k, 1], 8 * tape.code[k, 2], 8 * tape.code[k, 3]
+        operation, i, j, last = (
+            tape.code[k, 0],
+            8 * tape.code[k, 1],
+            8 * tape.code[k, 2],
+            8 * tape.code[k, 3],
+        )
         if operation == OUTPUT:
             store(value, i, load(work, j))
             if slopes is not None:
                 for c in range(0, 8 * d, 8):
                     store(slopes[0], i * d + c, load(slopes[1], j * d + c))
         elif operation in (INPUT, CONST):
-            store(work, i, load(z, j) if operation == INPUT else zeros() + tape.constants[k])
+            store(
+                work,
+                i,
+                load(z, j) if operation == INPUT else zeros() + tape.constants[k],
+            )
             if slopes is not None:
                 for c in range(0, 8 * d, 8):
-                    store(slopes[1], i * d + c, zeros() + (1.0 if operation == INPUT and c == j else 0.0))
+                    store(
+                        slopes[1],
+                        i * d + c,
+                        zeros() + (1.0 if operation == INPUT and c == j else 0.0),
+                    )
         else:
-            found, by_first, by_second = _operate(operation, load(work, j), load(work, last), work, 8 * tape.work)
+            found, by_first, by_second = _operate(
+                operation, load(work, j), load(work, last), work, 8 * tape.work
+            )
             store(work, i, found)
             if slopes is not None:
                 both = operation in TWO_OPERANDS
@@ -77,7 +122,11 @@ def linearize_tape(tape, points, values, jacobians):
     """Writes the values (K, size) at K points z (K, d), and their derivatives (K, size, d)."""
     use_widest_registers()
     (K, d), size = points.shape, tape.size
-    z, work, value = aligned_rows(d, 8), aligned_rows(tape.work + 5, 8), aligned_rows(size, 8)
+    z, work, value = (
+        aligned_rows(d, 8),
+        aligned_rows(tape.work + 5, 8),
+        aligned_rows(size, 8),
+    )
     derivative, tangents = aligned_rows(size * d, 8), aligned_rows(tape.work * d, 8)
     derivative[:] = 0.0
     for first in range(0, K, 8):
@@ -142,7 +191,11 @@ def _operate_rarely(operation, a, b):
         return math.log(a) if a > 0.0 else np.nan, _over(1.0, a), 0.0
     if operation in (POW, CONSTPOW):
         value = a**b
-        return value, b * a ** (b - 1.0), math.log(a) * value if operation == POW and a > 0.0 else 0.0
+        return (
+            value,
+            b * a ** (b - 1.0),
+            math.log(a) * value if operation == POW and a > 0.0 else 0.0,
+        )
     if operation == SQRT:
         root = math.sqrt(a) if a >= 0.0 else np.nan
         return root, _over(0.5, root), 0.0

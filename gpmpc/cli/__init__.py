@@ -24,7 +24,9 @@ def main() -> None:
         else:
             sys.__unraisablehook__(lost)
 
-    ignored = signal.getsignal(signal.SIGINT) is not signal.default_int_handler  # as under nohup
+    ignored = (
+        signal.getsignal(signal.SIGINT) is not signal.default_int_handler
+    )  # as under nohup
     if not ignored:
         signal.signal(signal.SIGINT, interrupt)
         if hasattr(signal, "setitimer"):  # not on Windows
@@ -40,10 +42,14 @@ def main() -> None:
     except BaseException as error:  # whatever a library made of the interrupt
         if not interrupts:
             raise
-        advice = f"; {error}" if isinstance(error, KeyboardInterrupt) and error.args else ""
+        advice = (
+            f"; {error}" if isinstance(error, KeyboardInterrupt) and error.args else ""
+        )
         with suppress(OSError):
             print(f"\ninterrupted{advice}", file=sys.stderr)
         sys.exit(130)
     finally:
         if not ignored:
-            signal.signal(signal.SIGINT, signal.SIG_DFL)  # ends what is still being tidied up, without a traceback
+            signal.signal(
+                signal.SIGINT, signal.SIG_DFL
+            )  # ends what is still being tidied up, without a traceback

@@ -54,7 +54,9 @@ def _settings(name: str, before: Sequence[str], word: str) -> list[str]:
     """Returns settings, one level at a time, or the options of a group; of a sweep, behind the last comma."""
     with settings():
         groups, names = group_options(name), setting_names(name)
-        with suppress(Exception):  # what was typed before may be no setting yet, or a sweep
+        with suppress(
+            Exception
+        ):  # what was typed before may be no setting yet, or a sweep
             names = setting_names(name, [each for each in before if "=" in each])
     key, equals, value = word.partition("=")
     if equals:
@@ -63,9 +65,21 @@ def _settings(name: str, before: Sequence[str], word: str) -> list[str]:
         head = value[: value.rfind(",") + 1]
         return [f"{key}={head}{option}" for option in groups.get(key, [])]
     nodes, parent = {each.rpartition(".")[0] for each in names}, key.rpartition(".")[0]
-    level = [each for each in names if each.rpartition(".")[0] == parent and not each.endswith("_")]  # as _target_
-    leaves = [f"{each}=" for each in dict.fromkeys([*groups, *level]) if each in groups or each not in nodes]
-    return leaves + [f"{each}." for each in level if each in nodes and (each not in groups or each == word)]
+    level = [
+        each
+        for each in names
+        if each.rpartition(".")[0] == parent and not each.endswith("_")
+    ]  # as _target_
+    leaves = [
+        f"{each}="
+        for each in dict.fromkeys([*groups, *level])
+        if each in groups or each not in nodes
+    ]
+    return leaves + [
+        f"{each}."
+        for each in level
+        if each in nodes and (each not in groups or each == word)
+    ]
 
 
 def _files(word: str) -> list[str]:

@@ -14,7 +14,15 @@ from gpmpc.cli._log import CUT
 from gpmpc.cli._settings import settings, write_files, writing
 from gpmpc.cli._terminal import print_error
 from gpmpc.exceptions import DataError, RecordingError, check_number
-from gpmpc.plotting import animate, calibration_figure, film, inputs_figure, png, timing_figure, tracking_figure
+from gpmpc.plotting import (
+    animate,
+    calibration_figure,
+    film,
+    inputs_figure,
+    png,
+    timing_figure,
+    tracking_figure,
+)
 from gpmpc.recording import Run, read_run
 from gpmpc.studies._document import Document, Table, terminal
 from gpmpc.studies._run_folder import RECORDING
@@ -22,7 +30,11 @@ from gpmpc.studies._run_folder import RECORDING
 if TYPE_CHECKING:
     from gpmpc.studies.flight import Experiment
 
-_LEVELS = 0.5, 0.9, 0.95  # of the intervals that a calibration draws; the last is printed
+_LEVELS = (
+    0.5,
+    0.9,
+    0.95,
+)  # of the intervals that a calibration draws; the last is printed
 
 
 def plot(given: argparse.Namespace) -> Result:
@@ -55,15 +67,23 @@ def _plot(given: argparse.Namespace, path: Path, folder: Path) -> dict[str, Any]
     run, written = read_run(path), []
     if not len(run.times):
         raise DataError(f"{path}: holds no step")
-    animated = given.film or (not given.no_animation and {"x", "y", "z"} <= run.pose.keys())
+    animated = given.film or (
+        not given.no_animation and {"x", "y", "z"} <= run.pose.keys()
+    )
     draw = partial(film, system=_experiment_of(run).flown) if given.film else animate
     with writing(folder, "to"), Console().status("drawing"):
         folder.mkdir(parents=True, exist_ok=True)
-        figures = {"tracking": tracking_figure(run), "inputs": inputs_figure(run), "timing": timing_figure(run)}
+        figures = {
+            "tracking": tracking_figure(run),
+            "inputs": inputs_figure(run),
+            "timing": timing_figure(run),
+        }
         for name, figure in figures.items():
             figure.savefig(folder / f"{name}.{given.format}", dpi=150)
             written.append(f"{name}.{given.format}")
-        for ending in ("gif", *["mp4"] * bool(shutil.which("ffmpeg"))) if animated else ():
+        for ending in (
+            ("gif", *["mp4"] * bool(shutil.which("ffmpeg"))) if animated else ()
+        ):
             draw(run, path=folder / f"flight.{ending}")
             written.append(f"flight.{ending}")
     note = "" if run.finished else f"; {len(run.times)} steps: the recording is {CUT}"
@@ -75,7 +95,9 @@ def _experiment_of(run: Run) -> "Experiment":
     """Makes what the settings in a recording describe."""
     config: Any = OmegaConf.create(run.config)
     if not {"system", "controller", "folder"} <= config.keys():
-        raise DataError(f"{run.path}: holds no settings, which gpmpc run puts into its recordings")
+        raise DataError(
+            f"{run.path}: holds no settings, which gpmpc run puts into its recordings"
+        )
     from gpmpc.cli._run import experiment_of  # loads torch, which figures do without
 
     with settings():
@@ -92,35 +114,74 @@ def calibrate(given: argparse.Namespace) -> Result:
     check_number("--steps", given.steps, least=1, whole=True)
     console, (first, *others) = Console(), _recordings(given.run)
     if others:
-        raise DataError(f"{given.run}: holds {1 + len(others)} runs; name the one whose model it is")
-    experiment, folder = _experiment_of(read_run(first)), given.to or first.parent / "calibration"
+        raise DataError(
+            f"{given.run}: holds {1 + len(others)} runs; name the one whose model it is"
+        )
+    experiment, folder = (
+        _experiment_of(read_run(first)),
+        given.to or first.parent / "calibration",
+    )
     system, model = experiment.system, experiment.model
-    flights = [read_run(path) for tree in given.flights or [first] for path in _recordings(tree)]
+    flights = [
+        read_run(path)
+        for tree in given.flights or [first]
+        for path in _recordings(tree)
+    ]
     for run in flights:
-        if (run.state_names, run.input_names) != (system.state_names, system.input_names):
+        if (run.state_names, run.input_names) != (
+            system.state_names,
+            system.input_names,
+        ):
             raise DataError(f"{run.path}: has other states or inputs than {first}")
         if len(run.times) < 2 or (run.steps[1:] != run.steps[:-1] + 1).any():
             raise DataError(f"{run.path}: has fewer than two steps, or one is missing")
     if not experiment.learns or hasattr(experiment.learning, "episodes"):
-        raise DataError(f"{first}: its controller learned no model, or learned it from whole flights")
+        raise DataError(
+            f"{first}: its controller learned no model, or learned it from whole flights"
+        )
     if model is None:
         with one_thread(), console.status("learning"):
-            model = experiment.learn(experiment.training_rows(), experiment.seed).posterior
-    flown = [calibration.Recording(torch.tensor(run.states), torch.tensor(run.inputs[:-1])) for run in flights]
+            model = experiment.learn(
+                experiment.training_rows(), experiment.seed
+            ).posterior
+    flown = [
+        calibration.Recording(torch.tensor(run.states), torch.tensor(run.inputs[:-1]))
+        for run in flights
+    ]
     horizon = min(given.steps, max(map(len, flown)))
     names = [f"{name} [{system.units.get(name, '?')}]" for name in system.state_names]
     with console.status("predicting"):
-        found = calibration.calibrate(model, flown, horizon=horizon, levels=_LEVELS, names=names)
+        found = calibration.calibrate(
+            model, flown, horizon=horizon, levels=_LEVELS, names=names
+        )
     rows = []
     for k in sorted({step for step in (1, 10, 50) if step <= horizon} | {horizon}):
         for i, name in enumerate(names):
             low, high = found.coverage_interval(k - 1, i, -1)
             held = f"{found.coverage[k - 1, i, -1]:.1%}", f"{low:.1%} to {high:.1%}"
-            rows.append([f"{k} ahead", name, float(found.rmse[k - 1, i]), *held, float(found.width[k - 1, i])])
-    table = Table(["steps", "state", "RMSE", "in 95 %", "exact interval", "width"], rows, sections=True)
+            rows.append(
+                [
+                    f"{k} ahead",
+                    name,
+                    float(found.rmse[k - 1, i]),
+                    *held,
+                    float(found.width[k - 1, i]),
+                ]
+            )
+    table = Table(
+        ["steps", "state", "RMSE", "in 95 %", "exact interval", "width"],
+        rows,
+        sections=True,
+    )
     lead = f"{found.samples[0]} predictions of {', '.join(str(run.path) for run in flights)}"
     images = {"calibration.png": png(calibration_figure(found))}
-    document = Document(f"How well the model of {first} predicts", [table], found.to_pandas(), lead, images=images)
+    document = Document(
+        f"How well the model of {first} predicts",
+        [table],
+        found.to_pandas(),
+        lead,
+        images=images,
+    )
     where = write_files(folder, document.files("calibration"), "to")
     console.print(terminal([table]))
     console.out(where, highlight=False)
@@ -129,17 +190,36 @@ def calibrate(given: argparse.Namespace) -> Result:
 
 def report(given: argparse.Namespace) -> Result:
     """Writes a tree of runs as one table with figures, and whether two groups of them differ."""
-    from gpmpc.studies.report import compare, notes, read_report, report_document, sentences, terminal_table
+    from gpmpc.studies.report import (
+        compare,
+        notes,
+        read_report,
+        report_document,
+        sentences,
+        terminal_table,
+    )
 
     console, folder = Console(), given.to or given.tree / "report"
     with console.status("reading runs and drawing"):
         found = read_report(given.tree)
-        lines = sentences(found, compare(found, *given.compare), *given.compare) if given.compare else []
+        lines = (
+            sentences(found, compare(found, *given.compare), *given.compare)
+            if given.compare
+            else []
+        )
         document = report_document(found, lines, folder)
-        where = write_files(folder, document.files("report") | {"report.html": document.html()}, "to")
+        where = write_files(
+            folder, document.files("report") | {"report.html": document.html()}, "to"
+        )
     console.print(terminal([terminal_table(found)]))
     for kind, items in notes(found).items():
         lines += [f"{kind.lower()}: {item}" for item in items]
     lines += [f"to fill: {command}" for command in found.commands()]
     console.out(*lines, where, sep="\n", highlight=False)
-    return Result({"folder": str(folder), "cells": document.data.to_dict("records"), "lines": lines})
+    return Result(
+        {
+            "folder": str(folder),
+            "cells": document.data.to_dict("records"),
+            "lines": lines,
+        }
+    )

@@ -15,8 +15,18 @@ from gpmpc.recording import Run, layout, read_run, recover
 from gpmpc.studies._document import Document, Table, plain_text, terminal
 
 CUT = "unfinished or damaged; this is what could be read"
-_ENDINGS = {"recover": (".mcap",), "export": (".csv", ".parquet"), "layout": (".json",), "inspect": (".html",)}
-_SUFFIXES = {"recover": ".recovered.mcap", "export": ".csv", "layout": ".layout.json", "inspect": ".inspection.html"}
+_ENDINGS = {
+    "recover": (".mcap",),
+    "export": (".csv", ".parquet"),
+    "layout": (".json",),
+    "inspect": (".html",),
+}
+_SUFFIXES = {
+    "recover": ".recovered.mcap",
+    "export": ".csv",
+    "layout": ".layout.json",
+    "inspect": ".inspection.html",
+}
 
 
 def log(given: argparse.Namespace) -> Result:
@@ -28,14 +38,19 @@ def log(given: argparse.Namespace) -> Result:
         return _info(file)
     output = given.output or file.parent / f"{file.stem}{_SUFFIXES[action]}"
     if given.output and action != "recover" and output.suffix not in _ENDINGS[action]:
-        raise SettingError("output", f"must end in {' or '.join(_ENDINGS[action])}; got {output.name!r}")
+        raise SettingError(
+            "output",
+            f"must end in {' or '.join(_ENDINGS[action])}; got {output.name!r}",
+        )
     if action == "inspect":
         return _inspect(file, output, given.mapping)
     if action == "recover":
         run = recover(file, output)
         seconds = np.ptp(run.times) if len(run.times) else 0.0
         note = f"{sum(count for count, _ in run.channels.values())} messages over {seconds:g} s"
-        note += "; the recording was finished, nothing was missing" if run.finished else ""
+        note += (
+            "; the recording was finished, nothing was missing" if run.finished else ""
+        )
     elif action == "layout":
         _write(output, layout(read_run(file)))
         note = f"open {file} in Foxglove or Lichtblick, then import it as a layout"
@@ -51,11 +66,22 @@ def log(given: argparse.Namespace) -> Result:
 def _info(file: Path) -> Result:
     run, console = read_run(file), Console()
     facts = _facts(run)
-    hint = "" if "recovered" in run.metadata else " (gpmpc log recover makes it readable for other tools)"
+    hint = (
+        ""
+        if "recovered" in run.metadata
+        else " (gpmpc log recover makes it readable for other tools)"
+    )
     state = "finished" if run.finished else f"{CUT}{hint}"
     console.print(f"{file}: {state}", soft_wrap=True, highlight=False, markup=False)
-    metadata = [(n, k, v) for n, pairs in run.metadata.items() if n != "units" for k, v in pairs.items()]
-    channels = [(topic, schema, count) for topic, (count, schema) in run.channels.items()]
+    metadata = [
+        (n, k, v)
+        for n, pairs in run.metadata.items()
+        if n != "units"
+        for k, v in pairs.items()
+    ]
+    channels = [
+        (topic, schema, count) for topic, (count, schema) in run.channels.items()
+    ]
     tables = [
         Table(head, [[plain_text(str(cell)) for cell in row] for row in rows])
         for head, rows in (
@@ -67,22 +93,38 @@ def _info(file: Path) -> Result:
     ]
     console.print(terminal(tables))
     counts = {topic: count for topic, (count, _) in run.channels.items()}
-    return Result({"finished": run.finished, "channels": counts, **facts, "metadata": dict(run.metadata)})
+    return Result(
+        {
+            "finished": run.finished,
+            "channels": counts,
+            **facts,
+            "metadata": dict(run.metadata),
+        }
+    )
 
 
 def _facts(run: Run) -> dict[str, str]:
     """The numbers of a run in words."""
     units = run.metadata.get("units", {})
     names = [("states", "state", run.state_names), ("inputs", "input", run.input_names)]
-    facts = {title: ", ".join(f"{n} [{units.get(f'{g}.{n}', '?')}]" for n in group) for title, g, group in names}
+    facts = {
+        title: ", ".join(f"{n} [{units.get(f'{g}.{n}', '?')}]" for n in group)
+        for title, g, group in names
+    }
     K = len(run.times)
     facts["steps"] = str(K)
     if K:
         facts["time"] = f"{run.times[0]:g} to {run.times[-1]:g} s"
-        counts = {status: run.statuses.count(status) for status in dict.fromkeys(run.statuses)}
-        facts["statuses"] = ", ".join(f"{status.name} {count}" for status, count in counts.items())
+        counts = {
+            status: run.statuses.count(status) for status in dict.fromkeys(run.statuses)
+        }
+        facts["statuses"] = ", ".join(
+            f"{status.name} {count}" for status, count in counts.items()
+        )
         facts["not applied"] = str(int(run.failed.sum()))
-        median, worst = (1e3 * float(f(run.timings[:, -1])) for f in (np.median, np.max))
+        median, worst = (
+            1e3 * float(f(run.timings[:, -1])) for f in (np.median, np.max)
+        )
         facts["decision"] = f"median {median:.3g} ms, longest {worst:.3g} ms"
         facts["problems"] = f"{len(run.problems)} kept for replay"
     facts["configuration"] = f"{len(run.config.splitlines())} lines"
@@ -98,16 +140,23 @@ def _table_file(run: Run, ending: str) -> str | bytes:
     try:
         return frame.to_parquet(index=False)
     except ImportError as error:
-        raise GpmpcError("Parquet needs pyarrow: pip install 'gpmpc[report]'") from error
+        raise GpmpcError(
+            "Parquet needs pyarrow: pip install 'gpmpc[report]'"
+        ) from error
 
 
 def _inspect(file: Path, output: Path, mapping_file: Path | None) -> Result:
-    from gpmpc.logs import LogMapping, inspect_log  # loads torch, which what is above does without
+    from gpmpc.logs import (
+        LogMapping,
+        inspect_log,
+    )  # loads torch, which what is above does without
     from gpmpc.plotting import inspection_figure, png
 
     mapping = LogMapping.load(mapping_file) if mapping_file else None
     found = inspect_log(file, mapping)
-    follows = pd.DataFrame([*found.follows.items()], columns=["input", "explained by the states"])
+    follows = pd.DataFrame(
+        [*found.follows.items()], columns=["input", "explained by the states"]
+    )
     frames = {
         "Streams": found.streams,
         "Channels": found.channels.reset_index(),
@@ -128,8 +177,16 @@ def _inspect(file: Path, output: Path, mapping_file: Path | None) -> Result:
     )
     _write(output, page.html())
     Console().print(terminal(tables[:2]))
-    Console(soft_wrap=True, highlight=False, markup=False).print(*found.warnings, f"written to {output}", sep="\n")
-    return Result({"output": str(output), "warnings": [*found.warnings], "channels": page.data.to_dict("records")})
+    Console(soft_wrap=True, highlight=False, markup=False).print(
+        *found.warnings, f"written to {output}", sep="\n"
+    )
+    return Result(
+        {
+            "output": str(output),
+            "warnings": [*found.warnings],
+            "channels": page.data.to_dict("records"),
+        }
+    )
 
 
 def _write(output: Path, content: str | bytes) -> None:

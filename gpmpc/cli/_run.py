@@ -37,10 +37,34 @@ from gpmpc.studies.flight import Experiment, metrics, run_trial, summary
 from gpmpc.studies.study import one_thread
 from gpmpc.systems import System
 
-ASIDE = ("launcher", "folder", "live", "tracker")  # settings that a result does not depend on
-_GROUPS = ("data", "trajectory", "system", "model", "controller", "propagation", "solver", "learning")
-_MISTAKES = (SettingError, ShapeError, DataError, InstantiationException, OmegaConfBaseException)
-_CHOICES = {"recorder": ("mcap", "none"), "tracker": ("mlflow", "none"), "live": (True, False)}
+ASIDE = (
+    "launcher",
+    "folder",
+    "live",
+    "tracker",
+)  # settings that a result does not depend on
+_GROUPS = (
+    "data",
+    "trajectory",
+    "system",
+    "model",
+    "controller",
+    "propagation",
+    "solver",
+    "learning",
+)
+_MISTAKES = (
+    SettingError,
+    ShapeError,
+    DataError,
+    InstantiationException,
+    OmegaConfBaseException,
+)
+_CHOICES = {
+    "recorder": ("mcap", "none"),
+    "tracker": ("mlflow", "none"),
+    "live": (True, False),
+}
 _LOST = 3  # exit code of a run that is finished, and whose flight was lost
 _LONGEST = 6000  # characters of a parameter that MLflow takes
 
@@ -49,7 +73,9 @@ def run(config: DictConfig) -> Result:
     """Flies, prints the results and where they are kept; the task behind ``conf/run.yaml``."""
     console = Console()
     with console.status("flying"), report_compilation():
-        experiment_of(config)  # what a user can get wrong is found before anything is written
+        experiment_of(
+            config
+        )  # what a user can get wrong is found before anything is written
         outcome = run_one(config)
     if "error" in outcome:
         print_error(f"{outcome['error']} (traceback: {outcome['folder']}/error.json)")
@@ -57,7 +83,10 @@ def run(config: DictConfig) -> Result:
     console.print(terminal([summary(outcome["result"])]))
     state = "finished before" if outcome["skipped"] else "written to"
     console.out(f"{state}: {outcome['folder']}", highlight=False)
-    return Result(outcome["result"] | {"folder": outcome["folder"]}, _LOST if outcome["result"].get("lost") else 0)
+    return Result(
+        outcome["result"] | {"folder": outcome["folder"]},
+        _LOST if outcome["result"].get("lost") else 0,
+    )
 
 
 def run_one(config: DictConfig, wait: bool = True) -> dict[str, Any]:
@@ -79,7 +108,10 @@ def run_one(config: DictConfig, wait: bool = True) -> dict[str, Any]:
             if _was_interrupted(error):
                 raise KeyboardInterrupt from error
             folder.fail(error, about)
-            return outcome | {"error": one_line(error), "mistake": isinstance(error, _MISTAKES)}
+            return outcome | {
+                "error": one_line(error),
+                "mistake": isinstance(error, _MISTAKES),
+            }
         if config.tracker == "mlflow":
             try:
                 log_to_mlflow(folder.path, result)
@@ -95,31 +127,65 @@ def _was_interrupted(error: BaseException | None) -> bool:
     return error is not None
 
 
-def _fly(experiment: Experiment, folder: RunFolder, config: DictConfig, about: dict[str, Any]) -> dict[str, Any]:
+def _fly(
+    experiment: Experiment, folder: RunFolder, config: DictConfig, about: dict[str, Any]
+) -> dict[str, Any]:
     """Trains, flies and records; returns the metrics."""
     if config.recorder != "mcap":
         return metrics(experiment, run_trial(experiment))
     system, text = experiment.system, OmegaConf.to_yaml(config, resolve=True)
-    known = {"seed": experiment.seed, "command": about["provenance"]["command"], "system": system.name}
+    known = {
+        "seed": experiment.seed,
+        "command": about["provenance"]["command"],
+        "system": system.name,
+    }
     known |= {"tracked": " ".join(system.tracked), "angles": " ".join(system.angles)}
     episodes = range(1, 1 + getattr(experiment.learning, "episodes", 0))
-    paths = iter([folder.path / name for name in [*(f"episode_{k}.mcap" for k in episodes), RECORDING]])
+    paths = iter(
+        [
+            folder.path / name
+            for name in [*(f"episode_{k}.mcap" for k in episodes), RECORDING]
+        ]
+    )
     with ExitStack() as stack:
 
         def prepare(controller: Any, training: Any) -> Callable[[Any], None]:
-            bounds = [side[0] for side in controller.problem.inputs.by_stage(controller.horizon)]
-            noise = {"noise_std": " ".join(map(str, experiment.unplanned_noise(training).tolist()))}
-            recorded, settings = RecordedSystem.of(system, bounds), {"config": text, "live": config.live}
-            recorder = McapRecorder(next(paths), recorded, metadata=known | noise, **settings)
+            bounds = [
+                side[0]
+                for side in controller.problem.inputs.by_stage(controller.horizon)
+            ]
+            noise = {
+                "noise_std": " ".join(
+                    map(str, experiment.unplanned_noise(training).tolist())
+                )
+            }
+            recorded, settings = (
+                RecordedSystem.of(system, bounds),
+                {"config": text, "live": config.live},
+            )
+            recorder = McapRecorder(
+                next(paths), recorded, metadata=known | noise, **settings
+            )
             stack.enter_context(recorder)
             if recorder.address:
-                print(f"live view: open {recorder.address} in Foxglove or Lichtblick", file=sys.stderr, flush=True)
-            gp_size, began = 0 if training is None else len(training.posterior), time.monotonic()
+                print(
+                    f"live view: open {recorder.address} in Foxglove or Lichtblick",
+                    file=sys.stderr,
+                    flush=True,
+                )
+            gp_size, began = (
+                0 if training is None else len(training.posterior),
+                time.monotonic(),
+            )
 
             def on_step(step: Any) -> None:
                 recorder.record(replace(step, gp_size=step.gp_size or gp_size))
                 if config.live:  # every step lasts as long as the plant's, so that a viewer can follow
-                    time.sleep(max(0.0, began + step.time + system.time_step - time.monotonic()))
+                    time.sleep(
+                        max(
+                            0.0, began + step.time + system.time_step - time.monotonic()
+                        )
+                    )
 
             return on_step
 
@@ -133,30 +199,46 @@ def experiment_of(config: DictConfig) -> Experiment:
     _check(config)
     system = _system_of(config.system)
     if known := config.nominal:
-        known = _system_of(known if "_target_" in known else OmegaConf.merge(config.system, known))
+        known = _system_of(
+            known if "_target_" in known else OmegaConf.merge(config.system, known)
+        )
         system = replace(system, nominal=known)
     with open_dict(config):
         for group, part in (("propagation", "propagator"), ("solver", "solver")):
             if config.get(group) and part not in config.controller:
-                raise SettingError(group, "this controller has none to choose; leave it out")
+                raise SettingError(
+                    group, "this controller has none to choose; leave it out"
+                )
             if config.get(group):
                 config.controller[part] = config[group]
         size = config.data.pop("size")
         _fill(config.controller, initial_input=system.initial_input)
         problem = config.controller.problem
         if problem.cost.get("Q") is None or problem.cost.get("R") is None:
-            raise SettingError("controller.problem.cost", f"has no weights Q and R; {system.name} is to bring them")
+            raise SettingError(
+                "controller.problem.cost",
+                f"has no weights Q and R; {system.name} is to bring them",
+            )
         _fill(problem.cost, angles=system.angle_indices)
         _fill(problem.inputs, lower=system.input_lower, upper=system.input_upper)
     ((name, trajectory),) = config.trajectory.items()
-    parts = {key: instantiate(config[key], _convert_="all") for key in ("data", "controller", "disturbances")}
-    other = {key: value for key, value in (config.plant or {}).items() if value != config.system.get(key)}
+    parts = {
+        key: instantiate(config[key], _convert_="all")
+        for key in ("data", "controller", "disturbances")
+    }
+    other = {
+        key: value
+        for key, value in (config.plant or {}).items()
+        if value != config.system.get(key)
+    }
     trained = instantiate(config.model, _convert_="all")
     saved = isinstance(trained, SavedModel)
     if saved:
         trained.check(system)
     if known and getattr(trained, "predicts", None) != "difference":
-        raise SettingError("nominal", "needs model=difference_gp, which learns what it misses")
+        raise SettingError(
+            "nominal", "needs model=difference_gp, which learns what it misses"
+        )
     return Experiment(
         **parts,
         trajectory=instantiate(trajectory, _convert_="all"),
@@ -168,7 +250,9 @@ def experiment_of(config: DictConfig) -> Experiment:
         size=size,
         propagator=getattr(parts["controller"], "keywords", {}).get("propagator"),
         noise=Noise(**config.noise) if any(config.noise.values()) else None,
-        learning=instantiate(config.learning, _convert_="all") if config.get("learning") else None,
+        learning=instantiate(config.learning, _convert_="all")
+        if config.get("learning")
+        else None,
         **{key: config[key] for key in ("steps", "seed", "loop", "on_failure")},
     )
 
@@ -178,19 +262,27 @@ def _check(config: DictConfig) -> None:
     folder_of(config.folder)
     check_number("horizon", config.horizon, least=1, whole=True)
     if not OmegaConf.is_list(config.disturbances):
-        raise SettingError("disturbances", f"must be a list; got {config.disturbances!r}")
+        raise SettingError(
+            "disturbances", f"must be a list; got {config.disturbances!r}"
+        )
     for key, choices in _CHOICES.items():
         if config[key] not in (*choices, None):
-            raise SettingError(key, f"must be {' or '.join(map(repr, choices))}; got {config[key]!r}")
+            raise SettingError(
+                key, f"must be {' or '.join(map(repr, choices))}; got {config[key]!r}"
+            )
     if config.tracker == "mlflow" and find_spec("mlflow") is None:
         raise SettingError("tracker", "needs MLflow: pip install mlflow")
     if config.live and config.recorder != "mcap":
-        raise SettingError("live", f"needs recorder=mcap; got recorder={config.recorder}")
+        raise SettingError(
+            "live", f"needs recorder=mcap; got recorder={config.recorder}"
+        )
     for group in ("data", "trajectory", "system", "model", "controller"):
         if not config.get(group):
             raise SettingError(group, "choose one")
     if len(config.trajectory) != 1:
-        raise SettingError("trajectory", f"choose one; got {', '.join(config.trajectory)}")
+        raise SettingError(
+            "trajectory", f"choose one; got {', '.join(config.trajectory)}"
+        )
 
 
 def _fill(config: DictConfig, **values: Any) -> None:
@@ -215,7 +307,9 @@ def plain_settings(config: DictConfig, chosen: Mapping[str, Any]) -> dict[str, A
     if path := settings["model"].get("path"):
         settings["model"]["sha256"] = sha256(Path(path).read_bytes()).hexdigest()
     options = {group: chosen.get(group) for group in _GROUPS}
-    return {key: value for key, value in settings.items() if key not in ASIDE} | {"options": options}
+    return {key: value for key, value in settings.items() if key not in ASIDE} | {
+        "options": options
+    }
 
 
 def plain_data(config: DictConfig) -> dict[str, Any]:
@@ -230,7 +324,11 @@ def choices(overrides: Sequence[str]) -> list[str]:
     for override in OverridesParser.create().parse_overrides(list(overrides)):
         key = override.get_key_element()
         if key not in ASIDE and not key.lstrip("+~").startswith(("hydra.", "hydra/")):
-            found[key] = key if override.is_delete() else f"{key}={override.get_value_element_as_str()}"
+            found[key] = (
+                key
+                if override.is_delete()
+                else f"{key}={override.get_value_element_as_str()}"
+            )
     return sorted(found.values())
 
 
@@ -245,12 +343,30 @@ def log_to_mlflow(folder: Path, result: Mapping[str, Any]) -> None:
     def name(key: str) -> str:  # in letters that MLflow takes
         return re.sub(r"[^\w\-. /]", "_", key, flags=re.ASCII)
 
-    found = flattened({key: value for key, value in result.items() if key not in ("settings", "provenance", "choices")})
-    numbers = {key: float(value) for key, value in found.items() if isinstance(value, int | float)}
-    settings = {name(key): str(value)[:_LONGEST] for key, value in flattened(result["settings"]).items()}
-    if "MLFLOW_EXPERIMENT_NAME" not in os.environ and "MLFLOW_EXPERIMENT_ID" not in os.environ:
+    found = flattened(
+        {
+            key: value
+            for key, value in result.items()
+            if key not in ("settings", "provenance", "choices")
+        }
+    )
+    numbers = {
+        key: float(value)
+        for key, value in found.items()
+        if isinstance(value, int | float)
+    }
+    settings = {
+        name(key): str(value)[:_LONGEST]
+        for key, value in flattened(result["settings"]).items()
+    }
+    if (
+        "MLFLOW_EXPERIMENT_NAME" not in os.environ
+        and "MLFLOW_EXPERIMENT_ID" not in os.environ
+    ):
         mlflow.set_experiment("gpmpc")
     with mlflow.start_run(run_name=folder.name):
         mlflow.log_params(settings)
-        mlflow.log_metrics({name(key): value for key, value in numbers.items() if math.isfinite(value)})
+        mlflow.log_metrics(
+            {name(key): value for key, value in numbers.items() if math.isfinite(value)}
+        )
         mlflow.log_artifacts(str(folder))

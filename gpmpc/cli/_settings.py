@@ -22,8 +22,16 @@ import gpmpc
 from gpmpc._files import write_whole
 from gpmpc.exceptions import GpmpcError, SettingError
 
-ENDINGS = (".safetensors", ".safetensors'", '.safetensors"')  # of files of models, quoted or not
-_EXTRAS = {"submitit_slurm": "slurm", "submitit_local": "slurm", "ray": "ray"}  # that bring a launcher
+ENDINGS = (
+    ".safetensors",
+    ".safetensors'",
+    '.safetensors"',
+)  # of files of models, quoted or not
+_EXTRAS = {
+    "submitit_slurm": "slurm",
+    "submitit_local": "slurm",
+    "ray": "ray",
+}  # that bring a launcher
 
 
 def folder_of(folder: Any) -> Path:
@@ -39,10 +47,14 @@ def writing(folder: Path, key: str = "folder") -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise SettingError(key, f"cannot write to {folder}: {error.strerror or error}") from error
+        raise SettingError(
+            key, f"cannot write to {folder}: {error.strerror or error}"
+        ) from error
 
 
-def write_files(folder: Path, files: Mapping[str, str | bytes], key: str = "folder") -> str:
+def write_files(
+    folder: Path, files: Mapping[str, str | bytes], key: str = "folder"
+) -> str:
     """Writes files, each in one piece, and makes the folder; returns the line that says so."""
     with writing(folder, key):
         for name, content in files.items():
@@ -67,7 +79,9 @@ def settings(own: str | None = None) -> Iterator[None]:
     try:
         here = os.getcwd()
     except OSError as error:
-        raise GpmpcError("the working folder is gone; change to one that exists") from error
+        raise GpmpcError(
+            "the working folder is gone; change to one that exists"
+        ) from error
     if here not in sys.path:
         sys.path.append(here)
     if own is not None:
@@ -80,7 +94,9 @@ def settings(own: str | None = None) -> Iterator[None]:
                 search_path.append("command-line", f"file://{folder.absolute()}")
 
         Plugins.instance().register(OwnFolder)
-    with hydra.initialize_config_dir(version_base="1.3", config_dir=str(config_folder())):
+    with hydra.initialize_config_dir(
+        version_base="1.3", config_dir=str(config_folder())
+    ):
         yield
 
 
@@ -94,7 +110,11 @@ def compose(name: str, overrides: Sequence[str] = ()) -> DictConfig:
 def model_file(override: str) -> list[str]:
     """Returns an override; in the place of ``model=FILE``, of a file or several, the option that reads it."""
     key, _, value = override.partition("=")
-    return ["model=saved", f"model.path={value}"] if key == "model" and value.endswith(ENDINGS) else [override]
+    return (
+        ["model=saved", f"model.path={value}"]
+        if key == "model" and value.endswith(ENDINGS)
+        else [override]
+    )
 
 
 def without_hydra(config: DictConfig) -> DictConfig:
@@ -110,25 +130,41 @@ def setting_names(name: str, overrides: Sequence[str] = ()) -> list[str]:
     def keys(node: object, prefix: str = "") -> list[str]:
         if not isinstance(node, dict):
             return []
-        return [key for k, value in node.items() for key in (f"{prefix}{k}", *keys(value, f"{prefix}{k}."))]
+        return [
+            key
+            for k, value in node.items()
+            for key in (f"{prefix}{k}", *keys(value, f"{prefix}{k}."))
+        ]
 
-    return keys(OmegaConf.to_container(hydra.compose(name, [*overrides]), resolve=False))
+    return keys(
+        OmegaConf.to_container(hydra.compose(name, [*overrides]), resolve=False)
+    )
 
 
 def group_options(name: str) -> dict[str, list[str]]:
     """Returns the options of every group that ``conf/NAME.yaml`` chooses from; not every command has every group."""
     defaults = OmegaConf.load(config_folder() / f"{name}.yaml").defaults
-    keys = [key for entry in defaults if OmegaConf.is_dict(entry) for key in entry if not key.startswith("override ")]
+    keys = [
+        key
+        for entry in defaults
+        if OmegaConf.is_dict(entry)
+        for key in entry
+        if not key.startswith("override ")
+    ]
     options = GlobalHydra.instance().config_loader().get_group_options
     found = {key: options(key.partition("@")[0]) for key in sorted(keys)}
-    for other in (entry for entry in defaults if isinstance(entry, str) and entry != "_self_"):
+    for other in (
+        entry for entry in defaults if isinstance(entry, str) and entry != "_self_"
+    ):
         found |= group_options(other)
     return found
 
 
 def help_text(name: str) -> str:
     """Returns what ``gpmpc COMMAND --help`` prints: how it is used, its choices, every setting with its value."""
-    choices = "\n".join(f"{key}: {', '.join(options)}" for key, options in group_options(name).items())
+    choices = "\n".join(
+        f"{key}: {', '.join(options)}" for key, options in group_options(name).items()
+    )
     every, header = OmegaConf.to_yaml(compose(name)), HydraConfig.get().help.header
     return f"{header}\n\nChoices:\n\n{choices}\n\nEvery setting, with its default:\n\n{every}"
 
@@ -141,7 +177,9 @@ def explain(error: Exception, name: str) -> str | None:
         return _of_settings(error, name)
     if isinstance(error, OSError):
         return f"{error.filename}: {error.strerror}" if error.filename else str(error)
-    if name and isinstance(error, TypeError | ValueError | ArithmeticError):  # a value that no check foresaw
+    if name and isinstance(
+        error, TypeError | ValueError | ArithmeticError
+    ):  # a value that no check foresaw
         reason = " ".join(str(error).split()) or type(error).__name__
         return f"{reason}; is a setting of the wrong kind? --debug shows where"
     return None
@@ -150,8 +188,13 @@ def explain(error: Exception, name: str) -> str | None:
 def nearest(name: str, known: Iterable[str]) -> str:
     """Returns what a misspelt name stands for, as a question; of a name without dots the last parts are compared."""
     part = (lambda key: key) if "." in name else (lambda key: key.rpartition(".")[2])
-    close = difflib.get_close_matches(name.lower(), {part(key).lower() for key in known}, n=1)
-    meant = sorted((key for key in known if part(key).lower() in close), key=lambda key: key.count("."))
+    close = difflib.get_close_matches(
+        name.lower(), {part(key).lower() for key in known}, n=1
+    )
+    meant = sorted(
+        (key for key in known if part(key).lower() in close),
+        key=lambda key: key.count("."),
+    )
     meant = [key for key in meant if "." not in key] or meant[:3]
     return f" (did you mean {' or '.join(map(repr, meant))}?)" if meant else ""
 
@@ -162,7 +205,10 @@ def _of_settings(error: Exception, name: str) -> str:
     if unknown := re.match(r"Could not override '([^']+)'", text):
         with settings():
             return f"unknown setting {unknown[1]!r}{nearest(unknown[1], setting_names(name))}"
-    option = re.search(r"Could not find '([^'/]+)/([^']+)'\s+Available options in '[^']+':\n((?:\t.*\n)+)", text)
+    option = re.search(
+        r"Could not find '([^'/]+)/([^']+)'\s+Available options in '[^']+':\n((?:\t.*\n)+)",
+        text,
+    )
     if option and (extra := _EXTRAS.get(option[2].removeprefix("launcher/"))):
         return f"launcher: this one is not installed: pip install 'gpmpc[{extra}]'"
     if option:
@@ -179,7 +225,11 @@ def _of_settings(error: Exception, name: str) -> str:
     if ambiguous := re.match(r"Ambiguous value for argument '([^=]+)=([^']+)'", text):
         listed = f"{ambiguous[1]}: a list is written in brackets, {ambiguous[1]}=[{ambiguous[2]}]"
         return f"{listed}; a sweep takes -m" if name == "run" else listed
-    lines = [line.strip() for line in text.splitlines() if line.strip() and "hydra.cc" not in line]
+    lines = [
+        line.strip()
+        for line in text.splitlines()
+        if line.strip() and "hydra.cc" not in line
+    ]
     return "; ".join(line.rstrip(".:;") for line in lines) or type(error).__name__
 
 

@@ -22,9 +22,17 @@ from gpmpc.studies._document import json_text, terminal
 from gpmpc.studies.flight import run_trial
 from gpmpc.studies.study import Study, TrialStore, run_study
 
-_ONE, _SEVERAL = ("data", "excited", "undithered", "model", "flying"), ("trajectory", "subsystem")
+_ONE, _SEVERAL = (
+    ("data", "excited", "undithered", "model", "flying"),
+    ("trajectory", "subsystem"),
+)
 _SHOWN_ERRORS = 10
-_FLOWN = ("controller=convex", "controller=paper", "controller=nonlinear", "controller=lqr")
+_FLOWN = (
+    "controller=convex",
+    "controller=paper",
+    "controller=nonlinear",
+    "controller=lqr",
+)
 _SHORT = ("data.samples=12", "model.restarts=0", "steps=2", "horizon=3")
 
 
@@ -39,22 +47,37 @@ def study(config: DictConfig) -> Result:
             folder.mkdir(parents=True, exist_ok=True)
             store = TrialStore(folder / "trials.jsonl")
             progress.update(task, description=study.name, total=len(trials))
-            records = run_study(study.run_trial, trials, store, study.workers, lambda _: progress.advance(task))
+            records = run_study(
+                study.run_trial,
+                trials,
+                store,
+                study.workers,
+                lambda _: progress.advance(task),
+            )
     meta = provenance() | {"settings": settings}
     found = study.document(records)
     found = replace(found, code={**found.code, "Made by": json_text(meta).splitlines()})
-    plain = [{key: value for key, value in record.items() if key != "drawn"} for record in records]
+    plain = [
+        {key: value for key, value in record.items() if key != "drawn"}
+        for record in records
+    ]
     data = {"meta": meta, study.trial_name: plain}
     written = found.files(study.name) | {f"{study.name}.json": json_text(data)}
     written["config.yaml"] = OmegaConf.to_yaml(config, resolve=True)
     where = write_files(folder, written)
     shown, notes = study.summary(records)
     console.print(terminal(shown, *notes))
-    failed = [(trial, record) for trial, record in zip(trials, records, strict=True) if "error" in record]
+    failed = [
+        (trial, record)
+        for trial, record in zip(trials, records, strict=True)
+        if "error" in record
+    ]
     lines = [f"\n{where}"]
     for trial, record in failed[:_SHOWN_ERRORS]:
         which = ", ".join(f"{key} {value}" for key, value in trial.labels.items())
-        lines.append(f"{'lost' if study.lost_is_result else 'failed'}: {which}: {record['error']}")
+        lines.append(
+            f"{'lost' if study.lost_is_result else 'failed'}: {which}: {record['error']}"
+        )
     console.out(*lines, sep="\n", highlight=False)
     wrong = len(failed) == len(records) or not study.lost_is_result
     return Result(data | {"folder": str(folder)}, 1 if failed and wrong else 0)
@@ -67,7 +90,9 @@ def _study(config: DictConfig, settings: dict[str, Any]) -> Study:
     """Makes the study that the settings describe; what a user can get wrong is found here."""
     for key in (*_ONE, *_SEVERAL):
         if key in config and not config[key]:
-            raise SettingError(key, "choose at least one" if key in _SEVERAL else "choose one")
+            raise SettingError(
+                key, "choose at least one" if key in _SEVERAL else "choose one"
+            )
 
     def flight(words: str) -> tuple[Any, dict[str, Any]]:
         composed = hydra.compose("run", words.split())

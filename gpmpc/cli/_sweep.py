@@ -48,7 +48,10 @@ class Job:
     @property
     def done(self) -> bool:
         """Whether this sweep, or another one, has finished it or seen it fail."""
-        return self.folder.finished or self.folder.failed_at not in (None, self.failed_before)
+        return self.folder.finished or self.folder.failed_at not in (
+            None,
+            self.failed_before,
+        )
 
 
 class Sweep:
@@ -58,7 +61,9 @@ class Sweep:
         self.config = hydra.compose(name, [*overrides], return_hydra_config=True)
         self.config.hydra.mode = RunMode.MULTIRUN
         self.tree, self.console = folder_of(self.config.folder), console
-        nothing: Any = SimpleNamespace(on_job_start=lambda **_: None, on_job_end=lambda **_: None)  # around every job
+        nothing: Any = SimpleNamespace(
+            on_job_start=lambda **_: None, on_job_end=lambda **_: None
+        )  # around every job
         self._context = HydraContext(GlobalHydra.instance().config_loader(), nothing)
         self._checked: set[str] = set()
 
@@ -69,7 +74,9 @@ class Sweep:
 
     def settings(self, job: Job) -> tuple[DictConfig, Mapping[str, Any]]:
         """Returns a run's settings, and the chosen option by group."""
-        composed = self._context.config_loader.load_sweep_config(self.config, job.overrides)
+        composed = self._context.config_loader.load_sweep_config(
+            self.config, job.overrides
+        )
         return without_hydra(composed), composed.hydra.runtime.choices
 
     def check(self, jobs: Sequence[Job]) -> None:
@@ -80,7 +87,9 @@ class Sweep:
                 if job not in finished and not self._checked.issuperset(job.overrides):
                     experiment_of(self.settings(job)[0])
                     self._checked.update(job.overrides)
-        with self.console.status(f"comparing the settings of {len(finished)} finished runs"):
+        with self.console.status(
+            f"comparing the settings of {len(finished)} finished runs"
+        ):
             for job in finished:
                 job.folder.result(plain_settings(*self.settings(job)))
 
@@ -88,35 +97,56 @@ class Sweep:
         """Flies the runs that are not finished; returns the outcome of each of those."""
         waiting = [job for job in jobs if not job.folder.finished]
         outcomes = self._launch(waiting, partial(_fly_job, wait=False))
-        busy = [job for job, outcome in zip(waiting, outcomes, strict=True) if "busy" in outcome]
-        return [o for o in outcomes if "busy" not in o] + self._launch(busy, partial(_fly_job, wait=True))
+        busy = [
+            job
+            for job, outcome in zip(waiting, outcomes, strict=True)
+            if "busy" in outcome
+        ]
+        return [o for o in outcomes if "busy" not in o] + self._launch(
+            busy, partial(_fly_job, wait=True)
+        )
 
-    def _launch(self, jobs: Sequence[Job], task: Callable[[DictConfig], dict[str, Any]]) -> list[dict[str, Any]]:
+    def _launch(
+        self, jobs: Sequence[Job], task: Callable[[DictConfig], dict[str, Any]]
+    ) -> list[dict[str, Any]]:
         if not jobs:
             return []
         launcher: Any = Plugins.instance().instantiate_launcher(
             hydra_context=self._context, task_function=task, config=self.config
         )
-        workers, quiet = getattr(launcher, "joblib", None), nullcontext()  # joblib's launcher has joblib's arguments
+        workers, quiet = (
+            getattr(launcher, "joblib", None),
+            nullcontext(),
+        )  # joblib's launcher has joblib's arguments
         if workers is not None:
             workers |= {"initializer": end_with, "initargs": (os.getpid(),)}
             from joblib.externals.loky.backend import resource_tracker
 
             resource_tracker.ensure_running()  # as in ``children_ignore_interrupts``
-            quiet = children_ignore_interrupts()  # the thread of the progress bar still receives Ctrl-C
+            quiet = (
+                children_ignore_interrupts()
+            )  # the thread of the progress bar still receives Ctrl-C
         try:
             with quiet:
-                returns = launcher.launch([job.overrides for job in jobs], initial_job_idx=0)
+                returns = launcher.launch(
+                    [job.overrides for job in jobs], initial_job_idx=0
+                )
             return [each.return_value for each in returns]
         except Exception as error:
             reason = " ".join(str(error).split()) or type(error).__name__
-            print_error(f"the launcher broke down: {reason}; the same command goes on where it stopped")
+            print_error(
+                f"the launcher broke down: {reason}; the same command goes on where it stopped"
+            )
             sys.exit(1)
 
     @contextmanager
-    def progress(self, jobs: Sequence[Job], total: int) -> Iterator[Callable[[str], None]]:
+    def progress(
+        self, jobs: Sequence[Job], total: int
+    ) -> Iterator[Callable[[str], None]]:
         """Shows one bar for many runs, which looks at their folders whenever it is drawn; yields what names it."""
-        with progress_bar(self.console, lambda: sum(job.done for job in [*jobs])) as bar:
+        with progress_bar(
+            self.console, lambda: sum(job.done for job in [*jobs])
+        ) as bar:
             task = bar.add_task("flying", total=total)
             yield lambda text: bar.update(task, description=text)
 
@@ -129,8 +159,13 @@ def sweep(given: Namespace) -> Result:
     finished = sum(job.folder.finished for job in jobs)
     runs.check(jobs)
     # What was asked for, so that a report knows what is missing; equal sweeps write the same file.
-    plan = json.dumps({"runs": [choices(job.overrides) for job in jobs]}, indent=1) + "\n"
-    write_files(runs.tree, {f"{PLAN}{hashlib.sha256(plan.encode()).hexdigest()[:10]}.json": plan})
+    plan = (
+        json.dumps({"runs": [choices(job.overrides) for job in jobs]}, indent=1) + "\n"
+    )
+    write_files(
+        runs.tree,
+        {f"{PLAN}{hashlib.sha256(plan.encode()).hexdigest()[:10]}.json": plan},
+    )
     with runs.progress(jobs, len(jobs)):
         outcomes = runs.fly(jobs)
     failed = [outcome for outcome in outcomes if "error" in outcome]
@@ -139,7 +174,11 @@ def sweep(given: Namespace) -> Result:
     console.out(f"{text}; in {runs.tree}", highlight=False)
     for outcome in failed:
         print_error(f"failed: {outcome['folder']}: {outcome['error']}")
-    data = {"folder": str(runs.tree), "runs": [str(job.folder.path) for job in jobs], "failed": failed}
+    data = {
+        "folder": str(runs.tree),
+        "runs": [str(job.folder.path) for job in jobs],
+        "failed": failed,
+    }
     return Result(data, 1 if failed else 0)
 
 
@@ -160,7 +199,11 @@ def _combinations(overrides: Sequence[str]) -> list[list[str]]:
     values: dict[str, Any] = {}
     for override in OverridesParser.create().parse_overrides(list(overrides)):
         key, swept = override.get_key_element(), override.is_sweep_override()
-        found = [f"{key}={value}" for value in override.sweep_string_iterator()] if swept else [override.input_line]
+        found = (
+            [f"{key}={value}" for value in override.sweep_string_iterator()]
+            if swept
+            else [override.input_line]
+        )
         if not found:
             raise SettingError(key, "holds no value to sweep over")
         values[key] = found

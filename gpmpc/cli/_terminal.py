@@ -11,7 +11,9 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.progress import Progress
 
-_SEARCH = "gpmpc.gp._search"  # logs single evaluations, where a bar says how far the work is
+_SEARCH = (
+    "gpmpc.gp._search"  # logs single evaluations, where a bar says how far the work is
+)
 
 
 class Output:
@@ -35,9 +37,15 @@ class Output:
         except OSError as error:
             if not self.broken:
                 self.broken = True
-                os.dup2(os.open(os.devnull, os.O_WRONLY), self._stream.fileno())  # for what is still in its buffer
-                if not isinstance(error, BrokenPipeError):  # the reader of a pipe, such as head, has seen enough
-                    print_error(f"cannot write to the standard output: {error.strerror}")
+                os.dup2(
+                    os.open(os.devnull, os.O_WRONLY), self._stream.fileno()
+                )  # for what is still in its buffer
+                if not isinstance(
+                    error, BrokenPipeError
+                ):  # the reader of a pipe, such as head, has seen enough
+                    print_error(
+                        f"cannot write to the standard output: {error.strerror}"
+                    )
             sys.exit(1)  # no error: nothing on the way may take it for one of a file
 
 
@@ -45,7 +53,9 @@ class Output:
 def usable_streams() -> Iterator[None]:
     """Makes both streams exist and take every letter; where the standard output takes nothing, the command ends."""
     for name in ("stdout", "stderr"):
-        if getattr(sys, name) is None:  # closed; else the next file that is opened would take its place
+        if (
+            getattr(sys, name) is None
+        ):  # closed; else the next file that is opened would take its place
             setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115
         with suppress(AttributeError):  # not of a file
             getattr(sys, name).reconfigure(errors="backslashreplace")
@@ -96,7 +106,9 @@ def logging_console() -> "Console":
         shown.add(text)
         return len(shown) > known and record.name != _SEARCH
 
-    handler = RichHandler(console=console, show_path=False, show_time=False, show_level=False)
+    handler = RichHandler(
+        console=console, show_path=False, show_time=False, show_level=False
+    )
     handler.addFilter(is_new)
     log = logging.getLogger("gpmpc")
     log.setLevel(logging.INFO)
@@ -104,7 +116,9 @@ def logging_console() -> "Console":
     return console
 
 
-def progress_bar(console: "Console", completed: Callable[[], int] | None = None) -> "Progress":
+def progress_bar(
+    console: "Console", completed: Callable[[], int] | None = None
+) -> "Progress":
     """Returns a bar with how much is done, for how long, and how long it will still take.
 
     ``completed`` says how much is done, whenever the bar is drawn; by default its task is told.
@@ -118,6 +132,14 @@ def progress_bar(console: "Console", completed: Callable[[], int] | None = None)
                     self.update(task, completed=completed())
             yield from super().get_renderables()
 
-    columns = [progress.TextColumn("{task.description}"), progress.BarColumn(), progress.MofNCompleteColumn()]
-    times = [progress.TimeElapsedColumn(), progress.TextColumn("left"), progress.TimeRemainingColumn()]
+    columns = [
+        progress.TextColumn("{task.description}"),
+        progress.BarColumn(),
+        progress.MofNCompleteColumn(),
+    ]
+    times = [
+        progress.TimeElapsedColumn(),
+        progress.TextColumn("left"),
+        progress.TimeRemainingColumn(),
+    ]
     return Bar(*columns, *times, console=console, refresh_per_second=2)

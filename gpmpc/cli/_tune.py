@@ -35,11 +35,19 @@ def tune(given: Namespace) -> Result:
     runs = Sweep(given.config_name, fixed, console)
     base, first = without_hydra(runs.config), runs.config.seed
     if base.recorder != "mcap":
-        raise SettingError("recorder", f"must be mcap: a flight's cost is read from it; got {base.recorder}")
+        raise SettingError(
+            "recorder",
+            f"must be mcap: a flight's cost is read from it; got {base.recorder}",
+        )
     if base.steps < 2:
-        raise SettingError("steps", f"must be 2 or more: the cost counts from the second state on; got {base.steps}")
+        raise SettingError(
+            "steps",
+            f"must be 2 or more: the cost counts from the second state on; got {base.steps}",
+        )
     search = Search(space, first)
-    controller: Any = experiment_of(base).controller  # whose weights the cost has, whatever is searched
+    controller: Any = experiment_of(
+        base
+    ).controller  # whose weights the cost has, whatever is searched
 
     def jobs_of(candidate: Mapping[str, Any]) -> list[Job]:
         overrides = [*fixed, *_overrides(candidate, base)]
@@ -51,7 +59,10 @@ def tune(given: Namespace) -> Result:
         runs.check([*batch.values()])
         flying.extend(batch.values())
         runs.fly([*batch.values()])
-        return [sum(_cost(job, controller.keywords) for job in group) / given.seeds for group in groups]
+        return [
+            sum(_cost(job, controller.keywords) for job in group) / given.seeds
+            for group in groups
+        ]
 
     flying: list[Job] = []
     with runs.progress(flying, (given.trials + 1) * given.seeds) as describe:
@@ -66,14 +77,29 @@ def tune(given: Namespace) -> Result:
     best = choices([*fixed, *_overrides(search.candidates[search.best], base)])
     command = shlex.join(["gpmpc", "run", *own, *best, f"folder={runs.tree / 'best'}"])
     document = search.document(unchanged if math.isfinite(unchanged) else None, command)
-    where = write_files(runs.tree, document.files("tuning") | {"tuning.html": document.html()})
+    where = write_files(
+        runs.tree, document.files("tuning") | {"tuning.html": document.html()}
+    )
     console.print(terminal(document.tables, document.lead))
     console.out(f"to fly the best one: {command}", where, sep="\n", highlight=False)
-    data = {"folder": str(runs.tree), "best": search.candidates[search.best], "cost": search.costs[search.best]}
-    return Result(data | {"unchanged": unchanged, "importances": search.importances(), "command": command})
+    data = {
+        "folder": str(runs.tree),
+        "best": search.candidates[search.best],
+        "cost": search.costs[search.best],
+    }
+    return Result(
+        data
+        | {
+            "unchanged": unchanged,
+            "importances": search.importances(),
+            "command": command,
+        }
+    )
 
 
-def _space(overrides: Sequence[str]) -> tuple[dict[str, Interval | Sequence[str]], list[str]]:
+def _space(
+    overrides: Sequence[str],
+) -> tuple[dict[str, Interval | Sequence[str]], list[str]]:
     """Returns what is searched, by setting, and the settings that stay."""
     space: dict[str, Any] = {}
     fixed: list[Any] = []
@@ -86,14 +112,19 @@ def _space(overrides: Sequence[str]) -> tuple[dict[str, Interval | Sequence[str]
         elif override.is_interval_sweep():
             whole, logarithmic = isinstance(value.start, int), "log" in value.tags
             if not value.start < value.end or (logarithmic and value.start <= 0):
-                raise SettingError(key, f"must rise{', from above 0' * logarithmic}; got {override.input_line}")
+                raise SettingError(
+                    key,
+                    f"must rise{', from above 0' * logarithmic}; got {override.input_line}",
+                )
             space[key] = Interval(value.start, value.end, logarithmic, whole)
         else:
             space[key] = [*override.sweep_string_iterator()]
             if not space[key]:
                 raise SettingError(key, "holds no value to search")
     if not space:
-        raise GpmpcError("tune: names nothing to search, such as horizon=1,5,10 or 'horizon=int(interval(1,30))'")
+        raise GpmpcError(
+            "tune: names nothing to search, such as horizon=1,5,10 or 'horizon=int(interval(1,30))'"
+        )
     return space, fixed
 
 
@@ -106,11 +137,15 @@ def _overrides(candidate: Mapping[str, Any], base: Any) -> list[str]:
         if last.isdecimal():
             before = OmegaConf.select(base, parent)
             if not OmegaConf.is_list(before) or int(last) >= len(before):
-                raise SettingError(key, f"{parent} is no list with such an entry; got {before}")
+                raise SettingError(
+                    key, f"{parent} is no list with such an entry; got {before}"
+                )
             lists.setdefault(parent, list(before))[int(last)] = value
         else:
             plain.append(f"{key}={value}")
-    return plain + [f"{key}=[{','.join(map(str, values))}]" for key, values in lists.items()]
+    return plain + [
+        f"{key}=[{','.join(map(str, values))}]" for key, values in lists.items()
+    ]
 
 
 def _cost(job: Job, controller: Mapping[str, Any]) -> float:
@@ -118,4 +153,11 @@ def _cost(job: Job, controller: Mapping[str, Any]) -> float:
     if not job.folder.finished or job.folder.result().get("lost"):
         return math.inf
     run, cost = read_run(job.folder.path / RECORDING), controller["problem"].cost
-    return tracking_cost(cost.Q, cost.R, run.states, run.references, run.inputs[:-1], controller["initial_input"])
+    return tracking_cost(
+        cost.Q,
+        cost.R,
+        run.states,
+        run.references,
+        run.inputs[:-1],
+        controller["initial_input"],
+    )

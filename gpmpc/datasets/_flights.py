@@ -21,7 +21,12 @@ from gpmpc.gp import Transitions
 from gpmpc.mpc import problem as mpc
 from gpmpc.mpc.baselines import NMPC
 from gpmpc.simulation import Noise, Rollout, closed_loop
-from gpmpc.systems import ATTITUDES, System, attitude_for_thrust_direction, translational
+from gpmpc.systems import (
+    ATTITUDES,
+    System,
+    attitude_for_thrust_direction,
+    translational,
+)
 from gpmpc.systems._quadrotor import approach_attitudes
 from gpmpc.trajectories import Trajectory
 
@@ -48,7 +53,9 @@ class DataSource(Protocol):
     @property
     def note(self) -> str: ...
     def check(self, system: System, trajectory: Trajectory | None) -> None: ...
-    def transitions(self, system: System, trajectory: Trajectory | None, name: str = "") -> Transitions: ...
+    def transitions(
+        self, system: System, trajectory: Trajectory | None, name: str = ""
+    ) -> Transitions: ...
 
 
 def check_data(data: Any, **least: int) -> None:
@@ -56,7 +63,10 @@ def check_data(data: Any, **least: int) -> None:
     for key, value in least.items():
         check_number(f"data.{key}", getattr(data, key), least=value, whole=True)
     if getattr(data, "attitude", "exact") not in ATTITUDES:
-        raise SettingError("data.attitude", f"must be one of {', '.join(ATTITUDES)}; got {data.attitude!r}")
+        raise SettingError(
+            "data.attitude",
+            f"must be one of {', '.join(ATTITUDES)}; got {data.attitude!r}",
+        )
 
 
 @dataclass(frozen=True)
@@ -80,7 +90,9 @@ class Tracking:
         """Unconstrained NMPC from rest along references (steps + horizon, n)."""
         problem = mpc.Problem(mpc.Tracking(self.Q, self.R, penalized="inputs"))
         controller = NMPC(self.plant, problem, horizon, self.initial_input)
-        return closed_loop(self.plant, controller, references, np.zeros(len(self.Q)), steps)
+        return closed_loop(
+            self.plant, controller, references, np.zeros(len(self.Q)), steps
+        )
 
 
 @dataclass(frozen=True)
@@ -105,18 +117,28 @@ class NMPCData:
 
     check = staticmethod(check_quadrotor)
 
-    def transitions(self, system: System, trajectory: Trajectory | None, name: str = "") -> Transitions:
+    def transitions(
+        self, system: System, trajectory: Trajectory | None, name: str = ""
+    ) -> Transitions:
         """Flies the trajectory by the plants of these settings, and for the rotational subsystem its attitude."""
         along = check_quadrotor(system, trajectory)
-        steps = self.samples + self.horizon  # the attitude's references reach this far beyond its last step
-        references = np.zeros((steps + self.horizon, 6))  # the velocities are asked to be zero, with little weight
-        references[:, ::2] = along(self.translational.plant.time_step * np.arange(len(references)))  # x, y, z
+        steps = (
+            self.samples + self.horizon
+        )  # the attitude's references reach this far beyond its last step
+        references = np.zeros(
+            (steps + self.horizon, 6)
+        )  # the velocities are asked to be zero, with little weight
+        references[:, ::2] = along(
+            self.translational.plant.time_step * np.arange(len(references))
+        )  # x, y, z
         outer = self.translational.fly(references, self.horizon, steps)
         if system.name == "translational":
             return _transitions(outer, self.samples)
         references = np.zeros((steps, 6))  # psi and the rates are to be zero
         references[:, [0, 2]] = _attitudes(outer, self.attitude)
-        return _transitions(self.rotational.fly(references, self.horizon, self.samples), self.samples)
+        return _transitions(
+            self.rotational.fly(references, self.horizon, self.samples), self.samples
+        )
 
 
 @dataclass(frozen=True)
@@ -131,24 +153,32 @@ class PaperData:
     def __post_init__(self) -> None:
         check_data(self, samples=1)
         if not isinstance(self.folder, str | Path) or not Path(self.folder).is_dir():
-            raise DataError(f"{self.folder}: no such folder; data.folder must hold the authors' four text files")
+            raise DataError(
+                f"{self.folder}: no such folder; data.folder must hold the authors' four text files"
+            )
 
     check = staticmethod(check_quadrotor)
 
-    def transitions(self, system: System, trajectory: Trajectory | None, name: str = "") -> Transitions:
+    def transitions(
+        self, system: System, trajectory: Trajectory | None, name: str = ""
+    ) -> Transitions:
         """Reads one file; ``DataError`` where it is missing, malformed, or shorter than ``samples``."""
         self.check(system, trajectory)
         part = {"translational": "trans", "rotational": "rotate"}[system.name]
         path = Path(self.folder) / f"ds_nmpc_{name.capitalize()}_{part}.txt"
         data = Transitions.from_text(path)
         if len(data) < self.samples:
-            raise DataError(f"{path}: the file holds {len(data)} rows; data.samples asks for {self.samples}")
+            raise DataError(
+                f"{path}: the file holds {len(data)} rows; data.samples asks for {self.samples}"
+            )
         return data[: self.samples]
 
 
 def _transitions(flight: Rollout, samples: int) -> Transitions:
     """The first transitions of a flight."""
-    return Transitions(flight.states[:samples], flight.inputs[:samples], flight.states[1 : samples + 1])
+    return Transitions(
+        flight.states[:samples], flight.inputs[:samples], flight.states[1 : samples + 1]
+    )
 
 
 def _attitudes(flight: Rollout, convention: str) -> np.ndarray:
@@ -167,23 +197,49 @@ class Excitation:
 
     Q: Sequence[float]  #: state weights, the diagonal (n,)
     R: Sequence[float]  #: weights of the inputs' increments, the diagonal (m,)
-    initial_input: Sequence[float]  #: first guess of the solver, and the input before the first (m,)
-    dither: Sequence[float]  #: standard deviation of what is added to the inputs (m,), in their units
-    noise: Sequence[float]  #: standard deviation of what is added to every next state (n,), in their units
+    initial_input: Sequence[
+        float
+    ]  #: first guess of the solver, and the input before the first (m,)
+    dither: Sequence[
+        float
+    ]  #: standard deviation of what is added to the inputs (m,), in their units
+    noise: Sequence[
+        float
+    ]  #: standard deviation of what is added to every next state (n,), in their units
     horizon: int = 1  #: of the NMPC
 
     def __post_init__(self) -> None:
-        for key, length in (("Q", 6), ("noise", 6), ("R", 3), ("initial_input", 3), ("dither", 3)):
-            check_numbers(key, getattr(self, key), length, **({} if key == "initial_input" else {"least": 0}))
+        for key, length in (
+            ("Q", 6),
+            ("noise", 6),
+            ("R", 3),
+            ("initial_input", 3),
+            ("dither", 3),
+        ):
+            check_numbers(
+                key,
+                getattr(self, key),
+                length,
+                **({} if key == "initial_input" else {"least": 0}),
+            )
         check_number("horizon", self.horizon, least=1, whole=True)
 
-    def fly(self, system: System, references: np.ndarray, steps: int, seed: int) -> Rollout:
+    def fly(
+        self, system: System, references: np.ndarray, steps: int, seed: int
+    ) -> Rollout:
         """From the first of the references (steps + horizon, n) on."""
         problem = mpc.Problem(mpc.Tracking(self.Q, self.R))
         controller = NMPC(system, problem, self.horizon, self.initial_input)
         noise = Noise(process=self.noise, input=self.dither)
         return closed_loop(
-            system, controller, references, references[0], steps, noise=noise, seed=seed, on_failure="previous_plan"
+            system,
+            controller,
+            references,
+            references[0],
+            steps,
+            noise=noise,
+            seed=seed,
+            on_failure="previous_plan",
         )
 
 
@@ -201,7 +257,9 @@ class ExcitedData:
     samples: int = 189  #: transitions of either
     hold: int = 10  #: inner steps that an attitude is asked for
     response_time: float = 0.1  #: of the approach to it [s]
-    attitude: str = "exact"  #: how thrust direction becomes attitude: ``"exact"`` or ``"paper"``
+    attitude: str = (
+        "exact"  #: how thrust direction becomes attitude: ``"exact"`` or ``"paper"``
+    )
     seed: int = 0  #: of dither, noise and the order of the attitudes
 
     note = (
@@ -215,20 +273,35 @@ class ExcitedData:
 
     check = staticmethod(check_quadrotor)
 
-    def transitions(self, system: System, trajectory: Trajectory | None, name: str = "") -> Transitions:
+    def transitions(
+        self, system: System, trajectory: Trajectory | None, name: str = ""
+    ) -> Transitions:
         """Flies the system; the inputs are those that acted, dither included.
 
         The attitudes that the rotational one flies are those of a flight of ``translational()``.
         """
         self.check(system, trajectory)
         outer = system if system.name == "translational" else translational()
-        references = outer.reference_states(trajectory, self.samples + self.translational.horizon)
+        references = outer.reference_states(
+            trajectory, self.samples + self.translational.horizon
+        )
         flight = self.translational.fly(outer, references, self.samples, self.seed)
         if system is outer:
             return _transitions(flight, self.samples)
         streams = np.random.SeedSequence([self.seed, SUBSYSTEMS.index("rotational")])
-        angles, count = _attitudes(flight, self.attitude), self.samples + self.rotational.horizon
-        chosen = angles[np.random.default_rng(streams).integers(len(angles), size=-(-count // self.hold))]
-        references = approach_attitudes(chosen, count, self.hold, system.time_step, self.response_time)
+        angles, count = (
+            _attitudes(flight, self.attitude),
+            self.samples + self.rotational.horizon,
+        )
+        chosen = angles[
+            np.random.default_rng(streams).integers(
+                len(angles), size=-(-count // self.hold)
+            )
+        ]
+        references = approach_attitudes(
+            chosen, count, self.hold, system.time_step, self.response_time
+        )
         seed = int(streams.generate_state(1)[0])
-        return _transitions(self.rotational.fly(system, references, self.samples, seed), self.samples)
+        return _transitions(
+            self.rotational.fly(system, references, self.samples, seed), self.samples
+        )

@@ -6,7 +6,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from gpmpc.datasets._flights import check_data
-from gpmpc.exceptions import DataError, SettingError, ShapeError, check_choice, check_number
+from gpmpc.exceptions import (
+    DataError,
+    SettingError,
+    ShapeError,
+    check_choice,
+    check_number,
+)
 from gpmpc.gp import Transitions
 from gpmpc.systems import System, step
 from gpmpc.trajectories import Trajectory
@@ -44,15 +50,27 @@ class RandomData:
 
     def check(self, system: System, trajectory: Trajectory | None = None) -> None:
         """Raises unless its inputs have limits, it has a region to start from, and noise fits its states."""
-        for name, *limits in zip(system.input_names, system.input_lower, system.input_upper, strict=True):
+        for name, *limits in zip(
+            system.input_names, system.input_lower, system.input_upper, strict=True
+        ):
             if not np.isfinite(limits).all():
-                raise SettingError("data", f"random inputs need limits; {name} of {system.name} has none")
+                raise SettingError(
+                    "data",
+                    f"random inputs need limits; {name} of {system.name} has none",
+                )
         if system.region is None and self.starts == "region" and not system.stateful:
-            raise SettingError("data.starts", f"{system.name} has no region; take starts=start, or give it one")
+            raise SettingError(
+                "data.starts",
+                f"{system.name} has no region; take starts=start, or give it one",
+            )
         if self.noise is not None and len(self.noise) != len(system.state_names):
-            raise ShapeError(f"data.noise must have {len(system.state_names)} deviations; got {len(self.noise)}")
+            raise ShapeError(
+                f"data.noise must have {len(system.state_names)} deviations; got {len(self.noise)}"
+            )
 
-    def transitions(self, system: System, trajectory: Trajectory | None = None, name: str = "") -> Transitions:
+    def transitions(
+        self, system: System, trajectory: Trajectory | None = None, name: str = ""
+    ) -> Transitions:
         """Steps the system.
 
         An episode ends early where it is farther outside the region than the region is wide, and where a simulator
@@ -64,7 +82,11 @@ class RandomData:
         self.check(system, trajectory)
         random = np.random.default_rng(self.seed)
         lower, upper = np.array(system.input_lower), np.array(system.input_upper)
-        middle = (lower + upper) / 2 if self.around == "middle" else np.array(system.initial_input)
+        middle = (
+            (lower + upper) / 2
+            if self.around == "middle"
+            else np.array(system.initial_input)
+        )
         half = self.amplitude * (upper - lower) / 2
         centre, reach = 0.0, np.finfo(float).max
         if system.region is not None:
@@ -78,7 +100,11 @@ class RandomData:
                     input = np.clip(middle + random.uniform(-half, half), lower, upper)
                 with np.errstate(over="ignore", invalid="ignore"):
                     after = step(system, state, input)
-                after = after if self.noise is None else after + random.normal(0, 1, len(after)) * self.noise
+                after = (
+                    after
+                    if self.noise is None
+                    else after + random.normal(0, 1, len(after)) * self.noise
+                )
                 if not (np.abs(after - centre) <= reach).all():
                     break
                 rows.append((state, input, after))
@@ -86,8 +112,12 @@ class RandomData:
                     break
                 state = after
             if len(rows) == self.samples:
-                return Transitions(*(np.array(column) for column in zip(*rows, strict=True)))
-        raise DataError(f"{system.name}: only {len(rows)} of {self.samples} random steps stayed near the region")
+                return Transitions(
+                    *(np.array(column) for column in zip(*rows, strict=True))
+                )
+        raise DataError(
+            f"{system.name}: only {len(rows)} of {self.samples} random steps stayed near the region"
+        )
 
     def _start(self, system: System, random: np.random.Generator) -> np.ndarray:
         if system.stateful:

@@ -1,9 +1,21 @@
 """Estimation of what is not measured: states, disturbances, delays, noise; and how far predictions can be believed."""
 
 from gpmpc.estimation._conformal import AdaptiveTube, ConformalTube
-from gpmpc.estimation._consistency import Consistency, autocorrelation, estimation_errors, normalized_errors
+from gpmpc.estimation._consistency import (
+    Consistency,
+    autocorrelation,
+    estimation_errors,
+    normalized_errors,
+)
 from gpmpc.estimation._delay import DelayEstimate, estimate_delay
-from gpmpc.estimation._kalman import FilterRun, KalmanFilter, LateMeasurements, Measurement, Update, smooth
+from gpmpc.estimation._kalman import (
+    FilterRun,
+    KalmanFilter,
+    LateMeasurements,
+    Measurement,
+    Update,
+    smooth,
+)
 from gpmpc.estimation._noise import (
     ProcessNoise,
     VaryingNoise,

@@ -46,12 +46,22 @@ class ConformalTube:
     rows: Array  #: the directions g (r, n) that were compared
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "scores", np.ascontiguousarray(np.sort(self.scores, axis=0), dtype=float))
+        object.__setattr__(
+            self,
+            "scores",
+            np.ascontiguousarray(np.sort(self.scores, axis=0), dtype=float),
+        )
         object.__setattr__(self, "rows", np.ascontiguousarray(self.rows, dtype=float))
 
     @classmethod
     def calibrate(
-        cls, model: DynamicsModel, propagator: Propagator, states: Any, inputs: Any, horizon: int, rows: Any = None
+        cls,
+        model: DynamicsModel,
+        propagator: Propagator,
+        states: Any,
+        inputs: Any,
+        horizon: int,
+        rows: Any = None,
     ) -> "ConformalTube":
         """Compares predictions with a held-out log, over windows that do not overlap.
 
@@ -69,20 +79,41 @@ class ConformalTube:
             DataError: The log is shorter than the horizon, or a score is not finite.
         """
         check_number("horizon", horizon, least=1, whole=True)
-        x, u = (torch.as_tensor(np.asarray(part), dtype=model.dtype, device=model.device) for part in (states, inputs))
+        x, u = (
+            torch.as_tensor(np.asarray(part), dtype=model.dtype, device=model.device)
+            for part in (states, inputs)
+        )
         if x.dim() != 2 or u.dim() != 2 or len(u) not in (len(x) - 1, len(x)):
             got = f"{tuple(x.shape)} and {tuple(u.shape)}"
-            raise ShapeError(f"states (T + 1, n) and inputs (T, m) must be one log; got {got}")
-        at, n = np.arange(0, len(x) - horizon, horizon)[:, None] + np.arange(1, horizon + 1), x.shape[1]
+            raise ShapeError(
+                f"states (T + 1, n) and inputs (T, m) must be one log; got {got}"
+            )
+        at, n = (
+            np.arange(0, len(x) - horizon, horizon)[:, None]
+            + np.arange(1, horizon + 1),
+            x.shape[1],
+        )
         if not len(at):
-            raise DataError(f"a log of {len(x)} states has no window of {horizon} steps")
-        G = np.vstack([np.eye(n), -np.eye(n)]) if rows is None else np.atleast_2d(np.asarray(rows, dtype=float))
+            raise DataError(
+                f"a log of {len(x)} states has no window of {horizon} steps"
+            )
+        G = (
+            np.vstack([np.eye(n), -np.eye(n)])
+            if rows is None
+            else np.atleast_2d(np.asarray(rows, dtype=float))
+        )
         if G.shape[1] != n:
             raise ShapeError(f"rows must be (r, {n}); got {G.shape}")
-        predicted = rollout(propagator, model, Gaussian.certain(x[at[:, 0] - 1]), u[at - 1])
-        deviation = np.sqrt(np.einsum("ri,khij,rj->khr", G, to_array(predicted.covariance), G))
+        predicted = rollout(
+            propagator, model, Gaussian.certain(x[at[:, 0] - 1]), u[at - 1]
+        )
+        deviation = np.sqrt(
+            np.einsum("ri,khij,rj->khr", G, to_array(predicted.covariance), G)
+        )
         if not (deviation > 0).all():
-            raise DataError("a direction has no variance: predict with the process noise")
+            raise DataError(
+                "a direction has no variance: predict with the process noise"
+            )
         scores = (to_array(x[at] - predicted.mean) @ G.T / deviation).max(-1)
         if not np.isfinite(scores).all():
             raise DataError("a score is not finite: a prediction or a state is not")
@@ -104,7 +135,9 @@ class ConformalTube:
         rank = math.ceil((len(self.scores) + 1) * probability - 1e-9)
         if rank > len(self.scores):
             need = math.ceil(probability / (1 - probability) - 1e-9)
-            raise DataError(f"a probability of {probability:g} needs {need} windows or more; got {len(self.scores)}")
+            raise DataError(
+                f"a probability of {probability:g} needs {need} windows or more; got {len(self.scores)}"
+            )
         return self.scores[rank - 1].copy()
 
 
@@ -140,21 +173,34 @@ class AdaptiveTube:
         rate = (1.0 - probability) / 5.0 if rate is None else rate
         check_number("rate", rate, above=0)
         H, (r, n) = tube.horizon, tube.rows.shape
-        largest = 2.0 * max(float(tube.scores.max()), 1.0) if largest is None else largest
+        largest = (
+            2.0 * max(float(tube.scores.max()), 1.0) if largest is None else largest
+        )
         check_number("largest", largest, above=0)
         self.tube, self.probability = tube, float(probability)
         self.rate, self.largest = float(rate), float(largest)
-        self.noise = np.zeros((n, n)) if noise is None else np.ascontiguousarray(noise, dtype=float)
+        self.noise = (
+            np.zeros((n, n))
+            if noise is None
+            else np.ascontiguousarray(noise, dtype=float)
+        )
         self.allowed = np.full(H, 1.0 - probability)  # a of each stage
         if decisions is not None:
             check_number("decisions", decisions, least=1, whole=True)
             spare = np.arange(1, H + 1) + 1
-            self.allowed = (_most_misses(1.0 - probability, decisions) - spare) / (decisions + 1.0 / rate)
+            self.allowed = (_most_misses(1.0 - probability, decisions) - spare) / (
+                decisions + 1.0 / rate
+            )
             if not (self.allowed > 0).all():
-                raise SettingError("decisions", f"are too few for a probability of {probability:g}; got {decisions}")
+                raise SettingError(
+                    "decisions",
+                    f"are too few for a probability of {probability:g}; got {decisions}",
+                )
         self.kappas, self.alphas = np.empty(H), self.allowed.copy()
         self.counts, self.misses = np.zeros(H), np.zeros(H)
-        self._bounds = np.full((H, H, r), np.nan)  # of the plans of the last H steps, by stage and direction
+        self._bounds = np.full(
+            (H, H, r), np.nan
+        )  # of the plans of the last H steps, by stage and direction
         self._step = 0
         self.observe(np.full(n, np.nan))  # nothing yet: kappas alone
         self._step = 0
@@ -163,8 +209,20 @@ class AdaptiveTube:
         """Compares a state (n,) with what the plans before it said; returns kappa of each stage (H,)."""
         state = np.ascontiguousarray(state, dtype=np.float64)
         self._step += 1
-        numbers, parts = (self.rate, self.allowed, self.largest), (self.kappas, self.alphas, self.counts, self.misses)
-        call_unchecked(_observe, state, self.tube.rows, self._bounds, self._step, numbers, self.tube.scores, parts)
+        numbers, parts = (
+            (self.rate, self.allowed, self.largest),
+            (self.kappas, self.alphas, self.counts, self.misses),
+        )
+        call_unchecked(
+            _observe,
+            state,
+            self.tube.rows,
+            self._bounds,
+            self._step,
+            numbers,
+            self.tube.scores,
+            parts,
+        )
         return self.kappas
 
     def remember(self, means: Array, covariances: Array, stages: Any = None) -> None:
@@ -176,24 +234,42 @@ class AdaptiveTube:
             stages: Whether each stage's prediction counts (H,), or each of its directions (H, r), such as where the
                 plan touches a bound: how often bounds are violated there is what alpha follows then. By default all do.
         """
-        means, covariances = (np.ascontiguousarray(part, dtype=np.float64) for part in (means, covariances))
+        means, covariances = (
+            np.ascontiguousarray(part, dtype=np.float64)
+            for part in (means, covariances)
+        )
         expected = self.tube.horizon + 1, self.tube.rows.shape[1]
         if means.shape != expected:
             raise ShapeError(f"means must be {expected}; got {means.shape}")
         bounds = self._bounds[self._step % self.tube.horizon]
-        call_unchecked(_remember, means, covariances, self.noise, self.tube.rows, self.kappas, bounds)
+        call_unchecked(
+            _remember,
+            means,
+            covariances,
+            self.noise,
+            self.tube.rows,
+            self.kappas,
+            bounds,
+        )
         if stages is not None:
             bounds[~np.asarray(stages, dtype=bool)] = np.nan
 
     @property
     def violations(self) -> Array:
         """The share of the predictions that did not hold, by stage (H,); NaN before the first."""
-        return np.divide(self.misses, self.counts, out=np.full_like(self.misses, np.nan), where=self.counts > 0)
+        return np.divide(
+            self.misses,
+            self.counts,
+            out=np.full_like(self.misses, np.nan),
+            where=self.counts > 0,
+        )
 
 
 def _check_probability(probability: float) -> None:
     if not 0 < probability < 1:
-        raise SettingError("probability", f"must lie between 0 and 1; got {probability}")
+        raise SettingError(
+            "probability", f"must lie between 0 and 1; got {probability}"
+        )
 
 
 def _most_misses(share: float, decisions: int) -> int:
@@ -206,9 +282,19 @@ def _most_misses(share: float, decisions: int) -> int:
 @compiled(locked=True)
 def _observe(state, rows, bounds, step, numbers, scores, parts):
     """Updates alpha and kappa of each stage (H,) by a state (n,); ``bounds`` (H, H, r) hold the last plans."""
-    (N, H), (rate, allowed, largest), (kappas, alphas, counts, misses) = scores.shape, numbers, parts
-    for k in range(H):  # the plan of k + 1 steps ago said where the state would be at its stage k
-        counted, known, outside = False, True, False  # a bound that does not count is NaN
+    (N, H), (rate, allowed, largest), (kappas, alphas, counts, misses) = (
+        scores.shape,
+        numbers,
+        parts,
+    )
+    for k in range(
+        H
+    ):  # the plan of k + 1 steps ago said where the state would be at its stage k
+        counted, known, outside = (
+            False,
+            True,
+            False,
+        )  # a bound that does not count is NaN
         plan = (step - k - 1) % H
         for r in range(len(rows)):
             value = 0.0
@@ -221,7 +307,9 @@ def _observe(state, rows, bounds, step, numbers, scores, parts):
         if counted and known:
             counts[k] += 1.0
             misses[k] += 1.0 if outside else 0.0
-            alphas[k] = min(alphas[k] + rate * (allowed[k] - (1.0 if outside else 0.0)), 1.0)
+            alphas[k] = min(
+                alphas[k] + rate * (allowed[k] - (1.0 if outside else 0.0)), 1.0
+            )
         rank = math.ceil((N + 1) * (1.0 - alphas[k]) - 1e-9)
         kappas[k] = largest if rank > N else scores[max(rank, 1) - 1, k]
     bounds[step % H] = np.nan  # until a plan of this step is remembered
@@ -237,5 +325,9 @@ def _remember(means, covariances, noise, rows, kappas, bounds):
             for i in range(n):
                 value += rows[r, i] * means[k + 1, i]
                 for j in range(n):
-                    variance += rows[r, i] * (covariances[k + 1, i, j] + noise[i, j]) * rows[r, j]
+                    variance += (
+                        rows[r, i]
+                        * (covariances[k + 1, i, j] + noise[i, j])
+                        * rows[r, j]
+                    )
             bounds[k, r] = value + kappas[k] * math.sqrt(max(variance, 0.0))

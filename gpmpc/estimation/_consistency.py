@@ -24,8 +24,12 @@ class Consistency:
     """Normalised squared errors, and the band that their mean should lie in."""
 
     values: np.ndarray  #: one an error (N,); errors without a finite entry are left out
-    degrees: np.ndarray  #: degrees of freedom of each: how many entries were finite (N,)
-    band: tuple[float, float]  #: limits of the mean, per degree of freedom, for independent errors
+    degrees: (
+        np.ndarray
+    )  #: degrees of freedom of each: how many entries were finite (N,)
+    band: tuple[
+        float, float
+    ]  #: limits of the mean, per degree of freedom, for independent errors
 
     @property
     def mean(self) -> float:
@@ -54,20 +58,30 @@ def normalized_errors(
         ShapeError: The two do not belong together.
         DataError: No error is finite.
     """
-    e, P = (torch.as_tensor(part, dtype=torch.float64) for part in (errors, covariances))
+    e, P = (
+        torch.as_tensor(part, dtype=torch.float64) for part in (errors, covariances)
+    )
     if P.shape != (*e.shape, e.shape[-1]):
-        raise ShapeError(f"errors (..., n) need covariances (..., n, n); got {tuple(e.shape)} and {tuple(P.shape)}")
+        raise ShapeError(
+            f"errors (..., n) need covariances (..., n, n); got {tuple(e.shape)} and {tuple(P.shape)}"
+        )
     e, P = e.reshape(-1, e.shape[-1]), P.reshape(-1, *P.shape[-2:])
     missing = ~torch.isfinite(e)
     keep = ~missing.all(-1)
     if not bool(keep.any()):
         raise DataError("no error is finite")
     e, P, missing = e[keep], P[keep], missing[keep]
-    P = torch.where(missing[:, :, None] | missing[:, None, :], torch.eye(e.shape[-1], dtype=P.dtype), P)
+    P = torch.where(
+        missing[:, :, None] | missing[:, None, :],
+        torch.eye(e.shape[-1], dtype=P.dtype),
+        P,
+    )
     e = torch.where(missing, 0.0, e)
     values = (e * torch.linalg.solve(P, e[..., None])[..., 0]).sum(-1).numpy()
     degrees = (~missing).sum(-1).numpy()
-    total = float(degrees.mean()) * (len(values) if independent is None else independent)
+    total = float(degrees.mean()) * (
+        len(values) if independent is None else independent
+    )
     low, high = chi2.ppf([(1 - level) / 2, (1 + level) / 2], total) / total
     return Consistency(values, degrees, (float(low), float(high)))
 
@@ -85,17 +99,26 @@ def wrapped(angle: Any) -> Any:
     return (angle + math.pi) % (2 * math.pi) - math.pi
 
 
-def autocorrelation(innovations: Any, covariances: Any, lag: int = 1) -> tuple[float, float]:
+def autocorrelation(
+    innovations: Any, covariances: Any, lag: int = 1
+) -> tuple[float, float]:
     """The autocorrelation of whitened innovations (T, p), and the 95 % limit of its size where they are white.
 
     Raises:
         DataError: Fewer than two pairs are finite.
     """
-    e, S = (torch.as_tensor(part, dtype=torch.float64) for part in (innovations, covariances))
+    e, S = (
+        torch.as_tensor(part, dtype=torch.float64)
+        for part in (innovations, covariances)
+    )
     white = (e / S.diagonal(dim1=-2, dim2=-1).sqrt()).numpy()
     first, second = white[:-lag], white[lag:]
     pairs = np.isfinite(first) & np.isfinite(second)
     if pairs.sum() < 2:
-        raise DataError("an autocorrelation needs two pairs of finite innovations or more")
+        raise DataError(
+            "an autocorrelation needs two pairs of finite innovations or more"
+        )
     a, b = first[pairs], second[pairs]
-    return float((a * b).sum() / np.sqrt((a**2).sum() * (b**2).sum())), float(1.96 / np.sqrt(len(a)))
+    return float((a * b).sum() / np.sqrt((a**2).sum() * (b**2).sum())), float(
+        1.96 / np.sqrt(len(a))
+    )

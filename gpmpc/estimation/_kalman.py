@@ -37,8 +37,12 @@ class Measurement(TensorModel):
 
     state_dim: int  #: n, of the state
     noise_covariance: Tensor  #: R (p, p)
-    function: Callable[[Tensor], Tensor]  #: h, from x (*batch, n) to y (*batch, p), in torch
-    angles: Sequence[int] = ()  #: entries of y that are angles [rad]: their differences are wrapped to [-pi, pi)
+    function: Callable[
+        [Tensor], Tensor
+    ]  #: h, from x (*batch, n) to y (*batch, p), in torch
+    angles: Sequence[
+        int
+    ] = ()  #: entries of y that are angles [rad]: their differences are wrapped to [-pi, pi)
     input_dim = 0
     _part = property(lambda self: self.noise_covariance)
 
@@ -49,13 +53,22 @@ class Measurement(TensorModel):
         if R.dim() != 2 or len(R) != R.shape[1]:
             raise ShapeError(f"noise_covariance must be (p, p); got {tuple(R.shape)}")
         if not callable(self.function):
-            raise SettingError("function", f"must be a function of the state; got {self.function!r}")
+            raise SettingError(
+                "function", f"must be a function of the state; got {self.function!r}"
+            )
         if any(not 0 <= i < len(R) for i in self.angles):
-            raise SettingError("angles", f"must be entries of y from 0 to {len(R) - 1}; got {list(self.angles)}")
+            raise SettingError(
+                "angles",
+                f"must be entries of y from 0 to {len(R) - 1}; got {list(self.angles)}",
+            )
 
     @classmethod
     def of_states(
-        cls, state_dim: int, states: Sequence[int], std: Sequence[float], angles: Sequence[int] = ()
+        cls,
+        state_dim: int,
+        states: Sequence[int],
+        std: Sequence[float],
+        angles: Sequence[int] = (),
     ) -> "Measurement":
         """A measurement of some of n states, whose noise has these standard deviations.
 
@@ -65,7 +78,10 @@ class Measurement(TensorModel):
             SettingError: A state is out of range, or a standard deviation is negative.
         """
         if any(not 0 <= i < state_dim for i in states) or not len(states):
-            raise SettingError("states", f"must be indices from 0 to {state_dim - 1}; got {list(states)}")
+            raise SettingError(
+                "states",
+                f"must be indices from 0 to {state_dim - 1}; got {list(states)}",
+            )
         check_numbers("std", std, len(states), least=0)
         R = torch.diag(torch.tensor(list(std), dtype=torch.float64) ** 2)
         return cls(state_dim, R, _Selection(states, state_dim), angles)
@@ -79,17 +95,28 @@ class Measurement(TensorModel):
         """What is measured at a certain state (*batch, p), without the noise."""
         check_query(self, state, state[..., :0] if input is None else input)
         value = self.function(state)
-        if not isinstance(value, Tensor) or value.shape != (*state.shape[:-1], self.output_dim):
-            got = tuple(value.shape) if isinstance(value, Tensor) else type(value).__name__
+        if not isinstance(value, Tensor) or value.shape != (
+            *state.shape[:-1],
+            self.output_dim,
+        ):
+            got = (
+                tuple(value.shape)
+                if isinstance(value, Tensor)
+                else type(value).__name__
+            )
             at = f"(*batch, {self.output_dim}) at {tuple(state.shape)}"
             raise ShapeError(f"the measurement must give {at}; got {got}")
         return Gaussian(value, value.new_zeros(*value.shape, self.output_dim))
 
-    def linearize(self, states: Array, inputs: Array, covariance: bool = True) -> Linearized:
+    def linearize(
+        self, states: Array, inputs: Array, covariance: bool = True
+    ) -> Linearized:
         """Linearises h at K points (K, n); ``inputs`` is (K, 0)."""
         value, A = linearize_function(self.function, self, states)
         K, p = value.shape
-        return Linearized(value, A, np.zeros((K, p, 0)), np.zeros((K, p, p)) if covariance else None)
+        return Linearized(
+            value, A, np.zeros((K, p, 0)), np.zeros((K, p, p)) if covariance else None
+        )
 
 
 class _Selection:
@@ -102,7 +129,9 @@ class _Selection:
         return state[..., self.states]
 
     def linearize(self, states: Array) -> tuple[Array, Array]:
-        return np.ascontiguousarray(states[:, self.states]), np.tile(self.matrix, (len(states), 1, 1))
+        return np.ascontiguousarray(states[:, self.states]), np.tile(
+            self.matrix, (len(states), 1, 1)
+        )
 
 
 @dataclass(frozen=True)
@@ -145,13 +174,21 @@ class KalmanFilter:
         propagator: Propagator | None = None,
         observer: Propagator | None = None,
     ):
-        propagator = Linearization(process_noise=True) if propagator is None else propagator
+        propagator = (
+            Linearization(process_noise=True) if propagator is None else propagator
+        )
         if measurement.state_dim != model.state_dim:
             got = f"{measurement.state_dim} and {model.state_dim}"
-            raise SettingError("measurement", f"must be of as many states as the model has; got {got}")
+            raise SettingError(
+                "measurement", f"must be of as many states as the model has; got {got}"
+            )
         if not getattr(propagator, "process_noise", True):
-            rule = "must add the process noise, such as Linearization(process_noise=True)"
-            raise SettingError("propagator", f"{rule}; got {type(propagator).__name__} without")
+            rule = (
+                "must add the process noise, such as Linearization(process_noise=True)"
+            )
+            raise SettingError(
+                "propagator", f"{rule}; got {type(propagator).__name__} without"
+            )
         self.model, self.measurement, self.propagator = model, measurement, propagator
         self.observer = Linearization() if observer is None else observer
 
@@ -161,7 +198,9 @@ class KalmanFilter:
         return cls(model, measurement)
 
     @classmethod
-    def unscented(cls, model: DynamicsModel, measurement: Measurement) -> "KalmanFilter":
+    def unscented(
+        cls, model: DynamicsModel, measurement: Measurement
+    ) -> "KalmanFilter":
         """The unscented Kalman filter."""
         return cls(model, measurement, Unscented(process_noise=True), Unscented())
 
@@ -178,19 +217,30 @@ class KalmanFilter:
         y, R = _like(belief, measured), self.measurement.noise_covariance
         expected = (*belief.mean.shape[:-1], len(R))
         if y.shape != expected:
-            raise ShapeError(f"a measurement must have shape {expected}; got {tuple(y.shape)}")
+            raise ShapeError(
+                f"a measurement must have shape {expected}; got {tuple(y.shape)}"
+            )
         seen = self.observer.propagate(self.measurement, belief)
         S, missing = seen.belief.covariance + R, ~torch.isfinite(y)
         innovation, angles = y - seen.belief.mean, list(self.measurement.angles)
         if angles:
             innovation[..., angles] = wrapped(innovation[..., angles])
         # A missing entry is one of variance one that has nothing to do with the state.
-        used = torch.where(missing[..., None] | missing[..., None, :], torch.eye(len(R)).to(S), S)
+        used = torch.where(
+            missing[..., None] | missing[..., None, :], torch.eye(len(R)).to(S), S
+        )
         C = torch.where(missing[..., None, :], 0.0, seen.cross_covariance)
         gain = _right_solved(C, used)
-        mean = belief.mean + (gain @ torch.where(missing, 0.0, innovation)[..., None])[..., 0]
-        covariance, _ = nearest_positive_semidefinite(belief.covariance - gain @ used @ gain.mT)
-        return Update(Gaussian(mean, covariance), torch.where(missing, torch.nan, innovation), S)
+        mean = (
+            belief.mean
+            + (gain @ torch.where(missing, 0.0, innovation)[..., None])[..., 0]
+        )
+        covariance, _ = nearest_positive_semidefinite(
+            belief.covariance - gain @ used @ gain.mT
+        )
+        return Update(
+            Gaussian(mean, covariance), torch.where(missing, torch.nan, innovation), S
+        )
 
     def run(self, belief: Gaussian, inputs: Any, measured: Any) -> FilterRun:
         """Filters a log of inputs (T, m) and measurements (T + 1, p) from a belief before the first of them (n,).
@@ -200,7 +250,9 @@ class KalmanFilter:
         """
         inputs, measured = _like(belief, inputs), _like(belief, measured)
         if len(measured) != len(inputs) + 1:
-            raise ShapeError(f"T inputs belong to T + 1 measurements; got {len(inputs)} and {len(measured)}")
+            raise ShapeError(
+                f"T inputs belong to T + 1 measurements; got {len(inputs)} and {len(measured)}"
+            )
         predicted, updates = [belief], [self.update(belief, measured[0])]
         crosses = belief.covariance.new_zeros(len(inputs), *belief.covariance.shape)
         for k, input in enumerate(inputs):
@@ -208,8 +260,17 @@ class KalmanFilter:
             predicted.append(moved.belief)
             crosses[k] = moved.cross_covariance
             updates.append(self.update(moved.belief, measured[k + 1]))
-        innovations, covariances = (torch.stack([getattr(u, k) for u in updates]) for k in ("innovation", "covariance"))
-        return FilterRun(_stacked(predicted), _stacked([u.belief for u in updates]), crosses, innovations, covariances)
+        innovations, covariances = (
+            torch.stack([getattr(u, k) for u in updates])
+            for k in ("innovation", "covariance")
+        )
+        return FilterRun(
+            _stacked(predicted),
+            _stacked([u.belief for u in updates]),
+            crosses,
+            innovations,
+            covariances,
+        )
 
 
 def smooth(run: FilterRun) -> Gaussian:
@@ -245,7 +306,9 @@ class LateMeasurements:
     def __init__(self, filter: KalmanFilter, belief: Gaussian, longest: int = 10):
         check_number("longest", longest, least=0, whole=True)
         self.filter, self.belief = filter, belief
-        self._before: deque[Gaussian] = deque([belief], longest + 1)  # beliefs before the measurements of each step
+        self._before: deque[Gaussian] = deque(
+            [belief], longest + 1
+        )  # beliefs before the measurements of each step
         self._inputs: deque[Any] = deque(maxlen=longest)
         self._measured: deque[list[Any]] = deque([[]], longest + 1)
 
@@ -265,7 +328,10 @@ class LateMeasurements:
         """
         check_number("age", age, least=0, whole=True, unit="[steps]")
         if age >= len(self._before):
-            raise SettingError("age", f"must be at most {len(self._before) - 1} steps, which are remembered; got {age}")
+            raise SettingError(
+                "age",
+                f"must be at most {len(self._before) - 1} steps, which are remembered; got {age}",
+            )
         self._measured[-1 - age].append(measured)
         for k in range(-1 - age, 0):
             if k > -1 - age:
@@ -289,4 +355,7 @@ def _right_solved(C: Tensor, S: Tensor) -> Tensor:
 
 
 def _stacked(beliefs: Sequence[Gaussian]) -> Gaussian:
-    return Gaussian(torch.stack([b.mean for b in beliefs]), torch.stack([b.covariance for b in beliefs]))
+    return Gaussian(
+        torch.stack([b.mean for b in beliefs]),
+        torch.stack([b.covariance for b in beliefs]),
+    )

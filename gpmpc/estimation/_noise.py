@@ -37,14 +37,27 @@ from torch import Tensor
 
 from gpmpc._dynamics import DynamicsModel
 from gpmpc.exceptions import DataError, ShapeError, UnsupportedModel, check_number
-from gpmpc.gp import GPPosterior, Hyperparameters, Trainer, Transitions, informative_points
+from gpmpc.gp import (
+    GPPosterior,
+    Hyperparameters,
+    Trainer,
+    Transitions,
+    informative_points,
+)
 from gpmpc.gp._sparse import sparse_posterior
 from gpmpc.gp._transitions import check_transitions
 from gpmpc.models import NoisyModel
 
-SEARCHED, POINTS, FOLDS = 500, 50, 5  # rows of the search, at most; inducing points of g; parts that are held out
+SEARCHED, POINTS, FOLDS = (
+    500,
+    50,
+    5,
+)  # rows of the search, at most; inducing points of g; parts that are held out
 ITERATIONS = 15  # of the working responses; from the regression on log e^2 they change g by less than 1e-3 then
-CHI2_LOG = 1.2703628454614782, math.pi**2 / 2  # minus the mean of log chi^2_1, and its variance
+CHI2_LOG = (
+    1.2703628454614782,
+    math.pi**2 / 2,
+)  # minus the mean of log chi^2_1, and its variance
 
 
 @dataclass(frozen=True)
@@ -61,7 +74,9 @@ class ProcessNoise:
         return self.variance * (1 + rho) / (1 - rho)
 
 
-def estimate_process_noise(model: Any, transitions: Transitions, block: int = 20) -> ProcessNoise:
+def estimate_process_noise(
+    model: Any, transitions: Transitions, block: int = 20
+) -> ProcessNoise:
     """Estimates the noise of a model's outputs from transitions in their order of time.
 
     Args:
@@ -75,17 +90,23 @@ def estimate_process_noise(model: Any, transitions: Transitions, block: int = 20
     """
     errors, latent = _residuals(model, transitions, block)
     variance = (errors.square() - latent).mean(0)
-    floor = 0.01 * errors.square().mean(0)  # a variance of the latent function that is too large leaves something
+    floor = 0.01 * errors.square().mean(
+        0
+    )  # a variance of the latent function that is too large leaves something
     after, now = transitions.next_states[:-1], transitions.states[1:]
     successive = (after - now).abs().amax(1) <= 1e-12 + 1e-9 * now.abs().amax(1)
     rho = torch.full_like(variance, torch.nan)
     if int(successive.sum()) >= 10:
         first, second = errors[:-1][successive], errors[1:][successive]
-        rho = (first * second).sum(0) / (first.square().sum(0) * second.square().sum(0)).sqrt()
+        rho = (first * second).sum(0) / (
+            first.square().sum(0) * second.square().sum(0)
+        ).sqrt()
     return ProcessNoise(torch.maximum(variance, floor), rho)
 
 
-def with_process_noise(posterior: GPPosterior, noise: ProcessNoise | Tensor) -> GPPosterior:
+def with_process_noise(
+    posterior: GPPosterior, noise: ProcessNoise | Tensor
+) -> GPPosterior:
     """The posterior of GPs that have this noise, or these variances (k,), factorised anew over its points.
 
     Raises:
@@ -94,34 +115,50 @@ def with_process_noise(posterior: GPPosterior, noise: ProcessNoise | Tensor) -> 
     """
     variance = noise.variance if isinstance(noise, ProcessNoise) else noise
     if not isinstance(posterior, GPPosterior) or not posterior.has_observation_noise:
-        raise UnsupportedModel("the noise of a GPPosterior of observed rows can be replaced; train a sparse one again")
+        raise UnsupportedModel(
+            "the noise of a GPPosterior of observed rows can be replaced; train a sparse one again"
+        )
     if variance.shape != posterior.noise_variance.shape:
-        raise ShapeError(f"variances must be ({posterior.output_dim},); got {tuple(variance.shape)}")
+        raise ShapeError(
+            f"variances must be ({posterior.output_dim},); got {tuple(variance.shape)}"
+        )
     p = posterior
     kernel = p.lengthscales, p.signal_variance, variance.to(p.weights)
-    return GPPosterior.from_hyperparameters(p.features, p.targets, *kernel, p.input_dim, p.predicts, p.offset)
+    return GPPosterior.from_hyperparameters(
+        p.features, p.targets, *kernel, p.input_dim, p.predicts, p.offset
+    )
 
 
-def _residuals(model: Any, transitions: Transitions, block: int) -> tuple[Tensor, Tensor]:
+def _residuals(
+    model: Any, transitions: Transitions, block: int
+) -> tuple[Tensor, Tensor]:
     """Errors of the predicted outputs (N, k), and the variances of the latent functions (N, k) at the rows, checked."""
     check_transitions(transitions, model)
     if len(transitions) < 10:
         raise DataError(f"a noise needs ten rows or more; got {len(transitions)}")
     check_number("block", block, least=1, whole=True)
     to = {"dtype": model.dtype, "device": model.device}
-    x, u, after = (t.to(**to) for t in (transitions.states, transitions.inputs, transitions.next_states))
+    x, u, after = (
+        t.to(**to)
+        for t in (transitions.states, transitions.inputs, transitions.next_states)
+    )
     belief = model.predict(x, u)
     errors, variance = after - belief.mean, belief.variance.clone()
     if not isinstance(model, GPPosterior) or not model.has_observation_noise:
         return errors, variance
     trained = {tuple(point): i for i, point in enumerate(model.features.tolist())}
     features = enumerate(map(tuple, torch.cat([x, u], dim=1).tolist()))
-    pairs = torch.tensor([(row, trained[key]) for row, key in features if key in trained], dtype=torch.long)
+    pairs = torch.tensor(
+        [(row, trained[key]) for row, key in features if key in trained],
+        dtype=torch.long,
+    )
     for seen, at in (part.unbind(1) for part in pairs.split(block) if len(part)):
         for a in range(model.output_dim):
             covariance = torch.linalg.inv(model.precision[a][at][:, at])
             errors[seen, a] = covariance @ model.weights[a, at]
-            variance[seen, a] = (covariance.diagonal() - model.noise_variance[a]).clamp_min(0)
+            variance[seen, a] = (
+                covariance.diagonal() - model.noise_variance[a]
+            ).clamp_min(0)
     return errors, variance
 
 
@@ -151,27 +188,47 @@ def estimate_varying_noise(
         DataError: There are fewer than ten blocks.
         TrainingError: The GP of an output could not be trained.
     """
-    errors, latent = (part.cpu().double() for part in _residuals(model, transitions, block))
+    errors, latent = (
+        part.cpu().double() for part in _residuals(model, transitions, block)
+    )
     if len(errors) < 2 * FOLDS * block:
-        raise DataError(f"a varying noise needs {2 * FOLDS} blocks of {block} rows or more; got {len(errors)} rows")
-    squares, features, m = errors.square().clamp_min(1e-300), transitions.features, transitions.input_dim
+        raise DataError(
+            f"a varying noise needs {2 * FOLDS} blocks of {block} rows or more; got {len(errors)} rows"
+        )
+    squares, features, m = (
+        errors.square().clamp_min(1e-300),
+        transitions.features,
+        transitions.input_dim,
+    )
     fold = torch.arange(len(features)) // block % FOLDS
     constant = _constant(squares, latent)
     z = (squares * constant.exp() / (constant.exp() + latent)).log() + CHI2_LOG[0]
-    z = torch.maximum(z, constant - 12)  # a residual of zero is one of 0.3 % of a standard deviation
+    z = torch.maximum(
+        z, constant - 12
+    )  # a residual of zero is one of 0.3 % of a standard deviation
     chosen = np.sort(np.random.default_rng(seed).permutation(len(features))[:SEARCHED])
     found = Trainer(penalty=_prior).fit(features[chosen], z[chosen], m, "value", seed)
-    start, kernel = found.posterior, Hyperparameters.from_theta(torch.from_numpy(found.theta))
+    start, kernel = (
+        found.posterior,
+        Hyperparameters.from_theta(torch.from_numpy(found.theta)),
+    )
     Z = features[informative_points(features, kernel, POINTS)]
 
     def learned(rows: Tensor) -> tuple[GPPosterior, Tensor]:
         """G of some rows, and the logarithm of their constant variance."""
-        x, s, v, mean = features[rows], squares[rows], latent[rows], _constant(squares[rows], latent[rows])
+        x, s, v, mean = (
+            features[rows],
+            squares[rows],
+            latent[rows],
+            _constant(squares[rows], latent[rows]),
+        )
         scored = kernel._replace(noise_variance=torch.full_like(mean, 2.0))
         g = start
         for _ in range(ITERATIONS):
             at = g.predict(*x.split([x.shape[1] - m, m], dim=1)).mean
-            about_zero = sparse_posterior(Z, x, _responses(at, s, v) - mean, scored, m, "value")
+            about_zero = sparse_posterior(
+                Z, x, _responses(at, s, v) - mean, scored, m, "value"
+            )
             g = replace(about_zero, offset=mean, targets=about_zero.targets + mean)
         return g, mean
 
@@ -180,17 +237,36 @@ def estimate_varying_noise(
         held = fold == part
         g, mean = learned(~held)
         belief = g.predict(transitions.states[held], transitions.inputs[held])
-        varying, constant = (belief.mean + belief.variance / 2).exp() + latent[held], mean.exp() + latent[held]
-        gains[held] = ((constant / varying).log() + squares[held] * (1 / constant - 1 / varying)) / 2
+        varying, constant = (
+            (belief.mean + belief.variance / 2).exp() + latent[held],
+            mean.exp() + latent[held],
+        )
+        gains[held] = (
+            (constant / varying).log() + squares[held] * (1 / constant - 1 / varying)
+        ) / 2
     blocks = torch.stack([part.sum(0) for part in gains.split(block)])
     gain, error = blocks.sum(0), (len(blocks) * blocks.var(0)).sqrt()
-    outputs = tuple(torch.nonzero((gain > 2 * error) & (gain > math.log(100)))[:, 0].tolist())
+    outputs = tuple(
+        torch.nonzero((gain > 2 * error) & (gain > math.log(100)))[:, 0].tolist()
+    )
     if not outputs:
         return VaryingNoise(model, outputs, gain, error)
     g, at = learned(torch.ones_like(fold, dtype=torch.bool))[0], list(outputs)
-    each = "targets", "lengthscales", "signal_variance", "noise_variance", "offset", "cholesky", "weights"
-    g = replace(g, targets=g.targets[:, at], **{name: getattr(g, name)[at] for name in each[1:]})
-    return VaryingNoise(NoisyModel(model, g.to(model.device, model.dtype), at), outputs, gain, error)
+    each = (
+        "targets",
+        "lengthscales",
+        "signal_variance",
+        "noise_variance",
+        "offset",
+        "cholesky",
+        "weights",
+    )
+    g = replace(
+        g, targets=g.targets[:, at], **{name: getattr(g, name)[at] for name in each[1:]}
+    )
+    return VaryingNoise(
+        NoisyModel(model, g.to(model.device, model.dtype), at), outputs, gain, error
+    )
 
 
 def _constant(squares: Tensor, latent: Tensor) -> Tensor:
@@ -211,4 +287,6 @@ def _prior(theta: np.ndarray, log_std: np.ndarray) -> tuple[float, np.ndarray]:
     """Asks, with its gradient, for the noise of log chi^2_1 within 5 %, and no length-scale far below the spread."""
     noise = (theta[-2] - theta[-1] - math.log(CHI2_LOG[1]) / 2) / 0.05
     short = np.minimum(theta[:-2] - log_std, 0.0) / 0.3
-    return (noise**2 + (short**2).sum()) / 2, np.append(short / 0.3, [noise / 0.05, -noise / 0.05])
+    return (noise**2 + (short**2).sum()) / 2, np.append(
+        short / 0.3, [noise / 0.05, -noise / 0.05]
+    )

@@ -1,9 +1,19 @@
 """Gaussian process models of dynamics: data, training, and the frozen posterior that predicts."""
 
 from gpmpc.gp._backend import backend
-from gpmpc.gp._gpytorch import KernelPosterior, exact_inference, from_gpytorch, to_gpytorch
+from gpmpc.gp._gpytorch import (
+    KernelPosterior,
+    exact_inference,
+    from_gpytorch,
+    to_gpytorch,
+)
 from gpmpc.gp._kernel import Hyperparameters
-from gpmpc.gp._online import SlidingWindow, append_points, append_transitions, remove_points
+from gpmpc.gp._online import (
+    SlidingWindow,
+    append_points,
+    append_transitions,
+    remove_points,
+)
 from gpmpc.gp._posterior import GPPosterior
 from gpmpc.gp._scaling import Scaling, centre, identity, min_max, standardize
 from gpmpc.gp._search import SoftLimits

@@ -20,7 +20,14 @@ import torch
 from gpytorch.constraints import Positive
 from torch import Tensor
 
-from gpmpc._dynamics import Array, Linearized, TensorModel, check_destination, check_query, linearize_by_autograd
+from gpmpc._dynamics import (
+    Array,
+    Linearized,
+    TensorModel,
+    check_destination,
+    check_query,
+    linearize_by_autograd,
+)
 from gpmpc.exceptions import SettingError, ShapeError, UnsupportedModel
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp._kernel import Hyperparameters, Predicts, check_columns
@@ -47,24 +54,36 @@ class BatchExactGP(gpytorch.models.ExactGP):
 
     def __init__(self, features: Tensor, targets: Tensor):
         batch, d = torch.Size([targets.shape[1]]), features.shape[1]
-        log = Positive(transform=torch.exp, inv_transform=torch.log)  # raw values are logarithms
-        likelihood = gpytorch.likelihoods.GaussianLikelihood(batch_shape=batch, noise_constraint=log)
+        log = Positive(
+            transform=torch.exp, inv_transform=torch.log
+        )  # raw values are logarithms
+        likelihood = gpytorch.likelihoods.GaussianLikelihood(
+            batch_shape=batch, noise_constraint=log
+        )
         super().__init__(features, targets.T.contiguous(), likelihood)
         self.mean_module = gpytorch.means.ZeroMean(batch_shape=batch)
-        kernel = gpytorch.kernels.RBFKernel(ard_num_dims=d, batch_shape=batch, lengthscale_constraint=log)
-        self.covar_module = gpytorch.kernels.ScaleKernel(kernel, batch_shape=batch, outputscale_constraint=log)
+        kernel = gpytorch.kernels.RBFKernel(
+            ard_num_dims=d, batch_shape=batch, lengthscale_constraint=log
+        )
+        self.covar_module = gpytorch.kernels.ScaleKernel(
+            kernel, batch_shape=batch, outputscale_constraint=log
+        )
         self.double()
 
     def forward(self, features: Tensor) -> gpytorch.distributions.MultivariateNormal:
         """The prior over all outputs at inputs (N, d)."""
-        return gpytorch.distributions.MultivariateNormal(self.mean_module(features), self.covar_module(features))
+        return gpytorch.distributions.MultivariateNormal(
+            self.mean_module(features), self.covar_module(features)
+        )
 
     def set_hyperparameters(self, theta: Tensor) -> None:
         """Takes rows (log l (d), log sf, log(sf / sn)), one an output: (n, d + 2)."""
         with torch.no_grad():
             self.covar_module.base_kernel.raw_lengthscale.copy_(theta[:, None, :-2])
             self.covar_module.raw_outputscale.copy_(2 * theta[:, -2])
-            self.likelihood.noise_covar.raw_noise.copy_(2 * (theta[:, -2:-1] - theta[:, -1:]))
+            self.likelihood.noise_covar.raw_noise.copy_(
+                2 * (theta[:, -2:-1] - theta[:, -1:])
+            )
 
 
 def to_gpytorch(posterior: GPPosterior) -> BatchExactGP:
@@ -73,13 +92,22 @@ def to_gpytorch(posterior: GPPosterior) -> BatchExactGP:
     mean = gpytorch.means.ConstantMean(batch_shape=posterior.offset.shape)
     model.mean_module = mean.requires_grad_(False).double()
     model.mean_module.constant.copy_(posterior.offset)
-    deviation, noise = posterior.signal_variance.log() / 2, posterior.noise_variance.log() / 2
-    model.set_hyperparameters(torch.column_stack([posterior.lengthscales.log(), deviation, deviation - noise]))
+    deviation, noise = (
+        posterior.signal_variance.log() / 2,
+        posterior.noise_variance.log() / 2,
+    )
+    model.set_hyperparameters(
+        torch.column_stack([posterior.lengthscales.log(), deviation, deviation - noise])
+    )
     return model.eval()
 
 
 def from_gpytorch(
-    model: Any, likelihood: Any = None, *, input_dim: int, predicts: Predicts = "next_state"
+    model: Any,
+    likelihood: Any = None,
+    *,
+    input_dim: int,
+    predicts: Predicts = "next_state",
 ) -> GPPosterior:
     """Freezes trained SE-ARD ExactGPs of GPyTorch: one, a batch (one batch dimension, an output each), or a list.
 
@@ -99,39 +127,92 @@ def from_gpytorch(
         ShapeError: The models of a list have other training inputs or inducing points, or there is more than one batch
             dimension.
     """
-    rows: list[tuple[Tensor, ...]] = []  # targets, length-scales, signal and noise variance, offset
+    rows: list[
+        tuple[Tensor, ...]
+    ] = []  # targets, length-scales, signal and noise variance, offset
     inputs: list[Tensor] = []
     inducing: list[Tensor] = []
     for one, own in _members(model, likelihood):
-        targets, kernel, none = one.train_targets, one.covar_module, torch.zeros((), dtype=torch.float64)
+        targets, kernel, none = (
+            one.train_targets,
+            one.covar_module,
+            torch.zeros((), dtype=torch.float64),
+        )
         inputs += _features(one)
         outputs, scale = targets[None] if targets.dim() == 1 else targets, none + 1
-        if isinstance(kernel, gpytorch.kernels.InducingPointKernel) and kernel.active_dims is None:
-            inducing += kernel.inducing_points.detach().reshape(-1, *kernel.inducing_points.shape[-2:])
+        if (
+            isinstance(kernel, gpytorch.kernels.InducingPointKernel)
+            and kernel.active_dims is None
+        ):
+            inducing += kernel.inducing_points.detach().reshape(
+                -1, *kernel.inducing_points.shape[-2:]
+            )
             kernel = kernel.base_kernel
         if isinstance(kernel, gpytorch.kernels.ScaleKernel):
             scale, kernel = kernel.outputscale, kernel.base_kernel
-        if type(kernel) is not gpytorch.kernels.RBFKernel or kernel.active_dims is not None:
-            name = type(kernel).__name__ + (" on some dimensions" if kernel.active_dims is not None else "")
-            rule = "GPPosterior has the SE-ARD kernel: RBFKernel, in a ScaleKernel or not"
-            raise UnsupportedModel(f"{rule}; got {name}. KernelPosterior takes any kernel")
-        if not isinstance(one.mean_module, gpytorch.means.ConstantMean | gpytorch.means.ZeroMean):
-            raise UnsupportedModel(f"the mean must be zero or constant; got {type(one.mean_module).__name__}")
+        if (
+            type(kernel) is not gpytorch.kernels.RBFKernel
+            or kernel.active_dims is not None
+        ):
+            name = type(kernel).__name__ + (
+                " on some dimensions" if kernel.active_dims is not None else ""
+            )
+            rule = (
+                "GPPosterior has the SE-ARD kernel: RBFKernel, in a ScaleKernel or not"
+            )
+            raise UnsupportedModel(
+                f"{rule}; got {name}. KernelPosterior takes any kernel"
+            )
+        if not isinstance(
+            one.mean_module, gpytorch.means.ConstantMean | gpytorch.means.ZeroMean
+        ):
+            raise UnsupportedModel(
+                f"the mean must be zero or constant; got {type(one.mean_module).__name__}"
+            )
         k, constant = len(outputs), getattr(one.mean_module, "constant", none)
-        numbers = (value.reshape(-1).expand(k).to(targets.device) for value in (scale, own.noise, constant))
-        lengthscales = kernel.lengthscale.reshape(-1, kernel.lengthscale.shape[-1]).expand(k, inputs[0].shape[1])
+        numbers = (
+            value.reshape(-1).expand(k).to(targets.device)
+            for value in (scale, own.noise, constant)
+        )
+        lengthscales = kernel.lengthscale.reshape(
+            -1, kernel.lengthscale.shape[-1]
+        ).expand(k, inputs[0].shape[1])
         rows.append((outputs, lengthscales, *numbers))
     if not _equal(inputs):
-        raise ShapeError("all outputs must have the same training inputs (N, d); got different ones")
-    targets, *kernel, offset = (torch.cat(values).detach().clone() for values in zip(*rows, strict=True))
-    features, targets, hyperparameters = inputs[0].clone(), targets.T.contiguous(), Hyperparameters(*kernel)
+        raise ShapeError(
+            "all outputs must have the same training inputs (N, d); got different ones"
+        )
+    targets, *kernel, offset = (
+        torch.cat(values).detach().clone() for values in zip(*rows, strict=True)
+    )
+    features, targets, hyperparameters = (
+        inputs[0].clone(),
+        targets.T.contiguous(),
+        Hyperparameters(*kernel),
+    )
     if not inducing:
-        return GPPosterior.from_hyperparameters(features, targets, *hyperparameters, input_dim, predicts, offset)
+        return GPPosterior.from_hyperparameters(
+            features, targets, *hyperparameters, input_dim, predicts, offset
+        )
     if len(inducing) not in (1, targets.shape[1]) or not _equal(inducing):
-        raise ShapeError("all outputs must be sparse, with the same inducing points (M, d); got different ones")
-    method: Method = "fitc" if gpytorch.settings.sgpr_diagonal_correction.on() else "sgpr"
-    given = inducing[0].clone(), features, targets - offset, hyperparameters, input_dim, predicts, method
-    return sparse_posterior(*given).unscaled(identity(features), Scaling(offset, torch.ones_like(offset)))
+        raise ShapeError(
+            "all outputs must be sparse, with the same inducing points (M, d); got different ones"
+        )
+    method: Method = (
+        "fitc" if gpytorch.settings.sgpr_diagonal_correction.on() else "sgpr"
+    )
+    given = (
+        inducing[0].clone(),
+        features,
+        targets - offset,
+        hyperparameters,
+        input_dim,
+        predicts,
+        method,
+    )
+    return sparse_posterior(*given).unscaled(
+        identity(features), Scaling(offset, torch.ones_like(offset))
+    )
 
 
 @dataclass(frozen=True)
@@ -141,7 +222,9 @@ class KernelPosterior(TensorModel):
     It works with every propagation but ``MomentMatching``, which has a closed form for the SE-ARD kernel only.
     """
 
-    parts: tuple["_Part", ...]  #: one a GPyTorch model, each with one output or a batch of them
+    parts: tuple[
+        "_Part", ...
+    ]  #: one a GPyTorch model, each with one output or a batch of them
     input_dim: int  #: m, how many of the last features are controls
     predicts: Predicts  #: what the targets mean
 
@@ -149,7 +232,12 @@ class KernelPosterior(TensorModel):
 
     @classmethod
     def from_gpytorch(
-        cls, model: Any, likelihood: Any = None, *, input_dim: int, predicts: Predicts = "next_state"
+        cls,
+        model: Any,
+        likelihood: Any = None,
+        *,
+        input_dim: int,
+        predicts: Predicts = "next_state",
     ) -> "KernelPosterior":
         """Freezes trained ExactGPs in float64, which are copied; arguments are as for ``gpmpc.gp.from_gpytorch``.
 
@@ -158,11 +246,19 @@ class KernelPosterior(TensorModel):
             ShapeError: The numbers of features differ, or do not go with the numbers of outputs and controls.
             SettingError: The model is not in float64, or its kernel matrix is not positive definite.
         """
-        found = cls(tuple(_Part.of(one, own) for one, own in _members(model, likelihood)), input_dim, predicts)
+        found = cls(
+            tuple(_Part.of(one, own) for one, own in _members(model, likelihood)),
+            input_dim,
+            predicts,
+        )
         widths = sorted({part.features.shape[-1] for part in found.parts})
         if len(widths) > 1:
-            raise ShapeError(f"all models must have the same number of features; got {widths}")
-        check_columns("the models' features", widths[0], found.output_dim, input_dim, predicts)
+            raise ShapeError(
+                f"all models must have the same number of features; got {widths}"
+            )
+        check_columns(
+            "the models' features", widths[0], found.output_dim, input_dim, predicts
+        )
         return found
 
     @property
@@ -180,12 +276,22 @@ class KernelPosterior(TensorModel):
         """Of the observations (k, k), diagonal."""
         return torch.diag(torch.cat([part.noise for part in self.parts]))
 
-    def to(self, device: str | torch.device | None = None, dtype: torch.dtype | None = None) -> "KernelPosterior":
+    def to(
+        self, device: str | torch.device | None = None, dtype: torch.dtype | None = None
+    ) -> "KernelPosterior":
         """Copies the model to another device, or to another type: float32 or float64."""
         check_destination(device, dtype)
         to: dict[str, Any] = {"device": device, "dtype": dtype}
-        parts = [(copy.deepcopy(part.model), *(getattr(part, name) for name in _TENSORS)) for part in self.parts]
-        return replace(self, parts=tuple(_Part(*(value.to(**to) for value in values)) for values in parts))
+        parts = [
+            (copy.deepcopy(part.model), *(getattr(part, name) for name in _TENSORS))
+            for part in self.parts
+        ]
+        return replace(
+            self,
+            parts=tuple(
+                _Part(*(value.to(**to) for value in values)) for values in parts
+            ),
+        )
 
     def predict(self, state: Tensor, input: Tensor | None = None) -> Gaussian:
         """The next state's distribution at a certain state and input; see ``GPPosterior.predict``."""
@@ -193,11 +299,20 @@ class KernelPosterior(TensorModel):
         check_query(self, state, input)
         batch, query = state.shape[:-1], torch.cat([state, input], dim=-1)
         flat = query.reshape(-1, query.shape[-1])
-        means, variances = zip(*(part.predict(flat) for part in self.parts), strict=True)
-        mean, variance = (torch.cat(rows, dim=-1).reshape(*batch, -1) for rows in (means, variances))
-        return Gaussian(mean + state if self.predicts == "difference" else mean, torch.diag_embed(variance))
+        means, variances = zip(
+            *(part.predict(flat) for part in self.parts), strict=True
+        )
+        mean, variance = (
+            torch.cat(rows, dim=-1).reshape(*batch, -1) for rows in (means, variances)
+        )
+        return Gaussian(
+            mean + state if self.predicts == "difference" else mean,
+            torch.diag_embed(variance),
+        )
 
-    def linearize(self, states: Array, inputs: Array, covariance: bool = True) -> Linearized:
+    def linearize(
+        self, states: Array, inputs: Array, covariance: bool = True
+    ) -> Linearized:
         """Linearises the mean at K points (K, n), (K, m) by torch autograd."""
         return linearize_by_autograd(self, states, inputs, covariance)
 
@@ -218,8 +333,12 @@ class _Part:
     @classmethod
     def of(cls, model: Any, likelihood: Any) -> "_Part":
         targets = model.train_targets
-        if isinstance(getattr(model, "covar_module", None), gpytorch.kernels.InducingPointKernel):
-            raise UnsupportedModel("the model is sparse (InducingPointKernel): freeze it by from_gpytorch")
+        if isinstance(
+            getattr(model, "covar_module", None), gpytorch.kernels.InducingPointKernel
+        ):
+            raise UnsupportedModel(
+                "the model is sparse (InducingPointKernel): freeze it by from_gpytorch"
+            )
         copied = copy.deepcopy(model).eval().requires_grad_(False)
         copied.prediction_strategy = None
         batch, features = targets.shape[:-1], _features(copied)
@@ -233,49 +352,82 @@ class _Part:
             if bool(info.any()):
                 rule = "its kernel matrix is not positive definite in float64: raise the noise, or drop equal rows"
                 raise SettingError("model", rule)
-            weights = torch.cholesky_solve((targets - prior.mean)[..., None], cholesky)[..., 0]
+            weights = torch.cholesky_solve((targets - prior.mean)[..., None], cholesky)[
+                ..., 0
+            ]
         return cls(copied, features, cholesky, weights, noise)
 
     def predict(self, query: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and variance (B, k) at (B, d)."""
         size = self.features.shape[-2]
-        joined = torch.cat([self.features, query.expand(*self.features.shape[:-2], -1, -1)], dim=-2)
+        joined = torch.cat(
+            [self.features, query.expand(*self.features.shape[:-2], -1, -1)], dim=-2
+        )
         with exact_inference():
-            prior = self.model.forward(joined)  # lazy: only the two blocks below are evaluated
+            prior = self.model.forward(
+                joined
+            )  # lazy: only the two blocks below are evaluated
             covariance = prior.lazy_covariance_matrix
             k = covariance[..., :size, size:].to_dense()  # (*k, N, B)
             own = covariance[..., size:, size:].diagonal(dim1=-2, dim2=-1)
-        explained = torch.linalg.solve_triangular(self.cholesky, k, upper=False).square().sum(-2)
+        explained = (
+            torch.linalg.solve_triangular(self.cholesky, k, upper=False)
+            .square()
+            .sum(-2)
+        )
         mean = prior.mean[..., size:] + (self.weights[..., None] * k).sum(-2)
         variance = (own - explained).clamp_min(0)
-        return mean.reshape(len(self.noise), -1).mT, variance.reshape(len(self.noise), -1).mT
+        return mean.reshape(len(self.noise), -1).mT, variance.reshape(
+            len(self.noise), -1
+        ).mT
 
 
 def _members(model: Any, likelihood: Any) -> list[tuple[Any, Any]]:
     """Trained exact GPs with their likelihoods, from one model, an ``IndependentModelList`` or a sequence; checked."""
-    given: list[Any] = [getattr(model, "models", model), getattr(likelihood, "likelihoods", likelihood)]
-    models, likelihoods = (list(x) if isinstance(x, Sequence | torch.nn.ModuleList) else [x] for x in given)
+    given: list[Any] = [
+        getattr(model, "models", model),
+        getattr(likelihood, "likelihoods", likelihood),
+    ]
+    models, likelihoods = (
+        list(x) if isinstance(x, Sequence | torch.nn.ModuleList) else [x] for x in given
+    )
     likelihoods = likelihoods * len(models) if len(likelihoods) == 1 else likelihoods
     if len(likelihoods) != len(models):
-        raise ShapeError(f"each model needs one likelihood; got {len(models)} models and {len(likelihoods)}")
+        raise ShapeError(
+            f"each model needs one likelihood; got {len(models)} models and {len(likelihoods)}"
+        )
     owners = zip(models, likelihoods, strict=True)
-    pairs: list[Any] = [(one, getattr(one, "likelihood", None) if own is None else own) for one, own in owners]
+    pairs: list[Any] = [
+        (one, getattr(one, "likelihood", None) if own is None else own)
+        for one, own in owners
+    ]
     for one, own in pairs:
         if not isinstance(one, gpytorch.models.ExactGP) or one.train_inputs is None:
-            raise UnsupportedModel(f"only ExactGP models with training data can be frozen; got {type(one).__name__}")
+            raise UnsupportedModel(
+                f"only ExactGP models with training data can be frozen; got {type(one).__name__}"
+            )
         if type(own) is not gpytorch.likelihoods.GaussianLikelihood:
-            raise UnsupportedModel(f"the likelihood must be a GaussianLikelihood; got {type(own).__name__}")
+            raise UnsupportedModel(
+                f"the likelihood must be a GaussianLikelihood; got {type(own).__name__}"
+            )
         if one.train_targets.dim() > 2:
             shape = tuple(one.train_targets.shape)
-            raise ShapeError(f"a batch of models has one batch dimension; got targets {shape}")
+            raise ShapeError(
+                f"a batch of models has one batch dimension; got targets {shape}"
+            )
         for transform in ("input_transform", "outcome_transform"):
             if getattr(one, transform, None) is not None:
                 raise UnsupportedModel(
                     f"the model carries an {transform}, which its hyperparameters do not contain: "
                     "train without it, and give the units back by GPPosterior.unscaled"
                 )
-        if one.train_targets.dtype != torch.float64 or one.train_inputs[0].dtype != torch.float64:
-            raise SettingError("model", "must be in float64 (model.double(), data too); got float32")
+        if (
+            one.train_targets.dtype != torch.float64
+            or one.train_inputs[0].dtype != torch.float64
+        ):
+            raise SettingError(
+                "model", "must be in float64 (model.double(), data too); got float32"
+            )
     return pairs
 
 

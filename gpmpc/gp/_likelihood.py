@@ -27,7 +27,9 @@ class NegativeLogMarginalLikelihood:
     default from 400 points on, where that is faster. One call at a time: the array is this object's.
     """
 
-    def __init__(self, features: np.ndarray, targets: np.ndarray, in_place: bool | None = None):
+    def __init__(
+        self, features: np.ndarray, targets: np.ndarray, in_place: bool | None = None
+    ):
         self._x = np.ascontiguousarray(centred(features))
         self._y = np.ascontiguousarray(targets)
         size = len(targets)
@@ -38,11 +40,20 @@ class NegativeLogMarginalLikelihood:
         """Value and gradient (d + 2,)."""
         d = self._x.shape[1]
         z = self._x * np.exp(-theta[:d])
-        sf2, sn2 = float(np.exp(2 * theta[d])), float(np.exp(2 * (theta[d] - theta[d + 1])))
-        found = self._small(z, sf2, sn2) if self._square is None else self._large(self._square, z, sf2, sn2)
+        sf2, sn2 = (
+            float(np.exp(2 * theta[d])),
+            float(np.exp(2 * (theta[d] - theta[d + 1]))),
+        )
+        found = (
+            self._small(z, sf2, sn2)
+            if self._square is None
+            else self._large(self._square, z, sf2, sn2)
+        )
         return (np.inf, np.zeros_like(theta)) if found is None else found
 
-    def _small(self, z: np.ndarray, sf2: float, sn2: float) -> tuple[float, np.ndarray] | None:
+    def _small(
+        self, z: np.ndarray, sf2: float, sn2: float
+    ) -> tuple[float, np.ndarray] | None:
         size, d = z.shape
         half_squares = -np.einsum("id,id->i", z, z) / 2
         signal = z @ z.T
@@ -56,17 +67,25 @@ class NegativeLogMarginalLikelihood:
         if info:
             return None
         weights, value = self._weights_and_value(factor)
-        inverse, _ = lapack.dlauum(_triangular_inverse(factor), lower=1, overwrite_c=1)  # K^-1 = L^-T L^-1
-        W = blas.dsyr(-1.0, weights, a=inverse, lower=1, overwrite_a=1).T  # upper triangle; zeros below
+        inverse, _ = lapack.dlauum(
+            _triangular_inverse(factor), lower=1, overwrite_c=1
+        )  # K^-1 = L^-T L^-1
+        W = blas.dsyr(
+            -1.0, weights, a=inverse, lower=1, overwrite_a=1
+        ).T  # upper triangle; zeros below
         trace = W.trace()
         M = np.multiply(W, signal, out=W)
         gradient = np.empty(d + 2)
-        gradient[:d] = (M.sum(axis=0) + M.sum(axis=1)) @ (z * z) - 2 * np.einsum("id,id->d", M @ z, z)
+        gradient[:d] = (M.sum(axis=0) + M.sum(axis=1)) @ (z * z) - 2 * np.einsum(
+            "id,id->d", M @ z, z
+        )
         gradient[d] = 2 * M.sum() - sf2 * trace + sn2 * trace
         gradient[d + 1] = -sn2 * trace
         return value, gradient
 
-    def _large(self, square: np.ndarray, z: np.ndarray, sf2: float, sn2: float) -> tuple[float, np.ndarray] | None:
+    def _large(
+        self, square: np.ndarray, z: np.ndarray, sf2: float, sn2: float
+    ) -> tuple[float, np.ndarray] | None:
         """Uses one array: above its diagonal sf2 E, which stays; below it K, then L, then K^-1."""
         _fill(square, z, sf2, sn2)
         # LAPACK leaves the other half alone: clean = 0.
@@ -79,11 +98,17 @@ class NegativeLogMarginalLikelihood:
             return None
         trace = inverse.trace() - weights @ weights  # of W
         by_lengthscale, total = _sums(square, z, weights)
-        return value, np.append(by_lengthscale, [2 * total + (sf2 + sn2) * trace, -sn2 * trace])
+        return value, np.append(
+            by_lengthscale, [2 * total + (sf2 + sn2) * trace, -sn2 * trace]
+        )
 
     def _weights_and_value(self, factor: np.ndarray) -> tuple[np.ndarray, float]:
         weights, _ = lapack.dpotrs(factor, self._y, lower=1)
-        value = self._y @ weights / 2 + np.log(factor.diagonal()).sum() + len(self._y) / 2 * np.log(2 * np.pi)
+        value = (
+            self._y @ weights / 2
+            + np.log(factor.diagonal()).sum()
+            + len(self._y) / 2 * np.log(2 * np.pi)
+        )
         return weights, value
 
 
@@ -102,7 +127,9 @@ def _fill(square: np.ndarray, z: np.ndarray, sf2: float, sn2: float) -> None:
     square.flat[:: len(z) + 1] = sf2 + sn2
 
 
-def _sums(square: np.ndarray, z: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, float]:
+def _sums(
+    square: np.ndarray, z: np.ndarray, weights: np.ndarray
+) -> tuple[np.ndarray, float]:
     """sum_{i>j} M_ij (z_id - z_jd)^2 (d,), and sum_{i>j} M_ij, over block columns and the rows that mirror them."""
     by_lengthscale, total = np.zeros(z.shape[1]), 0.0
     for begin in range(0, len(z), _BLOCK):
@@ -128,5 +155,7 @@ def _triangular_inverse(lower: np.ndarray) -> np.ndarray:
     inverse = np.zeros((size, size), order="F")
     inverse[:half, :half] = _triangular_inverse(lower[:half, :half])
     inverse[half:, half:] = _triangular_inverse(lower[half:, half:])
-    inverse[half:, :half] = -inverse[half:, half:] @ (lower[half:, :half] @ inverse[:half, :half])
+    inverse[half:, :half] = -inverse[half:, half:] @ (
+        lower[half:, :half] @ inverse[:half, :half]
+    )
     return inverse

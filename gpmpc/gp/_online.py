@@ -25,7 +25,14 @@ import torch
 from torch import Tensor
 
 from gpmpc._kernels._window import drop_point
-from gpmpc.exceptions import DataError, SettingError, ShapeError, UnsupportedModel, check_choice, check_number
+from gpmpc.exceptions import (
+    DataError,
+    SettingError,
+    ShapeError,
+    UnsupportedModel,
+    check_choice,
+    check_number,
+)
 from gpmpc.gaussian import check_tensors
 from gpmpc.gp._kernel import check_positive_definite, check_posterior, kernel_matrix
 from gpmpc.gp._posterior import GPPosterior
@@ -47,20 +54,29 @@ def append_transitions(posterior: GPPosterior, transitions: Transitions) -> GPPo
     return append_points(posterior, transitions.features, targets)
 
 
-def append_points(posterior: GPPosterior, features: Tensor, targets: Tensor) -> GPPosterior:
+def append_points(
+    posterior: GPPosterior, features: Tensor, targets: Tensor
+) -> GPPosterior:
     """Appends points x~ = (x, u) (p, n + m) with targets (p, k) to a posterior's data."""
     check_tensors(features=features, targets=targets)
     features, targets = features.to(posterior.features), targets.to(posterior.features)
     given = {"features": features, "targets": targets}
     check_posterior(given, posterior.input_dim, posterior.predicts, posterior.dtype)
-    if (got := (features.shape[1], targets.shape[1])) != (posterior.features.shape[1], posterior.output_dim):
-        raise ShapeError(f"points must have features and targets like those of {posterior}; got {got[0]} and {got[1]}")
+    if (got := (features.shape[1], targets.shape[1])) != (
+        posterior.features.shape[1],
+        posterior.output_dim,
+    ):
+        raise ShapeError(
+            f"points must have features and targets like those of {posterior}; got {got[0]} and {got[1]}"
+        )
     size, p = len(posterior), len(features)
     scales, sf2 = posterior.lengthscales, posterior.signal_variance
     old_targets = (posterior.targets - posterior.offset).mT[..., None]  # (k, N, 1)
     new_targets = (targets - posterior.offset).mT[..., None]
     # One pass over the factor serves the new rows and the first half of the weights.
-    right = torch.cat([kernel_matrix(posterior.features, features, scales, sf2), old_targets], dim=-1)
+    right = torch.cat(
+        [kernel_matrix(posterior.features, features, scales, sf2), old_targets], dim=-1
+    )
     right = torch.linalg.solve_triangular(posterior.cholesky, right, upper=False)
     L21, w1 = right[..., :p].mT, right[..., p:]
     corner = kernel_matrix(features, features, scales, sf2) - L21 @ L21.mT
@@ -71,12 +87,25 @@ def append_points(posterior: GPPosterior, features: Tensor, targets: Tensor) -> 
     cholesky[:, :size, :size], cholesky[:, :size, size:] = posterior.cholesky, 0
     cholesky[:, size:, :size], cholesky[:, size:, size:] = L21, L22
     w2 = torch.linalg.solve_triangular(L22, new_targets - L21 @ w1, upper=False)
-    weights = torch.linalg.solve_triangular(cholesky.mT, torch.cat([w1, w2], dim=-2), upper=True)[..., 0]
-    features, targets = torch.cat([posterior.features, features]), torch.cat([posterior.targets, targets])
-    return replace(posterior, features=features, targets=targets, cholesky=cholesky, weights=weights)
+    weights = torch.linalg.solve_triangular(
+        cholesky.mT, torch.cat([w1, w2], dim=-2), upper=True
+    )[..., 0]
+    features, targets = (
+        torch.cat([posterior.features, features]),
+        torch.cat([posterior.targets, targets]),
+    )
+    return replace(
+        posterior,
+        features=features,
+        targets=targets,
+        cholesky=cholesky,
+        weights=weights,
+    )
 
 
-def remove_points(posterior: GPPosterior, indices: Sequence[int] | Tensor) -> GPPosterior:
+def remove_points(
+    posterior: GPPosterior, indices: Sequence[int] | Tensor
+) -> GPPosterior:
     """Removes points (rows of ``features``) from a posterior's data.
 
     Raises:
@@ -87,14 +116,24 @@ def remove_points(posterior: GPPosterior, indices: Sequence[int] | Tensor) -> GP
     removed = _indices(indices, size)
     if not removed:
         return posterior
-    kept = torch.tensor(sorted(set(range(size)).difference(removed)), device=posterior.device)
+    kept = torch.tensor(
+        sorted(set(range(size)).difference(removed)), device=posterior.device
+    )
     if not len(kept):
-        raise DataError(f"a posterior needs at least one point; removing {len(removed)} of {size} leaves none")
-    if posterior.device.type != "cpu" or posterior.cholesky.requires_grad or len(removed) > _MANY * size:
+        raise DataError(
+            f"a posterior needs at least one point; removing {len(removed)} of {size} leaves none"
+        )
+    if (
+        posterior.device.type != "cpu"
+        or posterior.cholesky.requires_grad
+        or len(removed) > _MANY * size
+    ):
         rows = posterior.cholesky[:, kept]
         first = removed[0]  # nothing changes above it
         cholesky = rows[:, :, kept]
-        cholesky[:, first:, first:] = torch.linalg.cholesky(rows[:, first:, first:] @ rows[:, first:, first:].mT)
+        cholesky[:, first:, first:] = torch.linalg.cholesky(
+            rows[:, first:, first:] @ rows[:, first:, first:].mT
+        )
     else:
         columns = np.ascontiguousarray(posterior.cholesky.mT.detach().numpy())
         for index in reversed(removed):
@@ -102,9 +141,17 @@ def remove_points(posterior: GPPosterior, indices: Sequence[int] | Tensor) -> GP
             drop_point(before, index, columns)
         cholesky = torch.from_numpy(columns).mT
     targets = posterior.targets[kept]
-    half = torch.linalg.solve_triangular(cholesky, (targets - posterior.offset).mT[..., None], upper=False)
+    half = torch.linalg.solve_triangular(
+        cholesky, (targets - posterior.offset).mT[..., None], upper=False
+    )
     weights = torch.linalg.solve_triangular(cholesky.mT, half, upper=True)[..., 0]
-    return replace(posterior, features=posterior.features[kept], targets=targets, cholesky=cholesky, weights=weights)
+    return replace(
+        posterior,
+        features=posterior.features[kept],
+        targets=targets,
+        cholesky=cholesky,
+        weights=weights,
+    )
 
 
 def targets_of(posterior: GPPosterior, transitions: Transitions) -> Tensor:
@@ -136,23 +183,36 @@ class SlidingWindow:
         """The posterior with the transitions, held to ``points`` points; errors are those of ``append_transitions``."""
         if not isinstance(posterior, GPPosterior):
             got = type(posterior).__name__
-            raise UnsupportedModel(f"a window is for a GPPosterior (ResidualModel.append takes one); got {got}")
+            raise UnsupportedModel(
+                f"a window is for a GPPosterior (ResidualModel.append takes one); got {got}"
+            )
         targets = targets_of(posterior, transitions)
         return self.append(posterior, transitions.features, targets)
 
-    def append(self, posterior: GPPosterior, features: Tensor, targets: Tensor) -> GPPosterior:
+    def append(
+        self, posterior: GPPosterior, features: Tensor, targets: Tensor
+    ) -> GPPosterior:
         """The posterior with points x~ (p, n + m) and their targets (p, k), held to ``points`` points."""
         larger, removable = append_points(posterior, features, targets), len(posterior)
         if len(features) > self.points:
-            _log.warning("%d new points exceed the window of %d: some are removed too", len(features), self.points)
+            _log.warning(
+                "%d new points exceed the window of %d: some are removed too",
+                len(features),
+                self.points,
+            )
             larger, removable = remove_points(larger, range(removable)), len(features)
         if (excess := len(larger) - self.points) <= 0:
             return larger
         oldest = self.remove == "oldest"
-        return remove_points(larger, range(excess) if oldest else least_informative(larger, excess, removable))
+        return remove_points(
+            larger,
+            range(excess) if oldest else least_informative(larger, excess, removable),
+        )
 
 
-def least_informative(posterior: GPPosterior, count: int, candidates: int | None = None) -> list[int]:
+def least_informative(
+    posterior: GPPosterior, count: int, candidates: int | None = None
+) -> list[int]:
     """Which of the first ``candidates`` points to drop, each the least informative when those before it are gone."""
     P, beta = posterior.precision.clone(), posterior.weights.clone()
     noise = _noise_variances(posterior)
@@ -190,8 +250,13 @@ def _noise_variances(posterior: GPPosterior) -> Tensor:
 def _indices(indices: Sequence[int] | Tensor, size: int) -> list[int]:
     """Different indices from 0 to size - 1 in ascending order; negative ones count from the end, as everywhere."""
     given = np.atleast_1d(np.asarray(indices)).tolist()
-    if any(isinstance(i, bool) or not isinstance(i, int) or not -size <= i < size for i in given):
-        raise SettingError("indices", f"must be whole numbers from {-size} to {size - 1}; got {given}")
+    if any(
+        isinstance(i, bool) or not isinstance(i, int) or not -size <= i < size
+        for i in given
+    ):
+        raise SettingError(
+            "indices", f"must be whole numbers from {-size} to {size - 1}; got {given}"
+        )
     found = sorted({i % size for i in given})
     if len(found) != len(given):
         raise SettingError("indices", f"must be different; got {given}")

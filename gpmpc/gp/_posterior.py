@@ -15,7 +15,15 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import torch
 from torch import Tensor
 
-from gpmpc._dynamics import Array, Linearized, TensorModel, check_destination, check_query, tensors_for, to_array
+from gpmpc._dynamics import (
+    Array,
+    Linearized,
+    TensorModel,
+    check_destination,
+    check_query,
+    tensors_for,
+    to_array,
+)
 from gpmpc.gaussian import Gaussian, check_tensors, constant_arrays
 from gpmpc.gp._backend import host_arrays
 from gpmpc.gp._kernel import Hyperparameters, Predicts, check_posterior, factorize
@@ -38,7 +46,9 @@ class AffineForm(NamedTuple):
     B: Tensor | None = None  #: (n, k)
     states: list[int] | None = None  #: the states that f depends on
     inputs: list[int] | None = None  #: the inputs that f depends on
-    angles: tuple[int, ...] = ()  #: those of ``states`` that f sees as (sine, cosine), at their place
+    angles: tuple[
+        int, ...
+    ] = ()  #: those of ``states`` that f sees as (sine, cosine), at their place
     tape: Any = None  #: f0 as a ``gpmpc._kernels.tape.Tape``; None for zero
 
 
@@ -93,14 +103,28 @@ class GPPosterior(TensorModel):
         check_tensors(targets=targets)
         offset = torch.zeros_like(targets[:1].flatten()) if offset is None else offset
         kernel = Hyperparameters(lengthscales, signal_variance, noise_variance)
-        given: dict[str, Tensor] = {"inputs": inputs, "targets": targets, **kernel._asdict(), "offset": offset}
+        given: dict[str, Tensor] = {
+            "inputs": inputs,
+            "targets": targets,
+            **kernel._asdict(),
+            "offset": offset,
+        }
         check_posterior(given, input_dim, predicts)
         inputs, targets, *scales, offset = (value.clone() for value in given.values())
         kernel = Hyperparameters(*scales)
         cholesky = factorize(inputs, *kernel)
-        rights = (targets - offset).mT[..., None]  # one after another: torch copies the factors it is given
-        weights = torch.stack([torch.cholesky_solve(b, L)[:, 0] for b, L in zip(rights, cholesky, strict=True)])
-        return cls(inputs, targets, *kernel, offset, cholesky, weights, input_dim, predicts)
+        rights = (targets - offset).mT[
+            ..., None
+        ]  # one after another: torch copies the factors it is given
+        weights = torch.stack(
+            [
+                torch.cholesky_solve(b, L)[:, 0]
+                for b, L in zip(rights, cholesky, strict=True)
+            ]
+        )
+        return cls(
+            inputs, targets, *kernel, offset, cholesky, weights, input_dim, predicts
+        )
 
     def unscaled(self, features: Scaling, targets: Scaling) -> "GPPosterior":
         """Converts GPs that were trained on scaled features x~ (n + m,) and targets (k,) to physical units."""
@@ -149,7 +173,13 @@ class GPPosterior(TensorModel):
         from gpmpc._kernels import pack  # loads numba
 
         kernel = self.lengthscales.numpy(), self.signal_variance.numpy()
-        return pack(self.features.numpy(), *kernel, self.cholesky.numpy(), self.weights.numpy(), self.state_dim)
+        return pack(
+            self.features.numpy(),
+            *kernel,
+            self.cholesky.numpy(),
+            self.weights.numpy(),
+            self.state_dim,
+        )
 
     @cached_property
     def _on_host(self) -> bool:
@@ -177,11 +207,20 @@ class GPPosterior(TensorModel):
         error = (self.cholesky.square().sum(-1) - diagonal).abs()
         return bool((error <= torch.finfo(self.dtype).eps ** 0.75 * diagonal).all())
 
-    def to(self, device: str | torch.device | None = None, dtype: torch.dtype | None = None) -> "GPPosterior":
+    def to(
+        self, device: str | torch.device | None = None, dtype: torch.dtype | None = None
+    ) -> "GPPosterior":
         """Copies the posterior to another device, or to another type: float32 or float64."""
         check_destination(device, dtype)
-        tensors = {f.name: v for f in fields(self) if isinstance(v := getattr(self, f.name), Tensor)}
-        moved: dict[str, Any] = {name: value.to(device=device, dtype=dtype) for name, value in tensors.items()}
+        tensors = {
+            f.name: v
+            for f in fields(self)
+            if isinstance(v := getattr(self, f.name), Tensor)
+        }
+        moved: dict[str, Any] = {
+            name: value.to(device=device, dtype=dtype)
+            for name, value in tensors.items()
+        }
         return replace(self, **moved)
 
     def predict(self, state: Tensor, input: Tensor | None = None) -> Gaussian:
@@ -201,39 +240,59 @@ class GPPosterior(TensorModel):
         k, _ = self._correlations(state, input)
         return self._belief(k, state)
 
-    def linearize(self, states: Array, inputs: Array, covariance: bool = True) -> Linearized:
+    def linearize(
+        self, states: Array, inputs: Array, covariance: bool = True
+    ) -> Linearized:
         """Linearises the mean at K points (K, n), (K, m): by the compiled kernels where they can, else by torch."""
         if (host_arrays() if self._on_host else host_arrays(self.weights)) is not None:
             from gpmpc import _kernels as kernels  # loads numba
 
-            return Linearized(*kernels.linearize(self.packed, states, inputs, covariance, *self._prior))
+            return Linearized(
+                *kernels.linearize(
+                    self.packed, states, inputs, covariance, *self._prior
+                )
+            )
         x, u = tensors_for(self, states, inputs)
         k, difference = self._correlations(x, u)
         A, B = self._jacobian(k, difference)
         V = to_array(self._belief(k, x).covariance) if covariance else None
         return Linearized(to_array(self._mean(k, x)), to_array(A), to_array(B), V)
 
-    def predict_with_jacobian(self, state: Tensor, input: Tensor | None = None) -> tuple[Gaussian, Tensor, Tensor]:
+    def predict_with_jacobian(
+        self, state: Tensor, input: Tensor | None = None
+    ) -> tuple[Gaussian, Tensor, Tensor]:
         """``predict``, and its mean's derivatives by state (*batch, k, n) and input (*batch, k, m), all by torch."""
         k, difference = self._correlations(state, input)
         return self._belief(k, state), *self._jacobian(k, difference)
 
-    def variance_reduction(self, k: Tensor, outputs: list[int] | slice = slice(None)) -> Tensor:
+    def variance_reduction(
+        self, k: Tensor, outputs: list[int] | slice = slice(None)
+    ) -> Tensor:
         """|L_a^-1 k_a|^2 (*batch, k) of correlations k (*batch, k, N): by how much the data reduce the variance.
 
         The batch goes to the right-hand side's columns: broadcast against it, L would be copied for every member.
         """
         columns = k.unsqueeze(0).flatten(0, -3).movedim(0, -1)  # (k, N, batch)
-        squares = torch.linalg.solve_triangular(self.cholesky[outputs], columns, upper=False).square().sum(-2)
+        squares = (
+            torch.linalg.solve_triangular(self.cholesky[outputs], columns, upper=False)
+            .square()
+            .sum(-2)
+        )
         return squares.mT.reshape(k.shape[:-1])
 
-    def _correlations(self, state: Tensor, input: Tensor | None) -> tuple[Tensor, Tensor]:
+    def _correlations(
+        self, state: Tensor, input: Tensor | None
+    ) -> tuple[Tensor, Tensor]:
         """k(x~_i, x~) (*batch, k, N) and (x~_i - x~) / l (*batch, k, N, d)."""
         input = state[..., :0] if input is None else input
         check_query(self, state, input)
         query = torch.cat([state, input], dim=-1)
-        difference = (self.features - query[..., None, :])[..., None, :, :] / self.lengthscales[:, None, :]
-        return self.signal_variance[:, None] * torch.exp(-difference.square().sum(-1) / 2), difference
+        difference = (self.features - query[..., None, :])[
+            ..., None, :, :
+        ] / self.lengthscales[:, None, :]
+        return self.signal_variance[:, None] * torch.exp(
+            -difference.square().sum(-1) / 2
+        ), difference
 
     def _mean(self, k: Tensor, state: Tensor) -> Tensor:
         mean = (k * self.weights).sum(-1) + self.offset
@@ -247,7 +306,10 @@ class GPPosterior(TensorModel):
         """The mean's derivatives by state and input, from what ``_correlations`` gives."""
         weighted = (k * self.weights)[..., None, :]  # (*batch, k, 1, N)
         jacobian = (weighted @ (difference / self.lengthscales[:, None, :]))[..., 0, :]
-        by_state, by_input = jacobian[..., : self.state_dim], jacobian[..., self.state_dim :]
+        by_state, by_input = (
+            jacobian[..., : self.state_dim],
+            jacobian[..., self.state_dim :],
+        )
         if self.predicts == "difference":
             by_state = by_state + self._eye
         return by_state, by_input

@@ -27,7 +27,10 @@ class Scaling:
                 f"offset and factor must both be (d,); got {tuple(self.offset.shape)} and {tuple(self.factor.shape)}"
             )
         if not bool((self.factor > 0).all()):
-            raise SettingError("factor", f"must be positive in every column; got {self.factor.tolist()}")
+            raise SettingError(
+                "factor",
+                f"must be positive in every column; got {self.factor.tolist()}",
+            )
 
     def scale(self, values: Tensor) -> Tensor:
         """Scaled values (..., d) from values in the units of the data."""
@@ -45,20 +48,31 @@ def identity(columns: Tensor, names: Sequence[str] = ()) -> Scaling:
 
 def centre(columns: Tensor, names: Sequence[str] = ()) -> Scaling:
     """Maps columns (N, d) to mean zero and keeps their units."""
-    return Scaling(columns[0] + (columns - columns[0]).mean(dim=0), torch.ones_like(columns[0]))
+    return Scaling(
+        columns[0] + (columns - columns[0]).mean(dim=0), torch.ones_like(columns[0])
+    )
 
 
-def standardize(columns: Tensor, names: Sequence[str], resolution: float = 0.0) -> Scaling:
+def standardize(
+    columns: Tensor, names: Sequence[str], resolution: float = 0.0
+) -> Scaling:
     """Maps columns (N, d) to mean zero and standard deviation one; a constant column to zero.
 
     A column whose range is at most ``resolution``, in the units of the data, counts as constant; the log names it.
     """
     constant = _constant(columns, names, resolution)
-    return Scaling(columns.mean(dim=0), torch.where(constant, 1.0, columns.std(dim=0, correction=0)))
+    return Scaling(
+        columns.mean(dim=0),
+        torch.where(constant, 1.0, columns.std(dim=0, correction=0)),
+    )
 
 
 def min_max(
-    columns: Tensor, names: Sequence[str], low: float = 0.1, high: float = 0.9, resolution: float = 0.0
+    columns: Tensor,
+    names: Sequence[str],
+    low: float = 0.1,
+    high: float = 0.9,
+    resolution: float = 0.0,
 ) -> Scaling:
     """Maps the range of each column (N, d) onto [low, high]; a constant column, as in ``standardize``, to the middle.
 
@@ -80,9 +94,15 @@ def min_max(
 def _constant(columns: Tensor, names: Sequence[str], resolution: float) -> Tensor:
     """Which columns (d,) do not move; a note in the log names them."""
     if columns.dim() != 2 or len(names) != columns.shape[1]:
-        raise ShapeError(f"columns (N, d) need d names; got {tuple(columns.shape)} and {len(names)} names")
+        raise ShapeError(
+            f"columns (N, d) need d names; got {tuple(columns.shape)} and {len(names)} names"
+        )
     moved = columns.amax(dim=0) - columns.amin(dim=0)
     if bool((moved <= resolution).any()):
-        which = ", ".join(f"{n} (moves by {m:.0e})" for n, m in zip(names, moved, strict=True) if m <= resolution)
+        which = ", ".join(
+            f"{n} (moves by {m:.0e})"
+            for n, m in zip(names, moved, strict=True)
+            if m <= resolution
+        )
         _log.info("constant columns are centred, not scaled: %s", which)
     return moved <= resolution

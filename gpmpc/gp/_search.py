@@ -45,7 +45,9 @@ class SoftLimits:
     (Deisenroth, 2010) and of the experiment of Cao, Lai and Alam (2017). Nearly flat inside, steep outside.
     """
 
-    lengthscale_factor: float = 100.0  #: r, how far a length-scale may be from its input's standard deviation
+    lengthscale_factor: float = (
+        100.0  #: r, how far a length-scale may be from its input's standard deviation
+    )
     signal_to_noise: float = 1000.0  #: s, how large sf / sn may be
     power: int = 30  #: p, even
 
@@ -56,12 +58,16 @@ class SoftLimits:
         if self.power % 2:
             raise SettingError("power", f"must be even; got {self.power}")
 
-    def __call__(self, theta: np.ndarray, log_std: np.ndarray) -> tuple[float, np.ndarray]:
+    def __call__(
+        self, theta: np.ndarray, log_std: np.ndarray
+    ) -> tuple[float, np.ndarray]:
         """Value and gradient (d + 2,) at theta, given the logarithms of the inputs' standard deviations (d,)."""
         width = np.full(len(theta), np.log(self.lengthscale_factor))
         width[-1] = np.log(self.signal_to_noise)
         position = np.append(theta[:-2] - log_std, [0.0, theta[-1]]) / width
-        return (position**self.power).sum(), self.power * position ** (self.power - 1) / width
+        return (position**self.power).sum(), self.power * position ** (
+            self.power - 1
+        ) / width
 
 
 class OutputSearch:
@@ -85,11 +91,16 @@ class OutputSearch:
         self._settings, self._deadline = settings, deadline
         self._log_std, self._constant = np.log(std), constant
         self._log_output = np.log(column_std(targets[:, None])[0])
-        self._box = search_box(self._log_std, self._log_output, settings.signal_to_noise_limit)
+        self._box = search_box(
+            self._log_std, self._log_output, settings.signal_to_noise_limit
+        )
         self.evaluations, self._last_log = 0, time.perf_counter()
 
     def __call__(
-        self, first: np.ndarray | None, perturbations: np.ndarray, rows: np.ndarray | None
+        self,
+        first: np.ndarray | None,
+        perturbations: np.ndarray,
+        rows: np.ndarray | None,
     ) -> tuple[np.ndarray, float, list[float]]:
         """Gives theta, its objective (FAILED or more where every start failed), and those where the exploration ended.
 
@@ -100,7 +111,10 @@ class OutputSearch:
         """
         plain = np.append(self._log_std, [self._log_output, np.log(10.0)])
         longer = np.append(np.full(len(self._log_std), _LONGER), [0.0, 0.0])
-        starts = [plain if first is None else first, *(plain + longer + shift for shift in perturbations[1:])]
+        starts = [
+            plain if first is None else first,
+            *(plain + longer + shift for shift in perturbations[1:]),
+        ]
         self._see(slice(None) if rows is None else rows)
         ends: list[tuple[np.ndarray, float]] = []
         for start in starts:
@@ -115,14 +129,24 @@ class OutputSearch:
             self._see(slice(None))
             theta, value = self._minimize(theta, _ITERATIONS)
         if self._is_late():
-            _log.info("training: %s: its share of time_limit=%g s is over", self._name, self._settings.time_limit)
+            _log.info(
+                "training: %s: its share of time_limit=%g s is over",
+                self._name,
+                self._settings.time_limit,
+            )
         # Nothing can be learned about an input that never moved, and nothing is: it drops out of the kernel.
         theta[:-2][self._constant] = self._log_std[self._constant] + np.log(IGNORED)
-        return theta, value, [end[1] for end in ends] + [math.nan] * (len(starts) - len(ends))
+        return (
+            theta,
+            value,
+            [end[1] for end in ends] + [math.nan] * (len(starts) - len(ends)),
+        )
 
     def _see(self, rows: Any) -> None:
         """Takes the likelihood of some of the points."""
-        self._likelihood = NegativeLogMarginalLikelihood(self._inputs[rows], self._targets[rows])
+        self._likelihood = NegativeLogMarginalLikelihood(
+            self._inputs[rows], self._targets[rows]
+        )
         self._size = len(self._targets[rows])
 
     def _minimize(self, start: np.ndarray, iterations: int) -> tuple[np.ndarray, float]:
@@ -134,7 +158,12 @@ class OutputSearch:
             method="L-BFGS-B",
             bounds=np.column_stack(self._box),
             callback=self._look_at_clock,
-            options={"ftol": self._settings.tolerance, "gtol": 1e-6, "maxiter": iterations, "maxfun": 5 * iterations},
+            options={
+                "ftol": self._settings.tolerance,
+                "gtol": 1e-6,
+                "maxiter": iterations,
+                "maxfun": 5 * iterations,
+            },
         )
         return outcome.x, float(outcome.fun)
 
@@ -162,7 +191,9 @@ class OutputSearch:
         return value, gradient
 
 
-def search_box(log_inputs: np.ndarray, log_output: float, signal_to_noise_limit: float) -> tuple[np.ndarray, ...]:
+def search_box(
+    log_inputs: np.ndarray, log_output: float, signal_to_noise_limit: float
+) -> tuple[np.ndarray, ...]:
     """The least and the largest theta (d + 2,), around the logarithms of the data's standard deviations."""
     reach = np.full(len(log_inputs) + 2, np.log(_LENGTHSCALE_LIMIT))
     reach[-2:] = np.log(1e6), np.log(signal_to_noise_limit)
@@ -173,9 +204,15 @@ def search_box(log_inputs: np.ndarray, log_output: float, signal_to_noise_limit:
 def column_std(columns: np.ndarray) -> np.ndarray:
     """The standard deviation (d,) of columns (N, d); of a constant column its magnitude, or 1 where that is 0."""
     away = columns - columns[0]
-    reach, magnitude, constant = np.abs(away).max(axis=0), np.abs(columns).max(axis=0), constant_columns(columns)
+    reach, magnitude, constant = (
+        np.abs(away).max(axis=0),
+        np.abs(columns).max(axis=0),
+        constant_columns(columns),
+    )
     unit = np.where(constant, np.where(magnitude > 0, magnitude, 1.0), reach)
-    return unit * np.where(constant, 1.0, (away / unit).std(axis=0, ddof=min(1, len(columns) - 1)))
+    return unit * np.where(
+        constant, 1.0, (away / unit).std(axis=0, ddof=min(1, len(columns) - 1))
+    )
 
 
 def constant_columns(columns: np.ndarray) -> np.ndarray:
@@ -191,7 +228,10 @@ def training_data(
     check_tensors(**given)
     for name, value in given.items():
         if value.device.type != "cpu":
-            raise SettingError(name, f"must be in host memory for training ({name}.cpu()); got {value.device}")
+            raise SettingError(
+                name,
+                f"must be in host memory for training ({name}.cpu()); got {value.device}",
+            )
     check_posterior(given, input_dim, predicts)
     features, targets = features.detach(), targets.detach()
     n = features.shape[1] - input_dim
@@ -200,14 +240,20 @@ def training_data(
     return features, targets, scaling(features, names), scaling(targets, outputs)
 
 
-def restored_theta(theta: np.ndarray, features: Scaling, targets: Scaling) -> np.ndarray:
+def restored_theta(
+    theta: np.ndarray, features: Scaling, targets: Scaling
+) -> np.ndarray:
     """Rows (log l, log sf, log(sf / sn)) in the units of the data, from those in scaled units."""
-    shift = np.tile(np.append(features.factor.log().numpy(), [0.0, 0.0]), (len(theta), 1))
+    shift = np.tile(
+        np.append(features.factor.log().numpy(), [0.0, 0.0]), (len(theta), 1)
+    )
     shift[:, -2] = targets.factor.log().numpy()
     return theta + shift
 
 
-def log_hyperparameters(posterior: GPPosterior, features: Scaling, targets: Scaling) -> np.ndarray:
+def log_hyperparameters(
+    posterior: GPPosterior, features: Scaling, targets: Scaling
+) -> np.ndarray:
     """Rows (log l, log sf, log(sf / sn)), one an output (k, d + 2), of a posterior, in scaled units."""
     k, d = len(targets.factor), len(features.factor)
     if posterior.lengthscales.shape != (k, d):
@@ -217,4 +263,6 @@ def log_hyperparameters(posterior: GPPosterior, features: Scaling, targets: Scal
     parts = posterior.lengthscales, posterior.signal_variance, posterior.noise_variance
     length, sf2, sn2 = (part.to("cpu", torch.float64) for part in parts)
     deviation, ratio = (sf2.sqrt() / targets.factor).log(), (sf2 / sn2).log() / 2
-    return torch.column_stack([(length / features.factor).log(), deviation, ratio]).numpy()
+    return torch.column_stack(
+        [(length / features.factor).log(), deviation, ratio]
+    ).numpy()

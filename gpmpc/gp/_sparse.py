@@ -83,14 +83,25 @@ def sparse_posterior(
     b, U = torch.linalg.eigh(sums.gram)
     b = b.clamp_min(_UNINFORMED)
     upper = torch.linalg.qr(((1 + b) / b).sqrt()[..., None] * (Lz @ U).mT).R
-    cholesky = (upper * upper.diagonal(dim1=-2, dim2=-1).sign()[..., None]).mT.contiguous()
+    cholesky = (
+        upper * upper.diagonal(dim1=-2, dim2=-1).sign()[..., None]
+    ).mT.contiguous()
     projections = U.mT @ sums.projections[..., None]
-    weights = torch.linalg.solve_triangular(Lz.mT, U @ (projections / (1 + b)[..., None]), upper=True)
+    weights = torch.linalg.solve_triangular(
+        Lz.mT, U @ (projections / (1 + b)[..., None]), upper=True
+    )
     pseudo_targets = (cholesky @ (cholesky.mT @ weights))[..., 0].mT
     kernel = Hyperparameters(*(value.clone() for value in hyperparameters))
     offset = torch.zeros_like(pseudo_targets[0])
     return GPPosterior(
-        inducing.clone(), pseudo_targets, *kernel, offset, cholesky, weights[..., 0], input_dim, predicts
+        inducing.clone(),
+        pseudo_targets,
+        *kernel,
+        offset,
+        cholesky,
+        weights[..., 0],
+        input_dim,
+        predicts,
     )
 
 
@@ -108,33 +119,60 @@ def collapsed_bound(
     hyperparameters.
     """
     if (outputs := targets.shape[1]) > 1:
-        kernels = [Hyperparameters(*(value[a, None] for value in hyperparameters)) for a in range(outputs)]
+        kernels = [
+            Hyperparameters(*(value[a, None] for value in hyperparameters))
+            for a in range(outputs)
+        ]
         columns = targets.split(1, dim=1)
         return torch.cat(
-            [collapsed_bound(inducing, features, *of, method, jitter) for of in zip(columns, kernels, strict=True)]
+            [
+                collapsed_bound(inducing, features, *of, method, jitter)
+                for of in zip(columns, kernels, strict=True)
+            ]
         )
     Lz = inducing_factor(inducing, hyperparameters, jitter)
     sums = data_sums(Lz, inducing, features, targets, hyperparameters, method)
-    LB = torch.linalg.cholesky(sums.gram + torch.eye(len(inducing), dtype=Lz.dtype, device=Lz.device))
-    explained = torch.linalg.solve_triangular(LB, sums.projections[..., None], upper=False).square().sum((-2, -1))
+    LB = torch.linalg.cholesky(
+        sums.gram + torch.eye(len(inducing), dtype=Lz.dtype, device=Lz.device)
+    )
+    explained = (
+        torch.linalg.solve_triangular(LB, sums.projections[..., None], upper=False)
+        .square()
+        .sum((-2, -1))
+    )
     logdet = 2 * LB.diagonal(dim1=-2, dim2=-1).log().sum(-1) + sums.logdet
-    bound = -(len(features) * math.log(2 * math.pi) + logdet + sums.squares - explained) / 2
+    bound = (
+        -(len(features) * math.log(2 * math.pi) + logdet + sums.squares - explained) / 2
+    )
     if method == "fitc":
         return bound
     trace = sums.gram.diagonal(dim1=-2, dim2=-1).sum(-1)
-    prior = len(features) * hyperparameters.signal_variance / hyperparameters.noise_variance
+    prior = (
+        len(features) * hyperparameters.signal_variance / hyperparameters.noise_variance
+    )
     return bound - (prior - trace) / 2
 
 
-def data_sums(Lz: Tensor, Z: Tensor, x: Tensor, y: Tensor, kernel: Hyperparameters, method: Method) -> _Sums:
+def data_sums(
+    Lz: Tensor, Z: Tensor, x: Tensor, y: Tensor, kernel: Hyperparameters, method: Method
+) -> _Sums:
     """The sums over all points, of every output, in blocks."""
     step, outputs = max(_ENTRIES // len(Z), 64), []
     for a in range(y.shape[1]):
         total: Any = 0.0, 0.0, 0.0, 0.0
         for rows in (slice(begin, begin + step) for begin in range(0, len(x), step)):
-            block: Any = Lz[a, None], Z, x[rows], y[rows, a, None], *(value[a, None] for value in kernel), method
+            block: Any = (
+                Lz[a, None],
+                Z,
+                x[rows],
+                y[rows, a, None],
+                *(value[a, None] for value in kernel),
+                method,
+            )
             if torch.is_grad_enabled() and step < len(x):
-                part: Any = checkpoint(_block_sums, *block, use_reentrant=True, preserve_rng_state=False)
+                part: Any = checkpoint(
+                    _block_sums, *block, use_reentrant=True, preserve_rng_state=False
+                )
             else:
                 part = _block_sums(*block)
             total = [t + p for t, p in zip(total, part, strict=True)]
@@ -145,7 +183,9 @@ def data_sums(Lz: Tensor, Z: Tensor, x: Tensor, y: Tensor, kernel: Hyperparamete
 def inducing_factor(inducing: Tensor, kernel: Hyperparameters, jitter: float) -> Tensor:
     """Lz (k, M, M), the Cholesky factor of Kzz with a jitter in units of sf2; raises where there is none."""
     Kzz = kernel_matrix(inducing, inducing, kernel.lengthscales, kernel.signal_variance)
-    Kzz = Kzz + torch.diag_embed((jitter * kernel.signal_variance)[:, None].expand(-1, len(inducing)))
+    Kzz = Kzz + torch.diag_embed(
+        (jitter * kernel.signal_variance)[:, None].expand(-1, len(inducing))
+    )
     Lz, info = torch.linalg.cholesky_ex(Kzz)
     if bool(info.any()):
         raise SettingError(
@@ -156,7 +196,9 @@ def inducing_factor(inducing: Tensor, kernel: Hyperparameters, jitter: float) ->
     return Lz
 
 
-def _block_sums(Lz: Tensor, Z: Tensor, x: Tensor, y: Tensor, *kernel_and_method: Any) -> _Sums:
+def _block_sums(
+    Lz: Tensor, Z: Tensor, x: Tensor, y: Tensor, *kernel_and_method: Any
+) -> _Sums:
     *tensors, method = kernel_and_method
     kernel = Hyperparameters(*tensors)
     _, signal_variance, noise_variance = kernel
@@ -166,7 +208,9 @@ def _block_sums(Lz: Tensor, Z: Tensor, x: Tensor, y: Tensor, *kernel_and_method:
         Lam = (signal_variance[:, None] - whitened.square().sum(-2)).clamp_min(0) + Lam
     root = Lam.sqrt()
     A, r = whitened / root[:, None, :], y.mT / root
-    return _Sums(A @ A.mT, (A @ r[..., None])[..., 0], r.square().sum(-1), Lam.log().sum(-1))
+    return _Sums(
+        A @ A.mT, (A @ r[..., None])[..., 0], r.square().sum(-1), Lam.log().sum(-1)
+    )
 
 
 def _cross(inducing: Tensor, features: Tensor, kernel: Hyperparameters) -> Tensor:

@@ -22,15 +22,30 @@ from gpmpc.exceptions import SettingError, TrainingError, check_choice, check_nu
 from gpmpc.gp._kernel import Hyperparameters, Predicts, kernel_matrix
 from gpmpc.gp._likelihood import FAILED
 from gpmpc.gp._scaling import Scaling, centre, identity
-from gpmpc.gp._search import column_std, log_hyperparameters, restored_theta, search_box, training_data
-from gpmpc.gp._sparse import JITTER, Method, collapsed_bound, data_sums, inducing_factor, sparse_posterior
+from gpmpc.gp._search import (
+    column_std,
+    log_hyperparameters,
+    restored_theta,
+    search_box,
+    training_data,
+)
+from gpmpc.gp._sparse import (
+    JITTER,
+    Method,
+    collapsed_bound,
+    data_sums,
+    inducing_factor,
+    sparse_posterior,
+)
 from gpmpc.gp._training import Trainer, Training
 from gpmpc.gp._transitions import Transitions, check_transitions
 
 _log = logging.getLogger(__name__)
 _EVERY = 10  # iterations between two lines of the log
 _TOLERANCE = 1e-7  # relative decrease of the objective at which L-BFGS stops
-_SIGNAL_TO_NOISE = 1e4  # the box holds sf / sn within this factor of one, as that of ``Trainer``
+_SIGNAL_TO_NOISE = (
+    1e4  # the box holds sf / sn within this factor of one, as that of ``Trainer``
+)
 
 
 @dataclass(frozen=True)
@@ -67,10 +82,20 @@ class SparseTrainer:
                 points learned nothing but noise of it where the subset's training learned more.
         """
         check_transitions(transitions)
-        return self.fit(transitions.features, transitions.targets(self.predicts), transitions.input_dim, seed=seed)
+        return self.fit(
+            transitions.features,
+            transitions.targets(self.predicts),
+            transitions.input_dim,
+            seed=seed,
+        )
 
     def fit(
-        self, features: Tensor, targets: Tensor, input_dim: int, predicts: Predicts | None = None, seed: int = 0
+        self,
+        features: Tensor,
+        targets: Tensor,
+        input_dim: int,
+        predicts: Predicts | None = None,
+        seed: int = 0,
     ) -> Training:
         """Trains on features x~ = (x, u) (N, n + m) and any targets (N, k)."""
         begin = time.perf_counter()
@@ -85,7 +110,11 @@ class SparseTrainer:
         chosen = np.random.default_rng(seed).permutation(len(x))[: self.subset]
         exact = self._exact().fit(features[chosen], y[chosen], input_dim, "value", seed)
         theta = log_hyperparameters(exact.posterior, feature_scaling, identity(y))
-        Z = x[informative_points(x, Hyperparameters.from_theta(torch.from_numpy(theta)), self.inducing)]
+        Z = x[
+            informative_points(
+                x, Hyperparameters.from_theta(torch.from_numpy(theta)), self.inducing
+            )
+        ]
         text = "sparse training: %d inducing points chosen among %d after %.1f s"
         _log.info(text, len(Z), len(x), time.perf_counter() - begin)
         unit = torch.from_numpy(column_std(features.numpy())) / feature_scaling.factor
@@ -93,16 +122,34 @@ class SparseTrainer:
         initial = bound.values()
         bound.maximize()
         if failed := np.flatnonzero(~np.isfinite(objective := bound.values())).tolist():
-            raise TrainingError(failed, "the inducing points' kernel matrix is not positive definite: take fewer")
-        self._check_learned(_noise_alone(y) - objective, _noise_alone(y[chosen]) - exact.objective, x.shape[1] + 2)
+            raise TrainingError(
+                failed,
+                "the inducing points' kernel matrix is not positive definite: take fewer",
+            )
+        self._check_learned(
+            _noise_alone(y) - objective,
+            _noise_alone(y[chosen]) - exact.objective,
+            x.shape[1] + 2,
+        )
         theta, Z = bound.parts(torch.from_numpy(bound.best))
         kernel = Hyperparameters.from_theta(theta)
-        scaled = sparse_posterior(Z, x, y, kernel, input_dim, predicts, self.method, JITTER)
+        scaled = sparse_posterior(
+            Z, x, y, kernel, input_dim, predicts, self.method, JITTER
+        )
         posterior = scaled.unscaled(feature_scaling, target_scaling)
         theta = restored_theta(theta.numpy(), feature_scaling, target_scaling)
-        return Training(posterior, theta, objective, initial[:, None], bound.evaluations, time.perf_counter() - begin)
+        return Training(
+            posterior,
+            theta,
+            objective,
+            initial[:, None],
+            bound.evaluations,
+            time.perf_counter() - begin,
+        )
 
-    def _with_unexplained(self, theta: np.ndarray, Z: Tensor, x: Tensor, y: Tensor) -> np.ndarray:
+    def _with_unexplained(
+        self, theta: np.ndarray, Z: Tensor, x: Tensor, y: Tensor
+    ) -> np.ndarray:
         """Adds to the noise what the inducing points leave unexplained of the signal, on average.
 
         Else the bound is so low where the search begins that its first step leaves for a model of noise alone.
@@ -112,12 +159,16 @@ class SparseTrainer:
         kernel = Hyperparameters.from_theta(torch.from_numpy(theta))
         _, sf2, sn2 = kernel
         with torch.no_grad():
-            sums = data_sums(inducing_factor(Z, kernel, JITTER), Z, x, y, kernel, self.method)
+            sums = data_sums(
+                inducing_factor(Z, kernel, JITTER), Z, x, y, kernel, self.method
+            )
         explained = sums.gram.diagonal(dim1=-2, dim2=-1).sum(-1)
         sn2 = sn2 + (sf2 - explained * sn2 / len(x)).clamp_min(0)
         return np.column_stack([theta[:, :-1], (sf2 / sn2).log().numpy() / 2])
 
-    def _check_learned(self, gains: np.ndarray, exact_gains: np.ndarray, parameters: int) -> None:
+    def _check_learned(
+        self, gains: np.ndarray, exact_gains: np.ndarray, parameters: int
+    ) -> None:
         """Raises, or warns in the log, where the GPs are no better than noise alone.
 
         Gains are log evidence over that of noise alone (k,), ``exact_gains`` those of the exact GPs of the subset; one
@@ -132,7 +183,10 @@ class SparseTrainer:
                 f"where exact GPs of {self.subset} points learned more: raise inducing",
             )
         if nothing:
-            _log.warning("sparse training: nothing but noise was found in output %s", ", ".join(map(str, nothing)))
+            _log.warning(
+                "sparse training: nothing but noise was found in output %s",
+                ", ".join(map(str, nothing)),
+            )
 
     def _exact(self) -> Trainer:
         return Trainer(
@@ -145,10 +199,14 @@ class SparseTrainer:
 
 def _noise_alone(targets: Tensor) -> np.ndarray:
     """The least negative log evidence (k,) of targets (N, k) as noise alone; minus infinity where all are zero."""
-    return (len(targets) / 2 * (2 * math.pi * math.e * targets.square().mean(0)).log()).numpy()
+    return (
+        len(targets) / 2 * (2 * math.pi * math.e * targets.square().mean(0)).log()
+    ).numpy()
 
 
-def informative_points(features: Tensor, hyperparameters: Sequence[Tensor], count: int) -> list[int]:
+def informative_points(
+    features: Tensor, hyperparameters: Sequence[Tensor], count: int
+) -> list[int]:
     """Chooses rows of features (N, d): each where most is unexplained by those before it.
 
     A pivoted Cholesky factorisation of sum_a K_a / sn2_a's diagonal. Fewer than ``count`` come back where nothing is
@@ -156,17 +214,23 @@ def informative_points(features: Tensor, hyperparameters: Sequence[Tensor], coun
     """
     lengthscales, signal_variance, noise_variance = hyperparameters
     left = signal_variance[:, None].repeat(1, len(features))
-    rows = features.new_zeros(len(lengthscales), min(count, len(features)), len(features))
+    rows = features.new_zeros(
+        len(lengthscales), min(count, len(features)), len(features)
+    )
     chosen: list[int] = []
     for step in range(rows.shape[1]):
         i = int((left / noise_variance[:, None]).sum(0).argmax())
         if bool((left[:, i] <= 1e-10 * signal_variance).all()):
             break
-        row = kernel_matrix(features[i : i + 1], features, lengthscales, signal_variance)[:, 0]
+        row = kernel_matrix(
+            features[i : i + 1], features, lengthscales, signal_variance
+        )[:, 0]
         row = row - (rows[:, :step, i][:, None, :] @ rows[:, :step])[:, 0]
         # An output to which this point is nothing new gives a row of round-off: none, rather.
         new = left[:, i] > 1e-10 * signal_variance
-        rows[:, step] = torch.where(new[:, None], row / left[:, i].clamp_min(1e-300).sqrt()[:, None], 0.0)
+        rows[:, step] = torch.where(
+            new[:, None], row / left[:, i].clamp_min(1e-300).sqrt()[:, None], 0.0
+        )
         left = (left - rows[:, step].square()).clamp_min(0)
         left[:, i] = 0
         chosen.append(i)
@@ -176,8 +240,22 @@ def informative_points(features: Tensor, hyperparameters: Sequence[Tensor], coun
 class _Bound:
     """Minus the collapsed bound of all outputs over one vector: their theta, and Z in units of the features' spread."""
 
-    def __init__(self, trainer: SparseTrainer, x: Tensor, y: Tensor, unit: Tensor, theta: np.ndarray, Z: Tensor):
-        self._trainer, self._x, self._y, self._unit, self._shape = trainer, x, y, unit, theta.shape
+    def __init__(
+        self,
+        trainer: SparseTrainer,
+        x: Tensor,
+        y: Tensor,
+        unit: Tensor,
+        theta: np.ndarray,
+        Z: Tensor,
+    ):
+        self._trainer, self._x, self._y, self._unit, self._shape = (
+            trainer,
+            x,
+            y,
+            unit,
+            theta.shape,
+        )
         self.best = np.append(
             theta.ravel(), (Z / unit).numpy().ravel()
         )  #: the start, or the best point evaluated since
@@ -186,15 +264,30 @@ class _Bound:
     def maximize(self) -> None:
         """Searches by L-BFGS in a box around the data that holds the start."""
         log_inputs, trainer = self._unit.log().numpy(), self._trainer
-        boxes = [search_box(log_inputs, own, _SIGNAL_TO_NOISE) for own in np.log(column_std(self._y.numpy()))]
-        smallest, largest = ((edge / self._unit).numpy() for edge in (self._x.amin(0), self._x.amax(0)))
-        margin, count = 0.1 * (largest - smallest), (len(self.best) - self._shape[0] * self._shape[1]) // len(smallest)
+        boxes = [
+            search_box(log_inputs, own, _SIGNAL_TO_NOISE)
+            for own in np.log(column_std(self._y.numpy()))
+        ]
+        smallest, largest = (
+            (edge / self._unit).numpy() for edge in (self._x.amin(0), self._x.amax(0))
+        )
+        margin, count = (
+            0.1 * (largest - smallest),
+            (len(self.best) - self._shape[0] * self._shape[1]) // len(smallest),
+        )
         lower, upper = (np.concatenate(side) for side in zip(*boxes, strict=True))
         # A feature that the subset saw at rest has a length-scale beyond any box (IGNORED); it stays there.
-        lower = np.minimum(np.append(lower, np.tile(smallest - margin, count)), self.best)
-        upper = np.maximum(np.append(upper, np.tile(largest + margin, count)), self.best)
+        lower = np.minimum(
+            np.append(lower, np.tile(smallest - margin, count)), self.best
+        )
+        upper = np.maximum(
+            np.append(upper, np.tile(largest + margin, count)), self.best
+        )
         if self._trainer.iterations:  # of none L-BFGS-B makes one
-            limits = {"maxiter": trainer.iterations, "maxfun": 3 * trainer.iterations + 1}
+            limits = {
+                "maxiter": trainer.iterations,
+                "maxfun": 3 * trainer.iterations + 1,
+            }
             minimize(
                 self,
                 self.best,
@@ -208,7 +301,9 @@ class _Bound:
     def parts(self, vector: Tensor) -> tuple[Tensor, Tensor]:
         """Rows of theta (k, d + 2) and Z (M, d)."""
         split = self._shape[0] * self._shape[1]
-        return vector[:split].reshape(self._shape), vector[split:].reshape(-1, len(self._unit)) * self._unit
+        return vector[:split].reshape(self._shape), vector[split:].reshape(
+            -1, len(self._unit)
+        ) * self._unit
 
     def values(self) -> np.ndarray:
         """Minus the bound of every output (k,) at the best point; infinite where a matrix is not positive definite."""
@@ -234,12 +329,18 @@ class _Bound:
     def _report(self, _: np.ndarray) -> None:
         self._iterations += 1
         if self._iterations % _EVERY == 0:
-            _log.info("sparse training: iteration %d, minus the bound %.6g", self._iterations, self._least)
+            _log.info(
+                "sparse training: iteration %d, minus the bound %.6g",
+                self._iterations,
+                self._least,
+            )
 
     def _bounds(self, vector: Tensor) -> Tensor:
         theta, Z = self.parts(vector)
         try:
             kernel = Hyperparameters.from_theta(theta)
-            return -collapsed_bound(Z, self._x, self._y, kernel, self._trainer.method, JITTER)
+            return -collapsed_bound(
+                Z, self._x, self._y, kernel, self._trainer.method, JITTER
+            )
         except (SettingError, torch.linalg.LinAlgError):  # pyright: ignore[reportPrivateImportUsage]
             return torch.full(self._shape[:1], torch.inf, dtype=torch.float64)

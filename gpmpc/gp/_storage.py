@@ -42,7 +42,9 @@ _HEADER = "header.json"
 _EXPANSION = 20  # times what a file holds: more than numbers shrink by
 
 
-def save_posterior(posterior: GPPosterior, path: str | Path, metadata: Mapping[str, Any] | None = None) -> None:
+def save_posterior(
+    posterior: GPPosterior, path: str | Path, metadata: Mapping[str, Any] | None = None
+) -> None:
     """Writes a posterior to one file, in one piece or not at all.
 
     Args:
@@ -74,10 +76,14 @@ def load_metadata(path: str | Path) -> dict[str, Any]:
     return _content(existing_file(path, "a saved model"), "model", header_only=True)[0]
 
 
-def posterior_parts(path: Path, posterior: GPPosterior) -> tuple[dict[str, Any], dict[str, Tensor]]:
+def posterior_parts(
+    path: Path, posterior: GPPosterior
+) -> tuple[dict[str, Any], dict[str, Tensor]]:
     """The header and the tensors of a posterior, after a check that they could be read again."""
     if type(posterior) is not GPPosterior:
-        raise UnsupportedModel(f"only a GPPosterior can be saved; got {type(posterior).__name__}")
+        raise UnsupportedModel(
+            f"only a GPPosterior can be saved; got {type(posterior).__name__}"
+        )
     header = {
         "predicts": posterior.predicts,
         "input_dim": posterior.input_dim,
@@ -85,34 +91,54 @@ def posterior_parts(path: Path, posterior: GPPosterior) -> tuple[dict[str, Any],
         "outputs": posterior.output_dim,
         "points": len(posterior),
     }
-    tensors = {f.name: v for f in fields(posterior) if isinstance(v := getattr(posterior, f.name), Tensor)}
+    tensors = {
+        f.name: v
+        for f in fields(posterior)
+        if isinstance(v := getattr(posterior, f.name), Tensor)
+    }
     posterior_of_parts(path, header, tensors)
     return header, tensors
 
 
-def posterior_of_parts(path: Path, header: Any, tensors: Mapping[str, Tensor]) -> GPPosterior:
+def posterior_of_parts(
+    path: Path, header: Any, tensors: Mapping[str, Tensor]
+) -> GPPosterior:
     """Builds a posterior of a file's header and tensors, after a check of everything."""
-    names = [f.name for f in fields(GPPosterior) if f.name not in ("input_dim", "predicts")]
+    names = [
+        f.name for f in fields(GPPosterior) if f.name not in ("input_dim", "predicts")
+    ]
     try:
         found = {name: tensors[name] for name in names}
         predicts, m = header["predicts"], header["input_dim"]
         check_posterior(found, m, predicts, found["features"].dtype)
     except (GpmpcError, KeyError, TypeError) as error:
-        raise DataError(f"{path}: not a consistent posterior of {', '.join(names)} ({error})") from error
+        raise DataError(
+            f"{path}: not a consistent posterior of {', '.join(names)} ({error})"
+        ) from error
     if not bool((found["cholesky"].diagonal(dim1=-2, dim2=-1) > 0).all()):
         raise DataError(f"{path}: the diagonal of cholesky must be positive")
     return GPPosterior(**found, input_dim=m, predicts=predicts)
 
 
 def write_model(
-    path: Path, kind: str, header: dict, tensors: dict[str, Tensor], metadata: Mapping[str, Any] | None = None
+    path: Path,
+    kind: str,
+    header: dict,
+    tensors: dict[str, Tensor],
+    metadata: Mapping[str, Any] | None = None,
 ) -> None:
     """Writes a model file of a kind, in one piece or not at all."""
     for name, value in tensors.items():
         if value.dtype not in _DTYPES:
-            raise SettingError(name, f"must be one of {', '.join(_DTYPES.values())} to be saved; got {value.dtype}")
+            raise SettingError(
+                name,
+                f"must be one of {', '.join(_DTYPES.values())} to be saved; got {value.dtype}",
+            )
     tensors = {name: value.detach() for name, value in tensors.items()}
-    arrays = {name: _packed(name, value).cpu().contiguous().numpy() for name, value in tensors.items()}
+    arrays = {
+        name: _packed(name, value).cpu().contiguous().numpy()
+        for name, value in tensors.items()
+    }
     header = {
         "format": _FORMAT,
         "format_version": _VERSION,
@@ -120,7 +146,8 @@ def write_model(
         "kernel": "SE-ARD",
         **header,
         "memory_order": {  # of the dimensions, from the outermost to the innermost
-            name: sorted(range(value.dim()), key=value.stride, reverse=True) for name, value in tensors.items()
+            name: sorted(range(value.dim()), key=value.stride, reverse=True)
+            for name, value in tensors.items()
         },
         "versions": versions(("gpmpc", "torch", "gpytorch", "numpy")),
         "created": now(),
@@ -129,7 +156,9 @@ def write_model(
     try:
         text = json.dumps({**header, "checksum": _checksum(header, arrays)})
     except (TypeError, ValueError) as error:
-        raise SettingError("metadata", f"must be what JSON can hold; {error}") from error
+        raise SettingError(
+            "metadata", f"must be what JSON can hold; {error}"
+        ) from error
     write_whole(path, safetensors.numpy.save(arrays, {"gpmpc": text}))
 
 
@@ -141,10 +170,17 @@ def read_model(path: Path, kind: str) -> tuple[dict[str, Any], dict[str, Tensor]
             raise DataError(f"{path}: holds a {got}; expected a {expected}")
     try:
         if not _is_npz(path) and header["checksum"] != _checksum(header, arrays):
-            raise ValueError("the checksum of its parts differs from the one in its header")
-        return header, {name: _restored(name, arrays.pop(name), header["memory_order"][name]) for name in list(arrays)}
+            raise ValueError(
+                "the checksum of its parts differs from the one in its header"
+            )
+        return header, {
+            name: _restored(name, arrays.pop(name), header["memory_order"][name])
+            for name in list(arrays)
+        }
     except Exception as error:
-        raise DataError(f"{path}: damaged; expected a saved {kind} ({' '.join(str(error).split())})") from error
+        raise DataError(
+            f"{path}: damaged; expected a saved {kind} ({' '.join(str(error).split())})"
+        ) from error
 
 
 def write_npz(header: dict[str, Any], arrays: Mapping[str, np.ndarray]) -> bytes:
@@ -152,11 +188,16 @@ def write_npz(header: dict[str, Any], arrays: Mapping[str, np.ndarray]) -> bytes
     content = io.BytesIO()
     np.savez(content, allow_pickle=False, **arrays)
     with zipfile.ZipFile(content, "a") as archive:
-        archive.writestr(_HEADER, json.dumps(header | {"checksum": _npz_checksum(header, archive)}, indent=2))
+        archive.writestr(
+            _HEADER,
+            json.dumps(header | {"checksum": _npz_checksum(header, archive)}, indent=2),
+        )
     return content.getvalue()
 
 
-def read_npz(path: Path, names: tuple[str, ...] | None = None) -> tuple[Any, dict[str, np.ndarray]]:
+def read_npz(
+    path: Path, names: tuple[str, ...] | None = None
+) -> tuple[Any, dict[str, np.ndarray]]:
     """The header, None where there is none, and the arrays of a file, all of them or those of the given names.
 
     Damage makes zipfile, json and NumPy raise whatever they come upon first: callers take any exception for one and
@@ -166,17 +207,33 @@ def read_npz(path: Path, names: tuple[str, ...] | None = None) -> tuple[Any, dic
     with zipfile.ZipFile(path) as archive:
         declared = sum(info.file_size for info in archive.infolist())
         if declared > _EXPANSION * size:
-            raise ValueError(f"declares {declared} bytes, more than a file of {size} bytes can hold")
-        header = json.loads(archive.read(_HEADER)) if _HEADER in archive.namelist() else None
-        if isinstance(header, dict) and header.get("checksum", expected := _npz_checksum(header, archive)) != expected:
-            raise ValueError("the checksum of its parts differs from the one in its header")
+            raise ValueError(
+                f"declares {declared} bytes, more than a file of {size} bytes can hold"
+            )
+        header = (
+            json.loads(archive.read(_HEADER)) if _HEADER in archive.namelist() else None
+        )
+        if (
+            isinstance(header, dict)
+            and header.get("checksum", expected := _npz_checksum(header, archive))
+            != expected
+        ):
+            raise ValueError(
+                "the checksum of its parts differs from the one in its header"
+            )
         if (damaged := archive.testzip()) is not None:  # compares the CRCs
             raise ValueError(f"{damaged} is damaged")
     with np.load(path, allow_pickle=False) as file:
-        return header, {name: file[name] for name in file.files if name != _HEADER and (not names or name in names)}
+        return header, {
+            name: file[name]
+            for name in file.files
+            if name != _HEADER and (not names or name in names)
+        }
 
 
-def _content(path: Path, kind: str, header_only: bool = False) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+def _content(
+    path: Path, kind: str, header_only: bool = False
+) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """The header and the arrays of a model file; damage makes libraries raise whatever they meet first."""
     try:
         if _is_npz(path):
@@ -187,7 +244,9 @@ def _content(path: Path, kind: str, header_only: bool = False) -> tuple[dict[str
                 if len(text) > _LONGEST:
                     raise ValueError(f"its header is longer than {_LONGEST} characters")
                 header = json.loads(text)
-                wanted = [] if header_only or not isinstance(header, dict) else file.keys()
+                wanted = (
+                    [] if header_only or not isinstance(header, dict) else file.keys()
+                )
                 arrays = {name: file.get_tensor(name) for name in wanted}
     except Exception as error:
         what = f"damaged, or not a file of this package; expected a saved {kind}"
@@ -213,12 +272,20 @@ def _without_checksum(header: dict[str, Any]) -> dict[str, Any]:
 
 
 def _npz_checksum(header: dict[str, Any], archive: zipfile.ZipFile) -> str:
-    parts = sorted((i.filename, i.file_size, i.CRC) for i in archive.infolist() if i.filename.endswith(".npy"))
-    return hashlib.sha256(json.dumps([_without_checksum(header), parts], sort_keys=True).encode()).hexdigest()
+    parts = sorted(
+        (i.filename, i.file_size, i.CRC)
+        for i in archive.infolist()
+        if i.filename.endswith(".npy")
+    )
+    return hashlib.sha256(
+        json.dumps([_without_checksum(header), parts], sort_keys=True).encode()
+    ).hexdigest()
 
 
 def _checksum(header: dict[str, Any], arrays: Mapping[str, np.ndarray]) -> str:
-    found = hashlib.sha256(json.dumps(_without_checksum(header), sort_keys=True).encode())
+    found = hashlib.sha256(
+        json.dumps(_without_checksum(header), sort_keys=True).encode()
+    )
     for name in sorted(arrays):
         found.update(f"{name} {arrays[name].dtype} {arrays[name].shape}".encode())
         found.update(arrays[name].data if arrays[name].size else b"")
@@ -236,13 +303,23 @@ def _packed(name: str, value: Tensor) -> Tensor:
 def _restored(name: str, stored: np.ndarray, order: list[int]) -> Tensor:
     """The tensor of an array, lying in memory as it did when it was saved."""
     if stored.dtype.name not in _DTYPES.values():
-        raise ValueError(f"{name} must be of type {' or '.join(_DTYPES.values())}; got {stored.dtype}")
-    shape, triangular, size = stored.shape, name.endswith("cholesky"), math.isqrt(2 * stored.shape[-1])
+        raise ValueError(
+            f"{name} must be of type {' or '.join(_DTYPES.values())}; got {stored.dtype}"
+        )
+    shape, triangular, size = (
+        stored.shape,
+        name.endswith("cholesky"),
+        math.isqrt(2 * stored.shape[-1]),
+    )
     whole = (len(stored), size, size) if triangular else shape
-    if sorted(order) != list(range(len(whole))) or (triangular and shape != (len(stored), size * (size + 1) // 2)):
+    if sorted(order) != list(range(len(whole))) or (
+        triangular and shape != (len(stored), size * (size + 1) // 2)
+    ):
         raise ValueError(f"{name} of shape {shape} cannot lie in the order {order}")
     inverse = sorted(range(len(whole)), key=order.__getitem__)
-    array = np.zeros([whole[d] for d in order], stored.dtype).transpose(inverse)  # pages that nobody writes are free
+    array = np.zeros([whole[d] for d in order], stored.dtype).transpose(
+        inverse
+    )  # pages that nobody writes are free
     if not triangular:
         array[...] = stored
     for row in range(size if triangular else 0):

@@ -15,7 +15,14 @@ import torch
 from threadpoolctl import threadpool_limits
 from torch import Tensor
 
-from gpmpc.exceptions import DataError, SettingError, TrainingError, UnsupportedModel, check_choice, check_number
+from gpmpc.exceptions import (
+    DataError,
+    SettingError,
+    TrainingError,
+    UnsupportedModel,
+    check_choice,
+    check_number,
+)
 from gpmpc.gp._kernel import PREDICTS, Hyperparameters, Predicts
 from gpmpc.gp._likelihood import FAILED
 from gpmpc.gp._online import targets_of
@@ -49,7 +56,9 @@ class Training:
     #: subset if there is one, NaN for starts that a time limit left out; of a sparse training, where the search over
     #: the bound began (k, 1)
     explored: np.ndarray
-    evaluations: int  #: of the likelihood or of the bound, all starts and outputs together
+    evaluations: (
+        int  #: of the likelihood or of the bound, all starts and outputs together
+    )
     seconds: float  #: wall time [s]
 
 
@@ -86,20 +95,35 @@ class Trainer:
         if self.subset is not None:
             check_number("subset", self.subset, least=1, whole=True)
         for key, example in (("scaling", "standardize"), ("penalty", "SoftLimits()")):
-            if not (callable(value := getattr(self, key)) or (key == "penalty" and value is None)):
-                raise SettingError(key, f"must be a function such as {example} of gpmpc.gp; got {value!r}")
+            if not (
+                callable(value := getattr(self, key))
+                or (key == "penalty" and value is None)
+            ):
+                raise SettingError(
+                    key,
+                    f"must be a function such as {example} of gpmpc.gp; got {value!r}",
+                )
         check_number("tolerance", self.tolerance, above=0)
         check_number("signal_to_noise_limit", self.signal_to_noise_limit, above=1)
         if self.time_limit is not None:
             check_number("time_limit", self.time_limit, above=0, unit="[s]")
 
-    def __call__(self, transitions: Transitions, seed: int = 0, start: GPPosterior | None = None) -> Training:
+    def __call__(
+        self, transitions: Transitions, seed: int = 0, start: GPPosterior | None = None
+    ) -> Training:
         """Trains on transitions; see ``fit``."""
         check_transitions(transitions)
         targets = transitions.targets(self.predicts)
-        return self.fit(transitions.features, targets, transitions.input_dim, seed=seed, start=start)
+        return self.fit(
+            transitions.features, targets, transitions.input_dim, seed=seed, start=start
+        )
 
-    def refit(self, posterior: GPPosterior, transitions: Transitions | None = None, seed: int = 0) -> Training:
+    def refit(
+        self,
+        posterior: GPPosterior,
+        transitions: Transitions | None = None,
+        seed: int = 0,
+    ) -> Training:
         """Trains on the points a posterior holds, and on new ones, from its hyperparameters on.
 
         With ``restarts=0`` only from them on. The prior mean is that of this trainer's scaling, as in any training.
@@ -110,11 +134,20 @@ class Trainer:
             raise UnsupportedModel(
                 "the posterior holds a sparse model's pseudo-observations, no data: train again with SparseTrainer"
             )
-        features, targets = (t.to("cpu", torch.float64) for t in (posterior.features, posterior.targets))
+        features, targets = (
+            t.to("cpu", torch.float64) for t in (posterior.features, posterior.targets)
+        )
         if transitions is not None:
             targets = torch.cat([targets, targets_of(posterior, transitions)])
             features = torch.cat([features, transitions.features])
-        return self.fit(features, targets, posterior.input_dim, posterior.predicts, seed, start=posterior)
+        return self.fit(
+            features,
+            targets,
+            posterior.input_dim,
+            posterior.predicts,
+            seed,
+            start=posterior,
+        )
 
     def fit(
         self,
@@ -149,7 +182,10 @@ class Trainer:
         )
         (size, d), outputs = features.shape, targets.shape[1]
         _check_memory(size, outputs)
-        x, y = feature_scaling.scale(features).numpy(), target_scaling.scale(targets).numpy()
+        x, y = (
+            feature_scaling.scale(features).numpy(),
+            target_scaling.scale(targets).numpy(),
+        )
         first: Any = [None] * outputs
         if start is not None:
             _check_start("start", start)
@@ -157,15 +193,29 @@ class Trainer:
         rng = np.random.default_rng(seed)
         perturbations = rng.normal(size=(outputs, self.restarts + 1, d + 2))
         rows = None
-        converged = start is not None and not self.restarts  # a subset could not improve on where the search begins
+        converged = (
+            start is not None and not self.restarts
+        )  # a subset could not improve on where the search begins
         if self.subset is not None and size > self.subset and not converged:
             rows = np.sort(rng.permutation(size)[: self.subset])
         std, constant = column_std(features.numpy()), constant_columns(features.numpy())
         std = std / feature_scaling.factor.numpy()
         found, evaluations = [], 0
         for a in range(outputs):
-            deadline = np.inf if self.time_limit is None else begin + self.time_limit * (a + 1) / outputs
-            search = OutputSearch(f"output {a + 1} of {outputs}", x, y[:, a], std, constant, self, deadline)
+            deadline = (
+                np.inf
+                if self.time_limit is None
+                else begin + self.time_limit * (a + 1) / outputs
+            )
+            search = OutputSearch(
+                f"output {a + 1} of {outputs}",
+                x,
+                y[:, a],
+                std,
+                constant,
+                self,
+                deadline,
+            )
             with threadpool_limits(1 if size < _ONE_THREAD else None, user_api="blas"):
                 found.append(search(first[a], perturbations[a], rows))
             evaluations += search.evaluations
@@ -177,9 +227,21 @@ class Trainer:
                 f"{', '.join(map(str, failed))}: lower signal_to_noise_limit, or remove duplicate rows",
             )
         theta = restored_theta(theta, feature_scaling, target_scaling)
-        kernel, offset = Hyperparameters.from_theta(torch.from_numpy(theta)), target_scaling.offset
-        posterior = GPPosterior.from_hyperparameters(features, targets, *kernel, input_dim, predicts, offset)
-        return Training(posterior, theta, objective, explored, evaluations, time.perf_counter() - begin)
+        kernel, offset = (
+            Hyperparameters.from_theta(torch.from_numpy(theta)),
+            target_scaling.offset,
+        )
+        posterior = GPPosterior.from_hyperparameters(
+            features, targets, *kernel, input_dim, predicts, offset
+        )
+        return Training(
+            posterior,
+            theta,
+            objective,
+            explored,
+            evaluations,
+            time.perf_counter() - begin,
+        )
 
 
 def train(transitions: Transitions, seed: int = 0, **settings: Any) -> Training:
@@ -189,13 +251,17 @@ def train(transitions: Transitions, seed: int = 0, **settings: Any) -> Training:
 
 def _check_start(key: str, posterior: Any) -> None:
     if not isinstance(posterior, GPPosterior):
-        raise UnsupportedModel(f"{key} must be a GPPosterior; got {type(posterior).__name__}")
+        raise UnsupportedModel(
+            f"{key} must be a GPPosterior; got {type(posterior).__name__}"
+        )
 
 
 def _check_memory(size: int, outputs: int) -> None:
     """Raises ``DataError`` where a training of N points and k outputs would not fit the available memory."""
     free = available_memory()
-    needed = 8 * size**2 * (outputs + 2)  # of the posterior's factors, and two more while one is made
+    needed = (
+        8 * size**2 * (outputs + 2)
+    )  # of the posterior's factors, and two more while one is made
     if free is None or needed <= free:
         return
     raise DataError(
@@ -214,13 +280,22 @@ def available_memory(system: Path = Path("/")) -> int | None:
     groups, left = system / "sys/fs/cgroup", []
     with suppress(OSError):
         lines = (system / "proc/meminfo").read_text().splitlines()
-        left += [1024 * int(line.split()[1]) for line in lines if line.startswith("MemAvailable:")]
+        left += [
+            1024 * int(line.split()[1])
+            for line in lines
+            if line.startswith("MemAvailable:")
+        ]
     with suppress(OSError):
         lines = (system / "proc/self/cgroup").read_text().splitlines()
         own = [groups / line[3:].strip("/") for line in lines if line.startswith("0::")]
         for folder in {folder for group in own for folder in (group, *group.parents)}:
             with suppress(OSError, ValueError):  # "max" where there is no limit
-                pages = dict(line.split() for line in (folder / "memory.stat").read_text().splitlines())
-                used = int((folder / "memory.current").read_text()) - int(pages.get("inactive_file", 0))
+                pages = dict(
+                    line.split()
+                    for line in (folder / "memory.stat").read_text().splitlines()
+                )
+                used = int((folder / "memory.current").read_text()) - int(
+                    pages.get("inactive_file", 0)
+                )
                 left.append(int((folder / "memory.max").read_text()) - used)
     return max(min(left), 0) if left else None

@@ -16,7 +16,14 @@ import torch
 from torch import Tensor
 
 from gpmpc._files import existing_file, new_file, write_whole
-from gpmpc.exceptions import DataError, GpmpcError, SettingError, ShapeError, UnsupportedModel, check_number
+from gpmpc.exceptions import (
+    DataError,
+    GpmpcError,
+    SettingError,
+    ShapeError,
+    UnsupportedModel,
+    check_number,
+)
 from gpmpc.gp._storage import read_npz, write_npz
 
 _NAMES = ("states", "inputs", "next_states")
@@ -49,11 +56,17 @@ class Transitions:
             try:
                 value = _real(getattr(self, name))
             except (TypeError, ValueError) as error:
-                raise DataError(f"{name} must be numbers in rows and columns; {error}") from error
+                raise DataError(
+                    f"{name} must be numbers in rows and columns; {error}"
+                ) from error
             if value.dim() != 2:
-                raise ShapeError(f"{name} must have two dimensions (rows, columns); got shape {tuple(value.shape)}")
+                raise ShapeError(
+                    f"{name} must have two dimensions (rows, columns); got shape {tuple(value.shape)}"
+                )
             for row, column in torch.nonzero(~torch.isfinite(value))[:1].tolist():
-                got = f"{float(value[row, column])} in row {row + 1}, column {column + 1}"
+                got = (
+                    f"{float(value[row, column])} in row {row + 1}, column {column + 1}"
+                )
                 raise DataError(f"{name} must be finite; got {got}")
             object.__setattr__(self, name, value)
         x, u, after = (tuple(getattr(self, name).shape) for name in _NAMES)
@@ -93,7 +106,11 @@ class Transitions:
                 "transitions hold no targets of GPs with predicts='value': use append_points, "
                 "or fit(features, targets, ...) of a trainer"
             )
-        return self.next_states - self.states if predicts == "difference" else self.next_states
+        return (
+            self.next_states - self.states
+            if predicts == "difference"
+            else self.next_states
+        )
 
     def __getitem__(self, rows: slice | Sequence[int]) -> "Transitions":
         """The transitions of some rows, in the order given."""
@@ -102,7 +119,10 @@ class Transitions:
     def save(self, path: str | Path) -> None:
         """Writes an uncompressed ``.npz`` (no pickle), in one piece or not at all."""
         arrays = {name: getattr(self, name).numpy(force=True) for name in _NAMES}
-        write_whole(new_file(path), write_npz({"format": "gpmpc transitions", "format_version": 1}, arrays))
+        write_whole(
+            new_file(path),
+            write_npz({"format": "gpmpc transitions", "format_version": 1}, arrays),
+        )
 
     @classmethod
     def load(cls, path: str | Path) -> "Transitions":
@@ -115,14 +135,20 @@ class Transitions:
         try:
             _, arrays = read_npz(path, _NAMES)
         except Exception as error:
-            raise DataError(f"{path}: not a readable .npz file of transitions ({error})") from error
+            raise DataError(
+                f"{path}: not a readable .npz file of transitions ({error})"
+            ) from error
         missing = [name for name in _NAMES if name not in arrays]
         if missing:
-            raise DataError(f"{path}: array {missing[0]!r} is missing; expected {', '.join(_NAMES)}")
+            raise DataError(
+                f"{path}: array {missing[0]!r} is missing; expected {', '.join(_NAMES)}"
+            )
         return _with_path(path, *(arrays[name] for name in _NAMES))
 
     @classmethod
-    def from_text(cls, path: str | Path, state_dim: int = 6, input_dim: int = 3) -> "Transitions":
+    def from_text(
+        cls, path: str | Path, state_dim: int = 6, input_dim: int = 3
+    ) -> "Transitions":
         """Reads blank-separated columns x[k] (n), u[k] (m), x[k+1] (n), the format of Cao, Lai and Alam's data.
 
         Raises:
@@ -132,12 +158,18 @@ class Transitions:
         check_number("input_dim", input_dim, least=0, whole=True)
         n, width = state_dim, 2 * state_dim + input_dim
         lines = enumerate(map(str.split, _text(path).splitlines()), start=1)
-        table = _table(path, lines, {number: number - 1 for number in range(1, width + 1)}, width)
+        table = _table(
+            path, lines, {number: number - 1 for number in range(1, width + 1)}, width
+        )
         return _with_path(path, table[:, :n], table[:, n:-n], table[:, -n:])
 
     @classmethod
     def from_csv(
-        cls, path: str | Path, states: Sequence[str], inputs: Sequence[str], next_states: Sequence[str] | None = None
+        cls,
+        path: str | Path,
+        states: Sequence[str],
+        inputs: Sequence[str],
+        next_states: Sequence[str] | None = None,
     ) -> "Transitions":
         """Reads named columns of a CSV file with a header line.
 
@@ -152,16 +184,31 @@ class Transitions:
             SettingError: One name was given where a list of them belongs.
             DataError: The file or a column is missing, or an entry is no finite number.
         """
-        for key, names in (("states", states), ("inputs", inputs), ("next_states", next_states or ())):
+        for key, names in (
+            ("states", states),
+            ("inputs", inputs),
+            ("next_states", next_states or ()),
+        ):
             if isinstance(names, str) or not isinstance(names, Iterable):
-                raise SettingError(key, f"must be a list of column names; got {names!r}")
+                raise SettingError(
+                    key, f"must be a list of column names; got {names!r}"
+                )
         text = _text(path)
-        reader = csv.reader(io.StringIO(text), delimiter=max(",;\t", key=text.partition("\n")[0].count))
+        reader = csv.reader(
+            io.StringIO(text), delimiter=max(",;\t", key=text.partition("\n")[0].count)
+        )
         try:
-            (_, header), *lines = [(reader.line_num, fields) for fields in reader] or [(1, [])]
+            (_, header), *lines = [(reader.line_num, fields) for fields in reader] or [
+                (1, [])
+            ]
         except csv.Error as error:
-            raise DataError(f"{path}: row {reader.line_num} cannot be read ({error})") from error
-        header, wanted = [name.strip() for name in header], [*states, *inputs, *(next_states or ())]
+            raise DataError(
+                f"{path}: row {reader.line_num} cannot be read ({error})"
+            ) from error
+        header, wanted = (
+            [name.strip() for name in header],
+            [*states, *inputs, *(next_states or ())],
+        )
         for name in wanted:
             if header.count(name) != 1:
                 problem = "stands there twice" if name in header else "is missing"
@@ -171,14 +218,23 @@ class Transitions:
         places = {name: header.index(name) for name in wanted}
         table = _table(path, lines, places, len(header), least=1 if next_states else 2)
         column = list(places).index
-        x, u, after = (table[:, list(map(column, part))] for part in (states, inputs, next_states or states))
-        return _with_path(path, x, u, after) if next_states else _with_path(path, x[:-1], u[:-1], after[1:])
+        x, u, after = (
+            table[:, list(map(column, part))]
+            for part in (states, inputs, next_states or states)
+        )
+        return (
+            _with_path(path, x, u, after)
+            if next_states
+            else _with_path(path, x[:-1], u[:-1], after[1:])
+        )
 
 
 def check_transitions(transitions: Any, model: Any = None) -> None:
     """Raises unless these are transitions, of as many states and inputs as a model, where one is given, has."""
     if not isinstance(transitions, Transitions):
-        raise SettingError("transitions", f"must be Transitions(...); got {type(transitions).__name__}")
+        raise SettingError(
+            "transitions", f"must be Transitions(...); got {type(transitions).__name__}"
+        )
     n, m = transitions.state_dim, transitions.input_dim
     if model is not None and (n, m) != (model.state_dim, model.input_dim):
         rule = f"the model has {model.state_dim} states and {model.input_dim} inputs"
@@ -206,17 +262,30 @@ def _text(path: str | Path) -> str:
 
 
 def _table(
-    path: str | Path, lines: Iterable[tuple[int, list[str]]], columns: Mapping[Any, int], width: int, least: int = 1
+    path: str | Path,
+    lines: Iterable[tuple[int, list[str]]],
+    columns: Mapping[Any, int],
+    width: int,
+    least: int = 1,
 ) -> np.ndarray:
     """The numbers in the columns, at the places by their names, of ``least`` or more lines that are not empty."""
     rows = []
     for line, fields in lines:
         if fields and len(fields) != width:
-            raise DataError(f"{path}: row {line} has {len(fields)} columns; expected {width}")
+            raise DataError(
+                f"{path}: row {line} has {len(fields)} columns; expected {width}"
+            )
         if fields:
-            rows.append([_number(path, line, name, fields[place]) for name, place in columns.items()])
+            rows.append(
+                [
+                    _number(path, line, name, fields[place])
+                    for name, place in columns.items()
+                ]
+            )
     if len(rows) < least:
-        raise DataError(f"{path}: the file holds {len(rows)} rows; expected {least} or more, of {width} columns")
+        raise DataError(
+            f"{path}: the file holds {len(rows)} rows; expected {least} or more, of {width} columns"
+        )
     return np.array(rows)
 
 
@@ -226,11 +295,15 @@ def _number(path: str | Path, row: int, column: int | str, field: str) -> float:
     except ValueError:
         value = np.nan
     if not np.isfinite(value) or "_" in field:  # Python takes 1_0 for 10
-        raise DataError(f"{path}: row {row}, column {column} is {field.strip()!r}; expected a finite number")
+        raise DataError(
+            f"{path}: row {row}, column {column} is {field.strip()!r}; expected a finite number"
+        )
     return value
 
 
-def _with_path(path: str | Path, states: Any, inputs: Any, next_states: Any) -> Transitions:
+def _with_path(
+    path: str | Path, states: Any, inputs: Any, next_states: Any
+) -> Transitions:
     try:
         return Transitions(states, inputs, next_states)
     except GpmpcError as error:

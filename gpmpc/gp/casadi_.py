@@ -38,19 +38,29 @@ def casadi_function(model: Any, name: str = "gp") -> casadi.Function:
     Raises:
         UnsupportedModel: The nominal model or the effect is a Python function, or it is another model.
     """
-    x, u = casadi.MX.sym("state", model.state_dim), casadi.MX.sym("input", model.input_dim)
+    x, u = (
+        casadi.MX.sym("state", model.state_dim),
+        casadi.MX.sym("input", model.input_dim),
+    )
     if isinstance(model, GPPosterior):
         mean, variance = _moments(model, x, u)
         mean = mean + x if model.predicts == "difference" else mean
     else:
         mean, variance = _residual(model, x, u)
-    return casadi.Function(name, [x, u], [mean, variance], ["state", "input"], ["mean", "variance"])
+    return casadi.Function(
+        name, [x, u], [mean, variance], ["state", "input"], ["mean", "variance"]
+    )
 
 
 def successor_function(plant: Any) -> casadi.Function:
     """Writes the next state of a plant, such as a ``System``, as a CasADi function of state (n,) and input (m,)."""
-    x, u = (casadi.SX.sym("x", len(plant.dynamics.state_names)), casadi.SX.sym("u", len(plant.dynamics.input_names)))
-    return casadi.Function("successor", [x, u], [casadi.vertcat(*plant.successor(x, u))])
+    x, u = (
+        casadi.SX.sym("x", len(plant.dynamics.state_names)),
+        casadi.SX.sym("u", len(plant.dynamics.input_names)),
+    )
+    return casadi.Function(
+        "successor", [x, u], [casadi.vertcat(*plant.successor(x, u))]
+    )
 
 
 def _residual(model: Any, x: casadi.MX, u: casadi.MX) -> tuple[casadi.MX, casadi.MX]:
@@ -60,15 +70,22 @@ def _residual(model: Any, x: casadi.MX, u: casadi.MX) -> tuple[casadi.MX, casadi
     known: Any = getattr(nominal, "function", None)
     effect: Any = getattr(B, "function", None)
     affine = all(hasattr(nominal, part) for part in "ABc")
-    if not (known is not None or affine) or not (effect is not None or isinstance(B, torch.Tensor)):
-        got = type(model).__name__ + (f" of a nominal {type(nominal).__name__}" if nominal is not None else "")
+    if not (known is not None or affine) or not (
+        effect is not None or isinstance(B, torch.Tensor)
+    ):
+        got = type(model).__name__ + (
+            f" of a nominal {type(nominal).__name__}" if nominal is not None else ""
+        )
         raise UnsupportedModel(
             f"CasADi can take a GPPosterior, or a ResidualModel of Affine, CasadiFunction and numbers; got {got}"
         )
     seen: list[Any] = []  # angles as sine and cosine
     for i in model.states:
         seen += [casadi.sin(x[i]), casadi.cos(x[i])] if i in model.angles else [x[i]]
-    features, selected = (casadi.vertcat(casadi.MX(0, 1), *some) for some in (seen, [u[i] for i in model.inputs]))
+    features, selected = (
+        casadi.vertcat(casadi.MX(0, 1), *some)
+        for some in (seen, [u[i] for i in model.inputs])
+    )
     mean, variance = _moments(model.residual, features, selected)
     matrix = _numbers(B) if effect is None else effect(x)
     if affine:
@@ -79,11 +96,15 @@ def _residual(model: Any, x: casadi.MX, u: casadi.MX) -> tuple[casadi.MX, casadi
     return moved + matrix @ mean, matrix**2 @ variance
 
 
-def _moments(gp: GPPosterior, x: casadi.MX, u: casadi.MX) -> tuple[casadi.MX, casadi.MX]:
+def _moments(
+    gp: GPPosterior, x: casadi.MX, u: casadi.MX
+) -> tuple[casadi.MX, casadi.MX]:
     """Mean (k,) and variance (k,) of the GPs at x and u."""
     points, size = _numbers(gp.features), len(gp)
     difference = points - casadi.repmat(casadi.vertcat(x, u).T, size, 1)  # (N, d)
-    exponents = difference**2 @ _numbers(gp.lengthscales.mT.double() ** -2) / -2  # (N, k)
+    exponents = (
+        difference**2 @ _numbers(gp.lengthscales.mT.double() ** -2) / -2
+    )  # (N, k)
     k = casadi.exp(exponents) * casadi.repmat(_numbers(gp.signal_variance).T, size, 1)
     mean = casadi.sum1(k * _numbers(gp.weights.mT)).T + _numbers(gp.offset)
     variance = []
@@ -91,9 +112,15 @@ def _moments(gp: GPPosterior, x: casadi.MX, u: casadi.MX) -> tuple[casadi.MX, ca
     for a, column in enumerate(casadi.horzsplit(k)):
         # The factor's inverse, since CasADi cannot serialise its triangular solve; both lose the same digits.
         eye = torch.eye(size, dtype=torch.float64)
-        inverse = torch.linalg.solve_triangular(gp.cholesky[a].detach().double().cpu(), eye, upper=False)
+        inverse = torch.linalg.solve_triangular(
+            gp.cholesky[a].detach().double().cpu(), eye, upper=False
+        )
         entries = casadi.DM(lower, inverse.numpy().T[np.triu_indices(size)])
-        variance.append(casadi.fmax(0, float(gp.signal_variance[a]) - casadi.sumsqr(entries @ column)))
+        variance.append(
+            casadi.fmax(
+                0, float(gp.signal_variance[a]) - casadi.sumsqr(entries @ column)
+            )
+        )
     return mean, casadi.vertcat(*variance)
 
 
@@ -113,7 +140,10 @@ def tape_of(function: casadi.Function) -> tapes.Tape | None:
     if not all(function.sparsity_in(i).is_dense() for i in range(function.n_in())):
         return None
     sizes = [function.numel_in(i) for i in range(function.n_in())]
-    first, places = np.concatenate([[0], np.cumsum(sizes)]), function.sparsity_out(0).find()
+    first, places = (
+        np.concatenate([[0], np.cumsum(sizes)]),
+        function.sparsity_out(0).find(),
+    )
     code = np.zeros((function.n_instructions(), 4), dtype=np.int64)
     constants = np.zeros(len(code))
     for k, row in enumerate(code):
@@ -132,7 +162,9 @@ def tape_of(function: casadi.Function) -> tapes.Tape | None:
     return tapes.Tape(code, constants, function.sz_w(), function.numel_out(0))
 
 
-def function_of_tape(code: Array, constants: Array, sizes: Sequence[int], shape: tuple[int, int]) -> casadi.Function:
+def function_of_tape(
+    code: Array, constants: Array, sizes: Sequence[int], shape: tuple[int, int]
+) -> casadi.Function:
     """Writes a tape, of arguments and a value of these sizes, as a CasADi function again: the inverse of ``tape_of``.
 
     Raises ``DataError`` where code (K, 4) and constants (K,) are no tape's.
@@ -141,7 +173,9 @@ def function_of_tape(code: Array, constants: Array, sizes: Sequence[int], shape:
     z, value = casadi.vertcat(*arguments), casadi.SX(shape[0] * shape[1], 1)
     work: dict[int, Any] = {}
     try:
-        for (operation, to, first, last), constant in zip(code.astype(int).tolist(), constants.tolist(), strict=True):
+        for (operation, to, first, last), constant in zip(
+            code.astype(int).tolist(), constants.tolist(), strict=True
+        ):
             if operation == tapes.OUTPUT:
                 value[to] = work[first]
             elif operation == tapes.INPUT:
@@ -155,5 +189,7 @@ def function_of_tape(code: Array, constants: Array, sizes: Sequence[int], shape:
             else:
                 raise DataError(f"there is no operation {operation}")
     except (KeyError, RuntimeError, ValueError) as error:
-        raise DataError(f"a function's operations do not follow from each other ({error})") from error
+        raise DataError(
+            f"a function's operations do not follow from each other ({error})"
+        ) from error
     return casadi.Function("function", arguments, [casadi.reshape(value, *shape)])

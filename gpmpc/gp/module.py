@@ -29,23 +29,34 @@ class PosteriorModule(torch.nn.Module):
         super().__init__()
         if not isinstance(posterior, GPPosterior):
             got = type(posterior).__name__
-            raise UnsupportedModel(f"PosteriorModule takes a GPPosterior, such as a model's .residual; got {got}")
+            raise UnsupportedModel(
+                f"PosteriorModule takes a GPPosterior, such as a model's .residual; got {got}"
+            )
         eye = torch.eye(len(posterior), dtype=posterior.dtype, device=posterior.device)
         # ONNX has no triangular solve. |L^-1 k|^2 loses fewer digits than k' (K + sn2 I)^-1 k.
-        self._add("inverse_factor", torch.linalg.solve_triangular(posterior.cholesky, eye, upper=False))
-        self._add("inverse_lengthscales", posterior.lengthscales.reciprocal()[:, None, :])
+        self._add(
+            "inverse_factor",
+            torch.linalg.solve_triangular(posterior.cholesky, eye, upper=False),
+        )
+        self._add(
+            "inverse_lengthscales", posterior.lengthscales.reciprocal()[:, None, :]
+        )
         for name in ("features", "signal_variance", "offset", "weights"):
             self._add(name, getattr(posterior, name))
         self.adds_state = posterior.predicts == "difference"
 
     def _add(self, name: str, value: Tensor) -> None:
         """Registers a copy: a file of weights wants memory of its own for each."""
-        self.register_buffer(name, value.detach().clone(memory_format=torch.contiguous_format))
+        self.register_buffer(
+            name, value.detach().clone(memory_format=torch.contiguous_format)
+        )
 
     def forward(self, state: Tensor, input: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and variance of the latent next state, in physical units."""
         query = torch.cat([state, input], dim=-1)
-        z = (self.features - query[..., None, :])[..., None, :, :] * self.inverse_lengthscales
+        z = (self.features - query[..., None, :])[
+            ..., None, :, :
+        ] * self.inverse_lengthscales
         k = self.signal_variance[:, None] * torch.exp((z * z).sum(-1) * -0.5)
         mean = (k * self.weights).sum(-1) + self.offset
         whitened = (self.inverse_factor @ k[..., None])[..., 0]

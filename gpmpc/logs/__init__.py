@@ -9,7 +9,13 @@ from gpmpc.logs._log import Log
 from gpmpc.logs._mapping import LogMapping
 from gpmpc.logs._reading import read_log
 from gpmpc.logs._rollouts import LogModel, MultirotorNominal
-from gpmpc.logs._storage import LogDynamics, SavedModel, load_flyable, load_learned, save_learned
+from gpmpc.logs._storage import (
+    LogDynamics,
+    SavedModel,
+    load_flyable,
+    load_learned,
+    save_learned,
+)
 
 __all__ = [
     "Inspection",

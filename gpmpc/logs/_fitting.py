@@ -23,7 +23,14 @@ from scipy.optimize import least_squares, nnls
 from gpmpc.exceptions import DataError, ShapeError, check_number
 from gpmpc.logs._kinematics import Array, Kinematics
 from gpmpc.logs._log import Log, Windows
-from gpmpc.logs._rollouts import PAST, STEPS, AffineNominal, LogModel, finite_errors, rollout_errors
+from gpmpc.logs._rollouts import (
+    PAST,
+    STEPS,
+    AffineNominal,
+    LogModel,
+    finite_errors,
+    rollout_errors,
+)
 
 WINDOWS = 300
 EVALUATIONS = 15
@@ -32,8 +39,14 @@ BLOCK = 4  # consecutive windows whose errors are correlated
 TIME_CONSTANTS = (0.0, 0.05, 0.25, 1.0)  # [s]; zero is white
 FITTED = (1, 2, 3, 5, 7, 10, 15, 20, 30, 50)  # steps
 DIFFERENCE = 1e-6
-FOLLOWED, PRIOR = 6.0, 1.0  # times of the longest prediction: after which an error is forgotten, that a one weighs
-NOISE_WINDOWS, LINEARIZED = 2000, 200  # of a fold: whose errors count, and along which rollouts are linearised
+FOLLOWED, PRIOR = (
+    6.0,
+    1.0,
+)  # times of the longest prediction: after which an error is forgotten, that a one weighs
+NOISE_WINDOWS, LINEARIZED = (
+    2000,
+    200,
+)  # of a fold: whose errors count, and along which rollouts are linearised
 
 
 @dataclass(frozen=True)
@@ -46,10 +59,19 @@ class NominalFit:
     def to_rows(self) -> list[tuple[str, float, float]]:
         """Name, value and standard error of every parameter that has a name."""
         names = self.model.nominal.parameter_names
-        return list(zip(names, self.model.theta.tolist(), self.standard_errors.tolist(), strict=False))
+        return list(
+            zip(
+                names,
+                self.model.theta.tolist(),
+                self.standard_errors.tolist(),
+                strict=False,
+            )
+        )
 
 
-def fit_nominal(model: LogModel, theta0: Array | None, log: Log, steps: int = STEPS) -> NominalFit:
+def fit_nominal(
+    model: LogModel, theta0: Array | None, log: Log, steps: int = STEPS
+) -> NominalFit:
     """Fits the parameters of a model's nominal part by the errors of its rollouts.
 
     Args:
@@ -65,7 +87,9 @@ def fit_nominal(model: LogModel, theta0: Array | None, log: Log, steps: int = ST
     check_number("steps", steps, least=1, whole=True)
     theta0 = np.asarray(model.nominal.start if theta0 is None else theta0, dtype=float)
     if theta0.shape != (len(model.nominal.parameter_names),):
-        raise ShapeError(f"theta0 must have {len(model.nominal.parameter_names)} entries; got {theta0.shape}")
+        raise ShapeError(
+            f"theta0 must have {len(model.nominal.parameter_names)} entries; got {theta0.shape}"
+        )
     cut = log.windows(steps, max(model.past, PAST), most=WINDOWS)
     if not len(theta0):
         return NominalFit(replace(model, theta=theta0), theta0)
@@ -76,22 +100,37 @@ def fit_nominal(model: LogModel, theta0: Array | None, log: Log, steps: int = ST
         """Of parameter vectors (T, P): (T, W, steps, e)."""
         count = max(MEMORY_ROWS // len(cut), 1)
         batches = (theta[i : i + count] for i in range(0, len(theta), count))
-        parts = [rollout_errors(cut, model.rollout(cut, steps, batch), at) / scale for batch in batches]
+        parts = [
+            rollout_errors(cut, model.rollout(cut, steps, batch), at) / scale
+            for batch in batches
+        ]
         return np.nan_to_num(np.concatenate(parts), nan=1e6, posinf=1e6, neginf=-1e6)
 
     def jacobian(theta: Array) -> Array:
         h = 1e-5 * np.maximum(np.abs(theta), 1.0)
         around = residuals(np.concatenate([theta + np.diag(h), theta[None]]))
-        return ((around[:-1] - around[-1]) / h[:, None, None, None]).reshape(len(theta), -1).T
+        return (
+            ((around[:-1] - around[-1]) / h[:, None, None, None])
+            .reshape(len(theta), -1)
+            .T
+        )
 
     def flat(theta: Array) -> Array:
         return residuals(theta[None])[0].ravel()
 
     with np.errstate(over="ignore", invalid="ignore"):
         if not (np.abs(flat(theta0)) < 1e6).all():
-            raise DataError("the rollouts at theta0 are not finite: begin nearer, or with fewer steps")
-        tolerances: dict[str, Any] = {"xtol": 1e-4, "ftol": 1e-4, "max_nfev": EVALUATIONS}
-        found = least_squares(flat, theta0, jacobian, loss="soft_l1", x_scale="jac", **tolerances)
+            raise DataError(
+                "the rollouts at theta0 are not finite: begin nearer, or with fewer steps"
+            )
+        tolerances: dict[str, Any] = {
+            "xtol": 1e-4,
+            "ftol": 1e-4,
+            "max_nfev": EVALUATIONS,
+        }
+        found = least_squares(
+            flat, theta0, jacobian, loss="soft_l1", x_scale="jac", **tolerances
+        )
     errors = _standard_errors(found.x, jacobian(found.x), residuals(found.x[None])[0])
     return NominalFit(replace(model, theta=found.x), errors)
 
@@ -108,7 +147,11 @@ def _still_error(windows: Windows, at: np.ndarray) -> Array:
 def _standard_errors(theta: Array, J: Array, residuals: Array) -> Array:
     """Of a sandwich estimate whose residuals may be correlated within blocks of windows (P,)."""
     weights = 1 / np.sqrt(1 + residuals.ravel() ** 2)  # of the loss
-    scores = (J * (weights * residuals.ravel())[:, None]).reshape(len(residuals), -1, len(theta)).sum(axis=1)
+    scores = (
+        (J * (weights * residuals.ravel())[:, None])
+        .reshape(len(residuals), -1, len(theta))
+        .sum(axis=1)
+    )
     blocks = np.add.reduceat(scores, np.arange(0, len(scores), BLOCK))
     bread = np.linalg.pinv(J.T @ (J * weights[:, None]))
     return np.sqrt(np.maximum(np.diagonal(bread @ (blocks.T @ blocks) @ bread), 0.0))
@@ -120,8 +163,12 @@ def fit_least_squares(kinematics: Kinematics, log: Log) -> LogModel:
     x, u, c = cut.states[:, 0], cut.inputs[:, 0], cut.context[:, 0]
     z = kinematics.features(x, u, c)
     y = kinematics.outputs(x, cut.states[:, 1], log.time_step)
-    solution: Any = np.linalg.lstsq(np.column_stack([z, np.ones(len(z))]), y, rcond=1e-8)[0]
-    return LogModel(kinematics, AffineNominal(kinematics), solution.T.ravel(), (0,) * y.shape[1])
+    solution: Any = np.linalg.lstsq(
+        np.column_stack([z, np.ones(len(z))]), y, rcond=1e-8
+    )[0]
+    return LogModel(
+        kinematics, AffineNominal(kinematics), solution.T.ravel(), (0,) * y.shape[1]
+    )
 
 
 @dataclass(frozen=True)
@@ -132,12 +179,18 @@ class OutputNoise:
     measurement: Array  #: of each entry of a difference of states (e,), likewise
 
 
-def error_variances(model: LogModel, windows: Windows, noise: OutputNoise, steps: Sequence[int]) -> Array:
+def error_variances(
+    model: LogModel, windows: Windows, noise: OutputNoise, steps: Sequence[int]
+) -> Array:
     """Computes the variances (W, len(steps), e) of a model's errors at some steps after the starts of windows."""
-    return _responses(model, windows, steps) @ np.concatenate([noise.outputs.ravel(), noise.measurement])
+    return _responses(model, windows, steps) @ np.concatenate(
+        [noise.outputs.ravel(), noise.measurement]
+    )
 
 
-def follow_errors(windows: Windows, errors: Array, variances: Array, steps: Sequence[int]) -> Array:
+def follow_errors(
+    windows: Windows, errors: Array, variances: Array, steps: Sequence[int]
+) -> Array:
     """Scales claimed variances by how predictions of the same run ended that were over before each one began.
 
     A run may be calmer or rougher than those that the noise was fitted to. For each entry of the state and each step
@@ -152,14 +205,22 @@ def follow_errors(windows: Windows, errors: Array, variances: Array, steps: Sequ
         spacing = float(times[-1] - times[0]) / max(len(at) - 1, 1)
         for k, step in enumerate(steps):
             age = times[:, None] - times - (step - 0.5) * windows.time_step
-            weights = np.where(age > 0, spacing * np.exp(-np.maximum(age, 0) / (FOLLOWED * longest)), 0.0)
+            weights = np.where(
+                age > 0,
+                spacing * np.exp(-np.maximum(age, 0) / (FOLLOWED * longest)),
+                0.0,
+            )
             ratio = errors[at, k] ** 2 / np.maximum(variances[at, k], 1e-300)
             prior = PRIOR * longest
-            scaled[at, k] *= (prior + weights @ ratio) / (prior + weights.sum(axis=1, keepdims=True))
+            scaled[at, k] *= (prior + weights @ ratio) / (
+                prior + weights.sum(axis=1, keepdims=True)
+            )
     return scaled
 
 
-def fit_noise(models: Sequence[LogModel], logs: Sequence[Log], most: int) -> OutputNoise:
+def fit_noise(
+    models: Sequence[LogModel], logs: Sequence[Log], most: int
+) -> OutputNoise:
     """Finds the noise that explains the errors of rollouts, of ``most`` steps, on runs that a fold's model did not see.
 
     Where these do not tell the outputs of a group apart, as x from y while the heading turns, the outputs share as the
@@ -169,13 +230,28 @@ def fit_noise(models: Sequence[LogModel], logs: Sequence[Log], most: int) -> Out
     found: list[tuple[Array, Array, Array]] = []
     for model, log in zip(models, logs, strict=True):
         cut = log.windows(most, max(model.past, PAST), most=NOISE_WINDOWS)
-        few, past = cut[:: -(-len(cut) // LINEARIZED)], cut.past  # derivatives are slow, and vary little
+        few, past = (
+            cut[:: -(-len(cut) // LINEARIZED)],
+            cut.past,
+        )  # derivatives are slow, and vary little
         x, after = cut.states[:, past], cut.states[:, past + 1]
-        y = model.outputs(x, cut.inputs[:, past - model.lag], cut.context[:, past]) + model.disturbance(cut)
+        y = model.outputs(
+            x, cut.inputs[:, past - model.lag], cut.context[:, past]
+        ) + model.disturbance(cut)
         residuals = model.kinematics.outputs(x, after, cut.time_step) - y
-        found.append((np.square(finite_errors(cut, model, steps)), _responses(model, few, steps), np.square(residuals)))
-    mean, responses, squares = (np.concatenate(one).mean(axis=0) for one in zip(*found, strict=True))
-    relative = (responses / np.maximum(mean, 1e-300)[..., None]).reshape(-1, responses.shape[-1])
+        found.append(
+            (
+                np.square(finite_errors(cut, model, steps)),
+                _responses(model, few, steps),
+                np.square(residuals),
+            )
+        )
+    mean, responses, squares = (
+        np.concatenate(one).mean(axis=0) for one in zip(*found, strict=True)
+    )
+    relative = (responses / np.maximum(mean, 1e-300)[..., None]).reshape(
+        -1, responses.shape[-1]
+    )
     factor = np.maximum(relative.max(axis=0), 1e-300)
     alike = _alike(models[0], factor, squares)
     targets = np.r_[np.ones(len(relative)), np.zeros(len(alike))]
@@ -223,7 +299,9 @@ def _linearized(model: LogModel, windows: Windows, steps: int) -> tuple[Array, A
     """Derivatives of each step by the state (W, K, e, e) and by the outputs (W, K, e, o), along the rollout."""
     space, kinematics, dt = windows.space, model.kinematics, windows.time_step
     predicted = model.rollout(windows, steps)
-    x = np.concatenate([windows.states[:, windows.past : windows.past + 1], predicted[:, :-1]], axis=1)
+    x = np.concatenate(
+        [windows.states[:, windows.past : windows.past + 1], predicted[:, :-1]], axis=1
+    )
     at = windows.past - model.lag
     u, c = windows.inputs[:, at : at + steps], windows.context[:, windows.past][:, None]
     c = np.broadcast_to(c, (*x.shape[:-1], c.shape[-1]))
@@ -231,7 +309,15 @@ def _linearized(model: LogModel, windows: Windows, steps: int) -> tuple[Array, A
     y = model.outputs(x, u, c) + d
     after = kinematics.step(x, y, dt)
     displaced = (space.displace(x, h) for h in DIFFERENCE * np.eye(space.error_dim))
-    by_state = [kinematics.step(moved, model.outputs(moved, u, c) + d, dt) for moved in displaced]
-    by_output = [kinematics.step(x, y + h, dt) for h in DIFFERENCE * np.eye(y.shape[-1])]
-    A, B = (np.stack([space.difference(m, after) / DIFFERENCE for m in moved], -1) for moved in (by_state, by_output))
+    by_state = [
+        kinematics.step(moved, model.outputs(moved, u, c) + d, dt)
+        for moved in displaced
+    ]
+    by_output = [
+        kinematics.step(x, y + h, dt) for h in DIFFERENCE * np.eye(y.shape[-1])
+    ]
+    A, B = (
+        np.stack([space.difference(m, after) / DIFFERENCE for m in moved], -1)
+        for moved in (by_state, by_output)
+    )
     return A, B

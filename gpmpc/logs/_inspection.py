@@ -20,13 +20,28 @@ from gpmpc.logs._mapping import TIME_UNITS, LogMapping
 from gpmpc.logs._readers import STAMP, read_streams
 from gpmpc.logs._reading import ordered_stamps, read_log
 
-TIMES = (STAMP, "t", "time", "stamp", "Time", "seconds")  # columns that hold the time where nobody says which
+TIMES = (
+    STAMP,
+    "t",
+    "time",
+    "stamp",
+    "Time",
+    "seconds",
+)  # columns that hold the time where nobody says which
 DRAWN = 3000  # points of a channel's line
 BLOCKS, BLOCK, REACH = 16, 4096, 50  # rows in which delays are sought, and how far
 SHARP = 10  # rows within which a peak falls by a fifth
 CORRELATED = 0.5  # from which a delay says something
 PAIRS = 20  # most delays that are listed
-_DELAYS = ["channel", "later channel", "rows", "lowest", "highest", "agreement", "correlation"]
+_DELAYS = [
+    "channel",
+    "later channel",
+    "rows",
+    "lowest",
+    "highest",
+    "agreement",
+    "correlation",
+]
 FOLLOWS = 0.95  # share of an input's variance that the states explain
 
 
@@ -35,7 +50,9 @@ class Inspection:
     """What is in a log file; shares lie between 0 and 1."""
 
     title: str  #: the file and its size in words
-    streams: pd.DataFrame  #: a row a stream; its jitter is the standard deviation over the time step
+    streams: (
+        pd.DataFrame
+    )  #: a row a stream; its jitter is the standard deviation over the time step
     #: a row a channel, by name; "white noise" is the standard deviation of the one that second differences hold,
     #: "repeated" the share of the rows with the value of the row before, "smoothness" the correlation of neighbouring
     #: second differences
@@ -43,7 +60,9 @@ class Inspection:
     #: a row a pair, the strongest first: by how many rows the later channel is late (median, with its range over the
     #: blocks), which share of the blocks agrees to a row, and the correlation of the differences
     delays: pd.DataFrame
-    follows: dict[str, float]  #: share of the variance that the states explain, by input; only with a mapping
+    follows: dict[
+        str, float
+    ]  #: share of the variance that the states explain, by input; only with a mapping
     lines: dict[str, tuple[Array, Array]]  #: time [s] and values to draw, by channel
     gaps: tuple[tuple[float, float], ...]  #: begin and end [s] of each, of all streams
     warnings: tuple[str, ...]  #: what to beware of, in words
@@ -59,7 +78,9 @@ def inspect_log(path: str | Path, mapping: LogMapping | None = None) -> Inspecti
     Raises:
         DataError: The file cannot be read, or no column holds the time.
     """
-    streams = read_streams(path, {signal.topic for signal in mapping.signals} if mapping else ())
+    streams = read_streams(
+        path, {signal.topic for signal in mapping.signals} if mapping else ()
+    )
     tables: list[dict[str, Any]] = []
     channels: dict[str, Any] = {}
     lines: dict[str, Any] = {}
@@ -73,22 +94,58 @@ def inspect_log(path: str | Path, mapping: LogMapping | None = None) -> Inspecti
         step, where = float(np.median(steps)), f" of {topic}" if topic else ""
         wide = np.flatnonzero(steps > 1.5 * step)
         gaps += [(float(stamps.time[i]), float(stamps.time[i + 1])) for i in wide]
-        longest, jitter = float(steps[wide].max(initial=0)), float(steps[steps <= 1.5 * step].std() / step)
-        counts = {"repeated stamps": stamps.repeated, "backward stamps": stamps.backwards}
-        row = {"stream": topic, "rows": len(table), "rate [Hz]": 1 / step, "jitter": jitter, "gaps": len(wide)}
+        longest, jitter = (
+            float(steps[wide].max(initial=0)),
+            float(steps[steps <= 1.5 * step].std() / step),
+        )
+        counts = {
+            "repeated stamps": stamps.repeated,
+            "backward stamps": stamps.backwards,
+        }
+        row = {
+            "stream": topic,
+            "rows": len(table),
+            "rate [Hz]": 1 / step,
+            "jitter": jitter,
+            "gaps": len(wide),
+        }
         tables.append(row | {"longest gap [s]": longest} | counts)
-        warnings += [f"{len(wide)} gaps{where}, up to {longest:.3g} s"] if len(wide) else []
-        warnings += [f"{count} {what}{where}" for what, count in counts.items() if count]
-        warnings += [f"stamps{where} jitter by {jitter:.0%} of the time step: state a rate"] if jitter > 0.1 else []
-        wanted = {c for s in mapping.signals if s.topic == topic for c in s.columns} if mapping else set(table)
-        names = [c for c in table.select_dtypes("number") if c != time_name and c in wanted]
+        warnings += (
+            [f"{len(wide)} gaps{where}, up to {longest:.3g} s"] if len(wide) else []
+        )
+        warnings += [
+            f"{count} {what}{where}" for what, count in counts.items() if count
+        ]
+        warnings += (
+            [f"stamps{where} jitter by {jitter:.0%} of the time step: state a rate"]
+            if jitter > 0.1
+            else []
+        )
+        wanted = (
+            {c for s in mapping.signals if s.topic == topic for c in s.columns}
+            if mapping
+            else set(table)
+        )
+        names = [
+            c for c in table.select_dtypes("number") if c != time_name and c in wanted
+        ]
         values = table[names].to_numpy(float)[stamps.rows]
         titles = [f"{topic}.{name}" if topic else str(name) for name in names]
-        channels |= {name: _channel(column) for name, column in zip(titles, values.T, strict=True)}
+        channels |= {
+            name: _channel(column)
+            for name, column in zip(titles, values.T, strict=True)
+        }
         stride = max(len(values) // DRAWN, 1)
-        lines |= {name: (stamps.time[::stride], v[::stride]) for name, v in zip(titles, values.T, strict=True)}
+        lines |= {
+            name: (stamps.time[::stride], v[::stride])
+            for name, v in zip(titles, values.T, strict=True)
+        }
         delays += _delays(titles, values)
-    warnings += [f"{name}: {remark}" for name, numbers in channels.items() if (remark := _remark(numbers))]
+    warnings += [
+        f"{name}: {remark}"
+        for name, numbers in channels.items()
+        if (remark := _remark(numbers))
+    ]
     delays = sorted(delays, key=lambda delay: -abs(delay[-1]))[:PAIRS]
     for first, second, rows, low, high, agreement, _ in delays:
         if abs(rows) >= 1 or high - low > 2:
@@ -106,20 +163,36 @@ def inspect_log(path: str | Path, mapping: LogMapping | None = None) -> Inspecti
     return Inspection(size, *frames, follows, lines, tuple(gaps), tuple(warnings))
 
 
-def _time(path: str | Path, table: pd.DataFrame, mapping: LogMapping | None) -> tuple[str, Array]:
-    names = [mapping.time] if mapping and mapping.time else [name for name in TIMES if name in table]
+def _time(
+    path: str | Path, table: pd.DataFrame, mapping: LogMapping | None
+) -> tuple[str, Array]:
+    names = (
+        [mapping.time]
+        if mapping and mapping.time
+        else [name for name in TIMES if name in table]
+    )
     if not names or names[0] not in table:
         wanted = repr(names[0]) if names else "of the time, such as " + ", ".join(TIMES)
-        raise DataError(f"{path}: no column {wanted}; there are {', '.join(map(str, table.columns[:12]))}")
-    return names[0], table[names[0]].to_numpy(float) * (TIME_UNITS[mapping.time_unit] if mapping else 1.0)
+        raise DataError(
+            f"{path}: no column {wanted}; there are {', '.join(map(str, table.columns[:12]))}"
+        )
+    return names[0], table[names[0]].to_numpy(float) * (
+        TIME_UNITS[mapping.time_unit] if mapping else 1.0
+    )
 
 
 def _channel(values: Array) -> dict[str, float]:
     known = values[np.isfinite(values)]
-    low, high, std = (float(f(known)) if len(known) else np.nan for f in (np.min, np.max, np.std))
+    low, high, std = (
+        float(f(known)) if len(known) else np.nan for f in (np.min, np.max, np.std)
+    )
     same, second = np.diff(known) == 0, np.diff(known, 2)
     # The median is deaf to manoeuvres; 1.4826 makes it the standard deviation of a normal distribution.
-    noise = 1.4826 * float(np.median(np.abs(second - np.median(second)))) / np.sqrt(6) if len(second) else 0.0
+    noise = (
+        1.4826 * float(np.median(np.abs(second - np.median(second)))) / np.sqrt(6)
+        if len(second)
+        else 0.0
+    )
     power = float(second @ second)
     return {
         "lowest": low,
@@ -139,7 +212,9 @@ def _remark(channel: dict[str, float]) -> str:
     if channel["std"] == 0:
         remarks.insert(0, "never changes")
     elif channel["repeated"] > 0.5:
-        remarks.insert(0, f"a new value every {1 / max(1 - channel['repeated'], 1e-9):.1f} rows")
+        remarks.insert(
+            0, f"a new value every {1 / max(1 - channel['repeated'], 1e-9):.1f} rows"
+        )
     elif channel["smoothness"] > 0.3:
         remarks.insert(0, "smoothed: its errors hang together over rows")
     return ", ".join(remarks)
@@ -151,7 +226,9 @@ def _delays(names: list[str], values: Array) -> list[tuple[Any, ...]]:
     if length < 4 * REACH:
         return []
     starts = np.unique(np.linspace(0, len(values) - length, BLOCKS).astype(int))
-    steps = np.nan_to_num(np.diff([values[a : a + length] for a in starts], axis=1))  # (b, rows, c)
+    steps = np.nan_to_num(
+        np.diff([values[a : a + length] for a in starts], axis=1)
+    )  # (b, rows, c)
     steps = steps - steps.mean(axis=1, keepdims=True)
     norms = np.linalg.norm(steps, axis=1)
     usable = np.flatnonzero((norms > 0).all(axis=0))
@@ -159,20 +236,38 @@ def _delays(names: list[str], values: Array) -> list[tuple[Any, ...]]:
     spectra = np.fft.rfft(steps[:, :, usable] / norms[:, None, usable], size, axis=1)
     found = []
     for i in range(len(usable)):
-        cross = np.fft.irfft(spectra[:, :, i + 1 :] * np.conj(spectra[:, :, i : i + 1]), size, axis=1)
-        cross = np.concatenate([cross[:, -REACH:], cross[:, : REACH + 1]], axis=1)  # lags -REACH .. REACH
+        cross = np.fft.irfft(
+            spectra[:, :, i + 1 :] * np.conj(spectra[:, :, i : i + 1]), size, axis=1
+        )
+        cross = np.concatenate(
+            [cross[:, -REACH:], cross[:, : REACH + 1]], axis=1
+        )  # lags -REACH .. REACH
         peak = np.abs(cross).argmax(axis=1)  # (b, others)
         height = np.take_along_axis(cross, peak[:, None], axis=1)[:, 0]
         for j in range(peak.shape[1]):
             correlation = float(np.median(height[:, j]))
             middle = int(np.clip(np.median(peak[:, j]), SHARP, 2 * REACH - SHARP))
-            around = np.median(np.abs(cross[:, [middle - SHARP, middle + SHARP], j]), axis=0)
+            around = np.median(
+                np.abs(cross[:, [middle - SHARP, middle + SHARP], j]), axis=0
+            )
             # A slow oscillation is correlated with any other at some delay; a delay has a sharp peak.
             if abs(correlation) >= CORRELATED and around.max() < 0.8 * abs(correlation):
                 lags = peak[:, j] - REACH
-                delay, agreement = float(np.median(lags)), float((np.abs(lags - np.median(lags)) <= 1).mean())
+                delay, agreement = (
+                    float(np.median(lags)),
+                    float((np.abs(lags - np.median(lags)) <= 1).mean()),
+                )
                 pair = names[usable[i]], names[usable[i + 1 + j]]
-                found.append((*pair, delay, float(lags.min()), float(lags.max()), agreement, correlation))
+                found.append(
+                    (
+                        *pair,
+                        delay,
+                        float(lags.min()),
+                        float(lags.max()),
+                        agreement,
+                        correlation,
+                    )
+                )
     return found
 
 
@@ -184,4 +279,8 @@ def _dependence(log: Log) -> dict[str, float]:
     z = np.column_stack([np.ones(len(z)), z, z**2])
     left = u - z @ np.linalg.lstsq(z, u, rcond=1e-8)[0]
     spread = u.var(axis=0)
-    return {n: 1 - float(v / s) for n, v, s in zip(log.input_names, left.var(axis=0), spread, strict=True) if s > 0}
+    return {
+        n: 1 - float(v / s)
+        for n, v, s in zip(log.input_names, left.var(axis=0), spread, strict=True)
+        if s > 0
+    }

@@ -35,7 +35,9 @@ class Judgement:
     groups: tuple[str, ...]  #: names of the groups of states
     units: tuple[str, ...]  #: of their errors
     steps: tuple[int, ...]  #: k
-    mean: dict[str, Array]  #: mean error (k, groups) by the name of the predictor; the model's is "model"
+    mean: dict[
+        str, Array
+    ]  #: mean error (k, groups) by the name of the predictor; the model's is "model"
     rmse: dict[str, Array]  #: root mean squared error, likewise
     coverage: Array  #: share of the entries inside their interval (k, groups)
     coverage_interval: Array  #: exact interval of that share, from independent windows only (k, groups, 2)
@@ -56,17 +58,33 @@ class Judgement:
     def to_pandas(self) -> pd.DataFrame:
         """A row a predictor, step and group."""
         low, high = np.moveaxis(self.coverage_interval, -1, 0)
-        own = {"coverage": self.coverage, "coverage_low": low, "coverage_high": high, "width": self.width}
+        own = {
+            "coverage": self.coverage,
+            "coverage_low": low,
+            "coverage_high": high,
+            "width": self.width,
+        }
         rows = []
         for name, mean in self.mean.items():
-            numbers = {"mean_error": mean, "rmse": self.rmse[name]} | (own if name == "model" else {})
+            numbers = {"mean_error": mean, "rmse": self.rmse[name]} | (
+                own if name == "model" else {}
+            )
             for k, g in np.ndindex(mean.shape):
-                row = {"predictor": name, "step": self.steps[k], "group": self.groups[g], "unit": self.units[g]}
-                rows.append(row | {key: values[k, g] for key, values in numbers.items()})
+                row = {
+                    "predictor": name,
+                    "step": self.steps[k],
+                    "group": self.groups[g],
+                    "unit": self.units[g],
+                }
+                rows.append(
+                    row | {key: values[k, g] for key, values in numbers.items()}
+                )
         return pd.DataFrame(rows)
 
 
-def judge(learned: Learned, held_out: Log, train: Log, steps: Sequence[int] = STEPS) -> Judgement:
+def judge(
+    learned: Learned, held_out: Log, train: Log, steps: Sequence[int] = STEPS
+) -> Judgement:
     """Judges a learned model on a log of other runs.
 
     Args:
@@ -84,58 +102,97 @@ def judge(learned: Learned, held_out: Log, train: Log, steps: Sequence[int] = ST
     start, seen = cut.states[:, past], train.windows(longest, PAST, most=RIDGE_WINDOWS)
     own = rollout_errors(cut, model.rollout(cut), steps)
     with np.errstate(over="ignore", invalid="ignore"):
-        affine = rollout_errors(cut, fit_least_squares(kinematics, train).rollout(cut), steps)
+        affine = rollout_errors(
+            cut, fit_least_squares(kinematics, train).rollout(cut), steps
+        )
 
     def direct(predict: Callable[[int], Array]) -> Array:
-        return np.stack([space.difference(predict(k), cut.states[:, past + k]) for k in steps], axis=1)
+        return np.stack(
+            [space.difference(predict(k), cut.states[:, past + k]) for k in steps],
+            axis=1,
+        )
 
     errors = {
         "model": own,
         "constant state": direct(lambda k: start),
-        "constant velocity": direct(lambda k: kinematics.coast(start, k * cut.time_step)),
-        "least squares": np.nan_to_num(affine, nan=np.inf, posinf=np.inf, neginf=np.inf),
-        "ridge regression": direct(lambda k: _predict_by_ridge(kinematics, seen, cut, k)),
+        "constant velocity": direct(
+            lambda k: kinematics.coast(start, k * cut.time_step)
+        ),
+        "least squares": np.nan_to_num(
+            affine, nan=np.inf, posinf=np.inf, neginf=np.inf
+        ),
+        "ridge regression": direct(
+            lambda k: _predict_by_ridge(kinematics, seen, cut, k)
+        ),
     }
     distances = {name: space.distances(e) for name, e in errors.items()}
     parts = [cut[i : i + CHUNK] for i in range(0, len(cut), CHUNK)]
-    variances = np.concatenate([error_variances(model, part, learned.noise, steps) for part in parts])
+    variances = np.concatenate(
+        [error_variances(model, part, learned.noise, steps) for part in parts]
+    )
     variances = follow_errors(cut, own, variances, steps)
 
     def of_groups(values: Array) -> Array:  # (W, steps, e) -> (steps, groups)
-        return np.stack([values[..., at].mean(axis=(0, 2)) for at in space.error_columns], axis=-1)
+        return np.stack(
+            [values[..., at].mean(axis=(0, 2)) for at in space.error_columns], axis=-1
+        )
 
     coverage = of_groups(np.abs(own) <= ndtri((1 + LEVEL) / 2) * np.sqrt(variances))
-    independent = [max(len(cut) * cut.stride // max(step, cut.stride), 1) for step in steps]  # do not overlap
+    independent = [
+        max(len(cut) * cut.stride // max(step, cut.stride), 1) for step in steps
+    ]  # do not overlap
     pairs = zip(coverage, independent, strict=True)
-    intervals = [[binomial_interval(round(share * n), n, LEVEL) for share in row] for row, n in pairs]
+    intervals = [
+        [binomial_interval(round(share * n), n, LEVEL) for share in row]
+        for row, n in pairs
+    ]
     return Judgement(
         groups=tuple(group.name for group in space.groups),
-        units=tuple("rad" if group.kind == "quaternion" else group.unit for group in space.groups),
+        units=tuple(
+            "rad" if group.kind == "quaternion" else group.unit
+            for group in space.groups
+        ),
         steps=tuple(steps),
         mean={name: d.mean(axis=0) for name, d in distances.items()},
-        rmse={name: np.sqrt(np.square(d).mean(axis=0)) for name, d in distances.items()},
+        rmse={
+            name: np.sqrt(np.square(d).mean(axis=0)) for name, d in distances.items()
+        },
         coverage=coverage,
         coverage_interval=np.array(intervals),
-        width=np.sqrt(of_groups(variances) / np.maximum(of_groups(np.square(own)), 1e-300)),
+        width=np.sqrt(
+            of_groups(variances) / np.maximum(of_groups(np.square(own)), 1e-300)
+        ),
         windows=len(cut),
     )
 
 
-def _predict_by_ridge(kinematics: Kinematics, seen: Windows, windows: Windows, step: int) -> Array:
+def _predict_by_ridge(
+    kinematics: Kinematics, seen: Windows, windows: Windows, step: int
+) -> Array:
     """Predicts states (W, n) at a step straight from past states, past and coming inputs, by a fit to ``seen``."""
 
     def regressors(cut: Windows) -> Array:
         start, past, u = cut.states[:, cut.past], cut.past, cut.inputs
         columns = [kinematics.features(start, u[:, past], cut.context[:, past])]
-        columns += [cut.space.difference(start, cut.states[:, past - lag]) for lag in LAGS]
+        columns += [
+            cut.space.difference(start, cut.states[:, past - lag]) for lag in LAGS
+        ]
         columns += [u[:, past - lag] for lag in LAGS]
-        columns += [u[:, past + rows].mean(axis=1) for rows in np.array_split(np.arange(step), min(BINS, step))]
+        columns += [
+            u[:, past + rows].mean(axis=1)
+            for rows in np.array_split(np.arange(step), min(BINS, step))
+        ]
         return np.concatenate(columns, axis=1)
 
     z = regressors(seen)
     mean, factor = z.mean(axis=0), np.maximum(z.std(axis=0), 1e-12)
-    z, new = (np.column_stack([np.ones(len(a)), (a - mean) / factor]) for a in (z, regressors(windows)))
-    y = seen.space.difference(seen.states[:, seen.past + step], seen.states[:, seen.past])
+    z, new = (
+        np.column_stack([np.ones(len(a)), (a - mean) / factor])
+        for a in (z, regressors(windows))
+    )
+    y = seen.space.difference(
+        seen.states[:, seen.past + step], seen.states[:, seen.past]
+    )
     penalty = PENALTY * len(z) * np.diag(np.r_[0.0, np.ones(z.shape[1] - 1)])
     weights = np.linalg.solve(z.T @ z + penalty, z.T @ y)
     return windows.space.displace(windows.states[:, windows.past], new @ weights)

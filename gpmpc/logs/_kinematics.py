@@ -27,7 +27,9 @@ class StateGroup:
     name: str  #: such as "position"
     entries: tuple[str, ...]  #: names of the entries; four of a quaternion, x, y, z, w
     unit: str = ""  #: of the entries; a quaternion's errors are in rad
-    kind: Literal["vector", "angle", "quaternion"] = "vector"  #: how differences are taken
+    kind: Literal["vector", "angle", "quaternion"] = (
+        "vector"  #: how differences are taken
+    )
 
     @property
     def error_dim(self) -> int:
@@ -71,15 +73,21 @@ class StateSpace:
         for group, at in zip(self.groups, self.columns, strict=True):
             one, other = a[..., at], b[..., at]
             if group.kind == "quaternion":
-                parts.append(rotation_vector(quaternion_product(quaternion_inverse(other), one)))
+                parts.append(
+                    rotation_vector(quaternion_product(quaternion_inverse(other), one))
+                )
             else:
-                parts.append(wrap(one - other) if group.kind == "angle" else one - other)
+                parts.append(
+                    wrap(one - other) if group.kind == "angle" else one - other
+                )
         return np.concatenate(parts, axis=-1)
 
     def displace(self, state: Array, error: Array) -> Array:
         """Computes the state (..., n) whose difference from ``state`` is ``error`` (..., e)."""
         parts = []
-        for group, at, error_at in zip(self.groups, self.columns, self.error_columns, strict=True):
+        for group, at, error_at in zip(
+            self.groups, self.columns, self.error_columns, strict=True
+        ):
             one, by = state[..., at], error[..., error_at]
             if group.kind == "quaternion":
                 parts.append(quaternion_product(one, rotation_quaternion(by)))
@@ -89,12 +97,17 @@ class StateSpace:
 
     def distances(self, errors: Array) -> Array:
         """Computes the Euclidean or geodesic length of each group's error (..., groups) of errors (..., e)."""
-        return np.stack([np.linalg.norm(errors[..., at], axis=-1) for at in self.error_columns], axis=-1)
+        return np.stack(
+            [np.linalg.norm(errors[..., at], axis=-1) for at in self.error_columns],
+            axis=-1,
+        )
 
 
 def _slices(lengths: Sequence[int]) -> tuple[slice, ...]:
     ends = np.cumsum(lengths).tolist()
-    return tuple(slice(end - length, end) for end, length in zip(ends, lengths, strict=True))
+    return tuple(
+        slice(end - length, end) for end, length in zip(ends, lengths, strict=True)
+    )
 
 
 def wrap(angle: Array) -> Array:
@@ -154,7 +167,11 @@ class Increments:
     @property
     def output_names(self) -> tuple[str, ...]:
         """One rate of change for every entry of a difference."""
-        return tuple(f"d_{entry}" for group in self.space.groups for entry in group.entries[: group.error_dim])
+        return tuple(
+            f"d_{entry}"
+            for group in self.space.groups
+            for entry in group.entries[: group.error_dim]
+        )
 
     @property
     def output_groups(self) -> dict[str, tuple[int, ...]]:
@@ -206,12 +223,20 @@ class RigidBody:
         half_turn = rotation_quaternion((w + alpha * (time_step / 2)) * (time_step / 2))
         middle = quaternion_product(q, half_turn)
         a = rotate(middle, force) + GRAVITY
-        parts = [p + v * time_step + a * (time_step**2 / 2), quaternion_product(middle, half_turn)]
-        return np.concatenate([*parts, v + a * time_step, w + alpha * time_step], axis=-1)
+        parts = [
+            p + v * time_step + a * (time_step**2 / 2),
+            quaternion_product(middle, half_turn),
+        ]
+        return np.concatenate(
+            [*parts, v + a * time_step, w + alpha * time_step], axis=-1
+        )
 
     def outputs(self, states: Array, next_states: Array, time: float) -> Array:
         """The mean force and angular acceleration of the changes of velocity and rate."""
-        (_, q, v, w), (_, q_after, v_after, w_after) = _parts(states), _parts(next_states)
+        (_, q, v, w), (_, q_after, v_after, w_after) = (
+            _parts(states),
+            _parts(next_states),
+        )
         turn = rotation_vector(quaternion_product(quaternion_inverse(q), q_after))
         middle = quaternion_product(q, rotation_quaternion(turn / 2))
         force = rotate(quaternion_inverse(middle), (v_after - v) / time - GRAVITY)
@@ -222,12 +247,17 @@ class RigidBody:
         _, q, v, w = _parts(states)
         to_body = quaternion_inverse(q)
         down = rotate(to_body, np.broadcast_to(-GRAVITY / 9.80665, v.shape))
-        return np.concatenate([rotate(to_body, v), down[..., :2], w, inputs, context], axis=-1)
+        return np.concatenate(
+            [rotate(to_body, v), down[..., :2], w, inputs, context], axis=-1
+        )
 
     def coast(self, states: Array, time: float) -> Array:
         """Goes on at constant velocity and rate for a time [s]."""
         p, q, v, w = _parts(states)
-        return np.concatenate([p + v * time, quaternion_product(q, rotation_quaternion(w * time)), v, w], axis=-1)
+        return np.concatenate(
+            [p + v * time, quaternion_product(q, rotation_quaternion(w * time)), v, w],
+            axis=-1,
+        )
 
 
 def _parts(states: Array) -> tuple[Array, Array, Array, Array]:

@@ -17,10 +17,24 @@ from scipy.spatial import cKDTree
 
 from gpmpc.exceptions import DataError, check_number
 from gpmpc.gp import Trainer, standardize
-from gpmpc.logs._fitting import NominalFit, OutputNoise, fit_least_squares, fit_noise, fit_nominal
+from gpmpc.logs._fitting import (
+    NominalFit,
+    OutputNoise,
+    fit_least_squares,
+    fit_noise,
+    fit_nominal,
+)
 from gpmpc.logs._kinematics import Array, Increments, RigidBody
 from gpmpc.logs._log import Log
-from gpmpc.logs._rollouts import PAST, STEPS, AffineNominal, LogModel, MultirotorNominal, OutputGP, finite_errors
+from gpmpc.logs._rollouts import (
+    PAST,
+    STEPS,
+    AffineNominal,
+    LogModel,
+    MultirotorNominal,
+    OutputGP,
+    finite_errors,
+)
 
 AVERAGES = (1, 5, 10)  # rows over which the targets of a GP are averaged
 LATE = 3  # rows by which motors may act late
@@ -94,7 +108,12 @@ def learn(
 
     def errors(trained: list[LogModel]) -> Array:
         at = [min(step, steps) for step in JUDGED]
-        found = np.concatenate([finite_errors(cut, model, at) for cut, model in zip(cuts, trained, strict=True)])
+        found = np.concatenate(
+            [
+                finite_errors(cut, model, at)
+                for cut, model in zip(cuts, trained, strict=True)
+            ]
+        )
         return log.space.distances(found).mean(axis=0)
 
     def is_best(name: str, errors: Array) -> bool:
@@ -113,8 +132,14 @@ def learn(
         progress(f"{trial_name}: fitted on rollouts of {steps} steps")
         if trial_name not in memory:
             starts = zip(models or [structure] * len(folds), folds, strict=True)
-            memory[trial_name] = [_fit(trial, model, train, steps).model.theta.tolist() for model, (train, _) in starts]
-        fitted = [replace(trial, theta=np.array(theta, dtype=float)) for theta in memory[trial_name]]
+            memory[trial_name] = [
+                _fit(trial, model, train, steps).model.theta.tolist()
+                for model, (train, _) in starts
+            ]
+        fitted = [
+            replace(trial, theta=np.array(theta, dtype=float))
+            for theta in memory[trial_name]
+        ]
         if is_best(trial_name, errors(fitted)):
             models, name, structure = fitted, trial_name, trial
     choice: dict[str, int] = {}
@@ -130,7 +155,9 @@ def learn(
                 trained = [_with_gp(model, train, *learning) for model, train in base]
                 memory[words] = errors(trained).tolist()
             if is_best(words, np.array(memory[words])):
-                models = trained or [_with_gp(model, train, *learning) for model, train in base]
+                models = trained or [
+                    _with_gp(model, train, *learning) for model, train in base
+                ]
                 choice[group] = average
     progress(f"chosen: {candidates[best].name}")
     candidates[best] = replace(candidates[best], chosen=True)
@@ -138,7 +165,10 @@ def learn(
     noise = fit_noise(models, [held_out for _, held_out in folds], steps)
     progress("the chosen structure, fitted to all runs")
     fit = _fit(structure, models[0], log, steps)
-    gps = tuple(_train(fit.model, log, groups[group], average, points, seed) for group, average in choice.items())
+    gps = tuple(
+        _train(fit.model, log, groups[group], average, points, seed)
+        for group, average in choice.items()
+    )
     values = np.concatenate([np.hstack([run.states, run.inputs]) for run in log])
     return Learned(
         model=replace(fit.model, gps=gps),
@@ -156,7 +186,9 @@ def learn(
 
 def _is_better(candidate: Candidate, incumbent: Candidate) -> bool:
     """Whether a candidate's errors are smaller on the whole, and in no group at no step much larger."""
-    ratio = np.log(np.maximum(candidate.errors, 1e-12) / np.maximum(incumbent.errors, 1e-12))
+    ratio = np.log(
+        np.maximum(candidate.errors, 1e-12) / np.maximum(incumbent.errors, 1e-12)
+    )
     return bool(ratio.mean() < -GAIN and ratio.max() < LOSS)
 
 
@@ -166,26 +198,46 @@ def _structures(log: Log) -> tuple[str, LogModel, dict[str, Grow]]:
         kinematics, o = Increments(log.space), log.space.error_dim
         options: dict[str, Grow] = {
             "": lambda model: model,
-            "least squares": lambda model: replace(model, nominal=AffineNominal(kinematics)),
+            "least squares": lambda model: replace(
+                model, nominal=AffineNominal(kinematics)
+            ),
             "disturbance": lambda model: replace(model, history=(PAST,) * o),
         }
         zero = AffineNominal(kinematics, fitted=False)
         return "increments", LogModel(kinematics, zero, np.empty(0), (0,) * o), options
     options = {
         "": lambda model: model,
-        "force disturbance": lambda model: replace(model, history=(PAST,) * 3 + (0,) * 3),
-        "motor torque": lambda model: replace(model, nominal=replace(model.nominal, torque=True)),
-        FEEDBACK: lambda model: replace(model, nominal=replace(model.nominal, feedback=True)),
-        LATE_INPUTS: lambda model: replace(model, lag=LATE) if model.nominal.torque else None,
+        "force disturbance": lambda model: replace(
+            model, history=(PAST,) * 3 + (0,) * 3
+        ),
+        "motor torque": lambda model: replace(
+            model, nominal=replace(model.nominal, torque=True)
+        ),
+        FEEDBACK: lambda model: replace(
+            model, nominal=replace(model.nominal, feedback=True)
+        ),
+        LATE_INPUTS: lambda model: (
+            replace(model, lag=LATE) if model.nominal.torque else None
+        ),
         "torque disturbance": lambda model: (
-            replace(model, history=model.history[:3] + (PAST,) * 3) if model.nominal.torque else None
+            replace(model, history=model.history[:3] + (PAST,) * 3)
+            if model.nominal.torque
+            else None
         ),
     }
     volts = [signal.unit for signal in log.mapping.of("context")][:1] in (["V"], ["mV"])
-    voltage = float(np.median(np.concatenate([run.context[:, 0] for run in log]))) if volts else 0.0
+    voltage = (
+        float(np.median(np.concatenate([run.context[:, 0] for run in log])))
+        if volts
+        else 0.0
+    )
     thrusts = all(signal.unit == "N" for signal in log.mapping.of("inputs"))
     nominal = MultirotorNominal(len(log.input_names), voltage=voltage, thrusts=thrusts)
-    return "rigid body", LogModel(RigidBody(log.space), nominal, np.empty(0), (0,) * 6), options
+    return (
+        "rigid body",
+        LogModel(RigidBody(log.space), nominal, np.empty(0), (0,) * 6),
+        options,
+    )
 
 
 def _split(log: Log) -> list[tuple[Log, Log]]:
@@ -200,31 +252,60 @@ def _split(log: Log) -> list[tuple[Log, Log]]:
 def _fit(structure: LogModel, simpler: LogModel, log: Log, steps: int) -> NominalFit:
     """Fits a structure's nominal part, from the parameters that a simpler model has in common with it."""
     nominal = structure.nominal
-    if isinstance(nominal, AffineNominal) and nominal.fitted:  # linear in its many parameters
-        return NominalFit(replace(fit_least_squares(nominal.kinematics, log), history=structure.history), np.empty(0))
+    if (
+        isinstance(nominal, AffineNominal) and nominal.fitted
+    ):  # linear in its many parameters
+        return NominalFit(
+            replace(
+                fit_least_squares(nominal.kinematics, log), history=structure.history
+            ),
+            np.empty(0),
+        )
     known = dict(zip(simpler.nominal.parameter_names, simpler.theta, strict=False))
     pairs = zip(nominal.parameter_names, nominal.start, strict=True)
-    return fit_nominal(structure, np.array([known.get(name, start) for name, start in pairs]), log, steps)
+    return fit_nominal(
+        structure,
+        np.array([known.get(name, start) for name, start in pairs]),
+        log,
+        steps,
+    )
 
 
 def _with_gp(model: LogModel, log: Log, *learning: Any) -> LogModel:
     return replace(model, gps=(*model.gps, _train(model, log, *learning)))
 
 
-def _train(model: LogModel, log: Log, outputs: tuple[int, ...], average: int, points: int, seed: int) -> OutputGP:
+def _train(
+    model: LogModel,
+    log: Log,
+    outputs: tuple[int, ...],
+    average: int,
+    points: int,
+    seed: int,
+) -> OutputGP:
     """Trains a GP on what the nominal part leaves of some outputs, averaged over some rows."""
     cut = log.windows(average, model.lag)
     at = slice(cut.past, cut.past + average)
-    x, u = cut.states[:, at], cut.inputs[:, cut.past - model.lag : cut.past - model.lag + average]
+    x, u = (
+        cut.states[:, at],
+        cut.inputs[:, cut.past - model.lag : cut.past - model.lag + average],
+    )
     c = np.broadcast_to(cut.context[:, -1:], (*x.shape[:-1], cut.context.shape[-1]))
-    seen = model.kinematics.outputs(x[:, 0], cut.states[:, cut.past + average], cut.time_step * average)
+    seen = model.kinematics.outputs(
+        x[:, 0], cut.states[:, cut.past + average], cut.time_step * average
+    )
     y = seen - model.nominal.outputs(model.theta, x, u, c).mean(axis=1)
     middle = average // 2
     z = model.kinematics.features(x[:, middle], u[:, middle], c[:, middle])
     rows = choose_rows(z, points, seed)
     trainer = Trainer(predicts="value", scaling=standardize, restarts=1, tolerance=1e-6)
     y = np.ascontiguousarray(y[rows][:, list(outputs)])
-    return OutputGP(outputs, trainer.fit(torch.from_numpy(z[rows]), torch.from_numpy(y), 0, "value", seed).posterior)
+    return OutputGP(
+        outputs,
+        trainer.fit(
+            torch.from_numpy(z[rows]), torch.from_numpy(y), 0, "value", seed
+        ).posterior,
+    )
 
 
 def choose_rows(features: Array, count: int, seed: int = 0) -> np.ndarray:
@@ -240,7 +321,9 @@ def choose_rows(features: Array, count: int, seed: int = 0) -> np.ndarray:
     sample = z[np.random.default_rng(seed).permutation(len(z))[: 10 * count]]
     chosen, distance = [0], np.full(len(sample), np.inf)
     while len(chosen) < count:  # farthest points (Gonzalez, 1985)
-        distance = np.minimum(distance, np.square(sample - sample[chosen[-1]]).sum(axis=1))
+        distance = np.minimum(
+            distance, np.square(sample - sample[chosen[-1]]).sum(axis=1)
+        )
         chosen.append(int(distance.argmax()))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # a centre that loses its members stays

@@ -49,12 +49,22 @@ class LogRun:
 
     def starts(self, past: int, ahead: int, stride: int = 1) -> np.ndarray:
         """Lists the rows that have ``past`` rows before and ``ahead`` after them in their own piece."""
-        return np.concatenate([np.arange(begin + past, end - ahead, stride) for begin, end in self.pieces]).astype(int)
+        return np.concatenate(
+            [np.arange(begin + past, end - ahead, stride) for begin, end in self.pieces]
+        ).astype(int)
 
     def part(self, begin: int, end: int, name: str) -> "LogRun":
         """The rows from ``begin`` to before ``end`` as a run of its own."""
-        rows, begins = slice(begin, end), (0, *(b - begin for b in self.begins if begin < b < end))
-        arrays = self.time[rows], self.states[rows], self.inputs[rows], self.context[rows]
+        rows, begins = (
+            slice(begin, end),
+            (0, *(b - begin for b in self.begins if begin < b < end)),
+        )
+        arrays = (
+            self.time[rows],
+            self.states[rows],
+            self.inputs[rows],
+            self.context[rows],
+        )
         return LogRun(f"{self.name}, {name}", *arrays, begins=begins)
 
 
@@ -76,7 +86,10 @@ class Windows:
         return len(self.states)
 
     def __getitem__(self, rows: Any) -> "Windows":
-        parts = {name: getattr(self, name)[rows] for name in ("states", "inputs", "context", "runs", "times")}
+        parts = {
+            name: getattr(self, name)[rows]
+            for name in ("states", "inputs", "context", "runs", "times")
+        }
         return replace(self, **parts)
 
     @property
@@ -117,7 +130,11 @@ class Log:
     @property
     def input_names(self) -> tuple[str, ...]:
         """Names of the m inputs."""
-        return tuple(entry for signal in self.mapping.of("inputs") for entry in signal.group.entries)
+        return tuple(
+            entry
+            for signal in self.mapping.of("inputs")
+            for entry in signal.group.entries
+        )
 
     def split(self, held_out: Sequence[str]) -> tuple["Log", "Log"]:
         """Splits by run: a log of all others, and one of the named runs.
@@ -128,17 +145,28 @@ class Log:
         names = [run.name for run in self.runs]
         for name in held_out:
             if name not in names:
-                raise SettingError("held_out", f"no such run {name!r}; there are {', '.join(names)}")
+                raise SettingError(
+                    "held_out", f"no such run {name!r}; there are {', '.join(names)}"
+                )
         if not 0 < len(set(held_out)) < len(names):
-            raise SettingError("held_out", f"must leave runs on both sides; got {len(set(held_out))} of {len(names)}")
-        sides = ([run for run in self.runs if (run.name in held_out) == held] for held in (False, True))
+            raise SettingError(
+                "held_out",
+                f"must leave runs on both sides; got {len(set(held_out))} of {len(names)}",
+            )
+        sides = (
+            [run for run in self.runs if (run.name in held_out) == held]
+            for held in (False, True)
+        )
         first, last = (replace(self, runs=tuple(side)) for side in sides)
         return first, last
 
     def split_by_time(self, share: float) -> tuple["Log", "Log"]:
         """Splits every run: a log of the first ``share`` of its rows, and one of the others."""
         check_number("share", share, above=0)
-        cuts = [(run, min(max(round(share * len(run)), 1), len(run) - 1)) for run in self.runs]
+        cuts = [
+            (run, min(max(round(share * len(run)), 1), len(run) - 1))
+            for run in self.runs
+        ]
         first = tuple(run.part(0, cut, "first part") for run, cut in cuts)
         last = tuple(run.part(cut, len(run), "last part") for run, cut in cuts)
         return replace(self, runs=first), replace(self, runs=last)
@@ -151,13 +179,18 @@ class Log:
     def episodes(self) -> list[Recording]:
         """Every piece of two rows or more as a recording for ``gpmpc.calibration``."""
         return [
-            Recording(torch.from_numpy(run.states[a:b].copy()), torch.from_numpy(run.inputs[a : b - 1].copy()))
+            Recording(
+                torch.from_numpy(run.states[a:b].copy()),
+                torch.from_numpy(run.inputs[a : b - 1].copy()),
+            )
             for run in self.runs
             for a, b in run.pieces
             if b - a > 1
         ]
 
-    def windows(self, ahead: int, past: int = 0, stride: int = 1, most: int | None = None) -> Windows:
+    def windows(
+        self, ahead: int, past: int = 0, stride: int = 1, most: int | None = None
+    ) -> Windows:
         """Cuts windows that lie inside a piece each.
 
         Args:
@@ -169,20 +202,33 @@ class Log:
         Raises:
             DataError: No piece is as long.
         """
-        for key, value, least in (("ahead", ahead, 0), ("past", past, 0), ("stride", stride, 1)):
+        for key, value, least in (
+            ("ahead", ahead, 0),
+            ("past", past, 0),
+            ("stride", stride, 1),
+        ):
             check_number(key, value, least=least, whole=True)
         lengths = [b - a for run in self.runs for a, b in run.pieces]
         if most is not None:
-            stride = max(-(-sum(max(length - ahead - past, 0) for length in lengths) // most), 1)
+            stride = max(
+                -(-sum(max(length - ahead - past, 0) for length in lengths) // most), 1
+            )
         offsets, parts = np.arange(-past, ahead + 1), []
         for number, run in enumerate(self.runs):
             starts = run.starts(past, ahead, stride)
             rows = starts[:, None] + offsets
-            before, numbers = run.context[rows[:, : past + 1]], np.full(len(rows), number)
-            parts.append((run.states[rows], run.inputs[rows], before, numbers, run.time[starts]))
+            before, numbers = (
+                run.context[rows[:, : past + 1]],
+                np.full(len(rows), number),
+            )
+            parts.append(
+                (run.states[rows], run.inputs[rows], before, numbers, run.time[starts])
+            )
         arrays = [np.concatenate(one) for one in zip(*parts, strict=True)]
         if not len(arrays[0]):
-            raise DataError(f"windows of {past + ahead + 1} rows need a piece as long; the longest has {max(lengths)}")
+            raise DataError(
+                f"windows of {past + ahead + 1} rows need a piece as long; the longest has {max(lengths)}"
+            )
         return Windows(self.space, self.time_step, past, stride, *arrays)
 
     def __iter__(self) -> Iterator[LogRun]:

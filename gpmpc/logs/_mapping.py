@@ -31,8 +31,24 @@ UNITS = {  # what one of it is in the units that states come out in
     "mV": ("V", 1e-3),
 }
 TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
-_PLAIN = ("run", "rate", "max_gap", "held", "rest", "model")  # keys whose values are taken as they are
-_SIGNAL_KEYS = ("columns", "unit", "kind", "order", "frame", "scale", "resample", "topic")
+_PLAIN = (
+    "run",
+    "rate",
+    "max_gap",
+    "held",
+    "rest",
+    "model",
+)  # keys whose values are taken as they are
+_SIGNAL_KEYS = (
+    "columns",
+    "unit",
+    "kind",
+    "order",
+    "frame",
+    "scale",
+    "resample",
+    "topic",
+)
 
 
 @dataclass(frozen=True)
@@ -61,8 +77,15 @@ class Signal:
         ):
             check_choice(f"{key}.{name}", getattr(self, name), known)
         number = {"quaternion": 4, "euler": 3}.get(self.kind, len(self.columns))
-        if not self.columns or len(self.columns) != number or not all(isinstance(c, str) for c in self.columns):
-            raise SettingError(f"{key}.columns", f"must be {number or 1} names of columns; got {list(self.columns)}")
+        if (
+            not self.columns
+            or len(self.columns) != number
+            or not all(isinstance(c, str) for c in self.columns)
+        ):
+            raise SettingError(
+                f"{key}.columns",
+                f"must be {number or 1} names of columns; got {list(self.columns)}",
+            )
         check_number(f"{key}.scale", self.scale)
         if self.kind in ("angle", "euler"):
             check_choice(f"{key}.unit", self.unit, ("rad", "deg"))
@@ -75,7 +98,9 @@ class Signal:
     @property
     def rule(self) -> str:
         """How it is resampled."""
-        return self.resample or ("hold" if self.role != "states" else "spherical" if self.turns else "linear")
+        return self.resample or (
+            "hold" if self.role != "states" else "spherical" if self.turns else "linear"
+        )
 
     @property
     def factor(self) -> float:
@@ -86,9 +111,16 @@ class Signal:
     def group(self) -> StateGroup:
         """As it comes out."""
         if self.turns:
-            return StateGroup(self.name, tuple(f"{self.name}_{axis}" for axis in "xyzw"), "", "quaternion")
+            return StateGroup(
+                self.name,
+                tuple(f"{self.name}_{axis}" for axis in "xyzw"),
+                "",
+                "quaternion",
+            )
         unit = UNITS.get(self.unit, (self.unit, 1.0))[0]
-        return StateGroup(self.name, self.columns, unit, "angle" if self.kind == "angle" else "vector")
+        return StateGroup(
+            self.name, self.columns, unit, "angle" if self.kind == "angle" else "vector"
+        )
 
 
 @dataclass(frozen=True)
@@ -99,26 +131,38 @@ class LogMapping:
     time: str = ""  #: column of the stamps; empty takes the stamps of the messages
     time_unit: str = "s"  #: of that column
     run: str = ""  #: column that names the runs
-    rate: float | None = None  #: to which rows are resampled [Hz]; None leaves them as they are
-    max_gap: float | None = None  #: no value is carried over a longer gap [s]; 1.5 time steps by default
+    rate: float | None = (
+        None  #: to which rows are resampled [Hz]; None leaves them as they are
+    )
+    max_gap: float | None = (
+        None  #: no value is carried over a longer gap [s]; 1.5 time steps by default
+    )
     #: ranges (lowest, highest) of columns; rows outside are left out.
     keep: dict[str, tuple[float, float]] = field(default_factory=dict)
     #: "drop" leaves out rows in which a state's whole signal repeats the row before; "use" takes them.
     held: str = "drop"
-    rest: str = "drop"  #: "drop" leaves out parts in which nothing moves; "use" takes them
+    rest: str = (
+        "drop"  #: "drop" leaves out parts in which nothing moves; "use" takes them
+    )
     model: str = "none"  #: what is known of the system: "rigid_body" or "none"
 
     def __post_init__(self) -> None:
         for key in ("rate", "max_gap"):
             if getattr(self, key) is not None:
                 check_number(key, getattr(self, key), above=0)
-        for key, known in (("held", ("drop", "use")), ("rest", ("drop", "use")), ("model", ("rigid_body", "none"))):
+        for key, known in (
+            ("held", ("drop", "use")),
+            ("rest", ("drop", "use")),
+            ("model", ("rigid_body", "none")),
+        ):
             check_choice(key, getattr(self, key), known)
         check_choice("time.unit", self.time_unit, tuple(TIME_UNITS))
         if not self.of("states"):
             raise SettingError("states", "must name at least one signal; got none")
         if len({signal.topic for signal in self.signals}) > 1 and self.rate is None:
-            raise SettingError("rate", "must be given where signals come from several topics; got none")
+            raise SettingError(
+                "rate", "must be given where signals come from several topics; got none"
+            )
 
     def of(self, role: Role) -> tuple[Signal, ...]:
         """The signals of one role."""
@@ -126,8 +170,13 @@ class LogMapping:
 
     def split(self, values: Array) -> list[Array]:
         """Splits rows of all signals (K, n + m + c) into those of states, inputs and context."""
-        sizes = [sum(len(signal.group.entries) for signal in self.of(role)) for role in ROLES]
-        return [np.ascontiguousarray(part) for part in np.split(values, np.cumsum(sizes[:-1]), axis=1)]
+        sizes = [
+            sum(len(signal.group.entries) for signal in self.of(role)) for role in ROLES
+        ]
+        return [
+            np.ascontiguousarray(part)
+            for part in np.split(values, np.cumsum(sizes[:-1]), axis=1)
+        ]
 
     def column_names(self, role: Role) -> tuple[str, ...]:
         """The columns of one role in the order that they come out in, with what was done to their values."""
@@ -141,7 +190,9 @@ class LogMapping:
                 names = (*names[1:], names[0])
             other_frame = {"m/s": "body", "rad/s": "world"}.get(signal.group.unit)
             done = f" times {signal.factor:.6g}" * (signal.factor != 1)
-            done += " in other axes" * (self.model == "rigid_body" and signal.frame == other_frame)
+            done += " in other axes" * (
+                self.model == "rigid_body" and signal.frame == other_frame
+            )
             found += [f"{name}{done}" for name in names]
         return tuple(found)
 
@@ -156,7 +207,9 @@ class LogMapping:
         try:
             content = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
         except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-            raise SettingError("mapping", f"{path} cannot be read ({' '.join(str(error).split())})") from error
+            raise SettingError(
+                "mapping", f"{path} cannot be read ({' '.join(str(error).split())})"
+            ) from error
         return cls.from_dict(content)
 
     @classmethod
@@ -178,11 +231,22 @@ class LogMapping:
         keep = {}
         for column, limits in (content.get("keep") or {}).items():
             if not isinstance(limits, list) or len(limits) != 2:
-                raise SettingError(f"keep.{column}", f"must be [lowest, highest]; got {limits!r}")
+                raise SettingError(
+                    f"keep.{column}", f"must be [lowest, highest]; got {limits!r}"
+                )
             low, high = limits
-            keep[column] = (-np.inf if low is None else float(low), np.inf if high is None else float(high))
+            keep[column] = (
+                -np.inf if low is None else float(low),
+                np.inf if high is None else float(high),
+            )
         plain = {key: content[key] for key in _PLAIN if key in content}
-        return cls(tuple(signals), time.get("column", ""), time.get("unit", "s"), keep=keep, **plain)
+        return cls(
+            tuple(signals),
+            time.get("column", ""),
+            time.get("unit", "s"),
+            keep=keep,
+            **plain,
+        )
 
 
 def _check_keys(key: str, given: Any, known: Sequence[str] | None) -> None:
@@ -190,4 +254,6 @@ def _check_keys(key: str, given: Any, known: Sequence[str] | None) -> None:
         raise SettingError(key, f"must be keys and values; got {given!r}")
     unknown = [name for name in given if known is not None and name not in known]
     if unknown:
-        raise SettingError(f"{key}.{unknown[0]}", f"no such key; known are {', '.join(known or ())}")
+        raise SettingError(
+            f"{key}.{unknown[0]}", f"no such key; known are {', '.join(known or ())}"
+        )

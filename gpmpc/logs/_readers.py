@@ -18,27 +18,37 @@ STAMP = "timestamp"  # [s], of streams with a topic
 Streams = dict[str, pd.DataFrame]
 
 
-def read_streams(path: str | Path, topics: Iterable[str] = (), partial: bool = False) -> Streams:
+def read_streams(
+    path: str | Path, topics: Iterable[str] = (), partial: bool = False
+) -> Streams:
     """Reads the tables of a log file: all topics by default, or what is whole of an unfinished recording."""
     path = Path(path)
     if not path.is_file():
         raise DataError(f"{path}: no such file")
     name = path.name.lower().removesuffix(".gz")
-    reader = next((read for ending, read in _READERS.items() if name.endswith(ending)), None)
+    reader = next(
+        (read for ending, read in _READERS.items() if name.endswith(ending)), None
+    )
     if reader is None:
-        raise DataError(f"{path}: unknown kind of file; known are {', '.join(_READERS)}")
+        raise DataError(
+            f"{path}: unknown kind of file; known are {', '.join(_READERS)}"
+        )
     try:
         streams = reader(path, tuple(topics), partial)
     except GpmpcError:
         raise
     except ImportError as error:
-        raise DataError(f"{path}: this kind of file needs pip install 'gpmpc[logs]' ({error})") from error
+        raise DataError(
+            f"{path}: this kind of file needs pip install 'gpmpc[logs]' ({error})"
+        ) from error
     except Exception as error:  # whatever a library raises on a damaged file
         reason = " ".join(str(error).split()) or type(error).__name__
         raise DataError(f"{path}: cannot be read ({reason})") from error
     missing = [topic for topic in topics if topic and topic not in streams]
     if missing:
-        raise DataError(f"{path}: topic {missing[0]!r} is missing; it has {', '.join(sorted(streams)) or 'no topics'}")
+        raise DataError(
+            f"{path}: topic {missing[0]!r} is missing; it has {', '.join(sorted(streams)) or 'no topics'}"
+        )
     if not any(len(table) for table in streams.values()):
         raise DataError(f"{path}: holds no rows")
     return streams
@@ -48,12 +58,16 @@ def _read_csv(path: Path, topics: tuple[str, ...], partial: bool) -> Streams:
     options: dict[str, Any] = {"encoding": "utf-8-sig", "skipinitialspace": True}
 
     def first_line(delimiter: str) -> pd.Series:
-        return pd.read_csv(path, sep=delimiter, header=None, nrows=1, dtype=str, **options).iloc[0]
+        return pd.read_csv(
+            path, sep=delimiter, header=None, nrows=1, dtype=str, **options
+        ).iloc[0]
 
     delimiter = max(",;\t", key=lambda candidate: len(first_line(candidate)))
     names = first_line(delimiter).str.strip()
     if pd.to_numeric(names, errors="coerce").notna().any() or names.duplicated().any():
-        raise DataError(f"{path}: the first line must name every column differently; got {', '.join(map(str, names))}")
+        raise DataError(
+            f"{path}: the first line must name every column differently; got {', '.join(map(str, names))}"
+        )
     with warnings.catch_warnings():  # of rows that are longer than the header
         warnings.simplefilter("error", pd.errors.ParserWarning)
         table = pd.read_csv(path, sep=delimiter, index_col=False, **options)
@@ -62,16 +76,26 @@ def _read_csv(path: Path, topics: tuple[str, ...], partial: bool) -> Streams:
 
 def _read_npz(path: Path, topics: tuple[str, ...], partial: bool) -> Streams:
     with np.load(path, allow_pickle=False) as archive:
-        arrays = {name: archive[name] for name in archive.files if archive[name].ndim in (1, 2)}
+        arrays = {
+            name: archive[name]
+            for name in archive.files
+            if archive[name].ndim in (1, 2)
+        }
     columns: dict[str, np.ndarray] = {}  # pandas names arrays of different lengths
     for name, values in arrays.items():
-        columns |= {name: values} if values.ndim == 1 else {f"{name}[{i}]": v for i, v in enumerate(values.T)}
+        columns |= (
+            {name: values}
+            if values.ndim == 1
+            else {f"{name}[{i}]": v for i, v in enumerate(values.T)}
+        )
     return {"": pd.DataFrame(columns)}
 
 
 def _read_mcap(path: Path, topics: tuple[str, ...], partial: bool) -> Streams:
     with path.open("rb") as file:
-        if file.read(25)[17:] == b"\4\0\0\0ros2":  # the profile, with its length, is the first field of an MCAP file
+        if (
+            file.read(25)[17:] == b"\4\0\0\0ros2"
+        ):  # the profile, with its length, is the first field of an MCAP file
             return _read_ros2(path, topics, partial)
     from gpmpc.recording import read_run
 
@@ -92,7 +116,9 @@ def _read_ros2(path: Path, topics: tuple[str, ...], partial: bool) -> Streams:
         # In the file's order, because the index of a truncated file is lost.
         reader = NonSeekingReader(file, decoder_factories=[DecoderFactory()])
         try:
-            for _, channel, message, decoded in reader.iter_decoded_messages(log_time_order=False):
+            for _, channel, message, decoded in reader.iter_decoded_messages(
+                log_time_order=False
+            ):
                 known = rows.setdefault(channel.topic, [])
                 if topics and channel.topic not in topics:
                     continue
@@ -104,7 +130,9 @@ def _read_ros2(path: Path, topics: tuple[str, ...], partial: bool) -> Streams:
         except Exception as error:
             if not (partial and rows):
                 hint = "" if partial else "; partial=true takes what is whole"
-                raise DataError(f"{path}: the bag cannot be read to its end ({error}){hint}") from error
+                raise DataError(
+                    f"{path}: the bag cannot be read to its end ({error}){hint}"
+                ) from error
     return {topic: pd.DataFrame(messages) for topic, messages in rows.items()}
 
 
@@ -132,7 +160,9 @@ def _read_ulog(path: Path, topics: tuple[str, ...], partial: bool) -> Streams:
     for data in log.data_list:
         table = pd.DataFrame(data.data)
         table[STAMP] = table["timestamp"] * 1e-6
-        streams[data.name if data.multi_id == 0 else f"{data.name}[{data.multi_id}]"] = table
+        streams[
+            data.name if data.multi_id == 0 else f"{data.name}[{data.multi_id}]"
+        ] = table
     return streams
 
 

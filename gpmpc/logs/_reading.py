@@ -31,14 +31,18 @@ from gpmpc.logs._readers import STAMP, Streams, read_streams
 REST_TIME = 0.5  # [s] for which nothing moves at rest
 REST_SHARE = 0.1  # of a state's usual spread that counts as no movement
 MOST_HELD = 0.5  # of the rows; beyond, a signal has another rate than its table
-MOST_OUT_OF_ORDER = 0.05  # of the rows; beyond, the file does not hold one run in the order of time
+MOST_OUT_OF_ORDER = (
+    0.05  # of the rows; beyond, the file does not hold one run in the order of time
+)
 RESOLUTION = 1e-6  # [s] of stamps: float64 seconds since 1970 resolve a quarter of it
 SPAN = 4  # rows on each side of a finite difference: above the noise of one row
 SLOPES = (0.5, 2.0)  # of a signal over the derivative that it should be
 FIT = 0.7  # correlation from which a slope says something
 MOST_ROWS = 20_000
 _RIGID_BODY = [("vector", 3), ("quaternion", 3), ("vector", 3), ("vector", 3)]
-_Note = Callable[[str, Any, str], None]  # takes the kind, the count and the text of a finding
+_Note = Callable[
+    [str, Any, str], None
+]  # takes the kind, the count and the text of a finding
 
 
 class _Table(NamedTuple):
@@ -69,59 +73,116 @@ def read_log(
         SettingError: The mapping is wrong.
     """
     if not isinstance(mapping, LogMapping):
-        mapping = LogMapping.load(mapping) if isinstance(mapping, str | Path) else LogMapping.from_dict(mapping)
+        mapping = (
+            LogMapping.load(mapping)
+            if isinstance(mapping, str | Path)
+            else LogMapping.from_dict(mapping)
+        )
     files = [files] if isinstance(files, str | Path) else list(files)
     findings: list[Finding] = []
     tables: list[_Table] = []
     for file in map(Path, files):
-        streams = read_streams(file, {signal.topic for signal in mapping.signals}, partial)
+        streams = read_streams(
+            file, {signal.topic for signal in mapping.signals}, partial
+        )
         runs = [(file.name.removesuffix(".gz").rsplit(".", 1)[0], streams)]
         if mapping.run:
             table = streams.get("", pd.DataFrame())
             _check_column(str(file), table, mapping.run)
-            runs = [(f"{runs[0][0]}:{run}", {"": part}) for run, part in table.groupby(mapping.run, sort=False)]
+            runs = [
+                (f"{runs[0][0]}:{run}", {"": part})
+                for run, part in table.groupby(mapping.run, sort=False)
+            ]
         for name, parts in runs:
             if name in {table.name for table in tables}:
-                raise DataError(f"run {name!r} comes from two files: give the files different names")
+                raise DataError(
+                    f"run {name!r} comes from two files: give the files different names"
+                )
 
             def note(kind: str, count: Any, text: str, name: str = name) -> None:
                 if count:
                     findings.append(Finding(kind, name, int(count), text))
 
-            tables.append(_tabulate(f"{file}, run {name}" if mapping.run else str(file), name, parts, mapping, note))
+            tables.append(
+                _tabulate(
+                    f"{file}, run {name}" if mapping.run else str(file),
+                    name,
+                    parts,
+                    mapping,
+                    note,
+                )
+            )
     if not tables:
         raise DataError("no log file was given")
-    step = 1 / mapping.rate if mapping.rate else float(np.median(np.concatenate([np.diff(t.time) for t in tables])))
+    step = (
+        1 / mapping.rate
+        if mapping.rate
+        else float(np.median(np.concatenate([np.diff(t.time) for t in tables])))
+    )
     spread = _spread([mapping.split(table.values)[0] for table in tables])
-    usable = [run for table in tables if (run := _make_run(table, step, spread, mapping)) is not None]
+    usable = [
+        run
+        for table in tables
+        if (run := _make_run(table, step, spread, mapping)) is not None
+    ]
     if not usable:
         said = "; ".join(f"{f.run}: {f.text}" for f in findings[-3:])
-        raise DataError(f"{files[0]}{' and others' * (len(files) > 1)}: no row can be used ({said})")
+        raise DataError(
+            f"{files[0]}{' and others' * (len(files) > 1)}: no row can be used ({said})"
+        )
     inputs = [run.inputs for run in usable]
     if inputs[0].shape[1] and all(np.ptp(u, axis=0).max() == 0 for u in inputs):
-        raise DataError("no input changes in any row: the system is at rest, and nothing can be learned of it")
+        raise DataError(
+            "no input changes in any row: the system is at rest, and nothing can be learned of it"
+        )
     if mapping.model == "rigid_body":
         usable = _rigid_bodies(usable, step, mapping)
     return Log(mapping, step, tuple(usable), tuple(findings))
 
 
-def _tabulate(where: str, name: str, streams: Streams, mapping: LogMapping, note: _Note) -> _Table:
+def _tabulate(
+    where: str, name: str, streams: Streams, mapping: LogMapping, note: _Note
+) -> _Table:
     """Puts the signals of a run on one grid of times, in the units and conventions of ``gpmpc.logs``."""
     stamps, tables = {}, {}
-    labels = {signal.topic: f"{where}, {signal.topic}" if signal.topic else where for signal in mapping.signals}
+    labels = {
+        signal.topic: f"{where}, {signal.topic}" if signal.topic else where
+        for signal in mapping.signals
+    }
     for topic, label in labels.items():
-        stamps[topic] = found = ordered_stamps(_time(label, streams[topic], mapping), label)
-        tables[topic], of_topic = streams[topic].iloc[found.rows], f" of {topic}" if topic else ""
-        note("repeated stamp", found.repeated, f"{found.repeated} rows{of_topic}: left out")
-        note("stamp runs backwards", found.backwards, f"{found.backwards} rows{of_topic}: left out")
+        stamps[topic] = found = ordered_stamps(
+            _time(label, streams[topic], mapping), label
+        )
+        tables[topic], of_topic = (
+            streams[topic].iloc[found.rows],
+            f" of {topic}" if topic else "",
+        )
+        note(
+            "repeated stamp",
+            found.repeated,
+            f"{found.repeated} rows{of_topic}: left out",
+        )
+        note(
+            "stamp runs backwards",
+            found.backwards,
+            f"{found.backwards} rows{of_topic}: left out",
+        )
     if mapping.rate is None:
-        ((grid, breaks),) = ((found.time, found.after_reversal) for found in stamps.values())
+        ((grid, breaks),) = (
+            (found.time, found.after_reversal) for found in stamps.values()
+        )
     else:
         begin = max(found.time[0] for found in stamps.values())
         end = min(found.time[-1] for found in stamps.values())
         if not end > begin:
-            raise DataError(f"{where}: the topics {', '.join(stamps)} have no time in common")
-        grid = begin + np.arange(int(np.floor((end - begin) * mapping.rate * (1 + 1e-12))) + 1) / mapping.rate
+            raise DataError(
+                f"{where}: the topics {', '.join(stamps)} have no time in common"
+            )
+        grid = (
+            begin
+            + np.arange(int(np.floor((end - begin) * mapping.rate * (1 + 1e-12))) + 1)
+            / mapping.rate
+        )
         breaks = np.zeros(len(grid), dtype=bool)
 
     def on_grid(topic: str, values: Array, rule: str, max_gap: float | None) -> Array:
@@ -133,7 +194,14 @@ def _tabulate(where: str, name: str, streams: Streams, mapping: LogMapping, note
 
     parts = []
     for s in mapping.signals:
-        parts.append(on_grid(s.topic, _values(labels[s.topic], tables[s.topic], s, note), s.rule, mapping.max_gap))
+        parts.append(
+            on_grid(
+                s.topic,
+                _values(labels[s.topic], tables[s.topic], s, note),
+                s.rule,
+                mapping.max_gap,
+            )
+        )
     outside = np.zeros(len(grid), dtype=bool)
     for column, (low, high) in mapping.keep.items():
         for topic, table in tables.items():
@@ -145,15 +213,21 @@ def _tabulate(where: str, name: str, streams: Streams, mapping: LogMapping, note
 
 
 def _time(label: str, table: pd.DataFrame, mapping: LogMapping) -> Array:
-    if not mapping.time and STAMP not in table and mapping.rate:  # rows without stamps, at a rate that is declared
+    if (
+        not mapping.time and STAMP not in table and mapping.rate
+    ):  # rows without stamps, at a rate that is declared
         return np.arange(len(table)) / mapping.rate
-    return _numbers(label, table, mapping.time or STAMP) * (TIME_UNITS[mapping.time_unit] if mapping.time else 1.0)
+    return _numbers(label, table, mapping.time or STAMP) * (
+        TIME_UNITS[mapping.time_unit] if mapping.time else 1.0
+    )
 
 
 def _check_column(label: str, table: pd.DataFrame, column: str) -> None:
     if column not in table:
         known = ", ".join(map(str, table.columns[:12]))
-        raise DataError(f"{label}: column {column!r} is missing; it has {known}{', ...' * (len(table.columns) > 12)}")
+        raise DataError(
+            f"{label}: column {column!r} is missing; it has {known}{', ...' * (len(table.columns) > 12)}"
+        )
 
 
 def _numbers(label: str, table: pd.DataFrame, column: str) -> Array:
@@ -163,21 +237,36 @@ def _numbers(label: str, table: pd.DataFrame, column: str) -> Array:
     wrong = np.isnan(numbers) & ~values.isna().to_numpy()
     if wrong.any():
         row = int(np.argmax(wrong))
-        raise DataError(f"{label}: row {row + 1}, column {column!r} is {values.iloc[row]!r}; expected a number")
+        raise DataError(
+            f"{label}: row {row + 1}, column {column!r} is {values.iloc[row]!r}; expected a number"
+        )
     return numbers
 
 
 def _values(label: str, table: pd.DataFrame, signal: Signal, note: _Note) -> Array:
     """A signal (K, c) in the units and conventions of ``gpmpc.logs``; NaN where it is missing."""
-    values = np.column_stack([_numbers(label, table, column) for column in signal.columns]) * signal.factor
+    values = (
+        np.column_stack([_numbers(label, table, column) for column in signal.columns])
+        * signal.factor
+    )
     values[~np.isfinite(values)] = np.nan
     absent = np.isnan(values).any(axis=1)
-    note("missing value", absent.sum(), f"{absent.sum()} rows of {signal.name} without a value: left out")
+    note(
+        "missing value",
+        absent.sum(),
+        f"{absent.sum()} rows of {signal.name} without a value: left out",
+    )
     if signal.kind == "quaternion":
         return _quaternions(label, values, signal, note)
     largest = float(np.nanmax(np.abs(values), initial=0.0))
-    if signal.kind in ("angle", "euler") and signal.unit == "rad" and largest > 4 * np.pi:
-        raise DataError(f"{label}: {signal.name} reaches {largest:.4g} rad: are these degrees? (unit: deg)")
+    if (
+        signal.kind in ("angle", "euler")
+        and signal.unit == "rad"
+        and largest > 4 * np.pi
+    ):
+        raise DataError(
+            f"{label}: {signal.name} reaches {largest:.4g} rad: are these degrees? (unit: deg)"
+        )
     if signal.kind == "euler":
         turned = np.full((len(values), 4), np.nan)
         turned[~absent] = Rotation.from_euler("ZYX", values[~absent, ::-1]).as_quat()
@@ -193,7 +282,9 @@ def _quaternions(label: str, values: Array, signal: Signal, note: _Note) -> Arra
     off = np.abs(norms - 1) > 0.05
     if off.any():
         row = int(np.argmax(off))
-        raise DataError(f"{label}: {signal.name} in row {row + 1} has norm {norms[row]:.4g}; expected unit quaternions")
+        raise DataError(
+            f"{label}: {signal.name} in row {row + 1} has norm {norms[row]:.4g}; expected unit quaternions"
+        )
     values = values / norms[:, None]
     present = np.flatnonzero(np.isfinite(norms))
     flips = np.einsum("ij,ij->i", values[present[1:]], values[present[:-1]]) < 0
@@ -211,7 +302,9 @@ def _spread(states: Sequence[Array]) -> Array:
     return (high - low) / 2
 
 
-def _make_run(table: _Table, step: float, spread: Array, mapping: LogMapping) -> LogRun | None:
+def _make_run(
+    table: _Table, step: float, spread: Array, mapping: LogMapping
+) -> LogRun | None:
     """Leaves out what cannot be used, and marks where a new piece begins; None where nothing is left."""
     states, inputs, _ = mapping.split(table.values)
     usable, note = np.ones(len(table.time), dtype=bool), table.note
@@ -223,10 +316,18 @@ def _make_run(table: _Table, step: float, spread: Array, mapping: LogMapping) ->
 
     leave_out(table.outside, "outside of keep", "outside the ranges of keep")
     if mapping.rest == "drop":
-        leave_out(_at_rest(states, inputs, spread, step), "at rest", "where nothing moves")
-    leave_out(np.isnan(table.values).any(axis=1), "missing value", "in a gap or without a value")
+        leave_out(
+            _at_rest(states, inputs, spread, step), "at rest", "where nothing moves"
+        )
+    leave_out(
+        np.isnan(table.values).any(axis=1),
+        "missing value",
+        "in a gap or without a value",
+    )
     for signal, at in zip(mapping.of("states"), mapping.space.columns, strict=True):
-        if mapping.held == "use" or len(signal.columns) < 2:  # a single one may repeat by its resolution
+        if (
+            mapping.held == "use" or len(signal.columns) < 2
+        ):  # a single one may repeat by its resolution
             continue
         same = np.r_[False, (states[1:, at] == states[:-1, at]).all(axis=1)] & usable
         if same.sum() > MOST_HELD * max(usable.sum(), 1):
@@ -240,12 +341,24 @@ def _make_run(table: _Table, step: float, spread: Array, mapping: LogMapping) ->
         note("nothing left", len(table.time), "no row can be used: the run is left out")
         return None
     times = np.diff(table.time[rows])
-    uneven = (times > (mapping.max_gap if mapping.max_gap and not mapping.rate else 1.5 * step)) | (times < 0.5 * step)
+    uneven = (
+        times
+        > (mapping.max_gap if mapping.max_gap and not mapping.rate else 1.5 * step)
+    ) | (times < 0.5 * step)
     inner = times[uneven & (np.diff(rows) == 1)]
     if len(inner):
         shortest, longest = inner.min(), inner.max()
-        text = f"gaps, up to {longest:.3g} s" if shortest > step else f"steps of {shortest:.3g} to {longest:.3g} s"
-        note("gap", len(inner), f"{len(inner)} {text}: boundaries" + ("" if shortest > step else " (a rate resamples)"))
+        text = (
+            f"gaps, up to {longest:.3g} s"
+            if shortest > step
+            else f"steps of {shortest:.3g} to {longest:.3g} s"
+        )
+        note(
+            "gap",
+            len(inner),
+            f"{len(inner)} {text}: boundaries"
+            + ("" if shortest > step else " (a rate resamples)"),
+        )
     breaks = uneven | (np.diff(rows) > 1) | table.breaks[rows[1:]]
     begins = (0, *(np.flatnonzero(breaks) + 1).tolist())
     states, inputs, context = mapping.split(table.values[rows])
@@ -263,7 +376,9 @@ def _at_rest(states: Array, inputs: Array, spread: Array, step: float) -> np.nda
     return binary_dilation((moved <= limit).all(axis=1), np.ones(2 * (size // 2) + 1))
 
 
-def _rigid_bodies(runs: Sequence[LogRun], step: float, mapping: LogMapping) -> list[LogRun]:
+def _rigid_bodies(
+    runs: Sequence[LogRun], step: float, mapping: LogMapping
+) -> list[LogRun]:
     """Turns velocities to world axes and rates to body axes, and checks that they are the derivatives of the others.
 
     Raises:
@@ -277,26 +392,40 @@ def _rigid_bodies(runs: Sequence[LogRun], step: float, mapping: LogMapping) -> l
         )
     frames = [signals[2].frame or "world", signals[3].frame or "body"]
     before, now, after = (
-        np.concatenate([run.states[run.starts(SPAN, SPAN) + shift] for run in runs]) for shift in (-SPAN, 0, SPAN)
+        np.concatenate([run.states[run.starts(SPAN, SPAN) + shift] for run in runs])
+        for shift in (-SPAN, 0, SPAN)
     )
-    before, now, after = (states[:: max(len(now) // MOST_ROWS, 1)] for states in (before, now, after))
+    before, now, after = (
+        states[:: max(len(now) // MOST_ROWS, 1)] for states in (before, now, after)
+    )
     q, time = now[:, 3:7], 2 * SPAN * step
     speed = (after[:, 0:3] - before[:, 0:3]) / time
-    turn = rotation_vector(quaternion_product(quaternion_inverse(before[:, 3:7]), after[:, 3:7])) / time
+    turn = (
+        rotation_vector(
+            quaternion_product(quaternion_inverse(before[:, 3:7]), after[:, 3:7])
+        )
+        / time
+    )
     found = (
         (now[:, 7:10], {"world": speed, "body": rotate(quaternion_inverse(q), speed)}),
         (now[:, 10:13], {"world": rotate(q, turn), "body": turn}),
     )
-    for (measured, derivatives), frame, of, signal in zip(found, frames, signals, signals[2:], strict=False):
+    for (measured, derivatives), frame, of, signal in zip(
+        found, frames, signals, signals[2:], strict=False
+    ):
         other = "world" if frame == "body" else "body"
-        (slope, fit), (_, fit_other) = (_regression(measured, derivatives[axes]) for axes in (frame, other))
+        (slope, fit), (_, fit_other) = (
+            _regression(measured, derivatives[axes]) for axes in (frame, other)
+        )
         what = f"the derivative of {of.name}"
         if fit_other > max(FIT, fit + 0.1):
             axes = f"in {other} axes (correlation {fit_other:.2f}), not in {frame} axes"
             raise DataError(f"{signal.name} is {what} {axes}, as the mapping says")
         if fit > FIT and not SLOPES[0] < slope < SLOPES[1]:
             text = f"{slope:.3g} times {what} (correlation {fit:.2f})"
-            raise DataError(f"{signal.name} is {text}; is its unit right? (degrees for radians make a factor of 57)")
+            raise DataError(
+                f"{signal.name} is {text}; is its unit right? (degrees for radians make a factor of 57)"
+            )
     turned = []
     for run in runs:
         states, q = run.states.copy(), run.states[:, 3:7]
@@ -322,7 +451,9 @@ class Stamps(NamedTuple):
 
     rows: np.ndarray  # (K,) of the table, those that are used
     time: Array  # (K,) [s]
-    after_reversal: np.ndarray  # (K,) whether rows with earlier stamps stood before this one
+    after_reversal: (
+        np.ndarray
+    )  # (K,) whether rows with earlier stamps stood before this one
     repeated: int
     backwards: int
 
@@ -331,7 +462,9 @@ def ordered_stamps(stamps: Array, where: str) -> Stamps:
     """Leaves out rows whose stamp is not the latest; ``DataError`` where it is not finite, or 5 % run backwards."""
     if not np.isfinite(stamps).all():
         row = int(np.argmin(np.isfinite(stamps)))
-        raise DataError(f"{where}: the time in row {row + 1} is {stamps[row]}; expected a number")
+        raise DataError(
+            f"{where}: the time in row {row + 1} is {stamps[row]}; expected a number"
+        )
     latest = np.maximum.accumulate(stamps)
     rises = np.r_[True, stamps[1:] > latest[:-1]]
     repeated = np.r_[False, stamps[1:] == stamps[:-1]] & ~rises
@@ -344,10 +477,14 @@ def ordered_stamps(stamps: Array, where: str) -> Stamps:
         )
     rows = np.flatnonzero(rises)
     reversed_before = np.diff(np.cumsum(backwards)[rows], prepend=0) > 0
-    return Stamps(rows, stamps[rows], reversed_before, int(repeated.sum()), int(backwards.sum()))
+    return Stamps(
+        rows, stamps[rows], reversed_before, int(repeated.sum()), int(backwards.sum())
+    )
 
 
-def resample(time: Array, values: Array, grid: Array, rule: str, max_gap: float) -> Array:
+def resample(
+    time: Array, values: Array, grid: Array, rule: str, max_gap: float
+) -> Array:
     """Computes values (G, c) at the times of a grid (G,) [s] from samples (K, c) at increasing times (K,) [s].
 
     The rule "hold" takes the last sample, "linear" interpolates, "spherical" interpolates quaternions. Values are NaN
@@ -370,5 +507,7 @@ def resample(time: Array, values: Array, grid: Array, rule: str, max_gap: float)
             found = quaternion_product(one, rotation_quaternion(share * turn))
         else:
             found = one + share * (other - one)
-        usable = (at >= 0) & ((lag <= RESOLUTION) | ((at < len(time) - 1) & (span <= max_gap)))
+        usable = (at >= 0) & (
+            (lag <= RESOLUTION) | ((at < len(time) - 1) & (span <= max_gap))
+        )
     return np.where(usable[:, None], found, np.nan)

@@ -47,15 +47,24 @@ class MultirotorNominal:
 
     def __post_init__(self) -> None:
         if self.motors < 1:
-            raise SettingError("inputs", "must name the motor signals of a rigid body; got none")
+            raise SettingError(
+                "inputs", "must name the motor signals of a rigid body; got none"
+            )
 
     @property
     def parameter_names(self) -> tuple[str, ...]:
         names = ["thrust", "drag_xy", "drag_z", "damping_x", "damping_y", "damping_z"]
         if self.feedback:
-            names += ["feedback_x_by_y", "feedback_x_by_x", "feedback_y_by_x", "feedback_y_by_y"]
+            names += [
+                "feedback_x_by_y",
+                "feedback_x_by_x",
+                "feedback_y_by_x",
+                "feedback_y_by_y",
+            ]
         if self.torque:
-            names += [f"torque_{axis}{i + 1}" for axis in "xyz" for i in range(self.motors)]
+            names += [
+                f"torque_{axis}{i + 1}" for axis in "xyz" for i in range(self.motors)
+            ]
         return tuple(names)
 
     @property
@@ -65,12 +74,20 @@ class MultirotorNominal:
         start[0], start[3:6] = 20.0, 5.0
         return start
 
-    def outputs(self, theta: Any, states: Array, inputs: Array, context: Array) -> Array:
+    def outputs(
+        self, theta: Any, states: Array, inputs: Array, context: Array
+    ) -> Array:
         thrust, drag_xy, drag_z, *rest = theta
         to_body = quaternion_inverse(states[..., 3:7])
         v, w = rotate(to_body, states[..., 7:10]), states[..., 10:13]
-        u2 = (inputs if self.thrusts else inputs**2) * (context[..., :1] / self.voltage if self.voltage else 1.0)
-        force = [-drag_xy * v[..., 0], -drag_xy * v[..., 1], thrust * u2.mean(axis=-1) - drag_z * v[..., 2]]
+        u2 = (inputs if self.thrusts else inputs**2) * (
+            context[..., :1] / self.voltage if self.voltage else 1.0
+        )
+        force = [
+            -drag_xy * v[..., 0],
+            -drag_xy * v[..., 1],
+            thrust * u2.mean(axis=-1) - drag_z * v[..., 2],
+        ]
         alpha = [-rest[i] * w[..., i] for i in range(3)]
         if self.feedback:
             tilt = rotate(to_body, np.broadcast_to(np.array([0.0, 0.0, 1.0]), v.shape))
@@ -80,7 +97,9 @@ class MultirotorNominal:
             gains = rest[len(rest) - 3 * self.motors :]
             for axis in range(3):
                 own = gains[axis * self.motors : (axis + 1) * self.motors]
-                alpha[axis] = alpha[axis] + sum(g * u2[..., i] for i, g in enumerate(own))
+                alpha[axis] = alpha[axis] + sum(
+                    g * u2[..., i] for i, g in enumerate(own)
+                )
         return np.stack(np.broadcast_arrays(*force, *alpha), axis=-1)
 
 
@@ -93,12 +112,16 @@ class AffineNominal:
     parameter_names = ()
     start = np.empty(0)
 
-    def outputs(self, theta: Any, states: Array, inputs: Array, context: Array) -> Array:
+    def outputs(
+        self, theta: Any, states: Array, inputs: Array, context: Array
+    ) -> Array:
         o = len(self.kinematics.output_names)
         if not self.fitted:
             return np.zeros((*states.shape[:-1], o))
         A = np.asarray(theta, dtype=float).reshape(o, -1)
-        return self.kinematics.features(states, inputs, context) @ A[:, :-1].T + A[:, -1]
+        return (
+            self.kinematics.features(states, inputs, context) @ A[:, :-1].T + A[:, -1]
+        )
 
 
 @dataclass(frozen=True)
@@ -122,25 +145,38 @@ class LogModel:
     kinematics: Kinematics  #: what the outputs do
     nominal: Any  #: the part with parameters, such as a ``MultirotorNominal``
     theta: Array  #: its parameters (P,)
-    history: tuple[int, ...]  #: rows over which each output's disturbance is averaged (o,); zero for none
+    history: tuple[
+        int, ...
+    ]  #: rows over which each output's disturbance is averaged (o,); zero for none
     lag: int = 0  #: rows by which the inputs act late
     gps: tuple[OutputGP, ...] = ()  #: what is learned besides
 
     def __post_init__(self) -> None:
         if len(self.history) != len(self.kinematics.output_names):
-            raise SettingError("history", f"must have {len(self.kinematics.output_names)} numbers; got {self.history}")
+            raise SettingError(
+                "history",
+                f"must have {len(self.kinematics.output_names)} numbers; got {self.history}",
+            )
 
     @property
     def past(self) -> int:
         """Rows that a prediction needs before its start."""
         return max(self.history) + self.lag
 
-    def outputs(self, states: Array, inputs: Array, context: Array, theta: Any = None) -> Array:
+    def outputs(
+        self, states: Array, inputs: Array, context: Array, theta: Any = None
+    ) -> Array:
         """Computes the outputs (..., o) without disturbance; ``theta`` (unpacked) instead of the own one."""
-        y = self.nominal.outputs(self.theta if theta is None else theta, states, inputs, context)
+        y = self.nominal.outputs(
+            self.theta if theta is None else theta, states, inputs, context
+        )
         if self.gps:
             whole = np.broadcast_to(context, (*states.shape[:-1], context.shape[-1]))
-            z = self.kinematics.features(states, np.broadcast_to(inputs, (*states.shape[:-1], inputs.shape[-1])), whole)
+            z = self.kinematics.features(
+                states,
+                np.broadcast_to(inputs, (*states.shape[:-1], inputs.shape[-1])),
+                whole,
+            )
             y = y.copy()
             for gp in self.gps:
                 y[..., list(gp.outputs)] += gp.mean(z)
@@ -154,12 +190,18 @@ class LogModel:
             at = slice(windows.past - rows, windows.past)
             x = windows.states[:, windows.past - rows : windows.past + 1]
             u = windows.inputs[:, at.start - self.lag : at.stop - self.lag]
-            said = self.outputs(x[:, :-1], u, windows.context[:, at], expand).mean(axis=-2)
-            seen = self.kinematics.outputs(x[:, :-1], x[:, 1:], windows.time_step).mean(axis=-2)
+            said = self.outputs(x[:, :-1], u, windows.context[:, at], expand).mean(
+                axis=-2
+            )
+            seen = self.kinematics.outputs(x[:, :-1], x[:, 1:], windows.time_step).mean(
+                axis=-2
+            )
             total = total + np.where(np.array(self.history) == rows, seen - said, 0.0)
         return total
 
-    def rollout(self, windows: Windows, steps: int | None = None, theta: Array | None = None) -> Array:
+    def rollout(
+        self, windows: Windows, steps: int | None = None, theta: Array | None = None
+    ) -> Array:
         """Predicts windows from their starts with the inputs that were applied: the states after it (W, steps, n).
 
         Windows need ``past`` rows before the start; all steps that they hold are predicted by default. Parameter
@@ -167,14 +209,26 @@ class LogModel:
         """
         steps = windows.ahead if steps is None else steps
         if windows.past < self.past:
-            raise SettingError("past", f"must be {self.past} rows or more for this model; got {windows.past}")
-        terms = None if theta is None else [p[:, None] for p in np.moveaxis(theta, -1, 0)]
+            raise SettingError(
+                "past",
+                f"must be {self.past} rows or more for this model; got {windows.past}",
+            )
+        terms = (
+            None if theta is None else [p[:, None] for p in np.moveaxis(theta, -1, 0)]
+        )
         batch = (len(windows),) if theta is None else (len(theta), len(windows))
-        x = np.broadcast_to(windows.states[:, windows.past], (*batch, windows.states.shape[-1]))
+        x = np.broadcast_to(
+            windows.states[:, windows.past], (*batch, windows.states.shape[-1])
+        )
         context, d = windows.context[:, windows.past], self.disturbance(windows, terms)
         found = np.empty((*batch, steps, x.shape[-1]))
         for k in range(steps):
-            y = self.outputs(x, windows.inputs[:, windows.past + k - self.lag], context, terms) + d
+            y = (
+                self.outputs(
+                    x, windows.inputs[:, windows.past + k - self.lag], context, terms
+                )
+                + d
+            )
             x = self.kinematics.step(x, y, windows.time_step)
             found[..., k, :] = x
         return found
@@ -182,8 +236,12 @@ class LogModel:
 
 def rollout_errors(windows: Windows, predicted: Array, steps: Any = None) -> Array:
     """Computes the errors (..., W, steps, e) of rollouts (..., W, K, n) at some steps from 1, by default all."""
-    steps = np.arange(1, predicted.shape[-2] + 1) if steps is None else np.asarray(steps)
-    return windows.space.difference(predicted[..., steps - 1, :], windows.states[:, windows.past + steps])
+    steps = (
+        np.arange(1, predicted.shape[-2] + 1) if steps is None else np.asarray(steps)
+    )
+    return windows.space.difference(
+        predicted[..., steps - 1, :], windows.states[:, windows.past + steps]
+    )
 
 
 def finite_errors(windows: Windows, model: LogModel, steps: Any = None) -> Array:

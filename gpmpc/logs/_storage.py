@@ -20,9 +20,21 @@ from gpmpc._files import existing_file, new_file
 from gpmpc.exceptions import DataError, SettingError
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import load_metadata
-from gpmpc.gp._storage import posterior_of_parts, posterior_parts, read_model, write_model
+from gpmpc.gp._storage import (
+    posterior_of_parts,
+    posterior_parts,
+    read_model,
+    write_model,
+)
 from gpmpc.logs._fitting import NominalFit, OutputNoise
-from gpmpc.logs._kinematics import Array, Increments, RigidBody, StateGroup, StateSpace, wrap
+from gpmpc.logs._kinematics import (
+    Array,
+    Increments,
+    RigidBody,
+    StateGroup,
+    StateSpace,
+    wrap,
+)
 from gpmpc.logs._learning import Candidate, Learned
 from gpmpc.logs._rollouts import AffineNominal, LogModel, MultirotorNominal, OutputGP
 from gpmpc.models import load_model
@@ -43,8 +55,15 @@ def save_learned(learned: Learned, path: str | Path) -> None:
     """
     path, model, nominal = new_file(path), learned.model, learned.model.nominal
     if not isinstance(nominal, MultirotorNominal | AffineNominal):
-        raise SettingError("nominal", f"only models of gpmpc.logs can be saved; got {type(nominal).__name__}")
-    arrays = {"theta": model.theta, "standard_errors": learned.fit.standard_errors, "ranges": learned.ranges}
+        raise SettingError(
+            "nominal",
+            f"only models of gpmpc.logs can be saved; got {type(nominal).__name__}",
+        )
+    arrays = {
+        "theta": model.theta,
+        "standard_errors": learned.fit.standard_errors,
+        "ranges": learned.ranges,
+    }
     arrays |= {f"noise/{key}": getattr(learned.noise, key) for key in _NOISE}
     tensors, gps = {key: torch.from_numpy(value) for key, value in arrays.items()}, []
     for i, gp in enumerate(model.gps):
@@ -54,11 +73,16 @@ def save_learned(learned: Learned, path: str | Path) -> None:
     header = {
         "groups": [asdict(group) for group in model.kinematics.space.groups],
         "kinematics": type(model.kinematics).__name__,
-        "nominal": [type(nominal).__name__, {k: v for k, v in vars(nominal).items() if isinstance(v, int | float)}],
+        "nominal": [
+            type(nominal).__name__,
+            {k: v for k, v in vars(nominal).items() if isinstance(v, int | float)},
+        ],
         "history": model.history,
         "lag": model.lag,
         "gps": gps,
-        "candidates": [[c.name, c.errors.tolist(), c.chosen] for c in learned.candidates],
+        "candidates": [
+            [c.name, c.errors.tolist(), c.chosen] for c in learned.candidates
+        ],
         "names": [getattr(learned, key) for key in _TEXTS],
         "time_step": learned.time_step,
     }
@@ -80,8 +104,14 @@ def load_learned(path: str | Path) -> Learned:
 
 
 def _learned(path: Path, header: dict[str, Any], tensors: dict[str, Tensor]) -> Learned:
-    space = StateSpace(tuple(StateGroup(**g | {"entries": tuple(g["entries"])}) for g in header["groups"]))
-    kinematics = RigidBody(space) if header["kinematics"] == "RigidBody" else Increments(space)
+    space = StateSpace(
+        tuple(
+            StateGroup(**g | {"entries": tuple(g["entries"])}) for g in header["groups"]
+        )
+    )
+    kinematics = (
+        RigidBody(space) if header["kinematics"] == "RigidBody" else Increments(space)
+    )
     name, settings = header["nominal"]
     if name == "MultirotorNominal":
         nominal = MultirotorNominal(**settings)
@@ -89,18 +119,35 @@ def _learned(path: Path, header: dict[str, Any], tensors: dict[str, Tensor]) -> 
         nominal = AffineNominal(kinematics, settings.get("fitted", name != "Still"))
     gps = []
     for i, (outputs, described) in enumerate(header["gps"]):
-        own = {key.removeprefix(f"gp{i}/"): value for key, value in tensors.items() if key.startswith(f"gp{i}/")}
+        own = {
+            key.removeprefix(f"gp{i}/"): value
+            for key, value in tensors.items()
+            if key.startswith(f"gp{i}/")
+        }
         gps.append(OutputGP(tuple(outputs), posterior_of_parts(path, described, own)))
     arrays = {key: value.numpy() for key, value in tensors.items()}
-    model = LogModel(kinematics, nominal, arrays["theta"], tuple(header["history"]), header["lag"], tuple(gps))
+    model = LogModel(
+        kinematics,
+        nominal,
+        arrays["theta"],
+        tuple(header["history"]),
+        header["lag"],
+        tuple(gps),
+    )
     return Learned(
         model=model,
         noise=OutputNoise(*(arrays[f"noise/{key}"] for key in _NOISE)),
         fit=NominalFit(model, arrays["standard_errors"]),
-        candidates=tuple(Candidate(name, np.array(errors), chosen) for name, errors, chosen in header["candidates"]),
+        candidates=tuple(
+            Candidate(name, np.array(errors), chosen)
+            for name, errors, chosen in header["candidates"]
+        ),
         ranges=arrays["ranges"],
         time_step=header["time_step"],
-        **{key: tuple(names) for key, names in zip(_TEXTS, header["names"], strict=True)},
+        **{
+            key: tuple(names)
+            for key, names in zip(_TEXTS, header["names"], strict=True)
+        },
     )
 
 
@@ -119,10 +166,15 @@ class LogDynamics:
     dtype, device = torch.float64, torch.device("cpu")
 
     def __post_init__(self) -> None:
-        late = f"has inputs that act {self.model.lag} rows late" if self.model.lag else ""
+        late = (
+            f"has inputs that act {self.model.lag} rows late" if self.model.lag else ""
+        )
         if late or getattr(self.model.nominal, "feedback", False):
             what = late or "holds the feedback of the controller that flew"
-            raise SettingError("model", f"{what}, which no controller can plan with: gpmpc learn --for-control")
+            raise SettingError(
+                "model",
+                f"{what}, which no controller can plan with: gpmpc learn --for-control",
+            )
 
     @property
     def state_dim(self) -> int:
@@ -154,24 +206,47 @@ class LogDynamics:
         """The next state's distribution: mean (*batch, n), covariance (*batch, n, n)."""
         check_query(self, state, input)
         n, batch = self.state_dim, state.shape[:-1]
-        x, u = to_array(state).reshape(-1, n), to_array(input).reshape(-1, self.input_dim)
+        x, u = (
+            to_array(state).reshape(-1, n),
+            to_array(input).reshape(-1, self.input_dim),
+        )
         mean, covariance = self._mean(x, u), self._covariance(x, u)
-        return Gaussian(*(torch.from_numpy(a).reshape(*batch, *a.shape[1:]) for a in (mean, covariance)))
+        return Gaussian(
+            *(
+                torch.from_numpy(a).reshape(*batch, *a.shape[1:])
+                for a in (mean, covariance)
+            )
+        )
 
-    def linearize(self, states: Array, inputs: Array, covariance: bool = True) -> Linearized:
+    def linearize(
+        self, states: Array, inputs: Array, covariance: bool = True
+    ) -> Linearized:
         """Linearises at K points (K, n), (K, m) by central differences, all of them at once."""
         n, z = self.state_dim, np.concatenate([states, inputs], axis=1)
         h = DIFFERENCE * np.maximum(np.abs(z), 1.0)
-        moved = z + np.concatenate([np.eye(z.shape[1]), -np.eye(z.shape[1])])[:, None] * h
-        values = self._mean(*np.split(moved.reshape(-1, z.shape[1]), [n], axis=1)).reshape(2, -1, *states.shape)
+        moved = (
+            z + np.concatenate([np.eye(z.shape[1]), -np.eye(z.shape[1])])[:, None] * h
+        )
+        values = self._mean(
+            *np.split(moved.reshape(-1, z.shape[1]), [n], axis=1)
+        ).reshape(2, -1, *states.shape)
         J = np.moveaxis((values[0] - values[1]) / (2 * h.T[..., None]), 0, -1)
         A, B = (np.ascontiguousarray(part) for part in np.split(J, [n], axis=2))
-        return Linearized(self._mean(states, inputs), A, B, self._covariance(states, inputs) if covariance else None)
+        return Linearized(
+            self._mean(states, inputs),
+            A,
+            B,
+            self._covariance(states, inputs) if covariance else None,
+        )
 
     def _mean(self, x: Array, u: Array) -> Array:
         model = self.model
-        after = model.kinematics.step(x, model.outputs(x, u, np.empty((len(x), 0))), self.time_step)
-        for group, at in zip(model.kinematics.space.groups, model.kinematics.space.columns, strict=True):
+        after = model.kinematics.step(
+            x, model.outputs(x, u, np.empty((len(x), 0))), self.time_step
+        )
+        for group, at in zip(
+            model.kinematics.space.groups, model.kinematics.space.columns, strict=True
+        ):
             if group.kind == "angle":  # a plan counts turns
                 after[:, at] = x[:, at] + wrap(after[:, at] - x[:, at])
         return after
@@ -180,7 +255,10 @@ class LogDynamics:
         model, nothing, K = self.model, np.empty((len(x), 0)), len(x)
         if not model.gps:
             return np.zeros((K, self.state_dim, self.state_dim))
-        z, y = np.ascontiguousarray(model.kinematics.features(x, u, nothing)), model.outputs(x, u, nothing)
+        z, y = (
+            np.ascontiguousarray(model.kinematics.features(x, u, nothing)),
+            model.outputs(x, u, nothing),
+        )
         V = np.zeros((K, y.shape[1], y.shape[1]))
         for gp in model.gps:
             learned: Any = gp.posterior.linearize(z, nothing, True).covariance
@@ -191,7 +269,10 @@ class LogDynamics:
     def _by_outputs(self, x: Array, y: Array) -> Array:
         """Derivatives of the next states by the outputs (K, n, o)."""
         step, dt = self.model.kinematics.step, self.time_step
-        columns = [step(x, y + h, dt) - step(x, y - h, dt) for h in DIFFERENCE * np.eye(y.shape[1])]
+        columns = [
+            step(x, y + h, dt) - step(x, y - h, dt)
+            for h in DIFFERENCE * np.eye(y.shape[1])
+        ]
         return np.stack(columns, axis=-1) / (2 * DIFFERENCE)
 
 
@@ -215,7 +296,10 @@ class SavedModel:
             if dim != len(wanted) or (own and own != list(wanted)):
                 found = f"the {key} {', '.join(own) or dim}; {system.name} has {', '.join(wanted)}"
                 raise SettingError("model", f"{self.path} has {found}")
-        if self.time_step is not None and abs(self.time_step / system.time_step - 1) > 1e-3:
+        if (
+            self.time_step is not None
+            and abs(self.time_step / system.time_step - 1) > 1e-3
+        ):
             steps = f"{self.time_step:g} s; {system.name} has {system.time_step:g} s"
             raise SettingError("model", f"{self.path} has time steps of {steps}")
 
@@ -232,9 +316,22 @@ def load_flyable(path: str | Path) -> SavedModel:
         learned = load_learned(path)
         if learned.context_names:
             context = ", ".join(learned.context_names)
-            raise SettingError("model", f"{path} needs a context ({context}), which is not known in flight")
-        flown = LogDynamics(learned.model, len(learned.input_names), learned.time_step, learned.noise)
-        return SavedModel(str(path), flown, learned.state_names, learned.input_names, learned.time_step)
+            raise SettingError(
+                "model",
+                f"{path} needs a context ({context}), which is not known in flight",
+            )
+        flown = LogDynamics(
+            learned.model, len(learned.input_names), learned.time_step, learned.noise
+        )
+        return SavedModel(
+            str(path),
+            flown,
+            learned.state_names,
+            learned.input_names,
+            learned.time_step,
+        )
     said = header.get("metadata") or {}
     states, inputs = (tuple(said.get(key) or ()) for key in ("states", "inputs"))
-    return SavedModel(str(path), load_model(path), states, inputs, said.get("time_step"))
+    return SavedModel(
+        str(path), load_model(path), states, inputs, said.get("time_step")
+    )

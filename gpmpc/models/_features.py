@@ -27,18 +27,33 @@ class Features:
 
     states: Sequence[int]  #: selected states, in the order of the features
     inputs: Sequence[int]  #: selected inputs
-    angles: Sequence[int]  #: those of the selected states that are seen as (sine, cosine), at their place
+    angles: Sequence[
+        int
+    ]  #: those of the selected states that are seen as (sine, cosine), at their place
     state_dim: int  #: n, of the state they are selected from
     input_dim: int  #: m
 
     def __post_init__(self) -> None:
         for key in ("states", "inputs", "angles"):
-            indices, count = getattr(self, key), self.input_dim if key == "inputs" else self.state_dim
+            indices, count = (
+                getattr(self, key),
+                self.input_dim if key == "inputs" else self.state_dim,
+            )
             whole = all(isinstance(i, int) and not isinstance(i, bool) for i in indices)
-            if not whole or any(not 0 <= i < count for i in indices) or len(set(indices)) != len(indices):
-                raise SettingError(key, f"must be different indices from 0 to {count - 1}; got {list(indices)}")
+            if (
+                not whole
+                or any(not 0 <= i < count for i in indices)
+                or len(set(indices)) != len(indices)
+            ):
+                raise SettingError(
+                    key,
+                    f"must be different indices from 0 to {count - 1}; got {list(indices)}",
+                )
         if not set(self.angles) <= set(self.states):
-            raise SettingError("angles", f"must be some of the selected states {list(self.states)}; got {self.angles}")
+            raise SettingError(
+                "angles",
+                f"must be some of the selected states {list(self.states)}; got {self.angles}",
+            )
 
     @property
     def dim(self) -> int:
@@ -48,7 +63,10 @@ class Features:
     @cached_property
     def columns(self) -> NDArray[np.intp]:
         """The state that each feature is a function of (d,)."""
-        return np.array([i for i in self.states for _ in range(1 + (i in self.angles))], dtype=np.intp)
+        return np.array(
+            [i for i in self.states for _ in range(1 + (i in self.angles))],
+            dtype=np.intp,
+        )
 
     @cached_property
     def sines(self) -> NDArray[np.intp]:
@@ -68,15 +86,22 @@ class Features:
 
     def __call__(self, state: Tensor, input: Tensor) -> tuple[Tensor, Tensor]:
         """The features (*batch, d) of a state (*batch, n), and the selected inputs (*batch, m_s)."""
-        z, selected, sines = state[..., self.columns.tolist()], input[..., list(self.inputs)], self.sines.tolist()
+        z, selected, sines = (
+            state[..., self.columns.tolist()],
+            input[..., list(self.inputs)],
+            self.sines.tolist(),
+        )
         if not sines:
             return z, selected
         parts = [
-            part.sin() if k in sines else part.cos() if k - 1 in sines else part for k, part in enumerate(z.unbind(-1))
+            part.sin() if k in sines else part.cos() if k - 1 in sines else part
+            for k, part in enumerate(z.unbind(-1))
         ]
         return torch.stack(parts, dim=-1), selected
 
-    def linearize(self, states: Array, inputs: Array) -> tuple[Array, Array, Array | None]:
+    def linearize(
+        self, states: Array, inputs: Array
+    ) -> tuple[Array, Array, Array | None]:
         """Features (K, d), selected inputs (K, m_s), each feature's derivative (K, d) by its state, None for one."""
         z, v, sines = states[:, self.columns], inputs[:, self._selected], self.sines
         if not self.angles:
@@ -86,7 +111,9 @@ class Features:
         slope[:, sines], slope[:, sines + 1] = cosine, -sine
         return z, v, slope
 
-    def chain(self, by_features: Array, by_inputs: Array, slope: Array | None) -> tuple[Array, Array]:
+    def chain(
+        self, by_features: Array, by_inputs: Array, slope: Array | None
+    ) -> tuple[Array, Array]:
         """Turns derivatives (K, k, d), (K, k, m_s) by features and selected inputs into those by x and u."""
         if slope is not None:
             by_features = by_features * slope[:, None, :]
@@ -111,7 +138,12 @@ class Lags:
     inputs: int = 0  #: q, how many earlier inputs are
 
     def __post_init__(self) -> None:
-        for key, least in (("state_dim", 1), ("input_dim", 0), ("states", 0), ("inputs", 0)):
+        for key, least in (
+            ("state_dim", 1),
+            ("input_dim", 0),
+            ("states", 0),
+            ("inputs", 0),
+        ):
             check_number(key, getattr(self, key), least=least, whole=True)
 
     @property
@@ -123,7 +155,10 @@ class Lags:
     def nominal(self) -> Affine:
         """The nominal model for ``ResidualModel``: x stays where it is, and earlier values move on by a place."""
         n, m, first = self.state_dim, self.input_dim, self.state_dim * (1 + self.states)
-        A, B = torch.zeros(self.dim, self.dim, dtype=torch.float64), torch.zeros(self.dim, m, dtype=torch.float64)
+        A, B = (
+            torch.zeros(self.dim, self.dim, dtype=torch.float64),
+            torch.zeros(self.dim, m, dtype=torch.float64),
+        )
         A[:n, :n] = torch.eye(n)
         A[n:first, : first - n] = torch.eye(first - n)
         if self.inputs:
@@ -143,7 +178,10 @@ class Lags:
         ``ShapeError`` where the two do not belong together, or hold too few rows.
         """
         T, first = len(states), max(self.states, self.inputs)
-        found, shapes = (np.shape(states), np.shape(inputs)), [(k, self.input_dim) for k in (T - 1, T)]
+        found, shapes = (
+            (np.shape(states), np.shape(inputs)),
+            [(k, self.input_dim) for k in (T - 1, T)],
+        )
         if found[0] != (T, self.state_dim) or found[1] not in shapes or first >= T:
             what = f"states (T, {self.state_dim}) and inputs (T or T - 1, {self.input_dim}) need T above {first}"
             raise ShapeError(f"{what}; got {found[0]} and {found[1]}")

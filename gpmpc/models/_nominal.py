@@ -10,7 +10,14 @@ import torch
 from torch import Tensor
 
 from gpmpc._compiled import call_unchecked
-from gpmpc._dynamics import Array, Linearized, batched_jacobian, check_query, tensors_for, to_array
+from gpmpc._dynamics import (
+    Array,
+    Linearized,
+    batched_jacobian,
+    check_query,
+    tensors_for,
+    to_array,
+)
 from gpmpc.exceptions import ShapeError, UnsupportedModel
 from gpmpc.gaussian import Gaussian, check_tensors
 
@@ -30,15 +37,24 @@ class Affine:
 
     def __post_init__(self) -> None:
         check_tensors(A=self.A, B=self.B, c=self.c)
-        shapes, n = [tuple(part.shape) for part in (self.A, self.B, self.c)], self.c.numel()
+        shapes, n = (
+            [tuple(part.shape) for part in (self.A, self.B, self.c)],
+            self.c.numel(),
+        )
         if shapes != [(n, n), (n, *shapes[1][1:2]), (n,)] or self.B.dim() != 2:
-            raise ShapeError(f"A, B and c must be (n, n), (n, m) and (n,); got {', '.join(map(str, shapes))}")
+            raise ShapeError(
+                f"A, B and c must be (n, n), (n, m) and (n,); got {', '.join(map(str, shapes))}"
+            )
 
     @classmethod
     def identity(cls, state_dim: int, input_dim: int) -> "Affine":
         """The model x+ = x, whose residual is the difference of two states."""
         n, m, dtype = state_dim, input_dim, torch.float64
-        return cls(torch.eye(n, dtype=dtype), torch.zeros(n, m, dtype=dtype), torch.zeros(n, dtype=dtype))
+        return cls(
+            torch.eye(n, dtype=dtype),
+            torch.zeros(n, m, dtype=dtype),
+            torch.zeros(n, dtype=dtype),
+        )
 
     def __call__(self, state: Tensor, input: Tensor) -> Tensor:
         """The nominal next state (*batch, n)."""
@@ -47,7 +63,11 @@ class Affine:
     def linearize(self, states: Array, inputs: Array) -> tuple[Array, Array, Array]:
         """The nominal next states (K, n) and their constant derivatives (K, n, n) and (K, n, m)."""
         (A, B, c), K = self._arrays, len(states)
-        return states @ A.T + inputs @ B.T + c, np.tile(A, (K, 1, 1)), np.tile(B, (K, 1, 1))
+        return (
+            states @ A.T + inputs @ B.T + c,
+            np.tile(A, (K, 1, 1)),
+            np.tile(B, (K, 1, 1)),
+        )
 
     @cached_property
     def _arrays(self) -> tuple[Array, Array, Array]:
@@ -86,10 +106,14 @@ class KnownModel:
         mean = self.function(state, input)
         return Gaussian(mean, mean.new_zeros(*mean.shape, self.state_dim))
 
-    def linearize(self, states: Array, inputs: Array, covariance: bool = True) -> Linearized:
+    def linearize(
+        self, states: Array, inputs: Array, covariance: bool = True
+    ) -> Linearized:
         """Linearises the function at K points (K, n), (K, m)."""
         mean, A, B = linearize_function(self.function, self, states, inputs)
-        return Linearized(mean, A, B, np.zeros((*mean.shape, self.state_dim)) if covariance else None)
+        return Linearized(
+            mean, A, B, np.zeros((*mean.shape, self.state_dim)) if covariance else None
+        )
 
 
 class CasadiFunction:
@@ -106,10 +130,18 @@ class CasadiFunction:
     def __init__(self, function: Any):
         from gpmpc.gp.casadi_ import tape_of  # loads CasADi
 
-        if not hasattr(function, "n_in") or function.n_out() != 1 or not function.n_in():
-            raise UnsupportedModel(f"CasadiFunction takes a CasADi function of one value; got {function!r}")
+        if (
+            not hasattr(function, "n_in")
+            or function.n_out() != 1
+            or not function.n_in()
+        ):
+            raise UnsupportedModel(
+                f"CasadiFunction takes a CasADi function of one value; got {function!r}"
+            )
         if any(function.size2_in(i) != 1 for i in range(function.n_in())):
-            raise UnsupportedModel(f"a CasADi function takes vectors (column by column); got {function!r}")
+            raise UnsupportedModel(
+                f"a CasADi function takes vectors (column by column); got {function!r}"
+            )
         self.function, self.tape = function, tape_of(function)
         self._mapped: dict[int, Any] = {}
         self.shape = function.size1_out(0), function.size2_out(0)
@@ -119,19 +151,28 @@ class CasadiFunction:
     def _expansion(self) -> Any:
         """Value and derivatives as a CasADi function."""
         names, value = self.function.name_in(), self.function.name_out(0)
-        return self.function.factory("expansion", names, [value, *(f"jac:{value}:{name}" for name in names)])
+        return self.function.factory(
+            "expansion", names, [value, *(f"jac:{value}:{name}" for name in names)]
+        )
 
     def check_sizes(self, arguments: tuple[int, ...], value: tuple[int, int]) -> None:
         """Raises ``UnsupportedModel`` unless arguments and value have these sizes."""
         if (tuple(self.sizes), self.shape) != (arguments, value):
             rule = f"must map vectors of {arguments} entries to a matrix of {value}"
-            raise UnsupportedModel(f"a CasADi function of this model {rule}; got {self.function}")
+            raise UnsupportedModel(
+                f"a CasADi function of this model {rule}; got {self.function}"
+            )
 
     def __call__(self, *arguments: Tensor) -> Tensor:
         """The value (*batch, rows), or (*batch, rows, columns) of a matrix, at arguments (*batch, d_i)."""
         like = arguments[0]
-        flat = (to_array(a).reshape(-1, size) for a, size in zip(arguments, self.sizes, strict=True))
-        value = torch.as_tensor(self.linearize(*flat)[0], dtype=like.dtype, device=like.device)
+        flat = (
+            to_array(a).reshape(-1, size)
+            for a, size in zip(arguments, self.sizes, strict=True)
+        )
+        value = torch.as_tensor(
+            self.linearize(*flat)[0], dtype=like.dtype, device=like.device
+        )
         return value.reshape(*like.shape[:-1], *value.shape[1:])
 
     def linearize(self, *arguments: Array) -> tuple[Array, ...]:
@@ -142,21 +183,35 @@ class CasadiFunction:
             from gpmpc._kernels.tape import linearize_tape  # loads numba
 
             points = np.ascontiguousarray(np.hstack(arguments))
-            values, jacobians = np.empty((K, size)), np.empty((K, size, points.shape[1]))
+            values, jacobians = (
+                np.empty((K, size)),
+                np.empty((K, size, points.shape[1])),
+            )
             call_unchecked(linearize_tape, self.tape, points, values, jacobians)
             parts = [values, *np.split(jacobians, np.cumsum(self.sizes)[:-1], axis=2)]
         else:
             if K not in self._mapped:
                 self._mapped[K] = self._expansion.map(K)
-            value, *jacobians = (part.full() for part in self._mapped[K].call([a.T for a in arguments]))
-            parts = [value.reshape(rows, K, columns).transpose(1, 2, 0).reshape(K, size)]
-            parts += [jacobian.reshape(size, K, -1).swapaxes(0, 1) for jacobian in jacobians]
+            value, *jacobians = (
+                part.full() for part in self._mapped[K].call([a.T for a in arguments])
+            )
+            parts = [
+                value.reshape(rows, K, columns).transpose(1, 2, 0).reshape(K, size)
+            ]
+            parts += [
+                jacobian.reshape(size, K, -1).swapaxes(0, 1) for jacobian in jacobians
+            ]
         if columns > 1:
-            parts = [part.reshape(K, columns, rows, *part.shape[2:]).swapaxes(1, 2) for part in parts]
+            parts = [
+                part.reshape(K, columns, rows, *part.shape[2:]).swapaxes(1, 2)
+                for part in parts
+            ]
         return tuple(np.ascontiguousarray(part) for part in parts)
 
 
-def linearize_function(function: Callable[..., Tensor], model: Any, *arguments: Array) -> tuple[Array, ...]:
+def linearize_function(
+    function: Callable[..., Tensor], model: Any, *arguments: Array
+) -> tuple[Array, ...]:
     """Value and derivatives by each argument of a batched function at K points, arguments (K, d_i).
 
     By the function's own method ``linearize``; else by one batched call of torch autograd, with tensors of the model's
@@ -172,5 +227,8 @@ def linearize_function(function: Callable[..., Tensor], model: Any, *arguments: 
         return (value.flatten(1),)
 
     (value,), jacobians = batched_jacobian(flat, tensors_for(model, *arguments))
-    parts = [value.unflatten(1, shape[0]), *(by.unflatten(1, shape[0]) for by in jacobians)]
+    parts = [
+        value.unflatten(1, shape[0]),
+        *(by.unflatten(1, shape[0]) for by in jacobians),
+    ]
     return tuple(to_array(part) for part in parts)

@@ -15,10 +15,24 @@ from typing import Any, cast
 import torch
 from torch import Tensor
 
-from gpmpc._dynamics import Array, Linearized, TensorModel, check_query, tensors_for, to_array
+from gpmpc._dynamics import (
+    Array,
+    Linearized,
+    TensorModel,
+    check_query,
+    tensors_for,
+    to_array,
+)
 from gpmpc.exceptions import SettingError, ShapeError
 from gpmpc.gaussian import Gaussian, check_tensors
-from gpmpc.gp import GPPosterior, SlidingWindow, Trainer, Training, Transitions, append_points
+from gpmpc.gp import (
+    GPPosterior,
+    SlidingWindow,
+    Trainer,
+    Training,
+    Transitions,
+    append_points,
+)
 from gpmpc.gp._posterior import AffineForm
 from gpmpc.gp._transitions import check_transitions
 from gpmpc.models._features import Features
@@ -47,7 +61,9 @@ class ResidualModel(TensorModel):
     states: Sequence[int]  #: the states that d depends on, in its order
     inputs: Sequence[int]  #: the inputs that d depends on, in its order
     input_dim: int  #: m, all of them
-    angles: Sequence[int] = ()  #: those of ``states`` that d sees as (sine, cosine), at their place
+    angles: Sequence[
+        int
+    ] = ()  #: those of ``states`` that d sees as (sine, cosine), at their place
     #: covariance of the observations (n, n); by default that of d's, B diag(sn2) B', which needs a constant B
     noise: Tensor | None = None
 
@@ -57,12 +73,20 @@ class ResidualModel(TensorModel):
     def __post_init__(self) -> None:
         gp, nominal, n, m = self.residual, self.nominal, self.state_dim, self.input_dim
         if getattr(gp, "predicts", None) != "value":
-            raise SettingError("residual", f"must be a GP with predicts='value'; got {getattr(gp, 'predicts', gp)!r}")
+            raise SettingError(
+                "residual",
+                f"must be a GP with predicts='value'; got {getattr(gp, 'predicts', gp)!r}",
+            )
         if callable(self.B) and self.noise is None:
-            raise SettingError("noise", "must be given (n, n) where B is a function of the state; got None")
+            raise SettingError(
+                "noise",
+                "must be given (n, n) where B is a function of the state; got None",
+            )
         if (self.features.dim, len(self.inputs)) != (gp.state_dim, gp.input_dim):
             got = f"{self.features.dim} and {len(self.inputs)} selected"
-            raise ShapeError(f"the residual has {gp.state_dim} states and {gp.input_dim} inputs; got {got}")
+            raise ShapeError(
+                f"the residual has {gp.state_dim} states and {gp.input_dim} inputs; got {got}"
+            )
         if isinstance(nominal, CasadiFunction):
             nominal.check_sizes((n, m), (n, 1))
         if isinstance(self.B, CasadiFunction):
@@ -74,11 +98,16 @@ class ResidualModel(TensorModel):
             parts["noise"] = self.noise, (n, n)
         if isinstance(nominal, Affine):
             shapes = {"A": (n, n), "B": (n, m), "c": (n,)}
-            parts |= {f"nominal.{name}": (getattr(nominal, name), shape) for name, shape in shapes.items()}
+            parts |= {
+                f"nominal.{name}": (getattr(nominal, name), shape)
+                for name, shape in shapes.items()
+            }
         for name, (value, shape) in parts.items():
             check_tensors(**{name: value})
             if tuple(value.shape) != shape:
-                raise ShapeError(f"{name} must have shape {shape}; got {tuple(value.shape)}")
+                raise ShapeError(
+                    f"{name} must have shape {shape}; got {tuple(value.shape)}"
+                )
             check_like(name, value, gp)
 
     @classmethod
@@ -104,26 +133,37 @@ class ResidualModel(TensorModel):
             TrainingError: An output could not be trained.
         """
         trainer = Trainer() if trainer is None else trainer
-        return cast(Any, train_residual(trainer, transitions, angles, nominal, seed, B, states, inputs).posterior)
+        return cast(
+            Any,
+            train_residual(
+                trainer, transitions, angles, nominal, seed, B, states, inputs
+            ).posterior,
+        )
 
     def __len__(self) -> int:
         return len(self.residual)
 
-    def append(self, transitions: Transitions, window: SlidingWindow | None = None) -> "ResidualModel":
+    def append(
+        self, transitions: Transitions, window: SlidingWindow | None = None
+    ) -> "ResidualModel":
         """Appends transitions to the data of the residual GP, held to a number of points where a window is given.
 
         Raises:
             ShapeError: The transitions have other dimensions.
         """
         check_transitions(transitions, self)
-        points = _residuals(self.nominal, self.B, self.features, transitions, like=self.residual.weights)
+        points = _residuals(
+            self.nominal, self.B, self.features, transitions, like=self.residual.weights
+        )
         add = append_points if window is None else window.append
         return replace(self, residual=add(self.residual, *points))
 
     @cached_property
     def features(self) -> Features:
         """What d sees of the state and the input."""
-        return Features(self.states, self.inputs, self.angles, self.state_dim, self.input_dim)
+        return Features(
+            self.states, self.inputs, self.angles, self.state_dim, self.input_dim
+        )
 
     @property
     def state_dim(self) -> int:
@@ -156,17 +196,31 @@ class ResidualModel(TensorModel):
         """The mean of the next states (K, n) at K points (K, n), (K, m), without derivatives."""
         x, u = tensors_for(self, states, inputs)
         with torch.no_grad():
-            known, B = to_array(_nominal(self.nominal, x, u)), to_array(_effect(self.B, x))
+            known, B = (
+                to_array(_nominal(self.nominal, x, u)),
+                to_array(_effect(self.B, x)),
+            )
         features, selected, _ = self.features.linearize(states, inputs)
-        return known + (B @ self.residual.linearize(features, selected, False).mean[..., None])[..., 0]
+        return (
+            known
+            + (B @ self.residual.linearize(features, selected, False).mean[..., None])[
+                ..., 0
+            ]
+        )
 
-    def linearize(self, states: Array, inputs: Array, covariance: bool = True) -> Linearized:
+    def linearize(
+        self, states: Array, inputs: Array, covariance: bool = True
+    ) -> Linearized:
         """Linearises the model at K points (K, n), (K, m), by the chain rule around the GP's own ``linearize``.
 
         A nominal model or an effect with a method ``linearize``, such as ``Affine`` or ``CasadiFunction``, is
         linearised by it; any other by one batched call of torch autograd.
         """
-        nominal = self.nominal if hasattr(self.nominal, "linearize") else partial(_nominal, self.nominal)
+        nominal = (
+            self.nominal
+            if hasattr(self.nominal, "linearize")
+            else partial(_nominal, self.nominal)
+        )
         mean, A, G = linearize_function(nominal, self, states, inputs)
         features, selected, slope = self.features.linearize(states, inputs)
         d = self.residual.linearize(features, selected, covariance)
@@ -192,8 +246,16 @@ class ResidualModel(TensorModel):
         nominal, tape = self.nominal, getattr(self.nominal, "tape", None)
         if callable(self.B) or not (isinstance(nominal, Affine) or tape is not None):
             return None
-        A, G, c = (nominal.A, nominal.B, nominal.c) if isinstance(nominal, Affine) else (None, None, None)
-        states, inputs, angles = list(self.states), list(self.inputs), tuple(self.angles)
+        A, G, c = (
+            (nominal.A, nominal.B, nominal.c)
+            if isinstance(nominal, Affine)
+            else (None, None, None)
+        )
+        states, inputs, angles = (
+            list(self.states),
+            list(self.inputs),
+            tuple(self.angles),
+        )
         return AffineForm(self.residual, A, G, c, self.B, states, inputs, angles, tape)
 
 
@@ -201,9 +263,13 @@ def _nominal(nominal: Nominal, state: Tensor, input: Tensor) -> Tensor:
     """f0 (*batch, n), held against the rule that a wrong number of states would otherwise be broadcast."""
     value = nominal(state, input)
     if not isinstance(value, Tensor):
-        raise SettingError("nominal", f"must give a torch tensor; got {type(value).__name__}")
+        raise SettingError(
+            "nominal", f"must give a torch tensor; got {type(value).__name__}"
+        )
     if value.shape != state.shape:
-        what = f"nominal must give next states of the states' shape {tuple(state.shape)}"
+        what = (
+            f"nominal must give next states of the states' shape {tuple(state.shape)}"
+        )
         raise ShapeError(f"{what}; got {tuple(value.shape)}")
     return value
 
@@ -215,7 +281,9 @@ def _effect(B: Effect, state: Tensor) -> Tensor:
     if callable(B) and value.shape == rows:  # one output
         value = value[..., None]
     if value.shape[:-1] != rows:
-        raise ShapeError(f"B must be ({', '.join(map(str, rows))}, k), a row a state; got {tuple(value.shape)}")
+        raise ShapeError(
+            f"B must be ({', '.join(map(str, rows))}, k), a row a state; got {tuple(value.shape)}"
+        )
     return value
 
 
@@ -235,34 +303,65 @@ def train_residual(
     """
     check_transitions(transitions)
     if not hasattr(trainer, "fit"):
-        raise SettingError("trainer", f"must be a Trainer or SparseTrainer; got {trainer!r}")
+        raise SettingError(
+            "trainer", f"must be a Trainer or SparseTrainer; got {trainer!r}"
+        )
     n, m = transitions.state_dim, transitions.input_dim
     nominal = Affine.identity(n, m) if nominal is None else nominal
     B = torch.eye(n, dtype=torch.float64) if B is None else B
-    states, inputs = (list(range(k) if some is None else some) for some, k in ((states, n), (inputs, m)))
-    observed = _residuals(nominal, B, Features(states, inputs, list(angles), n, m), transitions)
+    states, inputs = (
+        list(range(k) if some is None else some)
+        for some, k in ((states, n), (inputs, m))
+    )
+    observed = _residuals(
+        nominal, B, Features(states, inputs, list(angles), n, m), transitions
+    )
     training, noise = trainer.fit(*observed, len(inputs), "value", seed), None
-    if callable(B):  # one covariance for all states: its mean over those that were observed
+    if callable(
+        B
+    ):  # one covariance for all states: its mean over those that were observed
         effect = _effect(B, transitions.states)
         noise = (effect @ training.posterior.noise_covariance @ effect.mT).mean(0)
-    model = ResidualModel(nominal, training.posterior, B, states, inputs, m, list(angles), noise)
+    model = ResidualModel(
+        nominal, training.posterior, B, states, inputs, m, list(angles), noise
+    )
     return replace(training, posterior=cast(Any, model))
 
 
 def _residuals(
-    nominal: Nominal, B: Effect, features: Features, transitions: Transitions, like: Tensor | None = None
+    nominal: Nominal,
+    B: Effect,
+    features: Features,
+    transitions: Transitions,
+    like: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Features (N, d) and targets (N, k) of the residual GP: the least-squares part of the error of f0."""
-    like = B if like is None and isinstance(B, Tensor) else transitions.states if like is None else like
+    like = (
+        B
+        if like is None and isinstance(B, Tensor)
+        else transitions.states
+        if like is None
+        else like
+    )
     to: dict[str, Any] = {"device": like.device, "dtype": like.dtype}
-    x, u, after = (t.to(**to) for t in (transitions.states, transitions.inputs, transitions.next_states))
+    x, u, after = (
+        t.to(**to)
+        for t in (transitions.states, transitions.inputs, transitions.next_states)
+    )
     effect = _effect(B, x)
     if int(torch.linalg.matrix_rank(effect).min()) < effect.shape[-1]:
-        raise SettingError("B", "must have linearly independent columns: equal effects cannot be distinguished")
+        raise SettingError(
+            "B",
+            "must have linearly independent columns: equal effects cannot be distinguished",
+        )
     missed = after - _nominal(nominal, x, u)
-    Q, R = torch.linalg.qr(effect)  # torch.linalg.lstsq gives other last digits from call to call
+    Q, R = torch.linalg.qr(
+        effect
+    )  # torch.linalg.lstsq gives other last digits from call to call
     if callable(B):
-        targets = torch.linalg.solve_triangular(R, Q.mT @ missed[..., None], upper=True)[..., 0]
+        targets = torch.linalg.solve_triangular(
+            R, Q.mT @ missed[..., None], upper=True
+        )[..., 0]
     else:
         targets = torch.linalg.solve_triangular(R, Q.mT @ missed.mT, upper=True).mT
     return torch.cat(features(x, u), dim=1), targets

@@ -8,7 +8,14 @@ import torch
 from gpmpc._compiled import call_unchecked
 from gpmpc._dynamics import Array, DynamicsModel, linearize, to_array
 from gpmpc._kernels import GPArrays
-from gpmpc._kernels.gp_rollout import COSINE, PLAIN, SINE, AffineGPs, Feedback, roll_out_gps
+from gpmpc._kernels.gp_rollout import (
+    COSINE,
+    PLAIN,
+    SINE,
+    AffineGPs,
+    Feedback,
+    roll_out_gps,
+)
 from gpmpc._kernels.tape import NO_TAPE
 from gpmpc.gp._backend import host_arrays
 from gpmpc.gp._posterior import AffineForm
@@ -30,25 +37,47 @@ class RollOut:
         elif getattr(model, "tape", None) is not None:
             self._gps = _known_form(model)
 
-    def __call__(self, start: Array, feedback: Feedback, disturbance: Array | None = None) -> tuple[Array, Array]:
+    def __call__(
+        self, start: Array, feedback: Feedback, disturbance: Array | None = None
+    ) -> tuple[Array, Array]:
         """Returns states (T, H + 1, n) and inputs (T, H, m) from x_0 (T, n) on; a disturbance (n,) is added at each."""
         (T, H, m), n = feedback.inputs.shape, start.shape[1]
         states, inputs = np.empty((T, H + 1, n)), np.empty((T, H, m))
         start = np.ascontiguousarray(start, dtype=float)
-        added = np.zeros(n) if disturbance is None else np.ascontiguousarray(disturbance, dtype=float)
+        added = (
+            np.zeros(n)
+            if disturbance is None
+            else np.ascontiguousarray(disturbance, dtype=float)
+        )
         if self._gps is not None:
-            call_unchecked(roll_out_gps, self._gps, feedback, start, added, states, inputs)
+            call_unchecked(
+                roll_out_gps, self._gps, feedback, start, added, states, inputs
+            )
             return states, inputs
         gains = np.broadcast_to(feedback.gains, (T, *feedback.gains.shape[1:]))
         states[:, 0], last = start, feedback.previous_input
         for k in range(H):
-            u = feedback.inputs[:, k] + (gains[:, k] @ (states[:, k] - feedback.states[:, k])[..., None])[..., 0]
-            u = np.minimum(np.maximum(u, last + feedback.rate_lower[k]), last + feedback.rate_upper[k])
-            last = inputs[:, k] = np.minimum(np.maximum(u, feedback.lower[k]), feedback.upper[k])
-            states[:, k + 1] = self._mean(np.ascontiguousarray(states[:, k]), last) + added
+            u = (
+                feedback.inputs[:, k]
+                + (gains[:, k] @ (states[:, k] - feedback.states[:, k])[..., None])[
+                    ..., 0
+                ]
+            )
+            u = np.minimum(
+                np.maximum(u, last + feedback.rate_lower[k]),
+                last + feedback.rate_upper[k],
+            )
+            last = inputs[:, k] = np.minimum(
+                np.maximum(u, feedback.lower[k]), feedback.upper[k]
+            )
+            states[:, k + 1] = (
+                self._mean(np.ascontiguousarray(states[:, k]), last) + added
+            )
         return states, inputs
 
-    def open_loop(self, start: Array, inputs: Array, disturbance: Array | None = None) -> Array:
+    def open_loop(
+        self, start: Array, inputs: Array, disturbance: Array | None = None
+    ) -> Array:
         """Returns the states (T, H + 1, n) that inputs (T, H, m) lead to from x_0 (T, n), without bounds."""
         (T, H, m), n = inputs.shape, start.shape[1]
         gains, free = np.zeros((1, H, m, n)), np.full((H, m), np.inf)
@@ -71,16 +100,24 @@ def _compiled_form(form: AffineForm, n: int, m: int) -> AffineGPs:
     kinds[features.sines], kinds[features.sines + 1] = SINE, COSINE
     zero, shapes = torch.zeros((), dtype=torch.float64), ((n, n), (n, m), (n,))
     parts = zip((form.A, form.G, form.c), shapes, strict=True)
-    A, G, c = (to_array((zero if part is None else part).expand(shape).contiguous()) for part, shape in parts)
+    A, G, c = (
+        to_array((zero if part is None else part).expand(shape).contiguous())
+        for part, shape in parts
+    )
     B = np.eye(n) if form.B is None else to_array(form.B)
     places = features.columns, kinds, np.array(inputs, dtype=np.intp)
     tape = NO_TAPE if form.tape is None else form.tape
-    return AffineGPs(form.f.packed.arrays, to_array(form.f.offset), A, G, c, B, *places, tape)
+    return AffineGPs(
+        form.f.packed.arrays, to_array(form.f.offset), A, G, c, B, *places, tape
+    )
 
 
 def _known_form(model: Any) -> AffineGPs:
     """The arrays of a tape alone, without a GP."""
     n, m, none = model.state_dim, model.input_dim, np.empty((0, 0))
-    nothing, empty = GPArrays(none, none, np.empty(0), none, 0), np.empty(0, dtype=np.intp)
+    nothing, empty = (
+        GPArrays(none, none, np.empty(0), none, 0),
+        np.empty(0, dtype=np.intp),
+    )
     affine = np.zeros((n, n)), np.zeros((n, m)), np.zeros(n), np.empty((n, 0))
     return AffineGPs(nothing, np.empty(0), *affine, empty, empty, empty, model.tape)

@@ -23,15 +23,25 @@ from torch import Tensor
 from gpmpc._files import existing_file, new_file
 from gpmpc.exceptions import DataError, GpmpcError, UnsupportedModel
 from gpmpc.gp import GPPosterior, load_metadata
-from gpmpc.gp._storage import posterior_of_parts, posterior_parts, read_model, write_model
+from gpmpc.gp._storage import (
+    posterior_of_parts,
+    posterior_parts,
+    read_model,
+    write_model,
+)
 from gpmpc.models._nominal import Affine, CasadiFunction
 from gpmpc.models._residual import ResidualModel
 from gpmpc.models._wrapper import DelayedModel, DisturbedModel, NoisyModel
 
-_MODELS = {model.__name__: model for model in (GPPosterior, ResidualModel, DelayedModel, DisturbedModel, NoisyModel)}
+_MODELS = {
+    model.__name__: model
+    for model in (GPPosterior, ResidualModel, DelayedModel, DisturbedModel, NoisyModel)
+}
 
 
-def save_model(model: Any, path: str | Path, metadata: Mapping[str, Any] | None = None) -> None:
+def save_model(
+    model: Any, path: str | Path, metadata: Mapping[str, Any] | None = None
+) -> None:
     """Writes a model of this package to one file, in one piece or not at all.
 
     Args:
@@ -65,7 +75,9 @@ def load_model(path: str | Path) -> Any:
         return _built(path, header | {"kind": kind}, tensors)
     except (GpmpcError, AttributeError, KeyError, TypeError) as error:
         text = f"{path}: not a consistent model ({error})"
-        raise (error if str(error).startswith(str(path)) else DataError(text)) from error
+        raise (
+            error if str(error).startswith(str(path)) else DataError(text)
+        ) from error
 
 
 def _parts(path: Path, model: Any) -> tuple[dict[str, Any], dict[str, Tensor]]:
@@ -102,11 +114,18 @@ def _built(path: Path, header: Any, tensors: Mapping[str, Tensor]) -> Any:
     parts: dict[str, Any] = {}
     for name in (field.name for field in fields(model)):
         entry = header.get(name)
-        inner = {key.partition("/")[2]: value for key, value in tensors.items() if key.startswith(f"{name}/")}
+        inner = {
+            key.partition("/")[2]: value
+            for key, value in tensors.items()
+            if key.startswith(f"{name}/")
+        }
         if isinstance(entry, dict) and entry.get("kind") in _MODELS:
             parts[name] = _built(path, entry, inner)
             continue
-        if not all(bool(torch.isfinite(part).all()) for part in (*inner.values(), tensors.get(name, torch.zeros(1)))):
+        if not all(
+            bool(torch.isfinite(part).all())
+            for part in (*inner.values(), tensors.get(name, torch.zeros(1)))
+        ):
             raise DataError("the numbers beside the inner model must be finite")
         if isinstance(entry, dict):
             parts[name] = _function(name, entry, inner)
@@ -123,17 +142,28 @@ def _described(key: str, function: Any, tensors: dict[str, Tensor]) -> dict[str,
     """A function's header: its operations, which go to the tensors, or where it is imported from."""
     tape = function.tape if isinstance(function, CasadiFunction) else None
     if tape is not None and np.isfinite(tape.constants).all():
-        tensors |= {part: torch.as_tensor(getattr(tape, part)).double() for part in ("code", "constants")}
+        tensors |= {
+            part: torch.as_tensor(getattr(tape, part)).double()
+            for part in ("code", "constants")
+        }
         return {"kind": "operations", "sizes": function.sizes, "shape": function.shape}
     kind, source, parameters = "function", function, {}
     if isinstance(function, partial) and not function.args:
         kind, source, parameters = "partial", function.func, dict(function.keywords)
     elif is_dataclass(function) and not isinstance(function, type):
         kind, source = "dataclass", type(function)
-        parameters = {field.name: getattr(function, field.name) for field in fields(function) if field.init}
+        parameters = {
+            field.name: getattr(function, field.name)
+            for field in fields(function)
+            if field.init
+        }
     path = f"{getattr(source, '__module__', '')}:{getattr(source, '__qualname__', '')}"
     found = None if path.startswith("__main__") else _imported(path)
-    if found is None or found is not source or any(isinstance(value, Tensor) for value in parameters.values()):
+    if (
+        found is None
+        or found is not source
+        or any(isinstance(value, Tensor) for value in parameters.values())
+    ):
         raise UnsupportedModel(
             f"{key} is code that a file cannot name: {function!r}. It can be saved as a function of a module, a "
             "functools.partial of one with keyword arguments, a dataclass of numbers with __call__, or a "
@@ -148,16 +178,30 @@ def _function(key: str, entry: Mapping[str, Any], tensors: Mapping[str, Tensor])
         from gpmpc.gp.casadi_ import function_of_tape  # loads CasADi
 
         code, constants = (tensors[part].numpy() for part in ("code", "constants"))
-        return CasadiFunction(function_of_tape(code, constants, entry["sizes"], entry["shape"]))
+        return CasadiFunction(
+            function_of_tape(code, constants, entry["sizes"], entry["shape"])
+        )
     kind, parameters = entry["kind"], entry["parameters"]
     source: Any = _imported(entry["path"])
-    right = isinstance(source, type) and is_dataclass(source) if kind == "dataclass" else type(source) is FunctionType
-    if not right or kind not in ("function", "partial", "dataclass", "casadi") or not isinstance(parameters, dict):
-        raise DataError(f"{key} {entry['path']!r} is no {kind} that can be imported here")
+    right = (
+        isinstance(source, type) and is_dataclass(source)
+        if kind == "dataclass"
+        else type(source) is FunctionType
+    )
+    if (
+        not right
+        or kind not in ("function", "partial", "dataclass", "casadi")
+        or not isinstance(parameters, dict)
+    ):
+        raise DataError(
+            f"{key} {entry['path']!r} is no {kind} that can be imported here"
+        )
     if kind in ("function", "partial"):
         return partial(source, **parameters) if kind == "partial" else source
     made = source(**parameters)
-    return made if kind == "dataclass" else CasadiFunction(made)  # as older files name what makes it
+    return (
+        made if kind == "dataclass" else CasadiFunction(made)
+    )  # as older files name what makes it
 
 
 def _imported(path: str) -> Any:

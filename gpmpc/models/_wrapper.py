@@ -81,17 +81,32 @@ class _LinearWrapper(Wrapper):
         mean = pad(moved.mean, (0, self.state_dim - n)) + state @ L.mT + input @ M.mT
         return Gaussian(mean, self._padded(moved.covariance))
 
-    def linearize(self, states: Array, inputs: Array, covariance: bool = True) -> Linearized:
+    def linearize(
+        self, states: Array, inputs: Array, covariance: bool = True
+    ) -> Linearized:
         """Linearises the model at K points (K, k), (K, m), by the inner model's ``linearize``."""
         n, K, (Z, W, L, M) = self.model.state_dim, len(states), self.matrices
-        inner = linearize(self.model, np.ascontiguousarray(states[:, :n]), states @ Z.T + inputs @ W.T, covariance)
-        mean, A, B = states @ L.T + inputs @ M.T, np.tile(L, (K, 1, 1)), np.tile(M, (K, 1, 1))
+        inner = linearize(
+            self.model,
+            np.ascontiguousarray(states[:, :n]),
+            states @ Z.T + inputs @ W.T,
+            covariance,
+        )
+        mean, A, B = (
+            states @ L.T + inputs @ M.T,
+            np.tile(L, (K, 1, 1)),
+            np.tile(M, (K, 1, 1)),
+        )
         mean[:, :n] += inner.mean
         A[:, :n] += inner.B @ Z
         A[:, :n, :n] += inner.A
         B[:, :n] += inner.B @ W
         more = self.state_dim - n
-        V = None if inner.covariance is None else np.pad(inner.covariance, ((0, 0), (0, more), (0, more)))
+        V = (
+            None
+            if inner.covariance is None
+            else np.pad(inner.covariance, ((0, 0), (0, more), (0, more)))
+        )
         return Linearized(mean, A, B, V)
 
     def _padded(self, covariance: Tensor) -> Tensor:
@@ -149,9 +164,17 @@ class DelayedModel(_LinearWrapper):
     def matrices(self) -> tuple[Array, Array, Array, Array]:
         """Of the linear part: a mean of the two oldest inputs acts, and the others move on by a place."""
         (n, m), D, w = (self.model.state_dim, self.input_dim), self.pending, self._share
-        every = np.eye((D + 1) * m)  # of the inputs on their way and the one before them
-        acting, moved = w * every[:m] + (1 - w) * every[m : 2 * m], np.vstack([np.zeros((n, len(every))), every[m:]])
-        Z, L = (np.hstack([np.zeros((len(part), n)), part[:, : D * m]]) for part in (acting, moved))
+        every = np.eye(
+            (D + 1) * m
+        )  # of the inputs on their way and the one before them
+        acting, moved = (
+            w * every[:m] + (1 - w) * every[m : 2 * m],
+            np.vstack([np.zeros((n, len(every))), every[m:]]),
+        )
+        Z, L = (
+            np.hstack([np.zeros((len(part), n)), part[:, : D * m]])
+            for part in (acting, moved)
+        )
         return Z, acting[:, D * m :], L, moved[:, D * m :]
 
     def augmented(self, belief: Gaussian, inputs: Any) -> Gaussian:
@@ -160,8 +183,14 @@ class DelayedModel(_LinearWrapper):
         Raises:
             ShapeError: Another number of inputs.
         """
-        queue = self._queue(belief, inputs).flatten(-2).expand(*belief.mean.shape[:-1], self.pending * self.input_dim)
-        return Gaussian(torch.cat([belief.mean, queue], dim=-1), self._padded(belief.covariance))
+        queue = (
+            self._queue(belief, inputs)
+            .flatten(-2)
+            .expand(*belief.mean.shape[:-1], self.pending * self.input_dim)
+        )
+        return Gaussian(
+            torch.cat([belief.mean, queue], dim=-1), self._padded(belief.covariance)
+        )
 
     @cached_property
     def remaining(self) -> DynamicsModel:
@@ -183,12 +212,22 @@ class DelayedModel(_LinearWrapper):
         """
         queue, w = self._queue(belief, inputs), self._share
         for k in range(self.lead):
-            belief = propagator(self.model, belief, queue[k] if w == 1 else w * queue[k] + (1 - w) * queue[k + 1])
-        return belief if w == 1 else DelayedModel(self.model, w).augmented(belief, queue[-1:])
+            belief = propagator(
+                self.model,
+                belief,
+                queue[k] if w == 1 else w * queue[k] + (1 - w) * queue[k + 1],
+            )
+        return (
+            belief
+            if w == 1
+            else DelayedModel(self.model, w).augmented(belief, queue[-1:])
+        )
 
     def _queue(self, belief: Gaussian, inputs: Any) -> Tensor:
         given = np.asarray(inputs) if not isinstance(inputs, Tensor) else inputs
-        queue = torch.as_tensor(given, dtype=belief.mean.dtype, device=belief.mean.device)
+        queue = torch.as_tensor(
+            given, dtype=belief.mean.dtype, device=belief.mean.device
+        )
         if queue.shape != (shape := (self.pending, self.input_dim)):
             what = f"a delay of {self.delay:g} steps needs the last inputs {shape}, the oldest first"
             raise ShapeError(f"{what}; got {tuple(queue.shape)}")
@@ -214,14 +253,20 @@ class DisturbedModel(_LinearWrapper):
 
     model: DynamicsModel  #: without them, of n states
     effect: Tensor  #: E, by how much each moves the states within a step (n, q), in the model's type
-    std: Sequence[float]  #: standard deviations of w, by how much each changes from step to step (q,)
-    decay: Sequence[float] = ()  #: diagonal of Phi (q,): by default 1, a constant; less in size for an AR(1) process
+    std: Sequence[
+        float
+    ]  #: standard deviations of w, by how much each changes from step to step (q,)
+    decay: Sequence[
+        float
+    ] = ()  #: diagonal of Phi (q,): by default 1, a constant; less in size for an AR(1) process
 
     def __post_init__(self) -> None:
         n, _ = check_next_states(self.model)
         check_tensors(effect=self.effect)
         if self.effect.dim() != 2 or len(self.effect) != n:
-            raise ShapeError(f"effect must be ({n}, q), a row a state; got {tuple(self.effect.shape)}")
+            raise ShapeError(
+                f"effect must be ({n}, q), a row a state; got {tuple(self.effect.shape)}"
+            )
         check_like("effect", self.effect, self.model)
         q = self.effect.shape[1]
         check_numbers("std", self.std, q, least=0)
@@ -258,7 +303,9 @@ class DisturbedModel(_LinearWrapper):
         return Gaussian(pad(belief.mean, (0, q)), self._padded(belief.covariance) + own)
 
     def _diagonal(self, std: Sequence[float]) -> Tensor:
-        return torch.diag(torch.as_tensor(list(std), dtype=self.dtype, device=self.device).square())
+        return torch.diag(
+            torch.as_tensor(list(std), dtype=self.dtype, device=self.device).square()
+        )
 
 
 @dataclass(frozen=True)
@@ -280,7 +327,9 @@ class NoisyModel(Wrapper):
 
     model: DynamicsModel  #: f, of n states and m inputs
     log_noise: GPPosterior  #: g, over (x, u), with ``predicts="value"``: an output each
-    outputs: Sequence[int]  #: the states whose noise g describes, in its order; the others keep that of the model
+    outputs: Sequence[
+        int
+    ]  #: the states whose noise g describes, in its order; the others keep that of the model
 
     to = move
 
@@ -288,14 +337,27 @@ class NoisyModel(Wrapper):
         (n, m), g, outputs = check_next_states(self.model), self.log_noise, self.outputs
         if getattr(g, "predicts", None) != "value":
             got = repr(g.predicts) if isinstance(g, GPPosterior) else type(g).__name__
-            raise SettingError("log_noise", f"must be a GPPosterior, and must predict 'value'; got {got}")
+            raise SettingError(
+                "log_noise",
+                f"must be a GPPosterior, and must predict 'value'; got {got}",
+            )
         check_like("log_noise", g, self)
-        if not hasattr(outputs, "__len__") or not outputs or not all(type(i) is int for i in outputs):
-            raise SettingError("outputs", f"must be a list of whole numbers; got {outputs!r}")
+        if (
+            not hasattr(outputs, "__len__")
+            or not outputs
+            or not all(type(i) is int for i in outputs)
+        ):
+            raise SettingError(
+                "outputs", f"must be a list of whole numbers; got {outputs!r}"
+            )
         if len(set(outputs)) < len(outputs) or not set(outputs) <= set(range(n)):
-            raise SettingError("outputs", f"must be distinct, of 0 .. {n - 1}; got {list(outputs)}")
+            raise SettingError(
+                "outputs", f"must be distinct, of 0 .. {n - 1}; got {list(outputs)}"
+            )
         if (found := (g.state_dim, g.input_dim, g.output_dim)) != (n, m, len(outputs)):
-            raise ShapeError(f"log_noise must have {n} states, {m} inputs and {len(outputs)} outputs; got {found}")
+            raise ShapeError(
+                f"log_noise must have {n} states, {m} inputs and {len(outputs)} outputs; got {found}"
+            )
 
     @property
     def noise_covariance(self) -> Tensor:
@@ -305,27 +367,35 @@ class NoisyModel(Wrapper):
     def noise(self, state: Tensor, input: Tensor) -> Tensor:
         """Covariance of the noise at x (*batch, n) and u (*batch, m), (*batch, n, n)."""
         g = self.log_noise.predict(state, input)
-        return self._constant + torch.diag_embed((g.mean + g.variance / 2).exp() @ self._places)
+        return self._constant + torch.diag_embed(
+            (g.mean + g.variance / 2).exp() @ self._places
+        )
 
     def predict(self, state: Tensor, input: Tensor) -> Gaussian:
         """The next state's distribution at x (*batch, n) and u (*batch, m), with the noise."""
         belief = self.model.predict(state, input)
         return Gaussian(belief.mean, belief.covariance + self.noise(state, input))
 
-    def linearize(self, states: Array, inputs: Array, covariance: bool = True) -> Linearized:
+    def linearize(
+        self, states: Array, inputs: Array, covariance: bool = True
+    ) -> Linearized:
         """Linearises f at K points (K, n), (K, m); with the noise in the covariance."""
         found = linearize(self.model, states, inputs, covariance)
         if found.covariance is None:
             return found
         g, at = self.log_noise.linearize(states, inputs), list(self.outputs)
         V = found.covariance + to_array(self._constant)
-        V[:, at, at] += np.exp(g.mean + np.einsum("kii->ki", cast(Array, g.covariance)) / 2)
+        V[:, at, at] += np.exp(
+            g.mean + np.einsum("kii->ki", cast(Array, g.covariance)) / 2
+        )
         return found._replace(covariance=V)
 
     @cached_property
     def _places(self) -> Tensor:
         """Rows of the identity (k, n)."""
-        return torch.eye(self.state_dim, dtype=self.dtype, device=self.device)[list(self.outputs)]
+        return torch.eye(self.state_dim, dtype=self.dtype, device=self.device)[
+            list(self.outputs)
+        ]
 
     @cached_property
     def _constant(self) -> Tensor:
@@ -338,4 +408,6 @@ def check_like(name: str, part: Any, model: Any) -> None:
     """Raises ``SettingError`` unless a part of a model has its type and is on its device."""
     if (part.dtype, part.device) != (model.dtype, model.device):
         got = f"{part.dtype} on {part.device}"
-        raise SettingError(name, f"must be {model.dtype} on {model.device} like the model; got {got}")
+        raise SettingError(
+            name, f"must be {model.dtype} on {model.device} like the model; got {got}"
+        )

@@ -47,13 +47,29 @@ _LARGEST_GROWTH = 3e7  # quadrotors over 100 stages have 2e7; in doubled precisi
 
 
 def condense(
-    cost: QuadraticCost, bounds: InputBounds, stages: Stages, start: Array, references: References, rows: StageRows
+    cost: QuadraticCost,
+    bounds: InputBounds,
+    stages: Stages,
+    start: Array,
+    references: References,
+    rows: StageRows,
 ) -> CondensedProgram:
     """Makes the program in the coordinates that suit it; ``expand`` gives inputs and states of its solution."""
-    for array in (*stages, start, rows.E, rows.D, references.states, cost.squares):  # the kernel ignores strides
+    for array in (
+        *stages,
+        start,
+        rows.E,
+        rows.D,
+        references.states,
+        cost.squares,
+    ):  # the kernel ignores strides
         if not array.flags.c_contiguous:
             raise ShapeError("stages, rows and references must be contiguous arrays")
-    (p, m), size, count = stages.B.shape[1:], bounds.lower.size, bounds.rate_lower.size + rows.lower.size
+    (p, m), size, count = (
+        stages.B.shape[1:],
+        bounds.lower.size,
+        bounds.rate_lower.size + rows.lower.size,
+    )
     lower, upper = np.empty((2, size + count))
     P, q, G = np.empty((size, size)), np.empty(size), np.empty((count, size))
     program = CondensedProgram(P, q, G, lower, upper, np.empty((0, m, p + m + 1)))
@@ -66,10 +82,19 @@ def condense(
 @compiled
 def _condense(cost, bounds, stages, start, references, rows, program):
     """Writes the program in input coordinates, and returns the growth of A: P_ii over the last stage's, summed."""
-    (H, m), first, P, G, growth = bounds.lower.shape, bounds.rate_lower.size, program.P, program.G, 0.0
+    (H, m), first, P, G, growth = (
+        bounds.lower.shape,
+        bounds.rate_lower.size,
+        program.P,
+        program.G,
+        0.0,
+    )
     P[:], G[:] = 0.0, 0.0
     for k in range(H):
-        R, following = cost.input[min(k, len(cost.input) - 1)], cost.input[min(k + 1, len(cost.input) - 1)]
+        R, following = (
+            cost.input[min(k, len(cost.input) - 1)],
+            cost.input[min(k + 1, len(cost.input) - 1)],
+        )
         for i in range(m):
             for j in range(m):
                 P[k * m + i, k * m + j] = 2.0 * R[i, j]
@@ -94,13 +119,20 @@ def _condense(cost, bounds, stages, start, references, rows, program):
 @njit_inner
 def _add_varying_stages(cost, stages, rows, H, P, G):
     """Adds 2 Gamma' W Gamma to P, and writes E Gamma to G; whole registers at a time, in padded copies."""
-    (p, m), n, last, Z = stages.B.shape[1:], cost.terminal.shape[1], len(stages.A) - 1, cost.squares
+    (p, m), n, last, Z = (
+        stages.B.shape[1:],
+        cost.terminal.shape[1],
+        len(stages.A) - 1,
+        cost.squares,
+    )
     E, D = rows.E, rows.D
     r = E.shape[1]
     M, MA, MB = _zeros(p, p), _zeros(p, p), _zeros(p, m)
     A, transposed, B = _zeros(p, p), np.empty((p, p)), _zeros(p, m)
     BM = np.empty((H, m, p))  # 2 B_k' M_{k+1}
-    for k in range(H - 1, -1, -1):  # backward: M_{k+1} = W_{k+1} + A' M A, the second part is there already
+    for k in range(
+        H - 1, -1, -1
+    ):  # backward: M_{k+1} = W_{k+1} + A' M A, the second part is there already
         at = min(k, last)
         add_blocks(weight_of_stage(cost, k, H), M)
         add_blocks(Z[k : k + 1, :n, :n], M)
@@ -157,7 +189,11 @@ def _add_constant_stages(cost, stages, E, H, P, G):
     """``_add_varying_stages`` for one A, B and E."""
     (p, m), r, size = stages.B.shape[1:], len(E), len(P)
     X, transposed = _zeros(size, p), _zeros(p, p)  # row l m + a of X: column a of A^l B
-    W, T, same = _padded(cost.state[0]), _padded(cost.terminal), np.array_equal(cost.state[0], cost.terminal)
+    W, T, same = (
+        _padded(cost.state[0]),
+        _padded(cost.terminal),
+        np.array_equal(cost.state[0], cost.terminal),
+    )
     for i in range(p):
         for j in range(p):
             transposed[j, i] = stages.A[0, i, j]
@@ -165,7 +201,11 @@ def _add_constant_stages(cost, stages, E, H, P, G):
             X[a, i] = stages.B[0, i, a]
     for row in range(m, size):
         combine_rows(transposed, p, X[row - m], 0, p, X[row])
-    strip, stage, end = _zeros(p, size + 8), _zeros(1, size + 8)[0], _zeros(1, size + 8)[0]
+    strip, stage, end = (
+        _zeros(p, size + 8),
+        _zeros(1, size + 8)[0],
+        _zeros(1, size + 8)[0],
+    )
     for row in range(size):
         for i in range(p):
             strip[i, row] = X[row, i]
@@ -182,7 +222,9 @@ def _add_constant_stages(cost, stages, E, H, P, G):
             ends, total, out = stage if same else end, sums[a], P[j * m + a]
             for d in range(j + 1):
                 for b in range(m):
-                    out[(j - d) * m + b] += 2.0 * (total[d * m + b] + ends[start + d * m + b])
+                    out[(j - d) * m + b] += 2.0 * (
+                        total[d * m + b] + ends[start + d * m + b]
+                    )
             for i in range(size - start):
                 total[i] += stage[start + i]
     for e in range(r):
@@ -197,13 +239,25 @@ def _add_constant_stages(cost, stages, E, H, P, G):
 @njit_inner
 def _write_gradient_and_bounds(cost, bounds, stages, start, references, rows, program):
     """Writes q by the adjoint recursion, and the bounds of the stacked constraints, in input coordinates."""
-    A, B, Z, targets, last = stages.A, stages.B, cost.squares, references.states, len(stages.A) - 1
+    A, B, Z, targets, last = (
+        stages.A,
+        stages.B,
+        cost.squares,
+        references.states,
+        len(stages.A) - 1,
+    )
     (H, m), n, p = references.inputs.shape, targets.shape[1], len(start)
-    q, previous, free = program.q.reshape(H, m), references.previous_input, np.empty((H + 1, p))
+    q, previous, free = (
+        program.q.reshape(H, m),
+        references.previous_input,
+        np.empty((H + 1, p)),
+    )
     copy(start, free[0])
     for k in range(H):
         for i in range(p):
-            free[k + 1, i] = stages.c[min(k, last), i] + dot(A[min(k, last), i], free[k], p)
+            free[k + 1, i] = stages.c[min(k, last), i] + dot(
+                A[min(k, last), i], free[k], p
+            )
     q[:] = 0.0
     W = _padded(cost.state[0])
     error, gradient, pulled = np.empty(p), np.zeros(p + 8), np.zeros(p)
@@ -219,7 +273,13 @@ def _write_gradient_and_bounds(cost, bounds, stages, start, references, rows, pr
         copy(free[k + 1], error)
         for i in range(n):
             error[i] -= targets[k, i]
-        _weigh(W if len(cost.state) == 1 and k < H - 1 else _padded(weight_of_stage(cost, k, H)), error, gradient)
+        _weigh(
+            W
+            if len(cost.state) == 1 and k < H - 1
+            else _padded(weight_of_stage(cost, k, H)),
+            error,
+            gradient,
+        )
         for i in range(p):
             gradient[i] = 2.0 * gradient[i] + pulled[i]
         for i in range(n + m if len(Z) > 0 else 0):
@@ -246,7 +306,11 @@ def condense_with_feedback(cost, bounds, stages, start, references, rows):
     size, count = H * m, H * m + limited + H * r
     feedback, hessians = optimal_feedback(cost, stages, references)
     P, G = np.zeros((size, size)), np.zeros((count, size))
-    reach, following, factors = _zeros(p + m, size), _zeros(p, size), np.empty(p + m)  # of s_k and u_{k-1}; of s_{k+1}
+    reach, following, factors = (
+        _zeros(p + m, size),
+        _zeros(p, size),
+        np.empty(p + m),
+    )  # of s_k and u_{k-1}; of s_{k+1}
     inputs = _zeros(m, size)  # of u_k
     for k in range(H):
         at, here, width = min(k, len(stages.A) - 1), k * m, (k + 1) * m
@@ -274,7 +338,11 @@ def condense_with_feedback(cost, bounds, stages, start, references, rows):
             combine_rows(reach, p + m, factors, 0, width, inputs[0])
             copy(inputs[0], G[size + limited + k * r + e, :width])
             inputs[0, here:width] = 0.0
-    previous, lower, upper = references.previous_input, np.full(size + count, -np.inf), np.full(size + count, np.inf)
+    previous, lower, upper = (
+        references.previous_input,
+        np.full(size + count, -np.inf),
+        np.full(size + count, np.inf),
+    )
     program = CondensedProgram(P, np.zeros(size), G, lower, upper, feedback)
     free_inputs, free = expand(stages, start, feedback, previous, program.q)
     _write_bounds(bounds, rows, free_inputs, free, previous, size, program)
@@ -290,13 +358,22 @@ def _write_bounds(bounds, rows, inputs, states, previous_input, unbounded, progr
     for k in range(H):
         for i in range(m):
             at = unbounded + k * m + i
-            lower[at], upper[at] = bounds.lower[k, i] - inputs[k, i], bounds.upper[k, i] - inputs[k, i]
+            lower[at], upper[at] = (
+                bounds.lower[k, i] - inputs[k, i],
+                bounds.upper[k, i] - inputs[k, i],
+            )
             if limited > 0:
                 rate = inputs[k, i] - (inputs[k - 1, i] if k > 0 else previous_input[i])
                 at = first + k * m + i
-                lower[at], upper[at] = bounds.rate_lower[k, i] - rate, bounds.rate_upper[k, i] - rate
+                lower[at], upper[at] = (
+                    bounds.rate_lower[k, i] - rate,
+                    bounds.rate_upper[k, i] - rate,
+                )
         for e in range(r):
-            at, value = first + limited + k * r + e, dot(E[min(k, len(E) - 1), e], states[k + 1], E.shape[2])
+            at, value = (
+                first + limited + k * r + e,
+                dot(E[min(k, len(E) - 1), e], states[k + 1], E.shape[2]),
+            )
             value += dot(D[k, e], inputs[k], m) if len(D) > 0 else 0.0
             lower[at], upper[at] = rows.lower[k, e] - value, rows.upper[k, e] - value
 

@@ -12,7 +12,13 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from gpmpc._compiled import call_unchecked, compiled, njit_inner
-from gpmpc.exceptions import DataError, SettingError, ShapeError, check_number, check_numbers
+from gpmpc.exceptions import (
+    DataError,
+    SettingError,
+    ShapeError,
+    check_number,
+    check_numbers,
+)
 from gpmpc.gaussian import Gaussian
 from gpmpc.mpc._linear_quadratic import References
 from gpmpc.mpc.problem import Problem
@@ -42,24 +48,37 @@ class Reference:
     kappas: Array | None = None
 
     def __post_init__(self) -> None:
-        shape, wide = np.shape(self.states), None if self.inputs is None else np.shape(self.inputs)
+        shape, wide = (
+            np.shape(self.states),
+            None if self.inputs is None else np.shape(self.inputs),
+        )
         if len(shape) == 1:
             if wide is not None and len(wide) != 1:
                 raise ShapeError(f"inputs of a set point must be (m,); got {wide}")
             return
         if len(shape) != 2 or shape[0] < 2:
-            raise ShapeError(f"reference states must be (H + 1, n), H of 1 or more; got {shape}")
+            raise ShapeError(
+                f"reference states must be (H + 1, n), H of 1 or more; got {shape}"
+            )
         if wide is not None and (len(wide) != 2 or wide[0] != shape[0] - 1):
-            raise ShapeError(f"reference inputs must be ({shape[0] - 1}, m); got {wide}")
+            raise ShapeError(
+                f"reference inputs must be ({shape[0] - 1}, m); got {wide}"
+            )
         if self.kappas is not None and np.shape(self.kappas) != (self.horizon,):
-            raise ShapeError(f"kappas must be ({self.horizon},); got {np.shape(self.kappas)}")
+            raise ShapeError(
+                f"kappas must be ({self.horizon},); got {np.shape(self.kappas)}"
+            )
 
     def over(self, horizon: int) -> "Reference":
         """The reference itself, or a set point repeated over a horizon."""
         if np.ndim(self.states) == 2:
             return self
-        inputs = None if self.inputs is None else np.tile(_array(self.inputs), (horizon, 1))
-        return Reference(np.tile(_array(self.states), (horizon + 1, 1)), inputs, self.kappas)
+        inputs = (
+            None if self.inputs is None else np.tile(_array(self.inputs), (horizon, 1))
+        )
+        return Reference(
+            np.tile(_array(self.states), (horizon + 1, 1)), inputs, self.kappas
+        )
 
     @property
     def horizon(self) -> int:
@@ -93,7 +112,9 @@ class Decision:
     iterations: int  #: of the solver
     timing: Timing  #: of the parts
     problem: QuadraticProgram | None = None  #: that was solved last, where there is one
-    solution: QPSolution | None = None  #: of it: active set, multipliers, residuals; a warm start for the next
+    solution: QPSolution | None = (
+        None  #: of it: active set, multipliers, residuals; a warm start for the next
+    )
     #: estimate of the model's constant error (n,), added to its mean at every stage; None where nothing is estimated
     disturbance: Array | None = None
     #: the solve stopped short of its tolerance, at a limit say, with a plan that keeps its bounds and that steps
@@ -107,7 +128,9 @@ class Decision:
     learned: Any = None
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "input", np.array(self.input, dtype=float))  # no view of the plan
+        object.__setattr__(
+            self, "input", np.array(self.input, dtype=float)
+        )  # no view of the plan
 
     @property
     def applicable(self) -> bool:
@@ -125,7 +148,11 @@ class Decision:
 
         Zero but for rounding where all are kept; NaN without a program.
         """
-        return math.nan if self.solution is None else float(self.solution.violation().max(initial=0.0))
+        return (
+            math.nan
+            if self.solution is None
+            else float(self.solution.violation().max(initial=0.0))
+        )
 
 
 class Controller(Protocol):
@@ -136,7 +163,9 @@ class Controller(Protocol):
         """H, how far it looks ahead."""
         ...
 
-    def control(self, belief: Gaussian, reference: Reference, previous: Decision | None = None) -> Decision:
+    def control(
+        self, belief: Gaussian, reference: Reference, previous: Decision | None = None
+    ) -> Decision:
         """Decides the input for one step.
 
         Args:
@@ -156,12 +185,20 @@ class Request(NamedTuple):
     #: inputs (H, m) within their bounds: those handed over; else the last plan's, one step on, the last one repeated;
     #: else the previous input repeated
     initial_guess: Array
-    finite: bool  # whether the belief is; one that is not is a bad measurement, not misuse
-    disturbance: Array | None = None  # added to the model's mean at every stage (n,); None where nothing is estimated
+    finite: (
+        bool  # whether the belief is; one that is not is a bad measurement, not misuse
+    )
+    disturbance: Array | None = (
+        None  # added to the model's mean at every stage (n,); None where nothing is estimated
+    )
     parameters: Array | None = None  # of the smooth constraints, by stage (H, q)
     kappas: Array | None = None  # of the reference (H,), where it has some
-    previous: Decision | None = None  # the last one, where its plan may be started from and has this horizon
-    states: Array | None = None  # a first guess of x_0 .. x_H (H + 1, n), where one was handed over
+    previous: Decision | None = (
+        None  # the last one, where its plan may be started from and has this horizon
+    )
+    states: Array | None = (
+        None  # a first guess of x_0 .. x_H (H + 1, n), where one was handed over
+    )
 
     @classmethod
     def read(
@@ -185,15 +222,34 @@ class Request(NamedTuple):
                 f"got {type(belief).__name__} and {type(reference).__name__}"
             )
         reference, n, m = reference.over(horizon), problem.state_dim, problem.input_dim
-        state, covariance, states = _array(belief.mean), _array(belief.covariance), _array(reference.states)
+        state, covariance, states = (
+            _array(belief.mean),
+            _array(belief.covariance),
+            _array(reference.states),
+        )
         if state.shape != (n,) or states.shape != (horizon + 1, n):
             expected = f"({n},) and ({horizon + 1}, {n})"
-            raise ShapeError(f"state and reference must have shapes {expected}; got {state.shape} and {states.shape}")
-        inputs = np.zeros((horizon, m)) if reference.inputs is None else _array(reference.inputs)
+            raise ShapeError(
+                f"state and reference must have shapes {expected}; got {state.shape} and {states.shape}"
+            )
+        inputs = (
+            np.zeros((horizon, m))
+            if reference.inputs is None
+            else _array(reference.inputs)
+        )
         if inputs.shape != (horizon, m):
-            raise ShapeError(f"reference inputs must have shape ({horizon}, {m}); got {inputs.shape}")
-        last, guess = _array(initial_input if previous is None else previous.input), np.empty((horizon, m))
-        usable = previous is not None and previous.applicable and np.shape(previous.inputs) == guess.shape
+            raise ShapeError(
+                f"reference inputs must have shape ({horizon}, {m}); got {inputs.shape}"
+            )
+        last, guess = (
+            _array(initial_input if previous is None else previous.input),
+            np.empty((horizon, m)),
+        )
+        usable = (
+            previous is not None
+            and previous.applicable
+            and np.shape(previous.inputs) == guess.shape
+        )
         made = previous if usable else None
         first, guessed = (_NO_PLAN if made is None else _array(made.inputs)), None
         if plan is not None:
@@ -204,9 +260,14 @@ class Request(NamedTuple):
             last = _array(initial_input)
             call_unchecked(_check, *given, last, first, limits, guess)
         kappas = None if reference.kappas is None else _array(reference.kappas)
-        for name, values, known in (("states", states, finite[1]), ("inputs", inputs, finite[2])):
+        for name, values, known in (
+            ("states", states, finite[1]),
+            ("inputs", inputs, finite[2]),
+        ):
             if not known:
-                raise DataError(f"reference {name} must be finite; got {values[~np.isfinite(values)][0]}")
+                raise DataError(
+                    f"reference {name} must be finite; got {values[~np.isfinite(values)][0]}"
+                )
         if kappas is not None and not np.isfinite(kappas).all():
             raise DataError(f"reference kappas must be finite; got {kappas}")
         if problem.cost.angles and guessed is None and finite[0]:
@@ -220,29 +281,42 @@ class Request(NamedTuple):
         """The previous input over the whole horizon (H, m)."""
         return np.tile(self.references.previous_input, (len(self.initial_guess), 1))
 
-    def failed_decision(self, status: Status, iterations: int = 0, timing: Timing | None = None) -> Decision:
+    def failed_decision(
+        self, status: Status, iterations: int = 0, timing: Timing | None = None
+    ) -> Decision:
         """The decision of a step without a usable solve: the initial guess, and no prediction."""
         (H, n), inputs = self.references.states.shape, self.initial_guess
         unknown = np.full((H + 1, n), np.nan), np.full((H + 1, n, n), np.nan)
-        return Decision(inputs[0], inputs, *unknown, status, iterations, timing or Timing())
+        return Decision(
+            inputs[0], inputs, *unknown, status, iterations, timing or Timing()
+        )
 
 
 def check_method(key: str, value: object, method: str, example: str) -> None:
     """Raises ``SettingError`` unless a setting is an object (no class of them) with a method."""
     if isinstance(value, type) or not hasattr(value, method):
         got = f"the class {value.__name__}" if isinstance(value, type) else repr(value)
-        raise SettingError(key, f"must be an object with the method {method!r}, such as {example}; got {got}")
+        raise SettingError(
+            key,
+            f"must be an object with the method {method!r}, such as {example}; got {got}",
+        )
 
 
-def check_controller(problem: Problem, states: int, inputs: int, horizon: int, initial_input: Any) -> Array:
+def check_controller(
+    problem: Problem, states: int, inputs: int, horizon: int, initial_input: Any
+) -> Array:
     """Checks the settings that every controller has against its model; returns the initial input as an array (m,)."""
     if not isinstance(problem, Problem):
-        raise SettingError("problem", f"must be Problem(...); got {type(problem).__name__}")
+        raise SettingError(
+            "problem", f"must be Problem(...); got {type(problem).__name__}"
+        )
     check_number("horizon", horizon, least=1, whole=True)
     check_numbers("initial_input", initial_input, inputs)
     if (problem.state_dim, problem.input_dim) != (states, inputs):
         got = f"{problem.state_dim} and {problem.input_dim}"
-        raise SettingError("problem", f"must weigh {states} states and {inputs} inputs; got {got}")
+        raise SettingError(
+            "problem", f"must weigh {states} states and {inputs} inputs; got {got}"
+        )
     return np.array(initial_input, dtype=float)
 
 
@@ -262,7 +336,9 @@ def read_parameters(parameters: Any, horizon: int) -> Array:
     if values.ndim == 1:
         values = np.tile(values, (horizon, 1))
     if values.ndim != 2 or len(values) != horizon:
-        raise ShapeError(f"parameters must be (q,) or ({horizon}, q); got {np.shape(parameters)}")
+        raise ShapeError(
+            f"parameters must be (q,) or ({horizon}, q); got {np.shape(parameters)}"
+        )
     if not np.isfinite(values).all():
         raise DataError("parameters must be finite")
     return values
@@ -279,15 +355,23 @@ def _read_plan(plan: Any, horizon: int, n: int, m: int) -> tuple[Array, Array | 
     """The inputs of a plan, after one more row, and its states where it has some."""
     inputs, states = plan if isinstance(plan, tuple) else (plan, None)
     inputs, states = _array(inputs), None if states is None else _array(states)
-    if inputs.shape != (horizon, m) or (states is not None and states.shape != (horizon + 1, n)):
+    if inputs.shape != (horizon, m) or (
+        states is not None and states.shape != (horizon + 1, n)
+    ):
         shapes = f"inputs ({horizon}, {m}), or these and states ({horizon + 1}, {n})"
-        raise ShapeError(f"a plan must be {shapes}; got {inputs.shape}{'' if states is None else f', {states.shape}'}")
-    if not (np.isfinite(inputs).all() and (states is None or np.isfinite(states).all())):
+        raise ShapeError(
+            f"a plan must be {shapes}; got {inputs.shape}{'' if states is None else f', {states.shape}'}"
+        )
+    if not (
+        np.isfinite(inputs).all() and (states is None or np.isfinite(states).all())
+    ):
         raise DataError("a plan to start from must be finite")
     return np.vstack([inputs[:1], inputs]), states
 
 
-def _unwrapped(states: Array, state: Array, previous: Decision | None, angles: Sequence[int]) -> Array:
+def _unwrapped(
+    states: Array, state: Array, previous: Decision | None, angles: Sequence[int]
+) -> Array:
     """References (H + 1, n) whose angles are moved by full turns towards the plan, or the state where none is."""
     plan = np.tile(state, (len(states), 1))
     if previous is not None:
@@ -302,10 +386,18 @@ def _check(state, covariance, states, inputs, last, plan, limits, guess):
     (H, m), (lower, upper) = guess.shape, limits
     for k in range(H):
         for j in range(m):
-            u, at = plan[min(k + 1, len(plan) - 1), j] if len(plan) > 0 else last[j], min(k, len(lower) - 1)
+            u, at = (
+                plan[min(k + 1, len(plan) - 1), j] if len(plan) > 0 else last[j],
+                min(k, len(lower) - 1),
+            )
             guess[k, j] = min(max(u, lower[at, j]), upper[at, j])
     belief = _is_finite(state) and _is_finite(covariance.ravel())
-    return belief, _is_finite(states.ravel()), _is_finite(inputs.ravel()), _is_finite(last)
+    return (
+        belief,
+        _is_finite(states.ravel()),
+        _is_finite(inputs.ravel()),
+        _is_finite(last),
+    )
 
 
 @njit_inner

@@ -42,15 +42,31 @@ class Tracking:
         Q, R = _weight("Q", self.Q), _weight("R", self.R)
         lowest, n = np.linalg.eigvalsh(R).min(), Q.shape[-1]
         if lowest <= 0:
-            raise SettingError("R", f"must be positive definite; its smallest eigenvalue is {lowest:.3g}")
-        terminal = Q.reshape(-1, n, n)[-1] if self.terminal is None else _weight("terminal", self.terminal)
+            raise SettingError(
+                "R",
+                f"must be positive definite; its smallest eigenvalue is {lowest:.3g}",
+            )
+        terminal = (
+            Q.reshape(-1, n, n)[-1]
+            if self.terminal is None
+            else _weight("terminal", self.terminal)
+        )
         if terminal.shape != (n, n):
-            raise SettingError("terminal", f"must be a weight of {n} states; got {len(terminal)}")
+            raise SettingError(
+                "terminal", f"must be a weight of {n} states; got {len(terminal)}"
+            )
         check_choice("penalized", self.penalized, PENALIZED)
         angles = tuple(self.angles or ())
         if not all(isinstance(index, int) and 0 <= index < n for index in angles):
-            raise SettingError("angles", f"must be indices of {n} states; got {self.angles!r}")
-        for key, value in (("Q", Q), ("R", R), ("terminal", terminal), ("angles", angles)):
+            raise SettingError(
+                "angles", f"must be indices of {n} states; got {self.angles!r}"
+            )
+        for key, value in (
+            ("Q", Q),
+            ("R", R),
+            ("terminal", terminal),
+            ("angles", angles),
+        ):
             object.__setattr__(self, key, value)
 
     def by_stage(self, horizon: int) -> tuple[Array, Array]:
@@ -82,17 +98,31 @@ class LeastSquares:
         if not callable(self.y):
             raise SettingError("y", f"must be a function; got {type(self.y).__name__}")
         weight = _weight("weight", self.weight)
-        reference = np.zeros(weight.shape[-1]) if self.reference is None else np.array(self.reference, dtype=float)
+        reference = (
+            np.zeros(weight.shape[-1])
+            if self.reference is None
+            else np.array(self.reference, dtype=float)
+        )
         fits = reference.ndim in (1, 2) and reference.shape[-1] == weight.shape[-1]
         if not (fits and np.isfinite(reference).all()):
-            raise SettingError("reference", f"must be {weight.shape[-1]} finite numbers, or these by stage")
+            raise SettingError(
+                "reference",
+                f"must be {weight.shape[-1]} finite numbers, or these by stage",
+            )
         object.__setattr__(self, "weight", weight)
         object.__setattr__(self, "reference", reference)
 
     def squares(self, states: Array, inputs: Array, parameters: Array | None) -> Array:
         """Returns the squares Z (H, n + m + 1, n + m + 1) along a plan x_1 .. x_H, u_0 .. u_{H-1}; see the module."""
-        y, J, K = expand_function("y", self.y, self.weight.shape[-1], states, inputs, parameters)
-        e = y - self.reference - np.einsum("kri,ki->kr", J, states) - np.einsum("kri,ki->kr", K, inputs)
+        y, J, K = expand_function(
+            "y", self.y, self.weight.shape[-1], states, inputs, parameters
+        )
+        e = (
+            y
+            - self.reference
+            - np.einsum("kri,ki->kr", J, states)
+            - np.einsum("kri,ki->kr", K, inputs)
+        )
         rows = np.concatenate([J, K, e[..., None]], axis=2)
         return rows.mT @ self.weight @ rows
 
@@ -100,8 +130,12 @@ class LeastSquares:
 def by_stage(key: str, values: Array, horizon: int, dims: int) -> Array:
     """Returns values of every stage, given of every stage (H of them) or of one (whose array has ``dims`` axes)."""
     if values.ndim > dims and len(values) != horizon:
-        raise SettingError(key, f"must be given for one stage or all {horizon}; got {len(values)}")
-    return np.ascontiguousarray(np.broadcast_to(values, (horizon, *values.shape[values.ndim - dims :])))
+        raise SettingError(
+            key, f"must be given for one stage or all {horizon}; got {len(values)}"
+        )
+    return np.ascontiguousarray(
+        np.broadcast_to(values, (horizon, *values.shape[values.ndim - dims :]))
+    )
 
 
 class FunctionNotFinite(DataError):
@@ -109,7 +143,12 @@ class FunctionNotFinite(DataError):
 
 
 def expand_function(
-    name: str, function: Any, count: int, states: Array, inputs: Array, parameters: Array | None
+    name: str,
+    function: Any,
+    count: int,
+    states: Array,
+    inputs: Array,
+    parameters: Array | None,
 ) -> tuple[Array, Array, Array]:
     """Returns a function's values (H, count) along a plan, and its derivatives (H, count, n) and (H, count, m).
 
@@ -118,7 +157,9 @@ def expand_function(
     least, most = _arguments(function)
     arguments = [states, inputs] if parameters is None else [states, inputs, parameters]
     if len(arguments) < least:
-        raise SettingError("parameters", f"must come with every call: {name} is a function of them")
+        raise SettingError(
+            "parameters", f"must come with every call: {name} is a function of them"
+        )
     if hasattr(function, "n_in"):
         values, *jacobians = _casadi_function(function).linearize(*arguments[:most])
     else:
@@ -127,19 +168,40 @@ def expand_function(
         def stacked(*at: torch.Tensor) -> torch.Tensor:
             value = function(*at, *known)
             if not isinstance(value, torch.Tensor) or value.shape[:1] != (len(states),):
-                found = tuple(value.shape) if isinstance(value, torch.Tensor) else type(value).__name__
-                raise ShapeError(f"{name} must give a tensor ({len(states)}, {count}); got {found}")
+                found = (
+                    tuple(value.shape)
+                    if isinstance(value, torch.Tensor)
+                    else type(value).__name__
+                )
+                raise ShapeError(
+                    f"{name} must give a tensor ({len(states)}, {count}); got {found}"
+                )
             return value.unsqueeze(-1) if value.dim() == 1 else value
 
-        values, *jacobians = linearize_function(stacked, _FLOAT64, *arguments[: min(most, 2)])
+        values, *jacobians = linearize_function(
+            stacked, _FLOAT64, *arguments[: min(most, 2)]
+        )
     if values.shape != (len(states), count):
-        raise ShapeError(f"{name} must give ({len(states)}, {count}); got {values.shape}")
-    by_state, by_input = [*jacobians, np.zeros((len(states), count, inputs.shape[1]))][:2]
+        raise ShapeError(
+            f"{name} must give ({len(states)}, {count}); got {values.shape}"
+        )
+    by_state, by_input = [*jacobians, np.zeros((len(states), count, inputs.shape[1]))][
+        :2
+    ]
     found = values, by_state, by_input
     if not all(np.isfinite(part).all() for part in found):
-        k = next(k for k in range(len(states)) if not all(np.isfinite(part[k]).all() for part in found))
-        x, u = (np.array2string(row[k], precision=4, max_line_width=10**6) for row in (states, inputs))
-        raise FunctionNotFinite(f"{name} or its gradient is not finite at x = {x}, u = {u}")
+        k = next(
+            k
+            for k in range(len(states))
+            if not all(np.isfinite(part[k]).all() for part in found)
+        )
+        x, u = (
+            np.array2string(row[k], precision=4, max_line_width=10**6)
+            for row in (states, inputs)
+        )
+        raise FunctionNotFinite(
+            f"{name} or its gradient is not finite at x = {x}, u = {u}"
+        )
     return values, by_state, by_input
 
 
@@ -156,7 +218,9 @@ def _arguments(function: Any) -> tuple[int, int]:
         found = inspect.signature(function).parameters.values()
     except ValueError:  # such as torch.sin
         return 1, 1
-    positional = [p for p in found if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)]
+    positional = [
+        p for p in found if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)
+    ]
     most = 3 if any(p.kind is p.VAR_POSITIONAL for p in found) else len(positional)
     return sum(p.default is p.empty for p in positional), most
 
@@ -166,18 +230,25 @@ def _weight(key: str, value: Any) -> Array:
     weight = read_numbers(key, value, "the diagonal of a weight or a square matrix")
     weight = np.diag(weight) if weight.ndim == 1 else weight
     if weight.ndim not in (2, 3) or weight.shape != weight.mT.shape:
-        raise SettingError(key, f"must be the diagonal of a weight or a square matrix; got {value!r}")
+        raise SettingError(
+            key, f"must be the diagonal of a weight or a square matrix; got {value!r}"
+        )
     if not np.isfinite(weight).all():
         raise SettingError(key, f"must be finite; got {value!r}")
     if not np.allclose(weight, weight.mT, rtol=1e-12, atol=0):
         raise SettingError(key, "must be symmetric")
     lowest = np.linalg.eigvalsh(weight).min()
     if lowest < -1e-12 * max(1.0, np.abs(weight).max()):
-        raise SettingError(key, f"must be positive semidefinite; its smallest eigenvalue is {lowest:.3g}")
+        raise SettingError(
+            key,
+            f"must be positive semidefinite; its smallest eigenvalue is {lowest:.3g}",
+        )
     return weight
 
 
-def read_numbers(key: str, value: Any, rule: str = "a list of numbers, infinite where unbounded") -> Array:
+def read_numbers(
+    key: str, value: Any, rule: str = "a list of numbers, infinite where unbounded"
+) -> Array:
     """An array from a list."""
     try:
         array = np.array(value, dtype=float)

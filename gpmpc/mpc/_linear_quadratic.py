@@ -15,14 +15,23 @@ from typing import NamedTuple
 import numpy as np
 
 from gpmpc._compiled import compiled, njit_inner, njit_noalloc
-from gpmpc._kernels.linalg import add_transposed_product, copy, copy_matrix, dot, product, solve_positive
+from gpmpc._kernels.linalg import (
+    add_transposed_product,
+    copy,
+    copy_matrix,
+    dot,
+    product,
+    solve_positive,
+)
 from gpmpc.exceptions import SettingError
 
 Array = np.ndarray
 
 INPUTS, DEVIATIONS, INCREMENTS = range(3)
 
-_SETTLED = 1e-12  # relative change of P at which the gains of a constant system have converged
+_SETTLED = (
+    1e-12  # relative change of P at which the gains of a constant system have converged
+)
 _LONGEST = 10_000  # stages after which they are taken to have
 _STABLE = 1e-9  # by how much an eigenvalue may lie outside the unit circle by rounding
 
@@ -33,8 +42,12 @@ class Stages(NamedTuple):
     A: Array  # (K, p, p)
     B: Array  # (K, p, m)
     c: Array  # (K, p); the defects of the plan are part of it
-    next: Array = np.empty((0, 0))  # where the dynamics lead from the points of the plan, F(s_k, u_k) (K, p)
-    V: Array = np.empty((0, 0, 0))  # what a stage adds to A Sigma A' (K, n, n), in the mode ``zero_order``; else zero
+    next: Array = np.empty(
+        (0, 0)
+    )  # where the dynamics lead from the points of the plan, F(s_k, u_k) (K, p)
+    V: Array = np.empty(
+        (0, 0, 0)
+    )  # what a stage adds to A Sigma A' (K, n, n), in the mode ``zero_order``; else zero
 
 
 class QuadraticCost(NamedTuple):
@@ -103,7 +116,11 @@ def expand(stages, start, feedback, previous_input, unknowns):
                 F = feedback[k, i]
                 u[i] += F[p + m] + dot(F, s, p) + dot(F[p:], before, m)
         for i in range(p):
-            after[i] = stages.c[at, i] + dot(stages.A[at, i], s, p) + dot(stages.B[at, i], u, m)
+            after[i] = (
+                stages.c[at, i]
+                + dot(stages.A[at, i], s, p)
+                + dot(stages.B[at, i], u, m)
+            )
     return inputs, states
 
 
@@ -112,7 +129,12 @@ def evaluate_cost(cost, states, inputs, references, constant):
     """The cost of states s_0 .. s_H (H + 1, p) and inputs (H, m), with ``constant`` in the place of the 1 of z."""
     targets, penalized = references.states, cost.penalized
     (H, n), m = targets.shape, inputs.shape[1]
-    total, error, v, z = 0.0, np.empty(states.shape[1]), np.empty(m), np.full(n + m + 1, constant)
+    total, error, v, z = (
+        0.0,
+        np.empty(states.shape[1]),
+        np.empty(m),
+        np.full(n + m + 1, constant),
+    )
     for k in range(H):
         copy(states[k + 1], error)
         for i in range(n):
@@ -153,10 +175,20 @@ def finite_horizon_lqr(A, B, Q, R, terminal, horizon):
     """
     (n, m), constant = B.shape[1:], len(A) == len(Q) == len(R) == 1
     gains, hessians = np.zeros((horizon, m, n)), np.empty((horizon, m, m))
-    P, following, PB, PC = terminal.copy(), np.empty((n, n)), np.empty((n, m)), np.empty((n, n))
+    P, following, PB, PC = (
+        terminal.copy(),
+        np.empty((n, n)),
+        np.empty((n, m)),
+        np.empty((n, n)),
+    )
     closed, factor, RK = np.empty((n, n)), np.empty((m, m)), np.empty((m, n))
     for k in range(horizon - 1, -1, -1):
-        A_k, B_k, K, D = A[min(k, len(A) - 1)], B[min(k, len(B) - 1)], gains[k], hessians[k]
+        A_k, B_k, K, D = (
+            A[min(k, len(A) - 1)],
+            B[min(k, len(B) - 1)],
+            gains[k],
+            hessians[k],
+        )
         R_k = R[min(k, len(R) - 1)]
         product(P, B_k, PB)
         copy_matrix(R_k, D)
@@ -198,7 +230,9 @@ def optimal_feedback(cost, stages, references):
     incremental = cost.penalized == INCREMENTS
     (H, n), e = targets.shape, p + (m if incremental or len(squares) > 0 else 0)
     A, B = np.zeros((H, e + 1, e + 1)), np.zeros((H, e + 1, m))
-    weights = np.zeros((H if len(squares) > 0 else len(cost.state), e + 1, e + 1))  # of stages 1 .. H - 1
+    weights = np.zeros(
+        (H if len(squares) > 0 else len(cost.state), e + 1, e + 1)
+    )  # of stages 1 .. H - 1
     terminal = np.zeros((e + 1, e + 1))
     add_blocks(cost.terminal, terminal)
     for k in range(len(weights)):
@@ -222,7 +256,9 @@ def optimal_feedback(cost, stages, references):
                 shift[p + i] = references.inputs[k, i]
         if incremental:
             copy_matrix(B[k], A[k, :, p:e])
-    before = np.concatenate((weights[:1], weights))[: H if len(weights) > 1 else 1]  # of stages 0 .. H - 1
+    before = np.concatenate((weights[:1], weights))[
+        : H if len(weights) > 1 else 1
+    ]  # of stages 0 .. H - 1
     gains, hessians = finite_horizon_lqr(A, B, before, cost.input, terminal, H)
     feedback = np.zeros((H, m, p + m + 1))
     for k in range(H):
@@ -232,7 +268,9 @@ def optimal_feedback(cost, stages, references):
                 F[j] = -K[j]
             if incremental:
                 F[p + i] += 1.0
-            F[p + m] = -K[e] + (references.inputs[k, i] if cost.penalized == DEVIATIONS else 0.0)
+            F[p + m] = -K[e] + (
+                references.inputs[k, i] if cost.penalized == DEVIATIONS else 0.0
+            )
             if k > 0:
                 F[p + m] += dot(K, targets[k - 1], n)
     return feedback, hessians
@@ -269,6 +307,12 @@ def dlqr(A: Array, B: Array, Q: Array, R: Array) -> Array:
     """
     A, B, Q, R = (np.ascontiguousarray(matrix, dtype=float) for matrix in (A, B, Q, R))
     K = finite_horizon_lqr(A[None], B[None], Q[None], R[None], Q, _LONGEST)[0][0]
-    if not np.isfinite(K).all() or np.abs(np.linalg.eigvals(A - B @ K)).max() > 1 + _STABLE:
-        raise SettingError("A, B, Q", "there is no stationary gain: the inputs do not reach a growing mode")
+    if (
+        not np.isfinite(K).all()
+        or np.abs(np.linalg.eigvals(A - B @ K)).max() > 1 + _STABLE
+    ):
+        raise SettingError(
+            "A, B, Q",
+            "there is no stationary gain: the inputs do not reach a growing mode",
+        )
     return K

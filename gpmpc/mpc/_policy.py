@@ -13,7 +13,13 @@ import numpy as np
 import torch
 from scipy.interpolate import krogh_interpolate
 
-from gpmpc.exceptions import SettingError, ShapeError, SolverFailure, check_choice, check_number
+from gpmpc.exceptions import (
+    SettingError,
+    ShapeError,
+    SolverFailure,
+    check_choice,
+    check_number,
+)
 from gpmpc.gaussian import Gaussian
 from gpmpc.mpc._controller import Controller, Decision, Reference, Timing, full_turns
 from gpmpc.mpc.problem import Problem
@@ -64,9 +70,20 @@ def command(
     Raises:
         SolverFailure: The policy is ``"raise"``, or there is nothing to fall back on.
     """
-    previous, reference = None if last is None else last.plan, reference.over(controller.horizon)
-    known = {key: value for key, value in (("parameters", parameters), ("plan", plan)) if value is not None}
-    decision = controller.control(belief, reference, previous, **known) if _is_finite(belief) else None
+    previous, reference = (
+        None if last is None else last.plan,
+        reference.over(controller.horizon),
+    )
+    known = {
+        key: value
+        for key, value in (("parameters", parameters), ("plan", plan))
+        if value is not None
+    }
+    decision = (
+        controller.control(belief, reference, previous, **known)
+        if _is_finite(belief)
+        else None
+    )
     return _conclude(controller, decision, reference, last, on_failure, step)
 
 
@@ -88,12 +105,20 @@ def commands(
     if many is None:
         found = [controller.control(beliefs[t], reference, plans[t]) for t in finite]
     else:
-        found = many([beliefs[t] for t in finite], [reference] * len(finite), [plans[t] for t in finite])
+        found = many(
+            [beliefs[t] for t in finite],
+            [reference] * len(finite),
+            [plans[t] for t in finite],
+        )
     decisions = dict(zip(finite, found, strict=True))
     outcomes: list[Command | SolverFailure] = []
     for t, before in enumerate(last):
         try:
-            outcomes.append(_conclude(controller, decisions.get(t), reference, before, on_failure, step))
+            outcomes.append(
+                _conclude(
+                    controller, decisions.get(t), reference, before, on_failure, step
+                )
+            )
         except SolverFailure as failure:
             outcomes.append(failure)
     return outcomes
@@ -125,9 +150,13 @@ class ControlLoop:
         self.last: Command | None = None
         self.failures, self._steps = 0, 0
         self._before: Command | None = None  # the one before the last
-        self._gains: tuple[Decision, np.ndarray] | None = None  # of the last plan that they were needed of
+        self._gains: tuple[Decision, np.ndarray] | None = (
+            None  # of the last plan that they were needed of
+        )
 
-    def input(self, state: Any, reference: Any, parameters: Any = None, plan: Any = None) -> np.ndarray:
+    def input(
+        self, state: Any, reference: Any, parameters: Any = None, plan: Any = None
+    ) -> np.ndarray:
         """Returns the input to apply now (m,).
 
         Args:
@@ -140,8 +169,16 @@ class ControlLoop:
             ShapeError: State, reference, parameters or plan have other dimensions than the controller.
             SolverFailure: The policy is ``"raise"``.
         """
-        belief = state if isinstance(state, Gaussian) else Gaussian.certain(np.asarray(state, dtype=float))
-        wanted = reference if isinstance(reference, Reference) else Reference(np.asarray(reference, dtype=float))
+        belief = (
+            state
+            if isinstance(state, Gaussian)
+            else Gaussian.certain(np.asarray(state, dtype=float))
+        )
+        wanted = (
+            reference
+            if isinstance(reference, Reference)
+            else Reference(np.asarray(reference, dtype=float))
+        )
         known = self.last, self.on_failure, self._steps, parameters, plan
         self._before = self.last
         self.last = command(self.controller, belief, wanted, *known)
@@ -169,10 +206,15 @@ class ControlLoop:
         stage = min(int(share), len(plan.inputs) - 1)
         input = plan.inputs[stage]
         if state.shape != plan.means.shape[1:]:
-            raise ShapeError(f"state must have shape {plan.means.shape[1:]}; got {state.shape}")
+            raise ShapeError(
+                f"state must have shape {plan.means.shape[1:]}; got {state.shape}"
+            )
         if np.isfinite(plan.means).all() and np.isfinite(state).all():
             if self._gains is None or self._gains[0] is not plan:
-                gains, none = getattr(self.controller, "gains", None), np.zeros((*plan.inputs.shape, len(state)))
+                gains, none = (
+                    getattr(self.controller, "gains", None),
+                    np.zeros((*plan.inputs.shape, len(state))),
+                )
                 self._gains = plan, none if gains is None else gains(plan)
             error = state - _state_along(plan.means, min(share, len(plan.inputs)))
             cost = getattr(getattr(self.controller, "problem", None), "cost", None)
@@ -201,7 +243,9 @@ def check_policy(on_failure: str) -> None:
 
 
 def _is_finite(belief: Gaussian) -> bool:
-    return bool(torch.isfinite(belief.mean).all() and torch.isfinite(belief.covariance).all())
+    return bool(
+        torch.isfinite(belief.mean).all() and torch.isfinite(belief.covariance).all()
+    )
 
 
 def _conclude(
@@ -226,37 +270,68 @@ def _conclude(
         raise SolverFailure(step, reason)
     if last is not None and last.plan is not None and last.plan.applicable:
         rows = (plan := last.plan).inputs, plan.means, plan.covariances
-        inputs, means, covariances = (np.concatenate([part[1:], part[-1:]]) for part in rows)
+        inputs, means, covariances = (
+            np.concatenate([part[1:], part[-1:]]) for part in rows
+        )
         first = last.input if on_failure == "hold" else inputs[0]
-        shifted = replace(_with_first(plan, inputs, first), means=means, covariances=covariances)
+        shifted = replace(
+            _with_first(plan, inputs, first), means=means, covariances=covariances
+        )
         if (admitted := _admit(controller, shifted, last)) is not None:
             return Command(admitted.input, status, decision, admitted)
-    known = getattr(controller, "initial_input", None) if reference.inputs is None else reference.inputs[0]
+    known = (
+        getattr(controller, "initial_input", None)
+        if reference.inputs is None
+        else reference.inputs[0]
+    )
     if known is None or not np.isfinite(known).all():
-        raise SolverFailure(step, f"{reason} (no earlier plan and no reference input to fall back on)")
+        raise SolverFailure(
+            step, f"{reason} (no earlier plan and no reference input to fall back on)"
+        )
     input = _within_bounds(controller, np.array(known, dtype=float), last)
     H, n = reference.horizon, reference.states.shape[1]
     unknown = np.full((H + 1, n), np.nan), np.full((H + 1, n, n), np.nan)
-    return Command(input, status, decision, Decision(input, np.tile(input, (H, 1)), *unknown, status, 0, Timing()))
+    return Command(
+        input,
+        status,
+        decision,
+        Decision(input, np.tile(input, (H, 1)), *unknown, status, 0, Timing()),
+    )
 
 
-def _has_right_shape(controller: Controller, decision: Decision, last: Command | None) -> bool:
+def _has_right_shape(
+    controller: Controller, decision: Decision, last: Command | None
+) -> bool:
     """Whether the inputs of a decision have the shapes (m,) and (H, m)."""
     problem = getattr(controller, "problem", None)
-    m = problem.input_dim if isinstance(problem, Problem) else (decision if last is None else last).input.size
-    return decision.input.shape == (m,) == np.shape(decision.inputs)[1:] and len(decision.inputs) > 0
+    m = (
+        problem.input_dim
+        if isinstance(problem, Problem)
+        else (decision if last is None else last).input.size
+    )
+    return (
+        decision.input.shape == (m,) == np.shape(decision.inputs)[1:]
+        and len(decision.inputs) > 0
+    )
 
 
-def _admit(controller: Controller, plan: Decision, last: Command | None) -> Decision | None:
+def _admit(
+    controller: Controller, plan: Decision, last: Command | None
+) -> Decision | None:
     """A plan, its first input put onto the bounds that it misses by rounding; None where it must not be applied."""
     input = _within_bounds(controller, plan.input, last)
     off = np.abs(input - plan.input)
-    if not (off <= _ROUNDING * np.maximum(1.0, np.abs(input))).all() or not np.isfinite(plan.inputs).all():
+    if (
+        not (off <= _ROUNDING * np.maximum(1.0, np.abs(input))).all()
+        or not np.isfinite(plan.inputs).all()
+    ):
         return None  # off is NaN where an input is not finite
     return _with_first(plan, plan.inputs, input) if off.any() else plan
 
 
-def _within_bounds(controller: Controller, input: np.ndarray, last: Command | None) -> np.ndarray:
+def _within_bounds(
+    controller: Controller, input: np.ndarray, last: Command | None
+) -> np.ndarray:
     """The nearest input in the box of the controller's problem, where it has one, and among these within its rates."""
     problem = getattr(controller, "problem", None)
     if not isinstance(problem, Problem):

@@ -46,8 +46,22 @@ from gpmpc.mpc._controller import (
     full_turns,
     read_parameters,
 )
-from gpmpc.mpc._linear_quadratic import InputBounds, QuadraticCost, StageRows, Stages, finite_horizon_lqr
-from gpmpc.mpc._stages import COVARIANCES, ConstraintRows, Covariance, Plan, StageCosts, StageLinearizer, keep_rates
+from gpmpc.mpc._linear_quadratic import (
+    InputBounds,
+    QuadraticCost,
+    StageRows,
+    Stages,
+    finite_horizon_lqr,
+)
+from gpmpc.mpc._stages import (
+    COVARIANCES,
+    ConstraintRows,
+    Covariance,
+    Plan,
+    StageCosts,
+    StageLinearizer,
+    keep_rates,
+)
 from gpmpc.mpc.problem import Problem
 from gpmpc.propagation import Linearization, Propagator
 
@@ -60,7 +74,9 @@ FORMS = ("trajectory", "velocity")
 class Prediction(NamedTuple):
     """A plan, the stages linearised at it, the covariances of its states, and the rows tightened by them."""
 
-    plan: Plan  # where the stages were linearised; with ``velocity`` its first stage only
+    plan: (
+        Plan  # where the stages were linearised; with ``velocity`` its first stage only
+    )
     stages: Stages
     covariances: Array  # Sigma_0 .. Sigma_H (H + 1, n, n)
     rows: StageRows
@@ -95,14 +111,24 @@ class PredictionSettings:
         check_choice("covariance", self.covariance, COVARIANCES)
         for key in ("feedback", "rolled_out"):
             if not isinstance(getattr(self, key), bool):
-                raise SettingError(key, f"must be true or false; got {getattr(self, key)!r}")
+                raise SettingError(
+                    key, f"must be true or false; got {getattr(self, key)!r}"
+                )
         if self.rolled_out and self.form == "velocity":
-            raise SettingError("rolled_out", "is for plans of form 'trajectory'; got form 'velocity'")
+            raise SettingError(
+                "rolled_out", "is for plans of form 'trajectory'; got form 'velocity'"
+            )
         check_number("disturbance_gain", self.disturbance_gain, least=0)
         if self.disturbance_gain > (self.form != "velocity"):
             velocity = self.form == "velocity"
-            rule = "be 0 for form 'velocity', which needs none" if velocity else "lie between 0 and 1"
-            raise SettingError("disturbance_gain", f"must {rule}; got {self.disturbance_gain}")
+            rule = (
+                "be 0 for form 'velocity', which needs none"
+                if velocity
+                else "lie between 0 and 1"
+            )
+            raise SettingError(
+                "disturbance_gain", f"must {rule}; got {self.disturbance_gain}"
+            )
 
 
 class PredictionModel:
@@ -117,15 +143,29 @@ class PredictionModel:
         initial_input: Sequence[float] | Array,
         settings: PredictionSettings,
     ):
-        self.initial_input = check_controller(problem, *check_next_states(model), horizon, initial_input)
+        self.initial_input = check_controller(
+            problem, *check_next_states(model), horizon, initial_input
+        )
         check_method("propagator", propagator, "propagate", "Linearization()")
         if not isinstance(settings, PredictionSettings):
-            raise SettingError("prediction", f"must be PredictionSettings(...); got {type(settings).__name__}")
+            raise SettingError(
+                "prediction",
+                f"must be PredictionSettings(...); got {type(settings).__name__}",
+            )
         self.propagator, self.problem, self.horizon = propagator, problem, horizon
-        self.settings, self.points = settings, horizon if settings.form == "trajectory" else 1
+        self.settings, self.points = (
+            settings,
+            horizon if settings.form == "trajectory" else 1,
+        )
         self._set_model(model)
-        inputs, rates = problem.inputs.by_stage(horizon), problem.input_rates.by_stage(horizon)
-        self._limits, rated = (*inputs, *rates), horizon if problem.input_rates.finite else 0
+        inputs, rates = (
+            problem.inputs.by_stage(horizon),
+            problem.input_rates.by_stage(horizon),
+        )
+        self._limits, rated = (
+            (*inputs, *rates),
+            horizon if problem.input_rates.finite else 0,
+        )
         self.bounds = InputBounds(*inputs, *[side[:rated] for side in rates])
         self.constraints = ConstraintRows(problem, horizon, settings.covariance)
         self.costs = StageCosts(problem, horizon, self.linearizer)
@@ -137,8 +177,13 @@ class PredictionModel:
         return other
 
     def _set_model(self, model: DynamicsModel) -> None:
-        self.model, self.linearizer = model, StageLinearizer(model, self.propagator, self.settings.covariance)
-        self._at_points = StageLinearizer(model, Linearization(), "zero_order")  # for the first guess of covariances
+        self.model, self.linearizer = (
+            model,
+            StageLinearizer(model, self.propagator, self.settings.covariance),
+        )
+        self._at_points = StageLinearizer(
+            model, Linearization(), "zero_order"
+        )  # for the first guess of covariances
         self._roll_out = RollOut(model)
 
     def read(
@@ -151,21 +196,36 @@ class PredictionModel:
     ) -> Request:
         """The arguments of a controller's ``control``, whose dimensions are checked, with the disturbance estimate."""
         problem, H = self.problem, self.horizon
-        request = Request.read(problem, H, self.initial_input, belief, reference, previous, plan)
+        request = Request.read(
+            problem, H, self.initial_input, belief, reference, previous, plan
+        )
         if parameters is not None:
             request = request._replace(parameters=read_parameters(parameters, H))
         if reference.inputs is None and problem.cost.penalized == "deviations":
-            raise ShapeError(f"penalized 'deviations' needs reference inputs ({H}, {problem.input_dim}); got none")
+            raise ShapeError(
+                f"penalized 'deviations' needs reference inputs ({H}, {problem.input_dim}); got none"
+            )
         if request.kappas is not None and self.linearizer.covariance != "zero_order":
             mode = self.linearizer.covariance
-            raise SettingError("kappas", f"are for covariances of 'zero_order'; this controller has {mode!r}")
+            raise SettingError(
+                "kappas",
+                f"are for covariances of 'zero_order'; this controller has {mode!r}",
+            )
         if self.settings.disturbance_gain and request.finite:
             request = request._replace(disturbance=self._disturbance(request))
-        if plan is not None and request.states is None and request.finite:  # those that the inputs lead to
-            request = request._replace(states=self.lead(request.state, request.initial_guess, request.disturbance))
+        if (
+            plan is not None and request.states is None and request.finite
+        ):  # those that the inputs lead to
+            request = request._replace(
+                states=self.lead(
+                    request.state, request.initial_guess, request.disturbance
+                )
+            )
         return request
 
-    def lead(self, state: Array, inputs: Array, disturbance: Array | None = None) -> Array:
+    def lead(
+        self, state: Array, inputs: Array, disturbance: Array | None = None
+    ) -> Array:
         """The states (H + 1, n) that inputs (H, m) lead to; all of them the first one where these are not finite."""
         states = self._roll_out.open_loop(state[None], inputs[None], disturbance)[0]
         return states if np.isfinite(states).all() else np.tile(state, (len(states), 1))
@@ -186,33 +246,50 @@ class PredictionModel:
             covariances[0] = request.covariance
         if self.settings.form == "velocity":
             means[1:], covariances[1:] = request.state, covariances[0]
-            return Plan(self.linearizer.state(means, covariances), request.constant_guess, covariances)
+            return Plan(
+                self.linearizer.state(means, covariances),
+                request.constant_guess,
+                covariances,
+            )
         inputs, last = request.initial_guess, request.previous
         if request.states is not None:
             means[1:] = request.states[1:]
         elif last is not None:
             means[1:H], means[H] = last.means[2:], last.means[H]
             if problem.cost.angles:  # a sensor may have taken a turn off
-                means[1:] += full_turns(request.state - last.means[1], problem.cost.angles)
+                means[1:] += full_turns(
+                    request.state - last.means[1], problem.cost.angles
+                )
         else:
-            targets, shares = request.references.states, np.linspace(1.0, 0.0, H + 1)[1:, None]
+            targets, shares = (
+                request.references.states,
+                np.linspace(1.0, 0.0, H + 1)[1:, None],
+            )
             means[1:] = targets + shares * (request.state - targets[0])
             if problem.cost.penalized == "deviations":
-                inputs = request.references.inputs.clip(problem.inputs.lower, problem.inputs.upper)
+                inputs = request.references.inputs.clip(
+                    problem.inputs.lower, problem.inputs.upper
+                )
         if problem.input_rates.finite:
             inputs = inputs.copy()
-            keep_rates(inputs, request.references.previous_input, *problem.input_rates.sides)
+            keep_rates(
+                inputs, request.references.previous_input, *problem.input_rates.sides
+            )
         if last is not None and not self.linearizer.at_points:
             covariances[1:] = last.covariances[1:]
         elif not self.linearizer.at_points:  # of the stages at the points
             stages = self._at_points(means[:-1], inputs, covariances[1:])
-            covariances[1:] = self._covariances(stages, self.costs.quadratic, request.covariance)[1:]
+            covariances[1:] = self._covariances(
+                stages, self.costs.quadratic, request.covariance
+            )[1:]
         return Plan(self.linearizer.state(means, covariances), inputs, covariances)
 
     def linearize(self, plan: Plan, request: Request) -> Prediction:
         """The stages of a plan, linearised in one call, with covariances, rows and cost."""
         K = self.points
-        stages = self.linearizer(plan.states[:K], plan.inputs[:K], plan.covariances[:K], request.disturbance)
+        stages = self.linearizer(
+            plan.states[:K], plan.inputs[:K], plan.covariances[:K], request.disturbance
+        )
         return self.predict(plan, stages, request)
 
     def linearize_many(self, requests: Sequence[Request]) -> list[Prediction]:
@@ -221,11 +298,19 @@ class PredictionModel:
             return []
         K, T = self.points, len(requests)
         plans = list(map(self.initial_guess, requests))
-        states, inputs, covariances = (np.concatenate([s[:K] for s in parts]) for parts in zip(*plans, strict=True))
-        disturbances = [np.tile(r.disturbance, (K, 1)) for r in requests if r.disturbance is not None]
+        states, inputs, covariances = (
+            np.concatenate([s[:K] for s in parts]) for parts in zip(*plans, strict=True)
+        )
+        disturbances = [
+            np.tile(r.disturbance, (K, 1))
+            for r in requests
+            if r.disturbance is not None
+        ]
         disturbance = np.concatenate(disturbances) if disturbances else None
         stages = self.linearizer(states, inputs, covariances, disturbance)
-        parts = zip(*(part.reshape(T, K, *part.shape[1:]) for part in stages), strict=True)
+        parts = zip(
+            *(part.reshape(T, K, *part.shape[1:]) for part in stages), strict=True
+        )
         return list(map(self.predict, plans, map(Stages._make, parts), requests))
 
     def canonical(self, plan: Plan) -> Plan:
@@ -240,45 +325,82 @@ class PredictionModel:
         if mode == "zero_order":
             covariances = self._covariances(stages, cost, request.covariance)
         elif self.settings.form == "velocity" and mode != "none":
-            covariances = np.repeat(self.linearizer.moments(stages.next, covariances)[1], self.horizon + 1, axis=0)
+            covariances = np.repeat(
+                self.linearizer.moments(stages.next, covariances)[1],
+                self.horizon + 1,
+                axis=0,
+            )
             covariances[0] = request.covariance
         if self.settings.form == "velocity" and request.previous is not None:
             stages = self._increments(plan, stages, request, request.previous)
-        rows = self.constraints.at(plan, covariances, self.points, request.parameters, request.kappas)
+        rows = self.constraints.at(
+            plan, covariances, self.points, request.parameters, request.kappas
+        )
         return Prediction(plan, stages, covariances, rows, cost)
 
-    def _increments(self, plan: Plan, stages: Stages, request: Request, previous: Decision) -> Stages:
+    def _increments(
+        self, plan: Plan, stages: Stages, request: Request, previous: Decision
+    ) -> Stages:
         """A held linearisation as that of the increments since s_{-1}, the state that the last decision began at."""
         before = self.linearizer.state(previous.means[:1], previous.covariances[:1])[0]
-        c = plan.states[0] - stages.A[0] @ before - stages.B[0] @ request.references.previous_input
+        c = (
+            plan.states[0]
+            - stages.A[0] @ before
+            - stages.B[0] @ request.references.previous_input
+        )
         if not request.covariance.any():
             n = self.problem.state_dim
             c[n:] = stages.c[0, n:]
         return stages._replace(c=c[None])
 
-    def roll_out(self, towards: Plan, prediction: Prediction, feedback: Array, request: Request) -> Prediction:
+    def roll_out(
+        self, towards: Plan, prediction: Prediction, feedback: Array, request: Request
+    ) -> Prediction:
         """The prediction at the plan that obeys the dynamics under a feedback towards another one, within its bounds.
 
         The feedback is a program's, F_k (H, m, p + m + 1), or that of the stages of ``prediction`` where that is empty.
         """
         n, linearizer = self.problem.state_dim, self.linearizer
-        gains = feedback if len(feedback) else -self.gains(*prediction.stages[:2], prediction.cost)
+        gains = (
+            feedback
+            if len(feedback)
+            else -self.gains(*prediction.stages[:2], prediction.cost)
+        )
         gains = np.ascontiguousarray(gains[:, :, :n])
         last, disturbance = request.references.previous_input, request.disturbance
         if linearizer.at_points:
-            law = Feedback(towards.states[None], towards.inputs[None], gains[None], *self._limits, last)
+            law = Feedback(
+                towards.states[None],
+                towards.inputs[None],
+                gains[None],
+                *self._limits,
+                last,
+            )
             states, inputs = self._roll_out(towards.states[:1], law, disturbance)
-            return self.linearize(Plan(states[0], inputs[0], towards.covariances), request)
+            return self.linearize(
+                Plan(states[0], inputs[0], towards.covariances), request
+            )
         low, high, down, up = self._limits
         states, inputs, covariances = (part.copy() for part in towards)
         parts = []
-        for k in range(self.horizon):  # of a belief, whose means depend on its covariances
-            input = towards.inputs[k] + gains[k] @ (states[k, :n] - towards.states[k, :n])
+        for k in range(
+            self.horizon
+        ):  # of a belief, whose means depend on its covariances
+            input = towards.inputs[k] + gains[k] @ (
+                states[k, :n] - towards.states[k, :n]
+            )
             input = np.clip(input, last + down[k], last + up[k])
             last = inputs[k] = np.clip(input, low[k], high[k])
-            stage = linearizer(states[k : k + 1], inputs[k : k + 1], covariances[k : k + 1], disturbance)
+            stage = linearizer(
+                states[k : k + 1],
+                inputs[k : k + 1],
+                covariances[k : k + 1],
+                disturbance,
+            )
             states[k + 1] = stage.next[0]
-            covariances[k + 1] = linearizer.moments(stage.next, covariances[k + 1 : k + 2])[1][0]
+            covariances[k + 1] = linearizer.moments(
+                stage.next, covariances[k + 1 : k + 2]
+            )[1][0]
             parts.append(stage)
         stages = Stages(*map(np.concatenate, zip(*parts, strict=True)))
         return self.predict(Plan(states, inputs, covariances), stages, request)
@@ -289,16 +411,26 @@ class PredictionModel:
         if not self.settings.feedback:
             return np.zeros((self.horizon, m, n))
         A, B = np.ascontiguousarray(A[:, :n, :n]), np.ascontiguousarray(B[:, :n])
-        Q, R, terminal = np.ascontiguousarray(cost.state[:1, 0]), cost.input[:1], cost.terminal[0]
+        Q, R, terminal = (
+            np.ascontiguousarray(cost.state[:1, 0]),
+            cost.input[:1],
+            cost.terminal[0],
+        )
         if len(Z):
-            Q, R, terminal = Q + Z[:1, :n, :n], R + Z[:1, n:-1, n:-1], terminal + Z[-1, :n, :n]
+            Q, R, terminal = (
+                Q + Z[:1, :n, :n],
+                R + Z[:1, n:-1, n:-1],
+                terminal + Z[-1, :n, :n],
+            )
         return call_unchecked(finite_horizon_lqr, A, B, Q, R, terminal, self.horizon)[0]
 
     def _covariances(self, stages: Stages, cost: QuadraticCost, start: Array) -> Array:
         """Sigma_0 .. Sigma_H (H + 1, n, n) of stages under their feedback."""
         covariances = np.empty((self.horizon + 1, *start.shape))
         K = self.gains(stages.A[:1], stages.B[:1], cost)[0]
-        call_unchecked(_predict_covariances, stages.A, stages.B, stages.V, start, K, covariances)
+        call_unchecked(
+            _predict_covariances, stages.A, stages.B, stages.V, start, K, covariances
+        )
         return covariances
 
     def _disturbance(self, request: Request) -> Array:
@@ -306,10 +438,18 @@ class PredictionModel:
         previous = request.previous
         if previous is None:
             return np.zeros(self.problem.state_dim)
-        before = np.zeros_like(request.state) if previous.disturbance is None else previous.disturbance
+        before = (
+            np.zeros_like(request.state)
+            if previous.disturbance is None
+            else previous.disturbance
+        )
         applied = request.references.previous_input[None]
-        predicted = linearize(self.model, previous.means[:1], applied, covariance=False).mean[0]
-        return before + self.settings.disturbance_gain * (request.state - predicted - before)
+        predicted = linearize(
+            self.model, previous.means[:1], applied, covariance=False
+        ).mean[0]
+        return before + self.settings.disturbance_gain * (
+            request.state - predicted - before
+        )
 
 
 @compiled

@@ -27,7 +27,12 @@ from gpmpc._compiled import call_unchecked, compiled
 from gpmpc._kernels.linalg import dot
 from gpmpc.exceptions import DataError, ProblemError
 from gpmpc.mpc._controller import Request
-from gpmpc.mpc._linear_quadratic import CondensedProgram, References, evaluate_cost, weight_of_stage
+from gpmpc.mpc._linear_quadratic import (
+    CondensedProgram,
+    References,
+    evaluate_cost,
+    weight_of_stage,
+)
 from gpmpc.mpc._prediction import Prediction, PredictionModel
 from gpmpc.mpc._stages import Plan, price_violations
 from gpmpc.qp import QPSolution
@@ -36,12 +41,21 @@ from gpmpc.status import Status
 Array = np.ndarray
 
 _TORCH_FAILURE = torch.linalg.LinAlgError  # pyright: ignore[reportPrivateImportUsage]
-FAILURES = (DataError, ProblemError, np.linalg.LinAlgError, _TORCH_FAILURE)  # no finite numbers
+FAILURES = (
+    DataError,
+    ProblemError,
+    np.linalg.LinAlgError,
+    _TORCH_FAILURE,
+)  # no finite numbers
 _SUFFICIENT_DECREASE = 1e-4  # of what the program promised (Armijo)
 _SHARES = [2.0**-k for k in range(11)]  # of a step
 _ROUND_OFF = 1e-8  # share of the cost below which a difference says nothing: posteriors with sf2 >> y^2 lose that much
-_NOISE = 1e-10  # the square of an offset that a model with that round-off need not get below
-_SMALL = 1e-3  # share of an input's size whose cost counts where the cost itself vanishes
+_NOISE = (
+    1e-10  # the square of an offset that a model with that round-off need not get below
+)
+_SMALL = (
+    1e-3  # share of an input's size whose cost counts where the cost itself vanishes
+)
 _MEMORY = 10  # updates of a Hessian
 _NEAR = 0.2  # relative offset of plans near a solution: steps from further away mislead updates
 _CREEP = 0.25  # ratio of two offsets above which the Hessian is updated
@@ -54,12 +68,21 @@ class Globalization:
         self._model, self._request, self._tolerance = model, request, tolerance
         self._references = request.references
         R, bounds = model.costs.quadratic.input[0], model.problem.inputs.first
-        self._smallest = call_unchecked(_smallest_cost, R, *bounds, self._references.previous_input)
-        self._defect_prices, self._row_price = np.zeros(model.costs.quadratic.terminal[:, 0].size), 0.0
+        self._smallest = call_unchecked(
+            _smallest_cost, R, *bounds, self._references.previous_input
+        )
+        self._defect_prices, self._row_price = (
+            np.zeros(model.costs.quadratic.terminal[:, 0].size),
+            0.0,
+        )
         self._size, self._rate, self._creeps = math.inf, 1.0, False
-        self._updates: deque[tuple[Array, Array]] = deque(maxlen=_MEMORY)  # steps and changes of the gradient
+        self._updates: deque[tuple[Array, Array]] = deque(
+            maxlen=_MEMORY
+        )  # steps and changes of the gradient
         self._gradient = np.empty(0)  # of the cost at the plan of the last program
-        self._last: tuple[Array, Array, Array] | None = None  # inputs, gradient of the Lagrangian, multipliers
+        self._last: tuple[Array, Array, Array] | None = (
+            None  # inputs, gradient of the Lagrangian, multipliers
+        )
 
     def correct(self, program: CondensedProgram, plan: Plan) -> CondensedProgram:
         """A program made at a plan, with the curvature that the last steps showed, where the iteration creeps."""
@@ -70,7 +93,9 @@ class Globalization:
         if self._last is not None:
             before, last_gradient, z = self._last
             if self._size < _NEAR and np.any(inputs != before):
-                self._updates.append((inputs - before, gradient + program.G.T @ z - last_gradient))
+                self._updates.append(
+                    (inputs - before, gradient + program.G.T @ z - last_gradient)
+                )
         if not (self._updates and self._creeps):
             return program
         P = program.P.copy()
@@ -79,7 +104,11 @@ class Globalization:
         return program._replace(P=P, q=gradient - P @ inputs)
 
     def __call__(
-        self, at: Prediction, program: CondensedProgram, solution: QPSolution, proposed: Plan
+        self,
+        at: Prediction,
+        program: CondensedProgram,
+        solution: QPSolution,
+        proposed: Plan,
     ) -> tuple[Prediction, Status | None]:
         """The prediction at the next plan, and how the iteration ends: None where it goes on.
 
@@ -91,25 +120,67 @@ class Globalization:
             gradient = self._gradient + program.G.T @ z if len(z) else self._gradient
             self._last = plan.inputs.ravel(), gradient, z
         z = z[len(z) - at.rows.lower.size :].reshape(at.rows.lower.shape)
-        self._row_price = max(self._row_price, 2.0 * float(np.abs(z).max())) if z.size else self._row_price
-        terms, stages = (self._references, prices, self._row_price), (at.stages.A, at.stages.next)
-        found = call_unchecked(_assess, at.cost, terms, self._defect_prices, stages, at.rows, plan, proposed, z)
+        self._row_price = (
+            max(self._row_price, 2.0 * float(np.abs(z).max()))
+            if z.size
+            else self._row_price
+        )
+        terms, stages = (
+            (self._references, prices, self._row_price),
+            (at.stages.A, at.stages.next),
+        )
+        found = call_unchecked(
+            _assess,
+            at.cost,
+            terms,
+            self._defect_prices,
+            stages,
+            at.rows,
+            plan,
+            proposed,
+            z,
+        )
         cost, curvature, promised, largest, merit, self._defect_prices = found
-        size, first = max(math.sqrt(curvature / (cost + self._smallest)), largest), math.isinf(self._size)
-        self._size, self._rate = size, size / self._size if math.isfinite(self._size) else 1.0
+        size, first = (
+            max(math.sqrt(curvature / (cost + self._smallest)), largest),
+            math.isinf(self._size),
+        )
+        self._size, self._rate = (
+            size,
+            size / self._size if math.isfinite(self._size) else 1.0,
+        )
         self._creeps = self._creeps or (self._rate > _CREEP and size < _NEAR)
-        slower = max(self._rate, last_rate)  # the solution is better than the plan by about the slower of two rates
+        slower = max(
+            self._rate, last_rate
+        )  # the solution is better than the plan by about the slower of two rates
         settled = self._rate >= 1.0 and size**2 <= _NOISE
-        if settled or size <= self._tolerance or size * slower <= self._tolerance * (1.0 - slower):
+        if (
+            settled
+            or size <= self._tolerance
+            or size * slower <= self._tolerance * (1.0 - slower)
+        ):
             return at._replace(plan=proposed), Status.SOLVED
         slope = promised - curvature - merit
-        continued = self._request.previous is not None and self._request.states is None  # the last plan, one step on
+        continued = (
+            self._request.previous is not None and self._request.states is None
+        )  # the last plan, one step on
         far = size > _NEAR and not (first and continued)
         for length, trial in self._trials(at, plan, proposed, program.feedback, far):
-            bound = merit + _SUFFICIENT_DECREASE * length * min(slope, 0.0) + _ROUND_OFF * abs(merit)
-            rows = trial.rows if self._model.constraints.smooth else at.rows._replace(E=trial.rows.E)
+            bound = (
+                merit
+                + _SUFFICIENT_DECREASE * length * min(slope, 0.0)
+                + _ROUND_OFF * abs(merit)
+            )
+            rows = (
+                trial.rows
+                if self._model.constraints.smooth
+                else at.rows._replace(E=trial.rows.E)
+            )
             points = trial.stages.next, rows, trial.plan
-            if call_unchecked(_merit, trial.cost, terms, self._defect_prices, *points) <= bound:
+            if (
+                call_unchecked(_merit, trial.cost, terms, self._defect_prices, *points)
+                <= bound
+            ):
                 return trial, None
         if size**2 <= _ROUND_OFF:  # size^2 of the cost is what could still be gained
             return at._replace(plan=proposed), Status.SOLVED
@@ -141,7 +212,11 @@ class Globalization:
 
 
 def _between(plan: Plan, other: Plan, share: float) -> Plan:
-    return other if share == 1.0 else Plan(*(a + share * (b - a) for a, b in zip(plan, other, strict=True)))
+    return (
+        other
+        if share == 1.0
+        else Plan(*(a + share * (b - a) for a, b in zip(plan, other, strict=True)))
+    )
 
 
 @compiled
@@ -162,8 +237,18 @@ def _assess(cost, terms, defect_prices, stages, rows, plan, proposed, z):
     the largest defect relative to the states, merit of the plan under new prices of defects, and these prices (p,).
     """
     (references, prices, row_price), (A, after) = terms, stages
-    zero = References(0.0 * references.states, 0.0 * references.inputs, 0.0 * references.previous_input)
-    (H, p), reach, largest, defects, new = after.shape, 1.0, 0.0, np.zeros(after.shape[1]), defect_prices.copy()
+    zero = References(
+        0.0 * references.states,
+        0.0 * references.inputs,
+        0.0 * references.previous_input,
+    )
+    (H, p), reach, largest, defects, new = (
+        after.shape,
+        1.0,
+        0.0,
+        np.zeros(after.shape[1]),
+        defect_prices.copy(),
+    )
     for k in range(H):
         for i in range(p):
             reach = max(reach, abs(plan.states[k + 1, i]))
@@ -171,7 +256,9 @@ def _assess(cost, terms, defect_prices, stages, rows, plan, proposed, z):
             largest = max(largest, abs(after[k, i] - plan.states[k + 1, i]))
     here = evaluate_cost(cost, plan.states, plan.inputs, references, 1.0)
     here += price_violations(prices, rows, plan, row_price)
-    curvature = evaluate_cost(cost, proposed.states - plan.states, proposed.inputs - plan.inputs, zero, 0.0)
+    curvature = evaluate_cost(
+        cost, proposed.states - plan.states, proposed.inputs - plan.inputs, zero, 0.0
+    )
     promised = evaluate_cost(cost, proposed.states, proposed.inputs, references, 1.0)
     promised += price_violations(prices, rows, proposed, row_price)
     costates = _costates(cost, A, proposed, references.states, rows.E, z)
@@ -200,12 +287,22 @@ def _costates(cost, A, plan, targets, E, z):
     p, m = states.shape[1], inputs.shape[1]
     costates = np.zeros((H, p))
     for k in range(H - 1, -1, -1):
-        weight, out, rows = weight_of_stage(cost, k, H), costates[k], E[min(k, len(E) - 1)]
+        weight, out, rows = (
+            weight_of_stage(cost, k, H),
+            costates[k],
+            E[min(k, len(E) - 1)],
+        )
         for i in range(n if len(Z) > 0 else 0):
-            out[i] += 2.0 * (dot(Z[k, i], states[k + 1], n) + dot(Z[k, i, n:], inputs[k], m) + Z[k, i, n + m])
+            out[i] += 2.0 * (
+                dot(Z[k, i], states[k + 1], n)
+                + dot(Z[k, i, n:], inputs[k], m)
+                + Z[k, i, n + m]
+            )
         for i in range(p):
             for j in range(n):
-                error = states[k + 1, i // n * n + j] - (targets[k, j] if i < n else 0.0)
+                error = states[k + 1, i // n * n + j] - (
+                    targets[k, j] if i < n else 0.0
+                )
                 out[i] += 2.0 * weight[i // n, i % n, j] * error
             for e in range(len(rows)):
                 out[i] += rows[e, i] * z[k, e]

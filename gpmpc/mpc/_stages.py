@@ -52,13 +52,28 @@ class Plan(NamedTuple):
 class StageLinearizer:
     """Linearises the dynamics of the belief at K points in one call, in one covariance mode; see the module's text."""
 
-    def __init__(self, model: DynamicsModel, propagator: Propagator, covariance: Covariance):
-        self.model, self.propagator, self.covariance, self._n = model, propagator, covariance, model.state_dim
+    def __init__(
+        self, model: DynamicsModel, propagator: Propagator, covariance: Covariance
+    ):
+        self.model, self.propagator, self.covariance, self._n = (
+            model,
+            propagator,
+            covariance,
+            model.state_dim,
+        )
         first_order = getattr(propagator, "first_order", False)
-        self.at_points = covariance == "none" or (covariance == "zero_order" and first_order)
-        noisy = covariance == "zero_order" and getattr(propagator, "process_noise", False)
+        self.at_points = covariance == "none" or (
+            covariance == "zero_order" and first_order
+        )
+        noisy = covariance == "zero_order" and getattr(
+            propagator, "process_noise", False
+        )
         self._noise = to_array(model.noise_covariance) if noisy else None
-        moments = {"full": self._full, "diagonal": self._diagonal, "zero_order": self._zero_order}
+        moments = {
+            "full": self._full,
+            "diagonal": self._diagonal,
+            "zero_order": self._zero_order,
+        }
         self._linearize = self._points if self.at_points else moments[covariance]
 
     def prior_variances(self) -> Array:
@@ -67,18 +82,26 @@ class StageLinearizer:
         if form is None or not self.at_points or self.covariance == "none":
             return np.empty(0)
         B = np.eye(self._n) if form.B is None else to_array(form.B)
-        return B**2 @ to_array(form.f.signal_variance) + (0.0 if self._noise is None else np.diagonal(self._noise))
+        return B**2 @ to_array(form.f.signal_variance) + (
+            0.0 if self._noise is None else np.diagonal(self._noise)
+        )
 
     def weight(self, Q: Array) -> Array:
         """The weights of s that belong to weights of x (K, n, n): the blocks on their diagonals (K, p / n, n, n)."""
         if self.covariance == "full":  # tr(Q Sigma) = |vec S|^2 in I_n kron Q
             return np.repeat(Q[:, None], self._n + 1, axis=1)
-        return np.stack([Q, Q * np.eye(self._n)], axis=1) if self.covariance == "diagonal" else Q[:, None]
+        return (
+            np.stack([Q, Q * np.eye(self._n)], axis=1)
+            if self.covariance == "diagonal"
+            else Q[:, None]
+        )
 
     def state(self, means: Array, covariances: Array) -> Array:
         """The vectors s (K, p) of beliefs (K, n), (K, n, n)."""
         if self.covariance == "full":
-            return np.concatenate((means, square_roots(covariances)[0].reshape(len(means), -1)), axis=1)
+            return np.concatenate(
+                (means, square_roots(covariances)[0].reshape(len(means), -1)), axis=1
+            )
         if self.covariance == "diagonal":
             variances = np.diagonal(covariances, axis1=1, axis2=2)
             return np.concatenate([means, np.sqrt(np.clip(variances, 0, None))], axis=1)
@@ -94,53 +117,96 @@ class StageLinearizer:
             return states[:, :n], states[:, n:, None] ** 2 * np.eye(n)
         return states, covariances
 
-    def __call__(self, states: Array, inputs: Array, covariances: Array, disturbance: Array | None = None) -> Stages:
+    def __call__(
+        self,
+        states: Array,
+        inputs: Array,
+        covariances: Array,
+        disturbance: Array | None = None,
+    ) -> Stages:
         """The stage models at K points s (K, p), u (K, m), Sigma (K, n, n), disturbance (n,) added to the means."""
         after, A, B, V = self._linearize(states, inputs, covariances)
         if disturbance is not None:
             after = after.copy()
             after[:, : self._n] += disturbance
-        return Stages(A, B, call_unchecked(_constants, A, B, after, states, inputs), after, V)
+        return Stages(
+            A, B, call_unchecked(_constants, A, B, after, states, inputs), after, V
+        )
 
     def _points(self, states: Array, inputs: Array, _: Array) -> tuple[Array, ...]:
         found = linearize(self.model, states, inputs, self.covariance == "zero_order")
-        V = np.zeros((len(states), self._n, self._n)) if found.covariance is None else found.covariance
+        V = (
+            np.zeros((len(states), self._n, self._n))
+            if found.covariance is None
+            else found.covariance
+        )
         V = V if self._noise is None else V + self._noise
-        parts = found.mean, found.A, found.B, V  # a model may give views, which the kernels do not notice
+        parts = (
+            found.mean,
+            found.A,
+            found.B,
+            V,
+        )  # a model may give views, which the kernels do not notice
         return tuple([np.ascontiguousarray(part, dtype=np.float64) for part in parts])
 
-    def _zero_order(self, states: Array, inputs: Array, covariances: Array) -> tuple[Array, ...]:
-        moved, d = differentiate(self.propagator, self.model, *self._tensors(states, covariances, inputs))
+    def _zero_order(
+        self, states: Array, inputs: Array, covariances: Array
+    ) -> tuple[Array, ...]:
+        moved, d = differentiate(
+            self.propagator, self.model, *self._tensors(states, covariances, inputs)
+        )
         A, S = d.mean_by_mean, moved.belief.covariance
         passed = A @ moved.cross_covariance  # mean equivalence passes nothing on
         V, _ = nearest_positive_semidefinite(S - (passed + passed.mT) / 2)
         return tuple(map(to_array, (moved.belief.mean, A, d.mean_by_input, V)))
 
-    def _full(self, states: Array, inputs: Array, covariances: Array) -> tuple[Array, ...]:
+    def _full(
+        self, states: Array, inputs: Array, covariances: Array
+    ) -> tuple[Array, ...]:
         belief, input = self._tensors(states[:, : self._n], covariances, inputs)
         local = linearize_belief(self.propagator, self.model, belief, input)
-        return *map(to_array, (local.next_state, local.A, local.B)), np.zeros_like(covariances)
+        return *map(to_array, (local.next_state, local.A, local.B)), np.zeros_like(
+            covariances
+        )
 
-    def _diagonal(self, states: Array, inputs: Array, covariances: Array) -> tuple[Array, ...]:
+    def _diagonal(
+        self, states: Array, inputs: Array, covariances: Array
+    ) -> tuple[Array, ...]:
         n = self._n
         covariances = covariances * np.eye(n)
         belief, input = self._tensors(states[:, :n], covariances, inputs)
         moved, d = differentiate(self.propagator, self.model, belief, input)
         sd, sd_next = belief.variance.sqrt(), moved.belief.variance.clamp_min(0).sqrt()
         # d Sigma_cc = 2 sd_c d sd_c, and backwards; where the next deviation is zero it has no derivative.
-        backwards = torch.where(sd_next > 0, 0.5 / torch.where(sd_next > 0, sd_next, 1.0), 0.0)[..., None]
+        backwards = torch.where(
+            sd_next > 0, 0.5 / torch.where(sd_next > 0, sd_next, 1.0), 0.0
+        )[..., None]
         twice = 2 * sd[..., None, :]
         mean_by_sd = d.mean_by_covariance.diagonal(dim1=-2, dim2=-1) * twice
         by_mean, by_input = (
-            part.diagonal(dim1=-3, dim2=-2).mT for part in (d.covariance_by_mean, d.covariance_by_input)
+            part.diagonal(dim1=-3, dim2=-2).mT
+            for part in (d.covariance_by_mean, d.covariance_by_input)
         )
-        by_variance = d.covariance_by_covariance.diagonal(dim1=-2, dim2=-1).diagonal(dim1=-3, dim2=-2).mT
+        by_variance = (
+            d.covariance_by_covariance.diagonal(dim1=-2, dim2=-1)
+            .diagonal(dim1=-3, dim2=-2)
+            .mT
+        )
         upper = torch.cat([d.mean_by_mean, mean_by_sd], dim=-1)
-        lower = torch.cat([backwards * by_mean, backwards * by_variance * twice], dim=-1)
-        A, B = torch.cat([upper, lower], dim=-2), torch.cat([d.mean_by_input, backwards * by_input], dim=-2)
-        return *map(to_array, (torch.cat([moved.belief.mean, sd_next], dim=-1), A, B)), np.zeros_like(covariances)
+        lower = torch.cat(
+            [backwards * by_mean, backwards * by_variance * twice], dim=-1
+        )
+        A, B = (
+            torch.cat([upper, lower], dim=-2),
+            torch.cat([d.mean_by_input, backwards * by_input], dim=-2),
+        )
+        return *map(
+            to_array, (torch.cat([moved.belief.mean, sd_next], dim=-1), A, B)
+        ), np.zeros_like(covariances)
 
-    def _tensors(self, means: Array, covariances: Array, inputs: Array) -> tuple[Gaussian, torch.Tensor]:
+    def _tensors(
+        self, means: Array, covariances: Array, inputs: Array
+    ) -> tuple[Gaussian, torch.Tensor]:
         mean, covariance, input = tensors_for(self.model, means, covariances, inputs)
         return Gaussian(mean, covariance), input
 
@@ -151,7 +217,9 @@ def _constants(A, B, after, states, inputs):
     c = after.copy()
     for k in range(len(c)):
         for i in range(c.shape[1]):
-            c[k, i] -= dot(A[k, i], states[k], A.shape[2]) + dot(B[k, i], inputs[k], B.shape[2])
+            c[k, i] -= dot(A[k, i], states[k], A.shape[2]) + dot(
+                B[k, i], inputs[k], B.shape[2]
+            )
     return c
 
 
@@ -159,15 +227,31 @@ class StageCosts:
     """The cost of a problem's stages: the weights alone, ``quadratic``, and the squares of outputs along a plan."""
 
     def __init__(self, problem: Problem, horizon: int, linearizer: StageLinearizer):
-        n, m, cost, self._linearizer = problem.state_dim, problem.input_dim, problem.cost, linearizer
+        n, m, cost, self._linearizer = (
+            problem.state_dim,
+            problem.input_dim,
+            problem.cost,
+            linearizer,
+        )
         self.outputs, (Q, R) = problem.outputs, cost.by_stage(horizon)
         for output in self.outputs:
             by_stage("weight", output.weight, horizon, 2)
             by_stage("reference", output.reference, horizon, 1)
         self._Q, own = Q, linearizer.weight(Q[-1:])[0]
-        Q, R = Q if cost.Q.ndim > 2 else cost.Q[None], R if cost.R.ndim > 2 else cost.R[None]
-        W, own, R = (np.ascontiguousarray(part) for part in (linearizer.weight(Q), own, R))
-        self.quadratic = QuadraticCost(W, own, R, PENALIZED.index(cost.penalized), np.empty((0, n + m + 1, n + m + 1)))
+        Q, R = (
+            Q if cost.Q.ndim > 2 else cost.Q[None],
+            R if cost.R.ndim > 2 else cost.R[None],
+        )
+        W, own, R = (
+            np.ascontiguousarray(part) for part in (linearizer.weight(Q), own, R)
+        )
+        self.quadratic = QuadraticCost(
+            W,
+            own,
+            R,
+            PENALIZED.index(cost.penalized),
+            np.empty((0, n + m + 1, n + m + 1)),
+        )
 
     def at(self, plan: Plan, parameters: Array | None = None) -> QuadraticCost:
         """The cost with its outputs linearised along a plan; raises what ``expand_function`` does."""
@@ -175,10 +259,15 @@ class StageCosts:
             return self.quadratic
         n = self._Q.shape[1]
         means = np.ascontiguousarray(plan.states[1:, :n])
-        squares = np.sum([output.squares(means, plan.inputs, parameters) for output in self.outputs], axis=0)
+        squares = np.sum(
+            [output.squares(means, plan.inputs, parameters) for output in self.outputs],
+            axis=0,
+        )
         weights = self._linearizer.weight(self._Q + squares[:, :n, :n])
         weights[:, 0] = self._Q  # of the mean, which the squares weigh themselves
-        return self.quadratic._replace(state=weights, terminal=weights[-1], squares=squares)
+        return self.quadratic._replace(
+            state=weights, terminal=weights[-1], squares=squares
+        )
 
 
 class ConstraintRows:
@@ -196,12 +285,21 @@ class ConstraintRows:
         n, self._horizon, self._covariance = problem.state_dim, horizon, covariance
         self._smooth: list[tuple[Inequality, slice]] = []
         self._plain = np.zeros((0, 0, problem.input_dim))  # no row holds inputs
-        F, kappa, prices, lower, upper = [np.empty((0, n))], [], [], [np.empty((horizon, 0))], [np.empty((horizon, 0))]
+        F, kappa, prices, lower, upper = (
+            [np.empty((0, n))],
+            [],
+            [],
+            [np.empty((horizon, 0))],
+            [np.empty((horizon, 0))],
+        )
         for constraint in problem.constraints:
             rows, below, above = constraint.rows(horizon)
             if constraint.stages is not None:
                 if max(constraint.stages) > horizon:
-                    raise SettingError("stages", f"must be of 1 .. {horizon}; got {max(constraint.stages)}")
+                    raise SettingError(
+                        "stages",
+                        f"must be of 1 .. {horizon}; got {max(constraint.stages)}",
+                    )
                 outside = [k for k in range(horizon) if k + 1 not in constraint.stages]
                 below[outside], above[outside] = -np.inf, np.inf
             sides = int(np.isfinite(below).sum() + np.isfinite(above).sum())
@@ -210,22 +308,39 @@ class ConstraintRows:
                 self._smooth.append((constraint, slice(first, first + len(rows))))
                 rows = np.zeros((len(rows), n))
             F, lower, upper = [*F, rows], [*lower, below], [*upper, above]
-            kappa += [0.0 if covariance == "none" else constraint.standard_deviations(sides)] * len(rows)
+            kappa += [
+                0.0 if covariance == "none" else constraint.standard_deviations(sides)
+            ] * len(rows)
             prices += [problem.price(constraint)] * len(rows)
-        self._F, self._lower, self._upper = np.concatenate(F), np.hstack(lower), np.hstack(upper)
+        self._F, self._lower, self._upper = (
+            np.concatenate(F),
+            np.hstack(lower),
+            np.hstack(upper),
+        )
         self._kappa, self.prices = np.array(kappa), np.array(prices)
         self.signs = np.where(np.isfinite(self._upper).any(axis=0), 1.0, -1.0)
         self.applies = np.isfinite(self._lower) | np.isfinite(self._upper)
         self.per_stage, self.soft = len(kappa), bool(np.isfinite(self.prices).any())
-        margins = self._kappa if covariance == "zero_order" else np.zeros(self.per_stage)
+        margins = (
+            self._kappa if covariance == "zero_order" else np.zeros(self.per_stage)
+        )
         self._margins = np.tile(margins, (horizon, 1))
         self.smooth, self._fixed = bool(self._smooth), None
-        if not (self.smooth or margins.any() or (self.per_stage and covariance in ("full", "diagonal"))):
+        if not (
+            self.smooth
+            or margins.any()
+            or (self.per_stage and covariance in ("full", "diagonal"))
+        ):
             E = self._rows(self._F[None], np.zeros((1, n, n)))
             self._fixed = StageRows(E, self._plain, self._lower, self._upper)
 
     def at(
-        self, plan: Plan, covariances: Array, stages: int, parameters: Array | None = None, kappas: Array | None = None
+        self,
+        plan: Plan,
+        covariances: Array,
+        stages: int,
+        parameters: Array | None = None,
+        kappas: Array | None = None,
     ) -> StageRows:
         """The rows, tightened by the covariances (H + 1, n, n), at a plan where smooth constraints are linearised.
 
@@ -233,35 +348,61 @@ class ConstraintRows:
         """
         if self._fixed is not None:
             return self._fixed
-        lower, upper, F, D = self._lower.copy(), self._upper.copy(), self._F[None], self._plain
+        lower, upper, F, D = (
+            self._lower.copy(),
+            self._upper.copy(),
+            self._F[None],
+            self._plain,
+        )
         if self._smooth:
             means = np.ascontiguousarray(plan.states[1:, : F.shape[2]])
-            F, D = np.repeat(F, self._horizon, axis=0), np.zeros((self._horizon, self.per_stage, D.shape[2]))
+            F, D = (
+                np.repeat(F, self._horizon, axis=0),
+                np.zeros((self._horizon, self.per_stage, D.shape[2])),
+            )
             for constraint, where in self._smooth:
-                values, F[:, where], D[:, where] = constraint.expand(means, plan.inputs, parameters)
+                values, F[:, where], D[:, where] = constraint.expand(
+                    means, plan.inputs, parameters
+                )
                 upper[:, where] += np.einsum("kri,ki->kr", F[:, where], means) - values
                 upper[:, where] += np.einsum("kri,ki->kr", D[:, where], plan.inputs)
-        margins = self._margins if kappas is None else np.where(self._margins > 0, kappas[:, None], 0.0)
+        margins = (
+            self._margins
+            if kappas is None
+            else np.where(self._margins > 0, kappas[:, None], 0.0)
+        )
         call_unchecked(_tighten, F, margins, covariances, lower, upper)
         E = self._rows(F, covariances[1 : stages + 1])
         return StageRows(np.ascontiguousarray(E), D, lower, upper)
 
     def _rows(self, F: Array, covariances: Array) -> Array:
         """E (K, r, p) of gradients F (K, r, n) at covariances of the states (K, n, n); one of either stands for all."""
-        K, n, weight = max(len(F), len(covariances)), F.shape[2], self.signs * self._kappa
+        K, n, weight = (
+            max(len(F), len(covariances)),
+            F.shape[2],
+            self.signs * self._kappa,
+        )
         if self._covariance not in ("full", "diagonal"):
             return F
-        F, covariances = (np.broadcast_to(part, (K, *part.shape[1:])) for part in (F, covariances))
+        F, covariances = (
+            np.broadcast_to(part, (K, *part.shape[1:])) for part in (F, covariances)
+        )
         if self._covariance == "diagonal":
-            moved = F * np.sqrt(np.diagonal(covariances, axis1=1, axis2=2).clip(0))[:, None]
+            moved = (
+                F * np.sqrt(np.diagonal(covariances, axis1=1, axis2=2).clip(0))[:, None]
+            )
             norms = np.linalg.norm(moved, axis=-1, keepdims=True)
             slopes = np.divide(F * moved, norms, out=np.abs(F), where=norms > 0)
             return np.concatenate([F, weight[:, None] * slopes], axis=2)
         moved = F @ square_roots(covariances)[0]
         norms = np.linalg.norm(moved, axis=-1, keepdims=True)
-        directions = np.divide(moved, norms, out=np.zeros_like(moved), where=norms > 0)  # S g / |S g|
+        directions = np.divide(
+            moved, norms, out=np.zeros_like(moved), where=norms > 0
+        )  # S g / |S g|
         slopes = F[..., None] * directions[:, :, None, :]  # of |S g| by S (K, r, n, n)
-        return np.concatenate([F, (weight[:, None, None] * slopes).reshape(K, -1, n * n)], axis=2)
+        return np.concatenate(
+            [F, (weight[:, None, None] * slopes).reshape(K, -1, n * n)], axis=2
+        )
 
 
 @compiled
@@ -288,7 +429,9 @@ def price_violations(prices, rows, plan, hard_price):
     for k in range(len(lower)):
         at, s, u = min(k, len(E) - 1), plan.states[k + 1], plan.inputs[k]
         for e in range(len(prices)):
-            value = dot(E[at, e], s, len(s)) + (dot(D[k, e], u, len(u)) if len(D) > 0 else 0.0)
+            value = dot(E[at, e], s, len(s)) + (
+                dot(D[k, e], u, len(u)) if len(D) > 0 else 0.0
+            )
             outside = max(0.0, value - upper[k, e], lower[k, e] - value)
             total += (hard_price if prices[e] == np.inf else prices[e]) * outside
     return total
@@ -301,4 +444,6 @@ def keep_rates(inputs, last, lower, upper):
         for j in range(len(last)):
             before = inputs[k - 1, j] if k > 0 else last[j]
             at = min(k, len(lower) - 1)
-            inputs[k, j] = min(max(inputs[k, j], before + lower[at, j]), before + upper[at, j])
+            inputs[k, j] = min(
+                max(inputs[k, j], before + lower[at, j]), before + upper[at, j]
+            )

@@ -58,10 +58,16 @@ class ManyStarts:
         limit: float = inf,
         budget: float | None = None,
     ):
-        self.controller, self.planner = controller, controller if planner is None else planner
+        self.controller, self.planner = (
+            controller,
+            controller if planner is None else planner,
+        )
         for one in (self.controller, self.planner):
             if one.prediction.settings.form != "trajectory":
-                raise SettingError("controller", "must be of form 'trajectory', whose plans may start anywhere")
+                raise SettingError(
+                    "controller",
+                    "must be of form 'trajectory', whose plans may start anywhere",
+                )
         self.problem, self.horizon = controller.problem, controller.horizon
         self.initial_input = controller.initial_input
         H, m, angles = self.horizon, self.problem.input_dim, self.problem.cost.angles
@@ -73,7 +79,10 @@ class ManyStarts:
         self.guesses = guesses
         self.turns = [turns] * len(angles) if isinstance(turns, int) else list(turns)
         if len(self.turns) != len(angles) or min(self.turns, default=1) < 1:
-            raise SettingError("turns", f"must be whole numbers from 1 on, one for each of {len(angles)} angles")
+            raise SettingError(
+                "turns",
+                f"must be whole numbers from 1 on, one for each of {len(angles)} angles",
+            )
         if budget is not None:
             check_number("budget", budget, above=0, unit="[s]")
         self.criterion = self._cost if criterion is None else criterion
@@ -82,26 +91,52 @@ class ManyStarts:
         self.limit, self.budget = limit, budget
 
     def control(
-        self, belief: Gaussian, reference: Reference, previous: Decision | None = None, parameters: Any = None
+        self,
+        belief: Gaussian,
+        reference: Reference,
+        previous: Decision | None = None,
+        parameters: Any = None,
     ) -> Decision:
         """Decides the input for one step; see ``Controller.control``."""
         reference, state = reference.over(self.horizon), belief.mean.numpy()
         if not np.isfinite(state).all():
             return self.controller.control(belief, reference, previous, parameters)
         best, lowest = None, inf
-        if previous is not None and previous.applicable and len(previous.means) == self.horizon + 1:
+        if (
+            previous is not None
+            and previous.applicable
+            and len(previous.means) == self.horizon + 1
+        ):
             angles = self.problem.cost.angles
-            belief = replace(belief, mean=belief.mean - torch.as_tensor(full_turns(state - previous.means[1], angles)))
-            goal = _moved(reference, full_turns(previous.means[-1] - reference.states[-1], angles))
-            shifted = tuple(np.concatenate([part[1:], part[-1:]]) for part in (previous.inputs, previous.means))
-            best, lowest = self._try(self.controller, belief, goal, previous, parameters, shifted)
+            belief = replace(
+                belief,
+                mean=belief.mean
+                - torch.as_tensor(full_turns(state - previous.means[1], angles)),
+            )
+            goal = _moved(
+                reference, full_turns(previous.means[-1] - reference.states[-1], angles)
+            )
+            shifted = tuple(
+                np.concatenate([part[1:], part[-1:]])
+                for part in (previous.inputs, previous.means)
+            )
+            best, lowest = self._try(
+                self.controller, belief, goal, previous, parameters, shifted
+            )
             if best.applicable and lowest <= self.limit:
                 return best
-        begin, last = perf_counter(), None if previous is None else replace(previous, solution=None)
+        begin, last = (
+            perf_counter(),
+            None if previous is None else replace(previous, solution=None),
+        )
         for decision, value in self.plans(belief, reference, last, parameters):
             if best is None or value < lowest:
                 best, lowest = decision, value
-            if lowest < inf and self.budget is not None and perf_counter() - begin > self.budget:
+            if (
+                lowest < inf
+                and self.budget is not None
+                and perf_counter() - begin > self.budget
+            ):
                 break
         assert best is not None
         return best
@@ -131,25 +166,51 @@ class ManyStarts:
 
     def _cost(self, decision: Decision, reference: Reference) -> float:
         """The tracking cost of a plan."""
-        wanted = np.zeros_like(decision.inputs) if reference.inputs is None else np.asarray(reference.inputs)
-        references = References(np.asarray(reference.states[1:]), wanted, decision.inputs[0])
-        return evaluate_cost(self._weights, decision.means, decision.inputs, references, 1.0)
+        wanted = (
+            np.zeros_like(decision.inputs)
+            if reference.inputs is None
+            else np.asarray(reference.inputs)
+        )
+        references = References(
+            np.asarray(reference.states[1:]), wanted, decision.inputs[0]
+        )
+        return evaluate_cost(
+            self._weights, decision.means, decision.inputs, references, 1.0
+        )
 
-    def _try(self, controller: GPMPC, belief: Gaussian, goal: Reference, *more: Any) -> tuple[Decision, float]:
+    def _try(
+        self, controller: GPMPC, belief: Gaussian, goal: Reference, *more: Any
+    ) -> tuple[Decision, float]:
         """A controller's decision on its arguments, and its criterion: infinite where it is not applicable."""
         decision = controller.control(belief, goal, *more)
         value = self.criterion(decision, goal) if decision.applicable else inf
         return decision, value if np.isfinite(value) else inf
 
-    def _candidates(self, state: Array, reference: Reference) -> Iterator[tuple[Reference, tuple[Array, Array]]]:
+    def _candidates(
+        self, state: Array, reference: Reference
+    ) -> Iterator[tuple[Reference, tuple[Array, Array]]]:
         """Goals and guesses, inputs and states, guess by guess, the nearest goals first."""
         goals, H = list(self._goals(state, reference)), self.horizon
         for guess, goal in product(self.guesses, goals):
             if guess is None:
                 shares, targets = np.linspace(1.0, 0.0, H + 1)[:, None], goal.states
-                yield goal, (np.tile(self.initial_input, (H, 1)), targets + shares * (state - targets[0]))
+                yield (
+                    goal,
+                    (
+                        np.tile(self.initial_input, (H, 1)),
+                        targets + shares * (state - targets[0]),
+                    ),
+                )
             else:
-                yield goal, (guess, self.planner.prediction.lead(state, np.asarray(guess, dtype=float)))
+                yield (
+                    goal,
+                    (
+                        guess,
+                        self.planner.prediction.lead(
+                            state, np.asarray(guess, dtype=float)
+                        ),
+                    ),
+                )
 
     def _goals(self, state: Array, reference: Reference) -> Iterator[Reference]:
         angles, moves = list(self.problem.cost.angles), []
@@ -161,20 +222,29 @@ class ManyStarts:
         turns = np.zeros((len(chosen), len(state)))
         turns[:, angles] = 2 * np.pi * np.array(chosen).reshape(len(turns), len(angles))
         distances = np.abs(state - reference.states[-1] - turns)[:, angles].sum(axis=1)
-        return (_moved(reference, turns[i]) for i in np.argsort(distances, kind="stable"))
+        return (
+            _moved(reference, turns[i]) for i in np.argsort(distances, kind="stable")
+        )
 
 
-def kicks(problem: Problem, horizon: int, initial_input: Array, share: float = 0.5) -> list[Array]:
+def kicks(
+    problem: Problem, horizon: int, initial_input: Array, share: float = 0.5
+) -> list[Array]:
     """The initial input held (H, m); for each bounded input a push and a pull, and a pull and a push, of H/6 stages.
 
     ``share`` is the way from the initial input to its bounds.
     """
-    drift, length = np.tile(np.asarray(initial_input, dtype=float), (horizon, 1)), max(1, horizon // 6)
+    drift, length = (
+        np.tile(np.asarray(initial_input, dtype=float), (horizon, 1)),
+        max(1, horizon // 6),
+    )
     found, bounds = [drift], (problem.inputs.upper, problem.inputs.lower)
     for j, sides in product(range(problem.input_dim), (bounds, bounds[::-1])):
         if np.isfinite([side[j] for side in sides]).all():
             inputs = drift.copy()
-            for part, side in zip((slice(0, length), slice(length, 2 * length)), sides, strict=True):
+            for part, side in zip(
+                (slice(0, length), slice(length, 2 * length)), sides, strict=True
+            ):
                 inputs[part, j] += share * (side[j] - initial_input[j])
             found.append(inputs)
     return found

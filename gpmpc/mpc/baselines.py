@@ -35,7 +35,14 @@ from gpmpc._dynamics import DynamicsModel, check_next_states
 from gpmpc._interrupts import interrupts_after
 from gpmpc.exceptions import DataError, SettingError, check_number
 from gpmpc.gaussian import Gaussian
-from gpmpc.mpc._controller import FEASIBLE, Decision, Reference, Request, Timing, check_controller
+from gpmpc.mpc._controller import (
+    FEASIBLE,
+    Decision,
+    Reference,
+    Request,
+    Timing,
+    check_controller,
+)
 from gpmpc.mpc._linear_quadratic import optimal_feedback
 from gpmpc.mpc._prediction import Prediction, PredictionModel, PredictionSettings
 from gpmpc.mpc._sqp import FAILURES
@@ -70,7 +77,12 @@ class NMPC:
     """
 
     def __init__(
-        self, plant: System, problem: Problem, horizon: int, initial_input: Sequence[float], tolerance: float = 1e-10
+        self,
+        plant: System,
+        problem: Problem,
+        horizon: int,
+        initial_input: Sequence[float],
+        tolerance: float = 1e-10,
     ):
         n, m = len(plant.dynamics.state_names), len(plant.dynamics.input_names)
         self.initial_input = check_controller(problem, n, m, horizon, initial_input)
@@ -78,31 +90,62 @@ class NMPC:
         self.plant, self.problem, self.horizon = plant, problem, horizon
         self._solver, self._bounds = _build(plant, problem, horizon, tolerance)
 
-    def control(self, belief: Gaussian, reference: Reference, previous: Decision | None = None) -> Decision:
+    def control(
+        self, belief: Gaussian, reference: Reference, previous: Decision | None = None
+    ) -> Decision:
         """Solves the problem from the belief's mean along a reference; see ``Controller.control``."""
         n, m, H = self.problem.state_dim, self.problem.input_dim, self.horizon
         start = perf_counter()
-        request = Request.read(self.problem, H, self.initial_input, belief, reference, previous)
+        request = Request.read(
+            self.problem, H, self.initial_input, belief, reference, previous
+        )
         if not request.finite:
             return request.failed_decision(Status.INVALID_MEASUREMENT)
         (targets, inputs, last), (lower, upper) = request.references, self._bounds
-        guess, states = request.constant_guess.clip(*self.problem.inputs.by_stage(H)), [request.state]
+        guess, states = (
+            request.constant_guess.clip(*self.problem.inputs.by_stage(H)),
+            [request.state],
+        )
         for u in guess:
             states.append(np.array(self.plant.successor(states[-1], u), dtype=float))
         unknowns = np.zeros(len(lower["x"]))
         unknowns[: H * (n + m)] = np.concatenate([*states[1:], guess.ravel()])
-        parameters = np.concatenate([request.state, last, targets.ravel(), inputs.ravel()])
-        bounds = {"lbx": lower["x"], "ubx": upper["x"], "lbg": lower["g"], "ubg": upper["g"]}
+        parameters = np.concatenate(
+            [request.state, last, targets.ravel(), inputs.ravel()]
+        )
+        bounds = {
+            "lbx": lower["x"],
+            "ubx": upper["x"],
+            "lbg": lower["g"],
+            "ubg": upper["g"],
+        }
         with interrupts_after():
             solution = self._solver(x0=unknowns, p=parameters, **bounds)
-        stats, found = self._solver.stats(), {key: np.array(solution[key]).ravel() for key in ("x", "g")}
+        stats, found = (
+            self._solver.stats(),
+            {key: np.array(solution[key]).ravel() for key in ("x", "g")},
+        )
         means = np.vstack([request.state, found["x"][: H * n].reshape(H, n)])
         inputs = found["x"][H * n : H * (n + m)].reshape(H, m)
         status = _STATUSES.get(stats["return_status"], Status.NUMERICAL_TROUBLE)
-        violation = np.max([np.maximum(lower[key] - at, at - upper[key]).max() for key, at in found.items()])
-        suboptimal = status not in (Status.SOLVED, Status.INFEASIBLE) and bool(violation <= FEASIBLE)
+        violation = np.max(
+            [
+                np.maximum(lower[key] - at, at - upper[key]).max()
+                for key, at in found.items()
+            ]
+        )
+        suboptimal = status not in (Status.SOLVED, Status.INFEASIBLE) and bool(
+            violation <= FEASIBLE
+        )
         ended = status, stats["iter_count"], Timing(solve=perf_counter() - start)
-        return Decision(inputs[0], inputs, means, np.zeros((H + 1, n, n)), *ended, suboptimal=suboptimal)
+        return Decision(
+            inputs[0],
+            inputs,
+            means,
+            np.zeros((H + 1, n, n)),
+            *ended,
+            suboptimal=suboptimal,
+        )
 
 
 class LQR:
@@ -118,25 +161,42 @@ class LQR:
         SettingError: As for ``GPMPC``; or constraints of states.
     """
 
-    def __init__(self, model: DynamicsModel, problem: Problem, horizon: int, initial_input: Sequence[float]):
-        self.initial_input = check_controller(problem, *check_next_states(model), horizon, initial_input)
+    def __init__(
+        self,
+        model: DynamicsModel,
+        problem: Problem,
+        horizon: int,
+        initial_input: Sequence[float],
+    ):
+        self.initial_input = check_controller(
+            problem, *check_next_states(model), horizon, initial_input
+        )
         problem.check_plain("LQR")
         if problem.constraints:
-            raise SettingError("constraints", "LQR knows the bounds of inputs only; leave those of states out")
+            raise SettingError(
+                "constraints",
+                "LQR knows the bounds of inputs only; leave those of states out",
+            )
         self.model, self.problem, self.horizon = model, problem, horizon
         self._linearize = StageLinearizer(model, Linearization(), "none")
         self._cost = StageCosts(problem, horizon, self._linearize).quadratic
 
-    def control(self, belief: Gaussian, reference: Reference, previous: Decision | None = None) -> Decision:
+    def control(
+        self, belief: Gaussian, reference: Reference, previous: Decision | None = None
+    ) -> Decision:
         """The clipped linear-quadratic plan; see ``Controller.control``. Covariances are not predicted."""
         began = perf_counter()
-        request = Request.read(self.problem, self.horizon, self.initial_input, belief, reference, previous)
+        request = Request.read(
+            self.problem, self.horizon, self.initial_input, belief, reference, previous
+        )
         if not request.finite:
             return request.failed_decision(Status.INVALID_MEASUREMENT)
         (targets, wanted, last), x = request.references, request.state
         states = np.vstack([x, targets[:-1]])
         inputs: Any = request.constant_guess if reference.inputs is None else wanted
-        stages = self._linearize(states, inputs, np.empty((0, *request.covariance.shape)))
+        stages = self._linearize(
+            states, inputs, np.empty((0, *request.covariance.shape))
+        )
         modelled = perf_counter()
         feedback, _ = optimal_feedback(self._cost, stages, request.references)
         if not np.isfinite(feedback).all():
@@ -154,7 +214,15 @@ class LQR:
         finite = np.isfinite(means).all() and np.isfinite(inputs).all()
         status = Status.SOLVED if finite else Status.NUMERICAL_TROUBLE
         timing = Timing(modelled - began, 0.0, perf_counter() - modelled)
-        return Decision(inputs[0], inputs, means, np.zeros((*means.shape, len(x))), status, self.horizon, timing)
+        return Decision(
+            inputs[0],
+            inputs,
+            means,
+            np.zeros((*means.shape, len(x))),
+            status,
+            self.horizon,
+            timing,
+        )
 
 
 class StateFormMPC:
@@ -182,63 +250,117 @@ class StateFormMPC:
         solver: str = "CLARABEL",
         options: dict | None = None,
     ):
-        self.prediction = PredictionModel(model, propagator, problem, horizon, initial_input, prediction)
-        self.initial_input, self.problem, self.horizon = self.prediction.initial_input, problem, horizon
-        self.solver, self.options = solver, TIGHT.get(solver, {}) if options is None else options
+        self.prediction = PredictionModel(
+            model, propagator, problem, horizon, initial_input, prediction
+        )
+        self.initial_input, self.problem, self.horizon = (
+            self.prediction.initial_input,
+            problem,
+            horizon,
+        )
+        self.solver, self.options = (
+            solver,
+            TIGHT.get(solver, {}) if options is None else options,
+        )
         problem.check_plain("StateFormMPC")
         self._build(constraints)
 
-    def control(self, belief: Gaussian, reference: Reference, previous: Decision | None = None) -> Decision:
+    def control(
+        self, belief: Gaussian, reference: Reference, previous: Decision | None = None
+    ) -> Decision:
         """Decides the input for one step; see ``GPMPC.control``."""
         from cvxpy.error import SolverError
 
-        request, began = self.prediction.read(belief, reference, previous), perf_counter()
+        request, began = (
+            self.prediction.read(belief, reference, previous),
+            perf_counter(),
+        )
         if not request.finite:
             return request.failed_decision(Status.INVALID_MEASUREMENT)
         try:
-            prediction = self.prediction.linearize(self.prediction.initial_guess(request), request)
+            prediction = self.prediction.linearize(
+                self.prediction.initial_guess(request), request
+            )
             if not all(np.isfinite(part).all() for part in prediction.stages):
                 raise DataError("the stages are not finite")
         except FAILURES:
-            return request.failed_decision(Status.NUMERICAL_TROUBLE, timing=Timing(perf_counter() - began, 0.0, 0.0))
+            return request.failed_decision(
+                Status.NUMERICAL_TROUBLE,
+                timing=Timing(perf_counter() - began, 0.0, 0.0),
+            )
         modelled = perf_counter()
         self._set(prediction, request)
         built, program = perf_counter(), self._program
         try:
-            with warnings.catch_warnings():  # that a solution is inaccurate is said by its status
+            with (
+                warnings.catch_warnings()
+            ):  # that a solution is inaccurate is said by its status
                 warnings.simplefilter("ignore")
-                program.solve(solver=self.solver, **{"warm_start": False} | self.options)
+                program.solve(
+                    solver=self.solver, **{"warm_start": False} | self.options
+                )
             status = STATUSES.get(program.status, Status.NUMERICAL_TROUBLE)
         except SolverError:
             status = Status.NUMERICAL_TROUBLE
         timing = Timing(modelled - began, built - modelled, perf_counter() - built)
-        iterations = (program.solver_stats.num_iters or 0) if program.solver_stats else 0
+        iterations = (
+            (program.solver_stats.num_iters or 0) if program.solver_stats else 0
+        )
         values = [variable.value for variable in program.variables()]
-        stopped = status is Status.ITERATION_LIMIT and all(v is not None and np.isfinite(v).all() for v in values)
-        suboptimal = stopped and all(np.max(rule.violation()) <= FEASIBLE for rule in program.constraints)
+        stopped = status is Status.ITERATION_LIMIT and all(
+            v is not None and np.isfinite(v).all() for v in values
+        )
+        suboptimal = stopped and all(
+            np.max(rule.violation()) <= FEASIBLE for rule in program.constraints
+        )
         if not (status.solved or suboptimal):
             return request.failed_decision(status, iterations, timing)
         inputs, states = np.array(self._inputs.value), np.array(self._states.value)
         beliefs = self.prediction.linearizer.moments(states, prediction.covariances)
         ended: Any = {"disturbance": request.disturbance, "suboptimal": suboptimal}
-        return Decision(inputs[0], inputs, *beliefs, status, iterations, timing, **ended)
+        return Decision(
+            inputs[0], inputs, *beliefs, status, iterations, timing, **ended
+        )
 
     def _build(self, constraints: Callable[[Any, Any], list] | None) -> None:
         """Makes the CVXPY problem with its parameters."""
         import cvxpy
 
-        model, problem, H, m = self.prediction, self.problem, self.horizon, self.problem.input_dim
+        model, problem, H, m = (
+            self.prediction,
+            self.problem,
+            self.horizon,
+            self.problem.input_dim,
+        )
         (Q, R), rows = problem.cost.by_stage(H), model.constraints
         weights = [_factor(blocks) for blocks in model.linearizer.weight(Q)]
         p, K, r = len(weights[0]), model.points, rows.per_stage
-        self._states, self._inputs = s, u = cvxpy.Variable((H + 1, p)), cvxpy.Variable((H, m))
-        self._stages = [[cvxpy.Parameter(shape) for shape in ((p, p), (p, m), (p,))] for _ in range(K)]
-        self._start, self._targets = cvxpy.Parameter(p), cvxpy.Parameter((H, p), value=np.zeros((H, p)))
+        self._states, self._inputs = s, u = (
+            cvxpy.Variable((H + 1, p)),
+            cvxpy.Variable((H, m)),
+        )
+        self._stages = [
+            [cvxpy.Parameter(shape) for shape in ((p, p), (p, m), (p,))]
+            for _ in range(K)
+        ]
+        self._start, self._targets = (
+            cvxpy.Parameter(p),
+            cvxpy.Parameter((H, p), value=np.zeros((H, p))),
+        )
         self._wanted, self._last = cvxpy.Parameter((H, m)), cvxpy.Parameter(m)
-        rates = u - cvxpy.vstack([cvxpy.reshape(self._last, (1, m), order="C"), *([u[:-1]] if H > 1 else [])])
-        penalized = {"inputs": u, "deviations": u - self._wanted, "increments": rates}[problem.cost.penalized]
-        cost = sum(cvxpy.sum_squares(penalized[k] @ _factor(R[k : k + 1])) for k in range(H))
-        cost += sum(cvxpy.sum_squares((s[k + 1] - self._targets[k]) @ weights[k]) for k in range(H))
+        rates = u - cvxpy.vstack(
+            [cvxpy.reshape(self._last, (1, m), order="C"), *([u[:-1]] if H > 1 else [])]
+        )
+        penalized = {"inputs": u, "deviations": u - self._wanted, "increments": rates}[
+            problem.cost.penalized
+        ]
+        cost = sum(
+            cvxpy.sum_squares(penalized[k] @ _factor(R[k : k + 1])) for k in range(H)
+        )
+        cost += sum(
+            cvxpy.sum_squares((s[k + 1] - self._targets[k]) @ weights[k])
+            for k in range(H)
+        )
         rules = [s[0] == self._start, *_within(u, *problem.inputs.by_stage(H))]
         rules += _within(rates, *problem.input_rates.by_stage(H))
         for k in range(H):
@@ -246,31 +368,60 @@ class StateFormMPC:
             rules.append(s[k + 1] == A @ s[k] + B @ u[k] + c)
         self._rows = [cvxpy.Parameter((r, p)) for _ in range(K if r else 0)]
         if r:
-            self._bounds, hard, applies = cvxpy.Parameter((H, r)), np.isinf(rows.prices), rows.applies
+            self._bounds, hard, applies = (
+                cvxpy.Parameter((H, r)),
+                np.isinf(rows.prices),
+                rows.applies,
+            )
             slack = np.zeros((H, r))
             if rows.soft:
-                slack = cvxpy.multiply(cvxpy.Variable((H, r), nonneg=True), np.tile(np.where(hard, 0.0, 1.0), (H, 1)))
+                slack = cvxpy.multiply(
+                    cvxpy.Variable((H, r), nonneg=True),
+                    np.tile(np.where(hard, 0.0, 1.0), (H, 1)),
+                )
                 cost += cvxpy.sum(slack @ np.where(hard, 0.0, rows.prices))
             # Every bound as an upper one: the rows of lower bounds are handed over with their sign turned.
-            at = [self._rows[min(k, K - 1)] @ s[k + 1] - self._bounds[k] - slack[k] for k in range(H)]
-            rules += [at[k][np.flatnonzero(applies[k])] <= 0.0 for k in range(H) if applies[k].any()]
+            at = [
+                self._rows[min(k, K - 1)] @ s[k + 1] - self._bounds[k] - slack[k]
+                for k in range(H)
+            ]
+            rules += [
+                at[k][np.flatnonzero(applies[k])] <= 0.0
+                for k in range(H)
+                if applies[k].any()
+            ]
         rules += [] if constraints is None else list(constraints(s, u))
         self._program = cvxpy.Problem(cvxpy.Minimize(cost), rules)
         if not self._program.is_dpp():
-            raise SettingError("constraints", "must be convex, and parametrised as CVXPY's rules (DPP) ask")
+            raise SettingError(
+                "constraints",
+                "must be convex, and parametrised as CVXPY's rules (DPP) ask",
+            )
 
     def _set(self, prediction: Prediction, request: Request) -> None:
         """Gives all parameters their values of this step."""
-        for parameters, values in zip(self._stages, zip(*prediction.stages[:3], strict=True), strict=True):
+        for parameters, values in zip(
+            self._stages, zip(*prediction.stages[:3], strict=True), strict=True
+        ):
             for parameter, value in zip(parameters, values, strict=True):
                 parameter.value = value
         targets = np.zeros(self._targets.shape)
         targets[:, : self.problem.state_dim] = request.references.states
         self._start.value, self._targets.value = prediction.plan.states[0], targets
-        self._wanted.value, self._last.value = request.references.inputs, request.references.previous_input
+        self._wanted.value, self._last.value = (
+            request.references.inputs,
+            request.references.previous_input,
+        )
         if self._rows:
-            (E, _, lower, upper), sign = prediction.rows, self.prediction.constraints.signs
-            for parameter, value in zip(self._rows, np.broadcast_to(E, (len(self._rows), *E.shape[1:])), strict=True):
+            (E, _, lower, upper), sign = (
+                prediction.rows,
+                self.prediction.constraints.signs,
+            )
+            for parameter, value in zip(
+                self._rows,
+                np.broadcast_to(E, (len(self._rows), *E.shape[1:])),
+                strict=True,
+            ):
                 parameter.value = sign[:, None] * value
             bounds = np.where(sign > 0, upper, -lower)
             self._bounds.value = np.where(np.isfinite(bounds), bounds, 0.0)
@@ -283,27 +434,53 @@ def _build(
     problem.check_plain("NMPC")
     n, m, H, goal = problem.state_dim, problem.input_dim, horizon, problem.cost
     x0, last = casadi.SX.sym("x0", n), casadi.SX.sym("last", m)
-    x, u, r, wanted = (casadi.SX.sym(name, size, H) for name, size in (("x", n), ("u", m), ("r", n), ("wanted", m)))
+    x, u, r, wanted = (
+        casadi.SX.sym(name, size, H)
+        for name, size in (("x", n), ("u", m), ("r", n), ("wanted", m))
+    )
     rates = u - casadi.horzcat(last, u[:, :-1])
-    penalized = {"inputs": u, "deviations": u - wanted, "increments": rates}[goal.penalized]
+    penalized = {"inputs": u, "deviations": u - wanted, "increments": rates}[
+        goal.penalized
+    ]
     Q, R = goal.by_stage(H)
-    cost = sum(casadi.bilin(casadi.DM(R[k]), v, v) for k, v in enumerate(casadi.horzsplit(penalized)))
-    cost += sum(casadi.bilin(casadi.DM(Q[k]), e, e) for k, e in enumerate(casadi.horzsplit(x - r)))
+    cost = sum(
+        casadi.bilin(casadi.DM(R[k]), v, v)
+        for k, v in enumerate(casadi.horzsplit(penalized))
+    )
+    cost += sum(
+        casadi.bilin(casadi.DM(Q[k]), e, e)
+        for k, e in enumerate(casadi.horzsplit(x - r))
+    )
     before = casadi.horzsplit(casadi.horzcat(x0, x[:, :-1]))
-    after = [casadi.vertcat(*plant.successor(s, v)) for s, v in zip(before, casadi.horzsplit(u), strict=True)]
+    after = [
+        casadi.vertcat(*plant.successor(s, v))
+        for s, v in zip(before, casadi.horzsplit(u), strict=True)
+    ]
     constraints, g = [casadi.vec(x - casadi.horzcat(*after))], [np.zeros((2, H * n))]
     if problem.input_rates.finite:
         constraints.append(casadi.vec(rates))
         g.append(np.array(problem.input_rates.by_stage(H)).reshape(2, -1))
-    unknowns, box = [casadi.vec(x), casadi.vec(u)], [np.tile([[-np.inf], [np.inf]], H * n)]
+    unknowns, box = (
+        [casadi.vec(x), casadi.vec(u)],
+        [np.tile([[-np.inf], [np.inf]], H * n)],
+    )
     box.append(np.array(problem.inputs.by_stage(H)).reshape(2, -1))
     rows = ConstraintRows(problem, H, "none")
-    E, _, lower, upper = rows.at(Plan(np.empty((0, n)), np.empty((0, m)), np.empty(0)), np.empty(0), H)
+    E, _, lower, upper = rows.at(
+        Plan(np.empty((0, n)), np.empty((0, m)), np.empty(0)), np.empty(0), H
+    )
     soft = np.flatnonzero(np.isfinite(rows.prices))
     if rows.per_stage:
-        slack, values = casadi.SX.sym("slack", len(soft), H), casadi.mtimes(casadi.DM(E[0]), x)
-        for e, given in zip(soft, casadi.vertsplit(slack) if soft.size else [], strict=True):
-            values[int(e), :] -= rows.signs[e] * given  # what a soft row gives way by, on its side
+        slack, values = (
+            casadi.SX.sym("slack", len(soft), H),
+            casadi.mtimes(casadi.DM(E[0]), x),
+        )
+        for e, given in zip(
+            soft, casadi.vertsplit(slack) if soft.size else [], strict=True
+        ):
+            values[int(e), :] -= (
+                rows.signs[e] * given
+            )  # what a soft row gives way by, on its side
             cost += rows.prices[e] * casadi.sum2(given)
         constraints.append(casadi.vec(values))
         g.append(np.array([lower, upper]).reshape(2, -1))
@@ -311,8 +488,18 @@ def _build(
         box.append(np.tile([[0.0], [np.inf]], H * len(soft)))
     nlp = {"x": casadi.vertcat(*unknowns), "f": cost, "g": casadi.vertcat(*constraints)}
     nlp["p"] = casadi.vertcat(x0, last, casadi.vec(r), casadi.vec(wanted))
-    ipopt = {"print_level": 0, "sb": "yes", "tol": tolerance, "max_iter": 500, "bound_relax_factor": 0.0}
-    options: dict[str, Any] = {"print_time": False, "show_eval_warnings": False, "ipopt": ipopt}
+    ipopt = {
+        "print_level": 0,
+        "sb": "yes",
+        "tol": tolerance,
+        "max_iter": 500,
+        "bound_relax_factor": 0.0,
+    }
+    options: dict[str, Any] = {
+        "print_time": False,
+        "show_eval_warnings": False,
+        "ipopt": ipopt,
+    }
     bounds = [{"x": np.hstack(box)[side], "g": np.hstack(g)[side]} for side in (0, 1)]
     return casadi.nlpsol("nmpc", "ipopt", nlp, options), bounds
 

@@ -27,7 +27,14 @@ from gpmpc._dynamics import DynamicsModel, linearize
 from gpmpc.exceptions import SettingError, check_number
 from gpmpc.gaussian import Gaussian
 from gpmpc.mpc._condense import condense
-from gpmpc.mpc._controller import FEASIBLE, Decision, Reference, Request, Timing, check_method
+from gpmpc.mpc._controller import (
+    FEASIBLE,
+    Decision,
+    Reference,
+    Request,
+    Timing,
+    check_method,
+)
 from gpmpc.mpc._cost import FunctionNotFinite
 from gpmpc.mpc._linear_quadratic import CondensedProgram, expand
 from gpmpc.mpc._prediction import Prediction, PredictionModel, PredictionSettings
@@ -74,20 +81,33 @@ class GPMPC:
         iterations: int = 1,
         tolerance: float = 1e-6,
     ):
-        self.prediction = PredictionModel(model, propagator, problem, horizon, initial_input, prediction)
+        self.prediction = PredictionModel(
+            model, propagator, problem, horizon, initial_input, prediction
+        )
         check_number("iterations", iterations, least=1, whole=True)
         check_number("tolerance", tolerance, above=0)
         if iterations > 1 and prediction.form != "trajectory":
             rule = f"form {prediction.form!r} is one quadratic program, so 1"
             raise SettingError("iterations", f"{rule}; got {iterations}")
-        self.initial_input, self.problem, self.horizon = self.prediction.initial_input, problem, horizon
+        self.initial_input, self.problem, self.horizon = (
+            self.prediction.initial_input,
+            problem,
+            horizon,
+        )
         self.iterations, self.tolerance = iterations, tolerance
         self.solver = DualActiveSet() if solver is None else solver
         check_method("solver", self.solver, "solve", "DualActiveSet()")
         self._prior = self.prediction.linearizer.prior_variances()
-        rows, hard = self.prediction.constraints, np.full(self.prediction.bounds.rate_lower.size, np.inf)
-        self._hard = np.where(np.isinf(rows.prices), np.inf, 0.0)  # prices: of hard rows alone
-        self._prices = np.concatenate([hard, np.tile(rows.prices, horizon)]) if rows.soft else None  # of rows of G
+        rows, hard = (
+            self.prediction.constraints,
+            np.full(self.prediction.bounds.rate_lower.size, np.inf),
+        )
+        self._hard = np.where(
+            np.isinf(rows.prices), np.inf, 0.0
+        )  # prices: of hard rows alone
+        self._prices = (
+            np.concatenate([hard, np.tile(rows.prices, horizon)]) if rows.soft else None
+        )  # of rows of G
         if self._prices is not None and not isinstance(self.solver, DualActiveSet):
             rule = "soft constraints need DualActiveSet (penalty=None makes them hard)"
             raise SettingError("solver", f"{rule}; got {type(self.solver).__name__}")
@@ -117,38 +137,65 @@ class GPMPC:
             ShapeError: Belief, reference, parameters or plan have other dimensions, or reference inputs are missing.
             DataError: Reference, parameters or plan are not finite.
         """
-        return self._decide(self.prediction.read(belief, reference, previous, parameters, plan), [perf_counter()])
+        return self._decide(
+            self.prediction.read(belief, reference, previous, parameters, plan),
+            [perf_counter()],
+        )
 
-    def _decide(self, request: Request, laps: list[float], prediction: Prediction | None = None) -> Decision:
+    def _decide(
+        self, request: Request, laps: list[float], prediction: Prediction | None = None
+    ) -> Decision:
         """The decision on a request from the prediction at its first guess: failed where numbers are not finite."""
         if not request.finite:
             return request.failed_decision(Status.INVALID_MEASUREMENT)
         try:
             if prediction is None:
-                prediction = self.prediction.linearize(self.prediction.initial_guess(request), request)
+                prediction = self.prediction.linearize(
+                    self.prediction.initial_guess(request), request
+                )
             return self._improve(prediction, request, laps)
         except FAILURES as error:
             at_function = isinstance(error, FunctionNotFinite)
-            status = Status.FUNCTION_NOT_FINITE if at_function else Status.NUMERICAL_TROUBLE
+            status = (
+                Status.FUNCTION_NOT_FINITE if at_function else Status.NUMERICAL_TROUBLE
+            )
             return request.failed_decision(status, timing=_timing(laps))
 
-    def _improve(self, prediction: Prediction, request: Request, laps: list[float]) -> Decision:
+    def _improve(
+        self, prediction: Prediction, request: Request, laps: list[float]
+    ) -> Decision:
         """The decision from a prediction: program by program, up to a KKT point or the last one."""
-        guess, solution = prediction.plan, None if request.previous is None else request.previous.solution
-        search = Globalization(self.prediction, request, self.tolerance) if self.iterations > 1 else None
+        guess, solution = (
+            prediction.plan,
+            None if request.previous is None else request.previous.solution,
+        )
+        search = (
+            Globalization(self.prediction, request, self.tolerance)
+            if self.iterations > 1
+            else None
+        )
         solved_at, status, count = None, None, 0
         while True:
             laps.append(perf_counter())
             at = prediction.stages, prediction.plan.states[0], request.references
-            program = condense(prediction.cost, self.prediction.bounds, *at, prediction.rows)
-            program = program if search is None else search.correct(program, prediction.plan)
+            program = condense(
+                prediction.cost, self.prediction.bounds, *at, prediction.rows
+            )
+            program = (
+                program if search is None else search.correct(program, prediction.plan)
+            )
             laps.append(perf_counter())
             solution = self._solve(program, solution)
             laps.append(perf_counter())
             count, status = count + 1, solution.status
             if _is_usable(program, solution, prediction.plan):
                 unknowns = np.ascontiguousarray(solution.x, dtype=np.float64)
-                at = prediction.stages, prediction.plan.states[0], program.feedback, request.references.previous_input
+                at = (
+                    prediction.stages,
+                    prediction.plan.states[0],
+                    program.feedback,
+                    request.references.previous_input,
+                )
                 inputs, states = call_unchecked(expand, *at, unknowns)
                 proposed = Plan(states, inputs, prediction.covariances)
                 solved_at = prediction, program.feedback
@@ -160,19 +207,39 @@ class GPMPC:
                 break
         if solved_at is not None and self.prediction.settings.rolled_out:
             obeying = self.prediction.roll_out(prediction.plan, *solved_at, request)
-            prediction = obeying if np.isfinite(obeying.plan.states).all() else prediction
+            prediction = (
+                obeying if np.isfinite(obeying.plan.states).all() else prediction
+            )
         laps.append(perf_counter())
         timing = _timing(laps)
-        program, status = QuadraticProgram.unchecked(*program[:5]), Status.ITERATION_LIMIT if status is None else status
+        program, status = (
+            QuadraticProgram.unchecked(*program[:5]),
+            Status.ITERATION_LIMIT if status is None else status,
+        )
         suboptimal = not status.solved and prediction.plan is not guess
-        suboptimal = suboptimal and price_violations(self._hard, prediction.rows, prediction.plan, 1.0) <= FEASIBLE
+        suboptimal = (
+            suboptimal
+            and price_violations(self._hard, prediction.rows, prediction.plan, 1.0)
+            <= FEASIBLE
+        )
         if not (status.solved or suboptimal):
-            return replace(request.failed_decision(status, count, timing), problem=program, solution=solution)
+            return replace(
+                request.failed_decision(status, count, timing),
+                problem=program,
+                solution=solution,
+            )
         plan = prediction.plan
-        means, covariances = self.prediction.linearizer.moments(plan.states, prediction.covariances)
+        means, covariances = self.prediction.linearizer.moments(
+            plan.states, prediction.covariances
+        )
         novelty = call_unchecked(_largest_ratio, prediction.stages.V, self._prior)
-        inputs, found = plan.inputs.copy(), (program, solution, request.disturbance, suboptimal, novelty)
-        return Decision(inputs[0], inputs, means, covariances, status, count, timing, *found)
+        inputs, found = (
+            plan.inputs.copy(),
+            (program, solution, request.disturbance, suboptimal, novelty),
+        )
+        return Decision(
+            inputs[0], inputs, means, covariances, status, count, timing, *found
+        )
 
     def with_model(self, model: DynamicsModel) -> "GPMPC":
         """Returns the controller for another model of as many states and inputs, in microseconds."""
@@ -193,29 +260,50 @@ class GPMPC:
         """
         own = [None] * len(beliefs) if parameters is None else parameters
         asked = zip(beliefs, references, previous, own, strict=True)
-        requests, began = [self.prediction.read(*question) for question in asked], perf_counter()
+        requests, began = (
+            [self.prediction.read(*question) for question in asked],
+            perf_counter(),
+        )
         known = [request for request in requests if request.finite]
         try:
             made = iter(self.prediction.linearize_many(known))
         except FAILURES:  # one of them spoils the batch: which one, they say alone
             return [self._decide(request, [perf_counter()]) for request in requests]
         share = (perf_counter() - began) / max(1, len(known))
-        return [self._decide(r, [perf_counter() - share], next(made) if r.finite else None) for r in requests]
+        return [
+            self._decide(r, [perf_counter() - share], next(made) if r.finite else None)
+            for r in requests
+        ]
 
     def gains(self, decision: Decision, parameters: Array | None = None) -> Array:
         """K_0 .. K_{H-1} (H, m, n) of u = u_k - K_k (x - x_k), the regulator of the stages along a decision's plan."""
-        found = linearize(self.prediction.model, decision.means[:-1], decision.inputs, covariance=False)
-        cost = self.prediction.costs.at(Plan(decision.means, decision.inputs, decision.covariances), parameters)
+        found = linearize(
+            self.prediction.model,
+            decision.means[:-1],
+            decision.inputs,
+            covariance=False,
+        )
+        cost = self.prediction.costs.at(
+            Plan(decision.means, decision.inputs, decision.covariances), parameters
+        )
         return self.prediction.gains(found.A, found.B, cost)
 
     def _solve(self, program: CondensedProgram, warm: QPSolution | None) -> QPSolution:
         if isinstance(self.solver, DualActiveSet):
             prices = self._prices
-            if prices is not None and len(program.feedback):  # there the bounds of inputs are rows, too
-                prices = np.concatenate([np.full(len(program.G) - len(prices), np.inf), prices])
-            return self.solver.solve(QuadraticProgram.unchecked(*program[:5]), warm, prices)
+            if prices is not None and len(
+                program.feedback
+            ):  # there the bounds of inputs are rows, too
+                prices = np.concatenate(
+                    [np.full(len(program.G) - len(prices), np.inf), prices]
+                )
+            return self.solver.solve(
+                QuadraticProgram.unchecked(*program[:5]), warm, prices
+            )
         fits = warm is not None and warm.arrays[2].shape == program.G.shape
-        return self.solver.solve(QuadraticProgram.from_stacked(*program[:5]), warm if fits else None)
+        return self.solver.solve(
+            QuadraticProgram.from_stacked(*program[:5]), warm if fits else None
+        )
 
 
 class NonlinearGPMPC(GPMPC):
@@ -235,18 +323,33 @@ class NonlinearGPMPC(GPMPC):
         iterations: int = 100,
         tolerance: float = 1e-5,
     ):
-        settings, start = PredictionSettings(covariance=covariance), (problem, horizon, initial_input)
-        super().__init__(model, propagator, *start, settings, iterations=iterations, tolerance=tolerance)
+        settings, start = (
+            PredictionSettings(covariance=covariance),
+            (problem, horizon, initial_input),
+        )
+        super().__init__(
+            model,
+            propagator,
+            *start,
+            settings,
+            iterations=iterations,
+            tolerance=tolerance,
+        )
 
 
 def _is_usable(program: CondensedProgram, solution: QPSolution, plan: Plan) -> bool:
     """Whether a program was solved, or its solver stopped at a limit at a feasible point no worse than the plan."""
     if solution.status.solved:
         return True
-    stopped = solution.status in (Status.ITERATION_LIMIT, Status.TIME_LIMIT) and np.isfinite(solution.x).all()
+    stopped = (
+        solution.status in (Status.ITERATION_LIMIT, Status.TIME_LIMIT)
+        and np.isfinite(solution.x).all()
+    )
     if not (stopped and _violation(solution) <= FEASIBLE):
         return False
-    other = solution._replace(x=0.0 * solution.x if len(program.feedback) else plan.inputs.ravel())
+    other = solution._replace(
+        x=0.0 * solution.x if len(program.feedback) else plan.inputs.ravel()
+    )
     return solution.objective <= other.objective or _violation(other) > FEASIBLE
 
 

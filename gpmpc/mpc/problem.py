@@ -23,7 +23,14 @@ from typing import Any, Literal
 import numpy as np
 
 from gpmpc.exceptions import SettingError, check_number
-from gpmpc.mpc._cost import FunctionNotFinite, LeastSquares, Tracking, by_stage, expand_function, read_numbers
+from gpmpc.mpc._cost import (
+    FunctionNotFinite,
+    LeastSquares,
+    Tracking,
+    by_stage,
+    expand_function,
+    read_numbers,
+)
 from gpmpc.qp._problem import ABSENT
 
 Array = np.ndarray
@@ -46,7 +53,9 @@ class Constraint:
     #: price of a violation per unit and stage; ``"exact"``: one that no plan pays which can keep the constraint; None:
     #: hard
     penalty: float | Literal["exact"] | None = "exact"
-    stages: Iterable[int] | None = None  #: those of 1 .. H that it holds at, such as ``range(5, 11)``; all by default
+    stages: Iterable[int] | None = (
+        None  #: those of 1 .. H that it holds at, such as ``range(5, 11)``; all by default
+    )
     #: whether eta is for all sides and stages together, by Boole's inequality: each gets its part of 1 - eta
     joint: bool = False
 
@@ -54,7 +63,9 @@ class Constraint:
         if self.probability is not None:
             check_number("probability", self.probability)
             if not 0.5 < self.probability < 1:
-                raise SettingError("probability", f"must lie in (0.5, 1); got {self.probability}")
+                raise SettingError(
+                    "probability", f"must lie in (0.5, 1); got {self.probability}"
+                )
         elif self.joint:
             raise SettingError("joint", "needs a probability")
         if self.kappa is not None:
@@ -63,8 +74,12 @@ class Constraint:
             check_number("penalty", self.penalty, above=0)
         if self.stages is not None:
             stages = tuple(self.stages) if isinstance(self.stages, Iterable) else ()
-            if not stages or not all(isinstance(stage, int) and stage > 0 for stage in stages):
-                raise SettingError("stages", f"must be whole numbers from 1 on; got {self.stages!r}")
+            if not stages or not all(
+                isinstance(stage, int) and stage > 0 for stage in stages
+            ):
+                raise SettingError(
+                    "stages", f"must be whole numbers from 1 on; got {self.stages!r}"
+                )
             object.__setattr__(self, "stages", stages)
 
     def rows(self, horizon: int) -> tuple[Array, Array, Array]:
@@ -75,7 +90,9 @@ class Constraint:
         """Returns kappa of each of a number of sides, all stages counted."""
         if self.kappa is not None or self.probability is None:
             return float(self.kappa or 0.0)
-        return NormalDist().inv_cdf(1.0 - (1.0 - self.probability) / (sides if self.joint else 1))
+        return NormalDist().inv_cdf(
+            1.0 - (1.0 - self.probability) / (sides if self.joint else 1)
+        )
 
 
 @dataclass(frozen=True)
@@ -93,12 +110,23 @@ class Box(Constraint):
     def __post_init__(self) -> None:
         super().__post_init__()
         given = [("lower", self.lower), ("upper", self.upper)]
-        sides = [None if side is None else read_numbers(key, side) for key, side in given]
+        sides = [
+            None if side is None else read_numbers(key, side) for key, side in given
+        ]
         shape = next((side.shape for side in sides if side is not None), (0,))
-        for (key, value), side, absent in zip(given, sides, (-math.inf, math.inf), strict=True):
+        for (key, value), side, absent in zip(
+            given, sides, (-math.inf, math.inf), strict=True
+        ):
             array = np.full(shape, absent) if side is None else side
-            if array.ndim not in (1, 2) or array.shape != shape or np.isnan(array).any():
-                raise SettingError(key, f"must be a list of {shape[-1]} numbers, or one by stage; got {value!r}")
+            if (
+                array.ndim not in (1, 2)
+                or array.shape != shape
+                or np.isnan(array).any()
+            ):
+                raise SettingError(
+                    key,
+                    f"must be a list of {shape[-1]} numbers, or one by stage; got {value!r}",
+                )
             if (-np.sign(absent) * array >= ABSENT).any():
                 rule = f"no number keeps it: a bound of size {ABSENT:g} or more is none"
                 raise SettingError(key, f"{rule}; got {value!r}")
@@ -129,14 +157,25 @@ class Box(Constraint):
 
     def by_stage(self, horizon: int) -> tuple[Array, Array]:
         """Returns lower and upper bounds of every stage (H, d)."""
-        return by_stage("lower", self.lower, horizon, 1), by_stage("upper", self.upper, horizon, 1)
+        return by_stage("lower", self.lower, horizon, 1), by_stage(
+            "upper", self.upper, horizon, 1
+        )
 
     def rows(self, horizon: int) -> tuple[Array, Array, Array]:
         """Returns one row for each entry with a bound, upper ones first."""
         lower, upper = self.by_stage(horizon)
-        above, below = (np.flatnonzero(np.isfinite(side).any(axis=0)) for side in (upper, lower))
-        F, none = np.eye(self.size)[np.concatenate([above, below])], np.full((horizon, self.size), math.inf)
-        return F, np.hstack([-none[:, above], lower[:, below]]), np.hstack([upper[:, above], none[:, below]])
+        above, below = (
+            np.flatnonzero(np.isfinite(side).any(axis=0)) for side in (upper, lower)
+        )
+        F, none = (
+            np.eye(self.size)[np.concatenate([above, below])],
+            np.full((horizon, self.size), math.inf),
+        )
+        return (
+            F,
+            np.hstack([-none[:, above], lower[:, below]]),
+            np.hstack([upper[:, above], none[:, below]]),
+        )
 
 
 @dataclass(frozen=True)
@@ -155,9 +194,14 @@ class Halfspaces(Constraint):
         super().__post_init__()
         F, f = read_numbers("F", self.F), read_numbers("f", self.f)
         if F.ndim != 2 or f.ndim not in (1, 2) or f.shape[-1] != len(F):
-            raise SettingError("F, f", f"must be (r, n) and (r,) or (H, r); got {F.shape} and {f.shape}")
+            raise SettingError(
+                "F, f",
+                f"must be (r, n) and (r,) or (H, r); got {F.shape} and {f.shape}",
+            )
         if not (np.isfinite(F).all() and np.isfinite(f).all() and F.any(axis=1).all()):
-            raise SettingError("F, f", "must be finite, each row of F with an entry that is not zero")
+            raise SettingError(
+                "F, f", "must be finite, each row of F with an entry that is not zero"
+            )
         object.__setattr__(self, "F", F)
         object.__setattr__(self, "f", f)
 
@@ -197,7 +241,9 @@ class Inequality(Constraint):
         upper = np.zeros((horizon, self.count))
         return np.zeros((self.count, 0)), np.full_like(upper, -math.inf), upper
 
-    def expand(self, states: Array, inputs: Array, parameters: Array | None) -> tuple[Array, Array, Array]:
+    def expand(
+        self, states: Array, inputs: Array, parameters: Array | None
+    ) -> tuple[Array, Array, Array]:
         """Returns h (H, r) and its gradients (H, r, n), (H, r, m) along a plan (H, n), (H, m)."""
         return expand_function("h", self.h, self.count, states, inputs, parameters)
 
@@ -212,34 +258,61 @@ class Problem:
 
     cost: Tracking  #: of states and inputs; its Q may be zero
     inputs: Box = field(default_factory=Box)  #: bounds of the inputs; none by default
-    input_rates: Box = field(default_factory=Box)  #: bounds of u_i - u_{i-1} per step; none by default
-    constraints: Sequence[Constraint] = ()  #: of the states, ``Box``, ``Halfspaces`` or ``Inequality``; none by default
-    outputs: Sequence[LeastSquares] = ()  #: costs of outputs, ``LeastSquares``, beside ``cost``; none by default
+    input_rates: Box = field(
+        default_factory=Box
+    )  #: bounds of u_i - u_{i-1} per step; none by default
+    constraints: Sequence[
+        Constraint
+    ] = ()  #: of the states, ``Box``, ``Halfspaces`` or ``Inequality``; none by default
+    outputs: Sequence[
+        LeastSquares
+    ] = ()  #: costs of outputs, ``LeastSquares``, beside ``cost``; none by default
 
     def __post_init__(self) -> None:
         if not isinstance(self.cost, Tracking):
-            raise SettingError("cost", f"must be Tracking(...); got {type(self.cost).__name__}")
+            raise SettingError(
+                "cost", f"must be Tracking(...); got {type(self.cost).__name__}"
+            )
         for key in ("inputs", "input_rates"):
             box = Box() if getattr(self, key) is None else getattr(self, key)
             if not isinstance(box, Box):
-                raise SettingError(key, f"must be Box(lower, upper); got {type(box).__name__}")
-            if (box.probability, box.kappa, box.penalty, box.stages) != (None, None, "exact", None):
-                raise SettingError(key, "has bounds that are always kept: no probability, penalty or stages")
+                raise SettingError(
+                    key, f"must be Box(lower, upper); got {type(box).__name__}"
+                )
+            if (box.probability, box.kappa, box.penalty, box.stages) != (
+                None,
+                None,
+                "exact",
+                None,
+            ):
+                raise SettingError(
+                    key,
+                    "has bounds that are always kept: no probability, penalty or stages",
+                )
             box = box if box.size else Box(np.full(self.input_dim, -math.inf))
             if box.size != self.input_dim:
-                raise SettingError(key, f"must bound {self.input_dim} inputs; got {box.size}")
+                raise SettingError(
+                    key, f"must bound {self.input_dim} inputs; got {box.size}"
+                )
             object.__setattr__(self, key, box)
         examples = "Box(...), Halfspaces(...) or Inequality(...)"
-        kinds = ("constraints", Constraint, examples), ("outputs", LeastSquares, "LeastSquares(...)")
+        kinds = (
+            ("constraints", Constraint, examples),
+            ("outputs", LeastSquares, "LeastSquares(...)"),
+        )
         for key, kind, examples in kinds:
             value = () if getattr(self, key) is None else getattr(self, key)
             parts = (value,) if isinstance(value, kind) else tuple(value)
             for part in parts:
                 if not isinstance(part, kind):
-                    raise SettingError(key, f"must be {examples}; got {type(part).__name__}")
+                    raise SettingError(
+                        key, f"must be {examples}; got {type(part).__name__}"
+                    )
                 size = getattr(part, "size", None)
                 if size not in (None, self.state_dim):
-                    raise SettingError(key, f"must bound {self.state_dim} states; got {size}")
+                    raise SettingError(
+                        key, f"must bound {self.state_dim} states; got {size}"
+                    )
             object.__setattr__(self, key, parts)
 
     @property
@@ -254,23 +327,44 @@ class Problem:
 
     def check_plain(self, name: str) -> None:
         """Raises ``SettingError`` where there are functions to linearise, which a controller of this name does not."""
-        if self.outputs or any(isinstance(constraint, Inequality) for constraint in self.constraints):
-            raise SettingError("problem", f"{name} takes Box and Halfspaces; Inequality and LeastSquares are for GPMPC")
+        if self.outputs or any(
+            isinstance(constraint, Inequality) for constraint in self.constraints
+        ):
+            raise SettingError(
+                "problem",
+                f"{name} takes Box and Halfspaces; Inequality and LeastSquares are for GPMPC",
+            )
 
     def check_start(self, state: Array, input: Array) -> None:
         """Raises ``SettingError`` where a function, or its gradient, is not finite at a first state and input."""
         for part in (*self.outputs, *self.constraints):
             try:
                 if isinstance(part, LeastSquares):
-                    expand_function("y", part.y, part.weight.shape[-1], state[None], input[None], None)
+                    expand_function(
+                        "y",
+                        part.y,
+                        part.weight.shape[-1],
+                        state[None],
+                        input[None],
+                        None,
+                    )
                 elif isinstance(part, Inequality):
                     part.expand(state[None], input[None], None)
             except FunctionNotFinite as error:
-                raise SettingError("controller.problem", f"{error}, where the flight starts") from None
+                raise SettingError(
+                    "controller.problem", f"{error}, where the flight starts"
+                ) from None
 
     def price(self, constraint: Constraint) -> float:
         """Returns the price of violating a constraint, infinite for a hard one."""
         if constraint.penalty != "exact":
             return math.inf if constraint.penalty is None else float(constraint.penalty)
-        weights = self.cost.Q, self.cost.terminal, self.cost.R, *(part.weight for part in self.outputs)
-        return _EXACT * float(max(np.linalg.eigvalsh(weight).max() for weight in weights))
+        weights = (
+            self.cost.Q,
+            self.cost.terminal,
+            self.cost.R,
+            *(part.weight for part in self.outputs),
+        )
+        return _EXACT * float(
+            max(np.linalg.eigvalsh(weight).max() for weight in weights)
+        )

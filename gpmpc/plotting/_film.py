@@ -23,7 +23,13 @@ Array = np.ndarray
 _WIDTH, _HEIGHT = 640, 480  # of MuJoCo's off-screen buffer
 
 
-def film(run: "Run", system: "System", path: str | Path, frames: int = 100, enlarged: float = 1.0) -> None:
+def film(
+    run: "Run",
+    system: "System",
+    path: str | Path,
+    frames: int = 100,
+    enlarged: float = 1.0,
+) -> None:
     """Writes a flight as MuJoCo renders it, as a GIF, or as an MP4 by the file's ending.
 
     Reference, plan and tube are drawn where the recording's ``pose`` has x, y and z.
@@ -40,12 +46,18 @@ def film(run: "Run", system: "System", path: str | Path, frames: int = 100, enla
         SettingError: There is no off-screen rendering here.
         UnsupportedModel: The system is none of MuJoCo whose state says where its joints are, or no step was recorded.
     """
-    if not len(run.times) or not (hasattr(system.dynamics, "model") and hasattr(system.dynamics, "positions")):
-        raise UnsupportedModel(f"{run.path}: a film needs steps of a MuJoCo model, and its joints' positions")
+    if not len(run.times) or not (
+        hasattr(system.dynamics, "model") and hasattr(system.dynamics, "positions")
+    ):
+        raise UnsupportedModel(
+            f"{run.path}: a film needs steps of a MuJoCo model, and its joints' positions"
+        )
     try:
         mujoco = import_module("mujoco")
         chosen = "MUJOCO_GL" in os.environ or "DISPLAY" in os.environ
-        context = import_module("mujoco.gl_context" if chosen else "mujoco.egl").GLContext(_WIDTH, _HEIGHT)
+        context = import_module(
+            "mujoco.gl_context" if chosen else "mujoco.egl"
+        ).GLContext(_WIDTH, _HEIGHT)
         context.make_current()
     except Exception as error:  # of ctypes, of PyOpenGL, of a driver
         what = "no off-screen rendering by MuJoCo here; gpmpc.plotting.animate draws flights without it"
@@ -58,7 +70,11 @@ def film(run: "Run", system: "System", path: str | Path, frames: int = 100, enla
         image = figure.add_axes((0, 0, 1, 1)).imshow(scene.render(0), aspect="auto")
         image.axes.set_axis_off()
         clock = figure.text(0.02, 0.95, "")
-        legend = (("reference", REFERENCE), ("flown", FLOWN), ("plan and its tube", PLAN)) if scene.axes else ()
+        legend = (
+            (("reference", REFERENCE), ("flown", FLOWN), ("plan and its tube", PLAN))
+            if scene.axes
+            else ()
+        )
         for i, (name, color) in enumerate(legend):
             figure.text(0.02, 0.02 + 0.04 * i, name, color=color, weight="bold")
 
@@ -76,12 +92,26 @@ class _Scene:
     """What is rendered of one step."""
 
     def __init__(self, mujoco: Any, run: "Run", dynamics: Any, enlarged: float):
-        self.mujoco, self.run, self.positions, self.enlarged = mujoco, run, dynamics.positions, enlarged
+        self.mujoco, self.run, self.positions, self.enlarged = (
+            mujoco,
+            run,
+            dynamics.positions,
+            enlarged,
+        )
         self.model = dynamics.model
-        self.data, self.scene = mujoco.MjData(self.model), mujoco.MjvScene(self.model, 2000)
-        self.rendering = mujoco.MjrContext(self.model, mujoco.mjtFontScale.mjFONTSCALE_100)
+        self.data, self.scene = (
+            mujoco.MjData(self.model),
+            mujoco.MjvScene(self.model, 2000),
+        )
+        self.rendering = mujoco.MjrContext(
+            self.model, mujoco.mjtFontScale.mjFONTSCALE_100
+        )
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self.rendering)
-        self.axes = [run.pose[axis] for axis in "xyz"] if {"x", "y", "z"} <= run.pose.keys() else []
+        self.axes = (
+            [run.pose[axis] for axis in "xyz"]
+            if {"x", "y", "z"} <= run.pose.keys()
+            else []
+        )
         self.thinned = run.references[:: max(1, len(run.times) // 300)][:, self.axes]
 
     def render(self, k: int) -> Array:
@@ -95,10 +125,15 @@ class _Scene:
             camera.lookat[:] = run.states[k, self.axes]
             camera.distance, camera.elevation, camera.azimuth = 2.2, -25, 120
         every = mujoco.mjtCatBit.mjCAT_ALL
-        mujoco.mjv_updateScene(self.model, self.data, option, None, camera, every, self.scene)
+        mujoco.mjv_updateScene(
+            self.model, self.data, option, None, camera, every, self.scene
+        )
         if self.axes:
             self._draw_paths(k)
-        view, pixels = mujoco.MjrRect(0, 0, _WIDTH, _HEIGHT), np.empty((_HEIGHT, _WIDTH, 3), dtype=np.uint8)
+        view, pixels = (
+            mujoco.MjrRect(0, 0, _WIDTH, _HEIGHT),
+            np.empty((_HEIGHT, _WIDTH, 3), dtype=np.uint8),
+        )
         mujoco.mjr_render(view, self.scene, self.rendering)
         mujoco.mjr_readPixels(pixels, None, view, self.rendering)
         return pixels[::-1]
@@ -106,13 +141,27 @@ class _Scene:
     def _draw_paths(self, k: int) -> None:
         """Adds the reference, what was flown before step k, and the plan with its tube."""
         run = self.run
-        plan, covariances = run.plan_means[k][:, self.axes], run.plan_covariances[k][:, self.axes][..., self.axes]
-        finite = np.isfinite(plan).all(axis=1) & np.isfinite(covariances).all(axis=(1, 2))
-        capsule, ellipsoid = self.mujoco.mjtGeom.mjGEOM_CAPSULE, self.mujoco.mjtGeom.mjGEOM_ELLIPSOID
+        plan, covariances = (
+            run.plan_means[k][:, self.axes],
+            run.plan_covariances[k][:, self.axes][..., self.axes],
+        )
+        finite = np.isfinite(plan).all(axis=1) & np.isfinite(covariances).all(
+            axis=(1, 2)
+        )
+        capsule, ellipsoid = (
+            self.mujoco.mjtGeom.mjGEOM_CAPSULE,
+            self.mujoco.mjtGeom.mjGEOM_ELLIPSOID,
+        )
         flown = run.states[max(0, k - 200) : k + 1, self.axes]
-        for points, color in ((self.thinned, REFERENCE), (flown, FLOWN), (plan[finite], PLAN)):
+        for points, color in (
+            (self.thinned, REFERENCE),
+            (flown, FLOWN),
+            (plan[finite], PLAN),
+        ):
             for begin, end in pairwise(points):
-                if geom := self._add(capsule, np.zeros(3), np.zeros(3), np.eye(3), to_rgba(color)):
+                if geom := self._add(
+                    capsule, np.zeros(3), np.zeros(3), np.eye(3), to_rgba(color)
+                ):
                     self.mujoco.mjv_connector(geom, capsule, 0.008, begin, end)
         for mean, covariance in zip(plan[finite], covariances[finite], strict=True):
             squared, turn = np.linalg.eigh(covariance)
@@ -120,12 +169,16 @@ class _Scene:
             axes = np.maximum(2 * self.enlarged * np.sqrt(np.maximum(squared, 0)), 1e-3)
             self._add(ellipsoid, axes, mean, turn, to_rgba(PLAN, 0.15))
 
-    def _add(self, kind: Any, size: Array, place: Array, turn: Array, color: Any) -> Any:
+    def _add(
+        self, kind: Any, size: Array, place: Array, turn: Array, color: Any
+    ) -> Any:
         """Adds a shape; None where the scene is full."""
         if self.scene.ngeom == self.scene.maxgeom:
             return None
         geom = self.scene.geoms[self.scene.ngeom]
-        self.mujoco.mjv_initGeom(geom, kind, size, place, turn.ravel(), np.array(color, dtype=np.float32))
+        self.mujoco.mjv_initGeom(
+            geom, kind, size, place, turn.ravel(), np.array(color, dtype=np.float32)
+        )
         geom.emission = 0.5
         self.scene.ngeom += 1
         return geom

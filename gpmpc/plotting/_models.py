@@ -24,7 +24,9 @@ if TYPE_CHECKING:
     from gpmpc.estimation import FilterRun
     from gpmpc.logs import Inspection, Judgement
 
-_BASELINES = tuple(zip((GREY, *COLOURS[1:5]), "s^vDP", strict=True))  # told apart without colour by their markers
+_BASELINES = tuple(
+    zip((GREY, *COLOURS[1:5]), "s^vDP", strict=True)
+)  # told apart without colour by their markers
 _PER_PAGE = 24  # channels drawn
 
 
@@ -33,13 +35,17 @@ def calibration_figure(calibration: "Calibration") -> Figure:
     """Coverage against its nominal level (dashed), log density and error over the steps ahead, a column a state."""
     n, steps = len(calibration.names), range(1, calibration.horizon + 1)
     order = sorted(range(len(calibration.levels)), key=calibration.levels.__getitem__)
-    colours = colormaps["Blues"](np.linspace(1.0, 0.5, len(order))[::-1])  # the wider the interval, the darker
+    colours = colormaps["Blues"](
+        np.linspace(1.0, 0.5, len(order))[::-1]
+    )  # the wider the interval, the darker
     line = {"marker": "o" if calibration.horizon <= 30 else None, "markersize": 3}
     figure, axes = make_figure(1.5 + 2.4 * n, 6.0, 3, n, sharex=True)
     for i, (above, density, error) in enumerate(axes.T):
         above.set_title(calibration.names[i], fontsize="medium")
         for j, colour in zip(order, colours, strict=True):
-            above.axhline(calibration.levels[j], color=colour, linestyle=DASHED, linewidth=1)
+            above.axhline(
+                calibration.levels[j], color=colour, linestyle=DASHED, linewidth=1
+            )
             above.plot(steps, calibration.coverage[:, i, j], color=colour, **line)
         density.plot(steps, calibration.nlpd[:, i], color=colours[-1], **line)
         error.plot(steps, calibration.rmse[:, i], color=colours[-1], **line)
@@ -51,12 +57,22 @@ def calibration_figure(calibration: "Calibration") -> Figure:
         error.yaxis.set_major_locator(MaxNLocator(nbins=5))
         error.xaxis.set_major_locator(MaxNLocator(integer=True, nbins=6, min_n_ticks=1))
     lowest = 0.0
-    for j, colour in zip(order, colours, strict=True):  # a level is named at its line, or just above the last name
+    for j, colour in zip(
+        order, colours, strict=True
+    ):  # a level is named at its line, or just above the last name
         height = max(calibration.levels[j], lowest)
-        place: Any = {"xycoords": ("axes fraction", "data"), "va": "center", "fontsize": "small"}
-        axes[0, -1].annotate(f"{100 * calibration.levels[j]:g} %", (1.03, height), color=colour, **place)
+        place: Any = {
+            "xycoords": ("axes fraction", "data"),
+            "va": "center",
+            "fontsize": "small",
+        }
+        axes[0, -1].annotate(
+            f"{100 * calibration.levels[j]:g} %", (1.03, height), color=colour, **place
+        )
         lowest = height + 0.085
-    for axis, label in zip(axes[:, 0], ("coverage", "negative log density", "RMSE"), strict=True):
+    for axis, label in zip(
+        axes[:, 0], ("coverage", "negative log density", "RMSE"), strict=True
+    ):
         axis.set_ylabel(label)
     figure.supxlabel("steps ahead", fontsize="medium")
     figure.align_ylabels(axes[:, 0])
@@ -64,17 +80,32 @@ def calibration_figure(calibration: "Calibration") -> Figure:
 
 
 @styled
-def innovations_figure(run: "FilterRun", time_step: float = 1.0, names: list[str] | None = None) -> Figure:
+def innovations_figure(
+    run: "FilterRun", time_step: float = 1.0, names: list[str] | None = None
+) -> Figure:
     """Draws each measured value's innovations over their standard deviation, and the share outside of 95 %."""
     deviations = run.innovation_covariances.diagonal(dim1=-2, dim2=-1).sqrt()
     white = (run.innovations / deviations).cpu().numpy()
     p, times = white.shape[1], time_step * np.arange(len(white))
-    figure, axes = make_figure(7.0, 1.0 + 1.4 * p, p, 1, "innovations over their standard deviation", sharex=True)
+    figure, axes = make_figure(
+        7.0,
+        1.0 + 1.4 * p,
+        p,
+        1,
+        "innovations over their standard deviation",
+        sharex=True,
+    )
     for i, axis in enumerate(axes.flat):
         seen = np.isfinite(white[:, i])
-        outside = 100 * float((np.abs(white[seen, i]) > 1.96).mean()) if seen.any() else np.nan
+        outside = (
+            100 * float((np.abs(white[seen, i]) > 1.96).mean())
+            if seen.any()
+            else np.nan
+        )
         label = f"{outside:.1f} % outside (5 % expected), {100 * float((~seen).mean()):.0f} % missing"
-        axis.plot(times[seen], white[seen, i], ".", color=BLUE, markersize=3, label=label)
+        axis.plot(
+            times[seen], white[seen, i], ".", color=BLUE, markersize=3, label=label
+        )
         for limit in (-1.96, 1.96):
             axis.axhline(limit, color=VERMILION, linewidth=0.8)
         axis.set_ylabel(names[i] if names is not None else f"y{i + 1}")
@@ -87,18 +118,40 @@ def innovations_figure(run: "FilterRun", time_step: float = 1.0, names: list[str
 def judgement_figure(judgement: "Judgement") -> Figure:
     """Draws the errors over the steps for every predictor, with coverage and width of the model's intervals below."""
     steps, n = judgement.steps, len(judgement.groups)
-    figure, axes = make_figure(2.6 * n, 4.8, 2, n, gridspec_kw={"height_ratios": [3, 1.6]})
+    figure, axes = make_figure(
+        2.6 * n, 4.8, 2, n, gridspec_kw={"height_ratios": [3, 1.6]}
+    )
     for g, (axis, below) in enumerate(axes.T):
         others = (item for item in judgement.mean.items() if item[0] != "model")
         for (name, mean), (colour, marker) in zip(others, _BASELINES, strict=False):
             errors = np.where(np.isfinite(mean[:, g]), mean[:, g], np.nan)
-            axis.loglog(steps, errors, color=colour, marker=marker, markersize=4, linewidth=1, label=name)
-        axis.loglog(steps, judgement.mean["model"][:, g], color=BLUE, marker="o", linewidth=2, label="model")
+            axis.loglog(
+                steps,
+                errors,
+                color=colour,
+                marker=marker,
+                markersize=4,
+                linewidth=1,
+                label=name,
+            )
+        axis.loglog(
+            steps,
+            judgement.mean["model"][:, g],
+            color=BLUE,
+            marker="o",
+            linewidth=2,
+            label="model",
+        )
         axis.set(title=judgement.groups[g], ylabel=f"mean error [{judgement.units[g]}]")
-        share, (low, high) = judgement.coverage[:, g], judgement.coverage_interval[:, g].T
+        share, (low, high) = (
+            judgement.coverage[:, g],
+            judgement.coverage_interval[:, g].T,
+        )
         bars = np.maximum([share - low, high - share], 0)
         below.errorbar(steps, share, bars, color=BLUE, marker="o", capsize=3)
-        below.plot(steps, judgement.width[:, g], color=VERMILION, marker="s", linestyle="--")
+        below.plot(
+            steps, judgement.width[:, g], color=VERMILION, marker="s", linestyle="--"
+        )
         below.axhline(judgement.level, color="0.6", linewidth=0.8)
         below.set(xscale="log", ylim=(0.5, 1.5), xlabel="steps ahead")
         for each in (axis, below):

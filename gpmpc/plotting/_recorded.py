@@ -43,7 +43,11 @@ def expected(run: "Run", states: list[int]) -> tuple[np.ndarray, np.ndarray]:
     mean, std = np.full((2, len(run.times), len(states)), np.nan)
     if run.plan_means.shape[1] > 1:
         said = run.metadata.get("run", {}).get("noise_std", "").split()
-        noise = np.array(said, dtype=float) if len(said) == len(run.state_names) else np.zeros(len(run.state_names))
+        noise = (
+            np.array(said, dtype=float)
+            if len(said) == len(run.state_names)
+            else np.zeros(len(run.state_names))
+        )
         mean[1:] = run.plan_means[:-1, 1, states]
         std[1:] = np.hypot(run.plan_stds[:-1, 1, states], noise[states])
     return mean, std
@@ -52,25 +56,52 @@ def expected(run: "Run", states: list[int]) -> tuple[np.ndarray, np.ndarray]:
 @styled
 def tracking_figure(run: "Run") -> Figure:
     """Draws every tracked state and angle over time against its reference, and below it the error with the tube."""
-    said, names, units = run.metadata.get("run", {}), list(run.state_names), run.metadata.get("units", {})
-    angles, z_down = said.get("angles", "").split(), run.metadata.get("frames", {}).get("z axis") != "up"
+    said, names, units = (
+        run.metadata.get("run", {}),
+        list(run.state_names),
+        run.metadata.get("units", {}),
+    )
+    angles, z_down = (
+        said.get("angles", "").split(),
+        run.metadata.get("frames", {}).get("z axis") != "up",
+    )
     tracked = dict.fromkeys([*said.get("tracked", "").split(), *angles])
-    states = [names.index(name) for name in tracked if name in names] or list(range(len(names)))
+    states = [names.index(name) for name in tracked if name in names] or list(
+        range(len(names))
+    )
     mean, std = expected(run, states)
     n, heights = len(states), {"height_ratios": [3, 2]}
-    figure, axes = make_figure(2.9 * max(n, 2), 4.8, 2, n, _title_of(run), sharex=True, gridspec_kw=heights)
+    figure, axes = make_figure(
+        2.9 * max(n, 2), 4.8, 2, n, _title_of(run), sharex=True, gridspec_kw=heights
+    )
     dashed: Any = {"color": REFERENCE, "linestyle": DASHED}
     before = None
-    for (above, below), i, predicted, deviation in zip(axes.T, states, mean.T, std.T, strict=True):
-        state, reference, unit = run.states[:, i], run.references[:, i], units.get(f"state.{names[i]}", "")
+    for (above, below), i, predicted, deviation in zip(
+        axes.T, states, mean.T, std.T, strict=True
+    ):
+        state, reference, unit = (
+            run.states[:, i],
+            run.references[:, i],
+            units.get(f"state.{names[i]}", ""),
+        )
         if names[i] in angles:  # at the turn that is nearest to where it was
-            reference = reference + 2 * np.pi * np.round((state - reference) / (2 * np.pi))
+            reference = reference + 2 * np.pi * np.round(
+                (state - reference) / (2 * np.pi)
+            )
         above.plot(run.times, state, color=FLOWN, linewidth=1.6, label="flown")
         above.plot(run.times, reference, linewidth=1.2, label="reference", **dashed)
         above.set_title(name_of(names[i], unit, z_down))
         below.axhline(0, linewidth=1, **dashed)
-        low, high = predicted - reference - 2 * deviation, predicted - reference + 2 * deviation
-        tube = {"color": TUBE, "alpha": 0.7, "linewidth": 0, "label": "expected one step before, $\\pm 2\\sigma$"}
+        low, high = (
+            predicted - reference - 2 * deviation,
+            predicted - reference + 2 * deviation,
+        )
+        tube = {
+            "color": TUBE,
+            "alpha": 0.7,
+            "linewidth": 0,
+            "label": "expected one step before, $\\pm 2\\sigma$",
+        }
         below.fill_between(run.times, low, high, **tube)
         below.plot(run.times, state - reference, color=FLOWN, linewidth=1.2)
         _mark_failures(run, above, below)
@@ -88,9 +119,20 @@ def inputs_figure(run: "Run") -> Figure:
     """Draws what acted, over time, with its bounds."""
     m, units = len(run.input_names), run.metadata.get("units", {})
     figure, axes = make_figure(7.2, 1.6 * m + 1.0, m, 1, _title_of(run), sharex=True)
-    for axis, name, values, bounds in zip(axes.flat, run.input_names, run.inputs.T, run.input_bounds.T, strict=True):
-        until_end = np.append(values, values[-1])  # the last one holds until its step ends
-        axis.step(_edges(run), until_end, where="post", color=FLOWN, linewidth=1.4, label="applied")
+    for axis, name, values, bounds in zip(
+        axes.flat, run.input_names, run.inputs.T, run.input_bounds.T, strict=True
+    ):
+        until_end = np.append(
+            values, values[-1]
+        )  # the last one holds until its step ends
+        axis.step(
+            _edges(run),
+            until_end,
+            where="post",
+            color=FLOWN,
+            linewidth=1.4,
+            label="applied",
+        )
         _draw_bounds(axis, values, bounds)
         axis.set_ylabel(name_of(name, units.get(f"input.{name}", "")))
         _mark_failures(run, axis)
@@ -105,28 +147,50 @@ def timing_figure(run: "Run") -> Figure:
     """Draws where the time of every decision went, and how the totals are distributed."""
     milliseconds = 1e3 * run.timings
     widths = {"width_ratios": [3, 2]}
-    figure, ((over_time, distribution),) = make_figure(8.4, 3.6, 1, 2, _title_of(run), gridspec_kw=widths)
+    figure, ((over_time, distribution),) = make_figure(
+        8.4, 3.6, 1, 2, _title_of(run), gridspec_kw=widths
+    )
     bottom = np.zeros(len(run.times))
     for (name, colour), stage in zip(_STAGES.items(), milliseconds.T, strict=False):
-        over_time.stairs(bottom + stage, _edges(run), baseline=bottom, fill=True, color=colour, label=name)
+        over_time.stairs(
+            bottom + stage,
+            _edges(run),
+            baseline=bottom,
+            fill=True,
+            color=colour,
+            label=name,
+        )
         bottom = bottom + stage
     total = np.sort(milliseconds[:, -1])
-    total = total[total > 0] if total.any() else total  # a controller that was not asked took no time
+    total = (
+        total[total > 0] if total.any() else total
+    )  # a controller that was not asked took no time
     # A first step that compiles, and those that waited for a core, would leave nothing to be seen of the others.
     most_of_them = float(np.quantile(total, 0.98, method="inverted_cdf"))
     ceiling = 1.15 * min(most_of_them, 5 * float(np.median(total))) or 1.0
-    over_time.set(xlabel="time [s]", ylabel="time of a decision [ms]", ylim=(0, ceiling))
+    over_time.set(
+        xlabel="time [s]", ylabel="time of a decision [ms]", ylim=(0, ceiling)
+    )
     if beyond := int((total > ceiling).sum()):
-        over_time.set_title(f"{beyond} of {len(total)} steps above, up to {_duration(total[-1])}", fontsize="small")
-    distribution.step(total, np.arange(1, len(total) + 1) / len(total), where="post", color=FLOWN)
+        over_time.set_title(
+            f"{beyond} of {len(total)} steps above, up to {_duration(total[-1])}",
+            fontsize="small",
+        )
+    distribution.step(
+        total, np.arange(1, len(total) + 1) / len(total), where="post", color=FLOWN
+    )
     if total[0] > 0 and total[-1] > 5 * total[0]:
         distribution.set_xscale("log")
         plain_numbers(distribution.xaxis, few=total[-1] < 300 * total[0])
     median, most = np.quantile(total, [0.5, 0.99]).tolist()
     for value in (median, most):
         distribution.axvline(value, color=_BOUND, linewidth=1, linestyle=DASHED)
-    distribution.set_title(f"median {_duration(median)}, 99 % below {_duration(most)}", fontsize="small")
-    distribution.set(ylim=(0, 1.02), xlabel="time of a decision [ms]", ylabel="share of the steps")
+    distribution.set_title(
+        f"median {_duration(median)}, 99 % below {_duration(most)}", fontsize="small"
+    )
+    distribution.set(
+        ylim=(0, 1.02), xlabel="time of a decision [ms]", ylabel="share of the steps"
+    )
     legend_below(figure, [over_time])
     return figure
 
@@ -138,13 +202,22 @@ def _edges(run: "Run") -> np.ndarray:
 
 
 def _duration(milliseconds: float) -> str:
-    return f"{milliseconds:.3g} ms" if milliseconds < 999.5 else f"{milliseconds / 1e3:.3g} s"
+    return (
+        f"{milliseconds:.3g} ms"
+        if milliseconds < 999.5
+        else f"{milliseconds / 1e3:.3g} s"
+    )
 
 
 def _title_of(run: "Run") -> str:
     """Returns what was run: the command, or the file."""
     command = run.metadata.get("run", {}).get("command", "")
-    return textwrap.fill(command if command.startswith("gpmpc") else str(run.path), 90, max_lines=2, placeholder=" ...")
+    return textwrap.fill(
+        command if command.startswith("gpmpc") else str(run.path),
+        90,
+        max_lines=2,
+        placeholder=" ...",
+    )
 
 
 def _draw_bounds(axis: Axes, inputs: np.ndarray, bounds: np.ndarray) -> None:
@@ -156,14 +229,33 @@ def _draw_bounds(axis: Axes, inputs: np.ndarray, bounds: np.ndarray) -> None:
     for limit in near:
         axis.axhline(limit, color=_BOUND, linestyle=DASHED, linewidth=1, label="bound")
     low, high = min([low, *near]), max([high, *near])
-    axis.set_ylim(low - 0.12 * max(high - low, span), high + 0.25 * max(high - low, span))
+    axis.set_ylim(
+        low - 0.12 * max(high - low, span), high + 0.25 * max(high - low, span)
+    )
     if len(near) < len(limits):
-        place: Any = {"xycoords": "axes fraction", "ha": "right", "va": "top", "fontsize": "small", "color": _BOUND}
-        axis.annotate("bounds " + " and ".join(f"{limit:g}" for limit in limits), (0.995, 0.97), **place)
+        place: Any = {
+            "xycoords": "axes fraction",
+            "ha": "right",
+            "va": "top",
+            "fontsize": "small",
+            "color": _BOUND,
+        }
+        axis.annotate(
+            "bounds " + " and ".join(f"{limit:g}" for limit in limits),
+            (0.995, 0.97),
+            **place,
+        )
 
 
 def _mark_failures(run: "Run", *axes: Axes) -> None:
     """Draws a mark at every step whose decision was not applied."""
     for axis in axes:
         for time in run.times[run.failed]:
-            axis.axvline(time, color=ORANGE, linewidth=1, alpha=0.6, label="failed solve", zorder=0)
+            axis.axvline(
+                time,
+                color=ORANGE,
+                linewidth=1,
+                alpha=0.6,
+                label="failed solve",
+                zorder=0,
+            )

@@ -20,15 +20,36 @@ BLUE, VERMILION, GREEN, _PURPLE = "#0072b2", "#d55e00", "#009e73", "#cc79a7"
 ORANGE, SKY, BLACK, GREY = "#e69f00", "#56b4e9", "#000000", "0.45"
 COLOURS = (BLUE, VERMILION, GREEN, _PURPLE, ORANGE, SKY, BLACK, GREY)
 FLOWN, REFERENCE, TUBE, PLAN = BLUE, VERMILION, SKY, GREEN
-DASHES: tuple[Any, ...] = ("-", (0, (5, 2)), (0, (1.2, 1.6)), (0, (6, 2, 1.2, 2)), (0, (3, 3)), (0, (8, 2)))
+DASHES: tuple[Any, ...] = (
+    "-",
+    (0, (5, 2)),
+    (0, (1.2, 1.6)),
+    (0, (6, 2, 1.2, 2)),
+    (0, (3, 3)),
+    (0, (8, 2)),
+)
 DASHED: Any = (0, (4, 3))  # of references and bounds
-_NAMES = {"phi": "roll", "theta": "pitch", "psi": "yaw", "U1": "thrust U1", "ux": "direction ux", "uy": "direction uy"}
+_NAMES = {
+    "phi": "roll",
+    "theta": "pitch",
+    "psi": "yaw",
+    "U1": "thrust U1",
+    "ux": "direction ux",
+    "uy": "direction uy",
+}
 
-styled = mpl.rc_context(fname=Path(__file__).with_name("gpmpc.mplstyle"))  # a decorator of what makes a figure
+styled = mpl.rc_context(
+    fname=Path(__file__).with_name("gpmpc.mplstyle")
+)  # a decorator of what makes a figure
 
 
 def make_figure(
-    width: float, height: float, rows: int = 1, columns: int = 1, title: str = "", **options: Any
+    width: float,
+    height: float,
+    rows: int = 1,
+    columns: int = 1,
+    title: str = "",
+    **options: Any,
 ) -> tuple[Figure, np.ndarray]:
     """Returns a figure of some inches and its axes (rows, columns)."""
     figure = Figure(figsize=(width, height), layout="constrained")
@@ -50,19 +71,29 @@ def clipped(text: str, most: int) -> str:
 
 def plain_numbers(axis: Axis, few: bool) -> None:
     """Labels a logarithmic axis by plain numbers; over few decades by 2 and 5 between them as well."""
-    axis.set_major_locator(LogLocator(subs=(1, 2, 5)) if few else LogLocator(numticks=5))
+    axis.set_major_locator(
+        LogLocator(subs=(1, 2, 5)) if few else LogLocator(numticks=5)
+    )
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axis.set_minor_formatter(NullFormatter())
 
 
 def legend_below(figure: Figure, axes: Iterable[Axes]) -> None:
     """Puts one legend for all axes below them, each label once, in as many columns as the figure's width holds."""
-    found = {label: handle for axis in axes for handle, label in zip(*axis.get_legend_handles_labels(), strict=True)}
+    found = {
+        label: handle
+        for axis in axes
+        for handle, label in zip(*axis.get_legend_handles_labels(), strict=True)
+    }
     if found:
         characters = 11.0 * figure.get_figwidth()  # that fit into a line
         labels = [clipped(label, int(characters) - 6) for label in found]
-        columns = max(1, min(len(labels), int(characters / (max(map(len, labels)) + 6))))
-        figure.legend([*found.values()], labels, loc="outside lower center", ncols=columns)
+        columns = max(
+            1, min(len(labels), int(characters / (max(map(len, labels)) + 6)))
+        )
+        figure.legend(
+            [*found.values()], labels, loc="outside lower center", ncols=columns
+        )
 
 
 def png(figure: Figure, dpi: int = 150) -> bytes:

@@ -9,7 +9,14 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, NullLocator
 
-from gpmpc.plotting._style import COLOURS, clipped, legend_below, make_figure, plain_numbers, styled
+from gpmpc.plotting._style import (
+    COLOURS,
+    clipped,
+    legend_below,
+    make_figure,
+    plain_numbers,
+    styled,
+)
 
 
 @dataclass(frozen=True)
@@ -17,12 +24,18 @@ class Series:
     """One line of a figure."""
 
     label: str  # in the legend
-    values: Sequence[Sequence[float]]  # the runs' values by position on the axis; a position may have none
+    values: Sequence[
+        Sequence[float]
+    ]  # the runs' values by position on the axis; a position may have none
 
 
 @styled
 def over_variable(
-    title: str, positions: Sequence[str], label: str, lines: Sequence[Series], logarithmic: bool = False
+    title: str,
+    positions: Sequence[str],
+    label: str,
+    lines: Sequence[Series],
+    logarithmic: bool = False,
 ) -> Figure:
     """Median and quartiles of a measure over the values of a variable, every run a dot.
 
@@ -53,11 +66,19 @@ def over_variable(
     return figure
 
 
-def draw_quartiles(axis: Axes, lines: Sequence[Series], positions: Sequence[str]) -> None:
+def draw_quartiles(
+    axis: Axes, lines: Sequence[Series], positions: Sequence[str]
+) -> None:
     """Draws median, quartiles and every value of each line at each position."""
     numbers = _numbers(positions)
     wide = numbers is not None and numbers[0] > 0 and numbers[-1] >= 10 * numbers[0]
-    at = np.arange(float(len(positions))) if numbers is None else np.log10(numbers) if wide else numbers
+    at = (
+        np.arange(float(len(positions)))
+        if numbers is None
+        else np.log10(numbers)
+        if wide
+        else numbers
+    )
     gap = float(np.diff(at).min(initial=np.inf)) if len(at) > 1 else 1.0
 
     def place(x: np.ndarray) -> np.ndarray:
@@ -66,16 +87,43 @@ def draw_quartiles(axis: Axes, lines: Sequence[Series], positions: Sequence[str]
     width = min(0.14, 0.7 / max(len(lines), 1)) * gap
     for i, line in enumerate(lines):
         colour = COLOURS[i % len(COLOURS)]
-        middles = at + (i - (len(lines) - 1) / 2) * width  # side by side: their quartiles do not hide each other
+        middles = (
+            at + (i - (len(lines) - 1) / 2) * width
+        )  # side by side: their quartiles do not hide each other
         known = [p for p, group in enumerate(line.values) if group]
         if not known:  # a line of failed runs alone
             continue
-        low, middle, high = np.array([np.quantile(line.values[p], [0.25, 0.5, 0.75]) for p in known]).T
-        style: Any = {"color": colour, "marker": "o", "markersize": 4, "linestyle": "none" if numbers is None else "-"}
-        axis.errorbar(place(middles[known]), middle, np.array([middle - low, high - middle]), label=line.label, **style)
+        low, middle, high = np.array(
+            [np.quantile(line.values[p], [0.25, 0.5, 0.75]) for p in known]
+        ).T
+        style: Any = {
+            "color": colour,
+            "marker": "o",
+            "markersize": 4,
+            "linestyle": "none" if numbers is None else "-",
+        }
+        axis.errorbar(
+            place(middles[known]),
+            middle,
+            np.array([middle - low, high - middle]),
+            label=line.label,
+            **style,
+        )
         for x, group in zip(middles, line.values, strict=True):
-            aside = 0.3 * width * ((np.arange(len(group)) + 0.5) / max(len(group), 1) * 2 - 1)
-            axis.plot(place(x + aside), group, ".", color=colour, alpha=0.45, markersize=5, mew=0)
+            aside = (
+                0.3
+                * width
+                * ((np.arange(len(group)) + 0.5) / max(len(group), 1) * 2 - 1)
+            )
+            axis.plot(
+                place(x + aside),
+                group,
+                ".",
+                color=colour,
+                alpha=0.45,
+                markersize=5,
+                mew=0,
+            )
     if wide:
         axis.set_xscale("log")
     axis.set_xticks(place(at), [clipped(position, 24) for position in positions])
@@ -90,11 +138,17 @@ def _numbers(positions: Sequence[str]) -> np.ndarray | None:
         numbers = np.array([float(position) for position in positions])
     except ValueError:
         return None
-    return numbers if np.isfinite(numbers).all() and len(set(numbers)) == len(numbers) else None
+    return (
+        numbers
+        if np.isfinite(numbers).all() and len(set(numbers)) == len(numbers)
+        else None
+    )
 
 
 @styled
-def search_figure(costs: Sequence[float], importances: Mapping[str, float], unchanged: float | None) -> Figure:
+def search_figure(
+    costs: Sequence[float], importances: Mapping[str, float], unchanged: float | None
+) -> Figure:
     """Draws the costs of a search over its candidates, and beside them how much each setting mattered.
 
     Args:
@@ -102,24 +156,48 @@ def search_figure(costs: Sequence[float], importances: Mapping[str, float], unch
         importances: Shares by setting, the most first; may be empty.
         unchanged: Cost of the settings without the search; None leaves it out.
     """
-    figure, ((axis, *bars),) = make_figure(4.4 + 4.0 * bool(importances), 3.4, columns=1 + bool(importances))
+    figure, ((axis, *bars),) = make_figure(
+        4.4 + 4.0 * bool(importances), 3.4, columns=1 + bool(importances)
+    )
     values = np.array(costs)
     finite, best = np.isfinite(values), np.minimum.accumulate(values)
-    axis.plot(np.flatnonzero(finite), values[finite], ".", color=COLOURS[0], alpha=0.6, label="candidate")
+    axis.plot(
+        np.flatnonzero(finite),
+        values[finite],
+        ".",
+        color=COLOURS[0],
+        alpha=0.6,
+        label="candidate",
+    )
     known = np.isfinite(best)
-    axis.step(np.flatnonzero(known), best[known], color=COLOURS[1], where="post", label="best so far")
+    axis.step(
+        np.flatnonzero(known),
+        best[known],
+        color=COLOURS[1],
+        where="post",
+        label="best so far",
+    )
     if len(lost := np.flatnonzero(~finite)):
-        top = {"transform": axis.get_xaxis_transform(), "color": "0.5", "label": "lost or failed"}
+        top = {
+            "transform": axis.get_xaxis_transform(),
+            "color": "0.5",
+            "label": "lost or failed",
+        }
         axis.plot(lost, np.full(len(lost), 0.98), "x", **top)
     if unchanged is not None:
-        axis.axhline(unchanged, color="0.4", linestyle="--", label="settings as they are")
+        axis.axhline(
+            unchanged, color="0.4", linestyle="--", label="settings as they are"
+        )
     if finite.any() and values[finite].min() > 0:
         axis.set_yscale("log")
     axis.set(xlabel="candidate", ylabel="closed-loop cost per step")
     axis.xaxis.set_major_locator(MaxNLocator(integer=True))
     legend_below(figure, [axis])
     for beside in bars:
-        names, shares = [clipped(name, 60) for name in importances], [100 * share for share in importances.values()]
+        names, shares = (
+            [clipped(name, 60) for name in importances],
+            [100 * share for share in importances.values()],
+        )
         drawn = beside.barh(names[::-1], shares[::-1], color=COLOURS[0], height=0.5)
         beside.bar_label(drawn, fmt="%.0f %%", padding=3)
         beside.set(xlabel="importance [%]", xlim=(0, 115))

@@ -4,7 +4,12 @@ from gpmpc.propagation._linearization import Linearization, MeanEquivalence
 from gpmpc.propagation._local_model import linearize, rollout
 from gpmpc.propagation._moment_matching import MomentMatching, best_propagator
 from gpmpc.propagation._points import MonteCarlo, Unscented
-from gpmpc.propagation._propagator import Propagation, Propagator, Sensitivity, differentiate
+from gpmpc.propagation._propagator import (
+    Propagation,
+    Propagator,
+    Sensitivity,
+    differentiate,
+)
 
 __all__ = [
     "Linearization",

@@ -46,7 +46,9 @@ def square_roots(covariances: Array) -> tuple[Array, Array, Array]:
     return (U * r[..., None, :]) @ U.mT, r, U
 
 
-def linearize(propagator: Propagator, model: Any, belief: Gaussian, input: Tensor | None = None) -> LocalModel:
+def linearize(
+    propagator: Propagator, model: Any, belief: Gaussian, input: Tensor | None = None
+) -> LocalModel:
     """Linearises the next belief at a belief and an input, or along a plan when both have a leading dimension H.
 
     A local model is a constant: no gradient flows through it, and torch's function transforms do not apply. Arguments
@@ -55,13 +57,22 @@ def linearize(propagator: Propagator, model: Any, belief: Gaussian, input: Tenso
     belief = Gaussian(belief.mean.detach(), belief.covariance.detach())
     input = belief.mean[..., :0] if input is None else input.detach()
     if model.output_dim != belief.dim:
-        raise ShapeError(f"a local model needs an output a state; got {belief.dim} states, {model.output_dim} outputs")
+        raise ShapeError(
+            f"a local model needs an output a state; got {belief.dim} states, {model.output_dim} outputs"
+        )
     moved, d = differentiate(propagator, model, belief, input)
     batch, n, p = belief.mean.shape[:-1], belief.dim, belief.dim + belief.dim**2
-    of_mean, mean_by_covariance, mean_by_input, by_mean, by_covariance, by_input = map(to_array, vars(d).values())
-    covariances = np.stack([to_array(belief.covariance), to_array(moved.belief.covariance)])
+    of_mean, mean_by_covariance, mean_by_input, by_mean, by_covariance, by_input = map(
+        to_array, vars(d).values()
+    )
+    covariances = np.stack(
+        [to_array(belief.covariance), to_array(moved.belief.covariance)]
+    )
     roots, (_, r), (_, U) = square_roots(covariances)
-    means, u = np.stack([to_array(belief.mean), to_array(moved.belief.mean)]), to_array(input.expand(*batch, -1))
+    means, u = (
+        np.stack([to_array(belief.mean), to_array(moved.belief.mean)]),
+        to_array(input.expand(*batch, -1)),
+    )
     s, s_next = np.concatenate([means, roots.reshape(2, *batch, n * n)], axis=-1)
     # dSigma = E S + S E for a change E of the root: a derivative D by Sigma becomes 2 D S.
     twice = 2 * roots[0][..., None, :, :]
@@ -72,7 +83,9 @@ def linearize(propagator: Propagator, model: Any, belief: Gaussian, input: Tenso
     inverse = (total > 0) / np.maximum(total, np.finfo(float).tiny)
     change = _congruence(U.mT, np.concatenate([by_mean, by_root, by_input], axis=-1))
     lower = _congruence(U, change * inverse[..., None]).reshape(*batch, n * n, -1)
-    A = np.concatenate([np.concatenate([of_mean, mean_by_root], axis=-1), lower[..., :p]], axis=-2)
+    A = np.concatenate(
+        [np.concatenate([of_mean, mean_by_root], axis=-1), lower[..., :p]], axis=-2
+    )
     B = np.concatenate([mean_by_input, lower[..., p:]], axis=-2)
     c = s_next - (A @ s[..., None] + B @ u[..., None])[..., 0]
     A, B, c, after = tensors_for(model, A, B, c, s_next)
@@ -84,14 +97,18 @@ def _congruence(U: Array, X: Array) -> Array:
     return U[..., None, :, :] @ (U @ X.reshape(*X.shape[:-2], -1)).reshape(X.shape)
 
 
-def rollout(propagator: Propagator, model: Any, belief: Gaussian, inputs: Tensor) -> Gaussian:
+def rollout(
+    propagator: Propagator, model: Any, belief: Gaussian, inputs: Tensor
+) -> Gaussian:
     """The beliefs at steps 1 to H: mean (*batch, H, n), covariance (*batch, H, n, n).
 
     From a belief at step 0 (*batch) and inputs (*batch, H, m); an autonomous model takes (*batch, H, 0).
     """
     check_tensors(inputs=inputs)
     if inputs.dim() < 2 or not inputs.shape[-2]:
-        raise ShapeError(f"inputs must be (*batch, H, m) with H of 1 or more; got {tuple(inputs.shape)}")
+        raise ShapeError(
+            f"inputs must be (*batch, H, m) with H of 1 or more; got {tuple(inputs.shape)}"
+        )
     beliefs = []
     for control in inputs.unbind(-2):
         belief = propagator(model, belief, control)

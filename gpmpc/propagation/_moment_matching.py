@@ -22,7 +22,13 @@ from gpmpc.gp._backend import host_arrays
 from gpmpc.gp._posterior import AffineForm
 from gpmpc.propagation._moments import Latent, moments, moments_with_jacobian
 from gpmpc.propagation._points import Unscented
-from gpmpc.propagation._propagator import NoisyPropagator, Propagation, Propagator, Sensitivity, checked_input
+from gpmpc.propagation._propagator import (
+    NoisyPropagator,
+    Propagation,
+    Propagator,
+    Sensitivity,
+    checked_input,
+)
 
 
 class MomentMatching(NoisyPropagator):
@@ -48,19 +54,28 @@ class MomentMatching(NoisyPropagator):
         form, f = self._latent(model, belief, input, derivatives=True)
         d = _derivatives(form, belief.covariance, f)
         if self.diagonal:
-            of = torch.eye(d.covariance_by_mean.shape[-2], dtype=f.M.dtype, device=f.M.device)[..., None]
+            of = torch.eye(
+                d.covariance_by_mean.shape[-2], dtype=f.M.dtype, device=f.M.device
+            )[..., None]
             by_mean, by_input = of * d.covariance_by_mean, of * d.covariance_by_input
             by_covariance = of[..., None] * d.covariance_by_covariance
             d = replace(
-                d, covariance_by_mean=by_mean, covariance_by_covariance=by_covariance, covariance_by_input=by_input
+                d,
+                covariance_by_mean=by_mean,
+                covariance_by_covariance=by_covariance,
+                covariance_by_input=by_input,
             )
         return self._projected(model, *_next_moments(form, belief, input, f)), d
 
-    def _moved(self, model: Any, belief: Gaussian, input: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def _moved(
+        self, model: Any, belief: Gaussian, input: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
         form, f = self._latent(model, belief, input, derivatives=False)
         return _next_moments(form, belief, input, f)
 
-    def _latent(self, model: Any, belief: Gaussian, input: Tensor, derivatives: bool) -> tuple[AffineForm, Latent]:
+    def _latent(
+        self, model: Any, belief: Gaussian, input: Tensor, derivatives: bool
+    ) -> tuple[AffineForm, Latent]:
         """How the model is composed, and the moments of its latent functions, compiled or by torch."""
         if (form := _exact_form(model)) is None:
             raise UnsupportedModel(
@@ -71,16 +86,28 @@ class MomentMatching(NoisyPropagator):
         f, cross, batch = form.f, form.A is not None, belief.mean.shape[:-1]
         if form.states is not None:
             S = belief.covariance[..., form.states, :][..., form.states]
-            belief, input = Gaussian(belief.mean[..., form.states], S), input[..., form.inputs]
-        if (arrays := host_arrays(f.weights, belief.mean, belief.covariance, input)) is None:
+            belief, input = (
+                Gaussian(belief.mean[..., form.states], S),
+                input[..., form.inputs],
+            )
+        if (
+            arrays := host_arrays(f.weights, belief.mean, belief.covariance, input)
+        ) is None:
             if derivatives:
-                return form, moments_with_jacobian(f, belief, input, self.diagonal, cross)
+                return form, moments_with_jacobian(
+                    f, belief, input, self.diagonal, cross
+                )
             return form, Latent(*moments(f, belief, input, self.diagonal))
         from gpmpc import _kernels as kernels  # loads numba
 
-        mean, S, u = [part.reshape(batch.numel(), *part.shape[len(batch) :]) for part in arrays[1:]]
+        mean, S, u = [
+            part.reshape(batch.numel(), *part.shape[len(batch) :])
+            for part in arrays[1:]
+        ]
         found = kernels.moments(f.packed, mean, S, u, self.diagonal, derivatives)
-        parts: list[Any] = [torch.from_numpy(part.reshape(*batch, *part.shape[1:])) for part in found]
+        parts: list[Any] = [
+            torch.from_numpy(part.reshape(*batch, *part.shape[1:])) for part in found
+        ]
         parts[0] += f.offset
         return form, Latent(*parts)
 
@@ -96,7 +123,9 @@ def _exact_form(model: Any) -> AffineForm | None:
     return None if form is None or form.angles or form.tape is not None else form
 
 
-def _next_moments(form: AffineForm, belief: Gaussian, input: Tensor, f: Latent) -> tuple[Tensor, Tensor, Tensor]:
+def _next_moments(
+    form: AffineForm, belief: Gaussian, input: Tensor, f: Latent
+) -> tuple[Tensor, Tensor, Tensor]:
     """mu+ (*batch, n), Sigma+ (*batch, n, n) and Cov[x, x+] (*batch, n, n), by the module's text."""
     M, V, S, A = f.M, f.V, belief.covariance, form.A
     cross = (S if form.states is None else S[..., form.states]) @ f.J.mT
@@ -105,30 +134,45 @@ def _next_moments(form: AffineForm, belief: Gaussian, input: Tensor, f: Latent) 
     if A is None:
         return M, V, cross
     half = A @ cross
-    M = M + (belief.mean if form.G is None or form.c is None else belief.mean @ A.mT + input @ form.G.mT + form.c)
+    M = M + (
+        belief.mean
+        if form.G is None or form.c is None
+        else belief.mean @ A.mT + input @ form.G.mT + form.c
+    )
     return M, A @ S @ A.mT + half + half.mT + V, S @ A.mT + cross
 
 
 def _derivatives(form: AffineForm, S: Tensor, f: Latent) -> Sensitivity:
     """The derivatives of mu+ and Sigma+ at a belief with covariance S (*batch, n, n)."""
     A, B, n, m = form.A, form.B, S.shape[-1], 0 if form.G is None else form.G.shape[1]
-    J, dM_dS, dM_du = _whole(f.J, form.states, n), _whole(f.dM_dS, form.states, n, 2), _whole(f.dM_du, form.inputs, m)
+    J, dM_dS, dM_du = (
+        _whole(f.J, form.states, n),
+        _whole(f.dM_dS, form.states, n, 2),
+        _whole(f.dM_du, form.inputs, m),
+    )
     dV_dmu, dV_dS = _whole(f.dV_dmu, form.states, n), _whole(f.dV_dS, form.states, n, 2)
     dV_du = _whole(f.dV_du, form.inputs, m)
     if B is not None:
         J, dM_du, dM_dS = B @ J, B @ dM_du, torch.einsum("ia,...acd->...icd", B, dM_dS)
-        dV_dmu, dV_du = (torch.einsum("ia,jb,...abc->...ijc", B, B, d) for d in (dV_dmu, dV_du))
+        dV_dmu, dV_du = (
+            torch.einsum("ia,jb,...abc->...ijc", B, B, d) for d in (dV_dmu, dV_du)
+        )
         dV_dS = torch.einsum("ia,jb,...abcd->...ijcd", B, B, dV_dS)
     if A is None:
         return Sensitivity(J, dM_dS, dM_du, dV_dmu, dV_dS, dV_du)
 
-    AS = (A @ S) if form.states is None else (A @ S)[..., form.states]  # A C = (A S) J' B'
+    AS = (
+        (A @ S) if form.states is None else (A @ S)[..., form.states]
+    )  # A C = (A S) J' B'
     dJ_dS = _whole(f.dJ_dS, form.states, n, 2)
     by_mean = _doubled(B, AS, _whole(2 * f.dM_dS, form.states, n))
     by_input = _doubled(B, AS, _whole(f.dJ_du, form.inputs, m))
     by_covariance = _doubled(B, AS, dJ_dS.flatten(-2)).unflatten(-1, dJ_dS.shape[-2:])
     # of A S A' + A S J' B' + B J S A' at a held J
-    outer = A[:, None, :, None] * (A + J)[..., None, :, None, :] + J[..., :, None, :, None] * A[:, None, :]
+    outer = (
+        A[:, None, :, None] * (A + J)[..., None, :, None, :]
+        + J[..., :, None, :, None] * A[:, None, :]
+    )
     return Sensitivity(
         A + J,
         dM_dS,
@@ -147,7 +191,9 @@ def _doubled(B: Tensor | None, AS: Tensor, dJ: Tensor) -> Tensor:
     return moved + moved.transpose(-3, -2)
 
 
-def _whole(derivative: Tensor, places: list[int] | None, size: int, axes: int = 1) -> Tensor:
+def _whole(
+    derivative: Tensor, places: list[int] | None, size: int, axes: int = 1
+) -> Tensor:
     """Extends a derivative by some entries of a vector (its last axes) to one by all, ``size`` of them."""
     if places is None:
         return derivative

@@ -35,7 +35,9 @@ from torch import Tensor
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior
 
-_ENTRIES = 2**18  # of what is made at once of each kind, for one pair of outputs at least
+_ENTRIES = (
+    2**18
+)  # of what is made at once of each kind, for one pair of outputs at least
 _Pairs = tuple[list[int], list[int]]
 _NOT_WANTED: Any = None
 _LARGEST = {torch.float64: 300.0, torch.float32: 80.0}  # delta
@@ -52,7 +54,9 @@ class Latent(NamedTuple):
     dV_dmu: Tensor = _NOT_WANTED  # (*batch, k, k, n_s)
     dV_dS: Tensor = _NOT_WANTED  # (*batch, k, k, n_s, n_s)
     dV_du: Tensor = _NOT_WANTED  # (*batch, k, k, m_s)
-    dJ_dS: Tensor = _NOT_WANTED  # (*batch, k, n_s, n_s, n_s); needed where A is not zero
+    dJ_dS: Tensor = (
+        _NOT_WANTED  # (*batch, k, n_s, n_s, n_s); needed where A is not zero
+    )
     dJ_du: Tensor = _NOT_WANTED  # (*batch, k, n_s, m_s); needed where A is not zero
 
 
@@ -73,23 +77,45 @@ def moments(
 
     ``diagonal`` leaves the covariances between outputs at zero.
     """
-    at = belief.mean[..., None, :], belief.covariance[..., None, :, :], input[..., None, :]
-    terms, pairs = _output_terms(model, slice(None), *at), _chunks(model, belief, diagonal)
+    at = (
+        belief.mean[..., None, :],
+        belief.covariance[..., None, :, :],
+        input[..., None, :],
+    )
+    terms, pairs = (
+        _output_terms(model, slice(None), *at),
+        _chunks(model, belief, diagonal),
+    )
     weighted = model.weights * terms.q
     slope = (weighted[..., None, :] @ terms.z @ terms.G)[..., 0, :]
-    V = _symmetric_from_pairs([_pair_entries(model, *ab, *at) for ab in pairs], pairs, belief.mean.dim() - 1)
+    V = _symmetric_from_pairs(
+        [_pair_entries(model, *ab, *at) for ab in pairs], pairs, belief.mean.dim() - 1
+    )
     return weighted.sum(-1) + model.offset, V, slope
 
 
 def moments_with_jacobian(
-    model: GPPosterior, belief: Gaussian, input: Tensor, diagonal: bool = False, cross: bool = True
+    model: GPPosterior,
+    belief: Gaussian,
+    input: Tensor,
+    diagonal: bool = False,
+    cross: bool = True,
 ) -> Latent:
     """The moments of f at x ~ N(mu, S), and their derivatives by mu, S and u; ``cross`` adds those of J."""
     n, axis = model.state_dim, belief.mean.dim() - 1
-    at = belief.mean[..., None, :], belief.covariance[..., None, :, :], input[..., None, :]
-    terms, pairs = _output_terms(model, slice(None), *at), _chunks(model, belief, diagonal)
+    at = (
+        belief.mean[..., None, :],
+        belief.covariance[..., None, :, :],
+        input[..., None, :],
+    )
+    terms, pairs = (
+        _output_terms(model, slice(None), *at),
+        _chunks(model, belief, diagonal),
+    )
     w = terms.z @ terms.G  # dlog q_ai / dmu
-    c = (model.features[:, n:] - input[..., None, :])[..., None, :, :] * model.lengthscales[:, None, n:] ** -2
+    c = (model.features[:, n:] - input[..., None, :])[
+        ..., None, :, :
+    ] * model.lengthscales[:, None, n:] ** -2
     A = terms.G.mT * model.lengthscales[:, None, :n] ** -2  # G' D, symmetric
     weighted = model.weights * terms.q
     M, once = weighted.sum(-1), weighted[..., None] * w
@@ -98,31 +124,56 @@ def moments_with_jacobian(
     if cross:  # dJ/dS = 1/2 [sum_i beta_i q_i w_i w_i w_i - three times A with J],   dJ/du = sum_i beta_i q_i w_i c_i'
         third = torch.stack([(once * w[..., d, None]).mT @ w for d in range(n)], dim=-3)
         third = third - J[..., :, None, None] * A[..., None, :, :]
-        third = third - A[..., :, :, None] * J[..., None, None, :] - A[..., :, None, :] * J[..., None, :, None]
+        third = (
+            third
+            - A[..., :, :, None] * J[..., None, None, :]
+            - A[..., :, None, :] * J[..., None, :, None]
+        )
         dJ = third / 2, once.mT @ c
     with torch.inference_mode(False):
         parts = [_pair_entries_with_gradient(model, ab, at, axis) for ab in pairs]
-    V, dV_dmu, dV_dS, dV_du = (_symmetric_from_pairs(part, pairs, axis) for part in zip(*parts, strict=True))
+    V, dV_dmu, dV_dS, dV_du = (
+        _symmetric_from_pairs(part, pairs, axis) for part in zip(*parts, strict=True)
+    )
     dM_du = (weighted[..., None, :] @ c)[..., 0, :]
-    return Latent(M + model.offset, V, J, dM_dS, dM_du, dV_dmu, (dV_dS + dV_dS.mT) / 2, dV_du, *dJ)
+    return Latent(
+        M + model.offset, V, J, dM_dS, dM_du, dV_dmu, (dV_dS + dV_dS.mT) / 2, dV_du, *dJ
+    )
 
 
-def _output_terms(model: GPPosterior, a: Any, mu: Tensor, S: Tensor, u: Tensor) -> _OutputTerms:
+def _output_terms(
+    model: GPPosterior, a: Any, mu: Tensor, S: Tensor, u: Tensor
+) -> _OutputTerms:
     """The terms of outputs a (k,) at mu (*batch, k, n), S (*batch, k, n, n) and u (*batch, k, m), or one for all."""
     n, lengthscales = model.state_dim, model.lengthscales[a]
     D = lengthscales[:, :n] ** -2
-    nu, control = model.features[:, :n] - mu[..., None, :], model.features[:, n:] - u[..., None, :]
+    nu, control = (
+        model.features[:, :n] - mu[..., None, :],
+        model.features[:, n:] - u[..., None, :],
+    )
     half_logdet, factor, T = _conditioned(S, D)
-    whitened = torch.linalg.solve_triangular(factor, (nu * D.sqrt()[:, None, :]).mT, upper=False)
+    whitened = torch.linalg.solve_triangular(
+        factor, (nu * D.sqrt()[:, None, :]).mT, upper=False
+    )
     certain = (control / lengthscales[:, None, n:]).square().sum(-1)
     exponent = (certain + whitened.square().sum(-2)) / 2 + half_logdet[..., None]
     root, eye = D.sqrt(), torch.eye(n, dtype=D.dtype, device=D.device)
-    inverse = torch.cholesky_solve(eye.expand_as(factor), factor)  # cholesky_inverse has no right forward derivative
+    inverse = torch.cholesky_solve(
+        eye.expand_as(factor), factor
+    )  # cholesky_inverse has no right forward derivative
     G = inverse * (root[..., None, :] / root[..., :, None])
-    return _OutputTerms(nu * D[:, None, :], model.signal_variance[a, None] * (-exponent).exp(), half_logdet, G, T)
+    return _OutputTerms(
+        nu * D[:, None, :],
+        model.signal_variance[a, None] * (-exponent).exp(),
+        half_logdet,
+        G,
+        T,
+    )
 
 
-def _pair_entries(model: GPPosterior, a: list[int], b: list[int], mu: Tensor, S: Tensor, u: Tensor) -> Tensor:
+def _pair_entries(
+    model: GPPosterior, a: list[int], b: list[int], mu: Tensor, S: Tensor, u: Tensor
+) -> Tensor:
     """V_ab (*batch, P) of P pairs, all with a = b or none, at one belief for all or one for each (as above)."""
     same = a[0] == b[0]
     D_a, D_b = (model.lengthscales[one, : model.state_dim] ** -2 for one in (a, b))
@@ -135,13 +186,19 @@ def _pair_entries(model: GPPosterior, a: list[int], b: list[int], mu: Tensor, S:
     delta = of_a.z @ T @ of_b.z.mT + (rise[..., :, None] - fall[..., None, :])
     centred = torch.expm1(delta.clamp_max(_LARGEST[delta.dtype]))
     if not same:
-        return ((model.weights[a] * of_a.q)[..., None, :] @ centred @ (model.weights[b] * of_b.q)[..., None])[..., 0, 0]
+        return (
+            (model.weights[a] * of_a.q)[..., None, :]
+            @ centred
+            @ (model.weights[b] * of_b.q)[..., None]
+        )[..., 0, 0]
     E = model.weights[a, :, None] * model.weights[a, None, :] - model.precision[a]
     entries = (of_a.q[..., None, :] @ (E * centred) @ of_a.q[..., None])[..., 0, 0]
     return entries + model.signal_variance[a] - model.variance_reduction(of_a.q, a)
 
 
-def _pair_entries_with_gradient(model: GPPosterior, ab: _Pairs, at: Sequence[Tensor], axis: int) -> tuple[Tensor, ...]:
+def _pair_entries_with_gradient(
+    model: GPPosterior, ab: _Pairs, at: Sequence[Tensor], axis: int
+) -> tuple[Tensor, ...]:
     """V_ab (*batch, P), and its derivatives by mu (*batch, P, n), S (*batch, P, n, n) and u (*batch, P, m)."""
 
     def total(*copies: Tensor) -> tuple[Tensor, Tensor]:
@@ -149,27 +206,51 @@ def _pair_entries_with_gradient(model: GPPosterior, ab: _Pairs, at: Sequence[Ten
         return entries.sum(), entries
 
     copies = [part.repeat_interleave(len(ab[0]), dim=axis) for part in at]
-    gradients, entries = torch.func.grad(total, argnums=(0, 1, 2), has_aux=True)(*copies)
+    gradients, entries = torch.func.grad(total, argnums=(0, 1, 2), has_aux=True)(
+        *copies
+    )
     return entries, *gradients
 
 
 def _chunks(model: GPPosterior, belief: Gaussian, diagonal: bool) -> list[_Pairs]:
     """The pairs a <= b of outputs, as many in one list as are evaluated at once; first those with a = b."""
     outputs = range(model.output_dim)
-    size = len(model) * (len(model) + 8 * model.state_dim)  # of the matrices (N, N), and of the points' terms
+    size = len(model) * (
+        len(model) + 8 * model.state_dim
+    )  # of the matrices (N, N), and of the points' terms
     count = max(1, _ENTRIES // max(1, belief.mean.shape[:-1].numel() * size))
-    kinds = [(a, a) for a in outputs], [(a, b) for b in outputs for a in range(b) if not diagonal]
-    chunks = [pairs[i : i + count] for pairs in kinds for i in range(0, len(pairs), count)]
+    kinds = (
+        [(a, a) for a in outputs],
+        [(a, b) for b in outputs for a in range(b) if not diagonal],
+    )
+    chunks = [
+        pairs[i : i + count] for pairs in kinds for i in range(0, len(pairs), count)
+    ]
     return [([a for a, _ in chunk], [b for _, b in chunk]) for chunk in chunks]
 
 
-def _symmetric_from_pairs(parts: Sequence[Tensor], pairs: Sequence[_Pairs], axis: int) -> Tensor:
+def _symmetric_from_pairs(
+    parts: Sequence[Tensor], pairs: Sequence[_Pairs], axis: int
+) -> Tensor:
     """A symmetric matrix (*batch, k, k, ...) from its entries (*batch, P, ...); zero where there is none."""
-    places = {pair: p for p, pair in enumerate((a, b) for chunk in pairs for a, b in zip(*chunk, strict=True))}
+    places = {
+        pair: p
+        for p, pair in enumerate(
+            (a, b) for chunk in pairs for a, b in zip(*chunk, strict=True)
+        )
+    }
     k = max(places)[0] + 1
-    order = [places.get((min(a, b), max(a, b)), len(places)) for a in range(k) for b in range(k)]
-    entries = torch.cat([*parts, torch.zeros_like(parts[0].narrow(axis, 0, 1))], dim=axis)
-    return entries.index_select(axis, torch.tensor(order, device=entries.device)).unflatten(axis, (k, k))
+    order = [
+        places.get((min(a, b), max(a, b)), len(places))
+        for a in range(k)
+        for b in range(k)
+    ]
+    entries = torch.cat(
+        [*parts, torch.zeros_like(parts[0].narrow(axis, 0, 1))], dim=axis
+    )
+    return entries.index_select(
+        axis, torch.tensor(order, device=entries.device)
+    ).unflatten(axis, (k, k))
 
 
 def _conditioned(S: Tensor, D: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -180,8 +261,14 @@ def _conditioned(S: Tensor, D: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     root = D.sqrt()
     B = root[..., :, None] * S * root[..., None, :]
     half_logdet = torch.linalg.eigvalsh(B).log1p().sum(-1) / 2
-    factor = torch.linalg.cholesky(B + torch.eye(B.shape[-1], dtype=B.dtype, device=B.device))
-    return half_logdet, factor, torch.cholesky_solve(B, factor) / (root[..., :, None] * root[..., None, :])
+    factor = torch.linalg.cholesky(
+        B + torch.eye(B.shape[-1], dtype=B.dtype, device=B.device)
+    )
+    return (
+        half_logdet,
+        factor,
+        torch.cholesky_solve(B, factor) / (root[..., :, None] * root[..., None, :]),
+    )
 
 
 def _quadratic(z: Tensor, M: Tensor) -> Tensor:

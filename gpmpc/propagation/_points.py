@@ -20,7 +20,12 @@ from torch import Tensor
 from gpmpc.exceptions import SettingError, check_number
 from gpmpc.gaussian import Gaussian, square_root, square_root_differential
 from gpmpc.propagation._linearization import expand
-from gpmpc.propagation._propagator import NoisyPropagator, Propagation, Sensitivity, checked_input
+from gpmpc.propagation._propagator import (
+    NoisyPropagator,
+    Propagation,
+    Sensitivity,
+    checked_input,
+)
 
 _CHUNK = 1000  # samples predicted at once: bounds the memory at about chunk * N * outputs numbers
 
@@ -38,7 +43,13 @@ class Unscented(NoisyPropagator):
         SettingError: alpha is not positive, or (at the first step) n + kappa is not.
     """
 
-    def __init__(self, alpha: float = 1.0, beta: float = 0.0, kappa: float = 0.0, process_noise: bool = False):
+    def __init__(
+        self,
+        alpha: float = 1.0,
+        beta: float = 0.0,
+        kappa: float = 0.0,
+        process_noise: bool = False,
+    ):
         check_number("alpha", alpha, above=0)
         check_number("beta", beta)
         check_number("kappa", kappa)
@@ -55,13 +66,17 @@ class Unscented(NoisyPropagator):
         input, n = checked_input(model, belief, input), belief.dim
         r, U = torch.linalg.eigh(belief.covariance)
         r = r.clamp_min(0).sqrt()
-        steps, points, controls = self._points(belief, U @ (r[..., :, None] * U.mT), input)
+        steps, points, controls = self._points(
+            belief, U @ (r[..., :, None] * U.mT), input
+        )
         if (expansion := expand(model, points, controls)) is None:
             return None
         of_mean, of_covariance = self._weights(belief)
 
         # Of every point by [mu, vec(root), u] (*batch, 2n + 1, k, p): point 1 + j moves with column j of the root.
-        one = math.sqrt(self._spread(n)) * torch.eye(n, dtype=steps.dtype, device=steps.device)
+        one = math.sqrt(self._spread(n)) * torch.eye(
+            n, dtype=steps.dtype, device=steps.device
+        )
         ways = torch.cat([torch.zeros_like(one[:1]), one, -one])[:, None, None, :]
 
         def by_parameters(by_state: Tensor, by_input: Tensor) -> Tensor:
@@ -72,18 +87,35 @@ class Unscented(NoisyPropagator):
         mean_by = torch.einsum("i,...iap->...ap", of_mean, moves)
         mean = torch.einsum("i,...ia->...a", of_mean, expansion.belief.mean)
         centred = expansion.belief.mean - mean[..., None, :]
-        half = torch.einsum("i,...iap,...ib->...abp", of_covariance, moves - mean_by[..., None, :, :], centred)
-        spread_by = by_parameters(expansion.variance_by_state, expansion.variance_by_input)
-        own = torch.diag_embed(torch.einsum("i,...iap->...pa", of_mean, spread_by)).movedim(-3, -1)
+        half = torch.einsum(
+            "i,...iap,...ib->...abp",
+            of_covariance,
+            moves - mean_by[..., None, :, :],
+            centred,
+        )
+        spread_by = by_parameters(
+            expansion.variance_by_state, expansion.variance_by_input
+        )
+        own = torch.diag_embed(
+            torch.einsum("i,...iap->...pa", of_mean, spread_by)
+        ).movedim(-3, -1)
         covariance_by = half + half.transpose(-3, -2) + own
 
         def parts(by: Tensor) -> tuple[Tensor, Tensor, Tensor]:
             by_root = by[..., n : n + n * n].unflatten(-1, (n, n))
-            count = by_root.dim() - belief.mean.dim() - 1  # dimensions of what is differentiated
-            columns = ((by_root + by_root.mT) / 2).flatten(-2 - count, -3).movedim(-3, -1)
+            count = (
+                by_root.dim() - belief.mean.dim() - 1
+            )  # dimensions of what is differentiated
+            columns = (
+                ((by_root + by_root.mT) / 2).flatten(-2 - count, -3).movedim(-3, -1)
+            )
             # dR = L(dSigma) is linear, and L its own adjoint.
             by_covariance = square_root_differential(r, U, columns).movedim(-1, -3)
-            return by[..., :n], by_covariance.reshape(by_root.shape), by[..., n + n * n :]
+            return (
+                by[..., :n],
+                by_covariance.reshape(by_root.shape),
+                by[..., n + n * n :],
+            )
 
         of_means, of_covariances = parts(mean_by), parts(covariance_by)
         moved = self._projected(model, *self._moments(belief, steps, expansion.belief))
@@ -92,7 +124,9 @@ class Unscented(NoisyPropagator):
     def _spread(self, n: int) -> float:
         """The square of the distance of the points in units of the root: n + lambda."""
         if n + self.kappa <= 0:
-            raise SettingError("kappa", f"n + kappa must be positive; got {n} states and {self.kappa}")
+            raise SettingError(
+                "kappa", f"n + kappa must be positive; got {n} states and {self.kappa}"
+            )
         return self.alpha**2 * (n + self.kappa)
 
     def _weights(self, belief: Gaussian) -> tuple[Tensor, Tensor]:
@@ -100,21 +134,40 @@ class Unscented(NoisyPropagator):
         n, spread = belief.dim, self._spread(belief.dim)
         of_mean = belief.mean.new_full((2 * n + 1,), 1 / (2 * spread))
         of_covariance = of_mean.clone()
-        of_mean[0], of_covariance[0] = 1 - n / spread, 2 - n / spread - self.alpha**2 + self.beta
+        of_mean[0], of_covariance[0] = (
+            1 - n / spread,
+            2 - n / spread - self.alpha**2 + self.beta,
+        )
         return of_mean, of_covariance
 
-    def _points(self, belief: Gaussian, root: Tensor, input: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def _points(
+        self, belief: Gaussian, root: Tensor, input: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """Steps from the mean, points (*batch, 2n + 1, n), and the input at each."""
-        columns = math.sqrt(self._spread(belief.dim)) * root  # symmetric: rows are columns
-        steps = torch.cat([torch.zeros_like(columns[..., :1, :]), columns, -columns], dim=-2)
+        columns = (
+            math.sqrt(self._spread(belief.dim)) * root
+        )  # symmetric: rows are columns
+        steps = torch.cat(
+            [torch.zeros_like(columns[..., :1, :]), columns, -columns], dim=-2
+        )
         points = belief.mean[..., None, :] + steps
-        return steps, points, input[..., None, :].expand(*points.shape[:-1], input.shape[-1])
+        return (
+            steps,
+            points,
+            input[..., None, :].expand(*points.shape[:-1], input.shape[-1]),
+        )
 
-    def _moved(self, model: Any, belief: Gaussian, input: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        steps, points, controls = self._points(belief, square_root(belief.covariance), input)
+    def _moved(
+        self, model: Any, belief: Gaussian, input: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        steps, points, controls = self._points(
+            belief, square_root(belief.covariance), input
+        )
         return self._moments(belief, steps, model.predict(points, controls))
 
-    def _moments(self, belief: Gaussian, steps: Tensor, moved: Gaussian) -> tuple[Tensor, Tensor, Tensor]:
+    def _moments(
+        self, belief: Gaussian, steps: Tensor, moved: Gaussian
+    ) -> tuple[Tensor, Tensor, Tensor]:
         of_mean, of_covariance = self._weights(belief)
         mean = of_mean @ moved.mean
         centred = moved.mean - mean[..., None, :]
@@ -135,20 +188,30 @@ class MonteCarlo(NoisyPropagator):
         SettingError: Fewer than two samples, or a seed that is no whole number.
     """
 
-    def __init__(self, samples: int = 10_000, seed: int = 0, process_noise: bool = False):
+    def __init__(
+        self, samples: int = 10_000, seed: int = 0, process_noise: bool = False
+    ):
         check_number("samples", samples, least=2, whole=True)
         check_number("seed", seed, least=0, whole=True)
         super().__init__(process_noise)
         self.samples, self.seed = samples, seed
 
-    def _moved(self, model: Any, belief: Gaussian, input: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def _moved(
+        self, model: Any, belief: Gaussian, input: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
         # NumPy's generator: torch's would stop a vmap around this call.
-        normal = np.random.default_rng(self.seed).standard_normal((self.samples, belief.dim))
-        steps = torch.from_numpy(normal).to(belief.mean) @ square_root(belief.covariance)  # (*batch, samples, n)
+        normal = np.random.default_rng(self.seed).standard_normal(
+            (self.samples, belief.dim)
+        )
+        steps = torch.from_numpy(normal).to(belief.mean) @ square_root(
+            belief.covariance
+        )  # (*batch, samples, n)
         means, spread = [], 0.0
         for chunk in steps.split(_CHUNK, dim=-2):
             points = belief.mean[..., None, :] + chunk
-            moved = model.predict(points, input[..., None, :].expand(*points.shape[:-1], input.shape[-1]))
+            moved = model.predict(
+                points, input[..., None, :].expand(*points.shape[:-1], input.shape[-1])
+            )
             means.append(moved.mean)
             spread = spread + moved.covariance.sum(-3)
         states = torch.cat(means, dim=-2)

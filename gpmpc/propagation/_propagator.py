@@ -9,7 +9,12 @@ from torch import Tensor
 
 from gpmpc._dynamics import batched_jacobian, check_query
 from gpmpc.exceptions import DataError, SettingError
-from gpmpc.gaussian import Gaussian, check_tensors, constant_arrays, nearest_positive_semidefinite
+from gpmpc.gaussian import (
+    Gaussian,
+    check_tensors,
+    constant_arrays,
+    nearest_positive_semidefinite,
+)
 
 
 @dataclass(frozen=True)
@@ -46,7 +51,9 @@ class Propagator(Protocol):
     ``propagate``, which returns the ``Propagation`` and its ``Sensitivity``, or None where it has none.
     """
 
-    def propagate(self, model: Any, belief: Gaussian, input: Tensor | None = None) -> Propagation:
+    def propagate(
+        self, model: Any, belief: Gaussian, input: Tensor | None = None
+    ) -> Propagation:
         """Moves a belief one step on.
 
         Args:
@@ -62,7 +69,9 @@ class Propagator(Protocol):
         """
         ...
 
-    def __call__(self, model: Any, belief: Gaussian, input: Tensor | None = None) -> Gaussian:
+    def __call__(
+        self, model: Any, belief: Gaussian, input: Tensor | None = None
+    ) -> Gaussian:
         """The next state's belief; see ``propagate``."""
         return self.propagate(model, belief, input).belief
 
@@ -75,15 +84,23 @@ class NoisyPropagator(Propagator):
     def __init__(self, process_noise: bool = False):
         self.process_noise = process_noise
 
-    def propagate(self, model: Any, belief: Gaussian, input: Tensor | None = None) -> Propagation:
+    def propagate(
+        self, model: Any, belief: Gaussian, input: Tensor | None = None
+    ) -> Propagation:
         """Moves a belief one step on; see ``Propagator.propagate``."""
-        return self._projected(model, *self._moved(model, belief, checked_input(model, belief, input)))
+        return self._projected(
+            model, *self._moved(model, belief, checked_input(model, belief, input))
+        )
 
-    def _moved(self, model: Any, belief: Gaussian, input: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def _moved(
+        self, model: Any, belief: Gaussian, input: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """Mean, covariance and Cov[x, x+] of the next state, without process noise."""
         raise NotImplementedError
 
-    def _projected(self, model: Any, mean: Tensor, covariance: Tensor, cross: Tensor) -> Propagation:
+    def _projected(
+        self, model: Any, mean: Tensor, covariance: Tensor, cross: Tensor
+    ) -> Propagation:
         """Adds the process noise, if any, and projects the covariance."""
         if self.process_noise:
             covariance = covariance + model.noise_covariance
@@ -109,7 +126,10 @@ def differentiate(
         those of the projection (autograd) or of what was projected (closed form).
     """
     closed_form = getattr(propagator, "differentiate", None)
-    if closed_form is not None and (found := closed_form(model, belief, input)) is not None:
+    if (
+        closed_form is not None
+        and (found := closed_form(model, belief, input)) is not None
+    ):
         return found
     return by_autograd(propagator, model, belief, input)
 
@@ -119,24 +139,47 @@ def by_autograd(
 ) -> tuple[Propagation, Sensitivity]:
     """``differentiate`` by torch autograd, for any propagator and model that torch can follow."""
     input, n, k = checked_input(model, belief, input), belief.dim, model.output_dim
-    with torch.inference_mode(False):  # inference tensors, constants too, could not be saved for backward
+    with torch.inference_mode(
+        False
+    ):  # inference tensors, constants too, could not be saved for backward
         rows, columns = torch.tril_indices(k, k, device=belief.mean.device)
     batch = belief.mean.shape[:-1]
 
     def step(mean: Tensor, covariance: Tensor, control: Tensor) -> tuple[Tensor, ...]:
-        out = propagator.propagate(model, Gaussian(mean, covariance.unflatten(-1, (n, n))), control)
-        entries = torch.cat([out.belief.mean, out.belief.covariance[..., rows, columns]], dim=-1)
-        return entries, out.belief.mean, out.belief.covariance, out.cross_covariance, out.deficit
+        out = propagator.propagate(
+            model, Gaussian(mean, covariance.unflatten(-1, (n, n))), control
+        )
+        entries = torch.cat(
+            [out.belief.mean, out.belief.covariance[..., rows, columns]], dim=-1
+        )
+        return (
+            entries,
+            out.belief.mean,
+            out.belief.covariance,
+            out.cross_covariance,
+            out.deficit,
+        )
 
     values, (by_mean, by_covariance, by_input) = batched_jacobian(
-        step, (belief.mean, belief.covariance.flatten(-2), input.expand(*batch, input.shape[-1]))
+        step,
+        (
+            belief.mean,
+            belief.covariance.flatten(-2),
+            input.expand(*batch, input.shape[-1]),
+        ),
     )
     by_covariance = by_covariance.unflatten(-1, (n, n))
     by_covariance = (by_covariance + by_covariance.mT) / 2
     whole = torch.zeros(k, k, dtype=torch.long, device=rows.device)
-    whole[rows, columns] = whole[columns, rows] = torch.arange(len(rows), device=rows.device) + k
+    whole[rows, columns] = whole[columns, rows] = (
+        torch.arange(len(rows), device=rows.device) + k
+    )
     of_mean = by_mean[..., :k, :], by_covariance[..., :k, :, :], by_input[..., :k, :]
-    of_covariance = by_mean[..., whole, :], by_covariance[..., whole, :, :], by_input[..., whole, :]
+    of_covariance = (
+        by_mean[..., whole, :],
+        by_covariance[..., whole, :, :],
+        by_input[..., whole, :],
+    )
     moved = Propagation(Gaussian(values[1], values[2]), values[3], values[4])
     return moved, Sensitivity(*of_mean, *of_covariance)
 
@@ -151,13 +194,24 @@ def checked_input(model: Any, belief: Gaussian, input: Tensor | None) -> Tensor:
     input = belief.mean[..., :0] if input is None else input
     check_tensors(input=input)
     if input.dim() == 1 and input.shape[-1] == model.input_dim:
-        input = input.expand(*belief.mean.shape[:-1], model.input_dim)  # one control for all
+        input = input.expand(
+            *belief.mean.shape[:-1], model.input_dim
+        )  # one control for all
     check_query(model, belief.mean, input)
-    if belief.covariance.dtype != belief.mean.dtype or belief.covariance.device != belief.mean.device:
-        raise SettingError("belief", "mean and covariance must have the same dtype and device")
+    if (
+        belief.covariance.dtype != belief.mean.dtype
+        or belief.covariance.device != belief.mean.device
+    ):
+        raise SettingError(
+            "belief", "mean and covariance must have the same dtype and device"
+        )
     if (arrays := constant_arrays(belief.mean, belief.covariance, input)) is None:
         return input
-    for name, array in zip(("the belief's mean", "the belief's covariance", "the input"), arrays, strict=True):
+    for name, array in zip(
+        ("the belief's mean", "the belief's covariance", "the input"),
+        arrays,
+        strict=True,
+    ):
         if not np.isfinite(array).all():
             raise DataError(f"{name} must be finite; got {array}")
     _check_semidefinite(arrays[1])
@@ -169,9 +223,14 @@ def _check_semidefinite(covariance: np.ndarray) -> None:
     round_off = np.finfo(covariance.dtype).eps ** 0.5 * largest
     gap = np.abs(covariance - np.swapaxes(covariance, -1, -2)).max(initial=0.0)
     if gap > round_off:
-        raise DataError(f"the belief's covariance must be symmetric; got entries that differ by {float(gap):.3g}")
+        raise DataError(
+            f"the belief's covariance must be symmetric; got entries that differ by {float(gap):.3g}"
+        )
     try:
-        np.linalg.cholesky(covariance + round_off * np.eye(covariance.shape[-1], dtype=covariance.dtype))
+        np.linalg.cholesky(
+            covariance
+            + round_off * np.eye(covariance.shape[-1], dtype=covariance.dtype)
+        )
     except np.linalg.LinAlgError:
         if (lowest := float(np.linalg.eigvalsh(covariance).min())) < -round_off:
             raise DataError(

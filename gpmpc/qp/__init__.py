@@ -38,5 +38,7 @@ _SOLVERS = {
 def __getattr__(name: str) -> Any:
     if name not in _SOLVERS:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = globals()[name] = getattr(importlib.import_module(f"{__name__}.{_SOLVERS[name]}"), name)
+    value = globals()[name] = getattr(
+        importlib.import_module(f"{__name__}.{_SOLVERS[name]}"), name
+    )
     return value

@@ -70,9 +70,13 @@ class CvxpySolver:
 
         installed = cvxpy.installed_solvers()
         if self.name not in installed:
-            raise ProblemError(f"CVXPY finds no solver named {self.name!r}; it finds {', '.join(installed)}")
+            raise ProblemError(
+                f"CVXPY finds no solver named {self.name!r}; it finds {', '.join(installed)}"
+            )
 
-    def solve(self, problem: QuadraticProgram, warm_start: WarmStart = None) -> QPSolution:
+    def solve(
+        self, problem: QuadraticProgram, warm_start: WarmStart = None
+    ) -> QPSolution:
         """The minimiser; a warm start's x is offered to solvers that take one. See ``QPSolver``."""
         import cvxpy
 
@@ -81,31 +85,52 @@ class CvxpySolver:
         n, M = len(q), len(lower)
         equal = (lower == upper) & (upper < ABSENT)
         kinds = (equal, (upper < ABSENT) & ~equal, (lower > -ABSENT) & ~equal)
-        program, y, sides = _compile(threading.get_ident(), n, *(kind.tobytes() for kind in kinds))
+        program, y, sides = _compile(
+            threading.get_ident(), n, *(kind.tobytes() for kind in kinds)
+        )
         factor = np.linalg.cholesky(P).T
-        free, back = -cho_solve((factor, False), q), solve_triangular(factor, np.eye(n))  # back = L^-T
-        columns, offset = np.concatenate([back, G @ back]), np.concatenate([free, G @ free])
+        free, back = (
+            -cho_solve((factor, False), q),
+            solve_triangular(factor, np.eye(n)),
+        )  # back = L^-T
+        columns, offset = (
+            np.concatenate([back, G @ back]),
+            np.concatenate([free, G @ free]),
+        )
         for members, sign, rows, bound, _ in sides:
-            rows.value, bound.value = columns[members], ((lower if sign < 0 else upper) - offset)[members]
+            rows.value, bound.value = (
+                columns[members],
+                ((lower if sign < 0 else upper) - offset)[members],
+            )
         warm = False
         if isinstance(warm_start, QPSolution) and len(warm_start.x) == n:
             warm, y.value = True, factor @ (warm_start.x - free)
         built, best, least = perf_counter(), None, np.inf
-        for options in (TIGHT.get(self.name, {}), {}) if self.options is None else (self.options,):
+        for options in (
+            (TIGHT.get(self.name, {}), {}) if self.options is None else (self.options,)
+        ):
             status, x, multipliers = Status.NUMERICAL_TROUBLE, np.zeros(n), np.zeros(M)
             with warnings.catch_warnings(), suppress(cvxpy.SolverError):
-                warnings.simplefilter("ignore")  # an inaccurate solution is judged by its residuals
+                warnings.simplefilter(
+                    "ignore"
+                )  # an inaccurate solution is judged by its residuals
                 program.solve(solver=self.name, warm_start=warm, **options)
                 status = STATUSES.get(program.status, status)
             if status is Status.INFEASIBLE:
                 ray = farkas_ray(problem)
-                status, multipliers = (Status.NUMERICAL_TROUBLE, multipliers) if ray is None else (status, ray)
+                status, multipliers = (
+                    (Status.NUMERICAL_TROUBLE, multipliers)
+                    if ray is None
+                    else (status, ray)
+                )
             elif status is not Status.NUMERICAL_TROUBLE and y.value is not None:
                 x = np.clip(free + back @ y.value, problem.lb, problem.ub)
                 for members, sign, _, _, constraint in sides:
                     if constraint.dual_value is not None:
                         multipliers[members] += sign * np.ravel(constraint.dual_value)
-            size = max(1.0, np.abs(multipliers).max())  # beside which an interior-point method's remains are small
+            size = max(
+                1.0, np.abs(multipliers).max()
+            )  # beside which an interior-point method's remains are small
             statistics = program.solver_stats
             solution = make_solution(
                 problem,
@@ -119,7 +144,9 @@ class CvxpySolver:
             )
             if status is Status.INFEASIBLE:
                 return solution
-            residual = np.nan_to_num(max(solution.residuals(zero=1.0)), nan=np.inf)  # no interior point reaches zero
+            residual = np.nan_to_num(
+                max(solution.residuals(zero=1.0)), nan=np.inf
+            )  # no interior point reaches zero
             if status is Status.SOLVED and residual <= self.tolerance:
                 return solution
             if best is None or residual < least:
@@ -133,7 +160,9 @@ class CvxpySolver:
 
 
 @lru_cache(maxsize=64)
-def _compile(thread: int, n: int, equal: bytes, above: bytes, below: bytes) -> tuple[Any, Any, list]:
+def _compile(
+    thread: int, n: int, equal: bytes, above: bytes, below: bytes
+) -> tuple[Any, Any, list]:
     """Returns the problem of a thread for a pattern of bounds, its variable, and its constraints by kind.
 
     Of each kind (equalities and upper bounds have the sign +1, lower bounds -1): which of the stacked constraints
@@ -145,8 +174,23 @@ def _compile(thread: int, n: int, equal: bytes, above: bytes, below: bytes) -> t
     for kind, sign in ((equal, 1.0), (above, 1.0), (below, -1.0)):
         members = np.frombuffer(kind, dtype=bool)
         if members.any():
-            rows, bound = cvxpy.Parameter((members.sum(), n)), cvxpy.Parameter(members.sum())
+            rows, bound = (
+                cvxpy.Parameter((members.sum(), n)),
+                cvxpy.Parameter(members.sum()),
+            )
             at = rows @ y
-            constraint = at == bound if kind is equal else at <= bound if sign > 0 else bound <= at
+            constraint = (
+                at == bound
+                if kind is equal
+                else at <= bound
+                if sign > 0
+                else bound <= at
+            )
             sides.append((members, sign, rows, bound, constraint))
-    return cvxpy.Problem(cvxpy.Minimize(0.5 * cvxpy.sum_squares(y)), [side[-1] for side in sides]), y, sides
+    return (
+        cvxpy.Problem(
+            cvxpy.Minimize(0.5 * cvxpy.sum_squares(y)), [side[-1] for side in sides]
+        ),
+        y,
+        sides,
+    )

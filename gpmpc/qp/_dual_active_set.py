@@ -27,9 +27,17 @@ from gpmpc.qp._workspace import new_memory, prepare_memory
 Array = NDArray[np.float64]
 
 # Local names save look-ups; ``tuple.__new__`` takes half the time of a named tuple's own constructor.
-_NO_RECORD, _MISUSE, _FLOAT, _empty, _new = layout.NO_RECORD, layout.MISUSE, np.dtype(float), np.empty, tuple.__new__
+_NO_RECORD, _MISUSE, _FLOAT, _empty, _new = (
+    layout.NO_RECORD,
+    layout.MISUSE,
+    np.dtype(float),
+    np.empty,
+    tuple.__new__,
+)
 _run = solve  # until it is compiled
-_ITERATIONS_PER_CONSTRAINT = 10  # default limit, beyond which the iteration is taken to cycle
+_ITERATIONS_PER_CONSTRAINT = (
+    10  # default limit, beyond which the iteration is taken to cycle
+)
 _ITERATIONS_PER_LOOK = 25  # iterations between two looks at the clock
 
 
@@ -58,7 +66,10 @@ class DualActiveSet:
         _run = unchecked_entry_point(solve)
 
     def solve(
-        self, problem: QuadraticProgram, warm_start: WarmStart = None, prices: ArrayLike | None = None
+        self,
+        problem: QuadraticProgram,
+        warm_start: WarmStart = None,
+        prices: ArrayLike | None = None,
     ) -> QPSolution:
         """Solves one problem.
 
@@ -77,8 +88,16 @@ class DualActiveSet:
         """
         began = perf_counter()
         try:
-            plan = self._plans[problem.G.shape] if prices is None else self._plan(problem.G.shape, prices)
-        except (AttributeError, KeyError, TypeError):  # the first of its shape, or an unchecked one without a shape
+            plan = (
+                self._plans[problem.G.shape]
+                if prices is None
+                else self._plan(problem.G.shape, prices)
+            )
+        except (
+            AttributeError,
+            KeyError,
+            TypeError,
+        ):  # the first of its shape, or an unchecked one without a shape
             problem = QuadraticProgram.from_stacked(*problem)
             plan = self._plan(problem.G.shape, prices)
         (P, q, G, lower, upper), (caps, memory, size, where) = problem, plan
@@ -87,13 +106,23 @@ class DualActiveSet:
             guess = _NO_RECORD if warm_start is None else warm_start.record  # type: ignore[union-attr]
             if P.dtype is q.dtype is G.dtype is lower.dtype is upper.dtype is _FLOAT:
                 status = _run(P, q, G, lower, upper, guess, memory, record)
-        except (AttributeError, TypeError):  # not contiguous float64, or a warm start that is no solution of ours
+        except (
+            AttributeError,
+            TypeError,
+        ):  # not contiguous float64, or a warm start that is no solution of ours
             pass
         if status:
-            problem, record = self._solve_again(problem, warm_start, plan, status, record, began)
-        return _new(QPSolution, (record[where], problem, caps, record, 0.0, perf_counter() - began))
+            problem, record = self._solve_again(
+                problem, warm_start, plan, status, record, began
+            )
+        return _new(
+            QPSolution,
+            (record[where], problem, caps, record, 0.0, perf_counter() - began),
+        )
 
-    def prepare(self, P: ArrayLike, G: ArrayLike | None = None, prices: ArrayLike | None = None) -> "Prepared":
+    def prepare(
+        self, P: ArrayLike, G: ArrayLike | None = None, prices: ArrayLike | None = None
+    ) -> "Prepared":
         """Does once what depends on P, G and prices only.
 
         Args:
@@ -104,15 +133,21 @@ class DualActiveSet:
         Raises:
             ProblemError: As for ``solve``.
         """
-        return Prepared(self, QuadraticProgram(P, np.zeros(len(np.atleast_1d(P))), G), prices)
+        return Prepared(
+            self, QuadraticProgram(P, np.zeros(len(np.atleast_1d(P))), G), prices
+        )
 
-    def _plan(self, shape: tuple, prices: ArrayLike | None, prepared: bool = False) -> tuple[Array, Array, int, slice]:
+    def _plan(
+        self, shape: tuple, prices: ArrayLike | None, prepared: bool = False
+    ) -> tuple[Array, Array, int, slice]:
         """Returns caps, memory, the record's length, and where x is in it, for a shape of G."""
         m, n = shape
         caps, limit = multiplier_caps(prices, n, m), self._limit(n + m)
         if self.time_limit is not None:
             limit = min(limit, _ITERATIONS_PER_LOOK)
-        memory = new_memory(caps, n, limit, self.tolerance, prices is not None, prepared)
+        memory = new_memory(
+            caps, n, limit, self.tolerance, prices is not None, prepared
+        )
         size = layout.record_size(n, n + m, n if prepared else 0)
         plan = caps, memory, size, slice(layout.HEADER, layout.HEADER + n)
         if prices is None and not prepared:
@@ -123,7 +158,13 @@ class DualActiveSet:
         return self.iteration_limit or 100 + _ITERATIONS_PER_CONSTRAINT * M
 
     def _solve_again(
-        self, problem: QuadraticProgram, warm_start: WarmStart, plan: tuple, status: int, record: Array, began: float
+        self,
+        problem: QuadraticProgram,
+        warm_start: WarmStart,
+        plan: tuple,
+        status: int,
+        record: Array,
+        began: float,
     ) -> tuple[QuadraticProgram, Array]:
         """Continues a solve that did not end as ``SOLVED``: checks the problem, goes on, accepts or tries again.
 
@@ -135,14 +176,25 @@ class DualActiveSet:
         """
         caps, memory = plan[:2]
         if status == layout.MISUSE:
-            problem = QuadraticProgram.from_stacked(*problem)  # raises if it is misuse indeed
-            record[:] = 0.0  # of a proper problem, too: rows that overflow, P at the edge of definiteness
+            problem = QuadraticProgram.from_stacked(
+                *problem
+            )  # raises if it is misuse indeed
+            record[:] = (
+                0.0  # of a proper problem, too: rows that overflow, P at the edge of definiteness
+            )
             record[layout.STATUS] = layout.NUMERICAL_TROUBLE
-            status = solve(*problem, as_record(warm_start, len(problem.q), len(problem.lower)), memory, record)
+            status = solve(
+                *problem,
+                as_record(warm_start, len(problem.q), len(problem.lower)),
+                memory,
+                record,
+            )
         M, done = len(problem.lower), record[layout.ITERATIONS]
 
         def late() -> bool:
-            return self.time_limit is not None and perf_counter() - began > self.time_limit
+            return (
+                self.time_limit is not None and perf_counter() - began > self.time_limit
+            )
 
         while status == layout.ITERATION_LIMIT and not late() and done < self._limit(M):
             guess, record = record, np.empty_like(record)
@@ -167,14 +219,20 @@ class Prepared:
 
     __slots__ = ("_G", "_P", "_plan", "_solver")
 
-    def __init__(self, solver: DualActiveSet, problem: QuadraticProgram, prices: ArrayLike | None):
+    def __init__(
+        self, solver: DualActiveSet, problem: QuadraticProgram, prices: ArrayLike | None
+    ):
         self._P, self._G, self._solver = problem.P, problem.G, solver
-        _, memory, size, _ = self._plan = solver._plan(problem.G.shape, prices, prepared=True)
+        _, memory, size, _ = self._plan = solver._plan(
+            problem.G.shape, prices, prepared=True
+        )
         # factorises P and measures the rows of G; where numbers overflow, every solve is to find that out by itself
         if solve(*problem, layout.NO_RECORD, memory, np.empty(size)) == layout.SOLVED:
             prepare_memory(memory, problem.G)
 
-    def solve(self, q: Array, lower: Array, upper: Array, warm_start: WarmStart = None) -> QPSolution:
+    def solve(
+        self, q: Array, lower: Array, upper: Array, warm_start: WarmStart = None
+    ) -> QPSolution:
         """Solves for one q and one set of bounds.
 
         Args:
@@ -198,8 +256,13 @@ class Prepared:
         problem = P, q, G, lower, upper
         if status:
             problem = QuadraticProgram.unchecked(*problem)
-            problem, record = self._solver._solve_again(problem, warm_start, self._plan, status, record, began)
-        return _new(QPSolution, (record[where], problem, caps, record, 0.0, perf_counter() - began))
+            problem, record = self._solver._solve_again(
+                problem, warm_start, self._plan, status, record, began
+            )
+        return _new(
+            QPSolution,
+            (record[where], problem, caps, record, 0.0, perf_counter() - began),
+        )
 
 
 def _is_certain(record: Array, problem: QuadraticProgram) -> bool:

@@ -64,10 +64,16 @@ from gpmpc.qp._workspace import (
 
 NONE = 1e-26  # share of the length of q below which x, and a violation of a bound of zero, is none
 _GUESSED_PIVOT = 1e-9  # share of K_pp: a guessed constraint that depends on the others by more is left out
-_DEPENDENT = 1e-12  # d below this share of K_pp: the constraint depends on the working ones
+_DEPENDENT = (
+    1e-12  # d below this share of K_pp: the constraint depends on the working ones
+)
 _DOUBTFUL = 1e-4  # d below this share of K_pp is computed again without cancellation
-_ROUNDING = 1e-15  # share of the bounds of a contradiction by which it may be their rounding
-_HOPELESS = 1e-7  # violation of a dependent constraint that is taken for a contradiction
+_ROUNDING = (
+    1e-15  # share of the bounds of a contradiction by which it may be their rounding
+)
+_HOPELESS = (
+    1e-7  # violation of a dependent constraint that is taken for a contradiction
+)
 _BATCHES = 4  # times that all badly violated constraints enter at once
 _BAD = 0.5  # those violated by more than this share of the worst
 
@@ -93,7 +99,9 @@ def iterate(work, k, count, margin, iterations, batches):
                 return ITERATION_LIMIT, k, iterations, batches, passed, True
             p, chosen, violated = most_violated(vectors, indices, count), 0, True
             if complete and batches < _BATCHES:
-                chosen = choose_bad(vectors, indices, _BAD * vectors[EXCESS, p], count, n - k)
+                chosen = choose_bad(
+                    vectors, indices, _BAD * vectors[EXCESS, p], count, n - k
+                )
                 batches += chosen > 0
         before = k
         k = add_constraints(work, k, chosen)
@@ -109,7 +117,10 @@ def iterate(work, k, count, margin, iterations, batches):
                 if vectors[EXCESS, p] * vectors[SCALE, p] > _HOPELESS * size:
                     _write_ray(work, k, p)
                     return INFEASIBLE, k, iterations, batches, passed, True
-                vectors[MU, p], passed = mu_p, True  # what it gained on the way belongs to no working set
+                vectors[MU, p], passed = (
+                    mu_p,
+                    True,
+                )  # what it gained on the way belongs to no working set
                 ignore_violations(vectors, p)
                 unsettled = not work.soft  # else refinement has to do
             if work.soft:
@@ -118,7 +129,9 @@ def iterate(work, k, count, margin, iterations, batches):
             k = _drop_wrong_multipliers(work, k)
         _minimise(work, k)
         complete = several or work.soft or count == 1 or iterations >= work.limit
-        if not complete:  # first satisfy those that were seen to be violated, then look at all
+        if (
+            not complete
+        ):  # first satisfy those that were seen to be violated, then look at all
             count = keep_violated(work, margin, count)
             complete = count == 0
         if complete:
@@ -128,7 +141,9 @@ def iterate(work, k, count, margin, iterations, batches):
     if violated:
         for i in range(k):  # rounding can take multipliers out of their ranges
             p = abs(indices[NAME, i]) - 1
-            vectors[MU, p] = min(max(vectors[MU, p], vectors[LEAST, i]), vectors[MOST, i])
+            vectors[MU, p] = min(
+                max(vectors[MU, p], vectors[LEAST, i]), vectors[MOST, i]
+            )
     return SOLVED, k, iterations, batches, passed, violated
 
 
@@ -140,9 +155,17 @@ def _satisfy_constraint(work, k, p):
         False if it contradicts the working ones, the size of the working set, and how many entered or left.
     """
     vectors, names, factor, changes = work.vectors, work.indices[NAME], work.factor, 0
-    mu, r, solved, least, most = vectors[MU], vectors[R], vectors[SOLVED_K], vectors[LEAST], vectors[MOST]
+    mu, r, solved, least, most = (
+        vectors[MU],
+        vectors[R],
+        vectors[SOLVED_K],
+        vectors[LEAST],
+        vectors[MOST],
+    )
     above = mu[p] > 0.0 or (mu[p] == 0.0 and vectors[Y, p] > vectors[UPPER, p])
-    sense = 1.0 if above == (mu[p] == 0.0) else -1.0  # the direction of mu_p, which comes back from a cap
+    sense = (
+        1.0 if above == (mu[p] == 0.0) else -1.0
+    )  # the direction of mu_p, which comes back from a cap
     _write_slot(work, k, p, above)
     _solve_slot(work, k, p)
     violation, K_pp = (vectors[Y, p] - vectors[BOUND, k]) * sense, vectors[DIAGONAL, k]
@@ -154,11 +177,19 @@ def _satisfy_constraint(work, k, p):
         if d < _DOUBTFUL * K_pp:
             d = _distance_to_span(work, k)
         # ratio test:  t = min(t1, t2);  t2 = violation / d makes p hold,  t1 takes a multiplier to the end of its range
-        step = max(0.0, violation) / d if d > _DEPENDENT * K_pp and k < len(work.q) else np.inf
+        step = (
+            max(0.0, violation) / d
+            if d > _DEPENDENT * K_pp and k < len(work.q)
+            else np.inf
+        )
         room = most[k] - mu[p] if sense > 0.0 else mu[p] - least[k]
         capped = room < step
-        step, blocking = _first_blocking(vectors, names, k, sense, room if capped else step)
-        if step == np.inf:  # no step ends: (r, -1) is Farkas' proof, unless rounding made the violation
+        step, blocking = _first_blocking(
+            vectors, names, k, sense, room if capped else step
+        )
+        if (
+            step == np.inf
+        ):  # no step ends: (r, -1) is Farkas' proof, unless rounding made the violation
             for i in range(k):
                 vectors[NEGLIGIBLE, p] += _ROUNDING * abs(r[i] * vectors[BOUND, i])
             return False, k, changes
@@ -167,9 +198,13 @@ def _satisfy_constraint(work, k, p):
             mu[abs(names[i]) - 1] -= sense * step * r[i]
         mu[p] += sense * step
         changes += 1
-        if blocking < k:  # partial step: the blocking constraint leaves, and p is tried again
+        if (
+            blocking < k
+        ):  # partial step: the blocking constraint leaves, and p is tried again
             leaving = abs(names[blocking]) - 1
-            mu[leaving] = least[blocking] if sense * r[blocking] > 0.0 else most[blocking]
+            mu[leaving] = (
+                least[blocking] if sense * r[blocking] > 0.0 else most[blocking]
+            )
             _drop_constraint(work, k, blocking)
             k -= 1
             restore_limits(vectors, leaving)
@@ -204,7 +239,12 @@ def _first_blocking(vectors, names, k, sense, step):
 @inline_njit
 def _distance_to_span(work, k):
     """Returns ``d = |w_p - sum r_i w_i|^2``, p in slot k, as a sum of squares, which cannot cancel."""
-    rest, row, places, n = work.vectors[SCRATCH], work.rows[work.indices[PLACE, k]], work.indices[PLACE], len(work.q)
+    rest, row, places, n = (
+        work.vectors[SCRATCH],
+        work.rows[work.indices[PLACE, k]],
+        work.indices[PLACE],
+        len(work.q),
+    )
     scale(1.0, row, rest, n)
     subtract_rows(rest, work.rows, places, work.vectors[R], k, n)
     return dot(rest, rest, n)
@@ -219,7 +259,9 @@ def _write_ray(work, k, p):
         mu[i] = 0.0
     for i in range(k):
         w, ray = abs(names[i]) - 1, -sense * vectors[R, i]
-        if ray * names[i] >= 0.0 or vectors[LOWER, w] == vectors[UPPER, w]:  # else rounding: it cannot pull that way
+        if (
+            ray * names[i] >= 0.0 or vectors[LOWER, w] == vectors[UPPER, w]
+        ):  # else rounding: it cannot pull that way
             mu[w] = ray
     mu[p] = sense
 
@@ -231,7 +273,9 @@ def add_constraints(work, k, count):
     for i in range(count):
         name = work.indices[CANDIDATES, i]
         p = abs(name) - 1
-        outside = vectors[ALLOWED_LOW, p] > -np.inf or vectors[ALLOWED_HIGH, p] < np.inf  # of the working set
+        outside = (
+            vectors[ALLOWED_LOW, p] > -np.inf or vectors[ALLOWED_HIGH, p] < np.inf
+        )  # of the working set
         if outside and k < len(work.q):
             _write_slot(work, k, p, name > 0)
             _solve_slot(work, k, p)
@@ -278,7 +322,14 @@ def _solve_slot(work, k, p):
         for i in range(k):
             solved[i] = row[places[i]]
     else:
-        multiply_rows(work.rows, places, k, work.rows[places[k]], int(work.vectors[END, p]), solved)
+        multiply_rows(
+            work.rows,
+            places,
+            k,
+            work.rows[places[k]],
+            int(work.vectors[END, p]),
+            solved,
+        )
     solve_lower(work.factor, k, solved)
 
 
@@ -299,7 +350,9 @@ def restore_constraints(work, count, factor):
 def _drop_constraint(work, k, slot):
     """Drops the constraint in a slot from the working set of k, and from ``SOLVED``; those behind move up, k too."""
     vectors, names, places = work.vectors, work.indices[NAME], work.indices[PLACE]
-    delete_row(work.factor, k, slot, vectors[SOLVED_K], vectors[COSINES], vectors[SINES])
+    delete_row(
+        work.factor, k, slot, vectors[SOLVED_K], vectors[COSINES], vectors[SINES]
+    )
     place = places[slot]
     for i in range(slot, k):
         names[i], places[i] = names[i + 1], places[i + 1]
@@ -314,7 +367,12 @@ def _drop_wrong_multipliers(work, k):
 
     Any working set is a valid start of a dual method once this is done.
     """
-    vectors, names, solved, trial = work.vectors, work.indices[NAME], work.vectors[SOLVED_K], work.vectors[R]
+    vectors, names, solved, trial = (
+        work.vectors,
+        work.indices[NAME],
+        work.vectors[SOLVED_K],
+        work.vectors[R],
+    )
     for i in range(k):
         solved[i] = vectors[FREE_VALUE, i] - vectors[BOUND, i]
     solve_lower(work.factor, k, solved)

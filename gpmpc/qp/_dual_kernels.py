@@ -12,9 +12,25 @@ import math
 import numpy as np
 
 from gpmpc._compiled import compiled, inline_njit
-from gpmpc._kernels._simd import any_nonzero, clip, larger, largest, load, load_some, store, total, zeros
+from gpmpc._kernels._simd import (
+    any_nonzero,
+    clip,
+    larger,
+    largest,
+    load,
+    load_some,
+    store,
+    total,
+    zeros,
+)
 from gpmpc._kernels.linalg import dot, multiply
-from gpmpc.qp._dual_iteration import NONE, add_multipliers, iterate, multiply_constraints, restore_constraints
+from gpmpc.qp._dual_iteration import (
+    NONE,
+    add_multipliers,
+    iterate,
+    multiply_constraints,
+    restore_constraints,
+)
 from gpmpc.qp._record import (
     AGE,
     CONSTRAINTS,
@@ -29,7 +45,14 @@ from gpmpc.qp._record import (
     VARIABLES,
     WORKING,
 )
-from gpmpc.qp._triangular import factorise, multiply_rows, scale, solve_lower, solve_transposed, subtract_rows
+from gpmpc.qp._triangular import (
+    factorise,
+    multiply_rows,
+    scale,
+    solve_lower,
+    solve_transposed,
+    subtract_rows,
+)
 from gpmpc.qp._violations import TOLERATED, choose_guess, list_violated, restore_limits
 from gpmpc.qp._workspace import (
     ALLOWED_HIGH,
@@ -71,14 +94,22 @@ _ILL = 5e-4  # such a share: what else x violates is seen of the best x only
 _OLD = 1000  # changes after which a factor is computed anew
 _BATCHES = 4  # see ``iterate``
 _TINY = 1e-300
-_UNDEFINED = 1e300  # a residual that overflowed; less than infinity, so that refinement is tried
+_UNDEFINED = (
+    1e300  # a residual that overflowed; less than infinity, so that refinement is tried
+)
 
 
 @compiled(allocates=False, locked=True)
 def solve(P, q, G, lower, upper, guess, memory, out):
     """Solves one program; ``memory`` is of ``gpmpc.qp._workspace``, ``guess`` a record or empty. Returns a status."""
     n, M = P.shape[0], len(P) + len(G)
-    shaped = P.shape[1] == n and len(q) == n and G.shape[1] == n and len(lower) == M and len(upper) == M
+    shaped = (
+        P.shape[1] == n
+        and len(q) == n
+        and G.shape[1] == n
+        and len(lower) == M
+        and len(upper) == M
+    )
     dense = _is_dense(q) and _is_dense(lower) and _is_dense(upper) and _is_dense(guess)
     if not (shaped and dense and _is_dense_matrix(P) and _is_dense_matrix(G)):
         return MISUSE
@@ -91,9 +122,18 @@ def solve(P, q, G, lower, upper, guess, memory, out):
         length = load_some(q, i) * load(work.vectors[SCALE], i)
         longest, undefined = larger(longest, length), undefined + 0.0 * length
     least = NONE * largest(longest)  # length of x that is none
-    if share == 0.0 or any_nonzero(undefined) or not _read_bounds(work.vectors, lower, upper, least):
+    if (
+        share == 0.0
+        or any_nonzero(undefined)
+        or not _read_bounds(work.vectors, lower, upper, least)
+    ):
         return MISUSE
-    known = len(guess) > HEADER and guess[VARIABLES] == n and guess[CONSTRAINTS] == M and 0 <= guess[WORKING] <= M
+    known = (
+        len(guess) > HEADER
+        and guess[VARIABLES] == n
+        and guess[CONSTRAINTS] == M
+        and 0 <= guess[WORKING] <= M
+    )
     return _solve_opened(work, guess if known else guess[:0], least, share, out)
 
 
@@ -107,20 +147,29 @@ def _is_dense(vector):
 def _is_dense_matrix(A):
     """Returns whether a matrix is as contiguous as its type claims."""
     rows, columns = A.shape
-    return (A.strides[0] == columns * A.itemsize and A.strides[1] == A.itemsize) or rows * columns == 0
+    return (
+        A.strides[0] == columns * A.itemsize and A.strides[1] == A.itemsize
+    ) or rows * columns == 0
 
 
 @inline_njit
 def _solve_opened(work, guess, least, pivots, out):
     """Solves the program in the workspace, and writes the record ``out``."""
-    vectors, names, factor, n = work.vectors, work.indices[NAME], work.factor, len(work.q)
+    vectors, names, factor, n = (
+        work.vectors,
+        work.indices[NAME],
+        work.factor,
+        len(work.q),
+    )
     M, y, mu = n + len(work.G), vectors[Y], vectors[MU]
     k, guessed = _start(work, guess, out)
     margin, fine = _LATER / NONE * least, _FINE
     iterations, rounds = np.int64(0), 0  # for a literal numba compiles callees anew
     status, passed, moved = NUMERICAL_TROUBLE, False, False
     interrupted = len(guess) > 0 and guess[STATUS] == ITERATION_LIMIT
-    batches = np.int64(_BATCHES if interrupted else 0)  # with single steps only the dual objective cannot fall
+    batches = np.int64(
+        _BATCHES if interrupted else 0
+    )  # with single steps only the dual objective cannot fall
     count, near = -1 - guessed, 0.0
     while True:
         if rounds > 0:
@@ -130,7 +179,9 @@ def _solve_opened(work, guess, least, pivots, out):
             if fine > _FINEST:  # a small violation is believed of the best x only
                 fine, count, moved = _FINEST, 0, True
         if count != 0:
-            status, k, iterations, batches, passed_now, violated = iterate(work, k, count, margin, iterations, batches)
+            status, k, iterations, batches, passed_now, violated = iterate(
+                work, k, count, margin, iterations, batches
+            )
             if status != SOLVED:
                 break
             moved, passed = moved or violated, passed or passed_now
@@ -139,22 +190,36 @@ def _solve_opened(work, guess, least, pivots, out):
             p = abs(names[i]) - 1
             if p < n:  # bounds of variables hold exactly
                 y[p] = vectors[BOUND, i]
-            share = min(share, 1.0 / (factor[i, i] * factor[i, i] * vectors[DIAGONAL, i]))
+            share = min(
+                share, 1.0 / (factor[i, i] * factor[i, i] * vectors[DIAGONAL, i])
+            )
         share = min(pivots, math.sqrt(share))
         if passed or share < _ILL:
             fine = _FINEST
         worst, size, refined = _refine(work, k, least, min(fine, _DOUBT * share))
         moved = moved or refined
-        status = SOLVED if worst <= min(work.tolerance, _DOUBT * share) else NUMERICAL_TROUBLE
+        status = (
+            SOLVED
+            if worst <= min(work.tolerance, _DOUBT * share)
+            else NUMERICAL_TROUBLE
+        )
         rounds += 1
         if (not moved and margin == 0.0) or rounds == _ROUNDS or worst >= _UNDEFINED:
             break
         margin, moved = 0.0, False
-        near = worst * size / share if fine > _FINEST else 0.0  # what the error of x may hide
+        near = (
+            worst * size / share if fine > _FINEST else 0.0
+        )  # what the error of x may hide
     unsure = passed or rounds == _ROUNDS  # of the violations that are left
     if unsure and status == SOLVED and _worst_violation(work, least) > _NOISE:
         status = NUMERICAL_TROUBLE
-    out[STATUS], out[ITERATIONS], out[WORKING], out[VARIABLES], out[CONSTRAINTS] = status, iterations, k, n, M
+    out[STATUS], out[ITERATIONS], out[WORKING], out[VARIABLES], out[CONSTRAINTS] = (
+        status,
+        iterations,
+        k,
+        n,
+        M,
+    )
     out[TAG], out[AGE] = work.tag if status == SOLVED else 0.0, out[AGE] + iterations
     scale(1.0, y, out[HEADER:], n)
     scale(1.0, mu, out[HEADER + n :], M)
@@ -182,7 +247,10 @@ def _start(work, guess, out):
     if work.soft and len(guess) > 0:
         for p in range(n, M):
             value, cap = guess[HEADER + n + p], vectors[CAP, p]
-            if abs(value) >= cap and abs(vectors[UPPER if value > 0.0 else LOWER, p]) < np.inf:
+            if (
+                abs(value) >= cap
+                and abs(vectors[UPPER if value > 0.0 else LOWER, p]) < np.inf
+            ):
                 mu[p] = cap if value > 0.0 else -cap
                 restore_limits(vectors, p)
     add_multipliers(work, np.int64(0))
@@ -194,7 +262,12 @@ def _start(work, guess, out):
     first = HEADER + n + M
     names = guess[first : first + int(guess[WORKING])]
     chosen = choose_guess(vectors, work.indices, M, names)
-    known = work.tag != 0.0 and guess[TAG] == work.tag and guess[AGE] < _OLD and len(guess) == len(out)
+    known = (
+        work.tag != 0.0
+        and guess[TAG] == work.tag
+        and guess[AGE] < _OLD
+        and len(guess) == len(out)
+    )
     if known and chosen == len(names) and chosen <= n:
         out[AGE] = guess[AGE]
         restore_constraints(work, chosen, guess[first + M :])
@@ -207,14 +280,27 @@ def _read_bounds(vectors, lower, upper, least):
     """Copies the bounds, with absent ones infinite, and clears mu; returns False if any are crossed or undefined."""
     wrong = zeros()
     for p in range(0, len(lower), 8):
-        low, high = _remove_absent(load_some(lower, p)), _remove_absent(load_some(upper, p))
-        wrong = wrong + clip(high - low, -1.0, 0.0)  # infinity less infinity is undefined, and so none of a bound
+        low, high = (
+            _remove_absent(load_some(lower, p)),
+            _remove_absent(load_some(upper, p)),
+        )
+        wrong = wrong + clip(
+            high - low, -1.0, 0.0
+        )  # infinity less infinity is undefined, and so none of a bound
         negligible = least * load(vectors[SCALE], p)
         store(vectors[LOWER], p, low)
         store(vectors[UPPER], p, high)
         store(vectors[NEGLIGIBLE], p, negligible)
-        store(vectors[ALLOWED_LOW], p, low - (TOLERATED * larger(zeros(), low) + negligible))
-        store(vectors[ALLOWED_HIGH], p, high + (TOLERATED * larger(zeros(), high) + negligible))
+        store(
+            vectors[ALLOWED_LOW],
+            p,
+            low - (TOLERATED * larger(zeros(), low) + negligible),
+        )
+        store(
+            vectors[ALLOWED_HIGH],
+            p,
+            high + (TOLERATED * larger(zeros(), high) + negligible),
+        )
         store(vectors[MU], p, zeros())
     return not any_nonzero(wrong)
 
@@ -293,7 +379,10 @@ def _measure_residuals(work, k, least):
         rest = load_some(gradient[:n], i) + load_some(vectors[SLOPE][:n], i)
         store(gradient, i, rest)
         length = rest * load(scale, i)
-        lengths, shifts = larger(lengths, length), larger(shifts, length * load(scale, i))
+        lengths, shifts = (
+            larger(lengths, length),
+            larger(shifts, length * load(scale, i)),
+        )
         entries, nothing = larger(entries, load_some(y[:n], i)), nothing + 0.0 * length
     worst, undefined = largest(lengths) / size, total(nothing)
     worst = max(worst, 0.01 * largest(shifts) / max(largest(entries), _TINY))
@@ -316,7 +405,12 @@ def _measure_residuals(work, k, least):
 def _take_newton_step(work, k):
     """Takes one Newton step on the working set for the residuals; multipliers stay in range."""
     vectors, places, n = work.vectors, work.indices[PLACE], len(work.q)
-    y, change, trial, subtract = vectors[Y], vectors[SCRATCH], vectors[R], vectors[GRADIENT]
+    y, change, trial, subtract = (
+        vectors[Y],
+        vectors[SCRATCH],
+        vectors[R],
+        vectors[GRADIENT],
+    )
     scale(1.0, subtract, change, n)
     solve_transposed(work.L, n, change)
     multiply_rows(work.rows, places, k, change, n, trial)
@@ -331,7 +425,9 @@ def _take_newton_step(work, k):
         store(y, i, load(y, i) + load(subtract, i))
     for i in range(k):
         p = abs(work.indices[NAME, i]) - 1
-        vectors[MU, p] = min(max(vectors[MU, p] + trial[i], vectors[LEAST, i]), vectors[MOST, i])
+        vectors[MU, p] = min(
+            max(vectors[MU, p] + trial[i], vectors[LEAST, i]), vectors[MOST, i]
+        )
     multiply_constraints(work)
 
 

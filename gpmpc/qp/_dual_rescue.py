@@ -33,7 +33,11 @@ _CORRECTIONS = 12
 
 @np.errstate(all="ignore")  # what is not finite does not convince
 def rescue(
-    problem: tuple, caps: Array, record: Array, limit: int = 20, late: Callable[[], bool] = lambda: False
+    problem: tuple,
+    caps: Array,
+    record: Array,
+    limit: int = 20,
+    late: Callable[[], bool] = lambda: False,
 ) -> Array:
     """The record of a solve that starts from the working set of another, ``record``.
 
@@ -47,16 +51,25 @@ def rescue(
     P, q, G, lower, upper = problem
     result = record.copy()
     try:
-        lower, upper = np.where(lower <= -ABSENT, -np.inf, lower), np.where(upper >= ABSENT, np.inf, upper)
+        lower, upper = (
+            np.where(lower <= -ABSENT, -np.inf, lower),
+            np.where(upper >= ABSENT, np.inf, upper),
+        )
         for dependent in _DEPENDENT:
             solve = _Solve((P, q, G, lower, upper), caps, dependent, late)
-            result[layout.STATUS] = solve.run(layout.working_names(record, len(q), len(lower)), limit)
+            result[layout.STATUS] = solve.run(
+                layout.working_names(record, len(q), len(lower)), limit
+            )
             if result[layout.STATUS] != layout.NUMERICAL_TROUBLE:
                 break
         solve.write(result)  # pyright: ignore[reportPossiblyUnboundVariable]
     except TimeoutError:
         result[layout.STATUS] = layout.TIME_LIMIT
-    except (ArithmeticError, ValueError, np.linalg.LinAlgError):  # not finite, or not positive definite once scaled
+    except (
+        ArithmeticError,
+        ValueError,
+        np.linalg.LinAlgError,
+    ):  # not finite, or not positive definite once scaled
         result[layout.STATUS] = layout.NUMERICAL_TROUBLE
     return result
 
@@ -68,9 +81,15 @@ class _Solve:
         P, q, G, lower, upper = problem
         n, M = len(q), len(lower)
         D = _power_of_two(np.sqrt(np.diagonal(P)))
-        E = np.concatenate([1.0 / D, _power_of_two(np.abs(G * D).max(axis=1, initial=0.0))])
+        E = np.concatenate(
+            [1.0 / D, _power_of_two(np.abs(G * D).max(axis=1, initial=0.0))]
+        )
         self.D, self.E, self.n = D, E, n
-        self.P, self.q, self.C = P * np.outer(D, D), q * D, np.vstack([np.eye(n), G * D * E[n:, None]])
+        self.P, self.q, self.C = (
+            P * np.outer(D, D),
+            q * D,
+            np.vstack([np.eye(n), G * D * E[n:, None]]),
+        )
         self.lower, self.upper = lower * E, upper * E
         self.caps, self.G, self.bounds, self.late = caps / E, G, (lower, upper), late
         self.L = np.linalg.cholesky(self.P)
@@ -111,7 +130,9 @@ class _Solve:
         if not (np.isfinite(x).all() and np.isfinite(multipliers).all()):
             raise OverflowError
         record[layout.HEADER : layout.HEADER + n + M] = np.concatenate([x, multipliers])
-        record[layout.HEADER + n + M :][:k] = [side * (p + 1) for p, side in self.working.items()]
+        record[layout.HEADER + n + M :][:k] = [
+            side * (p + 1) for p, side in self.working.items()
+        ]
         record[[layout.WORKING, layout.VARIABLES, layout.CONSTRAINTS]] = k, n, M
         record[layout.ITERATIONS] += self.iterations
 
@@ -121,14 +142,22 @@ class _Solve:
     def _range(self, p: int, side: int) -> tuple[float, float]:
         """The range of a multiplier at the upper (+1) or lower (-1) bound."""
         equality, cap = self.lower[p] == self.upper[p], self.caps[p]
-        return (-cap if equality or side < 0 else 0.0), (cap if equality or side > 0 else 0.0)
+        return (-cap if equality or side < 0 else 0.0), (
+            cap if equality or side > 0 else 0.0
+        )
 
     def _guess(self, names: Array) -> None:
         """Starts with the named bounds, except those that depend on others."""
         guess = {int(abs(name)) - 1: int(np.sign(name)) for name in names}
-        some = [p for p, side in guess.items() if np.isfinite(self._bound(p, side)) and self.norms[p] > 0.0]
+        some = [
+            p
+            for p, side in guess.items()
+            if np.isfinite(self._bound(p, side)) and self.norms[p] > 0.0
+        ]
         if some:
-            R, order = qr(self.columns[:, some] / self.norms[some], mode="r", pivoting=True)
+            R, order = qr(
+                self.columns[:, some] / self.norms[some], mode="r", pivoting=True
+            )
             good = np.abs(np.diagonal(R)) > 1e6 * self.dependent
             self.working = {some[i]: guess[some[i]] for i in order[: len(good)][good]}
 
@@ -146,9 +175,15 @@ class _Solve:
             worst, wrong, end = 0.0, -1, 0.0
             for p, side in self.working.items():
                 least, most = self._range(p, side)
-                outside = max(self.mu[0, p] - most, least - self.mu[0, p]) * self.norms[p]
+                outside = (
+                    max(self.mu[0, p] - most, least - self.mu[0, p]) * self.norms[p]
+                )
                 if outside > worst:
-                    worst, wrong, end = outside, p, most if self.mu[0, p] > most else least
+                    worst, wrong, end = (
+                        outside,
+                        p,
+                        most if self.mu[0, p] > most else least,
+                    )
             if wrong < 0:
                 return True
             self._drop(wrong, end if np.isfinite(end) else 0.0)
@@ -165,13 +200,24 @@ class _Solve:
         others = np.setdiff1d(np.flatnonzero(mu[0]), W)  # soft rows at their caps
         for _ in range(_CORRECTIONS):
             r1 = _sum_products(
-                [(self.P, x[0]), (self.P, x[1]), (C.T, mu[0, W]), (C.T, mu[1, W]), (self.C[others].T, mu[0, others])],
+                [
+                    (self.P, x[0]),
+                    (self.P, x[1]),
+                    (C.T, mu[0, W]),
+                    (C.T, mu[1, W]),
+                    (self.C[others].T, mu[0, others]),
+                ],
                 self.q,
             )
-            r2, slope = _sum_products([(C, x[0]), (C, x[1])], -b), solve_triangular(self.L, r1, lower=True)
+            r2, slope = (
+                _sum_products([(C, x[0]), (C, x[1])], -b),
+                solve_triangular(self.L, r1, lower=True),
+            )
             along = solve_triangular(self.R, r2, trans="T")
             part = self.Q.T @ slope
-            dx = solve_triangular(self.L, self.Q @ (part - along) - slope, trans="T", lower=True)
+            dx = solve_triangular(
+                self.L, self.Q @ (part - along) - slope, trans="T", lower=True
+            )
             _add(x, slice(None), dx)
             _add(mu, W, solve_triangular(self.R, along - part))
             size = max(np.abs(x[0]).max(), NEGLIGIBLE * np.abs(self.q).max())
@@ -185,12 +231,23 @@ class _Solve:
 
     def _most_violated(self, passed: set[int]) -> tuple[int, int, int, float]:
         """The constraint violated most, the bound, the direction in which its multiplier moves, and by how much."""
-        y, mu = _sum_products([(self.C, self.x[0]), (self.C, self.x[1])], np.zeros(len(self.C))), self.mu[0]
+        y, mu = (
+            _sum_products(
+                [(self.C, self.x[0]), (self.C, self.x[1])], np.zeros(len(self.C))
+            ),
+            self.mu[0],
+        )
         sizes = np.abs(self.C) @ np.abs(self.x[0])
-        above = np.where(np.isfinite(self.upper), y - self.upper, -np.inf) - NEGLIGIBLE * np.abs(self.upper)
-        below = np.where(np.isfinite(self.lower), self.lower - y, -np.inf) - NEGLIGIBLE * np.abs(self.lower)
+        above = np.where(
+            np.isfinite(self.upper), y - self.upper, -np.inf
+        ) - NEGLIGIBLE * np.abs(self.upper)
+        below = np.where(
+            np.isfinite(self.lower), self.lower - y, -np.inf
+        ) - NEGLIGIBLE * np.abs(self.lower)
         # one at a cap must stay outside its bound: it is violated where it is not
-        excess = np.where(mu > 0.0, -above, np.where(mu < 0.0, -below, np.maximum(above, below)))
+        excess = np.where(
+            mu > 0.0, -above, np.where(mu < 0.0, -below, np.maximum(above, below))
+        )
         excess -= NEGLIGIBLE * np.maximum(sizes, np.abs(self.q).max())
         excess[[*self.working, *passed]] = -np.inf
         p = int(np.argmax(np.where(self.norms > 0.0, excess / self.norms, excess)))
@@ -205,7 +262,9 @@ class _Solve:
             return max(abs(self._bound(p, side)), np.abs(self.C[p]) @ np.abs(self.x[0]))
         return zero_row_size(self.G, *self.bounds)
 
-    def _step_to(self, p: int, side: int, sense: int, violation: float, rounding: float) -> bool:
+    def _step_to(
+        self, p: int, side: int, sense: int, violation: float, rounding: float
+    ) -> bool:
         """Moves multipliers until constraint p is satisfied.
 
         False if it contradicts the working ones, or depends on them and is violated by no more than rounding.
@@ -214,8 +273,14 @@ class _Solve:
         start = mu[p]
         while True:
             self._factorise()
-            W, rest, r = list(self.working), self.columns[:, p], np.zeros(len(self.working))
-            for _ in range(2):  # the combination r of the working columns nearest to p's; twice is enough
+            W, rest, r = (
+                list(self.working),
+                self.columns[:, p],
+                np.zeros(len(self.working)),
+            )
+            for _ in range(
+                2
+            ):  # the combination r of the working columns nearest to p's; twice is enough
                 part = self.Q.T @ rest
                 rest, r = rest - self.Q @ part, r + solve_triangular(self.R, part)
             square = rest @ rest
@@ -250,13 +315,18 @@ class _Solve:
 
     def _prove(self, p: int, sense: int) -> bool:
         """Whether the last contradiction has Farkas' proof, which becomes the ray."""
-        W, sides = np.array(list(self.working), dtype=int), np.array(list(self.working.values()), dtype=int)
+        W, sides = (
+            np.array(list(self.working), dtype=int),
+            np.array(list(self.working.values()), dtype=int),
+        )
         used = np.abs(self.r) * self.norms[W] > self.dependent * self.norms[p]
         W, sides, r = W[used], sides[used], self.r[used]
         Q, R = qr(self.columns[:, W], mode="economic")
         for _ in range(3):
             rest = _sum_products([(self.C[W].T, -r)], self.C[p])
-            r = r + solve_triangular(R, Q.T @ solve_triangular(self.L, rest, lower=True))
+            r = r + solve_triangular(
+                R, Q.T @ solve_triangular(self.L, rest, lower=True)
+            )
         # where a bound cannot pull that way it is rounding
         wrong = (-sense * r * sides < 0.0) & (self.lower[W] < self.upper[W])
         ray = np.zeros(len(self.E))
@@ -285,7 +355,11 @@ def _sum_products(products: list[tuple[Array, Array]], constant: Array) -> Array
         product = A * v
         A_high, v_high = _leading_half(A), _leading_half(v)
         A_low, v_low = A - A_high, v - v_high
-        terms += [product, ((A_high * v_high - product) + A_high * v_low + A_low * v_high) + A_low * v_low]
+        terms += [
+            product,
+            ((A_high * v_high - product) + A_high * v_low + A_low * v_high)
+            + A_low * v_low,
+        ]
     total, rest = np.concatenate(terms, axis=1), np.zeros(len(constant))
     while total.shape[1] > 1:
         if total.shape[1] % 2:

@@ -31,16 +31,26 @@ from scipy.optimize import linprog
 from gpmpc.qp import _record as layout
 from gpmpc.qp._dual_rescue import rescue
 from gpmpc.qp._problem import ABSENT, QuadraticProgram, check_positive
-from gpmpc.qp._solution import QPSolution, WarmStart, as_record, make_solution, proves_infeasibility
+from gpmpc.qp._solution import (
+    QPSolution,
+    WarmStart,
+    as_record,
+    make_solution,
+    proves_infeasibility,
+)
 from gpmpc.status import Status
 
 Array = NDArray[np.float64]
 
 _RANK = 1e-11  # share of the largest pivot of the QR below which a working row depends on the others
 _STILL = 1e-13  # share of the size of x below which a direction is zero
-_FULL_STEPS = 2  # unhindered steps on one working set after which what is left of d is rounding
+_FULL_STEPS = (
+    2  # unhindered steps on one working set after which what is left of d is rounding
+)
 _INSIDE = 1e-9  # share of the size of a row by which phase 1 may miss it
-_ZERO_STEPS = 20  # steps of length zero in a row after which Bland's rule breaks a possible cycle
+_ZERO_STEPS = (
+    20  # steps of length zero in a row after which Bland's rule breaks a possible cycle
+)
 
 
 class _Rows(NamedTuple):
@@ -72,21 +82,40 @@ class PrimalActiveSet:
         check_positive(self, "tolerance", "iteration_limit")
 
     @np.errstate(over="ignore", invalid="ignore")  # what is not finite is seen below
-    def solve(self, problem: QuadraticProgram, warm_start: WarmStart = None) -> QPSolution:
+    def solve(
+        self, problem: QuadraticProgram, warm_start: WarmStart = None
+    ) -> QPSolution:
         """The minimiser, from a warm start of any kind; see ``QPSolver``."""
         began = perf_counter()
         n, M = len(problem.q), len(problem.lower)
         rows, start, names = _one_sided(problem), np.zeros(n), np.zeros(0)
         given = as_record(warm_start, n, M)
-        if len(given) and (given[layout.VARIABLES], given[layout.CONSTRAINTS]) == (n, M):
+        if len(given) and (given[layout.VARIABLES], given[layout.CONSTRAINTS]) == (
+            n,
+            M,
+        ):
             names = layout.working_names(given, n, M)
-            start = np.nan_to_num(given[layout.HEADER : layout.HEADER + n], posinf=0.0, neginf=0.0)
+            start = np.nan_to_num(
+                given[layout.HEADER : layout.HEADER + n], posinf=0.0, neginf=0.0
+            )
 
         def finish(status, x, multipliers, active, iterations):
-            solution = make_solution(problem, status, x, multipliers, active_set=active, iterations=iterations)
-            if status in (Status.SOLVED, Status.NUMERICAL_TROUBLE):  # it is checked, and its last digits are found
+            solution = make_solution(
+                problem,
+                status,
+                x,
+                multipliers,
+                active_set=active,
+                iterations=iterations,
+            )
+            if status in (
+                Status.SOLVED,
+                Status.NUMERICAL_TROUBLE,
+            ):  # it is checked, and its last digits are found
                 solution.record[:] = rescue(problem, solution.caps, solution.record)
-                if solution.status is not Status.INFEASIBLE and not solution.is_optimal(self.tolerance):
+                if solution.status is not Status.INFEASIBLE and not solution.is_optimal(
+                    self.tolerance
+                ):
                     solution.record[layout.STATUS] = layout.NUMERICAL_TROUBLE
             return solution._replace(solve_seconds=perf_counter() - began)
 
@@ -94,26 +123,46 @@ class PrimalActiveSet:
         x, ray = _phase_1(rows, start, M)
         if ray is not None:
             proven = proves_infeasibility(ray, *problem[2:])
-            return finish(Status.INFEASIBLE if proven else Status.NUMERICAL_TROUBLE, x, ray, nothing, 0)
+            return finish(
+                Status.INFEASIBLE if proven else Status.NUMERICAL_TROUBLE,
+                x,
+                ray,
+                nothing,
+                0,
+            )
         limit = self.iteration_limit or 200 + 20 * len(rows.h)
-        guessed = np.isin((rows.stacked + 1) * np.sign(rows.factor), names)  # and they hold with equality at x
-        guessed &= np.abs(rows.A @ x - rows.h) <= _INSIDE * np.maximum(1.0, np.abs(rows.h))
+        guessed = np.isin(
+            (rows.stacked + 1) * np.sign(rows.factor), names
+        )  # and they hold with equality at x
+        guessed &= np.abs(rows.A @ x - rows.h) <= _INSIDE * np.maximum(
+            1.0, np.abs(rows.h)
+        )
         working = list(np.flatnonzero(rows.equality | guessed))
         still = full_steps = 0
         for iteration in range(limit):
             A, d, multipliers = rows.A[working], np.full(n, np.nan), nothing
-            with suppress(ValueError):  # from SciPy: not finite, or no longer positive definite
-                d, multipliers = _minimise_on_rows(problem.P, problem.P @ x + problem.q, A, rows.h[working] - A @ x)
+            with suppress(
+                ValueError
+            ):  # from SciPy: not finite, or no longer positive definite
+                d, multipliers = _minimise_on_rows(
+                    problem.P, problem.P @ x + problem.q, A, rows.h[working] - A @ x
+                )
             if not np.isfinite(d).all():
                 return finish(Status.NUMERICAL_TROUBLE, x, nothing, nothing, iteration)
-            if full_steps == _FULL_STEPS or np.abs(d).max() <= _STILL * max(1.0, np.abs(x).max()):
+            if full_steps == _FULL_STEPS or np.abs(d).max() <= _STILL * max(
+                1.0, np.abs(x).max()
+            ):
                 droppable = np.where(rows.equality[working], np.inf, multipliers)
                 if not working or droppable.min() >= 0.0:
                     stacked = _stack(rows, working, multipliers, M)
                     active = np.zeros(M)
                     active[rows.stacked[working]] = np.sign(rows.factor[working])
                     return finish(Status.SOLVED, x, stacked, active, iteration)
-                drop = np.argmax(droppable < 0.0) if still > _ZERO_STEPS else np.argmin(droppable)
+                drop = (
+                    np.argmax(droppable < 0.0)
+                    if still > _ZERO_STEPS
+                    else np.argmin(droppable)
+                )
                 working.pop(int(drop))
                 full_steps = 0
                 continue
@@ -128,20 +177,29 @@ class PrimalActiveSet:
 
 def _one_sided(problem: QuadraticProgram) -> _Rows:
     """Every bound that is there as one row ``a'x <= h`` of unit length (zero rows stay zero)."""
-    lower, upper, C = problem.lower, problem.upper, np.vstack([np.eye(len(problem.q)), problem.G])
+    lower, upper, C = (
+        problem.lower,
+        problem.upper,
+        np.vstack([np.eye(len(problem.q)), problem.G]),
+    )
     equal = lower == upper
     above = np.flatnonzero(upper < ABSENT)
     below = np.flatnonzero((lower > -ABSENT) & ~equal)
     stacked = np.concatenate([above, below])
     norms = np.linalg.norm(C, axis=1)[stacked]
-    factor = np.repeat([1.0, -1.0], [len(above), len(below)]) / np.where(norms > 0.0, norms, 1.0)
+    factor = np.repeat([1.0, -1.0], [len(above), len(below)]) / np.where(
+        norms > 0.0, norms, 1.0
+    )
     h = np.concatenate([upper[above], lower[below]]) * factor
     return _Rows(C[stacked] * factor[:, None], h, equal[stacked], stacked, factor)
 
 
 def _phase_1(rows: _Rows, start: Array, M: int) -> tuple[Array, Array | None]:
     """A feasible point (``start`` if it is one) and None, or ``start`` and a ray (M,) that may prove there is none."""
-    A, h = np.vstack([rows.A, -rows.A[rows.equality]]), np.concatenate([rows.h, -rows.h[rows.equality]])
+    A, h = (
+        np.vstack([rows.A, -rows.A[rows.equality]]),
+        np.concatenate([rows.h, -rows.h[rows.equality]]),
+    )
     if (A @ start <= h).all():
         return start, None
     n = len(start)
@@ -150,7 +208,10 @@ def _phase_1(rows: _Rows, start: Array, M: int) -> tuple[Array, Array | None]:
         A_ub=np.column_stack([A, np.full(len(A), -1.0)]),
         b_ub=h - A @ start,
         bounds=[(None, None)] * n + [(0.0, None)],
-        options={"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10},
+        options={
+            "primal_feasibility_tolerance": 1e-10,
+            "dual_feasibility_tolerance": 1e-10,
+        },
     )
     if least.x is None:
         return start, np.zeros(M)
@@ -169,7 +230,9 @@ def farkas_ray(problem: QuadraticProgram) -> Array | None:
     return None if ray is None or not proves_infeasibility(ray, *problem[2:]) else ray
 
 
-def _minimise_on_rows(P: Array, gradient: Array, A: Array, gap: Array) -> tuple[Array, Array]:
+def _minimise_on_rows(
+    P: Array, gradient: Array, A: Array, gap: Array
+) -> tuple[Array, Array]:
     """The minimiser d of ``1/2 d'Pd + gradient'd`` with ``A d = gap`` (zero but for rounding), and the multipliers.
 
     ``P d + gradient + A' multipliers = 0``; rows of A that depend on others get multiplier zero.
@@ -187,14 +250,25 @@ def _minimise_on_rows(P: Array, gradient: Array, A: Array, gap: Array) -> tuple[
     return d, multipliers
 
 
-def _step_length(rows: _Rows, x: Array, d: Array, working: list[int]) -> tuple[float, int | None]:
+def _step_length(
+    rows: _Rows, x: Array, d: Array, working: list[int]
+) -> tuple[float, int | None]:
     """Kappa in [0, 1] and the row that blocks, if one does."""
     speed = rows.A @ d
     speed[working] = 0.0
-    room, towards = np.maximum(rows.h - rows.A @ x, 0.0), speed > _STILL * np.linalg.norm(d)
+    room, towards = (
+        np.maximum(rows.h - rows.A @ x, 0.0),
+        speed > _STILL * np.linalg.norm(d),
+    )
     kappas = np.where(towards, room / np.where(towards, speed, 1.0), 1.0)
-    blocking = int(np.argmin(np.append(kappas, 1.0)))  # the last where none blocks before
-    return (float(kappas[blocking]), blocking) if blocking < len(kappas) and kappas[blocking] < 1.0 else (1.0, None)
+    blocking = int(
+        np.argmin(np.append(kappas, 1.0))
+    )  # the last where none blocks before
+    return (
+        (float(kappas[blocking]), blocking)
+        if blocking < len(kappas) and kappas[blocking] < 1.0
+        else (1.0, None)
+    )
 
 
 def _stack(rows: _Rows, which, multipliers: Array, M: int) -> Array:

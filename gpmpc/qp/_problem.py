@@ -25,20 +25,32 @@ ABSENT = 1e20  # a bound of this size or more is none
 _SYMMETRY = 1e-10  # largest |P - P'| accepted, as a share of the largest diagonal entry
 
 
-def _as_float_array(name: str, value: ArrayLike, shape: tuple[int, ...], finite: bool = False) -> Array:
+def _as_float_array(
+    name: str, value: ArrayLike, shape: tuple[int, ...], finite: bool = False
+) -> Array:
     """Returns ``value`` as a contiguous, writeable float64 array of that shape without NaN; itself if it is one."""
     try:
         array = np.require(value, np.float64, ["C", "A", "W"])
     except (TypeError, ValueError) as error:
-        raise ProblemError(f"{name} must be an array of real numbers; got {value!r}") from error
-    if array.size and array.strides != np.empty(array.shape).strides:  # an axis of length 1 may have any, for NumPy
+        raise ProblemError(
+            f"{name} must be an array of real numbers; got {value!r}"
+        ) from error
+    if (
+        array.size and array.strides != np.empty(array.shape).strides
+    ):  # an axis of length 1 may have any, for NumPy
         array = array.copy()
     if array.shape != shape:
         raise ProblemError(f"{name} must have shape {shape}; got {array.shape}")
     wrong = np.argwhere(~np.isfinite(array) if finite else np.isnan(array))
     if len(wrong):
-        rule = "not contain NaN; it does" if np.isnan(array).any() else "be finite; it is not"
-        raise ProblemError(f"{name} must {rule} at index {', '.join(map(str, wrong[0]))}")
+        rule = (
+            "not contain NaN; it does"
+            if np.isnan(array).any()
+            else "be finite; it is not"
+        )
+        raise ProblemError(
+            f"{name} must {rule} at index {', '.join(map(str, wrong[0]))}"
+        )
     return array
 
 
@@ -47,7 +59,9 @@ def _check_hessian(P: Array) -> None:
     skew = np.abs(P - P.T)
     if skew.max() > _SYMMETRY * np.abs(np.diagonal(P)).max():
         i, j = np.unravel_index(np.argmax(skew), P.shape)
-        raise ProblemError(f"P must be symmetric; got P[{i}, {j}] = {P[i, j]:.6g} and P[{j}, {i}] = {P[j, i]:.6g}")
+        raise ProblemError(
+            f"P must be symmetric; got P[{i}, {j}] = {P[i, j]:.6g} and P[{j}, {i}] = {P[j, i]:.6g}"
+        )
     try:
         pivots = np.diagonal(np.linalg.cholesky(P)) ** 2
         definite = bool((pivots > len(P) * np.finfo(float).eps * np.diagonal(P)).all())
@@ -61,13 +75,17 @@ def _check_hessian(P: Array) -> None:
         )
 
 
-def _check_bounds(n: int, lower: Array, upper: Array, names: tuple[str, str, str, str]) -> None:
+def _check_bounds(
+    n: int, lower: Array, upper: Array, names: tuple[str, str, str, str]
+) -> None:
     """Raises ``ProblemError`` where stacked bounds are crossed or cannot be met; names of the box's come first."""
     for i in np.flatnonzero((lower > upper) | (lower >= ABSENT) | (upper <= -ABSENT)):
         low, high = names[:2] if i < n else names[2:]
         place = f"variable {i}" if i < n else f"row {i - n}"
         if lower[i] > upper[i]:
-            raise ProblemError(f"{place}: {low} must not exceed {high}; got {lower[i]:.6g} > {upper[i]:.6g}")
+            raise ProblemError(
+                f"{place}: {low} must not exceed {high}; got {lower[i]:.6g} > {upper[i]:.6g}"
+            )
         name, value = (low, lower[i]) if lower[i] >= ABSENT else (high, upper[i])
         raise ProblemError(f"{place}: no number satisfies {name} = {value:.6g}")
 
@@ -119,52 +137,87 @@ class QuadraticProgram(_Arrays):
         ub: ArrayLike | None = None,
     ):
         if G is None and (h_lower is not None or h_upper is not None):
-            raise ProblemError("h_lower and h_upper bound the rows of G; got bounds without G")
+            raise ProblemError(
+                "h_lower and h_upper bound the rows of G; got bounds without G"
+            )
         (n, m), P, q, G = _check_matrices(P, q, G)
 
-        def bound(name: str, value: ArrayLike | None, size: int, absent: float) -> Array:
-            return _as_float_array(name, np.full(size, absent) if value is None else value, (size,))
+        def bound(
+            name: str, value: ArrayLike | None, size: int, absent: float
+        ) -> Array:
+            return _as_float_array(
+                name, np.full(size, absent) if value is None else value, (size,)
+            )
 
-        lower = np.concatenate([bound("lb", lb, n, -np.inf), bound("h_lower", h_lower, m, -np.inf)])
-        upper = np.concatenate([bound("ub", ub, n, np.inf), bound("h_upper", h_upper, m, np.inf)])
+        lower = np.concatenate(
+            [bound("lb", lb, n, -np.inf), bound("h_lower", h_lower, m, -np.inf)]
+        )
+        upper = np.concatenate(
+            [bound("ub", ub, n, np.inf), bound("h_upper", h_upper, m, np.inf)]
+        )
         _check_bounds(n, lower, upper, ("lb", "ub", "h_lower", "h_upper"))
         return cls.unchecked(P, q, G, lower, upper)
 
     @classmethod
     def from_stacked(
-        cls, P: ArrayLike, q: ArrayLike, G: ArrayLike, lower: ArrayLike, upper: ArrayLike
+        cls,
+        P: ArrayLike,
+        q: ArrayLike,
+        G: ArrayLike,
+        lower: ArrayLike,
+        upper: ArrayLike,
     ) -> "QuadraticProgram":
         """Checks a program with bounds (M,) on the stacked constraints ``[x; Gx]``."""
         (n, m), P, q, G = _check_matrices(P, q, G)
-        lower, upper = _as_float_array("lower", lower, (n + m,)), _as_float_array("upper", upper, (n + m,))
+        lower, upper = (
+            _as_float_array("lower", lower, (n + m,)),
+            _as_float_array("upper", upper, (n + m,)),
+        )
         _check_bounds(n, lower, upper, ("lower", "upper", "lower", "upper"))
         return cls.unchecked(P, q, G, lower, upper)
 
     @staticmethod
-    def unchecked(P: Array, q: Array, G: Array, lower: Array, upper: Array) -> "QuadraticProgram":
+    def unchecked(
+        P: Array, q: Array, G: Array, lower: Array, upper: Array
+    ) -> "QuadraticProgram":
         """Takes the arrays as they are, in 0.2 us; ``DualActiveSet.solve`` checks them in compiled code."""
         return _new(QuadraticProgram, (P, q, G, lower, upper))
 
     def __reduce__(self):
         return QuadraticProgram.unchecked, tuple(self)
 
-    h_lower = property(lambda self: self.lower[len(self.q) :], doc="(m,) lower bounds of the rows.")
-    h_upper = property(lambda self: self.upper[len(self.q) :], doc="(m,) upper bounds of the rows.")
+    h_lower = property(
+        lambda self: self.lower[len(self.q) :], doc="(m,) lower bounds of the rows."
+    )
+    h_upper = property(
+        lambda self: self.upper[len(self.q) :], doc="(m,) upper bounds of the rows."
+    )
     lb = property(lambda self: self.lower[: len(self.q)], doc="(n,) lower bounds of x.")
     ub = property(lambda self: self.upper[: len(self.q)], doc="(n,) upper bounds of x.")
 
 
-def _check_matrices(P: ArrayLike, q: ArrayLike, G: ArrayLike | None) -> tuple[tuple[int, int], Array, Array, Array]:
+def _check_matrices(
+    P: ArrayLike, q: ArrayLike, G: ArrayLike | None
+) -> tuple[tuple[int, int], Array, Array, Array]:
     """Returns (n, m), P, q and G as arrays."""
     shape = np.shape(P)
     if len(shape) != 2 or shape[0] != shape[1] or shape[0] == 0:
-        raise ProblemError(f"P must be a square matrix with at least one row; got shape {shape}")
+        raise ProblemError(
+            f"P must be a square matrix with at least one row; got shape {shape}"
+        )
     n = shape[0]
     rows = np.shape(G) if G is not None else (0, n)
     if len(rows) != 2:
         raise ProblemError(f"G must be a matrix of {n} columns; got shape {rows}")
-    P, q = _as_float_array("P", P, (n, n), finite=True), _as_float_array("q", q, (n,), finite=True)
-    G = np.zeros((0, n)) if G is None else _as_float_array("G", G, (rows[0], n), finite=True)
+    P, q = (
+        _as_float_array("P", P, (n, n), finite=True),
+        _as_float_array("q", q, (n,), finite=True),
+    )
+    G = (
+        np.zeros((0, n))
+        if G is None
+        else _as_float_array("G", G, (rows[0], n), finite=True)
+    )
     _check_hessian(P)
     return (n, rows[0]), P, q, G
 
@@ -179,7 +232,9 @@ def multiplier_caps(prices: ArrayLike | None, variables: int, rows: int) -> Arra
     if prices is not None:
         caps[variables:] = _as_float_array("prices of rows", prices, (rows,))
     for i in np.flatnonzero(caps <= 0.0):
-        raise ProblemError(f"price of row {i - variables} must be positive; got {caps[i]:.6g}")
+        raise ProblemError(
+            f"price of row {i - variables} must be positive; got {caps[i]:.6g}"
+        )
     return caps
 
 

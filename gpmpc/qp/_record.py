@@ -28,7 +28,9 @@ NO_RECORD: NDArray[np.float64] = np.zeros(0)
 
 def record_size(variables: int, constraints: int, working: int = 0) -> int:
     """Returns the length of a record for M stacked constraints and a factor of up to ``working`` rows."""
-    return HEADER + variables + 2 * constraints + working * (working + 1) // 2 + 8  # kernels write whole registers
+    return (
+        HEADER + variables + 2 * constraints + working * (working + 1) // 2 + 8
+    )  # kernels write whole registers
 
 
 def warm_record(active_set: NDArray, variables: int) -> NDArray[np.float64]:
@@ -37,11 +39,17 @@ def warm_record(active_set: NDArray, variables: int) -> NDArray[np.float64]:
     record = np.zeros(record_size(variables, constraints))
     members = np.flatnonzero(active_set)
     record[[VARIABLES, CONSTRAINTS, WORKING]] = variables, constraints, len(members)
-    record[HEADER + variables + constraints :][: len(members)] = np.sign(active_set[members]) * (members + 1)
+    record[HEADER + variables + constraints :][: len(members)] = np.sign(
+        active_set[members]
+    ) * (members + 1)
     return record
 
 
-def working_names(record: NDArray, variables: int, constraints: int) -> NDArray[np.float64]:
+def working_names(
+    record: NDArray, variables: int, constraints: int
+) -> NDArray[np.float64]:
     """Returns the working set of a record, without what is no bound."""
-    names = record[HEADER + variables + constraints :][: int(np.clip(np.nan_to_num(record[WORKING]), 0, constraints))]
+    names = record[HEADER + variables + constraints :][
+        : int(np.clip(np.nan_to_num(record[WORKING]), 0, constraints))
+    ]
     return names[(np.abs(names) >= 1.0) & (np.abs(names) <= constraints)]

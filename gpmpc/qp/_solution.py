@@ -48,7 +48,9 @@ class QPSolution(NamedTuple):
     caps: Array  #: largest sizes (M,) of the multipliers: the prices of soft rows, infinity elsewhere
     #: the solver's whole result in one array, and a warm start for the next solve; see ``gpmpc.qp._record``
     record: Array
-    build_seconds: float = 0.0  #: time spent on building or compiling the problem in this call [s]
+    build_seconds: float = (
+        0.0  #: time spent on building or compiling the problem in this call [s]
+    )
     solve_seconds: float = 0.0  #: time spent on solving it [s]
 
     @property
@@ -92,8 +94,14 @@ class QPSolution(NamedTuple):
 
     def violation(self) -> Array:
         """(M,) how far each stacked constraint lies outside its bounds, in the constraint's own unit; soft ones too."""
-        values, (lower, upper) = np.concatenate([self.x, self.arrays[2] @ self.x]), self.arrays[3:]
-        outside = np.where(upper < ABSENT, values - upper, 0.0), np.where(lower > -ABSENT, lower - values, 0.0)
+        values, (lower, upper) = (
+            np.concatenate([self.x, self.arrays[2] @ self.x]),
+            self.arrays[3:],
+        )
+        outside = (
+            np.where(upper < ABSENT, values - upper, 0.0),
+            np.where(lower > -ABSENT, lower - values, 0.0),
+        )
         return np.maximum(0.0, np.maximum(*outside))
 
     @np.errstate(all="ignore")  # the multipliers of a failed solve may be anything
@@ -114,13 +122,22 @@ class QPSolution(NamedTuple):
         violation = self.violation()
         beyond = np.where(sizes >= caps, 0.0, violation)
         bound = np.abs(np.where(np.concatenate([x, rows]) > upper, upper, lower))
-        own = np.concatenate([np.maximum(np.abs(x), zero / units), np.abs(G) @ np.maximum(np.abs(x), zero / units)])
+        own = np.concatenate(
+            [
+                np.maximum(np.abs(x), zero / units),
+                np.abs(G) @ np.maximum(np.abs(x), zero / units),
+            ]
+        )
         own[n:][~G.any(axis=1)] = zero_row_size(G, lower, upper)
         primal = _largest_ratio(beyond, np.maximum(own, bound))
 
         absent = (up & (upper >= ABSENT)) | (down & (lower <= -ABSENT))
         stray = np.where(absent, sizes, np.maximum(0.0, sizes - caps))
-        rest = np.abs(slope + q + G.T @ self.z + self.z_box) + stray[:n] + np.abs(G).T @ stray[n:]
+        rest = (
+            np.abs(slope + q + G.T @ self.z + self.z_box)
+            + stray[:n]
+            + np.abs(G).T @ stray[n:]
+        )
         paid = sizes - stray
         own = np.abs(P) @ np.abs(x) + np.abs(q) + paid[:n] + np.abs(G).T @ paid[n:]
         dual = _largest_ratio(rest, np.maximum(own, zero * units))
@@ -128,7 +145,12 @@ class QPSolution(NamedTuple):
         support = multipliers[up] * upper[up], multipliers[down] * lower[down]
         capped = (sizes >= caps) & np.isfinite(caps)
         curvature, gain = x @ slope, q @ x
-        gap = abs(curvature + gain + sum(map(np.sum, support)) + caps[capped] @ violation[capped])
+        gap = abs(
+            curvature
+            + gain
+            + sum(map(np.sum, support))
+            + caps[capped] @ violation[capped]
+        )
         own = sum(np.abs(part).sum() for part in support)
         gap = _largest_ratio(gap, max(abs(curvature), abs(gain), own, zero * free))
         return Residuals(primal, dual, gap)
@@ -145,14 +167,22 @@ WarmStart = QPSolution | NDArray[np.number] | None
 class QPSolver(Protocol):
     """Solves strictly convex quadratic programs; ``gpmpc.testing.check_qp_solver`` checks whether an object does."""
 
-    def solve(self, problem: QuadraticProgram, warm_start: WarmStart = None) -> QPSolution:
+    def solve(
+        self, problem: QuadraticProgram, warm_start: WarmStart = None
+    ) -> QPSolution:
         """Returns the minimiser, or the status that says why there is none: the same from any warm start."""
         ...
 
 
 def _largest_ratio(rest: ArrayLike, own: ArrayLike) -> float:
     """The largest of ``rest / own``, zero where both are."""
-    return float(np.max(np.divide(rest, own, out=np.zeros(np.shape(rest)), where=np.not_equal(rest, 0.0))))
+    return float(
+        np.max(
+            np.divide(
+                rest, own, out=np.zeros(np.shape(rest)), where=np.not_equal(rest, 0.0)
+            )
+        )
+    )
 
 
 def make_solution(
@@ -184,11 +214,18 @@ def make_solution(
         raise ProblemError(
             f"a solution needs x of shape {(n,)} and multipliers {(M,)}; got {x.shape}, {multipliers.shape}"
         )
-    record = layout.warm_record(np.nan_to_num(np.sign(multipliers) if active_set is None else active_set), n)
-    record[[layout.STATUS, layout.ITERATIONS]] = layout.STATUSES.index(status), iterations
+    record = layout.warm_record(
+        np.nan_to_num(np.sign(multipliers) if active_set is None else active_set), n
+    )
+    record[[layout.STATUS, layout.ITERATIONS]] = (
+        layout.STATUSES.index(status),
+        iterations,
+    )
     record[layout.HEADER : layout.HEADER + n + M] = np.concatenate([x, multipliers])
     x = record[layout.HEADER : layout.HEADER + n]
-    return QPSolution(x, problem, np.full(M, np.inf), record, build_seconds, solve_seconds)
+    return QPSolution(
+        x, problem, np.full(M, np.inf), record, build_seconds, solve_seconds
+    )
 
 
 def as_record(warm_start: WarmStart, n: int, M: int) -> Array:
@@ -223,7 +260,9 @@ def proves_infeasibility(ray: Array, G: Array, lower: Array, upper: Array) -> bo
     products = repaired[used] * bounds[used]
     if (np.abs(bounds[used]) >= ABSENT).any() or not np.isfinite(products).all():
         return False
-    sizes = np.abs(products).sum() + np.abs(ray[n:])[~G.any(axis=1)].sum() * zero_row_size(G, lower, upper)
+    sizes = np.abs(products).sum() + np.abs(ray[n:])[
+        ~G.any(axis=1)
+    ].sum() * zero_row_size(G, lower, upper)
     return bool(products.sum() < -_ROUNDING * sizes)
 
 

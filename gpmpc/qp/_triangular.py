@@ -41,7 +41,12 @@ def multiply_rows(A, places, count, vector, size, product):
     """Writes ``product[i] = A[places[i]] . vector``."""
     i = 0
     while i + 4 <= count:
-        r0, r1, r2, r3 = A[places[i]], A[places[i + 1]], A[places[i + 2]], A[places[i + 3]]
+        r0, r1, r2, r3 = (
+            A[places[i]],
+            A[places[i + 1]],
+            A[places[i + 2]],
+            A[places[i + 3]],
+        )
         four_dots((r0, r1, r2, r3), vector, size, product[i:])
         i += 4
     while i < count:
@@ -54,7 +59,12 @@ def subtract_rows(target, rows, places, factors, count, size):
     """Writes ``target -= sum_i factors[i] rows[places[i]]``."""
     i = 0
     while i + 4 <= count:
-        r0, r1, r2, r3 = rows[places[i]], rows[places[i + 1]], rows[places[i + 2]], rows[places[i + 3]]
+        r0, r1, r2, r3 = (
+            rows[places[i]],
+            rows[places[i + 1]],
+            rows[places[i + 2]],
+            rows[places[i + 3]],
+        )
         f0, f1, f2, f3 = factors[i], factors[i + 1], factors[i + 2], factors[i + 3]
         for j in range(size):
             target[j] -= f0 * r0[j] + f1 * r1[j] + f2 * r2[j] + f3 * r3[j]
@@ -76,14 +86,44 @@ def solve_lower(L, k, a):
         whole = i // _LANES * _LANES
         for j in range(0, whole, _LANES):
             x = load(a, j)
-            s0, s1, s2, s3 = s0 + load(r0, j) * x, s1 + load(r1, j) * x, s2 + load(r2, j) * x, s3 + load(r3, j) * x
-        a0, a1, a2, a3 = a[i] - total(s0), a[i + 1] - total(s1), a[i + 2] - total(s2), a[i + 3] - total(s3)
+            s0, s1, s2, s3 = (
+                s0 + load(r0, j) * x,
+                s1 + load(r1, j) * x,
+                s2 + load(r2, j) * x,
+                s3 + load(r3, j) * x,
+            )
+        a0, a1, a2, a3 = (
+            a[i] - total(s0),
+            a[i + 1] - total(s1),
+            a[i + 2] - total(s2),
+            a[i + 3] - total(s3),
+        )
         if whole < i:
             x0, x1, x2, x3 = a[whole], a[whole + 1], a[whole + 2], a[whole + 3]
-            a0 -= r0[whole] * x0 + r0[whole + 1] * x1 + r0[whole + 2] * x2 + r0[whole + 3] * x3
-            a1 -= r1[whole] * x0 + r1[whole + 1] * x1 + r1[whole + 2] * x2 + r1[whole + 3] * x3
-            a2 -= r2[whole] * x0 + r2[whole + 1] * x1 + r2[whole + 2] * x2 + r2[whole + 3] * x3
-            a3 -= r3[whole] * x0 + r3[whole + 1] * x1 + r3[whole + 2] * x2 + r3[whole + 3] * x3
+            a0 -= (
+                r0[whole] * x0
+                + r0[whole + 1] * x1
+                + r0[whole + 2] * x2
+                + r0[whole + 3] * x3
+            )
+            a1 -= (
+                r1[whole] * x0
+                + r1[whole + 1] * x1
+                + r1[whole + 2] * x2
+                + r1[whole + 3] * x3
+            )
+            a2 -= (
+                r2[whole] * x0
+                + r2[whole + 1] * x1
+                + r2[whole + 2] * x2
+                + r2[whole + 3] * x3
+            )
+            a3 -= (
+                r3[whole] * x0
+                + r3[whole + 1] * x1
+                + r3[whole + 2] * x2
+                + r3[whole + 3] * x3
+            )
         a0 = a0 * r0[i]
         a1 = (a1 - r1[i] * a0) * r1[i + 1]
         a2 = (a2 - r2[i] * a0 - r2[i + 1] * a1) * r2[i + 2]
@@ -139,12 +179,18 @@ def delete_row(L, k, gone, solved, cosines, sines):
             above[j] = row[j]
         for j in range(gone + 1, i):
             entry = row[j]
-            above[j - 1], rest = cosines[j] * rest + sines[j] * entry, cosines[j] * entry - sines[j] * rest
+            above[j - 1], rest = (
+                cosines[j] * rest + sines[j] * entry,
+                cosines[j] * entry - sines[j] * rest,
+            )
         diagonal = 1.0 / row[i]
         reciprocal = 1.0 / math.sqrt(rest * rest + diagonal * diagonal)
         cosines[i], sines[i] = rest * reciprocal, diagonal * reciprocal
         above[i - 1] = reciprocal
-        solved[i - 1], left = cosines[i] * left + sines[i] * below, cosines[i] * below - sines[i] * left
+        solved[i - 1], left = (
+            cosines[i] * left + sines[i] * below,
+            cosines[i] * below - sines[i] * left,
+        )
 
 
 @njit_noalloc
@@ -203,8 +249,15 @@ def _finish_four_rows(P, L, top):
     n, end = len(P), top + _BLOCK
     p0, p1, p2, p3 = P[top], P[top + 1], P[top + 2], P[top + 3]
     t0, t1, t2, t3 = L[top], L[top + 1], L[top + 2], L[top + 3]
-    for j in range(0, end, _LANES):  # P less what the rows of L below take off: registers hold all of it
-        a0, a1, a2, a3 = load_some(p0, j), load_some(p1, j), load_some(p2, j), load_some(p3, j)
+    for j in range(
+        0, end, _LANES
+    ):  # P less what the rows of L below take off: registers hold all of it
+        a0, a1, a2, a3 = (
+            load_some(p0, j),
+            load_some(p1, j),
+            load_some(p2, j),
+            load_some(p3, j),
+        )
         for s in range(end, n):
             row = L[s]
             x = load(row, j)

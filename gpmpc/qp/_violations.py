@@ -32,9 +32,15 @@ def restore_limits(vectors, p):
     allowed_low = low - (TOLERATED * abs(low) + vectors[NEGLIGIBLE, p])
     allowed_high = high + (TOLERATED * abs(high) + vectors[NEGLIGIBLE, p])
     if mu > 0.0:
-        allowed_low, allowed_high = high - (TOLERATED * abs(high) + vectors[NEGLIGIBLE, p]), np.inf
+        allowed_low, allowed_high = (
+            high - (TOLERATED * abs(high) + vectors[NEGLIGIBLE, p]),
+            np.inf,
+        )
     elif mu < 0.0:
-        allowed_low, allowed_high = -np.inf, low + (TOLERATED * abs(low) + vectors[NEGLIGIBLE, p])
+        allowed_low, allowed_high = (
+            -np.inf,
+            low + (TOLERATED * abs(low) + vectors[NEGLIGIBLE, p]),
+        )
     vectors[ALLOWED_LOW, p], vectors[ALLOWED_HIGH, p] = allowed_low, allowed_high
 
 
@@ -47,7 +53,12 @@ def ignore_violations(vectors, p):
 @inline_njit
 def list_violated(vectors, indices, M, margin):
     """Lists the constraints violated by more than ``margin``, in units of ``SCALE``; returns how many."""
-    y, low, high, scale = vectors[Y], vectors[ALLOWED_LOW], vectors[ALLOWED_HIGH], vectors[SCALE]
+    y, low, high, scale = (
+        vectors[Y],
+        vectors[ALLOWED_LOW],
+        vectors[ALLOWED_HIGH],
+        vectors[SCALE],
+    )
     excess, violated, count = vectors[EXCESS], indices[VIOLATED], 0
     for p in range(M):
         excess[p] = max(y[p] - high[p], low[p] - y[p]) - margin * scale[p]
@@ -65,7 +76,12 @@ def list_violated(vectors, indices, M, margin):
 @inline_njit
 def keep_violated(work, margin, count):
     """Computes the listed constraints anew, from x = y[:n]; keeps the violated ones, and returns how many."""
-    vectors, y, excess, violated = work.vectors, work.vectors[Y], work.vectors[EXCESS], work.indices[VIOLATED]
+    vectors, y, excess, violated = (
+        work.vectors,
+        work.vectors[Y],
+        work.vectors[EXCESS],
+        work.indices[VIOLATED],
+    )
     kept, n = 0, len(work.q)
     for i in range(count):
         p = violated[i]
@@ -102,7 +118,9 @@ def choose_bad(vectors, indices, threshold, count, room):
         if vectors[EXCESS, p] > threshold:
             bad += 1
             if chosen < room and vectors[MU, p] == 0.0:
-                candidates[chosen] = p + 1 if vectors[Y, p] > vectors[UPPER, p] else -(p + 1)
+                candidates[chosen] = (
+                    p + 1 if vectors[Y, p] > vectors[UPPER, p] else -(p + 1)
+                )
                 chosen += 1
     return chosen if bad > 1 else 0
 
@@ -114,7 +132,10 @@ def choose_guess(vectors, indices, M, names):
     for name in names:
         if 1.0 <= abs(name) <= M:
             p = int(abs(name)) - 1
-            if vectors[MU, p] == 0.0 and abs(vectors[UPPER if name > 0.0 else LOWER, p]) < np.inf:
+            if (
+                vectors[MU, p] == 0.0
+                and abs(vectors[UPPER if name > 0.0 else LOWER, p]) < np.inf
+            ):
                 candidates[chosen] = int(name)
                 chosen += 1
     return chosen

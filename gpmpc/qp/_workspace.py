@@ -25,13 +25,19 @@ NEGLIGIBLE = 4  # violation of a bound of zero that is none
 SCALE = 5  # length of c_p in the metric of the inverse of P's diagonal
 CAP = 6  # price of a violation: the largest size of a multiplier
 END = 7  # leading entries of c_p that may not be zero, in steps of a register
-MU, Y, EXCESS = 8, 9, 10  # multipliers; C x, so that the first n are the point; violations in units of ``SCALE``
+MU, Y, EXCESS = (
+    8,
+    9,
+    10,
+)  # multipliers; C x, so that the first n are the point; violations in units of ``SCALE``
 # by variable (n,): -L^-T q, so that L x = v without working constraints (-q if prepared); q + C'mu; P x + q + C'mu
 V, SLOPE, GRADIENT, SCRATCH = 11, 12, 13, 14
 # and by slot of the working set (k,): b_p; c_p'x at the unconstrained minimiser; the range of the multiplier, which is
 # [0, cap] at an upper bound, [-cap, 0] at a lower one and [-cap, cap] for an equality; K_pp
 BOUND, FREE_VALUE, LEAST, MOST, DIAGONAL = range(15, 20)
-REST, SOLVED_K, R, COSINES, SINES, _VECTORS = range(20, 26)  # residual; L_K^-1 K_Wp; K_WW^-1 K_Wp; of rotations
+REST, SOLVED_K, R, COSINES, SINES, _VECTORS = range(
+    20, 26
+)  # residual; L_K^-1 K_Wp; K_WW^-1 K_Wp; of rotations
 
 # Rows of ``Workspace.indices``: in the slots of the working set p + 1 at the upper bound or -(p + 1) at the lower one,
 # and the place of w_p in ``rows`` (those of slots from k on are free); the constraints with an excess; those to enter.
@@ -61,12 +67,16 @@ class Workspace(NamedTuple):
     tag: float  # of a prepared program, of which L, rows, ``SCALE``, ``END`` and share are there; zero otherwise
 
 
-def new_memory(caps: Array, n: int, limit: int, tolerance: float, soft: bool, prepared: bool) -> Array:
+def new_memory(
+    caps: Array, n: int, limit: int, tolerance: float, soft: bool, prepared: bool
+) -> Array:
     """Returns memory for programs of n variables with these caps (M,)."""
     M = len(caps)
     wide = padded(max(M, n + 2)) + 8  # kernels write whole lanes
     rows = n + (2 * M if prepared else n + 1) + n + 1
-    memory = aligned_rows(1 + _VECTORS + _INDICES + rows, wide)  # loads across cache lines take twice the time
+    memory = aligned_rows(
+        1 + _VECTORS + _INDICES + rows, wide
+    )  # loads across cache lines take twice the time
     memory[:] = 0.0
     box = np.arange(M) < n
     memory[0, :_TAG] = limit, tolerance, soft
@@ -78,10 +88,14 @@ def new_memory(caps: Array, n: int, limit: int, tolerance: float, soft: bool, pr
 def prepare_memory(memory: Array, G: Array) -> None:
     """Completes ``prepared`` memory, in which a solve has left the factor of P, with the rows w_p and K = C P^-1 C'."""
     m, n = G.shape
-    _, L, rows, K, _ = np.split(memory, 1 + _VECTORS + _INDICES + np.cumsum([0, n, n + m, n + m]))
+    _, L, rows, K, _ = np.split(
+        memory, 1 + _VECTORS + _INDICES + np.cumsum([0, n, n + m, n + m])
+    )
     L = np.tril(L[:, :n])
     np.fill_diagonal(L, 1.0 / np.diagonal(L))
-    w = solve_triangular(L, np.vstack([np.eye(n), G]).T, lower=True, trans="T", check_finite=False).T  # L^-T c_p
+    w = solve_triangular(
+        L, np.vstack([np.eye(n), G]).T, lower=True, trans="T", check_finite=False
+    ).T  # L^-T c_p
     rows[:, :n], K[:, : n + m] = w, w @ w.T
     memory[0, _TAG] = 1.0 + zlib.crc32(w.tobytes())
 

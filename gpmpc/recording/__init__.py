@@ -6,4 +6,13 @@ from gpmpc.recording._reader import Run, read_run, recover, replay
 from gpmpc.recording._recorder import McapRecorder
 from gpmpc.step import Step
 
-__all__ = ["McapRecorder", "RecordedSystem", "Run", "Step", "layout", "read_run", "recover", "replay"]
+__all__ = [
+    "McapRecorder",
+    "RecordedSystem",
+    "Run",
+    "Step",
+    "layout",
+    "read_run",
+    "recover",
+    "replay",
+]

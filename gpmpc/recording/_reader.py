@@ -19,7 +19,16 @@ from mcap.writer import CompressionType, Writer
 from gpmpc._files import whole_file
 from gpmpc.exceptions import GpmpcError, RecordingError, SettingError
 from gpmpc.recording import _messages
-from gpmpc.recording._messages import FIELDS, PLAN, QP, QP_ARRAYS, RESIDUALS, STEP, TIMING, TOPICS
+from gpmpc.recording._messages import (
+    FIELDS,
+    PLAN,
+    QP,
+    QP_ARRAYS,
+    RESIDUALS,
+    STEP,
+    TIMING,
+    TOPICS,
+)
 from gpmpc.recording._records import CONFIG, RECOVERED, room, whole_records
 from gpmpc.status import Status
 
@@ -31,9 +40,24 @@ if TYPE_CHECKING:
 Array = np.ndarray
 _STATUSES = tuple(Status)
 #: of ``Run``, by the field of a step's message
-_ATTRIBUTES = {"time": "times", "k": "steps", "reference": "references", "state": "states", "measured": "measured"}
-_ATTRIBUTES |= {"input": "inputs", "innovation": "innovations", "iterations": "iterations", "timing": "timings"}
-_ATTRIBUTES |= {"active_set_size": "active_set_sizes", "gp_size": "gp_sizes", "gp_version": "gp_versions"}
+_ATTRIBUTES = {
+    "time": "times",
+    "k": "steps",
+    "reference": "references",
+    "state": "states",
+    "measured": "measured",
+}
+_ATTRIBUTES |= {
+    "input": "inputs",
+    "innovation": "innovations",
+    "iterations": "iterations",
+    "timing": "timings",
+}
+_ATTRIBUTES |= {
+    "active_set_size": "active_set_sizes",
+    "gp_size": "gp_sizes",
+    "gp_version": "gp_versions",
+}
 _ATTRIBUTES |= {"failed": "failed", "novelty": "novelties"}
 
 
@@ -77,7 +101,9 @@ class Run:
     gp_sizes: Array  # (K,)
     gp_versions: Array  # (K,)
     failed: Array  # (K,) whether the decision was not applied
-    novelties: Array  # (K,) ``novelty`` of the decisions; 0 in files that do not have it
+    novelties: (
+        Array  # (K,) ``novelty`` of the decisions; 0 in files that do not have it
+    )
     channels: dict[str, tuple[int, str]]  # number of messages and schema by topic
     metadata: dict[str, dict[str, str]]
     config: str  # text of the resolved configuration
@@ -87,7 +113,11 @@ class Run:
     def pose(self) -> dict[str, int]:
         """Indices of the states that are x, y, z, roll, pitch and yaw in space, as far as there are any."""
         named = self.metadata.get("pose", {}).items()
-        return {axis: self.state_names.index(name) for axis, name in named if name in self.state_names}
+        return {
+            axis: self.state_names.index(name)
+            for axis, name in named
+            if name in self.state_names
+        }
 
     @cached_property
     def plan_stds(self) -> Array:
@@ -98,16 +128,30 @@ class Run:
     def residuals(self) -> Array:
         """Primal and dual residual and duality gap of every recorded solution (K, 3); NaN without one."""
         nothing = (np.nan, np.nan, np.nan)
-        return np.array([_residuals(self.problems[k]) if k in self.problems else nothing for k in self.steps.tolist()])
+        return np.array(
+            [
+                _residuals(self.problems[k]) if k in self.problems else nothing
+                for k in self.steps.tolist()
+            ]
+        )
 
     @cached_property
     def columns(self) -> dict[str, Array]:
         """The run as a table: a column (K,) per scalar field of ``gpmpc.Step``, in its order."""
-        values: dict[str, Array] = {field: getattr(self, name) for field, name in _ATTRIBUTES.items()}
+        values: dict[str, Array] = {
+            field: getattr(self, name) for field, name in _ATTRIBUTES.items()
+        }
         values["belief_std"] = _messages.deviations(self.belief_covariances)
         values["residuals"] = self.residuals.reshape(-1, 3)
-        values["status"] = np.array([status.name for status in self.statuses], dtype=object)
-        names = {"State": self.state_names, "Input": self.input_names, "Timing": TIMING, "": RESIDUALS}
+        values["status"] = np.array(
+            [status.name for status in self.statuses], dtype=object
+        )
+        names = {
+            "State": self.state_names,
+            "Input": self.input_names,
+            "Timing": TIMING,
+            "": RESIDUALS,
+        }
         found: dict[str, Array] = {}
         for field, kind in FIELDS["Step"].items():
             if field in values and kind in names:
@@ -136,13 +180,19 @@ def replay(run: Run, k: int) -> "QPSolution":
 
     recorded = run.problems.get(k)
     if recorded is None:
-        raise RecordingError(f"{run.path}: holds no quadratic program of step {k}; it holds {len(run.problems)} others")
+        raise RecordingError(
+            f"{run.path}: holds no quadratic program of step {k}; it holds {len(run.problems)} others"
+        )
     inverse, caps = recorded.softness[:, len(recorded.q) :]
     try:
         problem = QuadraticProgram.from_stacked(*recorded[:5])
         if inverse.any():
-            raise RecordingError("its rows have quadratic prices, as in files of the first edition")
-        return DualActiveSet().solve(problem, prices=None if np.isinf(caps).all() else caps)
+            raise RecordingError(
+                "its rows have quadratic prices, as in files of the first edition"
+            )
+        return DualActiveSet().solve(
+            problem, prices=None if np.isinf(caps).all() else caps
+        )
     except GpmpcError as error:
         raise RecordingError(f"{run.path}: step {k}: {error}") from error
 
@@ -175,13 +225,22 @@ def read_run(path: str | Path) -> Run:
         finished = isinstance(record, Footer)
     about = metadata.get("run", {})
     if not {"state_names", "input_names"} <= about.keys():
-        raise RecordingError(f"{path}: is not the recording of a run; it has no metadata about one")
+        raise RecordingError(
+            f"{path}: is not the recording of a run; it has no metadata about one"
+        )
     try:
-        states, inputs = (_messages.check_names(key, about[key].split()) for key in ("state_names", "input_names"))
-        classes = _messages.message_classes(_messages.descriptor(states, inputs, "bytes"))
+        states, inputs = (
+            _messages.check_names(key, about[key].split())
+            for key in ("state_names", "input_names")
+        )
+        classes = _messages.message_classes(
+            _messages.descriptor(states, inputs, "bytes")
+        )
     except SettingError as error:
         raise RecordingError(f"{path}: its metadata are damaged; {error}") from error
-    steps, plans, problems = (_decoded(path, topic, classes, len(states), found[topic]) for topic in found)
+    steps, plans, problems = (
+        _decoded(path, topic, classes, len(states), found[topic]) for topic in found
+    )
     return Run(
         path=path,
         finished=finished and RECOVERED not in metadata,
@@ -190,14 +249,19 @@ def read_run(path: str | Path) -> Run:
         statuses=tuple(_STATUSES[step.status] for step in steps),
         **_steps(steps, states, inputs),
         **_plans(path, plans, steps, states, inputs),
-        channels={channel.topic: (counts[i], schemas.get(channel.schema_id, "")) for i, channel in channels.items()},
+        channels={
+            channel.topic: (counts[i], schemas.get(channel.schema_id, ""))
+            for i, channel in channels.items()
+        },
         metadata=metadata,
         config=config,
         problems=dict(problems),
     )
 
 
-def _decoded(path: Path, topic: str, classes: dict[str, Any], n: int, records: list[Message]) -> list[Any]:
+def _decoded(
+    path: Path, topic: str, classes: dict[str, Any], n: int, records: list[Message]
+) -> list[Any]:
     """Parses the messages of a topic; a quadratic program becomes its step's number k and itself."""
     found: list[Any] = []
     for record in records:
@@ -214,7 +278,9 @@ def _decoded(path: Path, topic: str, classes: dict[str, Any], n: int, records: l
                 if not 0 <= message.status < len(_STATUSES):
                     raise ValueError(f"status {message.status} is unknown")
         except (DecodeError, ValueError) as error:
-            raise RecordingError(f"{path}: message {record.sequence} of {topic} is damaged: {error}") from error
+            raise RecordingError(
+                f"{path}: message {record.sequence} of {topic} is damaged: {error}"
+            ) from error
         found.append(message)
     return found
 
@@ -229,19 +295,30 @@ def _numbers(message: Any, field: str, *shape: int) -> Array:
 
 def _table(messages: Iterable[Any], names: Sequence[str]) -> Array:
     """Reads scalar fields of messages (K, names)."""
-    return np.array([[getattr(message, name) for name in names] for message in messages]).reshape(-1, len(names))
+    return np.array(
+        [[getattr(message, name) for name in names] for message in messages]
+    ).reshape(-1, len(names))
 
 
-def _steps(steps: list, states: tuple[str, ...], inputs: tuple[str, ...]) -> dict[str, Array]:
+def _steps(
+    steps: list, states: tuple[str, ...], inputs: tuple[str, ...]
+) -> dict[str, Array]:
     bounds = np.tile([[-np.inf], [np.inf]], len(inputs))
     if steps and steps[0].HasField("input_lower"):  # they are equal in all steps
         bounds = _table([steps[0].input_lower, steps[0].input_upper], inputs)
     covariances = np.frombuffer(b"".join(step.belief_covariance for step in steps))
-    found = {"input_bounds": bounds, "belief_covariances": covariances.reshape(-1, len(states), len(states))}
+    found = {
+        "input_bounds": bounds,
+        "belief_covariances": covariances.reshape(-1, len(states), len(states)),
+    }
     names = {"State": states, "Input": inputs, "Timing": TIMING}
     for field, name in _ATTRIBUTES.items():
         kind, values = FIELDS["Step"][field], [getattr(step, field) for step in steps]
-        found[name] = _table(values, names[kind]) if kind in names else np.array(values, dtype=kind)
+        found[name] = (
+            _table(values, names[kind])
+            if kind in names
+            else np.array(values, dtype=kind)
+        )
     return found
 
 
@@ -253,27 +330,62 @@ def _numbered(messages: list) -> Iterator[tuple[int, int]]:
         yield message.k, seen[message.k]
 
 
-def _plans(path: Path, plans: list, steps: list, states: tuple[str, ...], inputs: tuple[str, ...]) -> dict[str, Array]:
-    H, n, m = max((len(plan.stages) - 1 for plan in plans), default=0), len(states), len(inputs)
+def _plans(
+    path: Path,
+    plans: list,
+    steps: list,
+    states: tuple[str, ...],
+    inputs: tuple[str, ...],
+) -> dict[str, Array]:
+    H, n, m = (
+        max((len(plan.stages) - 1 for plan in plans), default=0),
+        len(states),
+        len(inputs),
+    )
     if (needed := 8 * len(steps) * (H + 1) * (n * n + n + m)) > room(path):
-        raise RecordingError(f"{path}: a plan of {H} stages would make arrays of {needed / 1e6:.0f} MB with the others")
+        raise RecordingError(
+            f"{path}: a plan of {H} stages would make arrays of {needed / 1e6:.0f} MB with the others"
+        )
     shapes = {"inputs": (H, m), "means": (H + 1, n), "covariances": (H + 1, n, n)}
-    arrays = {f"plan_{name}": np.full((len(steps), *shape), np.nan) for name, shape in shapes.items()}
+    arrays = {
+        f"plan_{name}": np.full((len(steps), *shape), np.nan)
+        for name, shape in shapes.items()
+    }
     rows = {key: row for row, key in enumerate(_numbered(steps))}
     for key, plan in zip(_numbered(plans), plans, strict=True):
         if key in rows:  # else the step is lost
             row, H = rows[key], len(plan.stages) - 1
-            arrays["plan_means"][row, : H + 1] = _table((stage.mean for stage in plan.stages), states)
-            arrays["plan_inputs"][row, :H] = _table((stage.input for stage in plan.stages[:-1]), inputs)
-            arrays["plan_covariances"][row, : H + 1] = _numbers(plan, "covariances", H + 1, n, n)
+            arrays["plan_means"][row, : H + 1] = _table(
+                (stage.mean for stage in plan.stages), states
+            )
+            arrays["plan_inputs"][row, :H] = _table(
+                (stage.input for stage in plan.stages[:-1]), inputs
+            )
+            arrays["plan_covariances"][row, : H + 1] = _numbers(
+                plan, "covariances", H + 1, n, n
+            )
     return arrays
 
 
 def _problem(message: Any) -> RecordedProblem:
     n, m = message.variables, message.rows
     M, has_solution = n + m, bool(message.x or message.multipliers)
-    shapes = ((n, n), (n,), (m, n), (M,), (M,), (2, M), (n * has_solution,), (M * has_solution,))
-    return RecordedProblem(*(_numbers(message, name, *s) for name, s in zip(QP_ARRAYS, shapes, strict=True)))
+    shapes = (
+        (n, n),
+        (n,),
+        (m, n),
+        (M,),
+        (M,),
+        (2, M),
+        (n * has_solution,),
+        (M * has_solution,),
+    )
+    return RecordedProblem(
+        *(
+            _numbers(message, name, *s)
+            for name, s in zip(QP_ARRAYS, shapes, strict=True)
+        )
+    )
 
 
 def _residuals(problem: RecordedProblem) -> tuple[float, float, float]:
@@ -283,7 +395,9 @@ def _residuals(problem: RecordedProblem) -> tuple[float, float, float]:
     if not len(problem.x):
         return np.nan, np.nan, np.nan
     P, q, G, lower, upper, softness, x, multipliers = problem
-    solution = make_solution(QuadraticProgram.unchecked(P, q, G, lower, upper), Status.SOLVED, x, multipliers)
+    solution = make_solution(
+        QuadraticProgram.unchecked(P, q, G, lower, upper), Status.SOLVED, x, multipliers
+    )
     return solution._replace(caps=softness[1]).residuals()
 
 
@@ -300,16 +414,22 @@ def recover(path: str | Path, output: str | Path) -> Run:
     path, output = Path(path), Path(output)
     try:
         if output.exists() and path.exists() and output.samefile(path):
-            raise RecordingError(f"{output}: a file cannot be recovered into itself; name another output")
+            raise RecordingError(
+                f"{output}: a file cannot be recovered into itself; name another output"
+            )
         with whole_file(output) as file:
             _copy(path, file)
             file.flush()
             try:
                 return replace(read_run(file.name), path=output)
             except RecordingError as error:
-                raise RecordingError(str(error).replace(file.name, str(path), 1)) from error
+                raise RecordingError(
+                    str(error).replace(file.name, str(path), 1)
+                ) from error
     except OSError as error:
-        raise RecordingError(f"{output}: cannot be written: {error.strerror or error}") from error
+        raise RecordingError(
+            f"{output}: cannot be written: {error.strerror or error}"
+        ) from error
 
 
 def _copy(path: Path, file: BinaryIO) -> None:
@@ -319,18 +439,37 @@ def _copy(path: Path, file: BinaryIO) -> None:
     schemas, channels, messages, finished = {}, {}, 0, False
     for record in whole_records(path):
         if isinstance(record, Schema) and record.id not in schemas:
-            schemas[record.id] = writer.register_schema(record.name, record.encoding, record.data)
+            schemas[record.id] = writer.register_schema(
+                record.name, record.encoding, record.data
+            )
         elif isinstance(record, Channel) and record.id not in channels:
-            about = (record.topic, record.message_encoding, schemas.get(record.schema_id, 0), record.metadata)
+            about = (
+                record.topic,
+                record.message_encoding,
+                schemas.get(record.schema_id, 0),
+                record.metadata,
+            )
             channels[record.id] = writer.register_channel(*about)
         elif isinstance(record, Message):
             channel = channels[record.channel_id]
-            writer.add_message(channel, record.log_time, record.data, record.publish_time, record.sequence)
+            writer.add_message(
+                channel,
+                record.log_time,
+                record.data,
+                record.publish_time,
+                record.sequence,
+            )
             messages += 1
         elif isinstance(record, Metadata):
             writer.add_metadata(record.name, record.metadata)
         elif isinstance(record, Attachment):
-            writer.add_attachment(record.create_time, record.log_time, record.name, record.media_type, record.data)
+            writer.add_attachment(
+                record.create_time,
+                record.log_time,
+                record.name,
+                record.media_type,
+                record.data,
+            )
         finished = isinstance(record, Footer)
     if not finished:
         writer.add_metadata(RECOVERED, {"messages": str(messages)})

@@ -58,14 +58,29 @@ class McapRecorder:
         live: bool = False,
     ):
         check_number("chunk_size", chunk_size, least=1, whole=True, unit="[bytes]")
-        about = flattened(provenance() | {"host": platform.node()} | dict(metadata or {}))
+        about = flattened(
+            provenance() | {"host": platform.node()} | dict(metadata or {})
+        )
         about = {key: str(value) for key, value in about.items()}
-        about |= {"state_names": " ".join(system.state_names), "input_names": " ".join(system.input_names)}
-        frames = {"positions": WORLD, "z axis": "down" if system.z_down else "up", "display": "z axis up"}
-        config = config if isinstance(config, str) else json.dumps(config, indent=2, default=str)
+        about |= {
+            "state_names": " ".join(system.state_names),
+            "input_names": " ".join(system.input_names),
+        }
+        frames = {
+            "positions": WORLD,
+            "z axis": "down" if system.z_down else "up",
+            "display": "z axis up",
+        }
+        config = (
+            config
+            if isinstance(config, str)
+            else json.dumps(config, indent=2, default=str)
+        )
 
         self.path = Path(path)
-        self.address: str | None = None  #: where a viewer finds the live view, such as ``ws://127.0.0.1:8765``
+        self.address: str | None = (
+            None  #: where a viewer finds the live view, such as ``ws://127.0.0.1:8765``
+        )
         self._n, self._m = len(system.state_names), len(system.input_names)
         self._record_problems, self._chunk_size = record_problems, chunk_size
         self._encoder = Encoder(system)
@@ -74,25 +89,50 @@ class McapRecorder:
         self._error: str | None = None  # why no more steps are taken
         self._closed, self._server = False, None
         self._sink = _Sink(self.path)
-        self._context = context = foxglove.Context()  # its channels live as long as it does
+        self._context = context = (
+            foxglove.Context()
+        )  # its channels live as long as it does
         # ``_end_chunk`` ends chunks, and each is written in one piece.
-        options: Any = {"chunk_size": None, "disable_seeking": True, "compression_threads": 0, "compression_level": 1}
+        options: Any = {
+            "chunk_size": None,
+            "disable_seeking": True,
+            "compression_threads": 0,
+            "compression_level": 1,
+        }
         options = MCAPWriteOptions(profile="gpmpc", **options)
-        self._writer = foxglove.open_mcap(self._sink, context=context, writer_options=options)
-        described = {"run": about, "units": system.field_units, "frames": frames, "pose": dict(system.pose)}
+        self._writer = foxglove.open_mcap(
+            self._sink, context=context, writer_options=options
+        )
+        described = {
+            "run": about,
+            "units": system.field_units,
+            "frames": frames,
+            "pose": dict(system.pose),
+        }
         for name, pairs in described.items():
             self._writer.write_metadata(name, pairs)
-        attached: Any = {"media_type": "application/yaml", "log_time": 0, "create_time": 0}
+        attached: Any = {
+            "media_type": "application/yaml",
+            "log_time": 0,
+            "create_time": 0,
+        }
         self._writer.attach(name=CONFIG, data=config.encode(), **attached)
         self._writer.flush()
         self._save(sync=True)
-        self._channels, self._log = self._encoder.channels(context), LogChannel("/log", context=context)
+        self._channels, self._log = (
+            self._encoder.channels(context),
+            LogChannel("/log", context=context),
+        )
         self._scene = Scene(context, system)
         if live:
             try:
-                self._server = foxglove.start_server(name=self.path.name, port=_PORT, context=context)
+                self._server = foxglove.start_server(
+                    name=self.path.name, port=_PORT, context=context
+                )
             except RuntimeError:  # the port is taken
-                self._server = foxglove.start_server(name=self.path.name, port=0, context=context)
+                self._server = foxglove.start_server(
+                    name=self.path.name, port=0, context=context
+                )
             self.address = f"ws://127.0.0.1:{self._server.port}"
 
     def record(self, step: Step) -> None:
@@ -107,12 +147,17 @@ class McapRecorder:
         copy = StepCopy(step, self._n, self._m, self._record_problems)
         size = len(copy.data)
         if 4 * size > LARGEST:
-            raise RecordingError(f"{self.path}: a step of {size} bytes is too large; at most {LARGEST // 4}")
+            raise RecordingError(
+                f"{self.path}: a step of {size} bytes is too large; at most {LARGEST // 4}"
+            )
         self._waiting.append(copy)
         self._bytes += size
         if self._server is not None:
             self._serialise()
-        if self._bytes > self._chunk_size or time.perf_counter() - self._last > _INTERVAL:
+        if (
+            self._bytes > self._chunk_size
+            or time.perf_counter() - self._last > _INTERVAL
+        ):
             self._end_chunk()
 
     def close(self, outcome: str = "complete") -> None:
@@ -126,7 +171,9 @@ class McapRecorder:
         if self._error is not None:
             raise RecordingError(self._error)
         self._end_chunk()
-        self._writer.write_metadata("end", {"steps": str(self._steps), "outcome": outcome})
+        self._writer.write_metadata(
+            "end", {"steps": str(self._steps), "outcome": outcome}
+        )
         self._writer.close()
         self._save(sync=True)
         self._closed = True
@@ -135,12 +182,16 @@ class McapRecorder:
     def __enter__(self) -> "McapRecorder":
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: Any) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, _: Any
+    ) -> None:
         if error is None or kind is None:
             self.close()
             return
         with contextlib.suppress(RecordingError):  # most likely the same error
-            self.close(f"{kind.__name__}: {error}")  # a run that ended in an error has been recorded up to there
+            self.close(
+                f"{kind.__name__}: {error}"
+            )  # a run that ended in an error has been recorded up to there
 
     def _end_chunk(self) -> None:
         self._serialise()
@@ -185,9 +236,13 @@ class _Sink:
         self._data, self._position = bytearray(), 0
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            self.descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | getattr(os, "O_BINARY", 0), 0o666)
+            self.descriptor = os.open(
+                path, os.O_WRONLY | os.O_CREAT | getattr(os, "O_BINARY", 0), 0o666
+            )
         except OSError as error:
-            raise RecordingError(f"{path}: cannot be written: {error.strerror}") from error
+            raise RecordingError(
+                f"{path}: cannot be written: {error.strerror}"
+            ) from error
         if not lock_descriptor(self.descriptor, blocking=False):
             os.close(self.descriptor)
             raise RecordingError(f"{path}: another process is recording to this file")

@@ -18,18 +18,40 @@ import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import EndOfFile, McapError
 from mcap.opcode import Opcode
-from mcap.records import Attachment, Channel, Chunk, Footer, McapRecord, Message, Metadata, Schema
+from mcap.records import (
+    Attachment,
+    Channel,
+    Chunk,
+    Footer,
+    McapRecord,
+    Message,
+    Metadata,
+    Schema,
+)
 from mcap.writer import MCAP0_MAGIC
 
 from gpmpc.exceptions import RecordingError
 
-CONFIG, RECOVERED = "config.yaml", "recovered"  # an attachment; metadata of a file that holds what was left of another
+CONFIG, RECOVERED = (
+    "config.yaml",
+    "recovered",
+)  # an attachment; metadata of a file that holds what was left of another
 LARGEST = 32 * 2**20  # of a record or an unfolded chunk [bytes]
-_ROOM, _RATIO = 64 * 2**20, 300  # [bytes], and bytes a byte of the file; runs are compressed 2 to 10 times
+_ROOM, _RATIO = (
+    64 * 2**20,
+    300,
+)  # [bytes], and bytes a byte of the file; runs are compressed 2 to 10 times
 _HEAD = struct.Struct("<BQ")  # kind and length
 _PARSED = Schema, Channel, Message, Chunk, Attachment, Metadata
 _KINDS: dict[Opcode, Any] = {Opcode[one.__name__.upper()]: one for one in _PARSED}
-_BROKEN = (McapError, struct.error, UnicodeDecodeError, OverflowError, zstandard.ZstdError, RuntimeError)
+_BROKEN = (
+    McapError,
+    struct.error,
+    UnicodeDecodeError,
+    OverflowError,
+    zstandard.ZstdError,
+    RuntimeError,
+)
 
 
 def room(path: Path) -> int:
@@ -45,7 +67,11 @@ def whole_records(path: Path) -> Iterator[McapRecord]:
         with path.open("rb") as file:
             magic = file.read(len(MCAP0_MAGIC))
             if magic != MCAP0_MAGIC:
-                reason = "is empty: its recording was killed before it began" if not magic else "is not an MCAP file"
+                reason = (
+                    "is empty: its recording was killed before it began"
+                    if not magic
+                    else "is not an MCAP file"
+                )
                 raise RecordingError(f"{path}: {reason}")
             channels = set()
             for record in _sound_records(file, path):
@@ -55,24 +81,47 @@ def whole_records(path: Path) -> Iterator[McapRecord]:
                     return
                 yield record
     except OSError as error:
-        raise RecordingError(f"{path}: cannot be read: {error.strerror or error}") from error
+        raise RecordingError(
+            f"{path}: cannot be read: {error.strerror or error}"
+        ) from error
 
 
 def _sound_records(file: BinaryIO, path: Path) -> Iterator[McapRecord]:
     """Yields the records behind the magic bytes, as far as lengths and checksums are right."""
-    left, size, checksum, whole, in_data = room(path), path.stat().st_size, zlib.crc32(MCAP0_MAGIC), True, True
+    left, size, checksum, whole, in_data = (
+        room(path),
+        path.stat().st_size,
+        zlib.crc32(MCAP0_MAGIC),
+        True,
+        True,
+    )
     while True:
         kind = 0
         try:
             head, content = _frame(file, size)
-            kind, before, checksum = head[0], checksum, zlib.crc32(content, zlib.crc32(head, checksum))
+            kind, before, checksum = (
+                head[0],
+                checksum,
+                zlib.crc32(content, zlib.crc32(head, checksum)),
+            )
             if kind == Opcode.FOOTER:
-                index = zlib.crc32(content[:16], zlib.crc32(head, before))  # the last field is the checksum
-                if whole and not in_data and _agrees(content[16:20], index) and file.read(9) == MCAP0_MAGIC:
+                index = zlib.crc32(
+                    content[:16], zlib.crc32(head, before)
+                )  # the last field is the checksum
+                if (
+                    whole
+                    and not in_data
+                    and _agrees(content[16:20], index)
+                    and file.read(9) == MCAP0_MAGIC
+                ):
                     yield Footer(*struct.unpack("<QQI", content))
                 return
             if kind == Opcode.DATA_END:
-                whole, in_data, checksum = whole and _agrees(content[:4], before), False, 0
+                whole, in_data, checksum = (
+                    whole and _agrees(content[:4], before),
+                    False,
+                    0,
+                )
             elif in_data and kind in _KINDS:
                 record = _parsed(kind, content)
                 if not isinstance(record, Chunk):
@@ -81,7 +130,9 @@ def _sound_records(file: BinaryIO, path: Path) -> Iterator[McapRecord]:
                 inside = BytesIO(_unfolded(record))
                 left -= record.uncompressed_size
                 if left < 0:
-                    raise RecordingError(f"{path}: its chunks unfold to more than {room(path) / 1e6:.0f} MB")
+                    raise RecordingError(
+                        f"{path}: its chunks unfold to more than {room(path) / 1e6:.0f} MB"
+                    )
                 while inside.tell() < record.uncompressed_size:
                     head, content = _frame(inside, record.uncompressed_size)
                     if head[0] in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE):
@@ -116,9 +167,15 @@ class _Content(ReadDataStream):
 def _parsed(kind: int, content: bytes) -> McapRecord:
     """Parses a record, of an attachment only if its checksum is right."""
     stream = _Content(BytesIO(content))
-    if kind == Opcode.ATTACHMENT and not _agrees(content[-4:], zlib.crc32(content[:-4])):
+    if kind == Opcode.ATTACHMENT and not _agrees(
+        content[-4:], zlib.crc32(content[:-4])
+    ):
         raise EndOfFile
-    return Message.read(stream, len(content)) if kind == Opcode.MESSAGE else _KINDS[Opcode(kind)].read(stream)
+    return (
+        Message.read(stream, len(content))
+        if kind == Opcode.MESSAGE
+        else _KINDS[Opcode(kind)].read(stream)
+    )
 
 
 def _unfolded(chunk: Chunk) -> bytes:
@@ -127,12 +184,17 @@ def _unfolded(chunk: Chunk) -> bytes:
     if size > LARGEST or chunk.compression not in ("zstd", "lz4", ""):
         raise EndOfFile
     if chunk.compression == "zstd":
-        if zstandard.frame_content_size(data) not in (-1, size):  # -1: the frame does not say
+        if zstandard.frame_content_size(data) not in (
+            -1,
+            size,
+        ):  # -1: the frame does not say
             raise EndOfFile
         data = zstandard.decompress(data, max_output_size=size)
     elif chunk.compression == "lz4":
         data = lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=size)
-    if len(data) != size or not _agrees(struct.pack("<I", chunk.uncompressed_crc), zlib.crc32(data)):
+    if len(data) != size or not _agrees(
+        struct.pack("<I", chunk.uncompressed_crc), zlib.crc32(data)
+    ):
         raise EndOfFile
     return data
 

@@ -45,7 +45,9 @@ class Cascade:
         check_number("ratio", self.ratio, least=1, whole=True)
         check_number("response_time", self.response_time, above=0, unit="[s]")
 
-    def attitude_reference(self, planned: np.ndarray, angles: np.ndarray, phase: int) -> Reference:
+    def attitude_reference(
+        self, planned: np.ndarray, angles: np.ndarray, phase: int
+    ) -> Reference:
         """What the inner controller is to follow over its horizon, with no moments as the inputs that belong to it.
 
         It is asked ``phase`` inner steps after the outer step began, at roll, pitch and yaw (3,) [rad]; yaw is to be
@@ -97,30 +99,49 @@ def cascade_loop(
         Diverged: Its step is an inner one.
     """
     check_policy(on_failure)
-    if (names := (plant.state_names, plant.input_names)) != (Coupled.state_names, Coupled.input_names):
-        raise ShapeError(f"a cascade flies the states and inputs of Coupled; got {names}")
+    if (names := (plant.state_names, plant.input_names)) != (
+        Coupled.state_names,
+        Coupled.input_names,
+    ):
+        raise ShapeError(
+            f"a cascade flies the states and inputs of Coupled; got {names}"
+        )
     horizon, ratio = cascade.outer.horizon, cascade.ratio
     references = check_references(references, steps, horizon)
     simulator = PlantSimulator(plant, initial, disturbances, noise, seed)
-    calls: Any = (None, None) if on_step is None else [partial(on_step, loop) for loop in ("outer", "inner")]
+    calls: Any = (
+        (None, None)
+        if on_step is None
+        else [partial(on_step, loop) for loop in ("outer", "inner")]
+    )
     outer = Flight(simulator, references, ratio * plant.time_step, calls[0], _OUTER)
     inner = Flight(simulator, references, plant.time_step, calls[1], _INNER)
     states, inputs, angles = [simulator.mean], [], np.zeros(3)
     thrust: Any = None  # the command of the outer step under way
     attitude: Any = None  # what the inner controller is to follow
     for j in range(steps * ratio):
-        (k, phase), time, before = divmod(j, ratio), round(j * plant.time_step, 9), (states[-1], simulator.covariance)
+        (k, phase), time, before = (
+            divmod(j, ratio),
+            round(j * plant.time_step, 9),
+            (states[-1], simulator.covariance),
+        )
         belief = simulator.measure(time)
         if phase == 0:
             ahead = window(references, k, horizon)
-            thrust = command(cascade.outer, _part(belief, _OUTER), ahead, outer.last, on_failure, k)
+            thrust = command(
+                cascade.outer, _part(belief, _OUTER), ahead, outer.last, on_failure, k
+            )
         # Attitudes start from where the vehicle is, or was when that was last known.
         measured = belief.mean.numpy()[6::2]
         angles = measured if np.isfinite(measured).all() else angles
         planned = thrust.input[None] if thrust.plan is None else thrust.plan.inputs
         attitude = cascade.attitude_reference(planned, angles, phase)
-        moments = command(cascade.inner, _part(belief, _INNER), attitude, inner.last, on_failure, j)
-        (applied,) = step_together([simulator], time, [np.append(thrust.input[:1], moments.input)])
+        moments = command(
+            cascade.inner, _part(belief, _INNER), attitude, inner.last, on_failure, j
+        )
+        (applied,) = step_together(
+            [simulator], time, [np.append(thrust.input[:1], moments.input)]
+        )
         if isinstance(applied, Diverged):
             raise applied
         if phase == 0:
@@ -128,7 +149,12 @@ def cascade_loop(
         inner.add(before, belief, applied[1:], moments, attitude.states[0])
         states.append(simulator.mean)
         inputs.append(applied)
-    return CascadeRollout(np.array(states), np.array(inputs), outer.rollout(), inner.rollout(attitude.states[1]))
+    return CascadeRollout(
+        np.array(states),
+        np.array(inputs),
+        outer.rollout(),
+        inner.rollout(attitude.states[1]),
+    )
 
 
 def _part(belief: Gaussian, states: slice) -> Gaussian:

@@ -61,7 +61,10 @@ class Gust(_Window):
     def __post_init__(self) -> None:
         super().__post_init__()
         if not isinstance(self.rates, Mapping) or not self.rates:
-            raise SettingError("rates", f"must map names of states to numbers, like {{'vx': 2.0}}; got {self.rates!r}")
+            raise SettingError(
+                "rates",
+                f"must map names of states to numbers, like {{'vx': 2.0}}; got {self.rates!r}",
+            )
         for name, rate in self.rates.items():
             check_number(f"rates.{name}", rate)
 
@@ -70,10 +73,14 @@ class Gust(_Window):
         for name in self.rates:
             if name not in plant.state_names:
                 known = ", ".join(plant.state_names)
-                raise SettingError("rates", f"must name states of the plant, {known}; got {name!r}")
+                raise SettingError(
+                    "rates", f"must name states of the plant, {known}; got {name!r}"
+                )
         if not self.acts(time):
             return plant
-        return _pushed(plant, tuple(float(self.rates.get(name, 0.0)) for name in plant.state_names))
+        return _pushed(
+            plant, tuple(float(self.rates.get(name, 0.0)) for name in plant.state_names)
+        )
 
 
 @dataclass(frozen=True)
@@ -86,9 +93,13 @@ class Replaced(_Window):
 
     def disturb_plant(self, plant: System, time: float) -> System:
         """Returns the other plant, inside the window; raises where it has other states, inputs or time steps."""
-        ours, theirs = ((p.state_names, p.input_names, p.time_step) for p in (plant, self.plant))
+        ours, theirs = (
+            (p.state_names, p.input_names, p.time_step) for p in (plant, self.plant)
+        )
         if ours != theirs:
-            raise ShapeError(f"a plant must be replaced by one of the same states, inputs, step {ours}; got {theirs}")
+            raise ShapeError(
+                f"a plant must be replaced by one of the same states, inputs, step {ours}; got {theirs}"
+            )
         return self.plant if self.acts(time) else plant
 
 
@@ -104,7 +115,9 @@ class Dropout(_Window):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.entries is not None:
-            object.__setattr__(self, "entries", tuple(np.asarray(self.entries).tolist()))
+            object.__setattr__(
+                self, "entries", tuple(np.asarray(self.entries).tolist())
+            )
         for entry in self.entries or ():
             check_number("entries", entry, least=0, whole=True)
 
@@ -113,7 +126,9 @@ class Dropout(_Window):
         n = len(plant.state_names)
         for entry in self.entries or ():
             if entry >= n:
-                raise SettingError("entries", f"must be indices of states, 0 to {n - 1}; got {entry!r}")
+                raise SettingError(
+                    "entries", f"must be indices of states, 0 to {n - 1}; got {entry!r}"
+                )
         return plant
 
     def disturb_measurement(self, state: np.ndarray, time: float) -> np.ndarray:
@@ -129,7 +144,9 @@ class Dropout(_Window):
 def _pushed(plant: System, rates: tuple[float, ...]) -> System:
     """A system with constants (n,) added to its right-hand side, or to its next state."""
     if plant.stateful:
-        raise UnsupportedModel("a gust needs equations, which a simulator has not. Possible with any plant: Replaced")
+        raise UnsupportedModel(
+            "a gust needs equations, which a simulator has not. Possible with any plant: Replaced"
+        )
     method = "successor" if hasattr(plant.dynamics, "successor") else "derivative"
     of = getattr(plant.dynamics, method)
 

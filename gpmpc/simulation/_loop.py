@@ -13,12 +13,26 @@ from typing import Any
 
 import numpy as np
 
-from gpmpc.exceptions import Diverged, GpmpcError, SettingError, ShapeError, SolverFailure, check_number
+from gpmpc.exceptions import (
+    Diverged,
+    GpmpcError,
+    SettingError,
+    ShapeError,
+    SolverFailure,
+    check_number,
+)
 from gpmpc.gaussian import Gaussian
 from gpmpc.mpc import Controller, Reference, Timing
 from gpmpc.mpc._policy import Command, OnFailure, check_policy, command, commands
 from gpmpc.simulation._disturbances import Disturbance
-from gpmpc.simulation._simulator import ModelLoop, ModelSimulator, Noise, PlantSimulator, Simulator, step_together
+from gpmpc.simulation._simulator import (
+    ModelLoop,
+    ModelSimulator,
+    Noise,
+    PlantSimulator,
+    Simulator,
+    step_together,
+)
 from gpmpc.status import Status
 from gpmpc.step import Step
 from gpmpc.systems import System
@@ -41,7 +55,9 @@ class Rollout:
     iterations: Array  # (K,) of the solver
     timings: tuple[Timing, ...]  # K, where the wall time of every decision went
     time_step: float  # [s]
-    suboptimal: tuple[int, ...] = ()  # steps at which a plan was applied whose solve stopped short of its tolerance
+    suboptimal: tuple[
+        int, ...
+    ] = ()  # steps at which a plan was applied whose solve stopped short of its tolerance
     far_from_data: tuple[int, ...] = ()  # steps whose plan left the model's data behind
 
     @property
@@ -58,7 +74,11 @@ class Rollout:
     def failures(self) -> tuple[tuple[int, Status], ...]:
         """Every step at which the policy chose the input, with how the solve failed."""
         applied = set(self.suboptimal)
-        return tuple((k, s) for k, s in enumerate(self.statuses) if not s.solved and k not in applied)
+        return tuple(
+            (k, s)
+            for k, s in enumerate(self.statuses)
+            if not s.solved and k not in applied
+        )
 
 
 class Flight:
@@ -77,11 +97,20 @@ class Flight:
         self.rows: list[tuple[Step, Array, Array, int, Timing, bool]] = []
         self.last: Command | None = None
         self.error: SolverFailure | Diverged | None = None
-        self.simulator, self._references, self.time_step = simulator, references, time_step
+        self.simulator, self._references, self.time_step = (
+            simulator,
+            references,
+            time_step,
+        )
         self._states, self._on_step = states, on_step
 
     def add(
-        self, state: tuple[Array, Array], belief: Gaussian, input: Array, last: Command, reference: Any = None
+        self,
+        state: tuple[Array, Array],
+        belief: Gaussian,
+        input: Array,
+        last: Command,
+        reference: Any = None,
     ) -> None:
         """Adds a step: mean and covariance where it began, what was measured, what was applied, the command.
 
@@ -93,7 +122,10 @@ class Flight:
         step = Step(
             time=round(k * self.time_step, 9),
             k=k,
-            reference=np.asarray(self._references.states[k] if reference is None else reference, dtype=float),
+            reference=np.asarray(
+                self._references.states[k] if reference is None else reference,
+                dtype=float,
+            ),
             state=state[0][part],
             measured=measured,
             input=np.asarray(input, dtype=float),
@@ -107,7 +139,10 @@ class Flight:
         )
         if self._on_step is not None:
             self._on_step(step)
-        expected: Any = (np.full_like(step.state, np.nan), np.full_like(step.belief_covariance, np.nan))
+        expected: Any = (
+            np.full_like(step.state, np.nan),
+            np.full_like(step.belief_covariance, np.nan),
+        )
         if decision is not None and not last.failed:
             expected = np.array(decision.means[1]), np.array(decision.covariances[1])
         spent: Any = (0, Timing(), False)
@@ -118,24 +153,37 @@ class Flight:
 
     def rollout(self, last: Array | None = None) -> Rollout:
         """Makes the arrays of all steps; ``last`` is the reference state of the end, by default that of its number."""
-        steps, means, covariances, iterations, timings, far = zip(*self.rows, strict=True)
+        steps, means, covariances, iterations, timings, far = zip(
+            *self.rows, strict=True
+        )
         part, end = self._states, self.simulator
         if last is None:
             last = self._references.states[: len(steps) + 1][-1]
         return Rollout(
             states=np.array([*(step.state for step in steps), end.mean[part]]),
-            covariances=np.array([*(step.belief_covariance for step in steps), end.covariance[part, part]]),
+            covariances=np.array(
+                [
+                    *(step.belief_covariance for step in steps),
+                    end.covariance[part, part],
+                ]
+            ),
             measured=np.array([step.measured for step in steps]),
             inputs=np.array([step.input for step in steps]),
-            references=np.array([*(step.reference for step in steps), last], dtype=float),
+            references=np.array(
+                [*(step.reference for step in steps), last], dtype=float
+            ),
             predicted_means=np.array(means),
             predicted_covariances=np.array(covariances),
             statuses=tuple(step.status for step in steps),
             iterations=np.array(iterations),
             timings=timings,
             time_step=self.time_step,
-            suboptimal=tuple(step.k for step in steps if not (step.failed or step.status.solved)),
-            far_from_data=tuple(step.k for step, left in zip(steps, far, strict=True) if left),
+            suboptimal=tuple(
+                step.k for step in steps if not (step.failed or step.status.solved)
+            ),
+            far_from_data=tuple(
+                step.k for step, left in zip(steps, far, strict=True) if left
+            ),
         )
 
 
@@ -145,13 +193,21 @@ def window(references: Reference, k: int, horizon: int) -> Reference:
     return Reference(references.states[k : k + horizon + 1], inputs)
 
 
-def check_references(references: Reference | Array | Sequence[float], steps: int, horizon: int) -> Reference:
+def check_references(
+    references: Reference | Array | Sequence[float], steps: int, horizon: int
+) -> Reference:
     """Returns references for all steps, or raises ``ShapeError`` where they are too few or no table."""
     check_number("steps", steps, least=1, whole=True)
-    references = references if isinstance(references, Reference) else Reference(np.asarray(references, dtype=float))
+    references = (
+        references
+        if isinstance(references, Reference)
+        else Reference(np.asarray(references, dtype=float))
+    )
     references, needed = references.over(steps + horizon), steps + horizon
     if len(references.states) < needed:
-        raise ShapeError(f"{steps} steps with horizon {horizon} need {needed} references; got {len(references.states)}")
+        raise ShapeError(
+            f"{steps} steps with horizon {horizon} need {needed} references; got {len(references.states)}"
+        )
     return references
 
 
@@ -194,9 +250,13 @@ def closed_loop(
     check_policy(on_failure)
     references = check_references(references, steps, controller.horizon)
     if not isinstance(system, ModelLoop):
-        simulator: Simulator = PlantSimulator(system, initial, disturbances, noise, seed)
+        simulator: Simulator = PlantSimulator(
+            system, initial, disturbances, noise, seed
+        )
     elif disturbances or noise is not None:
-        raise SettingError("disturbances, noise", "need a plant in the loop; got a ModelLoop")
+        raise SettingError(
+            "disturbances, noise", "need a plant in the loop; got a ModelLoop"
+        )
     else:
         simulator = ModelSimulator(system, initial)
     flight = Flight(simulator, references, system.time_step, on_step)
@@ -214,7 +274,9 @@ class Trial:
 
     seed: int
     result: Rollout | None  # None where it failed
-    error: str | None  # why it failed, with the kind of the error; None where it did not
+    error: (
+        str | None
+    )  # why it failed, with the kind of the error; None where it did not
 
 
 def closed_loops(
@@ -244,9 +306,14 @@ def closed_loops(
         SettingError: No seeds or equal ones; a model loop, in which a seed changes nothing; or a ``chunk`` below 1.
     """
     if isinstance(plant, ModelLoop):
-        raise SettingError("plant", "a model loop draws no random numbers, all seeds are one flight; take closed_loop")
+        raise SettingError(
+            "plant",
+            "a model loop draws no random numbers, all seeds are one flight; take closed_loop",
+        )
     if isinstance(plant, System) and plant.stateful:
-        raise SettingError("plant", "a simulator flies one seed after another; take closed_loop")
+        raise SettingError(
+            "plant", "a simulator flies one seed after another; take closed_loop"
+        )
     check_policy(on_failure)
     seeds = _check_seeds(seeds)
     references = check_references(references, steps, controller.horizon)
@@ -254,8 +321,12 @@ def closed_loops(
     finished: list[Trial] = []
     for start in range(0, len(seeds), chunk):
         some = seeds[start : start + chunk]
-        simulators = [PlantSimulator(plant, initial, disturbances, noise, seed) for seed in some]
-        flights = [Flight(simulator, references, plant.time_step) for simulator in simulators]
+        simulators = [
+            PlantSimulator(plant, initial, disturbances, noise, seed) for seed in some
+        ]
+        flights = [
+            Flight(simulator, references, plant.time_step) for simulator in simulators
+        ]
         _fly(flights, controller, references, steps, on_failure)
         for seed, flight in zip(some, flights, strict=True):
             if (error := flight.error) is None:
@@ -266,7 +337,11 @@ def closed_loops(
 
 
 def _fly(
-    flights: Sequence[Flight], controller: Controller, references: Reference, steps: int, on_failure: OnFailure
+    flights: Sequence[Flight],
+    controller: Controller,
+    references: Reference,
+    steps: int,
+    on_failure: OnFailure,
 ) -> None:
     """Runs the loop of all flights of one plant in step; one that fails ends with its error, and the others go on."""
     for k in range(steps):
@@ -275,21 +350,43 @@ def _fly(
         time, moving = round(k * flights[0].time_step, 9), []
         beliefs = [flight.simulator.measure(time) for flight in flying]
         ahead = window(references, k, controller.horizon)
-        decided = _decide(controller, beliefs, ahead, [flight.last for flight in flying], on_failure, k)
+        decided = _decide(
+            controller,
+            beliefs,
+            ahead,
+            [flight.last for flight in flying],
+            on_failure,
+            k,
+        )
         for flight, belief, outcome in zip(flying, beliefs, decided, strict=True):
             if isinstance(outcome, SolverFailure):
                 flight.error = outcome
             else:
-                moving.append((flight, (flight.simulator.mean, flight.simulator.covariance), belief, outcome))
-        applied = step_together([flight.simulator for flight, *_ in moving], time, [each[3].input for each in moving])
-        for (flight, state, belief, outcome), input in zip(moving, applied, strict=True):
+                moving.append(
+                    (
+                        flight,
+                        (flight.simulator.mean, flight.simulator.covariance),
+                        belief,
+                        outcome,
+                    )
+                )
+        applied = step_together(
+            [flight.simulator for flight, *_ in moving],
+            time,
+            [each[3].input for each in moving],
+        )
+        for (flight, state, belief, outcome), input in zip(
+            moving, applied, strict=True
+        ):
             if isinstance(input, Diverged):
                 flight.error = input
             else:
                 flight.add(state, belief, input, outcome)
 
 
-def _decide(controller: Controller, beliefs: Sequence[Gaussian], *rest: Any) -> list[Command | SolverFailure]:
+def _decide(
+    controller: Controller, beliefs: Sequence[Gaussian], *rest: Any
+) -> list[Command | SolverFailure]:
     """``commands``, where one belief alone takes the controller's method for one."""
     if len(beliefs) > 1:
         return commands(controller, beliefs, *rest)
@@ -300,13 +397,20 @@ def _decide(controller: Controller, beliefs: Sequence[Gaussian], *rest: Any) -> 
         return [failure]
 
 
-def rehearse(system: System | ModelLoop, controller: Controller, references: Reference, initial: Any) -> None:
+def rehearse(
+    system: System | ModelLoop,
+    controller: Controller,
+    references: Reference,
+    initial: Any,
+) -> None:
     """Flies the first two steps, without noise, and forgets them: a flight's times then hold no compiling and loading.
 
     Two, since the second one starts from a plan. What fails here fails again in the flight, and is raised there.
     """
     with suppress(GpmpcError):
-        closed_loop(system, controller, references, initial, 2, on_failure="previous_plan")
+        closed_loop(
+            system, controller, references, initial, 2, on_failure="previous_plan"
+        )
 
 
 def _check_seeds(seeds: int | Sequence[int]) -> list[int]:
@@ -318,5 +422,7 @@ def _check_seeds(seeds: int | Sequence[int]) -> list[int]:
     for seed in listed:
         check_number("seeds", seed, least=0, whole=True)
     if not listed or len(set(listed)) < len(listed):
-        raise SettingError("seeds", f"must be one or more different whole numbers; got {listed}")
+        raise SettingError(
+            "seeds", f"must be one or more different whole numbers; got {listed}"
+        )
     return listed

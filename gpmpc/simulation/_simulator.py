@@ -13,7 +13,13 @@ import numpy as np
 import torch
 
 from gpmpc._dynamics import DynamicsModel, to_array
-from gpmpc.exceptions import Diverged, SettingError, ShapeError, check_number, check_numbers
+from gpmpc.exceptions import (
+    Diverged,
+    SettingError,
+    ShapeError,
+    check_number,
+    check_numbers,
+)
 from gpmpc.gaussian import Gaussian
 from gpmpc.propagation import Propagator
 from gpmpc.systems import System, step, step_many
@@ -66,7 +72,14 @@ class PlantSimulator:
     ``initial`` is a state (n,), or a belief that it is drawn from; None for a simulator, which starts an episode.
     """
 
-    def __init__(self, plant: System, initial: Any, disturbances: Any = (), noise: Noise | None = None, seed: int = 0):
+    def __init__(
+        self,
+        plant: System,
+        initial: Any,
+        disturbances: Any = (),
+        noise: Noise | None = None,
+        seed: int = 0,
+    ):
         check_number("seed", seed, least=0, whole=True)
         if not isinstance(plant, System):
             what = "must be a plant, such as System(dynamics, 0.1), or a ModelLoop"
@@ -74,26 +87,48 @@ class PlantSimulator:
         if not isinstance(noise, Noise | None):
             raise SettingError("noise", f"must be Noise(...); got {noise!r}")
         if not isinstance(disturbances, Sequence):
-            raise SettingError("disturbances", f"must be a list of them; got {disturbances!r}")
+            raise SettingError(
+                "disturbances", f"must be a list of them; got {disturbances!r}"
+            )
         n, m = len(plant.state_names), len(plant.input_names)
-        self.plant, self.disturbances, self.noise, self._steps = plant, disturbances, noise or Noise(), 0
+        self.plant, self.disturbances, self.noise, self._steps = (
+            plant,
+            disturbances,
+            noise or Noise(),
+            0,
+        )
         for key, length in (("process", n), ("measurement", n), ("input", m)):
             values = getattr(self.noise, key)
             if values is not None and len(values) != length:
-                raise ShapeError(f"noise.{key} must have {length} standard deviations; got {len(values)}")
+                raise ShapeError(
+                    f"noise.{key} must have {length} standard deviations; got {len(values)}"
+                )
         # One stream a source: whether states are measured with noise changes nothing about the wind.
         sources = "initial", "process", "measurement", "input"
-        streams = map(np.random.default_rng, np.random.SeedSequence(seed).spawn(len(sources)))
-        self._streams: dict[str, np.random.Generator] = dict(zip(sources, streams, strict=True))
+        streams = map(
+            np.random.default_rng, np.random.SeedSequence(seed).spawn(len(sources))
+        )
+        self._streams: dict[str, np.random.Generator] = dict(
+            zip(sources, streams, strict=True)
+        )
         if initial is None:
             if not plant.stateful:
-                raise SettingError("initial", "must be a state; a simulator alone starts by itself")
+                raise SettingError(
+                    "initial", "must be a state; a simulator alone starts by itself"
+                )
             initial = plant.dynamics.reset(seed)
         drawn = isinstance(initial, Gaussian)
-        self.mean, self.covariance = _check_state(initial.mean if drawn else initial, n), np.zeros((n, n))
+        self.mean, self.covariance = (
+            _check_state(initial.mean if drawn else initial, n),
+            np.zeros((n, n)),
+        )
         if drawn:
-            self.mean = self._streams["initial"].multivariate_normal(self.mean, to_array(initial.covariance))
-        self._disturbed_plant(0.0)  # a disturbance that does not fit is found before the first step
+            self.mean = self._streams["initial"].multivariate_normal(
+                self.mean, to_array(initial.covariance)
+            )
+        self._disturbed_plant(
+            0.0
+        )  # a disturbance that does not fit is found before the first step
 
     def measure(self, time: float) -> Gaussian:
         """Measures the state; the measurement is taken for certain: controllers of this package filter nothing."""
@@ -110,16 +145,22 @@ class PlantSimulator:
 
     def _applied(self, input: Array) -> Array:
         if np.shape(input) != (shape := (len(self.plant.input_names),)):
-            raise ShapeError(f"the plant takes inputs of shape {shape}; got {np.shape(input)}")
+            raise ShapeError(
+                f"the plant takes inputs of shape {shape}; got {np.shape(input)}"
+            )
         return self._add_noise("input", input)
 
     def _arrive(self, state: Array, applied: Array) -> Array | Diverged:
         """Returns the input that was applied, or why the plant cannot go on from its next state."""
         if not np.isfinite(state).all():
             before = f"it was {self.mean}, input {applied}"
-            return Diverged(self._steps, f"the plant's state is not finite any more; {before}")
+            return Diverged(
+                self._steps, f"the plant's state is not finite any more; {before}"
+            )
         if getattr(self.plant.dynamics, "ended", False):
-            return Diverged(self._steps, f"the simulator has ended its episode, at state {state}")
+            return Diverged(
+                self._steps, f"the simulator has ended its episode, at state {state}"
+            )
         self.mean, self._steps = self._add_noise("process", state), self._steps + 1
         return applied
 
@@ -127,7 +168,9 @@ class PlantSimulator:
         deviations = getattr(self.noise, source)
         if deviations is None:
             return value
-        return value + np.asarray(deviations, dtype=float) * self._streams[source].standard_normal(len(value))
+        return value + np.asarray(deviations, dtype=float) * self._streams[
+            source
+        ].standard_normal(len(value))
 
 
 class ModelSimulator:
@@ -140,7 +183,9 @@ class ModelSimulator:
         mean, covariance = initial, 0.1**2 * torch.eye(n, **to)
         if isinstance(initial, Gaussian):
             mean, covariance = initial.mean, initial.covariance
-        self._belief = Gaussian(torch.as_tensor(_check_state(mean, n), **to), covariance.to(**to))
+        self._belief = Gaussian(
+            torch.as_tensor(_check_state(mean, n), **to), covariance.to(**to)
+        )
 
     @property
     def mean(self) -> Array:
@@ -160,8 +205,14 @@ class ModelSimulator:
         """Carries the belief one step on; returns the input, or why it cannot go on."""
         control = torch.as_tensor(np.asarray(input, dtype=float)).to(self._belief.mean)
         belief = self.loop.propagator(self.loop.model, self._belief, control)
-        if not bool(torch.isfinite(belief.mean).all() and torch.isfinite(belief.covariance).all()):
-            return Diverged(self._steps, f"the model's belief is not finite any more; its mean is {belief.mean}")
+        if not bool(
+            torch.isfinite(belief.mean).all()
+            and torch.isfinite(belief.covariance).all()
+        ):
+            return Diverged(
+                self._steps,
+                f"the model's belief is not finite any more; its mean is {belief.mean}",
+            )
         self._belief, self._steps = belief, self._steps + 1
         return input
 
@@ -169,7 +220,9 @@ class ModelSimulator:
 Simulator = PlantSimulator | ModelSimulator
 
 
-def step_together(simulators: Sequence[Any], time: float, inputs: Sequence[Array]) -> list[Array | Diverged]:
+def step_together(
+    simulators: Sequence[Any], time: float, inputs: Sequence[Array]
+) -> list[Array | Diverged]:
     """Steps simulators of one plant from a time [s] on, several plants in one evaluation.
 
     Returns the inputs that were applied, or why a simulator cannot go on.
@@ -177,18 +230,27 @@ def step_together(simulators: Sequence[Any], time: float, inputs: Sequence[Array
     if not simulators or isinstance(simulators[0], ModelSimulator):
         return [s.step(input) for s, input in zip(simulators, inputs, strict=True)]
     applied = [s._applied(input) for s, input in zip(simulators, inputs, strict=True)]
-    plant = simulators[0]._disturbed_plant(time)  # disturbances look at the time, not at a trial
+    plant = simulators[0]._disturbed_plant(
+        time
+    )  # disturbances look at the time, not at a trial
     with np.errstate(over="ignore", invalid="ignore"):
         if len(simulators) == 1:
             states: Any = [step(plant, simulators[0].mean, applied[0])]
         else:
-            states = step_many(plant, np.array([s.mean for s in simulators]), np.array(applied))
-    return [s._arrive(state, input) for s, state, input in zip(simulators, states, applied, strict=True)]
+            states = step_many(
+                plant, np.array([s.mean for s in simulators]), np.array(applied)
+            )
+    return [
+        s._arrive(state, input)
+        for s, state, input in zip(simulators, states, applied, strict=True)
+    ]
 
 
 def _check_state(value: Any, n: int) -> Array:
     """Returns a finite state (n,) as an array of its own."""
-    state = np.array(value.cpu().numpy() if isinstance(value, torch.Tensor) else value, dtype=float)
+    state = np.array(
+        value.cpu().numpy() if isinstance(value, torch.Tensor) else value, dtype=float
+    )
     if state.shape != (n,):
         raise ShapeError(f"the initial state must have shape ({n},); got {state.shape}")
     if not np.isfinite(state).all():

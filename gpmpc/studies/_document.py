@@ -24,7 +24,12 @@ from rich.text import Text
 MISSING = "—"
 _LATEX = str.maketrans(
     {c: f"\\{c}" for c in "&%$#_{}"}
-    | {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "—": "--"}
+    | {
+        "\\": r"\textbackslash{}",
+        "~": r"\textasciitilde{}",
+        "^": r"\textasciicircum{}",
+        "—": "--",
+    }
     | {"<": r"\textless{}", ">": r"\textgreater{}", "|": r"\textbar{}"}
     | {"●": r"$\in$", "▼": "$<$", "▲": "$>$"}
 )
@@ -38,13 +43,18 @@ class Table(NamedTuple):
     """A table of texts and numbers."""
 
     header: Sequence[str]  # names of the columns
-    rows: Sequence[Sequence[Any]]  # cells; of a text of several lines, those below the first are details
+    rows: Sequence[
+        Sequence[Any]
+    ]  # cells; of a text of several lines, those below the first are details
     title: str = ""  # stands above the table
     sections: bool = False  # whether rows of one first cell form a section
 
     def texts(self) -> list[list[str]]:
         """Returns the rows as texts, numbers by ``number``."""
-        return [[number(cell) if isinstance(cell, float) else str(cell) for cell in row] for row in self.rows]
+        return [
+            [number(cell) if isinstance(cell, float) else str(cell) for cell in row]
+            for row in self.rows
+        ]
 
 
 @dataclass(frozen=True)
@@ -56,15 +66,25 @@ class Document:
     data: pd.DataFrame  # one row a row of the tables, as numbers, for CSV
     lead: str = ""  # paragraph above the tables
     notes: Sequence[str] = ()  # paragraphs below the tables
-    lists: Mapping[str, Sequence[str]] = field(default_factory=dict)  # items by their heading; empty ones are left out
-    code: Mapping[str, Sequence[str]] = field(default_factory=dict)  # lines that are typed or data, by their heading
+    lists: Mapping[str, Sequence[str]] = field(
+        default_factory=dict
+    )  # items by their heading; empty ones are left out
+    code: Mapping[str, Sequence[str]] = field(
+        default_factory=dict
+    )  # lines that are typed or data, by their heading
     images: Mapping[str, bytes] = field(default_factory=dict)  # PNG files by name
-    links: Mapping[str, str] = field(default_factory=dict)  # addresses by their text, for HTML, folded
+    links: Mapping[str, str] = field(
+        default_factory=dict
+    )  # addresses by their text, for HTML, folded
     latex: Sequence[Table] | None = None  # tables for LaTeX; by default the same
 
     def files(self, name: str) -> dict[str, str | bytes]:
         """Returns the document as Markdown, CSV and LaTeX, and its images, by file name."""
-        written = {f"{name}.md": self.markdown(), f"{name}.csv": self.csv(), f"{name}.tex": self.tex()}
+        written = {
+            f"{name}.md": self.markdown(),
+            f"{name}.csv": self.csv(),
+            f"{name}.tex": self.tex(),
+        }
         return written | dict(self.images)
 
     def markdown(self) -> str:
@@ -81,7 +101,12 @@ class Document:
         out += [line for note in self.notes for line in (_markdown(note), "")]
         out += [line for name in self.images for line in (f"![{name}]({name})", "")]
         for heading, items in _filled(self.lists):
-            out += [f"## {heading}", "", *(f"- {_markdown(item)}" for item in items), ""]
+            out += [
+                f"## {heading}",
+                "",
+                *(f"- {_markdown(item)}" for item in items),
+                "",
+            ]
         for heading, lines in _filled(self.code):
             out += [f"## {heading}", "", "```", *lines, "```", ""]
         return "\n".join(out)
@@ -89,20 +114,40 @@ class Document:
     def csv(self) -> str:
         """Returns the data as CSV that a spreadsheet takes for numbers and texts only."""
         data = self.data.rename(columns=_csv)
-        return data.apply(lambda column: column.map(_csv)).to_csv(index=False, lineterminator="\n")
+        return data.apply(lambda column: column.map(_csv)).to_csv(
+            index=False, lineterminator="\n"
+        )
 
     def tex(self) -> str:
         """Returns the tables as LaTeX with the rules of the booktabs package."""
         out = ["% needs \\usepackage{booktabs}"]
         for table in self.tables if self.latex is None else self.latex:
-            header = [name.replace(", ", "\n").replace(" [", "\n[") for name in table.header]
-            out += [f"\\begin{{tabular}}{{{'r' * len(header)}}}", "\\toprule", *_latex_lines(header), "\\midrule"]
+            header = [
+                name.replace(", ", "\n").replace(" [", "\n[") for name in table.header
+            ]
+            out += [
+                f"\\begin{{tabular}}{{{'r' * len(header)}}}",
+                "\\toprule",
+                *_latex_lines(header),
+                "\\midrule",
+            ]
             before = None
             for first, *others in table.texts():
-                out += ["\\midrule"] if table.sections and before not in (None, first) else []
-                out += _latex_lines(["" if table.sections and first == before else first, *others])
+                out += (
+                    ["\\midrule"]
+                    if table.sections and before not in (None, first)
+                    else []
+                )
+                out += _latex_lines(
+                    ["" if table.sections and first == before else first, *others]
+                )
                 before = first
-            out += ["\\bottomrule", "\\end{tabular}", *([f"% {_latex(table.title)}"] if table.title else []), ""]
+            out += [
+                "\\bottomrule",
+                "\\end{tabular}",
+                *([f"% {_latex(table.title)}"] if table.title else []),
+                "",
+            ]
         return "\n".join(out)
 
     def html(self) -> str:
@@ -115,22 +160,42 @@ class Document:
         parts.append(f'<div class="figures">{"".join(images)}</div>')
         for table in self.tables:
             head = "".join(f"<th>{escape(name)}</th>" for name in table.header)
-            body = "\n".join(f"<tr>{''.join(f'<td>{_html(cell)}</td>' for cell in row)}</tr>" for row in table.texts())
+            body = "\n".join(
+                f"<tr>{''.join(f'<td>{_html(cell)}</td>' for cell in row)}</tr>"
+                for row in table.texts()
+            )
             whole = f"<table><thead><tr>{head}</tr></thead><tbody>\n{body}\n</tbody></table>"
-            parts += [f"<h2>{escape(table.title)}</h2>"] * bool(table.title) + [f'<div class="wide">{whole}</div>']
+            parts += [f"<h2>{escape(table.title)}</h2>"] * bool(table.title) + [
+                f'<div class="wide">{whole}</div>'
+            ]
         parts += [f"<p>{escape(note)}</p>" for note in self.notes]
         for heading, items in _filled(self.lists):
-            parts.append(f"<h2>{heading}</h2><ul>{''.join(f'<li>{escape(item)}</li>' for item in items)}</ul>")
+            parts.append(
+                f"<h2>{heading}</h2><ul>{''.join(f'<li>{escape(item)}</li>' for item in items)}</ul>"
+            )
         for heading, lines in _filled(self.code):
             text = f"<pre>{escape(chr(10).join(lines))}</pre>"
-            parts.append(f"<h2>{heading}</h2>{_folded('lines', lines, text) if len(lines) > _FOLDED else text}")
+            parts.append(
+                f"<h2>{heading}</h2>{_folded('lines', lines, text) if len(lines) > _FOLDED else text}"
+            )
         if self.links:
-            quoted = ((quote(to, errors="surrogateescape"), escape(text)) for text, to in self.links.items())
-            items = "".join(f'<li><a href="{to}/">{text}</a></li>' for to, text in quoted)
-            parts.append(f"<h2>Runs</h2>{_folded('folders', self.links, f'<ul>{items}</ul>')}")
+            quoted = (
+                (quote(to, errors="surrogateescape"), escape(text))
+                for text, to in self.links.items()
+            )
+            items = "".join(
+                f'<li><a href="{to}/">{text}</a></li>' for to, text in quoted
+            )
+            parts.append(
+                f"<h2>Runs</h2>{_folded('folders', self.links, f'<ul>{items}</ul>')}"
+            )
         head = '<meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">'
         head += f"<title>{escape(self.title)}</title><style>\n{_STYLE.read_text(encoding='utf-8')}</style>"
-        return f"<!doctype html>\n<html lang=en><head>{head}</head><body>\n" + "\n".join(parts) + "\n</body></html>\n"
+        return (
+            f"<!doctype html>\n<html lang=en><head>{head}</head><body>\n"
+            + "\n".join(parts)
+            + "\n</body></html>\n"
+        )
 
 
 def terminal(tables: Sequence[Table], *notes: str) -> Group:
@@ -153,14 +218,20 @@ def number(value: float) -> str:
 
 def with_range(low: float, middle: float, high: float) -> str:
     """Returns a number and, on a second line, the range around it unless it is empty."""
-    return number(middle) if low == high else f"{number(middle)}\n[{number(low)}, {number(high)}]"
+    return (
+        number(middle)
+        if low == high
+        else f"{number(middle)}\n[{number(low)}, {number(high)}]"
+    )
 
 
 def plain_text(text: object) -> str:
     """Returns a text on one line in which unprintable characters stand as their escapes."""
     if not isinstance(text, str):
         raise TypeError(f"must be a text; got {text!r:.80}")
-    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+    return "".join(
+        c if c.isprintable() else c.encode("unicode_escape").decode() for c in text
+    )
 
 
 def figure_label(text: str) -> str:
@@ -169,14 +240,21 @@ def figure_label(text: str) -> str:
 
 
 def _terminal_table(table: Table) -> TerminalTable:
-    style: Any = {"title_justify": "left", "title_style": "bold", "padding": (0, 1, 0, 0), "box": box.SIMPLE_HEAD}
+    style: Any = {
+        "title_justify": "left",
+        "title_style": "bold",
+        "padding": (0, 1, 0, 0),
+        "box": box.SIMPLE_HEAD,
+    }
     title = Text(f"\n{table.title}") if table.title else None
     shown = TerminalTable(title=title, show_header=any(table.header), **style)
     rows = table.texts()
     columns = list(zip(*rows, strict=True)) or [()] * len(table.header)
     for name, cells in list(zip(table.header, columns, strict=True))[table.sections :]:
         right = not any("\n" in cell or cell[:1].isalpha() for cell in cells)
-        shown.add_column(Text(name), justify="right" if right else "left", overflow="fold")
+        shown.add_column(
+            Text(name), justify="right" if right else "left", overflow="fold"
+        )
     section = None
     for row in rows:
         if table.sections and row[0] != section:
@@ -201,15 +279,26 @@ def _latex(text: str) -> str:
 def _latex_lines(row: Sequence[str]) -> list[str]:
     """Returns the lines of a row whose cells may have several lines."""
     out = []
-    for i, texts in enumerate(zip_longest(*(text.split("\n") for text in row), fillvalue="")):
-        line = " & ".join(f"\\footnotesize {_latex(text)}" if i and text else _latex(text) for text in texts)
-        out.append(("{}" if line.startswith(("[", "*")) else "") + line + " \\\\")  # the line before would take these
+    for i, texts in enumerate(
+        zip_longest(*(text.split("\n") for text in row), fillvalue="")
+    ):
+        line = " & ".join(
+            f"\\footnotesize {_latex(text)}" if i and text else _latex(text)
+            for text in texts
+        )
+        out.append(
+            ("{}" if line.startswith(("[", "*")) else "") + line + " \\\\"
+        )  # the line before would take these
     return out
 
 
 def _csv(value: Any) -> Any:
     """Quotes a text that a spreadsheet takes for a formula: what begins like one and is no number."""
-    if isinstance(value, str) and value.startswith(("=", "+", "-", "@", "\t", "\r")) and not _NUMBER.fullmatch(value):
+    if (
+        isinstance(value, str)
+        and value.startswith(("=", "+", "-", "@", "\t", "\r"))
+        and not _NUMBER.fullmatch(value)
+    ):
         return f"'{value}"
     return value
 

@@ -26,7 +26,12 @@ from gpmpc._files import remove_partial, write_whole
 from gpmpc._provenance import flattened, provenance
 from gpmpc.exceptions import DataError, GpmpcError, SettingError
 
-METRICS, ERROR, CONFIG, RECORDING = "metrics.json", "error.json", "config.yaml", "run.mcap"
+METRICS, ERROR, CONFIG, RECORDING = (
+    "metrics.json",
+    "error.json",
+    "config.yaml",
+    "run.mcap",
+)
 PLAN = "sweep-"  # begins the names of the files that say which runs a sweep asked for
 _LOCK = ".lock"  # locked by who works on the folder; stays, empty
 LONGEST_NAME = 150  # characters of a folder's name; file systems take 255 bytes
@@ -82,7 +87,10 @@ class RunFolder:
         kind = type(error).__name__
         what = {"error": " ".join(str(error).split()) or kind, "kind": kind}
         trace = "".join(traceback.format_exception(error))
-        write_whole(self.path / ERROR, json.dumps({**about, **what, "traceback": trace}, indent=1) + "\n")
+        write_whole(
+            self.path / ERROR,
+            json.dumps({**about, **what, "traceback": trace}, indent=1) + "\n",
+        )
 
     def result(self, settings: Mapping[str, Any] | None = None) -> dict[str, Any]:
         """Reads the result of the finished run."""
@@ -91,16 +99,28 @@ class RunFolder:
             content = json.loads(path.read_text(encoding="utf-8"))
             before = content["settings"]
         except (OSError, ValueError, KeyError, TypeError) as error:
-            raise DataError(f"{path}: is not what a run writes: {type(error).__name__}: {error}") from error
+            raise DataError(
+                f"{path}: is not what a run writes: {type(error).__name__}: {error}"
+            ) from error
         if settings is not None and (differs := difference(before, settings)):
             reason = f"{self.path} holds a finished run of other settings ({differs})"
-            raise SettingError("folder", f"{reason}; choose another folder, or remove that one to fly it again")
+            raise SettingError(
+                "folder",
+                f"{reason}; choose another folder, or remove that one to fly it again",
+            )
         return content
 
 
-def record(choices: Sequence[str], settings: Mapping[str, Any], command: str) -> dict[str, Any]:
+def record(
+    choices: Sequence[str], settings: Mapping[str, Any], command: str
+) -> dict[str, Any]:
     """Returns the beginning of metrics.json and error.json: what was asked for and what made it."""
-    about = {"schema": 1, "choices": list(choices), "settings": dict(settings), "seed": settings.get("seed")}
+    about = {
+        "schema": 1,
+        "choices": list(choices),
+        "settings": dict(settings),
+        "seed": settings.get("seed"),
+    }
     return about | {"provenance": provenance() | {"command": command}}
 
 
@@ -118,5 +138,12 @@ def folder_name(choices: Sequence[str]) -> str:
 def difference(then: Mapping[str, Any], now: Mapping[str, Any]) -> str:
     """Returns in words where two settings differ, the first three of their leaves; empty where they are equal."""
     a, b = flattened(then), flattened(now)
-    differing = [f"{k}: {a.get(k)!r} then, {b.get(k)!r} now" for k in dict.fromkeys([*a, *b]) if a.get(k) != b.get(k)]
-    return ", ".join(differing[:3] + ([f"and {len(differing) - 3} more"] if len(differing) > 3 else []))
+    differing = [
+        f"{k}: {a.get(k)!r} then, {b.get(k)!r} now"
+        for k in dict.fromkeys([*a, *b])
+        if a.get(k) != b.get(k)
+    ]
+    return ", ".join(
+        differing[:3]
+        + ([f"and {len(differing) - 3} more"] if len(differing) > 3 else [])
+    )

@@ -23,7 +23,15 @@ from gpmpc.studies._document import plain_text
 from gpmpc.studies._run_folder import ERROR, METRICS, PLAN, folder_name
 
 SEED = "seed"
-_DAMAGE = (OSError, ValueError, KeyError, TypeError, AttributeError, ArithmeticError, RecursionError)  # of a file
+_DAMAGE = (
+    OSError,
+    ValueError,
+    KeyError,
+    TypeError,
+    AttributeError,
+    ArithmeticError,
+    RecursionError,
+)  # of a file
 
 Choices = dict[str, str]
 Row = dict[str, Any]  # of a cell
@@ -34,15 +42,30 @@ MEASURES: dict[str, tuple[str, Callable[[Mapping[str, Any]], float | None]]] = {
     "rmse": ("RMSE [{unit}]", lambda r: r["rmse"]["total"]),
     "outside": (
         "steps outside bounds [%]",
-        lambda r: max((100 * v["rate"] for v in r["violations"].values()), default=None),
+        lambda r: max(
+            (100 * v["rate"] for v in r["violations"].values()), default=None
+        ),
     ),
-    "failed": ("failed solves [%]", lambda r: 100 * sum(r["failures"].values()) / r["steps"]),
-    "decision": ("decision, median [ms]", lambda r: 1e3 * r["times"]["total"]["median"]),
+    "failed": (
+        "failed solves [%]",
+        lambda r: 100 * sum(r["failures"].values()) / r["steps"],
+    ),
+    "decision": (
+        "decision, median [ms]",
+        lambda r: 1e3 * r["times"]["total"]["median"],
+    ),
     "training": ("training [s]", lambda r: r["times"]["training"]),
 }
 
 
-_ABSENT = {"folder": None, "unit": "", "settings": {}, "origin": {}, "lost": "", "error": ""} | dict.fromkeys(MEASURES)
+_ABSENT = {
+    "folder": None,
+    "unit": "",
+    "settings": {},
+    "origin": {},
+    "lost": "",
+    "error": "",
+} | dict.fromkeys(MEASURES)
 
 
 @dataclass(frozen=True)
@@ -60,7 +83,9 @@ class Report:
     constants: Choices  #: what was asked for of all runs alike
     cells: tuple[tuple[str, ...], ...]  #: values of the variables, in order
     runs: pd.DataFrame  #: see above
-    skipped: tuple[str, ...] = ()  #: what could not be read of it, with the reason, one line each
+    skipped: tuple[
+        str, ...
+    ] = ()  #: what could not be read of it, with the reason, one line each
 
     @cached_property
     def there(self) -> list[Any]:
@@ -70,13 +95,24 @@ class Report:
     @cached_property
     def measures(self) -> dict[str, str]:
         """The measures that any run has, and what each is called, with both units where runs are of both subsystems."""
-        known, unit = self.runs[[*MEASURES]].notna().any(), " or ".join(sorted({*self.runs.unit} - {""})) or "m"
-        return {name: label.format(unit=unit) for name, (label, _) in MEASURES.items() if known[name]}
+        known, unit = (
+            self.runs[[*MEASURES]].notna().any(),
+            " or ".join(sorted({*self.runs.unit} - {""})) or "m",
+        )
+        return {
+            name: label.format(unit=unit)
+            for name, (label, _) in MEASURES.items()
+            if known[name]
+        }
 
     def base_settings(self) -> list[str]:
         """Returns the settings that all runs share, one ``key: value`` each."""
         first, *others = self.there
-        shared = (item for item in first.settings.items() if all(item in run.settings.items() for run in others))
+        shared = (
+            item
+            for item in first.settings.items()
+            if all(item in run.settings.items() for run in others)
+        )
         return [plain_text(f"{key}: {json.dumps(value)}") for key, value in shared]
 
     def commands(self) -> list[str]:
@@ -85,11 +121,19 @@ class Report:
         Skipped runs are not among them: a run is not flown over what lies in its folder.
         """
         commands = []
-        for cell, runs in self.runs[self.runs.state.isin(("missing", "failed"))].groupby("cell"):
-            chosen = self.constants | dict(zip(self.variables, self.cells[cell], strict=True))
-            settings = _spelled({key: value for key, value in chosen.items() if value != "default"})
+        for cell, runs in self.runs[
+            self.runs.state.isin(("missing", "failed"))
+        ].groupby("cell"):
+            chosen = self.constants | dict(
+                zip(self.variables, self.cells[cell], strict=True)
+            )
+            settings = _spelled(
+                {key: value for key, value in chosen.items() if value != "default"}
+            )
             sweep = [f"{SEED}={','.join(runs.seed)}", f"folder={self.tree}"]
-            commands.append(plain_text(shlex.join(["gpmpc", "run", "-m", *settings, *sweep])))
+            commands.append(
+                plain_text(shlex.join(["gpmpc", "run", "-m", *settings, *sweep]))
+            )
         return commands
 
 
@@ -103,7 +147,11 @@ def read_report(tree: str | Path) -> Report:
     if not tree.is_dir():
         raise DataError(f"{tree}: no such folder")
     runs, plans, unread, skipped = [], [], set(), []
-    results = {path.parent: path for name in (ERROR, METRICS) for path in sorted(tree.rglob(name))}
+    results = {
+        path.parent: path
+        for name in (ERROR, METRICS)
+        for path in sorted(tree.rglob(name))
+    }
     for path in [*results.values(), *sorted(tree.rglob(f"{PLAN}*.json"))]:
         planned = path.name.startswith(PLAN)
         try:
@@ -114,11 +162,21 @@ def read_report(tree: str | Path) -> Report:
                 runs.append((_parsed(content["choices"]), _run(path, content)))
         except _DAMAGE as error:
             lacking = f"it lacks {error}; of an older version?"
-            reason = lacking if isinstance(error, KeyError) else f"{type(error).__name__}: {error}"
-            skipped.append(plain_text(f"{path}: is not what a {'sweep' if planned else 'run'} writes: {reason}"))
+            reason = (
+                lacking
+                if isinstance(error, KeyError)
+                else f"{type(error).__name__}: {error}"
+            )
+            skipped.append(
+                plain_text(
+                    f"{path}: is not what a {'sweep' if planned else 'run'} writes: {reason}"
+                )
+            )
             unread.add(path.parent.name)
     if not runs:
-        raise DataError(skipped[0] if skipped else f"{tree}: holds no run, finished or failed")
+        raise DataError(
+            skipped[0] if skipped else f"{tree}: holds no run, finished or failed"
+        )
     there = {frozenset(choices.items()) for choices, _ in runs}
     for plan in plans:
         if frozenset(plan.items()) not in there:
@@ -134,24 +192,47 @@ def _cells(
     keys = dict.fromkeys([*(key for choices, _ in runs for key in choices), SEED])
     # A run that did not choose had a setting; of one that is not there it is that of the others.
     usual = {
-        key: [_setting(run, key) for choices, run in runs if run["settings"] and key not in choices] for key in keys
+        key: [
+            _setting(run, key)
+            for choices, run in runs
+            if run["settings"] and key not in choices
+        ]
+        for key in keys
     }
     filled = []
     for choices, run in runs:
-        guesses = {key: _setting(run, key) or next(iter(usual[key]), "") or "default" for key in keys}
-        filled.append({key: choices.get(key) or guess for key, guess in guesses.items()})
+        guesses = {
+            key: _setting(run, key) or next(iter(usual[key]), "") or "default"
+            for key in keys
+        }
+        filled.append(
+            {key: choices.get(key) or guess for key, guess in guesses.items()}
+        )
     values = {key: {choices[key] for choices in filled} for key in keys if key != SEED}
     variables = tuple(sorted(key for key in values if len(values[key]) > 1))
-    constants = {key: value for key, (value, *more) in values.items() if not more and value != "default"}
+    constants = {
+        key: value
+        for key, (value, *more) in values.items()
+        if not more and value != "default"
+    }
     found: dict[tuple[tuple[str, ...], str], Row] = {}
     for choices, (_, run) in zip(filled, runs, strict=True):
         place = tuple(choices[key] for key in variables), choices[SEED]
-        if run["state"] == "finished" or place not in found:  # what is there comes first
+        if (
+            run["state"] == "finished" or place not in found
+        ):  # what is there comes first
             found[place] = run
-    cells = tuple(sorted({values for values, _ in found}, key=lambda values: [*map(in_order, values)]))
+    cells = tuple(
+        sorted(
+            {values for values, _ in found}, key=lambda values: [*map(in_order, values)]
+        )
+    )
     number = {values: i for i, values in enumerate(cells)}
     order = sorted(found, key=lambda place: (number[place[0]], in_order(place[1])))
-    rows = [found[values, seed] | {"cell": number[values], "seed": seed} for values, seed in order]
+    rows = [
+        found[values, seed] | {"cell": number[values], "seed": seed}
+        for values, seed in order
+    ]
     types = dict.fromkeys(MEASURES, float) | {"cell": int}
     return variables, constants, cells, pd.DataFrame(rows, dtype=object).astype(types)
 
@@ -167,26 +248,53 @@ def in_order(value: str) -> tuple[int, float, str]:
 def _run(path: Path, content: Mapping[str, Any]) -> Row:
     """Returns a run that finished or failed, from its result."""
     settings = content["settings"]
-    if not isinstance(settings, Mapping) or not isinstance(settings.get("options", {}), Mapping):
+    if not isinstance(settings, Mapping) or not isinstance(
+        settings.get("options", {}), Mapping
+    ):
         raise TypeError("settings and their options are not by name")
-    run = _ABSENT | {"folder": path.parent, "settings": flattened(settings), "origin": _origin(content)}
+    run = _ABSENT | {
+        "folder": path.parent,
+        "settings": flattened(settings),
+        "origin": _origin(content),
+    }
     if path.name == ERROR:
         return run | {"state": "failed", "error": plain_text(content["error"])}
     numbers = {name: of(content) for name, (_, of) in MEASURES.items()}
     for name, value in numbers.items():
-        if value is not None and (type(value) not in (int, float) or not math.isfinite(value)):
+        if value is not None and (
+            type(value) not in (int, float) or not math.isfinite(value)
+        ):
             raise ValueError(f"{name}: must be a finite number; got {value!r:.80}")
     lost = content.get("lost") or ""
-    lost = plain_text(", ".join(f"{k} {v}" for k, v in lost.items()) if isinstance(lost, Mapping) else str(lost))
-    return run | numbers | {"state": "finished", "lost": lost, "unit": plain_text(content["unit"])}
+    lost = plain_text(
+        ", ".join(f"{k} {v}" for k, v in lost.items())
+        if isinstance(lost, Mapping)
+        else str(lost)
+    )
+    return (
+        run
+        | numbers
+        | {"state": "finished", "lost": lost, "unit": plain_text(content["unit"])}
+    )
 
 
 def _origin(content: Mapping[str, Any]) -> dict[str, str]:
     """Returns date, commit and machine of a run, as far as it tells them."""
     about = content.get("provenance") or {}
-    git, machine, versions = about.get("git") or {}, about.get("machine") or {}, about.get("versions") or {}
-    commit = f"{git['commit'][:10]}{', changed' if git.get('dirty') else ''}" if git else versions.get("gpmpc")
-    made = ", ".join(f"{value} cores" if key == "cores" else str(value) for key, value in machine.items())
+    git, machine, versions = (
+        about.get("git") or {},
+        about.get("machine") or {},
+        about.get("versions") or {},
+    )
+    commit = (
+        f"{git['commit'][:10]}{', changed' if git.get('dirty') else ''}"
+        if git
+        else versions.get("gpmpc")
+    )
+    made = ", ".join(
+        f"{value} cores" if key == "cores" else str(value)
+        for key, value in machine.items()
+    )
     named = {"date": about.get("created"), "commit": commit, "machine": made}
     return {key: plain_text(str(value)) for key, value in named.items() if value}
 
@@ -195,7 +303,10 @@ def _parsed(choices: Any) -> Choices:
     """Returns choices, ``key=value`` each, by key."""
     if not isinstance(choices, list):
         raise TypeError(f"choices must be a list; got {choices!r:.80}")
-    return {key: value for key, _, value in (plain_text(choice).partition("=") for choice in choices)}
+    return {
+        key: value
+        for key, _, value in (plain_text(choice).partition("=") for choice in choices)
+    }
 
 
 def _spelled(choices: Choices) -> list[str]:

@@ -29,7 +29,15 @@ from gpmpc.mpc import Reference
 from gpmpc.mpc._policy import OnFailure, check_policy
 from gpmpc.mpc.problem import Box
 from gpmpc.propagation import Propagator, best_propagator
-from gpmpc.simulation import Disturbance, ModelLoop, Noise, Rollout, Step, closed_loop, rehearse
+from gpmpc.simulation import (
+    Disturbance,
+    ModelLoop,
+    Noise,
+    Rollout,
+    Step,
+    closed_loop,
+    rehearse,
+)
 from gpmpc.simulation._simulator import PlantSimulator
 from gpmpc.studies._document import Table
 from gpmpc.studies.study import derived_seed, random_rows
@@ -50,15 +58,21 @@ class Experiment:
     """
 
     data: DataSource  #: where transitions come from
-    trajectory: Trajectory | None  #: what is followed, from its beginning; None holds the system's goal
+    trajectory: (
+        Trajectory | None
+    )  #: what is followed, from its beginning; None holds the system's goal
     system: System  #: whose transitions are learned; names, units and references are its own
     #: from transitions and a ``seed`` to a ``Training``, such as a ``Trainer``; one that learns differences sees the
     #: system's angles as sine and cosine, and learns what the system's nominal model misses
     train: Callable[..., Training]
     #: from a model, or from a ``plant`` where its first argument is called so, to a ``Controller``
     controller: Callable[..., Any]
-    plant: System | None = None  #: what flies, and the true model of a controller that takes one; the system by default
-    name: str = "elliptical"  #: of the trajectory, which data from files are filed under
+    plant: System | None = (
+        None  #: what flies, and the true model of a controller that takes one; the system by default
+    )
+    name: str = (
+        "elliptical"  #: of the trajectory, which data from files are filed under
+    )
     size: int | None = None  #: rows drawn for the training; None takes all
     steps: int = 100  #: of the flight
     seed: int = 0  #: of all random numbers
@@ -69,11 +83,17 @@ class Experiment:
     noise: Noise | None = None  #: on the plant
     disturbances: Sequence[Disturbance] = ()  #: of the plant
     on_failure: OnFailure = "previous_plan"  #: what is applied where a solve fails
-    learning: OnlineLearning | EpisodicLearning | None = None  #: from the flight, while it flies or after it
-    model: DynamicsModel | None = None  #: trained before; None trains one where the controller needs it
+    learning: OnlineLearning | EpisodicLearning | None = (
+        None  #: from the flight, while it flies or after it
+    )
+    model: DynamicsModel | None = (
+        None  #: trained before; None trains one where the controller needs it
+    )
 
     def __post_init__(self) -> None:
-        check_number("data.size", 1 if self.size is None else self.size, least=1, whole=True)
+        check_number(
+            "data.size", 1 if self.size is None else self.size, least=1, whole=True
+        )
         check_number("steps", self.steps, least=1, whole=True)
         check_number("seed", self.seed, least=0, whole=True)
         check_policy(self.on_failure)
@@ -82,25 +102,43 @@ class Experiment:
         plant, system = self.flown, self.system
         shapes = [(p.state_names, p.input_names, p.time_step) for p in (system, plant)]
         if shapes[0] != shapes[1]:
-            raise SettingError("plant", f"must have the states, inputs and time step of {system.name}; got {shapes[1]}")
+            raise SettingError(
+                "plant",
+                f"must have the states, inputs and time step of {system.name}; got {shapes[1]}",
+            )
         if self.loop == "model" and not self.learns:
-            raise SettingError("loop", "a model loop needs a controller that learns a model; this one knows the plant")
+            raise SettingError(
+                "loop",
+                "a model loop needs a controller that learns a model; this one knows the plant",
+            )
         if self.learning is not None and not (self.learns and self.loop == "plant"):
-            raise SettingError("learning", "needs a controller that learns a model, and a plant in the loop")
+            raise SettingError(
+                "learning",
+                "needs a controller that learns a model, and a plant in the loop",
+            )
         for disturbance in self.disturbances:
             if not hasattr(disturbance, "disturb_plant"):
                 what = "must each name what it is, such as {_target_: gpmpc.simulation.Gust, rates: {vx: 0.5}}"
                 raise SettingError("disturbances", f"{what}; got {disturbance!r}")
-        if self.loop == "plant":  # noise and disturbances that do not fit it are found before the training
+        if (
+            self.loop == "plant"
+        ):  # noise and disturbances that do not fit it are found before the training
             PlantSimulator(plant, plant.goal, self.disturbances, self.noise, self.seed)
         first = self.references(1)[0]
-        if (problem := getattr(self.controller, "keywords", {}).get("problem")) is not None:
+        if (
+            problem := getattr(self.controller, "keywords", {}).get("problem")
+        ) is not None:
             if (problem.state_dim, problem.input_dim) != self._dimensions:
-                weighed = f"weighs {problem.state_dim} states and {problem.input_dim} inputs"
+                weighed = (
+                    f"weighs {problem.state_dim} states and {problem.input_dim} inputs"
+                )
                 has = "{} has {} and {}".format(system.name, *self._dimensions)
                 raise SettingError("controller.problem", f"{weighed}; {has}")
             start = first if plant.start is None else plant.start
-            problem.check_start(np.asarray(start, dtype=float), np.asarray(plant.initial_input, dtype=float))
+            problem.check_start(
+                np.asarray(start, dtype=float),
+                np.asarray(plant.initial_input, dtype=float),
+            )
         if self.learns and self.model is None and hasattr(self.data, "check"):
             self.data.check(system, self.trajectory)
 
@@ -127,7 +165,9 @@ class Experiment:
         """
         data = self.data.transitions(self.system, self.trajectory, self.name)
         if (data.state_dim, data.input_dim) != self._dimensions:
-            raise ShapeError(f"data and system must have the same dimensions; got {data.state_dim, data.input_dim}")
+            raise ShapeError(
+                f"data and system must have the same dimensions; got {data.state_dim, data.input_dim}"
+            )
         size = len(data) if self.size is None else self.size
         return data[random_rows(len(data), size, self.seed, "data.size")]
 
@@ -135,7 +175,9 @@ class Experiment:
         """Trains on transitions; see ``train``."""
         angles, known = self.system.angle_indices, self.system.nominal
         if (angles or known) and getattr(self.train, "predicts", None) == "difference":
-            nominal = None if known is None else CasadiFunction(successor_function(known))
+            nominal = (
+                None if known is None else CasadiFunction(successor_function(known))
+            )
             return train_residual(self.train, transitions, angles, nominal, seed)
         return self.train(transitions, seed=seed)
 
@@ -148,7 +190,10 @@ class Experiment:
 
         It is what the model has learned of it; a controller that knows the plant knows its noise as well.
         """
-        model, none = training.posterior if training else self.model, np.zeros(self._dimensions[0])
+        model, none = (
+            training.posterior if training else self.model,
+            np.zeros(self._dimensions[0]),
+        )
         if getattr(self.propagator, "process_noise", False) or self.loop == "model":
             return none
         if model is not None and self.learns:
@@ -163,7 +208,9 @@ class Flown:
 
     rollout: Rollout  #: every step, as arrays
     controller: Any  #: the ``Controller`` that steered, with its ``problem``
-    training: Training | None  #: what was learned; None where the controller knows the plant
+    training: (
+        Training | None
+    )  #: what was learned; None where the controller knows the plant
     #: where and why the system left the finite numbers, and the rollout ends; None where it did not
     diverged: Diverged | None = None
     before: tuple["Flown", ...] = ()  #: the episodes
@@ -195,7 +242,10 @@ def run_trial(experiment: Experiment, prepare: Prepare | None = None) -> Flown:
                 data = experiment.learning.with_flight(data, before[-1].rollout)
                 if k + 1 < experiment.learning.episodes:
                     training = experiment.learn(data, experiment.seed)
-            training = min(before, key=lambda flown: _error(experiment, flown)).training or training
+            training = (
+                min(before, key=lambda flown: _error(experiment, flown)).training
+                or training
+            )
         model = training.posterior
     return replace(_fly(experiment, prepare, model, training), before=tuple(before))
 
@@ -209,11 +259,16 @@ def _error(experiment: Experiment, flown: Flown, last: int = 0) -> float:
 def _tracking_error(experiment: Experiment, flown: Flown, last: int = 0) -> Any:
     system, rollout = experiment.system, flown.rollout
     states, references = rollout.states[-last:], rollout.references[-last:]
-    return tracking_error(states, references, system.tracked_indices, system.angle_indices)
+    return tracking_error(
+        states, references, system.tracked_indices, system.angle_indices
+    )
 
 
 def _fly(
-    experiment: Experiment, prepare: Prepare | None, model: DynamicsModel | None, training: Training | None
+    experiment: Experiment,
+    prepare: Prepare | None,
+    model: DynamicsModel | None,
+    training: Training | None,
 ) -> Flown:
     """Flies with a model, or on the plant's own where it is None."""
     plant = experiment.flown
@@ -222,17 +277,34 @@ def _fly(
         controller = LearningController(controller, experiment.learning)
     system: System | ModelLoop = plant
     if experiment.loop == "model" and model is not None:
-        system = ModelLoop(model, experiment.propagator or best_propagator(model), time_step=plant.time_step)
+        system = ModelLoop(
+            model,
+            experiment.propagator or best_propagator(model),
+            time_step=plant.time_step,
+        )
     states = experiment.references(experiment.steps + controller.horizon + 1)
-    resting = np.asarray(controller.initial_input)  # falls back on it where the very first solve fails
+    resting = np.asarray(
+        controller.initial_input
+    )  # falls back on it where the very first solve fails
     reference = Reference(states, np.tile(resting, (len(states) - 1, 1)))
     start = states[0] if plant.start is None else plant.start
     start = None if getattr(plant.dynamics, "stateful", False) else start
     rehearse(system, controller, reference, start)
     on_step = None if prepare is None else prepare(controller, training)
-    how = {key: getattr(experiment, key) for key in ("noise", "disturbances", "on_failure", "seed")}
+    how = {
+        key: getattr(experiment, key)
+        for key in ("noise", "disturbances", "on_failure", "seed")
+    }
     try:
-        rollout = closed_loop(system, controller, reference, start, experiment.steps, **how, on_step=on_step)
+        rollout = closed_loop(
+            system,
+            controller,
+            reference,
+            start,
+            experiment.steps,
+            **how,
+            on_step=on_step,
+        )
     except Diverged as error:
         if error.flown is None:
             raise
@@ -247,32 +319,71 @@ def metrics(experiment: Experiment, flown: Flown) -> dict[str, Any]:
     diverged has no RMSE: None.
     """
     rollout, problem, training = flown.rollout, flown.controller.problem, flown.training
-    system, horizon, total = experiment.system, flown.controller.horizon, _error(experiment, flown)
+    system, horizon, total = (
+        experiment.system,
+        flown.controller.horizon,
+        _error(experiment, flown),
+    )
     axes = _tracking_error(experiment, flown).axes.tolist()
-    rmse: dict[str, Any] = dict(zip(system.tracked, axes, strict=True)) | {"total": total}
-    violations = {"inputs": violation_rate(rollout.inputs, *(side[0] for side in problem.inputs.by_stage(horizon)))}
-    if boxes := [bounds.by_stage(horizon) for bounds in problem.constraints if isinstance(bounds, Box)]:
-        lower, upper = np.max([box[0][0] for box in boxes], axis=0), np.min([box[1][0] for box in boxes], axis=0)
+    rmse: dict[str, Any] = dict(zip(system.tracked, axes, strict=True)) | {
+        "total": total
+    }
+    violations = {
+        "inputs": violation_rate(
+            rollout.inputs, *(side[0] for side in problem.inputs.by_stage(horizon))
+        )
+    }
+    if boxes := [
+        bounds.by_stage(horizon)
+        for bounds in problem.constraints
+        if isinstance(bounds, Box)
+    ]:
+        lower, upper = (
+            np.max([box[0][0] for box in boxes], axis=0),
+            np.min([box[1][0] for box in boxes], axis=0),
+        )
         violations["states"] = violation_rate(rollout.states[1:], lower, upper)
     learned = None
     if training is not None:
         objective = [float(value) for value in training.objective]
-        learned = {"size": len(training.posterior), "evaluations": training.evaluations, "objective": objective}
+        learned = {
+            "size": len(training.posterior),
+            "evaluations": training.evaluations,
+            "objective": objective,
+        }
     return {
         "steps": len(rollout.inputs),
         "unit": system.unit,
         "rmse": rmse if np.isfinite(total) else dict.fromkeys(rmse),
-        "error_at_end": _error(experiment, flown, last=2) if np.isfinite(total) else None,
+        "error_at_end": _error(experiment, flown, last=2)
+        if np.isfinite(total)
+        else None,
         "lost": _lost(experiment, flown),
-        "violations": {name: asdict(rate) | {"rate": rate.rate} for name, rate in violations.items()},
+        "violations": {
+            name: asdict(rate) | {"rate": rate.rate}
+            for name, rate in violations.items()
+        },
         "failures": dict(Counter(status.name for _, status in rollout.failures)),
         "far_from_data": len(rollout.far_from_data),
-        "suboptimal": dict(Counter(rollout.statuses[k].name for k in rollout.suboptimal)),
-        "iterations": {"mean": float(rollout.iterations.mean()), "largest": int(rollout.iterations.max())},
+        "suboptimal": dict(
+            Counter(rollout.statuses[k].name for k in rollout.suboptimal)
+        ),
+        "iterations": {
+            "mean": float(rollout.iterations.mean()),
+            "largest": int(rollout.iterations.max()),
+        },
         "training": learned,
-        "episodes": [error if np.isfinite(error := _error(experiment, each)) else None for each in flown.before],
+        "episodes": [
+            error if np.isfinite(error := _error(experiment, each)) else None
+            for each in flown.before
+        ],
         "times": {"training": None if training is None else training.seconds}
-        | {stage: time_quantiles(np.array([getattr(t, stage) for t in rollout.timings])) for stage in _STAGES},
+        | {
+            stage: time_quantiles(
+                np.array([getattr(t, stage) for t in rollout.timings])
+            )
+            for stage in _STAGES
+        },
     }
 
 
@@ -281,7 +392,12 @@ def _lost(experiment: Experiment, flown: Flown) -> dict[str, Any] | None:
     system, rollout, found = experiment.system, flown.rollout, []
     unit, axes, angles = system.unit, system.tracked_indices, system.angle_indices
     if loss := find_loss(rollout.states, rollout.references, axes, system.lost, angles):
-        found.append((loss.step, f"{loss.distance:.3g} {unit} from its reference, more than {loss.limit:.3g} {unit}"))
+        found.append(
+            (
+                loss.step,
+                f"{loss.distance:.3g} {unit} from its reference, more than {loss.limit:.3g} {unit}",
+            )
+        )
     if flown.diverged is not None:
         found.append((flown.diverged.step, " ".join(str(flown.diverged).split())))
     if not found:
@@ -292,32 +408,64 @@ def _lost(experiment: Experiment, flown: Flown) -> dict[str, Any] | None:
 
 def summary(result: Mapping[str, Any]) -> Table:
     """Returns a run's metrics in words, a line each; what there is nothing to say of has none."""
-    settings, times, rmse, unit = result["settings"], result["times"], result["rmse"], result["unit"]
-    options, (system, plant, model) = settings["options"], (settings.get(k) or {} for k in ("system", "plant", "model"))
+    settings, times, rmse, unit = (
+        result["settings"],
+        result["times"],
+        result["rmse"],
+        result["unit"],
+    )
+    options, (system, plant, model) = (
+        settings["options"],
+        (settings.get(k) or {} for k in ("system", "plant", "model")),
+    )
     along = "" if options["trajectory"] == "goal" else f" along {options['trajectory']}"
-    training, lost, far = result["training"], result.get("lost"), result.get("far_from_data")
+    training, lost, far = (
+        result["training"],
+        result.get("lost"),
+        result.get("far_from_data"),
+    )
     error, stopped = result.get("error_at_end"), _counted(result.get("suboptimal", {}))
-    axes = ", ".join(f"{k} {v:.3g}" for k, v in rmse.items() if v is not None and k != "total")
-    stages = ", ".join(f"{stage} {1e3 * times[stage]['median']:.3g}" for stage in _STAGES[:3])
+    axes = ", ".join(
+        f"{k} {v:.3g}" for k, v in rmse.items() if v is not None and k != "total"
+    )
+    stages = ", ".join(
+        f"{stage} {1e3 * times[stage]['median']:.3g}" for stage in _STAGES[:3]
+    )
     median, most = (f"{1e3 * times['total'][key]:.3g}" for key in ("median", "p99"))
     lines = {
         "flight": f"{result['steps']} steps of {options['system']}{along} with {options['controller']}",
-        "flown with": ", ".join(f"{k} {v} (learned: {system.get(k)})" for k, v in plant.items() if v != system.get(k)),
+        "flown with": ", ".join(
+            f"{k} {v} (learned: {system.get(k)})"
+            for k, v in plant.items()
+            if v != system.get(k)
+        ),
         "model": model.get("path"),
-        "learned from": training and f"{training['size']} rows of {options['data']} data, in {times['training']:.2f} s",
-        "known before": ", ".join(f"{k} {v}" for k, v in (settings.get("nominal") or {}).items()),
-        "lost": lost and f"from step {lost['step']} ({lost['time']:g} s) on: {lost['reason']}",
-        f"RMSE [{unit}]": "none: it diverged" if rmse["total"] is None else f"{rmse['total']:.3g}  ({axes})",
+        "learned from": training
+        and f"{training['size']} rows of {options['data']} data, in {times['training']:.2f} s",
+        "known before": ", ".join(
+            f"{k} {v}" for k, v in (settings.get("nominal") or {}).items()
+        ),
+        "lost": lost
+        and f"from step {lost['step']} ({lost['time']:g} s) on: {lost['reason']}",
+        f"RMSE [{unit}]": "none: it diverged"
+        if rmse["total"] is None
+        else f"{rmse['total']:.3g}  ({axes})",
         f"at the end [{unit}]": None if error is None else f"{error:.3g}",
-        "episodes before": ", ".join("diverged" if e is None else f"{e:.3g}" for e in result.get("episodes", ())),
+        "episodes before": ", ".join(
+            "diverged" if e is None else f"{e:.3g}" for e in result.get("episodes", ())
+        ),
     }
     for name, rate in result["violations"].items():
         interval = f"{100 * rate['low']:.2g} to {100 * rate['high']:.2g} %"
-        lines[f"bounds of {name}"] = f"{rate['violations']} of {rate['steps']} steps outside (95 %: {interval})"
+        lines[f"bounds of {name}"] = (
+            f"{rate['violations']} of {rate['steps']} steps outside (95 %: {interval})"
+        )
     lines |= {
         "failed solves": _counted(result["failures"]) or "none",
-        "stopped early": stopped and f"{stopped}: plans that were not optimal yet, applied",
-        "far from the data": far and f"the plans of {far} steps: there the model knows little more than its prior",
+        "stopped early": stopped
+        and f"{stopped}: plans that were not optimal yet, applied",
+        "far from the data": far
+        and f"the plans of {far} steps: there the model knows little more than its prior",
         "decision [ms]": f"median {median}  ({stages}), 99 % below {most}",
     }
     return Table(("", ""), [(name, text) for name, text in lines.items() if text])

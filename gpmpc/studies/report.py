@@ -20,23 +20,52 @@ from scipy import stats
 from gpmpc._provenance import now
 from gpmpc.exceptions import DataError, SettingError
 from gpmpc.plotting import Series, over_variable, png
-from gpmpc.studies._document import MISSING, Document, Table, figure_label, plain_text, with_range
+from gpmpc.studies._document import (
+    MISSING,
+    Document,
+    Table,
+    figure_label,
+    plain_text,
+    with_range,
+)
 from gpmpc.studies._run_folder import LONGEST_NAME
 from gpmpc.studies._runs import SEED, Report, in_order, read_report
 
-__all__ = ["Comparison", "Report", "compare", "notes", "read_report", "report_document", "sentences", "terminal_table"]
+__all__ = [
+    "Comparison",
+    "Report",
+    "compare",
+    "notes",
+    "read_report",
+    "report_document",
+    "sentences",
+    "terminal_table",
+]
 
-_DRAWN = {"rmse": True, "failed": False, "decision": True}  # a figure each, and whether it may be logarithmic
+_DRAWN = {
+    "rmse": True,
+    "failed": False,
+    "decision": True,
+}  # a figure each, and whether it may be logarithmic
 _WALL_TIMES = ("decision", "training")
-_SHORT = {"rmse": "RMSE", "outside": "outside", "failed": "failed", "decision": "decision"}  # in a terminal
+_SHORT = {
+    "rmse": "RMSE",
+    "outside": "outside",
+    "failed": "failed",
+    "decision": "decision",
+}  # in a terminal
 _PARTS = ("q25", "median", "q75")
 _MOST_LINES = 8  # in a figure; what is varied besides is pooled
-_LEGEND = "Median [first to third quartile] over the seeds. In figures, every run is a dot."
+_LEGEND = (
+    "Median [first to third quartile] over the seeds. In figures, every run is a dot."
+)
 _LEVEL = 0.05
 _FEWEST = 6  # pairs; with n of them the smallest two-sided p-value of the signed-rank test is 2^(1 - n)
 
 
-def report_document(report: Report, comparison: Sequence[str] = (), folder: Path | None = None) -> Document:
+def report_document(
+    report: Report, comparison: Sequence[str] = (), folder: Path | None = None
+) -> Document:
     """Returns everything that is written of a report; what is zero everywhere is left out of the LaTeX table.
 
     Args:
@@ -50,13 +79,19 @@ def report_document(report: Report, comparison: Sequence[str] = (), folder: Path
         plain_text(report.tree.resolve().name),
         [_table(report, [*report.measures])],
         _numbers(report),
-        lead=f"{_counts(report)}." + (f" All of them: {constants}." if constants else ""),
+        lead=f"{_counts(report)}."
+        + (f" All of them: {constants}." if constants else ""),
         notes=[_LEGEND],
         lists={"Comparison": comparison, **notes(report), "Made": _made(report)},
-        code={"To fill the gaps": report.commands(), "Settings of all runs": report.base_settings()},
+        code={
+            "To fill the gaps": report.commands(),
+            "Settings of all runs": report.base_settings(),
+        },
         images=_figures(report),
         links={
-            plain_text(str(run.folder.relative_to(report.tree))): os.path.relpath(run.folder.resolve(), start)
+            plain_text(str(run.folder.relative_to(report.tree))): os.path.relpath(
+                run.folder.resolve(), start
+            )
             for run in report.there
         },
         latex=[_table(report, _telling(report))],
@@ -70,7 +105,11 @@ def _made(report: Report) -> list[str]:
         for key in ("date", "commit", "machine")
     }
     dates = " to ".join(dict.fromkeys([*made["date"][:1], *made["date"][-1:]]))
-    shown = {"Runs made": dates, "Commit": "; ".join(made["commit"]), "Machine": "; ".join(made["machine"])}
+    shown = {
+        "Runs made": dates,
+        "Commit": "; ".join(made["commit"]),
+        "Machine": "; ".join(made["machine"]),
+    }
     shown |= {"Report made": now(), "Tree": str(report.tree.resolve())}
     return [f"{key}: {plain_text(value)}" for key, value in shown.items() if value]
 
@@ -97,15 +136,29 @@ def terminal_table(report: Report) -> Table:
     """Returns the table with short headers: median, and the quartiles below it; what is zero everywhere is left out."""
     shown = [name for name in _telling(report) if name in _SHORT]
     header = [name.replace(".", ".\n") for name in report.variables or ("runs",)]
-    header += ["seeds", *(f"{_SHORT[name]}\n[{report.measures[name].rpartition(' [')[2]}" for name in shown)]
+    header += [
+        "seeds",
+        *(
+            f"{_SHORT[name]}\n[{report.measures[name].rpartition(' [')[2]}"
+            for name in shown
+        ),
+    ]
     return Table(header, _table(report, shown).rows, _counts(report))
 
 
 def notes(report: Report) -> dict[str, list[str]]:
     """Returns what has to be known of single runs, by kind: their folders and the reasons."""
     found = {
-        "Failed": [f"{plain_text(run.folder.name)}: {run.error}" for run in report.there if run.error],
-        "Lost": [f"{plain_text(run.folder.name)}: {run.lost}" for run in report.there if run.lost],
+        "Failed": [
+            f"{plain_text(run.folder.name)}: {run.error}"
+            for run in report.there
+            if run.error
+        ],
+        "Lost": [
+            f"{plain_text(run.folder.name)}: {run.lost}"
+            for run in report.there
+            if run.lost
+        ],
         "Skipped": list(report.skipped),
     }
     return {kind: lines for kind, lines in found.items() if lines}
@@ -113,16 +166,28 @@ def notes(report: Report) -> dict[str, list[str]]:
 
 def _quartiles(report: Report, measures: Sequence[str]) -> np.ndarray:
     """Returns first quartile, median and third (cells, measures, 3) over the seeds; NaN where no run has a number."""
-    numbers = [runs[name].dropna() for _, runs in report.runs.groupby("cell") for name in measures]
-    found = [np.quantile(of, [0.25, 0.5, 0.75]) if len(of) else np.full(3, np.nan) for of in numbers]
+    numbers = [
+        runs[name].dropna()
+        for _, runs in report.runs.groupby("cell")
+        for name in measures
+    ]
+    found = [
+        np.quantile(of, [0.25, 0.5, 0.75]) if len(of) else np.full(3, np.nan)
+        for of in numbers
+    ]
     return np.reshape(found, (len(report.cells), -1, 3))
 
 
 def _table(report: Report, measures: Sequence[str]) -> Table:
     rows = []
     counts = _states(report).to_dict("records")
-    for values, count, quartiles in zip(report.cells, counts, _quartiles(report, measures), strict=True):
-        seeds = [str(count.pop("finished")), *(f"{number} {word}" for word, number in count.items() if number)]
+    for values, count, quartiles in zip(
+        report.cells, counts, _quartiles(report, measures), strict=True
+    ):
+        seeds = [
+            str(count.pop("finished")),
+            *(f"{number} {word}" for word, number in count.items() if number),
+        ]
         texts = [MISSING if np.isnan(of).any() else with_range(*of) for of in quartiles]
         rows.append([*(values or ("all",)), "\n".join(seeds), *texts])
     labels = [report.measures[name] for name in measures]
@@ -132,10 +197,14 @@ def _table(report: Report, measures: Sequence[str]) -> Table:
 def _numbers(report: Report) -> pd.DataFrame:
     values = pd.DataFrame(report.cells, columns=[*report.variables], dtype=object)
     names = [
-        f"{name}_{part} [{label.rpartition(' [')[2]}" for name, label in report.measures.items() for part in _PARTS
+        f"{name}_{part} [{label.rpartition(' [')[2]}"
+        for name, label in report.measures.items()
+        for part in _PARTS
     ]
     quartiles = _quartiles(report, [*report.measures]).reshape(len(report.cells), -1)
-    found = pd.concat([values, _states(report), pd.DataFrame(quartiles, columns=names)], axis=1).astype(object)
+    found = pd.concat(
+        [values, _states(report), pd.DataFrame(quartiles, columns=names)], axis=1
+    ).astype(object)
     return found.where(found.notna(), None)
 
 
@@ -149,24 +218,45 @@ def _figures(report: Report) -> dict[str, bytes]:
     drawn: dict[str, bytes] = {}
     for index, variable in enumerate(report.variables):
         positions = sorted({values[index] for values in report.cells}, key=in_order)
-        at, lines = report.runs.cell.map(lambda cell, i=index: report.cells[cell][i]), _lines(report, index)
+        at, lines = (
+            report.runs.cell.map(lambda cell, i=index: report.cells[cell][i]),
+            _lines(report, index),
+        )
         for name in (name for name in _telling(report) if name in _DRAWN):
             numbers, series = report.runs[name].dropna(), []
             for label, cells in lines.items():
                 of = numbers[report.runs.cell.isin(cells)]
-                series.append(Series(figure_label(label), [of[at == position].tolist() for position in positions]))
-            title, label, *ticks = map(figure_label, (variable, report.measures[name], *positions))
+                series.append(
+                    Series(
+                        figure_label(label),
+                        [of[at == position].tolist() for position in positions],
+                    )
+                )
+            title, label, *ticks = map(
+                figure_label, (variable, report.measures[name], *positions)
+            )
             figure = over_variable(title, ticks, label, series, _DRAWN[name])
-            file = re.sub(r"[^\w.+-]", "-", f"{name}-over-{variable}"[:LONGEST_NAME], flags=re.ASCII)
-            drawn[f"{file}.png" if f"{file}.png" not in drawn else f"{file}-{index}.png"] = png(figure)
+            file = re.sub(
+                r"[^\w.+-]",
+                "-",
+                f"{name}-over-{variable}"[:LONGEST_NAME],
+                flags=re.ASCII,
+            )
+            drawn[
+                f"{file}.png" if f"{file}.png" not in drawn else f"{file}-{index}.png"
+            ] = png(figure)
     return drawn
 
 
 def _lines(report: Report, index: int) -> dict[str, list[int]]:
     """Groups cells by what else was varied; by one setting only where all together were too many lines."""
     others = [i for i in range(len(report.variables)) if i != index]
-    while len({tuple(values[i] for i in others) for values in report.cells}) > _MOST_LINES:
-        others.remove(max(others, key=lambda i: len({values[i] for values in report.cells})))
+    while (
+        len({tuple(values[i] for i in others) for values in report.cells}) > _MOST_LINES
+    ):
+        others.remove(
+            max(others, key=lambda i: len({values[i] for values in report.cells}))
+        )
     lines: dict[str, list[int]] = {}
     for cell, values in enumerate(report.cells):
         label = ", ".join(f"{report.variables[i]}={values[i]}" for i in others)
@@ -188,7 +278,9 @@ class Comparison:
     rank_biserial: float  # share of the signed ranks that are positive minus that of the negative (Kerby, 2014)
     standardised: float  # mean over standard deviation of the differences (Cohen's d_z)
     pairs: int
-    left_out: tuple[str, ...] = ()  # seeds and other settings of which A or B lacks runs
+    left_out: tuple[
+        str, ...
+    ] = ()  # seeds and other settings of which A or B lacks runs
 
     @property
     def verdict(self) -> str:
@@ -216,23 +308,43 @@ def compare(report: Report, a: str, b: str) -> list[Comparison]:
     """
     groups = [_runs_of(report, key, text) for key, text in (("A", a), ("B", b))]
     if len({*pd.concat(groups).unit}) > 1:
-        raise SettingError("compare", "errors in m and in rad have no common mean; add subsystem=... to both groups")
+        raise SettingError(
+            "compare",
+            "errors in m and in rad have no common mean; add subsystem=... to both groups",
+        )
     comparisons = []
     for measure in (name for name in report.measures if name not in _WALL_TIMES):
-        first, second = (group.pivot(index="others", columns="seed", values=measure) for group in groups)
-        first, second = first.align(second)  # a row a combination of the other settings, a column a seed
+        first, second = (
+            group.pivot(index="others", columns="seed", values=measure)
+            for group in groups
+        )
+        first, second = first.align(
+            second
+        )  # a row a combination of the other settings, a column a seed
         left_out, both = [], first.notna() & second.notna()
-        while both.size and not both.to_numpy().all():  # what lacks the largest share of its runs is left out
+        while (
+            both.size and not both.to_numpy().all()
+        ):  # what lacks the largest share of its runs is left out
             lacking = [(~both).mean(axis=1), (~both).mean(axis=0)]
             axis = int(lacking[1].max() >= lacking[0].max())
             left_out.append(lacking[axis].idxmax())
             both = both.drop(left_out[-1], axis=axis)
-        a_mean, b_mean = (side.loc[both.index, both.columns].mean(axis=0).to_numpy() for side in (first, second))
+        a_mean, b_mean = (
+            side.loc[both.index, both.columns].mean(axis=0).to_numpy()
+            for side in (first, second)
+        )
         if len(a_mean) >= 2:
-            left_out.sort(key=lambda name: (name.startswith(f"{SEED}="), in_order(name.removeprefix(f"{SEED}="))))
+            left_out.sort(
+                key=lambda name: (
+                    name.startswith(f"{SEED}="),
+                    in_order(name.removeprefix(f"{SEED}=")),
+                )
+            )
             comparisons.append(_test(measure, a_mean, b_mean, tuple(left_out)))
     if not comparisons:
-        raise DataError(f"{report.tree}: runs of {a} and {b} have fewer than two seeds in common")
+        raise DataError(
+            f"{report.tree}: runs of {a} and {b} have fewer than two seeds in common"
+        )
     return comparisons
 
 
@@ -243,21 +355,35 @@ def _runs_of(report: Report, key: str, text: str) -> pd.DataFrame:
         name, _, value = choice.partition("=")
         if name not in report.variables:
             varied = ", ".join(report.variables) or "nothing"
-            raise SettingError(f"compare {key}", f"must choose among what was varied, {varied}; got {choice!r}")
-        known = dict.fromkeys(values[report.variables.index(name)] for values in report.cells)
+            raise SettingError(
+                f"compare {key}",
+                f"must choose among what was varied, {varied}; got {choice!r}",
+            )
+        known = dict.fromkeys(
+            values[report.variables.index(name)] for values in report.cells
+        )
         if value not in known:
-            raise SettingError(f"compare {key}", f"{name} was varied over {', '.join(known)}; got {value!r}")
+            raise SettingError(
+                f"compare {key}",
+                f"{name} was varied over {', '.join(known)}; got {value!r}",
+            )
         group[name] = value
     others = {}
     for cell, values in enumerate(report.cells):
         chosen = dict(zip(report.variables, values, strict=True))
         if group.items() <= chosen.items():
-            others[cell] = ", ".join(f"{name}={value}" for name, value in chosen.items() if name not in group)
-    runs = report.runs[(report.runs.state == "finished") & report.runs.cell.isin(others)]
+            others[cell] = ", ".join(
+                f"{name}={value}" for name, value in chosen.items() if name not in group
+            )
+    runs = report.runs[
+        (report.runs.state == "finished") & report.runs.cell.isin(others)
+    ]
     return runs.assign(others=runs.cell.map(others), seed=f"{SEED}=" + runs.seed)
 
 
-def _test(measure: str, a: np.ndarray, b: np.ndarray, left_out: tuple[str, ...]) -> Comparison:
+def _test(
+    measure: str, a: np.ndarray, b: np.ndarray, left_out: tuple[str, ...]
+) -> Comparison:
     """Compares paired values (n,)."""
     d = a - b
     signed = stats.rankdata(np.abs(d[d != 0])) * np.sign(d[d != 0])
@@ -265,7 +391,11 @@ def _test(measure: str, a: np.ndarray, b: np.ndarray, left_out: tuple[str, ...])
     standardised = np.copysign(np.inf, mean) if mean else 0.0
     if np.ptp(d):  # else all are equal, and so is their mean without rounding
         t, mean, wilcoxon = stats.ttest_rel(a, b), d.mean(), stats.wilcoxon(d).pvalue
-        interval, t_test, standardised = tuple(t.confidence_interval()), t.pvalue, t.statistic / np.sqrt(len(d))
+        interval, t_test, standardised = (
+            tuple(t.confidence_interval()),
+            t.pvalue,
+            t.statistic / np.sqrt(len(d)),
+        )
     return Comparison(
         measure=measure,
         medians=(float(np.median(a)), float(np.median(b))),
@@ -281,10 +411,16 @@ def _test(measure: str, a: np.ndarray, b: np.ndarray, left_out: tuple[str, ...])
     )
 
 
-def sentences(report: Report, comparisons: Sequence[Comparison], a: str, b: str) -> list[str]:
+def sentences(
+    report: Report, comparisons: Sequence[Comparison], a: str, b: str
+) -> list[str]:
     """Returns a line a measure, with everything that a reader needs to doubt it."""
     head = f"A: {a}; B: {b}; pairs are seeds, what else was varied is averaged within a seed. Times are not compared."
-    everywhere = [name for name in comparisons[0].left_out if all(name in c.left_out for c in comparisons)]
+    everywhere = [
+        name
+        for name in comparisons[0].left_out
+        if all(name in c.left_out for c in comparisons)
+    ]
     if everywhere:
         head += f" Left out, since A or B lacks runs of it: {'; '.join(everywhere)}."
     lines = [head]
@@ -297,5 +433,8 @@ def sentences(report: Report, comparisons: Sequence[Comparison], a: str, b: str)
             line += f"difference {c.difference:.3g} (95 %: {c.interval[0]:.3g} to {c.interval[1]:.3g}), "
             line += f"paired t-test p = {c.t_test:.3g}, d_z {c.standardised:.2f}"
         others = "; ".join(name for name in c.left_out if name not in everywhere)
-        lines.append(f"{line}; n = {c.pairs}" + (f"; left out as well: {others}" if others else ""))
+        lines.append(
+            f"{line}; n = {c.pairs}"
+            + (f"; left out as well: {others}" if others else "")
+        )
     return lines

@@ -72,17 +72,25 @@ class TrialStore:
     def __init__(self, path: Path):
         self.path = path
         self.records: dict[str, dict] = {}
-        text = path.read_text(encoding="utf-8", errors="replace") if path.exists() else ""
+        text = (
+            path.read_text(encoding="utf-8", errors="replace") if path.exists() else ""
+        )
         for line in text.splitlines():
             with suppress(ValueError, KeyError, TypeError):
                 entry = json.loads(line)
                 self.records[entry["fingerprint"]] = entry["record"]
-        self._separator = "\n" if text and not text.endswith("\n") else ""  # behind a line that was cut short
+        self._separator = (
+            "\n" if text and not text.endswith("\n") else ""
+        )  # behind a line that was cut short
 
     def append(self, fingerprint: str, record: dict) -> None:
         """Keeps a record; it is on the disk when this returns."""
         with self.path.open("a", encoding="utf-8") as file:
-            file.write(self._separator + json.dumps({"fingerprint": fingerprint, "record": record}) + "\n")
+            file.write(
+                self._separator
+                + json.dumps({"fingerprint": fingerprint, "record": record})
+                + "\n"
+            )
             file.flush()
             os.fsync(file.fileno())
         self._separator, self.records[fingerprint] = "", record
@@ -111,22 +119,34 @@ def run_study(
     Raises:
         GpmpcError: A worker process died.
     """
-    missing = list({trial.fingerprint: trial for trial in trials if trial.fingerprint not in store.records}.values())
+    missing = list(
+        {
+            trial.fingerprint: trial
+            for trial in trials
+            if trial.fingerprint not in store.records
+        }.values()
+    )
     for trial in trials:
         if trial.fingerprint in store.records:
             progress(store.records[trial.fingerprint])
     try:
-        with closing(in_processes(partial(_record, run_trial), missing, workers)) as finished:
+        with closing(
+            in_processes(partial(_record, run_trial), missing, workers)
+        ) as finished:
             for index, record in finished:
                 store.append(missing[index].fingerprint, record)
                 progress(record)
     except BrokenProcessPool as error:
-        raise GpmpcError("a worker process died (out of memory?); the same command goes on where it stopped") from error
+        raise GpmpcError(
+            "a worker process died (out of memory?); the same command goes on where it stopped"
+        ) from error
     return [store.records[trial.fingerprint] | dict(trial.labels) for trial in trials]
 
 
 @report_compilation()
-def _record(run_trial: Callable[[Trial], dict[str, Any]], trial: Trial) -> dict[str, Any]:
+def _record(
+    run_trial: Callable[[Trial], dict[str, Any]], trial: Trial
+) -> dict[str, Any]:
     """Runs one trial in a worker process."""
     record = {**trial.labels, "seed": trial.seed}
     try:
@@ -160,7 +180,9 @@ def random_rows(count: int, size: int, seed: int, key: str = "size") -> list[int
         SettingError: There are fewer rows than the setting ``key`` asks for.
     """
     if size > count:
-        raise SettingError(key, f"must be at most {count}, the rows of the data; got {size}")
+        raise SettingError(
+            key, f"must be at most {count}, the rows of the data; got {size}"
+        )
     return np.sort(np.random.default_rng(seed).permutation(count)[:size]).tolist()
 
 
@@ -182,13 +204,27 @@ def fingerprint(settings: Any, *arrays: Any, code: Sequence[str] = ()) -> str:
 @cache
 def _source(pattern: str) -> bytes:
     path = Path(pattern)
-    found = [path] if path.is_absolute() else sorted(Path(gpmpc.__file__).parent.glob(pattern))
+    found = (
+        [path]
+        if path.is_absolute()
+        else sorted(Path(gpmpc.__file__).parent.glob(pattern))
+    )
     return b"".join(path.read_bytes() for path in found)
 
 
-def trained_model(train: Callable[..., Training], settings: Any, data: Transitions, seed: int, folder: Path) -> Path:
+def trained_model(
+    train: Callable[..., Training],
+    settings: Any,
+    data: Transitions,
+    seed: int,
+    folder: Path,
+) -> Path:
     """Trains GPs unless a file in ``folder`` holds those of the same settings, data and seed; returns that file."""
-    path = folder / "models" / f"{fingerprint([settings, seed], data.features, data.next_states)}.safetensors"
+    path = (
+        folder
+        / "models"
+        / f"{fingerprint([settings, seed], data.features, data.next_states)}.safetensors"
+    )
     if not path.exists():
         path.parent.mkdir(parents=True, exist_ok=True)
         with one_thread():

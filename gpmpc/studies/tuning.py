@@ -15,7 +15,14 @@ import pandas as pd
 
 from gpmpc.exceptions import GpmpcError
 from gpmpc.plotting import png, search_figure
-from gpmpc.studies._document import MISSING, Document, Table, figure_label, number, plain_text
+from gpmpc.studies._document import (
+    MISSING,
+    Document,
+    Table,
+    figure_label,
+    number,
+    plain_text,
+)
 from gpmpc.studies.study import derived_seed
 
 _FEWEST = 8  # candidates of which an importance is told
@@ -54,13 +61,17 @@ class Search:
         except ImportError as error:
             raise GpmpcError("tune: needs Optuna: pip install 'gpmpc[tune]'") from error
         optuna.logging.set_verbosity(optuna.logging.WARNING)
-        warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)  # of this sampler and the importances
+        warnings.simplefilter(
+            "ignore", optuna.exceptions.ExperimentalWarning
+        )  # of this sampler and the importances
         self._optuna, self._seed, kinds = optuna, seed, optuna.distributions
         self._study = optuna.create_study(direction="minimize")
         self._space: dict[str, Any] = {}
         for key, values in space.items():
             if isinstance(values, Interval):
-                kind: Any = kinds.IntDistribution if values.whole else kinds.FloatDistribution
+                kind: Any = (
+                    kinds.IntDistribution if values.whole else kinds.FloatDistribution
+                )
                 self._space[key] = kind(values.low, values.high, log=values.logarithmic)
             else:
                 self._space[key] = kinds.CategoricalDistribution([*values])
@@ -72,7 +83,9 @@ class Search:
         """Returns the next candidates, values by setting."""
         for _ in range(count):
             seed = derived_seed(self._seed, len(self.candidates))
-            self._study.sampler = self._optuna.samplers.TPESampler(seed=seed, multivariate=True, constant_liar=True)
+            self._study.sampler = self._optuna.samplers.TPESampler(
+                seed=seed, multivariate=True, constant_liar=True
+            )
             self._asked.append(self._study.ask(self._space))
             self.candidates.append(dict(self._asked[-1].params))
         return self.candidates[-count:]
@@ -95,7 +108,9 @@ class Search:
         if len(finite) < _FEWEST or len(self._space) < 2 or min(finite) == max(finite):
             return {}
         evaluator = self._optuna.importance.PedAnovaImportanceEvaluator()
-        return self._optuna.importance.get_param_importances(self._study, evaluator=evaluator)
+        return self._optuna.importance.get_param_importances(
+            self._study, evaluator=evaluator
+        )
 
     def document(self, base: float | None, command: str) -> Document:
         """Returns the candidates, what mattered, and how the best one is flown.
@@ -105,9 +120,19 @@ class Search:
             command: That flies the best candidate.
         """
         keys, matter = [*self._space], self.importances()
-        data = [{"candidate": i, "cost": cost, **self.candidates[i]} for i, cost in enumerate(self.costs)]
+        data = [
+            {"candidate": i, "cost": cost, **self.candidates[i]}
+            for i, cost in enumerate(self.costs)
+        ]
         best = sorted(data, key=lambda row: row["cost"])[:_SHOWN]
-        rows = [[str(row["candidate"]), _shown(row["cost"]), *(_text(row[key]) for key in keys)] for row in best]
+        rows = [
+            [
+                str(row["candidate"]),
+                _shown(row["cost"]),
+                *(_text(row[key]) for key in keys),
+            ]
+            for row in best
+        ]
         tables = [Table(["candidate", "cost", *keys], rows, "Best candidates")]
         if matter:
             share = [[key, f"{100 * value:.0f} %"] for key, value in matter.items()]

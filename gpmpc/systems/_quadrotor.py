@@ -24,7 +24,9 @@ RESPONSE_TIME = 0.1  # [s]
 _POSITION = {"x": "x", "y": "y", "z": "z"}
 _ATTITUDE = {"roll": "phi", "pitch": "theta", "yaw": "psi"}
 _POSITION_UNITS = dict.fromkeys("xyz", "m") | dict.fromkeys(("vx", "vy", "vz"), "m/s")
-_ANGLE_UNITS = dict.fromkeys(("phi", "theta", "psi"), "rad") | dict.fromkeys("pqr", "rad/s")
+_ANGLE_UNITS = dict.fromkeys(("phi", "theta", "psi"), "rad") | dict.fromkeys(
+    "pqr", "rad/s"
+)
 _FOLLOWS_POSITIONS: dict[str, Any] = {
     "tracked": ("x", "y", "z"),
     "rates": {"vx": "x", "vy": "y", "vz": "z"},
@@ -61,11 +63,20 @@ class Translational:
             # No direction with ux^2 + uy^2 > 1 exists; there the thrust is horizontal: max(s, 0) = (s + |s|) / 2.
             # The two small terms keep both roots differentiable where their argument would be zero.
             squared = 1 - u[1] * u[1] - u[2] * u[2]
-            vertical = ((squared + (squared * squared + 1e-24) ** 0.5) / 2 + 1e-12) ** 0.5
+            vertical = (
+                (squared + (squared * squared + 1e-24) ** 0.5) / 2 + 1e-12
+            ) ** 0.5
         else:
             roll, pitch = self.frozen_attitude
             vertical = math.cos(roll) * math.cos(pitch)
-        return [x[1], u[1] * thrust, x[3], u[2] * thrust, x[5], GRAVITY - vertical * thrust]
+        return [
+            x[1],
+            u[1] * thrust,
+            x[3],
+            u[2] * thrust,
+            x[5],
+            GRAVITY - vertical * thrust,
+        ]
 
 
 @dataclass(frozen=True)
@@ -76,7 +87,11 @@ class Rotational:
     """
 
     arm: float = 0.21  #: distance l from the centre of mass to a rotor [m]
-    inertia: tuple[float, float, float] = (0.005, 0.005, 0.0089)  #: principal moments Ixx, Iyy, Izz [kg m^2]
+    inertia: tuple[float, float, float] = (
+        0.005,
+        0.005,
+        0.0089,
+    )  #: principal moments Ixx, Iyy, Izz [kg m^2]
     #: the rotors' gyroscopic terms Jr W / Ixx and Jr W / Iyy, at their constant speed W [1/s]
     gyroscopic: tuple[float, float] = (0.01102, 0.01102)
 
@@ -106,7 +121,9 @@ class Coupled:
     """
 
     mass: float = 0.74  #: of the vehicle [kg]
-    rotational: Rotational = field(default_factory=Rotational)  #: the rotational subsystem
+    rotational: Rotational = field(
+        default_factory=Rotational
+    )  #: the rotational subsystem
 
     state_names = Translational.state_names + Rotational.state_names
     input_names = ("U1", *Rotational.input_names)
@@ -118,8 +135,18 @@ class Coupled:
         """d/dt of the twelve states [m/s, m/s^2, rad/s, rad/s^2]."""
         ux, uy, vertical = thrust_direction(x[6], x[8], x[10])
         thrust = u[0] / self.mass  # U1 / m [m/s^2]
-        turning = self.rotational.derivative([x[i] for i in range(6, 12)], [u[1], u[2], u[3]])
-        return [x[1], ux * thrust, x[3], uy * thrust, x[5], GRAVITY - vertical * thrust, *turning]
+        turning = self.rotational.derivative(
+            [x[i] for i in range(6, 12)], [u[1], u[2], u[3]]
+        )
+        return [
+            x[1],
+            ux * thrust,
+            x[3],
+            uy * thrust,
+            x[5],
+            GRAVITY - vertical * thrust,
+            *turning,
+        ]
 
 
 @dataclass(frozen=True)
@@ -137,7 +164,9 @@ class Map:
         return self.dynamics.derivative(x, u)
 
 
-def translational(time_step: float = 1.0, substeps: int = 1, **parameters: Any) -> System:
+def translational(
+    time_step: float = 1.0, substeps: int = 1, **parameters: Any
+) -> System:
     """Makes the translational subsystem; one Runge-Kutta substep is exact, its acceleration follows from the input."""
     return System(
         Translational(**parameters),
@@ -154,7 +183,9 @@ def translational(time_step: float = 1.0, substeps: int = 1, **parameters: Any) 
     )
 
 
-def rotational(time_step: float = 0.05, substeps: int = 10, **parameters: Any) -> System:
+def rotational(
+    time_step: float = 0.05, substeps: int = 10, **parameters: Any
+) -> System:
     """Makes the rotational subsystem at 20 Hz; a trajectory prescribes the attitudes that a flight along it needs."""
     return System(
         Rotational(**parameters),
@@ -174,14 +205,18 @@ def rotational(time_step: float = 0.05, substeps: int = 10, **parameters: Any) -
     )
 
 
-def coupled(mass: float = 0.74, time_step: float = 0.05, substeps: int = 2, **parameters: Any) -> System:
+def coupled(
+    mass: float = 0.74, time_step: float = 0.05, substeps: int = 2, **parameters: Any
+) -> System:
     """Makes the whole quadrotor at the rate of its inner loop, of a mass [kg] and ``parameters`` of ``Rotational``."""
     return System(
         Coupled(mass, Rotational(**parameters)),
         time_step,
         substeps,
         name="coupled",
-        units=_POSITION_UNITS | _ANGLE_UNITS | dict.fromkeys(("U1", "U2", "U3", "U4"), "N"),
+        units=_POSITION_UNITS
+        | _ANGLE_UNITS
+        | dict.fromkeys(("U1", "U2", "U3", "U4"), "N"),
         input_lower=(0.0, -2.0, -2.0, -2.0),
         input_upper=(20.0, 2.0, 2.0, 2.0),
         initial_input=(7.26, 0.0, 0.0, 0.0),  # the weight m g
@@ -199,7 +234,10 @@ def thrust_direction(phi: Any, theta: Any, psi: Any) -> tuple[Any, Any, Any]:
 
 
 def attitude_for_thrust_direction(
-    ux: np.ndarray, uy: np.ndarray, psi: np.ndarray | float = 0.0, convention: str = "exact"
+    ux: np.ndarray,
+    uy: np.ndarray,
+    psi: np.ndarray | float = 0.0,
+    convention: str = "exact",
 ) -> np.ndarray:
     """Roll and pitch (*batch, 2) [rad] that point the thrust along (ux, uy) at a yaw psi, by eq. (2) inverted.
 
@@ -214,24 +252,36 @@ def attitude_for_thrust_direction(
         theta = np.sign(phi) * np.arcsin(np.clip(ux, -1, 1))
     else:
         horizontal = np.cos(phi)
-        ratio = np.divide(ux, horizontal, out=np.zeros_like(horizontal), where=horizontal > 1e-12)
+        ratio = np.divide(
+            ux, horizontal, out=np.zeros_like(horizontal), where=horizontal > 1e-12
+        )
         theta = np.arcsin(np.clip(ratio, -1, 1))
     return np.stack([phi, theta], axis=-1)
 
 
-def attitudes_along(trajectory: Trajectory, count: int, outer_step: float = OUTER_STEP) -> np.ndarray:
+def attitudes_along(
+    trajectory: Trajectory, count: int, outer_step: float = OUTER_STEP
+) -> np.ndarray:
     """Roll and pitch (count, 2) [rad], one an outer step, that point the thrust where the trajectory needs it.
 
     Between two outer steps the velocity has to change by v[k+1] - v[k], so the thrust has to give the mean acceleration
     a = (v[k+1] - v[k]) / T beside the weight: U1 / m = |a - g e_z|, ux = a_x / (U1 / m), uy = a_y / (U1 / m).
     """
     velocities = trajectory.velocity(outer_step * np.arange(count + 1))
-    force = np.diff(velocities, axis=0) / outer_step - [0.0, 0.0, GRAVITY]  # over the mass [m/s^2]
-    direction = force / np.maximum(np.linalg.norm(force, axis=1, keepdims=True), 1e-12)  # of a free fall: none
+    force = np.diff(velocities, axis=0) / outer_step - [
+        0.0,
+        0.0,
+        GRAVITY,
+    ]  # over the mass [m/s^2]
+    direction = force / np.maximum(
+        np.linalg.norm(force, axis=1, keepdims=True), 1e-12
+    )  # of a free fall: none
     return attitude_for_thrust_direction(direction[:, 0], direction[:, 1])
 
 
-def approach_attitudes(angles: np.ndarray, count: int, hold: int, time_step: float, response_time: float) -> np.ndarray:
+def approach_attitudes(
+    angles: np.ndarray, count: int, hold: int, time_step: float, response_time: float
+) -> np.ndarray:
     """Rotational states (count, 6) that approach attitudes one after another at first order, as ``Cascade`` asks it to.
 
     Roll and pitch (K, 2) [rad], from the first of them on, are asked for ``hold`` inner steps each; times [s].
@@ -245,7 +295,9 @@ def approach_attitudes(angles: np.ndarray, count: int, hold: int, time_step: flo
     return states
 
 
-def rotational_states_along(trajectory: Trajectory, count: int, time_step: float) -> np.ndarray:
+def rotational_states_along(
+    trajectory: Trajectory, count: int, time_step: float
+) -> np.ndarray:
     """Rotational states phi, p, theta, q, psi, r (count, 6) [rad, rad/s], one an inner step, of a flight along it."""
     hold = max(1, round(OUTER_STEP / time_step))
     angles = attitudes_along(trajectory, -(-count // hold))

@@ -15,7 +15,9 @@ def library(name: str) -> Any:
     try:
         return import_module(name)
     except ImportError as error:
-        raise SettingError("system", f"needs {name}, which is not installed: pip install 'gpmpc[sim]'") from error
+        raise SettingError(
+            "system", f"needs {name}, which is not installed: pip install 'gpmpc[sim]'"
+        ) from error
 
 
 def numbers(x: Any, u: Any) -> tuple[Array, Array]:
@@ -48,10 +50,18 @@ class Simulator:
         """
         state, input = numbers(x, u)
         if state.ndim != 1:
-            raise SettingError("plant", "a simulator takes one step at a time; take closed_loop for each seed")
-        if (self._now is None or not np.array_equal(state, self._now)) and not self._set(state):
+            raise SettingError(
+                "plant",
+                "a simulator takes one step at a time; take closed_loop for each seed",
+            )
+        if (
+            self._now is None or not np.array_equal(state, self._now)
+        ) and not self._set(state):
             what = "this simulator cannot be set to a state"
-            raise SettingError("system", f"{what}: it takes no process noise and starts where it starts")
+            raise SettingError(
+                "system",
+                f"{what}: it takes no process noise and starts where it starts",
+            )
         self._now, self.ended = self._step(input)
         return self._now.copy()
 

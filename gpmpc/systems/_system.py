@@ -8,7 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from gpmpc.exceptions import GpmpcError, SettingError, ShapeError, check_number, check_numbers
+from gpmpc.exceptions import (
+    GpmpcError,
+    SettingError,
+    ShapeError,
+    check_number,
+    check_numbers,
+)
 from gpmpc.trajectories import Trajectory
 
 Array = np.ndarray
@@ -36,14 +42,20 @@ class System:
     time_step: float = 1.0  #: sampling time [s]
     substeps: int = 10  #: Runge-Kutta steps per sampling time
     name: str = ""  #: what it is called; by default as the class of its dynamics
-    units: Mapping[str, str] = field(default_factory=dict)  #: by name of state or input, such as ``{"x": "m"}``
+    units: Mapping[str, str] = field(
+        default_factory=dict
+    )  #: by name of state or input, such as ``{"x": "m"}``
     input_lower: Any = None  #: smallest inputs (m,); None where there is no limit
     input_upper: Any = None  #: largest inputs (m,)
     initial_input: Any = None  #: the input before the first step (m,), such as the one at rest; zero by default
     start: Any = None  #: where a flight begins (n,); on its reference by default
     goal: Any = None  #: the state that is held where no trajectory is followed (n,); zero by default
-    region: Any = None  #: smallest and largest states that random data start from (2, n)
-    angles: Sequence[str] = ()  #: states whose errors are taken within half a turn [rad]
+    region: Any = (
+        None  #: smallest and largest states that random data start from (2, n)
+    )
+    angles: Sequence[
+        str
+    ] = ()  #: states whose errors are taken within half a turn [rad]
     #: states that a trajectory prescribes and errors are reported of, in one unit; by default all in that of the first
     tracked: Sequence[str] = ()
     #: for a state, the tracked one that it is the time derivative of, such as ``{"vx": "x"}``
@@ -64,25 +76,44 @@ class System:
     def __post_init__(self) -> None:
         check_number("time_step", self.time_step, above=0, unit="[s]")
         check_number("substeps", self.substeps, least=1, whole=True)
-        states, inputs = (_names(self.dynamics, key) for key in ("state_names", "input_names"))
+        states, inputs = (
+            _names(self.dynamics, key) for key in ("state_names", "input_names")
+        )
         n, m, every = len(states), len(inputs), (*states, *inputs)
         self._set("name", self.name or type(self.dynamics).__name__)
         if unknown := set(self.units) - {*every}:
-            raise SettingError("units", f"must be of {', '.join(every)}; got {', '.join(sorted(unknown))}")
+            raise SettingError(
+                "units",
+                f"must be of {', '.join(every)}; got {', '.join(sorted(unknown))}",
+            )
         self._set("units", {name: self.units.get(name, UNKNOWN) for name in every})
-        tracked = self.tracked or [name for name in states if self.units[name] == self.units[states[0]]]
+        tracked = self.tracked or [
+            name for name in states if self.units[name] == self.units[states[0]]
+        ]
         for key, names in (("angles", self.angles), ("tracked", tracked)):
             self._set(key, tuple(names))
-        named = {"angles": self.angles, "tracked": self.tracked, "rates": self.rates, "pose": self.pose.values()}
+        named = {
+            "angles": self.angles,
+            "tracked": self.tracked,
+            "rates": self.rates,
+            "pose": self.pose.values(),
+        }
         for key, names in named.items():
             for name in names:
                 if name not in states:
-                    raise SettingError(key, f"must name states, {', '.join(states)}; got {name!r}")
+                    raise SettingError(
+                        key, f"must name states, {', '.join(states)}; got {name!r}"
+                    )
         for name in self.rates.values():
             if name not in self.tracked:
-                raise SettingError("rates", f"must be of tracked states, {', '.join(self.tracked)}; got {name!r}")
+                raise SettingError(
+                    "rates",
+                    f"must be of tracked states, {', '.join(self.tracked)}; got {name!r}",
+                )
         if len(found := {self.units[name] for name in self.tracked}) > 1:
-            raise SettingError("tracked", f"must be states of one unit; got {', '.join(sorted(found))}")
+            raise SettingError(
+                "tracked", f"must be states of one unit; got {', '.join(sorted(found))}"
+            )
         if self.lost != inf:
             check_number("lost", self.lost, above=0)
         for key, default in (
@@ -92,19 +123,37 @@ class System:
             ("goal", (0.0,) * n),
         ):
             given = getattr(self, key)
-            self._set(key, default if given is None else _floats(key, given, len(default)))
-        if any(low > high for low, high in zip(self.input_lower, self.input_upper, strict=True)):
-            raise SettingError("input_lower, input_upper", f"must not cross; got {self.input_lower, self.input_upper}")
+            self._set(
+                key, default if given is None else _floats(key, given, len(default))
+            )
+        if any(
+            low > high
+            for low, high in zip(self.input_lower, self.input_upper, strict=True)
+        ):
+            raise SettingError(
+                "input_lower, input_upper",
+                f"must not cross; got {self.input_lower, self.input_upper}",
+            )
         if self.start is not None:
             self._set("start", _floats("start", self.start, n))
         if self.region is not None:
             if len(self.region) != 2:
-                raise SettingError("region", f"must be the smallest and the largest states; got {self.region!r}")
-            self._set("region", tuple(_floats("region", side, n) for side in self.region))
+                raise SettingError(
+                    "region",
+                    f"must be the smallest and the largest states; got {self.region!r}",
+                )
+            self._set(
+                "region", tuple(_floats("region", side, n) for side in self.region)
+            )
         if (known := self.nominal) is not None:
             own = states, inputs, self.time_step
-            if (found := (known.state_names, known.input_names, known.time_step)) != own:
-                raise SettingError("nominal", f"must have the states, inputs and time step {own}; got {found}")
+            if (
+                found := (known.state_names, known.input_names, known.time_step)
+            ) != own:
+                raise SettingError(
+                    "nominal",
+                    f"must have the states, inputs and time step {own}; got {found}",
+                )
         self._check_dynamics()
 
     def _set(self, key: str, value: Any) -> None:
@@ -148,14 +197,20 @@ class System:
         """
         if hasattr(self.dynamics, "successor"):
             return list(self._check_length("successor", self.dynamics.successor(x, u)))
-        f, h, n = self.dynamics.derivative, self.time_step / self.substeps, len(self.dynamics.state_names)
+        f, h, n = (
+            self.dynamics.derivative,
+            self.time_step / self.substeps,
+            len(self.dynamics.state_names),
+        )
         x = [x[i] for i in range(n)]
         for _ in range(self.substeps):
             k1 = self._check_length("derivative", f(x, u))
             k2 = f([x[i] + h / 2 * k1[i] for i in range(n)], u)
             k3 = f([x[i] + h / 2 * k2[i] for i in range(n)], u)
             k4 = f([x[i] + h * k3[i] for i in range(n)], u)
-            x = [x[i] + h / 6 * (k1[i] + 2 * k2[i] + 2 * k3[i] + k4[i]) for i in range(n)]
+            x = [
+                x[i] + h / 6 * (k1[i] + 2 * k2[i] + 2 * k3[i] + k4[i]) for i in range(n)
+            ]
         return x
 
     def reference_states(self, trajectory: Trajectory | None, count: int) -> Array:
@@ -172,38 +227,56 @@ class System:
         positions, states = trajectory(times), np.tile(np.array(self.goal), (count, 1))
         if positions.shape[1:] != (len(self.tracked),):
             what = f"must prescribe {', '.join(self.tracked)} of {self.name}"
-            raise ShapeError(f"trajectory: {what}; got positions of {positions.shape[-1]} numbers")
+            raise ShapeError(
+                f"trajectory: {what}; got positions of {positions.shape[-1]} numbers"
+            )
         states[:, self.tracked_indices] = positions
         if self.rates:
             velocities = trajectory.velocity(times)
             for name, of in self.rates.items():
-                states[:, self.state_names.index(name)] = velocities[:, self.tracked.index(of)]
+                states[:, self.state_names.index(name)] = velocities[
+                    :, self.tracked.index(of)
+                ]
         return states
 
     def _check_length(self, method: str, entries: Any) -> Any:
         got = len(entries) if hasattr(entries, "__len__") else type(entries).__name__
         if got != (n := len(self.dynamics.state_names)):
-            raise ShapeError(f"{method} must give {n} entries, one for each of state_names; got {got}")
+            raise ShapeError(
+                f"{method} must give {n} entries, one for each of state_names; got {got}"
+            )
         return entries
 
     def _check_dynamics(self) -> None:
         """Evaluates the dynamics once, where the system starts; a simulator under way a step would move."""
-        if not (hasattr(self.dynamics, "derivative") or hasattr(self.dynamics, "successor")):
+        if not (
+            hasattr(self.dynamics, "derivative") or hasattr(self.dynamics, "successor")
+        ):
             what = "must have derivative(x, u), or successor(x, u) for the next state"
-            raise SettingError("dynamics", f"{what}; got {type(self.dynamics).__name__}")
+            raise SettingError(
+                "dynamics", f"{what}; got {type(self.dynamics).__name__}"
+            )
         if self.stateful:
             return
-        x, u = list(self.goal if self.start is None else self.start), list(self.initial_input)
+        x, u = (
+            list(self.goal if self.start is None else self.start),
+            list(self.initial_input),
+        )
         try:
             entries = [float(entry) for entry in self.successor(x, u)]
         except GpmpcError:
             raise
         except Exception as error:
             what = f"must step from state {x} with input {u}"
-            raise SettingError("dynamics", f"{what}; got {type(error).__name__}: {error}") from error
+            raise SettingError(
+                "dynamics", f"{what}; got {type(error).__name__}: {error}"
+            ) from error
         for name, entry in zip(self.state_names, entries, strict=True):
             if not isfinite(entry):
-                raise SettingError("dynamics", f"must be finite at state {x}, input {u}; {name} is {entry} after it")
+                raise SettingError(
+                    "dynamics",
+                    f"must be finite at state {x}, input {u}; {name} is {entry} after it",
+                )
 
 
 def step(plant: System, state: Array, input: Array) -> Array:
@@ -218,14 +291,22 @@ def step(plant: System, state: Array, input: Array) -> Array:
     """
     shapes = ((len(plant.dynamics.state_names),), (len(plant.dynamics.input_names),))
     if (found := (np.shape(state), np.shape(input))) != shapes:
-        raise ShapeError(f"state and input must have shapes {shapes[0]} and {shapes[1]}; got {found[0]} and {found[1]}")
+        raise ShapeError(
+            f"state and input must have shapes {shapes[0]} and {shapes[1]}; got {found[0]} and {found[1]}"
+        )
     return np.array(plant.successor(state, input), dtype=float)
 
 
 def step_many(plant: System, states: Array, inputs: Array) -> Array:
     """The next states (T, n) of T copies of a plant, from states (T, n) and inputs (T, m), in one evaluation."""
     entries = plant.successor(states.T, inputs.T)
-    return np.stack([np.broadcast_to(np.asarray(entry, dtype=float), len(states)) for entry in entries], axis=1)
+    return np.stack(
+        [
+            np.broadcast_to(np.asarray(entry, dtype=float), len(states))
+            for entry in entries
+        ],
+        axis=1,
+    )
 
 
 def sin(angle: Any) -> Any:
@@ -246,8 +327,15 @@ def exp(value: Any) -> Any:
 def _names(dynamics: Any, key: str) -> tuple[str, ...]:
     names = getattr(dynamics, key, None)
     listed = isinstance(names, Sequence) and not isinstance(names, str)
-    if not listed or not names or not all(isinstance(name, str) for name in names) or len(set(names)) < len(names):
-        raise SettingError(f"dynamics.{key}", f"must be a list of different names; got {names!r}")
+    if (
+        not listed
+        or not names
+        or not all(isinstance(name, str) for name in names)
+        or len(set(names)) < len(names)
+    ):
+        raise SettingError(
+            f"dynamics.{key}", f"must be a list of different names; got {names!r}"
+        )
     return tuple(names)
 
 

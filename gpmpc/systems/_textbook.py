@@ -21,7 +21,9 @@ class _Body:
 
     def __post_init__(self) -> None:
         for key, value in vars(self).items():
-            limits: dict[str, Any] = {"least" if key in self.may_be_zero else "above": 0}
+            limits: dict[str, Any] = {
+                "least" if key in self.may_be_zero else "above": 0
+            }
             numbers = value if isinstance(value, tuple | list) else [value]
             for number in () if key in self.words else numbers:
                 check_number(key, number, **limits)
@@ -70,7 +72,11 @@ class Pendulum(_Body):
 
     def derivative(self, x: Any, u: Any) -> list[Any]:
         """d/dt (angle, rate) [rad/s, rad/s^2]."""
-        torque = self.mass * GRAVITY * self.length / 2 * sin(x[0]) - self.damping * x[1] + u[0]
+        torque = (
+            self.mass * GRAVITY * self.length / 2 * sin(x[0])
+            - self.damping * x[1]
+            + u[0]
+        )
         return [x[1], torque / (self.mass * self.length**2 / 3)]
 
 
@@ -85,7 +91,10 @@ def pendulum(time_step: float = 0.05, **parameters: float) -> System:
         input_lower=[-2.0],
         input_upper=[2.0],
         start=[pi, 0.0],
-        region=[[-2.0, -8.0], [2 * pi + 2, 8.0]],  # around the whole circle, hanging in the middle
+        region=[
+            [-2.0, -8.0],
+            [2 * pi + 2, 8.0],
+        ],  # around the whole circle, hanging in the middle
         angles=["angle"],
         rates={"rate": "angle"},
     )
@@ -103,10 +112,15 @@ class CartPole(_Body):
 
     def derivative(self, x: Any, u: Any) -> list[Any]:
         """d/dt (position, velocity, angle, rate) [m/s, m/s^2, rad/s, rad/s^2]."""
-        total, moment = self.cart_mass + self.pole_mass, self.pole_mass * self.half_length
+        total, moment = (
+            self.cart_mass + self.pole_mass,
+            self.pole_mass * self.half_length,
+        )
         s, c = sin(x[2]), cos(x[2])
         push = (u[0] + moment * x[3] * x[3] * s) / total
-        turn = (GRAVITY * s - c * push) / (self.half_length * (4 / 3 - self.pole_mass * c * c / total))
+        turn = (GRAVITY * s - c * push) / (
+            self.half_length * (4 / 3 - self.pole_mass * c * c / total)
+        )
         return [x[1], push - moment * turn * c / total, x[3], turn]
 
 
@@ -117,7 +131,13 @@ def cart_pole(time_step: float = 0.05, **parameters: float) -> System:
         time_step,
         2,
         name="cart_pole",
-        units={"position": "m", "velocity": "m/s", "angle": "rad", "rate": "rad/s", "force": "N"},
+        units={
+            "position": "m",
+            "velocity": "m/s",
+            "angle": "rad",
+            "rate": "rad/s",
+            "force": "N",
+        },
         input_lower=[-10.0],
         input_upper=[10.0],
         start=[0.0, 0.0, pi, 0.0],
@@ -139,11 +159,20 @@ class DoublePendulum(_Body):
 
     masses: Sequence[float] = (0.5234602302, 0.6255677234)  #: of the links [kg]
     first_length: float = 0.2  #: of the first link [m]
-    centres: Sequence[float] = (0.2, 0.2556930544)  #: from each link's joint to its centre of mass [m]
-    inertias: Sequence[float] = (0.0109487904, 0.0099708947)  #: of the links about their centres of mass [kg m^2]
+    centres: Sequence[float] = (
+        0.2,
+        0.2556930544,
+    )  #: from each link's joint to its centre of mass [m]
+    inertias: Sequence[float] = (
+        0.0109487904,
+        0.0099708947,
+    )  #: of the links about their centres of mass [kg m^2]
     actuated: Literal["elbow", "shoulder"] = "elbow"  #: an acrobot, or a pendubot
 
-    state_names, input_names = ("shoulder", "shoulder_rate", "elbow", "elbow_rate"), ("torque",)
+    state_names, input_names = (
+        ("shoulder", "shoulder_rate", "elbow", "elbow_rate"),
+        ("torque",),
+    )
     words = ("actuated",)
 
     def __post_init__(self) -> None:
@@ -152,7 +181,12 @@ class DoublePendulum(_Body):
 
     def derivative(self, x: Any, u: Any) -> list[Any]:
         """d/dt (shoulder, shoulder_rate, elbow, elbow_rate) [rad/s, rad/s^2]."""
-        (m1, m2), (c1, c2), (i1, i2), l1 = self.masses, self.centres, self.inertias, self.first_length
+        (m1, m2), (c1, c2), (i1, i2), l1 = (
+            self.masses,
+            self.centres,
+            self.inertias,
+            self.first_length,
+        )
         a, da, b, db = x[0], x[1], x[2], x[3]
         # D (dda, ddb) + h + phi = torques
         coupling = m2 * l1 * c2
@@ -160,15 +194,27 @@ class DoublePendulum(_Body):
         d12 = m2 * c2**2 + coupling * cos(b) + i2
         d22 = m2 * c2**2 + i2
         fall = -m2 * c2 * GRAVITY * sin(a + b)
-        r1 = coupling * sin(b) * (2 * da * db + db * db) + (m1 * c1 + m2 * l1) * GRAVITY * sin(a) - fall
+        r1 = (
+            coupling * sin(b) * (2 * da * db + db * db)
+            + (m1 * c1 + m2 * l1) * GRAVITY * sin(a)
+            - fall
+        )
         r2 = -coupling * sin(b) * da * da - fall
         r1, r2 = (r1, r2 + u[0]) if self.actuated == "elbow" else (r1 + u[0], r2)
         determinant = d11 * d22 - d12 * d12
-        return [da, (d22 * r1 - d12 * r2) / determinant, db, (d11 * r2 - d12 * r1) / determinant]
+        return [
+            da,
+            (d22 * r1 - d12 * r2) / determinant,
+            db,
+            (d11 * r2 - d12 * r1) / determinant,
+        ]
 
 
 def acrobot(
-    masses: Sequence[float] = (1.0, 1.0), first_length: float = 1.0, time_step: float = 0.05, torque: float = 10.0
+    masses: Sequence[float] = (1.0, 1.0),
+    first_length: float = 1.0,
+    time_step: float = 0.05,
+    torque: float = 10.0,
 ) -> System:
     """Makes an acrobot that hangs at first (Spong, 1995, and its table); ``torque`` is its largest [N m]."""
     links = DoublePendulum(masses, first_length, (0.5, 1.0), (0.083, 0.33))
@@ -176,7 +222,10 @@ def acrobot(
 
 
 def double_pendulum(
-    actuated: Literal["elbow", "shoulder"] = "elbow", time_step: float = 0.02, torque: float = 6.0, **parameters: Any
+    actuated: Literal["elbow", "shoulder"] = "elbow",
+    time_step: float = 0.02,
+    torque: float = 6.0,
+    **parameters: Any,
 ) -> System:
     """Makes the double pendulum of the RealAIGym league, which hangs at first; ``torque`` is its largest [N m]."""
     links = DoublePendulum(actuated=actuated, **parameters)
@@ -184,14 +233,25 @@ def double_pendulum(
 
 
 def _two_links(
-    name: str, links: DoublePendulum, time_step: float, substeps: int, torque: float, rates: tuple[float, float]
+    name: str,
+    links: DoublePendulum,
+    time_step: float,
+    substeps: int,
+    torque: float,
+    rates: tuple[float, float],
 ) -> System:
     return System(
         links,
         time_step,
         substeps,
         name=name,
-        units=dict(zip((*links.state_names, "torque"), ("rad", "rad/s", "rad", "rad/s", "N m"), strict=True)),
+        units=dict(
+            zip(
+                (*links.state_names, "torque"),
+                ("rad", "rad/s", "rad", "rad/s", "N m"),
+                strict=True,
+            )
+        ),
         input_lower=[-torque],
         input_upper=[torque],
         start=[pi, 0.0, 0.0, 0.0],
@@ -228,7 +288,14 @@ def planar_quadrotor(time_step: float = 0.05, **parameters: float) -> System:
         time_step,
         2,
         name="planar_quadrotor",
-        units={"x": "m", "y": "m", "tilt": "rad", "vx": "m/s", "vy": "m/s", "tilt_rate": "rad/s"}
+        units={
+            "x": "m",
+            "y": "m",
+            "tilt": "rad",
+            "vx": "m/s",
+            "vy": "m/s",
+            "tilt_rate": "rad/s",
+        }
         | {"right": "N", "left": "N"},
         input_lower=[0.0, 0.0],
         input_upper=[weight, weight],  # of each rotor: twice the weight together
@@ -264,10 +331,20 @@ class StirredTank(_Body):
 
     def derivative(self, x: Any, u: Any) -> list[Any]:
         """d/dt (concentration, temperature) [mol/(L s), K/s]."""
-        exchange, reaction = self.flow / self.volume, self.rate * exp(-self.activation / x[1]) * x[0]  # per minute
+        exchange, reaction = (
+            self.flow / self.volume,
+            self.rate * exp(-self.activation / x[1]) * x[0],
+        )  # per minute
         cooling = self.transfer / (self.volume * self.capacity) * (u[0] - x[1])
-        warming = exchange * (self.feed_temperature - x[1]) + self.heat / self.capacity * reaction + cooling
-        return [(exchange * (self.feed_concentration - x[0]) - reaction) / 60, warming / 60]
+        warming = (
+            exchange * (self.feed_temperature - x[1])
+            + self.heat / self.capacity * reaction
+            + cooling
+        )
+        return [
+            (exchange * (self.feed_concentration - x[0]) - reaction) / 60,
+            warming / 60,
+        ]
 
 
 def stirred_tank(time_step: float = 3.0, **parameters: float) -> System:

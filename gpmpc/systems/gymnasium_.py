@@ -15,14 +15,28 @@ from gpmpc.systems._simulators import Simulator, library
 from gpmpc.systems._system import System, step
 
 Array = np.ndarray
-OURS = ("acrobot", "cart_pole", "double_integrator", "double_pendulum", "pendulum", "planar_quadrotor")
+OURS = (
+    "acrobot",
+    "cart_pole",
+    "double_integrator",
+    "double_pendulum",
+    "pendulum",
+    "planar_quadrotor",
+)
 OURS += ("stirred_tank", "translational")
 
 
 class _Environment(Simulator):
     """The dynamics of a gymnasium environment."""
 
-    def __init__(self, name: Any, observe: Any, state_names: Sequence[str], input_names: Sequence[str], settings: Any):
+    def __init__(
+        self,
+        name: Any,
+        observe: Any,
+        state_names: Sequence[str],
+        input_names: Sequence[str],
+        settings: Any,
+    ):
         gymnasium = library("gymnasium")
         self.environment = name
         if isinstance(name, str):
@@ -30,28 +44,39 @@ class _Environment(Simulator):
                 made = {"max_episode_steps": -1, "disable_env_checker": True} | settings
                 self.environment = gymnasium.make(name, **made)
             except (gymnasium.error.Error, ImportError, TypeError) as error:
-                raise SettingError("environment", f"{name!r}: {' '.join(str(error).split())}") from error
+                raise SettingError(
+                    "environment", f"{name!r}: {' '.join(str(error).split())}"
+                ) from error
         spaces = {"action": self.environment.action_space}
         if observe is None:
             spaces["observation"] = self.environment.observation_space
         for kind, space in spaces.items():
             if not isinstance(space, gymnasium.spaces.Box) or len(space.shape) != 1:
-                remedy = "; name a function with observe" if kind == "observation" else ""
+                remedy = (
+                    "; name a function with observe" if kind == "observation" else ""
+                )
                 what = f"the {kind} space must be a Box of one dimension"
                 raise SettingError("environment", f"{what}; got {space}{remedy}")
         action = spaces["action"]
-        self._observe, self.limits = observe, (action.low.astype(float), action.high.astype(float))
+        self._observe, self.limits = (
+            observe,
+            (action.low.astype(float), action.high.astype(float)),
+        )
         n, m = len(self.reset(0)), len(action.low)
         self.state_names = tuple(state_names or [f"x{i + 1}" for i in range(n)])
         self.input_names = tuple(input_names or [f"u{i + 1}" for i in range(m)])
         if (found := (len(self.state_names), len(self.input_names))) != (n, m):
-            raise ShapeError(f"state_names and input_names must be {n} and {m} names; got {found[0]} and {found[1]}")
+            raise ShapeError(
+                f"state_names and input_names must be {n} and {m} names; got {found[0]} and {found[1]}"
+            )
 
     def _reset(self, seed: int) -> Array:
         return self._state(self.environment.reset(seed=seed)[0])
 
     def _step(self, input: Array) -> tuple[Array, bool]:
-        action = np.clip(input, *self.limits).astype(self.environment.action_space.dtype)
+        action = np.clip(input, *self.limits).astype(
+            self.environment.action_space.dtype
+        )
         observation, _, terminated, _, _ = self.environment.step(action)
         return self._state(observation), bool(terminated)
 
@@ -59,13 +84,20 @@ class _Environment(Simulator):
         """Sets a MuJoCo environment to a state."""
         inner = self.environment.unwrapped
         model: Any = getattr(inner, "model", None)
-        if self._observe is not None or not hasattr(inner, "set_state") or len(state) != model.nq + model.nv:
+        if (
+            self._observe is not None
+            or not hasattr(inner, "set_state")
+            or len(state) != model.nq + model.nv
+        ):
             return False
         inner.set_state(state[: model.nq], state[model.nq :])
         return True
 
     def _state(self, observation: Any) -> Array:
-        state = np.array(observation if self._observe is None else self._observe(observation), dtype=float)
+        state = np.array(
+            observation if self._observe is None else self._observe(observation),
+            dtype=float,
+        )
         if state.ndim != 1:
             raise ShapeError(f"observe must give a state (n,); got {state.shape}")
         return state
@@ -96,11 +128,19 @@ def gymnasium_system(
         ShapeError: Names do not fit it.
     """
     dynamics = _Environment(environment, observe, state_names, input_names, make or {})
-    time_step = getattr(dynamics.environment.unwrapped, "dt", None) if time_step is None else time_step
+    time_step = (
+        getattr(dynamics.environment.unwrapped, "dt", None)
+        if time_step is None
+        else time_step
+    )
     if time_step is None:
         raise SettingError("time_step", "is not known of this environment; say it [s]")
     lower, upper = dynamics.limits
-    given = {"name": str(environment), "input_lower": lower, "input_upper": upper} | settings
+    given = {
+        "name": str(environment),
+        "input_lower": lower,
+        "input_upper": upper,
+    } | settings
     return System(dynamics, float(time_step), 1, **given)
 
 
@@ -111,7 +151,9 @@ def make_environment(system: System | str, **settings: Any) -> Any:
     episode ends where they are farther from it than at the start, and than ``System.lost``.
     """
     gymnasium = library("gymnasium")
-    flown: System = getattr(systems, system)(**settings) if isinstance(system, str) else system
+    flown: System = (
+        getattr(systems, system)(**settings) if isinstance(system, str) else system
+    )
 
     class Environment(gymnasium.Env):  # type: ignore[name-defined]
         """A system as an environment."""
@@ -121,30 +163,48 @@ def make_environment(system: System | str, **settings: Any) -> Any:
         def __init__(self) -> None:
             n = len(flown.state_names)
             lower, upper = np.array(flown.input_lower), np.array(flown.input_upper)
-            self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (n,), np.float64)
+            self.observation_space = gymnasium.spaces.Box(
+                -np.inf, np.inf, (n,), np.float64
+            )
             self.action_space = gymnasium.spaces.Box(lower, upper, dtype=np.float64)
             self.state = np.array(flown.goal)
 
-        def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Array, dict]:
+        def reset(
+            self, *, seed: int | None = None, options: Any = None
+        ) -> tuple[Array, dict]:
             """Starts where the system starts, or from its region."""
             super().reset(seed=seed)
             region: Any = flown.region if flown.start is None else None
-            start: Any = flown.start or flown.goal if region is None else self.np_random.uniform(*region)
+            start: Any = (
+                flown.start or flown.goal
+                if region is None
+                else self.np_random.uniform(*region)
+            )
             self.state = np.array(start, dtype=float)
             self._limit = max(flown.lost, 1.001 * self._distance())
             return self.state.copy(), {}
 
         def step(self, action: Array) -> tuple[Array, float, bool, bool, dict]:
             """Takes one step; the action is clipped."""
-            action = np.clip(np.asarray(action, dtype=float), flown.input_lower, flown.input_upper)
+            action = np.clip(
+                np.asarray(action, dtype=float), flown.input_lower, flown.input_upper
+            )
             with np.errstate(over="ignore", invalid="ignore"):
                 self.state = step(flown, self.state, action)
             distance = self._distance()
-            return self.state.copy(), -(distance**2), not distance <= self._limit, False, {}
+            return (
+                self.state.copy(),
+                -(distance**2),
+                not distance <= self._limit,
+                False,
+                {},
+            )
 
         def _distance(self) -> float:
             errors = self.state - flown.goal
-            errors[flown.angle_indices] = (errors[flown.angle_indices] + np.pi) % (2 * np.pi) - np.pi
+            errors[flown.angle_indices] = (errors[flown.angle_indices] + np.pi) % (
+                2 * np.pi
+            ) - np.pi
             return float(np.linalg.norm(errors[flown.tracked_indices]))
 
     return Environment()
@@ -157,5 +217,10 @@ def register_environments() -> list[str]:
     for name, system in zip(names, OURS, strict=True):
         if name not in gymnasium.registry:
             entry = f"{__name__}:make_environment"
-            gymnasium.register(name, entry_point=entry, max_episode_steps=500, kwargs={"system": system})
+            gymnasium.register(
+                name,
+                entry_point=entry,
+                max_episode_steps=500,
+                kwargs={"system": system},
+            )
     return names

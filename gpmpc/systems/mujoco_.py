@@ -25,7 +25,9 @@ class _Model:
         try:
             self.model = self.mujoco.MjModel.from_xml_path(str(path))
         except (ValueError, OSError) as error:
-            raise DataError(f"{path}: is no MJCF model ({' '.join(str(error).split())})") from error
+            raise DataError(
+                f"{path}: is no MJCF model ({' '.join(str(error).split())})"
+            ) from error
         self.path, self.data = path, self.mujoco.MjData(self.model)
         self.controls = self.indices("actuator", actuators)
         limited = self.model.actuator_ctrllimited.astype(bool)[self.controls]
@@ -45,7 +47,13 @@ class _Model:
 class _Joints(_Model):
     """Dynamics of a model by its joints, all of them hinges and slides; actuators that are not named stay at zero."""
 
-    def __init__(self, path: str | Path, joints: Sequence[str], actuators: Sequence[str], substeps: int = 1):
+    def __init__(
+        self,
+        path: str | Path,
+        joints: Sequence[str],
+        actuators: Sequence[str],
+        substeps: int = 1,
+    ):
         super().__init__(path, actuators)
         model, joint = self.model, self.mujoco.mjtJoint
         kinds = {int(joint.mjJNT_SLIDE), int(joint.mjJNT_HINGE)}
@@ -53,10 +61,20 @@ class _Joints(_Model):
         if model.njnt != len(found) or not set(model.jnt_type.tolist()) <= kinds:
             what = f"must name all {model.njnt} joints of {path}, hinges and slides; name sensors of other models"
             raise SettingError("joints", f"{what}; got {list(joints)}")
-        self.substeps, q, v = substeps, model.jnt_qposadr[found], model.jnt_dofadr[found]
+        self.substeps, q, v = (
+            substeps,
+            model.jnt_qposadr[found],
+            model.jnt_dofadr[found],
+        )
         # Where the states stand in MuJoCo's own: time, qpos, qvel, act.
-        self._order = np.concatenate([1 + q, 1 + model.nq + v, 1 + model.nq + model.nv + np.arange(model.na)])
-        lagging = [f"{model.actuator(i).name}_activation" for i in range(model.nu) if model.actuator_actadr[i] >= 0]
+        self._order = np.concatenate(
+            [1 + q, 1 + model.nq + v, 1 + model.nq + model.nv + np.arange(model.na)]
+        )
+        lagging = [
+            f"{model.actuator(i).name}_activation"
+            for i in range(model.nu)
+            if model.actuator_actadr[i] >= 0
+        ]
         self.state_names = (*joints, *(f"{name}_rate" for name in joints), *lagging)
         self.input_names = tuple(actuators)
 
@@ -70,7 +88,10 @@ class _Joints(_Model):
         """The next state (n,) or states (n, T) from a state and an input, or T of each."""
         states, inputs = numbers(x, u)
         single = states.ndim == 1
-        states, inputs = states.reshape(len(states), -1), inputs.reshape(len(inputs), -1)
+        states, inputs = (
+            states.reshape(len(states), -1),
+            inputs.reshape(len(inputs), -1),
+        )
         count, model = states.shape[1], self.model
         initial = np.zeros((count, 1 + model.nq + model.nv + model.na))
         initial[:, self._order] = states.T
@@ -78,7 +99,9 @@ class _Joints(_Model):
         control[:, :, self.controls] = inputs.T[:, None]
         after = np.full(states.shape, np.nan)
         if np.isfinite(initial).all() and np.isfinite(control).all():
-            moved, _ = library("mujoco.rollout").rollout(model, self.data, initial, control)
+            moved, _ = library("mujoco.rollout").rollout(
+                model, self.data, initial, control
+            )
             after = moved[:, -1, self._order].T
         return after[:, 0] if single else after
 
@@ -103,12 +126,26 @@ class _Sensors(_Model, Simulator):
         model = self.model
         found = self.indices("sensor", sensors)
         sizes = model.sensor_dim[found].tolist()
-        places = [model.sensor_adr[i] + np.arange(d) for i, d in zip(found, sizes, strict=True)]
-        self._places, self._observe, self.substeps, self._delay = np.concatenate(places), observe, substeps, input_delay
-        own = [f"{name}{k + 1}" if d > 1 else name for name, d in zip(sensors, sizes, strict=True) for k in range(d)]
+        places = [
+            model.sensor_adr[i] + np.arange(d)
+            for i, d in zip(found, sizes, strict=True)
+        ]
+        self._places, self._observe, self.substeps, self._delay = (
+            np.concatenate(places),
+            observe,
+            substeps,
+            input_delay,
+        )
+        own = [
+            f"{name}{k + 1}" if d > 1 else name
+            for name, d in zip(sensors, sizes, strict=True)
+            for k in range(d)
+        ]
         self.state_names, self.input_names = tuple(state_names or own), tuple(actuators)
         if (n := len(self.reset(0))) != len(self.state_names):
-            raise SettingError("state_names", f"must be {n} names; got {len(self.state_names)}")
+            raise SettingError(
+                "state_names", f"must be {n} names; got {len(self.state_names)}"
+            )
 
     def _reset(self, seed: int) -> Array:
         if self.model.nkey:
@@ -157,12 +194,23 @@ def mujoco_system(
             named, or neither.
     """
     if bool(joints) == bool(sensors):
-        raise SettingError("joints, sensors", "name either the joints or the sensors that are the state")
+        raise SettingError(
+            "joints, sensors",
+            "name either the joints or the sensors that are the state",
+        )
     if joints:
         dynamics: _Joints | _Sensors = _Joints(path, joints, actuators, substeps)
-        settings = {"rates": {f"{name}_rate": name for name in settings.get("tracked") or ()}} | settings
+        settings = {
+            "rates": {f"{name}_rate": name for name in settings.get("tracked") or ()}
+        } | settings
     else:
-        dynamics = _Sensors(path, sensors, actuators, substeps=substeps, **(observation or {}))
+        dynamics = _Sensors(
+            path, sensors, actuators, substeps=substeps, **(observation or {})
+        )
     lower, upper = dynamics.limits
-    given = {"name": Path(path).stem, "input_lower": lower, "input_upper": upper} | settings
+    given = {
+        "name": Path(path).stem,
+        "input_lower": lower,
+        "input_upper": upper,
+    } | settings
     return System(dynamics, substeps * float(dynamics.model.opt.timestep), 1, **given)

@@ -25,11 +25,28 @@ class RigidBody:
     """A rigid body that four rotors lift and turn; it knows neither drag nor that the rotors lag."""
 
     mass: float = 0.4  #: [kg]
-    inertia: tuple[float, float, float] = (0.0025, 0.0025, 0.0045)  #: principal moments of inertia [kg m^2]
+    inertia: tuple[float, float, float] = (
+        0.0025,
+        0.0025,
+        0.0045,
+    )  #: principal moments of inertia [kg m^2]
     arm: float = 0.12  #: from the centre to a rotor, along x and along y [m]
     yaw: float = 0.016  #: torque about z that a rotor's thrust brings [m]
 
-    state_names = ("x", "vx", "y", "vy", "z", "vz", "roll", "p", "pitch", "q", "yaw", "r")
+    state_names = (
+        "x",
+        "vx",
+        "y",
+        "vy",
+        "z",
+        "vz",
+        "roll",
+        "p",
+        "pitch",
+        "q",
+        "yaw",
+        "r",
+    )
     input_names = ROTORS
 
     def __post_init__(self) -> None:
@@ -42,7 +59,10 @@ class RigidBody:
         (p, q, r), (ixx, iyy, izz) = (x[7], x[9], x[11]), self.inertia
         s1, c1, s2, c2, s3, c3 = (f(x[i]) for i in (6, 8, 10) for f in (sin, cos))
         lift, turned = (u[0] + u[1] + u[2] + u[3]) / self.mass, q * s1 + r * c1
-        roll, pitch = self.arm * (u[0] - u[1] - u[2] + u[3]), self.arm * (u[2] + u[3] - u[0] - u[1])
+        roll, pitch = (
+            self.arm * (u[0] - u[1] - u[2] + u[3]),
+            self.arm * (u[2] + u[3] - u[0] - u[1]),
+        )
         return [
             x[1],
             lift * (c3 * s2 * c1 + s3 * s1),
@@ -78,15 +98,27 @@ def mujoco_quadrotor(
     check_number("mass", mass, above=0, unit="[kg]")
     check_numbers("wind", wind, 3, unit="[m/s]")
     names, hover = RigidBody.state_names, [_MASS * GRAVITY / 4] * 4
-    units = dict.fromkeys(("x", "y", "z"), "m") | dict.fromkeys(("vx", "vy", "vz"), "m/s")
-    units |= dict.fromkeys(("roll", "pitch", "yaw"), "rad") | dict.fromkeys("pqr", "rad/s") | dict.fromkeys(ROTORS, "N")
+    units = dict.fromkeys(("x", "y", "z"), "m") | dict.fromkeys(
+        ("vx", "vy", "vz"), "m/s"
+    )
+    units |= (
+        dict.fromkeys(("roll", "pitch", "yaw"), "rad")
+        | dict.fromkeys("pqr", "rad/s")
+        | dict.fromkeys(ROTORS, "N")
+    )
     flown = mujoco_system(
         _MODEL,
         ROTORS,
         sensors=("position", "velocity", "quaternion", "rate"),
         substeps=substeps,
-        observation={"state_names": names, "observe": _state, "input_delay": input_delay},
-        nominal=System(RigidBody(**(known or {})), 0.005 * substeps, 2, initial_input=hover),
+        observation={
+            "state_names": names,
+            "observe": _state,
+            "input_delay": input_delay,
+        },
+        nominal=System(
+            RigidBody(**(known or {})), 0.005 * substeps, 2, initial_input=hover
+        ),
         units=units,
         initial_input=hover,
         goal=[0, 0, 0, 0, 1, 0, 0, 0, 0, 0, 0, 0],
@@ -99,7 +131,9 @@ def mujoco_quadrotor(
     flown.dynamics.positions = _joint_positions
     model, vehicle = flown.dynamics.model, flown.dynamics.model.body("vehicle").id
     model.body_mass[vehicle] = mass
-    flown.dynamics.mujoco.mj_setConst(model, flown.dynamics.data)  # what follows from the mass
+    flown.dynamics.mujoco.mj_setConst(
+        model, flown.dynamics.data
+    )  # what follows from the mass
     # Linear drag in a wind is drag in still air and a constant force, which gravity on the one body can bring.
     model.opt.gravity += _DRAG * np.array(wind) / mass
     return flown
@@ -108,11 +142,20 @@ def mujoco_quadrotor(
 def _joint_positions(state: np.ndarray) -> np.ndarray:
     """The positions of the model's joints (7,) in a state (12,)."""
     turn = Rotation.from_euler("ZYX", np.asarray(state)[10:5:-2]).as_quat()
-    return np.array([state[0], state[2], state[4] - 1, turn[3], *turn[:3]])  # the quaternion's scalar first
+    return np.array(
+        [state[0], state[2], state[4] - 1, turn[3], *turn[:3]]
+    )  # the quaternion's scalar first
 
 
 def _state(measured: np.ndarray) -> np.ndarray:
     """The states of position, velocity, quaternion and body rates."""
     position, velocity, quaternion, rates = np.split(measured, (3, 6, 10))
-    angles = Rotation.from_quat(quaternion[[1, 2, 3, 0]]).as_euler("ZYX")[::-1]  # scalar last
-    return np.stack([position, velocity, angles, rates]).reshape(2, 2, 3).swapaxes(1, 2).ravel()
+    angles = Rotation.from_quat(quaternion[[1, 2, 3, 0]]).as_euler("ZYX")[
+        ::-1
+    ]  # scalar last
+    return (
+        np.stack([position, velocity, angles, rates])
+        .reshape(2, 2, 3)
+        .swapaxes(1, 2)
+        .ravel()
+    )

@@ -11,12 +11,24 @@ def require(condition: bool, promise: str, got: str) -> None:
 
 
 def require_close(
-    promise: str, got: Tensor, expected: Tensor, tolerance: float, what: str = "it", floor: float = 1.0
+    promise: str,
+    got: Tensor,
+    expected: Tensor,
+    tolerance: float,
+    what: str = "it",
+    floor: float = 1.0,
 ) -> None:
     """Raises unless two tensors differ by at most a part of the expected one's size (of ``floor`` if that is more)."""
     got, expected = got.detach().double(), expected.detach().double()
-    require(got.shape == expected.shape, promise, f"{what} has shape {[*got.shape]}, should be {[*expected.shape]}")
-    error, size = (part.abs().amax() if part.numel() else 0.0 for part in (got - expected, expected))
+    require(
+        got.shape == expected.shape,
+        promise,
+        f"{what} has shape {[*got.shape]}, should be {[*expected.shape]}",
+    )
+    error, size = (
+        part.abs().amax() if part.numel() else 0.0
+        for part in (got - expected, expected)
+    )
     bound = tolerance * max(floor, float(size))
     text = f"{what} is off by {float(error):.2e} (allowed {bound:.1e}):\ngot      {got}\nexpected {expected}"
     require(float(error) <= bound, promise, text)  # false for NaN as well
@@ -24,7 +36,11 @@ def require_close(
 
 def require_covariance(name: str, covariance: Tensor) -> None:
     """Raises unless covariances (*batch, k, k) are finite, symmetric and positive semidefinite up to round-off."""
-    require(bool(torch.isfinite(covariance).all()), f"{name}: the covariance is finite", f"it holds {covariance}")
+    require(
+        bool(torch.isfinite(covariance).all()),
+        f"{name}: the covariance is finite",
+        f"it holds {covariance}",
+    )
     size = max(float(covariance.abs().max()), 1e-300) if covariance.numel() else 1.0
     round_off = torch.finfo(covariance.dtype).eps * size
     lopsided = float((covariance - covariance.mT).abs().max())
@@ -32,4 +48,8 @@ def require_covariance(name: str, covariance: Tensor) -> None:
     require(lopsided <= 100 * round_off, f"{name}: the covariance is symmetric", text)
     lowest = float(torch.linalg.eigvalsh(covariance.double()).min())
     text = f"its lowest eigenvalue is {lowest:.2e}, its largest entry {size:.2e}"
-    require(lowest >= -1000 * round_off, f"{name}: the covariance is positive semidefinite", text)
+    require(
+        lowest >= -1000 * round_off,
+        f"{name}: the covariance is positive semidefinite",
+        text,
+    )

@@ -37,7 +37,11 @@ def check_qp_solver(solver: QPSolver, tolerance: float = 1e-6) -> None:
         _check(solution, known, tolerance)
         first, n, right = solution.x.copy(), len(solution.x), solution.active_set
         solver.solve(QuadraticProgram(2.0 * np.eye(n), np.ones(n)))
-        require(np.array_equal(first, solution.x), known.name, "a later solve changed an earlier solution")
+        require(
+            np.array_equal(first, solution.x),
+            known.name,
+            "a later solve changed an earlier solution",
+        )
         starts = {
             "its own solution": solution,
             "the right active set": right,
@@ -47,41 +51,113 @@ def check_qp_solver(solver: QPSolver, tolerance: float = 1e-6) -> None:
         }
         for kind, warm_start in starts.items():
             again = _solve(solver, known.name, known.problem, warm_start)
-            _check(again, known._replace(name=f"{known.name}, warm-started from {kind}"), tolerance)
+            _check(
+                again,
+                known._replace(name=f"{known.name}, warm-started from {kind}"),
+                tolerance,
+            )
         awkward = _solve(solver, known.name, _awkward(known.problem), None)
-        _check(awkward, known._replace(name=f"{known.name}, in Fortran order and strided"), tolerance)
+        _check(
+            awkward,
+            known._replace(name=f"{known.name}, in Fortran order and strided"),
+            tolerance,
+        )
     for name, problem in _infeasible().items():
-        for warm_start in (None, np.ones(len(problem.lower)), -np.ones(len(problem.lower))):
+        for warm_start in (
+            None,
+            np.ones(len(problem.lower)),
+            -np.ones(len(problem.lower)),
+        ):
             status = _solve(solver, name, problem, warm_start).status
-            require(status is Status.INFEASIBLE, name, f"expected INFEASIBLE, got {status.name}")
+            require(
+                status is Status.INFEASIBLE,
+                name,
+                f"expected INFEASIBLE, got {status.name}",
+            )
 
 
 def _small() -> list[_Known]:
     """Problems that can be solved by hand; some have more active constraints than variables, or repeat rows."""
-    book, centre = "Nocedal and Wright, Numerical Optimization (2006), example", np.array([3.0, -0.5, -7.0])
-    P, G = [[6.0, 2.0, 1.0], [2.0, 5.0, 2.0], [1.0, 2.0, 4.0]], [[1.0, 0.0, 1.0], [0.0, 1.0, 1.0]]
+    book, centre = (
+        "Nocedal and Wright, Numerical Optimization (2006), example",
+        np.array([3.0, -0.5, -7.0]),
+    )
+    P, G = (
+        [[6.0, 2.0, 1.0], [2.0, 5.0, 2.0], [1.0, 2.0, 4.0]],
+        [[1.0, 0.0, 1.0], [0.0, 1.0, 1.0]],
+    )
     equalities = QuadraticProgram(P, [-8.0, -3.0, -3.0], G, [3.0, 0.0], [3.0, 0.0])
-    rows, lower, upper = [[-1.0, 2.0], [1.0, 2.0], [1.0, -2.0]], [-_INF, -1e30, -_INF], [2.0, 6.0, 2.0]
-    inequalities = QuadraticProgram(2.0 * np.eye(2), [-2.0, -5.0], rows, lower, upper, lb=[0.0, 0.0])
-    box = QuadraticProgram(np.eye(3), -centre, lb=[-1.0, -1.0, -1.0], ub=[1.0, 1.0, 1e20])
-    redundant = QuadraticProgram([[2.0]], [-4.0], [[1.0], [2.0]], [-_INF, -_INF], [1.5, 2.0])
-    fan, apex = np.array([[np.cos(a), np.sin(a)] for a in np.linspace(0.1, 1.4, 7)]), np.array([1.0, 2.0])
-    lines = QuadraticProgram(np.diag([1.0, 3.0]), [-9.0, -20.0], fan, np.full(7, -_INF), fan @ apex)
+    rows, lower, upper = (
+        [[-1.0, 2.0], [1.0, 2.0], [1.0, -2.0]],
+        [-_INF, -1e30, -_INF],
+        [2.0, 6.0, 2.0],
+    )
+    inequalities = QuadraticProgram(
+        2.0 * np.eye(2), [-2.0, -5.0], rows, lower, upper, lb=[0.0, 0.0]
+    )
+    box = QuadraticProgram(
+        np.eye(3), -centre, lb=[-1.0, -1.0, -1.0], ub=[1.0, 1.0, 1e20]
+    )
+    redundant = QuadraticProgram(
+        [[2.0]], [-4.0], [[1.0], [2.0]], [-_INF, -_INF], [1.5, 2.0]
+    )
+    fan, apex = (
+        np.array([[np.cos(a), np.sin(a)] for a in np.linspace(0.1, 1.4, 7)]),
+        np.array([1.0, 2.0]),
+    )
+    lines = QuadraticProgram(
+        np.diag([1.0, 3.0]), [-9.0, -20.0], fan, np.full(7, -_INF), fan @ apex
+    )
     rows = np.outer([1.0, 1e-4, 1e4, 1.0, -3.0], [1.0, 1.0])
-    scales = QuadraticProgram(np.eye(2), [-2.0, -2.0], rows, [-_INF] * 4 + [-3.0], [1.0, 1e-4, 1e4, 1.0, _INF])
-    zero = QuadraticProgram(np.eye(2), [-2.0, 0.0], [[0.0, 0.0], [1.0, 0.0]], [0.0, -1.0], [0.0, 1.0], ub=[1.0, 1.0])
+    scales = QuadraticProgram(
+        np.eye(2), [-2.0, -2.0], rows, [-_INF] * 4 + [-3.0], [1.0, 1e-4, 1e4, 1.0, _INF]
+    )
+    zero = QuadraticProgram(
+        np.eye(2),
+        [-2.0, 0.0],
+        [[0.0, 0.0], [1.0, 0.0]],
+        [0.0, -1.0],
+        [0.0, 1.0],
+        ub=[1.0, 1.0],
+    )
     rows = [[1.0, 1.0], [1.0, -1.0], [2.0, 0.0]]
-    equal = QuadraticProgram(np.eye(2), [5.0, -5.0], rows, [3.0, 1.0, 4.0], [3.0, 1.0, 4.0])
+    equal = QuadraticProgram(
+        np.eye(2), [5.0, -5.0], rows, [3.0, 1.0, 4.0], [3.0, 1.0, 4.0]
+    )
     return [
-        _Known("no constraints", QuadraticProgram(np.diag([2.0, 4.0]), [-2.0, -8.0]), [1.0, 2.0], [0.0, 0.0]),
+        _Known(
+            "no constraints",
+            QuadraticProgram(np.diag([2.0, 4.0]), [-2.0, -8.0]),
+            [1.0, 2.0],
+            [0.0, 0.0],
+        ),
         _Known("projection on a box", box, [1.0, -0.5, -1.0], [2.0, 0.0, -6.0]),
-        _Known(f"{book} 16.2 (equalities)", equalities, [2.0, -1.0, 1.0], [0.0, 0.0, 0.0, -3.0, 2.0]),
-        _Known(f"{book} 16.4 (inequalities)", inequalities, [1.4, 1.7], [0.0, 0.0, 0.8, 0.0, 0.0]),
-        _Known("one variable, one redundant and one active row", redundant, [1.0], [0.0, 0.0, 1.0]),
+        _Known(
+            f"{book} 16.2 (equalities)",
+            equalities,
+            [2.0, -1.0, 1.0],
+            [0.0, 0.0, 0.0, -3.0, 2.0],
+        ),
+        _Known(
+            f"{book} 16.4 (inequalities)",
+            inequalities,
+            [1.4, 1.7],
+            [0.0, 0.0, 0.8, 0.0, 0.0],
+        ),
+        _Known(
+            "one variable, one redundant and one active row",
+            redundant,
+            [1.0],
+            [0.0, 0.0, 1.0],
+        ),
         _Known("seven lines through the solution", lines, apex),
         _Known("the same row five times, at five scales", scales, [0.5, 0.5]),
         _Known("a zero row, and a row that repeats the box", zero, [1.0, 0.0]),
-        _Known("equalities that repeat each other and fix every variable", equal, [2.0, 1.0]),
+        _Known(
+            "equalities that repeat each other and fix every variable",
+            equal,
+            [2.0, 1.0],
+        ),
     ]
 
 
@@ -91,7 +167,11 @@ def _constructed(count: int = 12) -> Iterator[_Known]:
     for number in range(count):
         n, m = int(rng.integers(2, 25)), int(rng.integers(1, 30))
         root = rng.standard_normal((n, n))
-        P, G, x = root @ root.T + np.eye(n), rng.standard_normal((m, n)), rng.standard_normal(n)
+        P, G, x = (
+            root @ root.T + np.eye(n),
+            rng.standard_normal((m, n)),
+            rng.standard_normal(n),
+        )
         C = np.vstack([np.eye(n), G])
         active = rng.choice(n + m, size=int(rng.integers(0, n)), replace=False)
         sides = rng.choice([-1.0, 1.0], size=len(active))
@@ -101,28 +181,48 @@ def _constructed(count: int = 12) -> Iterator[_Known]:
         below[active[sides < 0]], above[active[sides > 0]] = 0.0, 0.0
         lower, upper, q = C @ x - below, C @ x + above, -P @ x - C.T @ multipliers
         problem = QuadraticProgram(P, q, G, lower[n:], upper[n:], lower[:n], upper[:n])
-        yield _Known(f"constructed problem {number} (n = {n}, m = {m})", problem, x, multipliers)
+        yield _Known(
+            f"constructed problem {number} (n = {n}, m = {m})", problem, x, multipliers
+        )
 
 
 def _infeasible() -> dict[str, QuadraticProgram]:
     """Problems that no point satisfies."""
     eye, rows, sides = np.eye(2), [[1.0, 0.0], [0.0, 1.0], [1.0, 1.0]], [1.0, 1.0, 3.0]
     return {
-        "two opposite rows": QuadraticProgram(eye, [0.0, 0.0], [[1.0, 1.0], [-1.0, -1.0]], [-_INF, -_INF], [1.0, -2.0]),
-        "a row against the box": QuadraticProgram(eye, [1.0, -3.0], [[1.0, 2.0]], [4.0], [_INF], [-1, -1], [1.0, 1.0]),
-        "a zero row that should be one": QuadraticProgram(np.eye(3), np.ones(3), np.zeros((1, 3)), [1.0], [1.0]),
-        "three equalities in two variables": QuadraticProgram(eye, [0.0, 0.0], rows, sides, sides),
+        "two opposite rows": QuadraticProgram(
+            eye, [0.0, 0.0], [[1.0, 1.0], [-1.0, -1.0]], [-_INF, -_INF], [1.0, -2.0]
+        ),
+        "a row against the box": QuadraticProgram(
+            eye, [1.0, -3.0], [[1.0, 2.0]], [4.0], [_INF], [-1, -1], [1.0, 1.0]
+        ),
+        "a zero row that should be one": QuadraticProgram(
+            np.eye(3), np.ones(3), np.zeros((1, 3)), [1.0], [1.0]
+        ),
+        "three equalities in two variables": QuadraticProgram(
+            eye, [0.0, 0.0], rows, sides, sides
+        ),
     }
 
 
-def _solve(solver: QPSolver, name: str, problem: QuadraticProgram, warm_start: Any) -> QPSolution:
+def _solve(
+    solver: QPSolver, name: str, problem: QuadraticProgram, warm_start: Any
+) -> QPSolution:
     """Solves, and raises where the solver changed its arguments."""
     before = {field: getattr(problem, field).copy() for field in _FIELDS}
     guess = warm_start.copy() if isinstance(warm_start, np.ndarray) else None
     solution = solver.solve(problem, warm_start)
     for field, array in before.items():
-        require(np.array_equal(array, getattr(problem, field)), name, f"the solver modified {field}")
-    require(guess is None or np.array_equal(guess, warm_start), name, "the solver modified the warm start")
+        require(
+            np.array_equal(array, getattr(problem, field)),
+            name,
+            f"the solver modified {field}",
+        )
+    require(
+        guess is None or np.array_equal(guess, warm_start),
+        name,
+        "the solver modified the warm start",
+    )
     return solution
 
 
@@ -132,16 +232,32 @@ def _awkward(problem: QuadraticProgram) -> QuadraticProgram:
     def strided(array: np.ndarray) -> np.ndarray:
         return np.repeat(array, 2, axis=-1)[..., ::2]
 
-    return QuadraticProgram(np.asfortranarray(problem.P), *(strided(getattr(problem, field)) for field in _FIELDS[1:]))
+    return QuadraticProgram(
+        np.asfortranarray(problem.P),
+        *(strided(getattr(problem, field)) for field in _FIELDS[1:]),
+    )
 
 
 def _check(solution: QPSolution, known: _Known, tolerance: float) -> None:
-    require(solution.status is Status.SOLVED, known.name, f"expected SOLVED, got {solution.status.name}")
+    require(
+        solution.status is Status.SOLVED,
+        known.name,
+        f"expected SOLVED, got {solution.status.name}",
+    )
     parts = {"x": (solution.x, known.x)}
     if known.multipliers is not None:
-        parts["[z_box; z]"] = np.concatenate([solution.z_box, solution.z]), known.multipliers
+        parts["[z_box; z]"] = (
+            np.concatenate([solution.z_box, solution.z]),
+            known.multipliers,
+        )
     for name, (got, expected) in parts.items():
         error = np.abs(got - expected).max() / max(1.0, np.abs(expected).max())
-        require(error <= tolerance, known.name, f"{name} is {got}, should be {expected}")
+        require(
+            error <= tolerance, known.name, f"{name} is {got}, should be {expected}"
+        )
     for kind, value in solution.residuals()._asdict().items():
-        require(value <= tolerance, known.name, f"the {kind} residual is {value:.1e}, above {tolerance:.1e}")
+        require(
+            value <= tolerance,
+            known.name,
+            f"the {kind} residual is {value:.1e}, above {tolerance:.1e}",
+        )

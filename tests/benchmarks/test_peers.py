@@ -22,7 +22,10 @@ from gpmpc.status import Status
 from gpmpc.systems import System, Translational, step
 
 H, HOVER = 3, np.array([7.26, 0.0, 0.0])
-PROBLEM = Problem(Tracking([1.0] * 6, [1.0] * 3), inputs=Box([7.2, -0.008, -0.008], [7.4, 0.008, 0.008]))
+PROBLEM = Problem(
+    Tracking([1.0] * 6, [1.0] * 3),
+    inputs=Box([7.2, -0.008, -0.008], [7.4, 0.008, 0.008]),
+)
 
 
 @pytest.fixture(scope="module")
@@ -30,7 +33,10 @@ def gp():
     random, plant = np.random.default_rng(0), System(Translational(), 1.0, 1)
     states = random.uniform(-1.5, 1.5, (30, 6))
     inputs = HOVER + random.uniform(-1.0, 1.0, (30, 3)) * [0.6, 0.1, 0.1]
-    changes = np.array([step(plant, x, u) for x, u in zip(states, inputs, strict=True)]) - states
+    changes = (
+        np.array([step(plant, x, u) for x, u in zip(states, inputs, strict=True)])
+        - states
+    )
     features = np.concatenate([states, inputs], axis=1)
     scales, signal = np.tile(4.0 * features.std(0), (6, 1)), 10.0 * changes.var(0)
     parts = map(torch.from_numpy, (features, changes, scales, signal, 1e-5 * signal))
@@ -42,8 +48,12 @@ def gp():
 def instances():
     def asked(shift):
         states = np.tile([0.3 + shift, 0.0, -0.2, 0.0, 0.4, 0.0], (H + 1, 1))
-        belief = Gaussian.certain(torch.tensor([0.1 * shift, 0.1, 0.0, -0.1, 0.0, 0.0], dtype=torch.float64))
-        return Instance(belief, Reference(states), HOVER + np.array([0.05, 0.0, -0.005]))
+        belief = Gaussian.certain(
+            torch.tensor([0.1 * shift, 0.1, 0.0, -0.1, 0.0, 0.0], dtype=torch.float64)
+        )
+        return Instance(
+            belief, Reference(states), HOVER + np.array([0.05, 0.0, -0.005])
+        )
 
     return [asked(0.0), asked(0.05)]
 
@@ -54,7 +64,12 @@ def cost_of(gp, instance, plan):
     for u, target in zip(plan, torch.from_numpy(instance.targets), strict=True):
         x = gp.predict(x, u).mean
         total = total + (x - target).square().sum()
-    return total + torch.diff(plan, dim=0, prepend=torch.from_numpy(instance.last)[None]).square().sum()
+    return (
+        total
+        + torch.diff(plan, dim=0, prepend=torch.from_numpy(instance.last)[None])
+        .square()
+        .sum()
+    )
 
 
 @pytest.fixture(scope="module")
@@ -67,15 +82,28 @@ def optimum(gp, instances):
         cost.backward()
         return float(cost.detach()), (plan.grad.numpy() * [1.0, 0.1, 0.1]).ravel()
 
-    bounds = list(zip(PROBLEM.inputs.lower * [1, 10, 10], PROBLEM.inputs.upper * [1, 10, 10], strict=True)) * H
+    bounds = (
+        list(
+            zip(
+                PROBLEM.inputs.lower * [1, 10, 10],
+                PROBLEM.inputs.upper * [1, 10, 10],
+                strict=True,
+            )
+        )
+        * H
+    )
     plan = np.tile(HOVER, H)
     for _ in range(5):
         settings = {"ftol": 1e-16, "gtol": 1e-12, "maxiter": 2000, "maxcor": 30}
-        plan = minimize(value, plan, jac=True, method="L-BFGS-B", bounds=bounds, options=settings).x
+        plan = minimize(
+            value, plan, jac=True, method="L-BFGS-B", bounds=bounds, options=settings
+        ).x
     return plan.reshape(H, 3) * [1.0, 0.1, 0.1]
 
 
-def test_the_residual_vanishes_at_an_optimum_found_otherwise_and_nowhere_near_it(gp, instances, optimum):
+def test_the_residual_vanishes_at_an_optimum_found_otherwise_and_nowhere_near_it(
+    gp, instances, optimum
+):
     at_bounds = (optimum == PROBLEM.inputs.lower) | (optimum == PROBLEM.inputs.upper)
     assert at_bounds.any()
     assert not at_bounds.all()
@@ -84,16 +112,22 @@ def test_the_residual_vanishes_at_an_optimum_found_otherwise_and_nowhere_near_it
     for k, j in itertools.product(range(H), range(3)):
         moved = optimum.copy()
         moved[k, j] += (
-            0.01 * (PROBLEM.inputs.upper[j] - PROBLEM.inputs.lower[j]) * (-1 if moved[k, j] > HOVER[j] else 1)
+            0.01
+            * (PROBLEM.inputs.upper[j] - PROBLEM.inputs.lower[j])
+            * (-1 if moved[k, j] > HOVER[j] else 1)
         )
         assert kkt_residual(gp, PROBLEM, instances[0], moved) > 1e-4
     assert kkt_residual(gp, PROBLEM, instances[0], np.full((H, 3), np.nan)) == np.inf
 
 
-def test_a_plan_beyond_its_bounds_is_no_optimum_even_where_the_slope_is_zero(gp, instances):
+def test_a_plan_beyond_its_bounds_is_no_optimum_even_where_the_slope_is_zero(
+    gp, instances
+):
     free = Problem(Tracking(PROBLEM.cost.Q, PROBLEM.cost.R))
     answer = converged(gp, free, H)[OWN]()(instances[0], None)
-    assert ((answer.inputs < PROBLEM.inputs.lower) | (answer.inputs > PROBLEM.inputs.upper)).any()
+    assert (
+        (answer.inputs < PROBLEM.inputs.lower) | (answer.inputs > PROBLEM.inputs.upper)
+    ).any()
     assert kkt_residual(gp, free, instances[0], answer.inputs) < 1e-5
     assert kkt_residual(gp, PROBLEM, instances[0], answer.inputs) > 1e-3
 
@@ -101,11 +135,14 @@ def test_a_plan_beyond_its_bounds_is_no_optimum_even_where_the_slope_is_zero(gp,
 def test_the_residual_knows_no_units_of_the_cost(gp, instances):
     plan = np.tile(HOVER, (H, 1))
     scaled = Problem(
-        Tracking(100 * PROBLEM.cost.Q, 100 * PROBLEM.cost.R), inputs=Box(PROBLEM.inputs.lower, PROBLEM.inputs.upper)
+        Tracking(100 * PROBLEM.cost.Q, 100 * PROBLEM.cost.R),
+        inputs=Box(PROBLEM.inputs.lower, PROBLEM.inputs.upper),
     )
     residual = kkt_residual(gp, PROBLEM, instances[0], plan)
     assert 1e-3 < residual <= 1.0
-    assert kkt_residual(gp, scaled, instances[0], plan) == pytest.approx(residual, rel=1e-12)
+    assert kkt_residual(gp, scaled, instances[0], plan) == pytest.approx(
+        residual, rel=1e-12
+    )
 
 
 def test_all_contenders_that_are_here_agree(gp, instances, optimum):
@@ -150,7 +187,9 @@ def test_daqp_says_what_has_no_solution_and_goes_on():
 
 
 @pytest.mark.parametrize("cold", [False, True])
-def test_a_run_forgets_its_last_solution_when_the_instances_begin_again_or_at_once_when_cold(cold, instances):
+def test_a_run_forgets_its_last_solution_when_the_instances_begin_again_or_at_once_when_cold(
+    cold, instances
+):
     seen = []
 
     def solve(instance, last):
@@ -160,14 +199,21 @@ def test_a_run_forgets_its_last_solution_when_the_instances_begin_again_or_at_on
     run = Run(solve, instances, cold)
     for _ in range(3):
         run()
-    assert [instance is instances[k] for (instance, _), k in zip(seen, (0, 1, 0), strict=True)] == [True] * 3
+    assert [
+        instance is instances[k]
+        for (instance, _), k in zip(seen, (0, 1, 0), strict=True)
+    ] == [True] * 3
     assert [last for _, last in seen] == [None, None if cold else 1, None]
     assert run.plans == [(0, 1), (1, 2), (0, 3)]
 
 
-def test_the_table_of_peers_has_a_row_for_everybody_and_says_who_is_missing(gp, instances):
+def test_the_table_of_peers_has_a_row_for_everybody_and_says_who_is_missing(
+    gp, instances
+):
     cases = converged(gp, PROBLEM, H) | {"absent": None}
-    cases = {name: cases[name] for name in (OWN, "CasADi, IPOPT, Gauss-Newton", "absent")}
+    cases = {
+        name: cases[name] for name in (OWN, "CasADi, IPOPT, Gauss-Newton", "absent")
+    }
     *rows, missing = measure(cases, gp, PROBLEM, instances, 0.01, cold=False)
     assert [row["what"] for row in rows] == list(cases)[:2]
     assert rows[0]["times_ours"] == rows[0]["times_ours_evicted"] == 1.0
@@ -183,10 +229,17 @@ class _Plan:
 
 
 def test_ways_to_linearise_give_the_same_derivatives(gp):
-    at = Gaussian(torch.full((6,), 0.2, dtype=torch.float64), 0.01 * torch.eye(6, dtype=torch.float64))
+    at = Gaussian(
+        torch.full((6,), 0.2, dtype=torch.float64),
+        0.01 * torch.eye(6, dtype=torch.float64),
+    )
     # The kernels know the latent functions alone.
-    latent = replace(gp, offset=torch.zeros_like(gp.offset), targets=gp.targets - gp.offset)
-    for group in linearisation_groups(latent, at, torch.from_numpy(HOVER), reverse_mode=True):
+    latent = replace(
+        gp, offset=torch.zeros_like(gp.offset), targets=gp.targets - gp.offset
+    )
+    for group in linearisation_groups(
+        latent, at, torch.from_numpy(HOVER), reverse_mode=True
+    ):
         own, *others = [call() for call in group.values()]
         for answer in others:
             for a, b in zip(own, answer, strict=True):

@@ -16,7 +16,11 @@ IMPORTED = [
     "gpmpc.cli._command",
     "gpmpc.recording",
 ]
-IMPORTED += ["gpmpc.cli._sweep", "gpmpc.experiments.figures", "gpmpc.experiments.tables"]
+IMPORTED += [
+    "gpmpc.cli._sweep",
+    "gpmpc.experiments.figures",
+    "gpmpc.experiments.tables",
+]
 IMPORTED += ["gpmpc.studies.report", "gpmpc.studies.flight", "gpmpc.plotting._recorded"]
 SECONDS = 300  # a command may take
 
@@ -44,13 +48,17 @@ def forked(*arguments, cwd, **environment):
     """
     with tempfile.TemporaryDirectory() as folder:
         streams = [Path(folder) / name for name in ("out", "err")]
-        process = _copies.Process(target=_answer, args=(arguments, cwd, os.environ | environment, streams))
+        process = _copies.Process(
+            target=_answer, args=(arguments, cwd, os.environ | environment, streams)
+        )
         process.start()
         process.join(SECONDS)
         if process.exitcode is None:
             process.kill()
             raise subprocess.TimeoutExpired(arguments, SECONDS)
-        return subprocess.CompletedProcess(arguments, process.exitcode, *(path.read_text() for path in streams))
+        return subprocess.CompletedProcess(
+            arguments, process.exitcode, *(path.read_text() for path in streams)
+        )
 
 
 def _answer(arguments, cwd, environment, streams):
@@ -68,5 +76,9 @@ def _answer(arguments, cwd, environment, streams):
 def start(*arguments, cwd):
     """Runs on, in a process group of its own."""
     return subprocess.Popen(
-        [PATH, *arguments], cwd=cwd, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True
+        [PATH, *arguments],
+        cwd=cwd,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        start_new_session=True,
     )

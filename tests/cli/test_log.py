@@ -48,7 +48,10 @@ def test_info_shows_channels_counts_metadata_and_statuses(folder):
         "0 to 0.9 s",
     ):
         assert text in result.stdout
-    assert "cut.mcap: unfinished or damaged" in gpmpc_log("info", "cut.mcap", cwd=folder).stdout
+    assert (
+        "cut.mcap: unfinished or damaged"
+        in gpmpc_log("info", "cut.mcap", cwd=folder).stdout
+    )
 
 
 def test_a_table_of_an_unfinished_recording_says_that_it_is_one(folder):
@@ -62,7 +65,10 @@ def test_recover_writes_a_finished_file_beside_the_broken_one(folder):
     assert result.stdout.startswith("written to cut.recovered.mcap: ")
     assert len(read_run(folder / "cut.recovered.mcap").times) == 10
     shown = gpmpc_log("info", "cut.recovered.mcap", cwd=folder).stdout
-    assert "cut.recovered.mcap: unfinished or damaged; this is what could be read\n" in shown
+    assert (
+        "cut.recovered.mcap: unfinished or damaged; this is what could be read\n"
+        in shown
+    )
 
 
 def test_export_writes_a_row_per_step_with_exact_numbers(folder):
@@ -77,20 +83,29 @@ def test_export_writes_a_row_per_step_with_exact_numbers(folder):
     assert list(rows[0]) == list(run.columns)
 
 
-@pytest.mark.skipif(importlib.util.find_spec("pyarrow") is None, reason="the extra 'report' is not installed")
+@pytest.mark.skipif(
+    importlib.util.find_spec("pyarrow") is None,
+    reason="the extra 'report' is not installed",
+)
 def test_export_writes_parquet(folder):
     import pandas
 
     assert gpmpc_log("export", "run.mcap", "run.parquet", cwd=folder).returncode == 0
     frame = pandas.read_parquet(folder / "run.parquet")
-    np.testing.assert_array_equal(frame["state.vx"], read_run(folder / "run.mcap").states[:, 1])
+    np.testing.assert_array_equal(
+        frame["state.vx"], read_run(folder / "run.mcap").states[:, 1]
+    )
 
 
 def test_layout_writes_what_foxglove_imports(folder):
     result = gpmpc_log("layout", "run.mcap", cwd=folder)
     assert result.returncode == 0, result.stderr
-    assert result.stdout.startswith("written to run.layout.json: open run.mcap in Foxglove")
-    assert (folder / "run.layout.json").read_text() == layout(read_run(folder / "run.mcap"))
+    assert result.stdout.startswith(
+        "written to run.layout.json: open run.mcap in Foxglove"
+    )
+    assert (folder / "run.layout.json").read_text() == layout(
+        read_run(folder / "run.mcap")
+    )
 
 
 def foreign(folder):
@@ -102,12 +117,16 @@ def foreign(folder):
     with (folder / "other.mcap").open("wb") as file:
         writer = Writer(file)
         writer.start()
-        channel = writer.register_channel("/step", "json", writer.register_schema("step", "jsonschema", b"{}"))
+        channel = writer.register_channel(
+            "/step", "json", writer.register_schema("step", "jsonschema", b"{}")
+        )
         writer.add_message(channel, 0, b"{}", 0)
         writer.finish()
     data = (folder / "run.mcap").read_bytes()
     (folder / "nameless.mcap").write_bytes(data.replace(b"state_names", b"\xff" * 11))
-    (folder / "renamed.mcap").write_bytes(data.replace(b"x vx y vy z vz", b"x vx y vy z 1z"))
+    (folder / "renamed.mcap").write_bytes(
+        data.replace(b"x vx y vy z vz", b"x vx y vy z 1z")
+    )
     return {
         "empty.mcap": "is empty",
         "picture.mcap": "is not an MCAP file",
@@ -122,7 +141,9 @@ def foreign(folder):
     }
 
 
-def test_what_is_no_recording_is_refused_in_one_line_that_names_it(folder, tmp_path, monkeypatch):
+def test_what_is_no_recording_is_refused_in_one_line_that_names_it(
+    folder, tmp_path, monkeypatch
+):
     (tmp_path / "run.mcap").write_bytes((folder / "run.mcap").read_bytes())
     reasons, parser = foreign(tmp_path), COMMANDS["log"].parser("log")
     before = sorted(tmp_path.iterdir())
@@ -142,7 +163,9 @@ def test_what_is_no_recording_is_refused_in_one_line_that_names_it(folder, tmp_p
 
 
 def test_info_prints_nothing_that_a_terminal_would_obey(tmp_path):
-    runs.record_run(tmp_path / "run.mcap", steps=1, metadata={"note": "\x1b[31m\x07\x1b]0;title"})
+    runs.record_run(
+        tmp_path / "run.mcap", steps=1, metadata={"note": "\x1b[31m\x07\x1b]0;title"}
+    )
     result = gpmpc_log("info", "run.mcap", cwd=tmp_path)
     assert result.returncode == 0, result.stderr
     assert "]0;title" in result.stdout
@@ -150,24 +173,45 @@ def test_info_prints_nothing_that_a_terminal_would_obey(tmp_path):
 
 
 MISTAKES = [
-    (["info", "missing.mcap"], "missing.mcap: cannot be read: No such file or directory"),
+    (
+        ["info", "missing.mcap"],
+        "missing.mcap: cannot be read: No such file or directory",
+    ),
     (["info", "notes.mcap"], "notes.mcap: is not an MCAP file"),
     (["recover", "notes.mcap"], "notes.mcap: is not an MCAP file"),
-    (["recover", "run.mcap", "run.mcap"], "run.mcap: a file cannot be recovered into itself"),
+    (
+        ["recover", "run.mcap", "run.mcap"],
+        "run.mcap: a file cannot be recovered into itself",
+    ),
     (["recover", "run.mcap", "."], ".: cannot be written: "),
-    (["recover", "run.mcap", "nowhere/run.mcap"], "nowhere/run.mcap: cannot be written: No such file"),
-    (["export", "run.mcap", "run.xlsx"], "output: must end in .csv or .parquet; got 'run.xlsx'"),
-    (["export", "run.mcap", "nowhere/run.csv"], "output: cannot write to nowhere/run.csv: No such file"),
+    (
+        ["recover", "run.mcap", "nowhere/run.mcap"],
+        "nowhere/run.mcap: cannot be written: No such file",
+    ),
+    (
+        ["export", "run.mcap", "run.xlsx"],
+        "output: must end in .csv or .parquet; got 'run.xlsx'",
+    ),
+    (
+        ["export", "run.mcap", "nowhere/run.csv"],
+        "output: cannot write to nowhere/run.csv: No such file",
+    ),
     (["layout", "run.mcap", "run.yaml"], "output: must end in .json; got 'run.yaml'"),
     (["show", "run.mcap"], "invalid choice: 'show'"),
     (["info"], "the following arguments are required: file"),
     ([], "the following arguments are required: action, file"),
 ]
 if importlib.util.find_spec("pandas") is None:
-    MISTAKES.append((["export", "run.mcap", "run.parquet"], "pandas: pip install 'gpmpc[report]'"))
+    MISTAKES.append(
+        (["export", "run.mcap", "run.parquet"], "pandas: pip install 'gpmpc[report]'")
+    )
 
 
-@pytest.mark.parametrize(("arguments", "message"), MISTAKES, ids=lambda v: " ".join(v) if isinstance(v, list) else "")
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    MISTAKES,
+    ids=lambda v: " ".join(v) if isinstance(v, list) else "",
+)
 def test_a_mistake_is_one_clear_line(folder, arguments, message):
     result = gpmpc_log(*arguments, cwd=folder)
     assert result.returncode == 2
@@ -176,7 +220,9 @@ def test_a_mistake_is_one_clear_line(folder, arguments, message):
     assert result.stderr.count("\n") == 1
 
 
-def test_a_folder_of_runs_is_drawn_run_by_run_and_one_that_cannot_be_read_is_named(tmp_path):
+def test_a_folder_of_runs_is_drawn_run_by_run_and_one_that_cannot_be_read_is_named(
+    tmp_path,
+):
     for name in ("a", "b"):
         runs.record_run(tmp_path / name / "run.mcap", steps=3)
     (tmp_path / "c").mkdir()
@@ -189,4 +235,7 @@ def test_a_folder_of_runs_is_drawn_run_by_run_and_one_that_cannot_be_read_is_nam
         assert (tmp_path / name / "figures" / "tracking.png").exists()
     (tmp_path / "d").mkdir()
     done = forked("plot", "d", cwd=tmp_path)
-    assert (done.returncode, done.stderr) == (2, "gpmpc: d: holds no run.mcap, nor does a folder below it\n")
+    assert (done.returncode, done.stderr) == (
+        2,
+        "gpmpc: d: holds no run.mcap, nor does a folder below it\n",
+    )

@@ -12,24 +12,33 @@ from tests.recording import runs
 
 TINY = ["data.samples=25", "model.restarts=0", "horizon=2", "folder=tree"]
 NOISY = f"noise.process={[0.01] * 6}".replace(" ", "")
-GYROSCOPE = "plant.gyroscopic"  # so strong a one that Runge and Kutta's step is unstable
+GYROSCOPE = (
+    "plant.gyroscopic"  # so strong a one that Runge and Kutta's step is unstable
+)
 
 
 @pytest.mark.parametrize(
     ("choices", "reason"),
     [
         (["plant.mass=100", "trajectory=hover"], "m from its reference"),
-        (["system=rotational", f"{GYROSCOPE}=[1e4,1e4]", "controller=lqr"], "state is not finite any more"),
+        (
+            ["system=rotational", f"{GYROSCOPE}=[1e4,1e4]", "controller=lqr"],
+            "state is not finite any more",
+        ),
     ],
     ids=["falls", "diverges"],
 )
-def test_a_lost_flight_is_finished_and_readable_and_has_an_exit_code_of_its_own(choices, reason, tmp_path):
+def test_a_lost_flight_is_finished_and_readable_and_has_an_exit_code_of_its_own(
+    choices, reason, tmp_path
+):
     done = forked("run", *TINY, *choices, "steps=9", cwd=tmp_path)
     assert done.returncode == 3, done.stderr
     assert "lost " in done.stdout
     assert done.stderr == ""
     (folder,) = (tmp_path / "tree").iterdir()
-    found = json.loads((folder / "metrics.json").read_text(), parse_constant=pytest.fail)
+    found = json.loads(
+        (folder / "metrics.json").read_text(), parse_constant=pytest.fail
+    )
     assert reason in found["lost"]["reason"]
     run = read_run(folder / "run.mcap")
     assert run.finished
@@ -42,15 +51,20 @@ def test_a_lost_flight_is_finished_and_readable_and_has_an_exit_code_of_its_own(
     assert forked("report", "tree", cwd=tmp_path).returncode == 0
 
 
-def test_a_flight_is_predicted_and_what_cannot_be_predicted_or_filmed_is_said_in_one_line(tmp_path):
+def test_a_flight_is_predicted_and_what_cannot_be_predicted_or_filmed_is_said_in_one_line(
+    tmp_path,
+):
     assert forked("run", *TINY, "steps=9", cwd=tmp_path).returncode == 0
     done = forked("calibrate", "tree", "--steps", "12", "--json", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     rows = json.loads(done.stdout)["rows"]
-    assert [(row["step"], row["samples"]) for row in rows if row["state"] == "x [m]"] == [
-        (k, 9 - k) for k in range(1, 9)
-    ]
-    assert all(0 <= row["coverage_0.5"] <= row["coverage_0.95"] <= 1 and row["width"] > 0 for row in rows)
+    assert [
+        (row["step"], row["samples"]) for row in rows if row["state"] == "x [m]"
+    ] == [(k, 9 - k) for k in range(1, 9)]
+    assert all(
+        0 <= row["coverage_0.5"] <= row["coverage_0.95"] <= 1 and row["width"] > 0
+        for row in rows
+    )
     (folder,) = (tmp_path / "tree").glob("*/calibration")
     assert {path.suffix for path in folder.iterdir()} == {".csv", ".md", ".png", ".tex"}
     assert forked("run", *TINY, "steps=3", cwd=tmp_path).returncode == 0
@@ -58,9 +72,15 @@ def test_a_flight_is_predicted_and_what_cannot_be_predicted_or_filmed_is_said_in
     for words, said in (
         (["calibrate", "nowhere"], "nowhere: cannot be read"),
         (["calibrate", "tree"], "tree: holds 2 runs"),
-        (["calibrate", "tree", "--steps", "0"], "--steps: must be a whole number, 1 or more; got 0"),
+        (
+            ["calibrate", "tree", "--steps", "0"],
+            "--steps: must be a whole number, 1 or more; got 0",
+        ),
         (["calibrate", "foreign.mcap"], "foreign.mcap: holds no settings"),
-        (["plot", "--film", str(folder.parent)], "a film needs steps of a MuJoCo model"),
+        (
+            ["plot", "--film", str(folder.parent)],
+            "a film needs steps of a MuJoCo model",
+        ),
     ):
         wrong = forked(*words, cwd=tmp_path)
         assert (wrong.returncode, wrong.stderr.count("\n")) == (2, 1), wrong.stderr
@@ -68,7 +88,14 @@ def test_a_flight_is_predicted_and_what_cannot_be_predicted_or_filmed_is_said_in
 
 
 def test_who_is_not_lost_is_not_called_so(tmp_path):
-    done = forked("run", "model.restarts=0", "plant.mass=0.888", "steps=9", "folder=tree", cwd=tmp_path)
+    done = forked(
+        "run",
+        "model.restarts=0",
+        "plant.mass=0.888",
+        "steps=9",
+        "folder=tree",
+        cwd=tmp_path,
+    )
     assert done.returncode == 0, done.stderr
     assert "lost" not in done.stdout
     (path,) = tmp_path.glob("tree/*/metrics.json")
@@ -79,9 +106,20 @@ def test_who_is_not_lost_is_not_called_so(tmp_path):
     ("trajectory", "controller"),
     [("elliptical", "convex"), ("lorenz", "convex"), ("lorenz", "nmpc")],
 )
-def test_the_band_of_the_figure_holds_as_many_positions_as_two_deviations_promise(trajectory, controller, tmp_path):
-    choices = [f"trajectory={trajectory}", f"controller={controller}", "model.restarts=0", "horizon=2", NOISY]
-    assert forked("run", *choices, "steps=150", "folder=tree", cwd=tmp_path).returncode == 0
+def test_the_band_of_the_figure_holds_as_many_positions_as_two_deviations_promise(
+    trajectory, controller, tmp_path
+):
+    choices = [
+        f"trajectory={trajectory}",
+        f"controller={controller}",
+        "model.restarts=0",
+        "horizon=2",
+        NOISY,
+    ]
+    assert (
+        forked("run", *choices, "steps=150", "folder=tree", cwd=tmp_path).returncode
+        == 0
+    )
     run = read_run(next(tmp_path.glob("tree/*/run.mcap")))
     mean, std = expected(run, [0, 2, 4])
     inside = np.abs(run.states[:, ::2] - mean)[1:] <= 2 * std[1:]
@@ -91,8 +129,13 @@ def test_the_band_of_the_figure_holds_as_many_positions_as_two_deviations_promis
 
 def test_noise_that_the_plan_holds_already_is_not_counted_twice(tmp_path):
     stds = []
-    for propagation in ([], ["propagation=linearization", "propagation.process_noise=true"]):
-        assert forked("run", *TINY, *propagation, "steps=2", cwd=tmp_path).returncode in (0, 3)
+    for propagation in (
+        [],
+        ["propagation=linearization", "propagation.process_noise=true"],
+    ):
+        assert forked(
+            "run", *TINY, *propagation, "steps=2", cwd=tmp_path
+        ).returncode in (0, 3)
     for path in sorted(tmp_path.glob("tree/*/run.mcap")):
         stds.append(expected(read_run(path), [0, 2, 4])[1][1:])
     assert np.allclose(stds[0], stds[1], rtol=1e-9)
@@ -101,7 +144,13 @@ def test_noise_that_the_plan_holds_already_is_not_counted_twice(tmp_path):
 @pytest.mark.slow
 def test_compiling_is_told_on_a_pipe_and_in_no_decision(tmp_path):
     cold, warm = (
-        gpmpc("run", f"seed={seed}", "steps=20", cwd=tmp_path, NUMBA_CACHE_DIR=str(tmp_path / "cache"))
+        gpmpc(
+            "run",
+            f"seed={seed}",
+            "steps=20",
+            cwd=tmp_path,
+            NUMBA_CACHE_DIR=str(tmp_path / "cache"),
+        )
         for seed in range(2)
     )
     first, *lines = cold.stdout.splitlines()

@@ -5,14 +5,18 @@ import logging
 from gpmpc.cli._terminal import logging_console
 
 
-def test_what_the_package_logs_is_told_once_and_a_searchs_evaluations_not_at_all(capsys):
+def test_what_the_package_logs_is_told_once_and_a_searchs_evaluations_not_at_all(
+    capsys,
+):
     log = logging.getLogger("gpmpc")
     before = log.handlers, log.propagate, log.level
     try:
         logging_console()
         for _ in range(2):
             logging.getLogger("gpmpc.gp._scaling").info("constant columns are centred")
-        logging.getLogger("gpmpc.gp._search").info("training: output 1 of 6: evaluation 3")
+        logging.getLogger("gpmpc.gp._search").info(
+            "training: output 1 of 6: evaluation 3"
+        )
     finally:
         log.handlers, log.propagate, log.level = before
     shown = capsys.readouterr().out

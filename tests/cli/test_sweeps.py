@@ -30,17 +30,31 @@ def results(tree):
 @pytest.fixture(scope="module")
 def single(tmp_path_factory):
     cwd = tmp_path_factory.mktemp("single")
-    disturbances = "disturbances=[{_target_: gpmpc.simulation.Dropout, start: 2, stop: 3}]"
-    return cwd, forked("run", *TINY, "steps=4", "seed=7", disturbances, "folder=tree", cwd=cwd)
+    disturbances = (
+        "disturbances=[{_target_: gpmpc.simulation.Dropout, start: 2, stop: 3}]"
+    )
+    return cwd, forked(
+        "run", *TINY, "steps=4", "seed=7", disturbances, "folder=tree", cwd=cwd
+    )
 
 
 def test_a_run_leaves_a_folder_that_says_everything(single):
     cwd, done = single
     assert done.returncode == 0, done.stderr
-    for text in ("4 steps of translational along elliptical", "RMSE [m]", "INVALID_MEASUREMENT 1", "25 rows"):
+    for text in (
+        "4 steps of translational along elliptical",
+        "RMSE [m]",
+        "INVALID_MEASUREMENT 1",
+        "25 rows",
+    ):
         assert text in done.stdout
     (folder,) = (cwd / "tree").iterdir()
-    assert sorted(path.name for path in folder.iterdir()) == [".lock", "config.yaml", "metrics.json", "run.mcap"]
+    assert sorted(path.name for path in folder.iterdir()) == [
+        ".lock",
+        "config.yaml",
+        "metrics.json",
+        "run.mcap",
+    ]
     found = json.loads((folder / "metrics.json").read_text())
     assert set(found["rmse"]) == {"x", "y", "z", "total"}
     assert found["rmse"]["total"] < 1
@@ -61,11 +75,15 @@ def test_the_recording_holds_the_flight_and_its_decisions(single):
     assert run.failed.tolist() == [False, False, True, False]
     assert np.isnan(run.measured[2]).all()
     assert np.isnan(run.innovations[0]).all()
-    assert np.allclose(run.innovations[1], run.measured[1] - run.plan_means[0, 1], atol=1e-14)
+    assert np.allclose(
+        run.innovations[1], run.measured[1] - run.plan_means[0, 1], atol=1e-14
+    )
     assert run.input_bounds.tolist() == [[0.0, -0.7, -0.7], [100.0, 0.7, 0.7]]
     assert np.allclose(replay(run, 1).x, run.problems[1].x, atol=1e-9)
     assert run.metadata["run"]["seed"] == "7"
-    errors = np.square((run.states - run.references)[1:, ::2])  # x[K] is in the metrics, not in the recording
+    errors = np.square(
+        (run.states - run.references)[1:, ::2]
+    )  # x[K] is in the metrics, not in the recording
     assert found["rmse"]["total"] ** 2 * 4 >= errors.sum()
 
 
@@ -74,13 +92,22 @@ def test_a_recorded_flight_is_drawn(single):
     (folder,) = (cwd / "tree").iterdir()
     done = forked("plot", str(folder), "--to", "figures", cwd=cwd)
     assert done.returncode == 0, done.stderr
-    assert {"tracking.png", "inputs.png", "timing.png", "flight.gif"} <= {p.name for p in (cwd / "figures").iterdir()}
+    assert {"tracking.png", "inputs.png", "timing.png", "flight.gif"} <= {
+        p.name for p in (cwd / "figures").iterdir()
+    }
     assert (cwd / "figures" / "flight.gif").read_bytes().startswith(b"GIF89a")
     assert "Ignoring" not in done.stderr
 
 
 def test_the_attitude_alone_is_flown_recorded_drawn_and_reported_in_radians(tmp_path):
-    settings = ["system=rotational", "trajectory=lorenz", *TINY, "steps=70", "horizon=3", "folder=tree"]
+    settings = [
+        "system=rotational",
+        "trajectory=lorenz",
+        *TINY,
+        "steps=70",
+        "horizon=3",
+        "folder=tree",
+    ]
     done = forked("run", *settings, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert "70 steps of rotational along lorenz with convex" in done.stdout
@@ -90,14 +117,24 @@ def test_the_attitude_alone_is_flown_recorded_drawn_and_reported_in_radians(tmp_
     assert run.state_names == ("phi", "p", "theta", "q", "psi", "r")
     assert run.metadata["units"]["state.phi"] == "rad"
     assert run.times[1] == 0.05
-    assert np.abs(run.states - run.references)[:, ::2].max() < 0.02 < np.ptp(run.references[:, 0])
+    assert (
+        np.abs(run.states - run.references)[:, ::2].max()
+        < 0.02
+        < np.ptp(run.references[:, 0])
+    )
     assert forked("plot", str(folder), "--to", "figures", cwd=tmp_path).returncode == 0
-    assert {path.name for path in (tmp_path / "figures").iterdir()} == {"tracking.png", "inputs.png", "timing.png"}
+    assert {path.name for path in (tmp_path / "figures").iterdir()} == {
+        "tracking.png",
+        "inputs.png",
+        "timing.png",
+    }
     assert forked("report", "tree", cwd=tmp_path).returncode == 0
     assert "RMSE [rad]" in (tmp_path / "tree" / "report" / "report.md").read_text()
 
 
-def test_finished_runs_are_not_flown_again_and_other_settings_do_not_pass_for_them(single):
+def test_finished_runs_are_not_flown_again_and_other_settings_do_not_pass_for_them(
+    single,
+):
     cwd, _ = single
     (folder,) = (cwd / "tree").iterdir()
     found = json.loads((folder / "metrics.json").read_text())
@@ -109,7 +146,10 @@ def test_finished_runs_are_not_flown_again_and_other_settings_do_not_pass_for_th
     (folder / "metrics.json").write_text(json.dumps(found))
     other = forked(*arguments, cwd=cwd)
     assert other.returncode == 2
-    assert "holds a finished run of other settings (controller.tolerance: 1 then, 1e-06 now)" in other.stderr
+    assert (
+        "holds a finished run of other settings (controller.tolerance: 1 then, 1e-06 now)"
+        in other.stderr
+    )
 
 
 @pytest.mark.parametrize(
@@ -117,36 +157,83 @@ def test_finished_runs_are_not_flown_again_and_other_settings_do_not_pass_for_th
     [
         (["horizn=5"], "unknown setting 'horizn' (did you mean 'horizon'?)"),
         (["-m", "horizn=5,6"], "unknown setting 'horizn' (did you mean 'horizon'?)"),
-        (["controller=convx"], "controller: no such option 'convx'; available are convex, lqr, nmpc"),
-        (["-m", "controller=lqr,convx"], "controller: no such option 'convx'; available are convex, lqr, nmpc"),
+        (
+            ["controller=convx"],
+            "controller: no such option 'convx'; available are convex, lqr, nmpc",
+        ),
+        (
+            ["-m", "controller=lqr,convx"],
+            "controller: no such option 'convx'; available are convex, lqr, nmpc",
+        ),
         (["data=paper"], "data.folder: this setting has no default"),
         (["data=paper", "data.folder=nowhere"], "nowhere: no such folder"),
-        (["controller=lqr", "propagation=unscented"], "propagation: this controller has none to choose"),
+        (
+            ["controller=lqr", "propagation=unscented"],
+            "propagation: this controller has none to choose",
+        ),
         (["recorder=mpac"], "recorder: must be 'mcap' or 'none'; got 'mpac'"),
-        (["horizon=1,2"], "horizon: a list is written in brackets, horizon=[1,2]; a sweep takes -m"),
-        (["system=pendulum", "data=excited"], "data: these data are of translational and rotational alone"),
-        (["system=pendulum", "trajectory=lorenz"], "trajectory: must prescribe angle of pendulum; got positions of 3"),
-        (["system=pendulum", "controller.problem.cost.Q=[1,1,1]"], "controller.problem: weighs 3 states and 1 inputs"),
+        (
+            ["horizon=1,2"],
+            "horizon: a list is written in brackets, horizon=[1,2]; a sweep takes -m",
+        ),
+        (
+            ["system=pendulum", "data=excited"],
+            "data: these data are of translational and rotational alone",
+        ),
+        (
+            ["system=pendulum", "trajectory=lorenz"],
+            "trajectory: must prescribe angle of pendulum; got positions of 3",
+        ),
+        (
+            ["system=pendulum", "controller.problem.cost.Q=[1,1,1]"],
+            "controller.problem: weighs 3 states and 1 inputs",
+        ),
         (["system=pendulm"], "system: no such option 'pendulm'"),
-        (["system._target_=builtins.dict"], "system: _target_ must name a function that returns"),
+        (
+            ["system._target_=builtins.dict"],
+            "system: _target_ must name a function that returns",
+        ),
         (["folder=null"], "folder: must be the path of a folder; got None"),
         (["folder="], "folder: must be the path of a folder; got ''"),
         (["horizon=0"], "horizon: must be a whole number, 1 or more; got 0"),
         (["-m", "horizon=1,0"], "horizon: must be a whole number, 1 or more; got 0"),
-        (["-m", "data.size=[]"], "data.size: must be a whole number, 1 or more; got []"),
+        (
+            ["-m", "data.size=[]"],
+            "data.size: must be a whole number, 1 or more; got []",
+        ),
         (["-m", "seed=range(0)"], "seed: holds no value to sweep over"),
-        (["seed=range(3"], "'seed=range(3': cannot be read; a setting is written SETTING=VALUE"),
+        (
+            ["seed=range(3"],
+            "'seed=range(3': cannot be read; a setting is written SETTING=VALUE",
+        ),
         (["controller=papre"], "state_form (did you mean 'paper'?)"),
-        (["--hlep"], "unknown option '--hlep' (did you mean '--help'?); gpmpc run --help lists what there is"),
-        (["noise.process=0.1"], "noise.process: must be a list of standard deviations, one for every state; got 0.1"),
-        (["noise.process=[0.1]"], "noise.process must have 6 standard deviations; got 1"),
+        (
+            ["--hlep"],
+            "unknown option '--hlep' (did you mean '--help'?); gpmpc run --help lists what there is",
+        ),
+        (
+            ["noise.process=0.1"],
+            "noise.process: must be a list of standard deviations, one for every state; got 0.1",
+        ),
+        (
+            ["noise.process=[0.1]"],
+            "noise.process must have 6 standard deviations; got 1",
+        ),
         (["disturbances=gust"], "disturbances: must be a list; got 'gust'"),
-        (["disturbances=[{rates: {vx: 1}}]"], "disturbances: must each name what it is"),
-        (["disturbances=[{_target_: gpmpc.simulation.Gst}]"], "no such class or function 'gpmpc.simulation.Gst'"),
+        (
+            ["disturbances=[{rates: {vx: 1}}]"],
+            "disturbances: must each name what it is",
+        ),
+        (
+            ["disturbances=[{_target_: gpmpc.simulation.Gst}]"],
+            "no such class or function 'gpmpc.simulation.Gst'",
+        ),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )
-def test_a_mistake_is_one_clear_line_and_leaves_nothing_behind(arguments, message, tmp_path):
+def test_a_mistake_is_one_clear_line_and_leaves_nothing_behind(
+    arguments, message, tmp_path
+):
     done = forked("run", *arguments, cwd=tmp_path)
     assert done.returncode == 2
     assert message in done.stderr
@@ -182,18 +269,26 @@ def test_a_sweep_flies_every_combination(sweep):
     assert len({content["rmse"]["total"] for content in found.values()}) == 4
     assert "data.size=10,data.samples=25" not in found
     (plan,) = tree.glob("sweep-*.json")
-    assert sorted(json.loads(plan.read_text())["runs"]) == sorted(c["choices"] for c in found.values())
+    assert sorted(json.loads(plan.read_text())["runs"]) == sorted(
+        c["choices"] for c in found.values()
+    )
 
 
 def needs(module):
     """A launcher that an extra brings; tried out by hand."""
-    missing = pytest.mark.skipif(importlib.util.find_spec(module) is None, reason=f"{module} is not installed")
+    missing = pytest.mark.skipif(
+        importlib.util.find_spec(module) is None, reason=f"{module} is not installed"
+    )
     return [pytest.mark.slow, missing]
 
 
 @pytest.mark.parametrize(
     "launcher",
-    ["joblib", pytest.param("submitit", marks=needs("submitit")), pytest.param("ray", marks=needs("ray"))],
+    [
+        "joblib",
+        pytest.param("submitit", marks=needs("submitit")),
+        pytest.param("ray", marks=needs("ray")),
+    ],
 )
 def test_every_launcher_gives_the_same_numbers(launcher, sweep, tmp_path):
     capped = ["hydra.launcher.n_jobs=2"] if launcher == "joblib" else []
@@ -218,7 +313,9 @@ def test_a_killed_sweep_goes_on_and_ends_as_if_nothing_had_happened(sweep, tmp_p
     assert results(tree) == sweep[1]
 
 
-def test_a_sweep_does_not_take_a_finished_run_of_other_settings_for_its_own(sweep, tmp_path):
+def test_a_sweep_does_not_take_a_finished_run_of_other_settings_for_its_own(
+    sweep, tmp_path
+):
     tree = tmp_path / "tree"
     shutil.copytree(sweep[0], tree)
     again = forked(*SWEPT, "folder=tree", cwd=tmp_path)
@@ -233,11 +330,19 @@ def test_a_sweep_does_not_take_a_finished_run_of_other_settings_for_its_own(swee
     refused = forked(*SWEPT, "folder=tree", cwd=tmp_path)
     assert refused.returncode == 2
     assert refused.stderr.count("\n") == 1
-    assert f"folder: tree/{path.parent.name} holds a finished run of other settings" in refused.stderr
-    assert "controller.problem.cost.Q: [7.0, 1.0, 1.0, 1.0, 1.0, 1.0] then, [1.0, 1.0" in refused.stderr
+    assert (
+        f"folder: tree/{path.parent.name} holds a finished run of other settings"
+        in refused.stderr
+    )
+    assert (
+        "controller.problem.cost.Q: [7.0, 1.0, 1.0, 1.0, 1.0, 1.0] then, [1.0, 1.0"
+        in refused.stderr
+    )
     assert "gone: 1 then, None now" in refused.stderr
     assert "choose another folder, or remove that one to fly it again" in refused.stderr
-    assert json.loads(path.read_text()) == found  # nothing was overwritten, nothing else flown
+    assert (
+        json.loads(path.read_text()) == found
+    )  # nothing was overwritten, nothing else flown
     assert len(list(tree.glob("*/metrics.json"))) == 3
 
 
@@ -254,7 +359,9 @@ def test_failed_runs_are_named_and_stop_nothing(tmp_path):
     assert "6 runs: 4 flown, 0 finished before, 2 failed" in done.stdout
     lines = done.stderr.splitlines()
     assert len(lines) == 2
-    assert all("data.size=99" in line and "must be at most 25" in line for line in lines)
+    assert all(
+        "data.size=99" in line and "must be at most 25" in line for line in lines
+    )
     assert len(results(tmp_path / "t")) == 4
     told = forked("report", "t", cwd=tmp_path)
     assert told.returncode == 0, told.stderr

@@ -33,22 +33,35 @@ def shell(line, cwd, **environment):
 
 
 @pytest.mark.parametrize("command", ["--help", "run --cfg", "log --help"])
-def test_a_standard_output_that_takes_nothing_ends_the_command_in_one_line(command, tmp_path):
+def test_a_standard_output_that_takes_nothing_ends_the_command_in_one_line(
+    command, tmp_path
+):
     full = shell(f"$GPMPC {command} > /dev/full", tmp_path)
     assert (full.returncode, full.stderr) == (
         1,
         "gpmpc: cannot write to the standard output: No space left on device\n",
     )
     pipe = shell(f"$GPMPC {command} | true", tmp_path)
-    assert (pipe.returncode, pipe.stderr) in ((1, ""), (0, ""))  # all may have been written before true ended
+    assert (pipe.returncode, pipe.stderr) in (
+        (1, ""),
+        (0, ""),
+    )  # all may have been written before true ended
 
 
 def test_closed_streams_and_those_of_other_letters_do_no_harm(tmp_path):
     assert shell("$GPMPC run --cfg >&-", tmp_path).returncode == 0
     assert shell("$GPMPC run nope=1 2>&-", tmp_path).returncode == 2
     for code in ("ascii", "latin-1", "utf-8"):
-        done = shell("$GPMPC report $'n\\xc3\\xb6\\xe2\\x82\\xac\\xff'", tmp_path, PYTHONIOENCODING=code)
-        assert (done.returncode, done.stderr.count("\n"), "no such folder" in done.stderr) == (2, 1, True)
+        done = shell(
+            "$GPMPC report $'n\\xc3\\xb6\\xe2\\x82\\xac\\xff'",
+            tmp_path,
+            PYTHONIOENCODING=code,
+        )
+        assert (
+            done.returncode,
+            done.stderr.count("\n"),
+            "no such folder" in done.stderr,
+        ) == (2, 1, True)
 
 
 def test_what_cannot_be_written_is_no_error_that_a_command_could_take_for_one_of_a_file():
@@ -63,13 +76,18 @@ def test_what_cannot_be_written_is_no_error_that_a_command_could_take_for_one_of
 
 @pytest.mark.parametrize("command", ["run", "run -m seed=1,2", "report here"])
 def test_a_working_folder_that_is_gone_is_one_line(command, tmp_path):
-    done = shell(f"mkdir gone; cd gone; rmdir ../gone; exec $GPMPC {command} 2>&1 >/dev/null", tmp_path)
+    done = shell(
+        f"mkdir gone; cd gone; rmdir ../gone; exec $GPMPC {command} 2>&1 >/dev/null",
+        tmp_path,
+    )
     assert done.returncode == 2
     assert done.stdout.count("\n") == 1
     assert "gone" in done.stdout or "here: no such folder" in done.stdout
 
 
-INTERRUPT = "import os, signal, time; os.kill(os.getpid(), signal.SIGINT); time.sleep(5)"
+INTERRUPT = (
+    "import os, signal, time; os.kill(os.getpid(), signal.SIGINT); time.sleep(5)"
+)
 BREAKS = {
     "at once": INTERRUPT,
     "inside a library that makes an error of its own of it": f"""
@@ -91,33 +109,51 @@ time.sleep(5)
 
 @pytest.mark.parametrize("broken", BREAKS)
 @pytest.mark.parametrize(
-    ("command", "library"), [("run", "hydra"), ("plot nothing", "matplotlib"), ("report nothing", "rich")]
+    ("command", "library"),
+    [("run", "hydra"), ("plot nothing", "matplotlib"), ("report nothing", "rich")],
 )
-def test_ctrl_c_while_libraries_are_imported_is_one_line(command, library, broken, tmp_path):
+def test_ctrl_c_while_libraries_are_imported_is_one_line(
+    command, library, broken, tmp_path
+):
     (tmp_path / f"{library}.py").write_text(BREAKS[broken])
     done = shell(f"exec $GPMPC {command}", tmp_path, PYTHONPATH=str(tmp_path))
     assert (done.returncode, done.stderr) == (130, "\ninterrupted\n")
 
 
 def test_who_ignores_ctrl_c_is_not_interrupted(tmp_path):
-    (tmp_path / "rich.py").write_text("import os, signal; os.kill(os.getpid(), signal.SIGINT); os._exit(7)")
-    done = shell("trap '' INT; $GPMPC report nothing", tmp_path, PYTHONPATH=str(tmp_path))
+    (tmp_path / "rich.py").write_text(
+        "import os, signal; os.kill(os.getpid(), signal.SIGINT); os._exit(7)"
+    )
+    done = shell(
+        "trap '' INT; $GPMPC report nothing", tmp_path, PYTHONPATH=str(tmp_path)
+    )
     assert done.returncode == 7
 
 
 @pytest.mark.parametrize("command", ["run", "report"])
 def test_help_is_found_before_and_behind_a_command(command, tmp_path):
-    answers = [forked(*words, cwd=tmp_path) for words in (["help", command], [command, "--help"])]
-    assert {(each.returncode, each.stdout, each.stderr) for each in answers} == {(0, answers[0].stdout, "")}
+    answers = [
+        forked(*words, cwd=tmp_path)
+        for words in (["help", command], [command, "--help"])
+    ]
+    assert {(each.returncode, each.stdout, each.stderr) for each in answers} == {
+        (0, answers[0].stdout, "")
+    }
     assert f"gpmpc {command}" in answers[0].stdout
 
 
 def test_the_version_names_what_computes_wherever_it_is_asked_for(tmp_path):
-    versions = {forked(*words, cwd=tmp_path).stdout for words in (["--version"], ["run", "--version"], ["plot", "-V"])}
+    versions = {
+        forked(*words, cwd=tmp_path).stdout
+        for words in (["--version"], ["run", "--version"], ["plot", "-V"])
+    }
     (version,) = versions
     named = dict(line.split(maxsplit=1) for line in version.splitlines())
     assert {"gpmpc", "python", "torch", "numba", "BLAS", "CPU"} <= set(named)
-    assert json.loads(forked("version", "--json", cwd=tmp_path).stdout)["torch"] == named["torch"]
+    assert (
+        json.loads(forked("version", "--json", cwd=tmp_path).stdout)["torch"]
+        == named["torch"]
+    )
 
 
 def test_json_alone_stands_on_the_standard_output_and_quiet_leaves_it_empty(tmp_path):
@@ -126,7 +162,10 @@ def test_json_alone_stands_on_the_standard_output_and_quiet_leaves_it_empty(tmp_
     assert flown.returncode == 0, flown.stderr
     result = json.loads(flown.stdout)
     assert result["steps"] == 2
-    assert json.loads((tmp_path / result["folder"] / "metrics.json").read_text())["rmse"] == result["rmse"]
+    assert (
+        json.loads((tmp_path / result["folder"] / "metrics.json").read_text())["rmse"]
+        == result["rmse"]
+    )
     assert "RMSE [m]" in flown.stderr
     quiet = forked(*run, "--quiet", cwd=tmp_path)
     assert (quiet.returncode, quiet.stdout, quiet.stderr) == (0, "", "")
@@ -137,8 +176,15 @@ def test_json_alone_stands_on_the_standard_output_and_quiet_leaves_it_empty(tmp_
 
 
 def test_help_and_tab_list_only_choices_that_the_command_has(tmp_path):
-    for command, has, lacks in (("run", "controller", "study"), ("figures", "study", "launcher")):
-        listed = forked(command, "--help", cwd=tmp_path).stdout.partition("Choices:")[2].partition("Every setting")[0]
+    for command, has, lacks in (
+        ("run", "controller", "study"),
+        ("figures", "study", "launcher"),
+    ):
+        listed = (
+            forked(command, "--help", cwd=tmp_path)
+            .stdout.partition("Choices:")[2]
+            .partition("Every setting")[0]
+        )
         assert f"\n{has}: " in listed
         assert f"\n{lacks}: " not in listed
         offered = candidates(f"gpmpc {command} ")
@@ -158,7 +204,10 @@ def test_help_and_tab_list_only_choices_that_the_command_has(tmp_path):
         ("gpmpc run controller=nonlin", ["controller=nonlinear"]),
         ("gpmpc run noise.p", ["noise.process="]),
         ("gpmpc run controller=lqr controller.d", []),
-        ("gpmpc run controller.prediction.d", ["controller.prediction.disturbance_gain="]),
+        (
+            "gpmpc run controller.prediction.d",
+            ["controller.prediction.disturbance_gain="],
+        ),
         ("gpmpc run folder=tr", ["folder=tree/"]),
         ("gpmpc run --conf", ["--config-name", "--config-dir"]),
         ("gpmpc figures study=h", ["study=horizon"]),
@@ -189,9 +238,15 @@ def test_a_shell_completes_at_tab_in_a_terminal(shell_name, tmp_path):
     (tmp_path / "flights").mkdir()
     quiet = {"bash": ["--norc", "--noprofile"], "zsh": ["-f"]}[shell_name]
     path = os.pathsep.join([os.path.dirname(PATH), os.environ["PATH"]])
-    terminal = Terminal([shell_name, *quiet, "-i"], tmp_path, {"PATH": path, "PS1": "$ ", "TERM": "dumb"})
+    terminal = Terminal(
+        [shell_name, *quiet, "-i"],
+        tmp_path,
+        {"PATH": path, "PS1": "$ ", "TERM": "dumb"},
+    )
     try:
-        terminal.type(f'eval "$(gpmpc completion {shell_name})"; echo re""ady\n', until="ready")
+        terminal.type(
+            f'eval "$(gpmpc completion {shell_name})"; echo re""ady\n', until="ready"
+        )
         for typed, completed in (
             ("gpmpc fig", "gpmpc figures "),
             ("gpmpc run traj", "gpmpc run trajectory="),
@@ -222,9 +277,13 @@ class Terminal:
         os.write(self._fd, text.encode())
         shown, deadline = "", time.monotonic() + 20
         while until not in shown:
-            assert time.monotonic() < deadline, f"{until!r} was not shown after {text!r}: {shown!r}"
+            assert time.monotonic() < deadline, (
+                f"{until!r} was not shown after {text!r}: {shown!r}"
+            )
             if select.select([self._fd], [], [], 0.1)[0]:
-                shown += os.read(self._fd, 4096).decode(errors="replace").replace("\x07", "")
+                shown += (
+                    os.read(self._fd, 4096).decode(errors="replace").replace("\x07", "")
+                )
 
     def close(self):
         self._process.kill()
@@ -239,12 +298,27 @@ class Terminal:
         (["completion", "nosh"], "invalid choice: 'nosh'"),
         (["help", "rnu"], "unknown command 'rnu' (did you mean 'run'?)"),
         (["tables", "-m", "draws=1,2"], "unknown option '-m'"),
-        (["run", "-m", "--cfg", "seed=1,2"], "--cfg: shows the settings of one run; leave out -m"),
-        (["run", "tolerence=1"], "(did you mean 'model.tolerance' or 'controller.tolerance'"),
-        (["run", "controller.problem.cost.q=1"], "(did you mean 'controller.problem.cost.Q'?)"),
+        (
+            ["run", "-m", "--cfg", "seed=1,2"],
+            "--cfg: shows the settings of one run; leave out -m",
+        ),
+        (
+            ["run", "tolerence=1"],
+            "(did you mean 'model.tolerance' or 'controller.tolerance'",
+        ),
+        (
+            ["run", "controller.problem.cost.q=1"],
+            "(did you mean 'controller.problem.cost.Q'?)",
+        ),
         (["run", "--experimental-rerun", "x"], "unknown option '--experimental-rerun'"),
-        (["run", "-m", "--config-dir", "nowhere"], "--config-dir: nowhere: no such folder"),
-        (["run", "-m", "--config-name", "nothing"], "Cannot find primary config 'nothing'"),
+        (
+            ["run", "-m", "--config-dir", "nowhere"],
+            "--config-dir: nowhere: no such folder",
+        ),
+        (
+            ["run", "-m", "--config-name", "nothing"],
+            "Cannot find primary config 'nothing'",
+        ),
         (["log", "info", "a.mcap", "b.mcap"], "log info: writes nothing; got b.mcap"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
@@ -259,10 +333,21 @@ def test_a_mistake_is_one_clear_line(arguments, message, tmp_path):
 @pytest.mark.parametrize("sweep", [[], ["-m"]], ids=["one run", "sweep"])
 def test_settings_and_classes_of_the_users_own_folder_are_found(sweep, tmp_path):
     (tmp_path / "own" / "controller").mkdir(parents=True)
-    (tmp_path / "own" / "controller" / "mine.yaml").write_text("defaults: [convex]\ntolerance: 0.5\n")
+    (tmp_path / "own" / "controller" / "mine.yaml").write_text(
+        "defaults: [convex]\ntolerance: 0.5\n"
+    )
     (tmp_path / "own" / "ours.yaml").write_text("defaults: [run, _self_]\nseed: 5\n")
-    (tmp_path / "vehicle.py").write_text("from gpmpc.systems import translational as mine\n")
-    found = ["--config-dir", "own", "--config-name", "ours", "controller=mine", "system._target_=vehicle.mine"]
+    (tmp_path / "vehicle.py").write_text(
+        "from gpmpc.systems import translational as mine\n"
+    )
+    found = [
+        "--config-dir",
+        "own",
+        "--config-name",
+        "ours",
+        "controller=mine",
+        "system._target_=vehicle.mine",
+    ]
     done = forked("run", *sweep, *found, *TINY, "folder=tree", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     (path,) = (tmp_path / "tree").glob("*/config.yaml")
@@ -280,9 +365,21 @@ def test_kernels_are_compiled_when_asked_for(tmp_path):
 
 @pytest.mark.parametrize("command", ["run -m seed=1,2", "run"])
 def test_ctrl_c_in_the_middle_of_flights_is_one_line(command, tmp_path):
-    words = [PATH, *command.split(), *TINY, "steps=1000000", "recorder=none", "folder=tree"]
+    words = [
+        PATH,
+        *command.split(),
+        *TINY,
+        "steps=1000000",
+        "recorder=none",
+        "folder=tree",
+    ]
     flying = subprocess.Popen(
-        words, cwd=tmp_path, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, start_new_session=True
+        words,
+        cwd=tmp_path,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
     )
     deadline = time.monotonic() + SECONDS
     while not list(tmp_path.glob("tree/*/config.yaml")) and time.monotonic() < deadline:
@@ -317,15 +414,30 @@ if __name__ == "__main__":
 """
 
 
-@pytest.mark.parametrize("ended_by", [signal.SIGKILL, signal.SIGTERM, signal.SIGHUP], ids=str)
-def test_workers_end_with_a_parent_that_is_killed_and_let_its_pipe_go(ended_by, tmp_path):
+@pytest.mark.parametrize(
+    "ended_by", [signal.SIGKILL, signal.SIGTERM, signal.SIGHUP], ids=str
+)
+def test_workers_end_with_a_parent_that_is_killed_and_let_its_pipe_go(
+    ended_by, tmp_path
+):
     (tmp_path / "pool.py").write_text(POOL)
     _kill_and_wait_for_the_pipe([sys.executable, "pool.py"], tmp_path, "b", ended_by)
 
 
 def test_a_killed_joblib_sweep_leaves_no_worker(tmp_path):
-    command = [PATH, "run", "-m", *TINY, "steps=1000000", "seed=1,2", "launcher=joblib", "hydra.launcher.n_jobs=2"]
-    _kill_and_wait_for_the_pipe([*command, "folder=tree"], tmp_path, "tree/*/config.yaml", signal.SIGKILL)
+    command = [
+        PATH,
+        "run",
+        "-m",
+        *TINY,
+        "steps=1000000",
+        "seed=1,2",
+        "launcher=joblib",
+        "hydra.launcher.n_jobs=2",
+    ]
+    _kill_and_wait_for_the_pipe(
+        [*command, "folder=tree"], tmp_path, "tree/*/config.yaml", signal.SIGKILL
+    )
 
 
 def _kill_and_wait_for_the_pipe(command, cwd, begun, ended_by):
@@ -353,7 +465,9 @@ def _kill_and_wait_for_the_pipe(command, cwd, begun, ended_by):
 def test_ctrl_c_in_a_terminal_reaches_no_worker_while_it_starts(tmp_path):
     """Workers that are still importing would print their tracebacks between the lines of the parent."""
     starting = "import os, signal\nif __name__ == '__mp_main__':\n    os.kill(os.getpid(), signal.SIGINT)\n"
-    (tmp_path / "pool.py").write_text(f"{starting}{POOL.replace('time.sleep(120)', 'pass')}")
+    (tmp_path / "pool.py").write_text(
+        f"{starting}{POOL.replace('time.sleep(120)', 'pass')}"
+    )
     done = subprocess.run(
         [sys.executable, "pool.py"], cwd=tmp_path, capture_output=True, text=True, timeout=SECONDS, check=False,
         env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))},

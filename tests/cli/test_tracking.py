@@ -12,7 +12,10 @@ from gpmpc.cli._run import log_to_mlflow
 from tests.cli.command import forked
 
 TINY = ["steps=3", "data.samples=25", "model.restarts=0", "tracker=mlflow"]
-RESULT = {"settings": {"R": [1.0], "data": {"note": "x" * 9000}}, "rmse": {"total": 0.5, "x [m]": float("inf"), "n": 2}}
+RESULT = {
+    "settings": {"R": [1.0], "data": {"note": "x" * 9000}},
+    "rmse": {"total": 0.5, "x [m]": float("inf"), "n": 2},
+}
 
 
 class Store(types.ModuleType):
@@ -42,7 +45,9 @@ class Store(types.ModuleType):
         self.seen["artifacts"] = folder
 
 
-def test_settings_become_parameters_numbers_metrics_and_files_artifacts(monkeypatch, tmp_path):
+def test_settings_become_parameters_numbers_metrics_and_files_artifacts(
+    monkeypatch, tmp_path
+):
     for name in ("MLFLOW_EXPERIMENT_NAME", "MLFLOW_EXPERIMENT_ID"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setitem(sys.modules, "mlflow", store := Store())
@@ -53,7 +58,9 @@ def test_settings_become_parameters_numbers_metrics_and_files_artifacts(monkeypa
     assert store.seen["artifacts"] == str(tmp_path)
 
 
-def test_a_tracker_that_is_unknown_or_not_installed_is_named_before_anything_flies(tmp_path):
+def test_a_tracker_that_is_unknown_or_not_installed_is_named_before_anything_flies(
+    tmp_path,
+):
     wrong = [("comet", "tracker: must be 'mlflow' or 'none'; got 'comet'")]
     if find_spec("mlflow") is None:
         wrong.append(("mlflow", "tracker: needs MLflow: pip install mlflow"))
@@ -71,7 +78,10 @@ def test_a_run_is_found_in_mlflow_with_its_numbers_and_files(tmp_path):
     mlflow.set_tracking_uri(store)
     (found,) = mlflow.search_runs(experiment_names=["gpmpc"], output_format="list")
     (path,) = tmp_path.glob("outputs/run/*/metrics.json")
-    assert found.data.metrics["rmse.total"] == json.loads(path.read_text())["rmse"]["total"]
+    assert (
+        found.data.metrics["rmse.total"]
+        == json.loads(path.read_text())["rmse"]["total"]
+    )
     assert found.data.params["controller.horizon"] == "10"
     assert found.info.status == "FINISHED"
 

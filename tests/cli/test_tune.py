@@ -20,19 +20,34 @@ SEARCHED = [
 
 
 def tune(folder, trials, cwd):
-    done = forked("tune", *TINY, *SEARCHED, "--trials", trials, "--batch", "2", f"folder={folder}", "--json", cwd=cwd)
+    done = forked(
+        "tune",
+        *TINY,
+        *SEARCHED,
+        "--trials",
+        trials,
+        "--batch",
+        "2",
+        f"folder={folder}",
+        "--json",
+        cwd=cwd,
+    )
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout)
 
 
 def test_a_search_goes_on_where_it_stopped_and_its_best_settings_fly(tmp_path):
     tune("tree", "2", tmp_path)
-    flown = {path: path.stat().st_mtime_ns for path in tmp_path.glob("tree/*/metrics.json")}
+    flown = {
+        path: path.stat().st_mtime_ns for path in tmp_path.glob("tree/*/metrics.json")
+    }
     assert 2 <= len(flown) <= 3
     found = tune("tree", "4", tmp_path)
     assert all(path.stat().st_mtime_ns == before for path, before in flown.items())
     whole = tune("whole", "4", tmp_path)
-    assert (tmp_path / "tree" / "tuning.csv").read_text() == (tmp_path / "whole" / "tuning.csv").read_text()
+    assert (tmp_path / "tree" / "tuning.csv").read_text() == (
+        tmp_path / "whole" / "tuning.csv"
+    ).read_text()
     assert (found["best"], found["cost"]) == (whole["best"], whole["cost"])
     assert (tmp_path / "tree" / "tuning.png").read_bytes().startswith(b"\x89PNG")
     program, *arguments = shlex.split(found["command"])
@@ -40,12 +55,18 @@ def test_a_search_goes_on_where_it_stopped_and_its_best_settings_fly(tmp_path):
     composed = json.loads(forked(*arguments, "--cfg", "--json", cwd=tmp_path).stdout)
     assert composed["steps"] == 4
     assert composed["horizon"] == found["best"]["horizon"]
-    assert composed["controller"]["problem"]["cost"]["R"][1] == found["best"]["controller.problem.cost.R.1"]
+    assert (
+        composed["controller"]["problem"]["cost"]["R"][1]
+        == found["best"]["controller.problem.cost.R.1"]
+    )
     kind = {"convex": "GPMPC", "lqr": "LQR"}[found["best"]["controller"]]
     assert composed["controller"]["_target_"].endswith(f".{kind}")
     again = forked(*arguments, "--json", cwd=tmp_path)
     assert again.returncode == 0, again.stderr
-    totals = [json.loads(path.read_text())["rmse"]["total"] for path in tmp_path.glob("tree/*/metrics.json")]
+    totals = [
+        json.loads(path.read_text())["rmse"]["total"]
+        for path in tmp_path.glob("tree/*/metrics.json")
+    ]
     assert json.loads(again.stdout)["rmse"]["total"] in totals
 
 
@@ -53,18 +74,30 @@ def test_a_search_goes_on_where_it_stopped_and_its_best_settings_fly(tmp_path):
     ("arguments", "message"),
     [
         ([], "tune: names nothing to search, such as horizon=1,5,10"),
-        (["horizon=1,2", "--trials", "0"], "--trials: must be a whole number, 1 or more; got 0"),
+        (
+            ["horizon=1,2", "--trials", "0"],
+            "--trials: must be a whole number, 1 or more; got 0",
+        ),
         (["seed=1,2"], "seed: cannot be searched; seeds are many by --seeds"),
         (["horizon=1,2", "recorder=none"], "recorder: must be mcap"),
         (["horizon=1,2", "steps=1"], "steps: must be 2 or more"),
-        (["controller.tolerance=interval(2,1)"], "controller.tolerance: must rise; got"),
-        (["controller.tolerance=tag(log,interval(0,1))"], "controller.tolerance: must rise, from above 0; got"),
+        (
+            ["controller.tolerance=interval(2,1)"],
+            "controller.tolerance: must rise; got",
+        ),
+        (
+            ["controller.tolerance=tag(log,interval(0,1))"],
+            "controller.tolerance: must rise, from above 0; got",
+        ),
         (
             ["controller.problem.cost.R.7=interval(1,2)"],
             "controller.problem.cost.R.7: controller.problem.cost.R is no list with",
         ),
         (["horizn=1,2"], "unknown setting 'horizn' (did you mean 'horizon'?)"),
-        (["horizon=0,1", "--trials", "3"], "horizon: must be a whole number, 1 or more; got 0"),
+        (
+            ["horizon=0,1", "--trials", "3"],
+            "horizon: must be a whole number, 1 or more; got 0",
+        ),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )
@@ -79,5 +112,7 @@ def test_the_help_of_tune_can_be_typed(tmp_path):
     shown = forked("help", "tune", cwd=tmp_path).stdout
     typed = re.findall(r"^  ('?[a-z][\w.]*=\S+)", shown, re.MULTILINE)
     assert len(typed) >= 5
-    for override in OverridesParser.create().parse_overrides([text.strip("'") for text in typed if "DIR" not in text]):
+    for override in OverridesParser.create().parse_overrides(
+        [text.strip("'") for text in typed if "DIR" not in text]
+    ):
         assert override.get_key_element()

@@ -11,21 +11,35 @@ from gpmpc.exceptions import SettingError
 from gpmpc.systems import pendulum, rotational, step, translational
 from gpmpc.trajectories import Elliptical
 
-OUTER = Excitation([1] * 6, [1] * 3, [7.26, 0, 0], dither=[0.3, 0.03, 0.03], noise=[0.01] * 6)
-INNER = Excitation([1] * 6, [1] * 3, [0, 0, 0], dither=[0.05] * 3, noise=[1e-4, 1e-3] * 3)
+OUTER = Excitation(
+    [1] * 6, [1] * 3, [7.26, 0, 0], dither=[0.3, 0.03, 0.03], noise=[0.01] * 6
+)
+INNER = Excitation(
+    [1] * 6, [1] * 3, [0, 0, 0], dither=[0.05] * 3, noise=[1e-4, 1e-3] * 3
+)
 DATA = ExcitedData(OUTER, INNER, samples=60)
 POSITION, ATTITUDE = translational(), rotational(substeps=1)
 
 
 def by_input(plant, x, u):
     """The true derivatives by the inputs (6, 3)."""
-    return np.array([(step(plant, x, u + e) - step(plant, x, u - e)) / 2e-6 for e in 1e-6 * np.eye(3)]).T
+    return np.array(
+        [
+            (step(plant, x, u + e) - step(plant, x, u - e)) / 2e-6
+            for e in 1e-6 * np.eye(3)
+        ]
+    ).T
 
 
 @pytest.mark.parametrize(("system", "flown"), [(POSITION, OUTER), (ATTITUDE, INNER)])
-def test_transitions_are_the_systems_with_the_noise_and_inputs_that_acted(system, flown):
+def test_transitions_are_the_systems_with_the_noise_and_inputs_that_acted(
+    system, flown
+):
     data = DATA.transitions(system, Elliptical())
-    stepped = [step(system, x, u) for x, u in zip(data.states.numpy(), data.inputs.numpy(), strict=True)]
+    stepped = [
+        step(system, x, u)
+        for x, u in zip(data.states.numpy(), data.inputs.numpy(), strict=True)
+    ]
     left = data.next_states.numpy() - stepped
     assert np.abs(left.std(axis=0) / flown.noise - 1).max() < 0.5
     assert (data.inputs.numpy().std(axis=0) > 0.7 * np.array(flown.dither)).all()
@@ -34,7 +48,8 @@ def test_transitions_are_the_systems_with_the_noise_and_inputs_that_acted(system
 
 def test_the_seed_decides_the_flight():
     first, again, other = (
-        replace(DATA, seed=seed).transitions(ATTITUDE, Elliptical()).states.numpy() for seed in (0, 0, 1)
+        replace(DATA, seed=seed).transitions(ATTITUDE, Elliptical()).states.numpy()
+        for seed in (0, 0, 1)
     )
     assert np.array_equal(first, again)
     assert not np.array_equal(first, other)
@@ -56,8 +71,12 @@ def test_a_model_learns_from_dither_what_the_inputs_do_and_cannot_without():
 
 
 def test_a_frozen_attitude_can_be_flown():
-    source = replace(DATA, samples=20, translational=replace(OUTER, initial_input=[14.5, 0, 0]))
-    data = source.transitions(translational(frozen_attitude=(np.pi / 4, np.pi / 4)), Elliptical())
+    source = replace(
+        DATA, samples=20, translational=replace(OUTER, initial_input=[14.5, 0, 0])
+    )
+    data = source.transitions(
+        translational(frozen_attitude=(np.pi / 4, np.pi / 4)), Elliptical()
+    )
     assert abs(float(data.inputs[:, 0].mean()) - 2 * 0.74 * 9.81) < 0.5
 
 
@@ -76,16 +95,29 @@ def test_the_settings_that_ship_are_these():
         ({"samples": 0}, "data.samples: must be a whole number, 1 or more; got 0"),
         ({"hold": 1.5}, "data.hold: must be a whole number, 1 or more; got 1.5"),
         ({"seed": -1}, "data.seed: must be a whole number, 0 or more; got -1"),
-        ({"response_time": 0}, r"data.response_time: must be a number above 0 \[s\]; got 0"),
-        ({"attitude": "level"}, "data.attitude: must be one of paper, exact; got 'level'"),
+        (
+            {"response_time": 0},
+            r"data.response_time: must be a number above 0 \[s\]; got 0",
+        ),
+        (
+            {"attitude": "level"},
+            "data.attitude: must be one of paper, exact; got 'level'",
+        ),
     ],
 )
 def test_misuse_is_refused_with_the_rule(change, message):
     with pytest.raises(SettingError, match=message):
         replace(DATA, **change)
-    with pytest.raises(SettingError, match="dither: must be a number, 0 or more; got -1"):
+    with pytest.raises(
+        SettingError, match="dither: must be a number, 0 or more; got -1"
+    ):
         replace(OUTER, dither=[-1, 0, 0])
-    with pytest.raises(SettingError, match="are of translational and rotational alone; data=random is of any system"):
+    with pytest.raises(
+        SettingError,
+        match="are of translational and rotational alone; data=random is of any system",
+    ):
         DATA.transitions(pendulum(), Elliptical())
-    with pytest.raises(SettingError, match="trajectory: these data follow one; got none"):
+    with pytest.raises(
+        SettingError, match="trajectory: these data follow one; got none"
+    ):
         DATA.transitions(POSITION, None)

@@ -46,18 +46,34 @@ def share_that_holds(kappas, seed, rows=None):
 
 @pytest.mark.parametrize("rows", [None, [[1.0, 0.0]]], ids=["all states", "one side"])
 @pytest.mark.parametrize("probability", [0.9, 0.95])
-def test_the_quantile_of_held_out_scores_holds_where_the_gaussian_does_not(probability, rows):
-    tubes = [ConformalTube.calibrate(MODEL, PROPAGATOR, *log(1000, seed), H, rows) for seed in range(6)]
-    held = np.mean([share_that_holds(tube.kappas(probability), 100 + s, rows) for s, tube in enumerate(tubes)], axis=0)
+def test_the_quantile_of_held_out_scores_holds_where_the_gaussian_does_not(
+    probability, rows
+):
+    tubes = [
+        ConformalTube.calibrate(MODEL, PROPAGATOR, *log(1000, seed), H, rows)
+        for seed in range(6)
+    ]
+    held = np.mean(
+        [
+            share_that_holds(tube.kappas(probability), 100 + s, rows)
+            for s, tube in enumerate(tubes)
+        ],
+        axis=0,
+    )
     assert (held > probability - 0.015).all()
     assert (held < probability + 0.03).all()
-    assert (share_that_holds(np.full(H, 1.65 if probability == 0.95 else 1.28), 100, rows) < 0.8).all()
+    assert (
+        share_that_holds(np.full(H, 1.65 if probability == 0.95 else 1.28), 100, rows)
+        < 0.8
+    ).all()
 
 
 def test_too_few_windows_promise_nothing():
     tube = ConformalTube.calibrate(MODEL, PROPAGATOR, *log(18 * H, 0), H)
     assert (tube.kappas(0.9) == tube.scores[-1]).all()
-    with pytest.raises(DataError, match="a probability of 0.95 needs 19 windows or more; got 18"):
+    with pytest.raises(
+        DataError, match="a probability of 0.95 needs 19 windows or more; got 18"
+    ):
         tube.kappas(0.95)
 
 
@@ -65,16 +81,22 @@ def test_too_few_windows_promise_nothing():
 def test_an_adaptive_tube_holds_in_the_long_run_whatever_the_plant_does(plant):
     probability, rate, T = 0.9, 0.05, 1000
     scores = np.abs(np.random.default_rng(0).normal(size=(99, H)))
-    tube = AdaptiveTube(ConformalTube(scores, [[1.0, 0.0]]), probability, rate, largest=10.0)
+    tube = AdaptiveTube(
+        ConformalTube(scores, [[1.0, 0.0]]), probability, rate, largest=10.0
+    )
     rng, covariances = np.random.default_rng(1), np.tile(np.eye(2), (H + 1, 1, 1))
     for t in range(T):
         size = {"noisy": 1.0, "worse with time": 1 + 2 * t / T, "hostile": 0.0}[plant]
         x = size * rng.normal(size=2)
-        if plant == "hostile":  # just outside of the last bound of the first stage, where it is less than the largest
+        if (
+            plant == "hostile"
+        ):  # just outside of the last bound of the first stage, where it is less than the largest
             x = np.array([min(tube.kappas[0] + 1e-6, 9.99), 0.0])
         tube.observe(np.clip(x, -9.99, 9.99))
         tube.remember(np.zeros((H + 1, 2)), covariances)
-    allowed = 1 - probability + (1 + rate * (np.arange(1, H + 1) + 1)) / (rate * tube.counts)
+    allowed = (
+        1 - probability + (1 + rate * (np.arange(1, H + 1) + 1)) / (rate * tube.counts)
+    )
     assert (tube.violations <= allowed).all()
     assert tube.counts.tolist() == [T - k for k in range(1, H + 1)]
     if plant != "hostile":
@@ -83,10 +105,16 @@ def test_an_adaptive_tube_holds_in_the_long_run_whatever_the_plant_does(plant):
 
 @pytest.mark.parametrize("eta", [0.9, 0.95, 0.99])
 @pytest.mark.parametrize("size", [0.7, 1.4, 2.5])
-def test_a_tube_that_aims_lower_keeps_the_upper_limit_of_its_violations_at_what_is_allowed(eta, size):
+def test_a_tube_that_aims_lower_keeps_the_upper_limit_of_its_violations_at_what_is_allowed(
+    eta, size
+):
     T, rng = 3000, np.random.default_rng(0)
-    quantiles = norm.ppf(np.arange(1, 400) / 400)[:, None]  # of a noise that the plant's is ``size`` times
-    tube = AdaptiveTube(ConformalTube(quantiles, [[1.0]]), eta, largest=20.0, decisions=T)
+    quantiles = norm.ppf(np.arange(1, 400) / 400)[
+        :, None
+    ]  # of a noise that the plant's is ``size`` times
+    tube = AdaptiveTube(
+        ConformalTube(quantiles, [[1.0]]), eta, largest=20.0, decisions=T
+    )
     for x in size * rng.normal(size=T):
         tube.remember(np.zeros((2, 1)), np.ones((2, 1, 1)))
         tube.observe([x])
@@ -106,8 +134,15 @@ def test_only_predictions_of_the_stages_that_are_told_count():
 
 
 def test_only_the_directions_count_in_which_a_plan_touches_a_bound():
-    tube = AdaptiveTube(ConformalTube(np.ones((19, 1)), [[1.0], [-1.0]]), 0.9, largest=5.0)
-    touched = {"above": [[True, False]], "below": [[False, True]], "both": [[True, True]], "none": [[False, False]]}
+    tube = AdaptiveTube(
+        ConformalTube(np.ones((19, 1)), [[1.0], [-1.0]]), 0.9, largest=5.0
+    )
+    touched = {
+        "above": [[True, False]],
+        "below": [[False, True]],
+        "both": [[True, True]],
+        "none": [[False, False]],
+    }
     counted = []
     for stages in touched.values():
         tube.remember(np.zeros((2, 1)), np.ones((2, 1, 1)), stages)
@@ -123,7 +158,9 @@ def test_plans_are_compared_at_their_own_stage_and_those_of_failed_steps_are_lef
     tube = AdaptiveTube(ConformalTube(np.ones((19, 3)), [[1.0]]), 0.9, largest=5.0)
     covariances = np.ones((4, 1, 1))
     for t in range(8):
-        tube.observe([float(t)])  # the plan of step s says s + k at stage k: it always holds
+        tube.observe(
+            [float(t)]
+        )  # the plan of step s says s + k at stage k: it always holds
         if t != 4:
             tube.remember(t + np.arange(4.0)[:, None], covariances)
     assert tube.misses.tolist() == [0, 0, 0]
@@ -138,16 +175,24 @@ def test_misuse_is_refused():
     x, u = log(40, 0)
     with pytest.raises(DataError, match="a log of 5 states has no window of 5 steps"):
         ConformalTube.calibrate(MODEL, PROPAGATOR, x[:5], u[:4], H)
-    with pytest.raises(DataError, match="a direction has no variance: predict with the process noise"):
+    with pytest.raises(
+        DataError, match="a direction has no variance: predict with the process noise"
+    ):
         ConformalTube.calibrate(MODEL, Linearization(), x, u, H)
-    with pytest.raises(ShapeError, match=r"must be one log; got \(41, 2\) and \(30, 2\)"):
+    with pytest.raises(
+        ShapeError, match=r"must be one log; got \(41, 2\) and \(30, 2\)"
+    ):
         ConformalTube.calibrate(MODEL, PROPAGATOR, x, u[:30], H)
     tube = ConformalTube.calibrate(MODEL, PROPAGATOR, x, u, H)
-    with pytest.raises(SettingError, match="probability: must lie between 0 and 1; got 1"):
+    with pytest.raises(
+        SettingError, match="probability: must lie between 0 and 1; got 1"
+    ):
         tube.kappas(1.0)
     with pytest.raises(SettingError, match="rate: must be a number above 0"):
         AdaptiveTube(tube, 0.9, rate=0.0)
-    with pytest.raises(SettingError, match="decisions: are too few for a probability of 0.99; got 100"):
+    with pytest.raises(
+        SettingError, match="decisions: are too few for a probability of 0.99; got 100"
+    ):
         AdaptiveTube(tube, 0.99, decisions=100)
     with pytest.raises(ShapeError, match=r"means must be \(6, 2\); got \(5, 2\)"):
         AdaptiveTube(tube, 0.8).remember(np.zeros((5, 2)), np.zeros((5, 2, 2)))

@@ -22,10 +22,16 @@ def log(steps, delay, seed, feedback=0.0, std=(1e-3, 0.02), rho=0.0):
     """States and inputs of a flight; noise is an AR(1) process of these standard deviations."""
     rng, whole = np.random.default_rng(seed), int(np.ceil(delay))
     share = delay - (whole - 1)
-    states, inputs, noise = [np.array([0.3, 0.0])], [np.zeros(1)] * (whole + 1), np.zeros(2)
+    states, inputs, noise = (
+        [np.array([0.3, 0.0])],
+        [np.zeros(1)] * (whole + 1),
+        np.zeros(2),
+    )
     for _ in range(steps):
         inputs.append(rng.uniform(-1, 1, 1) - feedback * states[-1][1:])
-        acting = share * inputs[-1 - whole] + (1 - share) * inputs[-whole if whole else -1]
+        acting = (
+            share * inputs[-1 - whole] + (1 - share) * inputs[-whole if whole else -1]
+        )
         noise = rho * noise + np.sqrt(1 - rho**2) * rng.normal(0, std)
         states.append(pendulum(states[-1], acting) + noise)
     return np.array(states), np.array(inputs[whole + 1 :])
@@ -38,7 +44,10 @@ def test_a_delay_is_found_also_where_the_input_follows_the_state(delay, feedback
     assert found.steps == pytest.approx(delay, abs=0.15)
     assert found.interval[0] <= delay <= found.interval[1]
     assert found.interval[1] - found.interval[0] < 0.8
-    assert found.correlations.max() == found.correlations[found.delays.tolist().index(found.steps)]
+    assert (
+        found.correlations.max()
+        == found.correlations[found.delays.tolist().index(found.steps)]
+    )
 
 
 def test_the_interval_holds_the_delay_as_often_as_it_says():
@@ -64,13 +73,19 @@ def test_noise_and_its_correlation_are_those_of_the_process():
     found = estimate_process_noise(model, data)
     assert torch.allclose(found.variance.sqrt(), torch.tensor([2e-3, 0.03]), rtol=0.12)
     assert torch.allclose(found.correlation, torch.full((2,), 0.6), atol=0.12)
-    assert torch.allclose(found.long_run_variance / found.variance, torch.full((2,), 4.0), rtol=0.35)
+    assert torch.allclose(
+        found.long_run_variance / found.variance, torch.full((2,), 4.0), rtol=0.35
+    )
 
 
 def test_rows_that_were_trained_on_count_as_if_they_had_not_been():
     data = transitions(*log(200, 0, 3, std=(2e-3, 0.03)))
     model = Trainer(predicts="difference", restarts=0)(data).posterior
-    in_sample = (data.next_states - model.predict(data.states, data.inputs).mean).square().mean(0)
+    in_sample = (
+        (data.next_states - model.predict(data.states, data.inputs).mean)
+        .square()
+        .mean(0)
+    )
     held_out = estimate_process_noise(model, data[:20], block=20)
     without = GPPosterior.from_hyperparameters(
         model.features[20:], model.targets[20:], model.lengthscales, model.signal_variance, model.noise_variance, 1,
@@ -88,17 +103,25 @@ def test_a_posterior_with_more_noise_predicts_wider_tubes_and_the_same_data():
     wider = with_process_noise(model, 4 * noise.variance)
     assert torch.allclose(wider.noise_covariance, torch.diag(4 * noise.variance))
     assert torch.equal(wider.features, model.features)
-    belief = Linearization(process_noise=True)(wider, wider.predict(data.states[0], data.inputs[0]), data.inputs[1])
+    belief = Linearization(process_noise=True)(
+        wider, wider.predict(data.states[0], data.inputs[0]), data.inputs[1]
+    )
     assert (belief.variance > 4 * noise.variance).all()
-    residual = ResidualModel.train(Affine.identity(2, 1), data, angles=[0], trainer=Trainer(restarts=0))
-    assert torch.allclose(estimate_process_noise(residual, data).variance, noise.variance, rtol=0.5)
+    residual = ResidualModel.train(
+        Affine.identity(2, 1), data, angles=[0], trainer=Trainer(restarts=0)
+    )
+    assert torch.allclose(
+        estimate_process_noise(residual, data).variance, noise.variance, rtol=0.5
+    )
 
 
 def test_rows_in_no_order_of_time_have_no_correlation():
     data = transitions(*log(60, 0, 1))
     model = Trainer(predicts="difference", restarts=0)(data).posterior
     order = np.random.default_rng(0).permutation(60)
-    assert torch.isnan(estimate_process_noise(model, data[order.tolist()]).correlation).all()
+    assert torch.isnan(
+        estimate_process_noise(model, data[order.tolist()]).correlation
+    ).all()
 
 
 def test_misuse_is_refused():
@@ -107,12 +130,21 @@ def test_misuse_is_refused():
     model = Trainer(predicts="difference", restarts=0)(data).posterior
     with pytest.raises(DataError, match="needs ten rows or more; got 9"):
         estimate_process_noise(model, data[:9])
-    with pytest.raises(ShapeError, match="the model has 2 states and 1 inputs; got transitions with 2 and 2"):
-        estimate_process_noise(model, Transitions(data.states, data.states, data.next_states))
-    sparse = SparseTrainer(inducing=8, restarts=0, iterations=5, predicts="difference")(data).posterior
+    with pytest.raises(
+        ShapeError,
+        match="the model has 2 states and 1 inputs; got transitions with 2 and 2",
+    ):
+        estimate_process_noise(
+            model, Transitions(data.states, data.states, data.next_states)
+        )
+    sparse = SparseTrainer(inducing=8, restarts=0, iterations=5, predicts="difference")(
+        data
+    ).posterior
     with pytest.raises(UnsupportedModel, match="train a sparse one again"):
         with_process_noise(sparse, torch.ones(2))
-    with pytest.raises(ShapeError, match=r"must be one log; got \(61, 2\) and \(50, 1\)"):
+    with pytest.raises(
+        ShapeError, match=r"must be one log; got \(61, 2\) and \(50, 1\)"
+    ):
         estimate_delay(states, inputs[:50])
     with pytest.raises(DataError, match="a delay of up to 60 steps needs"):
         estimate_delay(states, inputs, longest=60)

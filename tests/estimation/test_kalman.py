@@ -29,7 +29,10 @@ class Known:
     input_dim, dtype, device = 1, F, torch.device("cpu")
 
     def __init__(self, function, noise):
-        self.function, self.noise_covariance = function, torch.diag(torch.tensor(noise, dtype=F) ** 2)
+        self.function, self.noise_covariance = (
+            function,
+            torch.diag(torch.tensor(noise, dtype=F) ** 2),
+        )
         self.state_dim = self.output_dim = len(noise)
 
     def predict(self, state, input):
@@ -37,7 +40,10 @@ class Known:
         return Gaussian(mean, mean.new_zeros(*mean.shape, len(self.noise_covariance)))
 
 
-A, B = torch.tensor([[1.0, 0.1], [-0.3, 0.9]], dtype=F), torch.tensor([[0.0], [0.1]], dtype=F)
+A, B = (
+    torch.tensor([[1.0, 0.1], [-0.3, 0.9]], dtype=F),
+    torch.tensor([[0.0], [0.1]], dtype=F),
+)
 LINEAR = Known(lambda x, u: x @ A.mT + u @ B.mT, [0.05, 0.1])
 
 
@@ -47,20 +53,29 @@ def pendulum(x, u):
 
 
 PENDULUM = Known(pendulum, [1e-3, 0.02])
-PRIOR = Gaussian(torch.tensor([0.5, 0.0], dtype=F), torch.diag(torch.tensor([0.04, 0.09], dtype=F)))
+PRIOR = Gaussian(
+    torch.tensor([0.5, 0.0], dtype=F), torch.diag(torch.tensor([0.04, 0.09], dtype=F))
+)
 
 
 def simulated(model, steps, seed, measurement, prior=PRIOR):
     rng = np.random.default_rng(seed)
 
     def noise(covariance):
-        return torch.from_numpy(rng.multivariate_normal(np.zeros(len(covariance)), covariance.numpy()))
+        return torch.from_numpy(
+            rng.multivariate_normal(np.zeros(len(covariance)), covariance.numpy())
+        )
 
-    states, inputs = [prior.mean + noise(prior.covariance)], torch.from_numpy(rng.normal(size=(steps, 1)))
+    states, inputs = (
+        [prior.mean + noise(prior.covariance)],
+        torch.from_numpy(rng.normal(size=(steps, 1))),
+    )
     for u in inputs:
         states.append(model.predict(states[-1], u).mean + noise(model.noise_covariance))
     x = torch.stack(states)
-    measured = torch.stack([measurement.function(s) + noise(measurement.noise_covariance) for s in x])
+    measured = torch.stack(
+        [measurement.function(s) + noise(measurement.noise_covariance) for s in x]
+    )
     return x, inputs, measured
 
 
@@ -74,7 +89,9 @@ def conditioned(inputs, measured, H, R):
         for j in range(k):
             covariance[k, :, j] = A @ covariance[k - 1, :, j]
             covariance[j, :, k] = covariance[k, :, j].mT
-        covariance[k, :, k] = A @ covariance[k - 1, :, k - 1] @ A.mT + LINEAR.noise_covariance
+        covariance[k, :, k] = (
+            A @ covariance[k - 1, :, k - 1] @ A.mT + LINEAR.noise_covariance
+        )
     whole, big_H = covariance.reshape(T * n, T * n), torch.block_diag(*[H] * T)
     seen = torch.isfinite(measured.flatten())
     big_H, y = big_H[seen], measured.flatten()[seen]
@@ -87,14 +104,18 @@ def conditioned(inputs, measured, H, R):
 
 
 @pytest.mark.parametrize("kind", [KalmanFilter.extended, KalmanFilter.unscented])
-def test_filter_and_smoother_of_a_linear_system_are_the_conditional_gaussian_also_where_values_are_missing(kind):
+def test_filter_and_smoother_of_a_linear_system_are_the_conditional_gaussian_also_where_values_are_missing(
+    kind,
+):
     both = Measurement.of_states(2, [0, 1], [0.1, 0.3])
     _, inputs, measured = simulated(LINEAR, 12, 0, both)
     measured[3] = torch.nan
     measured[5, 0], measured[7, 1], measured[8, 0] = torch.nan, torch.nan, torch.inf
     run = kind(LINEAR, both).run(PRIOR, inputs, measured)
     measured[8, 0] = torch.nan
-    mean, covariance = conditioned(inputs, measured, torch.eye(2, dtype=F), both.noise_covariance)
+    mean, covariance = conditioned(
+        inputs, measured, torch.eye(2, dtype=F), both.noise_covariance
+    )
     assert torch.allclose(run.filtered.mean[-1], mean[-1], atol=1e-10)
     assert torch.allclose(run.filtered.covariance[-1], covariance[-1], atol=1e-10)
     smoothed = smooth(run)
@@ -120,7 +141,9 @@ def test_a_late_measurement_counts_as_if_it_had_come_in_time():
             late.measure(measured[k - 1], age=2)
     assert torch.allclose(late.belief.mean, in_time.mean[-1], atol=1e-12)
     assert torch.allclose(late.belief.covariance, in_time.covariance[-1], atol=1e-12)
-    with pytest.raises(SettingError, match="age: must be at most 4 steps, which are remembered; got 5"):
+    with pytest.raises(
+        SettingError, match="age: must be at most 4 steps, which are remembered; got 5"
+    ):
         late.measure(measured[0], age=5)
 
 
@@ -134,7 +157,9 @@ def test_estimates_from_sine_and_cosine_of_an_angle_are_consistent(kind):
     filter, errors, covariances = kind(PENDULUM, sensor), [], []
     for seed in range(12):
         x, inputs, measured = simulated(PENDULUM, 40, seed, sensor)
-        measured[torch.rand(41, generator=torch.Generator().manual_seed(seed)) < 0.2] = torch.nan
+        measured[
+            torch.rand(41, generator=torch.Generator().manual_seed(seed)) < 0.2
+        ] = torch.nan
         run = filter.run(PRIOR, inputs, measured)
         errors.append(estimation_errors(run.filtered, x)[-1])
         covariances.append(run.filtered.covariance[-1])
@@ -162,7 +187,9 @@ def test_many_beliefs_are_updated_at_once():
     for k in range(3):
         alone = filter.update(PRIOR, y[k]).belief
         assert torch.allclose(together.belief.mean[k], alone.mean, atol=1e-13)
-        assert torch.allclose(together.belief.covariance[k], alone.covariance, atol=1e-13)
+        assert torch.allclose(
+            together.belief.covariance[k], alone.covariance, atol=1e-13
+        )
     assert torch.allclose(together.belief.mean[2], PRIOR.mean)
 
 
@@ -184,9 +211,14 @@ def test_a_disturbance_that_nobody_measures_is_estimated_through_a_delay():
 
 
 def test_errors_that_are_too_large_or_too_small_for_their_covariance_are_inconsistent():
-    errors, P = torch.from_numpy(np.random.default_rng(0).normal(size=(200, 3))), torch.eye(3).expand(200, 3, 3)
+    errors, P = (
+        torch.from_numpy(np.random.default_rng(0).normal(size=(200, 3))),
+        torch.eye(3).expand(200, 3, 3),
+    )
     assert normalized_errors(errors, P).consistent
-    assert normalized_errors(errors, P / 1.5).mean == pytest.approx(1.5 * normalized_errors(errors, P).mean)
+    assert normalized_errors(errors, P / 1.5).mean == pytest.approx(
+        1.5 * normalized_errors(errors, P).mean
+    )
     assert not normalized_errors(errors, P / 1.5).consistent
     assert not normalized_errors(errors, 1.5 * P).consistent
     wide = normalized_errors(errors, P, independent=20)

@@ -4,7 +4,11 @@ import numpy as np
 import pytest
 import torch
 
-from gpmpc.estimation import estimate_process_noise, estimate_varying_noise, with_process_noise
+from gpmpc.estimation import (
+    estimate_process_noise,
+    estimate_varying_noise,
+    with_process_noise,
+)
 from gpmpc.exceptions import DataError
 from gpmpc.gp import Trainer, Transitions
 from tests.estimation.test_delay_and_noise import STEP
@@ -12,7 +16,12 @@ from tests.estimation.test_delay_and_noise import STEP
 
 def sigma(rates, varies):
     """Standard deviations (N, 2) of the noise of angle and rate."""
-    return np.column_stack([np.full(len(rates), 1e-3), np.hypot(0.01, 0.03 * rates) if varies else 0.03 + 0 * rates])
+    return np.column_stack(
+        [
+            np.full(len(rates), 1e-3),
+            np.hypot(0.01, 0.03 * rates) if varies else 0.03 + 0 * rates,
+        ]
+    )
 
 
 def log(steps, seed, varies):
@@ -43,25 +52,39 @@ def held(model, rows, pick):
     """The share of the rates of some rows that intervals of 95 % hold, process noise included."""
     belief = model.predict(rows.states, rows.inputs)
     deviation = (belief.variance + model.noise_covariance.diagonal()).sqrt()
-    return float((((rows.next_states - belief.mean) / deviation).abs() < 1.96)[pick, 1].double().mean())
+    return float(
+        (((rows.next_states - belief.mean) / deviation).abs() < 1.96)[pick, 1]
+        .double()
+        .mean()
+    )
 
 
 def test_the_noise_is_found_where_it_is(driven):
     rows, model, found = driven
     assert found.outputs == (1,)
     assert found.gain[1] > 5 * found.error[1] > 0
-    deviations = found.model.noise(rows.states, rows.inputs).diagonal(dim1=1, dim2=2).sqrt().numpy()
+    deviations = (
+        found.model.noise(rows.states, rows.inputs)
+        .diagonal(dim1=1, dim2=2)
+        .sqrt()
+        .numpy()
+    )
     error = np.abs(np.log(deviations / sigma(rows.states[:, 1].numpy(), True)))[:, 1]
     assert np.sqrt((error**2).mean()) < 0.16
     assert np.quantile(error, 0.9) < 0.25
     assert np.allclose(deviations[:, 0] ** 2, float(model.noise_variance[0]))
-    assert torch.equal(found.model.predict(rows.states, rows.inputs).mean, model.predict(rows.states, rows.inputs).mean)
+    assert torch.equal(
+        found.model.predict(rows.states, rows.inputs).mean,
+        model.predict(rows.states, rows.inputs).mean,
+    )
 
 
 def test_intervals_hold_where_it_is_quiet_and_where_it_is_loud(driven):
     rows, model, found = driven
     fresh = log(6000, 1, True)
-    inside = (fresh.features >= rows.features.amin(0)) & (fresh.features <= rows.features.amax(0))
+    inside = (fresh.features >= rows.features.amin(0)) & (
+        fresh.features <= rows.features.amax(0)
+    )
     fresh = fresh[inside.all(1).nonzero()[:, 0].tolist()]
     quiet = fresh.states[:, 1].abs() < fresh.states[:, 1].abs().median()
     constant = with_process_noise(model, estimate_process_noise(model, rows))
@@ -89,7 +112,11 @@ def test_the_same_seed_gives_the_same_numbers():
 
 def test_a_state_that_is_predicted_exactly_has_a_constant_noise():
     rows = log(400, 0, True)
-    exact = Transitions(rows.states, rows.inputs, torch.stack([rows.states[:, 0], rows.next_states[:, 1]], dim=1))
+    exact = Transitions(
+        rows.states,
+        rows.inputs,
+        torch.stack([rows.states[:, 0], rows.next_states[:, 1]], dim=1),
+    )
     found = estimate_varying_noise(learned(exact), exact)
     assert found.outputs == (1,)
     assert torch.isfinite(found.gain).all()
@@ -97,5 +124,7 @@ def test_a_state_that_is_predicted_exactly_has_a_constant_noise():
 
 def test_too_few_rows_are_refused():
     rows = log(199, 0, True)
-    with pytest.raises(DataError, match="needs 10 blocks of 20 rows or more; got 199 rows"):
+    with pytest.raises(
+        DataError, match="needs 10 blocks of 20 rows or more; got 199 rows"
+    ):
         estimate_varying_noise(learned(rows), rows)

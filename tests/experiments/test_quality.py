@@ -13,7 +13,14 @@ from hypothesis import strategies as st
 
 from gpmpc.cli._run import experiment_of
 from gpmpc.exceptions import SettingError
-from gpmpc.experiments.quality import FAMILIES, TRUTH, Family, Quality, front_figure, pareto_front
+from gpmpc.experiments.quality import (
+    FAMILIES,
+    TRUTH,
+    Family,
+    Quality,
+    front_figure,
+    pareto_front,
+)
 from gpmpc.metrics import tracking_cost
 from gpmpc.mpc.gp_mpc import GPMPC
 from gpmpc.mpc.problem import Box, Problem, Tracking
@@ -30,7 +37,9 @@ few = st.lists(st.tuples(st.integers(0, 6), st.integers(0, 6)), max_size=12)
 @given(few)
 def test_nobody_on_the_front_is_dominated_and_everybody_else_is(points):
     def dominated(i):
-        at_least = [(t, c) for t, c in points if t <= points[i][0] and c <= points[i][1]]
+        at_least = [
+            (t, c) for t, c in points if t <= points[i][0] and c <= points[i][1]
+        ]
         return any(other != points[i] for other in at_least)
 
     found = pareto_front([t for t, _ in points], [c for _, c in points])
@@ -38,10 +47,14 @@ def test_nobody_on_the_front_is_dominated_and_everybody_else_is(points):
 
 
 @given(few, st.integers(1, 3))
-def test_where_more_time_has_to_buy_something_every_member_does_and_nobody_else(points, least):
+def test_where_more_time_has_to_buy_something_every_member_does_and_nobody_else(
+    points, least
+):
     times, costs = [t for t, _ in points], [c for _, c in points]
     found = pareto_front(times, costs, least)
-    front = sorted({point for point, member in zip(points, found, strict=True) if member})
+    front = sorted(
+        {point for point, member in zip(points, found, strict=True) if member}
+    )
     assert all(after[1] < before[1] - least for before, after in pairwise(front))
     for (time, cost), member in zip(points, found, strict=True):
         assert member or any(t <= time and c <= cost + least for t, c in front)
@@ -50,24 +63,39 @@ def test_where_more_time_has_to_buy_something_every_member_does_and_nobody_else(
 def test_the_cost_is_the_sum_of_what_every_step_pays(rng):
     roots = rng.normal(size=(6, 6)), rng.normal(size=(3, 3))
     weights = Problem(Tracking(*(root @ root.T + np.eye(len(root)) for root in roots)))
-    x, r, u, before = rng.normal(size=(8, 6)), rng.normal(size=(8, 6)), rng.normal(size=(7, 3)), [1.0, -2.0, 0.5]
+    x, r, u, before = (
+        rng.normal(size=(8, 6)),
+        rng.normal(size=(8, 6)),
+        rng.normal(size=(7, 3)),
+        [1.0, -2.0, 0.5],
+    )
     paid = 0.0
     for k in range(7):
         e, v = x[k + 1] - r[k + 1], u[k] - (u[k - 1] if k else before)
         paid += e @ weights.cost.Q @ e + v @ weights.cost.R @ v
-    assert tracking_cost(weights.cost.Q, weights.cost.R, x, r, u, before) == pytest.approx(paid / 7, rel=1e-12)
+    assert tracking_cost(
+        weights.cost.Q, weights.cost.R, x, r, u, before
+    ) == pytest.approx(paid / 7, rel=1e-12)
 
 
 def flight(family, **changes):
     with initialize_config_dir(str(CONF), version_base="1.3"):
-        words = [*family.words.split(), "model.restarts=0", "data.samples=60", f"noise.process={[0.01] * 6}"]
+        words = [
+            *family.words.split(),
+            "model.restarts=0",
+            "data.samples=60",
+            f"noise.process={[0.01] * 6}",
+        ]
         return replace(experiment_of(compose("run", words)), **changes)
 
 
 @pytest.mark.parametrize("family", FAMILIES, ids=lambda family: family.words)
 def test_the_words_of_a_family_are_settings_of_a_run(family):
     with initialize_config_dir(str(CONF), version_base="1.3"):
-        assert experiment_of(compose("run", [*family.words.split(), "horizon=2"])).loop == "plant"
+        assert (
+            experiment_of(compose("run", [*family.words.split(), "horizon=2"])).loop
+            == "plant"
+        )
 
 
 def test_every_controller_and_propagation_of_the_settings_is_among_the_contenders():
@@ -80,7 +108,9 @@ def test_every_controller_and_propagation_of_the_settings_is_among_the_contender
 
 def astray(model, horizon):
     """Hardly ever moves an input."""
-    problem = Problem(Tracking([1] * 6, [1e12] * 3), inputs=Box([0, -0.7, -0.7], [20, 0.7, 0.7]))
+    problem = Problem(
+        Tracking([1] * 6, [1e12] * 3), inputs=Box([0, -0.7, -0.7], [20, 0.7, 0.7])
+    )
     return GPMPC(model, Linearization(), problem, horizon, [7.26, 0, 0])
 
 
@@ -88,12 +118,25 @@ def astray(model, horizon):
 def rows(tmp_path_factory):
     torch.set_default_dtype(torch.float64)
     lost = Family("astray", "controller=convex")
-    experiments = {TRUTH: flight(TRUTH), CHEAP: flight(CHEAP), lost: flight(lost, controller=astray)}
-    study = Quality(experiments, {"elliptical": Elliptical()}, None, horizons=[1, 2], steps=12, seeds=2)
+    experiments = {
+        TRUTH: flight(TRUTH),
+        CHEAP: flight(CHEAP),
+        lost: flight(lost, controller=astray),
+    }
+    study = Quality(
+        experiments,
+        {"elliptical": Elliptical()},
+        None,
+        horizons=[1, 2],
+        steps=12,
+        seeds=2,
+    )
     folder = tmp_path_factory.mktemp("quality")
     trials = study.trials(folder)
     assert len({trial.fingerprint for trial in trials}) == len(trials) == 12
-    records = run_study(study.run_trial, trials, TrialStore(folder / "trials.jsonl"), workers=1)
+    records = run_study(
+        study.run_trial, trials, TrialStore(folder / "trials.jsonl"), workers=1
+    )
     document = study.document(records)
     assert document.images["quality.png"].startswith(b"\x89PNG")
     assert "controller=convex horizon=2: elliptical, seed 0: " in document.markdown()
@@ -106,7 +149,10 @@ def test_a_flight_gives_rows_of_finite_numbers_in_the_order_of_the_cases(rows):
     for key, row in rows.items():
         if key[0] != words[2]:
             assert row["lost"] is None
-            assert all(np.isfinite(row[key]) and row[key] > 0 for key in ("cost", "median", "p99", "rmse elliptical"))
+            assert all(
+                np.isfinite(row[key]) and row[key] > 0
+                for key in ("cost", "median", "p99", "rmse elliptical")
+            )
             assert row["median"] <= row["p99"]
             assert (row["failed"], row["flights"], row["samples"]) == (0, 2, 24)
 
@@ -136,14 +182,20 @@ def test_a_case_that_cannot_fly_is_reported_as_lost(rows):
     ],
 )
 def test_a_setting_out_of_its_range_is_refused(settings, message):
-    given = {"experiments": {TRUTH: None}, "trajectories": {"elliptical": Elliptical()}, "settings": None}
+    given = {
+        "experiments": {TRUTH: None},
+        "trajectories": {"elliptical": Elliptical()},
+        "settings": None,
+    }
     with pytest.raises(SettingError, match=message):
         Quality(**(given | settings))
 
 
 def test_the_figure_names_the_members_of_the_front_and_counts_the_lost(rows):
     figure = front_figure(list(rows.values()))
-    named = {text.get_text()[3:] for legend in figure.legends for text in legend.get_texts()}
+    named = {
+        text.get_text()[3:] for legend in figure.legends for text in legend.get_texts()
+    }
     for row in rows.values():
         assert (f"{row['what']} horizon={row['H']}" in named) == row["front"]
     assert "lost: 2" in [text.get_text() for text in figure.axes[0].texts]

@@ -52,9 +52,15 @@ def true_model(robot):
 
 
 @pytest.mark.parametrize(("robot", "joint"), [("acrobot", 1), ("pendubot", 0)])
-def test_a_controller_in_the_leagues_interface_plans_at_50_hz_and_drives_one_joint(robot, joint):
+def test_a_controller_in_the_leagues_interface_plans_at_50_hz_and_drives_one_joint(
+    robot, joint
+):
     who = pilot(true_model(robot), robot, horizon=25, programs=3, wild=False)
-    controller, rhs, x = league_controller(Interface, who), right_hand_side(), np.array([3.15, -0.02, 0.0, 0.1])
+    controller, rhs, x = (
+        league_controller(Interface, who),
+        right_hand_side(),
+        np.array([3.15, -0.02, 0.0, 0.1]),
+    )
     torques = []
     for k in range(40):
         torques.append(controller.get_control_output(x, 0.002 * k))
@@ -69,10 +75,19 @@ def test_a_controller_in_the_leagues_interface_plans_at_50_hz_and_drives_one_joi
     assert who.searched == [True, False, False, False, True]
 
 
-def test_where_no_plan_leads_up_the_motor_brakes_its_joint_for_a_while_before_the_next_search(monkeypatch):
+def test_where_no_plan_leads_up_the_motor_brakes_its_joint_for_a_while_before_the_next_search(
+    monkeypatch,
+):
     who = pilot(true_model("acrobot"), "acrobot", horizon=10, programs=1, wild=False)
-    monkeypatch.setattr(who.controller, "criterion", lambda plan, reference: REPLAN + 1.0)
-    torques = np.array([who.torques([0.1, 0.2, 3.0, 2.0 + k], 0.002 * k) for k in range(2 * PAUSE * TICKS)])
+    monkeypatch.setattr(
+        who.controller, "criterion", lambda plan, reference: REPLAN + 1.0
+    )
+    torques = np.array(
+        [
+            who.torques([0.1, 0.2, 3.0, 2.0 + k], 0.002 * k)
+            for k in range(2 * PAUSE * TICKS)
+        ]
+    )
     assert not torques[:, 0].any()
     held = -BRAKE * (2.0 + TICKS * (np.arange(2 * PAUSE * TICKS) // TICKS))
     assert torques[:, 1] == pytest.approx(np.clip(held, -TORQUE, TORQUE))
@@ -86,7 +101,10 @@ def test_hanging_is_below_and_upright_above_the_line():
 
 
 def test_every_parameter_of_the_wrong_body_is_wrong_by_the_share_and_seeds_differ():
-    true, bodies = double_pendulum("elbow").dynamics, [wrong_system("acrobot", 0.15, seed).dynamics for seed in (0, 1)]
+    true, bodies = (
+        double_pendulum("elbow").dynamics,
+        [wrong_system("acrobot", 0.15, seed).dynamics for seed in (0, 1)],
+    )
     for body in bodies:
         for key in ("masses", "first_length", "centres", "inertias"):
             ratio = np.array(getattr(body, key)) / np.array(getattr(true, key))
@@ -106,12 +124,19 @@ def test_learned_from_are_calm_transitions_without_a_torque_on_the_passive_joint
 
 
 @pytest.mark.parametrize("robot", ["acrobot", "pendubot"])
-def test_a_body_fitted_to_five_seconds_of_random_torques_predicts_others_as_the_true_one_does(robot):
+def test_a_body_fitted_to_five_seconds_of_random_torques_predicts_others_as_the_true_one_does(
+    robot,
+):
     wrong = wrong_system(robot, 0.15, 2)
     found = fit_body(robot, wrong, transitions(random_record(robot, 5.0, 0), robot))
     test = transitions(random_record(robot, 5.0, 1), robot)
     wrong_error, error, least = (
-        np.sqrt(np.square(step_many(body, test.states.numpy(), test.inputs.numpy()) - test.next_states.numpy()).mean())
+        np.sqrt(
+            np.square(
+                step_many(body, test.states.numpy(), test.inputs.numpy())
+                - test.next_states.numpy()
+            ).mean()
+        )
         for body in (wrong, found, double_pendulum(ACTUATED[robot]))
     )
     assert error < 2 * least < 0.01 * wrong_error
@@ -135,28 +160,50 @@ def test_a_residual_learned_from_random_torques_predicts_better_than_the_wrong_b
 
 def test_the_board_is_sorted_and_says_what_share_of_draws_is_above_the_best():
     rows = [
-        {"model": "gp", "seed": seed, "score": score, "median": 4.0, "p99": 9.0, "search": 600.0}
+        {
+            "model": "gp",
+            "seed": seed,
+            "score": score,
+            "median": 4.0,
+            "p99": 9.0,
+            "search": 600.0,
+        }
         for seed, score in ((0, 0.7), (1, 0.6))
     ]
     lines = table("acrobot", rows).splitlines()
-    assert lines[3] == "| gpmpc, gp model | 2 of 2 seeds | 0.650 | 0.600 | 50 % | 4.0, 9.0 | 600 |"
-    assert [line.split("|")[1].strip() for line in lines[2:5]] == ["AR-EAPO", "gpmpc, gp model", "VIMPPI"]
+    assert (
+        lines[3]
+        == "| gpmpc, gp model | 2 of 2 seeds | 0.650 | 0.600 | 50 % | 4.0, 9.0 | 600 |"
+    )
+    assert [line.split("|")[1].strip() for line in lines[2:5]] == [
+        "AR-EAPO",
+        "gpmpc, gp model",
+        "VIMPPI",
+    ]
 
 
-def test_what_was_learned_is_kept_in_a_file_and_not_learned_again(monkeypatch, tmp_path):
+def test_what_was_learned_is_kept_in_a_file_and_not_learned_again(
+    monkeypatch, tmp_path
+):
     data, learned = transitions(random_record("acrobot", 5.0, 0), "acrobot"), []
 
     def learned_model(robot, kind, seed):
-        learned.append(learn(data, casadi_model(wrong_system(robot, 0.15, seed)), points=40))
+        learned.append(
+            learn(data, casadi_model(wrong_system(robot, 0.15, seed)), points=40)
+        )
         return learned[-1], [1.0]
 
     monkeypatch.setattr(realaigym, "learned_model", learned_model)
     write_entry("acrobot", "residual", 3, tmp_path)
     entry = write_entry("acrobot", "residual", 3, tmp_path)
-    found = read_model("acrobot", "residual", entry.with_name("gpmpc_residual_3.safetensors"))
+    found = read_model(
+        "acrobot", "residual", entry.with_name("gpmpc_residual_3.safetensors")
+    )
     expected = learned[0].predict(data.states[:5], data.inputs[:5])
     assert len(learned) == 1
-    assert torch.equal(found.predict(data.states[:5], data.inputs[:5]).mean, expected.mean)
+    assert torch.equal(
+        found.predict(data.states[:5], data.inputs[:5]).mean, expected.mean
+    )
 
 
 SCRIPT = """
@@ -172,7 +219,10 @@ folder.mkdir(parents=True)
 
 
 def test_the_leagues_script_flies_the_file_that_was_written(monkeypatch, tmp_path):
-    source, script = tmp_path / "src" / "python", tmp_path / "leaderboard" / "pendubot" / "simulation_v3"
+    source, script = (
+        tmp_path / "src" / "python",
+        tmp_path / "leaderboard" / "pendubot" / "simulation_v3",
+    )
     (source / "double_pendulum" / "controller").mkdir(parents=True)
     (source / "double_pendulum" / "__init__.py").write_text("")
     (source / "double_pendulum" / "controller" / "abstract_controller.py").write_text(
@@ -194,7 +244,10 @@ def test_the_leagues_script_flies_the_file_that_was_written(monkeypatch, tmp_pat
     torque = play_script(entry, "pendubot")
     assert 0 < torque <= 6.0  # the shoulder is driven back upright
     shutil.rmtree(script)
-    with pytest.raises(SettingError, match="board=script needs the repository, not only its package: the league's"):
+    with pytest.raises(
+        SettingError,
+        match="board=script needs the repository, not only its package: the league's",
+    ):
         play_script(tmp_path / "kept" / "con_gpmpc_true_0.py", "pendubot")
 
 
@@ -219,25 +272,53 @@ def test_draws_that_were_played_are_read_and_not_played_again(monkeypatch, tmp_p
 def test_draws_of_another_version_are_counted(monkeypatch, tmp_path, capsys):
     monkeypatch.setattr(realaigym, "find_spec", lambda name: name)
     monkeypatch.setattr(
-        realaigym, "_play", lambda model, robot, draw: dict.fromkeys(("score", "search", "median", "p99"), 0.5)
+        realaigym,
+        "_play",
+        lambda model, robot, draw: dict.fromkeys(
+            ("score", "search", "median", "p99"), 0.5
+        ),
     )
     command = ["robot=acrobot", "model=true", "draws=1", f"folder={tmp_path}"]
     assert main(command) == 0
     monkeypatch.setattr(realaigym, "_version", lambda: "another")
     assert main([command[0], command[1], "draws=2", command[3]]) == 0
-    counted = [line for line in capsys.readouterr().out.splitlines() if "another version" in line]
-    assert counted == [f"1 of 2 draws were kept from another version of gpmpc ({tmp_path})"]
+    counted = [
+        line
+        for line in capsys.readouterr().out.splitlines()
+        if "another version" in line
+    ]
+    assert counted == [
+        f"1 of 2 draws were kept from another version of gpmpc ({tmp_path})"
+    ]
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ([], "realaigym: simulator: the league's simulator is not installed: git clone https://github.com/dfki-ric"),
-        (["robot=arm"], "realaigym: robot: must be one of acrobot, pendubot; got 'arm'"),
-        (["model=best"], "realaigym: model: must be one of true, residual, gp; got 'best'"),
-        (["board=chess"], "realaigym: board: must be one of simulation, script, robustness, film; got 'chess'"),
-        (["speed=2"], "realaigym: speed: must be one of robot, model, seeds, draws, board, time, folder"),
-        (["board=film", "time=real"], "realaigym: time: must be free for board=script and board=film"),
+        (
+            [],
+            "realaigym: simulator: the league's simulator is not installed: git clone https://github.com/dfki-ric",
+        ),
+        (
+            ["robot=arm"],
+            "realaigym: robot: must be one of acrobot, pendubot; got 'arm'",
+        ),
+        (
+            ["model=best"],
+            "realaigym: model: must be one of true, residual, gp; got 'best'",
+        ),
+        (
+            ["board=chess"],
+            "realaigym: board: must be one of simulation, script, robustness, film; got 'chess'",
+        ),
+        (
+            ["speed=2"],
+            "realaigym: speed: must be one of robot, model, seeds, draws, board, time, folder",
+        ),
+        (
+            ["board=film", "time=real"],
+            "realaigym: time: must be free for board=script and board=film",
+        ),
         (["seeds=0,,1"], "realaigym: seeds, draws: must be numbers such as"),
         (["draws=many"], "realaigym: seeds, draws: must be numbers such as"),
     ],
@@ -252,10 +333,15 @@ def test_a_mistake_is_one_line_and_exit_code_2(arguments, message, monkeypatch, 
 
 def test_our_equations_are_those_of_the_leagues_simulator(rng):
     plants = pytest.importorskip("double_pendulum.model.plant")
-    plant, ours = plants.DoublePendulumPlant(model_pars=realaigym.league_parameters([6.0, 6.0])), right_hand_side()
+    plant, ours = (
+        plants.DoublePendulumPlant(model_pars=realaigym.league_parameters([6.0, 6.0])),
+        right_hand_side(),
+    )
     for _ in range(20):
         x, torques = rng.normal(size=4) * [2.0, 2.0, 10.0, 10.0], rng.uniform(-6, 6, 2)
-        assert np.allclose(ours(0.0, x, torques), plant.rhs(0.0, x, torques), rtol=1e-9, atol=1e-9)
+        assert np.allclose(
+            ours(0.0, x, torques), plant.rhs(0.0, x, torques), rtol=1e-9, atol=1e-9
+        )
 
 
 @pytest.mark.slow

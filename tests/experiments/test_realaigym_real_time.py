@@ -31,7 +31,9 @@ def leagues(robot, torque_of, count, delay=0, response=1.0, noise=0.0):
     rhs, rng, last = right_hand_side(), np.random.default_rng(0), np.zeros(2)
     states, asked = [np.zeros(4)], []
     for k in range(count):
-        seen = states[max(0, k - delay)] + np.array([0.0, 0.0, 1.0, 1.0]) * noise * rng.normal(size=4)
+        seen = states[max(0, k - delay)] + np.array(
+            [0.0, 0.0, 1.0, 1.0]
+        ) * noise * rng.normal(size=4)
         asked.append(torque_of(seen, k * INPUT))
         last, x = np.clip(last + response * (asked[-1] - last), -6, 6), states[-1]
         for _ in range(2):  # the midpoint rule
@@ -52,7 +54,9 @@ def timed_pilot(monkeypatch, start, decision, value=0.1):
         return call
 
     model = KnownModel(casadi_model(double_pendulum("shoulder")), 4, 1)
-    parts = make_parts(model, 0.1, horizon=20, programs=3, wild=False)._replace(criterion=lambda plan, goal: value)
+    parts = make_parts(model, 0.1, horizon=20, programs=3, wild=False)._replace(
+        criterion=lambda plan, goal: value
+    )
     who = real_time_pilot(parts, 0)
     monkeypatch.setattr(realaigym_real_time, "process_time", lambda: clock[0])
     monkeypatch.setattr(who.search, "_try", slowed(who.search._try, start))
@@ -61,16 +65,25 @@ def timed_pilot(monkeypatch, start, decision, value=0.1):
 
 
 @pytest.mark.parametrize(("start", "begins"), [(0.01, 30), (0.05, 30), (0.07, None)])
-def test_a_plan_acts_after_the_time_that_its_search_has_and_never_if_that_is_too_short(start, begins, monkeypatch):
+def test_a_plan_acts_after_the_time_that_its_search_has_and_never_if_that_is_too_short(
+    start, begins, monkeypatch
+):
     who = timed_pilot(monkeypatch, start, 0.001)
-    torques = [who.torques(np.array([np.pi + 0.1, 0.0, 0.0, 0.0]), INPUT * k)[0] for k in range(60)]
+    torques = [
+        who.torques(np.array([np.pi + 0.1, 0.0, 0.0, 0.0]), INPUT * k)[0]
+        for k in range(60)
+    ]
     assert not np.any(torques[:begins])
     assert begins is None or all(torques[begins:])
     assert np.allclose(who.searched, start)
     assert np.allclose(who.seconds, 0.001)
     assert (len(who.seconds) > 0) == (begins is not None)
-    who.torques(np.array([np.pi + 0.1, 0.0, 0.0, 0.0]), 5.0)  # the league had taken it away: no plan, only the brake
-    assert who.torques(np.array([np.pi + 0.1, 0.0, 2.0, 0.0]), 5.0 + INPUT)[0] == pytest.approx(-0.6)
+    who.torques(
+        np.array([np.pi + 0.1, 0.0, 0.0, 0.0]), 5.0
+    )  # the league had taken it away: no plan, only the brake
+    assert who.torques(np.array([np.pi + 0.1, 0.0, 2.0, 0.0]), 5.0 + INPUT)[
+        0
+    ] == pytest.approx(-0.6)
 
 
 def test_a_late_decision_leaves_the_last_plan_flying_until_it_is_known(monkeypatch):
@@ -78,13 +91,25 @@ def test_a_late_decision_leaves_the_last_plan_flying_until_it_is_known(monkeypat
     for k in range(150):
         who.torques(np.array([np.pi + 0.01, 0.0, 0.0, 0.0]), INPUT * k)
         decided.append(len(who.seconds))
-    assert np.flatnonzero(np.diff(decided)).tolist() == [39, 59, 79, 99, 119, 139]  # every second period of 10
+    assert np.flatnonzero(np.diff(decided)).tolist() == [
+        39,
+        59,
+        79,
+        99,
+        119,
+        139,
+    ]  # every second period of 10
 
 
 @pytest.mark.parametrize(("value", "searches"), [(0.1, 1), (1.5, 12), (10.0, 20)])
-def test_all_starts_are_taken_for_a_plan_that_is_not_good_and_again_and_again_without_one(value, searches, monkeypatch):
+def test_all_starts_are_taken_for_a_plan_that_is_not_good_and_again_and_again_without_one(
+    value, searches, monkeypatch
+):
     who = timed_pilot(monkeypatch, 0.05, 0.001, value)
-    torques = [who.torques(np.array([np.pi + 0.1, 0.0, 0.0, 0.0]), INPUT * k)[0] for k in range(600)]
+    torques = [
+        who.torques(np.array([np.pi + 0.1, 0.0, 0.0, 0.0]), INPUT * k)[0]
+        for k in range(600)
+    ]
     assert len(who.searched) == searches  # of one start each, and there are twelve
     assert (len(who.seconds) > 0) == np.any(torques) == (value < 5)
 
@@ -92,7 +117,10 @@ def test_all_starts_are_taken_for_a_plan_that_is_not_good_and_again_and_again_wi
 def test_rates_are_found_from_angles_whatever_the_noise_of_the_rates():
     record = random_record("acrobot", 2.0, 0)[0]
     states = np.array([state_of(x) for x in record.states])
-    rates, filter_ = np.random.default_rng(0).normal(0, 0.5, (len(states), 2)), RateFilter()
+    rates, filter_ = (
+        np.random.default_rng(0).normal(0, 0.5, (len(states), 2)),
+        RateFilter(),
+    )
     filter_.restart(states[0])
     noisy = states + rates @ np.array([[0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
     found = np.array([filter_(measured) for measured in noisy])
@@ -101,11 +129,22 @@ def test_rates_are_found_from_angles_whatever_the_noise_of_the_rates():
 
 @pytest.mark.parametrize(
     ("robot", "delay", "response"),
-    [("acrobot", 0, 0.1), ("pendubot", 0, 0.3), ("acrobot", 3, 1.0), ("pendubot", 20, 1.0)],
+    [
+        ("acrobot", 0, 0.1),
+        ("pendubot", 0, 0.3),
+        ("acrobot", 3, 1.0),
+        ("pendubot", 20, 1.0),
+    ],
 )
 def test_delay_and_responsiveness_are_found_from_probes(robot, delay, response):
-    who = Watchful(SimpleNamespace(torques=lambda x, t: np.zeros(2)), RollOut(fine_model(robot)), JOINTS[robot])
-    leagues(robot, who.torques, realaigym_robustness.PROBES + 1, delay, response, noise=0.2)
+    who = Watchful(
+        SimpleNamespace(torques=lambda x, t: np.zeros(2)),
+        RollOut(fine_model(robot)),
+        JOINTS[robot],
+    )
+    leagues(
+        robot, who.torques, realaigym_robustness.PROBES + 1, delay, response, noise=0.2
+    )
     assert who.delay == delay
     assert who.response == pytest.approx(response, abs=0.05 if response < 1 else 0.25)
 
@@ -122,7 +161,11 @@ def test_a_pilot_is_shown_the_state_of_now_where_measurements_are_late():
     errors = np.array(shown) - states[realaigym_robustness.PROBES : 400]
     assert np.abs(errors).max() < 0.1
     assert (
-        np.abs(states[realaigym_robustness.PROBES : 390] - states[realaigym_robustness.PROBES + 10 : 400]).max() > 0.5
+        np.abs(
+            states[realaigym_robustness.PROBES : 390]
+            - states[realaigym_robustness.PROBES + 10 : 400]
+        ).max()
+        > 0.5
     )
     who.torques(np.zeros(4), 0.0)  # the next flight is probed anew
     assert who.delay == 0
@@ -132,7 +175,9 @@ def test_the_parts_are_flown_once_and_kept(monkeypatch, tmp_path):
     flown = []
 
     class Benchmarker:
-        def __init__(self, controller, x0, dt, t_final, goal, epsilon, check_only_final_state):
+        def __init__(
+            self, controller, x0, dt, t_final, goal, epsilon, check_only_final_state
+        ):
             assert (dt, t_final, check_only_final_state) == (0.002, 10.0, True)
 
         def set_model_parameter(self, model_pars):
@@ -141,11 +186,16 @@ def test_the_parts_are_flown_once_and_kept(monkeypatch, tmp_path):
         def check_modelpar_robustness(self, names, values):
             flown.append("model")
             assert values["m2"] == pytest.approx([0.75 * 0.6, 0.6, 1.25 * 0.6])
-            return {name: {"successes": [value >= 0 for value in values[name]]} for name in names}
+            return {
+                name: {"successes": [value >= 0 for value in values[name]]}
+                for name in names
+            }
 
         def check_meas_noise_robustness(self, repeated, mode, values):
             flown.append("rate noise")
-            return {"None": {"successes": [[value < 0.3] * repeated for value in values]}}
+            return {
+                "None": {"successes": [[value < 0.3] * repeated for value in values]}
+            }
 
         def check_unoise_robustness(self, repeated, values):
             return {"successes": [[True] * repeated for _ in values]}
@@ -182,4 +232,6 @@ def test_a_film_shows_every_twentieth_of_a_second(tmp_path):
 
 
 def test_every_robot_has_an_actuated_joint():
-    assert {robot: ("shoulder", "elbow")[joint] for robot, joint in JOINTS.items()} == ACTUATED
+    assert {
+        robot: ("shoulder", "elbow")[joint] for robot, joint in JOINTS.items()
+    } == ACTUATED

@@ -37,7 +37,9 @@ class Wave:
         t = torch.arange(25.0)[:, None]
         states = torch.sin(t * torch.linspace(0.1, 0.6, 6))
         inputs = torch.cos(t * torch.linspace(0.2, 0.4, 3))
-        return Transitions(states, inputs, states.roll(1, 1) + 0.2 * inputs.repeat(1, 2))
+        return Transitions(
+            states, inputs, states.roll(1, 1) + 0.2 * inputs.repeat(1, 2)
+        )
 
 
 def tables(**changes):
@@ -55,14 +57,23 @@ def tables(**changes):
 
 
 def without_times(records):
-    return [{k: v for k, v in record.items() if k != "training_seconds"} for record in records]
+    return [
+        {k: v for k, v in record.items() if k != "training_seconds"}
+        for record in records
+    ]
 
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
     store = TrialStore(tmp_path_factory.mktemp("tables") / "trials.jsonl")
     experiment = tables()
-    return experiment, store, run_study(experiment.run_trial, experiment.trials(), store, workers=experiment.workers)
+    return (
+        experiment,
+        store,
+        run_study(
+            experiment.run_trial, experiment.trials(), store, workers=experiment.workers
+        ),
+    )
 
 
 def test_there_is_one_record_a_draw_with_every_measure(finished):
@@ -75,7 +86,9 @@ def test_there_is_one_record_a_draw_with_every_measure(finished):
         assert (record["held_out_coverage_95"] is None) == (record["size"] == 25)
 
 
-def test_draws_have_their_own_seed_and_subset_and_the_full_set_is_its_own_test_set(finished):
+def test_draws_have_their_own_seed_and_subset_and_the_full_set_is_its_own_test_set(
+    finished,
+):
     _, _, records = finished
     assert len({record["seed"] for record in records}) == len(records)
     small = [r for r in records if r["size"] == 5 and r["subsystem"] == "translational"]
@@ -84,18 +97,31 @@ def test_draws_have_their_own_seed_and_subset_and_the_full_set_is_its_own_test_s
     cell = finished[0].trials()[0].condition
     gp = train(cell.data, seed=full["seed"], penalty=SoftLimits(), restarts=0).posterior
     error = predict_all(gp, cell.data, 0.1)[0] - cell.data.next_states
-    assert full["training_mse"] == full["test_mse"] == pytest.approx(float(error.square().sum(-1).mean()), rel=1e-2)
+    assert (
+        full["training_mse"]
+        == full["test_mse"]
+        == pytest.approx(float(error.square().sum(-1).mean()), rel=1e-2)
+    )
 
 
-def test_the_same_seed_gives_the_same_numbers_whatever_the_number_of_workers(finished, tmp_path):
+def test_the_same_seed_gives_the_same_numbers_whatever_the_number_of_workers(
+    finished, tmp_path
+):
     _, _, records = finished
     again = tables(workers=2)
-    repeated = run_study(again.run_trial, again.trials(), TrialStore(tmp_path / "trials.jsonl"), again.workers)
+    repeated = run_study(
+        again.run_trial,
+        again.trials(),
+        TrialStore(tmp_path / "trials.jsonl"),
+        again.workers,
+    )
     assert without_times(repeated) == without_times(records)
     assert tables(seed=1).trials()[0].seed != again.trials()[0].seed
 
 
-def test_a_run_goes_on_from_the_finished_fits_and_passes_over_a_torn_line(finished, tmp_path):
+def test_a_run_goes_on_from_the_finished_fits_and_passes_over_a_torn_line(
+    finished, tmp_path
+):
     experiment, store, records = finished
     lines = store.path.read_text().splitlines(keepends=True)
     torn = tmp_path / "trials.jsonl"
@@ -104,18 +130,26 @@ def test_a_run_goes_on_from_the_finished_fits_and_passes_over_a_torn_line(finish
     assert len(resumed.records) == 3
     known = set(resumed.records)
     called = []
-    repeated = run_study(experiment.run_trial, experiment.trials(), resumed, 1, called.append)
+    repeated = run_study(
+        experiment.run_trial, experiment.trials(), resumed, 1, called.append
+    )
     assert without_times(repeated) == without_times(records)
     assert len(called) == len(records)
-    assert [store.records[f] for f in known] == [resumed.records[f] for f in known]  # times too: not computed again
+    assert [store.records[f] for f in known] == [
+        resumed.records[f] for f in known
+    ]  # times too: not computed again
     assert len(TrialStore(torn).records) == len(records)
 
 
 def test_more_draws_reuse_the_first_ones_and_another_model_reuses_none():
     few, more = ([fit.fingerprint for fit in tables(draws=d).trials()] for d in (2, 3))
     assert set(few) < set(more)
-    assert set(few).isdisjoint(fit.fingerprint for fit in tables(model_settings={"restarts": 1}).trials())
-    assert set(few).isdisjoint(fit.fingerprint for fit in tables(state_std=0.2).trials())
+    assert set(few).isdisjoint(
+        fit.fingerprint for fit in tables(model_settings={"restarts": 1}).trials()
+    )
+    assert set(few).isdisjoint(
+        fit.fingerprint for fit in tables(state_std=0.2).trials()
+    )
 
 
 def failing(transitions, seed):
@@ -125,7 +159,10 @@ def failing(transitions, seed):
 def test_a_fit_that_fails_is_kept_counted_and_does_not_stop_the_others(tmp_path):
     experiment = tables(model=failing)
     records = run_study(
-        experiment.run_trial, experiment.trials(), TrialStore(tmp_path / "trials.jsonl"), workers=experiment.workers
+        experiment.run_trial,
+        experiment.trials(),
+        TrialStore(tmp_path / "trials.jsonl"),
+        workers=experiment.workers,
     )
     assert [record["error"] for record in records] == ["no start led anywhere"] * 8
     rows = summarise(records)
@@ -138,7 +175,10 @@ def test_a_fit_that_fails_is_kept_counted_and_does_not_stop_the_others(tmp_path)
     [
         ({"sizes": [5, 0]}, "sizes: must be a whole number, 1 or more; got 0"),
         ({"sizes": [2.5]}, "sizes: must be a whole number, 1 or more; got 2.5"),
-        ({"sizes": "ten"}, r"sizes: must be a list of whole numbers such as \[10,50\]; got 'ten'"),
+        (
+            {"sizes": "ten"},
+            r"sizes: must be a list of whole numbers such as \[10,50\]; got 'ten'",
+        ),
         ({"sizes": []}, "sizes: must be a list"),
         ({"draws": 0}, "draws: must be a whole number, 1 or more; got 0"),
         ({"draws": "5x"}, "draws: must be a whole number, 1 or more; got '5x'"),
@@ -146,7 +186,10 @@ def test_a_fit_that_fails_is_kept_counted_and_does_not_stop_the_others(tmp_path)
         ({"workers": 0}, "workers: must be a whole number, 1 or more; got 0"),
         ({"state_std": -0.1}, "state_std: must be a number, 0 or more; got -0.1"),
         ({"subsystems": []}, "subsystem: choose at least one"),
-        ({"subsystems": "rolling"}, "subsystem: must be among translational, rotational; got 'rolling'"),
+        (
+            {"subsystems": "rolling"},
+            "subsystem: must be among translational, rotational; got 'rolling'",
+        ),
     ],
 )
 def test_misuse_is_refused_with_the_rule(changes, message):
@@ -155,7 +198,10 @@ def test_misuse_is_refused_with_the_rule(changes, message):
 
 
 def test_a_size_beyond_the_data_is_refused_with_the_data_named():
-    with pytest.raises(SettingError, match="sizes: must be at most 25, the rows of hover translational; got 26"):
+    with pytest.raises(
+        SettingError,
+        match="sizes: must be at most 25, the rows of hover translational; got 26",
+    ):
         tables(sizes=[26]).trials()
 
 
@@ -164,11 +210,15 @@ def test_data_of_other_columns_than_the_subsystem_has_are_refused():
         def transitions(self, *_):
             return Transitions(*[torch.ones(5, 4)] * 3)
 
-    with pytest.raises(DataError, match="the data have 12 columns; the subsystem names 15"):
+    with pytest.raises(
+        DataError, match="the data have 12 columns; the subsystem names 15"
+    ):
         tables(data=Narrow()).trials()
 
 
-def test_the_first_prediction_gets_the_given_covariance_and_each_later_one_the_last_predicted(finished):
+def test_the_first_prediction_gets_the_given_covariance_and_each_later_one_the_last_predicted(
+    finished,
+):
     cell = finished[0].trials()[0].condition
     gp = train(cell.data, penalty=SoftLimits(), restarts=0).posterior
     _, fed, projected = predict_all(gp, cell.data, 0.1)
@@ -199,12 +249,21 @@ def test_the_papers_figure_is_placed_to_the_digits_that_it_prints(low, high, pos
 def test_the_printed_figures_are_complete():
     figures = paper_figures()
     assert len(figures) == 16
-    assert figures["elliptical", "translational", 189]["test_mse"] == Decimal("1.0132e-7")
+    assert figures["elliptical", "translational", 189]["test_mse"] == Decimal(
+        "1.0132e-7"
+    )
     assert figures["lorenz", "rotational", 10]["test_mse"] == Decimal("0.0044")
 
 
 @pytest.mark.parametrize(
-    ("value", "text"), [(1.234e-7, "1.23e-7"), (0.01234, "0.0123"), (1.4567, "1.46"), (0.0, "0"), (12345.0, "1.23e4")]
+    ("value", "text"),
+    [
+        (1.234e-7, "1.23e-7"),
+        (0.01234, "0.0123"),
+        (1.4567, "1.46"),
+        (0.0, "0"),
+        (12345.0, "1.23e4"),
+    ],
 )
 def test_numbers_are_short(value, text):
     assert number(value) == text
@@ -212,7 +271,10 @@ def test_numbers_are_short(value, text):
 
 def test_every_document_tells_the_same_numbers(finished):
     experiment, _, records = finished
-    named = [record | {"trajectory": "lorenz", "size": {5: 10, 25: 189}[record["size"]]} for record in records]
+    named = [
+        record | {"trajectory": "lorenz", "size": {5: 10, 25: 189}[record["size"]]}
+        for record in records
+    ]
     rows = summarise(named)
     written = experiment.document(named).files("tables")
     lines = list(csv.DictReader(io.StringIO(written["tables.csv"])))
@@ -229,13 +291,20 @@ def test_every_document_tells_the_same_numbers(finished):
     assert "a note on the data" in written["tables.md"]
     assert written["tables.tex"].count("\\toprule") == 1
     assert written["tables.png"].startswith(b"\x89PNG")
-    outside = [s for row in rows for s in row.statistics.values() if s.position in ("below", "above")]
+    outside = [
+        s
+        for row in rows
+        for s in row.statistics.values()
+        if s.position in ("below", "above")
+    ]
     assert len(differences(rows)) == len(outside)
 
 
 @pytest.mark.parametrize("trajectory", ["elliptical", "lorenz"])
 @pytest.mark.parametrize("subsystem", ["translational", "rotational"])
-def test_the_full_rows_are_the_papers_on_the_authors_data(paper_data, tmp_path, trajectory, subsystem):
+def test_the_full_rows_are_the_papers_on_the_authors_data(
+    paper_data, tmp_path, trajectory, subsystem
+):
     experiment = tables(
         data=PaperData(paper_data),
         trajectories={trajectory: Hover()},
@@ -245,13 +314,18 @@ def test_the_full_rows_are_the_papers_on_the_authors_data(paper_data, tmp_path, 
         draws=1,
     )
     (record,) = run_study(
-        experiment.run_trial, experiment.trials(), TrialStore(tmp_path / "trials.jsonl"), workers=experiment.workers
+        experiment.run_trial,
+        experiment.trials(),
+        TrialStore(tmp_path / "trials.jsonl"),
+        workers=experiment.workers,
     )
     for name, printed in paper_figures()[trajectory, subsystem, 189].items():
         assert record[name] == pytest.approx(float(printed), rel=0.05)
 
 
-def test_our_rotational_flight_with_the_authors_yaw_residue_gives_the_papers_row(paper_data, tmp_path):
+def test_our_rotational_flight_with_the_authors_yaw_residue_gives_the_papers_row(
+    paper_data, tmp_path
+):
     """Why our own rotational rows differ: the authors' yaw channels are solver residue, ours are at rest."""
     from gpmpc.trajectories import Elliptical
     from tests.datasets.test_flights import NMPC_DATA
@@ -260,7 +334,11 @@ def test_our_rotational_flight_with_the_authors_yaw_residue_gives_the_papers_row
         def transitions(self, system, trajectory, name=""):
             ours = NMPC_DATA.transitions(system, Elliptical())
             theirs = PaperData(paper_data).transitions(system, trajectory, name)
-            states, inputs, moved = ours.states.clone(), ours.inputs.clone(), ours.next_states.clone()
+            states, inputs, moved = (
+                ours.states.clone(),
+                ours.inputs.clone(),
+                ours.next_states.clone(),
+            )
             states[:, 4:], inputs[:, 2], moved[:, 4:] = (
                 theirs.states[:, 4:],
                 theirs.inputs[:, 2],
@@ -277,36 +355,57 @@ def test_our_rotational_flight_with_the_authors_yaw_residue_gives_the_papers_row
         draws=1,
     )
     (record,) = run_study(
-        experiment.run_trial, experiment.trials(), TrialStore(tmp_path / "trials.jsonl"), workers=experiment.workers
+        experiment.run_trial,
+        experiment.trials(),
+        TrialStore(tmp_path / "trials.jsonl"),
+        workers=experiment.workers,
     )
     for name, printed in paper_figures()["elliptical", "rotational", 189].items():
         assert record[name] == pytest.approx(float(printed), rel=1e-3)
 
 
 @pytest.mark.parametrize("subsystem", SUBSYSTEMS)
-def test_the_measures_of_a_fit_are_those_of_its_predictions_in_the_units_of_the_data(finished, subsystem):
+def test_the_measures_of_a_fit_are_those_of_its_predictions_in_the_units_of_the_data(
+    finished, subsystem
+):
     """Worked out anew from the posterior of all rows, by torch's own normal distribution."""
     experiment, _, records = finished
     full = next(r for r in records if (r["subsystem"], r["size"]) == (subsystem, 25))
-    cell = next(trial.condition for trial in experiment.trials() if trial.labels["subsystem"] == subsystem)
+    cell = next(
+        trial.condition
+        for trial in experiment.trials()
+        if trial.labels["subsystem"] == subsystem
+    )
     gp = train(cell.data, seed=full["seed"], penalty=SoftLimits(), restarts=0).posterior
     plain = gp.predict(cell.data.states, cell.data.inputs)
     raw, factor = Wave().transitions(None, Hover()).next_states, cell.scaling.factor
     predicted = torch.distributions.Normal(
-        cell.scaling.restore(plain.mean), (plain.variance + gp.noise_variance).sqrt() * factor
+        cell.scaling.restore(plain.mean),
+        (plain.variance + gp.noise_variance).sqrt() * factor,
     )
-    assert full["plain_test_mse"] == pytest.approx(float((predicted.mean - raw).square().sum(1).mean()), rel=1e-5)
+    assert full["plain_test_mse"] == pytest.approx(
+        float((predicted.mean - raw).square().sum(1).mean()), rel=1e-5
+    )
     assert full["plain_training_mse"] == full["plain_test_mse"]
-    assert full["nlpd"] == pytest.approx(-float(predicted.log_prob(raw).mean()), abs=1e-5)
+    assert full["nlpd"] == pytest.approx(
+        -float(predicted.log_prob(raw).mean()), abs=1e-5
+    )
     inside = (predicted.cdf(raw) - 0.5).abs() <= 0.475
     assert full["coverage_95"] == pytest.approx(float(inside.double().mean()))
     means, fed, projected = predict_all(gp, cell.data, 0.1)
     errors = cell.scaling.restore(means) - raw
-    assert full["test_mse"] == pytest.approx(float(errors.square().sum(1).mean()), rel=1e-5)
-    assert full["average_variance"] == pytest.approx(float(fed[:, [0, 2, 4]].mean()), rel=1e-5)
+    assert full["test_mse"] == pytest.approx(
+        float(errors.square().sum(1).mean()), rel=1e-5
+    )
+    assert full["average_variance"] == pytest.approx(
+        float(fed[:, [0, 2, 4]].mean()), rel=1e-5
+    )
     assert full["largest_projection"] == pytest.approx(projected, abs=1e-12)
     small = [r for r in records if (r["subsystem"], r["size"]) == (subsystem, 5)]
     for record in small:  # 5 rows of 25 are not held out; of 6 states each
-        inside, held_out = 150 * record["coverage_95"], 120 * record["held_out_coverage_95"]
+        inside, held_out = (
+            150 * record["coverage_95"],
+            120 * record["held_out_coverage_95"],
+        )
         assert held_out == pytest.approx(round(held_out))
         assert -1e-9 <= inside - held_out <= 30 + 1e-9

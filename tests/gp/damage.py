@@ -64,7 +64,11 @@ def rezipped(change):
         change(members, rng)
         out, small = io.BytesIO(), sum(map(len, members.values())) < 2**24
         with zipfile.ZipFile(
-            out, "w", zipfile.ZIP_STORED if small and rng.random() < 0.5 else zipfile.ZIP_DEFLATED
+            out,
+            "w",
+            zipfile.ZIP_STORED
+            if small and rng.random() < 0.5
+            else zipfile.ZIP_DEFLATED,
         ) as archive:
             for name, data in members.items():
                 archive.writestr(name, data)
@@ -87,7 +91,9 @@ def a_member_dropped(members, rng):
 
 @rezipped
 def a_member_renamed(members, rng):
-    members[rng.choice(["a.npy", "../features.npy", "states.npy", "header"])] = members.pop(rng.choice(sorted(members)))
+    members[rng.choice(["a.npy", "../features.npy", "states.npy", "header"])] = (
+        members.pop(rng.choice(sorted(members)))
+    )
 
 
 @rezipped
@@ -119,7 +125,16 @@ def a_header_edited(members, rng):
 
 @rezipped
 def a_header_of_garbage(members, rng):
-    choices = [b"", b"[" * 100_000, b"null", b"[]", b"1e999", b"\xff\xfe", b'{"format": "gpmpc model"}', b"{" * 9000]
+    choices = [
+        b"",
+        b"[" * 100_000,
+        b"null",
+        b"[]",
+        b"1e999",
+        b"\xff\xfe",
+        b'{"format": "gpmpc model"}',
+        b"{" * 9000,
+    ]
     members["header.json"] = rng.choice(choices)
 
 
@@ -127,8 +142,29 @@ def a_header_of_garbage(members, rng):
 def an_array_of_another_kind(members, rng):
     name = rng.choice([name for name in members if name.endswith(".npy")])
     array = np.load(io.BytesIO(members[name]))
-    dtypes = ["c16", "?", "U9", "S9", "M8[s]", "m8[s]", "O", ">f8", "f2", "f4", "i8", "u1", "f16"]
-    changed = [array.astype(rng.choice(dtypes)), array.T, array[:0], array[None], array.ravel(), array[..., :-1]]
+    dtypes = [
+        "c16",
+        "?",
+        "U9",
+        "S9",
+        "M8[s]",
+        "m8[s]",
+        "O",
+        ">f8",
+        "f2",
+        "f4",
+        "i8",
+        "u1",
+        "f16",
+    ]
+    changed = [
+        array.astype(rng.choice(dtypes)),
+        array.T,
+        array[:0],
+        array[None],
+        array.ravel(),
+        array[..., :-1],
+    ]
     written = io.BytesIO()
     with np.errstate(all="ignore"):
         np.save(written, rng.choice(changed), allow_pickle=True)
@@ -139,10 +175,27 @@ def an_array_of_another_kind(members, rng):
 def a_huge_shape(members, rng):
     name = rng.choice([name for name in members if name.endswith(".npy")])
     data = rng.choice([members[name][128:], b"", bytes(rng.choice([10**4, 10**7]))])
-    shape = rng.choice([(10**9, 3), (2**31, 2**31), (10**7,), (2**62, 4), (-1, 3), (0, 10**12), (10**30,), (1,) * 70])
+    shape = rng.choice(
+        [
+            (10**9, 3),
+            (2**31, 2**31),
+            (10**7,),
+            (2**62, 4),
+            (-1, 3),
+            (0, 10**12),
+            (10**30,),
+            (1,) * 70,
+        ]
+    )
     header = f"{{'descr': '{rng.choice(['<f8', '<f4', '|i1'])}', 'fortran_order': False, 'shape': {shape}, }}"
     version, length = rng.choice([(b"\x01\x00", 2), (b"\x02\x00", 4), (b"\x03\x00", 4)])
-    members[name] = b"\x93NUMPY" + version + len(header).to_bytes(length, "little") + header.encode() + data
+    members[name] = (
+        b"\x93NUMPY"
+        + version
+        + len(header).to_bytes(length, "little")
+        + header.encode()
+        + data
+    )
 
 
 @rezipped
@@ -173,23 +226,32 @@ def a_tensor(header, rng):
 
 @reheaded
 def a_tensor_elsewhere(header, rng):
-    a_tensor(header, rng)["data_offsets"] = rng.choice([[0, 8], [8, 0], [0, 2**62], [-8, 0], [2**63, 2**64 - 1], []])
+    a_tensor(header, rng)["data_offsets"] = rng.choice(
+        [[0, 8], [8, 0], [0, 2**62], [-8, 0], [2**63, 2**64 - 1], []]
+    )
 
 
 @reheaded
 def tensors_swapped(header, rng):
     one, other = a_tensor(header, rng), a_tensor(header, rng)
-    one["data_offsets"], other["data_offsets"] = other["data_offsets"], one["data_offsets"]
+    one["data_offsets"], other["data_offsets"] = (
+        other["data_offsets"],
+        one["data_offsets"],
+    )
 
 
 @reheaded
 def a_tensor_of_another_shape(header, rng):
-    a_tensor(header, rng)["shape"] = rng.choice([[10**9, 3], [2**31, 2**31], [], [0], [2**62, 4], [-1], [1] * 70])
+    a_tensor(header, rng)["shape"] = rng.choice(
+        [[10**9, 3], [2**31, 2**31], [], [0], [2**62, 4], [-1], [1] * 70]
+    )
 
 
 @reheaded
 def a_tensor_of_another_type(header, rng):
-    a_tensor(header, rng)["dtype"] = rng.choice(["F32", "I64", "BF16", "U8", "F8_E4M3", "x", None, 3])
+    a_tensor(header, rng)["dtype"] = rng.choice(
+        ["F32", "I64", "BF16", "U8", "F8_E4M3", "x", None, 3]
+    )
 
 
 @reheaded
@@ -207,22 +269,44 @@ def a_tensor_dropped(header, rng):
 def a_header_edited_in_place(header, rng):
     said = json.loads(header["__metadata__"]["gpmpc"])
     key = rng.choice([key for key in said if key != "checksum"])
-    said[key] = rng.choice([None, 0, -1, 3, 10**9, 1.5, True, "value", [], [0, 1], {}, {"features": [0, 0]}, "x" * 999])
+    said[key] = rng.choice(
+        [
+            None,
+            0,
+            -1,
+            3,
+            10**9,
+            1.5,
+            True,
+            "value",
+            [],
+            [0, 1],
+            {},
+            {"features": [0, 0]},
+            "x" * 999,
+        ]
+    )
     header["__metadata__"]["gpmpc"] = json.dumps(said)
 
 
 @reheaded
 def metadata_of_garbage(header, rng):
-    header["__metadata__"] = rng.choice([{}, {"gpmpc": "[" * 100_000}, {"gpmpc": "null"}, {"gpmpc": "x" * 2**21}, 3])
+    header["__metadata__"] = rng.choice(
+        [{}, {"gpmpc": "[" * 100_000}, {"gpmpc": "null"}, {"gpmpc": "x" * 2**21}, 3]
+    )
 
 
 @reheaded
 def a_whole_header_of_garbage(header, rng):
-    return rng.choice([b"", b"[" * 100_000, b"null", b"{}", b"\xff\xfe", b"{" * 9000, b'{"a": {}}'])
+    return rng.choice(
+        [b"", b"[" * 100_000, b"null", b"{}", b"\xff\xfe", b"{" * 9000, b'{"a": {}}']
+    )
 
 
 def a_huge_header(content, rng):
-    return rng.choice([2**27, 2**40, 2**63, 2**64 - 1]).to_bytes(8, "little") + content[8:]
+    return (
+        rng.choice([2**27, 2**40, 2**63, 2**64 - 1]).to_bytes(8, "little") + content[8:]
+    )
 
 
 BYTES = [flipped, cut, without_a_piece, overwritten, repeated]
@@ -284,12 +368,17 @@ def main(kind, count, seed):
         parts = ZIP if kind in ("transitions", "old") else SAFETENSORS
         whole, same = path.read_bytes(), content(load(path))
         before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-        size = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+        size = (
+            int(Path("/proc/self/statm").read_text().split()[0])
+            * resource.getpagesize()
+        )
         for _ in range(count):
             damage = rng.choice(BYTES if kind == "csv" or rng.random() < 0.5 else parts)
             damaged = damage(whole, rng)
             path.write_bytes(damaged)
-            resource.setrlimit(resource.RLIMIT_AS, (size + MEMORY, resource.RLIM_INFINITY))
+            resource.setrlimit(
+                resource.RLIMIT_AS, (size + MEMORY, resource.RLIM_INFINITY)
+            )
             begin = time.perf_counter()
             try:
                 loaded = load(path)
@@ -305,11 +394,15 @@ def main(kind, count, seed):
                 said["read"] += 1
             finally:
                 slowest = max(slowest, time.perf_counter() - begin)
-                resource.setrlimit(resource.RLIMIT_AS, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
+                resource.setrlimit(
+                    resource.RLIMIT_AS, (resource.RLIM_INFINITY, resource.RLIM_INFINITY)
+                )
             assert slowest < SECONDS, (damage.__name__, slowest)
         grown = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before
     print(
-        kind, dict(said), f"slowest {slowest:.2f} s, grown by {grown / 1024:.0f} MB at most (the damaging itself too)"
+        kind,
+        dict(said),
+        f"slowest {slowest:.2f} s, grown by {grown / 1024:.0f} MB at most (the damaging itself too)",
     )
 
 

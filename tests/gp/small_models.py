@@ -29,7 +29,11 @@ def posterior(size=12, n=2, m=1, predicts="next_state", seed=0):
 
 def residual_model():
     gp = posterior(n=1, m=1, predicts="value")
-    nominal = Affine(torch.tensor([[1.0, 0.1], [-0.2, 0.9]]), torch.tensor([[0.0, 0.1], [0.1, 0.0]]), torch.ones(2))
+    nominal = Affine(
+        torch.tensor([[1.0, 0.1], [-0.2, 0.9]]),
+        torch.tensor([[0.0, 0.1], [0.1, 0.0]]),
+        torch.ones(2),
+    )
     return ResidualModel(nominal, gp, torch.tensor([[0.0], [1.0]]), [1], [0], 2)
 
 
@@ -38,5 +42,9 @@ def as_before(model, path):
     new = path.with_suffix(".new")
     SAVE[type(model)](model, new)
     header, arrays = _storage._content(new, "model")
-    header = {key: value for key, value in header.items() if key not in ("checksum", "metadata")}
+    header = {
+        key: value
+        for key, value in header.items()
+        if key not in ("checksum", "metadata")
+    }
     path.write_bytes(_storage.write_npz(header | {"format_version": 1}, arrays))

@@ -37,42 +37,66 @@ def test_values_and_jacobians_are_those_of_predict(make):
     mean, variance = function(x, u)
     q = casadi.vertcat(x, u)
     everything = casadi.Function(
-        "all", [x, u], [mean, variance, casadi.jacobian(mean, q), casadi.jacobian(variance, q)]
+        "all",
+        [x, u],
+        [mean, variance, casadi.jacobian(mean, q), casadi.jacobian(variance, q)],
     )
     for _ in range(5):
         state, control = torch.randn(n), torch.randn(m)
         at, by_state, by_input = predict_with_jacobian(model, state, control)
         # The variance at a query that is one vector, whose derivatives torch can follow.
         spread = torch.autograd.functional.jacobian(
-            lambda joint: model.predict(joint[:n], joint[n:]).variance, torch.cat([state, control])
+            lambda joint: model.predict(joint[:n], joint[n:]).variance,
+            torch.cat([state, control]),
         )
-        expected = [at.mean[:, None], at.variance[:, None], torch.cat([by_state, by_input], dim=1), spread]
-        for ours, theirs in zip(everything(state.numpy(), control.numpy()), expected, strict=True):
+        expected = [
+            at.mean[:, None],
+            at.variance[:, None],
+            torch.cat([by_state, by_input], dim=1),
+            spread,
+        ]
+        for ours, theirs in zip(
+            everything(state.numpy(), control.numpy()), expected, strict=True
+        ):
             assert np.abs(ours.full() - theirs.numpy()).max() < 1e-10
 
 
 def test_an_ill_conditioned_model_loses_no_more_digits_than_torch():
     gp = posterior(size=60)
     gp = GPPosterior.from_hyperparameters(
-        gp.features, gp.targets, 2 * gp.lengthscales, gp.signal_variance, torch.full((2,), 1e-9), 1
+        gp.features,
+        gp.targets,
+        2 * gp.lengthscales,
+        gp.signal_variance,
+        torch.full((2,), 1e-9),
+        1,
     )
     assert float(torch.linalg.cond(gp.cholesky).max()) > 1e4
     state, control = 0.3 * torch.ones(2), torch.zeros(1)
     mean, variance = casadi_function(gp)(state.numpy(), control.numpy())
     at = gp.predict(state, control)
-    assert np.abs(mean.full()[:, 0] - at.mean.numpy()).max() < 1e-8 * float(gp.weights.abs().sum())
+    assert np.abs(mean.full()[:, 0] - at.mean.numpy()).max() < 1e-8 * float(
+        gp.weights.abs().sum()
+    )
     assert np.abs(variance.full()[:, 0] - at.variance.numpy()).max() < 1e-10
 
 
 def test_on_a_training_point_without_noise_the_variance_is_never_negative():
     gp = GPPosterior.from_hyperparameters(
-        torch.tensor([[0.5, 0.2]]), torch.ones(1, 1), torch.ones(1, 2), torch.ones(1), torch.tensor([1e-16]), 1
+        torch.tensor([[0.5, 0.2]]),
+        torch.ones(1, 1),
+        torch.ones(1, 2),
+        torch.ones(1),
+        torch.tensor([1e-16]),
+        1,
     )
     assert float(casadi_function(gp)(0.5, 0.2)[1]) == 0.0
 
 
 def test_the_graph_does_not_grow_with_the_data():
-    few, many = (casadi_function(posterior(size=size)).n_instructions() for size in (5, 150))
+    few, many = (
+        casadi_function(posterior(size=size)).n_instructions() for size in (5, 150)
+    )
     assert few == many < 60
 
 
@@ -82,7 +106,9 @@ def test_the_function_can_be_stored_expanded_and_compiled(tmp_path, monkeypatch)
     function.generate("gp.c")
     assert "int gp(" in (tmp_path / "gp.c").read_text()
     for other in (function.expand(), casadi.Function.deserialize(function.serialize())):
-        for ours, theirs in zip(other([0.1, 0.2], 0.3), function([0.1, 0.2], 0.3), strict=True):
+        for ours, theirs in zip(
+            other([0.1, 0.2], 0.3), function([0.1, 0.2], 0.3), strict=True
+        ):
             assert np.abs(ours.full() - theirs.full()).max() < 1e-13
 
 
@@ -94,9 +120,13 @@ def test_ipopt_steers_through_the_model():
     before = casadi.horzcat(start, x[:, :-1])
     moved, variance = dynamics.map(horizon)(before, u)
     reachable = float(gp.predict(torch.tensor([start]), torch.tensor([0.4])).mean)
-    cost = casadi.sumsqr(x - reachable) + 1e-3 * casadi.sumsqr(u) + casadi.sum2(variance)
+    cost = (
+        casadi.sumsqr(x - reachable) + 1e-3 * casadi.sumsqr(u) + casadi.sum2(variance)
+    )
     problem = {"x": casadi.veccat(x, u), "f": cost, "g": casadi.vec(moved - x)}
-    solver = casadi.nlpsol("solver", "ipopt", problem, {"ipopt.print_level": 0, "print_time": 0})
+    solver = casadi.nlpsol(
+        "solver", "ipopt", problem, {"ipopt.print_level": 0, "print_time": 0}
+    )
     solution = solver(x0=0.0, lbg=0.0, ubg=0.0)
     assert solver.stats()["success"]
     path = np.append(start, solution["x"].full()[:horizon, 0])
@@ -107,6 +137,15 @@ def test_ipopt_steers_through_the_model():
 
 def test_a_model_of_code_is_refused():
     model = residual_model()
-    model = ResidualModel(lambda x, u: x, model.residual, model.B, model.states, model.inputs, model.input_dim)
-    with pytest.raises(UnsupportedModel, match="got ResidualModel of a nominal function"):
+    model = ResidualModel(
+        lambda x, u: x,
+        model.residual,
+        model.B,
+        model.states,
+        model.inputs,
+        model.input_dim,
+    )
+    with pytest.raises(
+        UnsupportedModel, match="got ResidualModel of a nominal function"
+    ):
         casadi_function(model)

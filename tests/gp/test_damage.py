@@ -17,7 +17,14 @@ from tests.gp.small_models import posterior
 
 
 def assert_survived(count, seed):
-    command = [sys.executable, "-m", "tests.gp.damage", "model,old,residual,transitions,csv", str(count), str(seed)]
+    command = [
+        sys.executable,
+        "-m",
+        "tests.gp.damage",
+        "model,old,residual,transitions,csv",
+        str(count),
+        str(seed),
+    ]
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr[-2000:]
     assert done.stdout.count("slowest") == 5
@@ -33,7 +40,10 @@ def test_three_thousand_damaged_files_of_every_kind_are_refused_or_read_as_they_
 
 
 def arrays(**changed):
-    good = {name: np.arange(6.0).reshape(3, 2) for name in ("states", "inputs", "next_states")}
+    good = {
+        name: np.arange(6.0).reshape(3, 2)
+        for name in ("states", "inputs", "next_states")
+    }
     return good | changed
 
 
@@ -51,25 +61,41 @@ def arrays(**changed):
     ],
     ids=lambda column: str(column.dtype),
 )
-def test_what_could_be_taken_for_numbers_is_refused_in_files_and_in_memory(column, compressed, tmp_path):
+def test_what_could_be_taken_for_numbers_is_refused_in_files_and_in_memory(
+    column, compressed, tmp_path
+):
     path = tmp_path / "data.npz"
     (np.savez_compressed if compressed else np.savez)(path, **arrays(inputs=column))
-    with pytest.raises(DataError, match=r"data\.npz: (inputs must be numbers|not a readable .npz file of transitions)"):
+    with pytest.raises(
+        DataError,
+        match=r"data\.npz: (inputs must be numbers|not a readable .npz file of transitions)",
+    ):
         Transitions.load(path)
-    with pytest.raises(DataError, match="inputs must be numbers in rows and columns; got"):
+    with pytest.raises(
+        DataError, match="inputs must be numbers in rows and columns; got"
+    ):
         Transitions(**arrays(inputs=column))
 
 
-@pytest.mark.parametrize("column", [torch.ones(3, 2, dtype=torch.bool), torch.ones(3, 2, dtype=torch.complex128)])
+@pytest.mark.parametrize(
+    "column",
+    [torch.ones(3, 2, dtype=torch.bool), torch.ones(3, 2, dtype=torch.complex128)],
+)
 def test_tensors_of_no_real_numbers_are_refused(column):
-    with pytest.raises(DataError, match="inputs must be numbers in rows and columns; got torch"):
+    with pytest.raises(
+        DataError, match="inputs must be numbers in rows and columns; got torch"
+    ):
         Transitions(**arrays(inputs=column))
 
 
 @pytest.mark.parametrize("kind", ["f2", "f4", ">f8", "i1", "u4", "i8"])
 @pytest.mark.parametrize("save", [np.savez, np.savez_compressed])
 def test_arrays_of_others_and_of_any_real_type_are_read(kind, save, tmp_path):
-    save(tmp_path / "data.npz", **arrays(inputs=np.array([[1], [2], [3]], dtype=kind)), more=np.array(["x"]))
+    save(
+        tmp_path / "data.npz",
+        **arrays(inputs=np.array([[1], [2], [3]], dtype=kind)),
+        more=np.array(["x"]),
+    )
     data = Transitions.load(tmp_path / "data.npz")
     assert data.inputs.tolist() == [[1], [2], [3]]
     assert data.inputs.dtype == torch.float64
@@ -78,27 +104,48 @@ def test_arrays_of_others_and_of_any_real_type_are_read(kind, save, tmp_path):
 def test_a_file_that_declares_more_than_it_can_hold_is_refused(tmp_path):
     path = tmp_path / "data.npz"
     np.savez_compressed(path, **arrays(states=np.zeros((400_000, 2))))
-    with pytest.raises(DataError, match=r"declares \d+ bytes, more than a file of \d+ bytes can hold"):
+    with pytest.raises(
+        DataError, match=r"declares \d+ bytes, more than a file of \d+ bytes can hold"
+    ):
         Transitions.load(path)
 
 
 def test_an_array_that_declares_more_than_it_holds_is_refused(tmp_path):
-    path, header = tmp_path / "data.npz", "{'descr': '<f8', 'fortran_order': False, 'shape': (100000, 2), }"
+    path, header = (
+        tmp_path / "data.npz",
+        "{'descr': '<f8', 'fortran_order': False, 'shape': (100000, 2), }",
+    )
     with zipfile.ZipFile(path, "w") as archive:
         for name in arrays():
-            archive.writestr(f"{name}.npy", b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header.encode())
-    with pytest.raises(DataError, match=r"data\.npz: not a readable .npz file of transitions \(EOF: reading array"):
+            archive.writestr(
+                f"{name}.npy",
+                b"\x93NUMPY\x01\x00"
+                + len(header).to_bytes(2, "little")
+                + header.encode(),
+            )
+    with pytest.raises(
+        DataError,
+        match=r"data\.npz: not a readable .npz file of transitions \(EOF: reading array",
+    ):
         Transitions.load(path)
 
 
-@pytest.mark.parametrize(("one", "other"), [("signal_variance", "noise_variance"), ("features", "targets")])
+@pytest.mark.parametrize(
+    ("one", "other"), [("signal_variance", "noise_variance"), ("features", "targets")]
+)
 def test_parts_that_changed_places_are_noticed(one, other, tmp_path):
     path = tmp_path / "gp.safetensors"
     save_posterior(posterior(m=0), path)
     with safetensors.safe_open(path, framework="numpy") as file:
-        arrays, metadata = {name: file.get_tensor(name) for name in file.keys()}, file.metadata()  # noqa: SIM118
-    safetensors.numpy.save_file(arrays | {one: arrays[other], other: arrays[one]}, path, metadata)
-    with pytest.raises(DataError, match="damaged; expected a saved GPPosterior .the checksum of its parts"):
+        arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        metadata = file.metadata()
+    safetensors.numpy.save_file(
+        arrays | {one: arrays[other], other: arrays[one]}, path, metadata
+    )
+    with pytest.raises(
+        DataError,
+        match="damaged; expected a saved GPPosterior .the checksum of its parts",
+    ):
         load_posterior(path)
 
 
@@ -109,11 +156,15 @@ def test_parts_that_changed_places_are_noticed(one, other, tmp_path):
 )  # fmt: skip
 def test_a_path_is_one_name(load):
     for path in (["a.csv", "b.csv"], None, 3):
-        with pytest.raises(SettingError, match="path: must be the name of one file; got"):
+        with pytest.raises(
+            SettingError, match="path: must be the name of one file; got"
+        ):
             load(path)
 
 
-@pytest.mark.parametrize("load", [Transitions.load, Transitions.from_text, load_posterior, load_model])
+@pytest.mark.parametrize(
+    "load", [Transitions.load, Transitions.from_text, load_posterior, load_model]
+)
 def test_a_name_that_no_file_can_have_is_named(load):
     for path in ("x" * 5000, "zero\0"):
         with pytest.raises(DataError, match="expected a"):
@@ -129,7 +180,9 @@ def test_a_name_that_no_file_can_have_is_named(load):
         ('"' + "x" * 200_000 + "\n", r"row \d cannot be read"),
     ],
 )
-def test_what_only_python_reads_as_a_number_or_a_table_is_refused(text, message, tmp_path):
+def test_what_only_python_reads_as_a_number_or_a_table_is_refused(
+    text, message, tmp_path
+):
     (tmp_path / "log.csv").write_text(text)
     with pytest.raises(DataError, match=f"log.csv: {message}"):
         Transitions.from_csv(tmp_path / "log.csv", ["x"], ["u"])

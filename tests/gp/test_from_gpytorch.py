@@ -20,23 +20,37 @@ from gpmpc.exceptions import SettingError, ShapeError, UnsupportedModel
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import Hyperparameters, KernelPosterior, exact_inference, from_gpytorch
 from gpmpc.gp._sparse import collapsed_bound
-from gpmpc.propagation import Linearization, MeanEquivalence, MomentMatching, MonteCarlo, Unscented, differentiate
+from gpmpc.propagation import (
+    Linearization,
+    MeanEquivalence,
+    MomentMatching,
+    MonteCarlo,
+    Unscented,
+    differentiate,
+)
 
 
 class Model(gpytorch.models.ExactGP):
     def __init__(self, x, y, kernel, mean=None, likelihood=None, batch=()):
         likelihood = likelihood or GaussianLikelihood(batch_shape=torch.Size(batch))
         super().__init__(x, y, likelihood)
-        self.mean_module, self.covar_module = mean or ZeroMean(batch_shape=torch.Size(batch)), kernel
+        self.mean_module, self.covar_module = (
+            mean or ZeroMean(batch_shape=torch.Size(batch)),
+            kernel,
+        )
 
     def forward(self, x):
-        return gpytorch.distributions.MultivariateNormal(self.mean_module(x), self.covar_module(x))
+        return gpytorch.distributions.MultivariateNormal(
+            self.mean_module(x), self.covar_module(x)
+        )
 
 
 def data(size, outputs=2, d=3, seed=0):
     generator = torch.Generator().manual_seed(seed)
     x = 3 * torch.rand(size, d, generator=generator) - 1.5
-    y = torch.stack([torch.sin((a + 1) * x[:, 0]) + x[:, 1] * x[:, -1] + a for a in range(outputs)])
+    y = torch.stack(
+        [torch.sin((a + 1) * x[:, 0]) + x[:, 1] * x[:, -1] + a for a in range(outputs)]
+    )
     return x, y + 0.05 * torch.randn(outputs, size, generator=generator)
 
 
@@ -58,7 +72,9 @@ def one_output(size, kernel, y=0, mean=None, **settings):
 def batch(size, kernel=None, outputs=2, mean=None):
     x, y = data(size, outputs)
     shape = torch.Size([outputs])
-    kernel = kernel or ScaleKernel(RBFKernel(ard_num_dims=3, batch_shape=shape), batch_shape=shape)
+    kernel = kernel or ScaleKernel(
+        RBFKernel(ard_num_dims=3, batch_shape=shape), batch_shape=shape
+    )
     return shaken(Model(x.expand(outputs, -1, -1), y, kernel, mean, batch=shape))
 
 
@@ -66,8 +82,14 @@ def theirs(model, query):
     """GPyTorch's own exact mean and variance (B, k)."""
     models = model if isinstance(model, list) else getattr(model, "models", [model])
     with exact_inference(), torch.no_grad():
-        beliefs = [m.eval()(query.expand(*m.train_targets.shape[:-1], *query.shape)) for m in models]
-    flat = [(b.mean.reshape(-1, len(query)), b.variance.reshape(-1, len(query))) for b in beliefs]
+        beliefs = [
+            m.eval()(query.expand(*m.train_targets.shape[:-1], *query.shape))
+            for m in models
+        ]
+    flat = [
+        (b.mean.reshape(-1, len(query)), b.variance.reshape(-1, len(query)))
+        for b in beliefs
+    ]
     return tuple(torch.cat(parts).mT for parts in zip(*flat, strict=True))
 
 
@@ -77,8 +99,13 @@ def their_jacobian(model, query):
     for m in models:
         with exact_inference():
             leaf = query.clone().requires_grad_()
-            mean = m.eval()(leaf.expand(*m.train_targets.shape[:-1], *query.shape)).mean.reshape(-1, len(query))
-            rows += [torch.autograd.grad(each.sum(), leaf, retain_graph=True)[0] for each in mean]
+            mean = m.eval()(
+                leaf.expand(*m.train_targets.shape[:-1], *query.shape)
+            ).mean.reshape(-1, len(query))
+            rows += [
+                torch.autograd.grad(each.sum(), leaf, retain_graph=True)[0]
+                for each in mean
+            ]
     return torch.stack(rows, dim=1)
 
 
@@ -86,12 +113,19 @@ SE_ARD = {
     "single": lambda size: one_output(size, ScaleKernel(RBFKernel(ard_num_dims=3))),
     "shared length-scale": lambda size: one_output(size, ScaleKernel(RBFKernel())),
     "no scale": lambda size: one_output(size, RBFKernel(ard_num_dims=3)),
-    "constant mean": lambda size: one_output(size, ScaleKernel(RBFKernel()), mean=ConstantMean()),
+    "constant mean": lambda size: one_output(
+        size, ScaleKernel(RBFKernel()), mean=ConstantMean()
+    ),
     "batch": batch,
-    "batch with constant means": lambda size: batch(size, mean=ConstantMean(batch_shape=torch.Size([2]))),
-    "list": lambda size: [one_output(size, ScaleKernel(RBFKernel(ard_num_dims=3)), y) for y in (0, 1)],
+    "batch with constant means": lambda size: batch(
+        size, mean=ConstantMean(batch_shape=torch.Size([2]))
+    ),
+    "list": lambda size: [
+        one_output(size, ScaleKernel(RBFKernel(ard_num_dims=3)), y) for y in (0, 1)
+    ],
     "IndependentModelList": lambda size: gpytorch.models.IndependentModelList(
-        one_output(size, ScaleKernel(RBFKernel(ard_num_dims=3)), 0), one_output(size, RBFKernel(), 1)
+        one_output(size, ScaleKernel(RBFKernel(ard_num_dims=3)), 0),
+        one_output(size, RBFKernel(), 1),
     ),
 }
 
@@ -125,7 +159,9 @@ ANY_KERNEL = {
     "Matern 5/2": lambda: ScaleKernel(MaternKernel(nu=2.5)),
     "sum": lambda: ScaleKernel(RBFKernel(ard_num_dims=3)) + LinearKernel(),
     "product": lambda: ScaleKernel(ProductKernel(RBFKernel(), MaternKernel(nu=2.5))),
-    "periodic on one": lambda: ScaleKernel(PeriodicKernel(active_dims=[0])) + MaternKernel(nu=2.5),
+    "periodic on one": lambda: (
+        ScaleKernel(PeriodicKernel(active_dims=[0])) + MaternKernel(nu=2.5)
+    ),
 }
 
 
@@ -143,14 +179,22 @@ def test_any_kernel_predicts_what_gpytorch_does(kind, size):
     for d in range(3):
         shift = step * torch.eye(3)[d]
         ahead, behind = query + shift, query - shift
-        slope = gp.predict(ahead[:, :2], ahead[:, 2:]).mean - gp.predict(behind[:, :2], behind[:, 2:]).mean
+        slope = (
+            gp.predict(ahead[:, :2], ahead[:, 2:]).mean
+            - gp.predict(behind[:, :2], behind[:, 2:]).mean
+        )
         jacobian = torch.cat([by_state, by_input], dim=-1)[..., d]
         assert torch.allclose(jacobian, slope / (2 * step), rtol=1e-6, atol=1e-6)
 
 
 def matern_dynamics(predicts="next_state", size=40):
-    kernel = ScaleKernel(MaternKernel(nu=2.5, ard_num_dims=3, batch_shape=torch.Size([2])), batch_shape=torch.Size([2]))
-    return KernelPosterior.from_gpytorch(batch(size, kernel), input_dim=1, predicts=predicts)
+    kernel = ScaleKernel(
+        MaternKernel(nu=2.5, ard_num_dims=3, batch_shape=torch.Size([2])),
+        batch_shape=torch.Size([2]),
+    )
+    return KernelPosterior.from_gpytorch(
+        batch(size, kernel), input_dim=1, predicts=predicts
+    )
 
 
 def test_leading_batch_dimensions_are_those_of_the_query():
@@ -172,9 +216,15 @@ def test_a_difference_model_adds_the_state():
     assert torch.allclose(jacobians[1] - jacobians[0], torch.eye(2).expand(4, 2, 2))
 
 
-@pytest.mark.parametrize("propagator", [MeanEquivalence(), Linearization(), Unscented(), MonteCarlo(500)])
+@pytest.mark.parametrize(
+    "propagator", [MeanEquivalence(), Linearization(), Unscented(), MonteCarlo(500)]
+)
 def test_every_sampling_and_expanding_propagation_takes_any_kernel(propagator):
-    gp, at, control = matern_dynamics(), Gaussian(torch.tensor([0.2, -0.4]), 0.01 * torch.eye(2)), torch.rand(1)
+    gp, at, control = (
+        matern_dynamics(),
+        Gaussian(torch.tensor([0.2, -0.4]), 0.01 * torch.eye(2)),
+        torch.rand(1),
+    )
     sampled = MonteCarlo(20_000, seed=3)(gp, at, control)
     belief = propagator(gp, at, control)
     assert torch.allclose(belief.mean, sampled.mean, atol=0.05)
@@ -182,26 +232,50 @@ def test_every_sampling_and_expanding_propagation_takes_any_kernel(propagator):
         assert torch.allclose(belief.covariance, sampled.covariance, atol=0.01)
     moved, sensitivity = differentiate(propagator, gp, at, control)
     step = 1e-5
-    shifted = [propagator(gp, Gaussian(at.mean, at.covariance), control + s * step).mean for s in (1, -1)]
+    shifted = [
+        propagator(gp, Gaussian(at.mean, at.covariance), control + s * step).mean
+        for s in (1, -1)
+    ]
     assert torch.allclose(moved.belief.mean, belief.mean)
-    assert torch.allclose(sensitivity.mean_by_input[:, 0], (shifted[0] - shifted[1]) / (2 * step), atol=1e-5)
+    assert torch.allclose(
+        sensitivity.mean_by_input[:, 0],
+        (shifted[0] - shifted[1]) / (2 * step),
+        atol=1e-5,
+    )
 
 
 def test_moment_matching_says_what_is_possible_with_other_kernels():
-    with pytest.raises(UnsupportedModel, match="got KernelPosterior. Possible with any model: MeanEquivalence, Linear"):
-        MomentMatching()(matern_dynamics(), Gaussian(torch.zeros(2), torch.eye(2)), torch.zeros(1))
+    with pytest.raises(
+        UnsupportedModel,
+        match="got KernelPosterior. Possible with any model: MeanEquivalence, Linear",
+    ):
+        MomentMatching()(
+            matern_dynamics(), Gaussian(torch.zeros(2), torch.eye(2)), torch.zeros(1)
+        )
 
 
 def test_a_frozen_model_knows_its_sizes_noise_and_type_and_can_be_moved():
     gp = matern_dynamics()
-    assert (gp.state_dim, gp.input_dim, gp.output_dim, gp.dtype, gp.device.type) == (2, 1, 2, torch.float64, "cpu")
+    assert (gp.state_dim, gp.input_dim, gp.output_dim, gp.dtype, gp.device.type) == (
+        2,
+        1,
+        2,
+        torch.float64,
+        "cpu",
+    )
     assert gp.noise_covariance.shape == (2, 2)
     single = gp.to(dtype=torch.float32)
     x, u = torch.rand(5, 2), torch.rand(5, 1)
     assert single.dtype == torch.float32
-    assert torch.allclose(single.predict(x.float(), u.float()).mean.double(), gp.predict(x, u).mean, atol=1e-3)
+    assert torch.allclose(
+        single.predict(x.float(), u.float()).mean.double(),
+        gp.predict(x, u).mean,
+        atol=1e-3,
+    )
     assert gp.dtype == torch.float64
-    with pytest.raises(ShapeError, match=r"an input \(\*batch, 1\); got \(5, 2\) and \(5, 2\)"):
+    with pytest.raises(
+        ShapeError, match=r"an input \(\*batch, 1\); got \(5, 2\) and \(5, 2\)"
+    ):
         gp.predict(x, torch.zeros(5, 2))
 
 
@@ -227,21 +301,41 @@ def with_transform():
             UnsupportedModel,
             "got MaternKernel. KernelPosterior takes any kernel",
         ),
-        (lambda: one_output(10, RBFKernel(active_dims=[0])), UnsupportedModel, "got RBFKernel on some dimensions"),
-        (lambda: one_output(10, RBFKernel(), mean=LinearMean(3)), UnsupportedModel, "zero or constant; got LinearMean"),
         (
-            lambda: one_output(10, RBFKernel(), likelihood=FixedNoiseGaussianLikelihood(torch.full((10,), 0.1))),
+            lambda: one_output(10, RBFKernel(active_dims=[0])),
+            UnsupportedModel,
+            "got RBFKernel on some dimensions",
+        ),
+        (
+            lambda: one_output(10, RBFKernel(), mean=LinearMean(3)),
+            UnsupportedModel,
+            "zero or constant; got LinearMean",
+        ),
+        (
+            lambda: one_output(
+                10,
+                RBFKernel(),
+                likelihood=FixedNoiseGaussianLikelihood(torch.full((10,), 0.1)),
+            ),
             UnsupportedModel,
             "must be a GaussianLikelihood; got FixedNoiseGaussianLikelihood",
         ),
         (with_transform, UnsupportedModel, "carries an outcome_transform"),
-        (lambda: Model(*(t.float() for t in data(9, 1)), RBFKernel()), SettingError, "must be in float64"),
+        (
+            lambda: Model(*(t.float() for t in data(9, 1)), RBFKernel()),
+            SettingError,
+            "must be in float64",
+        ),
         (
             lambda: [one_output(10, RBFKernel()), one_output(11, RBFKernel())],
             ShapeError,
             "all outputs must have the same training inputs",
         ),
-        (lambda: torch.nn.Linear(1, 1), UnsupportedModel, "only ExactGP models .* got Linear"),
+        (
+            lambda: torch.nn.Linear(1, 1),
+            UnsupportedModel,
+            "only ExactGP models .* got Linear",
+        ),
     ],
 )
 def test_models_that_cannot_be_frozen_are_refused_with_the_reason(make, error, message):
@@ -250,12 +344,23 @@ def test_models_that_cannot_be_frozen_are_refused_with_the_reason(make, error, m
 
 
 def test_numbers_that_do_not_go_together_are_refused():
-    with pytest.raises(ShapeError, match="features must have n .* 1 controls; got 3 columns and 1 outputs"):
+    with pytest.raises(
+        ShapeError,
+        match="features must have n .* 1 controls; got 3 columns and 1 outputs",
+    ):
         KernelPosterior.from_gpytorch(one_output(10, MaternKernel()), input_dim=1)
-    with pytest.raises(ShapeError, match="each model needs one likelihood; got 1 models and 2"):
-        KernelPosterior.from_gpytorch(one_output(10, RBFKernel()), [GaussianLikelihood()] * 2, input_dim=1)
-    with pytest.raises(SettingError, match="'next_state', 'difference', 'value'; got 'delta'"):
-        KernelPosterior.from_gpytorch(one_output(10, RBFKernel()), input_dim=1, predicts="delta")
+    with pytest.raises(
+        ShapeError, match="each model needs one likelihood; got 1 models and 2"
+    ):
+        KernelPosterior.from_gpytorch(
+            one_output(10, RBFKernel()), [GaussianLikelihood()] * 2, input_dim=1
+        )
+    with pytest.raises(
+        SettingError, match="'next_state', 'difference', 'value'; got 'delta'"
+    ):
+        KernelPosterior.from_gpytorch(
+            one_output(10, RBFKernel()), input_dim=1, predicts="delta"
+        )
 
 
 # --- sparse ---------------------------------------------------------------------------------------------------------
@@ -265,9 +370,17 @@ def sgpr(size=120, points=12, outputs=2):
     x, y = data(size, outputs)
     likelihood = GaussianLikelihood(batch_shape=torch.Size([outputs]))
     shape = torch.Size([outputs])
-    kernel = ScaleKernel(RBFKernel(ard_num_dims=3, batch_shape=shape), batch_shape=shape)
+    kernel = ScaleKernel(
+        RBFKernel(ard_num_dims=3, batch_shape=shape), batch_shape=shape
+    )
     inducing = InducingPointKernel(kernel, x[:points].clone(), likelihood)
-    return Model(x.expand(outputs, -1, -1), y, inducing, likelihood=likelihood, batch=shape).double().eval()
+    return (
+        Model(
+            x.expand(outputs, -1, -1), y, inducing, likelihood=likelihood, batch=shape
+        )
+        .double()
+        .eval()
+    )
 
 
 @pytest.mark.parametrize(("corrected", "method"), [(False, "sgpr"), (True, "fitc")])
@@ -277,12 +390,19 @@ def test_a_frozen_sparse_model_predicts_what_gpytorch_does(corrected, method):
         mean, variance = theirs(model, query)
         gp = from_gpytorch(model, input_dim=1, predicts="value")
     belief = gp.predict(query[:, :2], query[:, 2:])
-    if method == "sgpr":  # GPyTorch leaves out what the inducing points do not explain: kxx - qxx
-        kernel, Z = model.covar_module.base_kernel, model.covar_module.inducing_points.detach()
+    if (
+        method == "sgpr"
+    ):  # GPyTorch leaves out what the inducing points do not explain: kxx - qxx
+        kernel, Z = (
+            model.covar_module.base_kernel,
+            model.covar_module.inducing_points.detach(),
+        )
         with torch.no_grad():
             across = kernel(Z, query).to_dense()
             variance = variance + gp.signal_variance
-            variance -= (across * torch.linalg.solve(kernel(Z).to_dense(), across)).sum(-2).mT
+            variance -= (
+                (across * torch.linalg.solve(kernel(Z).to_dense(), across)).sum(-2).mT
+            )
     assert len(gp) == 12
     assert not gp.has_observation_noise
     assert torch.allclose(belief.mean, mean, rtol=0, atol=1e-8)
@@ -291,7 +411,11 @@ def test_a_frozen_sparse_model_predicts_what_gpytorch_does(corrected, method):
 
 def test_the_bound_is_gpytorchs():
     model = sgpr()
-    kernel, (x, *_), y = model.covar_module.base_kernel, model.train_inputs, model.train_targets
+    kernel, (x, *_), y = (
+        model.covar_module.base_kernel,
+        model.train_inputs,
+        model.train_targets,
+    )
     ours = collapsed_bound(
         model.covar_module.inducing_points.detach(),
         x[0],
@@ -303,7 +427,9 @@ def test_the_bound_is_gpytorchs():
         ),
         jitter=0.0,
     )
-    likelihood = gpytorch.mlls.ExactMarginalLogLikelihood(model.likelihood.train(), model.train())
+    likelihood = gpytorch.mlls.ExactMarginalLogLikelihood(
+        model.likelihood.train(), model.train()
+    )
     with exact_inference(), torch.no_grad():
         bound = likelihood(model(*model.train_inputs), y) * y.shape[-1]
     assert torch.allclose(ours, bound, rtol=1e-8)

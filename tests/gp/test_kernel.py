@@ -7,7 +7,12 @@ from gpmpc.gp._kernel import factorize
 
 def arguments(size=150, outputs=3, d=4):
     scales = 0.5 + torch.rand(outputs, d)
-    return torch.randn(size, d), scales, 1 + torch.rand(outputs), torch.full((outputs,), 1e-3)
+    return (
+        torch.randn(size, d),
+        scales,
+        1 + torch.rand(outputs),
+        torch.full((outputs,), 1e-3),
+    )
 
 
 def test_factors_made_in_place_are_the_same_bit_by_bit(monkeypatch):
@@ -24,7 +29,9 @@ def test_of_factors_made_in_place_the_output_that_fails_is_named(monkeypatch):
     points, scales, signal, noise = arguments(size=100)
     points[50:] = points[:50]
     noise[2] = 1e-300
-    with pytest.raises(SettingError, match="the kernel matrix of output 2 is not positive definite"):
+    with pytest.raises(
+        SettingError, match="the kernel matrix of output 2 is not positive definite"
+    ):
         factorize(points, scales, signal, noise)
 
 
@@ -32,6 +39,10 @@ def test_gradients_pass_through_factors_of_any_size(monkeypatch):
     monkeypatch.setattr("gpmpc.gp._kernel._MANY", 10)
     points, scales, signal, noise = arguments(size=20, outputs=1)
     noise.requires_grad_()
-    factorize(points, scales, signal, noise).diagonal(dim1=-2, dim2=-1).log().sum().backward()
+    factorize(points, scales, signal, noise).diagonal(
+        dim1=-2, dim2=-1
+    ).log().sum().backward()
     K = factorize(points, scales, signal, noise.detach())[0]
-    assert float(noise.grad) == pytest.approx(float(torch.cholesky_inverse(K).trace()) / 2)
+    assert float(noise.grad) == pytest.approx(
+        float(torch.cholesky_inverse(K).trace()) / 2
+    )

@@ -12,11 +12,15 @@ from gpmpc.gp._likelihood import NegativeLogMarginalLikelihood
 def problem(size, d=4, outputs=2, seed=0):
     rng = np.random.default_rng(seed)
     x = rng.normal(size=(size, d))
-    y = np.column_stack([np.sin(x[:, 0]) + x[:, 1] ** 2, x[:, 2] * x[:, 3]])[:, :outputs] + 0.01 * rng.normal(
-        size=(size, outputs)
-    )
+    y = np.column_stack([np.sin(x[:, 0]) + x[:, 1] ** 2, x[:, 2] * x[:, 3]])[
+        :, :outputs
+    ] + 0.01 * rng.normal(size=(size, outputs))
     theta = np.column_stack(
-        [rng.normal(0.3, 0.4, size=(outputs, d)), rng.normal(0.5, 0.3, outputs), rng.uniform(1, 4, outputs)]
+        [
+            rng.normal(0.3, 0.4, size=(outputs, d)),
+            rng.normal(0.5, 0.3, outputs),
+            rng.uniform(1, 4, outputs),
+        ]
     )
     return x, y, theta
 
@@ -28,7 +32,9 @@ def test_the_closed_form_is_gpytorchs_marginal_likelihood(size):
         expected, slopes = GPyTorchLikelihood(x, y[:, a])(theta[a])
         value, gradient = NegativeLogMarginalLikelihood(x, y[:, a])(theta[a])
         assert value == pytest.approx(expected, rel=1e-10, abs=1e-9)
-        assert np.allclose(gradient, slopes, rtol=1e-7, atol=1e-8 * (1 + np.abs(slopes).max()))
+        assert np.allclose(
+            gradient, slopes, rtol=1e-7, atol=1e-8 * (1 + np.abs(slopes).max())
+        )
 
 
 def test_the_gradient_is_that_of_the_value():
@@ -42,11 +48,15 @@ def test_the_value_is_minus_the_log_of_the_gaussian_density():
     x, y, theta = problem(15)
     length, sf2 = np.exp(theta[0, :4]), np.exp(2 * theta[0, 4])
     squares = (((x[:, None] - x[None]) / length) ** 2).sum(-1)
-    covariance = sf2 * np.exp(-squares / 2) + np.exp(2 * (theta[0, 4] - theta[0, 5])) * np.eye(15)
-    density = torch.distributions.MultivariateNormal(torch.zeros(15), torch.from_numpy(covariance))
-    assert NegativeLogMarginalLikelihood(x, y[:, 0], in_place=False)(theta[0])[0] == pytest.approx(
-        -float(density.log_prob(torch.from_numpy(y[:, 0])))
+    covariance = sf2 * np.exp(-squares / 2) + np.exp(
+        2 * (theta[0, 4] - theta[0, 5])
+    ) * np.eye(15)
+    density = torch.distributions.MultivariateNormal(
+        torch.zeros(15), torch.from_numpy(covariance)
     )
+    assert NegativeLogMarginalLikelihood(x, y[:, 0], in_place=False)(theta[0])[
+        0
+    ] == pytest.approx(-float(density.log_prob(torch.from_numpy(y[:, 0]))))
 
 
 def test_a_kernel_matrix_that_is_not_positive_definite_has_infinite_likelihood():
@@ -68,7 +78,9 @@ def test_the_likelihood_in_place_is_the_likelihood_call_after_call(size):
     for point in (theta[0], theta[1], theta[0]):
         (value, gradient), (expected, slopes) = in_place(point), separate(point)
         assert value == pytest.approx(expected, rel=1e-10, abs=1e-9)
-        assert np.allclose(gradient, slopes, rtol=1e-8, atol=1e-8 * (1 + np.abs(slopes).max()))
+        assert np.allclose(
+            gradient, slopes, rtol=1e-8, atol=1e-8 * (1 + np.abs(slopes).max())
+        )
 
 
 def test_the_likelihood_in_place_is_infinite_where_the_matrix_is_not_positive_definite_and_recovers():
@@ -79,7 +91,8 @@ def test_the_likelihood_in_place_is_infinite_where_the_matrix_is_not_positive_de
     assert value == np.inf
     assert not gradient.any()
     assert likelihood(theta[0])[0] == pytest.approx(
-        NegativeLogMarginalLikelihood(x, y[:, 0], in_place=False)(theta[0])[0], rel=1e-10
+        NegativeLogMarginalLikelihood(x, y[:, 0], in_place=False)(theta[0])[0],
+        rel=1e-10,
     )
 
 

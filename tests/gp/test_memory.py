@@ -21,10 +21,16 @@ def test_a_running_process_has_some_memory_left():
     assert free is None or free > 2**20
 
 
-def test_the_tightest_control_group_above_the_process_counts_and_file_pages_are_free(tmp_path):
+def test_the_tightest_control_group_above_the_process_counts_and_file_pages_are_free(
+    tmp_path,
+):
     groups = tmp_path / "sys/fs/cgroup"
     write(tmp_path / "proc/self/cgroup", "1:cpu:/x\n0::/job/step\n")
-    for folder, limit, used, pages in (("job/step", "max", 0, 0), ("job", "1000", 700, 200), (".", "5000", 4900, 0)):
+    for folder, limit, used, pages in (
+        ("job/step", "max", 0, 0),
+        ("job", "1000", 700, 200),
+        (".", "5000", 4900, 0),
+    ):
         write_group(groups / folder, limit, used, pages)
     assert available_memory(tmp_path) == 100
     (groups / "memory.max").unlink()
@@ -34,18 +40,26 @@ def test_the_tightest_control_group_above_the_process_counts_and_file_pages_are_
 
 
 @pytest.mark.parametrize(
-    ("by_kernel", "by_group", "free"), [(7, 5, 5), (5, 7, 5), (None, 3, 3), (9, None, 9), (None, None, None)]
+    ("by_kernel", "by_group", "free"),
+    [(7, 5, 5), (5, 7, 5), (None, 3, 3), (9, None, 9), (None, None, None)],
 )
-def test_what_is_left_is_the_least_that_anybody_leaves(by_kernel, by_group, free, tmp_path):
+def test_what_is_left_is_the_least_that_anybody_leaves(
+    by_kernel, by_group, free, tmp_path
+):
     if by_kernel is not None:
-        write(tmp_path / "proc/meminfo", f"MemTotal: 9 kB\nMemAvailable:     {by_kernel} kB\n")
+        write(
+            tmp_path / "proc/meminfo",
+            f"MemTotal: 9 kB\nMemAvailable:     {by_kernel} kB\n",
+        )
     if by_group is not None:
         write(tmp_path / "proc/self/cgroup", "0::/\n")
         write_group(tmp_path / "sys/fs/cgroup", 1024 * by_group, 0, 0)
     assert available_memory(tmp_path) == (None if free is None else 1024 * free)
 
 
-def test_a_training_that_does_not_fit_is_refused_with_the_points_that_would(monkeypatch):
+def test_a_training_that_does_not_fit_is_refused_with_the_points_that_would(
+    monkeypatch,
+):
     needed = 8 * 1000**2 * (2 + 2)  # [bytes]
     for free in (needed, None):
         monkeypatch.setattr(_training, "available_memory", lambda free=free: free)

@@ -63,7 +63,10 @@ TRAINERS = {
 
 
 def assert_same_training(trainer, x, y, by, targets_by=0.0):
-    here, there = trainer.fit(x, y, 1, "value"), trainer.fit(x + by, y + targets_by, 1, "value")
+    here, there = (
+        trainer.fit(x, y, 1, "value"),
+        trainer.fit(x + by, y + targets_by, 1, "value"),
+    )
     assert np.abs(here.objective - there.objective).max() < 0.01
     at = on_grid(data(20, seed=1)[0])
     (ours, *slopes), (theirs, *their_slopes) = (
@@ -89,7 +92,9 @@ def test_training_in_place_does_not_see_where_the_features_lie(by, monkeypatch):
 
 
 @pytest.mark.parametrize("by", FEATURES, ids=str)
-def test_with_a_prior_mean_of_zero_training_does_not_see_where_the_features_lie_either(by):
+def test_with_a_prior_mean_of_zero_training_does_not_see_where_the_features_lie_either(
+    by,
+):
     assert_same_training(Trainer(restarts=0, scaling=identity), *data(), by)
 
 
@@ -105,12 +110,23 @@ def test_every_evidence_is_that_of_the_shifted_features(by):
     theta = np.array([0.2, 0.5, 0.1, 0.3, np.log(1e3)])
     shifted = x + by
     for in_place in (False, True):
-        value, gradient = NegativeLogMarginalLikelihood(x.numpy(), y[:, 0].numpy(), in_place)(theta)
-        there, slopes = NegativeLogMarginalLikelihood(shifted.numpy(), y[:, 0].numpy(), in_place)(theta)
+        value, gradient = NegativeLogMarginalLikelihood(
+            x.numpy(), y[:, 0].numpy(), in_place
+        )(theta)
+        there, slopes = NegativeLogMarginalLikelihood(
+            shifted.numpy(), y[:, 0].numpy(), in_place
+        )(theta)
         assert there == pytest.approx(value, rel=1e-10)
         assert np.allclose(slopes, gradient, rtol=1e-7)
-    kernel = [torch.tensor(theta[None, :3]).exp(), torch.ones(1), torch.full((1,), 1e-4)]
-    bounds = [collapsed_bound(p[:20], p, y[:, :1], Hyperparameters(*kernel)) for p in (x, shifted)]
+    kernel = [
+        torch.tensor(theta[None, :3]).exp(),
+        torch.ones(1),
+        torch.full((1,), 1e-4),
+    ]
+    bounds = [
+        collapsed_bound(p[:20], p, y[:, :1], Hyperparameters(*kernel))
+        for p in (x, shifted)
+    ]
     assert torch.allclose(*bounds, rtol=1e-10)
 
 
@@ -134,9 +150,13 @@ def posterior(by=0.0, targets_by=0.0, sparse=False, predicts="next_state"):
         "offset": torch.full((2,), 0.25) + targets_by,
     }
     if sparse:
-        hyperparameters = Hyperparameters(*(kernel.pop(name) for name in Hyperparameters._fields))
+        hyperparameters = Hyperparameters(
+            *(kernel.pop(name) for name in Hyperparameters._fields)
+        )
         offset = kernel.pop("offset")
-        gp = sparse_posterior(x[:10] + by, x + by, y + targets_by - offset, hyperparameters, **kernel)
+        gp = sparse_posterior(
+            x[:10] + by, x + by, y + targets_by - offset, hyperparameters, **kernel
+        )
         return gp.unscaled(identity(x), Scaling(offset, torch.ones_like(offset)))
     return GPPosterior.from_hyperparameters(x + by, y + targets_by, **kernel)
 
@@ -155,7 +175,8 @@ def everything(gp, by):
     module = PosteriorModule(gp)(x, u)
     said += [*module, *torch.export.export(PosteriorModule(gp), (x, u)).module()(x, u)]
     said += [
-        torch.from_numpy(np.array(part)).mT for part in casadi_function(gp).map(6)(casadi.DM(x.numpy().T), u.numpy().T)
+        torch.from_numpy(np.array(part)).mT
+        for part in casadi_function(gp).map(6)(casadi.DM(x.numpy().T), u.numpy().T)
     ]
     return said
 
@@ -165,7 +186,10 @@ def everything(gp, by):
 @pytest.mark.parametrize("sparse", [False, True], ids=["exact", "sparse"])
 def test_predictions_and_exports_are_those_of_the_shifted_model(by, choice, sparse):
     with backend(choice):
-        here, there = everything(posterior(sparse=sparse), 0.0), everything(posterior(by, sparse=sparse), by)
+        here, there = (
+            everything(posterior(sparse=sparse), 0.0),
+            everything(posterior(by, sparse=sparse), by),
+        )
     for ours, theirs in zip(here, there, strict=True):
         assert torch.allclose(ours, theirs, rtol=1e-7, atol=1e-8 if sparse else 1e-10)
 
@@ -175,13 +199,18 @@ PROPAGATORS = [
     (MomentMatching(diagonal=True, process_noise=True), 1e-10),
     (Linearization(), 1e-10),
     (MeanEquivalence(), 1e-10),
-    (Unscented(), 3e-7),  # its points, and the samples, are states: float64 resolves 1.5e-8 of them at 1e8
+    (
+        Unscented(),
+        3e-7,
+    ),  # its points, and the samples, are states: float64 resolves 1.5e-8 of them at 1e8
     (MonteCarlo(300), 3e-7),
 ]
 
 
 @pytest.mark.parametrize("choice", ["auto", "torch"])
-@pytest.mark.parametrize(("propagator", "atol"), PROPAGATORS, ids=lambda value: type(value).__name__)
+@pytest.mark.parametrize(
+    ("propagator", "atol"), PROPAGATORS, ids=lambda value: type(value).__name__
+)
 def test_propagations_are_those_of_the_shifted_model(propagator, atol, choice):
     by = torch.tensor([1e8, -3e6, 1e7])
     covariance = torch.tensor([[0.09, 0.02], [0.02, 0.04]])
@@ -189,21 +218,38 @@ def test_propagations_are_those_of_the_shifted_model(propagator, atol, choice):
     for shift in (torch.zeros(3), by):
         x, u = query(shift)
         with backend(choice):
-            moved = propagator.propagate(posterior(shift), Gaussian(x[0], covariance), u[0])
-            derivatives = differentiate(propagator, posterior(shift), Gaussian(x[0], covariance), u[0])[1]
-        said.append([moved.belief.mean, moved.belief.covariance, moved.cross_covariance, *vars(derivatives).values()])
+            moved = propagator.propagate(
+                posterior(shift), Gaussian(x[0], covariance), u[0]
+            )
+            derivatives = differentiate(
+                propagator, posterior(shift), Gaussian(x[0], covariance), u[0]
+            )[1]
+        said.append(
+            [
+                moved.belief.mean,
+                moved.belief.covariance,
+                moved.cross_covariance,
+                *vars(derivatives).values(),
+            ]
+        )
     for ours, theirs in zip(*said, strict=True):
         assert torch.allclose(ours, theirs, rtol=1e-6, atol=atol)
 
 
 @pytest.mark.parametrize("predicts", ["next_state", "difference"])
 def test_the_local_model_of_a_shifted_state_is_shifted(predicts):
-    by, covariance = torch.tensor([1e8, -3e6, 1e7]), torch.tensor([[0.09, 0.02], [0.02, 0.04]])
+    by, covariance = (
+        torch.tensor([1e8, -3e6, 1e7]),
+        torch.tensor([[0.09, 0.02], [0.02, 0.04]]),
+    )
     targets_by = by[:2] if predicts == "next_state" else 0.0
     said = []
     for shift, of_targets in ((torch.zeros(3), 0.0), (by, targets_by)):
         x, u = query(shift)
-        gp, belief = posterior(shift, of_targets, predicts=predicts), Gaussian(x[0], covariance)
+        gp, belief = (
+            posterior(shift, of_targets, predicts=predicts),
+            Gaussian(x[0], covariance),
+        )
         moved = MomentMatching()(gp, belief, u[0])
         local = linearize(MomentMatching(), gp, belief, u[0])
         said.append([moved.mean - shift[:2], moved.covariance, local.A, local.B])
@@ -215,10 +261,16 @@ def test_points_come_and_go_around_a_large_value_as_around_zero():
     x, y = data(28)
     new = slice(25, 28)
     here = remove_points(append_points(posterior(), x[new], y[new]), [0, 7])
-    there = remove_points(append_points(posterior(1e8, -1e8), x[new] + 1e8, y[new] - 1e8), [0, 7])
+    there = remove_points(
+        append_points(posterior(1e8, -1e8), x[new] + 1e8, y[new] - 1e8), [0, 7]
+    )
     (a, u), (b, v) = query(), query(1e8)
-    assert torch.allclose(here.predict(a, u).mean, there.predict(b, v).mean + 1e8, rtol=0, atol=1e-6)
-    assert torch.allclose(here.predict(a, u).variance, there.predict(b, v).variance, atol=1e-9)
+    assert torch.allclose(
+        here.predict(a, u).mean, there.predict(b, v).mean + 1e8, rtol=0, atol=1e-6
+    )
+    assert torch.allclose(
+        here.predict(a, u).variance, there.predict(b, v).variance, atol=1e-9
+    )
 
 
 def test_what_flies_around_a_large_value_is_learned_by_default():

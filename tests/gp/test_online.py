@@ -30,7 +30,9 @@ def transitions(rows, n=3, m=2, seed=0):
 
 def posterior(data, noise=1e-3, predicts="next_state", offset=None):
     n, d = data.state_dim, data.features.shape[1]
-    targets = data.next_states - data.states if predicts == "difference" else data.next_states
+    targets = (
+        data.next_states - data.states if predicts == "difference" else data.next_states
+    )
     return GPPosterior.from_hyperparameters(
         data.features,
         targets,
@@ -62,7 +64,12 @@ def assert_equal(one, other, tolerance=1e-9):
     assert torch.equal(one.features, other.features)
     assert torch.equal(one.targets, other.targets)
     assert torch.allclose(one.cholesky, other.cholesky, rtol=0, atol=tolerance)
-    assert torch.allclose(one.weights, other.weights, rtol=0, atol=tolerance * float(1 + other.weights.abs().max()))
+    assert torch.allclose(
+        one.weights,
+        other.weights,
+        rtol=0,
+        atol=tolerance * float(1 + other.weights.abs().max()),
+    )
     assert torch.allclose(ours.mean, theirs.mean, rtol=0, atol=tolerance)
     assert torch.allclose(ours.variance, theirs.variance, rtol=0, atol=tolerance)
 
@@ -71,17 +78,33 @@ def assert_equal(one, other, tolerance=1e-9):
 @pytest.mark.parametrize("new", [1, 7])
 def test_conditioning_is_the_posterior_of_all_points(predicts, new):
     data, offset = transitions(40 + new), torch.tensor([0.3, -1.0, 0.0])
-    grown = append_transitions(posterior(data[:40], predicts=predicts, offset=offset), data[40:])
+    grown = append_transitions(
+        posterior(data[:40], predicts=predicts, offset=offset), data[40:]
+    )
     assert_equal(grown, posterior(data, predicts=predicts, offset=offset), 1e-12)
 
 
 @pytest.mark.parametrize(
-    "gone", [[0], [39], [17], [-1], [3, 4, 30], [30, 3, 4], list(range(35)), range(5), torch.tensor([2, 9]), 6]
+    "gone",
+    [
+        [0],
+        [39],
+        [17],
+        [-1],
+        [3, 4, 30],
+        [30, 3, 4],
+        list(range(35)),
+        range(5),
+        torch.tensor([2, 9]),
+        6,
+    ],
 )
 def test_dropping_is_the_posterior_of_the_others(gone):
     data = transitions(40)
     rows = np.delete(np.arange(40), gone)
-    assert_equal(remove_points(posterior(data), gone), posterior(data[rows.tolist()]), 1e-11)
+    assert_equal(
+        remove_points(posterior(data), gone), posterior(data[rows.tolist()]), 1e-11
+    )
 
 
 def test_dropping_nothing_changes_nothing():
@@ -96,7 +119,8 @@ def test_hundreds_of_random_changes_leave_no_error_behind(noise, rng):
     for _ in range(250):
         new = int(rng.integers(1, 4))
         gp = remove_points(
-            append_transitions(gp, data[seen : seen + new]), rng.choice(len(gp) + new, new, replace=False)
+            append_transitions(gp, data[seen : seen + new]),
+            rng.choice(len(gp) + new, new, replace=False),
         )
         seen += new
     assert len(gp) == 60
@@ -125,7 +149,10 @@ def test_what_was_told_is_believed_and_what_was_forgotten_is_not():
     data = transitions(60)
     gp, new = posterior(data[:50], 1e-6), data[50:51]
     grown = append_transitions(gp, new)
-    before, after = gp.predict(new.states, new.inputs), grown.predict(new.states, new.inputs)
+    before, after = (
+        gp.predict(new.states, new.inputs),
+        grown.predict(new.states, new.inputs),
+    )
     assert (after.variance < before.variance).all()
     assert torch.allclose(after.mean, new.next_states, atol=1e-2)
     assert_equal(remove_points(grown, 50), gp)
@@ -133,27 +160,50 @@ def test_what_was_told_is_believed_and_what_was_forgotten_is_not():
 
 def test_single_precision_posteriors_can_be_updated_too():
     data = transitions(40)
-    gp = remove_points(append_transitions(posterior(data[:30], 1e-2).to(dtype=torch.float32), data[30:]), [0])
+    gp = remove_points(
+        append_transitions(
+            posterior(data[:30], 1e-2).to(dtype=torch.float32), data[30:]
+        ),
+        [0],
+    )
     query, control = data.states, data.inputs
     assert gp.dtype == torch.float32
     assert gp.has_observation_noise
     exact = posterior(data[1:], 1e-2).predict(query, control).mean
-    assert torch.allclose(gp.predict(query.float(), control.float()).mean.double(), exact, atol=1e-3)
+    assert torch.allclose(
+        gp.predict(query.float(), control.float()).mean.double(), exact, atol=1e-3
+    )
 
 
 def test_more_points_than_the_noise_allows_are_refused():
     data = transitions(3)
     gp = posterior(data, 1e-3)
-    without_noise = GPPosterior(**(vars(gp) | {"noise_variance": torch.full((3,), 1e-17)}))
-    with pytest.raises(SettingError, match="the kernel matrix of output . is not positive"):
-        append_points(without_noise, gp.features[0] + 1e-5 * torch.randn(30, 5), torch.zeros(30, 3))
+    without_noise = GPPosterior(
+        **(vars(gp) | {"noise_variance": torch.full((3,), 1e-17)})
+    )
+    with pytest.raises(
+        SettingError, match="the kernel matrix of output . is not positive"
+    ):
+        append_points(
+            without_noise,
+            gp.features[0] + 1e-5 * torch.randn(30, 5),
+            torch.zeros(30, 3),
+        )
 
 
 @pytest.mark.parametrize(
     ("change", "error", "message"),
     [
-        (lambda gp: append_transitions(gp, transitions(2, n=2)), ShapeError, "3 states and 2 inputs; got .* 2 and 2"),
-        (lambda gp: append_transitions(gp, transitions(2, m=1)), ShapeError, "3 states and 2 inputs; got .* 3 and 1"),
+        (
+            lambda gp: append_transitions(gp, transitions(2, n=2)),
+            ShapeError,
+            "3 states and 2 inputs; got .* 2 and 2",
+        ),
+        (
+            lambda gp: append_transitions(gp, transitions(2, m=1)),
+            ShapeError,
+            "3 states and 2 inputs; got .* 3 and 1",
+        ),
         (
             lambda gp: append_points(gp, torch.zeros(2, 5), torch.zeros(1, 3)),
             ShapeError,
@@ -165,19 +215,39 @@ def test_more_points_than_the_noise_allows_are_refused():
             "features must have n . m columns, .* got 4 columns and 3 outputs",
         ),
         (
-            lambda gp: append_points(replace(gp, predicts="value"), torch.zeros(2, 4), torch.zeros(2, 3)),
+            lambda gp: append_points(
+                replace(gp, predicts="value"), torch.zeros(2, 4), torch.zeros(2, 3)
+            ),
             ShapeError,
             "features and targets like those of GPPosterior.*; got 4 and 3",
         ),
         (
-            lambda gp: append_points(gp, torch.zeros(1, 5), torch.full((1, 3), torch.nan)),
+            lambda gp: append_points(
+                gp, torch.zeros(1, 5), torch.full((1, 3), torch.nan)
+            ),
             DataError,
             "targets must be finite; got nan",
         ),
-        (lambda gp: remove_points(gp, range(10)), DataError, "at least one point; removing 10 of 10 leaves none"),
-        (lambda gp: remove_points(gp, [10]), SettingError, r"whole numbers from -10 to 9; got \[10\]"),
-        (lambda gp: remove_points(gp, [True]), SettingError, r"whole numbers from -10 to 9; got \[True\]"),
-        (lambda gp: remove_points(gp, [1, -9]), SettingError, r"must be different; got \[1, -9\]"),
+        (
+            lambda gp: remove_points(gp, range(10)),
+            DataError,
+            "at least one point; removing 10 of 10 leaves none",
+        ),
+        (
+            lambda gp: remove_points(gp, [10]),
+            SettingError,
+            r"whole numbers from -10 to 9; got \[10\]",
+        ),
+        (
+            lambda gp: remove_points(gp, [True]),
+            SettingError,
+            r"whole numbers from -10 to 9; got \[True\]",
+        ),
+        (
+            lambda gp: remove_points(gp, [1, -9]),
+            SettingError,
+            r"must be different; got \[1, -9\]",
+        ),
     ],
 )
 def test_misuse_is_refused_with_the_rule(change, error, message):
@@ -218,5 +288,7 @@ def test_refitting_keeps_units_and_what_is_predicted():
 
 def test_a_start_of_other_dimensions_is_refused():
     other = train(transitions(10, n=2), restarts=0).posterior
-    with pytest.raises(ShapeError, match="must have 5 features and 3 outputs; got 4 and 2"):
+    with pytest.raises(
+        ShapeError, match="must have 5 features and 3 outputs; got 4 and 2"
+    ):
         Trainer()(transitions(10), start=other)

@@ -28,7 +28,11 @@ def test_predictions_are_gpytorchs_at_every_size(size):
     gp = posterior(size, n=3, m=2)
     model = to_gpytorch(gp)
     states, inputs = torch.rand(6, 3), torch.rand(6, 2)
-    with exact_inference(), torch.no_grad(), gpytorch.settings.skip_posterior_variances(False):
+    with (
+        exact_inference(),
+        torch.no_grad(),
+        gpytorch.settings.skip_posterior_variances(False),
+    ):
         theirs = model(torch.cat([states, inputs], dim=1).expand(3, -1, -1))
     ours = gp.predict(states, inputs)
     assert torch.allclose(ours.mean, theirs.mean.T, rtol=0, atol=1e-10)
@@ -38,7 +42,10 @@ def test_predictions_are_gpytorchs_at_every_size(size):
 def test_a_difference_model_adds_the_state():
     state, control = torch.rand(4, 2), torch.rand(4, 1)
     next_state, difference = posterior(), posterior(predicts="difference")
-    assert torch.allclose(difference.predict(state, control).mean, next_state.predict(state, control).mean + state)
+    assert torch.allclose(
+        difference.predict(state, control).mean,
+        next_state.predict(state, control).mean + state,
+    )
 
 
 def test_batches_and_transforms_agree_with_single_predictions():
@@ -49,8 +56,12 @@ def test_batches_and_transforms_agree_with_single_predictions():
     assert torch.allclose(batch.covariance[1, 2], single.covariance, atol=1e-14)
     mapped = torch.func.vmap(lambda x, u: gp.predict(x, u).mean)(states[0], inputs[0])
     assert torch.allclose(mapped, batch.mean[0], atol=1e-14)
-    forward = torch.func.jacfwd(lambda x: gp.predict(x, inputs[0, 0]).mean)(states[0, 0])
-    reverse = torch.func.jacrev(lambda x: gp.predict(x, inputs[0, 0]).mean)(states[0, 0])
+    forward = torch.func.jacfwd(lambda x: gp.predict(x, inputs[0, 0]).mean)(
+        states[0, 0]
+    )
+    reverse = torch.func.jacrev(lambda x: gp.predict(x, inputs[0, 0]).mean)(
+        states[0, 0]
+    )
     assert torch.allclose(forward, reverse, atol=1e-13)
 
 
@@ -63,13 +74,32 @@ def test_far_from_the_data_the_prior_returns():
 @pytest.mark.parametrize(
     ("change", "error", "message"),
     [
-        ({"lengthscales": torch.ones(2, 2)}, ShapeError, r"lengthscales must have shape \(2, 3\); got \(2, 2\)"),
-        ({"targets": torch.ones(9, 2)}, ShapeError, r"targets must have shape \(10, 2\); got \(9, 2\)"),
-        ({"noise_variance": torch.zeros(2)}, SettingError, r"noise_variance: must be positive; got \[0.0, 0.0\]"),
-        ({"input_dim": 2}, ShapeError, "2 controls; got 3 columns and 2 outputs"),
-        ({"predicts": "delta"}, SettingError, "'next_state', 'difference', 'value'; got 'delta'"),
         (
-            {"inputs": torch.zeros(10, 3), "noise_variance": torch.tensor([1.0, 1e-18])},
+            {"lengthscales": torch.ones(2, 2)},
+            ShapeError,
+            r"lengthscales must have shape \(2, 3\); got \(2, 2\)",
+        ),
+        (
+            {"targets": torch.ones(9, 2)},
+            ShapeError,
+            r"targets must have shape \(10, 2\); got \(9, 2\)",
+        ),
+        (
+            {"noise_variance": torch.zeros(2)},
+            SettingError,
+            r"noise_variance: must be positive; got \[0.0, 0.0\]",
+        ),
+        ({"input_dim": 2}, ShapeError, "2 controls; got 3 columns and 2 outputs"),
+        (
+            {"predicts": "delta"},
+            SettingError,
+            "'next_state', 'difference', 'value'; got 'delta'",
+        ),
+        (
+            {
+                "inputs": torch.zeros(10, 3),
+                "noise_variance": torch.tensor([1.0, 1e-18]),
+            },
             SettingError,
             "output 1 is not positive",
         ),
@@ -91,14 +121,36 @@ def test_misuse_is_refused_with_the_rule(change, error, message):
 @pytest.mark.parametrize(
     ("change", "error", "message"),
     [
-        ({"inputs": torch.zeros(0, 3), "targets": torch.zeros(0, 2)}, ShapeError, r"a row; got \(0, 3\) and \(0, 2\)"),
-        ({"inputs": torch.full((10, 3), torch.nan)}, DataError, "inputs must be finite; got nan"),
-        ({"targets": torch.rand(10, 2).float()}, SettingError, "targets: must be float64"),
-        ({"offset": torch.zeros(3)}, ShapeError, r"offset must have shape \(2,\); got \(3,\)"),
-        ({"input_dim": 3, "predicts": "value"}, ShapeError, "3 controls; got 3 columns and 2 outputs"),
+        (
+            {"inputs": torch.zeros(0, 3), "targets": torch.zeros(0, 2)},
+            ShapeError,
+            r"a row; got \(0, 3\) and \(0, 2\)",
+        ),
+        (
+            {"inputs": torch.full((10, 3), torch.nan)},
+            DataError,
+            "inputs must be finite; got nan",
+        ),
+        (
+            {"targets": torch.rand(10, 2).float()},
+            SettingError,
+            "targets: must be float64",
+        ),
+        (
+            {"offset": torch.zeros(3)},
+            ShapeError,
+            r"offset must have shape \(2,\); got \(3,\)",
+        ),
+        (
+            {"input_dim": 3, "predicts": "value"},
+            ShapeError,
+            "3 controls; got 3 columns and 2 outputs",
+        ),
     ],
 )
-def test_data_that_cannot_be_learned_from_are_refused_with_the_rule(change, error, message):
+def test_data_that_cannot_be_learned_from_are_refused_with_the_rule(
+    change, error, message
+):
     test_misuse_is_refused_with_the_rule(change, error, message)
 
 
@@ -106,7 +158,9 @@ def test_data_that_cannot_be_learned_from_are_refused_with_the_rule(change, erro
 def test_the_jacobian_of_the_mean_is_that_of_autograd(predicts):
     gp, state, control = posterior(predicts=predicts), torch.rand(2), torch.rand(1)
     belief, by_state, by_input = gp.predict_with_jacobian(state, control)
-    reference = torch.func.jacrev(lambda x, u: gp.predict(x, u).mean, argnums=(0, 1))(state, control)
+    reference = torch.func.jacrev(lambda x, u: gp.predict(x, u).mean, argnums=(0, 1))(
+        state, control
+    )
     assert torch.allclose(belief.mean, gp.predict(state, control).mean, atol=1e-13)
     assert torch.allclose(by_state, reference[0], atol=1e-12)
     assert torch.allclose(by_input, reference[1], atol=1e-12)
@@ -118,13 +172,22 @@ def test_a_posterior_of_scaled_data_speaks_physical_units_after_unscaling():
     targets = Scaling(torch.tensor([5.0, -7.0]), torch.tensor([100.0, 0.01]))
     physical, scaled = gp.unscaled(features, targets), torch.rand(6, 3)
     query = features.restore(scaled)
-    ours, theirs = physical.predict(query[:, :2], query[:, 2:]), gp.predict(scaled[:, :2], scaled[:, 2:])
+    ours, theirs = (
+        physical.predict(query[:, :2], query[:, 2:]),
+        gp.predict(scaled[:, :2], scaled[:, 2:]),
+    )
     assert torch.allclose(ours.mean, targets.restore(theirs.mean), rtol=1e-12)
-    assert torch.allclose(ours.variance, theirs.variance * targets.factor**2, rtol=1e-10)
+    assert torch.allclose(
+        ours.variance, theirs.variance * targets.factor**2, rtol=1e-10
+    )
     names = ("lengthscales", "signal_variance", "noise_variance")
     hyperparameters = {name: getattr(physical, name) for name in names}
     fresh = GPPosterior.from_hyperparameters(
-        physical.features, physical.targets, **hyperparameters, input_dim=1, offset=physical.offset
+        physical.features,
+        physical.targets,
+        **hyperparameters,
+        input_dim=1,
+        offset=physical.offset,
     )
     assert torch.allclose(physical.cholesky, fresh.cholesky, rtol=1e-9, atol=1e-9)
     assert torch.allclose(physical.weights, fresh.weights, rtol=1e-8, atol=1e-10)
@@ -134,23 +197,41 @@ def test_a_posterior_of_scaled_data_speaks_physical_units_after_unscaling():
 def test_a_value_model_may_have_any_number_of_outputs():
     inputs, targets = torch.rand(12, 4), torch.rand(12, 1)
     settings = (torch.ones(1, 4), torch.ones(1), torch.full((1,), 1e-4))
-    gp = GPPosterior.from_hyperparameters(inputs, targets, *settings, input_dim=1, predicts="value")
+    gp = GPPosterior.from_hyperparameters(
+        inputs, targets, *settings, input_dim=1, predicts="value"
+    )
     belief, by_state, by_input = gp.predict_with_jacobian(inputs[:, :3], inputs[:, 3:])
-    assert (gp.state_dim, gp.output_dim, by_state.shape, by_input.shape) == (3, 1, (12, 1, 3), (12, 1, 1))
+    assert (gp.state_dim, gp.output_dim, by_state.shape, by_input.shape) == (
+        3,
+        1,
+        (12, 1, 3),
+        (12, 1, 1),
+    )
     assert torch.allclose(belief.mean, targets, atol=0.05)
 
 
 def test_a_posterior_in_single_precision_predicts_nearly_the_same():
     gp, state, control = posterior(), torch.rand(4, 2), torch.rand(4, 1)
     single = gp.to(dtype=torch.float32)
-    assert (single.dtype, single.precision.dtype, gp.dtype) == (torch.float32, torch.float32, torch.float64)
-    assert torch.allclose(
-        single.predict(state.float(), control.float()).mean.double(), gp.predict(state, control).mean, atol=1e-3
+    assert (single.dtype, single.precision.dtype, gp.dtype) == (
+        torch.float32,
+        torch.float32,
+        torch.float64,
     )
-    with pytest.raises(SettingError, match="state: must be torch.float32 on cpu like the model; got torch.float64"):
+    assert torch.allclose(
+        single.predict(state.float(), control.float()).mean.double(),
+        gp.predict(state, control).mean,
+        atol=1e-3,
+    )
+    with pytest.raises(
+        SettingError,
+        match="state: must be torch.float32 on cpu like the model; got torch.float64",
+    ):
         single.predict(state, control)
 
 
 def test_a_query_of_other_dimensions_is_refused():
-    with pytest.raises(ShapeError, match=r"an input \(\*batch, 1\); got \(2,\) and \(0,\)"):
+    with pytest.raises(
+        ShapeError, match=r"an input \(\*batch, 1\); got \(2,\) and \(0,\)"
+    ):
         posterior().predict(torch.zeros(2))

@@ -7,13 +7,17 @@ from gpmpc.exceptions import SettingError, ShapeError
 from gpmpc.gp import Scaling, identity, min_max, standardize
 
 NAMES = ["a", "b", "c"]
-COLUMNS = torch.stack([torch.linspace(-3, 5, 20), torch.full((20,), 7.0), 1e-6 * torch.randn(20)], dim=1)
+COLUMNS = torch.stack(
+    [torch.linspace(-3, 5, 20), torch.full((20,), 7.0), 1e-6 * torch.randn(20)], dim=1
+)
 
 
 @pytest.mark.parametrize("make", [identity, standardize, min_max])
 def test_restoring_undoes_scaling(make):
     scaling = make(COLUMNS, NAMES)
-    assert torch.allclose(scaling.restore(scaling.scale(COLUMNS)), COLUMNS, rtol=1e-14, atol=1e-20)
+    assert torch.allclose(
+        scaling.restore(scaling.scale(COLUMNS)), COLUMNS, rtol=1e-14, atol=1e-20
+    )
 
 
 def test_standardized_columns_have_mean_zero_and_deviation_one():
@@ -28,14 +32,19 @@ def test_min_max_fills_the_interval_and_a_constant_column_goes_to_its_middle():
     assert torch.allclose(scaled.amax(0), torch.tensor([0.9, 0.5, 0.9]))
 
 
-def test_a_column_that_moves_less_than_the_resolution_counts_as_constant_and_is_noted(caplog):
+def test_a_column_that_moves_less_than_the_resolution_counts_as_constant_and_is_noted(
+    caplog,
+):
     with caplog.at_level(logging.INFO, "gpmpc"):
         scaled = min_max(COLUMNS, NAMES, resolution=1e-4).scale(COLUMNS)
     assert torch.allclose(scaled[:, 2], torch.full((20,), 0.5), atol=1e-5)
     assert float(scaled[:, 2].max() - scaled[:, 2].min()) == pytest.approx(
         float(COLUMNS[:, 2].max() - COLUMNS[:, 2].min())
     )
-    assert "constant columns are centred, not scaled: b (moves by 0e+00), c (moves by" in caplog.text
+    assert (
+        "constant columns are centred, not scaled: b (moves by 0e+00), c (moves by"
+        in caplog.text
+    )
 
 
 def test_misuse_is_refused_with_the_rule():

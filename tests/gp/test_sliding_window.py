@@ -4,15 +4,26 @@ import pytest
 import torch
 
 from gpmpc.exceptions import SettingError, ShapeError, UnsupportedModel
-from gpmpc.gp import GPPosterior, SlidingWindow, Transitions, append_transitions, remove_points
+from gpmpc.gp import (
+    GPPosterior,
+    SlidingWindow,
+    Transitions,
+    append_transitions,
+    remove_points,
+)
 from gpmpc.gp._online import _divergence, _noise_variances, least_informative
 from tests.gp.small_models import residual_model
 
 
 def transitions(rows, seed=0):
     generator = torch.Generator().manual_seed(seed)
-    x, u = 4 * torch.rand(rows, 2, generator=generator) - 2, torch.rand(rows, 1, generator=generator)
-    moved = torch.stack([torch.sin(2 * x[:, 0]) + u[:, 0], 100 * torch.cos(x[:, 1])], dim=1)
+    x, u = (
+        4 * torch.rand(rows, 2, generator=generator) - 2,
+        torch.rand(rows, 1, generator=generator),
+    )
+    moved = torch.stack(
+        [torch.sin(2 * x[:, 0]) + u[:, 0], 100 * torch.cos(x[:, 1])], dim=1
+    )
     return Transitions(x, u, moved)
 
 
@@ -39,19 +50,32 @@ def divergence_over_functions(one, other, points):
             difference = (points[:, None] - points) / gp.lengthscales[a]
             prior = gp.signal_variance[a] * torch.exp(-difference.square().sum(-1) / 2)
             half = torch.linalg.solve_triangular(gp.cholesky[a], across, upper=False)
-            covariance = prior - half.mT @ half + 1e-12 * gp.signal_variance[a] * torch.eye(len(points))
-            belief.append(torch.distributions.MultivariateNormal(across.mT @ gp.weights[a], covariance))
+            covariance = (
+                prior
+                - half.mT @ half
+                + 1e-12 * gp.signal_variance[a] * torch.eye(len(points))
+            )
+            belief.append(
+                torch.distributions.MultivariateNormal(
+                    across.mT @ gp.weights[a], covariance
+                )
+            )
         total += float(torch.distributions.kl_divergence(*belief))
     return total
 
 
 def information(gp):
-    return _divergence(gp.precision.diagonal(dim1=-2, dim2=-1), gp.weights, _noise_variances(gp))
+    return _divergence(
+        gp.precision.diagonal(dim1=-2, dim2=-1), gp.weights, _noise_variances(gp)
+    )
 
 
 def test_the_information_of_a_point_is_the_divergence_of_the_posteriors_with_and_without_it():
     gp = posterior(transitions(6))
-    expected = [divergence_over_functions(gp, remove_points(gp, i), gp.features) for i in range(6)]
+    expected = [
+        divergence_over_functions(gp, remove_points(gp, i), gp.features)
+        for i in range(6)
+    ]
     assert information(gp).tolist() == pytest.approx(expected, rel=1e-5)
 
 
@@ -73,7 +97,11 @@ def test_of_two_equal_points_one_is_the_first_to_go():
 
 @pytest.mark.parametrize("rule", ["oldest", "least_informative"])
 def test_a_window_is_held_and_what_just_came_stays(rule):
-    data, gp, window = transitions(60), posterior(transitions(60)[:20]), SlidingWindow(30, rule)
+    data, gp, window = (
+        transitions(60),
+        posterior(transitions(60)[:20]),
+        SlidingWindow(30, rule),
+    )
     for first in range(20, 60, 4):
         new = data[first : first + 4]
         gp = window(gp, new)
@@ -85,7 +113,9 @@ def test_a_window_is_held_and_what_just_came_stays(rule):
 
 def test_the_oldest_points_go_first():
     data = transitions(30)
-    assert torch.equal(SlidingWindow(12)(posterior(data[:10]), data[10:]).features, data.features[18:])
+    assert torch.equal(
+        SlidingWindow(12)(posterior(data[:10]), data[10:]).features, data.features[18:]
+    )
 
 
 def test_least_informative_points_are_a_better_loss_than_the_oldest():
@@ -111,18 +141,29 @@ def test_a_batch_larger_than_the_window_is_cut_and_the_log_says_so(rule, caplog)
 
 
 def test_misuse_is_refused_with_the_rule():
-    with pytest.raises(SettingError, match="points: must be a whole number, 1 or more; got 0"):
+    with pytest.raises(
+        SettingError, match="points: must be a whole number, 1 or more; got 0"
+    ):
         SlidingWindow(0)
-    with pytest.raises(SettingError, match="'oldest', 'least_informative'; got 'random'"):
+    with pytest.raises(
+        SettingError, match="'oldest', 'least_informative'; got 'random'"
+    ):
         SlidingWindow(5, "random")
-    with pytest.raises(ShapeError, match="2 states and 1 inputs; got transitions with 1 and 1"):
+    with pytest.raises(
+        ShapeError, match="2 states and 1 inputs; got transitions with 1 and 1"
+    ):
         SlidingWindow(5)(
-            posterior(transitions(3)), Transitions(torch.zeros(1, 1), torch.zeros(1, 1), torch.zeros(1, 1))
+            posterior(transitions(3)),
+            Transitions(torch.zeros(1, 1), torch.zeros(1, 1), torch.zeros(1, 1)),
         )
 
 
 def test_a_window_of_another_model_says_what_takes_one():
-    with pytest.raises(UnsupportedModel, match="ResidualModel.append takes one.; got ResidualModel"):
+    with pytest.raises(
+        UnsupportedModel, match="ResidualModel.append takes one.; got ResidualModel"
+    ):
         SlidingWindow(3)(residual_model(), transitions(2))
-    with pytest.raises(SettingError, match=r"transitions: must be Transitions\(...\); got Tensor"):
+    with pytest.raises(
+        SettingError, match=r"transitions: must be Transitions\(...\); got Tensor"
+    ):
         SlidingWindow(3)(posterior(transitions(5)), torch.zeros(2, 3))

@@ -13,7 +13,15 @@ import torch
 
 from gpmpc._dynamics import predict_with_jacobian
 from gpmpc.exceptions import DataError, SettingError, UnsupportedModel
-from gpmpc.gp import GPPosterior, Trainer, Transitions, _storage, load_metadata, load_posterior, save_posterior
+from gpmpc.gp import (
+    GPPosterior,
+    Trainer,
+    Transitions,
+    _storage,
+    load_metadata,
+    load_posterior,
+    save_posterior,
+)
 from gpmpc.models import ResidualModel, save_model
 from tests.gp.small_models import LOAD, SAVE, as_before, posterior, residual_model
 
@@ -21,14 +29,25 @@ from tests.gp.small_models import LOAD, SAVE, as_before, posterior, residual_mod
 def trained():
     states = torch.linspace(-2, 2, 20)[:, None] + 0.1 * torch.randn(20, 2)
     inputs = torch.randn(20, 1)
-    return Trainer(restarts=0)(Transitions(states, inputs, states.sin() + 0.1 * inputs)).posterior
+    return Trainer(restarts=0)(
+        Transitions(states, inputs, states.sin() + 0.1 * inputs)
+    ).posterior
 
 
 def assert_same(loaded, saved):
-    x, u = torch.randn(50, saved.state_dim, dtype=saved.dtype), torch.randn(50, saved.input_dim, dtype=saved.dtype)
+    x, u = (
+        torch.randn(50, saved.state_dim, dtype=saved.dtype),
+        torch.randn(50, saved.input_dim, dtype=saved.dtype),
+    )
     for state, control in ((x, u), (x[0], u[0])):
-        (ours, *ours_by), (theirs, *theirs_by) = (predict_with_jacobian(m, state, control) for m in (loaded, saved))
-        pairs = [(ours.mean, theirs.mean), (ours.covariance, theirs.covariance), *zip(ours_by, theirs_by, strict=True)]
+        (ours, *ours_by), (theirs, *theirs_by) = (
+            predict_with_jacobian(m, state, control) for m in (loaded, saved)
+        )
+        pairs = [
+            (ours.mean, theirs.mean),
+            (ours.covariance, theirs.covariance),
+            *zip(ours_by, theirs_by, strict=True),
+        ]
         assert all(torch.equal(a, b) for a, b in pairs)
 
 
@@ -45,7 +64,17 @@ def assert_same(loaded, saved):
         lambda: posterior().to(dtype=torch.float32),
         lambda: residual_model().to(dtype=torch.float32),
     ],
-    ids=["next_state", "trained", "residual", "difference", "m=0", "one point", "large", "float32", "residual32"],
+    ids=[
+        "next_state",
+        "trained",
+        "residual",
+        "difference",
+        "m=0",
+        "one point",
+        "large",
+        "float32",
+        "residual32",
+    ],
 )
 def test_what_is_loaded_predicts_what_was_saved_bit_by_bit(make, tmp_path):
     model, path = make(), tmp_path / "model.safetensors"
@@ -60,7 +89,12 @@ def test_what_is_loaded_predicts_what_was_saved_bit_by_bit(make, tmp_path):
 def test_a_posterior_of_a_slice_of_somebodys_array_comes_back_the_same(tmp_path):
     table = torch.rand(40, 9)
     gp = GPPosterior.from_hyperparameters(
-        table[::2, 1:4], table.T[5:7, ::2].T, torch.ones(3, 2).T, torch.ones(2), torch.full((2,), 1e-2), 1
+        table[::2, 1:4],
+        table.T[5:7, ::2].T,
+        torch.ones(3, 2).T,
+        torch.ones(2),
+        torch.full((2,), 1e-2),
+        1,
     )
     save_posterior(gp, tmp_path / "gp.safetensors")
     assert_same(load_posterior(tmp_path / "gp.safetensors"), gp)
@@ -68,9 +102,14 @@ def test_a_posterior_of_a_slice_of_somebodys_array_comes_back_the_same(tmp_path)
 
 def test_a_factor_that_no_hyperparameters_give_is_kept(tmp_path):
     gp = posterior()
-    gp = GPPosterior(**{f.name: getattr(gp, f.name) for f in fields(gp)} | {"cholesky": 1.5 * gp.cholesky})
+    gp = GPPosterior(
+        **{f.name: getattr(gp, f.name) for f in fields(gp)}
+        | {"cholesky": 1.5 * gp.cholesky}
+    )
     save_posterior(gp, tmp_path / "gp.safetensors")
-    assert torch.equal(load_posterior(tmp_path / "gp.safetensors").cholesky, gp.cholesky.tril())
+    assert torch.equal(
+        load_posterior(tmp_path / "gp.safetensors").cholesky, gp.cholesky.tril()
+    )
 
 
 def test_the_file_is_plain_arrays_and_a_readable_header(tmp_path):
@@ -79,8 +118,16 @@ def test_the_file_is_plain_arrays_and_a_readable_header(tmp_path):
     with safetensors.safe_open(path, framework="numpy") as file:
         assert np.array_equal(file.get_tensor("features"), gp.features.numpy())
     header = load_metadata(path)
-    said = {"format": "gpmpc model", "format_version": 2, "kind": "GPPosterior", "kernel": "SE-ARD"}
-    assert header.items() >= (said | {"predicts": "difference", "input_dim": 1, "points": 12}).items()
+    said = {
+        "format": "gpmpc model",
+        "format_version": 2,
+        "kind": "GPPosterior",
+        "kernel": "SE-ARD",
+    }
+    assert (
+        header.items()
+        >= (said | {"predicts": "difference", "input_dim": 1, "points": 12}).items()
+    )
     assert header["metadata"] == {"states": ["x", "y"], "units": ["m", "m"]}
     assert set(header["versions"]) == {"gpmpc", "torch", "gpytorch", "numpy"}
     assert header["versions"]["numpy"] == np.__version__
@@ -89,7 +136,9 @@ def test_the_file_is_plain_arrays_and_a_readable_header(tmp_path):
         save_posterior(gp, path, {"states": gp})
 
 
-@pytest.mark.parametrize("make", [posterior, residual_model], ids=["posterior", "residual"])
+@pytest.mark.parametrize(
+    "make", [posterior, residual_model], ids=["posterior", "residual"]
+)
 def test_a_file_of_the_first_format_is_read(make, tmp_path):
     as_before(make(), tmp_path / "old.npz")
     assert_same(LOAD[type(make())](tmp_path / "old.npz"), make())
@@ -105,12 +154,20 @@ def test_another_process_predicts_the_same_bits(tmp_path):
         "print([v.hex() for v in (*b.mean.tolist(), *b.variance.tolist())])"
     )
     command = [sys.executable, "-c", code, str(tmp_path / "gp.safetensors")]
-    said = subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
-    here = gp.predict(torch.full((3,), 0.3).float().double(), torch.full((1,), 0.1).float().double())
-    assert said == str([v.hex() for v in (*here.mean.tolist(), *here.variance.tolist())])
+    said = subprocess.run(
+        command, capture_output=True, text=True, check=True
+    ).stdout.strip()
+    here = gp.predict(
+        torch.full((3,), 0.3).float().double(), torch.full((1,), 0.1).float().double()
+    )
+    assert said == str(
+        [v.hex() for v in (*here.mean.tolist(), *here.variance.tolist())]
+    )
 
 
-@pytest.mark.parametrize("make", [posterior, residual_model], ids=["posterior", "residual"])
+@pytest.mark.parametrize(
+    "make", [posterior, residual_model], ids=["posterior", "residual"]
+)
 def test_a_file_cut_anywhere_is_refused(make, tmp_path):
     model, path = make(), tmp_path / "model.safetensors"
     SAVE[type(model)](model, path)
@@ -146,8 +203,13 @@ def test_a_flipped_bit_in_the_data_is_refused(tmp_path):
     for name in ("features", "targets", "lengthscales", "noise_variance", "weights"):
         content = getattr(gp, name).contiguous().numpy().tobytes()
         position = whole.index(content) + len(content) // 2
-        path.write_bytes(whole[:position] + bytes([whole[position] ^ 1]) + whole[position + 1 :])
-        with pytest.raises(DataError, match=r"gp\.safetensors: damaged; expected a saved GPPosterior \(the checksum"):
+        path.write_bytes(
+            whole[:position] + bytes([whole[position] ^ 1]) + whole[position + 1 :]
+        )
+        with pytest.raises(
+            DataError,
+            match=r"gp\.safetensors: damaged; expected a saved GPPosterior \(the checksum",
+        ):
             load_posterior(path)
 
 
@@ -155,7 +217,9 @@ def rewritten(path, header=None, **arrays):
     """The file with other header entries and arrays (None drops one), and a valid checksum."""
     said, parts = _storage._content(path, "model")
     said = said | (header or {})
-    parts = {name: value for name, value in (parts | arrays).items() if value is not None}
+    parts = {
+        name: value for name, value in (parts | arrays).items() if value is not None
+    }
     said["checksum"] = _storage._checksum(said, parts)
     safetensors.numpy.save_file(parts, path, {"gpmpc": json.dumps(said)})
 
@@ -163,23 +227,46 @@ def rewritten(path, header=None, **arrays):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"header": {"format_version": 3}}, "written in format 3 .*reads up to 2: update gpmpc"),
+        (
+            {"header": {"format_version": 3}},
+            "written in format 3 .*reads up to 2: update gpmpc",
+        ),
         ({"header": {"format_version": "x"}}, "written in format 'x' .*reads up to 2"),
-        ({"header": {"format": "other"}}, "a file of something else; expected a saved GPPosterior"),
+        (
+            {"header": {"format": "other"}},
+            "a file of something else; expected a saved GPPosterior",
+        ),
         ({"header": {"kernel": "Matern"}}, "holds a Matern; expected a SE-ARD"),
-        ({"header": {"predicts": "tomorrow"}}, "not a consistent posterior .*got 'tomorrow'"),
+        (
+            {"header": {"predicts": "tomorrow"}},
+            "not a consistent posterior .*got 'tomorrow'",
+        ),
         ({"header": {"input_dim": 2}}, "2 controls; got 3 columns and 2 outputs"),
         ({"header": {"input_dim": None}}, "input_dim: must be a whole number"),
         ({"header": {"memory_order": {}}}, "damaged; expected a saved GPPosterior"),
-        ({"weights": None}, r"not a consistent posterior of features, targets.* \('weights'\)"),
-        ({"weights": np.ones((2, 3))}, r"weights must have shape \(2, 12\); got \(2, 3\)"),
-        ({"offset": np.ones(2, dtype=np.float32)}, "offset: must be float64 .*got torch.float32"),
+        (
+            {"weights": None},
+            r"not a consistent posterior of features, targets.* \('weights'\)",
+        ),
+        (
+            {"weights": np.ones((2, 3))},
+            r"weights must have shape \(2, 12\); got \(2, 3\)",
+        ),
+        (
+            {"offset": np.ones(2, dtype=np.float32)},
+            "offset: must be float64 .*got torch.float32",
+        ),
         ({"targets": np.full((12, 2), np.nan)}, "targets must be finite; got nan"),
         ({"noise_variance": np.array([1.0, -1.0])}, "noise_variance: must be positive"),
-        ({"offset": np.ones(2, dtype=np.int64)}, "offset must be of type float64 or float32; got int64"),
+        (
+            {"offset": np.ones(2, dtype=np.int64)},
+            "offset must be of type float64 or float32; got int64",
+        ),
     ],
 )
-def test_a_file_of_other_content_is_refused_with_what_was_expected(change, message, tmp_path):
+def test_a_file_of_other_content_is_refused_with_what_was_expected(
+    change, message, tmp_path
+):
     path = tmp_path / "gp.safetensors"
     save_posterior(posterior(), path)
     rewritten(path, **change)
@@ -189,17 +276,26 @@ def test_a_file_of_other_content_is_refused_with_what_was_expected(change, messa
 
 def test_foreign_and_missing_files_are_named(tmp_path):
     path = tmp_path / "other.npz"
-    with pytest.raises(DataError, match=r"other\.npz: no such file; expected a saved GPPosterior"):
+    with pytest.raises(
+        DataError, match=r"other\.npz: no such file; expected a saved GPPosterior"
+    ):
         load_posterior(path)
     Transitions(torch.ones(1, 1), torch.ones(1, 1), torch.ones(1, 1)).save(path)
-    with pytest.raises(DataError, match=r"other\.npz: a file of something else; expected a saved GPPosterior"):
+    with pytest.raises(
+        DataError,
+        match=r"other\.npz: a file of something else; expected a saved GPPosterior",
+    ):
         load_posterior(path)
     for content in (b"", b"state,input\n1,2\n", bytes(1000)):
         path.write_bytes(content)
-        with pytest.raises(DataError, match=r"other\.npz: damaged, or not a file of this package"):
+        with pytest.raises(
+            DataError, match=r"other\.npz: damaged, or not a file of this package"
+        ):
             load_posterior(path)
     save_model(residual_model(), path)
-    with pytest.raises(DataError, match=r"holds a ResidualModel; expected a GPPosterior"):
+    with pytest.raises(
+        DataError, match=r"holds a ResidualModel; expected a GPPosterior"
+    ):
         load_posterior(path)
     with pytest.raises(DataError, match="the folder .* does not exist"):
         save_posterior(posterior(), tmp_path / "nowhere" / "gp.safetensors")
@@ -207,21 +303,44 @@ def test_foreign_and_missing_files_are_named(tmp_path):
 
 def test_what_cannot_be_saved_says_what_to_do(tmp_path):
     model = residual_model()
-    model = ResidualModel(lambda x, u: x, model.residual, model.B, model.states, model.inputs, model.input_dim)
-    with pytest.raises(UnsupportedModel, match="nominal is code that a file cannot name: <function"):
+    model = ResidualModel(
+        lambda x, u: x,
+        model.residual,
+        model.B,
+        model.states,
+        model.inputs,
+        model.input_dim,
+    )
+    with pytest.raises(
+        UnsupportedModel, match="nominal is code that a file cannot name: <function"
+    ):
         save_model(model, tmp_path / "model")
     gp = posterior()
     parts = {f.name: getattr(gp, f.name) for f in fields(gp)}
-    short = {name: value.to(torch.bfloat16) for name, value in parts.items() if isinstance(value, torch.Tensor)}
-    with pytest.raises(SettingError, match="features: must be one of float64, float32 to be saved; got torch.bfloat16"):
+    short = {
+        name: value.to(torch.bfloat16)
+        for name, value in parts.items()
+        if isinstance(value, torch.Tensor)
+    }
+    with pytest.raises(
+        SettingError,
+        match="features: must be one of float64, float32 to be saved; got torch.bfloat16",
+    ):
         save_posterior(GPPosterior(**parts | short), tmp_path / "gp.safetensors")
-    with pytest.raises(DataError, match=r"gp\.safetensors: .*weights must be finite; got nan"):
-        save_posterior(GPPosterior(**parts | {"weights": gp.weights * torch.nan}), tmp_path / "gp.safetensors")
+    with pytest.raises(
+        DataError, match=r"gp\.safetensors: .*weights must be finite; got nan"
+    ):
+        save_posterior(
+            GPPosterior(**parts | {"weights": gp.weights * torch.nan}),
+            tmp_path / "gp.safetensors",
+        )
 
     class Derived(GPPosterior):
         pass
 
-    with pytest.raises(UnsupportedModel, match="only a GPPosterior can be saved; got Derived"):
+    with pytest.raises(
+        UnsupportedModel, match="only a GPPosterior can be saved; got Derived"
+    ):
         save_posterior(Derived(**parts), tmp_path / "gp.safetensors")
     assert not list(tmp_path.iterdir())
 

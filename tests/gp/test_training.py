@@ -8,7 +8,13 @@ import pytest
 import torch
 from scipy.optimize import approx_fprime
 
-from gpmpc.exceptions import DataError, SettingError, ShapeError, TrainingError, UnsupportedModel
+from gpmpc.exceptions import (
+    DataError,
+    SettingError,
+    ShapeError,
+    TrainingError,
+    UnsupportedModel,
+)
 from gpmpc.gp import (
     GPPosterior,
     SoftLimits,
@@ -28,8 +34,15 @@ from gpmpc.gp._search import column_std
 def pendulum(rows=60, noise=1e-3, seed=0):
     rng = np.random.default_rng(seed)
     x, u = rng.uniform(-2, 2, (rows, 2)), rng.uniform(-1, 1, (rows, 1))
-    moved = np.column_stack([x[:, 0] + 0.1 * x[:, 1], x[:, 1] - np.sin(x[:, 0]) + u[:, 0]])
-    return Transitions(*(torch.from_numpy(a) for a in (x, u, moved + noise * rng.normal(size=moved.shape))))
+    moved = np.column_stack(
+        [x[:, 0] + 0.1 * x[:, 1], x[:, 1] - np.sin(x[:, 0]) + u[:, 0]]
+    )
+    return Transitions(
+        *(
+            torch.from_numpy(a)
+            for a in (x, u, moved + noise * rng.normal(size=moved.shape))
+        )
+    )
 
 
 def test_training_finds_the_noise_and_predicts_held_out_rows():
@@ -62,26 +75,42 @@ def test_the_same_seed_gives_the_same_numbers_and_more_starts_never_a_worse_opti
 def test_the_gpytorch_model_of_a_training_predicts_the_same():
     training, states, inputs = train(pendulum(30)), torch.rand(4, 2), torch.rand(4, 1)
     with torch.no_grad():
-        theirs = to_gpytorch(training.posterior)(torch.cat([states, inputs], dim=1).expand(2, -1, -1))
-    assert torch.allclose(training.posterior.predict(states, inputs).mean, theirs.mean.T, atol=1e-8)
+        theirs = to_gpytorch(training.posterior)(
+            torch.cat([states, inputs], dim=1).expand(2, -1, -1)
+        )
+    assert torch.allclose(
+        training.posterior.predict(states, inputs).mean, theirs.mean.T, atol=1e-8
+    )
 
 
 def test_the_penalty_keeps_signal_to_noise_and_lengthscales_within_its_limits():
     data = pendulum(40, noise=0.0)
-    free, limited = train(data).theta, train(data, penalty=SoftLimits(signal_to_noise=50.0)).theta
+    free, limited = (
+        train(data).theta,
+        train(data, penalty=SoftLimits(signal_to_noise=50.0)).theta,
+    )
     assert (free[:, -1] > np.log(200)).all()
     assert (limited[:, -1] < 1.2 * np.log(50)).all()
     near = train(data, penalty=SoftLimits(lengthscale_factor=2.0)).theta
-    assert (np.abs(near[:, :-2] - np.log(column_std(data.features.numpy()))) < 1.3 * np.log(2)).all()
+    assert (
+        np.abs(near[:, :-2] - np.log(column_std(data.features.numpy())))
+        < 1.3 * np.log(2)
+    ).all()
 
 
 def test_the_penalty_is_the_papers_and_its_gradient_is_right():
     theta, log_spread = np.array([1.0, -2.0, 0.5, 7.0]), np.array([0.3, 0.1])
     value, gradient = SoftLimits()(theta, log_spread)
-    expected = sum(((theta[:2] - log_spread) / np.log(100)) ** 30) + (theta[3] / np.log(1000)) ** 30
+    expected = (
+        sum(((theta[:2] - log_spread) / np.log(100)) ** 30)
+        + (theta[3] / np.log(1000)) ** 30
+    )
     assert value == pytest.approx(expected)
     assert np.allclose(
-        gradient, approx_fprime(theta, lambda t: SoftLimits()(t, log_spread)[0], 1e-7), rtol=1e-4, atol=1e-5
+        gradient,
+        approx_fprime(theta, lambda t: SoftLimits()(t, log_spread)[0], 1e-7),
+        rtol=1e-4,
+        atol=1e-5,
     )
 
 
@@ -94,25 +123,39 @@ def test_a_constant_input_has_no_influence_and_a_constant_target_is_predicted():
     gp = train(Transitions(states, data.inputs, moved), penalty=SoftLimits()).posterior
     near, far = torch.tensor([[0.3, 0.5]]), torch.tensor([[0.3, 2.0]])
     control = torch.tensor([[0.1]])
-    assert torch.allclose(gp.predict(near, control).mean, gp.predict(far, control).mean, atol=1e-9)
+    assert torch.allclose(
+        gp.predict(near, control).mean, gp.predict(far, control).mean, atol=1e-9
+    )
     assert float(gp.predict(far, control).mean[0, 1]) == pytest.approx(0.5, abs=1e-3)
 
 
 def test_the_spread_of_a_constant_column_is_its_magnitude_or_one():
-    columns = np.column_stack([[1.0, 2.0, 3.0], [-4.0] * 3, [0.0] * 3, [0.5, 0.5 + 1e-12, 0.5]])
+    columns = np.column_stack(
+        [[1.0, 2.0, 3.0], [-4.0] * 3, [0.0] * 3, [0.5, 0.5 + 1e-12, 0.5]]
+    )
     assert np.allclose(column_std(columns), [1, 4, 1, 0.5])
     assert np.allclose(column_std(np.array([[2.0, 0.0]])), [2, 1])
-    assert np.allclose(column_std(np.array([[1e9, 1.0], [3e9, 1.002]])), np.sqrt(2) * np.array([1e9, 1e-3]))
     assert np.allclose(
-        column_std(np.array([[1e9, 1.0, 1.0], [1e9 + 1e-2, 1.0, 1.0 + 1e-5]])), [1e9, 1, 1e-5 / np.sqrt(2)]
+        column_std(np.array([[1e9, 1.0], [3e9, 1.002]])),
+        np.sqrt(2) * np.array([1e9, 1e-3]),
+    )
+    assert np.allclose(
+        column_std(np.array([[1e9, 1.0, 1.0], [1e9 + 1e-2, 1.0, 1.0 + 1e-5]])),
+        [1e9, 1, 1e-5 / np.sqrt(2)],
     )
 
 
 def test_the_prior_mean_is_what_the_scaling_maps_to_zero():
     data = pendulum(12)
     means = data.next_states.mean(0)
-    for scaling, mean in ((None, means), (standardize, means), (identity, torch.zeros(2))):
-        gp = train(data, restarts=0, **({} if scaling is None else {"scaling": scaling})).posterior
+    for scaling, mean in (
+        (None, means),
+        (standardize, means),
+        (identity, torch.zeros(2)),
+    ):
+        gp = train(
+            data, restarts=0, **({} if scaling is None else {"scaling": scaling})
+        ).posterior
         assert torch.allclose(gp.offset, mean, atol=1e-14)
         far = gp.predict(torch.full((2,), 1e6), torch.full((1,), 1e6)).mean
         assert torch.allclose(far, mean, atol=1e-14)
@@ -137,7 +180,9 @@ def test_a_search_that_begins_with_a_subset_ends_at_the_same_optimum():
     everywhere, first_a_part = train(data, subset=None), train(data, subset=100)
     assert np.allclose(first_a_part.objective, everywhere.objective, rtol=1e-6)
     assert np.allclose(first_a_part.theta, everywhere.theta, atol=0.02)
-    assert (first_a_part.explored > everywhere.explored + 100).all()  # of fewer points: less evidence
+    assert (
+        first_a_part.explored > everywhere.explored + 100
+    ).all()  # of fewer points: less evidence
 
 
 def test_a_start_that_is_known_is_searched_from_over_all_points():
@@ -150,18 +195,25 @@ def test_a_start_that_is_known_is_searched_from_over_all_points():
 
 def test_a_subset_is_searched_first_where_there_are_more_points_and_other_starts_than_a_known_one():
     data = pendulum(40, noise=1e-2)
-    whole, same, fewer = (Trainer(restarts=0, subset=subset)(data) for subset in (None, 40, 39))
+    whole, same, fewer = (
+        Trainer(restarts=0, subset=subset)(data) for subset in (None, 40, 39)
+    )
     assert np.array_equal(same.theta, whole.theta)
     assert same.evaluations == whole.evaluations
     assert not np.array_equal(fewer.explored, whole.explored)
     start, again = whole.posterior, {}
     for restarts in (0, 1):
-        again[restarts] = [Trainer(restarts=restarts, subset=subset)(data, start=start) for subset in (None, 20)]
+        again[restarts] = [
+            Trainer(restarts=restarts, subset=subset)(data, start=start)
+            for subset in (None, 20)
+        ]
     assert np.array_equal(again[0][0].explored, again[0][1].explored)
     assert not np.array_equal(again[1][0].explored, again[1][1].explored)
 
 
-def test_what_does_not_fit_the_memory_is_refused_with_the_numbers_and_a_way_out(monkeypatch):
+def test_what_does_not_fit_the_memory_is_refused_with_the_numbers_and_a_way_out(
+    monkeypatch,
+):
     monkeypatch.setattr("gpmpc.gp._training.available_memory", lambda: 2 * 2**20)
     with pytest.raises(DataError) as refused:
         train(pendulum(400))
@@ -180,7 +232,10 @@ def test_what_does_not_fit_the_memory_is_refused_with_the_numbers_and_a_way_out(
         ({"subset": 0}, "subset: must be a whole number, 1 or more; got 0"),
         ({"restarts": -1}, "restarts: must be a whole number, 0 or more; got -1"),
         ({"predicts": "delta"}, "'next_state', 'difference', 'value'; got 'delta'"),
-        ({"signal_to_noise_limit": 1.0}, "signal_to_noise_limit: must be a number above 1; got 1.0"),
+        (
+            {"signal_to_noise_limit": 1.0},
+            "signal_to_noise_limit: must be a number above 1; got 1.0",
+        ),
         ({"tolerance": 0.0}, "tolerance: must be a number above 0; got 0.0"),
         ({"time_limit": 0.0}, r"time_limit: must be a number above 0 \[s\]; got 0.0"),
     ],
@@ -206,11 +261,17 @@ def test_limits_that_are_none_are_refused(arguments, message):
 
 def test_values_of_any_kind_are_learned_from_features_and_targets():
     x = torch.linspace(-2, 2, 30)[:, None]
-    for trainer in (Trainer(predicts="value", restarts=0), SparseTrainer(predicts="value", inducing=20, restarts=0)):
+    for trainer in (
+        Trainer(predicts="value", restarts=0),
+        SparseTrainer(predicts="value", inducing=20, restarts=0),
+    ):
         gp = trainer.fit(x, torch.sin(x), 0).posterior
         assert gp.predicts == "value"
         assert torch.allclose(gp.predict(x).mean, torch.sin(x), atol=1e-2)
-        with pytest.raises(UnsupportedModel, match="transitions hold no targets of GPs with predicts='value'"):
+        with pytest.raises(
+            UnsupportedModel,
+            match="transitions hold no targets of GPs with predicts='value'",
+        ):
             trainer(pendulum(5))
 
 
@@ -219,18 +280,58 @@ def two_columns(rows=6):
 
 
 TABLES = [
-    ({"features": [[1.0, 2.0]]}, SettingError, "features: must be a torch tensor; got list"),
-    ({"features": np.ones((6, 2))}, SettingError, "features: must be a torch tensor; got ndarray"),
-    ({"targets": np.ones((6, 1))}, SettingError, "targets: must be a torch tensor; got ndarray"),
-    ({"targets": torch.ones(5, 1)}, ShapeError, r"targets must have shape \(6, 1\); got \(5, 1\)"),
+    (
+        {"features": [[1.0, 2.0]]},
+        SettingError,
+        "features: must be a torch tensor; got list",
+    ),
+    (
+        {"features": np.ones((6, 2))},
+        SettingError,
+        "features: must be a torch tensor; got ndarray",
+    ),
+    (
+        {"targets": np.ones((6, 1))},
+        SettingError,
+        "targets: must be a torch tensor; got ndarray",
+    ),
+    (
+        {"targets": torch.ones(5, 1)},
+        ShapeError,
+        r"targets must have shape \(6, 1\); got \(5, 1\)",
+    ),
     ({"targets": torch.ones(6)}, ShapeError, "need two dimensions, a column and a row"),
-    ({"targets": torch.ones(6, 0)}, ShapeError, "need two dimensions, a column and a row"),
-    ({"features": torch.ones(0, 2), "targets": torch.ones(0, 1)}, ShapeError, "a row; got"),
-    ({"features": torch.full((6, 2), torch.nan)}, DataError, "features must be finite; got nan"),
-    ({"targets": torch.full((6, 1), torch.inf)}, DataError, "targets must be finite; got inf"),
+    (
+        {"targets": torch.ones(6, 0)},
+        ShapeError,
+        "need two dimensions, a column and a row",
+    ),
+    (
+        {"features": torch.ones(0, 2), "targets": torch.ones(0, 1)},
+        ShapeError,
+        "a row; got",
+    ),
+    (
+        {"features": torch.full((6, 2), torch.nan)},
+        DataError,
+        "features must be finite; got nan",
+    ),
+    (
+        {"targets": torch.full((6, 1), torch.inf)},
+        DataError,
+        "targets must be finite; got inf",
+    ),
     ({"features": torch.ones(6, 2).float()}, SettingError, "features: must be float64"),
-    ({"targets": torch.ones(6, 1, dtype=torch.int64)}, SettingError, "targets: must be float64"),
-    ({"features": torch.ones(6, 2, device="meta")}, SettingError, "features: must be in host memory for training"),
+    (
+        {"targets": torch.ones(6, 1, dtype=torch.int64)},
+        SettingError,
+        "targets: must be float64",
+    ),
+    (
+        {"features": torch.ones(6, 2, device="meta")},
+        SettingError,
+        "features: must be in host memory for training",
+    ),
     ({"input_dim": 2}, ShapeError, "2 controls"),
     ({"input_dim": -1}, SettingError, "input_dim: must be a whole number"),
     ({"input_dim": 1.0}, SettingError, "input_dim: must be a whole number"),
@@ -239,39 +340,68 @@ TABLES = [
 ]
 
 
-@pytest.mark.parametrize(("change", "error", "message"), TABLES, ids=lambda value: str(value)[:40])
-@pytest.mark.parametrize("trainer", [Trainer(), SparseTrainer()], ids=["exact", "sparse"])
-def test_tables_that_cannot_be_learned_from_are_refused_with_the_rule(trainer, change, error, message):
+@pytest.mark.parametrize(
+    ("change", "error", "message"), TABLES, ids=lambda value: str(value)[:40]
+)
+@pytest.mark.parametrize(
+    "trainer", [Trainer(), SparseTrainer()], ids=["exact", "sparse"]
+)
+def test_tables_that_cannot_be_learned_from_are_refused_with_the_rule(
+    trainer, change, error, message
+):
     features, targets = two_columns()
-    good = {"features": features, "targets": targets, "input_dim": 1, "predicts": "next_state"}
+    good = {
+        "features": features,
+        "targets": targets,
+        "input_dim": 1,
+        "predicts": "next_state",
+    }
     with pytest.raises(error, match=message):
         trainer.fit(**good | change)
 
 
 def test_tables_of_a_graph_are_learned_apart_from_it():
     features, targets = two_columns()
-    gp = Trainer(restarts=0).fit(features.requires_grad_(), targets, 1, "value").posterior
+    gp = (
+        Trainer(restarts=0)
+        .fit(features.requires_grad_(), targets, 1, "value")
+        .posterior
+    )
     assert not gp.weights.requires_grad
 
 
 def test_a_refit_and_a_start_need_a_posterior_and_transitions_that_fit_it():
     trainer, gp = Trainer(restarts=0), train(pendulum(8), restarts=0).posterior
     other = Transitions(torch.zeros(3, 3), torch.zeros(3, 1), torch.zeros(3, 3))
-    with pytest.raises(ShapeError, match="the model has 2 states and 1 inputs; got transitions with 3 and 1"):
+    with pytest.raises(
+        ShapeError,
+        match="the model has 2 states and 1 inputs; got transitions with 3 and 1",
+    ):
         trainer.refit(gp, other)
-    with pytest.raises(SettingError, match=r"transitions: must be Transitions\(...\); got Tensor"):
+    with pytest.raises(
+        SettingError, match=r"transitions: must be Transitions\(...\); got Tensor"
+    ):
         trainer.refit(gp, other.states)
-    with pytest.raises(UnsupportedModel, match="posterior must be a GPPosterior; got str"):
+    with pytest.raises(
+        UnsupportedModel, match="posterior must be a GPPosterior; got str"
+    ):
         trainer.refit("gp.npz")
-    with pytest.raises(UnsupportedModel, match="start must be a GPPosterior; got Training"):
+    with pytest.raises(
+        UnsupportedModel, match="start must be a GPPosterior; got Training"
+    ):
         trainer(pendulum(8), start=train(pendulum(8), restarts=0))
-    with pytest.raises(ShapeError, match="the posterior to start from must have 4 features and 3 outputs; got 3 and 2"):
+    with pytest.raises(
+        ShapeError,
+        match="the posterior to start from must have 4 features and 3 outputs; got 3 and 2",
+    ):
         trainer(other, start=gp)
     values = GPPosterior(**vars(gp) | {"predicts": "value"})
     with pytest.raises(UnsupportedModel, match="transitions hold no targets"):
         trainer.refit(values, pendulum(8))
     assert trainer.refit(values).posterior.predicts == "value"
-    with pytest.raises(SettingError, match=r"transitions: must be Transitions\(...\); got int"):
+    with pytest.raises(
+        SettingError, match=r"transitions: must be Transitions\(...\); got int"
+    ):
         SparseTrainer()(1)
 
 
@@ -288,7 +418,9 @@ def test_what_takes_long_tells_where_it_is(caplog, monkeypatch):
     assert len(told) == found.evaluations
 
 
-def test_a_time_limit_ends_every_outputs_search_with_the_best_found_so_far(caplog, monkeypatch):
+def test_a_time_limit_ends_every_outputs_search_with_the_best_found_so_far(
+    caplog, monkeypatch
+):
     data, ticks = pendulum(40), count()
     converged = train(data)
     clock = SimpleNamespace(perf_counter=lambda: float(next(ticks)))  # a second a look
@@ -308,26 +440,44 @@ def test_a_time_limit_ends_every_outputs_search_with_the_best_found_so_far(caplo
     assert np.array_equal(ample.theta, converged.theta)
 
 
-@pytest.mark.parametrize(("failing", "late_after", "explored"), [(0, 0, 2), (1, 0, 1), (1, 2, 2)])
-def test_a_time_limit_waits_for_one_start_that_succeeds(monkeypatch, failing, late_after, explored):
+@pytest.mark.parametrize(
+    ("failing", "late_after", "explored"), [(0, 0, 2), (1, 0, 1), (1, 2, 2)]
+)
+def test_a_time_limit_waits_for_one_start_that_succeeds(
+    monkeypatch, failing, late_after, explored
+):
     starts, search = count(), _search.OutputSearch._minimize
 
     def one_fails(self, start, iterations):
         number = next(starts)
-        monkeypatch.setattr(self.__class__, "_is_late", lambda _: number + 1 >= late_after)
-        return (start, 2 * _search.FAILED) if number == failing else search(self, start, iterations)
+        monkeypatch.setattr(
+            self.__class__, "_is_late", lambda _: number + 1 >= late_after
+        )
+        return (
+            (start, 2 * _search.FAILED)
+            if number == failing
+            else search(self, start, iterations)
+        )
 
     monkeypatch.setattr(_search.OutputSearch, "_minimize", one_fails)
     found = train(pendulum(20), time_limit=60.0)
-    assert np.isfinite(found.explored[0]).tolist() == [True] * explored + [False] * (4 - explored)
-    assert (found.explored[0] >= _search.FAILED).tolist() == [k == failing and k < explored for k in range(4)]
+    assert np.isfinite(found.explored[0]).tolist() == [True] * explored + [False] * (
+        4 - explored
+    )
+    assert (found.explored[0] >= _search.FAILED).tolist() == [
+        k == failing and k < explored for k in range(4)
+    ]
 
 
-def test_a_time_limit_leaves_one_start_on_the_subset_and_an_iteration_over_all_points(monkeypatch):
+def test_a_time_limit_leaves_one_start_on_the_subset_and_an_iteration_over_all_points(
+    monkeypatch,
+):
     data, search, sizes = pendulum(60, noise=1e-2), _search.OutputSearch._minimize, []
     converged = train(data, subset=20)
     monkeypatch.setattr(
-        _search.OutputSearch, "_minimize", lambda self, *given: sizes.append(self._size) or search(self, *given)
+        _search.OutputSearch,
+        "_minimize",
+        lambda self, *given: sizes.append(self._size) or search(self, *given),
     )
     found = train(data, subset=20, time_limit=1e-9)
     assert sizes == [20, 60, 20, 60]

@@ -22,13 +22,22 @@ def test_what_is_saved_is_loaded_to_the_bit(transitions, tmp_path):
 
 
 def test_single_precision_is_raised_to_double():
-    assert Transitions(torch.zeros(1, 1).float(), torch.zeros(1, 0), torch.zeros(1, 1)).states.dtype == torch.float64
+    assert (
+        Transitions(
+            torch.zeros(1, 1).float(), torch.zeros(1, 0), torch.zeros(1, 1)
+        ).states.dtype
+        == torch.float64
+    )
 
 
 def test_features_are_states_beside_inputs_and_rows_can_be_chosen(transitions):
     assert torch.equal(transitions.features[:, 3:], transitions.inputs)
     assert torch.equal(transitions[[4, 1]].next_states, transitions.next_states[[4, 1]])
-    assert (len(transitions[:3]), transitions.state_dim, transitions.input_dim) == (3, 3, 2)
+    assert (len(transitions[:3]), transitions.state_dim, transitions.input_dim) == (
+        3,
+        3,
+        2,
+    )
 
 
 @pytest.mark.parametrize(
@@ -39,8 +48,16 @@ def test_features_are_states_beside_inputs_and_rows_can_be_chosen(transitions):
             ShapeError,
             r"same n and number N of rows, one or more; got \(4, 2\), \(3, 1\) and \(4, 2\)",
         ),
-        (((4, 2), (4, 1), (4, 3)), ShapeError, r"need the same n .*; got \(4, 2\), \(4, 1\) and \(4, 3\)"),
-        (((4,), (4, 1), (4, 2)), ShapeError, r"states must have two dimensions \(rows, columns\); got shape \(4,\)"),
+        (
+            ((4, 2), (4, 1), (4, 3)),
+            ShapeError,
+            r"need the same n .*; got \(4, 2\), \(4, 1\) and \(4, 3\)",
+        ),
+        (
+            ((4,), (4, 1), (4, 2)),
+            ShapeError,
+            r"states must have two dimensions \(rows, columns\); got shape \(4,\)",
+        ),
         (((0, 2), (0, 1), (0, 2)), ShapeError, r"one or more; got \(0, 2\)"),
     ],
 )
@@ -53,11 +70,15 @@ def test_shapes_that_do_not_belong_together_are_refused(shapes, error, message):
 def test_an_entry_that_is_not_finite_is_named(value):
     inputs = torch.zeros(5, 2)
     inputs[3, 1] = value
-    with pytest.raises(DataError, match=f"inputs must be finite; got {value} in row 4, column 2"):
+    with pytest.raises(
+        DataError, match=f"inputs must be finite; got {value} in row 4, column 2"
+    ):
         Transitions(torch.zeros(5, 2), inputs, torch.zeros(5, 2))
 
 
-@pytest.mark.parametrize("damage", [lambda b: b[: len(b) // 2], lambda b: b"not an archive", lambda b: b""])
+@pytest.mark.parametrize(
+    "damage", [lambda b: b[: len(b) // 2], lambda b: b"not an archive", lambda b: b""]
+)
 def test_a_damaged_archive_is_named(transitions, tmp_path, damage):
     path = tmp_path / "data.npz"
     transitions.save(path)
@@ -84,10 +105,22 @@ def test_the_authors_text_format_is_read(tmp_path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (f"{ROW}\n{ROW.rsplit(' ', 1)[0]}\n", "data.txt: row 2 has 14 columns; expected 15"),
-        (f"{ROW}\n\n{ROW.replace('3.0', 'NaN', 1)}\n", "data.txt: row 3, column 4 is 'NaN'; expected a finite number"),
-        (ROW.replace("7.0", "-inf"), "data.txt: row 1, column 8 is '-inf'; expected a finite number"),
-        (ROW.replace("7.0", "7,0"), "data.txt: row 1, column 8 is '7,0'; expected a finite number"),
+        (
+            f"{ROW}\n{ROW.rsplit(' ', 1)[0]}\n",
+            "data.txt: row 2 has 14 columns; expected 15",
+        ),
+        (
+            f"{ROW}\n\n{ROW.replace('3.0', 'NaN', 1)}\n",
+            "data.txt: row 3, column 4 is 'NaN'; expected a finite number",
+        ),
+        (
+            ROW.replace("7.0", "-inf"),
+            "data.txt: row 1, column 8 is '-inf'; expected a finite number",
+        ),
+        (
+            ROW.replace("7.0", "7,0"),
+            "data.txt: row 1, column 8 is '7,0'; expected a finite number",
+        ),
         ("\n \n", "data.txt: the file holds 0 rows; expected 1 or more, of 15 columns"),
     ],
 )
@@ -107,13 +140,22 @@ def test_a_missing_file_and_a_binary_one_are_named(tmp_path):
 
 @pytest.mark.parametrize("delimiter", [",", ";", "\t"])
 def test_a_csv_file_gives_its_named_columns(tmp_path, delimiter):
-    lines = [["t", "v", "u", "x"], ["0", "2", "3", "1"], ["1", "5", "6", "4"], ["2", "8", "9", "7"]]
-    (tmp_path / "log.csv").write_text("\n".join(delimiter.join(line) for line in lines) + "\n")
+    lines = [
+        ["t", "v", "u", "x"],
+        ["0", "2", "3", "1"],
+        ["1", "5", "6", "4"],
+        ["2", "8", "9", "7"],
+    ]
+    (tmp_path / "log.csv").write_text(
+        "\n".join(delimiter.join(line) for line in lines) + "\n"
+    )
     data = Transitions.from_csv(tmp_path / "log.csv", states=["x", "v"], inputs=["u"])
     assert data.states.tolist() == [[1, 2], [4, 5]]
     assert data.inputs.tolist() == [[3], [6]]
     assert data.next_states.tolist() == [[4, 5], [7, 8]]  # the next row
-    paired = Transitions.from_csv(tmp_path / "log.csv", states=["x"], inputs=[], next_states=["v"])
+    paired = Transitions.from_csv(
+        tmp_path / "log.csv", states=["x"], inputs=[], next_states=["v"]
+    )
     assert paired.next_states.tolist() == [[2], [5], [8]]
     assert paired.inputs.shape == (3, 0)
 
@@ -161,5 +203,7 @@ def test_all_kinds_of_numbers_are_taken_as_doubles(values):
     ],
 )  # fmt: skip
 def test_what_only_could_be_taken_for_numbers_is_refused(values, kind):
-    with pytest.raises(DataError, match=f"inputs must be numbers in rows and columns; got {kind}"):
+    with pytest.raises(
+        DataError, match=f"inputs must be numbers in rows and columns; got {kind}"
+    ):
         Transitions(NUMBERS, values, NUMBERS)

@@ -13,7 +13,12 @@ import torch
 from gpmpc import _kernels as kernels
 from gpmpc._kernels import _gp_point, _simd
 from gpmpc._kernels._packed import pack
-from gpmpc._kernels._rows import largest_size, largest_square, reduce_variance, reduce_variances
+from gpmpc._kernels._rows import (
+    largest_size,
+    largest_square,
+    reduce_variance,
+    reduce_variances,
+)
 from gpmpc._kernels._simd import NEAR_ZERO, load, store
 from gpmpc.exceptions import ShapeError
 from gpmpc.gaussian import Gaussian
@@ -28,7 +33,9 @@ def packed(gp):
 
 def at_one(kernel, gps, *at, **settings):
     """A kernel's results at one point."""
-    found = kernel(gps, *(np.asarray(part, dtype=float)[None] for part in at), **settings)
+    found = kernel(
+        gps, *(np.asarray(part, dtype=float)[None] for part in at), **settings
+    )
     return type(found)(*(part[0] for part in found))
 
 
@@ -51,7 +58,9 @@ def numbers(*tensors):
 def close(mine, other, tolerance):
     other = np.asarray(other)
     assert mine.shape == other.shape
-    assert np.abs(mine - other).max(initial=0) <= tolerance * max(np.abs(other).max(initial=0), 1e-300)
+    assert np.abs(mine - other).max(initial=0) <= tolerance * max(
+        np.abs(other).max(initial=0), 1e-300
+    )
 
 
 def symmetric(derivative):
@@ -71,7 +80,12 @@ CASES = [
     ("short length-scales", {"lengthscale": 0.05}, {}, 0.0),
     ("ignored inputs", {"lengthscale": 1e8, "noise": 1e-2}, {}, 0.0),
     ("far from the data", {}, {}, 6.0),
-    ("joint exponents", {"lengthscale": 0.02, "size": 12}, {"spread": 1.0, "seed": 3}, 0.0),
+    (
+        "joint exponents",
+        {"lengthscale": 0.02, "size": 12},
+        {"spread": 1.0, "seed": 3},
+        0.0,
+    ),
 ]
 
 
@@ -81,7 +95,9 @@ def case(arguments, at, shift):
     return gp, Gaussian(at.mean + shift, at.covariance), control(gp.input_dim)
 
 
-@pytest.mark.parametrize(("name", "arguments", "at", "shift"), CASES, ids=[c[0] for c in CASES])
+@pytest.mark.parametrize(
+    ("name", "arguments", "at", "shift"), CASES, ids=[c[0] for c in CASES]
+)
 def test_values_and_derivatives_agree_with_torch(name, arguments, at, shift):
     gp, at, u = case(arguments, at, shift)
     mu, S = at.mean, at.covariance
@@ -109,7 +125,9 @@ def test_values_and_derivatives_agree_with_torch(name, arguments, at, shift):
     close(2 * mine.dM_dS, dJ[0], 1e-9)
     close(mine.dJ_dS, symmetric(dJ[1]), 1e-9)
     close(mine.dJ_du, dJ[2], 1e-9)
-    for value, with_jacobian in zip(valued(packed(gp), *numbers(mu, S, u)), mine[:3], strict=True):
+    for value, with_jacobian in zip(
+        valued(packed(gp), *numbers(mu, S, u)), mine[:3], strict=True
+    ):
         close(value, with_jacobian, 1e-12)
     for fast, plain in zip(mine, moments_with_jacobian(gp, at, u), strict=True):
         close(fast, plain, 1e-9)
@@ -128,7 +146,9 @@ def test_values_and_derivatives_agree_with_torch(name, arguments, at, shift):
         ({}, {"seed": 5}, 6.0, 1e-11),
     ],
 )
-def test_the_moments_agree_with_a_fifty_digit_evaluation(arguments, at, shift, tolerance):
+def test_the_moments_agree_with_a_fifty_digit_evaluation(
+    arguments, at, shift, tolerance
+):
     gp, at, u = case({"size": 7} | arguments, at, shift)
     exact_M, exact_V, exact_cross = (exact.numpy() for exact in by_mpmath(gp, at, u))
     by_torch = [part.numpy() for part in moments(gp, at, u)]
@@ -136,7 +156,9 @@ def test_the_moments_agree_with_a_fifty_digit_evaluation(arguments, at, shift, t
         assert np.abs(V - exact_V).max() < tolerance * np.abs(exact_V).max()
         assert np.abs(M - exact_M).max() < tolerance * max(1e-3, np.abs(exact_M).max())
         cross = at.covariance.numpy() @ J.T
-        assert np.abs(cross - exact_cross).max() < tolerance * max(1e-3, np.abs(exact_cross).max())
+        assert np.abs(cross - exact_cross).max() < tolerance * max(
+            1e-3, np.abs(exact_cross).max()
+        )
 
 
 @pytest.mark.parametrize("size", [1, 7, 8, 9, 189, 500])
@@ -144,14 +166,20 @@ def test_the_moments_agree_with_a_fifty_digit_evaluation(arguments, at, shift, t
 def test_padding_and_tiles_change_nothing(size, diagonal):
     gp, at, u = model(size=size, n=3, m=1, noise=1e-2), belief(3), control(1)
     M, V, J = moments(gp, at, u)
-    mine = differentiated(packed(gp), *numbers(at.mean, at.covariance, u), diagonal=diagonal)
+    mine = differentiated(
+        packed(gp), *numbers(at.mean, at.covariance, u), diagonal=diagonal
+    )
     close(mine.M, M, 1e-10)
     close(mine.V, torch.diag(V.diagonal()) if diagonal else V, 1e-10)
     close(mine.J, J, 1e-10)
-    dV = torch.func.jacrev(lambda mu: moments(gp, Gaussian(mu, at.covariance), u)[1])(at.mean)
+    dV = torch.func.jacrev(lambda mu: moments(gp, Gaussian(mu, at.covariance), u)[1])(
+        at.mean
+    )
     close(mine.dV_dmu, dV * torch.eye(3)[..., None] if diagonal else dV, 1e-9)
     for value, with_jacobian in zip(
-        valued(packed(gp), *numbers(at.mean, at.covariance, u), diagonal=diagonal), mine[:3], strict=True
+        valued(packed(gp), *numbers(at.mean, at.covariance, u), diagonal=diagonal),
+        mine[:3],
+        strict=True,
     ):
         close(value, with_jacobian, 1e-12)
 
@@ -168,11 +196,20 @@ def test_derivatives_agree_with_finite_differences(spread):
     def moved(t):
         return valued(gps, mu + t * d_mu, S + t * d_S, u + t * d_u)
 
-    numeric = [(after - before) / (2 * step) for after, before in zip(moved(step), moved(-step), strict=True)]
+    numeric = [
+        (after - before) / (2 * step)
+        for after, before in zip(moved(step), moved(-step), strict=True)
+    ]
     d = differentiated(gps, mu, S, u)
     close(d.J @ d_mu + np.tensordot(d.dM_dS, d_S) + d.dM_du @ d_u, numeric[0], 1e-7)
-    close(d.dV_dmu @ d_mu + np.tensordot(d.dV_dS, d_S) + d.dV_du @ d_u, numeric[1], 1e-7)
-    close(2 * d.dM_dS @ d_mu + np.tensordot(d.dJ_dS, d_S) + d.dJ_du @ d_u, numeric[2], 1e-7)
+    close(
+        d.dV_dmu @ d_mu + np.tensordot(d.dV_dS, d_S) + d.dV_du @ d_u, numeric[1], 1e-7
+    )
+    close(
+        2 * d.dM_dS @ d_mu + np.tensordot(d.dJ_dS, d_S) + d.dJ_du @ d_u,
+        numeric[2],
+        1e-7,
+    )
 
 
 def test_derivatives_in_the_covariance_are_symmetric():
@@ -189,7 +226,10 @@ def test_outputs_need_not_be_as_many_as_states():
     whole = differentiated(packed(gp), *numbers(at.mean, at.covariance, u))
     rows = [2, 0]
     few = pack(
-        *(v.numpy() for v in (gp.features, gp.lengthscales[rows], gp.signal_variance[rows])),
+        *(
+            v.numpy()
+            for v in (gp.features, gp.lengthscales[rows], gp.signal_variance[rows])
+        ),
         gp.cholesky[rows].numpy(),
         gp.weights[rows].numpy(),
         4,
@@ -201,8 +241,12 @@ def test_outputs_need_not_be_as_many_as_states():
         close(getattr(part, name), getattr(whole, name)[rows][:, rows], 1e-11)
 
 
-@pytest.mark.parametrize(("distance", "spread"), [(0.0, 1e3), (50.0, 10.0), (1e4, 1.0), (1e4, 1e4)])
-def test_wide_beliefs_far_from_the_data_neither_overflow_nor_lose_the_prior(distance, spread):
+@pytest.mark.parametrize(
+    ("distance", "spread"), [(0.0, 1e3), (50.0, 10.0), (1e4, 1.0), (1e4, 1e4)]
+)
+def test_wide_beliefs_far_from_the_data_neither_overflow_nor_lose_the_prior(
+    distance, spread
+):
     gp = model(lengthscale=0.05)
     at = Gaussian(torch.full((2,), distance), spread**2 * torch.eye(2))
     mine = differentiated(packed(gp), *numbers(at.mean, at.covariance), np.zeros(1))
@@ -222,7 +266,9 @@ def test_exponents_that_overflow_belong_to_nothing_that_counts():
     assert np.abs(mine.dV_dS).max() < 1e-100
 
 
-@pytest.mark.parametrize(("n", "m", "size"), [(1, 0, 5), (2, 1, 20), (3, 4, 33), (6, 3, 50)])
+@pytest.mark.parametrize(
+    ("n", "m", "size"), [(1, 0, 5), (2, 1, 20), (3, 4, 33), (6, 3, 50)]
+)
 def test_the_expansion_at_a_point_agrees_with_torch(n, m, size):
     gp, x, u = model(size=size, n=n, m=m), belief(n).mean, control(m)
 
@@ -236,15 +282,25 @@ def test_the_expansion_at_a_point_agrees_with_torch(n, m, size):
     jacrev, both = torch.func.jacrev, (0, 1)
     close(point.M, mean(x, u), 1e-12)
     close(point.variance, variance(x, u), 1e-10)
-    for mine, other in zip((point.J, point.dM_du), jacrev(mean, both)(x, u), strict=True):
+    for mine, other in zip(
+        (point.J, point.dM_du), jacrev(mean, both)(x, u), strict=True
+    ):
         close(mine, other, 1e-10)
-    for mine, other in zip((point.dvariance_dx, point.dvariance_du), jacrev(variance, both)(x, u), strict=True):
+    for mine, other in zip(
+        (point.dvariance_dx, point.dvariance_du),
+        jacrev(variance, both)(x, u),
+        strict=True,
+    ):
         close(mine, other, 1e-9)
-    for mine, other in zip((point.d2M_dx2, point.d2M_dxdu), jacrev(jacrev(mean), both)(x, u), strict=True):
+    for mine, other in zip(
+        (point.d2M_dx2, point.d2M_dxdu), jacrev(jacrev(mean), both)(x, u), strict=True
+    ):
         close(mine, other, 1e-10)
     offset = np.arange(float(n))
     for adds_state in (False, True):
-        M, A, B, V = kernels.linearize(packed(gp), *numbers(x[None], u[None]), True, offset, adds_state)
+        M, A, B, V = kernels.linearize(
+            packed(gp), *numbers(x[None], u[None]), True, offset, adds_state
+        )
         close(M[0], point.M + offset + adds_state * x.numpy(), 1e-12)
         close(A[0], point.J + adds_state * np.eye(n), 1e-12)
         close(B[0], point.dM_du, 1e-12)
@@ -279,7 +335,10 @@ def test_variances_at_several_points_are_reduced_as_each_alone(size):
     def together(columns, rows, totals):
         reduce_variances(columns, len(columns), rows, totals)
 
-    expected, totals = [alone(mine.precision.inverse_cholesky[1], row) for row in q], np.zeros(8)
+    expected, totals = (
+        [alone(mine.precision.inverse_cholesky[1], row) for row in q],
+        np.zeros(8),
+    )
     together(mine.columns[1], q, totals)
     assert np.allclose(totals, expected, rtol=1e-12, atol=0)
 
@@ -287,7 +346,10 @@ def test_variances_at_several_points_are_reduced_as_each_alone(size):
 def test_many_points_are_the_loop_over_them():
     gps = packed(model(n=3, m=2))
     beliefs = [belief(3, seed=s) for s in range(4)]
-    mu, S = np.stack([b.mean for b in beliefs]), np.stack([b.covariance for b in beliefs])
+    mu, S = (
+        np.stack([b.mean for b in beliefs]),
+        np.stack([b.covariance for b in beliefs]),
+    )
     u = np.linspace(-1, 1, 8).reshape(4, 2)
     together = [
         kernels.linearize(gps, mu, u, True, np.zeros(3), False),
@@ -297,7 +359,12 @@ def test_many_points_are_the_loop_over_them():
     ]
     for h in range(4):
         alone = [
-            [part[0] for part in kernels.linearize(gps, mu[h : h + 1], u[h : h + 1], True, np.zeros(3), False)],
+            [
+                part[0]
+                for part in kernels.linearize(
+                    gps, mu[h : h + 1], u[h : h + 1], True, np.zeros(3), False
+                )
+            ],
             at_one(kernels.point_with_jacobian, gps, mu[h], u[h]),
             at_one(kernels.moments, gps, mu[h], S[h], u[h], diagonal=True),
             differentiated(gps, mu[h], S[h], u[h]),
@@ -311,7 +378,9 @@ def test_threads_do_not_disturb_each_other():
     points = np.random.default_rng(0).normal(size=(16, 3))
     alone = [differentiated(gps, point, S, u).dV_dS for point in points]
     with ThreadPoolExecutor(4) as pool:
-        together = list(pool.map(lambda point: differentiated(gps, point, S, u).dV_dS, points))
+        together = list(
+            pool.map(lambda point: differentiated(gps, point, S, u).dV_dS, points)
+        )
     assert all((a == b).all() for a, b in zip(alone, together, strict=True))
 
 
@@ -319,7 +388,9 @@ def test_inputs_may_be_read_only_transposed_or_lists():
     gps, at, u = packed(model()), belief(), np.zeros(1)
     mu, S = at.mean.numpy().copy(), np.asfortranarray(at.covariance.numpy())
     mu.flags.writeable = False
-    for a, b in zip(valued(gps, mu, S, u), valued(gps, mu.tolist(), S.tolist(), [0.0]), strict=True):
+    for a, b in zip(
+        valued(gps, mu, S, u), valued(gps, mu.tolist(), S.tolist(), [0.0]), strict=True
+    ):
         assert (a == b).all()
 
 
@@ -348,10 +419,14 @@ def by_lanes(function):
     return evaluate
 
 
-exp, expm1, expm1_near_zero = (by_lanes(f) for f in (_simd.exp, _simd.expm1, _simd.expm1_near_zero))
+exp, expm1, expm1_near_zero = (
+    by_lanes(f) for f in (_simd.exp, _simd.expm1, _simd.expm1_near_zero)
+)
 
 
-@pytest.mark.parametrize(("low", "high"), [(-0.35, 0.35), (-1.1, 1.1), (-40, 30), (-1e-9, 1e-9), (-745, 709)])
+@pytest.mark.parametrize(
+    ("low", "high"), [(-0.35, 0.35), (-1.1, 1.1), (-40, 30), (-1e-9, 1e-9), (-745, 709)]
+)
 def test_the_exponentials_are_those_of_fifty_digits(low, high):
     x = np.random.default_rng(0).uniform(low, high, 2000)
     y = exp(x)
@@ -363,11 +438,15 @@ def test_the_exponentials_are_those_of_fifty_digits(low, high):
         x = x[x <= 300]
         exact = np.array([float(mpmath.expm1(v)) for v in x])
         y = expm1(x)
-        assert (np.abs(y - exact) <= (4e-16 + 3.4e-17 * np.maximum(x, 0)) * np.abs(exact)).all()
+        assert (
+            np.abs(y - exact) <= (4e-16 + 3.4e-17 * np.maximum(x, 0)) * np.abs(exact)
+        ).all()
 
 
 def test_near_zero_the_exponentials_without_reduction_are_the_same_to_the_last_bit():
-    x = np.random.default_rng(1).uniform(-NEAR_ZERO, NEAR_ZERO, 2000) * np.geomspace(1e-12, 1, 2000)
+    x = np.random.default_rng(1).uniform(-NEAR_ZERO, NEAR_ZERO, 2000) * np.geomspace(
+        1e-12, 1, 2000
+    )
     x[:2] = -NEAR_ZERO, NEAR_ZERO
     assert np.array_equal(expm1(x), expm1_near_zero(x))
 
@@ -375,30 +454,47 @@ def test_near_zero_the_exponentials_without_reduction_are_the_same_to_the_last_b
 @pytest.mark.parametrize("dims", [1, 3, 6])
 def test_sizes_over_points_are_the_largest_ones(dims):
     rows = np.random.default_rng(dims).standard_normal((dims, 48))
-    rows[0, 29], rows[-1, 7] = -8.0, np.nan  # NaN is passed over: such a pair stays NaN in either way
+    rows[0, 29], rows[-1, 7] = (
+        -8.0,
+        np.nan,
+    )  # NaN is passed over: such a pair stays NaN in either way
 
     @numba.njit
     def sizes(rows):
         return largest_square(rows), largest_size(rows[0])
 
-    assert sizes(rows) == pytest.approx((np.nanmax((rows**2).sum(axis=0)), 8.0), rel=1e-15)
+    assert sizes(rows) == pytest.approx(
+        (np.nanmax((rows**2).sum(axis=0)), 8.0), rel=1e-15
+    )
 
 
 def test_loops_over_points_may_use_the_widest_registers():
     gps = packed(model())
-    kernels.linearize(gps, np.zeros((1, 2)), np.zeros((1, 1)), False, np.zeros(2), False)
-    anew = numba.njit(_gp_point.linearize_points.py_func)  # the kernel itself may have been loaded
-    x, u, out = np.zeros((1, 2)), np.zeros((1, 1)), (np.zeros((1, 2)), np.zeros((1, 2, 2)), np.zeros((1, 2, 1)))
+    kernels.linearize(
+        gps, np.zeros((1, 2)), np.zeros((1, 1)), False, np.zeros(2), False
+    )
+    anew = numba.njit(
+        _gp_point.linearize_points.py_func
+    )  # the kernel itself may have been loaded
+    x, u, out = (
+        np.zeros((1, 2)),
+        np.zeros((1, 1)),
+        (np.zeros((1, 2)), np.zeros((1, 2, 2)), np.zeros((1, 2, 1))),
+    )
     memory, none = np.empty(7 * gps.arrays.points.shape[1] + 8), np.zeros((0, 2, 2))
     anew(gps.arrays, none, (np.zeros(2), False), x, u, memory, (*out, none))
     assert '"prefer-vector-width"="512"' in anew.inspect_llvm(anew.signatures[0])
 
 
 def test_the_exponentials_keep_the_limits():
-    x = np.array([0.0, -0.0, -1e9, -np.inf, 709.78, 710.0, 1e9, np.inf, np.nan, -745.2, -744.5])
+    x = np.array(
+        [0.0, -0.0, -1e9, -np.inf, 709.78, 710.0, 1e9, np.inf, np.nan, -745.2, -744.5]
+    )
     y = exp(x)
     with np.errstate(over="ignore"):
-        assert np.array_equal(y, np.exp(x), equal_nan=True) or np.allclose(y, np.exp(x), rtol=2e-16, equal_nan=True)
+        assert np.array_equal(y, np.exp(x), equal_nan=True) or np.allclose(
+            y, np.exp(x), rtol=2e-16, equal_nan=True
+        )
     assert expm1([0.0, -1e9, -np.inf, 1e-320]).tolist() == [0.0, -1.0, -1.0, 1e-320]
     large = expm1([1e9, np.inf, 300.0])
     assert large[0] == large[1] == large[2] == pytest.approx(np.exp(300.0), rel=2e-14)
@@ -408,18 +504,29 @@ def test_the_exponentials_keep_the_limits():
 def test_what_does_not_fit_is_refused():
     gp = model()
     gps = packed(gp)
-    with pytest.raises(ShapeError, match=r"states \(H, 2\) and inputs \(H, 1\); got \(1, 3\) and \(1, 1\)"):
+    with pytest.raises(
+        ShapeError,
+        match=r"states \(H, 2\) and inputs \(H, 1\); got \(1, 3\) and \(1, 1\)",
+    ):
         at_one(kernels.point_with_jacobian, gps, np.zeros(3), np.zeros(1))
     with pytest.raises(ShapeError, match=r"got \(1, 2\) and \(1, 2\)"):
         valued(gps, np.zeros(2), np.eye(2), np.zeros(2))
-    with pytest.raises(ShapeError, match=r"S must have shape \(1, 2, 2\); got \(1, 3, 3\)"):
+    with pytest.raises(
+        ShapeError, match=r"S must have shape \(1, 2, 2\); got \(1, 3, 3\)"
+    ):
         valued(gps, np.zeros(2), np.eye(3), np.zeros(1))
-    with pytest.raises(ShapeError, match=r"beta \(k, N\) of points \(20, 3\); got .* \(2, 19\)\)"):
+    with pytest.raises(
+        ShapeError, match=r"beta \(k, N\) of points \(20, 3\); got .* \(2, 19\)\)"
+    ):
         packed(replace(gp, weights=gp.weights[:, :-1]))
 
 
 def test_the_kernels_load_no_torch_of_their_own():
-    assert not [path for path in Path(kernels.__file__).parent.glob("*.py") if "import torch" in path.read_text()]
+    assert not [
+        path
+        for path in Path(kernels.__file__).parent.glob("*.py")
+        if "import torch" in path.read_text()
+    ]
 
 
 def test_the_sine_and_cosine_of_lanes_are_exact_to_round_off_and_stay_within_one(rng):

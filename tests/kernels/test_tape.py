@@ -12,13 +12,19 @@ from gpmpc.systems import double_pendulum, step
 X, U = casadi.SX.sym("x", 3), casadi.SX.sym("u", 2)
 EVERY = casadi.vertcat(
     X[0] / X[1] - casadi.atan2(X[2], U[0]) + casadi.sqrt(1 + X[0] ** 2),
-    casadi.exp(-X[1]) * casadi.fmin(X[0], U[1]) + casadi.fmax(X[2], U[0]) - casadi.tan(0.3 * X[0]),
-    casadi.tanh(X[2]) * casadi.log(2 + casadi.sin(U[0]) ** 2) + casadi.atan(U[1]) + 1 / (3 + casadi.cos(X[0])),
+    casadi.exp(-X[1]) * casadi.fmin(X[0], U[1])
+    + casadi.fmax(X[2], U[0])
+    - casadi.tan(0.3 * X[0]),
+    casadi.tanh(X[2]) * casadi.log(2 + casadi.sin(U[0]) ** 2)
+    + casadi.atan(U[1])
+    + 1 / (3 + casadi.cos(X[0])),
     casadi.fabs(X[0]) ** 1.5 + (2 + X[1] ** 2) ** X[2] - 2 * U[1],
 )
 
 
-MATRIX = casadi.horzcat(casadi.vertcat(X[0] * X[1], casadi.sin(X[2])), casadi.vertcat(2.0, X[1] ** 3))
+MATRIX = casadi.horzcat(
+    casadi.vertcat(X[0] * X[1], casadi.sin(X[2])), casadi.vertcat(2.0, X[1] ** 3)
+)
 FUNCTIONS = casadi.Function("f", [X, U], [EVERY]), casadi.Function("f", [X], [MATRIX])
 
 
@@ -26,10 +32,14 @@ FUNCTIONS = casadi.Function("f", [X, U], [EVERY]), casadi.Function("f", [X], [MA
 def test_a_tape_has_the_values_and_derivatives_of_casadi(function, rng):
     compiled, plain = CasadiFunction(function), CasadiFunction(function)
     plain.tape, names = None, function.name_in()
-    plain._expansion = function.factory("e", names, ["o0", *(f"jac:o0:{name}" for name in names)])
+    plain._expansion = function.factory(
+        "e", names, ["o0", *(f"jac:o0:{name}" for name in names)]
+    )
     assert compiled.tape is not None
     arguments = [rng.uniform(0.2, 2, (7, size)) for size in (3, 2)[: len(names)]]
-    for found, expected in zip(compiled.linearize(*arguments), plain.linearize(*arguments), strict=True):
+    for found, expected in zip(
+        compiled.linearize(*arguments), plain.linearize(*arguments), strict=True
+    ):
         assert found.shape == expected.shape
         assert np.allclose(found, expected, rtol=1e-12, atol=1e-12)
 
@@ -38,17 +48,24 @@ def test_expressions_of_matrices_are_expanded_and_other_calls_have_no_tape():
     x = casadi.MX.sym("x", 2)
     assert tape_of(casadi.Function("f", [x], [casadi.sin(x) @ x.T])) is not None
     assert tape_of(casadi.Function("f", [X], [casadi.floor(X)])) is None
-    table = casadi.interpolant("table", "bspline", [[0.0, 1.0, 2.0, 3.0, 4.0]], [0.0, 1.0, 4.0, 9.0, 16.0])
+    table = casadi.interpolant(
+        "table", "bspline", [[0.0, 1.0, 2.0, 3.0, 4.0]], [0.0, 1.0, 4.0, 9.0, 16.0]
+    )
     assert tape_of(casadi.Function("f", [x], [table(x[0])])) is None
 
 
 def test_a_known_model_is_rolled_out_in_one_call_under_a_feedback_within_bounds(rng):
     system, H = double_pendulum("shoulder"), 12
     x, u = casadi.SX.sym("x", 4), casadi.SX.sym("u", 1)
-    function = casadi.Function("successor", [x, u], [casadi.vertcat(*system.successor(x, u))])
+    function = casadi.Function(
+        "successor", [x, u], [casadi.vertcat(*system.successor(x, u))]
+    )
     model = KnownModel(CasadiFunction(function), 4, 1)
     planned, gains = rng.normal(size=(2, H, 4)), rng.normal(size=(2, H, 1, 4))
-    limits = *(np.full((H, 1), limit) for limit in (-6.0, 6.0, -3.0, 3.0)), np.array([0.5])
+    limits = (
+        *(np.full((H, 1), limit) for limit in (-6.0, 6.0, -3.0, 3.0)),
+        np.array([0.5]),
+    )
     feedback = Feedback(planned, rng.uniform(-4, 4, (2, H, 1)), gains, *limits)
     starts, gust = rng.normal(size=(2, 4)), np.array([0.0, 0.1, 0.0, 0.0])
     states, inputs = RollOut(model)(starts, feedback, gust)
@@ -63,22 +80,33 @@ def test_a_known_model_is_rolled_out_in_one_call_under_a_feedback_within_bounds(
 
 
 @pytest.mark.parametrize("count", [1, 3, 8, 9])
-def test_roll_outs_of_functions_without_a_value_at_zero_are_those_of_the_function(count, rng):
+def test_roll_outs_of_functions_without_a_value_at_zero_are_those_of_the_function(
+    count, rng
+):
     x, u = casadi.SX.sym("x", 2), casadi.SX.sym("u", 1)
     after = casadi.vertcat(
-        x[0] + 0.1 * (u[0] - casadi.sqrt(x[0])), x[1] + 0.1 * casadi.log(x[0]) / casadi.atan2(x[0], x[1])
+        x[0] + 0.1 * (u[0] - casadi.sqrt(x[0])),
+        x[1] + 0.1 * casadi.log(x[0]) / casadi.atan2(x[0], x[1]),
     )
     function = casadi.Function("f", [x, u], [after])
     starts, inputs = rng.uniform(1, 2, (count, 2)), rng.uniform(0.5, 1, (count, 5, 1))
-    states = RollOut(KnownModel(CasadiFunction(function), 2, 1)).open_loop(starts, inputs)
+    states = RollOut(KnownModel(CasadiFunction(function), 2, 1)).open_loop(
+        starts, inputs
+    )
     for t in range(count):
         for k in range(5):
-            assert np.allclose(states[t, k + 1], function(states[t, k], inputs[t, k]).full()[:, 0], rtol=1e-12)
+            assert np.allclose(
+                states[t, k + 1],
+                function(states[t, k], inputs[t, k]).full()[:, 0],
+                rtol=1e-12,
+            )
 
 
 def test_a_function_without_a_finite_derivative_has_an_infinite_one_and_no_error():
     function = CasadiFunction(
-        casadi.Function("f", [X], [casadi.vertcat(casadi.sqrt(X[0]), 1 / X[1], casadi.log(X[2]))])
+        casadi.Function(
+            "f", [X], [casadi.vertcat(casadi.sqrt(X[0]), 1 / X[1], casadi.log(X[2]))]
+        )
     )
     values, slopes = function.linearize(np.array([[0.0, 2.0, 1.0], [4.0, 0.0, 1.0]]))
     assert values.tolist() == [[0.0, 0.5, 0.0], [2.0, np.inf, 0.0]]

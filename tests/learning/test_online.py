@@ -31,8 +31,12 @@ def cart(x, u, gain=1.0, wind=0.0):
 def learned_model():
     rng = np.random.default_rng(0)
     x, u = rng.uniform(-2, 2, (60, 2)), rng.uniform(-4, 4, (60, 1))
-    after = np.array([cart(a, b) + rng.normal(0, NOISE) for a, b in zip(x, u, strict=True)])
-    return Trainer(predicts="difference", restarts=0)(Transitions(x, u, after)).posterior
+    after = np.array(
+        [cart(a, b) + rng.normal(0, NOISE) for a, b in zip(x, u, strict=True)]
+    )
+    return Trainer(predicts="difference", restarts=0)(
+        Transitions(x, u, after)
+    ).posterior
 
 
 MODEL = learned_model()
@@ -41,7 +45,9 @@ MODEL = learned_model()
 def flown(learning, changed=None, steps=120, seed=0, sensor=0.0):
     """Errors of the position, inputs and decisions of a flight along a sine; ``changed`` acts from step 40 on."""
     controller = GPMPC(MODEL, Linearization(), PROBLEM, 8, [0.0])
-    loop = ControlLoop(controller if learning is None else LearningController(controller, learning))
+    loop = ControlLoop(
+        controller if learning is None else LearningController(controller, learning)
+    )
     time, rng = STEP * np.arange(steps + 9), np.random.default_rng(seed)
     reference = np.stack([np.sin(time), np.cos(time)], axis=1)
     x, errors, decisions = reference[0].copy(), [], []
@@ -60,11 +66,15 @@ def rms(errors):
 @pytest.mark.parametrize("sensor", [0.0, 0.03])
 def test_a_plant_that_does_not_change_is_flown_as_without_learning(sensor):
     for seed in range(2):
-        plain, learning = (flown(way, seed=seed, sensor=sensor)[0] for way in (None, OnlineLearning()))
+        plain, learning = (
+            flown(way, seed=seed, sensor=sensor)[0] for way in (None, OnlineLearning())
+        )
         assert rms(learning) <= 1.02 * rms(plain)
 
 
-@pytest.mark.parametrize("changed", [{"gain": 0.7}, {"wind": 0.6}], ids=["actuator", "wind"])
+@pytest.mark.parametrize(
+    "changed", [{"gain": 0.7}, {"wind": 0.6}], ids=["actuator", "wind"]
+)
 def test_a_plant_that_changes_is_followed_again_within_seconds(changed):
     before, lost, found = (
         rms(np.array([flown(way, acting, seed=seed)[0][60:] for seed in range(3)]))
@@ -75,7 +85,9 @@ def test_a_plant_that_changes_is_followed_again_within_seconds(changed):
 
 def test_learning_is_switched_off_where_the_old_plant_comes_back_and_no_measurement_is_lost_on_the_way():
     steps, learning = [], OnlineLearning()
-    learned = Learned(ChangedModel(MODEL), np.zeros(2), np.full(2, np.nan), np.empty(0), np.empty(0))
+    learned = Learned(
+        ChangedModel(MODEL), np.zeros(2), np.full(2, np.nan), np.empty(0), np.empty(0)
+    )
     rng, x = np.random.default_rng(1), np.zeros(2)
     for k in range(150):
         u = rng.uniform(-3, 3, 1)
@@ -93,7 +105,10 @@ def test_equal_seeds_give_equal_bits_and_one_controller_flies_many_flights():
     assert np.array_equal(one[0], again[0])
     assert [d.learned.version for d in one[1]] == [d.learned.version for d in again[1]]
     controller = LearningController(GPMPC(MODEL, Linearization(), PROBLEM, 8, [0.0]))
-    x, reference = Gaussian.certain(np.array([0.5, 0.0])), Reference(np.zeros(2)).over(8)
+    x, reference = (
+        Gaussian.certain(np.array([0.5, 0.0])),
+        Reference(np.zeros(2)).over(8),
+    )
     first = controller.control(x, reference)
     second = controller.control(x, reference, first)
     controller.control(x, reference, second)
@@ -106,26 +121,39 @@ def test_a_decision_that_was_not_applied_is_no_point_and_ends_the_use_of_the_cha
     before = decisions[-1]
     assert before.learned.active
     controller = LearningController(GPMPC(MODEL, Linearization(), PROBLEM, 8, [0.0]))
-    shifted = replace(before, means=np.concatenate([before.means[1:], before.means[-1:]]))
+    shifted = replace(
+        before, means=np.concatenate([before.means[1:], before.means[-1:]])
+    )
     state, reference = Gaussian.certain(before.means[2]), Reference(before.means)
     after = controller.control(state, reference, shifted).learned
     assert not after.active
     assert after.model.change is before.learned.model.change
-    assert controller.control(state, reference, before).learned.model.change is not before.learned.model.change
+    assert (
+        controller.control(state, reference, before).learned.model.change
+        is not before.learned.model.change
+    )
 
 
 def changed_residual():
     rng = np.random.default_rng(0)
     x, u = rng.uniform(-2, 2, (40, 2)), rng.uniform(-2, 2, (40, 1))
-    after = np.array([cart(a, b) for a, b in zip(x, u, strict=True)]) + rng.normal(0, NOISE, (40, 2))
+    after = np.array([cart(a, b) for a, b in zip(x, u, strict=True)]) + rng.normal(
+        0, NOISE, (40, 2)
+    )
     B = torch.tensor([[0.1], [1.0]], dtype=torch.float64)
     rows = Transitions(x, u, after)
-    model = ResidualModel.train(Affine.identity(2, 1), rows, B, angles=[0], trainer=Trainer(restarts=0))
+    model = ResidualModel.train(
+        Affine.identity(2, 1), rows, B, angles=[0], trainer=Trainer(restarts=0)
+    )
     return ChangedModel(model)
 
 
-@pytest.mark.parametrize("changed", [ChangedModel(MODEL), changed_residual()], ids=["posterior", "residual"])
-def test_a_changed_model_keeps_the_promises_of_a_model_and_its_last_innovation_is_what_it_missed(changed):
+@pytest.mark.parametrize(
+    "changed", [ChangedModel(MODEL), changed_residual()], ids=["posterior", "residual"]
+)
+def test_a_changed_model_keeps_the_promises_of_a_model_and_its_last_innovation_is_what_it_missed(
+    changed,
+):
     rng = np.random.default_rng(2)
     x, u = rng.uniform(-1, 1, (12, 2)), rng.uniform(-1, 1, (12, 1))
     after = np.array([cart(a, b, gain=0.8) for a, b in zip(x, u, strict=True)])
@@ -138,10 +166,15 @@ def test_a_changed_model_keeps_the_promises_of_a_model_and_its_last_innovation_i
     point, error, _ = model.error(x[-1], u[-1], after[-1])
     larger = model.with_point(point, error, noise)
     found, at = larger.last_innovation(), torch.from_numpy(point[None])
-    d = model.posterior.predict(at[:, : -model.gp.input_dim - 1], at[:, -model.gp.input_dim - 1 :])
+    d = model.posterior.predict(
+        at[:, : -model.gp.input_dim - 1], at[:, -model.gp.input_dim - 1 :]
+    )
     np.testing.assert_allclose(found[0], error - d.mean.numpy()[0], atol=1e-8)
     np.testing.assert_allclose(found[1], d.variance.numpy()[0] + 1e-6, rtol=1e-6)
-    alone, later = (abs((after - one.linearize(x, u).mean) @ changed.arrays[1].T).max() for one in (changed, larger))
+    alone, later = (
+        abs((after - one.linearize(x, u).mean) @ changed.arrays[1].T).max()
+        for one in (changed, larger)
+    )
     assert later < 0.2 * alone
 
 
@@ -151,7 +184,9 @@ def taught(model, points, rng):
     for _ in range(points):
         noise = rng.uniform(0.5, 2.0) * model.arrays[2]
         point = np.append(rng.normal(size=3), models[-1].time)
-        models.append(models[-1].with_point(point, rng.normal(size=2), noise).later(1.0))
+        models.append(
+            models[-1].with_point(point, rng.normal(size=2), noise).later(1.0)
+        )
     return models
 
 
@@ -159,32 +194,52 @@ def check_exact(model):
     """The factor, the weights and predictions are those of a GP on the same points."""
     gp, size, now = model.posterior, len(model), model.change[0]
     difference = (gp.features[:, None] - gp.features) / gp.lengthscales[:, None, None]
-    K = gp.signal_variance[:, None, None] * torch.exp(-0.5 * difference.square().sum(-1))
-    L = torch.linalg.cholesky(K + torch.diag_embed(torch.from_numpy(now.data[6:8, :size].copy())))
+    K = gp.signal_variance[:, None, None] * torch.exp(
+        -0.5 * difference.square().sum(-1)
+    )
+    L = torch.linalg.cholesky(
+        K + torch.diag_embed(torch.from_numpy(now.data[6:8, :size].copy()))
+    )
     weights = torch.cholesky_solve(gp.targets.mT[..., None], L)[..., 0]
     np.testing.assert_allclose(gp.cholesky, L, rtol=1e-8, atol=1e-10)
     np.testing.assert_allclose(gp.weights, weights, rtol=1e-7, atol=1e-8)
     x, u = np.random.default_rng(0).normal(size=(2, 2)), np.zeros((2, 1))
     z = torch.from_numpy(np.column_stack([x, u, np.full(2, model.time)]))
     k = gp.signal_variance[:, None, None] * torch.exp(
-        -0.5 * ((z[:, None] - gp.features) / gp.lengthscales[:, None, None]).square().sum(-1)
+        -0.5
+        * ((z[:, None] - gp.features) / gp.lengthscales[:, None, None]).square().sum(-1)
     )
     found, alone = model.linearize(x, u), model.model.linearize(x, u)
-    np.testing.assert_allclose(found.mean - alone.mean, (k @ weights[..., None])[..., 0].mT, rtol=1e-8, atol=1e-10)
+    np.testing.assert_allclose(
+        found.mean - alone.mean,
+        (k @ weights[..., None])[..., 0].mT,
+        rtol=1e-8,
+        atol=1e-10,
+    )
     reduced = torch.linalg.solve_triangular(L, k.mT, upper=False).square().sum(1)
     variance = np.diagonal(found.covariance - alone.covariance, axis1=1, axis2=2).T
-    np.testing.assert_allclose(variance, gp.signal_variance[:, None] - reduced, rtol=1e-7, atol=1e-12)
+    np.testing.assert_allclose(
+        variance, gp.signal_variance[:, None] - reduced, rtol=1e-7, atol=1e-12
+    )
 
 
 @pytest.mark.parametrize("rule", ["oldest", "least_informative"])
 @pytest.mark.parametrize("most", [1, 2, 9, 50])
-def test_a_change_is_the_exact_gp_of_its_points_and_drops_some_when_they_are_too_many(most, rule):
+def test_a_change_is_the_exact_gp_of_its_points_and_drops_some_when_they_are_too_many(
+    most, rule
+):
     models = taught(
-        ChangedModel(MODEL, OnlineLearning(points=most, remove=rule)), 2 * most + 20, np.random.default_rng(3)
+        ChangedModel(MODEL, OnlineLearning(points=most, remove=rule)),
+        2 * most + 20,
+        np.random.default_rng(3),
     )
     for before, after in pairwise(models):
         check_exact(after)
-        assert 0.8 * most <= len(after) <= most if len(before) == most else len(after) == len(before) + 1
+        assert (
+            0.8 * most <= len(after) <= most
+            if len(before) == most
+            else len(after) == len(before) + 1
+        )
         times = after.posterior.features[:, -1].numpy()
         assert (np.diff(times) > 0).all()
         assert times[-1] == before.time
@@ -192,10 +247,20 @@ def test_a_change_is_the_exact_gp_of_its_points_and_drops_some_when_they_are_too
 
 
 def test_an_older_change_stays_what_it_was_and_can_go_another_way():
-    models = taught(ChangedModel(MODEL, OnlineLearning(points=30)), 60, np.random.default_rng(4))
-    kept = [[array.copy() for array in (m.posterior.cholesky.numpy(), m.posterior.weights.numpy())] for m in models[1:]]
+    models = taught(
+        ChangedModel(MODEL, OnlineLearning(points=30)), 60, np.random.default_rng(4)
+    )
+    kept = [
+        [
+            array.copy()
+            for array in (m.posterior.cholesky.numpy(), m.posterior.weights.numpy())
+        ]
+        for m in models[1:]
+    ]
     for k in (20, 29, 30, 47, 59):
-        again, other = (taught(models[k], 12, np.random.default_rng(seed))[-1] for seed in (5, 6))
+        again, other = (
+            taught(models[k], 12, np.random.default_rng(seed))[-1] for seed in (5, 6)
+        )
         same = taught(models[k], 12, np.random.default_rng(5))[-1]
         check_exact(other)
         assert torch.equal(again.posterior.weights, same.posterior.weights)

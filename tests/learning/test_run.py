@@ -10,11 +10,23 @@ from tests.cli.command import forked
 TINY = ["model.restarts=0", "horizon=3", f"noise.process={[0.01] * 6}".replace(" ", "")]
 
 
-def test_a_recorded_flight_shows_when_the_change_was_used_and_a_second_one_is_equal(tmp_path):
-    gust = "disturbances=[{_target_: gpmpc.simulation.Gust, rates: {vx: 0.5}, start: 10}]"
+def test_a_recorded_flight_shows_when_the_change_was_used_and_a_second_one_is_equal(
+    tmp_path,
+):
+    gust = (
+        "disturbances=[{_target_: gpmpc.simulation.Gust, rates: {vx: 0.5}, start: 10}]"
+    )
     found = []
     for tree in ("first", "second"):
-        done = forked("run", *TINY, gust, "learning=online", "steps=20", f"folder={tree}", cwd=tmp_path)
+        done = forked(
+            "run",
+            *TINY,
+            gust,
+            "learning=online",
+            "steps=20",
+            f"folder={tree}",
+            cwd=tmp_path,
+        )
         assert done.returncode == 0, done.stderr
         (folder,) = (tmp_path / tree).iterdir()
         run = read_run(folder / "run.mcap")
@@ -25,12 +37,26 @@ def test_a_recorded_flight_shows_when_the_change_was_used_and_a_second_one_is_eq
     assert np.array_equal(*found)
 
 
-def test_episodes_are_recorded_and_the_flight_that_counts_has_the_model_of_the_best(tmp_path):
-    done = forked("run", *TINY, "learning=episodes", "data.size=25", "steps=40", "folder=tree", cwd=tmp_path)
+def test_episodes_are_recorded_and_the_flight_that_counts_has_the_model_of_the_best(
+    tmp_path,
+):
+    done = forked(
+        "run",
+        *TINY,
+        "learning=episodes",
+        "data.size=25",
+        "steps=40",
+        "folder=tree",
+        cwd=tmp_path,
+    )
     assert done.returncode == 0, done.stderr
     (folder,) = (tmp_path / "tree").iterdir()
     result = json.loads((folder / "metrics.json").read_text())
-    assert {path.name for path in folder.glob("*.mcap")} == {"episode_1.mcap", "episode_2.mcap", "run.mcap"}
+    assert {path.name for path in folder.glob("*.mcap")} == {
+        "episode_1.mcap",
+        "episode_2.mcap",
+        "run.mcap",
+    }
     first, second = result["episodes"]
     assert result["training"]["size"] == 25 + (39 if second < first else 0)
     assert result["rmse"]["total"] < 1.1 * first

@@ -13,7 +13,12 @@ from gpmpc.exceptions import SettingError
 from gpmpc.gp import GPPosterior
 from gpmpc.logs import LogDynamics, LogModel, MultirotorNominal, RigidBody
 from gpmpc.logs._fitting import OutputNoise
-from gpmpc.logs._kinematics import Increments, StateGroup, StateSpace, rotation_quaternion
+from gpmpc.logs._kinematics import (
+    Increments,
+    StateGroup,
+    StateSpace,
+    rotation_quaternion,
+)
 from gpmpc.logs._rollouts import AffineNominal, OutputGP
 from gpmpc.testing import check_model
 
@@ -22,16 +27,29 @@ from tests.cli.command import forked
 
 PAGE = (Path(__file__).resolve().parents[2] / "docs" / "guide_log.md").read_text()
 VECTORS = [StateGroup(name, tuple(f"{name}{axis}" for axis in "xyz")) for name in "pvw"]
-BODY = StateSpace((VECTORS[0], StateGroup("q", ("qx", "qy", "qz", "qw"), "", "quaternion"), *VECTORS[1:]))
+BODY = StateSpace(
+    (
+        VECTORS[0],
+        StateGroup("q", ("qx", "qy", "qz", "qw"), "", "quaternion"),
+        *VECTORS[1:],
+    )
+)
 
 
 def dynamics(kinematics, nominal, theta, inputs, dim, **model):
     """What ``load_flyable`` would return, with a GP on the last output."""
     rng, o = np.random.default_rng(0), len(kinematics.output_names)
-    z, y = torch.from_numpy(rng.normal(size=(20, dim))), torch.from_numpy(rng.normal(size=(20, 1)))
+    z, y = (
+        torch.from_numpy(rng.normal(size=(20, dim))),
+        torch.from_numpy(rng.normal(size=(20, 1))),
+    )
     one = torch.ones(1, dtype=torch.float64)
-    gp = GPPosterior.from_hyperparameters(z, y, 2 * torch.ones(1, dim, dtype=torch.float64), one, 0.1 * one, 0, "value")
-    whole = LogModel(kinematics, nominal, theta, (0,) * o, gps=(OutputGP((o - 1,), gp),), **model)
+    gp = GPPosterior.from_hyperparameters(
+        z, y, 2 * torch.ones(1, dim, dtype=torch.float64), one, 0.1 * one, 0, "value"
+    )
+    whole = LogModel(
+        kinematics, nominal, theta, (0,) * o, gps=(OutputGP((o - 1,), gp),), **model
+    )
     noise = OutputNoise(np.ones((4, o)), np.ones(kinematics.space.error_dim))
     return LogDynamics(whole, inputs, 0.02, noise)
 
@@ -40,18 +58,32 @@ def test_what_was_learned_obeys_the_protocol_of_models():
     rng = np.random.default_rng(1)
     nominal = MultirotorNominal(4, torque=True)
     body = dynamics(RigidBody(BODY), nominal, rng.normal(size=18), 4, 12)
-    x = np.hstack([rng.normal(size=(5, 3)), rotation_quaternion(rng.normal(size=(5, 3))), rng.normal(size=(5, 6))])
-    check_model(body, torch.from_numpy(x), torch.from_numpy(rng.uniform(0.2, 0.8, (5, 4))))
-    space = StateSpace((StateGroup("a", ("a",), "rad", "angle"), StateGroup("b", ("b",))))
+    x = np.hstack(
+        [
+            rng.normal(size=(5, 3)),
+            rotation_quaternion(rng.normal(size=(5, 3))),
+            rng.normal(size=(5, 6)),
+        ]
+    )
+    check_model(
+        body, torch.from_numpy(x), torch.from_numpy(rng.uniform(0.2, 0.8, (5, 4)))
+    )
+    space = StateSpace(
+        (StateGroup("a", ("a",), "rad", "angle"), StateGroup("b", ("b",)))
+    )
     zero = AffineNominal(Increments(space), fitted=False)
     turning = dynamics(zero.kinematics, zero, np.empty(0), 1, 4)
-    states = torch.tensor([[3.1415, 60.0], [-7.0, 1.0]], dtype=torch.float64)  # a turn is counted, not taken back
+    states = torch.tensor(
+        [[3.1415, 60.0], [-7.0, 1.0]], dtype=torch.float64
+    )  # a turn is counted, not taken back
     check_model(turning, states, torch.ones(2, 1, dtype=torch.float64))
     assert abs(turning.predict(states, states[:, :1]).mean - states).max() < 0.1
 
 
 def test_what_no_controller_can_plan_with_is_named():
-    with pytest.raises(SettingError, match="inputs that act 3 rows late, which no controller"):
+    with pytest.raises(
+        SettingError, match="inputs that act 3 rows late, which no controller"
+    ):
         dynamics(RigidBody(BODY), MultirotorNominal(4), np.zeros(6), 4, 12, lag=3)
 
 
@@ -60,11 +92,17 @@ def test_the_guide_flies_learns_and_flies_what_was_learned(tmp_path):
     (mapping,) = re.findall(r"```yaml\n(.*?)```", section, re.DOTALL)
     (tmp_path / "map.yaml").write_text(mapping)
     for line in re.findall(r"```bash\n(.*?)```", section, re.DOTALL)[1].splitlines():
-        words = [name for w in shlex.split(line)[1:] for name in ([*map(str, tmp_path.glob(w))] if "*" in w else [w])]
+        words = [
+            name
+            for w in shlex.split(line)[1:]
+            for name in ([*map(str, tmp_path.glob(w))] if "*" in w else [w])
+        ]
         found = forked(*words, cwd=tmp_path)
         assert found.returncode == 0, found.stderr
     assert "learned/model.safetensors" in found.stdout
-    wrong = forked("run", "system=cart_pole", "model=learned/model.safetensors", cwd=tmp_path)
+    wrong = forked(
+        "run", "system=cart_pole", "model=learned/model.safetensors", cwd=tmp_path
+    )
     expected = "learned/model.safetensors has the states angle, rate; cart_pole has position, velocity, angle, rate"
     assert (wrong.returncode, wrong.stderr) == (2, f"gpmpc: model: {expected}\n")
     missing = forked("run", "system=pendulum", "model=none.safetensors", cwd=tmp_path)

@@ -41,8 +41,15 @@ def test_what_was_put_in_is_found(table, tmp_path):
     table.loc[7000, "t"] = table.loc[6999, "t"]
     table.to_csv(tmp_path / "log.csv", index=False)
     found = inspect_log(tmp_path / "log.csv")
-    ((_, rows, rate, jitter, gaps, longest, repeated, backwards),) = found.streams.to_numpy(object)
-    assert (rows, gaps, repeated, backwards) == (11_925, 2, 1, 0)  # a row that is left out leaves a gap
+    ((_, rows, rate, jitter, gaps, longest, repeated, backwards),) = (
+        found.streams.to_numpy(object)
+    )
+    assert (rows, gaps, repeated, backwards) == (
+        11_925,
+        2,
+        1,
+        0,
+    )  # a row that is left out leaves a gap
     assert (rate, longest) == (pytest.approx(250), pytest.approx(0.304))
     assert jitter < 0.1
     noisy = found.channels.loc["noisy"]
@@ -58,7 +65,9 @@ def test_what_was_put_in_is_found(table, tmp_path):
 
 def test_an_input_that_follows_the_states_is_named(table, tmp_path):
     table.to_csv(tmp_path / "log.csv", index=False)
-    mapping = LogMapping.from_dict({"time": "t", "states": {"x": ["a"]}, "inputs": {"u": ["u"], "free": ["noisy"]}})
+    mapping = LogMapping.from_dict(
+        {"time": "t", "states": {"x": ["a"]}, "inputs": {"u": ["u"], "free": ["noisy"]}}
+    )
     found = inspect_log(tmp_path / "log.csv", mapping)
     assert found.follows["u"] > 0.99
     assert found.follows["noisy"] < 0.1
@@ -85,16 +94,40 @@ def test_learn_writes_a_model_a_report_and_a_card_and_names_mistakes(tmp_path):
     example = runpy.run_path(str(ROOT / "examples" / "own_log.py"))
     for number, flight in enumerate(example["simulate_flights"](2, 300)):
         flight.to_csv(tmp_path / f"{number}.csv", index=False)
-    (tmp_path / "map.yaml").write_text(yaml.safe_dump(example["MAPPING"], sort_keys=False))
-    arguments = ["map.yaml", "0.csv", "1.csv", "--points", "20", "--steps", "10", "--held-out", "1"]
+    (tmp_path / "map.yaml").write_text(
+        yaml.safe_dump(example["MAPPING"], sort_keys=False)
+    )
+    arguments = [
+        "map.yaml",
+        "0.csv",
+        "1.csv",
+        "--points",
+        "20",
+        "--steps",
+        "10",
+        "--held-out",
+        "1",
+    ]
     result = forked("learn", *arguments, cwd=tmp_path)
     assert result.returncode == 0, result.stderr
     assert "loses: " in result.stdout or "ridge" in result.stdout
     written = {path.name for path in (tmp_path / "learned").iterdir()}
-    documents = {"report.md", "report.csv", "report.tex", "report.html", "report.png", "card.md"}
+    documents = {
+        "report.md",
+        "report.csv",
+        "report.tex",
+        "report.html",
+        "report.png",
+        "card.md",
+    }
     assert written == documents | {"model.safetensors", "progress.json"}
     card = (tmp_path / "learned" / "card.md").read_text()
     assert "What must not be trusted" in card
     assert "| thrust |" in card
-    wrong = forked("learn", "map.yaml", "0.csv", "1.csv", "--held-out", "7", cwd=tmp_path)
-    assert (wrong.returncode, wrong.stderr) == (2, "gpmpc: held_out: no such run '7'; there are 0, 1\n")
+    wrong = forked(
+        "learn", "map.yaml", "0.csv", "1.csv", "--held-out", "7", cwd=tmp_path
+    )
+    assert (wrong.returncode, wrong.stderr) == (
+        2,
+        "gpmpc: held_out: no such run '7'; there are 0, 1\n",
+    )

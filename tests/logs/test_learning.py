@@ -27,7 +27,9 @@ from gpmpc.logs._kinematics import rotation_quaternion
 from gpmpc.logs._learning import choose_rows
 from gpmpc.logs._log import Log, LogRun
 
-EXAMPLE = runpy.run_path(str(Path(__file__).resolve().parents[2] / "examples" / "own_log.py"))
+EXAMPLE = runpy.run_path(
+    str(Path(__file__).resolve().parents[2] / "examples" / "own_log.py")
+)
 MAPPING = LogMapping.from_dict(EXAMPLE["MAPPING"])
 FORCE_ONLY = (20, 20, 20, 0, 0, 0)
 
@@ -36,11 +38,20 @@ def as_log(tables, gaps=()):
     """A log of simulated flights, with rows left out."""
     runs = []
     for number, table in enumerate(tables):
-        rows = np.setdiff1d(np.arange(len(table)), [row + i for row in gaps for i in range(30)])
+        rows = np.setdiff1d(
+            np.arange(len(table)), [row + i for row in gaps for i in range(30)]
+        )
         values = table.to_numpy()[rows]
         begins = (0, *(np.flatnonzero(np.diff(rows) > 1) + 1).tolist())
         runs.append(
-            LogRun(f"flight {number}", values[:, 0], values[:, 1:14], values[:, 14:], np.empty((len(rows), 0)), begins)
+            LogRun(
+                f"flight {number}",
+                values[:, 0],
+                values[:, 1:14],
+                values[:, 14:],
+                np.empty((len(rows), 0)),
+                begins,
+            )
         )
     return Log(MAPPING, 0.01, tuple(runs))
 
@@ -54,17 +65,29 @@ def test_the_outputs_of_a_rigid_body_are_those_that_moved_it():
     rng = np.random.default_rng(0)
     body = RigidBody(MAPPING.space)
     states = np.hstack(
-        [rng.normal(size=(40, 3)), rotation_quaternion(rng.normal(size=(40, 3))), rng.normal(size=(40, 6))]
+        [
+            rng.normal(size=(40, 3)),
+            rotation_quaternion(rng.normal(size=(40, 3))),
+            rng.normal(size=(40, 6)),
+        ]
     )
     outputs = rng.normal(size=(40, 6)) * 5
-    np.testing.assert_allclose(body.outputs(states, body.step(states, outputs, 0.01), 0.01), outputs, atol=1e-9)
+    np.testing.assert_allclose(
+        body.outputs(states, body.step(states, outputs, 0.01), 0.01), outputs, atol=1e-9
+    )
     free = body.coast(states, 0.3)
-    np.testing.assert_allclose(body.space.difference(free, states)[:, 3:6], 0.3 * states[:, 10:13], atol=1e-9)
+    np.testing.assert_allclose(
+        body.space.difference(free, states)[:, 3:6], 0.3 * states[:, 10:13], atol=1e-9
+    )
 
 
-def test_parameters_come_back_from_rollouts_within_their_standard_errors_also_with_outliers(flights):
+def test_parameters_come_back_from_rollouts_within_their_standard_errors_also_with_outliers(
+    flights,
+):
     log = as_log(flights, gaps=(700,))
-    model = LogModel(RigidBody(log.space), MultirotorNominal(4, torque=True), np.empty(0), FORCE_ONLY)
+    model = LogModel(
+        RigidBody(log.space), MultirotorNominal(4, torque=True), np.empty(0), FORCE_ONLY
+    )
     truth = {"drag_xy": EXAMPLE["DRAG"], "torque_x1": 30.0, "torque_y2": -30.0}
     spoiled = [flight.copy() for flight in flights]
     for flight in spoiled:
@@ -73,24 +96,36 @@ def test_parameters_come_back_from_rollouts_within_their_standard_errors_also_wi
         fit = fit_nominal(model, None, data, steps=20)
         found = {name: (value, error) for name, value, error in fit.to_rows()}
         for name, value in truth.items():
-            assert abs(found[name][0] - value) < 4 * found[name][1] + 0.05 * abs(value), (name, found[name])
+            assert abs(found[name][0] - value) < 4 * found[name][1] + 0.05 * abs(
+                value
+            ), (name, found[name])
         assert 0 < found["torque_x1"][1] < 5
 
 
-def test_learning_chooses_the_motors_finds_the_noise_and_beats_what_costs_nothing(flights):
+def test_learning_chooses_the_motors_finds_the_noise_and_beats_what_costs_nothing(
+    flights,
+):
     log = as_log(flights, gaps=(500,))
     train, held_out = log.split(["flight 2"])
     learned = learn(train, points=20, steps=20)
     (chosen,) = [candidate for candidate in learned.candidates if candidate.chosen]
     assert "motor torque" in chosen.name
     judgement = judge(learned, held_out, train, steps=(1, 10, 20))
-    assert not [loss for loss in judgement.losses if " 1 steps" not in loss and "ridge" not in loss]
+    assert not [
+        loss
+        for loss in judgement.losses
+        if " 1 steps" not in loss and "ridge" not in loss
+    ]
     assert np.all((judgement.coverage[1:] > 0.9) & (judgement.coverage[1:] < 0.985))
     assert np.all((judgement.width[1:] > 0.8) & (judgement.width[1:] < 1.3))
     table = judgement.to_pandas()
     assert set(table["unit"]) == {"m", "rad", "m/s", "rad/s"}
-    truth = np.repeat([EXAMPLE["FORCE_NOISE"], EXAMPLE["TORQUE_NOISE"]], 3)  # of every output, though headings vary
-    np.testing.assert_allclose(np.sqrt(learned.noise.outputs.sum(axis=0)), truth, rtol=0.1)
+    truth = np.repeat(
+        [EXAMPLE["FORCE_NOISE"], EXAMPLE["TORQUE_NOISE"]], 3
+    )  # of every output, though headings vary
+    np.testing.assert_allclose(
+        np.sqrt(learned.noise.outputs.sum(axis=0)), truth, rtol=0.1
+    )
 
 
 def pendulum_log(friction, rows=900, seed=0, noise=0.02):
@@ -101,18 +136,32 @@ def pendulum_log(friction, rows=900, seed=0, noise=0.02):
         torques = np.repeat(rng.uniform(-8, 8, rows // 10), 10)
         for u in torques:
             table.append((*x, u))
-            x = x + 0.02 * np.array([x[1], u - friction(x)]) + rng.normal(0, noise, 2) * [0, 1]
+            x = (
+                x
+                + 0.02 * np.array([x[1], u - friction(x)])
+                + rng.normal(0, noise, 2) * [0, 1]
+            )
         table = np.array(table)
         time = 0.02 * np.arange(rows)
-        runs.append(LogRun(f"run {number}", time, table[:, :2], table[:, 2:], np.empty((rows, 0))))
-    mapping = LogMapping.from_dict({"states": {"angle": ["angle"], "rate": ["rate"]}, "inputs": {"torque": ["u"]}})
+        runs.append(
+            LogRun(
+                f"run {number}", time, table[:, :2], table[:, 2:], np.empty((rows, 0))
+            )
+        )
+    mapping = LogMapping.from_dict(
+        {"states": {"angle": ["angle"], "rate": ["rate"]}, "inputs": {"torque": ["u"]}}
+    )
     return Log(mapping, 0.02, tuple(runs))
 
 
 def test_an_output_keeps_its_gp_only_where_held_out_rollouts_get_better():
-    curved = learn(pendulum_log(lambda x: 9 * np.sin(x[0]) + 0.5 * x[1]), points=60, steps=20)
+    curved = learn(
+        pendulum_log(lambda x: 9 * np.sin(x[0]) + 0.5 * x[1]), points=60, steps=20
+    )
     assert [gp.outputs for gp in curved.model.gps][-1] == (1,)
-    linear = learn(pendulum_log(lambda x: 4 * x[0] + 0.5 * x[1], noise=0.1), points=60, steps=20)
+    linear = learn(
+        pendulum_log(lambda x: 4 * x[0] + 0.5 * x[1], noise=0.1), points=60, steps=20
+    )
     assert not linear.model.gps
     (chosen,) = [candidate.name for candidate in linear.candidates if candidate.chosen]
     assert chosen == "increments, least squares"
@@ -123,9 +172,13 @@ def test_a_model_that_loses_to_a_baseline_is_called_so():
     train, held_out = log.split(["run 2"])
     learned = learn(train, points=60, steps=20)
     assert not judge(learned, held_out, train, steps=(1, 10)).losses
-    wrong = replace(learned, model=replace(learned.model, theta=-learned.model.theta, gps=()))
+    wrong = replace(
+        learned, model=replace(learned.model, theta=-learned.model.theta, gps=())
+    )
     losses = judge(wrong, held_out, train, steps=(1, 10)).losses
-    assert any("rate 10 steps ahead" in loss and "constant state" in loss for loss in losses)
+    assert any(
+        "rate 10 steps ahead" in loss and "constant state" in loss for loss in losses
+    )
 
 
 def test_a_model_is_the_same_after_saving_and_damage_is_named(tmp_path):
@@ -137,11 +190,18 @@ def test_a_model_is_the_same_after_saving_and_damage_is_named(tmp_path):
     loaded = load_learned(tmp_path / "model.safetensors")
     windows = log.windows(20, 20, 100)
     expected = learned.model.rollout(windows)
-    np.testing.assert_allclose(loaded.model.rollout(windows), expected, rtol=0, atol=1e-9)
-    variances = [error_variances(one.model, windows, one.noise, (1, 20)) for one in (learned, loaded)]
+    np.testing.assert_allclose(
+        loaded.model.rollout(windows), expected, rtol=0, atol=1e-9
+    )
+    variances = [
+        error_variances(one.model, windows, one.noise, (1, 20))
+        for one in (learned, loaded)
+    ]
     np.testing.assert_allclose(*variances, rtol=1e-6)
     assert [c.name for c in loaded.candidates] == [c.name for c in learned.candidates]
-    (tmp_path / "cut.safetensors").write_bytes((tmp_path / "model.safetensors").read_bytes()[:-100])
+    (tmp_path / "cut.safetensors").write_bytes(
+        (tmp_path / "model.safetensors").read_bytes()[:-100]
+    )
     with pytest.raises(DataError, match="damaged"):
         load_learned(tmp_path / "cut.safetensors")
     # What an earlier call has gone through is not done again, and changes nothing.
@@ -151,8 +211,13 @@ def test_a_model_is_the_same_after_saving_and_damage_is_named(tmp_path):
 
 def test_the_same_rows_in_pieces_of_one_run_or_another_log_give_the_same_model(flights):
     one = as_log(flights[:2], gaps=(700,))
-    other = replace(one, runs=tuple(replace(run, time=run.time + 100 * (run.time > 7)) for run in one))
-    model = LogModel(RigidBody(one.space), MultirotorNominal(4), np.empty(0), FORCE_ONLY)
+    other = replace(
+        one,
+        runs=tuple(replace(run, time=run.time + 100 * (run.time > 7)) for run in one),
+    )
+    model = LogModel(
+        RigidBody(one.space), MultirotorNominal(4), np.empty(0), FORCE_ONLY
+    )
     fits = [fit_nominal(model, None, log, steps=10).model.theta for log in (one, other)]
     np.testing.assert_allclose(*fits, rtol=0, atol=1e-9)
 
@@ -162,25 +227,44 @@ def test_learning_is_the_same_whatever_marks_a_gap(tmp_path):
     tables = {way: [] for way in ("missing", "empty", "jump")}
     for run in pendulum_log(lambda x: 9 * np.sin(x[0]) + 0.5 * x[1], rows=300):
         table = pandas.DataFrame(
-            np.column_stack([run.time, run.states, run.inputs]), columns=["t", "angle", "rate", "u"]
+            np.column_stack([run.time, run.states, run.inputs]),
+            columns=["t", "angle", "rate", "u"],
         )
         gap = table.index.isin(range(120, 150))
         tables["missing"].append(table[~gap])
         tables["empty"].append(table.assign(rate=table["rate"].where(~gap)))
-        tables["jump"].append(table[~gap].assign(t=table["t"] + 100.0 * (table.index >= 150)))
+        tables["jump"].append(
+            table[~gap].assign(t=table["t"] + 100.0 * (table.index >= 150))
+        )
     found = []
     for way, runs in tables.items():
         files = [tmp_path / f"{number}.csv" for number in range(3)]
         for file, table in zip(files, runs, strict=True):
             table.to_csv(file, index=False)
-        mapping = {"time": "t", "states": {"angle": ["angle"], "rate": ["rate"]}, "inputs": {"torque": ["u"]}}
+        mapping = {
+            "time": "t",
+            "states": {"angle": ["angle"], "rate": ["rate"]},
+            "inputs": {"torque": ["u"]},
+        }
         log = read_log(files, mapping)
         assert [run.begins for run in log] == [(0, 120)] * 3, way
         learned = learn(log, points=30, steps=10)
         noise = learned.noise
-        numbers = [learned.model.theta, *(c.errors for c in learned.candidates), noise.outputs, noise.measurement]
+        numbers = [
+            learned.model.theta,
+            *(c.errors for c in learned.candidates),
+            noise.outputs,
+            noise.measurement,
+        ]
         windows = log.windows(10, 20, 50)
-        found.append(np.concatenate([a.ravel() for a in (*numbers, learned.model.rollout(windows), windows.inputs)]))
+        found.append(
+            np.concatenate(
+                [
+                    a.ravel()
+                    for a in (*numbers, learned.model.rollout(windows), windows.inputs)
+                ]
+            )
+        )
     np.testing.assert_allclose(found[1], found[0], rtol=1e-6, atol=1e-9)
     np.testing.assert_allclose(found[2], found[0], rtol=1e-6, atol=1e-9)
 
@@ -189,16 +273,23 @@ def test_intervals_follow_a_rougher_run_and_never_its_future(flights):
     windows = as_log(flights[:2]).windows(20, 20, 2)
     rng = np.random.default_rng(0)
     rough = np.where(windows.runs == 1, 3.0, 1.0)[:, None, None]
-    errors, claimed = rough * rng.normal(size=(len(windows), 2, 12)), np.ones((len(windows), 2, 12))
+    errors, claimed = (
+        rough * rng.normal(size=(len(windows), 2, 12)),
+        np.ones((len(windows), 2, 12)),
+    )
     scaled = follow_errors(windows, errors, claimed, (10, 20))
     late = windows.times > 2
     for run, std in ((0, 1.0), (1, 3.0)):
         found = np.sqrt(scaled[late & (windows.runs == run)].mean(axis=(0, 2)))
         np.testing.assert_allclose(found, std, rtol=0.1)
-    np.testing.assert_array_equal(scaled[windows.times < 0.3][:, 1], 1.0)  # no prediction of 20 steps is over
+    np.testing.assert_array_equal(
+        scaled[windows.times < 0.3][:, 1], 1.0
+    )  # no prediction of 20 steps is over
     changed = errors * np.where(windows.times > 5, 9.0, 1.0)[:, None, None]
     known = windows.times <= 5
-    np.testing.assert_array_equal(follow_errors(windows, changed, claimed, (10, 20))[known], scaled[known])
+    np.testing.assert_array_equal(
+        follow_errors(windows, changed, claimed, (10, 20))[known], scaled[known]
+    )
 
 
 def test_chosen_rows_cover_what_is_rare():
@@ -211,7 +302,9 @@ def test_chosen_rows_cover_what_is_rare():
 
 def test_misuse_is_named(flights):
     log = as_log(flights[:1])
-    model = LogModel(RigidBody(log.space), MultirotorNominal(4), np.empty(0), FORCE_ONLY)
+    model = LogModel(
+        RigidBody(log.space), MultirotorNominal(4), np.empty(0), FORCE_ONLY
+    )
     with pytest.raises(ShapeError, match="theta0 must have 6 entries"):
         fit_nominal(model, np.zeros(3), log)
     with pytest.raises(DataError, match="the longest has 1500"):
@@ -233,10 +326,23 @@ def test_real_flights_are_predicted_better_than_by_anything_that_costs_nothing()
         "states": {
             "position": {"columns": ["px", "py", "pz"], "unit": "m"},
             "attitude": {"columns": ["qx", "qy", "qz", "qw"], "kind": "quaternion"},
-            "velocity": {"columns": ["vx", "vy", "vz"], "unit": "m/s", "frame": "world"},
-            "rate": {"columns": [f"w{axis}_vicon" for axis in "xyz"], "unit": "rad/s", "frame": "body"},
+            "velocity": {
+                "columns": ["vx", "vy", "vz"],
+                "unit": "m/s",
+                "frame": "world",
+            },
+            "rate": {
+                "columns": [f"w{axis}_vicon" for axis in "xyz"],
+                "unit": "rad/s",
+                "frame": "body",
+            },
         },
-        "inputs": {"motors": {"columns": [f"motor_motor_m{i}" for i in range(1, 5)], "scale": 1 / 65535}},
+        "inputs": {
+            "motors": {
+                "columns": [f"motor_motor_m{i}" for i in range(1, 5)],
+                "scale": 1 / 65535,
+            }
+        },
         "context": {"battery": {"columns": ["pwr_pm_vbat"], "unit": "V"}},
     }
     log = read_log(sorted(Path(FLIGHTS).glob("*.csv.gz")), mapping)

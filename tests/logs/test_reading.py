@@ -13,7 +13,10 @@ from gpmpc.logs._kinematics import StateGroup, StateSpace, rotate, rotation_quat
 
 PENDULUM = {
     "time": {"column": "t"},
-    "states": {"angle": {"columns": ["angle"], "unit": "rad"}, "rate": {"columns": ["rate"], "unit": "rad/s"}},
+    "states": {
+        "angle": {"columns": ["angle"], "unit": "rad"},
+        "rate": {"columns": ["rate"], "unit": "rad/s"},
+    },
     "inputs": {"torque": {"columns": ["torque"], "unit": "N m"}},
 }
 BODY = {
@@ -21,7 +24,11 @@ BODY = {
     "model": "rigid_body",
     "states": {
         "position": {"columns": ["px", "py", "pz"], "unit": "m"},
-        "attitude": {"columns": ["roll", "pitch", "yaw"], "kind": "euler", "unit": "rad"},
+        "attitude": {
+            "columns": ["roll", "pitch", "yaw"],
+            "kind": "euler",
+            "unit": "rad",
+        },
         "velocity": {"columns": ["vx", "vy", "vz"], "unit": "m/s", "frame": "world"},
         "rate": {"columns": ["wx", "wy", "wz"], "unit": "rad/s", "frame": "body"},
     },
@@ -46,13 +53,37 @@ _NAMES = "px,py,pz,roll,pitch,yaw,vx,vy,vz,wx,wy,wz,u".split(",")  # noqa: SIM90
 def body_table(rows=300):
     """A body that turns about all axes along a curve, at 100 Hz."""
     t = 0.01 * np.arange(rows)
-    euler = np.column_stack([0.5 * np.sin(2 * t), 0.4 * np.cos(3 * t), 0.9 * np.sin(1.5 * t)])
+    euler = np.column_stack(
+        [0.5 * np.sin(2 * t), 0.4 * np.cos(3 * t), 0.9 * np.sin(1.5 * t)]
+    )
     p = np.column_stack([np.sin(2 * t), np.cos(1.5 * t), 1 + 0.3 * np.sin(3 * t)])
     (r, q, _), (dr, dq, dy) = euler.T, np.gradient(euler, 0.01, axis=0).T
-    w = [dr - dy * np.sin(q), dq * np.cos(r) + dy * np.sin(r) * np.cos(q), -dq * np.sin(r) + dy * np.cos(r) * np.cos(q)]
-    columns = np.column_stack([t, p, euler, np.gradient(p, 0.01, axis=0), np.transpose(w), np.sin(9 * t)])
+    w = [
+        dr - dy * np.sin(q),
+        dq * np.cos(r) + dy * np.sin(r) * np.cos(q),
+        -dq * np.sin(r) + dy * np.cos(r) * np.cos(q),
+    ]
+    columns = np.column_stack(
+        [t, p, euler, np.gradient(p, 0.01, axis=0), np.transpose(w), np.sin(9 * t)]
+    )
     return pandas.DataFrame(
-        columns, columns=["t", "px", "py", "pz", "roll", "pitch", "yaw", "vx", "vy", "vz", "wx", "wy", "wz", "u"]
+        columns,
+        columns=[
+            "t",
+            "px",
+            "py",
+            "pz",
+            "roll",
+            "pitch",
+            "yaw",
+            "vx",
+            "vy",
+            "vz",
+            "wx",
+            "wy",
+            "wz",
+            "u",
+        ],
     )
 
 
@@ -62,7 +93,10 @@ def written(folder, table, name="log.csv"):
 
 
 def changed(mapping, role, signal, **values):
-    return {**mapping, role: {**mapping[role], signal: {**mapping[role][signal], **values}}}
+    return {
+        **mapping,
+        role: {**mapping[role], signal: {**mapping[role][signal], **values}},
+    }
 
 
 def kinds(log):
@@ -72,11 +106,21 @@ def kinds(log):
 def test_no_transition_or_window_goes_over_a_gap(tmp_path):
     table = pendulum_table()
     with_gaps = table.drop(index=[*range(100, 115), 200, *range(301, 303)])
-    log, whole = (read_log(written(tmp_path, t, f"{len(t)}.csv"), PENDULUM) for t in (with_gaps, table))
+    log, whole = (
+        read_log(written(tmp_path, t, f"{len(t)}.csv"), PENDULUM)
+        for t in (with_gaps, table)
+    )
     assert [len(run.begins) for run in (*log, *whole)] == [4, 1]
     assert kinds(log) == {"gap": 3}
-    steps = {tuple(row) for row in np.hstack([whole.transitions().features, whole.transitions().next_states]).tolist()}
-    rows = np.hstack([log.transitions().features, log.transitions().next_states]).tolist()
+    steps = {
+        tuple(row)
+        for row in np.hstack(
+            [whole.transitions().features, whole.transitions().next_states]
+        ).tolist()
+    }
+    rows = np.hstack(
+        [log.transitions().features, log.transitions().next_states]
+    ).tolist()
     assert len(rows) == len(with_gaps) - 4
     assert all(tuple(row) in steps for row in rows)
     assert sum(len(episode) for episode in log.episodes()) == len(rows)
@@ -88,12 +132,17 @@ def test_no_transition_or_window_goes_over_a_gap(tmp_path):
 def test_a_resampled_log_has_the_same_rows_whenever_its_clock_began(tmp_path):
     table = pendulum_table(100)
     first, later = (
-        read_log(written(tmp_path, table.assign(t=table["t"] + begin), f"{begin}.csv"), {**PENDULUM, "rate": 40})
+        read_log(
+            written(tmp_path, table.assign(t=table["t"] + begin), f"{begin}.csv"),
+            {**PENDULUM, "rate": 40},
+        )
         for begin in (0, 4096)
     )
     assert len(first) == len(later) == 80  # of 1.98 s, with both ends
     assert kinds(first) == kinds(later) == {}
-    np.testing.assert_allclose(later.runs[0].states, first.runs[0].states, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(
+        later.runs[0].states, first.runs[0].states, rtol=0, atol=1e-9
+    )
 
 
 def test_every_kind_of_file_gives_the_same_log(tmp_path):
@@ -104,7 +153,9 @@ def test_every_kind_of_file_gives_the_same_log(tmp_path):
     np.savez(tmp_path / "a.npz", **{name: table[name].to_numpy() for name in table})
     for name in ("a.csv.gz", "a.parquet", "a.npz"):
         other = read_log(tmp_path / name, PENDULUM)
-        np.testing.assert_allclose(other.runs[0].states, log.runs[0].states, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(
+            other.runs[0].states, log.runs[0].states, rtol=0, atol=1e-12
+        )
         np.testing.assert_array_equal(other.runs[0].inputs, log.runs[0].inputs)
 
 
@@ -113,7 +164,10 @@ def test_runs_are_told_apart_by_file_or_by_column_and_splits_are_by_run(tmp_path
     files = [written(tmp_path, one, "one.csv"), written(tmp_path, other, "other.csv")]
     log = read_log(files, PENDULUM)
     train, held_out = log.split(["other"])
-    assert ([run.name for run in train], [run.name for run in held_out]) == (["one"], ["other"])
+    assert ([run.name for run in train], [run.name for run in held_out]) == (
+        ["one"],
+        ["other"],
+    )
     both = pandas.concat([one.assign(flight="a"), other.assign(flight="b")])
     log = read_log(written(tmp_path, both), {**PENDULUM, "run": "flight"})
     assert [len(run) for run in log] == [100, 120]
@@ -127,7 +181,11 @@ def test_stamps_that_repeat_or_run_backwards_are_counted_and_left_out(tmp_path):
     table.loc[[100, 101], "t"] -= 0.5
     log = read_log(written(tmp_path, table), PENDULUM)
     found = kinds(log)
-    assert (found["repeated stamp"], found["stamp runs backwards"], len(log)) == (1, 2, 397)
+    assert (found["repeated stamp"], found["stamp runs backwards"], len(log)) == (
+        1,
+        2,
+        397,
+    )
     table["t"] = table["t"] % 2.0
     with pytest.raises(DataError, match="time runs backwards in row 101"):
         read_log(written(tmp_path, table), PENDULUM)
@@ -146,11 +204,17 @@ def test_resampling_interpolates_states_holds_inputs_and_leaves_gaps_open(tmp_pa
     table = pendulum_table(4000)
     rng = np.random.default_rng(0)
     t = table["t"] + rng.uniform(-0.004, 0.004, len(table))
-    jittered = pandas.DataFrame({"t": t, "angle": np.sin(t), "rate": np.cos(t), "torque": np.floor(t)})
+    jittered = pandas.DataFrame(
+        {"t": t, "angle": np.sin(t), "rate": np.cos(t), "torque": np.floor(t)}
+    )
     jittered = jittered.drop(index=range(1000, 1030))
-    log = read_log(written(tmp_path, jittered), {**PENDULUM, "rate": 50, "max_gap": 0.05})
+    log = read_log(
+        written(tmp_path, jittered), {**PENDULUM, "rate": 50, "max_gap": 0.05}
+    )
     (run,) = log
-    np.testing.assert_allclose(run.states, np.column_stack([np.sin(run.time), np.cos(run.time)]), atol=1e-4)
+    np.testing.assert_allclose(
+        run.states, np.column_stack([np.sin(run.time), np.cos(run.time)]), atol=1e-4
+    )
     assert set(run.inputs[:, 0]) <= set(jittered["torque"])
     assert len(run.begins) == 2
     assert not ((run.time > 20.01) & (run.time < 20.58)).any()
@@ -158,12 +222,17 @@ def test_resampling_interpolates_states_holds_inputs_and_leaves_gaps_open(tmp_pa
 
 def test_a_sample_that_is_repeated_while_the_system_moves_is_no_measurement(tmp_path):
     table = body_table()
-    table.loc[[100, 101, 102], ["px", "py", "pz"]] = table.loc[99, ["px", "py", "pz"]].to_numpy(dtype=float)
+    table.loc[[100, 101, 102], ["px", "py", "pz"]] = table.loc[
+        99, ["px", "py", "pz"]
+    ].to_numpy(dtype=float)
     log = read_log(written(tmp_path, table), BODY)
     assert kinds(log) == {"held value": 3}
     assert len(log.runs[0].begins) == 2
     table = body_table().assign(
-        **{c: body_table()[c].iloc[np.arange(300) // 5 * 5].to_numpy() for c in ("px", "py", "pz")}
+        **{
+            c: body_table()[c].iloc[np.arange(300) // 5 * 5].to_numpy()
+            for c in ("px", "py", "pz")
+        }
     )
     with pytest.raises(DataError, match=r"position changes in \d+ of 300 rows only"):
         read_log(written(tmp_path, table), BODY)
@@ -171,7 +240,9 @@ def test_a_sample_that_is_repeated_while_the_system_moves_is_no_measurement(tmp_
 
 def test_parts_at_rest_are_left_out_unless_asked_for(tmp_path):
     table = pendulum_table(600)
-    rest = pandas.DataFrame({"t": 0.02 * np.arange(211), "angle": 0.3, "rate": 0.0, "torque": 0.0})
+    rest = pandas.DataFrame(
+        {"t": 0.02 * np.arange(211), "angle": 0.3, "rate": 0.0, "torque": 0.0}
+    )
     both = pandas.concat([rest, table.assign(t=table["t"] + 4.22)])
     log = read_log(written(tmp_path, both), PENDULUM)
     assert 195 <= kinds(log)["at rest"] <= 211
@@ -185,11 +256,20 @@ def test_a_quaternion_whose_sign_flips_is_the_attitude_that_it_is(tmp_path):
     q = Rotation.from_euler("ZYX", table[["yaw", "pitch", "roll"]].to_numpy()).as_quat()
     q[120:180] *= -1
     table[["qw", "qx", "qy", "qz"]] = q[:, [3, 0, 1, 2]]
-    quaternion = {"columns": ["qw", "qx", "qy", "qz"], "kind": "quaternion", "order": "wxyz"}
-    log = read_log(written(tmp_path, table), {**BODY, "states": {**BODY["states"], "attitude": quaternion}})
+    quaternion = {
+        "columns": ["qw", "qx", "qy", "qz"],
+        "kind": "quaternion",
+        "order": "wxyz",
+    }
+    log = read_log(
+        written(tmp_path, table),
+        {**BODY, "states": {**BODY["states"], "attitude": quaternion}},
+    )
     expected = read_log(written(tmp_path, table), BODY)
     assert kinds(log) == {"quaternion flips its sign": 2}
-    np.testing.assert_allclose(log.space.difference(log.runs[0].states, expected.runs[0].states), 0, atol=1e-12)
+    np.testing.assert_allclose(
+        log.space.difference(log.runs[0].states, expected.runs[0].states), 0, atol=1e-12
+    )
     assert np.abs(np.diff(log.runs[0].states[:, 3:7], axis=0)).max() < 0.1
 
 
@@ -201,25 +281,41 @@ def test_a_quaternion_whose_sign_flips_is_the_attitude_that_it_is(tmp_path):
             BODY,
             "velocity is 1e.03 times the derivative",
         ),
-        (lambda t: np.degrees(t[["roll", "pitch", "yaw"]]), BODY, r"reaches .* rad: are these degrees"),
+        (
+            lambda t: np.degrees(t[["roll", "pitch", "yaw"]]),
+            BODY,
+            r"reaches .* rad: are these degrees",
+        ),
         (
             lambda t: t,
             changed(BODY, "states", "attitude", unit="deg"),
             "rate is 5.* times .*is its unit right.*degrees for radians",
         ),
-        (lambda t: t, changed(BODY, "states", "rate", frame="world"), "in body axes .*, not in world axes"),
+        (
+            lambda t: t,
+            changed(BODY, "states", "rate", frame="world"),
+            "in body axes .*, not in world axes",
+        ),
         (
             lambda t: t.assign(px=2 * t.px, qx=t.px),
             changed(BODY, "states", "position", unit="mm"),
             "velocity is .* times",
         ),
         (lambda t: t.drop(columns="wy"), BODY, "column 'wy' is missing"),
-        (lambda t: t.assign(wy=["off", *t.wy[1:]]), BODY, "row 1, column 'wy' is 'off'"),
+        (
+            lambda t: t.assign(wy=["off", *t.wy[1:]]),
+            BODY,
+            "row 1, column 'wy' is 'off'",
+        ),
     ],
 )
 def test_what_contradicts_the_mapping_is_named(tmp_path, spoil, mapping, expected):
     table = body_table()
-    spoiled = table.assign(**dict(spoil(table).items())) if len(spoil(table).columns) == 3 else spoil(table)
+    spoiled = (
+        table.assign(**dict(spoil(table).items()))
+        if len(spoil(table).columns) == 3
+        else spoil(table)
+    )
     with pytest.raises(DataError, match=expected):
         read_log(written(tmp_path, spoiled), mapping)
 
@@ -234,7 +330,9 @@ def test_files_that_cannot_be_read_are_named(tmp_path):
     with pytest.raises(DataError, match="no such file"):
         read_log(tmp_path / "b.csv", PENDULUM)
     with pytest.raises(SettingError, match=r"states.angle.colums: no such key"):
-        read_log(tmp_path / "b.csv", {**PENDULUM, "states": {"angle": {"colums": ["angle"]}}})
+        read_log(
+            tmp_path / "b.csv", {**PENDULUM, "states": {"angle": {"colums": ["angle"]}}}
+        )
 
 
 def bag(path, rows=200):
@@ -249,7 +347,13 @@ def bag(path, rows=200):
             message = {"angle": np.sin(0.02 * k), "rate": [np.cos(0.02 * k), 0.0]}
             writer.write_message("/pose", pose, message, t, t)
             if k % 2:
-                writer.write_message("/torque", torque, {"torque": float(k % 7)}, t + 3_000_000, t + 3_000_000)
+                writer.write_message(
+                    "/torque",
+                    torque,
+                    {"torque": float(k % 7)},
+                    t + 3_000_000,
+                    t + 3_000_000,
+                )
         writer.finish()
 
 
@@ -269,13 +373,17 @@ def test_a_bag_of_several_topics_comes_to_one_grid(tmp_path):
     (run,) = read_log(tmp_path / "bag.mcap", BAG)
     seconds = run.time - 10
     np.testing.assert_allclose(run.states[:, 0], np.sin(seconds), atol=1e-4)
-    np.testing.assert_array_equal(run.inputs[:, 0], (np.floor((seconds - 0.023) / 0.04 + 1e-4) * 2 + 1) % 7)
+    np.testing.assert_array_equal(
+        run.inputs[:, 0], (np.floor((seconds - 0.023) / 0.04 + 1e-4) * 2 + 1) % 7
+    )
 
 
 def test_a_bag_without_the_topic_or_without_its_end_is_named(tmp_path):
     bag(tmp_path / "bag.mcap")
     with pytest.raises(DataError, match="topic '/force' is missing; it has"):
-        read_log(tmp_path / "bag.mcap", changed(BAG, "inputs", "torque", topic="/force"))
+        read_log(
+            tmp_path / "bag.mcap", changed(BAG, "inputs", "torque", topic="/force")
+        )
     (tmp_path / "cut.mcap").write_bytes((tmp_path / "bag.mcap").read_bytes()[:-3000])
     with pytest.raises(DataError, match=r"cut.mcap.*cannot be read to its end"):
         read_log(tmp_path / "cut.mcap", BAG)
@@ -286,7 +394,9 @@ def ulog(path, rows=100):
         return struct.pack("<Hc", len(body), kind) + body
 
     data = b"ULog\x01\x12\x35\x01" + struct.pack("<Q", 0) + message(b"B", bytes(40))
-    data += message(b"F", b"arm:uint64_t timestamp;float angle;float rate;float torque;")
+    data += message(
+        b"F", b"arm:uint64_t timestamp;float angle;float rate;float torque;"
+    )
     data += message(b"A", struct.pack("<BH", 0, 0) + b"arm")
     for k in range(rows):
         row = (np.sin(k / 10), np.cos(k / 10), k % 5)
@@ -296,7 +406,10 @@ def ulog(path, rows=100):
 
 def test_a_px4_log_is_read(tmp_path):
     ulog(tmp_path / "flight.ulg")
-    topics = {role: {k: {**v, "topic": "arm"} for k, v in PENDULUM[role].items()} for role in ("states", "inputs")}
+    topics = {
+        role: {k: {**v, "topic": "arm"} for k, v in PENDULUM[role].items()}
+        for role in ("states", "inputs")
+    }
     (run,) = read_log(tmp_path / "flight.ulg", topics)
     assert len(run) == 100
     np.testing.assert_allclose(np.diff(run.time), 0.01, rtol=1e-6)
@@ -314,13 +427,21 @@ def test_differences_of_states_are_inverse_to_displacements_and_geodesic():
     rng = np.random.default_rng(0)
     error = rng.uniform(-1.5, 1.5, (50, space.error_dim))
     state = np.hstack(
-        [rng.normal(size=(50, 2)), rng.uniform(-3, 3, (50, 1)), rotation_quaternion(rng.normal(size=(50, 3)))]
+        [
+            rng.normal(size=(50, 2)),
+            rng.uniform(-3, 3, (50, 1)),
+            rotation_quaternion(rng.normal(size=(50, 3))),
+        ]
     )
     moved = space.displace(state, error)
     np.testing.assert_allclose(space.difference(moved, state), error, atol=1e-12)
     moved[:, 3:] *= -1
     np.testing.assert_allclose(space.difference(moved, state), error, atol=1e-12)
-    np.testing.assert_allclose(space.distances(error)[:, 2], np.linalg.norm(error[:, 3:], axis=1))
     np.testing.assert_allclose(
-        rotate(rotation_quaternion(np.array([0, 0, np.pi / 2])), np.array([1.0, 0, 0])), [0, 1, 0], atol=1e-12
+        space.distances(error)[:, 2], np.linalg.norm(error[:, 3:], axis=1)
+    )
+    np.testing.assert_allclose(
+        rotate(rotation_quaternion(np.array([0, 0, np.pi / 2])), np.array([1.0, 0, 0])),
+        [0, 1, 0],
+        atol=1e-12,
     )

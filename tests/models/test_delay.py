@@ -22,7 +22,9 @@ def gp(n=2, m=1, size=25):
     ones = torch.ones(n, dtype=F)
     scales = 1 + draw(3, n, n + m).abs()
     targets = 0.3 * draw(2, size, n)
-    return GPPosterior.from_hyperparameters(draw(1, size, n + m), targets, scales, ones, 0.01 * ones, m, "difference")
+    return GPPosterior.from_hyperparameters(
+        draw(1, size, n + m), targets, scales, ones, 0.01 * ones, m, "difference"
+    )
 
 
 @pytest.mark.parametrize("m", [1, 2])
@@ -34,7 +36,10 @@ def test_a_delayed_model_is_a_model(delay, m):
 @pytest.mark.parametrize("delay", [1, 3])
 def test_an_input_acts_as_many_steps_later_as_the_delay_is(delay):
     model, inner, inputs = DelayedModel(gp(), delay), gp(), draw(5, 8, 1)
-    z, x = model.augmented(Gaussian.certain(torch.zeros(2)), np.zeros((delay, 1))).mean, torch.zeros(2)
+    z, x = (
+        model.augmented(Gaussian.certain(torch.zeros(2)), np.zeros((delay, 1))).mean,
+        torch.zeros(2),
+    )
     for k in range(8):
         z = model.predict(z, inputs[k]).mean
         x = inner.predict(x, inputs[k - delay] if k >= delay else torch.zeros(1)).mean
@@ -42,8 +47,16 @@ def test_an_input_acts_as_many_steps_later_as_the_delay_is(delay):
 
 
 def test_a_fraction_of_a_step_mixes_the_two_inputs_that_act_in_it():
-    class Integrator(torch.nn.Module):  # the exact answer is the mean of the input over the step
-        state_dim, input_dim, output_dim, dtype, device = 1, 1, 1, F, torch.device("cpu")
+    class Integrator(
+        torch.nn.Module
+    ):  # the exact answer is the mean of the input over the step
+        state_dim, input_dim, output_dim, dtype, device = (
+            1,
+            1,
+            1,
+            F,
+            torch.device("cpu"),
+        )
         noise_covariance = torch.zeros(1, 1, dtype=F)
 
         def predict(self, state, input):
@@ -56,16 +69,23 @@ def test_a_fraction_of_a_step_mixes_the_two_inputs_that_act_in_it():
 
 
 @pytest.mark.parametrize("delay", [1, 3, 0.6, 2.3])
-def test_looking_ahead_is_what_the_delayed_model_does_with_the_inputs_on_their_way(delay):
+def test_looking_ahead_is_what_the_delayed_model_does_with_the_inputs_on_their_way(
+    delay,
+):
     model, propagator = DelayedModel(gp(), delay), Linearization(process_noise=True)
-    queue, now = 0.5 * draw(6, model.pending, 1), Gaussian(torch.tensor([0.1, -0.2]), 0.01 * torch.eye(2, dtype=F))
+    queue, now = (
+        0.5 * draw(6, model.pending, 1),
+        Gaussian(torch.tensor([0.1, -0.2]), 0.01 * torch.eye(2, dtype=F)),
+    )
     ahead, whole = model.ahead(propagator, now, queue), model.augmented(now, queue)
     next_input = torch.zeros(1, dtype=F)
     for _ in range(model.lead):
         whole = propagator(model, whole, next_input)
     n = model.remaining.state_dim
     assert torch.allclose(ahead.mean[:2], whole.mean[:2], atol=1e-10)
-    assert torch.allclose(ahead.covariance[:2, :2], whole.covariance[:2, :2], atol=1e-10)
+    assert torch.allclose(
+        ahead.covariance[:2, :2], whole.covariance[:2, :2], atol=1e-10
+    )
     if delay % 1:
         assert n == 3
         assert float(ahead.mean[2]) == float(queue[-1])
@@ -76,7 +96,9 @@ def test_disturbance_states_are_a_model_and_move_as_sampling_says():
     model = DisturbedModel(gp(), effect, [0.1, 0.2], [1.0, 0.8])
     check_model(model)
     check_model(DelayedModel(model, 1.5))
-    prior = model.augmented(Gaussian(0.1 * draw(1, 2), 0.01 * torch.eye(2, dtype=F)), [0.3, 0.1])
+    prior = model.augmented(
+        Gaussian(0.1 * draw(1, 2), 0.01 * torch.eye(2, dtype=F)), [0.3, 0.1]
+    )
     found = Linearization(process_noise=True)(model, prior, torch.zeros(1))
     sampled = MonteCarlo(50_000, process_noise=True)(model, prior, torch.zeros(1))
     assert torch.allclose(found.mean, sampled.mean, atol=1e-2)

@@ -14,7 +14,14 @@ from gpmpc.exceptions import DataError, SettingError, ShapeError, UnsupportedMod
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior, Trainer, Transitions
 from gpmpc.gp.casadi_ import casadi_function, successor_function
-from gpmpc.models import Affine, CasadiFunction, Lags, ResidualModel, load_model, save_model
+from gpmpc.models import (
+    Affine,
+    CasadiFunction,
+    Lags,
+    ResidualModel,
+    load_model,
+    save_model,
+)
 from gpmpc.propagation import Linearization, MomentMatching, MonteCarlo, Unscented
 from gpmpc.testing import check_model
 
@@ -27,7 +34,9 @@ def draw(seed, *shape):
 
 def pendulum(x, u, damping=0.2):
     """Angle and rate [rad, rad/s] after a step, with a torque on it."""
-    turn = x[..., 1] + STEP * (-9.81 * x[..., 0].sin() - damping * x[..., 1] + u[..., 0])
+    turn = x[..., 1] + STEP * (
+        -9.81 * x[..., 0].sin() - damping * x[..., 1] + u[..., 0]
+    )
     return torch.stack([x[..., 0] + STEP * turn, turn], dim=-1)
 
 
@@ -42,7 +51,9 @@ class Damped:
 def pendulum_in_casadi(damping=0.2):
     x, u = casadi.SX.sym("x", 2), casadi.SX.sym("u", 1)
     turn = x[1] + STEP * (-9.81 * casadi.sin(x[0]) - damping * x[1] + u)
-    return casadi.Function("pendulum", [x, u], [casadi.vertcat(x[0] + STEP * turn, turn)])
+    return casadi.Function(
+        "pendulum", [x, u], [casadi.vertcat(x[0] + STEP * turn, turn)]
+    )
 
 
 def rotation(x):
@@ -52,15 +63,31 @@ def rotation(x):
 
 def rotation_in_casadi():
     x = casadi.SX.sym("x", 2)
-    return casadi.Function("rotation", [x], [casadi.vertcat(casadi.sin(x[0]), 1 + 0.5 * casadi.cos(x[0]))])
+    return casadi.Function(
+        "rotation", [x], [casadi.vertcat(casadi.sin(x[0]), 1 + 0.5 * casadi.cos(x[0]))]
+    )
 
 
 def every_operation():
     """An effect that no path leads to, of each operation that a compiled loop knows."""
     x, c = casadi.SX.sym("x", 2), casadi
     a, b = 1 + x[0] ** 2, x[1]
-    first = c.sqrt(a) + c.log(a) * c.tan(b / 9) - c.atan2(b, a) + a**0.3 + a**b + c.fmin(a, b) * c.fmax(a, 1.5)
-    second = c.exp(-c.fabs(b)) + c.tanh(b) / a + c.atan(b) + 1 / a + 2 * b - c.sin(a) * c.cos(b)
+    first = (
+        c.sqrt(a)
+        + c.log(a) * c.tan(b / 9)
+        - c.atan2(b, a)
+        + a**0.3
+        + a**b
+        + c.fmin(a, b) * c.fmax(a, 1.5)
+    )
+    second = (
+        c.exp(-c.fabs(b))
+        + c.tanh(b) / a
+        + c.atan(b)
+        + 1 / a
+        + 2 * b
+        - c.sin(a) * c.cos(b)
+    )
     return c.Function("all", [x], [c.vertcat(first, second)])
 
 
@@ -74,18 +101,31 @@ def gp(n, m, k, size=25):
 
 def with_angles(n=4, B=None):
     B = torch.eye(n, dtype=F) if B is None else B
-    return ResidualModel(Affine.identity(n, 2), gp(5, 1, B.shape[1]), B, [3, 1, 0], [1], 2, angles=[0, 3])
+    return ResidualModel(
+        Affine.identity(n, 2), gp(5, 1, B.shape[1]), B, [3, 1, 0], [1], 2, angles=[0, 3]
+    )
 
 
 def with_effect(nominal=pendulum, effect=rotation):
-    return ResidualModel(nominal, gp(3, 0, 1), effect, [0, 1], [], 1, [0], noise=0.01 * torch.eye(2, dtype=F))
+    return ResidualModel(
+        nominal,
+        gp(3, 0, 1),
+        effect,
+        [0, 1],
+        [],
+        1,
+        [0],
+        noise=0.01 * torch.eye(2, dtype=F),
+    )
 
 
 MODELS = {
     "angles": with_angles,
     "fewer outputs": lambda: with_angles(B=draw(5, 4, 2)),
     "effect in torch": with_effect,
-    "all in CasADi": lambda: with_effect(CasadiFunction(pendulum_in_casadi()), CasadiFunction(rotation_in_casadi())),
+    "all in CasADi": lambda: with_effect(
+        CasadiFunction(pendulum_in_casadi()), CasadiFunction(rotation_in_casadi())
+    ),
 }
 
 
@@ -97,7 +137,9 @@ def test_a_model_with_features_is_a_model(name):
 def test_torch_and_casadi_give_the_same_expansion():
     x, u = draw(8, 6, 2).numpy(), draw(9, 6, 1).numpy()
     for ours, theirs in zip(
-        MODELS["effect in torch"]().linearize(x, u), MODELS["all in CasADi"]().linearize(x, u), strict=True
+        MODELS["effect in torch"]().linearize(x, u),
+        MODELS["all in CasADi"]().linearize(x, u),
+        strict=True,
     ):
         np.testing.assert_allclose(ours, theirs, atol=1e-12)
 
@@ -105,13 +147,17 @@ def test_torch_and_casadi_give_the_same_expansion():
 def test_a_turn_more_changes_nothing_and_a_column_that_is_left_out_neither():
     model, x, u = with_angles(), draw(8, 5, 4), draw(9, 5, 2)
     moved = model.predict(x, u)
-    turn = x + torch.tensor([2 * torch.pi, 0, 7.0, -4 * torch.pi])  # state 2 is not seen
+    turn = x + torch.tensor(
+        [2 * torch.pi, 0, 7.0, -4 * torch.pi]
+    )  # state 2 is not seen
     after = model.predict(turn, u)
     assert torch.allclose(after.mean - turn, moved.mean - x, atol=1e-12)
     assert torch.allclose(after.covariance, moved.covariance, atol=1e-12)
 
 
-@pytest.mark.parametrize("propagator", [Linearization(), Unscented()], ids=lambda p: type(p).__name__)
+@pytest.mark.parametrize(
+    "propagator", [Linearization(), Unscented()], ids=lambda p: type(p).__name__
+)
 @pytest.mark.parametrize("name", ["angles", "effect in torch"])
 def test_a_belief_moves_through_features_as_sampling_says(name, propagator):
     model = MODELS[name]()
@@ -132,7 +178,9 @@ def observed(rows=60, seed=0):
 
 def test_with_sine_and_cosine_a_pendulum_is_predicted_at_angles_that_were_never_seen():
     seen = observed()
-    model = ResidualModel.train(Affine.identity(2, 1), seen, angles=[0], trainer=Trainer(restarts=0))
+    model = ResidualModel.train(
+        Affine.identity(2, 1), seen, angles=[0], trainer=Trainer(restarts=0)
+    )
     x, u = observed(40, seed=5).states, observed(40, seed=5).inputs
     far = x + torch.tensor([6 * torch.pi, 0.0])
     error = (model.predict(far, u).mean - pendulum(far, u)).abs().max()
@@ -147,10 +195,19 @@ def test_an_effect_that_depends_on_the_state_is_learned():
     force = (0.5 * x[:, 1].sin())[:, None, None]
     noise = 1e-3 * draw(3, 60, 2)
     seen = Transitions(x, u, pendulum(x, u) + (rotation(x) * force)[..., 0] + noise)
-    model = ResidualModel.train(pendulum, seen, rotation, [1], [], trainer=Trainer(restarts=0))
+    model = ResidualModel.train(
+        pendulum, seen, rotation, [1], [], trainer=Trainer(restarts=0)
+    )
     speed = torch.linspace(-1.5, 1.5, 20)[:, None]
-    assert torch.allclose(model.residual.predict(speed).mean[:, 0], 0.5 * speed[:, 0].sin(), atol=3e-3)
-    assert 1e-8 < float(model.noise_covariance.diagonal().min()) < float(model.noise_covariance.diagonal().max()) < 1e-5
+    assert torch.allclose(
+        model.residual.predict(speed).mean[:, 0], 0.5 * speed[:, 0].sin(), atol=3e-3
+    )
+    assert (
+        1e-8
+        < float(model.noise_covariance.diagonal().min())
+        < float(model.noise_covariance.diagonal().max())
+        < 1e-5
+    )
 
 
 def test_lags_are_shifted_and_a_velocity_that_is_not_measured_is_found_in_them():
@@ -159,7 +216,9 @@ def test_lags_are_shifted_and_a_velocity_that_is_not_measured_is_found_in_them()
     data = lags.transitions(angles, inputs)
     assert data.states.tolist() == [[2, 1, 11, 10], [3, 2, 12, 11], [4, 3, 13, 12]]
     assert data.inputs.tolist() == [[12], [13], [14]]
-    shifted = lags.nominal(data.states, data.inputs)  # the learned part moves the first entry only
+    shifted = lags.nominal(
+        data.states, data.inputs
+    )  # the learned part moves the first entry only
     assert shifted[:, 1:].tolist() == data.next_states[:, 1:].tolist()
     x, u = [torch.tensor([0.5, 0.0], dtype=F)], draw(4, 150, 1)
     for k in range(150):
@@ -167,7 +226,9 @@ def test_lags_are_shifted_and_a_velocity_that_is_not_measured_is_found_in_them()
     measured = torch.stack(x)[:, :1].numpy()
     lags = Lags(1, 1, states=1, inputs=1)
     seen = lags.transitions(measured[:100], u[:99].numpy())
-    model = ResidualModel.train(lags.nominal, seen, lags.B, angles=[0], trainer=Trainer(restarts=0))
+    model = ResidualModel.train(
+        lags.nominal, seen, lags.B, angles=[0], trainer=Trainer(restarts=0)
+    )
     held_out = lags.transitions(measured[100:], u[100:].numpy())
     moved = model.predict(held_out.states, held_out.inputs).mean
     assert float((moved - held_out.next_states).abs().max()) < 0.01
@@ -179,10 +240,16 @@ def test_lags_are_shifted_and_a_velocity_that_is_not_measured_is_found_in_them()
     [
         (Affine.identity(2, 1), rotation),
         (pendulum, rotation),
-        (functools.partial(pendulum, damping=0.3), CasadiFunction(rotation_in_casadi())),
+        (
+            functools.partial(pendulum, damping=0.3),
+            CasadiFunction(rotation_in_casadi()),
+        ),
         (Damped(0.3), rotation),
         (CasadiFunction(pendulum_in_casadi()), CasadiFunction(rotation_in_casadi())),
-        (CasadiFunction(successor_function(systems.pendulum())), CasadiFunction(every_operation())),
+        (
+            CasadiFunction(successor_function(systems.pendulum())),
+            CasadiFunction(every_operation()),
+        ),
     ],
     ids=["numbers", "function", "partial", "dataclass", "operations", "system"],
 )
@@ -193,18 +260,34 @@ def test_a_nominal_model_and_an_effect_are_saved_by_the_path_they_are_imported_f
     save_model(model, tmp_path / "m.safetensors")
     loaded = load_model(tmp_path / "m.safetensors")
     x, u = draw(8, 6, 2), draw(9, 6, 1)
-    for ours, theirs in zip(model.linearize(x.numpy(), u.numpy()), loaded.linearize(x.numpy(), u.numpy()), strict=True):
+    for ours, theirs in zip(
+        model.linearize(x.numpy(), u.numpy()),
+        loaded.linearize(x.numpy(), u.numpy()),
+        strict=True,
+    ):
         assert np.array_equal(ours, theirs)
 
 
-def test_code_without_a_path_is_refused_and_so_is_a_path_that_leads_nowhere(tmp_path, monkeypatch):
-    with pytest.raises(UnsupportedModel, match="nominal is code that a file cannot name"):
+def test_code_without_a_path_is_refused_and_so_is_a_path_that_leads_nowhere(
+    tmp_path, monkeypatch
+):
+    with pytest.raises(
+        UnsupportedModel, match="nominal is code that a file cannot name"
+    ):
         save_model(with_effect(lambda x, u: x), tmp_path / "m")
     save_model(with_effect(), tmp_path / "m")
-    x, u = casadi.MX.sym("x", 2), casadi.MX.sym("u", 1)  # a table is no operation that a file holds
+    x, u = (
+        casadi.MX.sym("x", 2),
+        casadi.MX.sym("u", 1),
+    )  # a table is no operation that a file holds
     table = casadi.interpolant("table", "linear", [[0.0, 1.0]], [0.0, 2.0])
-    with pytest.raises(UnsupportedModel, match="nominal is code that a file cannot name"):
-        save_model(with_effect(CasadiFunction(casadi.Function("f", [x, u], [x * table(u)]))), tmp_path / "m")
+    with pytest.raises(
+        UnsupportedModel, match="nominal is code that a file cannot name"
+    ):
+        save_model(
+            with_effect(CasadiFunction(casadi.Function("f", [x, u], [x * table(u)]))),
+            tmp_path / "m",
+        )
     monkeypatch.delitem(globals(), "rotation")
     with pytest.raises(DataError, match="no function that can be imported here"):
         load_model(tmp_path / "m")
@@ -213,14 +296,29 @@ def test_code_without_a_path_is_refused_and_so_is_a_path_that_leads_nowhere(tmp_
 @pytest.mark.parametrize(
     ("settings", "error", "rule"),
     [
-        ({"angles": [2]}, SettingError, r"angles: must be different indices from 0 to 1; got \[2\]"),
-        ({"states": [1], "angles": [0]}, SettingError, r"angles: must be some of the selected states \[1\]"),
+        (
+            {"angles": [2]},
+            SettingError,
+            r"angles: must be different indices from 0 to 1; got \[2\]",
+        ),
+        (
+            {"states": [1], "angles": [0]},
+            SettingError,
+            r"angles: must be some of the selected states \[1\]",
+        ),
         ({"angles": []}, ShapeError, "has 3 states and 0 inputs; got 2 and 0 selected"),
         ({"noise": None}, SettingError, "noise: must be given"),
     ],
 )
 def test_misuse_is_refused(settings, error, rule):
-    good = {"nominal": pendulum, "residual": gp(3, 0, 1), "B": rotation, "states": [0, 1], "inputs": [], "input_dim": 1}
+    good = {
+        "nominal": pendulum,
+        "residual": gp(3, 0, 1),
+        "B": rotation,
+        "states": [0, 1],
+        "inputs": [],
+        "input_dim": 1,
+    }
     good |= {"angles": [0], "noise": torch.eye(2, dtype=F)}
     with pytest.raises(error, match=rule):
         ResidualModel(**(good | settings))
@@ -231,7 +329,9 @@ def test_torch_can_follow_the_jacobian_which_is_that_of_the_fast_road(name):
     model = MODELS[name]()
     x, u = draw(8, 5, model.state_dim), draw(9, 5, model.input_dim)
     fast, A, B = predict_with_jacobian(model, x, u)
-    followed, slow_A, slow_B = predict_with_jacobian(model, x.clone().requires_grad_(), u)
+    followed, slow_A, slow_B = predict_with_jacobian(
+        model, x.clone().requires_grad_(), u
+    )
     for got, expected in ((followed.mean, fast.mean), (slow_A, A), (slow_B, B)):
         assert torch.allclose(got, expected, atol=1e-10)
     assert slow_A.requires_grad
@@ -240,8 +340,14 @@ def test_torch_can_follow_the_jacobian_which_is_that_of_the_fast_road(name):
 @pytest.mark.parametrize("name", ["angles", "fewer outputs", "all in CasADi"])
 def test_a_model_with_features_is_exported_to_casadi(name):
     model = MODELS[name]()
-    function, x, u = casadi_function(model), draw(8, model.state_dim), draw(9, model.input_dim)
+    function, x, u = (
+        casadi_function(model),
+        draw(8, model.state_dim),
+        draw(9, model.input_dim),
+    )
     belief = model.predict(x, u)
     mean, variance = function(x.numpy(), u.numpy())
     np.testing.assert_allclose(mean.full()[:, 0], belief.mean.numpy(), atol=1e-11)
-    np.testing.assert_allclose(variance.full()[:, 0], belief.variance.numpy(), atol=1e-11)
+    np.testing.assert_allclose(
+        variance.full()[:, 0], belief.variance.numpy(), atol=1e-11
+    )

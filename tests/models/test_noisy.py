@@ -19,7 +19,14 @@ from gpmpc.models import (
     save_model,
 )
 from gpmpc.mpc import GPMPC, Box, PredictionSettings, Problem, Reference, Tracking
-from gpmpc.propagation import Linearization, MeanEquivalence, MomentMatching, MonteCarlo, Unscented, best_propagator
+from gpmpc.propagation import (
+    Linearization,
+    MeanEquivalence,
+    MomentMatching,
+    MonteCarlo,
+    Unscented,
+    best_propagator,
+)
 from gpmpc.testing import check_model
 
 F = torch.float64
@@ -33,15 +40,31 @@ def gp(outputs, predicts, noise=0.01, by_input=1.0):
     ones = torch.ones(outputs, dtype=F)
     scales, targets = 1 + draw(3, outputs, 3).abs(), 0.3 * draw(2, 25, outputs)
     scales[:, 2] /= by_input
-    return GPPosterior.from_hyperparameters(draw(1, 25, 3), targets, scales, ones, noise * ones, 1, predicts)
+    return GPPosterior.from_hyperparameters(
+        draw(1, 25, 3), targets, scales, ones, noise * ones, 1, predicts
+    )
 
 
 def residual(noise=None):
-    return ResidualModel(Affine.identity(2, 1), gp(2, "value"), torch.eye(2, dtype=F), [0, 1], [0], 1, noise=noise)
+    return ResidualModel(
+        Affine.identity(2, 1),
+        gp(2, "value"),
+        torch.eye(2, dtype=F),
+        [0, 1],
+        [0],
+        1,
+        noise=noise,
+    )
 
 
-MODELS = {"difference": gp(2, "difference"), "residual": residual(), "known": KnownModel(Affine.identity(2, 1), 2, 1)}
-QUIET = Gaussian(torch.tensor([0.3, -0.2], dtype=F), torch.diag(torch.tensor([0.04, 0.02], dtype=F)))
+MODELS = {
+    "difference": gp(2, "difference"),
+    "residual": residual(),
+    "known": KnownModel(Affine.identity(2, 1), 2, 1),
+}
+QUIET = Gaussian(
+    torch.tensor([0.3, -0.2], dtype=F), torch.diag(torch.tensor([0.04, 0.02], dtype=F))
+)
 PUSH = torch.tensor([0.4], dtype=F)
 
 
@@ -53,7 +76,11 @@ def noisy(inner="difference", outputs=(1,)):
 @pytest.mark.parametrize("inner", MODELS)
 def test_a_noisy_model_is_a_model_and_what_holds_it_is_one(inner, outputs):
     model = noisy(inner, outputs)
-    for one in (model, DelayedModel(model, 1.5), DisturbedModel(model, torch.eye(2, 1, dtype=F), [0.1])):
+    for one in (
+        model,
+        DelayedModel(model, 1.5),
+        DisturbedModel(model, torch.eye(2, 1, dtype=F), [0.1]),
+    ):
         check_model(one)
 
 
@@ -64,7 +91,9 @@ def test_all_noise_is_in_the_prediction_and_the_mean_stays():
     assert torch.equal(belief.mean, alone.mean)
     assert torch.equal(belief.covariance, alone.covariance + noise)
     assert torch.equal(noise[:, 0, 0], torch.full((6,), 0.01, dtype=F))
-    draws = (g.mean + g.variance.sqrt() * draw(9, 100_000, 1, 1)).exp().mean(0)  # of sigma^2
+    draws = (
+        (g.mean + g.variance.sqrt() * draw(9, 100_000, 1, 1)).exp().mean(0)
+    )  # of sigma^2
     assert torch.allclose(noise[:, 1, 1], draws[:, 0], rtol=0.02)
     assert not noise[:, 0, 1].any()
     assert not model.noise_covariance.any()
@@ -72,10 +101,14 @@ def test_all_noise_is_in_the_prediction_and_the_mean_stays():
                        belief.mean.round(decimals=4))  # fmt: skip
 
 
-@pytest.mark.parametrize("kind", [Linearization, Unscented, MeanEquivalence, MonteCarlo])
+@pytest.mark.parametrize(
+    "kind", [Linearization, Unscented, MeanEquivalence, MonteCarlo]
+)
 def test_every_propagator_counts_it_once(kind):
     model = noisy()
-    with_noise, without = (kind(process_noise=on)(model, QUIET, PUSH) for on in (True, False))
+    with_noise, without = (
+        kind(process_noise=on)(model, QUIET, PUSH) for on in (True, False)
+    )
     assert torch.equal(with_noise.covariance, without.covariance)
     alone = kind()(model.model, QUIET, PUSH)
     added = with_noise.covariance - alone.covariance
@@ -100,7 +133,9 @@ def test_a_filter_is_that_of_the_noise_at_the_belief():
     at = model.noise(QUIET.mean, PUSH)
     fixed = residual(at)
     same = NoisyModel(MODELS["residual"], model.log_noise, (1,))
-    found, expected = (KalmanFilter.extended(one, sensor).predict(QUIET, PUSH) for one in (same, fixed))
+    found, expected = (
+        KalmanFilter.extended(one, sensor).predict(QUIET, PUSH) for one in (same, fixed)
+    )
     assert torch.allclose(found.covariance, expected.covariance, atol=1e-13)
 
 
@@ -109,10 +144,21 @@ def test_a_filter_is_that_of_the_noise_at_the_belief():
 def test_the_tube_of_a_controller_holds_the_noise_where_it_goes(covariance, kind):
     model = NoisyModel(MODELS["known"], gp(2, "value", by_input=1e-9), (0, 1))
     problem = Problem(
-        Tracking([1.0, 1.0], [0.1]), Box([-1.0], [1.0]), constraints=[Box(upper=[2.0, 2.0], probability=0.9)]
+        Tracking([1.0, 1.0], [0.1]),
+        Box([-1.0], [1.0]),
+        constraints=[Box(upper=[2.0, 2.0], probability=0.9)],
     )
-    controller = GPMPC(model, kind(process_noise=True), problem, 3, [0.0], PredictionSettings(covariance=covariance))
-    decision = controller.control(Gaussian.certain(QUIET.mean), Reference(np.zeros((4, 2))))
+    controller = GPMPC(
+        model,
+        kind(process_noise=True),
+        problem,
+        3,
+        [0.0],
+        PredictionSettings(covariance=covariance),
+    )
+    decision = controller.control(
+        Gaussian.certain(QUIET.mean), Reference(np.zeros((4, 2)))
+    )
     if covariance == "none":
         assert not decision.covariances.any()
         return
@@ -134,7 +180,9 @@ def test_misuse_is_refused():
         NoisyModel(model, gp(2, "difference"), [0, 1])
     with pytest.raises(SettingError, match="must be distinct, of 0 .. 1; got \\[2\\]"):
         NoisyModel(model, gp(1, "value"), [2])
-    with pytest.raises(ShapeError, match=r"must have 2 states, 1 inputs and 1 outputs; got \(2, 1, 2\)"):
+    with pytest.raises(
+        ShapeError, match=r"must have 2 states, 1 inputs and 1 outputs; got \(2, 1, 2\)"
+    ):
         NoisyModel(model, gp(2, "value"), [1])
 
 

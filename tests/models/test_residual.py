@@ -8,7 +8,13 @@ from gpmpc.exceptions import SettingError, ShapeError, UnsupportedModel
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior, SlidingWindow, SparseTrainer, Trainer, Transitions
 from gpmpc.models import Affine, ResidualModel
-from gpmpc.propagation import Linearization, MeanEquivalence, MomentMatching, MonteCarlo, Unscented
+from gpmpc.propagation import (
+    Linearization,
+    MeanEquivalence,
+    MomentMatching,
+    MonteCarlo,
+    Unscented,
+)
 
 A = torch.tensor([[1.0, 0.1, 0.0], [0.0, 0.9, 0.1], [0.2, 0.0, 0.8]])
 G = torch.tensor([[0.0, 0.1], [0.1, 0.0], [0.5, 0.2]])
@@ -50,7 +56,9 @@ def test_the_prediction_is_the_nominal_one_and_the_residual_where_it_acts(nomina
     found, d = model(nominal).predict(x, u), gp().predict(x[:, [2, 0]], u[:, [1]])
     assert torch.allclose(found.mean, nominal(x, u) + d.mean @ B.T)
     assert torch.allclose(found.covariance, B @ d.covariance @ B.T)
-    assert torch.allclose(model().noise_covariance, B @ torch.diag(torch.tensor([1e-3, 2e-3])) @ B.T)
+    assert torch.allclose(
+        model().noise_covariance, B @ torch.diag(torch.tensor([1e-3, 2e-3])) @ B.T
+    )
 
 
 @pytest.mark.parametrize("nominal", [AFFINE, nonlinear])
@@ -59,42 +67,59 @@ def test_the_jacobian_is_that_of_finite_differences(nominal):
     _, by_state, by_input = predict_with_jacobian(known, x, u)
     for d in range(3):
         shift = step * torch.eye(3)[d]
-        slope = (known.predict(x + shift, u).mean - known.predict(x - shift, u).mean) / (2 * step)
+        slope = (
+            known.predict(x + shift, u).mean - known.predict(x - shift, u).mean
+        ) / (2 * step)
         assert torch.allclose(by_state[..., d], slope, atol=1e-8)
     for d in range(2):
         shift = step * torch.eye(2)[d]
-        slope = (known.predict(x, u + shift).mean - known.predict(x, u - shift).mean) / (2 * step)
+        slope = (
+            known.predict(x, u + shift).mean - known.predict(x, u - shift).mean
+        ) / (2 * step)
         assert torch.allclose(by_input[..., d], slope, atol=1e-8)
 
 
 def test_moment_matching_with_an_affine_nominal_model_is_what_sampling_finds():
     known, at, control = model(), belief(), torch.tensor([0.3, -0.5])
     exact = MomentMatching().propagate(known, at, control)
-    found = [MonteCarlo(20_000, seed=seed).propagate(known, at, control) for seed in range(20)]
+    found = [
+        MonteCarlo(20_000, seed=seed).propagate(known, at, control)
+        for seed in range(20)
+    ]
     for exactly, drawn in (
         (exact.belief.mean, torch.stack([f.belief.mean for f in found])),
         (exact.belief.covariance, torch.stack([f.belief.covariance for f in found])),
         (exact.cross_covariance, torch.stack([f.cross_covariance for f in found])),
     ):
         z = (drawn.mean(0) - exactly) / (drawn.std(0) / 20**0.5 + 1e-15)
-        assert float(z.abs().max()) < 4.5  # of Student's t with 19 degrees of freedom: 1 in 4000 each
+        assert (
+            float(z.abs().max()) < 4.5
+        )  # of Student's t with 19 degrees of freedom: 1 in 4000 each
 
 
 def test_a_nonlinear_nominal_model_goes_with_every_other_propagation():
     known, at, control = model(nonlinear), belief(0.05), torch.tensor([0.3, -0.5])
-    with pytest.raises(UnsupportedModel, match="Possible with any model: MeanEquivalence, Linearization, Unscented"):
+    with pytest.raises(
+        UnsupportedModel,
+        match="Possible with any model: MeanEquivalence, Linearization, Unscented",
+    ):
         MomentMatching()(known, at, control)
     sampled = MonteCarlo(50_000)(known, at, control)
     for propagator in (Linearization(), Unscented()):
         found = propagator(known, at, control)
         assert torch.allclose(found.mean, sampled.mean, atol=5e-3)
         assert torch.allclose(found.covariance, sampled.covariance, atol=1e-3)
-    assert torch.allclose(MeanEquivalence()(known, at, control).mean, known.predict(at.mean, control).mean)
+    assert torch.allclose(
+        MeanEquivalence()(known, at, control).mean, known.predict(at.mean, control).mean
+    )
 
 
 def transitions(rows, noise=1e-3, seed=0):
     generator = torch.Generator().manual_seed(seed)
-    x, u = 3 * torch.rand(rows, 3, generator=generator) - 1.5, torch.rand(rows, 2, generator=generator)
+    x, u = (
+        3 * torch.rand(rows, 3, generator=generator) - 1.5,
+        torch.rand(rows, 2, generator=generator),
+    )
     moved = AFFINE(x, u) + torch.sin(2 * x[:, :1]) * torch.tensor([0.0, 0.5, 1.0])
     return Transitions(x, u, moved + noise * torch.randn(rows, 3, generator=generator))
 
@@ -102,69 +127,140 @@ def transitions(rows, noise=1e-3, seed=0):
 ACTS = torch.tensor([[0.0], [0.5], [1.0]])
 
 
-@pytest.mark.parametrize("trainer", [Trainer(restarts=0), SparseTrainer(inducing=15, restarts=0, iterations=5)])
+@pytest.mark.parametrize(
+    "trainer",
+    [Trainer(restarts=0), SparseTrainer(inducing=15, restarts=0, iterations=5)],
+)
 def test_training_finds_a_known_residual(trainer):
-    known = ResidualModel.train(AFFINE, transitions(40), ACTS, states=[0], inputs=[], trainer=trainer)
+    known = ResidualModel.train(
+        AFFINE, transitions(40), ACTS, states=[0], inputs=[], trainer=trainer
+    )
     x = torch.linspace(-1.3, 1.3, 30)[:, None].expand(-1, 3)
     found = known.residual.predict(x[:, :1]).mean[:, 0]
     assert torch.allclose(found, torch.sin(2 * x[:, 0]), atol=5e-3)
     held_out = transitions(50, noise=0.0, seed=1)
-    assert torch.allclose(known.predict(held_out.states, held_out.inputs).mean, held_out.next_states, atol=2e-2)
+    assert torch.allclose(
+        known.predict(held_out.states, held_out.inputs).mean,
+        held_out.next_states,
+        atol=2e-2,
+    )
 
 
 def test_by_default_every_state_has_a_residual_of_all_states_and_inputs():
     known = ResidualModel.train(AFFINE, transitions(15), trainer=Trainer(restarts=0))
-    assert (known.residual.state_dim, known.residual.input_dim, known.residual.output_dim) == (3, 2, 3)
+    assert (
+        known.residual.state_dim,
+        known.residual.input_dim,
+        known.residual.output_dim,
+    ) == (3, 2, 3)
 
 
 def test_a_residual_model_learns_while_it_runs():
     data = transitions(60)
-    known = ResidualModel.train(AFFINE, data[:20], ACTS, states=[0], inputs=[], trainer=Trainer(restarts=0))
+    known = ResidualModel.train(
+        AFFINE, data[:20], ACTS, states=[0], inputs=[], trainer=Trainer(restarts=0)
+    )
     grown = known.append(data[20:])
     assert len(grown.residual) == 60
     x, u = transitions(20, seed=1).states, transitions(20, seed=1).inputs
-    assert (grown.predict(x, u).covariance[:, 2, 2] < known.predict(x, u).covariance[:, 2, 2]).all()
+    assert (
+        grown.predict(x, u).covariance[:, 2, 2]
+        < known.predict(x, u).covariance[:, 2, 2]
+    ).all()
     held = known
     for i in range(20, 60):
         held = held.append(data[i : i + 1], SlidingWindow(25, "least_informative"))
     assert len(held.residual) == 25
-    with pytest.raises(ShapeError, match="3 states and 2 inputs; got transitions with 3 and 1"):
-        known.append(Transitions(torch.zeros(1, 3), torch.zeros(1, 1), torch.zeros(1, 3)))
+    with pytest.raises(
+        ShapeError, match="3 states and 2 inputs; got transitions with 3 and 1"
+    ):
+        known.append(
+            Transitions(torch.zeros(1, 3), torch.zeros(1, 1), torch.zeros(1, 3))
+        )
 
 
 def test_a_residual_model_can_be_moved_to_single_precision():
     x, u = torch.rand(4, 3), torch.rand(4, 2)
     single = model().to(dtype=torch.float32)
-    assert torch.allclose(single.predict(x.float(), u.float()).mean.double(), model().predict(x, u).mean, atol=1e-4)
+    assert torch.allclose(
+        single.predict(x.float(), u.float()).mean.double(),
+        model().predict(x, u).mean,
+        atol=1e-4,
+    )
 
 
 def test_any_trainer_learns_residuals_and_nothing_else_does():
     found = [
-        ResidualModel.train(AFFINE, transitions(15), trainer=Trainer(predicts=predicts, restarts=0)).residual
+        ResidualModel.train(
+            AFFINE, transitions(15), trainer=Trainer(predicts=predicts, restarts=0)
+        ).residual
         for predicts in ("value", "difference")
     ]
     assert found[1].predicts == "value"
     assert torch.equal(found[0].weights, found[1].weights)
-    with pytest.raises(SettingError, match="trainer: must be a Trainer or SparseTrainer; got 3"):
+    with pytest.raises(
+        SettingError, match="trainer: must be a Trainer or SparseTrainer; got 3"
+    ):
         ResidualModel.train(AFFINE, transitions(15), trainer=3)
-    with pytest.raises(SettingError, match=r"transitions: must be Transitions\(...\); got str"):
+    with pytest.raises(
+        SettingError, match=r"transitions: must be Transitions\(...\); got str"
+    ):
         ResidualModel.train(AFFINE, "data.npz")
 
 
 @pytest.mark.parametrize(
     ("change", "error", "message"),
     [
-        ({"states": [2.0, 0]}, SettingError, r"states: must be different indices from 0 to 2; got \[2.0, 0\]"),
-        ({"inputs": [True]}, SettingError, r"inputs: must be different indices from 0 to 1; got \[True\]"),
-        ({"states": [2]}, ShapeError, "has 2 states and 1 inputs; got 1 and 1 selected"),
-        ({"states": [2, 3]}, SettingError, r"states: must be different indices from 0 to 2; got \[2, 3\]"),
-        ({"inputs": [2]}, SettingError, r"inputs: must be different indices from 0 to 1; got \[2\]"),
-        ({"states": [1, 1]}, SettingError, r"different indices from 0 to 2; got \[1, 1\]"),
-        ({"B": torch.ones(3, 3)}, ShapeError, r"B must have shape \(3, 2\); got \(3, 3\)"),
-        ({"residual": GPPosterior(**(vars(gp()) | {"predicts": "difference"}))}, SettingError, "predicts='value'"),
+        (
+            {"states": [2.0, 0]},
+            SettingError,
+            r"states: must be different indices from 0 to 2; got \[2.0, 0\]",
+        ),
+        (
+            {"inputs": [True]},
+            SettingError,
+            r"inputs: must be different indices from 0 to 1; got \[True\]",
+        ),
+        (
+            {"states": [2]},
+            ShapeError,
+            "has 2 states and 1 inputs; got 1 and 1 selected",
+        ),
+        (
+            {"states": [2, 3]},
+            SettingError,
+            r"states: must be different indices from 0 to 2; got \[2, 3\]",
+        ),
+        (
+            {"inputs": [2]},
+            SettingError,
+            r"inputs: must be different indices from 0 to 1; got \[2\]",
+        ),
+        (
+            {"states": [1, 1]},
+            SettingError,
+            r"different indices from 0 to 2; got \[1, 1\]",
+        ),
+        (
+            {"B": torch.ones(3, 3)},
+            ShapeError,
+            r"B must have shape \(3, 2\); got \(3, 3\)",
+        ),
+        (
+            {"residual": GPPosterior(**(vars(gp()) | {"predicts": "difference"}))},
+            SettingError,
+            "predicts='value'",
+        ),
     ],
 )
 def test_misuse_is_refused_with_the_rule(change, error, message):
-    good = {"nominal": AFFINE, "residual": gp(), "B": B, "states": [2, 0], "inputs": [1], "input_dim": 2}
+    good = {
+        "nominal": AFFINE,
+        "residual": gp(),
+        "B": B,
+        "states": [2, 0],
+        "inputs": [1],
+        "input_dim": 2,
+    }
     with pytest.raises(error, match=message):
         ResidualModel(**(good | change))

@@ -12,15 +12,30 @@ GENERATOR = torch.Generator().manual_seed(3)
 
 
 def gp(features, inputs, outputs, predicts):
-    x = 3 * torch.rand(30, features + inputs, generator=GENERATOR, dtype=torch.float64) - 1.5
-    y = torch.sin(x @ torch.rand(features + inputs, outputs, generator=GENERATOR, dtype=torch.float64))
-    scales = 1 + torch.rand(outputs, features + inputs, generator=GENERATOR, dtype=torch.float64)
+    x = (
+        3 * torch.rand(30, features + inputs, generator=GENERATOR, dtype=torch.float64)
+        - 1.5
+    )
+    y = torch.sin(
+        x
+        @ torch.rand(
+            features + inputs, outputs, generator=GENERATOR, dtype=torch.float64
+        )
+    )
+    scales = 1 + torch.rand(
+        outputs, features + inputs, generator=GENERATOR, dtype=torch.float64
+    )
     one = torch.ones(outputs, dtype=torch.float64)
-    return GPPosterior.from_hyperparameters(x, y, scales, one, 1e-3 * one, inputs, predicts, 0.1 * one)
+    return GPPosterior.from_hyperparameters(
+        x, y, scales, one, 1e-3 * one, inputs, predicts, 0.1 * one
+    )
 
 
 def affine():
-    A, G, c = (torch.rand(shape, generator=GENERATOR, dtype=torch.float64) for shape in ((3, 3), (3, 2), (3,)))
+    A, G, c = (
+        torch.rand(shape, generator=GENERATOR, dtype=torch.float64)
+        for shape in ((3, 3), (3, 2), (3,))
+    )
     return Affine(0.5 * A, G, c)
 
 
@@ -34,7 +49,9 @@ MODELS = {
     "next states": lambda: gp(3, 2, 3, "next_state"),
     "differences": lambda: gp(3, 2, 3, "difference"),
     "an affine nominal model": lambda: residual(affine()),
-    "a nominal model in torch": lambda: residual(lambda x, u: torch.sin(x) + u.sum(-1, keepdim=True)),
+    "a nominal model in torch": lambda: residual(
+        lambda x, u: torch.sin(x) + u.sum(-1, keepdim=True)
+    ),
     "a model around another one": lambda: DisturbedModel(
         residual(affine()), torch.eye(3, 1, dtype=torch.float64), std=[0.1]
     ),
@@ -50,18 +67,33 @@ def test_a_roll_out_obeys_the_model_and_the_feedback_within_its_bounds(kind):
         random.normal(size=(T, H, m)),
         random.normal(size=(H, m, n)),
     )
-    bounds = [np.array(side) for side in ([-0.8, -np.inf], [0.9, np.inf], [-np.inf, -0.7], [np.inf, 0.6])]
+    bounds = [
+        np.array(side)
+        for side in ([-0.8, -np.inf], [0.9, np.inf], [-np.inf, -0.7], [np.inf, 0.6])
+    ]
     last, disturbance = np.array([0.1, 0.2]), 0.1 * random.normal(size=n)
-    start, limits = random.normal(size=(T, n)), [np.tile(bound, (H, 1)) for bound in bounds]
-    states, applied = RollOut(model)(start, Feedback(planned, inputs, gains[None], *limits, last), disturbance)
+    start, limits = (
+        random.normal(size=(T, n)),
+        [np.tile(bound, (H, 1)) for bound in bounds],
+    )
+    states, applied = RollOut(model)(
+        start, Feedback(planned, inputs, gains[None], *limits, last), disturbance
+    )
     assert (states[:, 0] == start).all()
     for t in range(T):
         before = last
         for k in range(H):
             u = inputs[t, k] + gains[k] @ (states[t, k] - planned[t, k])
-            before = np.clip(np.clip(u, before + bounds[2], before + bounds[3]), bounds[0], bounds[1])
+            before = np.clip(
+                np.clip(u, before + bounds[2], before + bounds[3]), bounds[0], bounds[1]
+            )
             assert np.allclose(applied[t, k], before, rtol=1e-12, atol=1e-12)
-            after = linearize(model, states[t, k : k + 1], applied[t, k : k + 1], False).mean[0] + disturbance
+            after = (
+                linearize(
+                    model, states[t, k : k + 1], applied[t, k : k + 1], False
+                ).mean[0]
+                + disturbance
+            )
             assert np.allclose(states[t, k + 1], after, rtol=1e-10, atol=1e-12)
 
 
@@ -77,13 +109,17 @@ def test_plans_may_have_gains_of_their_own():
     both = RollOut(model)(planned[:, 0], Feedback(planned, inputs, gains, *rest))
     for t in range(2):
         one = Feedback(planned[t : t + 1], inputs[t : t + 1], gains[t : t + 1], *rest)
-        for found, alone in zip(both, RollOut(model)(planned[t : t + 1, 0], one), strict=True):
+        for found, alone in zip(
+            both, RollOut(model)(planned[t : t + 1, 0], one), strict=True
+        ):
             assert np.array_equal(found[t], alone[0])
 
 
 def test_starts_of_whole_numbers_and_strided_disturbances_are_taken_as_they_are():
     roll_out, inputs = RollOut(MODELS["differences"]()), np.zeros((1, 3, 2))
     wide = np.arange(9.0).reshape(3, 3) / 10
-    expected = roll_out.open_loop(np.array([[1.0, 0.0, 1.0]]), inputs, wide[:, 0].copy())
+    expected = roll_out.open_loop(
+        np.array([[1.0, 0.0, 1.0]]), inputs, wide[:, 0].copy()
+    )
     for start in (np.array([[1, 0, 1]]), np.array([[1.0, 0.0, 1.0]])):
         assert np.array_equal(roll_out.open_loop(start, inputs, wide[:, 0]), expected)

@@ -7,10 +7,17 @@ from numba import njit
 from gpmpc.gaussian import Gaussian
 from gpmpc.models import Linearized
 
-MASS, LENGTH, CENTRE, GRAVITY = (0.523, 0.626), 0.2, (0.2, 0.256), 9.81  # [kg], [m], [m], [m/s^2]
+MASS, LENGTH, CENTRE, GRAVITY = (
+    (0.523, 0.626),
+    0.2,
+    (0.2, 0.256),
+    9.81,
+)  # [kg], [m], [m], [m/s^2]
 INERTIA = (0.0319, 0.0509)  # about the joints [kg m^2]
 PENDUBOT, ACROBOT = 0, 1  # the driven joint: shoulder, elbow
-UPRIGHT = np.array([np.pi, 0.0, 0.0, 0.0])  # angle from hanging down, relative angle of the second link; their rates
+UPRIGHT = np.array(
+    [np.pi, 0.0, 0.0, 0.0]
+)  # angle from hanging down, relative angle of the second link; their rates
 STEP = 1e-30
 
 
@@ -20,12 +27,31 @@ def derivative(x, u, joint):
     (m1, m2), (r1, r2), (I1, I2) = MASS, CENTRE, INERTIA
     q1, q2, v1, v2 = x
     h = m2 * LENGTH * r2
-    M11, M12, M22 = I1 + I2 + m2 * LENGTH**2 + 2 * h * np.cos(q2), I2 + h * np.cos(q2), I2
-    gravity1, gravity2 = GRAVITY * (m1 * r1 + m2 * LENGTH) * np.sin(q1), GRAVITY * m2 * r2 * np.sin(q1 + q2)
-    f1 = h * np.sin(q2) * (2 * v1 * v2 + v2 * v2) - gravity1 - gravity2 + (0.0 * u if joint == ACROBOT else u)
+    M11, M12, M22 = (
+        I1 + I2 + m2 * LENGTH**2 + 2 * h * np.cos(q2),
+        I2 + h * np.cos(q2),
+        I2,
+    )
+    gravity1, gravity2 = (
+        GRAVITY * (m1 * r1 + m2 * LENGTH) * np.sin(q1),
+        GRAVITY * m2 * r2 * np.sin(q1 + q2),
+    )
+    f1 = (
+        h * np.sin(q2) * (2 * v1 * v2 + v2 * v2)
+        - gravity1
+        - gravity2
+        + (0.0 * u if joint == ACROBOT else u)
+    )
     f2 = -h * np.sin(q2) * v1 * v1 - gravity2 + (u if joint == ACROBOT else 0.0 * u)
     determinant = M11 * M22 - M12 * M12
-    return np.array([v1, v2, (M22 * f1 - M12 * f2) / determinant, (M11 * f2 - M12 * f1) / determinant])
+    return np.array(
+        [
+            v1,
+            v2,
+            (M22 * f1 - M12 * f2) / determinant,
+            (M11 * f2 - M12 * f1) / determinant,
+        ]
+    )
 
 
 @njit
@@ -52,25 +78,39 @@ def expand_at(states, inputs, joint):
             x = states[k] + 0j
             x[j] += STEP * 1j
             A[k, :, j] = advance(x, inputs[k, 0] + 0j, joint).imag / STEP
-        B[k, :, 0] = advance(states[k] + 0j, inputs[k, 0] + STEP * 1j, joint).imag / STEP
+        B[k, :, 0] = (
+            advance(states[k] + 0j, inputs[k, 0] + STEP * 1j, joint).imag / STEP
+        )
     return mean, A, B
 
 
 class DoublePendulum:
     """The pendulum itself as a model without uncertainty."""
 
-    state_dim, output_dim, input_dim, dtype, device = 4, 4, 1, torch.float64, torch.device("cpu")
+    state_dim, output_dim, input_dim, dtype, device = (
+        4,
+        4,
+        1,
+        torch.float64,
+        torch.device("cpu"),
+    )
     noise_covariance = torch.zeros(4, 4)
 
     def __init__(self, joint):
         self.joint = joint
 
     def predict(self, state, input):
-        mean = expand_at(state.reshape(-1, 4).numpy(), input.reshape(-1, 1).numpy(), self.joint)[0]
-        return Gaussian(torch.as_tensor(mean).reshape(state.shape), torch.zeros(*state.shape, 4))
+        mean = expand_at(
+            state.reshape(-1, 4).numpy(), input.reshape(-1, 1).numpy(), self.joint
+        )[0]
+        return Gaussian(
+            torch.as_tensor(mean).reshape(state.shape), torch.zeros(*state.shape, 4)
+        )
 
     def linearize(self, states, inputs, covariance=True):
-        return Linearized(*expand_at(states, inputs, self.joint), np.zeros((len(states), 4, 4)))
+        return Linearized(
+            *expand_at(states, inputs, self.joint), np.zeros((len(states), 4, 4))
+        )
 
     def successor(self, x, u):
         """x+ (4,) of a state (4,) and a torque (1,)."""

@@ -16,7 +16,12 @@ class LinearGaussian:
         n, m = self.B.shape
         self.c = torch.zeros(n) if c is None else torch.tensor(c)
         self.W = torch.zeros(n, n) if W is None else torch.tensor(W)
-        self.state_dim, self.output_dim, self.input_dim, self.noise_covariance = n, n, m, torch.zeros(n, n)
+        self.state_dim, self.output_dim, self.input_dim, self.noise_covariance = (
+            n,
+            n,
+            m,
+            torch.zeros(n, n),
+        )
 
     def predict(self, state, input=None):
         mean = state @ self.A.mT + input @ self.B.mT + self.c
@@ -24,7 +29,11 @@ class LinearGaussian:
 
     def predict_with_jacobian(self, state, input=None):
         batch = state.shape[:-1]
-        return self.predict(state, input), self.A.expand(*batch, *self.A.shape), self.B.expand(*batch, *self.B.shape)
+        return (
+            self.predict(state, input),
+            self.A.expand(*batch, *self.A.shape),
+            self.B.expand(*batch, *self.B.shape),
+        )
 
 
 def double_integrator(**arguments):
@@ -34,7 +43,9 @@ def double_integrator(**arguments):
 def pendulum_posterior(size=40, noise=1e-4, seed=0):
     """A GP on the differences of a damped pendulum (angle, rate; torque), time step 0.2."""
     generator = torch.Generator().manual_seed(seed)
-    features = (2 * torch.rand(size, 3, generator=generator) - 1) * torch.tensor([2.5, 3.0, 4.0])
+    features = (2 * torch.rand(size, 3, generator=generator) - 1) * torch.tensor(
+        [2.5, 3.0, 4.0]
+    )
     angle, rate, torque = features.T
     acceleration = -4 * torch.sin(angle) - 0.3 * rate + torque
     targets = torch.stack([0.2 * rate + 0.02 * acceleration, 0.2 * acceleration], dim=1)

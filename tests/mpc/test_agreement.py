@@ -29,10 +29,19 @@ def questions(count, std):
     for _ in range(count):
         start = rng.uniform(-0.5, 0.5, 6)
         belief = Gaussian(torch.tensor(start), std**2 * torch.eye(6))
-        yield belief, Reference(start + np.linspace(0, 1, H + 1)[:, None] * rng.uniform(-0.4, 0.4, 6))
+        yield (
+            belief,
+            Reference(
+                start + np.linspace(0, 1, H + 1)[:, None] * rng.uniform(-0.4, 0.4, 6)
+            ),
+        )
 
 
-@pytest.mark.parametrize("propagator", [Linearization(), MomentMatching()], ids=["linearisation", "moment matching"])
+@pytest.mark.parametrize(
+    "propagator",
+    [Linearization(), MomentMatching()],
+    ids=["linearisation", "moment matching"],
+)
 def test_iterated_programs_reach_the_optimum_of_the_nonlinear_method(propagator):
     gp = quadrotor_gp()
     convex = GPMPC(
@@ -47,7 +56,9 @@ def test_iterated_programs_reach_the_optimum_of_the_nonlinear_method(propagator)
     )
     generic = SLSQP(gp, propagator, problem(0.5), H, HOVER, tolerance=1e-6)
     for belief, reference in questions(4, 0.05):
-        plans = [controller.control(belief, reference) for controller in (convex, generic)]
+        plans = [
+            controller.control(belief, reference) for controller in (convex, generic)
+        ]
         assert all(plan.status.solved for plan in plans)
         request = Request.read(problem(0.5), H, HOVER, belief, reference, None)
         reached, least = (generic.evaluate(plan.inputs, request).cost for plan in plans)
@@ -57,12 +68,18 @@ def test_iterated_programs_reach_the_optimum_of_the_nonlinear_method(propagator)
 def test_dual_primal_and_state_form_give_the_same_inputs():
     gp, active = quadrotor_gp(), 0
     asked = (gp, Linearization(), problem(0.02), H, HOVER)
-    ours, primal, state_form = GPMPC(*asked), GPMPC(*asked, solver=PrimalActiveSet()), StateFormMPC(*asked)
+    ours, primal, state_form = (
+        GPMPC(*asked),
+        GPMPC(*asked, solver=PrimalActiveSet()),
+        StateFormMPC(*asked),
+    )
     for belief, reference in questions(5, 0.0):
         plan = ours.control(belief, reference)
         active += len(plan.solution.active_set)
         for other in (primal, state_form):
-            assert np.allclose(other.control(belief, reference).inputs, plan.inputs, atol=1e-6)
+            assert np.allclose(
+                other.control(belief, reference).inputs, plan.inputs, atol=1e-6
+            )
     assert active
 
 
@@ -71,17 +88,29 @@ def test_a_bound_that_takes_a_large_step_of_the_inputs_is_kept_by_iterated_progr
     gp, limit = quadrotor_gp(150), 0.05
     sides = np.full(6, np.inf)
     sides[0] = limit
-    bounded = replace(problem(0.5), constraints=[Box(None, sides, probability=0.99, penalty=100)])
+    bounded = replace(
+        problem(0.5), constraints=[Box(None, sides, probability=0.99, penalty=100)]
+    )
     start = np.array([0.0, 0.4, 0.0, 0.0, 0.0, -0.5])
-    belief, reference = Gaussian.certain(start), Reference(np.stack([start, [0.2, 0.4, 0.0, 0.0, 0.3, 0.5]]))
+    belief, reference = (
+        Gaussian.certain(start),
+        Reference(np.stack([start, [0.2, 0.4, 0.0, 0.0, 0.3, 0.5]])),
+    )
     reached = []
     for iterations in (1, 30):
         asked = (gp, Linearization(process_noise=True), bounded, 1, HOVER)
-        plan = GPMPC(*asked, iterations=iterations, tolerance=1e-6).control(belief, reference)
+        plan = GPMPC(*asked, iterations=iterations, tolerance=1e-6).control(
+            belief, reference
+        )
         assert plan.status.solved
         after = Linearization(process_noise=True)(gp, belief, torch.tensor(plan.input))
         reached.append(
-            float(after.mean[0] + bounded.constraints[0].standard_deviations() * after.covariance[0, 0].sqrt()) - limit
+            float(
+                after.mean[0]
+                + bounded.constraints[0].standard_deviations()
+                * after.covariance[0, 0].sqrt()
+            )
+            - limit
         )
     assert abs(reached[0]) > 0.01  # [m]
     assert abs(reached[1]) < 1e-5

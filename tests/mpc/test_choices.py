@@ -21,7 +21,9 @@ def names(group):
 def chosen(*overrides):
     with initialize_config_dir(str(CONF), version_base="1.3"):
         settings = compose("run", overrides=list(overrides))
-    return partial(instantiate(settings.controller, _convert_="all"), initial_input=HOVER)  # the system's otherwise
+    return partial(
+        instantiate(settings.controller, _convert_="all"), initial_input=HOVER
+    )  # the system's otherwise
 
 
 @pytest.mark.parametrize("controller", names("controller"))
@@ -29,13 +31,22 @@ def test_every_controller_of_the_settings_flies(controller):
     make = chosen(f"controller={controller}", "horizon=3")
     made = make(QUADROTOR if controller == "nmpc" else quadrotor_gp(20))
     reference = Reference(np.zeros((4, 6)), np.tile(HOVER, (3, 1)))
-    assert made.control(Gaussian.certain(np.full(6, 0.2)), reference).status is Status.SOLVED
+    assert (
+        made.control(Gaussian.certain(np.full(6, 0.2)), reference).status
+        is Status.SOLVED
+    )
 
 
 @pytest.mark.parametrize("propagation", names("propagation"))
 @pytest.mark.parametrize("solver", names("solver"))
 def test_propagation_and_solver_are_chosen_by_name(propagation, solver):
-    overrides = [f"propagation@controller.propagator={propagation}", f"solver@controller.solver={solver}"]
+    overrides = [
+        f"propagation@controller.propagator={propagation}",
+        f"solver@controller.solver={solver}",
+    ]
     made = chosen("controller=convex", "horizon=2", *overrides)(quadrotor_gp(20))
     reference = Reference(np.zeros((3, 6)))
-    assert made.control(Gaussian.certain(np.full(6, 0.2)), reference).status is Status.SOLVED
+    assert (
+        made.control(Gaussian.certain(np.full(6, 0.2)), reference).status
+        is Status.SOLVED
+    )

@@ -8,7 +8,15 @@ import pytest
 from gpmpc.exceptions import ShapeError
 from gpmpc.mpc._condense import condense, condense_with_feedback
 from gpmpc.mpc._cost import PENALIZED
-from gpmpc.mpc._linear_quadratic import InputBounds, QuadraticCost, References, StageRows, Stages, evaluate_cost, expand
+from gpmpc.mpc._linear_quadratic import (
+    InputBounds,
+    QuadraticCost,
+    References,
+    StageRows,
+    Stages,
+    evaluate_cost,
+    expand,
+)
 from gpmpc.mpc.problem import Box, Problem, Tracking
 from gpmpc.qp import DualActiveSet, QuadraticProgram
 from gpmpc.status import Status
@@ -22,23 +30,41 @@ def spd(rng, n):
 
 def random_stages(rng, p, m, H, held):
     K = 1 if held else H
-    return Stages(rng.normal(size=(K, p, p)) / np.sqrt(p), rng.normal(size=(K, p, m)), rng.normal(size=(K, p)))
+    return Stages(
+        rng.normal(size=(K, p, p)) / np.sqrt(p),
+        rng.normal(size=(K, p, m)),
+        rng.normal(size=(K, p)),
+    )
 
 
 def random_references(rng, H, n, m):
-    return References(rng.normal(size=(H, n)), rng.normal(size=(H, m)), 0.1 * rng.normal(size=m))
+    return References(
+        rng.normal(size=(H, n)), rng.normal(size=(H, m)), 0.1 * rng.normal(size=m)
+    )
 
 
 class Condensing:
     """Condenses with a problem's bounds, the cost of an extended state of so many blocks, and squares of outputs."""
 
     def __init__(self, problem, H, blocks=1, squares=None):
-        rates = problem.input_rates.by_stage(H) if problem.input_rates.finite else np.empty((2, 0, problem.input_dim))
+        rates = (
+            problem.input_rates.by_stage(H)
+            if problem.input_rates.finite
+            else np.empty((2, 0, problem.input_dim))
+        )
         self.bounds = InputBounds(*problem.inputs.by_stage(H), *rates)
-        (Q, R), cost, z = problem.cost.by_stage(H), problem.cost, problem.state_dim + problem.input_dim + 1
+        (Q, R), cost, z = (
+            problem.cost.by_stage(H),
+            problem.cost,
+            problem.state_dim + problem.input_dim + 1,
+        )
         W = np.repeat(Q[:, None], blocks, axis=1)
         squares = np.empty((0, z, z)) if squares is None else squares
-        weights = W if cost.Q.ndim > 2 else np.tile(cost.Q, (1, blocks, 1, 1)), W[-1], R if cost.R.ndim > 2 else R[:1]
+        weights = (
+            W if cost.Q.ndim > 2 else np.tile(cost.Q, (1, blocks, 1, 1)),
+            W[-1],
+            R if cost.R.ndim > 2 else R[:1],
+        )
         self.cost = QuadraticCost(*weights, PENALIZED.index(cost.penalized), squares)
 
     def condense(self, *arguments):
@@ -74,15 +100,29 @@ def test_constant_stages_are_stages_that_vary_and_do_not(terminal, rng):
     n, m, r, blocks, H = 3, 2, 2, 4, 9
     Q, R = spd(rng, n), spd(rng, m)
     T = spd(rng, n) if terminal == "own" else Q
-    condenser = Condensing(Problem(Tracking(Q, R, terminal=T, penalized="inputs")), H, blocks)
-    stages, start = random_stages(rng, n * blocks, m, H, held=True), rng.normal(size=n * blocks)
+    condenser = Condensing(
+        Problem(Tracking(Q, R, terminal=T, penalized="inputs")), H, blocks
+    )
+    stages, start = (
+        random_stages(rng, n * blocks, m, H, held=True),
+        rng.normal(size=n * blocks),
+    )
     references = random_references(rng, H, n, m)
-    rows = state_rows(rng.normal(size=(1, r, n * blocks)), -np.ones((H, r)), np.ones((H, r)))
+    rows = state_rows(
+        rng.normal(size=(1, r, n * blocks)), -np.ones((H, r)), np.ones((H, r))
+    )
     repeated = Stages(*(np.repeat(part, H, axis=0) for part in stages))
     held = condenser.condense(stages, start, references, rows)
-    varying = condenser.condense(repeated, start, references, rows._replace(E=np.repeat(rows.E, H, axis=0)))
+    varying = condenser.condense(
+        repeated, start, references, rows._replace(E=np.repeat(rows.E, H, axis=0))
+    )
     for one, other in zip(held[:5], varying[:5], strict=True):
-        assert np.allclose(one, other, rtol=1e-12, atol=1e-12 * np.abs(other[np.isfinite(other)]).max(initial=0.0))
+        assert np.allclose(
+            one,
+            other,
+            rtol=1e-12,
+            atol=1e-12 * np.abs(other[np.isfinite(other)]).max(initial=0.0),
+        )
 
 
 @pytest.mark.parametrize("H", [1, 2, 7])
@@ -92,12 +132,23 @@ def test_constant_stages_are_stages_that_vary_and_do_not(terminal, rng):
 def test_the_condensed_problem_is_the_stacked_one(H, blocks, held, penalized, rng):
     n, m, r, p = 3, 2, 4, 3 * blocks
     Q, T, R = spd(rng, n), spd(rng, n), spd(rng, m)
-    problem = Problem(Tracking(Q, R, terminal=T, penalized=penalized), input_rates=Box([-1.0, -2.0], [1.0, np.inf]))
+    problem = Problem(
+        Tracking(Q, R, terminal=T, penalized=penalized),
+        input_rates=Box([-1.0, -2.0], [1.0, np.inf]),
+    )
     condenser = Condensing(problem, H, blocks)
-    stages, start, references = random_stages(rng, p, m, H, held), rng.normal(size=p), random_references(rng, H, n, m)
-    rows = state_rows(rng.normal(size=(len(stages.A), r, p)), np.zeros((H, r)), np.ones((H, r)))
+    stages, start, references = (
+        random_stages(rng, p, m, H, held),
+        rng.normal(size=p),
+        random_references(rng, H, n, m),
+    )
+    rows = state_rows(
+        rng.normal(size=(len(stages.A), r, p)), np.zeros((H, r)), np.ones((H, r))
+    )
     targets, wanted, last = references
-    P, q, G, lower, upper, feedback = condenser.condense(stages, start, references, rows)
+    P, q, G, lower, upper, feedback = condenser.condense(
+        stages, start, references, rows
+    )
 
     gamma, free = stacked_response(stages, start, H)
     gamma = gamma.reshape(-1, H * m)
@@ -116,8 +167,15 @@ def test_the_condensed_problem_is_the_stacked_one(H, blocks, held, penalized, rn
     E = np.zeros((H * r, H * p))
     for k in range(H):
         E[k * r : (k + 1) * r, k * p : (k + 1) * p] = at(rows.E, k)
-    assert np.allclose(P, 2 * (gamma.T @ weight @ gamma + T_u.T @ stacked_R @ T_u), rtol=1e-12, atol=1e-11)
-    gradient = gamma.T @ weight @ (free - reference).ravel() - T_u.T @ stacked_R @ centre
+    assert np.allclose(
+        P,
+        2 * (gamma.T @ weight @ gamma + T_u.T @ stacked_R @ T_u),
+        rtol=1e-12,
+        atol=1e-11,
+    )
+    gradient = (
+        gamma.T @ weight @ (free - reference).ravel() - T_u.T @ stacked_R @ centre
+    )
     assert np.allclose(q, 2 * gradient, rtol=1e-12, atol=1e-11)
     assert np.allclose(G, np.vstack([D, E @ gamma]), atol=1e-12)
     assert np.array_equal(P, P.T)
@@ -135,7 +193,9 @@ def test_the_condensed_problem_is_the_stacked_one(H, blocks, held, penalized, rn
     rest, at_rest = expand(stages, start, feedback, last, np.zeros(H * m))
     difference = evaluate_cost(condenser.cost, states, inputs, references, 1.0)
     difference -= evaluate_cost(condenser.cost, at_rest, rest, references, 1.0)
-    assert difference == pytest.approx(unknowns @ P @ unknowns / 2 + q @ unknowns, rel=1e-10, abs=1e-9)
+    assert difference == pytest.approx(
+        unknowns @ P @ unknowns / 2 + q @ unknowns, rel=1e-10, abs=1e-9
+    )
 
 
 def test_in_increments_it_is_the_papers_problem(rng):
@@ -157,17 +217,26 @@ def test_in_increments_it_is_the_papers_problem(rng):
     powers = [np.linalg.matrix_power(A[0], k) for k in range(H + 1)]
     A_tilde = np.vstack(powers[1:])
     zeros = np.zeros((p, m))
-    B_tilde = np.block([[powers[i - j] @ B[0] if i >= j else zeros for j in range(H)] for i in range(H)])
+    B_tilde = np.block(
+        [
+            [powers[i - j] @ B[0] if i >= j else zeros for j in range(H)]
+            for i in range(H)
+        ]
+    )
     T_z, T_u = np.kron(np.tri(H), np.eye(p)), np.kron(np.tri(H), np.eye(m))
     Q_tilde, R_tilde = np.kron(np.eye(H), Qbar), np.kron(np.eye(H), R)
     r = np.zeros((H, p))
     r[:, :n] = targets
     paper_P = 2 * (B_tilde.T @ T_z.T @ Q_tilde @ T_z @ B_tilde + T_u.T @ R_tilde @ T_u)
     offset = np.tile(s0, H) + T_z @ A_tilde @ (s0 - before) - r.ravel()
-    paper_q = 2 * (B_tilde.T @ T_z.T @ Q_tilde @ offset + T_u.T @ R_tilde @ np.tile(last, H))
+    paper_q = 2 * (
+        B_tilde.T @ T_z.T @ Q_tilde @ offset + T_u.T @ R_tilde @ np.tile(last, H)
+    )
     increments = np.linalg.solve(paper_P, -paper_q)
     assert np.allclose(T_u.T @ P @ T_u, paper_P, rtol=1e-11, atol=1e-10)
-    assert np.allclose(np.linalg.solve(P, -q), np.tile(last, H) + T_u @ increments, atol=1e-9)
+    assert np.allclose(
+        np.linalg.solve(P, -q), np.tile(last, H) + T_u @ increments, atol=1e-9
+    )
 
 
 @pytest.mark.parametrize("rated", [True, False], ids=["rates", "no rates"])
@@ -178,20 +247,38 @@ def test_feedback_coordinates_give_the_same_plan(penalized, held, rated, rng):
     p, solver = n * blocks, DualActiveSet()
     Q, T, R = spd(rng, n), spd(rng, n), spd(rng, m)
     rates = {"input_rates": Box([-0.4, -0.3], [0.4, np.inf])} if rated else {}
-    problem = Problem(Tracking(Q, R, terminal=T, penalized=penalized), inputs=Box([-0.5, -0.3], [np.inf, 0.4]), **rates)
+    problem = Problem(
+        Tracking(Q, R, terminal=T, penalized=penalized),
+        inputs=Box([-0.5, -0.3], [np.inf, 0.4]),
+        **rates,
+    )
     condenser = Condensing(problem, H, blocks)
-    stages, start, references = random_stages(rng, p, m, H, held), rng.normal(size=p), random_references(rng, H, n, m)
-    rows = state_rows(rng.normal(size=(len(stages.A), r, p)), np.full((H, r), -3.0), np.full((H, r), 4.0))
+    stages, start, references = (
+        random_stages(rng, p, m, H, held),
+        rng.normal(size=p),
+        random_references(rng, H, n, m),
+    )
+    rows = state_rows(
+        rng.normal(size=(len(stages.A), r, p)),
+        np.full((H, r), -3.0),
+        np.full((H, r), 4.0),
+    )
     price = np.full(H * r, 2.0)
     found, plain = [], condenser.condense(stages, start, references, rows)
     assert len(plain.feedback) == 0
-    other = condense_with_feedback(condenser.cost, condenser.bounds, stages, start, references, rows)
+    other = condense_with_feedback(
+        condenser.cost, condenser.bounds, stages, start, references, rows
+    )
     for program in (plain, other):
         prices = np.concatenate([np.full(len(program.G) - H * r, np.inf), price])
         solution = solver.solve(QuadraticProgram.unchecked(*program[:5]), prices=prices)
         assert solution.status is Status.SOLVED
-        inputs, states = expand(stages, start, program.feedback, references.previous_input, solution.x)
-        z = solution.multipliers[-(len(problem.inputs.lower) * H * (2 if rated else 1) + H * r) :]
+        inputs, states = expand(
+            stages, start, program.feedback, references.previous_input, solution.x
+        )
+        z = solution.multipliers[
+            -(len(problem.inputs.lower) * H * (2 if rated else 1) + H * r) :
+        ]
         found.append((inputs, states, z))
     assert np.count_nonzero(found[0][2]) > 3
     for one, same in zip(*found, strict=True):
@@ -203,14 +290,26 @@ def test_feedback_coordinates_give_the_same_plan(penalized, held, rated, rng):
 
 @pytest.mark.parametrize("held", [True, False], ids=["held", "varying"])
 @pytest.mark.parametrize("penalized", PENALIZED)
-def test_weights_by_stage_outputs_and_rows_of_inputs_make_the_stacked_problem_in_both_coordinates(penalized, held, rng):
+def test_weights_by_stage_outputs_and_rows_of_inputs_make_the_stacked_problem_in_both_coordinates(
+    penalized, held, rng
+):
     n, m, r, blocks, H = 3, 2, 2, 2, 6
     p, z = n * blocks, n + m + 1
-    Q, R = np.array([spd(rng, n) for _ in range(H)]), np.array([spd(rng, m) for _ in range(H)])
+    Q, R = (
+        np.array([spd(rng, n) for _ in range(H)]),
+        np.array([spd(rng, m) for _ in range(H)]),
+    )
     outputs = rng.normal(size=(H, 2, z))
-    problem = Problem(Tracking(Q, R, terminal=spd(rng, n), penalized=penalized), inputs=Box([-0.4] * m, [0.5] * m))
+    problem = Problem(
+        Tracking(Q, R, terminal=spd(rng, n), penalized=penalized),
+        inputs=Box([-0.4] * m, [0.5] * m),
+    )
     condenser = Condensing(problem, H, blocks, outputs.mT @ outputs)
-    stages, start, references = random_stages(rng, p, m, H, held), rng.normal(size=p), random_references(rng, H, n, m)
+    stages, start, references = (
+        random_stages(rng, p, m, H, held),
+        rng.normal(size=p),
+        random_references(rng, H, n, m),
+    )
     E, D = rng.normal(size=(H, r, p)), rng.normal(size=(H, r, m))
     rows = StageRows(E, D, np.full((H, r), -3.0), np.full((H, r), 1.0))
     W, _ = problem.cost.by_stage(H)
@@ -219,29 +318,50 @@ def test_weights_by_stage_outputs_and_rows_of_inputs_make_the_stacked_problem_in
         s, total, values = start, 0.0, []
         for k, u in enumerate(inputs):
             s = at(stages.A, k) @ s + at(stages.B, k) @ u + at(stages.c, k)
-            error, before = s.reshape(blocks, n).copy(), inputs[k - 1] if k else references.previous_input
+            error, before = (
+                s.reshape(blocks, n).copy(),
+                inputs[k - 1] if k else references.previous_input,
+            )
             error[0] -= references.states[k]
-            v = {"inputs": u, "deviations": u - references.inputs[k], "increments": u - before}[penalized]
+            v = {
+                "inputs": u,
+                "deviations": u - references.inputs[k],
+                "increments": u - before,
+            }[penalized]
             y = outputs[k] @ np.concatenate([s[:n], u, [1.0]])
             total += np.einsum("bi,ij,bj->", error, W[k], error) + v @ R[k] @ v + y @ y
             values.append(at(E, k) @ s + D[k] @ u)
         return total, np.array(values)
 
     rest, plans = cost_and_rows(np.zeros((H, m))), []
-    with_feedback = condense_with_feedback(condenser.cost, condenser.bounds, stages, start, references, rows)
+    with_feedback = condense_with_feedback(
+        condenser.cost, condenser.bounds, stages, start, references, rows
+    )
     plain = condenser.condense(stages, start, references, rows)
     for program in (plain, with_feedback):
         x = rng.normal(size=H * m)
-        inputs, states = expand(stages, start, program.feedback, references.previous_input, x)
-        origin, _ = expand(stages, start, program.feedback, references.previous_input, 0.0 * x)
+        inputs, states = expand(
+            stages, start, program.feedback, references.previous_input, x
+        )
+        origin, _ = expand(
+            stages, start, program.feedback, references.previous_input, 0.0 * x
+        )
         total, values = cost_and_rows(inputs)
-        assert evaluate_cost(condenser.cost, states, inputs, references, 1.0) == pytest.approx(total, rel=1e-11)
+        assert evaluate_cost(
+            condenser.cost, states, inputs, references, 1.0
+        ) == pytest.approx(total, rel=1e-11)
         gained = x @ program.P @ x / 2 + program.q @ x
         assert gained == pytest.approx(total - cost_and_rows(origin)[0], rel=1e-9)
         left = program.upper[-H * r :] - program.G[-H * r :] @ x
         assert np.allclose(left.reshape(H, r), 1.0 - values, atol=1e-10)
-        solution = DualActiveSet().solve(QuadraticProgram.unchecked(*program[:5]), prices=priced(program, H * r))
-        plans.append(expand(stages, start, program.feedback, references.previous_input, solution.x)[0])
+        solution = DualActiveSet().solve(
+            QuadraticProgram.unchecked(*program[:5]), prices=priced(program, H * r)
+        )
+        plans.append(
+            expand(
+                stages, start, program.feedback, references.previous_input, solution.x
+            )[0]
+        )
         assert cost_and_rows(plans[-1])[0] < rest[0]
     assert np.allclose(*plans, atol=1e-8)
 
@@ -250,16 +370,23 @@ def priced(program, rows):
     return np.concatenate([np.full(len(program.G) - rows, np.inf), np.full(rows, 2.0)])
 
 
-def test_an_unstable_plant_is_condensed_in_feedback_coordinates_and_the_plan_is_found(rng):
+def test_an_unstable_plant_is_condensed_in_feedback_coordinates_and_the_plan_is_found(
+    rng,
+):
     """x+ = 2 x + u over 50 stages: 2^100 stands beside R in P, and nothing of R is left."""
-    H, problem = 50, Problem(Tracking([1.0], [1.0], penalized="inputs"), inputs=Box([-3.0], [3.0]))
+    H, problem = (
+        50,
+        Problem(Tracking([1.0], [1.0], penalized="inputs"), inputs=Box([-3.0], [3.0])),
+    )
     condenser = Condensing(problem, H, 1)
     stages = Stages(np.array([[[2.0]]]), np.array([[[1.0]]]), np.zeros((1, 1)))
     references = References(np.zeros((H, 1)), np.zeros((H, 1)), np.zeros(1))
     program = condenser.condense(stages, np.array([2.5]), references, no_rows(1, H))
     assert len(program.feedback) == H
     solution = DualActiveSet().solve(QuadraticProgram.unchecked(*program[:5]))
-    inputs, states = expand(stages, np.array([2.5]), program.feedback, references.previous_input, solution.x)
+    inputs, states = expand(
+        stages, np.array([2.5]), program.feedback, references.previous_input, solution.x
+    )
     assert solution.status is Status.SOLVED
     assert inputs.min() == pytest.approx(-3.0, abs=1e-9)
     assert np.abs(states[-20:]).max() < 1e-6
@@ -267,11 +394,16 @@ def test_an_unstable_plant_is_condensed_in_feedback_coordinates_and_the_plan_is_
 
 
 def test_arrays_that_are_not_contiguous_are_refused(rng):
-    condenser = Condensing(Problem(Tracking([1.0, 1.0], [1.0], penalized="inputs")), 3, 1)
+    condenser = Condensing(
+        Problem(Tracking([1.0, 1.0], [1.0], penalized="inputs")), 3, 1
+    )
     stages = random_stages(rng, 2, 1, 3, held=False)
     with pytest.raises(ShapeError, match="contiguous"):
         condenser.condense(
-            stages._replace(A=stages.A.swapaxes(1, 2)), np.zeros(2), random_references(rng, 3, 2, 1), no_rows(2, 3)
+            stages._replace(A=stages.A.swapaxes(1, 2)),
+            np.zeros(2),
+            random_references(rng, 3, 2, 1),
+            no_rows(2, 3),
         )
 
 
@@ -295,25 +427,49 @@ def programs_of_the_double_pendulum(starts, seed):
 
     Six poses count as upright, a turn apart. Every solution is checked against the stages and the bounds.
     """
-    H, rng, solver, counts = 60, np.random.default_rng(seed), DualActiveSet(), np.zeros(2, dtype=int)
+    H, rng, solver, counts = (
+        60,
+        np.random.default_rng(seed),
+        DualActiveSet(),
+        np.zeros(2, dtype=int),
+    )
     bounds = {"inputs": Box([-6.0], [6.0])}
-    for joint, penalized, _ in product((ACROBOT, PENDUBOT), ("inputs", "increments"), range(starts)):
+    for joint, penalized, _ in product(
+        (ACROBOT, PENDUBOT), ("inputs", "increments"), range(starts)
+    ):
         problem, model = (
-            Problem(Tracking([100.0, 100.0, 1.0, 1.0], [1e-3], penalized=penalized), **bounds),
+            Problem(
+                Tracking([100.0, 100.0, 1.0, 1.0], [1e-3], penalized=penalized),
+                **bounds,
+            ),
             DoublePendulum(joint),
         )
         condenser = Condensing(problem, H, 1)
         start = np.concatenate([rng.uniform(-np.pi, np.pi, 2), rng.uniform(-15, 15, 2)])
         for turns in product((0, 1), (-1, 0, 1)):
             goal = UPRIGHT + 2 * np.pi * np.array([*turns, 0, 0])
-            references = References(np.tile(goal, (H, 1)), np.zeros((H, 1)), np.zeros(1))
+            references = References(
+                np.tile(goal, (H, 1)), np.zeros((H, 1)), np.zeros(1)
+            )
             for states, inputs in wild_plans(rng, model, start, goal, H):
                 at = model.linearize(states[:-1], inputs)
-                c = at.mean - np.einsum("kij,kj->ki", at.A, states[:-1]) - np.einsum("kij,kj->ki", at.B, inputs)
+                c = (
+                    at.mean
+                    - np.einsum("kij,kj->ki", at.A, states[:-1])
+                    - np.einsum("kij,kj->ki", at.B, inputs)
+                )
                 stages = Stages(at.A, at.B, c)
                 program = condenser.condense(stages, start, references, no_rows(4, H))
-                solution = solver.solve(QuadraticProgram.unchecked(*program[:5]))  # raises where P is indefinite
-                found, moved = expand(stages, start, program.feedback, references.previous_input, solution.x)
+                solution = solver.solve(
+                    QuadraticProgram.unchecked(*program[:5])
+                )  # raises where P is indefinite
+                found, moved = expand(
+                    stages,
+                    start,
+                    program.feedback,
+                    references.previous_input,
+                    solution.x,
+                )
                 assert solution.status is Status.SOLVED
                 assert np.isfinite(moved).all()
                 # Where torques are at their bounds the states of the linear stages grow, and rounding with them.

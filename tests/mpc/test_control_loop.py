@@ -36,7 +36,9 @@ def test_five_lines_steer_somebody_elses_plant_to_a_set_point():
 
 
 @pytest.mark.parametrize("on_failure", ["previous_plan", "hold"])
-def test_whatever_happens_an_input_is_finite_and_within_bounds_and_rates(on_failure, rng):
+def test_whatever_happens_an_input_is_finite_and_within_bounds_and_rates(
+    on_failure, rng
+):
     hard = Problem(PROBLEM.cost, BOX, RATES, [Box(None, [np.inf, 0.1], penalty=None)])
     loop, x, last = ControlLoop(controller(hard), on_failure), np.zeros(2), np.zeros(1)
     for k in range(60):
@@ -55,13 +57,22 @@ def test_its_inputs_are_those_of_the_simulation():
     steering = controller()
     flown = closed_loop(plant, steering, np.tile(GOAL, (25, 1)), np.zeros(2), 12)
     loop = ControlLoop(steering)
-    inputs = [loop.input(x, Reference(np.tile(GOAL, (11, 1)))) for x in flown.states[:12]]
+    inputs = [
+        loop.input(x, Reference(np.tile(GOAL, (11, 1)))) for x in flown.states[:12]
+    ]
     assert np.array_equal(inputs, flown.inputs)
 
 
-@pytest.mark.parametrize("solver", [CvxpySolver(), PrimalActiveSet()], ids=lambda solver: type(solver).__name__)
+@pytest.mark.parametrize(
+    "solver",
+    [CvxpySolver(), PrimalActiveSet()],
+    ids=lambda solver: type(solver).__name__,
+)
 def test_another_solver_steers_alike_from_step_to_step(solver):
-    loops, x = [ControlLoop(controller()), ControlLoop(controller(solver=solver))], np.zeros(2)
+    loops, x = (
+        [ControlLoop(controller()), ControlLoop(controller(solver=solver))],
+        np.zeros(2),
+    )
     for _ in range(8):
         ours, theirs = (loop.input(x, GOAL) for loop in loops)
         assert np.allclose(theirs, ours, atol=1e-6)

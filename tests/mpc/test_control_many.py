@@ -47,22 +47,35 @@ def controller(form, covariance, propagator, model=GP, feedback=True, **settings
 def beliefs(count, spread=0.05, seed=0):
     rng = np.random.default_rng(seed)
     roots = spread * rng.normal(size=(count, 6, 6))
-    return [Gaussian(torch.tensor(rng.uniform(-0.5, 0.5, 6)), torch.tensor(root @ root.T)) for root in roots]
+    return [
+        Gaussian(torch.tensor(rng.uniform(-0.5, 0.5, 6)), torch.tensor(root @ root.T))
+        for root in roots
+    ]
 
 
 def assert_same(many, alone, tolerance=1e-9):
     for ours, theirs in zip(many, alone, strict=True):
         assert ours.status is theirs.status
         for key in ("input", "inputs", "means", "covariances"):
-            assert np.allclose(getattr(ours, key), getattr(theirs, key), rtol=0, atol=tolerance, equal_nan=True)
+            assert np.allclose(
+                getattr(ours, key),
+                getattr(theirs, key),
+                rtol=0,
+                atol=tolerance,
+                equal_nan=True,
+            )
 
 
 @pytest.mark.parametrize("choice", ["auto", "torch"])
 @pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize(
-    ("covariance", "propagator"), MODES, ids=lambda v: v if isinstance(v, str) else type(v).__name__
+    ("covariance", "propagator"),
+    MODES,
+    ids=lambda v: v if isinstance(v, str) else type(v).__name__,
 )
-def test_many_questions_get_the_answers_that_each_gets_alone(form, covariance, propagator, choice):
+def test_many_questions_get_the_answers_that_each_gets_alone(
+    form, covariance, propagator, choice
+):
     asked = controller(form, covariance, propagator)
     with backend(choice):
         first = asked.control_many(beliefs(4), [REFERENCE] * 4, [None] * 4)
@@ -72,14 +85,22 @@ def test_many_questions_get_the_answers_that_each_gets_alone(form, covariance, p
         again[2] = Gaussian.certain(np.full(6, np.nan))
         before = [*first[:3], None]
         second = asked.control_many(again, [REFERENCE] * 4, before)
-        assert_same(second, [asked.control(b, REFERENCE, p) for b, p in zip(again, before, strict=True)])
+        assert_same(
+            second,
+            [
+                asked.control(b, REFERENCE, p)
+                for b, p in zip(again, before, strict=True)
+            ],
+        )
     assert second[2].status is Status.INVALID_MEASUREMENT
     assert all(second[t].status.solved for t in (0, 1, 3))
 
 
 def test_without_feedback_and_with_another_model_too():
     open_loop = controller("trajectory", "zero_order", MomentMatching(), feedback=False)
-    other = controller("trajectory", "zero_order", Linearization(), linear_gaussian(6, 3))
+    other = controller(
+        "trajectory", "zero_order", Linearization(), linear_gaussian(6, 3)
+    )
     for asked in (open_loop, other):
         many = asked.control_many(beliefs(3), [REFERENCE] * 3, [None] * 3)
         assert_same(many, [asked.control(b, REFERENCE) for b in beliefs(3)])
@@ -90,19 +111,28 @@ def test_compiled_and_torch_answer_alike():
         asked = controller("trajectory", covariance, propagator)
         compiled = asked.control_many(beliefs(3), [REFERENCE] * 3, [None] * 3)
         with backend("torch"):
-            assert_same(asked.control_many(beliefs(3), [REFERENCE] * 3, [None] * 3), compiled)
+            assert_same(
+                asked.control_many(beliefs(3), [REFERENCE] * 3, [None] * 3), compiled
+            )
 
 
 def test_one_that_cannot_be_answered_spoils_no_other():
     asked, questions = controller("velocity", "full", MomentMatching()), beliefs(3)
     questions[1] = Gaussian(questions[1].mean, -torch.eye(6))  # no covariance
     many = asked.control_many(questions, [REFERENCE] * 3, [None] * 3)
-    assert [d.status for d in many] == [Status.SOLVED, Status.NUMERICAL_TROUBLE, Status.SOLVED]
+    assert [d.status for d in many] == [
+        Status.SOLVED,
+        Status.NUMERICAL_TROUBLE,
+        Status.SOLVED,
+    ]
     assert_same(many, [asked.control(b, REFERENCE) for b in questions])
 
 
 def test_nobody_asks():
-    assert controller("trajectory", "full", MomentMatching()).control_many([], [], []) == []
+    assert (
+        controller("trajectory", "full", MomentMatching()).control_many([], [], [])
+        == []
+    )
 
 
 def test_each_question_may_take_its_own_number_of_programs():
@@ -122,8 +152,13 @@ def test_stages_stay_on_the_device_of_the_model(covariance, propagator):
     (belief,) = beliefs(1)
     linearizer = StageLinearizer(GP, propagator, covariance)
     covariances = np.repeat(belief.covariance.numpy()[None], 2, axis=0)
-    states = linearizer.state(np.repeat(belief.mean.numpy()[None], 2, axis=0), covariances)
-    with torch.device("meta"), backend("torch"):  # a tensor made without saying where lands there, and is noticed
+    states = linearizer.state(
+        np.repeat(belief.mean.numpy()[None], 2, axis=0), covariances
+    )
+    with (
+        torch.device("meta"),
+        backend("torch"),
+    ):  # a tensor made without saying where lands there, and is noticed
         stages = linearizer(states, np.ones((2, 3)), covariances)
     assert all(np.isfinite(part).all() for part in stages)
 
@@ -131,11 +166,19 @@ def test_stages_stay_on_the_device_of_the_model(covariance, propagator):
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
 @pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize(
-    ("covariance", "propagator"), MODES, ids=lambda v: v if isinstance(v, str) else type(v).__name__
+    ("covariance", "propagator"),
+    MODES,
+    ids=lambda v: v if isinstance(v, str) else type(v).__name__,
 )
 def test_a_model_on_a_gpu_gives_the_same_answers(form, covariance, propagator):
-    here, there = controller(form, covariance, propagator), controller(form, covariance, propagator, GP.to("cuda"))
-    first, before = here.control_many(beliefs(4), [REFERENCE] * 4, [None] * 4), [None] * 4
+    here, there = (
+        controller(form, covariance, propagator),
+        controller(form, covariance, propagator, GP.to("cuda")),
+    )
+    first, before = (
+        here.control_many(beliefs(4), [REFERENCE] * 4, [None] * 4),
+        [None] * 4,
+    )
     assert_same(there.control_many(beliefs(4), [REFERENCE] * 4, before), first)
     second = here.control_many(beliefs(4, seed=1), [REFERENCE] * 4, first)
     assert_same(there.control_many(beliefs(4, seed=1), [REFERENCE] * 4, first), second)

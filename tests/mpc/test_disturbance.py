@@ -22,16 +22,30 @@ H = 8
 PENDULUM = pendulum_posterior()
 PROBLEM = Problem(Tracking([10.0, 1.0], [0.1]), inputs=Box([-6.0], [6.0]))
 AT_REST = Reference(np.tile([0.4, 0.0], (H + 1, 1)), np.zeros((H, 1)))
-UNKNOWN = np.array([0.0, 0.08])  # what the plant does that its model does not say [rad, rad/s]
+UNKNOWN = np.array(
+    [0.0, 0.08]
+)  # what the plant does that its model does not say [rad, rad/s]
 
 
 def controller(kind=GPMPC, model=PENDULUM, propagator=None, **settings):
-    iterated = {"iterations": settings.pop("iterations")} if "iterations" in settings else {}
-    return kind(model, propagator or Linearization(), PROBLEM, H, [0.0], PredictionSettings(**settings), **iterated)
+    iterated = (
+        {"iterations": settings.pop("iterations")} if "iterations" in settings else {}
+    )
+    return kind(
+        model,
+        propagator or Linearization(),
+        PROBLEM,
+        H,
+        [0.0],
+        PredictionSettings(**settings),
+        **iterated,
+    )
 
 
 def moved(model, state, input, unknown=UNKNOWN):
-    return model.predict(torch.tensor(state), torch.tensor(input)).mean.numpy() + unknown
+    return (
+        model.predict(torch.tensor(state), torch.tensor(input)).mean.numpy() + unknown
+    )
 
 
 def flown(asked, model=PENDULUM, unknown=UNKNOWN, steps=40):
@@ -59,7 +73,10 @@ def flown(asked, model=PENDULUM, unknown=UNKNOWN, steps=40):
 )
 def test_a_constant_error_leaves_no_offset(settings):
     states, decisions = flown(controller(**settings))
-    exact = settings.get("covariance") not in ("full", "diagonal")  # these weigh the covariance as well
+    exact = settings.get("covariance") not in (
+        "full",
+        "diagonal",
+    )  # these weigh the covariance as well
     assert abs(states[-1, 0] - 0.4) < (1e-4 if exact else 2e-3)
     if "disturbance_gain" in settings:
         assert np.allclose(decisions[-1].disturbance, UNKNOWN, rtol=0, atol=1e-4)
@@ -72,7 +89,10 @@ def test_without_an_estimate_it_does():
 
 
 def test_a_model_that_is_right_is_left_alone():
-    plain, told = flown(controller(), unknown=0.0), flown(controller(disturbance_gain=1.0), unknown=0.0)
+    plain, told = (
+        flown(controller(), unknown=0.0),
+        flown(controller(disturbance_gain=1.0), unknown=0.0),
+    )
     assert np.allclose(plain[0], told[0], rtol=0, atol=1e-9)
     assert np.abs([decision.disturbance for decision in told[1]]).max() < 1e-12
 
@@ -81,14 +101,18 @@ def test_the_estimate_moves_by_its_gain_towards_what_the_last_step_showed():
     asked = controller(disturbance_gain=0.3)
     _, decisions = flown(asked, steps=6)
     found = [decision.disturbance for decision in decisions]
-    assert np.allclose(found, [(1 - 0.7**k) * UNKNOWN for k in range(6)], rtol=0, atol=1e-12)
+    assert np.allclose(
+        found, [(1 - 0.7**k) * UNKNOWN for k in range(6)], rtol=0, atol=1e-12
+    )
 
 
 def test_what_was_applied_counts_and_not_what_was_planned():
     asked = controller(disturbance_gain=1.0)
     last = asked.control(Gaussian.certain(np.zeros(2)), AT_REST)
     held = replace(last, input=np.array([1.5]))
-    now = asked.control(Gaussian.certain(moved(PENDULUM, np.zeros(2), held.input)), AT_REST, held)
+    now = asked.control(
+        Gaussian.certain(moved(PENDULUM, np.zeros(2), held.input)), AT_REST, held
+    )
     assert np.allclose(now.disturbance, UNKNOWN, rtol=0, atol=1e-12)
 
 
@@ -97,7 +121,9 @@ def test_a_measurement_that_is_missing_leaves_the_estimate_as_it_is():
     states, _ = flown(asked, steps=5)
     last = command(asked, Gaussian.certain(states[-1]), AT_REST, None, "previous_plan")
     last = replace(last, plan=replace(last.plan, disturbance=UNKNOWN))
-    blind = command(asked, Gaussian.certain(np.full(2, np.nan)), AT_REST, last, "previous_plan")
+    blind = command(
+        asked, Gaussian.certain(np.full(2, np.nan)), AT_REST, last, "previous_plan"
+    )
     assert blind.status is Status.INVALID_MEASUREMENT
     assert np.array_equal(blind.plan.disturbance, UNKNOWN)
 
@@ -111,7 +137,10 @@ def test_compiled_torch_batched_and_state_form_agree(covariance):
     in_cvxpy = controller(StateFormMPC, covariance=covariance, disturbance_gain=0.7)
     others = [in_cvxpy.control(belief, AT_REST, before)]
     with backend("torch"):
-        others += [asked.control(belief, AT_REST, before), *asked.control_many([belief], [AT_REST], [before])]
+        others += [
+            asked.control(belief, AT_REST, before),
+            *asked.control_many([belief], [AT_REST], [before]),
+        ]
     for other, tolerance in zip(others, (1e-6, 1e-9, 1e-9), strict=True):
         assert np.allclose(other.disturbance, answer.disturbance, rtol=0, atol=1e-12)
         assert np.allclose(other.inputs, answer.inputs, rtol=0, atol=tolerance)
@@ -130,7 +159,10 @@ def test_any_model_can_be_wrong():
     [
         ({"disturbance_gain": 1.2}, "lie between 0 and 1; got 1.2"),
         ({"disturbance_gain": -0.1}, "got -0.1"),
-        ({"disturbance_gain": 0.5, "form": "velocity"}, "be 0 for form 'velocity', which needs none; got 0.5"),
+        (
+            {"disturbance_gain": 0.5, "form": "velocity"},
+            "be 0 for form 'velocity', which needs none; got 0.5",
+        ),
     ],
 )
 @pytest.mark.parametrize("kind", [GPMPC, StateFormMPC])
@@ -142,8 +174,12 @@ def test_a_gain_out_of_range_is_refused(kind, settings, rule):
 @pytest.mark.parametrize("iterations", [1, 30])
 def test_a_controller_for_another_model_is_one_that_was_made_with_it(iterations):
     other, inputs = pendulum_posterior(seed=3), 2.0 * np.ones((H, 1))
-    asked = controller(covariance="none", rolled_out=True, iterations=iterations).with_model(other)
-    made = controller(model=other, covariance="none", rolled_out=True, iterations=iterations)
+    asked = controller(
+        covariance="none", rolled_out=True, iterations=iterations
+    ).with_model(other)
+    made = controller(
+        model=other, covariance="none", rolled_out=True, iterations=iterations
+    )
     question = Gaussian.certain([0.3, -0.2]), AT_REST, None, None, inputs
     found, expected = asked.control(*question), made.control(*question)
     assert np.array_equal(found.means, expected.means)

@@ -20,7 +20,13 @@ from gpmpc.propagation import Linearization, MeanEquivalence, MomentMatching, ro
 from gpmpc.qp import CvxpySolver, DualActiveSet
 from gpmpc.status import Status
 from gpmpc.systems import step
-from tests.mpc.systems import HOVER, QUADROTOR, LinearPlant, linear_gaussian, quadrotor_gp
+from tests.mpc.systems import (
+    HOVER,
+    QUADROTOR,
+    LinearPlant,
+    linear_gaussian,
+    quadrotor_gp,
+)
 
 PAIRS = list(product(FORMS, COVARIANCES))
 gp = lru_cache(quadrotor_gp)
@@ -38,7 +44,10 @@ def quadrotor_problem(**changes):
         "input_rates": Box([-2.0, -0.3, -0.3], [2.0, 0.3, 0.3]),
     }
     settings |= changes
-    return Problem(Tracking(settings.pop("Q"), settings.pop("R"), penalized="deviations"), **settings)
+    return Problem(
+        Tracking(settings.pop("Q"), settings.pop("R"), penalized="deviations"),
+        **settings,
+    )
 
 
 def at_origin(horizon):
@@ -62,19 +71,36 @@ def fly(controller, start, reference, steps):
 @pytest.mark.parametrize("penalized", ["inputs", "deviations", "increments"])
 def test_on_a_linear_model_all_forms_are_the_nonlinear_benchmark(penalized, rng):
     model, H = linear_gaussian(3, 2), 6
-    bounds = Box([-0.6, -np.inf, -0.6], [np.inf, 0.5, np.inf], probability=0.95, kappa=0.0, penalty=None)
-    cost = Tracking([2.0, 1.0, 0.5], [0.3, 0.2], terminal=[5.0, 5.0, 1.0], penalized=penalized)
+    bounds = Box(
+        [-0.6, -np.inf, -0.6],
+        [np.inf, 0.5, np.inf],
+        probability=0.95,
+        kappa=0.0,
+        penalty=None,
+    )
+    cost = Tracking(
+        [2.0, 1.0, 0.5], [0.3, 0.2], terminal=[5.0, 5.0, 1.0], penalized=penalized
+    )
     box, rates = Box([-0.7, -0.5], [0.7, 0.4]), Box([-0.5] * 2, [0.5] * 2)
     problem = Problem(cost, box, rates, [bounds])
     controllers = [
-        GPMPC(model, propagator(c), problem, H, [0.0, 0.0], prediction=PredictionSettings(form=f, covariance=c))
+        GPMPC(
+            model,
+            propagator(c),
+            problem,
+            H,
+            [0.0, 0.0],
+            prediction=PredictionSettings(form=f, covariance=c),
+        )
         for f, c in PAIRS
         if f != "velocity" or c != "full"
     ]
     benchmark = NMPC(LinearPlant(model), problem, H, [0.0, 0.0])
     state, last, worked = np.array([0.4, -0.3, 0.2]), None, 0
     for _ in range(5):
-        reference = Reference(0.5 * rng.normal(size=(H + 1, 3)), 0.3 * rng.normal(size=(H, 2)))
+        reference = Reference(
+            0.5 * rng.normal(size=(H + 1, 3)), 0.3 * rng.normal(size=(H, 2))
+        )
         best = benchmark.control(Gaussian.certain(state), reference, last)
         assert best.status is Status.SOLVED
         for controller in controllers:
@@ -90,7 +116,10 @@ def test_on_a_linear_model_all_forms_are_the_nonlinear_benchmark(penalized, rng)
 
 def test_it_is_the_exact_least_squares_solution_and_predicts_the_exact_covariances(rng):
     model, H = linear_gaussian(2, 1), 5
-    problem, state = Problem(Tracking([3.0, 0.5], [0.2], penalized="inputs")), rng.normal(size=2)
+    problem, state = (
+        Problem(Tracking([3.0, 0.5], [0.2], penalized="inputs")),
+        rng.normal(size=2),
+    )
     reference = Reference(rng.normal(size=(H + 1, 2)))
     A, B, c, V = (part.numpy() for part in (model.A, model.B, model.c, model.V))
     free, gamma, x = [], np.zeros((H, 2, H)), state
@@ -101,7 +130,11 @@ def test_it_is_the_exact_least_squares_solution_and_predicts_the_exact_covarianc
             gamma[i, :, j] = np.linalg.matrix_power(A, i - j) @ B[:, 0]
     rows = (np.sqrt([3.0, 0.5])[None, :, None] * gamma).reshape(-1, H)
     right = (np.sqrt([3.0, 0.5]) * (reference.states[1:] - np.array(free))).ravel()
-    best = np.linalg.lstsq(np.vstack([rows, np.sqrt(0.2) * np.eye(H)]), np.append(right, np.zeros(H)), rcond=None)[0]
+    best = np.linalg.lstsq(
+        np.vstack([rows, np.sqrt(0.2) * np.eye(H)]),
+        np.append(right, np.zeros(H)),
+        rcond=None,
+    )[0]
     S = np.zeros((2, 2))
     for _ in range(H):
         S = A @ S @ A.T + V
@@ -133,10 +166,19 @@ def test_bounds_and_rates_are_kept_for_thirty_steps(form, covariance):
     if covariance in ("full", "diagonal") and form == "trajectory":
         moves = MeanEquivalence()  # half the time; the bounds do not care
     controller, steps = (
-        GPMPC(gp(), moves, problem, H, HOVER, prediction=PredictionSettings(form=form, covariance=covariance)),
+        GPMPC(
+            gp(),
+            moves,
+            problem,
+            H,
+            HOVER,
+            prediction=PredictionSettings(form=form, covariance=covariance),
+        ),
         30,
     )
-    states, inputs, decisions = fly(controller, [0.8, 0.0, -0.6, 0.0, 0.5, 0.0], at_origin(H), steps)
+    states, inputs, decisions = fly(
+        controller, [0.8, 0.0, -0.6, 0.0, 0.5, 0.0], at_origin(H), steps
+    )
     rates = np.diff(inputs, axis=0, prepend=HOVER[None])
     plans = np.concatenate([d.inputs for d in decisions])
     assert (plans >= problem.inputs.lower - 1e-8).all()
@@ -153,14 +195,24 @@ def test_bounds_and_rates_are_kept_for_thirty_steps(form, covariance):
 def expected_cost(problem, model, moves, state, inputs, reference, covariance):
     """The nonlinear problem's cost, chance margins (H, n) and inputs (H, m) with their graph."""
     u = torch.tensor(inputs, requires_grad=True)
-    belief, Q, means, variances, cost = Gaussian.certain(torch.tensor(state)), torch.tensor(problem.cost.Q), [], [], 0.0
+    belief, Q, means, variances, cost = (
+        Gaussian.certain(torch.tensor(state)),
+        torch.tensor(problem.cost.Q),
+        [],
+        [],
+        0.0,
+    )
     for k, control in enumerate(u):
         if covariance == "diagonal":
             belief = Gaussian(belief.mean, torch.diag_embed(belief.variance))
         belief = rollout(moves, model, belief, control[None])
         belief = Gaussian(belief.mean[0], belief.covariance[0])
         error = belief.mean - torch.tensor(reference.states[k + 1])
-        cost = cost + error @ Q @ error + (Q * belief.covariance).sum() * (covariance in ("full", "diagonal"))
+        cost = (
+            cost
+            + error @ Q @ error
+            + (Q * belief.covariance).sum() * (covariance in ("full", "diagonal"))
+        )
         change = control - torch.tensor(reference.inputs[k])
         cost = cost + change @ torch.tensor(problem.cost.R) @ change
         means.append(belief.mean)
@@ -194,10 +246,16 @@ def test_more_iterations_end_in_a_kkt_point_of_the_nonlinear_problem(covariance,
     kappa = 0.0 if covariance == "none" else limits.standard_deviations()
 
     def exact(inputs):
-        cost, means, variances, u = expected_cost(problem, model, moves, state, inputs, reference, covariance)
+        cost, means, variances, u = expected_cost(
+            problem, model, moves, state, inputs, reference, covariance
+        )
         sd = variances.sqrt() if kappa else torch.zeros_like(means)
-        rows = torch.cat([(means + kappa * sd)[:, 1::2], (means - kappa * sd)[:, 1::2]], dim=1)  # the order of G
-        outside = (rows[:, :3] - 0.9).clamp_min(0).sum() + (-0.35 - rows[:, 3:]).clamp_min(0).sum()
+        rows = torch.cat(
+            [(means + kappa * sd)[:, 1::2], (means - kappa * sd)[:, 1::2]], dim=1
+        )  # the order of G
+        outside = (rows[:, :3] - 0.9).clamp_min(0).sum() + (
+            -0.35 - rows[:, 3:]
+        ).clamp_min(0).sum()
         return cost, rows, outside, u, means
 
     decision = controller.control(Gaussian.certain(state), reference)
@@ -217,9 +275,17 @@ def test_more_iterations_end_in_a_kkt_point_of_the_nonlinear_problem(covariance,
 
 
 def test_zero_order_ends_where_its_own_tightening_holds():
-    H, limits = 4, Box([-np.inf, -0.5] * 3, [np.inf, 0.9] * 3, probability=0.9, penalty=None)
-    problem, state = quadrotor_problem(constraints=[limits]), np.array([0.8, -0.1, -0.4, 0.1, 0.3, 0.0])
-    controller = GPMPC(gp(), Linearization(), problem, H, HOVER, iterations=30, tolerance=1e-7)
+    H, limits = (
+        4,
+        Box([-np.inf, -0.5] * 3, [np.inf, 0.9] * 3, probability=0.9, penalty=None),
+    )
+    problem, state = (
+        quadrotor_problem(constraints=[limits]),
+        np.array([0.8, -0.1, -0.4, 0.1, 0.3, 0.0]),
+    )
+    controller = GPMPC(
+        gp(), Linearization(), problem, H, HOVER, iterations=30, tolerance=1e-7
+    )
     decision = controller.control(Gaussian.certain(state), at_origin(H))
     assert decision.status is Status.SOLVED
     sd = np.sqrt(np.diagonal(decision.covariances[1:], axis1=1, axis2=2))
@@ -237,18 +303,29 @@ def test_too_few_iterations_say_so():
         prediction=PredictionSettings(form="trajectory", covariance="none"),
         iterations=2,
     )
-    decision = controller.control(Gaussian.certain(np.array([0.8, 0, 0.8, 0, 0.8, 0])), at_origin(4))
+    decision = controller.control(
+        Gaussian.certain(np.array([0.8, 0, 0.8, 0, 0.8, 0])), at_origin(4)
+    )
     assert decision.status is Status.ITERATION_LIMIT
     assert decision.iterations == 2
 
 
-@pytest.mark.parametrize(("form", "covariance"), [pair for pair in PAIRS if pair[1] != "none"])
+@pytest.mark.parametrize(
+    ("form", "covariance"), [pair for pair in PAIRS if pair[1] != "none"]
+)
 def test_a_higher_confidence_keeps_further_from_the_bound(form, covariance):
     H, state = 3, np.array([0.5, 0.0, 0.0, 0.0, 0.0, 0.0])
-    reference = Reference(np.tile([1.0, 1.0, 0, 0, 0, 0], (H + 1, 1)), np.tile(HOVER, (H, 1)))
+    reference = Reference(
+        np.tile([1.0, 1.0, 0, 0, 0, 0], (H + 1, 1)), np.tile(HOVER, (H, 1))
+    )
     highest, last = [], None
     for confidence in (0.6, 0.9, 0.99):
-        limits = Box([-np.inf] * 6, [0.9, np.inf, np.inf, np.inf, np.inf, np.inf], probability=confidence, penalty=None)
+        limits = Box(
+            [-np.inf] * 6,
+            [0.9, np.inf, np.inf, np.inf, np.inf, np.inf],
+            probability=confidence,
+            penalty=None,
+        )
         problem = quadrotor_problem(Q=[10.0, 10.0, 1, 1, 1, 1], constraints=[limits])
         count = 25 if form == "trajectory" else 1
         controller = GPMPC(
@@ -265,14 +342,19 @@ def test_a_higher_confidence_keeps_further_from_the_bound(form, covariance):
         assert last.status is Status.SOLVED
         highest.append(last.means[1:, 0].max())
         sd = np.sqrt(last.covariances[1:, 0, 0])
-        assert (last.means[1:, 0] + limits.standard_deviations() * sd).max() < 0.9 + 1e-4
+        assert (
+            last.means[1:, 0] + limits.standard_deviations() * sd
+        ).max() < 0.9 + 1e-4
     assert highest[0] > highest[1] + 1e-3 > highest[2] + 2e-3
 
 
 @pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize("price", [None, 100.0], ids=["hard", "soft"])
 def test_a_horizon_of_fifty_with_state_bounds_stays_feasible(form, price):
-    H, limits = 50, Box([-1.5, -0.8] * 3, [1.5, 0.8] * 3, probability=0.95, penalty=price)
+    H, limits = (
+        50,
+        Box([-1.5, -0.8] * 3, [1.5, 0.8] * 3, probability=0.95, penalty=price),
+    )
     covariance = "zero_order"
     controller = GPMPC(
         gp(),
@@ -282,31 +364,55 @@ def test_a_horizon_of_fifty_with_state_bounds_stays_feasible(form, price):
         HOVER,
         prediction=PredictionSettings(form=form, covariance=covariance),
     )
-    states, _, decisions = fly(controller, [0.8, 0.0, -0.6, 0.0, 0.5, 0.0], at_origin(H), 2)
+    states, _, decisions = fly(
+        controller, [0.8, 0.0, -0.6, 0.0, 0.5, 0.0], at_origin(H), 2
+    )
     assert np.isfinite(states).all()
     assert decisions[-1].inputs.shape == (50, 3)
 
 
 def test_feedback_keeps_a_long_horizon_feasible_where_open_loop_is_not():
     model, H = linear_gaussian(2, 1), 50
-    model = replace(model, A=torch.tensor([[1.0, 0.2], [0.0, 1.0]]), B=torch.tensor([[0.02], [0.2]]), c=torch.zeros(2))
+    model = replace(
+        model,
+        A=torch.tensor([[1.0, 0.2], [0.0, 1.0]]),
+        B=torch.tensor([[0.02], [0.2]]),
+        c=torch.zeros(2),
+    )
     problem = Problem(
         Tracking([1.0, 0.1], [0.1], penalized="inputs"),
         constraints=[Box([-1.5, -2.0], [1.5, 2.0], probability=0.95, penalty=None)],
     )
-    belief, reference = Gaussian.certain(np.array([0.3, 0.0])), Reference(np.zeros((H + 1, 2)))
+    belief, reference = (
+        Gaussian.certain(np.array([0.3, 0.0])),
+        Reference(np.zeros((H + 1, 2))),
+    )
     closed, opened = (
-        GPMPC(model, Linearization(), problem, H, [0.0], prediction=PredictionSettings(feedback=f))
+        GPMPC(
+            model,
+            Linearization(),
+            problem,
+            H,
+            [0.0],
+            prediction=PredictionSettings(feedback=f),
+        )
         for f in (True, False)
     )
     assert closed.control(belief, reference).status is Status.SOLVED
     decision = opened.control(belief, reference)
     assert decision.status is Status.INFEASIBLE
     assert "soften" in decision.status.advice
-    priced = replace(problem, constraints=[replace(problem.constraints[0], penalty=10.0)])
-    softened = GPMPC(model, Linearization(), priced, H, [0.0], prediction=PredictionSettings(feedback=False)).control(
-        belief, reference
+    priced = replace(
+        problem, constraints=[replace(problem.constraints[0], penalty=10.0)]
     )
+    softened = GPMPC(
+        model,
+        Linearization(),
+        priced,
+        H,
+        [0.0],
+        prediction=PredictionSettings(feedback=False),
+    ).control(belief, reference)
     assert softened.status is Status.SOLVED
 
 
@@ -314,11 +420,20 @@ def test_soft_bounds_cost_what_they_are_said_to_cost():
     model, H = linear_gaussian(3, 2), 4
     limits = Box([-0.2] * 3, [0.2] * 3, probability=0.95, kappa=0.0, penalty=0.3)
     problem = Problem(
-        Tracking([1.0] * 3, [0.3] * 2, penalized="inputs"), inputs=Box([-0.3] * 2, [0.3] * 2), constraints=[limits]
+        Tracking([1.0] * 3, [0.3] * 2, penalized="inputs"),
+        inputs=Box([-0.3] * 2, [0.3] * 2),
+        constraints=[limits],
     )
-    belief, reference = Gaussian.certain(np.array([1.0, -0.5, 0.3])), Reference(np.zeros((H + 1, 3)))
-    convex = GPMPC(model, Linearization(), problem, H, [0.0] * 2).control(belief, reference)
-    benchmark = NMPC(LinearPlant(model), problem, H, [0.0] * 2).control(belief, reference)
+    belief, reference = (
+        Gaussian.certain(np.array([1.0, -0.5, 0.3])),
+        Reference(np.zeros((H + 1, 3))),
+    )
+    convex = GPMPC(model, Linearization(), problem, H, [0.0] * 2).control(
+        belief, reference
+    )
+    benchmark = NMPC(LinearPlant(model), problem, H, [0.0] * 2).control(
+        belief, reference
+    )
     assert np.abs(convex.means[1:]).max() > 0.25
     assert np.allclose(convex.inputs, benchmark.inputs, atol=1e-6)
 
@@ -338,8 +453,12 @@ def test_a_warm_start_changes_the_time_and_not_the_answer(form):
     _, _, decisions = fly(controller, [0.8, 0, -0.6, 0, 0.5, 0], at_origin(6), 5)
     state = Gaussian.certain(decisions[-1].means[1])
     warm = controller.control(state, at_origin(6), decisions[-1])
-    cold = controller.control(state, at_origin(6), replace(decisions[-1], solution=None))
-    other = controller.control(state, at_origin(6), replace(decisions[-1], solution=decisions[0].solution))
+    cold = controller.control(
+        state, at_origin(6), replace(decisions[-1], solution=None)
+    )
+    other = controller.control(
+        state, at_origin(6), replace(decisions[-1], solution=decisions[0].solution)
+    )
     assert np.allclose(warm.inputs, cold.inputs, atol=1e-9)
     assert np.allclose(warm.inputs, other.inputs, atol=1e-9)
 
@@ -350,7 +469,9 @@ def test_a_decision_holds_the_problem_that_it_solves():
     decision = controller.control(belief, at_origin(3))
     program = decision.problem
     assert np.array_equal(program.P, program.P.T)
-    assert np.allclose(DualActiveSet().solve(program).x, decision.inputs.ravel(), atol=1e-9)
+    assert np.allclose(
+        DualActiveSet().solve(program).x, decision.inputs.ravel(), atol=1e-9
+    )
 
 
 # Failures.
@@ -369,7 +490,9 @@ def test_a_measurement_that_is_not_finite_is_not_given_to_the_solver(iterations)
         iterations=iterations,
     )
     for bad in (np.nan, np.inf):
-        decision = controller.control(Gaussian.certain(np.array([0, 0, bad, 0, 0, 0])), at_origin(3))
+        decision = controller.control(
+            Gaussian.certain(np.array([0, 0, bad, 0, 0, 0])), at_origin(3)
+        )
         assert decision.status is Status.INVALID_MEASUREMENT
         assert decision.solution is None
         assert np.isfinite(decision.input).all()
@@ -386,22 +509,39 @@ def test_a_decision_that_was_not_solved_is_no_warm_start():
     )
     belief = Gaussian.certain(np.full(6, 0.3))
     fresh = controller.control(belief, at_origin(3))
-    nothing = {"inputs": np.full((3, 3), np.nan), "status": Status.NUMERICAL_TROUBLE, "solution": None}
+    nothing = {
+        "inputs": np.full((3, 3), np.nan),
+        "status": Status.NUMERICAL_TROUBLE,
+        "solution": None,
+    }
     failed = replace(fresh, input=np.array(HOVER), **nothing)
-    assert np.array_equal(controller.control(belief, at_origin(3), failed).inputs, fresh.inputs)
+    assert np.array_equal(
+        controller.control(belief, at_origin(3), failed).inputs, fresh.inputs
+    )
 
 
 def test_what_was_applied_at_a_failed_step_is_where_the_next_increment_starts():
     problem = quadrotor_problem(input_rates=Box([-0.05] * 3, [0.05] * 3))
     controller = GPMPC(
-        gp(), MeanEquivalence(), problem, 3, HOVER, prediction=PredictionSettings(form="trajectory", covariance="none")
+        gp(),
+        MeanEquivalence(),
+        problem,
+        3,
+        HOVER,
+        prediction=PredictionSettings(form="trajectory", covariance="none"),
     )
     decision = controller.control(Gaussian.certain(np.full(6, 0.3)), at_origin(3))
     for _ in range(3):
-        decision = controller.control(Gaussian.certain(np.full(6, 0.3)), at_origin(3), decision)
-    blind = controller.control(Gaussian.certain(np.full(6, np.nan)), at_origin(3), decision)
+        decision = controller.control(
+            Gaussian.certain(np.full(6, 0.3)), at_origin(3), decision
+        )
+    blind = controller.control(
+        Gaussian.certain(np.full(6, np.nan)), at_origin(3), decision
+    )
     assert blind.status is Status.INVALID_MEASUREMENT
-    following = controller.control(Gaussian.certain(np.full(6, 0.3)), at_origin(3), blind)
+    following = controller.control(
+        Gaussian.certain(np.full(6, 0.3)), at_origin(3), blind
+    )
     assert np.abs(following.input - blind.input).max() <= 0.05 + 1e-8
     assert np.abs(blind.input - np.array(HOVER)).max() > 0.1
 
@@ -419,7 +559,9 @@ def test_bounds_that_cannot_be_kept_are_reported(iterations):
         solver=None,
         iterations=iterations,
     )
-    decision = controller.control(Gaussian.certain(np.array([0.8, 0.5, 0, 0, 0, 0])), at_origin(3))
+    decision = controller.control(
+        Gaussian.certain(np.array([0.8, 0.5, 0, 0, 0, 0])), at_origin(3)
+    )
     assert decision.status is Status.INFEASIBLE
     assert decision.solution.status is Status.INFEASIBLE
 
@@ -446,7 +588,12 @@ def test_misuse_is_refused_at_construction(changes, message):
     good = {"problem": quadrotor_problem(), "horizon": 3, "initial_input": HOVER}
 
     def make(prediction=None, **settings):
-        GPMPC(gp(), Linearization(), prediction=PredictionSettings(**prediction or {}), **settings)
+        GPMPC(
+            gp(),
+            Linearization(),
+            prediction=PredictionSettings(**prediction or {}),
+            **settings,
+        )
 
     with pytest.raises(SettingError, match=message):
         make(**(good | changes))
@@ -455,7 +602,10 @@ def test_misuse_is_refused_at_construction(changes, message):
 def test_a_reference_that_does_not_belong_is_refused():
     belief = Gaussian.certain(np.zeros(6))
     controller = GPMPC(gp(), Linearization(), quadrotor_problem(), 3, HOVER)
-    with pytest.raises(ShapeError, match=r"penalized 'deviations' needs reference inputs \(3, 3\); got none"):
+    with pytest.raises(
+        ShapeError,
+        match=r"penalized 'deviations' needs reference inputs \(3, 3\); got none",
+    ):
         controller.control(belief, Reference(np.zeros((4, 6))))
     with pytest.raises(ShapeError, match=r"\(4, 6\); got \(6,\) and \(3, 6\)"):
         controller.control(belief, at_origin(2))
@@ -466,10 +616,15 @@ def test_a_reference_that_does_not_belong_is_refused():
 @pytest.mark.parametrize("process_noise", [False, True])
 @pytest.mark.parametrize("feedback", [False, True])
 @pytest.mark.parametrize("covariance", ["zero_order", "none"])
-def test_the_compiled_rollout_is_the_one_stage_by_stage(covariance, feedback, process_noise):
+def test_the_compiled_rollout_is_the_one_stage_by_stage(
+    covariance, feedback, process_noise
+):
     H, propagator = 6, Linearization(process_noise=process_noise)
     settings = PredictionSettings(covariance=covariance, feedback=feedback)
-    compiled, by_torch = (GPMPC(gp(), propagator, quadrotor_problem(), H, HOVER, settings) for _ in range(2))
+    compiled, by_torch = (
+        GPMPC(gp(), propagator, quadrotor_problem(), H, HOVER, settings)
+        for _ in range(2)
+    )
     belief = Gaussian(torch.full((6,), 0.2), 1e-3 * torch.eye(6))
     first = compiled.control(belief, at_origin(H))
     with backend("torch"):
@@ -481,8 +636,12 @@ def test_the_compiled_rollout_is_the_one_stage_by_stage(covariance, feedback, pr
 
 
 @pytest.mark.parametrize("evaluated", ["auto", "torch"])
-@pytest.mark.parametrize(("form", "covariance"), [pair for pair in PAIRS if pair[1] != "none"])
-def test_noise_of_observations_widens_what_is_predicted_by_its_variance_on_request(form, covariance, evaluated):
+@pytest.mark.parametrize(
+    ("form", "covariance"), [pair for pair in PAIRS if pair[1] != "none"]
+)
+def test_noise_of_observations_widens_what_is_predicted_by_its_variance_on_request(
+    form, covariance, evaluated
+):
     state, found = Gaussian.certain(np.array([0.3, 0.0, -0.2, 0.1, 0.2, 0.0])), []
     for noise in (False, True):
         how = Linearization(process_noise=noise)
@@ -492,25 +651,45 @@ def test_noise_of_observations_widens_what_is_predicted_by_its_variance_on_reque
             quadrotor_problem(),
             3,
             HOVER,
-            prediction=PredictionSettings(form=form, covariance=covariance, feedback=False),
+            prediction=PredictionSettings(
+                form=form, covariance=covariance, feedback=False
+            ),
         )
         with backend(evaluated):
             found.append(controller.control(state, at_origin(3)).covariances[1])
-    assert np.allclose(found[1] - found[0], gp().noise_covariance, atol=1e-6)  # of 1e-4; the plans differ a little
+    assert np.allclose(
+        found[1] - found[0], gp().noise_covariance, atol=1e-6
+    )  # of 1e-4; the plans differ a little
 
 
-def test_each_part_of_a_decision_takes_its_own_time_and_questions_share_the_model(monkeypatch):
+def test_each_part_of_a_decision_takes_its_own_time_and_questions_share_the_model(
+    monkeypatch,
+):
     model, H = linear_gaussian(2, 1), 3
-    problem, reference = Problem(Tracking([1.0, 1.0], [0.1])), Reference(np.zeros((H + 1, 2)), np.zeros((H, 1)))
+    problem, reference = (
+        Problem(Tracking([1.0, 1.0], [0.1])),
+        Reference(np.zeros((H + 1, 2)), np.zeros((H, 1))),
+    )
     controller = GPMPC(model, Linearization(), problem, H, [0.0])
     at = Gaussian.certain(np.ones(2))
     looks = iter([0.0, 1.0, 11.0, 111.0, 1111.0])
     monkeypatch.setattr(gp_mpc, "perf_counter", lambda: next(looks))
     assert controller.control(at, reference).timing == Timing(1.0 + 1000.0, 10.0, 100.0)
-    looks = iter([0.0, 4.0, *(100.0 + k for k in (0, 1, 3, 7, 15)), *(200.0 + k for k in (0, 10, 30, 70, 150))])
+    looks = iter(
+        [
+            0.0,
+            4.0,
+            *(100.0 + k for k in (0, 1, 3, 7, 15)),
+            *(200.0 + k for k in (0, 10, 30, 70, 150)),
+        ]
+    )
     first, second = controller.control_many([at, at], [reference] * 2, [None] * 2)
     assert first.timing == Timing(4.0 / 2 + 1.0 + 8.0, 2.0, 4.0)
     assert second.timing == Timing(4.0 / 2 + 10.0 + 80.0, 20.0, 40.0)
     looks = iter(range(20))
-    again = GPMPC(model, Linearization(), problem, H, [0.0], iterations=5).control(at, reference)
-    assert again.timing == Timing(again.iterations + 1.0, float(again.iterations), float(again.iterations))
+    again = GPMPC(model, Linearization(), problem, H, [0.0], iterations=5).control(
+        at, reference
+    )
+    assert again.timing == Timing(
+        again.iterations + 1.0, float(again.iterations), float(again.iterations)
+    )

@@ -22,10 +22,17 @@ START = Gaussian.certain(np.zeros(2))
 
 def controller(probability=0.95, **settings):
     bounds = Box([-np.inf, -np.inf], [UPPER, np.inf], probability=probability)
-    problem = Problem(Tracking([10.0, 0.1], [1e-3]), Box([-20.0], [20.0]), constraints=[bounds])
+    problem = Problem(
+        Tracking([10.0, 0.1], [1e-3]), Box([-20.0], [20.0]), constraints=[bounds]
+    )
     propagator = Linearization()
     return GPMPC(
-        double_integrator(W=np.diag(STD**2).tolist()), propagator, problem, H, [0.0], PredictionSettings(**settings)
+        double_integrator(W=np.diag(STD**2).tolist()),
+        propagator,
+        problem,
+        H,
+        [0.0],
+        PredictionSettings(**settings),
     )
 
 
@@ -39,13 +46,17 @@ def test_bounds_are_moved_by_the_kappas_of_the_reference():
         assert (margins > kappas - 1e-6).all()
         assert np.isclose(margins, kappas, atol=1e-5).any()
         plain = asked.control(START, FAR) if plain is None else plain
-        assert np.allclose(found.inputs, plain.inputs, atol=1e-9) == (kappas[0] == kappas[-1])
+        assert np.allclose(found.inputs, plain.inputs, atol=1e-9) == (
+            kappas[0] == kappas[-1]
+        )
 
 
 def test_a_set_point_keeps_its_kappas():
     asked, kappas = controller(), np.full(H, 3.0)
     point = asked.control(START, Reference(FAR.states[0], np.zeros(1), kappas))
-    assert np.array_equal(point.inputs, asked.control(START, replace(FAR, kappas=kappas)).inputs)
+    assert np.array_equal(
+        point.inputs, asked.control(START, replace(FAR, kappas=kappas)).inputs
+    )
     with pytest.raises(ShapeError, match=r"kappas must be \(6,\); got \(2,\)"):
         asked.control(START, Reference(FAR.states[0], np.zeros(1), kappas[:2]))
 
@@ -60,14 +71,23 @@ def test_an_adaptive_tube_brings_the_violations_to_what_is_allowed_where_the_noi
     asked, rng = controller(), np.random.default_rng(0)
     outside = {}
     for name in ("as learned", "adapted"):
-        tube = ConformalTube(np.abs(np.random.default_rng(1).normal(size=(200, H))), [[1.0, 0.0]])
-        adaptive, x, last, count = AdaptiveTube(tube, 0.95, rate=0.05), np.zeros(2), None, 0
+        tube = ConformalTube(
+            np.abs(np.random.default_rng(1).normal(size=(200, H))), [[1.0, 0.0]]
+        )
+        adaptive, x, last, count = (
+            AdaptiveTube(tube, 0.95, rate=0.05),
+            np.zeros(2),
+            None,
+            0,
+        )
         for _ in range(250):
             adaptive.observe(x)
             kappas = adaptive.kappas if name == "adapted" else None
             last = asked.control(Gaussian.certain(x), replace(FAR, kappas=kappas), last)
             adaptive.remember(last.means, last.covariances)
-            moved = asked.prediction.model.predict(torch.from_numpy(x), torch.from_numpy(last.input)).mean.numpy()
+            moved = asked.prediction.model.predict(
+                torch.from_numpy(x), torch.from_numpy(last.input)
+            ).mean.numpy()
             x = moved + 3 * STD * rng.normal(size=2)
             count += x[0] > UPPER
         outside[name] = count / 250

@@ -27,7 +27,9 @@ def test_without_bounds_it_is_the_optimum_of_a_linear_model(penalized, rng):
     reference = Reference(rng.normal(size=(H + 1, 2)), rng.normal(size=(H, 1)))
     state = Gaussian.certain(rng.normal(size=2))
     ours = LQR(model, problem, H, [0.3]).control(state, reference)
-    best = NonlinearGPMPC(model, MeanEquivalence(), problem, H, [0.3], tolerance=1e-9).control(state, reference)
+    best = NonlinearGPMPC(
+        model, MeanEquivalence(), problem, H, [0.3], tolerance=1e-9
+    ).control(state, reference)
     assert ours.status is Status.SOLVED
     assert np.allclose(ours.inputs, best.inputs, atol=1e-8)
     assert np.allclose(ours.means, best.means, atol=1e-8)
@@ -38,15 +40,24 @@ def test_the_stationary_gain_solves_the_riccati_equation():
     K = dlqr(A, B, Q, R)
     moved = A - B @ K
     P = sum(
-        np.linalg.matrix_power(moved.T, i) @ (Q + K.T @ R @ K) @ np.linalg.matrix_power(moved, i) for i in range(400)
+        np.linalg.matrix_power(moved.T, i)
+        @ (Q + K.T @ R @ K)
+        @ np.linalg.matrix_power(moved, i)
+        for i in range(400)
     )
     assert np.abs(np.linalg.eigvals(moved)).max() < 1
-    assert np.allclose(P, Q + A.T @ P @ A - A.T @ P @ B @ np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A), rtol=1e-10)
+    assert np.allclose(
+        P,
+        Q + A.T @ P @ A - A.T @ P @ B @ np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A),
+        rtol=1e-10,
+    )
 
 
 def test_a_long_horizon_gives_the_stationary_gain(rng):
     controller, state = (
-        LQR(double_integrator(), Problem(Tracking(Q, R, penalized="inputs")), 60, [0.0]),
+        LQR(
+            double_integrator(), Problem(Tracking(Q, R, penalized="inputs")), 60, [0.0]
+        ),
         rng.normal(size=2),
     )
     decision = controller.control(Gaussian.certain(state), Reference(np.zeros((61, 2))))
@@ -54,7 +65,9 @@ def test_a_long_horizon_gives_the_stationary_gain(rng):
 
 
 def test_an_unweighted_mode_on_the_unit_circle_falls_back_to_the_recursion():
-    K = dlqr(np.diag([1.0, 0.5]), np.array([[0.0], [1.0]]), np.diag([0.0, 1.0]), np.eye(1))
+    K = dlqr(
+        np.diag([1.0, 0.5]), np.array([[0.0], [1.0]]), np.diag([0.0, 1.0]), np.eye(1)
+    )
     assert K[0, 0] == pytest.approx(0, abs=1e-12)
     assert K[0, 1] == pytest.approx(dlqr([[0.5]], [[1.0]], [[1.0]], [[1.0]])[0, 0])
 
@@ -66,18 +79,30 @@ def test_a_growing_mode_out_of_reach_has_no_gain():
 
 def test_reference_inputs_feed_forward():
     H, model = 5, double_integrator()
-    states, wanted = [np.array([0.2, -0.1])], np.array([[0.3], [0.1], [-0.4], [0.2], [0.0]])
+    states, wanted = (
+        [np.array([0.2, -0.1])],
+        np.array([[0.3], [0.1], [-0.4], [0.2], [0.0]]),
+    )
     for u in wanted:
         states.append(A @ states[-1] + B @ u)
     controller = LQR(model, Problem(Tracking(Q, R, penalized="deviations")), H, [0.0])
-    decision = controller.control(Gaussian.certain(states[0]), Reference(np.array(states), wanted))
+    decision = controller.control(
+        Gaussian.certain(states[0]), Reference(np.array(states), wanted)
+    )
     assert np.allclose(decision.inputs, wanted, atol=1e-10)
 
 
 def test_inputs_are_clipped_to_the_box_and_the_rates():
     bounds = {"inputs": Box([-0.5], [0.4]), "input_rates": Box([-0.3], [0.3])}
-    controller = LQR(double_integrator(), Problem(Tracking(Q, R, penalized="inputs"), **bounds), 6, [0.0])
-    decision = controller.control(Gaussian.certain(np.array([-3.0, 0.0])), Reference(np.zeros((7, 2))))
+    controller = LQR(
+        double_integrator(),
+        Problem(Tracking(Q, R, penalized="inputs"), **bounds),
+        6,
+        [0.0],
+    )
+    decision = controller.control(
+        Gaussian.certain(np.array([-3.0, 0.0])), Reference(np.zeros((7, 2)))
+    )
     rates = np.diff(decision.inputs[:, 0], prepend=0.0)
     assert rates[0] == pytest.approx(0.3)
     assert decision.inputs.max() == pytest.approx(0.4)
@@ -87,41 +112,71 @@ def test_inputs_are_clipped_to_the_box_and_the_rates():
 
 def test_an_input_without_effect_stays_at_rest():
     model = LinearGaussian(A.tolist(), [[0.125, 0.0], [0.5, 0.0]])
-    controller = LQR(model, Problem(Tracking(Q, [1e-3, 1e-3], penalized="inputs")), 3, [0.0, 0.0])
-    decision = controller.control(Gaussian.certain(np.array([1.0, 0.0])), Reference(np.zeros((4, 2))))
+    controller = LQR(
+        model, Problem(Tracking(Q, [1e-3, 1e-3], penalized="inputs")), 3, [0.0, 0.0]
+    )
+    decision = controller.control(
+        Gaussian.certain(np.array([1.0, 0.0])), Reference(np.zeros((4, 2)))
+    )
     assert np.allclose(decision.inputs[:, 1], 0)
 
 
 def test_it_brings_a_learned_pendulum_to_rest():
     model, state, decision = pendulum_posterior(), np.array([0.8, 0.0]), None
     controller = LQR(
-        model, Problem(Tracking([5.0, 0.5], [0.05], penalized="inputs"), inputs=Box([-4.0], [4.0])), 15, [0.0]
+        model,
+        Problem(
+            Tracking([5.0, 0.5], [0.05], penalized="inputs"), inputs=Box([-4.0], [4.0])
+        ),
+        15,
+        [0.0],
     )
     for _ in range(40):
-        decision = controller.control(Gaussian.certain(state), Reference(np.zeros((16, 2))), decision)
+        decision = controller.control(
+            Gaussian.certain(state), Reference(np.zeros((16, 2))), decision
+        )
         acceleration = -4 * np.sin(state[0]) - 0.3 * state[1] + decision.input[0]
-        state = state + np.array([0.2 * state[1] + 0.02 * acceleration, 0.2 * acceleration])
+        state = state + np.array(
+            [0.2 * state[1] + 0.02 * acceleration, 0.2 * acceleration]
+        )
     assert np.abs(state).max() < 0.02
 
 
 def test_a_bad_measurement_is_said_so_and_misuse_is_refused():
-    controller = LQR(double_integrator(), Problem(Tracking(Q, R, penalized="inputs")), 3, [0.2])
-    decision = controller.control(Gaussian.certain(np.array([np.nan, 0.0])), Reference(np.zeros((4, 2))))
+    controller = LQR(
+        double_integrator(), Problem(Tracking(Q, R, penalized="inputs")), 3, [0.2]
+    )
+    decision = controller.control(
+        Gaussian.certain(np.array([np.nan, 0.0])), Reference(np.zeros((4, 2)))
+    )
     assert decision.status is Status.INVALID_MEASUREMENT
     assert np.array_equal(decision.inputs, np.full((3, 1), 0.2))
     with pytest.raises(ShapeError, match=r"shapes \(2,\) and \(4, 2\)"):
         controller.control(Gaussian.certain(np.zeros(2)), Reference(np.zeros((3, 2))))
-    with pytest.raises(SettingError, match="must weigh 2 states and 1 inputs; got 2 and 2"):
-        LQR(double_integrator(), Problem(Tracking(Q, [1.0, 1.0], penalized="inputs")), 3, [0.2])
+    with pytest.raises(
+        SettingError, match="must weigh 2 states and 1 inputs; got 2 and 2"
+    ):
+        LQR(
+            double_integrator(),
+            Problem(Tracking(Q, [1.0, 1.0], penalized="inputs")),
+            3,
+            [0.2],
+        )
 
 
 @pytest.mark.parametrize("side", [-1.0, 1.0])
 def test_where_rates_and_box_contradict_each_other_no_input_leaves_the_box(side, rng):
     """The input before was far outside, and the rates alone would keep the next ones there."""
-    problem = Problem(Tracking(Q, R), inputs=Box([-0.5], [0.4]), input_rates=Box([-0.1], [0.1]))
+    problem = Problem(
+        Tracking(Q, R), inputs=Box([-0.5], [0.4]), input_rates=Box([-0.1], [0.1])
+    )
     controller = LQR(double_integrator(), problem, 5, [side * 3.0])
     for _ in range(20):
-        decision = controller.control(Gaussian.certain(rng.normal(size=2)), Reference(rng.normal(size=(6, 2))), None)
+        decision = controller.control(
+            Gaussian.certain(rng.normal(size=2)),
+            Reference(rng.normal(size=(6, 2))),
+            None,
+        )
         assert decision.inputs.min() >= -0.5
         assert decision.inputs.max() <= 0.4
         assert decision.input[0] == (0.4 if side > 0 else -0.5)
@@ -138,25 +193,44 @@ class Watched(LinearGaussian):
     def linearize(self, states, inputs, covariance=True):
         self.seen = states, inputs
         at = linearize_by_autograd(self, states, inputs, covariance)
-        return at._replace(A=at.A * self.factor if np.isfinite(self.factor) else at.A + self.factor)
+        return at._replace(
+            A=at.A * self.factor if np.isfinite(self.factor) else at.A + self.factor
+        )
 
 
-@pytest.mark.parametrize("known", [True, False], ids=["reference inputs", "no reference inputs"])
-def test_the_local_models_are_taken_at_the_state_and_then_along_the_reference(known, rng):
+@pytest.mark.parametrize(
+    "known", [True, False], ids=["reference inputs", "no reference inputs"]
+)
+def test_the_local_models_are_taken_at_the_state_and_then_along_the_reference(
+    known, rng
+):
     model, H = Watched(A.tolist(), B.tolist()), 4
-    states, wanted, state = rng.normal(size=(H + 1, 2)), rng.normal(size=(H, 1)), rng.normal(size=2)
+    states, wanted, state = (
+        rng.normal(size=(H + 1, 2)),
+        rng.normal(size=(H, 1)),
+        rng.normal(size=2),
+    )
     reference = Reference(states, wanted if known else None)
-    LQR(model, Problem(Tracking(Q, R, penalized="inputs")), H, [0.3]).control(Gaussian.certain(state), reference)
+    LQR(model, Problem(Tracking(Q, R, penalized="inputs")), H, [0.3]).control(
+        Gaussian.certain(state), reference
+    )
     assert np.array_equal(model.seen[0], np.vstack([state, states[1:-1]]))
     assert np.array_equal(model.seen[1], wanted if known else np.full((H, 1), 0.3))
 
 
 @pytest.mark.parametrize("factor", [np.nan, np.inf, 1e250])
-def test_a_model_that_is_not_finite_or_grows_beyond_all_numbers_is_numerical_trouble(factor):
+def test_a_model_that_is_not_finite_or_grows_beyond_all_numbers_is_numerical_trouble(
+    factor,
+):
     controller = LQR(
-        Watched(A.tolist(), B.tolist(), factor=factor), Problem(Tracking(Q, R, penalized="inputs")), 4, [0.2]
+        Watched(A.tolist(), B.tolist(), factor=factor),
+        Problem(Tracking(Q, R, penalized="inputs")),
+        4,
+        [0.2],
     )
-    decision = controller.control(Gaussian.certain(np.ones(2)), Reference(np.zeros((5, 2))))
+    decision = controller.control(
+        Gaussian.certain(np.ones(2)), Reference(np.zeros((5, 2)))
+    )
     assert decision.status is Status.NUMERICAL_TROUBLE
     assert np.array_equal(decision.inputs, np.full((4, 1), 0.2))
 
@@ -168,15 +242,26 @@ def test_a_state_that_is_part_of_a_graph_is_answered_like_any_other():
     )
     state = torch.tensor([0.3, -0.2], requires_grad=True)
     ours = controller.control(Gaussian(2 * state, torch.zeros(2, 2)), reference)
-    assert np.array_equal(ours.inputs, controller.control(Gaussian.certain([0.6, -0.4]), reference).inputs)
+    assert np.array_equal(
+        ours.inputs, controller.control(Gaussian.certain([0.6, -0.4]), reference).inputs
+    )
 
 
 def test_the_gain_over_a_long_horizon_is_stationary_and_exists_for_any_system(rng):
-    A, B, Q, R = rng.normal(size=(1, 4, 4)), rng.normal(size=(1, 4, 2)), np.eye(4), np.eye(2)
+    A, B, Q, R = (
+        rng.normal(size=(1, 4, 4)),
+        rng.normal(size=(1, 4, 2)),
+        np.eye(4),
+        np.eye(2),
+    )
     gains, hessians = finite_horizon_lqr(A, B, Q[None], R[None], Q, 500)
-    varying, same = finite_horizon_lqr(np.repeat(A, 500, axis=0), np.repeat(B, 500, axis=0), Q[None], R[None], Q, 500)
+    varying, same = finite_horizon_lqr(
+        np.repeat(A, 500, axis=0), np.repeat(B, 500, axis=0), Q[None], R[None], Q, 500
+    )
     assert np.allclose(gains[0], dlqr(A[0], B[0], Q, R), atol=1e-7)
     assert np.allclose(gains, varying, atol=1e-7)
     assert np.allclose(hessians, same, atol=1e-6)
-    unreachable, _ = finite_horizon_lqr(2 * np.eye(4)[None], np.zeros((1, 4, 2)), Q[None], R[None], Q, 20)
+    unreachable, _ = finite_horizon_lqr(
+        2 * np.eye(4)[None], np.zeros((1, 4, 2)), Q[None], R[None], Q, 20
+    )
     assert np.array_equal(unreachable, np.zeros((20, 2, 4)))

@@ -3,7 +3,13 @@
 import numpy as np
 import pytest
 
-from gpmpc.mpc._linear_quadratic import INCREMENTS, QuadraticCost, References, StageRows, evaluate_cost
+from gpmpc.mpc._linear_quadratic import (
+    INCREMENTS,
+    QuadraticCost,
+    References,
+    StageRows,
+    evaluate_cost,
+)
 from gpmpc.mpc._sqp import _assess, _between, _costates, _merit, _smallest_cost, _update
 from gpmpc.mpc._stages import Plan, keep_rates, price_violations
 
@@ -20,17 +26,37 @@ class Case:
 
     def __init__(self, rng, squares=True, inputs=True):
         Z = definite(rng, H if squares else 0, N + M + 1)
-        weights = definite(rng, H, P // N, N), definite(rng, P // N, N), definite(rng, 1, M)
+        weights = (
+            definite(rng, H, P // N, N),
+            definite(rng, P // N, N),
+            definite(rng, 1, M),
+        )
         self.cost = QuadraticCost(*weights, INCREMENTS, Z)
-        self.references = References(rng.normal(size=(H, N)), rng.normal(size=(H, M)), rng.normal(size=M))
+        self.references = References(
+            rng.normal(size=(H, N)), rng.normal(size=(H, M)), rng.normal(size=M)
+        )
         low, high = rng.normal(size=(H, R)) - 1.0, rng.normal(size=(H, R)) + 1.0
         low[:, 0], high[0, 1] = -np.inf, np.inf
-        self.rows = StageRows(rng.normal(size=(H, R, P)), rng.normal(size=(H if inputs else 0, R, M)), low, high)
+        self.rows = StageRows(
+            rng.normal(size=(H, R, P)),
+            rng.normal(size=(H if inputs else 0, R, M)),
+            low,
+            high,
+        )
         self.plan, self.proposed = (
-            Plan(2 * rng.normal(size=(H + 1, P)), rng.normal(size=(H, M)), np.zeros((H + 1, N, N))) for _ in range(2)
+            Plan(
+                2 * rng.normal(size=(H + 1, P)),
+                rng.normal(size=(H, M)),
+                np.zeros((H + 1, N, N)),
+            )
+            for _ in range(2)
         )
         self.A, self.after = rng.normal(size=(H, P, P)), 2 * rng.normal(size=(H, P))
-        self.prices, self.row_price, self.defect_prices = np.array([3.0, np.inf]), 7.0, rng.uniform(0, 2, P)
+        self.prices, self.row_price, self.defect_prices = (
+            np.array([3.0, np.inf]),
+            7.0,
+            rng.uniform(0, 2, P),
+        )
         self.z = rng.normal(size=(H, R))
 
     @property
@@ -44,9 +70,15 @@ class Case:
         total = 0.0
         for k in range(H):
             values = self.rows.E[k] @ plan.states[k + 1]
-            values = values + (self.rows.D[k] @ plan.inputs[k] if len(self.rows.D) else 0.0)
+            values = values + (
+                self.rows.D[k] @ plan.inputs[k] if len(self.rows.D) else 0.0
+            )
             for e, price in enumerate((3.0, 7.0)):  # a soft row, and a hard one
-                total += price * max(0.0, values[e] - self.rows.upper[k, e], self.rows.lower[k, e] - values[e])
+                total += price * max(
+                    0.0,
+                    values[e] - self.rows.upper[k, e],
+                    self.rows.lower[k, e] - values[e],
+                )
         return total
 
 
@@ -54,7 +86,9 @@ CASES = pytest.mark.parametrize(("squares", "inputs"), [(True, True), (False, Fa
 
 
 @CASES
-def test_violated_rows_cost_their_price_and_hard_ones_the_given_one(squares, inputs, rng):
+def test_violated_rows_cost_their_price_and_hard_ones_the_given_one(
+    squares, inputs, rng
+):
     seen = set()
     for _ in range(20):
         case = Case(rng, squares, inputs)
@@ -68,20 +102,33 @@ def test_violated_rows_cost_their_price_and_hard_ones_the_given_one(squares, inp
 def test_the_merit_is_cost_price_and_weighed_defects(squares, inputs, rng):
     for _ in range(10):
         case = Case(rng, squares, inputs)
-        found = _merit(case.cost, case.terms, case.defect_prices, case.after, case.rows, case.plan)
-        defects = np.abs(case.after - case.plan.states[1:]).sum(axis=0) @ case.defect_prices
-        assert found == pytest.approx(case.cost_of(case.plan) + case.price_of(case.plan) + defects, rel=1e-12)
+        found = _merit(
+            case.cost, case.terms, case.defect_prices, case.after, case.rows, case.plan
+        )
+        defects = (
+            np.abs(case.after - case.plan.states[1:]).sum(axis=0) @ case.defect_prices
+        )
+        assert found == pytest.approx(
+            case.cost_of(case.plan) + case.price_of(case.plan) + defects, rel=1e-12
+        )
 
 
 @CASES
-def test_multipliers_of_the_dynamics_are_what_a_push_of_a_state_costs(squares, inputs, rng):
+def test_multipliers_of_the_dynamics_are_what_a_push_of_a_state_costs(
+    squares, inputs, rng
+):
     """Central differences of cost and rows, with the push passed on to all later states; exact for quadratics."""
     case = Case(rng, squares, inputs)
-    found = _costates(case.cost, case.A, case.plan, case.references.states, case.rows.E, case.z)
+    found = _costates(
+        case.cost, case.A, case.plan, case.references.states, case.rows.E, case.z
+    )
 
     def lagrangian(states):
         rows = sum(case.z[k] @ case.rows.E[k] @ states[k + 1] for k in range(H))
-        return evaluate_cost(case.cost, states, case.plan.inputs, case.references, 1.0) + rows
+        return (
+            evaluate_cost(case.cost, states, case.plan.inputs, case.references, 1.0)
+            + rows
+        )
 
     for k in range(H):
         for i in range(P):
@@ -92,32 +139,64 @@ def test_multipliers_of_the_dynamics_are_what_a_push_of_a_state_costs(squares, i
                     states[j + 1] += moved
                     moved = case.A[j + 1] @ moved if j + 1 < H else moved
                 values.append(lagrangian(states))
-            assert found[k, i] == pytest.approx(values[0] - values[1], rel=1e-9, abs=1e-9)
+            assert found[k, i] == pytest.approx(
+                values[0] - values[1], rel=1e-9, abs=1e-9
+            )
 
 
 @CASES
 @pytest.mark.parametrize("known", [0.0, 1e6])
-def test_what_a_step_promises_is_measured_against_what_the_plan_costs(squares, inputs, known, rng):
+def test_what_a_step_promises_is_measured_against_what_the_plan_costs(
+    squares, inputs, known, rng
+):
     for _ in range(5):
         case = Case(rng, squares, inputs)
         before = np.full(P, known)
         stages = case.A, case.after
-        arguments = case.cost, case.terms, before, stages, case.rows, case.plan, case.proposed, case.z
+        arguments = (
+            case.cost,
+            case.terms,
+            before,
+            stages,
+            case.rows,
+            case.plan,
+            case.proposed,
+            case.z,
+        )
         here, curvature, promised, largest, merit, prices = _assess(*arguments)
         zero = References(*(np.zeros_like(part) for part in case.references))
         step = [b - a for a, b in zip(case.plan[:2], case.proposed[:2], strict=True)]
         missed = np.abs(case.after - case.plan.states[1:])
-        assert here == pytest.approx(case.cost_of(case.plan) + case.price_of(case.plan), rel=1e-12)
-        assert curvature == pytest.approx(evaluate_cost(case.cost, *step, zero, 0.0), rel=1e-12)
-        assert promised == pytest.approx(case.cost_of(case.proposed) + case.price_of(case.proposed), rel=1e-12)
-        assert largest == pytest.approx(missed.max() / max(1.0, np.abs(case.plan.states[1:]).max()), rel=1e-12)
-        costates = _costates(case.cost, case.A, case.proposed, case.references.states, case.rows.E, case.z)
-        np.testing.assert_allclose(prices, np.maximum(known, 1.5 * np.abs(costates).max(axis=0)), rtol=1e-12)
+        assert here == pytest.approx(
+            case.cost_of(case.plan) + case.price_of(case.plan), rel=1e-12
+        )
+        assert curvature == pytest.approx(
+            evaluate_cost(case.cost, *step, zero, 0.0), rel=1e-12
+        )
+        assert promised == pytest.approx(
+            case.cost_of(case.proposed) + case.price_of(case.proposed), rel=1e-12
+        )
+        assert largest == pytest.approx(
+            missed.max() / max(1.0, np.abs(case.plan.states[1:]).max()), rel=1e-12
+        )
+        costates = _costates(
+            case.cost,
+            case.A,
+            case.proposed,
+            case.references.states,
+            case.rows.E,
+            case.z,
+        )
+        np.testing.assert_allclose(
+            prices, np.maximum(known, 1.5 * np.abs(costates).max(axis=0)), rtol=1e-12
+        )
         assert merit == pytest.approx(here + missed.sum(axis=0) @ prices, rel=1e-12)
         assert (before == known).all()
 
 
-def test_an_update_gives_the_curvature_that_a_step_showed_and_stays_positive_definite(rng):
+def test_an_update_gives_the_curvature_that_a_step_showed_and_stays_positive_definite(
+    rng,
+):
     for turn in (1.0, -1.0, 0.0):
         P_, step = definite(rng, 5), rng.normal(size=5)
         B = P_.copy()
@@ -135,21 +214,33 @@ def test_between_two_plans_every_part_moves_by_the_same_share(rng):
     case = Case(rng)
     assert _between(case.plan, case.proposed, 1.0) is case.proposed
     for share in (0.0, 0.25):
-        for part, a, b in zip(_between(case.plan, case.proposed, share), case.plan, case.proposed, strict=True):
+        for part, a, b in zip(
+            _between(case.plan, case.proposed, share),
+            case.plan,
+            case.proposed,
+            strict=True,
+        ):
             np.testing.assert_allclose(part, (1 - share) * a + share * b, atol=1e-15)
 
 
 def test_the_smallest_cost_is_that_of_a_thousandth_of_the_cheapest_input():
     R_, wide = np.diag([4.0, 9.0]), np.full(2, np.inf)
     assert _smallest_cost(R_, -wide, wide, np.zeros(2)) == pytest.approx(4e-6)
-    assert _smallest_cost(R_, -wide, wide, np.array([-10.0, 0.5])) == pytest.approx(9e-6)
-    assert _smallest_cost(R_, np.array([-0.25, -9.0]), np.array([0.25, 9.0]), np.zeros(2)) == pytest.approx(1e-6)
+    assert _smallest_cost(R_, -wide, wide, np.array([-10.0, 0.5])) == pytest.approx(
+        9e-6
+    )
+    assert _smallest_cost(
+        R_, np.array([-0.25, -9.0]), np.array([0.25, 9.0]), np.zeros(2)
+    ) == pytest.approx(1e-6)
     assert _smallest_cost(0 * R_, -wide, wide, np.zeros(2)) > 0
 
 
 def test_inputs_are_moved_one_after_the_other_to_within_their_rates(rng):
     for stages in (1, H):
-        low, high = -rng.uniform(0.1, 0.5, (stages, M)), rng.uniform(0.1, 0.5, (stages, M))
+        low, high = (
+            -rng.uniform(0.1, 0.5, (stages, M)),
+            rng.uniform(0.1, 0.5, (stages, M)),
+        )
         inputs, last = rng.normal(size=(H, M)), rng.normal(size=M)
         expected, before = [], last
         for k, u in enumerate(inputs):

@@ -13,7 +13,14 @@ from gpmpc.mpc import Reference, Request
 from gpmpc.mpc.baselines import NMPC
 from gpmpc.mpc.gp_mpc import NonlinearGPMPC
 from gpmpc.mpc.problem import Box, Problem, Tracking
-from gpmpc.propagation import Linearization, MeanEquivalence, MomentMatching, MonteCarlo, Unscented, rollout
+from gpmpc.propagation import (
+    Linearization,
+    MeanEquivalence,
+    MomentMatching,
+    MonteCarlo,
+    Unscented,
+    rollout,
+)
 from gpmpc.qp import DualActiveSet, QuadraticProgram
 from gpmpc.status import Status
 from gpmpc.systems import System
@@ -37,16 +44,23 @@ def belief(state=(0.4, -0.3), covariance=SPREAD):
 
 def swing(H, amplitude=1.0):
     t = 0.2 * np.arange(H + 1)
-    return Reference(np.stack([amplitude * np.sin(2 * t), 2 * amplitude * np.cos(2 * t)], axis=1), np.full((H, 1), 0.5))
+    return Reference(
+        np.stack([amplitude * np.sin(2 * t), 2 * amplitude * np.cos(2 * t)], axis=1),
+        np.full((H, 1), 0.5),
+    )
 
 
 def request_of(problem, H, at=None, last=0.3, reference=None):
-    return Request.read(problem, H, np.array([last]), at or belief(), reference or swing(H), None)
+    return Request.read(
+        problem, H, np.array([last]), at or belief(), reference or swing(H), None
+    )
 
 
 @pytest.mark.parametrize("penalized", ["inputs", "deviations", "increments"])
 @pytest.mark.parametrize("name", PROPAGATORS)
-def test_the_adjoint_gradient_is_that_of_torch_and_of_finite_differences(name, penalized, rng):
+def test_the_adjoint_gradient_is_that_of_torch_and_of_finite_differences(
+    name, penalized, rng
+):
     H, propagator, model = 4, PROPAGATORS[name], pendulum_posterior()
     problem = Problem(Tracking(Q, R, terminal=2 * Q, penalized=penalized))
     baseline = SLSQP(model, propagator, problem, H, [0.0])
@@ -59,20 +73,39 @@ def test_the_adjoint_gradient_is_that_of_torch_and_of_finite_differences(name, p
         W = torch.tensor(np.array([Q] * (H - 1) + [2 * Q]))
         held = {"inputs": 0 * u, "deviations": torch.tensor(reference.inputs)}
         v = u - held.get(penalized, torch.cat([torch.tensor(last)[None], u[:-1]]))
-        return torch.einsum("ia,iab,ib->", error, W, error) + (W * moved.covariance).sum() + 0.2 * v.square().sum()
+        return (
+            torch.einsum("ia,iab,ib->", error, W, error)
+            + (W * moved.covariance).sum()
+            + 0.2 * v.square().sum()
+        )
 
     u = torch.tensor(inputs, requires_grad=True)
     expected = by_torch(u)
     assert found.cost == pytest.approx(float(expected.detach()), rel=1e-12)
-    assert np.allclose(found.gradient, torch.autograd.grad(expected, u)[0].ravel(), rtol=1e-9, atol=1e-10)
+    assert np.allclose(
+        found.gradient,
+        torch.autograd.grad(expected, u)[0].ravel(),
+        rtol=1e-9,
+        atol=1e-10,
+    )
     direction, step = rng.normal(size=H), 1e-5
-    ends = [baseline.evaluate(inputs.ravel() + s * direction, request_of(problem, H)).cost for s in (step, -step)]
-    assert (ends[0] - ends[1]) / (2 * step) == pytest.approx(float(found.gradient @ direction), rel=1e-6)
+    ends = [
+        baseline.evaluate(inputs.ravel() + s * direction, request_of(problem, H)).cost
+        for s in (step, -step)
+    ]
+    assert (ends[0] - ends[1]) / (2 * step) == pytest.approx(
+        float(found.gradient @ direction), rel=1e-6
+    )
 
 
-@pytest.mark.parametrize("name", ["mean equivalence", "linearisation", "moment matching"])
+@pytest.mark.parametrize(
+    "name", ["mean equivalence", "linearisation", "moment matching"]
+)
 def test_margins_of_chance_constraints_and_their_jacobian(name, rng):
-    H, limits = 4, Box([-1.0, -np.inf], [0.8, 1.5], probability=0.95, kappa=2.0, penalty=None)
+    H, limits = (
+        4,
+        Box([-1.0, -np.inf], [0.8, 1.5], probability=0.95, kappa=2.0, penalty=None),
+    )
     problem = Problem(Tracking(Q, R, penalized="inputs"), constraints=[limits])
     baseline = SLSQP(pendulum_posterior(), PROPAGATORS[name], problem, H, [0.0])
     request, plan = request_of(problem, H), rng.normal(size=H)
@@ -87,7 +120,11 @@ def test_margins_of_chance_constraints_and_their_jacobian(name, rng):
     assert np.allclose(shot.margins, np.transpose(expected).ravel())
     direction, step = rng.normal(size=H), 1e-5
     ends = [baseline.evaluate(plan + s * direction, request) for s in (step, -step)]
-    assert np.allclose((ends[0].margins - ends[1].margins) / (2 * step), shot.margin_jacobian @ direction, atol=1e-7)
+    assert np.allclose(
+        (ends[0].margins - ends[1].margins) / (2 * step),
+        shot.margin_jacobian @ direction,
+        atol=1e-7,
+    )
 
 
 def condensed(H, problem, state, reference, last):
@@ -101,15 +138,32 @@ def condensed(H, problem, state, reference, last):
         spread.append(np.sqrt(S.diagonal()))
         for j in range(i + 1):
             response[i, :, j] = np.linalg.matrix_power(A, i - j) @ B
-    D = np.eye(H) - np.eye(H, k=-1) if problem.cost.penalized == "increments" else np.eye(H)
-    offset = last * np.eye(H)[0] if problem.cost.penalized == "increments" else np.zeros(H)
-    P = 2 * np.einsum("iaj,ab,ibk->jk", response, problem.cost.Q, response) + 2 * problem.cost.R * D.T @ D
+    D = (
+        np.eye(H) - np.eye(H, k=-1)
+        if problem.cost.penalized == "increments"
+        else np.eye(H)
+    )
+    offset = (
+        last * np.eye(H)[0] if problem.cost.penalized == "increments" else np.zeros(H)
+    )
+    P = (
+        2 * np.einsum("iaj,ab,ibk->jk", response, problem.cost.Q, response)
+        + 2 * problem.cost.R * D.T @ D
+    )
     gap = free - reference[1:]
-    q = 2 * np.einsum("iaj,ab,ib->j", response, problem.cost.Q, gap) - 2 * float(problem.cost.R[0, 0]) * D.T @ offset
+    q = (
+        2 * np.einsum("iaj,ab,ib->j", response, problem.cost.Q, gap)
+        - 2 * float(problem.cost.R[0, 0]) * D.T @ offset
+    )
     rates = np.eye(H) - np.eye(H, k=-1)
     start, kappa = last * np.eye(H)[0], problem.constraints[0].standard_deviations()
     rows = np.concatenate([rates, response[:, 1]])
-    upper = np.concatenate([problem.input_rates.upper + start, 0.35 - kappa * np.array(spread)[:, 1] - free[:, 1]])
+    upper = np.concatenate(
+        [
+            problem.input_rates.upper + start,
+            0.35 - kappa * np.array(spread)[:, 1] - free[:, 1],
+        ]
+    )
     lower = np.concatenate([problem.input_rates.lower + start, np.full(H, -np.inf)])
     box = np.full(H, problem.inputs.lower[0]), np.full(H, problem.inputs.upper[0])
     return QuadraticProgram(P, q, rows, lower, upper, *box)
@@ -118,10 +172,25 @@ def condensed(H, problem, state, reference, last):
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("penalized", ["inputs", "increments"])
 def test_on_a_linear_model_the_optimum_is_the_quadratic_programs(kind, penalized):
-    H, limits = 6, Box([-np.inf, -np.inf], [np.inf, 0.35], probability=0.95, kappa=0.5, penalty=None)
+    H, limits = (
+        6,
+        Box(
+            [-np.inf, -np.inf],
+            [np.inf, 0.35],
+            probability=0.95,
+            kappa=0.5,
+            penalty=None,
+        ),
+    )
     bounds = {"inputs": Box([-1.0], [0.3]), "input_rates": Box([-0.25], [0.25])}
-    problem = Problem(Tracking(Q, R, penalized=penalized), constraints=[limits], **bounds)
-    model, state, reference = double_integrator(W=(0.01 * np.eye(2)).tolist()), np.array([0.2, -0.4]), np.ones((7, 2))
+    problem = Problem(
+        Tracking(Q, R, penalized=penalized), constraints=[limits], **bounds
+    )
+    model, state, reference = (
+        double_integrator(W=(0.01 * np.eye(2)).tolist()),
+        np.array([0.2, -0.4]),
+        np.ones((7, 2)),
+    )
     best = DualActiveSet().solve(condensed(H, problem, state, reference, 0.1))
     assert (best.active_set != 0).sum() >= 3
     controller = kind(model, Linearization(), problem, H, [0.1], tolerance=1e-8)
@@ -143,15 +212,22 @@ def test_on_a_certain_model_it_is_nonlinear_mpc_of_the_true_plant(rng):
     H, limits = 5, Box([-np.inf, -0.4], [np.inf, 0.4], probability=0.95, penalty=None)
     problem = Problem(Tracking(Q, R), inputs=Box(None, [0.5]), constraints=[limits])
     plant = System(DoubleIntegrator(), time_step=0.5, substeps=1)
-    state, reference = Gaussian.certain(np.array([0.1, 0.2])), Reference(rng.normal(size=(H + 1, 2)))
-    ours = NonlinearGPMPC(double_integrator(), MeanEquivalence(), problem, H, [0.1]).control(state, reference)
+    state, reference = (
+        Gaussian.certain(np.array([0.1, 0.2])),
+        Reference(rng.normal(size=(H + 1, 2))),
+    )
+    ours = NonlinearGPMPC(
+        double_integrator(), MeanEquivalence(), problem, H, [0.1]
+    ).control(state, reference)
     true = NMPC(plant, problem, H, [0.1]).control(state, reference)
     assert np.allclose(ours.inputs, true.inputs, atol=1e-6)
     assert np.allclose(ours.means, true.means, atol=1e-6)
 
 
 def constrained(penalty=None):
-    limits = Box([-np.inf, -1.2], [0.75, np.inf], probability=0.95, kappa=1.0, penalty=penalty)
+    limits = Box(
+        [-np.inf, -1.2], [0.75, np.inf], probability=0.95, kappa=1.0, penalty=penalty
+    )
     bounds = {"inputs": Box([-3.0], [4.0]), "input_rates": Box([-1.5], [1.5])}
     return Problem(Tracking(Q, R), constraints=[limits], **bounds)
 
@@ -172,11 +248,16 @@ def test_bounds_are_kept_and_no_feasible_perturbation_is_cheaper(name, kind, rng
     at = belief((0.3, 0.8), SPREAD / 20)
     decision = controller.control(at, swing(H))
     assert decision.status is Status.SOLVED
-    baseline, request = SLSQP(model, PROPAGATORS[name], problem, H, [0.3]), request_of(problem, H, at)
+    baseline, request = (
+        SLSQP(model, PROPAGATORS[name], problem, H, [0.3]),
+        request_of(problem, H, at),
+    )
     found = baseline.evaluate(decision.inputs, request)
     assert found.margins.max() < 1e-6
     assert np.abs(np.diff(decision.inputs[:, 0], prepend=0.3)).max() < 1.5 + 1e-7
-    assert found.margins.max() > -1e-5  # a chance constraint is active: the case is not an idle one
+    assert (
+        found.margins.max() > -1e-5
+    )  # a chance constraint is active: the case is not an idle one
     assert (decision.inputs >= -3).all()
     assert (decision.inputs <= 4).all()
     tried = 0
@@ -197,7 +278,9 @@ def test_bounds_are_kept_and_no_feasible_perturbation_is_cheaper(name, kind, rng
 def test_a_generic_optimizer_finds_the_same_plan():
     H, decisions = 5, []
     for kind in KINDS:
-        controller = kind(pendulum_posterior(), MomentMatching(), constrained(), H, [0.3])
+        controller = kind(
+            pendulum_posterior(), MomentMatching(), constrained(), H, [0.3]
+        )
         decisions.append(controller.control(belief((0.3, 0.8), SPREAD / 20), swing(H)))
     assert [d.status for d in decisions] == [Status.SOLVED] * 2
     assert np.allclose(decisions[0].inputs, decisions[1].inputs, atol=1e-3)
@@ -206,7 +289,13 @@ def test_a_generic_optimizer_finds_the_same_plan():
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_warm_start_takes_fewer_iterations(kind):
     H, cold, warm = 6, 0, 0
-    controller = kind(pendulum_posterior(), Linearization(), Problem(Tracking(Q, R, penalized="inputs")), H, [0.0])
+    controller = kind(
+        pendulum_posterior(),
+        Linearization(),
+        Problem(Tracking(Q, R, penalized="inputs")),
+        H,
+        [0.0],
+    )
     previous = controller.control(Gaussian.certain(np.array([0.5, -1.0])), swing(H))
     for _ in range(3):
         at = Gaussian.certain(previous.means[1])
@@ -221,8 +310,14 @@ def test_a_warm_start_takes_fewer_iterations(kind):
 def test_soft_bounds_give_way_and_their_price_is_at_its_minimum(price, rng):
     H, problem = 4, constrained(price)
     settings = pendulum_posterior(), Linearization()
-    controller, hard = NonlinearGPMPC(*settings, problem, H, [0.3]), SLSQP(*settings, constrained(), H, [0.3])
-    at, reference = belief((0.9, 0.5), SPREAD / 20), swing(H, 1.3)  # beyond its bound already
+    controller, hard = (
+        NonlinearGPMPC(*settings, problem, H, [0.3]),
+        SLSQP(*settings, constrained(), H, [0.3]),
+    )
+    at, reference = (
+        belief((0.9, 0.5), SPREAD / 20),
+        swing(H, 1.3),
+    )  # beyond its bound already
     decision = controller.control(at, reference)
     assert decision.status is Status.SOLVED
     assert decision.means[1, 0] > 0.75
@@ -243,7 +338,9 @@ def test_soft_bounds_give_way_and_their_price_is_at_its_minimum(price, rng):
 def test_an_exact_penalty_keeps_what_can_be_kept():
     H, at = 5, belief((0.3, 0.8), SPREAD / 20)
     plans = [
-        NonlinearGPMPC(pendulum_posterior(), Linearization(), constrained(penalty), H, [0.3])
+        NonlinearGPMPC(
+            pendulum_posterior(), Linearization(), constrained(penalty), H, [0.3]
+        )
         .control(at, swing(H))
         .inputs
         for penalty in (None, 1e4, "exact")
@@ -254,10 +351,18 @@ def test_an_exact_penalty_keeps_what_can_be_kept():
 @pytest.mark.parametrize("kind", KINDS)
 def test_contradicting_bounds_are_infeasible(kind):
     limits = Box([-np.inf, -np.inf], [-3.0, np.inf], probability=0.95, penalty=None)
-    hopeless = Problem(Tracking(Q, R, penalized="inputs"), inputs=Box([-1.0], [1.0]), constraints=[limits])
+    hopeless = Problem(
+        Tracking(Q, R, penalized="inputs"),
+        inputs=Box([-1.0], [1.0]),
+        constraints=[limits],
+    )
     controller = kind(pendulum_posterior(), Linearization(), hopeless, 3, [0.0])
     assert controller.control(belief(), swing(3)).status is Status.INFEASIBLE
-    apart = Problem(Tracking(Q, R, penalized="inputs"), inputs=Box([5.0], [6.0]), input_rates=Box([-0.1], [0.1]))
+    apart = Problem(
+        Tracking(Q, R, penalized="inputs"),
+        inputs=Box([5.0], [6.0]),
+        input_rates=Box([-0.1], [0.1]),
+    )
     controller = kind(pendulum_posterior(), Linearization(), apart, 3, [0.0])
     assert not controller.control(belief(), swing(3)).applicable
 
@@ -265,7 +370,15 @@ def test_contradicting_bounds_are_infeasible(kind):
 @pytest.mark.parametrize("kind", KINDS)
 def test_too_few_iterations_are_said_so(kind):
     problem = Problem(Tracking(Q, R, penalized="inputs"))
-    controller = kind(pendulum_posterior(), Linearization(), problem, 6, [0.0], iterations=2, tolerance=1e-9)
+    controller = kind(
+        pendulum_posterior(),
+        Linearization(),
+        problem,
+        6,
+        [0.0],
+        iterations=2,
+        tolerance=1e-9,
+    )
     decision = controller.control(belief((2.0, -2.0)), swing(6))
     assert decision.status is Status.ITERATION_LIMIT
     assert decision.iterations == 2
@@ -274,10 +387,16 @@ def test_too_few_iterations_are_said_so(kind):
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
 def test_a_bad_measurement_is_answered_by_the_shifted_plan(bad):
     controller = NonlinearGPMPC(
-        pendulum_posterior(), Linearization(), Problem(Tracking(Q, R, penalized="inputs")), 3, [0.2]
+        pendulum_posterior(),
+        Linearization(),
+        Problem(Tracking(Q, R, penalized="inputs")),
+        3,
+        [0.2],
     )
     good = controller.control(belief(), swing(3))
-    decision = controller.control(Gaussian.certain(np.array([0.1, bad])), swing(3), good)
+    decision = controller.control(
+        Gaussian.certain(np.array([0.1, bad])), swing(3), good
+    )
     assert decision.status is Status.INVALID_MEASUREMENT
     assert np.array_equal(decision.inputs, good.inputs[[1, 2, 2]])
     first = controller.control(Gaussian.certain(np.array([0.1, bad])), swing(3))
@@ -299,7 +418,13 @@ class Broken:
 
 
 def test_a_model_that_breaks_down_is_numerical_trouble():
-    controller = NonlinearGPMPC(Broken(), MeanEquivalence(), Problem(Tracking(Q, R, penalized="inputs")), 3, [0.2])
+    controller = NonlinearGPMPC(
+        Broken(),
+        MeanEquivalence(),
+        Problem(Tracking(Q, R, penalized="inputs")),
+        3,
+        [0.2],
+    )
     decision = controller.control(belief(), swing(3))
     assert decision.status is Status.NUMERICAL_TROUBLE
     assert np.isfinite(decision.inputs).all()
@@ -307,7 +432,15 @@ def test_a_model_that_breaks_down_is_numerical_trouble():
 
 def test_a_failed_plan_is_no_warm_start_and_one_that_stopped_at_a_limit_is():
     problem = Problem(Tracking(Q, R, penalized="inputs"))
-    impatient = NonlinearGPMPC(pendulum_posterior(), Linearization(), problem, 4, [0.0], iterations=2, tolerance=1e-9)
+    impatient = NonlinearGPMPC(
+        pendulum_posterior(),
+        Linearization(),
+        problem,
+        4,
+        [0.0],
+        iterations=2,
+        tolerance=1e-9,
+    )
     stopped = impatient.control(belief((2.0, -2.0)), swing(4))
     request = Request.read(problem, 4, np.zeros(1), belief(), swing(4), stopped)
     assert np.array_equal(request.initial_guess, stopped.inputs[[1, 2, 3, 3]])
@@ -319,7 +452,11 @@ def test_a_failed_plan_is_no_warm_start_and_one_that_stopped_at_a_limit_is():
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_same_question_has_the_same_answer(kind):
     controller = kind(
-        pendulum_posterior(), MonteCarlo(samples=20), Problem(Tracking(Q, R, penalized="inputs")), 3, [0.0]
+        pendulum_posterior(),
+        MonteCarlo(samples=20),
+        Problem(Tracking(Q, R, penalized="inputs")),
+        3,
+        [0.0],
     )
     first, second = (controller.control(belief(), swing(3)) for _ in range(2))
     assert np.array_equal(first.inputs, second.inputs)
@@ -340,18 +477,30 @@ def test_the_same_question_has_the_same_answer(kind):
     ],
 )
 def test_misuse_is_refused_at_construction(arguments, message):
-    good = {"problem": Problem(Tracking(Q, R, penalized="inputs")), "horizon": 3, "initial_input": [0.0]}
+    good = {
+        "problem": Problem(Tracking(Q, R, penalized="inputs")),
+        "horizon": 3,
+        "initial_input": [0.0],
+    }
     with pytest.raises(SettingError, match=message):
         NonlinearGPMPC(pendulum_posterior(), Linearization(), **(good | arguments))
 
 
 def test_a_question_that_does_not_fit_is_refused():
     controller = NonlinearGPMPC(
-        pendulum_posterior(), Linearization(), Problem(Tracking(Q, R, penalized="inputs")), 3, [0.0]
+        pendulum_posterior(),
+        Linearization(),
+        Problem(Tracking(Q, R, penalized="inputs")),
+        3,
+        [0.0],
     )
-    with pytest.raises(ShapeError, match=r"shapes \(2,\) and \(4, 2\); got \(2,\) and \(3, 2\)"):
+    with pytest.raises(
+        ShapeError, match=r"shapes \(2,\) and \(4, 2\); got \(2,\) and \(3, 2\)"
+    ):
         controller.control(belief(), swing(2))
-    with pytest.raises(ShapeError, match=r"reference inputs must have shape \(3, 1\); got \(3, 2\)"):
+    with pytest.raises(
+        ShapeError, match=r"reference inputs must have shape \(3, 1\); got \(3, 2\)"
+    ):
         controller.control(belief(), Reference(np.zeros((4, 2)), np.zeros((3, 2))))
     with pytest.raises(DataError, match="reference states must be finite; got nan"):
         controller.control(belief(), Reference(np.full((4, 2), np.nan)))

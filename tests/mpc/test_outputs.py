@@ -21,11 +21,16 @@ from tests.mpc.double_pendulum import ACROBOT, DoublePendulum
 from tests.mpc.systems import LinearPlant, linear_gaussian
 
 H = 7
-STATE, GOAL = np.array([0.4, -0.3, 0.2]), Reference(np.array([0.1, 0.2, -0.1]), np.array([0.05, -0.1]))
+STATE, GOAL = (
+    np.array([0.4, -0.3, 0.2]),
+    Reference(np.array([0.1, 0.2, -0.1]), np.array([0.05, -0.1])),
+)
 BOX = Box([-0.3] * 2, [0.25] * 2)
 
 
-def planned(problem, covariance="zero_order", form="trajectory", kind=GPMPC, **settings):
+def planned(
+    problem, covariance="zero_order", form="trajectory", kind=GPMPC, **settings
+):
     controller = kind(
         linear_gaussian(3, 2),
         Linearization(),
@@ -43,7 +48,11 @@ def planned(problem, covariance="zero_order", form="trajectory", kind=GPMPC, **s
 def test_a_linear_output_costs_what_tracking_does(form, covariance):
     """x - r and u as outputs with the weights Q and R, beside a cost that is next to nothing."""
     Q, R = np.diag([3.0, 0.5, 1.0]) + 0.1, np.diag([0.2, 0.4])
-    tracking = planned(Problem(Tracking(Q, R + 1e-9 * np.eye(2), penalized="inputs"), BOX), covariance, form)
+    tracking = planned(
+        Problem(Tracking(Q, R + 1e-9 * np.eye(2), penalized="inputs"), BOX),
+        covariance,
+        form,
+    )
     outputs = [
         LeastSquares(lambda x: x, Q, reference=GOAL.states),
         LeastSquares(lambda x, u: u, R),
@@ -57,33 +66,57 @@ def test_a_linear_output_costs_what_tracking_does(form, covariance):
 
 
 @pytest.mark.parametrize("penalized", ["inputs", "deviations", "increments"])
-def test_weights_and_bounds_by_stage_are_those_of_the_program_with_its_states_left_in(penalized, rng):
+def test_weights_and_bounds_by_stage_are_those_of_the_program_with_its_states_left_in(
+    penalized, rng
+):
     Q, R = rng.uniform(0.1, 2.0, (H, 3)), rng.uniform(0.1, 1.0, (H, 2))
     low, high = rng.uniform(-0.3, -0.1, (H, 2)), rng.uniform(0.1, 0.3, (H, 2))
-    cost = Tracking(*(weights[:, :, None] * np.eye(weights.shape[1]) for weights in (Q, R)), penalized=penalized)
+    cost = Tracking(
+        *(weights[:, :, None] * np.eye(weights.shape[1]) for weights in (Q, R)),
+        penalized=penalized,
+    )
     problem = Problem(cost, Box(low, high), Box(-0.1 - 0.1 * np.ones((H, 2)), None))
     for covariance in ("zero_order", "full"):
-        plans = [planned(problem, covariance, kind=kind).inputs for kind in (GPMPC, StateFormMPC)]
+        plans = [
+            planned(problem, covariance, kind=kind).inputs
+            for kind in (GPMPC, StateFormMPC)
+        ]
         assert np.allclose(*plans, atol=1e-6)
     nonlinear = NMPC(LinearPlant(linear_gaussian(3, 2)), problem, H, [0.1, 0.0])
-    assert np.allclose(nonlinear.control(Gaussian.certain(STATE), GOAL).inputs, planned(problem).inputs, atol=1e-5)
+    assert np.allclose(
+        nonlinear.control(Gaussian.certain(STATE), GOAL).inputs,
+        planned(problem).inputs,
+        atol=1e-5,
+    )
     free = Problem(cost)
-    law = LQR(linear_gaussian(3, 2), free, H, [0.1, 0.0]).control(Gaussian.certain(STATE), GOAL)
+    law = LQR(linear_gaussian(3, 2), free, H, [0.1, 0.0]).control(
+        Gaussian.certain(STATE), GOAL
+    )
     assert np.allclose(law.inputs, planned(free).inputs, atol=1e-9)
 
 
 def tip(x, u, p):
     """Place of a double pendulum's tip over the one that p says, and the power that its motor takes."""
     elbow, hand = x[..., 0], x[..., 0] + x[..., 1]
-    place = [torch.sin(elbow) + torch.sin(hand) - p[..., 0], torch.cos(elbow) + torch.cos(hand) - p[..., 1]]
+    place = [
+        torch.sin(elbow) + torch.sin(hand) - p[..., 0],
+        torch.cos(elbow) + torch.cos(hand) - p[..., 1],
+    ]
     return torch.stack([*place, 0.02 * u[..., 0] * x[..., 3]], dim=-1)
 
 
 def casadi_tip():
-    x, u, p = (casadi.SX.sym(name, size) for name, size in (("x", 4), ("u", 1), ("p", 2)))
+    x, u, p = (
+        casadi.SX.sym(name, size) for name, size in (("x", 4), ("u", 1), ("p", 2))
+    )
     elbow, hand = x[0], x[0] + x[1]
-    place = casadi.sin(elbow) + casadi.sin(hand) - p[0], casadi.cos(elbow) + casadi.cos(hand) - p[1]
-    return casadi.Function("tip", [x, u, p], [casadi.vertcat(*place, 0.02 * u[0] * x[3])])
+    place = (
+        casadi.sin(elbow) + casadi.sin(hand) - p[0],
+        casadi.cos(elbow) + casadi.cos(hand) - p[1],
+    )
+    return casadi.Function(
+        "tip", [x, u, p], [casadi.vertcat(*place, 0.02 * u[0] * x[3])]
+    )
 
 
 @pytest.mark.parametrize("y", [tip, casadi_tip()], ids=["torch", "CasADi"])
@@ -92,11 +125,23 @@ def test_an_iterated_plan_is_where_the_cost_of_its_outputs_has_no_slope(y):
     model, steps, R = DoublePendulum(ACROBOT), 12, 1e-2
     place, start = np.array([0.5, 1.6]), np.array([0.2, 0.1, 0.0, 0.0])
     problem = Problem(
-        Tracking([0.0, 0.0, 0.02, 0.02], [R], penalized="inputs"), outputs=[LeastSquares(y, [5.0, 5.0, 1.0])]
+        Tracking([0.0, 0.0, 0.02, 0.02], [R], penalized="inputs"),
+        outputs=[LeastSquares(y, [5.0, 5.0, 1.0])],
     )
     settings = PredictionSettings(covariance="none")
-    controller = GPMPC(model, Linearization(), problem, steps, [0.0], settings, iterations=60, tolerance=1e-9)
-    plan = controller.control(Gaussian.certain(start), Reference(np.zeros(4)), None, place)
+    controller = GPMPC(
+        model,
+        Linearization(),
+        problem,
+        steps,
+        [0.0],
+        settings,
+        iterations=60,
+        tolerance=1e-9,
+    )
+    plan = controller.control(
+        Gaussian.certain(start), Reference(np.zeros(4)), None, place
+    )
     assert plan.status is Status.SOLVED
     assert plan.iterations > 3
 
@@ -105,11 +150,15 @@ def test_an_iterated_plan_is_where_the_cost_of_its_outputs_has_no_slope(y):
         for u in inputs:
             x = model.successor(x, u)
             out = tip(torch.tensor(x), torch.tensor(u), torch.tensor(place)).numpy()
-            total += out @ np.diag([5.0, 5.0, 1.0]) @ out + R * u @ u + 0.02 * x[2:] @ x[2:]
+            total += (
+                out @ np.diag([5.0, 5.0, 1.0]) @ out + R * u @ u + 0.02 * x[2:] @ x[2:]
+            )
         return total
 
     step = 1e-5 * np.eye(steps)[:, :, None]
-    slopes = np.array([(cost(plan.inputs + d) - cost(plan.inputs - d)) / 2e-5 for d in step])
+    slopes = np.array(
+        [(cost(plan.inputs + d) - cost(plan.inputs - d)) / 2e-5 for d in step]
+    )
     at_rest = np.array([(cost(d) - cost(-d)) / 2e-5 for d in step])
     assert np.abs(slopes).max() < 1e-4 * np.abs(at_rest).max()
     assert cost(plan.inputs) < 0.97 * cost(0.0 * plan.inputs)
@@ -118,13 +167,20 @@ def test_an_iterated_plan_is_where_the_cost_of_its_outputs_has_no_slope(y):
 def test_a_constraint_of_states_and_inputs_is_kept_and_touched():
     """An input stays above x_3^2 - 0.2, whether it is said in torch or in CasADi."""
     x, u = casadi.SX.sym("x", 3), casadi.SX.sym("u", 2)
-    limits = [lambda x, u: x[:, 2] ** 2 - u[:, 0] - 0.2, casadi.Function("limit", [x, u], [x[2] ** 2 - u[0] - 0.2])]
+    limits = [
+        lambda x, u: x[:, 2] ** 2 - u[:, 0] - 0.2,
+        casadi.Function("limit", [x, u], [x[2] ** 2 - u[0] - 0.2]),
+    ]
     plans = []
     for limit in limits:
-        problem = Problem(Tracking([1.0] * 3, [0.1] * 2), BOX, constraints=[Inequality(limit)])
+        problem = Problem(
+            Tracking([1.0] * 3, [0.1] * 2), BOX, constraints=[Inequality(limit)]
+        )
         plans.append(planned(problem, iterations=40, tolerance=1e-8))
         assert plans[-1].status is Status.SOLVED
-        assert (plans[-1].means[1:, 2] ** 2 - plans[-1].inputs[:, 0]).max() == pytest.approx(0.2, abs=1e-7)
+        assert (
+            plans[-1].means[1:, 2] ** 2 - plans[-1].inputs[:, 0]
+        ).max() == pytest.approx(0.2, abs=1e-7)
         assert plans[-1].violation < 1e-7
     free = planned(Problem(Tracking([1.0] * 3, [0.1] * 2), BOX))
     assert (free.means[1:, 2] ** 2 - free.inputs[:, 0]).max() > 0.25
@@ -139,7 +195,11 @@ def test_a_plan_that_is_handed_over_is_where_the_iteration_starts():
     start = Gaussian.certain(np.array([0.3, -0.2, 0.0, 0.0]))
     controller = GPMPC(*args, iterations=60, **settings)
     solved = controller.control(start, goal)
-    for plan in (solved.inputs, (solved.inputs, solved.means), (torch.tensor(solved.inputs), solved.means)):
+    for plan in (
+        solved.inputs,
+        (solved.inputs, solved.means),
+        (torch.tensor(solved.inputs), solved.means),
+    ):
         again = controller.control(start, goal, plan=plan)
         assert again.iterations == 1
         assert np.allclose(again.inputs, solved.inputs, atol=1e-6)
@@ -153,19 +213,31 @@ def test_a_plan_that_is_handed_over_is_where_the_iteration_starts():
 
 def test_a_plan_that_leaves_the_data_is_flagged_and_one_among_them_is_not(rng):
     states, inputs = rng.uniform(-1, 1, (60, 2)), rng.uniform(-1, 1, (60, 1))
-    after = states + 0.1 * np.stack([np.sin(3 * states[:, 1]), np.sin(3 * inputs[:, 0])], axis=1)
+    after = states + 0.1 * np.stack(
+        [np.sin(3 * states[:, 1]), np.sin(3 * inputs[:, 0])], axis=1
+    )
     data = Transitions(states, inputs, after + rng.normal(0, 1e-3, (60, 2)))
     problem = Problem(Tracking([1.0, 1.0], [0.1]), Box([-1.0], [1.0]))
-    for model in (train(data, predicts="difference").posterior, ResidualModel.train(Affine.identity(2, 1), data)):
+    for model in (
+        train(data, predicts="difference").posterior,
+        ResidualModel.train(Affine.identity(2, 1), data),
+    ):
         controller = GPMPC(model, Linearization(), problem, 5, [0.0])
         places = [np.full(2, place) for place in (0.2, 4e3)]
-        among, beyond = (controller.control(Gaussian.certain(place), Reference(place)) for place in places)
+        among, beyond = (
+            controller.control(Gaussian.certain(place), Reference(place))
+            for place in places
+        )
         assert among.novelty < 0.2
         assert not among.far_from_data
         assert beyond.novelty == pytest.approx(1.0, abs=0.05)
         assert beyond.far_from_data
-    unknown = GPMPC(model, Linearization(), problem, 5, [0.0], PredictionSettings(covariance="none"))
-    assert not unknown.control(Gaussian.certain(np.zeros(2)), Reference(np.zeros(2))).far_from_data
+    unknown = GPMPC(
+        model, Linearization(), problem, 5, [0.0], PredictionSettings(covariance="none")
+    )
+    assert not unknown.control(
+        Gaussian.certain(np.zeros(2)), Reference(np.zeros(2))
+    ).far_from_data
 
 
 def test_mistakes_are_one_clear_error():
@@ -177,32 +249,70 @@ def test_mistakes_are_one_clear_error():
     ):
         with pytest.raises(SettingError, match=message):
             LeastSquares(*output)
-    with pytest.raises(SettingError, match=r"outputs: must be LeastSquares\(...\); got Box"):
+    with pytest.raises(
+        SettingError, match=r"outputs: must be LeastSquares\(...\); got Box"
+    ):
         Problem(tracking, outputs=[BOX])
-    with pytest.raises(SettingError, match="weight: must be given for one stage or all 7; got 2"):
-        planned(Problem(tracking, outputs=[LeastSquares(torch.sin, np.ones((2, 3, 3)) + np.eye(3))]))
-    with pytest.raises(SettingError, match="parameters: must come with every call: y is a function of them"):
-        planned(Problem(tracking, outputs=[LeastSquares(lambda x, u, p: x - p, [1.0] * 3)]))
+    with pytest.raises(
+        SettingError, match="weight: must be given for one stage or all 7; got 2"
+    ):
+        planned(
+            Problem(
+                tracking,
+                outputs=[LeastSquares(torch.sin, np.ones((2, 3, 3)) + np.eye(3))],
+            )
+        )
+    with pytest.raises(
+        SettingError,
+        match="parameters: must come with every call: y is a function of them",
+    ):
+        planned(
+            Problem(tracking, outputs=[LeastSquares(lambda x, u, p: x - p, [1.0] * 3)])
+        )
     with pytest.raises(ShapeError, match=r"y must give \(7, 2\); got \(7, 3\)"):
         planned(Problem(tracking, outputs=[LeastSquares(lambda x: x, [1.0] * 2)]))
-    assert planned(Problem(tracking, outputs=[LeastSquares(torch.log, [1.0] * 3)])).status is Status.FUNCTION_NOT_FINITE
+    assert (
+        planned(Problem(tracking, outputs=[LeastSquares(torch.log, [1.0] * 3)])).status
+        is Status.FUNCTION_NOT_FINITE
+    )
     mixed = Problem(tracking, outputs=[LeastSquares(torch.sin, [1.0] * 3)])
     for kind in (LQR, StateFormMPC):
         arguments = (Linearization(),) if kind is StateFormMPC else ()
-        with pytest.raises(SettingError, match="Inequality and LeastSquares are for GPMPC"):
+        with pytest.raises(
+            SettingError, match="Inequality and LeastSquares are for GPMPC"
+        ):
             kind(linear_gaussian(3, 2), *arguments, mixed, H, [0.0] * 2)
-    controller = GPMPC(linear_gaussian(3, 2), Linearization(), Problem(tracking), H, [0.0] * 2)
-    with pytest.raises(ShapeError, match=r"a plan must be inputs \(7, 2\), or these and states \(8, 3\); got \(3, 2\)"):
+    controller = GPMPC(
+        linear_gaussian(3, 2), Linearization(), Problem(tracking), H, [0.0] * 2
+    )
+    with pytest.raises(
+        ShapeError,
+        match=r"a plan must be inputs \(7, 2\), or these and states \(8, 3\); got \(3, 2\)",
+    ):
         controller.control(at, GOAL, plan=np.zeros((3, 2)))
     with pytest.raises(DataError, match="a plan to start from must be finite"):
         controller.control(at, GOAL, plan=np.full((7, 2), np.nan))
 
 
 def test_functions_are_looked_at_where_a_flight_starts_also_with_references_and_weights_by_stage():
-    cost, start, weight = Tracking([1.0] * 3, [1.0] * 2), (STATE, np.zeros(2)), np.stack([np.eye(3)] * H)
-    Problem(cost, outputs=[LeastSquares(lambda x: x, weight, np.zeros((H, 3)))]).check_start(*start)
-    with pytest.raises(SettingError, match=r"y or its gradient is not finite at x = \[ 0\.4 -0\.3  0\.2\], u"):
-        Problem(cost, outputs=[LeastSquares(torch.log, weight, np.zeros((H, 3)))]).check_start(*start)
+    cost, start, weight = (
+        Tracking([1.0] * 3, [1.0] * 2),
+        (STATE, np.zeros(2)),
+        np.stack([np.eye(3)] * H),
+    )
+    Problem(
+        cost, outputs=[LeastSquares(lambda x: x, weight, np.zeros((H, 3)))]
+    ).check_start(*start)
+    with pytest.raises(
+        SettingError,
+        match=r"y or its gradient is not finite at x = \[ 0\.4 -0\.3  0\.2\], u",
+    ):
+        Problem(
+            cost, outputs=[LeastSquares(torch.log, weight, np.zeros((H, 3)))]
+        ).check_start(*start)
     kept = Inequality(lambda x, u: u.log().sum(dim=1))
-    with pytest.raises(SettingError, match=r"h or its gradient is not finite at x = .* where the flight starts"):
+    with pytest.raises(
+        SettingError,
+        match=r"h or its gradient is not finite at x = .* where the flight starts",
+    ):
         Problem(cost, constraints=[kept]).check_start(*start)

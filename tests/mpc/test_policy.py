@@ -24,16 +24,25 @@ class Planner:
         k = len(self.previous)
         self.previous.append(previous)
         failed = k in self.failing
-        inputs = np.full((4, 1), 666.0) if failed else 10.0 * k + np.arange(4.0)[:, None]
-        means, covariances = np.arange(5.0)[:, None] + 100 * k, np.arange(5.0)[:, None, None] + 100 * k
+        inputs = (
+            np.full((4, 1), 666.0) if failed else 10.0 * k + np.arange(4.0)[:, None]
+        )
+        means, covariances = (
+            np.arange(5.0)[:, None] + 100 * k,
+            np.arange(5.0)[:, None, None] + 100 * k,
+        )
         status = Status.ITERATION_LIMIT if failed else Status.SOLVED
-        return Decision(inputs[0], inputs, means, covariances, status, 1, Timing(0.0, 0.0, 0.0))
+        return Decision(
+            inputs[0], inputs, means, covariances, status, 1, Timing(0.0, 0.0, 0.0)
+        )
 
 
 def run(planner, steps, on_failure, beliefs=None, reference=FAR):
     last, commands = None, []
     for k in range(steps):
-        last = command(planner, beliefs[k] if beliefs else STATE, reference, last, on_failure, k)
+        last = command(
+            planner, beliefs[k] if beliefs else STATE, reference, last, on_failure, k
+        )
         commands.append(last)
     return commands
 
@@ -52,7 +61,10 @@ def test_hold_keeps_the_last_input_that_was_applied():
 def test_a_failed_iterate_is_never_handed_on(on_failure):
     planner = Planner(1, 2, 5)
     commands = run(planner, 8, on_failure)
-    assert all(p is None or (p.status.solved and not (p.inputs == 666).any()) for p in planner.previous)
+    assert all(
+        p is None or (p.status.solved and not (p.inputs == 666).any())
+        for p in planner.previous
+    )
     assert [c.status.solved for c in commands] == [k not in (1, 2, 5) for k in range(8)]
     assert commands[1].decision.status is Status.ITERATION_LIMIT
 
@@ -60,7 +72,9 @@ def test_a_failed_iterate_is_never_handed_on(on_failure):
 def test_the_plan_handed_on_is_the_last_solved_one_as_if_made_one_step_ago():
     planner = Planner(1, 2)
     run(planner, 4, "previous_plan")
-    aged = planner.previous[3]  # made at step 0, two steps of which have gone by when step 2 is over
+    aged = planner.previous[
+        3
+    ]  # made at step 0, two steps of which have gone by when step 2 is over
     assert aged.inputs[:, 0].tolist() == [2, 3, 3, 3]
     assert aged.input[0] == 2  # what step 2 applied
     assert aged.means[:, 0].tolist() == [2, 3, 4, 4, 4]
@@ -86,26 +100,39 @@ def test_a_state_that_is_not_finite_is_not_given_to_the_controller():
 
 def test_before_the_first_plan_the_references_input_is_taken_or_the_loop_stops():
     known = Reference(np.zeros((5, 1)), np.full((4, 1), 7.0))
-    assert [c.input[0] for c in run(Planner(0, 1), 3, "hold", reference=known)] == [7, 7, 20]
-    with pytest.raises(SolverFailure, match="step 0: .* no reference input to fall back on"):
+    assert [c.input[0] for c in run(Planner(0, 1), 3, "hold", reference=known)] == [
+        7,
+        7,
+        20,
+    ]
+    with pytest.raises(
+        SolverFailure, match="step 0: .* no reference input to fall back on"
+    ):
         run(Planner(0), 1, "previous_plan")
 
 
 def test_raise_stops_at_the_step():
     with pytest.raises(SolverFailure, match="step 1: stopped at the iteration limit"):
         run(Planner(1), 3, "raise")
-    with pytest.raises(SolverFailure, match="step 0: the state is not finite: check the estimator"):
+    with pytest.raises(
+        SolverFailure, match="step 0: the state is not finite: check the estimator"
+    ):
         run(Planner(), 1, "raise", [LOST])
 
 
 def test_a_misspelt_policy_is_refused():
-    with pytest.raises(SettingError, match="on_failure: must be one of 'previous_plan', 'hold', 'raise'; got 'held'"):
+    with pytest.raises(
+        SettingError,
+        match="on_failure: must be one of 'previous_plan', 'hold', 'raise'; got 'held'",
+    ):
         ControlLoop(Planner(), "held")
 
 
 def test_before_the_first_plan_the_reference_input_is_applied_within_the_bounds_and_told_to_the_controller():
     planner = Planner()
-    planner.problem = Problem(Tracking([1.0], [1.0], penalized="inputs"), inputs=Box([-2.0], [2.0]))
+    planner.problem = Problem(
+        Tracking([1.0], [1.0], penalized="inputs"), inputs=Box([-2.0], [2.0])
+    )
     reference = Reference(np.zeros((5, 1)), np.full((4, 1), 5.0))
     commands = run(planner, 3, "previous_plan", [LOST, LOST, STATE], reference)
     assert [c.input[0] for c in commands] == [2, 2, 0]

@@ -10,21 +10,30 @@ from gpmpc.mpc.problem import Box, Halfspaces, Problem, Tracking
 def test_diagonals_and_matrices_mean_the_same():
     a = Tracking([1.0, 2.0], [3.0])
     b = Tracking(np.diag([1.0, 2.0]), [[3.0]], terminal=[1.0, 2.0])
-    assert all(np.array_equal(getattr(a, key), getattr(b, key)) for key in ("Q", "R", "terminal"))
+    assert all(
+        np.array_equal(getattr(a, key), getattr(b, key))
+        for key in ("Q", "R", "terminal")
+    )
     assert (Problem(a).state_dim, Problem(a).input_dim) == (2, 1)
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"Q": [1.0, -1.0]}, "Q: must be positive semidefinite; its smallest eigenvalue is -1"),
+        (
+            {"Q": [1.0, -1.0]},
+            "Q: must be positive semidefinite; its smallest eigenvalue is -1",
+        ),
         ({"Q": [[1.0, 0.5], [0.0, 1.0]]}, "Q: must be symmetric"),
         ({"Q": [[1.0, 0.5]]}, "Q: must be the diagonal of a weight or a square matrix"),
         ({"Q": ["a", "b"]}, "Q: must be the diagonal"),
         ({"Q": [np.nan, 1.0]}, "Q: must be finite"),
         ({"R": [0.0]}, "R: must be positive definite; its smallest eigenvalue is 0"),
         ({"terminal": [1.0]}, "terminal: must be a weight of 2 states; got 1"),
-        ({"penalized": "rates"}, "penalized: must be one of 'inputs', 'deviations', 'increments'; got 'rates'"),
+        (
+            {"penalized": "rates"},
+            "penalized: must be one of 'inputs', 'deviations', 'increments'; got 'rates'",
+        ),
     ],
 )
 def test_a_cost_that_makes_no_sense_is_refused(arguments, message):
@@ -39,11 +48,26 @@ def test_a_cost_that_makes_no_sense_is_refused(arguments, message):
         ({"inputs": Box([1.0, 2.0])}, "inputs: must bound 1 inputs; got 2"),
         ({"outputs": [Box([1.0])]}, r"outputs: must be LeastSquares\(...\); got Box"),
         ({"inputs": [-1, 1]}, r"inputs: must be Box\(lower, upper\); got list"),
-        ({"inputs": Box([-1.0], probability=0.9)}, "inputs: has bounds that are always kept"),
-        ({"input_rates": Box([-1.0], penalty=None)}, "input_rates: has bounds that are always kept"),
-        ({"constraints": [Box([0.0], [1.0])]}, "constraints: must bound 2 states; got 1"),
-        ({"constraints": [Halfspaces([[1.0]], [1.0])]}, "constraints: must bound 2 states; got 1"),
-        ({"constraints": [(-1, 1)]}, r"must be Box\(...\), Halfspaces\(...\) or Inequality\(...\); got tuple"),
+        (
+            {"inputs": Box([-1.0], probability=0.9)},
+            "inputs: has bounds that are always kept",
+        ),
+        (
+            {"input_rates": Box([-1.0], penalty=None)},
+            "input_rates: has bounds that are always kept",
+        ),
+        (
+            {"constraints": [Box([0.0], [1.0])]},
+            "constraints: must bound 2 states; got 1",
+        ),
+        (
+            {"constraints": [Halfspaces([[1.0]], [1.0])]},
+            "constraints: must bound 2 states; got 1",
+        ),
+        (
+            {"constraints": [(-1, 1)]},
+            r"must be Box\(...\), Halfspaces\(...\) or Inequality\(...\); got tuple",
+        ),
     ],
 )
 def test_a_problem_that_makes_no_sense_is_refused(arguments, message):
@@ -55,7 +79,10 @@ def test_a_problem_that_makes_no_sense_is_refused(arguments, message):
     ("arguments", "message"),
     [
         ({"lower": [2.0]}, "must not cross; entry 0 has 2 above 1"),
-        ({"lower": [[0.0], [2.0]], "upper": [[1.0], [1.0]]}, "must not cross; entry 0 has 2 above 1"),
+        (
+            {"lower": [[0.0], [2.0]], "upper": [[1.0], [1.0]]},
+            "must not cross; entry 0 has 2 above 1",
+        ),
         ({"lower": [math.inf], "upper": [math.inf]}, "lower: no number keeps it"),
         ({"lower": [-math.inf], "upper": [-1e20]}, "upper: no number keeps it"),
         ({"lower": [0.0, 0.0]}, "upper: must be a list of 2 numbers"),
@@ -75,14 +102,19 @@ def test_bounds_that_make_no_sense_are_refused(arguments, message):
         Box(**({"lower": [0.0], "upper": [1.0]} | arguments))
 
 
-@pytest.mark.parametrize("arguments", [([1.0], [1.0]), ([[1.0]], [1.0, 2.0]), ([[0.0]], [1.0]), ([[1.0]], [math.inf])])
+@pytest.mark.parametrize(
+    "arguments",
+    [([1.0], [1.0]), ([[1.0]], [1.0, 2.0]), ([[0.0]], [1.0]), ([[1.0]], [math.inf])],
+)
 def test_halfspaces_that_make_no_sense_are_refused(arguments):
     with pytest.raises(SettingError, match="F, f: must be"):
         Halfspaces(*arguments)
 
 
 def test_kappa_is_the_quantile_of_the_probability_unless_given():
-    assert Box([0.0], [1.0], probability=0.95).standard_deviations() == pytest.approx(1.6448536269514722, abs=1e-12)
+    assert Box([0.0], [1.0], probability=0.95).standard_deviations() == pytest.approx(
+        1.6448536269514722, abs=1e-12
+    )
     assert Box([0.0], [1.0], probability=0.95, kappa=2.0).standard_deviations() == 2.0
     assert Box([0.0], [1.0]).standard_deviations() == 0.0
     joint = Box([0.0], [1.0], probability=0.9, joint=True).standard_deviations(sides=10)
@@ -122,7 +154,9 @@ def test_without_bounds_everything_is_free_and_bounds_may_touch():
 def test_bounds_of_one_stage_are_those_of_all_and_others_need_every_stage():
     assert np.array_equal(Box([1.0, 2.0], [3.0, 4.0]).by_stage(3)[1], [[3.0, 4.0]] * 3)
     assert np.array_equal(Box([[1.0], [2.0]]).by_stage(2)[0], [[1.0], [2.0]])
-    with pytest.raises(SettingError, match="lower: must be given for one stage or all 3; got 2"):
+    with pytest.raises(
+        SettingError, match="lower: must be given for one stage or all 3; got 2"
+    ):
         Box([[1.0], [2.0]]).by_stage(3)
 
 

@@ -22,7 +22,9 @@ FREE = Problem(COST, Box([-0.15] * 2, [0.15] * 2))
 def integrator(noise=0.0):
     """x+ = x + u in the plane."""
     model, eye = linear_gaussian(2, 2), torch.eye(2, dtype=torch.float64)
-    return type(model)(A=eye, B=eye, c=torch.zeros(2, dtype=torch.float64), V=noise * eye)
+    return type(model)(
+        A=eye, B=eye, c=torch.zeros(2, dtype=torch.float64), V=noise * eye
+    )
 
 
 def disc(x, u, p):
@@ -37,14 +39,23 @@ def casadi_disc():
 
 def controller(constraint, **settings):
     problem = Problem(COST, FREE.inputs, constraints=[constraint])
-    return GPMPC(integrator(settings.pop("noise", 0.0)), Linearization(), problem, H, [0.0] * 2, **settings)
+    return GPMPC(
+        integrator(settings.pop("noise", 0.0)),
+        Linearization(),
+        problem,
+        H,
+        [0.0] * 2,
+        **settings,
+    )
 
 
 def flown(steering, goal, steps=40, parameters=lambda k: CENTRE):
     """States of a loop to a set point."""
     states, last = [np.zeros(2)], None
     for k in range(steps):
-        last = steering.control(Gaussian.certain(states[-1]), Reference(goal), last, parameters(k))
+        last = steering.control(
+            Gaussian.certain(states[-1]), Reference(goal), last, parameters(k)
+        )
         assert last.status is Status.SOLVED
         states.append(states[-1] + last.input)
     return np.array(states)
@@ -53,7 +64,11 @@ def flown(steering, goal, steps=40, parameters=lambda k: CENTRE):
 @pytest.mark.parametrize("h", [disc, casadi_disc()], ids=["torch", "CasADi"])
 def test_a_disc_in_the_way_is_passed_without_touching_it(h):
     goal = np.array([1.3, 0.0])
-    straight = flown(GPMPC(integrator(), Linearization(), FREE, H, [0.0] * 2), goal, parameters=lambda _: None)
+    straight = flown(
+        GPMPC(integrator(), Linearization(), FREE, H, [0.0] * 2),
+        goal,
+        parameters=lambda _: None,
+    )
     around = flown(controller(Inequality(h)), goal)
     assert np.linalg.norm(straight - CENTRE, axis=1).min() < 0.1
     assert np.linalg.norm(around - CENTRE, axis=1).min() > RADIUS - 1e-6
@@ -64,17 +79,24 @@ def test_a_moving_disc_is_passed_where_it_will_be():
     goal = np.array([1.3, 0.0])
     places = lambda k: CENTRE + [[0.0, 0.02 * (k + i + 1)] for i in range(H)]  # noqa: E731
     states = flown(controller(Inequality(disc)), goal, parameters=places)
-    distances = [np.linalg.norm(x - CENTRE - [0.0, 0.02 * k]) for k, x in enumerate(states)]
+    distances = [
+        np.linalg.norm(x - CENTRE - [0.0, 0.02 * k]) for k, x in enumerate(states)
+    ]
     assert min(distances) > RADIUS - 1e-6
     assert np.allclose(states[-1], goal, atol=1e-3)
 
 
 @pytest.mark.parametrize("covariance", ["zero_order", "diagonal", "full"])
 def test_an_uncertain_plan_keeps_its_standard_deviations_along_the_gradient(covariance):
-    reference, at = Reference(np.array([1.3, 0.2])), Gaussian.certain(np.array([0.0, 0.1]))
+    reference, at = (
+        Reference(np.array([1.3, 0.2])),
+        Gaussian.certain(np.array([0.0, 0.1])),
+    )
     constraint = Inequality(disc, probability=0.95, penalty=None)
     settings = PredictionSettings(covariance=covariance)
-    plan = controller(constraint, noise=1e-3, prediction=settings, iterations=50).control(at, reference, None, CENTRE)
+    plan = controller(
+        constraint, noise=1e-3, prediction=settings, iterations=50
+    ).control(at, reference, None, CENTRE)
     assert plan.status is Status.SOLVED
     away = plan.means[1:] - CENTRE
     distance = np.linalg.norm(away, axis=1)
@@ -86,27 +108,42 @@ def test_an_uncertain_plan_keeps_its_standard_deviations_along_the_gradient(cova
 
 
 def test_a_linear_function_is_a_halfspace_and_a_box_is_a_pair_of_them():
-    F, f, at = np.array([[1.0, 0.0], [0.6, 0.8]]), np.array([0.7, 0.5]), Gaussian.certain(np.array([0.1, 0.2]))
+    F, f, at = (
+        np.array([[1.0, 0.0], [0.6, 0.8]]),
+        np.array([0.7, 0.5]),
+        Gaussian.certain(np.array([0.1, 0.2])),
+    )
     lower = np.array([[-1.0, 0.0]])
     box, smooth = (
         Box([-0.2, -np.inf], [0.3, np.inf], probability=0.9),
         lambda x: x @ torch.tensor(F).T - torch.tensor(f),
     )
     pairs = [
-        (Inequality(smooth, count=2, probability=0.9), Halfspaces(F, f, probability=0.9)),
+        (
+            Inequality(smooth, count=2, probability=0.9),
+            Halfspaces(F, f, probability=0.9),
+        ),
         (box, Halfspaces([[1.0, 0.0], *lower], [0.3, 0.2], probability=0.9)),
     ]
     for pair in pairs:
         for mode in ("zero_order", "full"):
-            settings = {"noise": 1e-3, "prediction": PredictionSettings(covariance=mode)}
-            plans = [controller(one, **settings).control(at, Reference(np.array([1.0, 1.0]))) for one in pair]
+            settings = {
+                "noise": 1e-3,
+                "prediction": PredictionSettings(covariance=mode),
+            }
+            plans = [
+                controller(one, **settings).control(at, Reference(np.array([1.0, 1.0])))
+                for one in pair
+            ]
             assert np.allclose(plans[0].inputs, plans[1].inputs, atol=1e-9)
             assert np.abs(plans[0].solution.z).max() > 1e-3
 
 
 def test_bounds_hold_at_the_stages_that_they_are_for():
     box = Box([-np.inf] * 2, [0.2, np.inf], stages=range(3, 6))
-    plan = controller(box).control(Gaussian.certain(np.zeros(2)), Reference(np.array([1.0, 0.0])))
+    plan = controller(box).control(
+        Gaussian.certain(np.zeros(2)), Reference(np.array([1.0, 0.0]))
+    )
     assert plan.means[3:6, 0].max() <= 0.2 + 1e-9
     assert plan.means[6:, 0].max() > 0.3
     with pytest.raises(SettingError, match=r"stages: must be of 1 .. 12; got 13"):
@@ -116,11 +153,16 @@ def test_bounds_hold_at_the_stages_that_they_are_for():
 def test_the_exact_price_is_paid_by_no_plan_that_can_do_without_and_by_as_little_as_must_be():
     at, reference = Gaussian.certain(np.zeros(2)), Reference(np.array([3.0, 0.0]))
     soft, hard = (
-        controller(Box(None, [0.4, np.inf], penalty=price)).control(at, reference) for price in ("exact", None)
+        controller(Box(None, [0.4, np.inf], penalty=price)).control(at, reference)
+        for price in ("exact", None)
     )
     assert np.allclose(soft.inputs, hard.inputs, atol=1e-7)
     outside = Gaussian.certain(np.array([1.0, 0.0]))
-    assert not controller(Box(None, [0.4, np.inf], penalty=None)).control(outside, reference).applicable
+    assert (
+        not controller(Box(None, [0.4, np.inf], penalty=None))
+        .control(outside, reference)
+        .applicable
+    )
     back = controller(Box(None, [0.4, np.inf])).control(outside, reference)
     assert back.status is Status.SOLVED
     assert np.allclose(back.inputs[:4, 0], -0.15, atol=1e-7)
@@ -128,21 +170,29 @@ def test_the_exact_price_is_paid_by_no_plan_that_can_do_without_and_by_as_little
 
 def test_an_angle_is_steered_the_short_way_and_numbers_without_angles_are_as_they_were():
     cost = Tracking([1.0] * 2, [0.05] * 2, angles=[0])
-    turning = GPMPC(integrator(), Linearization(), Problem(cost, FREE.inputs), H, [0.0] * 2)
+    turning = GPMPC(
+        integrator(), Linearization(), Problem(cost, FREE.inputs), H, [0.0] * 2
+    )
     goal = Reference(np.array([-3.0, 0.2]))
     short = turning.control(Gaussian.certain(np.array([3.0, 0.0])), goal)
     assert short.inputs[0, 0] > 0.1
     plain = GPMPC(integrator(), Linearization(), FREE, H, [0.0] * 2)
     near = Gaussian.certain(np.array([-2.8, 0.0]))
-    assert np.array_equal(plain.control(near, goal).inputs, turning.control(near, goal).inputs)
-    moved = Gaussian.certain(short.means[1] - [2 * np.pi, 0.0])  # the sensor takes the turn off
+    assert np.array_equal(
+        plain.control(near, goal).inputs, turning.control(near, goal).inputs
+    )
+    moved = Gaussian.certain(
+        short.means[1] - [2 * np.pi, 0.0]
+    )  # the sensor takes the turn off
     again = turning.control(moved, goal, short)
     assert np.allclose(again.inputs[:-1], short.inputs[1:], atol=5e-2)
 
 
 def test_mistakes_are_one_clear_error():
     at, reference = Gaussian.certain(np.zeros(2)), Reference(np.zeros(2))
-    with pytest.raises(ShapeError, match=r"parameters must be \(q,\) or \(12, q\); got \(3, 2\)"):
+    with pytest.raises(
+        ShapeError, match=r"parameters must be \(q,\) or \(12, q\); got \(3, 2\)"
+    ):
         controller(Inequality(disc)).control(at, reference, None, np.zeros((3, 2)))
     with pytest.raises(DataError, match="parameters must be finite"):
         controller(Inequality(disc)).control(at, reference, None, [np.nan, 0.0])
@@ -150,14 +200,26 @@ def test_mistakes_are_one_clear_error():
         controller(Inequality(disc, count=2)).control(at, reference, None, CENTRE)
     blind = controller(Inequality(lambda x: x[:, 0].log())).control(at, reference)
     assert (blind.applicable, blind.status) == (False, Status.FUNCTION_NOT_FINITE)
-    with pytest.raises(SolverFailure, match="step 0: a constraint or output, or its gradient, is not finite along the"):
-        ControlLoop(controller(Inequality(lambda x: x[:, 0].log())), on_failure="raise").input(np.zeros(2), np.zeros(2))
+    with pytest.raises(
+        SolverFailure,
+        match="step 0: a constraint or output, or its gradient, is not finite along the",
+    ):
+        ControlLoop(
+            controller(Inequality(lambda x: x[:, 0].log())), on_failure="raise"
+        ).input(np.zeros(2), np.zeros(2))
     for wrong, found in ((lambda x: x.sum(), r"\(\)"), (lambda x: "inside", "str")):
-        with pytest.raises(ShapeError, match=rf"h must give a tensor \(12, 1\); got {found}"):
+        with pytest.raises(
+            ShapeError, match=rf"h must give a tensor \(12, 1\); got {found}"
+        ):
             controller(Inequality(wrong)).control(at, reference)
     with pytest.raises(SettingError, match="h: must be a function; got float"):
         Inequality(1.0)
     with pytest.raises(SettingError, match="NMPC takes Box and Halfspaces"):
-        NMPC(LinearPlant(integrator()), Problem(COST, constraints=[Inequality(disc)]), 3, [0.0] * 2)
+        NMPC(
+            LinearPlant(integrator()),
+            Problem(COST, constraints=[Inequality(disc)]),
+            3,
+            [0.0] * 2,
+        )
     with pytest.raises(SettingError, match="angles: must be indices of 2 states"):
         Tracking([1.0] * 2, [1.0], angles=[2])

@@ -35,14 +35,20 @@ def reachable(quadrotor):
     inputs = HOVER + 0.05 * np.random.default_rng(0).normal(size=(5, 3))
     states = [np.zeros(6)]
     for u in inputs:
-        states.append(quadrotor.predict(torch.tensor(states[-1]), torch.tensor(u)).mean.numpy())
+        states.append(
+            quadrotor.predict(torch.tensor(states[-1]), torch.tensor(u)).mean.numpy()
+        )
     return Reference(np.array(states), inputs)
 
 
 @pytest.mark.parametrize("tolerance", [1e-4, 1e-6, 1e-9, 1e-300])
-def test_a_reference_that_can_be_reached_at_no_cost_is_reached(quadrotor, reachable, tolerance):
+def test_a_reference_that_can_be_reached_at_no_cost_is_reached(
+    quadrotor, reachable, tolerance
+):
     """1e-300 asks for more than there is: it ends where every step is lost in round-off."""
-    problem = Problem(Tracking([10.0, 1.0] * 3, [0.1] * 3, penalized="deviations"), **BOX)
+    problem = Problem(
+        Tracking([10.0, 1.0] * 3, [0.1] * 3, penalized="deviations"), **BOX
+    )
     controller = GPMPC(
         quadrotor,
         Linearization(),
@@ -55,7 +61,9 @@ def test_a_reference_that_can_be_reached_at_no_cost_is_reached(quadrotor, reacha
     )
     decision = controller.control(Gaussian.certain(np.zeros(6)), reachable)
     assert decision.status is Status.SOLVED
-    assert np.abs(decision.inputs - reachable.inputs).max() < max(1e-2 * tolerance, 1e-9)
+    assert np.abs(decision.inputs - reachable.inputs).max() < max(
+        1e-2 * tolerance, 1e-9
+    )
     assert decision.iterations < (12 if tolerance >= 1e-6 else 40)
 
 
@@ -64,10 +72,16 @@ def test_a_reference_that_can_be_reached_at_no_cost_is_reached(quadrotor, reacha
 def test_a_regulator_at_its_origin_has_no_trouble(penalized, tolerance):
     """Data and their mirror image: the origin is an equilibrium of the mean, to which all cost vanishes."""
     half = pendulum_gp(2, 40)
-    features, targets = (torch.cat([part, -part]) for part in (half.features, half.targets))
+    features, targets = (
+        torch.cat([part, -part]) for part in (half.features, half.targets)
+    )
     parts = half.lengthscales, half.signal_variance, half.noise_variance
-    model = GPPosterior.from_hyperparameters(features, targets, *parts, 1, predicts="difference")
-    problem = Problem(Tracking([10.0, 1.0], [0.1], penalized=penalized), inputs=Box([-6.0], [6.0]))
+    model = GPPosterior.from_hyperparameters(
+        features, targets, *parts, 1, predicts="difference"
+    )
+    problem = Problem(
+        Tracking([10.0, 1.0], [0.1], penalized=penalized), inputs=Box([-6.0], [6.0])
+    )
     controller = GPMPC(
         model,
         Linearization(),
@@ -80,9 +94,13 @@ def test_a_regulator_at_its_origin_has_no_trouble(penalized, tolerance):
     )
     state, last = np.array([0.8, 0.0]), None
     for _ in range(120):
-        last = controller.control(Gaussian.certain(state), Reference(np.zeros((9, 2))), last)
+        last = controller.control(
+            Gaussian.certain(state), Reference(np.zeros((9, 2))), last
+        )
         assert last.status is Status.SOLVED
-        state = model.predict(torch.tensor(state), torch.tensor(last.input)).mean.numpy()
+        state = model.predict(
+            torch.tensor(state), torch.tensor(last.input)
+        ).mean.numpy()
     assert np.abs(state).max() < 1e-9
 
 
@@ -91,10 +109,17 @@ def test_the_residual_vanishes_with_the_distance_where_the_cost_does(quadrotor):
     inputs = np.tile(HOVER, (3, 1))
     states = [np.zeros(6)]
     for u in inputs:
-        states.append(quadrotor.predict(torch.tensor(states[-1]), torch.tensor(u)).mean.numpy())
+        states.append(
+            quadrotor.predict(torch.tensor(states[-1]), torch.tensor(u)).mean.numpy()
+        )
     problem = Problem(Tracking([10.0, 1.0] * 3, [0.1] * 3), **BOX)
-    question = Instance(Gaussian.certain(np.zeros(6)), Reference(np.array(states)), HOVER)
-    far, near, nearer = (kkt_residual(quadrotor, problem, question, inputs + d) for d in (1e-1, 1e-6, 1e-8))
+    question = Instance(
+        Gaussian.certain(np.zeros(6)), Reference(np.array(states)), HOVER
+    )
+    far, near, nearer = (
+        kkt_residual(quadrotor, problem, question, inputs + d)
+        for d in (1e-1, 1e-6, 1e-8)
+    )
     assert far > 0.1
     assert near < 1e-2
     assert nearer == pytest.approx(1e-2 * near, rel=1e-3)
@@ -120,16 +145,24 @@ def test_what_is_called_solved_is_within_ten_times_the_tolerance(quadrotor, tole
         reference = Reference(np.tile(0.5 * random.uniform(-1, 1, 6), (6, 1)))
         last = controller.control(belief, reference, last)
         assert last.status is Status.SOLVED
-        residual = kkt_residual(quadrotor, problem, Instance(belief, reference, before), last.inputs)
+        residual = kkt_residual(
+            quadrotor, problem, Instance(belief, reference, before), last.inputs
+        )
         assert residual < 10 * tolerance
         before = last.input
 
 
-@pytest.mark.parametrize(("scale", "bound"), [(1.0, 0.01), (1e6, 1.0), (1e6, 1e4), (1e9, 1e7)])
-def test_plans_of_the_program_keep_their_rates_whatever_the_unit_of_the_inputs(scale, bound):
+@pytest.mark.parametrize(
+    ("scale", "bound"), [(1.0, 0.01), (1e6, 1.0), (1e6, 1e4), (1e9, 1e7)]
+)
+def test_plans_of_the_program_keep_their_rates_whatever_the_unit_of_the_inputs(
+    scale, bound
+):
     model = linear_gaussian(2, 1)
     model = replace(model, B=model.B / scale)
-    problem = Problem(Tracking([10.0, 1.0], [0.1 / scale**2]), input_rates=Box([-bound], [bound]))
+    problem = Problem(
+        Tracking([10.0, 1.0], [0.1 / scale**2]), input_rates=Box([-bound], [bound])
+    )
     controller = GPMPC(
         model,
         Linearization(),
@@ -139,14 +172,24 @@ def test_plans_of_the_program_keep_their_rates_whatever_the_unit_of_the_inputs(s
         prediction=PredictionSettings(covariance="none"),
         iterations=10,
     )
-    state, last, before, bitten = np.array([0.8, 0.0]), None, np.array([1.234567 * scale]), 0
+    state, last, before, bitten = (
+        np.array([0.8, 0.0]),
+        None,
+        np.array([1.234567 * scale]),
+        0,
+    )
     for _ in range(20):
-        last = controller.control(Gaussian.certain(state), Reference(np.zeros((9, 2))), last)
+        last = controller.control(
+            Gaussian.certain(state), Reference(np.zeros((9, 2))), last
+        )
         assert last.status is Status.SOLVED
         rates = np.diff(last.inputs, axis=0, prepend=before[None])
         assert np.abs(rates).max() <= bound + 1e-9 * max(1.0, np.abs(last.inputs).max())
         bitten += int((np.abs(np.diff(last.inputs[:, 0])) > 0.999 * bound).sum())
-        state, before = model.predict(torch.tensor(state), torch.tensor(last.input)).mean.numpy(), last.input
+        state, before = (
+            model.predict(torch.tensor(state), torch.tensor(last.input)).mean.numpy(),
+            last.input,
+        )
     assert bitten > 10
 
 
@@ -163,17 +206,37 @@ BOUNDS = Box([-np.inf, -0.3] * 3, [np.inf, 0.3] * 3, probability=0.95, penalty=2
 @pytest.mark.parametrize("covariance", ["zero_order", "none"])
 @pytest.mark.parametrize(
     "limits",
-    [{}, {"input_rates": Box([-0.5, -0.05, -0.05], [0.5, 0.05, 0.05])}, {"constraints": [BOUNDS]}],
+    [
+        {},
+        {"input_rates": Box([-0.5, -0.05, -0.05], [0.5, 0.05, 0.05])},
+        {"constraints": [BOUNDS]},
+    ],
     ids=["box", "rates", "soft states"],
 )
-def test_compiled_and_torch_and_another_solver_iterate_alike(quadrotor, covariance, limits):
+def test_compiled_and_torch_and_another_solver_iterate_alike(
+    quadrotor, covariance, limits
+):
     problem = Problem(Tracking([10.0, 1.0] * 3, [0.1] * 3), **BOX, **limits)
-    arguments = quadrotor, Linearization(), problem, 5, HOVER, PredictionSettings(covariance=covariance)
-    told = {} if "constraints" in limits else {"solver": Other()}  # prices need our own solver
-    ours, other = (GPMPC(*arguments, **solver, iterations=60, tolerance=1e-7) for solver in ({}, told))
+    arguments = (
+        quadrotor,
+        Linearization(),
+        problem,
+        5,
+        HOVER,
+        PredictionSettings(covariance=covariance),
+    )
+    told = (
+        {} if "constraints" in limits else {"solver": Other()}
+    )  # prices need our own solver
+    ours, other = (
+        GPMPC(*arguments, **solver, iterations=60, tolerance=1e-7)
+        for solver in ({}, told)
+    )
     random, last, before, programs = np.random.default_rng(2), None, None, 0
     for _ in range(8):
-        belief = Gaussian(torch.tensor(0.4 * random.uniform(-1, 1, 6)), 1e-4 * torch.eye(6))
+        belief = Gaussian(
+            torch.tensor(0.4 * random.uniform(-1, 1, 6)), 1e-4 * torch.eye(6)
+        )
         reference = Reference(np.tile(0.5 * random.uniform(-1, 1, 6), (6, 1)))
         last = ours.control(belief, reference, last)
         with backend("torch"):
@@ -181,18 +244,31 @@ def test_compiled_and_torch_and_another_solver_iterate_alike(quadrotor, covarian
         assert last.status is before.status
         assert last.iterations == before.iterations
         for name in ("inputs", "means", "covariances"):
-            assert np.allclose(getattr(last, name), getattr(before, name), rtol=0, atol=1e-9, equal_nan=True)
+            assert np.allclose(
+                getattr(last, name),
+                getattr(before, name),
+                rtol=0,
+                atol=1e-9,
+                equal_nan=True,
+            )
         programs += last.iterations * last.status.solved
     assert programs > 16
 
 
 def test_the_order_in_memory_of_what_is_asked_changes_nothing(quadrotor):
-    problem = Problem(Tracking([10.0, 1.0] * 3, [0.1] * 3, penalized="deviations"), **BOX)
+    problem = Problem(
+        Tracking([10.0, 1.0] * 3, [0.1] * 3, penalized="deviations"), **BOX
+    )
     controller = GPMPC(quadrotor, Linearization(), problem, 5, HOVER, iterations=30)
     random = np.random.default_rng(3)
-    states, inputs = 0.3 * random.uniform(-1, 1, (6, 6)), HOVER + 0.1 * random.uniform(-1, 1, (5, 3))
+    states, inputs = (
+        0.3 * random.uniform(-1, 1, (6, 6)),
+        HOVER + 0.1 * random.uniform(-1, 1, (5, 3)),
+    )
     S = torch.tensor(np.cov(random.normal(size=(6, 40)))) * 1e-3
-    plain = controller.control(Gaussian(torch.tensor(states[0]), S), Reference(states, inputs))
+    plain = controller.control(
+        Gaussian(torch.tensor(states[0]), S), Reference(states, inputs)
+    )
     mean = torch.tensor(np.repeat(states[0], 2))[::2]
     strided = Reference(np.asfortranarray(states), np.repeat(inputs, 2, axis=0)[::2])
     other = controller.control(Gaussian(mean, S.mT), strided)
@@ -202,9 +278,17 @@ def test_the_order_in_memory_of_what_is_asked_changes_nothing(quadrotor):
 
 
 def test_the_parts_of_the_time_are_within_what_the_step_took(quadrotor, reachable):
-    problem = Problem(Tracking([10.0, 1.0] * 3, [0.1] * 3, penalized="deviations"), **BOX)
+    problem = Problem(
+        Tracking([10.0, 1.0] * 3, [0.1] * 3, penalized="deviations"), **BOX
+    )
     controller = GPMPC(
-        quadrotor, Linearization(), problem, 5, HOVER, prediction=PredictionSettings(covariance="none"), iterations=30
+        quadrotor,
+        Linearization(),
+        problem,
+        5,
+        HOVER,
+        prediction=PredictionSettings(covariance="none"),
+        iterations=30,
     )
     began = perf_counter()
     timing = controller.control(Gaussian.certain(np.zeros(6)), reachable).timing
@@ -214,7 +298,9 @@ def test_the_parts_of_the_time_are_within_what_the_step_took(quadrotor, reachabl
 
 @pytest.mark.parametrize("start", ["reference", "hover"])
 @pytest.mark.parametrize("horizon", [10, 30, 60])
-def test_from_no_plan_at_all_few_programs_reach_a_kkt_point_at_any_horizon(quadrotor, horizon, start):
+def test_from_no_plan_at_all_few_programs_reach_a_kkt_point_at_any_horizon(
+    quadrotor, horizon, start
+):
     problem = Problem(Tracking([1.0] * 6, [1.0] * 3), **BOX)
     controller = GPMPC(
         quadrotor,
@@ -227,23 +313,42 @@ def test_from_no_plan_at_all_few_programs_reach_a_kkt_point_at_any_horizon(quadr
     )
     time = 0.5 * np.arange(horizon + 1)[:, None]
     references = np.hstack(
-        [part for axis in range(3) for part in (0.3 * np.sin(time + axis), 0.3 * np.cos(time + axis))]
+        [
+            part
+            for axis in range(3)
+            for part in (0.3 * np.sin(time + axis), 0.3 * np.cos(time + axis))
+        ]
     )
     belief, previous = Gaussian.certain(references[0]), None
     if start == "hover":
         zeros = np.zeros((horizon + 1, 6, 6))
-        plan = np.tile(HOVER, (horizon, 1)), np.tile(references[0], (horizon + 1, 1)), zeros
+        plan = (
+            np.tile(HOVER, (horizon, 1)),
+            np.tile(references[0], (horizon + 1, 1)),
+            zeros,
+        )
         previous = Decision(HOVER, *plan, Status.SOLVED, 1, Timing(0.0, 0.0, 0.0))
     decision = controller.control(belief, Reference(references), previous)
     assert decision.status is Status.SOLVED
-    residual = kkt_residual(quadrotor, problem, Instance(belief, Reference(references), HOVER), decision.inputs)
+    residual = kkt_residual(
+        quadrotor,
+        problem,
+        Instance(belief, Reference(references), HOVER),
+        decision.inputs,
+    )
     assert residual < 1e-5
 
 
 class Table:
     """A pendulum-like model that is known for |x_i| <= 6 only."""
 
-    state_dim, input_dim, output_dim, dtype, device = 2, 1, 2, torch.float64, torch.device("cpu")
+    state_dim, input_dim, output_dim, dtype, device = (
+        2,
+        1,
+        2,
+        torch.float64,
+        torch.device("cpu"),
+    )
     noise_covariance = torch.zeros(2, 2, dtype=torch.float64)
 
     def predict(self, state, input):
@@ -253,9 +358,18 @@ class Table:
         if (np.abs(states) > 6).any():
             raise DataError("beyond the table")
         x, v = states.T
-        mean = np.stack([x + 0.1 * v, v + 0.1 * (3 * np.sin(x) * v + inputs[:, 0])], axis=1)
-        A, B = np.tile(np.eye(2), (len(x), 1, 1)), np.tile([[0.0], [0.1]], (len(x), 1, 1))
-        A[:, 0, 1], A[:, 1, 0], A[:, 1, 1] = 0.1, 0.3 * np.cos(x) * v, 1 + 0.3 * np.sin(x)
+        mean = np.stack(
+            [x + 0.1 * v, v + 0.1 * (3 * np.sin(x) * v + inputs[:, 0])], axis=1
+        )
+        A, B = (
+            np.tile(np.eye(2), (len(x), 1, 1)),
+            np.tile([[0.0], [0.1]], (len(x), 1, 1)),
+        )
+        A[:, 0, 1], A[:, 1, 0], A[:, 1, 1] = (
+            0.1,
+            0.3 * np.cos(x) * v,
+            1 + 0.3 * np.sin(x),
+        )
         return Linearized(mean, A, B, np.zeros((len(x), 2, 2)) if covariance else None)
 
 
@@ -263,20 +377,39 @@ class Table:
 def test_a_step_that_leads_the_model_out_of_its_numbers_is_shortened(start):
     problem = Problem(Tracking([10.0, 0.1], [0.01]), inputs=Box([-20.0], [20.0]))
     controller = GPMPC(
-        Table(), Linearization(), problem, 20, [0.0], PredictionSettings(covariance="none"), iterations=15
+        Table(),
+        Linearization(),
+        problem,
+        20,
+        [0.0],
+        PredictionSettings(covariance="none"),
+        iterations=15,
     )
-    decision = controller.control(Gaussian.certain(np.array(start)), Reference(np.zeros((21, 2))))
+    decision = controller.control(
+        Gaussian.certain(np.array(start)), Reference(np.zeros((21, 2)))
+    )
     assert decision.applicable
     assert decision.iterations > 4
 
 
-def test_the_first_step_from_the_last_plan_needs_no_roll_out_and_ends_where_others_do(quadrotor, monkeypatch):
+def test_the_first_step_from_the_last_plan_needs_no_roll_out_and_ends_where_others_do(
+    quadrotor, monkeypatch
+):
     problem = Problem(Tracking([1.0] * 6, [1.0] * 3), **BOX)
     settings = PredictionSettings(covariance="none")
-    controller = GPMPC(quadrotor, Linearization(), problem, 10, HOVER, settings, iterations=20)
+    controller = GPMPC(
+        quadrotor, Linearization(), problem, 10, HOVER, settings, iterations=20
+    )
     roll_out, rolled = controller.prediction.roll_out, []
-    monkeypatch.setattr(controller.prediction, "roll_out", lambda *given: rolled.append(1) or roll_out(*given))
-    reference, moved = Reference(np.tile([0.5, 0.0] * 3, (11, 1))), Gaussian.certain(np.array([-0.3, 0.2] * 3))
+    monkeypatch.setattr(
+        controller.prediction,
+        "roll_out",
+        lambda *given: rolled.append(1) or roll_out(*given),
+    )
+    reference, moved = (
+        Reference(np.tile([0.5, 0.0] * 3, (11, 1))),
+        Gaussian.certain(np.array([-0.3, 0.2] * 3)),
+    )
     last = controller.control(Gaussian.certain(np.zeros(6)), reference)
     assert rolled
     rolled.clear()
@@ -290,15 +423,26 @@ def test_the_first_step_from_the_last_plan_needs_no_roll_out_and_ends_where_othe
 
 def test_inputs_that_lead_a_model_out_of_its_numbers_begin_a_plan_at_the_state():
     x, u = casadi.SX.sym("x"), casadi.SX.sym("u")
-    runaway = KnownModel(CasadiFunction(casadi.Function("f", [x, u], [x + 0.1 * (x**3 + u)])), 1, 1)
-    problem = Problem(Tracking([1.0], [1.0], penalized="inputs"), inputs=Box([-99.0], [99.0]))
+    runaway = KnownModel(
+        CasadiFunction(casadi.Function("f", [x, u], [x + 0.1 * (x**3 + u)])), 1, 1
+    )
+    problem = Problem(
+        Tracking([1.0], [1.0], penalized="inputs"), inputs=Box([-99.0], [99.0])
+    )
     settings = PredictionSettings(covariance="none")
-    controller = GPMPC(runaway, Linearization(), problem, 12, [0.0], settings, iterations=30)
+    controller = GPMPC(
+        runaway, Linearization(), problem, 12, [0.0], settings, iterations=30
+    )
     belief, reference = Gaussian.certain(np.array([0.5])), Reference(np.zeros((13, 1)))
     last = controller.control(belief, reference)
-    request = controller.prediction.read(belief, reference, last, plan=np.full((12, 1), 50.0))
+    request = controller.prediction.read(
+        belief, reference, last, plan=np.full((12, 1), 50.0)
+    )
     assert request.states is not None
-    assert controller.prediction.initial_guess(request).states.ravel().tolist() == [0.5] * 13
+    assert (
+        controller.prediction.initial_guess(request).states.ravel().tolist()
+        == [0.5] * 13
+    )
     decision = controller.control(belief, reference, last, plan=np.full((12, 1), 50.0))
     assert decision.status is Status.SOLVED
     assert np.allclose(decision.inputs, last.inputs, atol=1e-4)

@@ -24,11 +24,23 @@ def residual():
     points = 2 * torch.rand(12, 2, generator=generator, dtype=torch.float64) - 1
     one = torch.ones(1, dtype=torch.float64)
     gp = GPPosterior.from_hyperparameters(
-        points, torch.sin(3 * points[:, :1]), one * torch.tensor([[0.7, 0.9]]), one, 1e-3 * one, 1, "value"
+        points,
+        torch.sin(3 * points[:, :1]),
+        one * torch.tensor([[0.7, 0.9]]),
+        one,
+        1e-3 * one,
+        1,
+        "value",
     )
-    A, B, c = torch.tensor([[1.0, 0.2], [0.0, 0.9]]), torch.tensor([[0.0], [0.2]]), torch.tensor([0.0, 0.1])
+    A, B, c = (
+        torch.tensor([[1.0, 0.2], [0.0, 0.9]]),
+        torch.tensor([[0.0], [0.2]]),
+        torch.tensor([0.0, 0.1]),
+    )
     affine = Affine(*(part.double() for part in (A, B, c)))
-    return ResidualModel(affine, gp, torch.tensor([[0.1], [0.3]], dtype=torch.float64), [1], [0], 1)
+    return ResidualModel(
+        affine, gp, torch.tensor([[0.1], [0.3]], dtype=torch.float64), [1], [0], 1
+    )
 
 
 def stage_at(mode, propagator, model, belief, input, disturbance=None):
@@ -36,7 +48,12 @@ def stage_at(mode, propagator, model, belief, input, disturbance=None):
     linearizer = StageLinearizer(model, propagator, mode)
     covariances = belief.covariance.numpy()[None]
     s = linearizer.state(belief.mean.numpy()[None], covariances)
-    return s[0], Stages(*(part[0] for part in linearizer(s, input.numpy()[None], covariances, disturbance)))
+    return s[0], Stages(
+        *(
+            part[0]
+            for part in linearizer(s, input.numpy()[None], covariances, disturbance)
+        )
+    )
 
 
 @pytest.mark.parametrize("noise", [False, True])
@@ -48,15 +65,23 @@ def test_the_shortcut_gives_the_same_stage(model, noise):
         Gaussian(torch.tensor([0.3, -0.2], dtype=torch.float64), root @ root.mT),
         0.4 * torch.ones(1).double(),
     )
-    _, short = stage_at("zero_order", Linearization(process_noise=noise), model, belief, input)
-    _, long = stage_at("zero_order", ByDifferentiation(process_noise=noise), model, belief, input)
+    _, short = stage_at(
+        "zero_order", Linearization(process_noise=noise), model, belief, input
+    )
+    _, long = stage_at(
+        "zero_order", ByDifferentiation(process_noise=noise), model, belief, input
+    )
     for mine, theirs in zip(short, long, strict=True):
         assert np.allclose(mine, theirs, rtol=0, atol=1e-12)
 
 
 def test_a_model_may_give_views_and_other_types():
     model, rng = pendulum_posterior(), np.random.default_rng(0)
-    states, inputs, covariances = rng.normal(size=(5, 2)), rng.normal(size=(5, 1)), np.zeros((5, 2, 2))
+    states, inputs, covariances = (
+        rng.normal(size=(5, 2)),
+        rng.normal(size=(5, 1)),
+        np.zeros((5, 2, 2)),
+    )
 
     class Views:
         state_dim = model.state_dim
@@ -65,12 +90,21 @@ def test_a_model_may_give_views_and_other_types():
             mean, A, B, V = model.linearize(states, inputs, covariance)
             one = np.eye(2, dtype=int)
             return Linearized(
-                np.asfortranarray(mean), A.mT.copy().mT, np.asfortranarray(B), np.broadcast_to(one, V.shape)
+                np.asfortranarray(mean),
+                A.mT.copy().mT,
+                np.asfortranarray(B),
+                np.broadcast_to(one, V.shape),
             )
 
-    expected = StageLinearizer(model, Linearization(), "zero_order")(states, inputs, covariances)
-    found = StageLinearizer(Views(), Linearization(), "zero_order")(states, inputs, covariances)
-    for mine, theirs in zip(found, expected._replace(V=np.tile(np.eye(2), (5, 1, 1))), strict=True):
+    expected = StageLinearizer(model, Linearization(), "zero_order")(
+        states, inputs, covariances
+    )
+    found = StageLinearizer(Views(), Linearization(), "zero_order")(
+        states, inputs, covariances
+    )
+    for mine, theirs in zip(
+        found, expected._replace(V=np.tile(np.eye(2), (5, 1, 1))), strict=True
+    ):
         assert mine.flags.c_contiguous
         assert mine.dtype == float
         np.testing.assert_array_equal(mine, theirs)
@@ -79,7 +113,11 @@ def test_a_model_may_give_views_and_other_types():
 @pytest.mark.parametrize("mode", ["full", "diagonal", "zero_order", "none"])
 def test_stages_of_many_points_are_those_of_each(mode):
     model, rng = pendulum_posterior(), np.random.default_rng(0)
-    means, inputs, roots = rng.normal(size=(5, 2)), rng.normal(size=(5, 1)), 0.2 * rng.normal(size=(5, 2, 2))
+    means, inputs, roots = (
+        rng.normal(size=(5, 2)),
+        rng.normal(size=(5, 1)),
+        0.2 * rng.normal(size=(5, 2, 2)),
+    )
     covariances = roots @ roots.mT
     linearizer = StageLinearizer(model, MomentMatching(), mode)
     states = linearizer.state(means, covariances)
@@ -111,8 +149,14 @@ def belief_at(mode, s, covariance):
 
 
 @pytest.mark.parametrize("mode", ["full", "diagonal", "zero_order", "none"])
-@pytest.mark.parametrize("propagator", [MomentMatching(), Linearization(), Unscented()], ids=lambda p: type(p).__name__)
-def test_a_stage_is_the_derivative_of_its_own_map_and_goes_through_its_point(mode, propagator):
+@pytest.mark.parametrize(
+    "propagator",
+    [MomentMatching(), Linearization(), Unscented()],
+    ids=lambda p: type(p).__name__,
+)
+def test_a_stage_is_the_derivative_of_its_own_map_and_goes_through_its_point(
+    mode, propagator
+):
     model, input, h = pendulum_posterior(), torch.tensor([0.4]), 1e-6
     propagator = MeanEquivalence() if mode == "none" else propagator
     root = torch.tensor([[0.2, 0.05], [0.05, 0.3]])
@@ -123,7 +167,13 @@ def test_a_stage_is_the_derivative_of_its_own_map_and_goes_through_its_point(mod
         return extended(mode, propagator(model, belief_at(mode, s, root @ root), input))
 
     def by_differences(function, at):
-        return torch.stack([(function(at + h * e) - function(at - h * e)) / (2 * h) for e in torch.eye(len(at))], -1)
+        return torch.stack(
+            [
+                (function(at + h * e) - function(at - h * e)) / (2 * h)
+                for e in torch.eye(len(at))
+            ],
+            -1,
+        )
 
     A, (s_next, by_s, by_u) = (
         stage.A.copy(),
@@ -140,7 +190,9 @@ def test_a_stage_is_the_derivative_of_its_own_map_and_goes_through_its_point(mod
         A[:, 3] = A[:, 4] = (A[:, 3] + A[:, 4]) / 2
     assert np.allclose(A, by_s, atol=1e-6)
     assert np.allclose(stage.B, by_u, atol=1e-6)
-    assert np.allclose(stage.A @ s.numpy() + stage.B @ input.numpy() + stage.c, s_next, atol=1e-12)
+    assert np.allclose(
+        stage.A @ s.numpy() + stage.B @ input.numpy() + stage.c, s_next, atol=1e-12
+    )
     assert np.allclose(stage.next, s_next, atol=1e-14)
 
 
@@ -152,7 +204,9 @@ def test_what_a_stage_adds_is_what_does_not_pass_through():
     propagator = Linearization(process_noise=True)
     _, stage = stage_at("zero_order", propagator, model, belief, input)
     after = propagator(model, belief, input).covariance.numpy()
-    assert np.allclose(stage.A @ belief.covariance.numpy() @ stage.A.T + stage.V, after, atol=1e-14)
+    assert np.allclose(
+        stage.A @ belief.covariance.numpy() @ stage.A.T + stage.V, after, atol=1e-14
+    )
     certain = Gaussian.certain(belief.mean)
     own = model.predict(belief.mean, input).covariance.numpy()
     for propagator in (Linearization(), MomentMatching(), Unscented()):
@@ -164,7 +218,10 @@ def test_what_a_stage_adds_is_what_does_not_pass_through():
 def test_a_disturbance_moves_the_mean_and_nothing_else(mode):
     model, input = pendulum_posterior(), torch.tensor([0.4])
     propagator = MeanEquivalence() if mode == "none" else Linearization()
-    belief, pushed = Gaussian(torch.tensor([0.3, -0.2]), 0.04 * torch.eye(2)), np.array([0.1, -0.3])
+    belief, pushed = (
+        Gaussian(torch.tensor([0.3, -0.2]), 0.04 * torch.eye(2)),
+        np.array([0.1, -0.3]),
+    )
     _, before = stage_at(mode, propagator, model, belief, input)
     _, after = stage_at(mode, propagator, model, belief, input, pushed)
     for name in ("c", "next"):

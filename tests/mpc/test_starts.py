@@ -9,7 +9,17 @@ import pytest
 from gpmpc.exceptions import SettingError, ShapeError
 from gpmpc.gaussian import Gaussian
 from gpmpc.models import CasadiFunction, KnownModel
-from gpmpc.mpc import GPMPC, Box, ControlLoop, ManyStarts, PredictionSettings, Problem, Reference, Tracking, kicks
+from gpmpc.mpc import (
+    GPMPC,
+    Box,
+    ControlLoop,
+    ManyStarts,
+    PredictionSettings,
+    Problem,
+    Reference,
+    Tracking,
+    kicks,
+)
 from gpmpc.propagation import Linearization
 from gpmpc.status import Status
 from gpmpc.systems import cart_pole, double_pendulum, pendulum, step
@@ -18,7 +28,13 @@ from gpmpc.systems import cart_pole, double_pendulum, pendulum, step
 def known(system):
     n, m = len(system.state_names), len(system.input_names)
     x, u = casadi.SX.sym("x", n), casadi.SX.sym("u", m)
-    return KnownModel(CasadiFunction(casadi.Function("f", [x, u], [casadi.vertcat(*system.successor(x, u))])), n, m)
+    return KnownModel(
+        CasadiFunction(
+            casadi.Function("f", [x, u], [casadi.vertcat(*system.successor(x, u))])
+        ),
+        n,
+        m,
+    )
 
 
 def controller(system, Q, R, horizon, iterations=1, rolled_out=True, **bounds):
@@ -29,7 +45,14 @@ def controller(system, Q, R, horizon, iterations=1, rolled_out=True, **bounds):
     )
     settings = PredictionSettings(covariance="none", rolled_out=rolled_out)
     start = problem, horizon, system.initial_input
-    return GPMPC(known(system), Linearization(), *start, settings, iterations=iterations, tolerance=1e-2)
+    return GPMPC(
+        known(system),
+        Linearization(),
+        *start,
+        settings,
+        iterations=iterations,
+        tolerance=1e-2,
+    )
 
 
 def pendulums(iterations=15, **settings):
@@ -48,7 +71,10 @@ def test_many_starts_swing_a_cart_pole_up_and_follow_their_plan_from_then_on():
         state = step(system, state, decision.input)
     assert searched[0]
     assert not any(searched[1:])
-    assert np.abs(state - [0, 0, 2 * np.pi * np.round(state[2] / (2 * np.pi)), 0]).max() < 0.15
+    assert (
+        np.abs(state - [0, 0, 2 * np.pi * np.round(state[2] / (2 * np.pi)), 0]).max()
+        < 0.15
+    )
 
 
 def test_the_search_is_never_worse_than_any_of_its_starts():
@@ -63,14 +89,21 @@ def test_the_search_is_never_worse_than_any_of_its_starts():
         alone = one.control(state, reference)
         goal = min(goals, key=lambda goal: abs(goal - alone.means[-1, 0]))
         if alone.applicable:
-            assert best <= one.criterion(alone, Reference(np.tile([goal, 0.0], (31, 1)))) + 1e-9
+            assert (
+                best
+                <= one.criterion(alone, Reference(np.tile([goal, 0.0], (31, 1)))) + 1e-9
+            )
 
 
 def test_the_plan_obeys_the_dynamics_and_may_end_a_full_turn_away():
     system = pendulum()
-    found = pendulums().control(Gaussian.certain(np.array([5.5, 2.0])), Reference(np.zeros(2)))
+    found = pendulums().control(
+        Gaussian.certain(np.array([5.5, 2.0])), Reference(np.zeros(2))
+    )
     for k, u in enumerate(found.inputs):
-        assert np.allclose(found.means[k + 1], step(system, found.means[k], u), rtol=1e-7, atol=1e-9)
+        assert np.allclose(
+            found.means[k + 1], step(system, found.means[k], u), rtol=1e-7, atol=1e-9
+        )
     assert found.means[-1, 0] == pytest.approx(2 * np.pi, abs=0.3)
 
 
@@ -78,12 +111,19 @@ def test_a_sensor_that_takes_a_turn_off_changes_nothing():
     many, reference = pendulums(), Reference(np.zeros(2))
     first = many.control(Gaussian.certain(np.array([5.5, 2.0])), reference)
     states = [first.means[1] - turn for turn in ([0.0, 0.0], [2 * np.pi, 0.0])]
-    inputs = [many.control(Gaussian.certain(state), reference, first).inputs for state in states]
+    inputs = [
+        many.control(Gaussian.certain(state), reference, first).inputs
+        for state in states
+    ]
     assert np.allclose(*inputs, rtol=1e-6, atol=1e-6)
 
 
 def test_the_users_criterion_chooses_and_a_spent_budget_ends_the_search():
-    state, reference, seen = Gaussian.certain(np.array([np.pi, 0.0])), Reference(np.zeros(2)), []
+    state, reference, seen = (
+        Gaussian.certain(np.array([np.pi, 0.0])),
+        Reference(np.zeros(2)),
+        [],
+    )
 
     def to_the_right(decision, goal):
         seen.append(goal.states[-1, 0])
@@ -94,7 +134,11 @@ def test_the_users_criterion_chooses_and_a_spent_budget_ends_the_search():
     assert len(seen) > 4
     assert {0.0, 6.283185} == set(np.round(seen, 6).tolist())
     seen.clear()
-    assert pendulums(criterion=to_the_right, budget=1e-9).control(state, reference).applicable
+    assert (
+        pendulums(criterion=to_the_right, budget=1e-9)
+        .control(state, reference)
+        .applicable
+    )
     assert len(seen) == 1
 
 
@@ -106,7 +150,9 @@ def test_a_plan_above_the_limit_is_given_up_for_a_better_one():
 
 
 def test_a_measurement_that_is_not_finite_is_said_so_and_misuse_is_refused():
-    bad = pendulums().control(Gaussian.certain(np.array([np.nan, 0.0])), Reference(np.zeros(2)))
+    bad = pendulums().control(
+        Gaussian.certain(np.array([np.nan, 0.0])), Reference(np.zeros(2))
+    )
     assert bad.status is Status.INVALID_MEASUREMENT
     with pytest.raises(ShapeError, match="guesses must be None or inputs"):
         pendulums(guesses=[np.zeros((3, 1))])
@@ -114,17 +160,34 @@ def test_a_measurement_that_is_not_finite_is_said_so_and_misuse_is_refused():
         pendulums(turns=(2, 2))
     one = controller(pendulum(), [1.0, 0.01], [0.01], 30)
     with pytest.raises(ShapeError, match="a plan must be inputs"):
-        one.control(Gaussian.certain(np.zeros(2)), Reference(np.zeros(2)), plan=(np.zeros((2, 1)), np.zeros((3, 2))))
+        one.control(
+            Gaussian.certain(np.zeros(2)),
+            Reference(np.zeros(2)),
+            plan=(np.zeros((2, 1)), np.zeros((3, 2))),
+        )
 
 
 def test_goals_are_the_nearest_turns_of_each_angle_seen_from_the_end_of_the_reference():
-    many = ManyStarts(controller(double_pendulum("elbow"), [10.0, 0.1, 10.0, 0.1], [0.01], 3), turns=(2, 3))
+    many = ManyStarts(
+        controller(double_pendulum("elbow"), [10.0, 0.1, 10.0, 0.1], [0.01], 3),
+        turns=(2, 3),
+    )
     angle = np.array([[0.0, 3.0, 7.0, 10.0], [5.0, 4.0, 2.0, -9.0]])
-    reference = Reference(np.stack([angle[0], np.full(4, 0.5), angle[1], np.full(4, -0.5)], axis=1))
+    reference = Reference(
+        np.stack([angle[0], np.full(4, 0.5), angle[1], np.full(4, -0.5)], axis=1)
+    )
     state = np.array([3.0, 8.0, 1.0, -8.0])
     off = state[[0, 2]] - angle[:, -1]
-    around = [sorted(range(-9, 9), key=lambda k, a=a: abs(off[a] - 2 * np.pi * k))[: (2, 3)[a]] for a in range(2)]
-    expected = sorted(product(*around), key=lambda turns: np.abs(off - 2 * np.pi * np.array(turns)).sum())
+    around = [
+        sorted(range(-9, 9), key=lambda k, a=a: abs(off[a] - 2 * np.pi * k))[
+            : (2, 3)[a]
+        ]
+        for a in range(2)
+    ]
+    expected = sorted(
+        product(*around),
+        key=lambda turns: np.abs(off - 2 * np.pi * np.array(turns)).sum(),
+    )
     goals = list(many._goals(state, reference))
     assert len(goals) == 6
     for goal, turns in zip(goals, expected, strict=True):
@@ -135,20 +198,31 @@ def test_goals_are_the_nearest_turns_of_each_angle_seen_from_the_end_of_the_refe
 def test_a_guess_is_a_line_to_the_goal_or_what_its_inputs_lead_to():
     system, H = pendulum(), 4
     inputs = np.array([[0.5], [-0.5], [1.0], [0.0]])
-    many = ManyStarts(controller(system, [1.0, 0.01], [0.01], H), guesses=[None, inputs, 1e308 * inputs], turns=2)
-    state, targets = np.array([0.3, -0.2]), np.stack([np.linspace(0.0, 1.0, 5), np.ones(5)], axis=1)
+    many = ManyStarts(
+        controller(system, [1.0, 0.01], [0.01], H),
+        guesses=[None, inputs, 1e308 * inputs],
+        turns=2,
+    )
+    state, targets = (
+        np.array([0.3, -0.2]),
+        np.stack([np.linspace(0.0, 1.0, 5), np.ones(5)], axis=1),
+    )
     found = list(many._candidates(state, Reference(targets)))
     assert len(found) == 6  # guess by guess, two goals each
     for goal, (given, states) in found[:2]:
         assert np.allclose(states[0], state)
         assert np.allclose(states[-1], goal.states[-1])
         for k in range(H + 1):
-            assert np.allclose(states[k], goal.states[k] + (1 - k / H) * (state - goal.states[0]))
+            assert np.allclose(
+                states[k], goal.states[k] + (1 - k / H) * (state - goal.states[0])
+            )
         assert np.array_equal(given, np.tile(system.initial_input, (H, 1)))
     for _, (given, states) in found[2:4]:
         assert given is inputs
         for k in range(H):
-            assert np.allclose(states[k + 1], step(system, states[k], given[k]), rtol=1e-7, atol=1e-9)
+            assert np.allclose(
+                states[k + 1], step(system, states[k], given[k]), rtol=1e-7, atol=1e-9
+            )
         assert np.array_equal(states[0], state)
     for _, (_, states) in found[4:]:  # which leads nowhere
         assert np.array_equal(states, np.tile(state, (H + 1, 1)))
@@ -157,31 +231,55 @@ def test_a_guess_is_a_line_to_the_goal_or_what_its_inputs_lead_to():
 def test_what_cannot_be_searched_is_refused():
     one = controller(pendulum(), [1.0, 0.01], [0.01], 30)
     for settings, message in (
-        ({"turns": 0}, "turns: must be whole numbers from 1 on, one for each of 1 angles"),
+        (
+            {"turns": 0},
+            "turns: must be whole numbers from 1 on, one for each of 1 angles",
+        ),
         ({"turns": [1, 0]}, "turns: must be whole numbers"),
         ({"budget": 0.0}, "budget: must be a number above 0"),
     ):
         with pytest.raises(SettingError, match=message):
             ManyStarts(one, **settings)
     settings = PredictionSettings("velocity", "none")
-    paper = GPMPC(one.prediction.model, Linearization(), one.problem, 30, one.initial_input, settings)
+    paper = GPMPC(
+        one.prediction.model,
+        Linearization(),
+        one.problem,
+        30,
+        one.initial_input,
+        settings,
+    )
     for parts in ((paper,), (one, paper)):
-        with pytest.raises(SettingError, match="controller: must be of form 'trajectory'"):
+        with pytest.raises(
+            SettingError, match="controller: must be of form 'trajectory'"
+        ):
             ManyStarts(*parts)
     bare = ManyStarts(one)
-    assert (bare.planner, bare.limit, bare.budget, bare.turns) == (one, np.inf, None, [2])
+    assert (bare.planner, bare.limit, bare.budget, bare.turns) == (
+        one,
+        np.inf,
+        None,
+        [2],
+    )
     assert (bare.horizon, bare.problem) == (30, one.problem)
 
 
 def test_kicks_push_every_input_to_both_sides_within_its_bounds():
-    problem = Problem(Tracking([1.0], [1.0, 1.0], penalized="inputs"), inputs=Box([0.0, -1.0], [2.0, np.inf]))
+    problem = Problem(
+        Tracking([1.0], [1.0, 1.0], penalized="inputs"),
+        inputs=Box([0.0, -1.0], [2.0, np.inf]),
+    )
     found = kicks(problem, 12, np.array([0.5, 0.0]))
     assert [inputs[0, 0] for inputs in found] == [0.5, 1.25, 0.25]
     assert all((inputs[:, 0] >= 0).all() and not inputs[:, 1].any() for inputs in found)
     assert [inputs[:6, 0].tolist() for inputs in found[1:]] == [
         [1.25, 1.25, 0.25, 0.25, 0.5, 0.5], [0.25, 0.25, 1.25, 1.25, 0.5, 0.5],
     ]  # fmt: skip
-    assert kicks(problem, 3, np.array([0.5, 0.0]), share=1.0)[1][:, 0].tolist() == [2.0, 0.0, 0.5]
+    assert kicks(problem, 3, np.array([0.5, 0.0]), share=1.0)[1][:, 0].tolist() == [
+        2.0,
+        0.0,
+        0.5,
+    ]
 
 
 @pytest.mark.parametrize("starts", [3, pytest.param(20, marks=pytest.mark.slow)])
@@ -193,14 +291,24 @@ def test_no_solve_of_a_double_pendulum_from_a_wild_start_breaks_down(starts):
         one = controller(system, [10.0, 0.1, 10.0, 0.1], [0.01], 60, 20)
         many = ManyStarts(one, turns=(2, 3))
         for _ in range(starts):
-            state = np.array([rng.uniform(-np.pi, np.pi), rng.uniform(-15, 15), rng.uniform(-np.pi, np.pi), 0.0])
+            state = np.array(
+                [
+                    rng.uniform(-np.pi, np.pi),
+                    rng.uniform(-15, 15),
+                    rng.uniform(-np.pi, np.pi),
+                    0.0,
+                ]
+            )
             state[3] = rng.uniform(-15, 15)
-            for goal, guess in list(many._candidates(state, Reference(np.zeros(4)).over(60)))[
-                :: 1 if starts > 3 else 5
-            ]:
+            for goal, guess in list(
+                many._candidates(state, Reference(np.zeros(4)).over(60))
+            )[:: 1 if starts > 3 else 5]:
                 found = one.control(Gaussian.certain(state), goal, plan=guess)
                 count += 1
-                assert found.status in (Status.SOLVED, Status.ITERATION_LIMIT) or found.suboptimal, found.status
+                assert (
+                    found.status in (Status.SOLVED, Status.ITERATION_LIMIT)
+                    or found.suboptimal
+                ), found.status
                 assert np.isfinite(found.inputs).all()
                 assert np.isfinite(found.means).all()
                 assert np.abs(found.inputs).max() <= 6.0 + 1e-9
@@ -232,7 +340,9 @@ def test_between_decisions_the_plan_is_followed_under_its_feedback():
 
 
 def test_a_plan_that_cannot_be_improved_is_searched_for_anew():
-    walls = [Box([-9.0, -9.0], [-8.0, 9.0], penalty=None)]  # far from the state: no program of this controller succeeds
+    walls = [
+        Box([-9.0, -9.0], [-8.0, 9.0], penalty=None)
+    ]  # far from the state: no program of this controller succeeds
     parts = pendulum(), [1.0, 0.01], [0.01], 30
     many = ManyStarts(controller(*parts, constraints=walls), controller(*parts, 15))
     state, reference = Gaussian.certain(np.array([1.0, 0.0])), Reference(np.zeros(2))
@@ -241,10 +351,16 @@ def test_a_plan_that_cannot_be_improved_is_searched_for_anew():
 
 
 def test_plans_are_made_start_by_start_from_any_start_on():
-    many, question = pendulums(3), (Gaussian.certain(np.array([np.pi, 0.3])), Reference(np.zeros(2)))
+    many, question = (
+        pendulums(3),
+        (Gaussian.certain(np.array([np.pi, 0.3])), Reference(np.zeros(2))),
+    )
     every = list(many.plans(*question))
     assert len(every) == len(many)
     later = list(many.plans(*question, first=2))
     assert len({tuple(plan.inputs[:, 0]) for plan, _ in every}) > 2
     assert [value for _, value in later] == [value for _, value in every[2:]]
-    assert all(np.array_equal(a.inputs, b.inputs) for (a, _), (b, _) in zip(later, every[2:], strict=True))
+    assert all(
+        np.array_equal(a.inputs, b.inputs)
+        for (a, _), (b, _) in zip(later, every[2:], strict=True)
+    )

@@ -26,15 +26,24 @@ REFERENCE = Reference(np.zeros((H + 1, 6)), np.tile(HOVER, (H, 1)))
 
 def problem(penalized="deviations", lower=-0.3, penalty=None):
     return Problem(
-        Tracking([10.0, 1.0] * 3, [0.1, 1.0, 1.0], terminal=[20.0, 1.0] * 3, penalized=penalized),
+        Tracking(
+            [10.0, 1.0] * 3,
+            [0.1, 1.0, 1.0],
+            terminal=[20.0, 1.0] * 3,
+            penalized=penalized,
+        ),
         inputs=Box([4.0, -0.4, -0.4], [10.5, 0.4, 0.4]),
         input_rates=Box([-2.0, -0.3, -0.3], [2.0, 0.3, 0.3]),
-        constraints=[Box([-np.inf, lower] * 3, [2.0, 0.9] * 3, probability=0.75, penalty=penalty)],
+        constraints=[
+            Box([-np.inf, lower] * 3, [2.0, 0.9] * 3, probability=0.75, penalty=penalty)
+        ],
     )
 
 
 @pytest.mark.parametrize(("form", "covariance"), list(product(FORMS, COVARIANCES)))
-@pytest.mark.parametrize("prices", [{}, {"lower": -0.05, "penalty": 3.0}], ids=["hard", "soft"])
+@pytest.mark.parametrize(
+    "prices", [{}, {"lower": -0.05, "penalty": 3.0}], ids=["hard", "soft"]
+)
 def test_it_gives_the_inputs_of_the_condensed_program(form, covariance, prices):
     moves = MeanEquivalence() if covariance == "none" else Linearization()
     arguments = (
@@ -50,7 +59,9 @@ def test_it_gives_the_inputs_of_the_condensed_program(form, covariance, prices):
         controllers.append(GPMPC(*arguments, CvxpySolver()))
     state, last, worked = np.array([0.8, 0.2, -0.4, 0.1, 0.3, 0.0]), None, 0
     for _ in range(3):
-        decisions = [c.control(Gaussian.certain(state), REFERENCE, last) for c in controllers]
+        decisions = [
+            c.control(Gaussian.certain(state), REFERENCE, last) for c in controllers
+        ]
         assert [d.status for d in decisions] == [Status.SOLVED] * len(decisions)
         for other in decisions[1:]:
             assert np.allclose(other.inputs, decisions[0].inputs, rtol=0, atol=1e-6)
@@ -62,30 +73,61 @@ def test_it_gives_the_inputs_of_the_condensed_program(form, covariance, prices):
 
 
 def test_a_constraint_of_ones_own_takes_one_line():
-    arguments = quadrotor_gp(), MeanEquivalence(), problem(), H, HOVER, PredictionSettings(covariance="none")
+    arguments = (
+        quadrotor_gp(),
+        MeanEquivalence(),
+        problem(),
+        H,
+        HOVER,
+        PredictionSettings(covariance="none"),
+    )
     belief = Gaussian.certain(np.array([0.5, 0.0, 0.5, 0.0, 0.0, 0.0]))
     free = StateFormMPC(*arguments).control(belief, REFERENCE)
-    bound = StateFormMPC(*arguments, constraints=lambda s, u: [s[1:, 0] + s[1:, 2] >= 0.8]).control(belief, REFERENCE)
+    bound = StateFormMPC(
+        *arguments, constraints=lambda s, u: [s[1:, 0] + s[1:, 2] >= 0.8]
+    ).control(belief, REFERENCE)
     assert (free.means[1:, 0] + free.means[1:, 2]).min() < 0.7
-    assert (bound.means[1:, 0] + bound.means[1:, 2]).min() == pytest.approx(0.8, abs=1e-7)
+    assert (bound.means[1:, 0] + bound.means[1:, 2]).min() == pytest.approx(
+        0.8, abs=1e-7
+    )
 
 
 def test_a_constraint_that_is_not_convex_is_refused():
     with pytest.raises(SettingError, match="constraints: must be convex"):
         StateFormMPC(
-            quadrotor_gp(), MeanEquivalence(), problem(), H, HOVER, constraints=lambda s, u: [s[1:, 0] ** 2 >= 0.1]
+            quadrotor_gp(),
+            MeanEquivalence(),
+            problem(),
+            H,
+            HOVER,
+            constraints=lambda s, u: [s[1:, 0] ** 2 >= 0.1],
         )
 
 
 def test_what_cannot_be_solved_is_reported():
-    arguments = quadrotor_gp(), MeanEquivalence(), problem(), H, HOVER, PredictionSettings(covariance="none")
+    arguments = (
+        quadrotor_gp(),
+        MeanEquivalence(),
+        problem(),
+        H,
+        HOVER,
+        PredictionSettings(covariance="none"),
+    )
     controller = StateFormMPC(*arguments, constraints=lambda s, u: [u[0, 0] >= 100.0])
-    assert controller.control(Gaussian.certain(np.zeros(6)), REFERENCE).status is Status.INFEASIBLE
-    assert controller.control(Gaussian.certain(np.full(6, np.nan)), REFERENCE).status is Status.INVALID_MEASUREMENT
+    assert (
+        controller.control(Gaussian.certain(np.zeros(6)), REFERENCE).status
+        is Status.INFEASIBLE
+    )
+    assert (
+        controller.control(Gaussian.certain(np.full(6, np.nan)), REFERENCE).status
+        is Status.INVALID_MEASUREMENT
+    )
 
 
 def test_importing_the_controllers_does_not_load_cvxpy():
     modules = "gpmpc.mpc, gpmpc.mpc.gp_mpc, gpmpc.mpc.baselines"
     code = f"import sys, {modules}; print([m for m in ('cvxpy', 'hydra', 'matplotlib') if m in sys.modules])"
-    loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.strip()
+    loaded = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    ).stdout.strip()
     assert loaded == "[]"

@@ -20,33 +20,63 @@ from gpmpc.status import Status
 from tests.mpc.systems import HOVER, QUADROTOR, quadrotor_gp
 
 GP, H, STEPS = quadrotor_gp(60), 12, 20
-LOWER, UPPER, RATE = np.array([3.0, -0.5, -0.5]), np.array([12.0, 0.5, 0.5]), np.array([2.0, 0.3, 0.3])
-PROBLEM = Problem(Tracking([10.0, 1.0] * 3, [0.1] * 3), inputs=Box(LOWER, UPPER), input_rates=Box(-RATE, RATE))
+LOWER, UPPER, RATE = (
+    np.array([3.0, -0.5, -0.5]),
+    np.array([12.0, 0.5, 0.5]),
+    np.array([2.0, 0.3, 0.3]),
+)
+PROBLEM = Problem(
+    Tracking([10.0, 1.0] * 3, [0.1] * 3),
+    inputs=Box(LOWER, UPPER),
+    input_rates=Box(-RATE, RATE),
+)
 REFERENCES = Reference(np.zeros((STEPS + H, 6)), np.tile(HOVER, (STEPS + H - 1, 1)))
 START = np.array([0.9, 0.0, -0.8, 0.2, 0.7, 0.0])
 
 
 def convex(problem=PROBLEM, covariance="zero_order", **settings):
-    return GPMPC(GP, Linearization(), problem, H, HOVER, PredictionSettings(covariance=covariance), **settings)
+    return GPMPC(
+        GP,
+        Linearization(),
+        problem,
+        H,
+        HOVER,
+        PredictionSettings(covariance=covariance),
+        **settings,
+    )
 
 
 def nmpc(monkeypatch):
     build = casadi.nlpsol
     with monkeypatch.context() as patch:
-        few = lambda *known: build(*known[:-1], known[-1] | {"ipopt": known[-1]["ipopt"] | {"max_iter": 11}})  # noqa: E731
-        patch.setattr(casadi, "nlpsol", few)
+
+        def stopped_after_11(name, plugin, program, options):
+            limited = options["ipopt"] | {"max_iter": 11}
+            return build(name, plugin, program, options | {"ipopt": limited})
+
+        patch.setattr(casadi, "nlpsol", stopped_after_11)
         return NMPC(QUADROTOR, PROBLEM, H, HOVER)
 
 
 STOPPED = {
     "two programs": lambda _: convex(iterations=2, tolerance=1e-12),
     "five programs": lambda _: convex(iterations=5, tolerance=1e-12),
-    "two, of the whole belief": lambda _: convex(iterations=2, tolerance=1e-12, covariance="diagonal"),
-    "two, of another solver": lambda _: convex(iterations=2, tolerance=1e-12, solver=PrimalActiveSet()),
+    "two, of the whole belief": lambda _: convex(
+        iterations=2, tolerance=1e-12, covariance="diagonal"
+    ),
+    "two, of another solver": lambda _: convex(
+        iterations=2, tolerance=1e-12, solver=PrimalActiveSet()
+    ),
     "a primal solver": lambda _: convex(solver=PrimalActiveSet(iteration_limit=3)),
-    "a state form": lambda _: StateFormMPC(GP, Linearization(), PROBLEM, H, HOVER, options={"max_iter": 3}),
-    "nonlinear": lambda _: NonlinearGPMPC(GP, Linearization(), PROBLEM, H, HOVER, iterations=3, tolerance=1e-9),
-    "slsqp": lambda _: SLSQP(GP, Linearization(), PROBLEM, 4, HOVER, iterations=3, tolerance=1e-9),
+    "a state form": lambda _: StateFormMPC(
+        GP, Linearization(), PROBLEM, H, HOVER, options={"max_iter": 3}
+    ),
+    "nonlinear": lambda _: NonlinearGPMPC(
+        GP, Linearization(), PROBLEM, H, HOVER, iterations=3, tolerance=1e-9
+    ),
+    "slsqp": lambda _: SLSQP(
+        GP, Linearization(), PROBLEM, 4, HOVER, iterations=3, tolerance=1e-9
+    ),
     "nmpc": nmpc,
 }
 
@@ -54,16 +84,27 @@ STOPPED = {
 @pytest.mark.parametrize("kind", STOPPED)
 def test_a_vehicle_comes_home_with_plans_that_were_not_optimal_yet(kind, monkeypatch):
     controller = STOPPED[kind](monkeypatch)
-    references = REFERENCES if controller.horizon == H else Reference(REFERENCES.states[:-8], REFERENCES.inputs[:-8])
-    flight = closed_loop(QUADROTOR, controller, references, START, STEPS, on_failure="raise")
+    references = (
+        REFERENCES
+        if controller.horizon == H
+        else Reference(REFERENCES.states[:-8], REFERENCES.inputs[:-8])
+    )
+    flight = closed_loop(
+        QUADROTOR, controller, references, START, STEPS, on_failure="raise"
+    )
     assert flight.failures == ()
     assert flight.suboptimal
-    assert {flight.statuses[k] for k in flight.suboptimal} <= {Status.ITERATION_LIMIT, Status.NUMERICAL_TROUBLE}
+    assert {flight.statuses[k] for k in flight.suboptimal} <= {
+        Status.ITERATION_LIMIT,
+        Status.NUMERICAL_TROUBLE,
+    }
     assert np.isfinite(flight.predicted_means).all()
     assert np.abs(flight.states[-1]).max() < 0.1
     assert (flight.inputs >= LOWER).all()
     assert (flight.inputs <= UPPER).all()
-    assert (np.abs(np.diff(np.vstack([HOVER, flight.inputs]), axis=0)) <= RATE + 1e-12).all()
+    assert (
+        np.abs(np.diff(np.vstack([HOVER, flight.inputs]), axis=0)) <= RATE + 1e-12
+    ).all()
 
 
 @pytest.mark.parametrize("limit", [2, 4, 8])
@@ -74,11 +115,16 @@ def test_the_plan_at_a_limit_is_the_best_that_the_iteration_got_to(limit):
         x, before, total = torch.tensor(START), HOVER, 0.0
         for u in plan:
             x = GP.predict(x, torch.tensor(u)).mean
-            total += x.numpy() @ PROBLEM.cost.Q @ x.numpy() + (u - before) @ PROBLEM.cost.R @ (u - before)
+            total += x.numpy() @ PROBLEM.cost.Q @ x.numpy() + (
+                u - before
+            ) @ PROBLEM.cost.R @ (u - before)
             before = u
         return float(total)
 
-    at, reference = Gaussian.certain(START), Reference(REFERENCES.states[: H + 1], REFERENCES.inputs[:H])
+    at, reference = (
+        Gaussian.certain(START),
+        Reference(REFERENCES.states[: H + 1], REFERENCES.inputs[:H]),
+    )
 
     def cost(count):
         controller = convex(covariance="none", iterations=count, tolerance=1e-14)
@@ -107,7 +153,13 @@ def test_a_plan_that_breaks_a_hard_bound_is_not_applied():
 
 
 def test_a_solver_that_stopped_outside_of_the_bounds_has_no_plan():
-    controller = convex(replace(PROBLEM, input_rates=Box(-RATE, 0.1 * RATE)), solver=DualActiveSet(iteration_limit=1))
-    decision = controller.control(Gaussian.certain(START), Reference(REFERENCES.states[: H + 1], REFERENCES.inputs[:H]))
+    controller = convex(
+        replace(PROBLEM, input_rates=Box(-RATE, 0.1 * RATE)),
+        solver=DualActiveSet(iteration_limit=1),
+    )
+    decision = controller.control(
+        Gaussian.certain(START),
+        Reference(REFERENCES.states[: H + 1], REFERENCES.inputs[:H]),
+    )
     assert decision.status is Status.ITERATION_LIMIT
     assert not decision.applicable

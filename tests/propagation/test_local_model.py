@@ -41,11 +41,15 @@ def test_the_local_model_is_the_derivative_of_the_step(name, make):
     assert torch.allclose(local(s, u), F(propagator, model, s, u), atol=1e-10)
     for j in range(m):
         du = step * torch.eye(m)[j]
-        numeric = (F(propagator, model, s, u + du) - F(propagator, model, s, u - du)) / (2 * step)
+        numeric = (
+            F(propagator, model, s, u + du) - F(propagator, model, s, u - du)
+        ) / (2 * step)
         assert torch.allclose(local.B[:, j], numeric, atol=1e-6)
     for j in range(n + n * n):
         ds = step * torch.eye(n + n * n)[j]
-        numeric = (F(propagator, model, s + ds, u) - F(propagator, model, s - ds, u)) / (2 * step)
+        numeric = (
+            F(propagator, model, s + ds, u) - F(propagator, model, s - ds, u)
+        ) / (2 * step)
         assert torch.allclose(local.A[:, j], numeric, atol=1e-6)
 
 
@@ -69,10 +73,16 @@ def test_a_plan_of_stages_is_the_loop_over_them(name):
     covariances = torch.stack([belief(scale=0.2 * k).covariance for k in range(H)])
     together = linearize(propagator, model, Gaussian(means, covariances), inputs)
     for k in range(H):
-        alone = linearize(propagator, model, Gaussian(means[k], covariances[k]), inputs[k])
+        alone = linearize(
+            propagator, model, Gaussian(means[k], covariances[k]), inputs[k]
+        )
         for part in ("A", "B", "c"):
-            assert torch.allclose(getattr(together, part)[k], getattr(alone, part), atol=1e-9)
-        assert torch.allclose(together.next.covariance[k], alone.next.covariance, atol=1e-12)
+            assert torch.allclose(
+                getattr(together, part)[k], getattr(alone, part), atol=1e-9
+            )
+        assert torch.allclose(
+            together.next.covariance[k], alone.next.covariance, atol=1e-12
+        )
 
 
 @pytest.mark.parametrize("name", ALL)
@@ -88,9 +98,15 @@ def test_linearising_along_inputs_follows_the_rollout(name):
     assert torch.allclose(local.next.mean, beliefs.mean, atol=1e-12)
     assert torch.allclose(local.next.covariance, beliefs.covariance, atol=1e-12)
     s = extended_state(at)
-    for k in range(5):  # the chain of local models reproduces the beliefs it was made along
-        s = (local.A[:, k] @ s[..., None] + local.B[:, k] @ inputs[:, k, :, None])[..., 0] + local.c[:, k]
-        expected = extended_state(Gaussian(beliefs.mean[:, k], beliefs.covariance[:, k]))
+    for k in range(
+        5
+    ):  # the chain of local models reproduces the beliefs it was made along
+        s = (local.A[:, k] @ s[..., None] + local.B[:, k] @ inputs[:, k, :, None])[
+            ..., 0
+        ] + local.c[:, k]
+        expected = extended_state(
+            Gaussian(beliefs.mean[:, k], beliefs.covariance[:, k])
+        )
         assert torch.allclose(s, expected, atol=1e-9)
 
 
@@ -104,7 +120,10 @@ def test_an_autonomous_model_needs_no_input(name):
 
 def test_inputs_without_a_horizon_are_refused():
     for inputs in (torch.zeros(1), torch.zeros(0, 1)):
-        with pytest.raises(ShapeError, match=r"inputs must be \(\*batch, H, m\) with H of 1 or more; got"):
+        with pytest.raises(
+            ShapeError,
+            match=r"inputs must be \(\*batch, H, m\) with H of 1 or more; got",
+        ):
             rollout(MomentMatching(), gp(), belief(), inputs)
     with pytest.raises(SettingError, match="inputs: must be a torch tensor; got list"):
         rollout(MomentMatching(), gp(), belief(), [[0.1]])
@@ -130,14 +149,21 @@ def test_the_derivative_of_the_root_agrees_with_finite_differences(eigenvalues):
     change = torch.randn(3, 3)
     change, step = change + change.T, 1e-3 * min(eigenvalues)
     _, derivative = torch.func.jvp(square_root, (S,), (change,))
-    numeric = (square_root(S + step * change) - square_root(S - step * change)) / (2 * step)
+    numeric = (square_root(S + step * change) - square_root(S - step * change)) / (
+        2 * step
+    )
     assert torch.allclose(derivative, numeric, rtol=1e-4, atol=1e-4)
     by_reverse = (torch.func.jacrev(square_root)(S) * change).sum((-2, -1))
     assert torch.allclose(by_reverse, derivative, atol=1e-9 / min(eigenvalues) ** 0.5)
 
 
-@pytest.mark.parametrize("eigenvalues", [(0.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, 2.0, 2.0), (-1e-17, 1.0, 1.0)])
-def test_where_the_root_has_no_derivative_it_is_finite_and_zero_in_the_null_space(eigenvalues):
+@pytest.mark.parametrize(
+    "eigenvalues",
+    [(0.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, 2.0, 2.0), (-1e-17, 1.0, 1.0)],
+)
+def test_where_the_root_has_no_derivative_it_is_finite_and_zero_in_the_null_space(
+    eigenvalues,
+):
     U = torch.linalg.qr(torch.randn(3, 3)).Q
     S = U @ torch.diag(torch.tensor(eigenvalues)) @ U.T
     S = (S + S.T) / 2 if any(eigenvalues) else torch.zeros(3, 3)

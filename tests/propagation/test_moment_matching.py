@@ -11,14 +11,22 @@ from gpmpc.propagation import MomentMatching
 from gpmpc.propagation._moments import moments
 
 
-def model(size=20, n=2, m=1, noise=1e-3, lengthscale=1.0, predicts="next_state", seed=0):
+def model(
+    size=20, n=2, m=1, noise=1e-3, lengthscale=1.0, predicts="next_state", seed=0
+):
     generator = torch.Generator().manual_seed(seed)
 
     def draw(*shape):
         return torch.rand(*shape, generator=generator)
 
     inputs = 4 * draw(size, n + m) - 2
-    targets = torch.stack([torch.sin(inputs[:, 0] * (a + 1)) + inputs[:, -1] * inputs[:, a] for a in range(n)], dim=1)
+    targets = torch.stack(
+        [
+            torch.sin(inputs[:, 0] * (a + 1)) + inputs[:, -1] * inputs[:, a]
+            for a in range(n)
+        ],
+        dim=1,
+    )
     return GPPosterior.from_hyperparameters(
         inputs,
         targets,
@@ -50,8 +58,12 @@ def by_mpmath(gp, at, control):
             K = mpmath.matrix(size, size)
             for i in range(size):
                 for j in range(size):
-                    squares = sum(((x[i, d] - x[j, d]) / length[a][d]) ** 2 for d in range(x.cols))
-                    K[i, j] = sf2[a] * mpmath.exp(-squares / 2) + (sn2[a] if i == j else 0)
+                    squares = sum(
+                        ((x[i, d] - x[j, d]) / length[a][d]) ** 2 for d in range(x.cols)
+                    )
+                    K[i, j] = sf2[a] * mpmath.exp(-squares / 2) + (
+                        sn2[a] if i == j else 0
+                    )
             precision.append(K**-1)
             beta.append(precision[a] * mpmath.matrix(gp.targets[:, a].tolist()))
             Lam = mpmath.diag([v**2 for v in length[a][:n]])
@@ -59,8 +71,15 @@ def by_mpmath(gp, at, control):
             qs = []
             for i in range(size):
                 nu = mpmath.matrix([x[i, d] - mu[d] for d in range(n)])
-                certain = sum(((x[i, n + d] - u[d]) / length[a][n + d]) ** 2 for d in range(len(u)))
-                qs.append(sf2[a] / mpmath.sqrt(det) * mpmath.exp(-((nu.T * inverse * nu)[0] + certain) / 2))
+                certain = sum(
+                    ((x[i, n + d] - u[d]) / length[a][n + d]) ** 2
+                    for d in range(len(u))
+                )
+                qs.append(
+                    sf2[a]
+                    / mpmath.sqrt(det)
+                    * mpmath.exp(-((nu.T * inverse * nu)[0] + certain) / 2)
+                )
                 step = S * inverse * nu * (beta[a][i] * qs[i])
                 for d in range(n):
                     cross[d, a] += step[d]
@@ -75,20 +94,36 @@ def by_mpmath(gp, at, control):
                 RS, det = R**-1 * S, mpmath.det(R)
 
                 def k(c, i):
-                    state = sum(((x[i, d] - mu[d]) / length[c][d]) ** 2 for d in range(n))
-                    certain = sum(((x[i, n + d] - u[d]) / length[c][n + d]) ** 2 for d in range(len(u)))
+                    state = sum(
+                        ((x[i, d] - mu[d]) / length[c][d]) ** 2 for d in range(n)
+                    )
+                    certain = sum(
+                        ((x[i, n + d] - u[d]) / length[c][n + d]) ** 2
+                        for d in range(len(u))
+                    )
                     return sf2[c] * mpmath.exp(-(state + certain) / 2)
 
                 total = mpmath.mpf(0)
                 reduction = mpmath.mpf(0)
                 for i in range(size):
                     for j in range(size):
-                        z = inverse_a * mpmath.matrix([x[i, d] - mu[d] for d in range(n)])
-                        z += inverse_b * mpmath.matrix([x[j, d] - mu[d] for d in range(n)])
-                        Q = k(a, i) * k(b, j) / mpmath.sqrt(det) * mpmath.exp((z.T * RS * z)[0] / 2)
+                        z = inverse_a * mpmath.matrix(
+                            [x[i, d] - mu[d] for d in range(n)]
+                        )
+                        z += inverse_b * mpmath.matrix(
+                            [x[j, d] - mu[d] for d in range(n)]
+                        )
+                        Q = (
+                            k(a, i)
+                            * k(b, j)
+                            / mpmath.sqrt(det)
+                            * mpmath.exp((z.T * RS * z)[0] / 2)
+                        )
                         total += beta[a][i] * Q * beta[b][j]
                         reduction += precision[a][i, j] * Q
-                covariance[a, b] = total - mean[a] * mean[b] + ((sf2[a] - reduction) if a == b else 0)
+                covariance[a, b] = (
+                    total - mean[a] * mean[b] + ((sf2[a] - reduction) if a == b else 0)
+                )
         to_tensor = torch.tensor
         return (
             to_tensor([float(v) for v in mean]),
@@ -110,7 +145,9 @@ def by_mpmath(gp, at, control):
         ("far from the data", {}, {"spread": 0.3, "seed": 5}, 1e-11),
     ],
 )
-def test_the_moments_agree_with_a_fifty_digit_evaluation(case, arguments, at, tolerance):
+def test_the_moments_agree_with_a_fifty_digit_evaluation(
+    case, arguments, at, tolerance
+):
     gp, control = model(size=7, **arguments), torch.tensor([0.4])
     at = belief(**at)
     if case == "far from the data":
@@ -120,14 +157,22 @@ def test_the_moments_agree_with_a_fifty_digit_evaluation(case, arguments, at, to
     exact_mean, exact_covariance, exact_cross = by_mpmath(gp, at, control)
     scale = float(exact_covariance.abs().max())
     assert float((covariance - exact_covariance).abs().max()) < tolerance * scale
-    assert float((mean - exact_mean).abs().max()) < tolerance * max(1e-3, float(exact_mean.abs().max()))
-    assert float((cross - exact_cross).abs().max()) < tolerance * max(1e-3, float(exact_cross.abs().max()))
+    assert float((mean - exact_mean).abs().max()) < tolerance * max(
+        1e-3, float(exact_mean.abs().max())
+    )
+    assert float((cross - exact_cross).abs().max()) < tolerance * max(
+        1e-3, float(exact_cross.abs().max())
+    )
 
 
 @pytest.mark.parametrize("predicts", ["next_state", "difference"])
 @pytest.mark.parametrize(("n", "m"), [(1, 0), (2, 1), (3, 2)])
 def test_the_moments_agree_with_monte_carlo(n, m, predicts):
-    gp, at, control = model(size=15, n=n, m=m, noise=1e-2, predicts=predicts), belief(n), torch.full((m,), 0.3)
+    gp, at, control = (
+        model(size=15, n=n, m=m, noise=1e-2, predicts=predicts),
+        belief(n),
+        torch.full((m,), 0.3),
+    )
     samples, chunk = 1_000_000, 20_000
     root = torch.linalg.cholesky(at.covariance)
     generator = torch.Generator().manual_seed(7)
@@ -136,7 +181,10 @@ def test_the_moments_agree_with_monte_carlo(n, m, predicts):
         x = at.mean + torch.randn(chunk, n, generator=generator) @ root.T
         prediction = gp.predict(x, control.expand(chunk, m))
         states.append(x)
-        moved.append(prediction.mean + prediction.variance.sqrt() * torch.randn(chunk, n, generator=generator))
+        moved.append(
+            prediction.mean
+            + prediction.variance.sqrt() * torch.randn(chunk, n, generator=generator)
+        )
     states, moved = torch.cat(states), torch.cat(moved)
     exact = MomentMatching().propagate(gp, at, control)
     assert float(exact.deficit) == 0
@@ -144,9 +192,13 @@ def test_the_moments_agree_with_monte_carlo(n, m, predicts):
     z_mean = (moved.mean(0) - exact.belief.mean) / (moved.std(0) / samples**0.5)
     centred = moved - exact.belief.mean
     products = centred[:, :, None] * centred[:, None, :]
-    z_covariance = (products.mean(0) - exact.belief.covariance) / (products.std(0) / samples**0.5)
+    z_covariance = (products.mean(0) - exact.belief.covariance) / (
+        products.std(0) / samples**0.5
+    )
     products = (states - at.mean)[:, :, None] * centred[:, None, :]
-    z_cross = (products.mean(0) - exact.cross_covariance) / (products.std(0) / samples**0.5)
+    z_cross = (products.mean(0) - exact.cross_covariance) / (
+        products.std(0) / samples**0.5
+    )
     for z in (z_mean, z_covariance, z_cross):
         assert float(z.abs().max()) < 4.5
 
@@ -156,9 +208,14 @@ def test_without_covariance_it_is_the_plain_prediction(predicts):
     gp = model(predicts=predicts)
     for control in torch.linspace(-1, 1, 5)[:, None]:
         at = Gaussian(torch.tensor([0.3, -0.4]), torch.zeros(2, 2))
-        plain, matched = gp.predict(at.mean, control), MomentMatching().propagate(gp, at, control)
+        plain, matched = (
+            gp.predict(at.mean, control),
+            MomentMatching().propagate(gp, at, control),
+        )
         assert torch.allclose(matched.belief.mean, plain.mean, rtol=0, atol=1e-10)
-        assert torch.allclose(matched.belief.covariance, plain.covariance, rtol=0, atol=1e-10)
+        assert torch.allclose(
+            matched.belief.covariance, plain.covariance, rtol=0, atol=1e-10
+        )
         assert not matched.cross_covariance.any()
 
 
@@ -166,7 +223,12 @@ def test_a_vanishing_covariance_approaches_the_plain_prediction_linearly():
     gp, at, control = model(), belief(), torch.tensor([0.2])
     plain = gp.predict(at.mean, control).mean
     gaps = [
-        float((moments(gp, Gaussian(at.mean, e * at.covariance), control)[0] - plain).abs().max()) for e in (1e-4, 1e-5)
+        float(
+            (moments(gp, Gaussian(at.mean, e * at.covariance), control)[0] - plain)
+            .abs()
+            .max()
+        )
+        for e in (1e-4, 1e-5)
     ]
     assert gaps[0] / gaps[1] == pytest.approx(10, rel=1e-2)
 
@@ -175,13 +237,20 @@ def test_a_batch_is_the_loop_over_its_members():
     gp = model()
     beliefs = [belief(seed=s) for s in range(4)]
     controls = torch.linspace(-1, 1, 4)[:, None]
-    batch = Gaussian(torch.stack([b.mean for b in beliefs]), torch.stack([b.covariance for b in beliefs]))
+    batch = Gaussian(
+        torch.stack([b.mean for b in beliefs]),
+        torch.stack([b.covariance for b in beliefs]),
+    )
     together = MomentMatching().propagate(gp, batch, controls)
     for k, (at, control) in enumerate(zip(beliefs, controls, strict=True)):
         alone = MomentMatching().propagate(gp, at, control)
         assert torch.allclose(together.belief.mean[k], alone.belief.mean, atol=1e-13)
-        assert torch.allclose(together.belief.covariance[k], alone.belief.covariance, atol=1e-13)
-        assert torch.allclose(together.cross_covariance[k], alone.cross_covariance, atol=1e-13)
+        assert torch.allclose(
+            together.belief.covariance[k], alone.belief.covariance, atol=1e-13
+        )
+        assert torch.allclose(
+            together.cross_covariance[k], alone.cross_covariance, atol=1e-13
+        )
 
 
 @pytest.mark.parametrize("spread", [0.3, 0.0])
@@ -190,7 +259,9 @@ def test_derivatives_by_torch_agree_with_finite_differences(spread):
     direction = torch.tensor([[0.5, 0.2], [0.2, 0.3]])
 
     def along(t):
-        shifted = Gaussian(at.mean + t * torch.tensor([0.3, -0.2]), at.covariance + t * direction)
+        shifted = Gaussian(
+            at.mean + t * torch.tensor([0.3, -0.2]), at.covariance + t * direction
+        )
         mean, covariance, cross = moments(gp, shifted, control + t)
         return torch.cat([mean, covariance.ravel(), cross.ravel()])
 
@@ -205,12 +276,19 @@ def test_derivatives_by_torch_agree_with_finite_differences(spread):
 def test_the_public_class_is_differentiable_where_covariances_have_equal_eigenvalues():
     gp = model()
     gp = GPPosterior.from_hyperparameters(
-        gp.features, gp.targets, gp.lengthscales, torch.ones(2), gp.noise_variance, gp.input_dim
+        gp.features,
+        gp.targets,
+        gp.lengthscales,
+        torch.ones(2),
+        gp.noise_variance,
+        gp.input_dim,
     )
     control = torch.zeros(1)
 
     def far(mean):
-        return MomentMatching()(gp, Gaussian(mean, 0.1 * torch.eye(2)), control).covariance
+        return MomentMatching()(
+            gp, Gaussian(mean, 0.1 * torch.eye(2)), control
+        ).covariance
 
     jacobian = torch.func.jacrev(far)(torch.full((2,), 50.0))
     assert torch.isfinite(jacobian).all()
@@ -223,15 +301,21 @@ def test_the_public_class_is_differentiable_where_covariances_have_equal_eigenva
 def test_vmap_maps_over_beliefs():
     gp, means = model(), torch.randn(3, 2)
     S, control = belief().covariance, torch.tensor([0.2])
-    mapped = torch.func.vmap(lambda mean: moments(gp, Gaussian(mean, S), control)[1])(means)
-    assert torch.allclose(mapped[2], moments(gp, Gaussian(means[2], S), control)[1], atol=1e-13)
+    mapped = torch.func.vmap(lambda mean: moments(gp, Gaussian(mean, S), control)[1])(
+        means
+    )
+    assert torch.allclose(
+        mapped[2], moments(gp, Gaussian(means[2], S), control)[1], atol=1e-13
+    )
 
 
 def test_wide_beliefs_far_from_the_data_neither_overflow_nor_lose_the_prior():
     gp = model(lengthscale=0.05)
     for distance, spread in ((0.0, 1e3), (50.0, 10.0), (1e4, 1.0)):
         mean, covariance, _ = moments(
-            gp, Gaussian(torch.full((2,), distance), spread**2 * torch.eye(2)), torch.zeros(1)
+            gp,
+            Gaussian(torch.full((2,), distance), spread**2 * torch.eye(2)),
+            torch.zeros(1),
         )
         assert torch.isfinite(mean).all()
         assert torch.allclose(covariance.diagonal(), gp.signal_variance, rtol=1e-3)
@@ -239,13 +323,21 @@ def test_wide_beliefs_far_from_the_data_neither_overflow_nor_lose_the_prior():
 
 def test_the_result_is_semidefinite_and_observation_noise_is_added_on_request():
     gp, at, control = model(noise=1e-8), belief(spread=1e-3), torch.tensor([0.1])
-    latent, noisy = MomentMatching()(gp, at, control), MomentMatching(process_noise=True)(gp, at, control)
+    latent, noisy = (
+        MomentMatching()(gp, at, control),
+        MomentMatching(process_noise=True)(gp, at, control),
+    )
     assert float(torch.linalg.eigvalsh(latent.covariance).min()) >= -1e-18
-    assert torch.allclose(noisy.covariance - latent.covariance, torch.diag(gp.noise_variance), atol=1e-14)
+    assert torch.allclose(
+        noisy.covariance - latent.covariance, torch.diag(gp.noise_variance), atol=1e-14
+    )
 
 
 def test_a_belief_of_another_dimension_is_refused():
-    with pytest.raises(ShapeError, match=r"a state \(\*batch, 2\) and an input \(\*batch, 1\); got \(3,\) and \(1,\)"):
+    with pytest.raises(
+        ShapeError,
+        match=r"a state \(\*batch, 2\) and an input \(\*batch, 1\); got \(3,\) and \(1,\)",
+    ):
         MomentMatching()(model(), belief(3), torch.zeros(1))
     with pytest.raises(ShapeError, match=r"got \(2,\) and \(2,\)"):
         MomentMatching()(model(), belief(), torch.zeros(2))

@@ -8,16 +8,26 @@ from gpmpc.exceptions import DataError, SettingError, ShapeError, UnsupportedMod
 from gpmpc.gaussian import Gaussian, square_root
 from gpmpc.gp import GPPosterior
 from gpmpc.models import Affine, ResidualModel
-from gpmpc.propagation import Linearization, MeanEquivalence, MomentMatching, MonteCarlo, Unscented
+from gpmpc.propagation import (
+    Linearization,
+    MeanEquivalence,
+    MomentMatching,
+    MonteCarlo,
+    Unscented,
+)
 
 DETERMINISTIC = {
     "mean equivalence": MeanEquivalence,
     "linearization": Linearization,
     "moment matching": MomentMatching,
     "unscented": Unscented,
-    "sigma points": lambda **settings: Unscented(alpha=0.5, beta=2.0, kappa=1.0, **settings),
+    "sigma points": lambda **settings: Unscented(
+        alpha=0.5, beta=2.0, kappa=1.0, **settings
+    ),
 }
-ALL = DETERMINISTIC | {"Monte Carlo": lambda **settings: MonteCarlo(samples=400, **settings)}
+ALL = DETERMINISTIC | {
+    "Monte Carlo": lambda **settings: MonteCarlo(samples=400, **settings)
+}
 
 
 def gp(n=2, m=1, predicts="next_state", outputs=None, noise=1e-2):
@@ -25,19 +35,41 @@ def gp(n=2, m=1, predicts="next_state", outputs=None, noise=1e-2):
     generator = torch.Generator().manual_seed(0)
     k = outputs or n
     features = 3 * torch.rand(25, n + m, generator=generator) - 1.5
-    targets = torch.stack([torch.sin(features.sum(1) + a) + 0.3 * features[:, a % n] ** 2 for a in range(k)], dim=1)
+    targets = torch.stack(
+        [
+            torch.sin(features.sum(1) + a) + 0.3 * features[:, a % n] ** 2
+            for a in range(k)
+        ],
+        dim=1,
+    )
     lengthscales = 1.0 + torch.rand(k, n + m, generator=generator)
     return GPPosterior.from_hyperparameters(
-        features, targets, lengthscales, torch.full((k,), 1.5), torch.full((k,), noise), m, predicts
+        features,
+        targets,
+        lengthscales,
+        torch.full((k,), 1.5),
+        torch.full((k,), noise),
+        m,
+        predicts,
     )
 
 
 def linear(noise=0.04):
     """x+ = A x + B u + c + d, d of a prior that no data have told anything: variance Q near 0, noise sn2."""
-    A, B, c = torch.tensor([[0.9, 0.4], [-0.3, 0.8]]), torch.tensor([[0.2], [0.7]]), torch.tensor([0.5, -1.0])
+    A, B, c = (
+        torch.tensor([[0.9, 0.4], [-0.3, 0.8]]),
+        torch.tensor([[0.2], [0.7]]),
+        torch.tensor([0.5, -1.0]),
+    )
     far = torch.full((1, 3), 1e6)  # so far off that the prior is all there is
     d = GPPosterior.from_hyperparameters(
-        far, torch.zeros(1, 2), torch.ones(2, 3), torch.tensor([0.03, 0.05]), torch.full((2,), noise), 1, "value"
+        far,
+        torch.zeros(1, 2),
+        torch.ones(2, 3),
+        torch.tensor([0.03, 0.05]),
+        torch.full((2,), noise),
+        1,
+        "value",
     )
     return ResidualModel(Affine(A, B, c), d, torch.eye(2), [0, 1], [0], 1)
 
@@ -47,7 +79,9 @@ def belief(n=2, scale=1.0):
     return Gaussian(torch.linspace(0.4, -0.3, n), scale * root @ root.T)
 
 
-@pytest.mark.parametrize("name", [name for name in DETERMINISTIC if name != "mean equivalence"])
+@pytest.mark.parametrize(
+    "name", [name for name in DETERMINISTIC if name != "mean equivalence"]
+)
 @pytest.mark.parametrize("process_noise", [False, True])
 def test_a_linear_gaussian_system_is_propagated_exactly(name, process_noise):
     model, at, u = linear(), belief(), torch.tensor([0.7])
@@ -55,7 +89,9 @@ def test_a_linear_gaussian_system_is_propagated_exactly(name, process_noise):
     Q = torch.diag(torch.tensor([0.03, 0.05])) + process_noise * 0.04 * torch.eye(2)
     result = DETERMINISTIC[name](process_noise=process_noise).propagate(model, at, u)
     assert torch.allclose(result.belief.mean, A @ at.mean + B @ u + c, atol=1e-12)
-    assert torch.allclose(result.belief.covariance, A @ at.covariance @ A.T + Q, atol=1e-12)
+    assert torch.allclose(
+        result.belief.covariance, A @ at.covariance @ A.T + Q, atol=1e-12
+    )
     assert torch.allclose(result.cross_covariance, at.covariance @ A.T, atol=1e-12)
     assert float(result.deficit) == 0
 
@@ -64,7 +100,9 @@ def test_mean_equivalence_of_a_linear_system_forgets_the_state_covariance_only()
     model, at, u = linear(), belief(), torch.tensor([0.7])
     result = MeanEquivalence().propagate(model, at, u)
     assert torch.allclose(result.belief.mean, model.nominal(at.mean, u), atol=1e-12)
-    assert torch.allclose(result.belief.covariance, torch.diag(torch.tensor([0.03, 0.05])), atol=1e-12)
+    assert torch.allclose(
+        result.belief.covariance, torch.diag(torch.tensor([0.03, 0.05])), atol=1e-12
+    )
     assert not result.cross_covariance.any()
 
 
@@ -74,19 +112,28 @@ def test_monte_carlo_of_a_linear_system_is_exact_up_to_its_standard_error():
     result = MonteCarlo(samples, seed=3).propagate(model, at, u)
     spread = A @ at.covariance @ A.T
     assert torch.all(
-        (result.belief.mean - model.nominal(at.mean, u)).abs() < 4.5 * (spread.diagonal() / samples).sqrt()
+        (result.belief.mean - model.nominal(at.mean, u)).abs()
+        < 4.5 * (spread.diagonal() / samples).sqrt()
     )
     expected = spread + torch.diag(torch.tensor([0.03, 0.05]))
     # Var of a sample covariance of Gaussians: (S_ab^2 + S_aa S_bb) / N.
-    error = ((spread**2 + torch.outer(spread.diagonal(), spread.diagonal())) / samples).sqrt()
+    error = (
+        (spread**2 + torch.outer(spread.diagonal(), spread.diagonal())) / samples
+    ).sqrt()
     assert torch.all((result.belief.covariance - expected).abs() < 4.5 * error)
-    error = ((at.covariance @ A.T) ** 2 + torch.outer(at.variance, spread.diagonal())) / samples
-    assert torch.all((result.cross_covariance - at.covariance @ A.T).abs() < 4.5 * error.sqrt())
+    error = (
+        (at.covariance @ A.T) ** 2 + torch.outer(at.variance, spread.diagonal())
+    ) / samples
+    assert torch.all(
+        (result.cross_covariance - at.covariance @ A.T).abs() < 4.5 * error.sqrt()
+    )
 
 
 def test_monte_carlo_says_the_same_for_the_same_seed_and_another_thing_for_another():
     model, at, u = gp(), belief(), torch.zeros(1)
-    first, again, other = (MonteCarlo(500, seed=seed)(model, at, u).mean for seed in (1, 1, 2))
+    first, again, other = (
+        MonteCarlo(500, seed=seed)(model, at, u).mean for seed in (1, 1, 2)
+    )
     assert torch.equal(first, again)
     assert not torch.equal(first, other)
 
@@ -97,18 +144,27 @@ def test_the_order_of_accuracy_on_a_nonlinear_model_is_as_stated():
     def errors(propagator, scale):
         at = belief(scale=scale)
         exact, ours = MomentMatching()(model, at, u), propagator(model, at, u)
-        return torch.stack([(ours.mean - exact.mean).abs().max(), (ours.covariance - exact.covariance).abs().max()])
+        return torch.stack(
+            [
+                (ours.mean - exact.mean).abs().max(),
+                (ours.covariance - exact.covariance).abs().max(),
+            ]
+        )
 
     # Error of the mean (scale^p): first order misses 1/2 tr(H S), sigma points do not.
-    for propagator, power in ((MeanEquivalence(), 1), (Linearization(), 1), (Unscented(), 2)):
+    for propagator, power in (
+        (MeanEquivalence(), 1),
+        (Linearization(), 1),
+        (Unscented(), 2),
+    ):
         rate = errors(propagator, 1e-2) / errors(propagator, 1e-3)
         assert float(rate[0].log10()) == pytest.approx(power, abs=0.15)
     # Error of the covariance: Unscented sees the curvature of the model's variance, linearization does not.
     rate = errors(Unscented(), 1e-2) / errors(Unscented(), 1e-3)
     assert float(rate[1].log10()) == pytest.approx(2, abs=0.15)
-    assert float((errors(Linearization(), 1e-2) / errors(Linearization(), 1e-3))[1].log10()) == pytest.approx(
-        1, abs=0.15
-    )
+    assert float(
+        (errors(Linearization(), 1e-2) / errors(Linearization(), 1e-3))[1].log10()
+    ) == pytest.approx(1, abs=0.15)
 
 
 @pytest.mark.parametrize("name", ALL)
@@ -119,16 +175,25 @@ def test_an_autonomous_model_takes_no_input_or_one_of_no_columns(name, predicts)
     assert torch.equal(without.mean, empty.mean)
     assert torch.equal(without.covariance, empty.covariance)
     batch = Gaussian(at.mean.expand(3, 2), at.covariance.expand(3, 2, 2))
-    assert torch.allclose(ALL[name]()(model, batch).mean, without.mean.expand(3, 2), atol=1e-12)
+    assert torch.allclose(
+        ALL[name]()(model, batch).mean, without.mean.expand(3, 2), atol=1e-12
+    )
 
 
 @pytest.mark.parametrize("name", ALL)
 def test_observation_noise_is_added_on_request_and_only_then(name):
     model, at, u = gp(noise=0.02), belief(), torch.tensor([0.3])
-    latent, noisy = ALL[name]().propagate(model, at, u), ALL[name](process_noise=True).propagate(model, at, u)
+    latent, noisy = (
+        ALL[name]().propagate(model, at, u),
+        ALL[name](process_noise=True).propagate(model, at, u),
+    )
     assert torch.equal(latent.belief.mean, noisy.belief.mean)
     assert torch.equal(latent.cross_covariance, noisy.cross_covariance)
-    assert torch.allclose(noisy.belief.covariance - latent.belief.covariance, 0.02 * torch.eye(2), atol=1e-13)
+    assert torch.allclose(
+        noisy.belief.covariance - latent.belief.covariance,
+        0.02 * torch.eye(2),
+        atol=1e-13,
+    )
 
 
 @pytest.mark.parametrize("name", ALL)
@@ -136,15 +201,23 @@ def test_noise_of_a_residual_model_acts_where_the_residual_does(name):
     d = gp(n=1, m=1, predicts="value")
     nominal = Affine(torch.eye(2), torch.ones(2, 1), torch.zeros(2))
     model = ResidualModel(nominal, d, torch.tensor([[0.5], [2.0]]), [1], [0], 1)
-    latent, noisy = (ALL[name](process_noise=noise)(model, belief(), torch.zeros(1)) for noise in (False, True))
+    latent, noisy = (
+        ALL[name](process_noise=noise)(model, belief(), torch.zeros(1))
+        for noise in (False, True)
+    )
     B = torch.tensor([[0.5], [2.0]])
-    assert torch.allclose(noisy.covariance - latent.covariance, 0.01 * B @ B.T, atol=1e-12)
+    assert torch.allclose(
+        noisy.covariance - latent.covariance, 0.01 * B @ B.T, atol=1e-12
+    )
 
 
 @pytest.mark.parametrize("name", [name for name in ALL if name != "moment matching"])
 def test_a_function_with_other_outputs_than_states_is_propagated_too(name):
     model, at, u = gp(predicts="value", outputs=3), belief(), torch.tensor([0.1])
-    result, exact = ALL[name]().propagate(model, at, u), MomentMatching().propagate(model, at, u)
+    result, exact = (
+        ALL[name]().propagate(model, at, u),
+        MomentMatching().propagate(model, at, u),
+    )
     assert result.belief.mean.shape == (3,)
     assert result.cross_covariance.shape == (2, 3)
     assert torch.allclose(result.belief.mean, exact.belief.mean, atol=0.15)
@@ -161,7 +234,9 @@ def test_moment_matching_says_what_it_can_do_and_who_can_do_the_rest():
         MomentMatching()(other, belief(), torch.zeros(1))
     assert str(caught.value) == message
     for name in ("mean equivalence", "linearization", "unscented", "Monte Carlo"):
-        assert torch.isfinite(ALL[name]()(other, belief(), torch.zeros(1)).covariance).all()
+        assert torch.isfinite(
+            ALL[name]()(other, belief(), torch.zeros(1)).covariance
+        ).all()
 
 
 @pytest.mark.parametrize("name", ALL)
@@ -170,7 +245,9 @@ class TestBadInput:
 
     def refused(self, name, error, message, at=None, u=None, model=None):
         with pytest.raises(error, match=message):
-            ALL[name]()(model or gp(), at or belief(), torch.zeros(1) if u is None else u)
+            ALL[name]()(
+                model or gp(), at or belief(), torch.zeros(1) if u is None else u
+            )
 
     def test_another_number_of_states_or_inputs(self, name):
         self.refused(name, ShapeError, r"got \(3,\) and \(1,\)", at=belief(3))
@@ -185,9 +262,17 @@ class TestBadInput:
     @pytest.mark.parametrize("value", [torch.nan, torch.inf])
     def test_entries_that_are_not_finite(self, name, value):
         at, bad = belief(), torch.tensor([0.1, value])
-        self.refused(name, DataError, "the belief's mean must be finite; got", at=Gaussian(bad, at.covariance))
         self.refused(
-            name, DataError, "the belief's covariance must be finite; got", at=Gaussian(at.mean, torch.diag(bad))
+            name,
+            DataError,
+            "the belief's mean must be finite; got",
+            at=Gaussian(bad, at.covariance),
+        )
+        self.refused(
+            name,
+            DataError,
+            "the belief's covariance must be finite; got",
+            at=Gaussian(at.mean, torch.diag(bad)),
         )
         self.refused(name, DataError, "the input must be finite; got", u=bad[1:])
 
@@ -208,10 +293,22 @@ class TestBadInput:
         single = Gaussian(at.mean.float(), at.covariance.float())
         message = "state: must be torch.float64 on cpu like the model; got torch.float32 on cpu"
         self.refused(name, SettingError, message, at=single)
-        self.refused(name, SettingError, "input: must be torch.float64", u=torch.zeros(1, dtype=torch.float32))
+        self.refused(
+            name,
+            SettingError,
+            "input: must be torch.float64",
+            u=torch.zeros(1, dtype=torch.float32),
+        )
         mixed = Gaussian(at.mean, at.covariance.float())
-        self.refused(name, SettingError, "belief: mean and covariance must have the same dtype and device", at=mixed)
-        moved = ALL[name]()(gp().to(dtype=torch.float32), single, torch.zeros(1, dtype=torch.float32))
+        self.refused(
+            name,
+            SettingError,
+            "belief: mean and covariance must have the same dtype and device",
+            at=mixed,
+        )
+        moved = ALL[name]()(
+            gp().to(dtype=torch.float32), single, torch.zeros(1, dtype=torch.float32)
+        )
         assert moved.covariance.dtype == torch.float32
 
 
@@ -219,9 +316,18 @@ def test_settings_out_of_range_are_refused():
     for make, message in (
         (lambda: Unscented(alpha=0.0), "alpha: must be a number above 0; got 0.0"),
         (lambda: Unscented(beta=torch.nan), "beta: must be a number; got nan"),
-        (lambda: MonteCarlo(samples=1), "samples: must be a whole number, 2 or more; got 1"),
-        (lambda: MonteCarlo(seed=0.5), "seed: must be a whole number, 0 or more; got 0.5"),
-        (lambda: Unscented(kappa=-2.0)(gp(), belief(), torch.zeros(1)), r"n \+ kappa must be positive; got 2 states"),
+        (
+            lambda: MonteCarlo(samples=1),
+            "samples: must be a whole number, 2 or more; got 1",
+        ),
+        (
+            lambda: MonteCarlo(seed=0.5),
+            "seed: must be a whole number, 0 or more; got 0.5",
+        ),
+        (
+            lambda: Unscented(kappa=-2.0)(gp(), belief(), torch.zeros(1)),
+            r"n \+ kappa must be positive; got 2 states",
+        ),
     ):
         with pytest.raises(SettingError, match=message):
             make()
@@ -231,9 +337,16 @@ def test_settings_out_of_range_are_refused():
 def test_monte_carlo_gives_the_sample_moments_of_its_draws(samples):
     model, at, u = gp(), belief(), torch.tensor([0.3])
     found = MonteCarlo(samples, seed=4).propagate(model, at, u)
-    steps = torch.from_numpy(np.random.default_rng(4).standard_normal((samples, 2))) @ square_root(at.covariance)
+    steps = torch.from_numpy(
+        np.random.default_rng(4).standard_normal((samples, 2))
+    ) @ square_root(at.covariance)
     moved = model.predict(at.mean + steps, u.expand(samples, 1))
     both = torch.cov(torch.cat([steps, moved.mean], dim=1).mT)
     assert torch.allclose(found.belief.mean, moved.mean.mean(0), rtol=1e-12)
-    assert torch.allclose(found.belief.covariance, both[2:, 2:] + moved.covariance.mean(0), rtol=1e-10, atol=1e-14)
+    assert torch.allclose(
+        found.belief.covariance,
+        both[2:, 2:] + moved.covariance.mean(0),
+        rtol=1e-10,
+        atol=1e-14,
+    )
     assert torch.allclose(found.cross_covariance, both[:2, 2:], rtol=1e-10, atol=1e-14)

@@ -8,7 +8,14 @@ from gpmpc.exceptions import DataError, SettingError, ShapeError
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior, backend, remove_points
 from gpmpc.models import Affine, ResidualModel
-from gpmpc.propagation import Linearization, MeanEquivalence, MomentMatching, Unscented, differentiate, linearize
+from gpmpc.propagation import (
+    Linearization,
+    MeanEquivalence,
+    MomentMatching,
+    Unscented,
+    differentiate,
+    linearize,
+)
 from gpmpc.propagation._propagator import by_autograd
 from tests.propagation.test_moment_matching import belief, model
 
@@ -25,9 +32,18 @@ def draw(*shape):
 
 def residual_model():
     f = GPPosterior.from_hyperparameters(
-        draw(30, 3), draw(30, 2), 1 + draw(2, 3).abs(), torch.ones(2), torch.full((2,), 1e-2), 1, "value", draw(2)
+        draw(30, 3),
+        draw(30, 2),
+        1 + draw(2, 3).abs(),
+        torch.ones(2),
+        torch.full((2,), 1e-2),
+        1,
+        "value",
+        draw(2),
     )
-    return ResidualModel(Affine(draw(3, 3), draw(3, 2), draw(3)), f, draw(3, 2), [2, 0], [1], 2)
+    return ResidualModel(
+        Affine(draw(3, 3), draw(3, 2), draw(3)), f, draw(3, 2), [2, 0], [1], 2
+    )
 
 
 MODELS = {
@@ -51,16 +67,25 @@ PROPAGATORS = [
 @pytest.mark.parametrize("choice", ["auto", "torch"])
 @pytest.mark.parametrize("batch", [(), (4,), (2, 3)], ids=str)
 @pytest.mark.parametrize("name", MODELS)
-@pytest.mark.parametrize("propagator", PROPAGATORS, ids=lambda p: f"{type(p).__name__}{sorted(vars(p).items())}")
+@pytest.mark.parametrize(
+    "propagator",
+    PROPAGATORS,
+    ids=lambda p: f"{type(p).__name__}{sorted(vars(p).items())}",
+)
 def test_closed_forms_are_autograds_derivatives(propagator, name, batch, choice):
     gp, at = MODELS[name], belief(3)
-    at = Gaussian(at.mean + 0.3 * draw(*batch, 3), at.covariance.expand(*batch, 3, 3).clone())
+    at = Gaussian(
+        at.mean + 0.3 * draw(*batch, 3), at.covariance.expand(*batch, 3, 3).clone()
+    )
     control = draw(*batch, gp.input_dim)
     with backend(choice):
         moved, closed_form = differentiate(propagator, gp, at, control)
     with backend("torch"):
         expected, automatic = by_autograd(propagator, gp, at, control)
-    pairs = [(getattr(closed_form, part), getattr(automatic, part)) for part in vars(automatic)]
+    pairs = [
+        (getattr(closed_form, part), getattr(automatic, part))
+        for part in vars(automatic)
+    ]
     pairs += [
         (moved.belief.mean, expected.belief.mean),
         (moved.belief.covariance, expected.belief.covariance),
@@ -70,17 +95,26 @@ def test_closed_forms_are_autograds_derivatives(propagator, name, batch, choice)
     for mine, other in pairs:
         assert mine.shape == other.shape
         assert torch.allclose(
-            mine, other, rtol=1e-9, atol=1e-10 * max(1.0, float(other.abs().max()) if other.numel() else 1)
+            mine,
+            other,
+            rtol=1e-9,
+            atol=1e-10 * max(1.0, float(other.abs().max()) if other.numel() else 1),
         )
 
 
-@pytest.mark.parametrize("propagator", [MeanEquivalence(), Linearization(), MomentMatching(), Unscented()], ids=_name)
+@pytest.mark.parametrize(
+    "propagator",
+    [MeanEquivalence(), Linearization(), MomentMatching(), Unscented()],
+    ids=_name,
+)
 def test_closed_forms_by_torch_can_be_differentiated_again(propagator):
     gp, at, control = MODELS["difference"], belief(3), torch.zeros(2)
     step = torch.tensor([1e-5, 0.0, 0.0])
 
     def slope(mean):
-        return differentiate(propagator, gp, Gaussian(mean, at.covariance), control)[1].covariance_by_mean.sum()
+        return differentiate(propagator, gp, Gaussian(mean, at.covariance), control)[
+            1
+        ].covariance_by_mean.sum()
 
     mean = at.mean.clone().requires_grad_()
     (curvature,) = torch.autograd.grad(slope(mean), mean)
@@ -113,11 +147,19 @@ def test_the_evaluation_can_be_forced_and_refuses_what_it_cannot_do():
     with backend("compiled"):
         compiled = predict_with_jacobian(gp, state, control)
         with pytest.raises(SettingError, match="part of a graph"):
-            MomentMatching().propagate(gp, Gaussian(state.clone().requires_grad_(), torch.eye(3)), control)
+            MomentMatching().propagate(
+                gp, Gaussian(state.clone().requires_grad_(), torch.eye(3)), control
+            )
     for mine, other in zip(compiled[1:], by_torch[1:], strict=True):
         assert torch.allclose(mine, other, rtol=1e-12, atol=1e-13)
     assert torch.allclose(compiled[0].covariance, by_torch[0].covariance, atol=1e-13)
-    with pytest.raises(SettingError, match="must be one of 'auto', 'compiled', 'torch'; got 'numba'"), backend("numba"):
+    with (
+        pytest.raises(
+            SettingError,
+            match="must be one of 'auto', 'compiled', 'torch'; got 'numba'",
+        ),
+        backend("numba"),
+    ):
         pass
 
 
@@ -125,7 +167,9 @@ def test_transforms_and_forward_mode_fall_back_to_torch_unasked():
     gp, control = MODELS["next state"], torch.zeros(2)
     states = draw(3, 3)
     mapped = torch.func.vmap(lambda x: gp.predict_with_jacobian(x, control)[1])(states)
-    assert torch.allclose(mapped, gp.predict_with_jacobian(states, control.expand(3, 2))[1], atol=1e-12)
+    assert torch.allclose(
+        mapped, gp.predict_with_jacobian(states, control.expand(3, 2))[1], atol=1e-12
+    )
     with torch.autograd.forward_ad.dual_level():
         dual = torch.autograd.forward_ad.make_dual(states[0], torch.ones(3))
         mean = gp.predict_with_jacobian(dual, control)[0].mean
@@ -135,7 +179,9 @@ def test_transforms_and_forward_mode_fall_back_to_torch_unasked():
 
 def test_a_float32_model_is_answered_by_torch_in_float32():
     gp = MODELS["next state"].to(dtype=torch.float32)
-    belief, A, _ = gp.predict_with_jacobian(torch.zeros(3, dtype=torch.float32), torch.zeros(2, dtype=torch.float32))
+    belief, A, _ = gp.predict_with_jacobian(
+        torch.zeros(3, dtype=torch.float32), torch.zeros(2, dtype=torch.float32)
+    )
     assert belief.mean.dtype == A.dtype == torch.float32
 
 
@@ -143,21 +189,42 @@ def value_model(n, m, k):
     features, targets = draw(20, n + m), draw(20, k)
     scales = 0.7 + draw(k, n + m).abs()
     return GPPosterior.from_hyperparameters(
-        features, targets, scales, torch.ones(k), torch.full((k,), 1e-2), m, predicts="value"
+        features,
+        targets,
+        scales,
+        torch.ones(k),
+        torch.full((k,), 1e-2),
+        m,
+        predicts="value",
     )
 
 
 @pytest.mark.parametrize(("n", "k"), [(2, 3), (3, 2)])
-@pytest.mark.parametrize("propagator", [MeanEquivalence(), Linearization(), MomentMatching(), Unscented()], ids=_name)
-def test_functions_with_more_or_fewer_outputs_than_states_have_derivatives_too(propagator, n, k):
+@pytest.mark.parametrize(
+    "propagator",
+    [MeanEquivalence(), Linearization(), MomentMatching(), Unscented()],
+    ids=_name,
+)
+def test_functions_with_more_or_fewer_outputs_than_states_have_derivatives_too(
+    propagator, n, k
+):
     gp, at, control = value_model(n, 1, k), belief(n), draw(1)
     found, d = differentiate(propagator, gp, at, control)
     step = 1e-6
     for c in range(n):
         shift = step * torch.eye(n)[c]
-        up, down = (propagator(gp, Gaussian(at.mean + sign * shift, at.covariance), control) for sign in (1, -1))
-        assert torch.allclose(d.mean_by_mean[:, c], (up.mean - down.mean) / (2 * step), atol=1e-7)
-        assert torch.allclose(d.covariance_by_mean[..., c], (up.covariance - down.covariance) / (2 * step), atol=1e-7)
+        up, down = (
+            propagator(gp, Gaussian(at.mean + sign * shift, at.covariance), control)
+            for sign in (1, -1)
+        )
+        assert torch.allclose(
+            d.mean_by_mean[:, c], (up.mean - down.mean) / (2 * step), atol=1e-7
+        )
+        assert torch.allclose(
+            d.covariance_by_mean[..., c],
+            (up.covariance - down.covariance) / (2 * step),
+            atol=1e-7,
+        )
     assert d.covariance_by_covariance.shape == (k, k, n, n)
     assert found.cross_covariance.shape == (n, k)
     with pytest.raises(ShapeError, match=f"got {n} states, {k} outputs"):
@@ -179,19 +246,32 @@ def test_beliefs_and_inputs_belong_together_or_are_refused(propagator, choice):
     control = draw(2)
     with backend(choice):
         one_for_all = propagator(gp, batch, control)
-        assert torch.allclose(one_for_all.mean, propagator(gp, batch, control.expand(2, 3, 2)).mean, atol=1e-13)
+        assert torch.allclose(
+            one_for_all.mean,
+            propagator(gp, batch, control.expand(2, 3, 2)).mean,
+            atol=1e-13,
+        )
         for wrong in (draw(3, 2, 2), draw(6, 2), draw(1, 2)):
-            with pytest.raises(ShapeError, match=r"a state \(\*batch, 3\) and an input \(\*batch, 2\); got"):
+            with pytest.raises(
+                ShapeError,
+                match=r"a state \(\*batch, 3\) and an input \(\*batch, 2\); got",
+            ):
                 propagator(gp, batch, wrong)
-        with pytest.raises(ShapeError, match=r"a state \(\*batch, 3\) and an input \(\*batch, 2\); got"):
+        with pytest.raises(
+            ShapeError, match=r"a state \(\*batch, 3\) and an input \(\*batch, 2\); got"
+        ):
             gp.predict_with_jacobian(batch.mean, draw(3, 2, 2))
         nobody = propagator(gp, Gaussian(draw(0, 3), draw(0, 3, 3)), draw(0, 2))
         assert nobody.mean.shape == (0, 3)
 
 
 def test_a_covariance_that_is_not_symmetric_is_refused():
-    lopsided = Gaussian(torch.zeros(3), torch.eye(3) + torch.diag(torch.full((2,), 0.3), 1))
-    with pytest.raises(DataError, match="must be symmetric; got entries that differ by 0.3"):
+    lopsided = Gaussian(
+        torch.zeros(3), torch.eye(3) + torch.diag(torch.full((2,), 0.3), 1)
+    )
+    with pytest.raises(
+        DataError, match="must be symmetric; got entries that differ by 0.3"
+    ):
         MomentMatching()(MODELS["next state"], lopsided, torch.zeros(2))
 
 
@@ -200,7 +280,9 @@ def test_models_whose_hyperparameters_carry_gradients_are_answered_by_torch():
     features, targets = draw(12, 3), draw(12, 2)
 
     def mean(scale):
-        gp = GPPosterior.from_hyperparameters(features, targets, scale.exp(), torch.ones(2), 0.1 * torch.ones(2), 1)
+        gp = GPPosterior.from_hyperparameters(
+            features, targets, scale.exp(), torch.ones(2), 0.1 * torch.ones(2), 1
+        )
         dropped = remove_points(gp, [1])
         at = Gaussian(torch.zeros(2), 0.1 * torch.eye(2))
         answers = gp.predict_with_jacobian(at.mean, torch.zeros(1))[1].sum()
@@ -213,7 +295,9 @@ def test_models_whose_hyperparameters_carry_gradients_are_answered_by_torch():
     (gradient,) = torch.autograd.grad(mean(log_scale), log_scale)
     shift = torch.zeros(2, 3)
     shift[0, 1] = 1e-6
-    numeric = (mean(log_scale.detach() + shift) - mean(log_scale.detach() - shift)) / 2e-6
+    numeric = (
+        mean(log_scale.detach() + shift) - mean(log_scale.detach() - shift)
+    ) / 2e-6
     assert torch.allclose(gradient[0, 1], numeric, rtol=1e-6, atol=1e-8)
 
 

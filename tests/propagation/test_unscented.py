@@ -24,19 +24,28 @@ class Quadratic:
 
 @pytest.mark.parametrize("alpha", [1e-2, 0.3, 1.0, 1.7])
 @pytest.mark.parametrize("curvature", [0.0, 1.0, -3.0])
-def test_with_beta_of_two_a_quadratic_of_one_state_is_exact_whatever_alpha(alpha, curvature):
+def test_with_beta_of_two_a_quadratic_of_one_state_is_exact_whatever_alpha(
+    alpha, curvature
+):
     """Which is what beta is for (van der Merwe, 2004): Var[g x + 1/2 h x^2] = g^2 s + 1/2 h^2 s^2 about zero."""
     model, s = Quadratic(torch.tensor([0.7]), torch.tensor([[curvature]])), 0.4
-    moved = Unscented(alpha, beta=2.0).propagate(model, Gaussian(torch.zeros(1), torch.tensor([[s]])))
+    moved = Unscented(alpha, beta=2.0).propagate(
+        model, Gaussian(torch.zeros(1), torch.tensor([[s]]))
+    )
     assert float(moved.belief.mean) == pytest.approx(curvature * s / 2, rel=1e-9)
-    assert float(moved.belief.covariance) == pytest.approx(0.49 * s + curvature**2 * s**2 / 2, rel=1e-9)
+    assert float(moved.belief.covariance) == pytest.approx(
+        0.49 * s + curvature**2 * s**2 / 2, rel=1e-9
+    )
     assert float(moved.cross_covariance) == pytest.approx(0.7 * s, rel=1e-9)
 
 
 @pytest.mark.parametrize(
-    ("alpha", "beta", "kappa"), [(1.0, 0.0, 0.0), (0.5, 2.0, 1.0), (0.1, 1.0, -1.5), (2.0, -0.5, 3.0)]
+    ("alpha", "beta", "kappa"),
+    [(1.0, 0.0, 0.0), (0.5, 2.0, 1.0), (0.1, 1.0, -1.5), (2.0, -0.5, 3.0)],
 )
-def test_moments_of_a_quadratic_of_three_states_are_those_of_the_points_worked_out_by_hand(alpha, beta, kappa):
+def test_moments_of_a_quadratic_of_three_states_are_those_of_the_points_worked_out_by_hand(
+    alpha, beta, kappa
+):
     """Along the columns r_j of the root, d_j = 1/2 r_j'H r_j: the mean is sum d_j = 1/2 tr(H S) for all parameters.
 
     The variance is g'S g + (n + lambda) sum d_j^2 + (beta - alpha^2) (sum d_j)^2.
@@ -45,11 +54,17 @@ def test_moments_of_a_quadratic_of_three_states_are_those_of_the_points_worked_o
     H = root + root.T
     root = root @ root.T / 4  # symmetric, and so the root of its square
     S = root @ root
-    moved = Unscented(alpha, beta, kappa).propagate(Quadratic(g, H), Gaussian(torch.zeros(3), S))
+    moved = Unscented(alpha, beta, kappa).propagate(
+        Quadratic(g, H), Gaussian(torch.zeros(3), S)
+    )
     d = torch.stack([r @ H @ r for r in root]) / 2
     assert float(moved.belief.mean) == pytest.approx(float((H * S).sum() / 2), rel=1e-9)
-    variance = g @ S @ g + alpha**2 * (3 + kappa) * d @ d + (beta - alpha**2) * d.sum() ** 2
-    assert float(moved.belief.covariance) == pytest.approx(max(0.0, float(variance)), rel=1e-8)
+    variance = (
+        g @ S @ g + alpha**2 * (3 + kappa) * d @ d + (beta - alpha**2) * d.sum() ** 2
+    )
+    assert float(moved.belief.covariance) == pytest.approx(
+        max(0.0, float(variance)), rel=1e-8
+    )
     assert float(moved.deficit) == pytest.approx(max(0.0, -float(variance)), rel=1e-8)
     assert torch.allclose(moved.cross_covariance[:, 0], S @ g, rtol=1e-9)
 

@@ -23,7 +23,10 @@ def exact_solution(problem, lower=None, upper=None):
     P, q, G = rational(problem.P), rational(problem.q), rational(problem.G)
     n, M = len(q), len(problem.lower)
     C = np.vstack([rational(np.eye(n)), G])
-    low, high = (_bounds(problem.lower if lower is None else lower), _bounds(problem.upper if upper is None else upper))
+    low, high = (
+        _bounds(problem.lower if lower is None else lower),
+        _bounds(problem.upper if upper is None else upper),
+    )
     answers = solve_linear(P, np.column_stack([C.T, q]))  # P^-1 [C', q]
     K, y = C @ answers[:, :M], -(C @ answers[:, M])
     mu, working = zeros(M), {}  # constraint: +1 at its upper bound, -1 at its lower one
@@ -65,7 +68,9 @@ def exact_solution(problem, lower=None, upper=None):
 
 def rational(array):
     """The same numbers as Fractions."""
-    return np.array([Fraction(float(v)) for v in np.ravel(array)], dtype=object).reshape(np.shape(array))
+    return np.array(
+        [Fraction(float(v)) for v in np.ravel(array)], dtype=object
+    ).reshape(np.shape(array))
 
 
 def zeros(*shape):
@@ -90,7 +95,11 @@ def _bounds(values):
 
 
 def _excess(value, low, high):
-    return max(Fraction(0), Fraction(0) if high is None else value - high, Fraction(0) if low is None else low - value)
+    return max(
+        Fraction(0),
+        Fraction(0) if high is None else value - high,
+        Fraction(0) if low is None else low - value,
+    )
 
 
 def _prove_optimal(P, q, C, low, high, x, mu):
@@ -102,4 +111,11 @@ def _prove_optimal(P, q, C, low, high, x, mu):
 
 def _prove_infeasible(C, low, high, ray):
     assert not (C.T @ ray).any()
-    assert sum(y * (b if y > 0 else a) for y, a, b in zip(ray, low, high, strict=True) if y != 0) < 0
+    assert (
+        sum(
+            y * (b if y > 0 else a)
+            for y, a, b in zip(ray, low, high, strict=True)
+            if y != 0
+        )
+        < 0
+    )

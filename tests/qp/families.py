@@ -8,13 +8,23 @@ from gpmpc.qp import QuadraticProgram
 def base(rng, feasible=True, whole=False):
     """P, q, G and stacked bounds of a program of up to four variables, small integers or normal numbers."""
     n, m = int(rng.integers(1, 5)), int(rng.integers(1, 7))
-    draw = (lambda *shape: rng.integers(-3, 4, shape).astype(float)) if whole else (lambda *s: rng.standard_normal(s))
+    draw = (
+        (lambda *shape: rng.integers(-3, 4, shape).astype(float))
+        if whole
+        else (lambda *s: rng.standard_normal(s))
+    )
     root = draw(n, n)
-    P, q, G = root @ root.T + np.eye(n) * (1.0 if whole else 0.1), 3.0 * draw(n), draw(m, n)
+    P, q, G = (
+        root @ root.T + np.eye(n) * (1.0 if whole else 0.1),
+        3.0 * draw(n),
+        draw(m, n),
+    )
     P = (P + P.T) / 2
     C = np.vstack([np.eye(n), G])
     centre = C @ draw(n)
-    widths = rng.integers(0, 3, (2, n + m)) if whole else rng.uniform(0.0, 2.0, (2, n + m))
+    widths = (
+        rng.integers(0, 3, (2, n + m)) if whole else rng.uniform(0.0, 2.0, (2, n + m))
+    )
     lower, upper = centre - widths[0], centre + widths[1]
     if not feasible:
         shift = 2.0 * draw(n + m)
@@ -67,10 +77,18 @@ def nearly_infeasible(rng):
     kind = rng.integers(0, 3)
     if kind == 0:
         scale = rng.choice([1.0, 2.0, magnitude(rng, -3, 3)])
-        more, low, high = [a, scale * a], [-np.inf, scale * (size + gap)], [size, np.inf]
+        more, low, high = (
+            [a, scale * a],
+            [-np.inf, scale * (size + gap)],
+            [size, np.inf],
+        )
     elif kind == 1:
         b = rng.standard_normal(n)
-        more, low, high = [a, b, a + b], [-np.inf, -np.inf, 2.0 * size + gap], [size, size, np.inf]
+        more, low, high = (
+            [a, b, a + b],
+            [-np.inf, -np.inf, 2.0 * size + gap],
+            [size, size, np.inf],
+        )
     else:
         more, low, high = [np.abs(a)], [np.abs(a).sum() * size + gap], [np.inf]
         lower[:n], upper[:n] = -np.inf, size
@@ -104,7 +122,13 @@ def parallel_rows(rng):
         G.append(scale * row)
         low.append(values[0])
         high.append(values[1])
-    return program(P, q, np.array(G), np.concatenate([lower[:n], low]), np.concatenate([upper[:n], high]))
+    return program(
+        P,
+        q,
+        np.array(G),
+        np.concatenate([lower[:n], low]),
+        np.concatenate([upper[:n], high]),
+    )
 
 
 def small_direction(rng):
@@ -144,8 +168,16 @@ def scaled(rng):
         G, lower, upper = s[:, None] * G, lower.copy(), upper.copy()
         lower[n:], upper[n:] = s * lower[n:], s * upper[n:]
     if kinds[3]:
-        s = magnitude(rng, -12, 12) ** (rng.uniform(-1, 1, n) if rng.random() < 0.7 else np.ones(n))
-        P, q, G, lower, upper = P * np.outer(s, s), q * s, G * s, lower.copy(), upper.copy()
+        s = magnitude(rng, -12, 12) ** (
+            rng.uniform(-1, 1, n) if rng.random() < 0.7 else np.ones(n)
+        )
+        P, q, G, lower, upper = (
+            P * np.outer(s, s),
+            q * s,
+            G * s,
+            lower.copy(),
+            upper.copy(),
+        )
         P = (P + P.T) / 2
         lower[:n], upper[:n] = lower[:n] / s, upper[:n] / s
     finite = np.concatenate([lower, upper])
@@ -168,7 +200,11 @@ def degenerate(rng):
     G = np.vstack([G, rng.integers(-2, 3, (int(rng.integers(n, 3 * n + 3)), n))])
     values = G @ vertex
     upper = np.concatenate([np.full(n, np.inf), values])
-    lower = np.where(rng.random(n + len(G)) < 0.2, np.concatenate([vertex - 2.0, values - 3.0]), -np.inf)
+    lower = np.where(
+        rng.random(n + len(G)) < 0.2,
+        np.concatenate([vertex - 2.0, values - 3.0]),
+        -np.inf,
+    )
     if rng.random() < 0.5:
         q = -P @ vertex - G.T @ rng.integers(0, 2, len(G))
     return program(P, q.astype(float), G, lower, upper)

@@ -5,14 +5,19 @@ import numpy as np
 from gpmpc.qp import DualActiveSet, PrimalActiveSet, QuadraticProgram
 
 
-def integer_problem(rng: np.random.Generator, feasible: bool | None = None) -> QuadraticProgram:
+def integer_problem(
+    rng: np.random.Generator, feasible: bool | None = None
+) -> QuadraticProgram:
     """Small integers everywhere: ties, repeated rows, vertices met by too many constraints.
 
     With ``feasible=True`` the bounds admit an integer point, on which many of them hold with equality.
     """
     n, m = int(rng.integers(1, 9)), int(rng.integers(0, 15))
     root = rng.integers(-2, 3, (n, n))
-    P, q = (root.T @ root + np.eye(n)).astype(float), rng.integers(-5, 6, n).astype(float)
+    P, q = (
+        (root.T @ root + np.eye(n)).astype(float),
+        rng.integers(-5, 6, n).astype(float),
+    )
     G = rng.integers(-2, 3, (m, n)).astype(float)
     if m > 2 and rng.random() < 0.5:
         G[0], G[2] = G[1], 2.0 * G[1]
@@ -25,7 +30,9 @@ def integer_problem(rng: np.random.Generator, feasible: bool | None = None) -> Q
     return QuadraticProgram.from_stacked(P, q, G, lower, upper)
 
 
-def feasible_problem(rng: np.random.Generator, n: int, m: int, condition: float = 1e2) -> QuadraticProgram:
+def feasible_problem(
+    rng: np.random.Generator, n: int, m: int, condition: float = 1e2
+) -> QuadraticProgram:
     """A feasible problem whose Hessian has eigenvalues spread over ``condition``; about half of the bounds matter."""
     basis = np.linalg.qr(rng.standard_normal((n, n)))[0]
     eigenvalues = np.geomspace(1.0, condition, n) if n > 1 else np.ones(1)
@@ -57,7 +64,11 @@ def distance(problem: QuadraticProgram, x: np.ndarray, other: np.ndarray) -> flo
 
 
 def prepared(problem, warm_start=None):
-    return DualActiveSet().prepare(problem.P, problem.G).solve(problem.q, problem.lower, problem.upper, warm_start)
+    return (
+        DualActiveSet()
+        .prepare(problem.P, problem.G)
+        .solve(problem.q, problem.lower, problem.upper, warm_start)
+    )
 
 
 def changing(problem, warm_start=None):
@@ -70,4 +81,6 @@ def primal(problem, warm_start=None):
 
 def solve_stacked(P, q, G, lower, upper, warm_start=None, prices=None):
     """The solution of arrays that nobody has checked."""
-    return DualActiveSet().solve(QuadraticProgram.unchecked(P, q, G, lower, upper), warm_start, prices)
+    return DualActiveSet().solve(
+        QuadraticProgram.unchecked(P, q, G, lower, upper), warm_start, prices
+    )

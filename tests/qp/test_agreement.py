@@ -8,9 +8,19 @@ from hypothesis import strategies as st
 
 from gpmpc.qp import CvxpySolver, PrimalActiveSet, QuadraticProgram
 from gpmpc.status import Status
-from tests.qp.problems import changing, distance, feasible_problem, integer_problem, prepared, worst_residual
+from tests.qp.problems import (
+    changing,
+    distance,
+    feasible_problem,
+    integer_problem,
+    prepared,
+    worst_residual,
+)
 
-DAQP_SOLVED, DAQP_INFEASIBLE = (1, 2), (-1, -6)  # -6: infeasible by its presolve of equal or crossed bounds
+DAQP_SOLVED, DAQP_INFEASIBLE = (
+    (1, 2),
+    (-1, -6),
+)  # -6: infeasible by its presolve of equal or crossed bounds
 
 
 def daqp_solution(problem: QuadraticProgram):
@@ -26,7 +36,9 @@ def daqp_solution(problem: QuadraticProgram):
 
 @pytest.mark.parametrize("feasible", [True, None])
 @pytest.mark.parametrize("block", range(4))
-def test_no_disagreement_with_daqp_on_integer_problems_feasible_and_infeasible(block, feasible):
+def test_no_disagreement_with_daqp_on_integer_problems_feasible_and_infeasible(
+    block, feasible
+):
     rng = np.random.default_rng([block, bool(feasible)])
     outcomes = set()
     for _ in range(600):
@@ -73,25 +85,36 @@ numbers = st.integers(-3, 3).map(float)
 @st.composite
 def small_problems(draw):
     n, m = draw(st.integers(1, 4)), draw(st.integers(0, 6))
-    root = np.array(draw(st.lists(numbers, min_size=n * n, max_size=n * n))).reshape(n, n)
+    root = np.array(draw(st.lists(numbers, min_size=n * n, max_size=n * n))).reshape(
+        n, n
+    )
     P = root.T @ root + draw(st.sampled_from([1e-3, 1.0, 100.0])) * np.eye(n)
     q = np.array(draw(st.lists(numbers, min_size=n, max_size=n)))
     G = np.array(draw(st.lists(numbers, min_size=m * n, max_size=m * n))).reshape(m, n)
     bound = st.one_of(st.none(), numbers)
     lower, upper = [], []
     for _ in range(n + m):
-        low, width = draw(bound), draw(st.one_of(st.none(), st.sampled_from([0.0, 0.5, 2.0])))
+        low, width = (
+            draw(bound),
+            draw(st.one_of(st.none(), st.sampled_from([0.0, 0.5, 2.0]))),
+        )
         lower.append(-np.inf if low is None else low)
         upper.append(np.inf if width is None else (0.0 if low is None else low) + width)
     guess = draw(st.lists(st.sampled_from([-1, 0, 1]), min_size=n + m, max_size=n + m))
-    return QuadraticProgram.from_stacked(P, q, G, np.array(lower), np.array(upper)), np.array(guess)
+    return QuadraticProgram.from_stacked(
+        P, q, G, np.array(lower), np.array(upper)
+    ), np.array(guess)
 
 
 @given(small_problems())
 @settings(max_examples=400, deadline=None, derandomize=True)
 def test_three_methods_agree_on_whatever_hypothesis_invents(case):
     problem, guess = case
-    solutions = [prepared(problem, guess), changing(problem, guess), PrimalActiveSet().solve(problem, guess)]
+    solutions = [
+        prepared(problem, guess),
+        changing(problem, guess),
+        PrimalActiveSet().solve(problem, guess),
+    ]
     assert len({solution.status for solution in solutions}) == 1
     assert solutions[0].status in (Status.SOLVED, Status.INFEASIBLE)
     if solutions[0].status.solved:

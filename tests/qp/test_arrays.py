@@ -15,7 +15,9 @@ ODD = {
     "a list": lambda a: a.tolist(),
     "another byte order": lambda a: a.astype(a.dtype.newbyteorder()),
     "a dtype that was pickled": lambda a: pickle.loads(pickle.dumps(a)),
-    "unaligned": lambda a: np.frombuffer(b"x" + a.tobytes(), dtype=float, offset=1).reshape(a.shape),
+    "unaligned": lambda a: np.frombuffer(
+        b"x" + a.tobytes(), dtype=float, offset=1
+    ).reshape(a.shape),
     "read-only": lambda a: np.frombuffer(a.tobytes()).reshape(a.shape),
     "integers": lambda a: np.rint(a).astype(np.int64),
 }
@@ -37,23 +39,32 @@ def test_an_odd_array_is_read_as_what_it_is(odd, position, rng):
     expected = solve_stacked(*arrays)
     solutions = [solve_stacked(*given), solve_stacked(*given, expected)]
     prepared = DualActiveSet().prepare(given[0], given[2])
-    solutions += [prepared.solve(given[1], *given[3:]), prepared.solve(given[1], *given[3:], expected)]
+    solutions += [
+        prepared.solve(given[1], *given[3:]),
+        prepared.solve(given[1], *given[3:], expected),
+    ]
     for solution in solutions:
         assert solution.status is expected.status
         if expected.status.solved:
             assert worst_residual(solution) < 1e-9
-            np.testing.assert_allclose(solution.x, expected.x, atol=1e-9 * max(1.0, np.abs(expected.x).max()))
+            np.testing.assert_allclose(
+                solution.x, expected.x, atol=1e-9 * max(1.0, np.abs(expected.x).max())
+            )
 
 
 def test_an_axis_of_length_one_may_have_any_stride():
     """NumPy calls such arrays contiguous whatever their strides; the solve then ended in memory never written to."""
     wide, rows = np.arange(1.0, 10.0).reshape(3, 3), np.array([[1.0, 2.0]])
     one = QuadraticProgram(wide[:1, :1], [-3.0], rows.T, [-9.0, -9.0], [1.0, 1.0])
-    several = QuadraticProgram(np.eye(2), [-3.0, 0.0], np.ones((4, 2))[::2][:1], [-9.0], [1.0])
+    several = QuadraticProgram(
+        np.eye(2), [-3.0, 0.0], np.ones((4, 2))[::2][:1], [-9.0], [1.0]
+    )
     for problem, x in ((one, [0.5]), (several, [2.0, -1.0])):
         for array in (problem.P, problem.G):
             assert array.strides == np.empty(array.shape).strides
-        solution = solve_stacked(problem.P, problem.q, problem.G, problem.lower, problem.upper)
+        solution = solve_stacked(
+            problem.P, problem.q, problem.G, problem.lower, problem.upper
+        )
         np.testing.assert_allclose(solution.x, x)
         assert solution.iterations <= 3
 
@@ -65,7 +76,10 @@ def test_eight_bytes_of_another_kind_are_not_taken_for_a_float(kind, rng):
     q = np.arange(3).astype(kind)
     expected = solve_stacked(problem.P, np.arange(3.0), problem.G, *rest)
     prepared = DualActiveSet().prepare(problem.P, problem.G)
-    for solution in (prepared.solve(q, *rest, expected), solve_stacked(problem.P, q, problem.G, *rest)):
+    for solution in (
+        prepared.solve(q, *rest, expected),
+        solve_stacked(problem.P, q, problem.G, *rest),
+    ):
         np.testing.assert_allclose(solution.x, expected.x, atol=1e-9)
 
 
@@ -73,7 +87,13 @@ def test_a_record_with_gaps_is_a_warm_start_too(rng):
     problem = feasible_problem(rng, 6, 9)
     cold = DualActiveSet().solve(problem)
     gappy = cold._replace(record=np.repeat(cold.record, 2)[::2])
-    prepared, vectors = DualActiveSet().prepare(problem.P, problem.G), (problem.q, problem.lower, problem.upper)
-    for solution in (DualActiveSet().solve(problem, gappy), prepared.solve(*vectors, gappy)):
+    prepared, vectors = (
+        DualActiveSet().prepare(problem.P, problem.G),
+        (problem.q, problem.lower, problem.upper),
+    )
+    for solution in (
+        DualActiveSet().solve(problem, gappy),
+        prepared.solve(*vectors, gappy),
+    ):
         assert solution.status.solved
         np.testing.assert_allclose(solution.x, cold.x, atol=1e-9)

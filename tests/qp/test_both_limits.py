@@ -10,18 +10,26 @@ from tests.qp.problems import feasible_problem
 
 @pytest.mark.parametrize("mode", ["prepared", "changing"])
 @pytest.mark.parametrize("limit", [10, 40, 80])
-def test_a_solve_stops_at_its_iteration_limit_however_much_time_there_is(mode, limit, rng):
+def test_a_solve_stops_at_its_iteration_limit_however_much_time_there_is(
+    mode, limit, rng
+):
     for _ in range(4):
         problem = feasible_problem(rng, 40, 80)
         solver = DualActiveSet(iteration_limit=limit, time_limit=60.0)
         if mode == "prepared":
-            solution = solver.prepare(problem.P, problem.G).solve(problem.q, problem.lower, problem.upper)
+            solution = solver.prepare(problem.P, problem.G).solve(
+                problem.q, problem.lower, problem.upper
+            )
         else:
             solution = solver.solve(problem)
         assert solution.status is Status.ITERATION_LIMIT
-        assert limit <= solution.iterations <= limit + 50  # it looks at its count now and then
+        assert (
+            limit <= solution.iterations <= limit + 50
+        )  # it looks at its count now and then
         residuals = solution.residuals()
-        assert residuals.dual < 1e-9  # an iterate of a dual method is stationary, and outside its bounds
+        assert (
+            residuals.dual < 1e-9
+        )  # an iterate of a dual method is stationary, and outside its bounds
         assert residuals.primal > 1e-6
         assert solution.objective <= DualActiveSet().solve(problem).objective + 1e-9
         assert np.isfinite(solution.x).all()

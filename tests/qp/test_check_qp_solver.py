@@ -11,7 +11,11 @@ from gpmpc.testing import check_qp_solver
 HONEST = DualActiveSet()
 
 
-@pytest.mark.parametrize("solver", [DualActiveSet(), PrimalActiveSet(), CvxpySolver()], ids=lambda s: type(s).__name__)
+@pytest.mark.parametrize(
+    "solver",
+    [DualActiveSet(), PrimalActiveSet(), CvxpySolver()],
+    ids=lambda s: type(s).__name__,
+)
 def test_the_packages_own_solvers_pass(solver):
     check_qp_solver(solver)
 
@@ -38,7 +42,9 @@ def multipliers_of_the_other_sign(_, problem, warm_start):
 
 def slightly_off(_, problem, warm_start):
     solution = HONEST.solve(problem, warm_start)
-    return make_solution(problem, solution.status, solution.x + 1e-4, solution.multipliers)
+    return make_solution(
+        problem, solution.status, solution.x + 1e-4, solution.multipliers
+    )
 
 
 def everything_is_solved(_, problem, warm_start):
@@ -58,7 +64,12 @@ def scribbles_on_the_input(_, problem, warm_start):
 
 def believes_its_warm_start(_, problem, warm_start):
     if isinstance(warm_start, np.ndarray) and (warm_start > 0).all():
-        return make_solution(problem, Status.SOLVED, np.minimum(problem.ub, 1.0), np.zeros(len(problem.lower)))
+        return make_solution(
+            problem,
+            Status.SOLVED,
+            np.minimum(problem.ub, 1.0),
+            np.zeros(len(problem.lower)),
+        )
     return HONEST.solve(problem, warm_start)
 
 
@@ -68,7 +79,9 @@ def reuses_its_memory(self, problem, warm_start):
         self.shared = np.zeros(len(solution.record))
     record = self.shared[: len(solution.record)]
     record[:] = solution.record
-    return solution._replace(x=record[layout.HEADER : layout.HEADER + len(problem.q)], record=record)
+    return solution._replace(
+        x=record[layout.HEADER : layout.HEADER + len(problem.q)], record=record
+    )
 
 
 @pytest.mark.parametrize(
@@ -90,4 +103,7 @@ def test_each_kind_of_liar_is_found_out(flaw, message):
 
 def test_a_solver_ends_with_any_status_but_those_of_what_made_the_program():
     assert len(layout.STATUSES) == len(set(layout.STATUSES))
-    assert set(layout.STATUSES) == set(Status) - {Status.INVALID_MEASUREMENT, Status.FUNCTION_NOT_FINITE}
+    assert set(layout.STATUSES) == set(Status) - {
+        Status.INVALID_MEASUREMENT,
+        Status.FUNCTION_NOT_FINITE,
+    }

@@ -6,7 +6,14 @@ from scipy.linalg import hilbert
 
 from gpmpc.qp import QuadraticProgram
 from gpmpc.status import Status
-from tests.qp.problems import changing, feasible_problem, prepared, primal, stacked_rows, worst_residual
+from tests.qp.problems import (
+    changing,
+    feasible_problem,
+    prepared,
+    primal,
+    stacked_rows,
+    worst_residual,
+)
 
 ALL = pytest.mark.parametrize("solve", [prepared, changing, primal])
 DUAL = pytest.mark.parametrize("solve", [prepared, changing])
@@ -14,11 +21,17 @@ DUAL = pytest.mark.parametrize("solve", [prepared, changing])
 
 @ALL
 @pytest.mark.parametrize("n", [2, 5, 8])
-def test_klee_minty_cubes_are_solved_in_far_fewer_than_exponentially_many_steps(solve, n):
+def test_klee_minty_cubes_are_solved_in_far_fewer_than_exponentially_many_steps(
+    solve, n
+):
     # sum_{j<i} 2^(i-j+1) x_j + x_i <= 5^i, x >= 0 (Klee and Minty, 1972), with a small Hessian
-    G = np.tril(2.0 ** (np.subtract.outer(np.arange(n), np.arange(n)) + 1.0), -1) + np.eye(n)
+    G = np.tril(
+        2.0 ** (np.subtract.outer(np.arange(n), np.arange(n)) + 1.0), -1
+    ) + np.eye(n)
     q = -(2.0 ** np.arange(n - 1, -1, -1))
-    problem = QuadraticProgram(1e-3 * np.eye(n), q, G, h_upper=5.0 ** np.arange(1, n + 1), lb=np.zeros(n))
+    problem = QuadraticProgram(
+        1e-3 * np.eye(n), q, G, h_upper=5.0 ** np.arange(1, n + 1), lb=np.zeros(n)
+    )
     solution = solve(problem)
     assert solution.status is Status.SOLVED
     assert worst_residual(solution) < 1e-9
@@ -30,7 +43,13 @@ def test_klee_minty_cubes_are_solved_in_far_fewer_than_exponentially_many_steps(
 def test_hilbert_hessians_are_solved_to_1e_9(solve, n):
     P = hilbert(n)
     problem = QuadraticProgram(
-        P, -P @ np.linspace(-2.0, 2.0, n), np.ones((1, n)), [0.5], [0.5], -np.ones(n), np.ones(n)
+        P,
+        -P @ np.linspace(-2.0, 2.0, n),
+        np.ones((1, n)),
+        [0.5],
+        [0.5],
+        -np.ones(n),
+        np.ones(n),
     )
     solution = solve(problem)
     assert solution.status is Status.SOLVED
@@ -62,7 +81,9 @@ def test_a_vertex_met_by_many_more_constraints_than_variables_is_found(solve, n,
     vertex = rng.standard_normal(n)
     G = rng.standard_normal((40, n))
     G[:, 0] = np.abs(G[:, 0]) + 1.0
-    problem = QuadraticProgram(np.eye(n), -vertex - 5.0 * G.sum(axis=0), G, h_upper=G @ vertex)
+    problem = QuadraticProgram(
+        np.eye(n), -vertex - 5.0 * G.sum(axis=0), G, h_upper=G @ vertex
+    )
     solution = solve(problem)
     assert solution.status is Status.SOLVED
     assert worst_residual(solution) < 1e-9
@@ -82,19 +103,30 @@ def test_equalities_alone_give_the_solution_of_their_kkt_system(solve, rng):
 
 
 @ALL
-def test_dependent_equalities_that_agree_are_solved_and_those_that_do_not_are_infeasible(solve, rng):
+def test_dependent_equalities_that_agree_are_solved_and_those_that_do_not_are_infeasible(
+    solve, rng
+):
     n = 4
     G = rng.standard_normal((3, n))
     G = np.vstack([G, G[0] + G[1], 2.0 * G[2]])
     b = G @ rng.standard_normal(n)
     assert solve(QuadraticProgram(np.eye(n), np.ones(n), G, b, b)).is_optimal(1e-9)
     b[3] += 1e-3
-    assert solve(QuadraticProgram(np.eye(n), np.ones(n), G, b, b)).status is Status.INFEASIBLE
+    assert (
+        solve(QuadraticProgram(np.eye(n), np.ones(n), G, b, b)).status
+        is Status.INFEASIBLE
+    )
 
 
 @DUAL
 def test_infeasibility_comes_with_a_farkas_proof(solve, rng):
-    problem = QuadraticProgram(np.eye(3), np.ones(3), rng.random((4, 3)), h_lower=np.full(4, 9.0), ub=np.ones(3))
+    problem = QuadraticProgram(
+        np.eye(3),
+        np.ones(3),
+        rng.random((4, 3)),
+        h_lower=np.full(4, 9.0),
+        ub=np.ones(3),
+    )
     solution = solve(problem)
     assert solution.status is Status.INFEASIBLE
     ray = solution.multipliers
@@ -108,7 +140,9 @@ def test_infeasibility_comes_with_a_farkas_proof(solve, rng):
 def test_a_thin_but_real_feasible_set_is_not_called_infeasible(solve, gap):
     # two nearly parallel rows leave a sliver between them
     G = np.array([[1.0, 1.0], [1.0 + gap, 1.0], [0.0, 1.0]])
-    problem = QuadraticProgram(np.eye(2), [-1.0, -1.0], G, [1.0, -np.inf, -np.inf], [np.inf, 1.0, 5.0])
+    problem = QuadraticProgram(
+        np.eye(2), [-1.0, -1.0], G, [1.0, -np.inf, -np.inf], [np.inf, 1.0, 5.0]
+    )
     solution = solve(problem)
     assert solution.status is Status.SOLVED
     assert worst_residual(solution) < 1e-9

@@ -12,7 +12,9 @@ from tests.qp.problems import distance, feasible_problem
 
 
 def test_an_unknown_solver_is_refused_with_the_list_of_those_installed():
-    with pytest.raises(ProblemError, match=r"no solver named 'GUROBIX'; it finds .*CLARABEL"):
+    with pytest.raises(
+        ProblemError, match=r"no solver named 'GUROBIX'; it finds .*CLARABEL"
+    ):
         CvxpySolver("GUROBIX")
 
 
@@ -29,7 +31,11 @@ assert "cvxpy" in sys.modules
 
 @pytest.mark.parametrize("name", ["CLARABEL", "DAQP", "OSQP"])
 def test_several_solvers_behind_cvxpy_find_our_minimiser_and_multipliers(name, rng):
-    options = {"eps_abs": 1e-9, "eps_rel": 1e-9, "max_iter": 100000} if name == "OSQP" else None
+    options = (
+        {"eps_abs": 1e-9, "eps_rel": 1e-9, "max_iter": 100000}
+        if name == "OSQP"
+        else None
+    )
     solver = CvxpySolver(name, options)
     for n, m in ((3, 0), (4, 6), (12, 20)):
         problem = feasible_problem(rng, n, m)
@@ -47,13 +53,17 @@ def test_a_second_problem_of_the_same_shape_is_not_compiled_again(rng):
     second = solver.solve(second_problem, first)
     assert second.is_optimal(1e-6)
     assert _compile.cache_info().misses == 1
-    np.testing.assert_allclose(second.x, DualActiveSet().solve(second_problem).x, atol=1e-6)
+    np.testing.assert_allclose(
+        second.x, DualActiveSet().solve(second_problem).x, atol=1e-6
+    )
 
 
 def test_the_store_of_compiled_problems_stays_small():
     solver = CvxpySolver()
     for n in range(1, 70):
-        assert solver.solve(QuadraticProgram(np.eye(n), np.ones(n), lb=np.zeros(n))).status.solved
+        assert solver.solve(
+            QuadraticProgram(np.eye(n), np.ones(n), lb=np.zeros(n))
+        ).status.solved
     assert _compile.cache_info().currsize == 64
 
 
@@ -66,7 +76,9 @@ def test_an_answer_that_its_residuals_do_not_bear_out_is_not_called_solved(rng):
 
 
 def test_an_iteration_limit_is_translated(rng):
-    solution = CvxpySolver("CLARABEL", {"max_iter": 2}).solve(feasible_problem(rng, 10, 15))
+    solution = CvxpySolver("CLARABEL", {"max_iter": 2}).solve(
+        feasible_problem(rng, 10, 15)
+    )
     assert solution.status is Status.ITERATION_LIMIT
 
 

@@ -17,7 +17,9 @@ ROUNDING = Fraction(1, 10**14)
 
 
 def guessed(problem):
-    guess = np.random.default_rng(len(problem.lower)).integers(-1, 2, len(problem.lower))
+    guess = np.random.default_rng(len(problem.lower)).integers(
+        -1, 2, len(problem.lower)
+    )
     return prepared(problem, guess)
 
 
@@ -27,10 +29,15 @@ def error(problem, x, exact):
         return np.inf
     units = np.sqrt(np.diagonal(problem.P))
     exact_x = np.array([float(value) for value in exact])
-    difference = np.array([abs(float(Fraction(float(a)) - b)) for a, b in zip(x, exact, strict=True)])
+    difference = np.array(
+        [abs(float(Fraction(float(a)) - b)) for a, b in zip(x, exact, strict=True)]
+    )
     zero = 1e-12 * np.abs(problem.q / units).max()
     plain = difference.max() / max(np.abs(exact_x).max(), (zero / units).max(), 1e-300)
-    return max(plain, (units * difference).max() / max((units * np.abs(exact_x)).max(), zero, 1e-300))
+    return max(
+        plain,
+        (units * difference).max() / max((units * np.abs(exact_x)).max(), zero, 1e-300),
+    )
 
 
 def row_sizes(problem, x):
@@ -39,7 +46,9 @@ def row_sizes(problem, x):
     terms = np.append(np.abs(x), np.abs(problem.G) @ np.abs(x))
     sizes = np.maximum(np.where(np.isfinite(sizes), sizes, 0.0).max(axis=0), terms)
     empty = np.append(np.zeros(len(problem.q), dtype=bool), ~problem.G.any(axis=1))
-    return np.where(empty, zero_row_size(problem.G, problem.lower, problem.upper), sizes)
+    return np.where(
+        empty, zero_row_size(problem.G, problem.lower, problem.upper), sizes
+    )
 
 
 def solves_up_to_rounding(problem, x):
@@ -64,10 +73,20 @@ def solves_up_to_rounding(problem, x):
 
 def proves_infeasibility_up_to_rounding(problem, ray):
     """Whether a change of the entries of C by 1e-14 of themselves makes the ray Farkas' proof (Oettli, Prager)."""
-    y, C = rational(ray), np.vstack([rational(np.eye(len(problem.q))), rational(problem.G)])
+    y, C = (
+        rational(ray),
+        np.vstack([rational(np.eye(len(problem.q))), rational(problem.G)]),
+    )
     if not (abs(C.T @ y) <= ROUNDING * (abs(C.T) @ abs(y))).all():
         return False
-    return sum(a * Fraction(float(problem.upper[p] if a > 0 else problem.lower[p])) for p, a in enumerate(y) if a) < 0
+    return (
+        sum(
+            a * Fraction(float(problem.upper[p] if a > 0 else problem.lower[p]))
+            for p, a in enumerate(y)
+            if a
+        )
+        < 0
+    )
 
 
 def unsolved(family, solve, count):
@@ -83,7 +102,9 @@ def unsolved(family, solve, count):
             if exact is not None:
                 assert solution.is_optimal(1e-8), (case, solution.residuals())
         elif solution.status is Status.INFEASIBLE:
-            assert exact is None or proves_infeasibility_up_to_rounding(problem, solution.multipliers), case
+            assert exact is None or proves_infeasibility_up_to_rounding(
+                problem, solution.multipliers
+            ), case
         else:
             left += 1
     return left
@@ -107,17 +128,37 @@ def test_no_answer_of_two_thousand_is_wrong(family, solve):
     assert unsolved(family, solve, STUDY) <= UNSOLVED * STUDY
 
 
-@pytest.mark.parametrize("family", ["huge_bounds", "nearly_infeasible", "parallel_rows", "small_numbers", "degenerate"])
-def test_rows_at_prices_beyond_their_multipliers_have_the_exact_solution_of_hard_ones(family):
-    rng, solver, feasible = np.random.default_rng([15, list(FAMILIES).index(family)]), DualActiveSet(), 0
+@pytest.mark.parametrize(
+    "family",
+    [
+        "huge_bounds",
+        "nearly_infeasible",
+        "parallel_rows",
+        "small_numbers",
+        "degenerate",
+    ],
+)
+def test_rows_at_prices_beyond_their_multipliers_have_the_exact_solution_of_hard_ones(
+    family,
+):
+    rng, solver, feasible = (
+        np.random.default_rng([15, list(FAMILIES).index(family)]),
+        DualActiveSet(),
+        0,
+    )
     for number in range(20):
         problem = FAMILIES[family](rng)
         exact, hard = exact_solution(problem), changing(problem)
         if exact is not None and hard.status.solved:
-            prices = np.full(len(problem.G), 2.0 * max(np.abs(hard.z).max(initial=0.0), np.finfo(float).tiny))
+            prices = np.full(
+                len(problem.G),
+                2.0 * max(np.abs(hard.z).max(initial=0.0), np.finfo(float).tiny),
+            )
             for solution in (
                 solver.solve(problem, prices=prices),
-                solver.prepare(problem.P, problem.G, prices).solve(problem.q, problem.lower, problem.upper),
+                solver.prepare(problem.P, problem.G, prices).solve(
+                    problem.q, problem.lower, problem.upper
+                ),
             ):
                 assert solution.status is Status.SOLVED, (family, number)
                 assert error(problem, solution.x, exact) < 1e-6, (family, number)
@@ -131,8 +172,16 @@ def test_rows_at_prices_beyond_their_multipliers_have_the_exact_solution_of_hard
 @pytest.mark.parametrize("sign", [-1.0, 1.0])
 def test_a_large_bound_on_one_side_leaves_the_other_as_it_is(solve, size, place, sign):
     sides = sorted([-sign * size, sign])
-    bounds = {"lb": sides[:1], "ub": sides[1:]} if place == "box" else {"h_lower": sides[:1], "h_upper": sides[1:]}
-    solution = solve(QuadraticProgram(np.eye(1), [-5.0 * sign], None if place == "box" else np.eye(1), **bounds))
+    bounds = (
+        {"lb": sides[:1], "ub": sides[1:]}
+        if place == "box"
+        else {"h_lower": sides[:1], "h_upper": sides[1:]}
+    )
+    solution = solve(
+        QuadraticProgram(
+            np.eye(1), [-5.0 * sign], None if place == "box" else np.eye(1), **bounds
+        )
+    )
     assert solution.status is Status.SOLVED
     assert solution.x[0] == sign
 
@@ -148,9 +197,13 @@ def test_what_only_looks_like_a_contradiction_is_solved(solve, share):
 
 
 @pytest.mark.parametrize("solve", [changing, prepared, primal])
-def test_a_zero_row_that_misses_zero_by_rounding_proves_nothing_and_one_that_misses_it_by_more_does(solve):
+def test_a_zero_row_that_misses_zero_by_rounding_proves_nothing_and_one_that_misses_it_by_more_does(
+    solve,
+):
     for bound, status in ((-1e-17, Status.SOLVED), (-1e-6, Status.INFEASIBLE)):
-        problem = QuadraticProgram(np.eye(2), [-1.0, 2.0], np.zeros((1, 2)), h_upper=[bound])
+        problem = QuadraticProgram(
+            np.eye(2), [-1.0, 2.0], np.zeros((1, 2)), h_upper=[bound]
+        )
         assert solve(problem).status is status
 
 

@@ -19,7 +19,9 @@ PACKAGE = Path(__file__).resolve().parents[2] / "gpmpc"
 
 
 @pytest.mark.parametrize("mode", ["prepared", "changing"])
-def test_the_iteration_limit_returns_a_dual_iterate_from_which_the_next_solve_goes_on(mode, rng):
+def test_the_iteration_limit_returns_a_dual_iterate_from_which_the_next_solve_goes_on(
+    mode, rng
+):
     problem = feasible_problem(rng, 20, 30)
     full = DualActiveSet().solve(problem)
     assert full.iterations > 6
@@ -52,7 +54,9 @@ def test_the_time_limit_stops_a_long_solve_and_does_not_touch_a_short_one(mode, 
 
     def solve(solver):
         if mode == "prepared":
-            return solver.prepare(problem.P, problem.G).solve(problem.q, problem.lower, problem.upper)
+            return solver.prepare(problem.P, problem.G).solve(
+                problem.q, problem.lower, problem.upper
+            )
         return solver.solve(problem)
 
     hurried = solve(DualActiveSet(time_limit=1e-7))
@@ -84,7 +88,10 @@ def test_one_solver_and_one_prepared_problem_serve_many_threads(rng):
     def work(_):
         own = DualActiveSet()
         return [
-            [[own.solve(p).x for p in problems], [prepared.solve(q, shared.lower, shared.upper).x for q in gradients]]
+            [
+                [own.solve(p).x for p in problems],
+                [prepared.solve(q, shared.lower, shared.upper).x for q in gradients],
+            ]
             for _ in range(50)
         ]
 
@@ -127,15 +134,21 @@ def copy_of_the_package(folder):
 
 
 def test_a_new_process_takes_its_kernels_from_the_cache_of_the_last_one():
-    DualActiveSet().prepare(np.eye(2))  # fills the cache beside the source, unless it is there already
+    DualActiveSet().prepare(
+        np.eye(2)
+    )  # fills the cache beside the source, unless it is there already
     assert first_solve(PACKAGE.parent) == 0
 
 
 @pytest.mark.slow
 def test_the_solver_works_where_no_compiled_code_can_be_kept(tmp_path):
     copy_of_the_package(tmp_path)
-    (tmp_path / "gpmpc" / "qp" / "__pycache__").write_text("in the way of the cache beside the source")
-    nowhere = str(tmp_path / "gpmpc" / "status.py")  # a file: no cache folder can be made below it
+    (tmp_path / "gpmpc" / "qp" / "__pycache__").write_text(
+        "in the way of the cache beside the source"
+    )
+    nowhere = str(
+        tmp_path / "gpmpc" / "status.py"
+    )  # a file: no cache folder can be made below it
     first_solve(tmp_path, HOME=nowhere, XDG_CACHE_HOME=nowhere, NUMBA_CACHE_DIR="")
 
 
@@ -152,12 +165,20 @@ def crowded_vertex(rng):
     """More rows than variables through one vertex, the solution; some are repeated or sums of others."""
     n = int(rng.integers(18, 40))
     m = int(rng.integers(n, 4 * n))
-    root, G, vertex = rng.standard_normal((n, n)), rng.standard_normal((m, n)), rng.standard_normal(n)
+    root, G, vertex = (
+        rng.standard_normal((n, n)),
+        rng.standard_normal((m, n)),
+        rng.standard_normal(n),
+    )
     if rng.random() < 0.3:
         root, G, vertex = (np.round(2.0 * part) for part in (root, G, vertex))
-    G[m // 2 :] = G[: m - m // 2] + G[rng.integers(0, m // 2, m - m // 2)] * (rng.random() < 0.5)
+    G[m // 2 :] = G[: m - m // 2] + G[rng.integers(0, m // 2, m - m // 2)] * (
+        rng.random() < 0.5
+    )
     P = root @ root.T / n + 10.0 ** rng.uniform(-3, 0) * np.eye(n)
-    q = -P @ vertex - G.T @ (rng.uniform(0, 1, m) * (rng.random(m) < rng.uniform(0.3, 1.0)))
+    q = -P @ vertex - G.T @ (
+        rng.uniform(0, 1, m) * (rng.random(m) < rng.uniform(0.3, 1.0))
+    )
     return QuadraticProgram((P + P.T) / 2, q, G, h_upper=G @ vertex), vertex
 
 
@@ -168,7 +189,9 @@ def test_vertices_where_many_rows_meet_are_found_without_cycling(mode, rng):
         problem, vertex = crowded_vertex(rng)
         prepared = solver.prepare(problem.P, problem.G)
         solution = (
-            prepared.solve(problem.q, problem.lower, problem.upper) if mode == "prepared" else solver.solve(problem)
+            prepared.solve(problem.q, problem.lower, problem.upper)
+            if mode == "prepared"
+            else solver.solve(problem)
         )
         assert solution.status is Status.SOLVED
         x, _, flag, _ = daqp.solve(
@@ -190,10 +213,14 @@ def test_rows_that_depend_on_each_other_but_for_rounding_are_no_obstacle(mode, r
         P = root @ root.T / n + 1e-4 * np.eye(n)
         G = rng.standard_normal((m, n // 2)) @ rng.standard_normal((n // 2, n))
         multipliers = rng.uniform(0, 1, m) * (rng.random(m) < 0.5)
-        problem = QuadraticProgram((P + P.T) / 2, -P @ vertex - G.T @ multipliers, G, h_upper=G @ vertex)
+        problem = QuadraticProgram(
+            (P + P.T) / 2, -P @ vertex - G.T @ multipliers, G, h_upper=G @ vertex
+        )
         prepared = solver.prepare(problem.P, problem.G)
         solution = (
-            prepared.solve(problem.q, problem.lower, problem.upper) if mode == "prepared" else solver.solve(problem)
+            prepared.solve(problem.q, problem.lower, problem.upper)
+            if mode == "prepared"
+            else solver.solve(problem)
         )
         assert solution.status is Status.SOLVED
         np.testing.assert_allclose(solution.x, vertex, atol=1e-6 * np.abs(vertex).max())
@@ -204,10 +231,13 @@ def test_a_second_look_keeps_the_time_limit(rng):
     problem = feasible_problem(rng, 60, 120)
     G = np.vstack([problem.G, problem.G + 1e-9 * rng.standard_normal(problem.G.shape)])
     low, high = (
-        np.concatenate([h, h + 1e-9 * rng.standard_normal(len(h))]) for h in (problem.h_lower, problem.h_upper)
+        np.concatenate([h, h + 1e-9 * rng.standard_normal(len(h))])
+        for h in (problem.h_lower, problem.h_upper)
     )
     low[120:130] = high[120:130]
-    problem = QuadraticProgram(problem.P, problem.q, G, low, np.maximum(low, high), problem.lb, problem.ub)
+    problem = QuadraticProgram(
+        problem.P, problem.q, G, low, np.maximum(low, high), problem.lb, problem.ub
+    )
     for limit in (1e-3, 1e-2):
         began = perf_counter()
         solution = DualActiveSet(time_limit=limit).solve(problem)

@@ -13,10 +13,20 @@ def near_dependent_problem(rng, feasible=True):
     root = rng.integers(-16, 17, (n, n)) / 8.0
     base = rng.integers(-16, 17, (max(1, m // 4), n)) / 8.0
     G = base[rng.integers(0, len(base), m)] * np.exp2(rng.integers(-3, 4, m))[:, None]
-    G += 2.0 ** -int(rng.integers(10, 50)) * rng.integers(-3, 4, (m, n)) * (rng.random((m, 1)) < 0.5)
-    P, q = root @ root.T + 10.0 ** rng.integers(-6, 3) * np.eye(n), rng.integers(-160, 161, n) / 16.0
+    G += (
+        2.0 ** -int(rng.integers(10, 50))
+        * rng.integers(-3, 4, (m, n))
+        * (rng.random((m, 1)) < 0.5)
+    )
+    P, q = (
+        root @ root.T + 10.0 ** rng.integers(-6, 3) * np.eye(n),
+        rng.integers(-160, 161, n) / 16.0,
+    )
     values = np.vstack([np.eye(n), G]) @ (rng.integers(-32, 33, n) / 16.0)
-    lower, upper = values - rng.integers(0, 3, n + m), values + rng.integers(0, 3, n + m)
+    lower, upper = (
+        values - rng.integers(0, 3, n + m),
+        values + rng.integers(0, 3, n + m),
+    )
     if not feasible:
         G[1], lower[n], upper[n], upper[n + 1] = -G[0], -np.inf, values[n], np.inf
         lower[n + 1] = -values[n] + 10.0 ** rng.uniform(-13, -5)
@@ -27,7 +37,9 @@ def near_dependent_problem(rng, feasible=True):
 @pytest.mark.parametrize("soft", [False, True])
 @pytest.mark.parametrize("feasible", [True, False])
 @pytest.mark.parametrize("mode", ["prepared", "changing"])
-def test_what_is_called_solved_is_optimal_and_what_is_called_infeasible_is(mode, feasible, soft, rng):
+def test_what_is_called_solved_is_optimal_and_what_is_called_infeasible_is(
+    mode, feasible, soft, rng
+):
     solver, solved = DualActiveSet(), 0
     for _ in range(250):
         problem = near_dependent_problem(rng, feasible)
@@ -52,4 +64,6 @@ def test_a_multiplier_on_the_way_to_a_contradiction_is_taken_back(rng):
     for _ in range(500):
         solution = DualActiveSet().solve(near_dependent_problem(rng))
         working = solution.active_set != 0
-        assert (solution.multipliers[~working] == 0.0).all() or not solution.status.solved
+        assert (
+            solution.multipliers[~working] == 0.0
+        ).all() or not solution.status.solved

@@ -11,7 +11,10 @@ FREE = np.full(3, np.inf)
 PROBLEMS = {  # the minimum is at -P^-1 q, which float64 cannot hold
     "everywhere": (1e-160 * np.eye(3), np.full(3, 1e160)),
     "in one variable": (np.diag([1e-155, 1.0, 1.0]), np.array([1e155, 1.0, 1.0])),
-    "in the last of many": (np.diag([*np.ones(12), 1e-155]), np.array([*np.ones(12), 1e155])),
+    "in the last of many": (
+        np.diag([*np.ones(12), 1e-155]),
+        np.array([*np.ones(12), 1e155]),
+    ),
 }
 
 
@@ -56,12 +59,19 @@ def test_one_overflowing_entry_is_seen_wherever_it_stands(size, mode):
         assert solution.status is Status.NUMERICAL_TROUBLE
 
 
-def test_a_proper_problem_that_the_kernel_refuses_is_not_answered_by_what_memory_held(monkeypatch):
+def test_a_proper_problem_that_the_kernel_refuses_is_not_answered_by_what_memory_held(
+    monkeypatch,
+):
     """A row whose norm overflows; zeros in memory read as SOLVED, with x = 0."""
     monkeypatch.setattr(np, "empty", np.zeros)
     rows = np.full((1, 3), 2e300)
     solution = solve_in(
-        "changing", np.eye(3), np.ones(3), rows, np.full(4, -np.inf), np.array([*np.full(3, np.inf), -1.0])
+        "changing",
+        np.eye(3),
+        np.ones(3),
+        rows,
+        np.full(4, -np.inf),
+        np.array([*np.full(3, np.inf), -1.0]),
     )
     assert solution.is_optimal(1e-9) or not solution.status.solved
 
@@ -69,19 +79,25 @@ def test_a_proper_problem_that_the_kernel_refuses_is_not_answered_by_what_memory
 @pytest.mark.parametrize("mode", ["prepared", "changing"])
 def test_a_row_whose_norm_overflows_is_not_taken_for_one_that_is_kept(mode):
     q, upper = np.array([1.0, -2.0, 1.0]), np.array([np.inf, np.inf, np.inf, -1.0])
-    solution = solve_in(mode, np.eye(3), q, np.array([[1e300, 2e300, 0.0]]), np.full(4, -np.inf), upper)
+    solution = solve_in(
+        mode, np.eye(3), q, np.array([[1e300, 2e300, 0.0]]), np.full(4, -np.inf), upper
+    )
     assert solution.is_optimal(1e-9) or not solution.status.solved
 
 
 def test_soft_rows_do_not_hide_it():
     P, q = PROBLEMS["in one variable"]
     free = np.append(FREE, 1.0)
-    solution = solve_stacked(P, q, np.array([[0.0, 1.0, 0.0]]), -free, free, prices=[1.0])
+    solution = solve_stacked(
+        P, q, np.array([[0.0, 1.0, 0.0]]), -free, free, prices=[1.0]
+    )
     assert solution.status is Status.NUMERICAL_TROUBLE
 
 
 def test_residuals_that_are_undefined_do_not_bear_a_solution_out():
-    solution = solve_stacked(np.eye(2), np.ones(2), np.zeros((0, 2)), -np.ones(2), np.ones(2))
+    solution = solve_stacked(
+        np.eye(2), np.ones(2), np.zeros((0, 2)), -np.ones(2), np.ones(2)
+    )
     assert solution.is_optimal()
     for value in (np.nan, np.inf):
         x = np.array([value, -1.0])

@@ -18,35 +18,70 @@ INDEFINITE = np.array([[1.0, 2.0], [2.0, 1.0]])  # eigenvalues -1 and 3
         ({"P": EYE, "q": [0, np.nan]}, "q must not contain NaN; it does at index 1"),
         ({"P": EYE, "q": [0, np.inf]}, "q must be finite"),
         ({"P": EYE, "q": ["a", "b"]}, "real numbers"),
-        ({"P": [[1.0, np.nan], [0.0, 1.0]], "q": [0, 0]}, "P must not contain NaN; it does at index 0, 1"),
+        (
+            {"P": [[1.0, np.nan], [0.0, 1.0]], "q": [0, 0]},
+            "P must not contain NaN; it does at index 0, 1",
+        ),
         ({"P": [[np.inf, 0.0], [0.0, 1.0]], "q": [0, 0]}, "P must be finite"),
-        ({"P": [[1.0, 0.5], [0.0, 1.0]], "q": [0, 0]}, r"symmetric; got P\[0, 1\] = 0.5 and P\[1, 0\] = 0"),
-        ({"P": INDEFINITE, "q": [0, 0]}, r"smallest eigenvalue \(number 0 of 2, in ascending order\) is -1,"),
+        (
+            {"P": [[1.0, 0.5], [0.0, 1.0]], "q": [0, 0]},
+            r"symmetric; got P\[0, 1\] = 0.5 and P\[1, 0\] = 0",
+        ),
+        (
+            {"P": INDEFINITE, "q": [0, 0]},
+            r"smallest eigenvalue \(number 0 of 2, in ascending order\) is -1,",
+        ),
         ({"P": [[1.0, 1.0], [1.0, 1.0]], "q": [0, 0]}, "positive definite"),
         ({"P": EYE, "q": [0, 0], "G": [1.0, 1.0]}, "matrix of 2 columns"),
-        ({"P": EYE, "q": [0, 0], "G": [[1.0, 1.0, 1.0]]}, r"G must have shape \(1, 2\); got \(1, 3\)"),
+        (
+            {"P": EYE, "q": [0, 0], "G": [[1.0, 1.0, 1.0]]},
+            r"G must have shape \(1, 2\); got \(1, 3\)",
+        ),
         ({"P": EYE, "q": [0, 0], "G": [[1.0, np.inf]]}, "G must be finite"),
         ({"P": EYE, "q": [0, 0], "h_upper": [1.0]}, "without G"),
         (
-            {"P": EYE, "q": [0, 0], "G": [[1.0, 1.0]], "h_lower": [2.0], "h_upper": [1.0]},
+            {
+                "P": EYE,
+                "q": [0, 0],
+                "G": [[1.0, 1.0]],
+                "h_lower": [2.0],
+                "h_upper": [1.0],
+            },
             "row 0: h_lower must not exceed",
         ),
         (
             {"P": EYE, "q": [0, 0], "lb": [0.0, 1.0], "ub": [0.0, 0.5]},
             r"variable 1: lb must not exceed ub; got 1 > 0.5",
         ),
-        ({"P": EYE, "q": [0, 0], "lb": [np.inf, 0.0]}, "variable 0: no number satisfies lb = inf"),
-        ({"P": EYE, "q": [0, 0], "lb": [1e20, 0.0]}, "variable 0: no number satisfies lb"),
-        ({"P": EYE, "q": [0, 0], "ub": [0.0, -1e20]}, "variable 1: no number satisfies ub"),
+        (
+            {"P": EYE, "q": [0, 0], "lb": [np.inf, 0.0]},
+            "variable 0: no number satisfies lb = inf",
+        ),
+        (
+            {"P": EYE, "q": [0, 0], "lb": [1e20, 0.0]},
+            "variable 0: no number satisfies lb",
+        ),
+        (
+            {"P": EYE, "q": [0, 0], "ub": [0.0, -1e20]},
+            "variable 1: no number satisfies ub",
+        ),
         ({"P": EYE, "q": [0, 0], "ub": [0.0, np.nan]}, "ub must not contain NaN"),
     ],
 )
-def test_a_malformed_problem_is_refused_with_the_rule_and_what_was_got(arguments, message):
+def test_a_malformed_problem_is_refused_with_the_rule_and_what_was_got(
+    arguments, message
+):
     with pytest.raises(ProblemError, match=message):
         QuadraticProgram(**arguments)
 
 
-GOOD = {"P": EYE, "q": np.zeros(2), "G": np.ones((1, 2)), "lower": -np.ones(3), "upper": np.ones(3)}
+GOOD = {
+    "P": EYE,
+    "q": np.zeros(2),
+    "G": np.ones((1, 2)),
+    "lower": -np.ones(3),
+    "upper": np.ones(3),
+}
 
 
 @pytest.mark.parametrize(
@@ -72,7 +107,9 @@ def test_the_fast_entries_refuse_the_same_misuse(name, value, message):
     with pytest.raises(ProblemError, match=message):
         solve_stacked(**arguments)
     with pytest.raises(ProblemError, match=message):
-        DualActiveSet().prepare(arguments.pop("P"), arguments.pop("G")).solve(**arguments)
+        DualActiveSet().prepare(arguments.pop("P"), arguments.pop("G")).solve(
+            **arguments
+        )
 
 
 def test_the_good_problem_of_these_tests_is_good():
@@ -81,7 +118,15 @@ def test_the_good_problem_of_these_tests_is_good():
 
 @pytest.mark.parametrize("bound", [np.inf, 1e20, 1e25, 1e300])
 def test_a_bound_of_1e20_or_more_is_none(bound):
-    free = QuadraticProgram(EYE, [-3.0, 4.0], EYE, [-bound, -bound], [bound, bound], [-bound, -bound], [bound, bound])
+    free = QuadraticProgram(
+        EYE,
+        [-3.0, 4.0],
+        EYE,
+        [-bound, -bound],
+        [bound, bound],
+        [-bound, -bound],
+        [bound, bound],
+    )
     for solver in (DualActiveSet(), PrimalActiveSet()):
         solution = solver.solve(free)
         assert solution.status.solved
@@ -100,7 +145,9 @@ def test_lists_and_integers_are_converted_and_the_givers_arrays_stay_as_they_are
 
 def test_unstacking_and_stacking_bounds_are_inverse(rng):
     lower, upper = -rng.random(5), rng.random(5)
-    problem = QuadraticProgram.from_stacked(EYE, np.zeros(2), rng.random((3, 2)), lower, upper)
+    problem = QuadraticProgram.from_stacked(
+        EYE, np.zeros(2), rng.random((3, 2)), lower, upper
+    )
     np.testing.assert_array_equal(problem.lower, lower)
     np.testing.assert_array_equal(problem.upper, upper)
 
@@ -122,7 +169,10 @@ def test_prices_are_positive_numbers_one_for_each_row(prices, message):
 
 
 @pytest.mark.parametrize("solver", [DualActiveSet, PrimalActiveSet])
-@pytest.mark.parametrize("settings", [{"tolerance": 0.0}, {"iteration_limit": -1}, {"tolerance": float("nan")}])
+@pytest.mark.parametrize(
+    "settings",
+    [{"tolerance": 0.0}, {"iteration_limit": -1}, {"tolerance": float("nan")}],
+)
 def test_settings_that_make_no_sense_are_refused(solver, settings):
     with pytest.raises(ProblemError, match="must be positive"):
         solver(**settings)
@@ -138,9 +188,13 @@ def test_a_warm_start_of_another_shape_is_misuse(solver):
 @pytest.mark.parametrize(("skew", "accepted"), [(5e-11, True), (2e-10, False)])
 def test_what_is_skew_by_rounding_is_taken_for_symmetric(size, skew, accepted):
     P = size * np.array([[1.0, 0.3, 0.1], [0.3, 0.5, 0.0], [0.1 + skew, 0.0, 0.6]])
-    program = QuadraticProgram.unchecked(P, np.ones(3), np.zeros((0, 3)), np.full(3, -np.inf), np.full(3, np.inf))
+    program = QuadraticProgram.unchecked(
+        P, np.ones(3), np.zeros((0, 3)), np.full(3, -np.inf), np.full(3, np.inf)
+    )
     if accepted:
-        assert DualActiveSet().solve(program).x == pytest.approx(np.linalg.solve(P, -np.ones(3)), rel=1e-9)
+        assert DualActiveSet().solve(program).x == pytest.approx(
+            np.linalg.solve(P, -np.ones(3)), rel=1e-9
+        )
     else:
         with pytest.raises(ProblemError, match="symmetric"):
             DualActiveSet().solve(program)

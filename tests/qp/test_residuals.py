@@ -11,7 +11,11 @@ ABSENT = 1e20
 
 
 def excess(value, lower, upper):
-    return max(0.0, value - upper if upper < ABSENT else 0.0, lower - value if lower > -ABSENT else 0.0)
+    return max(
+        0.0,
+        value - upper if upper < ABSENT else 0.0,
+        lower - value if lower > -ABSENT else 0.0,
+    )
 
 
 @np.errstate(invalid="ignore")  # the gap at an absent bound
@@ -31,17 +35,28 @@ def by_definition(solution):
         beyond = 0.0 if abs(y[p]) >= caps[p] else missed
         own = sum(abs(C[p, i]) * max(abs(x[i]), zero / units[i]) for i in range(n))
         if beyond:
-            primal = max(primal, beyond / max(own, abs(upper[p] if value > upper[p] else lower[p])))
+            primal = max(
+                primal,
+                beyond / max(own, abs(upper[p] if value > upper[p] else lower[p])),
+            )
         bound = upper[p] if y[p] > 0 else lower[p]
-        stray[p] = abs(y[p]) if y[p] and abs(bound) >= ABSENT else max(0.0, abs(y[p]) - caps[p])
+        stray[p] = (
+            abs(y[p])
+            if y[p] and abs(bound) >= ABSENT
+            else max(0.0, abs(y[p]) - caps[p])
+        )
         bounds += abs(y[p] * bound) if y[p] else 0.0
         price += caps[p] * missed if abs(y[p]) >= caps[p] else 0.0
         price += y[p] * bound if y[p] else 0.0
     for i in range(n):
         rest = abs(P[i] @ x + q[i] + C[:, i] @ y) + np.abs(C[:, i]) @ stray
-        own = np.abs(P[i]) @ np.abs(x) + abs(q[i]) + np.abs(C[:, i]) @ (np.abs(y) - stray)
+        own = (
+            np.abs(P[i]) @ np.abs(x) + abs(q[i]) + np.abs(C[:, i]) @ (np.abs(y) - stray)
+        )
         dual = max(dual, rest / max(own, zero * units[i]))
-    gap = abs(x @ P @ x + q @ x + price) / max(abs(x @ P @ x), abs(q @ x), bounds, zero * free)
+    gap = abs(x @ P @ x + q @ x + price) / max(
+        abs(x @ P @ x), abs(q @ x), bounds, zero * free
+    )
     return primal, dual, gap
 
 
@@ -51,11 +66,16 @@ def random_claim(rng, soft=False, absent=False, scale=1.0):
     root = rng.normal(size=(n, n))
     P, q, G = root @ root.T + np.eye(n), rng.normal(size=n), rng.normal(size=(m, n))
     lower, upper = -rng.uniform(0.1, 2, n + m), rng.uniform(0.1, 2, n + m)
-    x, y = scale * rng.normal(size=n), scale * rng.normal(size=n + m) * (rng.random(n + m) < 0.7)
+    x, y = (
+        scale * rng.normal(size=n),
+        scale * rng.normal(size=n + m) * (rng.random(n + m) < 0.7),
+    )
     if absent:
         lower[0], upper[-1] = -np.inf, 1e20
         y[0], y[-1] = -abs(y[0]), abs(y[-1])
-    claim = make_solution(QuadraticProgram.from_stacked(P, q, G, lower, upper), Status.SOLVED, x, y)
+    claim = make_solution(
+        QuadraticProgram.from_stacked(P, q, G, lower, upper), Status.SOLVED, x, y
+    )
     if soft:
         prices = np.where(rng.random(m) < 0.5, rng.uniform(0.1, 1.5, m), np.inf)
         claim = claim._replace(caps=np.append(claim.caps[:n], prices))
@@ -67,13 +87,17 @@ def random_claim(rng, soft=False, absent=False, scale=1.0):
 def test_residuals_are_those_of_their_definition(soft, scale, rng):
     for _ in range(40):
         claim = random_claim(rng, soft, scale=scale)
-        np.testing.assert_allclose(claim.residuals(), by_definition(claim), rtol=1e-9, atol=1e-15)
+        np.testing.assert_allclose(
+            claim.residuals(), by_definition(claim), rtol=1e-9, atol=1e-15
+        )
 
 
 def test_a_multiplier_of_an_absent_bound_counts_whole(rng):
     for _ in range(40):
         claim = random_claim(rng, absent=True)
-        np.testing.assert_allclose(claim.residuals()[:2], by_definition(claim)[:2], rtol=1e-9)
+        np.testing.assert_allclose(
+            claim.residuals()[:2], by_definition(claim)[:2], rtol=1e-9
+        )
 
 
 def test_what_counts_as_zero_is_a_share_of_the_free_minimiser():
@@ -90,20 +114,38 @@ def test_objective_and_violations_are_those_of_their_definition(soft, rng):
     for _ in range(20):
         claim = random_claim(rng, soft)
         (P, q, G, lower, upper), caps = claim.arrays, claim.caps
-        missed = [excess(v, a, b) for v, a, b in zip([*claim.x, *(G @ claim.x)], lower, upper, strict=True)]
+        missed = [
+            excess(v, a, b)
+            for v, a, b in zip([*claim.x, *(G @ claim.x)], lower, upper, strict=True)
+        ]
         np.testing.assert_allclose(claim.violation(), missed, atol=1e-15)
         price = sum(v * c for v, c in zip(missed, caps, strict=True) if np.isfinite(c))
-        assert claim.objective == pytest.approx(0.5 * claim.x @ P @ claim.x + q @ claim.x + price)
+        assert claim.objective == pytest.approx(
+            0.5 * claim.x @ P @ claim.x + q @ claim.x + price
+        )
 
 
 def test_a_solution_from_parts_holds_each_of_them(rng):
     program = QuadraticProgram(np.eye(2), [1.0, 2.0], [[1.0, 1.0]], [-1.0], [1.0])
     given = {"iterations": 7, "build_seconds": 0.25, "solve_seconds": 0.5}
-    made = make_solution(program, Status.TIME_LIMIT, [3.0, 4.0], [0.0, -5.0, 6.0], **given)
-    assert (made.status, made.iterations, made.build_seconds, made.solve_seconds) == (Status.TIME_LIMIT, 7, 0.25, 0.5)
-    assert (made.x.tolist(), made.z_box.tolist(), made.z.tolist()) == ([3.0, 4.0], [0.0, -5.0], [6.0])
+    made = make_solution(
+        program, Status.TIME_LIMIT, [3.0, 4.0], [0.0, -5.0, 6.0], **given
+    )
+    assert (made.status, made.iterations, made.build_seconds, made.solve_seconds) == (
+        Status.TIME_LIMIT,
+        7,
+        0.25,
+        0.5,
+    )
+    assert (made.x.tolist(), made.z_box.tolist(), made.z.tolist()) == (
+        [3.0, 4.0],
+        [0.0, -5.0],
+        [6.0],
+    )
     assert made.active_set.tolist() == [0, -1, 1]
-    other = make_solution(program, Status.SOLVED, [0.0, 0.0], np.zeros(3), active_set=[1, 0, -1])
+    other = make_solution(
+        program, Status.SOLVED, [0.0, 0.0], np.zeros(3), active_set=[1, 0, -1]
+    )
     assert other.active_set.tolist() == [1, 0, -1]
     bare = make_solution(program, Status.INFEASIBLE, [0.0, 0.0], np.full(3, np.nan))
     assert (bare.iterations, bare.build_seconds, bare.solve_seconds) == (0, 0.0, 0.0)
@@ -126,8 +168,15 @@ def test_a_ray_proves_what_it_contradicts_and_nothing_else(scale):
     assert not proves([0, 0, 0, 0])
     assert not proves([0, 0, np.nan, 0])
     assert not proves([0, 0, 1, -1], high=np.append(wide, [2.0, np.inf]))  # they touch
-    boxed = np.append(-np.full(2, 0.1), [-np.inf, 2.0]), np.append(np.full(2, 0.1), [1.0, np.inf])
+    boxed = (
+        np.append(-np.full(2, 0.1), [-np.inf, 2.0]),
+        np.append(np.full(2, 0.1), [1.0, np.inf]),
+    )
     assert proves([0, 0, 0, -1], *boxed)  # the box carries what is left: x + y <= 0.2
     assert proves([1, 1, 0, -1], *boxed)
     assert not proves([0, 0, 1, 0], *boxed)
-    assert not DualActiveSet().solve(QuadraticProgram.from_stacked(np.eye(2), np.zeros(2), G, *boxed)).status.solved
+    assert (
+        not DualActiveSet()
+        .solve(QuadraticProgram.from_stacked(np.eye(2), np.zeros(2), G, *boxed))
+        .status.solved
+    )

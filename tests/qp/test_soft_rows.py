@@ -41,7 +41,13 @@ def conflicting_problem(rng, n, m):
     problem = feasible_problem(rng, n, m)
     shift = rng.uniform(-3.0, 3.0, m)
     return QuadraticProgram(
-        problem.P, problem.q, problem.G, problem.h_lower + shift, problem.h_upper + shift, problem.lb, problem.ub
+        problem.P,
+        problem.q,
+        problem.G,
+        problem.h_lower + shift,
+        problem.h_upper + shift,
+        problem.lb,
+        problem.ub,
     )
 
 
@@ -55,12 +61,17 @@ def test_soft_rows_solve_the_problem_written_out_with_slacks(solve, hard, n, m, 
         prices = 10.0 ** rng.uniform(-1.0, 2.0, m)
         prices[: hard if m > 1 else 0] = np.inf
         solution = solve(problem, prices)
-        if solve(problem, np.where(np.isinf(prices), np.inf, 1e-9)).status is Status.INFEASIBLE:
+        if (
+            solve(problem, np.where(np.isinf(prices), np.inf, 1e-9)).status
+            is Status.INFEASIBLE
+        ):
             assert solution.status is Status.INFEASIBLE
             continue
         assert solution.status is Status.SOLVED
         assert worst_residual(solution) < 1e-9
-        written_out = PrimalActiveSet(tolerance=1e-7).solve(with_slacks(problem, prices))
+        written_out = PrimalActiveSet(tolerance=1e-7).solve(
+            with_slacks(problem, prices)
+        )
         np.testing.assert_allclose(solution.x, written_out.x[:n], atol=2e-5)
         violated += int((solution.violation()[n:] > 1e-6).sum())
         again = solve(problem, prices, solution)
@@ -70,7 +81,9 @@ def test_soft_rows_solve_the_problem_written_out_with_slacks(solve, hard, n, m, 
 
 
 @DUAL
-def test_an_exact_penalty_above_the_multipliers_leaves_a_feasible_problem_as_it_is(solve, rng):
+def test_an_exact_penalty_above_the_multipliers_leaves_a_feasible_problem_as_it_is(
+    solve, rng
+):
     problem = feasible_problem(rng, 6, 9)
     hard = changing(problem, None)
     assert np.abs(hard.z).max() > 0.1
@@ -83,7 +96,9 @@ def test_an_exact_penalty_above_the_multipliers_leaves_a_feasible_problem_as_it_
 @DUAL
 def test_rows_of_infinite_price_are_hard(solve, rng):
     problem = feasible_problem(rng, 6, 9)
-    np.testing.assert_allclose(solve(problem, np.full(9, np.inf)).x, solve(problem, None).x, atol=1e-10)
+    np.testing.assert_allclose(
+        solve(problem, np.full(9, np.inf)).x, solve(problem, None).x, atol=1e-10
+    )
 
 
 @DUAL
@@ -98,7 +113,9 @@ def test_rows_that_contradict_each_other_have_a_solution_once_they_are_soft(solv
 
 @DUAL
 def test_a_hard_box_stays_hard_however_dear_the_soft_rows(solve):
-    problem = QuadraticProgram(np.eye(1), [0.0], [[1.0]], [5.0], [np.inf], [-1.0], [1.0])
+    problem = QuadraticProgram(
+        np.eye(1), [0.0], [[1.0]], [5.0], [np.inf], [-1.0], [1.0]
+    )
     solution = solve(problem, [1e6])
     assert solution.status is Status.SOLVED
     assert solution.x[0] == pytest.approx(1.0, abs=1e-12)
@@ -127,14 +144,20 @@ def test_soft_problems_in_a_row_have_the_same_answers_warm_and_cold(solve, rng):
 @DUAL
 @pytest.mark.parametrize("side", [-1.0, 1.0])
 @pytest.mark.parametrize("price", [0.5, 40.0])
-def test_a_multiplier_beyond_what_its_row_may_pay_is_a_dual_residual(solve, side, price):
+def test_a_multiplier_beyond_what_its_row_may_pay_is_a_dual_residual(
+    solve, side, price
+):
     """min 1/2 x^2 with the row |x| >= 100 at the price w a unit: x = w. At any other x the multiplier is no price."""
     bounds = ([100.0], [np.inf]) if side > 0 else ([-np.inf], [-100.0])
     solution = solve(QuadraticProgram(np.eye(1), [0.0], [[1.0]], *bounds), [price])
     assert solution.x[0] == pytest.approx(side * price)
     assert solution.is_optimal()
-    solution.x[:] *= 1.5  # still stationary, P x + G'z = 0, and the violation is still paid for
+    solution.x[:] *= (
+        1.5  # still stationary, P x + G'z = 0, and the violation is still paid for
+    )
     solution.z[:] *= 1.5
     assert solution.residuals().primal == 0
-    assert solution.residuals().dual > 0.1  # half the price, whatever it is held against
+    assert (
+        solution.residuals().dual > 0.1
+    )  # half the price, whatever it is held against
     assert not solution.is_optimal(0.1)

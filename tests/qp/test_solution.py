@@ -15,7 +15,9 @@ def solved(rng):
 
 def test_a_solution_parts_are_those_of_the_stacked_problem(solved):
     problem, solution = solved
-    np.testing.assert_array_equal(solution.multipliers, np.concatenate([solution.z_box, solution.z]))
+    np.testing.assert_array_equal(
+        solution.multipliers, np.concatenate([solution.z_box, solution.z])
+    )
     assert solution.x.shape == (6,)
     assert solution.z.shape == (8,)
     assert solution.active_set.shape == (14,)
@@ -23,20 +25,29 @@ def test_a_solution_parts_are_those_of_the_stacked_problem(solved):
     assert working.any()
     assert not solution.multipliers[~working].any()
     assert (solution.multipliers[working] * solution.active_set[working] >= 0).all()
-    assert solution.objective == pytest.approx(0.5 * solution.x @ problem.P @ solution.x + problem.q @ solution.x)
+    assert solution.objective == pytest.approx(
+        0.5 * solution.x @ problem.P @ solution.x + problem.q @ solution.x
+    )
     assert solution.solve_seconds > 0.0
 
 
 @pytest.mark.parametrize("sign", [-1.0, 1.0])
-def test_residuals_see_a_point_that_is_moved_and_multipliers_that_are_changed(solved, rng, sign):
+def test_residuals_see_a_point_that_is_moved_and_multipliers_that_are_changed(
+    solved, rng, sign
+):
     problem, solution = solved
     assert solution.is_optimal(1e-9)
-    moved = make_solution(problem, Status.SOLVED, solution.x + sign * 1e-3, solution.multipliers)
+    moved = make_solution(
+        problem, Status.SOLVED, solution.x + sign * 1e-3, solution.multipliers
+    )
     assert not moved.is_optimal(1e-6)
     working = np.flatnonzero(solution.multipliers)[0]
     changed = solution.multipliers.copy()
     changed[working] += sign * 1e-2
-    assert make_solution(problem, Status.SOLVED, solution.x, changed).residuals().dual > 1e-5
+    assert (
+        make_solution(problem, Status.SOLVED, solution.x, changed).residuals().dual
+        > 1e-5
+    )
 
 
 def test_a_feasible_stationary_point_with_a_multiplier_of_the_wrong_sign_is_not_optimal():
@@ -62,7 +73,13 @@ def test_parts_of_the_wrong_shape_are_refused(solved):
 
 def test_a_solution_survives_being_made_from_its_parts(solved):
     problem, solution = solved
-    copy = make_solution(problem, solution.status, solution.x, solution.multipliers, active_set=solution.active_set)
+    copy = make_solution(
+        problem,
+        solution.status,
+        solution.x,
+        solution.multipliers,
+        active_set=solution.active_set,
+    )
     np.testing.assert_array_equal(copy.active_set, solution.active_set)
     assert worst_residual(copy) == worst_residual(solution)
     assert copy.status is Status.SOLVED

@@ -28,11 +28,20 @@ def test_the_answer_does_not_depend_on_the_warm_start(solve, n, m, rng):
     M = n + m
     other = solve(feasible_problem(rng, n, m))
     elsewhere = solve(feasible_problem(rng, n + 1, m))
-    for guess in (cold, other, elsewhere, np.ones(M), -np.ones(M), *rng.integers(-1, 2, (5, M))):
+    for guess in (
+        cold,
+        other,
+        elsewhere,
+        np.ones(M),
+        -np.ones(M),
+        *rng.integers(-1, 2, (5, M)),
+    ):
         warm = solve(problem, guess)
         assert warm.status is Status.SOLVED
         assert worst_residual(warm) < 1e-9
-        np.testing.assert_allclose(warm.x, cold.x, atol=1e-9 * max(1.0, np.abs(cold.x).max()))
+        np.testing.assert_allclose(
+            warm.x, cold.x, atol=1e-9 * max(1.0, np.abs(cold.x).max())
+        )
 
 
 @DUAL
@@ -69,7 +78,13 @@ def test_the_same_question_gets_the_same_bits(solve, rng):
 
 def test_strided_fortran_read_only_and_integer_inputs_give_the_same_bits(rng):
     problem = feasible_problem(rng, 6, 9)
-    P, q, G, lower, upper = problem.P, np.round(problem.q), problem.G, problem.lower, problem.upper
+    P, q, G, lower, upper = (
+        problem.P,
+        np.round(problem.q),
+        problem.G,
+        problem.lower,
+        problem.upper,
+    )
 
     def strided(array):
         return np.repeat(array, 3, axis=-1)[..., ::3]
@@ -85,15 +100,22 @@ def test_strided_fortran_read_only_and_integer_inputs_give_the_same_bits(rng):
     for change in (strided, np.asfortranarray, frozen):
         arrays = [change(array) for array in (P, q, G, lower, upper)]
         kept = [array.copy() for array in arrays]
-        again = DualActiveSet().prepare(arrays[0], arrays[2]).solve(arrays[1], arrays[3], arrays[4])
+        again = (
+            DualActiveSet()
+            .prepare(arrays[0], arrays[2])
+            .solve(arrays[1], arrays[3], arrays[4])
+        )
         np.testing.assert_array_equal(again.x, expected.x)
         again = solve_stacked(*arrays)
         np.testing.assert_array_equal(again.x, expected_lazy.x)
         for array, copy in zip(arrays, kept, strict=True):
             np.testing.assert_array_equal(array, copy)
-    np.testing.assert_array_equal(prepared.solve(q.astype(int), lower.tolist(), upper).x, expected.x)
     np.testing.assert_array_equal(
-        prepared.solve(q, lower, upper, expected).x, prepared.solve(q, lower, upper, expected).x
+        prepared.solve(q.astype(int), lower.tolist(), upper).x, expected.x
+    )
+    np.testing.assert_array_equal(
+        prepared.solve(q, lower, upper, expected).x,
+        prepared.solve(q, lower, upper, expected).x,
     )
 
 
@@ -107,14 +129,20 @@ def test_a_solution_is_a_copy_that_later_solves_leave_alone(solve, rng):
 
 
 @pytest.mark.parametrize(("n", "m"), [(1, 1), (6, 9), (20, 40)])
-def test_a_prepared_program_that_has_solved_others_gives_the_bits_of_a_new_one(n, m, rng):
+def test_a_prepared_program_that_has_solved_others_gives_the_bits_of_a_new_one(
+    n, m, rng
+):
     """The factor of the working set comes with the guess, not from the memory of the solver."""
     problem = feasible_problem(rng, n, m)
     used, last, changes = DualActiveSet().prepare(problem.P, problem.G), None, 0
     for k in range(60):
         q = problem.q + (0.0 if k % 3 == 0 else 2.0) * rng.standard_normal(n)
         guess = rng.integers(-1, 2, n + m) if k % 7 == 6 else last
-        new = DualActiveSet().prepare(problem.P, problem.G).solve(q, problem.lower, problem.upper, guess)
+        new = (
+            DualActiveSet()
+            .prepare(problem.P, problem.G)
+            .solve(q, problem.lower, problem.upper, guess)
+        )
         last = used.solve(q, problem.lower, problem.upper, guess)
         assert last.status is new.status is Status.SOLVED
         np.testing.assert_array_equal(last.x, new.x)

@@ -17,8 +17,31 @@ from gpmpc.recording import _messages
 from tests.recording import runs
 
 MAGIC = b"\x89MCAP0\r\n"
-FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, ATTACHMENT, METADATA, DATA_END = 2, 3, 4, 5, 6, 9, 12, 15  # opcodes of MCAP
-HUGE = (2**16, 2**20, 2**24, 2**28, 2**31 - 1, 2**31, 2**32 - 1, 2**33, 2**40, 2**62, 2**63 - 1, 2**63, 2**64 - 1)
+FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, ATTACHMENT, METADATA, DATA_END = (
+    2,
+    3,
+    4,
+    5,
+    6,
+    9,
+    12,
+    15,
+)  # opcodes of MCAP
+HUGE = (
+    2**16,
+    2**20,
+    2**24,
+    2**28,
+    2**31 - 1,
+    2**31,
+    2**32 - 1,
+    2**33,
+    2**40,
+    2**62,
+    2**63 - 1,
+    2**63,
+    2**64 - 1,
+)
 
 
 def records(data):
@@ -33,7 +56,9 @@ def records(data):
 
 
 def joined(found):
-    return b"".join(struct.pack("<BQ", opcode, len(content)) + content for opcode, content in found)
+    return b"".join(
+        struct.pack("<BQ", opcode, len(content)) + content for opcode, content in found
+    )
 
 
 def sealed(found):
@@ -61,17 +86,30 @@ def metadata(name, pairs):
 
 
 def attachment(name, content, crc=None):
-    body = struct.pack("<QQ", 0, 0) + text(name) + text("application/yaml") + struct.pack("<Q", len(content)) + content
-    return ATTACHMENT, body + struct.pack("<I", zlib.crc32(body) if crc is None else crc)
+    body = (
+        struct.pack("<QQ", 0, 0)
+        + text(name)
+        + text("application/yaml")
+        + struct.pack("<Q", len(content))
+        + content
+    )
+    return ATTACHMENT, body + struct.pack(
+        "<I", zlib.crc32(body) if crc is None else crc
+    )
 
 
 def chunk(content, compression="zstd", size=None, crc=None, compressed=None):
-    packed = {"zstd": zstandard.compress, "lz4": lz4.frame.compress}.get(compression, bytes)
+    packed = {"zstd": zstandard.compress, "lz4": lz4.frame.compress}.get(
+        compression, bytes
+    )
     compressed = packed(content) if compressed is None else compressed
-    size, crc = len(content) if size is None else size, zlib.crc32(content) if crc is None else crc
-    return CHUNK, struct.pack("<QQQI", 0, 0, size, crc) + text(compression) + struct.pack(
-        "<Q", len(compressed)
-    ) + compressed
+    size, crc = (
+        len(content) if size is None else size,
+        zlib.crc32(content) if crc is None else crc,
+    )
+    return CHUNK, struct.pack("<QQQI", 0, 0, size, crc) + text(
+        compression
+    ) + struct.pack("<Q", len(compressed)) + compressed
 
 
 def inside(content):
@@ -105,7 +143,9 @@ def flip_anywhere(data, rng):
 
 def flip_text(data, rng):
     """In the configuration or in metadata."""
-    _, start, end = _pick(rng, [span for span in _spans(data) if span[0] in (ATTACHMENT, METADATA)])
+    _, start, end = _pick(
+        rng, [span for span in _spans(data) if span[0] in (ATTACHMENT, METADATA)]
+    )
     return _flip(data, rng.integers(start + 9, end, rng.integers(1, 3)), rng)
 
 
@@ -134,13 +174,23 @@ def overwrite(data, rng):
     start = int(rng.integers(len(data)))
     length = min(int(rng.choice([1, 4, 8, 64, 512, 4096])), len(data) - start)
     elsewhere = int(rng.integers(len(data) - length + 1))
-    block = _pick(rng, [bytes(length), rng.bytes(length), b"\xff" * length, data[elsewhere : elsewhere + length]])
+    block = _pick(
+        rng,
+        [
+            bytes(length),
+            rng.bytes(length),
+            b"\xff" * length,
+            data[elsewhere : elsewhere + length],
+        ],
+    )
     return data[:start] + block + data[start + length :]
 
 
 def insert_or_delete(data, rng):
     start, length = int(rng.integers(len(data))), int(rng.integers(1, 200))
-    return data[:start] + (rng.bytes(length) + data[start:] if rng.integers(2) else data[start + length :])
+    return data[:start] + (
+        rng.bytes(length) + data[start:] if rng.integers(2) else data[start + length :]
+    )
 
 
 def append(data, rng):
@@ -175,7 +225,11 @@ def huge(data, rng):
     """A number of a record's content, or its length, becomes a huge one."""
     _, start, end = _pick(rng, list(_spans(data)))
     width, code = (8, "<Q") if rng.integers(2) else (4, "<I")
-    place = start + 1 if rng.integers(4) == 0 else int(rng.integers(start + 1, max(start + 2, min(end, start + 80))))
+    place = (
+        start + 1
+        if rng.integers(4) == 0
+        else int(rng.integers(start + 1, max(start + 2, min(end, start + 80))))
+    )
     number = struct.pack(code, _pick(rng, HUGE) % 2 ** (8 * width))
     return data[:place] + number + data[place + width :]
 
@@ -185,7 +239,10 @@ def in_chunk(data, rng, change):
     found = section(data)
     i = _pick(rng, [i for i, (opcode, _) in enumerate(found) if opcode == CHUNK])
     content = change(inside(found[i][1]))
-    found[i] = chunk(content if isinstance(content, bytes) else joined(content), _pick(rng, ["zstd", "lz4", ""]))
+    found[i] = chunk(
+        content if isinstance(content, bytes) else joined(content),
+        _pick(rng, ["zstd", "lz4", ""]),
+    )
     return sealed(found)
 
 
@@ -210,7 +267,12 @@ def cut_in_chunk(data, rng):
             return content[: int(rng.integers(len(content)))]
         i = int(rng.integers(len(found)))
         opcode, content = found[i]
-        found[i] = opcode, content[: int(rng.integers(len(content)))] if rng.integers(2) else content[:22]
+        found[i] = (
+            opcode,
+            content[: int(rng.integers(len(content)))]
+            if rng.integers(2)
+            else content[:22],
+        )
         return found
 
     return in_chunk(data, rng, change)
@@ -222,7 +284,10 @@ def renumber(data, rng):
     def change(found):
         i = int(rng.integers(len(found)))
         opcode, content = found[i]
-        place, number = int(rng.choice([0, 2, 6])), struct.pack("<H", int(rng.choice([0, 1, 2, 9, 65535])))
+        place, number = (
+            int(rng.choice([0, 2, 6])),
+            struct.pack("<H", int(rng.choice([0, 1, 2, 9, 65535]))),
+        )
         found[i] = opcode, content[:place] + number + content[place + 2 :]
         return found
 
@@ -231,25 +296,46 @@ def renumber(data, rng):
 
 def edit_message(data, rng):
     """Fields of a message that no longer belong together."""
-    classes = _messages.message_classes(_messages.descriptor(runs.STATES, runs.INPUTS, "bytes"))
+    classes = _messages.message_classes(
+        _messages.descriptor(runs.STATES, runs.INPUTS, "bytes")
+    )
 
     def change(found):
-        messages = [i for i, (opcode, content) in enumerate(found) if opcode == MESSAGE and content[0] in (1, 2, 3)]
+        messages = [
+            i
+            for i, (opcode, content) in enumerate(found)
+            if opcode == MESSAGE and content[0] in (1, 2, 3)
+        ]
         i = _pick(rng, messages)
         head, content = found[i][1][:22], found[i][1][22:]
-        message = classes[("Step", "Plan", "QuadraticProgram")[head[0] - 1]].FromString(content)
+        message = classes[("Step", "Plan", "QuadraticProgram")[head[0] - 1]].FromString(
+            content
+        )
         field = _pick(rng, list(message.DESCRIPTOR.fields))
         kind = rng.integers(3)
         if kind == 0 or field.message_type is not None:
             message.ClearField(field.name)
         elif field.type == field.TYPE_BYTES:
             old = getattr(message, field.name)
-            setattr(message, field.name, _pick(rng, [old[:-8], old[:-3], old + bytes(8), bytes(8 * 10**5)]))
+            setattr(
+                message,
+                field.name,
+                _pick(rng, [old[:-8], old[:-3], old + bytes(8), bytes(8 * 10**5)]),
+            )
         elif field.type == field.TYPE_DOUBLE:
             setattr(message, field.name, _pick(rng, [np.nan, np.inf, -1e300]))
         elif field.type != field.TYPE_BOOL:
             largest = 31 if field.type == field.TYPE_ENUM else 63
-            setattr(message, field.name, int(_pick(rng, [-1, -6, 99, 10**6, 2**31 - 1, 2**largest - 1, -(2**largest)])))
+            setattr(
+                message,
+                field.name,
+                int(
+                    _pick(
+                        rng,
+                        [-1, -6, 99, 10**6, 2**31 - 1, 2**largest - 1, -(2**largest)],
+                    )
+                ),
+            )
         found[i] = MESSAGE, head + message.SerializeToString()
         return found
 
@@ -258,8 +344,22 @@ def edit_message(data, rng):
 
 def edit_metadata(data, rng):
     about = {"state_names": " ".join(runs.STATES), "input_names": " ".join(runs.INPUTS)}
-    names = ["", "x", "x x", "x 1z", "x ü", "\0", " ".join(f"s{i}" for i in range(int(rng.choice([5, 7, 30000]))))]
-    names += ["x " * 20000, "class def import for None with", b"\xff\xfe", "__class__ x", "time k step a b c"]
+    names = [
+        "",
+        "x",
+        "x x",
+        "x 1z",
+        "x ü",
+        "\0",
+        " ".join(f"s{i}" for i in range(int(rng.choice([5, 7, 30000])))),
+    ]
+    names += [
+        "x " * 20000,
+        "class def import for None with",
+        b"\xff\xfe",
+        "__class__ x",
+        "time k step a b c",
+    ]
     about[_pick(rng, list(about))] = _pick(rng, names)
     if rng.integers(4) == 0:
         del about[_pick(rng, list(about))]
@@ -269,8 +369,16 @@ def edit_metadata(data, rng):
         metadata("frames", {}),
         metadata("units", {"state.x": "\x1b["}),
     ]
-    changed += [metadata("recovered", {}), metadata("", {"": ""}), metadata("end", {"steps": "-1"})]
-    changed += [(METADATA, b""), (METADATA, text("run")), (METADATA, text("run") + struct.pack("<I", 2**32 - 1))]
+    changed += [
+        metadata("recovered", {}),
+        metadata("", {"": ""}),
+        metadata("end", {"steps": "-1"}),
+    ]
+    changed += [
+        (METADATA, b""),
+        (METADATA, text("run")),
+        (METADATA, text("run") + struct.pack("<I", 2**32 - 1)),
+    ]
     found = section(data)
     i = _pick(rng, [i for i, (opcode, _) in enumerate(found) if opcode == METADATA])
     found[i] = changed[0] if rng.integers(2) else _pick(rng, changed)
@@ -278,12 +386,21 @@ def edit_metadata(data, rng):
 
 
 def edit_config(data, rng):
-    content = _pick(rng, [b"", b"\xff\xfe\x80", b"seed: 8\n", bytes(10**6), rng.bytes(1000)])
+    content = _pick(
+        rng, [b"", b"\xff\xfe\x80", b"seed: 8\n", bytes(10**6), rng.bytes(1000)]
+    )
     found = section(data)
     [i] = [i for i, (opcode, _) in enumerate(found) if opcode == ATTACHMENT]
-    changed = [attachment("config.yaml", content), attachment("config.yaml", content, crc=0)]
+    changed = [
+        attachment("config.yaml", content),
+        attachment("config.yaml", content, crc=0),
+    ]
     changed += [attachment("config.yaml", content, crc=5), attachment("other", content)]
-    changed += [(ATTACHMENT, b""), (ATTACHMENT, bytes(30)), (ATTACHMENT, found[i][1][:-7])]
+    changed += [
+        (ATTACHMENT, b""),
+        (ATTACHMENT, bytes(30)),
+        (ATTACHMENT, found[i][1][:-7]),
+    ]
     found[i] = _pick(rng, changed)
     return sealed(found)
 
@@ -299,7 +416,11 @@ def zeros(size, compression):
             if compression == "zstd"
             else lz4.frame.LZ4FrameCompressor()
         )
-        block, crc, parts = bytes(2**22), 0, [make.begin()] if compression == "lz4" else []
+        block, crc, parts = (
+            bytes(2**22),
+            0,
+            [make.begin()] if compression == "lz4" else [],
+        )
         for start in range(0, size, len(block)):
             piece = block[: size - start]
             parts.append(make.compress(piece))
@@ -318,14 +439,24 @@ def bomb(data, rng, largest=2**31):
         bombs = [chunk(b"", compression, size, crc, packed)]
     elif kind == 1:  # not honest
         packed, crc = zeros(largest, compression)
-        bombs = [chunk(b"", compression, int(rng.choice([0, 1, 10**5, 10**7])), _pick(rng, [0, crc]), packed)]
+        bombs = [
+            chunk(
+                b"",
+                compression,
+                int(rng.choice([0, 1, 10**5, 10**7])),
+                _pick(rng, [0, crc]),
+                packed,
+            )
+        ]
     elif kind == 2:  # says that it unfolds, and does not
         bombs = [chunk(b"tiny", compression, _pick(rng, HUGE), _pick(rng, [None, 0]))]
     elif kind == 3:  # one record of an unknown kind, many times
         content = struct.pack("<BQ", 99, 2**24) + bytes(2**24)
         bombs = [chunk(content, compression)] * int(rng.choice([1, 60]))
     else:  # a message of zeros on a channel of the run
-        content = struct.pack("<BQHIQQ", MESSAGE, 22 + 2**24, int(rng.integers(1, 4)), 0, 0, 0) + bytes(2**24)
+        content = struct.pack(
+            "<BQHIQQ", MESSAGE, 22 + 2**24, int(rng.integers(1, 4)), 0, 0, 0
+        ) + bytes(2**24)
         bombs = [chunk(content, compression)] * int(rng.choice([1, 60]))
     place = int(rng.integers(1, len(found) + 1))
     return sealed(found[:place] + bombs + found[place:])
@@ -338,21 +469,35 @@ def well_formed_bomb(data, rng):
     kind, many = rng.integers(3), int(rng.choice([3, 40]))
     if kind == 0:
         stages = int(rng.choice([3000, 30000]))
-        plan = classes["Plan"](k=int(rng.integers(20)), covariances=[0.0] * (stages * n * n))
+        plan = classes["Plan"](
+            k=int(rng.integers(20)), covariances=[0.0] * (stages * n * n)
+        )
         for _ in range(stages):
             plan.stages.add()
         message = 2, plan.SerializeToString()
     elif kind == 1:
         size = int(rng.choice([300, 1000]))
-        program = {"P": size * size, "q": size, "lower": size, "upper": size, "softness": 2 * size}
+        program = {
+            "P": size * size,
+            "q": size,
+            "lower": size,
+            "upper": size,
+            "softness": 2 * size,
+        }
         fields = {name: [0.0] * length for name, length in program.items()}
-        message = 3, classes["QuadraticProgram"](k=1, variables=size, **fields).SerializeToString()
+        message = (
+            3,
+            classes["QuadraticProgram"](
+                k=1, variables=size, **fields
+            ).SerializeToString(),
+        )
     else:
         step = classes["Step"](k=1, belief_covariance=[0.0] * (n * n))
         message, many = (1, step.SerializeToString()), many * 1000
     content = struct.pack("<HIQQ", message[0], 0, 0, 0) + message[1]
     chunks = [
-        chunk(joined([(MESSAGE, content)] * max(1, min(many, 2**23 // len(content))))) for _ in range(min(many, 40))
+        chunk(joined([(MESSAGE, content)] * max(1, min(many, 2**23 // len(content)))))
+        for _ in range(min(many, 40))
     ]
     return sealed(found + chunks)
 
@@ -363,7 +508,9 @@ def foreign(data, rng):
     writer = Writer(output)
     writer.start()
     topic = _pick(rng, ["/step", "/camera", "/plan"])
-    channel = writer.register_channel(topic, "json", writer.register_schema("s", "jsonschema", b"{}"))
+    channel = writer.register_channel(
+        topic, "json", writer.register_schema("s", "jsonschema", b"{}")
+    )
     if rng.integers(2):
         writer.add_metadata("run", {"state_names": "x y", "input_names": "u"})
     for i in range(5):
@@ -378,7 +525,9 @@ def foreign(data, rng):
         bytes(10**6),
         MAGIC + bytes(10**6),
     ]
-    return _pick(rng, [*others, output.getvalue(), output.getvalue(), output.getvalue()])
+    return _pick(
+        rng, [*others, output.getvalue(), output.getvalue(), output.getvalue()]
+    )
 
 
 DAMAGES = (

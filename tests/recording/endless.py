@@ -18,14 +18,34 @@ n, m, H = 6, 3, 10
 
 def record(path, steps):
     rng = np.random.default_rng(0)
-    system = RecordedSystem(["x", "vx", "y", "vy", "z", "vz"], ["U1", "ux", "uy"], time_step=0.01)
+    system = RecordedSystem(
+        ["x", "vx", "y", "vy", "z", "vz"], ["U1", "ux", "uy"], time_step=0.01
+    )
     recorder = McapRecorder(path, system, config="seed: 7\n", metadata={"seed": 7})
     for k in range(steps):
         inputs, means = rng.standard_normal((H, m)), rng.standard_normal((H + 1, n))
         covariances = np.tile(np.eye(n), (H + 1, 1, 1))
-        decision = Decision(inputs[0], inputs, means, covariances, Status.SOLVED, 3, Timing(0.0, 0.0, 0.0))
+        decision = Decision(
+            inputs[0],
+            inputs,
+            means,
+            covariances,
+            Status.SOLVED,
+            3,
+            Timing(0.0, 0.0, 0.0),
+        )
         vectors = [rng.standard_normal(n) for _ in range(3)]
-        recorder.record(Step(k * 0.01, k, *vectors, decision.inputs[0], decision, vectors[0], np.eye(n)))
+        recorder.record(
+            Step(
+                k * 0.01,
+                k,
+                *vectors,
+                decision.inputs[0],
+                decision,
+                vectors[0],
+                np.eye(n),
+            )
+        )
     print("recorded", flush=True)
     signal.pause()
 

@@ -8,7 +8,17 @@ from gpmpc.recording import McapRecorder, RecordedSystem, Step
 from gpmpc.status import Status
 
 STATES, INPUTS = ("x", "vx", "y", "vy", "z", "vz"), ("U1", "ux", "uy")
-UNITS = {"x": "m", "vx": "m/s", "y": "m", "vy": "m/s", "z": "m", "vz": "m/s", "U1": "N", "ux": "1", "uy": "1"}
+UNITS = {
+    "x": "m",
+    "vx": "m/s",
+    "y": "m",
+    "vy": "m/s",
+    "z": "m",
+    "vz": "m/s",
+    "U1": "N",
+    "ux": "1",
+    "uy": "1",
+}
 POSE = {axis: axis for axis in "xyz"}
 BOUNDS = [[0.0, -0.5, -0.5], [10.0, 0.5, 0.5]]
 TIME_STEP = 0.1  # [s]
@@ -19,10 +29,25 @@ def problem(rng, variables=6, rows=8):
     G = rng.standard_normal((rows, variables))
     bounds = {"h_lower": -np.ones(rows), "h_upper": np.ones(rows)}
     box = {"lb": -np.ones(variables), "ub": np.ones(variables)}
-    return QuadraticProgram(A @ A.T + np.eye(variables), 3 * rng.standard_normal(variables), G, **bounds, **box)
+    return QuadraticProgram(
+        A @ A.T + np.eye(variables),
+        3 * rng.standard_normal(variables),
+        G,
+        **bounds,
+        **box,
+    )
 
 
-def make_step(k, rng, horizon=5, status=Status.SOLVED, failed=False, qp=True, prices=None, variables=6):
+def make_step(
+    k,
+    rng,
+    horizon=5,
+    status=Status.SOLVED,
+    failed=False,
+    qp=True,
+    prices=None,
+    variables=6,
+):
     n, m = len(STATES), len(INPUTS)
     roots = rng.standard_normal((horizon + 1, n, n))
     program = problem(rng, variables) if qp else None
@@ -65,10 +90,14 @@ def recorder(path, **settings):
         "pose": POSE,
     } | settings
     of_system = {
-        key: given.pop(key) for key in ("time_step", "units", "input_bounds", "pose", "z_down") if key in given
+        key: given.pop(key)
+        for key in ("time_step", "units", "input_bounds", "pose", "z_down")
+        if key in given
     }
     system = RecordedSystem(STATES, INPUTS, **of_system)
-    return McapRecorder(path, system, **({"config": {"seed": 7}, "metadata": {"seed": 7}} | given))
+    return McapRecorder(
+        path, system, **({"config": {"seed": 7}, "metadata": {"seed": 7}} | given)
+    )
 
 
 def record_run(path, steps=8, **settings):

@@ -26,8 +26,25 @@ from gpmpc.recording import layout, read_run, recover, replay
 from tests.recording import damage
 
 MEMORY, SECONDS = 2**31, 60  # enough to see how much too much is taken
-ARRAYS = ("steps", "times", "references", "states", "measured", "inputs", "input_bounds", "innovations", "failed")
-ARRAYS += ("belief_covariances", "plan_inputs", "plan_means", "plan_stds", "plan_covariances", "iterations")
+ARRAYS = (
+    "steps",
+    "times",
+    "references",
+    "states",
+    "measured",
+    "inputs",
+    "input_bounds",
+    "innovations",
+    "failed",
+)
+ARRAYS += (
+    "belief_covariances",
+    "plan_inputs",
+    "plan_means",
+    "plan_stds",
+    "plan_covariances",
+    "iterations",
+)
 ARRAYS += ("active_set_sizes", "residuals", "timings", "gp_sizes", "gp_versions")
 PROBLEM = ("P", "q", "G", "lower", "upper", "softness", "x", "multipliers")
 
@@ -35,9 +52,14 @@ PROBLEM = ("P", "q", "G", "lower", "upper", "softness", "x", "multipliers")
 def same(run, other):
     """Whether two runs hold the same, to the last bit."""
     return (
-        all(np.array_equal(getattr(run, name), getattr(other, name), equal_nan=True) for name in ARRAYS)
-        and (run.statuses, run.metadata, run.config) == (other.statuses, other.metadata, other.config)
-        and (run.channels, run.state_names, run.input_names) == (other.channels, other.state_names, other.input_names)
+        all(
+            np.array_equal(getattr(run, name), getattr(other, name), equal_nan=True)
+            for name in ARRAYS
+        )
+        and (run.statuses, run.metadata, run.config)
+        == (other.statuses, other.metadata, other.config)
+        and (run.channels, run.state_names, run.input_names)
+        == (other.channels, other.state_names, other.input_names)
         and run.problems.keys() == other.problems.keys()
         and all(
             np.array_equal(getattr(problem, name), getattr(other.problems[k], name))
@@ -58,7 +80,9 @@ def outcome(operation, path, original):
         return f"{type(error).__name__}: {error}"[:200]
     if run is None:
         return "done"
-    return "unfinished" if not run.finished else "same" if same(run, original) else "other"
+    return (
+        "unfinished" if not run.finished else "same" if same(run, original) else "other"
+    )
 
 
 def given(*arguments):
@@ -72,14 +96,21 @@ def operations(path):
     def replays():
         run = read_run(path)
         for k in (*list(run.problems)[:2], 10**9):
-            with contextlib.suppress(GpmpcError) if k == 10**9 else contextlib.nullcontext():
+            with (
+                contextlib.suppress(GpmpcError)
+                if k == 10**9
+                else contextlib.nullcontext()
+            ):
                 replay(run, k)
 
     yield "read", lambda: read_run(path)
     yield "layout", lambda: layout(read_run(path)) and None
     yield "replay", replays
     yield "info", lambda: log(given("info", str(path))) and None
-    yield "export", lambda: log(given("export", str(path), str(path.with_suffix(".csv")))) and None
+    yield (
+        "export",
+        lambda: log(given("export", str(path), str(path.with_suffix(".csv")))) and None,
+    )
     yield "recover", lambda: recover(path, recovered) and None
     if recovered.exists():
         yield "recovered", lambda: read_run(recovered)
@@ -109,13 +140,22 @@ def study(recording, seed, first, end):
         path = Path(folder) / "damaged.mcap"
         path.write_bytes(data)
         bare = examine(path, original)["megabytes"]  # imports
-        mapped = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()  # libraries take much
-        resource.setrlimit(resource.RLIMIT_AS, (mapped + MEMORY, resource.RLIM_INFINITY))
+        mapped = (
+            int(Path("/proc/self/statm").read_text().split()[0])
+            * resource.getpagesize()
+        )  # libraries take much
+        resource.setrlimit(
+            resource.RLIMIT_AS, (mapped + MEMORY, resource.RLIM_INFINITY)
+        )
         for i in range(first, end):
             rng = np.random.default_rng([seed, i])
             kind = kinds[i % len(kinds)]
             path.write_bytes(kind(data, rng))
-            found = {"seed": [seed, i], "damage": kind.__name__, "size": path.stat().st_size}
+            found = {
+                "seed": [seed, i],
+                "damage": kind.__name__,
+                "size": path.stat().st_size,
+            }
             found |= examine(path, original)
             yield found | {"megabytes": found["megabytes"] - bare}
 

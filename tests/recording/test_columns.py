@@ -11,8 +11,16 @@ from tests.recording import runs
 @pytest.fixture(scope="module")
 def flown(tmp_path_factory):
     path, rng = tmp_path_factory.mktemp("run") / "run.mcap", np.random.default_rng(3)
-    outcomes = [(Status.SOLVED, False), (Status.INFEASIBLE, True), (Status.TIME_LIMIT, False), (Status.SOLVED, False)]
-    steps = [runs.make_step(k, rng, status=status, failed=failed) for k, (status, failed) in enumerate(outcomes)]
+    outcomes = [
+        (Status.SOLVED, False),
+        (Status.INFEASIBLE, True),
+        (Status.TIME_LIMIT, False),
+        (Status.SOLVED, False),
+    ]
+    steps = [
+        runs.make_step(k, rng, status=status, failed=failed)
+        for k, (status, failed) in enumerate(outcomes)
+    ]
     with runs.recorder(path) as recorder:
         for step in steps:
             recorder.record(step)
@@ -26,10 +34,14 @@ def test_every_column_is_what_its_name_says(flown):
         for i, name in enumerate(runs.INPUTS if group == "input" else runs.STATES):
             expected[f"{group}.{name}"] = [getattr(step, group)[i] for step in steps]
     for i, name in enumerate(runs.STATES):
-        expected[f"belief_std.{name}"] = [np.sqrt(step.belief_covariance[i, i]) for step in steps]
+        expected[f"belief_std.{name}"] = [
+            np.sqrt(step.belief_covariance[i, i]) for step in steps
+        ]
     expected |= {
         "iterations": [step.decision.iterations for step in steps],
-        "active_set_size": [np.count_nonzero(step.decision.solution.active_set) for step in steps],
+        "active_set_size": [
+            np.count_nonzero(step.decision.solution.active_set) for step in steps
+        ],
         "timing.model": [0.001] * 4,
         "timing.build": [0.002] * 4,
         "timing.solve": [0.003] * 4,
@@ -39,10 +51,19 @@ def test_every_column_is_what_its_name_says(flown):
         "novelty": [step.decision.novelty for step in steps],
     }
     for i, name in enumerate(("primal", "dual", "gap")):
-        expected[f"residuals.{name}"] = [step.decision.solution.residuals()[i] for step in steps]
+        expected[f"residuals.{name}"] = [
+            step.decision.solution.residuals()[i] for step in steps
+        ]
     for name, values in expected.items():
-        np.testing.assert_allclose(run.columns[name], values, rtol=1e-14, atol=1e-15, err_msg=name)
-    assert run.columns["status"].tolist() == ["SOLVED", "INFEASIBLE", "TIME_LIMIT", "SOLVED"]
+        np.testing.assert_allclose(
+            run.columns[name], values, rtol=1e-14, atol=1e-15, err_msg=name
+        )
+    assert run.columns["status"].tolist() == [
+        "SOLVED",
+        "INFEASIBLE",
+        "TIME_LIMIT",
+        "SOLVED",
+    ]
     assert run.columns["failed"].tolist() == [False, True, False, False]
     assert set(run.columns) == {*expected, "status", "failed"}
 

@@ -46,12 +46,23 @@ def check_study(path, seed, count):
     for line in lines:
         found = line["outcomes"]
         believed = {"other"} if line["damage"] in edits else set()
-        assert set(found.values()) <= {"error", "same", "unfinished", "done"} | believed, line
-        assert found.get("recovered") != "error", line  # what recover writes can always be read
+        assert (
+            set(found.values()) <= {"error", "same", "unfinished", "done"} | believed
+        ), line
+        assert found.get("recovered") != "error", (
+            line
+        )  # what recover writes can always be read
         assert line["megabytes"] + BARE < 300, line
         assert line["seconds"] < 5, line
-    assert {line["damage"] for line in lines} == edits | {kind.__name__ for kind in damage.DAMAGES}
-    assert {line["outcomes"]["read"] for line in lines} == {"error", "same", "unfinished", "other"}
+    assert {line["damage"] for line in lines} == edits | {
+        kind.__name__ for kind in damage.DAMAGES
+    }
+    assert {line["outcomes"]["read"] for line in lines} == {
+        "error",
+        "same",
+        "unfinished",
+        "other",
+    }
 
 
 def test_a_damaged_recording_is_never_believed_and_does_no_harm(recorded):
@@ -64,29 +75,50 @@ def test_three_thousand_damaged_recordings_are_never_believed_and_do_no_harm(rec
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_no_flipped_bit_of_the_configuration_or_the_metadata_passes_unseen(recorded, tmp_path, seed):
-    data, rng, path = recorded[0].read_bytes(), np.random.default_rng(seed), tmp_path / "flipped.mcap"
+def test_no_flipped_bit_of_the_configuration_or_the_metadata_passes_unseen(
+    recorded, tmp_path, seed
+):
+    data, rng, path = (
+        recorded[0].read_bytes(),
+        np.random.default_rng(seed),
+        tmp_path / "flipped.mcap",
+    )
     for _ in range(100):
         path.write_bytes(damage.flip_text(data, rng))
-        with contextlib.suppress(RecordingError):  # the names of states and inputs are among them
+        with contextlib.suppress(
+            RecordingError
+        ):  # the names of states and inputs are among them
             assert not read_run(path).finished
 
 
 CHANGES = {
     "lost": lambda found, i: found[:i] + found[i + 1 :],
     "repeated": lambda found, i: [*found[: i + 1], *found[i:]],
-    "of an unknown kind": lambda found, i: [*found[:i], (found[i][0] | 0x80, found[i][1]), *found[i + 1 :]],
+    "of an unknown kind": lambda found, i: [
+        *found[:i],
+        (found[i][0] | 0x80, found[i][1]),
+        *found[i + 1 :],
+    ],
 }
 
 
 @pytest.mark.parametrize("change", CHANGES)
-def test_a_file_of_which_a_record_is_lost_or_repeated_is_not_finished(recorded, tmp_path, change):
-    path, found = tmp_path / "changed.mcap", list(damage.records(recorded[0].read_bytes()[len(damage.MAGIC) :]))
+def test_a_file_of_which_a_record_is_lost_or_repeated_is_not_finished(
+    recorded, tmp_path, change
+):
+    path, found = (
+        tmp_path / "changed.mcap",
+        list(damage.records(recorded[0].read_bytes()[len(damage.MAGIC) :])),
+    )
     read_again = 0
     for i, (kind, _) in enumerate(found):
         if kind in (damage.CHUNK, damage.METADATA, damage.ATTACHMENT):
-            path.write_bytes(damage.MAGIC + damage.joined(CHANGES[change](found, i)) + damage.MAGIC)
-            with contextlib.suppress(RecordingError):  # the metadata about the run are among them
+            path.write_bytes(
+                damage.MAGIC + damage.joined(CHANGES[change](found, i)) + damage.MAGIC
+            )
+            with contextlib.suppress(
+                RecordingError
+            ):  # the metadata about the run are among them
                 assert not read_run(path).finished, (i, kind)
                 read_again += 1
     assert read_again > 3
@@ -95,11 +127,22 @@ def test_a_file_of_which_a_record_is_lost_or_repeated_is_not_finished(recorded, 
 
 
 @pytest.mark.parametrize("compression", ["zstd", "lz4", ""])
-def test_a_chunk_whose_last_record_is_shorter_than_it_says_ends_an_unfinished_run(recorded, tmp_path, compression):
+def test_a_chunk_whose_last_record_is_shorter_than_it_says_ends_an_unfinished_run(
+    recorded, tmp_path, compression
+):
     path, found = tmp_path / "cut.mcap", damage.section(recorded[0].read_bytes())
     i = max(i for i, (kind, _) in enumerate(found) if kind == damage.CHUNK)
-    content, last = (damage.joined(part) for part in (damage.inside(found[i][1]), damage.inside(found[i][1])[-1:]))
-    for missing in (0, 1, len(last) // 2, len(last) - 9, len(last) - 1):  # of the last record: head or kind alone
+    content, last = (
+        damage.joined(part)
+        for part in (damage.inside(found[i][1]), damage.inside(found[i][1])[-1:])
+    )
+    for missing in (
+        0,
+        1,
+        len(last) // 2,
+        len(last) - 9,
+        len(last) - 1,
+    ):  # of the last record: head or kind alone
         found[i] = damage.chunk(content[: len(content) - missing], compression)
         path.write_bytes(damage.sealed(found))
         assert read_run(path).finished == (missing == 0), missing
@@ -108,19 +151,28 @@ def test_a_chunk_whose_last_record_is_shorter_than_it_says_ends_an_unfinished_ru
 def with_messages(data, change):
     """The file with other messages, in one chunk, its checksums right."""
     found = damage.section(data)
-    records = [record for kind, content in found if kind == damage.CHUNK for record in damage.inside(content)]
+    records = [
+        record
+        for kind, content in found
+        if kind == damage.CHUNK
+        for record in damage.inside(content)
+    ]
     messages = [content for kind, content in records if kind == damage.MESSAGE]
     records = [record for record in records if record[0] != damage.MESSAGE]
     records += [(damage.MESSAGE, content) for content in change(messages)]
     chunk = damage.chunk(damage.joined(records))
-    return damage.sealed([record for record in found if record[0] not in (damage.CHUNK, 7)] + [chunk])
+    return damage.sealed(
+        [record for record in found if record[0] not in (damage.CHUNK, 7)] + [chunk]
+    )
 
 
 def channel(message):
     return struct.unpack_from("<H", message)[0]
 
 
-def test_a_plan_belongs_to_the_step_of_its_number_wherever_it_stands(recorded, tmp_path):
+def test_a_plan_belongs_to_the_step_of_its_number_wherever_it_stands(
+    recorded, tmp_path
+):
     path, steps = recorded[0], recorded[1]
     changed, rng = tmp_path / "changed.mcap", np.random.default_rng(0)
     for lost in (0, 7, 19):
@@ -137,8 +189,14 @@ def test_a_plan_belongs_to_the_step_of_its_number_wherever_it_stands(recorded, t
         for row, k in enumerate(run.steps):
             plan = steps[k].decision
             np.testing.assert_array_equal(run.states[row], steps[k].state)
-            np.testing.assert_array_equal(run.plan_means[row], plan.means if k != lost else np.full((6, 6), np.nan))
-            np.testing.assert_array_equal(run.plan_inputs[row], plan.inputs if k != lost else np.full((5, 3), np.nan))
+            np.testing.assert_array_equal(
+                run.plan_means[row],
+                plan.means if k != lost else np.full((6, 6), np.nan),
+            )
+            np.testing.assert_array_equal(
+                run.plan_inputs[row],
+                plan.inputs if k != lost else np.full((5, 3), np.nan),
+            )
 
 
 def test_a_plan_whose_step_is_lost_is_left_out(recorded, tmp_path):
@@ -152,7 +210,9 @@ def test_a_plan_whose_step_is_lost_is_left_out(recorded, tmp_path):
     changed.write_bytes(with_messages(path.read_bytes(), change))
     run = read_run(changed)
     assert run.steps.tolist() == list(range(1, 20))
-    np.testing.assert_array_equal(run.plan_means, [step.decision.means for step in steps[1:]])
+    np.testing.assert_array_equal(
+        run.plan_means, [step.decision.means for step in steps[1:]]
+    )
 
 
 def test_numbers_that_come_again_keep_their_own_plans(tmp_path):
@@ -161,12 +221,16 @@ def test_numbers_that_come_again_keep_their_own_plans(tmp_path):
     with runs.recorder(path) as recorder:
         for step in steps:
             recorder.record(step)
-    np.testing.assert_array_equal(read_run(path).plan_means, [step.decision.means for step in steps])
+    np.testing.assert_array_equal(
+        read_run(path).plan_means, [step.decision.means for step in steps]
+    )
 
 
 def test_a_shorter_plan_ends_in_nothing(tmp_path):
     path, rng = tmp_path / "run.mcap", np.random.default_rng(0)
-    steps = [runs.make_step(k, rng, horizon=horizon) for k, horizon in enumerate((3, 5, 1))]
+    steps = [
+        runs.make_step(k, rng, horizon=horizon) for k, horizon in enumerate((3, 5, 1))
+    ]
     with runs.recorder(path) as recorder:
         for step in steps:
             recorder.record(step)
@@ -199,7 +263,10 @@ def test_a_recording_of_the_largest_steps_is_read(tmp_path):
     step = runs.make_step(0, rng, qp=False)
     H = 21_000  # of a plan of zeros: 7.4 MB, half of what is shared with the writer, and more as messages
     zeros = replace(
-        step.decision, inputs=np.zeros((H, 3)), means=np.zeros((H + 1, 6)), covariances=np.zeros((H + 1, 6, 6))
+        step.decision,
+        inputs=np.zeros((H, 3)),
+        means=np.zeros((H + 1, 6)),
+        covariances=np.zeros((H + 1, 6, 6)),
     )
     with runs.recorder(path) as recorder:
         recorder.record(replace(step, decision=zeros))
@@ -212,9 +279,14 @@ def test_a_recording_of_the_largest_steps_is_read(tmp_path):
 @pytest.mark.parametrize("compression", ["zstd", "lz4", ""])
 def test_a_file_that_another_tool_compressed_is_read(recorded, tmp_path, compression):
     path, found = tmp_path / "other.mcap", damage.section(recorded[0].read_bytes())
-    chunks = [(kind, damage.inside(content) if kind == damage.CHUNK else content) for kind, content in found]
+    chunks = [
+        (kind, damage.inside(content) if kind == damage.CHUNK else content)
+        for kind, content in found
+    ]
     rewritten = [
-        damage.chunk(damage.joined(content), compression) if kind == damage.CHUNK else (kind, content)
+        damage.chunk(damage.joined(content), compression)
+        if kind == damage.CHUNK
+        else (kind, content)
         for kind, content in chunks
     ]
     path.write_bytes(damage.sealed(rewritten))
@@ -236,8 +308,12 @@ def test_a_frame_that_does_not_say_its_size_is_read(recorded, tmp_path):
 
 def test_metadata_and_configuration_may_stand_behind_the_messages(recorded, tmp_path):
     path, found = tmp_path / "other.mcap", damage.section(recorded[0].read_bytes())
-    behind = [record for record in found if record[0] in (damage.METADATA, damage.ATTACHMENT)]
-    path.write_bytes(damage.sealed([record for record in found if record not in behind] + behind))
+    behind = [
+        record for record in found if record[0] in (damage.METADATA, damage.ATTACHMENT)
+    ]
+    path.write_bytes(
+        damage.sealed([record for record in found if record not in behind] + behind)
+    )
     run, expected = read_run(path), read_run(recorded[0])
     assert run.finished
     assert (run.metadata, run.config) == (expected.metadata, expected.config)
@@ -249,7 +325,10 @@ def test_a_chunk_that_says_another_size_ends_what_is_read(recorded, tmp_path, si
     path, found = tmp_path / "changed.mcap", damage.section(recorded[0].read_bytes())
     chunks = [i for i, (kind, _) in enumerate(found) if kind == damage.CHUNK]
     content = found[chunks[2]][1]
-    found[chunks[2]] = damage.CHUNK, content[:16] + struct.pack("<Q", size) + content[24:]
+    found[chunks[2]] = (
+        damage.CHUNK,
+        content[:16] + struct.pack("<Q", size) + content[24:],
+    )
     path.write_bytes(damage.sealed(found))
     run = read_run(path)
     assert not run.finished

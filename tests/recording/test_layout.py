@@ -27,15 +27,22 @@ FLOWN = {
 def record(path, states, inputs, steps=3, **settings):
     n, m, H = len(states), len(inputs), 2
     rng = np.random.default_rng(0)
-    with McapRecorder(path, RecordedSystem(states, inputs, time_step=0.1, **settings)) as recorder:
+    with McapRecorder(
+        path, RecordedSystem(states, inputs, time_step=0.1, **settings)
+    ) as recorder:
         for k in range(steps):
-            means, covariances = rng.standard_normal((H + 1, n)), np.tile(np.eye(n), (H + 1, 1, 1))
+            means, covariances = (
+                rng.standard_normal((H + 1, n)),
+                np.tile(np.eye(n), (H + 1, 1, 1)),
+            )
             decision = Decision(
                 input=np.zeros(m), inputs=np.zeros((H, m)), means=means, covariances=covariances,
                 status=Status.SOLVED, iterations=1, timing=Timing(0.001, 0.002, 0.003),
             )  # fmt: skip
             x = means[0]
-            recorder.record(Step(0.1 * k, k, x, x, x, np.zeros(m), decision, np.zeros(n), np.eye(n)))
+            recorder.record(
+                Step(0.1 * k, k, x, x, x, np.zeros(m), decision, np.zeros(n), np.eye(n))
+            )
     return path
 
 
@@ -45,12 +52,22 @@ def shown(request, tmp_path_factory):
     system = FLOWN[request.param]
     states, inputs = system.state_names, system.input_names
     bounds = np.array([-np.ones(len(inputs)), np.ones(len(inputs))])
-    path = record(tmp_path_factory.mktemp("run") / "run.mcap", states, inputs, input_bounds=bounds, pose=system.pose)
+    path = record(
+        tmp_path_factory.mktemp("run") / "run.mcap",
+        states,
+        inputs,
+        input_bounds=bounds,
+        pose=system.pose,
+    )
     return request.param, path, json.loads(layout(read_run(path)))
 
 
 def paths_of(made):
-    return [line["value"] for panel in made["configById"].values() for line in panel.get("paths", ())]
+    return [
+        line["value"]
+        for panel in made["configById"].values()
+        for line in panel.get("paths", ())
+    ]
 
 
 def at(message, path):
@@ -65,7 +82,9 @@ def at(message, path):
 def test_every_path_is_a_number_of_the_recording(shown):
     _, path, made = shown
     with path.open("rb") as file:
-        decoded = make_reader(file, decoder_factories=[DecoderFactory()]).iter_decoded_messages()
+        decoded = make_reader(
+            file, decoder_factories=[DecoderFactory()]
+        ).iter_decoded_messages()
         last = {channel.topic: message for _, channel, _, message in decoded}
     for value in paths_of(made):
         topic, fields = re.fullmatch(r"(/\w+)((?:\.\w+(?:\[\d+\])?)+)", value).groups()
@@ -77,7 +96,9 @@ def test_every_state_and_every_input_with_its_bounds_is_plotted(shown):
     states, inputs = FLOWN[flown].state_names, FLOWN[flown].input_names
     groups = [(group, states) for group in ("reference", "state", "measured")]
     groups += [(group, inputs) for group in ("input", "input_lower", "input_upper")]
-    assert {f"/step.{group}.{name}" for group, names in groups for name in names} <= set(paths_of(made))
+    assert {
+        f"/step.{group}.{name}" for group, names in groups for name in names
+    } <= set(paths_of(made))
 
 
 def test_every_panel_has_its_place_and_every_place_its_panel(shown):
@@ -103,12 +124,19 @@ def test_the_vehicle_is_seen_in_space_where_the_states_tell_about_it(shown):
         assert scene["topics"]["/plan/tube"]["visible"] == (flown != "rotational")
         assert scene["topics"]["/plan/path"]["visible"] == (flown != "translational")
         assert scene["followTf"] == ("display" if flown == "rotational" else "vehicle")
-        assert scene["followMode"] == ("follow-none" if flown == "rotational" else "follow-position")
-        assert scene["foxglovePanelTitle"] == ("attitude" if flown == "rotational" else "plan and 2-sigma tube")
+        assert scene["followMode"] == (
+            "follow-none" if flown == "rotational" else "follow-position"
+        )
+        assert scene["foxglovePanelTitle"] == (
+            "attitude" if flown == "rotational" else "plan and 2-sigma tube"
+        )
         grid = scene["layers"]["grid"]
         assert grid["size"] == grid["divisions"] == (4 if flown == "rotational" else 40)
         assert scene["cameraState"]["distance"] == (3 if flown == "rotational" else 25)
-        assert (made["layout"]["splitPercentage"], made["layout"]["first"]["splitPercentage"]) == (50, 78)
+        assert (
+            made["layout"]["splitPercentage"],
+            made["layout"]["first"]["splitPercentage"],
+        ) == (50, 78)
     else:
         assert made["layout"] == {
             "direction": "row", "first": "RosOut!log", "second": "Tab!plots", "splitPercentage": 25
@@ -121,7 +149,12 @@ def test_the_shipped_layout_is_that_of_the_translational_quadrotor(tmp_path):
 
 
 def test_titles_have_units_and_bounds_are_drawn_only_where_there_are_any(tmp_path):
-    path = record(tmp_path / "run.mcap", ("x", "vx"), ("F",), units={"x": "m", "vx": "m/s", "F": "1"})
+    path = record(
+        tmp_path / "run.mcap",
+        ("x", "vx"),
+        ("F",),
+        units={"x": "m", "vx": "m/s", "F": "1"},
+    )
     panels = json.loads(layout(read_run(path)))["configById"]
     assert panels["Plot!state-vx"]["foxglovePanelTitle"] == "vx [m/s]"
     assert panels["Plot!input-F"]["foxglovePanelTitle"] == "F"
@@ -130,20 +163,34 @@ def test_titles_have_units_and_bounds_are_drawn_only_where_there_are_any(tmp_pat
 
 def test_states_stand_below_each_other_in_tabs_by_what_they_are(shown):
     flown, _, made = shown
-    tabs = {tab["title"]: tab["layout"] for tab in made["configById"]["Tab!plots"]["tabs"]}
+    tabs = {
+        tab["title"]: tab["layout"] for tab in made["configById"]["Tab!plots"]["tabs"]
+    }
     grouped = {
         "translational": ["Position", "Rates"], "rotational": ["Attitude", "Rates"],
         "whole": ["Position", "Attitude", "Rates"], "pendulum": ["States"],
     }[flown]  # fmt: skip
     assert [*tabs] == [*grouped, "Inputs", "Uncertainty", "Solver"]
-    uncertain = [panel for panel in made["configById"] if re.match("Plot!(expected|innovation)-", panel)]
-    kinds = [f"Plot!{kind}-{title.lower()}" for title in grouped[:2] for kind in ("expected", "innovation")]
+    uncertain = [
+        panel
+        for panel in made["configById"]
+        if re.match("Plot!(expected|innovation)-", panel)
+    ]
+    kinds = [
+        f"Plot!{kind}-{title.lower()}"
+        for title in grouped[:2]
+        for kind in ("expected", "innovation")
+    ]
     assert uncertain == kinds
     first, rest, shares = tabs["Solver"]["first"], tabs["Solver"]["second"], []
     for node in (tabs["Solver"], rest):
         assert node["direction"] == "column"
         shares.append(node["splitPercentage"])
-    assert (first, shares, rest["first"]) == ("Plot!timing", [33.33, 50.0], "Plot!iterations")
+    assert (first, shares, rest["first"]) == (
+        "Plot!timing",
+        [33.33, 50.0],
+        "Plot!iterations",
+    )
     dashed = {line["value"].split(".")[1] for panel in made["configById"].values() for line in panel.get("paths", ())
               if line.get("lineStyle") == "dashed"}  # fmt: skip
     assert dashed == {"reference", "input_lower", "input_upper"}

@@ -21,8 +21,12 @@ class Viewer:
         host, port = address.removeprefix("ws://").split(":")
         self.stream = socket.create_connection((host, int(port)), timeout=20)
         key = base64.b64encode(os.urandom(16)).decode()
-        lines = [f"GET / HTTP/1.1\r\nHost: {host}:{port}\r\nUpgrade: websocket\r\nConnection: Upgrade"]
-        lines += [f"Sec-WebSocket-Key: {key}\r\nSec-WebSocket-Version: 13\r\nSec-WebSocket-Protocol: foxglove.sdk.v1"]
+        lines = [
+            f"GET / HTTP/1.1\r\nHost: {host}:{port}\r\nUpgrade: websocket\r\nConnection: Upgrade"
+        ]
+        lines += [
+            f"Sec-WebSocket-Key: {key}\r\nSec-WebSocket-Version: 13\r\nSec-WebSocket-Protocol: foxglove.sdk.v1"
+        ]
         self.stream.sendall("\r\n".join([*lines, "\r\n"]).encode())
         answer = b""
         while not answer.endswith(b"\r\n\r\n"):
@@ -45,22 +49,34 @@ class Viewer:
         """The next message: data from JSON, or bytes."""
         kind, length = self._read(2)
         if length > 125:
-            length = struct.unpack(*((">H", self._read(2)) if length == 126 else (">Q", self._read(8))))[0]
+            length = struct.unpack(
+                *((">H", self._read(2)) if length == 126 else (">Q", self._read(8)))
+            )[0]
         content = self._read(length)
         return json.loads(content) if kind & 15 == 1 else content
 
     def send(self, data):
         content = json.dumps(data).encode()
-        head = struct.pack(">BBH", 0x81, 0x80 | 126, len(content)) + bytes(4)  # a mask of zeros
+        head = struct.pack(">BBH", 0x81, 0x80 | 126, len(content)) + bytes(
+            4
+        )  # a mask of zeros
         self.stream.sendall(head + content)
 
     def subscribe(self, *topics):
         """Numbers of the subscriptions' topics."""
         channels = {}
         while not set(topics) <= set(channels):
-            if isinstance(message := self.receive(), dict) and message["op"] == "advertise":
-                channels |= {channel["topic"]: channel for channel in message["channels"]}
-        wanted = [{"id": channels[topic]["id"], "channelId": channels[topic]["id"]} for topic in topics]
+            if (
+                isinstance(message := self.receive(), dict)
+                and message["op"] == "advertise"
+            ):
+                channels |= {
+                    channel["topic"]: channel for channel in message["channels"]
+                }
+        wanted = [
+            {"id": channels[topic]["id"], "channelId": channels[topic]["id"]}
+            for topic in topics
+        ]
         self.send({"op": "subscribe", "subscriptions": wanted})
         return {channels[topic]["id"]: topic for topic in topics}
 
@@ -80,14 +96,20 @@ def test_a_viewer_receives_every_step_at_once_and_the_file_holds_it_as_well(reco
         while min(map(len, seen.values())) < 10 and len(steps) < 200:
             steps.append(runs.make_step(len(steps), rng))
             recorder.record(steps[-1])
-            while select.select([viewer.stream], [], [], 0.1)[0]:  # at first the subscription is on its way
+            while select.select([viewer.stream], [], [], 0.1)[
+                0
+            ]:  # at first the subscription is on its way
                 message = viewer.receive()
                 if isinstance(message, bytes) and message[0] == 1:
-                    seen[topics[struct.unpack_from("<I", message, 1)[0]]].append(message[13:])
+                    seen[topics[struct.unpack_from("<I", message, 1)[0]]].append(
+                        message[13:]
+                    )
     received = [classes["Step"].FromString(message) for message in seen["/step"]]
     first = received[0].k
     assert [step.k for step in received] == list(range(first, first + len(received)))
-    assert [step.state.vx for step in received] == [steps[step.k].state[1] for step in received]
+    assert [step.state.vx for step in received] == [
+        steps[step.k].state[1] for step in received
+    ]
     assert len(seen["/plan/tube"]) >= 10
     recorder.close()
     assert read_run(recorder.path).steps.tolist() == list(range(len(steps)))

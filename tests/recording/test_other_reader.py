@@ -24,11 +24,18 @@ STEPS = 30
 
 def _node_reads_mcap():
     node, code = shutil.which("node"), "require('@mcap/core'); require('fzstd')"
-    return bool(node) and subprocess.run([node, "-e", code], capture_output=True, check=False).returncode == 0
+    return (
+        bool(node)
+        and subprocess.run(
+            [node, "-e", code], capture_output=True, check=False
+        ).returncode
+        == 0
+    )
 
 
 pytestmark = pytest.mark.skipif(
-    not _node_reads_mcap(), reason="node does not find @mcap/core and fzstd; CONTRIBUTING.md says how"
+    not _node_reads_mcap(),
+    reason="node does not find @mcap/core and fzstd; CONTRIBUTING.md says how",
 )
 
 
@@ -63,9 +70,12 @@ def ours(path):
                 for channel in summary.channels.values()
             },
             "counts": Counter(channel.topic for _, channel, _ in messages),
-            "metadata": {record.name: dict(record.metadata) for record in reader.iter_metadata()},
+            "metadata": {
+                record.name: dict(record.metadata) for record in reader.iter_metadata()
+            },
             "attachments": [
-                [a.name, a.media_type, base64.b64encode(a.data).decode()] for a in reader.iter_attachments()
+                [a.name, a.media_type, base64.b64encode(a.data).decode()]
+                for a in reader.iter_attachments()
             ],
             "statistics": len(messages),
             "done": True,
@@ -74,11 +84,24 @@ def ours(path):
 
 @pytest.mark.parametrize("way", ["stream", "indexed"])
 def test_another_reader_finds_every_channel_metadata_attachment_and_message(path, way):
-    output = subprocess.run(["node", str(SCRIPT), str(path)], capture_output=True, text=True, check=False)
+    output = subprocess.run(
+        ["node", str(SCRIPT), str(path)], capture_output=True, text=True, check=False
+    )
     assert output.returncode == 0, output.stderr
     found, expected = json.loads(output.stdout)[way], ours(path)
     assert found == expected
-    topics = {"/step", "/plan", "/qp", "/pose", "/reference", "/plan/path", "/plan/tube", "/tf", "/tf/display", "/log"}
+    topics = {
+        "/step",
+        "/plan",
+        "/qp",
+        "/pose",
+        "/reference",
+        "/plan/path",
+        "/plan/tube",
+        "/tf",
+        "/tf/display",
+        "/log",
+    }
     assert set(found["channels"]) == topics
     assert {"run", "units", "frames"} <= set(found["metadata"])
     assert [name for name, *_ in found["attachments"]] == ["config.yaml"]

@@ -29,7 +29,9 @@ def recorded(tmp_path_factory):
 
 def decoded(path, topic):
     with path.open("rb") as file:
-        messages = make_reader(file, decoder_factories=[DecoderFactory()]).iter_decoded_messages(topics=[topic])
+        messages = make_reader(
+            file, decoder_factories=[DecoderFactory()]
+        ).iter_decoded_messages(topics=[topic])
         return [(message, proto) for _, _, message, proto in messages]
 
 
@@ -43,19 +45,35 @@ def test_every_number_comes_back_as_it_was(recorded):
         "measured": "measured",
         "inputs": "input",
     }.items():
-        np.testing.assert_array_equal(getattr(run, name), [getattr(step, group) for step in steps])
+        np.testing.assert_array_equal(
+            getattr(run, name), [getattr(step, group) for step in steps]
+        )
     np.testing.assert_array_equal(run.innovations, [step.innovation for step in steps])
-    np.testing.assert_array_equal(run.belief_covariances, [step.belief_covariance for step in steps])
-    np.testing.assert_array_equal(run.plan_means, [step.decision.means for step in steps])
-    np.testing.assert_array_equal(run.plan_covariances, [step.decision.covariances for step in steps])
-    np.testing.assert_array_equal(run.plan_inputs, [step.decision.inputs for step in steps])
-    np.testing.assert_allclose(run.plan_stds**2, np.diagonal(run.plan_covariances, axis1=2, axis2=3), rtol=1e-14)
+    np.testing.assert_array_equal(
+        run.belief_covariances, [step.belief_covariance for step in steps]
+    )
+    np.testing.assert_array_equal(
+        run.plan_means, [step.decision.means for step in steps]
+    )
+    np.testing.assert_array_equal(
+        run.plan_covariances, [step.decision.covariances for step in steps]
+    )
+    np.testing.assert_array_equal(
+        run.plan_inputs, [step.decision.inputs for step in steps]
+    )
+    np.testing.assert_allclose(
+        run.plan_stds**2,
+        np.diagonal(run.plan_covariances, axis1=2, axis2=3),
+        rtol=1e-14,
+    )
     assert run.times.tolist() == [step.time for step in steps]
     assert run.steps.tolist() == list(range(30))
     assert run.iterations.tolist() == [step.decision.iterations for step in steps]
     assert run.gp_sizes.tolist() == [step.gp_size for step in steps]
     assert run.gp_versions.tolist() == [step.gp_version for step in steps]
-    np.testing.assert_allclose(run.timings, np.tile([0.001, 0.002, 0.003, 0.006], (30, 1)))
+    np.testing.assert_allclose(
+        run.timings, np.tile([0.001, 0.002, 0.003, 0.006], (30, 1))
+    )
 
 
 def test_the_quality_of_every_solution_is_recorded(recorded):
@@ -73,11 +91,18 @@ def test_the_whole_active_set_is_recorded_however_many_constraints_work(tmp_path
     path, rng = tmp_path / "run.mcap", np.random.default_rng(0)
     step = runs.make_step(0, rng)
     G, wide = rng.standard_normal((rows, 6)), np.full(rows, 100.0)
-    program = QuadraticProgram(np.eye(6), np.full(6, 9.0), G, -wide, wide, -np.ones(6), np.ones(6))
+    program = QuadraticProgram(
+        np.eye(6), np.full(6, 9.0), G, -wide, wide, -np.ones(6), np.ones(6)
+    )
     solution = DualActiveSet().solve(program)
     assert np.count_nonzero(solution.active_set) == 6  # the whole box
     with runs.recorder(path) as recorder:
-        recorder.record(replace(step, decision=replace(step.decision, problem=program, solution=solution)))
+        recorder.record(
+            replace(
+                step,
+                decision=replace(step.decision, problem=program, solution=solution),
+            )
+        )
     run = read_run(path)
     assert run.active_set_sizes.tolist() == [6]
     np.testing.assert_allclose(run.residuals[0], solution.residuals(), atol=1e-15)
@@ -97,9 +122,15 @@ def test_a_program_without_solution_is_recorded_hard_and_without_one(tmp_path):
         np.testing.assert_array_equal(getattr(recorded, name), getattr(program, name))
     np.testing.assert_array_equal(recorded.lower, program.lower)
     np.testing.assert_array_equal(recorded.upper, program.upper)
-    assert (len(recorded.x), len(recorded.multipliers), run.active_set_sizes[0]) == (0, 0, 0)
+    assert (len(recorded.x), len(recorded.multipliers), run.active_set_sizes[0]) == (
+        0,
+        0,
+        0,
+    )
     assert np.isnan(run.residuals).all()
-    np.testing.assert_allclose(replay(run, 0).x, step.decision.solution.x, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(
+        replay(run, 0).x, step.decision.solution.x, rtol=0, atol=1e-9
+    )
 
 
 def test_a_replayed_step_gives_the_same_answer(recorded):
@@ -133,7 +164,10 @@ def test_a_run_without_problems_has_none_to_replay_and_to_judge(tmp_path):
             recorder.record(step)
     run = read_run(path)
     assert np.isnan(run.residuals).all()
-    assert run.active_set_sizes.tolist() == [np.count_nonzero(steps[0].decision.solution.active_set), 0]
+    assert run.active_set_sizes.tolist() == [
+        np.count_nonzero(steps[0].decision.solution.active_set),
+        0,
+    ]
     with pytest.raises(RecordingError, match="holds no quadratic program of step 0"):
         replay(run, 0)
 
@@ -142,7 +176,15 @@ def test_the_file_says_where_it_comes_from_before_the_first_message(recorded):
     path, _ = recorded
     run = read_run(path)
     about = run.metadata["run"]
-    for key in ("seed", "command", "host", "python", "versions.numpy", "created", "machine.system"):
+    for key in (
+        "seed",
+        "command",
+        "host",
+        "python",
+        "versions.numpy",
+        "created",
+        "machine.system",
+    ):
         assert about[key]
     assert run.metadata["units"]["state.vx"] == "m/s"
     assert run.metadata["units"]["stages.input.U1"] == "N"
@@ -151,10 +193,19 @@ def test_the_file_says_where_it_comes_from_before_the_first_message(recorded):
     assert json.loads(run.config) == {"seed": 7}
     with path.open("rb") as file:
         reader = make_reader(file)
-        first_chunk = min(index.chunk_start_offset for index in reader.get_summary().chunk_indexes)
-        early = [index for index in reader.get_summary().metadata_indexes if index.offset < first_chunk]
+        first_chunk = min(
+            index.chunk_start_offset for index in reader.get_summary().chunk_indexes
+        )
+        early = [
+            index
+            for index in reader.get_summary().metadata_indexes
+            if index.offset < first_chunk
+        ]
         assert [index.name for index in early] == ["run", "units", "frames", "pose"]
-        assert all(index.offset < first_chunk for index in reader.get_summary().attachment_indexes)
+        assert all(
+            index.offset < first_chunk
+            for index in reader.get_summary().attachment_indexes
+        )
 
 
 def test_chunks_are_small_compressed_and_indexed(tmp_path):
@@ -169,7 +220,9 @@ def test_chunks_are_small_compressed_and_indexed(tmp_path):
         assert len(chunks) == 4
         assert {chunk.compression for chunk in chunks} == {"zstd"}
         assert max(chunk.uncompressed_size for chunk in chunks) < 2 * 256 * 1024
-        assert reader.get_summary().statistics.message_count == len(list(reader.iter_messages()))
+        assert reader.get_summary().statistics.message_count == len(
+            list(reader.iter_messages())
+        )
 
 
 def test_any_reader_finds_a_field_by_the_plants_names(recorded):
@@ -201,7 +254,9 @@ def test_the_tube_is_the_two_sigma_ellipsoid_of_the_predicted_position(recorded)
             R = np.eye(3) + 2 * q.w * cross + 2 * cross @ cross
             radii = np.array([sphere.size.x, sphere.size.y, sphere.size.z]) / 2
             covariance = step.decision.covariances[i][np.ix_([0, 2, 4], [0, 2, 4])]
-            np.testing.assert_allclose(R @ np.diag((radii / 2) ** 2) @ R.T, covariance, atol=1e-12)
+            np.testing.assert_allclose(
+                R @ np.diag((radii / 2) ** 2) @ R.T, covariance, atol=1e-12
+            )
             assert sphere.pose.position.z == step.decision.means[i, 4]
 
 
@@ -221,7 +276,9 @@ def test_failures_are_logged_with_advice(tmp_path):
         recorder.record(runs.make_step(0, rng))
         recorder.record(runs.make_step(1, rng, status=Status.INFEASIBLE, failed=True))
     [(_, entry)] = decoded(path, "/log")
-    assert entry.message.startswith("step 1: INFEASIBLE: no point satisfies the constraints")
+    assert entry.message.startswith(
+        "step 1: INFEASIBLE: no point satisfies the constraints"
+    )
     assert entry.message.endswith("the policy for failures chose the input")
     run = read_run(path)
     assert run.statuses == (Status.SOLVED, Status.INFEASIBLE)
@@ -256,7 +313,10 @@ def test_a_recorded_step_is_a_copy(tmp_path):
     ("change", "message"),
     [
         ({"state": np.zeros(5)}, r"step 0: state must be \(6,\); got \(5,\)"),
-        ({"belief_covariance": np.zeros(6)}, r"belief_covariance must be \(6, 6\); got \(6,\)"),
+        (
+            {"belief_covariance": np.zeros(6)},
+            r"belief_covariance must be \(6, 6\); got \(6,\)",
+        ),
     ],
 )
 def test_a_step_of_the_wrong_shape_is_refused(tmp_path, change, message):
@@ -273,7 +333,11 @@ def test_a_step_of_the_wrong_shape_is_refused(tmp_path, change, message):
     [
         ({"units": {"w": "m"}}, SettingError, "units: must be of x, vx"),
         ({"time_step": 0}, SettingError, "time_step: must be a number above 0"),
-        ({"input_bounds": [1, 2, 3]}, ShapeError, r"input bounds must be \(2, 3\); got \(3,\)"),
+        (
+            {"input_bounds": [1, 2, 3]},
+            ShapeError,
+            r"input bounds must be \(2, 3\); got \(3,\)",
+        ),
     ],
 )
 def test_misuse_is_refused_before_a_file_is_made(tmp_path, settings, error, message):
@@ -283,7 +347,10 @@ def test_misuse_is_refused_before_a_file_is_made(tmp_path, settings, error, mess
 
 
 def test_a_name_that_cannot_be_a_field_is_refused():
-    with pytest.raises(SettingError, match="letters, digits and _, a letter first; got 'vertical speed'"):
+    with pytest.raises(
+        SettingError,
+        match="letters, digits and _, a letter first; got 'vertical speed'",
+    ):
         RecordedSystem(["vertical speed"], ["u"], time_step=1.0)
 
 
@@ -304,7 +371,10 @@ def test_a_path_that_cannot_be_written_is_named(tmp_path):
 
 def test_two_recorders_do_not_share_a_file(tmp_path):
     message = "another process is recording to this file"
-    with runs.recorder(tmp_path / "run.mcap"), pytest.raises(RecordingError, match=message):
+    with (
+        runs.recorder(tmp_path / "run.mcap"),
+        pytest.raises(RecordingError, match=message),
+    ):
         runs.recorder(tmp_path / "run.mcap")
 
 
@@ -331,7 +401,10 @@ def test_a_full_disk_is_reported_and_leaves_no_file_that_looks_finished(tmp_path
 
     with pytest.raises(RecordingError) as caught:
         record_too_much()
-    assert str(caught.value) == f"{path}: the recording stopped and is unfinished: File too large"
+    assert (
+        str(caught.value)
+        == f"{path}: the recording stopped and is unfinished: File too large"
+    )
     assert path.stat().st_size <= room
     run = read_run(path)
     assert not run.finished
@@ -358,7 +431,10 @@ def test_a_disk_that_fills_up_with_the_index_leaves_a_file_without_footer(tmp_pa
 
 def test_a_disk_that_is_full_from_the_start_is_reported_at_the_start(tmp_path):
     path = tmp_path / "run.mcap"
-    with pytest.raises(RecordingError, match="unfinished: File too large"), disk_of(100):
+    with (
+        pytest.raises(RecordingError, match="unfinished: File too large"),
+        disk_of(100),
+    ):
         runs.recorder(path)
     with pytest.raises(RecordingError, match="is not the recording of a run"):
         read_run(path)
@@ -367,7 +443,9 @@ def test_a_disk_that_is_full_from_the_start_is_reported_at_the_start(tmp_path):
 def test_a_step_that_no_chunk_can_take_is_refused(tmp_path):
     step = runs.make_step(0, np.random.default_rng(0))
     program, rows = step.decision.problem, 200_000
-    large = QuadraticProgram(program.P, program.q, np.ones((rows, 6)), np.zeros(rows), np.ones(rows))
+    large = QuadraticProgram(
+        program.P, program.q, np.ones((rows, 6)), np.zeros(rows), np.ones(rows)
+    )
     decision = replace(step.decision, problem=large, solution=None)
     with runs.recorder(tmp_path / "run.mcap") as recorder:
         with pytest.raises(RecordingError, match="is too large; at most 8388608"):
@@ -376,7 +454,9 @@ def test_a_step_that_no_chunk_can_take_is_refused(tmp_path):
     assert len(read_run(tmp_path / "run.mcap").times) == 1
 
 
-def test_the_largest_step_that_is_allowed_is_written_and_one_byte_more_is_refused(tmp_path, monkeypatch):
+def test_the_largest_step_that_is_allowed_is_written_and_one_byte_more_is_refused(
+    tmp_path, monkeypatch
+):
     step = runs.make_step(0, np.random.default_rng(0))
     with runs.recorder(tmp_path / "run.mcap") as recorder:
         monkeypatch.setattr(_recorder, "LARGEST", 0)
@@ -392,8 +472,14 @@ def test_the_largest_step_that_is_allowed_is_written_and_one_byte_more_is_refuse
 
 
 def test_after_an_error_every_further_step_says_so(tmp_path):
-    recorder, step = runs.recorder(tmp_path / "run.mcap"), runs.make_step(0, np.random.default_rng(0), variables=200)
-    with disk_of(10_000), pytest.raises(RecordingError, match="unfinished: File too large"):
+    recorder, step = (
+        runs.recorder(tmp_path / "run.mcap"),
+        runs.make_step(0, np.random.default_rng(0), variables=200),
+    )
+    with (
+        disk_of(10_000),
+        pytest.raises(RecordingError, match="unfinished: File too large"),
+    ):
         recorder.record(step)
     with pytest.raises(RecordingError, match="unfinished: File too large"):
         recorder.record(step)
@@ -416,7 +502,11 @@ def test_a_step_whose_controller_was_not_called_has_no_plan(tmp_path):
     step = runs.make_step(0, rng)
     with runs.recorder(tmp_path / "run.mcap") as recorder:
         recorder.record(step)
-        recorder.record(replace(step, k=1, decision=None, status=Status.INVALID_MEASUREMENT, failed=True))
+        recorder.record(
+            replace(
+                step, k=1, decision=None, status=Status.INVALID_MEASUREMENT, failed=True
+            )
+        )
     run = read_run(tmp_path / "run.mcap")
     assert run.statuses == (Status.SOLVED, Status.INVALID_MEASUREMENT)
     assert np.isnan(run.plan_means[1]).all()
@@ -439,11 +529,16 @@ def _record_many(folder, name):
 
 def test_two_processes_recording_into_one_tree_lose_nothing(tmp_path):
     context = multiprocessing.get_context("fork")
-    processes = [context.Process(target=_record_many, args=(tmp_path, name)) for name in ("a", "b")]
+    processes = [
+        context.Process(target=_record_many, args=(tmp_path, name))
+        for name in ("a", "b")
+    ]
     for process in processes:
         process.start()
     for process in processes:
         process.join()
     files = sorted(tmp_path.rglob("*.mcap"))
     assert len(files) == 6
-    assert all(read_run(file).finished and len(read_run(file).times) == 20 for file in files)
+    assert all(
+        read_run(file).finished and len(read_run(file).times) == 20 for file in files
+    )

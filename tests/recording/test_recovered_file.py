@@ -10,7 +10,9 @@ from tests.recording import runs
 
 def metadata(path):
     with path.open("rb") as file:
-        return {record.name: record.metadata for record in make_reader(file).iter_metadata()}
+        return {
+            record.name: record.metadata for record in make_reader(file).iter_metadata()
+        }
 
 
 @pytest.mark.parametrize("cut", [0, 200, 40_000])
@@ -25,7 +27,9 @@ def test_a_recovered_file_tells_so_and_counts_what_it_holds(cut, tmp_path):
     assert ("recovered" in about) == (cut > 0)
     run = read_run(output)
     if cut:
-        assert about["recovered"]["messages"] == str(sum(count for count, _ in run.channels.values()))
+        assert about["recovered"]["messages"] == str(
+            sum(count for count, _ in run.channels.values())
+        )
     assert run.steps.tolist() == list(range(len(run.steps)))
     assert (len(run.steps) == len(steps)) == (cut < 1000)
     np.testing.assert_array_equal(found.states, run.states)

@@ -18,7 +18,13 @@ from gpmpc.recording import read_run, recover
 from tests.recording import runs
 
 ENDLESS = Path(__file__).with_name("endless.py")
-MESSAGE, CHUNK, ATTACHMENT, METADATA, DATA_END = 0x05, 0x06, 0x09, 0x0C, 0x0F  # opcodes of MCAP
+MESSAGE, CHUNK, ATTACHMENT, METADATA, DATA_END = (
+    0x05,
+    0x06,
+    0x09,
+    0x0C,
+    0x0F,
+)  # opcodes of MCAP
 MAGIC = 8  # [bytes]
 
 
@@ -56,7 +62,9 @@ def check_recovered(path, output):
         reader = make_reader(file, validate_crcs=True)
         assert len(list(reader.iter_messages())) == expected
         assert reader.get_summary().statistics.message_count == expected
-        assert all(index.message_index_offsets for index in reader.get_summary().chunk_indexes)
+        assert all(
+            index.message_index_offsets for index in reader.get_summary().chunk_indexes
+        )
         [config] = reader.iter_attachments()
         assert config.name == "config.yaml"
         assert config.data == b"seed: 7\n"
@@ -72,7 +80,12 @@ def check_recovered(path, output):
 @pytest.fixture(scope="module")
 def start():
     """Starts a process that records to a path; its number, once it has said the words that are waited for."""
-    zygote = subprocess.Popen([sys.executable, str(ENDLESS)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    zygote = subprocess.Popen(
+        [sys.executable, str(ENDLESS)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
 
     def start(*words):
         print(*words, file=zygote.stdin, flush=True)
@@ -90,7 +103,9 @@ def test_a_run_killed_at_twenty_random_moments_is_recovered_every_time(start, tm
     for i in range(20):
         path = tmp_path / f"{i}.mcap"
         process = start(path)
-        size = rng.choice([1, rng.uniform(1, 300_000)])  # soon after the start, or in the middle of some chunk
+        size = rng.choice(
+            [1, rng.uniform(1, 300_000)]
+        )  # soon after the start, or in the middle of some chunk
         deadline = time.monotonic() + 60
         while not path.exists() or path.stat().st_size < size:
             assert time.monotonic() < deadline, "nothing is recorded"
@@ -99,7 +114,9 @@ def test_a_run_killed_at_twenty_random_moments_is_recovered_every_time(start, tm
         os.kill(process, signal.SIGKILL)
         run = read_run(path)
         assert not run.finished
-        steps.append(len(check_recovered(path, path.with_suffix(".recovered.mcap")).times))
+        steps.append(
+            len(check_recovered(path, path.with_suffix(".recovered.mcap")).times)
+        )
         assert run.steps.tolist() == list(range(steps[-1]))
     assert max(steps) > 50
 
@@ -130,7 +147,15 @@ def test_a_file_cut_anywhere_gives_back_its_whole_chunks(finished, tmp_path):
         first = chunks[0].chunk_start_offset
         end = chunks[-1].chunk_start_offset + chunks[-1].chunk_length
     rng = np.random.default_rng(0)
-    cuts = [first, first + 1, first + 9, end - 1, end, len(data) - 1, *rng.integers(first, len(data), 10)]
+    cuts = [
+        first,
+        first + 1,
+        first + 9,
+        end - 1,
+        end,
+        len(data) - 1,
+        *rng.integers(first, len(data), 10),
+    ]
     for cut in cuts:
         path = tmp_path / "cut.mcap"
         path.write_bytes(data[:cut])
@@ -138,7 +163,9 @@ def test_a_file_cut_anywhere_gives_back_its_whole_chunks(finished, tmp_path):
         check_recovered(path, tmp_path / "recovered.mcap")
 
 
-def test_a_file_cut_before_its_configuration_is_whole_does_not_pretend_to_have_one(finished, tmp_path):
+def test_a_file_cut_before_its_configuration_is_whole_does_not_pretend_to_have_one(
+    finished, tmp_path
+):
     data = finished.read_bytes()
     path, output = tmp_path / "cut.mcap", tmp_path / "recovered.mcap"
     path.write_bytes(data[: data.index(b"seed: 7\n") + 4])
@@ -154,7 +181,11 @@ def test_a_damaged_chunk_ends_what_is_recovered(finished, tmp_path):
     data[chunks[-1].chunk_start_offset + 100] ^= 0xFF
     path, output = tmp_path / "damaged.mcap", tmp_path / "recovered.mcap"
     path.write_bytes(data)
-    assert 0 < messages_of(recover(path, output)) < messages_of(recover(finished, tmp_path / "copy.mcap"))
+    assert (
+        0
+        < messages_of(recover(path, output))
+        < messages_of(recover(finished, tmp_path / "copy.mcap"))
+    )
     assert not read_run(path).finished
 
 
@@ -174,7 +205,9 @@ def test_what_cannot_be_recovered_is_named(finished, tmp_path):
     (tmp_path / "notes.mcap").write_text("these are notes, no recording")
     (tmp_path / "empty.mcap").touch()
     output = tmp_path / "out.mcap"
-    with pytest.raises(RecordingError, match=r"missing\.mcap: cannot be read: No such file"):
+    with pytest.raises(
+        RecordingError, match=r"missing\.mcap: cannot be read: No such file"
+    ):
         recover(tmp_path / "missing.mcap", output)
     with pytest.raises(RecordingError, match=r"notes\.mcap: is not an MCAP file"):
         recover(tmp_path / "notes.mcap", output)
@@ -196,6 +229,8 @@ def test_a_file_of_others_is_no_run(tmp_path):
         writer.start()
         writer.finish()
     for use in (read_run, lambda path: recover(path, tmp_path / "recovered.mcap")):
-        with pytest.raises(RecordingError, match=r"other\.mcap: is not the recording of a run"):
+        with pytest.raises(
+            RecordingError, match=r"other\.mcap: is not the recording of a run"
+        ):
             use(path)
     assert [left.name for left in tmp_path.iterdir()] == ["other.mcap"]

@@ -16,14 +16,18 @@ H = 3
 
 def spreads(n, rng):
     """Covariances (H + 1, n, n): of variances 0.01 for few states, of any directions for many."""
-    roots = 0.1 * (np.tile(np.eye(n), (H + 1, 1, 1)) if n < 6 else rng.normal(size=(H + 1, n, n)))
+    roots = 0.1 * (
+        np.tile(np.eye(n), (H + 1, 1, 1)) if n < 6 else rng.normal(size=(H + 1, n, n))
+    )
     return roots @ roots.mT
 
 
 def record(path, states, outcomes, rng, **settings):
     """A step a second, of the statuses and of whether they count as failed; the steps."""
     n, steps = len(states), []
-    with McapRecorder(path, RecordedSystem(states, ("u",), time_step=1.0, **settings)) as recorder:
+    with McapRecorder(
+        path, RecordedSystem(states, ("u",), time_step=1.0, **settings)
+    ) as recorder:
         for k, (status, failed) in enumerate(outcomes):
             decision = Decision(
                 np.zeros(1), np.zeros((H, 1)), rng.uniform(-3, 3, (H + 1, n)), spreads(n, rng),
@@ -31,7 +35,16 @@ def record(path, states, outcomes, rng, **settings):
             )  # fmt: skip
             reference, state = rng.uniform(-3, 3, (2, n))
             step = Step(
-                float(k), k, reference, state, state, np.zeros(1), decision, np.zeros(n), np.eye(n), failed=failed
+                float(k),
+                k,
+                reference,
+                state,
+                state,
+                np.zeros(1),
+                decision,
+                np.zeros(n),
+                np.eye(n),
+                failed=failed,
             )
             recorder.record(step)
             steps.append(step)
@@ -40,7 +53,9 @@ def record(path, states, outcomes, rng, **settings):
 
 def decoded(path, topic):
     with path.open("rb") as file:
-        messages = make_reader(file, decoder_factories=[DecoderFactory()]).iter_decoded_messages(topics=[topic])
+        messages = make_reader(
+            file, decoder_factories=[DecoderFactory()]
+        ).iter_decoded_messages(topics=[topic])
         return [proto for _, _, _, proto in messages]
 
 
@@ -49,13 +64,18 @@ def place(vector):
 
 
 def turn(quaternion):
-    return Rotation.from_quat([quaternion.x, quaternion.y, quaternion.z, quaternion.w]).as_matrix()
+    return Rotation.from_quat(
+        [quaternion.x, quaternion.y, quaternion.z, quaternion.w]
+    ).as_matrix()
 
 
 @pytest.fixture(scope="module")
 def flown(tmp_path_factory):
     path, rng = tmp_path_factory.mktemp("run") / "run.mcap", np.random.default_rng(4)
-    outcomes = [(Status.SOLVED, False)] * 5 + [(Status.INFEASIBLE, True), (Status.ITERATION_LIMIT, False)]
+    outcomes = [(Status.SOLVED, False)] * 5 + [
+        (Status.INFEASIBLE, True),
+        (Status.ITERATION_LIMIT, False),
+    ]
     return path, record(path, Coupled.state_names, outcomes, rng, pose=coupled().pose)
 
 
@@ -86,18 +106,29 @@ def test_the_line_of_the_plan_passes_the_predicted_positions(flown):
     path, steps = flown
     for message, step in zip(decoded(path, "/plan/tube"), steps, strict=True):
         [line] = message.entities[0].lines
-        np.testing.assert_allclose([place(point) for point in line.points], step.decision.means[:, [0, 2, 4]])
+        np.testing.assert_allclose(
+            [place(point) for point in line.points], step.decision.means[:, [0, 2, 4]]
+        )
 
 
 def test_the_tube_has_an_ellipsoid_of_two_standard_deviations_at_every_stage(flown):
     path, steps = flown
     for message, step in zip(decoded(path, "/plan/tube"), steps, strict=True):
         spheres = message.entities[0].spheres
-        np.testing.assert_allclose([place(s.pose.position) for s in spheres], step.decision.means[:, [0, 2, 4]])
+        np.testing.assert_allclose(
+            [place(s.pose.position) for s in spheres], step.decision.means[:, [0, 2, 4]]
+        )
         for sphere, covariance in zip(spheres, step.decision.covariances, strict=True):
-            directions, radii = turn(sphere.pose.orientation), np.array(place(sphere.size)) / 2
+            directions, radii = (
+                turn(sphere.pose.orientation),
+                np.array(place(sphere.size)) / 2,
+            )
             covariance = covariance[np.ix_([0, 2, 4], [0, 2, 4])]
-            np.testing.assert_allclose(directions @ np.diag(radii**2) @ directions.T, 4 * covariance, atol=1e-12)
+            np.testing.assert_allclose(
+                directions @ np.diag(radii**2) @ directions.T,
+                4 * covariance,
+                atol=1e-12,
+            )
 
 
 def test_the_frames_lead_from_the_display_to_the_vehicle(flown):
@@ -109,7 +140,9 @@ def test_the_frames_lead_from_the_display_to_the_vehicle(flown):
         np.testing.assert_allclose(turn(message.rotation), rotation, atol=1e-12)
     for message in decoded(path, "/tf/display"):
         assert (message.parent_frame_id, message.child_frame_id) == ("display", "world")
-        np.testing.assert_allclose(turn(message.rotation), np.diag([1.0, -1.0, -1.0]), atol=1e-15)  # z points down
+        np.testing.assert_allclose(
+            turn(message.rotation), np.diag([1.0, -1.0, -1.0]), atol=1e-15
+        )  # z points down
         assert place(message.translation) == [0, 0, 0]
 
 
@@ -118,8 +151,13 @@ def test_every_solve_that_failed_is_logged_the_louder_the_more_it_mattered(flown
     failed, limited = decoded(path, "/log")
     assert (failed.level, limited.level) == (failed.ERROR, limited.WARNING)
     assert failed.message.startswith("step 5: INFEASIBLE: ")
-    assert limited.message == f"step 6: ITERATION_LIMIT: {Status.ITERATION_LIMIT.advice}"
-    assert failed.message == f"step 5: INFEASIBLE: {Status.INFEASIBLE.advice}; the policy for failures chose the input"
+    assert (
+        limited.message == f"step 6: ITERATION_LIMIT: {Status.ITERATION_LIMIT.advice}"
+    )
+    assert (
+        failed.message
+        == f"step 5: INFEASIBLE: {Status.INFEASIBLE.advice}; the policy for failures chose the input"
+    )
 
 
 def test_an_axis_that_no_state_is_is_zero(tmp_path, rng):
@@ -135,5 +173,9 @@ def test_an_axis_that_no_state_is_is_zero(tmp_path, rng):
         assert len(message.entities[0].spheres) == H + 1
         for sphere in message.entities[0].spheres:  # 0.01 in x and z, nothing in y
             assert sorted(place(sphere.size)) == pytest.approx([0, 0.4, 0.4])
-            along = turn(sphere.pose.orientation) @ np.diag(place(sphere.size)) @ turn(sphere.pose.orientation).T
+            along = (
+                turn(sphere.pose.orientation)
+                @ np.diag(place(sphere.size))
+                @ turn(sphere.pose.orientation).T
+            )
             np.testing.assert_allclose(along, np.diag([0.4, 0, 0.4]), atol=1e-12)

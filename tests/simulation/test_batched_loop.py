@@ -13,7 +13,15 @@ from gpmpc.mpc.problem import Box, Problem, Tracking
 from gpmpc.propagation import Linearization, MomentMatching
 from gpmpc.simulation import Dropout, Gust, ModelLoop, Noise, closed_loop, closed_loops
 from gpmpc.status import Status
-from gpmpc.systems import Coupled, Map, Rotational, System, Translational, step, step_many
+from gpmpc.systems import (
+    Coupled,
+    Map,
+    Rotational,
+    System,
+    Translational,
+    step,
+    step_many,
+)
 from tests.mpc.systems import HOVER, QUADROTOR, quadrotor_gp
 
 H, STEPS = 3, 8
@@ -21,10 +29,20 @@ GP = quadrotor_gp(20)
 REFERENCES = Reference(np.zeros((STEPS + H, 6)), np.tile(HOVER, (STEPS + H - 1, 1)))
 START = np.array([0.3, 0.0, -0.2, 0.0, 0.1, 0.0])
 NOISE = Noise(process=[0.01] * 6, measurement=[0.005] * 6, input=[0.02, 0.002, 0.002])
-ARRAYS = ("states", "covariances", "measured", "inputs", "references", "predicted_means", "predicted_covariances")
+ARRAYS = (
+    "states",
+    "covariances",
+    "measured",
+    "inputs",
+    "references",
+    "predicted_means",
+    "predicted_covariances",
+)
 
 
-def controller(covariance="zero_order", propagator=None, model=GP, bound=2.0, **settings):
+def controller(
+    covariance="zero_order", propagator=None, model=GP, bound=2.0, **settings
+):
     box = {"inputs": Box([0, -0.4, -0.4], [15, 0.4, 0.4])}
     problem = Problem(
         Tracking([1] * 6, [0.1] * 3),
@@ -43,17 +61,33 @@ def controller(covariance="zero_order", propagator=None, model=GP, bound=2.0, **
 
 
 def fly(asked, seeds=4, plant=QUADROTOR, initial=START, **settings):
-    return closed_loops(plant, asked, REFERENCES, initial, STEPS, seeds, **({"noise": NOISE} | settings))
+    return closed_loops(
+        plant, asked, REFERENCES, initial, STEPS, seeds, **({"noise": NOISE} | settings)
+    )
 
 
 def alone(asked, seed, plant=QUADROTOR, initial=START, **settings):
     settings.pop("chunk", None)
-    return closed_loop(plant, asked, REFERENCES, initial, STEPS, seed=seed, **({"noise": NOISE} | settings))
+    return closed_loop(
+        plant,
+        asked,
+        REFERENCES,
+        initial,
+        STEPS,
+        seed=seed,
+        **({"noise": NOISE} | settings),
+    )
 
 
 def assert_same(ours, theirs, tolerance=1e-9):
     for key in ARRAYS:
-        assert np.allclose(getattr(ours, key), getattr(theirs, key), rtol=0, atol=tolerance, equal_nan=True), key
+        assert np.allclose(
+            getattr(ours, key),
+            getattr(theirs, key),
+            rtol=0,
+            atol=tolerance,
+            equal_nan=True,
+        ), key
     assert ours.statuses == theirs.statuses
     assert ours.time_step == theirs.time_step
     assert np.array_equal(ours.iterations, theirs.iterations)
@@ -63,10 +97,16 @@ def assert_same(ours, theirs, tolerance=1e-9):
 @pytest.mark.parametrize("choice", ["auto", "torch"])
 @pytest.mark.parametrize(
     ("covariance", "propagator"),
-    [("none", Linearization()), ("zero_order", Linearization()), ("full", MomentMatching())],
+    [
+        ("none", Linearization()),
+        ("zero_order", Linearization()),
+        ("full", MomentMatching()),
+    ],
     ids=["mean", "linearised", "moment-matched"],
 )
-def test_a_trial_gives_the_same_numbers_in_a_crowd_and_alone(covariance, propagator, choice):
+def test_a_trial_gives_the_same_numbers_in_a_crowd_and_alone(
+    covariance, propagator, choice
+):
     asked = controller(covariance, propagator)
     with backend(choice):
         for trial in fly(asked):
@@ -77,7 +117,9 @@ def test_a_trial_gives_the_same_numbers_in_a_crowd_and_alone(covariance, propaga
 @pytest.mark.parametrize("chunk", [1, 2, 50])
 def test_the_size_of_a_chunk_changes_no_number(chunk):
     asked, seeds = controller("full", MomentMatching()), [7, 0, 3, 12, 5]
-    for ours, theirs in zip(fly(asked, seeds, chunk=chunk), fly(asked, seeds), strict=True):
+    for ours, theirs in zip(
+        fly(asked, seeds, chunk=chunk), fly(asked, seeds), strict=True
+    ):
         assert ours.seed == theirs.seed
         assert_same(ours.result, theirs.result)
 
@@ -90,7 +132,10 @@ def test_trials_come_in_the_order_of_their_seeds_and_differ():
 
 def test_starts_are_drawn_and_winds_blow_as_alone():
     initial = Gaussian(torch.tensor(START), 0.01 * torch.eye(6))
-    settings = {"initial": initial, "disturbances": [Gust({"vx": 0.3}, start=1.0, stop=2.0)]}
+    settings = {
+        "initial": initial,
+        "disturbances": [Gust({"vx": 0.3}, start=1.0, stop=2.0)],
+    }
     asked = controller()
     for trial in fly(asked, **settings):
         assert_same(trial.result, alone(asked, trial.seed, **settings))
@@ -108,7 +153,10 @@ def test_failures_are_bridged_and_counted_as_alone(policy):
     for trial in flown:
         assert_same(trial.result, alone(asked, trial.seed, **settings))
         assert (4, Status.INVALID_MEASUREMENT) in trial.result.failures
-    infeasible = {sum(status is Status.INFEASIBLE for status in trial.result.statuses) for trial in flown}
+    infeasible = {
+        sum(status is Status.INFEASIBLE for status in trial.result.statuses)
+        for trial in flown
+    }
     assert len(infeasible) > 1
 
 
@@ -134,7 +182,9 @@ def assert_each_ends_as_alone(flown, fly_alone):
 
 def test_a_trial_that_fails_stops_no_other():
     asked = controller(bound=0.5)
-    assert_each_ends_as_alone(fly(asked, 8, **SPREAD), lambda seed: alone(asked, seed, **SPREAD))
+    assert_each_ends_as_alone(
+        fly(asked, 8, **SPREAD), lambda seed: alone(asked, seed, **SPREAD)
+    )
 
 
 class Explosive:
@@ -154,11 +204,16 @@ class Proportional:
     def control(self, belief, reference, previous=None):
         input = -3 * belief.mean.numpy()
         nothing = np.zeros((2, 1)), np.zeros((2, 1, 1))
-        return Decision(input, input[None], *nothing, Status.SOLVED, 1, Timing(0.0, 0.0, 0.0))
+        return Decision(
+            input, input[None], *nothing, Status.SOLVED, 1, Timing(0.0, 0.0, 0.0)
+        )
 
 
 def test_a_controller_that_answers_one_by_one_flies_many_too_and_divergence_is_one_trials_own():
-    plant, initial = System(Explosive(), time_step=0.5), Gaussian(torch.zeros(1), 4 * torch.eye(1))
+    plant, initial = (
+        System(Explosive(), time_step=0.5),
+        Gaussian(torch.zeros(1), 4 * torch.eye(1)),
+    )
     asked = (plant, Proportional(), np.zeros((20, 1)), initial, 15)
     flown = closed_loops(*asked, 12)
     assert any("Diverged: step" in trial.error for trial in flown if trial.error)
@@ -180,19 +235,33 @@ def test_many_plants_step_as_one_does(plant, rng):
     n, m = len(plant.dynamics.state_names), len(plant.dynamics.input_names)
     states, inputs = 0.3 * rng.normal(size=(5, n)), 0.3 * rng.normal(size=(5, m))
     expected = [step(plant, x, u) for x, u in zip(states, inputs, strict=True)]
-    assert np.allclose(step_many(plant, states, inputs), expected, rtol=1e-14, atol=1e-15)
+    assert np.allclose(
+        step_many(plant, states, inputs), expected, rtol=1e-14, atol=1e-15
+    )
 
 
 @pytest.mark.parametrize(
     ("settings", "error", "message"),
     [
-        ({"plant": ModelLoop(GP, Linearization())}, SettingError, "plant: a model loop draws no random numbers"),
+        (
+            {"plant": ModelLoop(GP, Linearization())},
+            SettingError,
+            "plant: a model loop draws no random numbers",
+        ),
         ({"seeds": 0}, SettingError, "seeds: must be a whole number, 1 or more; got 0"),
         ({"seeds": [1, 1]}, SettingError, "different whole numbers"),
         ({"chunk": 0}, SettingError, "chunk: must be a whole number, 1 or more; got 0"),
         ({"on_failure": "ignore"}, SettingError, "on_failure: must be one of"),
-        ({"initial": np.zeros(3)}, ShapeError, r"the initial state must have shape \(6,\); got \(3,\)"),
-        ({"noise": Noise(process=[0.1])}, ShapeError, "noise.process must have 6 standard deviations; got 1"),
+        (
+            {"initial": np.zeros(3)},
+            ShapeError,
+            r"the initial state must have shape \(6,\); got \(3,\)",
+        ),
+        (
+            {"noise": Noise(process=[0.1])},
+            ShapeError,
+            "noise.process must have 6 standard deviations; got 1",
+        ),
     ],
 )
 def test_misuse_is_refused_before_the_first_step(settings, error, message):
@@ -203,10 +272,17 @@ def test_misuse_is_refused_before_the_first_step(settings, error, message):
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
 @pytest.mark.parametrize(
     ("covariance", "propagator"),
-    [("none", Linearization()), ("zero_order", Linearization()), ("full", MomentMatching())],
+    [
+        ("none", Linearization()),
+        ("zero_order", Linearization()),
+        ("full", MomentMatching()),
+    ],
     ids=["mean", "linearised", "moment-matched"],
 )
 def test_flights_with_the_model_on_a_gpu_are_those_on_the_cpu(covariance, propagator):
-    here, there = controller(covariance, propagator), controller(covariance, propagator, GP.to("cuda"))
+    here, there = (
+        controller(covariance, propagator),
+        controller(covariance, propagator, GP.to("cuda")),
+    )
     for ours, theirs in zip(fly(there), fly(here), strict=True):
         assert_same(ours.result, theirs.result)

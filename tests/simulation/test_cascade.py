@@ -24,7 +24,9 @@ NOISE = Noise(measurement=[0.01] * 6 + [0.002, 0.01] * 3)
 def fly(trajectory, steps, cascade=CASCADE, plant=PLANT, **settings):
     references = states_along(trajectory, np.arange(steps + 2.0))
     start = np.concatenate([references[0], np.zeros(6)])
-    return cascade_loop(plant, cascade, references, settings.pop("initial", start), steps, **settings)
+    return cascade_loop(
+        plant, cascade, references, settings.pop("initial", start), steps, **settings
+    )
 
 
 def distance(flight):
@@ -32,7 +34,9 @@ def distance(flight):
 
 
 @pytest.mark.parametrize(
-    ("trajectory", "expected"), [(Elliptical(), 0.01), (Lorenz(), 0.2)], ids=["elliptical", "lorenz"]
+    ("trajectory", "expected"),
+    [(Elliptical(), 0.01), (Lorenz(), 0.2)],
+    ids=["elliptical", "lorenz"],
 )
 def test_it_tracks_both_trajectories_of_the_paper(trajectory, expected):
     flight = fly(trajectory, 25)
@@ -42,7 +46,10 @@ def test_it_tracks_both_trajectories_of_the_paper(trajectory, expected):
 
 def test_the_rollouts_are_two_views_of_one_flight():
     flight = fly(Elliptical(), 3, noise=NOISE)
-    stepped = [step(PLANT, x, u) for x, u in zip(flight.states[:-1], flight.inputs, strict=True)]
+    stepped = [
+        step(PLANT, x, u)
+        for x, u in zip(flight.states[:-1], flight.inputs, strict=True)
+    ]
     assert np.array_equal(stepped, flight.states[1:])
     assert np.array_equal(flight.outer.states, flight.states[::20, :6])
     assert np.array_equal(flight.inner.states, flight.states[:, 6:])
@@ -54,20 +61,37 @@ def test_the_rollouts_are_two_views_of_one_flight():
 
 def test_each_loop_is_told_to_a_recorder_at_its_own_rate():
     steps = {"outer": [], "inner": []}
-    flight = fly(Elliptical(), 3, noise=NOISE, on_step=lambda loop, step: steps[loop].append(step))
+    flight = fly(
+        Elliptical(),
+        3,
+        noise=NOISE,
+        on_step=lambda loop, step: steps[loop].append(step),
+    )
     for told, loop in ((steps["outer"], flight.outer), (steps["inner"], flight.inner)):
         assert [step.k for step in told] == list(range(len(loop.inputs)))
-        assert [step.time for step in told] == pytest.approx(loop.time_step * np.arange(len(loop.inputs)))
-        for name, expected in (("state", loop.states[:-1]), ("measured", loop.measured), ("input", loop.inputs)):
+        assert [step.time for step in told] == pytest.approx(
+            loop.time_step * np.arange(len(loop.inputs))
+        )
+        for name, expected in (
+            ("state", loop.states[:-1]),
+            ("measured", loop.measured),
+            ("input", loop.inputs),
+        ):
             assert np.array_equal([getattr(step, name) for step in told], expected)
-        assert np.array_equal([step.reference for step in told], loop.references[: len(told)])
-        expected = [step.measured - before.decision.means[1] for before, step in pairwise(told)]
+        assert np.array_equal(
+            [step.reference for step in told], loop.references[: len(told)]
+        )
+        expected = [
+            step.measured - before.decision.means[1] for before, step in pairwise(told)
+        ]
         assert np.array_equal([step.innovation for step in told[1:]], expected)
 
 
 def test_the_attitude_comes_to_where_the_outer_plan_points_the_thrust():
     flight = fly(Lorenz(), 8)
-    ends = flight.states[18::20, 6:][:8]  # the last but one inner step looks at the next outer one
+    ends = flight.states[18::20, 6:][
+        :8
+    ]  # the last but one inner step looks at the next outer one
     reached = np.array([thrust_direction(x[0], x[2], x[4])[:2] for x in ends])
     assert np.abs(reached - flight.outer.inputs[:, 1:]).max() < 2e-3
 
@@ -82,18 +106,33 @@ def test_it_flies_with_a_yaw_that_is_still_wrong():
 
 def test_it_survives_a_wrong_mass_and_a_gust():
     heavy = System(Coupled(mass=0.8), time_step=0.05, substeps=1)
-    disturbances = [Replaced(heavy, start=4.0), Gust({"vx": 0.5, "vy": -0.3}, start=8.0, stop=10.0)]
-    flight = fly(Elliptical(), 20, disturbances=disturbances, noise=NOISE, on_failure="previous_plan")
-    error = np.linalg.norm((flight.outer.states - flight.outer.references)[:, ::2], axis=1)
+    disturbances = [
+        Replaced(heavy, start=4.0),
+        Gust({"vx": 0.5, "vy": -0.3}, start=8.0, stop=10.0),
+    ]
+    flight = fly(
+        Elliptical(),
+        20,
+        disturbances=disturbances,
+        noise=NOISE,
+        on_failure="previous_plan",
+    )
+    error = np.linalg.norm(
+        (flight.outer.states - flight.outer.references)[:, ::2], axis=1
+    )
     assert error[:5].max() < 0.1
     assert 0.2 < error.max() < 2.5  # nothing learns the mass: a sag in z remains
-    assert np.abs((flight.outer.states - flight.outer.references)[-3:, [0, 2]]).max() < 0.2  # the gust is over
+    assert (
+        np.abs((flight.outer.states - flight.outer.references)[-3:, [0, 2]]).max() < 0.2
+    )  # the gust is over
 
 
 def test_without_position_the_attitude_is_still_held():
     lost = [Dropout(3.0, 5.5, entries=range(6))]
     flight = fly(Elliptical(), 10, disturbances=lost, on_failure="previous_plan")
-    assert flight.outer.failures == tuple((k, Status.INVALID_MEASUREMENT) for k in (3, 4, 5))
+    assert flight.outer.failures == tuple(
+        (k, Status.INVALID_MEASUREMENT) for k in (3, 4, 5)
+    )
     assert flight.inner.failures == ()
     assert distance(flight) < 0.5
 
@@ -111,7 +150,13 @@ def test_without_any_measurement_for_a_moment_both_plans_go_on():
 def test_the_same_seed_gives_the_same_flight_and_every_inner_step_is_told():
     told = []
     first, again = (
-        fly(Elliptical(), 2, noise=NOISE, seed=1, on_step=lambda *step: told.append(step)),
+        fly(
+            Elliptical(),
+            2,
+            noise=NOISE,
+            seed=1,
+            on_step=lambda *step: told.append(step),
+        ),
         fly(Elliptical(), 2, noise=NOISE, seed=1),
     )
     assert np.array_equal(first.states, again.states)
@@ -130,7 +175,9 @@ def test_the_attitudes_asked_for_change_with_the_plan_and_are_approached_at_firs
     angles = np.array([0.05, 0.0, 0.1])
     reference = cascade.attitude_reference(planned, angles, phase=2)
     assert reference.horizon == 5
-    for row, direction in zip(reference.states, planned[[0, 0, 1, 1, 1, 1], 1:], strict=True):
+    for row, direction in zip(
+        reference.states, planned[[0, 0, 1, 1, 1, 1], 1:], strict=True
+    ):
         assert thrust_direction(row[0], row[2], 0.1)[:2] == pytest.approx(direction)
         assert np.allclose(row[1::2], (row[::2] - angles) / 0.2)
 
@@ -138,15 +185,31 @@ def test_the_attitudes_asked_for_change_with_the_plan_and_are_approached_at_firs
 @pytest.mark.parametrize(
     ("build", "error", "message"),
     [
-        (lambda: Cascade(OUTER, INNER, ratio=0), SettingError, "ratio: must be a whole number, 1 or more; got 0"),
-        (lambda: Cascade(OUTER, INNER, response_time=0), SettingError, "response_time: must be a number above 0"),
+        (
+            lambda: Cascade(OUTER, INNER, ratio=0),
+            SettingError,
+            "ratio: must be a whole number, 1 or more; got 0",
+        ),
+        (
+            lambda: Cascade(OUTER, INNER, response_time=0),
+            SettingError,
+            "response_time: must be a number above 0",
+        ),
         (
             lambda: fly(Elliptical(), 2, plant=System(Map(Rotational()))),
             ShapeError,
             "flies the states and inputs of Coupled",
         ),
-        (lambda: fly(Elliptical(), 2, on_failure="hope"), SettingError, "on_failure: must be one of"),
-        (lambda: fly(Elliptical(), 2, initial=np.zeros(6)), ShapeError, r"must have shape \(12,\); got \(6,\)"),
+        (
+            lambda: fly(Elliptical(), 2, on_failure="hope"),
+            SettingError,
+            "on_failure: must be one of",
+        ),
+        (
+            lambda: fly(Elliptical(), 2, initial=np.zeros(6)),
+            ShapeError,
+            r"must have shape \(12,\); got \(6,\)",
+        ),
         (
             lambda: cascade_loop(PLANT, CASCADE, np.zeros((2, 6)), np.zeros(12), 2),
             ShapeError,

@@ -48,7 +48,9 @@ class Feedback:
         status = Status.ITERATION_LIMIT if k in self.failing else Status.SOLVED
         means = np.tile(belief.mean.numpy(), (4, 1))
         inputs, covariances = np.tile(input, (3, 1)), np.zeros((4, 2, 2))
-        return Decision(input, inputs, means, covariances, status, 5, Timing(0.1, 0.2, 0.3))
+        return Decision(
+            input, inputs, means, covariances, status, 5, Timing(0.1, 0.2, 0.3)
+        )
 
 
 PLANT = System(Cart(), time_step=0.1, substeps=1)
@@ -58,12 +60,17 @@ ALL_NOISE = {"process": [0.01, 0.02], "measurement": [0.03, 0.01], "input": [0.1
 
 
 def fly(steps=30, controller=None, plant=PLANT, initial=START, **settings):
-    return closed_loop(plant, controller or Feedback(), REFERENCES, initial, steps, **settings)
+    return closed_loop(
+        plant, controller or Feedback(), REFERENCES, initial, steps, **settings
+    )
 
 
 def test_states_follow_the_plant_from_what_acted():
     flight = fly(initial=[1, 0])
-    stepped = [step(PLANT, x, u) for x, u in zip(flight.states[:-1], flight.inputs, strict=True)]
+    stepped = [
+        step(PLANT, x, u)
+        for x, u in zip(flight.states[:-1], flight.inputs, strict=True)
+    ]
     assert np.array_equal(stepped, flight.states[1:])
     assert np.array_equal(flight.measured, flight.states[:-1])
     assert flight.covariances.shape == (31, 2, 2)
@@ -76,7 +83,11 @@ def test_states_follow_the_plant_from_what_acted():
 
 def test_the_same_seed_gives_the_same_numbers_and_another_one_others():
     noise = Noise(**ALL_NOISE)
-    first, again, other = fly(noise=noise, seed=3), fly(noise=noise, seed=3), fly(noise=noise, seed=4)
+    first, again, other = (
+        fly(noise=noise, seed=3),
+        fly(noise=noise, seed=3),
+        fly(noise=noise, seed=4),
+    )
     assert np.array_equal(first.states, again.states)
     assert np.array_equal(first.measured, again.measured)
     assert not np.array_equal(first.states, other.states)
@@ -88,12 +99,24 @@ def test_each_noise_has_its_own_stream_and_deviation():
             return super().control(Gaussian.certain(np.zeros(2)), reference, previous)
 
     steps = 97
-    alone = {key: fly(steps, Blind(), noise=Noise(**{key: value})) for key, value in ALL_NOISE.items()}
+    alone = {
+        key: fly(steps, Blind(), noise=Noise(**{key: value}))
+        for key, value in ALL_NOISE.items()
+    }
     together = fly(steps, Blind(), noise=Noise(**ALL_NOISE))
     assert np.array_equal(alone["input"].inputs, together.inputs)
     drawn = together.measured - together.states[:-1]
-    assert np.allclose(alone["measurement"].measured - alone["measurement"].states[:-1], drawn, atol=1e-14)
-    pushed = np.array([step(PLANT, x, u) for x, u in zip(together.states[:-1], together.inputs, strict=True)])
+    assert np.allclose(
+        alone["measurement"].measured - alone["measurement"].states[:-1],
+        drawn,
+        atol=1e-14,
+    )
+    pushed = np.array(
+        [
+            step(PLANT, x, u)
+            for x, u in zip(together.states[:-1], together.inputs, strict=True)
+        ]
+    )
     process = together.states[1:] - pushed
     assert np.abs(process.std(axis=0) / ALL_NOISE["process"] - 1).max() < 0.3
     assert np.abs(drawn.std(axis=0) / ALL_NOISE["measurement"] - 1).max() < 0.3
@@ -102,7 +125,9 @@ def test_each_noise_has_its_own_stream_and_deviation():
 
 def test_a_belief_is_what_the_initial_state_is_drawn_from():
     belief = Gaussian(torch.tensor([1.0, 0.0]), torch.diag(torch.tensor([0.04, 0.0])))
-    starts = np.array([fly(1, initial=belief, seed=seed).states[0] for seed in range(40)])
+    starts = np.array(
+        [fly(1, initial=belief, seed=seed).states[0] for seed in range(40)]
+    )
     assert np.all(starts[:, 1] == 0)
     assert 0.1 < starts[:, 0].std() < 0.3
     assert np.array_equal(fly(1, initial=belief, seed=7).states[0], starts[7])
@@ -110,7 +135,10 @@ def test_a_belief_is_what_the_initial_state_is_drawn_from():
 
 def test_a_gust_acts_in_its_window_and_is_integrated():
     def pushes(flight):
-        free = [step(PLANT, x, u) for x, u in zip(flight.states[:-1], flight.inputs, strict=True)]
+        free = [
+            step(PLANT, x, u)
+            for x, u in zip(flight.states[:-1], flight.inputs, strict=True)
+        ]
         return flight.states[1:] - np.array(free)
 
     pushed = pushes(fly(disturbances=[Gust({"v": 2.0}, start=0.5, stop=1.0)]))
@@ -127,7 +155,10 @@ def test_a_gust_moves_the_next_state_of_a_plant_without_derivative():
 
     plant = System(InSteps(), time_step=0.1)
     flight = fly(plant=plant, disturbances=[Gust({"v": 2.0}, start=0.5, stop=1.0)])
-    free = [step(plant, x, u) for x, u in zip(flight.states[:-1], flight.inputs, strict=True)]
+    free = [
+        step(plant, x, u)
+        for x, u in zip(flight.states[:-1], flight.inputs, strict=True)
+    ]
     pushes = flight.states[1:] - np.array(free)
     assert np.allclose(pushes[5:10], [0.0, 2.0], atol=1e-12)
     assert np.abs(np.delete(pushes, range(5, 10), axis=0)).max() == 0
@@ -137,7 +168,9 @@ def test_a_plant_is_replaced_from_a_time_on():
     heavy = System(HeavyCart(), time_step=0.1, substeps=1)
     flight = fly(disturbances=[Replaced(heavy, start=1.0)])
     for k, (x, u) in enumerate(zip(flight.states[:-1], flight.inputs, strict=True)):
-        assert np.array_equal(step(PLANT if k < 10 else heavy, x, u), flight.states[k + 1])
+        assert np.array_equal(
+            step(PLANT if k < 10 else heavy, x, u), flight.states[k + 1]
+        )
 
 
 def test_disturbances_add_up_in_their_order():
@@ -149,7 +182,11 @@ def test_disturbances_add_up_in_their_order():
 
 def test_a_dropout_is_bridged_by_the_policy_counted_and_never_seen():
     controller = Feedback()
-    flight = fly(controller=controller, disturbances=[Dropout(0.3, 0.6)], on_failure="previous_plan")
+    flight = fly(
+        controller=controller,
+        disturbances=[Dropout(0.3, 0.6)],
+        on_failure="previous_plan",
+    )
     assert flight.failures == tuple((k, Status.INVALID_MEASUREMENT) for k in (3, 4, 5))
     assert np.isnan(flight.measured[3:6]).all()
     assert np.isnan(flight.predicted_means[3:6]).all()
@@ -173,7 +210,10 @@ def test_every_failure_is_counted_with_step_and_status():
 def test_every_plan_that_leaves_the_data_behind_is_counted_with_its_step():
     class Astray(Feedback):
         def control(self, belief, reference, previous=None):
-            return replace(super().control(belief, reference, previous), novelty=0.99 if len(self.seen) == 3 else 0.1)
+            return replace(
+                super().control(belief, reference, previous),
+                novelty=0.99 if len(self.seen) == 3 else 0.1,
+            )
 
     assert fly(5, Astray()).far_from_data == (2,)
 
@@ -198,19 +238,36 @@ def test_references_with_inputs_are_handed_on_window_by_window():
 
     references = Reference(np.arange(18.0).reshape(9, 2), np.arange(8.0)[:, None])
     flight = closed_loop(PLANT, Curious(), references, START, 6)
-    assert all(np.array_equal(r.states, references.states[k : k + 4]) for k, r in enumerate(seen))
-    assert all(np.array_equal(r.inputs, references.inputs[k : k + 3]) for k, r in enumerate(seen))
+    assert all(
+        np.array_equal(r.states, references.states[k : k + 4])
+        for k, r in enumerate(seen)
+    )
+    assert all(
+        np.array_equal(r.inputs, references.inputs[k : k + 3])
+        for k, r in enumerate(seen)
+    )
     assert np.array_equal(flight.references, references.states[:7])
 
 
 @pytest.fixture(scope="module")
 def model():
     rng = np.random.default_rng(0)
-    x, u = torch.from_numpy(rng.normal(size=(40, 2))), torch.from_numpy(3 * rng.normal(size=(40, 1)))
-    after = torch.from_numpy(np.array([step(PLANT, a, b) for a, b in zip(x.numpy(), u.numpy(), strict=True)]))
+    x, u = (
+        torch.from_numpy(rng.normal(size=(40, 2))),
+        torch.from_numpy(3 * rng.normal(size=(40, 1))),
+    )
+    after = torch.from_numpy(
+        np.array([step(PLANT, a, b) for a, b in zip(x.numpy(), u.numpy(), strict=True)])
+    )
     ones = torch.ones(2)
     return GPPosterior.from_hyperparameters(
-        torch.cat([x, u], 1), after - x, 6 * torch.ones(2, 3), 4 * ones, 1e-5 * ones, 1, "difference"
+        torch.cat([x, u], 1),
+        after - x,
+        6 * torch.ones(2, 3),
+        4 * ones,
+        1e-5 * ones,
+        1,
+        "difference",
     )
 
 
@@ -230,16 +287,21 @@ def test_a_model_loop_carries_mean_and_covariance_on(model):
 def test_a_model_loop_starts_from_a_given_belief(model):
     belief = Gaussian(torch.tensor([0.5, 0.0]), 0.5 * torch.eye(2))
     assert np.array_equal(
-        fly(1, plant=ModelLoop(model, MomentMatching()), initial=belief).covariances[0], np.eye(2) / 2
+        fly(1, plant=ModelLoop(model, MomentMatching()), initial=belief).covariances[0],
+        np.eye(2) / 2,
     )
 
 
 def test_a_plant_that_leaves_the_finite_numbers_is_said_so():
-    with pytest.raises(Diverged, match="step 1: the plant's state is not finite any more") as caught:
+    with pytest.raises(
+        Diverged, match="step 1: the plant's state is not finite any more"
+    ) as caught:
         fly(plant=System(Exploding(), substeps=1), initial=np.array([0.0, 1.0]))
     assert caught.value.step == 1
     flown = caught.value.flown
-    assert flown.states[:, 1] == pytest.approx([1.0, 1e60], rel=1e300)  # what was flown before is kept
+    assert flown.states[:, 1] == pytest.approx(
+        [1.0, 1e60], rel=1e300
+    )  # what was flown before is kept
     assert len(flown.inputs) == 1
     with pytest.raises(Diverged) as caught:
         fly(plant=System(Exploding(), substeps=1), initial=np.array([0.0, 1e300]))
@@ -249,17 +311,53 @@ def test_a_plant_that_leaves_the_finite_numbers_is_said_so():
 @pytest.mark.parametrize(
     ("settings", "error", "message"),
     [
-        ({"on_failure": "previous"}, SettingError, "on_failure: must be one of 'previous_plan', .*; got 'previous'"),
-        ({"noise": Noise(process=[0.1])}, ShapeError, "noise.process must have 2 standard deviations; got 1"),
-        ({"noise": Noise(input=[0.1, 1])}, ShapeError, "noise.input must have 1 standard deviations; got 2"),
-        ({"initial": np.zeros(3)}, ShapeError, r"the initial state must have shape \(2,\); got \(3,\)"),
-        ({"initial": np.array([np.nan, 0])}, SettingError, "initial: must be finite; got"),
-        ({"steps": 98}, ShapeError, "98 steps with horizon 3 need 101 references; got 100"),
+        (
+            {"on_failure": "previous"},
+            SettingError,
+            "on_failure: must be one of 'previous_plan', .*; got 'previous'",
+        ),
+        (
+            {"noise": Noise(process=[0.1])},
+            ShapeError,
+            "noise.process must have 2 standard deviations; got 1",
+        ),
+        (
+            {"noise": Noise(input=[0.1, 1])},
+            ShapeError,
+            "noise.input must have 1 standard deviations; got 2",
+        ),
+        (
+            {"initial": np.zeros(3)},
+            ShapeError,
+            r"the initial state must have shape \(2,\); got \(3,\)",
+        ),
+        (
+            {"initial": np.array([np.nan, 0])},
+            SettingError,
+            "initial: must be finite; got",
+        ),
+        (
+            {"steps": 98},
+            ShapeError,
+            "98 steps with horizon 3 need 101 references; got 100",
+        ),
         ({"steps": 0}, SettingError, "steps: must be a whole number, 1 or more; got 0"),
         ({"seed": -1}, SettingError, "seed: must be a whole number, 0 or more; got -1"),
-        ({"disturbances": [Gust({"w": 1.0})]}, SettingError, "must name states of the plant, x, v; got 'w'"),
-        ({"disturbances": [Dropout(5, 6, entries=[2])]}, SettingError, "must be indices of states, 0 to 1; got 2"),
-        ({"disturbances": [Replaced(System(Map(Translational())))]}, ShapeError, "replaced by one of the same states"),
+        (
+            {"disturbances": [Gust({"w": 1.0})]},
+            SettingError,
+            "must name states of the plant, x, v; got 'w'",
+        ),
+        (
+            {"disturbances": [Dropout(5, 6, entries=[2])]},
+            SettingError,
+            "must be indices of states, 0 to 1; got 2",
+        ),
+        (
+            {"disturbances": [Replaced(System(Map(Translational())))]},
+            ShapeError,
+            "replaced by one of the same states",
+        ),
     ],
 )
 def test_misuse_is_refused_with_the_rule(settings, error, message):
@@ -270,13 +368,22 @@ def test_misuse_is_refused_with_the_rule(settings, error, message):
 @pytest.mark.parametrize(
     ("build", "message"),
     [
-        (lambda: Noise(process=[0.1, -0.1]), "noise.process: must be a number, 0 or more; got -0.1"),
+        (
+            lambda: Noise(process=[0.1, -0.1]),
+            "noise.process: must be a number, 0 or more; got -0.1",
+        ),
         (lambda: Noise(measurement=0.1), "noise.measurement: must be a list"),
-        (lambda: Gust({"v": 1.0}, start=2.0, stop=1.0), r"stop: must be a number above 2.0 \[s\]; got 1.0"),
+        (
+            lambda: Gust({"v": 1.0}, start=2.0, stop=1.0),
+            r"stop: must be a number above 2.0 \[s\]; got 1.0",
+        ),
         (lambda: Gust({"v": "strong"}), "rates.v: must be a number; got 'strong'"),
         (lambda: Gust({}), "rates: must map names of states to numbers"),
         (lambda: Dropout(1.0, 1.0), "stop: must be a number above 1.0"),
-        (lambda: ModelLoop(None, None, time_step=-1), r"time_step: must be a number above 0 \[s\]; got -1"),
+        (
+            lambda: ModelLoop(None, None, time_step=-1),
+            r"time_step: must be a number above 0 \[s\]; got -1",
+        ),
     ],
 )
 def test_a_wrong_setting_is_refused_at_construction(build, message):
@@ -293,11 +400,19 @@ def test_a_gust_on_a_simulator_is_refused_with_what_is_possible():
 
     with pytest.raises(UnsupportedModel, match="Possible with any plant: Replaced"):
         fly(plant=System(UnderWay(), 0.1), disturbances=[Gust({"v": 1.0})])
-    with pytest.raises(SettingError, match=r"system: must be a plant, such as System\(dynamics, 0.1\).*got UnderWay"):
+    with pytest.raises(
+        SettingError,
+        match=r"system: must be a plant, such as System\(dynamics, 0.1\).*got UnderWay",
+    ):
         fly(plant=UnderWay())
 
 
 def test_nothing_disturbs_a_model_loop(model):
-    for settings in ({"noise": Noise(process=[0.1, 0.1])}, {"disturbances": [Gust({"v": 1.0})]}):
-        with pytest.raises(SettingError, match="need a plant in the loop; got a ModelLoop"):
+    for settings in (
+        {"noise": Noise(process=[0.1, 0.1])},
+        {"disturbances": [Gust({"v": 1.0})]},
+    ):
+        with pytest.raises(
+            SettingError, match="need a plant in the loop; got a ModelLoop"
+        ):
             fly(plant=ModelLoop(model, MomentMatching()), **settings)

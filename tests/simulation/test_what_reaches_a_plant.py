@@ -15,10 +15,18 @@ from gpmpc.systems import Coupled, System
 from tests.mpc.systems import QUADROTOR, quadrotor_gp
 
 H, STEPS = 3, 12
-LOWER, UPPER, RATE = np.array([5.0, -0.2, -0.2]), np.array([9.0, 0.2, 0.2]), np.array([0.5, 0.1, 0.1])
-PROBLEM = Problem(Tracking([1] * 6, [1] * 3), inputs=Box(LOWER, UPPER), input_rates=Box(-RATE, RATE))
+LOWER, UPPER, RATE = (
+    np.array([5.0, -0.2, -0.2]),
+    np.array([9.0, 0.2, 0.2]),
+    np.array([0.5, 0.1, 0.1]),
+)
+PROBLEM = Problem(
+    Tracking([1] * 6, [1] * 3), inputs=Box(LOWER, UPPER), input_rates=Box(-RATE, RATE)
+)
 FIRST = np.array([7.0, 0.0, 0.0])
-FAR = np.array([1e6, 1.0, 1.0])  # the inputs that belong to the reference, outside of everything
+FAR = np.array(
+    [1e6, 1.0, 1.0]
+)  # the inputs that belong to the reference, outside of everything
 REFERENCES = Reference(np.zeros((STEPS + H, 6)), np.tile(FAR, (STEPS + H - 1, 1)))
 START, NOTHING = np.zeros(6), (np.zeros((H + 1, 6)), np.zeros((H + 1, 6, 6)))
 
@@ -36,7 +44,9 @@ LIES = {
     "nan later": lambda plan: spoilt(plan, -1, 0, np.nan),
     "above the box": lambda plan: spoilt(plan, 0, 0, UPPER[0] + 0.01),
     "below the box": lambda plan: spoilt(plan, 0, 1, -1e9),
-    "a leap": lambda plan: spoilt(plan, 0, 0, plan[0, 0] + (0.8 if plan[0, 0] < 7 else -0.8)),
+    "a leap": lambda plan: spoilt(
+        plan, 0, 0, plan[0, 0] + (0.8 if plan[0, 0] < 7 else -0.8)
+    ),
     "two inputs": lambda plan: plan[:, :2],
     "four inputs": lambda plan: np.hstack([plan, plan[:, :1]]),
     "none": lambda plan: plan[:, :0],
@@ -56,11 +66,31 @@ class Liar:
         k, self.asked = self.asked, self.asked + 1
         plan = [self.initial_input if previous is None else previous.input]
         for _ in range(H):
-            plan.append(np.clip(plan[-1] + RATE * self.draws.uniform(-0.9, 0.9, 3), LOWER, UPPER))
-        plan = LIES[self.lies[k]](np.array(plan[1:])) if k in self.lies else np.array(plan[1:])
-        means, covariances = np.tile(belief.mean.numpy(), (H + 1, 1)), np.zeros((H + 1, 6, 6))
+            plan.append(
+                np.clip(
+                    plan[-1] + RATE * self.draws.uniform(-0.9, 0.9, 3), LOWER, UPPER
+                )
+            )
+        plan = (
+            LIES[self.lies[k]](np.array(plan[1:]))
+            if k in self.lies
+            else np.array(plan[1:])
+        )
+        means, covariances = (
+            np.tile(belief.mean.numpy(), (H + 1, 1)),
+            np.zeros((H + 1, 6, 6)),
+        )
         suboptimal = not self.status.solved
-        return Decision(plan[0], plan, means, covariances, self.status, 1, Timing(0.0, 0.0, 0.0), suboptimal=suboptimal)
+        return Decision(
+            plan[0],
+            plan,
+            means,
+            covariances,
+            self.status,
+            1,
+            Timing(0.0, 0.0, 0.0),
+            suboptimal=suboptimal,
+        )
 
 
 def check(inputs):
@@ -70,24 +100,46 @@ def check(inputs):
     assert (np.abs(np.diff(np.vstack([FIRST, inputs]), axis=0)) <= RATE + 1e-12).all()
 
 
-@pytest.mark.parametrize("status", [Status.SOLVED, Status.ITERATION_LIMIT], ids=["solved", "suboptimal"])
+@pytest.mark.parametrize(
+    "status", [Status.SOLVED, Status.ITERATION_LIMIT], ids=["solved", "suboptimal"]
+)
 @pytest.mark.parametrize("policy", ["previous_plan", "hold"])
-@pytest.mark.parametrize("system", [QUADROTOR, ModelLoop(quadrotor_gp(10), Linearization())], ids=["plant", "model"])
+@pytest.mark.parametrize(
+    "system",
+    [QUADROTOR, ModelLoop(quadrotor_gp(10), Linearization())],
+    ids=["plant", "model"],
+)
 def test_in_a_loop_no_lie_is_applied(system, policy, status):
     for shift, kinds in enumerate((list(LIES), list(LIES)[::-1])):
-        lies = {k + shift: kind for k, kind in enumerate(kinds)}  # from the first step on, and after a good one
-        flight = closed_loop(system, Liar(lies, status), REFERENCES, START, STEPS, on_failure=policy)
+        lies = {
+            k + shift: kind for k, kind in enumerate(kinds)
+        }  # from the first step on, and after a good one
+        flight = closed_loop(
+            system, Liar(lies, status), REFERENCES, START, STEPS, on_failure=policy
+        )
         check(flight.inputs)
-        assert flight.failures == tuple((k, Status.NUMERICAL_TROUBLE) for k in sorted(lies))
-        assert flight.suboptimal == (() if status.solved else tuple(sorted(set(range(STEPS)) - set(lies))))
+        assert flight.failures == tuple(
+            (k, Status.NUMERICAL_TROUBLE) for k in sorted(lies)
+        )
+        assert flight.suboptimal == (
+            () if status.solved else tuple(sorted(set(range(STEPS)) - set(lies)))
+        )
         assert np.isnan(flight.predicted_means[sorted(lies)]).all()
-        assert np.isfinite(np.delete(flight.predicted_means, sorted(lies), axis=0)).all()
+        assert np.isfinite(
+            np.delete(flight.predicted_means, sorted(lies), axis=0)
+        ).all()
 
 
 def test_in_a_cascade_no_lie_is_applied_by_either_controller():
-    cascade = Cascade(Liar({0: "nan", 2: "a leap"}), Liar({0: "two inputs", 3: "infinite", 4: "above the box"}), 2)
+    cascade = Cascade(
+        Liar({0: "nan", 2: "a leap"}),
+        Liar({0: "two inputs", 3: "infinite", 4: "above the box"}),
+        2,
+    )
     plant = System(Coupled(), 0.05, 1)
-    flight = cascade_loop(plant, cascade, REFERENCES, np.zeros(12), 4, on_failure="hold")
+    flight = cascade_loop(
+        plant, cascade, REFERENCES, np.zeros(12), 4, on_failure="hold"
+    )
     check(flight.outer.inputs)
     assert [k for k, _ in flight.outer.failures] == [0, 2]
     assert [k for k, _ in flight.inner.failures] == [0, 3, 4]
@@ -99,23 +151,37 @@ def test_in_a_cascade_no_lie_is_applied_by_either_controller():
 def test_many_at_once_are_looked_at_one_by_one(kind):
     class Crowd(Liar):
         def control_many(self, beliefs, references, previous):
-            return [self.control(*question) for question in zip(beliefs, references, previous, strict=True)]
+            return [
+                self.control(*question)
+                for question in zip(beliefs, references, previous, strict=True)
+            ]
 
     for controller in (Liar({4: kind}), Crowd({4: kind})):
-        flown = closed_loops(QUADROTOR, controller, REFERENCES, START, STEPS, 3, on_failure="hold")
+        flown = closed_loops(
+            QUADROTOR, controller, REFERENCES, START, STEPS, 3, on_failure="hold"
+        )
         for trial in flown:
             check(trial.result.inputs)
-        assert [len(trial.result.failures) for trial in flown] == [0, 1, 0]  # the second trial's second step
+        assert [len(trial.result.failures) for trial in flown] == [
+            0,
+            1,
+            0,
+        ]  # the second trial's second step
 
 
 @pytest.mark.parametrize("kind", LIES)
 def test_a_loop_of_ones_own_is_stopped_where_the_policy_says_so(kind):
     state, reference = Gaussian.certain(START), Reference(REFERENCES.states[: H + 1])
-    with pytest.raises(SolverFailure, match="step 7: its plan, SOLVED, is not finite or out of its bounds or shape"):
+    with pytest.raises(
+        SolverFailure,
+        match="step 7: its plan, SOLVED, is not finite or out of its bounds or shape",
+    ):
         command(Liar({0: kind}), state, reference, None, "raise", 7)
     (first,) = commands(Liar({0: kind}), [state], reference, [None], "hold", 7)
     assert first.failed
-    assert np.array_equal(first.input, Liar.initial_input)  # there is nothing else to hold
+    assert np.array_equal(
+        first.input, Liar.initial_input
+    )  # there is nothing else to hold
     good = command(Liar(), state, reference)
     held = command(Liar({0: kind}), state, reference, good, "hold")
     assert held.failed
@@ -129,17 +195,32 @@ def test_what_misses_a_bound_by_rounding_is_put_onto_it():
         def control(self, belief, reference, previous=None):
             plan = np.tile(np.array([7.5, 0.1, -0.1]) + 1e-7, (H, 1))
             return Decision(
-                plan[0], plan, np.zeros((H + 1, 6)), np.zeros((H + 1, 6, 6)), Status.SOLVED, 1, Timing(0.0, 0.0, 0.0)
+                plan[0],
+                plan,
+                np.zeros((H + 1, 6)),
+                np.zeros((H + 1, 6, 6)),
+                Status.SOLVED,
+                1,
+                Timing(0.0, 0.0, 0.0),
             )
 
-    asked = command(Loose(), Gaussian.certain(START), Reference(REFERENCES.states[: H + 1]))
+    asked = command(
+        Loose(), Gaussian.certain(START), Reference(REFERENCES.states[: H + 1])
+    )
     assert asked.input.tolist() == [7.5, 0.1, -0.1 + 1e-7]
-    assert asked.plan.inputs[0].tolist() == asked.plan.input.tolist() == asked.input.tolist()
+    assert (
+        asked.plan.inputs[0].tolist()
+        == asked.plan.input.tolist()
+        == asked.input.tolist()
+    )
     assert not asked.failed
 
 
 def test_a_reference_that_is_not_finite_is_nothing_to_fall_back_on():
-    lost, reference = Gaussian.certain(START * np.nan), Reference(REFERENCES.states[: H + 1], np.full((H, 3), np.nan))
+    lost, reference = (
+        Gaussian.certain(START * np.nan),
+        Reference(REFERENCES.states[: H + 1], np.full((H, 3), np.nan)),
+    )
     with pytest.raises(SolverFailure, match="no reference input to fall back on"):
         command(Liar(), lost, reference, None, "hold")
 
@@ -150,26 +231,64 @@ def test_a_controller_without_declared_bounds_is_held_to_finite_inputs_of_the_pl
 
         def control(self, belief, reference, previous=None):
             plan = np.full((H, 3), 1e3)
-            plan = LIES[self.lies[self.asked]](plan) if self.asked in self.lies else plan
+            plan = (
+                LIES[self.lies[self.asked]](plan) if self.asked in self.lies else plan
+            )
             self.asked += 1
             return Decision(
-                plan[0], plan, np.zeros((H + 1, 6)), np.zeros((H + 1, 6, 6)), Status.SOLVED, 1, Timing(0.0, 0.0, 0.0)
+                plan[0],
+                plan,
+                np.zeros((H + 1, 6)),
+                np.zeros((H + 1, 6, 6)),
+                Status.SOLVED,
+                1,
+                Timing(0.0, 0.0, 0.0),
             )
 
-    flight = closed_loop(QUADROTOR, Foreign({2: "nan", 3: "two inputs"}), REFERENCES, START, 4, on_failure="hold")
+    flight = closed_loop(
+        QUADROTOR,
+        Foreign({2: "nan", 3: "two inputs"}),
+        REFERENCES,
+        START,
+        4,
+        on_failure="hold",
+    )
     assert np.array_equal(flight.inputs, np.full((4, 3), 1e3))
     assert [k for k, _ in flight.failures] == [2, 3]
-    with pytest.raises(ShapeError, match=r"the plant takes inputs of shape \(3,\); got \(2,\)"):
+    with pytest.raises(
+        ShapeError, match=r"the plant takes inputs of shape \(3,\); got \(2,\)"
+    ):
         closed_loop(QUADROTOR, Foreign({0: "two inputs"}), REFERENCES, START, 4)
 
 
 def test_a_recorder_is_told_that_the_policy_chose_the_input():
     lies, told = {1: "nan", 3: "two inputs"}, []
-    closed_loop(QUADROTOR, Liar(lies), REFERENCES, START, 5, on_failure="hold", on_step=told.append)
+    closed_loop(
+        QUADROTOR,
+        Liar(lies),
+        REFERENCES,
+        START,
+        5,
+        on_failure="hold",
+        on_step=told.append,
+    )
     assert [step.failed for step in told] == [False, True, False, True, False]
     assert [step.status.solved for step in told] == [True, False, True, False, True]
-    assert [step.decision is None for step in told] == [False, False, False, True, False]
+    assert [step.decision is None for step in told] == [
+        False,
+        False,
+        False,
+        True,
+        False,
+    ]
     told.clear()
-    closed_loop(QUADROTOR, Liar(status=Status.TIME_LIMIT), REFERENCES, START, 5, on_step=told.append)
+    closed_loop(
+        QUADROTOR,
+        Liar(status=Status.TIME_LIMIT),
+        REFERENCES,
+        START,
+        5,
+        on_step=told.append,
+    )
     assert not any(step.failed for step in told)
     assert np.isfinite(told[1].innovation).all()

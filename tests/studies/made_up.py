@@ -14,13 +14,20 @@ from gpmpc.studies.flight import Experiment, Flown, metrics
 from gpmpc.studies.report import report_document
 from gpmpc.systems import translational
 
-SETTINGS = {"data": {"size": None}, "horizon": 10, "seed": 0, "options": {"controller": "convex"}}
+SETTINGS = {
+    "data": {"size": None},
+    "horizon": 10,
+    "seed": 0,
+    "options": {"controller": "convex"},
+}
 PLANT = translational()
 
 
 def metrics_of(error, steps=20, failing=0, constraints=()):
     """The metrics of a flight that is everywhere ``error`` [m] from its reference in x."""
-    problem = SimpleNamespace(inputs=Box(np.zeros(3), np.full(3, 10.0)), constraints=constraints)
+    problem = SimpleNamespace(
+        inputs=Box(np.zeros(3), np.full(3, 10.0)), constraints=constraints
+    )
     references = np.zeros((steps + 1, 6))
     states = references.copy()
     states[:, 0] = error
@@ -31,7 +38,9 @@ def metrics_of(error, steps=20, failing=0, constraints=()):
         np.full((steps, 6, 6), np.nan), statuses, np.ones(steps, int), (timing,) * steps, 1.0,
     )  # fmt: skip
     experiment = Experiment(None, None, PLANT, None, lambda plant: None, steps=steps)
-    return metrics(experiment, Flown(rollout, SimpleNamespace(problem=problem, horizon=2), None))
+    return metrics(
+        experiment, Flown(rollout, SimpleNamespace(problem=problem, horizon=2), None)
+    )
 
 
 def made_up_run(tree, choices, settings, result=None, error=None):
@@ -51,7 +60,13 @@ def plan(tree, runs):
 
 def chosen(controller, seed, **more):
     settings = SETTINGS | {"seed": seed, "options": {"controller": controller}}
-    return sorted([f"controller={controller}", f"seed={seed}", *(f"{k}={v}" for k, v in more.items())]), settings
+    return sorted(
+        [
+            f"controller={controller}",
+            f"seed={seed}",
+            *(f"{k}={v}" for k, v in more.items()),
+        ]
+    ), settings
 
 
 def add(tree, controller, seed, error, **how):

@@ -12,12 +12,21 @@ from gpmpc.studies.report import compare, sentences
 from gpmpc.studies.report import read_report as report
 from tests.studies.made_up import made_up_run, metrics_of
 
-SETTINGS = {"data": {"size": None}, "horizon": 10, "seed": 0, "options": {"controller": "convex"}}
+SETTINGS = {
+    "data": {"size": None},
+    "horizon": 10,
+    "seed": 0,
+    "options": {"controller": "convex"},
+}
 GROUPS = "controller=lqr", "controller=convex"
 
 
 def fly(tree, controller, seed, error, **more):
-    choices = [f"controller={controller}", f"seed={seed}", *(f"{key}={value}" for key, value in more.items())]
+    choices = [
+        f"controller={controller}",
+        f"seed={seed}",
+        *(f"{key}={value}" for key, value in more.items()),
+    ]
     settings = SETTINGS | {"seed": seed, "options": {"controller": controller}} | more
     made_up_run(tree, choices, settings, result=metrics_of(error))
 
@@ -31,7 +40,9 @@ def compared(tree, first, second):
 
 
 @pytest.mark.parametrize("pairs", [6, 9, 15])
-def test_the_statistics_of_pairs_are_those_of_scipy_and_of_their_definitions(pairs, tmp_path, rng):
+def test_the_statistics_of_pairs_are_those_of_scipy_and_of_their_definitions(
+    pairs, tmp_path, rng
+):
     a = rng.uniform(0.1, 0.2, pairs)
     b = a + 0.01 * rng.normal(0.3, 1.0, pairs)
     ours, theirs = compared(tmp_path, a, b), stats.ttest_rel(a, b)
@@ -53,22 +64,37 @@ def test_swapped_groups_turn_the_signs_and_keep_the_tests(tmp_path, rng):
     a, b = rng.uniform(0.1, 0.2, size=(2, 8))
     ours, turned = compared(tmp_path / "ab", a, b), compared(tmp_path / "ba", b, a)
     assert turned.medians == ours.medians[::-1]
-    assert (turned.wilcoxon, turned.t_test) == pytest.approx((ours.wilcoxon, ours.t_test))
-    assert turned.interval == pytest.approx((-ours.interval[1], -ours.interval[0]))
-    assert (turned.difference, turned.rank_biserial, turned.standardised) == pytest.approx(
-        (-ours.difference, -ours.rank_biserial, -ours.standardised)
+    assert (turned.wilcoxon, turned.t_test) == pytest.approx(
+        (ours.wilcoxon, ours.t_test)
     )
+    assert turned.interval == pytest.approx((-ours.interval[1], -ours.interval[0]))
+    assert (
+        turned.difference,
+        turned.rank_biserial,
+        turned.standardised,
+    ) == pytest.approx((-ours.difference, -ours.rank_biserial, -ours.standardised))
 
 
 def test_a_verdict_is_given_below_five_percent_and_not_above(tmp_path):
     """Of six pairs p is 2 / 64 where all agree, and 4 / 64 where the smallest difference contradicts the others."""
     sizes = np.array([1, 2, 3, 4, 5, 6]) * 1e-3
     found = compared(tmp_path / "agree", 0.2 + sizes, np.full(6, 0.2))
-    assert (found.wilcoxon, found.verdict) == (pytest.approx(2 / 64), "A is larger than B")
+    assert (found.wilcoxon, found.verdict) == (
+        pytest.approx(2 / 64),
+        "A is larger than B",
+    )
     found = compared(tmp_path / "turned", 0.2 - sizes, np.full(6, 0.2))
-    assert (found.wilcoxon, found.verdict) == (pytest.approx(2 / 64), "A is smaller than B")
-    found = compared(tmp_path / "contradict", 0.2 + sizes * [-1, 1, 1, 1, 1, 1], np.full(6, 0.2))
-    assert (found.wilcoxon, found.verdict) == (pytest.approx(4 / 64), "no difference shown")
+    assert (found.wilcoxon, found.verdict) == (
+        pytest.approx(2 / 64),
+        "A is smaller than B",
+    )
+    found = compared(
+        tmp_path / "contradict", 0.2 + sizes * [-1, 1, 1, 1, 1, 1], np.full(6, 0.2)
+    )
+    assert (found.wilcoxon, found.verdict) == (
+        pytest.approx(4 / 64),
+        "no difference shown",
+    )
 
 
 def test_groups_without_two_seeds_in_common_are_refused(tmp_path):
@@ -80,7 +106,9 @@ def test_groups_without_two_seeds_in_common_are_refused(tmp_path):
     assert compare(report(tmp_path), *GROUPS)[0].pairs == 2
 
 
-def test_the_words_name_what_only_one_measure_lacks_there_and_what_all_lack_at_the_top(tmp_path):
+def test_the_words_name_what_only_one_measure_lacks_there_and_what_all_lack_at_the_top(
+    tmp_path,
+):
     for seed in range(8):
         fly(tmp_path, "lqr", seed, 0.1)
         if seed != 7:

@@ -6,7 +6,16 @@ import pandas as pd
 import pytest
 from rich.console import Console
 
-from gpmpc.studies._document import Document, Table, figure_label, json_text, number, plain_text, terminal, with_range
+from gpmpc.studies._document import (
+    Document,
+    Table,
+    figure_label,
+    json_text,
+    number,
+    plain_text,
+    terminal,
+    with_range,
+)
 
 RUNS = Table(
     ["kind", "n, all", "RMSE [m]"],
@@ -22,7 +31,12 @@ DOCUMENT = Document(
     lead="It *is* so.",
     notes=["first", "a|b"],
     lists={"Failed": ["one_two _x_", "[a](b)"], "Nothing": []},
-    code={"Nothing else": (), "To fill": ["l < 1"], "Eleven": ["x"] * 11, "Ten": ["x"] * 10},
+    code={
+        "Nothing else": (),
+        "To fill": ["l < 1"],
+        "Eleven": ["x"] * 11,
+        "Ten": ["x"] * 10,
+    },
     images={"a.png": b"\x89PNG"},
     links={"run/<1>": "../a b"},
 )
@@ -175,7 +189,10 @@ def test_a_terminal_shows_sections_details_and_notes():
     tables = [RUNS, PLAIN, Table(["", ""], [["a", "1"]]), Table(["n"], [])]
     console = Console(file=io.StringIO(), width=60)
     console.print(terminal(tables, "note"))
-    assert "\n".join(line.rstrip() for line in console.file.getvalue().splitlines()) + "\n" == TERMINAL
+    assert (
+        "\n".join(line.rstrip() for line in console.file.getvalue().splitlines()) + "\n"
+        == TERMINAL
+    )
 
 
 def test_a_spreadsheet_takes_nothing_for_a_formula_and_numbers_for_numbers():
@@ -195,7 +212,9 @@ def test_a_document_of_a_title_and_a_table_is_no_more_than_that():
     bare = Document("t", [PLAIN], pd.DataFrame())
     assert bare.markdown() == "# t\n\n| x |\n| --- |\n| 1 |\n"
     assert "<h2>" not in bare.html()
-    shorter = Document("t", [RUNS], pd.DataFrame(), latex=[Table(["x, y [m]"], [["[1]"], [2.0]])])
+    shorter = Document(
+        "t", [RUNS], pd.DataFrame(), latex=[Table(["x, y [m]"], [["[1]"], [2.0]])]
+    )
     assert r"x \\" in shorter.tex()
     assert "{}[1] \\\\\n2 \\\\" in shorter.tex()
     assert "RMSE" not in shorter.tex()

@@ -28,10 +28,14 @@ from gpmpc.trajectories import Elliptical, Hover, Lorenz, Step
 
 CONF = Path(__file__).resolve().parents[2] / "conf"
 PLANT = translational()
-PROBLEM = Problem(Tracking([10, 1] * 3, [0.1, 1, 1]), inputs=Box([0, -0.7, -0.7], [20, 0.7, 0.7]))
+PROBLEM = Problem(
+    Tracking([10, 1] * 3, [0.1, 1, 1]), inputs=Box([0, -0.7, -0.7], [20, 0.7, 0.7])
+)
 HOVER = [7.26, 0, 0]
 EXCITED = Excitation([1] * 6, [1] * 3, HOVER, [0.3, 0.03, 0.03], [0.01] * 6)
-CONVEX = partial(GPMPC, propagator=Linearization(), problem=PROBLEM, horizon=2, initial_input=HOVER)
+CONVEX = partial(
+    GPMPC, propagator=Linearization(), problem=PROBLEM, horizon=2, initial_input=HOVER
+)
 ON_THE_PLANT = partial(NMPC, problem=PROBLEM, horizon=2, initial_input=HOVER)
 
 
@@ -46,12 +50,24 @@ class Blind:
     def control(self, belief, reference, previous=None):
         inputs = np.array([self.law(belief.mean.numpy())], dtype=float)
         timing = Timing(self.seconds(), 0.0, 0.0)
-        return Decision(inputs[0], inputs, np.zeros((2, 6)), np.zeros((2, 6, 6)), Status.SOLVED, 1, timing)
+        return Decision(
+            inputs[0],
+            inputs,
+            np.zeros((2, 6)),
+            np.zeros((2, 6, 6)),
+            Status.SOLVED,
+            1,
+            timing,
+        )
 
 
 def blind(law, **changes):
     seconds = changes.pop("seconds", lambda: 0.0)
-    return experiment(data=None, controller=partial(Blind, law=law, seconds=seconds), **{"steps": 30} | changes)
+    return experiment(
+        data=None,
+        controller=partial(Blind, law=law, seconds=seconds),
+        **{"steps": 30} | changes,
+    )
 
 
 def experiment(**changes):
@@ -70,7 +86,9 @@ def numbers(experiment):
 
 def test_the_same_seed_gives_the_same_numbers_and_another_one_others():
     noise = Noise(measurement=[0.01] * 6)
-    first, again, other = (numbers(experiment(noise=noise, seed=seed)) for seed in (3, 3, 4))
+    first, again, other = (
+        numbers(experiment(noise=noise, seed=seed)) for seed in (3, 3, 4)
+    )
     assert first == again
     assert first["rmse"]["total"] != other["rmse"]["total"]
     assert first["training"]["size"] == 20
@@ -78,9 +96,15 @@ def test_the_same_seed_gives_the_same_numbers_and_another_one_others():
 
 def test_the_rows_of_a_seed_are_nested_and_in_the_order_of_the_flight():
     everything = experiment(size=None).training_rows().features.numpy()
-    small, large = (experiment(size=size, seed=1).training_rows().features.numpy() for size in (5, 12))
+    small, large = (
+        experiment(size=size, seed=1).training_rows().features.numpy()
+        for size in (5, 12)
+    )
     assert len(everything) == 25
-    places = [[int(np.flatnonzero((everything == row).all(axis=1))[0]) for row in rows] for rows in (small, large)]
+    places = [
+        [int(np.flatnonzero((everything == row).all(axis=1))[0]) for row in rows]
+        for rows in (small, large)
+    ]
     assert places[1] == sorted(places[1])
     assert set(places[0]) < set(places[1])
 
@@ -100,9 +124,18 @@ def test_a_model_loop_never_meets_the_plant_and_the_true_model_needs_no_data():
         ({"steps": 0}, "steps: must be a whole number, 1 or more"),
         ({"loop": "plan"}, "loop: must be 'plant' or 'model'; got 'plan'"),
         ({"on_failure": "cry"}, "on_failure: must be one of"),
-        ({"plant": coupled()}, "plant: must have the states, inputs and time step of translational; got"),
-        ({"plant": translational(time_step=0.5)}, "plant: must have the states, inputs and time step"),
-        ({"controller": ON_THE_PLANT, "loop": "model"}, "loop: a model loop needs a controller that learns"),
+        (
+            {"plant": coupled()},
+            "plant: must have the states, inputs and time step of translational; got",
+        ),
+        (
+            {"plant": translational(time_step=0.5)},
+            "plant: must have the states, inputs and time step",
+        ),
+        (
+            {"controller": ON_THE_PLANT, "loop": "model"},
+            "loop: a model loop needs a controller that learns",
+        ),
     ],
     ids=str,
 )
@@ -114,7 +147,12 @@ def test_what_cannot_be_flown_is_refused(changes, message):
 def test_the_rotational_subsystem_follows_the_attitudes_of_the_trajectory_at_its_own_rate():
     excited = Excitation([1] * 6, [1] * 3, [0] * 3, [0.05] * 3, [1e-4, 1e-3] * 3)
     problem = Problem(Tracking([100, 1] * 3, [1] * 3), inputs=Box([-2] * 3, [2] * 3))
-    settings = {"propagator": Linearization(), "problem": problem, "horizon": 5, "initial_input": [0] * 3}
+    settings = {
+        "propagator": Linearization(),
+        "problem": problem,
+        "horizon": 5,
+        "initial_input": [0] * 3,
+    }
     turning = experiment(
         system=rotational(substeps=5), trajectory=Lorenz(), data=ExcitedData(EXCITED, excited, samples=60),
         controller=partial(GPMPC, **settings), size=None, steps=100,
@@ -122,19 +160,28 @@ def test_the_rotational_subsystem_follows_the_attitudes_of_the_trajectory_at_its
     flight = run_trial(turning)
     found = metrics(turning, flight)
     assert flight.rollout.time_step == 0.05
-    assert np.ptp(flight.rollout.references[:, 0]) > 0.03  # [rad]: there was something to follow
+    assert (
+        np.ptp(flight.rollout.references[:, 0]) > 0.03
+    )  # [rad]: there was something to follow
     assert set(found["rmse"]) == {"phi", "theta", "psi", "total"}
     assert found["unit"] == "rad"
     assert found["rmse"]["total"] < 0.005
 
 
-@pytest.mark.parametrize("trajectory", [Elliptical(), Lorenz(), Hover((0, 0, -5)), Step((0, 0, 0), (1, 1, -1), 3.0)])
-@pytest.mark.parametrize("law", [lambda x: [0, 0, 0], lambda x: [100, 0, 0], lambda x: [7.26, 0.6, 0]])
+@pytest.mark.parametrize(
+    "trajectory",
+    [Elliptical(), Lorenz(), Hover((0, 0, -5)), Step((0, 0, 0), (1, 1, -1), 3.0)],
+)
+@pytest.mark.parametrize(
+    "law", [lambda x: [0, 0, 0], lambda x: [100, 0, 0], lambda x: [7.26, 0.6, 0]]
+)
 def test_a_flight_that_no_longer_follows_is_lost_and_says_since_when(trajectory, law):
     lost = blind(law, trajectory=trajectory)
     flight = run_trial(lost)
     found = metrics(lost, flight)["lost"]
-    away = np.linalg.norm((flight.rollout.states - flight.rollout.references)[:, ::2], axis=1)
+    away = np.linalg.norm(
+        (flight.rollout.states - flight.rollout.references)[:, ::2], axis=1
+    )
     assert found["time"] == found["step"]
     assert 10 < away[found["step"]] <= away.max()
     assert away[: found["step"]].max() < away[found["step"]]
@@ -165,7 +212,10 @@ def test_a_plan_leaves_out_the_process_noise_of_the_plant_unless_its_covariances
         ({"noise": Noise(measurement=[1e-3] * 6)}, 0.0),
         ({}, 0.0),
     ):
-        assert blind(lambda x: HOVER, **settings).unplanned_noise(None).tolist() == [expected] * 6
+        assert (
+            blind(lambda x: HOVER, **settings).unplanned_noise(None).tolist()
+            == [expected] * 6
+        )
 
 
 def growing(rate):
@@ -197,12 +247,22 @@ def test_what_the_first_calls_take_is_no_part_of_the_times():
 
 def composed():
     """Settings of flights with every controller, propagation and solver there is."""
-    names = {group: sorted(path.stem for path in (CONF / group).glob("*.yaml")) for group in CHOSEN}
-    return [f"{group}={name}" for group, found in names.items() for name in found] + MORE
+    names = {
+        group: sorted(path.stem for path in (CONF / group).glob("*.yaml"))
+        for group in CHOSEN
+    }
+    return [
+        f"{group}={name}" for group, found in names.items() for name in found
+    ] + MORE
 
 
 CHOSEN = ("controller", "propagation", "solver")
-MORE = ["loop=model", "controller.iterations=5", "controller.prediction.disturbance_gain=0.3", "system=rotational"]
+MORE = [
+    "loop=model",
+    "controller.iterations=5",
+    "controller.prediction.disturbance_gain=0.3",
+    "system=rotational",
+]
 
 
 @pytest.fixture(scope="module")
@@ -231,8 +291,14 @@ def learned():
 def test_the_rehearsal_changes_no_bit(choice, learned, monkeypatch):
     with initialize_config_dir(str(CONF), version_base="1.3"):
         tiny = ["data.samples=20", "model.restarts=0", "steps=4", "horizon=3"]
-        noise = [] if choice == "loop=model" else [f"noise.process={[1e-3] * 6}", f"noise.measurement={[1e-3] * 6}"]
-        settings = learned(experiment_of(compose("run", overrides=[choice, *tiny, *noise])))
+        noise = (
+            []
+            if choice == "loop=model"
+            else [f"noise.process={[1e-3] * 6}", f"noise.measurement={[1e-3] * 6}"]
+        )
+        settings = learned(
+            experiment_of(compose("run", overrides=[choice, *tiny, *noise]))
+        )
     rehearsed = run_trial(settings).rollout
     monkeypatch.setattr(studied, "rehearse", lambda *_: None)
     at_once = run_trial(settings).rollout
@@ -245,16 +311,23 @@ def test_the_rehearsal_changes_no_bit(choice, learned, monkeypatch):
         "predicted_covariances",
         "iterations",
     ):
-        assert np.array_equal(getattr(rehearsed, name), getattr(at_once, name), equal_nan=True), name
+        assert np.array_equal(
+            getattr(rehearsed, name), getattr(at_once, name), equal_nan=True
+        ), name
     assert rehearsed.statuses == at_once.statuses
 
 
 def test_more_rows_than_there_are_are_refused():
-    with pytest.raises(SettingError, match="data.size: must be at most 25, the rows of the data; got 26"):
+    with pytest.raises(
+        SettingError,
+        match="data.size: must be at most 25, the rows of the data; got 26",
+    ):
         run_trial(experiment(size=26))
 
 
-def test_a_folder_is_finished_when_its_metrics_are_there_and_one_process_works_on_it(tmp_path):
+def test_a_folder_is_finished_when_its_metrics_are_there_and_one_process_works_on_it(
+    tmp_path,
+):
     folder = RunFolder(tmp_path / "run")
     with folder.locked():
         with pytest.raises(Busy), RunFolder(tmp_path / "run").locked(wait=False):
@@ -269,7 +342,11 @@ def test_a_folder_is_finished_when_its_metrics_are_there_and_one_process_works_o
     assert folder.result() == {"rmse": 1, "settings": {}}
     with folder.locked(wait=False):
         pass
-    assert sorted(path.name for path in folder.path.iterdir()) == [".lock", "config.yaml", "metrics.json"]
+    assert sorted(path.name for path in folder.path.iterdir()) == [
+        ".lock",
+        "config.yaml",
+        "metrics.json",
+    ]
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,15 @@ from gpmpc.plotting import Series, over_variable
 from gpmpc.studies._run_folder import METRICS, folder_name, record
 from gpmpc.studies.report import compare, sentences, terminal_table
 from gpmpc.studies.report import read_report as report
-from tests.studies.made_up import SETTINGS, add, chosen, documents, made_up_run, metrics_of, plan
+from tests.studies.made_up import (
+    SETTINGS,
+    add,
+    chosen,
+    documents,
+    made_up_run,
+    metrics_of,
+    plan,
+)
 
 CONF = Path(__file__).resolve().parents[2] / "conf"
 
@@ -52,20 +60,30 @@ def test_cells_are_made_of_what_was_varied_and_seeds_fill_them(tree):
     assert found.variables == ("controller",)
     assert found.cells == (("convex",), ("lqr",))
     convex, lqr = cells(found)
-    assert seeds(convex, "finished") == [*convex.seed] == [str(seed) for seed in range(8)]
+    assert (
+        seeds(convex, "finished") == [*convex.seed] == [str(seed) for seed in range(8)]
+    )
     assert (seeds(lqr, "failed"), seeds(lqr, "missing")) == (["6"], ["7"])
     assert convex["failed"].mean() == pytest.approx(2.5)
     assert np.allclose(np.array(lqr.rmse[:6]) / convex.rmse[:6], 1.2)
 
 
 def test_the_gaps_come_with_the_command_that_fills_them(tree):
-    assert report(tree).commands() == [f"gpmpc run -m controller=lqr seed=6,7 folder={tree}"]
+    assert report(tree).commands() == [
+        f"gpmpc run -m controller=lqr seed=6,7 folder={tree}"
+    ]
 
 
 def test_without_a_sweep_nothing_is_missing(tmp_path):
-    for horizon, (controller, seed) in enumerate((("lqr", 0), ("lqr", 1), ("convex", 1), ("nmpc", 7)), 1):
+    for horizon, (controller, seed) in enumerate(
+        (("lqr", 0), ("lqr", 1), ("convex", 1), ("nmpc", 7)), 1
+    ):
         choices = [f"controller={controller}", f"horizon={horizon}", f"seed={seed}"]
-        settings = SETTINGS | {"seed": seed, "horizon": horizon, "options": {"controller": controller}}
+        settings = SETTINGS | {
+            "seed": seed,
+            "horizon": horizon,
+            "options": {"controller": controller},
+        }
         made_up_run(tmp_path, choices, settings, result=metrics_of(0.1))
     found = report(tmp_path)
     assert [[*cell.state] for cell in cells(found)] == [["finished"]] * 4
@@ -73,10 +91,22 @@ def test_without_a_sweep_nothing_is_missing(tmp_path):
 
 
 def test_single_runs_beside_a_sweep_add_nothing_to_what_it_asked_for(tmp_path):
-    made_up_run(tmp_path, ["horizon=3", "seed=9"], SETTINGS | {"seed": 9, "horizon": 3}, result=metrics_of(0.1))
+    made_up_run(
+        tmp_path,
+        ["horizon=3", "seed=9"],
+        SETTINGS | {"seed": 9, "horizon": 3},
+        result=metrics_of(0.1),
+    )
     for seed in range(3):
         add(tmp_path, "lqr", seed, 0.1)
-    plan(tmp_path, [chosen(controller, seed)[0] for controller in ("lqr", "nmpc") for seed in range(4)])
+    plan(
+        tmp_path,
+        [
+            chosen(controller, seed)[0]
+            for controller in ("lqr", "nmpc")
+            for seed in range(4)
+        ],
+    )
     found = report(tmp_path)
     assert found.variables == ("controller", "horizon")
     gaps = {
@@ -89,7 +119,12 @@ def test_single_runs_beside_a_sweep_add_nothing_to_what_it_asked_for(tmp_path):
 
 def test_a_run_that_did_not_choose_counts_with_the_setting_that_it_had(tmp_path):
     made_up_run(tmp_path, ["seed=1"], SETTINGS | {"seed": 1}, result=metrics_of(0.1))
-    made_up_run(tmp_path, ["horizon=5", "seed=1"], SETTINGS | {"seed": 1, "horizon": 5}, result=metrics_of(0.1))
+    made_up_run(
+        tmp_path,
+        ["horizon=5", "seed=1"],
+        SETTINGS | {"seed": 1, "horizon": 5},
+        result=metrics_of(0.1),
+    )
     found = report(tmp_path)
     assert found.variables == ("horizon",)
     assert found.cells == (("5",), ("10",))  # numbers by their size
@@ -104,14 +139,19 @@ def test_every_document_holds_the_same_numbers_and_the_page_stands_alone(tree):
     assert float(rows[0]["rmse_median [m]"]) == expected
     assert float(rows[0]["rmse_q25 [m]"]) == np.quantile(errors, 0.25)
     assert (rows[1]["failed"], rows[1]["missing"]) == ("1", "1")
-    for name, seeds in (("report.md", "6, 1 failed, 1 missing"), ("report.html", "6<small>1 failed</small>")):
+    for name, seeds in (
+        ("report.md", "6, 1 failed, 1 missing"),
+        ("report.html", "6<small>1 failed</small>"),
+    ):
         for text in (f"{expected:.3g}", "no start led anywhere", seeds, "gpmpc run -m"):
             assert text in written[name]
     assert f"{expected:.3g}" in written["report.tex"]
     assert written["rmse-over-controller.png"].startswith(b"\x89PNG")
     html = written["report.html"]
     assert "data:image/png;base64," in html
-    assert not [mark for mark in ("http:", "https:", "<script", "<link") if mark in html]
+    assert not [
+        mark for mark in ("http:", "https:", "<script", "<link") if mark in html
+    ]
     assert len(terminal_table(found).rows) == 2
 
 
@@ -126,27 +166,45 @@ def test_a_run_that_cannot_be_read_is_named_and_the_others_are_reported(tree):
     assert [len(seeds(cell, "finished")) for cell in cells(found)] == [7, 5]
     assert len(found.skipped) == 2
     for path, reason in ((old, "it lacks 'unit'"), (broken, "JSONDecodeError")):
-        assert any(line.startswith(f"{path}: is not what a run writes") and reason in line for line in found.skipped)
+        assert any(
+            line.startswith(f"{path}: is not what a run writes") and reason in line
+            for line in found.skipped
+        )
     written = documents(found)
     for name in ("report.md", "report.html"):
         assert "2 skipped" in written[name]
         assert str(old) in written[name]
 
 
-def test_a_run_that_cannot_be_read_is_not_missing_and_no_command_flies_over_it(tmp_path):
+def test_a_run_that_cannot_be_read_is_not_missing_and_no_command_flies_over_it(
+    tmp_path,
+):
     for controller in ("convex", "lqr"):
         for seed in range(4):
             if (controller, seed) != ("lqr", 3):
                 add(tmp_path, controller, seed, 0.1)
-    plan(tmp_path, [chosen(controller, seed)[0] for controller in ("convex", "lqr") for seed in range(4)])
+    plan(
+        tmp_path,
+        [
+            chosen(controller, seed)[0]
+            for controller in ("convex", "lqr")
+            for seed in range(4)
+        ],
+    )
     (tmp_path / folder_name(chosen("lqr", 1)[0]) / METRICS).write_text('{"choices": ')
     found = report(tmp_path)
     convex, lqr = cells(found)
     assert {*convex.state} == {"finished"}
-    assert [seeds(lqr, state) for state in ("finished", "skipped", "missing")] == [["0", "2"], ["1"], ["3"]]
+    assert [seeds(lqr, state) for state in ("finished", "skipped", "missing")] == [
+        ["0", "2"],
+        ["1"],
+        ["3"],
+    ]
     assert found.commands() == [f"gpmpc run -m controller=lqr seed=3 folder={tmp_path}"]
     written = documents(found)
-    assert "6 finished in 2 cells, 0 failed, 1 missing, 1 skipped" in written["report.md"]
+    assert (
+        "6 finished in 2 cells, 0 failed, 1 missing, 1 skipped" in written["report.md"]
+    )
     assert "2, 1 missing, 1 skipped" in written["report.md"]
     assert "2<small>1 missing</small><small>1 skipped</small>" in written["report.html"]
     assert list(csv.DictReader(io.StringIO(written["report.csv"])))[1]["skipped"] == "1"
@@ -155,7 +213,14 @@ def test_a_run_that_cannot_be_read_is_not_missing_and_no_command_flies_over_it(t
 def test_a_folder_that_belongs_to_no_cell_fills_none(tmp_path):
     for controller, seed in (("lqr", 0), ("lqr", 1), ("convex", 1)):
         add(tmp_path, controller, seed, 0.1)
-    plan(tmp_path, [chosen(controller, seed)[0] for controller in ("convex", "lqr") for seed in range(2)])
+    plan(
+        tmp_path,
+        [
+            chosen(controller, seed)[0]
+            for controller in ("convex", "lqr")
+            for seed in range(2)
+        ],
+    )
     for name in ("elsewhere", "controller=convex,horizon=3,seed=0"):
         (tmp_path / name).mkdir()
         (tmp_path / name / METRICS).write_text("")
@@ -173,10 +238,15 @@ def test_a_line_of_the_latex_table_never_begins_with_a_bracket(tmp_path):
 
 
 def test_pairs_show_what_means_alone_do_not(tree):
-    by_measure = {c.measure: c for c in compare(report(tree), "controller=lqr", "controller=convex")}
+    by_measure = {
+        c.measure: c
+        for c in compare(report(tree), "controller=lqr", "controller=convex")
+    }
     rmse = by_measure["rmse"]
     assert rmse.pairs == 6
-    assert rmse.wilcoxon == pytest.approx(2 ** (1 - 6))  # every pair in one direction: the smallest p there is
+    assert rmse.wilcoxon == pytest.approx(
+        2 ** (1 - 6)
+    )  # every pair in one direction: the smallest p there is
     assert rmse.verdict == "A is larger than B"
     assert rmse.rank_biserial == 1
     assert rmse.interval[0] < rmse.difference < rmse.interval[1]
@@ -188,8 +258,17 @@ def test_pairs_show_what_means_alone_do_not(tree):
 def test_every_seed_is_an_average_over_the_same_and_what_is_left_out_is_named(tmp_path):
     def fly(controller, horizon, seed):
         choices = [f"controller={controller}", f"horizon={horizon}", f"seed={seed}"]
-        settings = SETTINGS | {"seed": seed, "horizon": horizon, "options": {"controller": controller}}
-        made_up_run(tmp_path, choices, settings, result=metrics_of(0.1 * horizon + 0.01 * (controller == "lqr")))
+        settings = SETTINGS | {
+            "seed": seed,
+            "horizon": horizon,
+            "options": {"controller": controller},
+        }
+        made_up_run(
+            tmp_path,
+            choices,
+            settings,
+            result=metrics_of(0.1 * horizon + 0.01 * (controller == "lqr")),
+        )
 
     for seed in range(8):
         for controller in ("lqr", "convex"):
@@ -202,24 +281,46 @@ def test_every_seed_is_an_average_over_the_same_and_what_is_left_out_is_named(tm
     rmse = compare(found, "controller=lqr", "controller=convex")[0]
     assert rmse.left_out == ("horizon=10", "seed=7")
     assert rmse.pairs == 7
-    assert rmse.medians == pytest.approx((0.31, 0.3))  # of the horizons 1 and 5 for every seed
-    assert "lacks runs of it: horizon=10; seed=7." in sentences(found, [rmse], "a", "b")[0]
+    assert rmse.medians == pytest.approx(
+        (0.31, 0.3)
+    )  # of the horizons 1 and 5 for every seed
+    assert (
+        "lacks runs of it: horizon=10; seed=7." in sentences(found, [rmse], "a", "b")[0]
+    )
     assert compare(found, "horizon=1", "horizon=5")[0].left_out == ("seed=7",)
-    alone = compare(found, "controller=convex,horizon=1", "controller=convex,horizon=5")[0]
+    alone = compare(
+        found, "controller=convex,horizon=1", "controller=convex,horizon=5"
+    )[0]
     assert alone.left_out == ()
     assert "Left out" not in sentences(found, [alone], "a", "b")[0]
 
 
-def test_errors_of_both_subsystems_keep_their_units_and_are_not_averaged_together(tmp_path):
+def test_errors_of_both_subsystems_keep_their_units_and_are_not_averaged_together(
+    tmp_path,
+):
     for seed in range(6):
         for subsystem, unit in (("translational", "m"), ("rotational", "rad")):
             for controller in ("lqr", "convex"):
-                choices = [f"controller={controller}", f"seed={seed}", f"subsystem={subsystem}"]
-                settings = SETTINGS | {"seed": seed, "options": {"controller": controller, "subsystem": subsystem}}
-                made_up_run(tmp_path, choices, settings, result=metrics_of(0.1 + 0.01 * seed) | {"unit": unit})
+                choices = [
+                    f"controller={controller}",
+                    f"seed={seed}",
+                    f"subsystem={subsystem}",
+                ]
+                settings = SETTINGS | {
+                    "seed": seed,
+                    "options": {"controller": controller, "subsystem": subsystem},
+                }
+                made_up_run(
+                    tmp_path,
+                    choices,
+                    settings,
+                    result=metrics_of(0.1 + 0.01 * seed) | {"unit": unit},
+                )
     found = report(tmp_path)
     assert "RMSE [m or rad]" in documents(found)["report.md"]
-    with pytest.raises(SettingError, match="errors in m and in rad have no common mean; add subsystem="):
+    with pytest.raises(
+        SettingError, match="errors in m and in rad have no common mean; add subsystem="
+    ):
         compare(found, "controller=lqr", "controller=convex")
     groups = [f"controller={name},subsystem=rotational" for name in ("lqr", "convex")]
     assert compare(found, *groups)[0].pairs == 6
@@ -229,24 +330,38 @@ def test_equal_groups_and_few_pairs_show_nothing(tmp_path):
     for seed in range(7):
         for controller in ("lqr", "convex"):
             add(tmp_path, controller, seed, 0.1 + 0.01 * seed)
-    assert compare(report(tmp_path), "controller=lqr", "controller=convex")[0].verdict == "no difference shown"
+    assert (
+        compare(report(tmp_path), "controller=lqr", "controller=convex")[0].verdict
+        == "no difference shown"
+    )
     copies = tmp_path / "copies"
     for seed in range(7):
         add(copies, "lqr", seed, 0.2)
         add(copies, "convex", seed, 0.1)
     found = compare(report(copies), "controller=lqr", "controller=convex")
     assert found[0].verdict.startswith("undecided: every seed gave the same")
-    assert "p =" not in sentences(report(copies), found[:1], "controller=lqr", "controller=convex")[1]
+    assert (
+        "p ="
+        not in sentences(
+            report(copies), found[:1], "controller=lqr", "controller=convex"
+        )[1]
+    )
     few = tmp_path / "few"
     for seed in range(5):
         add(few, "lqr", seed, 0.2)
         add(few, "convex", seed, 0.1)
-    assert "5 pairs" in compare(report(few), "controller=lqr", "controller=convex")[0].verdict
+    assert (
+        "5 pairs"
+        in compare(report(few), "controller=lqr", "controller=convex")[0].verdict
+    )
 
 
 @pytest.mark.parametrize(
     ("group", "message"),
-    [("controler=lqr", "must choose among what was varied, controller"), ("controller=x", "varied over convex, lqr")],
+    [
+        ("controler=lqr", "must choose among what was varied, controller"),
+        ("controller=x", "varied over convex, lqr"),
+    ],
 )
 def test_a_group_that_is_none_is_refused(tree, group, message):
     with pytest.raises(SettingError, match=message):
@@ -270,7 +385,11 @@ def test_a_thousand_runs_are_put_together_quickly_and_in_little_memory(tmp_path)
     for seed in range(50):
         for size in (10, 20, 50, 100, 189):
             for horizon in (1, 3, 5, 10):
-                content["choices"] = [f"data.size={size}", f"horizon={horizon}", f"seed={seed}"]
+                content["choices"] = [
+                    f"data.size={size}",
+                    f"horizon={horizon}",
+                    f"seed={seed}",
+                ]
                 folder = tmp_path / folder_name(content["choices"])
                 folder.mkdir()
                 (folder / METRICS).write_text(json.dumps(content, indent=1))
@@ -288,14 +407,21 @@ def test_a_thousand_runs_are_put_together_quickly_and_in_little_memory(tmp_path)
 
 def test_a_page_says_what_made_the_runs_and_links_them(tree):
     settings = SETTINGS | {"horizon": 5, "options": {"controller": "nmpc"}}
-    made_up_run(tree, ["controller=nmpc", "horizon=5"], settings, result=metrics_of(0.1))
+    made_up_run(
+        tree, ["controller=nmpc", "horizon=5"], settings, result=metrics_of(0.1)
+    )
     found = report(tree)
     html = documents(found)["report.html"]
     links = re.findall(r'href="([^"]*)"', html)
     assert len(links) == len(found.there) == 16
     assert all((tree / "report" / unquote(link)).resolve().is_dir() for link in links)
     made = provenance()
-    for text in (made["created"][:10], made["machine"]["processor"], "Settings of all runs", "data.size: null"):
+    for text in (
+        made["created"][:10],
+        made["machine"]["processor"],
+        "Settings of all runs",
+        "data.size: null",
+    ):
         assert text in html
     assert "horizon: " not in "\n".join(found.base_settings())  # it was varied
 
@@ -312,7 +438,9 @@ def test_a_page_says_what_made_the_runs_and_links_them(tree):
         (["7"], "linear", [7]),
     ],
 )
-def test_numbers_stand_at_their_place_on_an_axis_and_words_side_by_side(positions, scale, places):
+def test_numbers_stand_at_their_place_on_an_axis_and_words_side_by_side(
+    positions, scale, places
+):
     lines = [Series(name, [[1.0, 2.0]] * len(positions)) for name in ("a", "b")]
     (axis,) = over_variable("x", positions, "y", lines).axes
     assert axis.get_xscale() == scale

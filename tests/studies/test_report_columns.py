@@ -8,7 +8,12 @@ from gpmpc.studies.report import read_report as report
 from gpmpc.studies.report import terminal_table
 from tests.studies.made_up import documents, made_up_run, metrics_of
 
-SETTINGS = {"data": {"size": None}, "horizon": 10, "seed": 0, "options": {"controller": "convex"}}
+SETTINGS = {
+    "data": {"size": None},
+    "horizon": 10,
+    "seed": 0,
+    "options": {"controller": "convex"},
+}
 
 
 @pytest.mark.parametrize("failing", [0, 2])
@@ -18,7 +23,9 @@ def test_failed_solves_have_a_column_if_any_run_has_some(failing, tmp_path):
             settings = SETTINGS | {"seed": seed, "options": {"controller": controller}}
             some = failing if (controller, seed) == ("lqr", 3) else 0
             choices = [f"controller={controller}", f"seed={seed}"]
-            made_up_run(tmp_path, choices, settings, result=metrics_of(0.1, failing=some))
+            made_up_run(
+                tmp_path, choices, settings, result=metrics_of(0.1, failing=some)
+            )
     found = report(tmp_path)
     header = " ".join(terminal_table(found).header)
     for words in (header, documents(found)["report.tex"]):
@@ -35,13 +42,23 @@ def test_a_comparison_stands_in_the_page_and_in_the_text_if_there_is_one(tmp_pat
     found, lines = report(tmp_path), ["first line of it", "second line of it"]
     for name in ("report.md", "report.html"):
         with_it, without = documents(found, lines)[name], documents(found)[name]
-        assert all(line in with_it and line not in without for line in [*lines, "Comparison"])
+        assert all(
+            line in with_it and line not in without for line in [*lines, "Comparison"]
+        )
 
 
 def test_in_a_terminal_names_begin_and_numbers_end_below_each_other():
     console = Console(width=80)
     with console.capture() as capture:
-        console.print(terminal([Table(["system", "error"], [["cart", 0.25], ["quadrotor", 12.5]])]))
-    cart, quadrotor = (line.rstrip() for line in capture.get().splitlines() if "cart" in line or "quad" in line)
+        console.print(
+            terminal(
+                [Table(["system", "error"], [["cart", 0.25], ["quadrotor", 12.5]])]
+            )
+        )
+    cart, quadrotor = (
+        line.rstrip()
+        for line in capture.get().splitlines()
+        if "cart" in line or "quad" in line
+    )
     assert cart.index("cart") == quadrotor.index("quadrotor")
     assert len(cart) == len(quadrotor)

@@ -16,9 +16,24 @@ from gpmpc.studies._document import terminal
 from gpmpc.studies._run_folder import ERROR, METRICS, folder_name
 from gpmpc.studies.report import compare, report_document, sentences, terminal_table
 from gpmpc.studies.report import read_report as report
-from tests.studies.made_up import SETTINGS, add, chosen, documents, made_up_run, metrics_of, plan
+from tests.studies.made_up import (
+    SETTINGS,
+    add,
+    chosen,
+    documents,
+    made_up_run,
+    metrics_of,
+    plan,
+)
 
-RESULT = ("rmse", "steps", "failures", "violations", "times", "unit")  # what a failed run need not have
+RESULT = (
+    "rmse",
+    "steps",
+    "failures",
+    "violations",
+    "times",
+    "unit",
+)  # what a failed run need not have
 
 
 def states(found, state):
@@ -33,7 +48,12 @@ def undrawn(found, *comparison):
 def written_of(found):
     """Markdown, HTML, CSV and LaTeX without the figures, which take their time."""
     document = undrawn(found)
-    return {"md": document.markdown(), "html": document.html(), "csv": document.csv(), "tex": document.tex()}
+    return {
+        "md": document.markdown(),
+        "html": document.html(),
+        "csv": document.csv(),
+        "tex": document.tex(),
+    }
 
 
 def shown(found):
@@ -60,7 +80,9 @@ DAMAGE = {
     "violations a number": {"violations": 3},
     "times missing": {"times": {}},
     "times of texts": {"times": {"total": {"median": "fast"}, "training": 1}},
-    "training infinite": {"times": {"total": {"median": 1.0}, "training": float("inf")}},
+    "training infinite": {
+        "times": {"total": {"median": 1.0}, "training": float("inf")}
+    },
     "unit a number": {"unit": 1},
     "choices a text": {"choices": "controller=nmpc"},
     "choices of numbers": {"choices": [1, 2]},
@@ -81,18 +103,27 @@ WHOLE = {
 
 @pytest.mark.parametrize("name", [METRICS, ERROR])
 @pytest.mark.parametrize("damage", [*DAMAGE, *WHOLE])
-def test_one_damaged_run_is_skipped_with_its_reason_and_takes_no_other_with_it(damage, name, tmp_path):
+def test_one_damaged_run_is_skipped_with_its_reason_and_takes_no_other_with_it(
+    damage, name, tmp_path
+):
     for seed in range(2):
         add(tmp_path, "lqr", seed, 0.1)
-    made_up_run(tmp_path, *chosen("nmpc", 0), result=metrics_of(0.1) | {"error": "none"})
+    made_up_run(
+        tmp_path, *chosen("nmpc", 0), result=metrics_of(0.1) | {"error": "none"}
+    )
     folder = tmp_path / folder_name(chosen("nmpc", 0)[0])
     content = json.loads((folder / METRICS).read_text()) | DAMAGE.get(damage, {})
     (folder / METRICS).unlink()
-    (folder / name).write_bytes(WHOLE.get(damage) if damage in WHOLE else json.dumps(content).encode())
+    (folder / name).write_bytes(
+        WHOLE.get(damage) if damage in WHOLE else json.dumps(content).encode()
+    )
     found = report(tmp_path)
     reads_it = name == ERROR and set(DAMAGE.get(damage, ())) & {*RESULT}
     assert len(found.skipped) == (0 if reads_it else 1)
-    assert all(line.startswith(f"{folder / name}: is not what a run writes: ") for line in found.skipped)
+    assert all(
+        line.startswith(f"{folder / name}: is not what a run writes: ")
+        for line in found.skipped
+    )
     assert states(found, "finished") == 2
     for text in (*written_of(found).values(), shown(found)):
         assert "0.1" in text
@@ -103,7 +134,16 @@ def test_a_plan_that_cannot_be_read_is_skipped(tmp_path):
     for seed in range(6):
         add(tree, "lqr", seed, 0.1)
     plan(tree, [chosen("lqr", seed)[0] for seed in range(8)])
-    for i, text in enumerate(("", "{}", '{"runs": 3}', '{"runs": [3]}', '{"runs": [[1]]}', '{"runs": ["ab"]}')):
+    for i, text in enumerate(
+        (
+            "",
+            "{}",
+            '{"runs": 3}',
+            '{"runs": [3]}',
+            '{"runs": [[1]]}',
+            '{"runs": ["ab"]}',
+        )
+    ):
         (tree / f"sweep-damaged{i}.json").write_text(text)
     found = report(tree)
     assert len(found.skipped) == 6
@@ -132,25 +172,38 @@ def test_what_a_user_chose_is_text_in_every_document(nasty, tmp_path):
     for text in (*written.values(), shown(found)):
         text.encode()
         assert not set(text) & set("\x00\x1b\t\u202e")
-    text = re.sub(r"\n```\n.*?\n```\n", "", written["md"], flags=re.DOTALL)  # code is no markup
+    text = re.sub(
+        r"\n```\n.*?\n```\n", "", written["md"], flags=re.DOTALL
+    )  # code is no markup
     assert not re.search(r"<script|<img|\]\(java", text)
     assert not re.search(r"<script|<img (?!alt)", written["html"])
     commands = set(re.findall(r"\\[a-zA-Z]+", written["tex"]))
     ours = "begin end toprule midrule bottomrule footnotesize usepackage textbackslash textasciitilde textasciicircum"
-    assert commands <= {f"\\{name}" for name in (*ours.split(), "textless", "textgreater", "textbar")}
+    assert commands <= {
+        f"\\{name}" for name in (*ours.split(), "textless", "textgreater", "textbar")
+    }
     rows = list(csv.reader(io.StringIO(written["csv"])))
     assert {len(row) for row in rows} == {len(rows[0])}
-    for value in (value for row in rows for value in row if value.startswith(("=", "+", "-", "@"))):
+    for value in (
+        value for row in rows for value in row if value.startswith(("=", "+", "-", "@"))
+    ):
         float(value)
     table = [line for line in written["md"].splitlines() if line.startswith("|")]
     assert len(table) == 4
-    assert {len(re.findall(r"(?<!\\)\|", line)) for line in table} == {len(re.findall(r"\|", table[1]))}
+    assert {len(re.findall(r"(?<!\\)\|", line)) for line in table} == {
+        len(re.findall(r"\|", table[1]))
+    }
 
 
 def test_figures_take_every_text(tmp_path):
     for nasty in ("[/nope]", r"$\frac", "x" * 400, "a/b", "ünï", r"\input"):
         choices = [f"controller={nasty}", f"+{nasty}=1", "seed=0"]
-        made_up_run(tmp_path, choices, SETTINGS | {"options": {"controller": nasty}}, result=metrics_of(0.2))
+        made_up_run(
+            tmp_path,
+            choices,
+            SETTINGS | {"options": {"controller": nasty}},
+            result=metrics_of(0.2),
+        )
     written = documents(report(tmp_path))
     assert len({name.lower() for name in written}) == len(written) == 4 + 2 * 7
     for name in written:
@@ -160,7 +213,11 @@ def test_figures_take_every_text(tmp_path):
 def test_a_flight_that_was_lost_is_called_so(tmp_path):
     for seed in range(6):
         add(tmp_path, "convex", seed, 0.1)
-        lost = {"lost": {"step": 12 + seed, "reason": "14600 m away"}} if seed < 2 else {"lost": None}
+        lost = (
+            {"lost": {"step": 12 + seed, "reason": "14600 m away"}}
+            if seed < 2
+            else {"lost": None}
+        )
         result = metrics_of(0.2) | lost
         if seed == 0:  # it diverged
             result["rmse"] = dict.fromkeys(result["rmse"])
@@ -170,11 +227,17 @@ def test_a_flight_that_was_lost_is_called_so(tmp_path):
     assert [*found.runs.groupby("cell").rmse.count()] == [6, 5]
     written = written_of(found)
     for text in (written["md"], written["html"]):
-        for words in ("of those finished, 2 lost", "2 lost", "step 13, reason 14600 m away"):
+        for words in (
+            "of those finished, 2 lost",
+            "2 lost",
+            "step 13, reason 14600 m away",
+        ):
             assert words in text
     assert "2 lost" in shown(found)
     assert "2 lost" in written["tex"]
-    assert [row["lost"] for row in csv.DictReader(io.StringIO(written_of(found)["csv"]))] == ["0", "2"]
+    assert [
+        row["lost"] for row in csv.DictReader(io.StringIO(written_of(found)["csv"]))
+    ] == ["0", "2"]
 
 
 @pytest.mark.parametrize("outlier", [1.0, 1e3, 1e150])
@@ -183,10 +246,15 @@ def test_what_stands_before_quartiles_lies_between_them(outlier, tmp_path):
         add(tmp_path, "lqr", seed, error)
     found = report(tmp_path)
     (row,) = csv.DictReader(io.StringIO(written_of(found)["csv"]))
-    low, median, high = (float(row[f"rmse_{part} [m]"]) for part in ("q25", "median", "q75"))
+    low, median, high = (
+        float(row[f"rmse_{part} [m]"]) for part in ("q25", "median", "q75")
+    )
     assert low <= median <= high <= 0.14
     assert not any("mean" in name for name in row)
-    for text in (*(written_of(found)[name] for name in ("md", "tex", "html")), shown(found)):
+    for text in (
+        *(written_of(found)[name] for name in ("md", "tex", "html")),
+        shown(found),
+    ):
         assert "0.125" in text
         assert "Mean" not in text
 
@@ -198,7 +266,9 @@ def test_wall_times_are_not_compared(tmp_path):
             add(tree, controller, seed, 0.1 * (1 + seed) + 0.01 * len(controller))
     for path in tree.glob(f"*/{METRICS}"):
         content = json.loads(path.read_text())
-        content["times"]["training"] = content["times"]["total"]["median"] = 1.0 + ("lqr" in path.parent.name)
+        content["times"]["training"] = content["times"]["total"]["median"] = 1.0 + (
+            "lqr" in path.parent.name
+        )
         path.write_text(json.dumps(content))
     found = report(tree)
     assert {"decision", "training"} <= set(found.measures)
@@ -210,17 +280,30 @@ def test_wall_times_are_not_compared(tmp_path):
 def test_a_report_says_of_every_run_what_became_of_it(tmp_path):
     tree = tmp_path / "tree"
     for seed, error in enumerate([0.1, 0.2, 0.4]):
-        made_up_run(tree, *chosen("convex", seed, horizon=10), result=metrics_of(error, failing=2 * (seed == 2)))
+        made_up_run(
+            tree,
+            *chosen("convex", seed, horizon=10),
+            result=metrics_of(error, failing=2 * (seed == 2)),
+        )
     lost = {"lost": {"step": 3, "reason": "away"}}
     made_up_run(tree, *chosen("lqr", 0, horizon=10), result=metrics_of(0.5) | lost)
     made_up_run(tree, *chosen("lqr", 1, horizon=10), error="no\nluck")
     made_up_run(tree, *chosen("lqr", 2, horizon=10), result=metrics_of(0.5))
     damaged = tree / folder_name(chosen("lqr", 2, horizon=10)[0]) / METRICS
     damaged.write_text("{")
-    plan(tree, [chosen(controller, seed, horizon=10)[0] for controller in ("convex", "lqr") for seed in range(4)])
+    plan(
+        tree,
+        [
+            chosen(controller, seed, horizon=10)[0]
+            for controller in ("convex", "lqr")
+            for seed in range(4)
+        ],
+    )
     found = report(tree)
     document = undrawn(found, ["a line"])
-    head, made, tail = re.split(r"## Made\n\n(.*?)(?=## To)", document.markdown(), flags=re.DOTALL)
+    head, made, tail = re.split(
+        r"## Made\n\n(.*?)(?=## To)", document.markdown(), flags=re.DOTALL
+    )
     assert head == (
         "# tree\n\n4 finished in 2 cells, 1 failed, 2 missing, 1 skipped; of those finished, 1 lost."
         " All of them: horizon=10.\n\n"
@@ -254,13 +337,33 @@ def test_a_report_says_of_every_run_what_became_of_it(tmp_path):
     assert "failed_q25 [%],failed_median [%],failed_q75 [%],decision_q25 [ms]" in header
     assert convex.split(",")[:6] == ["convex", "3", "0", "0", "1", "0"]
     assert lqr.split(",")[:6] == ["lqr", "1", "1", "1", "1", "1"]
-    assert [float(value) for value in convex.split(",")[6:9]] == pytest.approx([0.15, 0.2, 0.3])
+    assert [float(value) for value in convex.split(",")[6:9]] == pytest.approx(
+        [0.15, 0.2, 0.3]
+    )
     assert "outside" not in document.tex()
     short = terminal_table(found)
-    assert short.header == ["controller", "seeds", "RMSE\n[m]", "failed\n[%]", "decision\n[ms]"]
-    assert short.rows[0] == ["convex", "3\n1 missing", "0.2\n[0.15, 0.3]", "0\n[0, 5]", "3.1"]
-    assert short.title == "4 finished in 2 cells, 1 failed, 2 missing, 1 skipped; of those finished, 1 lost"
-    assert document.links["controller=lqr,horizon=10,seed=1"] == "../controller=lqr,horizon=10,seed=1"
+    assert short.header == [
+        "controller",
+        "seeds",
+        "RMSE\n[m]",
+        "failed\n[%]",
+        "decision\n[ms]",
+    ]
+    assert short.rows[0] == [
+        "convex",
+        "3\n1 missing",
+        "0.2\n[0.15, 0.3]",
+        "0\n[0, 5]",
+        "3.1",
+    ]
+    assert (
+        short.title
+        == "4 finished in 2 cells, 1 failed, 2 missing, 1 skipped; of those finished, 1 lost"
+    )
+    assert (
+        document.links["controller=lqr,horizon=10,seed=1"]
+        == "../controller=lqr,horizon=10,seed=1"
+    )
     assert len(document.links) == 5
 
 
@@ -269,14 +372,24 @@ def test_a_report_says_of_every_run_what_became_of_it(tmp_path):
     [
         (None, {}),
         ({}, {}),
-        ({"git": {"commit": "0123456789abcdef"}, "created": "now"}, {"date": "now", "commit": "0123456789"}),
-        ({"git": {"commit": "0123456789abcdef", "dirty": True}}, {"commit": "0123456789, changed"}),
+        (
+            {"git": {"commit": "0123456789abcdef"}, "created": "now"},
+            {"date": "now", "commit": "0123456789"},
+        ),
+        (
+            {"git": {"commit": "0123456789abcdef", "dirty": True}},
+            {"commit": "0123456789, changed"},
+        ),
         ({"git": None, "versions": {"gpmpc": "1.2"}}, {"commit": "1.2"}),
         ({"machine": {"system": "Linux", "cores": 2}}, {"machine": "Linux, 2 cores"}),
     ],
 )
-def test_where_a_run_comes_from_is_told_as_far_as_it_says_so(provenance, origin, tmp_path):
-    made_up_run(tmp_path, *chosen("lqr", 0), result=metrics_of(0.1) | {"provenance": provenance})
+def test_where_a_run_comes_from_is_told_as_far_as_it_says_so(
+    provenance, origin, tmp_path
+):
+    made_up_run(
+        tmp_path, *chosen("lqr", 0), result=metrics_of(0.1) | {"provenance": provenance}
+    )
     (run,) = report(tmp_path).there
     assert run.origin == origin
 
@@ -287,32 +400,68 @@ def test_a_figure_has_a_curve_for_what_else_was_varied_or_for_less_of_it_where_t
     monkeypatch.setattr(reporting, "over_variable", lambda *arguments: arguments)
     monkeypatch.setattr(reporting, "png", lambda drawn: drawn)
     errors = {}
-    for i, (horizon, size, gain) in enumerate(product((1, 5, 10, 20), (50, 100, 200), ("high", "low"))):
+    for i, (horizon, size, gain) in enumerate(
+        product((1, 5, 10, 20), (50, 100, 200), ("high", "low"))
+    ):
         errors[horizon, size, gain] = 0.25 * (i + 1)
         choices = [f"gain={gain}", f"horizon={horizon}", "seed=0", f"size={size}"]
-        made_up_run(tmp_path, choices, SETTINGS, result=metrics_of(errors[horizon, size, gain], failing=i == 3))
+        made_up_run(
+            tmp_path,
+            choices,
+            SETTINGS,
+            result=metrics_of(errors[horizon, size, gain], failing=i == 3),
+        )
     drawn = reporting.report_document(report(tmp_path)).images
-    measures = {"rmse": "RMSE [m]", "failed": "failed solves [%]", "decision": "decision, median [ms]"}
-    assert {*drawn} == {f"{name}-over-{key}.png" for name in measures for key in ("horizon", "size", "gain")}
+    measures = {
+        "rmse": "RMSE [m]",
+        "failed": "failed solves [%]",
+        "decision": "decision, median [ms]",
+    }
+    assert {*drawn} == {
+        f"{name}-over-{key}.png"
+        for name in measures
+        for key in ("horizon", "size", "gain")
+    }
     for name, label in measures.items():
-        for key, ticks in (("horizon", ["1", "5", "10", "20"]), ("size", ["50", "100", "200"])):
+        for key, ticks in (
+            ("horizon", ["1", "5", "10", "20"]),
+            ("size", ["50", "100", "200"]),
+        ):
             title, found, axis, _, logarithmic = drawn[f"{name}-over-{key}.png"]
-            assert (title, found, axis, logarithmic) == (key, ticks, label, name != "failed")
+            assert (title, found, axis, logarithmic) == (
+                key,
+                ticks,
+                label,
+                name != "failed",
+            )
     series = drawn["rmse-over-horizon.png"][3]  # 6 curves
-    assert [line.label for line in series] == [f"gain={g}, size={s}" for g in ("high", "low") for s in (50, 100, 200)]
-    for line, (gain, size) in zip(series, product(("high", "low"), (50, 100, 200)), strict=True):
-        assert line.values == [[pytest.approx(errors[horizon, size, gain])] for horizon in (1, 5, 10, 20)]
+    assert [line.label for line in series] == [
+        f"gain={g}, size={s}" for g in ("high", "low") for s in (50, 100, 200)
+    ]
+    for line, (gain, size) in zip(
+        series, product(("high", "low"), (50, 100, 200)), strict=True
+    ):
+        assert line.values == [
+            [pytest.approx(errors[horizon, size, gain])] for horizon in (1, 5, 10, 20)
+        ]
     series = drawn["rmse-over-size.png"][3]  # 8 curves: as many as there may be
     assert [line.label for line in series] == [
         f"gain={g}, horizon={h}" for g in ("high", "low") for h in (1, 5, 10, 20)
     ]
-    series = drawn["rmse-over-gain.png"][3]  # 12 were too many: without the horizon, of which there are most
+    series = drawn["rmse-over-gain.png"][
+        3
+    ]  # 12 were too many: without the horizon, of which there are most
     assert [line.label for line in series] == ["size=50", "size=100", "size=200"]
     for line, size in zip(series, (50, 100, 200), strict=True):
-        pooled = [[errors[horizon, size, gain] for horizon in (1, 5, 10, 20)] for gain in ("high", "low")]
+        pooled = [
+            [errors[horizon, size, gain] for horizon in (1, 5, 10, 20)]
+            for gain in ("high", "low")
+        ]
         assert line.values == [pytest.approx(values) for values in pooled]
     failed = drawn["failed-over-horizon.png"][3]
-    assert sorted(value for line in failed for values in line.values for value in values) == [0] * 23 + [5]
+    assert sorted(
+        value for line in failed for values in line.values for value in values
+    ) == [0] * 23 + [5]
 
 
 def test_a_single_varied_setting_has_one_curve_and_names_that_would_be_files_already_get_a_number(
@@ -321,31 +470,61 @@ def test_a_single_varied_setting_has_one_curve_and_names_that_would_be_files_alr
     monkeypatch.setattr(reporting, "over_variable", lambda *arguments: arguments)
     monkeypatch.setattr(reporting, "png", lambda drawn: drawn)
     for value in (1, 2):
-        made_up_run(tmp_path / "one", [f"a/b={value}", "seed=0"], SETTINGS, result=metrics_of(0.1 * value))
+        made_up_run(
+            tmp_path / "one",
+            [f"a/b={value}", "seed=0"],
+            SETTINGS,
+            result=metrics_of(0.1 * value),
+        )
         for other in (1, 2):
             choices = [f"a/b={value}", f"a:b={other}", "seed=0"]
-            made_up_run(tmp_path / "two", choices, SETTINGS, result=metrics_of(0.1 * value))
-    one, two = (reporting.report_document(report(tmp_path / tree)).images for tree in ("one", "two"))
+            made_up_run(
+                tmp_path / "two", choices, SETTINGS, result=metrics_of(0.1 * value)
+            )
+    one, two = (
+        reporting.report_document(report(tmp_path / tree)).images
+        for tree in ("one", "two")
+    )
     assert [*one] == ["rmse-over-a-b.png", "decision-over-a-b.png"]
     (line,) = one["rmse-over-a-b.png"][3]
-    assert (line.label, line.values) == ("all", [[pytest.approx(0.1)], [pytest.approx(0.2)]])
+    assert (line.label, line.values) == (
+        "all",
+        [[pytest.approx(0.1)], [pytest.approx(0.2)]],
+    )
     assert [*two] == [
         "rmse-over-a-b.png", "decision-over-a-b.png", "rmse-over-a-b-1.png", "decision-over-a-b-1.png"
     ]  # fmt: skip
 
 
 def test_a_comparison_is_told_with_every_number(tmp_path):
-    for seed, (first, second) in enumerate(zip([3, 5, 7, 8, 9, 6, 5], [2, 3, 4, 4, 4, 7.5, 4.5], strict=True)):
+    for seed, (first, second) in enumerate(
+        zip([3, 5, 7, 8, 9, 6, 5], [2, 3, 4, 4, 4, 7.5, 4.5], strict=True)
+    ):
         add(tmp_path, "lqr", seed, float(first))
         add(tmp_path, "convex", seed, float(second), failing=2)
     found = report(tmp_path)
     compared = compare(found, "controller=lqr", "controller=convex")
     rmse, outside, failed = compared
     assert [each.measure for each in compared] == ["rmse", "outside", "failed"]
-    assert (rmse.medians, rmse.quartiles, rmse.difference) == ((6.0, 4.0), (0.75, 2.0, 3.5), 2)
-    assert rmse.rank_biserial == pytest.approx((28 - 2 * 3) / 28)  # -1.5 has the third rank of 1 to 7
-    assert (outside.difference, outside.standardised, outside.rank_biserial, outside.interval) == (0, 0, 0, (0, 0))
-    assert (failed.difference, failed.interval, failed.standardised) == (-10, (-10, -10), -np.inf)
+    assert (rmse.medians, rmse.quartiles, rmse.difference) == (
+        (6.0, 4.0),
+        (0.75, 2.0, 3.5),
+        2,
+    )
+    assert rmse.rank_biserial == pytest.approx(
+        (28 - 2 * 3) / 28
+    )  # -1.5 has the third rank of 1 to 7
+    assert (
+        outside.difference,
+        outside.standardised,
+        outside.rank_biserial,
+        outside.interval,
+    ) == (0, 0, 0, (0, 0))
+    assert (failed.difference, failed.interval, failed.standardised) == (
+        -10,
+        (-10, -10),
+        -np.inf,
+    )
     assert failed.rank_biserial == -1
     assert np.isnan([failed.wilcoxon, failed.t_test]).all()
     assert sentences(found, compared, "a", "b") == [

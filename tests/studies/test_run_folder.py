@@ -6,7 +6,15 @@ from itertools import combinations
 import pytest
 
 from gpmpc.exceptions import DataError, SettingError
-from gpmpc.studies._run_folder import ERROR, LONGEST_NAME, METRICS, RunFolder, difference, folder_name, record
+from gpmpc.studies._run_folder import (
+    ERROR,
+    LONGEST_NAME,
+    METRICS,
+    RunFolder,
+    difference,
+    folder_name,
+    record,
+)
 
 
 def test_other_choices_have_another_folder_even_where_capitals_count_for_nothing():
@@ -29,7 +37,11 @@ def test_other_choices_have_another_folder_even_where_capitals_count_for_nothing
         ({"a": {"b": 1}}, {"a": None}, "a.b: 1 then, None now"),
         ({"a": 1}, {"a": {"b": 1}}, "a: 1 then, None now, a.b: None then, 1 now"),
         ({"a": 1}, {"b": 2}, "a: 1 then, None now, b: None then, 2 now"),
-        ({"a": 0, "b": 0, "c": 0}, {"a": 1, "b": 1, "c": 1}, "a: 0 then, 1 now, b: 0 then, 1 now, c: 0 then, 1 now"),
+        (
+            {"a": 0, "b": 0, "c": 0},
+            {"a": 1, "b": 1, "c": 1},
+            "a: 0 then, 1 now, b: 0 then, 1 now, c: 0 then, 1 now",
+        ),
         (
             {"a": 0, "b": 0, "c": 0, "d": 0, "e": 0},
             {"a": 1, "b": 1, "c": 1, "d": 1, "e": 1},
@@ -60,7 +72,11 @@ def test_a_failure_is_kept_with_its_kind_and_where_it_was_raised(tmp_path):
         except ZeroDivisionError as error:
             folder.fail(error, {"seed": 3})
     content = json.loads((folder.path / ERROR).read_text())
-    assert (content["seed"], content["error"], content["kind"]) == (3, "too bad", "ZeroDivisionError")
+    assert (content["seed"], content["error"], content["kind"]) == (
+        3,
+        "too bad",
+        "ZeroDivisionError",
+    )
     assert content["traceback"].startswith("Traceback (most recent call last)")
     assert content["traceback"].endswith("ZeroDivisionError: too\n  bad\n")
     assert folder.failed_at == (folder.path / ERROR).stat().st_mtime_ns
@@ -72,16 +88,28 @@ def test_a_failure_is_kept_with_its_kind_and_where_it_was_raised(tmp_path):
 
 
 def test_a_result_of_other_settings_or_none_is_refused(tmp_path):
-    folder, about = RunFolder(tmp_path), record(["b=2", "a=1"], {"seed": 7, "steps": 3}, "gpmpc run")
+    folder, about = (
+        RunFolder(tmp_path),
+        record(["b=2", "a=1"], {"seed": 7, "steps": 3}, "gpmpc run"),
+    )
     folder.finish(about)
-    assert folder.result() == folder.result({"seed": 7, "steps": 3}) == json.loads(json.dumps(about))
+    assert (
+        folder.result()
+        == folder.result({"seed": 7, "steps": 3})
+        == json.loads(json.dumps(about))
+    )
     assert (about["choices"], about["seed"], about["schema"]) == (["b=2", "a=1"], 7, 1)
     assert about["provenance"]["command"] == "gpmpc run"
-    with pytest.raises(SettingError, match=r"finished run of other settings \(steps: 3 then, 4 now\); choose another"):
+    with pytest.raises(
+        SettingError,
+        match=r"finished run of other settings \(steps: 3 then, 4 now\); choose another",
+    ):
         folder.result({"seed": 7, "steps": 4})
     for text in ("", "[]", "{}", '{"settings": '):
         (tmp_path / METRICS).write_text(text)
-        with pytest.raises(DataError, match=r"metrics\.json: is not what a run writes: \w+: "):
+        with pytest.raises(
+            DataError, match=r"metrics\.json: is not what a run writes: \w+: "
+        ):
             folder.result()
     (tmp_path / METRICS).unlink()
     with pytest.raises(DataError, match="FileNotFoundError"):
@@ -89,7 +117,9 @@ def test_a_result_of_other_settings_or_none_is_refused(tmp_path):
 
 
 def test_a_name_is_the_choices_as_long_as_it_is_short_and_plain():
-    assert folder_name(["a=" + "x" * (LONGEST_NAME - 2)]) == "a=" + "x" * (LONGEST_NAME - 2)
+    assert folder_name(["a=" + "x" * (LONGEST_NAME - 2)]) == "a=" + "x" * (
+        LONGEST_NAME - 2
+    )
     longer = folder_name(["a=" + "x" * (LONGEST_NAME - 1)])
     assert len(longer) == LONGEST_NAME + 11
     assert longer.startswith("a=" + "x" * (LONGEST_NAME - 2) + "-")

@@ -32,7 +32,9 @@ def test_a_store_finds_what_was_kept_behind_any_line_that_was_cut_short(tmp_path
     assert not path.exists()
     store.append("a", {"error": 1})
     store.append("b", {"error": 2})
-    assert [json.loads(line)["fingerprint"] for line in path.read_text().splitlines()] == ["a", "b"]
+    assert [
+        json.loads(line)["fingerprint"] for line in path.read_text().splitlines()
+    ] == ["a", "b"]
     for torn in ('{"fingerprint": "c", "rec', "[1, 2]\n", '{"record": {}}\n', "\n"):
         path.write_text(path.read_text() + torn)
     again = TrialStore(path)
@@ -47,7 +49,9 @@ def test_a_store_finds_what_was_kept_behind_any_line_that_was_cut_short(tmp_path
 
 def test_a_record_is_on_the_disk_when_it_is_kept(tmp_path, monkeypatch):
     synced = []
-    monkeypatch.setattr(os, "fsync", lambda _: synced.append((tmp_path / "trials.jsonl").read_text()))
+    monkeypatch.setattr(
+        os, "fsync", lambda _: synced.append((tmp_path / "trials.jsonl").read_text())
+    )
     TrialStore(tmp_path / "trials.jsonl").append("a", {})
     assert synced == ['{"fingerprint": "a", "record": {}}\n']
 
@@ -73,9 +77,13 @@ def started(monkeypatch):
     return started
 
 
-def test_what_is_missing_is_run_and_records_stand_in_the_order_of_the_trials(tmp_path, started):
+def test_what_is_missing_is_run_and_records_stand_in_the_order_of_the_trials(
+    tmp_path, started
+):
     conditions = {3: "good", 4: "bad", 5: "singular", 6: "good"}
-    trials = [Trial({"name": c}, c, seed, f"print{seed}") for seed, c in conditions.items()]
+    trials = [
+        Trial({"name": c}, c, seed, f"print{seed}") for seed, c in conditions.items()
+    ]
     store, told = TrialStore(tmp_path / "trials.jsonl"), []
     store.append("print6", {"name": "of an older study", "seed": 6, "square": 36})
     records = run_study(fail, trials, store, 7, told.append)
@@ -86,15 +94,24 @@ def test_what_is_missing_is_run_and_records_stand_in_the_order_of_the_trials(tmp
         {"name": "singular", "seed": 5, "error": "not positive definite"},
         {"name": "good", "seed": 6, "square": 36},
     ]
-    assert [record["seed"] for record in told] == [6, 5, 4, 3]  # found, then as they finish
+    assert [record["seed"] for record in told] == [
+        6,
+        5,
+        4,
+        3,
+    ]  # found, then as they finish
     assert [*TrialStore(store.path).records] == ["print6", "print5", "print4", "print3"]
     again = []
-    assert run_study(fail, trials, TrialStore(store.path), None, again.append) == records
+    assert (
+        run_study(fail, trials, TrialStore(store.path), None, again.append) == records
+    )
     assert [record["seed"] for record in again] == [3, 4, 5, 6]
     assert len(started) == 3
 
 
-def test_other_errors_end_the_study_and_a_worker_that_died_is_named(tmp_path, started, monkeypatch):
+def test_other_errors_end_the_study_and_a_worker_that_died_is_named(
+    tmp_path, started, monkeypatch
+):
     trials = [Trial({}, None, seed=0, fingerprint="a")]
     with pytest.raises(ZeroDivisionError):
         run_study(lambda _: 1 / 0, trials, TrialStore(tmp_path / "trials.jsonl"))
@@ -111,28 +128,51 @@ def test_other_errors_end_the_study_and_a_worker_that_died_is_named(tmp_path, st
 def test_rows_and_seeds_follow_from_the_seed_alone():
     assert random_rows(6, 6, 0) == list(range(6))
     assert random_rows(6, 0, 0) == []
-    assert random_rows(100, 3, 5) == sorted(np.random.default_rng(5).permutation(100)[:3].tolist())
-    with pytest.raises(SettingError, match="data.size: must be at most 6, the rows of the data; got 7"):
+    assert random_rows(100, 3, 5) == sorted(
+        np.random.default_rng(5).permutation(100)[:3].tolist()
+    )
+    with pytest.raises(
+        SettingError, match="data.size: must be at most 6, the rows of the data; got 7"
+    ):
         random_rows(6, 7, 0, "data.size")
-    seeds = [derived_seed(*parts) for parts in ((0, 0), (0, 1), (1, 0), (1, 1), (2**32 - 1, 0))]
+    seeds = [
+        derived_seed(*parts)
+        for parts in ((0, 0), (0, 1), (1, 0), (1, 1), (2**32 - 1, 0))
+    ]
     assert len({*seeds}) == len(seeds)
-    assert derived_seed(1, 2, 3) == np.random.SeedSequence([1, 2, 3]).generate_state(2)[0]
+    assert (
+        derived_seed(1, 2, 3) == np.random.SeedSequence([1, 2, 3]).generate_state(2)[0]
+    )
 
 
-def test_a_fingerprint_differs_with_settings_arrays_and_code_and_with_nothing_else(tmp_path):
+def test_a_fingerprint_differs_with_settings_arrays_and_code_and_with_nothing_else(
+    tmp_path,
+):
     array, source = np.arange(6.0), tmp_path / "own.py"
     source.write_text("x = 1\n")
     prints = [
         fingerprint(*arguments, code=code)
-        for arguments in (({"a": 1, "b": 2},), ({"a": 2, "b": 1},), ([1], array), ([1], array + 1), ([1], array[:5]))
+        for arguments in (
+            ({"a": 1, "b": 2},),
+            ({"a": 2, "b": 1},),
+            ([1], array),
+            ([1], array + 1),
+            ([1], array[:5]),
+        )
         for code in ((), ("status.py",), ("st*.py",), ("studies/*.py",), (str(source),))
     ]
     assert len({*prints}) == len(prints)
     assert {len(each) for each in prints} == {32}
     assert fingerprint({"b": 2, "a": 1}) == prints[0]
-    assert fingerprint([1], array[::-1][::-1]) == fingerprint([1], torch.arange(6.0)) == prints[10]
+    assert (
+        fingerprint([1], array[::-1][::-1])
+        == fingerprint([1], torch.arange(6.0))
+        == prints[10]
+    )
     assert fingerprint([1], None, array) == prints[10]
-    assert fingerprint(tmp_path) == fingerprint(str(tmp_path))  # what is no plain data counts by its text
+    assert fingerprint(tmp_path) == fingerprint(
+        str(tmp_path)
+    )  # what is no plain data counts by its text
     other = tmp_path / "other.py"
     other.write_text("x = 2\n")
     assert fingerprint(0, code=[str(source)]) != fingerprint(0, code=[str(other)])

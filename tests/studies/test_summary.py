@@ -17,7 +17,12 @@ from gpmpc.studies._run_folder import record
 from gpmpc.studies.flight import Experiment, Flown, metrics, summary
 from tests.studies.made_up import PLANT, metrics_of
 
-OPTIONS = {"trajectory": "lorenz", "system": "translational", "data": "excited", "controller": "convex"}
+OPTIONS = {
+    "trajectory": "lorenz",
+    "system": "translational",
+    "data": "excited",
+    "controller": "convex",
+}
 
 
 def said(result, **options):
@@ -25,7 +30,11 @@ def said(result, **options):
     about = record([], {"seed": 0, "options": OPTIONS | options}, "gpmpc run")
     Console(file=stream, width=200).print(terminal([summary(about | result)]))
     lines = [line.strip() for line in stream.getvalue().splitlines()]
-    return {line.split("  ")[0]: line.partition("  ")[2].strip() for line in lines if "  " in line}
+    return {
+        line.split("  ")[0]: line.partition("  ")[2].strip()
+        for line in lines
+        if "  " in line
+    }
 
 
 @pytest.mark.parametrize("failing", [0, 3])
@@ -40,8 +49,13 @@ def test_a_summary_has_a_line_for_each_thing_that_is_measured(failing):
         assert lines[f"bounds of {name}"].startswith(
             f"{rate['violations']} of {rate['steps']} steps outside (95 %: 0 to"
         )
-    assert lines["decision [ms]"].startswith("median 3.1  (model 1, build 0.1, solve 2), 99 % below 3.1")
-    assert said(result, trajectory="goal", system="pendulum")["flight"] == "20 steps of pendulum with convex"
+    assert lines["decision [ms]"].startswith(
+        "median 3.1  (model 1, build 0.1, solve 2), 99 % below 3.1"
+    )
+    assert (
+        said(result, trajectory="goal", system="pendulum")["flight"]
+        == "20 steps of pendulum with convex"
+    )
 
 
 def test_everything_that_a_result_may_hold_has_its_line():
@@ -72,15 +86,27 @@ def test_everything_that_a_result_may_hold_has_its_line():
     assert lines["episodes before"] == "0.25, diverged"
     assert lines["stopped early"].startswith("ITERATION_LIMIT 2, TIME_LIMIT 1: ")
     assert lines["far from the data"].startswith("the plans of 7 steps: ")
-    assert dict(summary(result | {"rmse": dict.fromkeys(result["rmse"])}).rows)["RMSE [m]"] == "none: it diverged"
-    bare = result | {"settings": {"options": OPTIONS}, "training": None, "lost": None, "error_at_end": None}
+    assert (
+        dict(summary(result | {"rmse": dict.fromkeys(result["rmse"])}).rows)["RMSE [m]"]
+        == "none: it diverged"
+    )
+    bare = result | {
+        "settings": {"options": OPTIONS},
+        "training": None,
+        "lost": None,
+        "error_at_end": None,
+    }
     bare |= {"episodes": [], "suboptimal": {}, "far_from_data": 0}
     names = ["flight", "RMSE [m]", "bounds of inputs", "failed solves", "decision [ms]"]
     assert [name for name, _ in summary(bare).rows] == names
 
 
-@pytest.mark.parametrize(("error", "outside"), [(0.04, 0), (0.06, 20), (-1.5, 20), (-0.5, 0)])
-def test_states_are_counted_outside_the_tightest_bounds_that_all_boxes_have_now(error, outside):
+@pytest.mark.parametrize(
+    ("error", "outside"), [(0.04, 0), (0.06, 20), (-1.5, 20), (-0.5, 0)]
+)
+def test_states_are_counted_outside_the_tightest_bounds_that_all_boxes_have_now(
+    error, outside
+):
     narrow = np.full((2, 6), 9.0)
     narrow[:, 0] = 0.05, 0.01  # of the first stage, and of one later on
     boxes = Box(np.full(6, -1.0), np.full(6, 1.0)), Box(np.full((2, 6), -9.0), narrow)
@@ -110,19 +136,44 @@ def rollout_of(errors, **changes):
 def measured(rollout, training=None, diverged=None, before=(), system=PLANT):
     problem = SimpleNamespace(inputs=Box(np.zeros(3), np.full(3, 10.0)), constraints=())
     controller = SimpleNamespace(problem=problem, horizon=2)
-    experiment = Experiment(None, None, system, None, lambda plant: None, steps=len(rollout.inputs))
-    flown = Flown(rollout, controller, training, diverged, tuple(Flown(each, controller, None) for each in before))
+    experiment = Experiment(
+        None, None, system, None, lambda plant: None, steps=len(rollout.inputs)
+    )
+    flown = Flown(
+        rollout,
+        controller,
+        training,
+        diverged,
+        tuple(Flown(each, controller, None) for each in before),
+    )
     return metrics(experiment, flown)
 
 
 def test_the_metrics_of_a_flight_are_written_out_in_full():
-    statuses = Status.SOLVED, Status.INFEASIBLE, Status.ITERATION_LIMIT, Status.INFEASIBLE
-    solves = {"statuses": statuses, "suboptimal": (2,), "far_from_data": (0, 3), "iterations": np.array([1, 2, 3, 10])}
-    training = SimpleNamespace(posterior=range(7), evaluations=5, objective=np.array([1.5, 2.5]), seconds=0.25)
+    statuses = (
+        Status.SOLVED,
+        Status.INFEASIBLE,
+        Status.ITERATION_LIMIT,
+        Status.INFEASIBLE,
+    )
+    solves = {
+        "statuses": statuses,
+        "suboptimal": (2,),
+        "far_from_data": (0, 3),
+        "iterations": np.array([1, 2, 3, 10]),
+    }
+    training = SimpleNamespace(
+        posterior=range(7), evaluations=5, objective=np.array([1.5, 2.5]), seconds=0.25
+    )
     errors = [[9, 9, 9], [3, 0, 0], [0, 0, 4], [0, 0, 0], [0, 6, 0]]
-    episodes = rollout_of([[0, 0, 0], [0, 3, 0], [4, 0, 0]]), rollout_of([[0, 0, 0], [np.inf, 0, 0]])
+    episodes = (
+        rollout_of([[0, 0, 0], [0, 3, 0], [4, 0, 0]]),
+        rollout_of([[0, 0, 0], [np.inf, 0, 0]]),
+    )
     found = measured(rollout_of(errors, **solves), training, before=episodes)
-    quantiles = {name: found["times"].pop(name) for name in ("model", "build", "solve", "total")}
+    quantiles = {
+        name: found["times"].pop(name) for name in ("model", "build", "solve", "total")
+    }
     violations = found.pop("violations")
     assert found == {
         "steps": 4,
@@ -138,11 +189,18 @@ def test_the_metrics_of_a_flight_are_written_out_in_full():
         "episodes": [pytest.approx(np.sqrt(12.5)), None],
         "times": {"training": 0.25},
     }
-    assert quantiles["model"] == pytest.approx({"median": 0.0025, "p95": 0.00385, "p99": 0.00397, "largest": 0.004})
+    assert quantiles["model"] == pytest.approx(
+        {"median": 0.0025, "p95": 0.00385, "p99": 0.00397, "largest": 0.004}
+    )
     assert {quantiles["build"]["median"], quantiles["solve"]["median"]} == {0.01, 0.1}
     assert quantiles["total"]["largest"] == pytest.approx(0.114)
     rate = violations["inputs"]
-    assert (rate["violations"], rate["steps"], rate["rate"], rate["worst"]) == (1, 4, 0.25, 2.0)
+    assert (rate["violations"], rate["steps"], rate["rate"], rate["worst"]) == (
+        1,
+        4,
+        0.25,
+        2.0,
+    )
     assert measured(rollout_of(errors))["training"] is None
     assert measured(rollout_of(errors))["times"]["training"] is None
 
@@ -150,11 +208,26 @@ def test_the_metrics_of_a_flight_are_written_out_in_full():
 def test_a_loss_is_told_from_the_first_step_beyond_and_a_divergence_besides():
     errors = [[0, 0, 0], [0, 0, 9], [0, 0, 12], [0, 40, 0]]
     far = "12 m from its reference, more than 10 m"
-    assert measured(rollout_of(errors))["lost"] == {"step": 2, "time": 0.4, "reason": far}
+    assert measured(rollout_of(errors))["lost"] == {
+        "step": 2,
+        "time": 0.4,
+        "reason": far,
+    }
     assert measured(rollout_of(errors[:2]))["lost"] is None
     over = Diverged(7, "the plant's\n state is lost")
-    both = {"step": 2, "time": 0.4, "reason": f"{far}; step 7: the plant's state is lost"}
+    both = {
+        "step": 2,
+        "time": 0.4,
+        "reason": f"{far}; step 7: the plant's state is lost",
+    }
     assert measured(rollout_of(errors), diverged=over)["lost"] == both
     alone = measured(rollout_of(errors[:2]), diverged=over)
-    assert alone["lost"] == {"step": 7, "time": 1.4, "reason": "step 7: the plant's state is lost"}
-    assert (alone["rmse"], alone["error_at_end"]) == (dict.fromkeys(["x", "y", "z", "total"]), None)
+    assert alone["lost"] == {
+        "step": 7,
+        "time": 1.4,
+        "reason": "step 7: the plant's state is lost",
+    }
+    assert (alone["rmse"], alone["error_at_end"]) == (
+        dict.fromkeys(["x", "y", "z", "total"]),
+        None,
+    )

@@ -7,11 +7,19 @@ from gpmpc.plotting._sweeps import Series, over_variable
 
 
 @pytest.mark.parametrize(
-    "label", ["horizon=1", "data.size=189", "controller=nonlinear", "propagation=mean_equivalence"]
+    "label",
+    [
+        "horizon=1",
+        "data.size=189",
+        "controller=nonlinear",
+        "propagation=mean_equivalence",
+    ],
 )
 @pytest.mark.parametrize("count", [2, 3, 6])
 def test_a_legend_stays_within_its_figure(label, count):
-    figure = over_variable("horizon", ["1", "5"], "RMSE [m]", [Series(label, [[1.0], [2.0]])] * count)
+    figure = over_variable(
+        "horizon", ["1", "5"], "RMSE [m]", [Series(label, [[1.0], [2.0]])] * count
+    )
     FigureCanvasAgg(figure).draw()
     (legend,) = figure.legends
     box = legend.get_window_extent()

@@ -23,11 +23,19 @@ ROLLOUT, MODEL, STEP = object(), SimpleNamespace(name="model"), object()
 
 
 def steering(model=None, **made):
-    return SimpleNamespace(horizon=3, initial_input=[7.0, 0.0, 0.1], made_of=model, **made)
+    return SimpleNamespace(
+        horizon=3, initial_input=[7.0, 0.0, 0.1], made_of=model, **made
+    )
 
 
 def experiment(**changes):
-    given = {"data": None, "trajectory": Elliptical(), "system": PLANT, "train": None, "controller": steering}
+    given = {
+        "data": None,
+        "trajectory": Elliptical(),
+        "system": PLANT,
+        "train": None,
+        "controller": steering,
+    }
     return Experiment(**given | {"steps": 5, "model": MODEL} | changes)
 
 
@@ -36,12 +44,22 @@ def loops(monkeypatch):
     """What was rehearsed, and what was flown, in their order."""
     calls = []
     monkeypatch.setattr(studied, "rehearse", lambda *given: calls.append(given))
-    monkeypatch.setattr(studied, "closed_loop", lambda *given, **more: calls.append((given, more)) or ROLLOUT)
+    monkeypatch.setattr(
+        studied,
+        "closed_loop",
+        lambda *given, **more: calls.append((given, more)) or ROLLOUT,
+    )
     return calls
 
 
-def test_a_flight_goes_from_the_first_reference_along_all_that_its_last_plan_sees(loops):
-    heavy, noise, gust = translational(mass=0.9), Noise(process=[0.1] * 6), SimpleNamespace(disturb_plant=None)
+def test_a_flight_goes_from_the_first_reference_along_all_that_its_last_plan_sees(
+    loops,
+):
+    heavy, noise, gust = (
+        translational(mass=0.9),
+        Noise(process=[0.1] * 6),
+        SimpleNamespace(disturb_plant=None),
+    )
     told = []
     chosen = experiment(plant=heavy, noise=noise, seed=4, on_failure="raise")
     object.__setattr__(chosen, "disturbances", (gust,))
@@ -50,23 +68,40 @@ def test_a_flight_goes_from_the_first_reference_along_all_that_its_last_plan_see
     system, controller, reference, start, steps = given
     assert (system, steps, controller.made_of) == (heavy, 5, MODEL)
     assert all(one is other for one, other in zip(rehearsed, given[:4], strict=True))
-    assert np.array_equal(reference.states, PLANT.reference_states(Elliptical(), 5 + 3 + 1))
+    assert np.array_equal(
+        reference.states, PLANT.reference_states(Elliptical(), 5 + 3 + 1)
+    )
     assert np.array_equal(reference.inputs, [[7.0, 0.0, 0.1]] * 8)
     assert np.array_equal(start, reference.states[0])
-    settings = {"noise": noise, "disturbances": (gust,), "on_failure": "raise", "seed": 4, "on_step": STEP}
+    settings = {
+        "noise": noise,
+        "disturbances": (gust,),
+        "on_failure": "raise",
+        "seed": 4,
+        "on_step": STEP,
+    }
     assert more == settings
     assert told == [(controller, None)]
-    assert (flown.rollout, flown.controller, flown.training, flown.diverged) == (ROLLOUT, controller, None, None)
+    assert (flown.rollout, flown.controller, flown.training, flown.diverged) == (
+        ROLLOUT,
+        controller,
+        None,
+        None,
+    )
     assert flown.before == ()
 
 
-def test_a_flight_begins_where_the_plant_says_and_not_at_all_where_it_keeps_its_own_state(loops):
+def test_a_flight_begins_where_the_plant_says_and_not_at_all_where_it_keeps_its_own_state(
+    loops,
+):
     began = replace(PLANT, start=tuple(range(6)))
     run_trial(experiment(system=began))
     assert loops[0][3] == loops[1][0][3] == tuple(range(6))
     assert loops[1][1]["on_step"] is None
     own = experiment()
-    held = SimpleNamespace(start=None, dynamics=SimpleNamespace(stateful=True), time_step=1.0)
+    held = SimpleNamespace(
+        start=None, dynamics=SimpleNamespace(stateful=True), time_step=1.0
+    )
     object.__setattr__(own, "plant", held)
     run_trial(own)
     assert loops[-1][0][0] is held
@@ -81,20 +116,28 @@ def test_a_controller_that_knows_the_plant_is_made_of_it(loops):
 @pytest.mark.parametrize("propagator", [None, "mine"])
 def test_a_model_loop_is_flown_in_the_models_own_world(propagator, loops, monkeypatch):
     monkeypatch.setattr(studied, "best_propagator", lambda model: ("best for", model))
-    run_trial(experiment(loop="model", propagator=propagator, system=translational(time_step=0.25)))
+    run_trial(
+        experiment(
+            loop="model", propagator=propagator, system=translational(time_step=0.25)
+        )
+    )
     (system, *_), _ = loops[1]
     assert system == ModelLoop(MODEL, propagator or ("best for", MODEL), time_step=0.25)
 
 
 def test_a_controller_that_learns_while_it_flies_is_wrapped(loops, monkeypatch):
-    monkeypatch.setattr(studied, "LearningController", lambda *given: steering(given=given))
+    monkeypatch.setattr(
+        studied, "LearningController", lambda *given: steering(given=given)
+    )
     online = OnlineLearning()
     run_trial(experiment(learning=online))
     inner, learning = loops[1][0][1].given
     assert (inner.made_of, learning) == (MODEL, online)
 
 
-def test_a_flight_that_diverges_is_what_was_flown_of_it_or_raises_where_that_is_nothing(loops, monkeypatch):
+def test_a_flight_that_diverges_is_what_was_flown_of_it_or_raises_where_that_is_nothing(
+    loops, monkeypatch
+):
     error = Diverged(3, "away")
 
     def diverge(*_, **__):
@@ -105,10 +148,16 @@ def test_a_flight_that_diverges_is_what_was_flown_of_it_or_raises_where_that_is_
         run_trial(experiment())
     error.flown = ROLLOUT
     flown = run_trial(experiment())
-    assert (flown.rollout, flown.diverged, flown.controller.made_of) == (ROLLOUT, error, MODEL)
+    assert (flown.rollout, flown.diverged, flown.controller.made_of) == (
+        ROLLOUT,
+        error,
+        MODEL,
+    )
 
 
-def test_episodes_are_flown_with_seeds_of_their_own_and_the_model_of_the_best_flies_last(monkeypatch):
+def test_episodes_are_flown_with_seeds_of_their_own_and_the_model_of_the_best_flies_last(
+    monkeypatch,
+):
     errors, flown, learned = [3.0, 1.0, 2.0], [], []
 
     def learn(_, data, seed):
@@ -122,21 +171,40 @@ def test_episodes_are_flown_with_seeds_of_their_own_and_the_model_of_the_best_fl
     monkeypatch.setattr(Experiment, "training_rows", lambda _: ["rows"])
     monkeypatch.setattr(Experiment, "learn", learn)
     monkeypatch.setattr(studied, "_fly", fly)
-    monkeypatch.setattr(studied, "_error", lambda _, flown: errors[int(flown.rollout[-1]) - 1])
-    monkeypatch.setattr(EpisodicLearning, "with_flight", lambda _, data, rollout: [*data, rollout])
-    found = run_trial(experiment(model=None, seed=9, learning=EpisodicLearning(3)), "prepare")
+    monkeypatch.setattr(
+        studied, "_error", lambda _, flown: errors[int(flown.rollout[-1]) - 1]
+    )
+    monkeypatch.setattr(
+        EpisodicLearning, "with_flight", lambda _, data, rollout: [*data, rollout]
+    )
+    found = run_trial(
+        experiment(model=None, seed=9, learning=EpisodicLearning(3)), "prepare"
+    )
     seeds = [int(np.random.SeedSequence([9, k]).generate_state(1)[0]) for k in range(3)]
     models = ["model 1", "model 2", "model 3", "model 2"]
-    assert flown == [(seed, "prepare", model) for seed, model in zip([*seeds, 9], models, strict=True)]
-    assert learned == [(["rows", *(f"flight {i}" for i in range(1, k))], 9) for k in (1, 2, 3)]
-    assert [each.rollout for each in found.before] == ["flight 1", "flight 2", "flight 3"]
+    assert flown == [
+        (seed, "prepare", model)
+        for seed, model in zip([*seeds, 9], models, strict=True)
+    ]
+    assert learned == [
+        (["rows", *(f"flight {i}" for i in range(1, k))], 9) for k in (1, 2, 3)
+    ]
+    assert [each.rollout for each in found.before] == [
+        "flight 1",
+        "flight 2",
+        "flight 3",
+    ]
     assert found.rollout == "flight 4"
 
 
-def test_a_system_with_angles_or_something_known_learns_what_is_left_of_the_difference(monkeypatch):
+def test_a_system_with_angles_or_something_known_learns_what_is_left_of_the_difference(
+    monkeypatch,
+):
     monkeypatch.setattr(studied, "train_residual", lambda *given: ("residual", *given))
     monkeypatch.setattr(studied, "successor_function", lambda known: ("after", known))
-    monkeypatch.setattr(studied, "CasadiFunction", lambda function: ("function", function))
+    monkeypatch.setattr(
+        studied, "CasadiFunction", lambda function: ("function", function)
+    )
 
     def train(data, seed):
         return data, seed
@@ -144,11 +212,21 @@ def test_a_system_with_angles_or_something_known_learns_what_is_left_of_the_diff
     train.predicts = "difference"
     angles = PENDULUM.angle_indices
     assert angles
-    plain, turning = experiment(train=train), experiment(train=train, system=PENDULUM, trajectory=None)
+    plain, turning = (
+        experiment(train=train),
+        experiment(train=train, system=PENDULUM, trajectory=None),
+    )
     assert plain.learn("rows", 3) == ("rows", 3)
     assert turning.learn("rows", 3) == ("residual", train, "rows", angles, None, 3)
     known = experiment(train=train, system=replace(PLANT, nominal=PLANT))
-    assert known.learn("rows", 3) == ("residual", train, "rows", PLANT.angle_indices, ("function", ("after", PLANT)), 3)
+    assert known.learn("rows", 3) == (
+        "residual",
+        train,
+        "rows",
+        PLANT.angle_indices,
+        ("function", ("after", PLANT)),
+        3,
+    )
     train.predicts = "next_state"
     assert turning.learn("rows", 3) == known.learn("rows", 3) == ("rows", 3)
     del train.predicts
@@ -159,14 +237,18 @@ class Rows:
     """Transitions of some dimensions."""
 
     def __init__(self, n, m):
-        self.rows = Transitions(torch.arange(5.0 * n).reshape(5, n), torch.zeros(5, m), torch.zeros(5, n))
+        self.rows = Transitions(
+            torch.arange(5.0 * n).reshape(5, n), torch.zeros(5, m), torch.zeros(5, n)
+        )
 
     def transitions(self, system, trajectory, name):
         assert (system, trajectory, name) == (PLANT, Elliptical(), "mine")
         return self.rows
 
     def check(self, system, trajectory):
-        raise SettingError("data", f"{system.name} along {type(trajectory).__name__} is refused")
+        raise SettingError(
+            "data", f"{system.name} along {type(trajectory).__name__} is refused"
+        )
 
 
 def test_rows_are_of_the_systems_dimensions_and_as_many_as_asked_for():
@@ -175,31 +257,55 @@ def test_rows_are_of_the_systems_dimensions_and_as_many_as_asked_for():
 
     assert np.array_equal(drawn().states, Rows(6, 3).rows.states)
     assert len(drawn(size=5)) == 5
-    assert np.array_equal(drawn(size=2, seed=1).states, Rows(6, 3).rows[studied.random_rows(5, 2, 1)].states)
+    assert np.array_equal(
+        drawn(size=2, seed=1).states,
+        Rows(6, 3).rows[studied.random_rows(5, 2, 1)].states,
+    )
     for n, m in ((6, 2), (5, 3)):
-        with pytest.raises(ShapeError, match=rf"must have the same dimensions; got \({n}, {m}\)"):
+        with pytest.raises(
+            ShapeError, match=rf"must have the same dimensions; got \({n}, {m}\)"
+        ):
             drawn(n, m)
 
 
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"learning": OnlineLearning(), "loop": "model"}, "learning: needs a controller that learns a model, and a"),
-        ({"learning": OnlineLearning(), "controller": lambda plant: None}, "learning: needs a controller that learns"),
+        (
+            {"learning": OnlineLearning(), "loop": "model"},
+            "learning: needs a controller that learns a model, and a",
+        ),
+        (
+            {"learning": OnlineLearning(), "controller": lambda plant: None},
+            "learning: needs a controller that learns",
+        ),
         ({"disturbances": [object()]}, "disturbances: must each name what it is"),
         ({"seed": -1}, "seed: must be a whole number, 0 or more"),
-        ({"data": Rows(6, 3), "model": None}, "data: translational along Elliptical is refused"),
         (
-            {"controller": partial(steering, problem=Problem(Tracking([1] * 5, [1] * 3)))},
+            {"data": Rows(6, 3), "model": None},
+            "data: translational along Elliptical is refused",
+        ),
+        (
+            {
+                "controller": partial(
+                    steering, problem=Problem(Tracking([1] * 5, [1] * 3))
+                )
+            },
             "controller.problem: weighs 5 states and 3 inputs; translational has 6 and 3",
         ),
         (
-            {"controller": partial(steering, problem=Problem(Tracking([1] * 6, [1] * 2)))},
+            {
+                "controller": partial(
+                    steering, problem=Problem(Tracking([1] * 6, [1] * 2))
+                )
+            },
             "controller.problem: weighs 6 states and 2 inputs; translational has 6 and 3",
         ),
     ],
 )
-def test_what_does_not_fit_together_is_refused_before_anything_is_learned(changes, message):
+def test_what_does_not_fit_together_is_refused_before_anything_is_learned(
+    changes, message
+):
     with pytest.raises(SettingError, match=message):
         experiment(**changes)
 
@@ -220,6 +326,11 @@ def test_what_a_learned_model_holds_for_noise_is_left_out_of_a_plan():
     other = SimpleNamespace(posterior=SimpleNamespace(noise_covariance=torch.eye(2)))
     assert experiment(model=noisy).unplanned_noise(None).tolist() == [2, 3]
     assert experiment(model=noisy).unplanned_noise(other).tolist() == [1, 1]
-    assert experiment(model=noisy, loop="model").unplanned_noise(None).tolist() == [0] * 6
+    assert (
+        experiment(model=noisy, loop="model").unplanned_noise(None).tolist() == [0] * 6
+    )
     holding = SimpleNamespace(process_noise=True)
-    assert experiment(model=noisy, propagator=holding).unplanned_noise(None).tolist() == [0] * 6
+    assert (
+        experiment(model=noisy, propagator=holding).unplanned_noise(None).tolist()
+        == [0] * 6
+    )

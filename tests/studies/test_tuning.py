@@ -10,7 +10,11 @@ from gpmpc.studies import tuning
 from gpmpc.studies._document import number
 from gpmpc.studies.tuning import Interval, Search
 
-SPACE = {"weight": Interval(1e-3, 1e3, logarithmic=True), "horizon": Interval(1, 30, whole=True), "kind": ["a", "b"]}
+SPACE = {
+    "weight": Interval(1e-3, 1e3, logarithmic=True),
+    "horizon": Interval(1, 30, whole=True),
+    "kind": ["a", "b"],
+}
 
 
 def cost(candidate):
@@ -49,12 +53,17 @@ def test_a_search_of_one_seed_proposes_the_same_and_goes_on_as_if_it_had_never_s
 
 
 def test_flights_that_were_lost_count_as_the_worst_and_stop_nothing():
-    search = searched(21, of=lambda candidate: math.inf if candidate["weight"] < 1 else cost(candidate))
+    search = searched(
+        21,
+        of=lambda candidate: math.inf if candidate["weight"] < 1 else cost(candidate),
+    )
     assert search.candidates[search.best]["weight"] >= 1
     document = search.document(None, "gpmpc run")
-    assert "lost or failed" in " ".join(cell for row in document.tables[0].rows for cell in row) or len(
-        [c for c in search.costs if math.isfinite(c)]
-    ) >= len(document.tables[0].rows)
+    assert "lost or failed" in " ".join(
+        cell for row in document.tables[0].rows for cell in row
+    ) or len([c for c in search.costs if math.isfinite(c)]) >= len(
+        document.tables[0].rows
+    )
     assert document.images["tuning.png"]
 
 
@@ -95,10 +104,19 @@ def test_numbers_are_drawn_evenly_or_evenly_in_their_logarithm_and_whole_where_a
         assert {type(value) for value in values} == {int if interval.whole else float}
 
 
-def test_a_document_holds_the_ten_best_with_ties_in_their_order_and_everything_in_the_data(monkeypatch):
+def test_a_document_holds_the_ten_best_with_ties_in_their_order_and_everything_in_the_data(
+    monkeypatch,
+):
     monkeypatch.setattr(tuning, "search_figure", lambda *arguments: arguments)
     monkeypatch.setattr(tuning, "png", lambda drawn: drawn)
-    search = Search({"w.$x": Interval(0.0, 1.0), "n": Interval(1, 3, whole=True), "kind": ["a\n", "a\n"]}, 0)
+    search = Search(
+        {
+            "w.$x": Interval(0.0, 1.0),
+            "n": Interval(1, 3, whole=True),
+            "kind": ["a\n", "a\n"],
+        },
+        0,
+    )
     search.ask(5)
     search.tell([5.0, 2.0, math.inf, 2.0, 1234.5])
     assert len(search.ask(7)) == 7
@@ -107,19 +125,37 @@ def test_a_document_holds_the_ten_best_with_ties_in_their_order_and_everything_i
     monkeypatch.setattr(search, "importances", lambda: {"w.$x": 0.756, "n": 0.244})
     document = search.document(0.01234, "gpmpc run a=1")
     best, matter = document.tables
-    assert (best.title, [*best.header]) == ("Best candidates", ["candidate", "cost", "w.$x", "n", "kind"])
+    assert (best.title, [*best.header]) == (
+        "Best candidates",
+        ["candidate", "cost", "w.$x", "n", "kind"],
+    )
     shown = [(1, "2"), (3, "2"), (0, "5"), *((i, str(i + 1)) for i in range(5, 12))]
     of = search.candidates
-    assert best.rows == [[str(i), cost, number(of[i]["w.$x"]), str(of[i]["n"]), "a\\n"] for i, cost in shown]
+    assert best.rows == [
+        [str(i), cost, number(of[i]["w.$x"]), str(of[i]["n"]), "a\\n"]
+        for i, cost in shown
+    ]
     assert (matter.title, matter.header) == ("What mattered", ["setting", "importance"])
     assert matter.rows == [["w.$x", "76 %"], ["n", "24 %"]]
-    assert document.data.to_dict("records") == [{"candidate": i, "cost": search.costs[i], **of[i]} for i in range(12)]
-    assert document.lead == "12 candidates; cost of the best 2, of the settings as they are 0.0123."
+    assert document.data.to_dict("records") == [
+        {"candidate": i, "cost": search.costs[i], **of[i]} for i in range(12)
+    ]
+    assert (
+        document.lead
+        == "12 candidates; cost of the best 2, of the settings as they are 0.0123."
+    )
     assert document.code == {"To fly the best one": ["gpmpc run a=1"]}
-    assert document.images == {"tuning.png": (search.costs, {r"w.\$x": 0.756, "n": 0.244}, 0.01234)}
+    assert document.images == {
+        "tuning.png": (search.costs, {r"w.\$x": 0.756, "n": 0.244}, 0.01234)
+    }
     monkeypatch.setattr(search, "importances", dict)
     search.costs[:] = [math.inf] * 12
     nothing = search.document(None, "")
-    assert nothing.lead == "12 candidates; cost of the best lost or failed, of the settings as they are —."
+    assert (
+        nothing.lead
+        == "12 candidates; cost of the best lost or failed, of the settings as they are —."
+    )
     assert [table.title for table in nothing.tables] == ["Best candidates"]
-    assert [row[:2] for row in nothing.tables[0].rows] == [[str(i), "lost or failed"] for i in range(10)]
+    assert [row[:2] for row in nothing.tables[0].rows] == [
+        [str(i), "lost or failed"] for i in range(10)
+    ]

@@ -14,9 +14,13 @@ from gpmpc.systems._quadrotor import (
 from gpmpc.trajectories import Elliptical, Hover, Lorenz, states_along
 
 
-@pytest.mark.parametrize("trajectory", [Elliptical(), Lorenz()], ids=["elliptical", "lorenz"])
+@pytest.mark.parametrize(
+    "trajectory", [Elliptical(), Lorenz()], ids=["elliptical", "lorenz"]
+)
 @pytest.mark.parametrize("outer_step", [0.5, 1.0])
-def test_a_thrust_along_them_takes_the_velocity_from_one_reference_to_the_next(trajectory, outer_step):
+def test_a_thrust_along_them_takes_the_velocity_from_one_reference_to_the_next(
+    trajectory, outer_step
+):
     vehicle = Translational()
     plant = System(vehicle, outer_step, 1)
     states = states_along(trajectory, outer_step * np.arange(31))
@@ -35,9 +39,13 @@ def test_hovering_is_level():
 def test_an_attitude_is_approached_at_first_order_with_the_rate_that_belongs_to_it():
     angles = np.array([[0.1, -0.2], [0.3, 0.0]])
     states = approach_attitudes(angles, 8, 4, 0.05, 0.1)
-    assert np.array_equal(states[:5, [0, 2]], np.tile(angles[0], (5, 1)))  # it begins where it is to be
+    assert np.array_equal(
+        states[:5, [0, 2]], np.tile(angles[0], (5, 1))
+    )  # it begins where it is to be
     left = np.exp(-0.05 * np.arange(4) / 0.1)[:, None]
-    assert states[4:, [0, 2]] == pytest.approx(angles[1] + left * (angles[0] - angles[1]))
+    assert states[4:, [0, 2]] == pytest.approx(
+        angles[1] + left * (angles[0] - angles[1])
+    )
     assert states[4:, [1, 3]] == pytest.approx(left * (angles[1] - angles[0]) / 0.1)
     assert not states[:, 4:].any()
 

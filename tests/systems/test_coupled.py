@@ -24,22 +24,32 @@ def test_the_names_are_those_of_the_subsystems():
 def test_the_attitude_turns_as_the_rotational_subsystem_does(rng):
     rotational = Rotational(inertia=(0.004, 0.005, 0.009))
     x, u = rng.normal(size=12), rng.normal(size=4)
-    assert Coupled(rotational=rotational).derivative(x, u)[6:] == rotational.derivative(x[6:], u[1:])
+    assert Coupled(rotational=rotational).derivative(x, u)[6:] == rotational.derivative(
+        x[6:], u[1:]
+    )
     whole = System(Coupled(rotational=rotational), time_step=0.05)
     part = System(rotational, time_step=0.05)
     assert np.allclose(step(whole, x, u)[6:], step(part, x[6:], u[1:]), rtol=1e-13)
 
 
 @pytest.mark.parametrize("mass", [0.74, 1.1])
-def test_an_attitude_held_for_a_thrust_direction_moves_it_as_the_translational_subsystem(mass, rng):
+def test_an_attitude_held_for_a_thrust_direction_moves_it_as_the_translational_subsystem(
+    mass, rng
+):
     for _ in range(20):
         phi, theta, U1 = *rng.uniform(-1.2, 1.2, size=2), rng.uniform(1, 20)
         ux, uy = np.cos(phi) * np.sin(theta), -np.sin(phi)
         angles = attitude_for_thrust_direction(np.array(ux), np.array(uy))
         position = rng.normal(size=6)
         x = np.concatenate([position, [angles[0], 0, angles[1], 0, 0, 0]])
-        moved = step(System(Coupled(mass=mass), time_step=0.7), x, np.array([U1, 0, 0, 0]))
-        expected = step(System(Translational(mass=mass), time_step=0.7), position, np.array([U1, ux, uy]))
+        moved = step(
+            System(Coupled(mass=mass), time_step=0.7), x, np.array([U1, 0, 0, 0])
+        )
+        expected = step(
+            System(Translational(mass=mass), time_step=0.7),
+            position,
+            np.array([U1, ux, uy]),
+        )
         assert np.allclose(moved[:6], expected, atol=1e-9)
 
 
@@ -48,7 +58,11 @@ def test_the_frozen_attitude_of_the_papers_data_is_this_plant_held_there(rng):
     x[:6], x[[6, 8]] = rng.normal(size=6), QUARTER
     ux, uy, _ = thrust_direction(QUARTER, QUARTER, 0.0)
     frozen = Translational(frozen_attitude=(QUARTER, QUARTER))
-    assert np.allclose(Coupled().derivative(x, [U1, 0, 0, 0])[:6], frozen.derivative(x, [U1, ux, uy]), atol=1e-12)
+    assert np.allclose(
+        Coupled().derivative(x, [U1, 0, 0, 0])[:6],
+        frozen.derivative(x, [U1, ux, uy]),
+        atol=1e-12,
+    )
     assert (ux, uy) == pytest.approx((0.5, -np.sqrt(0.5)))
 
 
@@ -70,7 +84,11 @@ def test_the_thrust_direction_is_a_unit_vector_and_yaw_turns_it(rng):
 def test_the_attitude_for_a_direction_is_found_at_any_yaw(rng):
     phi, theta, psi = rng.uniform(-1.4, 1.4, size=(3, 50))
     ux, uy, _ = thrust_direction(phi, theta, psi)
-    assert np.allclose(attitude_for_thrust_direction(ux, uy, psi), np.column_stack([phi, theta]), atol=1e-11)
+    assert np.allclose(
+        attitude_for_thrust_direction(ux, uy, psi),
+        np.column_stack([phi, theta]),
+        atol=1e-11,
+    )
 
 
 def test_floats_numpy_and_casadi_pass_through_the_same_formula(rng):
@@ -78,10 +96,20 @@ def test_floats_numpy_and_casadi_pass_through_the_same_formula(rng):
     x, u = casadi.SX.sym("x", 12), casadi.SX.sym("u", 4)
     symbolic = casadi.Function("f", [x, u], [casadi.vertcat(*plant.successor(x, u))])
     state, control = rng.normal(size=12), rng.normal(size=4)
-    assert np.allclose(np.array(symbolic(state, control)).ravel(), step(plant, state, control), rtol=1e-12)
-    assert np.allclose(plant.successor(state.tolist(), control.tolist()), step(plant, state, control), rtol=1e-14)
+    assert np.allclose(
+        np.array(symbolic(state, control)).ravel(),
+        step(plant, state, control),
+        rtol=1e-12,
+    )
+    assert np.allclose(
+        plant.successor(state.tolist(), control.tolist()),
+        step(plant, state, control),
+        rtol=1e-14,
+    )
 
 
 def test_misuse_is_refused_with_the_rule():
-    with pytest.raises(SettingError, match=r"mass: must be a number above 0 \[kg\]; got -1"):
+    with pytest.raises(
+        SettingError, match=r"mass: must be a number above 0 \[kg\]; got -1"
+    ):
         Coupled(mass=-1)

@@ -42,13 +42,18 @@ class ToAndFro:
 
 def flown(seed):
     with settings():
-        chosen = experiment_of(compose("run", [*WORDS, f"seed={seed}", f"data.seed={seed}"]))
+        chosen = experiment_of(
+            compose("run", [*WORDS, f"seed={seed}", f"data.seed={seed}"])
+        )
     chosen = replace(chosen, trajectory=ToAndFro())
     with one_thread():
         return chosen, run_trial(chosen)
 
 
-@pytest.mark.parametrize("seed", [0, 1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(2, 20))])
+@pytest.mark.parametrize(
+    "seed",
+    [0, 1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(2, 20))],
+)
 def test_a_pole_learned_from_206_random_rows_survives_jumps_of_its_cart(seed):
     chosen, flight = flown(seed)
     assert len(flight.training.posterior) == 206
@@ -56,5 +61,7 @@ def test_a_pole_learned_from_206_random_rows_survives_jumps_of_its_cart(seed):
     assert metrics(chosen, flight)["lost"] is None
     states = flight.rollout.states
     assert np.abs(states[:, 0]).max() < 0.95
-    assert np.abs(states[:, 1]).max() < 0.2  # beyond it the environment ends its episode
+    assert (
+        np.abs(states[:, 1]).max() < 0.2
+    )  # beyond it the environment ends its episode
     assert np.abs(states[55:62, 0] - 0.5).max() < 0.05

@@ -19,7 +19,10 @@ def test_states_and_positions_of_joints_are_those_of_one_attitude(rng):
     vehicle = mujoco_quadrotor().dynamics
     for _ in range(5):
         state = np.zeros(12)
-        state[0:6:2], state[6::2] = rng.normal(size=3), rng.uniform([-3, -1.5, -3], [3, 1.5, 3])
+        state[0:6:2], state[6::2] = (
+            rng.normal(size=3),
+            rng.uniform([-3, -1.5, -3], [3, 1.5, 3]),
+        )
         vehicle.data.qpos[:], vehicle.data.qvel[:] = vehicle.positions(state), 0
         vehicle.mujoco.mj_forward(vehicle.model, vehicle.data)
         assert vehicle._measure() == pytest.approx(state, abs=1e-9)
@@ -54,7 +57,9 @@ def test_wind_pushes_by_drag_and_thrusts_may_act_late():
 
 def test_it_is_flown_from_the_command_line_on_top_of_its_data_sheet():
     with settings():
-        chosen = experiment_of(compose("run", ["system=mujoco_quadrotor", "data.samples=60", "steps=60"]))
+        chosen = experiment_of(
+            compose("run", ["system=mujoco_quadrotor", "data.samples=60", "steps=60"])
+        )
     flown = run_trial(chosen)
     found = metrics(chosen, flown)
     assert found["lost"] is None

@@ -15,7 +15,12 @@ from gpmpc.propagation import Linearization
 from gpmpc.simulation import closed_loop, closed_loops
 from gpmpc.studies.flight import Experiment, run_trial
 from gpmpc.systems import planar_quadrotor, step, step_many
-from gpmpc.systems.gymnasium_ import OURS, gymnasium_system, make_environment, register_environments
+from gpmpc.systems.gymnasium_ import (
+    OURS,
+    gymnasium_system,
+    make_environment,
+    register_environments,
+)
 from gpmpc.systems.mujoco_ import mujoco_system
 
 gymnasium = pytest.importorskip("gymnasium")
@@ -64,8 +69,12 @@ def lagging(tmp_path):
 
 
 @pytest.mark.parametrize("name", OURS)
-@pytest.mark.filterwarnings("ignore:.*we recommend using a symmetric and normalized space.*:UserWarning")
-@pytest.mark.filterwarnings("ignore:.*A Box observation space m.*imum value is -?infinity.*:UserWarning")
+@pytest.mark.filterwarnings(
+    "ignore:.*we recommend using a symmetric and normalized space.*:UserWarning"
+)
+@pytest.mark.filterwarnings(
+    "ignore:.*A Box observation space m.*imum value is -?infinity.*:UserWarning"
+)
 def test_our_systems_are_environments_that_pass_gymnasiums_checker(name):
     from gymnasium.utils.env_checker import check_env
 
@@ -96,8 +105,14 @@ def taken(**settings):
 
 def test_an_environment_is_learned_and_swung_up_like_any_other_system():
     system = taken(units={"rate": "rad/s", "cosine": "1", "sine": "1"})
-    assert (system.time_step, system.input_lower, system.input_upper) == (0.05, (-2.0,), (2.0,))
-    problem = Problem(Tracking([1, 1, 0.01], [0.01], penalized="inputs"), inputs=Box([-2], [2]))
+    assert (system.time_step, system.input_lower, system.input_upper) == (
+        0.05,
+        (-2.0,),
+        (2.0,),
+    )
+    problem = Problem(
+        Tracking([1, 1, 0.01], [0.01], penalized="inputs"), inputs=Box([-2], [2])
+    )
     experiment = Experiment(
         RandomData(samples=400, episode=40), None, system, Trainer(predicts="difference", scaling=standardize),
         partial(GPMPC, propagator=Linearization(), problem=problem, horizon=25, initial_input=[0.0]), steps=150,
@@ -118,22 +133,36 @@ class Pushing:
 
         n = len(belief.mean)
         return Decision(
-            [1.0], np.ones((1, 1)), np.zeros((2, n)), np.zeros((2, n, n)), Status.SOLVED, 1, Timing(0, 0, 0)
+            [1.0],
+            np.ones((1, 1)),
+            np.zeros((2, n)),
+            np.zeros((2, n, n)),
+            Status.SOLVED,
+            1,
+            Timing(0, 0, 0),
         )
 
 
 def test_where_an_environment_ends_its_episode_the_flight_ends_as_lost():
-    system = gymnasium_system(make_environment("double_integrator"), time_step=0.1, tracked=["x1"])
-    with pytest.raises(Diverged, match="the simulator has ended its episode, at state") as caught:
+    system = gymnasium_system(
+        make_environment("double_integrator"), time_step=0.1, tracked=["x1"]
+    )
+    with pytest.raises(
+        Diverged, match="the simulator has ended its episode, at state"
+    ) as caught:
         closed_loop(system, Pushing(), np.zeros((203, 2)), None, 200)
     assert np.abs(caught.value.flown.states[-1, 0]) < 10
     with pytest.raises(SettingError, match="a simulator flies one seed after another"):
         closed_loops(system, Pushing(), np.zeros((3, 2)), None, 2, seeds=2)
 
 
-def test_a_mujoco_model_moves_alike_by_joints_and_by_sensors_one_or_many_at_a_time(cart, rng):
+def test_a_mujoco_model_moves_alike_by_joints_and_by_sensors_one_or_many_at_a_time(
+    cart, rng
+):
     joints = mujoco_system(cart, ["push"], joints=["slider", "hinge"], substeps=4)
-    sensors = mujoco_system(cart, ["push"], sensors=["position", "angle", "velocity", "rate"], substeps=4)
+    sensors = mujoco_system(
+        cart, ["push"], sensors=["position", "angle", "velocity", "rate"], substeps=4
+    )
     assert joints.state_names == ("slider", "hinge", "slider_rate", "hinge_rate")
     assert sensors.state_names == ("position", "angle", "velocity", "rate")
     assert joints.time_step == 0.04
@@ -155,8 +184,12 @@ def test_an_actuators_lag_is_a_state_and_a_delay_waits(cart, lagging):
     state = np.zeros(5)
     for _ in range(5):
         state = step(lag, state, np.array([10.0]))
-    assert state[4] == pytest.approx(10 * (1 - 0.8**5))  # Euler's method: 0.01 s of 0.05 s, five times
-    late = mujoco_system(cart, ["push"], sensors=["velocity", "tip"], observation={"input_delay": 2})
+    assert state[4] == pytest.approx(
+        10 * (1 - 0.8**5)
+    )  # Euler's method: 0.01 s of 0.05 s, five times
+    late = mujoco_system(
+        cart, ["push"], sensors=["velocity", "tip"], observation={"input_delay": 2}
+    )
     assert late.state_names == ("velocity", "tip1", "tip2", "tip3")
     state, speeds = late.dynamics.reset(0), []
     for _ in range(4):
@@ -176,28 +209,69 @@ def test_misuse_of_simulators_is_one_clear_line(cart, tmp_path, monkeypatch):
         def step(self, action):
             return {"a": action}, 0.0, False, False, {}
 
-    named = gymnasium_system(Worded(), observe=lambda observation: observation["a"], time_step=0.1)
+    named = gymnasium_system(
+        Worded(), observe=lambda observation: observation["a"], time_step=0.1
+    )
     assert step(named, np.zeros(1), np.array([3.0])) == 1.0
     system = taken()
     started = system.dynamics.reset(0)
     for misuse, error, message in (
-        (lambda: gymnasium_system(Worded(), time_step=1), SettingError, "observation space must be a Box.*observe"),
-        (lambda: gymnasium_system("CartPole-v1"), SettingError, "the action space must be a Box of one dimension"),
-        (lambda: gymnasium_system("Pendlum-v1"), SettingError, "environment: 'Pendlum-v1': "),
-        (lambda: gymnasium_system(Worded(), observe=lambda o: o["a"]), SettingError, "time_step: is not known"),
-        (lambda: step(system, started + 0.1, np.zeros(1)), SettingError, "cannot be set to a state"),
+        (
+            lambda: gymnasium_system(Worded(), time_step=1),
+            SettingError,
+            "observation space must be a Box.*observe",
+        ),
+        (
+            lambda: gymnasium_system("CartPole-v1"),
+            SettingError,
+            "the action space must be a Box of one dimension",
+        ),
+        (
+            lambda: gymnasium_system("Pendlum-v1"),
+            SettingError,
+            "environment: 'Pendlum-v1': ",
+        ),
+        (
+            lambda: gymnasium_system(Worded(), observe=lambda o: o["a"]),
+            SettingError,
+            "time_step: is not known",
+        ),
+        (
+            lambda: step(system, started + 0.1, np.zeros(1)),
+            SettingError,
+            "cannot be set to a state",
+        ),
         (
             lambda: mujoco_system(cart, ["push"], joints=["slider", "hing"]),
             SettingError,
             "joints: Invalid name 'hing'. Valid names: .*'hinge'.*'slider'.* in .*cart.xml",
         ),
-        (lambda: mujoco_system(cart, ["pull"], joints=["slider", "hinge"]), SettingError, "actuators: .*'pull'"),
-        (lambda: mujoco_system(cart, ["push"], joints=["slider"]), SettingError, "must name all 2 joints"),
-        (lambda: mujoco_system(cart, ["push"]), SettingError, "name either the joints or the sensors"),
-        (lambda: mujoco_system(tmp_path / "no.xml", ["push"], joints=["a"]), DataError, "no.xml: is no MJCF model"),
+        (
+            lambda: mujoco_system(cart, ["pull"], joints=["slider", "hinge"]),
+            SettingError,
+            "actuators: .*'pull'",
+        ),
+        (
+            lambda: mujoco_system(cart, ["push"], joints=["slider"]),
+            SettingError,
+            "must name all 2 joints",
+        ),
+        (
+            lambda: mujoco_system(cart, ["push"]),
+            SettingError,
+            "name either the joints or the sensors",
+        ),
+        (
+            lambda: mujoco_system(tmp_path / "no.xml", ["push"], joints=["a"]),
+            DataError,
+            "no.xml: is no MJCF model",
+        ),
     ):
         with pytest.raises(error, match=message):
             misuse()
     monkeypatch.setitem(sys.modules, "mujoco", None)
-    with pytest.raises(SettingError, match=r"needs mujoco, which is not installed: pip install 'gpmpc\[sim\]'"):
+    with pytest.raises(
+        SettingError,
+        match=r"needs mujoco, which is not installed: pip install 'gpmpc\[sim\]'",
+    ):
         mujoco_system(cart, ["push"], joints=["slider", "hinge"])

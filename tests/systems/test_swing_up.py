@@ -21,7 +21,10 @@ def flown_up(name, *words):
     with one_thread():
         flown = run_trial(chosen)
     system, last = chosen.system, round(1 / chosen.system.time_step)
-    errors = flown.rollout.states[-last:, system.angle_indices] - np.array(system.goal)[system.angle_indices]
+    errors = (
+        flown.rollout.states[-last:, system.angle_indices]
+        - np.array(system.goal)[system.angle_indices]
+    )
     return chosen, flown, np.abs((errors + np.pi) % (2 * np.pi) - np.pi).max()
 
 
@@ -32,9 +35,14 @@ def test_a_pendulum_swings_up_whichever_turn_it_starts_in():
     assert found["error_at_end"] < 0.05 < 0.5 < found["rmse"]["total"]
     model, cost = flown.training.posterior, flown.controller.problem.cost
     assert (model.angles, cost.angles) == ([0], (0,))
-    x, u = torch.tensor([[0.5, 1.0]], dtype=torch.float64), torch.tensor([[0.3]], dtype=torch.float64)
+    x, u = (
+        torch.tensor([[0.5, 1.0]], dtype=torch.float64),
+        torch.tensor([[0.3]], dtype=torch.float64),
+    )
     turn = torch.tensor([[2 * np.pi, 0.0]], dtype=torch.float64)
-    assert torch.allclose(model.predict(x + turn, u).mean - turn, model.predict(x, u).mean, atol=1e-9)
+    assert torch.allclose(
+        model.predict(x + turn, u).mean - turn, model.predict(x, u).mean, atol=1e-9
+    )
 
 
 def test_a_cart_pole_swings_up_and_is_where_it_started():
@@ -50,7 +58,9 @@ def test_an_acrobot_swings_up_by_its_elbow_alone():
 
 
 def test_the_papers_protocol_sees_angles_as_they_are_and_a_users_own_may_be_named():
-    chosen = experiment("system=pendulum", "model=exact_gp", "model.restarts=0", "data.samples=12")
+    chosen = experiment(
+        "system=pendulum", "model=exact_gp", "model.restarts=0", "data.samples=12"
+    )
     training = chosen.learn(chosen.training_rows(), 0)
     assert training.posterior.features.shape == (12, 3)
     chosen = experiment("system=cart_pole", "controller.problem.cost.angles=[]")
@@ -61,9 +71,16 @@ def test_a_nominal_model_leaves_less_to_learn():
     fresh = experiment("system=pendulum", "data.seed=7").training_rows()
 
     def error(*words):
-        chosen = experiment("system=pendulum", "model.restarts=0", "data.samples=20", *words)
+        chosen = experiment(
+            "system=pendulum", "model.restarts=0", "data.samples=20", *words
+        )
         model = chosen.learn(chosen.training_rows(), 0).posterior
-        return float((model.predict(fresh.states, fresh.inputs).mean - fresh.next_states).pow(2).mean().sqrt())
+        return float(
+            (model.predict(fresh.states, fresh.inputs).mean - fresh.next_states)
+            .pow(2)
+            .mean()
+            .sqrt()
+        )
 
     assert error("nominal={mass: 0.8}") < 0.3 * error()
     assert error("nominal={}") == error()

@@ -52,36 +52,54 @@ class Spring:
 
 
 LIMITED = System(Spring(), 0.1, input_lower=[-1], input_upper=[1])
-ENDLESS = Spring(lambda x, u: [x[1], 1e308 * (u[0] + 100 * abs(u[0]))])  # at rest it stays
+ENDLESS = Spring(
+    lambda x, u: [x[1], 1e308 * (u[0] + 100 * abs(u[0]))]
+)  # at rest it stays
 
 
 @pytest.mark.parametrize("system", ALL, ids=lambda system: system.name)
 def test_one_formula_takes_floats_arrays_and_symbols(system, rng):
     n, m = len(system.state_names), len(system.input_names)
     start = np.array(system.goal if system.start is None else system.start)
-    states, inputs = start + 0.01 * rng.normal(size=(5, n)), np.array(system.initial_input) + 0.01 * rng.normal(size=m)
+    states, inputs = (
+        start + 0.01 * rng.normal(size=(5, n)),
+        np.array(system.initial_input) + 0.01 * rng.normal(size=m),
+    )
     x, u = casadi.SX.sym("x", n), casadi.SX.sym("u", m)
     symbolic = casadi.Function("f", [x, u], [casadi.vertcat(*system.successor(x, u))])
     many = step_many(system, states, np.tile(inputs, (5, 1)))
     for state, after in zip(states, many, strict=True):
         assert np.allclose(step(system, state, inputs), after, rtol=1e-13, atol=1e-15)
-        assert np.allclose(np.array(symbolic(state, inputs)).ravel(), after, rtol=1e-12, atol=1e-14)
+        assert np.allclose(
+            np.array(symbolic(state, inputs)).ravel(), after, rtol=1e-12, atol=1e-14
+        )
 
 
 def energy(system, x):
     d = system.dynamics
     if system.name == "pendulum":
-        return d.mass * d.length**2 / 6 * x[1] ** 2 + d.mass * GRAVITY * d.length / 2 * np.cos(x[0])
+        return d.mass * d.length**2 / 6 * x[
+            1
+        ] ** 2 + d.mass * GRAVITY * d.length / 2 * np.cos(x[0])
     if system.name == "cart_pole":
-        across, up = x[1] + d.half_length * x[3] * np.cos(x[2]), d.half_length * x[3] * np.sin(x[2])
+        across, up = (
+            x[1] + d.half_length * x[3] * np.cos(x[2]),
+            d.half_length * x[3] * np.sin(x[2]),
+        )
         turning = d.pole_mass * (2 * d.half_length) ** 2 / 24 * x[3] ** 2
         moving = d.cart_mass * x[1] ** 2 / 2 + d.pole_mass * (across**2 + up**2) / 2
         return moving + turning + d.pole_mass * GRAVITY * d.half_length * np.cos(x[2])
     (m1, m2), (c1, c2), (i1, i2), l1 = d.masses, d.centres, d.inertias, d.first_length
     a, da, b, db = x
-    squared = (l1 * da) ** 2 + (c2 * (da + db)) ** 2 + 2 * l1 * c2 * da * (da + db) * np.cos(b)
+    squared = (
+        (l1 * da) ** 2
+        + (c2 * (da + db)) ** 2
+        + 2 * l1 * c2 * da * (da + db) * np.cos(b)
+    )
     moving = (m1 * c1**2 + i1) * da**2 / 2 + m2 * squared / 2 + i2 * (da + db) ** 2 / 2
-    return moving + GRAVITY * (m1 * c1 * np.cos(a) + m2 * (l1 * np.cos(a) + c2 * np.cos(a + b)))
+    return moving + GRAVITY * (
+        m1 * c1 * np.cos(a) + m2 * (l1 * np.cos(a) + c2 * np.cos(a + b))
+    )
 
 
 @pytest.mark.parametrize(
@@ -102,12 +120,20 @@ def test_without_input_and_friction_energy_is_conserved(system, start):
 
 
 @pytest.mark.parametrize(("actuated", "joint"), [("shoulder", 1), ("elbow", 3)])
-def test_a_motor_of_the_double_pendulum_adds_torque_times_rate_of_its_joint_to_the_energy(actuated, joint):
-    system, state, torque = double_pendulum(actuated), np.array([2.0, 1.0, 0.5, -1.0]), np.array([1.5])
+def test_a_motor_of_the_double_pendulum_adds_torque_times_rate_of_its_joint_to_the_energy(
+    actuated, joint
+):
+    system, state, torque = (
+        double_pendulum(actuated),
+        np.array([2.0, 1.0, 0.5, -1.0]),
+        np.array([1.5]),
+    )
     system = replace(system, time_step=1e-4)
     after = step(system, state, torque)
     work = torque[0] * (state[joint] + after[joint]) / 2 * 1e-4
-    assert energy(system, after) - energy(system, state) == pytest.approx(work, rel=1e-5)
+    assert energy(system, after) - energy(system, state) == pytest.approx(
+        work, rel=1e-5
+    )
 
 
 def test_the_reactors_operating_point_is_an_unstable_equilibrium():
@@ -124,63 +150,134 @@ def test_a_trajectory_prescribes_the_tracked_states_and_their_rates():
     states = double_integrator(time_step=0.1).reference_states(moving, 11)
     assert np.array_equal(states[:, 0], moving(np.linspace(0, 1, 11))[:, 0])
     assert np.array_equal(states[:, 1], moving.velocity(np.linspace(0, 1, 11))[:, 0])
-    assert np.array_equal(stirred_tank().reference_states(None, 3), np.tile([0.5, 350.0], (3, 1)))
-    assert np.array_equal(stirred_tank().reference_states(Step([350.0], [351.0], 3.0), 2), [[0.5, 350], [0.5, 351]])
+    assert np.array_equal(
+        stirred_tank().reference_states(None, 3), np.tile([0.5, 350.0], (3, 1))
+    )
+    assert np.array_equal(
+        stirred_tank().reference_states(Step([350.0], [351.0], 3.0), 2),
+        [[0.5, 350], [0.5, 351]],
+    )
 
 
 @pytest.mark.parametrize(
     ("settings", "error", "message"),
     [
-        ({"dynamics": Spring(lambda x, u: [x[1]])}, ShapeError, "derivative must give 2 entries, one for each of"),
-        ({"dynamics": Spring(lambda x, u: 3.0)}, ShapeError, "derivative must give 2 entries.*got float"),
-        ({"dynamics": Spring(lambda x, u: [x[1], np.nan])}, SettingError, "must be finite at state .*is nan after it"),
-        ({"dynamics": Spring(lambda x, u: [x[1], x[7]])}, SettingError, "must step from state .*got IndexError"),
-        ({"dynamics": object()}, SettingError, "dynamics.state_names: must be a list of different names; got None"),
-        ({"units": {"torque": "N m"}}, SettingError, "units: must be of position, speed, force; got torque"),
-        ({"tracked": ["velocity"]}, SettingError, "tracked: must name states, position, speed; got 'velocity'"),
-        ({"tracked": ["position", "speed"]}, SettingError, "tracked: must be states of one unit; got m, m/s"),
-        ({"rates": {"position": "speed"}}, SettingError, "rates: must be of tracked states, position; got 'speed'"),
+        (
+            {"dynamics": Spring(lambda x, u: [x[1]])},
+            ShapeError,
+            "derivative must give 2 entries, one for each of",
+        ),
+        (
+            {"dynamics": Spring(lambda x, u: 3.0)},
+            ShapeError,
+            "derivative must give 2 entries.*got float",
+        ),
+        (
+            {"dynamics": Spring(lambda x, u: [x[1], np.nan])},
+            SettingError,
+            "must be finite at state .*is nan after it",
+        ),
+        (
+            {"dynamics": Spring(lambda x, u: [x[1], x[7]])},
+            SettingError,
+            "must step from state .*got IndexError",
+        ),
+        (
+            {"dynamics": object()},
+            SettingError,
+            "dynamics.state_names: must be a list of different names; got None",
+        ),
+        (
+            {"units": {"torque": "N m"}},
+            SettingError,
+            "units: must be of position, speed, force; got torque",
+        ),
+        (
+            {"tracked": ["velocity"]},
+            SettingError,
+            "tracked: must name states, position, speed; got 'velocity'",
+        ),
+        (
+            {"tracked": ["position", "speed"]},
+            SettingError,
+            "tracked: must be states of one unit; got m, m/s",
+        ),
+        (
+            {"rates": {"position": "speed"}},
+            SettingError,
+            "rates: must be of tracked states, position; got 'speed'",
+        ),
         ({"angles": ["position "]}, SettingError, "angles: must name states"),
         ({"input_lower": [1.0], "input_upper": [-1.0]}, SettingError, "must not cross"),
-        ({"input_lower": [0.0, 0.0]}, SettingError, "input_lower: must be a list of 1 numbers"),
+        (
+            {"input_lower": [0.0, 0.0]},
+            SettingError,
+            "input_lower: must be a list of 1 numbers",
+        ),
         ({"start": [0.0]}, SettingError, "start: must be a list of 2 numbers; got"),
-        ({"region": [[0.0, 0.0]]}, SettingError, "region: must be the smallest and the largest states"),
-        ({"nominal": pendulum()}, SettingError, "nominal: must have the states, inputs and time step .*position"),
+        (
+            {"region": [[0.0, 0.0]]},
+            SettingError,
+            "region: must be the smallest and the largest states",
+        ),
+        (
+            {"nominal": pendulum()},
+            SettingError,
+            "nominal: must have the states, inputs and time step .*position",
+        ),
         ({"lost": 0.0}, SettingError, "lost: must be a number above 0"),
     ],
 )
 def test_misuse_is_refused_where_the_system_is_made(settings, error, message):
-    given = {"dynamics": Spring(), "time_step": 0.1, "units": {"position": "m", "speed": "m/s"}}
+    given = {
+        "dynamics": Spring(),
+        "time_step": 0.1,
+        "units": {"position": "m", "speed": "m/s"},
+    }
     with pytest.raises(error, match=message):
         System(**(given | settings))
 
 
 def test_a_trajectory_of_another_number_of_positions_is_refused():
-    with pytest.raises(ShapeError, match="trajectory: must prescribe angle of pendulum; got positions of 3 numbers"):
+    with pytest.raises(
+        ShapeError,
+        match="trajectory: must prescribe angle of pendulum; got positions of 3 numbers",
+    ):
         pendulum().reference_states(Hover([0, 0, 0]), 3)
 
 
 def test_random_data_are_the_systems_own_within_its_limits():
     system = cart_pole()
     data = RandomData(samples=53, episode=7, hold=2, seed=3).transitions(system)
-    states, inputs, after = (part.numpy() for part in (data.states, data.inputs, data.next_states))
+    states, inputs, after = (
+        part.numpy() for part in (data.states, data.inputs, data.next_states)
+    )
     assert len(data) == 53
     assert np.abs(step_many(system, states, inputs) - after).max() < 1e-12
     assert (np.abs(inputs) <= 10).all()
     assert np.abs(inputs).max() > 9
-    inside = (np.array(system.region[0]) <= states[::7]) & (states[::7] <= system.region[1])
+    inside = (np.array(system.region[0]) <= states[::7]) & (
+        states[::7] <= system.region[1]
+    )
     assert inside.all()
     assert np.array_equal(states[1:7], after[:6])
     assert np.array_equal(inputs[0], inputs[1])
-    again, other = (RandomData(samples=53, episode=7, hold=2, seed=seed).transitions(system) for seed in (3, 4))
+    again, other = (
+        RandomData(samples=53, episode=7, hold=2, seed=seed).transitions(system)
+        for seed in (3, 4)
+    )
     assert np.array_equal(again.states, data.states)
     assert not np.array_equal(other.states, data.states)
 
 
 def test_noise_and_starts_of_random_data_are_as_asked_for():
     system = pendulum()
-    data = RandomData(samples=400, starts="start", episode=2, noise=[0.01, 0.1]).transitions(system)
-    left = data.next_states.numpy() - step_many(system, data.states.numpy(), data.inputs.numpy())
+    data = RandomData(
+        samples=400, starts="start", episode=2, noise=[0.01, 0.1]
+    ).transitions(system)
+    left = data.next_states.numpy() - step_many(
+        system, data.states.numpy(), data.inputs.numpy()
+    )
     assert left.std(axis=0) == pytest.approx([0.01, 0.1], rel=0.15)
     assert (data.states.numpy()[::2] == system.start).all()
 
@@ -188,15 +285,30 @@ def test_noise_and_starts_of_random_data_are_as_asked_for():
 @pytest.mark.parametrize(
     ("system", "settings", "error", "message"),
     [
-        (System(Spring(), 0.1), {}, SettingError, "random inputs need limits; force of Spring has none"),
+        (
+            System(Spring(), 0.1),
+            {},
+            SettingError,
+            "random inputs need limits; force of Spring has none",
+        ),
         (
             System(Spring(), 0.1, input_lower=[-1], input_upper=[1]),
             {},
             SettingError,
             "data.starts: Spring has no region",
         ),
-        (pendulum(), {"noise": [0.1]}, ShapeError, "data.noise must have 2 deviations; got 1"),
-        (replace(LIMITED, dynamics=ENDLESS), {"starts": "start", "episode": 100}, DataError, "only . of 200 random"),
+        (
+            pendulum(),
+            {"noise": [0.1]},
+            ShapeError,
+            "data.noise must have 2 deviations; got 1",
+        ),
+        (
+            replace(LIMITED, dynamics=ENDLESS),
+            {"starts": "start", "episode": 100},
+            DataError,
+            "only . of 200 random",
+        ),
     ],
 )
 def test_random_data_that_there_cannot_be_are_refused(system, settings, error, message):

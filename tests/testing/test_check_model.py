@@ -16,19 +16,33 @@ def posterior(n=2, m=1, predicts="next_state"):
     features = 3 * torch.rand(20, n + m) - 1.5
     targets = features[:, :n].sin() + features[:, -1:]
     return GPPosterior.from_hyperparameters(
-        features, targets, 0.7 + torch.rand(n, n + m), 1 + torch.rand(n), torch.full((n,), 1e-3), m, predicts
+        features,
+        targets,
+        0.7 + torch.rand(n, n + m),
+        1 + torch.rand(n),
+        torch.full((n,), 1e-3),
+        m,
+        predicts,
     )
 
 
 def residual(affine=True):
-    nominal = Affine(torch.tensor([[1.0, 0.1], [0.0, 0.9]]), torch.tensor([[0.0, 0.1], [0.2, 0.0]]), torch.ones(2))
+    nominal = Affine(
+        torch.tensor([[1.0, 0.1], [0.0, 0.9]]),
+        torch.tensor([[0.0, 0.1], [0.2, 0.0]]),
+        torch.ones(2),
+    )
     gp = posterior(n=1, m=1, predicts="value")
     # Of nonlinear code: torch follows it.
-    return ResidualModel(nominal if affine else pendulum, gp, torch.tensor([[0.5], [1.0]]), [1], [0], 2)
+    return ResidualModel(
+        nominal if affine else pendulum, gp, torch.tensor([[0.5], [1.0]]), [1], [0], 2
+    )
 
 
 def pendulum(x, u):
-    return torch.stack([x[..., 0] + 0.1 * x[..., 1], x[..., 1] - x[..., 0].sin() + u.sum(-1)], dim=-1)
+    return torch.stack(
+        [x[..., 0] + 0.1 * x[..., 1], x[..., 1] - x[..., 0].sin() + u.sum(-1)], dim=-1
+    )
 
 
 @pytest.mark.parametrize(
@@ -43,14 +57,25 @@ def pendulum(x, u):
         lambda: residual(affine=False),
         lambda: residual().to(dtype=torch.float32),
     ],
-    ids=["next_state", "difference", "autonomous", "value", "float32", "residual", "nonlinear residual", "residual32"],
+    ids=[
+        "next_state",
+        "difference",
+        "autonomous",
+        "value",
+        "float32",
+        "residual",
+        "nonlinear residual",
+        "residual32",
+    ],
 )
 def test_the_packages_own_models_pass(make):
     check_model(make())
 
 
 def test_queries_of_the_users_scale_are_taken():
-    check_model(posterior(), states=100 + 1e-3 * torch.randn(3, 2), inputs=torch.zeros(3, 1))
+    check_model(
+        posterior(), states=100 + 1e-3 * torch.randn(3, 2), inputs=torch.zeros(3, 1)
+    )
 
 
 @dataclass
@@ -65,7 +90,9 @@ class Honest:
     noise_covariance = torch.diag(torch.tensor([0.1, 0.2], dtype=torch.float64))
 
     def predict(self, state, input=None):
-        root = torch.stack([torch.stack([0.1 + state[..., 0] ** 2, 0 * state[..., 0]], -1), state], -2)
+        root = torch.stack(
+            [torch.stack([0.1 + state[..., 0] ** 2, 0 * state[..., 0]], -1), state], -2
+        )
         return Gaussian(pendulum(state, input), root @ root.mT)
 
     def linearize(self, states, inputs, covariance=True):
@@ -79,13 +106,19 @@ def test_an_outsiders_honest_model_passes():
 class ForgetsItsBatch(Honest):
     def predict(self, state, input=None):
         at = super().predict(state, input)
-        return Gaussian(at.mean, at.covariance.reshape(-1, 2, 2)[0].expand(at.covariance.shape))
+        return Gaussian(
+            at.mean, at.covariance.reshape(-1, 2, 2)[0].expand(at.covariance.shape)
+        )
 
 
 class MovesTheMean(Honest):
     def predict(self, state, input=None):
         at = super().predict(state, input)
-        return Gaussian(at.mean - at.mean.mean(0), at.covariance) if state.dim() > 1 else at
+        return (
+            Gaussian(at.mean - at.mean.mean(0), at.covariance)
+            if state.dim() > 1
+            else at
+        )
 
 
 class WrongShape(Honest):
@@ -97,7 +130,9 @@ class WrongShape(Honest):
 class Lopsided(Honest):
     def predict(self, state, input=None):
         at = super().predict(state, input)
-        return Gaussian(at.mean, at.covariance + torch.tensor([[0.0, 1e-6], [0.0, 0.0]]))
+        return Gaussian(
+            at.mean, at.covariance + torch.tensor([[0.0, 1e-6], [0.0, 0.0]])
+        )
 
 
 class Indefinite(Honest):
@@ -139,7 +174,11 @@ class FortranOrder(Honest):
 class AnotherPrediction(Honest):
     def linearize(self, states, inputs, covariance=True):
         found = super().linearize(states, inputs)
-        return found._replace(covariance=found.covariance + self.noise_covariance.numpy() if covariance else None)
+        return found._replace(
+            covariance=found.covariance + self.noise_covariance.numpy()
+            if covariance
+            else None
+        )
 
 
 class AlwaysCovariance(Honest):
@@ -164,20 +203,47 @@ class NoDimension(Honest):
 @pytest.mark.parametrize(
     ("broken", "message"),
     [
-        (ForgetsItsBatch, "a batch is the loop over its members; the covariance is off by"),
+        (
+            ForgetsItsBatch,
+            "a batch is the loop over its members; the covariance is off by",
+        ),
         (MovesTheMean, "a batch is the loop over its members; the mean is off by"),
-        (WrongShape, r"mean \(\*batch, k\) and covariance .*; got \(\(4, 1\), \(4, 1, 1\)\), should be \(\(4, 2\), "),
-        (Lopsided, "the covariance is symmetric; an entry and its mirror image differ by 1.00e-06"),
-        (Indefinite, "the covariance is positive semidefinite; its lowest eigenvalue is -"),
+        (
+            WrongShape,
+            r"mean \(\*batch, k\) and covariance .*; got \(\(4, 1\), \(4, 1, 1\)\), should be \(\(4, 2\), ",
+        ),
+        (
+            Lopsided,
+            "the covariance is symmetric; an entry and its mirror image differ by 1.00e-06",
+        ),
+        (
+            Indefinite,
+            "the covariance is positive semidefinite; its lowest eigenvalue is -",
+        ),
         (Scribbles, "the caller's state and input are left as they are"),
         (Dices, "the same arguments give the same result"),
-        (WrongSlope, "linearize: A agrees with finite differences of predict; it is off by 1.00e-03"),
-        (TransposedSlope, r"B is a C-contiguous float64 array of shape \(4, 2, 1\); got float64 \(4, 1, 2\)"),
+        (
+            WrongSlope,
+            "linearize: A agrees with finite differences of predict; it is off by 1.00e-03",
+        ),
+        (
+            TransposedSlope,
+            r"B is a C-contiguous float64 array of shape \(4, 2, 1\); got float64 \(4, 1, 2\)",
+        ),
         (FortranOrder, "A is a C-contiguous float64 array"),
-        (AnotherPrediction, "its mean and covariance are predict's; the covariance is off by"),
+        (
+            AnotherPrediction,
+            "its mean and covariance are predict's; the covariance is off by",
+        ),
         (AlwaysCovariance, "no covariance where it is not wanted"),
-        (FallsToSinglePrecision, "type and device are the model's, torch.float64 on cpu; got torch.float32"),
-        (NoiseOfAnotherShape, r"noise_covariance is a torch.float64 tensor of shape \(2, 2\); got Tensor .* \(2,\)"),
+        (
+            FallsToSinglePrecision,
+            "type and device are the model's, torch.float64 on cpu; got torch.float32",
+        ),
+        (
+            NoiseOfAnotherShape,
+            r"noise_covariance is a torch.float64 tensor of shape \(2, 2\); got Tensor .* \(2,\)",
+        ),
         (NoDimension, "output_dim is a whole number, 1 or more; got None"),
     ],
 )
