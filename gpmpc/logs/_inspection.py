@@ -6,9 +6,10 @@ found block by block, so that clocks that wander are seen. An input of which the
 linearly, teaches nothing of its own.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -18,16 +19,10 @@ from gpmpc.logs._kinematics import Array
 from gpmpc.logs._log import Log
 from gpmpc.logs._mapping import TIME_UNITS, LogMapping
 from gpmpc.logs._readers import STAMP, read_streams
-from gpmpc.logs._reading import ordered_stamps, read_log
+from gpmpc.logs._reading import read_log
 
-TIMES = (
-    STAMP,
-    "t",
-    "time",
-    "stamp",
-    "Time",
-    "seconds",
-)  # columns that hold the time where nobody says which
+# columns that hold the time where nobody says which
+TIMES = (STAMP, "t", "time", "stamp", "Time", "seconds")
 DRAWN = 3000  # points of a channel's line
 BLOCKS, BLOCK, REACH = 16, 4096, 50  # rows in which delays are sought, and how far
 SHARP = 10  # rows within which a peak falls by a fifth
@@ -43,6 +38,9 @@ _DELAYS = [
     "correlation",
 ]
 FOLLOWS = 0.95  # share of an input's variance that the states explain
+GAP = 1.5  # time steps between two rows, from which on rows are missing
+JITTER = 0.1  # of the time step, from which on a rate should be stated
+NAMED = 3  # channels that are named where many have the same remark
 
 
 @dataclass(frozen=True)
@@ -50,174 +48,346 @@ class Inspection:
     """What is in a log file; shares lie between 0 and 1."""
 
     title: str  #: the file and its size in words
-    streams: (
-        pd.DataFrame
-    )  #: a row a stream; its jitter is the standard deviation over the time step
-    #: a row a channel, by name; "white noise" is the standard deviation of the one that second differences hold,
-    #: "repeated" the share of the rows with the value of the row before, "smoothness" the correlation of neighbouring
-    #: second differences
+    #: a row a stream; its jitter is the standard deviation over the time step
+    streams: pd.DataFrame
+    #: a row a channel, by name; "white noise" is the standard deviation of the one
+    #: that second differences hold, "repeated" the share of the rows with the value of
+    #: the row before, "smoothness" the correlation of neighbouring second differences
     channels: pd.DataFrame
-    #: a row a pair, the strongest first: by how many rows the later channel is late (median, with its range over the
-    #: blocks), which share of the blocks agrees to a row, and the correlation of the differences
+    #: a row a pair, the strongest first: by how many rows the later channel is late
+    #: (median, with its range over the blocks), which share of the blocks agrees to a
+    #: row, and the correlation of the differences
     delays: pd.DataFrame
-    follows: dict[
-        str, float
-    ]  #: share of the variance that the states explain, by input; only with a mapping
+    #: share of the variance that the states explain, by input; only with a mapping
+    follows: dict[str, float]
     lines: dict[str, tuple[Array, Array]]  #: time [s] and values to draw, by channel
     gaps: tuple[tuple[float, float], ...]  #: begin and end [s] of each, of all streams
     warnings: tuple[str, ...]  #: what to beware of, in words
 
 
+class _Remark(NamedTuple):
+    """What to beware of in one channel."""
+
+    subject: str  # the channel
+    text: str  # of this channel
+    kind: str  # of all channels that it is said of with other numbers
+
+
+class _Clock(NamedTuple):
+    """The rows of a stream in the order of their stamps, one row a stamp."""
+
+    rows: np.ndarray  # (K,) of the table
+    time: Array  # (K,) [s]
+    missing: int  # rows whose stamp is no finite number
+    repeated: int  # rows with the stamp of another row
+    backwards: int  # rows that stand behind a row with a later stamp
+
+
+@dataclass(frozen=True)
+class _Stream:
+    """What was found in one stream."""
+
+    summary: dict[str, Any]
+    channels: dict[str, dict[str, float]]
+    lines: dict[str, tuple[Array, Array]]
+    delays: list[tuple[Any, ...]]
+    gaps: list[tuple[float, float]]
+    warnings: list[str]
+    text_columns: list[str]
+
+
 def inspect_log(path: str | Path, mapping: LogMapping | None = None) -> Inspection:
-    """Inspects a log file.
+    """Inspects a log file, however broken its rows are.
 
     Args:
         path: In a format of ``read_log``.
-        mapping: Says which columns matter, which is the time, and what are states and inputs; all numbers by default.
+        mapping: Says which columns matter, which is the time, and what are states and
+            inputs; all numbers by default.
 
     Raises:
         DataError: The file cannot be read, or no column holds the time.
     """
-    streams = read_streams(
-        path, {signal.topic for signal in mapping.signals} if mapping else ()
+    topics = {signal.topic for signal in mapping.signals} if mapping else ()
+    streams = [
+        _inspect_stream(path, topic, table, mapping)
+        for topic, table in read_streams(path, topics).items()
+    ]
+    channels = {
+        name: numbers for stream in streams for name, numbers in stream.channels.items()
+    }
+    delays = [delay for stream in streams for delay in stream.delays]
+    delays = sorted(delays, key=lambda delay: -abs(delay[-1]))[:PAIRS]
+    follows: dict[str, float] = {}
+    reading: list[str] = []
+    if mapping is not None:
+        try:
+            log = read_log(path, mapping)
+        except DataError as error:
+            reading = [f"with this mapping the log cannot be learned from: {error}"]
+        else:
+            reading = [f"{finding.kind}: {finding.text}" for finding in log.findings]
+            follows = _dependence(log)
+    warnings = [
+        *(warning for stream in streams for warning in stream.warnings),
+        *_text_warning([name for stream in streams for name in stream.text_columns]),
+        *_channel_warnings(channels),
+        *_delay_warnings(delays),
+        *reading,
+        *_dependence_warnings(follows),
+    ]
+    rows = sum(stream.summary["rows"] for stream in streams)
+    if not channels:
+        warnings.append("no channel of numbers stands beside the time")
+    return Inspection(
+        title=f"{Path(path).name}: {rows} rows, {len(channels)} channels",
+        streams=pd.DataFrame([stream.summary for stream in streams]),
+        channels=_channel_table(channels),
+        delays=pd.DataFrame(delays, columns=_DELAYS),
+        follows=follows,
+        lines={name: line for stream in streams for name, line in stream.lines.items()},
+        gaps=tuple(gap for stream in streams for gap in stream.gaps),
+        warnings=tuple(dict.fromkeys(warnings)),
     )
-    tables: list[dict[str, Any]] = []
-    channels: dict[str, Any] = {}
-    lines: dict[str, Any] = {}
-    delays, gaps, warnings = [], [], []
-    for topic, table in streams.items():
-        time_name, time = _time(path, table, mapping)
-        stamps = ordered_stamps(time, f"{path}{f', {topic}' if topic else ''}")
-        steps = np.diff(stamps.time)
-        if not len(steps):
-            continue
-        step, where = float(np.median(steps)), f" of {topic}" if topic else ""
-        wide = np.flatnonzero(steps > 1.5 * step)
-        gaps += [(float(stamps.time[i]), float(stamps.time[i + 1])) for i in wide]
-        longest, jitter = (
-            float(steps[wide].max(initial=0)),
-            float(steps[steps <= 1.5 * step].std() / step),
-        )
-        counts = {
-            "repeated stamps": stamps.repeated,
-            "backward stamps": stamps.backwards,
-        }
-        row = {
-            "stream": topic,
-            "rows": len(table),
+
+
+def _inspect_stream(
+    path: str | Path, topic: str, table: pd.DataFrame, mapping: LogMapping | None
+) -> _Stream:
+    """Inspects the rows of one table."""
+    time_name = _time_column(path, table, mapping)
+    stamps = pd.to_numeric(table[time_name], errors="coerce").to_numpy(float)
+    if mapping is not None:
+        stamps = stamps * TIME_UNITS[mapping.time_unit]
+    clock = _read_clock(stamps)
+    of_topic = f" of {topic}" if topic else ""
+    warnings = _clock_warnings(clock, of_topic)
+    steps = np.diff(clock.time)
+    summary = {"stream": topic, "rows": len(table)}
+    gaps: list[tuple[float, float]] = []
+    if len(steps):
+        step = float(np.median(steps))
+        is_gap = steps > GAP * step
+        gaps = [
+            (float(clock.time[row]), float(clock.time[row + 1]))
+            for row in np.flatnonzero(is_gap)
+        ]
+        longest = float(steps[is_gap].max(initial=0))
+        jitter = float(steps[~is_gap].std() / step)
+        summary |= {
             "rate [Hz]": 1 / step,
             "jitter": jitter,
-            "gaps": len(wide),
+            "gaps": len(gaps),
+            "longest gap [s]": longest,
         }
-        tables.append(row | {"longest gap [s]": longest} | counts)
-        warnings += (
-            [f"{len(wide)} gaps{where}, up to {longest:.3g} s"] if len(wide) else []
-        )
-        warnings += [
-            f"{count} {what}{where}" for what, count in counts.items() if count
-        ]
-        warnings += (
-            [f"stamps{where} jitter by {jitter:.0%} of the time step: state a rate"]
-            if jitter > 0.1
-            else []
-        )
-        wanted = (
-            {c for s in mapping.signals if s.topic == topic for c in s.columns}
-            if mapping
-            else set(table)
-        )
-        names = [
-            c for c in table.select_dtypes("number") if c != time_name and c in wanted
-        ]
-        values = table[names].to_numpy(float)[stamps.rows]
-        titles = [f"{topic}.{name}" if topic else str(name) for name in names]
-        channels |= {
-            name: _channel(column)
-            for name, column in zip(titles, values.T, strict=True)
+        if gaps:
+            warnings.append(f"{len(gaps)} gaps{of_topic}, up to {longest:.3g} s")
+        if jitter > JITTER:
+            share = f"{jitter:.0%} of the time step"
+            warnings.append(f"stamps{of_topic} jitter by {share}: state a rate")
+        rows, time = clock.rows, clock.time
+    else:
+        summary |= {
+            "rate [Hz]": np.nan,
+            "jitter": np.nan,
+            "gaps": 0,
+            "longest gap [s]": 0.0,
         }
-        stride = max(len(values) // DRAWN, 1)
-        lines |= {
-            name: (stamps.time[::stride], v[::stride])
-            for name, v in zip(titles, values.T, strict=True)
-        }
-        delays += _delays(titles, values)
-    warnings += [
-        f"{name}: {remark}"
-        for name, numbers in channels.items()
-        if (remark := _remark(numbers))
-    ]
-    delays = sorted(delays, key=lambda delay: -abs(delay[-1]))[:PAIRS]
+        warnings.append(
+            f"the time{of_topic} holds a single stamp: values stand over their rows"
+        )
+        rows = np.arange(len(table))
+        time = rows.astype(float)
+    summary |= {
+        "missing stamps": clock.missing,
+        "repeated stamps": clock.repeated,
+        "backward stamps": clock.backwards,
+    }
+    columns = [name for name in table if name != time_name]
+    if mapping is not None:
+        signals = [signal for signal in mapping.signals if signal.topic == topic]
+        mapped = {column for signal in signals for column in signal.columns}
+        columns = [name for name in columns if name in mapped]
+    numeric = set(table.select_dtypes("number"))
+    titles = {
+        name: f"{topic}.{name}" if topic else str(name)
+        for name in columns
+        if name in numeric
+    }
+    values = table[list(titles)].to_numpy(float)[rows]
+    stride = max(len(values) // DRAWN, 1)
+    return _Stream(
+        summary=summary,
+        channels={
+            title: _channel(column)
+            for title, column in zip(titles.values(), values.T, strict=True)
+        },
+        lines={
+            title: (time[::stride], column[::stride])
+            for title, column in zip(titles.values(), values.T, strict=True)
+        },
+        delays=_delays(list(titles.values()), values),
+        gaps=gaps,
+        warnings=warnings,
+        text_columns=[
+            f"{topic}.{name}" if topic else str(name)
+            for name in columns
+            if name not in numeric
+        ],
+    )
+
+
+def _time_column(
+    path: str | Path, table: pd.DataFrame, mapping: LogMapping | None
+) -> str:
+    """Finds the column of the time; ``DataError`` where there is none."""
+    if mapping is not None and mapping.time:
+        candidates = [mapping.time]
+        expected = repr(mapping.time)
+    else:
+        candidates = list(TIMES)
+        expected = "of the time, such as " + ", ".join(TIMES)
+    for name in candidates:
+        if name in table:
+            return name
+    columns = ", ".join(map(str, table.columns[:12]))
+    raise DataError(f"{path}: no column {expected}; there are {columns}")
+
+
+def _read_clock(stamps: Array) -> _Clock:
+    """Sorts rows by their stamps (K,) [s], and counts what is wrong with these."""
+    finite = np.flatnonzero(np.isfinite(stamps))
+    in_file_order = stamps[finite]
+    latest = np.maximum.accumulate(in_file_order)
+    order = np.argsort(in_file_order, kind="stable")
+    sorted_stamps = in_file_order[order]
+    first_of_stamp = np.ones(len(finite), dtype=bool)
+    first_of_stamp[1:] = sorted_stamps[1:] > sorted_stamps[:-1]
+    return _Clock(
+        rows=finite[order][first_of_stamp],
+        time=sorted_stamps[first_of_stamp],
+        missing=len(stamps) - len(finite),
+        repeated=int((~first_of_stamp).sum()),
+        backwards=int((in_file_order < latest).sum()),
+    )
+
+
+def _clock_warnings(clock: _Clock, of_topic: str) -> list[str]:
+    counts = {
+        "missing stamps": clock.missing,
+        "repeated stamps": clock.repeated,
+        "backward stamps": clock.backwards,
+    }
+    return [f"{count} {kind}{of_topic}" for kind, count in counts.items() if count]
+
+
+def _channel(values: Array) -> dict[str, float]:
+    """The numbers of one channel (K,); NaN where no row tells."""
+    finite = values[np.isfinite(values)]
+    numbers = dict.fromkeys(
+        [
+            "lowest",
+            "highest",
+            "std",
+            "white noise",
+            "missing",
+            "repeated",
+            "longest [rows]",
+            "smoothness",
+        ],
+        np.nan,
+    )
+    numbers["missing"] = 1 - len(finite) / len(values) if len(values) else 1.0
+    if not len(finite):
+        return numbers
+    numbers["lowest"] = float(finite.min())
+    numbers["highest"] = float(finite.max())
+    repeats = np.diff(finite) == 0
+    changes = np.flatnonzero(np.concatenate([[True], ~repeats, [True]]))
+    numbers["repeated"] = float(repeats.mean()) if len(repeats) else 0.0
+    numbers["longest [rows]"] = int(np.diff(changes).max())
+    # Values of 1e200 have no square: what they spread by is computed in their units.
+    scale = max(float(np.abs(finite).max()), np.finfo(float).tiny)
+    scaled = finite / scale
+    numbers["std"] = float(scaled.std()) * scale
+    curvature = np.diff(scaled, 2)
+    if not len(curvature):
+        return numbers
+    # The median is deaf to manoeuvres; 1.4826 makes it the standard deviation of a
+    # normal distribution.
+    deviation = float(np.median(np.abs(curvature - np.median(curvature))))
+    numbers["white noise"] = 1.4826 * deviation / float(np.sqrt(6)) * scale
+    power = float(curvature @ curvature)
+    if power > 0:
+        numbers["smoothness"] = float(curvature[1:] @ curvature[:-1]) / power
+    return numbers
+
+
+def _channel_table(channels: Mapping[str, dict[str, float]]) -> pd.DataFrame:
+    """A row a channel, by name."""
+    table = pd.DataFrame.from_dict(dict(channels), orient="index")
+    return table.rename_axis("channel")
+
+
+def _channel_warnings(channels: Mapping[str, dict[str, float]]) -> list[str]:
+    """What to beware of in the channels, in words; one line where many share it."""
+    by_kind: dict[str, list[_Remark]] = {}
+    for name, numbers in channels.items():
+        for remark in _remarks(name, numbers):
+            by_kind.setdefault(remark.kind, []).append(remark)
+    return [line for remarks in by_kind.values() for line in _said_once(remarks)]
+
+
+def _remarks(name: str, channel: Mapping[str, float]) -> list[_Remark]:
+    """What to beware of in one channel."""
+    remarks = []
+    if channel["lowest"] == channel["highest"]:
+        remarks.append(_Remark(name, "never changes", "never changes"))
+    elif channel["repeated"] > 0.5:
+        rows = 1 / max(1 - channel["repeated"], 1e-9)
+        text = f"a new value every {rows:.1f} rows"
+        remarks.append(_Remark(name, text, "a new value every few rows only"))
+    elif channel["smoothness"] > 0.3:
+        text = "smoothed: its errors hang together over rows"
+        remarks.append(_Remark(name, text, text))
+    if channel["missing"] == 1:
+        remarks.append(_Remark(name, "holds no value", "holds no value"))
+    elif channel["missing"]:
+        text = f"{channel['missing']:.1%} of the values are missing"
+        remarks.append(_Remark(name, text, "values are missing"))
+    return remarks
+
+
+def _said_once(remarks: list[_Remark]) -> list[str]:
+    """Remarks of one kind: a line each, or one line for many."""
+    if len(remarks) <= NAMED:
+        return [f"{remark.subject}: {remark.text}" for remark in remarks]
+    named = ", ".join(remark.subject for remark in remarks[:NAMED])
+    return [f"{named} and {len(remarks) - NAMED} more channels: {remarks[0].kind}"]
+
+
+def _text_warning(names: list[str]) -> list[str]:
+    if not names:
+        return []
+    listed = ", ".join(names[:NAMED]) + ", ..." * (len(names) > NAMED)
+    return [f"{len(names)} columns hold no numbers: {listed}"]
+
+
+def _delay_warnings(delays: list[tuple[Any, ...]]) -> list[str]:
+    warnings = []
     for first, second, rows, low, high, agreement, _ in delays:
         if abs(rows) >= 1 or high - low > 2:
             agree = f"{low:g} to {high:g}; {agreement:.0%} of the blocks agree"
             warnings.append(f"{second} comes {rows:g} rows after {first} ({agree})")
-    follows = _dependence(read_log(path, mapping)) if mapping else {}
-    warnings += [
-        f"{name} follows the states ({share:.0%} of its variance): its own effect cannot be learned"
+    return warnings
+
+
+def _dependence_warnings(follows: Mapping[str, float]) -> list[str]:
+    return [
+        f"{name} follows the states ({share:.0%} of its variance): its own effect "
+        "cannot be learned"
         for name, share in follows.items()
         if share > FOLLOWS
     ]
-    size = f"{Path(path).name}: {sum(row['rows'] for row in tables)} rows, {len(channels)} channels"
-    table = pd.DataFrame.from_dict(channels, orient="index").rename_axis("channel")
-    frames = pd.DataFrame(tables), table, pd.DataFrame(delays, columns=_DELAYS)
-    return Inspection(size, *frames, follows, lines, tuple(gaps), tuple(warnings))
-
-
-def _time(
-    path: str | Path, table: pd.DataFrame, mapping: LogMapping | None
-) -> tuple[str, Array]:
-    names = (
-        [mapping.time]
-        if mapping and mapping.time
-        else [name for name in TIMES if name in table]
-    )
-    if not names or names[0] not in table:
-        wanted = repr(names[0]) if names else "of the time, such as " + ", ".join(TIMES)
-        raise DataError(
-            f"{path}: no column {wanted}; there are {', '.join(map(str, table.columns[:12]))}"
-        )
-    return names[0], table[names[0]].to_numpy(float) * (
-        TIME_UNITS[mapping.time_unit] if mapping else 1.0
-    )
-
-
-def _channel(values: Array) -> dict[str, float]:
-    known = values[np.isfinite(values)]
-    low, high, std = (
-        float(f(known)) if len(known) else np.nan for f in (np.min, np.max, np.std)
-    )
-    same, second = np.diff(known) == 0, np.diff(known, 2)
-    # The median is deaf to manoeuvres; 1.4826 makes it the standard deviation of a normal distribution.
-    noise = (
-        1.4826 * float(np.median(np.abs(second - np.median(second)))) / np.sqrt(6)
-        if len(second)
-        else 0.0
-    )
-    power = float(second @ second)
-    return {
-        "lowest": low,
-        "highest": high,
-        "std": std,
-        "white noise": noise,
-        "missing": 1 - len(known) / len(values),
-        "repeated": float(same.mean()) if len(same) else 0.0,
-        "longest [rows]": int(np.diff(np.flatnonzero(np.r_[True, ~same, True])).max()),
-        "smoothness": float(second[1:] @ second[:-1]) / power if power > 0 else 0.0,
-    }
-
-
-def _remark(channel: dict[str, float]) -> str:
-    """What to beware of, in words."""
-    remarks = [f"{channel['missing']:.1%} missing"] if channel["missing"] else []
-    if channel["std"] == 0:
-        remarks.insert(0, "never changes")
-    elif channel["repeated"] > 0.5:
-        remarks.insert(
-            0, f"a new value every {1 / max(1 - channel['repeated'], 1e-9):.1f} rows"
-        )
-    elif channel["smoothness"] > 0.3:
-        remarks.insert(0, "smoothed: its errors hang together over rows")
-    return ", ".join(remarks)
 
 
 def _delays(names: list[str], values: Array) -> list[tuple[Any, ...]]:
@@ -225,6 +395,10 @@ def _delays(names: list[str], values: Array) -> list[tuple[Any, ...]]:
     length = min(BLOCK, len(values) // 8)
     if length < 4 * REACH:
         return []
+    finite = np.isfinite(values)
+    largest = np.abs(np.where(finite, values, 0.0)).max(axis=0)
+    # Correlations have no unit; of values such as 1e200 the squares would overflow.
+    values = np.where(finite, values, np.nan) / np.where(largest > 0, largest, 1.0)
     starts = np.unique(np.linspace(0, len(values) - length, BLOCKS).astype(int))
     steps = np.nan_to_num(
         np.diff([values[a : a + length] for a in starts], axis=1)

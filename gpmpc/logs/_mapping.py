@@ -13,23 +13,10 @@ import yaml
 
 from gpmpc.exceptions import SettingError, check_choice, check_number
 from gpmpc.logs._kinematics import Array, StateGroup, StateSpace
+from gpmpc.logs._units import Conversion, conversion
 
 Role = Literal["states", "inputs", "context"]
 ROLES: tuple[Role, ...] = ("states", "inputs", "context")
-DEGREE = float(np.pi / 180)
-UNITS = {  # what one of it is in the units that states come out in
-    "deg": ("rad", DEGREE),
-    "deg/s": ("rad/s", DEGREE),
-    "rpm": ("rad/s", float(np.pi / 30)),
-    "mm": ("m", 1e-3),
-    "cm": ("m", 1e-2),
-    "km": ("m", 1e3),
-    "mm/s": ("m/s", 1e-3),
-    "cm/s": ("m/s", 1e-2),
-    "km/h": ("m/s", 1 / 3.6),
-    "g": ("m/s2", 9.80665),
-    "mV": ("V", 1e-3),
-}
 TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 _PLAIN = (
     "run",
@@ -89,6 +76,11 @@ class Signal:
         check_number(f"{key}.scale", self.scale)
         if self.kind in ("angle", "euler"):
             check_choice(f"{key}.unit", self.unit, ("rad", "deg"))
+        conversion(f"{key}.unit", self.unit)
+
+    @property
+    def _conversion(self) -> Conversion:
+        return conversion(f"{self.role}.{self.name}.unit", self.unit)
 
     @property
     def turns(self) -> bool:
@@ -105,7 +97,7 @@ class Signal:
     @property
     def factor(self) -> float:
         """Of its values in the file, to the units that they come out in."""
-        return self.scale * UNITS.get(self.unit, ("", 1.0))[1]
+        return self.scale * self._conversion.factor
 
     @property
     def group(self) -> StateGroup:
@@ -117,9 +109,11 @@ class Signal:
                 "",
                 "quaternion",
             )
-        unit = UNITS.get(self.unit, (self.unit, 1.0))[0]
         return StateGroup(
-            self.name, self.columns, unit, "angle" if self.kind == "angle" else "vector"
+            name=self.name,
+            entries=self.columns,
+            unit=self._conversion.unit,
+            kind="angle" if self.kind == "angle" else "vector",
         )
 
 

@@ -166,6 +166,12 @@ def judgement_figure(judgement: "Judgement") -> Figure:
 def inspection_figure(inspection: "Inspection") -> Figure:
     """Draws each channel over the time, with its gaps, on one page."""
     channels = [*inspection.lines.items()][:_PER_PAGE]
+    if not channels:
+        figure, axes = make_figure(10, 2, 1, 1)
+        axes[0, 0].set_axis_off()
+        axes[0, 0].text(0.5, 0.5, "no channel of numbers", ha="center", va="center")
+        figure.suptitle(inspection.title, fontsize=10)
+        return figure
     columns = 2 if len(channels) > 6 else 1
     rows = -(-len(channels) // columns)
     figure, axes = make_figure(10, 1.1 * rows + 1, rows, columns, sharex=True)

@@ -41,17 +41,13 @@ def test_what_was_put_in_is_found(table, tmp_path):
     table.loc[7000, "t"] = table.loc[6999, "t"]
     table.to_csv(tmp_path / "log.csv", index=False)
     found = inspect_log(tmp_path / "log.csv")
-    ((_, rows, rate, jitter, gaps, longest, repeated, backwards),) = (
-        found.streams.to_numpy(object)
-    )
-    assert (rows, gaps, repeated, backwards) == (
-        11_925,
-        2,
-        1,
-        0,
-    )  # a row that is left out leaves a gap
-    assert (rate, longest) == (pytest.approx(250), pytest.approx(0.304))
-    assert jitter < 0.1
+    stream = found.streams.iloc[0]
+    # A row that is left out leaves a gap.
+    assert (stream["rows"], stream["gaps"]) == (11_925, 2)
+    assert (stream["repeated stamps"], stream["backward stamps"]) == (1, 0)
+    assert stream["rate [Hz]"] == pytest.approx(250)
+    assert stream["longest gap [s]"] == pytest.approx(0.304)
+    assert stream["jitter"] < 0.1
     noisy = found.channels.loc["noisy"]
     assert noisy["white noise"] == pytest.approx(0.5, rel=0.05)
     assert noisy["smoothness"] == pytest.approx(-2 / 3, abs=0.03)
@@ -86,6 +82,74 @@ def test_the_command_writes_a_page(table, tmp_path):
     assert "Delays between correlated channels" in page
     missing = forked("log", "inspect", "no.csv", cwd=tmp_path)
     assert (missing.returncode, missing.stderr) == (2, "gpmpc: no.csv: no such file\n")
+
+
+BROKEN = {
+    "constant stamps": (lambda t: t.assign(t=3.0), "holds a single stamp"),
+    "one row": (lambda t: t[:1], "holds a single stamp"),
+    "time alone": (lambda t: t[["t"]], "no channel of numbers"),
+    "text alone": (
+        lambda t: pandas.DataFrame({"t": t["t"], "mode": "hover", "note": "-"}),
+        "2 columns hold no numbers: mode, note",
+    ),
+    "no value at all": (lambda t: t.assign(a=np.nan), "a: holds no value"),
+    "infinite values": (
+        lambda t: t.assign(a=t["a"].where(t.index % 3 > 0, np.inf)),
+        "a: 33.3% of the values are missing",
+    ),
+    "values without a square": (lambda t: t.assign(a=1e200 * t["a"]), "smoothed"),
+    "stamps without order": (
+        lambda t: t.sample(frac=1, random_state=0),
+        "backward stamps",
+    ),
+    "half of the stamps missing": (
+        lambda t: t.assign(t=t["t"].where(t.index % 2 > 0)),
+        "missing stamps",
+    ),
+    "text for stamps": (lambda t: t.assign(t="noon"), "missing stamps"),
+    "a stamp of another age": (
+        lambda t: t.assign(t=t["t"].where(t.index < t.index[-1], 2147483647.0)),
+        "1 gaps, up to 2.15e+09 s",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", BROKEN)
+def test_a_broken_log_is_inspected_all_the_same(table, tmp_path, name):
+    spoil, remark = BROKEN[name]
+    spoil(table[:3000]).to_csv(tmp_path / "log.csv", index=False)
+    found = inspect_log(tmp_path / "log.csv")
+    assert any(remark in warning for warning in found.warnings), found.warnings
+    assert len(png(inspection_figure(found), dpi=30)) > 500
+
+
+def test_a_broken_log_becomes_a_page_too(tmp_path):
+    (tmp_path / "log.csv").write_text("t\n0.0\n0.1\n")
+    result = forked("log", "inspect", "log.csv", cwd=tmp_path)
+    assert (result.returncode, result.stderr) == (0, "")
+    assert "no channel of numbers" in (tmp_path / "log.inspection.html").read_text()
+
+
+def test_what_holds_for_hundreds_of_channels_is_one_line(tmp_path):
+    still = {f"esc[{i}]": 1.0 for i in range(300)}
+    slow = {f"slow[{i}]": np.arange(100) // 10 * 1.5 for i in range(5)}
+    table = pandas.DataFrame({"t": 0.01 * np.arange(100), **still, **slow, "x": 0.0})
+    table.to_csv(tmp_path / "log.csv", index=False)
+    assert inspect_log(tmp_path / "log.csv").warnings == (
+        "esc[0], esc[1], esc[2] and 298 more channels: never changes",
+        "slow[0], slow[1], slow[2] and 2 more channels: a new value every few rows "
+        "only",
+    )
+
+
+def test_a_log_that_contradicts_its_mapping_is_inspected_all_the_same(table, tmp_path):
+    table.assign(u=0.0).to_csv(tmp_path / "log.csv", index=False)
+    mapping = LogMapping.from_dict(
+        {"time": "t", "states": {"x": ["a"]}, "inputs": {"u": ["u"]}}
+    )
+    found = inspect_log(tmp_path / "log.csv", mapping)
+    assert found.follows == {}
+    assert any("cannot be learned from: no input" in text for text in found.warnings)
 
 
 def test_learn_writes_a_model_a_report_and_a_card_and_names_mistakes(tmp_path):
