@@ -16,6 +16,12 @@ from scipy.ndimage import binary_dilation, maximum_filter1d, minimum_filter1d
 from scipy.spatial.transform import Rotation
 
 from gpmpc.exceptions import DataError
+from gpmpc.logs._dropouts import (
+    changes_rarely,
+    frozen_rows,
+    sentinels,
+    zero_dropouts,
+)
 from gpmpc.logs._kinematics import (
     Array,
     quaternion_inverse,
@@ -153,10 +159,10 @@ def _tabulate(
         stamps[topic] = found = ordered_stamps(
             _time(label, streams[topic], mapping), label
         )
-        tables[topic], of_topic = (
-            streams[topic].iloc[found.rows],
-            f" of {topic}" if topic else "",
-        )
+        of_topic = f" of {topic}" if topic else ""
+        signals = [signal for signal in mapping.signals if signal.topic == topic]
+        ordered = streams[topic].iloc[found.rows]
+        tables[topic] = _without_zero_dropouts(label, ordered, signals, note)
         note(
             "repeated stamp",
             found.repeated,
@@ -222,6 +228,29 @@ def _time(label: str, table: pd.DataFrame, mapping: LogMapping) -> Array:
     )
 
 
+def _without_zero_dropouts(
+    label: str, table: pd.DataFrame, signals: Sequence[Signal], note: _Note
+) -> pd.DataFrame:
+    """Empties the rows in which all states are zero, because no sensor was read."""
+    columns = [
+        column
+        for signal in signals
+        if signal.role == "states"
+        for column in signal.columns
+    ]
+    states = [_numbers(label, table, column) for column in columns]
+    if not states:
+        return table
+    dropouts = zero_dropouts(np.column_stack(states))
+    if not dropouts.any():
+        return table
+    count = dropouts.sum()
+    note("all zero", count, f"{count} rows with zeros for all states: left out")
+    emptied = table.astype(dict.fromkeys(columns, float))
+    emptied.loc[dropouts, columns] = np.nan
+    return emptied
+
+
 def _check_column(label: str, table: pd.DataFrame, column: str) -> None:
     if column not in table:
         known = ", ".join(map(str, table.columns[:12]))
@@ -245,10 +274,16 @@ def _numbers(label: str, table: pd.DataFrame, column: str) -> Array:
 
 def _values(label: str, table: pd.DataFrame, signal: Signal, note: _Note) -> Array:
     """A signal (K, c) in the units and conventions of ``gpmpc.logs``; NaN where it is missing."""
-    values = (
-        np.column_stack([_numbers(label, table, column) for column in signal.columns])
-        * signal.factor
-    )
+    columns = []
+    for column in signal.columns:
+        numbers = _numbers(label, table, column)
+        holds_sentinel = sentinels(numbers)
+        if holds_sentinel.any():
+            listed = ", ".join(f"{n:g}" for n in np.unique(numbers[holds_sentinel])[:3])
+            text = f"{holds_sentinel.sum()} rows of {column} hold {listed}"
+            note("sentinel", holds_sentinel.sum(), f"{text}, no measurement: left out")
+        columns.append(np.where(holds_sentinel, np.nan, numbers))
+    values = np.column_stack(columns) * signal.factor
     values[~np.isfinite(values)] = np.nan
     absent = np.isnan(values).any(axis=1)
     note(
@@ -336,6 +371,8 @@ def _make_run(
                 "its own rate is lower; state a lower rate, or held: use"
             )
         leave_out(same, "held value", f"where {signal.name} repeats the row before")
+    if mapping.held == "drop":
+        _note_held_sensors(table, states, _motion(states, spread, step), mapping)
     rows = np.flatnonzero(usable)
     if len(rows) < 2:
         note("nothing left", len(table.time), "no row can be used: the run is left out")
@@ -363,6 +400,48 @@ def _make_run(
     begins = (0, *(np.flatnonzero(breaks) + 1).tolist())
     states, inputs, context = mapping.split(table.values[rows])
     return LogRun(table.name, table.time[rows], states, inputs, context, begins)
+
+
+def _note_held_sensors(
+    table: _Table, states: Array, motion: np.ndarray, mapping: LogMapping
+) -> None:
+    """Notes single columns that repeat while others move.
+
+    They stay in: a wheel at rest repeats its speed, too, and then starts with a jump.
+    """
+    for signal, columns in zip(
+        mapping.of("states"), mapping.space.columns, strict=True
+    ):
+        if signal.turns:
+            continue
+        for index, name in enumerate(signal.columns, start=columns.start):
+            others_move = np.delete(motion, index, axis=1).any(axis=1)
+            column = states[:, index]
+            frozen = frozen_rows(column, others_move)
+            if frozen.any():
+                table.note(
+                    "held sensor",
+                    frozen.sum(),
+                    f"{frozen.sum()} rows in which {name} stays at its value, and then "
+                    "jumps or ends, while others move: was the sensor silent? left in",
+                )
+            elif changes_rarely(column, others_move):
+                changes = int((np.diff(column) != 0).sum())
+                table.note(
+                    "held sensor",
+                    len(column) - 1 - changes,
+                    f"{name} changes in {changes} of {len(column)} rows only, while "
+                    "others move: is its own rate lower? state a lower rate; left in",
+                )
+
+
+def _motion(states: Array, spread: Array, step: float) -> np.ndarray:
+    """Whether each state moves by a tenth of its usual spread around a row (K, n)."""
+    size = max(round(REST_TIME / step), 3)
+    values = np.nan_to_num(states)
+    highest = maximum_filter1d(values, size, axis=0)
+    lowest = minimum_filter1d(values, size, axis=0)
+    return highest - lowest > REST_SHARE * spread
 
 
 def _at_rest(states: Array, inputs: Array, spread: Array, step: float) -> np.ndarray:
