@@ -1,0 +1,99 @@
+"""CSV files are read whoever wrote them, or refused by what is wrong with them."""
+
+import gzip
+import io
+
+import numpy as np
+import pandas
+import pytest
+
+from gpmpc.exceptions import DataError
+from gpmpc.logs import read_log
+from gpmpc.logs._csv import parse_csv
+
+MAPPING = {"time": "t", "states": {"x": ["x"]}, "inputs": {"u": ["u"]}}
+TABLE = pandas.DataFrame(
+    {
+        "t": 0.01 * np.arange(300),
+        "x": np.sin(0.07 * np.arange(300)),
+        "u": np.cos(0.05 * np.arange(300)),
+    }
+)
+TEXT = TABLE.to_csv(index=False)
+
+
+def parse(content):
+    content = content.encode() if isinstance(content, str) else content
+    return parse_csv("log.csv", io.BufferedReader(io.BytesIO(content)))
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        TEXT,
+        TEXT.replace("\n", "\r\n"),
+        "\n\n" + TEXT,
+        TABLE.to_csv(index=False, sep=";"),
+        TABLE.to_csv(index=False, sep="\t"),
+        TABLE.to_csv(index=False, sep=";", decimal=","),
+        TABLE.to_csv(index=False, sep="\t", decimal=","),
+        TABLE.to_csv(index=False, decimal=",", quoting=2),
+        TEXT.encode("utf-8-sig"),
+        TEXT.encode("utf-16"),
+        b"\xfe\xff" + TEXT.encode("utf-16-be"),
+        TEXT.encode("utf-16-le"),
+        TEXT.encode("utf-16-be"),
+        TEXT.encode("utf-32"),
+        "# flown on a Tuesday\n% by hand\n// again\n" + TEXT,
+        "# " + TEXT,
+        "# flown on a Tuesday\n# " + TEXT,
+        TEXT.replace("\n0.5,", "\n# a remark\n0.5,"),
+        TEXT.replace(",", ", "),
+    ],
+)
+def test_every_way_of_writing_numbers_is_read(content):
+    table = parse(content)
+    np.testing.assert_allclose(table.rows[["t", "x", "u"]], TABLE, rtol=1e-15)
+    assert not table.cut
+
+
+@pytest.mark.parametrize("missing", [1, 5, 12, 20, 30])
+def test_a_last_line_without_an_end_is_left_out_and_said(tmp_path, missing):
+    cut = TEXT[:-missing]
+    assert not cut.endswith("\n")
+    for name, content in {
+        "log.csv": cut.encode(),
+        "log.csv.gz": gzip.compress(cut.encode()),
+    }.items():
+        (tmp_path / name).write_bytes(content)
+        log = read_log(tmp_path / name, MAPPING)
+        assert len(log) == 299
+        np.testing.assert_array_equal(log.runs[0].states[:, 0], TABLE["x"][:299])
+        (finding,) = log.findings
+        assert finding.kind == "cut line"
+        assert "the last line has no end" in finding.text
+
+
+@pytest.mark.parametrize(
+    ("content", "reason"),
+    [
+        (TABLE.to_csv(index=False, decimal=",", sep=";").replace(";", ","), "comma"),
+        ("t;x;u [°]\n0;1;2\n".encode("latin-1"), "byte 0xb0 near line 1 is no text in"),
+        (b"", "no line with the names"),
+        (b"\n\n# nothing\n", "no line with the names"),
+        ("t,x,x\n0,1,2\n", "must name every column differently"),
+        ("0,1,2\n0,1,2\n", "must name every column differently"),
+        ("0;1,5;2\n0;1;2\n", "must name every column differently"),
+    ],
+)
+def test_what_cannot_be_read_is_refused_by_name(tmp_path, content, reason):
+    content = content.encode() if isinstance(content, str) else content
+    (tmp_path / "log.csv").write_bytes(content)
+    with pytest.raises(DataError, match=rf"log.csv: .*{reason}"):
+        read_log(tmp_path / "log.csv", MAPPING)
+
+
+def test_a_column_may_hold_a_comment_sign_in_its_name():
+    table = parse("t,motor#1\n0,1\n1,2\n")
+    assert list(table.rows) == ["t", "motor#1"]
+    assert len(table.rows) == 2
