@@ -15,12 +15,14 @@ of two steps, and not in their difference. To ``trajectory`` an estimate of it m
 
     d_k = (1 - L) d_{k-1} + L (mu_k - f(mu_{k-1}, u_{k-1}))
 
-Covariances of ``zero_order`` are predicted under a feedback u = u_k - K (x - mu_k),
+Covariances of ``zero_order`` are predicted under a feedback u = u_k - K_k (x - mu_k),
 
-    Sigma_{k+1} = (A_k - B_k K) Sigma_k (A_k - B_k K)' + V_k
+    Sigma_{k+1} = (A_k - B_k K_k) Sigma_k (A_k - B_k K_k)' + V_k
 
-because the next solves will see the next states and correct what went wrong (Hewing, Kabzan and Zeilinger, 2020). K is
-the gain of the finite-horizon LQR at the first stage, of the covariances only: the bounds of the inputs hold for u_k.
+because the next solves will see the next states and correct what went wrong (Hewing, Kabzan and Zeilinger, 2020). K_k
+are the gains of the finite-horizon LQR of the plan's own stages: a gain that is held over the horizon would drive
+deviations on where an input changes the sign of its effect along the plan, as in every swing-up. The feedback is of the
+covariances only: the bounds of the inputs hold for u_k.
 """
 
 from collections.abc import Sequence
@@ -425,11 +427,17 @@ class PredictionModel:
         return call_unchecked(finite_horizon_lqr, A, B, Q, R, terminal, self.horizon)[0]
 
     def _covariances(self, stages: Stages, cost: QuadraticCost, start: Array) -> Array:
-        """Sigma_0 .. Sigma_H (H + 1, n, n) of stages under their feedback."""
+        """Sigma_0 .. Sigma_H (H + 1, n, n) of stages under the feedback of each."""
         covariances = np.empty((self.horizon + 1, *start.shape))
-        K = self.gains(stages.A[:1], stages.B[:1], cost)[0]
+        gains = self.gains(stages.A, stages.B, cost)
         call_unchecked(
-            _predict_covariances, stages.A, stages.B, stages.V, start, K, covariances
+            _predict_covariances,
+            stages.A,
+            stages.B,
+            stages.V,
+            start,
+            gains,
+            covariances,
         )
         return covariances
 
@@ -453,8 +461,11 @@ class PredictionModel:
 
 
 @compiled
-def _predict_covariances(A, B, V, start, K, covariances):
-    """Writes Sigma_0 .. Sigma_H (H + 1, n, n) of H stages, or of one that is held."""
+def _predict_covariances(A, B, V, start, gains, covariances):
+    """Writes Sigma_0 .. Sigma_H (H + 1, n, n) of H stages, or of one that is held.
+
+    The gains (H, m, n) are of each stage.
+    """
     n, m, held = B.shape[1], B.shape[2], len(A) - 1
     closed, moved = np.empty((n, n)), np.empty((n, n))
     copy_matrix(start, covariances[0])
@@ -464,7 +475,7 @@ def _predict_covariances(A, B, V, start, K, covariances):
             for j in range(n):
                 closed[i, j] = A[at, i, j]
                 for r in range(m):
-                    closed[i, j] -= B[at, i, r] * K[r, j]
+                    closed[i, j] -= B[at, i, r] * gains[k, r, j]
         product(closed, covariances[k], moved)
         for i in range(n):
             for j in range(i + 1):
