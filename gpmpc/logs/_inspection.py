@@ -14,14 +14,16 @@ import numpy as np
 import pandas as pd
 
 from gpmpc.exceptions import DataError
+from gpmpc.logs._file import STAMP
 from gpmpc.logs._kinematics import Array
 from gpmpc.logs._log import Log
 from gpmpc.logs._mapping import TIME_UNITS, LogMapping
-from gpmpc.logs._readers import STAMP, read_streams
+from gpmpc.logs._readers import read_file
 from gpmpc.logs._reading import ordered_stamps, read_log
 
 TIMES = (
     STAMP,
+    "timestamp",
     "t",
     "time",
     "stamp",
@@ -78,14 +80,15 @@ def inspect_log(path: str | Path, mapping: LogMapping | None = None) -> Inspecti
     Raises:
         DataError: The file cannot be read, or no column holds the time.
     """
-    streams = read_streams(
-        path, {signal.topic for signal in mapping.signals} if mapping else ()
-    )
+    topics = {signal.topic for signal in mapping.signals} if mapping else ()
+    stamp = mapping.stamp if mapping else ""
+    file = read_file(path, topics, partial=True, stamp=stamp)
     tables: list[dict[str, Any]] = []
     channels: dict[str, Any] = {}
     lines: dict[str, Any] = {}
-    delays, gaps, warnings = [], [], []
-    for topic, table in streams.items():
+    delays, gaps = [], []
+    warnings = [f"{finding.kind}: {finding.text}" for finding in file.findings]
+    for topic, table in file.streams.items():
         time_name, time = _time(path, table, mapping)
         stamps = ordered_stamps(time, f"{path}{f', {topic}' if topic else ''}")
         steps = np.diff(stamps.time)
@@ -151,7 +154,7 @@ def inspect_log(path: str | Path, mapping: LogMapping | None = None) -> Inspecti
         if abs(rows) >= 1 or high - low > 2:
             agree = f"{low:g} to {high:g}; {agreement:.0%} of the blocks agree"
             warnings.append(f"{second} comes {rows:g} rows after {first} ({agree})")
-    follows = _dependence(read_log(path, mapping)) if mapping else {}
+    follows = _dependence(read_log(path, mapping, partial=True)) if mapping else {}
     warnings += [
         f"{name} follows the states ({share:.0%} of its variance): its own effect cannot be learned"
         for name, share in follows.items()

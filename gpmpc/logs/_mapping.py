@@ -38,7 +38,9 @@ _PLAIN = (
     "held",
     "rest",
     "model",
+    "stamp",
 )  # keys whose values are taken as they are
+_LONGEST = 2**20  # of a mapping's text [bytes]
 _SIGNAL_KEYS = (
     "columns",
     "unit",
@@ -87,6 +89,11 @@ class Signal:
                 f"must be {number or 1} names of columns; got {list(self.columns)}",
             )
         check_number(f"{key}.scale", self.scale)
+        for name in ("unit", "topic"):
+            if not isinstance(getattr(self, name), str):
+                raise SettingError(
+                    f"{key}.{name}", f"must be a word; got {getattr(self, name)!r}"
+                )
         if self.kind in ("angle", "euler"):
             check_choice(f"{key}.unit", self.unit, ("rad", "deg"))
 
@@ -145,8 +152,18 @@ class LogMapping:
         "drop"  #: "drop" leaves out parts in which nothing moves; "use" takes them
     )
     model: str = "none"  #: what is known of the system: "rigid_body" or "none"
+    #: times of a bag's messages: "header" takes the stamps that they carry, "log" the
+    #: times at which they were logged; empty takes what gives the topics time in common
+    stamp: str = ""
 
     def __post_init__(self) -> None:
+        if self.stamp and self.time:
+            raise SettingError("stamp", "has no effect where time names a column")
+        for key in ("time", "run"):
+            if not isinstance(getattr(self, key), str):
+                raise SettingError(
+                    key, f"must be the name of a column; got {getattr(self, key)!r}"
+                )
         for key in ("rate", "max_gap"):
             if getattr(self, key) is not None:
                 check_number(key, getattr(self, key), above=0)
@@ -154,6 +171,7 @@ class LogMapping:
             ("held", ("drop", "use")),
             ("rest", ("drop", "use")),
             ("model", ("rigid_body", "none")),
+            ("stamp", ("", "header", "log")),
         ):
             check_choice(key, getattr(self, key), known)
         check_choice("time.unit", self.time_unit, tuple(TIME_UNITS))
@@ -205,8 +223,26 @@ class LogMapping:
     def load(cls, path: str | Path) -> "LogMapping":
         """Reads a YAML file; ``SettingError`` where that fails, or a key or value is wrong."""
         try:
-            content = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
-        except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+            with Path(path).open(encoding="utf-8") as file:
+                text = file.read(_LONGEST + 1)
+            if len(text) > _LONGEST:
+                raise SettingError("mapping", f"{path} has more than {_LONGEST} bytes")
+            # A few aliases of aliases stand for more than any memory holds.
+            for event in yaml.parse(text, Loader=yaml.SafeLoader):
+                if isinstance(event, yaml.AliasEvent):
+                    raise SettingError(
+                        "mapping",
+                        f"{path} has an alias, *{event.anchor}; write out what it is",
+                    )
+            content = yaml.safe_load(text)
+        except (
+            OSError,
+            ValueError,  # of numbers and dates that are none
+            RecursionError,
+            yaml.YAMLError,
+        ) as error:
+            if isinstance(error, SettingError):
+                raise
             raise SettingError(
                 "mapping", f"{path} cannot be read ({' '.join(str(error).split())})"
             ) from error
@@ -236,8 +272,8 @@ class LogMapping:
                 )
             low, high = limits
             keep[column] = (
-                -np.inf if low is None else float(low),
-                np.inf if high is None else float(high),
+                -np.inf if low is None else _limit(column, low),
+                np.inf if high is None else _limit(column, high),
             )
         plain = {key: content[key] for key in _PLAIN if key in content}
         return cls(
@@ -247,6 +283,15 @@ class LogMapping:
             keep=keep,
             **plain,
         )
+
+
+def _limit(column: str, value: Any) -> float:
+    try:
+        return float(value)
+    except (TypeError, ValueError, OverflowError):
+        raise SettingError(
+            f"keep.{column}", f"must be two numbers or null; got {value!r}"
+        ) from None
 
 
 def _check_keys(key: str, given: Any, known: Sequence[str] | None) -> None:
