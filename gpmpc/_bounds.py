@@ -37,6 +37,6 @@ class Room:
             file_size = self.path.stat().st_size / 1e6
             raise DataError(
                 f"{self.path}: {what} would take more than the {self.size / 1e6:.0f} MB"
-                f" that a file of {file_size:.3g} MB may take; where it is really so"
-                " large, store it in parts, or without compression"
+                f" that a file of {file_size:.3g} MB may take; a log that is so large"
+                " is read in parts, or uncompressed"
             )

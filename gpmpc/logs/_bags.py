@@ -43,6 +43,7 @@ _RECORDING = "gpmpc.Step"  # the definition of a recording's steps
 _HEAD = struct.Struct("<BQ")  # kind and length of a record
 _MESSAGE = struct.Struct("<HIQQ")  # channel, number, time of the log, of publishing
 _RECORD = 256  # what a record costs [bytes]: its time, counted as memory
+_CHANNEL = 16_384  # what a channel and its definition cost [bytes], as above
 _DECODED = 2048  # what a message costs that is decoded [bytes], as above
 _COPIES = 4  # of the bytes of a message that is decoded
 _STAMP_FIELDS = [  # seconds and nanoseconds, as ROS 2, ROS 1, Foxglove and protobuf say
@@ -135,16 +136,18 @@ def read_bag(
         for kind, content in _records(path, room, damages if partial else None):
             if kind == Opcode.MESSAGE:
                 _take_message(path, content, channels, tables, partial, room)
-            elif kind == Opcode.SCHEMA:
-                schema = _parsed(_Record(kind, content))
-                schemas.setdefault(schema.id, schema)
+                continue
+            number = int.from_bytes(content[:2], "little")  # files may repeat them
+            if kind == Opcode.SCHEMA and number not in schemas:
+                room.take(_CHANNEL, "its definitions")
+                schema = schemas[number] = _parsed(_Record(kind, content))
                 if schema.name == _RECORDING and not any(topics):
                     return None
-            elif kind == Opcode.CHANNEL:
+            elif kind == Opcode.CHANNEL and number not in channels:
+                room.take(_CHANNEL, "its channels")
                 channel = _parsed(_Record(kind, content))
-                if channel.id not in channels:
-                    schema = schemas.get(channel.schema_id)
-                    channels[channel.id] = _channel(channel, schema, topics, room)
+                schema = schemas.get(channel.schema_id)
+                channels[number] = _channel(channel, schema, topics, room)
     except _Damaged as error:
         raise DataError(
             f"{path}: the bag cannot be read to its end ({error}); "
@@ -389,9 +392,9 @@ class _Clocks(NamedTuple):
 def _clocks(path: Path, tables: dict[str, _Topic], stamp: str, alone: bool) -> _Clocks:
     """Chooses between the stamps in the messages and the times of the log.
 
-    Unless the mapping decides, stamps of headers are taken where all topics have some
-    and these have time in common, and beside topics without a header where they are of
-    the log's clock: so topics have time in common whenever the log can have it.
+    Unless the mapping decides, messages have the times of their stamps where all topics
+    are stamped by one clock, and those of the log otherwise. A topic without stamps has
+    the log's clock. So topics have time in common whenever the log can have it.
 
     Args:
         path: Of the file.
@@ -400,54 +403,64 @@ def _clocks(path: Path, tables: dict[str, _Topic], stamp: str, alone: bool) -> _
         alone: Whether each topic is looked at for itself.
     """
     logged = {topic: _log_times(table) for topic, table in tables.items()}
-    stamped = {topic: _header_times(table) for topic, table in tables.items()}
+    stamped = {topic: _stamps(table) for topic, table in tables.items()}
     headers = {topic: times for topic, times in stamped.items() if times is not None}
     bare = [topic for topic in tables if topic not in headers]
     if stamp == "header" and bare:
         raise DataError(
-            f"{path}: stamp: header, but the messages of {bare[0]} carry no stamp"
+            f"{path}: stamp: header, but the messages of {bare[0]} carry no stamps"
         )
     if stamp == "log" or not headers:
         return _Clocks(logged)
     chosen = _Clocks(logged | headers)
     if stamp == "header" or alone:
         return chosen
-    if not bare and _have_time_in_common(headers):
-        return chosen
-    offsets = {topic: _offset(headers[topic], logged[topic]) for topic in headers}
+    reference = bare[0] if bare else next(iter(headers))
+    offsets = {
+        topic: _offset(topic, reference, logged, chosen.times) for topic in headers
+    }
     farthest = max(offsets, key=lambda topic: abs(offsets[topic]))
-    if bare and abs(offsets[farthest]) <= SAME_CLOCK:
+    if abs(offsets[farthest]) <= SAME_CLOCK:
         return chosen
-    others = f"{bare[0]} has none" if bare else "topics have no time in common"
     text = (
-        f"the stamps in {farthest} are {offsets[farthest]:.6g} s off the log's clock, "
-        f"and {others}: all times are those of the log (stamp: header | log decides)"
+        f"the stamps of {farthest} are {offsets[farthest]:.6g} s off the clock of "
+        f"{reference}: all times are those of the log (stamp: header | log decides)"
     )
     return _Clocks(logged, (Finding("times of the log", run_name(path), 1, text),))
 
 
-def _have_time_in_common(times: dict[str, np.ndarray]) -> bool:
-    begin = max(float(np.nanmin(stamps)) for stamps in times.values())
-    end = min(float(np.nanmax(stamps)) for stamps in times.values())
-    return begin < end
+def _offset(
+    topic: str,
+    reference: str,
+    logged: dict[str, np.ndarray],
+    times: dict[str, np.ndarray],
+) -> float:
+    """By how much a topic's clock is ahead of another's, as the log sees them [s]."""
+    order = np.argsort(logged[reference])
+    behind = (logged[reference] - times[reference])[order]
+    finite = np.isfinite(behind)
+    if not finite.any():
+        return np.inf
+    expected = np.interp(
+        logged[topic], logged[reference][order][finite], behind[finite]
+    )
+    return float(np.nanmedian(expected - (logged[topic] - times[topic])))
 
 
-def _offset(stamps: np.ndarray, logged: np.ndarray) -> float:
-    """By how much a topic's stamps are earlier than its times in the log [s]."""
-    return float(np.nanmedian(logged - stamps))
-
-
-def _header_times(table: _Topic) -> np.ndarray | None:
+def _stamps(table: _Topic) -> np.ndarray | None:
     """The stamps (K,) [s] in a topic's messages; None where they carry none.
 
-    A topic has none where every stamp is zero. A single zero is a time: a simulated
-    clock begins with it.
+    They carry none where all are equal, such as zero. A single zero is a time: a
+    simulated clock begins with it.
     """
     for seconds, nanoseconds in _STAMP_FIELDS:
         if seconds in table.columns and nanoseconds in table.columns:
             times = np.array(table.columns[seconds])
             times += np.array(table.columns[nanoseconds]) / 1e9
-            return times if np.nan_to_num(times).any() else None
+            finite = times[np.isfinite(times)]
+            is_set = len(finite) > 0 and (np.ptp(finite) > 0 or finite[0] != 0)
+            is_stuck = len(finite) > 1 and np.ptp(finite) == 0
+            return times if is_set and not is_stuck else None
     return None
 
 

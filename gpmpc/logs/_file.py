@@ -11,9 +11,9 @@ from gpmpc.logs._log import Finding
 #: column of the times [s] that a message carries or was logged at; no field of a
 #: message has this name
 STAMP = "(stamp)"
-NUMBER = 16  # of a number in a table, and of the copy that pandas makes [bytes]
+NUMBER = 32  # of a number in a table, and of its copies on the way there [bytes]
 TEXT = 64  # of a short text in a table, or of another Python object [bytes]
-MOST_COLUMNS = 10_000  # of a table
+MOST_COLUMNS = 4096  # of a table; with many more, pandas takes seconds for any
 
 Streams = dict[str, pd.DataFrame]
 

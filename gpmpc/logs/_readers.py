@@ -88,7 +88,8 @@ def read_file(
             where = f"{path}, {topic}" if topic else str(path)
             raise DataError(f"{where}: column {twice!r} stands there twice")
     if not any(len(table) for table in streams.values()):
-        raise DataError(f"{path}: holds no rows")
+        reasons = "; ".join(finding.text for finding in file.findings[:2])
+        raise DataError(f"{path}: holds no rows{f' ({reasons})' if reasons else ''}")
     return file
 
 

@@ -114,11 +114,13 @@ def read_log(
             tables.append(_tabulate(where, name, streams, mapping, note, room))
     if not tables:
         raise DataError("no log file was given")
-    step = (
-        1 / mapping.rate
-        if mapping.rate
-        else float(np.median(np.concatenate([np.diff(t.time) for t in tables])))
-    )
+    steps = np.concatenate([np.diff(table.time) for table in tables])
+    if not len(steps):
+        reason = "no two rows have different stamps"
+        if mapping.rate:
+            reason = f"a rate of {mapping.rate:g} Hz leaves a single row"
+        raise DataError(f"{files[0]}: {reason}")
+    step = 1 / mapping.rate if mapping.rate else float(np.median(steps))
     spread = _spread([mapping.split(table.values)[0] for table in tables])
     usable = [
         run
@@ -180,13 +182,14 @@ def _tabulate(
         stamps[topic] = ordered_stamps(_time(label, table, mapping), label, hint)
         tables[topic] = table.iloc[stamps[topic].rows]
         _note_stamps(topic, stamps[topic], mapping, note)
+    columns = sum(len(signal.group.entries) for signal in mapping.signals)
     if mapping.rate is None:
         (found,) = stamps.values()
         grid = found.time
+        room.take(_memory(len(grid), columns), f"{len(grid)} rows of {columns} columns")
         breaks = found.after_reversal.copy()
         breaks[_jumps(found.time, mapping) + 1] = True
     else:
-        columns = sum(len(signal.group.entries) for signal in mapping.signals)
         grid, breaks = _grid(where, stamps, mapping, columns, note, room)
 
     def on_grid(topic: str, values: Array, rule: str, max_gap: float | None) -> Array:
@@ -257,6 +260,11 @@ def _jumps(time: Array, mapping: LogMapping) -> np.ndarray:
     return np.flatnonzero(steps > longest)
 
 
+def _memory(rows: float, columns: int) -> float:
+    """What a run's rows of all signals take while they are worked on [bytes]."""
+    return rows * columns * COPIES * NUMBER
+
+
 class _Grid(NamedTuple):
     """Times (G,) [s] in equal steps, in pieces that all topics have in common."""
 
@@ -294,7 +302,9 @@ def _grid(
     lengths = np.floor((common[:, 1] - common[:, 0]) * mapping.rate * (1 + 1e-12)) + 1
     rows = float(lengths.sum())
     what = f"{rows:.6g} rows of {columns} columns at a rate of {mapping.rate:g} Hz"
-    room.take(rows * columns * COPIES * NUMBER, f"{where}: {what}")
+    if (mapping.max_gap or 0.0) > JUMP:
+        what += f", with gaps of up to {mapping.max_gap:g} s (max_gap),"
+    room.take(_memory(rows, columns), what)
     begins = np.repeat(common[:, 0], lengths.astype(int))
     firsts = np.r_[0, np.cumsum(lengths)[:-1]].astype(int)
     numbers = np.arange(len(begins)) - np.repeat(firsts, lengths.astype(int))

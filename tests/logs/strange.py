@@ -317,7 +317,7 @@ def bag_of_chunk(path, header, packed, size, compression=b"zstd"):
     return path
 
 
-def ulog(path, topics, formats="", extra=b"", sync_every=None):
+def ulog(path, topics, formats=b"", extra=b"", sync_every=None):
     """A ULog of topics of floats, as dictionaries of columns with their ``t`` [s]."""
     data = b"ULog\x01\x12\x35\x01" + struct.pack("<Q", 0)
     data += ulog_message(b"B", bytes(40))
