@@ -40,7 +40,8 @@ _PLAIN = (
     "model",
     "stamp",
 )  # keys whose values are taken as they are
-_LONGEST = 2**20  # of a mapping's text [bytes]
+_LONGEST = 2**16  # of a mapping's text [characters]
+_DEEPEST = 10  # levels of a mapping's text
 _SIGNAL_KEYS = (
     "columns",
     "unit",
@@ -226,14 +227,10 @@ class LogMapping:
             with Path(path).open(encoding="utf-8") as file:
                 text = file.read(_LONGEST + 1)
             if len(text) > _LONGEST:
-                raise SettingError("mapping", f"{path} has more than {_LONGEST} bytes")
-            # A few aliases of aliases stand for more than any memory holds.
-            for event in yaml.parse(text, Loader=yaml.SafeLoader):
-                if isinstance(event, yaml.AliasEvent):
-                    raise SettingError(
-                        "mapping",
-                        f"{path} has an alias, *{event.anchor}; write out what it is",
-                    )
+                raise SettingError(
+                    "mapping", f"{path} has more than {_LONGEST} characters"
+                )
+            _check_structure(text)
             content = yaml.safe_load(text)
         except (
             OSError,
@@ -285,6 +282,25 @@ class LogMapping:
         )
 
 
+def _check_structure(text: str) -> None:
+    """Raises ``SettingError`` of YAML that takes for ever, though it is short.
+
+    A few aliases of aliases stand for more than any memory holds, and the time of
+    nested brackets grows with the square of their depth.
+    """
+    depth = 0
+    for event in yaml.parse(text, Loader=yaml.SafeLoader):
+        if isinstance(event, yaml.AliasEvent):
+            raise SettingError(
+                "mapping",
+                f"has an alias, *{event.anchor}; write out what it stands for",
+            )
+        depth += isinstance(event, yaml.CollectionStartEvent)
+        depth -= isinstance(event, yaml.CollectionEndEvent)
+        if depth > _DEEPEST:
+            raise SettingError("mapping", f"is nested deeper than {_DEEPEST} levels")
+
+
 def _limit(column: str, value: Any) -> float:
     try:
         return float(value)
@@ -296,7 +312,7 @@ def _limit(column: str, value: Any) -> float:
 
 def _check_keys(key: str, given: Any, known: Sequence[str] | None) -> None:
     if not isinstance(given, Mapping):
-        raise SettingError(key, f"must be keys and values; got {given!r}")
+        raise SettingError(key, f"must be keys and values; got {given!r:.200}")
     unknown = [name for name in given if known is not None and name not in known]
     if unknown:
         raise SettingError(

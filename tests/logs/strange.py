@@ -192,19 +192,21 @@ def _other(names, topic):
 _ENCODERS = {"ros2": _ros2, "json": _json, "protobuf": _protobuf}
 
 
-def npz_bomb(path):
-    """Zeros: 1.2 MB that unfold to 1.2 GB."""
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+def npz_bomb(path, rows=5_000_000):
+    """Zeros: a file of 0.2 MB that unfolds to 160 MB, and to more in a table."""
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
         for name in ("t", "angle", "rate", "torque"):
             with archive.open(f"{name}.npy", "w") as member:
-                _write_zeros(member, rows=38_000_000)
+                _write_head(member, f"{rows},")
+                for _ in range(rows // 100_000):
+                    member.write(bytes(800_000))
     return path
 
 
 def npz_with_a_head_that_lies(path):
     """An array of eight bytes whose head says that it has 2**60."""
     with zipfile.ZipFile(path, "w") as archive, archive.open("t.npy", "w") as member:
-        _write_head(member, 2**57)
+        _write_head(member, f"{2**57},")
         member.write(bytes(8))
     return path
 
@@ -219,21 +221,14 @@ def npz_of_many_columns(path, columns=10_000_000):
 
 
 def _write_head(file, shape):
-    head = f"{{'descr': '<f8', 'fortran_order': False, 'shape': ({shape},), }}"
+    head = f"{{'descr': '<f8', 'fortran_order': False, 'shape': ({shape}), }}"
     head = head.ljust(117) + "\n"
     file.write(b"\x93NUMPY\1\0" + struct.pack("<H", len(head)) + head.encode())
 
 
-def _write_zeros(file, rows):
-    _write_head(file, rows)
-    for _ in range(rows // 100_000):
-        file.write(bytes(800_000))
-
-
-def parquet_bomb(path, rows=100_000_000, columns=8):
+def parquet_bomb(path, rows=10_000_000):
     """Constant columns: their pages hold a number and how often it comes."""
-    names = ["t", "angle", "rate", "torque"][:columns]
-    names += [f"c{i}" for i in range(columns - len(names))]
+    names = ("t", "angle", "rate", "torque")
     part = pyarrow.table({name: np.zeros(1_000_000) for name in names})
     with pyarrow.parquet.ParquetWriter(path, part.schema, compression="zstd") as writer:
         for _ in range(rows // 1_000_000):
@@ -251,22 +246,18 @@ def parquet_of_one_long_text(path, rows=1_000_000):
     return path
 
 
-def csv_bomb(path, row=b"0,0,0,0\n", size=1_300_000_000):
+def csv_bomb(path, row=b"0,0,0,0\n", size=1_300_000_000, head=None):
     """The same row over and over: 1.3 MB that unfold to 1.3 GB."""
-    block = row * (2**20 // len(row))
-    with gzip.open(path, "wb", compresslevel=6) as file:
-        file.write(b"t,angle,rate,torque\n")
-        for _ in range(size // len(block)):
-            file.write(block)
+    part = 20_000_000
+    block = gzip.compress(row * (part // len(row)))
+    head = gzip.compress(b"t,angle,rate,torque\n" if head is None else head)
+    path.write_bytes(head + block * max(size // part, 1))
     return path
 
 
-def csv_of_one_line(path, size=300_000_000):
+def csv_of_one_line(path):
     """A single line without an end."""
-    with gzip.open(path, "wb", compresslevel=1) as file:
-        for _ in range(size // 2**20):
-            file.write(b"0," * 2**19)
-    return path
+    return csv_bomb(path, row=b"0,", size=300_000_000, head=b"")
 
 
 MAGIC = b"\x89MCAP0\r\n"
