@@ -5,7 +5,7 @@ Every error of this package derives from ``GpmpcError``; its text is one line th
 the way back from a worker process (its constructor's arguments are its ``args``).
 """
 
-import math
+import sys
 from collections.abc import Sequence
 from typing import Any
 
@@ -99,7 +99,7 @@ def check_number(
     if (
         right_type
         and not isinstance(value, bool)
-        and math.isfinite(value)
+        and abs(value) <= sys.float_info.max  # False of nan, and of larger integers
         and (above is None or value > above)
         and (least is None or value >= least)
     ):

@@ -9,7 +9,6 @@ is the table.
 import codecs
 import io
 import re
-import warnings
 from collections.abc import Iterator
 from itertools import chain, islice
 from typing import NamedTuple
@@ -31,16 +30,25 @@ _ENCODINGS = (  # the longer marks first: that of UTF-32 begins as that of UTF-1
 )
 
 
-class CsvTable(NamedTuple):
-    """The rows of a CSV file."""
+class CsvText(NamedTuple):
+    """The text of a CSV file in the form that pandas reads, and how it is written."""
 
-    rows: pd.DataFrame
-    #: whether the last line had no end: it may be cut within a number, and is left out
-    cut: bool
+    text: "_Text"  #: the names of the columns and the rows, without comments
+    names: list[str]  #: of the columns
+    delimiter: str
+    decimal: str  #: the decimal mark
+
+    @property
+    def is_cut(self) -> bool:
+        """Whether the last line has no end, known where all is read.
+
+        It may be cut within a number, and is left out.
+        """
+        return self.text.lines.cut
 
 
-def parse_csv(label: str, file: io.BufferedReader) -> CsvTable:
-    """Reads CSV text as a table.
+def open_csv(label: str, file: io.BufferedReader) -> CsvText:
+    """Finds out how a CSV file is written.
 
     Args:
         label: The file's name, for errors.
@@ -64,17 +72,12 @@ def parse_csv(label: str, file: io.BufferedReader) -> CsvTable:
             f"{label}: the first line must name every column differently; got "
             f"{', '.join(names)}"
         )
-    decimal = _decimal_mark(label, names, head[1:], delimiter)
-    with warnings.catch_warnings():  # of rows that are longer than the header
-        warnings.simplefilter("error", pd.errors.ParserWarning)
-        rows = pd.read_csv(
-            _Text(chain(head, lines)),
-            sep=delimiter,
-            decimal=decimal,
-            index_col=False,
-            skipinitialspace=True,
-        )
-    return CsvTable(rows=rows.rename(columns=str.strip), cut=lines.cut)
+    return CsvText(
+        text=_Text(head, lines),
+        names=names,
+        delimiter=delimiter,
+        decimal=_decimal_mark(label, names, head[1:], delimiter),
+    )
 
 
 class _Lines(Iterator[str]):
@@ -118,10 +121,11 @@ class _Lines(Iterator[str]):
 
 
 class _Text(io.TextIOBase):
-    """Lines as a file that pandas reads."""
+    """Lines as a file that pandas reads, those of the head before all others."""
 
-    def __init__(self, lines: Iterator[str]):
-        self._lines = lines
+    def __init__(self, head: list[str], lines: _Lines):
+        self.lines = lines
+        self._all_lines = chain(head, lines)
         self._rest = ""
 
     def read(self, size: int | None = -1, /) -> str:
@@ -129,7 +133,7 @@ class _Text(io.TextIOBase):
         length = len(self._rest)
         parts = [self._rest]
         while size is None or size < 0 or length < size:
-            line = next(self._lines, "")
+            line = next(self._all_lines, "")
             if not line:
                 break
             parts.append(line)

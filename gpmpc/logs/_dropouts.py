@@ -63,7 +63,7 @@ def zero_dropouts(states: Array) -> np.ndarray:
     changes = np.abs(np.diff(states, axis=0))
     between = zero[1:] | zero[:-1]
     usual = _usual_change(changes[~between])
-    jumps = (changes > JUMP * usual).any(axis=1)
+    jumps = np.any(changes > JUMP * usual, axis=1)
     dropouts = np.zeros(len(states), dtype=bool)
     for begin, end in _stretches(zero):
         jumps_in = begin > 0 and jumps[begin - 1]

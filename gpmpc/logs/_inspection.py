@@ -15,14 +15,15 @@ import numpy as np
 import pandas as pd
 
 from gpmpc.exceptions import DataError
+from gpmpc.logs._file import STAMP
 from gpmpc.logs._kinematics import Array
 from gpmpc.logs._log import Log
 from gpmpc.logs._mapping import TIME_UNITS, LogMapping
-from gpmpc.logs._readers import STAMP, read_streams
+from gpmpc.logs._readers import read_file
 from gpmpc.logs._reading import read_log
 
 # columns that hold the time where nobody says which
-TIMES = (STAMP, "t", "time", "stamp", "Time", "seconds")
+TIMES = (STAMP, "timestamp", "t", "time", "stamp", "Time", "seconds")
 DRAWN = 3000  # points of a channel's line
 BLOCKS, BLOCK, REACH = 16, 4096, 50  # rows in which delays are sought, and how far
 SHARP = 10  # rows within which a peak falls by a fifth
@@ -108,9 +109,11 @@ def inspect_log(path: str | Path, mapping: LogMapping | None = None) -> Inspecti
         DataError: The file cannot be read, or no column holds the time.
     """
     topics = {signal.topic for signal in mapping.signals} if mapping else ()
+    stamp = mapping.stamp if mapping else ""
+    file = read_file(path, topics, partial=True, stamp=stamp)
     streams = [
         _inspect_stream(path, topic, table, mapping)
-        for topic, table in read_streams(path, topics).items()
+        for topic, table in file.streams.items()
     ]
     channels = {
         name: numbers for stream in streams for name, numbers in stream.channels.items()
@@ -121,13 +124,14 @@ def inspect_log(path: str | Path, mapping: LogMapping | None = None) -> Inspecti
     reading: list[str] = []
     if mapping is not None:
         try:
-            log = read_log(path, mapping)
+            log = read_log(path, mapping, partial=True)
         except DataError as error:
             reading = [f"with this mapping the log cannot be learned from: {error}"]
         else:
             reading = [f"{finding.kind}: {finding.text}" for finding in log.findings]
             follows = _dependence(log)
     warnings = [
+        *(f"{finding.kind}: {finding.text}" for finding in file.findings),
         *(warning for stream in streams for warning in stream.warnings),
         *_text_warning([name for stream in streams for name in stream.text_columns]),
         *_channel_warnings(channels),

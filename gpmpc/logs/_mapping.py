@@ -25,7 +25,10 @@ _PLAIN = (
     "held",
     "rest",
     "model",
+    "stamp",
 )  # keys whose values are taken as they are
+_LONGEST = 2**16  # of a mapping's text [characters]
+_DEEPEST = 10  # levels of a mapping's text
 _SIGNAL_KEYS = (
     "columns",
     "unit",
@@ -74,6 +77,11 @@ class Signal:
                 f"must be {number or 1} names of columns; got {list(self.columns)}",
             )
         check_number(f"{key}.scale", self.scale)
+        for name in ("unit", "topic"):
+            if not isinstance(getattr(self, name), str):
+                raise SettingError(
+                    f"{key}.{name}", f"must be a word; got {getattr(self, name)!r}"
+                )
         if self.kind in ("angle", "euler"):
             check_choice(f"{key}.unit", self.unit, ("rad", "deg"))
         conversion(f"{key}.unit", self.unit)
@@ -139,8 +147,18 @@ class LogMapping:
         "drop"  #: "drop" leaves out parts in which nothing moves; "use" takes them
     )
     model: str = "none"  #: what is known of the system: "rigid_body" or "none"
+    #: times of a bag's messages: "header" takes the stamps that they carry, "log" the
+    #: times at which they were logged; empty takes what gives the topics time in common
+    stamp: str = ""
 
     def __post_init__(self) -> None:
+        if self.stamp and self.time:
+            raise SettingError("stamp", "has no effect where time names a column")
+        for key in ("time", "run"):
+            if not isinstance(getattr(self, key), str):
+                raise SettingError(
+                    key, f"must be the name of a column; got {getattr(self, key)!r}"
+                )
         for key in ("rate", "max_gap"):
             if getattr(self, key) is not None:
                 check_number(key, getattr(self, key), above=0)
@@ -148,6 +166,7 @@ class LogMapping:
             ("held", ("drop", "use")),
             ("rest", ("drop", "use")),
             ("model", ("rigid_body", "none")),
+            ("stamp", ("", "header", "log")),
         ):
             check_choice(key, getattr(self, key), known)
         check_choice("time.unit", self.time_unit, tuple(TIME_UNITS))
@@ -199,8 +218,22 @@ class LogMapping:
     def load(cls, path: str | Path) -> "LogMapping":
         """Reads a YAML file; ``SettingError`` where that fails, or a key or value is wrong."""
         try:
-            content = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
-        except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+            with Path(path).open(encoding="utf-8") as file:
+                text = file.read(_LONGEST + 1)
+            if len(text) > _LONGEST:
+                raise SettingError(
+                    "mapping", f"{path} has more than {_LONGEST} characters"
+                )
+            _check_structure(text)
+            content = yaml.safe_load(text)
+        except (
+            OSError,
+            ValueError,  # of numbers and dates that are none
+            RecursionError,
+            yaml.YAMLError,
+        ) as error:
+            if isinstance(error, SettingError):
+                raise
             raise SettingError(
                 "mapping", f"{path} cannot be read ({' '.join(str(error).split())})"
             ) from error
@@ -230,8 +263,8 @@ class LogMapping:
                 )
             low, high = limits
             keep[column] = (
-                -np.inf if low is None else float(low),
-                np.inf if high is None else float(high),
+                -np.inf if low is None else _limit(column, low),
+                np.inf if high is None else _limit(column, high),
             )
         plain = {key: content[key] for key in _PLAIN if key in content}
         return cls(
@@ -243,9 +276,37 @@ class LogMapping:
         )
 
 
+def _check_structure(text: str) -> None:
+    """Raises ``SettingError`` of YAML that takes for ever, though it is short.
+
+    A few aliases of aliases stand for more than any memory holds, and the time of
+    nested brackets grows with the square of their depth.
+    """
+    depth = 0
+    for event in yaml.parse(text, Loader=yaml.SafeLoader):
+        if isinstance(event, yaml.AliasEvent):
+            raise SettingError(
+                "mapping",
+                f"has an alias, *{event.anchor}; write out what it stands for",
+            )
+        depth += isinstance(event, yaml.CollectionStartEvent)
+        depth -= isinstance(event, yaml.CollectionEndEvent)
+        if depth > _DEEPEST:
+            raise SettingError("mapping", f"is nested deeper than {_DEEPEST} levels")
+
+
+def _limit(column: str, value: Any) -> float:
+    try:
+        return float(value)
+    except (TypeError, ValueError, OverflowError):
+        raise SettingError(
+            f"keep.{column}", f"must be two numbers or null; got {value!r}"
+        ) from None
+
+
 def _check_keys(key: str, given: Any, known: Sequence[str] | None) -> None:
     if not isinstance(given, Mapping):
-        raise SettingError(key, f"must be keys and values; got {given!r}")
+        raise SettingError(key, f"must be keys and values; got {given!r:.200}")
     unknown = [name for name in given if known is not None and name not in known]
     if unknown:
         raise SettingError(

@@ -1,27 +1,59 @@
 """Reads log files as tables: CSV, Parquet, NumPy archives, recordings of this package, ROS 2 bags and PX4 logs.
 
-A file becomes one table a stream: a single one under the empty name, or one a topic, whose column ``timestamp`` holds
-the time [s]. Nothing is interpreted here.
+A file becomes one table a stream: a single one under the empty name, or one a topic. Nothing is interpreted here.
+Memory and time stay in proportion to the file's size: what a file declares or unfolds to is counted before it is
+allocated (``gpmpc._bounds``).
 """
 
+import gzip
+import io
+import math
 import warnings
+import zipfile
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 
+from gpmpc._bounds import Room
 from gpmpc.exceptions import DataError, GpmpcError
+from gpmpc.logs._bags import has_own_profile, read_bag
+from gpmpc.logs._csv import CsvText, open_csv
+from gpmpc.logs._file import (
+    NUMBER,
+    TEXT,
+    LogFile,
+    check_column_count,
+    run_name,
+)
+from gpmpc.logs._log import Finding
+from gpmpc.logs._ulogs import read_ulog
 
-STAMP = "timestamp"  # [s], of streams with a topic
-Streams = dict[str, pd.DataFrame]
+LONGEST_LINE = 2**20  # of a text file [bytes]
+_PART = 500_000  # cells of a text file that are parsed at once
+_QUOTED = 3  # further copies of a text in quotes, which may stand over many lines
 
 
-def read_streams(
-    path: str | Path, topics: Iterable[str] = (), partial: bool = False
-) -> Streams:
-    """Reads the tables of a log file: all topics by default, or what is whole of an unfinished recording."""
+def read_file(
+    path: str | Path,
+    topics: Iterable[str] = (),
+    partial: bool = False,
+    stamp: str = "",
+) -> LogFile:
+    """Reads the tables of a log file.
+
+    Args:
+        path: Of the file.
+        topics: Those that are read; all by default.
+        partial: Takes what is whole of a file that is unfinished or damaged.
+        stamp: The times of a bag's messages: "header", "log", or by the rule of
+            ``gpmpc.logs._bags``.
+
+    Raises:
+        DataError: The file cannot be read, or holds no rows.
+    """
     path = Path(path)
     if not path.is_file():
         raise DataError(f"{path}: no such file")
@@ -34,7 +66,7 @@ def read_streams(
             f"{path}: unknown kind of file; known are {', '.join(_READERS)}"
         )
     try:
-        streams = reader(path, tuple(topics), partial)
+        file = reader(path, tuple(topics), partial, stamp)
     except GpmpcError:
         raise
     except ImportError as error:
@@ -44,59 +76,221 @@ def read_streams(
     except Exception as error:  # whatever a library raises on a damaged file
         reason = " ".join(str(error).split()) or type(error).__name__
         raise DataError(f"{path}: cannot be read ({reason})") from error
-    missing = [topic for topic in topics if topic and topic not in streams]
+    streams = file.streams
+    missing = [topic for topic in topics if topic not in streams]
     if missing:
-        raise DataError(
-            f"{path}: topic {missing[0]!r} is missing; it has {', '.join(sorted(streams)) or 'no topics'}"
-        )
+        known = ", ".join(sorted(topic for topic in streams if topic)) or "no topics"
+        what = f"topic {missing[0]!r} is missing; it has {known}"
+        if not missing[0]:
+            what = "has topics, and the mapping names none for one of its signals"
+        raise DataError(f"{path}: {what}")
+    for topic, table in streams.items():
+        if table.columns.has_duplicates:
+            twice = table.columns[table.columns.duplicated()][0]
+            where = f"{path}, {topic}" if topic else str(path)
+            raise DataError(f"{where}: column {twice!r} stands there twice")
     if not any(len(table) for table in streams.values()):
-        raise DataError(f"{path}: holds no rows")
-    return streams
+        reasons = "; ".join(finding.text for finding in file.findings[:2])
+        raise DataError(f"{path}: holds no rows{f' ({reasons})' if reasons else ''}")
+    return file
 
 
-def _read_csv(path: Path, topics: tuple[str, ...], partial: bool) -> Streams:
-    options: dict[str, Any] = {"encoding": "utf-8-sig", "skipinitialspace": True}
-
-    def first_line(delimiter: str) -> pd.Series:
-        return pd.read_csv(
-            path, sep=delimiter, header=None, nrows=1, dtype=str, **options
-        ).iloc[0]
-
-    delimiter = max(",;\t", key=lambda candidate: len(first_line(candidate)))
-    names = first_line(delimiter).str.strip()
-    if pd.to_numeric(names, errors="coerce").notna().any() or names.duplicated().any():
-        raise DataError(
-            f"{path}: the first line must name every column differently; got {', '.join(map(str, names))}"
-        )
-    with warnings.catch_warnings():  # of rows that are longer than the header
-        warnings.simplefilter("error", pd.errors.ParserWarning)
-        table = pd.read_csv(path, sep=delimiter, index_col=False, **options)
-    return {"": table.rename(columns=str.strip)}
+def _read_csv(path: Path, *_: Any) -> LogFile:
+    room = Room(path)
+    _check_text(path, room)
+    with _open(path) as file:
+        csv = open_csv(str(path), file)
+        with warnings.catch_warnings():  # of rows that are longer than the header
+            warnings.simplefilter("error", pd.errors.ParserWarning)
+            table = _read_in_parts(csv, room)
+    findings = ()
+    if csv.is_cut:
+        text = "the last line has no end, and may be cut within a number: left out"
+        findings = (Finding("cut line", run_name(path), 1, text),)
+    return LogFile({"": table.rename(columns=str.strip)}, findings)
 
 
-def _read_npz(path: Path, topics: tuple[str, ...], partial: bool) -> Streams:
-    with np.load(path, allow_pickle=False) as archive:
-        arrays = {
-            name: archive[name]
-            for name in archive.files
-            if archive[name].ndim in (1, 2)
-        }
+def _open(path: Path) -> io.BufferedReader:
+    """Opens a file, unpacked where it is packed."""
+    if path.name.lower().endswith(".gz"):
+        return io.BufferedReader(gzip.GzipFile(path))
+    return path.open("rb")
+
+
+def _check_text(path: Path, room: Room) -> None:
+    """Counts what a text file unfolds to, before anything of it is parsed."""
+    with _open(path) as file:
+        first_line = file.readline(LONGEST_LINE)
+        check_column_count(path, max(map(first_line.count, _DELIMITERS)) + 1)
+        block = first_line
+        copies = 1
+        while block:
+            lines = max(block.count(b"\n"), block.count(b"\r"))
+            if len(block) == LONGEST_LINE and not lines:
+                raise DataError(f"{path}: has a line of more than {LONGEST_LINE} bytes")
+            if b'"' in block:
+                copies = 1 + _QUOTED
+            cells = max(map(block.count, _DELIMITERS)) + lines
+            room.take(copies * len(block) + NUMBER * cells, "its text")
+            block = file.read(LONGEST_LINE)
+
+
+def _read_in_parts(csv: CsvText, room: Room) -> pd.DataFrame:
+    """Parses text part by part, so that texts are counted before there are many."""
+    parts: list[pd.DataFrame] = []
+    texts: set[Any] = set()  # names of columns that hold some
+    with pd.read_csv(
+        csv.text,
+        sep=csv.delimiter,
+        decimal=csv.decimal,
+        chunksize=max(_PART // len(csv.names), 1),
+        index_col=False,
+        skipinitialspace=True,
+    ) as reader:
+        for part in reader:
+            is_text = part.select_dtypes(exclude=["number", "bool"])
+            room.take(TEXT * is_text.size, "its texts")
+            texts |= {*is_text.columns}
+            parts.append(part)
+    # Numbers in a column that also holds texts become objects, like texts.
+    numbers = sum(part[column].size for part in parts for column in texts)
+    room.take(TEXT * numbers, "its texts")
+    return pd.concat(parts, ignore_index=True)
+
+
+class _Array(NamedTuple):
+    """What an archive says of an array before it is read."""
+
+    shape: tuple[int, ...]
+    dtype: np.dtype
+
+    @property
+    def is_table(self) -> bool:
+        """Whether it has columns of numbers or short texts."""
+        return len(self.shape) in (1, 2) and self.dtype.kind in "biufSU"
+
+
+def _read_npz(path: Path, *_: Any) -> LogFile:
+    room = Room(path)
+    declared = _declared_arrays(path)
+    tables = {name: array for name, array in declared.items() if array.is_table}
+    widths = {name: math.prod(array.shape[1:]) for name, array in tables.items()}
+    check_column_count(path, sum(widths.values()))
+    for name, (shape, dtype) in tables.items():
+        of_cell = NUMBER if dtype.kind in "biuf" else TEXT + 2 * dtype.itemsize
+        room.take(math.prod(shape) * of_cell, f"array {name!r} of shape {shape}")
     columns: dict[str, np.ndarray] = {}  # pandas names arrays of different lengths
-    for name, values in arrays.items():
-        columns |= (
-            {name: values}
-            if values.ndim == 1
-            else {f"{name}[{i}]": v for i, v in enumerate(values.T)}
+    with np.load(path, allow_pickle=False) as archive:
+        for name, (shape, _) in tables.items():
+            values = archive[name]
+            if len(shape) == 1:
+                columns[name] = values
+            else:
+                columns |= {f"{name}[{i}]": v for i, v in enumerate(values.T)}
+    others = sorted(declared.keys() - tables.keys())
+    text = f"{', '.join(others[:5])}: no columns of numbers, left out"
+    findings = (Finding("not read", run_name(path), len(others), text),)
+    return LogFile({"": pd.DataFrame(columns)}, findings if others else ())
+
+
+def _declared_arrays(path: Path) -> dict[str, _Array]:
+    """The arrays of an archive by their heads, without their contents."""
+    headers = {
+        (1, 0): np.lib.format.read_array_header_1_0,
+        (2, 0): np.lib.format.read_array_header_2_0,
+    }
+    arrays = {}
+    with zipfile.ZipFile(path) as archive:
+        for member in archive.infolist():
+            name = member.filename.removesuffix(".npy")
+            if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+                raise DataError(f"{path}: array {name!r} is compressed in another way")
+            with archive.open(member) as file:
+                header = headers.get(np.lib.format.read_magic(file))
+                if header is None:  # of structured arrays, which are no columns
+                    arrays[name] = _Array((), np.dtype(object))
+                    continue
+                shape, _, dtype = header(file)
+            size = math.prod(shape) * dtype.itemsize
+            if min(shape, default=0) < 0 or (
+                dtype.kind != "O" and size > member.file_size
+            ):
+                raise DataError(f"{path}: array {name!r} is shorter than its head says")
+            arrays[name] = _Array(shape, dtype)
+    return arrays
+
+
+def _read_parquet(path: Path, *_: Any) -> LogFile:
+    """Reads the columns of numbers and texts.
+
+    Encoded columns may hold far more than their bytes: rows are counted for numbers,
+    and texts stay in their dictionaries, or are left out where they have another code.
+    """
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    room = Room(path)
+    with pq.ParquetFile(path) as file:
+        schema, metadata = file.schema_arrow, file.metadata
+        groups = [metadata.row_group(i) for i in range(metadata.num_row_groups)]
+    rows = max(metadata.num_rows, sum(group.num_rows for group in groups))
+    check_column_count(path, len(schema))
+    check_column_count(path, metadata.num_columns)
+    room.take(sum(group.total_byte_size for group in groups), "its pages")
+    expanding = {
+        group.column(i).path_in_schema
+        for group in groups
+        for i in range(group.num_columns)
+        if "DELTA_BYTE_ARRAY" in group.column(i).encodings
+    }
+    are_numbers = (
+        pa.types.is_integer,
+        pa.types.is_floating,
+        pa.types.is_decimal,
+        pa.types.is_boolean,
+        pa.types.is_timestamp,
+        pa.types.is_duration,
+        pa.types.is_null,
+    )
+    numbers, texts = [], []
+    for field in schema:
+        kind = (
+            field.type.value_type if pa.types.is_dictionary(field.type) else field.type
         )
-    return {"": pd.DataFrame(columns)}
+        is_text = pa.types.is_string(kind) or pa.types.is_large_string(kind)
+        if is_text and field.name not in expanding:
+            texts.append(field.name)
+        elif any(is_number(kind) for is_number in are_numbers):
+            numbers.append(field.name)
+    used = [name for name in schema.names if name in {*numbers, *texts}]
+    room.take(
+        rows * (NUMBER * len(used) + TEXT * len(texts)),
+        f"{rows} rows of {len(used)} columns",
+    )
+    with pq.ParquetFile(path, read_dictionary=texts) as file:
+        content = file.read(columns=used if len(used) < len(schema) else None)
+    for i, field in enumerate(content.schema):
+        if pa.types.is_decimal(field.type):
+            exact = content.column(i)
+            content = content.set_column(i, field.name, exact.cast(pa.float64()))
+    table = content.to_pandas(ignore_metadata=True)
+    for name in table.select_dtypes("category"):
+        table[name] = table[name].astype(object)
+    table = table.loc[:, [not n.startswith("__index_level_") for n in table.columns]]
+    others = [name for name in schema.names if name not in used]
+    text = f"{', '.join(others[:5])}: no columns of numbers, left out"
+    findings = (Finding("not read", run_name(path), len(others), text),)
+    return LogFile({"": table}, findings if others else ())
 
 
-def _read_mcap(path: Path, topics: tuple[str, ...], partial: bool) -> Streams:
-    with path.open("rb") as file:
-        if (
-            file.read(25)[17:] == b"\4\0\0\0ros2"
-        ):  # the profile, with its length, is the first field of an MCAP file
-            return _read_ros2(path, topics, partial)
+def _read_mcap(
+    path: Path, topics: tuple[str, ...], partial: bool, stamp: str
+) -> LogFile:
+    bag = None
+    if not has_own_profile(path):
+        bag = read_bag(path, topics, partial, stamp)
+    if bag is not None:
+        return bag
     from gpmpc.recording import read_run
 
     run = read_run(path)
@@ -104,72 +298,22 @@ def _read_mcap(path: Path, topics: tuple[str, ...], partial: bool) -> Streams:
         raise DataError(
             f"{path}: unfinished or damaged; gpmpc log recover rescues it, partial=true takes what is whole"
         )
-    return {"": run.to_pandas()}
+    findings = ()
+    if not run.finished:
+        text = f"{len(run.times)} steps are whole; what came later is lost"
+        findings = (Finding("unfinished", run_name(path), 1, text),)
+    return LogFile({"": run.to_pandas()}, findings)
 
 
-def _read_ros2(path: Path, topics: tuple[str, ...], partial: bool) -> Streams:
-    from mcap.reader import NonSeekingReader
-    from mcap_ros2.decoder import DecoderFactory
-
-    rows: dict[str, list[dict[str, float]]] = {}
-    with path.open("rb") as file:
-        # In the file's order, because the index of a truncated file is lost.
-        reader = NonSeekingReader(file, decoder_factories=[DecoderFactory()])
-        try:
-            for _, channel, message, decoded in reader.iter_decoded_messages(
-                log_time_order=False
-            ):
-                known = rows.setdefault(channel.topic, [])
-                if topics and channel.topic not in topics:
-                    continue
-                header = getattr(decoded, "header", None)
-                stamp = message.log_time / 1e9
-                if header is not None and (header.stamp.sec or header.stamp.nanosec):
-                    stamp = header.stamp.sec + header.stamp.nanosec / 1e9
-                known.append({STAMP: stamp, **dict(_fields(decoded, ""))})
-        except Exception as error:
-            if not (partial and rows):
-                hint = "" if partial else "; partial=true takes what is whole"
-                raise DataError(
-                    f"{path}: the bag cannot be read to its end ({error}){hint}"
-                ) from error
-    return {topic: pd.DataFrame(messages) for topic, messages in rows.items()}
+def _read_ulog(path: Path, topics: tuple[str, ...], partial: bool, _: str) -> LogFile:
+    return read_ulog(path, topics, partial)
 
 
-def _fields(message: Any, prefix: str) -> Iterable[tuple[str, float]]:
-    """The numbers of a ROS message with their paths, such as ("pose.position.x", 1.5)."""
-    for name in message.__slots__:
-        value, path = getattr(message, name), f"{prefix}{name}"
-        if isinstance(value, bool | int | float):
-            yield path, float(value)
-        elif hasattr(value, "__slots__"):
-            yield from _fields(value, f"{path}.")
-        elif isinstance(value, list | tuple | np.ndarray) and len(value) <= 64:
-            for i, entry in enumerate(value):
-                if isinstance(entry, int | float | np.number):
-                    yield f"{path}[{i}]", float(entry)
-
-
-def _read_ulog(path: Path, topics: tuple[str, ...], partial: bool) -> Streams:
-    from pyulog import ULog
-
-    log = ULog(str(path))
-    if log.file_corruption and not partial:
-        raise DataError(f"{path}: damaged; partial=true takes what is whole")
-    streams = {}
-    for data in log.data_list:
-        table = pd.DataFrame(data.data)
-        table[STAMP] = table["timestamp"] * 1e-6
-        streams[
-            data.name if data.multi_id == 0 else f"{data.name}[{data.multi_id}]"
-        ] = table
-    return streams
-
-
-_READERS: dict[str, Callable[[Path, tuple[str, ...], bool], Streams]] = {
+_DELIMITERS = (b",", b";", b"\t")
+_READERS: dict[str, Callable[[Path, tuple[str, ...], bool, str], LogFile]] = {
     ".csv": _read_csv,
     ".tsv": _read_csv,
-    ".parquet": lambda path, *_: {"": pd.read_parquet(path)},
+    ".parquet": _read_parquet,
     ".npz": _read_npz,
     ".mcap": _read_mcap,
     ".ulg": _read_ulog,

@@ -5,8 +5,9 @@ attitude in another order makes every model wrong, and each is visible from the 
 the other's finite differences by least squares.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import reduce
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,6 +16,7 @@ import pandas as pd
 from scipy.ndimage import binary_dilation, maximum_filter1d, minimum_filter1d
 from scipy.spatial.transform import Rotation
 
+from gpmpc._bounds import Room
 from gpmpc.exceptions import DataError
 from gpmpc.logs._dropouts import (
     changes_rarely,
@@ -22,6 +24,7 @@ from gpmpc.logs._dropouts import (
     sentinels,
     zero_dropouts,
 )
+from gpmpc.logs._file import NUMBER, STAMP, Streams, run_name
 from gpmpc.logs._kinematics import (
     Array,
     quaternion_inverse,
@@ -32,7 +35,7 @@ from gpmpc.logs._kinematics import (
 )
 from gpmpc.logs._log import Finding, Log, LogRun
 from gpmpc.logs._mapping import TIME_UNITS, LogMapping, Signal
-from gpmpc.logs._readers import STAMP, Streams, read_streams
+from gpmpc.logs._readers import read_file
 
 REST_TIME = 0.5  # [s] for which nothing moves at rest
 REST_SHARE = 0.1  # of a state's usual spread that counts as no movement
@@ -40,11 +43,20 @@ MOST_HELD = 0.5  # of the rows; beyond, a signal has another rate than its table
 MOST_OUT_OF_ORDER = (
     0.05  # of the rows; beyond, the file does not hold one run in the order of time
 )
+CLOSE = 0.6  # of the usual time step: a row that is closer to another mixes two clocks
+MOST_FIT = 0.9  # of the rows out of order that have to fit, to be sorted
+JUMP = 60.0  # [s] from which a step of time is a jump, if it is also
+JUMP_STEPS = 100  # usual time steps: over neither is anything resampled
 RESOLUTION = 1e-6  # [s] of stamps: float64 seconds since 1970 resolve a quarter of it
 SPAN = 4  # rows on each side of a finite difference: above the noise of one row
 SLOPES = (0.5, 2.0)  # of a signal over the derivative that it should be
 FIT = 0.7  # correlation from which a slope says something
 MOST_ROWS = 20_000
+MOST_RUNS = 100  # in a file, unless each has
+FEWEST_ROWS = 10
+COPIES = 2  # of a grid's values, while signals are put on it
+ORDER_ROWS = "name the column of the runs, or order the rows"
+ORDER_TOPICS = "stamp: log takes the times of the log"
 _RIGID_BODY = [("vector", 3), ("quaternion", 3), ("vector", 3), ("vector", 3)]
 _Note = Callable[
     [str, Any, str], None
@@ -58,7 +70,7 @@ class _Table(NamedTuple):
     time: Array
     values: Array  # states, inputs and context (K, n + m + c)
     outside: np.ndarray  # (K,) rows that the mapping leaves out
-    breaks: np.ndarray  # (K,) rows before which time ran backwards
+    breaks: np.ndarray  # (K,) rows before which time ran backwards, or jumped
     note: _Note
 
 
@@ -72,7 +84,7 @@ def read_log(
     Args:
         files: Each ends in .csv, .csv.gz, .tsv, .parquet, .npz, .mcap (of this package or of ROS 2) or .ulg.
         mapping: What the columns mean: a YAML file, plain data or a ``LogMapping``.
-        partial: Takes what is whole of unfinished recordings.
+        partial: Takes what is whole of unfinished or damaged files; findings say what is lost.
 
     Raises:
         DataError: A file, topic or column is missing or cannot be used; the text says where and why.
@@ -87,44 +99,34 @@ def read_log(
     files = [files] if isinstance(files, str | Path) else list(files)
     findings: list[Finding] = []
     tables: list[_Table] = []
-    for file in map(Path, files):
-        streams = read_streams(
-            file, {signal.topic for signal in mapping.signals}, partial
-        )
-        runs = [(file.name.removesuffix(".gz").rsplit(".", 1)[0], streams)]
-        if mapping.run:
-            table = streams.get("", pd.DataFrame())
-            _check_column(str(file), table, mapping.run)
-            runs = [
-                (f"{runs[0][0]}:{run}", {"": part})
-                for run, part in table.groupby(mapping.run, sort=False)
-            ]
-        for name, parts in runs:
-            if name in {table.name for table in tables}:
+    names: set[str] = set()
+    topics = {signal.topic for signal in mapping.signals}
+    for path in map(Path, files):
+        file = read_file(path, topics, partial, mapping.stamp)
+        findings.extend(file.findings)
+        room = Room(path)
+        for name, streams in _runs(path, file.streams, mapping):
+            if name in names:
                 raise DataError(
                     f"run {name!r} comes from two files: give the files different names"
                 )
+            names.add(name)
 
             def note(kind: str, count: Any, text: str, name: str = name) -> None:
                 if count:
                     findings.append(Finding(kind, name, int(count), text))
 
-            tables.append(
-                _tabulate(
-                    f"{file}, run {name}" if mapping.run else str(file),
-                    name,
-                    parts,
-                    mapping,
-                    note,
-                )
-            )
+            where = f"{path}, run {name}" if mapping.run else str(path)
+            tables.append(_tabulate(where, name, streams, mapping, note, room))
     if not tables:
         raise DataError("no log file was given")
-    step = (
-        1 / mapping.rate
-        if mapping.rate
-        else float(np.median(np.concatenate([np.diff(t.time) for t in tables])))
-    )
+    steps = np.concatenate([np.diff(table.time) for table in tables])
+    if not len(steps):
+        reason = "no two rows have different stamps"
+        if mapping.rate:
+            reason = f"a rate of {mapping.rate:g} Hz leaves a single row"
+        raise DataError(f"{files[0]}: {reason}")
+    step = 1 / mapping.rate if mapping.rate else float(np.median(steps))
     spread = _spread([mapping.split(table.values)[0] for table in tables])
     usable = [
         run
@@ -146,50 +148,57 @@ def read_log(
     return Log(mapping, step, tuple(usable), tuple(findings))
 
 
+def _runs(
+    path: Path, streams: Streams, mapping: LogMapping
+) -> Iterator[tuple[str, Streams]]:
+    """Yields the runs of a file with their names: one, or those that a column names."""
+    if not mapping.run:
+        yield run_name(path), streams
+        return
+    table = streams.get("", pd.DataFrame())
+    _check_column(str(path), table, mapping.run)
+    count = table[mapping.run].nunique()
+    if count > MOST_RUNS and count > len(table) / FEWEST_ROWS:
+        raise DataError(
+            f"{path}: column {mapping.run!r} names {count} runs in {len(table)} rows; "
+            f"a run has {FEWEST_ROWS} at least"
+        )
+    for run, part in table.groupby(mapping.run, sort=False):
+        yield f"{run_name(path)}:{run}", {"": part}
+
+
 def _tabulate(
-    where: str, name: str, streams: Streams, mapping: LogMapping, note: _Note
+    where: str,
+    name: str,
+    streams: Streams,
+    mapping: LogMapping,
+    note: _Note,
+    room: Room,
 ) -> _Table:
     """Puts the signals of a run on one grid of times, in the units and conventions of ``gpmpc.logs``."""
-    stamps, tables = {}, {}
+    stamps: dict[str, Stamps] = {}
+    tables: dict[str, pd.DataFrame] = {}
     labels = {
         signal.topic: f"{where}, {signal.topic}" if signal.topic else where
         for signal in mapping.signals
     }
     for topic, label in labels.items():
-        stamps[topic] = found = ordered_stamps(
-            _time(label, streams[topic], mapping), label
-        )
-        of_topic = f" of {topic}" if topic else ""
+        table = _stamped_rows(topic, streams[topic], note)
+        hint = ORDER_TOPICS if topic else ORDER_ROWS
+        stamps[topic] = ordered_stamps(_time(label, table, mapping), label, hint)
         signals = [signal for signal in mapping.signals if signal.topic == topic]
-        ordered = streams[topic].iloc[found.rows]
+        ordered = table.iloc[stamps[topic].rows]
         tables[topic] = _without_zero_dropouts(label, ordered, signals, note)
-        note(
-            "repeated stamp",
-            found.repeated,
-            f"{found.repeated} rows{of_topic}: left out",
-        )
-        note(
-            "stamp runs backwards",
-            found.backwards,
-            f"{found.backwards} rows{of_topic}: left out",
-        )
+        _note_stamps(topic, stamps[topic], mapping, note)
+    columns = sum(len(signal.group.entries) for signal in mapping.signals)
     if mapping.rate is None:
-        ((grid, breaks),) = (
-            (found.time, found.after_reversal) for found in stamps.values()
-        )
+        (found,) = stamps.values()
+        grid = found.time
+        room.take(_memory(len(grid), columns), f"{len(grid)} rows of {columns} columns")
+        breaks = found.after_reversal.copy()
+        breaks[_jumps(found.time, mapping) + 1] = True
     else:
-        begin = max(found.time[0] for found in stamps.values())
-        end = min(found.time[-1] for found in stamps.values())
-        if not end > begin:
-            raise DataError(
-                f"{where}: the topics {', '.join(stamps)} have no time in common"
-            )
-        grid = (
-            begin
-            + np.arange(int(np.floor((end - begin) * mapping.rate * (1 + 1e-12))) + 1)
-            / mapping.rate
-        )
-        breaks = np.zeros(len(grid), dtype=bool)
+        grid, breaks = _grid(where, stamps, mapping, columns, note, room)
 
     def on_grid(topic: str, values: Array, rule: str, max_gap: float | None) -> Array:
         if mapping.rate is None:
@@ -218,14 +227,135 @@ def _tabulate(
     return _Table(name, grid, np.concatenate(parts, axis=1), outside, breaks, note)
 
 
+def _stamped_rows(topic: str, table: pd.DataFrame, note: _Note) -> pd.DataFrame:
+    """The rows of a topic whose message carries a stamp; all of other tables."""
+    if STAMP not in table:
+        return table
+    stamped = np.isfinite(table[STAMP].to_numpy(dtype=float))
+    count = int((~stamped).sum())
+    note("no stamp", count, f"{count} messages of {topic} without a stamp: left out")
+    if not stamped.any():
+        raise DataError(f"{topic}: no message carries a stamp")
+    return table[stamped]
+
+
+def _note_stamps(topic: str, found: "Stamps", mapping: LogMapping, note: _Note) -> None:
+    """Notes what was wrong with the stamps of a topic."""
+    of_topic = f" of {topic}" if topic else ""
+    for kind, count, what in (
+        ("repeated stamp", found.repeated, "left out"),
+        ("stamp runs backwards", found.backwards, "left out"),
+        ("rows out of order", found.disordered, "sorted by their stamps"),
+    ):
+        note(kind, count, f"{count} rows{of_topic}: {what}")
+    jumps = _jumps(found.time, mapping)
+    if len(jumps):
+        longest = float(np.diff(found.time)[jumps].max())
+        text = (
+            f"{len(jumps)} jumps of the stamps{of_topic} by up to {longest:.6g} s, the "
+            f"first behind row {jumps[0] + 1} of {len(found.time)}: boundaries, the rows"
+            " on both sides are used"
+        )
+        note("jump", len(jumps), text)
+
+
+def _jumps(time: Array, mapping: LogMapping) -> np.ndarray:
+    """Rows (J,) behind which time jumps: by more than any gap within a run."""
+    steps = np.diff(time)
+    if not len(steps):
+        return np.empty(0, dtype=int)
+    longest = max(JUMP, JUMP_STEPS * float(np.median(steps)), mapping.max_gap or 0.0)
+    return np.flatnonzero(steps > longest)
+
+
+def _memory(rows: float, columns: int) -> float:
+    """What a run's rows of all signals take while they are worked on [bytes]."""
+    return rows * columns * COPIES * NUMBER
+
+
+class _Grid(NamedTuple):
+    """Times (G,) [s] in equal steps, in pieces that all topics have in common."""
+
+    time: Array
+    breaks: np.ndarray  # (G,) whether a piece begins
+
+
+def _grid(
+    where: str,
+    stamps: Mapping[str, "Stamps"],
+    mapping: LogMapping,
+    columns: int,
+    note: _Note,
+    room: Room,
+) -> _Grid:
+    """Makes the grid of a run, piece by piece; nothing of it stands over a jump.
+
+    Raises:
+        DataError: The topics have no time in common, or the grid would be too large.
+    """
+    assert mapping.rate is not None
+    pieces = {topic: _pieces(found.time, mapping) for topic, found in stamps.items()}
+    common = reduce(_intersections, pieces.values())
+    if not len(common):
+        hint = ": stamp: log takes the times of the log" if any(stamps) else ""
+        raise DataError(
+            f"{where}: the topics {', '.join(stamps)} have no time in common{hint}"
+        )
+    for topic, of_topic in pieces.items():
+        alone = [piece for piece in of_topic if not _meets(piece, common)]
+        time = stamps[topic].time
+        count = sum(int(((time >= a) & (time <= b)).sum()) for a, b in alone)
+        text = f"{count} rows of {topic} have no time in common with others: left out"
+        note("no time in common", count, text)
+    lengths = np.floor((common[:, 1] - common[:, 0]) * mapping.rate * (1 + 1e-12)) + 1
+    rows = float(lengths.sum())
+    what = f"{rows:.6g} rows of {columns} columns at a rate of {mapping.rate:g} Hz"
+    if (mapping.max_gap or 0.0) > JUMP:
+        what += f", with gaps of up to {mapping.max_gap:g} s (max_gap),"
+    room.take(_memory(rows, columns), what)
+    begins = np.repeat(common[:, 0], lengths.astype(int))
+    firsts = np.r_[0, np.cumsum(lengths)[:-1]].astype(int)
+    numbers = np.arange(len(begins)) - np.repeat(firsts, lengths.astype(int))
+    breaks = np.zeros(len(begins), dtype=bool)
+    breaks[firsts[1:]] = True
+    return _Grid(begins + numbers / mapping.rate, breaks)
+
+
+def _pieces(time: Array, mapping: LogMapping) -> Array:
+    """Begins and ends (P, 2) [s] of the pieces between jumps."""
+    jumps = _jumps(time, mapping)
+    begins = time[np.r_[0, jumps + 1]]
+    ends = time[np.r_[jumps, len(time) - 1]]
+    return np.column_stack([begins, ends])
+
+
+def _intersections(pieces: Array, others: Array) -> Array:
+    """What two lists of pieces (P, 2), in the order of time, have in common (C, 2)."""
+    common = []
+    i, j = 0, 0
+    while i < len(pieces) and j < len(others):
+        begin = max(pieces[i, 0], others[j, 0])
+        end = min(pieces[i, 1], others[j, 1])
+        if begin < end:
+            common.append((begin, end))
+        if pieces[i, 1] < others[j, 1]:
+            i += 1
+        else:
+            j += 1
+    return np.array(common).reshape(-1, 2)
+
+
+def _meets(piece: Array, pieces: Array) -> bool:
+    """Whether a piece (2,) has time in common with one of others (P, 2)."""
+    return bool(((pieces[:, 0] <= piece[1]) & (pieces[:, 1] >= piece[0])).any())
+
+
 def _time(label: str, table: pd.DataFrame, mapping: LogMapping) -> Array:
-    if (
-        not mapping.time and STAMP not in table and mapping.rate
-    ):  # rows without stamps, at a rate that is declared
-        return np.arange(len(table)) / mapping.rate
-    return _numbers(label, table, mapping.time or STAMP) * (
-        TIME_UNITS[mapping.time_unit] if mapping.time else 1.0
-    )
+    column = mapping.time or (STAMP if STAMP in table else "timestamp")
+    if not mapping.time and column not in table and mapping.rate:
+        return np.arange(len(table)) / mapping.rate  # rows at a rate that is declared
+    unit = TIME_UNITS[mapping.time_unit] if mapping.time else 1.0
+    return _numbers(label, table, column) * unit
 
 
 def _without_zero_dropouts(
@@ -382,7 +512,8 @@ def _make_run(
         times
         > (mapping.max_gap if mapping.max_gap and not mapping.rate else 1.5 * step)
     ) | (times < 0.5 * step)
-    inner = times[uneven & (np.diff(rows) == 1)]
+    is_jump = table.breaks[rows[1:]] & (times > JUMP)  # which has its own finding
+    inner = times[uneven & (np.diff(rows) == 1) & ~is_jump]
     if len(inner):
         shortest, longest = inner.min(), inner.max()
         text = (
@@ -415,7 +546,7 @@ def _note_held_sensors(
         if signal.turns:
             continue
         for index, name in enumerate(signal.columns, start=columns.start):
-            others_move = np.delete(motion, index, axis=1).any(axis=1)
+            others_move = np.any(np.delete(motion, index, axis=1), axis=1)
             column = states[:, index]
             frozen = frozen_rows(column, others_move)
             if frozen.any():
@@ -534,17 +665,39 @@ class Stamps(NamedTuple):
         np.ndarray
     )  # (K,) whether rows with earlier stamps stood before this one
     repeated: int
-    backwards: int
+    backwards: int  # rows that are left out because a later stamp stood before
+    disordered: int = 0  # rows that stood behind later ones, and are sorted
 
 
-def ordered_stamps(stamps: Array, where: str) -> Stamps:
-    """Leaves out rows whose stamp is not the latest; ``DataError`` where it is not finite, or 5 % run backwards."""
+def ordered_stamps(stamps: Array, where: str, hint: str = ORDER_ROWS) -> Stamps:
+    """Brings rows into the order of their stamps.
+
+    Rows out of order are sorted if they fit between the others, as messages do that a
+    file holds in another order, or parts on both sides of a clock that was set. Where
+    sorting would mix rows, those whose stamp is not the latest are left out: a stamp is
+    wrong, or a clock was set back.
+
+    Raises:
+        DataError: A stamp is not finite, or 5 % of the rows would be left out.
+    """
     if not np.isfinite(stamps).all():
         row = int(np.argmin(np.isfinite(stamps)))
         raise DataError(
             f"{where}: the time in row {row + 1} is {stamps[row]}; expected a number"
         )
     latest = np.maximum.accumulate(stamps)
+    is_late = np.r_[False, stamps[1:] < latest[:-1]]
+    if is_late.any() and _fit_between(stamps, is_late):
+        order = np.argsort(stamps, kind="stable")
+        is_new = np.r_[True, np.diff(stamps[order]) > 0]
+        return Stamps(
+            order[is_new],
+            stamps[order][is_new],
+            after_reversal=np.zeros(int(is_new.sum()), dtype=bool),
+            repeated=int((~is_new).sum()),
+            backwards=0,
+            disordered=int(is_late.sum()),
+        )
     rises = np.r_[True, stamps[1:] > latest[:-1]]
     repeated = np.r_[False, stamps[1:] == stamps[:-1]] & ~rises
     backwards = ~rises & ~repeated
@@ -552,13 +705,26 @@ def ordered_stamps(stamps: Array, where: str) -> Stamps:
         row = int(np.argmax(backwards))
         raise DataError(
             f"{where}: time runs backwards in row {row + 1} (from {stamps[row - 1]:g} to {stamps[row]:g} s), and "
-            f"{int(backwards.sum())} rows come before the latest stamp: name the column of the runs, or order the rows"
+            f"{int(backwards.sum())} rows come before the latest stamp: {hint}"
         )
     rows = np.flatnonzero(rises)
     reversed_before = np.diff(np.cumsum(backwards)[rows], prepend=0) > 0
     return Stamps(
         rows, stamps[rows], reversed_before, int(repeated.sum()), int(backwards.sum())
     )
+
+
+def _fit_between(stamps: Array, is_late: np.ndarray) -> bool:
+    """Whether late rows, where they are sorted in, are as far from others as usual.
+
+    ``is_late`` (K,) marks rows with an earlier stamp than a row before them.
+    """
+    order = np.argsort(stamps, kind="stable")
+    steps = np.diff(stamps[order])
+    usual = float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
+    nearest = np.minimum(np.r_[np.inf, steps], np.r_[steps, np.inf])
+    fits = nearest[is_late[order]] >= CLOSE * usual
+    return usual > 0 and float(fits.mean()) >= MOST_FIT
 
 
 def resample(

@@ -30,17 +30,13 @@ from mcap.records import (
 )
 from mcap.writer import MCAP0_MAGIC
 
+from gpmpc._bounds import LARGEST, room
 from gpmpc.exceptions import RecordingError
 
 CONFIG, RECOVERED = (
     "config.yaml",
     "recovered",
 )  # an attachment; metadata of a file that holds what was left of another
-LARGEST = 32 * 2**20  # of a record or an unfolded chunk [bytes]
-_ROOM, _RATIO = (
-    64 * 2**20,
-    300,
-)  # [bytes], and bytes a byte of the file; runs are compressed 2 to 10 times
 _HEAD = struct.Struct("<BQ")  # kind and length
 _PARSED = Schema, Channel, Message, Chunk, Attachment, Metadata
 _KINDS: dict[Opcode, Any] = {Opcode[one.__name__.upper()]: one for one in _PARSED}
@@ -52,11 +48,6 @@ _BROKEN = (
     zstandard.ZstdError,
     RuntimeError,
 )
-
-
-def room(path: Path) -> int:
-    """Bounds the memory that a file's content may take [bytes]; a recording of this size holds far less."""
-    return _ROOM + _RATIO * path.stat().st_size
 
 
 def whole_records(path: Path) -> Iterator[McapRecord]:

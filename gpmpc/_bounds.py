@@ -1,0 +1,42 @@
+"""Bounds the memory that a file's content may take, so that a small file cannot ask for all of it."""
+
+from pathlib import Path
+
+from gpmpc.exceptions import DataError
+
+LARGEST = 32 * 2**20  # of a record or an unfolded chunk of a recording [bytes]
+_ROOM = 64 * 2**20  # [bytes]
+_RATIO = 300  # bytes a byte of the file; recordings are compressed 2 to 10 times
+
+
+def room(path: Path) -> int:
+    """Bounds the memory that a file's content may take [bytes].
+
+    Recordings and logs of this size hold far less.
+    """
+    return _ROOM + _RATIO * path.stat().st_size
+
+
+class Room:
+    """What is left of the memory that a file's content may take.
+
+    Readers take from it before they allocate. What costs time and hardly any memory,
+    such as records that are skipped, is counted as memory too: so time is bounded as
+    well.
+    """
+
+    def __init__(self, path: Path):
+        self.path = path
+        self.size = room(path)  #: [bytes]
+        self.left = float(self.size)  #: [bytes]
+
+    def take(self, size: float, what: str) -> None:
+        """Takes ``size`` bytes for ``what``; ``DataError`` where fewer are left."""
+        self.left -= size
+        if self.left < 0:
+            file_size = self.path.stat().st_size / 1e6
+            raise DataError(
+                f"{self.path}: {what} would take more than the {self.size / 1e6:.0f} MB"
+                f" that a file of {file_size:.3g} MB may take; a log that is so large"
+                " is read in parts, or uncompressed"
+            )

@@ -1,0 +1,121 @@
+"""Says how the messages of a bag's channel are read: ROS 2, JSON, or protobuf."""
+
+import json
+from collections.abc import Callable, Iterable
+from typing import Any
+
+from mcap.records import Channel, Schema
+
+from gpmpc._bounds import Room
+from gpmpc.exceptions import GpmpcError
+from gpmpc.logs._file import MOST_COLUMNS
+from gpmpc.logs._ros2 import LISTED, Cells, Decode, ros2_decoder
+
+_Fields = Iterable[tuple[str, Any]]
+_LONGEST = 4 * 2**20  # of a message in JSON or protobuf [bytes]
+READ = "cdr with ros2msg, json, and protobuf are"
+
+
+def decoder(channel: Channel, schema: Schema | None, room: Room) -> Decode:
+    """Returns what reads the numbers of a channel's messages with their paths.
+
+    Raises:
+        ValueError: Messages of this kind are not read; the text says why.
+    """
+    message, definition = channel.message_encoding, schema.encoding if schema else ""
+    try:
+        if message == "cdr" and schema and definition == "ros2msg":
+            text = schema.data.decode()
+            return ros2_decoder(schema.name, text, room)
+        if message == "json":
+            return _json
+        if message == "protobuf" and schema and definition == "protobuf":
+            return _protobuf_decoder(schema)
+    except GpmpcError:
+        raise
+    except ImportError as error:
+        raise ValueError(f"it needs pip install 'gpmpc[logs]' ({error})") from error
+    except Exception as error:  # whatever a library raises on a definition
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise ValueError(f"its definition cannot be read ({reason})") from error
+    described = f"{message or 'nothing'} with {definition or 'no definition'}"
+    raise ValueError(f"it is encoded as {described}, which is not read; {READ}")
+
+
+def _json(data: bytes) -> Cells:
+    _check_length(data)
+    content = json.loads(data)
+    if not isinstance(content, dict):
+        raise ValueError(f"it is {type(content).__name__} in JSON; expected an object")
+    cells: Cells = {}
+    _collect(content, "", cells, _json_fields)
+    return cells
+
+
+def _protobuf_decoder(schema: Schema) -> Decode:
+    from mcap_protobuf.decoder import DecoderFactory
+
+    parse = DecoderFactory().decoder_for("protobuf", schema)
+    if parse is None:
+        raise ValueError("it is no set of file descriptors")
+
+    def decode(data: bytes) -> Cells:
+        _check_length(data)
+        cells: Cells = {}
+        _collect(parse(data), "", cells, _protobuf_fields)
+        return cells
+
+    return decode
+
+
+def _json_fields(value: Any) -> _Fields | None:
+    """The fields of an object; None of what is none."""
+    return value.items() if isinstance(value, dict) else None
+
+
+def _protobuf_fields(value: Any) -> _Fields | None:
+    """The fields of a message, and of those inside it that are set.
+
+    Numbers that are not set are zero, as everywhere in protobuf. None of what is no
+    message.
+    """
+    if not hasattr(value, "DESCRIPTOR"):
+        return None
+    fields = ((f.name, getattr(value, f.name)) for f in value.DESCRIPTOR.fields)
+    return (
+        (name, content)
+        for name, content in fields
+        if not hasattr(content, "DESCRIPTOR") or value.HasField(name)
+    )
+
+
+def _collect(
+    message: Any,
+    prefix: str,
+    cells: Cells,
+    fields_of: Callable[[Any], _Fields | None],
+) -> None:
+    """Collects the numbers of a message and of those inside it."""
+    for name, value in fields_of(message) or ():
+        path = f"{prefix}{name}"
+        if isinstance(value, bool | int | float):
+            cells[path] = float(value)
+        elif fields_of(value) is not None:
+            _collect(value, f"{path}.", cells, fields_of)
+        elif _is_short_list(value):
+            for i, entry in enumerate(value):
+                if isinstance(entry, bool | int | float):
+                    cells[f"{path}[{i}]"] = float(entry)
+        if len(cells) > MOST_COLUMNS:
+            raise ValueError(f"it holds more than {MOST_COLUMNS} numbers")
+
+
+def _is_short_list(value: Any) -> bool:
+    is_text = isinstance(value, str | bytes)
+    is_map = hasattr(value, "keys")  # of protobuf
+    return hasattr(value, "__len__") and not (is_text or is_map or len(value) > LISTED)
+
+
+def _check_length(data: bytes) -> None:
+    if len(data) > _LONGEST:
+        raise ValueError(f"it has {len(data)} bytes; {_LONGEST} at most are read")

@@ -1,0 +1,219 @@
+"""Reads the numbers of ROS 2 messages (CDR) by their definitions.
+
+The work is bounded by a message's own bytes: what its definition declares is counted
+before anything is read, and lists of messages are walked over without being kept.
+Sources: the OMG's CDR (DDSI-RTPS 2.5, section 10; DDS-XTYPES 1.3, section 7.4) and
+https://docs.ros.org/en/rolling/Concepts/Basic/About-Interfaces.html.
+"""
+
+import re
+import struct
+from collections.abc import Callable
+from typing import NamedTuple
+
+from gpmpc._bounds import Room
+from gpmpc.logs._file import MOST_COLUMNS, TEXT
+
+LISTED = 64  # entries of a list that become columns, at most
+_STEP = 1024  # of a step of a plan [bytes]
+_CODES = {  # of ``struct``, by the names of primitive types
+    "bool": "?",
+    "byte": "B",
+    "char": "B",
+    "float32": "f",
+    "float64": "d",
+    "int8": "b",
+    "uint8": "B",
+    "int16": "h",
+    "uint16": "H",
+    "int32": "i",
+    "uint32": "I",
+    "int64": "q",
+    "uint64": "Q",
+}
+_TIMES = "int32 sec\nuint32 nanosec"
+_BUILTIN = {
+    "builtin_interfaces/Time": _TIMES,
+    "builtin_interfaces/Duration": _TIMES,
+}
+_SEPARATOR = re.compile(r"^={3,}\s*$", re.MULTILINE)
+_TITLE = re.compile(r"^\s*MSG:\s*(\S+)\s*$", re.MULTILINE)
+_CONSTANT = re.compile(r"^\S+\s+[A-Za-z]\w*\s*=")
+_FIELD = re.compile(r"^([\w/]+)(<=\d+)?(\[(<=)?(\d*)\])?\s+([A-Za-z]\w*)")
+_PLAIN_CDR = {0: ">", 1: "<"}  # byte order, by the kind of encapsulation
+
+Cells = dict[str, float]
+Decode = Callable[[bytes], Cells]
+
+
+class _Step(NamedTuple):
+    """One thing that stands in a message: numbers, texts, or a list of messages."""
+
+    path: str  # such as "pose.position.x"
+    type: str  # a primitive one, "string", or the name of a message
+    count: int | None  # of a fixed list; None: a single value
+    counted: bool = False  # whether the list's length stands before it
+
+
+def ros2_decoder(name: str, definition: str, room: Room) -> Decode:
+    """Returns what reads the numbers of a message with their paths.
+
+    Args:
+        name: Of the type, such as "geometry_msgs/msg/Pose".
+        definition: Its text with those of the types inside it.
+        room: Of the file; plans and what is walked over are taken from it.
+
+    Raises:
+        ValueError: The definition is not complete, or holds what cannot be read.
+    """
+    types = _definitions(name, definition)
+    plans: dict[str, list[_Step]] = {}
+
+    def plan(type_name: str) -> list[_Step]:
+        if type_name not in plans:
+            plans[type_name] = _flat(type_name, types)
+            room.take(_STEP * len(plans[type_name]), f"the message {type_name}")
+        return plans[type_name]
+
+    whole = plan(_short(name))
+    return lambda data: _Message(data, plan, room).numbers(whole)
+
+
+def _definitions(name: str, text: str) -> dict[str, str]:
+    """The definitions of a text, by the short names of their types."""
+    types = dict(_BUILTIN)
+    for number, part in enumerate(_SEPARATOR.split(text)):
+        title = _TITLE.search(part)
+        if title:
+            types[_short(title[1])] = _TITLE.sub("", part, count=1)
+        elif number == 0:
+            types[_short(name)] = part
+    return types
+
+
+def _short(name: str) -> str:
+    """The name of a type without the folder that ROS 2 puts into it."""
+    return name.replace("/msg/", "/")
+
+
+def _fields(type_name: str, text: str) -> list[_Step]:
+    package = type_name.rpartition("/")[0]
+    fields = []
+    for line in text.splitlines():
+        line = line.partition("#")[0].strip()
+        if not line or _CONSTANT.match(line):
+            continue
+        field = _FIELD.match(line)
+        if not field:
+            raise ValueError(f"the definition of {type_name} has a line {line[:60]!r}")
+        kind, _, brackets, at_most, size, field_name = field.groups()
+        if kind in ("time", "duration"):
+            kind = f"builtin_interfaces/{kind.title()}"
+        elif kind not in _CODES and kind not in ("string", "wstring"):
+            kind = _short(kind if "/" in kind else f"{package}/{kind}")
+        counted = bool(brackets) and (bool(at_most) or not size)
+        fixed = bool(brackets) and not counted
+        if fixed and not int(size):
+            raise ValueError(f"{type_name} has a list {field_name!r} of length 0")
+        fields.append(_Step(field_name, kind, int(size) if fixed else None, counted))
+    return fields
+
+
+def _flat(type_name: str, types: dict[str, str]) -> list[_Step]:
+    """The steps of a message and of the messages inside it, one after the other."""
+    steps: list[_Step] = []
+    numbers = 0
+    fields: dict[str, list[_Step]] = {}
+
+    def add(name: str, prefix: str, outer: tuple[str, ...]) -> None:
+        nonlocal numbers
+        if name not in types:
+            raise ValueError(f"the definition of {name} is missing")
+        if name in outer:
+            raise ValueError(f"a message of type {name} holds itself")
+        if name not in fields:
+            # A message without fields has a byte: IDL knows no empty structures.
+            empty = _Step("", "empty", None)
+            fields[name] = _fields(name, types[name]) or [empty]
+        for field in fields[name]:
+            is_list = field.counted or field.count is not None
+            is_message = field.type in types or "/" in field.type
+            if is_message and not is_list:
+                add(field.type, f"{prefix}{field.path}.", (*outer, name))
+                continue
+            steps.append(field._replace(path=f"{prefix}{field.path}"))
+            numbers += min(field.count or 1, LISTED)
+            if numbers > MOST_COLUMNS:
+                raise ValueError(f"{type_name} holds more than {MOST_COLUMNS} numbers")
+
+    add(type_name, "", ())
+    return steps
+
+
+class _Message:
+    """The bytes of a message, and how far they were read."""
+
+    def __init__(self, data: bytes, plan: Callable[[str], list[_Step]], room: Room):
+        if len(data) < 4:
+            raise ValueError(f"it has {len(data)} bytes, fewer than its head")
+        kind = data[0] * 256 + data[1]
+        if kind not in _PLAIN_CDR:
+            raise ValueError(
+                f"its encapsulation is {kind:#06x} (XCDR2 or a list of parameters); "
+                "only plain CDR is read"
+            )
+        self.data = data
+        self.plan = plan
+        self.room = room
+        self.order = _PLAIN_CDR[kind]
+        self.position = 4
+
+    def numbers(self, plan: list[_Step]) -> Cells:
+        """Reads all numbers but those of lists of more than ``LISTED`` entries."""
+        cells: Cells = {}
+        for step in plan:
+            values = self.values(step)
+            if step.counted or step.count is not None:
+                for i, value in enumerate(values):
+                    cells[f"{step.path}[{i}]"] = float(value)
+            elif values:
+                cells[step.path] = float(values[0])
+        return cells
+
+    def values(self, step: _Step) -> tuple[float, ...]:
+        """Moves over a step; its numbers, if it has some and they are not many."""
+        count = 1 if step.count is None else step.count
+        if step.counted:
+            count = self.scalars("I", 1)[0]
+        if step.type == "empty":
+            self.scalars("B", 1)
+            return ()
+        if step.type in _CODES:
+            return self.scalars(_CODES[step.type], count)
+        if step.type == "wstring":
+            raise ValueError(f"{step.path} is a wstring, which is not read")
+        if count > len(self.data) - self.position:  # each has a byte at least
+            raise ValueError(f"it ends within {step.path}")
+        if step.type == "string":
+            self.room.take(TEXT * count, "the texts of its messages")
+            for _ in range(count):
+                self.scalars("B", self.scalars("I", 1)[0])
+            return ()
+        inner = self.plan(step.type)
+        self.room.take(TEXT * count * len(inner), "the lists of its messages")
+        for _ in range(count):
+            for inner_step in inner:
+                self.values(inner_step)
+        return ()
+
+    def scalars(self, code: str, count: int) -> tuple[float, ...]:
+        """Reads so many numbers of one kind; only moves over more than ``LISTED``."""
+        size = struct.calcsize(f"={code}")
+        begin = 4 + -(-(self.position - 4) // size) * size if count else self.position
+        end = begin + size * count
+        if end > len(self.data):
+            raise ValueError(f"it ends after {len(self.data)} bytes, within its fields")
+        self.position = end
+        if count > LISTED:
+            return ()
+        return struct.unpack_from(f"{self.order}{count}{code}", self.data, begin)

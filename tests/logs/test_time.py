@@ -1,0 +1,247 @@
+"""Rows stand in the order of their stamps, and nothing is carried over a jump."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+sys.path.append(str(Path(__file__).resolve().parents[2]))
+from gpmpc.exceptions import DataError, SettingError
+from gpmpc.logs import LogMapping, inspect_log, read_log
+from tests.logs import strange
+from tests.logs.strange import BAG_MAPPING, BEGIN, STEP, TABLE_MAPPING
+
+TEN_DAYS = 864_000.0
+ROWS = 400
+
+
+def kinds(log):
+    return {finding.kind: finding.count for finding in log.findings}
+
+
+def texts(log):
+    return " ".join(finding.text for finding in log.findings)
+
+
+def set_by_ntp(stamps):
+    """Of a clock that began at 5 s and was set after 50 messages."""
+    return np.r_[5 + STEP * np.arange(50), stamps[50:]]
+
+
+def with_a_last_stamp(stamps):
+    return np.r_[stamps[:-1], 2_147_483_647.0]
+
+
+def ten_days_on(stamps):
+    return stamps + TEN_DAYS * (np.arange(len(stamps)) >= 200)
+
+
+def ten_days_back(stamps):
+    return stamps - TEN_DAYS * (np.arange(len(stamps)) >= 200)
+
+
+JUMPS = [  # rows before and after, by the time that comes first
+    (set_by_ntp, 50, 350),
+    (with_a_last_stamp, 399, 1),
+    (ten_days_on, 200, 200),
+    (ten_days_back, 200, 200),
+]
+
+
+@pytest.mark.parametrize("rate", [None, 50])
+@pytest.mark.parametrize(("change", "before", "after"), JUMPS)
+def test_both_sides_of_a_jump_are_used_and_nothing_goes_over_it(
+    tmp_path, change, before, after, rate
+):
+    table = strange.pendulum(ROWS)
+    table["t"] = change(BEGIN + table["t"].to_numpy())
+    table.to_csv(tmp_path / "arm.csv", index=False)
+    log = read_log(tmp_path / "arm.csv", {**TABLE_MAPPING, "rate": rate})
+    (run,) = log
+    assert kinds(log)["jump"] == 1
+    assert f"behind row {before} of {ROWS}" in texts(log)
+    # A grid may leave out the last row of a piece, and a piece of a single row.
+    assert abs(run.pieces[0][1] - before) <= 1
+    assert abs(len(run) - run.pieces[0][1] - after) <= 1
+    assert np.diff(run.time[run.begins[0] : run.pieces[0][1]]).max() < 1.5 * STEP
+
+
+def test_a_bag_whose_clock_was_set_has_the_pieces_of_both_topics(tmp_path):
+    topics = strange.pendulum_topics(ROWS)
+    for name, topic in topics.items():
+        topics[name] = topic._replace(stamps=set_by_ntp(topic.stamps))
+    log = read_log(strange.write_bag(tmp_path / "arm.mcap", topics), BAG_MAPPING)
+    (run,) = log
+    assert [end - begin for begin, end in run.pieces] == [50, 350]
+    np.testing.assert_allclose(
+        run.states[:, 0], strange.pendulum(ROWS)["angle"], atol=1e-6
+    )
+    assert texts(log).count("by up to 1.7e+09 s, the first behind row 50 of 400") == 2
+
+
+def test_what_one_topic_holds_alone_is_counted(tmp_path):
+    topics = strange.pendulum_topics(ROWS)
+    stamps = set_by_ntp(topics["/arm"].stamps)
+    topics["/arm"] = topics["/arm"]._replace(stamps=stamps)
+    topics["/motor"] = topics["/motor"]._replace(stamps=None)
+    log = read_log(strange.write_bag(tmp_path / "arm.mcap", topics), BAG_MAPPING)
+    assert kinds(log) == {"jump": 1, "no time in common": 50}
+    assert 349 <= len(log) <= 350
+
+
+@pytest.mark.parametrize("rate", [None, 50])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_rows_out_of_order_are_sorted_and_none_is_thrown_away(tmp_path, rate, seed):
+    table = strange.pendulum(ROWS)
+    order = np.random.default_rng(seed).permutation(ROWS)
+    if seed:
+        order = np.arange(ROWS)
+        order[100:103] = [102, 100, 101]
+    mapping = {**TABLE_MAPPING, "rate": rate}
+    table.to_csv(tmp_path / "sorted.csv", index=False)
+    table.iloc[order].to_csv(tmp_path / "mixed.csv", index=False)
+    expected = read_log(tmp_path / "sorted.csv", mapping)
+    log = read_log(tmp_path / "mixed.csv", mapping)
+    np.testing.assert_array_equal(log.runs[0].states, expected.runs[0].states)
+    assert log.runs[0].begins == (0,)
+    assert list(kinds(log)) == ["rows out of order"]
+
+
+def test_messages_in_any_order_are_the_bag_that_they_are(tmp_path):
+    topics = strange.pendulum_topics(ROWS)
+    expected = read_log(strange.write_bag(tmp_path / "a.mcap", topics), BAG_MAPPING)
+    shuffled = np.random.default_rng(0).permutation
+    for order in (shuffled, lambda count: range(count - 1, -1, -1)):
+        path = strange.write_bag(tmp_path / "b.mcap", topics, order=order)
+        log = read_log(path, BAG_MAPPING)
+        np.testing.assert_array_equal(log.runs[0].states, expected.runs[0].states)
+
+
+def test_messages_that_arrive_late_are_sorted_by_their_stamps(tmp_path):
+    rng = np.random.default_rng(0)
+    topics = strange.pendulum_topics(ROWS)
+    for name, topic in topics.items():
+        late = topic.log_times + rng.uniform(0, 0.05, ROWS)
+        topics[name] = topic._replace(log_times=late)
+    log = read_log(strange.write_bag(tmp_path / "arm.mcap", topics), BAG_MAPPING)
+    assert (len(log), len(log.runs[0].begins)) == (ROWS, 1)
+    assert list(kinds(log)) == ["rows out of order"]
+
+
+def test_a_clock_that_was_set_back_into_the_log_is_named_with_a_way_out(tmp_path):
+    topics = strange.pendulum_topics(ROWS)
+    for name, topic in topics.items():
+        stamps = topic.stamps - 2.0 * (np.arange(ROWS) >= 200)
+        topics[name] = topic._replace(stamps=stamps)
+    path = strange.write_bag(tmp_path / "arm.mcap", topics)
+    with pytest.raises(
+        DataError, match="runs backwards in row 201 .* stamp: log takes"
+    ):
+        read_log(path, BAG_MAPPING)
+    assert len(read_log(path, {**BAG_MAPPING, "stamp": "log"})) == ROWS
+
+
+def test_a_simulated_clock_that_begins_at_zero_is_a_clock(tmp_path):
+    topics = strange.pendulum_topics(ROWS)
+    for name, topic in topics.items():
+        topics[name] = topic._replace(stamps=STEP * np.arange(ROWS))
+    log = read_log(strange.write_bag(tmp_path / "arm.mcap", topics), BAG_MAPPING)
+    assert (len(log), kinds(log)) == (ROWS, {})
+    np.testing.assert_allclose(log.runs[0].time, STEP * np.arange(ROWS), atol=1e-9)
+
+
+@pytest.mark.parametrize("stuck", [0.0, 7.0])
+def test_headers_that_nobody_stamps_count_as_none(tmp_path, stuck):
+    topics = strange.pendulum_topics(ROWS)
+    for name, topic in topics.items():
+        topics[name] = topic._replace(stamps=np.full(ROWS, stuck))
+    log = read_log(strange.write_bag(tmp_path / "arm.mcap", topics), BAG_MAPPING)
+    assert len(log) == ROWS
+    assert log.runs[0].time[0] == BEGIN
+
+
+def test_topics_with_and_without_a_header_have_time_in_common(tmp_path):
+    topics = strange.pendulum_topics(ROWS)
+    topics["/motor"] = topics["/motor"]._replace(stamps=None)
+    path = strange.write_bag(tmp_path / "arm.mcap", topics)
+    log = read_log(path, BAG_MAPPING)  # the headers' clock is the log's
+    assert (len(log), kinds(log)) == (ROWS - 1, {})
+    times = STEP * np.arange(ROWS)  # now it is not
+    topics["/arm"] = topics["/arm"]._replace(stamps=times)
+    path = strange.write_bag(tmp_path / "arm.mcap", topics)
+    log = read_log(path, BAG_MAPPING)
+    assert (len(log), kinds(log)) == (ROWS, {"times of the log": 1})
+    assert "-1.7e+09 s off the clock of /motor" in texts(log)
+    with pytest.raises(DataError, match="stamp: header, but the messages of /motor"):
+        read_log(path, {**BAG_MAPPING, "stamp": "header"})
+
+
+def test_topics_of_two_clocks_take_the_times_of_the_log_unless_told(tmp_path):
+    topics = strange.pendulum_topics(ROWS)
+    stamps = topics["/arm"].stamps - 5.0
+    topics["/arm"] = topics["/arm"]._replace(stamps=stamps)
+    path = strange.write_bag(tmp_path / "arm.mcap", topics)
+    log = read_log(path, BAG_MAPPING)
+    assert (len(log), kinds(log)) == (ROWS, {"times of the log": 1})
+    by_header = read_log(path, {**BAG_MAPPING, "stamp": "header"})
+    assert len(by_header) == 150  # of 8 s, less the 5
+    far = topics["/arm"]._replace(stamps=stamps - 1e6)
+    path = strange.write_bag(tmp_path / "far.mcap", topics | {"/arm": far})
+    with pytest.raises(DataError, match="have no time in common: stamp: log takes"):
+        read_log(path, {**BAG_MAPPING, "stamp": "header"})
+
+
+def test_a_simulation_slower_than_the_log_keeps_its_stamps(tmp_path):
+    topics = strange.pendulum_topics(ROWS)
+    for name, topic in topics.items():
+        slow = BEGIN + 3 * (topic.log_times - BEGIN)
+        topics[name] = topic._replace(log_times=slow, stamps=topic.log_times - BEGIN)
+    motor = topics["/motor"]
+    topics["/motor"] = motor._replace(
+        columns={"torque": motor.columns["torque"][300:]},
+        log_times=motor.log_times[300:],
+        stamps=motor.stamps[300:],
+    )
+    log = read_log(strange.write_bag(tmp_path / "arm.mcap", topics), BAG_MAPPING)
+    assert (len(log), kinds(log)) == (100, {})
+    assert log.runs[0].time[0] == pytest.approx(6.0)
+
+
+def test_messages_without_the_stamp_of_the_others_are_counted(tmp_path):
+    topics = strange.pendulum_topics(ROWS, encoding="json")
+    path = strange.write_bag(tmp_path / "arm.mcap", topics)
+    whole = path.read_bytes()
+    path.write_bytes(whole)
+    stamps = topics["/arm"].stamps.astype(object)
+    stamps[100] = None
+    topics["/arm"] = topics["/arm"]._replace(stamps=stamps)
+    log = read_log(strange.write_bag(path, topics), BAG_MAPPING)
+    assert kinds(log) == {"no stamp": 1}
+    assert len(log) == ROWS
+
+
+def test_a_table_of_one_time_is_refused(tmp_path):
+    strange.pendulum(ROWS).assign(t=1.0).to_csv(tmp_path / "arm.csv", index=False)
+    with pytest.raises(DataError, match="no two rows have different stamps"):
+        read_log(tmp_path / "arm.csv", TABLE_MAPPING)
+
+
+def test_a_mapping_says_which_stamps_it_takes():
+    states = {"angle": ["angle"]}
+    assert LogMapping.from_dict({"states": states, "stamp": "log"}).stamp == "log"
+    with pytest.raises(SettingError, match="stamp: must be one of '', 'header', 'log'"):
+        LogMapping.from_dict({"states": states, "stamp": "both"})
+    with pytest.raises(SettingError, match="stamp: has no effect where time names"):
+        LogMapping.from_dict({"states": states, "stamp": "log", "time": "t"})
+
+
+def test_an_inspection_reads_bags_in_any_order_and_what_is_whole(tmp_path):
+    topics = strange.pendulum_topics(ROWS)
+    path = strange.write_bag(
+        tmp_path / "arm.mcap", topics, order=np.random.default_rng(0).permutation
+    )
+    path.write_bytes(path.read_bytes()[:-1500])
+    found = inspect_log(path)
+    assert list(found.streams["backward stamps"]) == [0, 0]
+    assert any(warning.startswith("damaged: ") for warning in found.warnings)
