@@ -52,15 +52,19 @@ from gpmpc.logs._log import Finding, LogRun
 from gpmpc.logs._mapping import DEGREE, UNITS, LogMapping, Signal
 
 _RIGID_BODY = [("vector", 3), ("quaternion", 3), ("vector", 3), ("vector", 3)]
-HALF_WINDOW = 0.05  # [s] on each side of the middle of a window
+HALF_WINDOW = 0.1  # [s] on each side of the middle of a window
+HALF_SHORT = 0.03  # [s] likewise, of a body that turns fast
+FAST = 1.5  # [rad] within a window that is turning fast
 HALF_WIDE = 0.1  # [s] of the windows of accelerations, which are noisier
-WINDOWS = 1500  # of a run that are looked at
+WINDOWS = 800  # of a run that are looked at
 FEWEST = 50  # windows that say something
 LIKELY = 12  # readings of the position that are tried with a velocity in body axes
 LONGEST_LAG = 0.8  # [s] that is sought
 LAG_STEP = 0.02  # [s] from one lag to the next
 QUANTILES = (0.5, 0.75, 0.9, 0.97, 0.99)  # of absolute values
-FITS = 0.5  # misfit below which an axis fits
+FITS = 0.75  # misfit below which an axis may fit
+HALF = 0.5  # of the claim's misfit, which a better reading has to stay below
+DOUBTFUL = 0.2  # misfit from which another reading is looked for
 BAD = 0.8  # misfit from which an axis fits badly
 TILT_FITS = 0.6  # likewise of the third relation, which drag disturbs
 TILT_MOVES = 0.3  # [m/s2] of the horizontal force from which it is looked at
@@ -74,7 +78,7 @@ UNRELATED = (
     0.5  # correlation below which two signals have nothing to do with each other
 )
 # Misfits below these are noise or smoothing, and no reason to prefer a reading.
-_FLOOR_VELOCITY, _FLOOR_RATE, _FLOOR_TILT = 0.05, 0.1, 0.3
+_FLOOR_VELOCITY, _FLOOR_RATE, _FLOOR_TILT = 0.05, 0.1, 0.1
 _LENGTHS = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "km": 1e3, "ft": 0.3048, "in": 0.0254}
 _SPEEDS = {
     "m/s": 1.0,
@@ -188,6 +192,8 @@ class _Windows(NamedTuple):
 def _cut_windows(runs: Sequence[LogRun], step: float, claim: _Claim) -> _Windows | None:
     """Windows that lie inside a piece each; None where there are too few."""
     half = max(round(HALF_WINDOW / step), 1)
+    if _turns_fast(runs, half):
+        half = max(round(HALF_SHORT / step), 1)
     wide = max(round(HALF_WIDE / step), half)
     starts = [run.starts(wide, wide) for run in runs]
     count = sum(len(rows) for rows in starts)
@@ -245,6 +251,17 @@ def _cut_windows(runs: Sequence[LogRun], step: float, claim: _Claim) -> _Windows
         wide_velocities=wide_velocities,
         wide_duration=2 * wide * step,
     )
+
+
+def _turns_fast(runs: Sequence[LogRun], half: int) -> bool:
+    """Whether turns within windows come near to half a turn, and cannot be told."""
+    angles = []
+    for run in runs:
+        rows = run.starts(half, half)
+        ends = run.states[rows - half, 3:7], run.states[rows + half, 3:7]
+        cosines = np.abs((ends[0] * ends[1]).sum(axis=1))
+        angles.append(2 * np.arccos(np.minimum(cosines, 1.0)))
+    return float(np.quantile(np.concatenate(angles), 0.99)) > FAST
 
 
 def _moving_mean(values: Array, half: int) -> Array:
@@ -433,6 +450,7 @@ class _Series(NamedTuple):
     later: Array  # (L, N, 3); NaN beyond the piece
     clipped: Array  # likewise, centred and without glitches; 0 beyond the piece
     inside: np.ndarray  # (L, N)
+    squares: Array  # sums of squares of the clipped ones (L, 3)
 
 
 def _series(lags: Array, later: Array) -> _Series:
@@ -441,7 +459,8 @@ def _series(lags: Array, later: Array) -> _Series:
     low, high = np.nanquantile(now, [0.01, 0.99], axis=0)
     clipped = np.clip(later, low, high) - np.nanmedian(now, axis=0)
     clipped[~inside] = 0.0
-    return _Series(lags, later, clipped, inside)
+    squares = np.square(clipped).sum(axis=1)
+    return _Series(lags, later, clipped, inside, squares)
 
 
 def _correlations(series: _Series, derived: Array) -> Array:
@@ -449,7 +468,7 @@ def _correlations(series: _Series, derived: Array) -> Array:
     low, high = np.quantile(derived, [0.01, 0.99], axis=0)
     derived = np.clip(derived, low, high) - np.median(derived, axis=0)
     products = np.swapaxes(series.clipped, 1, 2) @ derived
-    own = np.square(series.clipped).sum(axis=1)[:, :, None]
+    own = series.squares[:, :, None]
     others = (series.inside.astype(float) @ np.square(derived))[:, None, :]
     scale = np.sqrt(own * others)
     correlations = np.divide(
@@ -523,6 +542,14 @@ def _attitude_changes(claim: _Claim) -> list[_AttitudeChange]:
         for change in columns[:2]
         for turn in turns
     ]
+    first, second = columns[:2]
+    changes.append(
+        _AttitudeChange(
+            f"{first.advice}; and {second.advice}",
+            first.cost + second.cost,
+            _chain(first.attitudes, second.attitudes, to_enu),
+        )
+    )
     return changes
 
 
@@ -773,7 +800,7 @@ class _Search:
         attitude = self.attitudes[0]
         velocity = _Fit(misfits=misfits(*self._velocities(attitude, self._frames[0])))
         rate = _Fit(misfits=misfits(*self._rates(attitude, self._frames[1])))
-        reading = self._reading(
+        return self._reading(
             attitude=attitude,
             position=np.eye(3),
             velocity=replace(velocity, score=_score(velocity, _FLOOR_VELOCITY)),
@@ -781,7 +808,6 @@ class _Search:
             velocity_frame=self._frames[0],
             rate_frame=self._frames[1],
         )
-        return reading
 
     def relations(self) -> tuple[_Relation, _Relation]:
         """The first two relations, as the mapping claims them."""
@@ -916,7 +942,7 @@ class _Search:
         if _fits_tilt(tilt):
             score += float(np.nansum(np.log(np.maximum(tilt, _FLOOR_TILT))))
         if lift < 0:
-            score += CHANGE / 2  # a body that hangs from its own top is rare
+            score += CHANGE  # a body that hangs from its own top is rare
         return replace(reading, cost=cost, score=score)
 
     def _body_axis(self, attitude: _AttitudeChange) -> Array:
@@ -930,33 +956,40 @@ class _Search:
     def _cost(self, reading: _Reading) -> float:
         """The number of mistakes; one that several signals share counts once."""
         if self.is_other_frame(reading):
-            return 1.0
+            return 0.5  # the commonest, and one that looks like others
         claim = self.claim
         cost = reading.attitude.cost + reading.rate.cost
         cost += reading.velocity_frame != claim.velocity_frame
         cost += reading.rate_frame != claim.rate_frame
-        unit = abs(np.linalg.det(reading.position)) ** (1 / 3)
-        position = reading.position / unit
-        cost += _cost(position) + (not np.isclose(unit, 1))
+        if reading.attitude.turns_axes and self._turns_rate(reading):
+            cost -= 0.75  # both come from one source
+        fit = reading.velocity
+        unit, axes = _unit_and_axes(reading.position)
         if reading.velocity_frame == "body":
-            return cost + reading.velocity.cost
-        own = reading.velocity.cost - _cost(reading.velocity.matrix)
-        together = reading.velocity.matrix @ position
-        if (reading.velocity.matrix == np.eye(3)).all():
-            return cost + own
-        return cost + own + _cost(together)
+            return cost + _cost(axes) + (unit != 1) + fit.cost
+        # What the velocity is to the read position, it is to the true one by both.
+        is_shared = np.array_equal(fit.matrix, np.eye(3))
+        cost += _cost(axes) + (0 if is_shared else _cost(fit.matrix @ axes))
+        in_units = fit.cost - _cost(fit.matrix) - (fit.lag != 0)
+        if in_units and np.allclose(fit.factors * unit, 1):
+            in_units = 0.0  # the unit of the position is the only one that is wrong
+        return cost + (unit != 1) + in_units + (fit.lag != 0)
+
+    def _turns_rate(self, reading: _Reading) -> bool:
+        """Whether NED and ENU, or FRD and FLU, change places in the rate."""
+        turned = FRD if reading.rate_frame == "body" else NED
+        return np.array_equal(reading.rate.matrix, turned)
 
     def is_other_frame(self, reading: _Reading) -> bool:
         """Whether all is in NED that is said to be in ENU, or the reverse."""
         in_world = reading.velocity_frame == "world"
         velocity = np.eye(3) if in_world else FRD
-        rate = FRD if reading.rate_frame == "body" else NED
         fits = reading.velocity, reading.rate
         return (
             reading.attitude.turns_axes
             and np.array_equal(reading.position, NED)
             and np.array_equal(reading.velocity.matrix, velocity)
-            and np.array_equal(reading.rate.matrix, rate)
+            and self._turns_rate(reading)
             and all(fit.lag == 0 and (fit.factors == 1).all() for fit in fits)
             and (reading.velocity_frame, reading.rate_frame) == self._frames
         )
@@ -966,7 +999,7 @@ class _Search:
         claimed = self.claimed()
         best = claimed.score
         velocity_frames = [self._frames[0]]
-        if claimed.velocity.misfits.max() > BAD:
+        if claimed.velocity.misfits.max() > DOUBTFUL:
             velocity_frames.append(_other_frame(self._frames[0]))
         in_world = _fit_later(
             self.velocities,
@@ -974,37 +1007,47 @@ class _Search:
             self.speed_factors,
             _FLOOR_VELOCITY,
         )
+        positions = [*_position_changes()]
+        explained = in_world.matrix * in_world.factors[:, None]
+        if not np.array_equal(explained, np.eye(3)) and not in_world.lag:
+            positions.append(np.linalg.inv(explained))
+        # No reading can fit a velocity better than this.
+        best_velocity = 3 * np.log(_FLOOR_VELOCITY)
+        if velocity_frames == ["world"]:
+            best_velocity = in_world.score - CHANGE * in_world.cost
+        best_tilt = 2 * np.log(_FLOOR_TILT)
         for attitude in self.attitudes:
             body_axis = self._body_axis(attitude)
             for rate_frame in ("body", "world"):
-                measured, derived = self._rates(attitude, rate_frame)
+                _, derived = self._rates(attitude, rate_frame)
                 rate = _fit_later(self.rates, derived, self.rate_factors, _FLOOR_RATE)
-                own = rate.score + CHANGE * (
-                    attitude.cost + (rate_frame != self._frames[1])
-                )
-                # What the other two relations can gain, and changes shared with them.
-                most = 3 * np.log(_FLOOR_VELOCITY) + 2 * np.log(_FLOOR_TILT)
-                if own + most - 2 * CHANGE > best:
+                # A mistake that several signals share counts once.
+                least_cost = attitude.cost + (rate_frame != self._frames[1]) - 2
+                least = rate.score + CHANGE * max(least_cost, -rate.cost)
+                if least + best_velocity + best_tilt > best:
                     continue
-                for velocity_frame in velocity_frames:
-                    positions = _position_changes()
-                    if velocity_frame == "body":
-                        positions = positions[:LIKELY]
-                    for position in positions:
-                        velocity = in_world
-                        if velocity_frame == "body":
-                            velocity = self._fit_body_velocity(attitude, position)
-                        reading = self._reading(
-                            attitude=attitude,
-                            position=position,
-                            velocity=velocity,
-                            rate=rate,
-                            velocity_frame=velocity_frame,
-                            rate_frame=rate_frame,
-                            body_axis=body_axis,
-                        )
-                        best = min(best, reading.score)
-                        yield reading
+                for frame, position in itertools.product(velocity_frames, positions):
+                    is_likely = attitude.cost == 0 and _is_likely(position)
+                    if (
+                        frame == "body"
+                        and not is_likely
+                        and position is not positions[0]
+                    ):
+                        continue
+                    velocity = in_world
+                    if frame == "body":
+                        velocity = self._fit_body_velocity(attitude, position)
+                    reading = self._reading(
+                        attitude=attitude,
+                        position=position,
+                        velocity=velocity,
+                        rate=rate,
+                        velocity_frame=frame,
+                        rate_frame=rate_frame,
+                        body_axis=body_axis,
+                    )
+                    best = min(best, reading.score)
+                    yield reading
 
     def _fit_body_velocity(self, attitude: _AttitudeChange, position: Array) -> _Fit:
         _, derived = self._velocities(attitude, "body", position)
@@ -1053,6 +1096,20 @@ def _position_changes() -> list[Array]:
     units = [unit for unit in _LENGTHS.values() if unit != 1]
     factors = sorted({*units, *(1 / unit for unit in units)})
     return [*single, *turns, *(factor * np.eye(3) for factor in factors)]
+
+
+def _unit_and_axes(position: Array) -> tuple[float, Array]:
+    """The factor and the change of axes (3, 3) that are in one change of a position."""
+    unit = float(abs(np.linalg.det(position)) ** (1 / 3))
+    if abs(unit - 1) < 1e-9:
+        unit = 1.0
+    return unit, position / unit
+
+
+def _is_likely(position: Array) -> bool:
+    """Whether one mistake in the axes makes a change of a position."""
+    unit, axes = _unit_and_axes(position)
+    return unit == 1 and _cost(axes) < 2
 
 
 def _factors(
@@ -1130,7 +1187,7 @@ def _check(
 
 def _is_doubtful(search: _Search, claimed: _Reading) -> bool:
     """Whether it is worth while to look for another reading."""
-    if max(claimed.velocity.misfits.max(), claimed.rate.misfits.max()) > FITS:
+    if max(claimed.velocity.misfits.max(), claimed.rate.misfits.max()) > DOUBTFUL:
         return True
     if claimed.tilt is not None and not _fits_tilt(claimed.tilt):
         return True
@@ -1142,17 +1199,13 @@ def _is_better(best: _Reading, claimed: _Reading) -> bool:
     if claimed.score - best.score < GAIN:
         return False
     for fit, own in ((best.velocity, claimed.velocity), (best.rate, claimed.rate)):
-        if ((own.misfits > BAD) & (fit.misfits < FITS)).any():
+        is_better = (fit.misfits < FITS) & (fit.misfits < HALF * own.misfits)
+        if (is_better & (own.misfits > DOUBTFUL)).any():
             return True
-        if (
-            fit.lag
-            and (fit.misfits < 0.6 * own.misfits).any()
-            and fit.misfits.min() < FITS
-        ):
-            return True
-    if claimed.tilt is None or not _fits_tilt(best.tilt):
+    if claimed.tilt is None or best.tilt is None or not _fits_tilt(best.tilt):
         return False
-    return bool((claimed.tilt > 1).any())
+    is_better = best.tilt < TILT_FITS * claimed.tilt
+    return bool((is_better & (claimed.tilt > TILT_FITS)).any())
 
 
 def _noticed(claimed: _Reading, claim: _Claim, run: str) -> list[Finding]:
@@ -1228,27 +1281,29 @@ def _position_words(best: _Reading, search: _Search) -> list[str]:
     claim = search.claim
     relation = search.relations()[0]
     fit = best.velocity
-    unit = abs(np.linalg.det(best.position)) ** (1 / 3)
-    axes = best.position / unit
+    unit, axes = _unit_and_axes(best.position)
     words = []
-    if not np.isclose(unit, 1):
+    if unit != 1 and (fit.factors == 1).all():
         true_unit = _unit_factor(claim.position) / unit
-        name = _unit_name(_LENGTHS, true_unit)
         words.append(
             f"{claim.position.name} and {claim.velocity.name} are {unit:.3g} times "
-            f"what gravity says; are their units right? write unit: {name} and "
-            f"unit: {_unit_name(_SPEEDS, true_unit)}"
+            f"what gravity says; are their units right? write "
+            f"unit: {_unit_name(_LENGTHS, true_unit)} for {claim.position.name} and "
+            f"unit: {_unit_name(_SPEEDS, true_unit)} for {claim.velocity.name}"
         )
     if not np.array_equal(axes, np.eye(3)):
         words.append(_axes_words(claim, claim.position, "world", axes))
         if best.velocity_frame == "world":
             fit = replace(fit, matrix=fit.matrix @ axes)
+    units = (_SPEEDS, _LENGTHS)
+    if np.allclose(fit.factors * unit, 1):
+        units = ({}, _LENGTHS)  # gravity says that the velocity's is right
     return words + _fit_words(
         search=search,
         relation=relation,
         fit=fit,
         frame=best.velocity_frame,
-        units=(_SPEEDS, _LENGTHS),
+        units=units,
         attitude=best.attitude,
     )
 
@@ -1298,13 +1353,14 @@ def _axes_words(claim: _Claim, signal: Signal, frame: str, matrix: Array) -> str
     inverse = (to_enu @ matrix @ to_enu).T  # from the file's axes to the true ones
     order = np.abs(inverse).argmax(axis=1).tolist()
     signs = inverse.sum(axis=1)
-    flipped = ["xyz"[axis] for axis in order if signs[order.index(axis)] < 0]
-    flipped = sorted(flipped)
+    flipped = sorted("xyz"[order[axis]] for axis in range(3) if signs[axis] < 0)
     parts = []
     if order != [0, 1, 2]:
         moved = [f"{'xyz'[axis]}" for axis in range(3) if order[axis] != axis]
         parts.append(f"{' and '.join(moved)} of {signal.name} have changed places")
-    if flipped:
+    if len(flipped) == 3:
+        parts.append(f"{signal.name} has the opposite sign")
+    elif flipped:
         verb = "has" if len(flipped) == 1 else "have"
         parts.append(
             f"{' and '.join(flipped)} of {signal.name} {verb} the opposite sign"
