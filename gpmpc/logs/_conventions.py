@@ -58,7 +58,6 @@ FAST = 1.5  # [rad] within a window that is turning fast
 HALF_WIDE = 0.1  # [s] of the windows of accelerations, which are noisier
 WINDOWS = 800  # of a run that are looked at
 FEWEST = 50  # windows that say something
-LIKELY = 12  # readings of the position that are tried with a velocity in body axes
 LONGEST_LAG = 0.8  # [s] that is sought
 LAG_STEP = 0.02  # [s] from one lag to the next
 QUANTILES = (0.5, 0.75, 0.9, 0.97, 0.99)  # of absolute values
@@ -69,6 +68,8 @@ BAD = 0.8  # misfit from which an axis fits badly
 TILT_FITS = 0.6  # likewise of the third relation, which drag disturbs
 TILT_MOVES = 0.3  # [m/s2] of the horizontal force from which it is looked at
 CHANGE = 0.7  # that a change of the reading costs, in logarithms of misfits
+RARE = 1.25  # mistakes that a rarer one counts for
+NEAR = 0.25  # of the score within which two readings cannot be told apart
 GAIN = 0.3  # least gain in logarithms, beyond that, for which a reading is believed
 NAMED_LAG = 0.1  # [s] from which a lag is refused
 NOTED_LAG = 0.05  # [s] from which it is a finding
@@ -631,7 +632,7 @@ def _quaternion_changes(signal: Signal) -> Iterator[_AttitudeChange]:
         yield _AttitudeChange(
             f"{letters} of {name} {'have' if several else 'has'} the opposite sign: "
             f"write {_quaternion_columns(signal, [0, 1, 2, 3], signs)}",
-            1 if axes in ([0], [1], [2], [1, 2]) else 2,
+            RARE if axes in ([0], [1], [2], [1, 2]) else 2,
             lambda q, signs=signs: q * signs,
         )
     for order in ([1, 0, 2, 3], [2, 1, 0, 3], [0, 2, 1, 3]):
@@ -639,7 +640,7 @@ def _quaternion_changes(signal: Signal) -> Iterator[_AttitudeChange]:
         yield _AttitudeChange(
             f"{'xyz'[swapped[0]]} and {'xyz'[swapped[1]]} of {name} have changed "
             f"places: write {_quaternion_columns(signal, order, np.ones(4))}",
-            1,
+            RARE,
             lambda q, order=order: q[..., order],
         )
 
@@ -879,6 +880,29 @@ class _Search:
             lags.append(float(series.lags[int(sums.argmax())]))
         return lags[0], lags[1]
 
+    def tilt_lag(self, claimed: _Reading) -> float:
+        """The lag [s] of the accelerations after the tilt, where it is clear; else 0."""
+        if self.claim.velocity_frame == "body" or claimed.tilt is None:
+            return 0.0
+        series = self.velocities
+        reach = max(round(HALF_WIDE / (series.lags[1] - series.lags[0])), 1)
+        span = series.lags[2 * reach] - series.lags[0]
+        rises = (series.later[2 * reach :] - series.later[: -2 * reach]) / span
+        lags = series.lags[reach:-reach]
+        body_axis = self._body_axis(self.attitudes[0])
+        accelerations = _series(lags, rises)
+        leans = np.column_stack([body_axis[:, :2], np.zeros(len(body_axis))])
+        sums = _correlations(accelerations, leans)[:, [0, 1], [0, 1]].sum(axis=1)
+        lag = int(sums.argmax())
+        rows = accelerations.inside[lag]
+        if abs(lags[lag]) < NAMED_LAG or rows.sum() < FEWEST:
+            return 0.0
+        tilt = _tilt_misfits(rises[lag][rows], body_axis[rows])
+        if tilt is None or not _fits_tilt(tilt):
+            return 0.0
+        is_better = (tilt < HALF * claimed.tilt).any()
+        return float(lags[lag]) if is_better else 0.0
+
     def _velocities(
         self, attitude: _AttitudeChange, frame: str, position: Array | None = None
     ) -> tuple[Array, Array]:
@@ -969,6 +993,8 @@ class _Search:
             return cost + _cost(axes) + (unit != 1) + fit.cost
         # What the velocity is to the read position, it is to the true one by both.
         is_shared = np.array_equal(fit.matrix, np.eye(3))
+        if axes[2, 2] != 1 and not np.array_equal(axes, NED):
+            cost += RARE - 1  # whether z points up, gravity hardly says
         cost += _cost(axes) + (0 if is_shared else _cost(fit.matrix @ axes))
         in_units = fit.cost - _cost(fit.matrix) - (fit.lag != 0)
         if in_units and np.allclose(fit.factors * unit, 1):
@@ -1103,7 +1129,7 @@ def _unit_and_axes(position: Array) -> tuple[float, Array]:
     unit = float(abs(np.linalg.det(position)) ** (1 / 3))
     if abs(unit - 1) < 1e-9:
         unit = 1.0
-    return unit, position / unit
+    return unit, np.rint(position / unit)
 
 
 def _is_likely(position: Array) -> bool:
@@ -1162,27 +1188,43 @@ def _check(
         return []
     search = _Search(windows, claim)
     claimed = search.claimed()
+    name = runs[0].name
     if not _is_doubtful(search, claimed):
-        return _noticed(claimed, claim, runs[0].name)
-    best = claimed
-    for reading in search.readings():
-        if reading.score < best.score - 1e-9:
-            best = reading
+        return _noticed(search, claimed, name)
+    readings = sorted(search.readings(), key=lambda reading: reading.score)
+    best = readings[0] if readings else claimed
     if _is_better(best, claimed):
-        numbers = _numbers(search)
-        sentences = _sentences(best, search)
-        lags = [abs(best.velocity.lag), abs(best.rate.lag)]
-        if best.cost == 1 and 0 < max(lags) < NAMED_LAG:
-            return [Finding("late", runs[0].name, 1, "; ".join(sentences))]
-        raise DataError(f"{where}{'; and '.join(sentences)} ({numbers})")
+        text = "; and ".join(_sentences(best, search))
+        if _is_short_lag(best):
+            return [Finding("late", name, 1, text), *_noticed(search, claimed, name)]
+        other = _near_reading(readings, search)
+        raise DataError(f"{where}{text}{other} ({_numbers(search)})")
     unexplained = _unexplained(search, claimed)
     if unexplained:
         raise DataError(
             f"{where}{unexplained}, and contradicts the mapping: no single change of "
-            f"order, axes, signs, units or lag explains it "
-            f"({_numbers(search)})"
+            f"order, axes, signs, units or lag explains it ({_numbers(search)})"
         )
-    return _noticed(claimed, claim, runs[0].name)
+    return _noticed(search, claimed, name)
+
+
+def _is_short_lag(best: _Reading) -> bool:
+    """Whether all that is wrong is a lag too short to refuse."""
+    fits = best.velocity, best.rate
+    is_short = all(abs(fit.lag) < NAMED_LAG for fit in fits)
+    return is_short and best.cost == sum(fit.lag != 0 for fit in fits)
+
+
+def _near_reading(readings: Sequence[_Reading], search: _Search) -> str:
+    """Another reading that fits as well as the best, in words; mostly empty."""
+    best = _sentences(readings[0], search)
+    for reading in readings[1:]:
+        if reading.score > readings[0].score + NEAR:
+            break
+        sentences = _sentences(reading, search)
+        if sentences != best and len(sentences) <= len(best):
+            return f"; or else: {'; and '.join(sentences)}"
+    return ""
 
 
 def _is_doubtful(search: _Search, claimed: _Reading) -> bool:
@@ -1208,18 +1250,31 @@ def _is_better(best: _Reading, claimed: _Reading) -> bool:
     return bool((is_better & (claimed.tilt > TILT_FITS)).any())
 
 
-def _noticed(claimed: _Reading, claim: _Claim, run: str) -> list[Finding]:
+def _noticed(search: _Search, claimed: _Reading, run: str) -> list[Finding]:
     """What is unusual, and no contradiction."""
-    if claimed.lift > GRAVITY[2] / 2:
-        return []
-    turned = _body_turned(claim.attitude)
+    claim = search.claim
     name = claim.attitude.name
-    text = (
-        f"the force that carries the body points along its -z ({claimed.lift:.1f} "
-        f"m/s2): it hangs upside down, or {name} is that of a body in FRD axes: "
-        f"write {turned}"
-    )
-    return [Finding("upside down", run, 1, text)]
+    findings = []
+    if claimed.lift < GRAVITY[2] / 2:
+        text = (
+            f"the force that carries the body points along its -z ({claimed.lift:.1f} "
+            f"m/s2): it hangs upside down, or {name} is that of a body in FRD axes, "
+            f"and so are its rates: write {_body_turned(claim.attitude)}, and "
+            f"axes: ned for {claim.rate.name}"
+        )
+        findings.append(Finding("upside down", run, 1, text))
+    lag = search.tilt_lag(claimed)
+    if lag:
+        late, early = (
+            (f"{claim.position.name} and {claim.velocity.name}", name)
+            if lag > 0
+            else (name, f"{claim.position.name} and {claim.velocity.name}")
+        )
+        text = (
+            f"{late} come about {abs(lag):.2g} s after {early}: do their clocks agree?"
+        )
+        findings.append(Finding("late", run, 1, text))
+    return findings
 
 
 def _unexplained(search: _Search, claimed: _Reading) -> str:
