@@ -4,19 +4,25 @@ A mapping is a YAML file or a dictionary (docs/guide_log.md). States come out in
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 import yaml
 
-from gpmpc.exceptions import SettingError, check_choice, check_number
+from gpmpc.exceptions import (
+    SettingError,
+    check_choice,
+    check_number,
+    check_numbers,
+)
 from gpmpc.logs._kinematics import Array, StateGroup, StateSpace
 from gpmpc.logs._units import Conversion, conversion
 
 Role = Literal["states", "inputs", "context"]
 ROLES: tuple[Role, ...] = ("states", "inputs", "context")
+AXES = ("enu", "ned")  # of the world; the body's are then FLU or FRD
 TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 _PLAIN = (
     "run",
@@ -26,6 +32,7 @@ _PLAIN = (
     "rest",
     "model",
     "stamp",
+    "frame",
 )  # keys whose values are taken as they are
 _LONGEST = 2**16  # of a mapping's text [characters]
 _DEEPEST = 10  # levels of a mapping's text
@@ -35,6 +42,7 @@ _SIGNAL_KEYS = (
     "kind",
     "order",
     "frame",
+    "axes",
     "scale",
     "resample",
     "topic",
@@ -53,7 +61,10 @@ class Signal:
     kind: str = "vector"
     order: str = "xyzw"  #: of a quaternion: "xyzw" or "wxyz"
     frame: str = ""  #: "world" or "body", for velocities and rates of a rigid body; empty where it has none
-    scale: float = 1.0  #: the values are multiplied by it
+    #: "enu" or "ned", for states of a rigid body; empty takes the mapping's frame.
+    axes: str = ""
+    #: The values are multiplied by it: one number, or one for each column.
+    scale: float | tuple[float, ...] = 1.0
     resample: str = ""  #: "hold", "linear" or "spherical"; by default states are interpolated and all else is held
     topic: str = ""  #: the stream that holds the columns; empty where a file has one
 
@@ -63,6 +74,7 @@ class Signal:
             ("kind", ("vector", "angle", "quaternion", "euler")),
             ("order", ("xyzw", "wxyz")),
             ("frame", ("", "world", "body")),
+            ("axes", ("", *AXES)),
             ("resample", ("", "hold", "spherical" if self.turns else "linear")),
         ):
             check_choice(f"{key}.{name}", getattr(self, name), known)
@@ -76,7 +88,11 @@ class Signal:
                 f"{key}.columns",
                 f"must be {number or 1} names of columns; got {list(self.columns)}",
             )
-        check_number(f"{key}.scale", self.scale)
+        if isinstance(self.scale, list | tuple):
+            check_numbers(f"{key}.scale", self.scale, len(self.columns))
+            object.__setattr__(self, "scale", tuple(self.scale))
+        else:
+            check_number(f"{key}.scale", self.scale)
         for name in ("unit", "topic"):
             if not isinstance(getattr(self, name), str):
                 raise SettingError(
@@ -103,9 +119,12 @@ class Signal:
         )
 
     @property
-    def factor(self) -> float:
-        """Of its values in the file, to the units that they come out in."""
-        return self.scale * self._conversion.factor
+    def factors(self) -> tuple[float, ...]:
+        """Of each column's values in the file, to the units that they come out in."""
+        scales = self.scale
+        if not isinstance(scales, tuple):
+            scales = (scales,) * len(self.columns)
+        return tuple(scale * self._conversion.factor for scale in scales)
 
     @property
     def group(self) -> StateGroup:
@@ -150,6 +169,9 @@ class LogMapping:
     #: times of a bag's messages: "header" takes the stamps that they carry, "log" the
     #: times at which they were logged; empty takes what gives the topics time in common
     stamp: str = ""
+    #: of a rigid body's states: "enu" (the body FLU) or "ned" (the body FRD); empty
+    #: where nothing is said: "ned" in a PX4 log, and "enu" in any other.
+    frame: str = ""
 
     def __post_init__(self) -> None:
         if self.stamp and self.time:
@@ -167,8 +189,13 @@ class LogMapping:
             ("rest", ("drop", "use")),
             ("model", ("rigid_body", "none")),
             ("stamp", ("", "header", "log")),
+            ("frame", ("", *AXES)),
         ):
             check_choice(key, getattr(self, key), known)
+        if self.frame and self.model == "none":
+            raise SettingError(
+                "frame", f"needs model: rigid_body; got {self.frame} without one"
+            )
         check_choice("time.unit", self.time_unit, tuple(TIME_UNITS))
         if not self.of("states"):
             raise SettingError("states", "must name at least one signal; got none")
@@ -198,21 +225,52 @@ class LogMapping:
             if signal.kind == "euler":
                 found += signal.group.entries
                 continue
-            names = signal.columns
+            names = [
+                name if factor == 1 else f"{name} times {factor:.6g}"
+                for name, factor in zip(signal.columns, signal.factors, strict=True)
+            ]
             if signal.kind == "quaternion" and signal.order == "wxyz":
-                names = (*names[1:], names[0])
-            other_frame = {"m/s": "body", "rad/s": "world"}.get(signal.group.unit)
-            done = f" times {signal.factor:.6g}" * (signal.factor != 1)
-            done += " in other axes" * (
-                self.model == "rigid_body" and signal.frame == other_frame
-            )
-            found += [f"{name}{done}" for name in names]
+                names = [*names[1:], names[0]]
+            if self._swaps_east_and_north(signal):
+                names = [names[1], names[0], names[2]]
+            if self._turns_axes(signal):
+                names = [f"{name} in other axes" for name in names]
+            found += names
         return tuple(found)
+
+    def axes_of(self, signal: Signal) -> str:
+        """The axes of a rigid body's state in the file: "enu" or "ned"."""
+        return signal.axes or self.frame or "enu"
+
+    def _turns_axes(self, signal: Signal) -> bool:
+        """Whether a signal comes out in other axes than those of the file."""
+        if self.model != "rigid_body" or signal.role != "states":
+            return False
+        other_frame = {"m/s": "body", "rad/s": "world"}.get(signal.group.unit)
+        return signal.frame == other_frame or self.axes_of(signal) == "ned"
+
+    def _swaps_east_and_north(self, signal: Signal) -> bool:
+        """Whether the first two columns change places: in NED north comes first."""
+        states = self.of("states")
+        if self.model != "rigid_body" or self.axes_of(signal) == "enu":
+            return False
+        is_position = signal in states[0:1]
+        is_velocity = signal in states[2:3]
+        in_world_axes = is_position or (is_velocity and signal.frame != "body")
+        return in_world_axes and len(signal.columns) == 3
+
+    def _group(self, signal: Signal) -> StateGroup:
+        """A signal of the states as it comes out."""
+        group = signal.group
+        if not self._swaps_east_and_north(signal):
+            return group
+        north, east, down = group.entries
+        return replace(group, entries=(east, north, down))
 
     @property
     def space(self) -> StateSpace:
         """The space of the states."""
-        return StateSpace(tuple(signal.group for signal in self.of("states")))
+        return StateSpace(tuple(self._group(signal) for signal in self.of("states")))
 
     @classmethod
     def load(cls, path: str | Path) -> "LogMapping":
@@ -251,7 +309,12 @@ class LogMapping:
                 _check_keys(f"{role}.{name}", given, _SIGNAL_KEYS)
                 columns = given.get("columns") or ()
                 columns = (columns,) if isinstance(columns, str) else tuple(columns)
-                signals.append(Signal(str(name), role, **{**given, "columns": columns}))
+                signal = Signal(str(name), role, **{**given, "columns": columns})
+                if signal.axes and content.get("model") != "rigid_body":
+                    raise SettingError(
+                        f"{role}.{name}.axes", "needs model: rigid_body; got none"
+                    )
+                signals.append(signal)
         time = content.get("time") or {}
         time = {"column": time} if isinstance(time, str) else time
         _check_keys("time", time, ("column", "unit"))

@@ -1,12 +1,9 @@
 """Makes runs of tables: applies a mapping, resamples, and leaves out what is no measurement of a moving system.
 
-What is wrong with a file is found, counted and named. A velocity in other units than stated, a rate in degrees or an
-attitude in another order makes every model wrong, and each is visible from the log alone: the signal is compared with
-the other's finite differences by least squares.
+What is wrong with a file is found, counted and named.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import replace
 from functools import reduce
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -18,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from gpmpc._bounds import Room
 from gpmpc.exceptions import DataError
+from gpmpc.logs._conventions import read_rigid_bodies
 from gpmpc.logs._dropouts import (
     changes_rarely,
     frozen_rows,
@@ -25,11 +23,11 @@ from gpmpc.logs._dropouts import (
     zero_dropouts,
 )
 from gpmpc.logs._file import NUMBER, STAMP, Streams, run_name
+from gpmpc.logs._frames import with_frame_of_files
 from gpmpc.logs._kinematics import (
     Array,
     quaternion_inverse,
     quaternion_product,
-    rotate,
     rotation_quaternion,
     rotation_vector,
 )
@@ -48,16 +46,11 @@ MOST_FIT = 0.9  # of the rows out of order that have to fit, to be sorted
 JUMP = 60.0  # [s] from which a step of time is a jump, if it is also
 JUMP_STEPS = 100  # usual time steps: over neither is anything resampled
 RESOLUTION = 1e-6  # [s] of stamps: float64 seconds since 1970 resolve a quarter of it
-SPAN = 4  # rows on each side of a finite difference: above the noise of one row
-SLOPES = (0.5, 2.0)  # of a signal over the derivative that it should be
-FIT = 0.7  # correlation from which a slope says something
-MOST_ROWS = 20_000
 MOST_RUNS = 100  # in a file, unless each has
 FEWEST_ROWS = 10
 COPIES = 2  # of a grid's values, while signals are put on it
 ORDER_ROWS = "name the column of the runs, or order the rows"
 ORDER_TOPICS = "stamp: log takes the times of the log"
-_RIGID_BODY = [("vector", 3), ("quaternion", 3), ("vector", 3), ("vector", 3)]
 _Note = Callable[
     [str, Any, str], None
 ]  # takes the kind, the count and the text of a finding
@@ -97,6 +90,7 @@ def read_log(
             else LogMapping.from_dict(mapping)
         )
     files = [files] if isinstance(files, str | Path) else list(files)
+    mapping = with_frame_of_files(mapping, [Path(file) for file in files])
     findings: list[Finding] = []
     tables: list[_Table] = []
     names: set[str] = set()
@@ -144,7 +138,8 @@ def read_log(
             "no input changes in any row: the system is at rest, and nothing can be learned of it"
         )
     if mapping.model == "rigid_body":
-        usable = _rigid_bodies(usable, step, mapping)
+        usable, remarks = read_rigid_bodies(usable, step, mapping)
+        findings += remarks
     return Log(mapping, step, tuple(usable), tuple(findings))
 
 
@@ -413,7 +408,7 @@ def _values(label: str, table: pd.DataFrame, signal: Signal, note: _Note) -> Arr
             text = f"{holds_sentinel.sum()} rows of {column} hold {listed}"
             note("sentinel", holds_sentinel.sum(), f"{text}, no measurement: left out")
         columns.append(np.where(holds_sentinel, np.nan, numbers))
-    values = np.column_stack(columns) * signal.factor
+    values = np.column_stack(columns) * signal.factors
     values[~np.isfinite(values)] = np.nan
     absent = np.isnan(values).any(axis=1)
     note(
@@ -584,76 +579,6 @@ def _at_rest(states: Array, inputs: Array, spread: Array, step: float) -> np.nda
     both = np.nan_to_num(np.concatenate([states, inputs], axis=1))
     moved = maximum_filter1d(both, size, axis=0) - minimum_filter1d(both, size, axis=0)
     return binary_dilation((moved <= limit).all(axis=1), np.ones(2 * (size // 2) + 1))
-
-
-def _rigid_bodies(
-    runs: Sequence[LogRun], step: float, mapping: LogMapping
-) -> list[LogRun]:
-    """Turns velocities to world axes and rates to body axes, and checks that they are the derivatives of the others.
-
-    Raises:
-        DataError: The states are others, or a velocity or rate contradicts the mapping in unit or axes.
-    """
-    signals = mapping.of("states")
-    if [(s.group.kind, s.group.error_dim) for s in signals] != _RIGID_BODY:
-        raise DataError(
-            "a rigid body's states are position (3), attitude (quaternion or Euler angles), velocity (3) and angular "
-            f"rate (3), in this order; the mapping has {', '.join(s.name for s in signals)}"
-        )
-    frames = [signals[2].frame or "world", signals[3].frame or "body"]
-    before, now, after = (
-        np.concatenate([run.states[run.starts(SPAN, SPAN) + shift] for run in runs])
-        for shift in (-SPAN, 0, SPAN)
-    )
-    before, now, after = (
-        states[:: max(len(now) // MOST_ROWS, 1)] for states in (before, now, after)
-    )
-    q, time = now[:, 3:7], 2 * SPAN * step
-    speed = (after[:, 0:3] - before[:, 0:3]) / time
-    turn = (
-        rotation_vector(
-            quaternion_product(quaternion_inverse(before[:, 3:7]), after[:, 3:7])
-        )
-        / time
-    )
-    found = (
-        (now[:, 7:10], {"world": speed, "body": rotate(quaternion_inverse(q), speed)}),
-        (now[:, 10:13], {"world": rotate(q, turn), "body": turn}),
-    )
-    for (measured, derivatives), frame, of, signal in zip(
-        found, frames, signals, signals[2:], strict=False
-    ):
-        other = "world" if frame == "body" else "body"
-        (slope, fit), (_, fit_other) = (
-            _regression(measured, derivatives[axes]) for axes in (frame, other)
-        )
-        what = f"the derivative of {of.name}"
-        if fit_other > max(FIT, fit + 0.1):
-            axes = f"in {other} axes (correlation {fit_other:.2f}), not in {frame} axes"
-            raise DataError(f"{signal.name} is {what} {axes}, as the mapping says")
-        if fit > FIT and not SLOPES[0] < slope < SLOPES[1]:
-            text = f"{slope:.3g} times {what} (correlation {fit:.2f})"
-            raise DataError(
-                f"{signal.name} is {text}; is its unit right? (degrees for radians make a factor of 57)"
-            )
-    turned = []
-    for run in runs:
-        states, q = run.states.copy(), run.states[:, 3:7]
-        if frames[0] == "body":
-            states[:, 7:10] = rotate(q, states[:, 7:10])
-        if frames[1] == "world":
-            states[:, 10:13] = rotate(quaternion_inverse(q), states[:, 10:13])
-        turned.append(replace(run, states=states))
-    return turned
-
-
-def _regression(signal: Array, derivative: Array) -> tuple[float, float]:
-    """Slope of the signal over the derivative, and the absolute correlation of the two; none of less than 50 rows."""
-    if len(signal) < 50:
-        return 1.0, 0.0
-    a, b = (x - x.mean(axis=0) for x in (signal, derivative))
-    aa, bb, ab = float((a * a).sum()), float((b * b).sum()), float((a * b).sum())
-    return (ab / bb, abs(ab) / np.sqrt(aa * bb)) if aa > 0 and bb > 0 else (1.0, 0.0)
 
 
 class Stamps(NamedTuple):

@@ -1,0 +1,80 @@
+"""Brings the states of a rigid body to the axes of ``gpmpc.logs``.
+
+The world's axes are east, north, up (ENU) and the body's forward, left, up (FLU): gravity is ``GRAVITY`` in every log.
+Aviation, and PX4's logs, have north, east, down (NED) and forward, right, down (FRD).
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from gpmpc.exceptions import SettingError
+from gpmpc.logs._kinematics import (
+    Array,
+    quaternion_inverse,
+    quaternion_product,
+    rotate,
+)
+
+if TYPE_CHECKING:
+    from gpmpc.logs._mapping import LogMapping
+
+# Both matrices are their own inverses, and so are the turns that they make.
+NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+FRD = np.diag([1.0, -1.0, -1.0])
+NED_TURN = np.array([np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0])
+FRD_TURN = np.array([1.0, 0.0, 0.0, 0.0])
+NAMES = {  # by the axes: of the world, and of the body
+    "enu": ("ENU", "FLU"),
+    "ned": ("NED", "FRD"),
+}
+
+
+def with_frame_of_files(mapping: "LogMapping", files: Sequence[Path]) -> "LogMapping":
+    """The mapping, with the frame that files of this kind have where it says none.
+
+    Raises:
+        SettingError: It says none, and the files are of two kinds.
+    """
+    if mapping.model != "rigid_body" or mapping.frame:
+        return mapping
+    are_px4 = {file.suffix.lower() == ".ulg" for file in files}
+    if len(are_px4) > 1:
+        raise SettingError(
+            "frame",
+            "must be said (enu or ned): PX4 logs are NED, and other files are with them",
+        )
+    return replace(mapping, frame="ned" if are_px4 == {True} else "enu")
+
+
+def attitudes_to_enu(attitudes: Array, axes: str) -> Array:
+    """Attitudes (..., 4) of a FLU body in an ENU world, of those in other axes."""
+    if axes == "enu":
+        return attitudes
+    return quaternion_product(quaternion_product(NED_TURN, attitudes), FRD_TURN)
+
+
+def axes_to_enu(axes: str, frame: str) -> Array:
+    """The matrix (3, 3) that brings vectors in "world" or "body" axes to ENU or FLU."""
+    if axes == "enu":
+        return np.eye(3)
+    return NED if frame == "world" else FRD
+
+
+def velocities_to_world(states: Array, frame: str) -> Array:
+    """Velocities (..., 3) of states in world axes."""
+    velocities = states[..., 7:10]
+    if frame == "world":
+        return velocities
+    return rotate(states[..., 3:7], velocities)
+
+
+def rates_to_body(states: Array, frame: str) -> Array:
+    """Angular rates (..., 3) of states in body axes."""
+    rates = states[..., 10:13]
+    if frame == "body":
+        return rates
+    return rotate(quaternion_inverse(states[..., 3:7]), rates)
