@@ -21,8 +21,9 @@ _log = logging.getLogger(__name__)
 #: Part of its magnitude by which a column moves for round-off alone: twelve of the 52
 #: bits of a number. A feature of spread 1 around 1e9, which is 2e-9, moves.
 ROUND_OFF = 2**12 * np.finfo(np.float64).eps
-#: What a column moves by at most, in its own unit, where it does not move.
-RESOLUTION = 1e-11
+#: What a column moves by at most, in its own unit, where it does not move: solvers and
+#: simulators leave residues of as much.
+RESOLUTION = 1e-9
 _SHOWN = 6  # columns that a line names; of more it says how many
 
 
@@ -34,9 +35,15 @@ class Columns(NamedTuple):
     #: of the numbers that the targets are differences of (k,), which round-off is
     #: relative to; None: of the targets themselves
     magnitudes: NDArray[np.float64] | None = None
-    #: standard deviations (k,) that ``prior_deviation`` counts in, in the units of the
-    #: targets; None: one unit each
+    #: what ``prior_deviation`` counts in (k,), in the units of the targets; None: those
     deviations: NDArray[np.float64] | None = None
+
+    @property
+    def units(self) -> NDArray[np.float64]:
+        """What ``prior_deviation`` counts in (k,)."""
+        return (
+            np.ones(len(self.outputs)) if self.deviations is None else self.deviations
+        )
 
     @classmethod
     def of(cls, features: Tensor, targets: Tensor, input_dim: int, predicts: str):
@@ -110,6 +117,7 @@ def warn_of_constants(
     columns: Columns,
     constants: Constants,
     prior: PriorScales,
+    resolution: float,
 ) -> None:
     """Names in the log what the data hold still, and what is supposed of it instead.
 
@@ -135,17 +143,21 @@ def warn_of_constants(
         return
     if unknown.any():
         _log.warning(
-            "training: never moves in the %d rows: %s. What it changes is not known: "
-            "away from that value predictions return to the prior, over a length-scale "
-            "of %s (prior_lengthscale; math.inf where it is known to change nothing)",
+            "training: never moves by more than %.1g (resolution) in the %d rows: %s. "
+            "What it changes is not known: away from that value predictions return to "
+            "the prior, over a length-scale of %s (prior_lengthscale; math.inf where it "
+            "is known to change nothing)",
+            resolution,
             size,
             _listed(columns.features, features[0], unknown),
             lengths,
         )
     if varies.any():
         _log.warning(
-            "training: never changes in the %d rows, as a target: %s. How much it varies "
-            "elsewhere is not known: supposed is a deviation of %s (prior_deviation)",
+            "training: never changes by more than %.1g (resolution) in the targets of "
+            "the %d rows: %s. How much it varies elsewhere is not known: supposed is a "
+            "deviation of %s (prior_deviation)",
+            resolution,
             size,
             _listed(columns.outputs, targets[0], varies),
             deviations,

@@ -2,11 +2,12 @@
 
 No likelihood depends on the length-scale of a feature that never moved, nor says how
 much an output varies that was never seen to. What is left is a prior, and it has to be
-modest: away from the data nothing is known. By default it is one unit of the scaled
-column, as the length-scales that GPyTorch begins with (0.69) and leaves untouched; where
-the column lies does not count, as it does not for any other (350 K is no scale of a
-temperature). One who knows the ranges says so: by the settings, or by a ``Scaling`` whose
-factors they are.
+modest: away from the data nothing is known. By default it is one unit of the data, as
+the length-scales that GPyTorch begins with (0.69) and leaves untouched. Where the column
+lies does not count, as it does not for any other (350 K is no scale of a temperature),
+nor does a scaling, which has nothing to go by. Longer is not safer: on its way back to
+the prior a mean has a slope that nobody has seen, over as much as a length-scale, and a
+controller follows it. One who knows the ranges says so.
 """
 
 import math
@@ -29,22 +30,14 @@ class PriorScales(NamedTuple):
     deviations: NDArray[np.float64] | None
 
     @classmethod
-    def of(
-        cls,
-        trainer: Any,
-        features: Scaling,
-        targets: Scaling,
-        deviations: NDArray[np.float64] | None,
-    ) -> "PriorScales":
-        """Those that a trainer's settings ask for.
+    def of(cls, trainer: Any, d: int, units: NDArray[np.float64]) -> "PriorScales":
+        """Those that a trainer's settings ask for, of d features and k outputs.
 
-        ``deviations`` (k,) are what its ``prior_deviation`` counts in; None: one unit of
-        the scaled targets each.
+        ``units`` (k,) are what its ``prior_deviation`` counts in.
 
         Raises:
             SettingError: ``prior_lengthscale`` is a list of another number of features.
         """
-        d = len(features.factor)
         lengthscale = trainer.prior_lengthscale
         if lengthscale is None:
             lengthscale = 1.0
@@ -53,11 +46,10 @@ class PriorScales(NamedTuple):
                 "prior_lengthscale",
                 f"must be one number, or {d}, one a feature; got {len(lengthscale)}",
             )
-        unit = targets.factor.numpy() if deviations is None else deviations
         deviation = trainer.prior_deviation
         return cls(
-            lengthscales=np.broadcast_to(lengthscale, d) * features.factor.numpy(),
-            deviations=None if deviation is None else deviation * unit,
+            lengthscales=np.broadcast_to(np.asarray(lengthscale, dtype=float), d),
+            deviations=None if deviation is None else deviation * units,
         )
 
     def of_scaled_targets(self, targets: Scaling) -> "PriorScales":
@@ -71,7 +63,7 @@ def check_prior_scales(trainer: Any) -> None:
     """Raises ``SettingError`` unless a trainer's settings of columns at rest are right."""
     lengthscale = trainer.prior_lengthscale
     if lengthscale is not None:
-        several = isinstance(lengthscale, Sequence)
+        several = isinstance(lengthscale, Sequence) and not isinstance(lengthscale, str)
         for value in lengthscale if several else [lengthscale]:
             if value != math.inf:
                 check_number("prior_lengthscale", value, above=0)

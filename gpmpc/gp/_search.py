@@ -22,7 +22,7 @@ from torch import Tensor
 
 from gpmpc.exceptions import SettingError, ShapeError, check_number
 from gpmpc.gaussian import check_tensors
-from gpmpc.gp._data_checks import constant_columns
+from gpmpc.gp._data_checks import RESOLUTION, constant_columns
 from gpmpc.gp._kernel import IGNORED, check_posterior
 from gpmpc.gp._likelihood import FAILED, NegativeLogMarginalLikelihood
 from gpmpc.gp._posterior import GPPosterior
@@ -97,11 +97,11 @@ class OutputSearch:
     ):
         self._name, self._inputs, self._targets = name, inputs, targets
         self._settings, self._deadline = settings, deadline
-        self._log_std, self._constant = np.log(std), constant
         # An input that is known to have no effect drops out of the kernel.
-        self._log_prior = np.where(
-            np.isinf(prior), self._log_std + np.log(IGNORED), np.log(prior)
-        )
+        ignored = constant & np.isinf(prior)
+        self._log_prior = np.log(np.where(ignored, IGNORED * std, prior))
+        self._constant = constant
+        self._log_std = np.log(np.where(constant & ~ignored, prior, std))
         self._log_output = np.log(_output_std(targets))
         self._box = search_box(
             self._log_std, self._log_output, settings.signal_to_noise_limit
@@ -238,14 +238,14 @@ def search_box(
 def column_std(columns: np.ndarray, constant: np.ndarray | None = None) -> np.ndarray:
     """The standard deviation (d,) of columns (N, d).
 
-    Of a constant column its magnitude, or 1 where that is 0; ``constant`` (d,) says
+    Of a constant column its magnitude, or 1 where that is none; ``constant`` (d,) says
     which are, by default those of ``constant_columns``.
     """
     constant = constant_columns(columns) if constant is None else constant
     away = columns - columns[0]
     reach = np.abs(away).max(axis=0)
     magnitude = np.abs(columns).max(axis=0)
-    unit = np.where(constant, np.where(magnitude > 0, magnitude, 1.0), reach)
+    unit = np.where(constant, np.where(magnitude > RESOLUTION, magnitude, 1.0), reach)
     return unit * np.where(
         constant, 1.0, (away / unit).std(axis=0, ddof=min(1, len(columns) - 1))
     )

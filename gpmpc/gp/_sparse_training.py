@@ -125,10 +125,8 @@ class SparseTrainer:
         if columns is None:
             columns = Columns.of(features, targets, input_dim, predicts)
         constants = Constants.of(features, targets, columns, self.resolution)
-        prior = PriorScales.of(
-            self, feature_scaling, target_scaling, columns.deviations
-        )
-        warn_of_constants(features, targets, columns, constants, prior)
+        prior = PriorScales.of(self, features.shape[1], columns.units)
+        warn_of_constants(features, targets, columns, constants, prior, self.resolution)
         fixed = constants.outputs & (prior.deviations is not None)
         # A stationary kernel depends on differences; those from one of the points are exact, wherever the data lie.
         feature_scaling = Scaling(features[0], feature_scaling.factor)

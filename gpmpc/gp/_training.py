@@ -98,13 +98,13 @@ class Trainer:
     #: wall time of a training [s], in equal parts for the outputs, after which the best found so far is taken: what
     #: that is depends on the machine. One iteration over all points is made in any case. None: no limit
     time_limit: float | None = None
-    #: of features that never move in the data, for all or one each, in their unit [that of ``scaling``, where it has
-    #: one]: how far from the value they have predictions hold. None: one unit; ``math.inf``: known to have no effect
+    #: of features that never move in the data, for all or one each, in their units: how far from the value that they
+    #: have predictions hold. None: one unit; ``math.inf``: known to have no effect
     prior_lengthscale: float | Sequence[float] | None = None
     #: of outputs that never change in the data: the standard deviation that they are supposed to have elsewhere, in
-    #: their unit, as above. None: what the search finds, which is as good as none
+    #: their units; of a residual, in units of what a step changes. None: what the search finds, which is nearly none
     prior_deviation: float | None = 1.0
-    #: a feature or a target that moves by no more than this, in the unit of the data, or by round-off, never moves
+    #: a feature or a target that moves by no more than this, in its unit, or by round-off, never moves
     resolution: float = RESOLUTION
 
     def __post_init__(self) -> None:
@@ -209,10 +209,8 @@ class Trainer:
         if columns is None:
             columns = Columns.of(features, targets, input_dim, predicts)
         constants = Constants.of(features, targets, columns, self.resolution)
-        prior = PriorScales.of(
-            self, data.feature_scaling, data.target_scaling, columns.deviations
-        )
-        warn_of_constants(features, targets, columns, constants, prior)
+        prior = PriorScales.of(self, features.shape[1], columns.units)
+        warn_of_constants(features, targets, columns, constants, prior, self.resolution)
         return self.fit_known(
             data,
             constants,
