@@ -88,7 +88,7 @@ class OnlineLearning:
         noise = model.arrays[2] * max(1.0, ratio)
         larger, alone = model.with_point(point, error, noise), noise + latent
         missed, variance = larger.last_innovation()
-        variance = variance + latent
+        variance = variance + model.remaining(latent, variance - noise, model.signal)
         lead = _log_density(missed, variance) - _log_density(error, alone)
         leads = np.append(learned.leads, max(-_LARGEST, min(lead, _LARGEST)))[
             -self.window :
@@ -176,8 +176,8 @@ class ChangedModel(Wrapper):
         scales = np.column_stack(
             [to_array(gp.lengthscales), np.full(gp.output_dim, self.learning.memory)]
         )
-        signal = self.learning.share**2 * to_array(gp.signal_variance)
-        return Window.empty(scales, signal, gp.state_dim, self.learning.points), None
+        window = Window.empty(scales, self.signal, gp.state_dim, self.learning.points)
+        return window, None
 
     def __len__(self) -> int:
         return self.change[0].arrays.size
@@ -243,6 +243,23 @@ class ChangedModel(Wrapper):
         root = last[:, len(self) - 1]
         return last[:, -1] * root, root**2
 
+    def remaining(self, latent: Any, variance: Any, signal: Any) -> Any:
+        """What the model alone does not know (*batch, k), less what d's points have seen.
+
+        Where its ``latent`` variance is more than d's prior variance, the ``signal``, it
+        knows nothing, as where an input moves that its data held still. There an error
+        teaches both at once, and of the excess as large a part is left as of the signal
+        is in d's own ``variance``. All three are NumPy's arrays, or all torch's.
+        """
+        excess = (latent - signal).clip(0.0)
+        left = (variance / signal).clip(None, 1.0)
+        return latent - excess * (1.0 - left)
+
+    @cached_property
+    def signal(self) -> Array:
+        """The prior variances of d (k,)."""
+        return self.learning.share**2 * to_array(self.gp.signal_variance)
+
     @property
     def posterior(self) -> GPPosterior:
         """The GPs of d as tensors."""
@@ -281,9 +298,13 @@ class ChangedModel(Wrapper):
         d = self.posterior.predict(
             z, torch.cat([v, torch.full_like(state[..., :1], self.time)], dim=-1)
         )
+        reach = torch.as_tensor(self.arrays[1]).to(belief.mean)
+        latent = ((reach @ belief.covariance) * reach).sum(-1)
+        signal = torch.as_tensor(self.signal).to(belief.mean)
+        variance = self.remaining(latent, d.variance, signal) + d.variance
         return Gaussian(
             belief.mean + d.mean @ self.B.mT,
-            belief.covariance + self.B @ d.covariance @ self.B.mT,
+            self.B @ torch.diag_embed(variance) @ self.B.mT,
         )
 
     def linearize(
@@ -304,8 +325,13 @@ class ChangedModel(Wrapper):
             change, z, at, covariance, offset, False
         )
         by_state, by_input = self.features.chain(by_state, by_input[..., :-1], slope)
-        B, V = self.arrays[0], found.covariance
-        V = None if V is None or variance is None else V + B @ variance @ B.T
+        B, reach, _ = self.arrays
+        V = found.covariance
+        if V is not None and variance is not None:
+            own = np.diagonal(variance, axis1=1, axis2=2)
+            latent = ((reach @ V) * reach).sum(-1)
+            own = own + self.remaining(latent, own, self.signal)
+            V = (B * own[:, None, :]) @ B.T
         return Linearized(
             found.mean + mean @ B.T, found.A + B @ by_state, found.B + B @ by_input, V
         )

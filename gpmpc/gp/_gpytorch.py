@@ -10,6 +10,7 @@ jitter without a word, keeps the noise above 1e-4, takes no leading batch dimens
 """
 
 import copy
+import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -34,6 +35,13 @@ from gpmpc.gp._kernel import Hyperparameters, Predicts, check_columns
 from gpmpc.gp._posterior import GPPosterior
 from gpmpc.gp._scaling import Scaling, identity
 from gpmpc.gp._sparse import Method, sparse_posterior
+
+_PROBES = 25  # points at which a model's forward is compared with its parts, twice
+_SAME = 1e-8  # relative difference of two priors that are the same
+_ROADS = (
+    "KernelPosterior.from_gpytorch takes an exact model's forward as it is; for "
+    "GPPosterior, train on transformed data (GPPosterior.unscaled gives units back)"
+)
 
 
 @contextmanager
@@ -123,7 +131,8 @@ def from_gpytorch(
         predicts: What the training targets mean.
 
     Raises:
-        UnsupportedModel: The kernel, mean or likelihood is another one, or transforms are attached.
+        UnsupportedModel: The kernel, mean or likelihood is another one, transforms are attached, or the model's
+            ``forward`` scales, warps or adds: it is not the distribution of its mean and kernel modules.
         ShapeError: The models of a list have other training inputs or inducing points, or there is more than one batch
             dimension.
     """
@@ -133,6 +142,7 @@ def from_gpytorch(
     inputs: list[Tensor] = []
     inducing: list[Tensor] = []
     for one, own in _members(model, likelihood):
+        _check_forward(one)
         targets, kernel, none = (
             one.train_targets,
             one.covar_module,
@@ -242,7 +252,8 @@ class KernelPosterior(TensorModel):
         """Freezes trained ExactGPs in float64, which are copied; arguments are as for ``gpmpc.gp.from_gpytorch``.
 
         Raises:
-            UnsupportedModel: The model is no such, or approximate.
+            UnsupportedModel: The model is no such, or approximate, or its ``forward`` gives a point another prior
+                beside other points, as one that scales by the range of what it is given.
             ShapeError: The numbers of features differ, or do not go with the numbers of outputs and controls.
             SettingError: The model is not in float64, or its kernel matrix is not positive definite.
         """
@@ -344,6 +355,7 @@ class _Part:
         batch, features = targets.shape[:-1], _features(copied)
         features = features.expand(*batch, -1, -1) if batch else features[0]
         noise = likelihood.noise.detach().reshape(-1).expand(*batch or (1,)).clone()
+        _check_pointwise(copied)
         with exact_inference(), torch.no_grad():
             prior = copied.forward(features)
             kernel = prior.lazy_covariance_matrix.to_dense().clone()
@@ -431,11 +443,103 @@ def _members(model: Any, likelihood: Any) -> list[tuple[Any, Any]]:
     return pairs
 
 
+def _check_forward(model: Any) -> None:
+    """Raises ``UnsupportedModel`` unless ``forward`` is that of the mean and the kernel.
+
+    GPyTorch predicts by a model's ``forward``, which may scale inputs, pass them through
+    a network, or add to the mean; its modules know nothing of it. So mean and covariance
+    of the prior are compared at training points and around them.
+    """
+    copied = copy.deepcopy(model).eval().requires_grad_(False)
+    for part in ("mean_module", "covar_module"):
+        if not callable(getattr(copied, part, None)):
+            raise UnsupportedModel(
+                f"the model has no {part}, which it would be frozen from. {_ROADS}"
+            )
+    points = _probes(copied)
+    with torch.no_grad():
+        try:
+            prior = copied.forward(points)
+            mean, covariance = prior.mean, prior.covariance_matrix
+        except Exception as error:
+            raise UnsupportedModel(
+                "the model's forward fails at points around its training inputs "
+                f"({type(error).__name__}: {error}). {_ROADS}"
+            ) from error
+        try:
+            own_mean = copied.mean_module(points)
+            own_covariance = copied.covar_module(points).to_dense()
+        except Exception:  # the modules are made for other inputs, as of a network
+            own_mean, own_covariance = torch.full_like(mean, torch.nan), covariance
+    missed = [
+        _difference(mean, own_mean, mean.std() + 1),
+        _difference(covariance, own_covariance, covariance.abs().max()),
+    ]
+    for what, error in zip(("mean", "covariance"), missed, strict=True):
+        if not error <= _SAME:
+            raise UnsupportedModel(
+                "the model's forward is not the distribution of its mean_module and "
+                f"covar_module: the prior's {what} is another one (it scales, warps or "
+                f"adds), and only the modules would be frozen. {_ROADS}"
+            )
+
+
+def _check_pointwise(model: Any) -> None:
+    """Raises ``UnsupportedModel`` where a point's prior depends on the points beside it."""
+    points = _training_points(model)[..., :_PROBES, :]
+    with torch.no_grad():
+        alone = model.forward(points[..., :3, :])
+        among = model.forward(points)
+    count = alone.mean.shape[-1]
+    covariance = among.covariance_matrix[..., :count, :count]
+    errors = [
+        _difference(among.mean[..., :count], alone.mean, among.mean.std() + 1),
+        _difference(covariance, alone.covariance_matrix, covariance.abs().max()),
+    ]
+    if not max(errors) <= _SAME:
+        raise UnsupportedModel(
+            "the model's forward gives a point another prior beside other points, as "
+            "where it scales by the range of what it is given: take the range of the "
+            "training inputs once and for all"
+        )
+
+
+def _probes(model: Any) -> Tensor:
+    """Points at which priors are compared (*batch, P, d): of the training, and around.
+
+    They lie in the box of the training inputs and up to half its width outside.
+    """
+    inputs = _training_points(model)
+    among = inputs[..., :: max(1, inputs.shape[-2] // _PROBES), :][..., :_PROBES, :]
+    lower, upper = inputs.amin(dim=-2), inputs.amax(dim=-2)
+    width = torch.where(upper > lower, upper - lower, 1.0)
+    generator = torch.Generator().manual_seed(0)
+    unit = torch.rand(
+        _PROBES, inputs.shape[-1], generator=generator, dtype=torch.float64
+    )
+    around = lower[..., None, :] + (2 * unit.to(inputs) - 0.5) * width[..., None, :]
+    return torch.cat([among, around], dim=-2)
+
+
+def _difference(values: Tensor, others: Tensor, unit: Tensor) -> float:
+    """The largest difference in a unit; infinite where the shapes differ, or NaN."""
+    try:
+        others = others.expand_as(values)
+    except RuntimeError:
+        return math.inf
+    return float(((values - others).abs() / unit).max())
+
+
 def _features(model: Any) -> Tensor:
     """The training inputs of a model, once (1, N, d) or for every member of a batch (k, N, d)."""
-    inputs = model.train_inputs[0].detach()
-    inputs = inputs[:, None] if inputs.dim() == 1 else inputs
+    inputs = _training_points(model)
     return inputs.reshape(-1, *inputs.shape[-2:])
+
+
+def _training_points(model: Any) -> Tensor:
+    """The training inputs of a model as they are, but of two dimensions or more."""
+    inputs = model.train_inputs[0].detach()
+    return inputs[:, None] if inputs.dim() == 1 else inputs
 
 
 def _equal(tensors: list[Tensor]) -> bool:

@@ -13,7 +13,7 @@ import logging
 import math
 import time
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -22,6 +22,7 @@ from torch import Tensor
 
 from gpmpc.exceptions import SettingError, ShapeError, check_number
 from gpmpc.gaussian import check_tensors
+from gpmpc.gp._data_checks import RESOLUTION, constant_columns
 from gpmpc.gp._kernel import IGNORED, check_posterior
 from gpmpc.gp._likelihood import FAILED, NegativeLogMarginalLikelihood
 from gpmpc.gp._posterior import GPPosterior
@@ -31,8 +32,13 @@ _log = logging.getLogger(__name__)
 _EXPLORATION = 16  # L-BFGS iterations from every start, before ...
 _FINALISTS = 2  # ... this many of the best go on to convergence
 _ITERATIONS = 1000  # of the search to convergence, at most
+_PLAIN_RATIO = 10.0  # sf / sn where the search begins
 _LONGER = 1.0  # mean of log l over log std(x~) at the random starts: smooth dynamics prefer long length-scales
-_CONSTANT = 3e-9  # of its magnitude: a column that moves by no more holds a solver's residue (1e-9); 1e8 +- 0.5 moves
+_SMOOTH = 5.0  # length-scale of an output that never changes, in spreads of its inputs
+_REPEATED = 1e4  # sf / sn of such an output, at most: the data repeat themselves
+_SMALL = (
+    3e-9  # part of its magnitude: targets that vary by less vary as their magnitude
+)
 _LENGTHSCALE_LIMIT = 1e4  # the box holds length-scales within this factor of their input's standard deviation
 _LOG_INTERVAL = 5.0  # [s]
 
@@ -73,8 +79,9 @@ class SoftLimits:
 class OutputSearch:
     """The search for one output's hyperparameters, in scaled units, with a ``Trainer``'s settings.
 
-    ``std`` (d,) is of the inputs (N, d), see ``column_std``; ``constant`` (d,) which of them are. From the deadline on,
-    by the clock of ``time.perf_counter`` [s], the best found so far is taken.
+    ``std`` (d,) is of the inputs (N, d), see ``column_std``; ``constant`` (d,) which of them are, and ``prior`` (d,)
+    the length-scales of those. From the deadline on, by the clock of ``time.perf_counter`` [s], the best found so far
+    is taken.
     """
 
     def __init__(
@@ -84,13 +91,18 @@ class OutputSearch:
         targets: np.ndarray,
         std: np.ndarray,
         constant: np.ndarray,
+        prior: np.ndarray,
         settings: Any,
         deadline: float,
     ):
         self._name, self._inputs, self._targets = name, inputs, targets
         self._settings, self._deadline = settings, deadline
-        self._log_std, self._constant = np.log(std), constant
-        self._log_output = np.log(column_std(targets[:, None])[0])
+        # An input that is known to have no effect drops out of the kernel.
+        ignored = constant & np.isinf(prior)
+        self._log_prior = np.log(np.where(ignored, IGNORED * std, prior))
+        self._constant = constant
+        self._log_std = np.log(np.where(constant & ~ignored, prior, std))
+        self._log_output = np.log(_output_std(targets))
         self._box = search_box(
             self._log_std, self._log_output, settings.signal_to_noise_limit
         )
@@ -109,7 +121,7 @@ class OutputSearch:
             perturbations: Standard normal (restarts + 1, d + 2); the first row is not used.
             rows: The subset that the search begins with; None for all points from the start.
         """
-        plain = np.append(self._log_std, [self._log_output, np.log(10.0)])
+        plain = np.append(self._log_std, [self._log_output, np.log(_PLAIN_RATIO)])
         longer = np.append(np.full(len(self._log_std), _LONGER), [0.0, 0.0])
         starts = [
             plain if first is None else first,
@@ -134,13 +146,35 @@ class OutputSearch:
                 self._name,
                 self._settings.time_limit,
             )
-        # Nothing can be learned about an input that never moved, and nothing is: it drops out of the kernel.
-        theta[:-2][self._constant] = self._log_std[self._constant] + np.log(IGNORED)
+        # The likelihood says nothing of an input that never moved: the prior does.
+        theta[:-2][self._constant] = self._log_prior[self._constant]
         return (
             theta,
             value,
             [end[1] for end in ends] + [math.nan] * (len(starts) - len(ends)),
         )
+
+    def unsearched(self, deviation: float) -> tuple[np.ndarray, float, list[float]]:
+        """What is supposed of an output that never changes, in the place of a search.
+
+        The likelihood only ever asks for less signal and longer length-scales: for
+        certainty everywhere, from data that have not seen the output vary. So the
+        signal has the prior's ``deviation``, and the length-scales are some spreads of
+        the inputs: among the data the output is known, far from them it is not. A
+        single row leaves the noise open as well: that of the plain start.
+        """
+        lengths = self._log_std + np.log(_SMOOTH)
+        lengths[self._constant] = self._log_prior[self._constant]
+        signal = max(deviation, np.abs(self._targets).max())
+        ratio = min(_REPEATED, self._settings.signal_to_noise_limit)
+        if len(self._targets) == 1:
+            ratio = min(_PLAIN_RATIO, ratio)
+        theta = np.append(lengths, [np.log(signal), np.log(ratio)])
+        self._see(slice(None))
+        value = self._likelihood(theta)[0]
+        self.evaluations += 1
+        value = float(value) if np.isfinite(value) else FAILED
+        return theta, value, [value] + [math.nan] * self._settings.restarts
 
     def _see(self, rows: Any) -> None:
         """Takes the likelihood of some of the points."""
@@ -201,28 +235,48 @@ def search_box(
     return centre - reach, centre + reach
 
 
-def column_std(columns: np.ndarray) -> np.ndarray:
-    """The standard deviation (d,) of columns (N, d); of a constant column its magnitude, or 1 where that is 0."""
+def column_std(columns: np.ndarray, constant: np.ndarray | None = None) -> np.ndarray:
+    """The standard deviation (d,) of columns (N, d).
+
+    Of a constant column its magnitude, or 1 where that is none; ``constant`` (d,) says
+    which are, by default those of ``constant_columns``.
+    """
+    constant = constant_columns(columns) if constant is None else constant
     away = columns - columns[0]
-    reach, magnitude, constant = (
-        np.abs(away).max(axis=0),
-        np.abs(columns).max(axis=0),
-        constant_columns(columns),
-    )
-    unit = np.where(constant, np.where(magnitude > 0, magnitude, 1.0), reach)
+    reach = np.abs(away).max(axis=0)
+    magnitude = np.abs(columns).max(axis=0)
+    unit = np.where(constant, np.where(magnitude > RESOLUTION, magnitude, 1.0), reach)
     return unit * np.where(
         constant, 1.0, (away / unit).std(axis=0, ddof=min(1, len(columns) - 1))
     )
 
 
-def constant_columns(columns: np.ndarray) -> np.ndarray:
-    """Which columns (d,) of (N, d) do not move by more than round-off."""
-    return np.ptp(columns, axis=0) <= _CONSTANT * np.abs(columns).max(axis=0)
+def plain_theta(std: np.ndarray, targets: np.ndarray) -> np.ndarray:
+    """Where the search begins (d + 2,): l = std(x~), sf = std(y), sn = std(y) / 10."""
+    return np.append(np.log(std), np.log([_output_std(targets), _PLAIN_RATIO]))
+
+
+def _output_std(targets: np.ndarray) -> float:
+    """The standard deviation of scaled targets (N,), or their magnitude.
+
+    Where the prior mean is far from them, signals are of their magnitude.
+    """
+    small = np.ptp(targets) <= _SMALL * np.abs(targets).max()
+    return float(column_std(targets[:, None], np.array([small]))[0])
+
+
+class TrainingData(NamedTuple):
+    """What a training learns from, in the units of the data, and how it is scaled."""
+
+    features: Tensor  #: (N, d)
+    targets: Tensor  #: (N, k)
+    feature_scaling: Scaling
+    target_scaling: Scaling
 
 
 def training_data(
     features: Tensor, targets: Tensor, input_dim: int, predicts: str, scaling: Any
-) -> tuple[Tensor, Tensor, Scaling, Scaling]:
+) -> TrainingData:
     """Features and targets apart from any graph, and the scalings of both; errors are those of ``Trainer.fit``."""
     given = {"features": features, "targets": targets}
     check_tensors(**given)
@@ -237,7 +291,12 @@ def training_data(
     n = features.shape[1] - input_dim
     names = [f"x{i + 1}" for i in range(n)] + [f"u{i + 1}" for i in range(input_dim)]
     outputs = [f"y{a + 1}" for a in range(targets.shape[1])]
-    return features, targets, scaling(features, names), scaling(targets, outputs)
+    return TrainingData(
+        features=features,
+        targets=targets,
+        feature_scaling=scaling(features, names),
+        target_scaling=scaling(targets, outputs),
+    )
 
 
 def restored_theta(

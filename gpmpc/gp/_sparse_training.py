@@ -19,12 +19,23 @@ from scipy.optimize import minimize
 from torch import Tensor
 
 from gpmpc.exceptions import SettingError, TrainingError, check_choice, check_number
+from gpmpc.gp._data_checks import (
+    RESOLUTION,
+    Columns,
+    Constants,
+    columns_of,
+    warn_of_constants,
+    warn_of_transitions,
+)
 from gpmpc.gp._kernel import Hyperparameters, Predicts, kernel_matrix
 from gpmpc.gp._likelihood import FAILED
+from gpmpc.gp._prior_scales import PriorScales
 from gpmpc.gp._scaling import Scaling, centre, identity
 from gpmpc.gp._search import (
+    TrainingData,
     column_std,
     log_hyperparameters,
+    plain_theta,
     restored_theta,
     search_box,
     training_data,
@@ -66,6 +77,10 @@ class SparseTrainer:
     iterations: int = 100  #: of L-BFGS, at most
     subset: int = 200  #: number of random transitions in the first, exact, training
     restarts: int = 1  #: random starts of that one
+    #: of features that never move in the data, and of outputs that never change; all three as in ``Trainer``
+    prior_lengthscale: float | Sequence[float] | None = None
+    prior_deviation: float | None = 1.0
+    resolution: float = RESOLUTION
 
     def __post_init__(self) -> None:
         for key in ("inducing", "subset"):
@@ -82,11 +97,14 @@ class SparseTrainer:
                 points learned nothing but noise of it where the subset's training learned more.
         """
         check_transitions(transitions)
+        targets = transitions.targets(self.predicts)
+        warn_of_transitions(transitions)
         return self.fit(
             transitions.features,
-            transitions.targets(self.predicts),
+            targets,
             transitions.input_dim,
             seed=seed,
+            columns=columns_of(transitions, self.predicts),
         )
 
     def fit(
@@ -96,20 +114,46 @@ class SparseTrainer:
         input_dim: int,
         predicts: Predicts | None = None,
         seed: int = 0,
+        columns: Columns | None = None,
     ) -> Training:
-        """Trains on features x~ = (x, u) (N, n + m) and any targets (N, k)."""
+        """Trains on features x~ = (x, u) (N, n + m) and any targets (N, k); see ``Trainer.fit``."""
         begin = time.perf_counter()
         check_number("seed", seed, least=0, whole=True)
         predicts = predicts or self.predicts
-        features, targets, feature_scaling, target_scaling = training_data(
-            features, targets, input_dim, predicts, self.scaling
-        )
+        data = training_data(features, targets, input_dim, predicts, self.scaling)
+        features, targets, feature_scaling, target_scaling = data
+        if columns is None:
+            columns = Columns.of(features, targets, input_dim, predicts)
+        constants = Constants.of(features, targets, columns, self.resolution)
+        prior = PriorScales.of(self, features.shape[1], columns.units)
+        warn_of_constants(features, targets, columns, constants, prior, self.resolution)
+        fixed = constants.outputs & (prior.deviations is not None)
         # A stationary kernel depends on differences; those from one of the points are exact, wherever the data lie.
         feature_scaling = Scaling(features[0], feature_scaling.factor)
         x, y = feature_scaling.scale(features), target_scaling.scale(targets)
         chosen = np.random.default_rng(seed).permutation(len(x))[: self.subset]
-        exact = self._exact().fit(features[chosen], y[chosen], input_dim, "value", seed)
+        unit = torch.from_numpy(column_std(features.numpy(), constants.features))
+        unit = unit / feature_scaling.factor
+        # Exact GPs of a subset, which may have seen at rest what moves elsewhere.
+        part = TrainingData(
+            features[chosen], y[chosen], identity(features), identity(y)
+        )
+        at_rest = Constants.of(
+            features[chosen], targets[chosen], columns, self.resolution
+        )
+        exact = self._exact().fit_known(
+            part,
+            at_rest,
+            prior.of_scaled_targets(target_scaling),
+            input_dim,
+            "value",
+            seed,
+        )
         theta = log_hyperparameters(exact.posterior, feature_scaling, identity(y))
+        moving = at_rest.features & ~constants.features
+        theta[:, :-2][:, moving] = np.log(unit.numpy())[moving]
+        for a in np.flatnonzero(at_rest.outputs & ~constants.outputs):
+            theta[a] = plain_theta(unit.numpy(), y[:, a].numpy())
         Z = x[
             informative_points(
                 x, Hyperparameters.from_theta(torch.from_numpy(theta)), self.inducing
@@ -117,8 +161,11 @@ class SparseTrainer:
         ]
         text = "sparse training: %d inducing points chosen among %d after %.1f s"
         _log.info(text, len(Z), len(x), time.perf_counter() - begin)
-        unit = torch.from_numpy(column_std(features.numpy())) / feature_scaling.factor
-        bound = _Bound(self, x, y, unit, self._with_unexplained(theta, Z, x, y), Z)
+        theta = self._with_unexplained(theta, Z, x, y)
+        unsearched = np.zeros(theta.shape, dtype=bool)
+        unsearched[fixed] = True
+        unsearched[:, :-2][:, constants.features] = True
+        bound = _Bound(self, x, y, unit, theta, Z, unsearched)
         initial = bound.values()
         bound.maximize()
         if failed := np.flatnonzero(~np.isfinite(objective := bound.values())).tolist():
@@ -126,8 +173,10 @@ class SparseTrainer:
                 failed,
                 "the inducing points' kernel matrix is not positive definite: take fewer",
             )
+        gains = _noise_alone(y) - objective
+        gains[fixed] = np.inf  # there is nothing to learn of them
         self._check_learned(
-            _noise_alone(y) - objective,
+            gains,
             _noise_alone(y[chosen]) - exact.objective,
             x.shape[1] + 2,
         )
@@ -194,6 +243,9 @@ class SparseTrainer:
             scaling=identity,
             restarts=self.restarts,
             tolerance=_TOLERANCE,
+            prior_lengthscale=self.prior_lengthscale,
+            prior_deviation=self.prior_deviation,
+            resolution=self.resolution,
         )
 
 
@@ -248,7 +300,9 @@ class _Bound:
         unit: Tensor,
         theta: np.ndarray,
         Z: Tensor,
+        unsearched: np.ndarray,
     ):
+        self._unsearched = unsearched  # entries of theta (k, d + 2) that stay
         self._trainer, self._x, self._y, self._unit, self._shape = (
             trainer,
             x,
@@ -276,13 +330,17 @@ class _Bound:
             (len(self.best) - self._shape[0] * self._shape[1]) // len(smallest),
         )
         lower, upper = (np.concatenate(side) for side in zip(*boxes, strict=True))
-        # A feature that the subset saw at rest has a length-scale beyond any box (IGNORED); it stays there.
         lower = np.minimum(
             np.append(lower, np.tile(smallest - margin, count)), self.best
         )
         upper = np.maximum(
             np.append(upper, np.tile(largest + margin, count)), self.best
         )
+        stays = np.append(
+            self._unsearched.ravel(),
+            np.zeros(self.best.size - self._unsearched.size, dtype=bool),
+        )
+        lower[stays] = upper[stays] = self.best[stays]
         if self._trainer.iterations:  # of none L-BFGS-B makes one
             limits = {
                 "maxiter": trainer.iterations,

@@ -23,15 +23,25 @@ from gpmpc.exceptions import (
     check_choice,
     check_number,
 )
+from gpmpc.gp._data_checks import (
+    RESOLUTION,
+    Columns,
+    Constants,
+    columns_of,
+    constant_columns,
+    warn_of_constants,
+    warn_of_transitions,
+)
 from gpmpc.gp._kernel import PREDICTS, Hyperparameters, Predicts
 from gpmpc.gp._likelihood import FAILED
 from gpmpc.gp._online import targets_of
 from gpmpc.gp._posterior import GPPosterior
+from gpmpc.gp._prior_scales import PriorScales, check_prior_scales
 from gpmpc.gp._scaling import Scaling, centre
 from gpmpc.gp._search import (
     OutputSearch,
+    TrainingData,
     column_std,
-    constant_columns,
     log_hyperparameters,
     restored_theta,
     training_data,
@@ -88,6 +98,14 @@ class Trainer:
     #: wall time of a training [s], in equal parts for the outputs, after which the best found so far is taken: what
     #: that is depends on the machine. One iteration over all points is made in any case. None: no limit
     time_limit: float | None = None
+    #: of features that never move in the data, for all or one each, in their units: how far from the value that they
+    #: have predictions hold. None: one unit; ``math.inf``: known to have no effect
+    prior_lengthscale: float | Sequence[float] | None = None
+    #: of outputs that never change in the data: the standard deviation that they are supposed to have elsewhere, in
+    #: their units; of a residual, in units of what a step changes. None: what the search finds, which is nearly none
+    prior_deviation: float | None = 1.0
+    #: a feature or a target that moves by no more than this, in its unit, or by round-off, never moves
+    resolution: float = RESOLUTION
 
     def __post_init__(self) -> None:
         check_choice("predicts", self.predicts, PREDICTS)
@@ -103,6 +121,7 @@ class Trainer:
                     key,
                     f"must be a function such as {example} of gpmpc.gp; got {value!r}",
                 )
+        check_prior_scales(self)
         check_number("tolerance", self.tolerance, above=0)
         check_number("signal_to_noise_limit", self.signal_to_noise_limit, above=1)
         if self.time_limit is not None:
@@ -114,8 +133,14 @@ class Trainer:
         """Trains on transitions; see ``fit``."""
         check_transitions(transitions)
         targets = transitions.targets(self.predicts)
+        warn_of_transitions(transitions)
         return self.fit(
-            transitions.features, targets, transitions.input_dim, seed=seed, start=start
+            transitions.features,
+            targets,
+            transitions.input_dim,
+            seed=seed,
+            start=start,
+            columns=columns_of(transitions, self.predicts),
         )
 
     def refit(
@@ -157,8 +182,9 @@ class Trainer:
         predicts: Predicts | None = None,
         seed: int = 0,
         start: GPPosterior | None = None,
+        columns: Columns | None = None,
     ) -> Training:
-        """Trains on features and any targets.
+        """Trains on features and any targets; what they cannot teach is named in the log.
 
         Args:
             features: x~ = (x, u) (N, n + m).
@@ -167,6 +193,7 @@ class Trainer:
             predicts: What the targets mean; the trainer's setting by default.
             seed: Of the random starts.
             start: Its hyperparameters are the first start instead; the random ones stay where they are.
+            columns: What the log calls features and targets; by default states, inputs and outputs with numbers.
 
         Raises:
             ShapeError, SettingError, UnsupportedModel: Features, targets and ``start`` do not belong together, or are
@@ -177,19 +204,54 @@ class Trainer:
         begin = time.perf_counter()
         check_number("seed", seed, least=0, whole=True)
         predicts = predicts or self.predicts
-        features, targets, feature_scaling, target_scaling = training_data(
-            features, targets, input_dim, predicts, self.scaling
+        data = training_data(features, targets, input_dim, predicts, self.scaling)
+        features, targets = data.features, data.targets
+        if columns is None:
+            columns = Columns.of(features, targets, input_dim, predicts)
+        constants = Constants.of(features, targets, columns, self.resolution)
+        prior = PriorScales.of(self, features.shape[1], columns.units)
+        warn_of_constants(features, targets, columns, constants, prior, self.resolution)
+        return self.fit_known(
+            data,
+            constants,
+            prior,
+            input_dim,
+            predicts,
+            seed=seed,
+            start=start,
+            begin=begin,
         )
+
+    def fit_known(
+        self,
+        data: TrainingData,
+        constants: Constants,
+        prior: PriorScales,
+        input_dim: int,
+        predicts: Predicts,
+        seed: int,
+        start: GPPosterior | None = None,
+        begin: float | None = None,
+    ) -> Training:
+        """``fit`` to checked data of which it is known, and was said, what never moves.
+
+        ``begin`` is when it began, by ``time.perf_counter`` [s]; by default now.
+        """
+        begin = time.perf_counter() if begin is None else begin
+        features, targets, feature_scaling, target_scaling = data
         (size, d), outputs = features.shape, targets.shape[1]
         _check_memory(size, outputs)
         x, y = (
             feature_scaling.scale(features).numpy(),
             target_scaling.scale(targets).numpy(),
         )
+        factor = feature_scaling.factor.numpy()
+        std = column_std(features.numpy(), constants.features) / factor
         first: Any = [None] * outputs
         if start is not None:
             _check_start("start", start)
             first = log_hyperparameters(start, feature_scaling, target_scaling)
+            first = self._without_constants(first, start, constants, np.log(std))
         rng = np.random.default_rng(seed)
         perturbations = rng.normal(size=(outputs, self.restarts + 1, d + 2))
         rows = None
@@ -198,8 +260,6 @@ class Trainer:
         )  # a subset could not improve on where the search begins
         if self.subset is not None and size > self.subset and not converged:
             rows = np.sort(rng.permutation(size)[: self.subset])
-        std, constant = column_std(features.numpy()), constant_columns(features.numpy())
-        std = std / feature_scaling.factor.numpy()
         found, evaluations = [], 0
         for a in range(outputs):
             deadline = (
@@ -212,12 +272,17 @@ class Trainer:
                 x,
                 y[:, a],
                 std,
-                constant,
+                constants.features,
+                prior.lengthscales / factor,
                 self,
                 deadline,
             )
             with threadpool_limits(1 if size < _ONE_THREAD else None, user_api="blas"):
-                found.append(search(first[a], perturbations[a], rows))
+                if constants.outputs[a] and prior.deviations is not None:
+                    unit = float(target_scaling.factor[a])
+                    found.append(search.unsearched(prior.deviations[a] / unit))
+                else:
+                    found.append(search(first[a], perturbations[a], rows))
             evaluations += search.evaluations
         theta, objective, explored = map(np.array, zip(*found, strict=True))
         if failed := np.flatnonzero(objective >= FAILED).tolist():
@@ -242,6 +307,24 @@ class Trainer:
             evaluations,
             time.perf_counter() - begin,
         )
+
+    def _without_constants(
+        self,
+        first: np.ndarray,
+        start: GPPosterior,
+        constants: Constants,
+        log_std: np.ndarray,
+    ) -> list[np.ndarray | None]:
+        """The starts of a posterior (k, d + 2), apart from what its own data held still.
+
+        Of that its hyperparameters say nothing: a feature that moves by now begins with
+        its spread, and an output that changes by now with the plain start.
+        """
+        began = constant_columns(start.features.cpu().double().numpy(), self.resolution)
+        began &= ~constants.features
+        first[:, :-2][:, began] = log_std[began]
+        same = constant_columns(start.targets.cpu().double().numpy(), self.resolution)
+        return [None if same[a] else first[a] for a in range(len(first))]
 
 
 def train(transitions: Transitions, seed: int = 0, **settings: Any) -> Training:

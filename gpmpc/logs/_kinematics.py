@@ -193,6 +193,19 @@ class Increments:
             parts += [np.sin(own), np.cos(own)] if group.kind == "angle" else [own]
         return np.concatenate([*parts, inputs, context], axis=-1)
 
+    def feature_names(
+        self, inputs: Sequence[str], context: Sequence[str]
+    ) -> tuple[str, ...]:
+        """What the features are called (d,), of inputs and context by their names."""
+        names: list[str] = []
+        for group in self.space.groups:
+            if group.kind == "angle":
+                names += [f"sine of {entry}" for entry in group.entries]
+                names += [f"cosine of {entry}" for entry in group.entries]
+            else:
+                names += group.entries
+        return (*names, *inputs, *context)
+
     def coast(self, states: Array, time: float) -> Array:
         """The states themselves: nothing says which of them are velocities."""
         return states
@@ -250,6 +263,15 @@ class RigidBody:
         return np.concatenate(
             [rotate(to_body, v), down[..., :2], w, inputs, context], axis=-1
         )
+
+    def feature_names(
+        self, inputs: Sequence[str], context: Sequence[str]
+    ) -> tuple[str, ...]:
+        """What the features are called (d,), of inputs and context by their names."""
+        velocity = [f"velocity along the body's {axis}" for axis in "xyz"]
+        down = [f"gravity along the body's {axis}" for axis in "xy"]
+        rate = [f"rate about the body's {axis}" for axis in "xyz"]
+        return (*velocity, *down, *rate, *inputs, *context)
 
     def coast(self, states: Array, time: float) -> Array:
         """Goes on at constant velocity and rate for a time [s]."""

@@ -17,6 +17,7 @@ from scipy.spatial import cKDTree
 
 from gpmpc.exceptions import DataError, check_number
 from gpmpc.gp import Trainer, standardize
+from gpmpc.gp._data_checks import Columns
 from gpmpc.logs._fitting import (
     NominalFit,
     OutputNoise,
@@ -300,12 +301,21 @@ def _train(
     rows = choose_rows(z, points, seed)
     trainer = Trainer(predicts="value", scaling=standardize, restarts=1, tolerance=1e-6)
     y = np.ascontiguousarray(y[rows][:, list(outputs)])
-    return OutputGP(
-        outputs,
-        trainer.fit(
-            torch.from_numpy(z[rows]), torch.from_numpy(y), 0, "value", seed
-        ).posterior,
+    inputs = log.mapping.column_names("inputs")
+    context = log.mapping.column_names("context")
+    columns = Columns(
+        features=model.kinematics.feature_names(inputs, context),
+        outputs=[model.kinematics.output_names[a] for a in outputs],
     )
+    training = trainer.fit(
+        torch.from_numpy(z[rows]),
+        torch.from_numpy(y),
+        0,
+        "value",
+        seed,
+        columns=columns,
+    )
+    return OutputGP(outputs, training.posterior)
 
 
 def choose_rows(features: Array, count: int, seed: int = 0) -> np.ndarray:

@@ -33,6 +33,12 @@ from gpmpc.gp import (
     Transitions,
     append_points,
 )
+from gpmpc.gp._data_checks import (
+    RESOLUTION,
+    Columns,
+    names_of,
+    warn_of_transitions,
+)
 from gpmpc.gp._posterior import AffineForm
 from gpmpc.gp._transitions import check_transitions
 from gpmpc.models._features import Features
@@ -313,10 +319,18 @@ def train_residual(
         list(range(k) if some is None else some)
         for some, k in ((states, n), (inputs, m))
     )
-    observed = _residuals(
-        nominal, B, Features(states, inputs, list(angles), n, m), transitions
+    seen = Features(states, inputs, list(angles), n, m)
+    features, targets = _residuals(nominal, B, seen, transitions)
+    warn_of_transitions(transitions)
+    training = trainer.fit(
+        features,
+        targets,
+        len(inputs),
+        "value",
+        seed,
+        columns=_columns(transitions, B, seen),
     )
-    training, noise = trainer.fit(*observed, len(inputs), "value", seed), None
+    noise = None
     if callable(
         B
     ):  # one covariance for all states: its mean over those that were observed
@@ -326,6 +340,40 @@ def train_residual(
         nominal, training.posterior, B, states, inputs, m, list(angles), noise
     )
     return replace(training, posterior=cast(Any, model))
+
+
+def _columns(transitions: Transitions, B: Effect, seen: Features) -> Columns:
+    """What features and targets of a residual are called, and how large they may be.
+
+    A residual is what two states differ by, as seen through the pseudo-inverse of B, and
+    round-off is that of the states. What it is where no data were seen may be as much as
+    a step changes: there the nominal model is right, or it is not.
+    """
+    states, inputs = names_of(transitions)
+    features: list[str] = []
+    for i in seen.states:
+        if i in seen.angles:
+            features += [f"sine of {states[i]}", f"cosine of {states[i]}"]
+        else:
+            features.append(states[i])
+    features += [inputs[j] for j in seen.inputs]
+    reach = torch.linalg.pinv(_effect(B, transitions.states))
+    if not callable(B) and torch.equal(reach, torch.eye(len(reach)).to(reach)):
+        outputs = [f"what is missed of {name}" for name in states]
+    else:
+        outputs = [f"output {a + 1} of the residual" for a in range(reach.shape[-2])]
+    before, after = transitions.states, transitions.next_states
+    larger = torch.maximum(before.abs(), after.abs())
+    magnitudes = (reach.abs() @ larger[..., None]).amax(dim=0)[:, 0]
+    steps = (reach @ (after - before)[..., None])[..., 0]
+    deviations = steps.std(dim=0, correction=0)
+    deviations = torch.where(deviations > RESOLUTION, deviations, 1.0)
+    return Columns(
+        features=features,
+        outputs=outputs,
+        magnitudes=magnitudes.detach().numpy(force=True),
+        deviations=deviations.detach().numpy(force=True),
+    )
 
 
 def _residuals(

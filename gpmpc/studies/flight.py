@@ -172,14 +172,24 @@ class Experiment:
         return data[random_rows(len(data), size, self.seed, "data.size")]
 
     def learn(self, transitions: Transitions, seed: int) -> Training:
-        """Trains on transitions; see ``train``."""
+        """Trains on transitions; see ``train``.
+
+        What a trainer supposes of columns that never move follows from the system's
+        limits, where its ``prior_lengthscale`` is None.
+        """
         angles, known = self.system.angle_indices, self.system.nominal
-        if (angles or known) and getattr(self.train, "predicts", None) == "difference":
+        residual = getattr(self.train, "predicts", None) == "difference"
+        residual = residual and bool(angles or known)
+        train: Any = self.train
+        if getattr(train, "prior_lengthscale", 1.0) is None:
+            lengthscales = _prior_lengthscales(self.system, residual)
+            train = replace(train, prior_lengthscale=lengthscales)
+        if residual:
             nominal = (
                 None if known is None else CasadiFunction(successor_function(known))
             )
-            return train_residual(self.train, transitions, angles, nominal, seed)
-        return self.train(transitions, seed=seed)
+            return train_residual(train, transitions, angles, nominal, seed)
+        return train(transitions, seed=seed)
 
     def references(self, count: int) -> np.ndarray:
         """Returns the states to follow (count, n), one per time step."""
@@ -200,6 +210,26 @@ class Experiment:
             return model.noise_covariance.diagonal().sqrt().numpy()
         noise = self.noise and self.noise.process
         return none if noise is None else np.array(noise, dtype=float)
+
+
+def _prior_lengthscales(system: System, turned: bool) -> list[float]:
+    """Of what a GP sees of states and inputs: one unit, or a tenth of the limits' range.
+
+    Whichever is less: from one limit to the other predictions then forget what they know.
+    More would do harm where limits are wide. On its way back to the prior a mean has a
+    slope that nobody has seen, and a controller follows it. Where angles are ``turned``
+    into sine and cosine these have one unit.
+    """
+    unlimited = np.full(len(system.state_names), np.inf)
+    lower, upper = system.region or (-unlimited, unlimited)
+    ranges = np.subtract((*upper, *system.input_upper), (*lower, *system.input_lower))
+    lengthscales = []
+    for i, width in enumerate(ranges.tolist()):
+        if turned and i in system.angle_indices:
+            lengthscales += [1.0, 1.0]
+        else:
+            lengthscales.append(min(1.0, width / 10) if width > 0 else 1.0)
+    return lengthscales
 
 
 @dataclass(frozen=True)

@@ -363,6 +363,134 @@ def test_numbers_that_do_not_go_together_are_refused():
         )
 
 
+# --- a forward of its own -------------------------------------------------------------
+
+
+def its_prior(model, mean_points, points, added=0.0, factor=1.0):
+    return gpytorch.distributions.MultivariateNormal(
+        model.mean_module(mean_points) + added, factor * model.covar_module(points)
+    )
+
+
+FORWARDS = {
+    "scales its inputs": lambda model, x: its_prior(model, x, x / 3),
+    "scales both": lambda model, x: its_prior(model, (x - 0.3) / 2, (x - 0.3) / 2),
+    "warps": lambda model, x: its_prior(model, x, torch.tanh(x)),
+    "clamps": lambda model, x: its_prior(model, x, x.clamp(-1.7, 1.7)),
+    "adds to the mean": lambda model, x: its_prior(model, x, x, added=x.sum(-1)),
+    "scales the kernel": lambda model, x: its_prior(model, x, x, factor=2.0),
+    "is a logarithm's": lambda model, x: its_prior(model, x, (x + 2).log()),
+}
+
+
+def with_forward(model, forward):
+    """A model whose last part has a ``forward`` of its own."""
+    models = model if isinstance(model, list) else [*getattr(model, "models", [model])]
+    of_its_own = {"forward": lambda self, x: forward(self, x)}
+    models[-1].__class__ = type("Warped", (Model,), of_its_own)
+    return model
+
+
+@pytest.mark.parametrize("kind", SE_ARD)
+@pytest.mark.parametrize("name", FORWARDS)
+def test_a_forward_that_is_another_model_is_refused_and_kernel_posterior_takes_it(
+    kind, name
+):
+    model = with_forward(SE_ARD[kind](20), FORWARDS[name])
+    with pytest.raises(UnsupportedModel, match="forward is not the distribution") as e:
+        from_gpytorch(model, input_dim=1, predicts="value")
+    assert "KernelPosterior.from_gpytorch takes an exact model's forward" in str(
+        e.value
+    )
+    gp = KernelPosterior.from_gpytorch(model, input_dim=1, predicts="value")
+    query = data(7, seed=5)[0]
+    mean, variance = theirs(model, query)
+    belief = gp.predict(query[:, :2], query[:, 2:])
+    assert torch.allclose(belief.mean, mean, rtol=0, atol=1e-11)
+    assert torch.allclose(belief.variance, variance, rtol=0, atol=1e-11)
+
+
+@pytest.mark.parametrize("name", FORWARDS)
+def test_a_sparse_model_with_a_forward_of_its_own_is_refused_too(name):
+    model = with_forward(sgpr(60, 8), FORWARDS[name])
+    with pytest.raises(UnsupportedModel, match="train on transformed data"):
+        from_gpytorch(model, input_dim=1, predicts="value")
+
+
+class DeepKernel(gpytorch.models.ExactGP):
+    """The form of GPyTorch's example of deep kernel learning."""
+
+    def __init__(self, x, y):
+        super().__init__(x, y, GaussianLikelihood())
+        self.mean_module = ConstantMean()
+        self.covar_module = ScaleKernel(RBFKernel(ard_num_dims=2))
+        layers = torch.nn.Linear(3, 5), torch.nn.Tanh(), torch.nn.Linear(5, 2)
+        self.network = torch.nn.Sequential(*layers)
+        self.lower, self.upper = (
+            torch.full((2,), torch.inf),
+            torch.full((2,), -torch.inf),
+        )
+
+    def forward(self, x):
+        seen = self.network(x)
+        if self.training:  # as GPyTorch's ScaleToBounds
+            self.lower, self.upper = seen.amin(0).detach(), seen.amax(0).detach()
+        seen = (seen - self.lower) / (self.upper - self.lower)
+        return gpytorch.distributions.MultivariateNormal(
+            self.mean_module(seen), self.covar_module(seen)
+        )
+
+
+def test_a_deep_kernel_is_refused_by_name_and_taken_as_a_kernel():
+    torch.manual_seed(0)
+    x, y = data(30)
+    model = DeepKernel(x, y[0]).double().train()
+    model(x)
+    before = model.eval().lower.clone()
+    with pytest.raises(UnsupportedModel, match="prior's mean is another one"):
+        from_gpytorch(model, input_dim=1, predicts="value")
+    gp = KernelPosterior.from_gpytorch(model, input_dim=1, predicts="value")
+    query = data(7, seed=5)[0]
+    mean, variance = theirs(model, query)
+    belief = gp.predict(query[:, :2], query[:, 2:])
+    assert torch.allclose(belief.mean, mean, rtol=0, atol=1e-11)
+    assert torch.allclose(belief.variance, variance, rtol=0, atol=1e-11)
+    assert torch.equal(model.lower, before)
+
+
+def test_a_forward_that_moves_all_points_alike_is_the_same_model():
+    model = with_forward(
+        SE_ARD["single"](20), lambda model, x: its_prior(model, x, x + 5)
+    )
+    assert_equal(model, from_gpytorch)
+
+
+def test_a_prior_that_depends_on_the_points_beside_is_none():
+    def ranged(model, x):
+        low, high = x.amin(-2, keepdim=True), x.amax(-2, keepdim=True)
+        return its_prior(model, x, (x - low) / (high - low))
+
+    model = with_forward(SE_ARD["single"](20), ranged)
+    with pytest.raises(UnsupportedModel, match="another prior beside other points"):
+        KernelPosterior.from_gpytorch(model, input_dim=1, predicts="value")
+    with pytest.raises(UnsupportedModel, match="forward is not the distribution"):
+        from_gpytorch(model, input_dim=1, predicts="value")
+
+
+def test_a_model_whose_parts_have_other_names_is_refused_by_what_is_missing():
+    model = one_output(10, RBFKernel())
+    model.kernel = model.covar_module
+    del model.covar_module
+    with pytest.raises(UnsupportedModel, match="the model has no covar_module"):
+        from_gpytorch(model, input_dim=1, predicts="value")
+
+
+def test_a_model_that_has_predicted_is_frozen_as_before():
+    model, query = SE_ARD["batch"](20), data(4, seed=5)[0]
+    model(query.expand(2, -1, -1)).mean.sum()
+    assert_equal(model, from_gpytorch)
+
+
 # --- sparse ---------------------------------------------------------------------------------------------------------
 
 

@@ -453,7 +453,7 @@ def test_where_there_is_nothing_but_noise_the_log_says_so(caplog):
     assert torch.allclose(gp.noise_variance, torch.ones(2), atol=0.2)
 
 
-def test_an_output_at_rest_is_learned_without_complaint(caplog):
+def test_an_output_at_rest_is_learned_and_only_what_is_supposed_of_it_is_said(caplog):
     x, y = sines(300, 2, 0.1, seed=0)
     with caplog.at_level(logging.WARNING, "gpmpc"):
         gp = (
@@ -462,4 +462,5 @@ def test_an_output_at_rest_is_learned_without_complaint(caplog):
             .posterior
         )
     assert torch.allclose(gp.predict(x).mean[:, 1], torch.tensor(7.0), atol=1e-6)
-    assert not caplog.text
+    assert len(caplog.records) == 1
+    assert "output 2 (7). How much it varies elsewhere is not known" in caplog.text
