@@ -70,6 +70,8 @@ def _read_csv(path: Path, topics: tuple[str, ...], partial: bool) -> Streams:
         )
     with warnings.catch_warnings():  # of rows that are longer than the header
         warnings.simplefilter("error", pd.errors.ParserWarning)
+        # else pandas before version 3 reads some numbers wrong in their last digit
+        options["float_precision"] = "round_trip"
         table = pd.read_csv(path, sep=delimiter, index_col=False, **options)
     return {"": table.rename(columns=str.strip)}
 
