@@ -3,8 +3,14 @@
 PYTHON ?= python3
 ENV := .venv/.installed
 ONLY ?= steps peers gp qp
+FLOORS := .venv-floors/bin/python
+# What tells whether a dependency is too old: every module, models, logs, solvers, recorded flights, figures, sweeps.
+SMOKE := tests/test_imports.py tests/test_compiled.py tests/test_animation.py tests/gp/test_storage.py \
+	tests/gp/test_casadi.py tests/gp/test_from_gpytorch.py tests/qp/test_cvxpy.py tests/qp/test_agreement.py \
+	tests/mpc/test_nmpc.py tests/systems tests/recording tests/logs tests/studies tests/cli/test_run.py \
+	tests/cli/test_sweeps.py tests/cli/test_tune.py
 
-.PHONY: tables figures test lint bench guard docs live clean
+.PHONY: tables figures test floors lint bench guard docs live clean
 
 tables: $(ENV)  ## The paper's Tables 1 and 2 beside ours; settings: make tables SET="draws=50 data=paper data.folder=DIR"
 	.venv/bin/gpmpc tables $(SET)
@@ -14,6 +20,15 @@ figures: $(ENV)  ## Figures 2 to 4 and section 5.2; settings: make figures SET="
 
 test: $(ENV)  ## The whole test suite, on all cores; options: make test ARGS="-k gaussian"
 	.venv/bin/python -m pytest --numprocesses auto --dist loadfile $(ARGS)
+
+# Warnings are none of its business: old libraries warn of newer ones that they rest on.
+floors:  ## Smoke tests with the lowest versions that pyproject.toml allows; another torch: make floors TORCH=2.8.0
+	$(PYTHON) -m venv --clear .venv-floors
+	$(FLOORS) -m pip install --quiet --constraint constraints.txt packaging tomli
+	$(FLOORS) .ci/floors.py $(if $(TORCH),torch=$(TORCH)) > .venv-floors/floors.txt
+	$(FLOORS) -m pip install --quiet --constraint .venv-floors/floors.txt torch
+	$(FLOORS) -m pip install --quiet --constraint .venv-floors/floors.txt --editable ".[dev]"
+	NUMBA_CACHE_DIR=.venv-floors/numba $(FLOORS) -m pytest -W ignore --numprocesses auto --dist loadfile $(SMOKE) $(ARGS)
 
 lint: $(ENV)  ## Format check, linter, import contracts and types
 	.venv/bin/ruff format --check .
@@ -44,4 +59,4 @@ $(ENV): pyproject.toml constraints.txt
 	@touch $@
 
 clean:
-	rm -rf .venv outputs
+	rm -rf .venv .venv-floors outputs

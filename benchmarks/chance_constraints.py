@@ -43,7 +43,7 @@ from scipy.stats import beta, t
 
 from benchmarks.estimation import HORIZON, LIMIT, NOISE, pendulum, random_motion
 from benchmarks.hummingbird import compiled_hummingbird
-from benchmarks.timing import RESULTS, write_results
+from benchmarks.timing import RESULTS, own_source, write_results
 from gpmpc.estimation import (
     AdaptiveTube,
     ConformalTube,
@@ -55,6 +55,7 @@ from gpmpc.gp import Trainer, Transitions
 from gpmpc.models import Affine, ResidualModel
 from gpmpc.mpc import GPMPC, Box, Problem, Reference, Tracking
 from gpmpc.propagation import Linearization
+from gpmpc.studies.study import fingerprint
 from gpmpc.systems.gymnasium_ import gymnasium_system
 
 WAYS = (
@@ -415,6 +416,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=20)
     arguments = parser.parse_args()
     torch.set_num_threads(1)
+    code = fingerprint(own_source(__file__))
     path = RESULTS / "chance_constraints.json"
     results = json.loads(path.read_text())["results"] if path.exists() else []
     print(
@@ -472,6 +474,7 @@ def main() -> None:
                 float(beta.ppf(0.95, bad + 1, active - bad)) if bad < active else 1.0
             )
             cell = {"plant": name, "way": way, "eta": eta, "seeds": arguments.seeds}
+            cell["code"] = code  # rows of other code stay beside those of this one
             numbers = {"violations": bad, "active": active, "upper_limit": limit}
             numbers |= {
                 "distance": found.distance,

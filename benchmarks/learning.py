@@ -8,7 +8,7 @@ model as learned, without and with the controller's own disturbance estimate (ga
 that was trained on the plant that flies after the change (on the plant without wind where the wind changes), which
 flies that plant all along. RMSE of the position [m] from 5 s after a change on, pooled over the seeds; ``ratio`` is to
 the last of these, ``lost`` counts flights farther than 5 m away then. Also by how much a decision takes longer. Each
-cell is kept in ``outputs/benchmarks/learning.json`` and not flown again; remove the file to fly anew.
+cell is kept in ``outputs/benchmarks/learning.json`` and not flown again by the same code.
 """
 
 import argparse
@@ -31,7 +31,7 @@ from benchmarks.quadrotor import (
     problem,
     trained,
 )
-from benchmarks.timing import write_results
+from benchmarks.timing import own_source, write_results
 from gpmpc._files import write_whole
 from gpmpc.gp import GPPosterior
 from gpmpc.learning import LearningController, OnlineLearning
@@ -40,6 +40,7 @@ from gpmpc.mpc.gp_mpc import GPMPC
 from gpmpc.plotting import png
 from gpmpc.propagation import Linearization
 from gpmpc.simulation import Gust, Noise, Replaced, Rollout, closed_loop
+from gpmpc.studies.study import fingerprint
 from gpmpc.systems import translational
 from gpmpc.trajectories import states_along
 
@@ -146,6 +147,7 @@ def main() -> None:
                         "way": way,
                     }
                     key["seeds"] = arguments.seeds
+                    key["code"] = fingerprint(own_source(__file__))
                     found = next(
                         (row for row in rows if key.items() <= row.items()), None
                     )

@@ -8,11 +8,11 @@ steps a rigid body is fitted (mass and three moments of inertia, least squares),
 misses. Both are flown for 12 s along the ellipse and the Lorenz path, which begin at rest, and again with a fifth more
 mass in a wind of 4 m/s. NMPC is solved to a KKT point of 1e-6 at every step, without an estimate of disturbances: the
 nominal controller. The rigid body with ``disturbance_gain=0.3``, and the learned model with it, are flown by one
-quadratic program a step. Each flight is a line of ``outputs/benchmarks/mujoco_quadrotor.jsonl``.
+quadratic program a step. The flights of a seed are a line of ``outputs/benchmarks/mujoco_quadrotor.jsonl``, where a
+run of the same code goes on.
 """
 
 import argparse
-import json
 from dataclasses import replace
 
 import numpy as np
@@ -20,14 +20,14 @@ import pandas
 import torch
 from scipy.optimize import least_squares
 
-from benchmarks.timing import RESULTS, describe, machine
+from benchmarks.timing import RESULTS, describe, machine, own_source
 from gpmpc.gp import Trainer, Transitions, standardize
 from gpmpc.gp.casadi_ import successor_function
 from gpmpc.models import CasadiFunction, KnownModel, ResidualModel
 from gpmpc.mpc import GPMPC, Box, PredictionSettings, Problem, Reference, Tracking
 from gpmpc.propagation import Linearization
 from gpmpc.simulation import Noise, Rollout, closed_loop
-from gpmpc.studies.study import one_thread
+from gpmpc.studies.study import TrialStore, fingerprint, one_thread
 from gpmpc.systems import System, step_many
 from gpmpc.systems.mujoco_quadrotor import RigidBody, mujoco_quadrotor
 from gpmpc.trajectories import Elliptical, Lorenz
@@ -205,19 +205,15 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=20)
     given = parser.parse_args()
     RESULTS.mkdir(parents=True, exist_ok=True)
-    path = RESULTS / "mujoco_quadrotor.jsonl"
-    rows = (
-        [json.loads(line) for line in path.read_text().splitlines()]
-        if path.exists()
-        else []
-    )
-    for seed in sorted(set(range(given.seeds)) - {row["seed"] for row in rows}):
-        with one_thread():
-            found = flights(seed)
-        with path.open("a") as file:
-            file.writelines(json.dumps(row) + "\n" for row in found)
-        rows += found
-        print(f"seed {seed} done", flush=True)
+    store = TrialStore(RESULTS / "mujoco_quadrotor.jsonl")
+    rows = []
+    for seed in range(given.seeds):
+        name = fingerprint([own_source(__file__), seed])
+        if name not in store.records:
+            with one_thread():
+                store.append(name, {"flights": flights(seed)})
+            print(f"seed {seed} done", flush=True)
+        rows += store.records[name]["flights"]
     print(f"{describe(machine())}\n\n{summary(rows)}")
 
 

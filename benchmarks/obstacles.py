@@ -9,11 +9,11 @@ some stage, the exact 95 % interval of that rate (Clopper and Pearson, 1934; for
 decisions), scenes with any such step, the time of a decision, and how many programs had no plan that keeps all bounds
 (by HiGHS, as a linear program), which of them the decision says by its ``violation``, and which it does not.
 
-Each scene is a line of ``outputs/benchmarks/obstacles.jsonl`` as soon as it is done: a run that stopped goes on there.
+Each scene is a line of ``outputs/benchmarks/obstacles.jsonl`` as soon as it is done: a run of the same code that
+stopped goes on there.
 """
 
 import argparse
-import json
 from time import perf_counter
 
 import casadi
@@ -21,10 +21,11 @@ import numpy as np
 from scipy.optimize import linprog
 from scipy.stats import beta
 
-from benchmarks.timing import RESULTS, describe, machine
+from benchmarks.timing import RESULTS, describe, machine, own_source
 from gpmpc.gp import GPPosterior, Transitions, standardize, train
 from gpmpc.mpc import GPMPC, Box, ControlLoop, Decision, Inequality, Problem, Tracking
 from gpmpc.propagation import Linearization
+from gpmpc.studies.study import TrialStore, fingerprint
 
 HORIZON, STEPS, STEP = 20, 60, 0.1  # stages, [-], [s]
 NOISE = np.array(
@@ -185,17 +186,16 @@ def main() -> None:
     )
     arguments = parser.parse_args()
     RESULTS.mkdir(parents=True, exist_ok=True)
-    path, eta = RESULTS / "obstacles.jsonl", arguments.probability
-    lines = path.read_text().splitlines() if path.exists() else []
-    done = {
-        row["seed"]: row for row in map(json.loads, lines) if row["probability"] == eta
-    }
+    store = TrialStore(RESULTS / "obstacles.jsonl")
+    eta = arguments.probability
     model = learn()
-    for seed in sorted(set(range(arguments.scenes)) - set(done)):
-        done[seed] = fly(model, eta, seed)
-        with path.open("a") as file:
-            file.write(json.dumps(done[seed]) + "\n")
-    print(f"{describe(machine())}\n\n{summary(list(done.values()), eta)}")
+    scenes = []
+    for seed in range(arguments.scenes):
+        name = fingerprint([own_source(__file__), eta, seed])
+        if name not in store.records:
+            store.append(name, fly(model, eta, seed))
+        scenes.append(store.records[name])
+    print(f"{describe(machine())}\n\n{summary(scenes, eta)}")
 
 
 def summary(scenes: list[dict], eta: float) -> str:

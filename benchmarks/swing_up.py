@@ -5,12 +5,11 @@
 Systems fly with the settings that ``gpmpc run system=NAME`` has; the seed is that of data, training and noise.
 ``circle`` is the pendulum whose state is (cosine, sine, rate). A flight counts as up and held where all angles are
 within 0.2 rad of upright through its last second. ``in time`` is the share of decisions within the sampling period, on
-one thread. Each flight is a line of ``outputs/benchmarks/swing_up.jsonl``, and those that stand there are not flown
-again.
+one thread. Each flight is a line of ``outputs/benchmarks/swing_up.jsonl``, and those of the same code that stand there
+are not flown again.
 """
 
 import argparse
-import json
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -20,13 +19,14 @@ import numpy as np
 import torch
 from rich.console import Console
 
+from benchmarks.timing import own_source
 from gpmpc.cli._run import experiment_of
 from gpmpc.cli._settings import compose, settings
 from gpmpc.gp import Transitions
 from gpmpc.mpc.problem import Tracking
 from gpmpc.studies._document import Table, terminal
 from gpmpc.studies.flight import Experiment, run_trial
-from gpmpc.studies.study import one_thread
+from gpmpc.studies.study import TrialStore, fingerprint, one_thread
 from gpmpc.systems import System
 
 SYSTEMS = ("pendulum", "circle", "cart_pole", "acrobot")
@@ -181,19 +181,15 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=20)
     given = parser.parse_args()
     FLIGHTS.parent.mkdir(parents=True, exist_ok=True)
-    flights = (
-        [json.loads(line) for line in FLIGHTS.read_text().splitlines()]
-        if FLIGHTS.exists()
-        else []
-    )
-    finished = {(flight["system"], flight["seed"]) for flight in flights}
+    store = TrialStore(FLIGHTS)
+    flights = []
     for seed in range(given.seeds):
-        for name in given.systems:
-            if (name, seed) not in finished:
-                flights.append(fly(name, seed))
-                with FLIGHTS.open("a") as file:
-                    file.write(json.dumps(flights[-1]) + "\n")
-                print(flights[-1], flush=True)
+        for system in given.systems:
+            name = fingerprint([own_source(__file__), system, seed])
+            if name not in store.records:
+                store.append(name, fly(system, seed))
+                print(store.records[name], flush=True)
+            flights.append(store.records[name])
     Console(width=120).print(terminal([table(flights)]))
 
 

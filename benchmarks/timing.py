@@ -188,6 +188,11 @@ def _cell(value: object) -> str:
     return str(value)
 
 
+def own_source(path: str) -> str:
+    """The source of a benchmark, which its kept rows depend on beside gpmpc's code."""
+    return Path(path).read_text(encoding="utf-8")
+
+
 def write_results(name: str, results: Any, **meta: Any) -> Path:
     """Writes results with what made them to ``outputs/benchmarks/NAME.json`` and prints where."""
     path = RESULTS / f"{name}.json"

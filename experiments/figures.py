@@ -47,18 +47,6 @@ from gpmpc.studies.study import (
 from gpmpc.systems import GRAVITY
 from gpmpc.trajectories import Trajectory
 
-ROOMS = (
-    "gp",
-    "models",
-    "propagation",
-    "kernels",
-    "qp",
-    "mpc",
-    "simulation",
-    "datasets",
-    "systems",
-)
-CODE = ("gaussian.py", "metrics.py", *(f"{room}/*.py" for room in ROOMS), __file__)
 PROPAGATIONS = {"moment_matching": MomentMatching, "linearization": Linearization}
 CONTROLLERS = {
     "nmpc": NMPC,
@@ -347,8 +335,8 @@ class Figures:
                 condition.model and condition.model.name,
                 *(box and asdict(box) for box in bounds),
             ]
-            arrays = reference.states, reference.inputs, condition.scaling.factor
-            named = fingerprint(settings, *arrays, code=CODE)
+            arrays = [reference.states, reference.inputs, condition.scaling.factor]
+            named = fingerprint(settings, arrays)
             labels = {
                 "name": row.title or name,
                 "trajectory": trajectory,

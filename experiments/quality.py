@@ -44,18 +44,6 @@ from gpmpc.studies.flight import Experiment, run_trial
 from gpmpc.studies.study import Trial, fingerprint, read_model, trained_model
 from gpmpc.trajectories import Trajectory
 
-ROOMS = (
-    "gp",
-    "models",
-    "propagation",
-    "kernels",
-    "qp",
-    "mpc",
-    "simulation",
-    "datasets",
-    "systems",
-)
-CODE = ("gaussian.py", *(f"{room}/*.py" for room in ROOMS), __file__)
 LOST = 5.0  # [m] from the reference, some hundred times what is usual: nothing to compare costs with
 SAME = 1e-3  # difference of two costs below which the seeds' noise hides it: it buys no time
 CURVES = 5  # in the figure
@@ -221,10 +209,18 @@ class Quality:
                 "H": horizon,
                 "trajectory": name,
             }
+            model = models[name] if experiment.learns else None
+            condition = Condition(flown, model)
             named = fingerprint(
-                [labels, self.settings, repr(trajectory), seed, self.steps], code=CODE
+                [
+                    labels,
+                    self.settings,
+                    repr(trajectory),
+                    seed,
+                    self.steps,
+                    model and model.name,  # names the rows that it learned from
+                ]
             )
-            condition = Condition(flown, models[name] if experiment.learns else None)
             trials.append(Trial(labels, condition, seed, named))
         return trials
 

@@ -32,7 +32,7 @@ import torch
 from scipy.optimize import least_squares
 
 from gpmpc._files import write_whole
-from gpmpc._provenance import provenance
+from gpmpc._provenance import code_fingerprint, provenance
 from gpmpc.exceptions import GpmpcError, SettingError
 from gpmpc.gp import (
     Trainer,
@@ -312,7 +312,10 @@ def read_model(robot: str, kind: str, path: Path) -> Any:
 
 
 def write_entry(robot: str, kind: str, seed: int, folder: Path) -> Path:
-    """Writes a controller file for the league's scripts, and beside it the model, learned first where it is not there.
+    """Writes a controller file for the league's scripts, and beside it the model.
+
+    The model is learned first where there is none that this code has learned; one that
+    other code has learned stays under another name.
 
     Returns the path of the controller file, ``con_gpmpc_*.py``.
     """
@@ -322,16 +325,30 @@ def write_entry(robot: str, kind: str, seed: int, folder: Path) -> Path:
         folder / robot / f"con_{name}.py",
     )
     entry.parent.mkdir(parents=True, exist_ok=True)
-    if kind != "true" and not model.exists():
+    if kind != "true" and not _was_learned_by_this_code(model):
         begin = perf_counter()
         learned, body = learned_model(robot, kind, seed)
-        save_model(learned, model, {"robot": robot, "seed": seed, "body": body})
+        about = {"robot": robot, "seed": seed, "body": body}
+        save_model(learned, model, about | {"code": code_fingerprint()})
         _say(f"  learned in {perf_counter() - begin:.0f} s: {model}")
     write_whole(
         entry,
         ENTRY.format(robot=robot, kind=kind, name=name, described=DESCRIBED[kind]),
     )
     return entry
+
+
+def _was_learned_by_this_code(model: Path) -> bool:
+    """Whether there is a model of this code; one of other code is renamed."""
+    if not model.exists():
+        return False
+    code = load_metadata(model)["metadata"].get("code", "older")
+    if code == code_fingerprint():
+        return True
+    other_name = model.with_name(f"{model.stem}.{code[:8]}{model.suffix}")
+    model.replace(other_name)
+    _say(f"  learned by other code, and now called {other_name.name}: {model.name}")
+    return False
 
 
 def beside(entry: Path, ending: str) -> Path:
@@ -351,7 +368,7 @@ def play_robustness(entry: Path, robot: str, kind: str, size: int) -> str:
         robot, None if kind == "true" else load_metadata(path)["metadata"]["body"]
     )
     who = Watchful(_real_time_pilot(model, robot), RollOut(fine), JOINTS[robot])
-    store = beside(entry, f"_robustness_{size}.json")
+    store = beside(entry, f"_robustness_{size}_{code_fingerprint()[:8]}.json")
     found = robustness(league_controller(AbstractController, who), robot, size, store)
     shares = {part: float(np.mean(successes)) for part, successes in found.items()}
     lines = [
@@ -727,16 +744,23 @@ def board(
 ) -> list[dict[str, Any]]:
     """Plays a number of draws with the model of each seed; prints and returns one row for each play.
 
-    Rows that the folder holds already are read, not played again.
+    Rows that the folder holds already are read, not played again. Those of other code
+    stay in their file and are none of them.
     """
     rows = []
+    code = code_fingerprint()
     for seed in seeds:
         entry = write_entry(robot, kind, seed, folder)
         store = beside(entry, "_real_time.json" if real_time else ".json")
         played = json.loads(store.read_text()) if store.exists() else []
         model = read_model(robot, kind, beside(entry, ".safetensors"))
+        of_other_code = sum(row.get("code") != code for row in played)
+        if of_other_code:
+            _say(f"  {of_other_code} draws of other code are not shown ({store})")
         for draw in draws:
-            if not any(row["draw"] == draw for row in played):
+            if not any(
+                (row["draw"], row.get("code")) == (draw, code) for row in played
+            ):
                 played.append(
                     {
                         "robot": robot,
@@ -744,6 +768,7 @@ def board(
                         "seed": seed,
                         "draw": draw,
                         "version": _version(),
+                        "code": code,
                     }
                 )
                 played[-1] |= (
@@ -752,12 +777,15 @@ def board(
                     else _play(model, robot, draw)
                 )
                 write_whole(store, json.dumps(played, indent=1))
-            rows += [row for row in played if row["draw"] == draw]
+            rows += [
+                row for row in played if (row["draw"], row.get("code")) == (draw, code)
+            ]
             _say(
                 "  "
                 + "  ".join(
                     f"{k} {v:.3f}" if isinstance(v, float) else f"{k} {v}"
                     for k, v in rows[-1].items()
+                    if k != "code"
                 )
             )
     return rows
@@ -901,11 +929,6 @@ def main(arguments: list[str]) -> int:
                 given["time"] == "real",
             )
             _say(table(robot, rows))
-            others = sum(row.get("version") != _version() for row in rows)
-            if others:
-                _say(
-                    f"{others} of {len(rows)} draws were kept from another version of gpmpc ({folder})"
-                )
             return 0
         for seed in seeds:
             entry = write_entry(robot, kind, seed, folder)

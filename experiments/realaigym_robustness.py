@@ -164,7 +164,7 @@ def robustness(
         controller: In the league's interface.
         robot: ``"acrobot"`` or ``"pendubot"``.
         size: Values of each quantity; the league takes 21, and 10 flights at each noise and 50 with pulses.
-        store: A JSON file.
+        store: A JSON file, of one code.
     """
     from double_pendulum.analysis.benchmark import benchmarker
 

@@ -46,15 +46,6 @@ from gpmpc.studies._document import MISSING, Document, Table, number, with_range
 from gpmpc.studies.study import Trial, derived_seed, fingerprint, random_rows
 from gpmpc.trajectories import Trajectory
 
-CODE = (
-    "gaussian.py",
-    "metrics.py",
-    "gp/*.py",
-    "models/*.py",
-    "propagation/*.py",
-    "kernels/*.py",
-    __file__,
-)
 MEASURES = {
     "training_mse": "training MSE",
     "test_mse": "test MSE",
@@ -163,7 +154,7 @@ class Tables:
                             size,
                             seed,
                         ]
-                        arrays = data.features, data.next_states, scaling.factor
+                        arrays = [data.features, data.next_states, scaling.factor]
                         table = {"elliptical": 1, "lorenz": 2}.get(trajectory)
                         labels = {
                             "table": table,
@@ -171,7 +162,7 @@ class Tables:
                             "subsystem": subsystem,
                             "size": size,
                         }
-                        name = fingerprint(settings, *arrays, code=CODE)
+                        name = fingerprint(settings, arrays)
                         trials.append(Trial(labels | {"draw": draw}, fit, seed, name))
         return trials
 

@@ -121,7 +121,7 @@ def test_a_kernel_runs_its_own_copy_of_what_it_calls_whatever_was_loaded_or_comp
         script = f"from own import *\nprint({code})"
         result = subprocess.run(
             [sys.executable, "-B", "-c", script], capture_output=True, text=True, check=True,
-            env=os.environ | {"PYTHONPATH": f"{tmp_path}{os.pathsep}{ROOT}", "FACTOR": factor},
+            env=os.environ | {"PYTHONPATH": f"{tmp_path}{os.pathsep}{ROOT}", "FACTOR": factor, "NUMBA_CACHE_DIR": ""},
         )  # fmt: skip
         return [float(number) for number in result.stdout.split()]
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from omegaconf import OmegaConf
 from rich.console import Console
 
+from gpmpc._provenance import is_of_this_code
 from gpmpc.cli._command import Result
 from gpmpc.cli._log import CUT
 from gpmpc.cli._settings import settings, write_files, writing
@@ -117,11 +118,17 @@ def calibrate(given: argparse.Namespace) -> Result:
         raise DataError(
             f"{given.run}: holds {1 + len(others)} runs; name the one whose model it is"
         )
-    experiment, folder = (
-        _experiment_of(read_run(first)),
-        given.to or first.parent / "calibration",
-    )
+    recorded = read_run(first)
+    experiment = _experiment_of(recorded)
+    folder = given.to or first.parent / "calibration"
     system, model = experiment.system, experiment.model
+    notes = []
+    learned_again = model is None
+    if learned_again and not is_of_this_code(recorded.metadata.get("run", {})):
+        notes.append(
+            f"{first} was flown by other code: the model that is judged is what this "
+            "code learns from the same settings"
+        )
     flights = [
         read_run(path)
         for tree in given.flights or [first]
@@ -180,11 +187,12 @@ def calibrate(given: argparse.Namespace) -> Result:
         [table],
         found.to_pandas(),
         lead,
+        notes=notes,
         images=images,
     )
     where = write_files(folder, document.files("calibration"), "to")
     console.print(terminal([table]))
-    console.out(where, highlight=False)
+    console.out(*notes, where, sep="\n", highlight=False)
     return Result({"folder": str(folder), "rows": document.data.to_dict("records")})
 
 

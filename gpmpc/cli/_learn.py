@@ -2,7 +2,6 @@
 
 import argparse
 import json
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -11,12 +10,13 @@ from rich.console import Console
 
 from gpmpc import logs
 from gpmpc._files import write_whole
-from gpmpc._provenance import provenance
+from gpmpc._provenance import code_fingerprint, provenance
 from gpmpc.cli._command import Result
 from gpmpc.cli._settings import write_files, writing
 from gpmpc.logs import Judgement, Learned, Log
 from gpmpc.plotting import judgement_figure, png
 from gpmpc.studies._document import Document, Table, number, terminal
+from gpmpc.studies._run_folder import describe_code
 from gpmpc.studies.study import fingerprint
 
 _MODEL = "model.safetensors"
@@ -38,10 +38,12 @@ def learn(given: argparse.Namespace) -> Result:
         settings = repr(
             (train.mapping, given.points, given.steps, given.seed, given.for_control)
         )
-        rows = (
+        rows = [
             array for run in train for array in (run.states, run.inputs, run.context)
-        )
-        memory = _FileMemory(folder / "progress.json", fingerprint(settings, *rows))
+        ]
+        memory = _FileMemory(folder / "progress.json", fingerprint(settings, rows))
+        if memory.begun_anew:
+            console.print(memory.begun_anew)
         with console.status("learning") as status:
 
             def show(stage: str) -> None:
@@ -98,23 +100,49 @@ def _split(log: Log, held_out: list[str]) -> tuple[Log, Log]:
 
 
 class _FileMemory(dict[str, Any]):
-    """Outcomes of stages, kept in a JSON file; other data or other settings begin it anew."""
+    """Outcomes of stages, kept in a JSON file; other code, data or settings begin it anew.
+
+    Args:
+        path: The file.
+        fingerprint: Of code, data and settings.
+    """
 
     def __init__(self, path: Path, fingerprint: str):
-        self._path, self._fingerprint = path, fingerprint
-        with suppress(
-            OSError, ValueError, KeyError, TypeError
-        ):  # nothing there, or nothing whole
-            found = json.loads(path.read_text())
-            super().__init__(
-                found["stages"] if found["fingerprint"] == fingerprint else {}
+        self._path = path
+        self._fingerprint = fingerprint
+        self._code = code_fingerprint()
+        #: a line that says why the outcomes of an earlier call are not used; "" where
+        #: they are, or where there are none
+        self.begun_anew = ""
+        try:
+            content = json.loads(path.read_text(encoding="utf-8"))
+            known = content["fingerprint"] == fingerprint
+            stages = dict(content["stages"])
+            code = content.get("code")
+        except FileNotFoundError:
+            return
+        except (OSError, ValueError, KeyError, TypeError, RecursionError):
+            self.begun_anew = f"{path}: is not whole; all is learned anew"
+            return
+        if known:
+            super().__init__(stages)
+        elif code != self._code:
+            self.begun_anew = (
+                f"{path}: is of other code of gpmpc than this; all is learned anew"
+            )
+        else:
+            self.begun_anew = (
+                f"{path}: is of other data or settings; all is learned anew"
             )
 
     def __setitem__(self, key: str, value: Any) -> None:
         super().__setitem__(key, value)
-        write_whole(
-            self._path, json.dumps({"fingerprint": self._fingerprint, "stages": self})
-        )
+        content = {
+            "fingerprint": self._fingerprint,
+            "code": self._code,
+            "stages": self,
+        }
+        write_whole(self._path, json.dumps(content))
 
 
 def _report(
@@ -218,6 +246,7 @@ def _card(
         "rate": f"{1 / train.time_step:g} Hz",
         "judged on": ", ".join(run.name for run in held_out),
         "made": made["created"],
+        "made by": describe_code(made),
         "command": made["command"],
     }
     return Document(

@@ -32,7 +32,13 @@ from gpmpc.logs import SavedModel
 from gpmpc.recording import McapRecorder, RecordedSystem
 from gpmpc.simulation import Noise
 from gpmpc.studies._document import terminal
-from gpmpc.studies._run_folder import RECORDING, RunFolder, folder_name, record
+from gpmpc.studies._run_folder import (
+    RECORDING,
+    RunFolder,
+    folder_name,
+    of_other_code,
+    record,
+)
 from gpmpc.studies.flight import Experiment, metrics, run_trial, summary
 from gpmpc.studies.study import one_thread
 from gpmpc.systems import System
@@ -83,10 +89,18 @@ def run(config: DictConfig) -> Result:
     console.print(terminal([summary(outcome["result"])]))
     state = "finished before" if outcome["skipped"] else "written to"
     console.out(f"{state}: {outcome['folder']}", highlight=False)
-    return Result(
-        outcome["result"] | {"folder": outcome["folder"]},
-        _LOST if outcome["result"].get("lost") else 0,
-    )
+    other_code = of_other_code(outcome["result"])
+    if other_code:
+        console.out(
+            f"these are the numbers of other code ({other_code}); remove the folder to "
+            "fly it with this code",
+            highlight=False,
+        )
+    data = outcome["result"] | {
+        "folder": outcome["folder"],
+        "of_other_code": bool(other_code),
+    }
+    return Result(data, _LOST if outcome["result"].get("lost") else 0)
 
 
 def run_one(config: DictConfig, wait: bool = True) -> dict[str, Any]:

@@ -2,8 +2,9 @@
 
 Hydra composes every run's settings and its launcher plugins start the runs; what is kept, and whether it is finished,
 is in the runs' folders alone. So the same command resumes a sweep: only failed and unfinished runs are launched again.
-Where a finished run has other settings, the sweep is refused before anything is launched. Several sweeps may share a
-tree: a run that another process works on is left to it, and looked at again at the end.
+Where a finished run has other settings, the sweep is refused before anything is launched. Where it was flown by other
+code it stays, and the sweep says how many such runs there are. Several sweeps may share a tree: a run that another
+process works on is left to it, and looked at again at the end.
 """
 
 import hashlib
@@ -16,6 +17,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -34,7 +36,7 @@ from gpmpc.cli._settings import folder_of, without_hydra, write_files
 from gpmpc.cli._terminal import print_error, progress_bar
 from gpmpc.exceptions import GpmpcError, SettingError
 from gpmpc.parallel import children_ignore_interrupts, end_with
-from gpmpc.studies._run_folder import PLAN, Busy, RunFolder, folder_name
+from gpmpc.studies._run_folder import PLAN, Busy, RunFolder, folder_name, of_other_code
 
 
 @dataclass(frozen=True)
@@ -66,6 +68,8 @@ class Sweep:
         )  # around every job
         self._context = HydraContext(GlobalHydra.instance().config_loader(), nothing)
         self._checked: set[str] = set()
+        #: folders of finished runs that other code flew, and what it was
+        self.of_other_code: dict[Path, str] = {}
 
     def job(self, overrides: Sequence[str]) -> Job:
         """Returns the run of these settings."""
@@ -91,7 +95,22 @@ class Sweep:
             f"comparing the settings of {len(finished)} finished runs"
         ):
             for job in finished:
-                job.folder.result(plain_settings(*self.settings(job)))
+                result = job.folder.result(plain_settings(*self.settings(job)))
+                other_code = of_other_code(result)
+                if other_code:
+                    self.of_other_code[job.folder.path] = other_code
+
+    def tell_other_code(self) -> None:
+        """Prints how many finished runs were flown by other code, where any was."""
+        if not self.of_other_code:
+            return
+        codes = "; ".join(dict.fromkeys(self.of_other_code.values()))
+        self.console.out(
+            f"{len(self.of_other_code)} of the runs that were finished before were "
+            f"flown by other code ({codes}): remove their folders, or choose another "
+            "folder, to fly them with this code",
+            highlight=False,
+        )
 
     def fly(self, jobs: Sequence[Job]) -> list[dict[str, Any]]:
         """Flies the runs that are not finished; returns the outcome of each of those."""
@@ -172,11 +191,13 @@ def sweep(given: Namespace) -> Result:
     total = "1 run" if len(jobs) == 1 else f"{len(jobs)} runs"
     text = f"{total}: {len(outcomes) - len(failed)} flown, {finished} finished before, {len(failed)} failed"
     console.out(f"{text}; in {runs.tree}", highlight=False)
+    runs.tell_other_code()
     for outcome in failed:
         print_error(f"failed: {outcome['folder']}: {outcome['error']}")
     data = {
         "folder": str(runs.tree),
         "runs": [str(job.folder.path) for job in jobs],
+        "of_other_code": [str(path) for path in runs.of_other_code],
         "failed": failed,
     }
     return Result(data, 1 if failed else 0)

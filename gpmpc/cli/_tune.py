@@ -82,6 +82,7 @@ def tune(given: Namespace) -> Result:
     )
     console.print(terminal(document.tables, document.lead))
     console.out(f"to fly the best one: {command}", where, sep="\n", highlight=False)
+    runs.tell_other_code()
     data = {
         "folder": str(runs.tree),
         "best": search.candidates[search.best],
@@ -91,6 +92,7 @@ def tune(given: Namespace) -> Result:
         data
         | {
             "unchanged": unchanged,
+            "of_other_code": [str(path) for path in runs.of_other_code],
             "importances": search.importances(),
             "command": command,
         }

@@ -146,6 +146,8 @@ def _read_in_parts(csv: CsvText, room: Room) -> pd.DataFrame:
         chunksize=max(_PART // len(csv.names), 1),
         index_col=False,
         skipinitialspace=True,
+        # pandas before version 3 reads some numbers wrong in their last digit else
+        float_precision="round_trip",
     ) as reader:
         for part in reader:
             is_text = part.select_dtypes(exclude=["number", "bool"])

@@ -7,6 +7,9 @@
 
 Any number of processes can work on one tree of such folders: who works on a folder holds a lock on it, which the system
 takes back from a process that dies.
+
+A finished run is one of the code that flew it. It is not thrown away where the code has changed since, but whoever
+shows its numbers says so: ``of_other_code`` tells.
 """
 
 import hashlib
@@ -23,7 +26,7 @@ from typing import Any
 from filelock import lock_descriptor
 
 from gpmpc._files import remove_partial, write_whole
-from gpmpc._provenance import flattened, provenance
+from gpmpc._provenance import flattened, is_of_this_code, own_code, provenance
 from gpmpc.exceptions import DataError, GpmpcError, SettingError
 
 METRICS, ERROR, CONFIG, RECORDING = (
@@ -121,7 +124,41 @@ def record(
         "settings": dict(settings),
         "seed": settings.get("seed"),
     }
-    return about | {"provenance": provenance() | {"command": command}}
+    made = provenance() | {"command": command, "own_code": own_code(settings)}
+    return about | {"provenance": made}
+
+
+def of_other_code(result: Mapping[str, Any]) -> str:
+    """Returns what flew a run that this code did not fly; empty where it was this code.
+
+    Args:
+        result: Content of ``metrics.json``.
+    """
+    about = _mapping(result.get("provenance"))
+    if is_of_this_code(about, result.get("settings")):
+        return ""
+    return describe_code(about)
+
+
+def describe_code(about: Mapping[str, Any]) -> str:
+    """Returns version and commit of what made a result, as far as it tells them.
+
+    Args:
+        about: What ``provenance`` returned there.
+    """
+    version = _mapping(about.get("versions")).get("gpmpc")
+    git = _mapping(about.get("git"))
+    words = [f"gpmpc {version}" if version else "a gpmpc that did not say which"]
+    if git.get("commit"):
+        words.append(f"commit {str(git['commit'])[:10]}")
+    if git.get("dirty"):
+        words.append("changed")
+    return ", ".join(words)
+
+
+def _mapping(value: Any) -> Mapping[str, Any]:
+    """Returns a part of a file that is to be by name; nothing where it is not."""
+    return value if isinstance(value, Mapping) else {}
 
 
 def folder_name(choices: Sequence[str]) -> str:

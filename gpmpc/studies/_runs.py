@@ -20,7 +20,7 @@ import pandas as pd
 from gpmpc._provenance import flattened
 from gpmpc.exceptions import DataError
 from gpmpc.studies._document import plain_text
-from gpmpc.studies._run_folder import ERROR, METRICS, PLAN, folder_name
+from gpmpc.studies._run_folder import ERROR, METRICS, PLAN, describe_code, folder_name
 
 SEED = "seed"
 _DAMAGE = (
@@ -63,6 +63,7 @@ _ABSENT = {
     "unit": "",
     "settings": {},
     "origin": {},
+    "code": "",
     "lost": "",
     "error": "",
 } | dict.fromkeys(MEASURES)
@@ -75,7 +76,8 @@ class Report:
     ``runs`` has a row for every run that is there or was asked for, cell by cell and seed by seed. Its columns are
     ``cell``, the position in ``cells``; ``seed``, a text; ``state``: "finished", "failed", "missing" (there is nothing
     of it) or "skipped" (it cannot be read); the measures, NaN where the run has none; ``lost`` and ``error``, since
-    when and why; ``folder``; ``unit`` of the errors; ``settings`` by dotted key; ``origin``: date, commit and machine.
+    when and why; ``folder``; ``unit`` of the errors; ``settings`` by dotted key; ``origin``: date, commit and machine;
+    ``code``: names the code that made it, "" where there is none or it does not tell.
     """
 
     tree: Path  #: where it is
@@ -256,6 +258,7 @@ def _run(path: Path, content: Mapping[str, Any]) -> Row:
         "folder": path.parent,
         "settings": flattened(settings),
         "origin": _origin(content),
+        "code": _code(content),
     }
     if path.name == ERROR:
         return run | {"state": "failed", "error": plain_text(content["error"])}
@@ -297,6 +300,17 @@ def _origin(content: Mapping[str, Any]) -> dict[str, str]:
     )
     named = {"date": about.get("created"), "commit": commit, "machine": made}
     return {key: plain_text(str(value)) for key, value in named.items() if value}
+
+
+def _code(content: Mapping[str, Any]) -> str:
+    """Returns a text that differs where the code of two runs differs, as far as they tell.
+
+    Older runs tell their commit or version alone.
+    """
+    about = content.get("provenance") or {}
+    own_code = about.get("own_code") or {}
+    named = about.get("code") or describe_code(about)
+    return plain_text(json.dumps([named, own_code], sort_keys=True))
 
 
 def _parsed(choices: Any) -> Choices:

@@ -147,7 +147,7 @@ def terminal_table(report: Report) -> Table:
 
 
 def notes(report: Report) -> dict[str, list[str]]:
-    """Returns what has to be known of single runs, by kind: their folders and the reasons."""
+    """Returns what has to be known of runs, by kind: their folders and the reasons."""
     found = {
         "Failed": [
             f"{plain_text(run.folder.name)}: {run.error}"
@@ -160,8 +160,30 @@ def notes(report: Report) -> dict[str, list[str]]:
             if run.lost
         ],
         "Skipped": list(report.skipped),
+        "Mixed code": _mixed_code(report),
     }
     return {kind: lines for kind, lines in found.items() if lines}
+
+
+def _mixed_code(report: Report) -> list[str]:
+    """Returns a line where the finished runs were flown by different code."""
+    counts: dict[str, int] = {}
+    commits: dict[str, str] = {}
+    dates: dict[str, str] = {}
+    for run in report.there:
+        if run.state != "finished":
+            continue
+        counts[run.code] = counts.get(run.code, 0) + 1
+        commits[run.code] = run.origin.get("commit", "of unknown version")
+        dates[run.code] = max(dates.get(run.code, ""), run.origin.get("date", ""))
+    if len(counts) < 2:
+        return []
+    parts = [
+        f"{counts[code]} of {commits[code]} (last {dates[code][:10] or MISSING})"
+        for code in sorted(counts, key=lambda code: dates[code])
+    ]
+    line = "the finished runs are of different code, and may differ for that alone: "
+    return [line + "; ".join(parts)]
 
 
 def _quartiles(report: Report, measures: Sequence[str]) -> np.ndarray:

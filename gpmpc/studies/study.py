@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
-from functools import cache, lru_cache, partial
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -20,8 +20,8 @@ import numpy as np
 import torch
 from threadpoolctl import threadpool_limits
 
-import gpmpc
 from gpmpc._compiling import report_compilation
+from gpmpc._provenance import code_fingerprint, own_code
 from gpmpc.exceptions import GpmpcError, SettingError
 from gpmpc.gp import Training, Transitions
 from gpmpc.models import DynamicsModel, load_model, save_model
@@ -186,30 +186,29 @@ def random_rows(count: int, size: int, seed: int, key: str = "size") -> list[int
     return np.sort(np.random.default_rng(seed).permutation(count)[:size]).tolist()
 
 
-def fingerprint(settings: Any, *arrays: Any, code: Sequence[str] = ()) -> str:
-    """Returns a text that differs where settings, arrays or code differ: a record of other code is not reused.
+def fingerprint(settings: Any, arrays: Sequence[Any] = ()) -> str:
+    """Returns a text that differs where settings, arrays or code differ.
+
+    A record is kept under it, so that one of other code is not taken for one of this.
+    The code is all of gpmpc, and what of the user's own the settings name.
 
     Args:
         settings: Plain data.
-        arrays: NumPy arrays or CPU tensors; None counts as nothing.
-        code: Patterns of source files below the package, or whole paths.
+        arrays: NumPy arrays or CPU tensors; None where there is none.
+
+    Raises:
+        GpmpcError: The source of the code is not there.
     """
-    digest = hashlib.sha256(b"".join(_source(pattern) for pattern in code))
-    digest.update(json.dumps(settings, sort_keys=True, default=str).encode())
+    content = [code_fingerprint(), own_code(settings), settings]
+    text = json.dumps(content, sort_keys=True, default=str)
+    digest = hashlib.sha256(text.encode())
     for array in arrays:
-        digest.update(b"" if array is None else np.ascontiguousarray(array).tobytes())
+        values = None if array is None else np.ascontiguousarray(array)
+        # Shapes keep two arrays apart from others of the same bytes.
+        shape = None if values is None else [values.dtype.str, *values.shape]
+        digest.update(json.dumps(shape).encode())
+        digest.update(b"" if values is None else values.tobytes())
     return digest.hexdigest()[:32]
-
-
-@cache
-def _source(pattern: str) -> bytes:
-    path = Path(pattern)
-    found = (
-        [path]
-        if path.is_absolute()
-        else sorted(Path(gpmpc.__file__).parent.glob(pattern))
-    )
-    return b"".join(path.read_bytes() for path in found)
 
 
 def trained_model(
@@ -219,12 +218,13 @@ def trained_model(
     seed: int,
     folder: Path,
 ) -> Path:
-    """Trains GPs unless a file in ``folder`` holds those of the same settings, data and seed; returns that file."""
-    path = (
-        folder
-        / "models"
-        / f"{fingerprint([settings, seed], data.features, data.next_states)}.safetensors"
-    )
+    """Trains GPs unless ``folder`` has those of this code, settings, data and seed.
+
+    Returns:
+        The file that holds them.
+    """
+    name = fingerprint([settings, seed], [data.features, data.next_states])
+    path = folder / "models" / f"{name}.safetensors"
     if not path.exists():
         path.parent.mkdir(parents=True, exist_ok=True)
         with one_thread():

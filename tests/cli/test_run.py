@@ -1,10 +1,14 @@
 """What one flight tells: that it was lost, that it waits for a compiler, and how well it foresaw itself."""
 
+import argparse
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from gpmpc._provenance import code_fingerprint
+from gpmpc.cli import _flights
 from gpmpc.plotting._recorded import expected
 from gpmpc.recording import read_run
 from tests.cli.command import forked, gpmpc
@@ -52,7 +56,7 @@ def test_a_lost_flight_is_finished_and_readable_and_has_an_exit_code_of_its_own(
 
 
 def test_a_flight_is_predicted_and_what_cannot_be_predicted_or_filmed_is_said_in_one_line(
-    tmp_path,
+    tmp_path, monkeypatch, capsys
 ):
     assert forked("run", *TINY, "steps=9", cwd=tmp_path).returncode == 0
     done = forked("calibrate", "tree", "--steps", "12", "--json", cwd=tmp_path)
@@ -67,6 +71,18 @@ def test_a_flight_is_predicted_and_what_cannot_be_predicted_or_filmed_is_said_in
     )
     (folder,) = (tmp_path / "tree").glob("*/calibration")
     assert {path.suffix for path in folder.iterdir()} == {".csv", ".md", ".png", ".tex"}
+    assert "other code" not in done.stderr
+    (recording,) = (tmp_path / "tree").glob("*/run.mcap")
+    assert read_run(recording).metadata["run"]["code"] == code_fingerprint()
+    # a flight of other code: the model is learned again, by this code
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(_flights, "is_of_this_code", lambda about: False)
+    given = {"run": Path("tree"), "to": None, "flights": [], "steps": 3}
+    _flights.calibrate(argparse.Namespace(**given))
+    said = "was flown by other code: the model that is judged is what this code learns"
+    assert said in capsys.readouterr().out
+    (written,) = (tmp_path / "tree").glob("*/calibration/calibration.md")
+    assert said in written.read_text()
     assert forked("run", *TINY, "steps=3", cwd=tmp_path).returncode == 0
     runs.record_run(tmp_path / "foreign.mcap", steps=3)
     for words, said in (

@@ -132,6 +132,45 @@ def test_the_attitude_alone_is_flown_recorded_drawn_and_reported_in_radians(tmp_
     assert "RMSE [rad]" in (tmp_path / "tree" / "report" / "report.md").read_text()
 
 
+def change_code(folder, code):
+    """Makes a finished run one that other code has flown."""
+    path = folder / "metrics.json"
+    content = json.loads(path.read_text())
+    content["provenance"] |= code
+    path.write_text(json.dumps(content))
+    return content
+
+
+def test_a_finished_run_of_other_code_stays_and_is_said_to_be_one(single, tmp_path):
+    shutil.copytree(single[0] / "tree", tmp_path / "tree")
+    (folder,) = (tmp_path / "tree").iterdir()
+    original = json.loads((folder / "metrics.json").read_text())
+    arguments = ["run", *original["choices"], "folder=tree", "--json"]
+
+    def run_again():
+        again = forked(*arguments, cwd=tmp_path)
+        assert again.returncode == 0, again.stderr
+        assert "finished before" in again.stderr
+        said = (
+            "these are the numbers of other code (gpmpc 0.0.9); remove the folder to "
+            "fly it with this code"
+        )
+        of_other_code = json.loads(again.stdout)["of_other_code"]
+        assert (said in again.stderr) == of_other_code
+        return of_other_code
+
+    assert not run_again()
+    version = {"git": None, "versions": {"gpmpc": "0.0.9"}}
+    for code in (
+        {"code": "0" * 32},
+        {"code": None},  # of a version that did not say
+        {"code": original["provenance"]["code"], "own_code": {"my_robot": "1"}},
+    ):
+        content = change_code(folder, version | code)
+        assert run_again()
+        assert json.loads((folder / "metrics.json").read_text()) == content
+
+
 def test_finished_runs_are_not_flown_again_and_other_settings_do_not_pass_for_them(
     single,
 ):
@@ -150,6 +189,27 @@ def test_finished_runs_are_not_flown_again_and_other_settings_do_not_pass_for_th
         "holds a finished run of other settings (controller.tolerance: 1 then, 1e-06 now)"
         in other.stderr
     )
+
+
+def test_a_run_is_of_the_users_own_code_and_says_so_where_that_has_changed(tmp_path):
+    (tmp_path / "my_plant.py").write_text(
+        "from gpmpc.systems import pendulum\nMASS = 1.0\n"
+        "def make(**settings):\n    return pendulum(mass=MASS)\n"
+    )
+    own = ["system=pendulum", "system._target_=my_plant.make", "folder=tree"]
+    command = ["run", *TINY, *own]
+    first = forked(*command, cwd=tmp_path)
+    assert first.returncode == 0, first.stderr
+    assert "written to" in first.stdout
+    again = forked(*command, cwd=tmp_path).stdout
+    assert "finished before" in again
+    assert "other code" not in again
+    (tmp_path / "my_plant.py").write_text(
+        (tmp_path / "my_plant.py").read_text().replace("1.0", "1.5")
+    )
+    changed = forked(*command, cwd=tmp_path).stdout
+    assert "finished before" in changed
+    assert "these are the numbers of other code" in changed
 
 
 @pytest.mark.parametrize(
@@ -344,6 +404,44 @@ def test_a_sweep_does_not_take_a_finished_run_of_other_settings_for_its_own(
         json.loads(path.read_text()) == found
     )  # nothing was overwritten, nothing else flown
     assert len(list(tree.glob("*/metrics.json"))) == 3
+
+
+def test_a_sweep_and_a_report_say_how_many_runs_are_of_other_code(sweep, tmp_path):
+    tree = tmp_path / "tree"
+    shutil.copytree(sweep[0], tree)
+    first, second, *_ = sorted(path.parent for path in tree.glob("*/metrics.json"))
+    for folder in (first, second):
+        change_code(
+            folder,
+            {
+                "code": "0" * 32,
+                "git": {"commit": "0123456789abcdef"},
+                "versions": {"gpmpc": "0.0.9"},
+                "created": "2020-02-02T02:02:02+00:00",
+            },
+        )
+    said = (
+        "2 of the runs that were finished before were flown by other code "
+        "(gpmpc 0.0.9, commit 0123456789): remove their folders"
+    )
+    again = forked(*SWEPT, "folder=tree", cwd=tmp_path)
+    assert again.returncode == 0, again.stderr
+    assert "4 runs: 0 flown, 4 finished before, 0 failed" in again.stdout
+    assert said in again.stdout
+    told = json.loads(forked(*SWEPT, "folder=tree", "--json", cwd=tmp_path).stdout)
+    assert told["of_other_code"] == [f"tree/{first.name}", f"tree/{second.name}"]
+    reported = forked("report", "tree", cwd=tmp_path)
+    assert reported.returncode == 0, reported.stderr
+    mixed = "mixed code: the finished runs are of different code, and may differ for"
+    assert mixed in reported.stdout
+    assert "2 of 0123456789 (last 2020-02-02); 2 of " in reported.stdout
+    assert "Mixed code" in (tree / "report" / "report.md").read_text()
+    shutil.rmtree(first)
+    shutil.rmtree(second)
+    flown = forked(*SWEPT, "folder=tree", cwd=tmp_path)
+    assert "4 runs: 2 flown, 2 finished before, 0 failed" in flown.stdout
+    assert "other code" not in flown.stdout
+    assert "mixed code" not in forked("report", "tree", cwd=tmp_path).stdout
 
 
 def test_two_sweeps_share_a_tree(sweep, tmp_path):

@@ -42,7 +42,13 @@ def test_a_search_goes_on_where_it_stopped_and_its_best_settings_fly(tmp_path):
         path: path.stat().st_mtime_ns for path in tmp_path.glob("tree/*/metrics.json")
     }
     assert 2 <= len(flown) <= 3
+    older = next(iter(flown))
+    content = json.loads(older.read_text())
+    content["provenance"]["code"] = "0" * 32
+    older.write_text(json.dumps(content))
+    flown[older] = older.stat().st_mtime_ns
     found = tune("tree", "4", tmp_path)
+    assert found["of_other_code"] == [str(older.parent.relative_to(tmp_path))]
     assert all(path.stat().st_mtime_ns == before for path, before in flown.items())
     whole = tune("whole", "4", tmp_path)
     assert (tmp_path / "tree" / "tuning.csv").read_text() == (

@@ -1,5 +1,6 @@
 """The league's experiment: interface, equations, what is learned from, what is said without the simulator."""
 
+import json
 import shutil
 import sys
 from pathlib import Path
@@ -182,7 +183,7 @@ def test_the_board_is_sorted_and_says_what_share_of_draws_is_above_the_best():
     ]
 
 
-def test_what_was_learned_is_kept_in_a_file_and_not_learned_again(
+def test_what_was_learned_is_kept_in_a_file_and_not_learned_again_by_the_same_code(
     monkeypatch, tmp_path
 ):
     data, learned = transitions(random_record("acrobot", 5.0, 0), "acrobot"), []
@@ -204,6 +205,15 @@ def test_what_was_learned_is_kept_in_a_file_and_not_learned_again(
     assert torch.equal(
         found.predict(data.states[:5], data.inputs[:5]).mean, expected.mean
     )
+    code = realaigym.code_fingerprint()
+    monkeypatch.setattr(realaigym, "code_fingerprint", lambda: "another")
+    write_entry("acrobot", "residual", 3, tmp_path)
+    assert len(learned) == 2
+    files = {path.name for path in entry.parent.glob("*.safetensors")}
+    assert files == {
+        "gpmpc_residual_3.safetensors",
+        f"gpmpc_residual_3.{code[:8]}.safetensors",
+    }
 
 
 SCRIPT = """
@@ -269,27 +279,28 @@ def test_draws_that_were_played_are_read_and_not_played_again(monkeypatch, tmp_p
     assert again[0]["version"]
 
 
-def test_draws_of_another_version_are_counted(monkeypatch, tmp_path, capsys):
+def test_draws_of_other_code_are_played_again_and_stay_in_their_file(
+    monkeypatch, tmp_path, capsys
+):
+    scores = iter((0.1, 0.2, 0.3))
+    others = dict.fromkeys(("search", "median", "p99"), 0.5)
     monkeypatch.setattr(realaigym, "find_spec", lambda name: name)
     monkeypatch.setattr(
         realaigym,
         "_play",
-        lambda model, robot, draw: dict.fromkeys(
-            ("score", "search", "median", "p99"), 0.5
-        ),
+        lambda model, robot, draw: others | {"score": next(scores)},
     )
-    command = ["robot=acrobot", "model=true", "draws=1", f"folder={tmp_path}"]
-    assert main(command) == 0
-    monkeypatch.setattr(realaigym, "_version", lambda: "another")
-    assert main([command[0], command[1], "draws=2", command[3]]) == 0
-    counted = [
-        line
-        for line in capsys.readouterr().out.splitlines()
-        if "another version" in line
-    ]
-    assert counted == [
-        f"1 of 2 draws were kept from another version of gpmpc ({tmp_path})"
-    ]
+    command = ["robot=acrobot", "model=true", f"folder={tmp_path}"]
+    assert main([*command, "draws=1"]) == 0
+    assert "other code" not in capsys.readouterr().out
+    monkeypatch.setattr(realaigym, "code_fingerprint", lambda: "another")
+    assert main([*command, "draws=2"]) == 0
+    printed = capsys.readouterr().out
+    store = tmp_path / "acrobot" / "gpmpc_true_0.json"
+    assert f"1 draws of other code are not shown ({store})" in printed
+    assert "| 0.250 | 0.200 |" in printed  # the mean and worst of the two new ones
+    kept = [(row["draw"], row["score"]) for row in json.loads(store.read_text())]
+    assert kept == [(100, 0.1), (100, 0.2), (101, 0.3)]
 
 
 @pytest.mark.parametrize(

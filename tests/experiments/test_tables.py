@@ -21,6 +21,7 @@ from gpmpc.experiments.tables import (
     summarise,
 )
 from gpmpc.gp import SoftLimits, Transitions, identity, train
+from gpmpc.studies import study
 from gpmpc.studies._document import number
 from gpmpc.studies.study import TrialStore, run_study
 from gpmpc.trajectories import Hover
@@ -150,6 +151,13 @@ def test_more_draws_reuse_the_first_ones_and_another_model_reuses_none():
     assert set(few).isdisjoint(
         fit.fingerprint for fit in tables(state_std=0.2).trials()
     )
+
+
+def test_no_draw_of_other_code_is_reused(finished, monkeypatch):
+    experiment, store, _ = finished
+    monkeypatch.setattr(study, "code_fingerprint", lambda: "other code")
+    trials = experiment.trials()
+    assert {trial.fingerprint for trial in trials}.isdisjoint(store.records)
 
 
 def failing(transitions, seed):

@@ -14,6 +14,7 @@ from gpytorch.kernels import (
 )
 from gpytorch.likelihoods import FixedNoiseGaussianLikelihood, GaussianLikelihood
 from gpytorch.means import ConstantMean, LinearMean, ZeroMean
+from packaging.version import Version
 
 from gpmpc._dynamics import predict_with_jacobian
 from gpmpc.exceptions import SettingError, ShapeError, UnsupportedModel
@@ -518,8 +519,9 @@ def test_a_frozen_sparse_model_predicts_what_gpytorch_does(corrected, method):
         mean, variance = theirs(model, query)
         gp = from_gpytorch(model, input_dim=1, predicts="value")
     belief = gp.predict(query[:, :2], query[:, 2:])
+    leaves_out = Version(gpytorch.__version__) >= Version("1.15.2")
     if (
-        method == "sgpr"
+        method == "sgpr" and leaves_out
     ):  # GPyTorch leaves out what the inducing points do not explain: kxx - qxx
         kernel, Z = (
             model.covar_module.base_kernel,

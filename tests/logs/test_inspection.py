@@ -1,5 +1,6 @@
 """An inspection finds what was put into a log: delays, noise, repeated values, gaps, inputs that teach nothing."""
 
+import json
 import runpy
 import sys
 from pathlib import Path
@@ -8,6 +9,7 @@ import numpy as np
 import pandas
 import pytest
 
+from gpmpc.cli._learn import _FileMemory
 from gpmpc.exceptions import DataError
 from gpmpc.logs import LogMapping, inspect_log
 from gpmpc.plotting import inspection_figure, png
@@ -188,6 +190,15 @@ def test_learn_writes_a_model_a_report_and_a_card_and_names_mistakes(tmp_path):
     card = (tmp_path / "learned" / "card.md").read_text()
     assert "What must not be trusted" in card
     assert "| thrust |" in card
+    progress = tmp_path / "learned" / "progress.json"
+    kept = json.loads(progress.read_text())
+    stages = dict.fromkeys(kept["stages"], "of another version")
+    progress.write_text(json.dumps({"fingerprint": "0", "stages": stages}))
+    anew = forked("learn", *arguments, cwd=tmp_path)
+    assert anew.returncode == 0, anew.stderr
+    assert "learned anew" not in result.stdout
+    assert "learned/progress.json: is of other code of gpmpc than this" in anew.stdout
+    assert json.loads(progress.read_text()) == kept
     wrong = forked(
         "learn", "map.yaml", "0.csv", "1.csv", "--held-out", "7", cwd=tmp_path
     )
@@ -195,3 +206,29 @@ def test_learn_writes_a_model_a_report_and_a_card_and_names_mistakes(tmp_path):
         2,
         "gpmpc: held_out: no such run '7'; there are 0, 1\n",
     )
+
+
+def test_outcomes_of_stages_are_used_again_or_a_line_says_why_they_are_not(tmp_path):
+    path = tmp_path / "progress.json"
+    memory = _FileMemory(path, "name")
+    assert memory == {}
+    assert memory.begun_anew == ""
+    memory["fit"] = [1.5]
+    again = _FileMemory(path, "name")
+    assert again == {"fit": [1.5]}
+    assert again.begun_anew == ""
+    kept = json.loads(path.read_text())
+    older = {"fingerprint": "name of older code", "stages": {"fit": [2.5]}}
+    for content, reason in (
+        (json.dumps(kept | {"fingerprint": "other"}), "is of other data or settings"),
+        (json.dumps(older | {"code": "0" * 32}), "is of other code of gpmpc than this"),
+        (json.dumps(older), "is of other code of gpmpc than this"),
+        ('{"fingerprint": "na', "is not whole"),
+        ("[]", "is not whole"),
+        ("[" * 100_000, "is not whole"),
+        (json.dumps(kept | {"stages": 3}), "is not whole"),
+    ):
+        path.write_text(content)
+        memory = _FileMemory(path, "name")
+        assert memory == {}
+        assert memory.begun_anew == f"{path}: {reason}; all is learned anew"

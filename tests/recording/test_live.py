@@ -1,12 +1,15 @@
 """A viewer that connects to the live view receives the steps as they are recorded."""
 
 import base64
+import inspect
 import json
 import os
 import select
 import socket
 import struct
+from pathlib import Path
 
+import foxglove
 import numpy as np
 import pytest
 
@@ -17,7 +20,7 @@ from tests.recording import runs
 class Viewer:
     """A WebSocket client that knows as much of the protocols (RFC 6455, foxglove.sdk.v1) as these tests need."""
 
-    def __init__(self, address):
+    def __init__(self, address, origin=None):
         host, port = address.removeprefix("ws://").split(":")
         self.stream = socket.create_connection((host, int(port)), timeout=20)
         key = base64.b64encode(os.urandom(16)).decode()
@@ -27,6 +30,8 @@ class Viewer:
         lines += [
             f"Sec-WebSocket-Key: {key}\r\nSec-WebSocket-Version: 13\r\nSec-WebSocket-Protocol: foxglove.sdk.v1"
         ]
+        if origin is not None:  # as a browser says which page asks
+            lines.append(f"Origin: {origin}")
         self.stream.sendall("\r\n".join([*lines, "\r\n"]).encode())
         answer = b""
         while not answer.endswith(b"\r\n\r\n"):
@@ -121,6 +126,29 @@ def test_a_second_live_view_takes_another_port(recorder, tmp_path):
         assert other.address != recorder.address
         with Viewer(other.address) as viewer:
             viewer.subscribe("/step")
+
+
+def test_the_live_view_listens_on_this_machine_alone_and_takes_no_orders(recorder):
+    port = int(recorder.address.rpartition(":")[2])
+    for other_address in ("127.0.0.2", "::1"):  # what stands for any other interface
+        with pytest.raises(OSError, match=r"refused|unreachable|Cannot assign"):
+            socket.create_connection((other_address, port), timeout=2)
+    with Viewer(recorder.address) as viewer:
+        greeting = viewer.receive()
+    assert greeting["op"] == "serverInfo"
+    assert greeting["capabilities"] == []  # a viewer sets, publishes and calls nothing
+
+
+def test_the_library_cannot_tell_pages_apart_which_the_documents_say(recorder):
+    """Where this fails, foxglove-sdk has learned to check: let the recorder use it."""
+    options = inspect.signature(foxglove.start_server).parameters
+    assert not [name for name in options if "origin" in name.lower()]
+    with Viewer(recorder.address, origin="https://elsewhere.example") as viewer:
+        viewer.subscribe("/step")
+    root = Path(__file__).resolve().parents[2]
+    for page in ("SECURITY.md", "docs/recording.md"):
+        text = " ".join((root / page).read_text().split())
+        assert "any page that is open in a browser on the same machine" in text
 
 
 def test_a_recorder_without_live_view_has_no_address(tmp_path):

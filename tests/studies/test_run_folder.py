@@ -13,6 +13,7 @@ from gpmpc.studies._run_folder import (
     RunFolder,
     difference,
     folder_name,
+    of_other_code,
     record,
 )
 
@@ -114,6 +115,26 @@ def test_a_result_of_other_settings_or_none_is_refused(tmp_path):
     (tmp_path / METRICS).unlink()
     with pytest.raises(DataError, match="FileNotFoundError"):
         folder.result()
+
+
+def test_what_flew_a_run_is_told_as_far_as_it_says_so():
+    settings = {"seed": 7}
+    about = record([], settings, "gpmpc run")
+    assert of_other_code(about) == ""
+    said = {
+        "gpmpc 1.2": {"versions": {"gpmpc": "1.2"}},
+        "gpmpc 1.2, commit 0123456789, changed": {
+            "versions": {"gpmpc": "1.2"},
+            "git": {"commit": "0123456789abcdef", "dirty": True},
+        },
+        "a gpmpc that did not say which": {"code": "0" * 32, "git": None},
+    }
+    for words, made in said.items():
+        assert of_other_code({"settings": settings, "provenance": made}) == words
+    for damaged in (None, 5, [], {"versions": 1, "git": "x"}, {"own_code": 3}):
+        content = {"settings": settings, "provenance": damaged}
+        assert of_other_code(content) == "a gpmpc that did not say which"
+    assert of_other_code({}) == "a gpmpc that did not say which"
 
 
 def test_a_name_is_the_choices_as_long_as_it_is_short_and_plain():

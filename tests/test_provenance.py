@@ -1,0 +1,198 @@
+"""A result is named by the code that made it: one fingerprint, wherever that code lies and whenever it was written."""
+
+import os
+import shutil
+import subprocess
+import time
+from pathlib import Path
+
+import pytest
+
+from gpmpc import _provenance
+from gpmpc._provenance import (
+    code_fingerprint,
+    is_of_this_code,
+    own_code,
+    provenance,
+    source_fingerprint,
+)
+from gpmpc.exceptions import GpmpcError
+
+ROOT = Path(__file__).resolve().parents[1]
+#: files that no number depends on: how documents look, texts of the command line
+SHOWN_ONLY = {".css", ".mplstyle", ".txt", ".typed"}
+
+
+@pytest.fixture
+def checkout(tmp_path):
+    """A copy of the source, as a checkout has it."""
+    for name in ("gpmpc", "experiments"):
+        shutil.copytree(
+            ROOT / name,
+            tmp_path / name,
+            ignore=shutil.ignore_patterns("__pycache__"),
+        )
+    return tmp_path
+
+
+def test_the_code_is_the_same_wherever_it_lies_and_whenever_it_was_written(checkout):
+    assert source_fingerprint(checkout / "gpmpc") == code_fingerprint()
+    for path in checkout.rglob("*.py"):
+        path.write_bytes(path.read_bytes().replace(b"\n", b"\r\n"))
+        os.utime(path, (0, 0))
+    (checkout / "gpmpc" / "__pycache__").mkdir()
+    (checkout / "gpmpc" / "__pycache__" / "gaussian.cpython-311.py").write_text("1")
+    (checkout / "gpmpc" / "notes.txt").write_text("not code")
+    (checkout / "gpmpc" / "conf").mkdir()
+    (checkout / "gpmpc" / "conf" / "own.py").write_text("not code")
+    assert source_fingerprint(checkout / "gpmpc") == code_fingerprint()
+
+
+def test_the_code_of_a_wheel_is_that_of_its_checkout(checkout):
+    for path in (checkout / "experiments").iterdir():
+        shutil.copy(path, checkout / "gpmpc" / "experiments")
+    shutil.rmtree(checkout / "experiments")
+    # what stands beside an installed package is another one's
+    (checkout / "experiments").mkdir()
+    (checkout / "experiments" / "other.py").write_text("x = 1\n")
+    assert source_fingerprint(checkout / "gpmpc") == code_fingerprint()
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "gpmpc/_kernels/_gp_moments.py",
+        "gpmpc/_dynamics.py",
+        "gpmpc/_compiled.py",
+        "gpmpc/trajectories.py",
+        "gpmpc/learning.py",
+        "gpmpc/estimation/_kalman.py",
+        "gpmpc/cli/_study.py",
+        "gpmpc/systems/quadrotor.xml",
+        "experiments/tables.py",
+        "experiments/subsystems.py",
+        "experiments/paper_tables.csv",
+    ],
+)
+def test_any_file_that_changes_moves_or_goes_makes_it_other_code(name, checkout):
+    path = checkout / name
+    content = path.read_bytes()
+    middle = len(content) // 2
+    path.write_bytes(content[:middle] + b"1" + content[middle:])
+    changed = source_fingerprint(checkout / "gpmpc")
+    path.write_bytes(content)
+    moved_to = path.with_name(f"other{path.suffix}")
+    path.rename(moved_to)
+    moved = source_fingerprint(checkout / "gpmpc")
+    moved_to.unlink()
+    try:
+        removed = source_fingerprint(checkout / "gpmpc")
+    except GpmpcError:  # it was the only one of its kind
+        removed = "refused"
+    assert len({code_fingerprint(), changed, moved, removed}) == 4
+
+
+def test_every_file_of_the_package_is_code_or_known_to_change_no_number():
+    listed = ["git", "ls-files", "gpmpc", "experiments"]
+    tracked = subprocess.run(listed, cwd=ROOT, capture_output=True, text=True)
+    names = tracked.stdout.split()
+    if not names:
+        pytest.skip("no checkout")
+    endings = {Path(name).suffix for name in names}
+    assert endings - SHOWN_ONLY == {*_provenance._SOURCES}
+
+
+def test_a_package_without_its_source_files_is_refused_by_the_ending_that_is_missing(
+    tmp_path, monkeypatch
+):
+    (tmp_path / "gaussian.py").write_text("x = 1\n")
+    with pytest.raises(GpmpcError, match=r"holds no \*\.xml"):
+        source_fingerprint(tmp_path)
+    with pytest.raises(GpmpcError, match=r"holds no \*\.py"):
+        source_fingerprint(tmp_path / "gone")
+
+    def refuse():
+        raise GpmpcError("no source")
+
+    monkeypatch.setattr(_provenance, "code_fingerprint", refuse)
+    assert provenance()["code"] is None
+    assert not is_of_this_code(provenance())
+
+
+def test_what_does_not_say_which_code_made_it_was_made_by_other_code():
+    assert is_of_this_code(provenance())
+    assert not is_of_this_code({})
+    assert not is_of_this_code(provenance() | {"code": "0" * 32})
+
+
+def test_the_fingerprint_is_read_once_a_process_and_takes_less_than_a_flight_notices():
+    code_fingerprint()
+    began = time.perf_counter()
+    code_fingerprint()
+    assert time.perf_counter() - began < 1e-3
+    assert code_fingerprint.cache_info().misses <= 1
+
+
+@pytest.fixture
+def own(tmp_path, monkeypatch):
+    """Code of a user's own in a folder on the path, each file by its name."""
+    monkeypatch.syspath_prepend(str(tmp_path))
+    (tmp_path / "my_robot").mkdir()
+    files = {
+        "my_robot/__init__.py": "",
+        "my_robot/plant.py": "from my_constants import MASS\n",
+        "my_robot/robot.xml": "<mujoco/>",
+        "my_robot/log.csv": "t\n0\n",
+        "my_constants.py": "import numpy\nMASS = 1.0\n",
+        "my_notes.py": "x = 1\n",
+        "my_script.py": "import my_constants\n",
+    }
+    for name, text in files.items():
+        (tmp_path / name).write_text(text)
+    _provenance._own_fingerprint.cache_clear()
+    yield tmp_path
+    _provenance._own_fingerprint.cache_clear()
+
+
+SETTINGS = {
+    "system": {"_target_": "my_robot.plant.make"},
+    "list": [
+        {"parts": ({"_target_": "my_script.f"}, {"_target_": "scipy.stats.norm"})}
+    ],
+    "model": {"_target_": "gpmpc.gp.train", "value": 1},
+    "nothing": {"_target_": "no_such_module.f"},
+    "builtin": {"_target_": "builtins.dict"},
+    "number": {"_target_": 3},
+}
+
+
+def test_code_of_the_users_own_counts_with_what_it_imports_and_nothing_installed(own):
+    before = own_code(SETTINGS)
+    assert sorted(before) == ["my_robot", "my_script"]
+
+    def changed(name, text):
+        (own / name).write_text(text)
+        _provenance._own_fingerprint.cache_clear()
+        after = own_code(SETTINGS)
+        return {key for key in before if after[key] != before[key]}
+
+    assert changed("my_notes.py", "x = 2\n") == set()
+    assert changed("my_robot/log.csv", "t\n1\n") == set()
+    assert changed("my_robot/robot.xml", "<mujoco model='a'/>") == {"my_robot"}
+    assert changed("my_constants.py", "MASS = 2.0\n") == {"my_robot", "my_script"}
+
+
+def test_a_result_of_own_code_that_changed_since_is_one_of_other_code(own):
+    about = provenance() | {"own_code": own_code(SETTINGS)}
+    assert is_of_this_code(about, SETTINGS)
+    assert not is_of_this_code(provenance(), SETTINGS)
+    (own / "my_constants.py").write_text("MASS = 2.0\n")
+    _provenance._own_fingerprint.cache_clear()
+    assert not is_of_this_code(about, SETTINGS)
+
+
+def test_own_code_that_cannot_be_parsed_counts_as_it_stands(own):
+    before = own_code(SETTINGS)
+    (own / "my_script.py").write_text("import (\n")
+    _provenance._own_fingerprint.cache_clear()
+    assert own_code(SETTINGS)["my_script"] != before["my_script"]
