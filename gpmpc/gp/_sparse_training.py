@@ -39,6 +39,7 @@ from gpmpc.gp._sparse import (
 )
 from gpmpc.gp._training import Trainer, Training
 from gpmpc.gp._transitions import Transitions, check_transitions
+from gpmpc.gp._wrapped import warn_of_turns
 
 _log = logging.getLogger(__name__)
 _EVERY = 10  # iterations between two lines of the log
@@ -82,6 +83,7 @@ class SparseTrainer:
                 points learned nothing but noise of it where the subset's training learned more.
         """
         check_transitions(transitions)
+        warn_of_turns(transitions)
         return self.fit(
             transitions.features,
             transitions.targets(self.predicts),

@@ -37,6 +37,7 @@ from gpmpc.gp._search import (
     training_data,
 )
 from gpmpc.gp._transitions import Transitions, check_transitions
+from gpmpc.gp._wrapped import warn_of_turns
 
 _ONE_THREAD = 1000  # points below which LAPACK's threads wait for each other longer than they work
 _GIB = 2**30
@@ -113,6 +114,7 @@ class Trainer:
     ) -> Training:
         """Trains on transitions; see ``fit``."""
         check_transitions(transitions)
+        warn_of_turns(transitions)
         targets = transitions.targets(self.predicts)
         return self.fit(
             transitions.features, targets, transitions.input_dim, seed=seed, start=start
@@ -138,6 +140,7 @@ class Trainer:
             t.to("cpu", torch.float64) for t in (posterior.features, posterior.targets)
         )
         if transitions is not None:
+            warn_of_turns(transitions)
             targets = torch.cat([targets, targets_of(posterior, transitions)])
             features = torch.cat([features, transitions.features])
         return self.fit(

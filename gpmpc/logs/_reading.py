@@ -15,6 +15,7 @@ import pandas as pd
 from scipy.ndimage import binary_dilation, maximum_filter1d, minimum_filter1d
 from scipy.spatial.transform import Rotation
 
+from gpmpc._angles import wrap
 from gpmpc.exceptions import DataError
 from gpmpc.logs._kinematics import (
     Array,
@@ -185,12 +186,18 @@ def _tabulate(
         )
         breaks = np.zeros(len(grid), dtype=bool)
 
-    def on_grid(topic: str, values: Array, rule: str, max_gap: float | None) -> Array:
+    def on_grid(
+        topic: str,
+        values: Array,
+        rule: str,
+        max_gap: float | None,
+        angles: bool = False,
+    ) -> Array:
         if mapping.rate is None:
             return values
         time = stamps[topic].time
         usual = max(float(np.median(np.diff(time))), 1 / mapping.rate)
-        return resample(time, values, grid, rule, max_gap or 1.5 * usual)
+        return resample(time, values, grid, rule, max_gap or 1.5 * usual, angles)
 
     parts = []
     for s in mapping.signals:
@@ -200,6 +207,7 @@ def _tabulate(
                 _values(labels[s.topic], tables[s.topic], s, note),
                 s.rule,
                 mapping.max_gap,
+                s.kind == "angle",
             )
         )
     outside = np.zeros(len(grid), dtype=bool)
@@ -483,12 +491,18 @@ def ordered_stamps(stamps: Array, where: str) -> Stamps:
 
 
 def resample(
-    time: Array, values: Array, grid: Array, rule: str, max_gap: float
+    time: Array,
+    values: Array,
+    grid: Array,
+    rule: str,
+    max_gap: float,
+    angles: bool = False,
 ) -> Array:
     """Computes values (G, c) at the times of a grid (G,) [s] from samples (K, c) at increasing times (K,) [s].
 
     The rule "hold" takes the last sample, "linear" interpolates, "spherical" interpolates quaternions. Values are NaN
     beyond the samples and where two of them are farther apart than ``max_gap`` [s]; samples with a NaN are left out.
+    Between two ``angles`` [rad] the rule "linear" goes the short way round.
     """
     present = np.isfinite(values).all(axis=1)
     time, values = time[present], values[present]
@@ -506,7 +520,8 @@ def resample(
             turn = rotation_vector(quaternion_product(quaternion_inverse(one), other))
             found = quaternion_product(one, rotation_quaternion(share * turn))
         else:
-            found = one + share * (other - one)
+            change = wrap(other - one) if angles else other - one
+            found = one + share * change
         usable = (at >= 0) & (
             (lag <= RESOLUTION) | ((at < len(time) - 1) & (span <= max_gap))
         )
