@@ -24,7 +24,9 @@ from gpmpc._angles import wrap
 from gpmpc._dynamics import Array
 from gpmpc.exceptions import DataError, SettingError, ShapeError, check_number
 
-_DEPENDENT = 1e-8  # share of a square that a regression leaves, below which it leaves nothing
+_DEPENDENT = (
+    1e-8  # share of a square that a regression leaves, below which it leaves nothing
+)
 _RIDGE = 1e-9  # of columns of unit square: some draws of rows do not tell them apart
 
 
@@ -88,7 +90,7 @@ def estimate_delay(
     moving = np.ptp(changes, axis=0) > 0
     if not moving.any():
         raise DataError(
-            "no state ever changes its pace: the data cannot tell the delay of an input"
+            "no state moves, but at a constant pace: the data cannot tell the delay of an input"
         )
     known = _orthonormal(x[rows])
     changes = changes[:, moving] - changes[:, moving].mean(axis=0)

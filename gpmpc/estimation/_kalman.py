@@ -241,7 +241,9 @@ class KalmanFilter:
         innovation = state_difference(y, view.mean, self.measurement.angles)
         # A missing entry shows nothing, with a noise that has nothing to do with others.
         apart = missing[..., None] | missing[..., None, :]
-        noise = torch.where(apart, torch.eye(len(R)).to(R), view.linearization_error + R)
+        noise = torch.where(
+            apart, torch.eye(len(R)).to(R), view.linearization_error + R
+        )
         seen = torch.where(missing[..., None], 0.0, view.seen)
         posterior = condition(view.root, seen, noise)
         correction = posterior.gain @ torch.where(missing, 0.0, innovation)[..., None]

@@ -18,12 +18,32 @@ from gpmpc._angles import TURN
 from gpmpc.gp._transitions import Transitions
 
 _log = logging.getLogger(__name__)
-_FAR_SMALLER = 1 / 6  # of a turn: the largest step that is no jump
-_FAR_SMALLER_APART = 1 / 12  # likewise, where values lie farther apart than a turn
-_EXACT = 0.05  # of a turn, by which jumps may miss whole turns there
-_SLACK = 0.01  # of a turn: noise that was added after the angle was wrapped
-_AS_SMALL = 1.25  # jumps without their turns, over the largest other step
-_UNITS = ((TURN, "2 pi"), (360.0, "360"))
+_FAR_SMALLER_APART = (
+    1 / 10
+)  # of a turn: as below, where values lie farther apart than a turn
+_EXACT = 0.1  # of a turn, by which jumps may miss whole turns there
+_SLACK = 0.005  # of a turn: noise that was added after the angle was wrapped
+_AS_SMALL = (
+    1.15  # what is left of jumps without whole turns, over the largest other step
+)
+
+
+DECLARE = (
+    "Declare angles, in rad (train_residual or ResidualModel.train with angles={columns}), "
+    "or let them count turns (numpy.unwrap)"
+)
+
+
+class Turn(NamedTuple):
+    """A whole turn in a unit."""
+
+    size: float
+    words: str
+    far_smaller: float  #: largest step that is no jump, where there are some [turns]
+
+
+# Many honest states reach hundreds, few of them 6: what counts for degrees is stricter.
+_TURNS = Turn(TURN, "2 pi", 1 / 6), Turn(360.0, "360", 1 / 36)
 
 
 class WrappedColumn(NamedTuple):
@@ -41,16 +61,24 @@ def wrapped_columns(
     columns = []
     for column in range(states.shape[1]):
         before, after = states[:, column], next_states[:, column]
-        for turn, unit in _UNITS:
+        for turn in _TURNS:
             rows = _jumps(before, after, turn)
             if rows:
-                columns.append(WrappedColumn(column, rows, unit))
+                columns.append(WrappedColumn(column, rows, turn.words))
                 break
     return columns
 
 
-def warn_of_turns(transitions: Transitions, angles: Sequence[int] = ()) -> None:
-    """Logs which states jump by whole turns although they are not among the declared angles."""
+def warn_of_turns(
+    transitions: Transitions, angles: Sequence[int] = (), remedy: str = DECLARE
+) -> None:
+    """Logs which states jump by whole turns although they are not among the declared angles.
+
+    Args:
+        transitions: What a model is about to learn from.
+        angles: Indices of the states that are declared.
+        remedy: What the message tells the user to do; ``{columns}`` stands for the indices.
+    """
     columns = wrapped_columns(
         transitions.states.numpy(force=True), transitions.next_states.numpy(force=True)
     )
@@ -63,30 +91,28 @@ def warn_of_turns(transitions: Transitions, angles: Sequence[int] = ()) -> None:
         for found in undeclared
     )
     _log.warning(
-        "%s, as an angle does that is shown within one turn: jumps are learned as motion. Declare angles, in rad "
-        "(train_residual or ResidualModel.train with angles=%s), or let them count turns (numpy.unwrap)",
+        "%s, as an angle does that is shown within one turn: jumps are learned as motion. %s",
         what,
-        [found.column for found in undeclared],
+        remedy.format(columns=[found.column for found in undeclared]),
     )
 
 
-def _jumps(
-    before: NDArray[np.float64], after: NDArray[np.float64], turn: float
-) -> int:
+def _jumps(before: NDArray[np.float64], after: NDArray[np.float64], turn: Turn) -> int:
     """How many steps of a column (N,) are whole turns; none unless that is what they are."""
-    steps = after - before
-    large = np.abs(steps) > turn / 2
-    jumps = steps[large]
+    steps = (after - before) / turn.size
+    large = np.abs(steps) > 0.5
     others = np.abs(steps[~large])
-    if not len(jumps) or len(others) < 2:
+    count = int(large.sum())
+    if not count or len(others) < 2:
         return 0
-    smallness = float(others.max())
-    misses = float(np.abs(jumps - turn * np.round(jumps / turn)).max())
+    largest_other = float(others.max())
+    remainder = float(np.abs(steps[large] - np.round(steps[large])).max())
     lowest = min(before.min(), after.min())
     highest = max(before.max(), after.max())
-    if highest - lowest <= (1 + _SLACK) * turn:
-        as_small = misses <= _AS_SMALL * smallness + _SLACK * turn
-        return len(jumps) if smallness <= _FAR_SMALLER * turn and as_small else 0
-    as_small = misses <= min(_AS_SMALL * smallness, _EXACT * turn)
-    far_smaller = smallness <= _FAR_SMALLER_APART * turn
-    return len(jumps) if far_smaller and as_small and len(jumps) > 1 else 0
+    if highest - lowest <= (1 + 2 * _SLACK) * turn.size:
+        far_smaller = turn.far_smaller
+        small = _AS_SMALL * largest_other + _SLACK
+    else:
+        far_smaller = min(turn.far_smaller, _FAR_SMALLER_APART)
+        small = min(_AS_SMALL * largest_other, _EXACT) if count > 1 else 0.0
+    return count if largest_other <= far_smaller and remainder <= small else 0

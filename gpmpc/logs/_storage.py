@@ -15,9 +15,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gpmpc._angles import full_turns
 from gpmpc._dynamics import DynamicsModel, Linearized, check_query, to_array
 from gpmpc._files import existing_file, new_file
-from gpmpc._angles import full_turns
 from gpmpc.exceptions import DataError, SettingError
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import load_metadata
