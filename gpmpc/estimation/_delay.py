@@ -178,7 +178,7 @@ def _check_different(inputs: Array) -> None:
         )
 
 
-def _acting_inputs(inputs: Array, rows: Array, delay: float) -> Array:
+def _acting_inputs(inputs: Array, rows: np.ndarray, delay: float) -> Array:
     """The inputs (rows, m) that act in each row with a delay [steps]."""
     whole = int(np.ceil(delay))
     share = delay - (whole - 1)  # of the older input

@@ -4,10 +4,12 @@
     update:    K = Cov[x, y] (Cov[y] + R)^-1,   mu = mu- + K (y - E[y]),   Sigma = Sigma- - K (Cov[y] + R) K'
 
 with the moments of y = h(x) + v, v ~ N(0, R), by a propagator as well: a measurement is a ``DynamicsModel`` without
-inputs. The update is computed from a root of Sigma-, without the difference that it is written with
-(``gpmpc.estimation._conditioning``): a prior may be 1e16 times as wide as the sensor's noise, and a sensor perfect. By first-order linearisation this is the extended Kalman filter, by the unscented transform the unscented one
+inputs. By first-order linearisation this is the extended Kalman filter, by the unscented transform the unscented one
 (Julier and Uhlmann, 2004), by moment matching the assumed-density filter of Deisenroth, Huber and Hanebeck (2009).
 Entries of y that are not finite are missing, and the others are used.
+
+The update is computed from a root of Sigma-, not by the difference that it is written with
+(``gpmpc.estimation._conditioning``): a prior may be 1e16 times as wide as a sensor's noise, and a sensor perfect.
 """
 
 from collections import deque
