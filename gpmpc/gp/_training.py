@@ -140,8 +140,8 @@ class Trainer:
             t.to("cpu", torch.float64) for t in (posterior.features, posterior.targets)
         )
         if transitions is not None:
-            warn_of_turns(transitions)
             targets = torch.cat([targets, targets_of(posterior, transitions)])
+            warn_of_turns(transitions)
             features = torch.cat([features, transitions.features])
         return self.fit(
             features,
