@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
+from gpmpc._angles import angles_of, whole_turns
 from gpmpc._dynamics import DynamicsModel
 from gpmpc.exceptions import DataError, SettingError, ShapeError, check_number
 from gpmpc.gaussian import Gaussian
@@ -143,6 +144,7 @@ def calibrate(
     horizon: int = 10,
     levels: Sequence[float] = (0.5, 0.9, 0.95),
     names: Sequence[str] = (),
+    angles: Sequence[int] | None = None,
 ) -> Calibration:
     """Predicts held-out recordings from every state, and compares.
 
@@ -156,6 +158,8 @@ def calibrate(
         horizon: H, the longest prediction in steps.
         levels: Of the central intervals.
         names: Of the states; x1, x2, ... by default.
+        angles: Indices of the states that are angles [rad], whose errors are taken within half a turn; by default
+            those of the model.
 
     Raises:
         ShapeError: Recordings, model or names do not belong together.
@@ -167,6 +171,7 @@ def calibrate(
     check_number("horizon", horizon, least=1, whole=True)
     _check(model, recordings, horizon, levels, names)
     n = model.state_dim
+    turning = angles_of(model) if angles is None else list(angles)
     like: dict[str, Any] = {"dtype": model.dtype, "device": model.device}
     noise, certain = model.noise_covariance.diagonal(), torch.zeros(n, n, **like)
 
@@ -189,14 +194,12 @@ def calibrate(
                         belief.mean[: last - first], belief.covariance[: last - first]
                     )
                     belief = propagator(model, belief, u[first + k : last + k])
-                    observed = recording.states[first + k + 1 : last + k + 1]
-                    found[k].append(
-                        (
-                            belief.mean.double().cpu(),
-                            (belief.variance + noise).double().cpu(),
-                            observed,
-                        )
-                    )
+                    mean = belief.mean.double().cpu()
+                    variance = (belief.variance + noise).double().cpu()
+                    observed = recording.states[first + k + 1 : last + k + 1].clone()
+                    turns = whole_turns((observed - mean)[:, turning])
+                    observed[:, turning] -= turns
+                    found[k].append((mean, variance, observed))
     steps = [
         tuple(torch.cat(parts) for parts in zip(*step, strict=True)) for step in found
     ]

@@ -17,6 +17,7 @@ neither chance nor the noise of late explains, what was seen before is forgotten
 model's noise is scaled by what successive errors differ by, in the median, where that is more.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cache, cached_property
 from time import perf_counter
@@ -27,6 +28,7 @@ import torch
 from scipy.stats import chi2
 from torch import Tensor
 
+from gpmpc._angles import angles_of, state_difference
 from gpmpc._dynamics import Array, DynamicsModel, Linearized, linearize, to_array
 from gpmpc._kernels import Window
 from gpmpc._kernels import linearize as linearize_gps
@@ -123,6 +125,8 @@ class ChangedModel(Wrapper):
         default_factory=OnlineLearning
     )  #: how d is learned
     time: float = 0.0  #: t of all predictions [steps]
+    #: further states that are angles, besides those of the model: a sensor may show them within a turn
+    further_angles: Sequence[int] = ()
 
     def __post_init__(self) -> None:
         if (
@@ -158,6 +162,11 @@ class ChangedModel(Wrapper):
             if self.gp is model
             else model.B
         )
+
+    @cached_property
+    def angles(self) -> list[int]:  # type: ignore[override]
+        """Indices of the states that are angles."""
+        return sorted({*angles_of(self.model), *self.further_angles})
 
     @cached_property
     def arrays(self) -> tuple[Array, Array, Array]:
@@ -199,11 +208,8 @@ class ChangedModel(Wrapper):
         alone = linearize(self.model, states, inputs)
         z, v, _ = self.features.linearize(states, inputs)
         variance = ((reach @ cast(Array, alone.covariance)[0]) * reach).sum(1)
-        return (
-            np.concatenate([z[0], v[0], [self.time]]),
-            reach @ (next_state - alone.mean[0]),
-            variance,
-        )
+        missed = state_difference(next_state, alone.mean[0], self.angles)
+        return np.concatenate([z[0], v[0], [self.time]]), reach @ missed, variance
 
     def with_point(self, point: Array, target: Array, noise: Array) -> "ChangedModel":
         """The model with a further point (phi, u, t) (d,) of the change, its target (k,) and its noise's variance (k,).
@@ -374,7 +380,11 @@ class LearningController:
         )
         self.problem, self.horizon = controller.problem, controller.horizon
         self.initial_input = controller.initial_input
-        self._model = ChangedModel(controller.prediction.model, self.learning)
+        self._model = ChangedModel(
+            controller.prediction.model,
+            self.learning,
+            further_angles=self.problem.cost.angles,
+        )
 
     def control(
         self,

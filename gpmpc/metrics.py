@@ -9,34 +9,49 @@ import torch
 from scipy import stats
 from torch import Tensor
 
+from gpmpc._angles import state_difference
 from gpmpc.exceptions import SettingError, ShapeError
 from gpmpc.gaussian import check_tensors
 
 
-def mean_squared_error(predicted: Tensor, observed: Tensor) -> float:
-    """Computes the squared error summed over the outputs, averaged over the samples; both (N, n)."""
+def mean_squared_error(
+    predicted: Tensor, observed: Tensor, angles: Sequence[int] = ()
+) -> float:
+    """Computes the squared error summed over the outputs, averaged over the samples; both (N, n).
+
+    ``angles`` are outputs whose errors are taken within half a turn [rad].
+    """
     _check_alike(predicted=predicted, observed=observed)
-    return float((predicted - observed).square().sum(dim=-1).mean())
+    errors = state_difference(predicted, observed, angles)
+    return float(errors.square().sum(dim=-1).mean())
 
 
 def negative_log_predictive_density(
-    mean: Tensor, variance: Tensor, observed: Tensor
+    mean: Tensor, variance: Tensor, observed: Tensor, angles: Sequence[int] = ()
 ) -> float:
     """Computes -log N(observed; mean, variance), averaged over samples and outputs; all (N, n). Lower is better.
+
+    ``angles`` are outputs whose errors are taken within half a turn [rad].
 
     Quinonero-Candela et al. (2006), "Evaluating predictive uncertainty challenge".
     """
     _check_alike(mean=mean, variance=variance, observed=observed)
-    return float(
-        ((2 * math.pi * variance).log() + (observed - mean).square() / variance).mean()
-        / 2
-    )
+    errors = state_difference(observed, mean, angles)
+    densities = (2 * math.pi * variance).log() + errors.square() / variance
+    return float(densities.mean() / 2)
 
 
 def interval_coverage(
-    mean: Tensor, variance: Tensor, observed: Tensor, level: float = 0.95
+    mean: Tensor,
+    variance: Tensor,
+    observed: Tensor,
+    level: float = 0.95,
+    angles: Sequence[int] = (),
 ) -> float:
-    """Computes the part of observations inside the central interval of a level; all (N, n). Ideal: the level."""
+    """Computes the part of observations inside the central interval of a level; all (N, n). Ideal: the level.
+
+    ``angles`` are outputs whose errors are taken within half a turn [rad].
+    """
     _check_alike(mean=mean, variance=variance, observed=observed)
     if not 0 < level < 1:
         raise SettingError("level", f"must lie between 0 and 1; got {level}")
@@ -44,7 +59,8 @@ def interval_coverage(
         torch.special.ndtri(torch.tensor((1 + level) / 2, dtype=variance.dtype))
         * variance.sqrt()
     )
-    return float(((observed - mean).abs() <= half_width).double().mean())
+    errors = state_difference(observed, mean, angles)
+    return float((errors.abs() <= half_width).double().mean())
 
 
 def _check_alike(**given: Tensor) -> None:
@@ -86,7 +102,7 @@ def _errors(
     axes: Sequence[int],
     angles: Sequence[int],
 ) -> np.ndarray:
-    """Differences on some axes (K + 1, j), those of angles in [-pi, pi)."""
+    """Differences on some axes (K + 1, j), those of angles within half a turn."""
     if (
         np.ndim(states) != 2
         or np.shape(states) != np.shape(references)
@@ -99,11 +115,9 @@ def _errors(
     n = np.shape(states)[1]
     if not all(-n <= axis < n for axis in axes):
         raise ShapeError(f"axes must be states from 0 to {n - 1}; got {tuple(axes)}")
-    errors = (np.asarray(states) - np.asarray(references))[:, list(axes)]
-    for j, axis in enumerate(axes):
-        if axis in angles:
-            errors[:, j] = (errors[:, j] + math.pi) % (2 * math.pi) - math.pi
-    return errors
+    flown = np.asarray(states, dtype=float)
+    errors = state_difference(flown, np.asarray(references, dtype=float), angles)
+    return errors[:, list(axes)]
 
 
 @dataclass(frozen=True)
@@ -232,16 +246,15 @@ def tracking_cost(
     references: np.ndarray,
     inputs: np.ndarray,
     previous_input: Sequence[float] | np.ndarray,
+    angles: Sequence[int] = (),
 ) -> float:
     """Computes the cost of a flight per step: 1/K (sum_k |x_k - r_k|^2_Q + sum_k |u_k - u_{k-1}|^2_R).
 
     Q is (n, n) and R (m, m); states and references are (K + 1, n), of which the first cost nothing, inputs (K, m), and
-    the previous input u_{-1} (m,).
+    the previous input u_{-1} (m,). ``angles`` are states whose errors are taken within half a turn [rad].
     """
-    errors, increments = (
-        states[1:] - references[1:],
-        np.diff(inputs, axis=0, prepend=np.atleast_2d(previous_input)),
-    )
+    errors = state_difference(states[1:], references[1:], angles)
+    increments = np.diff(inputs, axis=0, prepend=np.atleast_2d(previous_input))
     cost = np.einsum("ki,ij,kj", errors, Q, errors) + np.einsum(
         "ki,ij,kj", increments, R, increments
     )

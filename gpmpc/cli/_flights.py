@@ -159,7 +159,12 @@ def calibrate(given: argparse.Namespace) -> Result:
     names = [f"{name} [{system.units.get(name, '?')}]" for name in system.state_names]
     with console.status("predicting"):
         found = calibration.calibrate(
-            model, flown, horizon=horizon, levels=_LEVELS, names=names
+            model,
+            flown,
+            horizon=horizon,
+            levels=_LEVELS,
+            names=names,
+            angles=system.angle_indices,
         )
     rows = []
     for k in sorted({step for step in (1, 10, 50) if step <= horizon} | {horizon}):

@@ -24,6 +24,7 @@ whose exact upper 95 % limit (Clopper and Pearson, 1934) is at or below 1 - eta;
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -31,6 +32,7 @@ import numpy as np
 import torch
 from scipy.stats import beta
 
+from gpmpc._angles import angles_of, full_turns, state_difference
 from gpmpc._compiled import call_unchecked, compiled
 from gpmpc._dynamics import Array, DynamicsModel, to_array
 from gpmpc.exceptions import DataError, SettingError, ShapeError, check_number
@@ -44,6 +46,7 @@ class ConformalTube:
 
     scores: Array  #: those of each stage in a column (N, H), which are sorted
     rows: Array  #: the directions g (r, n) that were compared
+    angles: Sequence[int] = ()  #: states whose errors are taken within half a turn
 
     def __post_init__(self) -> None:
         object.__setattr__(
@@ -62,6 +65,7 @@ class ConformalTube:
         inputs: Any,
         horizon: int,
         rows: Any = None,
+        angles: Sequence[int] | None = None,
     ) -> "ConformalTube":
         """Compares predictions with a held-out log, over windows that do not overlap.
 
@@ -73,6 +77,8 @@ class ConformalTube:
             horizon: H.
             rows: Directions g (r, n); both sides of every state by default. A bound on the first state from above alone
                 is [[1, 0, ..]]: fewer directions, a smaller kappa.
+            angles: Indices of the states that are angles [rad], whose errors are taken within half a turn; by default
+                those of the model.
 
         Raises:
             ShapeError: States, inputs or rows do not belong together.
@@ -114,10 +120,12 @@ class ConformalTube:
             raise DataError(
                 "a direction has no variance: predict with the process noise"
             )
-        scores = (to_array(x[at] - predicted.mean) @ G.T / deviation).max(-1)
+        turning = angles_of(model) if angles is None else list(angles)
+        errors = to_array(state_difference(x[at], predicted.mean, turning))
+        scores = (errors @ G.T / deviation).max(-1)
         if not np.isfinite(scores).all():
             raise DataError("a score is not finite: a prediction or a state is not")
-        return cls(scores, G)
+        return cls(scores, G, turning)
 
     @property
     def horizon(self) -> int:
@@ -202,12 +210,15 @@ class AdaptiveTube:
             (H, H, r), np.nan
         )  # of the plans of the last H steps, by stage and direction
         self._step = 0
+        # Plans count turns from the state that they began at, which a sensor may wrap. So states and plans are moved
+        # by whole turns to where this state, the last one, goes on without jumps.
+        self._last_state = np.full(n, np.nan)
         self.observe(np.full(n, np.nan))  # nothing yet: kappas alone
         self._step = 0
 
     def observe(self, state: Any) -> Array:
         """Compares a state (n,) with what the plans before it said; returns kappa of each stage (H,)."""
-        state = np.ascontiguousarray(state, dtype=np.float64)
+        state = self._without_jumps(np.ascontiguousarray(state, dtype=np.float64))
         self._step += 1
         numbers, parts = (
             (self.rate, self.allowed, self.largest),
@@ -241,6 +252,8 @@ class AdaptiveTube:
         expected = self.tube.horizon + 1, self.tube.rows.shape[1]
         if means.shape != expected:
             raise ShapeError(f"means must be {expected}; got {means.shape}")
+        if len(self.tube.angles) and np.isfinite(self._last_state).all():
+            means = means + full_turns(self._last_state - means[0], self.tube.angles)
         bounds = self._bounds[self._step % self.tube.horizon]
         call_unchecked(
             _remember,
@@ -253,6 +266,15 @@ class AdaptiveTube:
         )
         if stages is not None:
             bounds[~np.asarray(stages, dtype=bool)] = np.nan
+
+    def _without_jumps(self, state: Array) -> Array:
+        """The state (n,) whose angles are within half a turn of the last ones."""
+        if not len(self.tube.angles) or not np.isfinite(state).all():
+            return state
+        if np.isfinite(self._last_state).all():
+            state = state - full_turns(state - self._last_state, self.tube.angles)
+        self._last_state = state
+        return state
 
     @property
     def violations(self) -> Array:

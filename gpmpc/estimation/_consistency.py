@@ -6,7 +6,6 @@ independent ones N times the mean is chi-square of N n degrees of freedom (Bar-S
 5.4). Too large a mean: the estimator is overconfident. Innovations of a consistent filter are white.
 """
 
-import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,6 +14,7 @@ import torch
 from scipy.stats import chi2
 from torch import Tensor
 
+from gpmpc._angles import state_difference
 from gpmpc.exceptions import DataError, ShapeError
 from gpmpc.gaussian import Gaussian
 
@@ -87,16 +87,9 @@ def normalized_errors(
 
 
 def estimation_errors(belief: Gaussian, states: Any, angles: Any = ()) -> Tensor:
-    """The errors x - mu (..., n) of beliefs, those of angles wrapped to [-pi, pi)."""
-    errors = torch.as_tensor(states, dtype=belief.mean.dtype) - belief.mean
-    for i in angles:
-        errors[..., i] = wrapped(errors[..., i])
-    return errors
-
-
-def wrapped(angle: Any) -> Any:
-    """The angle in [-pi, pi) that differs by whole turns [rad]."""
-    return (angle + math.pi) % (2 * math.pi) - math.pi
+    """The errors x - mu (..., n) of beliefs, those of angles within half a turn."""
+    truth = torch.as_tensor(states, dtype=belief.mean.dtype)
+    return state_difference(truth, belief.mean, angles)
 
 
 def autocorrelation(

@@ -7,23 +7,41 @@ with the moments of y = h(x) + v, v ~ N(0, R), by a propagator as well: a measur
 inputs. By first-order linearisation this is the extended Kalman filter, by the unscented transform the unscented one
 (Julier and Uhlmann, 2004), by moment matching the assumed-density filter of Deisenroth, Huber and Hanebeck (2009).
 Entries of y that are not finite are missing, and the others are used.
+
+The update is computed from a root of Sigma-, not by the difference that it is written with
+(``gpmpc.estimation._conditioning``): a prior may be 1e16 times as wide as a sensor's noise, and a sensor perfect.
 """
 
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from gpmpc._dynamics import Array, DynamicsModel, Linearized, TensorModel, check_query
-from gpmpc.estimation._consistency import wrapped
+from gpmpc._angles import state_difference
+from gpmpc._dynamics import (
+    Array,
+    DynamicsModel,
+    Linearized,
+    TensorModel,
+    check_query,
+    predict_with_jacobian,
+)
+from gpmpc.estimation._conditioning import (
+    condition,
+    covariance_root,
+    seen_through,
+    squared,
+    unexplained,
+)
 from gpmpc.exceptions import SettingError, ShapeError, check_number, check_numbers
-from gpmpc.gaussian import Gaussian, check_tensors, nearest_positive_semidefinite
+from gpmpc.gaussian import Gaussian, check_tensors
 from gpmpc.models._nominal import linearize_function
 from gpmpc.propagation import Linearization, Propagator, Unscented
+from gpmpc.propagation._propagator import checked_input
 
 
 @dataclass(frozen=True)
@@ -42,7 +60,7 @@ class Measurement(TensorModel):
     ]  #: h, from x (*batch, n) to y (*batch, p), in torch
     angles: Sequence[
         int
-    ] = ()  #: entries of y that are angles [rad]: their differences are wrapped to [-pi, pi)
+    ] = ()  #: entries of y that are angles [rad]: their differences are taken within half a turn
     input_dim = 0
     _part = property(lambda self: self.noise_covariance)
 
@@ -220,27 +238,37 @@ class KalmanFilter:
             raise ShapeError(
                 f"a measurement must have shape {expected}; got {tuple(y.shape)}"
             )
-        seen = self.observer.propagate(self.measurement, belief)
-        S, missing = seen.belief.covariance + R, ~torch.isfinite(y)
-        innovation, angles = y - seen.belief.mean, list(self.measurement.angles)
-        if angles:
-            innovation[..., angles] = wrapped(innovation[..., angles])
-        # A missing entry is one of variance one that has nothing to do with the state.
-        used = torch.where(
-            missing[..., None] | missing[..., None, :], torch.eye(len(R)).to(S), S
+        view = self._view(belief)
+        missing = ~torch.isfinite(y)
+        innovation = state_difference(y, view.mean, self.measurement.angles)
+        # A missing entry shows nothing, with a noise that has nothing to do with others.
+        apart = missing[..., None] | missing[..., None, :]
+        noise = torch.where(
+            apart, torch.eye(len(R)).to(R), view.linearization_error + R
         )
-        C = torch.where(missing[..., None, :], 0.0, seen.cross_covariance)
-        gain = _right_solved(C, used)
-        mean = (
-            belief.mean
-            + (gain @ torch.where(missing, 0.0, innovation)[..., None])[..., 0]
-        )
-        covariance, _ = nearest_positive_semidefinite(
-            belief.covariance - gain @ used @ gain.mT
-        )
+        seen = torch.where(missing[..., None], 0.0, view.seen)
+        posterior = condition(view.root, seen, noise)
+        correction = posterior.gain @ torch.where(missing, 0.0, innovation)[..., None]
         return Update(
-            Gaussian(mean, covariance), torch.where(missing, torch.nan, innovation), S
+            Gaussian(belief.mean + correction[..., 0], posterior.covariance),
+            torch.where(missing, torch.nan, innovation),
+            view.covariance + R,
         )
+
+    def _view(self, belief: Gaussian) -> "_View":
+        """What the sensors show of a belief (*batch, n), without their noise."""
+        root = covariance_root(belief.covariance)
+        if getattr(self.observer, "first_order", False):
+            nothing = checked_input(self.measurement, belief, None)
+            value, H, _ = predict_with_jacobian(self.measurement, belief.mean, nothing)
+            seen = H @ root
+            covariance = squared(seen) + value.covariance
+            return _View(root, seen, value.mean, covariance, value.covariance)
+        moved = self.observer.propagate(self.measurement, belief)
+        covariance = moved.belief.covariance
+        seen = seen_through(root, moved.cross_covariance)
+        error = unexplained(covariance, seen)
+        return _View(root, seen, moved.belief.mean, covariance, error)
 
     def run(self, belief: Gaussian, inputs: Any, measured: Any) -> FilterRun:
         """Filters a log of inputs (T, m) and measurements (T + 1, p) from a belief before the first of them (n,).
@@ -273,6 +301,16 @@ class KalmanFilter:
         )
 
 
+class _View(NamedTuple):
+    """What sensors show of a belief N(mu, L L')."""
+
+    root: Tensor  # L (*batch, n, n)
+    seen: Tensor  # Y of Cov[x, y] = L Y' (*batch, p, n)
+    mean: Tensor  # E[y] (*batch, p)
+    covariance: Tensor  # Cov[y] (*batch, p, p)
+    linearization_error: Tensor  # Cov[y] - Y Y' (*batch, p, p)
+
+
 def smooth(run: FilterRun) -> Gaussian:
     """The beliefs given the whole log (T + 1, n): the smoother of Rauch, Tung and Striebel (1965).
 
@@ -282,11 +320,16 @@ def smooth(run: FilterRun) -> Gaussian:
     mean, covariance = run.filtered.mean[-1], run.filtered.covariance[-1]
     beliefs = [Gaussian(mean, covariance)]
     for k in reversed(range(len(run.cross_covariances))):
-        before, after = run.predicted.covariance[k + 1], run.predicted.mean[k + 1]
-        gain = _right_solved(run.cross_covariances[k], before)
-        mean = run.filtered.mean[k] + gain @ (mean - after)
-        covariance = run.filtered.covariance[k] + gain @ (covariance - before) @ gain.mT
-        covariance, _ = nearest_positive_semidefinite(covariance)
+        # The state a step later is a measurement of this one; what the log says of it
+        # comes instead of what was predicted, whose noise is the process noise.
+        root = covariance_root(run.filtered.covariance[k])
+        seen = seen_through(root, run.cross_covariances[k])
+        noise = unexplained(run.predicted.covariance[k + 1], seen)
+        given_next = condition(root, seen, noise)
+        difference = mean - run.predicted.mean[k + 1]
+        mean = run.filtered.mean[k] + given_next.gain @ difference
+        carried = given_next.gain @ covariance_root(covariance)
+        covariance = given_next.covariance + squared(carried)
         beliefs.append(Gaussian(mean, covariance))
     return _stacked(beliefs[::-1])
 
@@ -344,14 +387,6 @@ class LateMeasurements:
 
 def _like(belief: Gaussian, value: Any) -> Tensor:
     return torch.as_tensor(value, dtype=belief.mean.dtype, device=belief.mean.device)
-
-
-def _right_solved(C: Tensor, S: Tensor) -> Tensor:
-    """C S^-1 for symmetric S; by the pseudo-inverse where S is singular."""
-    factor, info = torch.linalg.cholesky_ex(S)
-    if bool(info.any()):
-        return C @ torch.linalg.pinv(S, hermitian=True)
-    return torch.cholesky_solve(C.mT, factor).mT
 
 
 def _stacked(beliefs: Sequence[Gaussian]) -> Gaussian:

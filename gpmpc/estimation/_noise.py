@@ -35,6 +35,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gpmpc._angles import angles_of, state_difference
 from gpmpc._dynamics import DynamicsModel
 from gpmpc.exceptions import DataError, ShapeError, UnsupportedModel, check_number
 from gpmpc.gp import (
@@ -94,7 +95,8 @@ def estimate_process_noise(
         0
     )  # a variance of the latent function that is too large leaves something
     after, now = transitions.next_states[:-1], transitions.states[1:]
-    successive = (after - now).abs().amax(1) <= 1e-12 + 1e-9 * now.abs().amax(1)
+    gap = state_difference(after, now, angles_of(model)).abs().amax(1)
+    successive = gap <= 1e-12 + 1e-9 * now.abs().amax(1)
     rho = torch.full_like(variance, torch.nan)
     if int(successive.sum()) >= 10:
         first, second = errors[:-1][successive], errors[1:][successive]
@@ -143,7 +145,8 @@ def _residuals(
         for t in (transitions.states, transitions.inputs, transitions.next_states)
     )
     belief = model.predict(x, u)
-    errors, variance = after - belief.mean, belief.variance.clone()
+    errors = state_difference(after, belief.mean, angles_of(model))
+    variance = belief.variance.clone()
     if not isinstance(model, GPPosterior) or not model.has_observation_noise:
         return errors, variance
     trained = {tuple(point): i for i, point in enumerate(model.features.tolist())}

@@ -50,6 +50,7 @@ from gpmpc.gp._sparse import (
 )
 from gpmpc.gp._training import Trainer, Training
 from gpmpc.gp._transitions import Transitions, check_transitions
+from gpmpc.gp._wrapped import warn_of_turns
 
 _log = logging.getLogger(__name__)
 _EVERY = 10  # iterations between two lines of the log
@@ -99,6 +100,7 @@ class SparseTrainer:
         check_transitions(transitions)
         targets = transitions.targets(self.predicts)
         warn_of_transitions(transitions)
+        warn_of_turns(transitions)
         return self.fit(
             transitions.features,
             targets,

@@ -47,6 +47,7 @@ from gpmpc.gp._search import (
     training_data,
 )
 from gpmpc.gp._transitions import Transitions, check_transitions
+from gpmpc.gp._wrapped import warn_of_turns
 
 _ONE_THREAD = 1000  # points below which LAPACK's threads wait for each other longer than they work
 _GIB = 2**30
@@ -132,6 +133,7 @@ class Trainer:
     ) -> Training:
         """Trains on transitions; see ``fit``."""
         check_transitions(transitions)
+        warn_of_turns(transitions)
         targets = transitions.targets(self.predicts)
         warn_of_transitions(transitions)
         return self.fit(
@@ -164,6 +166,7 @@ class Trainer:
         )
         if transitions is not None:
             targets = torch.cat([targets, targets_of(posterior, transitions)])
+            warn_of_turns(transitions)
             features = torch.cat([features, transitions.features])
         return self.fit(
             features,

@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gpmpc._angles import state_difference
 from gpmpc._files import existing_file, new_file, write_whole
 from gpmpc.exceptions import (
     DataError,
@@ -95,8 +96,10 @@ class Transitions:
         """x~ = (x, u), (N, n + m)."""
         return torch.cat([self.states, self.inputs], dim=1)
 
-    def targets(self, predicts: str) -> Tensor:
+    def targets(self, predicts: str, angles: Sequence[int] = ()) -> Tensor:
         """What GPs that predict ``"next_state"`` or ``"difference"`` learn of them (N, n).
+
+        Differences of ``angles``, indices of states in rad, are taken within half a turn: a sensor may wrap them.
 
         Raises:
             UnsupportedModel: They predict values, which transitions do not hold.
@@ -106,11 +109,9 @@ class Transitions:
                 "transitions hold no targets of GPs with predicts='value': use append_points, "
                 "or fit(features, targets, ...) of a trainer"
             )
-        return (
-            self.next_states - self.states
-            if predicts == "difference"
-            else self.next_states
-        )
+        if predicts == "difference":
+            return state_difference(self.next_states, self.states, angles)
+        return self.next_states
 
     def __getitem__(self, rows: slice | Sequence[int]) -> "Transitions":
         """The transitions of some rows, in the order given."""

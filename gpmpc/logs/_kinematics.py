@@ -1,7 +1,7 @@
 """State spaces made of vectors, angles and unit quaternions, and how outputs that a model learns move a state.
 
 The difference of two states is taken in the tangent space (Sola, Deray and Atchuthan, 2018): a vector's is the ordinary
-one, an angle's is wrapped to [-pi, pi), and an attitude's is the rotation vector log(q_b^-1 q_a) in the body frame, so
+one, an angle's is wrapped to [-pi, pi], and an attitude's is the rotation vector log(q_b^-1 q_a) in the body frame, so
 a quaternion of four numbers has an error of three. Quaternions are scalar last (x, y, z, w), body to world.
 
 Kinematics have nothing to learn: x[k+1] = step(x[k], y[k]) and y[k] = outputs(x[k], x[k+1]) are inverse to each other
@@ -15,6 +15,8 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+
+from gpmpc._angles import wrap
 
 Array = NDArray[np.float64]
 GRAVITY = np.array([0.0, 0.0, -9.80665])  # [m/s2], world
@@ -56,6 +58,13 @@ class StateSpace:
     def error_columns(self) -> tuple[slice, ...]:
         """Where each group stands in a difference."""
         return _slices([group.error_dim for group in self.groups])
+
+    @cached_property
+    def angles(self) -> tuple[int, ...]:
+        """Which entries of a state are angles."""
+        pairs = zip(self.groups, self.columns, strict=True)
+        columns = [at for group, at in pairs if group.kind == "angle"]
+        return tuple(entry for at in columns for entry in range(at.start, at.stop))
 
     @property
     def dim(self) -> int:
@@ -108,11 +117,6 @@ def _slices(lengths: Sequence[int]) -> tuple[slice, ...]:
     return tuple(
         slice(end - length, end) for end, length in zip(ends, lengths, strict=True)
     )
-
-
-def wrap(angle: Array) -> Array:
-    """Wraps angles [rad] to [-pi, pi)."""
-    return np.mod(angle + np.pi, 2 * np.pi) - np.pi
 
 
 # scipy's Rotation does the same, several times slower for the small batches of a rollout's step.

@@ -18,6 +18,7 @@ from scipy.spatial import cKDTree
 from gpmpc.exceptions import DataError, check_number
 from gpmpc.gp import Trainer, standardize
 from gpmpc.gp._data_checks import Columns
+from gpmpc.gp._wrapped import warn_of_turns
 from gpmpc.logs._fitting import (
     NominalFit,
     OutputNoise,
@@ -100,6 +101,9 @@ def learn(
     """
     check_number("points", points, least=10, whole=True)
     check_number("steps", steps, least=2, whole=True)
+    warn_of_turns(
+        log.transitions(), log.space.angles, "Say kind: angle of it in the mapping"
+    )
     folds = _split(log)
     cuts = [held_out.windows(steps, PAST + LATE, most=WINDOWS) for _, held_out in folds]
     memory = {} if memory is None else memory
@@ -292,9 +296,11 @@ def _train(
         cut.inputs[:, cut.past - model.lag : cut.past - model.lag + average],
     )
     c = np.broadcast_to(cut.context[:, -1:], (*x.shape[:-1], cut.context.shape[-1]))
-    seen = model.kinematics.outputs(
-        x[:, 0], cut.states[:, cut.past + average], cut.time_step * average
-    )
+    after = cut.states[:, cut.past + 1 : cut.past + average + 1]
+    if model.kinematics.space.angles:  # may go round by more than half a turn
+        seen = model.kinematics.outputs(x, after, cut.time_step).mean(axis=1)
+    else:
+        seen = model.kinematics.outputs(x[:, 0], after[:, -1], cut.time_step * average)
     y = seen - model.nominal.outputs(model.theta, x, u, c).mean(axis=1)
     middle = average // 2
     z = model.kinematics.features(x[:, middle], u[:, middle], c[:, middle])

@@ -13,6 +13,7 @@ import pandas as pd
 from scipy.ndimage import binary_dilation, maximum_filter1d, minimum_filter1d
 from scipy.spatial.transform import Rotation
 
+from gpmpc._angles import wrap
 from gpmpc._bounds import Room
 from gpmpc.exceptions import DataError
 from gpmpc.logs._conventions import read_rigid_bodies
@@ -195,12 +196,18 @@ def _tabulate(
     else:
         grid, breaks = _grid(where, stamps, mapping, columns, note, room)
 
-    def on_grid(topic: str, values: Array, rule: str, max_gap: float | None) -> Array:
+    def on_grid(
+        topic: str,
+        values: Array,
+        rule: str,
+        max_gap: float | None,
+        angles: bool = False,
+    ) -> Array:
         if mapping.rate is None:
             return values
         time = stamps[topic].time
         usual = max(float(np.median(np.diff(time))), 1 / mapping.rate)
-        return resample(time, values, grid, rule, max_gap or 1.5 * usual)
+        return resample(time, values, grid, rule, max_gap or 1.5 * usual, angles)
 
     parts = []
     for s in mapping.signals:
@@ -210,6 +217,7 @@ def _tabulate(
                 _values(labels[s.topic], tables[s.topic], s, note),
                 s.rule,
                 mapping.max_gap,
+                s.kind == "angle",
             )
         )
     outside = np.zeros(len(grid), dtype=bool)
@@ -653,12 +661,18 @@ def _fit_between(stamps: Array, is_late: np.ndarray) -> bool:
 
 
 def resample(
-    time: Array, values: Array, grid: Array, rule: str, max_gap: float
+    time: Array,
+    values: Array,
+    grid: Array,
+    rule: str,
+    max_gap: float,
+    angles: bool = False,
 ) -> Array:
     """Computes values (G, c) at the times of a grid (G,) [s] from samples (K, c) at increasing times (K,) [s].
 
     The rule "hold" takes the last sample, "linear" interpolates, "spherical" interpolates quaternions. Values are NaN
     beyond the samples and where two of them are farther apart than ``max_gap`` [s]; samples with a NaN are left out.
+    Between two ``angles`` [rad] the rule "linear" goes the short way round.
     """
     present = np.isfinite(values).all(axis=1)
     time, values = time[present], values[present]
@@ -676,7 +690,8 @@ def resample(
             turn = rotation_vector(quaternion_product(quaternion_inverse(one), other))
             found = quaternion_product(one, rotation_quaternion(share * turn))
         else:
-            found = one + share * (other - one)
+            change = wrap(other - one) if angles else other - one
+            found = one + share * change
         usable = (at >= 0) & (
             (lag <= RESOLUTION) | ((at < len(time) - 1) & (span <= max_gap))
         )

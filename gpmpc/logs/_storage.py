@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gpmpc._angles import full_turns
 from gpmpc._dynamics import DynamicsModel, Linearized, check_query, to_array
 from gpmpc._files import existing_file, new_file
 from gpmpc.exceptions import DataError, SettingError
@@ -33,7 +34,6 @@ from gpmpc.logs._kinematics import (
     RigidBody,
     StateGroup,
     StateSpace,
-    wrap,
 )
 from gpmpc.logs._learning import Candidate, Learned
 from gpmpc.logs._rollouts import AffineNominal, LogModel, MultirotorNominal, OutputGP
@@ -184,6 +184,11 @@ class LogDynamics:
     output_dim = state_dim
 
     @property
+    def angles(self) -> tuple[int, ...]:
+        """Indices of the states that are angles."""
+        return self.model.kinematics.space.angles
+
+    @property
     def noise_covariance(self) -> Tensor:
         """Of the next state, where all states are zero and nothing is turned (n, n)."""
         return self._noise
@@ -244,12 +249,8 @@ class LogDynamics:
         after = model.kinematics.step(
             x, model.outputs(x, u, np.empty((len(x), 0))), self.time_step
         )
-        for group, at in zip(
-            model.kinematics.space.groups, model.kinematics.space.columns, strict=True
-        ):
-            if group.kind == "angle":  # a plan counts turns
-                after[:, at] = x[:, at] + wrap(after[:, at] - x[:, at])
-        return after
+        # Kinematics wrap angles; a plan counts their turns.
+        return after + full_turns(x - after, self.angles)
 
     def _covariance(self, x: Array, u: Array) -> Array:
         model, nothing, K = self.model, np.empty((len(x), 0)), len(x)

@@ -5,6 +5,8 @@
 f0 is the nominal model, d a GP, B its effect on the states, and phi what the GP sees of the state and the input:
 selected columns, angles as sine and cosine (Hewing, Kabzan and Zeilinger, 2020, eq. (3), with constant B and columns).
 With ``Affine.identity`` as nominal model d is the difference of two states, and the model a full one with features.
+An angle counts turns in what is predicted; in what is learned from a sensor may show it within one turn, since whole
+turns between x[k+1] and f0 are no error of f0.
 """
 
 from collections.abc import Callable, Sequence
@@ -15,6 +17,7 @@ from typing import Any, cast
 import torch
 from torch import Tensor
 
+from gpmpc._angles import state_difference, whole_turns
 from gpmpc._dynamics import (
     Array,
     Linearized,
@@ -41,6 +44,7 @@ from gpmpc.gp._data_checks import (
 )
 from gpmpc.gp._posterior import AffineForm
 from gpmpc.gp._transitions import check_transitions
+from gpmpc.gp._wrapped import warn_of_turns
 from gpmpc.models._features import Features
 from gpmpc.models._nominal import Affine, CasadiFunction, linearize_function
 from gpmpc.models._wrapper import check_like, move
@@ -67,9 +71,9 @@ class ResidualModel(TensorModel):
     states: Sequence[int]  #: the states that d depends on, in its order
     inputs: Sequence[int]  #: the inputs that d depends on, in its order
     input_dim: int  #: m, all of them
-    angles: Sequence[
-        int
-    ] = ()  #: those of ``states`` that d sees as (sine, cosine), at their place
+    #: those of ``states`` that are angles [rad]: d sees them as (sine, cosine), at their place, and their differences
+    #: are taken within half a turn
+    angles: Sequence[int] = ()
     #: covariance of the observations (n, n); by default that of d's, B diag(sn2) B', which needs a constant B
     noise: Tensor | None = None
 
@@ -195,17 +199,16 @@ class ResidualModel(TensorModel):
         check_query(self, state, input)
         d = self.residual.predict(*self.features(state, input))
         B = _effect(self.B, state)
-        mean = _nominal(self.nominal, state, input) + (B @ d.mean[..., None])[..., 0]
+        known = _nominal(self.nominal, state, input, self.angles)
+        mean = known + (B @ d.mean[..., None])[..., 0]
         return Gaussian(mean, B @ d.covariance @ B.mT)
 
     def predict_mean(self, states: Array, inputs: Array) -> Array:
         """The mean of the next states (K, n) at K points (K, n), (K, m), without derivatives."""
         x, u = tensors_for(self, states, inputs)
         with torch.no_grad():
-            known, B = (
-                to_array(_nominal(self.nominal, x, u)),
-                to_array(_effect(self.B, x)),
-            )
+            known = to_array(_nominal(self.nominal, x, u, self.angles))
+            B = to_array(_effect(self.B, x))
         features, selected, _ = self.features.linearize(states, inputs)
         return (
             known
@@ -225,7 +228,7 @@ class ResidualModel(TensorModel):
         nominal = (
             self.nominal
             if hasattr(self.nominal, "linearize")
-            else partial(_nominal, self.nominal)
+            else partial(_nominal, self.nominal, angles=self.angles)
         )
         mean, A, G = linearize_function(nominal, self, states, inputs)
         features, selected, slope = self.features.linearize(states, inputs)
@@ -265,8 +268,13 @@ class ResidualModel(TensorModel):
         return AffineForm(self.residual, A, G, c, self.B, states, inputs, angles, tape)
 
 
-def _nominal(nominal: Nominal, state: Tensor, input: Tensor) -> Tensor:
-    """f0 (*batch, n), held against the rule that a wrong number of states would otherwise be broadcast."""
+def _nominal(
+    nominal: Nominal, state: Tensor, input: Tensor, angles: Sequence[int]
+) -> Tensor:
+    """f0 (*batch, n), held against the rule that a wrong number of states would otherwise be broadcast.
+
+    A function that wraps angles gives them within half a turn of the state's: plans count turns.
+    """
     value = nominal(state, input)
     if not isinstance(value, Tensor):
         raise SettingError(
@@ -277,6 +285,11 @@ def _nominal(nominal: Nominal, state: Tensor, input: Tensor) -> Tensor:
             f"nominal must give next states of the states' shape {tuple(state.shape)}"
         )
         raise ShapeError(f"{what}; got {tuple(value.shape)}")
+    if len(angles) and not hasattr(nominal, "linearize"):
+        places = list(angles)
+        turns = torch.zeros_like(value)
+        turns[..., places] = whole_turns((value - state)[..., places])
+        return value - turns
     return value
 
 
@@ -322,6 +335,7 @@ def train_residual(
     seen = Features(states, inputs, list(angles), n, m)
     features, targets = _residuals(nominal, B, seen, transitions)
     warn_of_transitions(transitions)
+    warn_of_turns(transitions, angles)
     training = trainer.fit(
         features,
         targets,
@@ -402,7 +416,8 @@ def _residuals(
             "B",
             "must have linearly independent columns: equal effects cannot be distinguished",
         )
-    missed = after - _nominal(nominal, x, u)
+    known = _nominal(nominal, x, u, features.angles)
+    missed = state_difference(after, known, features.angles)
     Q, R = torch.linalg.qr(
         effect
     )  # torch.linalg.lstsq gives other last digits from call to call

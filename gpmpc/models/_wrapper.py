@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
+from gpmpc._angles import angles_of
 from gpmpc._dynamics import (
     Array,
     DynamicsModel,
@@ -49,6 +50,11 @@ class Wrapper(TensorModel):
     def output_dim(self) -> int:
         """Number of outputs: the next state."""
         return self.state_dim
+
+    @property
+    def angles(self) -> Sequence[int]:
+        """Indices of the states that are angles: those of the model, whose states come first."""
+        return angles_of(self.model)
 
 
 def move(model: Any, device: Any = None, dtype: torch.dtype | None = None) -> Any:

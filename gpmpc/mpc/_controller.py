@@ -11,6 +11,7 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
+from gpmpc._angles import full_turns
 from gpmpc._compiled import call_unchecked, compiled, njit_inner
 from gpmpc.exceptions import (
     DataError,
@@ -342,13 +343,6 @@ def read_parameters(parameters: Any, horizon: int) -> Array:
     if not np.isfinite(values).all():
         raise DataError("parameters must be finite")
     return values
-
-
-def full_turns(difference: Array, angles: Sequence[int]) -> Array:
-    """Returns the full turns (..., n) in differences of states, zero where they are no angles."""
-    turns, index = np.zeros_like(difference), list(angles)
-    turns[..., index] = 2.0 * np.pi * np.round(difference[..., index] / (2.0 * np.pi))
-    return turns
 
 
 def _read_plan(plan: Any, horizon: int, n: int, m: int) -> tuple[Array, Array | None]:

@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from scipy.interpolate import krogh_interpolate
 
+from gpmpc._angles import full_turns
 from gpmpc.exceptions import (
     SettingError,
     ShapeError,
@@ -21,7 +22,7 @@ from gpmpc.exceptions import (
     check_number,
 )
 from gpmpc.gaussian import Gaussian
-from gpmpc.mpc._controller import Controller, Decision, Reference, Timing, full_turns
+from gpmpc.mpc._controller import Controller, Decision, Reference, Timing
 from gpmpc.mpc.problem import Problem
 from gpmpc.status import Status
 

@@ -32,6 +32,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
+from gpmpc._angles import angles_of, full_turns, state_difference
 from gpmpc._compiled import call_unchecked, compiled
 from gpmpc._dynamics import DynamicsModel, check_next_states, linearize
 from gpmpc._kernels.gp_rollout import Feedback
@@ -45,7 +46,6 @@ from gpmpc.mpc._controller import (
     Request,
     check_controller,
     check_method,
-    full_turns,
     read_parameters,
 )
 from gpmpc.mpc._linear_quadratic import (
@@ -187,6 +187,8 @@ class PredictionModel:
             model, Linearization(), "zero_order"
         )  # for the first guess of covariances
         self._roll_out = RollOut(model)
+        #: what cost or model take for angles: a sensor may show them within a turn
+        self.angles = sorted({*self.problem.cost.angles, *angles_of(model)})
 
     def read(
         self,
@@ -344,7 +346,9 @@ class PredictionModel:
         self, plan: Plan, stages: Stages, request: Request, previous: Decision
     ) -> Stages:
         """A held linearisation as that of the increments since s_{-1}, the state that the last decision began at."""
-        before = self.linearizer.state(previous.means[:1], previous.covariances[:1])[0]
+        turns = full_turns(request.state - previous.means[0], self.angles)
+        mean_before = previous.means[:1] + turns
+        before = self.linearizer.state(mean_before, previous.covariances[:1])[0]
         c = (
             plan.states[0]
             - stages.A[0] @ before
@@ -455,9 +459,8 @@ class PredictionModel:
         predicted = linearize(
             self.model, previous.means[:1], applied, covariance=False
         ).mean[0]
-        return before + self.settings.disturbance_gain * (
-            request.state - predicted - before
-        )
+        error = state_difference(request.state, predicted, self.angles)
+        return before + self.settings.disturbance_gain * (error - before)
 
 
 @compiled

@@ -16,9 +16,10 @@ from typing import Any
 import numpy as np
 import torch
 
+from gpmpc._angles import full_turns
 from gpmpc.exceptions import SettingError, ShapeError, check_number
 from gpmpc.gaussian import Gaussian
-from gpmpc.mpc._controller import Array, Decision, Reference, full_turns
+from gpmpc.mpc._controller import Array, Decision, Reference
 from gpmpc.mpc._linear_quadratic import References, evaluate_cost
 from gpmpc.mpc._stages import StageCosts, StageLinearizer
 from gpmpc.mpc.gp_mpc import GPMPC

@@ -11,6 +11,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from gpmpc._angles import whole_turns
 from gpmpc.plotting._style import (
     BLUE,
     DASHED,
@@ -85,9 +86,8 @@ def tracking_figure(run: "Run") -> Figure:
             units.get(f"state.{names[i]}", ""),
         )
         if names[i] in angles:  # at the turn that is nearest to where it was
-            reference = reference + 2 * np.pi * np.round(
-                (state - reference) / (2 * np.pi)
-            )
+            reference = reference + whole_turns(state - reference)
+            predicted = predicted + whole_turns(state - predicted)
         above.plot(run.times, state, color=FLOWN, linewidth=1.6, label="flown")
         above.plot(run.times, reference, linewidth=1.2, label="reference", **dashed)
         above.set_title(name_of(names[i], unit, z_down))

@@ -7,6 +7,9 @@ columns of the symmetric root of Sigma (Julier and Uhlmann, 2004; van der Merwe,
 spherical cubature rule (Arasaratnam and Haykin, 2009), whose weights are positive, so that no covariance can come out
 indefinite.
 
+Where outputs are angles, the values of all points are moved by whole turns towards that of the first before they are
+averaged: the mean of 3.1 and -3.1 rad is pi, and not 0.
+
 Monte Carlo: the reference for every other. Its standard error falls as one over the root of the number of samples.
 """
 
@@ -17,6 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gpmpc._angles import angles_of, whole_turns
 from gpmpc.exceptions import SettingError, check_number
 from gpmpc.gaussian import Gaussian, square_root, square_root_differential
 from gpmpc.propagation._linearization import expand
@@ -118,7 +122,8 @@ class Unscented(NoisyPropagator):
             )
 
         of_means, of_covariances = parts(mean_by), parts(covariance_by)
-        moved = self._projected(model, *self._moments(belief, steps, expansion.belief))
+        moments = self._moments(model, belief, steps, expansion.belief)
+        moved = self._projected(model, *moments)
         return moved, Sensitivity(*of_means, *of_covariances)
 
     def _spread(self, n: int) -> float:
@@ -163,14 +168,15 @@ class Unscented(NoisyPropagator):
         steps, points, controls = self._points(
             belief, square_root(belief.covariance), input
         )
-        return self._moments(belief, steps, model.predict(points, controls))
+        return self._moments(model, belief, steps, model.predict(points, controls))
 
     def _moments(
-        self, belief: Gaussian, steps: Tensor, moved: Gaussian
+        self, model: Any, belief: Gaussian, steps: Tensor, moved: Gaussian
     ) -> tuple[Tensor, Tensor, Tensor]:
         of_mean, of_covariance = self._weights(belief)
-        mean = of_mean @ moved.mean
-        centred = moved.mean - mean[..., None, :]
+        values = _near_the_first(moved.mean, model)
+        mean = of_mean @ values
+        centred = values - mean[..., None, :]
         covariance = centred.mT @ (of_covariance[:, None] * centred)
         covariance = covariance + (of_mean[:, None, None] * moved.covariance).sum(-3)
         return mean, covariance, steps.mT @ (of_mean[1] * centred)
@@ -214,9 +220,23 @@ class MonteCarlo(NoisyPropagator):
             )
             means.append(moved.mean)
             spread = spread + moved.covariance.sum(-3)
-        states = torch.cat(means, dim=-2)
+        states = _near_the_first(torch.cat(means, dim=-2), model)
         mean = states.mean(-2)
         centred = states - mean[..., None, :]
         covariance = centred.mT @ centred / (self.samples - 1) + spread / self.samples
         cross = (steps - steps.mean(-2, keepdim=True)).mT @ centred / (self.samples - 1)
         return mean, covariance, cross
+
+
+def _near_the_first(values: Tensor, model: Any) -> Tensor:
+    """A model's outputs at points (*batch, points, k), moved by whole turns.
+
+    Those of angles come within half a turn of the first point's; all others stay.
+    """
+    angles = angles_of(model)
+    if not angles:
+        return values
+    own = values[..., angles]
+    moved = values.clone()
+    moved[..., angles] = own - whole_turns(own - own[..., :1, :])
+    return moved

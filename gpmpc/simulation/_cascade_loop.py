@@ -15,6 +15,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from gpmpc._angles import wrap
 from gpmpc.exceptions import Diverged, ShapeError, check_number
 from gpmpc.gaussian import Gaussian
 from gpmpc.mpc import Controller, Reference
@@ -59,7 +60,7 @@ class Cascade:
         states = np.zeros((len(ahead), 6))
         ux, uy = direction[:, 1:].T
         states[:, [0, 2]] = attitude_for_thrust_direction(ux, uy, angles[2])
-        states[:, 1::2] = (states[:, ::2] - angles) / self.response_time
+        states[:, 1::2] = wrap(states[:, ::2] - angles) / self.response_time
         return Reference(states, np.zeros((self.inner.horizon, 3)))
 
 

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from gpmpc._angles import state_difference
 from gpmpc.exceptions import (
     Diverged,
     GpmpcError,
@@ -103,6 +104,8 @@ class Flight:
             time_step,
         )
         self._states, self._on_step = states, on_step
+        own = range(len(simulator.mean))[states]
+        self._angles = [i for i, j in enumerate(own) if j in simulator.angles]
 
     def add(
         self,
@@ -119,6 +122,7 @@ class Flight:
         part, k, decision = self._states, len(self.rows), last.decision
         learned = None if decision is None else decision.learned
         measured = belief.mean.cpu().numpy().astype(float)[part]
+        expected_now = self.rows[-1][1] if self.rows else np.full_like(measured, np.nan)
         step = Step(
             time=round(k * self.time_step, 9),
             k=k,
@@ -130,7 +134,7 @@ class Flight:
             measured=measured,
             input=np.asarray(input, dtype=float),
             decision=decision,
-            innovation=measured - (self.rows[-1][1] if self.rows else np.nan),
+            innovation=state_difference(measured, expected_now, self._angles),
             belief_covariance=state[1][part, part],
             gp_size=0 if learned is None else learned.size,
             gp_version=0 if learned is None else learned.version,

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from gpmpc._angles import angles_of
 from gpmpc._dynamics import DynamicsModel, to_array
 from gpmpc.exceptions import (
     Diverged,
@@ -130,6 +131,11 @@ class PlantSimulator:
             0.0
         )  # a disturbance that does not fit is found before the first step
 
+    @property
+    def angles(self) -> list[int]:
+        """Indices of the states that are angles."""
+        return self.plant.angle_indices
+
     def measure(self, time: float) -> Gaussian:
         """Measures the state; the measurement is taken for certain: controllers of this package filter nothing."""
         measured = self._add_noise("measurement", self.mean)
@@ -196,6 +202,11 @@ class ModelSimulator:
     def covariance(self) -> Array:
         """Of the belief (n, n)."""
         return to_array(self._belief.covariance)
+
+    @property
+    def angles(self) -> list[int]:
+        """Indices of the states that are angles."""
+        return angles_of(self.loop.model)
 
     def measure(self, time: float) -> Gaussian:
         """Returns the belief."""

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from gpmpc import systems
+from gpmpc._angles import state_difference
 from gpmpc.exceptions import SettingError, ShapeError
 from gpmpc.systems._simulators import Simulator, library
 from gpmpc.systems._system import System, step
@@ -201,10 +202,7 @@ def make_environment(system: System | str, **settings: Any) -> Any:
             )
 
         def _distance(self) -> float:
-            errors = self.state - flown.goal
-            errors[flown.angle_indices] = (errors[flown.angle_indices] + np.pi) % (
-                2 * np.pi
-            ) - np.pi
+            errors = state_difference(self.state, flown.goal, flown.angle_indices)
             return float(np.linalg.norm(errors[flown.tracked_indices]))
 
     return Environment()

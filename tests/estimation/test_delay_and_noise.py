@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from gpmpc.estimation import estimate_delay, estimate_process_noise, with_process_noise
-from gpmpc.exceptions import DataError, ShapeError, UnsupportedModel
+from gpmpc.exceptions import DataError, SettingError, ShapeError, UnsupportedModel
 from gpmpc.gp import GPPosterior, SparseTrainer, Trainer, Transitions
 from gpmpc.models import Affine, ResidualModel
 from gpmpc.propagation import Linearization
@@ -61,6 +61,85 @@ def test_inputs_without_an_effect_give_a_wide_interval():
     found = estimate_delay(states, np.random.default_rng(5).normal(size=(200, 1)))
     assert found.interval[1] - found.interval[0] > 3
     assert found.correlations.max() < 0.4
+
+
+@pytest.mark.parametrize("offset", [1e3, -1e6, 1e9])
+def test_a_delay_is_found_wherever_states_and_inputs_have_their_zero(offset):
+    states, inputs = log(300, 3, 0)
+    away = estimate_delay(states + offset, inputs)
+    assert away.steps == pytest.approx(3, abs=0.15)
+    assert away.interval[1] - away.interval[0] < 0.8
+    assert estimate_delay(states, inputs + offset).steps == pytest.approx(3, abs=0.15)
+    scaled = estimate_delay(states * [1e-6, 1e6], inputs * 1e-9)
+    assert scaled.steps == estimate_delay(states, inputs).steps
+
+
+def test_states_that_rest_or_repeat_others_change_no_delay():
+    states, inputs = log(300, 3, 0)
+    more = [np.full(301, 2.0), states[:, 0], states @ [1.0, -3.0]]
+    found = estimate_delay(np.column_stack([states, *more]), inputs)
+    assert found.steps == pytest.approx(3, abs=0.15)
+
+
+def feedback_alone(steps, delay, noise):
+    """A log of a pendulum whose torque is a function of its state and nothing else."""
+    rng, gain = np.random.default_rng(0), np.array([[1.0, 0.3]])
+    states, inputs = [np.array([0.5, 0.0])], [np.zeros(1)] * (delay + 1)
+    for _ in range(steps):
+        inputs.append(-gain @ states[-1])
+        after = pendulum(states[-1], inputs[-1 - delay])
+        states.append(after + noise * rng.normal(0, [1e-3, 0.02]))
+    return np.array(states), np.array(inputs[delay + 1 :])
+
+
+OTHER = np.random.default_rng(3).normal(size=(300, 1))
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (lambda x, u: (x, 0 * u), "input 1 is constant"),
+        (lambda x, u: (x, 0 * u + 0.1), "input 1 is constant"),
+        (lambda x, u: (x, np.hstack([u, 0 * u + 3])), "input 2 is constant"),
+        (lambda x, u: (x, np.hstack([u, u])), "inputs 1 and 2 move alike"),
+        (lambda x, u: (x, np.hstack([OTHER, u, 7 - 3 * u])), "inputs 2 and 3 move alike"),
+        (lambda x, u: (x, np.hstack([u, OTHER, u - OTHER])), "input 3 is a sum of those before"),
+        (lambda x, u: (0 * x + 1, u), "no state moves"),
+        (lambda x, u: feedback_alone(300, 0, 1.0), "input 1 of 0 steps before is a function of the state"),
+        (lambda x, u: feedback_alone(300, 3, 1.0), "input 1 of 0 steps before is a function of the state"),
+        (lambda x, u: feedback_alone(300, 1, 0.0), "is a function of the state, as under feedback alone"),
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize("offset", [0.0, 1e4])
+def test_a_delay_that_the_data_cannot_tell_is_refused_by_its_reason(
+    change, reason, offset
+):
+    states, inputs = change(*log(300, 3, 0))
+    with pytest.raises(DataError, match=f"{reason}.*the data cannot tell"):
+        estimate_delay(states + offset, inputs)
+
+
+def test_a_little_excitation_beside_a_feedback_is_enough():
+    states, inputs = log(600, 3, 0, feedback=2.0)
+    found = estimate_delay(states, inputs)
+    assert found.interval[0] <= 3 <= found.interval[1]
+
+
+def test_a_delay_is_found_where_the_angle_of_a_spinning_pendulum_wraps():
+    states, inputs = (
+        [np.array([3.0, 6.0])],
+        np.random.default_rng(1).normal(size=(300, 1)),
+    )
+    for k in range(300):
+        states.append(pendulum(states[-1], 2 + inputs[max(k - 3, 0)]))
+    wrapped = np.array(states)
+    wrapped[:, 0] = np.mod(wrapped[:, 0] + np.pi, 2 * np.pi) - np.pi
+    found = estimate_delay(wrapped, inputs, angles=[0])
+    assert found.steps == pytest.approx(3, abs=0.15)
+    counting = estimate_delay(states, inputs)
+    assert np.allclose(found.correlations, counting.correlations, atol=1e-4)
+    with pytest.raises(SettingError, match=r"angles: must be indices of 2 states"):
+        estimate_delay(wrapped, inputs, angles=[2])
 
 
 def transitions(states, inputs):

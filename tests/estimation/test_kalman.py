@@ -1,5 +1,7 @@
 """Filters and the smoother, against conditioning of the joint Gaussian, and their consistency on a pendulum."""
 
+from fractions import Fraction
+
 import numpy as np
 import pytest
 import torch
@@ -17,7 +19,12 @@ from gpmpc.exceptions import DataError, SettingError, ShapeError
 from gpmpc.gaussian import Gaussian
 from gpmpc.models import DelayedModel, DisturbedModel
 from gpmpc.plotting import innovations_figure
-from gpmpc.propagation import Linearization, MeanEquivalence, Unscented
+from gpmpc.propagation import (
+    Linearization,
+    MeanEquivalence,
+    MonteCarlo,
+    Unscented,
+)
 from gpmpc.testing import check_model
 
 F, STEP = torch.float64, 0.05
@@ -176,6 +183,159 @@ def test_an_angle_that_is_measured_modulo_one_turn_corrects_by_the_short_way():
     found = KalmanFilter.extended(PENDULUM, sensor).update(before, [-3.1])
     assert float(found.innovation[0]) == pytest.approx(2 * np.pi - 6.2)
     assert 3.1 < float(found.belief.mean[0]) < 3.2
+
+
+def test_an_angle_measured_beyond_half_a_turn_has_the_same_innovation_under_sigma_points():
+    sensor = Measurement.of_states(2, [0], [0.1], angles=[0])
+
+    def wrapping(x):
+        return torch.remainder(x[..., :1] + np.pi, 2 * np.pi) - np.pi
+
+    shown = Measurement(2, sensor.noise_covariance, wrapping, angles=[0])
+    for mean in (3.1, np.pi, -3.12, 9.4, 0.3):
+        before = Gaussian(torch.tensor([mean, 0.0], dtype=F), PRIOR.covariance)
+        y = wrapping(before.mean) - 0.1
+        exact = KalmanFilter.extended(PENDULUM, sensor).update(before, y)
+        for observer in (Unscented(), Unscented(alpha=0.5), MonteCarlo(20_000)):
+            filter = KalmanFilter(PENDULUM, shown, observer=observer)
+            found = filter.update(before, y)
+            loose = 0.02 if isinstance(observer, MonteCarlo) else 1e-9
+            assert float(found.innovation[0]) == pytest.approx(-0.1, abs=loose)
+            assert torch.allclose(found.covariance, exact.covariance, rtol=loose)
+            assert torch.allclose(found.belief.mean, exact.belief.mean, atol=loose)
+
+
+def test_a_flight_across_half_a_turn_is_estimated_as_one_away_from_it():
+    """The pendulum hangs at pi here: the sensor flips between both ends of its turn."""
+    hanging = Known(
+        lambda x, u: (
+            pendulum(x - torch.tensor([np.pi, 0.0], dtype=F), u)
+            + torch.tensor([np.pi, 0.0], dtype=F)
+        ),
+        [1e-3, 0.02],
+    )
+    turned = torch.tensor([np.pi, 0.0], dtype=F)
+    sensor = Measurement.of_states(2, [0], [0.05], angles=[0])
+    x, inputs, measured = simulated(PENDULUM, 30, 3, sensor)
+    seen = torch.remainder(measured + 2 * np.pi, 2 * np.pi) - np.pi
+    assert (seen.diff(dim=0).abs() > 3).any()
+    away = Gaussian(PRIOR.mean + turned, PRIOR.covariance)
+    for kind in (KalmanFilter.extended, KalmanFilter.unscented):
+        here = kind(PENDULUM, sensor).run(PRIOR, inputs, measured)
+        there = kind(hanging, sensor).run(away, inputs, seen)
+        assert torch.allclose(here.innovations, there.innovations, atol=1e-7)
+        assert torch.allclose(smooth(here).mean + turned, smooth(there).mean, atol=1e-7)
+        errors = estimation_errors(there.filtered, x + turned - 2 * np.pi, [0])
+        assert errors[:, 0].abs().max() < 0.3
+
+
+def exact_update(P, H, R, mean, y):
+    """Mean and covariance given measurements of independent noise, in rational numbers."""
+    P, H, mean, y, R = (
+        np.vectorize(Fraction, otypes=[object])(np.asarray(part, dtype=float))
+        for part in (P, H, mean, y, R)
+    )
+    for h, value, r in zip(H, y, R, strict=True):
+        C = P @ h
+        S = h @ C + r
+        if S:
+            mean, P = mean + C * ((value - h @ mean) / S), P - np.outer(C, C) / S
+    return mean.astype(float), P.astype(float)
+
+
+def random_covariance(n, scale):
+    root = np.random.default_rng(n).normal(size=(n, n))
+    return scale * (root @ root.T)
+
+
+WIDE = {
+    "1e14": (1e14 * np.eye(1), [[1.0]], [1.0]),
+    "1e16": (1e16 * np.eye(1), [[1.0]], [1.0]),
+    "3e20": (3e20 * np.eye(1), [[1.0]], [1.0]),
+    "two sensors of one state": (3e16 * np.eye(1), [[1.0], [2.0]], [1.0, 3.0]),
+    "ten sensors of one state": (np.diag([1e14, 1.0]), [[1.0, 0.0]] * 10, [1.0] * 10),
+    "wide beside narrow": (np.diag([3e16, 2.0]), [[1.0, 1.0], [1.0, -2.0]], [1.0, 0.3]),
+    "only a sum": (np.diag([3e14, 7e14]), [[1.0, 1.0]], [1.0]),
+    "correlated": (random_covariance(6, 1e14), np.eye(6)[:4], [1.0] * 4),
+    "correlated, all": (random_covariance(6, 1e16), np.eye(6), [1.0] * 6),
+    "nearly singular": ([[1.0, 1 - 1e-12], [1 - 1e-12, 1.0]], [[1.0, 0.0]], [1e-6]),
+    "nearly singular, difference": ([[1.0, 1 - 1e-12], [1 - 1e-12, 1.0]], [[1.0, -1.0]], [1e-8]),
+    "singular": (7 * np.outer([1.0, 2.0, -3.0], [1.0, 2.0, -3.0]), [[1.0, 0.0, 0.0]], [1e-3]),
+    "singular and wide": (3e14 * np.ones((2, 2)), [[1.0, 0.0]], [1.0]),
+    "Hilbert's matrix": (1 / (np.arange(5)[:, None] + np.arange(5) + 1), np.eye(5)[:3], [1e-6] * 3),
+    "perfect": (random_covariance(4, 1.0), [[1.0, 0.0, 0.0, 0.0]], [0.0]),
+    "perfect, thrice": (random_covariance(4, 1.0), [[1, 2, 0, 0], [2, 4, 0, 0], [1, 2, 0, 0]], [0.0] * 3),
+    "perfect and noisy": (random_covariance(4, 1.0), [[1, 2, 0.3, 0], [1, 2, 0.3, 0], [0, 1, 1, 1]], [0.0, 1e-3, 1e-5]),
+    "unlike scales": (random_covariance(4, 1.0), [[1, 2, 0.3, 0], [0, 2, 0.3, 1], [0, 1, 1, 1]], [1e-12, 1.0, 1e12]),
+    "unlike units": (random_covariance(4, 1e3), [[1e6, 2e6, 0, 0], [0, 2e-6, 1e-6, 1e-6]], [1e-2, 1e-18]),
+    "certain": (np.zeros((2, 2)), [[1.0, 1.0], [1.0, 0.0]], [0.0, 0.0]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", WIDE)
+@pytest.mark.parametrize("kind", [KalmanFilter.extended, KalmanFilter.unscented])
+def test_an_update_is_exact_however_wide_or_singular_the_prior_and_however_good_the_sensors(
+    kind, name
+):
+    P, H, R = (np.asarray(part, dtype=float) for part in WIDE[name])
+    rng, n = np.random.default_rng(0), len(P)
+    mean = rng.normal(size=n)
+    y = H @ mean + rng.normal(size=len(H)) * np.sqrt(np.diag(H @ P @ H.T) + R)
+    y = np.full_like(y, (H @ mean).mean()) if name == "certain" else y
+    expected_mean, expected = exact_update(P, H, R, mean, y)
+    rows = torch.from_numpy(H)
+    still = Known(lambda x, u: x, [0.1] * n)
+    sensor = Measurement(n, torch.from_numpy(np.diag(R)), lambda x: x @ rows.mT)
+    prior = Gaussian(torch.from_numpy(mean), torch.from_numpy(P))
+    found = kind(still, sensor).update(prior, y).belief
+    deviations = np.sqrt(np.diag(expected))
+    covariance = found.covariance.numpy()
+    scale = np.outer(deviations, deviations) + 1e-15 * np.abs(P)
+    assert np.all(np.abs(covariance - expected) <= 1e-6 * scale)
+    missed = np.abs(found.mean.numpy() - expected_mean)
+    assert np.all(missed <= 1e-5 * deviations + 1e-13 * np.abs(expected_mean))
+    assert np.array_equal(covariance, covariance.T)
+    assert np.diag(covariance).min() >= 0.0
+    assert np.linalg.eigvalsh(covariance).min() >= -1e-15 * np.abs(covariance).max()
+
+
+def test_a_smoother_keeps_its_digits_where_the_prior_says_nothing():
+    """Ten measurements of a position say what a velocity of unknown size was at the start."""
+    first = Measurement.of_states(2, [0], [0.1])
+    track = Known(
+        lambda x, u: x @ torch.tensor([[1.0, 0.1], [0.0, 1.0]], dtype=F).mT,
+        [1e-3, 1e-3],
+    )
+    y = torch.linspace(0, 1, 11, dtype=F)[:, None]
+    inputs = torch.zeros(10, 1, dtype=F)
+    runs = [
+        smooth(
+            KalmanFilter.extended(track, first).run(
+                Gaussian(torch.zeros(2, dtype=F), scale * torch.eye(2, dtype=F)),
+                inputs,
+                y,
+            )
+        )
+        for scale in (1e6, 1e10)
+    ]
+    assert torch.allclose(runs[0].covariance, runs[1].covariance, rtol=1e-4)
+    assert torch.allclose(runs[0].mean, runs[1].mean, atol=1e-5)
+    assert (torch.linalg.eigvalsh(runs[1].covariance) > 0).all()
+
+
+def test_correlated_noise_of_nearly_perfect_sensors_is_taken_as_it_is():
+    R = torch.tensor([[1e-20, 1e-20], [1e-20, 1.0]], dtype=F)
+    H = torch.tensor([[1.0, 1.0], [1.0, 0.0]], dtype=F)
+    sensor = Measurement(2, R, lambda x: x @ H.mT)
+    y = torch.tensor([1.0, 0.4], dtype=F)
+    found = KalmanFilter.extended(LINEAR, sensor).update(PRIOR, y).belief
+    # The second measurement less the first has a noise of its own.
+    apart = [[1.0, 1.0], [0.0, -1.0]]
+    mean, covariance = exact_update(
+        PRIOR.covariance, apart, [1e-20, 1.0], PRIOR.mean, [1.0, -0.6]
+    )
+    assert np.allclose(found.mean, mean, rtol=1e-9)
+    assert np.allclose(found.covariance, covariance, rtol=1e-9, atol=1e-18)
 
 
 def test_many_beliefs_are_updated_at_once():

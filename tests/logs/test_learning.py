@@ -23,9 +23,10 @@ from gpmpc.logs import (
     save_learned,
 )
 from gpmpc.logs._fitting import error_variances, follow_errors
-from gpmpc.logs._kinematics import rotation_quaternion
-from gpmpc.logs._learning import choose_rows
+from gpmpc.logs._kinematics import Increments, rotation_quaternion
+from gpmpc.logs._learning import _train, choose_rows
 from gpmpc.logs._log import Log, LogRun
+from gpmpc.logs._rollouts import AffineNominal
 
 EXAMPLE = runpy.run_path(
     str(Path(__file__).resolve().parents[2] / "examples" / "own_log.py")
@@ -165,6 +166,49 @@ def test_an_output_keeps_its_gp_only_where_held_out_rollouts_get_better():
     assert not linear.model.gps
     (chosen,) = [candidate.name for candidate in linear.candidates if candidate.chosen]
     assert chosen == "increments, least squares"
+
+
+def spinning_log(kind, rows=400):
+    """A pendulum that turns once a second and more, whose sensor shows an angle within a turn."""
+    torques = np.random.default_rng(0).uniform(-8, 8, rows)
+    states = [np.array([0.0, 9.0])]
+    for u in torques[:-1]:
+        states.append(states[-1] + 0.02 * np.array([states[-1][1], u]))
+    shown = np.array(states)
+    shown[:, 0] = np.mod(shown[:, 0] + np.pi, 2 * np.pi) - np.pi
+    angle = {"columns": ["angle"], "unit": "rad", "kind": kind}
+    mapping = {
+        "states": {"angle": angle, "rate": ["rate"]},
+        "inputs": {"torque": ["u"]},
+    }
+    time, nothing = 0.02 * np.arange(rows), np.empty((rows, 0))
+    runs = [LogRun(f"{i}", time, shown, torques[:, None], nothing) for i in range(2)]
+    return Log(LogMapping.from_dict(mapping), 0.02, tuple(runs))
+
+
+class Begun(Exception):
+    """Raised by the first line of progress: what comes later is not of interest."""
+
+
+def begin(text):
+    raise Begun
+
+
+def test_learning_names_an_angle_that_wraps_and_is_not_called_one(caplog):
+    for kind, told in (("vector", 1), ("angle", 0)):
+        caplog.clear()
+        with pytest.raises(Begun):
+            learn(spinning_log(kind), steps=10, progress=begin)
+        assert caplog.text.count("column 1 of the states jumps by whole turns") == told
+
+
+def test_a_rate_of_turning_is_averaged_over_more_than_half_a_turn():
+    log = spinning_log("angle")
+    kinematics = Increments(log.space)
+    nominal = AffineNominal(kinematics, fitted=False)
+    model = LogModel(kinematics, nominal, np.empty(0), (0, 0))
+    gp = _train(model, log, (0,), 20, 30, 0)  # in 20 rows it turns by 3.6 rad
+    assert gp.posterior.targets.min() > 6.0
 
 
 def test_a_model_that_loses_to_a_baseline_is_called_so():

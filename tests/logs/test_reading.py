@@ -7,6 +7,7 @@ import pandas
 import pytest
 from scipy.spatial.transform import Rotation
 
+from gpmpc._angles import wrap
 from gpmpc.exceptions import DataError, SettingError
 from gpmpc.logs import read_log
 from gpmpc.logs._kinematics import StateGroup, StateSpace, rotate, rotation_quaternion
@@ -218,6 +219,19 @@ def test_resampling_interpolates_states_holds_inputs_and_leaves_gaps_open(tmp_pa
     assert set(run.inputs[:, 0]) <= set(jittered["torque"])
     assert len(run.begins) == 2
     assert not ((run.time > 20.01) & (run.time < 20.58)).any()
+
+
+def test_an_angle_that_wraps_is_interpolated_the_short_way_round(tmp_path):
+    t = 0.02 * np.arange(500) + 0.007
+    angle = np.mod(3.0 * t + np.pi, 2 * np.pi) - np.pi
+    table = pandas.DataFrame({"t": t, "angle": angle, "rate": 3.0, "torque": t})
+    angles = {"columns": ["angle"], "unit": "rad", "kind": "angle"}
+    states = {**PENDULUM["states"], "angle": angles}
+    mapping = {**PENDULUM, "states": states, "rate": 100, "held": "use", "rest": "use"}
+    (run,) = read_log(written(tmp_path, table), mapping)
+    away = wrap(run.states[:, 0] - 3.0 * run.time)
+    assert len(run.time) > 900
+    assert np.abs(away - away[0]).max() < 1e-9
 
 
 def test_a_sample_that_is_repeated_while_the_system_moves_is_no_measurement(tmp_path):

@@ -180,6 +180,9 @@ def test_the_attitudes_asked_for_change_with_the_plan_and_are_approached_at_firs
     ):
         assert thrust_direction(row[0], row[2], 0.1)[:2] == pytest.approx(direction)
         assert np.allclose(row[1::2], (row[::2] - angles) / 0.2)
+    turns = np.array([0.0, 0.0, 4 * np.pi])
+    turned = cascade.attitude_reference(planned, angles + turns, phase=2)
+    assert np.allclose(turned.states, reference.states)
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,207 @@
+"""A Gaussian given a measurement, in square-root form.
+
+With Sigma = L L', a measurement y = H x + v and v ~ N(0, N), the posterior covariance is
+
+    Sigma+ = L (I - Y' (Y Y' + N)^-1 Y) L',     Y = H L
+
+and Sigma - K S K' takes two numbers of the size of Sigma from each other: where Sigma is
+1e16 times N no digit is left. Here L itself is turned into a root of Sigma+, by an
+orthogonal matrix T that makes the array lower triangular (Kailath, Sayed and Hassibi,
+2000, chapter 12):
+
+    [Y  N^(1/2)] T = [S^(1/2)  0 ],      S = Y Y' + N,   K = G S^(-1/2)
+    [L  0      ]     [G        L+]
+
+T is made of reflections of Householder. The columns of the prior, which are large, come
+before those of the noise, so that large and small entries are not mixed (Cox and Higham,
+1998): the error of a standard deviation is round-off of the prior's, relatively that of
+Sigma+ the root of what Sigma - K S K' loses.
+
+Sensors that are perfect, or nearly, are taken one by one instead. What one of them shows
+of what is known already is round-off of its row, and must not be taken for knowledge.
+"""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+_ROUND_OFF = 16.0  # of a sum of products, in units of the last place of its largest
+_PERFECT = 1e4  # deviation of a sensor's noise below which it is perfect, likewise
+
+
+class Conditioned(NamedTuple):
+    """What a measurement leaves of a Gaussian."""
+
+    gain: Tensor  #: K (*batch, n, p): the mean moves by K times the innovation
+    root: Tensor  #: L+ (*batch, n, n), with L+ L+' the posterior covariance
+
+    @property
+    def covariance(self) -> Tensor:
+        """Of the posterior (*batch, n, n): symmetric and positive semidefinite."""
+        return squared(self.root)
+
+
+def squared(root: Tensor) -> Tensor:
+    """L L' (*batch, n, n) of a root L, symmetric to the last digit."""
+    covariance = root @ root.mT
+    return (covariance + covariance.mT) / 2
+
+
+def covariance_root(covariance: Tensor) -> Tensor:
+    """A root L (*batch, n, n) with L L' = Sigma: Cholesky's where Sigma has one.
+
+    Of singular covariances it is that of the correlations, times the deviations: a small
+    variance beside a large one keeps its digits. What is left of a variance by
+    cancellation, round-off of it, is none.
+    """
+    factor, info = torch.linalg.cholesky_ex(covariance)
+    variances = covariance.diagonal(dim1=-2, dim2=-1).clamp_min(0)
+    pivots = factor.diagonal(dim1=-2, dim2=-1).square()
+    eps = torch.finfo(covariance.dtype).eps
+    singular = (info > 0) | (pivots <= eps * variances).any(-1)
+    if not bool(singular.any()):
+        return factor
+    deviations = variances.sqrt()
+    inverse = torch.where(deviations > 0, 1 / deviations, 0.0)
+    correlations = inverse[..., :, None] * covariance * inverse[..., None, :]
+    eigenvalues, vectors = torch.linalg.eigh((correlations + correlations.mT) / 2)
+    kept = eigenvalues > covariance.shape[-1] * eps * eigenvalues[..., -1:]
+    lengths = torch.where(kept, eigenvalues, 0.0).sqrt()
+    root = deviations[..., :, None] * vectors * lengths[..., None, :]
+    return torch.where(singular[..., None, None], root, factor)
+
+
+def seen_through(root: Tensor, cross_covariance: Tensor) -> Tensor:
+    """Y (*batch, p, n) of Cov[x, y] = L Y' (*batch, n, p), the least one if L is singular.
+
+    Y = H L where the measurement is linear, and the best linear one elsewhere.
+    """
+    regular = bool((root.diagonal(dim1=-2, dim2=-1) > 0).all())
+    if regular and torch.equal(root, root.tril()):
+        solved = torch.linalg.solve_triangular(root, cross_covariance, upper=False)
+        return solved.mT
+    # Rows in the units of their deviations: small states are not lost beside large ones.
+    deviations = root.norm(dim=-1, keepdim=True)
+    inverse = torch.where(deviations > 0, 1 / deviations, 0.0)
+    return (torch.linalg.pinv(inverse * root) @ (inverse * cross_covariance)).mT
+
+
+def unexplained(covariance: Tensor, seen: Tensor) -> Tensor:
+    """What Y does not explain of Cov[y] (*batch, p, p): the error of linearisation.
+
+    Entries that are round-off of Cov[y] are zero.
+    """
+    remainder = covariance - seen @ seen.mT
+    remainder = (remainder + remainder.mT) / 2
+    sizes = covariance.diagonal(dim1=-2, dim2=-1).clamp_min(0).sqrt()
+    eps = torch.finfo(covariance.dtype).eps
+    round_off = _ROUND_OFF * eps * sizes[..., :, None] * sizes[..., None, :]
+    return torch.where(remainder.abs() <= round_off, 0.0, remainder)
+
+
+def condition(root: Tensor, seen: Tensor, noise: Tensor) -> Conditioned:
+    """A Gaussian of root L given a measurement that sees it through Y, with noise N.
+
+    Args:
+        root: L (*batch, n, n).
+        seen: Y = H L (*batch, p, n); a row of zeros shows nothing.
+        noise: N (*batch, p, p), positive semidefinite: zero for what is measured exactly.
+    """
+    batch, p, n = seen.shape[:-2], *seen.shape[-2:]
+    noise = noise.expand(*batch, p, p)
+    root = root.expand(*batch, n, n)
+    noise_root, info = torch.linalg.cholesky_ex(noise)
+    deviations = noise_root.diagonal(dim1=-2, dim2=-1)
+    perfect = deviations <= _PERFECT * torch.finfo(seen.dtype).eps * seen.norm(dim=-1)
+    if bool((info > 0).any() | perfect.any()):
+        return _one_by_one(root, seen, noise)
+    of_prior = torch.cat([seen.mT, root.mT], dim=-1)
+    of_noise = torch.cat([noise_root.mT, root.new_zeros(*batch, p, n)], dim=-1)
+    triangular = torch.linalg.qr(torch.cat([of_prior, of_noise], dim=-2), mode="r").R.mT
+    innovation_root = triangular[..., :p, :p]
+    gain = torch.linalg.solve_triangular(
+        innovation_root, triangular[..., p:, :p], upper=False, left=False
+    )
+    return Conditioned(gain, triangular[..., p:, p:])
+
+
+def _one_by_one(root: Tensor, seen: Tensor, noise: Tensor) -> Conditioned:
+    """``condition``, by one scalar measurement after the other, also perfect ones."""
+    batch, p = seen.shape[:-2], seen.shape[-2]
+    unit_lower, variances = _decorrelated(noise)
+    rows = torch.linalg.solve_triangular(
+        unit_lower, seen, upper=False, unitriangular=True
+    )
+    round_off = _ROUND_OFF * torch.finfo(seen.dtype).eps * rows.norm(dim=-1)
+    # What is measured and the states are corrected alike: rows of one matrix.
+    factor = torch.cat([rows, root], dim=-2)
+    gains = factor.new_zeros(*batch, factor.shape[-2], p)
+    innovations = torch.eye(p, dtype=seen.dtype, device=seen.device)
+    for i in range(p):
+        row, variance = factor[..., i, :], variances[..., i]
+        perfect = round_off[..., i] ** 2 >= variance
+        known = row.abs() <= round_off[..., i, None]
+        row = torch.where(perfect[..., None] & known, 0.0, row)
+        weights, factor = _corrected(factor, row, variance)
+        innovation = innovations[i] - gains[..., i, :]
+        gains = gains + weights[..., :, None] * innovation[..., None, :]
+    gain = torch.linalg.solve_triangular(
+        unit_lower, gains[..., p:, :], upper=False, left=False, unitriangular=True
+    )
+    return Conditioned(gain, factor[..., p:, :])
+
+
+def _corrected(factor: Tensor, row: Tensor, variance: Tensor) -> tuple[Tensor, Tensor]:
+    """Corrects everything by one scalar measurement.
+
+    Args:
+        factor: A row of what is corrected each (*batch, q, n).
+        row: That of what is measured (*batch, n).
+        variance: Of its noise (*batch,).
+
+    Returns:
+        Gains (*batch, q), zero where nothing is shown, and the factor given the
+        measurement (*batch, q, n).
+    """
+    total = row.square().sum(-1) + variance
+    shown = total > 0
+    scale = torch.where(shown, total, 1.0).sqrt()
+    largest = row.abs().argmax(-1, keepdim=True)
+    pivot = torch.zeros_like(row).scatter(-1, largest, 1.0)
+    entry = row.gather(-1, largest)
+    sign = torch.where(entry < 0, -1.0, 1.0).to(row)
+    normal = row + sign * scale[..., None] * pivot  # of the reflection
+    length = scale * (scale + entry[..., 0].abs())  # half of its square
+    weight = torch.where(shown, 1 / length, 0.0)
+    along = weight[..., None] * (factor @ normal[..., None])[..., 0]
+    reflected = factor - along[..., :, None] * normal[..., None, :]
+    noise = -along * variance.sqrt()[..., None]
+    # The pivot's column has become that of the measurement, and the noise takes its place.
+    replaced = shown[..., None, None] & (pivot[..., None, :] > 0)
+    corrected = torch.where(replaced, noise[..., :, None], reflected)
+    covariances = (factor @ row[..., None])[..., 0]
+    gains = torch.where(shown[..., None], covariances / scale[..., None] ** 2, 0.0)
+    return gains, corrected
+
+
+def _decorrelated(noise: Tensor) -> tuple[Tensor, Tensor]:
+    """T (*batch, p, p), unit lower triangular, and d >= 0 (*batch, p): N = T diag(d) T'."""
+    p = noise.shape[-1]
+    unit_lower = torch.eye(p, dtype=noise.dtype, device=noise.device)
+    unit_lower = unit_lower.expand(noise.shape).clone()
+    remainder = noise.clone()
+    variances = []
+    for i in range(p):
+        pivot = remainder[..., i, i]
+        round_off = _ROUND_OFF * torch.finfo(noise.dtype).eps * noise[..., i, i].abs()
+        exact = pivot <= round_off
+        pivot = torch.where(exact, 0.0, pivot)
+        column = remainder[..., i + 1 :, i]
+        divisor = torch.where(exact, 1.0, pivot)[..., None]
+        column = torch.where(exact[..., None], 0.0, column / divisor)
+        unit_lower[..., i + 1 :, i] = column
+        outer = pivot[..., None, None] * column[..., :, None] * column[..., None, :]
+        remainder[..., i + 1 :, i + 1 :] -= outer
+        variances.append(pivot)
+    return unit_lower, torch.stack(variances, dim=-1)

@@ -1,0 +1,118 @@
+"""Finds states that jump by whole turns: angles that a sensor shows within a turn, and that nobody declared.
+
+A model that takes such a jump for a change of the state learns that a pendulum is thrown by a turn where it passes
+the seam. An angle that wraps has three marks, which honest large steps do not have together: there are steps of almost
+a turn and, but for these, only steps that are far smaller; without the turn the large ones are as small as the others;
+and all values lie within one turn. Where values lie farther apart, as where a simulator counts turns in its states and
+wraps in its next states, the large steps have to be whole turns as exactly as the others are small.
+"""
+
+import logging
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gpmpc._angles import TURN
+from gpmpc.gp._transitions import Transitions
+
+_log = logging.getLogger(__name__)
+_FAR_SMALLER_APART = (
+    1 / 10
+)  # of a turn: as below, where values lie farther apart than a turn
+_EXACT = 0.1  # of a turn, by which jumps may miss whole turns there
+_SLACK = 0.005  # of a turn: noise that was added after the angle was wrapped
+_AS_SMALL = (
+    1.15  # what is left of jumps without whole turns, over the largest other step
+)
+
+
+DECLARE = (
+    "Declare angles, in rad (train_residual or ResidualModel.train with angles={columns}), "
+    "or let them count turns (numpy.unwrap)"
+)
+
+
+class Turn(NamedTuple):
+    """A whole turn in a unit."""
+
+    size: float
+    words: str
+    far_smaller: float  #: largest step that is no jump, where there are some [turns]
+
+
+# Many honest states reach hundreds, few of them 6: what counts for degrees is stricter.
+_TURNS = Turn(TURN, "2 pi", 1 / 6), Turn(360.0, "360", 1 / 36)
+
+
+class WrappedColumn(NamedTuple):
+    """A state that jumps by whole turns."""
+
+    column: int  #: its index, from 0
+    rows: int  #: how many rows jump
+    turn: str  #: what it jumps by, in words
+
+
+def wrapped_columns(
+    states: NDArray[np.float64], next_states: NDArray[np.float64]
+) -> list[WrappedColumn]:
+    """Finds the columns of x[k] and x[k+1], both (N, n), that jump by whole turns."""
+    columns = []
+    for column in range(states.shape[1]):
+        before, after = states[:, column], next_states[:, column]
+        for turn in _TURNS:
+            rows = _jumps(before, after, turn)
+            if rows:
+                columns.append(WrappedColumn(column, rows, turn.words))
+                break
+    return columns
+
+
+def warn_of_turns(
+    transitions: Transitions, angles: Sequence[int] = (), remedy: str = DECLARE
+) -> None:
+    """Logs which states jump by whole turns although they are not among the declared angles.
+
+    Args:
+        transitions: What a model is about to learn from.
+        angles: Indices of the states that are declared.
+        remedy: What the message tells the user to do; ``{columns}`` stands for the indices.
+    """
+    columns = wrapped_columns(
+        transitions.states.numpy(force=True), transitions.next_states.numpy(force=True)
+    )
+    undeclared = [found for found in columns if found.column not in angles]
+    if not undeclared:
+        return
+    what = "; ".join(
+        f"column {found.column + 1} of the states jumps by whole turns ({found.turn}) "
+        f"in {found.rows} of {len(transitions)} rows"
+        for found in undeclared
+    )
+    _log.warning(
+        "%s, as an angle does that is shown within one turn: jumps are learned as motion. %s",
+        what,
+        remedy.format(columns=[found.column for found in undeclared]),
+    )
+
+
+def _jumps(before: NDArray[np.float64], after: NDArray[np.float64], turn: Turn) -> int:
+    """How many steps of a column (N,) are whole turns; none unless that is what they are."""
+    steps = (after - before) / turn.size
+    large = np.abs(steps) > 0.5
+    others = np.abs(steps[~large])
+    count = int(large.sum())
+    if not count or len(others) < 2:
+        return 0
+    largest_other = float(others.max())
+    remainder = float(np.abs(steps[large] - np.round(steps[large])).max())
+    lowest = min(before.min(), after.min())
+    highest = max(before.max(), after.max())
+    if highest - lowest <= (1 + 2 * _SLACK) * turn.size:
+        far_smaller = turn.far_smaller
+        small = _AS_SMALL * largest_other + _SLACK
+    else:
+        far_smaller = min(turn.far_smaller, _FAR_SMALLER_APART)
+        small = min(_AS_SMALL * largest_other, _EXACT) if count > 1 else 0.0
+    return count if largest_other <= far_smaller and remainder <= small else 0

@@ -1,0 +1,313 @@
+"""Angles that a sensor shows within a turn teach and predict what angles that count turns do, or somebody is told."""
+
+import logging
+
+import numpy as np
+import pytest
+import torch
+
+from gpmpc._angles import full_turns, state_difference, wrap
+from gpmpc.calibration import Recording, calibrate
+from gpmpc.estimation import (
+    AdaptiveTube,
+    ConformalTube,
+    estimate_process_noise,
+)
+from gpmpc.gaussian import Gaussian
+from gpmpc.gp import SlidingWindow, SparseTrainer, Trainer, Transitions
+from gpmpc.models import Affine, DelayedModel, DisturbedModel, Lags, ResidualModel
+from gpmpc.models._residual import train_residual
+from gpmpc.propagation import Linearization, MonteCarlo, Unscented
+
+STEP, F = 0.05, torch.float64
+IDENTITY = Affine.identity(2, 1)
+EXACT = Trainer(restarts=0)
+
+
+def pendulum(x, u):
+    """Angle from upright and rate [rad, rad/s] after a step; the angle counts turns."""
+    rate = x[..., 1] + STEP * (9.81 * np.sin(x[..., 0]) - 0.2 * x[..., 1] + u[..., 0])
+    return np.stack([x[..., 0] + STEP * rate, rate], axis=-1)
+
+
+def shown(x, lowest=-np.pi):
+    """The states as a sensor shows them whose angles begin at ``lowest``."""
+    seen = np.array(x)
+    seen[..., 0] = np.mod(seen[..., 0] - lowest, 2 * np.pi) + lowest
+    return seen
+
+
+def flight(start, torque, steps=150, seed=0):
+    """States (steps + 1, 2), whose angles count turns, and inputs (steps, 1)."""
+    rng, states, inputs = np.random.default_rng(seed), [np.array(start)], []
+    for _ in range(steps):
+        inputs.append(rng.uniform(-torque, torque, 1))
+        states.append(pendulum(states[-1], inputs[-1]))
+    return np.array(states), np.array(inputs)
+
+
+FLIGHTS = {"hanging": flight([np.pi, 0.0], 4.0), "turning": flight([0.5, 6.0], 6.0)}
+
+
+def transitions(kind, sensor=shown):
+    states, inputs = FLIGHTS[kind]
+    seen = sensor(states)
+    return Transitions(seen[:-1], inputs, seen[1:])
+
+
+def learned(data, nominal=None):
+    return train_residual(EXACT, data, angles=[0], nominal=nominal).posterior
+
+
+HANGING = learned(transitions("hanging"))
+
+
+def error(model, kind):
+    """Largest error of one step from the states of a flight."""
+    states, inputs = FLIGHTS[kind]
+    return np.abs(model.predict_mean(states[:-1], inputs) - states[1:]).max()
+
+
+@pytest.mark.parametrize("kind", ["hanging", "turning"])
+@pytest.mark.parametrize(
+    "sensor",
+    [shown, lambda x: shown(x, 0.0), lambda x: shown(x, -1.0)],
+    ids=["-pi to pi", "0 to 2 pi", "-1 to 2 pi - 1"],
+)
+def test_a_pendulum_whose_sensor_wraps_is_learned_as_one_that_counts_turns(
+    kind, sensor
+):
+    data = transitions(kind, sensor)
+    assert error(learned(data), kind) < 1e-4
+    assert error(learned(transitions(kind, np.array)), kind) < 1e-4
+
+
+def test_states_that_count_turns_beside_next_states_that_do_not_are_learned_alike():
+    states, inputs = FLIGHTS["turning"]
+    data = Transitions(states[:-1], inputs, shown(states[1:]))
+    assert error(learned(data), "turning") < 1e-4
+
+
+@pytest.mark.parametrize("window", [None, SlidingWindow(150)], ids=["all", "window"])
+def test_appended_rows_that_wrap_teach_what_rows_do_that_count_turns(window):
+    wrapping, counting = (
+        learned(transitions("hanging", sensor)[:100]).append(
+            transitions("hanging", sensor)[100:], window
+        )
+        for sensor in (shown, np.array)
+    )
+    assert error(wrapping, "hanging") < 1e-4
+    assert torch.allclose(wrapping.residual.targets, counting.residual.targets)
+
+
+def test_targets_of_differences_leave_out_the_turns_of_declared_angles_alone():
+    data = transitions("hanging")
+    plain, declared = data.targets("difference"), data.targets("difference", [0])
+    assert plain[:, 0].abs().max() > 6.0
+    assert declared[:, 0].abs().max() < 1.0
+    assert torch.equal(plain[:, 1], declared[:, 1])
+
+
+def wrapping_pendulum(x, u):
+    """The pendulum without damping, in torch, whose angle comes out between -pi and pi."""
+    rate = x[..., 1] + STEP * (9.81 * x[..., 0].sin() + u[..., 0])
+    angle = x[..., 0] + STEP * rate
+    return torch.stack([torch.atan2(angle.sin(), angle.cos()), rate], dim=-1)
+
+
+@pytest.mark.parametrize("nominal", [None, wrapping_pendulum], ids=["none", "wraps"])
+def test_predictions_go_on_without_a_jump_where_an_angle_passes_half_a_turn(nominal):
+    model = learned(transitions("hanging"), nominal)
+    angles = torch.linspace(np.pi - 0.3, np.pi + 0.3, 61, dtype=F)
+    x = torch.stack([angles, torch.full_like(angles, 1.0)], dim=-1)
+    u = torch.zeros(61, 1, dtype=F)
+    mean = model.predict(x, u).mean
+    assert (mean.diff(dim=0)[:, 0] - 0.01).abs().max() < 0.002
+    assert np.allclose(model.linearize(x.numpy(), u.numpy()).mean, mean)
+    assert np.allclose(model.predict_mean(x.numpy(), u.numpy()), mean)
+    turned = torch.tensor([6 * np.pi, 0.0], dtype=F)
+    assert torch.allclose(model.predict(x + turned, u).mean - turned, mean, atol=1e-9)
+    for propagator in (Linearization(), Unscented(), MonteCarlo(200)):
+        belief = Gaussian(x, 0.01 * torch.eye(2, dtype=F).expand(61, 2, 2))
+        moved = propagator(model, belief, u)
+        assert (moved.mean - mean).abs().max() < 0.05
+        assert moved.variance[:, 0].max() < 0.02
+
+
+class Wrapping:
+    """A model of the own that wraps its angle, and says that it is one."""
+
+    state_dim, output_dim, input_dim, angles = 2, 2, 1, (0,)
+    dtype, device, noise_covariance = F, torch.device("cpu"), 1e-6 * torch.eye(2).to(F)
+
+    def predict(self, state, input):
+        mean = wrapping_pendulum(state, input)
+        return Gaussian(mean, mean.new_zeros(*mean.shape, 2))
+
+
+@pytest.mark.parametrize("propagator", [Unscented(), MonteCarlo(4000)])
+def test_points_are_averaged_the_short_way_where_the_next_angle_wraps(propagator):
+    away = torch.tensor([np.pi, 0.0], dtype=F)
+    spread = torch.diag(torch.tensor([0.04, 0.01], dtype=F))
+    u = torch.zeros(1, dtype=F)
+    seam = propagator.propagate(Wrapping(), Gaussian(away, spread), u)
+    linear = Linearization()(Wrapping(), Gaussian(away, spread), u)
+    assert abs(wrap(seam.belief.mean[0] - np.pi)) < 0.02
+    assert torch.allclose(
+        seam.belief.covariance, linear.covariance, rtol=0.1, atol=1e-3
+    )
+
+
+def test_wrappers_and_lagged_states_know_the_angles_of_their_model():
+    effect = torch.tensor([[0.0], [1.0]], dtype=F)
+    disturbed = DisturbedModel(HANGING, effect, [0.1])
+    assert list(DelayedModel(disturbed, 2).angles) == [0]
+    states, inputs = FLIGHTS["hanging"]
+    lags = Lags(state_dim=2, input_dim=1, states=1)
+    seen = lags.transitions(shown(states), inputs)
+    model = ResidualModel.train(
+        lags.nominal, seen, lags.B, angles=[0, 2], trainer=EXACT
+    )
+    whole = lags.augmented(states, inputs)
+    missed = model.predict_mean(whole[:-1], inputs[1:]) - whole[1:]
+    assert np.abs(missed).max() < 1e-3
+
+
+@pytest.mark.parametrize(
+    "train",
+    [
+        lambda data: train_residual(EXACT, data),
+        lambda data: EXACT(data),
+        lambda data: Trainer(predicts="difference", restarts=0)(data),
+        lambda data: EXACT.refit(
+            EXACT(transitions("hanging", np.array)).posterior, data
+        ),
+        lambda data: SparseTrainer(inducing=10, subset=40, iterations=1)(data),
+    ],
+    ids=["residual", "next state", "difference", "refit", "sparse"],
+)
+def test_training_says_once_which_undeclared_state_jumps_by_whole_turns(train, caplog):
+    with caplog.at_level(logging.WARNING, "gpmpc"):
+        train(transitions("hanging"))
+    told = [r.getMessage() for r in caplog.records if "whole turns" in r.getMessage()]
+    assert len(told) == 1
+    assert "column 1 of the states jumps by whole turns (2 pi) in 9 of 150" in told[0]
+    assert "angles=[0]" in told[0]
+
+
+def warned(states, next_states, caplog, angles=()):
+    from gpmpc.gp._wrapped import warn_of_turns
+
+    data = Transitions(states, np.zeros((len(states), 1)), next_states)
+    with caplog.at_level(logging.WARNING, "gpmpc"):
+        warn_of_turns(data, angles)
+    text = caplog.text
+    caplog.clear()
+    return text
+
+
+def test_declared_angles_and_those_that_count_turns_are_no_news(caplog):
+    for kind, (states, _) in FLIGHTS.items():
+        seen = shown(states)
+        assert warned(states[:-1], states[1:], caplog) == "", kind
+        assert warned(seen[:-1], seen[1:], caplog, [0]) == "", kind
+        assert "column 1" in warned(seen[:-1], seen[1:], caplog), kind
+
+
+def test_degrees_and_next_states_alone_that_wrap_are_named(caplog):
+    states = FLIGHTS["turning"][0][:, :1]
+    slow = 0.3 * states
+    degrees = np.degrees(wrap(slow))
+    assert "by whole turns (360)" in warned(degrees[:-1], degrees[1:], caplog)
+    assert "by whole turns (2 pi)" in warned(slow[:-1], wrap(slow[1:]), caplog)
+    both = np.column_stack([wrap(slow), states, wrap(slow + 1.0)])
+    assert "column 1" in (text := warned(both[:-1], both[1:], caplog))
+    assert "column 3" in text
+    assert "column 2" not in text
+
+
+@pytest.mark.parametrize(
+    "steps",
+    [
+        lambda rng: rng.normal(0, 3, 300),
+        lambda rng: np.full(300, 2 * np.pi),
+        lambda rng: rng.choice([0.01, -0.02, 6.0, -6.0], 300, p=[0.48, 0.48, 0.02, 0.02]),
+        lambda rng: np.where(np.arange(300) % 50, 0.0, 25.0) + rng.normal(0, 0.02, 300),
+        lambda rng: 0.05 * rng.standard_cauchy(300),
+        lambda rng: np.where(np.arange(300) % 30, 0.1, -2.9),
+        lambda rng: np.where(np.arange(300) % 90, 0.1, -8.9),
+        lambda rng: rng.uniform(0, 9, 300),
+        lambda rng: np.zeros(300),
+    ],
+    ids=["walk", "whole turns always", "jumps of 6", "jumps of 25", "heavy tails",
+         "sawtooth of 3", "sawtooth of 9", "only upwards", "still"],
+)  # fmt: skip
+def test_honest_large_steps_are_no_turns(steps, caplog):
+    for seed in range(5):
+        x = np.cumsum(steps(np.random.default_rng(seed)))[:, None]
+        assert warned(x[:-1], x[1:], caplog) == ""
+
+
+def test_every_difference_of_states_leaves_whole_turns_out_of_arrays_and_tensors():
+    one, other = np.array([[3.1, 5.0], [-9.0, 0.0]]), np.array([[-3.1, -5.0]])
+    for kind in (np.array, torch.tensor):
+        found = state_difference(kind(one), kind(other), [0])
+        assert np.allclose(found, [[6.2 - 2 * np.pi, 10.0], [-5.9 + 2 * np.pi, 5.0]])
+    assert np.array_equal(state_difference(one, other, []), one - other)
+    assert np.allclose(full_turns(one - other, [0]), [[2 * np.pi, 0], [-2 * np.pi, 0]])
+    small = np.array([1e-17, -1e-9, 3.14, -3.14, np.pi, -np.pi])
+    assert np.array_equal(wrap(small), small)
+    assert np.isnan(wrap(np.array([np.nan]))).all()
+
+
+def test_a_calibration_counts_no_turn_as_an_error():
+    states, inputs = FLIGHTS["hanging"]
+    counting, wrapping = (
+        calibrate(HANGING, Recording(sensor(states), inputs), horizon=3)
+        for sensor in (np.array, shown)
+    )
+    assert torch.allclose(counting.rmse, wrapping.rmse, atol=1e-9)
+    assert wrapping.rmse.max() < 1e-2
+    assert torch.equal(counting.coverage, wrapping.coverage)
+    plain = Trainer(predicts="difference", restarts=0)(transitions("hanging", np.array))
+    seen = Recording(shown(states, 0.0) - 2 * np.pi, inputs)
+    off, right = (
+        calibrate(plain.posterior, seen, horizon=1, angles=angles).rmse
+        for angles in ((), [0])
+    )
+    assert off[0, 0] >= right[0, 0]
+
+
+def test_noise_of_a_process_is_that_of_the_motion_and_its_order_of_time_is_found():
+    rng, (states, inputs) = np.random.default_rng(0), FLIGHTS["hanging"]
+    noisy = states + rng.normal(0, [1e-3, 1e-2], states.shape)
+    found = []
+    for sensor in (np.array, shown):
+        seen = sensor(noisy)
+        found.append(
+            estimate_process_noise(HANGING, Transitions(seen[:-1], inputs, seen[1:]))
+        )
+    assert torch.allclose(found[0].variance, found[1].variance, rtol=1e-6)
+    assert torch.allclose(found[0].correlation, found[1].correlation, rtol=1e-6)
+
+
+def test_tubes_hold_across_the_seam():
+    states, inputs = FLIGHTS["hanging"]
+    model = HANGING
+    tubes = [
+        ConformalTube.calibrate(
+            model, Linearization(process_noise=True), sensor(states), inputs, 5
+        )
+        for sensor in (np.array, shown)
+    ]
+    assert np.allclose(tubes[0].scores, tubes[1].scores, rtol=1e-4)
+    adaptive = [AdaptiveTube(tube, 0.8) for tube in tubes]
+    covariances = np.tile(1e-4 * np.eye(2), (6, 1, 1))
+    for k in range(len(states) - 6):
+        plan = states[k : k + 6]
+        for tube, sensor in zip(adaptive, (np.array, shown), strict=True):
+            tube.observe(sensor(states[k]))
+            turns = sensor(states[k]) - states[k]  # a plan counts them from there
+            tube.remember(plan + turns, covariances)
+    assert np.allclose(adaptive[0].misses, adaptive[1].misses)
+    assert adaptive[1].misses.sum() == 0
