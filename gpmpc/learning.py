@@ -39,6 +39,7 @@ from gpmpc.models._wrapper import Wrapper
 from gpmpc.mpc import Decision, Reference
 from gpmpc.mpc._controller import check_method
 from gpmpc.mpc.gp_mpc import GPMPC
+from gpmpc.signals import Signals, signals_of
 from gpmpc.simulation import Rollout
 
 _FEW, _MANY = 3, 100  # differences of errors that say how large the noise is
@@ -435,7 +436,11 @@ class EpisodicLearning:
             flight.inputs[rows],
             flight.measured[rows + 1],
         )
-        parts = (data.states, states), (data.inputs, inputs), (data.next_states, after)
-        return Transitions(
-            *(torch.cat([first, torch.from_numpy(second)]) for first, second in parts)
+        flown = Signals(time_step=flight.time_step)
+        data.signals.check("the data", flown, "the flight")
+        return replace(
+            data,
+            states=torch.cat([data.states, torch.from_numpy(states)]),
+            inputs=torch.cat([data.inputs, torch.from_numpy(inputs)]),
+            next_states=torch.cat([data.next_states, torch.from_numpy(after)]),
         )

@@ -145,7 +145,9 @@ def calibrate(given: argparse.Namespace) -> Result:
                 experiment.training_rows(), experiment.seed
             ).posterior
     flown = [
-        calibration.Recording(torch.tensor(run.states), torch.tensor(run.inputs[:-1]))
+        calibration.Recording(
+            torch.tensor(run.states), torch.tensor(run.inputs[:-1]), system.signals
+        )
         for run in flights
     ]
     horizon = min(given.steps, max(map(len, flown)))

@@ -20,6 +20,7 @@ from gpmpc.exceptions import DataError, SettingError, check_number, check_number
 from gpmpc.gp import Transitions
 from gpmpc.mpc import problem as mpc
 from gpmpc.mpc.baselines import NMPC
+from gpmpc.signals import Signals
 from gpmpc.simulation import Noise, Rollout, closed_loop
 from gpmpc.systems import (
     ATTITUDES,
@@ -133,12 +134,11 @@ class NMPCData:
         )  # x, y, z
         outer = self.translational.fly(references, self.horizon, steps)
         if system.name == "translational":
-            return _transitions(outer, self.samples)
+            return _transitions(outer, self.samples, system)
         references = np.zeros((steps, 6))  # psi and the rates are to be zero
         references[:, [0, 2]] = _attitudes(outer, self.attitude)
-        return _transitions(
-            self.rotational.fly(references, self.horizon, self.samples), self.samples
-        )
+        inner = self.rotational.fly(references, self.horizon, self.samples)
+        return _transitions(inner, self.samples, system)
 
 
 @dataclass(frozen=True)
@@ -174,10 +174,13 @@ class PaperData:
         return data[: self.samples]
 
 
-def _transitions(flight: Rollout, samples: int) -> Transitions:
-    """The first transitions of a flight."""
+def _transitions(flight: Rollout, samples: int, system: System) -> Transitions:
+    """The first transitions of a flight of a system."""
     return Transitions(
-        flight.states[:samples], flight.inputs[:samples], flight.states[1 : samples + 1]
+        flight.states[:samples],
+        flight.inputs[:samples],
+        flight.states[1 : samples + 1],
+        Signals(system.state_names, system.input_names, flight.time_step),
     )
 
 
@@ -287,7 +290,7 @@ class ExcitedData:
         )
         flight = self.translational.fly(outer, references, self.samples, self.seed)
         if system is outer:
-            return _transitions(flight, self.samples)
+            return _transitions(flight, self.samples, system)
         streams = np.random.SeedSequence([self.seed, SUBSYSTEMS.index("rotational")])
         angles, count = (
             _attitudes(flight, self.attitude),
@@ -302,6 +305,5 @@ class ExcitedData:
             chosen, count, self.hold, system.time_step, self.response_time
         )
         seed = int(streams.generate_state(1)[0])
-        return _transitions(
-            self.rotational.fly(system, references, self.samples, seed), self.samples
-        )
+        inner = self.rotational.fly(system, references, self.samples, seed)
+        return _transitions(inner, self.samples, system)

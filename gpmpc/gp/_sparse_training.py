@@ -82,12 +82,13 @@ class SparseTrainer:
                 points learned nothing but noise of it where the subset's training learned more.
         """
         check_transitions(transitions)
-        return self.fit(
+        training = self.fit(
             transitions.features,
             transitions.targets(self.predicts),
             transitions.input_dim,
             seed=seed,
         )
+        return training.with_signals(transitions.signals)
 
     def fit(
         self,

@@ -6,7 +6,7 @@ Each output is fitted on its own; see ``gpmpc.gp._search``. What cannot fit the 
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +37,7 @@ from gpmpc.gp._search import (
     training_data,
 )
 from gpmpc.gp._transitions import Transitions, check_transitions
+from gpmpc.signals import Signals
 
 _ONE_THREAD = 1000  # points below which LAPACK's threads wait for each other longer than they work
 _GIB = 2**30
@@ -60,6 +61,10 @@ class Training:
         int  #: of the likelihood or of the bound, all starts and outputs together
     )
     seconds: float  #: wall time [s]
+
+    def with_signals(self, signals: Signals) -> "Training":
+        """The training whose posterior carries the names and time step of its data."""
+        return replace(self, posterior=replace(self.posterior, signals=signals))
 
 
 @dataclass(frozen=True)
@@ -114,9 +119,10 @@ class Trainer:
         """Trains on transitions; see ``fit``."""
         check_transitions(transitions)
         targets = transitions.targets(self.predicts)
-        return self.fit(
+        training = self.fit(
             transitions.features, targets, transitions.input_dim, seed=seed, start=start
         )
+        return training.with_signals(transitions.signals)
 
     def refit(
         self,
@@ -140,7 +146,7 @@ class Trainer:
         if transitions is not None:
             targets = torch.cat([targets, targets_of(posterior, transitions)])
             features = torch.cat([features, transitions.features])
-        return self.fit(
+        training = self.fit(
             features,
             targets,
             posterior.input_dim,
@@ -148,6 +154,7 @@ class Trainer:
             seed,
             start=posterior,
         )
+        return training.with_signals(posterior.signals)
 
     def fit(
         self,

@@ -15,7 +15,8 @@ from gpmpc.calibration import Recording
 from gpmpc.exceptions import DataError, SettingError, check_number
 from gpmpc.gp import Transitions
 from gpmpc.logs._kinematics import Array, StateSpace
-from gpmpc.logs._mapping import LogMapping
+from gpmpc.logs._mapping import LogMapping, plain_names
+from gpmpc.signals import Signals
 
 
 @dataclass(frozen=True)
@@ -136,6 +137,13 @@ class Log:
             for entry in signal.group.entries
         )
 
+    @property
+    def signals(self) -> Signals:
+        """Names and time step; states and inputs of our recordings as their system calls them."""
+        return Signals(
+            plain_names(self.space.names), plain_names(self.input_names), self.time_step
+        )
+
     def split(self, held_out: Sequence[str]) -> tuple["Log", "Log"]:
         """Splits by run: a log of all others, and one of the named runs.
 
@@ -174,7 +182,8 @@ class Log:
     def transitions(self) -> Transitions:
         """All transitions from one row to the next inside a piece, as data of GPs."""
         cut = self.windows(1)
-        return Transitions(cut.states[:, 0], cut.inputs[:, 0], cut.states[:, 1])
+        now, after = cut.states[:, 0], cut.states[:, 1]
+        return Transitions(now, cut.inputs[:, 0], after, self.signals)
 
     def episodes(self) -> list[Recording]:
         """Every piece of two rows or more as a recording for ``gpmpc.calibration``."""
@@ -182,6 +191,7 @@ class Log:
             Recording(
                 torch.from_numpy(run.states[a:b].copy()),
                 torch.from_numpy(run.inputs[a : b - 1].copy()),
+                self.signals,
             )
             for run in self.runs
             for a, b in run.pieces

@@ -20,6 +20,7 @@ from gpmpc._dynamics import (
 )
 from gpmpc.exceptions import ShapeError, UnsupportedModel
 from gpmpc.gaussian import Gaussian, check_tensors
+from gpmpc.signals import UNKNOWN, Signals
 
 
 @dataclass(frozen=True)
@@ -82,6 +83,7 @@ class KnownModel:
     function: Callable[[Tensor, Tensor], Tensor]
     state_dim: int  #: n
     input_dim: int  #: m
+    signals: Signals = UNKNOWN  #: names and time step, where they are known
 
     dtype, device = torch.float64, torch.device("cpu")
 

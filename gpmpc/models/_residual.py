@@ -38,6 +38,7 @@ from gpmpc.gp._transitions import check_transitions
 from gpmpc.models._features import Features
 from gpmpc.models._nominal import Affine, CasadiFunction, linearize_function
 from gpmpc.models._wrapper import check_like, move
+from gpmpc.signals import UNKNOWN, Signals
 
 Nominal = Callable[[Tensor, Tensor], Tensor]
 Effect = Tensor | Callable[[Tensor], Tensor]
@@ -66,6 +67,7 @@ class ResidualModel(TensorModel):
     ] = ()  #: those of ``states`` that d sees as (sine, cosine), at their place
     #: covariance of the observations (n, n); by default that of d's, B diag(sn2) B', which needs a constant B
     noise: Tensor | None = None
+    signals: Signals = UNKNOWN  #: names and time step of the data, where they are known
 
     _part = property(lambda self: self.residual)
     to = move
@@ -91,6 +93,7 @@ class ResidualModel(TensorModel):
             nominal.check_sizes((n, m), (n, 1))
         if isinstance(self.B, CasadiFunction):
             self.B.check_sizes((n,), (n, gp.output_dim))
+        self.signals.check_sizes(n, m)
         parts: dict[str, tuple[Any, tuple[int, ...]]] = {}
         if not callable(self.B):
             parts["B"] = self.B, (n, gp.output_dim)
@@ -323,7 +326,15 @@ def train_residual(
         effect = _effect(B, transitions.states)
         noise = (effect @ training.posterior.noise_covariance @ effect.mT).mean(0)
     model = ResidualModel(
-        nominal, training.posterior, B, states, inputs, m, list(angles), noise
+        nominal,
+        training.posterior,
+        B,
+        states,
+        inputs,
+        m,
+        list(angles),
+        noise,
+        transitions.signals,
     )
     return replace(training, posterior=cast(Any, model))
 

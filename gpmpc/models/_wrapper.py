@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any, cast
 
@@ -27,6 +27,7 @@ from gpmpc.exceptions import SettingError, ShapeError, check_number, check_numbe
 from gpmpc.gaussian import Gaussian, check_tensors
 from gpmpc.gp import GPPosterior
 from gpmpc.models._nominal import Affine
+from gpmpc.signals import Signals, signals_of
 
 
 class Wrapper(TensorModel):
@@ -49,6 +50,21 @@ class Wrapper(TensorModel):
     def output_dim(self) -> int:
         """Number of outputs: the next state."""
         return self.state_dim
+
+    @property
+    def signals(self) -> Signals:
+        """Names and time step, where the model knows them; further states are named, too."""
+        inner, further = signals_of(self.model), self._further_names
+        if not further or not inner.state_names:
+            return inner
+        names = (*inner.state_names, *further)
+        distinct = len(set(names)) == len(names)  # not so of a delay around a delay
+        return replace(inner, state_names=names if distinct else ())
+
+    @property
+    def _further_names(self) -> list[str]:
+        """Of the states beyond those of the model."""
+        return []
 
 
 def move(model: Any, device: Any = None, dtype: torch.dtype | None = None) -> Any:
@@ -144,6 +160,13 @@ class DelayedModel(_LinearWrapper):
     def pending(self) -> int:
         """Number of inputs on their way, D: the delay rounded up."""
         return math.ceil(self.delay)
+
+    @property
+    def _further_names(self) -> list[str]:
+        own = signals_of(self.model).input_names
+        names = own or [f"u{i + 1}" for i in range(self.input_dim)]
+        ages = range(self.pending, 0, -1)
+        return [f"{name}[k-{age}]" for age in ages for name in names]
 
     @property
     def _share(self) -> float:
@@ -279,6 +302,10 @@ class DisturbedModel(_LinearWrapper):
     def state_dim(self) -> int:
         """Number of states, n + q."""
         return self.model.state_dim + self.effect.shape[1]
+
+    @property
+    def _further_names(self) -> list[str]:
+        return [f"disturbance{i + 1}" for i in range(self.effect.shape[1])]
 
     @property
     def noise_covariance(self) -> Tensor:
