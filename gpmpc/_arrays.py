@@ -1,0 +1,98 @@
+"""Reads numbers that a user hands over: float64 arrays, in the order of known names.
+
+Numbers come as arrays, tensors or lists, and from tables and series of pandas and the
+like, whose columns and entries have labels. Text, truth values, dates, complex numbers
+and tensors of a graph only could be taken for numbers: they are refused.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gpmpc.exceptions import DataError
+
+Array = NDArray[np.float64]
+
+
+_RULE = "must be real numbers"
+
+
+def read_array(
+    key: str, values: Any, names: Sequence[str] = (), rule: str = _RULE
+) -> Array:
+    """Returns numbers as a float64 array, their last axis in the order of the names.
+
+    An array that is one already is returned itself. Only what has labels is sorted.
+
+    Args:
+        key: What the numbers are, for the message.
+        values: Anything that is an array of numbers.
+        names: Of the entries of the last axis; empty where they are not known.
+        rule: What they must be, for the message.
+
+    Raises:
+        DataError: They are no real numbers, or their labels are not the names.
+    """
+    if type(values) is np.ndarray and values.dtype == np.float64:
+        return values
+    if getattr(values, "requires_grad", False):
+        got = "a tensor of a graph: hand over its numbers, tensor.detach()"
+        raise DataError(f"{key} {rule}; got {got}")
+    on_host = values.cpu() if hasattr(values, "cpu") else values
+    try:
+        array = np.asarray(on_host)
+    except (TypeError, ValueError, RuntimeError) as error:
+        got = f"a {type(values).__name__} whose parts are no numbers of one shape"
+        raise DataError(f"{key} {rule}; got {got}") from error
+    if array.dtype.kind not in "fiu":
+        raise DataError(f"{key} {rule}; got {_described(values, array)}")
+    order = _order(key, labels_of(values), names)
+    array = array if order is None else array[..., order]
+    return np.asarray(array, dtype=np.float64)
+
+
+def labels_of(values: Any) -> tuple[Any, ...]:
+    """The labels of a table's columns or a series' entries; empty without any."""
+    if isinstance(values, np.ndarray | list | tuple):
+        return ()
+    labels = getattr(values, "columns", None)
+    if labels is None:
+        labels = getattr(values, "index", None)
+    if labels is None or callable(labels):
+        return ()
+    return tuple(labels)
+
+
+def names_of(values: Any) -> tuple[str, ...]:
+    """The labels of a table or a series where all are texts; a count is no name."""
+    labels = labels_of(values)
+    return labels if all(isinstance(label, str) for label in labels) else ()
+
+
+def order_of(labels: Sequence[Any], names: Sequence[Any]) -> list[int] | None:
+    """Where each name stands among as many labels; None where the labels are others."""
+    if len(labels) != len(names) or set(labels) != set(names):
+        return None
+    return [labels.index(name) for name in names]
+
+
+def _order(key: str, labels: Sequence[Any], names: Sequence[str]) -> list[int] | None:
+    """How entries with labels are sorted by names; None where they stay."""
+    known = bool(names) and all(isinstance(label, str) for label in labels)
+    if not labels or not known:
+        return None
+    order = order_of(labels, names)
+    if order is None:
+        rule = f"{key} must have the names {', '.join(names)}"
+        raise DataError(f"{rule}; got {', '.join(labels)}")
+    return order
+
+
+def _described(values: Any, array: NDArray[Any]) -> str:
+    """What is no number, in a few words."""
+    if array.dtype.kind == "O" or not array.ndim:
+        text = repr(values)
+        return text if len(text) < 60 and "\n" not in text else type(values).__name__
+    return "text" if array.dtype.kind in "US" else str(array.dtype)
