@@ -48,9 +48,25 @@ def read_array(
         raise DataError(f"{key} {rule}; got {got}") from error
     if array.dtype.kind not in "fiu":
         raise DataError(f"{key} {rule}; got {_described(values, array)}")
-    order = _order(key, labels_of(values), names)
-    array = array if order is None else array[..., order]
+    labels = labels_of(values)
+    if labels and names and all(isinstance(label, str) for label in labels):
+        array = sorted_columns(key, array, labels, names)
     return np.asarray(array, dtype=np.float64)
+
+
+def sorted_columns(
+    key: str, values: Any, names: Sequence[str], wanted: Sequence[str]
+) -> Any:
+    """Values (*batch, n) with names on their last axis, in the order of wanted names.
+
+    Raises:
+        DataError: The names are others.
+    """
+    order = order_of(names, wanted)
+    if order is None:
+        rule = f"{key} must have the names {', '.join(wanted)}"
+        raise DataError(f"{rule}; got {', '.join(names)}")
+    return values[..., order]
 
 
 def labels_of(values: Any) -> tuple[Any, ...]:
@@ -76,18 +92,6 @@ def order_of(labels: Sequence[Any], names: Sequence[Any]) -> list[int] | None:
     if len(labels) != len(names) or set(labels) != set(names):
         return None
     return [labels.index(name) for name in names]
-
-
-def _order(key: str, labels: Sequence[Any], names: Sequence[str]) -> list[int] | None:
-    """How entries with labels are sorted by names; None where they stay."""
-    known = bool(names) and all(isinstance(label, str) for label in labels)
-    if not labels or not known:
-        return None
-    order = order_of(labels, names)
-    if order is None:
-        rule = f"{key} must have the names {', '.join(names)}"
-        raise DataError(f"{rule}; got {', '.join(labels)}")
-    return order
 
 
 def _described(values: Any, array: NDArray[Any]) -> str:

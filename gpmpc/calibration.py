@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -71,7 +72,7 @@ class Recording:
             ("inputs", signals.input_names),
         ):
             array = read_array(f"{name} of a recording", getattr(self, name), names)
-            object.__setattr__(self, name, torch.as_tensor(array))
+            object.__setattr__(self, name, torch.from_numpy(np.array(array)))
         if (
             self.states.dim() != 2
             or self.inputs.dim() != 2

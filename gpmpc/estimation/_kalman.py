@@ -18,12 +18,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gpmpc._arrays import read_array
 from gpmpc._dynamics import Array, DynamicsModel, Linearized, TensorModel, check_query
 from gpmpc.estimation._consistency import wrapped
 from gpmpc.exceptions import SettingError, ShapeError, check_number, check_numbers
 from gpmpc.gaussian import Gaussian, check_tensors, nearest_positive_semidefinite
 from gpmpc.models._nominal import linearize_function
 from gpmpc.propagation import Linearization, Propagator, Unscented
+from gpmpc.signals import signals_of
 
 
 @dataclass(frozen=True)
@@ -85,6 +87,13 @@ class Measurement(TensorModel):
         check_numbers("std", std, len(states), least=0)
         R = torch.diag(torch.tensor(list(std), dtype=torch.float64) ** 2)
         return cls(state_dim, R, _Selection(states, state_dim), angles)
+
+    def names_of(self, state_names: Sequence[str]) -> tuple[str, ...]:
+        """The names of y where it is some of the states; nothing is known otherwise."""
+        measured = getattr(self.function, "states", None)
+        if measured is None or not state_names:
+            return ()
+        return tuple(state_names[i] for i in measured)
 
     @property
     def output_dim(self) -> int:
@@ -190,6 +199,8 @@ class KalmanFilter:
                 "propagator", f"{rule}; got {type(propagator).__name__} without"
             )
         self.model, self.measurement, self.propagator = model, measurement, propagator
+        self._names = signals_of(model)
+        self._measured_names = measurement.names_of(self._names.state_names)
         self.observer = Linearization() if observer is None else observer
 
     @classmethod
@@ -206,7 +217,9 @@ class KalmanFilter:
 
     def predict(self, belief: Gaussian, input: Any) -> Gaussian:
         """Moves a belief (*batch, n) on by a step with the input that was applied (*batch, m)."""
-        return self.propagator(self.model, belief, _like(belief, input))
+        belief = belief.in_order(self._names.state_names)
+        acting = _like(belief, "input", input, self._names.input_names)
+        return self.propagator(self.model, belief, acting)
 
     def update(self, belief: Gaussian, measured: Any) -> Update:
         """Corrects a belief (*batch, n) by a measurement y (*batch, p), whose entries that are not finite are missing.
@@ -214,7 +227,9 @@ class KalmanFilter:
         Raises:
             ShapeError: y has another number of entries.
         """
-        y, R = _like(belief, measured), self.measurement.noise_covariance
+        belief = belief.in_order(self._names.state_names)
+        y = _like(belief, "a measurement", measured, self._measured_names)
+        R = self.measurement.noise_covariance
         expected = (*belief.mean.shape[:-1], len(R))
         if y.shape != expected:
             raise ShapeError(
@@ -248,7 +263,9 @@ class KalmanFilter:
         Raises:
             ShapeError: There is not one measurement more than inputs.
         """
-        inputs, measured = _like(belief, inputs), _like(belief, measured)
+        belief = belief.in_order(self._names.state_names)
+        inputs = _like(belief, "inputs", inputs, self._names.input_names)
+        measured = _like(belief, "measurements", measured, self._measured_names)
         if len(measured) != len(inputs) + 1:
             raise ShapeError(
                 f"T inputs belong to T + 1 measurements; got {len(inputs)} and {len(measured)}"
@@ -342,7 +359,10 @@ class LateMeasurements:
         return self.belief
 
 
-def _like(belief: Gaussian, value: Any) -> Tensor:
+def _like(belief: Gaussian, key: str, value: Any, names: Sequence[str]) -> Tensor:
+    """Numbers as a tensor of a belief's type on its device, in the order of names."""
+    if not isinstance(value, Tensor) or value.is_complex():
+        value = np.array(read_array(key, value, names))
     return torch.as_tensor(value, dtype=belief.mean.dtype, device=belief.mean.device)
 
 

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
+from gpmpc._arrays import read_array
 from gpmpc._dynamics import (
     Array,
     DynamicsModel,
@@ -206,6 +207,7 @@ class DelayedModel(_LinearWrapper):
         Raises:
             ShapeError: Another number of inputs.
         """
+        belief = belief.in_order(signals_of(self.model).state_names)
         queue = (
             self._queue(belief, inputs)
             .flatten(-2)
@@ -247,7 +249,9 @@ class DelayedModel(_LinearWrapper):
         )
 
     def _queue(self, belief: Gaussian, inputs: Any) -> Tensor:
-        given = np.asarray(inputs) if not isinstance(inputs, Tensor) else inputs
+        names = signals_of(self.model).input_names
+        real = isinstance(inputs, Tensor) and not inputs.is_complex()
+        given = inputs if real else np.array(read_array("inputs", inputs, names))
         queue = torch.as_tensor(
             given, dtype=belief.mean.dtype, device=belief.mean.device
         )
@@ -326,6 +330,7 @@ class DisturbedModel(_LinearWrapper):
         d is zero, independent, with prior standard deviations ``std`` (q,).
         """
         check_numbers("std", std, q := self.effect.shape[1], least=0)
+        belief = belief.in_order(signals_of(self.model).state_names)
         own = self._diagonal([0.0] * self.model.state_dim + list(std))
         return Gaussian(pad(belief.mean, (0, q)), self._padded(belief.covariance) + own)
 

@@ -50,6 +50,7 @@ from gpmpc.mpc._stages import ConstraintRows, Plan, StageCosts, StageLinearizer
 from gpmpc.mpc.problem import Problem
 from gpmpc.propagation import Linearization, Propagator
 from gpmpc.qp._cvxpy import STATUSES, TIGHT
+from gpmpc.signals import signals_of
 from gpmpc.status import Status
 from gpmpc.systems import System
 
@@ -85,7 +86,10 @@ class NMPC:
         tolerance: float = 1e-10,
     ):
         n, m = len(plant.dynamics.state_names), len(plant.dynamics.input_names)
-        self.initial_input = check_controller(problem, n, m, horizon, initial_input)
+        self.signals = plant.signals
+        self.initial_input = check_controller(
+            problem, n, m, horizon, initial_input, self.signals.input_names
+        )
         check_number("tolerance", tolerance, above=0)
         self.plant, self.problem, self.horizon = plant, problem, horizon
         self._solver, self._bounds = _build(plant, problem, horizon, tolerance)
@@ -97,7 +101,13 @@ class NMPC:
         n, m, H = self.problem.state_dim, self.problem.input_dim, self.horizon
         start = perf_counter()
         request = Request.read(
-            self.problem, H, self.initial_input, belief, reference, previous
+            self.problem,
+            H,
+            self.initial_input,
+            belief,
+            reference,
+            previous,
+            signals=self.signals,
         )
         if not request.finite:
             return request.failed_decision(Status.INVALID_MEASUREMENT)
@@ -168,8 +178,13 @@ class LQR:
         horizon: int,
         initial_input: Sequence[float],
     ):
+        self.signals = signals_of(model)
         self.initial_input = check_controller(
-            problem, *check_next_states(model), horizon, initial_input
+            problem,
+            *check_next_states(model),
+            horizon,
+            initial_input,
+            self.signals.input_names,
         )
         problem.check_plain("LQR")
         if problem.constraints:
@@ -187,7 +202,13 @@ class LQR:
         """The clipped linear-quadratic plan; see ``Controller.control``. Covariances are not predicted."""
         began = perf_counter()
         request = Request.read(
-            self.problem, self.horizon, self.initial_input, belief, reference, previous
+            self.problem,
+            self.horizon,
+            self.initial_input,
+            belief,
+            reference,
+            previous,
+            signals=self.signals,
         )
         if not request.finite:
             return request.failed_decision(Status.INVALID_MEASUREMENT)
@@ -263,6 +284,7 @@ class StateFormMPC:
             TIGHT.get(solver, {}) if options is None else options,
         )
         problem.check_plain("StateFormMPC")
+        self.signals = self.prediction.signals
         self._build(constraints)
 
     def control(

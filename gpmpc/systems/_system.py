@@ -145,10 +145,9 @@ class System:
             self._set(
                 "region", tuple(_floats("region", side, states) for side in self.region)
             )
-        if self.nominal is not None:
-            self.signals.check(
-                self.name, self.nominal.signals, "its nominal model", "nominal"
-            )
+        if self.nominal is not None and self.nominal.signals != self.signals:
+            rule = f"must have the states, inputs and time step {self.signals}"
+            raise SettingError("nominal", f"{rule}; got {self.nominal.signals}")
         self._check_dynamics()
 
     def _set(self, key: str, value: Any) -> None:
