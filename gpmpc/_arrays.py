@@ -96,7 +96,13 @@ def order_of(labels: Sequence[Any], names: Sequence[Any]) -> list[int] | None:
 
 def _described(values: Any, array: NDArray[Any]) -> str:
     """What is no number, in a few words."""
-    if array.dtype.kind == "O" or not array.ndim:
+    if hasattr(values, "requires_grad"):
+        return str(values.dtype)  # as torch calls it
+    if not array.ndim:
         text = repr(values)
         return text if len(text) < 60 and "\n" not in text else type(values).__name__
-    return "text" if array.dtype.kind in "US" else str(array.dtype)
+    if array.dtype.kind != "O":
+        return str(array.dtype)
+    numbers = int, float, np.number
+    first = next((one for one in array.ravel() if not isinstance(one, numbers)), None)
+    return f"object, such as {type(first).__name__}"
