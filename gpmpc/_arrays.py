@@ -40,7 +40,9 @@ def read_array(
     if getattr(values, "requires_grad", False):
         got = "a tensor of a graph: hand over its numbers, tensor.detach()"
         raise DataError(f"{key} {rule}; got {got}")
-    on_host = values.cpu() if hasattr(values, "cpu") else values
+    on_host: Any = values
+    if hasattr(on_host, "cpu"):  # a tensor
+        on_host = on_host.cpu()
     try:
         array = np.asarray(on_host)
     except (TypeError, ValueError, RuntimeError) as error:

@@ -78,10 +78,10 @@ class Signals:
                 raise SettingError(
                     key, f"{found}; {other_owner} has {', '.join(theirs)}{same}"
                 )
-        steps = self.time_step, other.time_step
-        if None not in steps and abs(steps[0] / steps[1] - 1) > SAME_STEP:
-            found = f"{owner} has time steps of {steps[0]:g} s"
-            raise SettingError(key, f"{found}; {other_owner} has {steps[1]:g} s")
+        ours, theirs = self.time_step, other.time_step
+        if ours and theirs and abs(ours / theirs - 1) > SAME_STEP:
+            found = f"{owner} has time steps of {ours:g} s"
+            raise SettingError(key, f"{found}; {other_owner} has {theirs:g} s")
 
     def to_header(self) -> dict[str, Any]:
         """What is known, as data that JSON can hold, for the header of a file."""

@@ -12,6 +12,7 @@ Entries of y that are not finite are missing, and the others are used.
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,7 @@ from torch import Tensor
 
 from gpmpc._arrays import read_array
 from gpmpc._dynamics import Array, DynamicsModel, Linearized, TensorModel, check_query
+from gpmpc._functions import call
 from gpmpc.estimation._consistency import wrapped
 from gpmpc.exceptions import SettingError, ShapeError, check_number, check_numbers
 from gpmpc.gaussian import Gaussian, check_tensors, nearest_positive_semidefinite
@@ -88,13 +90,6 @@ class Measurement(TensorModel):
         R = torch.diag(torch.tensor(list(std), dtype=torch.float64) ** 2)
         return cls(state_dim, R, _Selection(states, state_dim), angles)
 
-    def names_of(self, state_names: Sequence[str]) -> tuple[str, ...]:
-        """The names of y where it is some of the states; nothing is known otherwise."""
-        measured = getattr(self.function, "states", None)
-        if measured is None or not state_names:
-            return ()
-        return tuple(state_names[i] for i in measured)
-
     @property
     def output_dim(self) -> int:
         """Number of measured values, p."""
@@ -103,7 +98,7 @@ class Measurement(TensorModel):
     def predict(self, state: Tensor, input: Tensor | None = None) -> Gaussian:
         """What is measured at a certain state (*batch, p), without the noise."""
         check_query(self, state, state[..., :0] if input is None else input)
-        value = self.function(state)
+        value = call("function", self.function, state)
         if not isinstance(value, Tensor) or value.shape != (
             *state.shape[:-1],
             self.output_dim,
@@ -121,7 +116,10 @@ class Measurement(TensorModel):
         self, states: Array, inputs: Array, covariance: bool = True
     ) -> Linearized:
         """Linearises h at K points (K, n); ``inputs`` is (K, 0)."""
-        value, A = linearize_function(self.function, self, states)
+        function = self.function
+        if not hasattr(function, "linearize"):
+            function = partial(call, "function", function)
+        value, A = linearize_function(function, self, states)
         K, p = value.shape
         return Linearized(
             value, A, np.zeros((K, p, 0)), np.zeros((K, p, p)) if covariance else None
@@ -200,7 +198,7 @@ class KalmanFilter:
             )
         self.model, self.measurement, self.propagator = model, measurement, propagator
         self._names = signals_of(model)
-        self._measured_names = measurement.names_of(self._names.state_names)
+        self._measured_names = _measured_names(measurement, self._names.state_names)
         self.observer = Linearization() if observer is None else observer
 
     @classmethod
@@ -357,6 +355,14 @@ class LateMeasurements:
             for y in self._measured[k]:
                 self.belief = self.filter.update(self.belief, y).belief
         return self.belief
+
+
+def _measured_names(measurement: Any, state_names: Sequence[str]) -> tuple[str, ...]:
+    """The names of y where it is some of the states; nothing is known otherwise."""
+    function = getattr(measurement, "function", None)
+    if not state_names or not isinstance(function, _Selection):
+        return ()
+    return tuple(state_names[i] for i in function.states)
 
 
 def _like(belief: Gaussian, key: str, value: Any, names: Sequence[str]) -> Tensor:

@@ -169,7 +169,8 @@ class Transitions:
             raise DataError(
                 f"{path}: array {missing[0]!r} is missing; expected {', '.join(_NAMES)}"
             )
-        return _with_path(path, *(arrays[name] for name in _NAMES), signals)
+        states, inputs, next_states = (arrays[name] for name in _NAMES)
+        return _with_path(path, states, inputs, next_states, signals)
 
     @classmethod
     def from_text(

@@ -213,12 +213,11 @@ class LogDynamics:
             to_array(input).reshape(-1, self.input_dim),
         )
         mean, covariance = self._mean(x, u), self._covariance(x, u)
-        return Gaussian(
-            *(
-                torch.from_numpy(a).reshape(*batch, *a.shape[1:])
-                for a in (mean, covariance)
-            )
+        mean, covariance = (
+            torch.from_numpy(a).reshape(*batch, *a.shape[1:])
+            for a in (mean, covariance)
         )
+        return Gaussian(mean, covariance)
 
     def linearize(
         self, states: Array, inputs: Array, covariance: bool = True

@@ -23,6 +23,7 @@ from gpmpc._dynamics import (
     tensors_for,
     to_array,
 )
+from gpmpc._functions import call
 from gpmpc.exceptions import SettingError, ShapeError
 from gpmpc.gaussian import Gaussian, check_tensors
 from gpmpc.gp import (
@@ -264,7 +265,7 @@ class ResidualModel(TensorModel):
 
 def _nominal(nominal: Nominal, state: Tensor, input: Tensor) -> Tensor:
     """f0 (*batch, n), held against the rule that a wrong number of states would otherwise be broadcast."""
-    value = nominal(state, input)
+    value = call("nominal", nominal, state, input)
     if not isinstance(value, Tensor):
         raise SettingError(
             "nominal", f"must give a torch tensor; got {type(value).__name__}"
@@ -279,7 +280,8 @@ def _nominal(nominal: Nominal, state: Tensor, input: Tensor) -> Tensor:
 
 def _effect(B: Effect, state: Tensor) -> Tensor:
     """B (n, k), or of a function (*batch, n, k), at states (*batch, n), checked."""
-    value, rows = (B(state), state.shape) if callable(B) else (B, state.shape[-1:])
+    rows = state.shape if callable(B) else state.shape[-1:]
+    value: Any = call("B", B, state) if callable(B) else B
     check_tensors(B=value)
     if callable(B) and value.shape == rows:  # one output
         value = value[..., None]
@@ -319,6 +321,7 @@ def train_residual(
     observed = _residuals(
         nominal, B, Features(states, inputs, list(angles), n, m), transitions
     )
+    _check_derivatives(nominal, B, transitions)
     training, noise = trainer.fit(*observed, len(inputs), "value", seed), None
     if callable(
         B
@@ -337,6 +340,18 @@ def train_residual(
         transitions.signals,
     )
     return replace(training, posterior=cast(Any, model))
+
+
+def _check_derivatives(nominal: Nominal, B: Effect, transitions: Transitions) -> None:
+    """Raises ``SettingError`` where torch cannot follow a function.
+
+    Training asks for no derivative: only a controller would come upon it.
+    """
+    x, u = to_array(transitions.states[:2]), to_array(transitions.inputs[:2])
+    if not hasattr(nominal, "linearize"):
+        linearize_function(partial(_nominal, nominal), transitions.states, x, u)
+    if callable(B) and not hasattr(B, "linearize"):
+        linearize_function(partial(_effect, B), transitions.states, x)
 
 
 def _residuals(

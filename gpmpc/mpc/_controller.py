@@ -54,7 +54,10 @@ class Reference:
     signals: Signals = UNKNOWN
 
     def __post_init__(self) -> None:
-        if type(self.states) is not np.ndarray or self.signals is not UNKNOWN:
+        plain = type(self.states) is np.ndarray and (
+            self.inputs is None or type(self.inputs) is np.ndarray
+        )
+        if not plain or self.signals is not UNKNOWN:
             check_signals(self.signals)
             self._read_names()
         shape, wide = (
@@ -126,6 +129,18 @@ class Reference:
     def horizon(self) -> int:
         """H; 1 for a set point."""
         return len(self.states) - 1 if np.ndim(self.states) == 2 else 1
+
+
+def read_reference(value: Any) -> Reference:
+    """A reference, or the one of a set point (n,) or of states (H + 1, n).
+
+    Raises:
+        DataError: They are no real numbers.
+    """
+    if isinstance(value, Reference):
+        return value
+    read_array("a reference", value)  # says what is no number; a table keeps its names
+    return Reference(value)
 
 
 @dataclass(frozen=True)

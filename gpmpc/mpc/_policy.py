@@ -22,7 +22,14 @@ from gpmpc.exceptions import (
     check_number,
 )
 from gpmpc.gaussian import Gaussian
-from gpmpc.mpc._controller import Controller, Decision, Reference, Timing, full_turns
+from gpmpc.mpc._controller import (
+    Controller,
+    Decision,
+    Reference,
+    Timing,
+    full_turns,
+    read_reference,
+)
 from gpmpc.mpc.problem import Problem
 from gpmpc.signals import UNKNOWN, signals_of
 from gpmpc.status import Status
@@ -175,9 +182,7 @@ class ControlLoop:
         if not isinstance(state, Gaussian):
             names = signals_of(self.controller).state_names
             belief = Gaussian.certain(read_array("state", state, names))
-        wanted = reference
-        if not isinstance(reference, Reference):
-            wanted = Reference(reference)
+        wanted = read_reference(reference)
         if wanted.signals is not UNKNOWN:
             wanted = wanted.in_order(signals_of(self.controller))
         known = self.last, self.on_failure, self._steps, parameters, plan

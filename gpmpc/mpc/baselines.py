@@ -35,6 +35,7 @@ from gpmpc._dynamics import DynamicsModel, check_next_states
 from gpmpc._interrupts import interrupts_after
 from gpmpc.exceptions import DataError, SettingError, check_number
 from gpmpc.gaussian import Gaussian
+from gpmpc.gp.casadi_ import successor_function
 from gpmpc.mpc._controller import (
     FEASIBLE,
     Decision,
@@ -86,7 +87,7 @@ class NMPC:
         tolerance: float = 1e-10,
     ):
         n, m = len(plant.dynamics.state_names), len(plant.dynamics.input_names)
-        self.signals = plant.signals
+        self.signals = signals_of(plant)
         self.initial_input = check_controller(
             problem, n, m, horizon, initial_input, self.signals.input_names
         )
@@ -454,6 +455,7 @@ def _build(
 ) -> tuple[casadi.Function, list[dict[str, np.ndarray]]]:
     """IPOPT on the unknowns (x_1 .. x_H, u_0 .. u_{H-1}, slacks), and the bounds of unknowns and constraints."""
     problem.check_plain("NMPC")
+    successor_function(plant)  # says what CasADi cannot follow
     n, m, H, goal = problem.state_dim, problem.input_dim, horizon, problem.cost
     x0, last = casadi.SX.sym("x0", n), casadi.SX.sym("last", m)
     x, u, r, wanted = (

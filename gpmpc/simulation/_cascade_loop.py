@@ -19,6 +19,7 @@ from gpmpc.exceptions import Diverged, ShapeError, check_number
 from gpmpc.gaussian import Gaussian
 from gpmpc.mpc import Controller, Reference
 from gpmpc.mpc._policy import OnFailure, check_policy, command
+from gpmpc.signals import Signals
 from gpmpc.simulation._disturbances import Disturbance
 from gpmpc.simulation._loop import (
     Flight,
@@ -28,7 +29,6 @@ from gpmpc.simulation._loop import (
     window,
 )
 from gpmpc.simulation._simulator import Noise, PlantSimulator, step_together
-from gpmpc.signals import Signals
 from gpmpc.step import Step
 from gpmpc.systems import (
     Coupled,

@@ -23,7 +23,9 @@ from gpmpc.exceptions import (
 )
 from gpmpc.gaussian import Gaussian
 from gpmpc.mpc import Controller, Reference, Timing
+from gpmpc.mpc._controller import read_reference
 from gpmpc.mpc._policy import Command, OnFailure, check_policy, command, commands
+from gpmpc.signals import Signals, signals_of
 from gpmpc.simulation._disturbances import Disturbance
 from gpmpc.simulation._simulator import (
     ModelLoop,
@@ -33,7 +35,6 @@ from gpmpc.simulation._simulator import (
     Simulator,
     step_together,
 )
-from gpmpc.signals import Signals, signals_of
 from gpmpc.status import Status
 from gpmpc.step import Step
 from gpmpc.systems import System
@@ -207,10 +208,8 @@ def check_references(
         DataError: They are no numbers, or have other names.
     """
     check_number("steps", steps, least=1, whole=True)
-    if not isinstance(references, Reference):
-        references = Reference(references)
-    references, needed = references.in_order(signals), steps + horizon
-    references = references.over(needed)
+    needed = steps + horizon
+    references = read_reference(references).in_order(signals).over(needed)
     if len(references.states) < needed:
         raise ShapeError(
             f"{steps} steps with horizon {horizon} need {needed} references; got {len(references.states)}"

@@ -78,7 +78,7 @@ class Noise:
                 if not isinstance(listed, list):
                     what = f"must be a list of standard deviations, one for every {key if key == 'input' else 'state'}"
                     raise SettingError(f"noise.{key}", f"{what}; got {values!r}")
-                check_numbers(f"noise.{key}", listed, np.size(listed), least=0)
+                check_numbers(f"noise.{key}", listed, len(listed), least=0)
 
 
 class PlantSimulator:
@@ -123,8 +123,8 @@ class PlantSimulator:
                     f"noise.{key} must have {length} standard deviations; got {len(values)}"
                 )
             if labels_of(values):
-                values = read_array(f"noise.{key}", values, names)
-                self.noise = replace(self.noise, **{key: values})
+                ordered: Any = read_array(f"noise.{key}", values, names)
+                self.noise = replace(self.noise, **{key: ordered})
         # One stream a source: whether states are measured with noise changes nothing about the wind.
         sources = "initial", "process", "measurement", "input"
         streams = map(

@@ -9,6 +9,7 @@ from typing import Any, cast
 import numpy as np
 
 from gpmpc._arrays import labels_of, read_array
+from gpmpc._functions import call_dynamics, dynamics_advice
 from gpmpc.exceptions import (
     GpmpcError,
     SettingError,
@@ -266,6 +267,8 @@ class System:
         except GpmpcError:
             raise
         except Exception as error:
+            if advice := dynamics_advice(error):
+                raise SettingError("dynamics", advice) from error
             what = f"must step from state {x} with input {u}"
             raise SettingError(
                 "dynamics", f"{what}; got {type(error).__name__}: {error}"
@@ -302,7 +305,7 @@ def step(plant: System, state: Array, input: Array) -> Array:
 
 def step_many(plant: System, states: Array, inputs: Array) -> Array:
     """The next states (T, n) of T copies of a plant, from states (T, n) and inputs (T, m), in one evaluation."""
-    entries = plant.successor(states.T, inputs.T)
+    entries = call_dynamics(plant.successor, states.T, inputs.T)
     return np.stack(
         [
             np.broadcast_to(np.asarray(entry, dtype=float), len(states))
