@@ -53,7 +53,8 @@ def read_array(
     labels = labels_of(values)
     if labels and names and all(isinstance(label, str) for label in labels):
         array = sorted_columns(key, array, labels, names)
-    return np.asarray(array, dtype=np.float64)
+    array = np.asarray(array, dtype=np.float64)
+    return array if array.flags.writeable else array.copy()  # torch wants to write
 
 
 def sorted_columns(

@@ -30,8 +30,15 @@ _TORCH = {  # where torch calls the same function otherwise
 }
 _RULE = "must be written with torch, which follows its own functions alone"
 _OTHERWISE = "or as a CasADi function"
-_SYSTEMS = ("sin", "cos", "exp")  # functions of gpmpc.systems
-DYNAMICS_RULE = "must be written with plain arithmetic and functions that floats, arrays and CasADi take"
+_PLAIN = {  # what floats, arrays and CasADi take in the place of a function of math
+    "sin": "gpmpc.systems.sin",
+    "cos": "gpmpc.systems.cos",
+    "exp": "gpmpc.systems.exp",
+    "sqrt": "**0.5",
+    "pow": "**",
+    "fabs": "abs",
+}
+DYNAMICS_RULE = "must be written with plain arithmetic and sin, cos, exp of gpmpc.systems, for floats, arrays and CasADi"
 
 
 def call(key: str, function: Callable[..., Any], *arguments: Tensor) -> Any:
@@ -84,7 +91,7 @@ def dynamics_advice(error: BaseException) -> str | None:
     foreign = _foreign_calls(error, _NO_ARRAYS)
     if not foreign:
         return None
-    names = [f"{_name_in_systems(name)} for {name}" for name in foreign]
+    names = [f"{_plain_name(name)} for {name}" for name in foreign]
     return f"{DYNAMICS_RULE}: {', '.join(names)}"
 
 
@@ -186,7 +193,6 @@ def _name_in_torch(name: str) -> str:
     return f"torch.{'.'.join(path)}" if callable(found) else "what torch has"
 
 
-def _name_in_systems(name: str) -> str:
+def _plain_name(name: str) -> str:
     """What to write for a function of math or torch in dynamics."""
-    last = name.rpartition(".")[2]
-    return f"gpmpc.systems.{last}" if last in _SYSTEMS else f"numpy.{last}"
+    return _PLAIN.get(name.rpartition(".")[2], "plain arithmetic")

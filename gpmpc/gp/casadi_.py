@@ -73,8 +73,7 @@ def _check_numbers(function: casadi.Function) -> None:
         constant = function.instruction_id(i) == casadi.OP_CONST
         if constant and math.isnan(function.instruction_constant(i)):
             got = "NaN, which math.sin and its like make of a CasADi expression"
-            what = f"{DYNAMICS_RULE} (gpmpc.systems.sin, numpy.sqrt); got {got}"
-            raise SettingError("dynamics", what)
+            raise SettingError("dynamics", f"{DYNAMICS_RULE}; got {got}")
 
 
 def _residual(model: Any, x: casadi.MX, u: casadi.MX) -> tuple[casadi.MX, casadi.MX]:

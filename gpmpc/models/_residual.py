@@ -8,6 +8,7 @@ With ``Affine.identity`` as nominal model d is the difference of two states, and
 """
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Any, cast
@@ -318,10 +319,10 @@ def train_residual(
         list(range(k) if some is None else some)
         for some, k in ((states, n), (inputs, m))
     )
+    _check_derivatives(nominal, B, transitions)
     observed = _residuals(
         nominal, B, Features(states, inputs, list(angles), n, m), transitions
     )
-    _check_derivatives(nominal, B, transitions)
     training, noise = trainer.fit(*observed, len(inputs), "value", seed), None
     if callable(
         B
@@ -345,13 +346,15 @@ def train_residual(
 def _check_derivatives(nominal: Nominal, B: Effect, transitions: Transitions) -> None:
     """Raises ``SettingError`` where torch cannot follow a function.
 
-    Training asks for no derivative: only a controller would come upon it.
+    Training asks for no derivative: only a controller would come upon it. What is wrong
+    with a function's shape is said at all rows.
     """
     x, u = to_array(transitions.states[:2]), to_array(transitions.inputs[:2])
-    if not hasattr(nominal, "linearize"):
-        linearize_function(partial(_nominal, nominal), transitions.states, x, u)
-    if callable(B) and not hasattr(B, "linearize"):
-        linearize_function(partial(_effect, B), transitions.states, x)
+    with suppress(ShapeError):
+        if not hasattr(nominal, "linearize"):
+            linearize_function(partial(_nominal, nominal), transitions.states, x, u)
+        if callable(B) and not hasattr(B, "linearize"):
+            linearize_function(partial(_effect, B), transitions.states, x)
 
 
 def _residuals(

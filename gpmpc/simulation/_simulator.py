@@ -12,7 +12,7 @@ from typing import Any, cast
 import numpy as np
 import torch
 
-from gpmpc._arrays import labels_of, read_array
+from gpmpc._arrays import read_array
 from gpmpc._dynamics import DynamicsModel, to_array
 from gpmpc.exceptions import (
     Diverged,
@@ -71,11 +71,9 @@ class Noise:
 
     def __post_init__(self) -> None:
         for key, values in vars(self).items():
-            if hasattr(values, "requires_grad"):
-                values = read_array(f"noise.{key}", values)
             if values is not None:
-                listed = np.asarray(values, dtype=object).tolist()
-                if not isinstance(listed, list):
+                listed = values.tolist() if hasattr(values, "tolist") else values
+                if not isinstance(listed, Sequence) or isinstance(listed, str):
                     what = f"must be a list of standard deviations, one for every {key if key == 'input' else 'state'}"
                     raise SettingError(f"noise.{key}", f"{what}; got {values!r}")
                 check_numbers(f"noise.{key}", listed, len(listed), least=0)
@@ -118,13 +116,14 @@ class PlantSimulator:
             ("input", m, plant.input_names),
         ):
             values = getattr(self.noise, key)
-            if values is not None and len(values) != length:
+            if values is None:
+                continue
+            if len(values) != length:
                 raise ShapeError(
                     f"noise.{key} must have {length} standard deviations; got {len(values)}"
                 )
-            if labels_of(values):
-                ordered: Any = read_array(f"noise.{key}", values, names)
-                self.noise = replace(self.noise, **{key: ordered})
+            ordered: Any = read_array(f"noise.{key}", values, names)
+            self.noise = replace(self.noise, **{key: ordered})
         # One stream a source: whether states are measured with noise changes nothing about the wind.
         sources = "initial", "process", "measurement", "input"
         streams = map(

@@ -132,7 +132,11 @@ def test_tables_of_other_columns_are_refused_by_name(changed, message):
     [
         (Signals(["angle"]), ShapeError, "2 states need as many names; got angle"),
         (Signals((), ["a", "b"]), ShapeError, "1 inputs need as many names; got a, b"),
-        ({"time_step": 0.1}, SettingError, r"signals: must be Signals\(...\); got dict"),
+        (
+            {"time_step": 0.1},
+            SettingError,
+            r"signals: must be Signals\(...\); got dict",
+        ),
         (None, SettingError, r"signals: must be Signals\(...\); got NoneType"),
     ],
 )
