@@ -5,6 +5,7 @@ like, whose columns and entries have labels. Text, truth values, dates, complex 
 and tensors of a graph only could be taken for numbers: they are refused.
 """
 
+import re
 from collections.abc import Sequence
 from typing import Any
 
@@ -17,6 +18,7 @@ Array = NDArray[np.float64]
 
 
 _RULE = "must be real numbers"
+_TOPIC = re.compile(r"^(state|measured|input)\.")
 
 
 def read_array(
@@ -81,7 +83,18 @@ def labels_of(values: Any) -> tuple[Any, ...]:
         labels = getattr(values, "index", None)
     if labels is None or callable(labels):
         return ()
-    return tuple(labels)
+    return plain_names(tuple(labels))
+
+
+def plain_names(labels: Sequence[Any]) -> tuple[Any, ...]:
+    """Labels without the topic that our recordings put before them (``state.x``).
+
+    They stay where two would be one, such as the state and what was measured of it.
+    """
+    plain = tuple(
+        _TOPIC.sub("", label) if isinstance(label, str) else label for label in labels
+    )
+    return plain if len(set(plain)) == len(plain) else tuple(labels)
 
 
 def names_of(values: Any) -> tuple[str, ...]:

@@ -1,4 +1,4 @@
-"""Calls functions that users write, and says which name to write where one is of another library.
+"""Calls functions that users write; says what to write for names of other libraries.
 
 torch follows its own functions alone. numpy asks a tensor for its numbers, math for one
 number: both fail with a sentence about tensors, which says nothing of what to write, or
@@ -19,7 +19,6 @@ from gpmpc.exceptions import GpmpcError, SettingError
 _LOST = (TypeError, ValueError, RuntimeError, AttributeError, NotImplementedError)
 _OURS = ("gpmpc", "torch", "numpy", "casadi")  # packages whose frames no user wrote
 _NUMBERS = ("numpy", "math", "cmath", "scipy")  # what torch does not follow
-_NO_ARRAYS = ("math", "cmath", "torch")  # what dynamics do not take
 _TORCH = {  # where torch calls the same function otherwise
     "array": "stack (of numbers torch.tensor)",
     "fabs": "abs",
@@ -38,7 +37,10 @@ _PLAIN = {  # what floats, arrays and CasADi take in the place of a function of 
     "pow": "**",
     "fabs": "abs",
 }
-DYNAMICS_RULE = "must be written with plain arithmetic and sin, cos, exp of gpmpc.systems, for floats, arrays and CasADi"
+DYNAMICS_RULE = (
+    "must be written with plain arithmetic and sin, cos, exp of gpmpc.systems, "
+    "for floats, arrays and CasADi"
+)
 
 
 def call(key: str, function: Callable[..., Any], *arguments: Tensor) -> Any:
@@ -51,8 +53,8 @@ def call(key: str, function: Callable[..., Any], *arguments: Tensor) -> Any:
 
     Raises:
         SettingError: It failed where it calls numpy or math, or takes numbers out of a
-            tensor; or its value is one that torch did not follow. Any other error of its
-            own is left as it is.
+            tensor; or its value is one that torch did not follow. Any other error of
+            its own is left as it is.
     """
     try:
         value = function(*arguments)
@@ -72,23 +74,23 @@ def call_dynamics(function: Callable[..., Any], *arguments: Any) -> Any:
     """Calls the dynamics of a system on arrays or CasADi expressions.
 
     Raises:
-        SettingError: They failed where they call math or torch. Any other error of their
-            own is left as it is.
+        SettingError: They failed where they call math or torch. Any other error of
+            their own is left as it is.
     """
     try:
         return function(*arguments)
     except GpmpcError:
         raise
     except _LOST as error:
-        advice = dynamics_advice(error)
+        advice = dynamics_advice(error, ("math", "cmath", "torch"))
         if advice is None:
             raise
         raise SettingError("dynamics", advice) from error
 
 
-def dynamics_advice(error: BaseException) -> str | None:
-    """The rule that dynamics break which failed in math or torch; None where the fault is another one."""
-    foreign = _foreign_calls(error, _NO_ARRAYS)
+def dynamics_advice(error: BaseException, packages: Sequence[str]) -> str | None:
+    """The rule that dynamics broke which failed in one of these packages; or None."""
+    foreign = _foreign_calls(error, packages)
     if not foreign:
         return None
     names = [f"{_plain_name(name)} for {name}" for name in foreign]
@@ -96,7 +98,7 @@ def dynamics_advice(error: BaseException) -> str | None:
 
 
 def _check_followed(key: str, value: Tensor, arguments: tuple[Tensor, ...]) -> None:
-    """Raises ``SettingError`` where values (K, ...) change with arguments that torch did not follow to them.
+    """Raises ``SettingError`` where values (K, ...) change and torch lost them.
 
     Their derivatives would be taken for zero. One row says nothing, nor does a value
     that depends on further arguments.
@@ -105,14 +107,15 @@ def _check_followed(key: str, value: Tensor, arguments: tuple[Tensor, ...]) -> N
         return
     if not value.dim() or bool((value == value[:1]).all() | value.isnan().any()):
         return
-    advice = "its values change, and their derivatives are lost (by numpy, math, torch.tensor, .detach() or .item())"
-    raise SettingError(key, f"{_RULE}: {advice}, {_OTHERWISE}")
+    lost = "its values change, and their derivatives are lost"
+    ways = "by numpy, math, torch.tensor, .detach() or .item()"
+    raise SettingError(key, f"{_RULE}: {lost} ({ways}), {_OTHERWISE}")
 
 
 def _advice(function: Any, error: BaseException) -> str | None:
-    """What to write in the place of what failed; None where the fault is another one."""
+    """What to write in the place of what failed; None where the fault is another."""
     if _is_of(function, _NUMBERS):  # the function itself is one of them
-        foreign = [f"{type(function).__module__}.{function.__name__}"]
+        foreign = [f"{_package_of(function)}.{function.__name__}"]
     else:
         foreign = _foreign_calls(error, _NUMBERS)
     if foreign:
@@ -135,7 +138,7 @@ def _frame_of_user(traceback: TracebackType | None) -> tuple[FrameType, int] | N
 
 
 def _foreign_calls(error: BaseException, packages: Sequence[str]) -> list[str]:
-    """Functions of packages on the line where a user's code stopped, as it writes them, once each."""
+    """Functions of packages on the line where a user's code stopped, by its names."""
     frame = _frame_of_user(error.__traceback__)
     if frame is None:
         return []
@@ -144,7 +147,7 @@ def _foreign_calls(error: BaseException, packages: Sequence[str]) -> list[str]:
 
 
 def _names_on(frame: FrameType, line: int) -> Iterator[tuple[str, Any]]:
-    """Every name that is read on a line, such as ``np.linalg.norm``, with what it stands for."""
+    """Every name on a line, such as ``np.linalg.norm``, and what it stands for."""
     known = {**frame.f_globals, **frame.f_locals}
     name, value = "", None
     for instruction in _instructions(frame.f_code, line):
@@ -178,12 +181,16 @@ def _instructions(code: CodeType, line: int) -> Iterator[dis.Instruction]:
 
 def _is_of(value: Any, packages: Sequence[str]) -> bool:
     """Whether something is a function of one of these packages."""
+    return callable(value) and _package_of(value) in packages
+
+
+def _package_of(value: Any) -> str:
     module = getattr(value, "__module__", None) or type(value).__module__
-    return callable(value) and str(module).partition(".")[0] in packages
+    return str(module).partition(".")[0]
 
 
 def _name_in_torch(name: str) -> str:
-    """What torch calls a function of numpy or math; of its own name where both have it."""
+    """What torch calls a function of numpy or math: mostly the same."""
     path = name.split(".")[1:] or [name]
     if path[-1] in _TORCH:
         return f"torch.{_TORCH[path[-1]]}"

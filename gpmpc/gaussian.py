@@ -69,8 +69,8 @@ class Gaussian:
     def certain(cls, value: Any) -> "Gaussian":
         """A belief without doubt, such as a measured state (*batch, n), from a tensor, an array or a list.
 
-        Tensors and arrays of floating point keep their type; everything else becomes float64. The labels of a
-        series or of a table's columns become the belief's names.
+        Tensors and arrays of floating point keep their type; everything else becomes float64.
+        The labels of a series or of a table's columns become the belief's names.
 
         >>> Gaussian.certain([1.0, 2.0]).variance.tolist()
         [0.0, 0.0]
@@ -103,7 +103,7 @@ class Gaussian:
         )
 
     def in_order(self, names: Sequence[str]) -> "Gaussian":
-        """The belief with its entries in the order of names; itself where they are not known.
+        """The belief in the order of names; itself where its own are not known.
 
         Raises:
             DataError: Its own names are others.

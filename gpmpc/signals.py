@@ -1,4 +1,4 @@
-"""What says that data, a model and a plant belong together: names of states and inputs, and the time step.
+"""What says that data, a model and a plant belong together: names and the time step.
 
 Nothing here is needed: what is not known is left out, fits everything, and is checked
 against nothing. What two sides both know has to agree.
@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from gpmpc._arrays import plain_names
 from gpmpc.exceptions import SettingError, ShapeError, check_number
 
 SAME_STEP = 1e-3  # relative difference of two time steps that are the same: a log's are
@@ -16,6 +17,8 @@ SAME_STEP = 1e-3  # relative difference of two time steps that are the same: a l
 @dataclass(frozen=True)
 class Signals:
     """States and inputs by name, in their order, and the time between two samples.
+
+    Columns of our own recordings are named without their topic, ``x`` for ``state.x``.
 
     >>> Signals(["angle", "rate"], ["torque"], 0.05).state_names
     ('angle', 'rate')
@@ -41,7 +44,7 @@ class Signals:
                 raise SettingError(
                     key, f"must be a list of different names; got {names!r}"
                 )
-            object.__setattr__(self, key, tuple(names))
+            object.__setattr__(self, key, plain_names(names))
         if self.time_step is not None:
             check_number("time_step", self.time_step, above=0, unit="[s]")
 
@@ -102,7 +105,8 @@ class Signals:
             return cls()
         known = {"state_names", "input_names", "time_step"}
         if not isinstance(header, Mapping) or not header.keys() <= known:
-            raise SettingError("signals", f"must be names and a time step; got {header!r}")
+            rule = "must be names and a time step"
+            raise SettingError("signals", f"{rule}; got {header!r}")
         return cls(**header)
 
 

@@ -123,7 +123,7 @@ class NMPCData:
     ) -> Transitions:
         """Flies the trajectory by the plants of these settings, and for the rotational subsystem its attitude."""
         along = check_quadrotor(system, trajectory)
-        # Without a time step: a map goes from state to state, whatever the time between.
+        # Without a time step: a map goes from state to state, whatever the time is.
         signals = Signals(system.state_names, system.input_names)
         steps = (
             self.samples + self.horizon

@@ -205,9 +205,10 @@ class Transitions:
             path: The file; separated by commas, or by semicolons or tabs where the header has them.
             states: Names of the columns x[k].
             inputs: Names of the columns u[k].
-            next_states: Names of the columns x[k+1], sorted as the states where they are the states' names with a
-                prefix or suffix. ``None`` takes the file for one recording at equal time steps: the next row's states
-                are the next states, and the last row only serves as such.
+            next_states: Names of the columns x[k+1], sorted as the states where they are
+                the states' names with a prefix or suffix. ``None`` takes the file for
+                one recording at equal time steps: the next row's states are the next
+                states, and the last row only serves as such.
             time_step: Between the two states of a row [s], where it is known.
 
         Raises:

@@ -67,7 +67,7 @@ def successor_function(plant: Any) -> casadi.Function:
 
 
 def _check_numbers(function: casadi.Function) -> None:
-    """Raises ``SettingError`` where an expression holds a NaN: what math makes of a CasADi symbol."""
+    """Raises ``SettingError`` for a NaN: what math makes of a CasADi symbol."""
     instructions = function.n_instructions() if function.is_a("SXFunction") else 0
     for i in range(instructions):
         constant = function.instruction_id(i) == casadi.OP_CONST

@@ -15,7 +15,7 @@ from gpmpc.calibration import Recording
 from gpmpc.exceptions import DataError, SettingError, check_number
 from gpmpc.gp import Transitions
 from gpmpc.logs._kinematics import Array, StateSpace
-from gpmpc.logs._mapping import LogMapping, plain_names
+from gpmpc.logs._mapping import LogMapping
 from gpmpc.signals import Signals
 
 
@@ -139,10 +139,8 @@ class Log:
 
     @property
     def signals(self) -> Signals:
-        """Names and time step; states and inputs of our recordings as their system calls them."""
-        return Signals(
-            plain_names(self.space.names), plain_names(self.input_names), self.time_step
-        )
+        """Names of states and inputs, and time step."""
+        return Signals(self.space.names, self.input_names, self.time_step)
 
     def split(self, held_out: Sequence[str]) -> tuple["Log", "Log"]:
         """Splits by run: a log of all others, and one of the named runs.

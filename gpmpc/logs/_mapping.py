@@ -3,7 +3,6 @@
 A mapping is a YAML file or a dictionary (docs/guide_log.md). States come out in m, rad, s, kg and their products.
 """
 
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -50,11 +49,6 @@ _SIGNAL_KEYS = (
     "resample",
     "topic",
 )
-
-
-def plain_names(names: Sequence[str]) -> tuple[str, ...]:
-    """Names of columns without the topic that our own recordings put before them."""
-    return tuple(re.sub(r"^(state|measured|input)\.", "", name) for name in names)
 
 
 @dataclass(frozen=True)

@@ -35,7 +35,6 @@ from gpmpc.logs._kinematics import (
     wrap,
 )
 from gpmpc.logs._learning import Candidate, Learned
-from gpmpc.logs._mapping import plain_names
 from gpmpc.logs._rollouts import AffineNominal, LogModel, MultirotorNominal, OutputGP
 from gpmpc.models import load_model
 from gpmpc.signals import UNKNOWN, Signals, signals_of
@@ -324,11 +323,7 @@ def load_flyable(path: str | Path) -> SavedModel:
                 "model",
                 f"{path} needs a context ({context}), which is not known in flight",
             )
-        signals = Signals(
-            plain_names(learned.state_names),
-            plain_names(learned.input_names),
-            learned.time_step,
-        )
+        signals = Signals(learned.state_names, learned.input_names, learned.time_step)
         flown = LogDynamics(
             learned.model,
             len(learned.input_names),

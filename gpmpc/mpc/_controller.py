@@ -49,8 +49,8 @@ class Reference:
     #: standard deviations (H,) between the means and the sides of chance constraints, by stage, in the place of the
     #: problem's, such as those of an ``AdaptiveTube``; for covariances of ``zero_order``
     kappas: Array | None = None
-    #: names of states and inputs, where they are known: by default of a series' entries,
-    #: or of a table's columns. A controller sorts by them
+    #: names of states and inputs, where they are known: by default of a series'
+    #: entries, or of a table's columns. A controller sorts by them
     signals: Signals = UNKNOWN
 
     def __post_init__(self) -> None:
@@ -272,8 +272,9 @@ class Request(NamedTuple):
         """Validates the arguments of ``Controller.control`` for H stages of a problem.
 
         ``initial_input`` is taken for the previous one where there is no decision before; of one that is not applicable
-        only ``input`` counts: what was applied. For ``plan``, and the errors, see ``GPMPC.control``. ``signals`` are
-        the controller's, by which a belief and a reference with names are sorted.
+        only ``input`` counts: what was applied. For ``plan``, and the errors, see
+        ``GPMPC.control``. ``signals`` are the controller's, by which a belief and a
+        reference with names are sorted.
         """
         check_arguments(belief, reference)
         if belief.names:
@@ -352,10 +353,11 @@ class Request(NamedTuple):
 
 
 def check_arguments(belief: Any, reference: Any) -> None:
-    """Raises ``ShapeError`` unless the arguments of ``control`` are a belief and a reference."""
+    """Raises ``ShapeError`` unless these are what ``control`` takes."""
     if not (isinstance(belief, Gaussian) and isinstance(reference, Reference)):
         raise ShapeError(
-            "control takes a Gaussian (Gaussian.certain(x) for a measured state) and a Reference(states); "
+            "control takes a Gaussian (Gaussian.certain(x) for a measured state) "
+            "and a Reference(states); "
             f"got {type(belief).__name__} and {type(reference).__name__}"
         )
 
@@ -396,7 +398,10 @@ def check_controller(
 
 
 def _array(value: Any, key: str = "a state, a reference or a plan") -> Array:
-    """A tensor or array as contiguous float64 in host memory; ``DataError`` where it is no real numbers."""
+    """A tensor or array as contiguous float64 in host memory.
+
+    ``DataError`` where it is no real numbers.
+    """
     if type(value) is not np.ndarray and hasattr(value, "detach"):
         try:
             value = value.numpy()

@@ -218,7 +218,10 @@ def check_references(
 
 
 def check_belongs(controller: Controller, signals: Signals, plant: str) -> None:
-    """Raises ``SettingError`` where a controller knows other names or another time step than what it is to steer."""
+    """Raises ``SettingError`` where a controller is of something else than the plant.
+
+    That is, of other names of states and inputs, or another time step.
+    """
     signals_of(controller).check("the controller", signals, plant, "system")
 
 
@@ -254,8 +257,9 @@ def closed_loop(
 
     Raises:
         ShapeError: Too few references for the steps and the horizon, or a state of the wrong length.
-        SettingError: An unknown policy, negative noise, noise in a model loop, or a controller of a model with other
-            names of states and inputs, or another time step, than the plant has.
+        SettingError: An unknown policy, negative noise, noise in a model loop, or a
+            controller of other names of states and inputs, or another time step, than
+            the plant has.
         SolverFailure: A solve failed, and the policy is ``"raise"`` or there was nothing to fall back on.
         Diverged: The system left the finite numbers; ``flown`` holds the steps before.
     """

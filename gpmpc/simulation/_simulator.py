@@ -39,7 +39,7 @@ class ModelLoop:
 
     model: DynamicsModel  #: it predicts the next state
     propagator: Propagator  #: how the belief is carried on
-    #: time that one step stands for [s]; by default the model's, or 1 where it knows none
+    #: time that one step stands for [s]; by default the model's, or 1 where it has none
     time_step: float = cast(float, None)
 
     def __post_init__(self) -> None:

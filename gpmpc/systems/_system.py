@@ -267,7 +267,7 @@ class System:
         except GpmpcError:
             raise
         except Exception as error:
-            if advice := dynamics_advice(error):
+            if advice := dynamics_advice(error, ("torch",)):  # math takes floats
                 raise SettingError("dynamics", advice) from error
             what = f"must step from state {x} with input {u}"
             raise SettingError(

@@ -1,4 +1,4 @@
-"""A controller steers only what its model is of; series and tables are sorted by name before they are numbers."""
+"""A controller steers what its model is of; series and tables are sorted by name."""
 
 from dataclasses import replace
 
@@ -76,7 +76,7 @@ def test_data_of_a_system_and_what_learns_from_them_know_it(model, controller):
     [
         (
             System(Swapped(), 0.1),
-            "the controller has the states angle, rate; Swapped has rate, angle, the same in another order",
+            "the controller has the states angle, rate; Swapped has rate, angle, the",
         ),
         (pendulum(0.5), "has time steps of 0.1 s; pendulum has 0.5 s"),
     ],
