@@ -98,14 +98,15 @@ def plain_names(labels: Sequence[Any]) -> tuple[Any, ...]:
 
 
 def names_of(values: Any) -> tuple[str, ...]:
-    """The labels of a table or a series where all are texts; a count is no name."""
+    """The labels of a table or a series where all are texts, and no two the same."""
     labels = labels_of(values)
-    return labels if all(isinstance(label, str) for label in labels) else ()
+    texts = all(isinstance(label, str) for label in labels)
+    return labels if texts and len(set(labels)) == len(labels) else ()
 
 
 def order_of(labels: Sequence[Any], names: Sequence[Any]) -> list[int] | None:
     """Where each name stands among as many labels; None where the labels are others."""
-    if len(labels) != len(names) or set(labels) != set(names):
+    if not len(names) == len(labels) == len(set(labels)) or set(labels) != set(names):
         return None
     return [labels.index(name) for name in names]
 

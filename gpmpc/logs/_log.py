@@ -139,8 +139,13 @@ class Log:
 
     @property
     def signals(self) -> Signals:
-        """Names of states and inputs, and time step."""
-        return Signals(self.space.names, self.input_names, self.time_step)
+        """Names of states and inputs, and time step; columns of two topics may share one."""
+        states, inputs = self.space.names, self.input_names
+        return Signals(
+            states if len(set(states)) == len(states) else (),
+            inputs if len(set(inputs)) == len(inputs) else (),
+            self.time_step,
+        )
 
     def split(self, held_out: Sequence[str]) -> tuple["Log", "Log"]:
         """Splits by run: a log of all others, and one of the named runs.

@@ -90,6 +90,22 @@ def test_columns_that_are_numbers_or_pairs_are_sorted_without_being_names():
         assert read.signals.state_names == ()
 
 
+def test_columns_of_one_name_are_no_names():
+    same = STATES.set_axis(["x", "x"], axis=1)
+    read = Transitions(same, INPUTS, AFTER.set_axis(["x", "x"], axis=1))
+    assert read.signals.state_names == ()
+    assert torch.equal(read.next_states, data().next_states)
+
+
+def test_columns_of_our_recordings_are_named_as_their_system_names_them():
+    measured = STATES.add_prefix("measured.")
+    applied = INPUTS.add_prefix("input.")
+    read = Transitions(measured, applied, measured.shift(-1, fill_value=0.0))
+    assert read.signals == replace(KNOWN, time_step=None)
+    both = ["state.angle", "measured.angle"]
+    assert Signals(both).state_names == tuple(both)
+
+
 def test_columns_are_sorted_by_the_names_that_are_given():
     names = Signals(SWAPPED, ["torque"])
     read = Transitions(STATES, INPUTS, AFTER, names)
