@@ -10,6 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from gpmpc._functions import call
 from gpmpc.exceptions import SettingError, ShapeError
 from gpmpc.gaussian import Gaussian, check_tensors, constant_arrays
 
@@ -224,7 +225,7 @@ def predict_by_autograd(
     """``predict_with_jacobian`` by torch autograd, for any model that has ``predict``."""
 
     def prediction(x: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
-        belief = model.predict(x, u)
+        belief = call("model", model.predict, x, u)
         return belief.mean, belief.covariance
 
     (mean, covariance), (A, B) = batched_jacobian(prediction, (state, input))

@@ -15,10 +15,12 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from gpmpc._angles import angles_of, whole_turns
+from gpmpc._arrays import names_of, read_array
 from gpmpc._dynamics import DynamicsModel
 from gpmpc.exceptions import DataError, SettingError, ShapeError, check_number
 from gpmpc.gaussian import Gaussian
@@ -30,6 +32,7 @@ from gpmpc.metrics import (
     negative_log_predictive_density,
 )
 from gpmpc.propagation import Propagator, best_propagator
+from gpmpc.signals import UNKNOWN, Signals, check_signals, signals_of
 
 if TYPE_CHECKING:
     import pandas
@@ -48,12 +51,29 @@ class Recording:
 
     states: Tensor  #: x[0] to x[K] (K + 1, n)
     inputs: Tensor  #: u[0] to u[K - 1] (K, m)
+    #: names and time step, where they are known; those of tables' columns by default
+    signals: Signals = UNKNOWN
+
+    if TYPE_CHECKING:  # anything that is an array of numbers
+
+        def __init__(
+            self, states: Any, inputs: Any, signals: Signals = UNKNOWN
+        ) -> None: ...
 
     def __post_init__(self) -> None:
-        for name in ("states", "inputs"):
-            object.__setattr__(
-                self, name, torch.as_tensor(getattr(self, name), dtype=torch.float64)
-            )
+        check_signals(self.signals)
+        signals = Signals(
+            self.signals.state_names or names_of(self.states),
+            self.signals.input_names or names_of(self.inputs),
+            self.signals.time_step,
+        )
+        object.__setattr__(self, "signals", signals)
+        for name, names in (
+            ("states", signals.state_names),
+            ("inputs", signals.input_names),
+        ):
+            array = read_array(f"{name} of a recording", getattr(self, name), names)
+            object.__setattr__(self, name, torch.from_numpy(np.array(array)))
         if (
             self.states.dim() != 2
             or self.inputs.dim() != 2
@@ -63,6 +83,7 @@ class Recording:
                 "a recording has states (K + 1, n) and inputs (K, m), K of 1 or more; "
                 f"got {tuple(self.states.shape)} and {tuple(self.inputs.shape)}"
             )
+        signals.check_sizes(self.states.shape[1], self.inputs.shape[1])
         for name in ("states", "inputs"):
             if not bool(torch.isfinite(getattr(self, name)).all()):
                 raise DataError(f"{name} of a recording must be finite")
@@ -83,7 +104,7 @@ class Recording:
         ]
         runs = [transitions[begin:end] for begin, end in pairwise(ends)]
         return [
-            cls(torch.cat([run.states, run.next_states[-1:]]), run.inputs)
+            cls(torch.cat([run.states, run.next_states[-1:]]), run.inputs, run.signals)
             for run in runs
         ]
 
@@ -157,7 +178,8 @@ def calibrate(
         propagator: How the belief moves; as ``best_propagator`` of ``gpmpc.propagation`` does by default.
         horizon: H, the longest prediction in steps.
         levels: Of the central intervals.
-        names: Of the states; x1, x2, ... by default.
+        names: Of the states; by default as the model or the first recording calls them,
+            or x1, x2, ...
         angles: Indices of the states that are angles [rad], whose errors are taken within half a turn; by default
             those of the model.
 
@@ -167,7 +189,10 @@ def calibrate(
     """
     recordings = [recordings] if isinstance(recordings, Recording) else list(recordings)
     propagator = best_propagator(model) if propagator is None else propagator
-    names = tuple(names) or tuple(f"x{i + 1}" for i in range(model.state_dim))
+    own = signals_of(model).state_names
+    if not own and recordings:
+        own = recordings[0].signals.state_names
+    names = tuple(names or own) or tuple(f"x{i + 1}" for i in range(model.state_dim))
     check_number("horizon", horizon, least=1, whole=True)
     _check(model, recordings, horizon, levels, names)
     n = model.state_dim
@@ -251,6 +276,8 @@ def _check(
         raise ShapeError(
             f"recordings must have the model's {n} states and {m} inputs; got {sizes or 'no recording'}"
         )
+    for recording in recordings:
+        signals_of(model).check("the model", recording.signals, "the recording")
     longest = max(map(len, recordings))
     if horizon > longest:
         raise SettingError(

@@ -1,14 +1,19 @@
 """Gaussian beliefs N(mean, covariance), alone or in a batch, and symmetric square roots of covariances."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 from torch.autograd import forward_ad
 
-from gpmpc.exceptions import SettingError, ShapeError
+from gpmpc._arrays import names_of, read_array, sorted_columns
+from gpmpc.exceptions import DataError, SettingError, ShapeError
+
+_FLOATS = np.dtype(np.float64), np.dtype(np.float32), np.dtype(np.float16)
 
 
 def check_tensors(**given: Any) -> None:
@@ -48,6 +53,8 @@ class Gaussian:
 
     mean: Tensor  #: (*batch, n)
     covariance: Tensor  #: (*batch, n, n), symmetric
+    #: of the n entries, where they are known: a controller and a filter sort by them
+    names: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         check_tensors(mean=self.mean, covariance=self.covariance)
@@ -63,6 +70,7 @@ class Gaussian:
         """A belief without doubt, such as a measured state (*batch, n), from a tensor, an array or a list.
 
         Tensors and arrays of floating point keep their type; everything else becomes float64.
+        The labels of a series or of a table's columns become the belief's names.
 
         >>> Gaussian.certain([1.0, 2.0]).variance.tolist()
         [0.0, 0.0]
@@ -70,17 +78,18 @@ class Gaussian:
         Raises:
             ShapeError: No vector of numbers was given.
         """
-        mean = value
-        if not isinstance(value, Tensor):
+        if isinstance(value, np.ndarray) and value.dtype in _FLOATS:
+            mean = torch.as_tensor(value)
+        elif isinstance(value, Tensor) and _is_real(value):
+            mean = value if value.is_floating_point() else value.to(torch.float64)
+        else:
             try:
-                mean = torch.as_tensor(
-                    value, dtype=None if hasattr(value, "dtype") else torch.float64
-                )
-            except (TypeError, ValueError) as error:
+                mean = torch.from_numpy(np.array(read_array("a state", value)))
+            except DataError as error:
+                got = str(error).partition("; got ")[2]
                 raise ShapeError(
-                    f"a state must be numbers (*batch, n); got {value!r}"
+                    f"a state must be numbers (*batch, n); got {got}"
                 ) from error
-        mean = mean if mean.is_floating_point() else mean.to(torch.float64)
         if not mean.dim():
             raise ShapeError(
                 f"a state must be numbers (*batch, n); got the single number {value!r}"
@@ -90,7 +99,21 @@ class Gaussian:
             torch.zeros(
                 *mean.shape, mean.shape[-1], dtype=mean.dtype, device=mean.device
             ),
+            () if isinstance(value, np.ndarray | Tensor) else names_of(value),
         )
+
+    def in_order(self, names: Sequence[str]) -> "Gaussian":
+        """The belief in the order of names; itself where its own are not known.
+
+        Raises:
+            DataError: Its own names are others.
+        """
+        if not self.names or not names or self.names == tuple(names):
+            return self
+        mean = sorted_columns("state", self.mean, self.names, names)
+        by_column = sorted_columns("state", self.covariance, self.names, names)
+        covariance = sorted_columns("state", by_column.mT, self.names, names)
+        return Gaussian(mean, covariance, tuple(names))
 
     @property
     def dim(self) -> int:
@@ -101,6 +124,10 @@ class Gaussian:
     def variance(self) -> Tensor:
         """The diagonal of the covariance (*batch, n)."""
         return self.covariance.diagonal(dim1=-2, dim2=-1)
+
+
+def _is_real(value: Tensor) -> bool:
+    return not (value.is_complex() or value.dtype == torch.bool)
 
 
 def nearest_positive_semidefinite(covariance: Tensor) -> tuple[Tensor, Tensor]:

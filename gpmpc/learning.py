@@ -39,8 +39,9 @@ from gpmpc.gp._online import least_informative
 from gpmpc.models import Features
 from gpmpc.models._wrapper import Wrapper
 from gpmpc.mpc import Decision, Reference
-from gpmpc.mpc._controller import check_method
+from gpmpc.mpc._controller import check_arguments, check_method
 from gpmpc.mpc.gp_mpc import GPMPC
+from gpmpc.signals import Signals
 from gpmpc.simulation import Rollout
 
 _FEW, _MANY = 3, 100  # differences of errors that say how large the noise is
@@ -380,6 +381,7 @@ class LearningController:
         )
         self.problem, self.horizon = controller.problem, controller.horizon
         self.initial_input = controller.initial_input
+        self.signals = controller.signals
         self._model = ChangedModel(
             controller.prediction.model,
             self.learning,
@@ -395,6 +397,9 @@ class LearningController:
     ) -> Decision:
         """Learns from the last step, and decides; see ``Controller.control``."""
         begin = perf_counter()
+        check_arguments(belief, reference)
+        if belief.names:
+            belief = belief.in_order(self.signals.state_names)
         learned = self._learned(to_array(belief.mean).copy(), previous)
         controller = (
             self.controller.with_model(learned.model)
@@ -471,7 +476,11 @@ class EpisodicLearning:
             flight.inputs[rows],
             flight.measured[rows + 1],
         )
-        parts = (data.states, states), (data.inputs, inputs), (data.next_states, after)
-        return Transitions(
-            *(torch.cat([first, torch.from_numpy(second)]) for first, second in parts)
+        flown = Signals(time_step=flight.time_step)
+        data.signals.check("the data", flown, "the flight")
+        return replace(
+            data,
+            states=torch.cat([data.states, torch.from_numpy(states)]),
+            inputs=torch.cat([data.inputs, torch.from_numpy(inputs)]),
+            next_states=torch.cat([data.next_states, torch.from_numpy(after)]),
         )

@@ -6,19 +6,20 @@ import numpy as np
 import pytest
 import torch
 
-from gpmpc import metrics
+from gpmpc import calibration, metrics
 from gpmpc._dynamics import predict_with_jacobian
-from gpmpc.exceptions import DataError, SettingError, ShapeError
+from gpmpc.estimation import KalmanFilter, Measurement
+from gpmpc.exceptions import DataError, GpmpcError, SettingError, ShapeError
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior, Trainer, Transitions, append_points, train
-from gpmpc.models import Affine, ResidualModel
-from gpmpc.mpc import Reference
+from gpmpc.models import Affine, DelayedModel, Lags, ResidualModel
+from gpmpc.mpc import ControlLoop, Reference
 from gpmpc.mpc.baselines import StateFormMPC
 from gpmpc.mpc.gp_mpc import GPMPC, NonlinearGPMPC
-from gpmpc.mpc.problem import Box, Problem, Tracking
+from gpmpc.mpc.problem import Box, LeastSquares, Problem, Tracking
 from gpmpc.propagation import Linearization, MomentMatching, rollout
 from gpmpc.qp import DualActiveSet
-from gpmpc.simulation import Gust, closed_loop
+from gpmpc.simulation import Gust, ModelLoop, Noise, closed_loop, closed_loops
 from gpmpc.systems import System, step
 
 F = torch.float64
@@ -245,7 +246,7 @@ def test_rows_that_are_no_table_of_numbers_are_refused(rows):
         (
             {"nominal": lambda x, u: x.numpy()},
             SettingError,
-            "nominal: must give a torch tensor; got ndarray",
+            "nominal: must be written with torch.*takes numbers out of a tensor",
         ),
         (
             {"B": torch.eye(3, dtype=F)},
@@ -362,3 +363,118 @@ def test_tracking_errors_of_axes_that_are_not_there_are_refused():
         ShapeError, match=r"axes must be states from 0 to 1; got \(0, 2, 4\)"
     ):
         metrics.tracking_error(np.zeros((3, 2)), np.zeros((3, 2)), (0, 2, 4))
+
+
+NO_NUMBERS = {
+    "complex array": np.array([1j, 0.0]),
+    "complex list": [1j, 0.0],
+    "complex tensor": torch.zeros(2, dtype=torch.complex128),
+    "text": "ab",
+    "texts": ["0.1", "0.2"],
+    "dictionary": {"position": 0.1, "velocity": 0.0},
+    "nothing": None,
+    "nothings": [None, None],
+    "truth values": [True, False],
+    "dates": np.array(["2020-01-01"] * 2, "datetime64[D]"),
+    "objects": [object(), 1.0],
+    "rows of two lengths": [[1.0], [2.0, 3.0]],
+    "tensor of a graph": torch.zeros(2, dtype=F, requires_grad=True),
+    "list of tensors of a graph": [torch.zeros(2, dtype=F, requires_grad=True)] * 2,
+}
+PLANT = System(Oscillator(), 0.1)
+STEPS = np.zeros((9, 2))
+
+
+def fly(**changed):
+    given = {
+        "system": PLANT,
+        "controller": controller(),
+        "references": STEPS,
+        "initial": [0.0, 0.0],
+        "steps": 2,
+    }
+    return closed_loop(**given | changed)
+
+
+def in_rows(value):
+    return value[None] if hasattr(value, "shape") else [value]
+
+
+def control(**changed):
+    given = {"belief": belief(), "reference": Reference(np.zeros(2))}
+    return controller().control(**given | changed)
+
+
+TAKES_NUMBERS = {
+    "Transitions, states": lambda x: Transitions(in_rows(x), [[0.0]], [[0.0, 0.0]]),
+    "Transitions, next": lambda x: Transitions([[0.0, 0.0]], [[0.0]], in_rows(x)),
+    "Recording": lambda x: calibration.Recording([x, x], [[0.0]]),
+    "step, state": lambda x: step(PLANT, x, [0.0]),
+    "step, input": lambda x: step(PLANT, [0.0, 0.0], x),
+    "closed_loop, initial": lambda x: fly(initial=x),
+    "closed_loop, references": lambda x: fly(references=x),
+    "closed_loop, model loop": lambda x: fly(
+        system=ModelLoop(posterior(), Linearization(), 0.1), initial=x
+    ),
+    "closed_loops, initial": lambda x: closed_loops(
+        PLANT, controller(), STEPS, x, 2, seeds=2
+    ),
+    "ControlLoop, state": lambda x: ControlLoop(controller()).input(x, [0.0, 0.0]),
+    "ControlLoop, reference": lambda x: ControlLoop(controller()).input([0.0, 0.0], x),
+    "Lags": lambda x: Lags(2, 1).transitions([x, x, x], np.zeros((3, 1))),
+}
+# What torch may follow, or what None stands for nothing in.
+TAKES_TENSORS = {
+    "certain": Gaussian.certain,
+    "predict, state": lambda x: posterior().predict(x, torch.zeros(1, dtype=F)),
+    "Reference, set point": lambda x: control(reference=Reference(x)),
+    "propagate": lambda x: Linearization()(posterior(), belief(), x),
+    "update": lambda x: filter_of_states().update(belief(), x),
+    "predict of a filter": lambda x: filter_of_states().predict(belief(), x),
+    "augmented": lambda x: DelayedModel(posterior(), 2).augmented(belief(), x),
+}
+TAKES_NOTHING = {
+    "Reference, inputs": lambda x: control(reference=Reference(np.zeros(2), x)),
+    "parameters": lambda x: control(parameters=x),
+    "plan": lambda x: control(plan=x),
+    "reference of LeastSquares": lambda x: LeastSquares(lambda at: at, [1.0, 1.0], x),
+    "Box": lambda x: Box(x),
+    "Noise": lambda x: fly(noise=Noise(process=x)),
+}
+
+
+def filter_of_states():
+    measurement = Measurement.of_states(2, [0, 1], [0.1, 0.1])
+    return KalmanFilter.extended(posterior(), measurement)
+
+
+def refuses(call, value):
+    """Whether a value is refused by one line of ours."""
+    try:
+        call(value)
+    except GpmpcError as error:
+        text = str(error)
+        assert "\n" not in text
+        assert not any(word in text for word in ("numpy()", "float()", "Casting"))
+        return True
+    return False
+
+
+@pytest.mark.parametrize("kind", NO_NUMBERS)
+def test_what_is_no_number_gets_one_line_wherever_numbers_are_taken(kind):
+    value = NO_NUMBERS[kind]
+    for name, call in TAKES_NUMBERS.items():
+        assert refuses(call, value), name
+    for name, call in TAKES_TENSORS.items():
+        assert refuses(call, value) or kind == "tensor of a graph", name
+    for name, call in TAKES_NOTHING.items():
+        assert refuses(call, value) or kind in ("nothing", "tensor of a graph"), name
+
+
+def test_a_state_that_is_no_number_is_named():
+    with pytest.raises(DataError, match="the initial state must be real numbers; got"):
+        fly(initial={"position": 0.1, "velocity": 0.0})
+    with pytest.raises(DataError, match=r"tensor of a graph: .* tensor.detach\(\)"):
+        step(PLANT, torch.zeros(2, requires_grad=True), [0.0])
+    with pytest.raises(DataError, match="got object, such as NoneType"):
+        step(PLANT, [None, 1.0], [0.0])

@@ -86,7 +86,11 @@ CASES = [
         "time_step",
         (0.0, -1.0, math.nan),
     ),
-    (lambda **settings: System(Rotational(), **settings), "substeps", (0, 1.5, -2)),
+    (
+        lambda **settings: System(Rotational(), 1.0, **settings),
+        "substeps",
+        (0, 1.5, -2),
+    ),
     (Translational, "mass", (0.0, -0.74, math.nan)),
     (Translational, "frozen_attitude", ((1.0, math.nan), (1.0, 2.0, 3.0))),
     (Coupled, "mass", (0.0, math.inf)),

@@ -25,6 +25,7 @@ from gpmpc.plotting import (
     tracking_figure,
 )
 from gpmpc.recording import Run, read_run
+from gpmpc.signals import Signals
 from gpmpc.studies._document import Document, Table, terminal
 from gpmpc.studies._run_folder import RECORDING
 
@@ -107,8 +108,6 @@ def _experiment_of(run: Run) -> "Experiment":
 
 def calibrate(given: argparse.Namespace) -> Result:
     """Predicts flights from each of their steps with a run's model: errors, and how often 95 % intervals hold."""
-    import torch
-
     from gpmpc import calibration
     from gpmpc.studies.study import one_thread
 
@@ -152,7 +151,7 @@ def calibrate(given: argparse.Namespace) -> Result:
                 experiment.training_rows(), experiment.seed
             ).posterior
     flown = [
-        calibration.Recording(torch.tensor(run.states), torch.tensor(run.inputs[:-1]))
+        calibration.Recording(run.states, run.inputs[:-1], _signals_of(run))
         for run in flights
     ]
     horizon = min(given.steps, max(map(len, flown)))
@@ -199,6 +198,12 @@ def calibrate(given: argparse.Namespace) -> Result:
     console.print(terminal([table]))
     console.out(*notes, where, sep="\n", highlight=False)
     return Result({"folder": str(folder), "rows": document.data.to_dict("records")})
+
+
+def _signals_of(run: Run) -> Signals:
+    """Names and time step of a recorded flight of two steps or more."""
+    time_step = float(run.times[-1] - run.times[0]) / (len(run.times) - 1)
+    return Signals(run.state_names, run.input_names, time_step)
 
 
 def report(given: argparse.Namespace) -> Result:

@@ -20,6 +20,7 @@ from gpmpc.exceptions import DataError, SettingError, check_number, check_number
 from gpmpc.gp import Transitions
 from gpmpc.mpc import problem as mpc
 from gpmpc.mpc.baselines import NMPC
+from gpmpc.signals import Signals
 from gpmpc.simulation import Noise, Rollout, closed_loop
 from gpmpc.systems import (
     ATTITUDES,
@@ -122,6 +123,8 @@ class NMPCData:
     ) -> Transitions:
         """Flies the trajectory by the plants of these settings, and for the rotational subsystem its attitude."""
         along = check_quadrotor(system, trajectory)
+        # Without a time step: a map goes from state to state, whatever the time is.
+        signals = Signals(system.state_names, system.input_names)
         steps = (
             self.samples + self.horizon
         )  # the attitude's references reach this far beyond its last step
@@ -133,12 +136,11 @@ class NMPCData:
         )  # x, y, z
         outer = self.translational.fly(references, self.horizon, steps)
         if system.name == "translational":
-            return _transitions(outer, self.samples)
+            return _transitions(outer, self.samples, signals)
         references = np.zeros((steps, 6))  # psi and the rates are to be zero
         references[:, [0, 2]] = _attitudes(outer, self.attitude)
-        return _transitions(
-            self.rotational.fly(references, self.horizon, self.samples), self.samples
-        )
+        inner = self.rotational.fly(references, self.horizon, self.samples)
+        return _transitions(inner, self.samples, signals)
 
 
 @dataclass(frozen=True)
@@ -174,10 +176,13 @@ class PaperData:
         return data[: self.samples]
 
 
-def _transitions(flight: Rollout, samples: int) -> Transitions:
+def _transitions(flight: Rollout, samples: int, signals: Signals) -> Transitions:
     """The first transitions of a flight."""
     return Transitions(
-        flight.states[:samples], flight.inputs[:samples], flight.states[1 : samples + 1]
+        flight.states[:samples],
+        flight.inputs[:samples],
+        flight.states[1 : samples + 1],
+        signals,
     )
 
 
@@ -287,7 +292,7 @@ class ExcitedData:
         )
         flight = self.translational.fly(outer, references, self.samples, self.seed)
         if system is outer:
-            return _transitions(flight, self.samples)
+            return _transitions(flight, self.samples, system.signals)
         streams = np.random.SeedSequence([self.seed, SUBSYSTEMS.index("rotational")])
         angles, count = (
             _attitudes(flight, self.attitude),
@@ -302,6 +307,5 @@ class ExcitedData:
             chosen, count, self.hold, system.time_step, self.response_time
         )
         seed = int(streams.generate_state(1)[0])
-        return _transitions(
-            self.rotational.fly(system, references, self.samples, seed), self.samples
-        )
+        inner = self.rotational.fly(system, references, self.samples, seed)
+        return _transitions(inner, self.samples, system.signals)

@@ -112,9 +112,8 @@ class RandomData:
                     break
                 state = after
             if len(rows) == self.samples:
-                return Transitions(
-                    *(np.array(column) for column in zip(*rows, strict=True))
-                )
+                states, inputs, after = map(np.array, zip(*rows, strict=True))
+                return Transitions(states, inputs, after, system.signals)
         raise DataError(
             f"{system.name}: only {len(rows)} of {self.samples} random steps stayed near the region"
         )

@@ -15,6 +15,7 @@ The update is computed from a root of Sigma-, not by the difference that it is w
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -22,6 +23,7 @@ import torch
 from torch import Tensor
 
 from gpmpc._angles import state_difference
+from gpmpc._arrays import read_array
 from gpmpc._dynamics import (
     Array,
     DynamicsModel,
@@ -30,6 +32,7 @@ from gpmpc._dynamics import (
     check_query,
     predict_with_jacobian,
 )
+from gpmpc._functions import call
 from gpmpc.estimation._conditioning import (
     condition,
     covariance_root,
@@ -42,6 +45,7 @@ from gpmpc.gaussian import Gaussian, check_tensors
 from gpmpc.models._nominal import linearize_function
 from gpmpc.propagation import Linearization, Propagator, Unscented
 from gpmpc.propagation._propagator import checked_input
+from gpmpc.signals import signals_of
 
 
 @dataclass(frozen=True)
@@ -112,7 +116,7 @@ class Measurement(TensorModel):
     def predict(self, state: Tensor, input: Tensor | None = None) -> Gaussian:
         """What is measured at a certain state (*batch, p), without the noise."""
         check_query(self, state, state[..., :0] if input is None else input)
-        value = self.function(state)
+        value = call("function", self.function, state)
         if not isinstance(value, Tensor) or value.shape != (
             *state.shape[:-1],
             self.output_dim,
@@ -130,7 +134,10 @@ class Measurement(TensorModel):
         self, states: Array, inputs: Array, covariance: bool = True
     ) -> Linearized:
         """Linearises h at K points (K, n); ``inputs`` is (K, 0)."""
-        value, A = linearize_function(self.function, self, states)
+        function = self.function
+        if not hasattr(function, "linearize"):
+            function = partial(call, "function", function)
+        value, A = linearize_function(function, self, states)
         K, p = value.shape
         return Linearized(
             value, A, np.zeros((K, p, 0)), np.zeros((K, p, p)) if covariance else None
@@ -208,6 +215,8 @@ class KalmanFilter:
                 "propagator", f"{rule}; got {type(propagator).__name__} without"
             )
         self.model, self.measurement, self.propagator = model, measurement, propagator
+        self._names = signals_of(model)
+        self._measured_names = _measured_names(measurement, self._names.state_names)
         self.observer = Linearization() if observer is None else observer
 
     @classmethod
@@ -224,7 +233,9 @@ class KalmanFilter:
 
     def predict(self, belief: Gaussian, input: Any) -> Gaussian:
         """Moves a belief (*batch, n) on by a step with the input that was applied (*batch, m)."""
-        return self.propagator(self.model, belief, _like(belief, input))
+        belief = belief.in_order(self._names.state_names)
+        acting = _like(belief, "input", input, self._names.input_names)
+        return self.propagator(self.model, belief, acting)
 
     def update(self, belief: Gaussian, measured: Any) -> Update:
         """Corrects a belief (*batch, n) by a measurement y (*batch, p), whose entries that are not finite are missing.
@@ -232,7 +243,9 @@ class KalmanFilter:
         Raises:
             ShapeError: y has another number of entries.
         """
-        y, R = _like(belief, measured), self.measurement.noise_covariance
+        belief = belief.in_order(self._names.state_names)
+        y = _like(belief, "a measurement", measured, self._measured_names)
+        R = self.measurement.noise_covariance
         expected = (*belief.mean.shape[:-1], len(R))
         if y.shape != expected:
             raise ShapeError(
@@ -276,7 +289,9 @@ class KalmanFilter:
         Raises:
             ShapeError: There is not one measurement more than inputs.
         """
-        inputs, measured = _like(belief, inputs), _like(belief, measured)
+        belief = belief.in_order(self._names.state_names)
+        inputs = _like(belief, "inputs", inputs, self._names.input_names)
+        measured = _like(belief, "measurements", measured, self._measured_names)
         if len(measured) != len(inputs) + 1:
             raise ShapeError(
                 f"T inputs belong to T + 1 measurements; got {len(inputs)} and {len(measured)}"
@@ -385,7 +400,18 @@ class LateMeasurements:
         return self.belief
 
 
-def _like(belief: Gaussian, value: Any) -> Tensor:
+def _measured_names(measurement: Any, state_names: Sequence[str]) -> tuple[str, ...]:
+    """The names of y where it is some of the states; nothing is known otherwise."""
+    function = getattr(measurement, "function", None)
+    if not state_names or not isinstance(function, _Selection):
+        return ()
+    return tuple(state_names[i] for i in function.states)
+
+
+def _like(belief: Gaussian, key: str, value: Any, names: Sequence[str]) -> Tensor:
+    """Numbers as a tensor of a belief's type on its device, in the order of names."""
+    if not isinstance(value, Tensor) or value.is_complex():
+        value = np.array(read_array(key, value, names))
     return torch.as_tensor(value, dtype=belief.mean.dtype, device=belief.mean.device)
 
 

@@ -127,7 +127,7 @@ def with_process_noise(
     p = posterior
     kernel = p.lengthscales, p.signal_variance, variance.to(p.weights)
     return GPPosterior.from_hyperparameters(
-        p.features, p.targets, *kernel, p.input_dim, p.predicts, p.offset
+        p.features, p.targets, *kernel, p.input_dim, p.predicts, p.offset, p.signals
     )
 
 

@@ -91,20 +91,20 @@ def constant_columns(
     return np.ptp(columns, axis=0) <= np.maximum(ROUND_OFF * largest, resolution)
 
 
-def names_of(transitions: Transitions) -> tuple[list[str], list[str]]:
+def signal_names(transitions: Transitions) -> tuple[list[str], list[str]]:
     """Names of the states and of the inputs: the data's own, or numbers from 1."""
-    states = getattr(transitions, "state_names", None)
-    inputs = getattr(transitions, "input_names", None)
+    states = list(transitions.signals.state_names)
+    inputs = list(transitions.signals.input_names)
     if not states:
         states = [f"state {i + 1}" for i in range(transitions.state_dim)]
     if not inputs:
         inputs = [f"input {i + 1}" for i in range(transitions.input_dim)]
-    return list(states), list(inputs)
+    return states, inputs
 
 
 def columns_of(transitions: Transitions, predicts: str) -> Columns:
     """The columns of GPs that learn next states, or differences, of transitions."""
-    states, inputs = names_of(transitions)
+    states, inputs = signal_names(transitions)
     magnitudes = None
     if predicts == "difference":
         magnitudes = transitions.states.abs().amax(dim=0).numpy()

@@ -35,6 +35,7 @@ from gpmpc.gp._kernel import Hyperparameters, Predicts, check_columns
 from gpmpc.gp._posterior import GPPosterior
 from gpmpc.gp._scaling import Scaling, identity
 from gpmpc.gp._sparse import Method, sparse_posterior
+from gpmpc.signals import UNKNOWN, Signals, signals_of
 
 _PROBES = 25  # points at which a model's forward is compared with its parts, twice
 _SAME = 1e-8  # relative difference of two priors that are the same
@@ -59,6 +60,8 @@ def exact_inference() -> Iterator[None]:
 
 class BatchExactGP(gpytorch.models.ExactGP):
     """Independent zero-mean SE-ARD GPs over the same inputs (N, d), one for each column of the targets (N, n)."""
+
+    signals: Signals = UNKNOWN  #: of the posterior that it was made of
 
     def __init__(self, features: Tensor, targets: Tensor):
         batch, d = torch.Size([targets.shape[1]]), features.shape[1]
@@ -97,6 +100,7 @@ class BatchExactGP(gpytorch.models.ExactGP):
 def to_gpytorch(posterior: GPPosterior) -> BatchExactGP:
     """Builds the GPyTorch model of a posterior; its prior mean is a constant that training leaves alone."""
     model = BatchExactGP(posterior.features, posterior.targets)
+    model.signals = posterior.signals
     mean = gpytorch.means.ConstantMean(batch_shape=posterior.offset.shape)
     model.mean_module = mean.requires_grad_(False).double()
     model.mean_module.constant.copy_(posterior.offset)
@@ -116,6 +120,7 @@ def from_gpytorch(
     *,
     input_dim: int,
     predicts: Predicts = "next_state",
+    signals: Signals | None = None,
 ) -> GPPosterior:
     """Freezes trained SE-ARD ExactGPs of GPyTorch: one, a batch (one batch dimension, an output each), or a list.
 
@@ -129,6 +134,7 @@ def from_gpytorch(
         likelihood: Its ``GaussianLikelihood``, or a list of them; the models' own by default.
         input_dim: m.
         predicts: What the training targets mean.
+        signals: Names of states and inputs, and time step; by default those that a model of ``to_gpytorch`` kept.
 
     Raises:
         UnsupportedModel: The kernel, mean or likelihood is another one, transforms are attached, or the model's
@@ -136,6 +142,7 @@ def from_gpytorch(
         ShapeError: The models of a list have other training inputs or inducing points, or there is more than one batch
             dimension.
     """
+    signals = signals_of(model) if signals is None else signals
     rows: list[
         tuple[Tensor, ...]
     ] = []  # targets, length-scales, signal and noise variance, offset
@@ -202,7 +209,7 @@ def from_gpytorch(
     )
     if not inducing:
         return GPPosterior.from_hyperparameters(
-            features, targets, *hyperparameters, input_dim, predicts, offset
+            features, targets, *hyperparameters, input_dim, predicts, offset, signals
         )
     if len(inducing) not in (1, targets.shape[1]) or not _equal(inducing):
         raise ShapeError(
@@ -220,9 +227,10 @@ def from_gpytorch(
         predicts,
         method,
     )
-    return sparse_posterior(*given).unscaled(
+    posterior = sparse_posterior(*given).unscaled(
         identity(features), Scaling(offset, torch.ones_like(offset))
     )
+    return replace(posterior, signals=signals)
 
 
 @dataclass(frozen=True)
@@ -237,6 +245,7 @@ class KernelPosterior(TensorModel):
     ]  #: one a GPyTorch model, each with one output or a batch of them
     input_dim: int  #: m, how many of the last features are controls
     predicts: Predicts  #: what the targets mean
+    signals: Signals = UNKNOWN  #: names and time step of the data, where they are known
 
     _part = property(lambda self: self.parts[0].cholesky)
 
@@ -248,6 +257,7 @@ class KernelPosterior(TensorModel):
         *,
         input_dim: int,
         predicts: Predicts = "next_state",
+        signals: Signals | None = None,
     ) -> "KernelPosterior":
         """Freezes trained ExactGPs in float64, which are copied; arguments are as for ``gpmpc.gp.from_gpytorch``.
 
@@ -261,6 +271,7 @@ class KernelPosterior(TensorModel):
             tuple(_Part.of(one, own) for one, own in _members(model, likelihood)),
             input_dim,
             predicts,
+            signals_of(model) if signals is None else signals,
         )
         widths = sorted({part.features.shape[-1] for part in found.parts})
         if len(widths) > 1:

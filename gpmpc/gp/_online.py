@@ -59,6 +59,9 @@ def append_points(
 ) -> GPPosterior:
     """Appends points x~ = (x, u) (p, n + m) with targets (p, k) to a posterior's data."""
     check_tensors(features=features, targets=targets)
+    for key, value in (("features", features), ("targets", targets)):
+        if value.is_complex():
+            raise SettingError(key, f"must be real numbers; got {value.dtype}")
     features, targets = features.to(posterior.features), targets.to(posterior.features)
     given = {"features": features, "targets": targets}
     check_posterior(given, posterior.input_dim, posterior.predicts, posterior.dtype)

@@ -28,6 +28,7 @@ from gpmpc.gaussian import Gaussian, check_tensors, constant_arrays
 from gpmpc.gp._backend import host_arrays
 from gpmpc.gp._kernel import Hyperparameters, Predicts, check_posterior, factorize
 from gpmpc.gp._scaling import Scaling
+from gpmpc.signals import UNKNOWN, Signals
 
 if TYPE_CHECKING:
     from gpmpc._kernels import Packed
@@ -66,6 +67,7 @@ class GPPosterior(TensorModel):
     weights: Tensor  #: beta = (K + sn2 I)^-1 (y - offset) (k, N)
     input_dim: int  #: m, how many of the last features are certain inputs (controls)
     predicts: Predicts  #: what the targets mean
+    signals: Signals = UNKNOWN  #: names and time step of the data, where they are known
 
     _part = property(lambda self: self.features)
 
@@ -80,6 +82,7 @@ class GPPosterior(TensorModel):
         input_dim: int,
         predicts: Predicts = "next_state",
         offset: Tensor | None = None,
+        signals: Signals = UNKNOWN,
     ) -> "GPPosterior":
         """Factorises K + sn2 I and solves for the weights.
 
@@ -93,6 +96,7 @@ class GPPosterior(TensorModel):
             predicts: ``"next_state"``; ``"difference"`` for targets x[k+1] - x[k]; or ``"value"`` for any function of
                 (x, u) with k outputs, such as the residual of a known model.
             offset: Constant prior means (k,); zero by default.
+            signals: Names of states and inputs, and time step, where they are known.
 
         Raises:
             ShapeError: The shapes do not belong together, or there is no row.
@@ -110,6 +114,7 @@ class GPPosterior(TensorModel):
             "offset": offset,
         }
         check_posterior(given, input_dim, predicts)
+        signals.check_sizes(inputs.shape[1] - input_dim, input_dim)
         inputs, targets, *scales, offset = (value.clone() for value in given.values())
         kernel = Hyperparameters(*scales)
         cholesky = factorize(inputs, *kernel)
@@ -123,7 +128,15 @@ class GPPosterior(TensorModel):
             ]
         )
         return cls(
-            inputs, targets, *kernel, offset, cholesky, weights, input_dim, predicts
+            inputs,
+            targets,
+            *kernel,
+            offset,
+            cholesky,
+            weights,
+            input_dim,
+            predicts,
+            signals,
         )
 
     def unscaled(self, features: Scaling, targets: Scaling) -> "GPPosterior":

@@ -101,13 +101,14 @@ class SparseTrainer:
         targets = transitions.targets(self.predicts)
         warn_of_transitions(transitions)
         warn_of_turns(transitions)
-        return self.fit(
+        training = self.fit(
             transitions.features,
             targets,
             transitions.input_dim,
             seed=seed,
             columns=columns_of(transitions, self.predicts),
         )
+        return training.with_signals(transitions.signals)
 
     def fit(
         self,

@@ -34,6 +34,7 @@ from gpmpc._provenance import now, versions
 from gpmpc.exceptions import DataError, GpmpcError, SettingError, UnsupportedModel
 from gpmpc.gp._kernel import check_posterior
 from gpmpc.gp._posterior import GPPosterior
+from gpmpc.signals import Signals
 
 _FORMAT, _VERSION = "gpmpc model", 2
 _DTYPES = {torch.float64: "float64", torch.float32: "float32"}
@@ -90,6 +91,7 @@ def posterior_parts(
         "states": posterior.state_dim,
         "outputs": posterior.output_dim,
         "points": len(posterior),
+        "signals": posterior.signals.to_header(),
     }
     tensors = {
         f.name: v
@@ -104,20 +106,21 @@ def posterior_of_parts(
     path: Path, header: Any, tensors: Mapping[str, Tensor]
 ) -> GPPosterior:
     """Builds a posterior of a file's header and tensors, after a check of everything."""
-    names = [
-        f.name for f in fields(GPPosterior) if f.name not in ("input_dim", "predicts")
-    ]
+    settings = "input_dim", "predicts", "signals"
+    names = [f.name for f in fields(GPPosterior) if f.name not in settings]
     try:
         found = {name: tensors[name] for name in names}
         predicts, m = header["predicts"], header["input_dim"]
         check_posterior(found, m, predicts, found["features"].dtype)
+        signals = Signals.from_header(header.get("signals"))
+        signals.check_sizes(found["features"].shape[1] - m, m)
     except (GpmpcError, KeyError, TypeError) as error:
         raise DataError(
             f"{path}: not a consistent posterior of {', '.join(names)} ({error})"
         ) from error
     if not bool((found["cholesky"].diagonal(dim1=-2, dim2=-1) > 0).all()):
         raise DataError(f"{path}: the diagonal of cholesky must be positive")
-    return GPPosterior(**found, input_dim=m, predicts=predicts)
+    return GPPosterior(**found, input_dim=m, predicts=predicts, signals=signals)
 
 
 def write_model(

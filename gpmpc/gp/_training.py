@@ -6,7 +6,7 @@ Each output is fitted on its own; see ``gpmpc.gp._search``. What cannot fit the 
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -48,6 +48,7 @@ from gpmpc.gp._search import (
 )
 from gpmpc.gp._transitions import Transitions, check_transitions
 from gpmpc.gp._wrapped import warn_of_turns
+from gpmpc.signals import Signals
 
 _ONE_THREAD = 1000  # points below which LAPACK's threads wait for each other longer than they work
 _GIB = 2**30
@@ -71,6 +72,10 @@ class Training:
         int  #: of the likelihood or of the bound, all starts and outputs together
     )
     seconds: float  #: wall time [s]
+
+    def with_signals(self, signals: Signals) -> "Training":
+        """The training whose posterior carries the names and time step of its data."""
+        return replace(self, posterior=replace(self.posterior, signals=signals))
 
 
 @dataclass(frozen=True)
@@ -136,7 +141,7 @@ class Trainer:
         warn_of_turns(transitions)
         targets = transitions.targets(self.predicts)
         warn_of_transitions(transitions)
-        return self.fit(
+        training = self.fit(
             transitions.features,
             targets,
             transitions.input_dim,
@@ -144,6 +149,7 @@ class Trainer:
             start=start,
             columns=columns_of(transitions, self.predicts),
         )
+        return training.with_signals(transitions.signals)
 
     def refit(
         self,
@@ -168,7 +174,7 @@ class Trainer:
             targets = torch.cat([targets, targets_of(posterior, transitions)])
             warn_of_turns(transitions)
             features = torch.cat([features, transitions.features])
-        return self.fit(
+        training = self.fit(
             features,
             targets,
             posterior.input_dim,
@@ -176,6 +182,7 @@ class Trainer:
             seed,
             start=posterior,
         )
+        return training.with_signals(posterior.signals)
 
     def fit(
         self,

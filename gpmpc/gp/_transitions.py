@@ -2,6 +2,7 @@
 
 They come from arrays, an ``.npz`` file, a CSV file with named columns, or the text format in which Cao, Lai and Alam
 published their data, and are finite float64 of matching shapes; errors name file, row and column.
+Names and time step stand with them where they are known: tables of pandas and CSV files have names.
 """
 
 import csv
@@ -16,6 +17,7 @@ import torch
 from torch import Tensor
 
 from gpmpc._angles import state_difference
+from gpmpc._arrays import labels_of, names_of, order_of, read_array
 from gpmpc._files import existing_file, new_file, write_whole
 from gpmpc.exceptions import (
     DataError,
@@ -26,6 +28,7 @@ from gpmpc.exceptions import (
     check_number,
 )
 from gpmpc.gp._storage import read_npz, write_npz
+from gpmpc.signals import UNKNOWN, Signals, check_signals, signals_of
 
 _NAMES = ("states", "inputs", "next_states")
 _EXPECTED = "a file of transitions"
@@ -35,9 +38,14 @@ _EXPECTED = "a file of transitions"
 class Transitions:
     """N observed transitions of a system with n states and m inputs, as float64.
 
+    Columns of tables are sorted by name, next states like the states: by the same names,
+    or by these with one prefix or suffix (``next_angle``, ``next_rate``).
+
     Raises:
-        ShapeError: The three do not belong together, or there is no row.
-        DataError: An entry is not finite (its row and column are named, from 1), or no number.
+        ShapeError: The three do not belong together, there is no row, or there are not
+            as many names as columns.
+        DataError: An entry is not finite (its row and column are named, from 1), or no
+            number; or a table has other columns than its names say.
 
     >>> data = Transitions(states=[[0.0], [1.0]], inputs=[[0.5], [0.5]], next_states=[[1.0], [2.0]])
     >>> len(data), data[1:].states.tolist()
@@ -47,19 +55,33 @@ class Transitions:
     states: Tensor  #: x[k], (N, n)
     inputs: Tensor  #: u[k], (N, m); m may be zero
     next_states: Tensor  #: x[k+1], (N, n)
+    #: names and time step, where they are known; those of tables' columns by default
+    signals: Signals = UNKNOWN
 
     if TYPE_CHECKING:  # anything that is an array of numbers
 
-        def __init__(self, states: Any, inputs: Any, next_states: Any) -> None: ...
+        def __init__(
+            self,
+            states: Any,
+            inputs: Any,
+            next_states: Any,
+            signals: Signals = UNKNOWN,
+        ) -> None: ...
 
     def __post_init__(self) -> None:
-        for name in _NAMES:
-            try:
-                value = _real(getattr(self, name))
-            except (TypeError, ValueError) as error:
-                raise DataError(
-                    f"{name} must be numbers in rows and columns; {error}"
-                ) from error
+        check_signals(self.signals)
+        signals = Signals(
+            self.signals.state_names or names_of(self.states),
+            self.signals.input_names or names_of(self.inputs),
+            self.signals.time_step,
+        )
+        tables = {
+            "states": _real("states", self.states, signals.state_names),
+            "inputs": _real("inputs", self.inputs, signals.input_names),
+            "next_states": _real_next(self.next_states, self.states, signals),
+        }
+        object.__setattr__(self, "signals", signals)
+        for name, value in tables.items():
             if value.dim() != 2:
                 raise ShapeError(
                     f"{name} must have two dimensions (rows, columns); got shape {tuple(value.shape)}"
@@ -74,6 +96,7 @@ class Transitions:
         if x != after or x[0] != u[0] or not x[0]:
             rule = "states (N, n), inputs (N, m), next_states (N, n) need the same n and number N of rows, one or more"
             raise ShapeError(f"{rule}; got {x}, {u} and {after}")
+        signals.check_sizes(self.state_dim, self.input_dim)
 
     def __len__(self) -> int:
         return len(self.states)
@@ -115,15 +138,16 @@ class Transitions:
 
     def __getitem__(self, rows: slice | Sequence[int]) -> "Transitions":
         """The transitions of some rows, in the order given."""
-        return Transitions(self.states[rows], self.inputs[rows], self.next_states[rows])
+        return Transitions(
+            self.states[rows], self.inputs[rows], self.next_states[rows], self.signals
+        )
 
     def save(self, path: str | Path) -> None:
         """Writes an uncompressed ``.npz`` (no pickle), in one piece or not at all."""
         arrays = {name: getattr(self, name).numpy(force=True) for name in _NAMES}
-        write_whole(
-            new_file(path),
-            write_npz({"format": "gpmpc transitions", "format_version": 1}, arrays),
-        )
+        header: dict[str, Any] = {"format": "gpmpc transitions", "format_version": 1}
+        header["signals"] = self.signals.to_header()
+        write_whole(new_file(path), write_npz(header, arrays))
 
     @classmethod
     def load(cls, path: str | Path) -> "Transitions":
@@ -134,7 +158,9 @@ class Transitions:
         """
         path = existing_file(path, _EXPECTED)
         try:
-            _, arrays = read_npz(path, _NAMES)
+            header, arrays = read_npz(path, _NAMES)
+            said = header.get("signals") if isinstance(header, dict) else None
+            signals = Signals.from_header(said)
         except Exception as error:
             raise DataError(
                 f"{path}: not a readable .npz file of transitions ({error})"
@@ -144,7 +170,8 @@ class Transitions:
             raise DataError(
                 f"{path}: array {missing[0]!r} is missing; expected {', '.join(_NAMES)}"
             )
-        return _with_path(path, *(arrays[name] for name in _NAMES))
+        states, inputs, next_states = (arrays[name] for name in _NAMES)
+        return _with_path(path, states, inputs, next_states, signals)
 
     @classmethod
     def from_text(
@@ -171,6 +198,7 @@ class Transitions:
         states: Sequence[str],
         inputs: Sequence[str],
         next_states: Sequence[str] | None = None,
+        time_step: float | None = None,
     ) -> "Transitions":
         """Reads named columns of a CSV file with a header line.
 
@@ -178,8 +206,11 @@ class Transitions:
             path: The file; separated by commas, or by semicolons or tabs where the header has them.
             states: Names of the columns x[k].
             inputs: Names of the columns u[k].
-            next_states: Names of the columns x[k+1]. ``None`` takes the file for one recording at equal time steps:
-                the next row's states are the next states, and the last row only serves as such.
+            next_states: Names of the columns x[k+1], sorted as the states where they are
+                the states' names with a prefix or suffix. ``None`` takes the file for
+                one recording at equal time steps: the next row's states are the next
+                states, and the last row only serves as such.
+            time_step: Between the two states of a row [s], where it is known.
 
         Raises:
             SettingError: One name was given where a list of them belongs.
@@ -218,16 +249,18 @@ class Transitions:
                 )
         places = {name: header.index(name) for name in wanted}
         table = _table(path, lines, places, len(header), least=1 if next_states else 2)
+        signals = Signals(list(states), list(inputs), time_step)
         column = list(places).index
         x, u, after = (
             table[:, list(map(column, part))]
             for part in (states, inputs, next_states or states)
         )
-        return (
-            _with_path(path, x, u, after)
-            if next_states
-            else _with_path(path, x[:-1], u[:-1], after[1:])
-        )
+        if next_states:
+            named = _without_affixes(list(next_states), signals.state_names)
+            order = order_of(named, signals.state_names)
+            after = after if order is None else after[:, order]
+            return _with_path(path, x, u, after, signals)
+        return _with_path(path, x[:-1], u[:-1], after[1:], signals)
 
 
 def check_transitions(transitions: Any, model: Any = None) -> None:
@@ -240,18 +273,50 @@ def check_transitions(transitions: Any, model: Any = None) -> None:
     if model is not None and (n, m) != (model.state_dim, model.input_dim):
         rule = f"the model has {model.state_dim} states and {model.input_dim} inputs"
         raise ShapeError(f"{rule}; got transitions with {n} and {m}")
+    if model is not None:
+        signals_of(model).check("the model", transitions.signals, "transitions")
 
 
-def _real(values: Any) -> Tensor:
-    """Numbers as float64; what only could be taken for numbers (truth values, text, dates, complex ones) raises."""
-    if not isinstance(values, Tensor):
-        values = np.asarray(values)
-        if values.dtype.kind not in "fiu":
-            raise TypeError(f"got {values.dtype}")
-        values = torch.from_numpy(np.array(values, dtype=np.float64))
-    if values.dtype == torch.bool or values.is_complex():
-        raise TypeError(f"got {values.dtype}")
-    return values.to(torch.float64)
+def _real(key: str, values: Any, names: Sequence[str] = ()) -> Tensor:
+    """A table of numbers as float64, its columns in the order of the names."""
+    real = isinstance(values, Tensor) and values.dtype != torch.bool
+    if real and not (values.is_complex() or values.requires_grad):
+        return values.to(torch.float64)
+    rule = "must be numbers in rows and columns"
+    return torch.from_numpy(np.array(read_array(key, values, names, rule)))
+
+
+def _real_next(values: Any, states: Any, signals: Signals) -> Tensor:
+    """Next states as float64, whose columns stand in the order of the states'.
+
+    Raises:
+        DataError: Both are tables, and no column says which state it belongs to.
+    """
+    ours = signals.state_names or labels_of(states)
+    labels = labels_of(values)
+    table = _real("next_states", values)
+    if not labels or not ours:
+        return table
+    order = order_of(_without_affixes(labels, ours), ours)
+    if order is not None:
+        return table[:, order]
+    if not (names_of(values) and signals.state_names):  # numbers of columns say nothing
+        return table
+    rule = "next_states must have the columns of the states, or these with one prefix"
+    raise DataError(
+        f"{rule} or suffix; got {', '.join(labels)}, states {', '.join(ours)}"
+    )
+
+
+def _without_affixes(labels: Sequence[Any], names: Sequence[Any]) -> Sequence[Any]:
+    """The names in labels that are these between one prefix and one suffix."""
+    if not all(isinstance(label, str) for label in (*labels, *names)):
+        return labels
+    for name in names:
+        prefix, found, suffix = labels[0].partition(name)
+        if found and {f"{prefix}{each}{suffix}" for each in names} == set(labels):
+            return [label.removeprefix(prefix).removesuffix(suffix) for label in labels]
+    return labels
 
 
 def _text(path: str | Path) -> str:
@@ -303,9 +368,13 @@ def _number(path: str | Path, row: int, column: int | str, field: str) -> float:
 
 
 def _with_path(
-    path: str | Path, states: Any, inputs: Any, next_states: Any
+    path: str | Path,
+    states: Any,
+    inputs: Any,
+    next_states: Any,
+    signals: Signals = UNKNOWN,
 ) -> Transitions:
     try:
-        return Transitions(states, inputs, next_states)
+        return Transitions(states, inputs, next_states, signals)
     except GpmpcError as error:
         raise DataError(f"{path}: {error}") from error

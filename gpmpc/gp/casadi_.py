@@ -6,6 +6,7 @@ is written with a dozen matrix nodes of CasADi's MX, whatever N, from which CasA
 (Andersson, Gillis, Horn, Rawlings and Diehl, 2019). Importing this file loads CasADi; ``gpmpc.gp`` does not.
 """
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -13,8 +14,9 @@ import casadi
 import numpy as np
 import torch
 
+from gpmpc._functions import DYNAMICS_RULE, call_dynamics
 from gpmpc._kernels import tape as tapes
-from gpmpc.exceptions import DataError, UnsupportedModel
+from gpmpc.exceptions import DataError, SettingError, UnsupportedModel
 from gpmpc.gp._posterior import GPPosterior
 
 Array = np.ndarray
@@ -58,9 +60,20 @@ def successor_function(plant: Any) -> casadi.Function:
         casadi.SX.sym("x", len(plant.dynamics.state_names)),
         casadi.SX.sym("u", len(plant.dynamics.input_names)),
     )
-    return casadi.Function(
-        "successor", [x, u], [casadi.vertcat(*plant.successor(x, u))]
-    )
+    entries = call_dynamics(plant.successor, x, u)
+    function = casadi.Function("successor", [x, u], [casadi.vertcat(*entries)])
+    _check_numbers(function)
+    return function
+
+
+def _check_numbers(function: casadi.Function) -> None:
+    """Raises ``SettingError`` for a NaN: what math makes of a CasADi symbol."""
+    instructions = function.n_instructions() if function.is_a("SXFunction") else 0
+    for i in range(instructions):
+        constant = function.instruction_id(i) == casadi.OP_CONST
+        if constant and math.isnan(function.instruction_constant(i)):
+            got = "NaN, which math.sin and its like make of a CasADi expression"
+            raise SettingError("dynamics", f"{DYNAMICS_RULE}; got {got}")
 
 
 def _residual(model: Any, x: casadi.MX, u: casadi.MX) -> tuple[casadi.MX, casadi.MX]:

@@ -16,6 +16,7 @@ from gpmpc.exceptions import DataError, SettingError, check_number
 from gpmpc.gp import Transitions
 from gpmpc.logs._kinematics import Array, StateSpace
 from gpmpc.logs._mapping import LogMapping
+from gpmpc.signals import Signals
 
 
 @dataclass(frozen=True)
@@ -136,6 +137,16 @@ class Log:
             for entry in signal.group.entries
         )
 
+    @property
+    def signals(self) -> Signals:
+        """Names of states and inputs, and time step; columns of two topics may share one."""
+        states, inputs = self.space.names, self.input_names
+        return Signals(
+            states if len(set(states)) == len(states) else (),
+            inputs if len(set(inputs)) == len(inputs) else (),
+            self.time_step,
+        )
+
     def split(self, held_out: Sequence[str]) -> tuple["Log", "Log"]:
         """Splits by run: a log of all others, and one of the named runs.
 
@@ -174,7 +185,8 @@ class Log:
     def transitions(self) -> Transitions:
         """All transitions from one row to the next inside a piece, as data of GPs."""
         cut = self.windows(1)
-        return Transitions(cut.states[:, 0], cut.inputs[:, 0], cut.states[:, 1])
+        now, after = cut.states[:, 0], cut.states[:, 1]
+        return Transitions(now, cut.inputs[:, 0], after, self.signals)
 
     def episodes(self) -> list[Recording]:
         """Every piece of two rows or more as a recording for ``gpmpc.calibration``."""
@@ -182,6 +194,7 @@ class Log:
             Recording(
                 torch.from_numpy(run.states[a:b].copy()),
                 torch.from_numpy(run.inputs[a : b - 1].copy()),
+                self.signals,
             )
             for run in self.runs
             for a, b in run.pieces

@@ -5,7 +5,6 @@ its derivatives are central differences, all stages in one batch; the disturbanc
 controller's own estimate.
 """
 
-import re
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
@@ -38,6 +37,7 @@ from gpmpc.logs._kinematics import (
 from gpmpc.logs._learning import Candidate, Learned
 from gpmpc.logs._rollouts import AffineNominal, LogModel, MultirotorNominal, OutputGP
 from gpmpc.models import load_model
+from gpmpc.signals import UNKNOWN, Signals, signals_of
 from gpmpc.systems import System
 
 KIND = "LogModel"
@@ -163,6 +163,7 @@ class LogDynamics:
     input_dim: int  #: number of inputs, m
     time_step: float  #: [s]
     noise: OutputNoise | None = None  #: of its outputs; none by default
+    signals: Signals = UNKNOWN  #: names and time step, where they are known
     dtype, device = torch.float64, torch.device("cpu")
 
     def __post_init__(self) -> None:
@@ -216,12 +217,11 @@ class LogDynamics:
             to_array(input).reshape(-1, self.input_dim),
         )
         mean, covariance = self._mean(x, u), self._covariance(x, u)
-        return Gaussian(
-            *(
-                torch.from_numpy(a).reshape(*batch, *a.shape[1:])
-                for a in (mean, covariance)
-            )
+        mean, covariance = (
+            torch.from_numpy(a).reshape(*batch, *a.shape[1:])
+            for a in (mean, covariance)
         )
+        return Gaussian(mean, covariance)
 
     def linearize(
         self, states: Array, inputs: Array, covariance: bool = True
@@ -283,26 +283,29 @@ class SavedModel:
 
     path: str  #: of the file
     model: DynamicsModel  #: trained
-    state_names: tuple[str, ...] = ()  #: empty where the file has none
-    input_names: tuple[str, ...] = ()  #: likewise
-    time_step: float | None = None  #: [s]; None where the file has none
+    signals: Signals = UNKNOWN  #: names and time step, where the file has them
 
     def check(self, system: System) -> None:
         """Raises ``SettingError`` unless states, inputs and time step are a system's."""
-        for key, dim, names, wanted in (
-            ("states", self.model.state_dim, self.state_names, system.state_names),
-            ("inputs", self.model.input_dim, self.input_names, system.input_names),
+        for key, dim, own, wanted in (
+            (
+                "states",
+                self.model.state_dim,
+                self.signals.state_names,
+                system.state_names,
+            ),
+            (
+                "inputs",
+                self.model.input_dim,
+                self.signals.input_names,
+                system.input_names,
+            ),
         ):
-            own = [re.sub(r"^(state|measured|input)\.", "", name) for name in names]
-            if dim != len(wanted) or (own and own != list(wanted)):
-                found = f"the {key} {', '.join(own) or dim}; {system.name} has {', '.join(wanted)}"
-                raise SettingError("model", f"{self.path} has {found}")
-        if (
-            self.time_step is not None
-            and abs(self.time_step / system.time_step - 1) > 1e-3
-        ):
-            steps = f"{self.time_step:g} s; {system.name} has {system.time_step:g} s"
-            raise SettingError("model", f"{self.path} has time steps of {steps}")
+            if dim != len(wanted):
+                found = f"the {key} {', '.join(own) or dim}"
+                has = f"{system.name} has {', '.join(wanted)}"
+                raise SettingError("model", f"{self.path} has {found}; {has}")
+        self.signals.check(self.path, system.signals, system.name, "model")
 
 
 def load_flyable(path: str | Path) -> SavedModel:
@@ -321,18 +324,20 @@ def load_flyable(path: str | Path) -> SavedModel:
                 "model",
                 f"{path} needs a context ({context}), which is not known in flight",
             )
+        signals = Signals(learned.state_names, learned.input_names, learned.time_step)
         flown = LogDynamics(
-            learned.model, len(learned.input_names), learned.time_step, learned.noise
-        )
-        return SavedModel(
-            str(path),
-            flown,
-            learned.state_names,
-            learned.input_names,
+            learned.model,
+            len(learned.input_names),
             learned.time_step,
+            learned.noise,
+            signals,
         )
-    said = header.get("metadata") or {}
-    states, inputs = (tuple(said.get(key) or ()) for key in ("states", "inputs"))
-    return SavedModel(
-        str(path), load_model(path), states, inputs, said.get("time_step")
-    )
+        return SavedModel(str(path), flown, signals)
+    model = load_model(path)
+    signals = signals_of(model)
+    said = header.get("metadata")  # where names stood before models carried them
+    if signals == UNKNOWN and isinstance(said, dict):
+        signals = Signals(
+            said.get("states") or (), said.get("inputs") or (), said.get("time_step")
+        )
+    return SavedModel(str(path), model, signals)

@@ -9,10 +9,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from gpmpc._arrays import names_of, read_array
 from gpmpc._dynamics import Array
 from gpmpc.exceptions import SettingError, ShapeError, check_number
 from gpmpc.gp import Transitions
 from gpmpc.models._nominal import Affine
+from gpmpc.signals import Signals
 
 
 @dataclass(frozen=True)
@@ -177,6 +179,7 @@ class Lags:
         Of states x_0 .. x_{T-1} (T, n) and inputs (T - 1 or T, m), each applied from the time of its row on;
         ``ShapeError`` where the two do not belong together, or hold too few rows.
         """
+        states, inputs = read_array("states", states), read_array("inputs", inputs)
         T, first = len(states), max(self.states, self.inputs)
         found, shapes = (
             (np.shape(states), np.shape(inputs)),
@@ -192,4 +195,15 @@ class Lags:
     def transitions(self, states: Array, inputs: Array) -> Transitions:
         """Transitions of the state with earlier values, from one log at equal time steps; see ``augmented``."""
         whole, first = self.augmented(states, inputs), max(self.states, self.inputs)
-        return Transitions(whole[:-1], inputs[first : len(states) - 1], whole[1:])
+        applied = read_array("inputs", inputs)[first : len(states) - 1]
+        signals = self._signals(names_of(states), names_of(inputs))
+        return Transitions(whole[:-1], applied, whole[1:], signals)
+
+    def _signals(self, states: Sequence[str], inputs: Sequence[str]) -> Signals:
+        """The names of the state with earlier values, where all of its parts have some."""
+        names = list(states)
+        for lag in range(1, self.states + 1):
+            names += [f"{name}[k-{lag}]" for name in states]
+        for lag in range(1, self.inputs + 1):
+            names += [f"{name}[k-{lag}]" for name in inputs]
+        return Signals(names if len(names) == self.dim else (), inputs)

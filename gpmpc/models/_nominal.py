@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -18,8 +18,10 @@ from gpmpc._dynamics import (
     tensors_for,
     to_array,
 )
+from gpmpc._functions import call
 from gpmpc.exceptions import ShapeError, UnsupportedModel
 from gpmpc.gaussian import Gaussian, check_tensors
+from gpmpc.signals import UNKNOWN, Signals
 
 
 @dataclass(frozen=True)
@@ -82,6 +84,7 @@ class KnownModel:
     function: Callable[[Tensor, Tensor], Tensor]
     state_dim: int  #: n
     input_dim: int  #: m
+    signals: Signals = UNKNOWN  #: names and time step, where they are known
 
     dtype, device = torch.float64, torch.device("cpu")
 
@@ -103,14 +106,17 @@ class KnownModel:
     def predict(self, state: Tensor, input: Tensor) -> Gaussian:
         """The next state (*batch, n), with zero covariance."""
         check_query(self, state, input)
-        mean = self.function(state, input)
+        mean = call("function", self.function, state, input)
         return Gaussian(mean, mean.new_zeros(*mean.shape, self.state_dim))
 
     def linearize(
         self, states: Array, inputs: Array, covariance: bool = True
     ) -> Linearized:
         """Linearises the function at K points (K, n), (K, m)."""
-        mean, A, B = linearize_function(self.function, self, states, inputs)
+        function = self.function
+        if not hasattr(function, "linearize"):
+            function = partial(call, "function", function)
+        mean, A, B = linearize_function(function, self, states, inputs)
         return Linearized(
             mean, A, B, np.zeros((*mean.shape, self.state_dim)) if covariance else None
         )
@@ -219,6 +225,12 @@ def linearize_function(
     """
     if (method := getattr(function, "linearize", None)) is not None:
         return method(*arguments)
+    if len(arguments[0]) == 1:
+        # Of one row Python makes a number (float, math.sin), which has no derivative:
+        # of two it fails.
+        pairs = [np.repeat(argument, 2, axis=0) for argument in arguments]
+        twice = linearize_function(function, model, *pairs)
+        return tuple(part[:1] for part in twice)
     shape: list[torch.Size] = []
 
     def flat(*at: Tensor) -> tuple[Tensor]:

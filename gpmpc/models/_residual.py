@@ -10,6 +10,7 @@ turns between x[k+1] and f0 are no error of f0.
 """
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Any, cast
@@ -26,6 +27,7 @@ from gpmpc._dynamics import (
     tensors_for,
     to_array,
 )
+from gpmpc._functions import call
 from gpmpc.exceptions import SettingError, ShapeError
 from gpmpc.gaussian import Gaussian, check_tensors
 from gpmpc.gp import (
@@ -39,7 +41,7 @@ from gpmpc.gp import (
 from gpmpc.gp._data_checks import (
     RESOLUTION,
     Columns,
-    names_of,
+    signal_names,
     warn_of_transitions,
 )
 from gpmpc.gp._posterior import AffineForm
@@ -48,6 +50,7 @@ from gpmpc.gp._wrapped import warn_of_turns
 from gpmpc.models._features import Features
 from gpmpc.models._nominal import Affine, CasadiFunction, linearize_function
 from gpmpc.models._wrapper import check_like, move
+from gpmpc.signals import UNKNOWN, Signals
 
 Nominal = Callable[[Tensor, Tensor], Tensor]
 Effect = Tensor | Callable[[Tensor], Tensor]
@@ -76,6 +79,7 @@ class ResidualModel(TensorModel):
     angles: Sequence[int] = ()
     #: covariance of the observations (n, n); by default that of d's, B diag(sn2) B', which needs a constant B
     noise: Tensor | None = None
+    signals: Signals = UNKNOWN  #: names and time step of the data, where they are known
 
     _part = property(lambda self: self.residual)
     to = move
@@ -101,6 +105,7 @@ class ResidualModel(TensorModel):
             nominal.check_sizes((n, m), (n, 1))
         if isinstance(self.B, CasadiFunction):
             self.B.check_sizes((n,), (n, gp.output_dim))
+        self.signals.check_sizes(n, m)
         parts: dict[str, tuple[Any, tuple[int, ...]]] = {}
         if not callable(self.B):
             parts["B"] = self.B, (n, gp.output_dim)
@@ -275,7 +280,7 @@ def _nominal(
 
     A function that wraps angles gives them within half a turn of the state's: plans count turns.
     """
-    value = nominal(state, input)
+    value = call("nominal", nominal, state, input)
     if not isinstance(value, Tensor):
         raise SettingError(
             "nominal", f"must give a torch tensor; got {type(value).__name__}"
@@ -295,7 +300,8 @@ def _nominal(
 
 def _effect(B: Effect, state: Tensor) -> Tensor:
     """B (n, k), or of a function (*batch, n, k), at states (*batch, n), checked."""
-    value, rows = (B(state), state.shape) if callable(B) else (B, state.shape[-1:])
+    rows = state.shape if callable(B) else state.shape[-1:]
+    value: Any = call("B", B, state) if callable(B) else B
     check_tensors(B=value)
     if callable(B) and value.shape == rows:  # one output
         value = value[..., None]
@@ -332,6 +338,7 @@ def train_residual(
         list(range(k) if some is None else some)
         for some, k in ((states, n), (inputs, m))
     )
+    _check_derivatives(nominal, B, transitions)
     seen = Features(states, inputs, list(angles), n, m)
     features, targets = _residuals(nominal, B, seen, transitions)
     warn_of_transitions(transitions)
@@ -351,7 +358,15 @@ def train_residual(
         effect = _effect(B, transitions.states)
         noise = (effect @ training.posterior.noise_covariance @ effect.mT).mean(0)
     model = ResidualModel(
-        nominal, training.posterior, B, states, inputs, m, list(angles), noise
+        nominal,
+        training.posterior,
+        B,
+        states,
+        inputs,
+        m,
+        list(angles),
+        noise,
+        transitions.signals,
     )
     return replace(training, posterior=cast(Any, model))
 
@@ -363,7 +378,7 @@ def _columns(transitions: Transitions, B: Effect, seen: Features) -> Columns:
     round-off is that of the states. What it is where no data were seen may be as much as
     a step changes: there the nominal model is right, or it is not.
     """
-    states, inputs = names_of(transitions)
+    states, inputs = signal_names(transitions)
     features: list[str] = []
     for i in seen.states:
         if i in seen.angles:
@@ -388,6 +403,22 @@ def _columns(transitions: Transitions, B: Effect, seen: Features) -> Columns:
         magnitudes=magnitudes.detach().numpy(force=True),
         deviations=deviations.detach().numpy(force=True),
     )
+
+
+def _check_derivatives(nominal: Nominal, B: Effect, transitions: Transitions) -> None:
+    """Raises ``SettingError`` where torch cannot follow a function.
+
+    Training asks for no derivative: only a controller would come upon it. What is wrong
+    with a function's shape is said at all rows.
+    """
+    x, u = to_array(transitions.states[:2]), to_array(transitions.inputs[:2])
+    with suppress(ShapeError):
+        if not hasattr(nominal, "linearize"):
+            linearize_function(
+                partial(_nominal, nominal, angles=()), transitions.states, x, u
+            )
+        if callable(B) and not hasattr(B, "linearize"):
+            linearize_function(partial(_effect, B), transitions.states, x)
 
 
 def _residuals(

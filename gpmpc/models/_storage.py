@@ -32,6 +32,7 @@ from gpmpc.gp._storage import (
 from gpmpc.models._nominal import Affine, CasadiFunction
 from gpmpc.models._residual import ResidualModel
 from gpmpc.models._wrapper import DelayedModel, DisturbedModel, NoisyModel
+from gpmpc.signals import Signals
 
 _MODELS = {
     model.__name__: model
@@ -94,6 +95,8 @@ def _parts(path: Path, model: Any) -> tuple[dict[str, Any], dict[str, Tensor]]:
         value, inner = getattr(model, name), {}
         if isinstance(value, Tensor):
             tensors[name] = value
+        elif isinstance(value, Signals):
+            header[name] = value.to_header()
         elif isinstance(value, Affine):
             inner = vars(Affine(value.A, value.B, value.c))
         elif hasattr(value, "predict"):
@@ -114,6 +117,9 @@ def _built(path: Path, header: Any, tensors: Mapping[str, Tensor]) -> Any:
     parts: dict[str, Any] = {}
     for name in (field.name for field in fields(model)):
         entry = header.get(name)
+        if name == "signals":
+            parts[name] = Signals.from_header(entry)
+            continue
         inner = {
             key.partition("/")[2]: value
             for key, value in tensors.items()

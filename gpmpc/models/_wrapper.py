@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any, cast
 
@@ -12,6 +12,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from gpmpc._angles import angles_of
+from gpmpc._arrays import read_array
 from gpmpc._dynamics import (
     Array,
     DynamicsModel,
@@ -28,6 +29,7 @@ from gpmpc.exceptions import SettingError, ShapeError, check_number, check_numbe
 from gpmpc.gaussian import Gaussian, check_tensors
 from gpmpc.gp import GPPosterior
 from gpmpc.models._nominal import Affine
+from gpmpc.signals import Signals, signals_of
 
 
 class Wrapper(TensorModel):
@@ -55,6 +57,21 @@ class Wrapper(TensorModel):
     def angles(self) -> Sequence[int]:
         """Indices of the states that are angles: those of the model, whose states come first."""
         return angles_of(self.model)
+
+    @property
+    def signals(self) -> Signals:
+        """Names and time step, where the model knows them; further states are named, too."""
+        inner, further = signals_of(self.model), self._further_names
+        if not further or not inner.state_names:
+            return inner
+        names = (*inner.state_names, *further)
+        distinct = len(set(names)) == len(names)  # not so of a delay around a delay
+        return replace(inner, state_names=names if distinct else ())
+
+    @property
+    def _further_names(self) -> list[str]:
+        """Of the states beyond those of the model."""
+        return []
 
 
 def move(model: Any, device: Any = None, dtype: torch.dtype | None = None) -> Any:
@@ -152,6 +169,13 @@ class DelayedModel(_LinearWrapper):
         return math.ceil(self.delay)
 
     @property
+    def _further_names(self) -> list[str]:
+        own = signals_of(self.model).input_names
+        names = own or [f"u{i + 1}" for i in range(self.input_dim)]
+        ages = range(self.pending, 0, -1)
+        return [f"{name}[k-{age}]" for age in ages for name in names]
+
+    @property
     def _share(self) -> float:
         """The part of a step w in which the older of two inputs acts."""
         return self.delay - (self.pending - 1)
@@ -189,6 +213,7 @@ class DelayedModel(_LinearWrapper):
         Raises:
             ShapeError: Another number of inputs.
         """
+        belief = belief.in_order(signals_of(self.model).state_names)
         queue = (
             self._queue(belief, inputs)
             .flatten(-2)
@@ -230,7 +255,9 @@ class DelayedModel(_LinearWrapper):
         )
 
     def _queue(self, belief: Gaussian, inputs: Any) -> Tensor:
-        given = np.asarray(inputs) if not isinstance(inputs, Tensor) else inputs
+        names = signals_of(self.model).input_names
+        real = isinstance(inputs, Tensor) and not inputs.is_complex()
+        given = inputs if real else np.array(read_array("inputs", inputs, names))
         queue = torch.as_tensor(
             given, dtype=belief.mean.dtype, device=belief.mean.device
         )
@@ -287,6 +314,10 @@ class DisturbedModel(_LinearWrapper):
         return self.model.state_dim + self.effect.shape[1]
 
     @property
+    def _further_names(self) -> list[str]:
+        return [f"disturbance{i + 1}" for i in range(self.effect.shape[1])]
+
+    @property
     def noise_covariance(self) -> Tensor:
         """Of the observations, and of the disturbances' changes."""
         return torch.block_diag(self.model.noise_covariance, self._diagonal(self.std))
@@ -305,6 +336,7 @@ class DisturbedModel(_LinearWrapper):
         d is zero, independent, with prior standard deviations ``std`` (q,).
         """
         check_numbers("std", std, q := self.effect.shape[1], least=0)
+        belief = belief.in_order(signals_of(self.model).state_names)
         own = self._diagonal([0.0] * self.model.state_dim + list(std))
         return Gaussian(pad(belief.mean, (0, q)), self._padded(belief.covariance) + own)
 

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from gpmpc._angles import full_turns
+from gpmpc._arrays import names_of, read_array, sorted_columns
 from gpmpc._compiled import call_unchecked, compiled, njit_inner
 from gpmpc.exceptions import (
     DataError,
@@ -24,6 +25,7 @@ from gpmpc.gaussian import Gaussian
 from gpmpc.mpc._linear_quadratic import References
 from gpmpc.mpc.problem import Problem
 from gpmpc.qp import QPSolution, QuadraticProgram
+from gpmpc.signals import UNKNOWN, Signals, check_signals
 from gpmpc.status import Status
 
 Array = np.ndarray
@@ -31,6 +33,7 @@ Array = np.ndarray
 _FAR = 0.9  # of the standard deviation without data
 FEASIBLE = 1e-3  # by how much a suboptimal plan may miss hard bounds, in their units: a next step mends it
 _NO_PLAN = np.empty((0, 0))
+_FLOAT64 = np.dtype(np.float64)
 
 
 @dataclass(frozen=True)
@@ -47,8 +50,17 @@ class Reference:
     #: standard deviations (H,) between the means and the sides of chance constraints, by stage, in the place of the
     #: problem's, such as those of an ``AdaptiveTube``; for covariances of ``zero_order``
     kappas: Array | None = None
+    #: names of states and inputs, where they are known: by default of a series'
+    #: entries, or of a table's columns. A controller sorts by them
+    signals: Signals = UNKNOWN
 
     def __post_init__(self) -> None:
+        plain = type(self.states) is np.ndarray and (
+            self.inputs is None or type(self.inputs) is np.ndarray
+        )
+        if not plain or self.signals is not UNKNOWN:
+            check_signals(self.signals)
+            self._read_names()
         shape, wide = (
             np.shape(self.states),
             None if self.inputs is None else np.shape(self.inputs),
@@ -70,6 +82,40 @@ class Reference:
                 f"kappas must be ({self.horizon},); got {np.shape(self.kappas)}"
             )
 
+    def _read_names(self) -> None:
+        """Turns series and tables into arrays, whose names are known then."""
+        states = self.signals.state_names or names_of(self.states)
+        inputs = self.signals.input_names or names_of(self.inputs)
+        signals = Signals(states, inputs) if states or inputs else UNKNOWN
+        object.__setattr__(self, "signals", signals)
+        for key, names in (
+            ("states", signals.state_names),
+            ("inputs", signals.input_names),
+        ):
+            values = getattr(self, key)
+            if values is not None and not hasattr(values, "detach"):
+                array = read_array(f"reference {key}", values, names)
+                object.__setattr__(self, key, array)
+
+    def in_order(self, signals: Signals) -> "Reference":
+        """The reference, its columns sorted by names; itself where they are not known.
+
+        Raises:
+            DataError: Its own names are others.
+        """
+        states, inputs = self.states, self.inputs
+        if self.signals.state_names and signals.state_names:
+            names = self.signals.state_names
+            states = sorted_columns(
+                "reference states", states, names, signals.state_names
+            )
+        if self.signals.input_names and signals.input_names and inputs is not None:
+            names = self.signals.input_names
+            inputs = sorted_columns(
+                "reference inputs", inputs, names, signals.input_names
+            )
+        return Reference(states, inputs, self.kappas)
+
     def over(self, horizon: int) -> "Reference":
         """The reference itself, or a set point repeated over a horizon."""
         if np.ndim(self.states) == 2:
@@ -77,14 +123,25 @@ class Reference:
         inputs = (
             None if self.inputs is None else np.tile(_array(self.inputs), (horizon, 1))
         )
-        return Reference(
-            np.tile(_array(self.states), (horizon + 1, 1)), inputs, self.kappas
-        )
+        states = np.tile(_array(self.states), (horizon + 1, 1))
+        return Reference(states, inputs, self.kappas, self.signals)
 
     @property
     def horizon(self) -> int:
         """H; 1 for a set point."""
         return len(self.states) - 1 if np.ndim(self.states) == 2 else 1
+
+
+def read_reference(value: Any) -> Reference:
+    """A reference, or the one of a set point (n,) or of states (H + 1, n).
+
+    Raises:
+        DataError: They are no real numbers.
+    """
+    if isinstance(value, Reference):
+        return value
+    read_array("a reference", value)  # says what is no number; a table keeps its names
+    return Reference(value)
 
 
 @dataclass(frozen=True)
@@ -211,17 +268,20 @@ class Request(NamedTuple):
         reference: Reference,
         previous: Decision | None,
         plan: Any = None,
+        signals: Signals = UNKNOWN,
     ) -> "Request":
         """Validates the arguments of ``Controller.control`` for H stages of a problem.
 
         ``initial_input`` is taken for the previous one where there is no decision before; of one that is not applicable
-        only ``input`` counts: what was applied. For ``plan``, and the errors, see ``GPMPC.control``.
+        only ``input`` counts: what was applied. For ``plan``, and the errors, see
+        ``GPMPC.control``. ``signals`` are the controller's, by which a belief and a
+        reference with names are sorted.
         """
-        if not (isinstance(belief, Gaussian) and isinstance(reference, Reference)):
-            raise ShapeError(
-                "control takes a Gaussian (Gaussian.certain(x) for a measured state) and a Reference(states); "
-                f"got {type(belief).__name__} and {type(reference).__name__}"
-            )
+        check_arguments(belief, reference)
+        if belief.names:
+            belief = belief.in_order(signals.state_names)
+        if reference.signals is not UNKNOWN:
+            reference = reference.in_order(signals)
         reference, n, m = reference.over(horizon), problem.state_dim, problem.input_dim
         state, covariance, states = (
             _array(belief.mean),
@@ -293,6 +353,16 @@ class Request(NamedTuple):
         )
 
 
+def check_arguments(belief: Any, reference: Any) -> None:
+    """Raises ``ShapeError`` unless these are what ``control`` takes."""
+    if not (isinstance(belief, Gaussian) and isinstance(reference, Reference)):
+        raise ShapeError(
+            "control takes a Gaussian (Gaussian.certain(x) for a measured state) "
+            "and a Reference(states); "
+            f"got {type(belief).__name__} and {type(reference).__name__}"
+        )
+
+
 def check_method(key: str, value: object, method: str, example: str) -> None:
     """Raises ``SettingError`` unless a setting is an object (no class of them) with a method."""
     if isinstance(value, type) or not hasattr(value, method):
@@ -304,7 +374,12 @@ def check_method(key: str, value: object, method: str, example: str) -> None:
 
 
 def check_controller(
-    problem: Problem, states: int, inputs: int, horizon: int, initial_input: Any
+    problem: Problem,
+    states: int,
+    inputs: int,
+    horizon: int,
+    initial_input: Any,
+    input_names: Sequence[str] = (),
 ) -> Array:
     """Checks the settings that every controller has against its model; returns the initial input as an array (m,)."""
     if not isinstance(problem, Problem):
@@ -312,6 +387,8 @@ def check_controller(
             "problem", f"must be Problem(...); got {type(problem).__name__}"
         )
     check_number("horizon", horizon, least=1, whole=True)
+    if names_of(initial_input):
+        initial_input = read_array("initial_input", initial_input, input_names)
     check_numbers("initial_input", initial_input, inputs)
     if (problem.state_dim, problem.input_dim) != (states, inputs):
         got = f"{problem.state_dim} and {problem.input_dim}"
@@ -321,19 +398,24 @@ def check_controller(
     return np.array(initial_input, dtype=float)
 
 
-def _array(value: Any) -> Array:
-    """A tensor or array as contiguous float64 in host memory."""
-    if hasattr(value, "detach"):
+def _array(value: Any, key: str = "a state, a reference or a plan") -> Array:
+    """A tensor or array as contiguous float64 in host memory.
+
+    ``DataError`` where it is no real numbers.
+    """
+    if type(value) is not np.ndarray and hasattr(value, "detach"):
         try:
             value = value.numpy()
         except (RuntimeError, TypeError):  # on another device, or part of a graph
             value = value.numpy(force=True)
-    return np.ascontiguousarray(value, dtype=np.float64)
+    if type(value) is not np.ndarray or value.dtype is not _FLOAT64:
+        value = read_array(key, value)
+    return np.ascontiguousarray(value)
 
 
 def read_parameters(parameters: Any, horizon: int) -> Array:
     """Returns finite parameters of every stage (H, q), given as these or as (q,)."""
-    values = np.atleast_1d(_array(parameters))
+    values = np.atleast_1d(_array(parameters, "parameters"))
     if values.ndim == 1:
         values = np.tile(values, (horizon, 1))
     if values.ndim != 2 or len(values) != horizon:
@@ -348,7 +430,8 @@ def read_parameters(parameters: Any, horizon: int) -> Array:
 def _read_plan(plan: Any, horizon: int, n: int, m: int) -> tuple[Array, Array | None]:
     """The inputs of a plan, after one more row, and its states where it has some."""
     inputs, states = plan if isinstance(plan, tuple) else (plan, None)
-    inputs, states = _array(inputs), None if states is None else _array(states)
+    inputs = _array(inputs, "inputs of a plan")
+    states = None if states is None else _array(states, "states of a plan")
     if inputs.shape != (horizon, m) or (
         states is not None and states.shape != (horizon + 1, n)
     ):

@@ -13,6 +13,8 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
+from gpmpc._arrays import read_array
+from gpmpc._functions import call
 from gpmpc.exceptions import DataError, SettingError, ShapeError, check_choice
 from gpmpc.models._nominal import CasadiFunction, linearize_function
 
@@ -101,7 +103,7 @@ class LeastSquares:
         reference = (
             np.zeros(weight.shape[-1])
             if self.reference is None
-            else np.array(self.reference, dtype=float)
+            else np.array(read_array("reference", self.reference))
         )
         fits = reference.ndim in (1, 2) and reference.shape[-1] == weight.shape[-1]
         if not (fits and np.isfinite(reference).all()):
@@ -166,15 +168,17 @@ def expand_function(
         known = [torch.as_tensor(argument) for argument in arguments[2:most]]
 
         def stacked(*at: torch.Tensor) -> torch.Tensor:
-            value = function(*at, *known)
-            if not isinstance(value, torch.Tensor) or value.shape[:1] != (len(states),):
+            rows = len(at[0])
+            of_rows = [part.expand(rows, *part.shape[1:]) for part in known]
+            value = call(name, function, *at, *of_rows)
+            if not isinstance(value, torch.Tensor) or value.shape[:1] != (rows,):
                 found = (
                     tuple(value.shape)
                     if isinstance(value, torch.Tensor)
                     else type(value).__name__
                 )
                 raise ShapeError(
-                    f"{name} must give a tensor ({len(states)}, {count}); got {found}"
+                    f"{name} must give a tensor ({rows}, {count}); got {found}"
                 )
             return value.unsqueeze(-1) if value.dim() == 1 else value
 
@@ -251,8 +255,8 @@ def read_numbers(
 ) -> Array:
     """An array from a list."""
     try:
-        array = np.array(value, dtype=float)
-    except (TypeError, ValueError):
+        array = np.array(read_array(key, value))
+    except DataError:
         array = np.empty(())
     if not (array.ndim and array.size):
         raise SettingError(key, f"must be {rule}; got {value!r}")

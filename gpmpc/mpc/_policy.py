@@ -14,6 +14,7 @@ import torch
 from scipy.interpolate import krogh_interpolate
 
 from gpmpc._angles import full_turns
+from gpmpc._arrays import read_array
 from gpmpc.exceptions import (
     SettingError,
     ShapeError,
@@ -22,8 +23,15 @@ from gpmpc.exceptions import (
     check_number,
 )
 from gpmpc.gaussian import Gaussian
-from gpmpc.mpc._controller import Controller, Decision, Reference, Timing
+from gpmpc.mpc._controller import (
+    Controller,
+    Decision,
+    Reference,
+    Timing,
+    read_reference,
+)
 from gpmpc.mpc.problem import Problem
+from gpmpc.signals import UNKNOWN, signals_of
 from gpmpc.status import Status
 
 OnFailure = Literal["previous_plan", "hold", "raise"]
@@ -170,16 +178,13 @@ class ControlLoop:
             ShapeError: State, reference, parameters or plan have other dimensions than the controller.
             SolverFailure: The policy is ``"raise"``.
         """
-        belief = (
-            state
-            if isinstance(state, Gaussian)
-            else Gaussian.certain(np.asarray(state, dtype=float))
-        )
-        wanted = (
-            reference
-            if isinstance(reference, Reference)
-            else Reference(np.asarray(reference, dtype=float))
-        )
+        belief = state
+        if not isinstance(state, Gaussian):
+            names = signals_of(self.controller).state_names
+            belief = Gaussian.certain(read_array("state", state, names))
+        wanted = read_reference(reference)
+        if wanted.signals is not UNKNOWN:
+            wanted = wanted.in_order(signals_of(self.controller))
         known = self.last, self.on_failure, self._steps, parameters, plan
         self._before = self.last
         self.last = command(self.controller, belief, wanted, *known)
@@ -203,7 +208,8 @@ class ControlLoop:
         if self.last is None or self.last.plan is None:
             raise SettingError("input_between", "needs a decision: call input first")
         check_number("share", share, least=0)
-        plan, state = self.last.plan, np.asarray(state, dtype=float)
+        plan = self.last.plan
+        state = read_array("state", state, signals_of(self.controller).state_names)
         stage = min(int(share), len(plan.inputs) - 1)
         input = plan.inputs[stage]
         if state.shape != plan.means.shape[1:]:

@@ -66,6 +66,7 @@ from gpmpc.mpc._stages import (
 )
 from gpmpc.mpc.problem import Problem
 from gpmpc.propagation import Linearization, Propagator
+from gpmpc.signals import signals_of
 
 Array = np.ndarray
 
@@ -146,7 +147,11 @@ class PredictionModel:
         settings: PredictionSettings,
     ):
         self.initial_input = check_controller(
-            problem, *check_next_states(model), horizon, initial_input
+            problem,
+            *check_next_states(model),
+            horizon,
+            initial_input,
+            signals_of(model).input_names,
         )
         check_method("propagator", propagator, "propagate", "Linearization()")
         if not isinstance(settings, PredictionSettings):
@@ -174,6 +179,7 @@ class PredictionModel:
 
     def with_model(self, model: DynamicsModel) -> "PredictionModel":
         """Returns the predictions by another model of as many states and inputs."""
+        signals_of(model).check("the model", self.signals, "the controller", "model")
         other = copy(self)
         other._set_model(model)
         return other
@@ -189,6 +195,7 @@ class PredictionModel:
         self._roll_out = RollOut(model)
         #: what cost or model take for angles: a sensor may show them within a turn
         self.angles = sorted({*self.problem.cost.angles, *angles_of(model)})
+        self.signals = signals_of(model)
 
     def read(
         self,
@@ -201,7 +208,14 @@ class PredictionModel:
         """The arguments of a controller's ``control``, whose dimensions are checked, with the disturbance estimate."""
         problem, H = self.problem, self.horizon
         request = Request.read(
-            problem, H, self.initial_input, belief, reference, previous, plan
+            problem,
+            H,
+            self.initial_input,
+            belief,
+            reference,
+            previous,
+            plan,
+            self.signals,
         )
         if parameters is not None:
             request = request._replace(parameters=read_parameters(parameters, H))

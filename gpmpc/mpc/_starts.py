@@ -19,7 +19,12 @@ import torch
 from gpmpc._angles import full_turns
 from gpmpc.exceptions import SettingError, ShapeError, check_number
 from gpmpc.gaussian import Gaussian
-from gpmpc.mpc._controller import Array, Decision, Reference
+from gpmpc.mpc._controller import (
+    Array,
+    Decision,
+    Reference,
+    check_arguments,
+)
 from gpmpc.mpc._linear_quadratic import References, evaluate_cost
 from gpmpc.mpc._stages import StageCosts, StageLinearizer
 from gpmpc.mpc.gp_mpc import GPMPC
@@ -71,6 +76,7 @@ class ManyStarts:
                 )
         self.problem, self.horizon = controller.problem, controller.horizon
         self.initial_input = controller.initial_input
+        self.signals = controller.signals
         H, m, angles = self.horizon, self.problem.input_dim, self.problem.cost.angles
         if guesses is None:
             guesses = [None, *kicks(self.problem, H, self.initial_input)]
@@ -99,7 +105,10 @@ class ManyStarts:
         parameters: Any = None,
     ) -> Decision:
         """Decides the input for one step; see ``Controller.control``."""
-        reference, state = reference.over(self.horizon), belief.mean.numpy()
+        check_arguments(belief, reference)
+        belief = belief.in_order(self.signals.state_names)
+        reference = reference.in_order(self.signals).over(self.horizon)
+        state = belief.mean.numpy()
         if not np.isfinite(state).all():
             return self.controller.control(belief, reference, previous, parameters)
         best, lowest = None, inf

@@ -35,6 +35,7 @@ from gpmpc._dynamics import DynamicsModel, check_next_states
 from gpmpc._interrupts import interrupts_after
 from gpmpc.exceptions import DataError, SettingError, check_number
 from gpmpc.gaussian import Gaussian
+from gpmpc.gp.casadi_ import successor_function
 from gpmpc.mpc._controller import (
     FEASIBLE,
     Decision,
@@ -50,6 +51,7 @@ from gpmpc.mpc._stages import ConstraintRows, Plan, StageCosts, StageLinearizer
 from gpmpc.mpc.problem import Problem
 from gpmpc.propagation import Linearization, Propagator
 from gpmpc.qp._cvxpy import STATUSES, TIGHT
+from gpmpc.signals import signals_of
 from gpmpc.status import Status
 from gpmpc.systems import System
 
@@ -85,7 +87,10 @@ class NMPC:
         tolerance: float = 1e-10,
     ):
         n, m = len(plant.dynamics.state_names), len(plant.dynamics.input_names)
-        self.initial_input = check_controller(problem, n, m, horizon, initial_input)
+        self.signals = signals_of(plant)
+        self.initial_input = check_controller(
+            problem, n, m, horizon, initial_input, self.signals.input_names
+        )
         check_number("tolerance", tolerance, above=0)
         self.plant, self.problem, self.horizon = plant, problem, horizon
         self._solver, self._bounds = _build(plant, problem, horizon, tolerance)
@@ -97,7 +102,13 @@ class NMPC:
         n, m, H = self.problem.state_dim, self.problem.input_dim, self.horizon
         start = perf_counter()
         request = Request.read(
-            self.problem, H, self.initial_input, belief, reference, previous
+            self.problem,
+            H,
+            self.initial_input,
+            belief,
+            reference,
+            previous,
+            signals=self.signals,
         )
         if not request.finite:
             return request.failed_decision(Status.INVALID_MEASUREMENT)
@@ -168,8 +179,13 @@ class LQR:
         horizon: int,
         initial_input: Sequence[float],
     ):
+        self.signals = signals_of(model)
         self.initial_input = check_controller(
-            problem, *check_next_states(model), horizon, initial_input
+            problem,
+            *check_next_states(model),
+            horizon,
+            initial_input,
+            self.signals.input_names,
         )
         problem.check_plain("LQR")
         if problem.constraints:
@@ -187,7 +203,13 @@ class LQR:
         """The clipped linear-quadratic plan; see ``Controller.control``. Covariances are not predicted."""
         began = perf_counter()
         request = Request.read(
-            self.problem, self.horizon, self.initial_input, belief, reference, previous
+            self.problem,
+            self.horizon,
+            self.initial_input,
+            belief,
+            reference,
+            previous,
+            signals=self.signals,
         )
         if not request.finite:
             return request.failed_decision(Status.INVALID_MEASUREMENT)
@@ -263,6 +285,7 @@ class StateFormMPC:
             TIGHT.get(solver, {}) if options is None else options,
         )
         problem.check_plain("StateFormMPC")
+        self.signals = self.prediction.signals
         self._build(constraints)
 
     def control(
@@ -432,6 +455,7 @@ def _build(
 ) -> tuple[casadi.Function, list[dict[str, np.ndarray]]]:
     """IPOPT on the unknowns (x_1 .. x_H, u_0 .. u_{H-1}, slacks), and the bounds of unknowns and constraints."""
     problem.check_plain("NMPC")
+    successor_function(plant)  # says what CasADi cannot follow
     n, m, H, goal = problem.state_dim, problem.input_dim, horizon, problem.cost
     x0, last = casadi.SX.sym("x0", n), casadi.SX.sym("last", m)
     x, u, r, wanted = (

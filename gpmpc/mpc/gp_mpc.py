@@ -43,6 +43,7 @@ from gpmpc.mpc._stages import Covariance, Plan, price_violations
 from gpmpc.mpc.problem import Problem
 from gpmpc.propagation import Propagator
 from gpmpc.qp import DualActiveSet, QPSolution, QPSolver, QuadraticProgram
+from gpmpc.signals import Signals
 from gpmpc.status import Status
 
 Array = np.ndarray
@@ -111,6 +112,11 @@ class GPMPC:
         if self._prices is not None and not isinstance(self.solver, DualActiveSet):
             rule = "soft constraints need DualActiveSet (penalty=None makes them hard)"
             raise SettingError("solver", f"{rule}; got {type(self.solver).__name__}")
+
+    @property
+    def signals(self) -> Signals:
+        """Names of states and inputs, and time step, as far as the model knows them."""
+        return self.prediction.signals
 
     def control(
         self,

@@ -15,6 +15,7 @@ from gpmpc.gaussian import (
     constant_arrays,
     nearest_positive_semidefinite,
 )
+from gpmpc.signals import Signals, signals_of
 
 
 @dataclass(frozen=True)
@@ -191,6 +192,8 @@ def checked_input(model: Any, belief: Gaussian, input: Tensor | None) -> Tensor:
     """
     if not isinstance(belief, Gaussian):
         raise SettingError("belief", f"must be a Gaussian; got {type(belief).__name__}")
+    if belief.names:
+        signals_of(model).check("the model", Signals(belief.names), "it", "belief")
     input = belief.mean[..., :0] if input is None else input
     check_tensors(input=input)
     if input.dim() == 1 and input.shape[-1] == model.input_dim:

@@ -20,11 +20,24 @@ from gpmpc.exceptions import Diverged, ShapeError, check_number
 from gpmpc.gaussian import Gaussian
 from gpmpc.mpc import Controller, Reference
 from gpmpc.mpc._policy import OnFailure, check_policy, command
+from gpmpc.signals import Signals
 from gpmpc.simulation._disturbances import Disturbance
-from gpmpc.simulation._loop import Flight, Rollout, check_references, window
+from gpmpc.simulation._loop import (
+    Flight,
+    Rollout,
+    check_belongs,
+    check_references,
+    window,
+)
 from gpmpc.simulation._simulator import Noise, PlantSimulator, step_together
 from gpmpc.step import Step
-from gpmpc.systems import Coupled, System, attitude_for_thrust_direction
+from gpmpc.systems import (
+    Coupled,
+    Rotational,
+    System,
+    Translational,
+    attitude_for_thrust_direction,
+)
 
 _OUTER, _INNER = slice(0, 6), slice(6, 12)
 
@@ -108,7 +121,13 @@ def cascade_loop(
             f"a cascade flies the states and inputs of Coupled; got {names}"
         )
     horizon, ratio = cascade.outer.horizon, cascade.ratio
-    references = check_references(references, steps, horizon)
+    slow = Signals(
+        Translational.state_names, Translational.input_names, ratio * plant.time_step
+    )
+    fast = Signals(Rotational.state_names, Rotational.input_names, plant.time_step)
+    check_belongs(cascade.outer, slow, "the outer loop")
+    check_belongs(cascade.inner, fast, "the inner loop")
+    references = check_references(references, steps, horizon, slow)
     simulator = PlantSimulator(plant, initial, disturbances, noise, seed)
     calls: Any = (
         (None, None)

@@ -93,12 +93,10 @@ class Replaced(_Window):
 
     def disturb_plant(self, plant: System, time: float) -> System:
         """Returns the other plant, inside the window; raises where it has other states, inputs or time steps."""
-        ours, theirs = (
-            (p.state_names, p.input_names, p.time_step) for p in (plant, self.plant)
-        )
-        if ours != theirs:
+        if plant.signals != self.plant.signals:
             raise ShapeError(
-                f"a plant must be replaced by one of the same states, inputs, step {ours}; got {theirs}"
+                f"a plant must be replaced by one of the same states, inputs, step {plant.signals}; "
+                f"got {self.plant.signals}"
             )
         return self.plant if self.acts(time) else plant
 

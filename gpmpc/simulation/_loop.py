@@ -24,7 +24,9 @@ from gpmpc.exceptions import (
 )
 from gpmpc.gaussian import Gaussian
 from gpmpc.mpc import Controller, Reference, Timing
+from gpmpc.mpc._controller import read_reference
 from gpmpc.mpc._policy import Command, OnFailure, check_policy, command, commands
+from gpmpc.signals import Signals, signals_of
 from gpmpc.simulation._disturbances import Disturbance
 from gpmpc.simulation._simulator import (
     ModelLoop,
@@ -198,21 +200,33 @@ def window(references: Reference, k: int, horizon: int) -> Reference:
 
 
 def check_references(
-    references: Reference | Array | Sequence[float], steps: int, horizon: int
+    references: Reference | Array | Sequence[float],
+    steps: int,
+    horizon: int,
+    signals: Signals,
 ) -> Reference:
-    """Returns references for all steps, or raises ``ShapeError`` where they are too few or no table."""
+    """Returns references for all steps, their columns in the order of names.
+
+    Raises:
+        ShapeError: They are too few, or no table.
+        DataError: They are no numbers, or have other names.
+    """
     check_number("steps", steps, least=1, whole=True)
-    references = (
-        references
-        if isinstance(references, Reference)
-        else Reference(np.asarray(references, dtype=float))
-    )
-    references, needed = references.over(steps + horizon), steps + horizon
+    needed = steps + horizon
+    references = read_reference(references).in_order(signals).over(needed)
     if len(references.states) < needed:
         raise ShapeError(
             f"{steps} steps with horizon {horizon} need {needed} references; got {len(references.states)}"
         )
     return references
+
+
+def check_belongs(controller: Controller, signals: Signals, plant: str) -> None:
+    """Raises ``SettingError`` where a controller is of something else than the plant.
+
+    That is, of other names of states and inputs, or another time step.
+    """
+    signals_of(controller).check("the controller", signals, plant, "system")
 
 
 def closed_loop(
@@ -247,12 +261,16 @@ def closed_loop(
 
     Raises:
         ShapeError: Too few references for the steps and the horizon, or a state of the wrong length.
-        SettingError: An unknown policy, negative noise, or noise in a model loop.
+        SettingError: An unknown policy, negative noise, noise in a model loop, or a
+            controller of other names of states and inputs, or another time step, than
+            the plant has.
         SolverFailure: A solve failed, and the policy is ``"raise"`` or there was nothing to fall back on.
         Diverged: The system left the finite numbers; ``flown`` holds the steps before.
     """
     check_policy(on_failure)
-    references = check_references(references, steps, controller.horizon)
+    signals = signals_of(system)
+    check_belongs(controller, signals, getattr(system, "name", "the model loop"))
+    references = check_references(references, steps, controller.horizon, signals)
     if not isinstance(system, ModelLoop):
         simulator: Simulator = PlantSimulator(
             system, initial, disturbances, noise, seed
@@ -320,7 +338,9 @@ def closed_loops(
         )
     check_policy(on_failure)
     seeds = _check_seeds(seeds)
-    references = check_references(references, steps, controller.horizon)
+    signals = signals_of(plant)
+    check_belongs(controller, signals, getattr(plant, "name", "the plant"))
+    references = check_references(references, steps, controller.horizon, signals)
     check_number("chunk", chunk, least=1, whole=True)
     finished: list[Trial] = []
     for start in range(0, len(seeds), chunk):

@@ -6,13 +6,14 @@ enters. It shows how a controller and a model get on with each other, not how a 
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, cast
 
 import numpy as np
 import torch
 
 from gpmpc._angles import angles_of
+from gpmpc._arrays import read_array
 from gpmpc._dynamics import DynamicsModel, to_array
 from gpmpc.exceptions import (
     Diverged,
@@ -23,6 +24,7 @@ from gpmpc.exceptions import (
 )
 from gpmpc.gaussian import Gaussian
 from gpmpc.propagation import Propagator
+from gpmpc.signals import Signals, signals_of
 from gpmpc.systems import System, step, step_many
 
 Array = np.ndarray
@@ -38,10 +40,21 @@ class ModelLoop:
 
     model: DynamicsModel  #: it predicts the next state
     propagator: Propagator  #: how the belief is carried on
-    time_step: float = 1.0  #: time that one step stands for [s]
+    #: time that one step stands for [s]; by default the model's, or 1 where it has none
+    time_step: float = cast(float, None)
 
     def __post_init__(self) -> None:
+        known = signals_of(self.model)
+        if self.time_step is None:
+            object.__setattr__(self, "time_step", known.time_step or 1.0)
         check_number("time_step", self.time_step, above=0, unit="[s]")
+        loop = Signals(time_step=self.time_step)
+        known.check("the model", loop, "the model loop", "time_step")
+
+    @property
+    def signals(self) -> Signals:
+        """Names and time step, as far as they are known."""
+        return replace(signals_of(self.model), time_step=self.time_step)
 
 
 @dataclass(frozen=True)
@@ -60,11 +73,11 @@ class Noise:
     def __post_init__(self) -> None:
         for key, values in vars(self).items():
             if values is not None:
-                listed = np.asarray(values, dtype=object).tolist()
-                if not isinstance(listed, list):
+                listed = values.tolist() if hasattr(values, "tolist") else values
+                if not isinstance(listed, Sequence) or isinstance(listed, str):
                     what = f"must be a list of standard deviations, one for every {key if key == 'input' else 'state'}"
                     raise SettingError(f"noise.{key}", f"{what}; got {values!r}")
-                check_numbers(f"noise.{key}", listed, np.size(listed), least=0)
+                check_numbers(f"noise.{key}", listed, len(listed), least=0)
 
 
 class PlantSimulator:
@@ -98,12 +111,20 @@ class PlantSimulator:
             noise or Noise(),
             0,
         )
-        for key, length in (("process", n), ("measurement", n), ("input", m)):
+        for key, length, names in (
+            ("process", n, plant.state_names),
+            ("measurement", n, plant.state_names),
+            ("input", m, plant.input_names),
+        ):
             values = getattr(self.noise, key)
-            if values is not None and len(values) != length:
+            if values is None:
+                continue
+            if len(values) != length:
                 raise ShapeError(
                     f"noise.{key} must have {length} standard deviations; got {len(values)}"
                 )
+            ordered: Any = read_array(f"noise.{key}", values, names)
+            self.noise = replace(self.noise, **{key: ordered})
         # One stream a source: whether states are measured with noise changes nothing about the wind.
         sources = "initial", "process", "measurement", "input"
         streams = map(
@@ -119,10 +140,11 @@ class PlantSimulator:
                 )
             initial = plant.dynamics.reset(seed)
         drawn = isinstance(initial, Gaussian)
-        self.mean, self.covariance = (
-            _check_state(initial.mean if drawn else initial, n),
-            np.zeros((n, n)),
-        )
+        if drawn:
+            initial = initial.in_order(plant.state_names)
+        state = initial.mean if drawn else initial
+        self.mean = _check_state(state, n, plant.state_names)
+        self.covariance = np.zeros((n, n))
         if drawn:
             self.mean = self._streams["initial"].multivariate_normal(
                 self.mean, to_array(initial.covariance)
@@ -187,11 +209,12 @@ class ModelSimulator:
         model, n = loop.model, loop.model.state_dim
         to: Any = {"device": model.device, "dtype": model.dtype}
         mean, covariance = initial, 0.1**2 * torch.eye(n, **to)
+        names = signals_of(model).state_names
         if isinstance(initial, Gaussian):
+            initial = initial.in_order(names)
             mean, covariance = initial.mean, initial.covariance
-        self._belief = Gaussian(
-            torch.as_tensor(_check_state(mean, n), **to), covariance.to(**to)
-        )
+        state = _check_state(mean, n, names)
+        self._belief = Gaussian(torch.as_tensor(state, **to), covariance.to(**to))
 
     @property
     def mean(self) -> Array:
@@ -257,11 +280,9 @@ def step_together(
     ]
 
 
-def _check_state(value: Any, n: int) -> Array:
-    """Returns a finite state (n,) as an array of its own."""
-    state = np.array(
-        value.cpu().numpy() if isinstance(value, torch.Tensor) else value, dtype=float
-    )
+def _check_state(value: Any, n: int, names: Sequence[str]) -> Array:
+    """Returns a finite state (n,) as an array of its own, in the order of names."""
+    state = np.array(read_array("the initial state", value, names))
     if state.shape != (n,):
         raise ShapeError(f"the initial state must have shape ({n},); got {state.shape}")
     if not np.isfinite(state).all():

@@ -100,11 +100,10 @@ class Experiment:
         if self.loop not in ("plant", "model"):
             raise SettingError("loop", f"must be 'plant' or 'model'; got {self.loop!r}")
         plant, system = self.flown, self.system
-        shapes = [(p.state_names, p.input_names, p.time_step) for p in (system, plant)]
-        if shapes[0] != shapes[1]:
+        if system.signals != plant.signals:
             raise SettingError(
                 "plant",
-                f"must have the states, inputs and time step of {system.name}; got {shapes[1]}",
+                f"must have the states, inputs and time step of {system.name}; got {plant.signals}",
             )
         if self.loop == "model" and not self.learns:
             raise SettingError(

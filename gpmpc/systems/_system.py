@@ -4,10 +4,12 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from math import inf, isfinite
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
+from gpmpc._arrays import labels_of, read_array
+from gpmpc._functions import call_dynamics, dynamics_advice
 from gpmpc.exceptions import (
     GpmpcError,
     SettingError,
@@ -15,6 +17,7 @@ from gpmpc.exceptions import (
     check_number,
     check_numbers,
 )
+from gpmpc.signals import Signals
 from gpmpc.trajectories import Trajectory
 
 Array = np.ndarray
@@ -39,7 +42,7 @@ class System:
     """
 
     dynamics: Any  #: names of states and inputs, and how it moves
-    time_step: float = 1.0  #: sampling time [s]
+    time_step: float = cast(float, None)  #: sampling time [s]; it has to be said
     substeps: int = 10  #: Runge-Kutta steps per sampling time
     name: str = ""  #: what it is called; by default as the class of its dynamics
     units: Mapping[str, str] = field(
@@ -116,16 +119,14 @@ class System:
             )
         if self.lost != inf:
             check_number("lost", self.lost, above=0)
-        for key, default in (
-            ("input_lower", (-inf,) * m),
-            ("input_upper", (inf,) * m),
-            ("initial_input", (0.0,) * m),
-            ("goal", (0.0,) * n),
+        for key, default, names in (
+            ("input_lower", (-inf,) * m, inputs),
+            ("input_upper", (inf,) * m, inputs),
+            ("initial_input", (0.0,) * m, inputs),
+            ("goal", (0.0,) * n, states),
         ):
             given = getattr(self, key)
-            self._set(
-                key, default if given is None else _floats(key, given, len(default))
-            )
+            self._set(key, default if given is None else _floats(key, given, names))
         if any(
             low > high
             for low, high in zip(self.input_lower, self.input_upper, strict=True)
@@ -135,7 +136,7 @@ class System:
                 f"must not cross; got {self.input_lower, self.input_upper}",
             )
         if self.start is not None:
-            self._set("start", _floats("start", self.start, n))
+            self._set("start", _floats("start", self.start, states))
         if self.region is not None:
             if len(self.region) != 2:
                 raise SettingError(
@@ -143,17 +144,11 @@ class System:
                     f"must be the smallest and the largest states; got {self.region!r}",
                 )
             self._set(
-                "region", tuple(_floats("region", side, n) for side in self.region)
+                "region", tuple(_floats("region", side, states) for side in self.region)
             )
-        if (known := self.nominal) is not None:
-            own = states, inputs, self.time_step
-            if (
-                found := (known.state_names, known.input_names, known.time_step)
-            ) != own:
-                raise SettingError(
-                    "nominal",
-                    f"must have the states, inputs and time step {own}; got {found}",
-                )
+        if self.nominal is not None and self.nominal.signals != self.signals:
+            rule = f"must have the states, inputs and time step {self.signals}"
+            raise SettingError("nominal", f"{rule}; got {self.nominal.signals}")
         self._check_dynamics()
 
     def _set(self, key: str, value: Any) -> None:
@@ -168,6 +163,11 @@ class System:
     def input_names(self) -> tuple[str, ...]:
         """Names of the m inputs."""
         return tuple(self.dynamics.input_names)
+
+    @cached_property
+    def signals(self) -> Signals:
+        """Names of states and inputs, and time step: what data and models of it carry."""
+        return Signals(self.state_names, self.input_names, self.time_step)
 
     @property
     def stateful(self) -> bool:
@@ -267,6 +267,8 @@ class System:
         except GpmpcError:
             raise
         except Exception as error:
+            if advice := dynamics_advice(error, ("torch",)):  # math takes floats
+                raise SettingError("dynamics", advice) from error
             what = f"must step from state {x} with input {u}"
             raise SettingError(
                 "dynamics", f"{what}; got {type(error).__name__}: {error}"
@@ -288,8 +290,12 @@ def step(plant: System, state: Array, input: Array) -> Array:
 
     Raises:
         ShapeError: State or input are of another length.
+        DataError: They are no real numbers, or have other names than the plant's.
     """
-    shapes = ((len(plant.dynamics.state_names),), (len(plant.dynamics.input_names),))
+    names = plant.dynamics.state_names, plant.dynamics.input_names
+    state = read_array("state", state, names[0])
+    input = read_array("input", input, names[1])
+    shapes = ((len(names[0]),), (len(names[1]),))
     if (found := (np.shape(state), np.shape(input))) != shapes:
         raise ShapeError(
             f"state and input must have shapes {shapes[0]} and {shapes[1]}; got {found[0]} and {found[1]}"
@@ -299,7 +305,7 @@ def step(plant: System, state: Array, input: Array) -> Array:
 
 def step_many(plant: System, states: Array, inputs: Array) -> Array:
     """The next states (T, n) of T copies of a plant, from states (T, n) and inputs (T, m), in one evaluation."""
-    entries = plant.successor(states.T, inputs.T)
+    entries = call_dynamics(plant.successor, states.T, inputs.T)
     return np.stack(
         [
             np.broadcast_to(np.asarray(entry, dtype=float), len(states))
@@ -339,8 +345,11 @@ def _names(dynamics: Any, key: str) -> tuple[str, ...]:
     return tuple(names)
 
 
-def _floats(key: str, values: Any, length: int) -> tuple[float, ...]:
-    """Numbers as floats; None stays for an infinite bound."""
+def _floats(key: str, values: Any, names: Sequence[str]) -> tuple[float, ...]:
+    """Numbers as floats, one a name; None stays for an infinite bound."""
+    length = len(names)
+    if labels_of(values):
+        values = read_array(key, values, names)
     values = values.tolist() if isinstance(values, np.ndarray) else values
     infinite = {"input_lower": -inf, "input_upper": inf}.get(key)
     finite = values

@@ -17,11 +17,11 @@ from gpmpc.systems import (
 from gpmpc.trajectories import Elliptical, Hover, Lorenz
 
 SYSTEMS = {"translational": translational(), "rotational": rotational()}
-TRANSLATIONAL = System(Map(Translational(frozen_attitude=(np.pi / 4, np.pi / 4))))
+TRANSLATIONAL = System(Map(Translational(frozen_attitude=(np.pi / 4, np.pi / 4))), 1.0)
 NMPC_DATA = NMPCData(
     Tracking(TRANSLATIONAL, [21000, 1, 27000, 1, 21000, 1], [1, 1, 1], [7.26, 0, 0]),
     Tracking(
-        System(Map(Rotational())),
+        System(Map(Rotational()), 1.0),
         [27000, 1, 21000, 1, 51000, 1],
         [1.3, 1.5, 1.1],
         [0, 0, 0],
@@ -40,7 +40,7 @@ def elliptical():
 def test_transitions_obey_the_plant_and_follow_each_other(elliptical):
     for part, plant in (
         ("translational", TRANSLATIONAL),
-        ("rotational", System(Map(Rotational()))),
+        ("rotational", System(Map(Rotational()), 1.0)),
     ):
         data = elliptical[part]
         assert len(data) == 189

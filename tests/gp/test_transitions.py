@@ -188,7 +188,8 @@ NUMBERS = [[1, 2], [3, 4]]
     ],
 )  # fmt: skip
 def test_all_kinds_of_numbers_are_taken_as_doubles(values):
-    for taken in vars(Transitions(values, values, values)).values():
+    data = Transitions(values, values, values)
+    for taken in (data.states, data.inputs, data.next_states):
         assert taken.dtype == torch.float64
         assert taken.tolist() == NUMBERS
 

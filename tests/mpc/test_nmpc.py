@@ -44,7 +44,7 @@ def test_on_a_linear_plant_it_is_the_least_squares_solution(rng):
 
 @pytest.mark.parametrize(
     "plant",
-    [System(Map(Rotational())), System(Translational(), time_step=0.5)],
+    [System(Map(Rotational()), 1.0), System(Translational(), time_step=0.5)],
     ids=["map", "integrated"],
 )
 def test_no_small_change_of_the_plan_is_cheaper(plant, rng):
@@ -96,12 +96,12 @@ def test_misuse_is_refused_at_construction(arguments, error, message):
         "initial_input": [0.0] * 3,
     }
     with pytest.raises(error, match=message):
-        NMPC(System(Map(Rotational())), **(good | arguments))
+        NMPC(System(Map(Rotational()), 1.0), **(good | arguments))
 
 
 def test_a_reference_of_another_shape_is_refused():
     controller = NMPC(
-        System(Map(Rotational())),
+        System(Map(Rotational()), 1.0),
         Problem(Tracking([1.0] * 6, [1.0] * 3, penalized="inputs")),
         3,
         [0.0] * 3,
@@ -204,7 +204,7 @@ def test_too_few_references_are_refused_before_the_first_step():
         ShapeError, match="3 steps with horizon 2 need 5 references; got 3"
     ):
         closed_loop(
-            System(Map(DoubleIntegrator())),
+            System(Map(DoubleIntegrator()), 1.0),
             Scripted(),
             np.zeros((3, 2)),
             np.zeros(2),
@@ -250,7 +250,7 @@ def test_a_bad_measurement_is_said_so_and_the_last_plan_is_handed_on():
 
 def test_reference_inputs_of_another_number_are_refused():
     controller = NMPC(
-        System(Map(Rotational())),
+        System(Map(Rotational()), 1.0),
         Problem(Tracking([1.0] * 6, [1.0] * 3, penalized="inputs")),
         3,
         [0.0] * 3,
@@ -275,7 +275,7 @@ def test_a_soft_state_bound_costs_what_it_says_on_either_side(price):
 
     limits = Box([-0.5], [0.2], penalty=price)
     controller = NMPC(
-        System(Map(Shifted())),
+        System(Map(Shifted()), 1.0),
         Problem(Tracking([1.0], [1.0], penalized="inputs"), constraints=[limits]),
         1,
         [0.0],

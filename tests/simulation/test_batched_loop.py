@@ -223,11 +223,11 @@ def test_a_controller_that_answers_one_by_one_flies_many_too_and_divergence_is_o
 @pytest.mark.parametrize(
     "plant",
     [
-        System(Map(Translational(frozen_attitude=(0.7, 0.7)))),
+        System(Map(Translational(frozen_attitude=(0.7, 0.7))), 1.0),
         System(Translational(), 0.3),
         System(Rotational(), 0.1, substeps=2),
         System(Coupled(), 0.05),
-        System(Map(Explosive())),
+        System(Map(Explosive()), 1.0),
     ],
     ids=lambda plant: f"{type(plant).__name__} {type(plant.dynamics).__name__}",
 )

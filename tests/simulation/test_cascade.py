@@ -199,7 +199,7 @@ def test_the_attitudes_asked_for_change_with_the_plan_and_are_approached_at_firs
             "response_time: must be a number above 0",
         ),
         (
-            lambda: fly(Elliptical(), 2, plant=System(Map(Rotational()))),
+            lambda: fly(Elliptical(), 2, plant=System(Map(Rotational()), 1.0)),
             ShapeError,
             "flies the states and inputs of Coupled",
         ),

@@ -296,7 +296,7 @@ def test_a_plant_that_leaves_the_finite_numbers_is_said_so():
     with pytest.raises(
         Diverged, match="step 1: the plant's state is not finite any more"
     ) as caught:
-        fly(plant=System(Exploding(), substeps=1), initial=np.array([0.0, 1.0]))
+        fly(plant=System(Exploding(), 1.0, substeps=1), initial=np.array([0.0, 1.0]))
     assert caught.value.step == 1
     flown = caught.value.flown
     assert flown.states[:, 1] == pytest.approx(
@@ -304,7 +304,7 @@ def test_a_plant_that_leaves_the_finite_numbers_is_said_so():
     )  # what was flown before is kept
     assert len(flown.inputs) == 1
     with pytest.raises(Diverged) as caught:
-        fly(plant=System(Exploding(), substeps=1), initial=np.array([0.0, 1e300]))
+        fly(plant=System(Exploding(), 1.0, substeps=1), initial=np.array([0.0, 1e300]))
     assert caught.value.flown is None
 
 
@@ -354,7 +354,7 @@ def test_a_plant_that_leaves_the_finite_numbers_is_said_so():
             "must be indices of states, 0 to 1; got 2",
         ),
         (
-            {"disturbances": [Replaced(System(Map(Translational())))]},
+            {"disturbances": [Replaced(System(Map(Translational()), 1.0))]},
             ShapeError,
             "replaced by one of the same states",
         ),

@@ -1,3 +1,5 @@
+from functools import partial
+
 import casadi
 import numpy as np
 import pytest
@@ -26,7 +28,7 @@ DYNAMICS = [
 @pytest.mark.parametrize("trajectory", ["Elliptical", "Lorenz"])
 def test_the_authors_data_obey_the_map(paper_data, trajectory, subsystem):
     rows = np.loadtxt(paper_data / f"ds_nmpc_{trajectory}_{subsystem}.txt")
-    plant = System(Map(FROZEN if subsystem == "trans" else Rotational()))
+    plant = System(Map(FROZEN if subsystem == "trans" else Rotational()), 1.0)
     predicted = np.array([step(plant, row[:6], row[6:9]) for row in rows])
     assert np.abs(predicted - rows[:, 9:]).max() < 1e-6 * np.abs(rows[:, 9:]).max()
 
@@ -35,7 +37,7 @@ def test_the_map_is_the_right_hand_side(rng):
     x, u = rng.normal(size=6), rng.normal(size=3)
     m, g = 0.74, 9.81
     expected = [x[1], u[1] * u[0] / m, x[3], u[2] * u[0] / m, x[5], g - 0.5 * u[0] / m]
-    assert np.allclose(step(System(Map(FROZEN)), x, u), expected, rtol=1e-15)
+    assert np.allclose(step(System(Map(FROZEN), 1.0), x, u), expected, rtol=1e-15)
 
 
 def test_the_rotational_coefficients_are_the_decoded_ones():
@@ -87,7 +89,9 @@ def test_one_substep_is_exact_for_the_translational_subsystem(rng):
     assert np.allclose(moved[1::2], x[1::2] + h * acceleration, atol=1e-11)
 
 
-@pytest.mark.parametrize("plant", [Map, System], ids=["map", "integrated"])
+@pytest.mark.parametrize(
+    "plant", [Map, partial(System, time_step=1.0)], ids=["map", "integrated"]
+)
 @pytest.mark.parametrize("dynamics", DYNAMICS, ids=repr)
 def test_casadi_and_numpy_pass_through_the_same_formula(plant, dynamics, rng):
     plant = plant(dynamics)
@@ -103,16 +107,17 @@ def test_casadi_and_numpy_pass_through_the_same_formula(plant, dynamics, rng):
 
 
 def test_no_thrust_direction_beyond_the_horizontal_exists():
-    assert step(System(Map(Translational())), np.zeros(6), np.array([7.0, 2.0, 2.0]))[
-        5
-    ] == pytest.approx(9.81, abs=1e-4)
+    assert step(
+        System(Map(Translational()), 1.0), np.zeros(6), np.array([7.0, 2.0, 2.0])
+    )[5] == pytest.approx(9.81, abs=1e-4)
 
 
 @pytest.mark.parametrize("u", [(7.0, 1.0, 0.0), (7.0, 0.9, 0.9), (0.0, 0.0, 0.0)])
 def test_the_derivative_exists_at_and_beyond_a_horizontal_thrust(u):
     x, control = casadi.SX.sym("x", 6), casadi.SX.sym("u", 3)
     jacobian = casadi.jacobian(
-        casadi.vertcat(*System(Map(Translational())).successor(x, control)), control
+        casadi.vertcat(*System(Map(Translational()), 1.0).successor(x, control)),
+        control,
     )
     assert np.isfinite(
         np.array(casadi.Function("J", [x, control], [jacobian])(np.zeros(6), u))
@@ -157,7 +162,7 @@ def test_the_papers_attitude_has_its_slip_and_saturates():
             "time_step: must be a number above 0",
         ),
         (
-            lambda: System(Rotational(), substeps=0),
+            lambda: System(Rotational(), 1.0, substeps=0),
             "substeps: must be a whole number, 1 or more; got 0",
         ),
         (

@@ -1,0 +1,205 @@
+"""Calls functions that users write; says what to write for names of other libraries.
+
+torch follows its own functions alone. numpy asks a tensor for its numbers, math for one
+number: both fail with a sentence about tensors, which says nothing of what to write, or
+lose a derivative without a word. Dynamics take floats, arrays and CasADi expressions:
+math and torch do not.
+"""
+
+import dis
+from collections.abc import Callable, Iterator, Sequence
+from types import CodeType, FrameType, TracebackType
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gpmpc.exceptions import GpmpcError, SettingError
+
+_LOST = (TypeError, ValueError, RuntimeError, AttributeError, NotImplementedError)
+_OURS = ("gpmpc", "torch", "numpy", "casadi")  # packages whose frames no user wrote
+_NUMBERS = ("numpy", "math", "cmath", "scipy")  # what torch does not follow
+_TORCH = {  # where torch calls the same function otherwise
+    "array": "stack (of numbers torch.tensor)",
+    "fabs": "abs",
+    "absolute": "abs",
+    "power": "pow",
+    "max": "amax",
+    "min": "amin",
+}
+_RULE = "must be written with torch, which follows its own functions alone"
+_OTHERWISE = "or as a CasADi function"
+_PLAIN = {  # what floats, arrays and CasADi take in the place of a function of math
+    "sin": "gpmpc.systems.sin",
+    "cos": "gpmpc.systems.cos",
+    "exp": "gpmpc.systems.exp",
+    "sqrt": "**0.5",
+    "pow": "**",
+    "fabs": "abs",
+}
+DYNAMICS_RULE = (
+    "must be written with plain arithmetic and sin, cos, exp of gpmpc.systems, "
+    "for floats, arrays and CasADi"
+)
+
+
+def call(key: str, function: Callable[..., Any], *arguments: Tensor) -> Any:
+    """Calls a function of tensors that a user wrote.
+
+    Args:
+        key: What the function is, for the message.
+        function: In torch.
+        arguments: Of it.
+
+    Raises:
+        SettingError: It failed where it calls numpy or math, or takes numbers out of a
+            tensor; or its value is one that torch did not follow. Any other error of
+            its own is left as it is.
+    """
+    try:
+        value = function(*arguments)
+    except GpmpcError:
+        raise
+    except _LOST as error:
+        advice = _advice(function, error)
+        if advice is None:
+            raise
+        raise SettingError(key, f"{_RULE}: {advice}, {_OTHERWISE}") from error
+    if torch.is_grad_enabled() and isinstance(value, Tensor):
+        _check_followed(key, value, arguments)
+    return value
+
+
+def call_dynamics(function: Callable[..., Any], *arguments: Any) -> Any:
+    """Calls the dynamics of a system on arrays or CasADi expressions.
+
+    Raises:
+        SettingError: They failed where they call math or torch. Any other error of
+            their own is left as it is.
+    """
+    try:
+        return function(*arguments)
+    except GpmpcError:
+        raise
+    except _LOST as error:
+        advice = dynamics_advice(error, ("math", "cmath", "torch"))
+        if advice is None:
+            raise
+        raise SettingError("dynamics", advice) from error
+
+
+def dynamics_advice(error: BaseException, packages: Sequence[str]) -> str | None:
+    """The rule that dynamics broke which failed in one of these packages; or None."""
+    foreign = _foreign_calls(error, packages)
+    if not foreign:
+        return None
+    names = [f"{_plain_name(name)} for {name}" for name in foreign]
+    return f"{DYNAMICS_RULE}: {', '.join(names)}"
+
+
+def _check_followed(key: str, value: Tensor, arguments: tuple[Tensor, ...]) -> None:
+    """Raises ``SettingError`` where values (K, ...) change and torch lost them.
+
+    Their derivatives would be taken for zero. One row says nothing, nor does a value
+    that depends on further arguments.
+    """
+    if value.requires_grad or not all(one.requires_grad for one in arguments):
+        return
+    if not value.dim() or bool((value == value[:1]).all() | value.isnan().any()):
+        return
+    lost = "its values change, and their derivatives are lost"
+    ways = "by numpy, math, torch.tensor, .detach() or .item()"
+    raise SettingError(key, f"{_RULE}: {lost} ({ways}), {_OTHERWISE}")
+
+
+def _advice(function: Any, error: BaseException) -> str | None:
+    """What to write in the place of what failed; None where the fault is another."""
+    if _is_of(function, _NUMBERS):  # the function itself is one of them
+        foreign = [f"{_package_of(function)}.{function.__name__}"]
+    else:
+        foreign = _foreign_calls(error, _NUMBERS)
+    if foreign:
+        return ", ".join(f"{_name_in_torch(name)} for {name}" for name in foreign)
+    text = str(error)
+    if "numpy() on Tensor" in text or ("converted to" in text and "ensor" in text):
+        return "it takes numbers out of a tensor (float, .item(), .numpy())"
+    return None
+
+
+def _frame_of_user(traceback: TracebackType | None) -> tuple[FrameType, int] | None:
+    """The innermost frame that a user wrote, and the line where it stopped."""
+    found = None
+    while traceback is not None:
+        module = str(traceback.tb_frame.f_globals.get("__name__", ""))
+        if module.partition(".")[0] not in _OURS:
+            found = traceback.tb_frame, traceback.tb_lineno
+        traceback = traceback.tb_next
+    return found
+
+
+def _foreign_calls(error: BaseException, packages: Sequence[str]) -> list[str]:
+    """Functions of packages on the line where a user's code stopped, by its names."""
+    frame = _frame_of_user(error.__traceback__)
+    if frame is None:
+        return []
+    names = [name for name, value in _names_on(*frame) if _is_of(value, packages)]
+    return list(dict.fromkeys(names))
+
+
+def _names_on(frame: FrameType, line: int) -> Iterator[tuple[str, Any]]:
+    """Every name on a line, such as ``np.linalg.norm``, and what it stands for."""
+    known = {**frame.f_globals, **frame.f_locals}
+    name, value = "", None
+    for instruction in _instructions(frame.f_code, line):
+        if instruction.opname in ("LOAD_ATTR", "LOAD_METHOD") and name:
+            name = f"{name}.{instruction.argval}"
+            value = getattr(value, instruction.argval, None)
+            continue
+        if name:
+            yield name, value
+        name = ""
+        if instruction.opname.startswith("LOAD_") and isinstance(
+            instruction.argval, str
+        ):
+            name, value = instruction.argval, known.get(instruction.argval)
+    if name:
+        yield name, value
+
+
+def _instructions(code: CodeType, line: int) -> Iterator[dis.Instruction]:
+    """The instructions of one line."""
+    current = None
+    for instruction in dis.get_instructions(code):
+        started = instruction.starts_line
+        if isinstance(started, int) and not isinstance(started, bool):
+            current = started
+        elif started:  # as Python says it from 3.13 on
+            current = getattr(instruction, "line_number", current)
+        if current == line:
+            yield instruction
+
+
+def _is_of(value: Any, packages: Sequence[str]) -> bool:
+    """Whether something is a function of one of these packages."""
+    return callable(value) and _package_of(value) in packages
+
+
+def _package_of(value: Any) -> str:
+    module = getattr(value, "__module__", None) or type(value).__module__
+    return str(module).partition(".")[0]
+
+
+def _name_in_torch(name: str) -> str:
+    """What torch calls a function of numpy or math: mostly the same."""
+    path = name.split(".")[1:] or [name]
+    if path[-1] in _TORCH:
+        return f"torch.{_TORCH[path[-1]]}"
+    found: Any = torch
+    for part in path:
+        found = getattr(found, part, None)
+    return f"torch.{'.'.join(path)}" if callable(found) else "what torch has"
+
+
+def _plain_name(name: str) -> str:
+    """What to write for a function of math or torch in dynamics."""
+    return _PLAIN.get(name.rpartition(".")[2], "plain arithmetic")
