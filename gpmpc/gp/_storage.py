@@ -18,7 +18,8 @@ import io
 import json
 import math
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -31,7 +32,7 @@ from torch import Tensor
 
 from gpmpc._files import existing_file, new_file, write_whole
 from gpmpc._provenance import now, versions
-from gpmpc.exceptions import DataError, GpmpcError, SettingError, UnsupportedModel
+from gpmpc.exceptions import DataError, SettingError, UnsupportedModel
 from gpmpc.gp._kernel import check_posterior
 from gpmpc.gp._posterior import GPPosterior
 
@@ -107,17 +108,29 @@ def posterior_of_parts(
     names = [
         f.name for f in fields(GPPosterior) if f.name not in ("input_dim", "predicts")
     ]
-    try:
+    with consistent(path, f"not a consistent posterior of {', '.join(names)}"):
         found = {name: tensors[name] for name in names}
         predicts, m = header["predicts"], header["input_dim"]
         check_posterior(found, m, predicts, found["features"].dtype)
-    except (GpmpcError, KeyError, TypeError) as error:
-        raise DataError(
-            f"{path}: not a consistent posterior of {', '.join(names)} ({error})"
-        ) from error
     if not bool((found["cholesky"].diagonal(dim1=-2, dim2=-1) > 0).all()):
         raise DataError(f"{path}: the diagonal of cholesky must be positive")
     return GPPosterior(**found, input_dim=m, predicts=predicts)
+
+
+@contextmanager
+def consistent(path: Path, otherwise: str) -> Iterator[None]:
+    """Turns whatever a file's parts raise that do not belong together into one ``DataError`` that names the file."""
+    try:
+        yield
+    except Exception as error:
+        if isinstance(error, DataError) and str(error).startswith(f"{path}: "):
+            raise
+        raise DataError(f"{path}: {otherwise} ({_reason(error)})") from error
+
+
+def _reason(error: Exception) -> str:
+    """The text of an error in one line; its kind where it has no text."""
+    return f"{' '.join(str(error).split()) or type(error).__name__:.500}"
 
 
 def write_model(
@@ -179,7 +192,7 @@ def read_model(path: Path, kind: str) -> tuple[dict[str, Any], dict[str, Tensor]
         }
     except Exception as error:
         raise DataError(
-            f"{path}: damaged; expected a saved {kind} ({' '.join(str(error).split())})"
+            f"{path}: damaged; expected a saved {kind} ({_reason(error)})"
         ) from error
 
 
@@ -250,7 +263,7 @@ def _content(
                 arrays = {name: file.get_tensor(name) for name in wanted}
     except Exception as error:
         what = f"damaged, or not a file of this package; expected a saved {kind}"
-        raise DataError(f"{path}: {what} ({' '.join(str(error).split())})") from error
+        raise DataError(f"{path}: {what} ({_reason(error)})") from error
     if not isinstance(header, dict) or header.get("format") != _FORMAT:
         raise DataError(f"{path}: a file of something else; expected a saved {kind}")
     version = header.get("format_version")
