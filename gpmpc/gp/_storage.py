@@ -128,6 +128,11 @@ def consistent(path: Path, otherwise: str) -> Iterator[None]:
         raise DataError(f"{path}: {otherwise} ({_reason(error)})") from error
 
 
+def brief(value: Any) -> str:
+    """What stands in a file, in one short line."""
+    return f"{' '.join(str(value).split()):.80}"
+
+
 def _reason(error: Exception) -> str:
     """The text of an error in one line; its kind where it has no text."""
     return f"{' '.join(str(error).split()) or type(error).__name__:.500}"
@@ -180,7 +185,7 @@ def read_model(path: Path, kind: str) -> tuple[dict[str, Any], dict[str, Tensor]
     header, arrays = _content(path, kind)
     for got, expected in ((header.get("kind"), kind), (header.get("kernel"), "SE-ARD")):
         if got != expected:
-            raise DataError(f"{path}: holds a {got}; expected a {expected}")
+            raise DataError(f"{path}: holds a {brief(got)}; expected a {expected}")
     try:
         if not _is_npz(path) and header["checksum"] != _checksum(header, arrays):
             raise ValueError(
@@ -218,11 +223,18 @@ def read_npz(
     """
     size = path.stat().st_size
     with zipfile.ZipFile(path) as archive:
-        declared = sum(info.file_size for info in archive.infolist())
+        members = archive.infolist()
+        declared = sum(info.file_size for info in members)
         if declared > _EXPANSION * size:
             raise ValueError(
                 f"declares {declared} bytes, more than a file of {size} bytes can hold"
             )
+        for info in members:
+            if info.filename == _HEADER and info.file_size > _LONGEST:
+                raise ValueError(f"its header is longer than {_LONGEST} characters")
+            name, is_array, _ = info.filename.rpartition(".npy")
+            if is_array and (not names or name in names):
+                _check_array_size(archive, info)
         header = (
             json.loads(archive.read(_HEADER)) if _HEADER in archive.namelist() else None
         )
@@ -242,6 +254,22 @@ def read_npz(
             for name in file.files
             if name != _HEADER and (not names or name in names)
         }
+
+
+def _check_array_size(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> None:
+    """Raises ``ValueError`` where an array says to hold more, or less, than the archive has of it."""
+    with archive.open(info) as member:
+        version = np.lib.format.read_magic(member)
+        if version == (1, 0):
+            header = np.lib.format.read_array_header_1_0(member)
+        else:  # a later version is of names in a structure, which no number has
+            header = np.lib.format.read_array_header_2_0(member)
+        shape, _, dtype = header
+        stored = info.file_size - member.tell()
+    if dtype.hasobject or math.prod(shape) * dtype.itemsize != stored:
+        raise ValueError(
+            f"{info.filename} is an array of shape {shape!s:.80} and {stored} bytes"
+        )
 
 
 def _content(
@@ -269,7 +297,7 @@ def _content(
     version = header.get("format_version")
     if not isinstance(version, int) or not 1 <= version <= _VERSION:
         raise DataError(
-            f"{path}: written in format {version!r} (versions {header.get('versions')}); this version reads up to "
+            f"{path}: written in format {version!r:.80} (versions {brief(header.get('versions'))}); this version reads up to "
             f"{_VERSION}: update gpmpc"
         )
     return header, arrays

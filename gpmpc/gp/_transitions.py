@@ -24,7 +24,7 @@ from gpmpc.exceptions import (
     UnsupportedModel,
     check_number,
 )
-from gpmpc.gp._storage import read_npz, write_npz
+from gpmpc.gp._storage import consistent, read_npz, write_npz
 
 _NAMES = ("states", "inputs", "next_states")
 _EXPECTED = "a file of transitions"
@@ -132,17 +132,15 @@ class Transitions:
             DataError: The file is missing, damaged, or not such a file.
         """
         path = existing_file(path, _EXPECTED)
-        try:
+        with consistent(path, "not a readable .npz file of transitions"):
             _, arrays = read_npz(path, _NAMES)
-        except Exception as error:
-            raise DataError(
-                f"{path}: not a readable .npz file of transitions ({error})"
-            ) from error
         missing = [name for name in _NAMES if name not in arrays]
         if missing:
             raise DataError(
                 f"{path}: array {missing[0]!r} is missing; expected {', '.join(_NAMES)}"
             )
+        if not arrays["states"].size:
+            raise DataError(f"{path}: holds no states")
         return _with_path(path, *(arrays[name] for name in _NAMES))
 
     @classmethod

@@ -47,6 +47,8 @@ from gpmpc.systems import System
 KIND = "LogModel"
 _TEXTS = ("state_names", "input_names", "context_names", "runs")
 _NOISE = ("outputs", "measurement")
+_LONGEST = 10_000  # rows that a model from a file looks back
+_SLOWEST = 1e9  # time step of a model from a file [s]
 _MOST = 2048  # states, inputs or context of a model from a file
 DIFFERENCE = 1e-5  # of central differences, relative to entries above one
 
@@ -121,7 +123,7 @@ def _learned(path: Path, header: dict[str, Any], tensors: dict[str, Tensor]) -> 
     ).shape[1]
     model = LogModel(
         kinematics,
-        _nominal(header["nominal"], kinematics, len(texts["input_names"])),
+        _nominal(header["nominal"], kinematics, texts),
         arrays["theta"],
         tuple(header["history"]),
         header["lag"],
@@ -183,15 +185,18 @@ def _resting(space: StateSpace) -> Array:
 
 
 def _nominal(
-    described: Any, kinematics: Kinematics, inputs: int
+    described: Any, kinematics: Kinematics, texts: dict[str, tuple[str, ...]]
 ) -> MultirotorNominal | AffineNominal:
     name, settings = described
     if name != "MultirotorNominal":  # older files have a Still
         return AffineNominal(kinematics, settings.get("fitted", name != "Still"))
-    motors = settings["motors"]
+    motors, inputs = settings["motors"], len(texts["input_names"])
     if type(motors) is not int or motors != inputs:
         raise DataError(f"a multirotor of {inputs} inputs has no {motors!r:.80} motors")
-    check_number("voltage", settings.get("voltage", 0.0), least=0)
+    voltage = settings.get("voltage", 0.0)
+    check_number("voltage", voltage, least=0)
+    if voltage and not texts["context_names"]:
+        raise DataError("a multirotor whose voltage counts has it in its context")
     if not isinstance(kinematics, RigidBody):
         raise DataError("a multirotor is a rigid body")
     return MultirotorNominal(**settings)
@@ -225,8 +230,12 @@ def _check_learned(learned: Learned, features: int) -> None:
     if max(n, len(learned.input_names), len(learned.context_names)) > _MOST:
         raise DataError(f"the model has more than {_MOST} states or inputs")
     check_number("time_step", learned.time_step, above=0, unit="[s]")
+    if learned.time_step > _SLOWEST:
+        raise DataError(f"time_step must be {_SLOWEST:g} s at most")
     for key, rows in (("lag", model.lag), *(("history", h) for h in model.history)):
         check_number(key, rows, least=0, whole=True, unit="[rows]")
+        if rows > _LONGEST:
+            raise DataError(f"{key} must be {_LONGEST} rows at most; got {rows}")
     if isinstance(model.nominal, AffineNominal):
         parameters = outputs * (features + 1) if model.nominal.fitted else None
     else:

@@ -32,6 +32,7 @@ from gpmpc._trust import (
 from gpmpc.exceptions import DataError, UnsupportedModel, check_number
 from gpmpc.gp import GPPosterior, load_metadata
 from gpmpc.gp._storage import (
+    brief,
     consistent,
     posterior_of_parts,
     posterior_parts,
@@ -91,7 +92,7 @@ def load_model(path: str | Path, trusted: Sequence[str] = ()) -> Any:
     kind = load_metadata(path).get("kind")
     if not isinstance(kind, str) or kind not in _MODELS:
         raise DataError(
-            f"{path}: holds a {str(kind):.80}; expected one of {', '.join(_MODELS)}"
+            f"{path}: holds a {brief(kind)}; expected one of {', '.join(_MODELS)}"
         )
     header, tensors = read_model(path, kind)
     with consistent(path, "not a consistent model"):
@@ -116,7 +117,7 @@ def _check_code(
         elif kind in _CODE_KINDS:
             _check_name(path, field.name, entry.get("path"), trusted)
         elif kind != "operations":
-            raise DataError(f"{field.name} is of an unknown kind, {str(kind):.80!r}")
+            raise DataError(f"{field.name} is of an unknown kind, {brief(kind)}")
 
 
 def _check_name(path: Path, key: str, name: Any, trusted: Sequence[str]) -> None:
@@ -212,12 +213,24 @@ def _fields(
             arguments, value = _function_sizes(name, header, tensors)
             values[name] = _function(name, entry, inner, arguments, value, trusted)
         elif name in header:
-            values[name] = entry
+            values[name] = _plain(name, entry)
         elif name in tensors:
             values[name] = tensors[name]
         elif inner and name == "nominal":
             values[name] = Affine(**inner)
     return values
+
+
+def _plain(name: str, entry: Any) -> Any:
+    """A field that is a number or a list of numbers; ``DataError`` of anything else, which a model may not notice."""
+    numbers = entry if isinstance(entry, list) else [entry]
+    if not all(type(number) in (int, float) for number in numbers):
+        raise DataError(f"{name} must be a number or numbers; got {brief(entry)}")
+    if name == "input_dim":
+        check_number(name, entry, least=0, whole=True)
+    elif name != "delay" and not isinstance(entry, list):
+        raise DataError(f"{name} must be a list of numbers; got {brief(entry)}")
+    return entry
 
 
 def _function_sizes(
@@ -226,8 +239,7 @@ def _function_sizes(
     """The sizes of the arguments and of the value that a residual model's function must have, by its other parts."""
     square = tensors["noise"] if "noise" in tensors else tensors["B"]
     n, k, m = len(square), tensors["residual/targets"].shape[1], header["input_dim"]
-    check_number("input_dim", m, least=0, whole=True)
-    if max(n, m) > _MOST:
+    if max(n, _plain("input_dim", m)) > _MOST:
         raise DataError(f"the model has more than {_MOST} states, outputs or inputs")
     return ([n, m], [n, 1]) if name == "nominal" else ([n], [n, k])
 
