@@ -23,11 +23,14 @@ from gpmpc._trust import (
 )
 from gpmpc.exceptions import DataError
 
-LONGEST = 2**16  # characters of all settings, of which a flight's own have about 3000
+_LONGEST = 2**16  # characters of all settings, of which a flight's own have about 3000
 _LONGEST_TEXT = 5000  # characters of one entry
-_DEEPEST = 40  # lists and dictionaries inside each other
+_MOST = 4000  # entries, each a value, a list or a dictionary; a flight has about 200
+_DEEPEST = 20  # lists and dictionaries inside each other
 _MARKS = ("_target_", "_partial_", "_args_", "_recursive_", "_convert_")
-_LOOKUPS = ("hydra.utils.get_method", "hydra.utils.get_class")  # code by its ``path``
+_LOOKUPS = tuple(  # code by its ``path``
+    f"hydra.utils.get_{kind}" for kind in ("class", "method", "object", "static_method")
+)
 _LOAD = "gpmpc.logs.load_flyable"
 
 
@@ -38,8 +41,8 @@ def read_settings(text: str) -> dict[str, Any]:
         DataError: They are no YAML of names and values, too long or too deep, or hold an alias, a tag or an
             interpolation.
     """
-    if len(text) > LONGEST:
-        raise DataError(f"its settings are longer than {LONGEST} characters")
+    if len(text) > _LONGEST:
+        raise DataError(f"its settings are longer than {_LONGEST} characters")
     try:
         _check_yaml(text)
         settings = OmegaConf.to_container(OmegaConf.create(text))
@@ -55,8 +58,11 @@ def read_settings(text: str) -> dict[str, Any]:
 
 def _check_yaml(text: str) -> None:
     """Raises ``DataError`` where settings hold more than plain data, before anything is made of them."""
-    depth = 0
+    depth = entries = 0
     for event in yaml.parse(text, Loader=yaml.SafeLoader):
+        entries += isinstance(event, yaml.NodeEvent)
+        if entries > _MOST:
+            raise DataError(f"its settings hold more than {_MOST} entries")
         if isinstance(event, yaml.AliasEvent):
             raise DataError("its settings hold a YAML alias, which no flight's do")
         if getattr(event, "tag", None) is not None:
@@ -196,7 +202,9 @@ def _check_arguments(call: _Call, name: str | None, trusted: Sequence[str]) -> N
 def _check_environment(call: _Call, trusted: Sequence[str]) -> None:
     """gymnasium imports the module in ``module:name``, and an environment may open the files it is told to."""
     environment = call.settings.get("environment")
-    module, colon, _ = environment.partition(":") if isinstance(environment, str) else ("",) * 3
+    module, colon, _ = (
+        environment.partition(":") if isinstance(environment, str) else ("",) * 3
+    )
     if colon and not is_trusted(module, trusted):
         place = _at(call.place, "environment")
         raise DataError(

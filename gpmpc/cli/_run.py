@@ -228,9 +228,7 @@ def _merged(config: DictConfig) -> DictConfig:
             for key, value in (config.plant or {}).items()
             if value != config.system.get(key)
         }
-        config.plant = (
-            OmegaConf.merge(config.system, differing) if differing else None
-        )
+        config.plant = OmegaConf.merge(config.system, differing) if differing else None
         for group, part in (("propagation", "propagator"), ("solver", "solver")):
             if config.get(group) and part not in config.controller:
                 raise SettingError(

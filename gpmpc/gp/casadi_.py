@@ -173,7 +173,9 @@ def function_of_tape(
     rows = _tape_rows(code, constants)
     for size in (*sizes, *shape):
         if type(size) is not int or size < 0:
-            raise DataError(f"a size must be a whole number, zero or more; got {size!r}")
+            raise DataError(
+                f"a size must be a whole number, zero or more; got {size!r}"
+            )
     arguments = [casadi.SX.sym(f"argument{i}", size) for i, size in enumerate(sizes)]
     entries = casadi.vertcat(*arguments).elements()
     count = shape[0] * shape[1]

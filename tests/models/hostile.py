@@ -114,7 +114,10 @@ def learned(kinematics, nominal, inputs, parameters, features):
 
 
 def of_a_pendulum_log():
-    groups = StateGroup("angle", ("angle",), "rad", "angle"), StateGroup("rate", ("rate",))
+    groups = (
+        StateGroup("angle", ("angle",), "rad", "angle"),
+        StateGroup("rate", ("rate",)),
+    )
     kinematics = Increments(StateSpace(groups))
     return learned(kinematics, AffineNominal(kinematics), 1, 2 * 5, 4)
 
@@ -139,7 +142,9 @@ def load_to_fly(path):
 
 def load_log_model(path):
     found = load_learned(path)
-    return LogDynamics(found.model, len(found.input_names), found.time_step, found.noise)
+    return LogDynamics(
+        found.model, len(found.input_names), found.time_step, found.noise
+    )
 
 
 KINDS = {
@@ -210,7 +215,10 @@ def a_field_added(header, arrays, rng):
 
 def a_model_inside_another(header, arrays, rng):
     node = {key: value for key, value in header.items() if key != "memory_order"}
-    depth, kind = rng.choice([1, 3, 30, 300]), rng.choice(["DelayedModel", "NoisyModel"])
+    depth, kind = (
+        rng.choice([1, 3, 30, 300]),
+        rng.choice(["DelayedModel", "NoisyModel"]),
+    )
     for _ in range(depth):
         node = {"kind": kind, "model": node, "delay": rng.choice([1, 0.5, 1e5])}
     header |= node
@@ -246,7 +254,9 @@ def a_shape(header, arrays, rng):
 def another_name(header, arrays, rng):
     name, other = rng.choice([*arrays]), rng.choice([*arrays])
     prefix = name.rpartition("/")[0]
-    new = rng.choice([other, f"B/{other}", f"{prefix}/A", "noise", "B", "effect", "model/B"])
+    new = rng.choice(
+        [other, f"B/{other}", f"{prefix}/A", "noise", "B", "effect", "model/B"]
+    )
     arrays[new] = arrays.pop(name) if rng.random() < 0.5 else arrays[name]
     order = header.get("memory_order")
     if isinstance(order, dict):
@@ -262,7 +272,10 @@ MUTATIONS = [
 def check_predicts(model):
     """Predicts and linearises; what comes out has the right shape."""
     n, m = model.state_dim, model.input_dim
-    x, u = torch.full((3, n), 0.1, dtype=model.dtype), torch.full((3, m), 0.2, dtype=model.dtype)
+    x, u = (
+        torch.full((3, n), 0.1, dtype=model.dtype),
+        torch.full((3, m), 0.2, dtype=model.dtype),
+    )
     with warnings.catch_warnings(), np.errstate(all="ignore"):
         warnings.simplefilter("ignore")
         belief = model.predict(x, u)
@@ -277,6 +290,8 @@ def address_space():
 
 
 def main(count, seed):
+    torch.set_num_threads(1)
+    torch.set_default_dtype(torch.float64)
     rng, said, slowest = random.Random(seed), Counter(), (0.0, "")
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "model.safetensors"
@@ -333,8 +348,6 @@ def main(count, seed):
 
 
 if __name__ == "__main__":
-    torch.set_num_threads(1)
-    torch.set_default_dtype(torch.float64)
     from tests.models import hostile  # whose functions have a path
 
     hostile.main(int(sys.argv[1]), int(sys.argv[2]))
