@@ -1,11 +1,12 @@
-"""Says which code a file may name: what gpmpc ships for that purpose, and packages that the caller names.
+"""Says which code a file may name: what is listed here, and packages of the caller's.
 
-A saved model, or the settings in a recording, may name functions and classes by a dotted path, and to import a module
-is to run it. So every name of a file is compared with a list before anything is imported. ``gpmpc.`` as a prefix is no
-permission: most of the package reads, writes or imports what its arguments say.
+A saved model, or the settings in a recording, may name functions and classes by a
+dotted path, and to import a module is to run it. So every name of a file is compared
+with a list before anything is imported. ``gpmpc.`` as a prefix is no permission: most
+of the package reads, writes or imports what its arguments say.
 
-Of a package that the caller names its own code may be called, not what its modules have imported from elsewhere:
-``my_robot.os.system`` is no part of ``my_robot``.
+Of a package that the caller names its own code may be called, not what its modules have
+imported from elsewhere: ``my_robot.os.system`` is no part of ``my_robot``.
 """
 
 import re
@@ -18,7 +19,7 @@ from typing import Any
 
 from gpmpc.exceptions import DataError, SettingError
 
-#: functions that a saved model may name, ``module:name``; a nominal model is mostly stored as its operations instead
+#: functions that a saved model may name, ``module:name``; mostly it holds operations
 MODEL_CODE = frozenset(
     f"gpmpc.systems{module}:{name}"
     for module in ("", "._system")
@@ -27,8 +28,8 @@ MODEL_CODE = frozenset(
 
 _SETTINGS = {
     "gpmpc.datasets": "ExcitedData Excitation NMPCData PaperData RandomData Tracking",
-    "gpmpc.gp": "SlidingWindow SoftLimits SparseTrainer Trainer centre identity min_max "
-    "standardize",
+    "gpmpc.gp": "SlidingWindow SoftLimits SparseTrainer Trainer centre identity "
+    "min_max standardize",
     "gpmpc.learning": "EpisodicLearning OnlineLearning",
     "gpmpc.logs": "load_flyable",
     "gpmpc.mpc": "Box GPMPC Halfspaces Inequality LeastSquares ManyStarts "
@@ -48,7 +49,7 @@ _SETTINGS = {
     "gpmpc.systems.mujoco_quadrotor": "RigidBody mujoco_quadrotor",
     "gpmpc.trajectories": "Elliptical Hover Lorenz Step Waypoints",
 }
-#: classes and functions that settings in a file may call: they describe systems, data, models and controllers
+#: classes and functions that settings in a file may call: what describes a flight
 SETTINGS_CODE = frozenset(
     f"{module}.{name}" for module, names in _SETTINGS.items() for name in names.split()
 )
@@ -60,8 +61,9 @@ def trusted_packages(key: str, names: Any) -> tuple[str, ...]:
     """Returns the names of packages that a caller trusts; none for None.
 
     Raises:
-        SettingError: They are no list of names, or one is Python itself or of what gpmpc is made of, whose functions
-            do anything that their arguments say. ``key`` is what the setting is called.
+        SettingError: They are no list of names, or one is of Python itself or of what
+            gpmpc is made of, whose functions do anything that their arguments say.
+            ``key`` is what the setting is called.
     """
     if names is None:
         return ()
@@ -81,7 +83,7 @@ def trusted_packages(key: str, names: Any) -> tuple[str, ...]:
 
 
 def may_be_trusted(name: str) -> bool:
-    """Whether a caller may name a package: not Python's own modules, nor those that gpmpc is made of."""
+    """Whether a package can be trusted: not Python's own, nor what gpmpc is made of."""
     return package_of(name) not in _NEVER
 
 
@@ -91,12 +93,12 @@ def parts_of(name: str) -> list[str]:
 
 
 def package_of(name: str) -> str:
-    """Returns the package, or the module, that a path such as ``my_robot.arm:Arm`` begins with."""
+    """Returns the package that a path such as ``my_robot.arm:Arm`` begins with."""
     return parts_of(name)[0]
 
 
 def is_trusted(name: str, packages: Sequence[str]) -> bool:
-    """Whether a path leads into one of some packages; what its parts are there is not known before it is imported."""
+    """Whether a path leads into one of some packages, as far as its text says."""
     parts = parts_of(name)
     plain = all(part.isidentifier() and part[:2] != "__" for part in parts)
     return plain and any(
@@ -108,29 +110,29 @@ def trusted_code(name: str, packages: Sequence[str]) -> Any:
     """Imports what a path names within packages that are trusted (``is_trusted``).
 
     Raises:
-        DataError: There is nothing of this name, or it came into the package from another one that is neither trusted
-            nor on a list of this module.
+        DataError: There is nothing of this name, or it came into the package from
+            another one that is neither trusted nor on a list of this module.
     """
     parts = parts_of(name)
     try:
-        found: Any = import_module(parts[0])
+        code: Any = import_module(parts[0])
         for count, part in enumerate(parts[1:], start=2):
-            if isinstance(found, ModuleType) and not hasattr(found, part):
+            if isinstance(code, ModuleType) and not hasattr(code, part):
                 import_module(".".join(parts[:count]))
-            found = getattr(found, part)
-            if isinstance(found, ModuleType):
-                _check_home(name, found.__name__, found, packages)
+            code = getattr(code, part)
+            if isinstance(code, ModuleType):
+                _check_home(name, code.__name__, code, packages)
     except DataError:
         raise
     except Exception as error:  # whatever the package raises when it is imported
         reason = f"{type(error).__name__}: {' '.join(str(error).split())}"
         raise DataError(f"{name} cannot be imported here ({reason})") from error
-    _check_home(name, _home(found), found, packages)
-    return found
+    _check_home(name, _home(code), code, packages)
+    return code
 
 
 def shipped_name(code: Any) -> str | None:
-    """Returns the name of ``SETTINGS_CODE`` that an object has; None where it has none."""
+    """Returns the name that an object has in ``SETTINGS_CODE``; None without one."""
     if package_of(_home(code)) != "gpmpc":
         return None
     for name in SETTINGS_CODE:
@@ -148,7 +150,7 @@ def _home(code: Any) -> str:
 
 
 def _check_home(name: str, home: str, code: Any, packages: Sequence[str]) -> None:
-    """Raises ``DataError`` where code was written in another package than the trusted ones, and is not shipped."""
+    """Raises ``DataError`` of code from elsewhere that is not shipped either."""
     holds_trusted = isinstance(code, ModuleType) and any(
         package.startswith(f"{home}.") for package in packages
     )

@@ -1,4 +1,4 @@
-"""A file names code only of what gpmpc lists for it, and of packages that its reader trusts."""
+"""A file names code of what gpmpc lists, and of packages that its reader trusts."""
 
 import importlib
 import inspect
@@ -41,7 +41,7 @@ keep = partial(np.save, "file")
 '''
 
 
-@pytest.fixture()
+@pytest.fixture
 def own_package(tmp_path, monkeypatch):
     """A package of a user's, which imports what packages import."""
     folder = tmp_path / "robot_of_mine"
@@ -123,7 +123,7 @@ def listed():
         yield name, getattr(importlib.import_module(module), attribute)
 
 
-def test_everything_that_settings_call_in_conf_is_listed_and_everything_listed_is_there():
+def test_all_that_settings_call_in_conf_is_listed_and_all_that_is_listed_is_there():
     called = set()
     for path in (*ROOT.glob("conf/**/*.yaml"), *ROOT.glob("docs/*.md")):
         called |= set(re.findall(r"_target_: (gpmpc\.[\w.]+)", path.read_text()))
@@ -135,7 +135,8 @@ def test_everything_that_settings_call_in_conf_is_listed_and_everything_listed_i
         assert _trust.shipped_name(code) is not None
 
 
-#: arguments of listed code that take a text: words, names, and what is guarded (see ``_recorded_settings._ARGUMENTS``)
+#: arguments of listed code that take a text: words, names, and what is guarded
+#: (``_recorded_settings._ARGUMENTS``)
 WORDS = {"attitude", "starts", "around", "name", "solver"}
 FILES_THAT_ARE_READ = {"folder", "path"}
 GUARDED = {"trusted", "environment", "make", "options"}

@@ -101,10 +101,13 @@ def _plot(given: argparse.Namespace, path: Path, folder: Path) -> dict[str, Any]
 
 
 def _experiment_of(run: Run, trust: Sequence[str]) -> "Experiment":
-    """Makes what the settings in a recording describe; they may call code of the packages in ``trust``.
+    """Makes what the settings in a recording describe.
+
+    They may call code of the packages in ``trust``, besides gpmpc's own.
 
     Raises:
-        DataError: The recording holds no settings, or such that describe another flight, none, or call other code.
+        DataError: The recording holds no settings, or such that describe another
+            flight, none, or call other code.
     """
     trusted = trusted_packages("--trust", trust)
     if not run.config.strip():
@@ -127,7 +130,7 @@ def _experiment_of(run: Run, trust: Sequence[str]) -> "Experiment":
 
 @contextmanager
 def _settings_of(run: Run) -> Iterator[None]:
-    """Turns whatever the settings of a recording lead to, which nobody has checked, into one error that names it."""
+    """Turns whatever settings that nobody has checked raise into one error."""
     try:
         yield
     except Exception as error:

@@ -1,9 +1,11 @@
-"""Reads the settings out of a recording, and refuses those that would call anything but what describes a flight.
+"""Reads the settings out of a recording; refused are those that call anything else.
 
-Settings that a user gives are a program: ``_target_`` calls whatever it names. A recording may come from anywhere, so
-its settings are data. They are plain YAML without aliases, tags and interpolations; every ``_target_`` in them, at every
-depth, is compared with the list in ``gpmpc._trust`` before the first call; and arguments through which a listed function
-would import a module, or a solver write a file, are held to the same rule.
+Settings that a user gives are a program: ``_target_`` calls whatever it names. A
+recording may come from anywhere, so its settings are data. They are plain YAML without
+aliases, tags and interpolations. Every ``_target_`` in them, at every depth, is
+compared with the list in ``gpmpc._trust`` before the first call; and arguments through
+which a listed function would import a module, or a solver write a file, are held to the
+same rule.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -35,11 +37,11 @@ _LOAD = "gpmpc.logs.load_flyable"
 
 
 def read_settings(text: str) -> dict[str, Any]:
-    """Reads settings in YAML as plain data, in time and memory in proportion to their length.
+    """Reads settings in YAML as plain data, in bounded time and memory.
 
     Raises:
-        DataError: They are no YAML of names and values, too long or too deep, or hold an alias, a tag or an
-            interpolation.
+        DataError: They are no YAML of names and values, too long or too deep, or hold
+            an alias, a tag or an interpolation.
     """
     if len(text) > _LONGEST:
         raise DataError(f"its settings are longer than {_LONGEST} characters")
@@ -57,7 +59,7 @@ def read_settings(text: str) -> dict[str, Any]:
 
 
 def _check_yaml(text: str) -> None:
-    """Raises ``DataError`` where settings hold more than plain data, before anything is made of them."""
+    """Raises ``DataError`` of more than plain data, before anything is made of it."""
     depth = entries = 0
     for event in yaml.parse(text, Loader=yaml.SafeLoader):
         entries += isinstance(event, yaml.NodeEvent)
@@ -79,7 +81,8 @@ def _check_yaml(text: str) -> None:
                 )
             if len(event.value) > _LONGEST_TEXT:
                 raise DataError(
-                    f"its settings hold an entry of more than {_LONGEST_TEXT} characters"
+                    "its settings hold an entry of more than "
+                    f"{_LONGEST_TEXT} characters"
                 )
         if depth > _DEEPEST:
             raise DataError(f"its settings are nested deeper than {_DEEPEST} levels")
@@ -90,11 +93,12 @@ def checked_settings(settings: Any, trusted: Sequence[str]) -> Any:
 
     Args:
         settings: Plain data, merged to what will be called.
-        trusted: Names of packages whose code they may call besides. Saved models that they name are loaded with the
-            same trust, whatever the file says.
+        trusted: Names of packages whose code they may call besides. Saved models that
+            they name are loaded with the same trust, whatever the file says.
 
     Raises:
-        DataError: They call something else, and nothing was imported; or a trusted package has no such code.
+        DataError: They call something else, and nothing was imported; or a trusted
+            package has no such code.
     """
     checked = _with_trust(settings, trusted)
     calls = [*_calls(checked, "")]
@@ -124,7 +128,7 @@ class _Call:
 
 
 def _with_trust(node: Any, trusted: Sequence[str]) -> Any:
-    """A copy of plain settings, in which saved models are loaded with a caller's trust."""
+    """A copy of plain settings, in which saved models get a caller's trust."""
     if isinstance(node, list):
         return [_with_trust(entry, trusted) for entry in node]
     if not isinstance(node, dict):
@@ -172,7 +176,7 @@ def _check_form(call: _Call) -> None:
 
 
 def _check_name(call: _Call, trusted: Sequence[str]) -> None:
-    """Raises ``DataError`` unless what is called is listed, or of a package that is trusted."""
+    """Raises ``DataError`` unless what is called is listed, or trusted."""
     name, package = call.code, package_of(call.code)
     if name in SETTINGS_CODE or is_trusted(name, trusted):
         return
@@ -184,13 +188,13 @@ def _check_name(call: _Call, trusted: Sequence[str]) -> None:
 
 def _remedy(package: str) -> str:
     return (
-        f"code of {package} and not of gpmpc: if you trust the file as you do a script, "
-        f"--trust {package}"
+        f"code of {package} and not of gpmpc: "
+        f"if you trust the file as you do a script, --trust {package}"
     )
 
 
 def _check_arguments(call: _Call, name: str | None, trusted: Sequence[str]) -> None:
-    """Raises ``DataError`` where an argument would let a listed function import a module or write a file."""
+    """Raises ``DataError`` where a listed function would import a module or write."""
     check = _ARGUMENTS.get(name or "")
     if check is None:
         return
@@ -200,7 +204,10 @@ def _check_arguments(call: _Call, name: str | None, trusted: Sequence[str]) -> N
 
 
 def _check_environment(call: _Call, trusted: Sequence[str]) -> None:
-    """gymnasium imports the module in ``module:name``, and an environment may open the files it is told to."""
+    """Raises where gymnasium would import a module, or hand text to an environment.
+
+    It imports the module in ``module:name``; a text may be a file to be opened.
+    """
     environment = call.settings.get("environment")
     module, colon, _ = (
         environment.partition(":") if isinstance(environment, str) else ("",) * 3
@@ -208,12 +215,14 @@ def _check_environment(call: _Call, trusted: Sequence[str]) -> None:
     if colon and not is_trusted(module, trusted):
         place = _at(call.place, "environment")
         raise DataError(
-            f"its settings import {module!r:.100} ({place}), {_remedy(package_of(module))}"
+            f"its settings import {module!r:.100} ({place}), "
+            f"{_remedy(package_of(module))}"
         )
     if _holds_text(call.settings.get("make")) and not is_trusted("gymnasium", trusted):
         place = _at(call.place, "make")
         raise DataError(
-            f"its settings hand text to an environment ({place}), {_remedy('gymnasium')}"
+            f"its settings hand text to an environment ({place}), "
+            f"{_remedy('gymnasium')}"
         )
 
 

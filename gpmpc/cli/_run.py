@@ -195,7 +195,7 @@ def _fly(
 
 
 def experiment_of(config: DictConfig) -> Experiment:
-    """Makes the objects that a user's settings describe; they may call whatever they name."""
+    """Makes the objects that a user's settings describe; they may call anything."""
     return _made(_merged(DictConfig(plain_data(config))))
 
 
@@ -214,9 +214,10 @@ def experiment_of_file(settings: dict[str, Any], trusted: Sequence[str]) -> Expe
 
 
 def _merged(config: DictConfig) -> DictConfig:
-    """Checks settings and completes their parts; every part is then what will be called.
+    """Checks settings and completes their parts, each as it will be called.
 
-    A known system and a plant are whole systems, the controller has its propagator and its solver.
+    A nominal system and a plant are whole systems, the controller has its propagator and
+    its solver.
     """
     _check(config)
     with open_dict(config):

@@ -119,7 +119,7 @@ def posterior_of_parts(
 
 @contextmanager
 def consistent(path: Path, otherwise: str) -> Iterator[None]:
-    """Turns whatever a file's parts raise that do not belong together into one ``DataError`` that names the file."""
+    """Turns whatever parts of a file raise into one ``DataError`` that names it."""
     try:
         yield
     except Exception as error:
@@ -257,7 +257,7 @@ def read_npz(
 
 
 def _check_array_size(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> None:
-    """Raises ``ValueError`` where an array says to hold more, or less, than the archive has of it."""
+    """Raises ``ValueError`` of an array that says to be larger or smaller than it is."""
     with archive.open(info) as member:
         version = np.lib.format.read_magic(member)
         if version == (1, 0):
@@ -297,7 +297,8 @@ def _content(
     version = header.get("format_version")
     if not isinstance(version, int) or not 1 <= version <= _VERSION:
         raise DataError(
-            f"{path}: written in format {version!r:.80} (versions {brief(header.get('versions'))}); this version reads up to "
+            f"{path}: written in format {version!r:.80} "
+            f"(versions {brief(header.get('versions'))}); this version reads up to "
             f"{_VERSION}: update gpmpc"
         )
     return header, arrays

@@ -165,10 +165,13 @@ def tape_of(function: casadi.Function) -> tapes.Tape | None:
 def function_of_tape(
     code: Array, constants: Array, sizes: Sequence[int], shape: Sequence[int]
 ) -> casadi.Function:
-    """Writes a tape, of arguments and a value of these sizes, as a CasADi function again: the inverse of ``tape_of``.
+    """Writes a tape as a CasADi function again: the inverse of ``tape_of``.
 
-    Raises ``DataError`` where code (K, 4) and constants (K,) are no tape's, or sizes are none. What a size asks for is
-    made before the code is read: a caller who has sizes from a file knows that they are right.
+    Its arguments and its value are made as large as ``sizes`` and ``shape`` say: who has
+    them from a file compares them with something first.
+
+    Raises:
+        DataError: Code (K, 4) and constants (K,) are no tape's, or a size is none.
     """
     rows = _tape_rows(code, constants)
     for size in (*sizes, *shape):
@@ -177,7 +180,7 @@ def function_of_tape(
                 f"a size must be a whole number, zero or more; got {size!r}"
             )
     arguments = [casadi.SX.sym(f"argument{i}", size) for i, size in enumerate(sizes)]
-    entries = casadi.vertcat(*arguments).elements()
+    entries: Any = casadi.vertcat(*arguments).elements()
     count = shape[0] * shape[1]
     work: dict[int, casadi.SX] = {}
     value: dict[int, casadi.SX] = {}

@@ -128,8 +128,8 @@ def _learned(path: Path, header: dict[str, Any], tensors: dict[str, Tensor]) -> 
         tuple(header["history"]),
         header["lag"],
         tuple(
-            _output_gp(path, f"gp{i}/", *described, tensors, features)
-            for i, described in enumerate(header["gps"])
+            _output_gp(path, f"gp{i}/", outputs, described, tensors, features)
+            for i, (outputs, described) in enumerate(header["gps"])
         ),
     )
     learned = Learned(
@@ -216,8 +216,9 @@ def _output_gp(
         if key.startswith(prefix)
     }
     gp = OutputGP(tuple(outputs), posterior_of_parts(path, described, own))
-    seen = gp.posterior.predicts, gp.posterior.state_dim, gp.posterior.input_dim
-    if seen != ("value", features, 0) or gp.posterior.output_dim != len(gp.outputs):
+    posterior = gp.posterior
+    shape = posterior.state_dim, posterior.input_dim, posterior.output_dim
+    if posterior.predicts != "value" or shape != (features, 0, len(gp.outputs)):
         raise DataError(f"a GP must predict {outputs!r:.80} of {features} features")
     return gp
 
@@ -257,8 +258,8 @@ def _check_learned(learned: Learned, features: int) -> None:
     if len(learned.state_names) != n:
         raise DataError(f"must have {n} names of states; got {learned.state_names}")
     for gp in model.gps:
-        known = all(type(i) is int and 0 <= i < outputs for i in gp.outputs)
-        if not known or len(set(gp.outputs)) < len(gp.outputs):
+        in_range = all(type(i) is int and 0 <= i < outputs for i in gp.outputs)
+        if not in_range or len(set(gp.outputs)) < len(gp.outputs):
             raise DataError(f"a GP must predict outputs; got {gp.outputs!r:.80}")
 
 
@@ -421,8 +422,10 @@ def load_flyable(path: str | Path, trusted: Sequence[str] | None = None) -> Save
         trusted: Names of packages whose code the file may name; see ``load_model``.
 
     Raises:
-        DataError: The file is missing, damaged or of another kind, or names code that is not trusted.
-        SettingError: What is in it cannot be flown, or ``trusted`` is no list of names of packages.
+        DataError: The file is missing, damaged or of another kind, or names code that
+            is not trusted.
+        SettingError: What is in it cannot be flown, or ``trusted`` is no list of names
+            of packages.
     """
     packages = trusted_packages("model.trusted", trusted)
     header = load_metadata(path)
@@ -446,10 +449,10 @@ def load_flyable(path: str | Path, trusted: Sequence[str] | None = None) -> Save
         )
     model = load_model(path, packages)
     with consistent(Path(path), "its metadata do not describe a model"):
-        said = header.get("metadata") or {}
-        states = _words("states", said.get("states") or [])
-        inputs = _words("inputs", said.get("inputs") or [])
-        time_step = said.get("time_step")
+        metadata = header.get("metadata") or {}
+        states = _words("states", metadata.get("states") or [])
+        inputs = _words("inputs", metadata.get("inputs") or [])
+        time_step = metadata.get("time_step")
         if time_step is not None:
             check_number("time_step", time_step, above=0, unit="[s]")
     return SavedModel(str(path), model, states, inputs, time_step)

@@ -79,12 +79,13 @@ def load_model(path: str | Path, trusted: Sequence[str] = ()) -> Any:
 
     Args:
         path: The file.
-        trusted: Names of packages, such as ``["my_robot"]``, whose code the file may name: a nominal model or an effect
-            that was saved by its path is imported from there. Nothing else is imported.
+        trusted: Names of packages, such as ``["my_robot"]``, whose code the file may
+            name: a nominal model or an effect that was saved by its path is imported
+            from there. Nothing else is imported.
 
     Raises:
-        DataError: The file is missing, damaged, of another kind or of a newer format, or names code that is not there
-            or not trusted.
+        DataError: The file is missing, damaged, of another kind or of a newer format,
+            or names code that is not there or not trusted.
         SettingError: ``trusted`` is no list of names of packages.
     """
     packages = trusted_packages("trusted", trusted)
@@ -104,7 +105,7 @@ def load_model(path: str | Path, trusted: Sequence[str] = ()) -> Any:
 def _check_code(
     path: Path, header: Mapping[str, Any], trusted: Sequence[str], depth: int = 0
 ) -> None:
-    """Raises ``DataError`` unless every function that a header names may be imported; nothing is imported yet."""
+    """Raises ``DataError`` unless all code that a header names may be imported."""
     if depth > _DEEPEST:
         raise DataError(f"holds models inside each other, more than {_DEEPEST}")
     for field in fields(_MODELS[header["kind"]]):
@@ -180,7 +181,7 @@ def _built(
 
 
 def _check_size(model: Any) -> None:
-    """Raises ``DataError`` where a model has more states than a matrix of theirs could be made for."""
+    """Raises ``DataError`` of a model whose covariances would be too large to make."""
     if max(model.state_dim, model.output_dim, model.input_dim) > _MOST:
         raise DataError(f"the model has more than {_MOST} states, outputs or inputs")
 
@@ -222,7 +223,10 @@ def _fields(
 
 
 def _plain(name: str, entry: Any) -> Any:
-    """A field that is a number or a list of numbers; ``DataError`` of anything else, which a model may not notice."""
+    """A field that is a number or a list of numbers; ``DataError`` of anything else.
+
+    A model may not notice it before it predicts.
+    """
     numbers = entry if isinstance(entry, list) else [entry]
     if not all(type(number) in (int, float) for number in numbers):
         raise DataError(f"{name} must be a number or numbers; got {brief(entry)}")
@@ -236,7 +240,11 @@ def _plain(name: str, entry: Any) -> Any:
 def _function_sizes(
     name: str, header: Mapping[str, Any], tensors: Mapping[str, Tensor]
 ) -> tuple[list[int], list[int]]:
-    """The sizes of the arguments and of the value that a residual model's function must have, by its other parts."""
+    """The sizes that a residual model's function must have, by the model's arrays.
+
+    Returns:
+        Entries of each argument, and rows and columns of the value.
+    """
     square = tensors["noise"] if "noise" in tensors else tensors["B"]
     n, k, m = len(square), tensors["residual/targets"].shape[1], header["input_dim"]
     if max(n, _plain("input_dim", m)) > _MOST:
@@ -286,7 +294,10 @@ def _function(
     value: list[int],
     trusted: Sequence[str],
 ) -> Any:
-    """The function whose operations are stored, or that a header names; its name was checked (``_check_code``)."""
+    """The function whose operations are stored, or that a header names.
+
+    Its name was checked before (``_check_code``).
+    """
     if entry["kind"] == "operations":
         from gpmpc.gp.casadi_ import function_of_tape  # loads CasADi
 
@@ -312,10 +323,10 @@ def _function(
         return source
     if kind == "partial":
         return partial(source, **parameters)
-    made = source(**parameters)
+    function = source(**parameters)
     if kind == "casadi":  # older files name what makes the function
-        return CasadiFunction(made)
-    return made
+        return CasadiFunction(function)
+    return function
 
 
 def _imported(path: str) -> Any:

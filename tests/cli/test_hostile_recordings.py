@@ -1,4 +1,4 @@
-"""Settings in a recording are data: nothing that is not listed is imported or called, and errors are one line."""
+"""Settings in a recording are data: what is not listed is not called nor imported."""
 
 import json
 import os
@@ -21,7 +21,7 @@ from tests.cli.command import copied_process, forked
 from tests.recording import runs
 
 CANARY = "canary_of_the_tests"
-TEXT = f"""
+TEXT = """
 from pathlib import Path
 Path(__file__).with_name("fired").touch()
 from gpmpc.systems import translational
@@ -62,7 +62,7 @@ def environment(name, **more):
 
 
 def six_hostile_settings():
-    """Settings that would write or run something: at the top, inside, and deep in lists and dictionaries."""
+    """Settings that would write or run something: at the top, inside, and deep."""
     canary = {"_target_": f"{CANARY}.write"}
     deep = [[{"a": [{"b": {"_target_": "numpy.save", "file": "x", "arr": [1]}}]}]]
     whole = {"_target_": "gpmpc._files.write_whole", "path": "x", "content": "x"}
@@ -95,7 +95,7 @@ def record(path, found):
     return path
 
 
-@pytest.fixture()
+@pytest.fixture
 def folder(tmp_path):
     """A working folder with a module that tells when it is imported."""
     (tmp_path / f"{CANARY}.py").write_text(TEXT)
@@ -123,7 +123,7 @@ def test_settings_that_call_anything_else_are_refused_at_every_depth(name):
 
 
 def run_of(found):
-    """What ``read_run`` would return of a recording with these settings, as far as it is looked at."""
+    """What ``read_run`` would return of a recording with these settings, in part."""
 
     class Run:
         path = Path("run.mcap")
@@ -344,7 +344,8 @@ def test_whom_a_saved_model_may_trust_the_caller_says_and_not_the_recording():
     [
         lambda f: put(f, "system", 5), lambda f: put(f, "system", None), lambda f: put(f, "controller", "x"),
         lambda f: put(f, "trajectory", {"a": 1, "b": 2}), lambda f: put(f, "disturbances", {"a": 1}),
-        lambda f: put(f, "data", {"size": None}), lambda f: put(f, "data", {"_target_": "gpmpc.trajectories.Hover", "size": 3}),
+        lambda f: put(f, "data", {"size": None}),
+        lambda f: put(f, "data", {"_target_": "gpmpc.trajectories.Hover", "size": 3}),
         lambda f: put(f, "plant", [1]), lambda f: put(f, "nominal", 3), lambda f: put(f, "noise", 3),
         lambda f: put(f, "horizon", "many"), lambda f: put(f, "controller.problem", 3),
         lambda f: put(f, "system", {"_target_": "gpmpc.systems.pendulum", "mass": "x"}),
@@ -357,10 +358,13 @@ def test_whom_a_saved_model_may_trust_the_caller_says_and_not_the_recording():
     ],
 )  # fmt: skip
 def test_settings_that_describe_no_flight_are_one_line_with_the_recordings_name(change):
-    with pytest.raises(DataError, match=r"^run\.mcap: [^\n]+$"):
+    def learn():
         experiment = _flights._experiment_of(run_of(change(flight())), [])
         with _flights._settings_of(run_of("")):
             experiment.learn(experiment.training_rows(), 0)
+
+    with pytest.raises(DataError, match=r"^run\.mcap: [^\n]+$"):
+        learn()
 
 
 def test_a_recording_and_its_settings_must_be_of_one_system():

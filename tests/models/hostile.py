@@ -1,7 +1,8 @@
-"""Loads crafted models under a limit of memory; ``python -m tests.models.hostile COUNT SEED`` in a process of its own.
+"""Loads crafted models under a limit of memory: ``python -m tests.models.hostile N SEED``.
 
-Unlike damage, a crafted file has the right checksum: every field of a header and every array may hold anything. What
-is loaded predicts; everything else is a ``DataError`` of one line that names the file. Nothing takes 300 MB or 5 s.
+Unlike a damaged file, a crafted one has the right checksum: every field of its header
+and every array may hold anything. What is loaded predicts; everything else is a
+``DataError`` of one line that names the file. Nothing takes 300 MB or 5 s.
 """
 
 import copy

@@ -1,4 +1,4 @@
-"""Crafted model files, whose checksums are right: nothing is imported, and what is wrong is said in one line."""
+"""Crafted models, whose checksums are right: nothing is imported, errors are one line."""
 
 import copy
 import json
@@ -28,7 +28,7 @@ def code(kind, name, **parameters):
 
 
 def six_hostile_models(good, canary):
-    """Contents of six files that would run something: at the top, inside a wrapper, and inside two."""
+    """Contents of six files that would run something, inside none to two wrappers."""
     header, arrays = parts_of(good)
     for name in ("nominal/A", "nominal/B", "nominal/c"):
         del arrays[name]
@@ -80,9 +80,9 @@ def six_hostile_models(good, canary):
     return contents
 
 
-@pytest.fixture()
+@pytest.fixture
 def saved(tmp_path):
-    """Writes a model with a changed header and changed arrays, and a checksum that is right."""
+    """Writes a model with a changed header and arrays, and the right checksum."""
 
     def save(model, change=lambda header, arrays: None):
         path = tmp_path / "model.safetensors"
