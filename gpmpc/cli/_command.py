@@ -82,7 +82,10 @@ class Command(NamedTuple):
         found: dict[str, list[str] | None] = {"-h": None, "--help": None}
         for names, how in self.arguments:
             found |= dict.fromkeys(
-                names, None if "action" in how else [*how.get("choices", ())]
+                names,
+                None
+                if how.get("action") == "store_true"
+                else [*how.get("choices", ())],
             )
         return found
 
@@ -252,6 +255,13 @@ _REPORT = [
     _folder("where the documents go (OUTPUTS/report)"),
     _argument("--compare", nargs=2, metavar=("A", "B"), help=_GROUPS),
 ]
+_TRUST = _argument(
+    "--trust",
+    action="append",
+    default=[],
+    metavar="PACKAGE",
+    help="a package of yours whose code the recording's settings may call; repeatable",
+)
 _PLOT = [
     _argument("run", type=Path, metavar="RUN", help=_RECORDED),
     _folder("where the figures go (RUN/figures)"),
@@ -265,6 +275,7 @@ _PLOT = [
     _argument(
         "--film", **_FLAG, help="a system of MuJoCo: the animation as MuJoCo renders it"
     ),
+    _TRUST,
 ]
 _CALIBRATE = [
     _argument(
@@ -284,6 +295,7 @@ _CALIBRATE = [
         "--steps", type=int, default=50, help="length of the longest prediction (50)"
     ),
     _folder("where all goes (RUN/calibration)"),
+    _TRUST,
 ]
 _LEARN = [
     _argument("mapping", type=Path, help="a YAML file that says what the columns mean"),

@@ -2,17 +2,20 @@
 
 import argparse
 import shutil
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from omegaconf import OmegaConf
 from rich.console import Console
 
 from gpmpc._provenance import is_of_this_code
+from gpmpc._trust import trusted_packages
 from gpmpc.cli._command import Result
 from gpmpc.cli._log import CUT
-from gpmpc.cli._settings import settings, write_files, writing
+from gpmpc.cli._recorded_settings import read_settings
+from gpmpc.cli._settings import find_modules_here, one_line, write_files, writing
 from gpmpc.cli._terminal import print_error
 from gpmpc.exceptions import DataError, RecordingError, check_number
 from gpmpc.plotting import (
@@ -37,6 +40,8 @@ _LEVELS = (
     0.9,
     0.95,
 )  # of the intervals that a calibration draws; the last is printed
+
+_NO_SETTINGS = "holds no settings, which gpmpc run puts into its recordings"
 
 
 def plot(given: argparse.Namespace) -> Result:
@@ -72,7 +77,11 @@ def _plot(given: argparse.Namespace, path: Path, folder: Path) -> dict[str, Any]
     animated = given.film or (
         not given.no_animation and {"x", "y", "z"} <= run.pose.keys()
     )
-    draw = partial(film, system=_experiment_of(run).flown) if given.film else animate
+    draw = (
+        partial(film, system=_experiment_of(run, given.trust).flown)
+        if given.film
+        else animate
+    )
     with writing(folder, "to"), Console().status("drawing"):
         folder.mkdir(parents=True, exist_ok=True)
         figures = {
@@ -93,17 +102,41 @@ def _plot(given: argparse.Namespace, path: Path, folder: Path) -> dict[str, Any]
     return {"folder": str(folder), "written": written, "finished": run.finished}
 
 
-def _experiment_of(run: Run) -> "Experiment":
-    """Makes what the settings in a recording describe."""
-    config: Any = OmegaConf.create(run.config)
-    if not {"system", "controller", "folder"} <= config.keys():
-        raise DataError(
-            f"{run.path}: holds no settings, which gpmpc run puts into its recordings"
-        )
-    from gpmpc.cli._run import experiment_of  # loads torch, which figures do without
+def _experiment_of(run: Run, trust: Sequence[str]) -> "Experiment":
+    """Makes what the settings in a recording describe.
 
-    with settings():
-        return experiment_of(config)
+    They may call code of the packages in ``trust``, besides gpmpc's own.
+
+    Raises:
+        DataError: The recording holds no settings, or such that describe another
+            flight, none, or call other code.
+    """
+    trusted = trusted_packages("--trust", trust)
+    if not run.config.strip():
+        raise DataError(f"{run.path}: {_NO_SETTINGS}")
+    from gpmpc.cli._run import experiment_of_file  # loads torch; figures do without
+
+    with _settings_of(run):
+        settings = read_settings(run.config)
+        if not {"system", "controller", "folder"} <= settings.keys():
+            raise DataError(_NO_SETTINGS)
+        if trusted:  # else nothing in the working folder may be imported
+            find_modules_here()
+        experiment = experiment_of_file(settings, trusted)
+        system = experiment.system
+        described = system.state_names, system.input_names
+        if described != (run.state_names, run.input_names):
+            raise DataError("its settings describe another system than it recorded")
+    return experiment
+
+
+@contextmanager
+def _settings_of(run: Run) -> Iterator[None]:
+    """Turns whatever settings that nobody has checked raise into one error."""
+    try:
+        yield
+    except Exception as error:
+        raise DataError(f"{run.path}: {one_line(error)}") from error
 
 
 def calibrate(given: argparse.Namespace) -> Result:
@@ -118,7 +151,7 @@ def calibrate(given: argparse.Namespace) -> Result:
             f"{given.run}: holds {1 + len(others)} runs; name the one whose model it is"
         )
     recorded = read_run(first)
-    experiment = _experiment_of(recorded)
+    experiment = _experiment_of(recorded, given.trust)
     folder = given.to or first.parent / "calibration"
     system, model = experiment.system, experiment.model
     notes = []
@@ -146,7 +179,11 @@ def calibrate(given: argparse.Namespace) -> Result:
             f"{first}: its controller learned no model, or learned it from whole flights"
         )
     if model is None:
-        with one_thread(), console.status("learning"):
+        with (
+            one_thread(),
+            console.status("learning"),
+            _settings_of(recorded),
+        ):
             model = experiment.learn(
                 experiment.training_rows(), experiment.seed
             ).posterior

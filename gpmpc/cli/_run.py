@@ -25,6 +25,7 @@ from rich.console import Console
 from gpmpc._compiling import report_compilation
 from gpmpc._provenance import flattened
 from gpmpc.cli._command import Result
+from gpmpc.cli._recorded_settings import checked_settings
 from gpmpc.cli._settings import folder_of, one_line, writing
 from gpmpc.cli._terminal import print_error
 from gpmpc.exceptions import DataError, SettingError, ShapeError, check_number
@@ -208,16 +209,41 @@ def _fly(
 
 
 def experiment_of(config: DictConfig) -> Experiment:
-    """Makes the objects that the settings describe."""
-    config = DictConfig(plain_data(config))
+    """Makes the objects that a user's settings describe; they may call anything."""
+    return _made(_merged(DictConfig(plain_data(config))))
+
+
+def experiment_of_file(settings: dict[str, Any], trusted: Sequence[str]) -> Experiment:
+    """Makes the objects that settings out of a file describe.
+
+    Args:
+        settings: Plain data (``read_settings``).
+        trusted: Packages whose code they may call, besides what ``gpmpc._trust`` lists.
+
+    Raises:
+        DataError: They call something else.
+    """
+    merged = plain_data(_merged(DictConfig(settings)))
+    return _made(DictConfig(checked_settings(merged, trusted)))
+
+
+def _merged(config: DictConfig) -> DictConfig:
+    """Checks settings and completes their parts, each as it will be called.
+
+    A nominal system and a plant are whole systems, the controller has its propagator and
+    its solver.
+    """
     _check(config)
-    system = _system_of(config.system)
-    if known := config.nominal:
-        known = _system_of(
-            known if "_target_" in known else OmegaConf.merge(config.system, known)
-        )
-        system = replace(system, nominal=known)
     with open_dict(config):
+        known = config.nominal
+        if known and "_target_" not in known:
+            config.nominal = OmegaConf.merge(config.system, known)
+        differing = {
+            key: value
+            for key, value in (config.plant or {}).items()
+            if value != config.system.get(key)
+        }
+        config.plant = OmegaConf.merge(config.system, differing) if differing else None
         for group, part in (("propagation", "propagator"), ("solver", "solver")):
             if config.get(group) and part not in config.controller:
                 raise SettingError(
@@ -225,6 +251,16 @@ def experiment_of(config: DictConfig) -> Experiment:
                 )
             if config.get(group):
                 config.controller[part] = config[group]
+    return config
+
+
+def _made(config: DictConfig) -> Experiment:
+    """Makes the objects of merged settings."""
+    system = _system_of(config.system)
+    known = config.nominal
+    if known:
+        system = replace(system, nominal=_system_of(known))
+    with open_dict(config):
         size = config.data.pop("size")
         _fill(config.controller, initial_input=system.initial_input)
         problem = config.controller.problem
@@ -240,11 +276,6 @@ def experiment_of(config: DictConfig) -> Experiment:
         key: instantiate(config[key], _convert_="all")
         for key in ("data", "controller", "disturbances")
     }
-    other = {
-        key: value
-        for key, value in (config.plant or {}).items()
-        if value != config.system.get(key)
-    }
     trained = instantiate(config.model, _convert_="all")
     saved = isinstance(trained, SavedModel)
     if saved:
@@ -259,7 +290,7 @@ def experiment_of(config: DictConfig) -> Experiment:
         train=trained,
         model=trained.model if saved else None,
         system=system,
-        plant=_system_of(OmegaConf.merge(config.system, other)) if other else None,
+        plant=_system_of(config.plant) if config.plant else None,
         name=name,
         size=size,
         propagator=getattr(parts["controller"], "keywords", {}).get("propagator"),

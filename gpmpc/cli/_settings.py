@@ -76,14 +76,7 @@ def settings(own: str | None = None) -> Iterator[None]:
 
     What stands in the working folder can be named by ``_target_`` inside, behind everything that is installed.
     """
-    try:
-        here = os.getcwd()
-    except OSError as error:
-        raise GpmpcError(
-            "the working folder is gone; change to one that exists"
-        ) from error
-    if here not in sys.path:
-        sys.path.append(here)
+    find_modules_here()
     if own is not None:
         folder = Path(own)
         if not folder.is_dir():
@@ -98,6 +91,18 @@ def settings(own: str | None = None) -> Iterator[None]:
         version_base="1.3", config_dir=str(config_folder())
     ):
         yield
+
+
+def find_modules_here() -> None:
+    """Lets modules of the working folder be imported, behind everything that is installed."""
+    try:
+        here = os.getcwd()
+    except OSError as error:
+        raise GpmpcError(
+            "the working folder is gone; change to one that exists"
+        ) from error
+    if here not in sys.path:
+        sys.path.append(here)
 
 
 def compose(name: str, overrides: Sequence[str] = ()) -> DictConfig:

@@ -18,7 +18,8 @@ import io
 import json
 import math
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -31,7 +32,7 @@ from torch import Tensor
 
 from gpmpc._files import existing_file, new_file, write_whole
 from gpmpc._provenance import now, versions
-from gpmpc.exceptions import DataError, GpmpcError, SettingError, UnsupportedModel
+from gpmpc.exceptions import DataError, SettingError, UnsupportedModel
 from gpmpc.gp._kernel import check_posterior
 from gpmpc.gp._posterior import GPPosterior
 from gpmpc.signals import Signals
@@ -108,19 +109,36 @@ def posterior_of_parts(
     """Builds a posterior of a file's header and tensors, after a check of everything."""
     settings = "input_dim", "predicts", "signals"
     names = [f.name for f in fields(GPPosterior) if f.name not in settings]
-    try:
+    with consistent(path, f"not a consistent posterior of {', '.join(names)}"):
         found = {name: tensors[name] for name in names}
         predicts, m = header["predicts"], header["input_dim"]
         check_posterior(found, m, predicts, found["features"].dtype)
         signals = Signals.from_header(header.get("signals"))
         signals.check_sizes(found["features"].shape[1] - m, m)
-    except (GpmpcError, KeyError, TypeError) as error:
-        raise DataError(
-            f"{path}: not a consistent posterior of {', '.join(names)} ({error})"
-        ) from error
     if not bool((found["cholesky"].diagonal(dim1=-2, dim2=-1) > 0).all()):
         raise DataError(f"{path}: the diagonal of cholesky must be positive")
     return GPPosterior(**found, input_dim=m, predicts=predicts, signals=signals)
+
+
+@contextmanager
+def consistent(path: Path, otherwise: str) -> Iterator[None]:
+    """Turns whatever parts of a file raise into one ``DataError`` that names it."""
+    try:
+        yield
+    except Exception as error:
+        if isinstance(error, DataError) and str(error).startswith(f"{path}: "):
+            raise
+        raise DataError(f"{path}: {otherwise} ({_reason(error)})") from error
+
+
+def brief(value: Any) -> str:
+    """What stands in a file, in one short line."""
+    return f"{' '.join(str(value).split()):.80}"
+
+
+def _reason(error: Exception) -> str:
+    """The text of an error in one line; its kind where it has no text."""
+    return f"{' '.join(str(error).split()) or type(error).__name__:.500}"
 
 
 def write_model(
@@ -170,7 +188,7 @@ def read_model(path: Path, kind: str) -> tuple[dict[str, Any], dict[str, Tensor]
     header, arrays = _content(path, kind)
     for got, expected in ((header.get("kind"), kind), (header.get("kernel"), "SE-ARD")):
         if got != expected:
-            raise DataError(f"{path}: holds a {got}; expected a {expected}")
+            raise DataError(f"{path}: holds a {brief(got)}; expected a {expected}")
     try:
         if not _is_npz(path) and header["checksum"] != _checksum(header, arrays):
             raise ValueError(
@@ -182,7 +200,7 @@ def read_model(path: Path, kind: str) -> tuple[dict[str, Any], dict[str, Tensor]
         }
     except Exception as error:
         raise DataError(
-            f"{path}: damaged; expected a saved {kind} ({' '.join(str(error).split())})"
+            f"{path}: damaged; expected a saved {kind} ({_reason(error)})"
         ) from error
 
 
@@ -208,11 +226,18 @@ def read_npz(
     """
     size = path.stat().st_size
     with zipfile.ZipFile(path) as archive:
-        declared = sum(info.file_size for info in archive.infolist())
+        members = archive.infolist()
+        declared = sum(info.file_size for info in members)
         if declared > _EXPANSION * size:
             raise ValueError(
                 f"declares {declared} bytes, more than a file of {size} bytes can hold"
             )
+        for info in members:
+            if info.filename == _HEADER and info.file_size > _LONGEST:
+                raise ValueError(f"its header is longer than {_LONGEST} characters")
+            name, is_array, _ = info.filename.rpartition(".npy")
+            if is_array and (not names or name in names):
+                _check_array_size(archive, info)
         header = (
             json.loads(archive.read(_HEADER)) if _HEADER in archive.namelist() else None
         )
@@ -234,6 +259,22 @@ def read_npz(
         }
 
 
+def _check_array_size(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> None:
+    """Raises ``ValueError`` of an array that says to be larger or smaller than it is."""
+    with archive.open(info) as member:
+        version = np.lib.format.read_magic(member)
+        if version == (1, 0):
+            header = np.lib.format.read_array_header_1_0(member)
+        else:  # a later version is of names in a structure, which no number has
+            header = np.lib.format.read_array_header_2_0(member)
+        shape, _, dtype = header
+        stored = info.file_size - member.tell()
+    if dtype.hasobject or math.prod(shape) * dtype.itemsize != stored:
+        raise ValueError(
+            f"{info.filename} is an array of shape {shape!s:.80} and {stored} bytes"
+        )
+
+
 def _content(
     path: Path, kind: str, header_only: bool = False
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
@@ -253,13 +294,14 @@ def _content(
                 arrays = {name: file.get_tensor(name) for name in wanted}
     except Exception as error:
         what = f"damaged, or not a file of this package; expected a saved {kind}"
-        raise DataError(f"{path}: {what} ({' '.join(str(error).split())})") from error
+        raise DataError(f"{path}: {what} ({_reason(error)})") from error
     if not isinstance(header, dict) or header.get("format") != _FORMAT:
         raise DataError(f"{path}: a file of something else; expected a saved {kind}")
     version = header.get("format_version")
     if not isinstance(version, int) or not 1 <= version <= _VERSION:
         raise DataError(
-            f"{path}: written in format {version!r} (versions {header.get('versions')}); this version reads up to "
+            f"{path}: written in format {version!r:.80} "
+            f"(versions {brief(header.get('versions'))}); this version reads up to "
             f"{_VERSION}: update gpmpc"
         )
     return header, arrays

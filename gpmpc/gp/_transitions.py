@@ -27,7 +27,7 @@ from gpmpc.exceptions import (
     UnsupportedModel,
     check_number,
 )
-from gpmpc.gp._storage import read_npz, write_npz
+from gpmpc.gp._storage import consistent, read_npz, write_npz
 from gpmpc.signals import UNKNOWN, Signals, check_signals, signals_of
 
 _NAMES = ("states", "inputs", "next_states")
@@ -157,19 +157,17 @@ class Transitions:
             DataError: The file is missing, damaged, or not such a file.
         """
         path = existing_file(path, _EXPECTED)
-        try:
+        with consistent(path, "not a readable .npz file of transitions"):
             header, arrays = read_npz(path, _NAMES)
-            said = header.get("signals") if isinstance(header, dict) else None
-            signals = Signals.from_header(said)
-        except Exception as error:
-            raise DataError(
-                f"{path}: not a readable .npz file of transitions ({error})"
-            ) from error
+            stated = header.get("signals") if isinstance(header, dict) else None
+            signals = Signals.from_header(stated)
         missing = [name for name in _NAMES if name not in arrays]
         if missing:
             raise DataError(
                 f"{path}: array {missing[0]!r} is missing; expected {', '.join(_NAMES)}"
             )
+        if not arrays["states"].size:
+            raise DataError(f"{path}: holds no states")
         states, inputs, next_states = (arrays[name] for name in _NAMES)
         return _with_path(path, states, inputs, next_states, signals)
 

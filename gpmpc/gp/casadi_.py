@@ -176,23 +176,35 @@ def tape_of(function: casadi.Function) -> tapes.Tape | None:
 
 
 def function_of_tape(
-    code: Array, constants: Array, sizes: Sequence[int], shape: tuple[int, int]
+    code: Array, constants: Array, sizes: Sequence[int], shape: Sequence[int]
 ) -> casadi.Function:
-    """Writes a tape, of arguments and a value of these sizes, as a CasADi function again: the inverse of ``tape_of``.
+    """Writes a tape as a CasADi function again: the inverse of ``tape_of``.
 
-    Raises ``DataError`` where code (K, 4) and constants (K,) are no tape's.
+    Its arguments and its value are made as large as ``sizes`` and ``shape`` say: who has
+    them from a file compares them with something first.
+
+    Raises:
+        DataError: Code (K, 4) and constants (K,) are no tape's, or a size is none.
     """
+    rows = _tape_rows(code, constants)
+    for size in (*sizes, *shape):
+        if type(size) is not int or size < 0:
+            raise DataError(
+                f"a size must be a whole number, zero or more; got {size!r}"
+            )
     arguments = [casadi.SX.sym(f"argument{i}", size) for i, size in enumerate(sizes)]
-    z, value = casadi.vertcat(*arguments), casadi.SX(shape[0] * shape[1], 1)
-    work: dict[int, Any] = {}
+    entries: Any = casadi.vertcat(*arguments).elements()
+    count = shape[0] * shape[1]
+    work: dict[int, casadi.SX] = {}
+    value: dict[int, casadi.SX] = {}
     try:
         for (operation, to, first, last), constant in zip(
-            code.astype(int).tolist(), constants.tolist(), strict=True
+            rows, constants.tolist(), strict=True
         ):
             if operation == tapes.OUTPUT:
                 value[to] = work[first]
             elif operation == tapes.INPUT:
-                work[to] = z[first]
+                work[to] = entries[first]
             elif operation == tapes.CONST:
                 work[to] = casadi.SX(constant)
             elif operation in tapes.TWO_OPERANDS:
@@ -201,8 +213,29 @@ def function_of_tape(
                 work[to] = casadi.SX.unary(operation, work[first])
             else:
                 raise DataError(f"there is no operation {operation}")
-    except (KeyError, RuntimeError, ValueError) as error:
+    except (IndexError, KeyError, RuntimeError, ValueError) as error:
         raise DataError(
             f"a function's operations do not follow from each other ({error})"
         ) from error
-    return casadi.Function("function", arguments, [casadi.reshape(value, *shape)])
+    places = sorted(value)
+    if places and places[-1] >= count:
+        raise DataError(f"a value of {count} entries has none at {places[-1]}")
+    # Made at once: an entry that is added to a sparse vector moves all those behind it.
+    sparsity = casadi.Sparsity(count, 1, [0, len(places)], places)
+    column = casadi.SX(sparsity, casadi.vertcat(*(value[place] for place in places)))
+    return casadi.Function("function", arguments, [casadi.reshape(column, *shape)])
+
+
+def _tape_rows(code: Array, constants: Array) -> list[list[int]]:
+    """The rows of a tape's code as whole numbers; ``DataError`` where they are none."""
+    if code.ndim != 2 or code.shape[1] != 4 or constants.shape != code.shape[:1]:
+        raise DataError(
+            f"code (K, 4) and constants (K,) must be of equal length; "
+            f"got {code.shape} and {constants.shape}"
+        )
+    whole = (code >= 0) & (code < 2**31) & (code == np.floor(code))
+    if not whole.all():
+        raise DataError(
+            f"code must be whole numbers, zero or more; got {code[~whole][0]}"
+        )
+    return code.astype(np.int64).tolist()

@@ -5,6 +5,8 @@ its derivatives are central differences, all stages in one batch; the disturbanc
 controller's own estimate.
 """
 
+import re
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
@@ -17,19 +19,22 @@ from torch import Tensor
 from gpmpc._angles import full_turns
 from gpmpc._dynamics import DynamicsModel, Linearized, check_query, to_array
 from gpmpc._files import existing_file, new_file
-from gpmpc.exceptions import DataError, SettingError
+from gpmpc._trust import trusted_packages
+from gpmpc.exceptions import DataError, SettingError, check_choice, check_number
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import load_metadata
 from gpmpc.gp._storage import (
+    consistent,
     posterior_of_parts,
     posterior_parts,
     read_model,
     write_model,
 )
-from gpmpc.logs._fitting import NominalFit, OutputNoise
+from gpmpc.logs._fitting import TIME_CONSTANTS, NominalFit, OutputNoise
 from gpmpc.logs._kinematics import (
     Array,
     Increments,
+    Kinematics,
     RigidBody,
     StateGroup,
     StateSpace,
@@ -43,6 +48,9 @@ from gpmpc.systems import System
 KIND = "LogModel"
 _TEXTS = ("state_names", "input_names", "context_names", "runs")
 _NOISE = ("outputs", "measurement")
+_LONGEST = 10_000  # rows that a model from a file looks back
+_SLOWEST = 1e9  # time step of a model from a file [s]
+_MOST = 2048  # states, inputs or context of a model from a file
 DIFFERENCE = 1e-5  # of central differences, relative to entries above one
 
 
@@ -97,58 +105,163 @@ def load_learned(path: str | Path) -> Learned:
     """
     path = existing_file(path, "what gpmpc learn saved")
     header, tensors = read_model(path, KIND)
-    try:
+    with consistent(path, f"not a readable {KIND}"):
         return _learned(path, header, tensors)
-    except (KeyError, TypeError, ValueError) as error:
-        raise DataError(f"{path}: not a readable {KIND} ({error})") from error
 
 
 def _learned(path: Path, header: dict[str, Any], tensors: dict[str, Tensor]) -> Learned:
-    space = StateSpace(
-        tuple(
-            StateGroup(**g | {"entries": tuple(g["entries"])}) for g in header["groups"]
-        )
-    )
-    kinematics = (
-        RigidBody(space) if header["kinematics"] == "RigidBody" else Increments(space)
-    )
-    name, settings = header["nominal"]
-    if name == "MultirotorNominal":
-        nominal = MultirotorNominal(**settings)
-    else:  # older files have a Still
-        nominal = AffineNominal(kinematics, settings.get("fitted", name != "Still"))
-    gps = []
-    for i, (outputs, described) in enumerate(header["gps"]):
-        own = {
-            key.removeprefix(f"gp{i}/"): value
-            for key, value in tensors.items()
-            if key.startswith(f"gp{i}/")
-        }
-        gps.append(OutputGP(tuple(outputs), posterior_of_parts(path, described, own)))
+    texts = {
+        key: _words(key, names)
+        for key, names in zip(_TEXTS, header["names"], strict=True)
+    }
+    space = _space(header["groups"])
+    kinematics = _kinematics(header["kinematics"], space)
     arrays = {key: value.numpy() for key, value in tensors.items()}
+    features = kinematics.features(
+        _resting(space),
+        np.zeros((1, len(texts["input_names"]))),
+        np.zeros((1, len(texts["context_names"]))),
+    ).shape[1]
     model = LogModel(
         kinematics,
-        nominal,
+        _nominal(header["nominal"], kinematics, texts),
         arrays["theta"],
         tuple(header["history"]),
         header["lag"],
-        tuple(gps),
+        tuple(
+            _output_gp(path, f"gp{i}/", outputs, described, tensors, features)
+            for i, (outputs, described) in enumerate(header["gps"])
+        ),
     )
-    return Learned(
+    learned = Learned(
         model=model,
         noise=OutputNoise(*(arrays[f"noise/{key}"] for key in _NOISE)),
         fit=NominalFit(model, arrays["standard_errors"]),
         candidates=tuple(
-            Candidate(name, np.array(errors), chosen)
+            Candidate(str(name), np.array(errors, dtype=float), bool(chosen))
             for name, errors, chosen in header["candidates"]
         ),
         ranges=arrays["ranges"],
         time_step=header["time_step"],
-        **{
-            key: tuple(names)
-            for key, names in zip(_TEXTS, header["names"], strict=True)
-        },
+        **texts,
     )
+    _check_learned(learned, features)
+    return learned
+
+
+def _words(key: str, names: Any) -> tuple[str, ...]:
+    """A list of texts; ``DataError`` of anything else."""
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        raise DataError(f"{key} must be a list of texts; got {names!r:.80}")
+    return tuple(names)
+
+
+def _space(described: Any) -> StateSpace:
+    groups = []
+    for group in described:
+        entries = _words("entries", group["entries"])
+        groups.append(StateGroup(**group | {"entries": entries}))
+        check_choice("kind", groups[-1].kind, ("vector", "angle", "quaternion"))
+        if not entries or (groups[-1].kind == "quaternion" and len(entries) != 4):
+            raise DataError(f"a {groups[-1].kind} cannot have {len(entries)} entries")
+    return StateSpace(tuple(groups))
+
+
+def _kinematics(name: str, space: StateSpace) -> Kinematics:
+    if name != "RigidBody":
+        return Increments(space)
+    parts = [(group.kind, len(group.entries)) for group in space.groups]
+    vector = ("vector", 3)
+    if parts != [vector, ("quaternion", 4), vector, vector]:
+        raise DataError("a rigid body has position, attitude, velocity and rate")
+    return RigidBody(space)
+
+
+def _resting(space: StateSpace) -> Array:
+    """A state (1, n) of zeros, in which nothing is turned."""
+    x = np.zeros((1, space.dim))
+    for group, at in zip(space.groups, space.columns, strict=True):
+        x[0, at.stop - 1] = group.kind == "quaternion"
+    return x
+
+
+def _nominal(
+    described: Any, kinematics: Kinematics, texts: dict[str, tuple[str, ...]]
+) -> MultirotorNominal | AffineNominal:
+    name, settings = described
+    if name != "MultirotorNominal":  # older files have a Still
+        return AffineNominal(kinematics, settings.get("fitted", name != "Still"))
+    motors, inputs = settings["motors"], len(texts["input_names"])
+    if type(motors) is not int or motors != inputs:
+        raise DataError(f"a multirotor of {inputs} inputs has no {motors!r:.80} motors")
+    voltage = settings.get("voltage", 0.0)
+    check_number("voltage", voltage, least=0)
+    if voltage and not texts["context_names"]:
+        raise DataError("a multirotor whose voltage counts has it in its context")
+    if not isinstance(kinematics, RigidBody):
+        raise DataError("a multirotor is a rigid body")
+    return MultirotorNominal(**settings)
+
+
+def _output_gp(
+    path: Path,
+    prefix: str,
+    outputs: Any,
+    described: Any,
+    tensors: dict[str, Tensor],
+    features: int,
+) -> OutputGP:
+    own = {
+        key.removeprefix(prefix): value
+        for key, value in tensors.items()
+        if key.startswith(prefix)
+    }
+    gp = OutputGP(tuple(outputs), posterior_of_parts(path, described, own))
+    posterior = gp.posterior
+    shape = posterior.state_dim, posterior.input_dim, posterior.output_dim
+    if posterior.predicts != "value" or shape != (features, 0, len(gp.outputs)):
+        raise DataError(f"a GP must predict {outputs!r:.80} of {features} features")
+    return gp
+
+
+def _check_learned(learned: Learned, features: int) -> None:
+    """Raises unless everything that was read belongs together."""
+    model, noise = learned.model, learned.noise
+    outputs = len(model.kinematics.output_names)
+    n, e = model.kinematics.space.dim, model.kinematics.space.error_dim
+    if max(n, len(learned.input_names), len(learned.context_names)) > _MOST:
+        raise DataError(f"the model has more than {_MOST} states or inputs")
+    check_number("time_step", learned.time_step, above=0, unit="[s]")
+    if learned.time_step > _SLOWEST:
+        raise DataError(f"time_step must be {_SLOWEST:g} s at most")
+    for key, rows in (("lag", model.lag), *(("history", h) for h in model.history)):
+        check_number(key, rows, least=0, whole=True, unit="[rows]")
+        if rows > _LONGEST:
+            raise DataError(f"{key} must be {_LONGEST} rows at most; got {rows}")
+    if isinstance(model.nominal, AffineNominal):
+        parameters = outputs * (features + 1) if model.nominal.fitted else None
+    else:
+        parameters = len(model.nominal.parameter_names)
+    shapes = {
+        "theta": (model.theta, (parameters,)),
+        "ranges": (learned.ranges, (2, n + len(learned.input_names))),
+        "noise/outputs": (noise.outputs, (len(TIME_CONSTANTS), outputs)),
+        "noise/measurement": (noise.measurement, (e,)),
+    }
+    for key, (array, shape) in shapes.items():
+        if None not in shape and array.shape != shape:
+            raise DataError(f"{key} must have shape {shape}; got {array.shape}")
+    errors = learned.fit.standard_errors
+    if errors.shape not in ((0,), model.theta.shape):  # a nameless parameter has none
+        raise DataError(f"standard_errors are no theta's; got {errors.shape}")
+    if not all(np.isfinite(a).all() for a in (model.theta, *vars(noise).values())):
+        raise DataError("theta and noise must be finite")
+    if len(learned.state_names) != n:
+        raise DataError(f"must have {n} names of states; got {learned.state_names}")
+    for gp in model.gps:
+        in_range = all(type(i) is int and 0 <= i < outputs for i in gp.outputs)
+        if not in_range or len(set(gp.outputs)) < len(gp.outputs):
+            raise DataError(f"a GP must predict outputs; got {gp.outputs!r:.80}")
 
 
 @dataclass(frozen=True)
@@ -199,9 +312,7 @@ class LogDynamics:
         space, noise, n = self.model.kinematics.space, self.noise, self.state_dim
         if noise is None:
             return torch.zeros(n, n, dtype=torch.float64)
-        x = np.zeros((1, n))
-        for group, at in zip(space.groups, space.columns, strict=True):
-            x[0, at.stop - 1] = group.kind == "quaternion"
+        x = _resting(space)
         h = DIFFERENCE * np.eye(space.error_dim)
         B = self._by_outputs(x, np.zeros((1, noise.outputs.shape[1])))[0]
         D = (space.displace(x, h) - space.displace(x, -h)).T / (2 * DIFFERENCE)
@@ -308,13 +419,20 @@ class SavedModel:
         self.signals.check(self.path, system.signals, system.name, "model")
 
 
-def load_flyable(path: str | Path) -> SavedModel:
+def load_flyable(path: str | Path, trusted: Sequence[str] | None = None) -> SavedModel:
     """Reads a file of ``gpmpc learn`` or of ``save_model``.
 
+    Args:
+        path: The file.
+        trusted: Names of packages whose code the file may name; see ``load_model``.
+
     Raises:
-        DataError: The file is missing, damaged or of another kind.
-        SettingError: What is in it cannot be flown.
+        DataError: The file is missing, damaged or of another kind, or names code that
+            is not trusted.
+        SettingError: What is in it cannot be flown, or ``trusted`` is no list of names
+            of packages.
     """
+    packages = trusted_packages("model.trusted", trusted)
     header = load_metadata(path)
     if header.get("kind") == KIND:
         learned = load_learned(path)
@@ -333,11 +451,14 @@ def load_flyable(path: str | Path) -> SavedModel:
             signals,
         )
         return SavedModel(str(path), flown, signals)
-    model = load_model(path)
+    model = load_model(path, packages)
     signals = signals_of(model)
-    said = header.get("metadata")  # where names stood before models carried them
-    if signals == UNKNOWN and isinstance(said, dict):
-        signals = Signals(
-            said.get("states") or (), said.get("inputs") or (), said.get("time_step")
-        )
+    if signals == UNKNOWN:  # names stood in the metadata before models carried them
+        with consistent(Path(path), "its metadata do not describe a model"):
+            metadata = header.get("metadata") or {}
+            signals = Signals(
+                state_names=_words("states", metadata.get("states") or []),
+                input_names=_words("inputs", metadata.get("inputs") or []),
+                time_step=metadata.get("time_step"),
+            )
     return SavedModel(str(path), model, signals)

@@ -91,6 +91,11 @@ class ResidualModel(TensorModel):
                 "residual",
                 f"must be a GP with predicts='value'; got {getattr(gp, 'predicts', gp)!r}",
             )
+        if not callable(nominal):
+            raise SettingError(
+                "nominal",
+                f"must be a function of states and inputs, such as Affine; got {nominal!r}",
+            )
         if callable(self.B) and self.noise is None:
             raise SettingError(
                 "noise",

@@ -26,6 +26,8 @@ SECONDS = 300  # a command may take
 
 _copies = multiprocessing.get_context("forkserver")
 _copies.set_forkserver_preload(IMPORTED)
+#: ``multiprocessing.Process``, as a copy of one that has imported everything
+copied_process = _copies.Process
 
 
 def gpmpc(*arguments, cwd, **environment):
@@ -48,7 +50,7 @@ def forked(*arguments, cwd, **environment):
     """
     with tempfile.TemporaryDirectory() as folder:
         streams = [Path(folder) / name for name in ("out", "err")]
-        process = _copies.Process(
+        process = copied_process(
             target=_answer, args=(arguments, cwd, os.environ | environment, streams)
         )
         process.start()

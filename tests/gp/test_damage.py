@@ -125,7 +125,7 @@ def test_an_array_that_declares_more_than_it_holds_is_refused(tmp_path):
             )
     with pytest.raises(
         DataError,
-        match=r"data\.npz: not a readable .npz file of transitions \(EOF: reading array",
+        match=r"data\.npz: not a readable .npz file of transitions \(states.npy is an array of shape",
     ):
         Transitions.load(path)
 

@@ -1,0 +1,467 @@
+"""Settings in a recording are data: what is not listed is not called nor imported."""
+
+import json
+import os
+import sys
+import time
+from functools import cache
+from pathlib import Path
+
+import pytest
+import yaml
+from omegaconf import OmegaConf
+
+from gpmpc.cli import _flights
+from gpmpc.cli._recorded_settings import checked_settings, read_settings
+from gpmpc.cli._run import plain_data
+from gpmpc.cli._settings import compose, settings
+from gpmpc.exceptions import DataError, SettingError
+from gpmpc.recording import read_run
+from tests.cli.command import copied_process, forked
+from tests.recording import runs
+
+CANARY = "canary_of_the_tests"
+TEXT = """
+from pathlib import Path
+Path(__file__).with_name("fired").touch()
+from gpmpc.systems import translational
+def vehicle(mass=0.74): return translational(mass=mass)
+def write(*given, **named): Path(__file__).with_name("fired").touch()
+import numpy as np
+"""
+
+
+@cache
+def _flight(*words):
+    with settings():
+        return json.dumps(plain_data(compose("run", ["data.samples=12", *words])))
+
+
+def flight(*words):
+    """Settings of a flight as it records them."""
+    return json.loads(_flight(*words))
+
+
+def put(found, place, value):
+    """Settings with a value at a dotted place."""
+    *parents, last = place.split(".")
+    node = found
+    for key in parents:
+        node = node[key]
+    node[last] = value
+    return found
+
+
+def write(text):
+    return {"_target_": "pathlib.Path.write_text", "_args_": [text, "x"]}
+
+
+def environment(name, **more):
+    target = "gpmpc.systems.gymnasium_.gymnasium_system"
+    return {"_target_": target, "environment": name, **more}
+
+
+def six_hostile_settings():
+    """Settings that would write or run something: at the top, inside, and deep."""
+    canary = {"_target_": f"{CANARY}.write"}
+    deep = [[{"a": [{"b": {"_target_": "numpy.save", "file": "x", "arr": [1]}}]}]]
+    whole = {"_target_": "gpmpc._files.write_whole", "path": "x", "content": "x"}
+    alias = {"_target_": "gpmpc._files.os.system", "_args_": ["touch fired"]}
+    copied = {"_target_": "shutil.copyfile", "src": "/etc/hostname", "dst": "fired"}
+    return {
+        "system": put(flight(), "system", write("fired")),
+        "module": put(flight(), "model.scaling", canary | {"_partial_": True}),
+        "arguments": put(
+            flight(), "controller.problem.cost.Q", {"_args_": [whole], "x": dict(whole)}
+        ),
+        "plant": put(
+            put(flight(), "system", environment("CartPole-v1")),
+            "plant",
+            {"environment": f"{CANARY}:Env"},
+        ),
+        "lists": put(flight(), "disturbances", deep),
+        "unused": put(
+            flight(), "hydra", [{"_recursive_": False, "z": [alias, copied]}]
+        ),
+    }
+
+
+def record(path, found):
+    """A recording with settings, given as data or as text."""
+    text = (
+        found if isinstance(found, str) else OmegaConf.to_yaml(OmegaConf.create(found))
+    )
+    runs.record_run(path, steps=3, config=text)
+    return path
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """A working folder with a module that tells when it is imported."""
+    (tmp_path / f"{CANARY}.py").write_text(TEXT)
+    return tmp_path
+
+
+@pytest.mark.parametrize("words", [["calibrate"], ["plot", "--film"]], ids=" ".join)
+def test_a_hostile_recording_is_refused_in_one_line_and_nothing_happens(words, folder):
+    record(folder / "run.mcap", six_hostile_settings()["module"])
+    before = sorted(path.name for path in folder.iterdir())
+    done = forked(*words, "run.mcap", cwd=folder)
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1), done.stderr
+    assert f"--trust {CANARY}" in done.stderr
+    assert "model.scaling._target_" in done.stderr
+    assert sorted(path.name for path in folder.iterdir()) == before
+
+
+@pytest.mark.parametrize("name", [*six_hostile_settings()])
+def test_settings_that_call_anything_else_are_refused_at_every_depth(name):
+    found = six_hostile_settings()[name]
+    with pytest.raises(DataError, match=r"its settings (call|import) '") as told:
+        _flights._experiment_of(run_of(found), [])
+    assert "\n" not in str(told.value)
+    assert str(told.value).startswith("run.mcap: ")
+
+
+def run_of(found):
+    """What ``read_run`` would return of a recording with these settings, in part."""
+
+    class Run:
+        path = Path("run.mcap")
+        config = found if isinstance(found, str) else yaml.safe_dump(found)
+        state_names, input_names = runs.STATES, runs.INPUTS
+
+    return Run
+
+
+NOT_CALLED = [
+    "os.system", "builtins.eval", "builtins.exec", "subprocess.run", "pickle.loads", "numpy.load", "torch.load",
+    "gpmpc._files.write_whole", "gpmpc._files.os.system", "gpmpc.gp.Transitions.load", "gpmpc.gp.save_posterior",
+    "gpmpc.models.save_model", "gpmpc.recording.recover", "gpmpc.systems._simulators.library",
+    "gpmpc.systems._simulators.import_module", "gpmpc.cli._run.run_one", "gpmpc.cli._run.instantiate",
+    "gpmpc.systems.gymnasium_.register_environments", "gpmpc.systems.gymnasium_.make_environment",
+    "gpmpc.systems.pendulum.__globals__", "gpmpc.systems.System.__init__", "gpmpc", "hydra.utils.instantiate",
+    "hydra.utils.call", "omegaconf.OmegaConf.load", "functools.partial", "importlib.import_module",
+    "gpmpc.systems .pendulum", "gpmpc.systems.pendulum\n", "", "gpmpc.systems:pendulum", "GPMPC.systems.pendulum",
+    "_frozen_importlib.__import__", "antigravity", "webbrowser.open",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("target", NOT_CALLED)
+@pytest.mark.parametrize(
+    "place", [lambda t: t, lambda t: {"x": [{"y": t}]}, lambda t: {"_args_": [[t]]}],
+    ids=["here", "in a list", "in arguments"],
+)  # fmt: skip
+def test_what_is_not_on_the_list_is_not_called(target, place):
+    modules = {*sys.modules}
+    with pytest.raises(DataError, match=r"its settings (call|name)") as told:
+        checked_settings({"a": place({"_target_": target})}, ["my_robot"])
+    assert "\n" not in str(told.value)
+    assert {*sys.modules} == modules
+
+
+@pytest.mark.parametrize(
+    ("found", "rule"),
+    [
+        ({"_target_": 3}, "name nothing at a._target_"),
+        ({"_target_": ["gpmpc.systems.pendulum"]}, "name nothing"),
+        ({"_target_": None}, "name nothing"),
+        ({"_target_": "gpmpc.systems.pendulum", "_partial_": "yes"}, "true or false"),
+        ({"_target_": "gpmpc.systems.pendulum", "_recursive_": 0}, "true or false"),
+        ({"_target_": "gpmpc.systems.pendulum", "_convert_": "x"}, "a word of Hydra's"),
+        ({"_target_": "gpmpc.systems.pendulum", "_args_": {"a": 1}}, "must be a list"),
+        ({"_target_": "gpmpc.systems.pendulum", "_call_": 1}, "a._call_, which means"),
+        ({"x": [{"__class__": "os.system"}]}, r"a.x\[0\].__class__, which means"),
+        (
+            {"_target_": "hydra.utils.get_method", "path": "os.system"},
+            "call 'os.system'",
+        ),
+        (
+            {"_target_": "hydra.utils.get_method", "_args_": ["os.system"]},
+            "name nothing",
+        ),
+        (
+            {
+                "_target_": "hydra.utils.get_class",
+                "path": "my_robot.A",
+                "_args_": ["os.b"],
+            },
+            "look code up in another way",
+        ),
+        ({"_target_": "hydra.utils.get_object", "path": "canary.x"}, "--trust canary"),
+        (environment("canary:Env-v0"), "import 'canary' .*--trust canary"),
+        (environment("os:Env"), "import 'os'"),
+        (environment("Ant-v5", make={"xml_file": "x.xml"}), "--trust gymnasium"),
+        (environment("Ant-v5", _args_=["canary:Env"]), "arguments by their names"),
+        (
+            {
+                "_target_": "gpmpc.qp.CvxpySolver",
+                "options": {"write_data_filename": "x"},
+            },
+            "--trust cvxpy",
+        ),
+        (
+            {"_target_": "gpmpc.mpc.baselines.StateFormMPC", "options": {"a": 1}},
+            "--trust cvxpy",
+        ),
+        ({"_target_": "gpmpc.qp.CvxpySolver", "_args_": ["SCS", {"a": 1}]}, "by their"),
+    ],
+    ids=lambda value: str(value)[:60],
+)
+def test_a_call_that_is_written_in_another_way_is_refused(found, rule):
+    with pytest.raises(DataError, match=rule):
+        checked_settings({"a": found}, [])
+
+
+def aliases(levels):
+    lines = ["a0: &a0 [x, x, x, x, x, x, x, x, x]"]
+    for i in range(1, levels):
+        inner = ", ".join([f"*a{i - 1}"] * 9)
+        lines.append(f"a{i}: &a{i} [{inner}]")
+    return "\n".join(lines)
+
+
+@pytest.mark.parametrize(
+    ("text", "rule"),
+    [
+        (aliases(7), "a YAML alias"),
+        ("a: &x 1\nb: *x", "a YAML alias"),
+        ("a: !!python/object/apply:pathlib.Path [x]", "a YAML tag"),
+        ("a: !!binary aGVsbG8=", "a YAML tag"),
+        ("a: ${oc.env:HOME}", "an interpolation"),
+        ("a: 'x ${b} y'", "an interpolation"),
+        ("'${a}': 1", "an interpolation"),
+        ("a: \"\\x24{oc.decode:'1'}\"", "an interpolation"),
+        ("a: \\${b}", "an interpolation"),
+        ("[" * 5000, "nested deeper"),
+        ("a: " + "[" * 100 + "]" * 100, "nested deeper"),
+        ("a: 1\n" * 20000, "longer than"),
+        ("a: [" + "1," * 30000 + "]", "more than 4000 entries"),
+        (f"a: {'9' * 4900}", "cannot be read"),
+        (f"a: {'9' * 6000}", "an entry of more than"),
+        ("a: 1\na: 2", "cannot be read .*duplicate key"),
+        ("a: 1\n--- \nb: 2", "cannot be read"),
+        ("- 1", "no names with values"),
+        ("a: [", "cannot be read"),
+        ("a: \x00", "cannot be read"),
+        ("? [1, 2]\n: 3", "cannot be read"),
+    ],
+    ids=lambda value: value[:40],
+)
+def test_settings_that_are_no_plain_names_and_values_are_refused_at_once(text, rule):
+    began = time.process_time()
+    with pytest.raises(DataError, match=rule) as told:
+        read_settings(text)
+    assert "\n" not in str(told.value)
+    assert time.process_time() - began < 2.0
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["a: [" + "1," * 1990 + "1]", "a:\n" + "- -\n" * 1900, "a: [" + "[1]," * 900 + "]",
+     "a:\n" + ("- " + "[" * 18 + "1" + "]" * 18 + "\n") * 200],
+    ids=["numbers", "lists", "flow", "deep"],
+)  # fmt: skip
+def test_the_largest_settings_are_read_in_a_second_or_two(text):
+    began = time.process_time()
+    assert read_settings(text)["a"]
+    assert time.process_time() - began < 4.0
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        [],
+        ["system=pendulum", "controller=lqr", "plant.mass=1.1"],
+        ["controller=state_form", "trajectory=lorenz"],
+        ["nominal={mass: 0.8}", "solver=clarabel", "learning=online"],
+        ["system=translational", "data=nmpc", "controller=nonlinear", "propagation=unscented"],
+        ["disturbances=[{_target_: gpmpc.simulation.Gust, rates: {vx: 0.5}, start: 2}]"],
+    ],
+    ids=" ".join,
+)  # fmt: skip
+def test_settings_of_an_ordinary_flight_describe_the_same_as_before(words):
+    from gpmpc.cli._run import experiment_of, experiment_of_file
+
+    found = flight(*words)
+    with settings():
+        expected = experiment_of(OmegaConf.create(found))
+    text = OmegaConf.to_yaml(OmegaConf.create(found))
+    experiment = experiment_of_file(read_settings(text), [])
+    for key in ("data", "trajectory", "train", "steps", "learning", "disturbances"):
+        assert repr(getattr(experiment, key)) == repr(getattr(expected, key))
+    for ours, theirs in (
+        (experiment.system, expected.system),
+        (experiment.flown, expected.flown),
+    ):
+        assert vars(ours.dynamics) == vars(theirs.dynamics)
+        assert (ours.time_step, ours.nominal is None) == (
+            theirs.time_step,
+            theirs.nominal is None,
+        )
+    assert {*experiment.controller.keywords} == {*expected.controller.keywords}
+
+
+def test_a_package_that_is_trusted_may_be_called_and_no_more_than_its_own_code(
+    folder, monkeypatch
+):
+    monkeypatch.chdir(folder)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    monkeypatch.delitem(sys.modules, CANARY, raising=False)
+    own = put(flight(), "system", {"_target_": f"{CANARY}.vehicle", "mass": 0.8})
+    with pytest.raises(DataError, match=f"--trust {CANARY}"):
+        _flights._experiment_of(run_of(own), [])
+    assert str(folder) not in sys.path
+    assert not (folder / "fired").exists()
+    system = _flights._experiment_of(run_of(own), [CANARY]).system
+    assert system.dynamics.mass == 0.8
+    (folder / "fired").unlink()
+    for name in ("np.save", "Path.write_text", "Path"):
+        hostile = put(flight(), "model.scaling", {"_target_": f"{CANARY}.{name}"})
+        with pytest.raises(DataError, match=f"which {CANARY} only imports"):
+            _flights._experiment_of(run_of(hostile), [CANARY])
+    with pytest.raises(DataError, match="cannot be imported here"):
+        _flights._experiment_of(
+            run_of(put(flight(), "model", {"_target_": f"{CANARY}.nothing"})), [CANARY]
+        )
+    with pytest.raises(SettingError, match="--trust: os is no package to trust"):
+        _flights._experiment_of(run_of(own), ["os"])
+    hostile = put(own, "model.scaling", {"_target_": "shutil.rmtree", "path": "x"})
+    monkeypatch.delitem(sys.modules, CANARY)
+    with pytest.raises(DataError, match=r"shutil.rmtree.*which no settings"):
+        _flights._experiment_of(run_of(hostile), [CANARY])
+    assert not (folder / "fired").exists()  # names are compared before any import
+
+
+def test_whom_a_saved_model_may_trust_the_caller_says_and_not_the_recording():
+    model = {"_target_": "gpmpc.logs.load_flyable", "path": "x", "trusted": ["evil"]}
+    for trusted in ([], ["my_robot"]):
+        assert checked_settings(model, trusted)["trusted"] == trusted
+        assert checked_settings([{"a": model}], trusted)[0]["a"]["trusted"] == trusted
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda f: put(f, "system", 5), lambda f: put(f, "system", None), lambda f: put(f, "controller", "x"),
+        lambda f: put(f, "trajectory", {"a": 1, "b": 2}), lambda f: put(f, "disturbances", {"a": 1}),
+        lambda f: put(f, "data", {"size": None}),
+        lambda f: put(f, "data", {"_target_": "gpmpc.trajectories.Hover", "size": 3}),
+        lambda f: put(f, "plant", [1]), lambda f: put(f, "nominal", 3), lambda f: put(f, "noise", 3),
+        lambda f: put(f, "horizon", "many"), lambda f: put(f, "controller.problem", 3),
+        lambda f: put(f, "system", {"_target_": "gpmpc.systems.pendulum", "mass": "x"}),
+        lambda f: put(f, "system", {"_target_": "gpmpc.systems.pendulum", "weight": 1}),
+        lambda f: put(f, "system", {"_target_": "gpmpc.systems.pendulum"}),
+        lambda f: put(f, "data.samples", "???"), lambda f: put(f, "model", {"_target_": "gpmpc.qp.DualActiveSet"}),
+        lambda f: {key: f[key] for key in ("system", "controller", "folder")},
+        lambda f: put(f, "controller.problem.cost", {"_target_": "gpmpc.systems.pendulum", "Q": [1], "R": [1]}),
+        lambda f: put(f, "seed", [1]), lambda f: put(f, "steps", 1.5), lambda f: put(f, "loop", {}),
+    ],
+)  # fmt: skip
+def test_settings_that_describe_no_flight_are_one_line_with_the_recordings_name(change):
+    def learn():
+        experiment = _flights._experiment_of(run_of(change(flight())), [])
+        with _flights._settings_of(run_of("")):
+            experiment.learn(experiment.training_rows(), 0)
+
+    with pytest.raises(DataError, match=r"^run\.mcap: [^\n]+$"):
+        learn()
+
+
+def test_a_recording_and_its_settings_must_be_of_one_system():
+    found = flight("system=pendulum", "controller=lqr")
+    with pytest.raises(DataError, match="describe another system than it recorded"):
+        _flights._experiment_of(run_of(found), [])
+
+
+# The twelve hostile files: six recordings of above, six models of tests/models/test_hostile_models.py.
+
+WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND
+ACTING = (
+    "import", "subprocess.", "socket.", "shutil.", "os.system", "os.exec", "os.fork", "os.spawn", "os.posix_spawn",
+    "os.rename", "os.remove", "os.mkdir", "os.rmdir", "os.link", "os.symlink", "os.truncate", "os.chmod", "os.chown",
+    "os.utime", "os.putenv", "ctypes.", "webbrowser.", "urllib.", "pickle.find_class", "pty.", "signal.", "sqlite3.",
+)  # fmt: skip
+
+
+class Watch:
+    """Notes, and stops, whatever a file may not lead to while it is read."""
+
+    def __init__(self):
+        self.on, self.seen = False, []
+        sys.addaudithook(self)
+
+    def __call__(self, event, given):
+        if not self.on:
+            return
+        acts = event.startswith(ACTING)
+        if event == "open":
+            mode, flags = given[1] or "", given[2] or 0
+            acts = bool({*"wax+"} & {*str(mode)}) or bool(flags & WRITING)
+        if acts:
+            self.seen.append(f"{event} {given!r:.200}")
+            raise PermissionError(f"{event} while a file is read")
+
+
+def read_hostile(folder, told):
+    """Reads every file of a folder under a watch, and writes what was said and what happened."""
+    os.chdir(folder)
+    sys.path.insert(0, str(folder))  # the worst case: what a file names can be imported
+    from gpmpc.logs import load_flyable
+    from gpmpc.models import load_model
+
+    def calibrate(path):
+        _flights._experiment_of(read_run(path), [])
+
+    for road in (load_model, load_flyable):
+        road(folder / "good.safetensors")
+    calibrate(folder / "good.mcap")
+    watch, outcomes = Watch(), {}
+    for path in sorted(folder.glob("hostile*")):
+        roads = (calibrate,) if path.suffix == ".mcap" else (load_model, load_flyable)
+        for road in roads:
+            try:
+                watch.on = True
+                road(path)
+                outcome = "read"
+            except DataError as error:
+                outcome = str(error)
+            except Exception as error:
+                outcome = f"escaped: {error!r}"
+            finally:
+                watch.on = False
+            outcomes[f"{path.name} by {road.__name__}"] = outcome
+    told.write_text(json.dumps({"outcomes": outcomes, "seen": watch.seen}))
+
+
+def test_twelve_hostile_files_are_refused_and_nothing_is_imported_called_or_written(
+    folder, tmp_path_factory
+):
+    from gpmpc.models import save_model
+    from tests.gp.small_models import residual_model
+    from tests.models.test_hostile_models import six_hostile_models
+
+    save_model(residual_model(), folder / "good.safetensors")
+    for name, content in six_hostile_models(
+        folder / "good.safetensors", CANARY
+    ).items():
+        (folder / f"hostile_{name}.safetensors").write_bytes(content)
+    record(folder / "good.mcap", flight())
+    for name, found in six_hostile_settings().items():
+        record(folder / f"hostile_{name}.mcap", found)
+    before = sorted(path.name for path in folder.iterdir())
+    told = tmp_path_factory.mktemp("told") / "told.json"
+    process = copied_process(target=read_hostile, args=(folder, told))
+    process.start()
+    process.join(120)
+    assert process.exitcode == 0
+    found = json.loads(told.read_text())
+    assert found["seen"] == []
+    assert len(found["outcomes"]) == 6 + 2 * 6
+    for name, outcome in found["outcomes"].items():
+        assert outcome.startswith(str(folder / name.partition(" by ")[0])), (
+            name,
+            outcome,
+        )
+        assert "\n" not in outcome
+    after = sorted(path.name for path in folder.iterdir())
+    assert [name for name in after if name != "__pycache__"] == before
