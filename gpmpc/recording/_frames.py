@@ -6,6 +6,7 @@ it is known to be small.
 
 import struct
 import zlib
+from collections.abc import Container, Iterator
 from io import BytesIO
 from typing import Any, BinaryIO, NamedTuple
 
@@ -20,7 +21,6 @@ from mcap.records import (
     Channel,
     Chunk,
     ChunkIndex,
-    McapRecord,
     Message,
     Metadata,
     MetadataIndex,
@@ -86,7 +86,7 @@ def read_frame(stream: BinaryIO | BytesIO, start: int, end: int) -> Frame | None
     return Frame(kind, start, content) if len(content) == length else None
 
 
-def parsed(kind: int, content: bytes) -> McapRecord:
+def parsed(kind: int, content: bytes) -> Any:
     """Parses a record, of an attachment only if its checksum is right.
 
     Raises one of ``BROKEN`` where the content is none of its kind.
@@ -138,6 +138,44 @@ def stored_checksum(content: bytes) -> int:
 def agrees(stored: int, computed: int) -> bool:
     """Whether a checksum is right, or there is none."""
     return stored in (0, computed)
+
+
+def frames(data: bytes) -> Iterator[Frame]:
+    """Yields the records in data one after the other, up to the first that is cut."""
+    stream = BytesIO(data)
+    position = 0
+    while position < len(data):
+        frame = read_frame(stream, position, len(data))
+        if frame is None:
+            return
+        yield frame
+        position = frame.end
+
+
+def topics_of_chunk(data: bytes, known: Container[int]) -> dict[int, str]:
+    """Reads the topics by channel out of a chunk and what follows it.
+
+    A chunk is unfolded only where an index of messages behind it is of a channel that
+    is not known.
+    """
+    records = list(frames(data))
+    indexed = {
+        int.from_bytes(frame.content[:2], "little")
+        for frame in records
+        if frame.kind == Opcode.MESSAGE_INDEX
+    }
+    if all(number in known for number in indexed):
+        return {}
+    topics = {}
+    for frame in records:
+        if frame.kind != Opcode.CHUNK:
+            continue
+        chunk: Chunk = parsed(frame.kind, frame.content)
+        for inner in frames(unfolded(chunk)):
+            if inner.kind == Opcode.CHANNEL:
+                channel: Channel = parsed(inner.kind, inner.content)
+                topics[channel.id] = channel.topic
+    return topics
 
 
 class _Content(ReadDataStream):

@@ -193,7 +193,8 @@ def _read_records(index: Index, data: bytes) -> list[tuple[Place, Place]]:
                 stated[record.group_opcode] = record.group_start, record.group_length
             else:
                 _add(index, record)
-    return [(place, groups.get(kind, (0, 0))) for kind, place in stated.items()]
+    # A writer may name a part that is empty.
+    return [(place, groups.get(kind, (place[0], 0))) for kind, place in stated.items()]
 
 
 def _add(index: Index, record: McapRecord) -> None:

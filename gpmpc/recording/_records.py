@@ -278,8 +278,7 @@ class _Reader:
         """Yields the records of a chunk, and sees to where the next record stands."""
         has_successor = self._is_likely(frame.end)
         try:
-            chunk = parsed(frame.kind, frame.content)
-            assert isinstance(chunk, Chunk)
+            chunk: Chunk = parsed(frame.kind, frame.content)
             end = frame.content_start + chunk_length(chunk)
             data = self._unfold(chunk)
         except RecordingError:
@@ -450,8 +449,7 @@ class _Reader:
         self._file.seek(content_start)
         content = self._file.read(data_start + length)
         try:
-            chunk = parsed(Opcode.CHUNK, content)
-            assert isinstance(chunk, Chunk)
+            chunk: Chunk = parsed(Opcode.CHUNK, content)
             data = self._unfold(chunk)
         except RecordingError:
             raise  # it is a RuntimeError, as broken records raise
