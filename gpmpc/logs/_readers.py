@@ -15,6 +15,7 @@ import pandas as pd
 from gpmpc.exceptions import DataError, GpmpcError
 
 STAMP = "timestamp"  # [s], of streams with a topic
+FLAWS = "flaws"  # in the ``attrs`` of tables: what is wrong with their file
 Streams = dict[str, pd.DataFrame]
 
 
@@ -100,21 +101,36 @@ def _read_mcap(path: Path, topics: tuple[str, ...], partial: bool) -> Streams:
     from gpmpc.recording import read_run
 
     run = read_run(path)
-    if not run.finished and not partial:
+    if not run.whole and not partial:
+        reasons = "; ".join(flaw.text for flaw in run.flaws)
         raise DataError(
-            f"{path}: unfinished or damaged; gpmpc log recover rescues it, partial=true takes what is whole"
+            f"{path}: unfinished or damaged; gpmpc log recover rescues it, "
+            f"partial=true takes what is whole ({reasons})"
         )
-    return {"": run.to_pandas()}
+    table = run.to_pandas()
+    table.attrs[FLAWS] = run.flaws
+    return {"": table}
 
 
 def _read_ros2(path: Path, topics: tuple[str, ...], partial: bool) -> Streams:
     from mcap.reader import NonSeekingReader
     from mcap_ros2.decoder import DecoderFactory
 
+    from gpmpc.recording import NO_CHECKSUMS, bag_flaws
+
+    flaws = bag_flaws(path)
+    if not partial and any(flaw.kind != NO_CHECKSUMS for flaw in flaws):
+        reasons = "; ".join(flaw.text for flaw in flaws)
+        raise DataError(
+            f"{path}: the bag cannot be read to its end ({reasons}); "
+            "partial=true takes what is whole"
+        )
     rows: dict[str, list[dict[str, float]]] = {}
     with path.open("rb") as file:
         # In the file's order, because the index of a truncated file is lost.
-        reader = NonSeekingReader(file, decoder_factories=[DecoderFactory()])
+        reader = NonSeekingReader(
+            file, validate_crcs=True, decoder_factories=[DecoderFactory()]
+        )
         try:
             for _, channel, message, decoded in reader.iter_decoded_messages(
                 log_time_order=False
@@ -133,7 +149,10 @@ def _read_ros2(path: Path, topics: tuple[str, ...], partial: bool) -> Streams:
                 raise DataError(
                     f"{path}: the bag cannot be read to its end ({error}){hint}"
                 ) from error
-    return {topic: pd.DataFrame(messages) for topic, messages in rows.items()}
+    streams = {topic: pd.DataFrame(messages) for topic, messages in rows.items()}
+    for table in streams.values():
+        table.attrs[FLAWS] = flaws
+    return streams
 
 
 def _fields(message: Any, prefix: str) -> Iterable[tuple[str, float]]:

@@ -26,7 +26,7 @@ from gpmpc.logs._kinematics import (
 )
 from gpmpc.logs._log import Finding, Log, LogRun
 from gpmpc.logs._mapping import TIME_UNITS, LogMapping, Signal
-from gpmpc.logs._readers import STAMP, Streams, read_streams
+from gpmpc.logs._readers import FLAWS, STAMP, Streams, read_streams
 
 REST_TIME = 0.5  # [s] for which nothing moves at rest
 REST_SHARE = 0.1  # of a state's usual spread that counts as no movement
@@ -86,6 +86,11 @@ def read_log(
             file, {signal.topic for signal in mapping.signals}, partial
         )
         runs = [(file.name.removesuffix(".gz").rsplit(".", 1)[0], streams)]
+        flaws = [f for table in streams.values() for f in table.attrs.get(FLAWS, ())]
+        findings.extend(
+            Finding(flaw.kind, runs[0][0], flaw.count, flaw.text)
+            for flaw in dict.fromkeys(flaws)  # tables of a file have the same
+        )
         if mapping.run:
             table = streams.get("", pd.DataFrame())
             _check_column(str(file), table, mapping.run)

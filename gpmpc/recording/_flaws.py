@@ -1,6 +1,6 @@
 """Names what can be wrong with a recording: what is missing, altered, or not vouched for."""
 
-from typing import NamedTuple
+from dataclasses import dataclass
 
 UNFINISHED = "unfinished"  # the file has no end
 LOST_CHUNKS = "lost chunks"
@@ -17,7 +17,8 @@ RECOVERED = "recovered"  # the file holds what was left of another
 DAMAGE = (LOST_CHUNKS, LOST_STEPS, LOST_MESSAGES, DAMAGED_RECORDS, WRONG_CHECKSUM)
 
 
-class Flaw(NamedTuple):
+@dataclass(frozen=True)
+class Flaw:
     """Something that is wrong with a recording."""
 
     kind: str  # such as "lost steps"

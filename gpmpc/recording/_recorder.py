@@ -32,7 +32,7 @@ from gpmpc.step import Step
 
 _INTERVAL = 1.0  # [s] of the clock after which the next step ends a chunk
 _SPAN = 2.0  # [s] of the flight in a chunk; a simulated one takes less than it lasts
-_LEAST = 16 * 1024  # numbers [bytes] for which a chunk is worth its own entries
+_LEAST = 8 * 1024  # numbers [bytes] for which a chunk is worth its own entries
 _PORT = 8765  # of the live view, if it is free
 
 
