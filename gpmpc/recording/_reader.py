@@ -339,24 +339,23 @@ def _names(
 ) -> tuple[tuple[str, ...], tuple[str, ...], bool]:
     """Returns the names of states and inputs, and whether metadata name others.
 
-    The schema of the steps has them as well, and has a checksum where metadata have
+    Those in the schema of the steps count, which has a checksum where metadata have
     none.
     """
     about = content.metadata.get("run", {})
-    described = [
-        about[key].split() for key in ("state_names", "input_names") if key in about
-    ]
-    names = _names_in_schema(content) or described
-    if len(names) < 2:
+    if not {"state_names", "input_names"} <= about.keys():
         raise RecordingError(
             f"{path}: is not the recording of a run; it has no metadata about one"
         )
+    described = [about[key].split() for key in ("state_names", "input_names")]
     try:
-        state_names = _messages.check_names("state_names", names[0])
-        input_names = _messages.check_names("input_names", names[1])
+        for names in (described, _names_in_schema(content) or described):
+            state_names = _messages.check_names("state_names", names[0])
+            input_names = _messages.check_names("input_names", names[1])
     except SettingError as error:
         raise RecordingError(f"{path}: its metadata are damaged; {error}") from error
-    return state_names, input_names, names != described
+    are_others = [list(state_names), list(input_names)] != described
+    return state_names, input_names, are_others
 
 
 def _names_in_schema(content: _FileContent) -> list[list[str]] | None:
