@@ -385,34 +385,42 @@ def _step_flaws(
 def _count_flaws(content: _FileContent, present: int, where: str) -> list[Flaw]:
     """Compares the number of steps with what end, index and numbering of a file say."""
     stated = _stated_steps(content)
+    total = str(stated)
+    if stated is None:  # those behind the last that was read are not known
+        stated = _numbered_steps(content)
+        total = f"at least {stated}"
     if present > stated > 0:
         text = f"its end counts {stated} steps; there are {present}"
         return [Flaw(WRONG_COUNT, present - stated, text)]
     if present < stated:
         lost = stated - present
-        text = f"{lost} of {stated} steps are lost" + (f": {where}" if where else "")
+        text = f"{lost} of {total} steps are lost" + (f": {where}" if where else "")
         return [Flaw(LOST_STEPS, lost, text)]
     return []
 
 
-def _stated_steps(content: _FileContent) -> int:
-    """How many steps were recorded, as far as the file says; 0 where it does not."""
+def _stated_steps(content: _FileContent) -> int | None:
+    """How many steps were recorded, by the end of the file or its index."""
     stated = content.metadata.get("end", {}).get("steps", "")
     if stated.isdecimal() and len(stated) < 10:
         return int(stated)
-    if content.statistics is not None:
-        by_channel = content.statistics.channel_message_counts
-        of_steps = [
-            by_channel.get(number, 0)
-            for number, channel in content.channels.items()
-            if channel.topic == STEP
-        ]
-        if any(of_steps):
-            return sum(of_steps)
-    # The first number is 1, or 0 in files of the first edition.
+    if content.statistics is None:
+        return None
+    by_channel = content.statistics.channel_message_counts
+    counts = [
+        by_channel[number]
+        for number, channel in content.channels.items()
+        if channel.topic == STEP and number in by_channel
+    ]
+    return sum(counts) if counts else None
+
+
+def _numbered_steps(content: _FileContent) -> int:
+    """How many steps were recorded up to the last that was read, by their numbering."""
     sequence = [message.sequence for message in content.messages[STEP]]
     if not any(sequence):
-        return 0
+        return len(sequence)
+    # The first number is 1, or 0 in files of the first edition.
     return max(sequence) + (1 if min(sequence) == 0 else 0)
 
 

@@ -6,6 +6,7 @@ lengths of the records or, where one of these is damaged, from the index or from
 mark of a compressed chunk. What is left out is counted as a flaw.
 """
 
+import contextlib
 import re
 import struct
 import zlib
@@ -80,6 +81,8 @@ _COMPRESSION = 28  # where the name of the compression stands in a chunk's conte
 _MARK = re.compile(
     rb"\x04\x00\x00\x00zstd|\x03\x00\x00\x00lz4"
 )  # of a compressed chunk
+_CHANNELS_MARK = len(CHANNELS).to_bytes(4, "little") + CHANNELS.encode()
+_MARKS = re.compile(_MARK.pattern + b"|" + re.escape(_CHANNELS_MARK))
 _MAGICS = {b"zstd": b"\x28\xb5\x2f\xfd", b"lz4": b"\x04\x22\x4d\x18"}
 _LENGTH = struct.Struct("<Q")
 _BLOCK = 2**20  # [bytes] that are searched at once
@@ -204,7 +207,7 @@ class _Reader:
         if self._damaged_records:
             count = len(self._damaged_records)
             where = ", ".join(map(str, self._damaged_records[:3]))
-            text = f"{count} other records are damaged, at byte {where}"
+            text = f"damaged besides: {_records(count)}, at byte {where}"
             flaws.append(Flaw(DAMAGED_RECORDS, count, text + " ..." * (count > 3)))
         if self._repeated_chunks:
             text = f"{self._repeated_chunks} chunks come twice; one of each is left out"
@@ -411,27 +414,40 @@ class _Reader:
         yield from self._inside(placed)
 
     def _next_chunk(self, begin: int, end: int) -> _PlacedChunk | None:
-        """Finds the next compressed chunk that a checksum vouches for."""
-        for content_start in self._marks(begin, end):
-            placed = self._chunk_at(content_start)
+        """Finds the next compressed chunk that a checksum vouches for.
+
+        Topics of channels that stand on the way are taken along.
+        """
+        for position, mark in self._marks(begin, end):
+            if mark == _CHANNELS_MARK:
+                self._take_topics(position - HEAD.size)
+                continue
+            placed = self._chunk_at(position - _COMPRESSION)
             if placed is not None:
                 return placed
         return None
 
-    def _marks(self, begin: int, end: int) -> Iterator[int]:
-        """Yields where the content of a compressed chunk may begin, from ``begin`` on."""
+    def _take_topics(self, start: int) -> None:
+        frame = read_frame(self._file, start, self._size)
+        if frame is not None and frame.kind == Opcode.METADATA:
+            with contextlib.suppress(*BROKEN):
+                self._topics |= _topics(parsed(frame.kind, frame.content).metadata)
+
+    def _marks(self, begin: int, end: int) -> Iterator[tuple[int, bytes]]:
+        """Yields the marks of chunks and of ``CHANNELS`` with their places."""
         position = begin
         while position < end:
             self._file.seek(position)
-            block = self._file.read(_BLOCK + _COMPRESSION + 8)
-            for mark in _MARK.finditer(block):
-                content_start = position + mark.start() - _COMPRESSION
-                if mark.start() < _BLOCK and begin <= content_start < end:
-                    yield content_start
+            block = self._file.read(_BLOCK + len(_CHANNELS_MARK) - 1)
+            for mark in _MARKS.finditer(block):
+                if mark.start() < min(_BLOCK, end - position):
+                    yield position + mark.start(), mark[0]
             position += _BLOCK
 
     def _chunk_at(self, content_start: int) -> _PlacedChunk | None:
         """Reads the chunk whose content begins there, if a checksum vouches for it."""
+        if content_start < self._searched:
+            return None
         self._file.seek(content_start)
         head = self._file.read(_COMPRESSION + 4 + 4 + _LENGTH.size + 4)
         name = b"zstd" if head[_COMPRESSION + 4 :].startswith(b"zstd") else b"lz4"
@@ -464,6 +480,10 @@ class _Reader:
 def _is_like_chunk(content: bytes) -> bool:
     """Whether the content of a record is a compressed chunk's, whatever its kind says."""
     return _MARK.match(content, _COMPRESSION) is not None
+
+
+def _records(count: int) -> str:
+    return "1 record" if count == 1 else f"{count} records"
 
 
 def _topics(pairs: dict[str, str]) -> dict[int, str]:
