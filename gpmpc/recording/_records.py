@@ -437,12 +437,13 @@ class _Reader:
         """Yields the marks of chunks and of ``CHANNELS`` with their places."""
         position = begin
         while position < end:
+            length = min(_BLOCK, end - position)
             self._file.seek(position)
-            block = self._file.read(_BLOCK + len(_CHANNELS_MARK) - 1)
+            block = self._file.read(length + len(_CHANNELS_MARK) - 1)
             for mark in _MARKS.finditer(block):
-                if mark.start() < min(_BLOCK, end - position):
+                if mark.start() < length:
                     yield position + mark.start(), mark[0]
-            position += _BLOCK
+            position += length
 
     def _chunk_at(self, content_start: int) -> _PlacedChunk | None:
         """Reads the chunk whose content begins there, if a checksum vouches for it."""
