@@ -384,26 +384,40 @@ def _step_flaws(
 
 def _count_flaws(content: _FileContent, present: int, where: str) -> list[Flaw]:
     """Compares the number of steps with what end, index and numbering of a file say."""
-    stated = _stated_steps(content)
+    by_index = _steps_by_index(content)
+    by_end = _steps_by_end(content)
+    flaws = []
+    if by_index is not None and by_end is not None and by_end < by_index:
+        text = f"its end counts {by_end} steps, its index {by_index}"
+        flaws.append(Flaw(WRONG_COUNT, 1, text))
+    is_damaged = any(flaw.kind in DAMAGE for flaw in content.flaws)
+    if is_damaged and by_index is not None:  # which has a checksum of its own
+        stated: int | None = by_index
+    else:  # what rewrites a file makes a new index, and keeps the end
+        known = [count for count in (by_index, by_end) if count is not None]
+        stated = max(known, default=None)
     total = str(stated)
     if stated is None:  # those behind the last that was read are not known
         stated = _numbered_steps(content)
         total = f"at least {stated}"
     if present > stated > 0:
-        text = f"its end counts {stated} steps; there are {present}"
-        return [Flaw(WRONG_COUNT, present - stated, text)]
+        text = f"{stated} steps were recorded by its end; there are {present}"
+        flaws.append(Flaw(WRONG_COUNT, present - stated, text))
     if present < stated:
         lost = stated - present
         text = f"{lost} of {total} steps are lost" + (f": {where}" if where else "")
-        return [Flaw(LOST_STEPS, lost, text)]
-    return []
+        flaws.append(Flaw(LOST_STEPS, lost, text))
+    return flaws
 
 
-def _stated_steps(content: _FileContent) -> int | None:
-    """How many steps were recorded, by the end of the file or its index."""
+def _steps_by_end(content: _FileContent) -> int | None:
+    """How many steps the end of the recording counts."""
     stated = content.metadata.get("end", {}).get("steps", "")
-    if stated.isdecimal() and len(stated) < 10:
-        return int(stated)
+    return int(stated) if stated.isdecimal() and len(stated) < 10 else None
+
+
+def _steps_by_index(content: _FileContent) -> int | None:
+    """How many steps the index of the file counts."""
     if content.statistics is None:
         return None
     by_channel = content.statistics.channel_message_counts
