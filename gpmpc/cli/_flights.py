@@ -13,7 +13,7 @@ from rich.console import Console
 from gpmpc._provenance import is_of_this_code
 from gpmpc._trust import trusted_packages
 from gpmpc.cli._command import Result
-from gpmpc.cli._log import CUT
+from gpmpc.cli._log import condition
 from gpmpc.cli._recorded_settings import read_settings
 from gpmpc.cli._settings import find_modules_here, one_line, write_files, writing
 from gpmpc.cli._terminal import print_error
@@ -97,7 +97,7 @@ def _plot(given: argparse.Namespace, path: Path, folder: Path) -> dict[str, Any]
         ):
             draw(run, path=folder / f"flight.{ending}")
             written.append(f"flight.{ending}")
-    note = "" if run.finished else f"; {len(run.times)} steps: the recording is {CUT}"
+    note = "" if run.finished else f"; {len(run.times)} steps: {condition(run)}"
     print(f"written to {folder}: {', '.join(written)}{note}")
     return {"folder": str(folder), "written": written, "finished": run.finished}
 
@@ -174,6 +174,8 @@ def calibrate(given: argparse.Namespace) -> Result:
             raise DataError(f"{run.path}: has other states or inputs than {first}")
         if len(run.times) < 2 or (run.steps[1:] != run.steps[:-1] + 1).any():
             raise DataError(f"{run.path}: has fewer than two steps, or one is missing")
+        if not run.finished:
+            console.out(f"{run.path}: {condition(run)}", highlight=False)
     if not experiment.learns or hasattr(experiment.learning, "episodes"):
         raise DataError(
             f"{first}: its controller learned no model, or learned it from whole flights"

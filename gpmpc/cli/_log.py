@@ -1,7 +1,9 @@
 """``gpmpc log``: what is in a recording, rescue an unfinished one, its steps as a table, a layout to look at it."""
 
 import argparse
+from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -10,7 +12,8 @@ from rich.console import Console
 from gpmpc._files import write_whole
 from gpmpc.cli._command import Result
 from gpmpc.cli._settings import writing
-from gpmpc.exceptions import GpmpcError, SettingError
+from gpmpc.cli._terminal import print_error
+from gpmpc.exceptions import DataError, GpmpcError, SettingError
 from gpmpc.recording import Run, layout, read_run, recover
 from gpmpc.studies._document import Document, Table, plain_text, terminal
 
@@ -29,6 +32,12 @@ _SUFFIXES = {
 }
 
 
+def condition(run: Run) -> str:
+    """Says what is wrong with a recording that is not finished."""
+    reasons = "; ".join(flaw.text for flaw in run.flaws)
+    return reasons if run.whole else f"{CUT} ({reasons})"
+
+
 def log(given: argparse.Namespace) -> Result:
     """Does what was asked for with a recording."""
     action, file = given.action, given.file
@@ -45,22 +54,38 @@ def log(given: argparse.Namespace) -> Result:
     if action == "inspect":
         return _inspect(file, output, given.mapping)
     if action == "recover":
+        flawed = _read_steps(file)
         run = recover(file, output)
-        seconds = np.ptp(run.times) if len(run.times) else 0.0
-        note = f"{sum(count for count, _ in run.channels.values())} messages over {seconds:g} s"
+        messages = sum(count for count, _ in run.channels.values())
+        note = f"{messages} messages over {np.ptp(run.times):g} s; "
         note += (
-            "; the recording was finished, nothing was missing" if run.finished else ""
+            "the recording was finished, nothing was missing"
+            if flawed.finished
+            else "; ".join(flaw.text for flaw in flawed.flaws)
         )
     elif action == "layout":
-        _write(output, layout(read_run(file)))
+        run = _read_steps(file)
+        _write(output, layout(run))
         note = f"open {file} in Foxglove or Lichtblick, then import it as a layout"
     else:
-        run = read_run(file)
+        run = _read_steps(file)
         _write(output, _table_file(run, output.suffix))
         note = f"{len(run.times)} rows, {len(run.columns)} columns"
-        note += "" if run.finished else f"; the recording is {CUT}"
+        note += "" if run.finished else f"; the recording: {condition(run)}"
     print(f"written to {output}: {note}")
-    return Result({"output": str(output)})
+    return Result({"output": str(output), "flaws": _flaws(run)})
+
+
+def _read_steps(file: Path) -> Run:
+    """Reads a recording that has steps."""
+    run = read_run(file)
+    if not len(run.times):
+        raise DataError(f"{file}: holds no step ({condition(run) or 'it is finished'})")
+    return run
+
+
+def _flaws(run: Run) -> list[dict[str, Any]]:
+    return [asdict(flaw) for flaw in run.flaws]
 
 
 def _info(file: Path) -> Result:
@@ -72,7 +97,10 @@ def _info(file: Path) -> Result:
         else " (gpmpc log recover makes it readable for other tools)"
     )
     state = "finished" if run.finished else f"{CUT}{hint}"
-    console.print(f"{file}: {state}", soft_wrap=True, highlight=False, markup=False)
+    if run.whole and not run.finished:
+        state = "whole, as far as can be told"
+    lines = [f"{file}: {state}", *(f"  {flaw.text}" for flaw in run.flaws)]
+    console.print(*lines, sep="\n", soft_wrap=True, highlight=False, markup=False)
     metadata = [
         (n, k, v)
         for n, pairs in run.metadata.items()
@@ -93,13 +121,17 @@ def _info(file: Path) -> Result:
     ]
     console.print(terminal(tables))
     counts = {topic: count for topic, (count, _) in run.channels.items()}
+    if not len(run.times):
+        print_error(f"{file}: holds no step")
     return Result(
         {
             "finished": run.finished,
+            "flaws": _flaws(run),
             "channels": counts,
             **facts,
             "metadata": dict(run.metadata),
-        }
+        },
+        0 if len(run.times) else 2,
     )
 
 

@@ -18,7 +18,7 @@ from gpmpc.cli._command import Result
 from gpmpc.cli._run import choices, experiment_of
 from gpmpc.cli._settings import without_hydra, write_files
 from gpmpc.cli._sweep import Job, Sweep
-from gpmpc.exceptions import GpmpcError, SettingError, check_number
+from gpmpc.exceptions import DataError, GpmpcError, SettingError, check_number
 from gpmpc.metrics import tracking_cost
 from gpmpc.recording import read_run
 from gpmpc.studies._document import terminal
@@ -155,6 +155,8 @@ def _cost(job: Job, controller: Mapping[str, Any]) -> float:
     if not job.folder.finished or job.folder.result().get("lost"):
         return math.inf
     run, cost = read_run(job.folder.path / RECORDING), controller["problem"].cost
+    if not run.whole:  # the cost of the steps that are left would be too low
+        raise DataError(f"{run.path}: {'; '.join(flaw.text for flaw in run.flaws)}")
     return tracking_cost(
         cost.Q,
         cost.R,

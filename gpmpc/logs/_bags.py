@@ -14,10 +14,8 @@ from io import BytesIO
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
-import lz4.frame
 import numpy as np
 import pandas as pd
-import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, Schema
@@ -31,13 +29,18 @@ from gpmpc.logs._file import (
     TEXT,
     LogFile,
     check_column_count,
+    flaw_findings,
     run_name,
 )
 from gpmpc.logs._log import Finding
 from gpmpc.logs._ros2 import Cells, Decode
+from gpmpc.recording import NO_CHECKSUMS, Flaw, bag_flaws
+from gpmpc.recording._flaws import WRONG_COUNT
+from gpmpc.recording._frames import BROKEN, agrees, unfolded
 
 MAGIC = b"\x89MCAP0\r\n"
 SAME_CLOCK = 1.0  # [s] between two clocks that are taken for one
+_UNSEEN = (NO_CHECKSUMS, WRONG_COUNT)  # flaws that no record shows by itself
 _PROFILE = b"\5\0\0\0gpmpc"
 _RECORDING = "gpmpc.Step"  # the definition of a recording's steps
 _HEAD = struct.Struct("<BQ")  # kind and length of a record
@@ -128,6 +131,9 @@ def read_bag(
         DataError: The file is damaged, a topic is missing or cannot be read.
     """
     room = Room(path)
+    unseen_flaws = [flaw for flaw in bag_flaws(path) if flaw.kind in _UNSEEN]
+    if not partial:
+        _check_counts(path, unseen_flaws)
     damages: list[str] = []
     schemas: dict[int, Schema] = {}
     channels: dict[int, _Channel] = {}
@@ -155,9 +161,20 @@ def read_bag(
         ) from error
     _check_topics(path, channels, tables, topics)
     findings = _left_out(path, channels, tables, topics, damages)
+    findings += flaw_findings(path, unseen_flaws)
     clocks = _clocks(path, tables, stamp, alone=not topics)
     streams = {topic: _table(tables[topic], clocks.times[topic]) for topic in tables}
     return LogFile(streams, (*findings, *clocks.findings))
+
+
+def _check_counts(path: Path, flaws: list[Flaw]) -> None:
+    """Raises ``DataError`` where an index counts otherwise than there is."""
+    reasons = [flaw.text for flaw in flaws if flaw.kind == WRONG_COUNT]
+    if reasons:
+        raise DataError(
+            f"{path}: the bag cannot be read to its end ({'; '.join(reasons)}); "
+            "partial=true takes what is whole"
+        )
 
 
 def _records(path: Path, room: Room, damages: list[str] | None) -> Iterator[_Record]:
@@ -189,7 +206,7 @@ def _records(path: Path, room: Room, damages: list[str] | None) -> Iterator[_Rec
                 return
             kind, content = record
             if kind == Opcode.DATA_END:
-                if not _agrees(int.from_bytes(content[:4], "little"), checksum):
+                if not agrees(int.from_bytes(content[:4], "little"), checksum):
                     note("the checksum of all data is wrong")
                 return
             head = _HEAD.pack(kind, len(content))
@@ -201,8 +218,7 @@ def _records(path: Path, room: Room, damages: list[str] | None) -> Iterator[_Rec
             chunk = None
             try:
                 chunk = _parsed(record)
-                data = _unfolded(chunk, room)
-                yield from _inside(data, room)
+                yield from _inside(_unfold(chunk, room), room)
             except _Damaged as error:
                 where = f"at byte {position}"
                 if chunk is not None:
@@ -219,6 +235,15 @@ def _next_record(file: BinaryIO, size: int) -> _Record | None:
     if not kind or length > size - file.tell():
         return None
     return _Record(kind, file.read(length))
+
+
+def _unfold(chunk: Chunk, room: Room) -> bytes:
+    """Decompresses a chunk; ``_Damaged`` where its size or its checksum is another."""
+    room.take(chunk.uncompressed_size, "its chunks")
+    try:
+        return unfolded(chunk, largest=room.size)
+    except BROKEN as error:
+        raise _Damaged("its size, its checksum or its compression is wrong") from error
 
 
 def _inside(data: bytes, room: Room) -> Iterator[_Record]:
@@ -249,33 +274,6 @@ def _parsed(record: _Record) -> Chunk | Schema | Channel:
         return parsers[Opcode(record.kind)](stream)
     except Exception as error:  # whatever the library raises on damaged records
         raise _Damaged(f"a record of kind {record.kind} is broken") from error
-
-
-def _unfolded(chunk: Chunk, room: Room) -> bytes:
-    """Decompresses a chunk, if it is as long as it says and its checksum is right."""
-    size, data = chunk.uncompressed_size, chunk.data
-    room.take(size, "its chunks")
-    try:
-        if chunk.compression == "zstd":
-            # -1: the frame does not say. A larger size would be allocated at once.
-            if zstandard.frame_content_size(data) not in (-1, size):
-                raise _Damaged("its size is another than its head says")
-            data = zstandard.decompress(data, max_output_size=size) if size else b""
-        elif chunk.compression == "lz4":
-            data = lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=size)
-        elif chunk.compression:
-            raise _Damaged(f"it is compressed by {chunk.compression!r}")
-    except (zstandard.ZstdError, RuntimeError, EOFError) as error:
-        raise _Damaged("it cannot be decompressed") from error
-    if len(data) != size:
-        raise _Damaged("it is shorter or longer than its head says")
-    if not _agrees(chunk.uncompressed_crc, zlib.crc32(data)):
-        raise _Damaged("its checksum is wrong")
-    return data
-
-
-def _agrees(stored: int, computed: int) -> bool:
-    return stored in (0, computed)  # 0: there is no checksum
 
 
 def _channel(

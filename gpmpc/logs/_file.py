@@ -1,5 +1,6 @@
 """What a log file holds: tables of numbers, one a stream, and what was noticed."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -7,6 +8,7 @@ import pandas as pd
 
 from gpmpc.exceptions import DataError
 from gpmpc.logs._log import Finding
+from gpmpc.recording import Flaw
 
 #: column of the times [s] that a message carries or was logged at; no field of a
 #: message has this name
@@ -36,3 +38,8 @@ def check_column_count(path: Path, count: int, what: str = "it") -> None:
         raise DataError(
             f"{path}: {what} has {count} columns; a log has {MOST_COLUMNS} at most"
         )
+
+
+def flaw_findings(path: Path, flaws: Sequence[Flaw]) -> list[Finding]:
+    """What is wrong with a recording or a bag, as findings."""
+    return [Finding(flaw.kind, run_name(path), flaw.count, flaw.text) for flaw in flaws]

@@ -26,6 +26,7 @@ from gpmpc.logs._file import (
     TEXT,
     LogFile,
     check_column_count,
+    flaw_findings,
     run_name,
 )
 from gpmpc.logs._log import Finding
@@ -296,15 +297,13 @@ def _read_mcap(
     from gpmpc.recording import read_run
 
     run = read_run(path)
-    if not run.finished and not partial:
+    if not run.whole and not partial:
+        reasons = "; ".join(flaw.text for flaw in run.flaws)
         raise DataError(
-            f"{path}: unfinished or damaged; gpmpc log recover rescues it, partial=true takes what is whole"
+            f"{path}: unfinished or damaged; gpmpc log recover rescues it, "
+            f"partial=true takes what is whole ({reasons})"
         )
-    findings = ()
-    if not run.finished:
-        text = f"{len(run.times)} steps are whole; what came later is lost"
-        findings = (Finding("unfinished", run_name(path), 1, text),)
-    return LogFile({"": run.to_pandas()}, findings)
+    return LogFile({"": run.to_pandas()}, tuple(flaw_findings(path, run.flaws)))
 
 
 def _read_ulog(path: Path, topics: tuple[str, ...], partial: bool, _: str) -> LogFile:

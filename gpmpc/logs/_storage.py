@@ -5,7 +5,6 @@ its derivatives are central differences, all stages in one batch; the disturbanc
 controller's own estimate.
 """
 
-import re
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property

@@ -23,6 +23,7 @@ from google.protobuf.descriptor_pb2 import (
     FileDescriptorSet,
 )
 from google.protobuf.descriptor_pool import DescriptorPool
+from google.protobuf.message import DecodeError
 from google.protobuf.message_factory import GetMessageClass
 
 from gpmpc.exceptions import SettingError, ShapeError, check_number
@@ -187,6 +188,25 @@ def descriptor(
                 kind = "enum" if kind == "Status" else "message"
             added.type = FieldDescriptorProto.Type.Value(f"TYPE_{kind.upper()}")
     return file
+
+
+def names_in(schema: bytes) -> list[list[str]] | None:
+    """Reads the names of states and inputs out of the schema of a step.
+
+    None where it is no such schema.
+    """
+    files = FileDescriptorSet()
+    try:
+        files.ParseFromString(schema)
+    except DecodeError:
+        return None
+    fields = {
+        message.name: [field.name for field in message.field]
+        for file in files.file
+        for message in file.message_type
+    }
+    names = [fields.get("State"), fields.get("Input")]
+    return [group for group in names if group] if all(names) else None
 
 
 def message_classes(file: FileDescriptorProto) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 A message whose checksum is right may come from another program, so the sizes of its arrays are checked.
 """
 
+import dataclasses
 import math
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
@@ -13,12 +14,30 @@ from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple
 
 import numpy as np
 from google.protobuf.message import DecodeError
-from mcap.records import Attachment, Channel, Footer, Message, Metadata, Schema
+from mcap.records import (
+    Attachment,
+    Channel,
+    Message,
+    Metadata,
+    Schema,
+    Statistics,
+)
 from mcap.writer import CompressionType, Writer
 
 from gpmpc._files import whole_file
 from gpmpc.exceptions import GpmpcError, RecordingError, SettingError
 from gpmpc.recording import _messages
+from gpmpc.recording._flaws import (
+    DAMAGE,
+    DAMAGED_RECORDS,
+    LOST_CHUNKS,
+    LOST_STEPS,
+    NO_CHECKSUMS,
+    WRONG_COUNT,
+    WRONG_ORDER,
+    Flaw,
+)
+from gpmpc.recording._flaws import RECOVERED as WAS_RECOVERED
 from gpmpc.recording._messages import (
     FIELDS,
     PLAN,
@@ -29,7 +48,7 @@ from gpmpc.recording._messages import (
     TIMING,
     TOPICS,
 )
-from gpmpc.recording._records import CONFIG, RECOVERED, room, whole_records
+from gpmpc.recording._records import CHANNELS, CONFIG, RECOVERED, room, whole_records
 from gpmpc.status import Status
 
 if TYPE_CHECKING:
@@ -39,6 +58,7 @@ if TYPE_CHECKING:
 
 Array = np.ndarray
 _STATUSES = tuple(Status)
+_MOST_SPANS = 3  # of lost steps that are named
 #: of ``Run``, by the field of a step's message
 _ATTRIBUTES = {
     "time": "times",
@@ -79,7 +99,9 @@ class Run:
     """K recorded steps; n states, m inputs, horizon H (the longest; NaN beyond a shorter one)."""
 
     path: Path
-    finished: bool  # recorded to its end, every checksum is right; otherwise this is what was saved of it
+    # Recorded to its end, nothing is missing, and checksums vouch for all of it;
+    # otherwise this is what could be read of it, and ``flaws`` say what is wrong.
+    finished: bool
     state_names: tuple[str, ...]
     input_names: tuple[str, ...]
     steps: Array  # (K,) their numbers k
@@ -108,6 +130,25 @@ class Run:
     metadata: dict[str, dict[str, str]]
     config: str  # text of the resolved configuration
     problems: dict[int, RecordedProblem]  # by k; see ``replay``
+    flaws: tuple[Flaw, ...] = ()  # what is wrong with the recording
+
+    @property
+    def whole(self) -> bool:
+        """Whether nothing of it is known to be missing.
+
+        Where it is not finished all the same, it has no checksums to tell.
+        """
+        return all(flaw.kind == NO_CHECKSUMS for flaw in self.flaws)
+
+    @property
+    def lost_steps(self) -> int:
+        """How many steps are known to be lost."""
+        return sum(flaw.count for flaw in self.flaws if flaw.kind == LOST_STEPS)
+
+    @property
+    def lost_chunks(self) -> int:
+        """How many pieces of the file could not be read."""
+        return sum(flaw.count for flaw in self.flaws if flaw.kind == LOST_CHUNKS)
 
     @cached_property
     def pose(self) -> dict[str, int]:
@@ -200,63 +241,214 @@ def replay(run: Run, k: int) -> "QPSolution":
 def read_run(path: str | Path) -> Run:
     """Reads a recording, finished or not.
 
+    What is damaged is left out, and ``Run.flaws`` say what is missing.
+
     Raises:
-        RecordingError: There is no such file, or it is no recording of a run.
+        RecordingError: There is no such file, it is no recording of a run, or damage
+            has left no step of it.
     """
     path = Path(path)
-    metadata: dict[str, dict[str, str]] = {}
-    schemas: dict[int, str] = {}
-    channels: dict[int, Channel] = {}
-    counts: Counter[int] = Counter()
-    found: dict[str, list[Message]] = {STEP: [], PLAN: [], QP: []}
-    config, finished = "", False
-    for record in whole_records(path):
-        if isinstance(record, Message):
-            counts[record.channel_id] += 1
-            found.get(channels[record.channel_id].topic, []).append(record)
-        elif isinstance(record, Schema):
-            schemas[record.id] = record.name
-        elif isinstance(record, Channel):
-            channels[record.id] = record
-        elif isinstance(record, Metadata):
-            metadata.setdefault(record.name, record.metadata)
-        elif isinstance(record, Attachment) and record.name == CONFIG:
-            config = record.data.decode(errors="replace")
-        finished = isinstance(record, Footer)
-    about = metadata.get("run", {})
-    if not {"state_names", "input_names"} <= about.keys():
-        raise RecordingError(
-            f"{path}: is not the recording of a run; it has no metadata about one"
-        )
+    content = _read_content(path)
+    flaws = list(content.flaws)
+    state_names, input_names, are_named_twice = _names(path, content)
+    if are_named_twice:
+        text = "its metadata name other states or inputs than its messages"
+        flaws.append(Flaw(DAMAGED_RECORDS, 1, text))
     try:
-        states, inputs = (
-            _messages.check_names(key, about[key].split())
-            for key in ("state_names", "input_names")
-        )
         classes = _messages.message_classes(
-            _messages.descriptor(states, inputs, "bytes")
+            _messages.descriptor(state_names, input_names, "bytes")
         )
     except SettingError as error:
         raise RecordingError(f"{path}: its metadata are damaged; {error}") from error
     steps, plans, problems = (
-        _decoded(path, topic, classes, len(states), found[topic]) for topic in found
+        _decoded(path, topic, classes, len(state_names), content.messages[topic])
+        for topic in (STEP, PLAN, QP)
     )
+    flaws += _step_flaws(content, steps, flaws)
+    if not steps and any(flaw.kind in DAMAGE for flaw in flaws):
+        reasons = "; ".join(flaw.text for flaw in flaws)
+        raise RecordingError(f"{path}: no step of it can be read: {reasons}")
+    if RECOVERED in content.metadata:
+        text = "it was recovered, and holds what was left of another file"
+        if reasons := content.metadata[RECOVERED].get("flaws"):
+            text += f" ({reasons})"
+        flaws.append(Flaw(WAS_RECOVERED, 1, text))
     return Run(
         path=path,
-        finished=finished and RECOVERED not in metadata,
-        state_names=states,
-        input_names=inputs,
+        finished=not flaws,
+        state_names=state_names,
+        input_names=input_names,
         statuses=tuple(_STATUSES[step.status] for step in steps),
-        **_steps(steps, states, inputs),
-        **_plans(path, plans, steps, states, inputs),
+        **_steps(steps, state_names, input_names),
+        **_plans(path, plans, steps, state_names, input_names),
         channels={
-            channel.topic: (counts[i], schemas.get(channel.schema_id, ""))
-            for i, channel in channels.items()
+            channel.topic: (
+                content.counts[number],
+                content.schemas[channel.schema_id].name
+                if channel.schema_id in content.schemas
+                else "",
+            )
+            for number, channel in content.channels.items()
         },
-        metadata=metadata,
-        config=config,
+        metadata=content.metadata,
+        config=content.config,
         problems=dict(problems),
+        flaws=tuple(flaws),
     )
+
+
+@dataclass
+class _FileContent:
+    """The records of a file, those of the topics that a run is read from."""
+
+    messages: dict[str, list[Message]]  # by topic
+    counts: Counter[int] = dataclasses.field(
+        default_factory=Counter
+    )  # of messages, by channel
+    channels: dict[int, Channel] = dataclasses.field(default_factory=dict)
+    schemas: dict[int, Schema] = dataclasses.field(default_factory=dict)
+    metadata: dict[str, dict[str, str]] = dataclasses.field(default_factory=dict)
+    config: str = ""
+    statistics: Statistics | None = None
+    flaws: list[Flaw] = dataclasses.field(default_factory=list)
+
+
+def _read_content(path: Path) -> _FileContent:
+    content = _FileContent(messages={STEP: [], PLAN: [], QP: []})
+    for record in whole_records(path, content.flaws):
+        if isinstance(record, Message):
+            content.counts[record.channel_id] += 1
+            topic = content.channels[record.channel_id].topic
+            if topic in content.messages:
+                content.messages[topic].append(record)
+        elif isinstance(record, Schema):
+            content.schemas[record.id] = record
+        elif isinstance(record, Channel):
+            content.channels[record.id] = record
+        elif isinstance(record, Metadata) and record.name != CHANNELS:
+            content.metadata.setdefault(record.name, record.metadata)
+        elif isinstance(record, Attachment) and record.name == CONFIG:
+            content.config = record.data.decode(errors="replace")
+        elif isinstance(record, Statistics):
+            content.statistics = record
+    return content
+
+
+def _names(
+    path: Path, content: _FileContent
+) -> tuple[tuple[str, ...], tuple[str, ...], bool]:
+    """Returns the names of states and inputs, and whether metadata name others.
+
+    Those in the schema of the steps count, which has a checksum where metadata have
+    none.
+    """
+    about = content.metadata.get("run", {})
+    if not {"state_names", "input_names"} <= about.keys():
+        raise RecordingError(
+            f"{path}: is not the recording of a run; it has no metadata about one"
+        )
+    described = [about[key].split() for key in ("state_names", "input_names")]
+    try:
+        for names in (described, _names_in_schema(content) or described):
+            state_names = _messages.check_names("state_names", names[0])
+            input_names = _messages.check_names("input_names", names[1])
+    except SettingError as error:
+        raise RecordingError(f"{path}: its metadata are damaged; {error}") from error
+    are_others = [list(state_names), list(input_names)] != described
+    return state_names, input_names, are_others
+
+
+def _names_in_schema(content: _FileContent) -> list[list[str]] | None:
+    """Reads the names of states and inputs out of the schema of the steps."""
+    for channel in content.channels.values():
+        schema = content.schemas.get(channel.schema_id)
+        if channel.topic == STEP and schema is not None:
+            return _messages.names_in(schema.data)
+    return None
+
+
+def _step_flaws(
+    content: _FileContent, steps: list[Any], flaws: Sequence[Flaw]
+) -> list[Flaw]:
+    """Says which steps are lost, repeated or in another order, and where."""
+    sequence = np.array([message.sequence for message in content.messages[STEP]])
+    is_numbered = bool(sequence.any())  # not every program numbers its messages
+    is_ordered = is_numbered and bool((np.diff(sequence) > 0).all())
+    # Where every checksum is right, another program chose the order.
+    if flaws and is_numbered and not is_ordered:
+        text = "its steps do not stand in the order in which they were recorded"
+        return [Flaw(WRONG_ORDER, 1, text), *_count_flaws(content, len(steps), "")]
+    where = _lost_spans(sequence, steps) if is_ordered else ""
+    return _count_flaws(content, len(steps), where)
+
+
+def _count_flaws(content: _FileContent, present: int, where: str) -> list[Flaw]:
+    """Compares the number of steps with what end, index and numbering of a file say."""
+    by_index = _steps_by_index(content)
+    by_end = _steps_by_end(content)
+    flaws = []
+    if by_index is not None and by_end is not None and by_end < by_index:
+        text = f"its end counts {by_end} steps, its index {by_index}"
+        flaws.append(Flaw(WRONG_COUNT, 1, text))
+    is_damaged = any(flaw.kind in DAMAGE for flaw in content.flaws)
+    if is_damaged and by_index is not None:  # which has a checksum of its own
+        stated: int | None = by_index
+    else:  # what rewrites a file makes a new index, and keeps the end
+        known = [count for count in (by_index, by_end) if count is not None]
+        stated = max(known, default=None)
+    total = str(stated)
+    if stated is None:  # those behind the last that was read are not known
+        stated = _numbered_steps(content)
+        total = f"at least {stated}"
+    if present > stated > 0:
+        text = f"{stated} steps were recorded by its end; there are {present}"
+        flaws.append(Flaw(WRONG_COUNT, present - stated, text))
+    if present < stated:
+        lost = stated - present
+        text = f"{lost} of {total} steps are lost" + (f": {where}" if where else "")
+        flaws.append(Flaw(LOST_STEPS, lost, text))
+    return flaws
+
+
+def _steps_by_end(content: _FileContent) -> int | None:
+    """How many steps the end of the recording counts."""
+    stated = content.metadata.get("end", {}).get("steps", "")
+    return int(stated) if stated.isdecimal() and len(stated) < 10 else None
+
+
+def _steps_by_index(content: _FileContent) -> int | None:
+    """How many steps the index of the file counts."""
+    if content.statistics is None:
+        return None
+    by_channel = content.statistics.channel_message_counts
+    counts = [
+        by_channel[number]
+        for number, channel in content.channels.items()
+        if channel.topic == STEP and number in by_channel
+    ]
+    return sum(counts) if counts else None
+
+
+def _numbered_steps(content: _FileContent) -> int:
+    """How many steps were recorded up to the last that was read, by their numbering."""
+    sequence = [message.sequence for message in content.messages[STEP]]
+    if not any(sequence):
+        return len(sequence)
+    # The first number is 1, or 0 in files of the first edition.
+    return max(sequence) + (1 if min(sequence) == 0 else 0)
+
+
+def _lost_spans(sequence: Array, steps: list[Any]) -> str:
+    """Names the steps between which some are lost, by their numbers."""
+    spans = []
+    if sequence[0] > 1:
+        spans.append(f"before step {steps[0].k}")
+    gaps = np.flatnonzero(np.diff(sequence) > 1)
+    for row in gaps[:_MOST_SPANS]:
+        spans.append(f"between steps {steps[row].k} and {steps[row + 1].k}")
+    if len(gaps) > _MOST_SPANS:
+        spans.append(f"and at {len(gaps) - _MOST_SPANS} other places")
+    return ", ".join(spans) or f"after step {steps[-1].k}"
 
 
 def _decoded(
@@ -402,66 +594,71 @@ def _residuals(problem: RecordedProblem) -> tuple[float, float, float]:
 
 
 def recover(path: str | Path, output: str | Path) -> Run:
-    """Writes everything whole in a recording to a new file with index and footer, and reads that.
+    """Writes everything whole in a recording to a new file with index, and reads that.
 
     Args:
-        path: A file that a crash left without footer; an MCAP reader takes it for empty.
-        output: The new file, which says that it was recovered; it appears when it is complete and has been read.
+        path: A file that a crash left without an end, or that is damaged; an MCAP
+            reader takes it for empty.
+        output: The new file, which says that it was recovered and what is missing; it
+            appears when it is complete and has been read.
 
     Raises:
         RecordingError: There is no run to recover, or the output cannot be written.
     """
     path, output = Path(path), Path(output)
+    run = read_run(path)
     try:
         if output.exists() and path.exists() and output.samefile(path):
             raise RecordingError(
                 f"{output}: a file cannot be recovered into itself; name another output"
             )
         with whole_file(output) as file:
-            _copy(path, file)
+            _copy(path, file, run.flaws)
             file.flush()
-            try:
-                return replace(read_run(file.name), path=output)
-            except RecordingError as error:
-                raise RecordingError(
-                    str(error).replace(file.name, str(path), 1)
-                ) from error
+            return replace(read_run(file.name), path=output)
     except OSError as error:
         raise RecordingError(
             f"{output}: cannot be written: {error.strerror or error}"
         ) from error
 
 
-def _copy(path: Path, file: BinaryIO) -> None:
-    """Copies whole records."""
+def _copy(path: Path, file: BinaryIO, flaws: Sequence[Flaw]) -> None:
+    """Copies whole records, and what is wrong with their file."""
     writer = Writer(file, compression=CompressionType.ZSTD, enable_data_crcs=True)
     writer.start(profile="gpmpc", library="gpmpc")
-    schemas, channels, messages, finished = {}, {}, 0, False
+    schemas: dict[int, int] = {}  # numbers in the copy, by those in the file
+    channels: dict[int, int] = {}
+    topics: dict[str, str] = {}  # of ``CHANNELS``
+    messages = 0
+    are_topics_listed = False
+    was_recovered = False
     for record in whole_records(path):
         if isinstance(record, Schema) and record.id not in schemas:
             schemas[record.id] = writer.register_schema(
                 record.name, record.encoding, record.data
             )
         elif isinstance(record, Channel) and record.id not in channels:
-            about = (
+            channels[record.id] = writer.register_channel(
                 record.topic,
                 record.message_encoding,
                 schemas.get(record.schema_id, 0),
                 record.metadata,
             )
-            channels[record.id] = writer.register_channel(*about)
+            topics[str(channels[record.id])] = record.topic
         elif isinstance(record, Message):
-            channel = channels[record.channel_id]
             writer.add_message(
-                channel,
+                channels[record.channel_id],
                 record.log_time,
                 record.data,
                 record.publish_time,
                 record.sequence,
             )
             messages += 1
+        elif isinstance(record, Metadata) and record.name == CHANNELS:
+            are_topics_listed = True
         elif isinstance(record, Metadata):
             writer.add_metadata(record.name, record.metadata)
+            was_recovered |= record.name == RECOVERED
         elif isinstance(record, Attachment):
             writer.add_attachment(
                 record.create_time,
@@ -470,7 +667,9 @@ def _copy(path: Path, file: BinaryIO) -> None:
                 record.media_type,
                 record.data,
             )
-        finished = isinstance(record, Footer)
-    if not finished:
-        writer.add_metadata(RECOVERED, {"messages": str(messages)})
+    if are_topics_listed:
+        writer.add_metadata(CHANNELS, topics)
+    if flaws and not was_recovered:
+        reasons = "; ".join(flaw.text for flaw in flaws)
+        writer.add_metadata(RECOVERED, {"messages": str(messages), "flaws": reasons})
     writer.finish()

@@ -1,11 +1,14 @@
 """Records every step of a run in a file that explains itself and survives a crash, and shows it live.
 
-``record`` copies the step; the copies that wait are serialised and written as one compressed chunk, and a run killed at
-any moment loses at most that one. Where the file comes from is on the disk before the first step.
+``record`` copies the step; the copies that wait are serialised and written as one
+compressed chunk, of two seconds of the flight or so. A run killed at any moment loses
+at most the last one, and a spoiled byte the one that it lies in. Where the file comes
+from is on the disk before the first step.
 """
 
 import contextlib
 import json
+import math
 import os
 import platform
 import time
@@ -21,12 +24,15 @@ from foxglove.messages import Log, LogLevel, Timestamp
 
 from gpmpc._provenance import flattened, provenance
 from gpmpc.exceptions import RecordingError, check_number
+from gpmpc.recording._frames import LARGEST, topics_of_chunk
 from gpmpc.recording._messages import Encoder, RecordedSystem, StepCopy
-from gpmpc.recording._records import CONFIG, LARGEST
+from gpmpc.recording._records import CHANNELS, CONFIG
 from gpmpc.recording._scene import WORLD, Scene
 from gpmpc.step import Step
 
-_INTERVAL = 1.0  # [s] after which the next step ends a chunk
+_INTERVAL = 1.0  # [s] of the clock after which the next step ends a chunk
+_SPAN = 2.0  # [s] of the flight in a chunk; a simulated one takes less than it lasts
+_LEAST = 8 * 1024  # numbers [bytes] for which a chunk is worth its own entries
 _PORT = 8765  # of the live view, if it is free
 
 
@@ -39,7 +45,8 @@ class McapRecorder:
         config: The resolved configuration, as YAML text or as plain data (written as JSON, which is YAML).
         metadata: More to know of the run, such as its seed.
         record_problems: Keep every step's quadratic program, so that it can be replayed.
-        chunk_size: Numbers [bytes] that wait in memory at most, if more than one step does; what a killed run loses.
+        chunk_size: Numbers [bytes] that wait in memory at most, if more than one step
+            does; what a killed run loses.
         live: Serve every step to viewers as well, at ``address``.
 
     Raises:
@@ -86,6 +93,8 @@ class McapRecorder:
         self._encoder = Encoder(system)
         self._waiting: list[StepCopy] = []
         self._bytes, self._steps = 0, 0
+        self._waiting_since = -math.inf  # when the chunk's first step was [s]
+        self._topics: dict[int, str] = {}  # by channel, as far as they are written
         self._error: str | None = None  # why no more steps are taken
         self._closed, self._server = False, None
         self._sink = _Sink(self.path)
@@ -150,14 +159,13 @@ class McapRecorder:
             raise RecordingError(
                 f"{self.path}: a step of {size} bytes is too large; at most {LARGEST // 4}"
             )
+        if self._bytes == 0:
+            self._waiting_since = step.time
         self._waiting.append(copy)
         self._bytes += size
         if self._server is not None:
             self._serialise()
-        if (
-            self._bytes > self._chunk_size
-            or time.perf_counter() - self._last > _INTERVAL
-        ):
+        if self._is_chunk_full(step):
             self._end_chunk()
 
     def close(self, outcome: str = "complete") -> None:
@@ -193,9 +201,23 @@ class McapRecorder:
                 f"{kind.__name__}: {error}"
             )  # a run that ended in an error has been recorded up to there
 
+    def _is_chunk_full(self, step: Step) -> bool:
+        """Whether the steps that wait are to be written now."""
+        if self._bytes > self._chunk_size:
+            return True
+        if step.time - self._waiting_since >= _SPAN and self._bytes >= _LEAST:
+            return True
+        return time.perf_counter() - self._last > _INTERVAL
+
     def _end_chunk(self) -> None:
+        """Writes what waits, and behind it the topics of channels that are new."""
         self._serialise()
         self._writer.flush()
+        new_topics = topics_of_chunk(self._sink.unsaved, self._topics)
+        if new_topics:
+            self._topics |= new_topics
+            pairs = {str(number): topic for number, topic in self._topics.items()}
+            self._writer.write_metadata(CHANNELS, pairs)
         self._save()
 
     def _serialise(self) -> None:
@@ -247,6 +269,11 @@ class _Sink:
             os.close(self.descriptor)
             raise RecordingError(f"{path}: another process is recording to this file")
         os.ftruncate(self.descriptor, 0)
+
+    @property
+    def unsaved(self) -> bytes:
+        """What was written since it was saved."""
+        return bytes(self._data)
 
     def write(self, data: bytes | bytearray) -> int:
         """Takes all of the data."""
