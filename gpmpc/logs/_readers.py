@@ -73,7 +73,7 @@ def read_file(
         ) from error
     except Exception as error:  # whatever a library raises on a damaged file
         reason = " ".join(str(error).split()) or type(error).__name__
-        raise DataError(f"{path}: cannot be read ({reason})") from error
+        raise DataError(f"{path}: cannot be read ({reason[:300]})") from error
     streams = file.streams
     missing = [topic for topic in topics if topic not in streams]
     if missing:
