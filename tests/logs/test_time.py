@@ -1,6 +1,7 @@
 """Rows stand in the order of their stamps, and nothing is carried over a jump."""
 
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -256,3 +257,15 @@ def test_an_inspection_reads_bags_in_any_order_and_what_is_whole(tmp_path):
     found = inspect_log(path)
     assert list(found.streams["backward stamps"]) == [0, 0]
     assert any(warning.startswith("damaged: ") for warning in found.warnings)
+
+
+def test_thousands_of_jumps_take_no_longer_than_their_rows(tmp_path):
+    rows = np.arange(30_000)
+    table = strange.pendulum(3).iloc[rows % 3].assign(torque=rows % 7)
+    table["t"] = STEP * rows + 1e5 * (rows // 3)
+    table.to_csv(tmp_path / "arm.csv", index=False)
+    mapping = {**TABLE_MAPPING, "rate": 50, "held": "use"}
+    begin = time.monotonic()
+    log = read_log(tmp_path / "arm.csv", mapping)
+    assert time.monotonic() - begin < 5
+    assert (len(log), kinds(log)) == (len(rows), {"jump": 9999})
