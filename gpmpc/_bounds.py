@@ -1,4 +1,4 @@
-"""Bounds the memory that a file's content may take, so that a small file cannot ask for all of it."""
+"""Bounds the memory of a file's content: a small file cannot ask for all there is."""
 
 from pathlib import Path
 

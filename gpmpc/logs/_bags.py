@@ -8,11 +8,12 @@ and data have to agree with their checksums, where they have some.
 import struct
 import zlib
 from array import array
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
-from typing import BinaryIO, NamedTuple
+from typing import BinaryIO, NamedTuple, TypeVar
 
 import numpy as np
 import pandas as pd
@@ -22,7 +23,7 @@ from mcap.records import Channel, Chunk, Schema
 
 from gpmpc._bounds import Room
 from gpmpc.exceptions import DataError, GpmpcError
-from gpmpc.logs._encodings import decoder
+from gpmpc.logs._encodings import UnreadError, decoder
 from gpmpc.logs._file import (
     NUMBER,
     STAMP,
@@ -49,6 +50,7 @@ _RECORD = 256  # what a record costs [bytes]: its time, counted as memory
 _CHANNEL = 16_384  # what a channel and its definition cost [bytes], as above
 _DECODED = 2048  # what a message costs that is decoded [bytes], as above
 _COPIES = 4  # of the bytes of a message that is decoded
+_LISTED_DAMAGES = 5  # each by its text
 _STAMP_FIELDS = [  # seconds and nanoseconds, as ROS 2, ROS 1, Foxglove and protobuf say
     (f"{place}.{seconds}", f"{place}.{nanoseconds}")
     for place in ("header.stamp", "stamp", "timestamp")
@@ -59,6 +61,9 @@ _STAMP_FIELDS = [  # seconds and nanoseconds, as ROS 2, ROS 1, Foxglove and prot
         ("seconds", "nanos"),
     )
 ]
+
+
+_Parsed = TypeVar("_Parsed", Chunk, Schema, Channel)
 
 
 class _Damaged(Exception):
@@ -125,45 +130,31 @@ def read_bag(
         path: An MCAP file.
         topics: Their names; none for all that can be read.
         partial: Takes what is whole of a file that is damaged or cut off.
-        stamp: The times of the messages: "header", "log", or "" (see ``_stamped``).
+        stamp: The times of the messages: "header", "log", or "" (see ``_clocks``).
 
     Raises:
         DataError: The file is damaged, a topic is missing or cannot be read.
     """
-    room = Room(path)
     unseen_flaws = [flaw for flaw in bag_flaws(path) if flaw.kind in _UNSEEN]
     if not partial:
         _check_counts(path, unseen_flaws)
-    damages: list[str] = []
-    schemas: dict[int, Schema] = {}
-    channels: dict[int, _Channel] = {}
-    tables: dict[str, _Topic] = {}
+    bag = _Bag(path, topics, partial, Room(path))
     try:
-        for kind, content in _records(path, room, damages if partial else None):
-            if kind == Opcode.MESSAGE:
-                _take_message(path, content, channels, tables, partial, room)
-                continue
-            number = int.from_bytes(content[:2], "little")  # files may repeat them
-            if kind == Opcode.SCHEMA and number not in schemas:
-                room.take(_CHANNEL, "its definitions")
-                schema = schemas[number] = _parsed(_Record(kind, content))
-                if schema.name == _RECORDING and not any(topics):
-                    return None
-            elif kind == Opcode.CHANNEL and number not in channels:
-                room.take(_CHANNEL, "its channels")
-                channel = _parsed(_Record(kind, content))
-                schema = schemas.get(channel.schema_id)
-                channels[number] = _channel(channel, schema, topics, room)
+        for record in _records(path, bag.room, bag.note_damage):
+            bag.take(record)
+            if bag.is_recording:
+                return None
     except _Damaged as error:
         raise DataError(
             f"{path}: the bag cannot be read to its end ({error}); "
             "partial=true takes what is whole"
         ) from error
-    _check_topics(path, channels, tables, topics)
-    findings = _left_out(path, channels, tables, topics, damages)
-    findings += flaw_findings(path, unseen_flaws)
-    clocks = _clocks(path, tables, stamp, alone=not topics)
-    streams = {topic: _table(tables[topic], clocks.times[topic]) for topic in tables}
+    bag.check_topics()
+    clocks = _clocks(path, bag.tables, stamp, alone=not topics)
+    streams = {
+        name: _table(bag.tables[name], clocks.times[name]) for name in bag.tables
+    }
+    findings = bag.findings() + flaw_findings(path, unseen_flaws)
     return LogFile(streams, (*findings, *clocks.findings))
 
 
@@ -177,20 +168,143 @@ def _check_counts(path: Path, flaws: list[Flaw]) -> None:
         )
 
 
-def _records(path: Path, room: Room, damages: list[str] | None) -> Iterator[_Record]:
+@dataclass
+class _Bag:
+    """What was read of a file so far."""
+
+    path: Path
+    topics: tuple[str, ...]  # that are asked for; none for all
+    partial: bool  # whether what is whole will do
+    room: Room
+    schemas: dict[int, Schema] = field(default_factory=dict)
+    channels: dict[int, _Channel] = field(default_factory=dict)
+    tables: dict[str, _Topic] = field(default_factory=dict)  # by topic
+    damages: Counter[str] = field(default_factory=Counter)  # how often, by their texts
+    is_recording: bool = False  # of this package, and no topic is asked for
+
+    def note_damage(self, text: str) -> None:
+        """Counts what is broken, or raises ``_Damaged`` where all has to be whole."""
+        if not self.partial:
+            raise _Damaged(text)
+        self.damages[text] += 1
+
+    def take(self, record: _Record) -> None:
+        """Takes a schema, a channel or a message; all else is nothing to read."""
+        kind, content = record
+        number = int.from_bytes(content[:2], "little")
+        try:
+            if kind == Opcode.MESSAGE:
+                self._take_message(content)
+            elif kind == Opcode.SCHEMA and number not in self.schemas:
+                self.room.take(_CHANNEL, "its definitions")
+                schema = self.schemas[number] = _parsed(Schema, content)
+                is_of_run = schema.name == _RECORDING and not any(self.topics)
+                self.is_recording = self.is_recording or is_of_run
+            elif kind == Opcode.CHANNEL and number not in self.channels:
+                self.room.take(_CHANNEL, "its channels")
+                self.channels[number] = self._channel(_parsed(Channel, content))
+        except _Damaged as error:
+            self.note_damage(str(error))
+
+    def _channel(self, channel: Channel) -> _Channel:
+        """How a channel's messages are read; not at all if nobody asked for them."""
+        if self.topics and channel.topic not in self.topics:
+            return _Channel(channel.topic, decode=None)
+        try:
+            schema = self.schemas.get(channel.schema_id)
+            return _Channel(channel.topic, decoder(channel, schema, self.room))
+        except UnreadError as error:
+            return _Channel(channel.topic, decode=None, refusal=str(error))
+
+    def _take_message(self, content: bytes) -> None:
+        """Counts a message, and decodes it if its topic was asked for."""
+        if len(content) < _MESSAGE.size:
+            raise _Damaged("a message is shorter than its head")
+        channel_id, _, log_time, _ = _MESSAGE.unpack_from(content)
+        if channel_id not in self.channels:
+            raise _Damaged(f"a message is of channel {channel_id}, which there is not")
+        channel = self.channels[channel_id]
+        channel.messages += 1
+        if channel.decode is None:
+            return
+        data = content[_MESSAGE.size :]
+        self.room.take(_DECODED + _COPIES * len(data), "its messages")
+        table = self.tables.setdefault(channel.topic, _Topic())
+        try:
+            cells = channel.decode(data)
+        except GpmpcError:
+            raise
+        except Exception as error:  # whatever a library raises on a damaged message
+            table.malformed += 1
+            if self.partial:
+                return
+            reason = " ".join(str(error).split()) or type(error).__name__
+            raise DataError(
+                f"{self.path}: message {channel.messages} of {channel.topic} cannot be "
+                f"read: {reason[:200]}; partial=true leaves it out"
+            ) from error
+        table.append(log_time, cells, self.room)
+        check_column_count(self.path, len(table.columns), channel.topic)
+
+    def check_topics(self) -> None:
+        """Raises ``DataError`` where a topic that was asked for cannot be read."""
+        channels = self.channels.values()
+        for channel in channels:
+            if channel.refusal and channel.topic in self.topics:
+                raise DataError(
+                    f"{self.path}: topic {channel.topic}: {channel.refusal}"
+                )
+        known = {channel.topic for channel in channels}
+        for topic in self.topics:
+            if topic in known and topic not in self.tables:
+                raise DataError(f"{self.path}: topic {topic!r} has no message")
+            if topic not in known:
+                listed = ", ".join(sorted(known)) or "no topics"
+                what = f"topic {topic!r} is missing"
+                if not topic:
+                    what = "a bag has topics, and the mapping names none for a signal"
+                raise DataError(f"{self.path}: {what}; it has {listed}")
+
+    def findings(self) -> list[Finding]:
+        """What was not read, lost or damaged, with numbers."""
+        run = run_name(self.path)
+        findings = []
+        for text, count in self.damages.most_common(_LISTED_DAMAGES):
+            often = f" ({count} times)" if count > 1 else ""
+            findings.append(Finding("damaged", run, count, f"{text}{often}: lost"))
+        unlisted = self.damages.total() - sum(finding.count for finding in findings)
+        if unlisted:
+            text = f"{unlisted} other places are damaged: lost"
+            findings.append(Finding("damaged", run, unlisted, text))
+        for topic, table in self.tables.items():
+            count = table.malformed
+            if count:
+                text = f"{count} messages of {topic} cannot be read: left out"
+                findings.append(Finding("malformed message", run, count, text))
+        for channel in self.channels.values():
+            count = channel.messages
+            if channel.refusal and count:
+                text = f"{count} messages of {channel.topic}: {channel.refusal}"
+                findings.append(Finding("not read", run, count, text))
+        asked = self.topics or {channel.topic for channel in self.channels.values()}
+        others = [c for c in self.channels.values() if c.topic not in asked]
+        count = sum(channel.messages for channel in others)
+        if count:
+            text = f"{count} messages of {len(others)} other topics: left out"
+            findings.append(Finding("not asked for", run, count, text))
+        return findings
+
+
+def _records(
+    path: Path, room: Room, note_damage: Callable[[str], None]
+) -> Iterator[_Record]:
     """Yields the records of the data section, those inside of chunks in their place.
 
     Args:
         path: An MCAP file.
         room: What chunks unfold to is taken from it.
-        damages: Takes what is broken, in words; None raises ``_Damaged`` instead.
+        note_damage: Takes what is broken, in words; may raise.
     """
-
-    def note(damage: str) -> None:
-        if damages is None:
-            raise _Damaged(damage)
-        damages.append(damage)
-
     size = path.stat().st_size
     with path.open("rb") as file:
         if file.read(len(MAGIC)) != MAGIC:
@@ -200,14 +314,13 @@ def _records(path: Path, room: Room, damages: list[str] | None) -> Iterator[_Rec
             position = file.tell()
             record = _next_record(file, size)
             if record is None:
-                note(
-                    f"the last {size - position} of {size} bytes are cut off or no record"
-                )
+                left = size - position
+                note_damage(f"the last {left} of {size} bytes are cut off or no record")
                 return
             kind, content = record
             if kind == Opcode.DATA_END:
                 if not agrees(int.from_bytes(content[:4], "little"), checksum):
-                    note("the checksum of all data is wrong")
+                    note_damage("the checksum of all data is wrong")
                 return
             head = _HEAD.pack(kind, len(content))
             checksum = zlib.crc32(content, zlib.crc32(head, checksum))
@@ -215,16 +328,14 @@ def _records(path: Path, room: Room, damages: list[str] | None) -> Iterator[_Rec
             if kind != Opcode.CHUNK:
                 yield record
                 continue
-            chunk = None
+            where = f"at byte {position}"
             try:
-                chunk = _parsed(record)
+                chunk = _parsed(Chunk, content)
+                begin, end = chunk.message_start_time, chunk.message_end_time
+                where = f"with the messages from {begin / 1e9} to {end / 1e9} s"
                 yield from _inside(_unfold(chunk, room), room)
             except _Damaged as error:
-                where = f"at byte {position}"
-                if chunk is not None:
-                    begin, end = chunk.message_start_time, chunk.message_end_time
-                    where = f"with the messages from {begin / 1e9} to {end / 1e9} s"
-                note(f"a chunk {where} is damaged: {error}")
+                note_damage(f"a chunk {where} is damaged: {error}")
 
 
 def _next_record(file: BinaryIO, size: int) -> _Record | None:
@@ -262,122 +373,12 @@ def _inside(data: bytes, room: Room) -> Iterator[_Record]:
             yield _Record(kind, data[begin:position])
 
 
-def _parsed(record: _Record) -> Chunk | Schema | Channel:
+def _parsed(kind: type[_Parsed], content: bytes) -> _Parsed:
     """Parses a record that is none of a message."""
-    parsers = {
-        Opcode.CHUNK: Chunk.read,
-        Opcode.SCHEMA: Schema.read,
-        Opcode.CHANNEL: Channel.read,
-    }
     try:
-        stream = ReadDataStream(BytesIO(record.content))
-        return parsers[Opcode(record.kind)](stream)
+        return kind.read(ReadDataStream(BytesIO(content)))
     except Exception as error:  # whatever the library raises on damaged records
-        raise _Damaged(f"a record of kind {record.kind} is broken") from error
-
-
-def _channel(
-    channel: Channel, schema: Schema | None, topics: tuple[str, ...], room: Room
-) -> _Channel:
-    """How the messages of a channel are read; not at all if nobody asked for them."""
-    if topics and channel.topic not in topics:
-        return _Channel(channel.topic, decode=None)
-    try:
-        return _Channel(channel.topic, decoder(channel, schema, room))
-    except ValueError as error:
-        if isinstance(error, GpmpcError):
-            raise
-        return _Channel(channel.topic, decode=None, refusal=str(error))
-
-
-def _take_message(
-    path: Path,
-    content: bytes,
-    channels: dict[int, _Channel],
-    tables: dict[str, _Topic],
-    partial: bool,
-    room: Room,
-) -> None:
-    """Counts a message, and decodes it if its topic was asked for."""
-    if len(content) < _MESSAGE.size:
-        raise _Damaged("a message is shorter than its head")
-    channel_id, _, log_time, _ = _MESSAGE.unpack_from(content)
-    if channel_id not in channels:
-        raise _Damaged(f"a message is of channel {channel_id}, which there is not")
-    channel = channels[channel_id]
-    channel.messages += 1
-    if channel.decode is None:
-        return
-    data = content[_MESSAGE.size :]
-    room.take(_DECODED + _COPIES * len(data), "its messages")
-    table = tables.setdefault(channel.topic, _Topic())
-    try:
-        cells = channel.decode(data)
-    except GpmpcError:
-        raise
-    except Exception as error:  # whatever a library raises on a damaged message
-        table.malformed += 1
-        if partial:
-            return
-        reason = " ".join(str(error).split()) or type(error).__name__
-        raise DataError(
-            f"{path}: message {channel.messages} of {channel.topic} cannot be read: "
-            f"{reason[:200]}; partial=true leaves it out"
-        ) from error
-    table.append(log_time, cells, room)
-    check_column_count(path, len(table.columns), channel.topic)
-
-
-def _check_topics(
-    path: Path,
-    channels: dict[int, _Channel],
-    tables: dict[str, _Topic],
-    topics: tuple[str, ...],
-) -> None:
-    """Raises ``DataError`` where a topic that was asked for cannot be read."""
-    for channel in channels.values():
-        if channel.refusal and channel.topic in topics:
-            raise DataError(f"{path}: topic {channel.topic}: {channel.refusal}")
-    if channels and not topics and all(c.refusal for c in channels.values()):
-        first = next(iter(channels.values()))
-        raise DataError(f"{path}: topic {first.topic}: {first.refusal}")
-    known = {channel.topic for channel in channels.values()}
-    missing = [topic for topic in topics if topic not in known]
-    silent = [topic for topic in topics if topic in known and topic not in tables]
-    if silent and not missing:
-        raise DataError(f"{path}: topic {silent[0]!r} has no message")
-    if missing:
-        listed = ", ".join(sorted(known)) or "no topics"
-        what = f"topic {missing[0]!r} is missing"
-        if not missing[0]:
-            what = "a bag has topics, and the mapping names none for a signal"
-        raise DataError(f"{path}: {what}; it has {listed}")
-
-
-def _left_out(
-    path: Path,
-    channels: dict[int, _Channel],
-    tables: dict[str, _Topic],
-    topics: tuple[str, ...],
-    damages: list[str],
-) -> list[Finding]:
-    """What was not read, lost or damaged, with numbers."""
-    run = run_name(path)
-    findings = [Finding("damaged", run, 1, f"{damage}: lost") for damage in damages]
-    for topic, table in tables.items():
-        if table.malformed:
-            text = f"{table.malformed} messages of {topic} cannot be read: left out"
-            findings.append(Finding("malformed message", run, table.malformed, text))
-    for channel in channels.values():
-        if channel.refusal and channel.messages:
-            text = f"{channel.messages} messages of {channel.topic}: {channel.refusal}"
-            findings.append(Finding("not read", run, channel.messages, text))
-    others = [c for c in channels.values() if topics and c.topic not in topics]
-    count = sum(channel.messages for channel in others)
-    if count:
-        text = f"{count} messages of {len(others)} other topics: left out"
-        findings.append(Finding("not asked for", run, count, text))
-    return findings
+        raise _Damaged(f"a {kind.__name__.lower()} record is broken") from error
 
 
 class _Clocks(NamedTuple):

@@ -16,11 +16,15 @@ _LONGEST = 4 * 2**20  # of a message in JSON or protobuf [bytes]
 READ = "cdr with ros2msg, json, and protobuf are"
 
 
+class UnreadError(Exception):
+    """Messages of a kind that is not read; the text says why."""
+
+
 def decoder(channel: Channel, schema: Schema | None, room: Room) -> Decode:
     """Returns what reads the numbers of a channel's messages with their paths.
 
     Raises:
-        ValueError: Messages of this kind are not read; the text says why.
+        UnreadError: Messages of this kind are not read; the text says why.
     """
     message, definition = channel.message_encoding, schema.encoding if schema else ""
     try:
@@ -34,12 +38,12 @@ def decoder(channel: Channel, schema: Schema | None, room: Room) -> Decode:
     except GpmpcError:
         raise
     except ImportError as error:
-        raise ValueError(f"it needs pip install 'gpmpc[logs]' ({error})") from error
+        raise UnreadError(f"it needs pip install 'gpmpc[logs]' ({error})") from error
     except Exception as error:  # whatever a library raises on a definition
         reason = " ".join(str(error).split()) or type(error).__name__
-        raise ValueError(f"its definition cannot be read ({reason})") from error
+        raise UnreadError(f"its definition cannot be read ({reason})") from error
     described = f"{message or 'nothing'} with {definition or 'no definition'}"
-    raise ValueError(f"it is encoded as {described}, which is not read; {READ}")
+    raise UnreadError(f"it is encoded as {described}, which is not read; {READ}")
 
 
 def _json(data: bytes) -> Cells:

@@ -76,7 +76,7 @@ def read_file(
         ) from error
     except Exception as error:  # whatever a library raises on a damaged file
         reason = " ".join(str(error).split()) or type(error).__name__
-        raise DataError(f"{path}: cannot be read ({reason})") from error
+        raise DataError(f"{path}: cannot be read ({reason[:300]})") from error
     streams = file.streams
     missing = [topic for topic in topics if topic not in streams]
     if missing:
@@ -179,14 +179,16 @@ def _read_npz(path: Path, *_: Any) -> LogFile:
     tables = {name: array for name, array in declared.items() if array.is_table}
     widths = {name: math.prod(array.shape[1:]) for name, array in tables.items()}
     check_column_count(path, sum(widths.values()))
-    for name, (shape, dtype) in tables.items():
-        of_cell = NUMBER if dtype.kind in "biuf" else TEXT + 2 * dtype.itemsize
-        room.take(math.prod(shape) * of_cell, f"array {name!r} of shape {shape}")
+    for name, array in tables.items():
+        is_number = array.dtype.kind in "biuf"
+        of_cell = NUMBER if is_number else TEXT + 2 * array.dtype.itemsize
+        what = f"array {name!r} of shape {array.shape}"
+        room.take(math.prod(array.shape) * of_cell, what)
     columns: dict[str, np.ndarray] = {}  # pandas names arrays of different lengths
     with np.load(path, allow_pickle=False) as archive:
-        for name, (shape, _) in tables.items():
+        for name, array in tables.items():
             values = archive[name]
-            if len(shape) == 1:
+            if len(array.shape) == 1:
                 columns[name] = values
             else:
                 columns |= {f"{name}[{i}]": v for i, v in enumerate(values.T)}

@@ -305,12 +305,12 @@ def _grid(
             f"{where}: the topics {', '.join(stamps)} have no time in common{hint}"
         )
     for topic, of_topic in pieces.items():
-        alone = [piece for piece in of_topic if not _meets(piece, common)]
-        time = stamps[topic].time
-        count = sum(int(((time >= a) & (time <= b)).sum()) for a, b in alone)
+        count = _rows_alone(stamps[topic].time, of_topic, common)
         text = f"{count} rows of {topic} have no time in common with others: left out"
         note("no time in common", count, text)
-    lengths = np.floor((common[:, 1] - common[:, 0]) * mapping.rate * (1 + 1e-12)) + 1
+    steps = (common[:, 1] - common[:, 0]) * mapping.rate * (1 + 1e-12)
+    resolution = min(RESOLUTION * mapping.rate, 0.1)  # of the stamps, in steps
+    lengths = np.floor(steps + resolution) + 1
     rows = float(lengths.sum())
     what = f"{rows:.6g} rows of {columns} columns at a rate of {mapping.rate:g} Hz"
     if (mapping.max_gap or 0.0) > JUMP:
@@ -348,9 +348,16 @@ def _intersections(pieces: Array, others: Array) -> Array:
     return np.array(common).reshape(-1, 2)
 
 
-def _meets(piece: Array, pieces: Array) -> bool:
-    """Whether a piece (2,) has time in common with one of others (P, 2)."""
-    return bool(((pieces[:, 0] <= piece[1]) & (pieces[:, 1] >= piece[0])).any())
+def _rows_alone(time: Array, pieces: Array, common: Array) -> int:
+    """How many rows of a topic stand in pieces (P, 2) of which nothing is in common."""
+    candidates = np.searchsorted(
+        common[:, 1], pieces[:, 0]
+    )  # they end behind its begin
+    nearest = common[np.minimum(candidates, len(common) - 1)]
+    is_alone = (nearest[:, 1] < pieces[:, 0]) | (nearest[:, 0] > pieces[:, 1])
+    ends = np.searchsorted(time, pieces[:, 1], side="right")
+    rows = ends - np.searchsorted(time, pieces[:, 0])
+    return int(rows[is_alone].sum())
 
 
 def _time(label: str, table: pd.DataFrame, mapping: LogMapping) -> Array:

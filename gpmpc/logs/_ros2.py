@@ -51,7 +51,7 @@ class _Step(NamedTuple):
 
     path: str  # such as "pose.position.x"
     type: str  # a primitive one, "string", or the name of a message
-    count: int | None  # of a fixed list; None: a single value
+    length: int | None  # of a fixed list; None: a single value
     counted: bool = False  # whether the list's length stands before it
 
 
@@ -136,13 +136,13 @@ def _flat(type_name: str, types: dict[str, str]) -> list[_Step]:
             empty = _Step("", "empty", None)
             fields[name] = _fields(name, types[name]) or [empty]
         for field in fields[name]:
-            is_list = field.counted or field.count is not None
+            is_list = field.counted or field.length is not None
             is_message = field.type in types or "/" in field.type
             if is_message and not is_list:
                 add(field.type, f"{prefix}{field.path}.", (*outer, name))
                 continue
             steps.append(field._replace(path=f"{prefix}{field.path}"))
-            numbers += min(field.count or 1, LISTED)
+            numbers += min(field.length or 1, LISTED)
             if numbers > MOST_COLUMNS:
                 raise ValueError(f"{type_name} holds more than {MOST_COLUMNS} numbers")
 
@@ -173,7 +173,7 @@ class _Message:
         cells: Cells = {}
         for step in plan:
             values = self.values(step)
-            if step.counted or step.count is not None:
+            if step.counted or step.length is not None:
                 for i, value in enumerate(values):
                     cells[f"{step.path}[{i}]"] = float(value)
             elif values:
@@ -182,9 +182,9 @@ class _Message:
 
     def values(self, step: _Step) -> tuple[float, ...]:
         """Moves over a step; its numbers, if it has some and they are not many."""
-        count = 1 if step.count is None else step.count
+        count = 1 if step.length is None else step.length
         if step.counted:
-            count = self.scalars("I", 1)[0]
+            count = self.length()
         if step.type == "empty":
             self.scalars("B", 1)
             return ()
@@ -197,7 +197,7 @@ class _Message:
         if step.type == "string":
             self.room.take(TEXT * count, "the texts of its messages")
             for _ in range(count):
-                self.scalars("B", self.scalars("I", 1)[0])
+                self.scalars("B", self.length())
             return ()
         inner = self.plan(step.type)
         self.room.take(TEXT * count * len(inner), "the lists of its messages")
@@ -205,6 +205,10 @@ class _Message:
             for inner_step in inner:
                 self.values(inner_step)
         return ()
+
+    def length(self) -> int:
+        """Reads the length of a list or text."""
+        return int(self.scalars("I", 1)[0])
 
     def scalars(self, code: str, count: int) -> tuple[float, ...]:
         """Reads so many numbers of one kind; only moves over more than ``LISTED``."""

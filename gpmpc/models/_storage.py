@@ -201,7 +201,7 @@ def _fields(
     for name in (field.name for field in fields(kind)):
         entry = header.get(name)
         if name == "signals":
-            parts[name] = Signals.from_header(entry)
+            values[name] = Signals.from_header(entry)
             continue
         inner = {
             key.partition("/")[2]: value

@@ -137,7 +137,9 @@ class _Reader:
         if self._index is not None and self._index.sound:
             self._data_end = self._index.start
         self._room = room(path)  # left for what chunks unfold to [bytes]
-        self._search_room = _ROOM + 4 * self._size  # for what may be a chunk [bytes]
+        self._search_room = (
+            2 * LARGEST + 4 * self._size
+        )  # for what may be a chunk [bytes]
         self._content = Content()
         self._topics: dict[int, str] = {}  # of ``CHANNELS``
         self._identities: set[tuple[int, int, int]] = set()  # of chunks

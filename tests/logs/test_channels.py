@@ -19,6 +19,7 @@ from gpmpc.logs._readers import read_file
 from gpmpc.logs._ros2 import ros2_decoder
 from tests.logs import strange
 from tests.logs.strange import BAG_MAPPING, STEP, TABLE_MAPPING
+from tests.recording import runs
 
 ROWS = 400
 DEFINITION = """
@@ -341,3 +342,18 @@ def test_sections_that_were_appended_to_a_ulog_are_read(tmp_path):
     path.write_bytes(first[: start + 1] + flags + first[start + 41 :] + late)
     table = read_file(path, ["arm"], partial=True).streams["arm"]
     assert (len(table), table["timestamp"].iloc[-1]) == (ROWS + 1, 100.0)
+
+
+def test_a_recording_of_this_package_is_one_whoever_has_rewritten_it(tmp_path):
+    runs.record_run(tmp_path / "run.mcap")
+    expected = read_file(tmp_path / "run.mcap").streams[""]
+    content = (tmp_path / "run.mcap").read_bytes()
+    foreign = content.replace(b"\5\0\0\0gpmpc", b"\5\0\0\0other", 1)
+    (tmp_path / "other.mcap").write_bytes(foreign)
+    file = read_file(tmp_path / "other.mcap", [""], partial=True)
+    assert file.streams[""].equals(expected)
+    (tmp_path / "cut.mcap").write_bytes(content[: len(content) * 3 // 4])
+    with pytest.raises(DataError, match="gpmpc log recover rescues it"):
+        read_file(tmp_path / "cut.mcap", [""])
+    file = read_file(tmp_path / "cut.mcap", [""], partial=True)
+    assert findings(file)["unfinished"][1].startswith(f"{len(file.streams[''])} steps")
