@@ -116,7 +116,7 @@ def _read_ros2(path: Path, topics: tuple[str, ...], partial: bool) -> Streams:
     from mcap.reader import NonSeekingReader
     from mcap_ros2.decoder import DecoderFactory
 
-    from gpmpc.recording import NO_CHECKSUMS, bag_flaws
+    from gpmpc.recording import NO_CHECKSUMS, Flaw, bag_flaws
 
     flaws = bag_flaws(path)
     if not partial and any(flaw.kind != NO_CHECKSUMS for flaw in flaws):
@@ -149,6 +149,8 @@ def _read_ros2(path: Path, topics: tuple[str, ...], partial: bool) -> Streams:
                 raise DataError(
                     f"{path}: the bag cannot be read to its end ({error}){hint}"
                 ) from error
+            text = f"the bag cannot be read to its end ({error})"
+            flaws += (Flaw("damaged", 1, text),)
     streams = {topic: pd.DataFrame(messages) for topic, messages in rows.items()}
     for table in streams.values():
         table.attrs[FLAWS] = flaws
