@@ -11,6 +11,7 @@ import pytest
 from mcap.writer import Writer
 
 sys.path.append(str(Path(__file__).resolve().parents[1] / "recording"))
+import damage
 import runs
 
 from gpmpc.cli._command import COMMANDS
@@ -69,6 +70,80 @@ def test_recover_writes_a_finished_file_beside_the_broken_one(folder):
         "cut.recovered.mcap: unfinished or damaged; this is what could be read\n"
         in shown
     )
+
+
+def chunk_starts(data):
+    return [start for kind, start, _ in damage._spans(data) if kind == damage.CHUNK]
+
+
+def spoil(data, starts):
+    """The file with a wrong byte in every chunk that starts there."""
+    changed = bytearray(data)
+    for start in starts:
+        changed[start + 200] ^= 0xFF
+    return bytes(changed)
+
+
+def test_recover_of_a_recording_without_a_step_left_writes_no_file(folder, tmp_path):
+    data = (folder / "run.mcap").read_bytes()
+    starts = chunk_starts(data)
+    (tmp_path / "spoiled.mcap").write_bytes(spoil(data, starts))
+    (tmp_path / "early.mcap").write_bytes(data[: starts[0]])
+    before = sorted(tmp_path.iterdir())
+    reasons = {
+        "spoiled.mcap": "no step of it can be read: 2 of 2 chunks cannot be read",
+        "early.mcap": "holds no step (unfinished or damaged",
+    }
+    for name, reason in reasons.items():
+        result = gpmpc_log("recover", name, cwd=tmp_path)
+        assert result.returncode == 2
+        assert result.stderr.startswith(f"gpmpc: {name}: {reason}")
+        assert result.stderr.count("\n") == 1
+        assert result.stdout == ""
+    assert sorted(tmp_path.iterdir()) == before
+
+
+def test_a_recording_without_steps_is_an_error_of_every_command(
+    folder, tmp_path, monkeypatch
+):
+    data = (folder / "run.mcap").read_bytes()
+    (tmp_path / "early.mcap").write_bytes(data[: chunk_starts(data)[0]])
+    monkeypatch.chdir(tmp_path)
+    parser = COMMANDS["log"].parser("log")
+    for command in ("recover", "export", "layout"):
+        with pytest.raises(GpmpcError, match=r"early\.mcap: holds no step"):
+            log(parser.parse_args([command, "early.mcap"]))
+    result = gpmpc_log("info", "early.mcap", cwd=tmp_path)
+    assert result.returncode == 2
+    assert result.stderr == "gpmpc: early.mcap: holds no step\n"
+    assert "vx [m/s]" in result.stdout
+
+
+def test_every_command_says_what_is_lost(folder, tmp_path):
+    data = (folder / "run.mcap").read_bytes()
+    (tmp_path / "run.mcap").write_bytes(spoil(data, chunk_starts(data)[1:]))
+    lost = "5 of 10 steps are lost: after step 4"
+    for command in ("info", "export", "recover"):
+        result = gpmpc_log(command, "run.mcap", cwd=tmp_path)
+        assert result.returncode == 0, result.stderr
+        assert "1 of 2 chunks cannot be read" in result.stdout
+        assert lost in result.stdout
+    assert "unfinished or damaged" in gpmpc_log("info", "run.mcap", cwd=tmp_path).stdout
+
+
+def test_every_command_says_that_there_are_no_checksums(folder, tmp_path):
+    found = []
+    for kind, content in damage.records((folder / "run.mcap").read_bytes()[8:]):
+        if kind == damage.CHUNK:
+            content = content[:24] + bytes(4) + content[28:]
+        found.append((kind, bytes(4) if kind == damage.DATA_END else content))
+    data = damage.MAGIC + damage.joined(found) + damage.MAGIC
+    (tmp_path / "run.mcap").write_bytes(data)
+    for command in ("info", "export", "recover"):
+        result = gpmpc_log(command, "run.mcap", cwd=tmp_path)
+        assert result.returncode == 0, result.stderr
+        assert "no checksums: 90 messages may be altered unnoticed" in result.stdout
+        assert "unfinished or damaged" not in result.stdout
 
 
 def test_export_writes_a_row_per_step_with_exact_numbers(folder):
