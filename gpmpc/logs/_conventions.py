@@ -22,7 +22,7 @@ no reading, such as that of a car, it says nothing.
 import itertools
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache
+from functools import cache, cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -58,6 +58,8 @@ FAST = 1.5  # [rad] within a window that is turning fast
 HALF_WIDE = 0.1  # [s] of the windows of accelerations, which are noisier
 WINDOWS = 800  # of a run that are looked at
 FEWEST = 50  # windows that say something
+LEAST_AGREEMENT = 0.7  # likewise, of which another reading is worth while
+AGREEMENT = 0.15  # in the sum of three correlations, which is more than chance
 LONGEST_LAG = 0.8  # [s] that is sought
 LAG_STEP = 0.02  # [s] from one lag to the next
 QUANTILES = (0.5, 0.75, 0.9, 0.97, 0.99)  # of absolute values
@@ -480,6 +482,14 @@ def _correlations(series: _Series, derived: Array) -> Array:
     return correlations
 
 
+def _agreements(series: _Series, derived: Array) -> Array:
+    """At each lag (L,), the correlations of the axes in their best order, summed."""
+    correlations = np.abs(_correlations(series, derived))
+    axes = np.arange(3)
+    orders = np.array(list(itertools.permutations(axes)))
+    return correlations[:, axes, orders].sum(axis=2).max(axis=1)
+
+
 def _fit_later(
     series: _Series, derived: Array, factors: Sequence[float], floor: float
 ) -> _Fit:
@@ -487,10 +497,7 @@ def _fit_later(
     now = len(series.lags) // 2
     rows = series.inside[now]
     fit = _fit_axes(series.later[now][rows], derived[rows], factors, floor)
-    correlations = np.abs(_correlations(series, derived))
-    axes = np.arange(3)
-    orders = np.array(list(itertools.permutations(axes)))
-    sums = correlations[:, axes, orders].sum(axis=2).max(axis=1)
+    sums = _agreements(series, derived)
     lag = int(sums.argmax())
     if abs(series.lags[lag]) < NOTED_LAG or sums[lag] <= sums[now]:
         return fit
@@ -810,6 +817,7 @@ class _Search:
             rate_frame=self._frames[1],
         )
 
+    @cached_property
     def relations(self) -> tuple[_Relation, _Relation]:
         """The first two relations, as the mapping claims them."""
         claim = self.claim
@@ -1024,9 +1032,6 @@ class _Search:
         """All readings that may be better than the claim."""
         claimed = self.claimed()
         best = claimed.score
-        velocity_frames = [self._frames[0]]
-        if claimed.velocity.misfits.max() > DOUBTFUL:
-            velocity_frames.append(_other_frame(self._frames[0]))
         in_world = _fit_later(
             self.velocities,
             self.windows.moves,
@@ -1039,20 +1044,28 @@ class _Search:
             positions.append(np.linalg.inv(explained))
         # No reading can fit a velocity better than this.
         best_velocity = 3 * np.log(_FLOOR_VELOCITY)
-        if velocity_frames == ["world"]:
+        may_be_body = self._is_body_velocity(self.attitudes[0], claimed)
+        if not may_be_body:
             best_velocity = in_world.score - CHANGE * in_world.cost
         best_tilt = 2 * np.log(_FLOOR_TILT)
+        least_agreement = self._least_agreement(claimed)
         for attitude in self.attitudes:
             body_axis = self._body_axis(attitude)
             for rate_frame in ("body", "world"):
                 _, derived = self._rates(attitude, rate_frame)
+                agreements = _agreements(self.rates, derived)
+                if attitude.cost and agreements.max() < least_agreement:
+                    continue
                 rate = _fit_later(self.rates, derived, self.rate_factors, _FLOOR_RATE)
                 # A mistake that several signals share counts once.
                 least_cost = attitude.cost + (rate_frame != self._frames[1]) - 2
                 least = rate.score + CHANGE * max(least_cost, -rate.cost)
                 if least + best_velocity + best_tilt > best:
                     continue
-                for frame, position in itertools.product(velocity_frames, positions):
+                frames = ["world"]
+                if self._is_body_velocity(attitude, claimed):
+                    frames.append("body")
+                for frame, position in itertools.product(frames, positions):
                     is_likely = attitude.cost == 0 and _is_likely(position)
                     if (
                         frame == "body"
@@ -1074,6 +1087,30 @@ class _Search:
                     )
                     best = min(best, reading.score)
                     yield reading
+
+    def _least_agreement(self, claimed: _Reading) -> float:
+        """Sum of the rate's correlations of which another attitude is worth while."""
+        _, derived = self._rates(self.attitudes[0], self._frames[1])
+        now = len(self.rates.lags) // 2
+        agreement = float(np.trace(_correlations(self.rates, derived)[now]))
+        is_velocity_doubtful = claimed.velocity.misfits.max() > DOUBTFUL
+        is_in_question = is_velocity_doubtful and self._frames[0] == "body"
+        if claimed.tilt is not None and not _fits_tilt(claimed.tilt):
+            is_in_question = True
+        chance = -AGREEMENT if is_in_question else AGREEMENT
+        return max(agreement + chance, LEAST_AGREEMENT)
+
+    def _is_body_velocity(self, attitude: _AttitudeChange, claimed: _Reading) -> bool:
+        """Whether a velocity in body axes is worth while to be looked at."""
+        if self._frames[0] == "body":
+            return True
+        if claimed.velocity.misfits.max() < DOUBTFUL:
+            return False
+        now = len(self.velocities.lags) // 2
+        own = np.trace(_correlations(self.velocities, self.windows.moves)[now])
+        _, derived = self._velocities(attitude, "body")
+        agreement = _agreements(self.velocities, derived).max()
+        return bool(agreement > max(own, LEAST_AGREEMENT))
 
     def _fit_body_velocity(self, attitude: _AttitudeChange, position: Array) -> _Fit:
         _, derived = self._velocities(attitude, "body", position)
@@ -1265,13 +1302,11 @@ def _noticed(search: _Search, claimed: _Reading, run: str) -> list[Finding]:
         findings.append(Finding("upside down", run, 1, text))
     lag = search.tilt_lag(claimed)
     if lag:
-        late, early = (
-            (f"{claim.position.name} and {claim.velocity.name}", name)
-            if lag > 0
-            else (name, f"{claim.position.name} and {claim.velocity.name}")
-        )
+        place = f"{claim.position.name} and {claim.velocity.name}"
+        turn = f"{name} and {claim.rate.name}"
+        late, early = (place, turn) if lag > 0 else (turn, place)
         text = (
-            f"{late} come about {abs(lag):.2g} s after {early}: do their clocks agree?"
+            f"{late} come about {abs(lag):.1f} s after {early}: do their clocks agree?"
         )
         findings.append(Finding("late", run, 1, text))
     return findings
@@ -1280,7 +1315,7 @@ def _noticed(search: _Search, claimed: _Reading, run: str) -> list[Finding]:
 def _unexplained(search: _Search, claimed: _Reading) -> str:
     """Which derivative has nothing to do with its signal, though neither is noise."""
     for relation, fit in zip(
-        search.relations(), (claimed.velocity, claimed.rate), strict=True
+        search.relations, (claimed.velocity, claimed.rate), strict=True
     ):
         correlations = relation.correlations
         unrelated = (fit.misfits > BAD) & (np.abs(correlations) < UNRELATED)
@@ -1295,7 +1330,7 @@ def _unexplained(search: _Search, claimed: _Reading) -> str:
 def _numbers(search: _Search) -> str:
     """The correlations of what the mapping says."""
     words = []
-    for relation in search.relations():
+    for relation in search.relations:
         numbers = ", ".join(f"{number:.2f}" for number in relation.correlations)
         words.append(f"{relation.measured.name} {numbers}")
     return (
@@ -1322,7 +1357,7 @@ def _sentences(best: _Reading, search: _Search) -> list[str]:
     words += _position_words(best, search)
     words += _fit_words(
         search=search,
-        relation=search.relations()[1],
+        relation=search.relations[1],
         fit=best.rate,
         frame=best.rate_frame,
         units=(_RATES, _ANGLES),
@@ -1334,7 +1369,7 @@ def _sentences(best: _Reading, search: _Search) -> list[str]:
 def _position_words(best: _Reading, search: _Search) -> list[str]:
     """What position and velocity are."""
     claim = search.claim
-    relation = search.relations()[0]
+    relation = search.relations[0]
     fit = best.velocity
     unit, axes = _unit_and_axes(best.position)
     words = []

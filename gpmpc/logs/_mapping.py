@@ -54,6 +54,7 @@ _SIGNAL_KEYS = (
     "frame",
     "axes",
     "scale",
+    "delay",
     "resample",
     "topic",
 )
@@ -75,6 +76,8 @@ class Signal:
     axes: str = ""
     #: The values are multiplied by it: one number, or one for each column.
     scale: float | tuple[float, ...] = 1.0
+    #: [s] by which its values come later than their stamps say; they are moved back.
+    delay: float = 0.0
     resample: str = ""  #: "hold", "linear" or "spherical"; by default states are interpolated and all else is held
     topic: str = ""  #: the stream that holds the columns; empty where a file has one
 
@@ -103,6 +106,7 @@ class Signal:
             object.__setattr__(self, "scale", tuple(self.scale))
         else:
             check_number(f"{key}.scale", self.scale)
+        check_number(f"{key}.delay", self.delay)
         if self.kind in ("angle", "euler"):
             check_choice(f"{key}.unit", self.unit, ("rad", "deg"))
 

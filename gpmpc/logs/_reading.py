@@ -180,12 +180,20 @@ def _tabulate(
         )
         breaks = np.zeros(len(grid), dtype=bool)
 
-    def on_grid(topic: str, values: Array, rule: str, max_gap: float | None) -> Array:
-        if mapping.rate is None:
+    def on_grid(
+        topic: str,
+        values: Array,
+        rule: str,
+        max_gap: float | None,
+        delay: float = 0.0,
+    ) -> Array:
+        if mapping.rate is None and delay == 0:
             return values
         time = stamps[topic].time
-        usual = max(float(np.median(np.diff(time))), 1 / mapping.rate)
-        return resample(time, values, grid, rule, max_gap or 1.5 * usual)
+        usual = float(np.median(np.diff(time)))
+        if mapping.rate is not None:
+            usual = max(usual, 1 / mapping.rate)
+        return resample(time, values, grid + delay, rule, max_gap or 1.5 * usual)
 
     parts = []
     for s in mapping.signals:
@@ -195,6 +203,7 @@ def _tabulate(
                 _values(labels[s.topic], tables[s.topic], s, note),
                 s.rule,
                 mapping.max_gap,
+                s.delay,
             )
         )
     outside = np.zeros(len(grid), dtype=bool)
