@@ -20,7 +20,7 @@ from gpmpc.logs._kinematics import (
 )
 
 if TYPE_CHECKING:
-    from gpmpc.logs._mapping import LogMapping
+    from gpmpc.logs._mapping import LogMapping, Signal
 
 # Both matrices are their own inverses, and so are the turns that they make.
 NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
@@ -78,3 +78,36 @@ def rates_to_body(states: Array, frame: str) -> Array:
     if frame == "body":
         return rates
     return rotate(quaternion_inverse(states[..., 3:7]), rates)
+
+
+class Claim:
+    """What a mapping says of the states of a rigid body."""
+
+    def __init__(self, mapping: "LogMapping") -> None:
+        self.position, self.attitude, self.velocity, self.rate = mapping.of("states")
+        self.velocity_frame = self.velocity.frame or "world"
+        self.rate_frame = self.rate.frame or "body"
+        self.frame = mapping.frame or "enu"
+        self.axes = {s.name: mapping.axes_of(s) for s in mapping.of("states")}
+
+    def to_enu(self, signal: "Signal", frame: str) -> Array:
+        """The matrix (3, 3) that brings a vector of the file to ENU or FLU axes."""
+        return axes_to_enu(self.axes[signal.name], frame)
+
+    def turn_axes(self, states: Array) -> Array:
+        """States (..., 13) in ENU and FLU axes, in the frames that the mapping says."""
+        p, q, v, w = np.split(states, [3, 7, 10], axis=-1)
+        parts = [
+            p @ self.to_enu(self.position, "world"),
+            attitudes_to_enu(q, self.axes[self.attitude.name]),
+            v @ self.to_enu(self.velocity, self.velocity_frame),
+            w @ self.to_enu(self.rate, self.rate_frame),
+        ]
+        return np.concatenate(parts, axis=-1)
+
+    def read(self, states: Array) -> Array:
+        """States (..., 13) as the package has them."""
+        states = self.turn_axes(states)
+        velocities = velocities_to_world(states, self.velocity_frame)
+        rates = rates_to_body(states, self.rate_frame)
+        return np.concatenate([states[..., :7], velocities, rates], axis=-1)

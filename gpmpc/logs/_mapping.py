@@ -44,6 +44,7 @@ _SIGNAL_KEYS = (
     "frame",
     "axes",
     "scale",
+    "delay",
     "resample",
     "topic",
 )
@@ -65,6 +66,8 @@ class Signal:
     axes: str = ""
     #: The values are multiplied by it: one number, or one for each column.
     scale: float | tuple[float, ...] = 1.0
+    #: [s] by which its values come later than their stamps say; they are moved back.
+    delay: float = 0.0
     resample: str = ""  #: "hold", "linear" or "spherical"; by default states are interpolated and all else is held
     topic: str = ""  #: the stream that holds the columns; empty where a file has one
 
@@ -93,6 +96,7 @@ class Signal:
             object.__setattr__(self, "scale", tuple(self.scale))
         else:
             check_number(f"{key}.scale", self.scale)
+        check_number(f"{key}.delay", self.delay)
         for name in ("unit", "topic"):
             if not isinstance(getattr(self, name), str):
                 raise SettingError(

@@ -202,12 +202,17 @@ def _tabulate(
         rule: str,
         max_gap: float | None,
         angles: bool = False,
+        delay: float = 0.0,
     ) -> Array:
-        if mapping.rate is None:
+        if mapping.rate is None and delay == 0:
             return values
         time = stamps[topic].time
-        usual = max(float(np.median(np.diff(time))), 1 / mapping.rate)
-        return resample(time, values, grid, rule, max_gap or 1.5 * usual, angles)
+        usual = float(np.median(np.diff(time)))
+        if mapping.rate is not None:
+            usual = max(usual, 1 / mapping.rate)
+        return resample(
+            time, values, grid + delay, rule, max_gap or 1.5 * usual, angles
+        )
 
     parts = []
     for s in mapping.signals:
@@ -217,7 +222,8 @@ def _tabulate(
                 _values(labels[s.topic], tables[s.topic], s, note),
                 s.rule,
                 mapping.max_gap,
-                s.kind == "angle",
+                angles=s.kind == "angle",
+                delay=s.delay,
             )
         )
     outside = np.zeros(len(grid), dtype=bool)

@@ -19,6 +19,7 @@ class Conversion(NamedTuple):
     factor: float  #: how many of it
 
 
+DEGREE = float(np.pi / 180)
 SYMBOLS = {
     "m": Conversion("m", 1.0),
     "mm": Conversion("m", 1e-3),
@@ -26,7 +27,7 @@ SYMBOLS = {
     "km": Conversion("m", 1e3),
     "rad": Conversion("rad", 1.0),
     "mrad": Conversion("rad", 1e-3),
-    "deg": Conversion("rad", float(np.pi / 180)),
+    "deg": Conversion("rad", DEGREE),
     "s": Conversion("s", 1.0),
     "ms": Conversion("s", 1e-3),
     "us": Conversion("s", 1e-6),

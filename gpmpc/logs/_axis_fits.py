@@ -1,0 +1,266 @@
+"""Says how measured vectors follow from those of a motion: axes, signs, units and lags.
+
+Vectors are compared axis by axis. The *misfit* of two axes is a quantile of their
+difference over the same quantile of the larger one: 0 where they agree, about 1 where
+they have nothing to do with each other, 2 where one is the negative of the other. The
+smallest of five quantiles counts, so that neither glitches nor long rests decide.
+"""
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+
+from gpmpc.logs._frames import FRD, NED
+from gpmpc.logs._kinematics import Array
+
+QUANTILES = (0.5, 0.75, 0.9, 0.97, 0.99)  # of absolute values
+FEWEST = 50  # vectors that say something
+SHORTEST_LAG = 0.05  # [s] that is a lag
+CHANGE = 0.7  # price of a mistake that is supposed, in logarithms of misfits
+
+
+class _AxisChanges(NamedTuple):
+    """The 48 ways in which axes change places and signs, by the number of mistakes."""
+
+    matrices: Array  # (48, 3, 3)
+    sources: np.ndarray  # (48, 3) of which axis each axis is
+    flips: np.ndarray  # (48, 3) 1 where it is the negative of it
+    costs: Array  # (48,)
+
+
+@cache
+def axis_changes() -> _AxisChanges:
+    """Products of the mistakes that are made, the fewest first."""
+    swaps = [np.eye(3)[list(order)] for order in ((1, 0, 2), (2, 1, 0), (0, 2, 1))]
+    cycles = [np.eye(3)[list(order)] for order in ((1, 2, 0), (2, 0, 1))]
+    flips = [np.diag(signs) for signs in ([-1, 1, 1], [1, -1, 1], [1, 1, -1])]
+    mistakes = [*flips, -np.eye(3), FRD, NED, *swaps, *cycles]
+    costs = {_key(np.eye(3)): 0}
+    matrices = [np.eye(3)]
+    for matrix in matrices:  # grows while it is gone through
+        for mistake in mistakes:
+            product = mistake @ matrix
+            if _key(product) not in costs:
+                costs[_key(product)] = costs[_key(matrix)] + 1
+                matrices.append(product)
+    stacked = np.array(matrices)
+    return _AxisChanges(
+        matrices=stacked,
+        sources=np.abs(stacked).argmax(axis=2),
+        flips=(stacked.sum(axis=2) < 0).astype(int),
+        costs=np.array([costs[_key(matrix)] for matrix in matrices], dtype=float),
+    )
+
+
+def _key(matrix: Array) -> tuple[int, ...]:
+    """A matrix of whole numbers as the key of a dictionary."""
+    return tuple(np.rint(matrix).astype(int).ravel().tolist())
+
+
+def count_mistakes(matrix: Array) -> float:
+    """The number of mistakes that make a change of the axes."""
+    changes = axis_changes()
+    matches = (changes.matrices == np.rint(matrix)).all(axis=(1, 2))
+    return float(changes.costs[int(np.argmax(matches))])
+
+
+@dataclass(frozen=True)
+class AxisFit:
+    """How measured vectors are those of the motion: factors * matrix @ vector, later."""
+
+    matrix: Array = field(default_factory=lambda: np.eye(3))
+    factors: Array = field(default_factory=lambda: np.ones(3))  # of the measured axes
+    lag: float = 0.0  # [s] by which the measured ones come later
+    misfits: Array = field(default_factory=lambda: np.ones(3))
+    cost: float = 0.0  # number of mistakes
+    score: float = 0.0  # sum of the misfits' logarithms, with the cost
+
+
+def absolute_quantiles(values: Array) -> Array:
+    """Quantiles (Q, ...) of absolute values (N, ...)."""
+    places = [int(share * (len(values) - 1)) for share in QUANTILES]
+    return np.partition(np.abs(values), places, axis=0)[places]
+
+
+def centred(values: Array) -> Array:
+    return values - np.median(values, axis=0)
+
+
+def misfits(measured: Array, derived: Array) -> Array:
+    """Misfits (...) of measured values to derived ones (N, ...), as this file says."""
+    measured = centred(measured)
+    derived = centred(derived)
+    sizes = np.maximum(absolute_quantiles(measured), absolute_quantiles(derived))
+    errors = absolute_quantiles(measured - derived)
+    ratios = np.divide(errors, sizes, out=np.ones_like(errors), where=sizes > 0)
+    return ratios.min(axis=0)
+
+
+def _fit_axes(
+    measured: Array, derived: Array, factors: Sequence[float], floor: float
+) -> AxisFit:
+    """The change of axes and units that explains measured vectors (N, 3) best.
+
+    One unit may be wrong: that of all axes, or of one.
+    """
+    measured = centred(measured)
+    derived = centred(derived)
+    sizes = absolute_quantiles(measured)[:, :, None]  # (Q, 3, 1)
+    derived_sizes = absolute_quantiles(derived)[:, None, :]  # (Q, 1, 3)
+    units = [1.0, *_plausible(factors, sizes, derived_sizes)]
+    tables = []
+    for unit in units:
+        scaled = unit * derived[:, None, :]
+        both_signs = np.stack(
+            [measured[:, :, None] - scaled, measured[:, :, None] + scaled], axis=-1
+        )
+        errors = absolute_quantiles(both_signs)
+        largest = np.maximum(sizes, unit * derived_sizes)[..., None]
+        ratios = np.divide(
+            errors,
+            np.broadcast_to(largest, errors.shape),
+            out=np.ones_like(errors),
+            where=np.broadcast_to(largest > 0, errors.shape),
+        )
+        tables.append(ratios.min(axis=0))
+    table = np.array(tables)  # (U, measured, derived, sign)
+    changes = axis_changes()
+    axes = np.arange(3)
+    each = table[:, axes, changes.sources, changes.flips]  # (U, 48, 3)
+    logs = np.log(np.maximum(each, floor))
+    plain = logs[0].sum(axis=1)
+    costs = changes.costs
+    options = [(plain + CHANGE * costs, 0, None)]
+    for unit in range(1, len(units)):
+        kind = 1 if units[unit] in factors else 1.5  # a factor that is no unit
+        options.append(
+            (logs[unit].sum(axis=1) + CHANGE * (costs + kind), unit, None),
+        )
+        if kind == 1:
+            options += [
+                (
+                    plain
+                    + logs[unit, :, axis]
+                    - logs[0, :, axis]
+                    + CHANGE * (costs + kind),
+                    unit,
+                    axis,
+                )
+                for axis in range(3)
+            ]
+    scores, unit, axis = min(options, key=lambda option: option[0].min())
+    best = int(scores.argmin())
+    scale = np.ones(3)
+    chosen = each[0, best].copy()
+    if unit and axis is None:
+        scale[:] = units[unit]
+        chosen = each[unit, best]
+    elif unit:
+        scale[axis] = units[unit]
+        chosen[axis] = each[unit, best, axis]
+    score = float(scores[best])
+    cost = (score - float(np.log(np.maximum(chosen, floor)).sum())) / CHANGE
+    return AxisFit(changes.matrices[best], scale, 0.0, chosen, cost, score)
+
+
+def _plausible(
+    factors: Sequence[float], sizes: Array, derived_sizes: Array
+) -> list[float]:
+    """Factors that the sizes of both sides allow, and their own one where it is large."""
+    large = QUANTILES.index(0.9)
+    ratios = sizes[large] / np.maximum(derived_sizes[large], 1e-300)
+    units = [f for f in factors if ((ratios > 0.7 * f) & (ratios < 1.4 * f)).any()]
+    total = float(np.square(sizes[large]).sum())
+    derived_total = float(np.square(derived_sizes[large]).sum())
+    if min(total, derived_total) <= 0:
+        return units
+    usual = float(np.sqrt(total / derived_total))
+    is_large = not 0.5 < usual < 2
+    if is_large and not any(abs(usual / unit - 1) < 0.05 for unit in units):
+        units.append(usual)
+    return units
+
+
+def correlation(one: Array, other: Array) -> Array:
+    """Correlations (3,) of the axes of vectors (N, 3), without glitches."""
+    one = _without_glitches(one)
+    other = _without_glitches(other)
+    product = (one * other).sum(axis=0)
+    scale = np.sqrt((one * one).sum(axis=0) * (other * other).sum(axis=0))
+    return np.divide(product, scale, out=np.zeros(3), where=scale > 0)
+
+
+def _without_glitches(vectors: Array) -> Array:
+    """Centred vectors (N, 3) whose largest hundredth is cut off at either side."""
+    low, high = np.quantile(vectors, [0.01, 0.99], axis=0)
+    clipped = np.clip(vectors, low, high)
+    return clipped - clipped.mean(axis=0)
+
+
+class LaggedVectors(NamedTuple):
+    """Measured vectors at all lags, as they are correlated with others."""
+
+    lags: Array  # (L,) [s]
+    later: Array  # (L, N, 3); NaN beyond the piece
+    clipped: Array  # likewise, centred and without glitches; 0 beyond the piece
+    inside: np.ndarray  # (L, N)
+    squares: Array  # sums of squares of the clipped ones (L, 3)
+
+
+def lagged_vectors(lags: Array, later: Array) -> LaggedVectors:
+    inside = np.isfinite(later[:, :, 0])
+    now = later[len(lags) // 2]
+    low, high = np.nanquantile(now, [0.01, 0.99], axis=0)
+    clipped = np.clip(later, low, high) - np.nanmedian(now, axis=0)
+    clipped[~inside] = 0.0
+    squares = np.square(clipped).sum(axis=1)
+    return LaggedVectors(lags, later, clipped, inside, squares)
+
+
+def lagged_correlations(series: LaggedVectors, derived: Array) -> Array:
+    """Correlations (L, 3, 3) of measured axes, at each lag, with derived ones."""
+    low, high = np.quantile(derived, [0.01, 0.99], axis=0)
+    derived = np.clip(derived, low, high) - np.median(derived, axis=0)
+    products = np.swapaxes(series.clipped, 1, 2) @ derived
+    own = series.squares[:, :, None]
+    others = (series.inside.astype(float) @ np.square(derived))[:, None, :]
+    scale = np.sqrt(own * others)
+    correlations = np.divide(
+        products, scale, out=np.zeros_like(products), where=scale > 0
+    )
+    enough = series.inside.sum(axis=1) >= max(FEWEST, 0.3 * len(derived))
+    correlations[~enough] = 0.0
+    return correlations
+
+
+def agreements(series: LaggedVectors, derived: Array) -> Array:
+    """At each lag (L,), the correlations of the axes in their best order, summed."""
+    correlations = np.abs(lagged_correlations(series, derived))
+    axes = np.arange(3)
+    orders = np.array(list(itertools.permutations(axes)))
+    return correlations[:, axes, orders].sum(axis=2).max(axis=1)
+
+
+def fit_axes_and_lag(
+    series: LaggedVectors, derived: Array, factors: Sequence[float], floor: float
+) -> AxisFit:
+    """The change of axes and units, now or at the lag of the largest correlations."""
+    now = len(series.lags) // 2
+    rows = series.inside[now]
+    fit = _fit_axes(series.later[now][rows], derived[rows], factors, floor)
+    sums = agreements(series, derived)
+    lag = int(sums.argmax())
+    if abs(series.lags[lag]) < SHORTEST_LAG or sums[lag] <= sums[now]:
+        return fit
+    rows = series.inside[lag]
+    late = _fit_axes(series.later[lag][rows], derived[rows], factors, floor)
+    late_score = late.score + CHANGE
+    if late_score >= fit.score:
+        return fit
+    return replace(
+        late, lag=float(series.lags[lag]), cost=late.cost + 1, score=late_score
+    )
