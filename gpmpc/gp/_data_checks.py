@@ -145,8 +145,8 @@ def warn_of_constants(
         _log.warning(
             "training: never moves by more than %.1g (resolution) in the %d rows: %s. "
             "What it changes is not known: away from that value predictions return to "
-            "the prior, over a length-scale of %s (prior_lengthscale; math.inf where it "
-            "is known to change nothing)",
+            "the prior, over a length-scale of %s (prior_lengthscale; 'no_effect' where "
+            "it is known to change nothing)",
             resolution,
             size,
             _listed(columns.features, features[0], unknown),

@@ -12,13 +12,16 @@ controller follows it. One who knows the ranges says so.
 
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gpmpc.exceptions import SettingError, check_number
+from gpmpc.exceptions import GpmpcError, SettingError, check_number
 from gpmpc.gp._scaling import Scaling
+
+NO_EFFECT = "no_effect"  # in the place of the length-scale of a feature without any
+PriorLengthscale = float | Literal["no_effect"]
 
 
 class PriorScales(NamedTuple):
@@ -38,17 +41,17 @@ class PriorScales(NamedTuple):
         Raises:
             SettingError: ``prior_lengthscale`` is a list of another number of features.
         """
-        lengthscale = trainer.prior_lengthscale
-        if lengthscale is None:
-            lengthscale = 1.0
-        if isinstance(lengthscale, Sequence) and len(lengthscale) != d:
+        setting = trainer.prior_lengthscale
+        if not _is_list(setting):
+            setting = [1.0 if setting is None else setting] * d
+        if len(setting) != d:
             raise SettingError(
                 "prior_lengthscale",
-                f"must be one number, or {d}, one a feature; got {len(lengthscale)}",
+                f"must be one number, or {d}, one a feature; got {len(setting)}",
             )
         deviation = trainer.prior_deviation
         return cls(
-            lengthscales=np.broadcast_to(np.asarray(lengthscale, dtype=float), d),
+            lengthscales=np.array([math.inf if s == NO_EFFECT else s for s in setting]),
             deviations=None if deviation is None else deviation * units,
         )
 
@@ -61,12 +64,22 @@ class PriorScales(NamedTuple):
 
 def check_prior_scales(trainer: Any) -> None:
     """Raises ``SettingError`` unless a trainer's settings of columns at rest are right."""
-    lengthscale = trainer.prior_lengthscale
-    if lengthscale is not None:
-        several = isinstance(lengthscale, Sequence) and not isinstance(lengthscale, str)
-        for value in lengthscale if several else [lengthscale]:
-            if value != math.inf:
+    setting = trainer.prior_lengthscale
+    for value in (
+        setting if _is_list(setting) else [1.0 if setting is None else setting]
+    ):
+        if value != NO_EFFECT:
+            try:
                 check_number("prior_lengthscale", value, above=0)
+            except GpmpcError as error:
+                raise SettingError(
+                    "prior_lengthscale",
+                    f"must be numbers above 0, or {NO_EFFECT!r}; got {value!r}",
+                ) from error
     if trainer.prior_deviation is not None:
         check_number("prior_deviation", trainer.prior_deviation, above=0)
     check_number("resolution", trainer.resolution, least=0)
+
+
+def _is_list(setting: Any) -> bool:
+    return isinstance(setting, Sequence) and not isinstance(setting, str)

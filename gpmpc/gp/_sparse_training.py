@@ -29,7 +29,7 @@ from gpmpc.gp._data_checks import (
 )
 from gpmpc.gp._kernel import Hyperparameters, Predicts, kernel_matrix
 from gpmpc.gp._likelihood import FAILED
-from gpmpc.gp._prior_scales import PriorScales
+from gpmpc.gp._prior_scales import PriorLengthscale, PriorScales
 from gpmpc.gp._scaling import Scaling, centre, identity
 from gpmpc.gp._search import (
     TrainingData,
@@ -79,7 +79,7 @@ class SparseTrainer:
     subset: int = 200  #: number of random transitions in the first, exact, training
     restarts: int = 1  #: random starts of that one
     #: of features that never move in the data, and of outputs that never change; all three as in ``Trainer``
-    prior_lengthscale: float | Sequence[float] | None = None
+    prior_lengthscale: PriorLengthscale | Sequence[PriorLengthscale] | None = None
     prior_deviation: float | None = 1.0
     resolution: float = RESOLUTION
 

@@ -36,7 +36,7 @@ from gpmpc.gp._kernel import PREDICTS, Hyperparameters, Predicts
 from gpmpc.gp._likelihood import FAILED
 from gpmpc.gp._online import targets_of
 from gpmpc.gp._posterior import GPPosterior
-from gpmpc.gp._prior_scales import PriorScales, check_prior_scales
+from gpmpc.gp._prior_scales import PriorLengthscale, PriorScales, check_prior_scales
 from gpmpc.gp._scaling import Scaling, centre
 from gpmpc.gp._search import (
     OutputSearch,
@@ -105,8 +105,8 @@ class Trainer:
     #: that is depends on the machine. One iteration over all points is made in any case. None: no limit
     time_limit: float | None = None
     #: of features that never move in the data, for all or one each, in their units: how far from the value that they
-    #: have predictions hold. None: one unit; ``math.inf``: known to have no effect
-    prior_lengthscale: float | Sequence[float] | None = None
+    #: have predictions hold. None: one unit; ``"no_effect"``: it is known that they have none
+    prior_lengthscale: PriorLengthscale | Sequence[PriorLengthscale] | None = None
     #: of outputs that never change in the data: the standard deviation that they are supposed to have elsewhere, in
     #: their units; of a residual, in units of what a step changes. None: what the search finds, which is nearly none
     prior_deviation: float | None = 1.0

@@ -2,11 +2,15 @@
 
 import csv
 import io
+from dataclasses import replace
 from decimal import Decimal
 from functools import partial
+from pathlib import Path
 
 import pytest
 import torch
+from hydra import compose, initialize_config_dir
+from hydra.utils import instantiate
 
 from gpmpc.datasets import PaperData
 from gpmpc.exceptions import DataError, SettingError, TrainingError
@@ -26,6 +30,7 @@ from gpmpc.studies._document import number
 from gpmpc.studies.study import TrialStore, run_study
 from gpmpc.trajectories import Hover
 
+CONF = Path(__file__).resolve().parents[2] / "conf"
 SUBSYSTEMS = ("translational", "rotational")
 
 
@@ -417,3 +422,22 @@ def test_the_measures_of_a_fit_are_those_of_its_predictions_in_the_units_of_the_
         )
         assert held_out == pytest.approx(round(held_out))
         assert -1e-9 <= inside - held_out <= 30 + 1e-9
+
+
+@pytest.mark.parametrize("name", ["tables", "figures"])
+def test_the_papers_models_know_that_yaw_at_rest_changes_nothing(name, caplog):
+    with initialize_config_dir(str(CONF), version_base=None):
+        trainer = instantiate(compose(name).model)
+    t = torch.arange(20.0)[:, None]
+    states = 0.5 + 0.4 * torch.sin(t * torch.linspace(0.1, 0.6, 6))
+    residue = 3e-10 * torch.cos(t[:, 0])  # of the solver
+    states[:, 4] = 0.5 + residue
+    after = states.roll(-1, 0)
+    data = Transitions(states, torch.cos(t * torch.linspace(0.2, 0.4, 3)), after)
+    gp = replace(trainer, restarts=0)(data).posterior
+    assert (gp.lengthscales[:, 4] == gp.lengthscales[0, 4]).all()
+    assert float(gp.lengthscales[0, 4]) == pytest.approx(0.5e8)
+    yaw = gp.predict(data.states, data.inputs)
+    assert torch.allclose(yaw.mean[:, 4], torch.tensor(0.5), atol=1e-4)
+    assert (yaw.variance[:, 4].sqrt() < 1e-3).all()
+    assert not caplog.records

@@ -257,7 +257,7 @@ def test_of_many_columns_at_rest_a_few_are_named_and_the_others_counted(caplog, 
 
 
 def test_one_who_knows_says_so_and_is_told_nothing(caplog):
-    settings = {"prior_lengthscale": [1.0, 1.0, 1.0, math.inf], "restarts": 0}
+    settings = {"prior_lengthscale": [1.0, 1.0, 1.0, "no_effect"], "restarts": 0}
     gp = train(hover(), **settings).posterior
     assert (deviations(gp, [0.3, 0.2], [0.1, 5.0]) < 0.05).all()
     assert not caplog.records
@@ -269,7 +269,7 @@ def test_one_who_knows_says_so_and_is_told_nothing(caplog):
     assert torch.allclose(smaller.signal_variance.sqrt(), torch.tensor(0.01))
     caplog.clear()
     found = train(
-        still, prior_deviation=None, prior_lengthscale=math.inf, restarts=0
+        still, prior_deviation=None, prior_lengthscale="no_effect", restarts=0
     ).posterior
     assert (found.signal_variance.sqrt() < 1e-3).all()
     assert not caplog.records
@@ -279,18 +279,21 @@ def test_one_who_knows_says_so_and_is_told_nothing(caplog):
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"prior_lengthscale": 0.0}, "prior_lengthscale: must be a number above 0"),
+        (
+            {"prior_lengthscale": 0.0},
+            "prior_lengthscale: must be numbers above 0, or 'no_effect'",
+        ),
         (
             {"prior_lengthscale": "long"},
-            "prior_lengthscale: must be a number .* 'long'",
+            "prior_lengthscale: .* got 'long'",
         ),
         (
             {"prior_lengthscale": [1.0, -1.0]},
-            "prior_lengthscale: must be a number above",
+            "prior_lengthscale: must be numbers .* got -1.0",
         ),
         (
             {"prior_lengthscale": math.nan},
-            "prior_lengthscale: must be a number above 0",
+            "prior_lengthscale: must be numbers above 0, or 'no_effect'",
         ),
         ({"prior_deviation": 0.0}, "prior_deviation: must be a number above 0"),
         ({"prior_deviation": math.inf}, "prior_deviation: must be a number above 0"),
@@ -310,7 +313,7 @@ def test_there_are_as_many_prior_lengthscales_as_features(make):
 
 def test_a_refit_learns_what_moves_by_now():
     first = Trainer(restarts=0)(hover()).posterior
-    ignored = Trainer(restarts=0, prior_lengthscale=math.inf)(hover()).posterior
+    ignored = Trainer(restarts=0, prior_lengthscale="no_effect")(hover()).posterior
     rng = np.random.default_rng(2)
     x, u = rng.uniform(-2, 2, (60, 2)), rng.uniform(-1, 1, (60, 2))
     moving = Transitions(x, u, plant(x, u))

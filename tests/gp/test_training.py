@@ -118,7 +118,7 @@ def test_an_input_that_is_known_to_have_no_effect_has_none():
     data = pendulum(40)
     states, moved = data.states.clone(), data.next_states.clone()
     states[:, 1], moved[:, 1] = 0.5, 0.5
-    known = {"prior_lengthscale": np.inf, "prior_deviation": None}
+    known = {"prior_lengthscale": "no_effect", "prior_deviation": None}
     huge = Transitions(states * torch.tensor([1.0, 1e10]), data.inputs, moved)
     long = train(huge, restarts=0, **known).posterior.lengthscales
     assert float(long[0, 1]) > 1e17

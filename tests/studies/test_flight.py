@@ -12,7 +12,7 @@ from hydra import compose, initialize_config_dir
 from gpmpc.cli._run import experiment_of
 from gpmpc.datasets import Excitation, ExcitedData
 from gpmpc.exceptions import Diverged, SettingError
-from gpmpc.gp import Trainer
+from gpmpc.gp import Trainer, Transitions
 from gpmpc.mpc import Decision, Timing
 from gpmpc.mpc.baselines import NMPC
 from gpmpc.mpc.gp_mpc import GPMPC
@@ -23,7 +23,7 @@ from gpmpc.status import Status
 from gpmpc.studies import flight as studied
 from gpmpc.studies._run_folder import Busy, RunFolder, folder_name
 from gpmpc.studies.flight import Experiment, metrics, run_trial
-from gpmpc.systems import coupled, rotational, translational
+from gpmpc.systems import coupled, pendulum, rotational, translational
 from gpmpc.trajectories import Elliptical, Hover, Lorenz, Step
 
 CONF = Path(__file__).resolve().parents[2] / "conf"
@@ -367,3 +367,36 @@ def test_folders_of_different_choices_never_collide(one, other):
 
 def test_the_order_of_choices_does_not_matter_for_the_name():
     assert folder_name(["b=2", "a=1"]) == folder_name(["a=1", "b=2"]) == "a=1,b=2"
+
+
+@pytest.mark.parametrize(
+    "settings", [{}, {"predicts": "difference"}], ids=["next states", "differences"]
+)
+def test_what_a_run_supposes_of_columns_at_rest_follows_from_the_limits(settings):
+    rng = np.random.default_rng(0)
+    states, inputs = rng.uniform(-1, 1, (20, 6)), rng.uniform(-0.5, 0.5, (20, 3))
+    states[:, 4], states[:, 5], inputs[:, :2] = 1.0, 0.0, [7.26, 0.1]
+    data = Transitions(states, inputs, rng.uniform(-1, 1, (20, 6)))
+    flown = experiment(train=Trainer(restarts=0, **settings))
+    gp = flown.learn(data, seed=0).posterior
+    # One unit; a tenth of 4 m/s; one unit though thrusts reach 100 N; a tenth of 1.4.
+    expected = [1.0, 0.4, 1.0, 0.14]
+    assert np.allclose(gp.lengthscales[:, [4, 5, 6, 7]], expected)
+    known = replace(flown, train=replace(flown.train, prior_lengthscale=3.0))
+    lengthscales = known.learn(data, seed=0).posterior.lengthscales
+    assert np.allclose(lengthscales[:, [4, 5, 6, 7]], 3.0)
+
+
+def test_angles_at_rest_that_a_run_sees_by_sine_and_cosine_have_one_unit():
+    plant = replace(pendulum(), region=[[-3.0, -2.0], [3.0, 2.0]])
+    rng = np.random.default_rng(0)
+    states = np.column_stack([np.full(20, 0.5), rng.uniform(-1, 1, 20)])
+    data = Transitions(states, np.full((20, 1), 0.2), rng.uniform(-1, 1, (20, 2)))
+    flown = replace(
+        experiment(train=Trainer(restarts=0, predicts="difference")),
+        system=plant,
+        trajectory=None,
+        controller=partial(ON_THE_PLANT, problem=Problem(Tracking([1, 1], [1]))),
+    )
+    learned = flown.learn(data, seed=0).posterior.residual
+    assert np.allclose(learned.lengthscales[:, [0, 1, 3]], [1.0, 1.0, 0.4])
