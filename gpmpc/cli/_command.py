@@ -14,6 +14,7 @@ import gpmpc
 from gpmpc.cli._settings import (
     compose,
     explain,
+    find_modules_here,
     help_text,
     model_file,
     nearest,
@@ -186,6 +187,8 @@ def _with_settings(name: str, command: Command, given: argparse.Namespace) -> Re
         if given.help:
             print(help_text(name))
             return Result()
+        if not given.cfg:
+            find_modules_here()
         if swept and given.cfg:
             raise GpmpcError(
                 "--cfg: shows the settings of one run; leave out -m, and give each setting one value"

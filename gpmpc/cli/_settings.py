@@ -72,11 +72,7 @@ def config_folder() -> Path:
 
 @contextmanager
 def settings(own: str | None = None) -> Iterator[None]:
-    """Lets Hydra find the package's settings, and those in a folder ``own`` behind them.
-
-    What stands in the working folder can be named by ``_target_`` inside, behind everything that is installed.
-    """
-    find_modules_here()
+    """Lets Hydra find the package's settings, and those in a folder ``own`` behind them."""
     if own is not None:
         folder = Path(own)
         if not folder.is_dir():
@@ -94,7 +90,12 @@ def settings(own: str | None = None) -> Iterator[None]:
 
 
 def find_modules_here() -> None:
-    """Lets modules of the working folder be imported, behind everything that is installed."""
+    """Lets ``_target_`` name modules of the working folder, behind all installed ones.
+
+    Only where they are to be called: whoever asks for help, or presses TAB, in a folder of
+    somebody else's runs nothing of it. Hydra, which imports what is called like a plugin
+    of its own, has looked for plugins before.
+    """
     try:
         here = os.getcwd()
     except OSError as error:

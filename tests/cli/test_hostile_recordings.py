@@ -465,3 +465,19 @@ def test_twelve_hostile_files_are_refused_and_nothing_is_imported_called_or_writ
         assert "\n" not in outcome
     after = sorted(path.name for path in folder.iterdir())
     assert [name for name in after if name != "__pycache__"] == before
+
+
+@pytest.mark.parametrize(
+    "words",
+    [["completion", "--line", "gpmpc run sys"], ["run", "--help"], ["run", "--cfg"],
+     ["run", "data.samples=12", "horizon=-1"]],
+    ids=" ".join,
+)  # fmt: skip
+def test_a_folder_of_somebody_else_brings_no_plugin(words, tmp_path):
+    plugin = tmp_path / "hydra_plugins" / "plugin.py"
+    plugin.parent.mkdir()
+    plugin.write_text(
+        "from pathlib import Path\nPath(__file__).with_name('fired').touch()\n"
+    )
+    forked(*words, cwd=tmp_path)
+    assert not plugin.with_name("fired").exists()
