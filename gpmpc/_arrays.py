@@ -16,7 +16,6 @@ from gpmpc.exceptions import DataError
 
 Array = NDArray[np.float64]
 
-
 _RULE = "must be real numbers"
 _TOPIC = re.compile(r"^(state|measured|input)\.")
 

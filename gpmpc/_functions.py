@@ -8,7 +8,7 @@ math and torch do not.
 
 import dis
 from collections.abc import Callable, Iterator, Sequence
-from types import CodeType, FrameType, TracebackType
+from types import CodeType, FrameType, ModuleType, TracebackType
 from typing import Any
 
 import torch
@@ -153,7 +153,8 @@ def _names_on(frame: FrameType, line: int) -> Iterator[tuple[str, Any]]:
     for instruction in _instructions(frame.f_code, line):
         if instruction.opname in ("LOAD_ATTR", "LOAD_METHOD") and name:
             name = f"{name}.{instruction.argval}"
-            value = getattr(value, instruction.argval, None)
+            module = isinstance(value, ModuleType)  # another's attribute may be code
+            value = getattr(value, instruction.argval, None) if module else None
             continue
         if name:
             yield name, value
