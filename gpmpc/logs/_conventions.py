@@ -54,7 +54,7 @@ BAD = 0.8  # misfit from which an axis fits badly
 UNRELATED = 0.5  # correlation below which signals have nothing to do with each other
 NEAR = 0.25  # of the score within which two readings cannot be told apart
 GAIN = 0.3  # least gain of a score for which a reading is believed
-LEAST_REFUSED_LAG = 0.1  # [s]; a shorter one is a finding
+LEAST_REFUSED_LAG = 0.15  # [s]; a shorter one is a finding
 
 
 def read_rigid_bodies(

@@ -44,7 +44,7 @@ from gpmpc.logs._log import LogRun
 from gpmpc.logs._mapping import Signal
 from gpmpc.logs._units import DEGREE, conversion
 
-WINDOWS = 800  # of a run that are looked at
+WINDOWS = 600  # of a run that are looked at
 HALF_WINDOW = 0.1  # [s] on each side of the middle of a window
 HALF_SHORT = 0.03  # [s] likewise, of a body that turns fast
 FAST = 1.5  # [rad] within a window that is turning fast

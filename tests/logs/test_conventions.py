@@ -4,18 +4,35 @@ Forty mistakes in conventions, single and in pairs, on one flight; and right log
 vehicles, with noise like that of real ones, of which none is refused.
 """
 
+import os
+import struct
 import sys
+import warnings
 from pathlib import Path
 
 import numpy as np
+import pandas
 import pytest
+import yaml
 from scipy.spatial.transform import Rotation
 
-from gpmpc.exceptions import DataError
-from gpmpc.logs import read_log
+from gpmpc.exceptions import DataError, SettingError
+from gpmpc.logs import LogMapping, read_log
 
 sys.path.append(str(Path(__file__).resolve().parents[2]))
-from tests.logs.flights import FRD, MAPPING, NED, Flight, fly, late
+from tests.logs.flights import (
+    FRD,
+    MAPPING,
+    NED,
+    Flight,
+    drive,
+    fly,
+    late,
+    loop,
+    sail,
+    soar,
+    tumble,
+)
 
 DEGREES = 180 / np.pi
 
@@ -91,7 +108,9 @@ MISTAKES = {
         ["FRD", "columns: [qw, qz, qy, qx]", "scale: [1, 1, -1, -1] for attitude"],
     ),
     "an attitude in a NED world": (
-        lambda f: f.change(q=Rotation.from_matrix(NED @ f.attitude.as_matrix()).as_quat()),
+        lambda f: f.change(
+            q=Rotation.from_matrix(NED @ f.attitude.as_matrix()).as_quat()
+        ),
         ["in a world in NED axes"],
     ),
     "a velocity NED": (lambda f: f.change(v=f.v @ NED), ["axes: ned for velocity"]),
@@ -253,3 +272,286 @@ def test_a_mistake_in_the_conventions_is_refused_and_named(mistake, flight, tmp_
     assert "\n" not in text
     missing = [words for words in expected if words not in text]
     assert not missing, text
+
+
+def with_glitches(flight):
+    """One row in fifty of every signal is wrong by much."""
+    rng = np.random.default_rng(1)
+    arrays = {}
+    for name, size in (("p", 5.0), ("v", 20.0), ("w", 40.0)):
+        values = getattr(flight, name).copy()
+        rows = rng.choice(len(values), len(values) // 50, replace=False)
+        values[rows] += size * rng.normal(size=(len(rows), 3))
+        arrays[name] = values
+    return flight.change(**arrays)
+
+
+def with_signs_that_flip(flight):
+    signs = np.random.default_rng(2).choice([-1.0, 1.0], len(flight.t))
+    return flight.change(q=flight.q * signs[:, None])
+
+
+def with_gps(flight):
+    """Positions that wander and come ten times a second, and velocities with noise."""
+    rng = np.random.default_rng(3)
+    wander = 0.01 * np.cumsum(rng.normal(size=flight.p.shape), axis=0)
+    coarse = (flight.p + wander)[::10]
+    p = [np.interp(flight.t, flight.t[::10], column) for column in coarse.T]
+    v = flight.v + 0.2 * rng.normal(size=flight.v.shape)
+    return flight.change(p=np.column_stack(p), v=v)
+
+
+RIGHT = {
+    "a flight": lambda: fly(seed=1),
+    "a hover": lambda: fly(size=0.01, turning=0.0, heading=0.0),
+    "a fast turn": lambda: fly(heading=8.0, turning=0.0),
+    "large tilts": lambda: fly(size=3.0),
+    "much noise": lambda: fly(noise=10.0),
+    "noise alone": lambda: fly(size=0.05, noise=30.0),
+    "a gyroscope's offset": lambda: fly(offset=0.3),
+    "ten rows a second": lambda: fly(rate=10.0, seconds=100.0),
+    "a thousand rows a second": lambda: fly(rate=1000.0, seconds=8.0),
+    "loops": loop,
+    "a car on hills": drive,
+    "an aeroplane": soar,
+    "a boat in waves": sail,
+    "a body that is carried about": tumble,
+    "glitches": lambda: with_glitches(fly()),
+    "signs of quaternions that flip": lambda: with_signs_that_flip(fly()),
+    "a satellite receiver": lambda: with_gps(fly()),
+}
+
+
+@pytest.mark.parametrize("name", RIGHT)
+def test_a_right_log_is_read_without_a_word(name, tmp_path):
+    log = read_log(stored(tmp_path, RIGHT[name]()), MAPPING)
+    kinds = {finding.kind for finding in log.findings}
+    assert kinds <= {"quaternion flips its sign"}
+
+
+def test_a_right_log_in_pieces_and_on_another_grid_is_read(tmp_path):
+    table = fly(seconds=20).to_pandas()
+    table = table.drop(index=[*range(400, 440), *range(900, 905), 1300])
+    path = stored(tmp_path, table)
+    assert len(read_log(path, MAPPING).runs[0].begins) == 4
+    resampled = read_log(path, {**MAPPING, "rate": 30, "max_gap": 0.05})
+    assert resampled.time_step == pytest.approx(1 / 30)
+
+
+def test_short_pieces_are_judged_together(tmp_path):
+    flight = fly(seconds=14)
+    table = flight.change(w=flight.w @ FRD).to_pandas()
+    table = table[(table["t"] % 0.7) < 0.6]
+    with pytest.raises(DataError, match="axes: ned for rate"):
+        read_log(stored(tmp_path, table), MAPPING)
+
+
+def test_euler_angles_near_the_gimbal_lock_are_read_and_their_signs_are_named(tmp_path):
+    angles = ["roll", "pitch", "yaw"]
+    euler = {"columns": angles, "kind": "euler", "unit": "rad", "order": "xyzw"}
+    mapping = with_states(attitude=euler)
+    table = tumble().to_pandas()
+    turns = Rotation.from_quat(table[["qx", "qy", "qz", "qw"]].to_numpy())
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # scipy's, of the lock
+        table[angles] = turns.as_euler("ZYX")[:, ::-1]
+    assert table["pitch"].abs().max() > 1.5
+    assert read_log(stored(tmp_path, table), mapping).findings == ()
+    with pytest.raises(DataError, match=r"pitch of attitude.*scale: \[1, -1, 1\]"):
+        read_log(stored(tmp_path, table.assign(pitch=-table["pitch"])), mapping)
+    with pytest.raises(DataError, match=r"columns: \[pitch, roll, yaw\] for attitude"):
+        swapped = table.assign(roll=table["pitch"], pitch=table["roll"])
+        read_log(stored(tmp_path, swapped), mapping)
+
+
+def test_a_body_that_is_carried_by_its_underside_is_a_finding(flight, tmp_path):
+    upside_down = flight.change(q=of_frd(flight), w=flight.w @ FRD)
+    (finding,) = read_log(stored(tmp_path, upside_down), MAPPING).findings
+    assert finding.kind == "upside down"
+    assert "hangs upside down, or attitude is that of a body in FRD" in finding.text
+    assert "columns: [qw, qz, qy, qx] and scale: [1, 1, -1, -1]" in finding.text
+
+
+def test_a_short_lag_and_clocks_that_disagree_are_findings(flight, tmp_path):
+    rates_late = flight.change(w=late(flight.w, 10))
+    (finding,) = read_log(stored(tmp_path, rates_late), MAPPING).findings
+    assert finding.kind == "late"
+    assert "rate comes 0.1 s after attitude" in finding.text
+    other_clock = flight.change(q=late(flight.q, 30), w=late(flight.w, 30))
+    (finding,) = read_log(stored(tmp_path, other_clock), MAPPING).findings
+    assert "attitude and rate come about 0.3 s after position" in finding.text
+
+
+def test_what_nothing_explains_is_refused_with_its_numbers(flight, tmp_path):
+    other = fly(seconds=14, seed=7)
+    with pytest.raises(
+        DataError, match=r"no single change .* explains it \(corr.*rate"
+    ):
+        read_log(stored(tmp_path, flight.change(w=other.w)), MAPPING)
+
+
+def test_a_run_is_named_and_one_wrong_file_of_many_is_found(flight, tmp_path):
+    right = stored(tmp_path, flight, "right")
+    wrong = stored(tmp_path, flight.change(q=scalar_first(flight.q)), "wrong")
+    with pytest.raises(DataError, match="run wrong: attitude is in the order wxyz"):
+        read_log([right, wrong], MAPPING)
+
+
+@pytest.mark.parametrize(
+    ("mistake", "states"),
+    [
+        ("quaternions with the scalar first", {"attitude": {"order": "wxyz"}}),
+        ("inverse quaternions", {"attitude": {"scale": [-1, -1, -1, 1]}}),
+        ("rates FRD", {"rate": {"axes": "ned"}}),
+        ("an attitude NED and FRD", {"attitude": {"axes": "ned"}}),
+        (
+            "an attitude FRD",
+            {
+                "attitude": {
+                    "columns": ["qw", "qz", "qy", "qx"],
+                    "scale": [1, 1, -1, -1],
+                }
+            },
+        ),
+        ("a velocity NED", {"velocity": {"axes": "ned"}}),
+        (
+            "x and y of the velocity swapped",
+            {"velocity": {"columns": ["vy", "vx", "vz"]}},
+        ),
+        ("rates in world axes", {"rate": {"frame": "world"}}),
+        ("one rate in degrees", {"rate": {"scale": [np.pi / 180, 1, 1]}}),
+        ("an attitude 0.2 s late", {"attitude": {"delay": 0.2}}),
+        (
+            "velocities in body axes, FRD",
+            {"velocity": {"frame": "body", "axes": "ned"}},
+        ),
+    ],
+)
+def test_what_is_advised_reads_the_log_as_it_was(mistake, states, flight, tmp_path):
+    spoil, _ = MISTAKES[mistake]
+    log = read_log(stored(tmp_path, spoil(flight)), with_states(**states))
+    expected = read_log(stored(tmp_path, flight), MAPPING)
+    rows = slice(50, 1300)
+    difference = log.space.difference(
+        log.runs[0].states[rows], expected.runs[0].states[rows]
+    )
+    np.testing.assert_allclose(difference, 0, atol=1e-9)
+    assert log.findings == expected.findings == ()
+
+
+def test_a_log_in_ned_and_frd_comes_out_in_enu_and_flu(flight, tmp_path):
+    ned = flight.change(
+        p=flight.p @ NED, q=in_ned(flight), v=flight.v @ NED, w=flight.w @ FRD
+    )
+    expected = read_log(stored(tmp_path, flight), MAPPING)
+    log = read_log(stored(tmp_path, ned), {**MAPPING, "frame": "ned"})
+    difference = log.space.difference(log.runs[0].states, expected.runs[0].states)
+    np.testing.assert_allclose(difference, 0, atol=1e-9)
+    assert log.space.groups[0].entries == ("py", "px", "pz")
+    assert log.mapping.column_names("states")[:2] == (
+        "py in other axes",
+        "px in other axes",
+    )
+    body = ned.change(v=(ned.attitude.inv()).apply(ned.v))
+    mapping = {**with_states(velocity={"frame": "body"}), "frame": "ned"}
+    log = read_log(stored(tmp_path, body), mapping)
+    difference = log.space.difference(log.runs[0].states, expected.runs[0].states)
+    np.testing.assert_allclose(difference, 0, atol=1e-9)
+
+
+def test_a_log_in_enu_that_is_said_to_be_in_ned_is_refused(flight, tmp_path):
+    with pytest.raises(DataError, match="gravity says .* write frame: enu"):
+        read_log(stored(tmp_path, flight), {**MAPPING, "frame": "ned"})
+
+
+def px4_log(path, flight):
+    """A ULog of one topic with the states of a flight."""
+    names = list(flight.to_pandas().drop(columns="t"))
+    fields = "".join(f"float {name};" for name in names)
+
+    def message(kind, body):
+        return struct.pack("<Hc", len(body), kind) + body
+
+    data = b"ULog\x01\x12\x35\x01" + struct.pack("<Q", 0) + message(b"B", bytes(40))
+    data += message(b"F", f"body:uint64_t timestamp;{fields}".encode())
+    data += message(b"A", struct.pack("<BH", 0, 0) + b"body")
+    for t, *row in flight.to_pandas().to_numpy():
+        stamp = round(1e6 * (t + 1))
+        body = struct.pack(f"<HQ{len(row)}f", 0, stamp, *row)
+        data += message(b"D", body)
+    path.write_bytes(data)
+    return path
+
+
+def test_a_px4_log_is_in_ned_unless_its_mapping_says_otherwise(flight, tmp_path):
+    ned = flight.change(
+        p=flight.p @ NED, q=in_ned(flight), v=flight.v @ NED, w=flight.w @ FRD
+    )
+    path = px4_log(tmp_path / "flight.ulg", ned)
+    topics = {
+        role: {
+            name: {
+                **(own if isinstance(own, dict) else {"columns": own}),
+                "topic": "body",
+            }
+            for name, own in MAPPING[role].items()
+        }
+        for role in ("states", "inputs")
+    }
+    mapping = {"model": "rigid_body", **topics}
+    log = read_log(path, mapping)
+    assert log.mapping.frame == "ned"
+    expected = read_log(stored(tmp_path, flight), MAPPING)
+    difference = log.space.difference(log.runs[0].states, expected.runs[0].states)
+    np.testing.assert_allclose(difference, 0, atol=1e-5)
+    with pytest.raises(DataError, match="frame: ned"):
+        read_log(path, {**mapping, "frame": "enu"})
+    with pytest.raises(SettingError, match="frame.*enu or ned"):
+        read_log([path, stored(tmp_path, flight)], mapping)
+
+
+@pytest.mark.parametrize(
+    ("content", "expected"),
+    [
+        ({**MAPPING, "frame": "nwu"}, "frame"),
+        ({**MAPPING, "frame": "ned", "model": "none"}, "frame.*model: rigid_body"),
+        (with_states(rate={"axes": "frd"}), "states.rate.axes"),
+        (with_states(rate={"scale": [1, -1]}), "states.rate.scale.*3 numbers"),
+        (with_states(rate={"delay": "late"}), "states.rate.delay"),
+        (
+            {**with_states(rate={"axes": "ned"}), "model": "none"},
+            "states.rate.axes.*rigid_body",
+        ),
+    ],
+)
+def test_a_wrong_word_about_axes_is_named(content, expected):
+    with pytest.raises(SettingError, match=expected):
+        LogMapping.from_dict(yaml.safe_load(yaml.safe_dump(content)))
+
+
+@pytest.fixture(scope="session")
+def real_flights():
+    """The ten flights of NanoBench, which are not part of this repository."""
+    folder = os.environ.get("GPMPC_FLIGHTS")
+    if not folder:
+        pytest.skip("GPMPC_FLIGHTS names no folder with the flights of NanoBench")
+    return sorted(Path(folder).glob("*.csv.gz"))
+
+
+def test_no_real_flight_is_refused_and_mistakes_in_it_are(real_flights, tmp_path):
+    airborne = {"keep": {"pz": [0.2, None]}, "max_gap": 0.045, "held": "use"}
+    rates = {"columns": [f"w{axis}_vicon" for axis in "xyz"]}
+    motors = {"motors": [f"motor_motor_m{i}" for i in (1, 2, 3, 4)]}
+    mapping = {**with_states(rate=rates), **airborne, "inputs": motors}
+    on_ground = {**mapping, "keep": {}, "rest": "use", "inputs": {}}
+    assert len(real_flights) == 10
+    for path in real_flights:
+        stays = path.name.startswith("B7")
+        log = read_log(path, on_ground if stays else mapping)
+        assert not {"late", "upside down"} & {f.kind for f in log.findings}
+        if stays:
+            continue
+        table = pandas.read_csv(path)
+        spoiled = table.rename(columns={"qw": "qx", "qx": "qy", "qy": "qz", "qz": "qw"})
+        with pytest.raises(DataError, match="order: wxyz for attitude"):
+            read_log(stored(tmp_path, spoiled), mapping)
