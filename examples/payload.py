@@ -78,7 +78,10 @@ for seed in range(3):
         seed=seed,
     )
     rows.append((flown.measured[:-1], flown.inputs[:-1], flown.measured[1:]))
-data = Transitions(*(np.concatenate(part)[::3] for part in zip(*rows, strict=True)))
+states, inputs, next_states = (
+    np.concatenate(part)[::3] for part in zip(*rows, strict=True)
+)
+data = Transitions(states, inputs, next_states)
 B = torch.eye(12, dtype=torch.float64)[
     :, 1::2
 ]  # what is missed acts on velocities and rates
