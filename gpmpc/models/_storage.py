@@ -235,7 +235,9 @@ def _plain(name: str, entry: Any) -> Any:
     """
     numbers = entry if isinstance(entry, list) else [entry]
     if not all(type(number) in (int, float) for number in numbers):
-        raise DataError(f"{name} must be a number or numbers; got {brief(entry)}")
+        raise DataError(
+            f"{name} is neither numbers nor a part of a model: {brief(entry)}"
+        )
     if name == "input_dim":
         check_number(name, entry, least=0, whole=True)
     elif name != "delay" and not isinstance(entry, list):

@@ -481,3 +481,33 @@ def test_a_folder_of_somebody_else_brings_no_plugin(words, tmp_path):
     )
     forked(*words, cwd=tmp_path)
     assert not plugin.with_name("fired").exists()
+
+
+def test_a_saved_model_flies_by_code_of_ones_own_where_that_is_trusted(
+    tmp_path, monkeypatch
+):
+    import torch
+
+    from gpmpc.models import ResidualModel, save_model
+    from tests.gp.small_models import posterior
+
+    (tmp_path / "mass_of_mine.py").write_text(
+        "import torch\ndef moved(x, u):\n"
+        "    return x + 0.1 * torch.cat([x[..., 1:], u], dim=-1)\n"
+    )
+    monkeypatch.syspath_prepend(str(tmp_path))
+    from mass_of_mine import moved  # pyright: ignore[reportMissingImports]
+
+    effect = torch.tensor([[0.0], [1e-3]], dtype=torch.float64)
+    gp = posterior(n=1, m=1, predicts="value")
+    model = ResidualModel(moved, gp, effect, [1], [0], 1)
+    save_model(model, tmp_path / "mass.safetensors")
+    words = ["run", "system=double_integrator", "steps=3", "folder=tree"]
+    words += ["model=mass.safetensors", "controller=lqr"]
+    refused = forked(*words, cwd=tmp_path)
+    assert (refused.returncode, refused.stderr.count("\n")) == (2, 1)
+    assert "gpmpc run model.trusted=[mass_of_mine]" in refused.stderr
+    wrong = forked(*words, "model.trusted=mass_of_mine", cwd=tmp_path)
+    assert "model.trusted: must be a list of packages" in wrong.stderr
+    done = forked(*words, "model.trusted=[mass_of_mine]", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
