@@ -18,7 +18,8 @@ before those of the noise, so that large and small entries are not mixed (Cox an
 Sigma+ the root of what Sigma - K S K' loses.
 
 Sensors that are perfect, or nearly, are taken one by one instead. What one of them shows
-of what is known already is round-off of its row, and must not be taken for knowledge.
+of what others have shown already is round-off of its row, and must not be taken for
+knowledge: two such sensors that contradict each other would move other states.
 """
 
 from typing import NamedTuple
@@ -27,7 +28,7 @@ import torch
 from torch import Tensor
 
 _ROUND_OFF = 16.0  # of a sum of products, in units of the last place of its largest
-_PERFECT = 1e4  # deviation of a sensor's noise below which it is perfect, likewise
+_PERFECT = 1e-6  # deviation of a sensor's noise over what it shows: below, it is nearly perfect
 
 
 class Conditioned(NamedTuple):
@@ -113,8 +114,8 @@ def condition(root: Tensor, seen: Tensor, noise: Tensor) -> Conditioned:
     root = root.expand(*batch, n, n)
     noise_root, info = torch.linalg.cholesky_ex(noise)
     deviations = noise_root.diagonal(dim1=-2, dim2=-1)
-    perfect = deviations <= _PERFECT * torch.finfo(seen.dtype).eps * seen.norm(dim=-1)
-    if bool((info > 0).any() | perfect.any()):
+    nearly_perfect = (p > 1) & (deviations <= _PERFECT * seen.norm(dim=-1))
+    if bool((info > 0).any() | nearly_perfect.any()):
         return _one_by_one(root, seen, noise)
     of_prior = torch.cat([seen.mT, root.mT], dim=-1)
     of_noise = torch.cat([noise_root.mT, root.new_zeros(*batch, p, n)], dim=-1)
@@ -140,9 +141,7 @@ def _one_by_one(root: Tensor, seen: Tensor, noise: Tensor) -> Conditioned:
     innovations = torch.eye(p, dtype=seen.dtype, device=seen.device)
     for i in range(p):
         row, variance = factor[..., i, :], variances[..., i]
-        perfect = round_off[..., i] ** 2 >= variance
-        known = row.abs() <= round_off[..., i, None]
-        row = torch.where(perfect[..., None] & known, 0.0, row)
+        row = torch.where(row.abs() <= round_off[..., i, None], 0.0, row)
         weights, factor = _corrected(factor, row, variance)
         innovation = innovations[i] - gains[..., i, :]
         gains = gains + weights[..., :, None] * innovation[..., None, :]

@@ -323,6 +323,23 @@ def test_a_smoother_keeps_its_digits_where_the_prior_says_nothing():
     assert (torch.linalg.eigvalsh(runs[1].covariance) > 0).all()
 
 
+@pytest.mark.parametrize("variance", [1e-8, 1e-12, 1e-16, 1e-20, 1e-26])
+def test_two_good_sensors_that_contradict_each_other_move_other_states_little(
+    variance,
+):
+    P, H = random_covariance(5, 1.0), [[1, 2, 0.3, 0, 1], [1, 2, 0.3, 0, 1]]
+    rows, mean = torch.tensor(H, dtype=F), np.zeros(5)
+    y = [1.0, 1.5]
+    expected, covariance = exact_update(P, H, [variance] * 2, mean, y)
+    sensor = Measurement(5, variance * torch.eye(2, dtype=F), lambda x: x @ rows.mT)
+    still = Known(lambda x, u: x, [0.1] * 5)
+    prior = Gaussian(torch.from_numpy(mean), torch.from_numpy(P))
+    found = KalmanFilter.extended(still, sensor).update(prior, y).belief
+    missed = np.abs(found.mean.numpy() - expected)
+    assert missed.max() < 0.02  # the sensors differ by 0.5
+    assert np.allclose(found.covariance, covariance, atol=1e-12)
+
+
 def test_correlated_noise_of_nearly_perfect_sensors_is_taken_as_it_is():
     R = torch.tensor([[1e-20, 1e-20], [1e-20, 1.0]], dtype=F)
     H = torch.tensor([[1.0, 1.0], [1.0, 0.0]], dtype=F)
