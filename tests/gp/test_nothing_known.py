@@ -311,6 +311,24 @@ def test_there_are_as_many_prior_lengthscales_as_features(make):
         make(prior_lengthscale=[1.0, 2.0])(hover())
 
 
+def test_what_moves_outside_the_subset_of_a_sparse_training_is_learned(caplog):
+    rng = np.random.default_rng(0)
+    x = rng.uniform(-1, 1, (200, 2))
+    chosen = np.random.default_rng(0).permutation(200)[
+        :40
+    ]  # by the seed of the training
+    x[:, 1] *= 1e-6
+    x[chosen, 1] = 0.0
+    second = np.sin(2e6 * x[:, 1])
+    values = np.column_stack([np.sin(2 * x[:, 0]) + second, second])
+    trainer = SparseTrainer(inducing=40, subset=40, restarts=0, iterations=40)
+    features, targets = torch.from_numpy(x), torch.from_numpy(values)
+    gp = trainer.fit(features, targets, 0, "value", seed=0).posterior
+    error = (gp.predict(features).mean - targets).square().mean(0).sqrt()
+    assert (error < 0.05).all()
+    assert not caplog.records
+
+
 def test_a_refit_learns_what_moves_by_now():
     first = Trainer(restarts=0)(hover()).posterior
     ignored = Trainer(restarts=0, prior_lengthscale="no_effect")(hover()).posterior
