@@ -335,7 +335,13 @@ class Figures:
                 condition.model and condition.model.name,
                 *(box and asdict(box) for box in bounds),
             ]
-            arrays = [reference.states, reference.inputs, condition.scaling.factor]
+            scaling = condition.scaling
+            arrays = [
+                reference.states,
+                reference.inputs,
+                scaling.offset,
+                scaling.factor,
+            ]
             named = fingerprint(settings, arrays)
             labels = {
                 "name": row.title or name,

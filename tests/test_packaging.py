@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from gpmpc._provenance import code_fingerprint, source_fingerprint
+
 ROOT = Path(__file__).resolve().parents[1]
 
 
@@ -45,6 +47,11 @@ def test_the_wheel_carries_the_settings_the_printed_figures_and_its_types(wheel)
     assert {f"gpmpc/experiments/{name}" for name in results} <= set(names)
     assert not [name for name in names if "__pycache__" in name]
     assert not [name for name in names if name.startswith(("tests/", "benchmarks/"))]
+
+
+def test_the_code_of_the_wheel_has_the_fingerprint_of_the_checkout(wheel, tmp_path):
+    zipfile.ZipFile(wheel).extractall(tmp_path)
+    assert source_fingerprint(tmp_path / "gpmpc") == code_fingerprint()
 
 
 def test_an_installed_package_finds_its_settings_from_an_empty_directory(
