@@ -203,7 +203,7 @@ class McapRecorder:
 
     def _is_chunk_full(self, step: Step) -> bool:
         """Whether the steps that wait are to be written now."""
-        if self._bytes > self._chunk_size:
+        if self._bytes > min(self._chunk_size, LARGEST // 8):
             return True
         if step.time - self._waiting_since >= _SPAN and self._bytes >= _LEAST:
             return True

@@ -3,11 +3,17 @@
 import json
 import re
 import shlex
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
+from gpmpc.cli._tune import _cost
+from gpmpc.exceptions import DataError
+from gpmpc.studies._run_folder import RECORDING
 from tests.cli.command import forked
+from tests.recording import runs
 
 pytest.importorskip("optuna")
 
@@ -122,3 +128,17 @@ def test_the_help_of_tune_can_be_typed(tmp_path):
         [text.strip("'") for text in typed if "DIR" not in text]
     ):
         assert override.get_key_element()
+
+
+def test_a_flight_of_which_steps_are_lost_has_no_cost(tmp_path):
+    path = tmp_path / RECORDING
+    runs.record_run(path, steps=20)
+    folder = SimpleNamespace(finished=True, path=tmp_path, result=dict)
+    cost = SimpleNamespace(Q=np.eye(6), R=np.eye(3))
+    controller = {"problem": SimpleNamespace(cost=cost), "initial_input": np.zeros(3)}
+    assert _cost(SimpleNamespace(folder=folder), controller) > 0
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 0xFF
+    path.write_bytes(data)
+    with pytest.raises(DataError, match=r"5 of 20 steps are lost"):
+        _cost(SimpleNamespace(folder=folder), controller)
