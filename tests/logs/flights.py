@@ -177,7 +177,7 @@ def loop(seconds=20.0, seed=0):
         [1.5 * np.sin(angle), 0.4 * np.sin(1.3 * t), -1.5 * np.cos(angle)]
     )
     a = np.gradient(np.gradient(p, 0.01, axis=0), 0.01, axis=0)
-    up = a + [0, 0, GRAVITY]
+    up = a + np.array([0, 0, GRAVITY])
     up /= np.linalg.norm(up, axis=1, keepdims=True)
     left = np.cross(up, np.cross([0.0, 1.0, 0.0], up))
     left /= np.linalg.norm(left, axis=1, keepdims=True)
