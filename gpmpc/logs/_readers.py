@@ -33,6 +33,10 @@ from gpmpc.logs._log import Finding
 from gpmpc.logs._ulogs import read_ulog
 
 LONGEST_LINE = 2**20  # of a text file [bytes]
+# pandas before version 3 reads some numbers wrong in their last digit else
+_EXACT: dict[str, Any] = (
+    {"float_precision": "round_trip"} if pd.__version__ < "3" else {}
+)
 _PART = 500_000  # cells of a text file that are parsed at once
 _QUOTED = 3  # further copies of a text in quotes, which may stand over many lines
 
@@ -147,8 +151,7 @@ def _read_in_parts(csv: CsvText, room: Room) -> pd.DataFrame:
         chunksize=max(_PART // len(csv.names), 1),
         index_col=False,
         skipinitialspace=True,
-        # pandas before version 3 reads some numbers wrong in their last digit else
-        float_precision="round_trip",
+        **_EXACT,
     ) as reader:
         for part in reader:
             is_text = part.select_dtypes(exclude=["number", "bool"])
