@@ -157,4 +157,4 @@ def test_a_known_unit_is_converted(unit, si_unit, factor):
     states = {"angle": {"columns": ["angle"], "unit": unit}}
     (signal,) = LogMapping.from_dict({**MAPPING, "states": states}).of("states")
     assert signal.group.unit == si_unit
-    assert signal.factor == pytest.approx(factor, rel=1e-15)
+    assert signal.factors == pytest.approx((factor,), rel=1e-15)
