@@ -251,12 +251,12 @@ class ChangedModel(Wrapper):
         return last[:, -1] * root, root**2
 
     def remaining(self, latent: Any, variance: Any, signal: Any) -> Any:
-        """What the model alone does not know (*batch, k), less what d's points have seen.
+        """What the model alone does not know (*batch, k), less what d's points saw.
 
-        Where its ``latent`` variance is more than d's prior variance, the ``signal``, it
-        knows nothing, as where an input moves that its data held still. There an error
-        teaches both at once, and of the excess as large a part is left as of the signal
-        is in d's own ``variance``. All three are NumPy's arrays, or all torch's.
+        Where its ``latent`` variance is more than d's prior variance, the ``signal``,
+        it knows nothing, as where an input moves that its data held still. There an
+        error teaches both at once, and of the excess as large a part is left as of the
+        signal is in d's own ``variance``. All three are NumPy's arrays, or torch's.
         """
         excess = (latent - signal).clip(0.0)
         left = (variance / signal).clip(None, 1.0)

@@ -82,8 +82,8 @@ def constant_columns(
 ) -> NDArray[np.bool_]:
     """Which columns (d,) of (N, d) move by no more than round-off or ``resolution``.
 
-    Round-off is relative to ``magnitudes`` (d,), by default the columns' own: it is that
-    of the numbers that a column holds or is the difference of.
+    Round-off is relative to ``magnitudes`` (d,), by default the columns' own: it is
+    that of the numbers that a column holds or is the difference of.
     """
     largest = np.abs(columns).max(axis=0)
     if magnitudes is not None:
@@ -121,8 +121,8 @@ def warn_of_constants(
 ) -> None:
     """Names in the log what the data hold still, and what is supposed of it instead.
 
-    What a setting says is known is not named: a feature of an infinite length-scale, and
-    outputs whose deviation the search is to find.
+    What a setting says is known is not named: a feature of an infinite length-scale,
+    and outputs whose deviation the search is to find.
     """
     size = len(features)
     unknown = constants.features & np.isfinite(prior.lengthscales)
@@ -145,8 +145,8 @@ def warn_of_constants(
         _log.warning(
             "training: never moves by more than %.1g (resolution) in the %d rows: %s. "
             "What it changes is not known: away from that value predictions return to "
-            "the prior, over a length-scale of %s (prior_lengthscale; 'no_effect' where "
-            "it is known to change nothing)",
+            "the prior, over a length-scale of %s (prior_lengthscale; 'no_effect' "
+            "where it is known to change nothing)",
             resolution,
             size,
             _listed(columns.features, features[0], unknown),
@@ -179,7 +179,8 @@ def warn_of_transitions(transitions: Transitions) -> None:
             _log.warning(
                 "training: next_states equal states in all %d rows, though the states "
                 "differ from row to row: next_states[k] must be the states one step "
-                "after states[k] (of one recording x: states x[:-1], next_states x[1:])",
+                "after states[k] (of one recording x: states x[:-1], "
+                "next_states x[1:])",
                 len(states),
             )
         return
@@ -187,8 +188,9 @@ def warn_of_transitions(transitions: Transitions) -> None:
     distinct = len(np.unique(rows.numpy(force=True), axis=0))
     if 2 * distinct <= len(rows):
         _log.warning(
-            "training: only %d of %d rows that move are different: copies teach nothing "
-            "new, and make the noise look smaller than it is; give every row once",
+            "training: only %d of %d rows that move are different: copies teach "
+            "nothing new, and make the noise look smaller than it is; give every row "
+            "once",
             distinct,
             len(rows),
         )

@@ -137,8 +137,9 @@ def from_gpytorch(
         signals: Names of states and inputs, and time step; by default those that a model of ``to_gpytorch`` kept.
 
     Raises:
-        UnsupportedModel: The kernel, mean or likelihood is another one, transforms are attached, or the model's
-            ``forward`` scales, warps or adds: it is not the distribution of its mean and kernel modules.
+        UnsupportedModel: The kernel, mean or likelihood is another one, transforms are
+            attached, or the model's ``forward`` scales, warps or adds: it is not the
+            distribution of its mean and kernel modules.
         ShapeError: The models of a list have other training inputs or inducing points, or there is more than one batch
             dimension.
     """
@@ -262,8 +263,9 @@ class KernelPosterior(TensorModel):
         """Freezes trained ExactGPs in float64, which are copied; arguments are as for ``gpmpc.gp.from_gpytorch``.
 
         Raises:
-            UnsupportedModel: The model is no such, or approximate, or its ``forward`` gives a point another prior
-                beside other points, as one that scales by the range of what it is given.
+            UnsupportedModel: The model is no such, or approximate, or its ``forward``
+                gives a point another prior beside other points, as one that scales by
+                the range of what it is given.
             ShapeError: The numbers of features differ, or do not go with the numbers of outputs and controls.
             SettingError: The model is not in float64, or its kernel matrix is not positive definite.
         """
@@ -455,11 +457,11 @@ def _members(model: Any, likelihood: Any) -> list[tuple[Any, Any]]:
 
 
 def _check_forward(model: Any) -> None:
-    """Raises ``UnsupportedModel`` unless ``forward`` is that of the mean and the kernel.
+    """Raises ``UnsupportedModel`` unless ``forward`` is that of mean and kernel.
 
-    GPyTorch predicts by a model's ``forward``, which may scale inputs, pass them through
-    a network, or add to the mean; its modules know nothing of it. So mean and covariance
-    of the prior are compared at training points and around them.
+    GPyTorch predicts by a model's ``forward``, which may scale inputs, pass them
+    through a network, or add to the mean; its modules know nothing of it. So mean and
+    covariance of the prior are compared at training points and around them.
     """
     copied = copy.deepcopy(model).eval().requires_grad_(False)
     for part in ("mean_module", "covar_module"):
@@ -496,7 +498,7 @@ def _check_forward(model: Any) -> None:
 
 
 def _check_pointwise(model: Any) -> None:
-    """Raises ``UnsupportedModel`` where a point's prior depends on the points beside it."""
+    """Raises ``UnsupportedModel`` where a point's prior depends on other points."""
     points = _training_points(model)[..., :_PROBES, :]
     with torch.no_grad():
         alone = model.forward(points[..., :3, :])

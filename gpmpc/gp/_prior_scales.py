@@ -3,7 +3,7 @@
 No likelihood depends on the length-scale of a feature that never moved, nor says how
 much an output varies that was never seen to. What is left is a prior, and it has to be
 modest: away from the data nothing is known. By default it is one unit of the data, as
-the length-scales that GPyTorch begins with (0.69) and leaves untouched. Where the column
+the length-scales that GPyTorch begins with (0.69) and leaves untouched. Where a column
 lies does not count, as it does not for any other (350 K is no scale of a temperature),
 nor does a scaling, which has nothing to go by. Longer is not safer: on its way back to
 the prior a mean has a slope that nobody has seen, over as much as a length-scale, and a
@@ -63,7 +63,7 @@ class PriorScales(NamedTuple):
 
 
 def check_prior_scales(trainer: Any) -> None:
-    """Raises ``SettingError`` unless a trainer's settings of columns at rest are right."""
+    """Raises ``SettingError`` unless settings of columns at rest are right."""
     setting = trainer.prior_lengthscale
     for value in (
         setting if _is_list(setting) else [1.0 if setting is None else setting]

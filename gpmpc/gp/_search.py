@@ -79,9 +79,9 @@ class SoftLimits:
 class OutputSearch:
     """The search for one output's hyperparameters, in scaled units, with a ``Trainer``'s settings.
 
-    ``std`` (d,) is of the inputs (N, d), see ``column_std``; ``constant`` (d,) which of them are, and ``prior`` (d,)
-    the length-scales of those. From the deadline on, by the clock of ``time.perf_counter`` [s], the best found so far
-    is taken.
+    ``std`` (d,) is of the inputs (N, d), see ``column_std``; ``constant`` (d,) which of
+    them are, and ``prior`` (d,) the length-scales of those. From the deadline on, by
+    the clock of ``time.perf_counter`` [s], the best found so far is taken.
     """
 
     def __init__(

@@ -78,7 +78,8 @@ class SparseTrainer:
     iterations: int = 100  #: of L-BFGS, at most
     subset: int = 200  #: number of random transitions in the first, exact, training
     restarts: int = 1  #: random starts of that one
-    #: of features that never move in the data, and of outputs that never change; all three as in ``Trainer``
+    #: of features that never move in the data, and of outputs that never change; all
+    #: three as in ``Trainer``
     prior_lengthscale: PriorLengthscale | Sequence[PriorLengthscale] | None = None
     prior_deviation: float | None = 1.0
     resolution: float = RESOLUTION
@@ -119,7 +120,10 @@ class SparseTrainer:
         seed: int = 0,
         columns: Columns | None = None,
     ) -> Training:
-        """Trains on features x~ = (x, u) (N, n + m) and any targets (N, k); see ``Trainer.fit``."""
+        """Trains on features x~ = (x, u) (N, n + m) and any targets (N, k).
+
+        Arguments are those of ``Trainer.fit``.
+        """
         begin = time.perf_counter()
         check_number("seed", seed, least=0, whole=True)
         predicts = predicts or self.predicts

@@ -104,13 +104,16 @@ class Trainer:
     #: wall time of a training [s], in equal parts for the outputs, after which the best found so far is taken: what
     #: that is depends on the machine. One iteration over all points is made in any case. None: no limit
     time_limit: float | None = None
-    #: of features that never move in the data, for all or one each, in their units: how far from the value that they
-    #: have predictions hold. None: one unit; ``"no_effect"``: it is known that they have none
+    #: of features that never move in the data, for all or one each, in their units:
+    #: how far from the value that they have predictions hold. None: one unit;
+    #: ``"no_effect"``: it is known that they have none
     prior_lengthscale: PriorLengthscale | Sequence[PriorLengthscale] | None = None
-    #: of outputs that never change in the data: the standard deviation that they are supposed to have elsewhere, in
-    #: their units; of a residual, in units of what a step changes. None: what the search finds, which is nearly none
+    #: of outputs that never change in the data: the standard deviation that they are
+    #: supposed to have elsewhere, in their units; of a residual, in units of what a
+    #: step changes. None: what the search finds, which is nearly none
     prior_deviation: float | None = 1.0
-    #: a feature or a target that moves by no more than this, in its unit, or by round-off, never moves
+    #: a feature or a target that moves by no more than this, in its unit, or by
+    #: round-off, never moves
     resolution: float = RESOLUTION
 
     def __post_init__(self) -> None:
@@ -194,7 +197,7 @@ class Trainer:
         start: GPPosterior | None = None,
         columns: Columns | None = None,
     ) -> Training:
-        """Trains on features and any targets; what they cannot teach is named in the log.
+        """Trains on features and any targets; the log names what they cannot teach.
 
         Args:
             features: x~ = (x, u) (N, n + m).
@@ -203,7 +206,8 @@ class Trainer:
             predicts: What the targets mean; the trainer's setting by default.
             seed: Of the random starts.
             start: Its hyperparameters are the first start instead; the random ones stay where they are.
-            columns: What the log calls features and targets; by default states, inputs and outputs with numbers.
+            columns: What the log calls features and targets; by default states,
+                inputs and outputs with numbers.
 
         Raises:
             ShapeError, SettingError, UnsupportedModel: Features, targets and ``start`` do not belong together, or are
@@ -325,7 +329,7 @@ class Trainer:
         constants: Constants,
         log_std: np.ndarray,
     ) -> list[np.ndarray | None]:
-        """The starts of a posterior (k, d + 2), apart from what its own data held still.
+        """The starts of a posterior (k, d + 2), but for what its data held still.
 
         Of that its hyperparameters say nothing: a feature that moves by now begins with
         its spread, and an output that changes by now with the plain start.

@@ -379,9 +379,9 @@ def train_residual(
 def _columns(transitions: Transitions, B: Effect, seen: Features) -> Columns:
     """What features and targets of a residual are called, and how large they may be.
 
-    A residual is what two states differ by, as seen through the pseudo-inverse of B, and
-    round-off is that of the states. What it is where no data were seen may be as much as
-    a step changes: there the nominal model is right, or it is not.
+    A residual is what two states differ by, as seen through the pseudo-inverse of B,
+    and round-off is that of the states. What it is where no data were seen may be as
+    much as a step changes: there the nominal model is right, or it is not.
     """
     states, inputs = signal_names(transitions)
     features: list[str] = []

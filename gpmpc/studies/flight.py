@@ -212,9 +212,9 @@ class Experiment:
 
 
 def _prior_lengthscales(system: System, turned: bool) -> list[float]:
-    """Of what a GP sees of states and inputs: one unit, or a tenth of the limits' range.
+    """Of what a GP sees of states and inputs: one unit, or a tenth of limits' range.
 
-    Whichever is less: from one limit to the other predictions then forget what they know.
+    Whichever is less: from one limit to the other predictions forget what they know.
     More would do harm where limits are wide. On its way back to the prior a mean has a
     slope that nobody has seen, and a controller follows it. Where angles are ``turned``
     into sine and cosine these have one unit.
