@@ -116,9 +116,10 @@ UNKNOWN = Signals()  # of what says nothing
 def signals_of(owner: Any) -> Signals:
     """The names and the time step of a model, a controller, data or a plant.
 
-    Nothing is known of one without the attribute ``signals``.
+    Nothing is known of one without such an attribute ``signals``.
     """
-    return getattr(owner, "signals", UNKNOWN)
+    known = getattr(owner, "signals", UNKNOWN)
+    return known if isinstance(known, Signals) else UNKNOWN
 
 
 def check_signals(value: Any) -> None:

@@ -35,7 +35,7 @@ from gpmpc.gp._kernel import Hyperparameters, Predicts, check_columns
 from gpmpc.gp._posterior import GPPosterior
 from gpmpc.gp._scaling import Scaling, identity
 from gpmpc.gp._sparse import Method, sparse_posterior
-from gpmpc.signals import UNKNOWN, Signals, signals_of
+from gpmpc.signals import UNKNOWN, Signals, check_signals, signals_of
 
 _PROBES = 25  # points at which a model's forward is compared with its parts, twice
 _SAME = 1e-8  # relative difference of two priors that are the same
@@ -144,6 +144,7 @@ def from_gpytorch(
             dimension.
     """
     signals = signals_of(model) if signals is None else signals
+    check_signals(signals)
     rows: list[
         tuple[Tensor, ...]
     ] = []  # targets, length-scales, signal and noise variance, offset
@@ -283,6 +284,7 @@ class KernelPosterior(TensorModel):
         check_columns(
             "the models' features", widths[0], found.output_dim, input_dim, predicts
         )
+        found.signals.check_sizes(found.state_dim, input_dim)
         return found
 
     @property

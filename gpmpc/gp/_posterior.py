@@ -28,7 +28,7 @@ from gpmpc.gaussian import Gaussian, check_tensors, constant_arrays
 from gpmpc.gp._backend import host_arrays
 from gpmpc.gp._kernel import Hyperparameters, Predicts, check_posterior, factorize
 from gpmpc.gp._scaling import Scaling
-from gpmpc.signals import UNKNOWN, Signals
+from gpmpc.signals import UNKNOWN, Signals, check_signals
 
 if TYPE_CHECKING:
     from gpmpc._kernels import Packed
@@ -114,6 +114,7 @@ class GPPosterior(TensorModel):
             "offset": offset,
         }
         check_posterior(given, input_dim, predicts)
+        check_signals(signals)
         signals.check_sizes(inputs.shape[1] - input_dim, input_dim)
         inputs, targets, *scales, offset = (value.clone() for value in given.values())
         kernel = Hyperparameters(*scales)

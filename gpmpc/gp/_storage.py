@@ -35,7 +35,7 @@ from gpmpc._provenance import now, versions
 from gpmpc.exceptions import DataError, SettingError, UnsupportedModel
 from gpmpc.gp._kernel import check_posterior
 from gpmpc.gp._posterior import GPPosterior
-from gpmpc.signals import Signals
+from gpmpc.signals import Signals, check_signals
 
 _FORMAT, _VERSION = "gpmpc model", 2
 _DTYPES = {torch.float64: "float64", torch.float32: "float32"}
@@ -86,6 +86,7 @@ def posterior_parts(
         raise UnsupportedModel(
             f"only a GPPosterior can be saved; got {type(posterior).__name__}"
         )
+    check_signals(posterior.signals)
     header = {
         "predicts": posterior.predicts,
         "input_dim": posterior.input_dim,

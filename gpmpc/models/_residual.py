@@ -50,7 +50,7 @@ from gpmpc.gp._wrapped import warn_of_turns
 from gpmpc.models._features import Features
 from gpmpc.models._nominal import Affine, CasadiFunction, linearize_function
 from gpmpc.models._wrapper import check_like, move
-from gpmpc.signals import UNKNOWN, Signals
+from gpmpc.signals import UNKNOWN, Signals, check_signals
 
 Nominal = Callable[[Tensor, Tensor], Tensor]
 Effect = Tensor | Callable[[Tensor], Tensor]
@@ -110,6 +110,7 @@ class ResidualModel(TensorModel):
             nominal.check_sizes((n, m), (n, 1))
         if isinstance(self.B, CasadiFunction):
             self.B.check_sizes((n,), (n, gp.output_dim))
+        check_signals(self.signals)
         self.signals.check_sizes(n, m)
         parts: dict[str, tuple[Any, tuple[int, ...]]] = {}
         if not callable(self.B):

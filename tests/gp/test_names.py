@@ -38,7 +38,7 @@ from gpmpc.models import (
     load_model,
     save_model,
 )
-from gpmpc.signals import Signals
+from gpmpc.signals import Signals, signals_of
 
 KNOWN = Signals(("angle", "rate"), ("torque",), 0.1)
 rng = np.random.default_rng(0)
@@ -283,6 +283,10 @@ def test_saved_models_carry_names_and_files_without_them_are_read(tmp_path, post
 
 def test_a_model_file_of_wrong_names_is_refused(tmp_path, posterior):
     path = tmp_path / "model.safetensors"
+    with pytest.raises(
+        SettingError, match=r"signals: must be Signals\(...\); got dict"
+    ):
+        save_posterior(replace(posterior, signals={}), path)
     for signals in (Signals(["angle"]), Signals((), ["a", "b"])):
         with pytest.raises((DataError, ShapeError), match="need as many names"):
             save_posterior(replace(posterior, signals=signals), path)
@@ -311,6 +315,13 @@ def test_data_of_other_names_or_time_step_join_no_model(posterior, signals, mess
             join()
     with pytest.raises(SettingError, match=message.replace("transitions", "the rec.*")):
         calibrate(posterior, Recording.chained(other), horizon=1)
+
+
+def test_an_attribute_of_that_name_that_is_something_else_says_nothing():
+    class Machine:
+        signals = ("SIGINT", "SIGTERM")
+
+    assert signals_of(Machine()) == Signals()
 
 
 def test_what_is_not_known_is_checked_against_nothing(posterior):
