@@ -361,4 +361,4 @@ def test_a_recording_of_this_package_is_one_whoever_has_rewritten_it(tmp_path):
         read_file(tmp_path / "cut.mcap", [""])
     file = read_file(tmp_path / "cut.mcap", [""], partial=True)
     assert "it was not finished" in findings(file)["unfinished"][1]
-    assert 0 < len(file.streams[""]) < len(expected)
+    assert 0 < len(file.streams[""]) <= len(expected)
