@@ -134,7 +134,7 @@ def _fit_axes(
     logs = np.log(np.maximum(each, floor))
     plain = logs[0].sum(axis=1)
     costs = changes.costs
-    options = [(plain + CHANGE * costs, 0, None)]
+    options: list[tuple[Array, int, int | None]] = [(plain + CHANGE * costs, 0, None)]
     for unit in range(1, len(units)):
         kind = 1 if units[unit] in factors else 1.5  # a factor that is no unit
         options.append(
