@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -140,7 +141,7 @@ def _quaternion_changes(signal: Signal) -> Iterator[AttitudeReading]:
             f"{letters} of {name} {'have' if several else 'has'} the opposite sign: "
             f"write {_quaternion_columns(signal, [0, 1, 2, 3], signs)}",
             RARE if axes in ([0], [1], [2], [1, 2]) else 2,
-            lambda q, signs=signs: q * signs,
+            partial(np.multiply, signs),
         )
     for order in ([1, 0, 2, 3], [2, 1, 0, 3], [0, 2, 1, 3]):
         swapped = [i for i in range(3) if order[i] != i]
@@ -148,7 +149,7 @@ def _quaternion_changes(signal: Signal) -> Iterator[AttitudeReading]:
             f"{'xyz'[swapped[0]]} and {'xyz'[swapped[1]]} of {name} have changed "
             f"places: write {_quaternion_columns(signal, order, np.ones(4))}",
             RARE,
-            lambda q, order=order: q[..., order],
+            partial(np.take, indices=order, axis=-1),
         )
 
 

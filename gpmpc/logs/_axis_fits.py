@@ -20,6 +20,7 @@ from gpmpc.logs._kinematics import Array
 QUANTILES = (0.5, 0.75, 0.9, 0.97, 0.99)  # of absolute values
 FEWEST = 50  # vectors that say something
 SHORTEST_LAG = 0.05  # [s] that is a lag
+NO_UNIT = 1.5  # mistakes that a factor counts for which no unit makes
 CHANGE = 0.7  # price of a mistake that is supposed, in logarithms of misfits
 
 
@@ -109,73 +110,64 @@ def _fit_axes(
     """
     measured = centred(measured)
     derived = centred(derived)
-    sizes = absolute_quantiles(measured)[:, :, None]  # (Q, 3, 1)
-    derived_sizes = absolute_quantiles(derived)[:, None, :]  # (Q, 1, 3)
-    units = [1.0, *_plausible(factors, sizes, derived_sizes)]
-    tables = []
-    for unit in units:
-        scaled = unit * derived[:, None, :]
-        both_signs = np.stack(
-            [measured[:, :, None] - scaled, measured[:, :, None] + scaled], axis=-1
-        )
-        errors = absolute_quantiles(both_signs)
-        largest = np.maximum(sizes, unit * derived_sizes)[..., None]
-        ratios = np.divide(
-            errors,
-            np.broadcast_to(largest, errors.shape),
-            out=np.ones_like(errors),
-            where=np.broadcast_to(largest > 0, errors.shape),
-        )
-        tables.append(ratios.min(axis=0))
-    table = np.array(tables)  # (U, measured, derived, sign)
+    units = [1.0, *_plausible(factors, measured, derived)]
+    table = np.array([_misfit_table(measured, unit * derived) for unit in units])
     changes = axis_changes()
-    axes = np.arange(3)
-    each = table[:, axes, changes.sources, changes.flips]  # (U, 48, 3)
+    costs = changes.costs
+    each = table[:, np.arange(3), changes.sources, changes.flips]  # (U, 48, 3)
     logs = np.log(np.maximum(each, floor))
     plain = logs[0].sum(axis=1)
-    costs = changes.costs
-    options = [(plain + CHANGE * costs, 0, None)]
+    # The scores of all changes of axes, the unit, and the axis that has it: None is all.
+    options: list[tuple[Array, int, int | None]] = [(plain + CHANGE * costs, 0, None)]
     for unit in range(1, len(units)):
-        kind = 1 if units[unit] in factors else 1.5  # a factor that is no unit
-        options.append(
-            (logs[unit].sum(axis=1) + CHANGE * (costs + kind), unit, None),
-        )
-        if kind == 1:
-            options += [
-                (
-                    plain
-                    + logs[unit, :, axis]
-                    - logs[0, :, axis]
-                    + CHANGE * (costs + kind),
-                    unit,
-                    axis,
-                )
-                for axis in range(3)
-            ]
+        is_unit = units[unit] in factors
+        with_unit = costs + (1 if is_unit else NO_UNIT)
+        options.append((logs[unit].sum(axis=1) + CHANGE * with_unit, unit, None))
+        for axis in range(3) if is_unit else ():
+            gain = logs[unit, :, axis] - logs[0, :, axis]
+            options.append((plain + gain + CHANGE * with_unit, unit, axis))
     scores, unit, axis = min(options, key=lambda option: option[0].min())
     best = int(scores.argmin())
+    axes = slice(None) if axis is None else axis
     scale = np.ones(3)
-    chosen = each[0, best].copy()
-    if unit and axis is None:
-        scale[:] = units[unit]
-        chosen = each[unit, best]
-    elif unit:
-        scale[axis] = units[unit]
-        chosen[axis] = each[unit, best, axis]
+    scale[axes] = units[unit]
+    misfits_of_best = each[0, best].copy()
+    misfits_of_best[axes] = each[unit, best, axes]
     score = float(scores[best])
-    cost = (score - float(np.log(np.maximum(chosen, floor)).sum())) / CHANGE
-    return AxisFit(changes.matrices[best], scale, 0.0, chosen, cost, score)
+    fits = float(np.log(np.maximum(misfits_of_best, floor)).sum())
+    return AxisFit(
+        matrix=changes.matrices[best],
+        factors=scale,
+        lag=0.0,
+        misfits=misfits_of_best,
+        cost=(score - fits) / CHANGE,
+        score=score,
+    )
+
+
+def _misfit_table(measured: Array, derived: Array) -> Array:
+    """Misfits (3, 3, 2) of each measured axis to each derived one and its negative."""
+    own = absolute_quantiles(measured)[:, :, None, None]
+    others = absolute_quantiles(derived)[:, None, :, None]
+    differences = measured[:, :, None] - derived[:, None, :]
+    sums = measured[:, :, None] + derived[:, None, :]
+    errors = absolute_quantiles(np.stack([differences, sums], axis=-1))
+    sizes = np.broadcast_to(np.maximum(own, others), errors.shape)
+    ratios = np.divide(errors, sizes, out=np.ones_like(errors), where=sizes > 0)
+    return ratios.min(axis=0)
 
 
 def _plausible(
-    factors: Sequence[float], sizes: Array, derived_sizes: Array
+    factors: Sequence[float], measured: Array, derived: Array
 ) -> list[float]:
     """Factors that the sizes of both sides allow, and their own one where it is large."""
     large = QUANTILES.index(0.9)
-    ratios = sizes[large] / np.maximum(derived_sizes[large], 1e-300)
+    sizes = absolute_quantiles(measured)[large]
+    derived_sizes = absolute_quantiles(derived)[large]
+    ratios = sizes[:, None] / np.maximum(derived_sizes, 1e-300)
     units = [f for f in factors if ((ratios > 0.7 * f) & (ratios < 1.4 * f)).any()]
-    total = float(np.square(sizes[large]).sum())
-    derived_total = float(np.square(derived_sizes[large]).sum())
+    total = float(np.square(sizes).sum())
+    derived_total = float(np.square(derived_sizes).sum())
     if min(total, derived_total) <= 0:
         return units
     usual = float(np.sqrt(total / derived_total))
@@ -212,6 +204,7 @@ class LaggedVectors(NamedTuple):
 
 
 def lagged_vectors(lags: Array, later: Array) -> LaggedVectors:
+    """Makes vectors (L, N, 3) at lags [s] (L,) ready to be correlated with others."""
     inside = np.isfinite(later[:, :, 0])
     now = later[len(lags) // 2]
     low, high = np.nanquantile(now, [0.01, 0.99], axis=0)

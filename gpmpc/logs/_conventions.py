@@ -1,6 +1,6 @@
-"""Checks that the states of a rigid body are what the mapping says, by what holds of every rigid body.
+"""Checks that the states of a rigid body are what their mapping says.
 
-Three relations hold in windows of a tenth of a second, whatever drives the body:
+Three relations are judged in windows of a fifth of a second:
 
 1. the mean velocity is the change of the position over the time;
 2. the mean angular rate is the turn of the attitude over the time;
@@ -47,6 +47,7 @@ from gpmpc.logs._reading_search import (
     unit_and_axes,
     unit_factor,
 )
+from gpmpc.logs._units import is_known
 
 _RIGID_BODY = [("vector", 3), ("quaternion", 3), ("vector", 3), ("vector", 3)]
 FITS = 0.75  # misfit below which an axis may fit
@@ -180,11 +181,14 @@ def _noticed(search: ReadingSearch, claimed: Reading, run: str) -> list[Finding]
     name = claim.attitude.name
     findings = []
     if claimed.lift < GRAVITY[2] / 2:
+        other = "ned" if claim.axes[claim.rate.name] == "enu" else "enu"
+        _, other_body = NAMES[other]
         text = (
-            f"the force that carries the body points along its -z ({claimed.lift:.1f} "
-            f"m/s2): it hangs upside down, or {name} is that of a body in FRD axes, "
-            f"and so are its rates: write {words_of_turned_body(claim.attitude)}, and "
-            f"axes: ned for {claim.rate.name}"
+            f"the force that carries the body points along its own underside "
+            f"({claimed.lift:.1f} m/s2): it flies on its back, or {name} is that of a "
+            f"body in {other_body} axes, and so are its rates: write "
+            f"{words_of_turned_body(claim.attitude)}, and axes: {other} for "
+            f"{claim.rate.name}"
         )
         findings.append(Finding("upside down", run, 1, text))
     lag = search.tilt_lag(claimed)
@@ -262,8 +266,8 @@ def _position_words(best: Reading, search: ReadingSearch) -> list[str]:
         words.append(
             f"{claim.position.name} and {claim.velocity.name} are {unit:.3g} times "
             f"what gravity says; are their units right? write "
-            f"unit: {_unit_name(LENGTHS, true_unit)} for {claim.position.name} and "
-            f"unit: {_unit_name(SPEEDS, true_unit)} for {claim.velocity.name}"
+            f"{_unit_advice(claim.position, LENGTHS, true_unit)} and "
+            f"{_unit_advice(claim.velocity, SPEEDS, true_unit)}"
         )
     if not np.array_equal(axes, np.eye(3)):
         words.append(_axes_words(claim, claim.position, "world", axes))
@@ -360,12 +364,13 @@ def _unit_words(
             f"of {of.name}; is its unit right? ({hint}) write "
             f"{words_of_columns(signal, (0, 1, 2), scale)}"
         )
-    own = _unit_name(units[0], unit_factor(signal) / factor)
-    others = _unit_name(units[1], unit_factor(of) * factor)
     advice = " or ".join(
-        f"unit: {unit} for {name}"
-        for unit, name in ((own, signal.name), (others, of.name))
-        if unit
+        words
+        for words in (
+            _unit_advice(signal, units[0], unit_factor(signal) / factor),
+            _unit_advice(of, units[1], unit_factor(of) * factor),
+        )
+        if words
     )
     return (
         f"{signal.name} is {factor:.3g} times the derivative of {of.name}; is its "
@@ -373,7 +378,13 @@ def _unit_words(
     )
 
 
-def _unit_name(units: dict[str, float], factor: float) -> str:
-    """The unit of a factor; empty where none has it."""
-    near = [name for name, own in units.items() if abs(own / factor - 1) < 0.02]
-    return near[0] if near else ""
+def _unit_advice(signal: Signal, units: dict[str, float], factor: float) -> str:
+    """What to write where a signal's unit is such a factor; empty where none is."""
+    names = [name for name, own in units.items() if abs(own / factor - 1) < 0.02]
+    if not names:
+        return ""
+    if factor == 1 or is_known(names[0]):
+        return f"unit: {names[0]} for {signal.name}"
+    scale = units[names[0]] / unit_factor(signal)
+    columns = range(len(signal.columns))
+    return f"{words_of_columns(signal, columns, [scale] * len(columns))} ({names[0]})"

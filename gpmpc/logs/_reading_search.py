@@ -218,11 +218,38 @@ class ReadingSearch:
     def __init__(self, windows: MotionWindows, claim: Claim) -> None:
         self.windows = windows
         self.claim = claim
-        self.rates = lagged_vectors(windows.lags, windows.later_rates)
-        self.velocities = lagged_vectors(windows.lags, windows.later_velocities)
+        self._velocities_in = self._in_both_frames(
+            windows.later_velocities, claim.velocity, claim.velocity_frame
+        )
+        self._rates_in = self._in_both_frames(
+            windows.later_rates, claim.rate, claim.rate_frame
+        )
+        self.velocities = self._velocities_in[claim.velocity_frame]
+        self.rates = self._rates_in[claim.rate_frame]
         self.attitudes = attitude_readings(claim)
         self.speed_factors = _factors(claim.velocity, SPEEDS, claim.position, LENGTHS)
         self.rate_factors = _factors(claim.rate, RATES, claim.attitude, ANGLES)
+
+    def _in_both_frames(
+        self, later: Array, signal: Signal, claimed_frame: str
+    ) -> dict[str, LaggedVectors]:
+        """The measured vectors, taken for those of either frame."""
+        claimed = lagged_vectors(self.windows.lags, later)
+        both = {}
+        for frame in ("world", "body"):
+            turn = self._turn_to(signal, claimed_frame, frame)
+            both[frame] = claimed
+            if not np.array_equal(turn, np.eye(3)):
+                both[frame] = lagged_vectors(self.windows.lags, later @ turn)
+        return both
+
+    def _turn_to(self, signal: Signal, claimed_frame: str, frame: str) -> Array:
+        """What brings a vector that was taken for one of the claimed frame's (3, 3).
+
+        NED becomes ENU by another change of the axes than FRD becomes FLU.
+        """
+        claimed = self.claim.to_enu(signal, claimed_frame)
+        return claimed @ self.claim.to_enu(signal, frame)
 
     def claimed(self) -> Reading:
         """What the mapping says."""
@@ -367,7 +394,8 @@ class ReadingSearch:
         self, attitude: AttitudeReading, position: Array, velocity: AxisFit, frame: str
     ) -> Array:
         """Accelerations (N, 3) in world axes, after this reading."""
-        velocities = self.windows.wide_velocities / velocity.factors
+        turn = self._turn_to(self.claim.velocity, self.claim.velocity_frame, frame)
+        velocities = (self.windows.wide_velocities @ turn) / velocity.factors
         if frame == "world":
             # The velocity is to the read position what that is to the true one.
             true_velocities = velocities @ np.linalg.inv(velocity.matrix @ position).T
@@ -473,7 +501,7 @@ class ReadingSearch:
         claimed = self.claimed()
         best = claimed.score
         in_world = fit_axes_and_lag(
-            self.velocities,
+            self._velocities_in["world"],
             self.windows.moves,
             self.speed_factors,
             FLOOR_VELOCITY,
@@ -493,12 +521,11 @@ class ReadingSearch:
             body_axis = self._body_axis(attitude)
             for rate_frame in ("body", "world"):
                 _, derived = self._rates(attitude, rate_frame)
-                agreement = float(agreements(self.rates, derived).max())
+                rates = self._rates_in[rate_frame]
+                agreement = float(agreements(rates, derived).max())
                 if attitude.cost and agreement < least_agreement:
                     continue
-                rate = fit_axes_and_lag(
-                    self.rates, derived, self.rate_factors, FLOOR_RATE
-                )
+                rate = fit_axes_and_lag(rates, derived, self.rate_factors, FLOOR_RATE)
                 # A mistake that several signals share counts once.
                 least_cost = attitude.cost + (rate_frame != self._frames[1]) - 2
                 least = rate.score + CHANGE * max(least_cost, -rate.cost)
@@ -546,13 +573,13 @@ class ReadingSearch:
         now = len(self.velocities.lags) // 2
         own = np.trace(lagged_correlations(self.velocities, self.windows.moves)[now])
         _, derived = self._velocities(attitude, "body")
-        agreement = agreements(self.velocities, derived).max()
+        agreement = agreements(self._velocities_in["body"], derived).max()
         return bool(agreement > max(own, LEAST_AGREEMENT))
 
     def _fit_body_velocity(self, attitude: AttitudeReading, position: Array) -> AxisFit:
         _, derived = self._velocities(attitude, "body", position)
         return fit_axes_and_lag(
-            self.velocities, derived, self.speed_factors, FLOOR_VELOCITY
+            self._velocities_in["body"], derived, self.speed_factors, FLOOR_VELOCITY
         )
 
 

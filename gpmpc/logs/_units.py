@@ -89,6 +89,15 @@ def conversion(key: str, unit: str) -> Conversion:
     return product
 
 
+def is_known(unit: str) -> bool:
+    """Tells whether ``conversion`` takes a unit."""
+    try:
+        conversion("unit", unit)
+    except SettingError:
+        return False
+    return True
+
+
 def _product(key: str, unit: str, text: str) -> Conversion:
     """What a product of symbols such as "N m" or "s2", a part of ``unit``, is."""
     names = []

@@ -211,7 +211,7 @@ MISTAKES = {
     ),
     "positions in feet": (
         lambda f: f.change(p=f.p / 0.3048),
-        ["velocity is 0.305 times", "unit: ft for position"],
+        ["velocity is 0.305 times", "for position (ft)"],
     ),
     "positions and velocities in cm": (
         lambda f: f.change(p=100 * f.p, v=100 * f.v),
@@ -353,7 +353,7 @@ def test_euler_angles_near_the_gimbal_lock_are_read_and_their_signs_are_named(tm
     angles = ["roll", "pitch", "yaw"]
     euler = {"columns": angles, "kind": "euler", "unit": "rad", "order": "xyzw"}
     mapping = with_states(attitude=euler)
-    table = tumble().to_pandas()
+    table = tumble(seconds=9).to_pandas()
     turns = Rotation.from_quat(table[["qx", "qy", "qz", "qw"]].to_numpy())
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # scipy's, of the lock
@@ -371,7 +371,7 @@ def test_a_body_that_is_carried_by_its_underside_is_a_finding(flight, tmp_path):
     upside_down = flight.change(q=of_frd(flight), w=flight.w @ FRD)
     (finding,) = remarks(read_log(stored(tmp_path, upside_down), MAPPING))
     assert finding.kind == "upside down"
-    assert "hangs upside down, or attitude is that of a body in FRD" in finding.text
+    assert "on its back, or attitude is that of a body in FRD axes" in finding.text
     assert "columns: [qw, qz, qy, qx] and scale: [1, 1, -1, -1]" in finding.text
 
 
@@ -398,6 +398,30 @@ def test_a_run_is_named_and_one_wrong_file_of_many_is_found(flight, tmp_path):
     wrong = stored(tmp_path, flight.change(q=scalar_first(flight.q)), "wrong")
     with pytest.raises(DataError, match="run wrong: attitude is in the order wxyz"):
         read_log([right, wrong], MAPPING)
+
+
+@pytest.mark.parametrize(
+    ("mistake", "expected"),
+    [
+        ("quaternions with the scalar first", "order: wxyz"),
+        ("rates FRD", "rate is in FLU axes, not in FRD: write axes: enu for rate"),
+        ("a velocity NED", "axes: enu for velocity"),
+        ("velocities in body axes", "frame: body for velocity"),
+        ("rates in world axes", "frame: world for rate"),
+        ("y of the velocity flipped", r"scale: \[1, -1, 1\] for velocity"),
+        ("x and y of the rate swapped", r"columns: \[wy, wx, wz\] for rate"),
+    ],
+)
+def test_a_mistake_in_a_log_that_is_in_ned_is_named(
+    mistake, expected, flight, tmp_path
+):
+    ned = flight.change(
+        p=flight.p @ NED, q=in_ned(flight), v=flight.v @ NED, w=flight.w @ FRD
+    )
+    spoil, _ = MISTAKES[mistake]
+    with pytest.raises(DataError, match=expected) as refusal:
+        read_log(stored(tmp_path, spoil(ned)), {**MAPPING, "frame": "ned"})
+    assert "; and" not in str(refusal.value)
 
 
 @pytest.mark.parametrize(
