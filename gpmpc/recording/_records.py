@@ -76,9 +76,8 @@ _PARSED_KINDS = (
 )
 _IN_CHUNKS = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE)
 _COMPRESSION = 28  # where the name of the compression stands in a chunk's content
-_MARK = re.compile(
-    rb"\x04\x00\x00\x00zstd|\x03\x00\x00\x00lz4"
-)  # of a compressed chunk
+# How the name of the compression stands in a chunk, by which it is found.
+_MARK = re.compile(rb"\x04\x00\x00\x00zstd|\x03\x00\x00\x00lz4")
 _CHANNELS_MARK = len(CHANNELS).to_bytes(4, "little") + CHANNELS.encode()
 _MARKS = re.compile(_MARK.pattern + b"|" + re.escape(_CHANNELS_MARK))
 _MAGICS = {b"zstd": b"\x28\xb5\x2f\xfd", b"lz4": b"\x04\x22\x4d\x18"}
@@ -439,6 +438,7 @@ class _Reader:
 
     def _chunk_at(self, content_start: int) -> _PlacedChunk | None:
         """Reads the chunk whose content begins there, if a checksum vouches for it."""
+        start = content_start - HEAD.size
         if content_start < self._searched:
             return None
         self._file.seek(content_start)
@@ -463,11 +463,12 @@ class _Reader:
         except RecordingError:
             raise  # it is a RuntimeError, as broken records raise
         except BROKEN:
-            self._lost_chunks.append(content_start - HEAD.size)
+            self._lost_chunks.append(start)
             return None
         if chunk.uncompressed_crc == 0:
+            self._lost_chunks.append(start)
             return None
-        return _PlacedChunk(content_start - HEAD.size, end, chunk, data)
+        return _PlacedChunk(start, end, chunk, data)
 
 
 def _is_like_chunk(content: bytes) -> bool:
@@ -480,5 +481,9 @@ def _records(count: int) -> str:
 
 
 def _topics(pairs: dict[str, str]) -> dict[int, str]:
-    """Reads the topics by channel."""
-    return {int(key): topic for key, topic in pairs.items() if key.isdecimal()}
+    """Reads the topics by channel, whose numbers have two bytes."""
+    return {
+        int(key): topic
+        for key, topic in pairs.items()
+        if key.isdecimal() and len(key) <= len("65535")
+    }

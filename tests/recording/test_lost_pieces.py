@@ -563,7 +563,13 @@ def entries(data):
     return body + index + footer + checksum + damage.MAGIC
 
 
-@pytest.mark.parametrize("harm", [marks, bombs, entries])
+def topics(data):
+    """Channels with numbers of thousands of digits."""
+    pairs = {"9" * 5000: "/step", "\u0663": "/plan", "-1": "/qp", "70000": "/step"}
+    return data + damage.joined([damage.metadata("channels", pairs)])
+
+
+@pytest.mark.parametrize("harm", [marks, bombs, entries, topics])
 def test_the_search_behind_damage_ends(small, tmp_path, harm):
     path = tmp_path / "harm.mcap"
     path.write_bytes(harm(damage.MAGIC + damage.joined(damage.section(small[0]))))
