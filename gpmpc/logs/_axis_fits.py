@@ -71,7 +71,7 @@ def count_mistakes(matrix: Array) -> float:
 
 @dataclass(frozen=True)
 class AxisFit:
-    """How measured vectors are those of the motion: factors * matrix @ vector, later."""
+    """Measured vectors as those of a motion: factors * matrix @ vector, later."""
 
     matrix: Array = field(default_factory=lambda: np.eye(3))
     factors: Array = field(default_factory=lambda: np.ones(3))  # of the measured axes
@@ -117,7 +117,7 @@ def _fit_axes(
     each = table[:, np.arange(3), changes.sources, changes.flips]  # (U, 48, 3)
     logs = np.log(np.maximum(each, floor))
     plain = logs[0].sum(axis=1)
-    # The scores of all changes of axes, the unit, and the axis that has it: None is all.
+    # The scores of all changes of axes, the unit, and its axis: None means all three.
     options: list[tuple[Array, int, int | None]] = [(plain + CHANGE * costs, 0, None)]
     for unit in range(1, len(units)):
         is_unit = units[unit] in factors
@@ -160,7 +160,7 @@ def _misfit_table(measured: Array, derived: Array) -> Array:
 def _plausible(
     factors: Sequence[float], measured: Array, derived: Array
 ) -> list[float]:
-    """Factors that the sizes of both sides allow, and their own one where it is large."""
+    """Factors that the sizes of both sides allow, and their own where it is large."""
     large = QUANTILES.index(0.9)
     sizes = absolute_quantiles(measured)[large]
     derived_sizes = absolute_quantiles(derived)[large]

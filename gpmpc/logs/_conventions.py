@@ -61,7 +61,7 @@ LEAST_REFUSED_LAG = 0.15  # [s]; a shorter one is a finding
 def read_rigid_bodies(
     runs: Sequence[LogRun], step: float, mapping: LogMapping
 ) -> tuple[list[LogRun], list[Finding]]:
-    """Brings states to ENU and FLU axes, velocities to the world's, rates to the body's.
+    """Brings states to ENU and FLU axes, velocities to world and rates to body axes.
 
     Returns:
         The runs, and what was noticed.

@@ -1,6 +1,7 @@
 """Brings the states of a rigid body to the axes of ``gpmpc.logs``.
 
-The world's axes are east, north, up (ENU) and the body's forward, left, up (FLU): gravity is ``GRAVITY`` in every log.
+The world's axes are east, north, up (ENU) and the body's forward, left, up (FLU), so
+that gravity is ``GRAVITY`` in every log.
 Aviation, and PX4's logs, have north, east, down (NED) and forward, right, down (FRD).
 """
 
@@ -45,7 +46,7 @@ def with_frame_of_files(mapping: "LogMapping", files: Sequence[Path]) -> "LogMap
     if len(are_px4) > 1:
         raise SettingError(
             "frame",
-            "must be said (enu or ned): PX4 logs are NED, and other files are with them",
+            "must be enu or ned where PX4 logs, which are NED, are read with others",
         )
     return replace(mapping, frame="ned" if are_px4 == {True} else "enu")
 

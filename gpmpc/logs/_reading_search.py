@@ -175,7 +175,7 @@ def _turns_fast(runs: Sequence[LogRun], half: int) -> bool:
 
 
 def _moving_mean(values: Array, half: int) -> Array:
-    """Means (K, c) of the rows from ``half`` before to ``half`` after, by trapezoids."""
+    """Means (K, c) of rows from ``half`` before to ``half`` after, by trapezoids."""
     sums = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(values, axis=0)])
     means = np.zeros_like(values)
     if len(values) > 2 * half:
@@ -341,7 +341,7 @@ class ReadingSearch:
         return lags[0], lags[1]
 
     def tilt_lag(self, claimed: Reading) -> float:
-        """The lag [s] of the accelerations after the tilt, where it is clear; else 0."""
+        """The lag [s] of the accelerations after the tilt; 0 where it is not clear."""
         if self.claim.velocity_frame == "body" or claimed.tilt is None:
             return 0.0
         series = self.velocities

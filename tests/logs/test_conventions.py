@@ -1,7 +1,7 @@
-"""A log of a rigid body that contradicts its mapping is refused, and what fits is named.
+"""A log of a rigid body that contradicts its mapping is refused; what fits is named.
 
-Forty mistakes in conventions, single and in pairs, on one flight; and right logs of many
-vehicles, with noise like that of real ones, of which none is refused.
+Forty-five mistakes in conventions, single and in pairs, on one flight; and right logs
+of many vehicles, with noise like that of real ones, of which none is refused.
 """
 
 import os
