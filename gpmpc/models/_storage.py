@@ -111,7 +111,7 @@ def _check_code(
         raise DataError(f"holds models inside each other, more than {_DEEPEST}")
     for field in fields(_MODELS[header["kind"]]):
         entry = header.get(field.name)
-        if not isinstance(entry, dict):
+        if not isinstance(entry, dict) or field.name == "signals":
             continue
         kind = entry.get("kind")
         if kind in [*_MODELS]:

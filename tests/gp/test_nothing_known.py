@@ -5,7 +5,7 @@ that is sure of itself away from its data is wrong by many of its standard devia
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -30,6 +30,7 @@ from gpmpc.models import Affine, ResidualModel
 from gpmpc.mpc import GPMPC, Reference
 from gpmpc.mpc.problem import Box, Problem, Tracking
 from gpmpc.propagation import Linearization
+from gpmpc.signals import Signals
 
 REST = 0.5  # of the input that never moves
 
@@ -240,13 +241,8 @@ def test_angles_at_rest_are_named_as_what_is_seen_of_them(caplog):
 
 
 def test_columns_with_names_are_called_by_them(caplog):
-    @dataclass(frozen=True)
-    class Named(Transitions):
-        state_names: tuple[str, ...] = ("angle", "rate")
-        input_names: tuple[str, ...] = ("torque", "wind")
-
-    data = hover()
-    train(Named(data.states, data.inputs, data.next_states), restarts=0)
+    data = replace(hover(), signals=Signals(["angle", "rate"], ["torque", "wind"]))
+    train(data, restarts=0)
     assert "rows: wind (0.5)." in caplog.text
 
 
