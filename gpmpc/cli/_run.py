@@ -90,7 +90,7 @@ def run(config: DictConfig) -> Result:
     console.print(terminal([summary(outcome["result"])]))
     state = "finished before" if outcome["skipped"] else "written to"
     console.out(f"{state}: {outcome['folder']}", highlight=False)
-    other_code = of_other_code(outcome["result"])
+    other_code = of_other_code(outcome["result"]) if outcome["skipped"] else ""
     if other_code:
         console.out(
             f"these are the numbers of other code ({other_code}); remove the folder to "
