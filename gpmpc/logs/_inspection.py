@@ -366,7 +366,9 @@ def _said_once(remarks: list[_Remark]) -> list[str]:
     if len(remarks) <= NAMED:
         return [f"{remark.subject}: {remark.text}" for remark in remarks]
     named = ", ".join(remark.subject for remark in remarks[:NAMED])
-    return [f"{named} and {len(remarks) - NAMED} more channels: {remarks[0].kind}"]
+    others = len(remarks) - NAMED
+    channels = "channel" if others == 1 else "channels"
+    return [f"{named} and {others} more {channels}: {remarks[0].kind}"]
 
 
 def _text_warning(names: list[str]) -> list[str]:
