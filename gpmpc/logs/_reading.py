@@ -13,9 +13,21 @@ import pandas as pd
 from scipy.ndimage import binary_dilation, maximum_filter1d, minimum_filter1d
 from scipy.spatial.transform import Rotation
 
-from gpmpc._angles import wrap
 from gpmpc._bounds import Room
 from gpmpc.exceptions import DataError
+from gpmpc.logs._clocks import (
+    JUMP,
+    ORDER_ROWS,
+    ORDER_TOPICS,
+    RESOLUTION,
+    Stamps,
+    count_rows_alone,
+    cut_pieces,
+    find_jumps,
+    intersect_pieces,
+    ordered_stamps,
+    resample,
+)
 from gpmpc.logs._conventions import read_rigid_bodies
 from gpmpc.logs._dropouts import (
     changes_rarely,
@@ -27,10 +39,6 @@ from gpmpc.logs._file import NUMBER, STAMP, Streams, run_name
 from gpmpc.logs._frames import with_frame_of_files
 from gpmpc.logs._kinematics import (
     Array,
-    quaternion_inverse,
-    quaternion_product,
-    rotation_quaternion,
-    rotation_vector,
 )
 from gpmpc.logs._log import Finding, Log, LogRun
 from gpmpc.logs._mapping import TIME_UNITS, LogMapping, Signal
@@ -39,19 +47,9 @@ from gpmpc.logs._readers import read_file
 REST_TIME = 0.5  # [s] for which nothing moves at rest
 REST_SHARE = 0.1  # of a state's usual spread that counts as no movement
 MOST_HELD = 0.5  # of the rows; beyond, a signal has another rate than its table
-MOST_OUT_OF_ORDER = (
-    0.05  # of the rows; beyond, the file does not hold one run in the order of time
-)
-CLOSE = 0.6  # of the usual time step: a row that is closer to another mixes two clocks
-MOST_FIT = 0.9  # of the rows out of order that have to fit, to be sorted
-JUMP = 60.0  # [s] from which a step of time is a jump, if it is also
-JUMP_STEPS = 100  # usual time steps: over neither is anything resampled
-RESOLUTION = 1e-6  # [s] of stamps: float64 seconds since 1970 resolve a quarter of it
 MOST_RUNS = 100  # in a file, unless each has
 FEWEST_ROWS = 10
 COPIES = 2  # of a grid's values, while signals are put on it
-ORDER_ROWS = "name the column of the runs, or order the rows"
-ORDER_TOPICS = "stamp: log takes the times of the log"
 _Note = Callable[
     [str, Any, str], None
 ]  # takes the kind, the count and the text of a finding
@@ -192,7 +190,7 @@ def _tabulate(
         grid = found.time
         room.take(_memory(len(grid), columns), f"{len(grid)} rows of {columns} columns")
         breaks = found.after_reversal.copy()
-        breaks[_jumps(found.time, mapping) + 1] = True
+        breaks[find_jumps(found.time, mapping.max_gap) + 1] = True
     else:
         grid, breaks = _grid(where, stamps, mapping, columns, note, room)
 
@@ -248,7 +246,7 @@ def _stamped_rows(topic: str, table: pd.DataFrame, note: _Note) -> pd.DataFrame:
     return table[stamped]
 
 
-def _note_stamps(topic: str, found: "Stamps", mapping: LogMapping, note: _Note) -> None:
+def _note_stamps(topic: str, found: Stamps, mapping: LogMapping, note: _Note) -> None:
     """Notes what was wrong with the stamps of a topic."""
     of_topic = f" of {topic}" if topic else ""
     for kind, count, what in (
@@ -257,7 +255,7 @@ def _note_stamps(topic: str, found: "Stamps", mapping: LogMapping, note: _Note) 
         ("rows out of order", found.disordered, "sorted by their stamps"),
     ):
         note(kind, count, f"{count} rows{of_topic}: {what}")
-    jumps = _jumps(found.time, mapping)
+    jumps = find_jumps(found.time, mapping.max_gap)
     if len(jumps):
         longest = float(np.diff(found.time)[jumps].max())
         text = (
@@ -266,15 +264,6 @@ def _note_stamps(topic: str, found: "Stamps", mapping: LogMapping, note: _Note) 
             " on both sides are used"
         )
         note("jump", len(jumps), text)
-
-
-def _jumps(time: Array, mapping: LogMapping) -> np.ndarray:
-    """Rows (J,) behind which time jumps: by more than any gap within a run."""
-    steps = np.diff(time)
-    if not len(steps):
-        return np.empty(0, dtype=int)
-    longest = max(JUMP, JUMP_STEPS * float(np.median(steps)), mapping.max_gap or 0.0)
-    return np.flatnonzero(steps > longest)
 
 
 def _memory(rows: float, columns: int) -> float:
@@ -291,7 +280,7 @@ class _Grid(NamedTuple):
 
 def _grid(
     where: str,
-    stamps: Mapping[str, "Stamps"],
+    stamps: Mapping[str, Stamps],
     mapping: LogMapping,
     columns: int,
     note: _Note,
@@ -303,15 +292,18 @@ def _grid(
         DataError: The topics have no time in common, or the grid would be too large.
     """
     assert mapping.rate is not None
-    pieces = {topic: _pieces(found.time, mapping) for topic, found in stamps.items()}
-    common = reduce(_intersections, pieces.values())
+    pieces = {
+        topic: cut_pieces(found.time, mapping.max_gap)
+        for topic, found in stamps.items()
+    }
+    common = reduce(intersect_pieces, pieces.values())
     if not len(common):
         hint = ": stamp: log takes the times of the log" if any(stamps) else ""
         raise DataError(
             f"{where}: the topics {', '.join(stamps)} have no time in common{hint}"
         )
     for topic, of_topic in pieces.items():
-        count = _rows_alone(stamps[topic].time, of_topic, common)
+        count = count_rows_alone(stamps[topic].time, of_topic, common)
         text = f"{count} rows of {topic} have no time in common with others: left out"
         note("no time in common", count, text)
     steps = (common[:, 1] - common[:, 0]) * mapping.rate * (1 + 1e-12)
@@ -328,42 +320,6 @@ def _grid(
     breaks = np.zeros(len(begins), dtype=bool)
     breaks[firsts[1:]] = True
     return _Grid(begins + numbers / mapping.rate, breaks)
-
-
-def _pieces(time: Array, mapping: LogMapping) -> Array:
-    """Begins and ends (P, 2) [s] of the pieces between jumps."""
-    jumps = _jumps(time, mapping)
-    begins = time[np.r_[0, jumps + 1]]
-    ends = time[np.r_[jumps, len(time) - 1]]
-    return np.column_stack([begins, ends])
-
-
-def _intersections(pieces: Array, others: Array) -> Array:
-    """What two lists of pieces (P, 2), in the order of time, have in common (C, 2)."""
-    common = []
-    i, j = 0, 0
-    while i < len(pieces) and j < len(others):
-        begin = max(pieces[i, 0], others[j, 0])
-        end = min(pieces[i, 1], others[j, 1])
-        if begin < end:
-            common.append((begin, end))
-        if pieces[i, 1] < others[j, 1]:
-            i += 1
-        else:
-            j += 1
-    return np.array(common).reshape(-1, 2)
-
-
-def _rows_alone(time: Array, pieces: Array, common: Array) -> int:
-    """How many rows of a topic stand in pieces (P, 2) of which nothing is in common."""
-    candidates = np.searchsorted(
-        common[:, 1], pieces[:, 0]
-    )  # they end behind its begin
-    nearest = common[np.minimum(candidates, len(common) - 1)]
-    is_alone = (nearest[:, 1] < pieces[:, 0]) | (nearest[:, 0] > pieces[:, 1])
-    ends = np.searchsorted(time, pieces[:, 1], side="right")
-    rows = ends - np.searchsorted(time, pieces[:, 0])
-    return int(rows[is_alone].sum())
 
 
 def _time(label: str, table: pd.DataFrame, mapping: LogMapping) -> Array:
@@ -600,112 +556,3 @@ def _at_rest(states: Array, inputs: Array, spread: Array, step: float) -> np.nda
     both = np.nan_to_num(np.concatenate([states, inputs], axis=1))
     moved = maximum_filter1d(both, size, axis=0) - minimum_filter1d(both, size, axis=0)
     return binary_dilation((moved <= limit).all(axis=1), np.ones(2 * (size // 2) + 1))
-
-
-class Stamps(NamedTuple):
-    """Stamps (K,) [s] that only increase, with what was wrong with them."""
-
-    rows: np.ndarray  # (K,) of the table, those that are used
-    time: Array  # (K,) [s]
-    after_reversal: (
-        np.ndarray
-    )  # (K,) whether rows with earlier stamps stood before this one
-    repeated: int
-    backwards: int  # rows that are left out because a later stamp stood before
-    disordered: int = 0  # rows that stood behind later ones, and are sorted
-
-
-def ordered_stamps(stamps: Array, where: str, hint: str = ORDER_ROWS) -> Stamps:
-    """Brings rows into the order of their stamps.
-
-    Rows out of order are sorted if they fit between the others, as messages do that a
-    file holds in another order, or parts on both sides of a clock that was set. Where
-    sorting would mix rows, those whose stamp is not the latest are left out: a stamp is
-    wrong, or a clock was set back.
-
-    Raises:
-        DataError: A stamp is not finite, or 5 % of the rows would be left out.
-    """
-    if not np.isfinite(stamps).all():
-        row = int(np.argmin(np.isfinite(stamps)))
-        raise DataError(
-            f"{where}: the time in row {row + 1} is {stamps[row]}; expected a number"
-        )
-    latest = np.maximum.accumulate(stamps)
-    is_late = np.r_[False, stamps[1:] < latest[:-1]]
-    if is_late.any() and _fit_between(stamps, is_late):
-        order = np.argsort(stamps, kind="stable")
-        is_new = np.r_[True, np.diff(stamps[order]) > 0]
-        return Stamps(
-            order[is_new],
-            stamps[order][is_new],
-            after_reversal=np.zeros(int(is_new.sum()), dtype=bool),
-            repeated=int((~is_new).sum()),
-            backwards=0,
-            disordered=int(is_late.sum()),
-        )
-    rises = np.r_[True, stamps[1:] > latest[:-1]]
-    repeated = np.r_[False, stamps[1:] == stamps[:-1]] & ~rises
-    backwards = ~rises & ~repeated
-    if backwards.sum() > MOST_OUT_OF_ORDER * len(stamps):
-        row = int(np.argmax(backwards))
-        raise DataError(
-            f"{where}: time runs backwards in row {row + 1} (from {stamps[row - 1]:g} to {stamps[row]:g} s), and "
-            f"{int(backwards.sum())} rows come before the latest stamp: {hint}"
-        )
-    rows = np.flatnonzero(rises)
-    reversed_before = np.diff(np.cumsum(backwards)[rows], prepend=0) > 0
-    return Stamps(
-        rows, stamps[rows], reversed_before, int(repeated.sum()), int(backwards.sum())
-    )
-
-
-def _fit_between(stamps: Array, is_late: np.ndarray) -> bool:
-    """Whether late rows, where they are sorted in, are as far from others as usual.
-
-    ``is_late`` (K,) marks rows with an earlier stamp than a row before them.
-    """
-    order = np.argsort(stamps, kind="stable")
-    steps = np.diff(stamps[order])
-    usual = float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
-    nearest = np.minimum(np.r_[np.inf, steps], np.r_[steps, np.inf])
-    fits = nearest[is_late[order]] >= CLOSE * usual
-    return usual > 0 and float(fits.mean()) >= MOST_FIT
-
-
-def resample(
-    time: Array,
-    values: Array,
-    grid: Array,
-    rule: str,
-    max_gap: float,
-    angles: bool = False,
-) -> Array:
-    """Computes values (G, c) at the times of a grid (G,) [s] from samples (K, c) at increasing times (K,) [s].
-
-    The rule "hold" takes the last sample, "linear" interpolates, "spherical" interpolates quaternions. Values are NaN
-    beyond the samples and where two of them are farther apart than ``max_gap`` [s]; samples with a NaN are left out.
-    Between two ``angles`` [rad] the rule "linear" goes the short way round.
-    """
-    present = np.isfinite(values).all(axis=1)
-    time, values = time[present], values[present]
-    if not len(time):
-        return np.full((len(grid), values.shape[1]), np.nan)
-    at = np.searchsorted(time, grid + RESOLUTION, side="right") - 1
-    before, after = np.clip(at, 0, None), np.clip(at + 1, None, len(time) - 1)
-    lag, span = grid - time[before], time[after] - time[before]
-    if rule == "hold":
-        usable, found = (at >= 0) & (lag <= max_gap), values[before]
-    else:
-        share = np.divide(lag, span, out=np.zeros_like(lag), where=span > 0)[:, None]
-        one, other = values[before], values[after]
-        if rule == "spherical":
-            turn = rotation_vector(quaternion_product(quaternion_inverse(one), other))
-            found = quaternion_product(one, rotation_quaternion(share * turn))
-        else:
-            change = wrap(other - one) if angles else other - one
-            found = one + share * change
-        usable = (at >= 0) & (
-            (lag <= RESOLUTION) | ((at < len(time) - 1) & (span <= max_gap))
-        )
-    return np.where(usable[:, None], found, np.nan)
