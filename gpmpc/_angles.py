@@ -1,8 +1,8 @@
 """Differences of states some of whose entries are angles.
 
 An angle and the same angle a turn later are one direction. Where one of two states comes
-from a sensor that shows angles within a turn, their difference is off by whole turns;
-here is the one place that takes them off. Arrays and tensors are taken alike.
+from a sensor that shows angles within a turn, their difference is off by whole turns.
+What is taken off is counted here. Arrays and tensors are taken alike.
 """
 
 from collections.abc import Sequence

@@ -19,11 +19,17 @@ from typing import Any
 
 from gpmpc.exceptions import DataError, SettingError
 
-#: functions that a saved model may name, ``module:name``; mostly it holds operations
+#: functions that a saved model may name, ``module:name``; most models hold operations
+#: and name none of these
 MODEL_CODE = frozenset(
-    f"gpmpc.systems{module}:{name}"
-    for module in ("", "._system")
-    for name in ("sin", "cos", "exp")
+    {
+        "gpmpc.systems:sin",
+        "gpmpc.systems:cos",
+        "gpmpc.systems:exp",
+        "gpmpc.systems._system:sin",
+        "gpmpc.systems._system:cos",
+        "gpmpc.systems._system:exp",
+    }
 )
 
 _SETTINGS = {

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from gpmpc import _trust
+from gpmpc.cli import _recorded_settings
 from gpmpc.exceptions import DataError, SettingError
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -157,6 +158,13 @@ CODE = {
     "criterion",
     "constraints",
 }
+
+
+def test_code_whose_arguments_are_guarded_is_listed_under_one_name():
+    by_name = dict(listed())
+    for guarded in _recorded_settings._ARGUMENTS:
+        code = by_name[guarded]
+        assert [name for name in by_name if by_name[name] is code] == [guarded]
 
 
 def test_every_argument_of_listed_code_that_could_take_a_text_was_looked_at():

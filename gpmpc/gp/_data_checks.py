@@ -82,8 +82,9 @@ def constant_columns(
 ) -> NDArray[np.bool_]:
     """Which columns (d,) of (N, d) move by no more than round-off or ``resolution``.
 
-    Round-off is relative to ``magnitudes`` (d,), by default the columns' own: it is
-    that of the numbers that a column holds or is the difference of.
+    Round-off is relative to the columns' own magnitudes or to ``magnitudes`` (d,), the
+    larger of both: it is that of the numbers that a column holds or is the difference
+    of.
     """
     largest = np.abs(columns).max(axis=0)
     if magnitudes is not None:
@@ -125,14 +126,14 @@ def warn_of_constants(
     and outputs whose deviation the search is to find.
     """
     size = len(features)
-    unknown = constants.features & np.isfinite(prior.lengthscales)
-    lengths = _numbers(prior.lengthscales[unknown])
-    varies = np.zeros_like(constants.outputs)
+    unknown_features = constants.features & np.isfinite(prior.lengthscales)
+    lengths = _numbers(prior.lengthscales[unknown_features])
+    unknown_outputs = np.zeros_like(constants.outputs)
     deviations = ""
     if prior.deviations is not None:
-        varies = constants.outputs
-        deviations = _numbers(prior.deviations[varies])
-    if size == 1 and (unknown.any() or varies.any()):
+        unknown_outputs = constants.outputs
+        deviations = _numbers(prior.deviations[unknown_outputs])
+    if size == 1 and (unknown_features.any() or unknown_outputs.any()):
         _log.warning(
             "training: one row says nothing of how anything varies. Supposed are "
             "length-scales of %s (prior_lengthscale) and deviations of %s "
@@ -141,7 +142,7 @@ def warn_of_constants(
             deviations or "what is found",
         )
         return
-    if unknown.any():
+    if unknown_features.any():
         _log.warning(
             "training: never moves by more than %.1g (resolution) in the %d rows: %s. "
             "What it changes is not known: away from that value predictions return to "
@@ -149,17 +150,17 @@ def warn_of_constants(
             "where it is known to change nothing)",
             resolution,
             size,
-            _listed(columns.features, features[0], unknown),
+            _listed(columns.features, features[0], unknown_features),
             lengths,
         )
-    if varies.any():
+    if unknown_outputs.any():
         _log.warning(
             "training: never changes by more than %.1g (resolution) in the targets of "
             "the %d rows: %s. How much it varies elsewhere is not known: supposed is a "
             "deviation of %s (prior_deviation)",
             resolution,
             size,
-            _listed(columns.outputs, targets[0], varies),
+            _listed(columns.outputs, targets[0], unknown_outputs),
             deviations,
         )
 

@@ -35,9 +35,7 @@ class Stamps(NamedTuple):
 
     rows: np.ndarray  # (K,) of the table, those that are used
     time: Array  # (K,) [s]
-    after_reversal: (
-        np.ndarray
-    )  # (K,) whether rows with earlier stamps stood before this one
+    after_reversal: np.ndarray  # (K,) whether rows with earlier stamps stood before
     repeated: int
     backwards: int  # rows that are left out because a later stamp stood before
     disordered: int = 0  # rows that stood behind later ones, and are sorted
@@ -52,7 +50,8 @@ def ordered_stamps(stamps: Array, where: str, hint: str = ORDER_ROWS) -> Stamps:
     wrong, or a clock was set back.
 
     Raises:
-        DataError: A stamp is not finite, or 5 % of the rows would be left out.
+        DataError: A stamp is not finite, or more than ``MOST_OUT_OF_ORDER`` of the rows
+            run backwards.
     """
     if not np.isfinite(stamps).all():
         row = int(np.argmin(np.isfinite(stamps)))
@@ -65,8 +64,8 @@ def ordered_stamps(stamps: Array, where: str, hint: str = ORDER_ROWS) -> Stamps:
         order = np.argsort(stamps, kind="stable")
         is_new = np.r_[True, np.diff(stamps[order]) > 0]
         return Stamps(
-            order[is_new],
-            stamps[order][is_new],
+            rows=order[is_new],
+            time=stamps[order][is_new],
             after_reversal=np.zeros(int(is_new.sum()), dtype=bool),
             repeated=int((~is_new).sum()),
             backwards=0,
@@ -84,7 +83,11 @@ def ordered_stamps(stamps: Array, where: str, hint: str = ORDER_ROWS) -> Stamps:
     rows = np.flatnonzero(rises)
     reversed_before = np.diff(np.cumsum(backwards)[rows], prepend=0) > 0
     return Stamps(
-        rows, stamps[rows], reversed_before, int(repeated.sum()), int(backwards.sum())
+        rows=rows,
+        time=stamps[rows],
+        after_reversal=reversed_before,
+        repeated=int(repeated.sum()),
+        backwards=int(backwards.sum()),
     )
 
 
@@ -136,9 +139,8 @@ def intersect_pieces(pieces: Array, others: Array) -> Array:
 
 def count_rows_alone(time: Array, pieces: Array, common: Array) -> int:
     """How many rows of a topic stand in pieces (P, 2) of which nothing is in common."""
-    candidates = np.searchsorted(
-        common[:, 1], pieces[:, 0]
-    )  # they end behind its begin
+    # the first common piece that ends behind the begin of each
+    candidates = np.searchsorted(common[:, 1], pieces[:, 0])
     nearest = common[np.minimum(candidates, len(common) - 1)]
     is_alone = (nearest[:, 1] < pieces[:, 0]) | (nearest[:, 0] > pieces[:, 1])
     ends = np.searchsorted(time, pieces[:, 1], side="right")

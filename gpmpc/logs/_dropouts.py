@@ -1,6 +1,6 @@
 """Finds values of a log that no sensor measured, although they are numbers.
 
-A logger writes a sentinel such as -9999 where it has no value, zeros before its first
+A logger writes a sentinel such as -9999 where it has no value, zeros while it has no
 message, and the last value again while a sensor is silent. Each can be told from a
 measurement by what stands around it.
 """
@@ -17,9 +17,12 @@ SENTINELS = np.array(
 )
 HUGE = 1e20  # no state, input or context has such values in any unit
 FAR = 10.0  # ranges of the other values, from which on a sentinel is no measurement
-JUMP = 3.0  # usual changes, from which on a change is a jump
+JUMP_CHANGES = 3.0  # usual changes, from which on a change is a jump
 FROZEN = 10  # rows
 FROZEN_AT_END = 50  # rows, of a stretch that nothing ends
+FEWEST_CHANGES = 10  # that tell how a sensor changes
+MOST = 0.5  # of rows: what holds for more of them holds for most
+SMALL = 0.1  # quantile of the changes that is a small one
 VARIED = 0.3  # of the usual change: changes below it are of a sensor without steps
 
 
@@ -63,7 +66,7 @@ def zero_dropouts(states: Array) -> np.ndarray:
     changes = np.abs(np.diff(states, axis=0))
     between = zero[1:] | zero[:-1]
     usual = _usual_change(changes[~between])
-    jumps = np.any(changes > JUMP * usual, axis=1)
+    jumps = np.any(changes > JUMP_CHANGES * usual, axis=1)
     dropouts = np.zeros(len(states), dtype=bool)
     for begin, end in _stretches(zero):
         jumps_in = begin > 0 and jumps[begin - 1]
@@ -93,8 +96,9 @@ def frozen_rows(column: Array, moving: np.ndarray) -> np.ndarray:
     for begin, end in _stretches(repeats):
         at_end = end == len(column)
         long_enough = end - begin >= (FROZEN_AT_END if at_end else FROZEN)
-        jumps = at_end or changes[end - 1] > JUMP * usual
-        if long_enough and jumps and moving[begin:end].mean() > 0.5:
+        ends_as_silence = at_end or changes[end - 1] > JUMP_CHANGES * usual
+        others_move = moving[begin:end].mean() > MOST
+        if long_enough and ends_as_silence and others_move:
             frozen[begin:end] = True
     return frozen
 
@@ -107,9 +111,10 @@ def changes_rarely(column: Array, moving: np.ndarray) -> bool:
     """
     changes = np.abs(np.diff(column))[moving[1:]]
     nonzero = changes[changes > 0]
-    if len(nonzero) < 10 or len(nonzero) > 0.5 * len(changes):
+    if len(nonzero) < FEWEST_CHANGES or len(nonzero) > MOST * len(changes):
         return False
-    return float(np.quantile(nonzero, 0.1)) < VARIED * float(np.median(nonzero))
+    small_change = float(np.quantile(nonzero, SMALL))
+    return small_change < VARIED * float(np.median(nonzero))
 
 
 def _usual_change(changes: Array) -> Array:

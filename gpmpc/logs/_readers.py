@@ -20,7 +20,7 @@ import pandas as pd
 from gpmpc._bounds import Room
 from gpmpc.exceptions import DataError, GpmpcError
 from gpmpc.logs._bags import has_own_profile, read_bag
-from gpmpc.logs._csv import CsvText, open_csv
+from gpmpc.logs._csv import DELIMITERS, CsvText, open_csv
 from gpmpc.logs._file import (
     NUMBER,
     TEXT,
@@ -32,6 +32,7 @@ from gpmpc.logs._file import (
 from gpmpc.logs._log import Finding
 from gpmpc.logs._ulogs import read_ulog
 
+_DELIMITERS = [mark.encode() for mark in DELIMITERS]
 LONGEST_LINE = 2**20  # of a text file [bytes]
 # pandas before version 3 reads some numbers wrong in their last digit else
 _EXACT: dict[str, Any] = (
@@ -196,9 +197,15 @@ def _read_npz(path: Path, *_: Any) -> LogFile:
             else:
                 columns |= {f"{name}[{i}]": v for i, v in enumerate(values.T)}
     others = sorted(declared.keys() - tables.keys())
-    text = f"{', '.join(others[:5])}: no columns of numbers, left out"
-    findings = (Finding("not read", run_name(path), len(others), text),)
-    return LogFile({"": pd.DataFrame(columns)}, findings if others else ())
+    return LogFile({"": pd.DataFrame(columns)}, _left_out(path, others))
+
+
+def _left_out(path: Path, names: list[str]) -> tuple[Finding, ...]:
+    """What is said of columns that hold no numbers; nothing where there are none."""
+    if not names:
+        return ()
+    text = f"{', '.join(names[:5])}: no columns of numbers, left out"
+    return (Finding("not read", run_name(path), len(names), text),)
 
 
 def _declared_arrays(path: Path) -> dict[str, _Array]:
@@ -286,9 +293,7 @@ def _read_parquet(path: Path, *_: Any) -> LogFile:
         table[name] = table[name].astype(object)
     table = table.loc[:, [not n.startswith("__index_level_") for n in table.columns]]
     others = [name for name in schema.names if name not in used]
-    text = f"{', '.join(others[:5])}: no columns of numbers, left out"
-    findings = (Finding("not read", run_name(path), len(others), text),)
-    return LogFile({"": table}, findings if others else ())
+    return LogFile({"": table}, _left_out(path, others))
 
 
 def _read_mcap(
@@ -315,7 +320,6 @@ def _read_ulog(path: Path, topics: tuple[str, ...], partial: bool, _: str) -> Lo
     return read_ulog(path, topics, partial)
 
 
-_DELIMITERS = (b",", b";", b"\t")
 _READERS: dict[str, Callable[[Path, tuple[str, ...], bool, str], LogFile]] = {
     ".csv": _read_csv,
     ".tsv": _read_csv,
