@@ -90,7 +90,8 @@ def trusted_packages(key: str, names: Any) -> tuple[str, ...]:
 
 def may_be_trusted(name: str) -> bool:
     """Whether a package can be trusted: not Python's own, nor what gpmpc is made of."""
-    return package_of(name) not in _NEVER
+    package = package_of(name)
+    return package.isascii() and package not in _NEVER  # letters of others look alike
 
 
 def parts_of(name: str) -> list[str]:

@@ -156,7 +156,8 @@ def _calls(node: Any, place: str) -> Iterator[_Call]:
 
 def _at(place: str, key: Any) -> str:
     """The place of a key, dotted."""
-    return f"{place}.{key}".lstrip(".")
+    dotted = f"{place}.{key}".lstrip(".")
+    return dotted if dotted.isprintable() else repr(dotted)
 
 
 def _check_form(call: _Call) -> None:

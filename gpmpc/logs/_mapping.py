@@ -287,7 +287,7 @@ class LogMapping:
                     "mapping", f"{path} has more than {_LONGEST} characters"
                 )
             _check_structure(text)
-            content = yaml.safe_load(text)
+            content = yaml.load(text, Loader=_UniqueKeys)
         except (
             OSError,
             ValueError,  # of numbers and dates that are none
@@ -296,8 +296,10 @@ class LogMapping:
         ) as error:
             if isinstance(error, SettingError):
                 raise
+            name = " ".join(str(path).split())
+            reason = " ".join(str(error).split())
             raise SettingError(
-                "mapping", f"{path} cannot be read ({' '.join(str(error).split())})"
+                "mapping", f"{name:.200} cannot be read ({reason:.300})"
             ) from error
         return cls.from_dict(content)
 
@@ -322,6 +324,7 @@ class LogMapping:
         time = content.get("time") or {}
         time = {"column": time} if isinstance(time, str) else time
         _check_keys("time", time, ("column", "unit"))
+        _check_keys("keep", content.get("keep") or {}, None)
         keep = {}
         for column, limits in (content.get("keep") or {}).items():
             if not isinstance(limits, list) or len(limits) != 2:
@@ -341,6 +344,17 @@ class LogMapping:
             keep=keep,
             **plain,
         )
+
+
+class _UniqueKeys(yaml.SafeLoader):
+    """Reads YAML in which no mapping has a key twice, of which the last would win."""
+
+    def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
+        keys = [self.construct_object(key, deep=True) for key, _ in node.value]
+        for key in keys:
+            if keys.count(key) > 1:
+                raise SettingError("mapping", f"holds the key {key!r} twice")
+        return super().construct_mapping(node, deep)
 
 
 def _check_structure(text: str) -> None:

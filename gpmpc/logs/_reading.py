@@ -44,6 +44,8 @@ from gpmpc.logs._log import Finding, Log, LogRun
 from gpmpc.logs._mapping import TIME_UNITS, LogMapping, Signal
 from gpmpc.logs._readers import read_file
 
+SHORTEST_STEP = 1e-5  # [s] of rows that are measured one by one
+LONGEST_STEP = 3600.0  # [s] likewise
 REST_TIME = 0.5  # [s] for which nothing moves at rest
 REST_SHARE = 0.1  # of a state's usual spread that counts as no movement
 MOST_HELD = 0.5  # of the rows; beyond, a signal has another rate than its table
@@ -120,6 +122,9 @@ def read_log(
             reason = f"a rate of {mapping.rate:g} Hz leaves a single row"
         raise DataError(f"{files[0]}: {reason}")
     step = 1 / mapping.rate if mapping.rate else float(np.median(steps))
+    if not mapping.rate and not SHORTEST_STEP <= step <= LONGEST_STEP:
+        text = f"rows are {step:.3g} s apart: is the unit of the time right?"
+        findings.append(Finding("time step", tables[0].name, 1, text))
     spread = _spread([mapping.split(table.values)[0] for table in tables])
     usable = [
         run
@@ -467,6 +472,11 @@ def _make_run(
         ):  # a single one may repeat by its resolution
             continue
         same = np.r_[False, (states[1:, at] == states[:-1, at]).all(axis=1)] & usable
+        if same.sum() >= max(usable.sum() - 1, 1):
+            raise DataError(
+                f"run {table.name}: {signal.name} never changes: its sensor was silent; "
+                "leave it out, or held: use"
+            )
         if same.sum() > MOST_HELD * max(usable.sum(), 1):
             raise DataError(
                 f"run {table.name}: {signal.name} changes in {(usable & ~same).sum()} of {usable.sum()} rows only: "
@@ -540,7 +550,7 @@ def _note_held_sensors(
 
 def _motion(states: Array, spread: Array, step: float) -> np.ndarray:
     """Whether each state moves by a tenth of its usual spread around a row (K, n)."""
-    size = max(round(REST_TIME / step), 3)
+    size = min(max(round(REST_TIME / step), 3), len(states))
     values = np.nan_to_num(states)
     highest = maximum_filter1d(values, size, axis=0)
     lowest = minimum_filter1d(values, size, axis=0)

@@ -14,8 +14,8 @@ import numpy as np
 import pandas
 import pytest
 
-from gpmpc.exceptions import GpmpcError
-from gpmpc.logs import inspect_log, read_log
+from gpmpc.exceptions import GpmpcError, SettingError
+from gpmpc.logs import LogMapping, inspect_log, read_log
 
 ROOT = Path(__file__).resolve().parents[2]
 SEEDS = range(4)
@@ -304,6 +304,36 @@ def test_another_way_of_writing_gives_the_same_log(tmp_path, name):
     other = read_log(tmp_path / "other.csv", MAPPING)
     assert other.findings == ()
     np.testing.assert_array_equal(other.runs[0].states, expected.runs[0].states)
+
+
+@pytest.mark.parametrize("unit", ["ns", "us", 1e-12])
+def test_a_time_in_another_unit_is_noted(tmp_path, unit):
+    table = flight_of(0)
+    if unit == 1e-12:
+        table, time = table.assign(t=unit * table["t"]), "t"
+    else:
+        time = {"column": "t", "unit": unit}
+    table.to_csv(tmp_path / "log.csv", index=False)
+    states = {"position": MAPPING["states"]["position"]}
+    log = read_log(
+        tmp_path / "log.csv",
+        {"time": time, "states": states, "inputs": MAPPING["inputs"]},
+    )
+    assert "is the unit of the time right" in log.findings[0].text
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("keep: 3", "keep: must be keys and values"),
+        ("keep: [a]", "keep: must be keys and values"),
+        ("time: t\ntime: s", "mapping: holds the key 'time' twice"),
+    ],
+)
+def test_a_mapping_that_is_no_mapping_is_refused(tmp_path, text, reason):
+    (tmp_path / "map.yaml").write_text(text)
+    with pytest.raises(SettingError, match=reason):
+        LogMapping.load(tmp_path / "map.yaml")
 
 
 @pytest.mark.parametrize("name", STRANGE_MAPPINGS)
