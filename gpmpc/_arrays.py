@@ -41,6 +41,8 @@ def read_array(
     if getattr(values, "requires_grad", False):
         got = "a tensor of a graph: hand over its numbers, tensor.detach()"
         raise DataError(f"{key} {rule}; got {got}")
+    if np.ma.is_masked(values):
+        raise DataError(f"{key} {rule}; got a masked array with masked entries")
     on_host: Any = values
     if hasattr(on_host, "cpu"):  # a tensor
         on_host = on_host.cpu()

@@ -478,3 +478,19 @@ def test_a_state_that_is_no_number_is_named():
         step(PLANT, torch.zeros(2, requires_grad=True), [0.0])
     with pytest.raises(DataError, match="got object, such as NoneType"):
         step(PLANT, [None, 1.0], [0.0])
+
+
+def test_what_looks_like_transitions_is_refused_in_one_line(tmp_path):
+    import pandas
+
+    table = pandas.DataFrame({"a": [0.0, 1.0], "u": [0.0, 1.0]})
+    with pytest.raises(ShapeError, match="must have two dimensions"):
+        Transitions(table["a"], table[["u"]], table["a"])
+    masked = np.ma.masked_array([[999.0], [1.0]], [[True], [False]])
+    with pytest.raises(DataError, match="states .* masked entries"):
+        Transitions(masked, [[0.0], [0.0]], [[1.0], [2.0]])
+    table.to_csv(tmp_path / "log.csv", index=False)
+    with pytest.raises(SettingError, match="states: must name a column"):
+        Transitions.from_csv(tmp_path / "log.csv", states=[], inputs=["u"])
+    names = (name for name in ["a"])
+    assert Transitions.from_csv(tmp_path / "log.csv", names, ["u"]).state_dim == 1

@@ -223,6 +223,11 @@ class Transitions:
                 raise SettingError(
                     key, f"must be a list of column names; got {names!r}"
                 )
+        states = list(states)
+        inputs = list(inputs)
+        next_states = None if next_states is None else list(next_states)
+        if not states:
+            raise SettingError("states", "must name a column; got none")
         text = _text(path)
         reader = csv.reader(
             io.StringIO(text), delimiter=max(",;\t", key=text.partition("\n")[0].count)
@@ -296,7 +301,7 @@ def _real_next(values: Any, states: Any, signals: Signals) -> Tensor:
     if not labels or not ours:
         return table
     order = order_of(_without_affixes(labels, ours), ours)
-    if order is not None:
+    if order is not None and table.dim() == 2:
         return table[:, order]
     if not (names_of(values) and signals.state_names):  # numbers of columns say nothing
         return table
