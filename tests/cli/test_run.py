@@ -77,7 +77,7 @@ def test_a_flight_is_predicted_and_what_cannot_be_predicted_or_filmed_is_said_in
     # a flight of other code: the model is learned again, by this code
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(_flights, "is_of_this_code", lambda about: False)
-    given = {"run": Path("tree"), "to": None, "flights": [], "steps": 3}
+    given = {"run": Path("tree"), "to": None, "flights": [], "steps": 3, "trust": []}
     _flights.calibrate(argparse.Namespace(**given))
     said = "was flown by other code: the model that is judged is what this code learns"
     assert said in capsys.readouterr().out

@@ -19,6 +19,7 @@ from gpmpc.logs import LogMapping, inspect_log, read_log
 
 ROOT = Path(__file__).resolve().parents[2]
 SEEDS = range(4)
+FAST = 2  # seeds that every run of the tests takes; -m slow takes the others
 REAL = ("B2_circle_fast_rep2", "B3_figure8_fast_rep1", "B3_figure8_medium_rep2")
 STATES = ["px", "py", "pz", "qx", "qy", "qz", "qw", "vx", "vy", "vz", "wx", "wy", "wz"]
 MAPPING = {
@@ -259,7 +260,12 @@ def check_outcome(path, mapping):
 
 
 def trials(names):
-    return [(name, seed) for name in names for seed in SEEDS]
+    """Every way with every seed, the later ones slow."""
+    return [
+        pytest.param(name, seed, marks=[pytest.mark.slow] if seed >= FAST else [])
+        for name in names
+        for seed in SEEDS
+    ]
 
 
 def flight_of(seed):
