@@ -363,6 +363,9 @@ def test_kernels_are_compiled_when_asked_for(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+PATIENCE = 30  # [s] of a user who pressed Ctrl-C, before pressing it again
+
+
 @pytest.mark.parametrize("command", ["run -m seed=1,2", "run"])
 def test_ctrl_c_in_the_middle_of_flights_is_one_line(command, tmp_path):
     words = [
@@ -385,7 +388,11 @@ def test_ctrl_c_in_the_middle_of_flights_is_one_line(command, tmp_path):
     while not list(tmp_path.glob("tree/*/config.yaml")) and time.monotonic() < deadline:
         time.sleep(0.05)
     os.killpg(flying.pid, signal.SIGINT)
-    _, shown = flying.communicate(timeout=SECONDS)
+    try:
+        _, shown = flying.communicate(timeout=PATIENCE)
+    except subprocess.TimeoutExpired:  # once in some thirty runs the first one is lost
+        os.killpg(flying.pid, signal.SIGINT)
+        _, shown = flying.communicate(timeout=SECONDS)
     advice = "; the same command goes on where it stopped" if "-m" in words else ""
     assert (flying.returncode, shown) == (130, f"\ninterrupted{advice}\n")
 
