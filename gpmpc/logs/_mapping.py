@@ -3,6 +3,7 @@
 A mapping is a YAML file or a dictionary (docs/guide_log.md). States come out in m, rad, s, kg and their products.
 """
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -350,11 +351,12 @@ class _UniqueKeys(yaml.SafeLoader):
     """Reads YAML in which no mapping has a key twice, of which the last would win."""
 
     def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
-        keys = [self.construct_object(key, deep=True) for key, _ in node.value]
-        for key in keys:
-            if keys.count(key) > 1:
-                raise SettingError("mapping", f"holds the key {key!r} twice")
-        return super().construct_mapping(node, deep)
+        content = super().construct_mapping(node, deep)
+        if len(content) < len(node.value):
+            keys = [self.construct_object(key, deep=True) for key, _ in node.value]
+            key, _ = Counter(keys).most_common(1)[0]
+            raise SettingError("mapping", f"holds the key {key!r:.80} twice")
+        return content
 
 
 def _check_structure(text: str) -> None:

@@ -36,7 +36,7 @@ _DELIMITERS = [mark.encode() for mark in DELIMITERS]
 LONGEST_LINE = 2**20  # of a text file [bytes]
 # pandas before version 3 reads some numbers wrong in their last digit else
 _EXACT: dict[str, Any] = (
-    {"float_precision": "round_trip"} if pd.__version__ < "3" else {}
+    {"float_precision": "round_trip"} if int(pd.__version__.split(".")[0]) < 3 else {}
 )
 _PART = 500_000  # cells of a text file that are parsed at once
 _QUOTED = 3  # further copies of a text in quotes, which may stand over many lines

@@ -390,7 +390,7 @@ def test_ctrl_c_in_the_middle_of_flights_is_one_line(command, tmp_path):
     os.killpg(flying.pid, signal.SIGINT)
     try:
         _, shown = flying.communicate(timeout=PATIENCE)
-    except subprocess.TimeoutExpired:  # once in some thirty runs the first one is lost
+    except subprocess.TimeoutExpired:  # the first one may be lost, though rarely
         os.killpg(flying.pid, signal.SIGINT)
         _, shown = flying.communicate(timeout=SECONDS)
     advice = "; the same command goes on where it stopped" if "-m" in words else ""

@@ -1,7 +1,8 @@
 """Two hundred strange logs: each is refused in one line, noted, or read as what it was.
 
-Three flights are spoiled in fifty ways, four times each with another seed. They are
-simulated; where ``GPMPC_FLIGHTS`` names a folder of real ones, three of those.
+Three flights are spoiled in forty ways, four times each with another seed, the later
+two slow, and in a few more ways once. They are simulated; where ``GPMPC_FLIGHTS`` names
+a folder of real ones, three of those.
 """
 
 import gzip
