@@ -84,18 +84,21 @@ class Globalization:
             None  # inputs, gradient of the Lagrangian, multipliers
         )
 
-    def correct(self, program: CondensedProgram, plan: Plan) -> CondensedProgram:
+    def correct(self, program: CondensedProgram, at: Prediction) -> CondensedProgram:
         """A program made at a plan, with the curvature that the last steps showed, where the iteration creeps."""
         if not self._updatable(program):
             return program
+        plan = at.plan
+        obeys = np.abs(at.stages.next - plan.states[1:]).max() <= 1e-9*max(1.0,np.abs(plan.states).max())
         inputs = plan.inputs.ravel()
         self._gradient = gradient = program.P @ inputs + program.q
         if self._last is not None:
             before, last_gradient, z = self._last
-            if self._size < _NEAR and np.any(inputs != before):
+            if _NOISE < self._size**2 < _NEAR**2 and np.any(inputs != before) and self._obeys and obeys:
                 self._updates.append(
                     (inputs - before, gradient + program.G.T @ z - last_gradient)
                 )
+        self._obeys = obeys
         if not (self._updates and self._creeps):
             return program
         P = program.P.copy()
@@ -149,11 +152,11 @@ class Globalization:
             size,
             size / self._size if math.isfinite(self._size) else 1.0,
         )
-        self._creeps = self._creeps or (self._rate > _CREEP and size < _NEAR)
+        self._creeps = self._creeps or (not first and self._rate > _CREEP and _NOISE < size**2 < _NEAR**2)
         slower = max(
             self._rate, last_rate
         )  # the solution is better than the plan by about the slower of two rates
-        settled = self._rate >= 1.0 and size**2 <= _NOISE
+        settled = size**2 <= _NOISE and self._rate * last_rate > 0.5
         if (
             settled
             or size <= self._tolerance
@@ -164,7 +167,7 @@ class Globalization:
         continued = (
             self._request.previous is not None and self._request.states is None
         )  # the last plan, one step on
-        far = size > _NEAR and not (first and continued)
+        far = self._creeps or (size > _NEAR and not (first and continued))
         for length, trial in self._trials(at, plan, proposed, program.feedback, far):
             bound = (
                 merit
@@ -177,7 +180,7 @@ class Globalization:
                 else at.rows._replace(E=trial.rows.E)
             )
             points = trial.stages.next, rows, trial.plan
-            if (
+            if size**2 <= _ROUND_OFF or (
                 call_unchecked(_merit, trial.cost, terms, self._defect_prices, *points)
                 <= bound
             ):
@@ -188,7 +191,7 @@ class Globalization:
 
     def _updatable(self, program: CondensedProgram) -> bool:
         """Whether steps are remembered: where covariances make it creep; plans of means come from too far away."""
-        return not (len(program.feedback) or self._model.linearizer.at_points)
+        return not len(program.feedback)
 
     def _trials(
         self, at: Prediction, plan: Plan, proposed: Plan, feedback: Array, far: bool

@@ -188,7 +188,7 @@ class GPMPC:
                 prediction.cost, self.prediction.bounds, *at, prediction.rows
             )
             program = (
-                program if search is None else search.correct(program, prediction.plan)
+                program if search is None else search.correct(program, prediction)
             )
             laps.append(perf_counter())
             solution = self._solve(program, solution)
