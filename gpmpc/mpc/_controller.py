@@ -181,6 +181,8 @@ class Decision:
     #: the largest standard deviation that a stage of the plan adds, over the one that the model has far from all data:
     #: near 0 among data, near 1 where the model knows nothing; NaN where that is not known
     novelty: float = math.nan
+    #: lengths of the steps that its programs took, squared in the metric of the cost
+    steps: tuple[float, ...] = ()
     #: what the flight has taught a controller that learns (``gpmpc.learning``), for its next decision; with ``size``,
     #: the points of the model that decided, and ``version``, how often it has changed
     learned: Any = None

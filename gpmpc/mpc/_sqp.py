@@ -11,19 +11,21 @@ proposes. It has no defects, and exists where inputs alone would lead an unstabl
 
 A plan is judged by its relative offset (Bates and Watts, 1981): the Gauss-Newton step in the metric of the cost,
 relative to the root of the cost, which is the cosine between the residuals and what a plan can change of them; and by
-its defects, relative to the states. Gauss-Newton misses the curvature of the dynamics. Where that makes it creep, with
-matched beliefs, damped BFGS updates put it into the program (Nocedal and Wright, 2006, procedure 18.2).
+its defects, relative to the states. Gauss-Newton misses the curvature of the dynamics. Where that makes it creep,
+damped BFGS updates put it into the program (Nocedal and Wright, 2006, procedure 18.2). They are made of plans that
+obey the dynamics, whose gradients are those of the problem: an iteration that creeps goes on along roll-outs.
 """
 
 import math
 from collections import deque
 from collections.abc import Iterator
 from itertools import product
+from typing import NamedTuple
 
 import numpy as np
 import torch
 
-from gpmpc._compiled import call_unchecked, compiled
+from gpmpc._compiled import call_unchecked, compiled, njit_inner
 from gpmpc._kernels.linalg import dot
 from gpmpc.exceptions import DataError, ProblemError
 from gpmpc.mpc._controller import Request
@@ -48,57 +50,141 @@ FAILURES = (
     _TORCH_FAILURE,
 )  # no finite numbers
 _SUFFICIENT_DECREASE = 1e-4  # of what the program promised (Armijo)
-_SHARES = [2.0**-k for k in range(11)]  # of a step
-_ROUND_OFF = 1e-8  # share of the cost below which a difference says nothing: posteriors with sf2 >> y^2 lose that much
-_NOISE = (
-    1e-10  # the square of an offset that a model with that round-off need not get below
-)
-_SMALL = (
-    1e-3  # share of an input's size whose cost counts where the cost itself vanishes
-)
+_STEP_LENGTHS = [2.0**-k for k in range(11)]
+# Share of the cost below which a difference says nothing: posteriors with
+# sf2 >> y^2 lose that much.
+_ROUND_OFF = 1e-8
+# The square of an offset that a model with that round-off need not get below.
+_NOISE = 1e-10
+# Share of an input's size whose cost counts where the cost itself vanishes.
+_SMALL = 1e-3
 _MEMORY = 10  # updates of a Hessian
-_NEAR = 0.2  # relative offset of plans near a solution: steps from further away mislead updates
+# Relative offset of plans near a solution: steps from further away mislead updates.
+_NEAR = 0.2
 _CREEP = 0.25  # ratio of two offsets above which the Hessian is updated
+_STALL = 0.5  # what two steps leave of an offset that is lost in rounding
+_OBEYS = 1e-9  # defects, relative to the states, of a plan that was rolled out
+# How much further than the last step a step may lead, squared, to count as one more
+# of the same kind; and what linearising may have cost it, as a share of the cost.
+_FURTHER = 4.0
+_SLIGHT = 1e-3
 
 
-class Globalization:
+class StepForecast(NamedTuple):
+    """What the step from a plan to a proposed one promises."""
+
+    cost: float  # of the plan, with the price of its violated rows
+    promised: float  # likewise of the proposed plan, as the program sees it
+    curvature: float  # of the step in the cost: its length, squared
+    defect: float  # the largest of the plan, relative to the states
+    merit: float  # of the plan, under the new prices of defects
+    defect_prices: Array  # above the multipliers of the dynamics (p,)
+
+
+class Continuity(NamedTuple):
+    """How far a program led from the plan that it was made at."""
+
+    cost: float  # of the plan, with the price of its violated rows
+    step: float  # the step's length in the metric of the cost, squared
+    error: float  # what the plan's defects cost, but for that of its first stage
+
+
+class PriceTerms(NamedTuple):
+    """What costs are reckoned with besides their weights."""
+
+    references: References
+    prices: Array  # of violated rows (r,), infinite for hard ones
+    row_price: float  # of those
+
+
+def continues(
+    model: PredictionModel,
+    request: Request,
+    prediction: Prediction,
+    solution: QPSolution,
+    proposed: Plan,
+) -> tuple[bool, float]:
+    """Whether a step is one more along the last plan, and its length squared.
+
+    Then one program is enough. The defects of the last plan are what linearising it had
+    left out; that grows with the square of a step. A step that leads much further than
+    the last one is none of its kind, unless it hardly changes the cost.
+    """
+    terms = PriceTerms(request.references, model.constraints.prices, 0.0)
+    continuity = call_unchecked(
+        _measure_continuity,
+        prediction.cost,
+        terms,
+        prediction.stages.A,
+        prediction.stages.next,
+        prediction.rows,
+        prediction.plan,
+        proposed,
+        _row_multipliers(solution, prediction),
+    )
+    step = continuity.step
+    if request.previous is None:
+        return True, step
+    slight = _SLIGHT * (continuity.cost + smallest_cost(model, request))
+    last_steps = request.previous.steps
+    if step <= slight or not last_steps:
+        return True, step
+    if step > _FURTHER * last_steps[0]:
+        return False, step
+    left = continuity.error  # of the last step, which nothing has mended since
+    if len(last_steps) > 1:
+        left = last_steps[1]  # what its second program mended
+    growth = step / max(last_steps[0], 1e-300)
+    return left * max(1.0, growth) ** 2 <= slight, step
+
+
+def smallest_cost(model: PredictionModel, request: Request) -> float:
+    """What an input costs that is small beside the last one: the cheapest of them."""
+    lower, upper = model.problem.inputs.first
+    return call_unchecked(
+        _smallest_cost,
+        model.costs.quadratic.input[0],
+        lower,
+        upper,
+        request.references.previous_input,
+    )
+
+
+class Iteration:
     """Chooses the steps of one request's iteration, and says where it ends: at a tolerance of offset and defects."""
 
     def __init__(self, model: PredictionModel, request: Request, tolerance: float):
-        self._model, self._request, self._tolerance = model, request, tolerance
-        self._references = request.references
-        R, bounds = model.costs.quadratic.input[0], model.problem.inputs.first
-        self._smallest = call_unchecked(
-            _smallest_cost, R, *bounds, self._references.previous_input
-        )
-        self._defect_prices, self._row_price = (
-            np.zeros(model.costs.quadratic.terminal[:, 0].size),
-            0.0,
-        )
-        self._size, self._rate, self._creeps = math.inf, 1.0, False
-        self._updates: deque[tuple[Array, Array]] = deque(
-            maxlen=_MEMORY
-        )  # steps and changes of the gradient
-        self._gradient = np.empty(0)  # of the cost at the plan of the last program
-        self._last: tuple[Array, Array, Array] | None = (
-            None  # inputs, gradient of the Lagrangian, multipliers
-        )
+        self._model = model
+        self._request = request
+        self._tolerance = tolerance
+        self._smallest = smallest_cost(model, request)
+        self._defect_prices = np.zeros(model.costs.quadratic.terminal[:, 0].size)
+        self._row_price = 0.0
+        self._size = math.inf  # of the last step, relative; see the module's text
+        self._rate = 1.0  # of two sizes
+        self._creeps = False
+        self.steps: list[float] = []  # lengths of the programs' steps, squared
+        self._obeys = False  # whether the last plan obeyed the dynamics
+        # Steps and changes of the gradient.
+        self._updates: deque[tuple[Array, Array]] = deque(maxlen=_MEMORY)
+        # Inputs, gradient of the Lagrangian, multipliers.
+        self._last: tuple[Array, Array, Array] | None = None
 
-    def correct(self, program: CondensedProgram, at: Prediction) -> CondensedProgram:
-        """A program made at a plan, with the curvature that the last steps showed, where the iteration creeps."""
-        if not self._updatable(program):
+    def correct(
+        self, program: CondensedProgram, prediction: Prediction
+    ) -> CondensedProgram:
+        """A program made at a prediction, with the curvature that the last steps showed, where the iteration creeps."""
+        if len(program.feedback):  # there the unknowns are other ones at every plan
             return program
-        plan = at.plan
-        obeys = np.abs(at.stages.next - plan.states[1:]).max() <= 1e-9*max(1.0,np.abs(plan.states).max())
-        inputs = plan.inputs.ravel()
-        self._gradient = gradient = program.P @ inputs + program.q
-        if self._last is not None:
-            before, last_gradient, z = self._last
-            if _NOISE < self._size**2 < _NEAR**2 and np.any(inputs != before) and self._obeys and obeys:
-                self._updates.append(
-                    (inputs - before, gradient + program.G.T @ z - last_gradient)
-                )
-        self._obeys = obeys
+        inputs = prediction.plan.inputs.ravel()
+        gradient = program.P @ inputs + program.q
+        both_obey = self._obeys and _obeys_dynamics(prediction)
+        if self._last is not None and both_obey:
+            last_inputs, last_gradient, z = self._last
+            near = _NOISE < self._size**2 < _NEAR**2
+            if near and np.any(inputs != last_inputs):
+                change = gradient + program.G.T @ z - last_gradient
+                self._updates.append((inputs - last_inputs, change))
         if not (self._updates and self._creeps):
             return program
         P = program.P.copy()
@@ -108,118 +194,182 @@ class Globalization:
 
     def __call__(
         self,
-        at: Prediction,
+        prediction: Prediction,
         program: CondensedProgram,
         solution: QPSolution,
         proposed: Plan,
     ) -> tuple[Prediction, Status | None]:
         """The prediction at the next plan, and how the iteration ends: None where it goes on.
 
-        The program was made at the prediction ``at``; ``proposed`` is the plan that its solution means.
+        The program was made at the ``prediction``; ``proposed`` is the plan that its solution means.
         """
-        plan, last_rate, prices = at.plan, self._rate, self._model.constraints.prices
-        z = solution.z
-        if self._updatable(program):
-            gradient = self._gradient + program.G.T @ z if len(z) else self._gradient
-            self._last = plan.inputs.ravel(), gradient, z
-        z = z[len(z) - at.rows.lower.size :].reshape(at.rows.lower.shape)
-        self._row_price = (
-            max(self._row_price, 2.0 * float(np.abs(z).max()))
-            if z.size
-            else self._row_price
-        )
-        terms, stages = (
-            (self._references, prices, self._row_price),
-            (at.stages.A, at.stages.next),
-        )
-        found = call_unchecked(
-            _assess,
-            at.cost,
-            terms,
-            self._defect_prices,
-            stages,
-            at.rows,
-            plan,
-            proposed,
-            z,
-        )
-        cost, curvature, promised, largest, merit, self._defect_prices = found
-        size, first = (
-            max(math.sqrt(curvature / (cost + self._smallest)), largest),
-            math.isinf(self._size),
-        )
-        self._size, self._rate = (
-            size,
-            size / self._size if math.isfinite(self._size) else 1.0,
-        )
-        self._creeps = self._creeps or (not first and self._rate > _CREEP and _NOISE < size**2 < _NEAR**2)
-        slower = max(
-            self._rate, last_rate
-        )  # the solution is better than the plan by about the slower of two rates
-        settled = size**2 <= _NOISE and self._rate * last_rate > 0.5
-        if (
-            settled
-            or size <= self._tolerance
-            or size * slower <= self._tolerance * (1.0 - slower)
-        ):
-            return at._replace(plan=proposed), Status.SOLVED
-        slope = promised - curvature - merit
-        continued = (
-            self._request.previous is not None and self._request.states is None
-        )  # the last plan, one step on
-        far = self._creeps or (size > _NEAR and not (first and continued))
-        for length, trial in self._trials(at, plan, proposed, program.feedback, far):
-            bound = (
-                merit
-                + _SUFFICIENT_DECREASE * length * min(slope, 0.0)
-                + _ROUND_OFF * abs(merit)
-            )
-            rows = (
-                trial.rows
-                if self._model.constraints.smooth
-                else at.rows._replace(E=trial.rows.E)
-            )
-            points = trial.stages.next, rows, trial.plan
-            if size**2 <= _ROUND_OFF or (
-                call_unchecked(_merit, trial.cost, terms, self._defect_prices, *points)
-                <= bound
-            ):
-                return trial, None
-        if size**2 <= _ROUND_OFF:  # size^2 of the cost is what could still be gained
-            return at._replace(plan=proposed), Status.SOLVED
-        return at, Status.NUMERICAL_TROUBLE
+        first = math.isinf(self._size)
+        self._remember(program, solution, prediction)
+        forecast = self._forecast(prediction, solution, proposed)
+        self.steps.append(forecast.curvature)
+        arrived = self._judge(forecast, first)
+        if arrived:
+            return prediction._replace(plan=proposed), Status.SOLVED
+        trial = self._search_line(prediction, program, proposed, forecast, first)
+        if trial is not None:
+            return trial, None
+        # What could still be gained: the offset's square is a share of the cost.
+        if self._size**2 <= _ROUND_OFF:
+            return prediction._replace(plan=proposed), Status.SOLVED
+        return prediction, Status.NUMERICAL_TROUBLE
 
-    def _updatable(self, program: CondensedProgram) -> bool:
-        """Whether steps are remembered: where covariances make it creep; plans of means come from too far away."""
-        return not len(program.feedback)
+    def _remember(
+        self, program: CondensedProgram, solution: QPSolution, prediction: Prediction
+    ) -> None:
+        """Keeps the gradient of the Lagrangian, of which the next update is made."""
+        if len(program.feedback):
+            return
+        inputs = prediction.plan.inputs.ravel()
+        gradient = program.P @ inputs + program.q
+        if len(solution.z):
+            gradient = gradient + program.G.T @ solution.z
+        self._last = inputs, gradient, solution.z
+        self._obeys = _obeys_dynamics(prediction)
+
+    def _forecast(
+        self, prediction: Prediction, solution: QPSolution, proposed: Plan
+    ) -> StepForecast:
+        """What a step promises, under prices above the multipliers of its program."""
+        multipliers = _row_multipliers(solution, prediction)
+        if multipliers.size:
+            largest = float(np.abs(multipliers).max())
+            self._row_price = max(self._row_price, 2.0 * largest)
+        forecast = call_unchecked(
+            _forecast_step,
+            prediction.cost,
+            self._terms,
+            self._defect_prices,
+            prediction.stages.A,
+            prediction.stages.next,
+            prediction.rows,
+            prediction.plan,
+            proposed,
+            multipliers,
+        )
+        self._defect_prices = forecast.defect_prices
+        return forecast
+
+    @property
+    def _terms(self) -> PriceTerms:
+        prices = self._model.constraints.prices
+        return PriceTerms(self._request.references, prices, self._row_price)
+
+    def _judge(self, forecast: StepForecast, first: bool) -> bool:
+        """Whether the proposed plan is within the tolerance, or as near as rounding lets it come."""
+        offset = math.sqrt(forecast.curvature / (forecast.cost + self._smallest))
+        size = max(offset, forecast.defect)
+        last_rate = self._rate
+        self._rate = 1.0 if first else size / self._size
+        self._size = size
+        near = _NOISE < size**2 < _NEAR**2
+        if near and not first and self._rate > _CREEP:
+            self._creeps = True
+        if size**2 <= _NOISE and self._rate * last_rate > _STALL:
+            return True
+        if size <= self._tolerance:
+            return True
+        # The solution is better than the plan by about the slower of two rates.
+        slower = max(self._rate, last_rate)
+        return size * slower <= self._tolerance * (1.0 - slower)
+
+    def _search_line(
+        self,
+        prediction: Prediction,
+        program: CondensedProgram,
+        proposed: Plan,
+        forecast: StepForecast,
+        first: bool,
+    ) -> Prediction | None:
+        """The prediction at the first trial plan whose merit is lower by enough; None where there is none."""
+        slope = forecast.promised - forecast.curvature - forecast.merit
+        # The last plan, one step on.
+        continued = self._request.previous is not None and self._request.states is None
+        far = self._size > _NEAR and not (first and continued)
+        invisible = self._size**2 <= _ROUND_OFF  # what can be gained is lost in merits
+        obeying = self._creeps or far
+        for length, trial in self._trials(prediction, program, proposed, obeying):
+            if invisible:
+                return trial
+            largest_merit = (
+                forecast.merit
+                + _SUFFICIENT_DECREASE * length * min(slope, 0.0)
+                + _ROUND_OFF * abs(forecast.merit)
+            )
+            rows = trial.rows
+            if not self._model.constraints.smooth:  # bounds stay those of the program
+                rows = prediction.rows._replace(E=trial.rows.E)
+            merit = call_unchecked(
+                _merit,
+                trial.cost,
+                self._terms,
+                self._defect_prices,
+                trial.stages.next,
+                rows,
+                trial.plan,
+            )
+            if merit <= largest_merit:
+                return trial
+        return None
 
     def _trials(
-        self, at: Prediction, plan: Plan, proposed: Plan, feedback: Array, far: bool
+        self,
+        prediction: Prediction,
+        program: CondensedProgram,
+        proposed: Plan,
+        obeying: bool,
     ) -> Iterator[tuple[float, Prediction]]:
-        """Shares of the step to a proposed plan; predictions at the plan that obeys the dynamics and at the plan there.
+        """Lengths of the step to a proposed plan, and predictions there or at the plan that obeys the dynamics.
 
-        Far from a solution the first of these leads further; and it comes first where moments are linearised, since
-        they overshoot. Means are linearised at once near a solution, as a first step from the last plan is taken to
-        be: the plan there will be taken.
+        Far from a solution the second of these leads further, and where the iteration creeps its gradients are needed;
+        it comes first where moments are linearised, too, since they overshoot. Means are linearised at once near a
+        solution, as a first step from the last plan is taken to be: the plan there will be taken.
         """
-        model, request = self._model, self._request
-        for share, first in product(_SHARES, (True, False)):
-            towards = _between(plan, proposed, share)
+        model = self._model
+        request = self._request
+        order = (True, False)
+        if model.linearizer.at_points and not obeying:
+            order = (False, True)
+        for length, obeys in product(_STEP_LENGTHS, order):
+            target = _between(prediction.plan, proposed, length)
             try:
-                if first is (far or not model.linearizer.at_points):
-                    yield share, model.roll_out(towards, at, feedback, request)
+                if obeys:
+                    feedback = program.feedback
+                    trial = model.roll_out(target, prediction, feedback, request)
                 else:
-                    yield share, model.linearize(model.canonical(towards), request)
+                    trial = model.linearize(model.canonical(target), request)
             except FAILURES:  # a trial plan may lead the model out of its numbers
                 continue
+            yield length, trial
 
 
-def _between(plan: Plan, other: Plan, share: float) -> Plan:
-    return (
-        other
-        if share == 1.0
-        else Plan(*(a + share * (b - a) for a, b in zip(plan, other, strict=True)))
+def _between(plan: Plan, other: Plan, length: float) -> Plan:
+    """The plan at a length of the step from one to another."""
+    if length == 1.0:
+        return other
+    return Plan(
+        plan.states + length * (other.states - plan.states),
+        plan.inputs + length * (other.inputs - plan.inputs),
+        plan.covariances + length * (other.covariances - plan.covariances),
     )
+
+
+def _row_multipliers(solution: QPSolution, prediction: Prediction) -> Array:
+    """Those of the rows of the states (H, r); the last of a program's."""
+    shape = prediction.rows.lower.shape
+    count = prediction.rows.lower.size
+    return solution.z[len(solution.z) - count :].reshape(shape)
+
+
+def _obeys_dynamics(prediction: Prediction) -> bool:
+    """Whether a plan has no defects but for rounding."""
+    states = prediction.plan.states
+    defects = np.abs(prediction.stages.next - states[1:])
+    return bool(defects.max() <= _OBEYS * max(1.0, np.abs(states).max()))
 
 
 @compiled
@@ -232,51 +382,70 @@ def _smallest_cost(R, lower, upper, last):
     return least + 1e-300
 
 
-@compiled
-def _assess(cost, terms, defect_prices, stages, rows, plan, proposed, z):
-    """What a step from a plan to a proposed one promises.
-
-    Returns cost with price of violated rows at the plan, curvature of the step in the cost, cost with price promised,
-    the largest defect relative to the states, merit of the plan under new prices of defects, and these prices (p,).
-    """
-    (references, prices, row_price), (A, after) = terms, stages
+@njit_inner
+def _cost_of_step(cost, references, plan, proposed):
+    """What a step from a plan to a proposed one would cost as a plan of its own, without references."""
     zero = References(
         0.0 * references.states,
         0.0 * references.inputs,
         0.0 * references.previous_input,
     )
-    (H, p), reach, largest, defects, new = (
-        after.shape,
-        1.0,
-        0.0,
-        np.zeros(after.shape[1]),
-        defect_prices.copy(),
-    )
+    states = proposed.states - plan.states
+    inputs = proposed.inputs - plan.inputs
+    return evaluate_cost(cost, states, inputs, zero, 0.0)
+
+
+@njit_inner
+def _priced_cost(cost, terms, rows, plan):
+    """The cost of a plan, and the price of its violated rows."""
+    total = evaluate_cost(cost, plan.states, plan.inputs, terms.references, 1.0)
+    return total + price_violations(terms.prices, rows, plan, terms.row_price)
+
+
+@compiled
+def _measure_continuity(cost, terms, A, after, rows, plan, proposed, z):
+    """The ``Continuity`` of a program's step."""
+    here = _priced_cost(cost, terms, rows, plan)
+    step = _cost_of_step(cost, terms.references, plan, proposed)
+    costates = _costates(cost, A, proposed, terms.references.states, rows.E, z)
+    error = 0.0
+    # The first stage's defect is the disturbance, the last one's what repeating the
+    # end of the last plan missed.
+    for k in range(1, len(after) - 1):
+        for i in range(after.shape[1]):
+            error += abs(costates[k, i] * (after[k, i] - plan.states[k + 1, i]))
+    return Continuity(here, step, error)
+
+
+@compiled
+def _forecast_step(cost, terms, defect_prices, A, after, rows, plan, proposed, z):
+    """The ``StepForecast`` of a step from a plan to a proposed one."""
+    H, p = after.shape
+    defects = np.zeros(p)
+    largest = 0.0
+    reach = 1.0
     for k in range(H):
         for i in range(p):
+            defect = abs(after[k, i] - plan.states[k + 1, i])
+            defects[i] += defect
+            largest = max(largest, defect)
             reach = max(reach, abs(plan.states[k + 1, i]))
-            defects[i] += abs(after[k, i] - plan.states[k + 1, i])
-            largest = max(largest, abs(after[k, i] - plan.states[k + 1, i]))
-    here = evaluate_cost(cost, plan.states, plan.inputs, references, 1.0)
-    here += price_violations(prices, rows, plan, row_price)
-    curvature = evaluate_cost(
-        cost, proposed.states - plan.states, proposed.inputs - plan.inputs, zero, 0.0
-    )
-    promised = evaluate_cost(cost, proposed.states, proposed.inputs, references, 1.0)
-    promised += price_violations(prices, rows, proposed, row_price)
-    costates = _costates(cost, A, proposed, references.states, rows.E, z)
+    here = _priced_cost(cost, terms, rows, plan)
+    promised = _priced_cost(cost, terms, rows, proposed)
+    curvature = _cost_of_step(cost, terms.references, plan, proposed)
+    costates = _costates(cost, A, proposed, terms.references.states, rows.E, z)
+    prices = defect_prices.copy()
     for k in range(H):
         for i in range(p):
-            new[i] = max(new[i], 1.5 * abs(costates[k, i]))
-    return here, curvature, promised, largest / reach, here + dot(defects, new, p), new
+            prices[i] = max(prices[i], 1.5 * abs(costates[k, i]))
+    merit = here + dot(defects, prices, p)
+    return StepForecast(here, promised, curvature, largest / reach, merit, prices)
 
 
 @compiled
 def _merit(cost, terms, defect_prices, after, rows, plan):
     """The exact penalty function at a plan, within the bounds of ``rows``."""
-    references, prices, row_price = terms
-    merit = evaluate_cost(cost, plan.states, plan.inputs, references, 1.0)
-    merit += price_violations(prices, rows, plan, row_price)
+    merit = _priced_cost(cost, terms, rows, plan)
     for k in range(len(after)):
         for i in range(after.shape[1]):
             merit += defect_prices[i] * abs(after[k, i] - plan.states[k + 1, i])
@@ -286,15 +455,17 @@ def _merit(cost, terms, defect_prices, after, rows, plan):
 @compiled
 def _costates(cost, A, plan, targets, E, z):
     """Multipliers of the dynamics (H, p): the derivatives of cost and rows by s_1 .. s_H, through all that follows."""
-    states, inputs, (H, n), Z = plan.states, plan.inputs, targets.shape, cost.squares
-    p, m = states.shape[1], inputs.shape[1]
+    states = plan.states
+    inputs = plan.inputs
+    Z = cost.squares
+    H, n = targets.shape
+    p = states.shape[1]
+    m = inputs.shape[1]
     costates = np.zeros((H, p))
     for k in range(H - 1, -1, -1):
-        weight, out, rows = (
-            weight_of_stage(cost, k, H),
-            costates[k],
-            E[min(k, len(E) - 1)],
-        )
+        weight = weight_of_stage(cost, k, H)
+        out = costates[k]
+        rows = E[min(k, len(E) - 1)]
         for i in range(n if len(Z) > 0 else 0):
             out[i] += 2.0 * (
                 dot(Z[k, i], states[k + 1], n)
@@ -317,9 +488,12 @@ def _costates(cost, A, plan, targets, E, z):
 
 def _update(P: Array, step: Array, change: Array) -> None:
     """Updates P towards P step = change, damped so that it stays positive definite (Powell, 1978)."""
-    moved = P @ step
-    found, curvature, share = step @ change, step @ moved, 1.0
-    if found < 0.2 * curvature:
-        share = 0.8 * curvature / (curvature - found)
-    damped = share * change + (1.0 - share) * moved
-    P += np.outer(damped, damped) / (step @ damped) - np.outer(moved, moved) / curvature
+    product_with_step = P @ step
+    curvature = step @ product_with_step
+    shown = step @ change
+    share = 1.0
+    if shown < 0.2 * curvature:
+        share = 0.8 * curvature / (curvature - shown)
+    damped = share * change + (1.0 - share) * product_with_step
+    P += np.outer(damped, damped) / (step @ damped)
+    P -= np.outer(product_with_step, product_with_step) / curvature

@@ -38,7 +38,7 @@ from gpmpc.mpc._controller import (
 from gpmpc.mpc._cost import FunctionNotFinite
 from gpmpc.mpc._linear_quadratic import CondensedProgram, expand
 from gpmpc.mpc._prediction import Prediction, PredictionModel, PredictionSettings
-from gpmpc.mpc._sqp import FAILURES, Globalization
+from gpmpc.mpc._sqp import FAILURES, Iteration, continues
 from gpmpc.mpc._stages import Covariance, Plan, price_violations
 from gpmpc.mpc.problem import Problem
 from gpmpc.propagation import Propagator
@@ -49,6 +49,8 @@ from gpmpc.status import Status
 Array = np.ndarray
 
 _DEFAULT = PredictionSettings()
+_MOST = 10
+_LOOSE = 1e-2
 
 
 class GPMPC:
@@ -79,15 +81,23 @@ class GPMPC:
         initial_input: Sequence[float],
         prediction: PredictionSettings = _DEFAULT,
         solver: QPSolver | None = None,
-        iterations: int = 1,
-        tolerance: float = 1e-6,
+        iterations: int | None = None,
+        tolerance: float | None = None,
     ):
         self.prediction = PredictionModel(
             model, propagator, problem, horizon, initial_input, prediction
         )
-        check_number("iterations", iterations, least=1, whole=True)
-        check_number("tolerance", tolerance, above=0)
-        if iterations > 1 and prediction.form != "trajectory":
+        if iterations is not None:
+            check_number("iterations", iterations, least=1, whole=True)
+        self._tolerance = (
+            (_LOOSE if iterations is None else 1e-6) if tolerance is None else tolerance
+        )
+        check_number("tolerance", self._tolerance, above=0)
+        if (
+            iterations is not None
+            and iterations > 1
+            and prediction.form != "trajectory"
+        ):
             rule = f"form {prediction.form!r} is one quadratic program, so 1"
             raise SettingError("iterations", f"{rule}; got {iterations}")
         self.initial_input, self.problem, self.horizon = (
@@ -171,45 +181,48 @@ class GPMPC:
         self, prediction: Prediction, request: Request, laps: list[float]
     ) -> Decision:
         """The decision from a prediction: program by program, up to a KKT point or the last one."""
-        guess, solution = (
-            prediction.plan,
-            None if request.previous is None else request.previous.solution,
-        )
-        search = (
-            Globalization(self.prediction, request, self.tolerance)
-            if self.iterations > 1
-            else None
-        )
-        solved_at, status, count = None, None, 0
+        guess = prediction.plan
+        solution = None if request.previous is None else request.previous.solution
+        iteration: Iteration | None = None
+        limit = self.iterations or _MOST
+        one = limit == 1 or self.prediction.settings.form == "velocity"
+        steps: list[float] = []
+        solved_at, count = None, 0
         while True:
             laps.append(perf_counter())
-            at = prediction.stages, prediction.plan.states[0], request.references
             program = condense(
-                prediction.cost, self.prediction.bounds, *at, prediction.rows
+                prediction.cost,
+                self.prediction.bounds,
+                prediction.stages,
+                prediction.plan.states[0],
+                request.references,
+                prediction.rows,
             )
-            program = (
-                program if search is None else search.correct(program, prediction)
-            )
+            if iteration is not None:
+                program = iteration.correct(program, prediction)
             laps.append(perf_counter())
             solution = self._solve(program, solution)
             laps.append(perf_counter())
-            count, status = count + 1, solution.status
-            if _is_usable(program, solution, prediction.plan):
-                unknowns = np.ascontiguousarray(solution.x, dtype=np.float64)
-                at = (
-                    prediction.stages,
-                    prediction.plan.states[0],
-                    program.feedback,
-                    request.references.previous_input,
+            count += 1
+            status: Status | None = solution.status
+            if not _is_usable(program, solution, prediction.plan):
+                break
+            proposed = _expand(program, solution, prediction, request)
+            solved_at = prediction, program.feedback
+            enough = one
+            if not one and self.iterations is None and count == 1:
+                enough, step = continues(
+                    self.prediction, request, prediction, solution, proposed
                 )
-                inputs, states = call_unchecked(expand, *at, unknowns)
-                proposed = Plan(states, inputs, prediction.covariances)
-                solved_at = prediction, program.feedback
-                if search is None:  # the real-time iteration takes the whole step
-                    prediction = prediction._replace(plan=proposed)
-                else:
-                    prediction, status = search(prediction, program, solution, proposed)
-            if status is not None or count == self.iterations:
+                steps = [step]
+            if enough:  # the real-time iteration takes the whole step
+                prediction = prediction._replace(plan=proposed)
+                break
+            if iteration is None:
+                iteration = Iteration(self.prediction, request, self._tolerance)
+            prediction, status = iteration(prediction, program, solution, proposed)
+            steps = iteration.steps
+            if status is not None or count == limit:
                 break
         if solved_at is not None and self.prediction.settings.rolled_out:
             obeying = self.prediction.roll_out(prediction.plan, *solved_at, request)
@@ -241,7 +254,7 @@ class GPMPC:
         novelty = call_unchecked(_largest_ratio, prediction.stages.V, self._prior)
         inputs, found = (
             plan.inputs.copy(),
-            (program, solution, request.disturbance, suboptimal, novelty),
+            (program, solution, request.disturbance, suboptimal, novelty, tuple(steps)),
         )
         return Decision(
             inputs[0], inputs, means, covariances, status, count, timing, *found
@@ -341,6 +354,25 @@ class NonlinearGPMPC(GPMPC):
             iterations=iterations,
             tolerance=tolerance,
         )
+
+
+def _expand(
+    program: CondensedProgram,
+    solution: QPSolution,
+    prediction: Prediction,
+    request: Request,
+) -> Plan:
+    """The plan that the solution of a program means."""
+    unknowns = np.ascontiguousarray(solution.x, dtype=np.float64)
+    inputs, states = call_unchecked(
+        expand,
+        prediction.stages,
+        prediction.plan.states[0],
+        program.feedback,
+        request.references.previous_input,
+        unknowns,
+    )
+    return Plan(states, inputs, prediction.covariances)
 
 
 def _is_usable(program: CondensedProgram, solution: QPSolution, plan: Plan) -> bool:
