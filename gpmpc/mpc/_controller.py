@@ -6,7 +6,7 @@ and is handed to it again as ``previous``.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -181,6 +181,13 @@ class Decision:
     #: the largest standard deviation that a stage of the plan adds, over the one that the model has far from all data:
     #: near 0 among data, near 1 where the model knows nothing; NaN where that is not known
     novelty: float = math.nan
+    #: predicted cost of each stage of the plan (H,), that of x_{k+1} and u_k; empty where
+    #: it is not known
+    stage_costs: Array = field(default_factory=lambda: np.empty(0))
+    #: by how much the plan misses a bound, in the bound's unit: smooth constraints are
+    #: taken at its means; soft ones may be missed. Zero but for rounding where all are
+    #: kept; NaN where that is not known
+    violation: float = math.nan
     #: lengths of the steps that its programs took, squared in the metric of the cost
     steps: tuple[float, ...] = ()
     #: what the flight has taught a controller that learns (``gpmpc.learning``), for its next decision; with ``size``,
@@ -203,16 +210,20 @@ class Decision:
         return self.novelty > _FAR
 
     @property
-    def violation(self) -> float:
-        """By how much the plan misses a bound of its last program, in the bound's unit; soft ones may be missed.
+    def cost(self) -> float:
+        """The predicted cost of the plan, all stages together; NaN where it is not known."""
+        return float(self.stage_costs.sum()) if len(self.stage_costs) else math.nan
 
-        Zero but for rounding where all are kept; NaN without a program.
+    @property
+    def program_violation(self) -> float:
+        """By how much the solution of the last program misses a bound of it; NaN without one.
+
+        Of smooth constraints the program holds what they are at the plan before: the
+        plan itself may miss them by more, ``violation``.
         """
-        return (
-            math.nan
-            if self.solution is None
-            else float(self.solution.violation().max(initial=0.0))
-        )
+        if self.solution is None:
+            return math.nan
+        return float(self.solution.violation().max(initial=0.0))
 
 
 class Controller(Protocol):

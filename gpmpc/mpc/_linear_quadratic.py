@@ -127,28 +127,38 @@ def expand(stages, start, feedback, previous_input, unknowns):
 @compiled
 def evaluate_cost(cost, states, inputs, references, constant):
     """The cost of states s_0 .. s_H (H + 1, p) and inputs (H, m), with ``constant`` in the place of the 1 of z."""
-    targets, penalized = references.states, cost.penalized
-    (H, n), m = targets.shape, inputs.shape[1]
-    total, error, v, z = (
-        0.0,
-        np.empty(states.shape[1]),
-        np.empty(m),
-        np.full(n + m + 1, constant),
-    )
+    total = 0.0
+    for stage_cost in evaluate_stages(cost, states, inputs, references, constant):
+        total += stage_cost
+    return total
+
+
+@compiled
+def evaluate_stages(cost, states, inputs, references, constant):
+    """The costs of the stages (H,) whose sum ``evaluate_cost`` is; stage k is that of s_{k+1} and u_k."""
+    targets = references.states
+    H, n = targets.shape
+    m = inputs.shape[1]
+    error = np.empty(states.shape[1])
+    v = np.empty(m)
+    z = np.full(n + m + 1, constant)
+    costs = np.empty(H)
     for k in range(H):
         copy(states[k + 1], error)
         for i in range(n):
             error[i] -= targets[k, i]
-        weight, R = weight_of_stage(cost, k, H), cost.input[min(k, len(cost.input) - 1)]
+        weight = weight_of_stage(cost, k, H)
+        R = cost.input[min(k, len(cost.input) - 1)]
+        total = 0.0
         for b in range(len(weight)):
             for i in range(n):
                 for j in range(n):
                     total += error[b * n + i] * weight[b, i, j] * error[b * n + j]
         for i in range(m):
             v[i] = inputs[k, i]
-            if penalized == DEVIATIONS:
+            if cost.penalized == DEVIATIONS:
                 v[i] -= references.inputs[k, i]
-            elif penalized == INCREMENTS:
+            elif cost.penalized == INCREMENTS:
                 v[i] -= inputs[k - 1, i] if k > 0 else references.previous_input[i]
         for i in range(m):
             for j in range(m):
@@ -158,7 +168,8 @@ def evaluate_cost(cost, states, inputs, references, constant):
             copy(inputs[k], z[n : n + m])
             for i in range(n + m + 1):
                 total += z[i] * dot(cost.squares[k, i], z, n + m + 1)
-    return total
+        costs[k] = total
+    return costs
 
 
 @njit_inner

@@ -373,6 +373,58 @@ class PredictionModel:
             c[n:] = stages.c[0, n:]
         return stages._replace(c=c[None])
 
+    def obey(
+        self,
+        prediction: Prediction,
+        linearized: Prediction,
+        feedback: Array,
+        request: Request,
+    ) -> Prediction:
+        """The prediction whose plan obeys the dynamics under a feedback towards its own; itself where that overflows.
+
+        The feedback is one at the prediction that was ``linearized`` last. Stages and
+        covariances stay those of it where dynamics are linearised at points.
+        """
+        if not self.linearizer.at_points:
+            obeying = self.roll_out(prediction.plan, linearized, feedback, request)
+            return obeying if np.isfinite(obeying.plan.states).all() else prediction
+        plan = self._follow(prediction.plan, linearized, feedback, request)
+        if not np.isfinite(plan.states).all():
+            return prediction
+        rows = prediction.rows
+        if self.constraints.smooth:
+            rows = self.constraints.at(
+                plan,
+                prediction.covariances,
+                self.points,
+                request.parameters,
+                request.kappas,
+            )
+        cost = self.costs.at(plan, request.parameters)
+        return prediction._replace(plan=plan, rows=rows, cost=cost)
+
+    def _follow(
+        self, target: Plan, prediction: Prediction, feedback: Array, request: Request
+    ) -> Plan:
+        """The plan that the means obey under a feedback towards another one, within its bounds."""
+        law = Feedback(
+            target.states[None],
+            target.inputs[None],
+            self._gains_towards(prediction, feedback)[None],
+            *self._limits,
+            request.references.previous_input,
+        )
+        states, inputs = self._roll_out(target.states[:1], law, request.disturbance)
+        return Plan(states[0], inputs[0], target.covariances)
+
+    def _gains_towards(self, prediction: Prediction, feedback: Array) -> Array:
+        """Gains (H, m, n) of a feedback on the means: a program's, or the regulator of a prediction's stages."""
+        gains = feedback
+        if not len(feedback):
+            stages = prediction.stages
+            gains = -self.gains(stages.A, stages.B, prediction.cost)
+        return np.ascontiguousarray(gains[:, :, : self.problem.state_dim])
+
     def roll_out(
         self, towards: Plan, prediction: Prediction, feedback: Array, request: Request
     ) -> Prediction:
@@ -380,26 +432,14 @@ class PredictionModel:
 
         The feedback is a program's, F_k (H, m, p + m + 1), or that of the stages of ``prediction`` where that is empty.
         """
-        n, linearizer = self.problem.state_dim, self.linearizer
-        gains = (
-            feedback
-            if len(feedback)
-            else -self.gains(*prediction.stages[:2], prediction.cost)
-        )
-        gains = np.ascontiguousarray(gains[:, :, :n])
-        last, disturbance = request.references.previous_input, request.disturbance
+        linearizer = self.linearizer
         if linearizer.at_points:
-            law = Feedback(
-                towards.states[None],
-                towards.inputs[None],
-                gains[None],
-                *self._limits,
-                last,
-            )
-            states, inputs = self._roll_out(towards.states[:1], law, disturbance)
-            return self.linearize(
-                Plan(states[0], inputs[0], towards.covariances), request
-            )
+            plan = self._follow(towards, prediction, feedback, request)
+            return self.linearize(plan, request)
+        n = self.problem.state_dim
+        gains = self._gains_towards(prediction, feedback)
+        last = request.references.previous_input
+        disturbance = request.disturbance
         low, high, down, up = self._limits
         states, inputs, covariances = (part.copy() for part in towards)
         parts = []

@@ -68,6 +68,7 @@ _OBEYS = 1e-9  # defects, relative to the states, of a plan that was rolled out
 # of the same kind; and what linearising may have cost it, as a share of the cost.
 _FURTHER = 4.0
 _SLIGHT = 1e-3
+_TINY = 1e-300
 
 
 class StepForecast(NamedTuple):
@@ -82,6 +83,13 @@ class StepForecast(NamedTuple):
 
 
 class Continuity(NamedTuple):
+    """Whether a program's step is one more along the last plan."""
+
+    continues: bool
+    step: float  # its length in the metric of the cost, squared
+
+
+class StepMeasures(NamedTuple):
     """How far a program led from the plan that it was made at."""
 
     cost: float  # of the plan, with the price of its violated rows
@@ -97,24 +105,23 @@ class PriceTerms(NamedTuple):
     row_price: float  # of those
 
 
-def continues(
+def measure_continuity(
     model: PredictionModel,
     request: Request,
     prediction: Prediction,
     solution: QPSolution,
     proposed: Plan,
-) -> tuple[bool, float]:
-    """Whether a step is one more along the last plan, and its length squared.
+) -> Continuity:
+    """Whether a step is one more along the last plan, and how long it is.
 
     Then one program is enough. The defects of the last plan are what linearising it had
     left out; that grows with the square of a step. A step that leads much further than
     the last one is none of its kind, unless it hardly changes the cost.
     """
-    terms = PriceTerms(request.references, model.constraints.prices, 0.0)
-    continuity = call_unchecked(
-        _measure_continuity,
+    measures = call_unchecked(
+        _measure_step,
         prediction.cost,
-        terms,
+        PriceTerms(request.references, model.constraints.prices, 0.0),
         prediction.stages.A,
         prediction.stages.next,
         prediction.rows,
@@ -122,20 +129,20 @@ def continues(
         proposed,
         _row_multipliers(solution, prediction),
     )
-    step = continuity.step
-    if request.previous is None:
-        return True, step
-    slight = _SLIGHT * (continuity.cost + smallest_cost(model, request))
+    step = measures.step
+    if request.previous is None or not request.previous.steps:
+        return Continuity(True, step)
+    slight = _SLIGHT * (measures.cost + smallest_cost(model, request))
+    if step <= slight:
+        return Continuity(True, step)
     last_steps = request.previous.steps
-    if step <= slight or not last_steps:
-        return True, step
     if step > _FURTHER * last_steps[0]:
-        return False, step
-    left = continuity.error  # of the last step, which nothing has mended since
+        return Continuity(False, step)
+    left = measures.error  # by the last step's program, which nothing has mended since
     if len(last_steps) > 1:
         left = last_steps[1]  # what its second program mended
-    growth = step / max(last_steps[0], 1e-300)
-    return left * max(1.0, growth) ** 2 <= slight, step
+    growth = max(1.0, step / max(last_steps[0], _TINY))
+    return Continuity(left * growth**2 <= slight, step)
 
 
 def smallest_cost(model: PredictionModel, request: Request) -> float:
@@ -216,7 +223,7 @@ class Iteration:
         # What could still be gained: the offset's square is a share of the cost.
         if self._size**2 <= _ROUND_OFF:
             return prediction._replace(plan=proposed), Status.SOLVED
-        return prediction, Status.NUMERICAL_TROUBLE
+        return prediction, Status.STALLED
 
     def _remember(
         self, program: CondensedProgram, solution: QPSolution, prediction: Prediction
@@ -379,7 +386,7 @@ def _smallest_cost(R, lower, upper, last):
     for j in range(len(R)):
         size = min(max(1.0, abs(last[j])), upper[j] - lower[j]) * _SMALL
         least = min(least, R[j, j] * size * size)
-    return least + 1e-300
+    return least + _TINY
 
 
 @njit_inner
@@ -403,8 +410,8 @@ def _priced_cost(cost, terms, rows, plan):
 
 
 @compiled
-def _measure_continuity(cost, terms, A, after, rows, plan, proposed, z):
-    """The ``Continuity`` of a program's step."""
+def _measure_step(cost, terms, A, after, rows, plan, proposed, z):
+    """The ``StepMeasures`` of a program's step."""
     here = _priced_cost(cost, terms, rows, plan)
     step = _cost_of_step(cost, terms.references, plan, proposed)
     costates = _costates(cost, A, proposed, terms.references.states, rows.E, z)
@@ -414,7 +421,7 @@ def _measure_continuity(cost, terms, A, after, rows, plan, proposed, z):
     for k in range(1, len(after) - 1):
         for i in range(after.shape[1]):
             error += abs(costates[k, i] * (after[k, i] - plan.states[k + 1, i]))
-    return Continuity(here, step, error)
+    return StepMeasures(here, step, error)
 
 
 @compiled

@@ -438,6 +438,32 @@ def price_violations(prices, rows, plan, hard_price):
 
 
 @compiled
+def largest_violation(rows, bounds, plan, previous_input):
+    """By how much a plan misses a bound of its states, inputs or increments, at most."""
+    E, D, lower, upper = rows
+    largest = 0.0
+    for k in range(len(plan.inputs)):
+        s = plan.states[k + 1]
+        u = plan.inputs[k]
+        for e in range(lower.shape[1]):
+            value = dot(E[min(k, len(E) - 1), e], s, len(s))
+            if len(D) > 0:
+                value += dot(D[k, e], u, len(u))
+            largest = max(largest, value - upper[k, e], lower[k, e] - value)
+        for j in range(len(u)):
+            largest = max(largest, u[j] - bounds.upper[k, j], bounds.lower[k, j] - u[j])
+            if len(bounds.rate_lower) > 0:
+                before = plan.inputs[k - 1, j] if k > 0 else previous_input[j]
+                rate = u[j] - before
+                largest = max(
+                    largest,
+                    rate - bounds.rate_upper[k, j],
+                    bounds.rate_lower[k, j] - rate,
+                )
+    return largest
+
+
+@compiled
 def keep_rates(inputs, last, lower, upper):
     """Moves inputs (H, m), one after the other, to within their rates from the one before."""
     for k in range(len(inputs)):

@@ -16,9 +16,8 @@ nonlinear problem itself. Where the iteration ends, in the covariance modes of `
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import replace
-from itertools import pairwise
 from time import perf_counter
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -36,10 +35,15 @@ from gpmpc.mpc._controller import (
     check_method,
 )
 from gpmpc.mpc._cost import FunctionNotFinite
-from gpmpc.mpc._linear_quadratic import CondensedProgram, expand
+from gpmpc.mpc._linear_quadratic import CondensedProgram, evaluate_stages, expand
 from gpmpc.mpc._prediction import Prediction, PredictionModel, PredictionSettings
-from gpmpc.mpc._sqp import FAILURES, Iteration, continues
-from gpmpc.mpc._stages import Covariance, Plan, price_violations
+from gpmpc.mpc._sqp import FAILURES, Iteration, measure_continuity
+from gpmpc.mpc._stages import (
+    Covariance,
+    Plan,
+    largest_violation,
+    price_violations,
+)
 from gpmpc.mpc.problem import Problem
 from gpmpc.propagation import Propagator
 from gpmpc.qp import DualActiveSet, QPSolution, QPSolver, QuadraticProgram
@@ -51,6 +55,36 @@ Array = np.ndarray
 _DEFAULT = PredictionSettings()
 _MOST = 10
 _LOOSE = 1e-2
+_KEPT = 1e-5  # by how much a bound may be missed that is kept
+
+
+class Stopwatch:
+    """Sums the wall time of the parts of a decision."""
+
+    def __init__(self, spent: float = 0.0):
+        self._last = perf_counter() - spent
+        self._seconds = {"model": 0.0, "build": 0.0, "solve": 0.0}
+
+    def lap(self, part: str) -> None:
+        """Adds the time since the last lap to a part."""
+        now = perf_counter()
+        self._seconds[part] += now - self._last
+        self._last = now
+
+    @property
+    def timing(self) -> Timing:
+        """The sums so far."""
+        return Timing(**self._seconds)
+
+
+class Outcome(NamedTuple):
+    """How the programs of a decision ended."""
+
+    program: CondensedProgram  # the last one
+    solution: QPSolution  # of it
+    status: Status
+    count: int  # of programs
+    steps: tuple[float, ...]  # see ``Decision``
 
 
 class GPMPC:
@@ -108,6 +142,8 @@ class GPMPC:
         self.iterations, self.tolerance = iterations, tolerance
         self.solver = DualActiveSet() if solver is None else solver
         check_method("solver", self.solver, "solve", "DualActiveSet()")
+        velocity = prediction.form == "velocity"
+        self._most = 1 if velocity else iterations or _MOST
         self._prior = self.prediction.linearizer.prior_variances()
         rows, hard = (
             self.prediction.constraints,
@@ -155,109 +191,172 @@ class GPMPC:
         """
         return self._decide(
             self.prediction.read(belief, reference, previous, parameters, plan),
-            [perf_counter()],
+            Stopwatch(),
         )
 
     def _decide(
-        self, request: Request, laps: list[float], prediction: Prediction | None = None
+        self,
+        request: Request,
+        stopwatch: Stopwatch,
+        prediction: Prediction | None = None,
     ) -> Decision:
         """The decision on a request from the prediction at its first guess: failed where numbers are not finite."""
         if not request.finite:
             return request.failed_decision(Status.INVALID_MEASUREMENT)
         try:
             if prediction is None:
-                prediction = self.prediction.linearize(
-                    self.prediction.initial_guess(request), request
-                )
-            return self._improve(prediction, request, laps)
+                guess = self.prediction.initial_guess(request)
+                prediction = self.prediction.linearize(guess, request)
+            return self._improve(prediction, request, stopwatch)
         except FAILURES as error:
-            at_function = isinstance(error, FunctionNotFinite)
-            status = (
-                Status.FUNCTION_NOT_FINITE if at_function else Status.NUMERICAL_TROUBLE
-            )
-            return request.failed_decision(status, timing=_timing(laps))
+            status = Status.NUMERICAL_TROUBLE
+            if isinstance(error, FunctionNotFinite):
+                status = Status.FUNCTION_NOT_FINITE
+            return request.failed_decision(status, timing=stopwatch.timing)
 
     def _improve(
-        self, prediction: Prediction, request: Request, laps: list[float]
+        self, prediction: Prediction, request: Request, stopwatch: Stopwatch
     ) -> Decision:
-        """The decision from a prediction: program by program, up to a KKT point or the last one."""
+        """The decision from a prediction: program by program, to a plan that is good enough or the last program."""
         guess = prediction.plan
         solution = None if request.previous is None else request.previous.solution
         iteration: Iteration | None = None
-        limit = self.iterations or _MOST
-        one = limit == 1 or self.prediction.settings.form == "velocity"
         steps: list[float] = []
-        solved_at, count = None, 0
+        status: Status | None = None
+        count = 0
         while True:
-            laps.append(perf_counter())
-            program = condense(
-                prediction.cost,
-                self.prediction.bounds,
-                prediction.stages,
-                prediction.plan.states[0],
-                request.references,
-                prediction.rows,
-            )
+            stopwatch.lap("model")
+            program = self._condense(prediction, request)
             if iteration is not None:
                 program = iteration.correct(program, prediction)
-            laps.append(perf_counter())
+            stopwatch.lap("build")
             solution = self._solve(program, solution)
-            laps.append(perf_counter())
+            stopwatch.lap("solve")
             count += 1
-            status: Status | None = solution.status
+            status = solution.status
+            ending = prediction
             if not _is_usable(program, solution, prediction.plan):
                 break
             proposed = _expand(program, solution, prediction, request)
-            solved_at = prediction, program.feedback
-            enough = one
-            if not one and self.iterations is None and count == 1:
-                enough, step = continues(
+            enough = self._most == 1
+            if self.iterations is None and count == 1 and not enough:
+                continuity = measure_continuity(
                     self.prediction, request, prediction, solution, proposed
                 )
-                steps = [step]
+                enough = continuity.continues
+                steps = [continuity.step]
             if enough:  # the real-time iteration takes the whole step
-                prediction = prediction._replace(plan=proposed)
+                ending = prediction._replace(plan=proposed)
+            else:
+                if iteration is None:
+                    iteration = Iteration(self.prediction, request, self._tolerance)
+                ending, status = iteration(prediction, program, solution, proposed)
+                steps = iteration.steps
+                if status is None and count < self._most:
+                    prediction = ending
+                    continue
+            within_tolerance = self.iterations is not None and status is Status.SOLVED
+            open_defects = not (enough or within_tolerance)
+            if open_defects or self.prediction.constraints.smooth:
+                ending = self.prediction.obey(
+                    ending, prediction, program.feedback, request
+                )
+            if self._keeps_promise(ending, solution, request):
                 break
-            if iteration is None:
-                iteration = Iteration(self.prediction, request, self._tolerance)
-            prediction, status = iteration(prediction, program, solution, proposed)
-            steps = iteration.steps
-            if status is not None or count == limit:
+            if count == self._most:
+                status = None if self._most > 1 else status
                 break
-        if solved_at is not None and self.prediction.settings.rolled_out:
-            obeying = self.prediction.roll_out(prediction.plan, *solved_at, request)
-            prediction = (
-                obeying if np.isfinite(obeying.plan.states).all() else prediction
-            )
-        laps.append(perf_counter())
-        timing = _timing(laps)
-        program, status = (
-            QuadraticProgram.unchecked(*program[:5]),
-            Status.ITERATION_LIMIT if status is None else status,
+            # A curved bound lies elsewhere than the program saw it.
+            prediction = self.prediction.linearize(ending.plan, request)
+        if ending.plan is not guess and self.prediction.settings.rolled_out:
+            ending = self.prediction.obey(ending, prediction, program.feedback, request)
+        stopwatch.lap("model")
+        if status is None:
+            status = Status.ITERATION_LIMIT
+        outcome = Outcome(program, solution, status, count, tuple(steps))
+        return self._conclude(ending, guess, outcome, request, stopwatch.timing)
+
+    def _condense(self, prediction: Prediction, request: Request) -> CondensedProgram:
+        """The program at a prediction."""
+        return condense(
+            prediction.cost,
+            self.prediction.bounds,
+            prediction.stages,
+            prediction.plan.states[0],
+            request.references,
+            prediction.rows,
         )
-        suboptimal = not status.solved and prediction.plan is not guess
-        suboptimal = (
-            suboptimal
-            and price_violations(self._hard, prediction.rows, prediction.plan, 1.0)
-            <= FEASIBLE
+
+    def _keeps_promise(
+        self, ending: Prediction, solution: QPSolution, request: Request
+    ) -> bool:
+        """Whether a plan misses smooth constraints by no more than its program did."""
+        if not self.prediction.constraints.smooth:
+            return True
+        promised = float(solution.violation().max(initial=0.0))
+        return self._violation(ending, request) <= promised + _KEPT
+
+    def _violation(self, prediction: Prediction, request: Request) -> float:
+        """By how much a plan misses a bound, at most."""
+        return call_unchecked(
+            largest_violation,
+            prediction.rows,
+            self.prediction.bounds,
+            prediction.plan,
+            request.references.previous_input,
         )
-        if not (status.solved or suboptimal):
-            return replace(
-                request.failed_decision(status, count, timing),
-                problem=program,
-                solution=solution,
-            )
+
+    def _conclude(
+        self,
+        prediction: Prediction,
+        guess: Plan,
+        outcome: Outcome,
+        request: Request,
+        timing: Timing,
+    ) -> Decision:
+        """The decision for the plan of a prediction: failed where it is the guess or misses a hard bound."""
+        status = outcome.status
+        program = QuadraticProgram.unchecked(*outcome.program[:5])
         plan = prediction.plan
+        suboptimal = False
+        if not status.solved and plan is not guess:
+            missed = price_violations(self._hard, prediction.rows, plan, 1.0)
+            suboptimal = missed <= FEASIBLE
+        if not (status.solved or suboptimal):
+            failed = request.failed_decision(status, outcome.count, timing)
+            return replace(failed, problem=program, solution=outcome.solution)
+        violation = self._violation(prediction, request)
+        if status is Status.SOLVED and violation > _KEPT:
+            status = Status.SOFT_BOUND_MISSED
+        stage_costs = call_unchecked(
+            evaluate_stages,
+            prediction.cost,
+            plan.states,
+            plan.inputs,
+            request.references,
+            1.0,
+        )
         means, covariances = self.prediction.linearizer.moments(
             plan.states, prediction.covariances
         )
         novelty = call_unchecked(_largest_ratio, prediction.stages.V, self._prior)
-        inputs, found = (
-            plan.inputs.copy(),
-            (program, solution, request.disturbance, suboptimal, novelty, tuple(steps)),
-        )
+        inputs = plan.inputs.copy()
         return Decision(
-            inputs[0], inputs, means, covariances, status, count, timing, *found
+            input=inputs[0],
+            inputs=inputs,
+            means=means,
+            covariances=covariances,
+            status=status,
+            iterations=outcome.count,
+            timing=timing,
+            problem=program,
+            solution=outcome.solution,
+            disturbance=request.disturbance,
+            suboptimal=suboptimal,
+            novelty=novelty,
+            stage_costs=stage_costs,
+            violation=violation,
+            steps=outcome.steps,
         )
 
     def with_model(self, model: DynamicsModel) -> "GPMPC":
@@ -287,10 +386,10 @@ class GPMPC:
         try:
             made = iter(self.prediction.linearize_many(known))
         except FAILURES:  # one of them spoils the batch: which one, they say alone
-            return [self._decide(request, [perf_counter()]) for request in requests]
+            return [self._decide(request, Stopwatch()) for request in requests]
         share = (perf_counter() - began) / max(1, len(known))
         return [
-            self._decide(r, [perf_counter() - share], next(made) if r.finite else None)
+            self._decide(r, Stopwatch(share), next(made) if r.finite else None)
             for r in requests
         ]
 
@@ -394,12 +493,6 @@ def _is_usable(program: CondensedProgram, solution: QPSolution, plan: Plan) -> b
 def _violation(solution: QPSolution) -> float:
     """The largest violation of a hard row."""
     return float(solution.violation()[np.isinf(solution.caps)].max(initial=0.0))
-
-
-def _timing(laps: list[float]) -> Timing:
-    """Sums the times between laps, of the model, of building and of solving in turns."""
-    parts = [end - begin for begin, end in pairwise(laps)]
-    return Timing(sum(parts[::3]), sum(parts[1::3]), sum(parts[2::3]))
 
 
 @compiled
