@@ -11,18 +11,18 @@ class Status(Enum):
     """How a solve ended; the value is the advice to the user."""
 
     SOLVED = "solved to the requested tolerance"
-    SOFT_BOUND_MISSED = "solved, but no plan near this one keeps a soft bound: loosen it, or see how far it is missed"
     INFEASIBLE = "no point satisfies the constraints: soften state constraints, or loosen the bounds"
     ITERATION_LIMIT = "stopped at the iteration limit: raise the limit, or check the scaling of the problem"
     TIME_LIMIT = (
         "stopped at the time limit: raise the limit, shorten the horizon, or warm-start"
     )
-    STALLED = "no step lowers the cost any more, short of the tolerance: the plan is the best there was; loosen it"
     NUMERICAL_TROUBLE = "the residuals could not be brought to the tolerance: check the scaling of the problem"
     INVALID_MEASUREMENT = (
         "the state is not finite: check the estimator; the last plan can bridge a gap"
     )
     FUNCTION_NOT_FINITE = "a constraint or output, or its gradient, is not finite along the plan: check it at its start"
+    SOFT_BOUND_MISSED = "solved, but no plan near this one keeps a soft bound: loosen it, or see how far it is missed"
+    STALLED = "no step lowers the cost any more, short of the tolerance: the plan is the best there was; loosen it"
 
     @property
     def solved(self) -> bool:

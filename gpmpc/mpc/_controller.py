@@ -32,6 +32,7 @@ Array = np.ndarray
 
 _FAR = 0.9  # of the standard deviation without data
 FEASIBLE = 1e-3  # by how much a suboptimal plan may miss hard bounds, in their units: a next step mends it
+KEPT = 1e-5  # by how much a bound may be missed that counts as kept, in its unit
 _NO_PLAN = np.empty((0, 0))
 _FLOAT64 = np.dtype(np.float64)
 

@@ -53,6 +53,7 @@ from gpmpc.mpc._linear_quadratic import (
     QuadraticCost,
     StageRows,
     Stages,
+    evaluate_stages,
     finite_horizon_lqr,
 )
 from gpmpc.mpc._stages import (
@@ -63,6 +64,7 @@ from gpmpc.mpc._stages import (
     StageCosts,
     StageLinearizer,
     keep_rates,
+    largest_violation,
 )
 from gpmpc.mpc.problem import Problem
 from gpmpc.propagation import Linearization, Propagator
@@ -372,6 +374,27 @@ class PredictionModel:
             n = self.problem.state_dim
             c[n:] = stages.c[0, n:]
         return stages._replace(c=c[None])
+
+    def violation(self, prediction: Prediction, request: Request) -> float:
+        """By how much the plan of a prediction misses a bound, at most."""
+        return call_unchecked(
+            largest_violation,
+            prediction.rows,
+            self.bounds,
+            prediction.plan,
+            request.references.previous_input,
+        )
+
+    def stage_costs(self, prediction: Prediction, request: Request) -> Array:
+        """What each stage of the plan of a prediction costs (H,)."""
+        return call_unchecked(
+            evaluate_stages,
+            prediction.cost,
+            prediction.plan.states,
+            prediction.plan.inputs,
+            request.references,
+            1.0,
+        )
 
     def obey(
         self,

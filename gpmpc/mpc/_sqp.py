@@ -223,6 +223,10 @@ class Iteration:
         # What could still be gained: the offset's square is a share of the cost.
         if self._size**2 <= _ROUND_OFF:
             return prediction._replace(plan=proposed), Status.SOLVED
+        if self._updates:  # they may be what misleads
+            self._updates.clear()
+            self._last = None
+            return prediction, None
         return prediction, Status.STALLED
 
     def _remember(

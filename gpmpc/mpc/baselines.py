@@ -38,6 +38,7 @@ from gpmpc.gaussian import Gaussian
 from gpmpc.gp.casadi_ import successor_function
 from gpmpc.mpc._controller import (
     FEASIBLE,
+    KEPT,
     Decision,
     Reference,
     Request,
@@ -156,6 +157,7 @@ class NMPC:
             np.zeros((H + 1, n, n)),
             *ended,
             suboptimal=suboptimal,
+            violation=max(0.0, float(violation)),
         )
 
 
@@ -338,11 +340,27 @@ class StateFormMPC:
         )
         if not (status.solved or suboptimal):
             return request.failed_decision(status, iterations, timing)
-        inputs, states = np.array(self._inputs.value), np.array(self._states.value)
-        beliefs = self.prediction.linearizer.moments(states, prediction.covariances)
-        ended: Any = {"disturbance": request.disturbance, "suboptimal": suboptimal}
+        inputs = np.ascontiguousarray(self._inputs.value)
+        states = np.ascontiguousarray(self._states.value)
+        linearizer = self.prediction.linearizer
+        means, covariances = linearizer.moments(states, prediction.covariances)
+        plan = Plan(states, inputs, prediction.covariances)
+        planned = prediction._replace(plan=plan)
+        violation = self.prediction.violation(planned, request)
+        if status is Status.SOLVED and violation > KEPT:
+            status = Status.SOFT_BOUND_MISSED
         return Decision(
-            inputs[0], inputs, *beliefs, status, iterations, timing, **ended
+            input=inputs[0],
+            inputs=inputs,
+            means=means,
+            covariances=covariances,
+            status=status,
+            iterations=iterations,
+            timing=timing,
+            disturbance=request.disturbance,
+            suboptimal=suboptimal,
+            stage_costs=self.prediction.stage_costs(planned, request),
+            violation=violation,
         )
 
     def _build(self, constraints: Callable[[Any, Any], list] | None) -> None:

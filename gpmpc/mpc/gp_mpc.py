@@ -28,6 +28,7 @@ from gpmpc.gaussian import Gaussian
 from gpmpc.mpc._condense import condense
 from gpmpc.mpc._controller import (
     FEASIBLE,
+    KEPT,
     Decision,
     Reference,
     Request,
@@ -35,13 +36,12 @@ from gpmpc.mpc._controller import (
     check_method,
 )
 from gpmpc.mpc._cost import FunctionNotFinite
-from gpmpc.mpc._linear_quadratic import CondensedProgram, evaluate_stages, expand
+from gpmpc.mpc._linear_quadratic import CondensedProgram, expand
 from gpmpc.mpc._prediction import Prediction, PredictionModel, PredictionSettings
 from gpmpc.mpc._sqp import FAILURES, Iteration, measure_continuity
 from gpmpc.mpc._stages import (
     Covariance,
     Plan,
-    largest_violation,
     price_violations,
 )
 from gpmpc.mpc.problem import Problem
@@ -55,7 +55,6 @@ Array = np.ndarray
 _DEFAULT = PredictionSettings()
 _MOST = 10
 _LOOSE = 1e-2
-_KEPT = 1e-5  # by how much a bound may be missed that is kept
 
 
 class Stopwatch:
@@ -258,9 +257,7 @@ class GPMPC:
             within_tolerance = self.iterations is not None and status is Status.SOLVED
             open_defects = not (enough or within_tolerance)
             if open_defects or self.prediction.constraints.smooth:
-                ending = self.prediction.obey(
-                    ending, prediction, program.feedback, request
-                )
+                ending = self._obey(ending, prediction, program, request)
             if self._keeps_promise(ending, solution, request):
                 break
             if count == self._most:
@@ -294,17 +291,24 @@ class GPMPC:
         if not self.prediction.constraints.smooth:
             return True
         promised = float(solution.violation().max(initial=0.0))
-        return self._violation(ending, request) <= promised + _KEPT
+        return self.prediction.violation(ending, request) <= promised + KEPT
 
-    def _violation(self, prediction: Prediction, request: Request) -> float:
-        """By how much a plan misses a bound, at most."""
-        return call_unchecked(
-            largest_violation,
-            prediction.rows,
-            self.prediction.bounds,
-            prediction.plan,
-            request.references.previous_input,
-        )
+    def _obey(
+        self,
+        ending: Prediction,
+        linearized: Prediction,
+        program: CondensedProgram,
+        request: Request,
+    ) -> Prediction:
+        """The prediction whose plan obeys the dynamics.
+
+        It is the ending itself where that leads out of the model's numbers.
+        """
+        try:
+            feedback = program.feedback
+            return self.prediction.obey(ending, linearized, feedback, request)
+        except FAILURES:
+            return ending
 
     def _conclude(
         self,
@@ -325,17 +329,10 @@ class GPMPC:
         if not (status.solved or suboptimal):
             failed = request.failed_decision(status, outcome.count, timing)
             return replace(failed, problem=program, solution=outcome.solution)
-        violation = self._violation(prediction, request)
-        if status is Status.SOLVED and violation > _KEPT:
+        violation = self.prediction.violation(prediction, request)
+        if status is Status.SOLVED and violation > KEPT:
             status = Status.SOFT_BOUND_MISSED
-        stage_costs = call_unchecked(
-            evaluate_stages,
-            prediction.cost,
-            plan.states,
-            plan.inputs,
-            request.references,
-            1.0,
-        )
+        stage_costs = self.prediction.stage_costs(prediction, request)
         means, covariances = self.prediction.linearizer.moments(
             plan.states, prediction.covariances
         )

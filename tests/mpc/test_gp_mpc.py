@@ -413,7 +413,8 @@ def test_feedback_keeps_a_long_horizon_feasible_where_open_loop_is_not():
         [0.0],
         prediction=PredictionSettings(feedback=False),
     ).control(belief, reference)
-    assert softened.status is Status.SOLVED
+    assert softened.status is Status.SOFT_BOUND_MISSED
+    assert softened.violation > 1e-3
 
 
 def test_soft_bounds_cost_what_they_are_said_to_cost():

@@ -10,7 +10,15 @@ from gpmpc.mpc._linear_quadratic import (
     StageRows,
     evaluate_cost,
 )
-from gpmpc.mpc._sqp import _assess, _between, _costates, _merit, _smallest_cost, _update
+from gpmpc.mpc._sqp import (
+    PriceTerms,
+    _between,
+    _costates,
+    _forecast_step,
+    _merit,
+    _smallest_cost,
+    _update,
+)
 from gpmpc.mpc._stages import Plan, keep_rates, price_violations
 
 H, N, M, P, R = 3, 2, 2, 4, 2  # stages, states, inputs, entries of s, rows
@@ -61,7 +69,7 @@ class Case:
 
     @property
     def terms(self):
-        return self.references, self.prices, self.row_price
+        return PriceTerms(self.references, self.prices, self.row_price)
 
     def cost_of(self, plan):
         return evaluate_cost(self.cost, plan.states, plan.inputs, self.references, 1.0)
@@ -152,31 +160,30 @@ def test_what_a_step_promises_is_measured_against_what_the_plan_costs(
     for _ in range(5):
         case = Case(rng, squares, inputs)
         before = np.full(P, known)
-        stages = case.A, case.after
-        arguments = (
+        forecast = _forecast_step(
             case.cost,
             case.terms,
             before,
-            stages,
+            case.A,
+            case.after,
             case.rows,
             case.plan,
             case.proposed,
             case.z,
         )
-        here, curvature, promised, largest, merit, prices = _assess(*arguments)
         zero = References(*(np.zeros_like(part) for part in case.references))
         step = [b - a for a, b in zip(case.plan[:2], case.proposed[:2], strict=True)]
         missed = np.abs(case.after - case.plan.states[1:])
-        assert here == pytest.approx(
+        assert forecast.cost == pytest.approx(
             case.cost_of(case.plan) + case.price_of(case.plan), rel=1e-12
         )
-        assert curvature == pytest.approx(
+        assert forecast.curvature == pytest.approx(
             evaluate_cost(case.cost, *step, zero, 0.0), rel=1e-12
         )
-        assert promised == pytest.approx(
+        assert forecast.promised == pytest.approx(
             case.cost_of(case.proposed) + case.price_of(case.proposed), rel=1e-12
         )
-        assert largest == pytest.approx(
+        assert forecast.defect == pytest.approx(
             missed.max() / max(1.0, np.abs(case.plan.states[1:]).max()), rel=1e-12
         )
         costates = _costates(
@@ -188,9 +195,13 @@ def test_what_a_step_promises_is_measured_against_what_the_plan_costs(
             case.z,
         )
         np.testing.assert_allclose(
-            prices, np.maximum(known, 1.5 * np.abs(costates).max(axis=0)), rtol=1e-12
+            forecast.defect_prices,
+            np.maximum(known, 1.5 * np.abs(costates).max(axis=0)),
+            rtol=1e-12,
         )
-        assert merit == pytest.approx(here + missed.sum(axis=0) @ prices, rel=1e-12)
+        assert forecast.merit == pytest.approx(
+            forecast.cost + missed.sum(axis=0) @ forecast.defect_prices, rel=1e-12
+        )
         assert (before == known).all()
 
 

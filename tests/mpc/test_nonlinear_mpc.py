@@ -319,7 +319,7 @@ def test_soft_bounds_give_way_and_their_price_is_at_its_minimum(price, rng):
         swing(H, 1.3),
     )  # beyond its bound already
     decision = controller.control(at, reference)
-    assert decision.status is Status.SOLVED
+    assert decision.status is Status.SOFT_BOUND_MISSED
     assert decision.means[1, 0] > 0.75
     request = request_of(problem, H, at, reference=reference)
 

@@ -413,8 +413,11 @@ def test_the_first_step_from_the_last_plan_needs_no_roll_out_and_ends_where_othe
     last = controller.control(Gaussian.certain(np.zeros(6)), reference)
     assert rolled
     rolled.clear()
-    warm = controller.control(moved, reference, last)
+    near = Gaussian.certain(last.means[1] + 1e-3)
+    assert controller.control(near, reference, last).status is Status.SOLVED
     assert not rolled
+    warm = controller.control(moved, reference, last)
+    rolled.clear()
     given = controller.control(moved, reference, last, plan=(last.inputs, last.means))
     assert rolled
     assert (last.status, warm.status, given.status) == (Status.SOLVED,) * 3

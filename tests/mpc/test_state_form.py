@@ -54,16 +54,20 @@ def test_it_gives_the_inputs_of_the_condensed_program(form, covariance, prices):
         HOVER,
         PredictionSettings(form, covariance),
     )
-    controllers = [GPMPC(*arguments), StateFormMPC(*arguments)]
+    controllers = [GPMPC(*arguments, iterations=1), StateFormMPC(*arguments)]
     if not prices:
-        controllers.append(GPMPC(*arguments, CvxpySolver()))
+        controllers.append(GPMPC(*arguments, CvxpySolver(), iterations=1))
     state, last, worked = np.array([0.8, 0.2, -0.4, 0.1, 0.3, 0.0]), None, 0
     for _ in range(3):
         decisions = [
             c.control(Gaussian.certain(state), REFERENCE, last) for c in controllers
         ]
-        assert [d.status for d in decisions] == [Status.SOLVED] * len(decisions)
+        violation = decisions[0].violation
+        ended = Status.SOFT_BOUND_MISSED if violation > 1e-5 else Status.SOLVED
+        assert [d.status for d in decisions] == [ended] * len(decisions)
         for other in decisions[1:]:
+            assert other.violation == pytest.approx(violation, abs=1e-6)
+            assert other.cost == pytest.approx(decisions[0].cost, rel=1e-5)
             assert np.allclose(other.inputs, decisions[0].inputs, rtol=0, atol=1e-6)
             assert np.allclose(other.means, decisions[0].means, rtol=0, atol=1e-6)
         last = decisions[0]
