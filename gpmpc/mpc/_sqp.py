@@ -68,6 +68,7 @@ _OBEYS = 1e-9  # defects, relative to the states, of a plan that was rolled out
 # of the same kind; and what linearising may have cost it, as a share of the cost.
 _FURTHER = 4.0
 _SLIGHT = 1e-3
+_NEARLY = 5.0  # tolerances, within which an iteration that stalls has arrived
 _TINY = 1e-300
 
 
@@ -111,6 +112,7 @@ def measure_continuity(
     prediction: Prediction,
     solution: QPSolution,
     proposed: Plan,
+    prices: Array,
 ) -> Continuity:
     """Whether a step is one more along the last plan, and how long it is.
 
@@ -121,7 +123,7 @@ def measure_continuity(
     measures = call_unchecked(
         _measure_step,
         prediction.cost,
-        PriceTerms(request.references, model.constraints.prices, 0.0),
+        PriceTerms(request.references, prices, 0.0),
         prediction.stages.A,
         prediction.stages.next,
         prediction.rows,
@@ -160,7 +162,14 @@ def smallest_cost(model: PredictionModel, request: Request) -> float:
 class Iteration:
     """Chooses the steps of one request's iteration, and says where it ends: at a tolerance of offset and defects."""
 
-    def __init__(self, model: PredictionModel, request: Request, tolerance: float):
+    def __init__(
+        self,
+        model: PredictionModel,
+        request: Request,
+        tolerance: float,
+        prices: Array,
+    ):
+        self._prices = prices
         self._model = model
         self._request = request
         self._tolerance = tolerance
@@ -223,6 +232,8 @@ class Iteration:
         # What could still be gained: the offset's square is a share of the cost.
         if self._size**2 <= _ROUND_OFF:
             return prediction._replace(plan=proposed), Status.SOLVED
+        if self._size**2 <= _SLIGHT and self._size <= _NEARLY * self._tolerance:
+            return prediction, Status.SOLVED
         if self._updates:  # they may be what misleads
             self._updates.clear()
             self._last = None
@@ -267,8 +278,7 @@ class Iteration:
 
     @property
     def _terms(self) -> PriceTerms:
-        prices = self._model.constraints.prices
-        return PriceTerms(self._request.references, prices, self._row_price)
+        return PriceTerms(self._request.references, self._prices, self._row_price)
 
     def _judge(self, forecast: StepForecast, first: bool) -> bool:
         """Whether the proposed plan is within the tolerance, or as near as rounding lets it come."""

@@ -276,6 +276,7 @@ class ConstraintRows:
     Attributes:
         soft: Whether a violation of any has a price.
         prices: Of the rows (r,), infinite where they are hard.
+        elastic: Whether a row gives way where it cannot be kept (r,).
         signs: 1 where a row has upper bounds, -1 where it has lower ones (r,).
         applies: Whether a row has a bound at a stage (H, r).
         smooth: Whether there is any ``Inequality``.
@@ -285,6 +286,7 @@ class ConstraintRows:
         n, self._horizon, self._covariance = problem.state_dim, horizon, covariance
         self._smooth: list[tuple[Inequality, slice]] = []
         self._plain = np.zeros((0, 0, problem.input_dim))  # no row holds inputs
+        elastic: list[bool] = []
         F, kappa, prices, lower, upper = (
             [np.empty((0, n))],
             [],
@@ -312,12 +314,14 @@ class ConstraintRows:
                 0.0 if covariance == "none" else constraint.standard_deviations(sides)
             ] * len(rows)
             prices += [problem.price(constraint)] * len(rows)
+            elastic += [constraint.penalty == "elastic"] * len(rows)
         self._F, self._lower, self._upper = (
             np.concatenate(F),
             np.hstack(lower),
             np.hstack(upper),
         )
         self._kappa, self.prices = np.array(kappa), np.array(prices)
+        self.elastic = np.array(elastic, dtype=bool)
         self.signs = np.where(np.isfinite(self._upper).any(axis=0), 1.0, -1.0)
         self.applies = np.isfinite(self._lower) | np.isfinite(self._upper)
         self.per_stage, self.soft = len(kappa), bool(np.isfinite(self.prices).any())

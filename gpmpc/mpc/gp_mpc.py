@@ -36,6 +36,7 @@ from gpmpc.mpc._controller import (
     check_method,
 )
 from gpmpc.mpc._cost import FunctionNotFinite
+from gpmpc.mpc._elastic import elastic_price, violations
 from gpmpc.mpc._linear_quadratic import CondensedProgram, expand
 from gpmpc.mpc._prediction import Prediction, PredictionModel, PredictionSettings
 from gpmpc.mpc._sqp import FAILURES, Iteration, measure_continuity
@@ -53,8 +54,11 @@ from gpmpc.status import Status
 Array = np.ndarray
 
 _DEFAULT = PredictionSettings()
-_MOST = 10
-_LOOSE = 1e-2
+_MOST = 10  # programs of a step, where their number is not set
+_LOOSE = 1e-2  # tolerance there
+_SLIGHTLY_MORE = 1.02  # than its program may a plan miss a smooth constraint
+# Price of a row that does not count: a free row keeps its place among the others.
+_NEXT_TO_NOTHING = 1e-9
 
 
 class Stopwatch:
@@ -141,20 +145,14 @@ class GPMPC:
         self.iterations, self.tolerance = iterations, tolerance
         self.solver = DualActiveSet() if solver is None else solver
         check_method("solver", self.solver, "solve", "DualActiveSet()")
+        self._is_elastic = bool(self.prediction.constraints.elastic.any())
         velocity = prediction.form == "velocity"
         self._most = 1 if velocity else iterations or _MOST
         self._prior = self.prediction.linearizer.prior_variances()
-        rows, hard = (
-            self.prediction.constraints,
-            np.full(self.prediction.bounds.rate_lower.size, np.inf),
-        )
-        self._hard = np.where(
-            np.isinf(rows.prices), np.inf, 0.0
-        )  # prices: of hard rows alone
-        self._prices = (
-            np.concatenate([hard, np.tile(rows.prices, horizon)]) if rows.soft else None
-        )  # of rows of G
-        if self._prices is not None and not isinstance(self.solver, DualActiveSet):
+        rows = self.prediction.constraints
+        # Prices: of hard rows alone.
+        self._hard = np.where(np.isinf(rows.prices), np.inf, 0.0)
+        if rows.soft and not isinstance(self.solver, DualActiveSet):
             rule = "soft constraints need DualActiveSet (penalty=None makes them hard)"
             raise SettingError("solver", f"{rule}; got {type(self.solver).__name__}")
 
@@ -220,6 +218,7 @@ class GPMPC:
         guess = prediction.plan
         solution = None if request.previous is None else request.previous.solution
         iteration: Iteration | None = None
+        prices = self.prediction.constraints.prices
         steps: list[float] = []
         status: Status | None = None
         count = 0
@@ -229,7 +228,12 @@ class GPMPC:
             if iteration is not None:
                 program = iteration.correct(program, prediction)
             stopwatch.lap("build")
-            solution = self._solve(program, solution)
+            solution = self._solve(program, solution, prices)
+            if count == 0 and solution.status.solved and self._is_elastic:
+                lower = self._give_way(program, solution, prediction, request)
+                if lower is not None:
+                    prices = lower
+                    solution = self._solve(program, solution, prices)
             stopwatch.lap("solve")
             count += 1
             status = solution.status
@@ -240,7 +244,7 @@ class GPMPC:
             enough = self._most == 1
             if self.iterations is None and count == 1 and not enough:
                 continuity = measure_continuity(
-                    self.prediction, request, prediction, solution, proposed
+                    self.prediction, request, prediction, solution, proposed, prices
                 )
                 enough = continuity.continues
                 steps = [continuity.step]
@@ -248,7 +252,9 @@ class GPMPC:
                 ending = prediction._replace(plan=proposed)
             else:
                 if iteration is None:
-                    iteration = Iteration(self.prediction, request, self._tolerance)
+                    iteration = Iteration(
+                        self.prediction, request, self._tolerance, prices
+                    )
                 ending, status = iteration(prediction, program, solution, proposed)
                 steps = iteration.steps
                 if status is None and count < self._most:
@@ -258,7 +264,8 @@ class GPMPC:
             open_defects = not (enough or within_tolerance)
             if open_defects or self.prediction.constraints.smooth:
                 ending = self._obey(ending, prediction, program, request)
-            if self._keeps_promise(ending, solution, request):
+            solved = status is not None and status.solved
+            if not solved or self._keeps_promise(ending, solution, request):
                 break
             if count == self._most:
                 status = None if self._most > 1 else status
@@ -291,7 +298,8 @@ class GPMPC:
         if not self.prediction.constraints.smooth:
             return True
         promised = float(solution.violation().max(initial=0.0))
-        return self.prediction.violation(ending, request) <= promised + KEPT
+        missed = self.prediction.violation(ending, request)
+        return missed <= _SLIGHTLY_MORE * promised + KEPT
 
     def _obey(
         self,
@@ -403,18 +411,41 @@ class GPMPC:
         )
         return self.prediction.gains(found.A, found.B, cost)
 
-    def _solve(self, program: CondensedProgram, warm: QPSolution | None) -> QPSolution:
+    def _give_way(
+        self,
+        program: CondensedProgram,
+        solution: QPSolution,
+        prediction: Prediction,
+        request: Request,
+    ) -> Array | None:
+        """Prices of the rows (r,) where the solution misses elastic ones; None where it keeps them."""
+        elastic = self.prediction.constraints.elastic
+        plan = _expand(program, solution, prediction, request)
+        planned = prediction._replace(plan=plan)
+        if violations(planned, elastic).max() <= KEPT:
+            return None
+        prices = self.prediction.constraints.prices.copy()
+        prices[elastic] = _NEXT_TO_NOTHING
+        free = self._solve(program, solution, prices)
+        plan = _expand(program, free, prediction, request)
+        planned = prediction._replace(plan=plan)
+        cost = float(self.prediction.stage_costs(planned, request).sum())
+        prices[elastic] = elastic_price(planned, cost, elastic, self.problem.cost.Q)
+        return prices
+
+    def _solve(
+        self, program: CondensedProgram, warm: QPSolution | None, row_prices: Array
+    ) -> QPSolution:
+        """The solution of a program, its violations priced by row (r,)."""
         if isinstance(self.solver, DualActiveSet):
-            prices = self._prices
-            if prices is not None and len(
-                program.feedback
-            ):  # there the bounds of inputs are rows, too
-                prices = np.concatenate(
-                    [np.full(len(program.G) - len(prices), np.inf), prices]
-                )
-            return self.solver.solve(
-                QuadraticProgram.unchecked(*program[:5]), warm, prices
-            )
+            prices = None
+            if self.prediction.constraints.soft:
+                # The rows of the states are the last ones; all others are hard.
+                prices = np.full(len(program.G), np.inf)
+                soft = np.tile(row_prices, self.horizon)
+                prices[len(prices) - len(soft) :] = soft
+            problem = QuadraticProgram.unchecked(*program[:5])
+            return self.solver.solve(problem, warm, prices)
         fits = warm is not None and warm.arrays[2].shape == program.G.shape
         return self.solver.solve(
             QuadraticProgram.from_stacked(*program[:5]), warm if fits else None

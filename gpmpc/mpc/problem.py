@@ -10,7 +10,8 @@ led to it. For a Gaussian x_i, E|x - r|^2_Q = |mu - r|^2_Q + tr(Q Sigma).
 A constraint g'x <= f of a Gaussian state holds with probability eta where g'mu + kappa sqrt(g'Sigma g) <= f,
 kappa = Phi^-1(eta); smooth ones, h(x, u, p) <= 0, are linearised along the plan. By default a constraint is soft: a
 violation pays a price, so that a program always has a solution. The penalty is exact (Fletcher, 1987, section 14.3): as
-long as the price exceeds what the cost can gain by a violation, no plan that can keep the constraint pays it.
+long as the price exceeds what the cost can gain by a violation, no plan that can keep the constraint pays it. Where it
+cannot be kept, an elastic one gives way: its price falls to what cannot outweigh the cost (``gpmpc.mpc._elastic``).
 """
 
 import math
@@ -50,9 +51,10 @@ class Constraint:
     probability: float | None = None
     #: standard deviations between the mean and a side; Phi^-1(eta) unless given (the paper takes 2 for 0.95)
     kappa: float | None = None
-    #: price of a violation per unit and stage; ``"exact"``: one that no plan pays which can keep the constraint; None:
-    #: hard
-    penalty: float | Literal["exact"] | None = "exact"
+    #: price of a violation per unit and stage; ``"exact"``: one that no plan pays which can keep the constraint;
+    #: ``"elastic"``: the exact one, and where the constraint cannot be kept one that keeps the cost of the plan within
+    #: five times that of the plan without it (``gpmpc.mpc._elastic``); None: hard
+    penalty: float | Literal["elastic", "exact"] | None = "elastic"
     stages: Iterable[int] | None = (
         None  #: those of 1 .. H that it holds at, such as ``range(5, 11)``; all by default
     )
@@ -70,7 +72,7 @@ class Constraint:
             raise SettingError("joint", "needs a probability")
         if self.kappa is not None:
             check_number("kappa", self.kappa, least=0)
-        if self.penalty is not None and self.penalty != "exact":
+        if self.penalty is not None and self.penalty not in ("elastic", "exact"):
             check_number("penalty", self.penalty, above=0)
         if self.stages is not None:
             stages = tuple(self.stages) if isinstance(self.stages, Iterable) else ()
@@ -282,7 +284,7 @@ class Problem:
             if (box.probability, box.kappa, box.penalty, box.stages) != (
                 None,
                 None,
-                "exact",
+                "elastic",
                 None,
             ):
                 raise SettingError(
@@ -357,7 +359,7 @@ class Problem:
 
     def price(self, constraint: Constraint) -> float:
         """Returns the price of violating a constraint, infinite for a hard one."""
-        if constraint.penalty != "exact":
+        if constraint.penalty not in ("elastic", "exact"):
             return math.inf if constraint.penalty is None else float(constraint.penalty)
         weights = (
             self.cost.Q,
