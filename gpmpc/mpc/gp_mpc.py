@@ -126,10 +126,10 @@ class GPMPC:
         )
         if iterations is not None:
             check_number("iterations", iterations, least=1, whole=True)
-        self._tolerance = (
+        self.tolerance = (
             (_LOOSE if iterations is None else 1e-6) if tolerance is None else tolerance
         )
-        check_number("tolerance", self._tolerance, above=0)
+        check_number("tolerance", self.tolerance, above=0)
         if (
             iterations is not None
             and iterations > 1
@@ -253,7 +253,7 @@ class GPMPC:
             else:
                 if iteration is None:
                     iteration = Iteration(
-                        self.prediction, request, self._tolerance, prices
+                        self.prediction, request, self.tolerance, prices
                     )
                 ending, status = iteration(prediction, program, solution, proposed)
                 steps = iteration.steps
