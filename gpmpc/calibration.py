@@ -286,9 +286,7 @@ def calibrate(
 def _noise_in_words(moves_the_state: bool, sensors_known: bool) -> str:
     """Which noise predicted intervals hold."""
     if moves_the_state and sensors_known:
-        return (
-            "the model's noise at every step, the sensors' at the first and the last"
-        )
+        return "the model's noise at every step, the sensors' at the first and the last"
     if moves_the_state:
         return "the model's noise at every step"
     if sensors_known:

@@ -13,7 +13,8 @@ nonlinear problem itself. Where the iteration ends, in the covariance modes of `
 * ``none``: the cost of the means.
 """
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import replace
 from itertools import pairwise
@@ -22,7 +23,7 @@ from typing import Any
 
 import numpy as np
 
-from gpmpc._compiled import call_unchecked, compiled
+from gpmpc._compiled import call_unchecked
 from gpmpc._dynamics import DynamicsModel, linearize
 from gpmpc.exceptions import SettingError, check_number
 from gpmpc.gaussian import Gaussian
@@ -37,6 +38,7 @@ from gpmpc.mpc._controller import (
 )
 from gpmpc.mpc._cost import FunctionNotFinite
 from gpmpc.mpc._linear_quadratic import CondensedProgram, expand
+from gpmpc.mpc._novelty import data_scales, later, novelty_of
 from gpmpc.mpc._prediction import Prediction, PredictionModel, PredictionSettings
 from gpmpc.mpc._sqp import FAILURES, Globalization
 from gpmpc.mpc._stages import Covariance, Plan, price_violations
@@ -98,7 +100,7 @@ class GPMPC:
         self.iterations, self.tolerance = iterations, tolerance
         self.solver = DualActiveSet() if solver is None else solver
         check_method("solver", self.solver, "solve", "DualActiveSet()")
-        self._prior = self.prediction.linearizer.prior_variances()
+        self._scales = data_scales(model)
         rows, hard = (
             self.prediction.constraints,
             np.full(self.prediction.bounds.rate_lower.size, np.inf),
@@ -238,14 +240,25 @@ class GPMPC:
         means, covariances = self.prediction.linearizer.moments(
             plan.states, prediction.covariances
         )
-        novelty = call_unchecked(_largest_ratio, prediction.stages.V, self._prior)
-        inputs, found = (
-            plan.inputs.copy(),
-            (program, solution, request.disturbance, suboptimal, novelty),
-        )
+        inputs = plan.inputs.copy()
+        novelty = self._novelty(prediction, means, inputs, covariances)
+        found = program, solution, request.disturbance, suboptimal, novelty
         return Decision(
             inputs[0], inputs, means, covariances, status, count, timing, *found
         )
+
+    def _novelty(
+        self, prediction: Prediction, means: Array, inputs: Array, covariances: Array
+    ) -> float | Callable[[], float]:
+        """How far a plan is from the data; to be measured when it is read, where its stages hold no variances."""
+        if self._scales is None:
+            return math.nan
+        linearizer = self.prediction.linearizer
+        if linearizer.covariance == "zero_order":
+            V = prediction.stages.V
+            return novelty_of(V, linearizer.noise, covariances, self._scales)
+        model = self.prediction.model
+        return later(model, means, inputs, covariances, self._scales)
 
     def with_model(self, model: DynamicsModel) -> "GPMPC":
         """Returns the controller for another model of as many states and inputs, in microseconds."""
@@ -368,13 +381,3 @@ def _timing(laps: list[float]) -> Timing:
     """Sums the times between laps, of the model, of building and of solving in turns."""
     parts = [end - begin for begin, end in pairwise(laps)]
     return Timing(sum(parts[::3]), sum(parts[1::3]), sum(parts[2::3]))
-
-
-@compiled
-def _largest_ratio(V, prior):
-    """The root of the largest V_kii / prior_i; NaN without a prior."""
-    largest = 0.0 if len(prior) > 0 else np.nan
-    for k in range(len(V)):
-        for i in range(len(prior)):
-            largest = max(largest, V[k, i, i] / prior[i] if prior[i] > 0.0 else 0.0)
-    return np.sqrt(largest)

@@ -82,7 +82,6 @@ def check_propagator(
     Raises:
         AssertionError: The propagator breaks a promise; the message says which, and by how much.
     """
-
     if process_noise is None:
         process_noise = bool(getattr(propagator, "process_noise", False))
 

@@ -231,7 +231,9 @@ class WrongDerivative(MomentMatching):
     def differentiate(self, model, belief, input=None):
         from gpmpc.propagation._propagator import by_autograd
 
-        moved, d = by_autograd(MomentMatching(process_noise=False), model, belief, input)
+        moved, d = by_autograd(
+            MomentMatching(process_noise=False), model, belief, input
+        )
         return moved, replace(
             d, covariance_by_covariance=1.01 * d.covariance_by_covariance
         )
