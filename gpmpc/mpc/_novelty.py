@@ -15,7 +15,6 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-import torch
 
 from gpmpc._compiled import call_unchecked, compiled
 from gpmpc._dynamics import Array, DynamicsModel, linearize, to_array
@@ -50,12 +49,12 @@ def _learned_variances(gp: GPPosterior) -> Array:
     A GP that found nothing but noise is not asked to know more than to within the noise.
     """
     signal = to_array(gp.signal_variance)
-    noise = to_array(gp.noise_variance)
-    # Of a sparse model's pseudo-observations the spread says nothing.
-    first = gp.cholesky[:, :_ROWS, :_ROWS].square().sum(-1)
-    diagonal = (gp.signal_variance + gp.noise_variance)[:, None].expand_as(first)
-    if not torch.allclose(first, diagonal, rtol=1e-6):
+    rows = gp.cholesky[:, :_ROWS, :_ROWS].square().sum(-1)
+    noise = to_array(rows) - signal[:, None]
+    # The noise of pseudo-observations differs from one to the next, and their spread says nothing.
+    if (np.ptp(noise, axis=1) > 1e-6 * (signal + noise[:, 0])).any():
         return signal
+    noise = noise[:, 0].clip(0.0)
     spread = to_array(gp.targets.var(dim=0, correction=0))
     constant = spread <= 0.0
     return np.where(constant, signal, np.maximum(np.minimum(signal, spread), noise))
