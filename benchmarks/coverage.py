@@ -28,7 +28,6 @@ from gpmpc.cli._settings import compose, settings
 from gpmpc.datasets import RandomData
 from gpmpc.estimation import SeparatedNoise, separate_noise
 from gpmpc.gp import Trainer, Transitions, standardize
-from gpmpc.models import ResidualModel
 from gpmpc.propagation import MomentMatching, Unscented, best_propagator
 from gpmpc.simulation import Noise
 from gpmpc.studies._document import Table, terminal

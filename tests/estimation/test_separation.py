@@ -87,7 +87,7 @@ def test_intervals_of_noisy_sensors_are_honest_only_with_what_was_separated():
     judge = partial(calibrate, propagator=Linearization(), horizon=15)
     apart = judge(found.model, fresh, measurement_noise=known)
     cautious = judge(model, fresh)
-    assert 0.88 < float(apart.coverage[-1, :, -1].min())
+    assert float(apart.coverage[-1, :, -1].min()) > 0.88
     assert float(apart.coverage[:, :, -1].mean()) < 0.98
     assert float(cautious.coverage[-1, :, -1].min()) > 0.985
     assert float(cautious.width[-1].min()) > 1.4 * float(apart.width[-1].max())
