@@ -195,8 +195,6 @@ def calibrate(given: argparse.Namespace) -> Result:
     ]
     horizon = min(given.steps, max(map(len, flown)))
     names = [f"{name} [{system.units.get(name, '?')}]" for name in system.state_names]
-    # The settings say how noisy the sensors of their own flight were, not of others.
-    noise = experiment.noise if not given.flights else None
     with console.status("predicting"):
         found = calibration.calibrate(
             model,
@@ -205,7 +203,6 @@ def calibrate(given: argparse.Namespace) -> Result:
             levels=_LEVELS,
             names=names,
             angles=system.angle_indices,
-            measurement_noise=noise and noise.measurement,
         )
     notes.append(f"Intervals hold {found.noise}.")
     rows = []
