@@ -1,6 +1,6 @@
 """How often predicted intervals hold what happens, by which noise they hold, on flights that nobody trained on.
 
-    .venv/bin/python -m benchmarks.coverage [pendulum cart_pole ... car] [--flights 6] [--seeds 1]
+    .venv/bin/python -m benchmarks.coverage [pendulum cart_pole ... car] [--flights 4] [--seeds 1]
 
 Plants of the gallery are learned and flown with the settings that ``gpmpc run system=NAME`` has, once with a noise that
 moves the state and once with sensors that are as noisy; the car (a dynamic bicycle of 1:10, tyres that saturate) drives
@@ -210,7 +210,7 @@ def main() -> None:
     """Learns, flies, predicts and prints."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("plants", nargs="*", default=list(NOISES))
-    parser.add_argument("--flights", type=int, default=6)
+    parser.add_argument("--flights", type=int, default=4)
     parser.add_argument("--seeds", type=int, default=1)
     given = parser.parse_args()
     use_one_thread()

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from gpmpc._angles import angles_of, state_difference
@@ -90,12 +91,12 @@ def separate_noise(
     )
 
 
-def _successors(model: Any, transitions: Transitions) -> Array:
+def _successors(model: Any, transitions: Transitions) -> NDArray[np.intp]:
     """Rows that begin where the row before ended, to round-off."""
     after, now = transitions.next_states[:-1], transitions.states[1:]
     gap = state_difference(after, now, angles_of(model)).abs().amax(1)
     successive = gap <= 1e-12 + 1e-9 * now.abs().amax(1)
-    return 1 + np.flatnonzero(to_array(successive))
+    return 1 + np.flatnonzero(successive.cpu().numpy())
 
 
 def _shared_errors(before: Array, after: Array, A: Array) -> Array:
