@@ -201,9 +201,11 @@ class Decision:
 
         The largest of two ratios over all stages and states: the deviation that a stage adds without its noise, over
         the deviation of what the model has learned (1 at most); and the deviation predicted for a stage, over the
-        range of that state in the data (half a turn for an angle), which has no bound. NaN for models that are no GPs
-        in an affine form. Of a plan without variances it is measured when it is first read, by the model as it is
-        then: before it learns more.
+        range of that state in the data (half a turn for an angle), which has no bound. NaN for models without GPs, or
+        whose GPs act as the state says (a callable B).
+
+        Of a plan without variances it is measured when it is first read, by the model as it is then: read it before
+        the next decision of a controller that learns.
         """
         found = self.plan_novelty
         if callable(found):

@@ -15,11 +15,13 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
+import torch
 
 from gpmpc._compiled import call_unchecked, compiled
 from gpmpc._dynamics import Array, DynamicsModel, linearize, to_array
 from gpmpc.gp import GPPosterior
 from gpmpc.gp._posterior import AffineForm
+from gpmpc.models import DelayedModel, DisturbedModel, ResidualModel
 
 _ROWS = 16  # of a kernel matrix that tell observations from pseudo-observations
 
@@ -34,13 +36,35 @@ class DataScales(NamedTuple):
 
 
 def data_scales(model: DynamicsModel) -> DataScales | None:
-    """The scales of a model of GPs in an affine form; None of any other."""
-    form: AffineForm | None = getattr(model, "affine_form", None)
+    """The scales of GPs, of a residual with a constant B, and of both with delays or disturbances; else None."""
+    n = model.state_dim
+    if isinstance(model, DelayedModel | DisturbedModel):
+        inner = data_scales(model.model)
+        return None if inner is None else _with_further_states(inner, n)
+    form = _learned_part(model)
     if form is None:
         return None
-    n = model.state_dim
     B = np.eye(n) if form.B is None else to_array(form.B)
     return DataScales(B**2 @ _learned_variances(form.f), _ranges(form, n))
+
+
+def _with_further_states(scales: DataScales, n: int) -> DataScales:
+    """For n states, of which nothing is learned of those that are further ones."""
+    further = n - len(scales.added)
+    added = np.append(scales.added, np.zeros(further))
+    reached = np.append(scales.reached, np.full(further, np.inf))
+    return DataScales(added, reached)
+
+
+def _learned_part(model: DynamicsModel) -> AffineForm | None:
+    """The GPs of a model, where they act and what they see; what is known besides may be any function."""
+    if not isinstance(model, ResidualModel):
+        return getattr(model, "affine_form", None)
+    if callable(model.B) or not isinstance(model.residual, GPPosterior):
+        return None
+    states, angles = list(model.states), tuple(model.angles)
+    B = torch.as_tensor(model.B)
+    return AffineForm(model.residual, B=B, states=states, angles=angles)
 
 
 def _learned_variances(gp: GPPosterior) -> Array:
@@ -101,7 +125,11 @@ def measure_novelty(
 
 
 def later(
-    model: DynamicsModel, means: Array, inputs: Array, covariances: Array, scales
+    model: DynamicsModel,
+    means: Array,
+    inputs: Array,
+    covariances: Array,
+    scales: DataScales,
 ) -> partial[float]:
     """``measure_novelty`` of a plan's means (H + 1, n), when it is called."""
     return partial(measure_novelty, model, means[:-1], inputs, covariances, scales)

@@ -9,7 +9,7 @@ import torch
 
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior, SparseTrainer, Transitions, train
-from gpmpc.models import Affine, KnownModel, ResidualModel
+from gpmpc.models import Affine, DelayedModel, KnownModel, ResidualModel
 from gpmpc.mpc import PredictionSettings, Reference
 from gpmpc.mpc._novelty import data_scales
 from gpmpc.mpc.gp_mpc import GPMPC
@@ -138,6 +138,28 @@ def test_scales_of_angles_of_what_never_moved_and_of_pseudo_observations():
     scales = data_scales(sparse)
     assert scales is not None
     assert scales.added == pytest.approx(sparse.signal_variance.numpy())
+
+
+@pytest.mark.parametrize("mode", ["none", "zero_order"])
+def test_models_around_gps_know_it_too(gp, mode):
+    plain = decide(controller(gp, mode), 0.2).novelty
+    delayed = DelayedModel(gp, 1.0)
+    scales = data_scales(delayed)
+    assert scales is not None
+    assert scales.added.tolist()[2:] == [0.0]
+    assert scales.reached.tolist()[2:] == [np.inf]
+    problem = Problem(Tracking([1.0, 1.0, 0.0], [0.1]), Box([-1.0], [1.0]))
+    settings = PredictionSettings(covariance=mode)
+    chosen = GPMPC(delayed, Linearization(), problem, 5, [0.0], settings)
+    for place, far in ((0.2, False), (4e3, True)):
+        state = np.array([place, place, 0.0])
+        decision = chosen.control(Gaussian.certain(state), Reference(state))
+        assert decision.far_from_data is far
+    curved = ResidualModel.train(lambda x, u: x + 0.1 * x.sin(), transitions())
+    assert curved.affine_form is None
+    assert 0.0 < decide(controller(curved, mode), 0.2).novelty < 0.2
+    assert decide(controller(curved, mode), 4e3).far_from_data
+    assert plain < 0.2
 
 
 def test_a_plan_of_means_is_measured_when_it_is_read_and_not_before(gp, monkeypatch):
