@@ -349,9 +349,7 @@ def fly(
         Box([-plant.rate] * m, [plant.rate] * m),
         [box],
     )
-    controller = GPMPC(
-        model, Linearization(process_noise=True), problem, HORIZON, [0.0] * m
-    )
+    controller = GPMPC(model, Linearization(), problem, HORIZON, [0.0] * m)
     tube, rows = None, sides[:, None] * np.eye(n)[i]
     if quantile is None:
         quantiles = [

@@ -71,7 +71,8 @@ def ways(gp: GPPosterior, horizon: int) -> list[dict]:
 
     Whoever comes after a rival finds the caches full of it; so they take turns apart, each with the paper's form.
     """
-    exact, asked = MomentMatching(), (problem(), horizon, HOVER)
+    exact = MomentMatching(process_noise=False)
+    asked = (problem(), horizon, HOVER)
     paper = {
         "paper's form": GPMPC(
             gp,

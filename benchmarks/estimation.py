@@ -268,7 +268,7 @@ def fly(model: Any, loop: Loop, steps: int, seed: int) -> Flown:
     extra = planned.state_dim - 2
     cost = Tracking([10.0, 0.1] + [0.0] * extra, [1e-2])
     problem = Problem(cost, Box([-LIMIT], [LIMIT]))
-    propagator = Linearization(process_noise=True)
+    propagator = Linearization()
     controller = GPMPC(
         planned,
         propagator,

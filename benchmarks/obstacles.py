@@ -105,9 +105,7 @@ def fly(model: GPPosterior, probability: float, seed: int) -> dict:
         Box([-3.0] * 2, [3.0] * 2),
         constraints=[constraint],
     )
-    loop = ControlLoop(
-        GPMPC(model, Linearization(process_noise=True), problem, HORIZON, [0.0, 0.0])
-    )
+    loop = ControlLoop(GPMPC(model, Linearization(), problem, HORIZON, [0.0, 0.0]))
     (places, velocity), rng = scene(seed), np.random.default_rng([seed, 1])
     ahead = STEP * np.arange(1, HORIZON + 1)[:, None]
     x, milliseconds = np.zeros(4), []

@@ -102,7 +102,7 @@ def controllers(gp: GPPosterior, horizon: int) -> dict[str, Controller]:
     return {
         "paper's form": GPMPC(
             gp,
-            MomentMatching(),
+            MomentMatching(process_noise=False),
             *common,
             prediction=PredictionSettings(form="velocity", covariance="full"),
         ),

@@ -67,9 +67,7 @@ problem = Problem(
     inputs=Box([2.4, 2.4], [5.4, 5.4]),
     constraints=[Inequality(discs, count=3, probability=0.95), TILT],
 )
-controller = GPMPC(
-    model, Linearization(process_noise=True), problem, HORIZON, quadrotor.initial_input
-)
+controller = GPMPC(model, Linearization(), problem, HORIZON, quadrotor.initial_input)
 
 
 def centres(times: np.ndarray) -> np.ndarray:

@@ -62,7 +62,7 @@ flights = {}
 for name, problem in problems.items():
     controller = GPMPC(
         gp,
-        Linearization(process_noise=True),
+        Linearization(),
         problem,
         horizon=40,
         initial_input=[300.0],

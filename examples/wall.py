@@ -51,9 +51,7 @@ for name, probability in (
     problem = Problem(
         Tracking([10.0, 0.1], [0.1]), inputs=Box([-2.0], [2.0]), constraints=[behind]
     )
-    controller = GPMPC(
-        gp, Linearization(process_noise=True), problem, horizon=10, initial_input=[0.0]
-    )
+    controller = GPMPC(gp, Linearization(), problem, horizon=10, initial_input=[0.0])
     flights[name] = closed_loop(
         cart, controller, [WALL, 0.0], [-1.0, 0.0], STEPS, noise=Noise(process=GUSTS)
     )

@@ -468,7 +468,9 @@ class Figures:
         controller, reference = condition.controller(), condition.reference
         if condition.row.loop == "model":
             system, noise = (
-                ModelLoop(read_model(condition.model), MomentMatching()),
+                ModelLoop(
+                    read_model(condition.model), MomentMatching(process_noise=False)
+                ),
                 None,
             )
         else:

@@ -330,7 +330,7 @@ def predict_all(
         Predicted means (N, n), the variances of the states that were fed in (N, n), and the largest amount by which a
         predicted covariance had to be projected to be positive semidefinite.
     """
-    propagator = MomentMatching()
+    propagator = MomentMatching(process_noise=False)  # as in the paper
     covariance = state_std**2 * torch.eye(data.state_dim, dtype=torch.float64)
     means, fed, projected = [], [], 0.0
     for state, control in zip(data.states, data.inputs, strict=True):

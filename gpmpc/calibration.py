@@ -5,6 +5,11 @@ applied, and compared with what was measured, per step and state: root mean squa
 density (Quinonero-Candela et al., 2006), how often central intervals hold the measurement (Gneiting, Balabdaoui and
 Raftery, 2007), and their width. k = 1 from a certain state is the usual check of the model alone.
 
+Which noise an interval holds decides whether it can be believed. What scatters the targets of one step is in all of
+them, once: what a model has learned of noise. Whether it moves the state, and adds up from step to step, or is the
+sensors' alone, shows from the second step on. By default it moves the state: that is right for wind and for wear, and
+cautious where sensors are noisy. Where the sensors' part is known, it is said apart.
+
 Predictions from neighbouring states overlap, so their errors are correlated: the effective number of samples is smaller
 than the count, the more so the larger k. Intervals of a coverage count those that do not overlap.
 """
@@ -22,7 +27,13 @@ from torch import Tensor
 from gpmpc._angles import angles_of, whole_turns
 from gpmpc._arrays import names_of, read_array
 from gpmpc._dynamics import DynamicsModel
-from gpmpc.exceptions import DataError, SettingError, ShapeError, check_number
+from gpmpc.exceptions import (
+    DataError,
+    SettingError,
+    ShapeError,
+    check_number,
+    check_numbers,
+)
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import Transitions
 from gpmpc.metrics import (
@@ -121,6 +132,7 @@ class Calibration:
     coverage: Tensor  # (H, n, L) part of the measurements inside the central interval of each level
     width: Tensor  # (H, n) root mean predicted variance over the RMSE: one is honest, less claims too much
     independent: Tensor  # (H,) predictions that do not overlap, at most
+    noise: str = ""  # which noise the intervals hold, in words
 
     def coverage_interval(
         self, step: int, state: int, level: int
@@ -166,11 +178,12 @@ def calibrate(
     levels: Sequence[float] = (0.5, 0.9, 0.95),
     names: Sequence[str] = (),
     angles: Sequence[int] | None = None,
+    measurement_noise: Sequence[float] | None = None,
 ) -> Calibration:
     """Predicts held-out recordings from every state, and compares.
 
-    The model's noise is added to each predicted variance, because what it is compared with was measured; it does not
-    enter the propagation.
+    Predictions hold the model's noise once in every case: at each step, where the propagator adds the process noise
+    (all do by default), else at the last one alone, as if it were of the sensors. ``Calibration.noise`` says which.
 
     Args:
         model: What was learned, from other recordings.
@@ -182,10 +195,14 @@ def calibrate(
             or x1, x2, ...
         angles: Indices of the states that are angles [rad], whose errors are taken within half a turn; by default
             those of the model.
+        measurement_noise: Standard deviations of the sensors that the states were measured with (n,), where they are
+            known: starts are then as uncertain, and what is compared. The model's noise has to be that of the process
+            alone (``gpmpc.estimation.separate_noise``), or it counts theirs once more.
 
     Raises:
         ShapeError: Recordings, model or names do not belong together.
-        SettingError: A level is not between 0 and 1, or no recording is as long as the horizon.
+        SettingError: A level is not between 0 and 1, no recording is as long as the horizon, or a deviation of the
+            sensors is negative.
     """
     recordings = [recordings] if isinstance(recordings, Recording) else list(recordings)
     propagator = best_propagator(model) if propagator is None else propagator
@@ -198,7 +215,16 @@ def calibrate(
     n = model.state_dim
     turning = angles_of(model) if angles is None else list(angles)
     like: dict[str, Any] = {"dtype": model.dtype, "device": model.device}
-    noise, certain = model.noise_covariance.diagonal(), torch.zeros(n, n, **like)
+    holds_noise = bool(getattr(propagator, "process_noise", False))
+    sensors = torch.zeros(n, **like)
+    if measurement_noise is not None:
+        deviations = list(measurement_noise)
+        check_numbers("measurement_noise", deviations, n, least=0)
+        sensors = torch.tensor(deviations, **like).square()
+    added = sensors
+    if not holds_noise and measurement_noise is None:
+        added = model.noise_covariance.diagonal()
+    start = torch.diag(sensors)
 
     found: list[list[tuple[Tensor, ...]]] = [[] for _ in range(horizon)]
     with torch.no_grad():
@@ -210,7 +236,7 @@ def calibrate(
             )
             for first in range(0, K, CHUNK):
                 mean = x[first : min(first + CHUNK, K)]
-                belief = Gaussian(mean, certain.expand(len(mean), n, n))
+                belief = Gaussian(mean, start.expand(len(mean), n, n))
                 for k in range(min(horizon, K - first)):
                     last = min(
                         first + CHUNK, K - k
@@ -220,7 +246,7 @@ def calibrate(
                     )
                     belief = propagator(model, belief, u[first + k : last + k])
                     mean = belief.mean.double().cpu()
-                    variance = (belief.variance + noise).double().cpu()
+                    variance = (belief.variance + added).double().cpu()
                     observed = recording.states[first + k + 1 : last + k + 1].clone()
                     turns = whole_turns((observed - mean)[:, turning])
                     observed[:, turning] -= turns
@@ -253,7 +279,19 @@ def calibrate(
                 for k in range(1, horizon + 1)
             ]
         ),
+        _noise_in_words(holds_noise, measurement_noise is not None),
     )
+
+
+def _noise_in_words(moves_the_state: bool, sensors_known: bool) -> str:
+    """Which noise predicted intervals hold."""
+    if moves_the_state and sensors_known:
+        return "the model's noise at every step, the sensors' at the first and the last"
+    if moves_the_state:
+        return "the model's noise at every step"
+    if sensors_known:
+        return "the sensors' noise at the first step and the last, none in between"
+    return "the model's noise at the last step alone, as if it were the sensors'"
 
 
 def _check(

@@ -109,6 +109,46 @@ def test_observations_are_calibrated_with_their_noise():
     )
 
 
+def test_noise_of_the_process_adds_up_and_counts_once():
+    """x+ = A x + B u + w: what a propagator adds at every step is what happens."""
+    recordings = runs(200, 5, noisy=False)
+    learned = LinearGaussian(Q=0 * Q, noise_covariance=Q)
+    found = calibrate(learned, recordings, Linearization(), 5, (0.95,))
+    exact = calibrate(noiseless(), recordings, Linearization(), 5, (0.95,))
+    assert torch.allclose(found.width, exact.width)
+    assert torch.equal(found.coverage, exact.coverage)
+    assert float((found.coverage - 0.95).abs().max()) < 0.04
+    assert found.noise == "the model's noise at every step"
+    latent = Linearization(process_noise=False)
+    careless = calibrate(learned, recordings, latent, 5, (0.95,))
+    assert torch.allclose(careless.width[0], exact.width[0])
+    assert float(careless.coverage[4].max()) < 0.8
+    assert "at the last step alone" in careless.noise
+
+
+def test_sensors_that_are_known_make_starts_and_ends_uncertain():
+    sensors = NOISE.diagonal().sqrt().tolist()
+    recordings = runs(200, 5)
+    for recording in recordings:  # their first state is seen by the sensors, too
+        recording.states[0] += torch.randn(2) @ NOISE.sqrt()
+    model = LinearGaussian(Q=0 * Q, noise_covariance=Q)
+    for horizon in (1, 5):
+        found = calibrate(
+            model,
+            recordings,
+            Linearization(),
+            horizon,
+            (0.95,),
+            measurement_noise=sensors,
+        )
+        assert float((found.coverage - 0.95).abs().max()) < 0.04
+        assert "the sensors' at the first and the last" in found.noise
+    with pytest.raises(SettingError, match="measurement_noise: must be a list of 2"):
+        calibrate(model, recordings, horizon=1, measurement_noise=[0.1])
+    with pytest.raises(SettingError, match="measurement_noise"):
+        calibrate(model, recordings, horizon=1, measurement_noise=[0.1, -1.0])
+
+
 def test_false_confidence_shows():
     recordings = runs(100, 8, noisy=False)
     honest = calibrate(noiseless(), recordings, Linearization(), 5, (0.9,))

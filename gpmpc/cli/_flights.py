@@ -204,6 +204,7 @@ def calibrate(given: argparse.Namespace) -> Result:
             names=names,
             angles=system.angle_indices,
         )
+    notes.append(f"Intervals hold {found.noise}.")
     rows = []
     for k in sorted({step for step in (1, 10, 50) if step <= horizon} | {horizon}):
         for i, name in enumerate(names):

@@ -20,6 +20,10 @@ from gpmpc.studies._run_folder import describe_code
 from gpmpc.studies.study import fingerprint
 
 _MODEL = "model.safetensors"
+_HELD_NOISE = (
+    "the noise of the outputs, which adds up, and that of the sensors, which does not, "
+    "as fitted to held-out rollouts"
+)
 
 
 def learn(given: argparse.Namespace) -> Result:
@@ -199,6 +203,7 @@ def _report(
         notes=[
             "A width of 1 claims the spread that the errors have; the interval in brackets is the exact one of Clopper "
             "and Pearson for windows that do not overlap.",
+            f"Intervals hold {_HELD_NOISE}.",
             "The model loses to no baseline."
             if not judgement.losses
             else "The model loses to a baseline: see below.",
@@ -245,6 +250,7 @@ def _card(
         "runs": ", ".join(learned.runs),
         "rate": f"{1 / train.time_step:g} Hz",
         "judged on": ", ".join(run.name for run in held_out),
+        "intervals hold": _HELD_NOISE,
         "made": made["created"],
         "made by": describe_code(made),
         "command": made["command"],

@@ -23,6 +23,7 @@ from gpmpc.estimation._noise import (
     estimate_varying_noise,
     with_process_noise,
 )
+from gpmpc.estimation._separation import SeparatedNoise, separate_noise
 
 __all__ = [
     "AdaptiveTube",
@@ -34,6 +35,7 @@ __all__ = [
     "LateMeasurements",
     "Measurement",
     "ProcessNoise",
+    "SeparatedNoise",
     "Update",
     "VaryingNoise",
     "autocorrelation",
@@ -42,6 +44,7 @@ __all__ = [
     "estimate_varying_noise",
     "estimation_errors",
     "normalized_errors",
+    "separate_noise",
     "smooth",
     "with_process_noise",
 ]

@@ -71,7 +71,7 @@ class ConformalTube:
 
         Args:
             model: Was not trained on this log.
-            propagator: As the controller has it, with ``process_noise=True``.
+            propagator: As the controller has it, with the process noise.
             states: x_0 .. x_T at equal time steps (T + 1, n).
             inputs: u_0 .. u_{T-1} (T, m) or one more.
             horizon: H.

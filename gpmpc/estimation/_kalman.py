@@ -14,6 +14,7 @@ The update is computed from a root of Sigma-, not by the difference that it is w
 
 from collections import deque
 from collections.abc import Callable, Sequence
+from copy import copy
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
@@ -179,14 +180,23 @@ class FilterRun:
     innovation_covariances: Tensor  #: (T + 1, p, p)
 
 
+def _without_noise(observer: Propagator) -> Propagator:
+    """The observer as one that adds no noise."""
+    if not getattr(observer, "process_noise", False):
+        return observer
+    quiet: Any = copy(observer)
+    quiet.process_noise = False
+    return quiet
+
+
 class KalmanFilter:
     """Estimates the state of a model from measurements.
 
     Args:
         model: A ``DynamicsModel``; disturbance states or pending inputs are estimated with the others.
         measurement: What sensors show.
-        propagator: How beliefs move; with ``process_noise=True``.
-        observer: How the moments of the measurement are computed, without noise, which the update adds.
+        propagator: How beliefs move, with the process noise.
+        observer: How the moments of the measurement are computed; their noise is left to the update, which adds it.
 
     Raises:
         SettingError: Model and measurement have different states, or the propagator adds no process noise.
@@ -199,25 +209,22 @@ class KalmanFilter:
         propagator: Propagator | None = None,
         observer: Propagator | None = None,
     ):
-        propagator = (
-            Linearization(process_noise=True) if propagator is None else propagator
-        )
+        propagator = Linearization() if propagator is None else propagator
         if measurement.state_dim != model.state_dim:
             got = f"{measurement.state_dim} and {model.state_dim}"
             raise SettingError(
                 "measurement", f"must be of as many states as the model has; got {got}"
             )
         if not getattr(propagator, "process_noise", True):
-            rule = (
-                "must add the process noise, such as Linearization(process_noise=True)"
-            )
+            rule = "must add the process noise, as Linearization() does"
             raise SettingError(
                 "propagator", f"{rule}; got {type(propagator).__name__} without"
             )
         self.model, self.measurement, self.propagator = model, measurement, propagator
         self._names = signals_of(model)
         self._measured_names = _measured_names(measurement, self._names.state_names)
-        self.observer = Linearization() if observer is None else observer
+        observer = Linearization() if observer is None else observer
+        self.observer = _without_noise(observer)
 
     @classmethod
     def extended(cls, model: DynamicsModel, measurement: Measurement) -> "KalmanFilter":
@@ -229,7 +236,7 @@ class KalmanFilter:
         cls, model: DynamicsModel, measurement: Measurement
     ) -> "KalmanFilter":
         """The unscented Kalman filter."""
-        return cls(model, measurement, Unscented(process_noise=True), Unscented())
+        return cls(model, measurement, Unscented(), Unscented())
 
     def predict(self, belief: Gaussian, input: Any) -> Gaussian:
         """Moves a belief (*batch, n) on by a step with the input that was applied (*batch, m)."""

@@ -47,7 +47,7 @@ from gpmpc.gp import (
 )
 from gpmpc.gp._sparse import sparse_posterior
 from gpmpc.gp._transitions import check_transitions
-from gpmpc.models import NoisyModel
+from gpmpc.models import NoisyModel, ResidualModel
 
 SEARCHED, POINTS, FOLDS = (
     500,
@@ -147,22 +147,39 @@ def _residuals(
     belief = model.predict(x, u)
     errors = state_difference(after, belief.mean, angles_of(model))
     variance = belief.variance.clone()
-    if not isinstance(model, GPPosterior) or not model.has_observation_noise:
+    gp, seen_features, effect = _trained_gp(model, x, u)
+    if gp is None or not gp.has_observation_noise:
         return errors, variance
-    trained = {tuple(point): i for i, point in enumerate(model.features.tolist())}
-    features = enumerate(map(tuple, torch.cat([x, u], dim=1).tolist()))
+    trained = {tuple(point): i for i, point in enumerate(gp.features.tolist())}
+    features = enumerate(map(tuple, seen_features.tolist()))
     pairs = torch.tensor(
         [(row, trained[key]) for row, key in features if key in trained],
         dtype=torch.long,
     )
     for seen, at in (part.unbind(1) for part in pairs.split(block) if len(part)):
-        for a in range(model.output_dim):
-            covariance = torch.linalg.inv(model.precision[a][at][:, at])
-            errors[seen, a] = covariance @ model.weights[a, at]
-            variance[seen, a] = (
-                covariance.diagonal() - model.noise_variance[a]
-            ).clamp_min(0)
+        missed = errors.new_zeros(len(seen), gp.output_dim)
+        unknown = torch.zeros_like(missed)
+        for a in range(gp.output_dim):
+            covariance = torch.linalg.inv(gp.precision[a][at][:, at])
+            missed[:, a] = covariance @ gp.weights[a, at]
+            unknown[:, a] = (covariance.diagonal() - gp.noise_variance[a]).clamp_min(0)
+        errors[seen] = missed @ effect.mT
+        variance[seen] = unknown @ effect.square().mT
     return errors, variance
+
+
+def _trained_gp(
+    model: Any, states: Tensor, inputs: Tensor
+) -> tuple[GPPosterior | None, Tensor, Tensor]:
+    """The GPs of a model, what they see of states and inputs (N, d), and where they act (n, k)."""
+    if isinstance(model, GPPosterior):
+        effect = torch.eye(model.output_dim, dtype=model.dtype, device=model.device)
+        return model, torch.cat([states, inputs], dim=1), effect
+    if isinstance(model, ResidualModel) and not callable(model.B):
+        features = torch.cat(model.features(states, inputs), dim=1)
+        gp = model.residual
+        return gp if isinstance(gp, GPPosterior) else None, features, model.B
+    return None, states, states
 
 
 @dataclass(frozen=True)

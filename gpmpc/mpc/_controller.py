@@ -5,8 +5,9 @@ and is handed to it again as ``previous``.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -30,7 +31,7 @@ from gpmpc.status import Status
 
 Array = np.ndarray
 
-_FAR = 0.9  # of the standard deviation without data
+_FAR = 0.9  # a novelty
 FEASIBLE = 1e-3  # by how much a suboptimal plan may miss hard bounds, in their units: a next step mends it
 KEPT = 1e-5  # by how much a bound may be missed that counts as kept, in its unit
 _NO_PLAN = np.empty((0, 0))
@@ -179,9 +180,6 @@ class Decision:
     #: the solve stopped short of its tolerance, at a limit say, with a plan that keeps its bounds and that steps
     #: towards the optimum led to (Scokaert, Mayne and Rawlings, 1999)
     suboptimal: bool = False
-    #: the largest standard deviation that a stage of the plan adds, over the one that the model has far from all data:
-    #: near 0 among data, near 1 where the model knows nothing; NaN where that is not known
-    novelty: float = math.nan
     #: predicted cost of each stage of the plan (H,), that of x_{k+1} and u_k; empty where
     #: it is not known
     stage_costs: Array = field(default_factory=lambda: np.empty(0))
@@ -191,6 +189,8 @@ class Decision:
     violation: float = math.nan
     #: lengths of the steps that its programs took, squared in the metric of the cost
     steps: tuple[float, ...] = ()
+    #: ``novelty``, or what measures it when it is read: a plan of means alone does not pay for variances
+    plan_novelty: float | Callable[[], float] = math.nan
     #: what the flight has taught a controller that learns (``gpmpc.learning``), for its next decision; with ``size``,
     #: the points of the model that decided, and ``version``, how often it has changed
     learned: Any = None
@@ -205,9 +205,27 @@ class Decision:
         """Whether the plan may be applied, and started from; the inputs of another decision are a failed iterate."""
         return self.status.solved or self.suboptimal
 
+    @cached_property
+    def novelty(self) -> float:
+        """How far the plan is from what the model knows: near 0 among data, 1 where it says no more than they do.
+
+        The largest of two ratios over all stages and states: the deviation that a stage adds without its noise, over
+        the deviation of what the model has learned (1 at most); and the deviation predicted for a stage, over the
+        range of that state in the data (half a turn for an angle), which has no bound. NaN for models without GPs, or
+        whose GPs act as the state says (a callable B).
+
+        Of a plan without variances it is measured when it is first read, by the model as it is then: read it before
+        the next decision of a controller that learns.
+        """
+        found = self.plan_novelty
+        if callable(found):
+            found = found()
+            object.__setattr__(self, "plan_novelty", found)
+        return found
+
     @property
     def far_from_data(self) -> bool:
-        """Whether the plan leaves the data behind: its model says little more there than before any data."""
+        """Whether the plan leaves the data behind: its model says little more there than the data alone."""
         return self.novelty > _FAR
 
     @property

@@ -191,8 +191,9 @@ class PredictionModel:
             model,
             StageLinearizer(model, self.propagator, self.settings.covariance),
         )
+        noisy = getattr(self.propagator, "process_noise", False)
         self._at_points = StageLinearizer(
-            model, Linearization(), "zero_order"
+            model, Linearization(noisy), "zero_order"
         )  # for the first guess of covariances
         self._roll_out = RollOut(model)
         #: what cost or model take for angles: a sensor may show them within a turn

@@ -69,22 +69,16 @@ class StageLinearizer:
             propagator, "process_noise", False
         )
         self._noise = to_array(model.noise_covariance) if noisy else None
+        #: variances (n,) of the noise that V holds
+        self.noise = np.zeros(self._n)
+        if self._noise is not None:
+            self.noise = np.ascontiguousarray(np.diagonal(self._noise))
         moments = {
             "full": self._full,
             "diagonal": self._diagonal,
             "zero_order": self._zero_order,
         }
         self._linearize = self._points if self.at_points else moments[covariance]
-
-    def prior_variances(self) -> Array:
-        """What V is far from all data (n,), for GPs in an affine form; empty where V is zero or that is not known."""
-        form = getattr(self.model, "affine_form", None)
-        if form is None or not self.at_points or self.covariance == "none":
-            return np.empty(0)
-        B = np.eye(self._n) if form.B is None else to_array(form.B)
-        return B**2 @ to_array(form.f.signal_variance) + (
-            0.0 if self._noise is None else np.diagonal(self._noise)
-        )
 
     def weight(self, Q: Array) -> Array:
         """The weights of s that belong to weights of x (K, n, n): the blocks on their diagonals (K, p / n, n, n)."""

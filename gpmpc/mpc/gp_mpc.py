@@ -13,7 +13,8 @@ nonlinear problem itself. Where the iteration ends, in the covariance modes of `
 * ``none``: the cost of the means.
 """
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import replace
 from time import perf_counter
@@ -21,7 +22,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from gpmpc._compiled import call_unchecked, compiled
+from gpmpc._compiled import call_unchecked
 from gpmpc._dynamics import DynamicsModel, linearize
 from gpmpc.exceptions import SettingError, check_number
 from gpmpc.gaussian import Gaussian
@@ -38,6 +39,7 @@ from gpmpc.mpc._controller import (
 from gpmpc.mpc._cost import FunctionNotFinite
 from gpmpc.mpc._elastic import elastic_price, violations
 from gpmpc.mpc._linear_quadratic import CondensedProgram, expand
+from gpmpc.mpc._novelty import data_scales, later, novelty_of
 from gpmpc.mpc._prediction import Prediction, PredictionModel, PredictionSettings
 from gpmpc.mpc._sqp import FAILURES, Iteration, measure_continuity
 from gpmpc.mpc._stages import (
@@ -142,13 +144,13 @@ class GPMPC:
             problem,
             horizon,
         )
-        self.iterations, self.tolerance = iterations, tolerance
+        self.iterations = iterations
         self.solver = DualActiveSet() if solver is None else solver
         check_method("solver", self.solver, "solve", "DualActiveSet()")
         self._is_elastic = bool(self.prediction.constraints.elastic.any())
         velocity = prediction.form == "velocity"
         self._most = 1 if velocity else iterations or _MOST
-        self._prior = self.prediction.linearizer.prior_variances()
+        self._scales = data_scales(model)
         rows = self.prediction.constraints
         # Prices: of hard rows alone.
         self._hard = np.where(np.isinf(rows.prices), np.inf, 0.0)
@@ -344,7 +346,6 @@ class GPMPC:
         means, covariances = self.prediction.linearizer.moments(
             plan.states, prediction.covariances
         )
-        novelty = call_unchecked(_largest_ratio, prediction.stages.V, self._prior)
         inputs = plan.inputs.copy()
         return Decision(
             input=inputs[0],
@@ -358,11 +359,24 @@ class GPMPC:
             solution=outcome.solution,
             disturbance=request.disturbance,
             suboptimal=suboptimal,
-            novelty=novelty,
+            plan_novelty=self._novelty(prediction, means, inputs, covariances),
             stage_costs=stage_costs,
             violation=violation,
             steps=outcome.steps,
         )
+
+    def _novelty(
+        self, prediction: Prediction, means: Array, inputs: Array, covariances: Array
+    ) -> float | Callable[[], float]:
+        """How far a plan is from the data; to be measured when it is read, where its stages hold no variances."""
+        if self._scales is None:
+            return math.nan
+        linearizer = self.prediction.linearizer
+        if linearizer.covariance == "zero_order":
+            V = prediction.stages.V
+            return novelty_of(V, linearizer.noise, covariances, self._scales)
+        model = self.prediction.model
+        return later(model, means, inputs, covariances, self._scales)
 
     def with_model(self, model: DynamicsModel) -> "GPMPC":
         """Returns the controller for another model of as many states and inputs, in microseconds."""
@@ -521,13 +535,3 @@ def _is_usable(program: CondensedProgram, solution: QPSolution, plan: Plan) -> b
 def _violation(solution: QPSolution) -> float:
     """The largest violation of a hard row."""
     return float(solution.violation()[np.isinf(solution.caps)].max(initial=0.0))
-
-
-@compiled
-def _largest_ratio(V, prior):
-    """The root of the largest V_kii / prior_i; NaN without a prior."""
-    largest = 0.0 if len(prior) > 0 else np.nan
-    for k in range(len(V)):
-        for i in range(len(prior)):
-            largest = max(largest, V[k, i, i] / prior[i] if prior[i] > 0.0 else 0.0)
-    return np.sqrt(largest)

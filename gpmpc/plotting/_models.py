@@ -74,7 +74,10 @@ def calibration_figure(calibration: "Calibration") -> Figure:
         axes[:, 0], ("coverage", "negative log density", "RMSE"), strict=True
     ):
         axis.set_ylabel(label)
-    figure.supxlabel("steps ahead", fontsize="medium")
+    label = "steps ahead"
+    if calibration.noise:
+        label += f"; intervals hold {calibration.noise}"
+    figure.supxlabel(label, fontsize="medium")
     figure.align_ylabels(axes[:, 0])
     return figure
 

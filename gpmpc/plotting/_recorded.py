@@ -100,7 +100,7 @@ def tracking_figure(run: "Run") -> Figure:
             "color": TUBE,
             "alpha": 0.7,
             "linewidth": 0,
-            "label": "expected one step before, $\\pm 2\\sigma$",
+            "label": "expected one step before, noise included, $\\pm 2\\sigma$",
         }
         below.fill_between(run.times, low, high, **tube)
         below.plot(run.times, state - reference, color=FLOWN, linewidth=1.2)

@@ -60,7 +60,7 @@ def expand(model: Any, state: Tensor, input: Tensor) -> _Expansion | None:
 
 
 class Linearization(NoisyPropagator):
-    """First order; ``process_noise=True`` adds the model's noise covariance."""
+    """First order, with the model's noise unless ``process_noise=False``."""
 
     first_order = True  #: mean, derivatives and variance of the model at the belief's mean are all that it takes
 

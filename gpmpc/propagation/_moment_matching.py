@@ -39,10 +39,11 @@ class MomentMatching(NoisyPropagator):
     Args:
         diagonal: Takes the outputs as independent: only the diagonal of the predicted covariance is computed, at a
             quarter of the cost for six outputs.
-        process_noise: Adds the noise variance sn2 to the predicted covariance. The paper's tables do not.
+        process_noise: Whether the noise variance sn2 is added to the predicted covariance. In the paper's tables it is
+            not.
     """
 
-    def __init__(self, diagonal: bool = False, process_noise: bool = False):
+    def __init__(self, diagonal: bool = False, process_noise: bool = True):
         super().__init__(process_noise)
         self.diagonal = diagonal
 

@@ -41,7 +41,7 @@ class Unscented(NoisyPropagator):
         alpha: Spread of the points.
         beta: Weight of the centre in the covariance; 2 is best for Gaussians of small alpha.
         kappa: Secondary spread.
-        process_noise: Adds the model's noise covariance.
+        process_noise: Whether the model's noise covariance is added.
 
     Raises:
         SettingError: alpha is not positive, or (at the first step) n + kappa is not.
@@ -52,7 +52,7 @@ class Unscented(NoisyPropagator):
         alpha: float = 1.0,
         beta: float = 0.0,
         kappa: float = 0.0,
-        process_noise: bool = False,
+        process_noise: bool = True,
     ):
         check_number("alpha", alpha, above=0)
         check_number("beta", beta)
@@ -188,14 +188,14 @@ class MonteCarlo(NoisyPropagator):
     Args:
         samples: How many states are drawn.
         seed: Of the draws.
-        process_noise: Adds the model's noise covariance.
+        process_noise: Whether the model's noise covariance is added.
 
     Raises:
         SettingError: Fewer than two samples, or a seed that is no whole number.
     """
 
     def __init__(
-        self, samples: int = 10_000, seed: int = 0, process_noise: bool = False
+        self, samples: int = 10_000, seed: int = 0, process_noise: bool = True
     ):
         check_number("samples", samples, least=2, whole=True)
         check_number("seed", seed, least=0, whole=True)

@@ -78,11 +78,17 @@ class Propagator(Protocol):
 
 
 class NoisyPropagator(Propagator):
-    """A propagator that adds the model's noise covariance to the predicted one where it is asked to."""
+    """A propagator that adds the model's noise covariance to the predicted one, unless it is told not to.
+
+    Args:
+        process_noise: Whether the noise that the model has learned moves the state, at every step: a belief is then
+            over the state that will be there. Without it a belief is over the latent function's value, as if all
+            noise were of the sensors, and several steps on its intervals are too narrow by what happens in between.
+    """
 
     diagonal = False  #: whether only the diagonal of the predicted covariance is kept
 
-    def __init__(self, process_noise: bool = False):
+    def __init__(self, process_noise: bool = True):
         self.process_noise = process_noise
 
     def propagate(

@@ -197,13 +197,19 @@ class Experiment:
     def unplanned_noise(self, training: Training | None) -> np.ndarray:
         """Returns standard deviations (n,) of the noise of a next state that the covariances of a plan leave out.
 
-        It is what the model has learned of it; a controller that knows the plant knows its noise as well.
+        It is what the model has learned of it; a controller that knows the plant knows its noise as well. A plan of
+        means alone leaves out everything.
         """
         model, none = (
             training.posterior if training else self.model,
             np.zeros(self._dimensions[0]),
         )
-        if getattr(self.propagator, "process_noise", False) or self.loop == "model":
+        settings = getattr(self.controller, "keywords", {}).get("prediction")
+        predicts_means_alone = getattr(settings, "covariance", "") == "none"
+        holds_noise = getattr(self.propagator, "process_noise", False)
+        if holds_noise and not predicts_means_alone:
+            return none
+        if self.loop == "model":
             return none
         if model is not None and self.learns:
             return model.noise_covariance.diagonal().sqrt().numpy()

@@ -59,7 +59,7 @@ def check_propagator(
     *,
     linear: bool = True,
     diagonal: bool = False,
-    process_noise: bool = False,
+    process_noise: bool | None = None,
     samples: int | None = None,
 ) -> None:
     """Checks a propagator against the protocol ``gpmpc.propagation.Propagator``.
@@ -76,12 +76,14 @@ def check_propagator(
         linear: It claims to be exact where the model is linear, and first-order accurate in its input-output
             covariance. All methods of this package but mean equivalence do.
         diagonal: It claims the variances only, and predicts no correlation of the outputs.
-        process_noise: It adds the model's noise covariance.
+        process_noise: It adds the model's noise covariance; by default as its attribute of that name says.
         samples: How many states it draws, if it does; its own standard error is then allowed for.
 
     Raises:
         AssertionError: The propagator breaks a promise; the message says which, and by how much.
     """
+    if process_noise is None:
+        process_noise = bool(getattr(propagator, "process_noise", False))
 
     def case(model: Any) -> _Case:
         n, like = model.state_dim, {"dtype": model.dtype, "device": model.device}

@@ -83,6 +83,7 @@ def test_a_flight_is_predicted_and_what_cannot_be_predicted_or_filmed_is_said_in
     assert said in capsys.readouterr().out
     (written,) = (tmp_path / "tree").glob("*/calibration/calibration.md")
     assert said in written.read_text()
+    assert "Intervals hold the model's noise at every step." in written.read_text()
     assert forked("run", *TINY, "steps=3", cwd=tmp_path).returncode == 0
     runs.record_run(tmp_path / "foreign.mcap", steps=3)
     for words, said in (

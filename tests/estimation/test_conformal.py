@@ -178,7 +178,7 @@ def test_misuse_is_refused():
     with pytest.raises(
         DataError, match="a direction has no variance: predict with the process noise"
     ):
-        ConformalTube.calibrate(MODEL, Linearization(), x, u, H)
+        ConformalTube.calibrate(MODEL, Linearization(process_noise=False), x, u, H)
     with pytest.raises(
         ShapeError, match=r"must be one log; got \(41, 2\) and \(30, 2\)"
     ):

@@ -409,8 +409,8 @@ def test_errors_that_are_too_large_or_too_small_for_their_covariance_are_inconsi
     ("make", "error", "rule"),
     [
         (lambda m: KalmanFilter(LINEAR, Measurement.of_states(3, [0], [0.1])), SettingError, "measurement: must be of"),
-        (lambda m: KalmanFilter(LINEAR, m, Linearization()), SettingError, "propagator: must add the process noise"),
-        (lambda m: KalmanFilter(LINEAR, m, MeanEquivalence()), SettingError, "propagator: must add the process noise"),
+        (lambda m: KalmanFilter(LINEAR, m, Linearization(False)), SettingError, "propagator: must add the proc"),
+        (lambda m: KalmanFilter(LINEAR, m, MeanEquivalence(False)), SettingError, "propagator: must add the proc"),
         (lambda m: KalmanFilter(LINEAR, m).update(PRIOR, [0.0, 1.0]), ShapeError, r"shape \(1,\); got \(2,\)"),
         (lambda m: KalmanFilter(LINEAR, m).run(PRIOR, np.zeros((2, 1)), np.zeros((2, 1))), ShapeError, "got 2 and 2"),
         (lambda m: Measurement.of_states(2, [2], [0.1]), SettingError, "states: must be indices from 0 to 1"),

@@ -110,7 +110,7 @@ def test_every_propagator_counts_it_once(kind):
         kind(process_noise=on)(model, QUIET, PUSH) for on in (True, False)
     )
     assert torch.equal(with_noise.covariance, without.covariance)
-    alone = kind()(model.model, QUIET, PUSH)
+    alone = kind(process_noise=False)(model.model, QUIET, PUSH)
     added = with_noise.covariance - alone.covariance
     there = model.noise(QUIET.mean, PUSH)
     assert torch.allclose(added[0, 0], there[0, 0])

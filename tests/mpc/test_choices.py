@@ -37,6 +37,14 @@ def test_every_controller_of_the_settings_flies(controller):
     )
 
 
+def test_all_predictions_hold_the_noise_but_the_papers():
+    held = {}
+    for name in ("convex", "nonlinear", "state_form", "paper"):
+        made = chosen(f"controller={name}", "horizon=2")(quadrotor_gp(20))
+        held[name] = made.prediction.propagator.process_noise
+    assert held == dict.fromkeys(held, True) | {"paper": False}
+
+
 @pytest.mark.parametrize("propagation", names("propagation"))
 @pytest.mark.parametrize("solver", names("solver"))
 def test_propagation_and_solver_are_chosen_by_name(propagation, solver):

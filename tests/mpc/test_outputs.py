@@ -232,12 +232,6 @@ def test_a_plan_that_leaves_the_data_is_flagged_and_one_among_them_is_not(rng):
         assert not among.far_from_data
         assert beyond.novelty == pytest.approx(1.0, abs=0.05)
         assert beyond.far_from_data
-    unknown = GPMPC(
-        model, Linearization(), problem, 5, [0.0], PredictionSettings(covariance="none")
-    )
-    assert not unknown.control(
-        Gaussian.certain(np.zeros(2)), Reference(np.zeros(2))
-    ).far_from_data
 
 
 def test_mistakes_are_one_clear_error():

@@ -85,6 +85,7 @@ def test_a_model_may_give_views_and_other_types():
 
     class Views:
         state_dim = model.state_dim
+        noise_covariance = model.noise_covariance
 
         def linearize(self, states, inputs, covariance):
             mean, A, B, V = model.linearize(states, inputs, covariance)
@@ -96,6 +97,7 @@ def test_a_model_may_give_views_and_other_types():
                 np.broadcast_to(one, V.shape),
             )
 
+    noise = model.noise_covariance.numpy()
     expected = StageLinearizer(model, Linearization(), "zero_order")(
         states, inputs, covariances
     )
@@ -103,7 +105,7 @@ def test_a_model_may_give_views_and_other_types():
         states, inputs, covariances
     )
     for mine, theirs in zip(
-        found, expected._replace(V=np.tile(np.eye(2), (5, 1, 1))), strict=True
+        found, expected._replace(V=np.tile(np.eye(2) + noise, (5, 1, 1))), strict=True
     ):
         assert mine.flags.c_contiguous
         assert mine.dtype == float
@@ -208,10 +210,10 @@ def test_what_a_stage_adds_is_what_does_not_pass_through():
         stage.A @ belief.covariance.numpy() @ stage.A.T + stage.V, after, atol=1e-14
     )
     certain = Gaussian.certain(belief.mean)
-    own = model.predict(belief.mean, input).covariance.numpy()
+    own = model.predict(belief.mean, input).covariance + model.noise_covariance
     for propagator in (Linearization(), MomentMatching(), Unscented()):
         _, stage = stage_at("zero_order", propagator, model, certain, input)
-        assert np.allclose(stage.V, own, atol=1e-12)
+        assert np.allclose(stage.V, own.numpy(), atol=1e-12)
 
 
 @pytest.mark.parametrize("mode", ["full", "diagonal", "zero_order", "none"])

@@ -98,7 +98,7 @@ def test_a_linear_gaussian_system_is_propagated_exactly(name, process_noise):
 
 def test_mean_equivalence_of_a_linear_system_forgets_the_state_covariance_only():
     model, at, u = linear(), belief(), torch.tensor([0.7])
-    result = MeanEquivalence().propagate(model, at, u)
+    result = MeanEquivalence(process_noise=False).propagate(model, at, u)
     assert torch.allclose(result.belief.mean, model.nominal(at.mean, u), atol=1e-12)
     assert torch.allclose(
         result.belief.covariance, torch.diag(torch.tensor([0.03, 0.05])), atol=1e-12
@@ -109,7 +109,7 @@ def test_mean_equivalence_of_a_linear_system_forgets_the_state_covariance_only()
 def test_monte_carlo_of_a_linear_system_is_exact_up_to_its_standard_error():
     model, at, u, samples = linear(), belief(), torch.tensor([0.7]), 100_000
     A = model.nominal.A
-    result = MonteCarlo(samples, seed=3).propagate(model, at, u)
+    result = MonteCarlo(samples, 3, process_noise=False).propagate(model, at, u)
     spread = A @ at.covariance @ A.T
     assert torch.all(
         (result.belief.mean - model.nominal(at.mean, u)).abs()
@@ -181,11 +181,11 @@ def test_an_autonomous_model_takes_no_input_or_one_of_no_columns(name, predicts)
 
 
 @pytest.mark.parametrize("name", ALL)
-def test_observation_noise_is_added_on_request_and_only_then(name):
+def test_observation_noise_is_added_unless_it_is_refused(name):
     model, at, u = gp(noise=0.02), belief(), torch.tensor([0.3])
     latent, noisy = (
+        ALL[name](process_noise=False).propagate(model, at, u),
         ALL[name]().propagate(model, at, u),
-        ALL[name](process_noise=True).propagate(model, at, u),
     )
     assert torch.equal(latent.belief.mean, noisy.belief.mean)
     assert torch.equal(latent.cross_covariance, noisy.cross_covariance)
@@ -336,7 +336,7 @@ def test_settings_out_of_range_are_refused():
 @pytest.mark.parametrize("samples", [3, 2500])  # 2500 are predicted in three parts
 def test_monte_carlo_gives_the_sample_moments_of_its_draws(samples):
     model, at, u = gp(), belief(), torch.tensor([0.3])
-    found = MonteCarlo(samples, seed=4).propagate(model, at, u)
+    found = MonteCarlo(samples, 4, process_noise=False).propagate(model, at, u)
     steps = torch.from_numpy(
         np.random.default_rng(4).standard_normal((samples, 2))
     ) @ square_root(at.covariance)

@@ -212,7 +212,7 @@ def test_every_plan_that_leaves_the_data_behind_is_counted_with_its_step():
         def control(self, belief, reference, previous=None):
             return replace(
                 super().control(belief, reference, previous),
-                novelty=0.99 if len(self.seen) == 3 else 0.1,
+                plan_novelty=0.99 if len(self.seen) == 3 else 0.1,
             )
 
     assert fly(5, Astray()).far_from_data == (2,)

@@ -204,11 +204,11 @@ def test_an_offset_and_a_short_flight_are_no_loss(trajectory):
 
 
 def test_a_plan_leaves_out_the_process_noise_of_the_plant_unless_its_covariances_hold_it():
-    noisy, holding = Noise(process=[1e-3] * 6), Linearization(process_noise=True)
+    noisy, latent = Noise(process=[1e-3] * 6), Linearization(process_noise=False)
     for settings, expected in (
         ({"noise": noisy}, 1e-3),
-        ({"noise": noisy, "propagator": Linearization()}, 1e-3),
-        ({"noise": noisy, "propagator": holding}, 0.0),
+        ({"noise": noisy, "propagator": latent}, 1e-3),
+        ({"noise": noisy, "propagator": Linearization()}, 0.0),
         ({"noise": Noise(measurement=[1e-3] * 6)}, 0.0),
         ({}, 0.0),
     ):

@@ -11,6 +11,7 @@ import torch
 from gpmpc.exceptions import Diverged, SettingError, ShapeError
 from gpmpc.gp import Transitions
 from gpmpc.learning import EpisodicLearning, OnlineLearning
+from gpmpc.mpc import PredictionSettings
 from gpmpc.mpc.problem import Problem, Tracking
 from gpmpc.simulation import ModelLoop, Noise
 from gpmpc.studies import flight as studied
@@ -334,3 +335,8 @@ def test_what_a_learned_model_holds_for_noise_is_left_out_of_a_plan():
         experiment(model=noisy, propagator=holding).unplanned_noise(None).tolist()
         == [0] * 6
     )
+    means_alone = experiment(model=noisy, propagator=holding)
+    means = PredictionSettings(covariance="none")
+    alone = partial(means_alone.controller, prediction=means)
+    alone = replace(means_alone, controller=alone)
+    assert alone.unplanned_noise(None).tolist() == [2, 3]

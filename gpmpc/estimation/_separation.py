@@ -1,0 +1,130 @@
+"""Which part of the noise that a model has learned moves the state, and which is of the sensors that showed it.
+
+Both scatter the targets of one step alike. Several steps on they differ: noise of the process adds up, noise of the
+sensors does not. In the order of time they can be told apart: with y_k = x_k + v_k, v ~ N(0, R), the error of one step
+
+    e_{k+1} = y_{k+1} - f(y_k) = w_k + v_{k+1} - A_k v_k,    E[e_{k+1} e_k'] = -A_k R,
+
+is correlated with the one before, which shared v_k, and noise of the process is not. R is estimated by weighted least
+squares from all products of successive errors, an entry a state; what is within two standard errors of zero is zero.
+Noise of the process is what is left of the noise that was learned, Q = N - R - A R A'.
+"""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from gpmpc._angles import angles_of, state_difference
+from gpmpc._dynamics import Array, DynamicsModel, linearize, to_array
+from gpmpc.estimation._noise import _residuals
+from gpmpc.exceptions import DataError, UnsupportedModel
+from gpmpc.gp import GPPosterior, Transitions
+from gpmpc.models import ResidualModel
+
+_PAIRS = 20  # successive errors, at least
+_FLOOR = 0.01  # of the learned variance: what is always left to the process
+
+
+@dataclass(frozen=True)
+class SeparatedNoise:
+    """The two parts of a model's noise."""
+
+    model: DynamicsModel  #: the same predictions, with the noise of the process alone
+    process: Tensor  #: variances of what moves the state in a step (n,)
+    measurement: (
+        Tensor  #: variances of the sensors (n,); zero where none can be told from zero
+    )
+
+
+def separate_noise(
+    model: GPPosterior | ResidualModel, transitions: Transitions, block: int = 20
+) -> SeparatedNoise:
+    """Separates the noise of a model that was learned from measured states.
+
+    Args:
+        model: GPs of next states or differences, or a ``ResidualModel`` with a constant B.
+        transitions: Those of the training, in their order of time; a few hundred. Where x[k+1] of a row is not x[k] of
+            the next, a new run begins.
+        block: Rows that are left out together when one of them is predicted.
+
+    Raises:
+        UnsupportedModel: Another model, or one that was learned from pseudo-observations.
+        ShapeError: The transitions have other dimensions.
+        DataError: Fewer than twenty rows follow one another.
+    """
+    gp = getattr(model, "residual", model)
+    constant = not callable(getattr(model, "B", None))
+    if not isinstance(gp, GPPosterior) or not constant:
+        raise UnsupportedModel(
+            "the noise of GPs, or of a ResidualModel with a constant B, can be "
+            f"separated; got {type(model).__name__}"
+        )
+    if not gp.has_observation_noise:
+        raise UnsupportedModel(
+            "the noise of GPs of observed rows can be separated, not of sparse ones"
+        )
+    errors = to_array(_residuals(model, transitions, block)[0])
+    later = _successors(model, transitions)
+    if len(later) < _PAIRS:
+        raise DataError(
+            f"separate_noise needs {_PAIRS} rows that follow one another; got {len(later)}"
+        )
+    states = to_array(transitions.states)
+    A = linearize(model, states, to_array(transitions.inputs), covariance=False).A
+    learned = np.diagonal(to_array(model.noise_covariance))
+    correlated = _shared_errors(errors[later - 1], errors[later], A[later])
+    scatter = (errors**2).mean(axis=0)
+    # As a part of what was learned: errors of rows that were trained on are smaller.
+    share = np.divide(
+        correlated, scatter, out=np.zeros_like(scatter), where=scatter > 0
+    )
+    measurement = share.clip(0.0, 1.0) * learned
+    passed_on = (A[later] ** 2).mean(axis=0) @ measurement
+    process = np.maximum(learned - measurement - passed_on, _FLOOR * learned)
+    quiet = _with_noise(model, gp, torch.from_numpy(process))
+    return SeparatedNoise(
+        quiet, torch.from_numpy(process), torch.from_numpy(measurement)
+    )
+
+
+def _successors(model: Any, transitions: Transitions) -> NDArray[np.intp]:
+    """Rows that begin where the row before ended, to round-off."""
+    after, now = transitions.next_states[:-1], transitions.states[1:]
+    gap = state_difference(after, now, angles_of(model)).abs().amax(1)
+    successive = gap <= 1e-12 + 1e-9 * now.abs().amax(1)
+    return 1 + np.flatnonzero(successive.cpu().numpy())
+
+
+def _shared_errors(before: Array, after: Array, A: Array) -> Array:
+    """The variances R (n,) of what successive errors (K, n) share, E[after before'] = -A R; A is (K, n, n).
+
+    Zero where the estimate is within two standard errors of it.
+    """
+    scatter = (after**2).mean(axis=0)
+    weights = np.divide(1.0, scatter, out=np.zeros_like(scatter), where=scatter > 0)
+    products = np.einsum("kij,ki,kj,i->j", A, after, before, weights)
+    information = np.einsum("kij,i->j", A**2, weights)
+    known = information > 0
+    shared = np.divide(-products, information, out=np.zeros_like(products), where=known)
+    deviation = np.sqrt(
+        np.divide(scatter, information, out=np.zeros_like(products), where=known)
+    )
+    return np.where(shared > 2.0 * deviation, shared, 0.0)
+
+
+def _with_noise(model: Any, gp: GPPosterior, process: Tensor) -> Any:
+    """The model with other noise in what it predicts, (n,): its means and what it does not know stay."""
+    if gp is model:
+        return replace(gp, noise_variance=process.to(gp.noise_variance))
+    B = torch.as_tensor(model.B).to(gp.noise_variance)
+    learned = (B.square() @ gp.noise_variance).clamp_min(torch.finfo(B.dtype).tiny)
+    # Of each output the largest part that a state it acts on has left.
+    left = process.to(learned) / learned
+    parts = torch.stack([left[B[:, a] != 0].max() for a in range(gp.output_dim)])
+    return replace(
+        model, residual=replace(gp, noise_variance=parts * gp.noise_variance)
+    )

@@ -1,0 +1,105 @@
+"""Noise of the process and of the sensors, told apart on motions whose noise is known."""
+
+from functools import partial
+
+import numpy as np
+import pytest
+import torch
+
+from gpmpc.calibration import Recording, calibrate
+from gpmpc.estimation import separate_noise
+from gpmpc.exceptions import DataError, UnsupportedModel
+from gpmpc.gp import GPPosterior, SparseTrainer, Transitions, train
+from gpmpc.models import Affine, KnownModel, ResidualModel
+from gpmpc.propagation import Linearization
+
+A = np.array([[1.0, 0.1], [-0.2, 0.95]])
+B = np.array([[0.005], [0.1]])
+
+
+def motion(steps, process, sensors, seed=0):
+    """States as they are seen (steps + 1, n), and inputs."""
+    rng = np.random.default_rng(seed)
+    states, inputs = [rng.normal(0.0, 0.3, 2)], rng.uniform(-1, 1, (steps, 1))
+    for u in inputs:
+        after = A @ states[-1] + B @ u + 0.02 * np.sin(3 * states[-1])
+        states.append(after + rng.normal(0.0, 1.0, 2) * process)
+    seen = np.array(states)
+    return seen + rng.normal(0.0, 1.0, seen.shape) * sensors, inputs
+
+
+def learned(process, sensors, kind="gp", steps=250):
+    states, inputs = motion(steps, process, sensors)
+    rows = Transitions(states[:-1], inputs, states[1:])
+    if kind == "gp":
+        return train(rows, predicts="difference", restarts=0).posterior, rows
+    if kind == "residual":
+        return ResidualModel.train(Affine.identity(2, 1), rows), rows
+    return ResidualModel.train(Affine.identity(2, 1), rows, angles=[0]), rows
+
+
+@pytest.mark.parametrize("kind", ["gp", "residual", "features"])
+@pytest.mark.parametrize(
+    ("process", "sensors"),
+    [
+        ([0.01, 0.02], [0.0, 0.0]),
+        ([0.0, 0.0], [0.01, 0.02]),
+        ([0.01, 0.02], [0.01, 0.02]),
+    ],
+)
+def test_each_part_is_found(kind, process, sensors):
+    model, rows = learned(np.array(process), np.array(sensors), kind)
+    found = separate_noise(model, rows)
+    measurement = found.measurement.sqrt().numpy()
+    assert np.allclose(measurement, sensors, atol=2e-3, rtol=0.3)
+    if any(process):
+        moved = found.process.sqrt().numpy()
+        assert np.allclose(moved, process, rtol=0.35)
+    if not any(sensors):
+        assert not found.measurement.any()
+        assert torch.allclose(
+            found.model.noise_covariance, model.noise_covariance, rtol=1e-12
+        )
+
+
+def test_the_model_predicts_the_same_with_the_noise_of_the_process():
+    sensors = np.array([0.01, 0.02])
+    for kind in ("gp", "features"):
+        model, rows = learned(0.3 * sensors, sensors, kind)
+        found = separate_noise(model, rows)
+        at = torch.tensor([0.1, -0.2], dtype=torch.float64), torch.zeros(1).double()
+        before, after = model.predict(*at), found.model.predict(*at)
+        assert torch.equal(before.mean, after.mean)
+        assert torch.equal(before.covariance, after.covariance)
+        noise = found.model.noise_covariance.diagonal()
+        assert torch.allclose(noise, found.process)
+        assert bool((noise < 0.7 * model.noise_covariance.diagonal()).all())
+
+
+def test_intervals_of_noisy_sensors_are_honest_only_with_what_was_separated():
+    sensors = np.array([0.01, 0.02])
+    model, rows = learned(0.1 * sensors, sensors)
+    fresh = [
+        Recording(*motion(60, 0.1 * sensors, sensors, seed)) for seed in range(1, 9)
+    ]
+    found = separate_noise(model, rows)
+    known = found.measurement.sqrt().tolist()
+    judge = partial(calibrate, propagator=Linearization(), horizon=15)
+    apart = judge(found.model, fresh, measurement_noise=known)
+    cautious = judge(model, fresh)
+    assert float(apart.coverage[-1, :, -1].min()) > 0.88
+    assert float(apart.coverage[:, :, -1].mean()) < 0.98
+    assert float(cautious.coverage[-1, :, -1].min()) > 0.985
+    assert float(cautious.width[-1].min()) > 1.4 * float(apart.width[-1].max())
+
+
+def test_what_cannot_be_separated_is_refused():
+    model, rows = learned(np.full(2, 0.01), np.zeros(2), steps=60)
+    known = KnownModel(Affine.identity(2, 1), 2, 1)
+    sparse = SparseTrainer(inducing=10, restarts=0)(rows).posterior
+    for other in (known, sparse):
+        with pytest.raises(UnsupportedModel, match="can be separated"):
+            separate_noise(other, rows)
+    assert isinstance(model, GPPosterior)
+    with pytest.raises(DataError, match="needs 20 rows that follow one another; got 0"):
+        separate_noise(model, rows[torch.arange(0, 60, 2)])

@@ -1,0 +1,186 @@
+"""How far a plan is from the data, in every covariance mode, against what can be computed by hand."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from gpmpc.gaussian import Gaussian
+from gpmpc.gp import GPPosterior, SparseTrainer, Transitions, train
+from gpmpc.models import Affine, DelayedModel, KnownModel, ResidualModel
+from gpmpc.mpc import PredictionSettings, Reference
+from gpmpc.mpc._novelty import data_scales
+from gpmpc.mpc.gp_mpc import GPMPC
+from gpmpc.mpc.problem import Box, Problem, Tracking
+from gpmpc.propagation import Linearization, MomentMatching
+
+PROBLEM = Problem(Tracking([1.0, 1.0], [0.1]), Box([-1.0], [1.0]))
+MODES = ["full", "diagonal", "zero_order", "none"]
+
+
+def transitions(rows=60, unstable=0.0, noise=1e-3):
+    rng = np.random.default_rng(0)
+    states, inputs = rng.uniform(-1, 1, (rows, 2)), rng.uniform(-1, 1, (rows, 1))
+    after = states + 0.1 * np.stack(
+        [states[:, 1], np.sin(states[:, 0]) + inputs[:, 0]], axis=1
+    )
+    after = after + unstable * states
+    return Transitions(states, inputs, after + rng.normal(0, noise, (rows, 2)))
+
+
+@pytest.fixture(scope="module")
+def gp():
+    return train(transitions(), predicts="difference", restarts=0).posterior
+
+
+def controller(model, covariance="zero_order", horizon=5, propagator=None, **settings):
+    prediction = PredictionSettings(covariance=covariance, **settings)
+    propagator = Linearization() if propagator is None else propagator
+    return GPMPC(model, propagator, PROBLEM, horizon, [0.0], prediction)
+
+
+def decide(chosen, place):
+    state = np.full(2, place)
+    return chosen.control(Gaussian.certain(state), Reference(state))
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("form", ["trajectory", "velocity"])
+def test_every_mode_knows_whether_its_plan_is_among_the_data(gp, mode, form):
+    chosen = controller(gp, mode, form=form)
+    among, beyond = decide(chosen, 0.2), decide(chosen, 4e3)
+    assert 0.0 < among.novelty < 0.2
+    assert not among.far_from_data
+    assert 0.95 < beyond.novelty < 1.5  # what is added adds up
+    assert beyond.far_from_data
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_moments_may_be_matched(gp, mode):
+    chosen = controller(gp, mode, propagator=MomentMatching())
+    assert 0.0 < decide(chosen, 0.2).novelty < 0.2
+
+
+@pytest.mark.parametrize("mode", ["none", "zero_order"])
+def test_it_is_the_added_deviation_over_that_of_what_was_learned(gp, mode):
+    chosen, state = controller(gp, mode), np.full(2, 0.9)
+    decision = None
+    for _ in range(5):  # until the stages are those of the plan
+        decision = chosen.control(Gaussian.certain(state), Reference(state), decision)
+        state = state if mode == "none" else decision.means[0]
+    assert decision is not None
+    at = torch.from_numpy(decision.means[:-1]), torch.from_numpy(decision.inputs)
+    added = gp.predict(*at).variance.sqrt()
+    learned = gp.targets.std(dim=0, correction=0)
+    near = 1e-9 if mode == "none" else 0.5  # stages of the last plan
+    assert decision.novelty == pytest.approx(float((added / learned).max()), rel=near)
+
+
+def test_noise_is_no_novelty(gp):
+    quiet = decide(controller(gp, propagator=Linearization(process_noise=False)), 0.2)
+    noisy = decide(controller(gp), 0.2)
+    assert noisy.covariances[1].trace() > 2 * quiet.covariances[1].trace()
+    assert noisy.novelty == pytest.approx(quiet.novelty, rel=1e-6)
+
+
+def test_a_linear_function_is_not_known_far_beyond_its_data(gp):
+    """Its prior is far wider than its data, and a ratio to it stays small there."""
+    learned = gp.targets.var(dim=0, correction=0)
+    assert float((gp.signal_variance / learned).max()) > 5.0**2
+    decision = decide(controller(gp, "none"), 4.0)
+    at = torch.from_numpy(decision.means[:-1]), torch.from_numpy(decision.inputs)
+    to_prior = (gp.predict(*at).variance / gp.signal_variance).sqrt()
+    assert decision.far_from_data
+    assert float(to_prior.max()) < 0.4
+
+
+def test_a_deviation_beyond_the_range_of_the_data_is_above_one():
+    gp = train(transitions(unstable=0.5), predicts="difference", restarts=0).posterior
+    chosen = controller(gp, horizon=40, feedback=False)
+    decision = decide(chosen, 0.0)
+    ranges = np.ptp(gp.features.numpy()[:, :2], axis=0)
+    deviations = np.sqrt(np.diagonal(decision.covariances, axis1=1, axis2=2))
+    assert decision.novelty == pytest.approx((deviations / ranges).max())
+    assert decision.novelty > 10.0
+    assert decide(controller(gp, horizon=40), 0.0).novelty < 0.2
+
+
+def test_a_state_that_only_its_noise_moves_is_not_far_from_its_data():
+    rng = np.random.default_rng(1)
+    features = torch.from_numpy(rng.uniform(-1, 1, (60, 2)) * [1.0, 1e-4])
+    targets = torch.from_numpy(rng.normal(0, 1e-4, (60, 1)))
+    ones = torch.ones(1, dtype=torch.float64)
+    gp = GPPosterior.from_hyperparameters(
+        features, targets, ones.expand(1, 2), 1e-12 * ones, 1e-8 * ones, 1
+    )
+    belief, cost = Gaussian.certain([0.1]), Tracking([1.0], [0.1])
+    decision = GPMPC(gp, Linearization(), Problem(cost), 10, [0.0]).control(
+        belief, Reference([0.1])
+    )
+    assert 0.0 < decision.novelty < 0.1
+
+
+def test_scales_of_angles_of_what_never_moved_and_of_pseudo_observations():
+    data = transitions()
+    turned = ResidualModel.train(Affine.identity(2, 1), data, angles=[0])
+    scales = data_scales(turned)
+    assert scales is not None
+    assert scales.reached[0] == np.pi
+    assert scales.reached[1] == pytest.approx(np.ptp(data.states[:, 1].numpy()))
+    still = replace(data, states=data.states * torch.tensor([1.0, 0.0]))
+    kept = train(still, restarts=0).posterior
+    scales = data_scales(kept)
+    assert scales is not None
+    assert scales.reached[1] == np.inf
+    sparse = SparseTrainer(inducing=20, restarts=0)(data).posterior
+    scales = data_scales(sparse)
+    assert scales is not None
+    assert scales.added == pytest.approx(sparse.signal_variance.numpy())
+
+
+@pytest.mark.parametrize("mode", ["none", "zero_order"])
+def test_models_around_gps_know_it_too(gp, mode):
+    plain = decide(controller(gp, mode), 0.2).novelty
+    delayed = DelayedModel(gp, 1.0)
+    scales = data_scales(delayed)
+    assert scales is not None
+    assert scales.added.tolist()[2:] == [0.0]
+    assert scales.reached.tolist()[2:] == [np.inf]
+    problem = Problem(Tracking([1.0, 1.0, 0.0], [0.1]), Box([-1.0], [1.0]))
+    settings = PredictionSettings(covariance=mode)
+    chosen = GPMPC(delayed, Linearization(), problem, 5, [0.0], settings)
+    for place, far in ((0.2, False), (4e3, True)):
+        state = np.array([place, place, 0.0])
+        decision = chosen.control(Gaussian.certain(state), Reference(state))
+        assert decision.far_from_data is far
+    curved = ResidualModel.train(lambda x, u: x + 0.1 * x.sin(), transitions())
+    assert curved.affine_form is None
+    assert 0.0 < decide(controller(curved, mode), 0.2).novelty < 0.2
+    assert decide(controller(curved, mode), 4e3).far_from_data
+    assert plain < 0.2
+
+
+def test_a_plan_of_means_is_measured_when_it_is_read_and_not_before(gp, monkeypatch):
+    asked, linearize = [], GPPosterior.linearize
+
+    def counted(self, states, inputs, covariance=True):
+        asked.append(covariance)
+        return linearize(self, states, inputs, covariance)
+
+    monkeypatch.setattr(GPPosterior, "linearize", counted)
+    decision = decide(controller(gp, "none"), 0.2)
+    copied = replace(decision, suboptimal=True)
+    assert not any(asked)
+    known = decision.novelty
+    assert sum(asked) == 1
+    assert decision.novelty == known == decision.plan_novelty
+    assert copied.novelty == known
+
+
+def test_it_is_not_known_of_models_that_are_no_gps():
+    known = KnownModel(Affine.identity(2, 1), 2, 1)
+    decision = decide(controller(known), 0.2)
+    assert math.isnan(decision.novelty)
+    assert not decision.far_from_data
