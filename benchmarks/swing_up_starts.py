@@ -14,7 +14,7 @@ import json
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from time import perf_counter
+from time import process_time
 from typing import Any, NamedTuple
 
 import casadi
@@ -31,7 +31,6 @@ from gpmpc.mpc import (
     ManyStarts,
     PredictionSettings,
     Problem,
-    Reference,
     Tracking,
 )
 from gpmpc.propagation import Linearization
@@ -169,9 +168,7 @@ def problem_of(plant: Plant, weighting: str) -> Problem:
         penalized="inputs",
         angles=plant.system.angle_indices,
     )
-    return Problem(
-        cost, inputs=Box(plant.system.input_lower, plant.system.input_upper)
-    )
+    return Problem(cost, inputs=Box(plant.system.input_lower, plant.system.input_upper))
 
 
 class CountedStarts(ManyStarts):
@@ -224,9 +221,9 @@ def fly(name: str, horizon: int, weighting: str, kind: str) -> dict[str, Any]:
     paid = 0.0
     cost = steering.problem.cost
     for _ in range(round(PLANTS[name].seconds / system.time_step)):
-        begin = perf_counter()
+        begin = process_time()
         input = loop.input(state, system.goal)
-        seconds.append(perf_counter() - begin)
+        seconds.append(process_time() - begin)
         state = step(system, state, input)
         states.append(state)
         error = state - system.goal
