@@ -239,22 +239,27 @@ class Pilot:
         if self._pause > 0:
             self._pause -= 1
             return brake
-        begin, without = perf_counter(), self._loop is None
+        begin = perf_counter()
+        without = self._loop is None
         loop = ControlLoop(self.controller) if self._loop is None else self._loop
-        torque, plan = (
-            float(loop.input(state, Reference(np.zeros(4)))[0]),
-            loop.last.decision,
-        )
+        torque = float(loop.input(state, Reference(np.zeros(4)))[0])
+        if not (without or self._leads_up(loop)):  # a search may find a better plan
+            loop = ControlLoop(self.controller)
+            torque = float(loop.input(state, Reference(np.zeros(4)))[0])
         self.seconds.append(perf_counter() - begin)
         self.searched.append(without)
-        if (
-            not plan.applicable
-            or self.controller.criterion(plan, upright(plan.means)) > REPLAN
-        ):
+        if not self._leads_up(loop):
             self._loop, self._pause = None, PAUSE - 1
             return brake
         self._loop = loop
         return torque
+
+    def _leads_up(self, loop: ControlLoop) -> bool:
+        """Whether the plan of the last decision is worth following."""
+        plan = loop.last.decision
+        if not plan.applicable:
+            return False
+        return self.controller.criterion(plan, upright(plan.means)) <= REPLAN
 
 
 class Flies(Protocol):
@@ -510,7 +515,7 @@ def pilot(model: Any, robot: str, gain: float = 1.0, **settings: Any) -> Pilot:
         model, RATES[robot], **settings
     )
     return Pilot(
-        ManyStarts(controller, planner, guesses, TURNS[robot], criterion, REPLAN),
+        ManyStarts(controller, planner, guesses, TURNS[robot], criterion),
         JOINTS[robot],
         gain,
     )

@@ -1,11 +1,13 @@
-"""Many starts find plans that one misses, over any full turn, within their time; feedback holds between decisions."""
+"""Many starts find plans that one misses, over any full turn, within their time, and what was found is kept."""
 
+from dataclasses import replace
 from itertools import product
 
 import casadi
 import numpy as np
 import pytest
 
+from gpmpc._angles import state_difference, wrap
 from gpmpc.exceptions import SettingError, ShapeError
 from gpmpc.gaussian import Gaussian
 from gpmpc.models import CasadiFunction, KnownModel
@@ -55,26 +57,171 @@ def controller(system, Q, R, horizon, iterations=1, rolled_out=True, **bounds):
     )
 
 
+class CountedStarts(ManyStarts):
+    """Counts its searches."""
+
+    searches = 0
+
+    def plans(self, *arguments, **named):
+        self.searches += 1
+        return super().plans(*arguments, **named)
+
+
 def pendulums(iterations=15, **settings):
     parts = pendulum(), [1.0, 0.01], [0.01], 30
-    return ManyStarts(controller(*parts), controller(*parts, iterations), **settings)
+    return CountedStarts(controller(*parts), controller(*parts, iterations), **settings)
+
+
+def cart_poles(horizon=40):
+    parts = cart_pole(), [1.0, 0.01, 1.0, 0.01], [0.01], horizon
+    return CountedStarts(controller(*parts), controller(*parts, 10))
+
+
+def fly(steering, system, steps, kicks=(), measure=lambda state, k: state):
+    """States and what they cost, under kicks (step, change of the state)."""
+    loop = ControlLoop(steering)
+    state = np.array(system.start, dtype=float)
+    states = [state]
+    cost = steering.problem.cost
+    paid = 0.0
+    for k in range(steps):
+        input = loop.input(measure(state, k), np.zeros(len(state)))
+        state = step(system, state, input)
+        for when, change in kicks:
+            state = state + (k == when) * np.array(change)
+        states.append(state)
+        error = state_difference(state, 0.0 * state, cost.angles)
+        paid += error @ cost.Q @ error + input @ cost.R @ input
+    return np.array(states), paid
+
+
+def off_upright(states, angle):
+    return np.abs(wrap(states[:, angle]))
 
 
 def test_many_starts_swing_a_cart_pole_up_and_follow_their_plan_from_then_on():
-    system, reference = cart_pole(), Reference(np.zeros(4))
-    parts = system, [1.0, 0.01, 1.0, 0.01], [0.01], 40
-    many = ManyStarts(controller(*parts), controller(*parts, 10))
-    state, decision, searched = np.array(system.start), None, []
-    for _ in range(60):
-        decision = many.control(Gaussian.certain(state), reference, decision)
-        searched.append(decision.iterations > 1)
+    many = cart_poles()
+    states, _ = fly(many, cart_pole(), 60)
+    assert many.searches == 1
+    assert off_upright(states[-20:], 2).max() < 0.15
+    assert np.abs(states[-1, [0, 1, 3]]).max() < 0.15
+
+
+@pytest.mark.parametrize("horizon", [30, 60])
+def test_a_pendulum_is_up_where_the_controller_alone_gets_up_and_costs_no_more(horizon):
+    system = pendulum()
+    parts = system, [1.0, 0.01], [0.01], horizon
+    many = CountedStarts(controller(*parts), controller(*parts, 10))
+    states, paid = fly(many, system, 80)
+    alone, paid_alone = fly(controller(*parts), system, 80)
+    assert off_upright(alone[-15:], 0).max() < 0.2
+    assert off_upright(states[-15:], 0).max() < 0.2
+    assert paid < 1.001 * paid_alone
+    assert many.searches == 1
+
+
+def test_a_cart_pole_is_up_sooner_than_by_the_controller_alone():
+    system = cart_pole()
+    many = cart_poles(60)
+    states, paid = fly(many, system, 90)
+    alone, paid_alone = fly(many.controller, system, 90)
+    ups = [np.flatnonzero(off_upright(x, 2) > 0.2)[-1] for x in (states, alone)]
+    assert ups[0] < ups[1] - 20
+    assert paid < 0.8 * paid_alone
+
+
+def test_a_push_that_makes_the_rest_of_the_way_dearer_is_a_cause_to_search_again():
+    system = pendulum()
+    many = pendulums()
+    push = (30, [0.4, 3.0])
+    states, _ = fly(many, system, 110, [push])
+    assert many.searches == 2
+    assert off_upright(states[-15:], 0).max() < 0.2
+    many = pendulums()
+    fly(many, system, 110, [(30, [0.005, 0.01])])
+    assert many.searches == 1
+
+
+def test_a_push_off_the_top_is_a_cause_to_search_again():
+    many = pendulums()
+    states, _ = fly(many, pendulum(), 170, [(85, [0.9, 3.0])])
+    assert off_upright(states[80:85], 0).max() < 0.2
+    assert many.searches == 2
+    assert off_upright(states[-15:], 0).max() < 0.2
+
+
+def test_noise_at_the_top_is_none():
+    rng = np.random.default_rng(0)
+    many = pendulums()
+    noise = rng.normal(size=(120, 2)) * [0.005, 0.02]
+    fly(many, pendulum(), 120, measure=lambda state, k: state + noise[k])
+    assert many.searches == 1
+
+
+def test_a_measurement_that_fails_on_the_way_does_not_lose_the_way():
+    def measure(state, k):
+        return np.full(2, np.nan) if k in (12, 13, 40) else state
+
+    many = pendulums()
+    states, _ = fly(many, pendulum(), 90, measure=measure)
+    assert many.searches == 1
+    assert off_upright(states[-15:], 0).max() < 0.2
+
+
+def test_a_plan_is_not_torn_by_the_controller_that_follows_it():
+    def cost(decision, goal):
+        return many._cost(decision, goal)
+
+    system = cart_pole()
+    parts = system, [1.0, 0.01, 1.0, 0.01], [0.1], 80
+    many = CountedStarts(controller(*parts), controller(*parts, 10), criterion=cost)
+    state = np.array(system.start)
+    decision = None
+    ratios = []
+    for _ in range(40):
+        last = decision
+        decision = many.control(
+            Gaussian.certain(state), Reference(np.zeros(4)), decision
+        )
         state = step(system, state, decision.input)
-    assert searched[0]
-    assert not any(searched[1:])
-    assert (
-        np.abs(state - [0, 0, 2 * np.pi * np.round(state[2] / (2 * np.pi)), 0]).max()
-        < 0.15
-    )
+        if last is None:
+            continue
+        turn = np.zeros(4)
+        turn[2] = 2 * np.pi * np.round(last.means[-1, 2] / (2 * np.pi))
+        goal = Reference(np.tile(turn, (81, 1)))
+        inputs = np.concatenate([last.inputs[1:], last.inputs[-1:]])
+        means = many.controller.prediction.lead(last.means[1], inputs)
+        kept = replace(last, inputs=inputs, means=means)
+        ratios.append(cost(decision, goal) / cost(kept, goal))
+    assert many.searches == 1
+    assert max(ratios) < 1.01
+
+
+def test_another_set_point_is_not_the_one_that_a_flight_leads_to():
+    system = cart_pole()
+    many = cart_poles()
+    loop = ControlLoop(many)
+    state = np.array(system.start)
+    for k in range(80):
+        goal = np.array([0.0 if k < 5 else 1.0, 0.0, 0.0, 0.0])
+        state = step(system, state, loop.input(state, goal))
+    assert state[0] == pytest.approx(1.0, abs=0.1)
+    assert off_upright(state[None], 2)[0] < 0.1
+
+
+def test_a_reference_that_moves_is_followed_by_plans_alone():
+    system = cart_pole()
+    many = cart_poles(20)
+    loop = ControlLoop(many)
+    state = np.array([0.0, 0.0, 0.05, 0.0])
+    for k in range(60):
+        times = 0.05 * (k + np.arange(21))
+        reference = np.zeros((21, 4))
+        reference[:, 0] = 0.3 * np.sin(times)
+        reference[:, 1] = 0.3 * np.cos(times)
+        state = step(system, state, loop.input(state, reference))
+    assert many.searches == 1
+    assert np.abs(state[0] - 0.3 * np.sin(0.05 * 60)) < 0.1
 
 
 def test_the_search_is_never_worse_than_any_of_its_starts():
@@ -139,14 +286,30 @@ def test_the_users_criterion_chooses_and_a_spent_budget_ends_the_search():
         .control(state, reference)
         .applicable
     )
-    assert len(seen) == 1
+    assert len(seen) == 2  # the controller's own plan, and one start
 
 
-def test_a_plan_above_the_limit_is_given_up_for_a_better_one():
+def test_a_plan_that_does_not_lead_to_the_goal_is_given_up_and_a_good_one_is_not():
     state, reference = Gaussian.certain(np.array([np.pi, 0.0])), Reference(np.zeros(2))
-    poor = controller(pendulum(), [1.0, 0.01], [0.01], 30).control(state, reference)
-    assert pendulums().control(state, reference, poor).iterations == 1
-    assert pendulums(limit=1e-9).control(state, reference, poor).iterations > 1
+    one = controller(pendulum(), [1.0, 0.01], [0.01], 30)
+    many = pendulums()
+    many.control(state, reference, one.control(state, reference))
+    assert many.searches == 1
+    near = Gaussian.certain(np.array([0.1, 0.0]))
+    many = pendulums()
+    many.control(near, reference, one.control(near, reference))
+    assert many.searches == 0
+
+
+def test_a_spent_budget_leaves_what_the_controller_does_by_itself():
+    system = pendulum()
+    many = pendulums(budget=1e-9)
+    state = Gaussian.certain(np.array(system.start))
+    found = many.control(state, Reference(np.zeros(2)))
+    alone = many.controller.control(state, Reference(np.zeros(2)))
+    assert np.allclose(found.input, alone.input)
+    states, _ = fly(many, system, 80)
+    assert off_upright(states[-15:], 0).max() < 0.2
 
 
 def test_a_measurement_that_is_not_finite_is_said_so_and_misuse_is_refused():
@@ -255,12 +418,7 @@ def test_what_cannot_be_searched_is_refused():
         ):
             ManyStarts(*parts)
     bare = ManyStarts(one)
-    assert (bare.planner, bare.limit, bare.budget, bare.turns) == (
-        one,
-        np.inf,
-        None,
-        [2],
-    )
+    assert (bare.planner, bare.budget, bare.turns) == (one, None, [2])
     assert (bare.horizon, bare.problem) == (30, one.problem)
 
 
