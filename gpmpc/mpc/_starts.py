@@ -649,9 +649,14 @@ def _order(one: Flight, other: Flight) -> int:
 
 def _with_plan(decision: Decision, inputs: Array, means: Array) -> Decision:
     """A decision for another plan, which is applicable."""
-    changes: dict[str, Any] = {}
+    changes: dict[str, Any] = {
+        "stage_costs": np.empty(0),
+        "violation": math.nan,
+        "steps": (),
+    }
     if not decision.applicable:
-        changes = {"status": Status.ITERATION_LIMIT, "suboptimal": True}
+        changes["status"] = Status.ITERATION_LIMIT
+        changes["suboptimal"] = True
         changes["covariances"] = np.zeros((*means.shape, means.shape[1]))
     return replace(decision, input=inputs[0], inputs=inputs, means=means, **changes)
 
