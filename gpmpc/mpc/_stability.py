@@ -1,0 +1,487 @@
+"""Whether a loop is stable where it is to rest, known before it runs.
+
+Near a set point no bound is active, and the first input of the quadratic program is an affine function of what the
+program is told: u_k = F_x s_k + F_u u_{k-1} + F_d d_k + const, the gain of the finite-horizon regulator of the stages
+there. Closed with the plant's own linearisation it is a linear system in (x_k, s_{k-1}, u_{k-1}, d_{k-1}),
+
+    s_k = C x_k,    d_k = (1 - L) d_{k-1} + L (s_k - A s_{k-1} - B u_{k-1}),    x_{k+1} = A_p x_k + B_p u_k
+
+whose spectral radius says whether the loop settles. x is the plant's state, with the inputs on their way where they act
+late; s what the controller is told of it; d the estimate of the disturbance, of gain L. The form ``velocity`` is L = 1:
+its constant is what the last step missed. Derivatives of the stages by their points are of second order where the loop
+rests, so that the law is that of every iteration and covariance mode, but for what covariances weigh.
+
+A short horizon may take a plant's inverse response for the whole of it: every program is solved, and the loop runs away
+(on receding finite horizons: Bitmead, Gevers and Wertz, 1990). One backward Riccati recursion gives the first gains of
+all horizons.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from gpmpc._angles import state_difference
+from gpmpc._compiled import call_unchecked
+from gpmpc._dynamics import DynamicsModel, linearize, to_array
+from gpmpc.exceptions import SettingError
+from gpmpc.models import DelayedModel
+from gpmpc.models._wrapper import Wrapper
+from gpmpc.mpc._controller import Reference, read_parameters, read_reference
+from gpmpc.mpc._linear_quadratic import (
+    DEVIATIONS,
+    INCREMENTS,
+    QuadraticCost,
+    References,
+    Stages,
+    optimal_feedback,
+)
+from gpmpc.mpc._prediction import PredictionModel
+from gpmpc.mpc._stages import Plan
+
+Array = np.ndarray
+
+_POINTS = 10  # of a trajectory
+_LONGEST = 20  # horizons that are tried, in that of the controller
+_ROUNDING = 1e-6  # by how much a growing mode of a known model exceeds 1
+_LEARNED = 1e-3  # of a learned one: its integrators are not exact ones
+_ITERATIONS = 20  # towards a point of rest
+_HALVINGS = 10  # of a step that does not improve
+_SETTLED = 1e-3  # last change of a point of rest, relative to its size or 1
+_AT_REST = 1e-2  # largest step of a state at rest, likewise: learned models drift
+_NEGLIGIBLE = 1e-3  # weight of what no cost weighs, in the largest one
+_PRICE = 1e3  # of a state that does not rest, in the largest weight
+_LOWEST_GAIN = 0.5  # of the plant's inputs, in the model's
+_HIGHEST_GAIN = 1.5
+_GAINS = 21  # gains that are tried from the lowest to the highest
+_GAIN_TOLERANCE = 1e-3
+
+
+@dataclass(frozen=True)
+class Stability:
+    """What the loop does near the points where it is to rest."""
+
+    horizon: int  #: H, of the controller
+    #: the largest size of an eigenvalue of the closed loop: from 1 on it does not settle; NaN where no point could be
+    #: judged: the model rests nowhere near the reference within the bounds
+    spectral_radius: float
+    #: whether no mode grows: integrators that nothing weighs may stand still. Of a learned model growth below 0.1 % a
+    #: step does not count: its integrators are not exact ones
+    stable: bool
+    #: the shortest horizon from which on the radius stays below 1; None where none of those tried has it there, or
+    #: weights differ by stage
+    shortest_horizon: int | None
+    #: range of factors of the plant's inputs around 1, tried from 0.5 to 1.5, in which the loop is stable
+    gain_range: tuple[float, float]
+    states: Array  #: the points that were judged (K, n)
+    inputs: Array  #: the inputs that hold them (K, m)
+
+    @property
+    def judged(self) -> bool:
+        """Whether there was a point to judge."""
+        return len(self.states) > 0
+
+
+class _Point(NamedTuple):
+    """Where the loop is to rest, or to move as its reference does, and the model there."""
+
+    state: Array  # (n,)
+    input: Array  # (m,)
+    A: Array  # (n, n)
+    B: Array  # (n, m)
+    cost: QuadraticCost
+
+
+class _Plant(NamedTuple):
+    """The plant's linearisation with the last inputs as states, and what the controller is told of them."""
+
+    A: Array  # (p, p)
+    B: Array  # (p, m)
+    moved: Array  # whether a state (p,) is moved by what the inputs do, not by what they are
+    C: Array  # (n, p)
+
+
+def stability(
+    prediction: PredictionModel,
+    reference: Any,
+    plant: DynamicsModel | None = None,
+    ahead: DelayedModel | None = None,
+    parameters: Any = None,
+) -> Stability:
+    """Returns what a loop does near its reference; see ``GPMPC.stability``."""
+    followed = read_reference(reference).in_order(prediction.signals)
+    _check(prediction, plant, ahead)
+    horizon, problem = prediction.horizon, prediction.problem
+    points = _points(prediction, followed, parameters)
+    if not points:
+        return Stability(
+            horizon=horizon,
+            spectral_radius=math.nan,
+            stable=True,
+            shortest_horizon=None,
+            gain_range=(math.nan, math.nan),
+            states=np.empty((0, problem.state_dim)),
+            inputs=np.empty((0, problem.input_dim)),
+        )
+    loops = [_Loop(prediction, point, plant, ahead) for point in points]
+    gain_ranges = np.array([loop.gain_range() for loop in loops])
+    return Stability(
+        horizon=horizon,
+        spectral_radius=max(loop.radius(horizon) for loop in loops),
+        stable=not any(loop.grows(horizon) for loop in loops),
+        shortest_horizon=_shortest_horizon(loops, horizon),
+        gain_range=(float(gain_ranges[:, 0].max()), float(gain_ranges[:, 1].min())),
+        states=np.array([point.state for point in points]),
+        inputs=np.array([point.input for point in points]),
+    )
+
+
+def _check(
+    prediction: PredictionModel,
+    plant: DynamicsModel | None,
+    ahead: DelayedModel | None,
+) -> None:
+    """Raises ``SettingError`` where plant or delay do not belong to the controller."""
+    model = prediction.model
+    if ahead is not None:
+        if not isinstance(ahead, DelayedModel):
+            rule = "must be the DelayedModel whose ahead() the controller is told"
+            raise SettingError("ahead", f"{rule}; got {type(ahead).__name__}")
+        if ahead.remaining.state_dim != model.state_dim:
+            rule = f"must leave the controller's {model.state_dim} states"
+            got = ahead.remaining.state_dim
+            raise SettingError("ahead", f"{rule} in its remaining; got {got}")
+    if plant is None:
+        return
+    own = model.state_dim - len(_pending(model))
+    states = plant.state_dim - len(_pending(plant))
+    if states < own or plant.input_dim != model.input_dim:
+        rule = f"must have {own} states and {model.input_dim} inputs"
+        raise SettingError("plant", f"{rule}; got {states} and {plant.input_dim}")
+
+
+def _pending(model: Any) -> list[int]:
+    """Indices of a model's states that are inputs on their way, the oldest first."""
+    if not isinstance(model, Wrapper):
+        return []
+    within = _pending(model.model)
+    if not isinstance(model, DelayedModel):
+        return within
+    return within + list(range(model.model.state_dim, model.state_dim))
+
+
+def _points(
+    prediction: PredictionModel, reference: Reference, parameters: Any
+) -> list[_Point]:
+    """The points of a set point, or of some steps of a trajectory, at which the law can be judged."""
+    states = np.atleast_2d(np.asarray(reference.states, dtype=float))
+    inputs = np.zeros((len(states), prediction.problem.input_dim))
+    if reference.inputs is not None:
+        given = np.atleast_2d(np.asarray(reference.inputs, dtype=float))
+        inputs[: len(given)] = given
+        inputs[len(given) :] = given[-1]
+    steps = state_difference(states[1:], states[:-1], prediction.angles)
+    steps = np.vstack([steps, np.zeros_like(states[:1])]) if len(steps) else 0 * states
+    last, n = len(states) - 1, states.shape[1]
+    chosen = np.unique(np.linspace(0, max(last - 1, 0), _POINTS).round().astype(int))
+    rows = np.hstack([states, steps, inputs])[chosen]
+    points = []
+    for row in np.unique(rows, axis=0):
+        state, step, input = np.split(row, [n, 2 * n])
+        point = _RestSearch(prediction, state, step, input, parameters).find()
+        if point is not None:
+            points.append(point)
+    return points
+
+
+class _Unrest(NamedTuple):
+    """What a state and an input cost, and by how far the model moves them otherwise than it should."""
+
+    A: Array  # (n, n)
+    B: Array  # (n, m)
+    missing: Array  # of the step that the state is to make (n,)
+    cost: QuadraticCost
+    weight: Array  # half the Hessian by state and input (n + m, n + m)
+    slope: Array  # half the gradient (n + m,)
+    value: float  # infinite where the model has none
+
+
+class _RestSearch:
+    """Finds the cheapest state that some input holds, or moves as the reference does."""
+
+    def __init__(
+        self,
+        prediction: PredictionModel,
+        target: Array,
+        step: Array,
+        target_input: Array,
+        parameters: Any,
+    ):
+        self._prediction, self._parameters = prediction, parameters
+        self._target, self._step, self._target_input = target, step, target_input
+
+    def find(self) -> _Point | None:
+        """The point by Gauss-Newton steps from the target on; None where they find none within the input's bounds."""
+        prediction, n = self._prediction, len(self._target)
+        input = prediction.initial_input.copy()
+        state = self._target.copy()
+        pending = _pending(prediction.model)
+        state[pending] = np.tile(input, len(pending) // len(input))
+        here = self._at(state, input)
+        for _ in range(_ITERATIONS):
+            if not math.isfinite(here.value):
+                return None
+            change = -np.linalg.solve(here.weight, here.slope)
+            for _ in range(_HALVINGS):
+                there = self._at(state + change[:n], input + change[n:])
+                if there.value <= here.value * (1.0 + _ROUNDING):
+                    break
+                change = 0.5 * change
+            state, input, here = state + change[:n], input + change[n:], there
+            sizes = np.maximum(1.0, np.abs(np.concatenate([state, input])))
+            if (np.abs(change) <= _SETTLED * sizes).all():
+                break
+        else:
+            return None
+        lower, upper = prediction.problem.inputs.first
+        within = (lower < input) & (input < upper)
+        rests = np.abs(here.missing) <= _AT_REST * np.maximum(1.0, np.abs(state))
+        if not (within.all() and rests.all()):
+            return None
+        return _Point(state, input, here.A, here.B, here.cost)
+
+    def _at(self, state: Array, input: Array) -> _Unrest:
+        prediction = self._prediction
+        n, m = len(state), len(input)
+        model = linearize(prediction.model, state[None], input[None], covariance=False)
+        A, B = model.A[0], model.B[0]
+        moved = state_difference(model.mean[:1], state[None], prediction.angles)[0]
+        missing = moved - self._step
+        cost = _cost_at(prediction, state, input, self._parameters)
+        off = np.concatenate([state - self._target, input])
+        weight = np.zeros((n + m, n + m))
+        weight[:n, :n] = cost.state[0, 0]
+        if cost.penalized == DEVIATIONS:
+            off[n:] -= self._target_input
+        if cost.penalized != INCREMENTS:
+            weight[n:, n:] = cost.input[0]
+        slope = weight @ off
+        value = off @ slope
+        if len(cost.squares):
+            z = np.concatenate([state, input, [1.0]])
+            weight = weight + cost.squares[0, :-1, :-1]
+            slope = slope + (cost.squares[0] @ z)[:-1]
+            value = value + z @ cost.squares[0] @ z
+        largest = np.abs(weight).max()
+        rows = np.hstack([A - np.eye(n), B])
+        price = _PRICE * largest
+        weight = weight + _NEGLIGIBLE * largest * np.eye(n + m)
+        weight = weight + price * rows.T @ rows
+        slope = slope + price * rows.T @ missing
+        value = float(value + price * missing @ missing)
+        if not (np.isfinite(weight).all() and np.isfinite(slope).all()):
+            value = math.inf
+        return _Unrest(A, B, missing, cost, weight, slope, value)
+
+
+def _cost_at(
+    prediction: PredictionModel, state: Array, input: Array, parameters: Any
+) -> QuadraticCost:
+    """The cost of the means with outputs linearised at one point, at every stage."""
+    H = prediction.horizon
+    values = None if parameters is None else read_parameters(parameters, H)
+    plan = Plan(
+        states=np.tile(state, (H + 1, 1)),
+        inputs=np.tile(input, (H, 1)),
+        covariances=np.zeros((H + 1, len(state), len(state))),
+    )
+    cost = prediction.costs.at(plan, values)
+    return cost._replace(state=cost.state[:, :1], terminal=cost.terminal[:1])
+
+
+class _Loop:
+    """The closed loop of a controller and a plant, linearised at a point."""
+
+    def __init__(
+        self,
+        prediction: PredictionModel,
+        point: _Point,
+        plant: DynamicsModel | None,
+        ahead: DelayedModel | None,
+    ):
+        self._point, self._horizon = point, prediction.horizon
+        velocity = prediction.settings.form == "velocity"
+        self._observer_gain = 1.0 if velocity else prediction.settings.disturbance_gain
+        learned = bool(to_array(prediction.model.noise_covariance).any())
+        self._tolerance = _LEARNED if learned else _ROUNDING
+        self._plant = _linear_plant(prediction, point, plant, ahead)
+        self._laws = _laws(point.A, point.B, point.cost, prediction.horizon)
+
+    @property
+    def constant(self) -> bool:
+        """Whether the cost weighs all stages alike, so that another horizon has a meaning."""
+        cost = self._point.cost
+        parts = (cost.state[:-1], cost.input, cost.squares)
+        return all(len(part) == 0 or not np.ptp(part, axis=0).any() for part in parts)
+
+    def look_ahead(self, horizon: int) -> None:
+        """Computes the laws of all horizons up to one."""
+        point = self._point
+        self._laws = _laws(point.A, point.B, point.cost, horizon)
+
+    def radius(self, horizon: int, gain: float = 1.0) -> float:
+        """The spectral radius with a horizon's law, where the plant's inputs do ``gain`` times as much."""
+        return float(np.abs(np.linalg.eigvals(self.matrix(horizon, gain))).max())
+
+    def grows(self, horizon: int, gain: float = 1.0) -> bool:
+        """Whether the closed loop has a mode that grows."""
+        return self.radius(horizon, gain) > 1.0 + self._tolerance
+
+    def gain_range(self) -> tuple[float, float]:
+        """Smallest and largest factor of the plant's inputs, around 1, without a mode that grows; NaN without any."""
+        if self.grows(self._horizon):
+            return math.nan, math.nan
+        return self._last_stable_gain(_LOWEST_GAIN), self._last_stable_gain(
+            _HIGHEST_GAIN
+        )
+
+    def _last_stable_gain(self, end: float) -> float:
+        """The last stable factor on the way from 1 to an end."""
+        stable = 1.0
+        for gain in np.linspace(1.0, end, _GAINS)[1:]:
+            if self.grows(self._horizon, gain):
+                break
+            stable = gain
+        else:
+            return end
+        unstable = gain
+        while abs(stable - unstable) > _GAIN_TOLERANCE:
+            middle = 0.5 * (stable + unstable)
+            if self.grows(self._horizon, middle):
+                unstable = middle
+            else:
+                stable = middle
+        return float(stable)
+
+    def matrix(self, horizon: int, gain: float = 1.0) -> Array:
+        """The closed loop of (x_k, u_{k-1}, s_{k-1}, d_{k-1}), the last two where disturbances are estimated."""
+        A, B, L = self._point.A, self._point.B, self._observer_gain
+        A_p, C = self._plant.A, self._plant.C
+        B_p = np.where(self._plant.moved, gain, 1.0)[:, None] * self._plant.B
+        n, m = B.shape
+        p = len(A_p)
+        law = self._laws[-horizon]
+        by_state, by_error, by_input = np.split(law[:, :-1], [n, 2 * n], axis=1)
+        error = np.hstack([L * C, -L * B, -L * A, (1.0 - L) * np.eye(n)])
+        input = np.hstack([by_state @ C, by_input, np.zeros((m, 2 * n))])
+        input = input + by_error @ error
+        state = np.hstack([A_p, np.zeros((p, m + 2 * n))]) + B_p @ input
+        told = np.hstack([C, np.zeros((n, m + 2 * n))])
+        loop = np.vstack([state, input, told, error])
+        return loop if L > 0 else loop[: p + m, : p + m]
+
+
+def _laws(A: Array, B: Array, cost: QuadraticCost, horizon: int) -> Array:
+    """First inputs' derivatives by (s, d, u_{-1}, 1) for the horizons from ``horizon`` down to 1 (horizon, m, ...).
+
+    The disturbance is part of the state, to which it is added at every stage.
+    """
+    n, m = B.shape
+    step = np.block([[A, np.eye(n)], [np.zeros((n, n)), np.eye(n)]])
+    reach = np.vstack([B, np.zeros((n, m))])
+    stages = Stages(step[None], reach[None], np.zeros((1, 2 * n)))
+    references = References(np.zeros((horizon, n)), np.zeros((horizon, m)), np.zeros(m))
+    state = _at_stages(cost.state, horizon)
+    squares = _at_stages(cost.squares, horizon)
+    if len(squares):
+        state = np.repeat(state, horizon // len(state), axis=0)
+        squares = np.repeat(squares, horizon // len(squares), axis=0)
+    unweighted = np.zeros_like(state)
+    wide = cost._replace(
+        state=np.concatenate([state, unweighted], axis=1),
+        terminal=np.concatenate([cost.terminal, np.zeros_like(cost.terminal)]),
+        input=_at_stages(cost.input, horizon),
+        squares=squares,
+    )
+    return call_unchecked(optimal_feedback, wide, stages, references)[0]
+
+
+def _at_stages(values: Array, horizon: int) -> Array:
+    """Weights of the stages of a horizon, or of one that stands for all."""
+    return values if len(values) == horizon else values[:1]
+
+
+def _linear_plant(
+    prediction: PredictionModel,
+    point: _Point,
+    plant: DynamicsModel | None,
+    ahead: DelayedModel | None,
+) -> _Plant:
+    """The plant at a point, with as many of its last inputs as states as the controller knows of."""
+    model = prediction.model
+    n, m = point.B.shape
+    pending = _pending(model)
+    others = [i for i in range(n) if i not in pending]
+    if plant is None:
+        plant = model if ahead is None else ahead
+    count = len(pending) // m if ahead is None else ahead.pending
+    p = plant.state_dim
+    at = np.zeros(p)
+    queue = _pending(plant)
+    own = [i for i in range(p) if i not in queue]
+    at[own[: len(others)]] = point.state[others]
+    at[queue] = np.tile(point.input, len(queue) // m)
+    local = linearize(plant, at[None], point.input[None], covariance=False)
+    A, B = np.zeros((p + count * m, p + count * m)), np.zeros((p + count * m, m))
+    A[:p, :p], B[:p] = local.A[0], local.B[0]
+    if count:
+        A[p:-m, p + m :] = np.eye((count - 1) * m)
+        B[-m:] = np.eye(m)
+    moved = np.arange(len(A)) < p
+    last_inputs = np.eye(len(A))[p:]
+    shown = np.eye(len(A))[own[: len(others)]]
+    if ahead is not None:
+        shown, last_inputs = _look_ahead(ahead, point, shown, last_inputs)
+    C = np.zeros((n, len(A)))
+    C[others] = shown
+    C[pending] = last_inputs[len(last_inputs) - len(pending) :]
+    return _Plant(A, B, moved, C)
+
+
+def _look_ahead(
+    ahead: DelayedModel, point: _Point, state: Array, inputs: Array
+) -> tuple[Array, Array]:
+    """Where the inputs on their way (D m, p) lead a state (n, p) to, and those of them that are left.
+
+    Rows are linear functions of the closed loop's own state.
+    """
+    n, m = ahead.model.state_dim, ahead.input_dim
+    local = linearize(
+        ahead.model, point.state[None, :n], point.input[None], covariance=False
+    )
+    share = ahead.delay - (ahead.pending - 1)
+    for k in range(ahead.lead):
+        older = inputs[k * m : (k + 1) * m]
+        newer = inputs[(k + 1) * m : (k + 2) * m]
+        acting = older if share == 1 else share * older + (1 - share) * newer
+        state = local.A[0] @ state + local.B[0] @ acting
+    return state, inputs[ahead.lead * m :]
+
+
+def _shortest_horizon(loops: Sequence[_Loop], horizon: int) -> int | None:
+    """The shortest horizon from which on no loop grows; None where none of those tried is."""
+    if not all(loop.constant for loop in loops):
+        return None
+    longest = horizon
+    if any(loop.grows(horizon) for loop in loops):
+        longest = _LONGEST * horizon
+        for loop in loops:
+            loop.look_ahead(longest)
+    shortest = None
+    for candidate in range(longest, 0, -1):
+        if any(loop.grows(candidate) for loop in loops):
+            break
+        shortest = candidate
+    return shortest
