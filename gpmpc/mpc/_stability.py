@@ -18,6 +18,7 @@ all horizons.
 
 import math
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -30,13 +31,12 @@ from gpmpc.exceptions import SettingError
 from gpmpc.models import DelayedModel
 from gpmpc.models._wrapper import Wrapper
 from gpmpc.mpc._controller import Reference, read_parameters, read_reference
+from gpmpc.mpc._cost import FunctionNotFinite
 from gpmpc.mpc._linear_quadratic import (
     DEVIATIONS,
     INCREMENTS,
     QuadraticCost,
-    References,
-    Stages,
-    optimal_feedback,
+    finite_horizon_lqr,
 )
 from gpmpc.mpc._prediction import PredictionModel
 from gpmpc.mpc._stages import Plan
@@ -57,6 +57,7 @@ _LOWEST_GAIN = 0.5  # of the plant's inputs, in the model's
 _HIGHEST_GAIN = 1.5
 _GAINS = 21  # gains that are tried from the lowest to the highest
 _GAIN_TOLERANCE = 1e-3
+_PLANT_GAINS = (0.7, 1.0, 1.3)  # that an estimate of the disturbance is to bear
 
 
 @dataclass(frozen=True)
@@ -64,17 +65,21 @@ class Stability:
     """What the loop does near the points where it is to rest."""
 
     horizon: int  #: H, of the controller
-    #: the largest size of an eigenvalue of the closed loop: from 1 on it does not settle; NaN where no point could be
-    #: judged: the model rests nowhere near the reference within the bounds
+    #: the largest size of an eigenvalue of the closed loop: above 1 it does not settle; NaN where no point could be
+    #: judged: the model rests nowhere near the reference within the bounds of the inputs
     spectral_radius: float
     #: whether no mode grows: integrators that nothing weighs may stand still. Of a learned model growth below 0.1 % a
     #: step does not count: its integrators are not exact ones
     stable: bool
-    #: the shortest horizon from which on the radius stays below 1; None where none of those tried has it there, or
-    #: weights differ by stage
+    #: the shortest horizon from which on no mode grows; None where none of those tried is
     shortest_horizon: int | None
-    #: range of factors of the plant's inputs around 1, tried from 0.5 to 1.5, in which the loop is stable
+    horizons: int  #: how many were tried, from 1 on; 0 where weights differ by stage
+    #: range of factors of the plant's inputs around 1, tried from 0.5 to 1.5, in which no mode grows; NaN without any
     gain_range: tuple[float, float]
+    disturbance_gain: float  #: L, of the controller's estimate
+    #: the largest L up to the controller's with which no mode grows while the plant's inputs do 0.7 to 1.3 of what the
+    #: model says; NaN where that is too much without an estimate, too
+    safe_disturbance_gain: float
     states: Array  #: the points that were judged (K, n)
     inputs: Array  #: the inputs that hold them (K, m)
 
@@ -82,6 +87,25 @@ class Stability:
     def judged(self) -> bool:
         """Whether there was a point to judge."""
         return len(self.states) > 0
+
+    @property
+    def warnings(self) -> list[str]:
+        """What to change, a line each; none where nothing is."""
+        if self.safe_disturbance_gain < self.disturbance_gain:
+            what = f"disturbance_gain {self.disturbance_gain:g} is too large"
+            why = "the loop swings up where inputs do 0.7 or 1.3 of what the model says"
+            return [f"{what}: {why}; {self.safe_disturbance_gain:.2g} is safe"]
+        if self.stable:
+            return []
+        growth = 100.0 * (self.spectral_radius - 1.0)
+        what = f"horizon {self.horizon}: the loop runs away from its reference"
+        if self.shortest_horizon is not None:
+            cure = f"it settles with {self.shortest_horizon} steps or more"
+        elif self.horizons:
+            cure = f"so it does with any up to {self.horizons}: change the weights"
+        else:
+            cure = "try a longer one"
+        return [f"{what}, by {growth:.2g} % a step; {cure}"]
 
 
 class _Point(NamedTuple):
@@ -121,21 +145,52 @@ def stability(
             spectral_radius=math.nan,
             stable=True,
             shortest_horizon=None,
+            horizons=0,
             gain_range=(math.nan, math.nan),
+            disturbance_gain=prediction.settings.disturbance_gain,
+            safe_disturbance_gain=math.nan,
             states=np.empty((0, problem.state_dim)),
             inputs=np.empty((0, problem.input_dim)),
         )
     loops = [_Loop(prediction, point, plant, ahead) for point in points]
+    shortest, tried = _shortest_horizon(loops, horizon)
     gain_ranges = np.array([loop.gain_range() for loop in loops])
     return Stability(
         horizon=horizon,
         spectral_radius=max(loop.radius(horizon) for loop in loops),
         stable=not any(loop.grows(horizon) for loop in loops),
-        shortest_horizon=_shortest_horizon(loops, horizon),
+        shortest_horizon=shortest,
+        horizons=tried,
         gain_range=(float(gain_ranges[:, 0].max()), float(gain_ranges[:, 1].min())),
+        disturbance_gain=prediction.settings.disturbance_gain,
+        safe_disturbance_gain=_safe_disturbance_gain(
+            loops, prediction.settings.disturbance_gain
+        ),
         states=np.array([point.state for point in points]),
         inputs=np.array([point.input for point in points]),
     )
+
+
+def _safe_disturbance_gain(loops: "list[_Loop]", disturbance_gain: float) -> float:
+    """The largest gain up to one with which no loop grows at any of the plant's gains; NaN where none is."""
+
+    def bears(L: float) -> bool:
+        return not any(
+            loop.grows(loop.horizon, gain, L) for loop in loops for gain in _PLANT_GAINS
+        )
+
+    if bears(disturbance_gain):
+        return disturbance_gain
+    if not bears(0.0):
+        return math.nan
+    safe, unsafe = 0.0, disturbance_gain
+    while unsafe - safe > _GAIN_TOLERANCE:
+        middle = 0.5 * (safe + unsafe)
+        if bears(middle):
+            safe = middle
+        else:
+            unsafe = middle
+    return math.floor(100.0 * safe) / 100.0
 
 
 def _check(
@@ -190,9 +245,10 @@ def _points(
     points = []
     for row in np.unique(rows, axis=0):
         state, step, input = np.split(row, [n, 2 * n])
-        point = _RestSearch(prediction, state, step, input, parameters).find()
-        if point is not None:
-            points.append(point)
+        search = _RestSearch(prediction, state, step, input, parameters)
+        with suppress(FunctionNotFinite):
+            point = search.find()
+            points += [] if point is None else [point]
     return points
 
 
@@ -274,7 +330,7 @@ class _RestSearch:
             weight = weight + cost.squares[0, :-1, :-1]
             slope = slope + (cost.squares[0] @ z)[:-1]
             value = value + z @ cost.squares[0] @ z
-        largest = np.abs(weight).max()
+        largest = np.abs(weight).max() or 1.0
         rows = np.hstack([A - np.eye(n), B])
         price = _PRICE * largest
         weight = weight + _NEGLIGIBLE * largest * np.eye(n + m)
@@ -311,9 +367,11 @@ class _Loop:
         plant: DynamicsModel | None,
         ahead: DelayedModel | None,
     ):
-        self._point, self._horizon = point, prediction.horizon
+        self._point, self.horizon = point, prediction.horizon
         velocity = prediction.settings.form == "velocity"
-        self._observer_gain = 1.0 if velocity else prediction.settings.disturbance_gain
+        self._disturbance_gain = (
+            1.0 if velocity else prediction.settings.disturbance_gain
+        )
         learned = bool(to_array(prediction.model.noise_covariance).any())
         self._tolerance = _LEARNED if learned else _ROUNDING
         self._plant = _linear_plant(prediction, point, plant, ahead)
@@ -331,17 +389,25 @@ class _Loop:
         point = self._point
         self._laws = _laws(point.A, point.B, point.cost, horizon)
 
-    def radius(self, horizon: int, gain: float = 1.0) -> float:
-        """The spectral radius with a horizon's law, where the plant's inputs do ``gain`` times as much."""
-        return float(np.abs(np.linalg.eigvals(self.matrix(horizon, gain))).max())
+    def radius(
+        self, horizon: int, gain: float = 1.0, disturbance_gain: float | None = None
+    ) -> float:
+        """The spectral radius; see ``matrix``."""
+        loop = self.matrix(horizon, gain, disturbance_gain)
+        if not np.isfinite(loop).all():  # the recursion of a mode that nothing reaches
+            return math.inf
+        return float(np.abs(np.linalg.eigvals(loop)).max())
 
-    def grows(self, horizon: int, gain: float = 1.0) -> bool:
-        """Whether the closed loop has a mode that grows."""
-        return self.radius(horizon, gain) > 1.0 + self._tolerance
+    def grows(
+        self, horizon: int, gain: float = 1.0, disturbance_gain: float | None = None
+    ) -> bool:
+        """Whether the closed loop has a mode that grows; see ``matrix``."""
+        radius = self.radius(horizon, gain, disturbance_gain)
+        return radius > 1.0 + self._tolerance
 
     def gain_range(self) -> tuple[float, float]:
         """Smallest and largest factor of the plant's inputs, around 1, without a mode that grows; NaN without any."""
-        if self.grows(self._horizon):
+        if self.grows(self.horizon):
             return math.nan, math.nan
         return self._last_stable_gain(_LOWEST_GAIN), self._last_stable_gain(
             _HIGHEST_GAIN
@@ -351,7 +417,7 @@ class _Loop:
         """The last stable factor on the way from 1 to an end."""
         stable = 1.0
         for gain in np.linspace(1.0, end, _GAINS)[1:]:
-            if self.grows(self._horizon, gain):
+            if self.grows(self.horizon, gain):
                 break
             stable = gain
         else:
@@ -359,58 +425,96 @@ class _Loop:
         unstable = gain
         while abs(stable - unstable) > _GAIN_TOLERANCE:
             middle = 0.5 * (stable + unstable)
-            if self.grows(self._horizon, middle):
+            if self.grows(self.horizon, middle):
                 unstable = middle
             else:
                 stable = middle
         return float(stable)
 
-    def matrix(self, horizon: int, gain: float = 1.0) -> Array:
-        """The closed loop of (x_k, u_{k-1}, s_{k-1}, d_{k-1}), the last two where disturbances are estimated."""
-        A, B, L = self._point.A, self._point.B, self._observer_gain
+    def matrix(
+        self, horizon: int, gain: float = 1.0, disturbance_gain: float | None = None
+    ) -> Array:
+        """The closed loop of (x_k, u_{k-1}, s_{k-1}, d_{k-1}), the last two where disturbances are estimated.
+
+        Args:
+            horizon: Of the law.
+            gain: How many times as much the plant's inputs do as the model says.
+            disturbance_gain: L; the controller's own by default.
+        """
+        L = self._disturbance_gain if disturbance_gain is None else disturbance_gain
+        A, B = self._point.A, self._point.B
         A_p, C = self._plant.A, self._plant.C
         B_p = np.where(self._plant.moved, gain, 1.0)[:, None] * self._plant.B
         n, m = B.shape
         p = len(A_p)
         law = self._laws[-horizon]
-        by_state, by_error, by_input = np.split(law[:, :-1], [n, 2 * n], axis=1)
         error = np.hstack([L * C, -L * B, -L * A, (1.0 - L) * np.eye(n)])
-        input = np.hstack([by_state @ C, by_input, np.zeros((m, 2 * n))])
-        input = input + by_error @ error
+        input = np.hstack([law.by_state @ C, law.by_last_input, np.zeros((m, 2 * n))])
+        input = input + law.by_disturbance @ error
         state = np.hstack([A_p, np.zeros((p, m + 2 * n))]) + B_p @ input
         told = np.hstack([C, np.zeros((n, m + 2 * n))])
         loop = np.vstack([state, input, told, error])
         return loop if L > 0 else loop[: p + m, : p + m]
 
 
-def _laws(A: Array, B: Array, cost: QuadraticCost, horizon: int) -> Array:
-    """First inputs' derivatives by (s, d, u_{-1}, 1) for the horizons from ``horizon`` down to 1 (horizon, m, ...).
+class _Law(NamedTuple):
+    """Derivatives of the first inputs u_0 of a horizon (m, ...)."""
 
-    The disturbance is part of the state, to which it is added at every stage.
+    by_state: Array
+    by_disturbance: Array
+    by_last_input: Array
+
+
+def _laws(A: Array, B: Array, cost: QuadraticCost, horizon: int) -> list[_Law]:
+    """The laws of the horizons from ``horizon`` down to 1, those of the regulator of (s, d, u_{-1}).
+
+    The disturbance is added to the state at every stage, and nothing weighs it.
     """
     n, m = B.shape
-    step = np.block([[A, np.eye(n)], [np.zeros((n, n)), np.eye(n)]])
-    reach = np.vstack([B, np.zeros((n, m))])
-    stages = Stages(step[None], reach[None], np.zeros((1, 2 * n)))
-    references = References(np.zeros((horizon, n)), np.zeros((horizon, m)), np.zeros(m))
-    state = _at_stages(cost.state, horizon)
-    squares = _at_stages(cost.squares, horizon)
-    if len(squares):
-        state = np.repeat(state, horizon // len(state), axis=0)
-        squares = np.repeat(squares, horizon // len(squares), axis=0)
-    unweighted = np.zeros_like(state)
-    wide = cost._replace(
-        state=np.concatenate([state, unweighted], axis=1),
-        terminal=np.concatenate([cost.terminal, np.zeros_like(cost.terminal)]),
-        input=_at_stages(cost.input, horizon),
-        squares=squares,
+    none = np.zeros((n, n))
+    incremental = cost.penalized == INCREMENTS
+    held = np.eye(m) if incremental else np.zeros((m, m))
+    transition = np.block(
+        [
+            [A, np.eye(n), B @ held],
+            [none, np.eye(n), np.zeros((n, m))],
+            [np.zeros((m, 2 * n)), held],
+        ]
     )
-    return call_unchecked(optimal_feedback, wide, stages, references)[0]
+    effect = np.vstack([B, np.zeros((n, m)), np.eye(m)])
+    squares = _of_stages(cost.squares, horizon)
+    weights = _of_stages(cost.state[:, 0], horizon)
+    weights = np.stack([_wide(Q, squares[i : i + 1]) for i, Q in enumerate(weights)])
+    if len(weights) > 1:  # from those of s_1 .. s_{H-1} to those of s_0 .. s_{H-1}
+        weights = np.concatenate([weights[:1], weights[:-1]])
+    gains = call_unchecked(
+        finite_horizon_lqr,
+        transition[None],
+        effect[None],
+        weights,
+        _of_stages(cost.input, horizon),
+        _wide(cost.terminal[0], squares[-1:]),
+        horizon,
+    )[0]
+    feedback = -gains
+    feedback[:, :, 2 * n :] += held
+    return [_Law(*np.split(law, [n, 2 * n], axis=1)) for law in feedback]
 
 
-def _at_stages(values: Array, horizon: int) -> Array:
-    """Weights of the stages of a horizon, or of one that stands for all."""
-    return values if len(values) == horizon else values[:1]
+def _of_stages(weights: Array, horizon: int) -> Array:
+    """Weights of all stages of a horizon, or of one that stands for all."""
+    return weights if len(weights) == horizon else weights[:1]
+
+
+def _wide(Q: Array, squares: Array) -> Array:
+    """The weight of (s, d, u_{-1}) of a stage, with that of its outputs where there is one (1 or 0, ...)."""
+    n, m = len(Q), squares.shape[-1] - 1 - len(Q)
+    weight = np.zeros((2 * n + m, 2 * n + m))
+    weight[:n, :n] = Q
+    known = np.r_[:n, 2 * n : 2 * n + m]
+    for square in squares:
+        weight[np.ix_(known, known)] += square[:-1, :-1]
+    return weight
 
 
 def _linear_plant(
@@ -470,10 +574,10 @@ def _look_ahead(
     return state, inputs[ahead.lead * m :]
 
 
-def _shortest_horizon(loops: Sequence[_Loop], horizon: int) -> int | None:
-    """The shortest horizon from which on no loop grows; None where none of those tried is."""
+def _shortest_horizon(loops: Sequence[_Loop], horizon: int) -> tuple[int | None, int]:
+    """The shortest horizon from which on no loop grows, None without one, and how many were tried."""
     if not all(loop.constant for loop in loops):
-        return None
+        return None, 0
     longest = horizon
     if any(loop.grows(horizon) for loop in loops):
         longest = _LONGEST * horizon
@@ -484,4 +588,4 @@ def _shortest_horizon(loops: Sequence[_Loop], horizon: int) -> int | None:
         if any(loop.grows(candidate) for loop in loops):
             break
         shortest = candidate
-    return shortest
+    return shortest, longest
