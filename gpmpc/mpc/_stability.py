@@ -57,6 +57,7 @@ _LOWEST_GAIN = 0.5  # of the plant's inputs, in the model's
 _HIGHEST_GAIN = 1.5
 _GAINS = 21  # gains that are tried from the lowest to the highest
 _GAIN_TOLERANCE = 1e-3
+_SPARE = 0.8  # share of the largest gain of an estimate that is advised
 _PLANT_GAINS = (0.7, 1.0, 1.3)  # that an estimate of the disturbance is to bear
 
 
@@ -77,8 +78,8 @@ class Stability:
     #: range of factors of the plant's inputs around 1, tried from 0.5 to 1.5, in which no mode grows; NaN without any
     gain_range: tuple[float, float]
     disturbance_gain: float  #: L, of the controller's estimate
-    #: the largest L up to the controller's with which no mode grows while the plant's inputs do 0.7 to 1.3 of what the
-    #: model says; NaN where that is too much without an estimate, too
+    #: the controller's L where no mode grows while the plant's inputs do 0.7 to 1.3 of what the model says; where one
+    #: does, four fifths of the largest L with which none does; NaN where one does without an estimate, too
     safe_disturbance_gain: float
     states: Array  #: the points that were judged (K, n)
     inputs: Array  #: the inputs that hold them (K, m)
@@ -172,7 +173,7 @@ def stability(
 
 
 def _safe_disturbance_gain(loops: "list[_Loop]", disturbance_gain: float) -> float:
-    """The largest gain up to one with which no loop grows at any of the plant's gains; NaN where none is."""
+    """A gain of the estimate with which no loop grows at any of the plant's gains; see ``Stability``."""
 
     def bears(L: float) -> bool:
         return not any(
@@ -190,7 +191,7 @@ def _safe_disturbance_gain(loops: "list[_Loop]", disturbance_gain: float) -> flo
             safe = middle
         else:
             unsafe = middle
-    return math.floor(100.0 * safe) / 100.0
+    return math.floor(100.0 * _SPARE * safe) / 100.0
 
 
 def _check(
@@ -299,8 +300,6 @@ class _RestSearch:
             sizes = np.maximum(1.0, np.abs(np.concatenate([state, input])))
             if (np.abs(change) <= _SETTLED * sizes).all():
                 break
-        else:
-            return None
         lower, upper = prediction.problem.inputs.first
         within = (lower < input) & (input < upper)
         rests = np.abs(here.missing) <= _AT_REST * np.maximum(1.0, np.abs(state))
