@@ -28,11 +28,14 @@ class BeyondData(NamedTuple):
 
     def __str__(self) -> str:
         """A line that says what to do."""
-        ranges = [
-            f"{low:.3g} to {high:.3g}" for low, high in (self.reference, self.data)
-        ]
-        what = f"the reference of {self.name} is {ranges[0]}, its data {ranges[1]}"
+        reference, data = _in_words(self.reference), _in_words(self.data)
+        what = f"the reference of {self.name} is {reference}, its data {data}"
         return f"{what}: learn from data there, too"
+
+
+def _in_words(limits: tuple[float, float]) -> str:
+    low, high = (f"{limit:.3g}" for limit in limits)
+    return low if low == high else f"{low} to {high}"
 
 
 class _Column(NamedTuple):
