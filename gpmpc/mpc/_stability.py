@@ -20,9 +20,11 @@ import math
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.linalg import eig, matrix_balance
 
 from gpmpc._angles import state_difference
 from gpmpc._compiled import call_unchecked
@@ -39,10 +41,12 @@ from gpmpc.mpc._linear_quadratic import (
     finite_horizon_lqr,
 )
 from gpmpc.mpc._prediction import PredictionModel
+from gpmpc.mpc._slopes import slope_covariances
 from gpmpc.mpc._stages import Plan
 
 Array = np.ndarray
 
+_DEVIATIONS = 2.0  # of a growing mode from 1, by what a model's slopes are known to
 _POINTS = 10  # of a trajectory
 _LONGEST = 20  # horizons that are tried, in that of the controller
 _ROUNDING = 1e-6  # by how much a growing mode of a known model exceeds 1
@@ -69,8 +73,8 @@ class Stability:
     #: the largest size of an eigenvalue of the closed loop: above 1 it does not settle; NaN where no point could be
     #: judged: the model rests nowhere near the reference within the bounds of the inputs
     spectral_radius: float
-    #: whether no mode grows: integrators that nothing weighs may stand still. Of a learned model growth below 0.1 % a
-    #: step does not count: its integrators are not exact ones
+    #: whether no mode grows: integrators that nothing weighs may stand still. Of a learned model growth counts above
+    #: 0.1 % a step, since its integrators are not exact ones, and above two standard deviations of what its GPs know
     stable: bool
     #: the shortest horizon from which on no mode grows; None where none of those tried is
     shortest_horizon: int | None
@@ -126,6 +130,7 @@ class _Plant(NamedTuple):
     B: Array  # (p, m)
     moved: Array  # whether a state (p,) is moved by what the inputs do, not by what they are
     C: Array  # (n, p)
+    state: Array  # where, without the last inputs
 
 
 def stability(
@@ -291,11 +296,12 @@ class _RestSearch:
             if not math.isfinite(here.value):
                 return None
             change = -np.linalg.solve(here.weight, here.slope)
+            there = self._at(state + change[:n], input + change[n:])
             for _ in range(_HALVINGS):
-                there = self._at(state + change[:n], input + change[n:])
                 if there.value <= here.value * (1.0 + _ROUNDING):
                     break
                 change = 0.5 * change
+                there = self._at(state + change[:n], input + change[n:])
             state, input, here = state + change[:n], input + change[n:], there
             sizes = np.maximum(1.0, np.abs(np.concatenate([state, input])))
             if (np.abs(change) <= _SETTLED * sizes).all():
@@ -371,7 +377,8 @@ class _Loop:
         self._disturbance_gain = (
             1.0 if velocity else prediction.settings.disturbance_gain
         )
-        learned = bool(to_array(prediction.model.noise_covariance).any())
+        self._model: Any = plant or ahead or prediction.model
+        learned = bool(to_array(self._model.noise_covariance).any())
         self._tolerance = _LEARNED if learned else _ROUNDING
         self._plant = _linear_plant(prediction, point, plant, ahead)
         self._laws = _laws(point.A, point.B, point.cost, prediction.horizon)
@@ -400,9 +407,45 @@ class _Loop:
     def grows(
         self, horizon: int, gain: float = 1.0, disturbance_gain: float | None = None
     ) -> bool:
-        """Whether the closed loop has a mode that grows; see ``matrix``."""
-        radius = self.radius(horizon, gain, disturbance_gain)
-        return radius > 1.0 + self._tolerance
+        """Whether the closed loop has a mode that grows by more than its model's doubt; see ``matrix``."""
+        loop = self.matrix(horizon, gain, disturbance_gain)
+        limit = 1.0 + self._tolerance
+        if not np.isfinite(loop).all():
+            return True
+        if np.abs(np.linalg.eigvals(loop)).max() <= limit:
+            return False
+        _, (scales, _) = matrix_balance(loop, permute=False, separate=True)
+        values, left, right = eig(loop, left=True)
+        left, right = left * scales[:, None], right / scales[:, None]
+        left = left / np.linalg.norm(left, axis=0)
+        right = right / np.linalg.norm(right, axis=0)
+        return any(
+            abs(values[i])
+            > limit
+            + _DEVIATIONS * self._doubt(values[i], left[:, i], right[:, i], scales)
+            for i in np.flatnonzero(np.abs(values) > limit)
+        )
+
+    def _doubt(self, value: complex, left: Array, right: Array, scales: Array) -> float:
+        """The standard deviation of what the plant's model adds to a mode, by that of its slopes along it.
+
+        Vectors are of length 1 in states of balanced scales. That a mode may be ill-conditioned beside another one is
+        left out: this tells the modes that the model has no data of.
+        """
+        p, m = self._plant.B.shape
+        n = self._model.state_dim
+        state = (right * scales)[:n]
+        input = value * (right * scales)[p : p + m]
+        direction = np.concatenate([state, input])
+        variances = np.einsum(
+            "a,iab,b->i", direction.conj(), self._slope_covariances, direction
+        ).real
+        spread = np.abs(left[:n] / scales[:n]) ** 2 @ np.maximum(variances, 0.0)
+        return math.sqrt(float(spread))
+
+    @cached_property
+    def _slope_covariances(self) -> Array:
+        return slope_covariances(self._model, self._plant.state, self._point.input)
 
     def gain_range(self) -> tuple[float, float]:
         """Smallest and largest factor of the plant's inputs, around 1, without a mode that grows; NaN without any."""
@@ -550,7 +593,7 @@ def _linear_plant(
     C = np.zeros((n, len(A)))
     C[others] = shown
     C[pending] = last_inputs[len(last_inputs) - len(pending) :]
-    return _Plant(A, B, moved, C)
+    return _Plant(A, B, moved, C, at)
 
 
 def _look_ahead(

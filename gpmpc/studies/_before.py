@@ -1,10 +1,14 @@
 """What can be said of a flight before it begins: whether its loop settles, and whether its data reach its reference."""
 
 import math
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 from gpmpc._dynamics import DynamicsModel
+from gpmpc.exceptions import GpmpcError
 from gpmpc.mpc import GPMPC, Reference, beyond_data
 
 
@@ -30,9 +34,13 @@ def outlook(
     warnings: list[str] = []
     if model is not None:
         warnings += map(str, beyond_data(model, reference))
-    if not isinstance(controller, GPMPC):
+    stability = None
+    if isinstance(controller, GPMPC):
+        # what cannot be judged, such as outputs of parameters, is no reason not to fly
+        with suppress(GpmpcError, np.linalg.LinAlgError):
+            stability = controller.stability(reference)
+    if stability is None:
         return Outlook(warnings=tuple(warnings))
-    stability = controller.stability(reference)
     radius = stability.spectral_radius
     return Outlook(
         spectral_radius=radius if math.isfinite(radius) else None,
