@@ -83,7 +83,7 @@ def run(config: DictConfig) -> Result:
         experiment_of(
             config
         )  # what a user can get wrong is found before anything is written
-        outcome = run_one(config)
+        outcome = run_one(config, warn=_warning_printer())
     if "error" in outcome:
         print_error(f"{outcome['error']} (traceback: {outcome['folder']}/error.json)")
         return Result(outcome, 2 if outcome["mistake"] else 1)
@@ -104,8 +104,27 @@ def run(config: DictConfig) -> Result:
     return Result(data, _LOST if outcome["result"].get("lost") else 0)
 
 
-def run_one(config: DictConfig, wait: bool = True) -> dict[str, Any]:
-    """Flies one run; an error is kept in its folder and returned as ``error``."""
+def _warning_printer() -> Callable[[str], None]:
+    """Returns what prints each line once, however many flights it is of."""
+    printed: set[str] = set()
+
+    def warn(line: str) -> None:
+        if line not in printed:
+            print_error(f"before the flight: {line}")
+        printed.add(line)
+
+    return warn
+
+
+def run_one(
+    config: DictConfig,
+    wait: bool = True,
+    warn: Callable[[str], None] | None = None,
+) -> dict[str, Any]:
+    """Flies one run; an error is kept in its folder and returned as ``error``.
+
+    ``warn`` is called before the flight with each line of what may go wrong in it.
+    """
     overrides = choices(HydraConfig.get().overrides.task)
     folder = RunFolder(folder_of(config.folder) / folder_name(overrides))
     outcome = {"folder": str(folder.path), "skipped": False}
@@ -117,7 +136,8 @@ def run_one(config: DictConfig, wait: bool = True) -> dict[str, Any]:
         try:
             folder.begin(OmegaConf.to_yaml(config, resolve=True))
             with one_thread():  # the same sums in the same order, whatever the launcher
-                result = about | _fly(experiment_of(config), folder, config, about)
+                flown = _fly(experiment_of(config), folder, config, about, warn)
+            result = about | flown
             folder.finish(result)
         except Exception as error:
             if _was_interrupted(error):
@@ -143,11 +163,15 @@ def _was_interrupted(error: BaseException | None) -> bool:
 
 
 def _fly(
-    experiment: Experiment, folder: RunFolder, config: DictConfig, about: dict[str, Any]
+    experiment: Experiment,
+    folder: RunFolder,
+    config: DictConfig,
+    about: dict[str, Any],
+    warn: Callable[[str], None] | None,
 ) -> dict[str, Any]:
     """Trains, flies and records; returns the metrics."""
     if config.recorder != "mcap":
-        return metrics(experiment, run_trial(experiment))
+        return metrics(experiment, run_trial(experiment, warn=warn))
     system, text = experiment.system, OmegaConf.to_yaml(config, resolve=True)
     known = {
         "seed": experiment.seed,
@@ -204,7 +228,7 @@ def _fly(
 
             return on_step
 
-        flown = run_trial(experiment, prepare)
+        flown = run_trial(experiment, prepare, warn)
     return metrics(experiment, flown)
 
 

@@ -86,7 +86,7 @@ def move(model: Any, device: Any = None, dtype: torch.dtype | None = None) -> An
     return type(model)(**parts)
 
 
-class _LinearWrapper(Wrapper):
+class LinearWrapper(Wrapper):
     """A model f whose further states are linear: z+ = [f(x, Z z + W u); 0] + L z + M u, x the first n entries of z."""
 
     to = move
@@ -139,7 +139,7 @@ class _LinearWrapper(Wrapper):
 
 
 @dataclass(frozen=True)
-class DelayedModel(_LinearWrapper):
+class DelayedModel(LinearWrapper):
     """A model whose input acts late, by a whole or a fractional number of steps.
 
     The state holds the inputs that are on their way, z = (x, u_{k-D}, .., u_{k-1}), D the delay rounded up. With a
@@ -268,7 +268,7 @@ class DelayedModel(_LinearWrapper):
 
 
 @dataclass(frozen=True)
-class DisturbedModel(_LinearWrapper):
+class DisturbedModel(LinearWrapper):
     """A model with disturbances, what it does not explain, as further states (x, d) that a filter estimates.
 
         x[k+1] = f(x[k], u[k]) + E d[k],     d[k+1] = Phi d[k] + w[k],     w[k] ~ N(0, diag(q)^2)

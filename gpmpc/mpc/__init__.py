@@ -2,15 +2,18 @@
 
 from gpmpc.mpc._controller import Controller, Decision, Reference, Request, Timing
 from gpmpc.mpc._cost import LeastSquares, Tracking
+from gpmpc.mpc._data_range import BeyondData, beyond_data
 from gpmpc.mpc._linear_quadratic import dlqr
 from gpmpc.mpc._policy import ControlLoop
 from gpmpc.mpc._prediction import PredictionSettings
+from gpmpc.mpc._stability import Stability
 from gpmpc.mpc._starts import ManyStarts, kicks
 from gpmpc.mpc.gp_mpc import GPMPC, NonlinearGPMPC
 from gpmpc.mpc.problem import Box, Halfspaces, Inequality, Problem
 
 __all__ = [
     "GPMPC",
+    "BeyondData",
     "Box",
     "ControlLoop",
     "Controller",
@@ -24,8 +27,10 @@ __all__ = [
     "Problem",
     "Reference",
     "Request",
+    "Stability",
     "Timing",
     "Tracking",
+    "beyond_data",
     "dlqr",
     "kicks",
 ]

@@ -26,6 +26,7 @@ from gpmpc._compiled import call_unchecked
 from gpmpc._dynamics import DynamicsModel, linearize
 from gpmpc.exceptions import SettingError, check_number
 from gpmpc.gaussian import Gaussian
+from gpmpc.models import DelayedModel
 from gpmpc.mpc._condense import condense
 from gpmpc.mpc._controller import (
     FEASIBLE,
@@ -42,11 +43,8 @@ from gpmpc.mpc._linear_quadratic import CondensedProgram, expand
 from gpmpc.mpc._novelty import data_scales, later, novelty_of
 from gpmpc.mpc._prediction import Prediction, PredictionModel, PredictionSettings
 from gpmpc.mpc._sqp import FAILURES, Iteration, measure_continuity
-from gpmpc.mpc._stages import (
-    Covariance,
-    Plan,
-    price_violations,
-)
+from gpmpc.mpc._stability import Stability, stability
+from gpmpc.mpc._stages import Covariance, Plan, price_violations
 from gpmpc.mpc.problem import Problem
 from gpmpc.propagation import Propagator
 from gpmpc.qp import DualActiveSet, QPSolution, QPSolver, QuadraticProgram
@@ -424,6 +422,27 @@ class GPMPC:
             Plan(decision.means, decision.inputs, decision.covariances), parameters
         )
         return self.prediction.gains(found.A, found.B, cost)
+
+    def stability(
+        self,
+        reference: Any,
+        plant: DynamicsModel | None = None,
+        ahead: DelayedModel | None = None,
+        parameters: Any = None,
+    ) -> Stability:
+        """Tells before the loop runs whether it settles near a reference, and with which horizons; see ``Stability``.
+
+        Args:
+            reference: A set point (n,), or states of any number of steps (K + 1, n) of which some are judged.
+            plant: A model of what is steered, of other gains, or with a ``DelayedModel`` around it; the controller's
+                own model by default.
+            ahead: The delay that the belief is predicted over (``DelayedModel.ahead``) where it is.
+            parameters: Of outputs, as for ``control``.
+
+        Raises:
+            SettingError: The plant or the delay does not belong to the controller.
+        """
+        return stability(self.prediction, reference, plant, ahead, parameters)
 
     def _give_way(
         self,

@@ -11,7 +11,7 @@ and the subsets of one seed are nested, so that sizes can be compared in pairs.
 import inspect
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -39,6 +39,7 @@ from gpmpc.simulation import (
     rehearse,
 )
 from gpmpc.simulation._simulator import PlantSimulator
+from gpmpc.studies._before import Outlook, outlook
 from gpmpc.studies._document import Table
 from gpmpc.studies.study import derived_seed, random_rows
 from gpmpc.systems import System
@@ -249,15 +250,21 @@ class Flown:
     #: where and why the system left the finite numbers, and the rollout ends; None where it did not
     diverged: Diverged | None = None
     before: tuple["Flown", ...] = ()  #: the episodes
+    outlook: Outlook = field(default_factory=Outlook)  #: what was known before it began
 
 
-def run_trial(experiment: Experiment, prepare: Prepare | None = None) -> Flown:
+def run_trial(
+    experiment: Experiment,
+    prepare: Prepare | None = None,
+    warn: Callable[[str], None] | None = None,
+) -> Flown:
     """Trains and flies.
 
     Args:
         experiment: All of it.
         prepare: Called before the first step with the controller and the training; what it returns is called with
             every step.
+        warn: Called before the first step with each line of what may go wrong in the flight.
 
     Raises:
         SettingError: More rows are asked for than there are, or settings that do not fit each other.
@@ -273,7 +280,7 @@ def run_trial(experiment: Experiment, prepare: Prepare | None = None) -> Flown:
         if isinstance(experiment.learning, EpisodicLearning):
             for k in range(experiment.learning.episodes):
                 again = replace(experiment, seed=derived_seed(experiment.seed, k))
-                before.append(_fly(again, prepare, training.posterior, training))
+                before.append(_fly(again, prepare, training.posterior, training, warn))
                 data = experiment.learning.with_flight(data, before[-1].rollout)
                 if k + 1 < experiment.learning.episodes:
                     training = experiment.learn(data, experiment.seed)
@@ -282,7 +289,8 @@ def run_trial(experiment: Experiment, prepare: Prepare | None = None) -> Flown:
                 or training
             )
         model = training.posterior
-    return replace(_fly(experiment, prepare, model, training), before=tuple(before))
+    flown = _fly(experiment, prepare, model, training, warn)
+    return replace(flown, before=tuple(before))
 
 
 def _error(experiment: Experiment, flown: Flown, last: int = 0) -> float:
@@ -304,10 +312,12 @@ def _fly(
     prepare: Prepare | None,
     model: DynamicsModel | None,
     training: Training | None,
+    warn: Callable[[str], None] | None,
 ) -> Flown:
     """Flies with a model, or on the plant's own where it is None."""
     plant = experiment.flown
     controller = experiment.controller(model if experiment.learns else plant)
+    planner = controller
     if isinstance(experiment.learning, OnlineLearning):
         controller = LearningController(controller, experiment.learning)
     system: System | ModelLoop = plant
@@ -324,6 +334,10 @@ def _fly(
     reference = Reference(states, np.tile(resting, (len(states) - 1, 1)))
     start = states[0] if plant.start is None else plant.start
     start = None if getattr(plant.dynamics, "stateful", False) else start
+    expected = outlook(planner, model if experiment.learns else None, reference)
+    if warn is not None:
+        for line in expected.warnings:
+            warn(line)
     rehearse(system, controller, reference, start)
     on_step = None if prepare is None else prepare(controller, training)
     how = {
@@ -343,8 +357,8 @@ def _fly(
     except Diverged as error:
         if error.flown is None:
             raise
-        return Flown(error.flown, controller, training, error)
-    return Flown(rollout, controller, training)
+        return Flown(error.flown, controller, training, error, outlook=expected)
+    return Flown(rollout, controller, training, outlook=expected)
 
 
 def metrics(experiment: Experiment, flown: Flown) -> dict[str, Any]:
@@ -394,6 +408,7 @@ def metrics(experiment: Experiment, flown: Flown) -> dict[str, Any]:
         if np.isfinite(total)
         else None,
         "lost": _lost(experiment, flown),
+        "outlook": asdict(flown.outlook) | {"warnings": [*flown.outlook.warnings]},
         "violations": {
             name: asdict(rate) | {"rate": rate.rate}
             for name, rate in violations.items()
@@ -480,6 +495,7 @@ def summary(result: Mapping[str, Any]) -> Table:
         "known before": ", ".join(
             f"{k} {v}" for k, v in (settings.get("nominal") or {}).items()
         ),
+        "before the flight": "; ".join(result.get("outlook", {}).get("warnings", ())),
         "lost": lost
         and f"from step {lost['step']} ({lost['time']:g} s) on: {lost['reason']}",
         f"RMSE [{unit}]": "none: it diverged"

@@ -181,6 +181,11 @@ def test_the_metrics_of_a_flight_are_written_out_in_full():
         "rmse": pytest.approx({"x": 1.5, "y": 3.0, "z": 2.0, "total": np.sqrt(61 / 4)}),
         "error_at_end": pytest.approx(6.0),
         "lost": None,
+        "outlook": {
+            "spectral_radius": None,
+            "shortest_horizon": None,
+            "warnings": [],
+        },
         "failures": {"INFEASIBLE": 2},
         "far_from_data": 2,
         "suboptimal": {"ITERATION_LIMIT": 1},

@@ -165,7 +165,7 @@ def test_episodes_are_flown_with_seeds_of_their_own_and_the_model_of_the_best_fl
         learned.append((list(data), seed))
         return SimpleNamespace(posterior=f"model {len(learned)}")
 
-    def fly(experiment, prepare, model, training):
+    def fly(experiment, prepare, model, training, warn):
         flown.append((experiment.seed, prepare, model))
         return Flown(f"flight {len(flown)}", None, training)
 

@@ -1,0 +1,118 @@
+"""Whether a reference leaves the range of the data that a model was learned from.
+
+A GP knows nothing beyond its data: its mean goes back to the prior's, and a controller follows it there.
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from gpmpc._angles import TURN
+from gpmpc._dynamics import DynamicsModel, to_array
+from gpmpc.gp import GPPosterior
+from gpmpc.models import ResidualModel
+from gpmpc.mpc._controller import read_reference
+from gpmpc.signals import signals_of
+
+Array = np.ndarray
+
+_SMALL = 0.1  # share of the data's range, or of a lengthscale, that counts for nothing
+
+
+class BeyondData(NamedTuple):
+    """A state whose reference leaves the range of the data."""
+
+    name: str
+    reference: tuple[float, float]  #: its smallest and largest value
+    data: tuple[float, float]  #: those of the data
+
+    def __str__(self) -> str:
+        """A line that says what to do."""
+        reference, data = _in_words(self.reference), _in_words(self.data)
+        what = f"the reference of {self.name} is {reference}, its data {data}"
+        return f"{what}: learn from data there, too"
+
+
+def _in_words(limits: tuple[float, float]) -> str:
+    low, high = (f"{limit:.3g}" for limit in limits)
+    return low if low == high else f"{low} to {high}"
+
+
+class _Column(NamedTuple):
+    """What a GP has seen of a state."""
+
+    state: int
+    low: float
+    high: float
+    lengthscale: float  # the shortest of all outputs; infinite where it is not known
+    angle: bool = False
+
+
+def beyond_data(model: DynamicsModel, reference: Any) -> list[BeyondData]:
+    """Returns the states whose reference leaves the range of the data of a model's GPs, in their order.
+
+    By more than a tenth of that range, and of the shortest lengthscale of the state: what a GP does not depend on may
+    be anything. States that no GP sees are left out, and models without data have none.
+
+    Args:
+        model: What was learned; models around it are looked through.
+        reference: A set point (n,), or states of any number of steps (K, n), as for a controller.
+    """
+    signals = signals_of(model)
+    states = np.atleast_2d(read_reference(reference).in_order(signals).states)
+    states = np.asarray(states, dtype=float)
+    beyond = []
+    for column in _columns(model):
+        values = states[:, column.state]
+        if column.angle:
+            middle = 0.5 * (column.low + column.high)
+            values = values - TURN * np.round((values - middle) / TURN)
+        low, high = float(values.min()), float(values.max())
+        excess = max(column.low - low, high - column.high)
+        width = column.high - column.low
+        if excess <= _SMALL * width or excess <= _SMALL * column.lengthscale:
+            continue
+        name = f"x{column.state + 1}"
+        if signals.state_names:
+            name = signals.state_names[column.state]
+        data = (column.low, column.high)
+        beyond.append(BeyondData(name, (low, high), data))
+    return beyond
+
+
+def _columns(model: Any) -> list[_Column]:
+    """What the GPs of a model have seen of its states, in the order of these."""
+    if isinstance(model, GPPosterior):
+        return _columns_of(model, list(range(model.state_dim)), [])
+    if isinstance(model, ResidualModel):
+        return _columns_of(model.residual, list(model.states), list(model.angles))
+    within = getattr(model, "model", None)
+    return [] if within is None else _columns(within)
+
+
+def _columns_of(gp: GPPosterior, states: list[int], angles: list[int]) -> list[_Column]:
+    """The columns of the states that a GP sees, an angle as its sine and cosine."""
+    features, lengthscales = to_array(gp.features), to_array(gp.lengthscales)
+    shortest = lengthscales.min(axis=0)
+    columns, at = [], 0
+    for state in states:
+        if state in angles:
+            low, high = _arc(np.arctan2(features[:, at], features[:, at + 1]))
+            shorter = float(shortest[at : at + 2].min())
+            columns.append(_Column(state, low, high, shorter, angle=True))
+            at += 2
+            continue
+        values = features[:, at]
+        low, high = float(values.min()), float(values.max())
+        columns.append(_Column(state, low, high, float(shortest[at])))
+        at += 1
+    return sorted(columns)
+
+
+def _arc(angles: Array) -> tuple[float, float]:
+    """Beginning and end of the shortest arc that holds angles [rad]."""
+    ordered = np.sort(angles)
+    gaps = np.append(np.diff(ordered), ordered[0] + TURN - ordered[-1])
+    widest = int(np.argmax(gaps))
+    first = float(ordered[(widest + 1) % len(ordered)])
+    return first, first + TURN - float(gaps[widest])

@@ -1,0 +1,49 @@
+"""What can be said of a flight before it begins: whether its loop settles, and whether its data reach its reference."""
+
+import math
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from gpmpc._dynamics import DynamicsModel
+from gpmpc.exceptions import GpmpcError
+from gpmpc.mpc import GPMPC, Reference, beyond_data
+
+
+@dataclass(frozen=True)
+class Outlook:
+    """What was known of a flight before it."""
+
+    spectral_radius: float | None = None  #: ``Stability``'s; None where not judged
+    shortest_horizon: int | None = None  #: likewise
+    warnings: tuple[str, ...] = ()  #: what may go wrong and what to do, a line each
+
+
+def outlook(
+    controller: Any, model: DynamicsModel | None, reference: Reference
+) -> Outlook:
+    """Returns what is known of a flight along a reference before it begins.
+
+    Args:
+        controller: Of the flight.
+        model: That was learned for it; None where the controller knows the plant.
+        reference: Of all steps.
+    """
+    warnings: list[str] = []
+    if model is not None:
+        warnings += map(str, beyond_data(model, reference))
+    stability = None
+    if isinstance(controller, GPMPC):
+        # what cannot be judged, such as outputs of parameters, is no reason not to fly
+        with suppress(GpmpcError, np.linalg.LinAlgError):
+            stability = controller.stability(reference)
+    if stability is None:
+        return Outlook(warnings=tuple(warnings))
+    radius = stability.spectral_radius
+    return Outlook(
+        spectral_radius=radius if math.isfinite(radius) else None,
+        shortest_horizon=stability.shortest_horizon,
+        warnings=(*stability.warnings, *warnings),
+    )

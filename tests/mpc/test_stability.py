@@ -1,0 +1,303 @@
+"""Whether a loop settles, known before it runs: against the loop itself."""
+
+from collections import deque
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from benchmarks.horizons import TANK_GOAL, VOLTAGES, quadruple_tank, true_model
+from gpmpc._dynamics import linearize
+from gpmpc.exceptions import SettingError
+from gpmpc.gaussian import Gaussian
+from gpmpc.gp import Trainer, Transitions
+from gpmpc.models import Affine, DelayedModel, DisturbedModel, KnownModel
+from gpmpc.mpc import (
+    GPMPC,
+    Box,
+    LeastSquares,
+    PredictionSettings,
+    Problem,
+    Reference,
+    Tracking,
+)
+from gpmpc.mpc._stability import _Loop, _points
+from gpmpc.propagation import Linearization
+from gpmpc.systems import double_integrator, step
+
+TANK = true_model(quadruple_tank())
+LEVELS = [12.4, 13.2, 0.0, 0.0]  # of the upper tanks nothing is asked
+LATE = 3  # steps after which inputs act
+
+
+def linear(A, B):
+    A, B = (torch.tensor(part, dtype=torch.float64) for part in (A, B))
+    constant = torch.zeros(len(A), dtype=torch.float64)
+    return KnownModel(Affine(A, B, constant), *B.shape)
+
+
+INTEGRATOR = linear([[1.0]], [[0.1]])
+
+
+def loop_of(model, cost, horizon, initial_input, outputs=(), bounds=None, **prediction):
+    settings = PredictionSettings(**{"covariance": "none"} | prediction)
+    problem = Problem(cost, outputs=outputs, inputs=bounds)
+    return GPMPC(model, Linearization(), problem, horizon, initial_input, settings)
+
+
+def tank_loop(horizon, model=TANK, further=0, terminal=None, **changes):
+    """The tanks with what they weigh, and as many further states."""
+    none = [0.0] * further
+    outputs = changes.pop("outputs", ())
+    penalized = changes.pop("penalized", "increments")
+    cost = Tracking(
+        [1.0, 1.0, 0.0, 0.0, *none],
+        [0.1, 0.1],
+        terminal=None if terminal is None else [*terminal, *none],
+        penalized=penalized,
+    )
+    return loop_of(model, cost, horizon, VOLTAGES, outputs, **changes)
+
+
+def late_integrator(disturbance_gain, cost=1e-4, bounds=None):
+    """An integrator whose inputs act late, as it is planned with."""
+    weights = Tracking([1.0] + [0.0] * LATE, [cost])
+    delayed = DelayedModel(INTEGRATOR, LATE)
+    settings = {"disturbance_gain": disturbance_gain, "bounds": bounds}
+    return loop_of(delayed, weights, 20, [0.0], **settings)
+
+
+def products(states, inputs):
+    """Outputs that bend."""
+    return torch.stack([states[:, 0] * states[:, 1] / 10, inputs[:, 0] ** 2], dim=1)
+
+
+LOOPS = {
+    "increments": {},
+    "increments, estimate": {"disturbance_gain": 0.4},
+    "inputs": {"penalized": "inputs", "terminal": [5.0, 5.0, 0.0, 0.0]},
+    "deviations": {"penalized": "deviations", "disturbance_gain": 0.4},
+    "velocity": {"form": "velocity"},
+    "outputs": {"outputs": [LeastSquares(products, [0.3, 0.1], [16.0, 9.0])]},
+    "delayed": {
+        "model": DelayedModel(TANK, 1.5),
+        "further": 4,
+        "disturbance_gain": 0.4,
+    },
+}
+
+
+def steps_from(controller, reference, state, plan, count):
+    """The states of a flight of the model itself, and its last decision."""
+    states = []
+    for _ in range(count):
+        plan = controller.control(Gaussian.certain(state), reference, plan)
+        model = controller.prediction.model
+        moved = linearize(model, state[None], plan.input[None], covariance=False)
+        state = moved.mean[0]
+        states.append(state)
+    return np.array(states), plan
+
+
+@pytest.mark.parametrize("changes", LOOPS.values(), ids=LOOPS)
+def test_the_linear_loop_is_what_the_controller_does_near_its_rest(changes):
+    controller = tank_loop(40, **changes)
+    prediction = controller.prediction
+    further = prediction.problem.state_dim - 4
+    reference = Reference(np.array(LEVELS + [0.0] * further), np.array(VOLTAGES))
+    (point,) = _points(prediction, reference, None)
+    loop = _Loop(prediction, point, None, None).matrix(40)
+    settled, plan = steps_from(controller, reference, point.state, None, 300)
+    rest = settled[-1]
+    apart = 1e-5 * np.random.default_rng(0).normal(size=len(rest))
+    flights = [
+        steps_from(controller, reference, state, plan, 5)[0]
+        for state in (rest, rest + apart)
+    ]
+    moved = np.zeros(len(loop))
+    moved[: len(rest)] = apart
+    # the inputs on their way stand there twice: as the plant's states, and as told
+    moved[len(rest) : len(rest) + further] = apart[4:]
+    expected = []
+    for _ in range(5):
+        moved = loop @ moved
+        expected.append(moved[: len(rest)])
+    error = np.abs(flights[1] - flights[0] - np.array(expected)).max()
+    assert error < 5e-3 * np.abs(flights[1] - flights[0]).max()
+
+
+def test_a_horizon_too_short_for_an_inverse_response_is_named_and_flights_agree():
+    system = quadruple_tank()
+    known = tank_loop(10).stability(TANK_GOAL)
+    assert not known.stable
+    assert known.spectral_radius == pytest.approx(1.135, abs=5e-3)
+    shortest = known.shortest_horizon
+    (line,) = known.warnings
+    assert line.startswith("horizon 10: ")
+    assert line.endswith(f"it settles with {shortest} steps or more")
+    ends = {}
+    for horizon in (round(0.9 * shortest), round(1.1 * shortest)):
+        controller = tank_loop(horizon, bounds=Box([0.0, 0.0], [10.0, 10.0]))
+        judged = controller.stability(TANK_GOAL)
+        assert judged.stable == (horizon >= shortest)
+        assert bool(judged.warnings) == (horizon < shortest)
+        state = np.array(TANK_GOAL)
+        plan = None
+        for _ in range(300):
+            reference = Reference(np.array(TANK_GOAL))
+            plan = controller.control(Gaussian.certain(state), reference, plan)
+            assert plan.status.solved
+            state = step(system, state, plan.input)
+        ends[horizon] = np.abs(state - TANK_GOAL)[:2].max()
+    lost, held = ends.values()
+    assert lost > 0.05
+    assert held < 1e-3
+    assert tank_loop(60).stability(LEVELS).shortest_horizon == shortest
+
+
+def test_an_estimate_that_is_too_quick_for_a_delay_is_named_and_flights_agree():
+    def swing(disturbance_gain):
+        bounds = Box([-20.0], [20.0])
+        controller = late_integrator(disturbance_gain, bounds=bounds)
+        known = controller.stability(np.zeros(1 + LATE))
+        on_their_way = deque([np.zeros(1)] * LATE, LATE)
+        state, plan, positions = np.zeros(1), None, []
+        goal = Reference(np.array([1.0] + [0.0] * LATE))
+        for _ in range(150):
+            belief = np.concatenate([state, *on_their_way])
+            plan = controller.control(Gaussian.certain(belief), goal, plan)
+            state = state + 0.7 * 0.1 * on_their_way[0]  # it does less than believed
+            on_their_way.append(plan.input)
+            positions.append(state[0])
+        return known, np.ptp(positions[-50:])
+
+    quick, circling = swing(0.7)
+    assert circling > 1.0
+    assert quick.stable  # with the model's own gain
+    assert 0.7 < quick.gain_range[0] < 0.9
+    (line,) = quick.warnings
+    assert line.startswith("disturbance_gain 0.7 is too large")
+    assert line.endswith(f"{quick.safe_disturbance_gain:.2g} is safe")
+    for disturbance_gain in (0.0, 0.1, quick.safe_disturbance_gain):
+        known, circling = swing(disturbance_gain)
+        assert not known.warnings
+        assert circling < 0.05
+
+
+def test_the_range_of_gains_is_where_plants_of_these_gains_settle():
+    controller = late_integrator(0.7)
+    low, high = controller.stability(np.zeros(1 + LATE)).gain_range
+    for gain, settles in (
+        (low + 0.01, True),
+        (low - 0.01, False),
+        (high - 0.01, True),
+        (high + 0.01, False),
+    ):
+        plant = DelayedModel(linear([[1.0]], [[0.1 * gain]]), LATE)
+        told = controller.stability(np.zeros(1 + LATE), plant=plant)
+        assert told.stable == settles
+
+
+@pytest.mark.parametrize("delay", [1.0, 1.6, 3.0])
+def test_a_delay_that_is_bridged_and_one_that_is_ignored(delay):
+    late = DelayedModel(INTEGRATOR, delay)
+    remaining = late.remaining
+    further = remaining.state_dim - 1
+    cost = Tracking([1.0] + [0.0] * further, [1e-3])
+    controller = loop_of(remaining, cost, 20, [0.0])
+    goal = np.zeros(1 + further)
+    bridged = controller.stability(goal, ahead=late)
+    assert bridged.spectral_radius == pytest.approx(
+        controller.stability(goal).spectral_radius, abs=1e-6
+    )
+    ignorant = loop_of(INTEGRATOR, Tracking([1.0], [1e-3]), 20, [0.0])
+    told = ignorant.stability([0.0], plant=late)
+    assert told.spectral_radius > bridged.spectral_radius + 0.1
+    assert told.stable == (delay < 1.5)
+
+
+def test_what_nothing_weighs_may_stand_still():
+    cart = linear([[1.0, 0.1], [0.0, 1.0]], [[0.005], [0.1]])
+    for penalized in ("inputs", "increments"):
+        cost = Tracking([0.0, 1.0], [0.1], penalized=penalized)
+        known = loop_of(cart, cost, 10, [0.0]).stability([0.0, 0.0])
+        assert known.spectral_radius == pytest.approx(1.0, abs=1e-6)
+        assert known.stable
+        assert not known.warnings
+    effect = torch.tensor([[0.0], [0.1]], dtype=torch.float64)
+    pushed = DisturbedModel(cart, effect, [0.01])
+    cost = Tracking([1.0, 0.1, 0.0], [0.1])
+    assert loop_of(pushed, cost, 20, [0.0]).stability([0.0] * 3).stable
+
+
+def test_of_learned_integrators_a_little_growth_does_not_count():
+    system = double_integrator()
+    rng = np.random.default_rng(0)
+    states, inputs = rng.uniform(-1, 1, (60, 2)), rng.uniform(-1, 1, (60, 1))
+    after = np.array([step(system, x, u) for x, u in zip(states, inputs, strict=True)])
+    after += rng.normal(0, 1e-3, after.shape)
+    gp = Trainer(restarts=0)(Transitions(states, inputs, after), seed=0).posterior
+    known = loop_of(gp, Tracking([0.0, 1.0], [0.1]), 10, [0.0]).stability([0.0, 0.0])
+    assert known.judged
+    assert abs(known.spectral_radius - 1.0) < 1e-3
+    assert not known.warnings
+
+
+def test_a_mode_that_no_horizon_holds_is_said_to_be_one():
+    lost = linear([[1.1, 0.0], [0.0, 0.5]], [[0.0], [1.0]])  # the input reaches nothing
+    known = loop_of(lost, Tracking([1.0, 1.0], [0.1]), 5, [0.0]).stability([0.0, 0.0])
+    assert known.shortest_horizon is None
+    assert known.horizons == 100
+    assert known.warnings[0].endswith(
+        "so it does with any up to 100: change the weights"
+    )
+
+
+def test_a_reference_at_which_nothing_can_rest_is_not_judged():
+    stable = linear([[0.5]], [[1.0]])
+    bounded = loop_of(stable, Tracking([1.0], [0.1]), 5, [0.0], bounds=Box([-1], [1]))
+    known = bounded.stability([10.0])  # it would take an input of 5
+    assert not known.judged
+    assert np.isnan(known.spectral_radius)
+    assert not known.warnings
+    assert bounded.stability([1.0]).judged
+
+
+def test_some_points_of_a_trajectory_are_judged_with_its_inputs():
+    cart = linear([[1.0, 0.1], [0.0, 1.0]], [[0.005], [0.1]])
+    controller = loop_of(cart, Tracking([1.0, 0.1], [0.1]), 20, [0.0])
+    times = 0.1 * np.arange(200)
+    moving = np.column_stack([np.sin(times), np.cos(times)])
+    known = controller.stability(Reference(moving))
+    assert len(known.states) == 10
+    off = np.linalg.norm(known.states[:, None] - moving, axis=2).min(axis=1)
+    assert off.max() < 1e-2
+    held = controller.stability([0.0, 0.0])
+    assert len(held.states) == 1
+    assert known.spectral_radius == pytest.approx(held.spectral_radius)
+    assert known.shortest_horizon == held.shortest_horizon
+
+
+def test_weights_by_stage_have_one_horizon():
+    weights = np.tile(np.eye(4) * [1.0, 1.0, 0.0, 0.0], (10, 1, 1))
+    weights[3] *= 2.0
+    controller = loop_of(TANK, Tracking(weights, [0.1, 0.1]), 10, VOLTAGES)
+    known = controller.stability(TANK_GOAL)
+    assert not known.stable
+    assert known.shortest_horizon is None
+    assert known.warnings[0].endswith("try a longer one")
+    same = replace(controller.problem.cost, Q=np.tile(weights[0], (10, 1, 1)))
+    alike = loop_of(TANK, same, 10, VOLTAGES).stability(TANK_GOAL)
+    assert alike.shortest_horizon == tank_loop(10).stability(TANK_GOAL).shortest_horizon
+
+
+def test_a_plant_or_a_delay_of_something_else_is_refused():
+    controller = late_integrator(0.3)
+    goal = np.zeros(1 + LATE)
+    with pytest.raises(SettingError, match=r"plant.* 1 states and 1 inputs"):
+        controller.stability(goal, plant=TANK)
+    with pytest.raises(SettingError, match=r"ahead.*DelayedModel"):
+        controller.stability(goal, ahead=INTEGRATOR)
+    with pytest.raises(SettingError, match=r"ahead.*4 states"):
+        controller.stability(goal, ahead=DelayedModel(INTEGRATOR, 2))
