@@ -21,7 +21,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cache, cached_property
 from time import perf_counter
-from typing import Any, Literal, cast
+from typing import Any, Literal, NamedTuple, cast
 
 import numpy as np
 import torch
@@ -73,44 +73,161 @@ class OnlineLearning:
         check_number("margin", self.margin, least=0)
 
     def learn(self, learned: "Learned", input: Array, state: Array) -> "Learned":
-        """Learns from one step: the input that was applied (m,), and the state measured after it (n,)."""
-        model, spread = learned.model, learned.spread
-        point, error, latent = model.error(
-            learned.state, np.asarray(input, dtype=float), state
-        )
-        moved = float(((error - learned.error) ** 2 / model.arrays[2]).mean()) / 2.0
-        if np.isfinite(moved):
-            spread = np.append(spread, moved)[-_MANY:]
-        found: dict[str, Any] = {"state": state, "error": error, "spread": spread}
+        """Learns from one step of a flight.
+
+        Args:
+            learned: What the steps before have taught.
+            input: That was applied (m,).
+            state: Measured after it (n,).
+        """
+        input = np.asarray(input, dtype=float)
+        point, error, latent = learned.model.error(learned.state, input, state)
+        spread = _with_difference(learned, error)
+        seen = replace(learned, state=state, error=error, spread=spread)
         if len(spread) < _FEW:
-            return replace(learned, model=model.later(1.0), **found)
-        # What changes slowly has no part in differences of successive errors, and a jump no weight in their median.
-        ratio = (
-            float(np.sort(spread)[len(spread) // 2]) * len(error) / _median(len(error))
+            return seen.later()
+        noise = _noise_variance(spread, learned.model)
+        observation = Observation(
+            learned.state, input, state, point, error, latent, noise
         )
-        noise = model.arrays[2] * max(1.0, ratio)
-        larger, alone = model.with_point(point, error, noise), noise + latent
-        missed, variance = larger.last_innovation()
-        variance = variance + model.remaining(latent, variance - noise, model.signal)
-        lead = _log_density(missed, variance) - _log_density(error, alone)
-        leads = np.append(learned.leads, max(-_LARGEST, min(lead, _LARGEST)))[
-            -self.window :
-        ]
+        if learned.doubt is not None:
+            return self._resolve(seen, observation, learned.doubt)
+        if observation.stands_still:
+            return seen.later()
+        model = learned.model.with_observation(observation)
+        with_change = model.last_innovation(observation)
+        without_change = observation.innovation
+        innovation = with_change if learned.active else without_change
+        if innovation.largest > self.surprise:
+            return self._hold(seen, observation, Expectation.certain(learned.state))
+        lead = with_change.log_density - without_change.log_density
+        return self._compare(replace(seen, model=model), lead)
+
+    def _compare(self, seen: "Learned", lead: float) -> "Learned":
+        """Says whether the change is used, by its lead in the last steps."""
+        lead = max(-_LARGEST, min(lead, _LARGEST))
+        leads = np.append(seen.leads, lead)[-self.window :]
         total = float(leads.sum())
-        active = total >= 0 if learned.active else total > self.margin
-        squares = missed**2 / variance if learned.active else error**2 / alone
-        if float(squares.mean()) > self.surprise:
-            active, leads = True, leads[:0]
-            larger = replace(model).with_point(point, error, noise)
-        version = learned.version + (active or learned.active)
-        return replace(
-            learned,
-            model=larger.later(1.0),
-            leads=leads,
-            active=active,
-            version=version,
-            **found,
-        )
+        active = total >= 0 if seen.active else total > self.margin
+        version = seen.version + (active or seen.active)
+        return replace(seen, leads=leads, active=active, version=version).later()
+
+    def _hold(
+        self, seen: "Learned", observation: "Observation", start: "Expectation"
+    ) -> "Learned":
+        """Holds back a measurement that contradicts the step before it.
+
+        ``start`` is where the plant was before that step, as far as it is trusted.
+        """
+        expected = seen.expect(start, observation)
+        change = None
+        if not self._is_frozen(observation, expected, seen.model.angles):
+            fresh = seen.model.forgotten()
+            change = fresh.with_observation(observation).later(1.0)
+        return replace(seen, doubt=Doubt(expected, change)).later()
+
+    def _is_frozen(
+        self,
+        observation: "Observation",
+        expected: "Expectation",
+        angles: Sequence[int],
+    ) -> bool:
+        """Whether a sensor repeats itself to the last digit while the plant moves."""
+        motion = state_difference(expected.mean, observation.state, angles)
+        moves = motion**2 > self.surprise * np.diagonal(expected.covariance)
+        repeats = observation.state == observation.next_state
+        return bool((moves & repeats).any())
+
+    def _resolve(
+        self, seen: "Learned", observation: "Observation", doubt: "Doubt"
+    ) -> "Learned":
+        """Explains a measurement that was held back by the one after it."""
+        expected = seen.expect(doubt.expected, observation)
+        wrong_measurement = seen.innovation(expected)
+        displacement = observation.innovation
+        if seen.active:
+            model = seen.model.with_observation(observation)
+            displacement = model.last_innovation(observation)
+        same_plant = max(wrong_measurement, displacement, key=_density)
+        if doubt.change is not None and not observation.stands_still:
+            model = doubt.change.with_observation(observation)
+            change = model.last_innovation(observation)
+            explained = change.largest <= self.surprise
+            if explained and change.log_density > same_plant.log_density:
+                version = seen.version + 1
+                leads = seen.leads[:0]
+                return replace(
+                    seen,
+                    model=model,
+                    leads=leads,
+                    active=True,
+                    version=version,
+                    doubt=None,
+                ).later()
+        if same_plant.largest <= self.surprise:
+            return replace(seen, doubt=None).later()
+        return self._hold(seen, observation, doubt.expected)
+
+
+class Innovation(NamedTuple):
+    """By how much a prediction missed what was measured."""
+
+    error: Array  #: (k,)
+    variance: Array  #: that was expected of it (k,)
+
+    @property
+    def largest(self) -> float:
+        """The largest squared error over its variance."""
+        return float((self.error**2 / self.variance).max())
+
+    @property
+    def log_density(self) -> float:
+        """Of the error, as independent Gaussians, but for a constant."""
+        squares = self.error**2 / self.variance
+        return -0.5 * float((squares + np.log(self.variance)).sum())
+
+
+class Observation(NamedTuple):
+    """What one step of a flight says of the change."""
+
+    state: Array  #: measured before it (n,)
+    input: Array  #: applied (m,)
+    next_state: Array  #: measured after it (n,)
+    point: Array  #: (phi, u, t), where d is seen (d,)
+    error: Array  #: of the model alone, as far as a change reaches it (k,)
+    latent: Array  #: variance of the model alone (k,)
+    noise: Array  #: variance of the noise of this flight (k,)
+
+    @property
+    def innovation(self) -> Innovation:
+        """Of the model alone."""
+        return Innovation(self.error, self.noise + self.latent)
+
+    @property
+    def stands_still(self) -> bool:
+        """Whether the sensors repeat themselves to the last digit."""
+        return np.array_equal(self.state, self.next_state)
+
+
+class Expectation(NamedTuple):
+    """Where the plant is, as far as that is known."""
+
+    mean: Array  #: of the state (n,)
+    covariance: Array  #: (n, n)
+
+    @classmethod
+    def certain(cls, state: Array) -> "Expectation":
+        """Of a state that is known."""
+        return cls(state, np.zeros((len(state), len(state))))
+
+
+class Doubt(NamedTuple):
+    """A measurement that was held back, until the next one explains it."""
+
+    expected: Expectation  #: where the plant is if the measurement was wrong
+    #: the model whose change is what this step alone teaches, in case that the plant is
+    #: another one; None where the step teaches nothing, as from a frozen sensor
+    change: "ChangedModel | None"
 
 
 @dataclass(frozen=True)
@@ -241,14 +358,25 @@ class ChangedModel(Wrapper):
             )
         return self._replaced(change=(now.append(*new), coming))
 
-    def last_innovation(self) -> tuple[Array, Array]:
-        """Error and variance (k,) of the prediction of the last point of the change by those before, with its noise.
+    def with_observation(self, observation: Observation) -> "ChangedModel":
+        """The model with what a step says of the change."""
+        return self.with_point(observation.point, observation.error, observation.noise)
 
-        With L the factor and v = L^-1 y, L_NN^2 is the variance, and v_N L_NN the error.
+    def forgotten(self) -> "ChangedModel":
+        """The model without any point of the change."""
+        return replace(self)
+
+    def last_innovation(self, observation: Observation) -> Innovation:
+        """Of the prediction of the last point of the change, by those before it.
+
+        With L the factor and v = L^-1 y, L_NN^2 is the variance of d with its noise, and
+        v_N L_NN the error. What the model alone does not know comes on top.
         """
         last = self.change[0].columns[:, len(self) - 1]
         root = last[:, len(self) - 1]
-        return last[:, -1] * root, root**2
+        change = root**2 - observation.noise
+        remaining = self.remaining(observation.latent, change, self.signal)
+        return Innovation(last[:, -1] * root, root**2 + remaining)
 
     def remaining(self, latent: Any, variance: Any, signal: Any) -> Any:
         """What the model alone does not know (*batch, k), less what d's points saw.
@@ -355,11 +483,45 @@ class Learned:
     leads: Array  #: by how much the log density with the change exceeds that without, of the last steps
     active: bool = False  #: whether the change is part of the model that plans
     version: int = 0  #: how often that model has changed
+    doubt: Doubt | None = None  #: whether the last measurement is held back
 
     @property
     def size(self) -> int:
         """Points of the model that plans."""
         return len(self.model.gp) + (len(self.model) if self.active else 0)
+
+    def later(self) -> "Learned":
+        """What was learned, a step later."""
+        return replace(self, model=self.model.later(1.0))
+
+    def after_gap(self, state: Array) -> "Learned":
+        """What was learned, where steps were not measured and a state (n,) is again.
+
+        Nothing is known of the step that led to it.
+        """
+        error = np.full_like(self.error, np.nan)
+        version = self.version + self.active
+        other = replace(self, state=state, error=error, version=version, doubt=None)
+        return other.later()
+
+    def expect(self, start: Expectation, observation: Observation) -> Expectation:
+        """Where the model that plans expects the plant after a step from ``start``."""
+        planning = self.model if self.active else self.model.model
+        states = start.mean[None]
+        inputs = observation.input[None]
+        step = linearize(planning, states, inputs)
+        A = step.A[0]
+        B = self.model.arrays[0]
+        latent = cast(Array, step.covariance)[0]
+        noise = (B * observation.noise) @ B.T
+        return Expectation(step.mean[0], A @ start.covariance @ A.T + latent + noise)
+
+    def innovation(self, expected: Expectation) -> Innovation:
+        """Of the measured state, as far as a change reaches it."""
+        reach = self.model.arrays[1]
+        error = state_difference(self.state, expected.mean, self.model.angles)
+        variance = ((reach @ expected.covariance) * reach).sum(1)
+        return Innovation(reach @ error, variance)
 
 
 class LearningController:
@@ -413,26 +575,18 @@ class LearningController:
         return replace(decision, timing=timing, learned=learned)
 
     def _learned(self, state: Array, previous: Decision | None) -> Learned:
+        """What the flight has taught up to a measurement (n,)."""
         before = None if previous is None else previous.learned
-        if previous is None or before is None or not np.isfinite(state).all():
+        if previous is None or before is None:
             return self._begin(state)
-        if not np.array_equal(
-            previous.means[0], before.state
-        ):  # the decision between them was not applied
-            version = before.version + before.active
-            return replace(
-                before,
-                model=before.model.later(1.0),
-                state=state,
-                active=False,
-                version=version,
-            )
+        if not np.isfinite(state).all():
+            return before.later()
+        if not np.array_equal(previous.means[0], before.state):
+            return before.after_gap(state)
         try:
             return self.learning.learn(before, previous.input, state)
-        except (
-            SettingError,
-            DataError,
-        ):  # the points contradict each other beyond double precision
+        except (SettingError, DataError):
+            # The points contradict each other beyond double precision.
             return self._begin(state, before.version + 1)
 
     def _begin(self, state: Array, version: int = 0) -> Learned:
@@ -442,9 +596,29 @@ class LearningController:
         )
 
 
-def _log_density(error: Array, variance: Array) -> float:
-    """Of independent Gaussians, but for a constant."""
-    return -0.5 * float((error**2 / variance + np.log(variance)).sum())
+def _density(innovation: Innovation) -> float:
+    return innovation.log_density
+
+
+def _with_difference(learned: Learned, error: Array) -> Array:
+    """Squared differences of successive errors (w,), with that of an error (k,)."""
+    squares = (error - learned.error) ** 2 / learned.model.arrays[2]
+    difference = float(squares.mean()) / 2.0
+    if not np.isfinite(difference):
+        return learned.spread
+    return np.append(learned.spread, difference)[-_MANY:]
+
+
+def _noise_variance(spread: Array, model: ChangedModel) -> Array:
+    """The noise (k,) of the model, or of the last steps where that is more.
+
+    What changes slowly has no part in differences of successive errors, and a jump no
+    weight in their median.
+    """
+    noise = model.arrays[2]
+    outputs = len(noise)
+    middle = float(np.sort(spread)[len(spread) // 2])
+    return noise * max(1.0, middle * outputs / _median(outputs))
 
 
 @cache
