@@ -10,11 +10,34 @@ forgets in its kernel (a product of kernels in space and time: Bartels, Lahr, Ca
 Length-scales and signal variances are the model's: the plant may differ by a share of what was learned. Where nothing
 was seen lately d is zero, and with one point it is the estimate of a constant disturbance.
 
-Each step of the flight becomes a point of the change, whether that is used or not. The model with its change and the
-one without predict each step before they see it: the change is used once its log densities, summed over a window of
-steps, lead by a margin, and no longer once they trail, or where a decision could not be applied. After a step that
-neither chance nor the noise of late explains, what was seen before is forgotten and the change is used at once. The
-model's noise is scaled by what successive errors differ by, in the median, where that is more.
+Each step of the flight becomes a point of the change, whether that is used or not. The
+model with its change and the one without predict each step before they see it: the
+change is used once its log densities, summed over a window of steps, lead by a margin,
+and no longer once they trail. The model's noise is scaled by what successive errors
+differ by, in the median, where that is more. A decision that fails with the change is
+taken without it.
+
+One wrong measurement spoils two transitions, the one into it and the one out of it, and
+their errors have opposite signs; those of another plant agree. So a measurement that
+neither chance nor the noise of late explains is in doubt: it is held back, and teaches
+nothing before the next one has explained it. That one is compared with three
+predictions:
+
+* over both steps, from the last state that was trusted: then the measurement between was
+  wrong;
+* over one step, from the measurement in doubt: then the plant was moved, or its sensor;
+* over one step, from the measurement in doubt, by the change that the step into it has
+  taught: then the plant is another one. What was seen before is forgotten, and this
+  change is used at once.
+
+Where one of the first two holds, both steps are left out. The third has to be better than
+these by as much as one step may count for. It needs one more confirmation for every step
+that nothing has explained of late, as where a sensor is noisy or shows another unit for a
+second, and for every time that it is as large as ``surprise`` allows a plant to differ by
+``share``. A sensor that repeats itself to the last digit while the model moves the plant
+confirms nothing. Where nothing holds, the next measurement is in doubt in its turn, and
+the model as it was learned plans until one is explained. Steps in doubt may end the use
+of a change, and never begin it.
 """
 
 from collections.abc import Sequence
@@ -25,6 +48,7 @@ from typing import Any, Literal, NamedTuple, cast
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from scipy.stats import chi2
 from torch import Tensor
 
@@ -43,9 +67,11 @@ from gpmpc.mpc._controller import check_arguments, check_method
 from gpmpc.mpc.gp_mpc import GPMPC
 from gpmpc.signals import Signals
 from gpmpc.simulation import Rollout
+from gpmpc.status import Status
 
 _FEW, _MANY = 3, 100  # differences of errors that say how large the noise is
 _LARGEST = 10.0  # difference of log densities that one step counts for: no outlier decides alone
+_PATIENCE = 5  # unexplained steps that ask for further confirmations, at most
 
 
 @dataclass(frozen=True)
@@ -63,7 +89,8 @@ class OnlineLearning:
     margin: float = (
         20.0  #: lead of the summed log densities from which on the change is used
     )
-    surprise: float = 30.0  #: squared error over its expectation, from which on a plant is another one
+    #: squared error of an output over its expectation, from which on a step is in doubt
+    surprise: float = 30.0
 
     def __post_init__(self) -> None:
         SlidingWindow(self.points, self.remove)
@@ -87,86 +114,118 @@ class OnlineLearning:
         if len(spread) < _FEW:
             return seen.later()
         noise = _noise_variance(spread, learned.model)
-        observation = Observation(
-            learned.state, input, state, point, error, latent, noise
-        )
+        step = LearningStep(learned.state, input, state, point, error, latent, noise)
+        comparison = learned.model.compare(step)
         if learned.doubt is not None:
-            return self._resolve(seen, observation, learned.doubt)
-        if observation.stands_still:
-            return seen.later()
-        model = learned.model.with_observation(observation)
-        with_change = model.last_innovation(observation)
-        without_change = observation.innovation
-        innovation = with_change if learned.active else without_change
-        if innovation.largest > self.surprise:
-            return self._hold(seen, observation, Expectation.certain(learned.state))
-        lead = with_change.log_density - without_change.log_density
-        return self._compare(replace(seen, model=model), lead)
+            return self._resolve(seen, step, comparison, learned.doubt)
+        surprising = comparison.planned(learned.active).largest > self.surprise
+        if not (surprising or step.repeats.all()):
+            return self._accept(seen, comparison)
+        expected = seen.expect(Expectation.certain(learned.state), step)
+        if surprising or self._is_frozen(seen, step, expected):
+            return self._hold(seen, step, comparison, expected)
+        return seen.later()
 
-    def _compare(self, seen: "Learned", lead: float) -> "Learned":
-        """Says whether the change is used, by its lead in the last steps."""
-        lead = max(-_LARGEST, min(lead, _LARGEST))
+    def _accept(self, seen: "Learned", comparison: "Comparison") -> "Learned":
+        """Makes a step a point of the change, and says whether that is used."""
+        unexplained = max(0, seen.unexplained - 1)
+        trusted = replace(
+            seen, model=comparison.model, unexplained=unexplained, doubt=None
+        )
+        return self._count(trusted, comparison.lead)
+
+    def _count(self, seen: "Learned", lead: float) -> "Learned":
+        """Uses the change or not, by its lead over the last steps with this one's."""
         leads = np.append(seen.leads, lead)[-self.window :]
         total = float(leads.sum())
         active = total >= 0 if seen.active else total > self.margin
         version = seen.version + (active or seen.active)
         return replace(seen, leads=leads, active=active, version=version).later()
 
-    def _hold(
-        self, seen: "Learned", observation: "Observation", start: "Expectation"
-    ) -> "Learned":
-        """Holds back a measurement that contradicts the step before it.
+    def _count_doubtful(self, seen: "Learned", lead: float) -> "Learned":
+        """Counts a step in doubt, which may end the use of a change, not begin it."""
+        return self._count(seen, lead) if seen.active else seen.later()
 
-        ``start`` is where the plant was before that step, as far as it is trusted.
+    def _hold(
+        self,
+        seen: "Learned",
+        step: "LearningStep",
+        comparison: "Comparison",
+        expected: "Expectation",
+    ) -> "Learned":
+        """Holds a measurement back that no prediction explains.
+
+        ``expected`` is where the plant is if all measurements in doubt are wrong.
         """
-        expected = seen.expect(start, observation)
+        unexplained = seen.unexplained
+        steps = 1
+        if seen.doubt is not None:
+            unexplained = min(unexplained + 1, _PATIENCE)
+            steps = seen.doubt.steps + 1
         change = None
-        if not self._is_frozen(observation, expected, seen.model.angles):
-            fresh = seen.model.forgotten()
-            change = fresh.with_observation(observation).later(1.0)
-        return replace(seen, doubt=Doubt(expected, change)).later()
+        missing = 1 + unexplained
+        if not self._is_frozen(seen, step, expected):
+            alone = seen.model.forgotten().compare(step)
+            change = alone.model.later(1.0)
+            missing += int(alone.with_change.largest / self.surprise)
+        doubt = Doubt(expected, change, missing, steps)
+        held = replace(seen, unexplained=unexplained, doubt=doubt)
+        return self._count_doubtful(held, comparison.lead)
 
     def _is_frozen(
-        self,
-        observation: "Observation",
-        expected: "Expectation",
-        angles: Sequence[int],
+        self, seen: "Learned", step: "LearningStep", expected: "Expectation"
     ) -> bool:
         """Whether a sensor repeats itself to the last digit while the plant moves."""
-        motion = state_difference(expected.mean, observation.state, angles)
+        motion = state_difference(expected.mean, step.state, seen.model.angles)
         moves = motion**2 > self.surprise * np.diagonal(expected.covariance)
-        repeats = observation.state == observation.next_state
-        return bool((moves & repeats).any())
+        return bool((moves & step.repeats).any())
 
     def _resolve(
-        self, seen: "Learned", observation: "Observation", doubt: "Doubt"
+        self,
+        seen: "Learned",
+        step: "LearningStep",
+        comparison: "Comparison",
+        doubt: "Doubt",
     ) -> "Learned":
-        """Explains a measurement that was held back by the one after it."""
-        expected = seen.expect(doubt.expected, observation)
-        wrong_measurement = seen.innovation(expected)
-        displacement = observation.innovation
-        if seen.active:
-            model = seen.model.with_observation(observation)
-            displacement = model.last_innovation(observation)
-        same_plant = max(wrong_measurement, displacement, key=_density)
-        if doubt.change is not None and not observation.stands_still:
-            model = doubt.change.with_observation(observation)
-            change = model.last_innovation(observation)
-            explained = change.largest <= self.surprise
-            if explained and change.log_density > same_plant.log_density:
-                version = seen.version + 1
-                leads = seen.leads[:0]
-                return replace(
-                    seen,
-                    model=model,
-                    leads=leads,
-                    active=True,
-                    version=version,
-                    doubt=None,
-                ).later()
-        if same_plant.largest <= self.surprise:
-            return replace(seen, doubt=None).later()
-        return self._hold(seen, observation, doubt.expected)
+        """Explains the measurement in doubt by the one after it."""
+        expected = seen.expect(doubt.expected, step)
+        wrong = seen.innovation(expected)
+        moved = comparison.planned(seen.active)
+        least = max(wrong.log_density, moved.log_density) + _LARGEST
+        change = self._confirmed(doubt, step, least)
+        if change is not None and doubt.missing == 1:
+            return self._adopt(seen, change)
+        if change is not None:
+            later = change.later(1.0)
+            doubt = Doubt(expected, later, doubt.missing - 1, doubt.steps + 1)
+            return self._count_doubtful(replace(seen, doubt=doubt), comparison.lead)
+        if min(moved.largest, wrong.largest) <= self.surprise:
+            trusted = replace(seen, doubt=None)
+            return self._count_doubtful(trusted, comparison.lead)
+        return self._hold(seen, step, comparison, expected)
+
+    def _confirmed(
+        self, doubt: "Doubt", step: "LearningStep", least: float
+    ) -> "ChangedModel | None":
+        """The change of a doubt with a step that it explains; None where it does not.
+
+        ``least`` is the log density that it has to exceed.
+        """
+        if doubt.change is None or step.repeats.all():
+            return None
+        comparison = doubt.change.compare(step)
+        innovation = comparison.with_change
+        explains = innovation.largest <= self.surprise
+        if explains and innovation.log_density > least:
+            return comparison.model
+        return None
+
+    def _adopt(self, seen: "Learned", change: "ChangedModel") -> "Learned":
+        """Forgets what was seen, and uses the change of another plant."""
+        version = seen.version + 1
+        leads = seen.leads[:0]
+        other = replace(seen, model=change, leads=leads, version=version, doubt=None)
+        return replace(other, active=True).later()
 
 
 class Innovation(NamedTuple):
@@ -187,8 +246,8 @@ class Innovation(NamedTuple):
         return -0.5 * float((squares + np.log(self.variance)).sum())
 
 
-class Observation(NamedTuple):
-    """What one step of a flight says of the change."""
+class LearningStep(NamedTuple):
+    """A step of a flight, and what it says of the change."""
 
     state: Array  #: measured before it (n,)
     input: Array  #: applied (m,)
@@ -199,14 +258,27 @@ class Observation(NamedTuple):
     noise: Array  #: variance of the noise of this flight (k,)
 
     @property
-    def innovation(self) -> Innovation:
-        """Of the model alone."""
-        return Innovation(self.error, self.noise + self.latent)
+    def repeats(self) -> NDArray[np.bool_]:
+        """Which sensors show the same as before, to the last digit (n,)."""
+        return self.state == self.next_state
+
+
+class Comparison(NamedTuple):
+    """What the model with its change and the one without missed of a step."""
+
+    with_change: Innovation
+    without_change: Innovation
+    model: "ChangedModel"  #: with the step as a further point of its change
+
+    def planned(self, active: bool) -> Innovation:
+        """Of the model that plans."""
+        return self.with_change if active else self.without_change
 
     @property
-    def stands_still(self) -> bool:
-        """Whether the sensors repeat themselves to the last digit."""
-        return np.array_equal(self.state, self.next_state)
+    def lead(self) -> float:
+        """By how much the change's log density is larger, as far as a step counts."""
+        lead = self.with_change.log_density - self.without_change.log_density
+        return max(-_LARGEST, min(lead, _LARGEST))
 
 
 class Expectation(NamedTuple):
@@ -222,12 +294,14 @@ class Expectation(NamedTuple):
 
 
 class Doubt(NamedTuple):
-    """A measurement that was held back, until the next one explains it."""
+    """A measurement that is held back until the next one explains it."""
 
     expected: Expectation  #: where the plant is if the measurement was wrong
-    #: the model whose change is what this step alone teaches, in case that the plant is
-    #: another one; None where the step teaches nothing, as from a frozen sensor
+    #: the model whose change only the steps in doubt have taught, in case that the plant
+    #: is another one; None where they teach nothing
     change: "ChangedModel | None"
+    missing: int  #: steps that have still to confirm that change
+    steps: int  #: for which nothing has explained what is measured
 
 
 @dataclass(frozen=True)
@@ -358,25 +432,28 @@ class ChangedModel(Wrapper):
             )
         return self._replaced(change=(now.append(*new), coming))
 
-    def with_observation(self, observation: Observation) -> "ChangedModel":
-        """The model with what a step says of the change."""
-        return self.with_point(observation.point, observation.error, observation.noise)
-
     def forgotten(self) -> "ChangedModel":
         """The model without any point of the change."""
         return replace(self)
 
-    def last_innovation(self, observation: Observation) -> Innovation:
-        """Of the prediction of the last point of the change, by those before it.
+    def compare(self, step: LearningStep) -> Comparison:
+        """What a step, as the next point of the change, was predicted to be."""
+        model = self.with_point(step.point, step.error, step.noise)
+        error, variance = model.last_innovation()
+        change = variance - step.noise
+        remaining = self.remaining(step.latent, change, self.signal)
+        with_change = Innovation(error, variance + remaining)
+        without_change = Innovation(step.error, step.noise + step.latent)
+        return Comparison(with_change, without_change, model)
 
-        With L the factor and v = L^-1 y, L_NN^2 is the variance of d with its noise, and
-        v_N L_NN the error. What the model alone does not know comes on top.
+    def last_innovation(self) -> tuple[Array, Array]:
+        """Error and variance (k,) of the prediction of the last point of the change by those before, with its noise.
+
+        With L the factor and v = L^-1 y, L_NN^2 is the variance, and v_N L_NN the error.
         """
         last = self.change[0].columns[:, len(self) - 1]
         root = last[:, len(self) - 1]
-        change = root**2 - observation.noise
-        remaining = self.remaining(observation.latent, change, self.signal)
-        return Innovation(last[:, -1] * root, root**2 + remaining)
+        return last[:, -1] * root, root**2
 
     def remaining(self, latent: Any, variance: Any, signal: Any) -> Any:
         """What the model alone does not know (*batch, k), less what d's points saw.
@@ -481,14 +558,22 @@ class Learned:
     error: Array  #: of the model alone in the last step, as far as a change reaches it (k,); NaN for unknown
     spread: Array  #: squared differences of successive errors over those expected of the model's noise (w,)
     leads: Array  #: by how much the log density with the change exceeds that without, of the last steps
-    active: bool = False  #: whether the change is part of the model that plans
+    active: bool = False  #: whether the change is used
     version: int = 0  #: how often that model has changed
-    doubt: Doubt | None = None  #: whether the last measurement is held back
+    #: steps that nothing has explained, less those that went as predicted since then
+    unexplained: int = 0
+    doubt: Doubt | None = None  #: where the last measurement is held back
+
+    @property
+    def steers(self) -> bool:
+        """Whether the change is part of the model that plans now."""
+        lasting = self.doubt is not None and self.doubt.steps > 1
+        return self.active and not lasting
 
     @property
     def size(self) -> int:
         """Points of the model that plans."""
-        return len(self.model.gp) + (len(self.model) if self.active else 0)
+        return len(self.model.gp) + (len(self.model) if self.steers else 0)
 
     def later(self) -> "Learned":
         """What was learned, a step later."""
@@ -504,17 +589,16 @@ class Learned:
         other = replace(self, state=state, error=error, version=version, doubt=None)
         return other.later()
 
-    def expect(self, start: Expectation, observation: Observation) -> Expectation:
-        """Where the model that plans expects the plant after a step from ``start``."""
-        planning = self.model if self.active else self.model.model
-        states = start.mean[None]
-        inputs = observation.input[None]
-        step = linearize(planning, states, inputs)
-        A = step.A[0]
+    def expect(self, start: Expectation, step: LearningStep) -> Expectation:
+        """Where the plant is after a step from ``start``, by the change if it is used."""
+        model = self.model if self.active else self.model.model
+        local = linearize(model, start.mean[None], step.input[None])
+        A = local.A[0]
         B = self.model.arrays[0]
-        latent = cast(Array, step.covariance)[0]
-        noise = (B * observation.noise) @ B.T
-        return Expectation(step.mean[0], A @ start.covariance @ A.T + latent + noise)
+        latent = cast(Array, local.covariance)[0]
+        noise = (B * step.noise) @ B.T
+        covariance = A @ start.covariance @ A.T + latent + noise
+        return Expectation(local.mean[0], covariance)
 
     def innovation(self, expected: Expectation) -> Innovation:
         """Of the measured state, as far as a change reaches it."""
@@ -563,15 +647,17 @@ class LearningController:
         if belief.names:
             belief = belief.in_order(self.signals.state_names)
         learned = self._learned(to_array(belief.mean).copy(), previous)
-        controller = (
-            self.controller.with_model(learned.model)
-            if learned.active
-            else self.controller
-        )
+        controller = self.controller
+        if learned.steers:
+            controller = self.controller.with_model(learned.model)
         known = {} if parameters is None else {"parameters": parameters}
-        spent = perf_counter() - begin
+        seconds = perf_counter() - begin
         decision = controller.control(belief, reference, previous, **known)
-        timing = replace(decision.timing, model=decision.timing.model + spent)
+        if learned.steers and _has_failed(decision):
+            seconds += decision.timing.total
+            learned = replace(learned, active=False, version=learned.version + 1)
+            decision = self.controller.control(belief, reference, previous, **known)
+        timing = replace(decision.timing, model=decision.timing.model + seconds)
         return replace(decision, timing=timing, learned=learned)
 
     def _learned(self, state: Array, previous: Decision | None) -> Learned:
@@ -596,8 +682,10 @@ class LearningController:
         )
 
 
-def _density(innovation: Innovation) -> float:
-    return innovation.log_density
+def _has_failed(decision: Decision) -> bool:
+    """Whether a decision on a finite measurement must not be applied."""
+    failed = not decision.applicable
+    return failed and decision.status is not Status.INVALID_MEASUREMENT
 
 
 def _with_difference(learned: Learned, error: Array) -> Array:
