@@ -71,6 +71,7 @@ from gpmpc.status import Status
 
 _FEW, _MANY = 3, 100  # differences of errors that say how large the noise is
 _LARGEST = 10.0  # difference of log densities that one step counts for: no outlier decides alone
+_MISALIGNED = 0.1  # part of errors that no input explains, in deviations, at most
 _PATIENCE = 5  # unexplained steps that ask for further confirmations, at most
 
 
@@ -168,9 +169,33 @@ class OnlineLearning:
             alone = seen.model.forgotten().compare(step)
             change = alone.model.later(1.0)
             missing += int(alone.with_change.largest / self.surprise)
-        doubt = Doubt(expected, change, missing, steps)
-        held = replace(seen, unexplained=unexplained, doubt=doubt)
+        plans = change is not None and missing == 1
+        if plans:
+            innovation = comparison.planned(seen.active)
+            reach = seen.model.arrays[1]
+            plans = self._acts_like_input(innovation, reach @ expected.by_input)
+        doubt = Doubt(expected, change, missing, steps, plans)
+        version = seen.version + plans
+        held = replace(seen, unexplained=unexplained, doubt=doubt, version=version)
         return self._count_doubtful(held, comparison.lead)
+
+    def _acts_like_input(self, innovation: "Innovation", by_input: Array) -> bool:
+        """Whether errors stand in several outputs, and as inputs would act on them.
+
+        One wrong sensor is wrong alone, and several are not wrong in that proportion.
+
+        Args:
+            innovation: Of the model that plans.
+            by_input: Derivative of what it predicted by the input (k, m).
+        """
+        deviation = np.sqrt(innovation.variance)
+        errors = innovation.error / deviation
+        effects = by_input / deviation[:, None]
+        shares, _, rank, _ = np.linalg.lstsq(effects, errors, rcond=None)
+        several = np.count_nonzero(errors**2 > self.surprise) > 1
+        remaining = np.linalg.norm(errors - effects @ shares)
+        aligned = remaining <= _MISALIGNED * np.linalg.norm(errors)
+        return bool(several and aligned and rank < len(errors))
 
     def _is_frozen(
         self, seen: "Learned", step: "LearningStep", expected: "Expectation"
@@ -286,11 +311,13 @@ class Expectation(NamedTuple):
 
     mean: Array  #: of the state (n,)
     covariance: Array  #: (n, n)
+    by_input: Array  #: derivative of the mean by the last input (n, m)
 
     @classmethod
     def certain(cls, state: Array) -> "Expectation":
         """Of a state that is known."""
-        return cls(state, np.zeros((len(state), len(state))))
+        n = len(state)
+        return cls(state, np.zeros((n, n)), np.zeros((n, 0)))
 
 
 class Doubt(NamedTuple):
@@ -302,6 +329,7 @@ class Doubt(NamedTuple):
     change: "ChangedModel | None"
     missing: int  #: steps that have still to confirm that change
     steps: int  #: for which nothing has explained what is measured
+    plans: bool = False  #: whether that change is used before it is confirmed
 
 
 @dataclass(frozen=True)
@@ -565,19 +593,28 @@ class Learned:
     doubt: Doubt | None = None  #: where the last measurement is held back
 
     @property
-    def steers(self) -> bool:
-        """Whether the change is part of the model that plans now."""
+    def planning(self) -> ChangedModel | None:
+        """The model that plans now; None for the one without a change."""
+        if self.doubt is not None and self.doubt.plans:
+            return self.doubt.change
         lasting = self.doubt is not None and self.doubt.steps > 1
-        return self.active and not lasting
+        return self.model if self.active and not lasting else None
 
     @property
     def size(self) -> int:
         """Points of the model that plans."""
-        return len(self.model.gp) + (len(self.model) if self.steers else 0)
+        change = self.planning
+        return len(self.model.gp) + (0 if change is None else len(change))
 
     def later(self) -> "Learned":
         """What was learned, a step later."""
         return replace(self, model=self.model.later(1.0))
+
+    def without_change(self) -> "Learned":
+        """What was learned, where a decision with the change has failed."""
+        doubt = None if self.doubt is None else self.doubt._replace(plans=False)
+        version = self.version + 1
+        return replace(self, active=False, version=version, doubt=doubt)
 
     def after_gap(self, state: Array) -> "Learned":
         """What was learned, where steps were not measured and a state (n,) is again.
@@ -598,7 +635,7 @@ class Learned:
         latent = cast(Array, local.covariance)[0]
         noise = (B * step.noise) @ B.T
         covariance = A @ start.covariance @ A.T + latent + noise
-        return Expectation(local.mean[0], covariance)
+        return Expectation(local.mean[0], covariance, local.B[0])
 
     def innovation(self, expected: Expectation) -> Innovation:
         """Of the measured state, as far as a change reaches it."""
@@ -648,14 +685,14 @@ class LearningController:
             belief = belief.in_order(self.signals.state_names)
         learned = self._learned(to_array(belief.mean).copy(), previous)
         controller = self.controller
-        if learned.steers:
-            controller = self.controller.with_model(learned.model)
+        if learned.planning is not None:
+            controller = self.controller.with_model(learned.planning)
         known = {} if parameters is None else {"parameters": parameters}
         seconds = perf_counter() - begin
         decision = controller.control(belief, reference, previous, **known)
-        if learned.steers and _has_failed(decision):
+        if learned.planning is not None and _has_failed(decision):
             seconds += decision.timing.total
-            learned = replace(learned, active=False, version=learned.version + 1)
+            learned = learned.without_change()
             decision = self.controller.control(belief, reference, previous, **known)
         timing = replace(decision.timing, model=decision.timing.model + seconds)
         return replace(decision, timing=timing, learned=learned)
