@@ -160,9 +160,11 @@ class OnlineLearning:
         """
         unexplained = seen.unexplained
         steps = 1
+        spread = seen.spread[:-1]
         if seen.doubt is not None:
             unexplained = min(unexplained + 1, _PATIENCE)
             steps = seen.doubt.steps + 1
+            spread = seen.doubt.spread
         change = None
         missing = 1 + unexplained
         if not self._is_frozen(seen, step, expected):
@@ -174,7 +176,7 @@ class OnlineLearning:
             innovation = comparison.planned(seen.active)
             reach = seen.model.arrays[1]
             plans = self._acts_like_input(innovation, reach @ expected.by_input)
-        doubt = Doubt(expected, change, missing, steps, plans)
+        doubt = Doubt(expected, spread, change, missing, steps, plans)
         version = seen.version + plans
         held = replace(seen, unexplained=unexplained, doubt=doubt, version=version)
         return self._count_doubtful(held, comparison.lead)
@@ -222,10 +224,12 @@ class OnlineLearning:
             return self._adopt(seen, change)
         if change is not None:
             later = change.later(1.0)
-            doubt = Doubt(expected, later, doubt.missing - 1, doubt.steps + 1)
+            missing = doubt.missing - 1
+            steps = doubt.steps + 1
+            doubt = Doubt(expected, doubt.spread, later, missing, steps)
             return self._count_doubtful(replace(seen, doubt=doubt), comparison.lead)
         if min(moved.largest, wrong.largest) <= self.surprise:
-            trusted = replace(seen, doubt=None)
+            trusted = seen.without_doubt(doubt)
             return self._count_doubtful(trusted, comparison.lead)
         return self._hold(seen, step, comparison, expected)
 
@@ -324,6 +328,7 @@ class Doubt(NamedTuple):
     """A measurement that is held back until the next one explains it."""
 
     expected: Expectation  #: where the plant is if the measurement was wrong
+    spread: Array  #: of ``Learned`` without the steps in doubt (w,)
     #: the model whose change only the steps in doubt have taught, in case that the plant
     #: is another one; None where they teach nothing
     change: "ChangedModel | None"
@@ -615,6 +620,11 @@ class Learned:
         doubt = None if self.doubt is None else self.doubt._replace(plans=False)
         version = self.version + 1
         return replace(self, active=False, version=version, doubt=doubt)
+
+    def without_doubt(self, doubt: Doubt) -> "Learned":
+        """What was learned, without the steps that were in doubt."""
+        unknown = np.full_like(self.error, np.nan)
+        return replace(self, error=unknown, spread=doubt.spread, doubt=None)
 
     def after_gap(self, state: Array) -> "Learned":
         """What was learned, where steps were not measured and a state (n,) is again.
