@@ -11,10 +11,12 @@ flies that plant all along. RMSE of the position [m] from 5 s after a change on,
 the last of these, ``lost`` counts flights farther than 5 m away then. Also by how much a decision takes longer. Each
 cell is kept in ``outputs/benchmarks/learning.json`` and not flown again by the same code.
 
-With ``--faults`` its sensors fail on the ellipse, in calm air and in the wind: glitches of one state at a time, steps
-without a measurement, and a second in which all of them are frozen, or positions are in another unit. RMSE over the same
-steps, without and with online learning; "sound" is the ratio to online learning in the same air with sound sensors. The
-controller acts on a wrong measurement either way, and what that costs stands in the columns without learning.
+With ``--faults`` its sensors fail on the ellipse, in calm air and in the wind: glitches
+of one state at a time, steps without a measurement, and a second in which all of them
+are frozen, or positions are in another unit. RMSE over the same steps, without and with
+online learning; "sound" is the ratio to online learning in the same air with sound
+sensors. The controller acts on a wrong measurement either way, and what that costs
+stands in the columns without learning.
 """
 
 import argparse

@@ -72,7 +72,7 @@ from gpmpc.status import Status
 _FEW, _MANY = 3, 100  # differences of errors that say how large the noise is
 _LARGEST = 10.0  # difference of log densities that one step counts for: no outlier decides alone
 _MISALIGNED = 0.1  # part of errors that no input explains, in deviations, at most
-_PATIENCE = 5  # unexplained steps that ask for further confirmations, at most
+_PATIENCE = 2  # further confirmations for steps that nothing explained, at most
 
 
 @dataclass(frozen=True)
