@@ -205,7 +205,7 @@ def test_a_changed_plant_is_in_doubt_for_a_step_and_its_two_transitions_are_lear
 def test_a_change_that_shows_as_an_input_would_is_used_before_it_is_confirmed():
     states, inputs = excited(20)
     learned = taught(states, inputs)[-1]
-    blown = cart(states[-1], [1.0], wind=0.8)
+    blown = cart(states[-1], [1.0], wind=1.0)
     in_doubt = OnlineLearning().learn(learned, np.array([1.0]), blown)
     assert in_doubt.doubt.plans
     assert in_doubt.planning is in_doubt.doubt.change
