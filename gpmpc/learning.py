@@ -111,7 +111,7 @@ class OnlineLearning:
         input = np.asarray(input, dtype=float)
         point, error, latent = learned.model.error(learned.state, input, state)
         spread = _with_difference(learned, error)
-        seen = replace(learned, state=state, error=error, spread=spread)
+        seen = learned.with_measurement(state, error, spread)
         if len(spread) < _FEW:
             return seen.later()
         noise = _noise_variance(spread, learned.model)
@@ -130,9 +130,7 @@ class OnlineLearning:
     def _accept(self, seen: "Learned", comparison: "Comparison") -> "Learned":
         """Makes a step a point of the change, and says whether that is used."""
         unexplained = max(0, seen.unexplained - 1)
-        trusted = replace(
-            seen, model=comparison.model, unexplained=unexplained, doubt=None
-        )
+        trusted = replace(seen, model=comparison.model, unexplained=unexplained)
         return self._count(trusted, comparison.lead)
 
     def _count(self, seen: "Learned", lead: float) -> "Learned":
@@ -614,6 +612,12 @@ class Learned:
     def later(self) -> "Learned":
         """What was learned, a step later."""
         return replace(self, model=self.model.later(1.0))
+
+    def with_measurement(self, state: Array, error: Array, spread: Array) -> "Learned":
+        """What was learned, and what a further step has shown."""
+        tried = self.doubt is not None and self.doubt.plans
+        version = self.version + tried  # a change that was tried for a step ends
+        return replace(self, state=state, error=error, spread=spread, version=version)
 
     def without_change(self) -> "Learned":
         """What was learned, where a decision with the change has failed."""
