@@ -31,13 +31,15 @@ predictions:
   change is used at once.
 
 Where one of the first two holds, both steps are left out. The third has to be better than
-these by as much as one step may count for. It needs one more confirmation for every step
-that nothing has explained of late, as where a sensor is noisy or shows another unit for a
-second, and for every time that it is as large as ``surprise`` allows a plant to differ by
-``share``. A sensor that repeats itself to the last digit while the model moves the plant
-confirms nothing. Where nothing holds, the next measurement is in doubt in its turn, and
-the model as it was learned plans until one is explained. Steps in doubt may end the use
-of a change, and never begin it.
+these by as much as one step may count for. It needs further confirmations: one for each
+step that nothing has explained of late, two at most, as where a sensor is noisy or shows
+another unit for a second, and one for every time that its square is ``surprise`` times
+what ``share`` expects. A sensor that repeats itself to the last digit while the model
+moves the plant confirms nothing. Where nothing holds, the next measurement is in doubt in
+its turn, and the model as it was learned plans until one is explained. Steps in doubt may
+end the use of a change, and never begin it, with one exception: where several outputs err
+in the proportion in which an input acts on them, no single sensor is wrong, and the
+change is tried for the one step until it is confirmed.
 """
 
 from collections.abc import Sequence
