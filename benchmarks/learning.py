@@ -1,6 +1,7 @@
 """What learning while flying is worth: a vehicle that becomes a fifth heavier, a wind that changes, and nothing at all.
 
     .venv/bin/python -m benchmarks.learning [--seeds 20] [--figure docs/figures/learning.png]
+    .venv/bin/python -m benchmarks.learning --faults [--seeds 10]
 
 The translational quadrotor with the plant in the loop, GPs of 189 dithered transitions, convex GP-MPC with H = 10, one
 step a second. At 20 s it becomes 20 % heavier, or a wind begins, which turns at 50 s; or nothing happens. Compared: the
@@ -9,6 +10,13 @@ that was trained on the plant that flies after the change (on the plant without 
 flies that plant all along. RMSE of the position [m] from 5 s after a change on, pooled over the seeds; ``ratio`` is to
 the last of these, ``lost`` counts flights farther than 5 m away then. Also by how much a decision takes longer. Each
 cell is kept in ``outputs/benchmarks/learning.json`` and not flown again by the same code.
+
+With ``--faults`` its sensors fail on the ellipse, in calm air and in the wind: glitches
+of one state at a time, steps without a measurement, and a second in which all of them
+are frozen, or positions are in another unit. RMSE over the same steps, without and with
+online learning; "sound" is the ratio to online learning in the same air with sound
+sensors. The controller acts on a wrong measurement either way, and what that costs
+stands in the columns without learning.
 """
 
 import argparse
@@ -39,7 +47,14 @@ from gpmpc.mpc import Controller, PredictionSettings
 from gpmpc.mpc.gp_mpc import GPMPC
 from gpmpc.plotting import png
 from gpmpc.propagation import Linearization
-from gpmpc.simulation import Gust, Noise, Replaced, Rollout, closed_loop
+from gpmpc.simulation import (
+    Disturbance,
+    Gust,
+    Noise,
+    Replaced,
+    Rollout,
+    closed_loop,
+)
 from gpmpc.studies.study import fingerprint
 from gpmpc.systems import translational
 from gpmpc.trajectories import states_along
@@ -58,6 +73,51 @@ CHANGES: dict[str, tuple] = {
 NOISES = {"process 0.01": NOISE, "measured 0.01": Noise(measurement=[0.01] * 6)}
 WAYS = ("as learned", "disturbance estimate", "online", "trained on the new plant")
 STORE = Path("outputs/benchmarks/learning.json")
+COUNTS, SIZES = (1, 5, 20), (0.05, 0.5, 2.0)  # of glitches [m or m/s]
+FAULTS = (
+    "none",
+    *(f"{count} glitches of {size}" for count in COUNTS for size in SIZES),
+    "1 % missing",
+    "5 % missing",
+    "frozen",
+    "times 1000",
+    "degrees",
+)
+
+
+class FaultySensor(Disturbance):
+    """A sensor of the six states with one of ``FAULTS``, for one flight."""
+
+    def __init__(self, fault: str, seed: int):
+        random = np.random.default_rng(seed)
+        self.offset = np.zeros((STEPS + 1, 6))
+        self.factor = np.ones((STEPS + 1, 6))
+        self.frozen = np.zeros(STEPS + 1, dtype=bool)
+        self.shown = np.zeros(6)
+        start = int(random.integers(30, 40))
+        lasting = slice(start, start + 1)
+        if "glitches" in fault:
+            count, _, _, size = fault.split()
+            steps = random.choice(np.arange(5, STEPS - 5), int(count), replace=False)
+            states = random.integers(0, 6, len(steps))
+            self.offset[steps, states] = random.choice([-1, 1], len(steps)) * float(
+                size
+            )
+        elif "missing" in fault:
+            part = float(fault.split()[0]) / 100
+            self.offset[random.random(STEPS + 1) < part] = np.nan
+        elif fault == "frozen":
+            self.frozen[lasting] = True
+        elif fault != "none":
+            unit = {"times 1000": 1000.0, "degrees": 180 / np.pi}[fault]
+            self.factor[lasting, POSITION] = unit
+
+    def disturb_measurement(self, state: np.ndarray, time: float) -> np.ndarray:
+        """What the sensor shows of a state (6,) at a time [s]."""
+        step = round(time)
+        if not self.frozen[step]:
+            self.shown = state.copy()
+        return self.factor[step] * self.shown + self.offset[step]
 
 
 def controller_of(way: str, model: GPPosterior) -> Controller:
@@ -75,7 +135,7 @@ def controller_of(way: str, model: GPPosterior) -> Controller:
 
 
 def flights(
-    way: str, trajectory: str, change: str, noise: str, seeds: int
+    way: str, trajectory: str, change: str, noise: str, seeds: int, fault: str = "none"
 ) -> list[Rollout]:
     """One a seed."""
     disturbances, model = CHANGES[change], trained(trajectory)
@@ -92,7 +152,8 @@ def flights(
     return [
         closed_loop(
             OUTER, controller, references, references[0], STEPS,
-            noise=NOISES[noise], disturbances=disturbances, on_failure="previous_plan", seed=seed,
+            noise=NOISES[noise], disturbances=(*disturbances, FaultySensor(fault, seed)),
+            on_failure="previous_plan", seed=seed,
         )
         for seed in range(seeds)
     ]  # fmt: skip
@@ -124,15 +185,48 @@ def measured(flown: list[Rollout], change: str) -> dict[str, Any]:
     }
 
 
+def fault_table(seeds: int) -> None:
+    """Flies with faulty sensors, and prints what learning makes of that."""
+    noise = "process 0.01"
+    print(
+        f"{'':20}" + "".join(f"{air + ': as learned':>28}{'online':>10}{'ratio':>8}{'sound':>8}"
+                            for air in ("calm", "wind"))
+    )  # fmt: skip
+    sound: dict[str, float] = {}
+    rows: list[dict[str, Any]] = []
+    for fault in FAULTS:
+        text = f"{fault:20}"
+        for change in ("none", "wind"):
+            plain, online = (
+                measured(
+                    flights(way, "elliptical", change, noise, seeds, fault), change
+                )["rmse"]
+                for way in ("as learned", "online")
+            )
+            sound.setdefault(change, online)
+            rows.append(
+                {"fault": fault, "change": change, "plain": plain, "online": online}
+            )
+            text += f"{plain:28.4f}{online:10.4f}{online / plain:8.2f}"
+            text += f"{online / sound[change]:8.2f}"
+        print(text, flush=True)
+    write_results("learning_faults", rows)
+
+
 def main() -> None:
     """Flies, prints and draws."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--seeds", type=int, default=20)
+    parser.add_argument("--seeds", type=int, help="flights a cell; 20, faults 10")
+    parser.add_argument("--faults", action="store_true", help="of sensors")
     parser.add_argument(
         "--figure", type=Path, default=Path("outputs/benchmarks/learning.png")
     )
     arguments = parser.parse_args()
     torch.set_num_threads(1)
+    if arguments.faults:
+        fault_table(arguments.seeds or 10)
+        return
+    arguments.seeds = arguments.seeds or 20
     rows = json.loads(STORE.read_text())["results"] if STORE.exists() else []
     print(f"{'':46}" + "".join(f"{way:>28}" for way in WAYS))
     for trajectory in TRAJECTORIES:

@@ -10,21 +10,47 @@ forgets in its kernel (a product of kernels in space and time: Bartels, Lahr, Ca
 Length-scales and signal variances are the model's: the plant may differ by a share of what was learned. Where nothing
 was seen lately d is zero, and with one point it is the estimate of a constant disturbance.
 
-Each step of the flight becomes a point of the change, whether that is used or not. The model with its change and the
-one without predict each step before they see it: the change is used once its log densities, summed over a window of
-steps, lead by a margin, and no longer once they trail, or where a decision could not be applied. After a step that
-neither chance nor the noise of late explains, what was seen before is forgotten and the change is used at once. The
-model's noise is scaled by what successive errors differ by, in the median, where that is more.
+Each step of the flight becomes a point of the change, whether that is used or not. The
+model with its change and the one without predict each step before they see it: the
+change is used once its log densities, summed over a window of steps, lead by a margin,
+and no longer once they trail. The model's noise is scaled by what successive errors
+differ by, in the median, where that is more. A decision that fails with the change is
+taken without it.
+
+One wrong measurement spoils two transitions, the one into it and the one out of it, and
+their errors have opposite signs; those of another plant agree. So a measurement that
+neither chance nor the noise of late explains is in doubt: it is held back, and teaches
+nothing before the next one has explained it. That one is compared with three
+predictions:
+
+* over both steps, from the last state that was trusted: then the measurement between was
+  wrong;
+* over one step, from the measurement in doubt: then the plant was moved, or its sensor;
+* over one step, from the measurement in doubt, by the change that the step into it has
+  taught: then the plant is another one. What was seen before is forgotten, and this
+  change is used at once.
+
+Where one of the first two holds, both steps are left out. The third has to be better than
+these by as much as one step may count for. It needs further confirmations: one for each
+step that nothing has explained of late, two at most, as where a sensor is noisy or shows
+another unit for a second, and one for every time that its square is ``surprise`` times
+what ``share`` expects. A sensor that repeats itself to the last digit while the model
+moves the plant confirms nothing. Where nothing holds, the next measurement is in doubt in
+its turn, and the model as it was learned plans until one is explained. Steps in doubt may
+end the use of a change, and never begin it, with one exception: where several outputs err
+in the proportion in which an input acts on them, no single sensor is wrong, and the
+change is tried for the one step until it is confirmed.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cache, cached_property
 from time import perf_counter
-from typing import Any, Literal, cast
+from typing import Any, Literal, NamedTuple, cast
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from scipy.stats import chi2
 from torch import Tensor
 
@@ -43,9 +69,12 @@ from gpmpc.mpc._controller import check_arguments, check_method
 from gpmpc.mpc.gp_mpc import GPMPC
 from gpmpc.signals import Signals
 from gpmpc.simulation import Rollout
+from gpmpc.status import Status
 
 _FEW, _MANY = 3, 100  # differences of errors that say how large the noise is
 _LARGEST = 10.0  # difference of log densities that one step counts for: no outlier decides alone
+_MISALIGNED = 0.1  # part of errors that no input explains, in deviations, at most
+_PATIENCE = 2  # further confirmations for steps that nothing explained, at most
 
 
 @dataclass(frozen=True)
@@ -63,7 +92,8 @@ class OnlineLearning:
     margin: float = (
         20.0  #: lead of the summed log densities from which on the change is used
     )
-    surprise: float = 30.0  #: squared error over its expectation, from which on a plant is another one
+    #: squared error of an output over its expectation, from which on a step is in doubt
+    surprise: float = 30.0
 
     def __post_init__(self) -> None:
         SlidingWindow(self.points, self.remove)
@@ -73,44 +103,238 @@ class OnlineLearning:
         check_number("margin", self.margin, least=0)
 
     def learn(self, learned: "Learned", input: Array, state: Array) -> "Learned":
-        """Learns from one step: the input that was applied (m,), and the state measured after it (n,)."""
-        model, spread = learned.model, learned.spread
-        point, error, latent = model.error(
-            learned.state, np.asarray(input, dtype=float), state
-        )
-        moved = float(((error - learned.error) ** 2 / model.arrays[2]).mean()) / 2.0
-        if np.isfinite(moved):
-            spread = np.append(spread, moved)[-_MANY:]
-        found: dict[str, Any] = {"state": state, "error": error, "spread": spread}
+        """Learns from one step of a flight.
+
+        Args:
+            learned: What the steps before have taught.
+            input: That was applied (m,).
+            state: Measured after it (n,).
+        """
+        input = np.asarray(input, dtype=float)
+        point, error, latent = learned.model.error(learned.state, input, state)
+        spread = _with_difference(learned, error)
+        seen = learned.with_measurement(state, error, spread)
         if len(spread) < _FEW:
-            return replace(learned, model=model.later(1.0), **found)
-        # What changes slowly has no part in differences of successive errors, and a jump no weight in their median.
-        ratio = (
-            float(np.sort(spread)[len(spread) // 2]) * len(error) / _median(len(error))
-        )
-        noise = model.arrays[2] * max(1.0, ratio)
-        larger, alone = model.with_point(point, error, noise), noise + latent
-        missed, variance = larger.last_innovation()
-        variance = variance + model.remaining(latent, variance - noise, model.signal)
-        lead = _log_density(missed, variance) - _log_density(error, alone)
-        leads = np.append(learned.leads, max(-_LARGEST, min(lead, _LARGEST)))[
-            -self.window :
-        ]
+            return seen.later()
+        noise = _noise_variance(spread, learned.model)
+        step = LearningStep(learned.state, input, state, point, error, latent, noise)
+        comparison = learned.model.compare(step)
+        if learned.doubt is not None:
+            return self._resolve(seen, step, comparison, learned.doubt)
+        surprising = comparison.planned(learned.active).largest > self.surprise
+        if not (surprising or step.repeats.all()):
+            return self._accept(seen, comparison)
+        expected = seen.expect(Expectation.certain(learned.state), step)
+        if surprising or self._is_frozen(seen, step, expected):
+            return self._hold(seen, step, comparison, expected)
+        return seen.later()
+
+    def _accept(self, seen: "Learned", comparison: "Comparison") -> "Learned":
+        """Makes a step a point of the change, and says whether that is used."""
+        unexplained = max(0, seen.unexplained - 1)
+        trusted = replace(seen, model=comparison.model, unexplained=unexplained)
+        return self._count(trusted, comparison.lead)
+
+    def _count(self, seen: "Learned", lead: float) -> "Learned":
+        """Uses the change or not, by its lead over the last steps with this one's."""
+        leads = np.append(seen.leads, lead)[-self.window :]
         total = float(leads.sum())
-        active = total >= 0 if learned.active else total > self.margin
-        squares = missed**2 / variance if learned.active else error**2 / alone
-        if float(squares.mean()) > self.surprise:
-            active, leads = True, leads[:0]
-            larger = replace(model).with_point(point, error, noise)
-        version = learned.version + (active or learned.active)
-        return replace(
-            learned,
-            model=larger.later(1.0),
-            leads=leads,
-            active=active,
-            version=version,
-            **found,
-        )
+        active = total >= 0 if seen.active else total > self.margin
+        version = seen.version + (active or seen.active)
+        return replace(seen, leads=leads, active=active, version=version).later()
+
+    def _count_doubtful(self, seen: "Learned", lead: float) -> "Learned":
+        """Counts a step in doubt, which may end the use of a change, not begin it."""
+        return self._count(seen, lead) if seen.active else seen.later()
+
+    def _hold(
+        self,
+        seen: "Learned",
+        step: "LearningStep",
+        comparison: "Comparison",
+        expected: "Expectation",
+    ) -> "Learned":
+        """Holds a measurement back that no prediction explains.
+
+        ``expected`` is where the plant is if all measurements in doubt are wrong.
+        """
+        unexplained = seen.unexplained
+        steps = 1
+        spread = seen.spread[:-1]
+        if seen.doubt is not None:
+            unexplained = min(unexplained + 1, _PATIENCE)
+            steps = seen.doubt.steps + 1
+            spread = seen.doubt.spread
+        change = None
+        missing = 1 + unexplained
+        if not self._is_frozen(seen, step, expected):
+            alone = seen.model.forgotten().compare(step)
+            change = alone.model.later(1.0)
+            missing += int(alone.with_change.largest / self.surprise)
+        plans = change is not None and missing == 1
+        if plans:
+            innovation = comparison.planned(seen.active)
+            reach = seen.model.arrays[1]
+            plans = self._acts_like_input(innovation, reach @ expected.by_input)
+        doubt = Doubt(expected, spread, change, missing, steps, plans)
+        version = seen.version + plans
+        held = replace(seen, unexplained=unexplained, doubt=doubt, version=version)
+        return self._count_doubtful(held, comparison.lead)
+
+    def _acts_like_input(self, innovation: "Innovation", by_input: Array) -> bool:
+        """Whether errors stand in several outputs, and as inputs would act on them.
+
+        One wrong sensor is wrong alone, and several are not wrong in that proportion.
+
+        Args:
+            innovation: Of the model that plans.
+            by_input: Derivative of what it predicted by the input (k, m).
+        """
+        deviation = np.sqrt(innovation.variance)
+        errors = innovation.error / deviation
+        effects = by_input / deviation[:, None]
+        shares, _, rank, _ = np.linalg.lstsq(effects, errors, rcond=None)
+        several = np.count_nonzero(errors**2 > self.surprise) > 1
+        remaining = np.linalg.norm(errors - effects @ shares)
+        aligned = remaining <= _MISALIGNED * np.linalg.norm(errors)
+        return bool(several and aligned and rank < len(errors))
+
+    def _is_frozen(
+        self, seen: "Learned", step: "LearningStep", expected: "Expectation"
+    ) -> bool:
+        """Whether a sensor repeats itself to the last digit while the plant moves."""
+        motion = state_difference(expected.mean, step.state, seen.model.angles)
+        moves = motion**2 > self.surprise * np.diagonal(expected.covariance)
+        return bool((moves & step.repeats).any())
+
+    def _resolve(
+        self,
+        seen: "Learned",
+        step: "LearningStep",
+        comparison: "Comparison",
+        doubt: "Doubt",
+    ) -> "Learned":
+        """Explains the measurement in doubt by the one after it."""
+        expected = seen.expect(doubt.expected, step)
+        wrong = seen.innovation(expected)
+        moved = comparison.planned(seen.active)
+        least = max(wrong.log_density, moved.log_density) + _LARGEST
+        change = self._confirmed(doubt, step, least)
+        if change is not None and doubt.missing == 1:
+            return self._adopt(seen, change)
+        if change is not None:
+            later = change.later(1.0)
+            missing = doubt.missing - 1
+            steps = doubt.steps + 1
+            doubt = Doubt(expected, doubt.spread, later, missing, steps)
+            return self._count_doubtful(replace(seen, doubt=doubt), comparison.lead)
+        if min(moved.largest, wrong.largest) <= self.surprise:
+            trusted = seen.without_doubt(doubt)
+            return self._count_doubtful(trusted, comparison.lead)
+        return self._hold(seen, step, comparison, expected)
+
+    def _confirmed(
+        self, doubt: "Doubt", step: "LearningStep", least: float
+    ) -> "ChangedModel | None":
+        """The change of a doubt with a step that it explains; None where it does not.
+
+        ``least`` is the log density that it has to exceed.
+        """
+        if doubt.change is None or step.repeats.all():
+            return None
+        comparison = doubt.change.compare(step)
+        innovation = comparison.with_change
+        explains = innovation.largest <= self.surprise
+        if explains and innovation.log_density > least:
+            return comparison.model
+        return None
+
+    def _adopt(self, seen: "Learned", change: "ChangedModel") -> "Learned":
+        """Forgets what was seen, and uses the change of another plant."""
+        version = seen.version + 1
+        leads = seen.leads[:0]
+        other = replace(seen, model=change, leads=leads, version=version, doubt=None)
+        return replace(other, active=True).later()
+
+
+class Innovation(NamedTuple):
+    """By how much a prediction missed what was measured."""
+
+    error: Array  #: (k,)
+    variance: Array  #: that was expected of it (k,)
+
+    @property
+    def largest(self) -> float:
+        """The largest squared error over its variance."""
+        return float((self.error**2 / self.variance).max())
+
+    @property
+    def log_density(self) -> float:
+        """Of the error, as independent Gaussians, but for a constant."""
+        squares = self.error**2 / self.variance
+        return -0.5 * float((squares + np.log(self.variance)).sum())
+
+
+class LearningStep(NamedTuple):
+    """A step of a flight, and what it says of the change."""
+
+    state: Array  #: measured before it (n,)
+    input: Array  #: applied (m,)
+    next_state: Array  #: measured after it (n,)
+    point: Array  #: (phi, u, t), where d is seen (d,)
+    error: Array  #: of the model alone, as far as a change reaches it (k,)
+    latent: Array  #: variance of the model alone (k,)
+    noise: Array  #: variance of the noise of this flight (k,)
+
+    @property
+    def repeats(self) -> NDArray[np.bool_]:
+        """Which sensors show the same as before, to the last digit (n,)."""
+        return self.state == self.next_state
+
+
+class Comparison(NamedTuple):
+    """What the model with its change and the one without missed of a step."""
+
+    with_change: Innovation
+    without_change: Innovation
+    model: "ChangedModel"  #: with the step as a further point of its change
+
+    def planned(self, active: bool) -> Innovation:
+        """Of the model that plans."""
+        return self.with_change if active else self.without_change
+
+    @property
+    def lead(self) -> float:
+        """By how much the change's log density is larger, as far as a step counts."""
+        lead = self.with_change.log_density - self.without_change.log_density
+        return max(-_LARGEST, min(lead, _LARGEST))
+
+
+class Expectation(NamedTuple):
+    """Where the plant is, as far as that is known."""
+
+    mean: Array  #: of the state (n,)
+    covariance: Array  #: (n, n)
+    by_input: Array  #: derivative of the mean by the last input (n, m)
+
+    @classmethod
+    def certain(cls, state: Array) -> "Expectation":
+        """Of a state that is known."""
+        n = len(state)
+        return cls(state, np.zeros((n, n)), np.zeros((n, 0)))
+
+
+class Doubt(NamedTuple):
+    """A measurement that is held back until the next one explains it."""
+
+    expected: Expectation  #: where the plant is if the measurement was wrong
+    spread: Array  #: of ``Learned`` without the steps in doubt (w,)
+    #: the model whose change only the steps in doubt have taught, in case that the plant
+    #: is another one; None where they teach nothing
+    change: "ChangedModel | None"
+    missing: int  #: steps that have still to confirm that change
+    steps: int  #: for which nothing has explained what is measured
+    plans: bool = False  #: whether that change is used before it is confirmed
 
 
 @dataclass(frozen=True)
@@ -241,6 +465,20 @@ class ChangedModel(Wrapper):
             )
         return self._replaced(change=(now.append(*new), coming))
 
+    def forgotten(self) -> "ChangedModel":
+        """The model without any point of the change."""
+        return replace(self)
+
+    def compare(self, step: LearningStep) -> Comparison:
+        """What a step, as the next point of the change, was predicted to be."""
+        model = self.with_point(step.point, step.error, step.noise)
+        error, variance = model.last_innovation()
+        change = variance - step.noise
+        remaining = self.remaining(step.latent, change, self.signal)
+        with_change = Innovation(error, variance + remaining)
+        without_change = Innovation(step.error, step.noise + step.latent)
+        return Comparison(with_change, without_change, model)
+
     def last_innovation(self) -> tuple[Array, Array]:
         """Error and variance (k,) of the prediction of the last point of the change by those before, with its noise.
 
@@ -353,13 +591,74 @@ class Learned:
     error: Array  #: of the model alone in the last step, as far as a change reaches it (k,); NaN for unknown
     spread: Array  #: squared differences of successive errors over those expected of the model's noise (w,)
     leads: Array  #: by how much the log density with the change exceeds that without, of the last steps
-    active: bool = False  #: whether the change is part of the model that plans
+    active: bool = False  #: whether the change is used
     version: int = 0  #: how often that model has changed
+    #: steps that nothing has explained, less those that went as predicted since then
+    unexplained: int = 0
+    doubt: Doubt | None = None  #: where the last measurement is held back
+
+    @property
+    def planning(self) -> ChangedModel | None:
+        """The model that plans now; None for the one without a change."""
+        if self.doubt is not None and self.doubt.plans:
+            return self.doubt.change
+        lasting = self.doubt is not None and self.doubt.steps > 1
+        return self.model if self.active and not lasting else None
 
     @property
     def size(self) -> int:
         """Points of the model that plans."""
-        return len(self.model.gp) + (len(self.model) if self.active else 0)
+        change = self.planning
+        return len(self.model.gp) + (0 if change is None else len(change))
+
+    def later(self) -> "Learned":
+        """What was learned, a step later."""
+        return replace(self, model=self.model.later(1.0))
+
+    def with_measurement(self, state: Array, error: Array, spread: Array) -> "Learned":
+        """What was learned, and what a further step has shown."""
+        tried = self.doubt is not None and self.doubt.plans
+        version = self.version + tried  # a change that was tried for a step ends
+        return replace(self, state=state, error=error, spread=spread, version=version)
+
+    def without_change(self) -> "Learned":
+        """What was learned, where a decision with the change has failed."""
+        doubt = None if self.doubt is None else self.doubt._replace(plans=False)
+        version = self.version + 1
+        return replace(self, active=False, version=version, doubt=doubt)
+
+    def without_doubt(self, doubt: Doubt) -> "Learned":
+        """What was learned, without the steps that were in doubt."""
+        unknown = np.full_like(self.error, np.nan)
+        return replace(self, error=unknown, spread=doubt.spread, doubt=None)
+
+    def after_gap(self, state: Array) -> "Learned":
+        """What was learned, where steps were not measured and a state (n,) is again.
+
+        Nothing is known of the step that led to it.
+        """
+        error = np.full_like(self.error, np.nan)
+        version = self.version + self.active
+        other = replace(self, state=state, error=error, version=version, doubt=None)
+        return other.later()
+
+    def expect(self, start: Expectation, step: LearningStep) -> Expectation:
+        """Where the plant is after a step from ``start``, by the change if it is used."""
+        model = self.model if self.active else self.model.model
+        local = linearize(model, start.mean[None], step.input[None])
+        A = local.A[0]
+        B = self.model.arrays[0]
+        latent = cast(Array, local.covariance)[0]
+        noise = (B * step.noise) @ B.T
+        covariance = A @ start.covariance @ A.T + latent + noise
+        return Expectation(local.mean[0], covariance, local.B[0])
+
+    def innovation(self, expected: Expectation) -> Innovation:
+        """Of the measured state, as far as a change reaches it."""
+        reach = self.model.arrays[1]
+        error = state_difference(self.state, expected.mean, self.model.angles)
+        variance = ((reach @ expected.covariance) * reach).sum(1)
+        return Innovation(reach @ error, variance)
 
 
 class LearningController:
@@ -401,38 +700,32 @@ class LearningController:
         if belief.names:
             belief = belief.in_order(self.signals.state_names)
         learned = self._learned(to_array(belief.mean).copy(), previous)
-        controller = (
-            self.controller.with_model(learned.model)
-            if learned.active
-            else self.controller
-        )
+        controller = self.controller
+        if learned.planning is not None:
+            controller = self.controller.with_model(learned.planning)
         known = {} if parameters is None else {"parameters": parameters}
-        spent = perf_counter() - begin
+        seconds = perf_counter() - begin
         decision = controller.control(belief, reference, previous, **known)
-        timing = replace(decision.timing, model=decision.timing.model + spent)
+        if learned.planning is not None and _has_failed(decision):
+            seconds += decision.timing.total
+            learned = learned.without_change()
+            decision = self.controller.control(belief, reference, previous, **known)
+        timing = replace(decision.timing, model=decision.timing.model + seconds)
         return replace(decision, timing=timing, learned=learned)
 
     def _learned(self, state: Array, previous: Decision | None) -> Learned:
+        """What the flight has taught up to a measurement (n,)."""
         before = None if previous is None else previous.learned
-        if previous is None or before is None or not np.isfinite(state).all():
+        if previous is None or before is None:
             return self._begin(state)
-        if not np.array_equal(
-            previous.means[0], before.state
-        ):  # the decision between them was not applied
-            version = before.version + before.active
-            return replace(
-                before,
-                model=before.model.later(1.0),
-                state=state,
-                active=False,
-                version=version,
-            )
+        if not np.isfinite(state).all():
+            return before.later()
+        if not np.array_equal(previous.means[0], before.state):
+            return before.after_gap(state)
         try:
             return self.learning.learn(before, previous.input, state)
-        except (
-            SettingError,
-            DataError,
-        ):  # the points contradict each other beyond double precision
+        except (SettingError, DataError):
+            # The points contradict each other beyond double precision.
             return self._begin(state, before.version + 1)
 
     def _begin(self, state: Array, version: int = 0) -> Learned:
@@ -442,9 +735,31 @@ class LearningController:
         )
 
 
-def _log_density(error: Array, variance: Array) -> float:
-    """Of independent Gaussians, but for a constant."""
-    return -0.5 * float((error**2 / variance + np.log(variance)).sum())
+def _has_failed(decision: Decision) -> bool:
+    """Whether a decision on a finite measurement must not be applied."""
+    failed = not decision.applicable
+    return failed and decision.status is not Status.INVALID_MEASUREMENT
+
+
+def _with_difference(learned: Learned, error: Array) -> Array:
+    """Squared differences of successive errors (w,), with that of an error (k,)."""
+    squares = (error - learned.error) ** 2 / learned.model.arrays[2]
+    difference = float(squares.mean()) / 2.0
+    if not np.isfinite(difference):
+        return learned.spread
+    return np.append(learned.spread, difference)[-_MANY:]
+
+
+def _noise_variance(spread: Array, model: ChangedModel) -> Array:
+    """The noise (k,) of the model, or of the last steps where that is more.
+
+    What changes slowly has no part in differences of successive errors, and a jump no
+    weight in their median.
+    """
+    noise = model.arrays[2]
+    outputs = len(noise)
+    middle = float(np.sort(spread)[len(spread) // 2])
+    return noise * max(1.0, middle * outputs / _median(outputs))
 
 
 @cache

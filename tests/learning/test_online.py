@@ -116,7 +116,7 @@ def test_equal_seeds_give_equal_bits_and_one_controller_flies_many_flights():
     assert np.array_equal(controller.control(x, reference, first).inputs, second.inputs)
 
 
-def test_a_decision_that_was_not_applied_is_no_point_and_ends_the_use_of_the_change():
+def test_a_decision_that_was_not_applied_is_no_point_and_learning_goes_on_with_what_it_had():
     _, decisions = flown(OnlineLearning(), {"wind": 0.6}, steps=60)
     before = decisions[-1]
     assert before.learned.active
@@ -126,10 +126,11 @@ def test_a_decision_that_was_not_applied_is_no_point_and_ends_the_use_of_the_cha
     )
     state, reference = Gaussian.certain(before.means[2]), Reference(before.means)
     after = controller.control(state, reference, shifted).learned
-    assert not after.active
+    assert after.active
     assert after.model.change is before.learned.model.change
+    applied = Gaussian.certain(before.means[1])
     assert (
-        controller.control(state, reference, before).learned.model.change
+        controller.control(applied, reference, before).learned.model.change
         is not before.learned.model.change
     )
 

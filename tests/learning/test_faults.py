@@ -1,0 +1,309 @@
+"""Sensors that lie teach nothing: a flight with them is no worse than without learning."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from gpmpc.gaussian import Gaussian
+from gpmpc.learning import ChangedModel, Learned, LearningController, OnlineLearning
+from gpmpc.mpc import ControlLoop, Reference
+from gpmpc.mpc.gp_mpc import GPMPC
+from gpmpc.propagation import Linearization
+from gpmpc.status import Status
+from tests.learning.test_online import MODEL, NOISE, PROBLEM, STEP, cart
+
+STEPS, HORIZON = 120, 8
+NAN = np.nan
+WIND = 0.6
+TIME = STEP * np.arange(STEPS + HORIZON + 1)
+SINE = np.stack([np.sin(TIME), np.cos(TIME)], axis=1)
+
+
+class Sensor:
+    """Shows position and velocity, with the faults that are written into its arrays."""
+
+    def __init__(self):
+        self.offset = np.zeros((STEPS, 2))
+        self.factor = np.ones((STEPS, 2))
+        self.frozen = np.zeros((STEPS, 2), dtype=bool)
+        self.shown = np.zeros(2)
+
+    def __call__(self, k, state):
+        seen = self.factor[k] * state + self.offset[k]
+        self.shown = np.where(self.frozen[k], self.shown, seen)
+        return self.shown
+
+
+def second(random):
+    """The steps of one second of the flight."""
+    start = int(random.integers(60, 90))
+    return slice(start, start + 10)
+
+
+def sound(random):
+    return Sensor()
+
+
+def glitches(count, size, entry=0):
+    def fault(random):
+        sensor = Sensor()
+        steps = random.choice(np.arange(10, STEPS - 5), count, replace=False)
+        sensor.offset[steps, entry] = size * random.choice([-1, 1], count)
+        return sensor
+
+    return fault
+
+
+def missing(part):
+    def fault(random):
+        sensor = Sensor()
+        sensor.offset[random.random(STEPS) < part] = NAN
+        return sensor
+
+    return fault
+
+
+def frozen(*entries):
+    def fault(random):
+        sensor = Sensor()
+        sensor.frozen[second(random), entries] = True
+        return sensor
+
+    return fault
+
+
+def unit(factor, *entries):
+    def fault(random):
+        sensor = Sensor()
+        sensor.factor[second(random), entries] = factor
+        return sensor
+
+    return fault
+
+
+def noisy(random):
+    sensor = Sensor()
+    sensor.offset[second(random)] = random.normal(0, [0.03, 0.2], (10, 2))
+    return sensor
+
+
+FAULTS = {
+    "one glitch of .05": glitches(1, 0.05),
+    "five glitches of .5": glitches(5, 0.5),
+    "twenty glitches of .05": glitches(20, 0.05),
+    "twenty glitches of 2": glitches(20, 2.0),
+    "five glitches of .5 m/s": glitches(5, 0.5, entry=1),
+    "5 % missing": missing(0.05),
+    "frozen": frozen(0, 1),
+    "frozen position": frozen(0),
+    "times 1000": unit(1000.0, 0),
+    "degrees": unit(180 / np.pi, 0),
+    "noisy": noisy,
+}
+
+
+def controller_of(learning):
+    plain = GPMPC(MODEL, Linearization(), PROBLEM, HORIZON, [0.0])
+    return plain if learning is None else LearningController(plain, learning)
+
+
+def flown(learning, fault, wind=0.0, seed=0):
+    """Errors of the position (120,) and decisions; a wind blows from step 40 on."""
+    sensor = fault(np.random.default_rng([seed, 7]))
+    noise = np.random.default_rng(seed)
+    loop = ControlLoop(controller_of(learning))
+    state = SINE[0].copy()
+    errors, decisions = [], []
+    for k in range(STEPS):
+        input = loop.input(sensor(k, state), SINE[k : k + HORIZON + 1])
+        state = cart(state, input, wind=wind if k >= 40 else 0.0)
+        state = state + noise.normal(0, NOISE)
+        errors.append(state[0] - SINE[k + 1, 0])
+        decisions.append(loop.last.decision)
+    return np.array(errors), decisions
+
+
+def rms(learning, fault, wind=0.0):
+    errors = [flown(learning, fault, wind, seed)[0] for seed in range(2)]
+    return float(np.sqrt(np.mean(np.square(errors))))
+
+
+@pytest.mark.parametrize("fault", FAULTS.values(), ids=FAULTS)
+def test_a_sensor_that_lies_makes_learning_no_worse_than_none(fault):
+    assert rms(OnlineLearning(), fault) <= 1.1 * rms(None, fault)
+
+
+@pytest.mark.parametrize("fault", FAULTS.values(), ids=FAULTS)
+def test_in_a_wind_as_well(fault):
+    assert rms(OnlineLearning(), fault, WIND) <= 1.3 * rms(None, fault, WIND)
+
+
+@pytest.mark.parametrize(
+    "fault",
+    [glitches(5, 0.05), glitches(5, 0.05, entry=1), missing(0.05)],
+    ids=["position", "velocity", "missing"],
+)
+def test_the_wind_is_learned_between_wrong_measurements(fault):
+    alone = rms(OnlineLearning(), sound, WIND)
+    assert rms(OnlineLearning(), fault, WIND) <= 1.5 * alone
+    assert alone < 0.2 * rms(None, sound, WIND)
+
+
+def taught(states, inputs, learned=None):
+    """What is known after each step of a flight."""
+    if learned is None:
+        nothing = np.empty(0)
+        unknown = np.full(2, NAN)
+        learned = Learned(ChangedModel(MODEL), states[0], unknown, nothing, nothing)
+    steps = []
+    for state, input in zip(states[1:], inputs, strict=True):
+        learned = OnlineLearning().learn(learned, input, state)
+        steps.append(learned)
+    return steps
+
+
+def excited(steps, wind_from=None, seed=1):
+    random = np.random.default_rng(seed)
+    inputs = random.uniform(-3, 3, (steps, 1))
+    states = [np.zeros(2)]
+    for k, input in enumerate(inputs):
+        blows = wind_from is not None and k >= wind_from
+        state = cart(states[-1], input, wind=0.8 if blows else 0.0)
+        states.append(state + random.normal(0, NOISE))
+    return np.array(states), inputs
+
+
+@pytest.mark.parametrize("entry", [0, 1])
+@pytest.mark.parametrize("size", [0.15, -1.0])
+def test_a_glitch_is_in_doubt_for_a_step_and_both_its_transitions_are_left_out(
+    entry, size
+):
+    states, inputs = excited(30)
+    states[21, entry] += size
+    before, glitch, after, later = taught(states, inputs)[19:23]
+    assert before.doubt is None
+    assert glitch.doubt is not None
+    assert after.doubt is None
+    assert len(before.model) == len(glitch.model) == len(after.model)
+    assert len(later.model) == len(after.model) + 1
+    assert not any(one.active for one in (glitch, after, later))
+    assert np.array_equal(after.spread, before.spread)
+
+
+def test_a_changed_plant_is_in_doubt_for_a_step_and_its_two_transitions_are_learned():
+    states, inputs = excited(40, wind_from=20)
+    steps = taught(states, inputs)
+    first = next(k for k, one in enumerate(steps) if one.doubt is not None)
+    assert first == 20
+    assert not steps[first].active
+    assert steps[first + 1].active
+    assert len(steps[first + 1].model) == 2
+    assert all(one.active for one in steps[first + 1 :])
+
+
+def test_a_change_that_shows_as_an_input_would_is_used_before_it_is_confirmed():
+    states, inputs = excited(20)
+    learned = taught(states, inputs)[-1]
+    blown = cart(states[-1], [1.0], wind=1.0)
+    in_doubt = OnlineLearning().learn(learned, np.array([1.0]), blown)
+    assert in_doubt.doubt.plans
+    assert in_doubt.planning is in_doubt.doubt.change
+    assert in_doubt.size == len(MODEL) + 1
+    assert not in_doubt.active
+    wrong = blown + np.array([0.1, 0.0])
+    assert OnlineLearning().learn(learned, np.array([1.0]), wrong).planning is None
+
+
+def test_a_plant_that_was_moved_teaches_nothing():
+    states, inputs = excited(40)
+    random = np.random.default_rng(5)
+    state = states[20] + [0.0, 0.4]
+    states[20] = state
+    for k in range(20, 40):
+        state = cart(state, inputs[k]) + random.normal(0, NOISE)
+        states[k + 1] = state
+    steps = taught(states, inputs)
+    assert steps[19].doubt is not None
+    assert all(one.doubt is None for one in steps[20:])
+    assert not any(one.active for one in steps)
+
+
+def test_a_large_change_asks_for_more_confirmations():
+    states, inputs = excited(20)
+    learned = taught(states, inputs)[-1]
+    missing_steps = []
+    for size in (0.08, 0.3, 0.6):
+        after = cart(states[-1], [1.0]) + np.array([0.1 * size, size])
+        doubt = OnlineLearning().learn(learned, np.array([1.0]), after).doubt
+        missing_steps.append(doubt.missing)
+    assert missing_steps[0] == 1
+    assert missing_steps[0] < missing_steps[1] < missing_steps[2]
+
+
+def test_a_frozen_sensor_is_no_witness_of_a_change():
+    states, inputs = excited(30)
+    states[21:26, 0] = states[20, 0]
+    states[20:, 1] += 0.5  # it moves, by the other sensor
+    steps = taught(states, inputs)
+    assert all(one.doubt.change is None for one in steps[21:25])
+    assert not any(one.active for one in steps)
+
+
+def test_doubtful_steps_may_end_the_use_of_a_change():
+    states, inputs = excited(40, wind_from=20)
+    learned = taught(states, inputs)[-1]
+    assert learned.active
+    learned = replace(learned, leads=np.array([1.0]))
+    random = np.random.default_rng(0)
+    for _ in range(4):
+        gust = random.choice([-0.4, 0.4])
+        state = cart(learned.state, [0.0]) + np.array([0.0, gust])
+        learned = OnlineLearning().learn(learned, np.zeros(1), state)
+    assert learned.planning is None
+
+
+def test_a_measurement_that_is_missing_forgets_nothing():
+    _, decisions = flown(OnlineLearning(), sound, WIND)
+    before = decisions[60]
+    controller = controller_of(OnlineLearning())
+    reference = Reference(SINE[: HORIZON + 1])
+    lost = controller.control(Gaussian.certain(np.full(2, NAN)), reference, before)
+    assert lost.status is Status.INVALID_MEASUREMENT
+    assert lost.learned.active
+    assert lost.learned.model.change is before.learned.model.change
+    state = Gaussian.certain(before.means[2])
+    again = controller.control(state, reference, lost).learned
+    assert again.active
+    assert again.model.change is before.learned.model.change
+    assert np.array_equal(again.state, before.means[2])
+
+
+def test_what_was_learned_is_used_at_once_after_a_gap_in_the_measurements():
+    sensor = Sensor()
+    sensor.offset[80:84] = NAN
+    _, decisions = flown(OnlineLearning(), lambda random: sensor, WIND)
+    assert all(decision is None for decision in decisions[80:84])
+    assert all(decision.learned.active for decision in decisions[84:])
+    points = len(decisions[79].learned.model)
+    assert len(decisions[84].learned.model) == points
+
+
+def test_a_decision_that_fails_with_the_change_is_taken_without_it(monkeypatch):
+    _, decisions = flown(OnlineLearning(), sound, WIND)
+    before = decisions[60]
+    assert before.learned.active
+    controller = controller_of(OnlineLearning())
+    plain = controller.controller
+
+    class Failing:
+        def control(self, belief, reference, previous):
+            decision = plain.control(belief, reference, previous)
+            return replace(decision, status=Status.INFEASIBLE, suboptimal=False)
+
+    monkeypatch.setattr(plain, "with_model", lambda model: Failing())
+    state = Gaussian.certain(before.means[1])
+    decision = controller.control(state, Reference(SINE[: HORIZON + 1]), before)
+    assert decision.applicable
+    assert not decision.learned.active
+    assert decision.learned.size == len(MODEL)
