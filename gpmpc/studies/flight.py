@@ -11,6 +11,7 @@ and the subsets of one seed are nested, so that sizes can be compared in pairs.
 import inspect
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
@@ -26,8 +27,9 @@ from gpmpc.metrics import find_loss, time_quantiles, tracking_error, violation_r
 from gpmpc.models import CasadiFunction
 from gpmpc.models._residual import train_residual
 from gpmpc.mpc import Reference
+from gpmpc.mpc._cost import FunctionNotFinite
 from gpmpc.mpc._policy import OnFailure, check_policy
-from gpmpc.mpc.problem import Box
+from gpmpc.mpc.problem import Box, Halfspaces, Inequality, Problem
 from gpmpc.propagation import Propagator, best_propagator
 from gpmpc.simulation import (
     Disturbance,
@@ -357,21 +359,7 @@ def metrics(experiment: Experiment, flown: Flown) -> dict[str, Any]:
     rmse: dict[str, Any] = dict(zip(system.tracked, axes, strict=True)) | {
         "total": total
     }
-    violations = {
-        "inputs": violation_rate(
-            rollout.inputs, *(side[0] for side in problem.inputs.by_stage(horizon))
-        )
-    }
-    if boxes := [
-        bounds.by_stage(horizon)
-        for bounds in problem.constraints
-        if isinstance(bounds, Box)
-    ]:
-        lower, upper = (
-            np.max([box[0][0] for box in boxes], axis=0),
-            np.min([box[1][0] for box in boxes], axis=0),
-        )
-        violations["states"] = violation_rate(rollout.states[1:], lower, upper)
+    violations = _violation_rates(problem, horizon, rollout)
     learned = None
     if training is not None:
         objective = [float(value) for value in training.objective]
@@ -414,6 +402,61 @@ def metrics(experiment: Experiment, flown: Flown) -> dict[str, Any]:
             for stage in _STAGES
         },
     }
+
+
+def _violation_rates(
+    problem: Problem, horizon: int, rollout: Rollout
+) -> dict[str, Any]:
+    """Returns how often bounds of inputs and constraints of states were broken, by name.
+
+    Of states the flown ones count, with the sides that a first predicted state has: a
+    constraint of later stages alone asks nothing of them. All boxes are one, "states";
+    of another kind each constraint is counted for itself.
+    """
+    lower, upper = problem.inputs.by_stage(horizon)
+    rates = {"inputs": violation_rate(rollout.inputs, lower[0], upper[0])}
+    states = rollout.states[1:]
+    held = [
+        constraint
+        for constraint in problem.constraints
+        if constraint.stages is None or 1 in constraint.stages
+    ]
+    boxes = [part.by_stage(horizon) for part in held if isinstance(part, Box)]
+    if boxes:
+        tightest_lower = np.max([lower[0] for lower, _ in boxes], axis=0)
+        tightest_upper = np.min([upper[0] for _, upper in boxes], axis=0)
+        rates["states"] = violation_rate(states, tightest_lower, tightest_upper)
+    others = [
+        ("half-spaces", [part for part in held if isinstance(part, Halfspaces)]),
+        ("inequality", [part for part in held if isinstance(part, Inequality)]),
+    ]
+    for kind, constraints in others:
+        for number, constraint in enumerate(constraints, start=1):
+            name = kind if len(constraints) == 1 else f"{kind} {number}"
+            excess = _excess(constraint, states, rollout.inputs)
+            unbounded = np.full(excess.shape[1], -np.inf)
+            rates[name] = violation_rate(excess, unbounded, np.zeros(len(unbounded)))
+    return rates
+
+
+def _excess(
+    constraint: Halfspaces | Inequality, states: np.ndarray, inputs: np.ndarray
+) -> np.ndarray:
+    """Returns by how much each state (K, n) misses each side (K, r).
+
+    Negative where a side is kept, NaN where a function or its gradient is not finite.
+    """
+    if isinstance(constraint, Halfspaces):
+        return states @ constraint.F.T - np.atleast_2d(constraint.f)[0]
+    with suppress(FunctionNotFinite):
+        return constraint.expand(states, inputs, parameters=None)[0]
+    excess = np.full((len(states), constraint.count), np.nan)
+    for k in range(len(states)):  # which of them are finite, they say alone
+        with suppress(FunctionNotFinite):
+            excess[k] = constraint.expand(
+                states[k : k + 1], inputs[k : k + 1], parameters=None
+            )[0][0]
+    return excess
 
 
 def _lost(experiment: Experiment, flown: Flown) -> dict[str, Any] | None:
@@ -486,8 +529,11 @@ def summary(result: Mapping[str, Any]) -> Table:
     }
     for name, rate in result["violations"].items():
         interval = f"{100 * rate['low']:.2g} to {100 * rate['high']:.2g} %"
-        lines[f"bounds of {name}"] = (
-            f"{rate['violations']} of {rate['steps']} steps outside (95 %: {interval})"
+        label = f"bounds of {name}" if name in ("inputs", "states") else name
+        largest = f", by up to {rate['worst']:.3g}" if rate["violations"] else ""
+        lines[label] = (
+            f"{rate['violations']} of {rate['steps']} steps outside "
+            f"(95 %: {interval}){largest}"
         )
     lines |= {
         "failed solves": _counted(result["failures"]) or "none",

@@ -9,7 +9,7 @@ from rich.console import Console
 
 from gpmpc.exceptions import Diverged
 from gpmpc.mpc import Timing
-from gpmpc.mpc.problem import Box
+from gpmpc.mpc.problem import Box, Halfspaces, Inequality
 from gpmpc.simulation import Rollout
 from gpmpc.status import Status
 from gpmpc.studies._document import terminal
@@ -116,6 +116,34 @@ def test_states_are_counted_outside_the_tightest_bounds_that_all_boxes_have_now(
     assert "states" not in metrics_of(error)["violations"]
 
 
+@pytest.mark.parametrize(("error", "outside"), [(0.3, 0), (0.6, 20)])
+def test_every_kind_of_constraint_says_how_often_flown_states_missed_it(error, outside):
+    below = Halfspaces([[1.0, 0, 0, 0, 0, 0], [-1.0, 0, 0, 0, 0, 0]], [0.5, 9.0])
+    near = Inequality(lambda x: x[:, 0].abs() - 0.25)
+    later = Box(np.full(6, 1.0), np.full(6, 2.0), stages=[2])  # asks no first state
+    result = metrics_of(error, constraints=[below, near, later, below])
+    found = result["violations"]
+    assert list(found) == ["inputs", "half-spaces 1", "half-spaces 2", "inequality"]
+    assert found["half-spaces 1"] == found["half-spaces 2"]
+    assert found["half-spaces 1"]["violations"] == outside
+    assert found["half-spaces 1"]["worst"] == pytest.approx(max(0.0, error - 0.5))
+    assert found["inequality"]["rate"] == 1.0
+    assert found["inequality"]["worst"] == pytest.approx(error - 0.25)
+    lines = said(result)
+    assert lines["inequality"].startswith("20 of 20 steps outside (95 %: ")
+    assert lines["inequality"].endswith(f"by up to {error - 0.25:.3g}")
+
+
+def test_a_state_at_which_a_constraint_is_no_number_does_not_keep_it():
+    states = np.zeros((5, 6))
+    states[:, 0] = 1.0, 4.0, -1.0, 9.0, -4.0  # the first is no result
+    root = Inequality(lambda x: x[:, 0].sqrt() - 2.5)
+    errors = (states - rollout_of(np.zeros((5, 3))).references)[:, ::2]
+    rate = measured(rollout_of(errors), constraints=[root])["violations"]["inequality"]
+    assert (rate["violations"], rate["steps"]) == (3, 4)
+    assert rate["worst"] == pytest.approx(0.5)
+
+
 def rollout_of(errors, **changes):
     """A flight of ``PLANT`` so far from its reference along x, y and z [m], each row a state."""
     errors, n = np.array(errors, dtype=float), 6
@@ -133,8 +161,12 @@ def rollout_of(errors, **changes):
     } | changes)  # fmt: skip
 
 
-def measured(rollout, training=None, diverged=None, before=(), system=PLANT):
-    problem = SimpleNamespace(inputs=Box(np.zeros(3), np.full(3, 10.0)), constraints=())
+def measured(
+    rollout, training=None, diverged=None, before=(), system=PLANT, constraints=()
+):
+    problem = SimpleNamespace(
+        inputs=Box(np.zeros(3), np.full(3, 10.0)), constraints=constraints
+    )
     controller = SimpleNamespace(problem=problem, horizon=2)
     experiment = Experiment(
         None, None, system, None, lambda plant: None, steps=len(rollout.inputs)
