@@ -181,3 +181,61 @@ def experiment(scenario: Scenario) -> Experiment:
     if scenario.disturbances is not None:
         chosen = replace(chosen, disturbances=scenario.disturbances(chosen.flown))
     return replace(chosen, seed=scenario.seed)
+
+
+NOISE = {  # of measurements, by system
+    "double_integrator": (0.005, 0.005),
+    "pendulum": (0.005, 0.02),
+    "cart_pole": (0.003, 0.01, 0.003, 0.02),
+    "acrobot": (0.002, 0.01, 0.002, 0.01),
+    "stirred_tank": (0.002, 0.1),
+    "planar_quadrotor": (0.003, 0.01, 0.003, 0.01, 0.002, 0.02),
+    "translational": (0.01,) * 6,
+    "rotational": (0.002, 0.02) * 3,
+    "coupled": (0.003, 0.01) * 3 + (0.002, 0.02) * 3,
+}
+
+
+def _system_of(overrides: Sequence[str]) -> str:
+    named = [text.partition("=")[2] for text in overrides if text.startswith("system=")]
+    return named[0] if named else "translational"
+
+
+def _gust(rates: dict[str, float], start: float, stop: float) -> Any:
+    return lambda system: [Gust(rates, start, stop)]
+
+
+def good_flights() -> list[Scenario]:
+    """Returns a hundred flights of the documentation's kinds that come to a good end."""
+    flights: list[Scenario] = []
+
+    def add(name: str, count: int, *overrides: str, noisy: bool = True, **more: Any) -> None:
+        noise = NOISE[_system_of(overrides)]
+        for seed in range(count):
+            own = noise if noisy and seed % 2 else None
+            flights.append(Scenario(name, overrides, seed, noise=own, **more))
+
+    for data in range(3):  # swing-ups, each with models of its own
+        for system in ("pendulum", "cart_pole"):
+            add(f"{system} swings up", 4, f"system={system}", f"data.seed={data}")
+    add("acrobot swings up", 2, "system=acrobot", noisy=False)
+    add("double integrator", 4, "system=double_integrator")
+    add("reactor", 4, "system=stirred_tank")
+    add("planar quadrotor", 4, "system=planar_quadrotor")
+    add("planar quadrotor, gust", 4, "system=planar_quadrotor", disturbances=_gust({"vx": 1.0}, 2.0, 3.0))
+    add("whole quadrotor, jump", 4, "system=coupled")
+    add("whole quadrotor, gust", 4, "system=coupled", disturbances=_gust({"vx": 1.0}, 2.5, 3.5))
+    for path in ("elliptical", "lorenz", "hover", "step", "waypoints"):
+        add(f"quadrotor, {path}", 4, f"trajectory={path}")
+    for path in ("elliptical", "lorenz"):
+        add(f"attitude, {path}", 4, "system=rotational", f"trajectory={path}", "steps=200")
+    for path in ("lorenz", "hover"):
+        add(f"gust, {path}", 4, f"trajectory={path}", disturbances=_gust({"vx": 0.5}, 20, 40))
+    add("a fifth heavier, estimated", 4, "plant.mass=0.888", "disturbance_gain=0.3")
+    add("learning online in wind", 4, "learning=online", disturbances=_gust({"vx": 0.5}, 20, np.inf))
+    add("process noise", 4, "trajectory=lorenz", process=(0.01,) * 6)
+    add("few data", 4, "data.size=25", "horizon=5")
+    for controller in ("paper", "lqr"):
+        add(f"controller={controller}", 4, f"controller={controller}", "data.size=50")
+    add("nmpc", 2, "controller=nmpc", "trajectory=lorenz")
+    return flights

@@ -97,11 +97,25 @@ def run(config: DictConfig) -> Result:
             "fly it with this code",
             highlight=False,
         )
+    warning = warning_of(outcome["result"])
+    if warning is not None:
+        print_error(warning)
     data = outcome["result"] | {
         "folder": outcome["folder"],
         "of_other_code": bool(other_code),
     }
     return Result(data, _LOST if outcome["result"].get("lost") else 0)
+
+
+def warning_of(result: Mapping[str, Any]) -> str | None:
+    """Returns in a line that a flight was lost, or suspicious at its end, and why."""
+    lost, judgement = result.get("lost"), result.get("judgement") or {}
+    if lost:
+        return f"lost: from step {lost['step']} on: {lost['reason']}"
+    if judgement.get("level") == "suspicious":
+        since = f"from step {judgement['step']} on"
+        return f"suspicious: {since}: {judgement['reason']}"
+    return None
 
 
 def run_one(config: DictConfig, wait: bool = True) -> dict[str, Any]:

@@ -23,7 +23,7 @@ from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
-from scipy.stats import chi2, norm
+from scipy.stats import chi2
 
 from gpmpc._compiled import call_unchecked, compiled, njit_inner
 from gpmpc._dynamics import to_array
@@ -45,8 +45,9 @@ _GROWTH = (6, 20)  # least and most steps in each half of a window of growth
 _LONG = 20  # steps that a promise is followed for at most
 _RARE = 1e-6  # probability of a window's innovations below which they are no chance
 _LARGEST_RATIO = float(chi2.isf(_RARE, _WINDOW)) / _WINDOW  # of their mean square
-_LARGEST_BIAS = float(norm.isf(_RARE / 10.0))  # of a longer window's sum
+_LARGEST_BIAS = 3.0  # deviations of the model, which one error may keep for long
 _CAP = 16.0  # most that one innovation counts for: no outlier decides alone
+_LARGEST_SIGNED = 6.0  # most that one counts for, with its sign
 _SHARE = 0.05  # of what moves in a step that a good model may miss
 _FORGETTING = 0.8  # share of the largest motion's square that counts one step later
 _BROKEN = 4.0  # how many times a promise may be paid
@@ -57,7 +58,7 @@ _ROUNDING = 1e-9
 
 # Why a step is not healthy; the number is that of the kernel.
 _HEALTHY, _INNOVATION, _PROMISE, _NOVELTY, _VIOLATION, _FAILURES, _SATURATED = range(7)
-_FROZEN, _BIAS, _AWAY, _RISING = 7, 8, 9, 10
+_FROZEN, _BIAS, _AWAY, _RISING, _CLIMBING, _STANDING = 7, 8, 9, 10, 11, 12
 
 
 class Judgement(NamedTuple):
@@ -145,8 +146,19 @@ class _Memory(NamedTuple):
     numbers: Array  # by the names below
 
 
-_STEPS, _CHANGES, _VIOLATED, _LOST_AS, _LOOK_AHEAD, _SINCE_NEWS, _COUNTS = range(7)
-_TRAVEL, _LOST_AT, _VIOLATION_THEN, _STUCK_AT, _COST_BEFORE, _NUMBERS = range(6)
+(
+    _STEPS,
+    _CHANGES,
+    _VIOLATED,
+    _LOST_AS,
+    _LOOK_AHEAD,
+    _SINCE_NEWS,
+    _SINCE_NEARER,
+    _COUNTS,
+) = range(8)
+_TRAVEL, _LOST_AT, _VIOLATION_THEN, _STUCK_AT, _COST_BEFORE, _NEAREST, _NUMBERS = range(
+    7
+)
 _RINGS, _LENGTH = 7, 2 * _GROWTH[1] + 1
 _SIGNED = _WINDOW  # where the rings of each state begin, one below the other
 _CHANGED = _SIGNED + _BIAS_WINDOW
@@ -352,6 +364,9 @@ _REASONS = {
     "the reference does not fall",
     _AWAY: "ever faster away from its reference, against what the plans promised; "
     "{value:.3g} from it, in the metric of the cost",
+    _CLIMBING: "the plans cost {value:.2g} times as much as at first and ever more, "
+    "although the model predicts well",
+    _STANDING: "no nearer to the reference for {value:.0f} steps",
     _RISING: "the plans cost {value:.3g} times as much as at first and ever more, "
     "although the model predicts well: the horizon is too short for the plant",
 }
@@ -418,24 +433,29 @@ def _judge_step(settings, memory, reading):
     half = min(max(counts[_LOOK_AHEAD] // 2, _GROWTH[0]), _GROWTH[1])
     memory.distances[k % _LENGTH] = distance
     memory.costs[k % _LENGTH] = cost
-    grows = _is_growing(memory.distances, k, half)
+    was_away = memory.distances[(k - half) % _LENGTH] > least
+    grows = was_away and _is_growing(memory.distances, k, half)
     cost_grows = _is_growing(memory.costs, k, half)
     memory.far[slot] = 1.0 if reading.novelty > _FAR else 0.0
     memory.failed[slot] = 0.0 if reading.applied else 1.0
     failures, far = memory.failed.sum(), memory.far.sum()
     predicts_well = state < 0 and biased < 0 and far == 0.0
     was_nearer = memory.distances[(k - 2 * half) % _LENGTH] < distance
-    is_dear = counts[_SINCE_NEWS] > _LONG and cost > 2.0 * numbers[_COST_BEFORE] > 0.0
+    share = 0.0  # of the cost from which the plans were to bring it down
+    if counts[_SINCE_NEWS] > _LONG and numbers[_COST_BEFORE] > 0.0:
+        share = cost / numbers[_COST_BEFORE]
+    climbs = cost_grows and predicts_well and was_nearer and share > 0.1
     if counts[_LOST_AS] > 0 and distance < 0.5 * numbers[_LOST_AT]:
         counts[_LOST_AS] = 0
     if counts[_LOST_AS] == 0 and distance > least:
         if grows and promise > _BROKEN and distance > numbers[_TRAVEL]:
             counts[_LOST_AS] = _AWAY
-        elif cost_grows and is_dear and predicts_well and was_nearer:
+        elif climbs and share > 2.0:
             counts[_LOST_AS] = _RISING
         numbers[_LOST_AT] = distance
     stuck = _judge_bounds(settings, memory, reading, distance, least)
     missed = _judge_violation(memory, reading)
+    stands = _is_standing(memory, reading, distance, least)
     counts[_STEPS] = k + 1
     if counts[_LOST_AS] == _AWAY:
         return _AWAY, 0, distance
@@ -447,6 +467,8 @@ def _judge_step(settings, memory, reading):
         return _INNOVATION, state, size
     if biased >= 0:
         return _BIAS, biased, bias
+    if climbs and distance > least:
+        return _CLIMBING, 0, share
     if distance > least and promise > _BROKEN:
         return _PROMISE, 0, promise
     if failures >= _FEW:
@@ -455,6 +477,8 @@ def _judge_step(settings, memory, reading):
         return _NOVELTY, 0, reading.novelty
     if missed:
         return _VIOLATION, 0, reading.violation
+    if stands:
+        return _STANDING, 0, float(counts[_SINCE_NEARER])
     if stuck >= 0:
         return _SATURATED, stuck, float(memory.at_bound[stuck])
     return _HEALTHY, 0, 0.0
@@ -535,11 +559,11 @@ def _judge_innovation(settings, memory, reading):
     scale = (1.0 + _DOUBT / max(known, 1)) / 0.455 / 2.0
     has_change = False
     worst, worst_ratio = -1, _LARGEST_RATIO * _WINDOW
-    biased, bias = -1, _LARGEST_BIAS * math.sqrt(_BIAS_WINDOW)
+    biased, bias = -1, _LARGEST_BIAS * _BIAS_WINDOW
     for i in range(len(reading.measured)):
         innovation = reading.measured[i] - reading.expected[i]
         innovation = _wrapped(innovation, settings.angles[i])
-        ratio, motion = 0.0, 0.0
+        ratio, signed = 0.0, 0.0
         if is_judged:
             memory.variance[i] = scale * memory.ordered[known // 2, i]
         if innovation == innovation:
@@ -547,11 +571,14 @@ def _judge_innovation(settings, memory, reading):
             motion = max(motion * motion, _FORGETTING * memory.motion[i])
             memory.motion[i] = motion
             size = _ROUNDING * max(1.0, abs(reading.measured[i]))
-            variance = size * size + reading.spread[i, i] + settings.model_noise[i]
-            variance += _SHARE * _SHARE * motion + memory.variance[i]
+            # Of an error of the model each step may have all, the sensors' cancel.
+            own = size * size + reading.spread[i, i] + settings.model_noise[i]
+            own += _SHARE * _SHARE * motion
             if is_judged:
-                ratio = min(innovation * innovation / variance, _CAP)
-        signed = math.sqrt(ratio) if innovation > 0.0 else -math.sqrt(ratio)
+                ratio = innovation * innovation / (own + memory.variance[i])
+                ratio = min(ratio, _CAP)
+                signed = innovation / math.sqrt(own + memory.variance[i] / _BIAS_WINDOW)
+                signed = min(max(signed, -_LARGEST_SIGNED), _LARGEST_SIGNED)
         memory.ratio[i] += ratio - memory.ratios[slot, i]
         memory.bias[i] += signed - memory.signed[signed_slot, i]
         memory.ratios[slot, i] = ratio
@@ -708,6 +735,20 @@ def _judge_bounds(settings, memory, reading, distance, least):
         if memory.at_bound[j] > longest and distance >= least and not falls:
             stuck = j
     return stuck
+
+
+@njit_inner
+def _is_standing(memory, reading, distance, least):
+    """Whether it has come no nearer for long, while half of the way is still before it."""
+    counts, numbers = memory.counts, memory.numbers
+    is_nearer = distance < 0.9 * numbers[_NEAREST]
+    if is_nearer or counts[_SINCE_NEWS] == 0:
+        numbers[_NEAREST] = distance
+        counts[_SINCE_NEARER] = 0
+        return False
+    counts[_SINCE_NEARER] += 1
+    is_far = distance > max(least, 0.5 * numbers[_TRAVEL])
+    return is_far and counts[_SINCE_NEARER] > 3 * max(_LONG, reading.horizon)
 
 
 @njit_inner

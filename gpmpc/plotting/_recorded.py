@@ -247,9 +247,24 @@ def _draw_bounds(axis: Axes, inputs: np.ndarray, bounds: np.ndarray) -> None:
         )
 
 
+_LEVELS = {"suspicious": ORANGE, "lost": VERMILION}
+
+
 def _mark_failures(run: "Run", *axes: Axes) -> None:
-    """Draws a mark at every step whose decision was not applied."""
+    """Draws a mark at every step whose decision was not applied, and shades those that were suspicious or lost."""
+    edges = _edges(run)
     for axis in axes:
+        for level, colour in _LEVELS.items():
+            for k in np.flatnonzero(run.judgements == level):
+                axis.axvspan(
+                    edges[k],
+                    edges[k + 1],
+                    color=colour,
+                    alpha=0.15,
+                    linewidth=0,
+                    label=level,
+                    zorder=-1,
+                )
         for time in run.times[run.failed]:
             axis.axvline(
                 time,

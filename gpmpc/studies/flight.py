@@ -346,8 +346,9 @@ def _fly(
 def metrics(experiment: Experiment, flown: Flown) -> dict[str, Any]:
     """Returns the results of a flight as plain data; everything that differs between equal runs is under ``times``.
 
-    ``lost`` says since when and why a flight no longer follows its reference (``find_loss``, or it diverged). One that
-    diverged has no RMSE: None.
+    ``judgement`` is what the steps said while it flew (``gpmpc.mpc.FlightJudge``); ``lost`` says since when and why a
+    flight no longer follows its reference (``find_loss``, by its judgement, or it diverged). One that diverged has no
+    RMSE: None.
     """
     rollout, problem, training = flown.rollout, flown.controller.problem, flown.training
     system, horizon, total = (
@@ -375,6 +376,7 @@ def metrics(experiment: Experiment, flown: Flown) -> dict[str, Any]:
         "error_at_end": _error(experiment, flown, last=2)
         if np.isfinite(total)
         else None,
+        "judgement": _judgement(flown),
         "lost": _lost(experiment, flown),
         "violations": {
             name: asdict(rate) | {"rate": rate.rate}
@@ -459,6 +461,17 @@ def _excess(
     return excess
 
 
+def _judgement(flown: Flown) -> dict[str, Any]:
+    """Returns level, reason, first step and counts of what the steps said of a flight."""
+    judgement = flown.rollout.judgement
+    if flown.diverged is not None and judgement.level != "lost":
+        reason = " ".join(str(flown.diverged).split())
+        judgement = judgement._replace(
+            level="lost", reason=reason, step=flown.diverged.step
+        )
+    return judgement._asdict()
+
+
 def _lost(experiment: Experiment, flown: Flown) -> dict[str, Any] | None:
     """Returns step, time [s] and reason of a flight's loss; None where it was not lost."""
     system, rollout, found = experiment.system, flown.rollout, []
@@ -470,10 +483,13 @@ def _lost(experiment: Experiment, flown: Flown) -> dict[str, Any] | None:
                 f"{loss.distance:.3g} {unit} from its reference, more than {loss.limit:.3g} {unit}",
             )
         )
+    if rollout.judgement.level == "lost":
+        found.append((rollout.judgement.step, rollout.judgement.reason))
     if flown.diverged is not None:
         found.append((flown.diverged.step, " ".join(str(flown.diverged).split())))
     if not found:
         return None
+    found.sort(key=lambda loss: loss[0])
     step, reasons = found[0][0], "; ".join(reason for _, reason in found)
     return {"step": step, "time": round(step * rollout.time_step, 9), "reason": reasons}
 
@@ -519,6 +535,7 @@ def summary(result: Mapping[str, Any]) -> Table:
         ),
         "lost": lost
         and f"from step {lost['step']} ({lost['time']:g} s) on: {lost['reason']}",
+        "judgement": _judged(result),
         f"RMSE [{unit}]": "none: it diverged"
         if rmse["total"] is None
         else f"{rmse['total']:.3g}  ({axes})",
@@ -544,6 +561,18 @@ def summary(result: Mapping[str, Any]) -> Table:
         "decision [ms]": f"median {median}  ({stages}), 99 % below {most}",
     }
     return Table(("", ""), [(name, text) for name, text in lines.items() if text])
+
+
+def _judged(result: Mapping[str, Any]) -> str | None:
+    """Returns what the steps said of their flight, in words; None where it is told as lost, or nobody judged it."""
+    judgement = result.get("judgement")
+    if judgement is None or result.get("lost"):
+        return None
+    if judgement["level"] == "suspicious":
+        return f"suspicious from step {judgement['step']} on: {judgement['reason']}"
+    if judgement["suspicious"]:
+        return f"healthy at the end; {judgement['suspicious']} steps were suspicious"
+    return "healthy"
 
 
 def _counted(statuses: Mapping[str, int]) -> str:
