@@ -12,20 +12,23 @@ it travels.
 import argparse
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import lru_cache, partial
+from time import perf_counter
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+from rich.console import Console
 
 from gpmpc.cli._run import experiment_of
 from gpmpc.cli._settings import compose, settings
 from gpmpc.gp.casadi_ import successor_function
 from gpmpc.models import CasadiFunction, KnownModel
-from gpmpc.mpc import GPMPC, Box, PredictionSettings, Problem, Reference, Tracking
+from gpmpc.mpc import GPMPC, Box, FlightJudge, PredictionSettings, Problem, Tracking
 from gpmpc.propagation import Linearization
 from gpmpc.simulation import Disturbance, Gust, Noise, Replaced, closed_loop
+from gpmpc.studies._document import Table, terminal
 from gpmpc.studies.flight import Experiment, run_trial
 from gpmpc.studies.study import one_thread
 from gpmpc.systems import System
@@ -104,7 +107,9 @@ class QuadrupleTank:
         """d/dt levels [cm/s]."""
         outflow = [
             a * (2.0 * 981.0) ** 0.5 * h * (h * h + 1e-6) ** -0.25
-            for a, h in zip((0.071, 0.057, 0.071, 0.057), (x[0], x[1], x[2], x[3]), strict=True)
+            for a, h in zip(
+                (0.071, 0.057, 0.071, 0.057), (x[0], x[1], x[2], x[3]), strict=True
+            )
         ]
         first, second = 3.14 * u[0], 3.29 * u[1]
         return [
@@ -141,8 +146,14 @@ def tank(horizon: int, steps: int = 120, on_step: Any = None, **more: Any) -> An
         PredictionSettings(covariance="none"),
     )
     return closed_loop(
-        plant, controller, np.array(goal), np.array(rest), steps, on_step=on_step,
-        on_failure="previous_plan", **more,
+        plant,
+        controller,
+        np.array(goal),
+        np.array(rest),
+        steps,
+        on_step=on_step,
+        on_failure="previous_plan",
+        **more,
     )
 
 
@@ -173,11 +184,17 @@ def experiment(scenario: Scenario) -> Experiment:
     chosen = _trained(scenario.overrides)
     if scenario.start is not None:
         moved = replace(chosen.system, start=scenario.start)
-        chosen = replace(chosen, system=moved, plant=chosen.plant and replace(chosen.plant, start=scenario.start))
+        chosen = replace(
+            chosen,
+            system=moved,
+            plant=chosen.plant and replace(chosen.plant, start=scenario.start),
+        )
     if scenario.noise is not None or scenario.process is not None:
         chosen = replace(chosen, noise=Noise(scenario.process, scenario.noise))
     if scenario.horizon is not None:
-        chosen = replace(chosen, controller=partial(chosen.controller, horizon=scenario.horizon))
+        chosen = replace(
+            chosen, controller=partial(chosen.controller, horizon=scenario.horizon)
+        )
     if scenario.disturbances is not None:
         chosen = replace(chosen, disturbances=scenario.disturbances(chosen.flown))
     return replace(chosen, seed=scenario.seed)
@@ -209,7 +226,9 @@ def good_flights() -> list[Scenario]:
     """Returns a hundred flights of the documentation's kinds that come to a good end."""
     flights: list[Scenario] = []
 
-    def add(name: str, count: int, *overrides: str, noisy: bool = True, **more: Any) -> None:
+    def add(
+        name: str, count: int, *overrides: str, noisy: bool = True, **more: Any
+    ) -> None:
         noise = NOISE[_system_of(overrides)]
         for seed in range(count):
             own = noise if noisy and seed % 2 else None
@@ -222,20 +241,336 @@ def good_flights() -> list[Scenario]:
     add("double integrator", 4, "system=double_integrator")
     add("reactor", 4, "system=stirred_tank")
     add("planar quadrotor", 4, "system=planar_quadrotor")
-    add("planar quadrotor, gust", 4, "system=planar_quadrotor", disturbances=_gust({"vx": 1.0}, 2.0, 3.0))
+    add(
+        "planar quadrotor, gust",
+        4,
+        "system=planar_quadrotor",
+        disturbances=_gust({"vx": 1.0}, 2.0, 3.0),
+    )
     add("whole quadrotor, jump", 4, "system=coupled")
-    add("whole quadrotor, gust", 4, "system=coupled", disturbances=_gust({"vx": 1.0}, 2.5, 3.5))
+    add(
+        "whole quadrotor, gust",
+        4,
+        "system=coupled",
+        disturbances=_gust({"vx": 1.0}, 2.5, 3.5),
+    )
     for path in ("elliptical", "lorenz", "hover", "step", "waypoints"):
         add(f"quadrotor, {path}", 4, f"trajectory={path}")
     for path in ("elliptical", "lorenz"):
-        add(f"attitude, {path}", 4, "system=rotational", f"trajectory={path}", "steps=200")
+        add(
+            f"attitude, {path}",
+            4,
+            "system=rotational",
+            f"trajectory={path}",
+            "steps=200",
+        )
     for path in ("lorenz", "hover"):
-        add(f"gust, {path}", 4, f"trajectory={path}", disturbances=_gust({"vx": 0.5}, 20, 40))
+        add(
+            f"gust, {path}",
+            4,
+            f"trajectory={path}",
+            disturbances=_gust({"vx": 0.5}, 20, 40),
+        )
     add("a fifth heavier, estimated", 4, "plant.mass=0.888", "disturbance_gain=0.3")
-    add("learning online in wind", 4, "learning=online", disturbances=_gust({"vx": 0.5}, 20, np.inf))
+    add(
+        "learning online in wind",
+        4,
+        "learning=online",
+        disturbances=_gust({"vx": 0.5}, 20, np.inf),
+    )
     add("process noise", 4, "trajectory=lorenz", process=(0.01,) * 6)
     add("few data", 4, "data.size=25", "horizon=5")
     for controller in ("paper", "lqr"):
         add(f"controller={controller}", 4, f"controller={controller}", "data.size=50")
     add("nmpc", 2, "controller=nmpc", "trajectory=lorenz")
     return flights
+
+
+@dataclass(frozen=True)
+class Sabotage:
+    """What breaks in a flight, at a step."""
+
+    name: str
+    step: int
+    make: Callable[[System, float], Any]  # from plant and time [s] to a disturbance
+
+
+def _other(start: float, system: System, **changes: Any) -> Replaced:
+    return Replaced(
+        replace(system, dynamics=replace(system.dynamics, **changes)), start
+    )
+
+
+def _reversed_input(input: int) -> Callable[[System, float], Any]:
+    return lambda system, start: Reversed(input, start)
+
+
+def _frozen_sensor(state: int) -> Callable[[System, float], Any]:
+    return lambda system, start: Frozen([state], start)
+
+
+def _late_sensors(steps: int) -> Callable[[System, float], Any]:
+    return lambda system, start: Late(steps, start)
+
+
+def _heavier(factor: float, *names: str) -> Callable[[System, float], Any]:
+    def other(system: System, start: float) -> Replaced:
+        known = {name: getattr(system.dynamics, name) for name in names}
+        changes = {
+            name: tuple(factor * each for each in value)
+            if isinstance(value, tuple | list)
+            else factor * value
+            for name, value in known.items()
+        }
+        return _other(start, system, **changes)
+
+    return other
+
+
+SABOTAGED = {  # settings of a flight, what is reversed, heavier, frozen and late, and when
+    "double integrator": (("system=double_integrator",), 5, 0, ("mass",), 0, 3),
+    "pendulum": (("system=pendulum",), 20, 0, ("mass",), 0, 2),
+    "cart-pole": (("system=cart_pole",), 15, 0, ("cart_mass", "pole_mass"), 2, 2),
+    "reactor": (("system=stirred_tank", "steps=140"), 80, 0, ("heat",), 1, 3),
+    "planar quadrotor": (("system=planar_quadrotor",), 8, 0, ("mass",), 4, 3),
+    "quadrotor": (("trajectory=lorenz",), 40, 1, ("mass",), 0, 3),
+    "attitude": (
+        ("system=rotational", "trajectory=lorenz", "steps=200"),
+        60,
+        0,
+        ("inertia",),
+        0,
+        3,
+    ),
+    "whole quadrotor": (
+        ("system=coupled", "trajectory.step.at=3.0"),
+        58,
+        1,
+        ("mass",),
+        0,
+        3,
+    ),
+}
+
+
+def sabotages(name: str) -> list[Sabotage]:
+    """Returns what is done to a flight of ``SABOTAGED``; the heat of a reaction is half as much again."""
+    _, step, input, masses, state, late = SABOTAGED[name]
+    factor = 1.5 if masses == ("heat",) else 2.0
+    return [
+        Sabotage("an input's sign", step, _reversed_input(input)),
+        Sabotage("twice the mass", step, _heavier(factor, *masses)),
+        Sabotage("a frozen sensor", step, _frozen_sensor(state)),
+        Sabotage("late sensors", step, _late_sensors(late)),
+    ]
+
+
+def first_shown(flown: Array, twin: Array, noise: Array) -> int | None:
+    """Returns the first step at which the true states of two flights differ by what can be seen; None without one."""
+    count = min(len(flown), len(twin))
+    difference = np.abs(flown[:count] - twin[:count])
+    visible = np.maximum(5.0 * noise, 0.05 * np.ptp(twin, axis=0))
+    shown = np.flatnonzero((difference > visible).any(axis=1))
+    return int(shown[0]) if len(shown) else None
+
+
+def _first_farther(flown: Any, twin: Any) -> int | None:
+    """Returns the first step at which a tank is farther from its levels than its twin, by a twentieth of the way."""
+    distances = [
+        np.linalg.norm((each.states - each.references)[:, :2], axis=1)
+        for each in (flown, twin)
+    ]
+    shown = np.flatnonzero(distances[0] > distances[1] + 0.05 * distances[1][0])
+    return int(shown[0]) if len(shown) else None
+
+
+def first_called(flown: Any, twin: Any, since: int) -> int | None:
+    """Returns the first step from which on a flight is not healthy where its twin is; None without one."""
+    for k in range(since, len(flown.judgements)):
+        is_twin_healthy = (
+            k >= len(twin.judgements) or twin.judgements[k].level == "healthy"
+        )
+        if flown.judgements[k].level != "healthy" and is_twin_healthy:
+            return k
+    return None
+
+
+def good(limit: int) -> None:
+    """Prints how good flights are judged."""
+    flights = good_flights()[:limit]
+    rows, alarms, suspicious = [], 0, 0
+    for scenario in flights:
+        with one_thread():
+            judgement = run_trial(experiment(scenario)).rollout.judgement
+        alarms += judgement.level != "healthy"
+        suspicious += judgement.suspicious
+        if judgement.level != "healthy" or judgement.suspicious:
+            rows.append(
+                [
+                    scenario.name,
+                    str(scenario.seed),
+                    judgement.level,
+                    str(judgement.suspicious),
+                ]
+            )
+    title = f"{len(flights)} good flights: {alarms} lost or suspicious at their end, {suspicious} steps suspicious"
+    Console().print(
+        terminal([Table(("flight", "seed", "judged", "suspicious steps"), rows, title)])
+    )
+
+
+def sabotaged() -> None:
+    """Prints when sabotaged flights are called."""
+    rows = []
+    for name, (overrides, *_) in SABOTAGED.items():
+        for noisy in (False, True):
+            noise = NOISE[_system_of(overrides)]
+            base = Scenario(name, overrides, seed=1, noise=noise if noisy else None)
+            with one_thread():
+                twin = run_trial(experiment(base)).rollout
+            for sabotage in sabotages(name):
+
+                def made(system: System, what: Sabotage = sabotage) -> list[Any]:
+                    return [what.make(system, what.step * system.time_step)]
+
+                with one_thread():
+                    flown = run_trial(
+                        experiment(replace(base, disturbances=made))
+                    ).rollout
+                shown = first_shown(flown.states, twin.states, np.array(noise))
+                rows.append(
+                    _row(
+                        name,
+                        sabotage.name,
+                        noisy,
+                        shown,
+                        first_called(flown, twin, sabotage.step),
+                        flown,
+                    )
+                )
+    good_twin = tank(80)
+    for horizon in (5, 10, 20, 40):
+        flown = tank(horizon)
+        shown = _first_farther(flown, good_twin)
+        rows.append(
+            _row(
+                "quadruple tank",
+                f"H = {horizon}",
+                False,
+                shown,
+                first_called(flown, good_twin, 0),
+                flown,
+            )
+        )
+    relevant = [row for row in rows if row[3] != "-"]
+    in_time = sum(row[-1] == "yes" for row in relevant)
+    title = f"{len(relevant)} sabotaged flights that show it: {in_time} called within 20 steps"
+    header = (
+        "flight",
+        "sabotage",
+        "noise",
+        "shows at",
+        "called at",
+        "judged",
+        "in time",
+    )
+    Console().print(terminal([Table(header, rows, title)]))
+
+
+def _row(
+    name: str, what: str, noisy: bool, shown: int | None, called: int | None, flown: Any
+) -> list[str]:
+    in_time = called is not None and (shown is None or called <= shown + 20)
+    judged = flown.judgement
+    level = judged.level if judged.level == "lost" or called is None else "suspicious"
+    return [
+        name,
+        what,
+        "yes" if noisy else "no",
+        "-" if shown is None else str(shown),
+        "-" if called is None else str(called),
+        level,
+        "yes" if in_time else "no",
+    ]
+
+
+def tanks() -> None:
+    """Prints how the tank is judged by its horizon."""
+    rows = []
+    for horizon in (5, 10, 20, 30, 40, 50, 60, 80):
+        flown = tank(horizon)
+        judgement = flown.judgement
+        solved = sum(status.solved for status in flown.statuses)
+        rows.append(
+            [
+                str(horizon),
+                f"{solved} of {len(flown.statuses)}",
+                judgement.level,
+                str(judgement.step),
+                judgement.reason,
+            ]
+        )
+    header = ("H", "solved", "judged", "from step", "reason")
+    Console().print(
+        terminal([Table(header, rows, "A tank of non-minimum phase, 5 s a step")])
+    )
+
+
+def cost() -> None:
+    """Prints what judging takes beside deciding."""
+    rows = []
+    for path in ("elliptical", "lorenz"):
+        chosen = experiment(
+            Scenario(path, (f"trajectory={path}",), noise=NOISE["translational"])
+        )
+        steps: list[Any] = []
+        append = steps.append
+        with one_thread():
+            flown = run_trial(chosen, lambda *_, take=append: take)
+        horizon = flown.controller.horizon
+        references = chosen.references(len(steps) + horizon + 1)
+        judge = FlightJudge.of(flown.controller, 6, 3)
+        seconds = []
+        for step in steps:
+            ahead = references[step.k : step.k + horizon + 1]
+            begin = perf_counter()
+            judge.judge(step.measured, ahead, step.decision)
+            seconds.append(perf_counter() - begin)
+        spent, decided = (
+            float(np.median(seconds)),
+            float(np.median(flown.rollout.seconds)),
+        )
+        rows.append(
+            [
+                path,
+                f"{1e6 * spent:.1f}",
+                f"{1e6 * decided:.0f}",
+                f"{100 * spent / decided:.1f} %",
+            ]
+        )
+    header = ("flight", "judging [us]", "deciding [us]", "share")
+    Console().print(
+        terminal([Table(header, rows, "Medians of a flight, six states, H = 10")])
+    )
+
+
+def main() -> None:
+    """Prints the tables that were asked for."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument(
+        "parts", nargs="*", default=["good", "sabotaged", "tank", "cost"]
+    )
+    parser.add_argument("--flights", type=int, default=1000, help="good ones, at most")
+    options = parser.parse_args()
+    parts = {
+        "good": partial(good, options.flights),
+        "sabotaged": sabotaged,
+        "tank": tanks,
+        "cost": cost,
+    }
+    for part in options.parts:
+        parts[part]()
+
+
+if __name__ == "__main__":
+    main()

@@ -32,7 +32,7 @@ from gpmpc.exceptions import DataError, SettingError, ShapeError, check_number
 from gpmpc.logs import SavedModel
 from gpmpc.recording import McapRecorder, RecordedSystem
 from gpmpc.simulation import Noise
-from gpmpc.studies._document import terminal
+from gpmpc.studies._document import plain_text, terminal
 from gpmpc.studies._run_folder import (
     RECORDING,
     RunFolder,
@@ -109,13 +109,19 @@ def run(config: DictConfig) -> Result:
 
 def warning_of(result: Mapping[str, Any]) -> str | None:
     """Returns in a line that a flight was lost, or suspicious at its end, and why."""
-    lost, judgement = result.get("lost"), result.get("judgement") or {}
+    lost, judgement = result.get("lost"), result.get("judgement")
     if lost:
-        return f"lost: from step {lost['step']} on: {lost['reason']}"
-    if judgement.get("level") == "suspicious":
-        since = f"from step {judgement['step']} on"
-        return f"suspicious: {since}: {judgement['reason']}"
+        return plain_text(f"lost: {_since(lost)}")
+    if isinstance(judgement, Mapping) and judgement.get("level") == "suspicious":
+        return plain_text(f"suspicious: {_since(judgement)}")
     return None
+
+
+def _since(told: Any) -> str:
+    """Returns from which step on, and why, as far as a result tells."""
+    if not isinstance(told, Mapping):
+        return str(told)
+    return f"from step {told.get('step')} on: {told.get('reason')}"
 
 
 def run_one(config: DictConfig, wait: bool = True) -> dict[str, Any]:

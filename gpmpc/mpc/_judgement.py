@@ -25,7 +25,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from scipy.stats import chi2
 
-from gpmpc._compiled import call_unchecked, compiled, njit_inner
+from gpmpc._compiled import call_unchecked, compiled, njit_noalloc
 from gpmpc._dynamics import to_array
 from gpmpc.exceptions import UnsupportedModel
 from gpmpc.mpc._controller import Decision
@@ -46,7 +46,7 @@ _LONG = 20  # steps that a promise is followed for at most
 _RARE = 1e-6  # probability of a window's innovations below which they are no chance
 _LARGEST_RATIO = float(chi2.isf(_RARE, _WINDOW)) / _WINDOW  # of their mean square
 _LARGEST_BIAS = 3.0  # deviations of the model, which one error may keep for long
-_CAP = 16.0  # most that one innovation counts for: no outlier decides alone
+_CAP = 12.0  # most that one innovation counts for: no outlier decides alone
 _LARGEST_SIGNED = 6.0  # most that one counts for, with its sign
 _SHARE = 0.05  # of what moves in a step that a good model may miss
 _FORGETTING = 0.8  # share of the largest motion's square that counts one step later
@@ -134,6 +134,7 @@ class _Memory(NamedTuple):
     coarse: Array  # 1 where a sensor has gone on after showing the same (n,)
     start: Array  # the first measurement (n,)
     horizon_end: Array  # the last row of the last reference (n,)
+    next_reference: Array  # its row for this step (n,)
     distances: Array  # (2 growth + 1,)
     costs: Array  # of plans (2 growth + 1,)
     news: Array  # squared steps of the reference's end, which no earlier plan knew
@@ -164,10 +165,10 @@ _SIGNED = _WINDOW  # where the rings of each state begin, one below the other
 _CHANGED = _SIGNED + _BIAS_WINDOW
 _ORDERED = _CHANGED + _MEMORY
 _LATEST = _ORDERED + _MEMORY
-_ROWS = _LATEST + 10
+_ROWS = _LATEST + 11
 
 
-@njit_inner
+@njit_noalloc
 def _memory_of(states, rings, counts, numbers):
     """The fields of a memory (rows, n), (rings, length), (counts + m,), (numbers,)."""
     return _Memory(
@@ -185,6 +186,7 @@ def _memory_of(states, rings, counts, numbers):
         states[_LATEST + 7],
         states[_LATEST + 8],
         states[_LATEST + 9],
+        states[_LATEST + 10],
         rings[0],
         rings[1],
         rings[2],
@@ -256,21 +258,29 @@ class FlightJudge:
         self._constrained = bool(problem.constraints)
         self._states = tuple(names[0]) or tuple(f"state {i}" for i in range(n))
         self._inputs = tuple(names[1]) or tuple(f"input {j}" for j in range(m))
-        self._plan: Decision | None = None  # that was applied last
+        self._means = self._no_means  # of the plan that was applied last
+        self._covariances = self._no_covariances
         self.last = Judgement()
 
     @classmethod
-    def of(cls, controller: Any, state_dim: int, input_dim: int) -> "FlightJudge":
+    def of(
+        cls,
+        controller: Any,
+        state_dim: int,
+        input_dim: int,
+        names: tuple[Sequence[str], Sequence[str]] | None = None,
+    ) -> "FlightJudge":
         """A judge of a controller's flights, by its problem and by the noise that its model has learned.
 
-        Of a controller without a problem no distance is judged.
+        Of a controller without a problem no distance is judged. Names are by default its own.
         """
         problem = getattr(controller, "problem", None)
         if not isinstance(problem, Problem):
             nothing = Tracking(Q=np.zeros(state_dim), R=np.ones(input_dim))
             problem = Problem(nothing)
-        signals = signals_of(controller)
-        names = signals.state_names, signals.input_names
+        if names is None:
+            signals = signals_of(controller)
+            names = signals.state_names, signals.input_names
         return cls(problem, _learned_noise(controller), names)
 
     def judge(
@@ -283,17 +293,15 @@ class FlightJudge:
             reference: What it is to be from now on (H + 1, n), or a set point (n,).
             decision: What the controller decided on it; None where it was not called.
         """
-        last_means, last_covariances = self._no_means, self._no_covariances
-        if self._plan is not None:
-            last_means = _float64(self._plan.means)
-            last_covariances = _float64(self._plan.covariances)
-        self._plan = None
-        means, input = self._no_means, self._no_input
+        last_means, last_covariances = self._means, self._covariances
+        self._means, self._covariances = self._no_means, self._no_covariances
+        input = self._no_input
         novelty, violation = math.nan, 0.0
         if decision is not None:
             input = _float64(decision.input)
             if decision.applicable:
-                self._plan, means = decision, _float64(decision.means)
+                self._means = _float64(decision.means)
+                self._covariances = _float64(decision.covariances)
                 novelty = float(decision.novelty)
                 violation = decision.violation if self._constrained else 0.0
         references = _float64(reference)
@@ -308,7 +316,7 @@ class FlightJudge:
             references,
             last_means,
             last_covariances,
-            means,
+            self._means,
             input,
             novelty,
             violation,
@@ -372,7 +380,7 @@ _REASONS = {
 }
 
 
-@compiled(locked=True)
+@compiled(locked=True, allocates=False)
 def _judge(
     table,
     bounds,
@@ -417,7 +425,7 @@ def _judge(
     return _judge_step(settings, _memory_of(states, rings, counts, numbers), reading)
 
 
-@njit_inner
+@njit_noalloc
 def _judge_step(settings, memory, reading):
     counts, numbers = memory.counts, memory.numbers
     k = counts[_STEPS]
@@ -438,13 +446,13 @@ def _judge_step(settings, memory, reading):
     cost_grows = _is_growing(memory.costs, k, half)
     memory.far[slot] = 1.0 if reading.novelty > _FAR else 0.0
     memory.failed[slot] = 0.0 if reading.applied else 1.0
-    failures, far = memory.failed.sum(), memory.far.sum()
+    failures, far = _total(memory.failed), _total(memory.far)
     predicts_well = state < 0 and biased < 0 and far == 0.0
     was_nearer = memory.distances[(k - 2 * half) % _LENGTH] < distance
     share = 0.0  # of the cost from which the plans were to bring it down
     if counts[_SINCE_NEWS] > _LONG and numbers[_COST_BEFORE] > 0.0:
         share = cost / numbers[_COST_BEFORE]
-    climbs = cost_grows and predicts_well and was_nearer and share > 0.1
+    climbs = cost_grows and was_away and was_nearer and predicts_well and share > 0.1
     if counts[_LOST_AS] > 0 and distance < 0.5 * numbers[_LOST_AT]:
         counts[_LOST_AS] = 0
     if counts[_LOST_AS] == 0 and distance > least:
@@ -484,12 +492,12 @@ def _judge_step(settings, memory, reading):
     return _HEALTHY, 0, 0.0
 
 
-@njit_inner
+@njit_noalloc
 def _read_news(settings, memory, reading):
     """What the end of the reference tells that no plan has known before, in the cost's metric."""
     counts = memory.counts
     n = len(reading.measured)
-    end = reading.reference[-1]
+    now, end = reading.reference[0], reading.reference[-1]
     square, size = 0.0, 0.0
     for i in range(n):
         step = _wrapped(end[i] - memory.horizon_end[i], settings.angles[i])
@@ -503,10 +511,20 @@ def _read_news(settings, memory, reading):
     is_new = square > 0.0 or counts[_STEPS] == 0
     counts[_SINCE_NEWS] = 0 if is_new else counts[_SINCE_NEWS] + 1
     memory.news[counts[_STEPS] % max(counts[_LOOK_AHEAD], 1)] = square
-    memory.horizon_end[:] = end
+    following = reading.reference[min(1, len(reading.reference) - 1)]
+    is_as_announced = True
+    for i in range(n):
+        off = _wrapped(now[i] - memory.next_reference[i], settings.angles[i])
+        if abs(off) > _ROUNDING * max(1.0, abs(now[i])):
+            is_as_announced = False
+        memory.next_reference[i] = following[i]
+        memory.horizon_end[i] = end[i]
+    if not is_as_announced:  # no plan has promised anything of this
+        for j in range(_LENGTH):
+            memory.promised[j] = np.nan
 
 
-@njit_inner
+@njit_noalloc
 def _follow_cost(memory, reading):
     """What the plan costs; the largest while its reference was news is what it falls from."""
     counts, numbers = memory.counts, memory.numbers
@@ -516,7 +534,7 @@ def _follow_cost(memory, reading):
     return cost
 
 
-@njit_inner
+@njit_noalloc
 def _plan_cost(settings, means, references):
     """The squared distances of a plan's means (H + 1, n) from their references, weighed: of all, and of the first."""
     H, n = len(means) - 1, means.shape[1]
@@ -535,14 +553,22 @@ def _plan_cost(settings, means, references):
     return total, total if H <= _LONG else first
 
 
-@njit_inner
+@njit_noalloc
+def _total(values):
+    total = 0.0
+    for value in values:
+        total += value
+    return total
+
+
+@njit_noalloc
 def _wrapped(value, is_angle):
     if is_angle == 0.0:
         return value
     return value - 2.0 * math.pi * np.round(value / (2.0 * math.pi))
 
 
-@njit_inner
+@njit_noalloc
 def _judge_innovation(settings, memory, reading):
     """The states whose innovations are no chance, with their root mean square or mean in deviations; or -1.
 
@@ -599,7 +625,7 @@ def _judge_innovation(settings, memory, reading):
     return worst, math.sqrt(worst_ratio / _WINDOW), biased, bias / _BIAS_WINDOW
 
 
-@njit_inner
+@njit_noalloc
 def _remember(memory, changes, i, value):
     """Puts a value into the ring of a state's changes, and into its place in their order."""
     place = changes % _MEMORY
@@ -623,7 +649,7 @@ def _remember(memory, changes, i, value):
     memory.changes[place, i] = value
 
 
-@njit_inner
+@njit_noalloc
 def _judge_sensors(memory, reading):
     """A state that is measured the same to the last digit while others change; or -1.
 
@@ -648,7 +674,7 @@ def _judge_sensors(memory, reading):
     return -1
 
 
-@njit_inner
+@njit_noalloc
 def _measure_distance(settings, memory, reading):
     """Distance from the reference in the cost's metric, and the least that matters."""
     n = len(reading.measured)
@@ -679,7 +705,7 @@ def _measure_distance(settings, memory, reading):
     return math.sqrt(max(0.0, square)), least
 
 
-@njit_inner
+@njit_noalloc
 def _follow_promise(memory, reading, distance, least):
     """What steps cost in truth over what the plan before them promised; 0 where that is not known."""
     counts = memory.counts
@@ -687,12 +713,14 @@ def _follow_promise(memory, reading, distance, least):
     if h == 0:
         return 0.0
     slot = k % h
-    memory.paid[slot] = distance * distance
+    # One wrong measurement costs nothing.
+    nearer = min(distance, memory.distances[(k - 1) % _LENGTH]) if k > 0 else distance
+    memory.paid[slot] = nearer * nearer
     # What noise costs was not promised, nor what is done early for what came later.
     allowed = memory.promised[slot] + 0.25 * h * least * least
     is_known = min(reading.horizon, _LONG) == h
     memory.promised[slot] = reading.promised if is_known else np.nan
-    if k < h:
+    if k < h or counts[_CHANGES] <= _FEWEST:  # the noise is not known yet
         return 0.0
     paid = 0.0
     for j in range(h):
@@ -702,7 +730,7 @@ def _follow_promise(memory, reading, distance, least):
     return ratio if ratio == ratio else 0.0
 
 
-@njit_inner
+@njit_noalloc
 def _is_growing(ring, k, half):
     """Whether the last value is the largest of a window, and grew in its second half no slower than in its first."""
     size = len(ring)
@@ -717,7 +745,7 @@ def _is_growing(ring, k, half):
     return last - middle >= 0.8 * (middle - first) and last > 1.2 * middle
 
 
-@njit_inner
+@njit_noalloc
 def _judge_bounds(settings, memory, reading, distance, least):
     """An input that has stayed at a bound for long while the distance fell by nothing; or -1."""
     stuck = -1
@@ -737,7 +765,7 @@ def _judge_bounds(settings, memory, reading, distance, least):
     return stuck
 
 
-@njit_inner
+@njit_noalloc
 def _is_standing(memory, reading, distance, least):
     """Whether it has come no nearer for long, while half of the way is still before it."""
     counts, numbers = memory.counts, memory.numbers
@@ -751,7 +779,7 @@ def _is_standing(memory, reading, distance, least):
     return is_far and counts[_SINCE_NEARER] > 3 * max(_LONG, reading.horizon)
 
 
-@njit_inner
+@njit_noalloc
 def _judge_violation(memory, reading):
     """Whether plans have missed a constraint for long, and the last by no less than the first."""
     counts, numbers = memory.counts, memory.numbers

@@ -138,7 +138,7 @@ def cascade_loop(
         simulator,
         references,
         ratio * plant.time_step,
-        FlightJudge.of(cascade.outer, 6, 3),
+        FlightJudge.of(cascade.outer, 6, 3, (slow.state_names, slow.input_names)),
         calls[0],
         _OUTER,
     )
@@ -146,7 +146,7 @@ def cascade_loop(
         simulator,
         references,
         plant.time_step,
-        FlightJudge.of(cascade.inner, 6, 3),
+        FlightJudge.of(cascade.inner, 6, 3, (fast.state_names, fast.input_names)),
         calls[1],
         _INNER,
     )

@@ -379,7 +379,8 @@ def _judge_of(controller: Controller, system: System | ModelLoop) -> FlightJudge
     if isinstance(system, ModelLoop):
         model = system.model
         return FlightJudge.of(controller, model.state_dim, model.input_dim)
-    return FlightJudge.of(controller, len(system.state_names), len(system.input_names))
+    names = system.state_names, system.input_names
+    return FlightJudge.of(controller, len(names[0]), len(names[1]), names)
 
 
 def _fly(

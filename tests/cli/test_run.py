@@ -38,7 +38,9 @@ def test_a_lost_flight_is_finished_and_readable_and_has_an_exit_code_of_its_own(
     done = forked("run", *TINY, *choices, "steps=9", cwd=tmp_path)
     assert done.returncode == 3, done.stderr
     assert "lost " in done.stdout
-    assert done.stderr == ""
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("gpmpc: lost: from step ")
+    assert reason in line
     (folder,) = (tmp_path / "tree").iterdir()
     found = json.loads(
         (folder / "metrics.json").read_text(), parse_constant=pytest.fail

@@ -8,7 +8,7 @@ import pytest
 from rich.console import Console
 
 from gpmpc.exceptions import Diverged
-from gpmpc.mpc import Timing
+from gpmpc.mpc import FlightJudgement, Judgement, Timing
 from gpmpc.mpc.problem import Box, Halfspaces, Inequality
 from gpmpc.simulation import Rollout
 from gpmpc.status import Status
@@ -98,7 +98,30 @@ def test_everything_that_a_result_may_hold_has_its_line():
     }
     bare |= {"episodes": [], "suboptimal": {}, "far_from_data": 0}
     names = ["flight", "RMSE [m]", "bounds of inputs", "failed solves", "decision [ms]"]
-    assert [name for name, _ in summary(bare).rows] == names
+    unjudged = {key: bare[key] for key in bare if key != "judgement"}
+    assert [name for name, _ in summary(unjudged).rows] == names
+
+
+@pytest.mark.parametrize(
+    ("judgement", "line"),
+    [
+        (FlightJudgement(), "healthy"),
+        (
+            FlightJudgement(suspicious=3),
+            "healthy at the end; 3 steps were suspicious",
+        ),
+        (
+            FlightJudgement("suspicious", "why", 5, 15),
+            "suspicious from step 5 on: why",
+        ),
+        (FlightJudgement("lost", "away", 5, 2, 13), None),  # which is said above
+    ],
+)
+def test_how_a_flight_was_judged_is_said_in_a_line(judgement, line):
+    lost = {"step": 5, "time": 1.0, "reason": "away"} if line is None else None
+    result = metrics_of(0.125) | {"judgement": judgement._asdict(), "lost": lost}
+    lines = dict(summary(result | {"settings": {"options": OPTIONS}}).rows)
+    assert lines.get("judgement") == line
 
 
 @pytest.mark.parametrize(
@@ -188,10 +211,12 @@ def test_the_metrics_of_a_flight_are_written_out_in_full():
         Status.ITERATION_LIMIT,
         Status.INFEASIBLE,
     )
+    odd = Judgement("suspicious", "odd")
     solves = {
         "statuses": statuses,
         "suboptimal": (2,),
         "far_from_data": (0, 3),
+        "judgements": (odd, Judgement(), odd, odd),
         "iterations": np.array([1, 2, 3, 10]),
     }
     training = SimpleNamespace(
@@ -212,6 +237,13 @@ def test_the_metrics_of_a_flight_are_written_out_in_full():
         "unit": "m",
         "rmse": pytest.approx({"x": 1.5, "y": 3.0, "z": 2.0, "total": np.sqrt(61 / 4)}),
         "error_at_end": pytest.approx(6.0),
+        "judgement": {
+            "level": "suspicious",
+            "reason": "odd",
+            "step": 2,
+            "suspicious": 3,
+            "lost": 0,
+        },
         "lost": None,
         "failures": {"INFEASIBLE": 2},
         "far_from_data": 2,
@@ -263,3 +295,18 @@ def test_a_loss_is_told_from_the_first_step_beyond_and_a_divergence_besides():
         dict.fromkeys(["x", "y", "z", "total"]),
         None,
     )
+
+
+def test_a_flight_that_its_judge_calls_lost_is_lost_and_one_that_diverged_is_judged_so():
+    gone = Judgement("lost", "ever faster away")
+    near = [[0, 0, 0], [0, 0, 1], [0, 0, 2], [0, 2, 0]]
+    found = measured(rollout_of(near, judgements=(Judgement(), gone, gone)))
+    assert found["lost"] == {"step": 1, "time": 0.2, "reason": "ever faster away"}
+    both = measured(
+        rollout_of([*near, [0, 40, 0]], judgements=(Judgement(), gone, gone, gone))
+    )
+    assert both["lost"]["step"] == 1
+    assert both["lost"]["reason"].startswith("ever faster away; 40 m from")
+    diverged = measured(rollout_of(near), diverged=Diverged(3, "not finite any more"))
+    assert diverged["judgement"]["level"] == "lost"
+    assert diverged["judgement"]["step"] == 3
