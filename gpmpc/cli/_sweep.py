@@ -235,7 +235,9 @@ def _fly_job(config: DictConfig, wait: bool) -> dict[str, Any]:
         return {"busy": True}
     except GpmpcError as error:  # of this run; the others go on
         return {"error": str(error), "folder": config.folder}
-    found = {key: outcome[key] for key in ("folder", "error") if key in outcome}
+    found: dict[str, Any] = {
+        key: outcome[key] for key in ("folder", "error") if key in outcome
+    }
     if "result" in outcome:
         found["warning"] = warning_of(outcome["result"])
     return found

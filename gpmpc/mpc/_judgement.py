@@ -168,9 +168,18 @@ _LATEST = _ORDERED + _MEMORY
 _ROWS = _LATEST + 11
 
 
+class _Store(NamedTuple):
+    """The arrays that the fields of a memory are views of."""
+
+    states: Array  # (rows, n)
+    rings: Array  # (rings, length)
+    counts: Array  # (counts + m,)
+    numbers: Array  # (numbers,)
+
+
 @njit_noalloc
-def _memory_of(states, rings, counts, numbers):
-    """The fields of a memory (rows, n), (rings, length), (counts + m,), (numbers,)."""
+def _memory_in(store):
+    states, rings, counts = store.states, store.rings, store.counts
     return _Memory(
         states[:_SIGNED],
         states[_SIGNED:_CHANGED],
@@ -196,7 +205,7 @@ def _memory_of(states, rings, counts, numbers):
         rings[6, :_WINDOW],
         counts[:_COUNTS],
         counts[_COUNTS:],
-        numbers,
+        store.numbers,
     )
 
 
@@ -243,15 +252,15 @@ class FlightJudge:
         weights = problem.cost.Q.reshape(-1, n, n)[0]
         self._table = np.vstack([weights, problem.cost.terminal, own_noise, angles])
         self._bounds = np.array(problem.inputs.first, dtype=float)
-        self._memory = (
-            np.zeros((_ROWS, n)),
-            np.zeros((_RINGS, _LENGTH)),
-            np.zeros(_COUNTS + m, dtype=np.int64),
-            np.zeros(_NUMBERS),
+        self._store = _Store(
+            states=np.zeros((_ROWS, n)),
+            rings=np.zeros((_RINGS, _LENGTH)),
+            counts=np.zeros(_COUNTS + m, dtype=np.int64),
+            numbers=np.zeros(_NUMBERS),
         )
-        self._memory[0][_ORDERED:_LATEST] = np.inf
-        self._memory[0][_LATEST + 4 :] = np.nan
-        self._memory[0][_LATEST + 6 : _LATEST + 8] = 0.0
+        self._store.states[_ORDERED:_LATEST] = np.inf
+        self._store.states[_LATEST + 4 :] = np.nan
+        self._store.states[_LATEST + 6 : _LATEST + 8] = 0.0
         self._no_means = np.full((2, n), np.nan)
         self._no_covariances = np.full((2, n, n), np.nan)
         self._no_input = np.full(m, np.nan)
@@ -303,7 +312,7 @@ class FlightJudge:
                 self._means = _float64(decision.means)
                 self._covariances = _float64(decision.covariances)
                 novelty = float(decision.novelty)
-                violation = decision.violation if self._constrained else 0.0
+                violation = float(decision.violation) if self._constrained else 0.0
         references = _float64(reference)
         if references.ndim == 1:
             references = references[None]
@@ -311,15 +320,14 @@ class FlightJudge:
             _judge,
             self._table,
             self._bounds,
-            *self._memory,
+            self._store,
             _float64(measured),
             references,
             last_means,
             last_covariances,
             self._means,
             input,
-            novelty,
-            violation,
+            (novelty, violation),
         )
         self.last = _ALL_WELL if code == _HEALTHY else self._words(code, index, value)
         return self.last
@@ -384,18 +392,14 @@ _REASONS = {
 def _judge(
     table,
     bounds,
-    states,
-    rings,
-    counts,
-    numbers,
+    store,
     measured,
     reference,
     last_means,
     last_covariances,
     means,
     input,
-    novelty,
-    violation,
+    qualities,
 ):
     """Takes a step into the memory; returns why it is not healthy, which entry that is about, and a number."""
     n, horizon = len(measured), len(means) - 1
@@ -418,11 +422,11 @@ def _judge(
         cost,
         promised,
         input,
-        novelty,
-        violation,
+        qualities[0],
+        qualities[1],
         cost == cost,
     )
-    return _judge_step(settings, _memory_of(states, rings, counts, numbers), reading)
+    return _judge_step(settings, _memory_in(store), reading)
 
 
 @njit_noalloc

@@ -428,7 +428,7 @@ def _violation_rates(
         tightest_lower = np.max([lower[0] for lower, _ in boxes], axis=0)
         tightest_upper = np.min([upper[0] for _, upper in boxes], axis=0)
         rates["states"] = violation_rate(states, tightest_lower, tightest_upper)
-    others = [
+    others: list[tuple[str, list[Any]]] = [
         ("half-spaces", [part for part in held if isinstance(part, Halfspaces)]),
         ("inequality", [part for part in held if isinstance(part, Inequality)]),
     ]
@@ -483,8 +483,9 @@ def _lost(experiment: Experiment, flown: Flown) -> dict[str, Any] | None:
                 f"{loss.distance:.3g} {unit} from its reference, more than {loss.limit:.3g} {unit}",
             )
         )
-    if rollout.judgement.level == "lost":
-        found.append((rollout.judgement.step, rollout.judgement.reason))
+    judgement = rollout.judgement
+    if judgement.level == "lost" and judgement.step is not None:
+        found.append((judgement.step, judgement.reason))
     if flown.diverged is not None:
         found.append((flown.diverged.step, " ".join(str(flown.diverged).split())))
     if not found:
