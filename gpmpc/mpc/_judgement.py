@@ -12,7 +12,8 @@ flight tells more, and a judge looks at
   promised, the plan does not lead where it says;
 * the *distance* from the reference in the cost's metric: a plant whose distance grows faster and faster, against the
   promise, is lost;
-* *novelty*, *violation*, failed solves and inputs that stay at a bound without effect.
+* *novelty*, as long as the reference is far away or the promise not kept; *violation*, failed solves, sensors that
+  stand still and inputs that stay at a bound without effect.
 
 There is nothing to set. Windows are short (eight steps) beside those of the loss, so that one wrong measurement is no
 alarm, and a change is named within ten steps.
@@ -485,7 +486,8 @@ def _judge_step(settings, memory, reading):
         return _PROMISE, 0, promise
     if failures >= _FEW:
         return _FAILURES, 0, failures
-    if far >= _FEW:
+    is_on_its_way = distance > 0.5 * numbers[_TRAVEL] or promise > 0.5 * _BROKEN
+    if far >= _FEW and distance > least and is_on_its_way:
         return _NOVELTY, 0, reading.novelty
     if missed:
         return _VIOLATION, 0, reading.violation
