@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:  # recordings are read without torch
-    from gpmpc.mpc import Decision
+    from gpmpc.mpc import Decision, Judgement
     from gpmpc.status import Status
 
 
@@ -35,3 +35,5 @@ class Step:
     gp_version: int = 0  # how often the model has changed since the start
     failed: bool = False  # the decision was not applied; ``input`` comes from the policy for failures
     status: "Status | None" = None  # how the solve ended; the decision's if omitted
+    # whether the flight is healthy, suspicious or lost so far, and why; None where nobody judged it
+    judgement: "Judgement | None" = None

@@ -15,6 +15,7 @@ from gpmpc.cli._settings import writing
 from gpmpc.cli._terminal import print_error
 from gpmpc.exceptions import DataError, GpmpcError, SettingError
 from gpmpc.recording import Run, layout, read_run, recover
+from gpmpc.recording._messages import LEVELS
 from gpmpc.studies._document import Document, Table, plain_text, terminal
 
 CUT = "unfinished or damaged; this is what could be read"
@@ -154,6 +155,13 @@ def _facts(run: Run) -> dict[str, str]:
             f"{status.name} {count}" for status, count in counts.items()
         )
         facts["not applied"] = str(int(run.failed.sum()))
+        judged = [(run.judgements == level).sum() for level in LEVELS[1:]]
+        if any(judged):
+            counts = zip(LEVELS[1:], judged, strict=True)
+            steps = ", ".join(f"{level} {count}" for level, count in counts if count)
+            last = f"; at the end {run.judgements[-1]}"
+            why = f": {plain_text(run.reasons[-1])}" if run.reasons[-1] else ""
+            facts["judgement"] = f"{steps}{last}{why}"
         median, worst = (
             1e3 * float(f(run.timings[:, -1])) for f in (np.median, np.max)
         )

@@ -32,7 +32,7 @@ from gpmpc.exceptions import DataError, SettingError, ShapeError, check_number
 from gpmpc.logs import SavedModel
 from gpmpc.recording import McapRecorder, RecordedSystem
 from gpmpc.simulation import Noise
-from gpmpc.studies._document import terminal
+from gpmpc.studies._document import plain_text, terminal
 from gpmpc.studies._run_folder import (
     RECORDING,
     RunFolder,
@@ -97,11 +97,31 @@ def run(config: DictConfig) -> Result:
             "fly it with this code",
             highlight=False,
         )
+    warning = warning_of(outcome["result"])
+    if warning is not None:
+        print_error(warning)
     data = outcome["result"] | {
         "folder": outcome["folder"],
         "of_other_code": bool(other_code),
     }
     return Result(data, _LOST if outcome["result"].get("lost") else 0)
+
+
+def warning_of(result: Mapping[str, Any]) -> str | None:
+    """Returns in a line that a flight was lost, or suspicious at its end, and why."""
+    lost, judgement = result.get("lost"), result.get("judgement")
+    if lost:
+        return plain_text(f"lost: {_since(lost)}")
+    if isinstance(judgement, Mapping) and judgement.get("level") == "suspicious":
+        return plain_text(f"suspicious: {_since(judgement)}")
+    return None
+
+
+def _since(told: Any) -> str:
+    """Returns from which step on, and why, as far as a result tells."""
+    if not isinstance(told, Mapping):
+        return str(told)
+    return f"from step {told.get('step')} on: {told.get('reason')}"
 
 
 def _warning_printer() -> Callable[[str], None]:

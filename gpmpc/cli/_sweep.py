@@ -31,7 +31,7 @@ from rich.console import Console
 
 from gpmpc._compiling import report_compilation
 from gpmpc.cli._command import Result
-from gpmpc.cli._run import choices, experiment_of, plain_settings, run_one
+from gpmpc.cli._run import choices, experiment_of, plain_settings, run_one, warning_of
 from gpmpc.cli._settings import folder_of, without_hydra, write_files
 from gpmpc.cli._terminal import print_error, progress_bar
 from gpmpc.exceptions import GpmpcError, SettingError
@@ -70,6 +70,8 @@ class Sweep:
         self._checked: set[str] = set()
         #: folders of finished runs that other code flew, and what it was
         self.of_other_code: dict[Path, str] = {}
+        #: folders of finished runs that were lost, or suspicious at their end, and why
+        self.warnings: dict[Path, str] = {}
 
     def job(self, overrides: Sequence[str]) -> Job:
         """Returns the run of these settings."""
@@ -96,6 +98,9 @@ class Sweep:
         ):
             for job in finished:
                 result = job.folder.result(plain_settings(*self.settings(job)))
+                warning = warning_of(result)
+                if warning is not None:
+                    self.warnings[job.folder.path] = warning
                 other_code = of_other_code(result)
                 if other_code:
                     self.of_other_code[job.folder.path] = other_code
@@ -111,6 +116,11 @@ class Sweep:
             "folder, to fly them with this code",
             highlight=False,
         )
+
+    def tell_warnings(self) -> None:
+        """Prints the finished runs that were lost, or suspicious at their end, a line each."""
+        for folder, warning in sorted(self.warnings.items()):
+            print_error(f"{folder}: {warning}")
 
     def fly(self, jobs: Sequence[Job]) -> list[dict[str, Any]]:
         """Flies the runs that are not finished; returns the outcome of each of those."""
@@ -188,19 +198,32 @@ def sweep(given: Namespace) -> Result:
     with runs.progress(jobs, len(jobs)):
         outcomes = runs.fly(jobs)
     failed = [outcome for outcome in outcomes if "error" in outcome]
+    for outcome in outcomes:
+        if outcome.get("warning"):
+            runs.warnings[Path(outcome["folder"])] = outcome["warning"]
     total = "1 run" if len(jobs) == 1 else f"{len(jobs)} runs"
     text = f"{total}: {len(outcomes) - len(failed)} flown, {finished} finished before, {len(failed)} failed"
+    text += _counted([*runs.warnings.values()])
     console.out(f"{text}; in {runs.tree}", highlight=False)
     runs.tell_other_code()
+    runs.tell_warnings()
     for outcome in failed:
         print_error(f"failed: {outcome['folder']}: {outcome['error']}")
     data = {
         "folder": str(runs.tree),
         "runs": [str(job.folder.path) for job in jobs],
         "of_other_code": [str(path) for path in runs.of_other_code],
+        "warnings": {str(path): text for path, text in runs.warnings.items()},
         "failed": failed,
     }
     return Result(data, 1 if failed else 0)
+
+
+def _counted(warnings: Sequence[str]) -> str:
+    """Returns how many runs were lost or suspicious, as the end of a sentence."""
+    lost = sum(warning.startswith("lost") for warning in warnings)
+    counts = [(lost, "lost"), (len(warnings) - lost, "suspicious at their end")]
+    return "".join(f", {count} {what}" for count, what in counts if count)
 
 
 @report_compilation()
@@ -212,7 +235,12 @@ def _fly_job(config: DictConfig, wait: bool) -> dict[str, Any]:
         return {"busy": True}
     except GpmpcError as error:  # of this run; the others go on
         return {"error": str(error), "folder": config.folder}
-    return {key: outcome[key] for key in ("folder", "error") if key in outcome}
+    found: dict[str, Any] = {
+        key: outcome[key] for key in ("folder", "error") if key in outcome
+    }
+    if "result" in outcome:
+        found["warning"] = warning_of(outcome["result"])
+    return found
 
 
 def _combinations(overrides: Sequence[str]) -> list[list[str]]:

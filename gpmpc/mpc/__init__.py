@@ -3,6 +3,7 @@
 from gpmpc.mpc._controller import Controller, Decision, Reference, Request, Timing
 from gpmpc.mpc._cost import LeastSquares, Tracking
 from gpmpc.mpc._data_range import BeyondData, beyond_data
+from gpmpc.mpc._judgement import FlightJudge, FlightJudgement, Judgement
 from gpmpc.mpc._linear_quadratic import dlqr
 from gpmpc.mpc._policy import ControlLoop
 from gpmpc.mpc._prediction import PredictionSettings
@@ -18,8 +19,11 @@ __all__ = [
     "ControlLoop",
     "Controller",
     "Decision",
+    "FlightJudge",
+    "FlightJudgement",
     "Halfspaces",
     "Inequality",
+    "Judgement",
     "LeastSquares",
     "ManyStarts",
     "NonlinearGPMPC",

@@ -15,6 +15,7 @@ from scipy.interpolate import krogh_interpolate
 
 from gpmpc._angles import full_turns
 from gpmpc._arrays import read_array
+from gpmpc._dynamics import to_array
 from gpmpc.exceptions import (
     SettingError,
     ShapeError,
@@ -30,6 +31,7 @@ from gpmpc.mpc._controller import (
     Timing,
     read_reference,
 )
+from gpmpc.mpc._judgement import FlightJudge, Judgement
 from gpmpc.mpc.problem import Problem
 from gpmpc.signals import UNKNOWN, signals_of
 from gpmpc.status import Status
@@ -147,6 +149,7 @@ class ControlLoop:
     Attributes:
         last: Command of the last step: its input, decision and status; None before the first.
         failures: Number of steps whose input the policy chose.
+        judgement: Whether the last step was healthy, suspicious or lost, and why; None before the first.
 
     Raises:
         SettingError: No such policy.
@@ -158,6 +161,8 @@ class ControlLoop:
         self.on_failure: OnFailure = on_failure
         self.last: Command | None = None
         self.failures, self._steps = 0, 0
+        self.judgement: Judgement | None = None
+        self._judge: FlightJudge | None = None
         self._before: Command | None = None  # the one before the last
         self._gains: tuple[Decision, np.ndarray] | None = (
             None  # of the last plan that they were needed of
@@ -189,7 +194,17 @@ class ControlLoop:
         self._before = self.last
         self.last = command(self.controller, belief, wanted, *known)
         self.failures, self._steps = self.failures + self.last.failed, self._steps + 1
+        self.judgement = self._judged(belief, wanted, self.last)
         return self.last.input.copy()
+
+    def _judged(self, belief: Gaussian, wanted: Reference, last: Command) -> Judgement:
+        """The judgement of the last command."""
+        measured = to_array(belief.mean)
+        if self._judge is None:
+            input_dim = len(last.input)
+            self._judge = FlightJudge.of(self.controller, len(measured), input_dim)
+        states = np.asarray(wanted.states, dtype=float)
+        return self._judge.judge(measured, states, last.decision)
 
     def input_between(self, state: Any, share: float) -> np.ndarray:
         """Returns the input to apply until the next decision (m,): the plan's, corrected by its feedback.

@@ -247,9 +247,23 @@ def _draw_bounds(axis: Axes, inputs: np.ndarray, bounds: np.ndarray) -> None:
         )
 
 
+_LEVELS = {"suspicious": ORANGE, "lost": VERMILION}
+
+
+def _spans(steps: np.ndarray) -> list[tuple[int, int]]:
+    """Returns first and behind the last of every series of steps (K,) that are true."""
+    changes = np.flatnonzero(np.diff(np.concatenate([[0], steps, [0]])))
+    return [(int(first), int(end)) for first, end in changes.reshape(-1, 2)]
+
+
 def _mark_failures(run: "Run", *axes: Axes) -> None:
-    """Draws a mark at every step whose decision was not applied."""
+    """Draws a mark at every step whose decision was not applied, and shades those that were suspicious or lost."""
+    edges = _edges(run).tolist()
     for axis in axes:
+        for level, colour in _LEVELS.items():
+            for first, end in _spans(run.judgements == level):
+                shade: Any = {"color": colour, "alpha": 0.15, "linewidth": 0}
+                axis.axvspan(edges[first], edges[end], label=level, zorder=-1, **shade)
         for time in run.times[run.failed]:
             axis.axvline(
                 time,

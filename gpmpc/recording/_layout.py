@@ -142,7 +142,7 @@ def _tabs(run: Run, groups: Mapping[str, Sequence[str]]) -> dict[str, _Panels]:
     path = {"enabled": True, "timestampMethod": "receiveTime"}
     status = [
         {"value": f"{STEP}.{field}", "label": field} | path
-        for field in ("status", "failed")
+        for field in ("status", "failed", "judgement")
     ]
     tabs["Solver"] = {
         "Plot!timing": several(
@@ -153,7 +153,7 @@ def _tabs(run: Run, groups: Mapping[str, Sequence[str]]) -> dict[str, _Panels]:
             {f"{STEP}.{field}": label for field, label in counts.items()},
         ),
         "StateTransitions!status": {
-            "foxglovePanelTitle": "how the solves ended",
+            "foxglovePanelTitle": "how the solves ended, and how the flight goes",
             "isSynced": True,
             "paths": status,
         },

@@ -54,6 +54,8 @@ FIELDS = {
         "gp_version": "int64",
         "failed": "bool",
         "novelty": "double",
+        "judgement": "string",
+        "reason": "string",
     },
     "Stage": {"time": "double", "mean": "State", "std": "State", "input": "Input"},
     "Plan": {
@@ -70,6 +72,12 @@ FIELDS = {
     }
     | dict.fromkeys(QP_ARRAYS, "repeated double"),
 }
+LEVELS = (
+    "",
+    "healthy",
+    "suspicious",
+    "lost",
+)  # of a judgement, empty where there is none
 _LARGEST = 1000  # states or inputs
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 _STATES = ("reference", "state", "measured", "innovation")  # arrays (n,) of a step
@@ -373,6 +381,8 @@ class Encoder:
             gp_version=step.gp_version,
             failed=step.failed,
             novelty=np.nan if decision is None else decision.novelty,
+            judgement="" if step.judgement is None else step.judgement.level,
+            reason="" if step.judgement is None else step.judgement.reason,
             **self._bounds,
         )
         yield STEP, message.SerializeToString()

@@ -40,6 +40,7 @@ from gpmpc.recording._flaws import (
 from gpmpc.recording._flaws import RECOVERED as WAS_RECOVERED
 from gpmpc.recording._messages import (
     FIELDS,
+    LEVELS,
     PLAN,
     QP,
     QP_ARRAYS,
@@ -79,6 +80,7 @@ _ATTRIBUTES |= {
     "gp_version": "gp_versions",
 }
 _ATTRIBUTES |= {"failed": "failed", "novelty": "novelties"}
+_ATTRIBUTES |= {"judgement": "judgements", "reason": "reasons"}
 
 
 class RecordedProblem(NamedTuple):
@@ -126,6 +128,8 @@ class Run:
     novelties: (
         Array  # (K,) ``novelty`` of the decisions; 0 in files that do not have it
     )
+    judgements: Array  # (K,) of texts, healthy, suspicious or lost; empty ones in files that have none
+    reasons: Array  # (K,) of texts, why a step is not healthy
     channels: dict[str, tuple[int, str]]  # number of messages and schema by topic
     metadata: dict[str, dict[str, str]]
     config: str  # text of the resolved configuration
@@ -469,6 +473,8 @@ def _decoded(
                 _numbers(message, "belief_covariance", n, n)
                 if not 0 <= message.status < len(_STATUSES):
                     raise ValueError(f"status {message.status} is unknown")
+                if message.judgement not in LEVELS:
+                    raise ValueError(f"judgement {message.judgement!r:.40} is unknown")
         except (DecodeError, ValueError) as error:
             raise RecordingError(
                 f"{path}: message {record.sequence} of {topic} is damaged: {error}"
@@ -506,11 +512,10 @@ def _steps(
     names = {"State": states, "Input": inputs, "Timing": TIMING}
     for field, name in _ATTRIBUTES.items():
         kind, values = FIELDS["Step"][field], [getattr(step, field) for step in steps]
-        found[name] = (
-            _table(values, names[kind])
-            if kind in names
-            else np.array(values, dtype=kind)
-        )
+        if kind in names:
+            found[name] = _table(values, names[kind])
+        else:
+            found[name] = np.array(values, dtype=object if kind == "string" else kind)
     return found
 
 

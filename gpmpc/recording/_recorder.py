@@ -95,6 +95,7 @@ class McapRecorder:
         self._bytes, self._steps = 0, 0
         self._waiting_since = -math.inf  # when the chunk's first step was [s]
         self._topics: dict[int, str] = {}  # by channel, as far as they are written
+        self._level = "healthy"  # of the last judgement
         self._error: str | None = None  # why no more steps are taken
         self._closed, self._server = False, None
         self._sink = _Sink(self.path)
@@ -229,6 +230,10 @@ class McapRecorder:
             self._scene.log(copy, stamp)
             if copy.step.failed or not copy.status.solved:
                 self._log.log(_failure(copy, stamp), log_time=stamp)
+            judgement = copy.step.judgement
+            if judgement is not None and judgement.level != self._level:
+                self._level = judgement.level
+                self._log.log(_judgement(copy, stamp), log_time=stamp)
         self._steps += len(self._waiting)
         self._waiting.clear()
 
@@ -307,3 +312,21 @@ def _failure(copy: StepCopy, nanoseconds: int) -> Log:
         name="gpmpc",
         message=f"step {copy.step.k}: {status.name}: {status.advice}{policy}",
     )
+
+
+def _judgement(copy: StepCopy, nanoseconds: int) -> Log:
+    """Says that a flight is healthy, suspicious or lost from a step on, and why."""
+    judgement: Any = copy.step.judgement
+    return Log(
+        timestamp=Timestamp(sec=nanoseconds // 10**9, nsec=nanoseconds % 10**9),
+        level=_LOG_LEVELS[judgement.level],
+        name="gpmpc",
+        message=f"from step {copy.step.k} on {judgement}",
+    )
+
+
+_LOG_LEVELS = {
+    "healthy": LogLevel.Info,
+    "suspicious": LogLevel.Warning,
+    "lost": LogLevel.Error,
+}

@@ -18,7 +18,7 @@ import numpy as np
 from gpmpc._angles import wrap
 from gpmpc.exceptions import Diverged, ShapeError, check_number
 from gpmpc.gaussian import Gaussian
-from gpmpc.mpc import Controller, Reference
+from gpmpc.mpc import Controller, FlightJudge, Reference
 from gpmpc.mpc._policy import OnFailure, check_policy, command
 from gpmpc.signals import Signals
 from gpmpc.simulation._disturbances import Disturbance
@@ -134,8 +134,22 @@ def cascade_loop(
         if on_step is None
         else [partial(on_step, loop) for loop in ("outer", "inner")]
     )
-    outer = Flight(simulator, references, ratio * plant.time_step, calls[0], _OUTER)
-    inner = Flight(simulator, references, plant.time_step, calls[1], _INNER)
+    outer = Flight(
+        simulator,
+        references,
+        ratio * plant.time_step,
+        FlightJudge.of(cascade.outer, 6, 3, (slow.state_names, slow.input_names)),
+        calls[0],
+        _OUTER,
+    )
+    inner = Flight(
+        simulator,
+        references,
+        plant.time_step,
+        FlightJudge.of(cascade.inner, 6, 3, (fast.state_names, fast.input_names)),
+        calls[1],
+        _INNER,
+    )
     states, inputs, angles = [simulator.mean], [], np.zeros(3)
     thrust: Any = None  # the command of the outer step under way
     attitude: Any = None  # what the inner controller is to follow
@@ -165,8 +179,9 @@ def cascade_loop(
         if isinstance(applied, Diverged):
             raise applied
         if phase == 0:
-            outer.add(before, belief, thrust.input, thrust)
-        inner.add(before, belief, applied[1:], moments, attitude.states[0])
+            ahead = window(references, k, horizon).states
+            outer.add(before, belief, thrust.input, thrust, ahead)
+        inner.add(before, belief, applied[1:], moments, attitude.states)
         states.append(simulator.mean)
         inputs.append(applied)
     return CascadeRollout(

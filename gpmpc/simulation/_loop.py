@@ -25,6 +25,7 @@ from gpmpc.exceptions import (
 from gpmpc.gaussian import Gaussian
 from gpmpc.mpc import Controller, Reference, Timing
 from gpmpc.mpc._controller import read_reference
+from gpmpc.mpc._judgement import FlightJudge, FlightJudgement, Judgement
 from gpmpc.mpc._policy import Command, OnFailure, check_policy, command, commands
 from gpmpc.signals import Signals, signals_of
 from gpmpc.simulation._disturbances import Disturbance
@@ -62,6 +63,7 @@ class Rollout:
         int, ...
     ] = ()  # steps at which a plan was applied whose solve stopped short of its tolerance
     far_from_data: tuple[int, ...] = ()  # steps whose plan left the model's data behind
+    judgements: tuple[Judgement, ...] = ()  # K, whether it was healthy at every step
 
     @property
     def times(self) -> Array:
@@ -72,6 +74,11 @@ class Rollout:
     def seconds(self) -> Array:
         """Wall time of every decision (K,) [s]."""
         return np.array([timing.total for timing in self.timings])
+
+    @property
+    def judgement(self) -> FlightJudgement:
+        """Whether the flight is healthy, suspicious or lost, and why."""
+        return FlightJudgement.of(self.judgements)
 
     @property
     def failures(self) -> tuple[tuple[int, Status], ...]:
@@ -92,6 +99,7 @@ class Flight:
         simulator: Simulator,
         references: Reference,
         time_step: float,
+        judge: FlightJudge,
         on_step: Callable[[Step], None] | None = None,
         states: slice = slice(None),
     ):
@@ -105,7 +113,7 @@ class Flight:
             references,
             time_step,
         )
-        self._states, self._on_step = states, on_step
+        self._states, self._on_step, self._judge = states, on_step, judge
         own = range(len(simulator.mean))[states]
         self._angles = [i for i, j in enumerate(own) if j in simulator.angles]
 
@@ -115,11 +123,11 @@ class Flight:
         belief: Gaussian,
         input: Array,
         last: Command,
-        reference: Any = None,
+        ahead: Array,
     ) -> None:
         """Adds a step: mean and covariance where it began, what was measured, what was applied, the command.
 
-        By default its reference state (n,) is that of its number.
+        ``ahead`` are the reference states from this step on (H + 1, n).
         """
         part, k, decision = self._states, len(self.rows), last.decision
         learned = None if decision is None else decision.learned
@@ -128,10 +136,7 @@ class Flight:
         step = Step(
             time=round(k * self.time_step, 9),
             k=k,
-            reference=np.asarray(
-                self._references.states[k] if reference is None else reference,
-                dtype=float,
-            ),
+            reference=np.asarray(ahead[0], dtype=float),
             state=state[0][part],
             measured=measured,
             input=np.asarray(input, dtype=float),
@@ -142,6 +147,7 @@ class Flight:
             gp_version=0 if learned is None else learned.version,
             failed=last.failed,
             status=last.status,
+            judgement=self._judge.judge(measured, ahead, decision),
         )
         if self._on_step is not None:
             self._on_step(step)
@@ -190,6 +196,7 @@ class Flight:
             far_from_data=tuple(
                 step.k for step, left in zip(steps, far, strict=True) if left
             ),
+            judgements=tuple(step.judgement for step in steps),
         )
 
 
@@ -281,7 +288,8 @@ def closed_loop(
         )
     else:
         simulator = ModelSimulator(system, initial)
-    flight = Flight(simulator, references, system.time_step, on_step)
+    judge = _judge_of(controller, system)
+    flight = Flight(simulator, references, system.time_step, judge, on_step)
     _fly([flight], controller, references, steps, on_failure)
     if isinstance(flight.error, Diverged) and flight.rows:
         flight.error.flown = flight.rollout()
@@ -349,7 +357,13 @@ def closed_loops(
             PlantSimulator(plant, initial, disturbances, noise, seed) for seed in some
         ]
         flights = [
-            Flight(simulator, references, plant.time_step) for simulator in simulators
+            Flight(
+                simulator,
+                references,
+                plant.time_step,
+                _judge_of(controller, plant),
+            )
+            for simulator in simulators
         ]
         _fly(flights, controller, references, steps, on_failure)
         for seed, flight in zip(some, flights, strict=True):
@@ -358,6 +372,15 @@ def closed_loops(
             else:
                 finished.append(Trial(seed, None, f"{type(error).__name__}: {error}"))
     return finished
+
+
+def _judge_of(controller: Controller, system: System | ModelLoop) -> FlightJudge:
+    """Makes the judge of one flight."""
+    if isinstance(system, ModelLoop):
+        model = system.model
+        return FlightJudge.of(controller, model.state_dim, model.input_dim)
+    names = system.state_names, system.input_names
+    return FlightJudge.of(controller, len(names[0]), len(names[1]), names)
 
 
 def _fly(
@@ -405,7 +428,7 @@ def _fly(
             if isinstance(input, Diverged):
                 flight.error = input
             else:
-                flight.add(state, belief, input, outcome)
+                flight.add(state, belief, input, outcome, ahead.states)
 
 
 def _decide(

@@ -65,6 +65,7 @@ _ABSENT = {
     "origin": {},
     "code": "",
     "lost": "",
+    "suspicious": "",
     "error": "",
 } | dict.fromkeys(MEASURES)
 
@@ -75,9 +76,10 @@ class Report:
 
     ``runs`` has a row for every run that is there or was asked for, cell by cell and seed by seed. Its columns are
     ``cell``, the position in ``cells``; ``seed``, a text; ``state``: "finished", "failed", "missing" (there is nothing
-    of it) or "skipped" (it cannot be read); the measures, NaN where the run has none; ``lost`` and ``error``, since
-    when and why; ``folder``; ``unit`` of the errors; ``settings`` by dotted key; ``origin``: date, commit and machine;
-    ``code``: names the code that made it, "" where there is none or it does not tell.
+    of it) or "skipped" (it cannot be read); the measures, NaN where the run has none;
+    ``lost``, ``suspicious`` (at its end) and ``error``, since when and why; ``folder``; ``unit`` of the errors;
+    ``settings`` by dotted key; ``origin``: date, commit and machine; ``code``: names the code that made
+    it, "" where there is none or it does not tell.
     """
 
     tree: Path  #: where it is
@@ -277,8 +279,22 @@ def _run(path: Path, content: Mapping[str, Any]) -> Row:
     return (
         run
         | numbers
-        | {"state": "finished", "lost": lost, "unit": plain_text(content["unit"])}
+        | {
+            "state": "finished",
+            "lost": lost,
+            "suspicious": "" if lost else _suspicion(content),
+            "unit": plain_text(content["unit"]),
+        }
     )
+
+
+def _suspicion(content: Mapping[str, Any]) -> str:
+    """Returns since when and why a run was suspicious at its end, as far as it tells."""
+    judgement = content.get("judgement") or {}
+    if judgement.get("level") != "suspicious":
+        return ""
+    text = f"step {judgement.get('step')}, reason {judgement.get('reason')}"
+    return plain_text(text)
 
 
 def _origin(content: Mapping[str, Any]) -> dict[str, str]:

@@ -11,6 +11,7 @@ and the subsets of one seed are nested, so that sizes can be compared in pairs.
 import inspect
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal
 
@@ -26,8 +27,9 @@ from gpmpc.metrics import find_loss, time_quantiles, tracking_error, violation_r
 from gpmpc.models import CasadiFunction
 from gpmpc.models._residual import train_residual
 from gpmpc.mpc import Reference
+from gpmpc.mpc._cost import FunctionNotFinite
 from gpmpc.mpc._policy import OnFailure, check_policy
-from gpmpc.mpc.problem import Box
+from gpmpc.mpc.problem import Box, Halfspaces, Inequality, Problem
 from gpmpc.propagation import Propagator, best_propagator
 from gpmpc.simulation import (
     Disturbance,
@@ -364,8 +366,9 @@ def _fly(
 def metrics(experiment: Experiment, flown: Flown) -> dict[str, Any]:
     """Returns the results of a flight as plain data; everything that differs between equal runs is under ``times``.
 
-    ``lost`` says since when and why a flight no longer follows its reference (``find_loss``, or it diverged). One that
-    diverged has no RMSE: None.
+    ``judgement`` is what the steps said while it flew (``gpmpc.mpc.FlightJudge``); ``lost`` says since when and why a
+    flight no longer follows its reference (``find_loss``, by its judgement, or it diverged). One that diverged has no
+    RMSE: None.
     """
     rollout, problem, training = flown.rollout, flown.controller.problem, flown.training
     system, horizon, total = (
@@ -377,21 +380,7 @@ def metrics(experiment: Experiment, flown: Flown) -> dict[str, Any]:
     rmse: dict[str, Any] = dict(zip(system.tracked, axes, strict=True)) | {
         "total": total
     }
-    violations = {
-        "inputs": violation_rate(
-            rollout.inputs, *(side[0] for side in problem.inputs.by_stage(horizon))
-        )
-    }
-    if boxes := [
-        bounds.by_stage(horizon)
-        for bounds in problem.constraints
-        if isinstance(bounds, Box)
-    ]:
-        lower, upper = (
-            np.max([box[0][0] for box in boxes], axis=0),
-            np.min([box[1][0] for box in boxes], axis=0),
-        )
-        violations["states"] = violation_rate(rollout.states[1:], lower, upper)
+    violations = _violation_rates(problem, horizon, rollout)
     learned = None
     if training is not None:
         objective = [float(value) for value in training.objective]
@@ -407,6 +396,7 @@ def metrics(experiment: Experiment, flown: Flown) -> dict[str, Any]:
         "error_at_end": _error(experiment, flown, last=2)
         if np.isfinite(total)
         else None,
+        "judgement": _judgement(flown),
         "lost": _lost(experiment, flown),
         "outlook": asdict(flown.outlook) | {"warnings": [*flown.outlook.warnings]},
         "violations": {
@@ -437,6 +427,72 @@ def metrics(experiment: Experiment, flown: Flown) -> dict[str, Any]:
     }
 
 
+def _violation_rates(
+    problem: Problem, horizon: int, rollout: Rollout
+) -> dict[str, Any]:
+    """Returns how often bounds of inputs and constraints of states were broken, by name.
+
+    Of states the flown ones count, with the sides that a first predicted state has: a
+    constraint of later stages alone asks nothing of them. All boxes are one, "states";
+    of another kind each constraint is counted for itself.
+    """
+    lower, upper = problem.inputs.by_stage(horizon)
+    rates = {"inputs": violation_rate(rollout.inputs, lower[0], upper[0])}
+    states = rollout.states[1:]
+    held = [
+        constraint
+        for constraint in problem.constraints
+        if constraint.stages is None or 1 in constraint.stages
+    ]
+    boxes = [part.by_stage(horizon) for part in held if isinstance(part, Box)]
+    if boxes:
+        tightest_lower = np.max([lower[0] for lower, _ in boxes], axis=0)
+        tightest_upper = np.min([upper[0] for _, upper in boxes], axis=0)
+        rates["states"] = violation_rate(states, tightest_lower, tightest_upper)
+    others: list[tuple[str, list[Any]]] = [
+        ("half-spaces", [part for part in held if isinstance(part, Halfspaces)]),
+        ("inequality", [part for part in held if isinstance(part, Inequality)]),
+    ]
+    for kind, constraints in others:
+        for number, constraint in enumerate(constraints, start=1):
+            name = kind if len(constraints) == 1 else f"{kind} {number}"
+            excess = _excess(constraint, states, rollout.inputs)
+            unbounded = np.full(excess.shape[1], -np.inf)
+            rates[name] = violation_rate(excess, unbounded, np.zeros(len(unbounded)))
+    return rates
+
+
+def _excess(
+    constraint: Halfspaces | Inequality, states: np.ndarray, inputs: np.ndarray
+) -> np.ndarray:
+    """Returns by how much each state (K, n) misses each side (K, r).
+
+    Negative where a side is kept, NaN where a function or its gradient is not finite.
+    """
+    if isinstance(constraint, Halfspaces):
+        return states @ constraint.F.T - np.atleast_2d(constraint.f)[0]
+    with suppress(FunctionNotFinite):
+        return constraint.expand(states, inputs, parameters=None)[0]
+    excess = np.full((len(states), constraint.count), np.nan)
+    for k in range(len(states)):  # which of them are finite, they say alone
+        with suppress(FunctionNotFinite):
+            excess[k] = constraint.expand(
+                states[k : k + 1], inputs[k : k + 1], parameters=None
+            )[0][0]
+    return excess
+
+
+def _judgement(flown: Flown) -> dict[str, Any]:
+    """Returns level, reason, first step and counts of what the steps said of a flight."""
+    judgement = flown.rollout.judgement
+    if flown.diverged is not None and judgement.level != "lost":
+        reason = " ".join(str(flown.diverged).split())
+        judgement = judgement._replace(
+            level="lost", reason=reason, step=flown.diverged.step
+        )
+    return judgement._asdict()
+
+
 def _lost(experiment: Experiment, flown: Flown) -> dict[str, Any] | None:
     """Returns step, time [s] and reason of a flight's loss; None where it was not lost."""
     system, rollout, found = experiment.system, flown.rollout, []
@@ -448,10 +504,14 @@ def _lost(experiment: Experiment, flown: Flown) -> dict[str, Any] | None:
                 f"{loss.distance:.3g} {unit} from its reference, more than {loss.limit:.3g} {unit}",
             )
         )
+    judgement = rollout.judgement
+    if judgement.level == "lost" and judgement.step is not None:
+        found.append((judgement.step, judgement.reason))
     if flown.diverged is not None:
         found.append((flown.diverged.step, " ".join(str(flown.diverged).split())))
     if not found:
         return None
+    found.sort(key=lambda loss: loss[0])
     step, reasons = found[0][0], "; ".join(reason for _, reason in found)
     return {"step": step, "time": round(step * rollout.time_step, 9), "reason": reasons}
 
@@ -498,6 +558,7 @@ def summary(result: Mapping[str, Any]) -> Table:
         "before the flight": "; ".join(result.get("outlook", {}).get("warnings", ())),
         "lost": lost
         and f"from step {lost['step']} ({lost['time']:g} s) on: {lost['reason']}",
+        "judgement": _judged(result),
         f"RMSE [{unit}]": "none: it diverged"
         if rmse["total"] is None
         else f"{rmse['total']:.3g}  ({axes})",
@@ -508,8 +569,11 @@ def summary(result: Mapping[str, Any]) -> Table:
     }
     for name, rate in result["violations"].items():
         interval = f"{100 * rate['low']:.2g} to {100 * rate['high']:.2g} %"
-        lines[f"bounds of {name}"] = (
-            f"{rate['violations']} of {rate['steps']} steps outside (95 %: {interval})"
+        label = f"bounds of {name}" if name in ("inputs", "states") else name
+        largest = f", by up to {rate['worst']:.3g}" if rate["violations"] else ""
+        lines[label] = (
+            f"{rate['violations']} of {rate['steps']} steps outside "
+            f"(95 %: {interval}){largest}"
         )
     lines |= {
         "failed solves": _counted(result["failures"]) or "none",
@@ -520,6 +584,18 @@ def summary(result: Mapping[str, Any]) -> Table:
         "decision [ms]": f"median {median}  ({stages}), 99 % below {most}",
     }
     return Table(("", ""), [(name, text) for name, text in lines.items() if text])
+
+
+def _judged(result: Mapping[str, Any]) -> str | None:
+    """Returns what the steps said of their flight, in words; None where it is told as lost, or nobody judged it."""
+    judgement = result.get("judgement")
+    if judgement is None or result.get("lost"):
+        return None
+    if judgement["level"] == "suspicious":
+        return f"suspicious from step {judgement['step']} on: {judgement['reason']}"
+    if judgement["suspicious"]:
+        return f"healthy at the end; {judgement['suspicious']} steps were suspicious"
+    return "healthy"
 
 
 def _counted(statuses: Mapping[str, int]) -> str:

@@ -115,12 +115,14 @@ def _made(report: Report) -> list[str]:
 
 
 def _states(report: Report) -> pd.DataFrame:
-    """Returns how many runs of every cell finished, were lost, failed, are missing and were skipped."""
+    """Returns how many runs of every cell finished, were lost or suspicious, failed, are missing and were skipped."""
     runs = report.runs
     counts = pd.crosstab(runs.cell, runs.state).reindex(
         columns=["finished", "failed", "missing", "skipped"], fill_value=0
     )
     counts.insert(1, "lost", (runs.lost != "").groupby(runs.cell).sum())
+    suspicious = (runs.suspicious != "").groupby(runs.cell).sum()
+    counts.insert(2, "suspicious", suspicious)
     return counts
 
 
@@ -129,7 +131,12 @@ def _counts(report: Report) -> str:
     count = _states(report).sum()
     text = f"{count.finished} finished in {len(report.cells)} cells, {count.failed} failed, {count.missing} missing"
     text += f", {len(report.skipped)} skipped" if report.skipped else ""
-    return text + (f"; of those finished, {count.lost} lost" if count.lost else "")
+    judged = [
+        f"{number} {word}"
+        for number, word in ((count.lost, "lost"), (count.suspicious, "suspicious"))
+        if number
+    ]
+    return text + (f"; of those finished, {', '.join(judged)}" if judged else "")
 
 
 def terminal_table(report: Report) -> Table:
@@ -158,6 +165,11 @@ def notes(report: Report) -> dict[str, list[str]]:
             f"{plain_text(run.folder.name)}: {run.lost}"
             for run in report.there
             if run.lost
+        ],
+        "Suspicious": [
+            f"{plain_text(run.folder.name)}: {run.suspicious}"
+            for run in report.there
+            if run.suspicious
         ],
         "Skipped": list(report.skipped),
         "Mixed code": _mixed_code(report),

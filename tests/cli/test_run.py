@@ -38,7 +38,9 @@ def test_a_lost_flight_is_finished_and_readable_and_has_an_exit_code_of_its_own(
     done = forked("run", *TINY, *choices, "steps=9", cwd=tmp_path)
     assert done.returncode == 3, done.stderr
     assert "lost " in done.stdout
-    assert done.stderr == ""
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("gpmpc: lost: from step ")
+    assert reason in line
     (folder,) = (tmp_path / "tree").iterdir()
     found = json.loads(
         (folder / "metrics.json").read_text(), parse_constant=pytest.fail
@@ -53,6 +55,22 @@ def test_a_lost_flight_is_finished_and_readable_and_has_an_exit_code_of_its_own(
     assert "finished before" in again.stdout
     assert forked("plot", str(folder), cwd=tmp_path).returncode == 0
     assert forked("report", "tree", cwd=tmp_path).returncode == 0
+
+
+def test_a_sweep_names_the_flights_that_were_lost_also_when_they_were_flown_before(
+    tmp_path,
+):
+    sweep = ["run", "-m", *TINY, "plant.mass=0.74,100", "trajectory=hover", "steps=9"]
+    for before in (0, 2):
+        done = forked(*sweep, "recorder=none", cwd=tmp_path)
+        assert done.returncode == 0, done.stderr
+        total = (
+            f"2 runs: {2 - before} flown, {before} finished before, 0 failed, 1 lost;"
+        )
+        assert total in done.stdout
+        (line,) = done.stderr.splitlines()
+        assert "mass=100" in line
+        assert ": lost: from step " in line
 
 
 def test_a_flight_is_predicted_and_what_cannot_be_predicted_or_filmed_is_said_in_one_line(

@@ -279,11 +279,13 @@ def test_wall_times_are_not_compared(tmp_path):
 
 def test_a_report_says_of_every_run_what_became_of_it(tmp_path):
     tree = tmp_path / "tree"
+    odd = {"level": "suspicious", "step": 7, "reason": "innovations"}
     for seed, error in enumerate([0.1, 0.2, 0.4]):
         made_up_run(
             tree,
             *chosen("convex", seed, horizon=10),
-            result=metrics_of(error, failing=2 * (seed == 2)),
+            result=metrics_of(error, failing=2 * (seed == 2))
+            | ({"judgement": odd} if seed == 1 else {}),
         )
     lost = {"lost": {"step": 3, "reason": "away"}}
     made_up_run(tree, *chosen("lqr", 0, horizon=10), result=metrics_of(0.5) | lost)
@@ -305,16 +307,17 @@ def test_a_report_says_of_every_run_what_became_of_it(tmp_path):
         r"## Made\n\n(.*?)(?=## To)", document.markdown(), flags=re.DOTALL
     )
     assert head == (
-        "# tree\n\n4 finished in 2 cells, 1 failed, 2 missing, 1 skipped; of those finished, 1 lost."
+        "# tree\n\n4 finished in 2 cells, 1 failed, 2 missing, 1 skipped; of those finished, 1 lost, 1 suspicious."
         " All of them: horizon=10.\n\n"
         "| controller | seeds | RMSE [m] | steps outside bounds [%] | failed solves [%] | decision, median [ms] |\n"
         "| --- | --- | --- | --- | --- | --- |\n"
-        "| convex | 3, 1 missing | 0.2 [0.15, 0.3] | 0 | 0 [0, 5] | 3.1 |\n"
+        "| convex | 3, 1 suspicious, 1 missing | 0.2 [0.15, 0.3] | 0 | 0 [0, 5] | 3.1 |\n"
         "| lqr | 1, 1 lost, 1 failed, 1 missing, 1 skipped | 0.5 | 0 | 0 | 3.1 |\n\n"
         "Median [first to third quartile] over the seeds. In figures, every run is a dot.\n\n"
         "## Comparison\n\n- a line\n\n"
         "## Failed\n\n- controller=lqr,horizon=10,seed=1: no luck\n\n"
         "## Lost\n\n- controller=lqr,horizon=10,seed=0: step 3, reason away\n\n"
+        "## Suspicious\n\n- controller=convex,horizon=10,seed=1: step 7, reason innovations\n\n"
         f"## Skipped\n\n- {damaged}: is not what a run writes: JSONDecodeError: Expecting property name enclosed in"
         " double quotes: line 1 column 2 (char 1)\n\n"
     )
@@ -332,12 +335,13 @@ def test_a_report_says_of_every_run_what_became_of_it(tmp_path):
     assert origins[0]["machine"].endswith(" cores")
     header, convex, lqr = document.csv().splitlines()
     assert header.startswith(
-        "controller,finished,lost,failed,missing,skipped,rmse_q25 [m],rmse_median [m],rmse_q75 [m]"
+        "controller,finished,lost,suspicious,failed,missing,skipped,"
+        "rmse_q25 [m],rmse_median [m],rmse_q75 [m]"
     )
     assert "failed_q25 [%],failed_median [%],failed_q75 [%],decision_q25 [ms]" in header
-    assert convex.split(",")[:6] == ["convex", "3", "0", "0", "1", "0"]
-    assert lqr.split(",")[:6] == ["lqr", "1", "1", "1", "1", "1"]
-    assert [float(value) for value in convex.split(",")[6:9]] == pytest.approx(
+    assert convex.split(",")[:7] == ["convex", "3", "0", "1", "0", "1", "0"]
+    assert lqr.split(",")[:7] == ["lqr", "1", "1", "0", "1", "1", "1"]
+    assert [float(value) for value in convex.split(",")[7:10]] == pytest.approx(
         [0.15, 0.2, 0.3]
     )
     assert "outside" not in document.tex()
@@ -351,14 +355,14 @@ def test_a_report_says_of_every_run_what_became_of_it(tmp_path):
     ]
     assert short.rows[0] == [
         "convex",
-        "3\n1 missing",
+        "3\n1 suspicious\n1 missing",
         "0.2\n[0.15, 0.3]",
         "0\n[0, 5]",
         "3.1",
     ]
     assert (
         short.title
-        == "4 finished in 2 cells, 1 failed, 2 missing, 1 skipped; of those finished, 1 lost"
+        == "4 finished in 2 cells, 1 failed, 2 missing, 1 skipped; of those finished, 1 lost, 1 suspicious"
     )
     assert (
         document.links["controller=lqr,horizon=10,seed=1"]

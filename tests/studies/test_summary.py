@@ -8,8 +8,8 @@ import pytest
 from rich.console import Console
 
 from gpmpc.exceptions import Diverged
-from gpmpc.mpc import Timing
-from gpmpc.mpc.problem import Box
+from gpmpc.mpc import FlightJudgement, Judgement, Timing
+from gpmpc.mpc.problem import Box, Halfspaces, Inequality
 from gpmpc.simulation import Rollout
 from gpmpc.status import Status
 from gpmpc.studies._document import terminal
@@ -98,7 +98,30 @@ def test_everything_that_a_result_may_hold_has_its_line():
     }
     bare |= {"episodes": [], "suboptimal": {}, "far_from_data": 0}
     names = ["flight", "RMSE [m]", "bounds of inputs", "failed solves", "decision [ms]"]
-    assert [name for name, _ in summary(bare).rows] == names
+    unjudged = {key: bare[key] for key in bare if key != "judgement"}
+    assert [name for name, _ in summary(unjudged).rows] == names
+
+
+@pytest.mark.parametrize(
+    ("judgement", "line"),
+    [
+        (FlightJudgement(), "healthy"),
+        (
+            FlightJudgement(suspicious=3),
+            "healthy at the end; 3 steps were suspicious",
+        ),
+        (
+            FlightJudgement("suspicious", "why", 5, 15),
+            "suspicious from step 5 on: why",
+        ),
+        (FlightJudgement("lost", "away", 5, 2, 13), None),  # which is said above
+    ],
+)
+def test_how_a_flight_was_judged_is_said_in_a_line(judgement, line):
+    lost = {"step": 5, "time": 1.0, "reason": "away"} if line is None else None
+    result = metrics_of(0.125) | {"judgement": judgement._asdict(), "lost": lost}
+    lines = dict(summary(result | {"settings": {"options": OPTIONS}}).rows)
+    assert lines.get("judgement") == line
 
 
 @pytest.mark.parametrize(
@@ -114,6 +137,34 @@ def test_states_are_counted_outside_the_tightest_bounds_that_all_boxes_have_now(
     assert (found["states"]["violations"], found["states"]["steps"]) == (outside, 20)
     assert found["states"]["rate"] == outside / 20
     assert "states" not in metrics_of(error)["violations"]
+
+
+@pytest.mark.parametrize(("error", "outside"), [(0.3, 0), (0.6, 20)])
+def test_every_kind_of_constraint_says_how_often_flown_states_missed_it(error, outside):
+    below = Halfspaces([[1.0, 0, 0, 0, 0, 0], [-1.0, 0, 0, 0, 0, 0]], [0.5, 9.0])
+    near = Inequality(lambda x: x[:, 0].abs() - 0.25)
+    later = Box(np.full(6, 1.0), np.full(6, 2.0), stages=[2])  # asks no first state
+    result = metrics_of(error, constraints=[below, near, later, below])
+    found = result["violations"]
+    assert list(found) == ["inputs", "half-spaces 1", "half-spaces 2", "inequality"]
+    assert found["half-spaces 1"] == found["half-spaces 2"]
+    assert found["half-spaces 1"]["violations"] == outside
+    assert found["half-spaces 1"]["worst"] == pytest.approx(max(0.0, error - 0.5))
+    assert found["inequality"]["rate"] == 1.0
+    assert found["inequality"]["worst"] == pytest.approx(error - 0.25)
+    lines = said(result)
+    assert lines["inequality"].startswith("20 of 20 steps outside (95 %: ")
+    assert lines["inequality"].endswith(f"by up to {error - 0.25:.3g}")
+
+
+def test_a_state_at_which_a_constraint_is_no_number_does_not_keep_it():
+    states = np.zeros((5, 6))
+    states[:, 0] = 1.0, 4.0, -1.0, 9.0, -4.0  # the first is no result
+    root = Inequality(lambda x: x[:, 0].sqrt() - 2.5)
+    errors = (states - rollout_of(np.zeros((5, 3))).references)[:, ::2]
+    rate = measured(rollout_of(errors), constraints=[root])["violations"]["inequality"]
+    assert (rate["violations"], rate["steps"]) == (3, 4)
+    assert rate["worst"] == pytest.approx(0.5)
 
 
 def rollout_of(errors, **changes):
@@ -133,8 +184,12 @@ def rollout_of(errors, **changes):
     } | changes)  # fmt: skip
 
 
-def measured(rollout, training=None, diverged=None, before=(), system=PLANT):
-    problem = SimpleNamespace(inputs=Box(np.zeros(3), np.full(3, 10.0)), constraints=())
+def measured(
+    rollout, training=None, diverged=None, before=(), system=PLANT, constraints=()
+):
+    problem = SimpleNamespace(
+        inputs=Box(np.zeros(3), np.full(3, 10.0)), constraints=constraints
+    )
     controller = SimpleNamespace(problem=problem, horizon=2)
     experiment = Experiment(
         None, None, system, None, lambda plant: None, steps=len(rollout.inputs)
@@ -156,10 +211,12 @@ def test_the_metrics_of_a_flight_are_written_out_in_full():
         Status.ITERATION_LIMIT,
         Status.INFEASIBLE,
     )
+    odd = Judgement("suspicious", "odd")
     solves = {
         "statuses": statuses,
         "suboptimal": (2,),
         "far_from_data": (0, 3),
+        "judgements": (odd, Judgement(), odd, odd),
         "iterations": np.array([1, 2, 3, 10]),
     }
     training = SimpleNamespace(
@@ -180,6 +237,13 @@ def test_the_metrics_of_a_flight_are_written_out_in_full():
         "unit": "m",
         "rmse": pytest.approx({"x": 1.5, "y": 3.0, "z": 2.0, "total": np.sqrt(61 / 4)}),
         "error_at_end": pytest.approx(6.0),
+        "judgement": {
+            "level": "suspicious",
+            "reason": "odd",
+            "step": 2,
+            "suspicious": 3,
+            "lost": 0,
+        },
         "lost": None,
         "outlook": {
             "spectral_radius": None,
@@ -236,3 +300,18 @@ def test_a_loss_is_told_from_the_first_step_beyond_and_a_divergence_besides():
         dict.fromkeys(["x", "y", "z", "total"]),
         None,
     )
+
+
+def test_a_flight_that_its_judge_calls_lost_is_lost_and_one_that_diverged_is_judged_so():
+    gone = Judgement("lost", "ever faster away")
+    near = [[0, 0, 0], [0, 0, 1], [0, 0, 2], [0, 2, 0]]
+    found = measured(rollout_of(near, judgements=(Judgement(), gone, gone)))
+    assert found["lost"] == {"step": 1, "time": 0.2, "reason": "ever faster away"}
+    both = measured(
+        rollout_of([*near, [0, 40, 0]], judgements=(Judgement(), gone, gone, gone))
+    )
+    assert both["lost"]["step"] == 1
+    assert both["lost"]["reason"].startswith("ever faster away; 40 m from")
+    diverged = measured(rollout_of(near), diverged=Diverged(3, "not finite any more"))
+    assert diverged["judgement"]["level"] == "lost"
+    assert diverged["judgement"]["step"] == 3

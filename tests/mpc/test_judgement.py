@@ -1,0 +1,289 @@
+"""A flight is called suspicious or lost when something breaks, and healthy as long as nothing does."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from benchmarks.judgement import Frozen, Late, Reversed, tank
+from gpmpc.gp.casadi_ import successor_function
+from gpmpc.models import CasadiFunction, KnownModel
+from gpmpc.mpc import (
+    GPMPC,
+    Box,
+    ControlLoop,
+    Decision,
+    FlightJudge,
+    FlightJudgement,
+    Halfspaces,
+    Judgement,
+    PredictionSettings,
+    Problem,
+    Reference,
+    Timing,
+    Tracking,
+)
+from gpmpc.propagation import Linearization
+from gpmpc.simulation import (
+    Disturbance,
+    Dropout,
+    Gust,
+    Noise,
+    Replaced,
+    closed_loop,
+    closed_loops,
+)
+from gpmpc.status import Status
+from gpmpc.systems import double_integrator
+
+PLANT = double_integrator()
+T = PLANT.time_step
+NOISE = Noise(measurement=[0.003, 0.003])
+WAY = np.zeros((161, 2))  # to and fro, so that something moves at every step
+WAY[:, 0] = np.sin(0.6 * T * np.arange(161))
+WAY[:, 1] = 0.6 * np.cos(0.6 * T * np.arange(161))
+
+
+def controller(horizon=15, **settings):
+    model = KnownModel(CasadiFunction(successor_function(PLANT)), 2, 1)
+    problem = Problem(
+        Tracking([1.0, 0.1], [0.01]), inputs=Box([-1.0], [1.0]), **settings
+    )
+    prediction = PredictionSettings(covariance="none")
+    return GPMPC(model, Linearization(), problem, horizon, [0.0], prediction)
+
+
+CONTROLLER = controller()
+
+
+def fly(*disturbances, noise=NOISE, steps=80, seed=0, references=WAY, law=CONTROLLER):
+    return closed_loop(
+        PLANT,
+        law,
+        references,
+        WAY[0],
+        steps,
+        noise=noise,
+        disturbances=disturbances,
+        on_failure="previous_plan",
+        seed=seed,
+    )
+
+
+def levels(rollout):
+    return [judgement.level for judgement in rollout.judgements]
+
+
+class Glitch(Disturbance):
+    """One wrong measurement."""
+
+    def disturb_measurement(self, state, time):
+        is_wrong = time == pytest.approx(40 * T)
+        return np.array([state[0] + 0.5 * is_wrong, state[1]])
+
+
+class Rounded(Disturbance):
+    """A position that is shown in coarse steps."""
+
+    def disturb_measurement(self, state, time):
+        return np.array([np.round(state[0], 2), state[1]])
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("noise", [None, NOISE])
+def test_a_flight_in_which_nothing_breaks_is_healthy_at_every_step(noise, seed):
+    rollout = fly(noise=noise, seed=seed)
+    assert levels(rollout) == ["healthy"] * 80
+    assert rollout.judgement == FlightJudgement()
+
+
+@pytest.mark.parametrize("nothing", [Glitch(), Rounded()])
+def test_one_wrong_measurement_or_a_coarse_sensor_is_no_alarm(nothing):
+    assert fly(nothing).judgement == FlightJudgement()
+
+
+@pytest.mark.parametrize(
+    "broken",
+    [
+        Reversed(0, 40 * T),
+        Frozen([0], 40 * T),
+        Late(4, 40 * T),
+        Replaced(replace(PLANT, dynamics=replace(PLANT.dynamics, mass=2.0)), 40 * T),
+        Gust({"velocity": 1.0}, 40 * T, np.inf),
+    ],
+)
+@pytest.mark.parametrize("seed", range(2))
+def test_what_breaks_is_called_within_twenty_steps(broken, seed):
+    told = levels(fly(broken, seed=seed))
+    assert told[:40] == ["healthy"] * 40
+    assert set(told[40:60]) > {"healthy"}
+
+
+def test_a_plant_that_no_longer_obeys_is_lost_and_says_since_when():
+    rollout = fly(Reversed(0, 40 * T), steps=120)
+    judgement = rollout.judgement
+    assert judgement.level == "lost"
+    assert judgement.step == levels(rollout).index("lost") > 40
+    assert (judgement.suspicious, judgement.lost) == (
+        levels(rollout).count("suspicious"),
+        levels(rollout).count("lost"),
+    )
+    assert judgement.reason.startswith("ever faster away from its reference")
+
+
+def test_a_gust_is_suspicious_and_over_when_it_is_over():
+    rollout = fly(Gust({"velocity": 0.5}, 40 * T, 55 * T))
+    assert "lost" not in levels(rollout)
+    assert "suspicious" in levels(rollout)[40:60]
+    assert rollout.judgement == FlightJudgement(suspicious=rollout.judgement.suspicious)
+
+
+def test_reasons_name_states_and_inputs():
+    frozen = fly(Frozen([0], 40 * T)).judgements[44]
+    assert frozen.reason.startswith("position is measured the same for 4 steps")
+    judge = FlightJudge(CONTROLLER.problem)
+    assert "state 0" in judged_alone(judge, frozen_from=20)[-1].reason
+
+
+def judged_alone(judge, frozen_from):
+    """Judgements of a point that is to stand still, and whose first sensor freezes."""
+    rng, told = np.random.default_rng(0), []
+    for k in range(30):
+        measured = rng.normal(0.0, 0.01, 2)
+        if k >= frozen_from:
+            measured[0] = 0.005
+        told.append(judge.judge(measured, np.zeros(2), plan_of(measured)))
+    return told
+
+
+def plan_of(state, **changes):
+    H = 5
+    return Decision(
+        np.zeros(1), np.zeros((H, 1)), np.tile(state, (H + 1, 1)), np.zeros((H + 1, 2, 2)),
+        **({"status": Status.SOLVED, "iterations": 1, "timing": Timing()} | changes),
+    )  # fmt: skip
+
+
+def test_a_sensor_that_freezes_is_named_after_four_steps():
+    told = judged_alone(FlightJudge(CONTROLLER.problem), frozen_from=20)
+    assert {judgement.level for judgement in told[:24]} == {"healthy"}
+    assert told[24].reason.startswith("state 0 is measured the same for 4 steps")
+
+
+def test_decisions_that_cannot_be_applied_are_suspicious_from_the_third_on():
+    judge = FlightJudge(CONTROLLER.problem)
+    for k in range(20):
+        status = Status.INFEASIBLE if k >= 10 else Status.SOLVED
+        told = judge.judge(
+            np.zeros(2), np.zeros(2), plan_of(np.zeros(2), status=status)
+        )
+        assert told.level == ("suspicious" if k >= 12 else "healthy")
+    assert told.reason == "8 of the last 8 decisions could not be applied"
+    for _ in range(8):
+        told = judge.judge(np.zeros(2), np.zeros(2), plan_of(np.zeros(2)))
+    assert told == Judgement()
+
+
+def test_plans_far_from_all_data_are_suspicious_until_it_is_where_it_should_be():
+    for place, level in ([0.0, "healthy"], [1.0, "suspicious"]):
+        judge, x = FlightJudge(CONTROLLER.problem), np.array([place, 0.0])
+        plan = plan_of(x, novelty=0.95)
+        told = [judge.judge(x, np.zeros(2), plan).level for _ in range(4)]
+        assert told == ["healthy", "healthy", level, level]
+
+
+def test_a_flight_without_measurements_is_judged_again_when_they_are_back():
+    rollout = fly(Dropout(30 * T, 40 * T))
+    told = levels(rollout)
+    assert told[31:33] == ["healthy", "suspicious"]
+    assert "lost" not in told
+    assert told[-20:] == ["healthy"] * 20
+
+
+def test_a_constraint_that_plans_keep_missing_is_suspicious():
+    wall = Halfspaces([[1.0, 0.0]], [-0.5])  # the way leads through it
+    beyond = fly(law=controller(constraints=[wall]), references=np.zeros(2), noise=None)
+    assert "healthy" in levels(beyond)
+    impossible = Halfspaces([[1.0, 0.0], [-1.0, 0.0]], [-0.5, -0.5])
+    told = fly(law=controller(constraints=[impossible]), noise=None).judgements
+    assert any("plans miss a constraint" in judgement.reason for judgement in told)
+
+
+@pytest.mark.parametrize(
+    ("horizon", "level"), [(10, "lost"), (30, "lost"), (80, "healthy")]
+)
+def test_a_tank_that_runs_away_while_every_program_is_solved_is_lost(horizon, level):
+    rollout = tank(horizon)
+    assert all(status.solved for status in rollout.statuses)
+    assert rollout.judgement.level == level
+    if level == "lost":
+        assert "the horizon is too short for the plant" in rollout.judgement.reason
+
+
+@pytest.mark.parametrize("preview", [True, False])
+def test_a_jump_of_the_set_point_is_no_alarm(preview):
+    states = np.zeros((121, 2))
+    states[40:, 0] = 1.0
+    if preview:
+        told = fly(references=states, noise=None).judgements
+    else:
+        told, x, loop = [], np.zeros(2), ControlLoop(CONTROLLER)
+        for k in range(80):
+            u = loop.input(x, states[k])
+            told.append(loop.judgement)
+            x = np.array([x[0] + T * x[1] + T**2 / 2 * u[0], x[1] + T * u[0]])
+    assert {judgement.level for judgement in told} == {"healthy"}
+
+
+def test_every_loop_judges_alike():
+    broken = Reversed(0, 40 * T)
+    alone = fly(broken, seed=3)
+    many = closed_loops(
+        PLANT, CONTROLLER, WAY, WAY[0], 80, [1, 3], noise=NOISE, disturbances=[broken]
+    )
+    assert many[1].result.judgements == alone.judgements
+    loop = ControlLoop(CONTROLLER)
+    for k, measured in enumerate(alone.measured):
+        loop.input(measured, Reference(WAY[k : k + 16]))
+        assert loop.judgement.level == alone.judgements[k].level
+
+
+def test_what_a_judge_saw_of_a_flight_is_no_part_of_the_next():
+    first, again = fly(Frozen([0], 40 * T)), fly()
+    assert first.judgement.level != "healthy"
+    assert again.judgement.level == "healthy"
+
+
+def test_a_controller_without_a_problem_is_judged_by_its_innovations():
+    class Standing:
+        horizon = 5
+
+        def control(self, belief, reference, previous=None):
+            return plan_of(belief.mean.numpy())
+
+    still = closed_loop(PLANT, Standing(), np.zeros(2), np.zeros(2), 40, noise=NOISE)
+    assert still.judgement.level == "healthy"
+    pushed = [Gust({"velocity": 0.5}, 2.0)]
+    moved = closed_loop(
+        PLANT,
+        Standing(),
+        np.zeros(2),
+        np.zeros(2),
+        40,
+        noise=NOISE,
+        disturbances=pushed,
+    )
+    assert moved.judgement.level == "suspicious"
+
+
+def test_a_flight_is_what_its_steps_say():
+    well, odd, gone = Judgement(), Judgement("suspicious", "a"), Judgement("lost", "b")
+    of = FlightJudgement.of
+    assert of([]) == of([well, well]) == FlightJudgement()
+    assert of([odd, well]) == FlightJudgement(suspicious=1)
+    assert of([odd, well, odd, odd]) == FlightJudgement("suspicious", "a", 2, 3)
+    assert of([odd, gone, gone]) == FlightJudgement("lost", "b", 1, 1, 2)
+    back = FlightJudgement("lost", "b; back from step 2 on", 1, 0, 1)
+    assert of([well, gone, well]) == back
+    assert str(odd) == "suspicious: a"
+    assert str(well) == "healthy"
