@@ -312,7 +312,9 @@ class FlightJudge:
             if decision.applicable:
                 self._means = _float64(decision.means)
                 self._covariances = _float64(decision.covariances)
-                novelty = float(decision.novelty)
+                # One that would have to be measured first is not worth the time here.
+                if not callable(decision.plan_novelty):
+                    novelty = float(decision.plan_novelty)
                 violation = float(decision.violation) if self._constrained else 0.0
         references = _float64(reference)
         if references.ndim == 1:
@@ -344,7 +346,10 @@ class FlightJudge:
 
 
 def _learned_noise(controller: Any) -> Array | None:
-    """Variances (n,) of the noise that a controller's model has learned; None where there is no such model."""
+    """Variances (n,) of the noise that a controller's model has learned, where its plans do not hold them.
+
+    None where there is no such model.
+    """
     steering = getattr(controller, "controller", controller)  # of one that learns
     prediction = getattr(steering, "prediction", None)
     model = getattr(steering, "model", None) or getattr(prediction, "model", None)
@@ -352,7 +357,15 @@ def _learned_noise(controller: Any) -> Array | None:
         noise = getattr(model, "noise_covariance", None)
     except UnsupportedModel:  # it depends on the state
         noise = None
-    return None if noise is None else to_array(noise).diagonal().copy()
+    if noise is None:
+        return None
+    variances = to_array(noise).diagonal().copy()
+    settings = getattr(prediction, "settings", None)
+    propagator = getattr(prediction, "propagator", None)
+    planned = settings is not None and settings.covariance != "none"
+    if planned and getattr(propagator, "process_noise", False):
+        return np.zeros_like(variances)
+    return variances
 
 
 _ALL_WELL = Judgement()

