@@ -1,0 +1,150 @@
+"""An iteration says that it has arrived, takes as many programs as a step needs, and what it hands out is what it says."""
+
+import numpy as np
+import pytest
+import torch
+
+from gpmpc.gaussian import Gaussian
+from gpmpc.models import KnownModel
+from gpmpc.mpc import (
+    GPMPC,
+    Box,
+    Inequality,
+    PredictionSettings,
+    Problem,
+    Reference,
+    Tracking,
+)
+from gpmpc.propagation import Linearization
+from gpmpc.status import Status
+from gpmpc.systems import planar_quadrotor, step
+from tests.mpc.test_starts import known
+
+MEANS = PredictionSettings(covariance="none")
+
+
+def cart(force):
+    """Position and velocity under a drag, 10 Hz, pushed by a function of the input."""
+
+    def next_state(x, u):
+        position, velocity = x.unbind(-1)
+        moved = velocity + 0.1 * (force(u[..., 0]) - 0.3 * velocity)
+        return torch.stack([position + 0.1 * velocity, moved], -1)
+
+    return KnownModel(next_state, 2, 1)
+
+
+@pytest.mark.parametrize(
+    "force",
+    [lambda u: 2 * torch.tanh(u / 2), lambda u: 3 * torch.sin(u / 3)],
+    ids=["tanh", "sin"],
+)
+@pytest.mark.parametrize("tolerance", [1e-4, 1e-6])
+def test_an_input_that_saturates_is_no_reason_to_creep(force, tolerance):
+    """Gauss-Newton alone creeps at a rate of .64 here, or overshoots by 1.64, for ever."""
+    problem = Problem(Tracking([10.0, 1.0], [0.01]), inputs=Box([-5.0], [5.0]))
+    plans = []
+    for count in (100, 400):
+        controller = GPMPC(
+            cart(force), Linearization(), problem, 8, [0.0], MEANS,
+            iterations=count, tolerance=tolerance / (1 if count == 100 else 1e3),
+        )  # fmt: skip
+        decision = controller.control(
+            Gaussian.certain([1.0, 0.0]), Reference(np.zeros(2))
+        )
+        plans.append(decision)
+    assert plans[0].status is Status.SOLVED
+    assert plans[0].iterations <= 25
+    assert np.abs(plans[0].inputs - plans[1].inputs).max() < 100 * tolerance
+
+
+def flown(iterations, tolerance=None):
+    """Cost and programs of a planar quadrotor that jumps from set point to set point."""
+    system = planar_quadrotor()
+    problem = Problem(
+        Tracking([10.0, 1.0, 10.0, 1.0, 1.0, 0.1], [0.1, 0.1]),
+        Box(system.input_lower, system.input_upper),
+    )
+    controller = GPMPC(
+        known(system), Linearization(), problem, 15, system.initial_input, MEANS,
+        iterations=iterations, tolerance=tolerance,
+    )  # fmt: skip
+    state, decision, cost, programs = np.zeros(6), None, 0.0, []
+    for k in range(60):
+        goal = np.zeros(6)
+        goal[[0, 2]] = [(0.0, 0.0), (1.5, 0.5), (-1.5, 0.0)][k // 20]
+        decision = controller.control(
+            Gaussian.certain(state), Reference(goal), decision
+        )
+        assert decision.status is Status.SOLVED
+        programs.append(decision.iterations)
+        state = step(system, state, decision.input)
+        cost += (state - goal) @ problem.cost.Q @ (state - goal)
+    return cost, programs
+
+
+def test_a_step_takes_one_program_where_the_plan_goes_on_and_more_after_a_jump():
+    cost, programs = flown(None)
+    converged, _ = flown(100, 1e-8)
+    assert cost < 1.02 * converged
+    assert programs[20] > 1  # the first jump
+    assert np.mean(programs) < 1.3
+
+
+def ellipsoid(x):
+    off = x[:, [0, 2]] - torch.tensor([1.0, 0.5])
+    return (off**2 * torch.tensor([2.0, 0.7])).sum(1, keepdim=True) - 1.0
+
+
+def distance(x):
+    off = x[:, [0, 2]] - torch.tensor([0.8, 0.4])
+    return 0.7 - torch.linalg.norm(off, dim=1, keepdim=True)
+
+
+def energy(x):
+    return (x[:, [1, 3]] ** 2).sum(1, keepdim=True) / 2 - 0.2
+
+
+def puck(x, u):
+    """Two carts side by side whose motors saturate."""
+    p, v, q, w = x.unbind(-1)
+    push = torch.tanh(u)
+    parts = [p + 0.2 * v, v + 0.2 * push[..., 0], q + 0.2 * w, w + 0.2 * push[..., 1]]
+    return torch.stack(parts, -1)
+
+
+@pytest.mark.parametrize("h", [ellipsoid, distance, energy])
+@pytest.mark.parametrize("stages", [None, [8]], ids=["all stages", "the last"])
+@pytest.mark.parametrize("iterations", [None, 1, 30])
+def test_a_decision_tells_how_far_its_own_plan_misses_a_curved_bound(
+    h, stages, iterations, rng
+):
+    for _ in range(4):
+        problem = Problem(
+            Tracking([1.0, 0.1, 1.0, 0.1], [0.1, 0.1], penalized="inputs"),
+            inputs=Box([-1.0] * 2, [1.0] * 2),
+            constraints=[Inequality(h=h, stages=stages)],
+        )
+        controller = GPMPC(
+            KnownModel(puck, 4, 2), Linearization(), problem, 8, [0.0, 0.0], MEANS,
+            iterations=iterations,
+        )  # fmt: skip
+        start = rng.normal(size=4) * [2.0, 1.0, 2.0, 1.0]
+        decision = controller.control(Gaussian.certain(start), Reference(np.zeros(4)))
+        states = [torch.from_numpy(start)]
+        for u in decision.inputs:
+            states.append(puck(states[-1], torch.from_numpy(u)))
+        means = torch.stack(states)
+        values = h(means[1:]).numpy().ravel()
+        missed = max(0.0, (values if stages is None else values[-1:]).max())
+        assert decision.applicable
+        assert decision.status is not Status.NUMERICAL_TROUBLE
+        assert decision.violation == pytest.approx(missed, abs=1e-9)
+        np.testing.assert_allclose(decision.means, means.numpy(), atol=1e-9)
+        if decision.status.solved:
+            kept = decision.status is Status.SOLVED
+            assert kept == (missed <= 1e-5)
+        squares = means.numpy()[1:] ** 2 @ [1.0, 0.1, 1.0, 0.1]
+        stages_cost = squares + 0.1 * (decision.inputs**2).sum(1)
+        np.testing.assert_allclose(decision.stage_costs, stages_cost, rtol=1e-9)
+        assert decision.cost == pytest.approx(stages_cost.sum(), rel=1e-12)

@@ -1,0 +1,103 @@
+"""A bound that cannot be kept gives way where it would otherwise cost more than all that the cost is for."""
+
+import numpy as np
+import pytest
+import torch
+
+from gpmpc.gaussian import Gaussian
+from gpmpc.models import KnownModel
+from gpmpc.mpc import GPMPC, Box, PredictionSettings, Problem, Reference, Tracking
+from gpmpc.mpc._elastic import WORTH
+from gpmpc.propagation import Linearization
+from gpmpc.status import Status
+from tests.mpc.small_models import LinearGaussian
+
+H = 12
+
+
+def planned(penalty, start, goal=0.0, upper=0.5, form="trajectory"):
+    """A cart's plan whose position is to stay below a bound; the push costs next to nothing."""
+    settings = {} if penalty in ("default", "free") else {"penalty": penalty}
+    bound = Box([-np.inf, -np.inf], [upper, np.inf], **settings)
+    problem = Problem(
+        Tracking([1.0, 0.1], [0.01], penalized="inputs"),
+        Box([-50.0], [50.0]),
+        constraints=[] if penalty == "free" else [bound],
+    )
+    model = LinearGaussian([[1.0, 0.1], [0.0, 1.0]], [[0.005], [0.1]])
+    prediction = PredictionSettings(form, covariance="none")
+    controller = GPMPC(model, Linearization(), problem, H, [0.0], prediction)
+    return controller.control(
+        Gaussian.certain(np.array(start)), Reference(np.array([goal, 0.0]))
+    )
+
+
+@pytest.mark.parametrize("start", [[0.0, 0.0], [0.4, 0.5], [0.49, -1.0]])
+def test_where_a_bound_can_be_kept_an_elastic_one_is_the_exact_one(start):
+    elastic, exact = (planned(p, start, goal=3.0) for p in ("default", "exact"))
+    assert elastic.status is Status.SOLVED
+    assert elastic.means[1:, 0].max() <= 0.5 + 1e-7
+    np.testing.assert_allclose(elastic.inputs, exact.inputs, atol=1e-7)
+
+
+@pytest.mark.parametrize("form", ["trajectory", "velocity"])
+@pytest.mark.parametrize("start", [[0.8, 1.0], [2.0, 0.0], [0.5, 4.0]])
+def test_where_it_cannot_its_price_cannot_outweigh_the_cost(start, form):
+    free, elastic, exact = (
+        planned(p, start, form=form) for p in ("free", "default", "exact")
+    )
+    assert elastic.status is Status.SOFT_BOUND_MISSED
+    outside = np.maximum(0.0, elastic.means[1:, 0] - 0.5)
+    assert elastic.violation == pytest.approx(outside.max(), abs=1e-9)
+    # The deviation that a violation is beside the reference counts as well.
+    missed = np.maximum(0.0, free.means[1:, 0] - 0.5)
+    assert elastic.cost <= (1 + WORTH) * free.cost + WORTH * (missed**2).sum()
+    assert exact.cost > 1.2 * elastic.cost
+    assert outside.sum() < missed.sum()
+    assert np.abs(elastic.inputs).max() < np.abs(exact.inputs).max()
+
+
+def test_a_reference_beyond_a_bound_does_not_make_it_free():
+    """The plan without the bound costs nothing: it rests beyond it."""
+    decision = planned("default", [0.8, 0.0], goal=0.8)
+    assert decision.means[-1, 0] < 0.65
+
+
+def test_a_vehicle_that_was_pushed_out_of_its_lane_comes_back_and_does_not_spin():
+    """A tyre that lets go beyond a slip: what exact bounds ask for is more than it bears."""
+
+    def slide(x, u):
+        offset, rate, heading = x.unbind(-1)
+        slip = u[..., 0] - 2.0 * heading
+        grip = slip / (1.0 + (2.0 * slip) ** 4)
+        parts = [
+            offset + 0.1 * rate,
+            rate + 0.1 * (8.0 * grip - 0.5 * rate + 6.0 * heading),
+            heading + 0.1 * (2.0 * grip - 0.3 * heading),
+        ]
+        return torch.stack(parts, -1)
+
+    ends = {}
+    for penalty in ("default", "exact", "none"):
+        settings = {"penalty": "exact"} if penalty == "exact" else {}
+        lane = Box([-0.05, -np.inf, -np.inf], [0.05, np.inf, np.inf], **settings)
+        problem = Problem(
+            Tracking([10.0, 1.0, 1.0], [0.5], penalized="inputs"),
+            Box([-2.0], [2.0]),
+            constraints=[] if penalty == "none" else [lane],
+        )
+        controller = GPMPC(
+            KnownModel(slide, 3, 1), Linearization(), problem, 15, [0.0],
+            PredictionSettings(covariance="none"),
+        )  # fmt: skip
+        state, decision, worst = np.array([0.4, 0.0, 0.0]), None, 0.0
+        for _ in range(60):
+            decision = controller.control(
+                Gaussian.certain(state), Reference(np.zeros(3)), decision
+            )
+            moved = slide(torch.from_numpy(state), torch.from_numpy(decision.input))
+            state = moved.numpy()
+            worst = max(worst, abs(state[0]))
+        ends[penalty] = worst
+    assert ends["exact"] > 1.0
+    assert ends["default"] < 1.1 * max(0.4, ends["none"])
