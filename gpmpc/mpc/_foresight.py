@@ -238,7 +238,7 @@ class Foresight:
         self.shorter = [other for other in shorter if other is not None]
 
     def _with_horizon(
-        self, horizon: int, iterations: int, tolerance: float
+        self, horizon: int, iterations: int | None, tolerance: float
     ) -> GPMPC | None:
         """The controller with another horizon; None where its problem is of this one."""
         own = self.controller

@@ -132,12 +132,12 @@ def measure_continuity(
         _row_multipliers(solution, prediction),
     )
     step = measures.step
-    if request.previous is None or not request.previous.steps:
+    last_steps = () if request.previous is None else request.previous.steps
+    if len(last_steps) == 0:
         return Continuity(True, step)
     slight = _SLIGHT * (measures.cost + smallest_cost(model, request))
     if step <= slight:
         return Continuity(True, step)
-    last_steps = request.previous.steps
     if step > _FURTHER * last_steps[0]:
         return Continuity(False, step)
     left = measures.error  # by the last step's program, which nothing has mended since

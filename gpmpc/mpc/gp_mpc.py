@@ -86,7 +86,7 @@ class Outcome(NamedTuple):
     program: CondensedProgram  # the last one
     solution: QPSolution  # of it
     status: Status
-    count: int  # of programs
+    programs: int  # how many there were
     steps: tuple[float, ...]  # see ``Decision``
 
 
@@ -335,7 +335,7 @@ class GPMPC:
             missed = price_violations(self._hard, prediction.rows, plan, 1.0)
             suboptimal = missed <= FEASIBLE
         if not (status.solved or suboptimal):
-            failed = request.failed_decision(status, outcome.count, timing)
+            failed = request.failed_decision(status, outcome.programs, timing)
             return replace(failed, problem=program, solution=outcome.solution)
         violation = self.prediction.violation(prediction, request)
         if status is Status.SOLVED and violation > KEPT:
@@ -351,7 +351,7 @@ class GPMPC:
             means=means,
             covariances=covariances,
             status=status,
-            iterations=outcome.count,
+            iterations=outcome.programs,
             timing=timing,
             problem=program,
             solution=outcome.solution,

@@ -1,4 +1,4 @@
-"""An iteration says that it has arrived, takes as many programs as a step needs, and what it hands out is what it says."""
+"""An iteration says that it has arrived, takes as many programs as it needs, and hands out what it says."""
 
 import numpy as np
 import pytest
