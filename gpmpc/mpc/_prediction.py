@@ -397,6 +397,18 @@ class PredictionModel:
             1.0,
         )
 
+    def cost_of_inputs(self, inputs: Array, request: Request) -> float:
+        """What the plan costs that inputs (H, m) lead to, each stage's angles in the turn nearest to its reference."""
+        states = self.lead(request.state, inputs, request.disturbance)
+        plan = Plan(states, inputs, np.zeros((len(states), *request.covariance.shape)))
+        cost = self.costs.at(plan, request.parameters)
+        references = request.references
+        targets = references.states
+        turns = full_turns(states[1:] - targets, self.problem.cost.angles)
+        nearest = references._replace(states=targets + turns)
+        stages = call_unchecked(evaluate_stages, cost, states, inputs, nearest, 1.0)
+        return float(stages.sum())
+
     def obey(
         self,
         prediction: Prediction,

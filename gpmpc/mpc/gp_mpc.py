@@ -56,6 +56,7 @@ Array = np.ndarray
 _DEFAULT = PredictionSettings()
 _MOST = 10  # programs of a step, where their number is not set
 _LOOSE = 1e-2  # tolerance there
+_PAYS = 0.7  # of a first plan's cost, below which one that took more programs is taken
 _SLIGHTLY_MORE = 1.02  # than its program may a plan miss a smooth constraint
 # Price of a row that does not count: a free row keeps its place among the others.
 _NEXT_TO_NOTHING = 1e-9
@@ -204,15 +205,45 @@ class GPMPC:
             if prediction is None:
                 guess = self.prediction.initial_guess(request)
                 prediction = self.prediction.linearize(guess, request)
-            return self._improve(prediction, request, stopwatch)
+            is_first = request.previous is None and request.states is None
+            chooses = self.iterations is None and self._most > 1
+            # A curved bound lies elsewhere than one program sees it.
+            if is_first and chooses and not self.prediction.constraints.smooth:
+                return self._begin(prediction, request, stopwatch)
+            return self._improve(prediction, request, stopwatch, self._most)
         except FAILURES as error:
             status = Status.NUMERICAL_TROUBLE
             if isinstance(error, FunctionNotFinite):
                 status = Status.FUNCTION_NOT_FINITE
             return request.failed_decision(status, timing=stopwatch.timing)
 
-    def _improve(
+    def _begin(
         self, prediction: Prediction, request: Request, stopwatch: Stopwatch
+    ) -> Decision:
+        """The decision without a plan to go on from: that of one program, unless more of them pay much.
+
+        One program's first plan need not be consistent yet, and the next decisions lead it
+        further than its horizon shows: a swing-up that is iterated at once may lean for ever.
+        """
+        quick = self._improve(prediction, request, stopwatch, most=1)
+        if not (quick.applicable and self.prediction.linearizer.at_points):
+            return quick
+        thorough = self._improve(prediction, request, stopwatch, self._most)
+        iterations = quick.iterations + thorough.iterations
+        quick_cost, thorough_cost = (
+            self.prediction.cost_of_inputs(plan.inputs, request)
+            for plan in (quick, thorough)
+        )
+        pays = thorough.applicable and thorough_cost < _PAYS * quick_cost
+        chosen = thorough if pays else quick
+        return replace(chosen, iterations=iterations, timing=stopwatch.timing)
+
+    def _improve(
+        self,
+        prediction: Prediction,
+        request: Request,
+        stopwatch: Stopwatch,
+        most: int,
     ) -> Decision:
         """The decision from a prediction: program by program, to a plan that is good enough or the last program."""
         guess = prediction.plan
@@ -241,8 +272,9 @@ class GPMPC:
             if not _is_usable(program, solution, prediction.plan):
                 break
             proposed = _expand(program, solution, prediction, request)
-            enough = self._most == 1
-            if self.iterations is None and count == 1 and not enough:
+            enough = most == 1
+            continuing = self.iterations is None and request.previous is not None
+            if continuing and count == 1 and not enough:
                 continuity = measure_continuity(
                     self.prediction, request, prediction, solution, proposed, prices
                 )
@@ -257,7 +289,7 @@ class GPMPC:
                     )
                 ending, status = iteration(prediction, program, solution, proposed)
                 steps = iteration.steps
-                if status is None and count < self._most:
+                if status is None and count < most:
                     prediction = ending
                     continue
             within_tolerance = self.iterations is not None and status is Status.SOLVED
@@ -267,8 +299,8 @@ class GPMPC:
             solved = status is not None and status.solved
             if not solved or self._keeps_promise(ending, solution, request):
                 break
-            if count == self._most:
-                status = None if self._most > 1 else status
+            if count == most:
+                status = None if most > 1 else status
                 break
             # A curved bound lies elsewhere than the program saw it.
             prediction = self.prediction.linearize(ending.plan, request)

@@ -17,7 +17,7 @@ from gpmpc.mpc import (
 )
 from gpmpc.propagation import Linearization
 from gpmpc.status import Status
-from gpmpc.systems import planar_quadrotor, step
+from gpmpc.systems import cart_pole, pendulum, planar_quadrotor, step
 from tests.mpc.test_starts import known
 
 MEANS = PredictionSettings(covariance="none")
@@ -148,3 +148,24 @@ def test_a_decision_tells_how_far_its_own_plan_misses_a_curved_bound(
         stages_cost = squares + 0.1 * (decision.inputs**2).sum(1)
         np.testing.assert_allclose(decision.stage_costs, stages_cost, rtol=1e-9)
         assert decision.cost == pytest.approx(stages_cost.sum(), rel=1e-12)
+
+
+def test_a_first_plan_is_iterated_only_where_that_pays():
+    """A pendulum under a weak torque would lean for ever; a cart-pole is brought up at less cost."""
+    ends = {}
+    for make in (pendulum, cart_pole):
+        system = make()
+        Q = [1.0, 0.01] if make is pendulum else [1.0, 0.01, 1.0, 0.01]
+        cost = Tracking(Q, [0.01], penalized="inputs", angles=system.angle_indices)
+        problem = Problem(cost, Box(system.input_lower, system.input_upper))
+        plans = [
+            GPMPC(
+                known(system), Linearization(), problem, 30, [0.0], MEANS,
+                iterations=count,
+            ).control(Gaussian.certain(np.array(system.start)), Reference(np.zeros(len(Q))))
+            for count in (None, 1)
+        ]  # fmt: skip
+        ends[make] = np.abs(plans[0].inputs - plans[1].inputs).max()
+        assert plans[0].applicable
+    assert ends[pendulum] < 1e-9
+    assert ends[cart_pole] > 0.1

@@ -465,7 +465,9 @@ def test_a_warm_start_changes_the_time_and_not_the_answer(form):
 
 
 def test_a_decision_holds_the_problem_that_it_solves():
-    controller = GPMPC(gp(), Linearization(), quadrotor_problem(), 3, HOVER)
+    controller = GPMPC(
+        gp(), Linearization(), quadrotor_problem(), 3, HOVER, iterations=1
+    )
     belief = Gaussian.certain(np.full(6, 0.3))
     decision = controller.control(belief, at_origin(3))
     program = decision.problem
@@ -671,7 +673,7 @@ def test_each_part_of_a_decision_takes_its_own_time_and_questions_share_the_mode
         Problem(Tracking([1.0, 1.0], [0.1])),
         Reference(np.zeros((H + 1, 2)), np.zeros((H, 1))),
     )
-    controller = GPMPC(model, Linearization(), problem, H, [0.0])
+    controller = GPMPC(model, Linearization(), problem, H, [0.0], iterations=1)
     at = Gaussian.certain(np.ones(2))
     looks = iter([0.0, 1.0, 11.0, 111.0, 1111.0])
     monkeypatch.setattr(gp_mpc, "perf_counter", lambda: next(looks))
