@@ -54,7 +54,7 @@ from gpmpc.status import Status
 Array = np.ndarray
 
 _DEFAULT = PredictionSettings()
-_MOST = 10  # programs of a step, where their number is not set
+_MOST = 20  # programs of a step, where their number is not set
 _LOOSE = 1e-2  # tolerance there
 _PAYS = 0.7  # of a first plan's cost, below which one that took more programs is taken
 _SLIGHTLY_MORE = 1.02  # than its program may a plan miss a smooth constraint
@@ -67,6 +67,7 @@ class Stopwatch:
 
     def __init__(self, spent: float = 0.0):
         self._last = perf_counter() - spent
+        self._began = self._last
         self._seconds = {"model": 0.0, "build": 0.0, "solve": 0.0}
 
     def lap(self, part: str) -> None:
@@ -74,6 +75,11 @@ class Stopwatch:
         now = perf_counter()
         self._seconds[part] += now - self._last
         self._last = now
+
+    @property
+    def elapsed(self) -> float:
+        """All time so far [s]."""
+        return perf_counter() - self._began
 
     @property
     def timing(self) -> Timing:
@@ -102,9 +108,13 @@ class GPMPC:
         initial_input: The input before the first step, and the first guess of every planned one (m,).
         prediction: Form, covariance mode, feedback and disturbance estimate.
         solver: Of the quadratic program; ``DualActiveSet()`` by default, which soft constraints need.
-        iterations: Quadratic programs a step at most; more than one for the form ``"trajectory"`` only.
+        iterations: Quadratic programs a step at most; more than one for the form ``"trajectory"`` only. By default as
+            many as a step needs: one where the last plan goes on, more after a jump or a disturbance.
         tolerance: Of more iterations: relative offset and defects of a plan that counts as solved (``gpmpc.mpc._sqp``),
-            estimated from the slower of the last two rates of convergence. 1e-8 may be out of reach.
+            estimated from the slower of the last two rates of convergence. 1e-8 may be out of reach. By default 1e-2
+            where the number of programs is not set, and 1e-6 where it is.
+        budget: Time of a decision after which no further program is begun [s]; None for no limit. Decisions then
+            depend on the machine.
 
     Raises:
         SettingError: A setting is unknown or out of its range, or model and problem have other dimensions.
@@ -121,6 +131,7 @@ class GPMPC:
         solver: QPSolver | None = None,
         iterations: int | None = None,
         tolerance: float | None = None,
+        budget: float | None = None,
     ):
         self.prediction = PredictionModel(
             model, propagator, problem, horizon, initial_input, prediction
@@ -131,6 +142,9 @@ class GPMPC:
             (_LOOSE if iterations is None else 1e-6) if tolerance is None else tolerance
         )
         check_number("tolerance", self.tolerance, above=0)
+        if budget is not None:
+            check_number("budget", budget, above=0, unit="[s]")
+        self.budget = budget
         if (
             iterations is not None
             and iterations > 1
@@ -228,6 +242,8 @@ class GPMPC:
         quick = self._improve(prediction, request, stopwatch, most=1)
         if not (quick.applicable and self.prediction.linearizer.at_points):
             return quick
+        if self.budget is not None and stopwatch.elapsed > self.budget:
+            return quick
         thorough = self._improve(prediction, request, stopwatch, self._most)
         iterations = quick.iterations + thorough.iterations
         quick_cost, thorough_cost = (
@@ -272,8 +288,11 @@ class GPMPC:
             if not _is_usable(program, solution, prediction.plan):
                 break
             proposed = _expand(program, solution, prediction, request)
+            late = False
             enough = most == 1
-            continuing = self.iterations is None and request.previous is not None
+            smooth = self.prediction.constraints.smooth
+            follows = smooth or request.previous is not None
+            continuing = self.iterations is None and follows
             if continuing and count == 1 and not enough:
                 continuity = measure_continuity(
                     self.prediction, request, prediction, solution, proposed, prices
@@ -289,7 +308,8 @@ class GPMPC:
                     )
                 ending, status = iteration(prediction, program, solution, proposed)
                 steps = iteration.steps
-                if status is None and count < most:
+                late = self.budget is not None and stopwatch.elapsed > self.budget
+                if status is None and count < most and not late:
                     prediction = ending
                     continue
             within_tolerance = self.iterations is not None and status is Status.SOLVED
@@ -299,7 +319,7 @@ class GPMPC:
             solved = status is not None and status.solved
             if not solved or self._keeps_promise(ending, solution, request):
                 break
-            if count == most:
+            if count == most or late:
                 status = None if most > 1 else status
                 break
             # A curved bound lies elsewhere than the program saw it.

@@ -186,7 +186,7 @@ def test_finished_runs_are_not_flown_again_and_other_settings_do_not_pass_for_th
     other = forked(*arguments, cwd=cwd)
     assert other.returncode == 2
     assert (
-        "holds a finished run of other settings (controller.tolerance: 1 then, 1e-06 now)"
+        "holds a finished run of other settings (controller.tolerance: 1 then, None now)"
         in other.stderr
     )
 

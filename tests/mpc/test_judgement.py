@@ -187,7 +187,7 @@ def test_decisions_that_cannot_be_applied_are_suspicious_from_the_third_on():
 def test_plans_far_from_all_data_are_suspicious_until_it_is_where_it_should_be():
     for place, level in ([0.0, "healthy"], [1.0, "suspicious"]):
         judge, x = FlightJudge(CONTROLLER.problem), np.array([place, 0.0])
-        plan = plan_of(x, novelty=0.95)
+        plan = plan_of(x, plan_novelty=0.95)
         told = [judge.judge(x, np.zeros(2), plan).level for _ in range(4)]
         assert told == ["healthy", "healthy", level, level]
 

@@ -106,4 +106,6 @@ def test_a_solver_ends_with_any_status_but_those_of_what_made_the_program():
     assert set(layout.STATUSES) == set(Status) - {
         Status.INVALID_MEASUREMENT,
         Status.FUNCTION_NOT_FINITE,
+        Status.SOFT_BOUND_MISSED,
+        Status.STALLED,
     }
