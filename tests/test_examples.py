@@ -52,7 +52,7 @@ def test_the_example_of_the_readme_swings_a_pendulum_up(tmp_path, monkeypatch, c
         2
     ].strip() in readme
     printed = capsys.readouterr().out.strip()
-    assert printed == "upright after 2.7 s"
+    assert printed == "upright after 2.75 s"
     assert f"`{printed}`" in readme
     assert (tmp_path / "swing_up.png").exists()
 
