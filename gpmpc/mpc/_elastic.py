@@ -2,13 +2,14 @@
 
 An exact price of 1e6 weights says that nothing matters beside the bound. Where it can be kept that is what is asked
 for. Where it cannot, as after a gust that pushed a vehicle out of its lane, such a price spends everything on coming
-back a step earlier, be it the vehicle. There a price is taken that cannot outweigh what the cost is for: with J0 the
-cost of the plan without elastic bounds, and V0 the sum of its violations, at
+back a step earlier, be it the vehicle. There a price is taken that cannot outweigh what the cost is for: with J0 and V0
+the cost and the violations, all in all, of the plan without elastic bounds, at
 
-    price = WORTH J0 / V0
+    price = WORTH J / V0,   J0 <= J <= 2 J0
 
-no plan that is better under it costs more than (1 + WORTH) J0, whatever it gains: J + price V <= J0 + price V0. A plan
-that costs nothing has no scale; what it would cost to be beside its reference by its violations is added to J0.
+no plan that is better under it costs more than J0 + WORTH J, at most five times J0: that is what its violations may
+cost. J is the cost of the last plan within these limits: where that keeps the bound at some cost, the bound is worth
+more. A plan that costs nothing has no scale; what it would cost to be beside its reference by its violations is added.
 """
 
 import numpy as np
@@ -17,9 +18,9 @@ from gpmpc.mpc._prediction import Prediction
 
 Array = np.ndarray
 
-# In costs of the plan without elastic bounds, what keeping them may cost. On a car in
-# a lane, more than 4 spends the car now and then, and less leaves the lane for longer.
-WORTH = 4.0
+# With 4 instead, a car beside its lane was lost now and then; with 1 a reactor's
+# economic cost was worth more than its bound.
+WORTH = 2.0
 _TINY = 1e-12
 
 
@@ -35,13 +36,18 @@ def violations(prediction: Prediction, elastic: Array) -> Array:
 
 
 def elastic_price(
-    prediction: Prediction, cost: float, elastic: Array, Q: Array
+    prediction: Prediction,
+    free_cost: float,
+    last_cost: float,
+    elastic: Array,
+    Q: Array,
 ) -> float:
     """The price of elastic rows, from the plan without them.
 
     Args:
         prediction: With the plan that minimises the cost alone.
-        cost: Of that plan.
+        free_cost: Of that plan, J0.
+        last_cost: Of the last plan.
         elastic: Which of the r rows are elastic (r,).
         Q: Weight of the states (n, n), or of those of each stage (H, n, n).
     """
@@ -52,6 +58,7 @@ def elastic_price(
     squares = (gradients**2).sum(axis=2)
     # The cheapest move by a violation v along a gradient g has the size v / |g|.
     beside = weights / np.maximum(squares, _TINY) ** 2 * missed**2
+    cost = min(max(free_cost, last_cost), 2.0 * free_cost)
     return WORTH * (cost + beside.sum()) / max(missed.sum(), _TINY)
 
 

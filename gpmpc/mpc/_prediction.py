@@ -398,15 +398,29 @@ class PredictionModel:
         )
 
     def cost_of_inputs(self, inputs: Array, request: Request) -> float:
-        """What the plan costs that inputs (H, m) lead to, each stage's angles in the turn nearest to its reference."""
+        """What the plan costs that inputs (H, m) lead to."""
         states = self.lead(request.state, inputs, request.disturbance)
-        plan = Plan(states, inputs, np.zeros((len(states), *request.covariance.shape)))
-        cost = self.costs.at(plan, request.parameters)
+        return self._cost_along(states, inputs, request)
+
+    def _cost_along(self, states: Array, inputs: Array, request: Request) -> float:
+        """What means (H + 1, n) and inputs cost, each stage's angles in the turn nearest to its reference."""
+        n = self.problem.state_dim
+        plan = Plan(
+            self.linearizer.state(states, np.zeros((len(states), n, n))),
+            inputs,
+            np.zeros((len(states), n, n)),
+        )
         references = request.references
         targets = references.states
         turns = full_turns(states[1:] - targets, self.problem.cost.angles)
-        nearest = references._replace(states=targets + turns)
-        stages = call_unchecked(evaluate_stages, cost, states, inputs, nearest, 1.0)
+        stages = call_unchecked(
+            evaluate_stages,
+            self.costs.at(plan, request.parameters),
+            plan.states,
+            inputs,
+            references._replace(states=targets + turns),
+            1.0,
+        )
         return float(stages.sum())
 
     def obey(

@@ -65,7 +65,7 @@ _CREEP = 0.25  # ratio of two offsets above which the Hessian is updated
 _STALL = 0.5  # what two steps leave of an offset that is lost in rounding
 _OBEYS = 1e-9  # defects, relative to the states, of a plan that was rolled out
 # How much further than the last step a step may lead, squared, to count as one more
-# of the same kind; and what linearising may have cost it, as a share of the cost.
+# of the same kind; and the share of the cost below which that does not matter.
 _FURTHER = 4.0
 _SLIGHT = 1e-3
 _NEARLY = 5.0  # tolerances, within which an iteration that stalls has arrived
@@ -95,7 +95,6 @@ class StepMeasures(NamedTuple):
 
     cost: float  # of the plan, with the price of its violated rows
     step: float  # the step's length in the metric of the cost, squared
-    error: float  # what the plan's defects cost, but for that of its first stage
 
 
 class PriceTerms(NamedTuple):
@@ -110,41 +109,31 @@ def measure_continuity(
     model: PredictionModel,
     request: Request,
     prediction: Prediction,
-    solution: QPSolution,
     proposed: Plan,
     prices: Array,
 ) -> Continuity:
     """Whether a step is one more along the last plan, and how long it is.
 
-    Then one program is enough. The defects of the last plan are what linearising it had
-    left out; that grows with the square of a step. A step that leads much further than
-    the last one is none of its kind, unless it hardly changes the cost.
+    Then one program is enough, as in the real-time iteration. A step that leads much
+    further than the last one, and is not slight beside the cost, answers a jump of the
+    reference or of the state. On plants that bend much, the plans of one program a step
+    are not consistent; iterating each of them is slower and, on swing-ups, no better.
     """
     measures = call_unchecked(
         _measure_step,
         prediction.cost,
         PriceTerms(request.references, prices, 0.0),
-        prediction.stages.A,
-        prediction.stages.next,
         prediction.rows,
         prediction.plan,
         proposed,
-        _row_multipliers(solution, prediction),
     )
     step = measures.step
     last_steps = () if request.previous is None else request.previous.steps
     if len(last_steps) == 0:
-        return Continuity(True, step)
+        return Continuity(continues=True, step=step)
     slight = _SLIGHT * (measures.cost + smallest_cost(model, request))
-    if step <= slight:
-        return Continuity(True, step)
-    if step > _FURTHER * last_steps[0]:
-        return Continuity(False, step)
-    left = measures.error  # by the last step's program, which nothing has mended since
-    if len(last_steps) > 1:
-        left = last_steps[1]  # what its second program mended
-    growth = max(1.0, step / max(last_steps[0], _TINY))
-    return Continuity(left * growth**2 <= slight, step)
+    continues = step <= max(slight, _FURTHER * last_steps[0])
+    return Continuity(continues=continues, step=step)
 
 
 def smallest_cost(model: PredictionModel, request: Request) -> float:
@@ -424,18 +413,11 @@ def _priced_cost(cost, terms, rows, plan):
 
 
 @compiled
-def _measure_step(cost, terms, A, after, rows, plan, proposed, z):
+def _measure_step(cost, terms, rows, plan, proposed):
     """The ``StepMeasures`` of a program's step."""
     here = _priced_cost(cost, terms, rows, plan)
     step = _cost_of_step(cost, terms.references, plan, proposed)
-    costates = _costates(cost, A, proposed, terms.references.states, rows.E, z)
-    error = 0.0
-    # The first stage's defect is the disturbance, the last one's what repeating the
-    # end of the last plan missed.
-    for k in range(1, len(after) - 1):
-        for i in range(after.shape[1]):
-            error += abs(costates[k, i] * (after[k, i] - plan.states[k + 1, i]))
-    return StepMeasures(here, step, error)
+    return StepMeasures(here, step)
 
 
 @compiled

@@ -54,7 +54,7 @@ from gpmpc.status import Status
 Array = np.ndarray
 
 _DEFAULT = PredictionSettings()
-_MOST = 20  # programs of a step, where their number is not set
+_MOST = 10  # programs of a step, where their number is not set
 _LOOSE = 1e-2  # tolerance there
 _PAYS = 0.7  # of a first plan's cost, below which one that took more programs is taken
 _SLIGHTLY_MORE = 1.02  # than its program may a plan miss a smooth constraint
@@ -295,7 +295,7 @@ class GPMPC:
             continuing = self.iterations is None and follows
             if continuing and count == 1 and not enough:
                 continuity = measure_continuity(
-                    self.prediction, request, prediction, solution, proposed, prices
+                    self.prediction, request, prediction, proposed, prices
                 )
                 enough = continuity.continues
                 steps = [continuity.step]
@@ -514,8 +514,13 @@ class GPMPC:
         free = self._solve(program, solution, prices)
         plan = _expand(program, free, prediction, request)
         planned = prediction._replace(plan=plan)
-        cost = float(self.prediction.stage_costs(planned, request).sum())
-        prices[elastic] = elastic_price(planned, cost, elastic, self.problem.cost.Q)
+        prices[elastic] = elastic_price(
+            planned,
+            free_cost=float(self.prediction.stage_costs(planned, request).sum()),
+            last_cost=float(self.prediction.stage_costs(prediction, request).sum()),
+            elastic=elastic,
+            Q=self.problem.cost.Q,
+        )
         return prices
 
     def _solve(

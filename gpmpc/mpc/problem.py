@@ -52,8 +52,8 @@ class Constraint:
     #: standard deviations between the mean and a side; Phi^-1(eta) unless given (the paper takes 2 for 0.95)
     kappa: float | None = None
     #: price of a violation per unit and stage; ``"exact"``: one that no plan pays which can keep the constraint;
-    #: ``"elastic"``: the exact one, and where the constraint cannot be kept one that keeps the cost of the plan within
-    #: five times that of the plan without it (``gpmpc.mpc._elastic``); None: hard
+    #: ``"elastic"``: the exact one, and where the constraint cannot be kept one for which the plan costs at most
+    #: five times what it costs without (``gpmpc.mpc._elastic``); None: hard
     penalty: float | Literal["elastic", "exact"] | None = "elastic"
     stages: Iterable[int] | None = (
         None  #: those of 1 .. H that it holds at, such as ``range(5, 11)``; all by default

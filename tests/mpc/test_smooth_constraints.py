@@ -164,7 +164,8 @@ def test_the_exact_price_is_paid_by_no_plan_that_can_do_without_and_by_as_little
         .control(outside, reference)
         .applicable
     )
-    back = controller(Box(None, [0.4, np.inf])).control(outside, reference)
+    exact = Box(None, [0.4, np.inf], penalty="exact")
+    back = controller(exact).control(outside, reference)
     assert back.status is Status.SOFT_BOUND_MISSED
     assert back.violation == pytest.approx(back.means[1:, 0].max() - 0.4, abs=1e-9)
     assert np.allclose(back.inputs[:4, 0], -0.15, atol=1e-7)
