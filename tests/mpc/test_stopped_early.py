@@ -67,7 +67,9 @@ STOPPED = {
     "two, of another solver": lambda _: convex(
         iterations=2, tolerance=1e-12, solver=PrimalActiveSet()
     ),
-    "a primal solver": lambda _: convex(solver=PrimalActiveSet(iteration_limit=3)),
+    "a primal solver": lambda _: convex(
+        iterations=1, solver=PrimalActiveSet(iteration_limit=3)
+    ),
     "a state form": lambda _: StateFormMPC(
         GP, Linearization(), PROBLEM, H, HOVER, options={"max_iter": 3}
     ),

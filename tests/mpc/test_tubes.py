@@ -31,6 +31,7 @@ def deviations(horizon, feedback):
         horizon,
         [0.0],
         PredictionSettings(feedback=feedback),
+        iterations=1,
     )
     hanging = Gaussian(
         torch.tensor([np.pi, 0.0], dtype=torch.float64),
