@@ -244,7 +244,10 @@ class GPMPC:
             return quick
         if self.budget is not None and stopwatch.elapsed > self.budget:
             return quick
-        thorough = self._improve(prediction, request, stopwatch, self._most)
+        try:
+            thorough = self._improve(prediction, request, stopwatch, self._most)
+        except FAILURES:  # more programs led the model out of its numbers
+            return quick
         iterations = quick.iterations + thorough.iterations
         quick_cost, thorough_cost = (
             self.prediction.cost_of_inputs(plan.inputs, request)

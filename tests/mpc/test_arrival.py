@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from gpmpc.exceptions import DataError
 from gpmpc.gaussian import Gaussian
 from gpmpc.models import KnownModel
 from gpmpc.mpc import (
@@ -15,6 +16,7 @@ from gpmpc.mpc import (
     Reference,
     Tracking,
 )
+from gpmpc.mpc._sqp import Iteration
 from gpmpc.propagation import Linearization
 from gpmpc.status import Status
 from gpmpc.systems import cart_pole, pendulum, planar_quadrotor, step
@@ -169,3 +171,22 @@ def test_a_first_plan_is_iterated_only_where_that_pays():
         assert plans[0].applicable
     assert ends[pendulum] < 1e-9
     assert ends[cart_pole] > 0.1
+
+
+def test_a_first_plan_stands_where_more_programs_lead_the_model_out_of_its_numbers(
+    monkeypatch,
+):
+    problem = Problem(Tracking([10.0, 1.0], [0.01]), inputs=Box([-5.0], [5.0]))
+    controller = GPMPC(
+        cart(torch.tanh), Linearization(), problem, 8, [0.0], MEANS
+    )  # fmt: skip
+    at = Gaussian.certain([1.0, 0.0])
+    reference = Reference(np.zeros(2))
+
+    def fails(*arguments):
+        raise DataError("beyond the model's numbers")
+
+    monkeypatch.setattr(Iteration, "__call__", fails)
+    decision = controller.control(at, reference)
+    assert decision.status is Status.SOLVED
+    assert decision.iterations == 1
