@@ -10,7 +10,7 @@ at random. From every step of every flight 20 steps are predicted, and 95 % inte
 * default: it moves the state at every step;
 * separated: ``separate_noise`` says which part does what.
 
-A cell is the mean over the states, and below it the least and the largest of them. One thread, under three minutes.
+A cell is the mean over the states, and below it the least and the largest of them. It takes four minutes of one thread.
 """
 
 import argparse

@@ -54,7 +54,9 @@ def elastic_price(
     missed = violations(prediction, elastic)
     gradients = _by_stage(prediction.rows.E, len(missed))
     gradients = gradients[:, elastic, : Q.shape[-1]]
-    weights = np.einsum("kri,...ij,krj->kr", gradients, _one_weight(Q), gradients)
+    n = Q.shape[-1]
+    of_stages = _by_stage(Q.reshape(-1, n, n), len(missed))
+    weights = np.einsum("kri,kij,krj->kr", gradients, of_stages, gradients)
     squares = (gradients**2).sum(axis=2)
     # The cheapest move by a violation v along a gradient g has the size v / |g|.
     beside = weights / np.maximum(squares, _TINY) ** 2 * missed**2
@@ -62,11 +64,6 @@ def elastic_price(
     return WORTH * (cost + beside.sum()) / max(missed.sum(), _TINY)
 
 
-def _by_stage(rows: Array, horizon: int) -> Array:
-    """Rows of every stage, where one may stand for all."""
-    return np.broadcast_to(rows, (horizon, *rows.shape[1:]))
-
-
-def _one_weight(Q: Array) -> Array:
-    """The largest of the weights of all stages, entry by entry, or the one of all."""
-    return Q if Q.ndim == 2 else Q.max(axis=0)
+def _by_stage(parts: Array, horizon: int) -> Array:
+    """What belongs to every stage, where one may stand for all."""
+    return np.broadcast_to(parts, (horizon, *parts.shape[1:]))

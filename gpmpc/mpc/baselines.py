@@ -252,6 +252,8 @@ class LQR:
 class StateFormMPC:
     """GP-MPC in states and inputs, one program a step; arguments that are not listed are those of ``GPMPC``.
 
+    Elastic bounds have the exact price here, also where they cannot be kept.
+
     Args:
         constraints: Of the states s_0 .. s_H (H + 1, p), whose first n columns are the means, and the inputs (H, m),
             two CVXPY variables: a list of constraints. Called once.

@@ -56,6 +56,7 @@ Array = np.ndarray
 _DEFAULT = PredictionSettings()
 _MOST = 10  # programs of a step, where their number is not set
 _LOOSE = 1e-2  # tolerance there
+_TIGHT = 1e-6  # tolerance where it is set
 _PAYS = 0.7  # of a first plan's cost, below which one that took more programs is taken
 _SLIGHTLY_MORE = 1.02  # than its program may a plan miss a smooth constraint
 # Price of a row that does not count: a free row keeps its place among the others.
@@ -138,10 +139,10 @@ class GPMPC:
         )
         if iterations is not None:
             check_number("iterations", iterations, least=1, whole=True)
-        self.tolerance = (
-            (_LOOSE if iterations is None else 1e-6) if tolerance is None else tolerance
-        )
-        check_number("tolerance", self.tolerance, above=0)
+        if tolerance is None:
+            tolerance = _LOOSE if iterations is None else _TIGHT
+        check_number("tolerance", tolerance, above=0)
+        self.tolerance = tolerance
         if budget is not None:
             check_number("budget", budget, above=0, unit="[s]")
         self.budget = budget
@@ -289,6 +290,8 @@ class GPMPC:
             status = solution.status
             ending = prediction
             if not _is_usable(program, solution, prediction.plan):
+                if prediction.plan is not guess:
+                    ending = self._obey(prediction, prediction, program, request)
                 break
             proposed = _expand(program, solution, prediction, request)
             late = False
@@ -317,7 +320,7 @@ class GPMPC:
                     continue
             within_tolerance = self.iterations is not None and status is Status.SOLVED
             open_defects = not (enough or within_tolerance)
-            if open_defects or self.prediction.constraints.smooth:
+            if open_defects or smooth or self.prediction.settings.rolled_out:
                 ending = self._obey(ending, prediction, program, request)
             solved = status is not None and status.solved
             if not solved or self._keeps_promise(ending, solution, request):
@@ -327,8 +330,6 @@ class GPMPC:
                 break
             # A curved bound lies elsewhere than the program saw it.
             prediction = self.prediction.linearize(ending.plan, request)
-        if ending.plan is not guess and self.prediction.settings.rolled_out:
-            ending = self.prediction.obey(ending, prediction, program.feedback, request)
         stopwatch.lap("model")
         if status is None:
             status = Status.ITERATION_LIMIT
