@@ -72,12 +72,10 @@ def optimality(
     posteriors: dict, propagation: str, arguments: argparse.Namespace
 ) -> dict:
     """The nonlinear cost at the plan of iterated quadratic programs, relative to that at the plan of SLSQP."""
-    propagator, gaps, times, failed = (
-        PROPAGATIONS[propagation],
-        [],
-        [[], []],
-        {"convex": 0, "slsqp": 0},
-    )
+    propagator = PROPAGATIONS[propagation]
+    gaps = []
+    times = [[], []]
+    failed = {"convex": 0, "slsqp": 0}
     for trajectory, gp in posteriors.items():
         asked = (problem(), arguments.horizon, HOVER)
         convex = GPMPC(
@@ -132,7 +130,8 @@ def optimality(
 def solvers(posteriors: dict, count: int) -> dict:
     """Inputs by several solvers and forms on one program."""
     found = {name: [] for name in ("primal_active_set", "clarabel", "state_form")}
-    active, unsolved = 0, dict.fromkeys(found, 0)
+    active = 0
+    unsolved = dict.fromkeys(found, 0)
     for trajectory, gp in posteriors.items():
         # Bounds that bite: of the inputs and their increments, and of positions.
         bounds = Box(

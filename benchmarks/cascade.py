@@ -47,7 +47,8 @@ def main() -> None:
     torch.set_num_threads(1)
     results = []
     for trajectory in TRAJECTORIES:
-        outer, inner = trained(trajectory), trained(trajectory, "rotational")
+        outer = trained(trajectory)
+        inner = trained(trajectory, "rotational")
         cascades = {
             "true model": Cascade(
                 NMPC(OUTER, problem(), 1, HOVER),
@@ -94,7 +95,12 @@ def flights(
         TRAJECTORIES[trajectory], np.arange(arguments.steps + 2.0)
     )
     start = np.concatenate([references[0], np.zeros(6)])
-    squares, lost, failures, outer, inner, worst = [], 0, 0, [], [], 0.0
+    squares = []
+    lost = 0
+    failures = 0
+    outer = []
+    inner = []
+    worst = 0.0
     cascade_loop(
         PLANT, cascade, references, start, 2, on_failure="previous_plan"
     )  # compiles and loads

@@ -110,7 +110,8 @@ class PlainSLSQP(SLSQP):
             self.problem, self.horizon, self.initial_input, belief, reference, previous
         )
         memory = [self.evaluate(np.tile(HOVER, self.horizon), request)]
-        start, cost = memory[0].plan, memory[0].cost
+        start = memory[0].plan
+        cost = memory[0].cost
 
         def at(plan):
             if not np.array_equal(plan, memory[0].plan):
@@ -124,14 +125,10 @@ class PlainSLSQP(SLSQP):
         options = {"ftol": 1e-6 * cost, "maxiter": 300}
         gradient = {"jac": lambda U: at(U).gradient, "bounds": box, "options": options}
         result = minimize(lambda U: at(U).cost, start, method="SLSQP", **gradient)
-        found, status = (
-            at(result.x),
-            Status.SOLVED if result.success else Status.ITERATION_LIMIT,
-        )
-        inputs, spent = (
-            result.x.reshape(self.horizon, -1),
-            Timing(0.0, 0.0, time.perf_counter() - began),
-        )
+        found = at(result.x)
+        status = Status.SOLVED if result.success else Status.ITERATION_LIMIT
+        inputs = result.x.reshape(self.horizon, -1)
+        spent = Timing(0.0, 0.0, time.perf_counter() - began)
         return Decision(
             inputs[0], inputs, found.means, found.covariances, status, result.nit, spent
         )
@@ -146,7 +143,8 @@ def measured(
     )
     exact = MomentMatching()
     taken = {name: [] for name in ["jacobian", *controllers]}
-    unsolved, last = dict.fromkeys(controllers, 0), dict.fromkeys(controllers)
+    unsolved = dict.fromkeys(controllers, 0)
+    last = dict.fromkeys(controllers)
     for count, step in enumerate(flown):
         input = torch.tensor(step.decision.input)
         spent = {

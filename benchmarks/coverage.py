@@ -149,7 +149,8 @@ def partial_of(chosen: Experiment, restarts: int) -> Any:
 
 def of_car(kind: str, flights: int, seed: int) -> Learned:
     """Random drives."""
-    system, deviations = car(), NOISES["car"]
+    system = car()
+    deviations = NOISES["car"]
     process = deviations if kind == "process" else None
     rows = RandomData(400, noise=process, seed=seed).transitions(system)
     fresh = RandomData(
@@ -169,7 +170,8 @@ def of_car(kind: str, flights: int, seed: int) -> Learned:
 
 def measured(rows: Transitions, deviations: list[float], seed: int) -> Transitions:
     """The same motion as noisy sensors show it."""
-    rng, seen = np.random.default_rng(500 + seed), []
+    rng = np.random.default_rng(500 + seed)
+    seen = []
     for run in Recording.chained(rows):
         states = run.states.numpy()
         states = states + rng.normal(0.0, 1.0, states.shape) * deviations
@@ -180,7 +182,8 @@ def measured(rows: Transitions, deviations: list[float], seed: int) -> Transitio
 
 def calibrations(learned: Learned) -> dict[str, Calibration]:
     """By which noise the intervals hold."""
-    model, separated = learned.model, learned.separated
+    model = learned.model
+    separated = learned.separated
     latent: Any = MomentMatching(process_noise=False)
     if isinstance(best_propagator(model), Unscented):
         latent = Unscented(process_noise=False)
@@ -202,7 +205,8 @@ def calibrations(learned: Learned) -> dict[str, Calibration]:
 
 def cell(coverage: np.ndarray) -> str:
     """Mean, least and largest over the states."""
-    low, high = coverage.min(), coverage.max()
+    low = coverage.min()
+    high = coverage.max()
     return f"{coverage.mean():.2f} ({low:.2f}-{high:.2f})"
 
 
@@ -214,7 +218,8 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=1)
     given = parser.parse_args()
     use_one_thread()
-    console, rows = Console(width=130), []
+    console = Console(width=130)
+    rows = []
     pooled: dict[tuple[str, str], list[np.ndarray]] = {}
     for name in given.plants:
         for kind in KINDS:

@@ -227,7 +227,9 @@ def rows_of_furuta(seed: int) -> Transitions:
     """Noisy rows under random torques from random starts."""
     generator = np.random.default_rng(seed)
     system = furuta()
-    states, inputs, after = [], [], []
+    states = []
+    inputs = []
+    after = []
     while len(states) < ROWS:
         spread = [0.5, 4.0, 2.5, 8.0]
         x = generator.normal(size=4) * spread + [0.0, 0.0, np.pi, 0.0]
@@ -309,7 +311,9 @@ def rows_of_car(seed: int) -> Transitions:
     generator = np.random.default_rng(seed)
     system = car()
     spread = 0.002 * np.array([1.0, 1.0, 1.0, 5.0, 5.0, 10.0])
-    states, inputs, after = [], [], []
+    states = []
+    inputs = []
+    after = []
     while len(states) < ROWS:
         x = np.zeros(6)
         x[2] = generator.uniform(-np.pi, np.pi)

@@ -24,7 +24,11 @@ from gpmpc.mpc import GPMPC, Box, PredictionSettings, Problem, Reference, Tracki
 from gpmpc.propagation import Linearization
 from gpmpc.systems.gymnasium_ import gymnasium_system
 
-HORIZON, DELAY, SIDE, TURN, SECOND = 50, 3, 0.3, 60, 25
+HORIZON = 50
+DELAY = 3
+SIDE = 0.3
+TURN = 60
+SECOND = 25
 LOOPS = {
     "no delay": (0, 0),
     "delay ignored": (DELAY, 0),
@@ -38,7 +42,10 @@ pole = gymnasium_system("InvertedPendulum-v5").dynamics
 
 def learned(steps: int = 600) -> ResidualModel:
     """A model of 200 of the transitions under pushes that change every second step."""
-    rng, rows, seed, push = np.random.default_rng(0), [], 0, np.zeros(1)
+    rng = np.random.default_rng(0)
+    rows = []
+    seed = 0
+    push = np.zeros(1)
     state = pole.reset(seed)
     for k in range(steps):
         push = rng.uniform(-1, 1, 1) if k % 2 == 0 else push
@@ -72,11 +79,9 @@ def fly(
     controller = GPMPC(
         planned, Linearization(), problem, HORIZON, [0.0], PredictionSettings()
     )
-    reference, errors, decision = (
-        np.zeros((steps + HORIZON + 1, planned.state_dim)),
-        [],
-        None,
-    )
+    reference = np.zeros((steps + HORIZON + 1, planned.state_dim))
+    errors = []
+    decision = None
     if moved:
         reference[:, 0] = np.where(np.arange(len(reference)) // TURN % 2, -SIDE, SIDE)
     state = pole.reset(seed)
@@ -106,7 +111,8 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=300)
     arguments = parser.parse_args()
     torch.set_num_threads(1)
-    model, results = learned(), []
+    model = learned()
+    results = []
     print(
         f"{'':38}{'cart [m]':>10}{'ratio':>7}{'pole [rad]':>12}{'ratio':>7}{'lost':>6}"
     )

@@ -29,7 +29,9 @@ from gpmpc.mpc.gp_mpc import GPMPC
 from gpmpc.mpc.problem import Tracking
 from gpmpc.propagation import Linearization
 
-GAINS, CHANGES, STATES = (0.0, 0.3, 1.0), (0.01, 0.1), 6
+GAINS = (0.0, 0.3, 1.0)
+CHANGES = (0.01, 0.1)
+STATES = 6
 SENSORS = {
     "process 0.01": 1e-3,
     "measured 0.01": 0.01,
@@ -48,9 +50,12 @@ class FilteredControl:
     """
 
     def __init__(self, model: GPPosterior, change: float, sensor: float):
-        eye, n = torch.eye(STATES, dtype=torch.float64), STATES
-        self.model, self.sensor = DisturbedModel(model, eye, [change] * n), sensor
-        self.problem, self.horizon = problem(), HORIZON
+        eye = torch.eye(STATES, dtype=torch.float64)
+        n = STATES
+        self.model = DisturbedModel(model, eye, [change] * n)
+        self.sensor = sensor
+        self.problem = problem()
+        self.horizon = HORIZON
         cost = Tracking([1] * n + [0] * n, [1] * 3)
         self.inner = GPMPC(
             self.model,
@@ -64,7 +69,8 @@ class FilteredControl:
             self.model, Measurement.of_states(2 * n, range(n), [sensor] * n)
         )
         self.seconds: list[tuple[float, float]] = []
-        self._belief, self._last = None, None
+        self._belief = None
+        self._last = None
 
     def control(
         self, belief: Gaussian, reference: Reference, previous: Decision | None = None
@@ -73,12 +79,10 @@ class FilteredControl:
         begin = perf_counter()
         if previous is None or self._belief is None:
             covariance = self.sensor**2 * torch.eye(STATES, dtype=torch.float64)
-            self._belief, last = (
-                self.model.augmented(
-                    Gaussian(belief.mean, covariance), [CONSTANTS] * STATES
-                ),
-                None,
+            self._belief = self.model.augmented(
+                Gaussian(belief.mean, covariance), [CONSTANTS] * STATES
             )
+            last = None
         else:
             moved = self.filter.predict(self._belief, previous.input)
             self._belief = self.filter.update(moved, belief.mean).belief
@@ -111,7 +115,8 @@ def main() -> None:
     for trajectory in TRAJECTORIES:
         model = trained(trajectory)
         for way in (*GAINS, *(f"states, {change}" for change in CHANGES)):
-            row, times = [], []
+            row = []
+            times = []
             for mass in MASSES:
                 for noise in NOISES:
                     if isinstance(way, float):

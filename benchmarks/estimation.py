@@ -39,7 +39,10 @@ from gpmpc.mpc.gp_mpc import GPMPC
 from gpmpc.mpc.problem import Box, Problem, Tracking
 from gpmpc.propagation import Linearization
 
-STEP, LIMIT, HORIZON, DELAY = 0.05, 15.0, 20, 3
+STEP = 0.05
+LIMIT = 15.0
+HORIZON = 20
+DELAY = 3
 NOISE = np.array([1e-3, 0.02])  # of a step [rad, rad/s]
 SENSOR = np.array([0.01, 0.1])  # of a measurement [rad, rad/s]
 FALLEN = math.pi / 2
@@ -58,13 +61,11 @@ def pendulum(x: Array, u: Array, substeps: int = 5) -> Array:
 class Exact:
     """The pendulum itself as a model: what a controller could know at most."""
 
-    state_dim, input_dim, output_dim, dtype, device = (
-        2,
-        1,
-        2,
-        torch.float64,
-        torch.device("cpu"),
-    )
+    state_dim = 2
+    input_dim = 1
+    output_dim = 2
+    dtype = torch.float64
+    device = torch.device("cpu")
     noise_covariance = torch.diag(torch.from_numpy(NOISE**2))
 
     def predict(self, state: torch.Tensor, input: torch.Tensor) -> Gaussian:
@@ -93,7 +94,8 @@ def pendulum_many(
         (*states.shape[:-1], 2, 3)
     )  # of angle and rate by both and the torque
     slope[..., 0, 0] = slope[..., 1, 1] = 1.0
-    angle, rate = states[..., 0], states[..., 1]
+    angle = states[..., 0]
+    rate = states[..., 1]
     for _ in range(substeps):
         pull = (
             -9.81 * np.cos(angle)[..., None] * slope[..., 0, :]
@@ -102,10 +104,8 @@ def pendulum_many(
         )
         rate = rate + h * (-9.81 * np.sin(angle) - 0.1 * rate + inputs[..., 0])
         slope[..., 1, :] += h * pull
-        angle, slope[..., 0, :] = (
-            angle + h * rate,
-            slope[..., 0, :] + h * slope[..., 1, :],
-        )
+        angle = angle + h * rate
+        slope[..., 0, :] = slope[..., 0, :] + h * slope[..., 1, :]
     return (
         np.stack([angle, rate], axis=-1),
         slope[..., :2].copy(),
@@ -199,7 +199,8 @@ def one_in_five_lost(rng: np.random.Generator) -> Array:
     return np.full(2, np.nan if rng.random() < 0.2 else 0.0)
 
 
-LATE, FULL = f"delay {DELAY}", "noisy, filtered"
+LATE = f"delay {DELAY}"
+FULL = "noisy, filtered"
 LOOPS = {
     "state measured": Loop(),
     f"{LATE}, ignored": Loop(DELAY),
@@ -294,7 +295,12 @@ def fly(model: Any, loop: Loop, steps: int, seed: int) -> Flown:
     )
     if loop.drift:
         belief = estimated.augmented(belief, [5 * loop.drift])
-    decision, errors, decisions, filters, wrong, doubts = None, [], [], [], [], []
+    decision = None
+    errors = []
+    decisions = []
+    filters = []
+    wrong = []
+    doubts = []
     for k in range(steps):
         begin = perf_counter()
         if loop.measures is None:
@@ -361,7 +367,8 @@ def main() -> None:
         f"{'RMSE':>9}  {'ratio':24}fell  {'NEES (95 % band)':22}{'ms':>8}{'filter':>8}"
     )
     print(f"{'':30}{columns}")
-    results, rmse = [], {}
+    results = []
+    rmse = {}
     for name, loop in LOOPS.items():
         flown = [
             fly(model, loop, arguments.steps, seed) for seed in range(arguments.seeds)

@@ -28,7 +28,9 @@ from gpmpc._compiled import compiled
 from gpmpc._kernels._simd import load, store
 from gpmpc.gp import GPPosterior
 
-STATES, INPUTS, LANES = 6, 3, 8
+STATES = 6
+INPUTS = 3
+LANES = 8
 # Vector instructions for eight pairs of points, R states:
 DELTA = STATES + 1  # rise + fall + left . right
 REDUCTION = (
@@ -77,25 +79,23 @@ def measured(packed: kernels.Packed, size: int, belief: str) -> dict:
     S = BELIEFS[belief] * (np.eye(STATES) + 0.1)
     asked = packed, np.zeros((1, STATES)), S[None], np.zeros((1, INPUTS)), False, True
     kernels.moments(*asked)
-    times, rates, began = [], [], time.process_time()
+    times = []
+    rates = []
+    began = time.process_time()
     while time.process_time() - began < TIMES["seconds"] or len(times) < TIMES["least"]:
         rates.append(issue_rate())
         start = time.process_time()
         kernels.moments(*asked)
         times.append(time.process_time() - start)
-    middle, general = (
-        float(np.median(times)),
-        instructions(packed, reduced=True) / max(rates),
-    )
+    middle = float(np.median(times))
+    general = instructions(packed, reduced=True) / max(rates)
     floor = (
         general
         if belief == "wide"
         else instructions(packed, reduced=False) / max(rates)
     )
-    factor, centred = (
-        summed(packed.precision.inverse_cholesky),
-        summed(packed.precision.centred),
-    )
+    factor = summed(packed.precision.inverse_cholesky)
+    centred = summed(packed.precision.centred)
     return {
         "N": size,
         "belief": belief,
@@ -114,8 +114,10 @@ def measured(packed: kernels.Packed, size: int, belief: str) -> dict:
 
 def instructions(packed: kernels.Packed, reduced: bool) -> float:
     """Vector instructions that a Jacobian must issue over all pairs, with or without the reduction of expm1."""
-    k, padded = packed.output_dim, packed.arrays.points.shape[1]
-    square, triangle = padded**2 / LANES, padded * (padded + LANES) / 2 / LANES
+    k = packed.output_dim
+    padded = packed.arrays.points.shape[1]
+    square = padded**2 / LANES
+    triangle = padded * (padded + LANES) / 2 / LANES
     each = DELTA + EXPM1 + SUMS + (REDUCTION if reduced else 0)
     return k * (k - 1) / 2 * square * each + k * triangle * (each + WEIGHT + EXPLAINED)
 
@@ -131,29 +133,33 @@ def issue_rate(count: int = 200_000) -> float:
 @compiled
 def multiply_add(values, count):
     """Twelve chains of ``count`` multiply-adds in registers: two a cycle hide a latency of four."""
-    a, b, c, d = load(values, 0), load(values, 8), load(values, 16), load(values, 24)
-    e, f, g, h = load(values, 32), load(values, 40), load(values, 48), load(values, 56)
-    i, j, k, m = load(values, 64), load(values, 72), load(values, 80), load(values, 88)
-    added, factor = load(values, 96), values[104]
+    a = load(values, 0)
+    b = load(values, 8)
+    c = load(values, 16)
+    d = load(values, 24)
+    e = load(values, 32)
+    f = load(values, 40)
+    g = load(values, 48)
+    h = load(values, 56)
+    i = load(values, 64)
+    j = load(values, 72)
+    k = load(values, 80)
+    m = load(values, 88)
+    added = load(values, 96)
+    factor = values[104]
     for _ in range(count):
-        a, b, c, d = (
-            added + factor * a,
-            added + factor * b,
-            added + factor * c,
-            added + factor * d,
-        )
-        e, f, g, h = (
-            added + factor * e,
-            added + factor * f,
-            added + factor * g,
-            added + factor * h,
-        )
-        i, j, k, m = (
-            added + factor * i,
-            added + factor * j,
-            added + factor * k,
-            added + factor * m,
-        )
+        a = added + factor * a
+        b = added + factor * b
+        c = added + factor * c
+        d = added + factor * d
+        e = added + factor * e
+        f = added + factor * f
+        g = added + factor * g
+        h = added + factor * h
+        i = added + factor * i
+        j = added + factor * j
+        k = added + factor * k
+        m = added + factor * m
     store(values, 0, a), store(values, 8, b), store(values, 16, c), store(values, 24, d)
     (
         store(values, 32, e),

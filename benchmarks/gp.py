@@ -28,7 +28,8 @@ from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior, exact_inference, to_gpytorch
 from gpmpc.propagation._moments import moments
 
-STATES, INPUTS = 6, 3
+STATES = 6
+INPUTS = 3
 Group = dict[str, Callable[[], list | tuple]]
 
 
@@ -47,9 +48,14 @@ def main() -> None:
     parser.add_argument("--torch-jacobian-up-to", type=int, default=500)
     arguments = parser.parse_args()
     torch.set_default_dtype(torch.float64)
-    here, results, began = machine(), [], time.perf_counter()
-    gps, at, u = posterior(8).packed, belief(), np.zeros(INPUTS)
-    mu, S = at.mean.numpy()[None], at.covariance.numpy()[None]
+    here = machine()
+    results = []
+    began = time.perf_counter()
+    gps = posterior(8).packed
+    at = belief()
+    u = np.zeros(INPUTS)
+    mu = at.mean.numpy()[None]
+    S = at.covariance.numpy()[None]
     kernels.linearize(gps, mu, u[None], False, np.zeros(STATES), False)
     kernels.point_with_jacobian(gps, mu, u[None])
     kernels.moments(gps, mu, S, u[None], derivatives=True)
@@ -58,16 +64,15 @@ def main() -> None:
         f"{describe(here)}\nfirst calls of the three kernels: {first:.2f} s (compiled, or read from the cache)\n"
     )
     for size in arguments.sizes:
-        gp, control = posterior(size), torch.linspace(-0.3, 0.3, INPUTS)
+        gp = posterior(size)
+        control = torch.linspace(-0.3, 0.3, INPUTS)
         rows = []
         for group in linearisation_groups(
             gp, belief(), control, size <= arguments.torch_jacobian_up_to
         ):
             own = next(iter(group))
-            times, found = (
-                time_interleaved(group, arguments.seconds),
-                {name: call() for name, call in group.items()},
-            )
+            times = time_interleaved(group, arguments.seconds)
+            found = {name: call() for name, call in group.items()}
             for name, taken in times.items():
                 row = (
                     {"N": size, "what": name}
@@ -137,7 +142,8 @@ def linearisation_groups(
         reverse_mode: Includes torch's reverse mode through the closed form of the moments, which keeps all N x N
             products of all pairs of outputs.
     """
-    n, packed = gp.state_dim, gp.packed
+    n = gp.state_dim
+    packed = gp.packed
     at = (
         belief.mean.numpy()[None],
         belief.covariance.numpy()[None],

@@ -28,7 +28,9 @@ from gpmpc.qp import DualActiveSet
 
 RECORD = Path(__file__).with_name("guard.json")
 MARGIN = 1.3
-STATES, SIZE, HORIZON = 6, 189, 10
+STATES = 6
+SIZE = 189
+HORIZON = 10
 SECONDS = 2.0  # a group
 
 
@@ -92,7 +94,8 @@ def ratios() -> dict[str, float]:
 def groups() -> list[tuple]:
     """(name of the reference, the reference, what is compared with it)."""
     gp = pendulum_gp(STATES, SIZE)
-    exact, input = MomentMatching(), torch.zeros(gp.state_dim // 2, dtype=torch.float64)
+    exact = MomentMatching()
+    input = torch.zeros(gp.state_dim // 2, dtype=torch.float64)
     belief = Gaussian(
         torch.zeros(STATES, dtype=torch.float64),
         STD**2 * torch.eye(STATES, dtype=torch.float64),
@@ -144,7 +147,8 @@ def exponentials():
 
 def small_calls():
     """Forty products of small matrices, with what the interpreter does around each."""
-    matrix, vector = np.eye(6), np.ones(6)
+    matrix = np.eye(6)
+    vector = np.ones(6)
 
     def kernel():
         kept = []
@@ -157,7 +161,9 @@ def small_calls():
 
 def solving(programs):
     """Solves one of the quadratic programs a call, warm-started from the last."""
-    solver, tasks, last = DualActiveSet(), cycle(programs), [None]
+    solver = DualActiveSet()
+    tasks = cycle(programs)
+    last = [None]
 
     def solve():
         last[0] = solver.solve(next(tasks), last[0])

@@ -56,7 +56,8 @@ class QuadrupleTank:
         for level, outlet in zip([x[i] for i in range(4)], self.outlets, strict=True):
             root = level / (level * level + 1e-4) ** 0.25
             out.append(outlet * math.sqrt(2.0 * self.gravity) * root)
-        first, second = self.pumps[0] * u[0], self.pumps[1] * u[1]
+        first = self.pumps[0] * u[0]
+        second = self.pumps[1] * u[1]
         return [
             (out[2] + self.below[0] * first - out[0]) / self.areas[0],
             (out[3] + self.below[1] * second - out[1]) / self.areas[1],
@@ -114,7 +115,8 @@ def true_model(system: System) -> KnownModel:
 def learned_model(system: System, samples: int, seed: int) -> ResidualModel:
     """A model of random steps, whose angles are seen as sine and cosine."""
     data = RandomData(samples=samples, seed=seed).transitions(system, None, "random")
-    n, m = data.state_dim, data.input_dim
+    n = data.state_dim
+    m = data.input_dim
     return ResidualModel.train(
         Affine.identity(n, m),
         data,
@@ -172,7 +174,8 @@ def measured_horizon(
     system: System, model: DynamicsModel, cost: Tracking, longest: int
 ) -> int | None:
     """The shortest horizon with which flights do not part, by bisection up to the longest."""
-    lost, held = 0, longest
+    lost = 0
+    held = longest
     state = np.array(system.goal)
     if parts(system, controller(system, model, cost, longest), state):
         return None

@@ -14,7 +14,9 @@ import numpy as np
 from numba import njit
 
 Array = np.ndarray
-STEP, SUBSTEPS, GRAVITY = 0.01, 4, 9.81
+STEP = 0.01
+SUBSTEPS = 4
+GRAVITY = 9.81
 HOVER = np.array(
     [0, 0, 1.0] + [0.0] * 3 + [0, 0, 0, 1.0] + [0.0] * 10
 )  # without the rotors' speeds
@@ -77,7 +79,8 @@ def derivative(s, commands, p):
     k_eta, k_m, k_h = p.coefficients
     R = _rotation(s[6:10])
     air = R.T @ (v - wind)
-    force, torque = -math.sqrt((air * air).sum()) * p.drag * air, np.zeros(3)
+    force = -math.sqrt((air * air).sum()) * p.drag * air
+    torque = np.zeros(3)
     for r in range(4):
         local = air + np.cross(w, p.arms[r])
         f = -speeds[r] * p.rotor_drag * local
@@ -101,7 +104,8 @@ def derivative(s, commands, p):
 @njit(cache=True)
 def advance(s, velocity, wind, p, steps):
     """Moves a state (20,) on by steps of 0.01 s with a velocity command, in a constant wind."""
-    s, h = s.copy(), STEP / SUBSTEPS
+    s = s.copy()
+    h = STEP / SUBSTEPS
     s[13:16] = wind
     for _ in range(steps):
         commands = np.minimum(
@@ -135,14 +139,16 @@ def compiled_hummingbird() -> tuple[Array, Callable[[Array, Array, Array, int], 
         (float(theirs.k_v), float(theirs.kp_att), float(theirs.kd_att)),
         (float(theirs.rotor_speed_min), float(theirs.rotor_speed_max)), theirs.tau_m,
     )  # fmt: skip
-    hover, rng = HOVER.copy(), np.random.default_rng(0)
+    hover = HOVER.copy()
+    rng = np.random.default_rng(0)
     hover[16:] = math.sqrt(p.mass * GRAVITY / (4 * theirs.k_eta))
     for _ in range(20):
         s = hover + rng.normal(0, 1, 20) * np.repeat(
             [1.0, 0.2, 1.0, 2.0, 100.0], [6, 4, 3, 3, 4]
         )
         s[6:10] /= np.linalg.norm(s[6:10])
-        velocity, commands = rng.normal(0, 1, 3), rng.uniform(300, 900, 4)
+        velocity = rng.normal(0, 1, 3)
+        commands = rng.uniform(300, 900, 4)
         wanted = theirs.get_cmd_motor_speeds(
             Multirotor._unpack_state(s), {"cmd_v": velocity}
         )

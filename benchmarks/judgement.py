@@ -40,7 +40,8 @@ class Reversed(Disturbance):
     """From a time on an input acts the other way round, seen from its value at rest."""
 
     def __init__(self, input: int, start: float):
-        self.input, self.start = input, start
+        self.input = input
+        self.start = start
 
     def disturb_plant(self, plant: System, time: float) -> System:
         """Returns the plant with its input turned round."""
@@ -66,7 +67,8 @@ class Frozen(Disturbance):
     """From a time on sensors show what they showed then."""
 
     def __init__(self, entries: Sequence[int], start: float):
-        self.entries, self.start = list(entries), start
+        self.entries = list(entries)
+        self.start = start
         self._held: Array | None = None
 
     def disturb_measurement(self, state: Array, time: float) -> Array:
@@ -111,7 +113,8 @@ class QuadrupleTank:
                 (0.071, 0.057, 0.071, 0.057), (x[0], x[1], x[2], x[3]), strict=True
             )
         ]
-        first, second = 3.14 * u[0], 3.29 * u[1]
+        first = 3.14 * u[0]
+        second = 3.29 * u[1]
         return [
             (-outflow[0] + outflow[2] + 0.43 * first) / 28.0,
             (-outflow[1] + outflow[3] + 0.34 * second) / 32.0,
@@ -122,7 +125,8 @@ class QuadrupleTank:
 
 def tank(horizon: int, steps: int = 120, on_step: Any = None, **more: Any) -> Any:
     """Flies the tank with its true model, five seconds a step, from rest to higher levels."""
-    rest, goal = [12.6, 13.0, 4.8, 4.9], [13.6, 14.0, 4.8, 4.9]
+    rest = [12.6, 13.0, 4.8, 4.9]
+    goal = [13.6, 14.0, 4.8, 4.9]
     plant = System(
         QuadrupleTank(),
         5.0,
@@ -398,7 +402,9 @@ def first_called(flown: Any, twin: Any, since: int) -> int | None:
 def good(limit: int) -> None:
     """Prints how good flights are judged."""
     flights = good_flights()[:limit]
-    rows, alarms, suspicious = [], 0, 0
+    rows = []
+    alarms = 0
+    suspicious = 0
     for scenario in flights:
         with one_thread():
             judgement = run_trial(experiment(scenario)).rollout.judgement
@@ -536,10 +542,8 @@ def cost() -> None:
             begin = perf_counter()
             judge.judge(step.measured, ahead, step.decision)
             seconds.append(perf_counter() - begin)
-        spent, decided = (
-            float(np.median(seconds)),
-            float(np.median(flown.rollout.seconds)),
-        )
+        spent = float(np.median(seconds))
+        decided = float(np.median(flown.rollout.seconds))
         rows.append(
             [
                 path,

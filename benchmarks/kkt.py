@@ -80,7 +80,8 @@ def kkt_residual(
         raise SettingError(
             "problem", "must bound nothing but inputs, and weigh inputs or increments"
         )
-    H, m = len(instance.targets), problem.input_dim
+    H = len(instance.targets)
+    m = problem.input_dim
     if np.shape(inputs) != (H, m):
         raise ShapeError(
             f"a plan of {H} stages and {m} inputs must have shape ({H}, {m}); got {np.shape(inputs)}"
@@ -102,10 +103,8 @@ def kkt_residual(
         for i in range(k, H):
             response = response if i == k else A[i] @ response
             curvature[k] += 2 * np.einsum("aj,ab,bj->j", response, weights[i], response)
-    above, below = (
-        curvature * (inputs - problem.inputs.lower),
-        curvature * (inputs - problem.inputs.upper),
-    )
+    above = curvature * (inputs - problem.inputs.lower)
+    below = curvature * (inputs - problem.inputs.upper)
     left = np.abs(np.maximum(below, np.minimum(gradient, above)))
     sizes = np.minimum(
         np.maximum(1.0, np.abs(inputs)), problem.inputs.upper - problem.inputs.lower
@@ -120,7 +119,10 @@ def _rollout(
     model: DynamicsModel, state: Array, inputs: Array
 ) -> tuple[Array, Array, Array]:
     """States (H + 1, n), and the Jacobians (H, n, n) and (H, n, m) of every step."""
-    x, states, A, B = torch.tensor(state), [state], [], []
+    x = torch.tensor(state)
+    states = [state]
+    A = []
+    B = []
     for u in torch.from_numpy(np.array(inputs)):
         moved, by_state, by_input = predict_with_jacobian(model, x, u)
         x = moved.mean

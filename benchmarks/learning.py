@@ -59,7 +59,11 @@ from gpmpc.studies.study import fingerprint
 from gpmpc.systems import translational
 from gpmpc.trajectories import states_along
 
-HORIZON, STEPS, CHANGE, TURN, LOST = 10, 80, 20, 50, 5.0
+HORIZON = 10
+STEPS = 80
+CHANGE = 20
+TURN = 50
+LOST = 5.0
 POSITION = [0, 2, 4]
 HEAVY = translational(mass=1.2 * 0.74)
 CHANGES: dict[str, tuple] = {
@@ -73,7 +77,9 @@ CHANGES: dict[str, tuple] = {
 NOISES = {"process 0.01": NOISE, "measured 0.01": Noise(measurement=[0.01] * 6)}
 WAYS = ("as learned", "disturbance estimate", "online", "trained on the new plant")
 STORE = Path("outputs/benchmarks/learning.json")
-COUNTS, SIZES = (1, 5, 20), (0.05, 0.5, 2.0)  # of glitches [m or m/s]
+# of glitches [m or m/s]
+COUNTS = (1, 5, 20)
+SIZES = (0.05, 0.5, 2.0)
 FAULTS = (
     "none",
     *(f"{count} glitches of {size}" for count in COUNTS for size in SIZES),
@@ -138,11 +144,13 @@ def flights(
     way: str, trajectory: str, change: str, noise: str, seeds: int, fault: str = "none"
 ) -> list[Rollout]:
     """One a seed."""
-    disturbances, model = CHANGES[change], trained(trajectory)
+    disturbances = CHANGES[change]
+    model = trained(trajectory)
     if way == "trained on the new plant":
         if change == "20 % heavier":
             data = DATA.transitions(HEAVY, TRAJECTORIES[trajectory])
-            model, disturbances = TRAINER(data, seed=0).posterior, (Replaced(HEAVY),)
+            model = TRAINER(data, seed=0).posterior
+            disturbances = (Replaced(HEAVY),)
         else:
             disturbances = ()
     controller = controller_of(way, model)

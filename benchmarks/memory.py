@@ -19,7 +19,9 @@ from pathlib import Path
 
 import numpy as np
 
-WARM, STEADY = 5, 20  # steps before the steady state, and in it
+# steps before the steady state, and in it
+WARM = 5
+STEADY = 20
 MIB = 2.0**20
 
 
@@ -87,7 +89,8 @@ def flown(file: str, covariance: str, horizon: int) -> dict:
     torch.set_num_threads(1)
     libraries = resident()
     gp = load_posterior(file)
-    n, m = gp.state_dim, gp.input_dim
+    n = gp.state_dim
+    m = gp.input_dim
     box = {"inputs": Box([-1] * m, [1] * m)}
     problem = Problem(Tracking([1] * n, [1] * m), **box)
     settings = PredictionSettings(covariance=covariance)
@@ -95,8 +98,12 @@ def flown(file: str, covariance: str, horizon: int) -> dict:
         gp, Linearization(), problem, horizon, [0.0] * m, prediction=settings
     )
     reference = Reference(np.zeros((horizon + 1, n)))
-    eye, generator = torch.eye(n, dtype=torch.float64), torch.Generator().manual_seed(0)
-    decision, steady, risen, peak = None, 0, 0.0, 0.0
+    eye = torch.eye(n, dtype=torch.float64)
+    generator = torch.Generator().manual_seed(0)
+    decision = None
+    steady = 0
+    risen = 0.0
+    peak = 0.0
     for step in range(WARM + 2 * STEADY):
         belief = Gaussian(
             0.1 * torch.randn(n, generator=generator, dtype=torch.float64), 1e-4 * eye

@@ -42,7 +42,11 @@ CONTROLLERS = (
     ("body, estimate", "fitted", 0.3),
     ("learned", "learned", 0.3),
 )
-HORIZON, STEPS, STEP, RAMP = 20, 300, 0.04, 2.0  # stages, [-], [s], [s]
+# stages, [-], [s], [s]
+HORIZON = 20
+STEPS = 300
+STEP = 0.04
+RAMP = 2.0
 MEASURED = (
     np.tile([0.003, 0.01], 3).tolist() + np.tile([0.002, 0.02], 3).tolist()
 )  # [m, m/s], [rad, rad/s]
@@ -91,7 +95,8 @@ def fly(
     dither: float = 0.0,
 ) -> Rollout:
     """One flight: with a rigid body and neither estimate nor dither by NMPC, else by one program a step."""
-    known, solved = isinstance(model, KnownModel), gain == dither == 0.0
+    known = isinstance(model, KnownModel)
+    solved = gain == dither == 0.0
     settings = PredictionSettings(
         covariance="none" if known else "zero_order", disturbance_gain=gain
     )
@@ -120,7 +125,9 @@ def fly(
 
 def learn(seed: int) -> tuple[System, ResidualModel]:
     """The rigid body that is fitted to three flights, and the GPs on what it misses."""
-    rng, vehicle, rows = np.random.default_rng(seed), mujoco_quadrotor(), []
+    rng = np.random.default_rng(seed)
+    vehicle = mujoco_quadrotor()
+    rows = []
     for k in range(3):
         flown = fly(
             vehicle, known(vehicle.nominal), excitation(rng), 100 * seed + k, dither=0.1

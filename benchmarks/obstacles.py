@@ -27,7 +27,10 @@ from gpmpc.mpc import GPMPC, Box, ControlLoop, Decision, Inequality, Problem, Tr
 from gpmpc.propagation import Linearization
 from gpmpc.studies.study import TrialStore, fingerprint
 
-HORIZON, STEPS, STEP = 20, 60, 0.1  # stages, [-], [s]
+# stages, [-], [s]
+HORIZON = 20
+STEPS = 60
+STEP = 0.1
 NOISE = np.array(
     [0.004, 0.02, 0.004, 0.02]
 )  # standard deviations a step [m, m/s, m, m/s]
@@ -41,7 +44,9 @@ COUNTS = (
     "unflagged",
     "failed",
 )
-TOUCHES, MISSED = 1e-6, 1e-6  # [m] of a bound, of a violation
+# [m] of a bound, of a violation
+TOUCHES = 1e-6
+MISSED = 1e-6
 Array = np.ndarray
 
 
@@ -74,7 +79,9 @@ def learn(samples: int = 250) -> GPPosterior:
 
 def discs() -> casadi.Function:
     """By how far the point is inside each disc; parameters: x, y and radius of each."""
-    x, u, p = casadi.SX.sym("x", 4), casadi.SX.sym("u", 2), casadi.SX.sym("p", 9)
+    x = casadi.SX.sym("x", 4)
+    u = casadi.SX.sym("u", 2)
+    p = casadi.SX.sym("p", 9)
     inside = [
         p[3 * i + 2]
         - casadi.norm_2(casadi.vertcat(x[0] - p[3 * i], x[2] - p[3 * i + 1]))
@@ -108,7 +115,8 @@ def fly(model: GPPosterior, probability: float, seed: int) -> dict:
     loop = ControlLoop(GPMPC(model, Linearization(), problem, HORIZON, [0.0, 0.0]))
     (places, velocity), rng = scene(seed), np.random.default_rng([seed, 1])
     ahead = STEP * np.arange(1, HORIZON + 1)[:, None]
-    x, milliseconds = np.zeros(4), []
+    x = np.zeros(4)
+    milliseconds = []
     counts = dict.fromkeys(COUNTS, 0)
     for k in range(STEPS):
         p = np.tile(places.ravel(), (HORIZON, 1))
@@ -123,10 +131,8 @@ def fly(model: GPPosterior, probability: float, seed: int) -> dict:
             (np.linalg.norm(now[:, :2] - x[[0, 2]], axis=1) < now[:, 2]).any()
         )
         active = decision.applicable and margins(decision).max() > -TOUCHES
-        infeasible, flagged = (
-            least_violation(decision) > MISSED,
-            decision.violation > MISSED or not decision.status.solved,
-        )
+        infeasible = least_violation(decision) > MISSED
+        flagged = decision.violation > MISSED or not decision.status.solved
         found = (
             active,
             inside,
@@ -155,7 +161,8 @@ def margins(decision: Decision) -> Array:
 
 def least_violation(decision: Decision) -> float:
     """The least possible sum of violations of the discs' rows of a decision's program, inputs within their bounds."""
-    program, size = decision.problem, len(decision.problem.q)
+    program = decision.problem
+    size = len(decision.problem.q)
     rows = len(program.G)
     costs = np.concatenate([np.zeros(size), np.ones(rows)])
     sides = (
@@ -199,14 +206,13 @@ def main() -> None:
 def summary(scenes: list[dict], eta: float) -> str:
     """The table of all scenes."""
     total = {key: sum(scene[key] for scene in scenes) for key in COUNTS}
-    hits, active = total["inside of active"], total["active"]
+    hits = total["inside of active"]
+    active = total["active"]
     low = beta.ppf(0.025, hits, active - hits + 1) if hits else 0.0
     high = beta.ppf(0.975, hits + 1, active - hits) if hits < active else 1.0
     times = np.concatenate([scene["ms"] for scene in scenes])
-    touched, reached = (
-        sum(scene["inside"] > 0 for scene in scenes),
-        sum(scene["from goal"] < 0.3 for scene in scenes),
-    )
+    touched = sum(scene["inside"] > 0 for scene in scenes)
+    reached = sum(scene["from goal"] < 0.3 for scene in scenes)
     rows = [
         ("scenes, and steps", f"{len(scenes)}, {len(scenes) * STEPS}"),
         (

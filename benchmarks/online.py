@@ -19,7 +19,9 @@ import torch
 from benchmarks.timing import write_results
 from gpmpc.gp import GPPosterior, SlidingWindow, append_points, remove_points
 
-OUTPUTS, FEATURES, INPUTS = 6, 9, 3
+OUTPUTS = 6
+FEATURES = 9
+INPUTS = 3
 
 
 def main() -> None:
@@ -48,8 +50,10 @@ def main() -> None:
     for size in arguments.sizes:
         x, y, settings = problem(size + 10)
         gp = GPPosterior.from_hyperparameters(x[:size], y[:size], **settings)
-        one, ten = (x[size : size + 1], y[size : size + 1]), (x[size:], y[size:])
-        oldest, least = SlidingWindow(size), SlidingWindow(size, "least_informative")
+        one = (x[size : size + 1], y[size : size + 1])
+        ten = (x[size:], y[size:])
+        oldest = SlidingWindow(size)
+        least = SlidingWindow(size, "least_informative")
         ways: dict[str, Callable[[], GPPosterior]] = {
             "fresh": lambda s=size, x=x, y=y, h=settings: (
                 GPPosterior.from_hyperparameters(x[: s + 1], y[: s + 1], **h)

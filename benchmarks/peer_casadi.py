@@ -80,7 +80,9 @@ class Casadi:
         tolerance: float,
     ):
         check_problem(problem)
-        n, m, H = problem.state_dim, problem.input_dim, horizon
+        n = problem.state_dim
+        m = problem.input_dim
+        H = horizon
         plugin = method.split(",")[0]
         self._stagewise = plugin != "ipopt"
         carried = m if self._stagewise else 0  # of the last input in the state
@@ -88,10 +90,13 @@ class Casadi:
             mean_function(gp),
             *map(casadi.DM, (problem.cost.Q, problem.cost.R, problem.cost.terminal)),
         )
-        u, r = casadi.SX.sym("u", m, H), casadi.SX.sym("r", n, H)
+        u = casadi.SX.sym("u", m, H)
+        r = casadi.SX.sym("r", n, H)
         x = casadi.SX.sym("x", n + carried, H + 1)  # the first one is given
         last = casadi.SX.sym("last", m)
-        cost, gaps, unknowns = 0, [], []
+        cost = 0
+        gaps = []
+        unknowns = []
         for k in range(H):
             before = x[n:, k] if carried and k else u[:, k - 1] if k else last
             following = casadi.vertcat(
@@ -107,11 +112,9 @@ class Casadi:
                 else x[:, k + 1] - following
             )  # as they want it
             unknowns += [u[:, k], x[:, k + 1]]
-        w, p, g = (
-            casadi.vertcat(*unknowns),
-            casadi.veccat(x[:n, 0], last, r),
-            casadi.vertcat(*gaps),
-        )
+        w = casadi.vertcat(*unknowns)
+        p = casadi.veccat(x[:n, 0], last, r)
+        g = casadi.vertcat(*gaps)
         hessian = _gauss_newton(w, p, g, cost, triangle=plugin == "ipopt")
         options = _options(plugin, H, n + m, m, tolerance)
         if method in ("ipopt, gauss-newton", "sqpmethod"):
@@ -173,7 +176,8 @@ def check_problem(problem: Problem) -> None:
 
 def mean_function(gp: GPPosterior) -> casadi.Function:
     """The GPs' mean of the next state as scalar expressions, (state, input) -> mean."""
-    x, u = casadi.MX.sym("state", gp.state_dim), casadi.MX.sym("input", gp.input_dim)
+    x = casadi.MX.sym("state", gp.state_dim)
+    u = casadi.MX.sym("input", gp.input_dim)
     return casadi.Function(
         "mean", [x, u], [casadi_function(gp)(x, u)[0]], ["state", "input"], ["mean"]
     ).expand()
@@ -181,10 +185,8 @@ def mean_function(gp: GPPosterior) -> casadi.Function:
 
 def _gauss_newton(w: Any, p: Any, g: Any, cost: Any, triangle: bool) -> casadi.Function:
     """Hessian of the cost alone, which is that of Gauss and Newton for a quadratic cost of the unknowns."""
-    weight, multipliers = (
-        casadi.SX.sym("weight"),
-        casadi.SX.sym("multipliers", g.numel()),
-    )
+    weight = casadi.SX.sym("weight")
+    multipliers = casadi.SX.sym("multipliers", g.numel())
     hessian = weight * casadi.hessian(cost, w)[0]
     name, value = (
         ("triu_hess_gamma_x_x", casadi.triu(hessian))

@@ -47,10 +47,8 @@ class Daqp:
         P, q, G = (
             np.ascontiguousarray(part) for part in (problem.P, problem.q, problem.G)
         )
-        lower, upper = (
-            np.clip(problem.lower, -ABSENT, ABSENT),
-            np.clip(problem.upper, -ABSENT, ABSENT),
-        )
+        lower = np.clip(problem.lower, -ABSENT, ABSENT)
+        upper = np.clip(problem.upper, -ABSENT, ABSENT)
         model = self._models.get(G.shape)
         if model is None:
             model = self._models[G.shape] = daqp.Model()

@@ -72,11 +72,9 @@ class DoMpc:
         toolbox = importlib.import_module("do_mpc")
         model = _model(toolbox, gp)
         self._mpc = mpc = toolbox.controller.MPC(model)
-        (
-            mpc.settings.n_horizon,
-            mpc.settings.t_step,
-            mpc.settings.store_full_solution,
-        ) = self._horizon, 1.0, False
+        mpc.settings.n_horizon = self._horizon
+        mpc.settings.t_step = 1.0
+        mpc.settings.store_full_solution = False
         settings = {
             "tol": tolerance,
             "max_iter": MAX_ITERATIONS,
@@ -85,17 +83,17 @@ class DoMpc:
             f"ipopt.{name}": value for name, value in settings.items()
         }
         mpc.settings.supress_ipopt_output()
-        x, r = model.x["x"], model.tvp["r"]
-        Q, terminal = casadi.DM(problem.cost.Q), casadi.DM(problem.cost.terminal)
+        x = model.x["x"]
+        r = model.tvp["r"]
+        Q = casadi.DM(problem.cost.Q)
+        terminal = casadi.DM(problem.cost.terminal)
         mpc.set_objective(
             mterm=casadi.bilin(terminal, x - r, x - r),
             lterm=casadi.bilin(Q, x - r, x - r),
         )
         mpc.set_rterm(u=problem.cost.R.diagonal())
-        mpc.bounds["lower", "_u", "u"], mpc.bounds["upper", "_u", "u"] = (
-            problem.inputs.lower,
-            problem.inputs.upper,
-        )
+        mpc.bounds["lower", "_u", "u"] = problem.inputs.lower
+        mpc.bounds["upper", "_u", "u"] = problem.inputs.upper
         self._references = mpc.get_tvp_template()
         mpc.set_tvp_fun(lambda time: self._references)
         mpc.setup()

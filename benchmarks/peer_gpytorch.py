@@ -41,11 +41,10 @@ class GPyTorchSlsqp:
         self, gp: GPPosterior, problem: Problem, horizon: int, tolerance: float
     ):
         check_problem(problem)
-        self._model, self._adds_state = (
-            to_gpytorch(gp).requires_grad_(False),
-            gp.predicts == "difference",
-        )
-        self._horizon, self._tolerance = horizon, tolerance
+        self._model = to_gpytorch(gp).requires_grad_(False)
+        self._adds_state = gp.predicts == "difference"
+        self._horizon = horizon
+        self._tolerance = tolerance
         self._Q, self._R, self._terminal = map(
             torch.from_numpy, (problem.cost.Q, problem.cost.R, problem.cost.terminal)
         )
@@ -58,10 +57,8 @@ class GPyTorchSlsqp:
         start = np.tile(instance.last, (self._horizon, 1))
         if last is not None:
             start = np.concatenate([last.inputs[1:], last.inputs[-1:]])
-        targets, before = (
-            torch.from_numpy(instance.targets),
-            torch.from_numpy(np.array(instance.last)),
-        )
+        targets = torch.from_numpy(instance.targets)
+        before = torch.from_numpy(np.array(instance.last))
 
         def cost(plan: np.ndarray) -> tuple[float, np.ndarray]:
             inputs = torch.tensor(plan.reshape(start.shape), requires_grad=True)

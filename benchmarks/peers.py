@@ -46,15 +46,15 @@ from gpmpc.mpc.problem import Problem
 from gpmpc.propagation import Linearization
 from gpmpc.status import Status
 
-TRAJECTORY, STEPS = "lorenz", 150
+TRAJECTORY = "lorenz"
+STEPS = 150
 ACCURACY = 1e-5  # of the common KKT residual
-IPOPT, SQP, FATROP, SLSQP, OURS = (
-    1e-7,
-    1e-4,
-    1e-7,
-    1e-12,
-    1e-3,
-)  # tolerances of the solvers' own tests
+# tolerances of the solvers' own tests
+IPOPT = 1e-7
+SQP = 1e-4
+FATROP = 1e-7
+SLSQP = 1e-12
+OURS = 1e-3
 IN_A_ROW = 10
 MIN_ROUNDS = 2  # where a solver takes seconds
 SLOW_ABOVE = 10  # horizon above which SLSQP is left out: minutes
@@ -81,8 +81,11 @@ def main() -> None:
     )
     arguments = parser.parse_args()
     use_one_thread()
-    here, rows, sections = machine(), [], []
-    gp, task = trained(TRAJECTORY), peers_problem()
+    here = machine()
+    rows = []
+    sections = []
+    gp = trained(TRAJECTORY)
+    task = peers_problem()
     print(f"{describe(here)}\n")
     for horizon in (*arguments.horizons, *arguments.alone):
         instances = record_instances(gp, task, horizon, STEPS)
@@ -221,7 +224,8 @@ def _previous(instance: Instance, last: Decision | None) -> Decision:
             status=last.status, iterations=0, timing=Timing(0.0, 0.0, 0.0), solution=last.solution,
         )  # fmt: skip
     H, n = instance.targets.shape
-    inputs, nothing = np.tile(instance.last, (H, 1)), np.full((H + 1, n, n), np.nan)
+    inputs = np.tile(instance.last, (H, 1))
+    nothing = np.full((H + 1, n, n), np.nan)
     return Decision(
         input=inputs[0], inputs=inputs, means=nothing[:, 0], covariances=nothing,
         status=Status.ITERATION_LIMIT, iterations=0, timing=Timing(0.0, 0.0, 0.0),
@@ -236,12 +240,10 @@ class Run:
     """
 
     def __init__(self, solve: Solve, instances: Sequence[Instance], cold: bool = False):
-        self._solve, self._instances, self._cold, self._last = (
-            solve,
-            instances,
-            cold,
-            None,
-        )
+        self._solve = solve
+        self._instances = instances
+        self._cold = cold
+        self._last = None
         self.plans: list[tuple[int, np.ndarray]] = []
 
     def __call__(self) -> None:

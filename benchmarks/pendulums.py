@@ -49,7 +49,8 @@ class Pendulums:
         """d/dt (angle1, rate1, angle2, ...) [rad/s, rad/s^2], from torques per inertia [1/s^2]."""
         rates = []
         for i in range(self.count):
-            angle, rate = x[2 * i], x[2 * i + 1]
+            angle = x[2 * i]
+            rate = x[2 * i + 1]
             pull = -STIFFNESS * np.sin(angle) - DAMPING * rate + u[i]
             if i > 0:
                 pull = pull + SPRING * (x[2 * i - 2] - angle)
@@ -66,11 +67,10 @@ def pendulum_plant(state_dim: int) -> System:
 
 def pendulum_gp(state_dim: int, size: int, seed: int = 0) -> GPPosterior:
     """GPs on ``size`` transitions from all over the region that ``pendulum_references`` crosses."""
-    random, plant = (
-        np.random.default_rng([seed, state_dim, size]),
-        pendulum_plant(state_dim),
-    )
-    n, m = state_dim, state_dim // 2
+    random = np.random.default_rng([seed, state_dim, size])
+    plant = pendulum_plant(state_dim)
+    n = state_dim
+    m = state_dim // 2
     states = random.uniform(-1.0, 1.0, (size, n)) * np.tile(
         [1.2, 2.5], m
     )  # [rad, rad/s]
@@ -91,7 +91,9 @@ def pendulum_gp(state_dim: int, size: int, seed: int = 0) -> GPPosterior:
 
 def pendulum_references(state_dim: int, steps: int) -> np.ndarray:
     """Reference states (steps, n): every pendulum swings, each a little later than its neighbour."""
-    time, m = TIME_STEP * np.arange(steps), state_dim // 2
+    time = TIME_STEP * np.arange(steps)
+    m = state_dim // 2
     phase = time[:, None] - 0.3 * np.arange(m)
-    angles, rates = 0.8 * np.sin(1.5 * phase), 0.8 * 1.5 * np.cos(1.5 * phase)
+    angles = 0.8 * np.sin(1.5 * phase)
+    rates = 0.8 * 1.5 * np.cos(1.5 * phase)
     return np.stack([angles, rates], axis=2).reshape(steps, state_dim)

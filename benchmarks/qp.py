@@ -40,8 +40,11 @@ from gpmpc.qp import (
 )
 from gpmpc.status import Status
 
-OURS, DAQP_WARM, DAQP_COLD = "DualActiveSet", "DAQP update + solve", "DAQP solve"
-PRIMAL, CVXPY = "PrimalActiveSet", "CVXPY + Clarabel"
+OURS = "DualActiveSet"
+DAQP_WARM = "DAQP update + solve"
+DAQP_COLD = "DAQP solve"
+PRIMAL = "PrimalActiveSet"
+CVXPY = "CVXPY + Clarabel"
 CACHES = np.zeros(12_000_000)  # 96 MB, more than any cache of the machine
 
 Solve = Callable[[SequenceProblem], tuple[np.ndarray, np.ndarray]]
@@ -51,18 +54,17 @@ def ours(changing: bool) -> Callable[[SequenceProblem], Solve]:
     """A warm-started ``DualActiveSet``, with a prepared program where P and G stay."""
 
     def begin(first: SequenceProblem) -> Solve:
-        solver, last = DualActiveSet(), None
+        solver = DualActiveSet()
+        last = None
         prepared = None if changing else solver.prepare(first.P, first.G)
 
         def solve(problem: SequenceProblem):
             nonlocal last
-            P, q, G, lower, upper = (
-                problem.P,
-                problem.q,
-                problem.G,
-                problem.lower,
-                problem.upper,
-            )
+            P = problem.P
+            q = problem.q
+            G = problem.G
+            lower = problem.lower
+            upper = problem.upper
             if changing:
                 last = solver.solve(
                     QuadraticProgram.unchecked(P, q, G, lower, upper), last
@@ -141,7 +143,8 @@ def run_pass(
         *(np.array(a) for a in (first.P, first.q, first.G, first.lower, first.upper))
     )
     solve = begin(buffer)
-    seconds, answers = np.empty(len(problems)), []
+    seconds = np.empty(len(problems))
+    answers = []
     gc.collect()
     gc.disable()
     for i, problem in enumerate(problems):
@@ -254,7 +257,8 @@ def quantiles(seconds: np.ndarray) -> dict[str, float]:
 
 def describe(cell: dict) -> str:
     """One line per cell for the terminal."""
-    solvers, ratio = cell["solvers"], cell["ratio hot"]
+    solvers = cell["solvers"]
+    ratio = cell["ratio hot"]
     text = f"{cell['mode']:10s} H = {cell['horizon']:3d}, m = {cell['m']:3d}, {cell['active rows']:4.1f} active: "
     text += f"{solvers[OURS]['hot']['median']:8.2f} us, {cell['best DAQP path']} "
     text += f"{solvers[cell['best DAQP path']]['hot']['median']:8.2f} us, ratio {ratio['median']:.3f}"

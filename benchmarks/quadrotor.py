@@ -27,7 +27,8 @@ STATE_BOUNDS = {  # x [m], vx [m/s], y, vy, z, vz: a little inside the trajector
     ),
 }
 HOVER = [7.26, 0.0, 0.0]  # U1 [N], ux, uy [-]
-OUTER, INNER = translational(), rotational()
+OUTER = translational()
+INNER = rotational()
 NOISE = Noise(process=[0.01] * 6)
 DATA = ExcitedData(
     Excitation([1] * 6, [1] * 3, HOVER, [0.3, 0.03, 0.03], [0.01] * 6),
@@ -75,7 +76,8 @@ def recorded(
     asked: list[Asked] = []
 
     class Recording:
-        horizon, problem = controller.horizon, controller.problem
+        horizon = controller.horizon
+        problem = controller.problem
 
         def control(self, belief, reference, previous=None):
             eye = torch.eye(6, dtype=torch.float64)

@@ -37,7 +37,9 @@ WIDE = np.array(
     [5.0, 6.0] * 3
 )  # bounds on positions [m] and velocities [m/s] outside the corridor
 NARROW = np.array([2.5, 2.5] * 3)  # and inside it
-POSITION_NOISE, VELOCITY_NOISE = 0.01, 0.05  # standard deviations per step [m], [m/s]
+# standard deviations per step [m], [m/s]
+POSITION_NOISE = 0.01
+VELOCITY_NOISE = 0.05
 
 
 # Bounds that are active at about one step in ten: of ux and uy [-], and of the increments of U1 [N], ux, uy.
@@ -60,12 +62,11 @@ class SequenceProblem:
 
 def _reference(times: Array) -> Array:
     """Positions and velocities of the curve, one row of six per time."""
-    frequencies, amplitudes = np.array([0.9, 1.3, 0.7]), np.array([4.0, 3.0, 2.0])
+    frequencies = np.array([0.9, 1.3, 0.7])
+    amplitudes = np.array([4.0, 3.0, 2.0])
     phase = times[:, None] * frequencies
-    positions, velocities = (
-        amplitudes * np.sin(phase),
-        amplitudes * frequencies * np.cos(phase),
-    )
+    positions = amplitudes * np.sin(phase)
+    velocities = amplitudes * frequencies * np.cos(phase)
     return np.stack([positions, velocities], axis=2).reshape(len(times), 6)
 
 
@@ -78,7 +79,8 @@ def _linear_model(thrust: float, tilt: Array) -> tuple[Array, Array]:
             [-1.0 / MASS, 0.0, 0.0],
         ]
     )
-    A, B = np.eye(6), np.zeros((6, 3))
+    A = np.eye(6)
+    B = np.zeros((6, 3))
     A[[0, 2, 4], [1, 3, 5]] = TIME_STEP
     A[[1, 3, 5], [1, 3, 5]] -= DRAG * TIME_STEP
     B[[1, 3, 5]] = TIME_STEP * acceleration
@@ -88,14 +90,17 @@ def _linear_model(thrust: float, tilt: Array) -> tuple[Array, Array]:
 
 def _condense(A: Array, B: Array, horizon: int) -> tuple[Array, Array]:
     """``states = free x_0 + forced U`` over the horizon, A and B held."""
-    free, forced = np.zeros((6 * horizon, 6)), np.zeros((6 * horizon, 3 * horizon))
-    power, response = A, B
+    free = np.zeros((6 * horizon, 6))
+    forced = np.zeros((6 * horizon, 3 * horizon))
+    power = A
+    response = B
     for stage in range(horizon):
         free[6 * stage : 6 * stage + 6] = power
         for start in range(horizon - stage):
             row = 6 * (start + stage)
             forced[row : row + 6, 3 * start : 3 * start + 3] = response
-        power, response = A @ power, A @ response
+        power = A @ power
+        response = A @ response
     return free, forced
 
 
@@ -112,7 +117,8 @@ def quadrotor_sequence(
     rng = np.random.default_rng(seed)
     weight = np.kron(np.eye(horizon), STATE_WEIGHT)
     box = np.tile(INPUT_LIMIT, horizon)
-    state, plan = _reference(np.zeros(1))[0], np.zeros(3 * horizon)
+    state = _reference(np.zeros(1))[0]
+    plan = np.zeros(3 * horizon)
     prepared = None
     for step in range(length):
         now = step * TIME_STEP
@@ -135,7 +141,8 @@ def quadrotor_sequence(
         times = now + TIME_STEP * np.arange(1, horizon + 1)
         drift = free @ state
         q = gradient @ (drift - _reference(times).ravel())
-        limits, offset = _state_limits(times), drift
+        limits = _state_limits(times)
+        offset = drift
         feasible = G @ np.clip(np.concatenate([plan[3:], plan[-3:]]), -box, box)
         lower = np.concatenate([-box, np.minimum(-limits - offset, feasible - 0.01)])
         upper = np.concatenate([box, np.maximum(limits - offset, feasible + 0.01)])
@@ -175,11 +182,14 @@ def _two_sided(
     """Merges rows that are equal, such as an upper and a lower bound of one state: other solvers have fewer to scan."""
     n = len(q)
     rows, first, group = np.unique(G, axis=0, return_index=True, return_inverse=True)
-    low, high = np.full(len(rows), -np.inf), np.full(len(rows), np.inf)
+    low = np.full(len(rows), -np.inf)
+    high = np.full(len(rows), np.inf)
     np.maximum.at(low, group.ravel(), lower[n:])
     np.minimum.at(high, group.ravel(), upper[n:])
     order = np.argsort(first)
-    G, low, high = np.ascontiguousarray(rows[order]), low[order], high[order]
+    G = np.ascontiguousarray(rows[order])
+    low = low[order]
+    high = high[order]
     return SequenceProblem(
         P, q, G, np.concatenate([lower[:n], low]), np.concatenate([upper[:n], high])
     )

@@ -31,14 +31,19 @@ from gpmpc.qp import DualActiveSet, QuadraticProgram
 from gpmpc.recording import McapRecorder, RecordedSystem, Step
 from gpmpc.status import Status
 
-STATES, INPUTS = ("x", "vx", "y", "vy", "z", "vz"), ("U1", "ux", "uy")
+STATES = ("x", "vx", "y", "vy", "z", "vz")
+INPUTS = ("U1", "ux", "uy")
 
 
 def make_steps(horizon: int, count: int) -> list[Step]:
     """Steps that are all different."""
-    rng, n, m = np.random.default_rng(0), len(STATES), len(INPUTS)
-    variables, rows = m * horizon, n * horizon
-    solver, steps = DualActiveSet(), []
+    rng = np.random.default_rng(0)
+    n = len(STATES)
+    m = len(INPUTS)
+    variables = m * horizon
+    rows = n * horizon
+    solver = DualActiveSet()
+    steps = []
     for k in range(count):
         A = rng.standard_normal((variables, variables))
         bounds = {"h_lower": -np.full(rows, 5.0), "h_upper": np.full(rows, 5.0)}
@@ -85,7 +90,8 @@ def loop(
     steps: list[Step], count: int, apart: float, recorder: McapRecorder | None
 ) -> tuple[np.ndarray, float]:
     """Runs a loop; the times of ``record`` (count,) [s], and of the whole loop [s]."""
-    seconds, began = np.zeros(count), perf_counter()
+    seconds = np.zeros(count)
+    began = perf_counter()
     for k in range(count):
         total = 0.0
         for i in range(10_000):  # about half a millisecond
@@ -102,11 +108,14 @@ def measure(
     horizon: int, seconds: float, apart: float, record_problems: bool, turns: int
 ) -> dict:
     """Measures one line of the table."""
-    steps, count = make_steps(horizon, 16), round(seconds / 1e-3 / turns)
+    steps = make_steps(horizon, 16)
+    count = round(seconds / 1e-3 / turns)
     system = RecordedSystem(
         STATES, INPUTS, time_step=apart, pose={axis: axis for axis in "xyz"}
     )
-    records, with_recorder, without = [], [], []
+    records = []
+    with_recorder = []
+    without = []
     with tempfile.TemporaryDirectory() as folder:
         for turn in range(turns):
             path = Path(folder) / f"{turn}.mcap"

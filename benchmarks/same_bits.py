@@ -38,9 +38,12 @@ from gpmpc.simulation import Cascade, cascade_loop, closed_loop
 from gpmpc.systems import Coupled, System
 from gpmpc.trajectories import states_along
 
-STEPS, H, PATH = 8, 6, TRAJECTORIES["lorenz"]
+STEPS = 8
+H = 6
+PATH = TRAJECTORIES["lorenz"]
 BOUNDS = Box(*STATE_BOUNDS["lorenz"], probability=0.95, penalty=10.0)
-MATCHED, LINEARIZED = MomentMatching(), Linearization()
+MATCHED = MomentMatching()
+LINEARIZED = Linearization()
 CONTROLLERS: dict[str, Callable[[], Controller | Cascade]] = {
     "convex": lambda: GPMPC(trained("lorenz"), LINEARIZED, problem(), H, HOVER),
     "paper": lambda: GPMPC(
@@ -147,14 +150,13 @@ def main() -> int:
 
 def fly(names: list[str]) -> dict[str, np.ndarray]:
     """All arrays of the flights."""
-    references, found = states_along(PATH, np.arange(STEPS + H + 1.0)), {}
+    references = states_along(PATH, np.arange(STEPS + H + 1.0))
+    found = {}
     for name in names:
         controller = CONTROLLERS[name]()
         if isinstance(controller, Cascade):
-            plant, start = (
-                System(Coupled(), INNER.time_step, 1),
-                np.concatenate([references[0], np.zeros(6)]),
-            )
+            plant = System(Coupled(), INNER.time_step, 1)
+            start = np.concatenate([references[0], np.zeros(6)])
             flight = cascade_loop(
                 plant, controller, references, start, 2, on_failure="previous_plan"
             )

@@ -283,7 +283,8 @@ def _imported(tree: ast.Module, known: Mapping[str, object]) -> Iterator[str]:
 def _circles(graph: Mapping[str, set[str]]) -> list[list[str]]:
     """Strongly connected sets of more than one node: all that reach each other."""
     reached = {node: _reach(graph, node) for node in graph}
-    found, seen = [], set()
+    found = []
+    seen = set()
     for node in graph:
         circle = sorted(other for other in reached[node] if node in reached[other])
         if node not in seen and len(circle) > 1:
@@ -293,7 +294,8 @@ def _circles(graph: Mapping[str, set[str]]) -> list[list[str]]:
 
 
 def _reach(graph: Mapping[str, set[str]], start: str) -> set[str]:
-    reached, waiting = set(), [start]
+    reached = set()
+    waiting = [start]
     while waiting:
         for node in graph[waiting.pop()]:
             if node not in reached:

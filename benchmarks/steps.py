@@ -38,10 +38,9 @@ from gpmpc.simulation import closed_loop
 
 RECORDED_STEPS = 40
 STD = 0.01  # [rad, rad/s] of the beliefs: a full covariance is propagated, as with an estimator in the loop
-FIGURE_SIZE, FIGURE_HORIZON = (
-    189,
-    10,
-)  # N and H that the panels hold, or the nearest ones measured
+# N and H that the panels hold, or the nearest ones measured
+FIGURE_SIZE = 189
+FIGURE_HORIZON = 10
 LOOKS = {
     "paper's form": ("C1", "o"),
     "zero order": ("C0", "s"),
@@ -68,7 +67,9 @@ def main() -> None:
         "--seconds", type=float, default=0.5, help="processor time a cell [s]"
     )
     arguments = parser.parse_args()
-    here, rows, sections = machine(), [], []
+    here = machine()
+    rows = []
+    sections = []
     print(f"{describe(here)}\n")
     for n, cache in product(arguments.states, arguments.caches):
         found = [
@@ -131,7 +132,8 @@ class WarmStarted:
     unsolved: int = 0
 
     def __post_init__(self) -> None:
-        self._cycle, self._previous = cycle(self.steps), None
+        self._cycle = cycle(self.steps)
+        self._previous = None
 
     def __call__(self) -> Decision:
         """Decides the next step."""
@@ -144,10 +146,12 @@ def record_steps(
     gp: GPPosterior, controller: Controller, steps: int
 ) -> list[tuple[Gaussian, Reference]]:
     """Flies the pendulums with a controller and returns the beliefs and references of its steps."""
-    n, found = gp.state_dim, []
+    n = gp.state_dim
+    found = []
 
     class Recorder:
-        horizon, problem = controller.horizon, controller.problem
+        horizon = controller.horizon
+        problem = controller.problem
 
         def control(self, belief, reference, previous=None):
             belief = Gaussian(belief.mean, STD**2 * torch.eye(n, dtype=torch.float64))
@@ -194,12 +198,11 @@ def measure_size(
 
 def predictions(gp: GPPosterior) -> dict[str, Callable[[], object]]:
     """Builds the calls that predict one step of the GPs: mean, exact moments, exact moments with all derivatives."""
-    n, exact = gp.state_dim, MomentMatching()
+    n = gp.state_dim
+    exact = MomentMatching()
     references = torch.from_numpy(pendulum_references(n, RECORDED_STEPS))
-    covariance, input = (
-        STD**2 * torch.eye(n, dtype=torch.float64),
-        torch.zeros(n // 2, dtype=torch.float64),
-    )
+    covariance = STD**2 * torch.eye(n, dtype=torch.float64)
+    input = torch.zeros(n // 2, dtype=torch.float64)
 
     def along(predict: Callable[[Gaussian], object]) -> Callable[[], object]:
         beliefs = cycle([Gaussian(mean, covariance) for mean in references])
@@ -274,7 +277,8 @@ def speed_figure(rows: Sequence[Mapping]) -> Figure:
                     (row for row in panel if row["what"] == what),
                     key=lambda row: row[key],
                 )
-                at, median = [row[key] for row in line], [row["median"] for row in line]
+                at = [row[key] for row in line]
+                median = [row["median"] for row in line]
                 colour, marker = LOOKS[what]
                 axis.plot(
                     at, median, color=colour, marker=marker, markersize=3.5, label=what

@@ -41,7 +41,8 @@ class Circle:
         pendulum: Its dynamics.
     """
 
-    state_names, input_names = ("cosine", "sine", "rate"), ("torque",)
+    state_names = ("cosine", "sine", "rate")
+    input_names = ("torque",)
 
     def __init__(self, pendulum: Any):
         self.pendulum = pendulum
@@ -62,7 +63,8 @@ def experiment(name: str, seed: int) -> Experiment:
     if name != "circle":
         return chosen
     make: Any = chosen.controller
-    flown, problem = chosen.system, make.keywords["problem"]
+    flown = chosen.system
+    problem = make.keywords["problem"]
     system = System(
         Circle(flown.dynamics),
         flown.time_step,
@@ -96,7 +98,8 @@ class CircleData:
     note = "Data: our own, under random inputs."
 
     def __init__(self, data: Any, pendulum: System):
-        self.data, self.pendulum = data, pendulum
+        self.data = data
+        self.pendulum = pendulum
 
     def transitions(self, *_: Any) -> Transitions:
         """Returns them; the system that is asked for is this one."""
@@ -113,14 +116,16 @@ def fly(name: str, seed: int) -> dict[str, Any]:
     chosen = experiment(name, seed)
     with one_thread():
         flown = run_trial(chosen)
-    rollout, system = flown.rollout, chosen.system
+    rollout = flown.rollout
+    system = chosen.system
     if name == "circle":
         errors = np.arctan2(rollout.states[:, 1], rollout.states[:, 0])[:, None]
     else:
         errors = (rollout.states - np.array(system.goal))[:, system.angle_indices]
         errors = (errors + np.pi) % (2 * np.pi) - np.pi
     largest = np.abs(errors).max(axis=1)
-    away, last = np.flatnonzero(largest > NEAR), round(1 / system.time_step)
+    away = np.flatnonzero(largest > NEAR)
+    last = round(1 / system.time_step)
     settled = int(away[-1]) + 1 if len(away) else 0
     return {
         "system": name,
@@ -146,10 +151,8 @@ def table(flights: list[dict[str, Any]]) -> Table:
         if not own:
             continue
         up = [flight for flight in own if flight["up"]]
-        times, errors = (
-            [f["seconds_until_up"] for f in up],
-            [f["largest_error"] for f in up],
-        )
+        times = [f["seconds_until_up"] for f in up]
+        errors = [f["largest_error"] for f in up]
         rows.append(
             (
                 name,

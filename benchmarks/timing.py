@@ -128,7 +128,8 @@ def use_one_thread() -> None:
 
 def machine() -> dict:
     """Processor, cores, threads, load, and the rates of a matrix product and of reading memory, as plain data."""
-    left, numbers = np.ones((MATRIX_SIDE, MATRIX_SIDE)), np.ones(WALK_BYTES // 8)
+    left = np.ones((MATRIX_SIDE, MATRIX_SIDE))
+    numbers = np.ones(WALK_BYTES // 8)
     return {
         "processor": processor(),
         "cores": os.cpu_count(),

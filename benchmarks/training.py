@@ -59,7 +59,8 @@ def main() -> None:
         f"{'data':28}{'N':>5}{'median':>9}{'p99':>9}{'GPyTorch':>10}{'ratio':>8}{'paper':>8}"
     )
     for trial in experiment.trials():
-        everything, size = trial.condition.data, trial.labels["size"]
+        everything = trial.condition.data
+        size = trial.labels["size"]
         data = everything[random_rows(len(everything), size, trial.seed)]
         trainer(data, seed=0)
         seconds = [

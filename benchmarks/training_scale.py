@@ -21,13 +21,12 @@ import sys
 import time
 from pathlib import Path
 
-EXACT, GPYTORCH, SPARSE, GPYTORCH_SPARSE = (
-    "exact",
-    "GPyTorch",
-    "sparse",
-    "GPyTorch sparse",
-)
-D, NOISE = 9, 0.05
+EXACT = "exact"
+GPYTORCH = "GPyTorch"
+SPARSE = "sparse"
+GPYTORCH_SPARSE = "GPyTorch sparse"
+D = 9
+NOISE = 0.05
 TEST_ROWS = 2000
 COLOURS = {EXACT: "C0", GPYTORCH: "C1", SPARSE: "C2", GPYTORCH_SPARSE: "C4"}
 
@@ -49,7 +48,9 @@ def main() -> None:
     environment = dict(os.environ)
     for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
         environment[variable] = str(settings.threads)
-    results, left_out, began = [], [], time.monotonic()
+    results = []
+    left_out = []
+    began = time.monotonic()
     print(
         f"{'case':38}{'median [s]':>12}{'p99 [s]':>12}{'ratio':>8}{'memory [MB]':>13}{'test RMSE':>11}"
     )
@@ -90,9 +91,11 @@ def main() -> None:
 
 def cases(quick: bool) -> list[dict]:
     """What is measured: evaluations, trainings, a posterior; the smallest first."""
-    sizes, many = (100, 200, 500, 1000), (1000,)
+    sizes = (100, 200, 500, 1000)
+    many = (1000,)
     if not quick:
-        sizes, many = (*sizes, 2000, 5000), (*many, 5000, 20000)
+        sizes = (*sizes, 2000, 5000)
+        many = (*many, 5000, 20000)
     found = [{"what": "evaluation", "route": EXACT, "size": size} for size in sizes]
     found += [
         {"what": "evaluation", "route": GPYTORCH, "size": size}
@@ -136,7 +139,8 @@ def measure(what: str, route: str, size: int, inducing: int = 0) -> dict:
     evaluate = evaluation(route, x, y, inducing)
     imported = peak_megabytes()  # what is loaded at first use is no matrix
     evaluate()
-    count, found = repeats(evaluate), {"megabytes": peak_megabytes() - imported}
+    count = repeats(evaluate)
+    found = {"megabytes": peak_megabytes() - imported}
     if route in (EXACT, SPARSE):
         return quantiles([seconds_of(evaluate) for _ in range(count)]) | found
     ours = evaluation(EXACT if route == GPYTORCH else SPARSE, x, y, inducing)
@@ -185,10 +189,8 @@ def evaluation(route: str, x, y, inducing: int):
     if route == GPYTORCH:
         likelihood = GPyTorchLikelihood(x.numpy(), y[:, 0].numpy())
         return lambda: likelihood(theta)
-    scales, sf2 = (
-        torch.from_numpy(np.exp(theta[None, :D])),
-        torch.tensor([np.exp(1.0)], dtype=torch.float64),
-    )
+    scales = torch.from_numpy(np.exp(theta[None, :D]))
+    sf2 = torch.tensor([np.exp(1.0)], dtype=torch.float64)
     if route == SPARSE:
         leaves = [
             part.requires_grad_()
@@ -219,7 +221,8 @@ def gpytorch_sparse(x, y, inducing: int, scales, sf2):
             base = gpytorch.kernels.ScaleKernel(
                 gpytorch.kernels.RBFKernel(ard_num_dims=D)
             ).double()
-            base.base_kernel.lengthscale, base.outputscale = scales, sf2[0]
+            base.base_kernel.lengthscale = scales
+            base.outputscale = sf2[0]
             self.covar_module = gpytorch.kernels.InducingPointKernel(
                 base, x[:inducing].clone(), likelihood
             )
@@ -249,7 +252,8 @@ def training(route: str, x, y, inducing: int, imported: float) -> dict:
     trainer = Trainer() if route == EXACT else SparseTrainer(inducing=inducing)
     begin = time.process_time()
     trained = trainer.fit(x, y, 0, "value")
-    seconds, megabytes = time.process_time() - begin, peak_megabytes() - imported
+    seconds = time.process_time() - begin
+    megabytes = peak_megabytes() - imported
     queries = data(TEST_ROWS, seed=1)[0].split(100)
     error = torch.cat(
         [trained.posterior.predict(query).mean - function(query) for query in queries]
@@ -271,7 +275,9 @@ def posterior(x, y, imported: float) -> dict:
     from gpmpc.gp import GPPosterior
     from gpmpc.propagation import Linearization, MomentMatching, linearize
 
-    k, begin, size = 6, time.process_time(), len(x)
+    k = 6
+    begin = time.process_time()
+    size = len(x)
     scales = torch.linspace(2, 4, D, dtype=torch.float64).expand(k, D)
     one = torch.ones(k, dtype=torch.float64)
     gp = GPPosterior.from_hyperparameters(

@@ -29,7 +29,8 @@ from gpmpc.simulation import Noise, Replaced, Rollout, closed_loop
 from gpmpc.systems import System, Translational
 from gpmpc.trajectories import states_along
 
-HORIZON, ALTITUDE = 10, 4
+HORIZON = 10
+ALTITUDE = 4
 HEAVY = Replaced(System(Translational(mass=1.2 * 0.74), 1.0, 1))
 MASSES = {"as learned": (), "20 % heavier": (HEAVY,)}
 NOISES = {
@@ -56,7 +57,8 @@ def main() -> None:
     )
     arguments = parser.parse_args()
     torch.set_num_threads(1)
-    results, shown = [], {}
+    results = []
+    shown = {}
     print(f"{'':34}" + "".join(f"{mass:>28}" for mass in MASSES))
     print(f"{'':34}" + "".join(f"{noise:>14}" for _ in MASSES for noise in NOISES))
     for trajectory in TRAJECTORIES:

@@ -23,8 +23,11 @@ from gpmpc.systems import translational
 from gpmpc.trajectories import Elliptical, states_along
 
 FOLDER = Path(sys.argv[1] if len(sys.argv) > 1 else ".")
-STEPS, HORIZON, HOVER = 60, 10, [7.26, 0.0, 0.0]
-light, heavy = translational(), translational(mass=1.2 * 0.74)
+STEPS = 60
+HORIZON = 10
+HOVER = [7.26, 0.0, 0.0]
+light = translational()
+heavy = translational(mass=1.2 * 0.74)
 
 outer = Excitation([1] * 6, [1] * 3, HOVER, dither=[0.3, 0.03, 0.03], noise=[0.01] * 6)
 data = ExcitedData(outer, outer).transitions(light, Elliptical())

@@ -32,7 +32,8 @@ from gpmpc.systems import System
 from gpmpc.systems.mujoco_ import mujoco_system
 from gpmpc.systems.mujoco_quadrotor import mujoco_quadrotor
 
-STEP, ROTORS = 0.02, ["u1", "u2", "u3", "u4"]
+STEP = 0.02
+ROTORS = ["u1", "u2", "u3", "u4"]
 STATES = ["px", "py", "pz", "qx", "qy", "qz", "qw", "vx", "vy", "vz", "wx", "wy", "wz"]
 MAPPING = {
     "time": "t",
@@ -45,12 +46,11 @@ MAPPING = {
     },
     "inputs": {"thrusts": {"columns": ROTORS, "unit": "N"}},
 }
-MASS, INERTIA, ARM, YAW = (
-    0.4,
-    (0.0025, 0.0025, 0.0045),
-    0.12,
-    0.016,
-)  # of the data sheet [kg], [kg m2], [m], [m]
+# of the data sheet [kg], [kg m2], [m], [m]
+MASS = 0.4
+INERTIA = (0.0025, 0.0025, 0.0045)
+ARM = 0.12
+YAW = 0.016
 SIGNS = np.array(
     [[1, -1, -1, 1], [-1, -1, 1, 1], [-1, 1, -1, 1]]
 )  # of each rotor's roll, pitch and yaw
@@ -91,7 +91,8 @@ def curve(frequencies: np.ndarray, steps: int) -> np.ndarray:
     """Reference states (steps, 13) of sums of sines about a metre above the ground, from rest."""
     t = STEP * np.arange(steps)[:, None]
     reference = np.zeros((steps, 13))
-    reference[:, 6], ramp = 1.0, np.minimum(t / 2, 1)
+    reference[:, 6] = 1.0
+    ramp = np.minimum(t / 2, 1)
     reference[:, :3] = [0, 0, 1] + ramp * np.array([1.0, 1.0, 0.4]) * np.sin(
         frequencies * t
     )

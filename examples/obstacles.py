@@ -21,41 +21,34 @@ from gpmpc.mpc import GPMPC, Box, ControlLoop, Inequality, Problem, Tracking
 from gpmpc.propagation import Linearization
 from gpmpc.systems import planar_quadrotor, step_many
 
-HORIZON, STEPS = 30, 110
+HORIZON = 30
+STEPS = 110
 NOISE = [0.002, 0.02, 0.002, 0.02, 0.002, 0.02]  # standard deviations a step
 RADII = np.array([0.35, 0.3, 0.3])  # [m]
-PLACES, VELOCITIES = (
-    np.array([[0.9, 0.1], [1.9, -1.0], [2.9, 1.0]]),
-    np.array([[0.0, 0.0], [0.0, 0.5], [0.0, -0.4]]),
-)
+PLACES = np.array([[0.9, 0.1], [1.9, -1.0], [2.9, 1.0]])
+VELOCITIES = np.array([[0.0, 0.0], [0.0, 0.5], [0.0, -0.4]])
 GOAL = np.array([4.0, 0.0, 0.0, 0.0, 0.0, 0.0])
 
-quadrotor, rng = planar_quadrotor(), np.random.default_rng(0)
-lowest, highest = (
-    np.array([-0.5, -2.5, -1.5, -2.0, -0.8, -4.0]),
-    np.array([4.5, 2.5, 1.5, 2.0, 0.8, 4.0]),
-)
-states, thrusts = (
-    rng.uniform(lowest, highest, (500, 6)),
-    rng.uniform(2.0, 6.0, (500, 2)),
-)
+quadrotor = planar_quadrotor()
+rng = np.random.default_rng(0)
+lowest = np.array([-0.5, -2.5, -1.5, -2.0, -0.8, -4.0])
+highest = np.array([4.5, 2.5, 1.5, 2.0, 0.8, 4.0])
+states = rng.uniform(lowest, highest, (500, 6))
+thrusts = rng.uniform(2.0, 6.0, (500, 2))
 after = step_many(quadrotor, states, thrusts) + rng.normal(0, NOISE, (500, 6))
 kinematics = torch.eye(6, dtype=torch.float64)  # what is known: rates move positions
 kinematics[[0, 2, 4], [1, 3, 5]] = quadrotor.time_step
 nominal = replace(Affine.identity(6, 2), A=kinematics)
-data, trainer = (
-    Transitions(states, thrusts, after),
-    Trainer(scaling=standardize, restarts=0),
-)
+data = Transitions(states, thrusts, after)
+trainer = Trainer(scaling=standardize, restarts=0)
 model = ResidualModel.train(
     nominal, data, states=[4, 5], inputs=[0, 1], trainer=trainer
 )  # by tilt, its rate, thrusts
 
-x, u, p = (
-    casadi.SX.sym("x", 6),
-    casadi.SX.sym("u", 2),
-    casadi.SX.sym("p", 6),
-)  # p: the discs' centres
+# p: the discs' centres
+x = casadi.SX.sym("x", 6)
+u = casadi.SX.sym("u", 2)
+p = casadi.SX.sym("p", 6)
 inside = [
     radius - casadi.norm_2(casadi.vertcat(x[0] - p[2 * i], x[2] - p[2 * i + 1]))
     for i, radius in enumerate(RADII)
@@ -75,7 +68,9 @@ def centres(times: np.ndarray) -> np.ndarray:
     return PLACES + VELOCITIES * np.asarray(times)[..., None, None]
 
 
-loop, flown, gaps = ControlLoop(controller), [np.zeros(6)], []
+loop = ControlLoop(controller)
+flown = [np.zeros(6)]
+gaps = []
 times = quadrotor.time_step * np.arange(STEPS + HORIZON + 1)
 for k in range(STEPS):
     thrust = loop.input(
@@ -87,7 +82,8 @@ for k in range(STEPS):
     gaps.append(
         np.linalg.norm(centres(times[k + 1]) - flown[-1][[0, 2]], axis=1) - RADII
     )
-path, nearest = np.array(flown), float(np.min(gaps))
+path = np.array(flown)
+nearest = float(np.min(gaps))
 away = float(np.linalg.norm(path[-1, [0, 2]] - GOAL[[0, 2]]))
 print(
     f"{away:.2f} m from the goal, never nearer than {nearest:.3f} m to a disc, {loop.failures} failures"
@@ -111,7 +107,8 @@ def figure() -> Figure:
                 )
             )
         axis.plot(path[: k + 1, 0], path[: k + 1, 2], color="C0")
-        tilt, at = path[k, 4], path[k, [0, 2]]
+        tilt = path[k, 4]
+        at = path[k, [0, 2]]
         arm = 0.1 * np.array([np.cos(tilt), np.sin(tilt)])
         axis.plot(*np.transpose([at - arm, at + arm]), color="black", linewidth=3)
         axis.plot(*GOAL[[0, 2]], "+", color="black", markersize=9)

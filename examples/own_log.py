@@ -15,12 +15,17 @@ from scipy.spatial.transform import Rotation
 from gpmpc.logs import judge, learn, read_log
 from gpmpc.plotting import judgement_figure
 
-STEP, THRUST, DRAG = 0.01, 20.0, 0.3  # [s], [m/s2] of all motors at full signal, [1/s]
+# [s], [m/s2] of all motors at full signal, [1/s]
+STEP = 0.01
+THRUST = 20.0
+DRAG = 0.3
 MIXER = (
     np.array([[1, 1, -1], [1, -1, 1], [-1, -1, -1], [-1, 1, 1]]) / 4
 )  # motors' u^2 by roll, pitch, yaw
 TORQUE = np.array([120.0, 120.0, 40.0])  # [rad/s2] by that mixture
-FORCE_NOISE, TORQUE_NOISE = 0.6, 6.0  # [m/s2], [rad/s2], white at every step
+# [m/s2], [rad/s2], white at every step
+FORCE_NOISE = 0.6
+TORQUE_NOISE = 6.0
 NAMES = [
     "t",
     "px",
@@ -60,10 +65,8 @@ def simulate_flights(flights: int, rows: int, seed: int = 0) -> list[pandas.Data
     rng = np.random.default_rng(seed)
     p, v, w = (np.zeros((flights, 3)) for _ in range(3))
     attitude = Rotation.identity(flights)
-    frequencies, phases = (
-        rng.uniform(0.5, 2.0, (2, flights, 3)),
-        rng.uniform(0, 6, (2, flights, 3)),
-    )
+    frequencies = rng.uniform(0.5, 2.0, (2, flights, 3))
+    phases = rng.uniform(0, 6, (2, flights, 3))
     tables = np.empty((flights, rows, len(NAMES)))
     for k in range(rows):
         target = 0.7 * np.sin(frequencies * k * STEP + phases).sum(axis=0)

@@ -24,7 +24,8 @@ from gpmpc.trajectories import Waypoints
 class Arm:
     """A uniform arm of one metre that hangs from its joint."""
 
-    state_names, input_names = ("angle", "rate"), ("torque",)
+    state_names = ("angle", "rate")
+    input_names = ("torque",)
 
     def __init__(self, mass: float = 1.0):
         self.mass = mass  # [kg]

@@ -33,13 +33,15 @@ PROBLEM = Problem(
     Tracking([10, 1, 10, 1, 10, 1, 0.3, 0.3, 0.3, 0.3, 1, 0.3], [5.0] * 4),
     inputs=Box([0.0] * 4, [3.0] * 4),
 )
-vehicle, rng = mujoco_quadrotor(), np.random.default_rng(0)
+vehicle = mujoco_quadrotor()
+rng = np.random.default_rng(0)
 data_sheet = CasadiFunction(successor_function(vehicle.nominal))
 
 
 def curve(frequencies, steps):
     """States (steps, 12) of sums of sines from rest about a metre above the ground."""
-    t, states = 0.04 * np.arange(steps)[:, None], np.zeros((steps, 12))
+    t = 0.04 * np.arange(steps)[:, None]
+    states = np.zeros((steps, 12))
     states[:, 0:6:2] = [0, 0, 1] + np.minimum(t / 2, 1) * [1.0, 1.0, 0.3] * np.sin(
         frequencies * t
     )
@@ -90,11 +92,9 @@ learned = ResidualModel.train(
     data_sheet, data, B, states=[1, 3, 5, 6, 7, 8, 9, 10, 11], trainer=trainer
 )
 
-loaded, reference, recording = (
-    mujoco_quadrotor(mass=0.6),
-    curve(np.array([0.8, 1.6, 0.8]), 300),
-    FOLDER / "payload.mcap",
-)
+loaded = mujoco_quadrotor(mass=0.6)
+reference = curve(np.array([0.8, 1.6, 0.8]), 300)
+recording = FOLDER / "payload.mcap"
 flights = {
     "data sheet": fly(loaded, KnownModel(data_sheet, 12, 4), reference),
     "learned without the payload": fly(loaded, learned, reference),

@@ -19,15 +19,16 @@ from gpmpc.propagation import Linearization
 from gpmpc.simulation import Noise, Rollout, closed_loop
 from gpmpc.systems import step_many, stirred_tank
 
-HOTTEST, STEPS = 352.0, 200  # [K], [-]
+# [K], [-]
+HOTTEST = 352.0
+STEPS = 200
 HOTTEST_STATE = [np.inf, HOTTEST]
 NOISE = [0.0005, 0.1]  # standard deviations a step [mol/L, K]
 
-reactor, rng = stirred_tank(), np.random.default_rng(0)
-states, coolant = (
-    rng.uniform([0.2, 315.0], [0.95, 360.0], (400, 2)),
-    rng.uniform(280, 320, (400, 1)),
-)
+reactor = stirred_tank()
+rng = np.random.default_rng(0)
+states = rng.uniform([0.2, 315.0], [0.95, 360.0], (400, 2))
+coolant = rng.uniform(280, 320, (400, 1))
 states = states[states[:, 1] + 30 * states[:, 0] < 373]  # no runaway reactions
 coolant = coolant[: len(states)]
 after = step_many(reactor, states, coolant) + rng.normal(0, NOISE, states.shape)
@@ -75,7 +76,8 @@ for name, problem in problems.items():
         STEPS,
         noise=Noise(process=NOISE),
     )
-    flights[name], left = flight, flight.states[STEPS // 2 :, 0].mean()
+    flights[name] = flight
+    left = flight.states[STEPS // 2 :, 0].mean()
     hot = (flight.states[1:, 1] > HOTTEST).mean()
     print(
         f"{name:16} {left:.3f} mol/L of the feed left, too hot in {hot:.1%} of the steps"

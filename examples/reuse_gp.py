@@ -17,7 +17,8 @@ from gpmpc.gp import Transitions, load_posterior, save_posterior, train
 from gpmpc.propagation import MomentMatching, rollout
 
 STEP = 0.1  # sampling time [s]
-folder, rng = Path(sys.argv[1] if len(sys.argv) > 1 else "."), np.random.default_rng(0)
+folder = Path(sys.argv[1] if len(sys.argv) > 1 else ".")
+rng = np.random.default_rng(0)
 
 
 def pendulum(torques: np.ndarray, angle: float, rate: float) -> np.ndarray:

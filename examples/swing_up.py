@@ -13,14 +13,17 @@ from gpmpc.systems import System, step_many
 class Pendulum:
     """Upright at (1, 0, 0); the torque moves the rate by 3 rad/s^2 per unit, gravity by 15."""
 
-    state_names, input_names = ("cosine", "sine", "rate"), ("torque",)
+    state_names = ("cosine", "sine", "rate")
+    input_names = ("torque",)
 
     def derivative(self, x, u):
         return [-x[1] * x[2], x[0] * x[2], 15.0 * x[1] + 3.0 * u[0]]
 
 
-plant, rng = System(Pendulum(), time_step=0.05), np.random.default_rng(0)
-angles, torques = rng.uniform(-np.pi, np.pi, 400), rng.uniform(-2, 2, (400, 1))
+plant = System(Pendulum(), time_step=0.05)
+rng = np.random.default_rng(0)
+angles = rng.uniform(-np.pi, np.pi, 400)
+torques = rng.uniform(-2, 2, (400, 1))
 states = np.column_stack([np.cos(angles), np.sin(angles), rng.uniform(-8, 8, 400)])
 measured = step_many(plant, states, torques) + rng.normal(0, 0.001, (400, 3))
 gp = train(

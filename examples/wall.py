@@ -15,28 +15,27 @@ from gpmpc.propagation import Linearization
 from gpmpc.simulation import Noise, closed_loop
 from gpmpc.systems import System, step_many
 
-WALL, STEPS = 1.0, 400  # [m], [-]
+# [m], [-]
+WALL = 1.0
+STEPS = 400
 GUSTS = [0.005, 0.05]  # standard deviations a step [m, m/s]
 
 
 class Cart:
     """A cart with drag that is pushed along a rail."""
 
-    state_names, input_names = ("position", "velocity"), ("push",)
+    state_names = ("position", "velocity")
+    input_names = ("push",)
 
     def derivative(self, x, u):
         """d/dt of the state."""
         return [x[1], 2.0 * u[0] - 0.5 * x[1] - 0.2 * x[1] ** 3]
 
 
-cart, rng = (
-    System(Cart(), time_step=0.1, units={"position": "m", "velocity": "m/s"}),
-    np.random.default_rng(0),
-)
-states, pushes = (
-    rng.uniform([-1.5, -2.0], [1.5, 2.0], (300, 2)),
-    rng.uniform(-2, 2, (300, 1)),
-)
+cart = System(Cart(), time_step=0.1, units={"position": "m", "velocity": "m/s"})
+rng = np.random.default_rng(0)
+states = rng.uniform([-1.5, -2.0], [1.5, 2.0], (300, 2))
+pushes = rng.uniform(-2, 2, (300, 1))
 after = step_many(cart, states, pushes) + rng.normal(0, GUSTS, (300, 2))
 gp = train(
     Transitions(states, pushes, after), predicts="difference", scaling=standardize

@@ -183,7 +183,8 @@ class Condition:
 
     def controller(self) -> Controller:
         """Makes the controller."""
-        row, problem = self.row, tracking_problem(self.row, self.inputs, self.states)
+        row = self.row
+        problem = tracking_problem(self.row, self.inputs, self.states)
         settings = {
             key: value for key, value in row.settings.items() if key != "penalty"
         }
@@ -250,7 +251,9 @@ class Figures:
     seed: int = 0
     workers: int | None = None
 
-    name, trial_name, lost_is_result = "figures", "flights", True
+    name = "figures"
+    trial_name = "flights"
+    lost_is_result = True
 
     def __post_init__(self) -> None:
         for key, least in (("steps", 1), ("samples", 2), ("seed", 0)):
@@ -318,10 +321,8 @@ class Figures:
         trials = []
         for name, row, trajectory, subsystem in self._flown:
             condition = self._condition(row, trajectory, subsystem, folder)
-            reference, bounds = (
-                condition.reference,
-                [condition.inputs, condition.states],
-            )
+            reference = condition.reference
+            bounds = [condition.inputs, condition.states]
             settings = [
                 name,
                 asdict(row),
@@ -406,7 +407,8 @@ class Figures:
         """Returns the transitions of a row, and those that its GP learns from; None for the true model's controller."""
         if row.controller == "nmpc":
             return None, []
-        size, needed = row.size or self.samples, self.samples
+        size = row.size or self.samples
+        needed = self.samples
         count = max(needed, size if row.loop == "plant" else self.steps + row.horizon)
         source = replace(self.data[row.data], samples=count)
         key = f"{source!r} {trajectory} {self.trajectories[trajectory]!r} {subsystem}"
@@ -438,18 +440,15 @@ class Figures:
             reference = Reference(
                 PLANT.reference_states(self.trajectories[trajectory], n_ahead + 1)
             )
-            unscaled, model = (
-                Scaling(torch.zeros(6), torch.ones(6)),
-                None if data is None else trained(data),
-            )
+            unscaled = Scaling(torch.zeros(6), torch.ones(6))
+            model = None if data is None else trained(data)
             return Condition(row, model, reference, unscaled, *bounds, **rest)
-        system, scaling = SYSTEMS[subsystem], SCALINGS[subsystem]
+        system = SYSTEMS[subsystem]
+        scaling = SCALINGS[subsystem]
         # States and next states share one scaling, so that a prediction can be fed back in.
         visited = torch.cat([data.states, data.next_states[-1:]])
-        states, inputs = (
-            scaling(visited, system.state_names),
-            scaling(data.inputs, system.input_names),
-        )
+        states = scaling(visited, system.state_names)
+        inputs = scaling(data.inputs, system.input_names)
         learned = Transitions(
             states.scale(data.states),
             inputs.scale(data.inputs),
@@ -465,16 +464,16 @@ class Figures:
     def run_trial(trial: Trial) -> dict:
         """Flies one trial and measures it."""
         condition = trial.condition
-        controller, reference = condition.controller(), condition.reference
+        controller = condition.controller()
+        reference = condition.reference
         if condition.row.loop == "model":
-            system, noise = (
-                ModelLoop(
-                    read_model(condition.model), MomentMatching(process_noise=False)
-                ),
-                None,
+            system = ModelLoop(
+                read_model(condition.model), MomentMatching(process_noise=False)
             )
+            noise = None
         else:
-            system, noise = PLANT, Noise(process=[condition.noise] * 6)
+            system = PLANT
+            noise = Noise(process=[condition.noise] * 6)
         rehearse(system, controller, reference, reference.states[0])
         rollout = closed_loop(
             system, controller, reference, reference.states[0], condition.steps,
@@ -501,7 +500,8 @@ def from_settings(
     Raises:
         SettingError: An unknown loop, or a row with an unknown setting.
     """
-    loops, rows = _several(settings["loop"]), {}
+    loops = _several(settings["loop"])
+    rows = {}
     for loop in loops:
         if loop not in LOOPS:
             raise SettingError(
@@ -546,7 +546,8 @@ def measure(
     rollout: Rollout, condition: Condition, constraints: Sequence[Constraint]
 ) -> dict:
     """Returns the record of a flight."""
-    scale, inputs = condition.scaling, condition.inputs
+    scale = condition.scaling
+    inputs = condition.inputs
     states, references = (
         scale.restore(torch.from_numpy(x)).numpy()
         for x in (rollout.states, rollout.references)
@@ -562,7 +563,8 @@ def measure(
         "seconds": np.round(rollout.seconds, 7).tolist(),
     }
     for limits in constraints:
-        after, expected = rollout.states[1:], rollout.predicted_means
+        after = rollout.states[1:]
+        expected = rollout.predicted_means
         std = np.sqrt(rollout.predicted_covariances.diagonal(axis1=1, axis2=2))
         beyond = np.maximum(limits.lower - after, after - limits.upper).max(axis=1)
         planned = limits.standard_deviations() * std + np.maximum(

@@ -25,10 +25,8 @@ from gpmpc.plotting._style import (
 from gpmpc.studies._document import MISSING, Document, Table, number
 
 ERRORS = ("x - reference [m]", "y - reference [m]", "z - reference [m], downwards")
-POSITIONS, ANGLES = (
-    ("x [m]", "y [m]", "z, downwards [m]"),
-    ("roll [rad]", "pitch [rad]", "yaw [rad]"),
-)
+POSITIONS = ("x [m]", "y [m]", "z, downwards [m]")
+ANGLES = ("roll [rad]", "pitch [rad]", "yaw [rad]")
 INPUTS = ("thrust U1 [N]", "direction ux", "direction uy")
 LOOPS = {
     "model": "The paper's reading: the GP rolled on itself",
@@ -269,7 +267,8 @@ def timing(rows: pd.DataFrame) -> list[list[str]]:
         & (rows.subsystem == "translational")
         & (rows.trials > 0)
     ]
-    timed, lines = list(timed.itertuples()), []
+    timed = list(timed.itertuples())
+    lines = []
     for row in timed:
         if paper := paper_seconds().get(
             (KINDS.get(row.controller, row.controller), row.trajectory)
@@ -349,7 +348,8 @@ def tracking(
                     label="reference",
                 )
                 reach.append(wanted[:, j])
-            low, high = min(v.min() for v in reach), max(v.max() for v in reach)
+            low = min(v.min() for v in reach)
+            high = max(v.max() for v in reach)
             near = 0.4 * max(high - low, 1e-6)
             for bound in (side[j] for side in bounds):
                 if (
@@ -382,7 +382,8 @@ def over_settings(
     title: str = "",
 ) -> Figure:
     """One measure over a setting, a panel a title, with intervals; logarithmic, or with the diagonal drawn in."""
-    columns, rows = min(2, len(panels)), -(-len(panels) // 2)
+    columns = min(2, len(panels))
+    rows = -(-len(panels) // 2)
     figure, axes = make_figure(
         4.8 * columns, 3.5 * rows + 0.8 * (rows > 1), rows, columns, title
     )
@@ -391,11 +392,9 @@ def over_settings(
     for axis, (heading, curves) in zip(axes.flat, panels.items(), strict=False):
         axis.set(title=heading, xlabel=label)
         for i, curve in enumerate(curves):
-            colour, dash, value = (
-                COLOURS[i % len(COLOURS)],
-                DASHES[i % len(DASHES)],
-                curve.values[:, 0],
-            )
+            colour = COLOURS[i % len(COLOURS)]
+            dash = DASHES[i % len(DASHES)]
+            value = curve.values[:, 0]
             line = {"color": colour, "markersize": 4, "label": curve.label}
             if curve.interval is None:
                 axis.plot(
@@ -520,7 +519,8 @@ def _shown(records: Iterable[dict]) -> list[dict]:
 
 
 def _curve(record: dict, key: str, columns: Sequence[int]) -> Curve:
-    drawn, at = record["drawn"], list(columns)
+    drawn = record["drawn"]
+    at = list(columns)
     if key == "errors":
         values = (np.array(drawn["states"]) - np.array(drawn["references"]))[:, at]
     else:

@@ -48,7 +48,9 @@ LOST = 5.0  # [m] from the reference, some hundred times what is usual: nothing 
 SAME = 1e-3  # difference of two costs below which the seeds' noise hides it: it buys no time
 CURVES = 5  # in the figure
 MARKERS = ("o", "^", "s", "D", "v", "P", "X")
-OTHERS, FRONT = "0.75", "0.35"  # greys
+# greys
+OTHERS = "0.75"
+FRONT = "0.35"
 TICKS = (-1, 0, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)  # [%]
 LINEAR = 1.0  # [%] of cost up to which the axis is linear
 LEGEND = (
@@ -73,20 +75,19 @@ class Family(NamedTuple):
 
 
 TRUTH = Family("NMPC, true model", "controller=nmpc")
-INCREMENTS, STATES = "increments (paper)", "state form, Clarabel"
-MEAN, ZERO_ORDER = "trajectory, mean only", "trajectory, zero order"
-SPREAD, CONVERGED = "trajectory, diagonal or full", "trajectory, converged"
+INCREMENTS = "increments (paper)"
+STATES = "state form, Clarabel"
+MEAN = "trajectory, mean only"
+ZERO_ORDER = "trajectory, zero order"
+SPREAD = "trajectory, diagonal or full"
+CONVERGED = "trajectory, converged"
 NONLINEAR = "nonlinear GP-MPC"
-CONVEX, FULL, DIAGONAL = (
-    "controller=convex",
-    "controller.prediction.covariance=full",
-    "controller.prediction.covariance=diagonal",
-)
-NONE, EXACT, POINTS = (
-    "controller.prediction.covariance=none",
-    "propagation=moment_matching",
-    "propagation=unscented",
-)
+CONVEX = "controller=convex"
+FULL = "controller.prediction.covariance=full"
+DIAGONAL = "controller.prediction.covariance=diagonal"
+NONE = "controller.prediction.covariance=none"
+EXACT = "propagation=moment_matching"
+POINTS = "propagation=unscented"
 MORE = "controller.iterations=100 controller.tolerance=1e-6"
 FIRST_ORDER = "propagation=linearization"
 FAMILIES = (
@@ -145,7 +146,9 @@ class Quality:
     seeds: int = 3
     workers: int | None = 1
 
-    name, trial_name, lost_is_result = "quality", "flights", True
+    name = "quality"
+    trial_name = "flights"
+    lost_is_result = True
 
     def __post_init__(self) -> None:
         if not isinstance(self.horizons, list | tuple) or not self.horizons:
@@ -235,7 +238,8 @@ class Quality:
         flown = run_trial(
             replace(experiment, model=None if model is None else read_model(model))
         )
-        rollout, controller = flown.rollout, flown.controller
+        rollout = flown.rollout
+        controller = flown.controller
         distance = np.linalg.norm(
             (rollout.states - rollout.references)[:, experiment.system.tracked_indices],
             axis=1,
@@ -329,10 +333,8 @@ def from_settings(
         settings: See there.
         flight: From what is typed after ``gpmpc run`` to the flight and its settings.
     """
-    noise, only = (
-        f"noise.process=[{','.join([str(settings['noise'])] * 6)}]",
-        settings["only"],
-    )
+    noise = f"noise.process=[{','.join([str(settings['noise'])] * 6)}]"
+    only = settings["only"]
     chosen = [
         family
         for family in FAMILIES
@@ -353,7 +355,8 @@ class Clocked:
     """A controller whose decisions are timed, in seconds of its thread's processor time."""
 
     def __init__(self, controller: Controller):
-        self._controller, self.seconds = controller, []
+        self._controller = controller
+        self.seconds = []
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._controller, name)
@@ -401,7 +404,9 @@ def pareto_front(
         least: What takes more time has to cost less by more than this.
     """
     order = sorted(range(len(times)), key=lambda i: (times[i], costs[i]))
-    members, best, at = [False] * len(order), np.inf, np.nan
+    members = [False] * len(order)
+    best = np.inf
+    at = np.nan
     for i in order:
         if costs[i] < best - least:
             members[i], best, at = True, costs[i], times[i]
@@ -596,11 +601,10 @@ def _scales(axis: Axes, rows: Sequence[Mapping]) -> None:
     axis.set_xlabel("median time of a decision [ms], one thread")
     axis.set_ylabel("closed-loop cost above NMPC on the true model")
     plain_numbers(axis.xaxis, few=True)
-    values, times = (
-        [row["excess"] for row in rows] or [0.0],
-        [row["median"] for row in rows] or [1.0],
-    )
-    low, high = min(values), max(values)
+    values = [row["excess"] for row in rows] or [0.0]
+    times = [row["median"] for row in rows] or [1.0]
+    low = min(values)
+    high = max(values)
     reach = [tick for tick in TICKS if low * 1.5 - 1 <= tick <= high * 1.5 + 1]
     axis.set_yticks(reach, [f"{tick:+d} %" if tick else "0" for tick in reach])
     axis.yaxis.set_minor_locator(NullLocator())
@@ -612,8 +616,10 @@ def _front(axis: Axes, members: Sequence[Mapping]) -> None:
     """Draws a stair that nobody is below of; its members are numbered, and named under the axis."""
     if not members:
         return
-    x, y = [row["median"] for row in members], [row["excess"] for row in members]
-    right, top = axis.get_xlim()[1], axis.get_ylim()[1]
+    x = [row["median"] for row in members]
+    y = [row["excess"] for row in members]
+    right = axis.get_xlim()[1]
+    top = axis.get_ylim()[1]
     stair: Any = {
         "color": FRONT,
         "linewidth": 1.4,

@@ -68,10 +68,8 @@ from gpmpc.systems import System, double_pendulum, step, step_many
 
 Array = np.ndarray
 
-ACTUATED, JOINTS = (
-    {"acrobot": "elbow", "pendubot": "shoulder"},
-    {"acrobot": 1, "pendubot": 0},
-)
+ACTUATED = {"acrobot": "elbow", "pendubot": "shoulder"}
+JOINTS = {"acrobot": 1, "pendubot": 0}
 RATES = {"acrobot": 0.1, "pendubot": 0.02}  # weights of rates [s^2/rad^2]
 TURNS = {
     "acrobot": (2, 3),
@@ -95,13 +93,14 @@ INSTALL = (
     "the league's simulator is not installed: git clone https://github.com/dfki-ric-underactuated-lab/double_pendulum, "
     "put its src/python on PYTHONPATH, and pip install dill tabulate lxml filterpy pyyaml sympy"
 )
-PLAN, INPUT = 0.02, 0.002  # time steps of plans and of torques [s]
+# time steps of plans and of torques [s]
+PLAN = 0.02
+INPUT = 0.002
 TICKS = round(PLAN / INPUT)  # inputs in a plan's time step
-TORQUE, LINE, DURATION = (
-    6.0,
-    0.45,
-    60.0,
-)  # limit [N m], height to be above [m], length of a test [s]
+# limit [N m], height to be above [m], length of a test [s]
+TORQUE = 6.0
+LINE = 0.45
+DURATION = 60.0
 LENGTHS = 0.2, 0.3  # [m]
 WILD = 25.0, 38.0  # rates beyond which transitions are not learned from [rad/s]
 REPLAN = 5.0  # predicted time below the line above which a plan is given up [s]
@@ -130,10 +129,8 @@ def upright(states: Array) -> Reference:
 
 def casadi_model(system: System) -> CasadiFunction:
     """The step of a system as a function that can be linearised."""
-    x, u = (
-        casadi.SX.sym("x", len(system.state_names)),
-        casadi.SX.sym("u", len(system.input_names)),
-    )
+    x = casadi.SX.sym("x", len(system.state_names))
+    u = casadi.SX.sym("u", len(system.input_names))
     return CasadiFunction(
         casadi.Function("successor", [x, u], [casadi.vertcat(*system.successor(x, u))])
     )
@@ -161,7 +158,9 @@ def fit_body(robot: str, start: System, data: Transitions) -> System:
     Five combinations of the seven decide the motion, and only these are found: the second moments about both joints,
     the coupling of the links, and the weights' two moments.
     """
-    x, u, after = data.states.numpy(), data.inputs.numpy(), data.next_states.numpy()
+    x = data.states.numpy()
+    u = data.inputs.numpy()
+    after = data.next_states.numpy()
 
     def errors(logarithms: Array) -> Array:
         return (
@@ -219,8 +218,11 @@ class Pilot:
         """The torques of both joints (2,) at a state in the league's order and a time [s]."""
         state = state_of(x)
         if abs(t - self._last) > 1.5 * INPUT:
-            self._loop, self._count, self._pause = None, 0, 0
-        self._last, torque = t, self._held
+            self._loop = None
+            self._count = 0
+            self._pause = 0
+        self._last = t
+        torque = self._held
         if self._count == 0:
             torque = self._held = self._decide(state)
         elif self._loop is not None and self.gain > 0:
@@ -249,7 +251,8 @@ class Pilot:
         self.seconds.append(perf_counter() - begin)
         self.searched.append(without)
         if not self._leads_up(loop):
-            self._loop, self._pause = None, PAUSE - 1
+            self._loop = None
+            self._pause = PAUSE - 1
             return brake
         self._loop = loop
         return torque
@@ -325,10 +328,8 @@ def write_entry(robot: str, kind: str, seed: int, folder: Path) -> Path:
     Returns the path of the controller file, ``con_gpmpc_*.py``.
     """
     name = f"gpmpc_{kind}_{seed}"
-    model, entry = (
-        folder / robot / f"{name}.safetensors",
-        folder / robot / f"con_{name}.py",
-    )
+    model = folder / robot / f"{name}.safetensors"
+    entry = folder / robot / f"con_{name}.py"
     entry.parent.mkdir(parents=True, exist_ok=True)
     if kind != "true" and not _was_learned_by_this_code(model):
         begin = perf_counter()
@@ -391,10 +392,8 @@ def play_film(entry: Path, robot: str, kind: str) -> Path:
     """Writes the first 8 s of draw 100 as a GIF beside an entry."""
     from gpmpc.experiments.realaigym_film import film
 
-    path, model = (
-        beside(entry, ".gif"),
-        read_model(robot, kind, beside(entry, ".safetensors")),
-    )
+    path = beside(entry, ".gif")
+    model = read_model(robot, kind, beside(entry, ".safetensors"))
     film(play(pilot(model, robot), robot, 100, 8.0), JOINTS[robot], path)
     return path
 
@@ -467,7 +466,8 @@ def make_parts(
         wild: Whether starts with kicks are taken besides the straight line and the drift.
         kept: Programs of a decision from a plan.
     """
-    Q, R = np.diag([10.0, rate, 10.0, rate]), np.array([[0.01]])
+    Q = np.diag([10.0, rate, 10.0, rate])
+    R = np.array([[0.01]])
     still = model.linearize(np.zeros((1, 4)), np.zeros((1, 1)), False)
     P = _cost_to_go(still.A[0], still.B[0], Q, R)
     problem = Problem(
@@ -497,10 +497,8 @@ def make_parts(
     if wild:
         for sign in (0.5, -0.5):
             kick = np.zeros((horizon, 1))
-            kick[: horizon // 6], kick[horizon // 6 : horizon // 3] = (
-                sign * TORQUE,
-                -sign * TORQUE,
-            )
+            kick[: horizon // 6] = sign * TORQUE
+            kick[horizon // 6 : horizon // 3] = -sign * TORQUE
             guesses.append(kick)
     nominal = getattr(model, "nominal", None)
     quick = (
@@ -523,9 +521,12 @@ def pilot(model: Any, robot: str, gain: float = 1.0, **settings: Any) -> Pilot:
 
 def _cost_to_go(A: Array, B: Array, Q: Array, R: Array) -> Array:
     K = dlqr(A, B, Q, R)
-    closed, P, total = A - B @ K, Q + K.T @ R @ K, np.zeros_like(A)
+    closed = A - B @ K
+    P = Q + K.T @ R @ K
+    total = np.zeros_like(A)
     for _ in range(5000):
-        total, P = total + P, closed.T @ P @ closed
+        total = total + P
+        P = closed.T @ P @ closed
     return (total + total.T) / 2
 
 
@@ -586,7 +587,8 @@ def play(
     times, states, torques = Simulator(plant=plant).simulate(
         0.0, [0.0] * 4, seconds, INPUT, controller, "runge_kutta"
     )
-    times, states = np.array(times), np.array(states)
+    times = np.array(times)
+    states = np.array(states)
     return Play(
         get_uptime(times, states, mpar=limited) / seconds,
         states,
@@ -598,7 +600,8 @@ def league_parameters(limits: list[float]) -> Any:
     """The league's parameters of design C.1, model 1.1, without friction and motor inertia, from our system."""
     from double_pendulum.model.model_parameters import model_parameters
 
-    d, found = double_pendulum().dynamics, model_parameters()
+    d = double_pendulum().dynamics
+    found = model_parameters()
     found.set_mass(list(d.masses))
     found.set_length(list(LENGTHS))
     found.set_com(list(d.centres))
@@ -626,10 +629,8 @@ def right_hand_side() -> Callable[[float, Array, Array], Array]:
 
     def derivative(t: float, x: Array, tau: Array) -> Array:
         state = [x[0] - np.pi, float(x[2]), float(x[1]), float(x[3])]
-        first, second = (
-            shoulder.derivative(state, [float(tau[0])]),
-            elbow.derivative(state, [0.0]),
-        )
+        first = shoulder.derivative(state, [float(tau[0])])
+        second = elbow.derivative(state, [0.0])
         moved = elbow.derivative(state, [float(tau[1])])
         return np.array(
             [x[2], x[3], *(first[i] + moved[i] - second[i] for i in (1, 3))]
@@ -641,9 +642,13 @@ def right_hand_side() -> Callable[[float, Array, Array], Array]:
 def random_record(robot: str, seconds: float, seed: int) -> list[Play]:
     """Records of 2 s each, hanging at first, under torques that are drawn anew every 0.1 s."""
     system = replace(double_pendulum(ACTUATED[robot], time_step=INPUT), substeps=1)
-    rng, joint, records = np.random.default_rng(seed), JOINTS[robot], []
+    rng = np.random.default_rng(seed)
+    joint = JOINTS[robot]
+    records = []
     for _ in range(round(seconds / 2)):
-        state, states, torques = np.array([np.pi, 0.0, 0.0, 0.0]), [], []
+        state = np.array([np.pi, 0.0, 0.0, 0.0])
+        states = []
+        torques = []
         for k in range(1000):
             torque = rng.uniform(-TORQUE, TORQUE) if k % 50 == 0 else torques[-1][joint]
             states.append([state[0] + np.pi, state[2], state[1], state[3]])
@@ -656,14 +661,15 @@ def random_record(robot: str, seconds: float, seed: int) -> list[Play]:
 
 def transitions(records: list[Play], robot: str, spread: float = 0.05) -> Transitions:
     """Transitions over 20 ms with a torque that changed by at most ``spread`` [N m], and none on the passive joint."""
-    joint, count = JOINTS[robot], round(PLAN / INPUT)
-    states, inputs, after = [], [], []
+    joint = JOINTS[robot]
+    count = round(PLAN / INPUT)
+    states = []
+    inputs = []
+    after = []
     for record in records:
         for i in range(0, len(record.torques) - count, count // 2):
-            u, ends = (
-                record.torques[i : i + count],
-                [state_of(record.states[j]) for j in (i, i + count)],
-            )
+            u = record.torques[i : i + count]
+            ends = [state_of(record.states[j]) for j in (i, i + count)]
             calm = np.abs(ends)[:, [1, 3]].max(axis=0) < WILD
             if (
                 np.ptp(u[:, joint]) <= spread
@@ -694,15 +700,14 @@ def learn(
         tolerance=1e-6,
         signal_to_noise_limit=3e3,
     )
-    x, u = data.states, data.inputs
+    x = data.states
+    u = data.inputs
     seen = (
         torch.cat(Features(range(4), [0], (0, 2), 4, 1)(x, u), dim=1),
         data.next_states - nominal(x, u),
     )
-    one, noise = (
-        torch.ones(1, dtype=torch.float64),
-        torch.full((1,), 1e-8, dtype=torch.float64),
-    )
+    one = torch.ones(1, dtype=torch.float64)
+    noise = torch.full((1,), 1e-8, dtype=torch.float64)
     rows = informative_points(seen[0], (scales[None], one, noise), points)
     features, targets = (part[rows] for part in seen)
     posterior = trainer.fit(
@@ -719,11 +724,9 @@ def learned_model(
     """The model, and its body, of 20 s of random torque and four times 10 s of the league's test."""
     nominal: Any = Affine.identity(4, 1)
     nominal.A[[0, 2], [1, 3]] = PLAN  # an angle moves by its rate
-    body, model, records = (
-        wrong_system(robot, error, seed),
-        None,
-        random_record(robot, 20.0, seed),
-    )
+    body = wrong_system(robot, error, seed)
+    model = None
+    records = random_record(robot, 20.0, seed)
     for round_ in range(5):
         data = transitions(records, robot)
         if kind == "residual":
@@ -804,11 +807,9 @@ def _version() -> str:
 
 def _play(model: Any, robot: str, draw: int) -> dict[str, Any]:
     who = pilot(model, robot)
-    found, ms, search = (
-        play(who, robot, draw),
-        1e3 * np.array(who.seconds),
-        np.array(who.searched),
-    )
+    found = play(who, robot, draw)
+    ms = 1e3 * np.array(who.seconds)
+    search = np.array(who.searched)
     return {
         "score": found.score,
         "searches": int(search.sum()),
@@ -820,11 +821,9 @@ def _play(model: Any, robot: str, draw: int) -> dict[str, Any]:
 
 def _play_in_real_time(model: Any, robot: str, draw: int) -> dict[str, Any]:
     who = _real_time_pilot(model, robot)
-    found, ms, between = (
-        play(who, robot, draw),
-        1e3 * np.array(who.seconds),
-        1e3 * np.array(who.between),
-    )
+    found = play(who, robot, draw)
+    ms = 1e3 * np.array(who.seconds)
+    between = 1e3 * np.array(who.between)
     return {
         "score": found.score,
         "searches": len(who.searched),
@@ -910,7 +909,9 @@ def main(arguments: list[str]) -> int:
                 "seeds, draws",
                 "must be numbers such as 0,1 and a number of draws such as 3",
             )
-        robot, kind, folder = given["robot"], given["model"], Path(given["folder"])
+        robot = given["robot"]
+        kind = given["model"]
+        folder = Path(given["folder"])
         if given["board"] == "robustness" and kind == "gp":
             raise SettingError(
                 "model",
@@ -920,10 +921,8 @@ def main(arguments: list[str]) -> int:
             raise SettingError("time", "must be free for board=script and board=film")
         if find_spec("double_pendulum") is None:
             raise SettingError("simulator", INSTALL)
-        seeds, draws = (
-            [int(seed) for seed in given["seeds"].split(",")],
-            int(given["draws"]),
-        )
+        seeds = [int(seed) for seed in given["seeds"].split(",")]
+        draws = int(given["draws"])
         if given["board"] == "simulation":
             rows = board(
                 robot,

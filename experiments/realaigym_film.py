@@ -15,7 +15,8 @@ RATE = 20  # frames a second
 def film(flight: Play, joint: int, path: Path) -> None:
     """Writes the flight of a pendulum with the motor at a joint (0, 1), at its own speed."""
     first, second = LENGTHS
-    angle, both = flight.states[:, 0], flight.states[:, 0] + flight.states[:, 1]
+    angle = flight.states[:, 0]
+    both = flight.states[:, 0] + flight.states[:, 1]
     elbow = np.stack([first * np.sin(angle), -first * np.cos(angle)], axis=1)
     tip = elbow + np.stack([second * np.sin(both), -second * np.cos(both)], axis=1)
     figure = Figure(figsize=(4, 4.4))
@@ -32,7 +33,8 @@ def film(flight: Play, joint: int, path: Path) -> None:
     )
     gauge.tick_params(labelsize=7)
     (bar,) = gauge.barh([0], [0.0], height=1.0, color="tab:green")
-    clock, name = figure.text(0.03, 0.94, ""), "elbow" if joint else "shoulder"
+    clock = figure.text(0.03, 0.94, "")
+    name = "elbow" if joint else "shoulder"
     figure.text(0.03, 0.055, f"{name} torque [N m]", fontsize=7)
 
     def draw(k: int) -> list:

@@ -76,8 +76,10 @@ class RealTimePilot:
     _turn: int = 0  #: starts taken since there was a plan worth following
 
     def __post_init__(self) -> None:
-        self._roll_out, H = RollOut(self.search.planner.prediction.model), self.lead
-        limit, free = np.full((H, 1), TORQUE), np.full((H, 1), np.inf)
+        self._roll_out = RollOut(self.search.planner.prediction.model)
+        H = self.lead
+        limit = np.full((H, 1), TORQUE)
+        free = np.full((H, 1), np.inf)
         gains = np.tile(-BRAKE * np.eye(4)[1 + 2 * self.joint], (1, H, 1, 1))
         self._brake = Feedback(
             np.zeros((1, H, 4)),
@@ -96,10 +98,12 @@ class RealTimePilot:
         if abs(t - self._last) > 1.5 * INPUT:
             self._flight = self._decided = self._found = None
             self._count = self._turn = 0
-        self._last, now = t, self._count
+        self._last = t
+        now = self._count
         if self._decided is not None and now >= self._decided.known:
             if self._decided.value > REPLAN:
-                self._flight, self._turn = None, 0
+                self._flight = None
+                self._turn = 0
             else:
                 self._flight = self._decided
             self._decided = None
@@ -110,9 +114,11 @@ class RealTimePilot:
                 else self._value(self._flight, self._found.start) - PLAN
             )
             if self._found.value < flown:
-                self._flight, self._decided = self._found, None
+                self._flight = self._found
+                self._decided = None
             self._found = None
-        begin, torque = process_time(), -BRAKE * float(state[1 + 2 * self.joint])
+        begin = process_time()
+        torque = -BRAKE * float(state[1 + 2 * self.joint])
         if self._flight is not None:
             torque = self._flight.loop.input_between(
                 state, (now - self._flight.start) / TICKS
@@ -154,11 +160,14 @@ class RealTimePilot:
             ]
         expected = expected if np.isfinite(expected).all() else state
         start = Gaussian.certain(expected), Reference(np.zeros(4))
-        best, lowest, first = None, inf, self._turn % len(self.search)
+        best = None
+        lowest = inf
+        first = self._turn % len(self.search)
         for plan, value in self.search.plans(*start, first=first):
             self._turn += 1
             if best is None or value < lowest:
-                best, lowest = plan, value
+                best = plan
+                lowest = value
             if lowest <= GOOD or process_time() - begin > self.share * self.lead * PLAN:
                 break
         assert best is not None
@@ -168,7 +177,8 @@ class RealTimePilot:
         )  # too late to begin with
 
     def _decide(self, state: Array, now: int, flight: Flight) -> Flight:
-        begin, passed = process_time(), (now - flight.start) // TICKS
+        begin = process_time()
+        passed = (now - flight.start) // TICKS
         inputs, states = (
             _later(part, passed) for part in (flight.plan.inputs, flight.plan.means)
         )
@@ -182,7 +192,8 @@ class RealTimePilot:
         self, plan: Decision, begin: float, now: int, start: int, times: list[float]
     ) -> Flight:
         """The flight of a plan whose making began at a processor time; its value is infinite where it is of no use."""
-        loop, value = ControlLoop(self.step), inf
+        loop = ControlLoop(self.step)
+        value = inf
         if plan.applicable:
             loop.last = Command(plan.input, plan.status, plan, plan)
             loop.input_between(plan.means[0], 0.0)  # its gains

@@ -29,15 +29,13 @@ from gpmpc.experiments.realaigym import (
 from gpmpc.gaussian import Gaussian
 from gpmpc.models import Affine, DisturbedModel, KnownModel, RollOut
 
-ANGLE, RATE, JERK = (
-    1e-6,
-    0.3,
-    40.0,
-)  # deviations of measured angles and rates, and of accelerations' changes in 2 ms
-PROBES, LONGEST = (
-    150,
-    25,
-)  # inputs that are random, to estimate the delay, and its longest
+# deviations of measured angles and rates, and of accelerations' changes in 2 ms
+ANGLE = 1e-6
+RATE = 0.3
+JERK = 40.0
+# inputs that are random, to estimate the delay, and its longest
+PROBES = 150
+LONGEST = 25
 PROBE = 3.0  # their size [N m]
 
 
@@ -45,22 +43,23 @@ class RateFilter:
     """The steady state of a Kalman filter that knows no dynamics: accelerations are states that change at random."""
 
     def __init__(self) -> None:
-        moves, effect = Affine.identity(4, 1), torch.zeros(4, 2, dtype=torch.float64)
+        moves = Affine.identity(4, 1)
+        effect = torch.zeros(4, 2, dtype=torch.float64)
         moves.A[[0, 2], [1, 3]] = INPUT
-        effect[[0, 2], [0, 1]], effect[[1, 3], [0, 1]] = INPUT**2 / 2, INPUT
+        effect[[0, 2], [0, 1]] = INPUT**2 / 2
+        effect[[1, 3], [0, 1]] = INPUT
         model = DisturbedModel(KnownModel(moves, 4, 1), effect, [JERK, JERK])
         kalman = KalmanFilter.extended(
             model, Measurement.of_states(6, range(4), [ANGLE, RATE, ANGLE, RATE])
         )
-        zero, belief = (
-            np.zeros((1, 6)),
-            Gaussian(torch.zeros(6).double(), torch.eye(6).double()),
-        )
+        zero = np.zeros((1, 6))
+        belief = Gaussian(torch.zeros(6).double(), torch.eye(6).double())
         for _ in range(100):
             update = kalman.update(belief, zero[0, :4])
             gain = torch.linalg.solve(update.covariance, belief.covariance[:4]).T
             belief = kalman.predict(update.belief, [0.0])
-        self._gain, self._moves = gain.numpy(), model.linearize(zero, zero[:, :1]).A[0]
+        self._gain = gain.numpy()
+        self._moves = model.linearize(zero, zero[:, :1]).A[0]
         self._state = np.zeros(6)
 
     def restart(self, measured: Array) -> None:
@@ -124,9 +123,13 @@ class Watchful:
         measured = state_of(x)
         if t < self._last:
             self._filter.restart(measured)
-            self._states, self._acting, self.delay, self.response = [], [], 0, 1.0
+            self._states = []
+            self._acting = []
+            self.delay = 0
+            self.response = 1.0
         self._last, state = t, self._filter(measured)
-        count, torques = len(self._acting), np.zeros(2)
+        count = len(self._acting)
+        torques = np.zeros(2)
         if count < PROBES:
             self._states.append(state)
             torques[self.joint] = self._probes[count]
@@ -179,7 +182,9 @@ def robustness(
         check_only_final_state=True,
     )
     flights.set_model_parameter(model_pars=parameters)
-    masses, centres, inertias = parameters.m, parameters.r, parameters.I
+    masses = parameters.m
+    centres = parameters.r
+    inertias = parameters.I
     nominal = {"m1r1": masses[0] * centres[0], "I1": inertias[0]}
     nominal |= {"m2r2": masses[1] * centres[1], "m2": masses[1], "I2": inertias[1]}
     values = {

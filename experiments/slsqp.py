@@ -88,7 +88,9 @@ class SLSQP:
         self.initial_input = check_controller(
             problem, *check_next_states(model), horizon, initial_input
         )
-        H, m, cost = horizon, problem.input_dim, problem.cost
+        H = horizon
+        m = problem.input_dim
+        cost = problem.cost
         boxes = [
             box
             for box in problem.constraints
@@ -102,13 +104,12 @@ class SLSQP:
                 "must have hard boxes (penalty=None) at all stages, or no constraints",
             )
         problem.check_plain("SLSQP")
-        self.model, self.propagator, self.problem, self.horizon = (
-            model,
-            propagator,
-            problem,
-            horizon,
-        )
-        self.tolerance, self.iterations = tolerance, iterations
+        self.model = model
+        self.propagator = propagator
+        self.problem = problem
+        self.horizon = horizon
+        self.tolerance = tolerance
+        self.iterations = iterations
         self._differences = np.kron(
             np.eye(H) - np.eye(H, k=-1), np.eye(m)
         )  # U -> u_i - u_{i-1}, without u_{-1}
@@ -150,10 +151,8 @@ class SLSQP:
             RuntimeError,
         ):  # a trial plan led the model out of its numbers
             return request.failed_decision(Status.NUMERICAL_TROUBLE)
-        inputs, timing = (
-            found.plan.reshape(self.horizon, -1),
-            Timing(0.0, 0.0, time.perf_counter() - began),
-        )
+        inputs = found.plan.reshape(self.horizon, -1)
+        timing = Timing(0.0, 0.0, time.perf_counter() - began)
         kept = bool((found.margins <= 1e3 * FEASIBLE).all())
         predicted = found.means, found.covariances, status, count, timing
         return Decision(
@@ -190,7 +189,8 @@ class SLSQP:
         seeds = np.zeros(
             (H, 1 + H * n + H * r, n + n * n)
         )  # by stage, row (cost, means, margins), and s
-        seeds[:, 0, :n], seeds[:, 0, n:] = 2 * weighted, self._weights.reshape(H, -1)
+        seeds[:, 0, :n] = 2 * weighted
+        seeds[:, 0, n:] = self._weights.reshape(H, -1)
         for i in range(H):
             seeds[i, 1 + i * n : 1 + (i + 1) * n, :n] = np.eye(n)
             rows = 1 + H * n + i * r + np.arange(r)
@@ -224,10 +224,8 @@ class SLSQP:
             plan.ravel().clip(lower, upper)
             for plan in (request.constant_guess, request.initial_guess)
         ]
-        found, used = (
-            min((self.evaluate(plan, request) for plan in starts), key=_rank),
-            0,
-        )
+        found = min((self.evaluate(plan, request) for plan in starts), key=_rank)
+        used = 0
         for _ in range(ROUNDS):
             scale = (
                 abs(found.cost)
@@ -237,11 +235,9 @@ class SLSQP:
             T = solve_triangular(
                 np.linalg.cholesky(found.hessian), np.eye(len(found.plan)), lower=True
             ).T
-            last, result = (
-                found,
-                self._round(
-                    found, T, scale, lower, upper, request, self.iterations - used
-                ),
+            last = found
+            result = self._round(
+                found, T, scale, lower, upper, request, self.iterations - used
             )
             found = self.evaluate(
                 (last.plan + T @ result.x).clip(lower, upper), request
@@ -289,16 +285,21 @@ class SLSQP:
                 memory[0] = self.evaluate(plan, request)
             return memory[0]
 
-        rows, low, high = [np.eye(len(T))], [lower], [upper]
+        rows = [np.eye(len(T))]
+        low = [lower]
+        high = [upper]
         if self.problem.input_rates.finite:
-            first, H = self._first(request.references.previous_input), self.horizon
+            first = self._first(request.references.previous_input)
+            H = self.horizon
             rows.append(self._differences)
             low.append(np.tile(self.problem.input_rates.lower, H) + first)
             high.append(np.tile(self.problem.input_rates.upper, H) + first)
         C, low, high = (np.concatenate(parts) for parts in (rows, low, high))
         C, low, high = C @ T, low - C @ start.plan, high - C @ start.plan
-        C, b = np.concatenate([C, -C]), np.concatenate([low, -high])
-        C, b = C[np.isfinite(b)], b[np.isfinite(b)]
+        C = np.concatenate([C, -C])
+        b = np.concatenate([low, -high])
+        C = C[np.isfinite(b)]
+        b = b[np.isfinite(b)]
         kept = {
             "type": "ineq",
             "fun": lambda w: np.concatenate([C @ w - b, -at(w).margins]),
@@ -319,9 +320,12 @@ class SLSQP:
 
     def _roll_out(self, plan: Array, request: Request) -> tuple[Array, ...]:
         """Means and covariances of stages 0 .. H, and dF/ds (H, p, p) and dF/du (H, p, m), p = n + n^2."""
-        n, m = self.problem.state_dim, self.problem.input_dim
+        n = self.problem.state_dim
+        m = self.problem.input_dim
         belief = Gaussian(*tensors_for(self.model, request.state, request.covariance))
-        beliefs, by_state, by_input = [belief], [], []
+        beliefs = [belief]
+        by_state = []
+        by_input = []
         for u in tensors_for(self.model, plan.reshape(-1, m))[0]:
             moved, d = differentiate(self.propagator, self.model, beliefs[-1], u)
             beliefs.append(moved.belief)

@@ -96,7 +96,9 @@ class Tables:
     state_std: float = 0.1
     workers: int | None = None
 
-    name, trial_name, lost_is_result = "tables", "draws", False
+    name = "tables"
+    trial_name = "draws"
+    lost_is_result = False
 
     def __post_init__(self) -> None:
         sizes = (self.sizes,) if isinstance(self.sizes, int) else self.sizes
@@ -170,13 +172,13 @@ class Tables:
         self, trajectory: str, name: str
     ) -> tuple[Transitions, Scaling, tuple[int, ...]]:
         """Returns the data in the units of the model, the scaling of the next states, the indices that are reported."""
-        system, raw = (
-            SYSTEMS[name],
-            self.data.transitions(
-                SYSTEMS[name], self.trajectories[trajectory], trajectory
-            ),
+        system = SYSTEMS[name]
+        raw = self.data.transitions(
+            SYSTEMS[name], self.trajectories[trajectory], trajectory
         )
-        n, m, states = raw.state_dim, raw.input_dim, system.state_names
+        n = raw.state_dim
+        m = raw.input_dim
+        states = system.state_names
         columns = [*states, *system.input_names, *(f"{state}+" for state in states)]
         if len(columns) != 2 * n + m:
             named = (
@@ -200,11 +202,9 @@ class Tables:
     @staticmethod
     def run_trial(trial: Trial) -> dict:
         """Trains and scores one draw."""
-        fit, data, restore = (
-            trial.condition,
-            trial.condition.data,
-            trial.condition.scaling.restore,
-        )
+        fit = trial.condition
+        data = trial.condition.data
+        restore = trial.condition.scaling.restore
         subset = random_rows(len(data), fit.size, trial.seed)
         training_rows = data[subset]
         training = fit.model(training_rows, seed=trial.seed)
@@ -216,10 +216,8 @@ class Tables:
             else predict_all(posterior, training_rows, fit.state_std)[0]
         )
         plain = posterior.predict(data.states, data.inputs)
-        mean, variance = (
-            restore(plain.mean),
-            (plain.variance + posterior.noise_variance) * fit.scaling.factor**2,
-        )
+        mean = restore(plain.mean)
+        variance = (plain.variance + posterior.noise_variance) * fit.scaling.factor**2
         observed = restore(data.next_states)
         held_out = np.setdiff1d(np.arange(len(data)), subset).tolist()
         return {
@@ -332,7 +330,9 @@ def predict_all(
     """
     propagator = MomentMatching(process_noise=False)  # as in the paper
     covariance = state_std**2 * torch.eye(data.state_dim, dtype=torch.float64)
-    means, fed, projected = [], [], 0.0
+    means = []
+    fed = []
+    projected = 0.0
     for state, control in zip(data.states, data.inputs, strict=True):
         belief = Gaussian(state, covariance)
         fed.append(belief.variance)
@@ -408,10 +408,8 @@ def summarise(records: Sequence[dict]) -> list[Row]:
         ).append(record)
     rows = []
     for key, group in groups.items():
-        good, printed = (
-            [record for record in group if "error" not in record],
-            paper_figures().get(key, {}),
-        )
+        good = [record for record in group if "error" not in record]
+        printed = paper_figures().get(key, {})
         values = {
             name: tuple(r[name] for r in good if r[name] is not None)
             for name in [*MEASURES, *CALIBRATION]
@@ -541,11 +539,10 @@ def _figure(records: Sequence[dict]) -> Figure:
             ours.setdefault(record["size"], []).append(record["test_mse"])
         if printed := paper_figures().get((*name, record["size"])):
             paper[record["size"]] = float(printed["test_mse"])
-    columns, rows = min(2, len(panels)), -(-len(panels) // 2)
-    title, height = (
-        "Tables 1 and 2: error of held-out predictions",
-        3.4 * rows + 0.8 * (rows > 1),
-    )
+    columns = min(2, len(panels))
+    rows = -(-len(panels) // 2)
+    title = "Tables 1 and 2: error of held-out predictions"
+    height = 3.4 * rows + 0.8 * (rows > 1)
     figure, axes = make_figure(4.6 * columns, height, rows, columns, title)
     for axis in axes.flat[len(panels) :]:
         axis.set_visible(False)

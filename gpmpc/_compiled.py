@@ -163,7 +163,8 @@ def sources_stamp(module: str) -> bytes:
     The modules must have been imported: of others no kernel can contain anything. Imports are to be absolute.
     """
     packages = {name.partition(".")[0] for name in (module, __name__)}
-    pending, seen = [module], {}
+    pending = [module]
+    seen = {}
     while pending:
         name = pending.pop()
         if (

@@ -201,7 +201,8 @@ def predict_with_jacobian(
         and (arrays := constant_arrays(state, input)) is not None
     ):
         check_query(model, state, input)
-        batch, count = state.shape[:-1], state.shape[:-1].numel()
+        batch = state.shape[:-1]
+        count = state.shape[:-1].numel()
         flat = (
             np.ascontiguousarray(a, dtype=np.float64).reshape(count, a.shape[-1])
             for a in arrays
@@ -248,7 +249,8 @@ def check_next_states(model: Any) -> tuple[int, int]:
 def check_query(model: Any, state: Tensor, input: Tensor) -> None:
     """Raises unless a state (*batch, n) and an input (*batch, m) are tensors of a model's shape, type and device."""
     check_tensors(state=state, input=input)
-    n, m = model.state_dim, model.input_dim
+    n = model.state_dim
+    m = model.input_dim
     if state.shape[-1:] != (n,) or input.shape != (*state.shape[:-1], m):
         got = f"{tuple(state.shape)} and {tuple(input.shape)}"
         raise ShapeError(

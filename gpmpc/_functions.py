@@ -149,7 +149,8 @@ def _foreign_calls(error: BaseException, packages: Sequence[str]) -> list[str]:
 def _names_on(frame: FrameType, line: int) -> Iterator[tuple[str, Any]]:
     """Every name on a line, such as ``np.linalg.norm``, and what it stands for."""
     known = {**frame.f_globals, **frame.f_locals}
-    name, value = "", None
+    name = ""
+    value = None
     for instruction in _instructions(frame.f_code, line):
         if instruction.opname in ("LOAD_ATTR", "LOAD_METHOD") and name:
             name = f"{name}.{instruction.argval}"
@@ -162,7 +163,8 @@ def _names_on(frame: FrameType, line: int) -> Iterator[tuple[str, Any]]:
         if instruction.opname.startswith("LOAD_") and isinstance(
             instruction.argval, str
         ):
-            name, value = instruction.argval, known.get(instruction.argval)
+            name = instruction.argval
+            value = known.get(instruction.argval)
     if name:
         yield name, value
 

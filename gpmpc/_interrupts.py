@@ -18,7 +18,8 @@ def interrupts_after() -> Iterator[None]:
     Raises:
         KeyboardInterrupt: Or what else the process does about the signal.
     """
-    usual, first = signal.getsignal(signal.SIGINT), []
+    usual = signal.getsignal(signal.SIGINT)
+    first = []
     if threading.current_thread() is not threading.main_thread() or not callable(usual):
         yield  # nothing is raised here, or the signal is ignored
         return

@@ -229,11 +229,9 @@ def calibrate(
     found: list[list[tuple[Tensor, ...]]] = [[] for _ in range(horizon)]
     with torch.no_grad():
         for recording in recordings:
-            x, u, K = (
-                recording.states.to(**like),
-                recording.inputs.to(**like),
-                len(recording),
-            )
+            x = recording.states.to(**like)
+            u = recording.inputs.to(**like)
+            K = len(recording)
             for first in range(0, K, CHUNK):
                 mean = x[first : min(first + CHUNK, K)]
                 belief = Gaussian(mean, start.expand(len(mean), n, n))
@@ -301,7 +299,8 @@ def _check(
     levels: Sequence[float],
     names: tuple[str, ...],
 ) -> None:
-    n, m = model.state_dim, model.input_dim
+    n = model.state_dim
+    m = model.input_dim
     if model.output_dim != n:
         raise ShapeError(
             f"the model must predict its {n} states; it has {model.output_dim} outputs"

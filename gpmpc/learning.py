@@ -71,7 +71,9 @@ from gpmpc.signals import Signals
 from gpmpc.simulation import Rollout
 from gpmpc.status import Status
 
-_FEW, _MANY = 3, 100  # differences of errors that say how large the noise is
+# differences of errors that say how large the noise is
+_FEW = 3
+_MANY = 100
 _LARGEST = 10.0  # difference of log densities that one step counts for: no outlier decides alone
 _MISALIGNED = 0.1  # part of errors that no input explains, in deviations, at most
 _PATIENCE = 2  # further confirmations for steps that nothing explained, at most
@@ -371,7 +373,9 @@ class ChangedModel(Wrapper):
     @cached_property
     def features(self) -> Features:
         """What d sees of the state and the input."""
-        n, m, model = self.model.state_dim, self.model.input_dim, cast(Any, self.model)
+        n = self.model.state_dim
+        m = self.model.input_dim
+        model = cast(Any, self.model)
         return (
             Features(list(range(n)), list(range(m)), [], n, m)
             if self.gp is model
@@ -429,7 +433,9 @@ class ChangedModel(Wrapper):
         self, state: Array, input: Array, next_state: Array
     ) -> tuple[Array, Array, Array]:
         """The point (phi, u, t) (d,) of a transition, what d was there (k,), and the variance of f there (k,)."""
-        states, inputs, reach = state[None], input[None], self.arrays[1]
+        states = state[None]
+        inputs = input[None]
+        reach = self.arrays[1]
         alone = linearize(self.model, states, inputs)
         z, v, _ = self.features.linearize(states, inputs)
         variance = ((reach @ cast(Array, alone.covariance)[0]) * reach).sum(1)
@@ -456,7 +462,8 @@ class ChangedModel(Wrapper):
                 range(gone) if oldest else least_informative(self.posterior, gone)
             )
         if coming is not None and step == gone:
-            now, coming = coming, None
+            now = coming
+            coming = None
         elif (
             coming is not None
         ):  # rows are as much work as their number's square: all steps have the same share
@@ -508,7 +515,9 @@ class ChangedModel(Wrapper):
     @property
     def posterior(self) -> GPPosterior:
         """The GPs of d as tensors."""
-        gp, now, size = self.gp, self.change[0], len(self)
+        gp = self.gp
+        now = self.change[0]
+        size = len(self)
         arrays, (k, d) = now.arrays, now.arrays.inverse_squares.shape
         parts = (
             arrays.points[:, :size].T,
@@ -556,15 +565,14 @@ class ChangedModel(Wrapper):
         self, states: Array, inputs: Array, covariance: bool = True
     ) -> Linearized:
         """Linearises at K points (K, n), (K, m), the model and its change each by a method of their own."""
-        found, change = (
-            linearize(self.model, states, inputs, covariance),
-            self.change[0],
-        )
+        found = linearize(self.model, states, inputs, covariance)
+        change = self.change[0]
         if not len(self):
             return found
         z, v, slope = self.features.linearize(states, inputs)
         at = np.empty((len(v), v.shape[1] + 1))
-        at[:, :-1], at[:, -1] = v, self.time
+        at[:, :-1] = v
+        at[:, -1] = self.time
         offset = np.zeros(self.gp.output_dim)
         mean, by_state, by_input, variance = linearize_gps(
             change, z, at, covariance, offset, False
@@ -674,11 +682,10 @@ class LearningController:
 
     def __init__(self, controller: GPMPC, learning: OnlineLearning | None = None):
         check_method("controller", controller, "with_model", "GPMPC(...)")
-        self.controller, self.learning = (
-            controller,
-            OnlineLearning() if learning is None else learning,
-        )
-        self.problem, self.horizon = controller.problem, controller.horizon
+        self.controller = controller
+        self.learning = OnlineLearning() if learning is None else learning
+        self.problem = controller.problem
+        self.horizon = controller.horizon
         self.initial_input = controller.initial_input
         self.signals = controller.signals
         self._model = ChangedModel(
@@ -786,11 +793,9 @@ class EpisodicLearning:
         """The data and the transitions of a flight, as far as they were measured."""
         known = np.all(np.isfinite(flight.measured), axis=1)
         rows = np.flatnonzero(np.logical_and(known[:-1], known[1:]))
-        states, inputs, after = (
-            flight.measured[rows],
-            flight.inputs[rows],
-            flight.measured[rows + 1],
-        )
+        states = flight.measured[rows]
+        inputs = flight.inputs[rows]
+        after = flight.measured[rows + 1]
         flown = Signals(time_step=flight.time_step)
         data.signals.check("the data", flown, "the flight")
         return replace(

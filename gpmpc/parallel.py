@@ -42,7 +42,8 @@ def in_processes(
         if hasattr(os, "sched_getaffinity")
         else os.cpu_count() or 1
     )
-    workers, before = min(workers or cores, len(jobs)), set(active_children())
+    workers = min(workers or cores, len(jobs))
+    before = set(active_children())
     mine: dict[str, Any] = {"initializer": end_with, "initargs": (os.getpid(),)}
     with (
         _one_thread_each(),

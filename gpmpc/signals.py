@@ -81,7 +81,8 @@ class Signals:
                 raise SettingError(
                     key, f"{found}; {other_owner} has {', '.join(theirs)}{same}"
                 )
-        ours, theirs = self.time_step, other.time_step
+        ours = self.time_step
+        theirs = other.time_step
         if ours and theirs and abs(ours / theirs - 1) > SAME_STEP:
             found = f"{owner} has time steps of {ours:g} s"
             raise SettingError(key, f"{found}; {other_owner} has {theirs:g} s")

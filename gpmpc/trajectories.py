@@ -51,20 +51,16 @@ class Elliptical:
     def __call__(self, time: np.ndarray) -> np.ndarray:
         """Positions (..., 3) [m] at times (...) [s]."""
         t = np.asarray(time, dtype=float)
-        x, y = (
-            self.radius_x * np.sin(self.rate * t),
-            self.radius_y * np.cos(self.rate * t),
-        )
+        x = self.radius_x * np.sin(self.rate * t)
+        y = self.radius_y * np.cos(self.rate * t)
         return np.stack([x, y, self.start_z + self.climb_rate * t], axis=-1)
 
     def velocity(self, time: np.ndarray) -> np.ndarray:
         """Velocities (..., 3) [m/s] at times (...) [s]."""
         t = np.asarray(time, dtype=float)
         angle = self.rate * t
-        along_x, along_y = (
-            self.radius_x * self.rate * np.cos(angle),
-            -self.radius_y * self.rate * np.sin(angle),
-        )
+        along_x = self.radius_x * self.rate * np.cos(angle)
+        along_y = -self.radius_y * self.rate * np.sin(angle)
         return np.stack([along_x, along_y, np.full_like(t, self.climb_rate)], axis=-1)
 
 
@@ -131,7 +127,8 @@ class Lorenz:
             rtol=self.relative_tolerance,
             atol=1e-6,
         )
-        ends, pieces = [0.0], []
+        ends = [0.0]
+        pieces = []
         for _ in range(
             int(np.ceil(self.duration / self.sampling_time / self.samples_per_step))
         ):
@@ -143,7 +140,8 @@ class Lorenz:
     @cached_property
     def _samples(self) -> np.ndarray:
         """Lorenz times of the samples."""
-        ends, each = self._path.ts, self.samples_per_step
+        ends = self._path.ts
+        each = self.samples_per_step
         return np.interp(
             np.arange(each * (len(ends) - 1) + 1) / each, np.arange(len(ends)), ends
         )
@@ -159,7 +157,8 @@ class Lorenz:
         if np.any(t < 0) or np.any(t > self.duration):
             rule = f"this Lorenz trajectory is defined from 0 to {self.duration:g} s"
             raise SettingError("duration", f"{rule}; got {t.min():g} to {t.max():g} s")
-        samples, position = self._samples, t / self.sampling_time
+        samples = self._samples
+        position = t / self.sampling_time
         index = np.minimum(position.astype(int), len(samples) - 2)
         spacing = samples[index + 1] - samples[index]
         return samples[index] + (

@@ -9,7 +9,8 @@ from gpmpc.plotting._style import PLAN
 from gpmpc.recording import read_run
 from tests.recording.runs import record_run
 
-STEPS, HORIZON = 8, 5
+STEPS = 8
+HORIZON = 5
 
 
 def flight(folder, failed=()):

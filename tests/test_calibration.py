@@ -16,11 +16,9 @@ from gpmpc.metrics import binomial_interval
 from gpmpc.plotting import calibration_figure
 from gpmpc.propagation import Linearization, MeanEquivalence
 
-A, B, Q = (
-    torch.tensor([[0.9, 0.2], [-0.3, 0.8]]),
-    torch.tensor([[0.0], [0.5]]),
-    torch.diag(torch.tensor([0.04, 0.01])),
-)
+A = torch.tensor([[0.9, 0.2], [-0.3, 0.8]])
+B = torch.tensor([[0.0], [0.5]])
+Q = torch.diag(torch.tensor([0.04, 0.01]))
 NOISE = torch.diag(torch.tensor([0.01, 0.09]))
 
 CPU = torch.device("cpu")
@@ -59,7 +57,8 @@ def runs(count, steps, noisy=True):
     """Runs whose first state is known exactly and whose others are measured: one start each would be exact."""
     recordings = []
     for _ in range(count):
-        states, inputs = [torch.randn(2)], torch.randn(steps, 1)
+        states = [torch.randn(2)]
+        inputs = torch.randn(steps, 1)
         for u in inputs:
             states.append(A @ states[-1] + B @ u + Q.sqrt() @ torch.randn(2))
         states = torch.stack(states)
@@ -70,7 +69,8 @@ def runs(count, steps, noisy=True):
 
 
 def exact_covariances(steps):
-    S, found = torch.zeros(2, 2), []
+    S = torch.zeros(2, 2)
+    found = []
     for _ in range(steps):
         S = A @ S @ A.T + Q
         found.append(S)
@@ -78,7 +78,8 @@ def exact_covariances(steps):
 
 
 def test_the_true_model_is_calibrated_at_every_step_and_level():
-    count, levels = 400, (0.5, 0.9, 0.95)
+    count = 400
+    levels = (0.5, 0.9, 0.95)
     # Without noise every start is exact; the recordings' starts overlap, hence the generous bound.
     found = calibrate(
         noiseless(), runs(count, 8, noisy=False), Linearization(), 6, levels
@@ -95,10 +96,8 @@ def test_the_true_model_is_calibrated_at_every_step_and_level():
 
 
 def test_observations_are_calibrated_with_their_noise():
-    recordings, arguments = (
-        runs(800, 1),
-        {"propagator": Linearization(), "horizon": 1, "levels": (0.9,)},
-    )
+    recordings = runs(800, 1)
+    arguments = {"propagator": Linearization(), "horizon": 1, "levels": (0.9,)}
     told = calibrate(LinearGaussian(), recordings, **arguments)
     assert float((told.coverage - 0.9).abs().max()) < 0.04
     assert bool(
@@ -169,7 +168,8 @@ def test_false_confidence_shows():
 def test_the_batch_of_all_starts_is_the_loop_over_them():
     recordings = [*runs(3, 7), *runs(2, 3), *runs(1, CHUNK)]
     found = calibrate(LinearGaussian(), recordings, Linearization(), 5)
-    k, errors = 4, []
+    k = 4
+    errors = []
     for recording in recordings:
         for t in range(len(recording) - k + 1):
             belief = Gaussian(recording.states[t], torch.zeros(2, 2))
@@ -285,7 +285,8 @@ def test_transitions_fall_apart_into_recordings():
 
 
 def test_misuse_is_refused_with_the_rule():
-    model, recording = LinearGaussian(), runs(1, 4)
+    model = LinearGaussian()
+    recording = runs(1, 4)
     for change, error, message in (
         (
             {"horizon": 5},

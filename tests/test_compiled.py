@@ -148,7 +148,8 @@ def test_the_stamp_of_a_kernel_covers_constants_and_callees_and_spares_the_rest(
 
     def covered(module):
         before = gpmpc._compiled.sources_stamp(module)
-        read, changed = gpmpc._compiled._read_source, set()
+        read = gpmpc._compiled._read_source
+        changed = set()
         for name in [name for name in sys.modules if name.startswith("gpmpc.")]:
             file = getattr(sys.modules[name], "__file__", None)
 

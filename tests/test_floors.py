@@ -53,7 +53,8 @@ def test_torch_is_as_pinned_unless_another_is_named():
 
     constraints = (ROOT / "constraints.txt").read_text().splitlines()
     (pinned,) = (line for line in constraints if line.startswith("torch=="))
-    usual, other = printed(), printed("torch=2.8.0")
+    usual = printed()
+    other = printed("torch=2.8.0")
     assert pinned in usual
     assert "torch==2.8.0" in other
     assert {*usual} ^ {*other} == {pinned, "torch==2.8.0"}

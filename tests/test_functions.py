@@ -169,7 +169,8 @@ def test_measurements_get_the_rule_and_the_name():
 
 def plant(function):
     class Dynamics:
-        state_names, input_names = ("angle", "rate"), ("torque",)
+        state_names = ("angle", "rate")
+        input_names = ("torque",)
 
         def derivative(self, x, u):
             return [x[1], function(x[0]) + u[0]]
@@ -190,7 +191,8 @@ def test_dynamics_of_math_are_refused_where_arrays_or_expressions_come():
 
 
 class OfMath:
-    state_names, input_names = ("angle", "rate"), ("torque",)
+    state_names = ("angle", "rate")
+    input_names = ("torque",)
 
     def derivative(self, x, u):
         return [x[1], math.sqrt(math.cos(x[0])) + u[0]]

@@ -67,7 +67,8 @@ def test_ipopt_ends_a_solve_that_an_interrupt_meets_and_nmpc_passes_it_on():
         5,
         [7.26, 0.0, 0.0],
     )
-    solver, statuses = controller._solver, []
+    solver = controller._solver
+    statuses = []
 
     class Met:
         """Solves until the signal has come, which is in the middle of one."""

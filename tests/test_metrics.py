@@ -28,11 +28,9 @@ def test_the_mean_squared_error_sums_over_outputs_and_averages_over_samples():
 
 
 def test_the_predictive_density_is_the_gaussians():
-    mean, variance, observed = (
-        torch.randn(5, 3),
-        torch.rand(5, 3) + 0.1,
-        torch.randn(5, 3),
-    )
+    mean = torch.randn(5, 3)
+    variance = torch.rand(5, 3) + 0.1
+    observed = torch.randn(5, 3)
     exact = -torch.distributions.Normal(mean, variance.sqrt()).log_prob(observed).mean()
     assert negative_log_predictive_density(mean, variance, observed) == pytest.approx(
         float(exact)
@@ -41,7 +39,8 @@ def test_the_predictive_density_is_the_gaussians():
 
 @pytest.mark.parametrize("level", [0.5, 0.9, 0.95])
 def test_samples_of_the_prediction_are_covered_at_the_level(level):
-    mean, variance = torch.randn(20_000, 2), torch.rand(20_000, 2) + 0.1
+    mean = torch.randn(20_000, 2)
+    variance = torch.rand(20_000, 2) + 0.1
     observed = mean + variance.sqrt() * torch.randn(20_000, 2)
     assert abs(
         interval_coverage(mean, variance, observed, level) - level
@@ -55,9 +54,11 @@ def test_a_level_outside_zero_and_one_is_refused():
 
 
 def test_the_tracking_error_is_that_of_the_axes_and_of_the_distance_without_the_start():
-    states, references = np.zeros((3, 6)), np.zeros((3, 6))
+    states = np.zeros((3, 6))
+    references = np.zeros((3, 6))
     states[0] = 100.0  # where nobody steered
-    states[1, ::2], states[2, ::2] = [3, 0, 0], [0, 4, 0]
+    states[1, ::2] = [3, 0, 0]
+    states[2, ::2] = [0, 4, 0]
     states[:, 1::2] = 7.0  # velocities are not looked at
     error = tracking_error(states, references, AXES)
     assert np.allclose(error.axes, [np.sqrt(9 / 2), np.sqrt(16 / 2), 0])
@@ -107,10 +108,8 @@ def test_what_hovers_is_lost_beyond_the_least_distance_and_what_is_no_number_is_
 
 
 def test_errors_of_angles_are_taken_within_half_a_turn():
-    turned, upright = (
-        np.array([[3.0, 0.0], [2 * np.pi + 0.1, 0.0], [-2 * np.pi - 0.1, 0.0]]),
-        np.zeros((3, 2)),
-    )
+    turned = np.array([[3.0, 0.0], [2 * np.pi + 0.1, 0.0], [-2 * np.pi - 0.1, 0.0]])
+    upright = np.zeros((3, 2))
     assert tracking_error(turned, upright, [0], angles=[0]).total == pytest.approx(0.1)
     assert find_loss(turned, upright, [0], angles=[0]) is None
     assert find_loss(turned, upright, [0]).step == 1
@@ -184,7 +183,8 @@ def test_arrays_that_do_not_belong_together_are_refused(call, error, message):
 
 
 def test_a_bound_is_kept_up_to_the_tolerance_on_either_side():
-    lower, upper = np.array([-1.0, -np.inf]), np.array([1.0, 2.0])
+    lower = np.array([-1.0, -np.inf])
+    upper = np.array([1.0, 2.0])
     for sign, entry, bound in ((-1, 0, -1.0), (1, 0, 1.0), (1, 1, 2.0)):
         values = np.zeros((4, 2))
         values[:, entry] = bound + sign * np.array([-0.5, 0.0, 0.9e-6, 1.1e-6])

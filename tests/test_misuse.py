@@ -27,15 +27,14 @@ F = torch.float64
 
 def data():
     generator = torch.Generator().manual_seed(0)
-    x, u = (
-        torch.randn(12, 2, generator=generator, dtype=F),
-        torch.randn(12, 1, generator=generator, dtype=F),
-    )
+    x = torch.randn(12, 2, generator=generator, dtype=F)
+    u = torch.randn(12, 1, generator=generator, dtype=F)
     return Transitions(x, u, x + 0.1 * u)
 
 
 def posterior(**changed):
-    seen, ones = data(), torch.ones(2, dtype=F)
+    seen = data()
+    ones = torch.ones(2, dtype=F)
     given = {
         "inputs": seen.features,
         "targets": seen.next_states,
@@ -52,7 +51,8 @@ def belief():
 
 
 class Oscillator:
-    state_names, input_names = ("position", "velocity"), ("force",)
+    state_names = ("position", "velocity")
+    input_names = ("force",)
 
     def derivative(self, x, u):
         return [x[1], u[0] - x[0]]
@@ -277,7 +277,8 @@ def test_a_residual_model_refuses_a_nominal_of_another_size_when_it_predicts():
     wrong = ResidualModel(
         lambda x, u: x[..., :1], model.residual, model.B, model.states, model.inputs, 1
     )
-    x, u = torch.zeros(2, dtype=F), torch.zeros(1, dtype=F)
+    x = torch.zeros(2, dtype=F)
+    u = torch.zeros(1, dtype=F)
     for ask in (wrong.predict, partial(predict_with_jacobian, wrong)):
         with pytest.raises(ShapeError, match="nominal must give next states"):
             ask(x, u)
@@ -292,7 +293,8 @@ def test_an_affine_model_checks_its_shapes():
 
 @pytest.mark.parametrize("kind", [GPMPC, NonlinearGPMPC])
 def test_a_controller_says_what_it_takes(kind):
-    asked, reference = controller(kind), np.zeros((4, 2))
+    asked = controller(kind)
+    reference = np.zeros((4, 2))
     for given in ((belief(), reference), (np.zeros(2), Reference(reference))):
         with pytest.raises(
             ShapeError,
@@ -350,7 +352,8 @@ def test_a_step_of_other_lengths_is_refused():
     ],
 )
 def test_predictions_of_another_shape_are_not_broadcast(measure):
-    tall, wide = torch.ones(3, 1, dtype=F), torch.ones(3, 2, dtype=F)
+    tall = torch.ones(3, 1, dtype=F)
+    wide = torch.ones(3, 2, dtype=F)
     given = (
         (tall, wide) if measure is metrics.mean_squared_error else (tall, tall, wide)
     )

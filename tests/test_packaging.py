@@ -57,7 +57,8 @@ def test_the_code_of_the_wheel_has_the_fingerprint_of_the_checkout(wheel, tmp_pa
 def test_an_installed_package_finds_its_settings_from_an_empty_directory(
     wheel, tmp_path
 ):
-    site, empty = tmp_path / "site", tmp_path / "empty"
+    site = tmp_path / "site"
+    empty = tmp_path / "empty"
     empty.mkdir()
     zipfile.ZipFile(wheel).extractall(site)
     code = f"import gpmpc; assert gpmpc.__file__.startswith({str(site)!r}); from gpmpc.cli import main; main()"

@@ -38,7 +38,8 @@ def test_a_worker_that_dies_is_one_clear_error():
 
 
 def test_an_interrupt_between_the_starts_of_two_workers_ends_the_first(monkeypatch):
-    submitted, submit = [], ProcessPoolExecutor.submit
+    submitted = []
+    submit = ProcessPoolExecutor.submit
 
     def interrupted(pool, *job):
         if submitted:

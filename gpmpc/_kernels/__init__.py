@@ -76,16 +76,19 @@ def linearize(
     (K, k, n) and by u (K, k, m), and covariances (K, k, k), which take most of the time, or None. Raises ShapeError
     where x or u do not fit.
     """
-    K, k, n, m = len(x), len(packed.arrays.weights), packed.state_dim, packed.input_dim
+    K = len(x)
+    k = len(packed.arrays.weights)
+    n = packed.state_dim
+    m = packed.input_dim
     if x.shape != (K, n) or u.shape != (K, m):
         raise ShapeError(
             f"the model takes states (K, {n}) and inputs (K, {m}); got {x.shape} and {u.shape}"
         )
-    x, u = (
-        np.ascontiguousarray(x, dtype=np.float64),
-        np.ascontiguousarray(u, dtype=np.float64),
-    )
-    M, A, B = np.empty((K, k)), np.empty((K, k, n)), np.empty((K, k, m))
+    x = np.ascontiguousarray(x, dtype=np.float64)
+    u = np.ascontiguousarray(u, dtype=np.float64)
+    M = np.empty((K, k))
+    A = np.empty((K, k, n))
+    B = np.empty((K, k, m))
     V = np.zeros((K if covariance else 0, k, k))
     kept = k * (-(-K // 4) * 4) if covariance else 0
     memory = np.empty((2 * (n + m) + 1 + kept) * packed.arrays.points.shape[1] + 8)
@@ -107,7 +110,9 @@ def linearize(
 def point_with_jacobian(packed: Packed, x: Array, u: Array) -> Expansion:
     """Mean and variance at states x (H, n) and inputs u (H, m), with the derivatives that linearisation needs."""
     x, u = _points(packed, x, u)
-    k, n, m = packed.output_dim, packed.state_dim, packed.input_dim
+    k = packed.output_dim
+    n = packed.state_dim
+    m = packed.input_dim
     shapes = [(k,), (k,), (k, n), (k, m), (k, n), (k, m), (k, n, n), (k, n, m)]
     out = Expansion(*[np.empty((len(x), *shape)) for shape in shapes])
     call_unchecked(
@@ -131,7 +136,10 @@ def moments(
     """
     mu, u = _points(packed, mu, u)
     S = np.array(S, dtype=np.float64, order="C")
-    H, k, n, m = len(mu), packed.output_dim, packed.state_dim, packed.input_dim
+    H = len(mu)
+    k = packed.output_dim
+    n = packed.state_dim
+    m = packed.input_dim
     if S.shape != (H, n, n):
         raise ShapeError(f"S must have shape {(H, n, n)}; got {S.shape}")
     d = k if derivatives else 0
@@ -164,11 +172,11 @@ def moments(
 
 def _points(packed: Packed, x: Array, u: Array) -> tuple[Array, Array]:
     """Fresh contiguous (H, n) and (H, m), the one type the kernels are compiled for."""
-    x, u = (
-        np.array(x, dtype=np.float64, order="C"),
-        np.array(u, dtype=np.float64, order="C"),
-    )
-    H, n, m = len(x), packed.state_dim, packed.input_dim
+    x = np.array(x, dtype=np.float64, order="C")
+    u = np.array(u, dtype=np.float64, order="C")
+    H = len(x)
+    n = packed.state_dim
+    m = packed.input_dim
     if x.shape != (H, n) or u.shape != (H, m):
         raise ShapeError(
             f"the model takes states (H, {n}) and inputs (H, {m}); got {x.shape} and {u.shape}"

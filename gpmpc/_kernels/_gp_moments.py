@@ -120,7 +120,9 @@ def evaluate_moments(derivatives, diagonal, gp, precision, mu, S, u, out):
     for h in range(len(mu)):
         belief = _Belief(gp, S[h], rows[:n], rows[n : n + m])
         for d in range(n + m):
-            at, row, point = mu[h, d] if d < n else u[h, d - n], rows[d], gp.points[d]
+            at = mu[h, d] if d < n else u[h, d - n]
+            row = rows[d]
+            point = gp.points[d]
             for j in range(padded):
                 row[j] = point[j] - at
         for a in range(k):
@@ -128,10 +130,8 @@ def evaluate_moments(derivatives, diagonal, gp, precision, mu, S, u, out):
             out.M[h, a] = terms.M[a]
             multiply_transposed(terms.G[a], terms.first[a], out.J[h, a])
             if derivatives:
-                to, sums = (
-                    (out.J[h, a], out.dM_dS[h, a], out.dM_du[h, a]),
-                    (terms.first[a], terms.second[a]),
-                )
+                to = (out.J[h, a], out.dM_dS[h, a], out.dM_du[h, a])
+                sums = (terms.first[a], terms.second[a])
                 _differentiate_sum(
                     terms.weighted[a], 1.0, belief, a, terms, sums, work, to
                 )
@@ -166,15 +166,11 @@ def evaluate_moments(derivatives, diagonal, gp, precision, mu, S, u, out):
 
 @njit_inner
 def _make_terms(k, n, padded):
-    vectors, rows = (
-        aligned_rows(2 * k * n, padded).reshape(2, k, n, padded),
-        aligned_rows(2 * k, padded),
-    )
-    squares, sums, numbers = (
-        np.zeros((4, k, n, n)),
-        np.zeros((2, k, n)),
-        np.zeros((3, k)),
-    )
+    vectors = aligned_rows(2 * k * n, padded).reshape(2, k, n, padded)
+    rows = aligned_rows(2 * k, padded)
+    squares = np.zeros((4, k, n, n))
+    sums = np.zeros((2, k, n))
+    numbers = np.zeros((3, k))
     single = (
         vectors[0],
         vectors[1],
@@ -186,7 +182,8 @@ def _make_terms(k, n, padded):
         numbers[1],
     )
     terms = _OutputTerms(*single, sums[0], squares[2], numbers[2], sums[1], squares[3])
-    w, square = aligned_rows(3 * n + 6, padded), np.empty((5, n, n))
+    w = aligned_rows(3 * n + 6, padded)
+    square = np.empty((5, n, n))
     of_points = (
         w[0],
         w[1],
@@ -207,8 +204,12 @@ def _make_terms(k, n, padded):
 def _evaluate_output(belief, a, terms, work):
     """Fills the terms of output a, but for ``second`` and the sums over e."""
     use_widest_registers()
-    gp, n, log_q, whiten = belief.gp, len(belief.S), work.row, work.x
-    D, D_u = gp.inverse_squares[a, :n], gp.inverse_squares[a, n:]
+    gp = belief.gp
+    n = len(belief.S)
+    log_q = work.row
+    whiten = work.x
+    D = gp.inverse_squares[a, :n]
+    D_u = gp.inverse_squares[a, n:]
     # log q_i = log sf2 - 1/2 log|I + S D| - 1/2 |W (x_i - mu)|^2 - 1/2 (u_i - u)' D_u (u_i - u)
     terms.half_logdet[a] = condition(belief.S, D, whiten, terms.G[a])
     log_q[:] = gp.log_signal[a] - terms.half_logdet[a]
@@ -222,7 +223,8 @@ def _evaluate_output(belief, a, terms, work):
     product(terms.G[a], belief.S, terms.T[a])
     symmetrize(terms.T[a])
     for d in range(n):
-        z, x = terms.z[a, d], belief.x[d]
+        z = terms.z[a, d]
+        x = belief.x[d]
         for j in range(len(z)):
             z[j] = D[d] * x[j]
     transform(terms.T[a], terms.z[a], terms.Tz[a])
@@ -233,13 +235,11 @@ def _evaluate_output(belief, a, terms, work):
 def _differentiate_sum(v, factor, belief, a, terms, sums, work, to):
     """Writes ``factor`` sum_i v_i dlog q_ai; fills the sums of v_i z_i and v_i z_i z_i', and returns that of v_i."""
     (first, second), (dmu, dS, du) = sums, to
-    n, total, G, D, x = (
-        len(belief.S),
-        row_sum(v),
-        terms.G[a],
-        belief.gp.inverse_squares[a],
-        work.x,
-    )
+    n = len(belief.S)
+    total = row_sum(v)
+    G = terms.G[a]
+    D = belief.gp.inverse_squares[a]
+    x = work.x
     project(v, terms.z[a], first)
     project(v, belief.u, du)
     second_moments(v, terms.z[a], work.other, second)
@@ -263,12 +263,10 @@ def _differentiate_sum(v, factor, belief, a, terms, sums, work, to):
 def _differentiate_J(belief, a, terms, J, dJ_dS, dJ_du):
     """dJ/dS = 1/2 sum beta q (w w w - three times G'D with w), dJ/du = sum beta q w c'."""
     (n, padded), G, D = belief.x.shape, terms.G[a], belief.gp.inverse_squares[a]
-    w, work, sums, A = (
-        aligned_rows(n, padded),
-        aligned_rows(2, padded),
-        np.empty(n),
-        np.empty((n, n)),
-    )
+    w = aligned_rows(n, padded)
+    work = aligned_rows(2, padded)
+    sums = np.empty(n)
+    A = np.empty((n, n))
     for c in range(n):
         for d in range(n):
             A[c, d] = G[d, c] * D[d]
@@ -290,8 +288,12 @@ def _differentiate_J(belief, a, terms, J, dJ_dS, dJ_du):
 @njit_inner
 def _evaluate_pair(belief, a, b, terms, E, derivatives, work):
     """Returns sum_ij P_ij; its parts go to ``work``, and so does G_ab."""
-    gp, n, T_ab, whiten = belief.gp, len(belief.S), work.F, work.x
-    D_a, D_b = gp.inverse_squares[a, :n], gp.inverse_squares[b, :n]
+    gp = belief.gp
+    n = len(belief.S)
+    T_ab = work.F
+    whiten = work.x
+    D_a = gp.inverse_squares[a, :n]
+    D_b = gp.inverse_squares[b, :n]
     r = (
         terms.half_logdet[a]
         + terms.half_logdet[b]
@@ -333,15 +335,14 @@ def _sum_pairs(size, same, near, derivatives, work, weights, z, E):
     (n, padded), (weights_i, weights_j) = z.shape, weights
     work.p_j[:] = 0.0
     if derivatives:
-        work.p_i[:], work.g[:] = 0.0, 0.0
+        work.p_i[:] = 0.0
+        work.g[:] = 0.0
     at = 0
     for i in range(0, size, 4):
-        w0, w1, w2, w3 = (
-            weights_i[i],
-            weights_i[i + 1],
-            weights_i[i + 2],
-            weights_i[i + 3],
-        )
+        w0 = weights_i[i]
+        w1 = weights_i[i + 1]
+        w2 = weights_i[i + 2]
+        w3 = weights_i[i + 3]
         s0 = s1 = s2 = s3 = zeros()
         for j in range(0, i // 16 * 16 + 16 if same else padded, 16):
             P = _expm1_of_block(near, work.rise, work.fall, work.left, z, i, j)
@@ -360,62 +361,74 @@ def _sum_pairs(size, same, near, derivatives, work, weights, z, E):
                 load(work.p_j, j + 8) + w0 * b0 + w1 * b1 + w2 * b2 + w3 * b3,
             )
             if derivatives:
-                u, v = load(weights_j, j), load(weights_j, j + 8)
-                s0, s1 = s0 + a0 * u + b0 * v, s1 + a1 * u + b1 * v
-                s2, s3 = s2 + a2 * u + b2 * v, s3 + a3 * u + b3 * v
+                u = load(weights_j, j)
+                v = load(weights_j, j + 8)
+                s0 = s0 + a0 * u + b0 * v
+                s1 = s1 + a1 * u + b1 * v
+                s2 = s2 + a2 * u + b2 * v
+                s3 = s3 + a3 * u + b3 * v
                 (a0, b0), (a1, b1), (a2, b2), (a3, b3) = R
                 for d in range(n):
-                    g, y = work.g[d], work.weighted_z[d]
-                    y0, y1, y2, y3 = y[i], y[i + 1], y[i + 2], y[i + 3]
+                    g = work.g[d]
+                    y = work.weighted_z[d]
+                    y0 = y[i]
+                    y1 = y[i + 1]
+                    y2 = y[i + 2]
+                    y3 = y[i + 3]
                     store(g, j, load(g, j) + y0 * a0 + y1 * a1 + y2 * a2 + y3 * a3)
                     store(
                         g, j + 8, load(g, j + 8) + y0 * b0 + y1 * b1 + y2 * b2 + y3 * b3
                     )
         if derivatives:
-            work.p_i[i], work.p_i[i + 1], work.p_i[i + 2], work.p_i[i + 3] = (
-                total(s0),
-                total(s1),
-                total(s2),
-                total(s3),
-            )
+            work.p_i[i] = total(s0)
+            work.p_i[i + 1] = total(s1)
+            work.p_i[i + 2] = total(s2)
+            work.p_i[i + 3] = total(s3)
 
 
 @inline_njit
 def _expm1_of_block(near, rise, fall, left, z, i, j):
     """expm1(delta) of the rows from i and the columns from j on."""
-    a, b = load(fall, j), load(fall, j + 8)
-    a0, a1, a2, a3 = a + rise[i], a + rise[i + 1], a + rise[i + 2], a + rise[i + 3]
-    b0, b1, b2, b3 = b + rise[i], b + rise[i + 1], b + rise[i + 2], b + rise[i + 3]
+    a = load(fall, j)
+    b = load(fall, j + 8)
+    a0 = a + rise[i]
+    a1 = a + rise[i + 1]
+    a2 = a + rise[i + 2]
+    a3 = a + rise[i + 3]
+    b0 = b + rise[i]
+    b1 = b + rise[i + 1]
+    b2 = b + rise[i + 2]
+    b3 = b + rise[i + 3]
     for d in range(len(z)):
-        a, b, x = load(z[d], j), load(z[d], j + 8), left[d]
-        a0, a1, a2, a3 = (
-            a0 + x[i] * a,
-            a1 + x[i + 1] * a,
-            a2 + x[i + 2] * a,
-            a3 + x[i + 3] * a,
-        )
-        b0, b1, b2, b3 = (
-            b0 + x[i] * b,
-            b1 + x[i + 1] * b,
-            b2 + x[i + 2] * b,
-            b3 + x[i + 3] * b,
-        )
+        a = load(z[d], j)
+        b = load(z[d], j + 8)
+        x = left[d]
+        a0 = a0 + x[i] * a
+        a1 = a1 + x[i + 1] * a
+        a2 = a2 + x[i + 2] * a
+        a3 = a3 + x[i + 3] * a
+        b0 = b0 + x[i] * b
+        b1 = b1 + x[i + 1] * b
+        b2 = b2 + x[i + 2] * b
+        b3 = b3 + x[i + 3] * b
     if near:
-        a0, a1, a2, a3 = (
-            expm1_near_zero(a0),
-            expm1_near_zero(a1),
-            expm1_near_zero(a2),
-            expm1_near_zero(a3),
-        )
-        b0, b1, b2, b3 = (
-            expm1_near_zero(b0),
-            expm1_near_zero(b1),
-            expm1_near_zero(b2),
-            expm1_near_zero(b3),
-        )
+        a0 = expm1_near_zero(a0)
+        a1 = expm1_near_zero(a1)
+        a2 = expm1_near_zero(a2)
+        a3 = expm1_near_zero(a3)
+        b0 = expm1_near_zero(b0)
+        b1 = expm1_near_zero(b1)
+        b2 = expm1_near_zero(b2)
+        b3 = expm1_near_zero(b3)
     else:
-        a0, a1, a2, a3 = expm1(a0), expm1(a1), expm1(a2), expm1(a3)
-        b0, b1, b2, b3 = expm1(b0), expm1(b1), expm1(b2), expm1(b3)
+        a0 = expm1(a0)
+        a1 = expm1(a1)
+        a2 = expm1(a2)
+        a3 = expm1(a3)
+        b0 = expm1(b0)
+        b1 = expm1(b1)
+        b2 = expm1(b2)
+        b3 = expm1(b3)
     return (a0, b0), (a1, b1), (a2, b2), (a3, b3)
 
 
@@ -423,15 +436,22 @@ def _expm1_of_block(near, rise, fall, left, z, i, j):
 def _multiply_block(values, E, at):
     """E exp(delta) and E expm1(delta), from expm1(delta); ``at`` is where E of these rows and columns stands."""
     (a0, b0), (a1, b1), (a2, b2), (a3, b3) = values
-    e0, e1, e2, e3 = load(E, at), load(E, at + 16), load(E, at + 32), load(E, at + 48)
-    f0, f1, f2, f3 = (
-        load(E, at + 8),
-        load(E, at + 24),
-        load(E, at + 40),
-        load(E, at + 56),
-    )
-    a0, a1, a2, a3 = a0 * e0, a1 * e1, a2 * e2, a3 * e3
-    b0, b1, b2, b3 = b0 * f0, b1 * f1, b2 * f2, b3 * f3
+    e0 = load(E, at)
+    e1 = load(E, at + 16)
+    e2 = load(E, at + 32)
+    e3 = load(E, at + 48)
+    f0 = load(E, at + 8)
+    f1 = load(E, at + 24)
+    f2 = load(E, at + 40)
+    f3 = load(E, at + 56)
+    a0 = a0 * e0
+    a1 = a1 * e1
+    a2 = a2 * e2
+    a3 = a3 * e3
+    b0 = b0 * f0
+    b1 = b1 * f1
+    b2 = b2 * f2
+    b3 = b3 * f3
     P = (a0, b0), (a1, b1), (a2, b2), (a3, b3)
     return (
         (a0 + e0, b0 + f0),
@@ -445,10 +465,16 @@ def _multiply_block(values, E, at):
 def _differentiate_pair(belief, a, b, terms, P_sum, work, to):
     """Adds the derivatives of the pair's sum to those of V_ab."""
     dmu, dS, du = to
-    n, same = len(belief.S), a == b
-    G_ab, x, y, H = work.G_ab, work.x, work.y, work.H
-    D_a, D_b = belief.gp.inverse_squares[a], belief.gp.inverse_squares[b]
-    sums, controls = np.empty((2, n)), np.empty((2, len(du)))
+    n = len(belief.S)
+    same = a == b
+    G_ab = work.G_ab
+    x = work.x
+    y = work.y
+    H = work.H
+    D_a = belief.gp.inverse_squares[a]
+    D_b = belief.gp.inverse_squares[b]
+    sums = np.empty((2, n))
+    controls = np.empty((2, len(du)))
     # y = sum_ij P_ij (z_ai + z_bj) (z_ai + z_bj)' + U_ij (z_ai z_bj' + z_bj z_ai')
     second_moments(work.p_i, terms.z[a], work.row, x)
     second_moments(work.p_j, terms.z[b], work.row, y)
@@ -492,7 +518,11 @@ def _add_difference(to, terms, a, U_sum, M, e_share, scales, work):
     U_i = sum_j U_ij = M beta_i q_i - e_share e_i, y_i = G_ab' z_i, w_i = G_a' z_i.
     """
     (dmu, dS), (D, D_other) = to, scales
-    F, moment, x, G_a, G_ab = work.F, work.y, work.x, terms.G[a], work.G_ab
+    F = work.F
+    moment = work.y
+    x = work.x
+    G_a = terms.G[a]
+    G_ab = work.G_ab
     n = len(F)
     for c in range(n):
         for d in range(n):

@@ -24,12 +24,10 @@ def _write_offsets(points, x, u, offsets, squares):
     """Writes x~_i - x~ and its squares."""
     n = len(x)
     for d in range(len(points)):
-        at, point, offset, square = (
-            x[d] if d < n else u[d - n],
-            points[d],
-            offsets[d],
-            squares[d],
-        )
+        at = x[d] if d < n else u[d - n]
+        point = points[d]
+        offset = offsets[d]
+        square = squares[d]
         for j in range(len(point)):
             difference = point[j] - at
             offset[j] = difference
@@ -68,7 +66,9 @@ def linearize_points(gp, columns, outer, x, u, memory, out):
     memory = memory[skip : skip + (len(memory) - 8) // padded * padded].reshape(
         -1, padded
     )
-    offsets, squares, weighted = memory[:d], memory[d : 2 * d], memory[2 * d]
+    offsets = memory[:d]
+    squares = memory[d : 2 * d]
+    weighted = memory[2 * d]
     K = len(covariance)
     blocks = (K + 3) // 4 * 4 if K > 1 else K  # points whose k_a are kept, padded
     for h in range(len(x)):
@@ -111,14 +111,14 @@ def expand_points(gp, inverse_cholesky, x, u, out):
     d, (K, n) = len(gp.points), x.shape
     padded = gp.points.shape[1]
     memory = aligned_rows(2 * d + 4, padded)
-    offsets, squares, k, weighted = (
-        memory[:d],
-        memory[d : 2 * d],
-        memory[2 * d],
-        memory[2 * d + 1],
-    )
-    solved, once = memory[2 * d + 2], memory[2 * d + 3]
-    sums, moment = np.empty(d), np.empty(d)
+    offsets = memory[:d]
+    squares = memory[d : 2 * d]
+    k = memory[2 * d]
+    weighted = memory[2 * d + 1]
+    solved = memory[2 * d + 2]
+    once = memory[2 * d + 3]
+    sums = np.empty(d)
+    moment = np.empty(d)
     for h in range(K):
         _write_offsets(gp.points, x[h], u[h], offsets, squares)
         for a in range(len(gp.weights)):

@@ -18,7 +18,9 @@ from gpmpc.exceptions import ShapeError
 
 Array = NDArray[np.float64]
 
-ROWS, COLUMNS = 4, 16  # of a block of pairs of points
+# of a block of pairs of points
+ROWS = 4
+COLUMNS = 16
 
 
 class GPArrays(NamedTuple):
@@ -65,7 +67,9 @@ class Packed:
     def precision(self) -> Precision:
         """What exact moments and derivatives of the variance read."""
         (k, padded), size = self.arrays.weights.shape, self.arrays.size
-        starts, inverse, centred = range(0, padded, ROWS), [], []
+        starts = range(0, padded, ROWS)
+        inverse = []
+        centred = []
         for factor, beta in zip(
             self.cholesky, self.arrays.weights[:, :size], strict=True
         ):
@@ -91,7 +95,8 @@ class Packed:
             )
             centred.append(np.concatenate(list(blocks)))
         found = Precision(aligned((k, len(inverse[0]))), aligned((k, len(centred[0]))))
-        found.inverse_cholesky[:], found.centred[:] = inverse, centred
+        found.inverse_cholesky[:] = inverse
+        found.centred[:] = centred
         return found
 
 
@@ -115,8 +120,10 @@ def pack(
             f"l (k, d), sf2 (k,), L (k, N, N) and beta (k, N) of points {features.shape}; got {got}"
         )
     padded = -(-size // COLUMNS) * COLUMNS
-    points, padded_weights = aligned((d, padded)), aligned((k, padded))
-    points[:, :size], points[:, size:] = features.T, features[-1:].T
+    points = aligned((d, padded))
+    padded_weights = aligned((k, padded))
+    points[:, :size] = features.T
+    points[:, size:] = features[-1:].T
     padded_weights[:, :size] = weights
     arrays = GPArrays(
         points,

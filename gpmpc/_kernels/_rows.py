@@ -34,13 +34,17 @@ def project(row, rows, out):
     use_widest_registers()
     whole = len(rows) // 3 * 3
     for d in range(0, whole, 3):
-        row0, row1, row2 = rows[d], rows[d + 1], rows[d + 2]
+        row0 = rows[d]
+        row1 = rows[d + 1]
+        row2 = rows[d + 2]
         sum0 = sum1 = sum2 = 0.0
         for j in range(len(row)):
             sum0 += row[j] * row0[j]
             sum1 += row[j] * row1[j]
             sum2 += row[j] * row2[j]
-        out[d], out[d + 1], out[d + 2] = sum0, sum1, sum2
+        out[d] = sum0
+        out[d + 1] = sum1
+        out[d + 2] = sum2
     for d in range(whole, len(rows)):
         out[d] = dot(row, rows[d], len(row))
 
@@ -107,14 +111,14 @@ def reduce_variance(triangle, q, solved):
     """Returns |L^-1 q|^2 and writes (K + sn2 I)^-1 q to ``solved``, in one pass over L^-1 (``Precision``)."""
     use_widest_registers()
     solved[:] = 0.0
-    total, at = 0.0, 0
+    total = 0.0
+    at = 0
     for i in range(0, len(q), 4):
         length = i // 8 * 8 + 8
-        row0, row1 = triangle[at : at + length], triangle[at + length : at + 2 * length]
-        row2, row3 = (
-            triangle[at + 2 * length : at + 3 * length],
-            triangle[at + 3 * length : at + 4 * length],
-        )
+        row0 = triangle[at : at + length]
+        row1 = triangle[at + length : at + 2 * length]
+        row2 = triangle[at + 2 * length : at + 3 * length]
+        row3 = triangle[at + 3 * length : at + 4 * length]
         v0 = v1 = v2 = v3 = 0.0
         for j in range(length):
             v0 += row0[j] * q[j]
@@ -139,20 +143,24 @@ def reduce_variances(columns, size, q, totals):
     use_widest_registers()
     j = 0
     while j + 4 <= size:
-        c0, c1, c2, c3 = columns[j], columns[j + 1], columns[j + 2], columns[j + 3]
+        c0 = columns[j]
+        c1 = columns[j + 1]
+        c2 = columns[j + 2]
+        c3 = columns[j + 3]
         at = max(
             0, size - (size - j - 4 + 7) // 8 * 8
         )  # whole registers; what comes before j + 4 is done with
-        d0, d1, d2, d3 = c0[at:], c1[at:], c2[at:], c3[at:]
+        d0 = c0[at:]
+        d1 = c1[at:]
+        d2 = c2[at:]
+        d3 = c3[at:]
         for h in range(
             0, len(q) - 3, 4
         ):  # with a bound of len(q) // 4 * 4 LLVM makes loops that take twice as long
-            r0, r1, r2, r3 = (
-                q[h, at:size],
-                q[h + 1, at:size],
-                q[h + 2, at:size],
-                q[h + 3, at:size],
-            )
+            r0 = q[h, at:size]
+            r1 = q[h + 1, at:size]
+            r2 = q[h + 2, at:size]
+            r3 = q[h + 3, at:size]
             e0, e1, e2, e3 = _solve_four(c0, c1, c2, c3, j, q[h])
             f0, f1, f2, f3 = _solve_four(c0, c1, c2, c3, j, q[h + 1])
             g0, g1, g2, g3 = _solve_four(c0, c1, c2, c3, j, q[h + 2])
@@ -162,7 +170,10 @@ def reduce_variances(columns, size, q, totals):
             totals[h + 2] += g0 * g0 + g1 * g1 + g2 * g2 + g3 * g3
             totals[h + 3] += h0 * h0 + h1 * h1 + h2 * h2 + h3 * h3
             for i in range(len(r0)):
-                x0, x1, x2, x3 = d0[i], d1[i], d2[i], d3[i]
+                x0 = d0[i]
+                x1 = d1[i]
+                x2 = d2[i]
+                x3 = d3[i]
                 r0[i] -= e0 * x0 + e1 * x1 + e2 * x2 + e3 * x3
                 r1[i] -= f0 * x0 + f1 * x1 + f2 * x2 + f3 * x3
                 r2[i] -= g0 * x0 + g1 * x1 + g2 * x2 + g3 * x3
@@ -177,7 +188,8 @@ def reduce_variances(columns, size, q, totals):
     while j < size:
         column = columns[j]
         for h in range(len(q)):
-            row, value = q[h], q[h, j] / column[j]
+            row = q[h]
+            value = q[h, j] / column[j]
             totals[h] += value * value
             for i in range(j + 1, size):
                 row[i] -= value * column[i]

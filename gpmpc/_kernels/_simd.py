@@ -74,7 +74,8 @@ def _define(result: types.Type, *operands: Any) -> Callable[[Callable], Any]:
 
             return result(*kinds), generate
 
-        typed.__name__, typed.__doc__ = write.__name__, write.__doc__
+        typed.__name__ = write.__name__
+        typed.__doc__ = write.__doc__
         signature: Any = (
             typed  # numba reads from it the names of the arguments after the first
         )
@@ -195,7 +196,8 @@ def larger(builder, values, others):
 @_define(LANES, LANES, types.float64, types.float64)
 def clip(builder, values, low, high):
     """The entries, not below ``low`` and not above ``high``; NaN stays."""
-    low, high = _spread(builder, low), _spread(builder, high)
+    low = _spread(builder, low)
+    high = _spread(builder, high)
     values = builder.select(builder.fcmp_ordered("<", values, low), low, values)
     return builder.select(builder.fcmp_ordered(">", values, high), high, values)
 
@@ -250,7 +252,8 @@ def largest(builder, values):
 
 _SHIFT = 6755399441055744.0 + 1023.0  # 1.5 * 2^52, and the bias of the exponent
 _PER_LN2 = 1.4426950408889634
-_LN2_HIGH, _LN2_LOW = 0.6931471805599453, 2.3190468138462996e-17
+_LN2_HIGH = 0.6931471805599453
+_LN2_LOW = 2.3190468138462996e-17
 NEAR_ZERO = 0.34  # below ln(2)/2: k = 0
 
 
@@ -319,7 +322,8 @@ def sine(x, quarters=0.0):
     half = _floor_of_half(
         n
     )  # an odd n takes the cosine of r, and an odd half of it is negative
-    odd, negative = n - half * 2.0, half - _floor_of_half(half) * 2.0
+    odd = n - half * 2.0
+    negative = half - _floor_of_half(half) * 2.0
     return clip((s * (1.0 - odd) + c * odd) * (1.0 - negative * 2.0), -1.0, 1.0)
 
 

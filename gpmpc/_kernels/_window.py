@@ -56,10 +56,8 @@ class Window:
         data = np.ascontiguousarray(
             np.delete(self.data[:, : self.arrays.size], gone, axis=1)
         )
-        arrays, columns = (
-            self.arrays._replace(size=data.shape[1]),
-            _no_columns(*self.columns.shape[:2]),
-        )
+        arrays = self.arrays._replace(size=data.shape[1])
+        columns = _no_columns(*self.columns.shape[:2])
         return Window(arrays, data, columns, self.state_dim, self.input_dim)
 
     def append(
@@ -80,13 +78,15 @@ class Window:
         try:
             self._free.pop()
         except IndexError:  # another window has followed on this one
-            own, known = _no_columns(*columns.shape[:2]), slice(self.rows)
+            own = _no_columns(*columns.shape[:2])
+            known = slice(self.rows)
             own[:, known, known], own[:, known, -2:] = (
                 columns[:, known, known],
                 columns[:, known, -2:],
             )
             columns = own
-        rows, new = N if rows is None else rows, np.concatenate([point, target, noise])
+        rows = N if rows is None else rows
+        new = np.concatenate([point, target, noise])
         if not call_unchecked(
             _append, self.data, new, data, arrays, columns, self.rows, rows
         ):
@@ -112,26 +112,32 @@ def _append(before, new, data, gps, columns, first, last):
     for c in range(len(new)):
         data[c, : N - 1], data[c, N - 1 :] = before[c, : N - 1], new[c]
     memory = aligned_rows(d + 2, P)
-    squares, q, sums = memory[:d], memory[d], memory[d + 1]
+    squares = memory[:d]
+    q = memory[d]
+    sums = memory[d + 1]
     for a in range(k):
-        factor, targets, noises, beta = (
-            columns[a],
-            data[d + a],
-            data[d + k + a],
-            gps.weights[a],
-        )
+        factor = columns[a]
+        targets = data[d + a]
+        noises = data[d + k + a]
+        beta = gps.weights[a]
         for i in range(first, last):
             size = i // 8 * 8 + 8
             for c in range(d):
-                point, square, at = gps.points[c], squares[c], gps.points[c, i]
+                point = gps.points[c]
+                square = squares[c]
+                at = gps.points[c, i]
                 for j in range(size):
                     square[j] = (point[j] - at) * (point[j] - at)
             _write_kernel(
                 gps.log_signal[a], gps.inverse_squares[a], squares, beta, q[:size], sums
             )
-            rest, y = q[i] + noises[i], targets[i]
+            rest = q[i] + noises[i]
+            y = targets[i]
             for j in range(0, i, 4):  # columns from i on have zeros yet
-                c0, c1, c2, c3 = factor[j], factor[j + 1], factor[j + 2], factor[j + 3]
+                c0 = factor[j]
+                c1 = factor[j + 1]
+                c2 = factor[j + 2]
+                c3 = factor[j + 3]
                 w0 = q[j] * c0[-2]
                 w1 = (q[j + 1] - w0 * c0[j + 1]) * c1[-2]
                 w2 = (q[j + 2] - w0 * c0[j + 2] - w1 * c1[j + 2]) * c2[-2]
@@ -148,13 +154,21 @@ def _append(before, new, data, gps, columns, first, last):
                     store(q, m, load(q, m) - known)
                 rest -= w0 * w0 + w1 * w1 + w2 * w2 + w3 * w3
                 y -= w0 * c0[-1] + w1 * c1[-1] + w2 * c2[-1] + w3 * c3[-1]
-                c0[i], c1[i], c2[i], c3[i] = w0, w1, w2, w3
+                c0[i] = w0
+                c1[i] = w1
+                c2[i] = w2
+                c3[i] = w3
             if not rest > 0.0:
                 return False
             root = np.sqrt(rest)
-            factor[i, i], factor[i, -2], factor[i, -1] = root, 1.0 / root, y / root
+            factor[i, i] = root
+            factor[i, -2] = 1.0 / root
+            factor[i, -1] = y / root
         for j in range((N - 1) // 4 * 4, -1 if last == N else N, -4):  # L' beta = v
-            c0, c1, c2, c3 = factor[j], factor[j + 1], factor[j + 2], factor[j + 3]
+            c0 = factor[j]
+            c1 = factor[j + 1]
+            c2 = factor[j + 2]
+            c3 = factor[j + 3]
             four_dots(
                 (c0[j + 4 :], c1[j + 4 :], c2[j + 4 :], c3[j + 4 :]),
                 beta[j + 4 :],
@@ -167,7 +181,10 @@ def _append(before, new, data, gps, columns, first, last):
             w0 = (
                 c0[-1] - sums[0] - c0[j + 3] * w3 - c0[j + 2] * w2 - c0[j + 1] * w1
             ) * c0[-2]
-            beta[j], beta[j + 1], beta[j + 2], beta[j + 3] = w0, w1, w2, w3
+            beta[j] = w0
+            beta[j + 1] = w1
+            beta[j + 2] = w2
+            beta[j + 3] = w3
     return True
 
 
@@ -189,7 +206,10 @@ def drop_point(columns, gone, after):
                 continue
             old = columns[a, j + 1]
             radius = np.hypot(old[j + 1], moved[j])
-            c, s = old[j + 1] / radius, moved[j] / radius
+            c = old[j + 1] / radius
+            s = moved[j] / radius
             for i in range(j, size):
-                entry, rest = old[i + 1], moved[i]
-                row[i], moved[i] = c * entry + s * rest, c * rest - s * entry
+                entry = old[i + 1]
+                rest = moved[i]
+                row[i] = c * entry + s * rest
+                moved[i] = c * rest - s * entry

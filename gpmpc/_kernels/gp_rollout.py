@@ -58,12 +58,10 @@ def _write_means(f, offset, at, memory, means):
     """
     use_widest_registers()
     (dimensions, count), outputs = f.points.shape, len(offset)
-    points, weights, D, first = (
-        f.points.reshape(-1),
-        f.weights.reshape(-1),
-        f.inverse_squares,
-        8 * dimensions,
-    )
+    points = f.points.reshape(-1)
+    weights = f.weights.reshape(-1)
+    D = f.inverse_squares
+    first = 8 * dimensions
     for a in range(outputs):
         store(memory, first + 8 * a, zeros())
     for j in range(0, count, 8):
@@ -94,19 +92,15 @@ def roll_out_gps(model, feedback, start, disturbance, states, inputs):
     f, offset, A, G, c, B, columns, kinds, chosen, tape = model
     (T, H, m), n, d, k_dim = inputs.shape, start.shape[1], len(columns), len(offset)
     work = aligned_rows(2, 8 + d + len(chosen) + k_dim)
-    at, value, sums = (
-        work[0],
-        work[1],
-        aligned_rows(d + len(chosen) + k_dim, 8).reshape(-1),
-    )
+    at = work[0]
+    value = work[1]
+    sums = aligned_rows(d + len(chosen) + k_dim, 8).reshape(-1)
     memory = aligned_rows(
         2 * n + m + tape.work + 5, 8
     )  # eight roll-outs side by side, for the tape
-    point, known, places = (
-        memory[: n + m],
-        memory[n + m : 2 * n + m],
-        memory[2 * n + m :],
-    )
+    point = memory[: n + m]
+    known = memory[n + m : 2 * n + m]
+    places = memory[2 * n + m :]
     memory[: 2 * n + m] = 0.0
     for t in range(T):
         copy(start[t], states[t, 0])
@@ -114,7 +108,9 @@ def roll_out_gps(model, feedback, start, disturbance, states, inputs):
         together = range(first, min(first + 8, T))
         for k in range(H):
             for t in together:
-                x, u, planned = states[t, k], inputs[t, k], feedback.states[t, k]
+                x = states[t, k]
+                u = inputs[t, k]
+                planned = feedback.states[t, k]
                 gains = feedback.gains[min(t, len(feedback.gains) - 1), k]
                 for i in range(m):
                     wanted = feedback.inputs[t, k, i]
@@ -132,7 +128,9 @@ def roll_out_gps(model, feedback, start, disturbance, states, inputs):
             if tape.size > 0:
                 run_tape(tape, point, places, known, None)
             for t in together:
-                x, u, after = states[t, k], inputs[t, k], states[t, k + 1]
+                x = states[t, k]
+                u = inputs[t, k]
+                after = states[t, k + 1]
                 for i in range(d):
                     z = x[columns[i]]
                     at[i] = (

@@ -46,14 +46,20 @@ def dot(x, y, size):
 def four_dots(rows, x, size, out):
     """Writes rows[i]' x of four vectors to ``out``; x is read once, and four sums hide each other's latency."""
     r0, r1, r2, r3 = rows
-    s0, s1, s2, s3 = 0.0, 0.0, 0.0, 0.0
+    s0 = 0.0
+    s1 = 0.0
+    s2 = 0.0
+    s3 = 0.0
     for j in range(size):
         value = x[j]
         s0 += r0[j] * value
         s1 += r1[j] * value
         s2 += r2[j] * value
         s3 += r3[j] * value
-    out[0], out[1], out[2], out[3] = s0, s1, s2, s3
+    out[0] = s0
+    out[1] = s1
+    out[2] = s2
+    out[3] = s3
 
 
 @inline_njit
@@ -74,23 +80,32 @@ def combine_rows(rows, count, factors, start, width, out):
 
     Rows and ``out`` are padded: what lies between the last and the next whole register is written too.
     """
-    at, end = start, start + width
+    at = start
+    end = start + width
     while at + 8 < end:
         a = b = c = d = e = f = g = h = zeros()
         j = 0
         while j + 4 <= count:
-            r0, r1, r2, r3 = rows[j], rows[j + 1], rows[j + 2], rows[j + 3]
-            f0, f1, f2, f3 = factors[j], factors[j + 1], factors[j + 2], factors[j + 3]
-            a, b = a + f0 * load(r0, at), b + f0 * load(r0, at + 8)
-            c, d = c + f1 * load(r1, at), d + f1 * load(r1, at + 8)
-            e, f = e + f2 * load(r2, at), f + f2 * load(r2, at + 8)
-            g, h = g + f3 * load(r3, at), h + f3 * load(r3, at + 8)
+            r0 = rows[j]
+            r1 = rows[j + 1]
+            r2 = rows[j + 2]
+            r3 = rows[j + 3]
+            f0 = factors[j]
+            f1 = factors[j + 1]
+            f2 = factors[j + 2]
+            f3 = factors[j + 3]
+            a = a + f0 * load(r0, at)
+            b = b + f0 * load(r0, at + 8)
+            c = c + f1 * load(r1, at)
+            d = d + f1 * load(r1, at + 8)
+            e = e + f2 * load(r2, at)
+            f = f + f2 * load(r2, at + 8)
+            g = g + f3 * load(r3, at)
+            h = h + f3 * load(r3, at + 8)
             j += 4
         while j < count:
-            a, b = (
-                a + factors[j] * load(rows[j], at),
-                b + factors[j] * load(rows[j], at + 8),
-            )
+            a = a + factors[j] * load(rows[j], at)
+            b = b + factors[j] * load(rows[j], at + 8)
             j += 1
         store(out, at, (a + c) + (e + g))
         store(out, at + 8, (b + d) + (f + h))
@@ -99,14 +114,10 @@ def combine_rows(rows, count, factors, start, width, out):
         a = b = c = d = zeros()
         j = 0
         while j + 4 <= count:
-            a, b = (
-                a + factors[j] * load(rows[j], at),
-                b + factors[j + 1] * load(rows[j + 1], at),
-            )
-            c, d = (
-                c + factors[j + 2] * load(rows[j + 2], at),
-                d + factors[j + 3] * load(rows[j + 3], at),
-            )
+            a = a + factors[j] * load(rows[j], at)
+            b = b + factors[j + 1] * load(rows[j + 1], at)
+            c = c + factors[j + 2] * load(rows[j + 2], at)
+            d = d + factors[j + 3] * load(rows[j + 3], at)
             j += 4
         while j < count:
             a = a + factors[j] * load(rows[j], at)
@@ -130,7 +141,8 @@ def add_product(A, B, out):
     for i in range(len(A)):
         row = out[i]
         for k in range(len(B)):
-            factor, other = A[i, k], B[k]
+            factor = A[i, k]
+            other = B[k]
             for j in range(len(row)):
                 row[j] += factor * other[j]
 
@@ -141,7 +153,8 @@ def add_transposed_product(A, B, out):
     for k in range(len(B)):
         other = B[k]
         for i in range(len(out)):
-            factor, row = A[k, i], out[i]
+            factor = A[k, i]
+            row = out[i]
             for j in range(len(row)):
                 row[j] += factor * other[j]
 
@@ -202,7 +215,8 @@ def condition(S, D, whiten, G):
     With B = D^1/2 S D^1/2 and I + B = C C', well conditioned also where S is singular, G = D^-1/2 (I + B)^-1 D^1/2 and
     |W x|^2 = x' (S + D^-1)^-1 x. The pivots less one come without a one to cancel: a small S keeps its digits.
     """
-    n, half_logdet = len(S), 0.0
+    n = len(S)
+    half_logdet = 0.0
     for i in range(n):  # C, in place of G
         for j in range(i + 1):
             total = math.sqrt(D[i]) * S[i, j] * math.sqrt(D[j]) - dot(G[i], G[j], j)

@@ -36,18 +36,16 @@ Array = NDArray[np.float64]
     COS,
     TAN,
 ) = range(16)
-ATAN, FABS, FMIN, FMAX, INV, TANH, ATAN2, CONST, INPUT, OUTPUT = (
-    18,
-    29,
-    34,
-    35,
-    36,
-    39,
-    43,
-    44,
-    45,
-    46,
-)
+ATAN = 18
+FABS = 29
+FMIN = 34
+FMAX = 35
+INV = 36
+TANH = 39
+ATAN2 = 43
+CONST = 44
+INPUT = 45
+OUTPUT = 46
 TWO_OPERANDS = (ADD, SUB, MUL, DIV, POW, CONSTPOW, FMIN, FMAX, ATAN2)
 OPERATIONS = frozenset(
     {*range(16), ATAN, FABS, FMIN, FMAX, INV, TANH, ATAN2, CONST, INPUT, OUTPUT}
@@ -75,16 +73,17 @@ def run_tape(tape, z, work, value, slopes):
     ``slopes`` is None, or the derivatives (size, d, 8) to be written and memory for those of the places (places, d, 8).
     """
     use_widest_registers()
-    d, z, work, value = len(z), z.reshape(-1), work.reshape(-1), value.reshape(-1)
+    d = len(z)
+    z = z.reshape(-1)
+    work = work.reshape(-1)
+    value = value.reshape(-1)
     for i in range(tape.size):
         store(value, 8 * i, zeros())
     for k in range(len(tape.code)):
-        operation, i, j, last = (
-            tape.code[k, 0],
-            8 * tape.code[k, 1],
-            8 * tape.code[k, 2],
-            8 * tape.code[k, 3],
-        )
+        operation = tape.code[k, 0]
+        i = 8 * tape.code[k, 1]
+        j = 8 * tape.code[k, 2]
+        last = 8 * tape.code[k, 3]
         if operation == OUTPUT:
             store(value, i, load(work, j))
             if slopes is not None:
@@ -122,12 +121,11 @@ def linearize_tape(tape, points, values, jacobians):
     """Writes the values (K, size) at K points z (K, d), and their derivatives (K, size, d)."""
     use_widest_registers()
     (K, d), size = points.shape, tape.size
-    z, work, value = (
-        aligned_rows(d, 8),
-        aligned_rows(tape.work + 5, 8),
-        aligned_rows(size, 8),
-    )
-    derivative, tangents = aligned_rows(size * d, 8), aligned_rows(tape.work * d, 8)
+    z = aligned_rows(d, 8)
+    work = aligned_rows(tape.work + 5, 8)
+    value = aligned_rows(size, 8)
+    derivative = aligned_rows(size * d, 8)
+    tangents = aligned_rows(tape.work * d, 8)
     derivative[:] = 0.0
     for first in range(0, K, 8):
         for lane in range(8):

@@ -116,10 +116,8 @@ def help(given: argparse.Namespace) -> Result:
 
 def main() -> None:
     """Runs the command line."""
-    flags, arguments = (
-        {*FLAGS} & {*sys.argv[1:]},
-        [each for each in sys.argv[1:] if each not in FLAGS],
-    )
+    flags = {*FLAGS} & {*sys.argv[1:]}
+    arguments = [each for each in sys.argv[1:] if each not in FLAGS]
     with redirected_output(
         "error" if "--json" in flags else "nowhere" if "--quiet" in flags else "output"
     ):
@@ -351,10 +349,8 @@ _COMPLETION = [
         help="print what may come next after this beginning of a line",
     ),
 ]
-_RUN, _HELP = (
-    [_argument("--multirun", "-m", **_FLAG), *_OF_SETTINGS],
-    [_argument("name", metavar="COMMAND", nargs="?")],
-)
+_RUN = [_argument("--multirun", "-m", **_FLAG), *_OF_SETTINGS]
+_HELP = [_argument("name", metavar="COMMAND", nargs="?")]
 COMMANDS = {
     "run": Command(
         "Trains a model, flies with it, records; with -m a sweep of many flights",

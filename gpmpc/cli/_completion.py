@@ -29,7 +29,9 @@ def completion(given: argparse.Namespace) -> Result:
 def candidates(line: str) -> list[str]:
     """Returns the words that the last word of a line, up to the cursor, may become."""
     words = [*line.split(), *[""] * line.endswith(" ")][1:] or [""]
-    name, before, word = words[0], words[1:-1], words[-1]
+    name = words[0]
+    before = words[1:-1]
+    word = words[-1]
     if len(words) == 1 or (name == "help" and not before):
         found: Sequence[str] = [*COMMANDS]
     else:
@@ -53,7 +55,8 @@ def _after(name: str, before: Sequence[str], word: str) -> Sequence[str]:
 def _settings(name: str, before: Sequence[str], word: str) -> list[str]:
     """Returns settings, one level at a time, or the options of a group; of a sweep, behind the last comma."""
     with settings():
-        groups, names = group_options(name), setting_names(name)
+        groups = group_options(name)
+        names = setting_names(name)
         with suppress(
             Exception
         ):  # what was typed before may be no setting yet, or a sweep
@@ -64,7 +67,8 @@ def _settings(name: str, before: Sequence[str], word: str) -> list[str]:
             return [f"{key}={path}" for path in _files(value)]
         head = value[: value.rfind(",") + 1]
         return [f"{key}={head}{option}" for option in groups.get(key, [])]
-    nodes, parent = {each.rpartition(".")[0] for each in names}, key.rpartition(".")[0]
+    nodes = {each.rpartition(".")[0] for each in names}
+    parent = key.rpartition(".")[0]
     level = [
         each
         for each in names

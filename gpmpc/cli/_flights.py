@@ -49,7 +49,8 @@ def plot(given: argparse.Namespace) -> Result:
     paths = _recordings(given.run)
     if len(paths) == 1:
         return Result(_plot(given, paths[0], given.to or paths[0].parent / "figures"))
-    plotted, code = [], 0
+    plotted = []
+    code = 0
     for path in paths:
         try:
             to = given.to and given.to / path.parent.relative_to(given.run)
@@ -71,7 +72,8 @@ def _recordings(run: Path) -> list[Path]:
 
 
 def _plot(given: argparse.Namespace, path: Path, folder: Path) -> dict[str, Any]:
-    run, written = read_run(path), []
+    run = read_run(path)
+    written = []
     if not len(run.times):
         raise DataError(f"{path}: holds no step")
     animated = given.film or (
@@ -153,7 +155,8 @@ def calibrate(given: argparse.Namespace) -> Result:
     recorded = read_run(first)
     experiment = _experiment_of(recorded, given.trust)
     folder = given.to or first.parent / "calibration"
-    system, model = experiment.system, experiment.model
+    system = experiment.system
+    model = experiment.model
     notes = []
     learned_again = model is None
     if learned_again and not is_of_this_code(recorded.metadata.get("run", {})):
@@ -257,7 +260,8 @@ def report(given: argparse.Namespace) -> Result:
         terminal_table,
     )
 
-    console, folder = Console(), given.to or given.tree / "report"
+    console = Console()
+    folder = given.to or given.tree / "report"
     with console.status("reading runs and drawing"):
         found = read_report(given.tree)
         lines = (

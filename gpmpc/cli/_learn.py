@@ -28,10 +28,8 @@ _HELD_NOISE = (
 
 def learn(given: argparse.Namespace) -> Result:
     """Learns from logs, judges on held-out runs, and writes model, report and card; goes on where it stopped."""
-    console, folder = (
-        Console(soft_wrap=True, highlight=False, markup=False),
-        given.to or Path("learned"),
-    )
+    console = Console(soft_wrap=True, highlight=False, markup=False)
+    folder = given.to or Path("learned")
     log = logs.read_log(given.files, given.mapping, given.partial)
     console.print(repr(log))
     for finding in log.findings:
@@ -157,7 +155,8 @@ def _report(
         f"{group} [{unit}]"
         for group, unit in zip(judgement.groups, judgement.units, strict=True)
     ]
-    errors, intervals = [], []
+    errors = []
+    intervals = []
     for k, step in enumerate(judgement.steps):
         for name, mean in judgement.mean.items():
             pairs = zip(mean[k], judgement.rmse[name][k], strict=True)
@@ -217,10 +216,8 @@ def _card(
     learned: Learned, judgement: Judgement, train: Log, held_out: Log
 ) -> Document:
     """Makes the model card: data, ranges, what was left out, what is learned and why, and what must not be trusted."""
-    names, outputs = (
-        [*train.space.names, *train.input_names],
-        learned.model.kinematics.output_names,
-    )
+    names = [*train.space.names, *train.input_names]
+    outputs = learned.model.kinematics.output_names
     left_out = [
         f"{f.run}: {f.kind}: {f.text}" for f in train.findings if f.run in learned.runs
     ]

@@ -41,7 +41,8 @@ def condition(run: Run) -> str:
 
 def log(given: argparse.Namespace) -> Result:
     """Does what was asked for with a recording."""
-    action, file = given.action, given.file
+    action = given.action
+    file = given.file
     if action == "info":
         if given.output:
             raise GpmpcError(f"log info: writes nothing; got {given.output}")
@@ -90,7 +91,8 @@ def _flaws(run: Run) -> list[dict[str, Any]]:
 
 
 def _info(file: Path) -> Result:
-    run, console = read_run(file), Console()
+    run = read_run(file)
+    console = Console()
     facts = _facts(run)
     hint = (
         ""

@@ -22,7 +22,8 @@ _FILES = {
 
 def new(given: argparse.Namespace) -> Result:
     """Writes the project, and prints how it is run."""
-    name, folder = given.name, given.to or Path(given.name)
+    name = given.name
+    folder = given.to or Path(given.name)
     if (
         not name.isidentifier()
         or keyword.iskeyword(name)
@@ -43,7 +44,8 @@ def new(given: argparse.Namespace) -> Result:
         files[path.replace("NAME", name)] = re.sub(
             "NAME|CLASS", lambda found: named[found[0]], text
         )
-    written, run = [*files], f"gpmpc run --config-dir . system={name}"
+    written = [*files]
+    run = f"gpmpc run --config-dir . system={name}"
     print(write_files(folder, files, "to") + "\n")
     print(
         f"cd {folder}\n{run}\n{run} -m 'seed=range(5)' data.size=50,100,200\npython fly.py\npytest"

@@ -162,7 +162,8 @@ def _at(place: str, key: Any) -> str:
 
 def _check_form(call: _Call) -> None:
     """Raises ``DataError`` where a call is not written as Hydra reads one."""
-    settings, place = call.settings, call.place
+    settings = call.settings
+    place = call.place
     if not isinstance(settings["_target_"], str) or not isinstance(call.code, str):
         raise DataError(f"its settings name nothing at {_at(place, '_target_')}")
     if settings["_target_"] in _LOOKUPS and {*settings} != {"_target_", "path"}:
@@ -178,7 +179,8 @@ def _check_form(call: _Call) -> None:
 
 def _check_name(call: _Call, trusted: Sequence[str]) -> None:
     """Raises ``DataError`` unless what is called is listed, or trusted."""
-    name, package = call.code, package_of(call.code)
+    name = call.code
+    package = package_of(call.code)
     if name in SETTINGS_CODE or is_trusted(name, trusted):
         return
     named = f"its settings call {name!r:.100} ({_at(call.place, '_target_')})"

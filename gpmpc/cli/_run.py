@@ -109,7 +109,8 @@ def run(config: DictConfig) -> Result:
 
 def warning_of(result: Mapping[str, Any]) -> str | None:
     """Returns in a line that a flight was lost, or suspicious at its end, and why."""
-    lost, judgement = result.get("lost"), result.get("judgement")
+    lost = result.get("lost")
+    judgement = result.get("judgement")
     if lost:
         return plain_text(f"lost: {_since(lost)}")
     if isinstance(judgement, Mapping) and judgement.get("level") == "suspicious":
@@ -192,7 +193,8 @@ def _fly(
     """Trains, flies and records; returns the metrics."""
     if config.recorder != "mcap":
         return metrics(experiment, run_trial(experiment, warn=warn))
-    system, text = experiment.system, OmegaConf.to_yaml(config, resolve=True)
+    system = experiment.system
+    text = OmegaConf.to_yaml(config, resolve=True)
     known = {
         "seed": experiment.seed,
         "command": about["provenance"]["command"],
@@ -218,10 +220,8 @@ def _fly(
                     map(str, experiment.unplanned_noise(training).tolist())
                 )
             }
-            recorded, settings = (
-                RecordedSystem.of(system, bounds),
-                {"config": text, "live": config.live},
-            )
+            recorded = RecordedSystem.of(system, bounds)
+            settings = {"config": text, "live": config.live}
             recorder = McapRecorder(
                 next(paths), recorded, metadata=known | noise, **settings
             )
@@ -232,10 +232,8 @@ def _fly(
                     file=sys.stderr,
                     flush=True,
                 )
-            gp_size, began = (
-                0 if training is None else len(training.posterior),
-                time.monotonic(),
-            )
+            gp_size = 0 if training is None else len(training.posterior)
+            began = time.monotonic()
 
             def on_step(step: Any) -> None:
                 recorder.record(replace(step, gp_size=step.gp_size or gp_size))

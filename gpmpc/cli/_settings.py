@@ -171,7 +171,8 @@ def help_text(name: str) -> str:
     choices = "\n".join(
         f"{key}: {', '.join(options)}" for key, options in group_options(name).items()
     )
-    every, header = OmegaConf.to_yaml(compose(name)), HydraConfig.get().help.header
+    every = OmegaConf.to_yaml(compose(name))
+    header = HydraConfig.get().help.header
     return f"{header}\n\nChoices:\n\n{choices}\n\nEvery setting, with its default:\n\n{every}"
 
 

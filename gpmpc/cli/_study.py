@@ -22,10 +22,8 @@ from gpmpc.studies._document import json_text, terminal
 from gpmpc.studies.flight import run_trial
 from gpmpc.studies.study import Study, TrialStore, run_study
 
-_ONE, _SEVERAL = (
-    ("data", "excited", "undithered", "model", "flying"),
-    ("trajectory", "subsystem"),
-)
+_ONE = ("data", "excited", "undithered", "model", "flying")
+_SEVERAL = ("trajectory", "subsystem")
 _SHOWN_ERRORS = 10
 _FLOWN = (
     "controller=convex",
@@ -38,8 +36,10 @@ _SHORT = ("data.samples=12", "model.restarts=0", "steps=2", "horizon=3")
 
 def study(config: DictConfig) -> Result:
     """Runs what is missing of a study, writes its documents and prints its tables."""
-    settings, console = plain_data(config), logging_console()
-    study, folder = _study(config, settings), folder_of(settings["folder"])
+    settings = plain_data(config)
+    console = logging_console()
+    study = _study(config, settings)
+    folder = folder_of(settings["folder"])
     with progress_bar(console) as progress:
         task = progress.add_task("preparing data and models", total=None)
         trials = study.trials(folder)
@@ -105,7 +105,8 @@ def _study(config: DictConfig, settings: dict[str, Any]) -> Study:
 
 def warmup(given: argparse.Namespace) -> Result:
     """Flies two steps with every controller on a learned model, and prints how long that took."""
-    console, began = Console(), time.perf_counter()
+    console = Console()
+    began = time.perf_counter()
     with progress_bar(console) as bar, report_compilation(), settings():
         task = bar.add_task("", total=len(_FLOWN))
         for words in _FLOWN:

@@ -62,7 +62,8 @@ class Sweep:
     def __init__(self, name: str, overrides: Sequence[str], console: Any):
         self.config = hydra.compose(name, [*overrides], return_hydra_config=True)
         self.config.hydra.mode = RunMode.MULTIRUN
-        self.tree, self.console = folder_of(self.config.folder), console
+        self.tree = folder_of(self.config.folder)
+        self.console = console
         nothing: Any = SimpleNamespace(
             on_job_start=lambda **_: None, on_job_end=lambda **_: None
         )  # around every job
@@ -143,10 +144,9 @@ class Sweep:
         launcher: Any = Plugins.instance().instantiate_launcher(
             hydra_context=self._context, task_function=task, config=self.config
         )
-        workers, quiet = (
-            getattr(launcher, "joblib", None),
-            nullcontext(),
-        )  # joblib's launcher has joblib's arguments
+        # joblib's launcher has joblib's arguments
+        workers = getattr(launcher, "joblib", None)
+        quiet = nullcontext()
         if workers is not None:
             workers |= {"initializer": end_with, "initargs": (os.getpid(),)}
             from joblib.externals.loky.backend import resource_tracker
@@ -182,7 +182,8 @@ class Sweep:
 
 def sweep(given: Namespace) -> Result:
     """Runs every combination of the choices that is not finished; the result's code is 1 where runs failed."""
-    console, combinations = Console(), _combinations(given.overrides)
+    console = Console()
+    combinations = _combinations(given.overrides)
     runs = Sweep(given.config_name, combinations[0], console)
     jobs = list({job.folder.path: job for job in map(runs.job, combinations)}.values())
     finished = sum(job.folder.finished for job in jobs)
@@ -247,7 +248,8 @@ def _combinations(overrides: Sequence[str]) -> list[list[str]]:
     """Returns the overrides of every run; of a key given twice, the last one counts."""
     values: dict[str, Any] = {}
     for override in OverridesParser.create().parse_overrides(list(overrides)):
-        key, swept = override.get_key_element(), override.is_sweep_override()
+        key = override.get_key_element()
+        swept = override.is_sweep_override()
         found = (
             [f"{key}={value}" for value in override.sweep_string_iterator()]
             if swept

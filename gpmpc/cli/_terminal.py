@@ -20,7 +20,8 @@ class Output:
     """A stream that ends the command where nothing can be written to it any more."""
 
     def __init__(self, stream: TextIO):
-        self._stream, self.broken = stream, False
+        self._stream = stream
+        self.broken = False
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._stream, name)
@@ -59,7 +60,8 @@ def usable_streams() -> Iterator[None]:
             setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115
         with suppress(AttributeError):  # not of a file
             getattr(sys, name).reconfigure(errors="backslashreplace")
-    usual, output = sys.stdout, Output(sys.stdout)
+    usual = sys.stdout
+    output = Output(sys.stdout)
     sys.stdout = output
     try:
         yield
@@ -102,7 +104,8 @@ def logging_console() -> "Console":
     shown: set[str] = set()
 
     def is_new(record: logging.LogRecord) -> bool:
-        text, known = record.getMessage(), len(shown)
+        text = record.getMessage()
+        known = len(shown)
         shown.add(text)
         return len(shown) > known and record.name != _SEARCH
 
@@ -112,7 +115,8 @@ def logging_console() -> "Console":
     handler.addFilter(is_new)
     log = logging.getLogger("gpmpc")
     log.setLevel(logging.INFO)
-    log.handlers, log.propagate = [handler], False
+    log.handlers = [handler]
+    log.propagate = False
     return console
 
 

@@ -33,7 +33,8 @@ def tune(given: Namespace) -> Result:
     space, fixed = _space(given.overrides)
     console = Console()
     runs = Sweep(given.config_name, fixed, console)
-    base, first = without_hydra(runs.config), runs.config.seed
+    base = without_hydra(runs.config)
+    first = runs.config.seed
     if base.recorder != "mcap":
         raise SettingError(
             "recorder",
@@ -106,13 +107,15 @@ def _space(
     space: dict[str, Any] = {}
     fixed: list[Any] = []
     for override in OverridesParser.create().parse_overrides([*overrides]):
-        key, value = override.get_key_element(), cast(Any, override.value())
+        key = override.get_key_element()
+        value = cast(Any, override.value())
         if key in ("seed", "folder", "launcher") and override.is_sweep_override():
             raise SettingError(key, "cannot be searched; seeds are many by --seeds")
         if not override.is_sweep_override():
             fixed.append(override.input_line)
         elif override.is_interval_sweep():
-            whole, logarithmic = isinstance(value.start, int), "log" in value.tags
+            whole = isinstance(value.start, int)
+            logarithmic = "log" in value.tags
             if not value.start < value.end or (logarithmic and value.start <= 0):
                 raise SettingError(
                     key,
@@ -154,7 +157,8 @@ def _cost(job: Job, controller: Mapping[str, Any]) -> float:
     """Returns the cost of a run with the weights of a controller; infinite where it was lost or failed."""
     if not job.folder.finished or job.folder.result().get("lost"):
         return math.inf
-    run, cost = read_run(job.folder.path / RECORDING), controller["problem"].cost
+    run = read_run(job.folder.path / RECORDING)
+    cost = controller["problem"].cost
     if not run.whole:  # the cost of the steps that are left would be too low
         raise DataError(f"{run.path}: {'; '.join(flaw.text for flaw in run.flaws)}")
     return tracking_cost(

@@ -294,10 +294,8 @@ class ExcitedData:
         if system is outer:
             return _transitions(flight, self.samples, system.signals)
         streams = np.random.SeedSequence([self.seed, SUBSYSTEMS.index("rotational")])
-        angles, count = (
-            _attitudes(flight, self.attitude),
-            self.samples + self.rotational.horizon,
-        )
+        angles = _attitudes(flight, self.attitude)
+        count = self.samples + self.rotational.horizon
         chosen = angles[
             np.random.default_rng(streams).integers(
                 len(angles), size=-(-count // self.hold)

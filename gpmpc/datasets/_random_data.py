@@ -81,20 +81,24 @@ class RandomData:
         """
         self.check(system, trajectory)
         random = np.random.default_rng(self.seed)
-        lower, upper = np.array(system.input_lower), np.array(system.input_upper)
+        lower = np.array(system.input_lower)
+        upper = np.array(system.input_upper)
         middle = (
             (lower + upper) / 2
             if self.around == "middle"
             else np.array(system.initial_input)
         )
         half = self.amplitude * (upper - lower) / 2
-        centre, reach = 0.0, np.finfo(float).max
+        centre = 0.0
+        reach = np.finfo(float).max
         if system.region is not None:
             low, high = np.array(system.region)
-            centre, reach = (low + high) / 2, 1.5 * (high - low)
+            centre = (low + high) / 2
+            reach = 1.5 * (high - low)
         rows: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
         for _ in range(100 + 2 * self.samples):
-            state, input = self._start(system, random), middle
+            state = self._start(system, random)
+            input = middle
             for k in range(min(self.episode, self.samples - len(rows))):
                 if k % self.hold == 0:
                     input = np.clip(middle + random.uniform(-half, half), lower, upper)

@@ -129,7 +129,8 @@ def condition(root: Tensor, seen: Tensor, noise: Tensor) -> Conditioned:
 
 def _one_by_one(root: Tensor, seen: Tensor, noise: Tensor) -> Conditioned:
     """``condition``, by one scalar measurement after the other, also perfect ones."""
-    batch, p = seen.shape[:-2], seen.shape[-2]
+    batch = seen.shape[:-2]
+    p = seen.shape[-2]
     unit_lower, variances = _decorrelated(noise)
     rows = torch.linalg.solve_triangular(
         unit_lower, seen, upper=False, unitriangular=True
@@ -140,7 +141,8 @@ def _one_by_one(root: Tensor, seen: Tensor, noise: Tensor) -> Conditioned:
     gains = factor.new_zeros(*batch, factor.shape[-2], p)
     innovations = torch.eye(p, dtype=seen.dtype, device=seen.device)
     for i in range(p):
-        row, variance = factor[..., i, :], variances[..., i]
+        row = factor[..., i, :]
+        variance = variances[..., i]
         row = torch.where(row.abs() <= round_off[..., i, None], 0.0, row)
         weights, factor = _corrected(factor, row, variance)
         innovation = innovations[i] - gains[..., i, :]

@@ -94,11 +94,10 @@ class ConformalTube:
             raise ShapeError(
                 f"states (T + 1, n) and inputs (T, m) must be one log; got {got}"
             )
-        at, n = (
-            np.arange(0, len(x) - horizon, horizon)[:, None]
-            + np.arange(1, horizon + 1),
-            x.shape[1],
+        at = np.arange(0, len(x) - horizon, horizon)[:, None] + np.arange(
+            1, horizon + 1
         )
+        n = x.shape[1]
         if not len(at):
             raise DataError(
                 f"a log of {len(x)} states has no window of {horizon} steps"
@@ -185,8 +184,10 @@ class AdaptiveTube:
             2.0 * max(float(tube.scores.max()), 1.0) if largest is None else largest
         )
         check_number("largest", largest, above=0)
-        self.tube, self.probability = tube, float(probability)
-        self.rate, self.largest = float(rate), float(largest)
+        self.tube = tube
+        self.probability = float(probability)
+        self.rate = float(rate)
+        self.largest = float(largest)
         self.noise = (
             np.zeros((n, n))
             if noise is None
@@ -205,7 +206,8 @@ class AdaptiveTube:
                     f"are too few for a probability of {probability:g}; got {decisions}",
                 )
         self.kappas, self.alphas = np.empty(H), self.allowed.copy()
-        self.counts, self.misses = np.zeros(H), np.zeros(H)
+        self.counts = np.zeros(H)
+        self.misses = np.zeros(H)
         self._bounds = np.full(
             (H, H, r), np.nan
         )  # of the plans of the last H steps, by stage and direction
@@ -220,10 +222,8 @@ class AdaptiveTube:
         """Compares a state (n,) with what the plans before it said; returns kappa of each stage (H,)."""
         state = self._without_jumps(np.ascontiguousarray(state, dtype=np.float64))
         self._step += 1
-        numbers, parts = (
-            (self.rate, self.allowed, self.largest),
-            (self.kappas, self.alphas, self.counts, self.misses),
-        )
+        numbers = (self.rate, self.allowed, self.largest)
+        parts = (self.kappas, self.alphas, self.counts, self.misses)
         call_unchecked(
             _observe,
             state,
@@ -312,11 +312,10 @@ def _observe(state, rows, bounds, step, numbers, scores, parts):
     for k in range(
         H
     ):  # the plan of k + 1 steps ago said where the state would be at its stage k
-        counted, known, outside = (
-            False,
-            True,
-            False,
-        )  # a bound that does not count is NaN
+        # a bound that does not count is NaN
+        counted = False
+        known = True
+        outside = False
         plan = (step - k - 1) % H
         for r in range(len(rows)):
             value = 0.0
@@ -343,7 +342,8 @@ def _remember(means, covariances, noise, rows, kappas, bounds):
     n = means.shape[1]
     for k in range(len(kappas)):
         for r in range(len(rows)):
-            value, variance = 0.0, 0.0
+            value = 0.0
+            variance = 0.0
             for i in range(n):
                 value += rows[r, i] * means[k + 1, i]
                 for j in range(n):

@@ -65,12 +65,15 @@ def normalized_errors(
         raise ShapeError(
             f"errors (..., n) need covariances (..., n, n); got {tuple(e.shape)} and {tuple(P.shape)}"
         )
-    e, P = e.reshape(-1, e.shape[-1]), P.reshape(-1, *P.shape[-2:])
+    e = e.reshape(-1, e.shape[-1])
+    P = P.reshape(-1, *P.shape[-2:])
     missing = ~torch.isfinite(e)
     keep = ~missing.all(-1)
     if not bool(keep.any()):
         raise DataError("no error is finite")
-    e, P, missing = e[keep], P[keep], missing[keep]
+    e = e[keep]
+    P = P[keep]
+    missing = missing[keep]
     P = torch.where(
         missing[:, :, None] | missing[:, None, :],
         torch.eye(e.shape[-1], dtype=P.dtype),
@@ -105,13 +108,15 @@ def autocorrelation(
         for part in (innovations, covariances)
     )
     white = (e / S.diagonal(dim1=-2, dim2=-1).sqrt()).numpy()
-    first, second = white[:-lag], white[lag:]
+    first = white[:-lag]
+    second = white[lag:]
     pairs = np.isfinite(first) & np.isfinite(second)
     if pairs.sum() < 2:
         raise DataError(
             "an autocorrelation needs two pairs of finite innovations or more"
         )
-    a, b = first[pairs], second[pairs]
+    a = first[pairs]
+    b = second[pairs]
     return float((a * b).sum() / np.sqrt((a**2).sum() * (b**2).sum())), float(
         1.96 / np.sqrt(len(a))
     )

@@ -69,7 +69,8 @@ def estimate_delay(
         DataError: There are too few rows, or an entry is not finite; or the data cannot tell: no state changes, an
             input is constant, two of them move alike, or they are functions of the state (feedback alone).
     """
-    x, u = np.asarray(states, dtype=float), np.asarray(inputs, dtype=float)
+    x = np.asarray(states, dtype=float)
+    u = np.asarray(inputs, dtype=float)
     check_number("longest", longest, least=1, whole=True)
     check_number("resolution", resolution, above=0)
     if x.ndim != 2 or u.ndim != 2 or len(u) not in (len(x) - 1, len(x)):
@@ -124,7 +125,8 @@ def estimate_delay(
     low, high = np.quantile(
         drawn, [(1 - confidence) / 2, (1 + confidence) / 2], method="inverted_cdf"
     )
-    best, half = delays[np.argmax(scores)], resolution / 2 if resolution < 1 else 0.0
+    best = delays[np.argmax(scores)]
+    half = resolution / 2 if resolution < 1 else 0.0
     interval = float(max(min(low, best) - half, 0)), float(max(high, best) + half)
     return DelayEstimate(float(best), interval, delays, np.sqrt(-np.expm1(-scores)))
 

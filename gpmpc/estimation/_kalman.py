@@ -149,7 +149,8 @@ class _Selection:
     """h(x) = x[states], with its expansion."""
 
     def __init__(self, states: Sequence[int], state_dim: int):
-        self.states, self.matrix = list(states), np.eye(state_dim)[list(states)]
+        self.states = list(states)
+        self.matrix = np.eye(state_dim)[list(states)]
 
     def __call__(self, state: Tensor) -> Tensor:
         return state[..., self.states]
@@ -220,7 +221,9 @@ class KalmanFilter:
             raise SettingError(
                 "propagator", f"{rule}; got {type(propagator).__name__} without"
             )
-        self.model, self.measurement, self.propagator = model, measurement, propagator
+        self.model = model
+        self.measurement = measurement
+        self.propagator = propagator
         self._names = signals_of(model)
         self._measured_names = _measured_names(measurement, self._names.state_names)
         observer = Linearization() if observer is None else observer
@@ -303,7 +306,8 @@ class KalmanFilter:
             raise ShapeError(
                 f"T inputs belong to T + 1 measurements; got {len(inputs)} and {len(measured)}"
             )
-        predicted, updates = [belief], [self.update(belief, measured[0])]
+        predicted = [belief]
+        updates = [self.update(belief, measured[0])]
         crosses = belief.covariance.new_zeros(len(inputs), *belief.covariance.shape)
         for k, input in enumerate(inputs):
             moved = self.propagator.propagate(self.model, updates[-1].belief, input)
@@ -339,7 +343,8 @@ def smooth(run: FilterRun) -> Gaussian:
     With the covariances Cov[x_k, x_{k+1}] of the propagator, which makes it the unscented one of Sarkka (2008) where
     the filter is unscented.
     """
-    mean, covariance = run.filtered.mean[-1], run.filtered.covariance[-1]
+    mean = run.filtered.mean[-1]
+    covariance = run.filtered.covariance[-1]
     beliefs = [Gaussian(mean, covariance)]
     for k in reversed(range(len(run.cross_covariances))):
         # The state a step later is a measurement of this one; what the log says of it
@@ -370,7 +375,8 @@ class LateMeasurements:
 
     def __init__(self, filter: KalmanFilter, belief: Gaussian, longest: int = 10):
         check_number("longest", longest, least=0, whole=True)
-        self.filter, self.belief = filter, belief
+        self.filter = filter
+        self.belief = belief
         self._before: deque[Gaussian] = deque(
             [belief], longest + 1
         )  # beliefs before the measurements of each step

@@ -94,12 +94,14 @@ def estimate_process_noise(
     floor = 0.01 * errors.square().mean(
         0
     )  # a variance of the latent function that is too large leaves something
-    after, now = transitions.next_states[:-1], transitions.states[1:]
+    after = transitions.next_states[:-1]
+    now = transitions.states[1:]
     gap = state_difference(after, now, angles_of(model)).abs().amax(1)
     successive = gap <= 1e-12 + 1e-9 * now.abs().amax(1)
     rho = torch.full_like(variance, torch.nan)
     if int(successive.sum()) >= 10:
-        first, second = errors[:-1][successive], errors[1:][successive]
+        first = errors[:-1][successive]
+        second = errors[1:][successive]
         rho = (first * second).sum(0) / (
             first.square().sum(0) * second.square().sum(0)
         ).sqrt()
@@ -215,11 +217,9 @@ def estimate_varying_noise(
         raise DataError(
             f"a varying noise needs {2 * FOLDS} blocks of {block} rows or more; got {len(errors)} rows"
         )
-    squares, features, m = (
-        errors.square().clamp_min(1e-300),
-        transitions.features,
-        transitions.input_dim,
-    )
+    squares = errors.square().clamp_min(1e-300)
+    features = transitions.features
+    m = transitions.input_dim
     fold = torch.arange(len(features)) // block % FOLDS
     constant = _constant(squares, latent)
     z = (squares * constant.exp() / (constant.exp() + latent)).log() + CHI2_LOG[0]
@@ -228,20 +228,16 @@ def estimate_varying_noise(
     )  # a residual of zero is one of 0.3 % of a standard deviation
     chosen = np.sort(np.random.default_rng(seed).permutation(len(features))[:SEARCHED])
     found = Trainer(penalty=_prior).fit(features[chosen], z[chosen], m, "value", seed)
-    start, kernel = (
-        found.posterior,
-        Hyperparameters.from_theta(torch.from_numpy(found.theta)),
-    )
+    start = found.posterior
+    kernel = Hyperparameters.from_theta(torch.from_numpy(found.theta))
     Z = features[informative_points(features, kernel, POINTS)]
 
     def learned(rows: Tensor) -> tuple[GPPosterior, Tensor]:
         """G of some rows, and the logarithm of their constant variance."""
-        x, s, v, mean = (
-            features[rows],
-            squares[rows],
-            latent[rows],
-            _constant(squares[rows], latent[rows]),
-        )
+        x = features[rows]
+        s = squares[rows]
+        v = latent[rows]
+        mean = _constant(squares[rows], latent[rows])
         scored = kernel._replace(noise_variance=torch.full_like(mean, 2.0))
         g = start
         for _ in range(ITERATIONS):
@@ -257,21 +253,21 @@ def estimate_varying_noise(
         held = fold == part
         g, mean = learned(~held)
         belief = g.predict(transitions.states[held], transitions.inputs[held])
-        varying, constant = (
-            (belief.mean + belief.variance / 2).exp() + latent[held],
-            mean.exp() + latent[held],
-        )
+        varying = (belief.mean + belief.variance / 2).exp() + latent[held]
+        constant = mean.exp() + latent[held]
         gains[held] = (
             (constant / varying).log() + squares[held] * (1 / constant - 1 / varying)
         ) / 2
     blocks = torch.stack([part.sum(0) for part in gains.split(block)])
-    gain, error = blocks.sum(0), (len(blocks) * blocks.var(0)).sqrt()
+    gain = blocks.sum(0)
+    error = (len(blocks) * blocks.var(0)).sqrt()
     outputs = tuple(
         torch.nonzero((gain > 2 * error) & (gain > math.log(100)))[:, 0].tolist()
     )
     if not outputs:
         return VaryingNoise(model, outputs, gain, error)
-    g, at = learned(torch.ones_like(fold, dtype=torch.bool))[0], list(outputs)
+    g = learned(torch.ones_like(fold, dtype=torch.bool))[0]
+    at = list(outputs)
     each = (
         "targets",
         "lengthscales",

@@ -93,7 +93,8 @@ def separate_noise(
 
 def _successors(model: Any, transitions: Transitions) -> NDArray[np.intp]:
     """Rows that begin where the row before ended, to round-off."""
-    after, now = transitions.next_states[:-1], transitions.states[1:]
+    after = transitions.next_states[:-1]
+    now = transitions.states[1:]
     gap = state_difference(after, now, angles_of(model)).abs().amax(1)
     successive = gap <= 1e-12 + 1e-9 * now.abs().amax(1)
     return 1 + np.flatnonzero(successive.cpu().numpy())

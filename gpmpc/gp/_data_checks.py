@@ -48,7 +48,8 @@ class Columns(NamedTuple):
     @classmethod
     def of(cls, features: Tensor, targets: Tensor, input_dim: int, predicts: str):
         """Columns of states and inputs without names, which are counted from 1."""
-        d, k = features.shape[1], targets.shape[1]
+        d = features.shape[1]
+        k = targets.shape[1]
         states = [f"state {i + 1}" for i in range(d - input_dim)]
         inputs = [f"input {i + 1}" for i in range(input_dim)]
         outputs = states
@@ -173,7 +174,8 @@ def warn_of_transitions(transitions: Transitions) -> None:
     they teach no more than one of each, but look as if nothing were uncertain.
     Rows at rest, where nothing moves, may repeat.
     """
-    states, next_states = transitions.states, transitions.next_states
+    states = transitions.states
+    next_states = transitions.next_states
     moved = (states != next_states).any(dim=1)
     if not bool(moved.any()):
         if not constant_columns(states.numpy()).all():

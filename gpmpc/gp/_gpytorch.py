@@ -64,7 +64,8 @@ class BatchExactGP(gpytorch.models.ExactGP):
     signals: Signals = UNKNOWN  #: of the posterior that it was made of
 
     def __init__(self, features: Tensor, targets: Tensor):
-        batch, d = torch.Size([targets.shape[1]]), features.shape[1]
+        batch = torch.Size([targets.shape[1]])
+        d = features.shape[1]
         log = Positive(
             transform=torch.exp, inv_transform=torch.log
         )  # raw values are logarithms
@@ -104,10 +105,8 @@ def to_gpytorch(posterior: GPPosterior) -> BatchExactGP:
     mean = gpytorch.means.ConstantMean(batch_shape=posterior.offset.shape)
     model.mean_module = mean.requires_grad_(False).double()
     model.mean_module.constant.copy_(posterior.offset)
-    deviation, noise = (
-        posterior.signal_variance.log() / 2,
-        posterior.noise_variance.log() / 2,
-    )
+    deviation = posterior.signal_variance.log() / 2
+    noise = posterior.noise_variance.log() / 2
     model.set_hyperparameters(
         torch.column_stack([posterior.lengthscales.log(), deviation, deviation - noise])
     )
@@ -152,13 +151,12 @@ def from_gpytorch(
     inducing: list[Tensor] = []
     for one, own in _members(model, likelihood):
         _check_forward(one)
-        targets, kernel, none = (
-            one.train_targets,
-            one.covar_module,
-            torch.zeros((), dtype=torch.float64),
-        )
+        targets = one.train_targets
+        kernel = one.covar_module
+        none = torch.zeros((), dtype=torch.float64)
         inputs += _features(one)
-        outputs, scale = targets[None] if targets.dim() == 1 else targets, none + 1
+        outputs = targets[None] if targets.dim() == 1 else targets
+        scale = none + 1
         if (
             isinstance(kernel, gpytorch.kernels.InducingPointKernel)
             and kernel.active_dims is None
@@ -168,7 +166,8 @@ def from_gpytorch(
             )
             kernel = kernel.base_kernel
         if isinstance(kernel, gpytorch.kernels.ScaleKernel):
-            scale, kernel = kernel.outputscale, kernel.base_kernel
+            scale = kernel.outputscale
+            kernel = kernel.base_kernel
         if (
             type(kernel) is not gpytorch.kernels.RBFKernel
             or kernel.active_dims is not None
@@ -188,7 +187,8 @@ def from_gpytorch(
             raise UnsupportedModel(
                 f"the mean must be zero or constant; got {type(one.mean_module).__name__}"
             )
-        k, constant = len(outputs), getattr(one.mean_module, "constant", none)
+        k = len(outputs)
+        constant = getattr(one.mean_module, "constant", none)
         numbers = (
             value.reshape(-1).expand(k).to(targets.device)
             for value in (scale, own.noise, constant)
@@ -204,11 +204,9 @@ def from_gpytorch(
     targets, *kernel, offset = (
         torch.cat(values).detach().clone() for values in zip(*rows, strict=True)
     )
-    features, targets, hyperparameters = (
-        inputs[0].clone(),
-        targets.T.contiguous(),
-        Hyperparameters(*kernel),
-    )
+    features = inputs[0].clone()
+    targets = targets.T.contiguous()
+    hyperparameters = Hyperparameters(*kernel)
     if not inducing:
         return GPPosterior.from_hyperparameters(
             features, targets, *hyperparameters, input_dim, predicts, offset, signals
@@ -323,7 +321,8 @@ class KernelPosterior(TensorModel):
         """The next state's distribution at a certain state and input; see ``GPPosterior.predict``."""
         input = state[..., :0] if input is None else input
         check_query(self, state, input)
-        batch, query = state.shape[:-1], torch.cat([state, input], dim=-1)
+        batch = state.shape[:-1]
+        query = torch.cat([state, input], dim=-1)
         flat = query.reshape(-1, query.shape[-1])
         means, variances = zip(
             *(part.predict(flat) for part in self.parts), strict=True
@@ -367,7 +366,8 @@ class _Part:
             )
         copied = copy.deepcopy(model).eval().requires_grad_(False)
         copied.prediction_strategy = None
-        batch, features = targets.shape[:-1], _features(copied)
+        batch = targets.shape[:-1]
+        features = _features(copied)
         features = features.expand(*batch, -1, -1) if batch else features[0]
         noise = likelihood.noise.detach().reshape(-1).expand(*batch or (1,)).clone()
         _check_pointwise(copied)
@@ -475,7 +475,8 @@ def _check_forward(model: Any) -> None:
     with torch.no_grad():
         try:
             prior = copied.forward(points)
-            mean, covariance = prior.mean, prior.covariance_matrix
+            mean = prior.mean
+            covariance = prior.covariance_matrix
         except Exception as error:
             raise UnsupportedModel(
                 "the model's forward fails at points around its training inputs "
@@ -485,7 +486,8 @@ def _check_forward(model: Any) -> None:
             own_mean = copied.mean_module(points)
             own_covariance = copied.covar_module(points).to_dense()
         except Exception:  # the modules are made for other inputs, as of a network
-            own_mean, own_covariance = torch.full_like(mean, torch.nan), covariance
+            own_mean = torch.full_like(mean, torch.nan)
+            own_covariance = covariance
     missed = [
         _difference(mean, own_mean, mean.std() + 1),
         _difference(covariance, own_covariance, covariance.abs().max()),
@@ -526,7 +528,8 @@ def _probes(model: Any) -> Tensor:
     """
     inputs = _training_points(model)
     among = inputs[..., :: max(1, inputs.shape[-2] // _PROBES), :][..., :_PROBES, :]
-    lower, upper = inputs.amin(dim=-2), inputs.amax(dim=-2)
+    lower = inputs.amin(dim=-2)
+    upper = inputs.amax(dim=-2)
     width = torch.where(upper > lower, upper - lower, 1.0)
     generator = torch.Generator().manual_seed(0)
     unit = torch.rand(

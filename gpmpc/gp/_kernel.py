@@ -102,7 +102,8 @@ def _factorize_in_place(
     ).mT  # columns contiguous, as LAPACK wants them
     for a, factor in enumerate(cholesky):
         for end in range(_ROWS, size + _ROWS, _ROWS):  # the lower triangle
-            rows, columns = slice(end - _ROWS, end), slice(0, end)
+            rows = slice(end - _ROWS, end)
+            columns = slice(0, end)
             scales = lengthscales[a, None], signal_variance[a, None]
             factor[rows, columns] = kernel_matrix(
                 inputs[rows], inputs[columns], *scales

@@ -40,10 +40,8 @@ class NegativeLogMarginalLikelihood:
         """Value and gradient (d + 2,)."""
         d = self._x.shape[1]
         z = self._x * np.exp(-theta[:d])
-        sf2, sn2 = (
-            float(np.exp(2 * theta[d])),
-            float(np.exp(2 * (theta[d] - theta[d + 1]))),
-        )
+        sf2 = float(np.exp(2 * theta[d]))
+        sn2 = float(np.exp(2 * (theta[d] - theta[d + 1])))
         found = (
             self._small(z, sf2, sn2)
             if self._square is None
@@ -131,7 +129,8 @@ def _sums(
     square: np.ndarray, z: np.ndarray, weights: np.ndarray
 ) -> tuple[np.ndarray, float]:
     """sum_{i>j} M_ij (z_id - z_jd)^2 (d,), and sum_{i>j} M_ij, over block columns and the rows that mirror them."""
-    by_lengthscale, total = np.zeros(z.shape[1]), 0.0
+    by_lengthscale = np.zeros(z.shape[1])
+    total = 0.0
     for begin in range(0, len(z), _BLOCK):
         block = slice(begin, begin + _BLOCK)
         M = np.multiply.outer(-weights[begin:], weights[block])
@@ -139,7 +138,8 @@ def _sums(
         M *= square[block, begin:].T
         corner = M[: M.shape[1]]
         corner[np.triu_indices(len(corner))] = 0
-        rows, columns = M.sum(axis=1), M.sum(axis=0)
+        rows = M.sum(axis=1)
+        columns = M.sum(axis=0)
         total += rows.sum()
         by_lengthscale += rows @ z[begin:] ** 2 + columns @ z[block] ** 2
         by_lengthscale -= 2 * np.einsum("id,id->d", M @ z[block], z[begin:])

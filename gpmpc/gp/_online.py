@@ -62,7 +62,8 @@ def append_points(
     for key, value in (("features", features), ("targets", targets)):
         if value.is_complex():
             raise SettingError(key, f"must be real numbers; got {value.dtype}")
-    features, targets = features.to(posterior.features), targets.to(posterior.features)
+    features = features.to(posterior.features)
+    targets = targets.to(posterior.features)
     given = {"features": features, "targets": targets}
     check_posterior(given, posterior.input_dim, posterior.predicts, posterior.dtype)
     if (got := (features.shape[1], targets.shape[1])) != (
@@ -72,8 +73,10 @@ def append_points(
         raise ShapeError(
             f"points must have features and targets like those of {posterior}; got {got[0]} and {got[1]}"
         )
-    size, p = len(posterior), len(features)
-    scales, sf2 = posterior.lengthscales, posterior.signal_variance
+    size = len(posterior)
+    p = len(features)
+    scales = posterior.lengthscales
+    sf2 = posterior.signal_variance
     old_targets = (posterior.targets - posterior.offset).mT[..., None]  # (k, N, 1)
     new_targets = (targets - posterior.offset).mT[..., None]
     # One pass over the factor serves the new rows and the first half of the weights.
@@ -81,22 +84,23 @@ def append_points(
         [kernel_matrix(posterior.features, features, scales, sf2), old_targets], dim=-1
     )
     right = torch.linalg.solve_triangular(posterior.cholesky, right, upper=False)
-    L21, w1 = right[..., :p].mT, right[..., p:]
+    L21 = right[..., :p].mT
+    w1 = right[..., p:]
     corner = kernel_matrix(features, features, scales, sf2) - L21 @ L21.mT
     corner.diagonal(dim1=-2, dim2=-1).add_(posterior.noise_variance[:, None])
     L22, info = torch.linalg.cholesky_ex(corner)
     check_positive_definite(info, sf2, posterior.noise_variance)
     cholesky = posterior.cholesky.new_empty(posterior.output_dim, size + p, size + p)
-    cholesky[:, :size, :size], cholesky[:, :size, size:] = posterior.cholesky, 0
-    cholesky[:, size:, :size], cholesky[:, size:, size:] = L21, L22
+    cholesky[:, :size, :size] = posterior.cholesky
+    cholesky[:, :size, size:] = 0
+    cholesky[:, size:, :size] = L21
+    cholesky[:, size:, size:] = L22
     w2 = torch.linalg.solve_triangular(L22, new_targets - L21 @ w1, upper=False)
     weights = torch.linalg.solve_triangular(
         cholesky.mT, torch.cat([w1, w2], dim=-2), upper=True
     )[..., 0]
-    features, targets = (
-        torch.cat([posterior.features, features]),
-        torch.cat([posterior.targets, targets]),
-    )
+    features = torch.cat([posterior.features, features])
+    targets = torch.cat([posterior.targets, targets])
     return replace(
         posterior,
         features=features,
@@ -140,7 +144,8 @@ def remove_points(
     else:
         columns = np.ascontiguousarray(posterior.cholesky.mT.detach().numpy())
         for index in reversed(removed):
-            before, columns = columns, np.empty_like(columns[:, 1:, 1:], order="C")
+            before = columns
+            columns = np.empty_like(columns[:, 1:, 1:], order="C")
             drop_point(before, index, columns)
         cholesky = torch.from_numpy(columns).mT
     targets = posterior.targets[kept]
@@ -196,14 +201,16 @@ class SlidingWindow:
         self, posterior: GPPosterior, features: Tensor, targets: Tensor
     ) -> GPPosterior:
         """The posterior with points x~ (p, n + m) and their targets (p, k), held to ``points`` points."""
-        larger, removable = append_points(posterior, features, targets), len(posterior)
+        larger = append_points(posterior, features, targets)
+        removable = len(posterior)
         if len(features) > self.points:
             _log.warning(
                 "%d new points exceed the window of %d: some are removed too",
                 len(features),
                 self.points,
             )
-            larger, removable = remove_points(larger, range(removable)), len(features)
+            larger = remove_points(larger, range(removable))
+            removable = len(features)
         if (excess := len(larger) - self.points) <= 0:
             return larger
         oldest = self.remove == "oldest"
@@ -217,7 +224,8 @@ def least_informative(
     posterior: GPPosterior, count: int, candidates: int | None = None
 ) -> list[int]:
     """Which of the first ``candidates`` points to drop, each the least informative when those before it are gone."""
-    P, beta = posterior.precision.clone(), posterior.weights.clone()
+    P = posterior.precision.clone()
+    beta = posterior.weights.clone()
     noise = _noise_variances(posterior)
     allowed = torch.zeros(len(posterior), dtype=torch.bool, device=posterior.device)
     allowed[:candidates] = True
@@ -228,7 +236,8 @@ def least_informative(
         chosen.append(i)
         allowed[i] = False
         # Leaving i out is conditioning the precision matrix: the block inverse of what remains.
-        column, pivot = P[:, :, i].clone(), P[:, i, i].clone()
+        column = P[:, :, i].clone()
+        pivot = P[:, i, i].clone()
         beta -= column * (beta[:, i] / pivot)[:, None]
         P -= column[:, :, None] * (column / pivot[:, None])[:, None, :]
         P[:, i, i] = 1.0  # gone: any positive number

@@ -320,10 +320,8 @@ class GPPosterior(TensorModel):
         """The mean's derivatives by state and input, from what ``_correlations`` gives."""
         weighted = (k * self.weights)[..., None, :]  # (*batch, k, 1, N)
         jacobian = (weighted @ (difference / self.lengthscales[:, None, :]))[..., 0, :]
-        by_state, by_input = (
-            jacobian[..., : self.state_dim],
-            jacobian[..., self.state_dim :],
-        )
+        by_state = jacobian[..., : self.state_dim]
+        by_input = jacobian[..., self.state_dim :]
         if self.predicts == "difference":
             by_state = by_state + self._eye
         return by_state, by_input

@@ -95,8 +95,11 @@ class OutputSearch:
         settings: Any,
         deadline: float,
     ):
-        self._name, self._inputs, self._targets = name, inputs, targets
-        self._settings, self._deadline = settings, deadline
+        self._name = name
+        self._inputs = inputs
+        self._targets = targets
+        self._settings = settings
+        self._deadline = deadline
         # An input that is known to have no effect drops out of the kernel.
         ignored = constant & np.isinf(prior)
         self._log_prior = np.log(np.where(ignored, IGNORED * std, prior))
@@ -106,7 +109,8 @@ class OutputSearch:
         self._box = search_box(
             self._log_std, self._log_output, settings.signal_to_noise_limit
         )
-        self.evaluations, self._last_log = 0, time.perf_counter()
+        self.evaluations = 0
+        self._last_log = time.perf_counter()
 
     def __call__(
         self,
@@ -214,10 +218,12 @@ class OutputSearch:
             value, gradient = self._likelihood(theta)
         self.evaluations += 1
         if not (np.isfinite(value) and np.isfinite(gradient).all()):
-            value, gradient = FAILED, np.zeros_like(theta)
+            value = FAILED
+            gradient = np.zeros_like(theta)
         elif self._settings.penalty is not None:
             wall, slope = self._settings.penalty(theta, self._log_std)
-            value, gradient = value + wall, gradient + slope
+            value = value + wall
+            gradient = gradient + slope
         if time.perf_counter() - self._last_log > _LOG_INTERVAL:
             self._last_log = time.perf_counter()
             text = "training: %s, %d points: evaluation %d, minus log evidence %.8g"
@@ -287,7 +293,8 @@ def training_data(
                 f"must be in host memory for training ({name}.cpu()); got {value.device}",
             )
     check_posterior(given, input_dim, predicts)
-    features, targets = features.detach(), targets.detach()
+    features = features.detach()
+    targets = targets.detach()
     n = features.shape[1] - input_dim
     names = [f"x{i + 1}" for i in range(n)] + [f"u{i + 1}" for i in range(input_dim)]
     outputs = [f"y{a + 1}" for a in range(targets.shape[1])]
@@ -314,14 +321,16 @@ def log_hyperparameters(
     posterior: GPPosterior, features: Scaling, targets: Scaling
 ) -> np.ndarray:
     """Rows (log l, log sf, log(sf / sn)), one an output (k, d + 2), of a posterior, in scaled units."""
-    k, d = len(targets.factor), len(features.factor)
+    k = len(targets.factor)
+    d = len(features.factor)
     if posterior.lengthscales.shape != (k, d):
         got = tuple(posterior.lengthscales.shape[::-1])
         rule = f"the posterior to start from must have {d} features and {k} outputs"
         raise ShapeError(f"{rule}; got {got[0]} and {got[1]}")
     parts = posterior.lengthscales, posterior.signal_variance, posterior.noise_variance
     length, sf2, sn2 = (part.to("cpu", torch.float64) for part in parts)
-    deviation, ratio = (sf2.sqrt() / targets.factor).log(), (sf2 / sn2).log() / 2
+    deviation = (sf2.sqrt() / targets.factor).log()
+    ratio = (sf2 / sn2).log() / 2
     return torch.column_stack(
         [(length / features.factor).log(), deviation, ratio]
     ).numpy()

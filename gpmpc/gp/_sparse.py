@@ -157,7 +157,8 @@ def data_sums(
     Lz: Tensor, Z: Tensor, x: Tensor, y: Tensor, kernel: Hyperparameters, method: Method
 ) -> _Sums:
     """The sums over all points, of every output, in blocks."""
-    step, outputs = max(_ENTRIES // len(Z), 64), []
+    step = max(_ENTRIES // len(Z), 64)
+    outputs = []
     for a in range(y.shape[1]):
         total: Any = 0.0, 0.0, 0.0, 0.0
         for rows in (slice(begin, begin + step) for begin in range(0, len(x), step)):
@@ -207,7 +208,8 @@ def _block_sums(
     if method == "fitc":
         Lam = (signal_variance[:, None] - whitened.square().sum(-2)).clamp_min(0) + Lam
     root = Lam.sqrt()
-    A, r = whitened / root[:, None, :], y.mT / root
+    A = whitened / root[:, None, :]
+    r = y.mT / root
     return _Sums(
         A @ A.mT, (A @ r[..., None])[..., 0], r.square().sum(-1), Lam.log().sum(-1)
     )
@@ -215,7 +217,9 @@ def _block_sums(
 
 def _cross(inducing: Tensor, features: Tensor, kernel: Hyperparameters) -> Tensor:
     """Kzx (k, M, N) by one matrix product an output; around a common centre, so that little cancels."""
-    centre, scales = inducing.detach().mean(0), kernel.lengthscales[:, None, :]
-    z, x = (inducing - centre) / scales, (features - centre) / scales
+    centre = inducing.detach().mean(0)
+    scales = kernel.lengthscales[:, None, :]
+    z = (inducing - centre) / scales
+    x = (features - centre) / scales
     half = z.square().sum(-1)[..., :, None] / 2 + x.square().sum(-1)[..., None, :] / 2
     return kernel.signal_variance[:, None, None] * (z @ x.mT - half).clamp_max(0).exp()

@@ -137,7 +137,8 @@ class SparseTrainer:
         fixed = constants.outputs & (prior.deviations is not None)
         # A stationary kernel depends on differences; those from one of the points are exact, wherever the data lie.
         feature_scaling = Scaling(features[0], feature_scaling.factor)
-        x, y = feature_scaling.scale(features), target_scaling.scale(targets)
+        x = feature_scaling.scale(features)
+        y = target_scaling.scale(targets)
         chosen = np.random.default_rng(seed).permutation(len(x))[: self.subset]
         unit = torch.from_numpy(column_std(features.numpy(), constants.features))
         unit = unit / feature_scaling.factor
@@ -310,21 +311,22 @@ class _Bound:
         unsearched: np.ndarray,
     ):
         self._unsearched = unsearched  # entries of theta (k, d + 2) that stay
-        self._trainer, self._x, self._y, self._unit, self._shape = (
-            trainer,
-            x,
-            y,
-            unit,
-            theta.shape,
-        )
+        self._trainer = trainer
+        self._x = x
+        self._y = y
+        self._unit = unit
+        self._shape = theta.shape
         self.best = np.append(
             theta.ravel(), (Z / unit).numpy().ravel()
         )  #: the start, or the best point evaluated since
-        self.evaluations, self._least, self._iterations = 0, np.inf, 0
+        self.evaluations = 0
+        self._least = np.inf
+        self._iterations = 0
 
     def maximize(self) -> None:
         """Searches by L-BFGS in a box around the data that holds the start."""
-        log_inputs, trainer = self._unit.log().numpy(), self._trainer
+        log_inputs = self._unit.log().numpy()
+        trainer = self._trainer
         boxes = [
             search_box(log_inputs, own, _SIGNAL_TO_NOISE)
             for own in np.log(column_std(self._y.numpy()))
@@ -332,10 +334,8 @@ class _Bound:
         smallest, largest = (
             (edge / self._unit).numpy() for edge in (self._x.amin(0), self._x.amax(0))
         )
-        margin, count = (
-            0.1 * (largest - smallest),
-            (len(self.best) - self._shape[0] * self._shape[1]) // len(smallest),
-        )
+        margin = 0.1 * (largest - smallest)
+        count = (len(self.best) - self._shape[0] * self._shape[1]) // len(smallest)
         lower, upper = (np.concatenate(side) for side in zip(*boxes, strict=True))
         lower = np.minimum(
             np.append(lower, np.tile(smallest - margin, count)), self.best
@@ -381,14 +381,16 @@ class _Bound:
         variables = torch.from_numpy(vector.copy()).requires_grad_()
         with torch.enable_grad():
             total = self._bounds(variables).sum()
-            value, gradient = float(total.detach()), np.full_like(vector, np.nan)
+            value = float(total.detach())
+            gradient = np.full_like(vector, np.nan)
             if math.isfinite(value):
                 total.backward()
                 gradient = torch.as_tensor(variables.grad).numpy()
         if not np.isfinite(gradient).all():
             return FAILED, np.zeros_like(vector)
         if value < self._least:
-            self.best, self._least = vector.copy(), value
+            self.best = vector.copy()
+            self._least = value
         return value, gradient
 
     def _report(self, _: np.ndarray) -> None:

@@ -37,7 +37,8 @@ from gpmpc.gp._kernel import check_posterior
 from gpmpc.gp._posterior import GPPosterior
 from gpmpc.signals import Signals, check_signals
 
-_FORMAT, _VERSION = "gpmpc model", 2
+_FORMAT = "gpmpc model"
+_VERSION = 2
 _DTYPES = {torch.float64: "float64", torch.float32: "float32"}
 _LONGEST = 2**20  # characters of a header
 _HEADER = "header.json"
@@ -112,7 +113,8 @@ def posterior_of_parts(
     names = [f.name for f in fields(GPPosterior) if f.name not in settings]
     with consistent(path, f"not a consistent posterior of {', '.join(names)}"):
         found = {name: tensors[name] for name in names}
-        predicts, m = header["predicts"], header["input_dim"]
+        predicts = header["predicts"]
+        m = header["input_dim"]
         check_posterior(found, m, predicts, found["features"].dtype)
         signals = Signals.from_header(header.get("signals"))
         signals.check_sizes(found["features"].shape[1] - m, m)
@@ -352,11 +354,9 @@ def _restored(name: str, stored: np.ndarray, order: list[int]) -> Tensor:
         raise ValueError(
             f"{name} must be of type {' or '.join(_DTYPES.values())}; got {stored.dtype}"
         )
-    shape, triangular, size = (
-        stored.shape,
-        name.endswith("cholesky"),
-        math.isqrt(2 * stored.shape[-1]),
-    )
+    shape = stored.shape
+    triangular = name.endswith("cholesky")
+    size = math.isqrt(2 * stored.shape[-1])
     whole = (len(stored), size, size) if triangular else shape
     if sorted(order) != list(range(len(whole))) or (
         triangular and shape != (len(stored), size * (size + 1) // 2)

@@ -219,7 +219,8 @@ class Trainer:
         check_number("seed", seed, least=0, whole=True)
         predicts = predicts or self.predicts
         data = training_data(features, targets, input_dim, predicts, self.scaling)
-        features, targets = data.features, data.targets
+        features = data.features
+        targets = data.targets
         if columns is None:
             columns = Columns.of(features, targets, input_dim, predicts)
         constants = Constants.of(features, targets, columns, self.resolution)
@@ -255,10 +256,8 @@ class Trainer:
         features, targets, feature_scaling, target_scaling = data
         (size, d), outputs = features.shape, targets.shape[1]
         _check_memory(size, outputs)
-        x, y = (
-            feature_scaling.scale(features).numpy(),
-            target_scaling.scale(targets).numpy(),
-        )
+        x = feature_scaling.scale(features).numpy()
+        y = target_scaling.scale(targets).numpy()
         factor = feature_scaling.factor.numpy()
         std = column_std(features.numpy(), constants.features) / factor
         first: Any = [None] * outputs
@@ -274,7 +273,8 @@ class Trainer:
         )  # a subset could not improve on where the search begins
         if self.subset is not None and size > self.subset and not converged:
             rows = np.sort(rng.permutation(size)[: self.subset])
-        found, evaluations = [], 0
+        found = []
+        evaluations = 0
         for a in range(outputs):
             deadline = (
                 np.inf
@@ -306,10 +306,8 @@ class Trainer:
                 f"{', '.join(map(str, failed))}: lower signal_to_noise_limit, or remove duplicate rows",
             )
         theta = restored_theta(theta, feature_scaling, target_scaling)
-        kernel, offset = (
-            Hyperparameters.from_theta(torch.from_numpy(theta)),
-            target_scaling.offset,
-        )
+        kernel = Hyperparameters.from_theta(torch.from_numpy(theta))
+        offset = target_scaling.offset
         posterior = GPPosterior.from_hyperparameters(
             features, targets, *kernel, input_dim, predicts, offset
         )
@@ -374,7 +372,8 @@ def available_memory(system: Path = Path("/")) -> int | None:
     What Linux calls available, or what the process's control groups (v2; a container, a Slurm job) leave, whichever is
     less; file pages that can be dropped count as free.
     """
-    groups, left = system / "sys/fs/cgroup", []
+    groups = system / "sys/fs/cgroup"
+    left = []
     with suppress(OSError):
         lines = (system / "proc/meminfo").read_text().splitlines()
         left += [

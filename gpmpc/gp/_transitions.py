@@ -182,7 +182,8 @@ class Transitions:
         """
         check_number("state_dim", state_dim, least=1, whole=True)
         check_number("input_dim", input_dim, least=0, whole=True)
-        n, width = state_dim, 2 * state_dim + input_dim
+        n = state_dim
+        width = 2 * state_dim + input_dim
         lines = enumerate(map(str.split, _text(path).splitlines()), start=1)
         table = _table(
             path, lines, {number: number - 1 for number in range(1, width + 1)}, width
@@ -240,10 +241,8 @@ class Transitions:
             raise DataError(
                 f"{path}: row {reader.line_num} cannot be read ({error})"
             ) from error
-        header, wanted = (
-            [name.strip() for name in header],
-            [*states, *inputs, *(next_states or ())],
-        )
+        header = [name.strip() for name in header]
+        wanted = [*states, *inputs, *(next_states or ())]
         for name in wanted:
             if header.count(name) != 1:
                 problem = "stands there twice" if name in header else "is missing"
@@ -272,7 +271,8 @@ def check_transitions(transitions: Any, model: Any = None) -> None:
         raise SettingError(
             "transitions", f"must be Transitions(...); got {type(transitions).__name__}"
         )
-    n, m = transitions.state_dim, transitions.input_dim
+    n = transitions.state_dim
+    m = transitions.input_dim
     if model is not None and (n, m) != (model.state_dim, model.input_dim):
         rule = f"the model has {model.state_dim} states and {model.input_dim} inputs"
         raise ShapeError(f"{rule}; got transitions with {n} and {m}")

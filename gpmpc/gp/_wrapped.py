@@ -60,7 +60,8 @@ def wrapped_columns(
     """Finds the columns of x[k] and x[k+1], both (N, n), that jump by whole turns."""
     columns = []
     for column in range(states.shape[1]):
-        before, after = states[:, column], next_states[:, column]
+        before = states[:, column]
+        after = next_states[:, column]
         for turn in _TURNS:
             rows = _jumps(before, after, turn)
             if rows:

@@ -40,10 +40,8 @@ def casadi_function(model: Any, name: str = "gp") -> casadi.Function:
     Raises:
         UnsupportedModel: The nominal model or the effect is a Python function, or it is another model.
     """
-    x, u = (
-        casadi.MX.sym("state", model.state_dim),
-        casadi.MX.sym("input", model.input_dim),
-    )
+    x = casadi.MX.sym("state", model.state_dim)
+    u = casadi.MX.sym("input", model.input_dim)
     if isinstance(model, GPPosterior):
         mean, variance = _moments(model, x, u)
         mean = mean + x if model.predicts == "difference" else mean
@@ -56,10 +54,8 @@ def casadi_function(model: Any, name: str = "gp") -> casadi.Function:
 
 def successor_function(plant: Any) -> casadi.Function:
     """Writes the next state of a plant, such as a ``System``, as a CasADi function of state (n,) and input (m,)."""
-    x, u = (
-        casadi.SX.sym("x", len(plant.dynamics.state_names)),
-        casadi.SX.sym("u", len(plant.dynamics.input_names)),
-    )
+    x = casadi.SX.sym("x", len(plant.dynamics.state_names))
+    u = casadi.SX.sym("u", len(plant.dynamics.input_names))
     entries = call_dynamics(plant.successor, x, u)
     function = casadi.Function("successor", [x, u], [casadi.vertcat(*entries)])
     _check_numbers(function)
@@ -113,7 +109,8 @@ def _moments(
     gp: GPPosterior, x: casadi.MX, u: casadi.MX
 ) -> tuple[casadi.MX, casadi.MX]:
     """Mean (k,) and variance (k,) of the GPs at x and u."""
-    points, size = _numbers(gp.features), len(gp)
+    points = _numbers(gp.features)
+    size = len(gp)
     difference = points - casadi.repmat(casadi.vertcat(x, u).T, size, 1)  # (N, d)
     exponents = (
         difference**2 @ _numbers(gp.lengthscales.mT.double() ** -2) / -2
@@ -153,15 +150,14 @@ def tape_of(function: casadi.Function) -> tapes.Tape | None:
     if not all(function.sparsity_in(i).is_dense() for i in range(function.n_in())):
         return None
     sizes = [function.numel_in(i) for i in range(function.n_in())]
-    first, places = (
-        np.concatenate([[0], np.cumsum(sizes)]),
-        function.sparsity_out(0).find(),
-    )
+    first = np.concatenate([[0], np.cumsum(sizes)])
+    places = function.sparsity_out(0).find()
     code = np.zeros((function.n_instructions(), 4), dtype=np.int64)
     constants = np.zeros(len(code))
     for k, row in enumerate(code):
         row[0] = function.instruction_id(k)
-        inputs, outputs = function.instruction_input(k), function.instruction_output(k)
+        inputs = function.instruction_input(k)
+        outputs = function.instruction_output(k)
         if row[0] not in tapes.OPERATIONS:
             return None
         row[1] = places[outputs[1]] if row[0] == tapes.OUTPUT else outputs[0]

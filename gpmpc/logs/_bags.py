@@ -331,7 +331,8 @@ def _records(
             where = f"at byte {position}"
             try:
                 chunk = _parsed(Chunk, content)
-                begin, end = chunk.message_start_time, chunk.message_end_time
+                begin = chunk.message_start_time
+                end = chunk.message_end_time
                 where = f"with the messages from {begin / 1e9} to {end / 1e9} s"
                 yield from _inside(_unfold(chunk, room), room)
             except _Damaged as error:

@@ -124,7 +124,8 @@ def cut_pieces(time: Array, max_gap: float | None) -> Array:
 def intersect_pieces(pieces: Array, others: Array) -> Array:
     """What two lists of pieces (P, 2), in the order of time, have in common (C, 2)."""
     common = []
-    i, j = 0, 0
+    i = 0
+    j = 0
     while i < len(pieces) and j < len(others):
         begin = max(pieces[i, 0], others[j, 0])
         end = min(pieces[i, 1], others[j, 1])
@@ -163,17 +164,22 @@ def resample(
     Between two ``angles`` [rad] the rule "linear" goes the short way round.
     """
     present = np.isfinite(values).all(axis=1)
-    time, values = time[present], values[present]
+    time = time[present]
+    values = values[present]
     if not len(time):
         return np.full((len(grid), values.shape[1]), np.nan)
     at = np.searchsorted(time, grid + RESOLUTION, side="right") - 1
-    before, after = np.clip(at, 0, None), np.clip(at + 1, None, len(time) - 1)
-    lag, span = grid - time[before], time[after] - time[before]
+    before = np.clip(at, 0, None)
+    after = np.clip(at + 1, None, len(time) - 1)
+    lag = grid - time[before]
+    span = time[after] - time[before]
     if rule == "hold":
-        usable, found = (at >= 0) & (lag <= max_gap), values[before]
+        usable = (at >= 0) & (lag <= max_gap)
+        found = values[before]
     else:
         share = np.divide(lag, span, out=np.zeros_like(lag), where=span > 0)[:, None]
-        one, other = values[before], values[after]
+        one = values[before]
+        other = values[after]
         if rule == "spherical":
             turn = rotation_vector(quaternion_product(quaternion_inverse(one), other))
             found = quaternion_product(one, rotation_quaternion(share * turn))

@@ -295,7 +295,8 @@ def _fit_words(
     attitude: AttitudeReading,
 ) -> list[str]:
     """What a velocity or rate is of the derivative that it should be."""
-    signal, of = relation.measured, relation.derived
+    signal = relation.measured
+    of = relation.derived
     words = []
     if frame != relation.frame:
         correlation = search.correlation_in(relation, attitude, frame)

@@ -26,7 +26,8 @@ def decoder(channel: Channel, schema: Schema | None, room: Room) -> Decode:
     Raises:
         UnreadError: Messages of this kind are not read; the text says why.
     """
-    message, definition = channel.message_encoding, schema.encoding if schema else ""
+    message = channel.message_encoding
+    definition = schema.encoding if schema else ""
     try:
         if message == "cdr" and schema and definition == "ros2msg":
             text = schema.data.decode()

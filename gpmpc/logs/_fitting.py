@@ -39,14 +39,12 @@ BLOCK = 4  # consecutive windows whose errors are correlated
 TIME_CONSTANTS = (0.0, 0.05, 0.25, 1.0)  # [s]; zero is white
 FITTED = (1, 2, 3, 5, 7, 10, 15, 20, 30, 50)  # steps
 DIFFERENCE = 1e-6
-FOLLOWED, PRIOR = (
-    6.0,
-    1.0,
-)  # times of the longest prediction: after which an error is forgotten, that a one weighs
-NOISE_WINDOWS, LINEARIZED = (
-    2000,
-    200,
-)  # of a fold: whose errors count, and along which rollouts are linearised
+# times of the longest prediction: after which an error is forgotten, that a one weighs
+FOLLOWED = 6.0
+PRIOR = 1.0
+# of a fold: whose errors count, and along which rollouts are linearised
+NOISE_WINDOWS = 2000
+LINEARIZED = 200
 
 
 @dataclass(frozen=True)
@@ -160,7 +158,9 @@ def _standard_errors(theta: Array, J: Array, residuals: Array) -> Array:
 def fit_least_squares(kinematics: Kinematics, log: Log) -> LogModel:
     """Fits outputs that are affine in the features, one step ahead on all rows."""
     cut = log.windows(1)
-    x, u, c = cut.states[:, 0], cut.inputs[:, 0], cut.context[:, 0]
+    x = cut.states[:, 0]
+    u = cut.inputs[:, 0]
+    c = cut.context[:, 0]
     z = kinematics.features(x, u, c)
     y = kinematics.outputs(x, cut.states[:, 1], log.time_step)
     solution: Any = np.linalg.lstsq(
@@ -198,7 +198,8 @@ def follow_errors(
     T)), with a one of the weight T added, and T the time of the longest prediction (adaptive conformal inference by
     variances instead of quantiles; Gibbs and Candes, 2021).
     """
-    longest, scaled = max(steps) * windows.time_step, variances.copy()
+    longest = max(steps) * windows.time_step
+    scaled = variances.copy()
     for run in np.unique(windows.runs):
         at = np.flatnonzero(windows.runs == run)
         times = windows.times[at]
@@ -230,11 +231,11 @@ def fit_noise(
     found: list[tuple[Array, Array, Array]] = []
     for model, log in zip(models, logs, strict=True):
         cut = log.windows(most, max(model.past, PAST), most=NOISE_WINDOWS)
-        few, past = (
-            cut[:: -(-len(cut) // LINEARIZED)],
-            cut.past,
-        )  # derivatives are slow, and vary little
-        x, after = cut.states[:, past], cut.states[:, past + 1]
+        # derivatives are slow, and vary little
+        few = cut[:: -(-len(cut) // LINEARIZED)]
+        past = cut.past
+        x = cut.states[:, past]
+        after = cut.states[:, past + 1]
         y = model.outputs(
             x, cut.inputs[:, past - model.lag], cut.context[:, past]
         ) + model.disturbance(cut)
@@ -262,11 +263,13 @@ def fit_noise(
 
 def _alike(model: LogModel, factor: Array, squares: Array) -> Array:
     """Rows of least squares that are zero where the outputs of a group share as the residuals' squares (o,) do."""
-    rows, o = [], len(squares)
+    rows = []
+    o = len(squares)
     for start in range(0, len(TIME_CONSTANTS) * o, o):
         for group in model.kinematics.output_groups.values():
             for i, j in itertools.pairwise(group):
-                row, pair = np.zeros(len(factor)), [start + i, start + j]
+                row = np.zeros(len(factor))
+                pair = [start + i, start + j]
                 scale = factor[pair] * np.maximum(squares[[i, j]], 1e-300)
                 row[pair] = scale.min() / scale * [1.0, -1.0]
                 rows.append(row)
@@ -276,7 +279,9 @@ def _alike(model: LogModel, factor: Array, squares: Array) -> Array:
 def _responses(model: LogModel, windows: Windows, steps: Sequence[int]) -> Array:
     """Variance of every entry's error (W, s, e, sources) by a unit variance of every source."""
     A, B = _linearized(model, windows, max(steps))
-    W, e, o = len(windows), A.shape[-1], B.shape[-1]
+    W = len(windows)
+    e = A.shape[-1]
+    o = B.shape[-1]
     found = np.empty((W, len(steps), e, len(TIME_CONSTANTS) * o + e))
     for s, step in enumerate(steps):
         P = np.broadcast_to(np.eye(e), (W, e, e))
@@ -297,13 +302,16 @@ def _responses(model: LogModel, windows: Windows, steps: Sequence[int]) -> Array
 
 def _linearized(model: LogModel, windows: Windows, steps: int) -> tuple[Array, Array]:
     """Derivatives of each step by the state (W, K, e, e) and by the outputs (W, K, e, o), along the rollout."""
-    space, kinematics, dt = windows.space, model.kinematics, windows.time_step
+    space = windows.space
+    kinematics = model.kinematics
+    dt = windows.time_step
     predicted = model.rollout(windows, steps)
     x = np.concatenate(
         [windows.states[:, windows.past : windows.past + 1], predicted[:, :-1]], axis=1
     )
     at = windows.past - model.lag
-    u, c = windows.inputs[:, at : at + steps], windows.context[:, windows.past][:, None]
+    u = windows.inputs[:, at : at + steps]
+    c = windows.context[:, windows.past][:, None]
     c = np.broadcast_to(c, (*x.shape[:-1], c.shape[-1]))
     d = model.disturbance(windows)[:, None]
     y = model.outputs(x, u, c) + d

@@ -25,7 +25,10 @@ from gpmpc.logs._reading import read_log
 # columns that hold the time where nobody says which
 TIMES = (STAMP, "timestamp", "t", "time", "stamp", "Time", "seconds")
 DRAWN = 3000  # points of a channel's line
-BLOCKS, BLOCK, REACH = 16, 4096, 50  # rows in which delays are sought, and how far
+# rows in which delays are sought, and how far
+BLOCKS = 16
+BLOCK = 4096
+REACH = 50
 SHARP = 10  # rows within which a peak falls by a fifth
 CORRELATED = 0.5  # from which a delay says something
 PAIRS = 20  # most delays that are listed
@@ -188,7 +191,8 @@ def _inspect_stream(
         if jitter > JITTER:
             share = f"{jitter:.0%} of the time step"
             warnings.append(f"stamps{of_topic} jitter by {share}: state a rate")
-        rows, time = clock.rows, clock.time
+        rows = clock.rows
+        time = clock.time
     else:
         summary |= {
             "rate [Hz]": np.nan,
@@ -433,10 +437,8 @@ def _delays(names: list[str], values: Array) -> list[tuple[Any, ...]]:
             # A slow oscillation is correlated with any other at some delay; a delay has a sharp peak.
             if abs(correlation) >= CORRELATED and around.max() < 0.8 * abs(correlation):
                 lags = peak[:, j] - REACH
-                delay, agreement = (
-                    float(np.median(lags)),
-                    float((np.abs(lags - np.median(lags)) <= 1).mean()),
-                )
+                delay = float(np.median(lags))
+                agreement = float((np.abs(lags - np.median(lags)) <= 1).mean())
                 pair = names[usable[i]], names[usable[i + 1 + j]]
                 found.append(
                     (

@@ -19,7 +19,8 @@ from gpmpc.logs._log import Log, Windows
 from gpmpc.logs._rollouts import PAST, rollout_errors
 from gpmpc.metrics import binomial_interval
 
-STEPS, LEVEL = (1, 10, 50), 0.95
+STEPS = (1, 10, 50)
+LEVEL = 0.95
 WINDOWS = 1000
 RIDGE_WINDOWS = 3000  # to which the ridge regression is fitted
 LAGS = (1, 2, 3, 5, 8, 12, 20)  # rows of the past that it sees
@@ -96,10 +97,14 @@ def judge(
     Raises:
         DataError: No piece of the held-out log is long enough.
     """
-    model, space, kinematics = learned.model, held_out.space, learned.model.kinematics
-    past, longest = max(model.past, PAST), max(steps)
+    model = learned.model
+    space = held_out.space
+    kinematics = learned.model.kinematics
+    past = max(model.past, PAST)
+    longest = max(steps)
     cut = held_out.windows(longest, past, most=WINDOWS)
-    start, seen = cut.states[:, past], train.windows(longest, PAST, most=RIDGE_WINDOWS)
+    start = cut.states[:, past]
+    seen = train.windows(longest, PAST, most=RIDGE_WINDOWS)
     own = rollout_errors(cut, model.rollout(cut), steps)
     with np.errstate(over="ignore", invalid="ignore"):
         affine = rollout_errors(
@@ -172,7 +177,9 @@ def _predict_by_ridge(
     """Predicts states (W, n) at a step straight from past states, past and coming inputs, by a fit to ``seen``."""
 
     def regressors(cut: Windows) -> Array:
-        start, past, u = cut.states[:, cut.past], cut.past, cut.inputs
+        start = cut.states[:, cut.past]
+        past = cut.past
+        u = cut.inputs
         columns = [kinematics.features(start, u[:, past], cut.context[:, past])]
         columns += [
             cut.space.difference(start, cut.states[:, past - lag]) for lag in LAGS
@@ -185,7 +192,8 @@ def _predict_by_ridge(
         return np.concatenate(columns, axis=1)
 
     z = regressors(seen)
-    mean, factor = z.mean(axis=0), np.maximum(z.std(axis=0), 1e-12)
+    mean = z.mean(axis=0)
+    factor = np.maximum(z.std(axis=0), 1e-12)
     z, new = (
         np.column_stack([np.ones(len(a)), (a - mean) / factor])
         for a in (z, regressors(windows))

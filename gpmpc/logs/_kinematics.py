@@ -80,7 +80,8 @@ class StateSpace:
         """Computes a - b (..., e) of states (..., n)."""
         parts = []
         for group, at in zip(self.groups, self.columns, strict=True):
-            one, other = a[..., at], b[..., at]
+            one = a[..., at]
+            other = b[..., at]
             if group.kind == "quaternion":
                 parts.append(
                     rotation_vector(quaternion_product(quaternion_inverse(other), one))
@@ -97,7 +98,8 @@ class StateSpace:
         for group, at, error_at in zip(
             self.groups, self.columns, self.error_columns, strict=True
         ):
-            one, by = state[..., at], error[..., error_at]
+            one = state[..., at]
+            by = error[..., error_at]
             if group.kind == "quaternion":
                 parts.append(quaternion_product(one, rotation_quaternion(by)))
             else:
@@ -122,8 +124,14 @@ def _slices(lengths: Sequence[int]) -> tuple[slice, ...]:
 # scipy's Rotation does the same, several times slower for the small batches of a rollout's step.
 def quaternion_product(a: Array, b: Array) -> Array:
     """Computes the Hamilton product (..., 4) of quaternions (x, y, z, w)."""
-    ax, ay, az, aw = a[..., 0], a[..., 1], a[..., 2], a[..., 3]
-    bx, by, bz, bw = b[..., 0], b[..., 1], b[..., 2], b[..., 3]
+    ax = a[..., 0]
+    ay = a[..., 1]
+    az = a[..., 2]
+    aw = a[..., 3]
+    bx = b[..., 0]
+    by = b[..., 1]
+    bz = b[..., 2]
+    bw = b[..., 3]
     x = aw * bx + ax * bw + ay * bz - az * by
     y = aw * by - ax * bz + ay * bw + az * bx
     z = aw * bz + ax * by - ay * bx + az * bw
@@ -151,14 +159,19 @@ def rotation_vector(q: Array) -> Array:
 
 def rotate(q: Array, vector: Array) -> Array:
     """Turns vectors (..., 3) from body to world axes by quaternions (..., 4)."""
-    axis, scalar = q[..., :3], q[..., 3:]
+    axis = q[..., :3]
+    scalar = q[..., 3:]
     t = 2 * _cross(axis, vector)
     return vector + scalar * t + _cross(axis, t)
 
 
 def _cross(a: Array, b: Array) -> Array:  # several times faster than np.cross
-    ax, ay, az = a[..., 0], a[..., 1], a[..., 2]
-    bx, by, bz = b[..., 0], b[..., 1], b[..., 2]
+    ax = a[..., 0]
+    ay = a[..., 1]
+    az = a[..., 2]
+    bx = b[..., 0]
+    by = b[..., 1]
+    bz = b[..., 2]
     return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=-1)
 
 
@@ -236,7 +249,8 @@ class RigidBody:
 
     def step(self, states: Array, outputs: Array, time_step: float) -> Array:
         p, q, v, w = _parts(states)
-        force, alpha = outputs[..., 0:3], outputs[..., 3:6]
+        force = outputs[..., 0:3]
+        alpha = outputs[..., 3:6]
         half_turn = rotation_quaternion((w + alpha * (time_step / 2)) * (time_step / 2))
         middle = quaternion_product(q, half_turn)
         a = rotate(middle, force) + GRAVITY

@@ -40,7 +40,9 @@ from gpmpc.logs._rollouts import (
 
 AVERAGES = (1, 5, 10)  # rows over which the targets of a GP are averaged
 LATE = 3  # rows by which motors may act late
-FEEDBACK, LATE_INPUTS = "feedback", f"inputs {LATE} rows late"  # structures
+# structures
+FEEDBACK = "feedback"
+LATE_INPUTS = f"inputs {LATE} rows late"
 JUDGED = (10, 50)  # steps whose errors decide
 GAIN = 0.01  # least relative improvement for which a model may grow
 LOSS = 0.05  # most relative loss in any group at any step
@@ -146,7 +148,9 @@ def learn(
             for theta in memory[trial_name]
         ]
         if is_best(trial_name, errors(fitted)):
-            models, name, structure = fitted, trial_name, trial
+            models = fitted
+            name = trial_name
+            structure = trial
     choice: dict[str, int] = {}
     groups = structure.kinematics.output_groups
     for group, outputs in groups.items():
@@ -155,7 +159,8 @@ def learn(
             averages = {**choice, group: average}.items()
             words = f"{name}, GP on {' and '.join(f'{of} (averaged over {rows})' for of, rows in averages)}"
             progress(words)
-            trained, learning = [], (outputs, average, points, seed)
+            trained = []
+            learning = (outputs, average, points, seed)
             if words not in memory:
                 trained = [_with_gp(model, train, *learning) for model, train in base]
                 memory[words] = errors(trained).tolist()
@@ -200,7 +205,8 @@ def _is_better(candidate: Candidate, incumbent: Candidate) -> bool:
 def _structures(log: Log) -> tuple[str, LogModel, dict[str, Grow]]:
     """A name, the simplest model, and what is added to it one after the other; None where an addition has no sense."""
     if log.mapping.model != "rigid_body":
-        kinematics, o = Increments(log.space), log.space.error_dim
+        kinematics = Increments(log.space)
+        o = log.space.error_dim
         options: dict[str, Grow] = {
             "": lambda model: model,
             "least squares": lambda model: replace(
@@ -291,10 +297,8 @@ def _train(
     """Trains a GP on what the nominal part leaves of some outputs, averaged over some rows."""
     cut = log.windows(average, model.lag)
     at = slice(cut.past, cut.past + average)
-    x, u = (
-        cut.states[:, at],
-        cut.inputs[:, cut.past - model.lag : cut.past - model.lag + average],
-    )
+    x = cut.states[:, at]
+    u = cut.inputs[:, cut.past - model.lag : cut.past - model.lag + average]
     c = np.broadcast_to(cut.context[:, -1:], (*x.shape[:-1], cut.context.shape[-1]))
     after = cut.states[:, cut.past + 1 : cut.past + average + 1]
     if model.kinematics.space.angles:  # may go round by more than half a turn
@@ -335,7 +339,8 @@ def choose_rows(features: Array, count: int, seed: int = 0) -> np.ndarray:
         return np.arange(len(features))
     z = (features - features.mean(axis=0)) / np.maximum(features.std(axis=0), 1e-12)
     sample = z[np.random.default_rng(seed).permutation(len(z))[: 10 * count]]
-    chosen, distance = [0], np.full(len(sample), np.inf)
+    chosen = [0]
+    distance = np.full(len(sample), np.inf)
     while len(chosen) < count:  # farthest points (Gonzalez, 1985)
         distance = np.minimum(
             distance, np.square(sample - sample[chosen[-1]]).sum(axis=1)

@@ -56,10 +56,8 @@ class LogRun:
 
     def part(self, begin: int, end: int, name: str) -> "LogRun":
         """The rows from ``begin`` to before ``end`` as a run of its own."""
-        rows, begins = (
-            slice(begin, end),
-            (0, *(b - begin for b in self.begins if begin < b < end)),
-        )
+        rows = slice(begin, end)
+        begins = (0, *(b - begin for b in self.begins if begin < b < end))
         arrays = (
             self.time[rows],
             self.states[rows],
@@ -140,7 +138,8 @@ class Log:
     @property
     def signals(self) -> Signals:
         """Names of states and inputs, and time step; columns of two topics may share one."""
-        states, inputs = self.space.names, self.input_names
+        states = self.space.names
+        inputs = self.input_names
         return Signals(
             states if len(set(states)) == len(states) else (),
             inputs if len(set(inputs)) == len(inputs) else (),
@@ -185,7 +184,8 @@ class Log:
     def transitions(self) -> Transitions:
         """All transitions from one row to the next inside a piece, as data of GPs."""
         cut = self.windows(1)
-        now, after = cut.states[:, 0], cut.states[:, 1]
+        now = cut.states[:, 0]
+        after = cut.states[:, 1]
         return Transitions(now, cut.inputs[:, 0], after, self.signals)
 
     def episodes(self) -> list[Recording]:
@@ -226,14 +226,13 @@ class Log:
             stride = max(
                 -(-sum(max(length - ahead - past, 0) for length in lengths) // most), 1
             )
-        offsets, parts = np.arange(-past, ahead + 1), []
+        offsets = np.arange(-past, ahead + 1)
+        parts = []
         for number, run in enumerate(self.runs):
             starts = run.starts(past, ahead, stride)
             rows = starts[:, None] + offsets
-            before, numbers = (
-                run.context[rows[:, : past + 1]],
-                np.full(len(rows), number),
-            )
+            before = run.context[rows[:, : past + 1]]
+            numbers = np.full(len(rows), number)
             parts.append(
                 (run.states[rows], run.inputs[rows], before, numbers, run.time[starts])
             )

@@ -246,7 +246,8 @@ def _read_parquet(path: Path, *_: Any) -> LogFile:
 
     room = Room(path)
     with pq.ParquetFile(path) as file:
-        schema, metadata = file.schema_arrow, file.metadata
+        schema = file.schema_arrow
+        metadata = file.metadata
         groups = [metadata.row_group(i) for i in range(metadata.num_row_groups)]
     rows = max(metadata.num_rows, sum(group.num_rows for group in groups))
     check_column_count(path, len(schema))
@@ -267,7 +268,8 @@ def _read_parquet(path: Path, *_: Any) -> LogFile:
         pa.types.is_duration,
         pa.types.is_null,
     )
-    numbers, texts = [], []
+    numbers = []
+    texts = []
     for field in schema:
         kind = (
             field.type.value_type if pa.types.is_dictionary(field.type) else field.type

@@ -449,7 +449,8 @@ def _make_run(
 ) -> LogRun | None:
     """Leaves out what cannot be used, and marks where a new piece begins; None where nothing is left."""
     states, inputs, _ = mapping.split(table.values)
-    usable, note = np.ones(len(table.time), dtype=bool), table.note
+    usable = np.ones(len(table.time), dtype=bool)
+    note = table.note
 
     def leave_out(rows: Any, kind: str, text: str) -> None:
         count = (rows & usable).sum()
@@ -497,7 +498,8 @@ def _make_run(
     is_jump = table.breaks[rows[1:]] & (times > JUMP)  # which has its own finding
     inner = times[uneven & (np.diff(rows) == 1) & ~is_jump]
     if len(inner):
-        shortest, longest = inner.min(), inner.max()
+        shortest = inner.min()
+        longest = inner.max()
         text = (
             f"gaps, up to {longest:.3g} s"
             if shortest > step

@@ -71,7 +71,8 @@ class MultirotorNominal:
     def start(self) -> Array:
         """Hover at a mean squared signal of a half, without drag, little damping."""
         start = np.zeros(len(self.parameter_names))
-        start[0], start[3:6] = 20.0, 5.0
+        start[0] = 20.0
+        start[3:6] = 5.0
         return start
 
     def outputs(
@@ -79,7 +80,8 @@ class MultirotorNominal:
     ) -> Array:
         thrust, drag_xy, drag_z, *rest = theta
         to_body = quaternion_inverse(states[..., 3:7])
-        v, w = rotate(to_body, states[..., 7:10]), states[..., 10:13]
+        v = rotate(to_body, states[..., 7:10])
+        w = states[..., 10:13]
         u2 = (inputs if self.thrusts else inputs**2) * (
             context[..., :1] / self.voltage if self.voltage else 1.0
         )
@@ -220,7 +222,8 @@ class LogModel:
         x = np.broadcast_to(
             windows.states[:, windows.past], (*batch, windows.states.shape[-1])
         )
-        context, d = windows.context[:, windows.past], self.disturbance(windows, terms)
+        context = windows.context[:, windows.past]
+        d = self.disturbance(windows, terms)
         found = np.empty((*batch, steps, x.shape[-1]))
         for k in range(steps):
             y = (

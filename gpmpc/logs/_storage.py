@@ -60,7 +60,9 @@ def save_learned(learned: Learned, path: str | Path) -> None:
         SettingError: The nominal model is a user's own, which a file of numbers cannot hold.
         DataError: The folder does not exist.
     """
-    path, model, nominal = new_file(path), learned.model, learned.model.nominal
+    path = new_file(path)
+    model = learned.model
+    nominal = learned.model.nominal
     if not isinstance(nominal, MultirotorNominal | AffineNominal):
         raise SettingError(
             "nominal",
@@ -72,7 +74,8 @@ def save_learned(learned: Learned, path: str | Path) -> None:
         "ranges": learned.ranges,
     }
     arrays |= {f"noise/{key}": getattr(learned.noise, key) for key in _NOISE}
-    tensors, gps = {key: torch.from_numpy(value) for key, value in arrays.items()}, []
+    tensors = {key: torch.from_numpy(value) for key, value in arrays.items()}
+    gps = []
     for i, gp in enumerate(model.gps):
         described, own = posterior_parts(path, gp.posterior)
         gps.append([gp.outputs, described])
@@ -190,7 +193,8 @@ def _nominal(
     name, settings = described
     if name != "MultirotorNominal":  # older files have a Still
         return AffineNominal(kinematics, settings.get("fitted", name != "Still"))
-    motors, inputs = settings["motors"], len(texts["input_names"])
+    motors = settings["motors"]
+    inputs = len(texts["input_names"])
     if type(motors) is not int or motors != inputs:
         raise DataError(f"a multirotor of {inputs} inputs has no {motors!r:.80} motors")
     voltage = settings.get("voltage", 0.0)
@@ -225,9 +229,11 @@ def _output_gp(
 
 def _check_learned(learned: Learned, features: int) -> None:
     """Raises unless everything that was read belongs together."""
-    model, noise = learned.model, learned.noise
+    model = learned.model
+    noise = learned.noise
     outputs = len(model.kinematics.output_names)
-    n, e = model.kinematics.space.dim, model.kinematics.space.error_dim
+    n = model.kinematics.space.dim
+    e = model.kinematics.space.error_dim
     if max(n, len(learned.input_names), len(learned.context_names)) > _MOST:
         raise DataError(f"the model has more than {_MOST} states or inputs")
     check_number("time_step", learned.time_step, above=0, unit="[s]")
@@ -276,7 +282,8 @@ class LogDynamics:
     time_step: float  #: [s]
     noise: OutputNoise | None = None  #: of its outputs; none by default
     signals: Signals = UNKNOWN  #: names and time step, where they are known
-    dtype, device = torch.float64, torch.device("cpu")
+    dtype = torch.float64
+    device = torch.device("cpu")
 
     def __post_init__(self) -> None:
         late = (
@@ -308,7 +315,9 @@ class LogDynamics:
 
     @cached_property
     def _noise(self) -> Tensor:
-        space, noise, n = self.model.kinematics.space, self.noise, self.state_dim
+        space = self.model.kinematics.space
+        noise = self.noise
+        n = self.state_dim
         if noise is None:
             return torch.zeros(n, n, dtype=torch.float64)
         x = _resting(space)
@@ -321,12 +330,12 @@ class LogDynamics:
     def predict(self, state: Tensor, input: Tensor) -> Gaussian:
         """The next state's distribution: mean (*batch, n), covariance (*batch, n, n)."""
         check_query(self, state, input)
-        n, batch = self.state_dim, state.shape[:-1]
-        x, u = (
-            to_array(state).reshape(-1, n),
-            to_array(input).reshape(-1, self.input_dim),
-        )
-        mean, covariance = self._mean(x, u), self._covariance(x, u)
+        n = self.state_dim
+        batch = state.shape[:-1]
+        x = to_array(state).reshape(-1, n)
+        u = to_array(input).reshape(-1, self.input_dim)
+        mean = self._mean(x, u)
+        covariance = self._covariance(x, u)
         mean, covariance = (
             torch.from_numpy(a).reshape(*batch, *a.shape[1:])
             for a in (mean, covariance)
@@ -337,7 +346,8 @@ class LogDynamics:
         self, states: Array, inputs: Array, covariance: bool = True
     ) -> Linearized:
         """Linearises at K points (K, n), (K, m) by central differences, all of them at once."""
-        n, z = self.state_dim, np.concatenate([states, inputs], axis=1)
+        n = self.state_dim
+        z = np.concatenate([states, inputs], axis=1)
         h = DIFFERENCE * np.maximum(np.abs(z), 1.0)
         moved = (
             z + np.concatenate([np.eye(z.shape[1]), -np.eye(z.shape[1])])[:, None] * h
@@ -363,13 +373,13 @@ class LogDynamics:
         return after + full_turns(x - after, self.angles)
 
     def _covariance(self, x: Array, u: Array) -> Array:
-        model, nothing, K = self.model, np.empty((len(x), 0)), len(x)
+        model = self.model
+        nothing = np.empty((len(x), 0))
+        K = len(x)
         if not model.gps:
             return np.zeros((K, self.state_dim, self.state_dim))
-        z, y = (
-            np.ascontiguousarray(model.kinematics.features(x, u, nothing)),
-            model.outputs(x, u, nothing),
-        )
+        z = np.ascontiguousarray(model.kinematics.features(x, u, nothing))
+        y = model.outputs(x, u, nothing)
         V = np.zeros((K, y.shape[1], y.shape[1]))
         for gp in model.gps:
             learned: Any = gp.posterior.linearize(z, nothing, True).covariance
@@ -379,7 +389,8 @@ class LogDynamics:
 
     def _by_outputs(self, x: Array, y: Array) -> Array:
         """Derivatives of the next states by the outputs (K, n, o)."""
-        step, dt = self.model.kinematics.step, self.time_step
+        step = self.model.kinematics.step
+        dt = self.time_step
         columns = [
             step(x, y + h, dt) - step(x, y - h, dt)
             for h in DIFFERENCE * np.eye(y.shape[1])

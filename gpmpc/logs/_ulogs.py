@@ -140,7 +140,8 @@ def _sorted_out(content: bytes, topics: tuple[str, ...], room: Room) -> _Parts:
 
 def _messages(content: bytes, parts: _Parts, room: Room) -> Iterator[_Message]:
     """Yields whole messages; behind damage it goes on at the next synchronisation."""
-    position, ends = 16, [len(content)]
+    position = 16
+    ends = [len(content)]
     while position < len(content):
         room.take(_MESSAGE, "its messages")
         while len(ends) > 1 and position >= ends[0]:

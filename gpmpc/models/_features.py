@@ -37,10 +37,8 @@ class Features:
 
     def __post_init__(self) -> None:
         for key in ("states", "inputs", "angles"):
-            indices, count = (
-                getattr(self, key),
-                self.input_dim if key == "inputs" else self.state_dim,
-            )
+            indices = getattr(self, key)
+            count = self.input_dim if key == "inputs" else self.state_dim
             whole = all(isinstance(i, int) and not isinstance(i, bool) for i in indices)
             if (
                 not whole
@@ -88,11 +86,9 @@ class Features:
 
     def __call__(self, state: Tensor, input: Tensor) -> tuple[Tensor, Tensor]:
         """The features (*batch, d) of a state (*batch, n), and the selected inputs (*batch, m_s)."""
-        z, selected, sines = (
-            state[..., self.columns.tolist()],
-            input[..., list(self.inputs)],
-            self.sines.tolist(),
-        )
+        z = state[..., self.columns.tolist()]
+        selected = input[..., list(self.inputs)]
+        sines = self.sines.tolist()
         if not sines:
             return z, selected
         parts = [
@@ -105,12 +101,18 @@ class Features:
         self, states: Array, inputs: Array
     ) -> tuple[Array, Array, Array | None]:
         """Features (K, d), selected inputs (K, m_s), each feature's derivative (K, d) by its state, None for one."""
-        z, v, sines = states[:, self.columns], inputs[:, self._selected], self.sines
+        z = states[:, self.columns]
+        v = inputs[:, self._selected]
+        sines = self.sines
         if not self.angles:
             return z, v, None
-        sine, cosine, slope = np.sin(z[:, sines]), np.cos(z[:, sines]), np.ones_like(z)
-        z[:, sines], z[:, sines + 1] = sine, cosine
-        slope[:, sines], slope[:, sines + 1] = cosine, -sine
+        sine = np.sin(z[:, sines])
+        cosine = np.cos(z[:, sines])
+        slope = np.ones_like(z)
+        z[:, sines] = sine
+        z[:, sines + 1] = cosine
+        slope[:, sines] = cosine
+        slope[:, sines + 1] = -sine
         return z, v, slope
 
     def chain(
@@ -156,11 +158,11 @@ class Lags:
     @cached_property
     def nominal(self) -> Affine:
         """The nominal model for ``ResidualModel``: x stays where it is, and earlier values move on by a place."""
-        n, m, first = self.state_dim, self.input_dim, self.state_dim * (1 + self.states)
-        A, B = (
-            torch.zeros(self.dim, self.dim, dtype=torch.float64),
-            torch.zeros(self.dim, m, dtype=torch.float64),
-        )
+        n = self.state_dim
+        m = self.input_dim
+        first = self.state_dim * (1 + self.states)
+        A = torch.zeros(self.dim, self.dim, dtype=torch.float64)
+        B = torch.zeros(self.dim, m, dtype=torch.float64)
         A[:n, :n] = torch.eye(n)
         A[n:first, : first - n] = torch.eye(first - n)
         if self.inputs:
@@ -179,12 +181,12 @@ class Lags:
         Of states x_0 .. x_{T-1} (T, n) and inputs (T - 1 or T, m), each applied from the time of its row on;
         ``ShapeError`` where the two do not belong together, or hold too few rows.
         """
-        states, inputs = read_array("states", states), read_array("inputs", inputs)
-        T, first = len(states), max(self.states, self.inputs)
-        found, shapes = (
-            (np.shape(states), np.shape(inputs)),
-            [(k, self.input_dim) for k in (T - 1, T)],
-        )
+        states = read_array("states", states)
+        inputs = read_array("inputs", inputs)
+        T = len(states)
+        first = max(self.states, self.inputs)
+        found = (np.shape(states), np.shape(inputs))
+        shapes = [(k, self.input_dim) for k in (T - 1, T)]
         if found[0] != (T, self.state_dim) or found[1] not in shapes or first >= T:
             what = f"states (T, {self.state_dim}) and inputs (T or T - 1, {self.input_dim}) need T above {first}"
             raise ShapeError(f"{what}; got {found[0]} and {found[1]}")
@@ -194,7 +196,8 @@ class Lags:
 
     def transitions(self, states: Array, inputs: Array) -> Transitions:
         """Transitions of the state with earlier values, from one log at equal time steps; see ``augmented``."""
-        whole, first = self.augmented(states, inputs), max(self.states, self.inputs)
+        whole = self.augmented(states, inputs)
+        first = max(self.states, self.inputs)
         applied = read_array("inputs", inputs)[first : len(states) - 1]
         signals = self._signals(names_of(states), names_of(inputs))
         return Transitions(whole[:-1], applied, whole[1:], signals)

@@ -39,10 +39,8 @@ class Affine:
 
     def __post_init__(self) -> None:
         check_tensors(A=self.A, B=self.B, c=self.c)
-        shapes, n = (
-            [tuple(part.shape) for part in (self.A, self.B, self.c)],
-            self.c.numel(),
-        )
+        shapes = [tuple(part.shape) for part in (self.A, self.B, self.c)]
+        n = self.c.numel()
         if shapes != [(n, n), (n, *shapes[1][1:2]), (n,)] or self.B.dim() != 2:
             raise ShapeError(
                 f"A, B and c must be (n, n), (n, m) and (n,); got {', '.join(map(str, shapes))}"
@@ -51,7 +49,9 @@ class Affine:
     @classmethod
     def identity(cls, state_dim: int, input_dim: int) -> "Affine":
         """The model x+ = x, whose residual is the difference of two states."""
-        n, m, dtype = state_dim, input_dim, torch.float64
+        n = state_dim
+        m = input_dim
+        dtype = torch.float64
         return cls(
             torch.eye(n, dtype=dtype),
             torch.zeros(n, m, dtype=dtype),
@@ -86,7 +86,8 @@ class KnownModel:
     input_dim: int  #: m
     signals: Signals = UNKNOWN  #: names and time step, where they are known
 
-    dtype, device = torch.float64, torch.device("cpu")
+    dtype = torch.float64
+    device = torch.device("cpu")
 
     @property
     def tape(self) -> Any:
@@ -148,7 +149,8 @@ class CasadiFunction:
             raise UnsupportedModel(
                 f"a CasADi function takes vectors (column by column); got {function!r}"
             )
-        self.function, self.tape = function, tape_of(function)
+        self.function = function
+        self.tape = tape_of(function)
         self._mapped: dict[int, Any] = {}
         self.shape = function.size1_out(0), function.size2_out(0)
         self.sizes = [function.size1_in(i) for i in range(function.n_in())]
@@ -156,7 +158,8 @@ class CasadiFunction:
     @cached_property
     def _expansion(self) -> Any:
         """Value and derivatives as a CasADi function."""
-        names, value = self.function.name_in(), self.function.name_out(0)
+        names = self.function.name_in()
+        value = self.function.name_out(0)
         return self.function.factory(
             "expansion", names, [value, *(f"jac:{value}:{name}" for name in names)]
         )
@@ -189,10 +192,8 @@ class CasadiFunction:
             from gpmpc._kernels.tape import linearize_tape  # loads numba
 
             points = np.ascontiguousarray(np.hstack(arguments))
-            values, jacobians = (
-                np.empty((K, size)),
-                np.empty((K, size, points.shape[1])),
-            )
+            values = np.empty((K, size))
+            jacobians = np.empty((K, size, points.shape[1]))
             call_unchecked(linearize_tape, self.tape, points, values, jacobians)
             parts = [values, *np.split(jacobians, np.cumsum(self.sizes)[:-1], axis=2)]
         else:

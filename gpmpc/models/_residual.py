@@ -85,7 +85,10 @@ class ResidualModel(TensorModel):
     to = move
 
     def __post_init__(self) -> None:
-        gp, nominal, n, m = self.residual, self.nominal, self.state_dim, self.input_dim
+        gp = self.residual
+        nominal = self.nominal
+        n = self.state_dim
+        m = self.input_dim
         if getattr(gp, "predicts", None) != "value":
             raise SettingError(
                 "residual",
@@ -248,7 +251,8 @@ class ResidualModel(TensorModel):
         if callable(self.B):
             B, dB = linearize_function(self.B, self, states)
             if B.ndim == 2:  # one output
-                B, dB = B[..., None], dB[:, :, None]
+                B = B[..., None]
+                dB = dB[:, :, None]
             A = A + (dB * d.mean[:, None, :, None]).sum(2)
         else:
             B = self._constant_effect
@@ -263,7 +267,8 @@ class ResidualModel(TensorModel):
     @property
     def affine_form(self) -> AffineForm | None:
         """The parts of the model; None unless B is constant, and the nominal model ``Affine`` or a tape."""
-        nominal, tape = self.nominal, getattr(self.nominal, "tape", None)
+        nominal = self.nominal
+        tape = getattr(self.nominal, "tape", None)
         if callable(self.B) or not (isinstance(nominal, Affine) or tape is not None):
             return None
         A, G, c = (
@@ -271,11 +276,9 @@ class ResidualModel(TensorModel):
             if isinstance(nominal, Affine)
             else (None, None, None)
         )
-        states, inputs, angles = (
-            list(self.states),
-            list(self.inputs),
-            tuple(self.angles),
-        )
+        states = list(self.states)
+        inputs = list(self.inputs)
+        angles = tuple(self.angles)
         return AffineForm(self.residual, A, G, c, self.B, states, inputs, angles, tape)
 
 
@@ -337,7 +340,8 @@ def train_residual(
         raise SettingError(
             "trainer", f"must be a Trainer or SparseTrainer; got {trainer!r}"
         )
-    n, m = transitions.state_dim, transitions.input_dim
+    n = transitions.state_dim
+    m = transitions.input_dim
     nominal = Affine.identity(n, m) if nominal is None else nominal
     B = torch.eye(n, dtype=torch.float64) if B is None else B
     states, inputs = (
@@ -397,7 +401,8 @@ def _columns(transitions: Transitions, B: Effect, seen: Features) -> Columns:
         outputs = [f"what is missed of {name}" for name in states]
     else:
         outputs = [f"output {a + 1} of the residual" for a in range(reach.shape[-2])]
-    before, after = transitions.states, transitions.next_states
+    before = transitions.states
+    after = transitions.next_states
     larger = torch.maximum(before.abs(), after.abs())
     magnitudes = (reach.abs() @ larger[..., None]).amax(dim=0)[:, 0]
     steps = (reach @ (after - before)[..., None])[..., 0]
@@ -417,7 +422,8 @@ def _check_derivatives(nominal: Nominal, B: Effect, transitions: Transitions) ->
     Training asks for no derivative: only a controller would come upon it. What is wrong
     with a function's shape is said at all rows.
     """
-    x, u = to_array(transitions.states[:2]), to_array(transitions.inputs[:2])
+    x = to_array(transitions.states[:2])
+    u = to_array(transitions.inputs[:2])
     with suppress(ShapeError):
         if not hasattr(nominal, "linearize"):
             linearize_function(

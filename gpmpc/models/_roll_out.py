@@ -30,7 +30,8 @@ class RollOut:
     """
 
     def __init__(self, model: DynamicsModel):
-        self._model, self._gps = model, None
+        self._model = model
+        self._gps = None
         form: AffineForm | None = getattr(model, "affine_form", None)
         if form is not None and host_arrays(form.f.weights) is not None:
             self._gps = _compiled_form(form, model.state_dim, model.input_dim)
@@ -42,7 +43,8 @@ class RollOut:
     ) -> tuple[Array, Array]:
         """Returns states (T, H + 1, n) and inputs (T, H, m) from x_0 (T, n) on; a disturbance (n,) is added at each."""
         (T, H, m), n = feedback.inputs.shape, start.shape[1]
-        states, inputs = np.empty((T, H + 1, n)), np.empty((T, H, m))
+        states = np.empty((T, H + 1, n))
+        inputs = np.empty((T, H, m))
         start = np.ascontiguousarray(start, dtype=float)
         added = (
             np.zeros(n)
@@ -55,7 +57,8 @@ class RollOut:
             )
             return states, inputs
         gains = np.broadcast_to(feedback.gains, (T, *feedback.gains.shape[1:]))
-        states[:, 0], last = start, feedback.previous_input
+        states[:, 0] = start
+        last = feedback.previous_input
         for k in range(H):
             u = (
                 feedback.inputs[:, k]
@@ -80,8 +83,10 @@ class RollOut:
     ) -> Array:
         """Returns the states (T, H + 1, n) that inputs (T, H, m) lead to from x_0 (T, n), without bounds."""
         (T, H, m), n = inputs.shape, start.shape[1]
-        gains, free = np.zeros((1, H, m, n)), np.full((H, m), np.inf)
-        planned, inputs = np.zeros((T, H, n)), np.ascontiguousarray(inputs, dtype=float)
+        gains = np.zeros((1, H, m, n))
+        free = np.full((H, m), np.inf)
+        planned = np.zeros((T, H, n))
+        inputs = np.ascontiguousarray(inputs, dtype=float)
         law = Feedback(planned, inputs, gains, -free, free, -free, free, np.zeros(m))
         return self(start, law, disturbance)[0]
 
@@ -97,8 +102,10 @@ def _compiled_form(form: AffineForm, n: int, m: int) -> AffineGPs:
     inputs = list(range(m)) if form.inputs is None else form.inputs
     features = Features(states, inputs, form.angles, n, m)
     kinds = np.full(features.dim, PLAIN)
-    kinds[features.sines], kinds[features.sines + 1] = SINE, COSINE
-    zero, shapes = torch.zeros((), dtype=torch.float64), ((n, n), (n, m), (n,))
+    kinds[features.sines] = SINE
+    kinds[features.sines + 1] = COSINE
+    zero = torch.zeros((), dtype=torch.float64)
+    shapes = ((n, n), (n, m), (n,))
     parts = zip((form.A, form.G, form.c), shapes, strict=True)
     A, G, c = (
         to_array((zero if part is None else part).expand(shape).contiguous())
@@ -114,10 +121,10 @@ def _compiled_form(form: AffineForm, n: int, m: int) -> AffineGPs:
 
 def _known_form(model: Any) -> AffineGPs:
     """The arrays of a tape alone, without a GP."""
-    n, m, none = model.state_dim, model.input_dim, np.empty((0, 0))
-    nothing, empty = (
-        GPArrays(none, none, np.empty(0), none, 0),
-        np.empty(0, dtype=np.intp),
-    )
+    n = model.state_dim
+    m = model.input_dim
+    none = np.empty((0, 0))
+    nothing = GPArrays(none, none, np.empty(0), none, 0)
+    empty = np.empty(0, dtype=np.intp)
     affine = np.zeros((n, n)), np.zeros((n, m)), np.zeros(n), np.empty((n, 0))
     return AffineGPs(nothing, np.empty(0), *affine, empty, empty, empty, model.tape)

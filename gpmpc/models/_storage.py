@@ -150,7 +150,8 @@ def _parts(path: Path, model: Any) -> tuple[dict[str, Any], dict[str, Tensor]]:
     header: dict[str, Any] = {"kind": kind}
     tensors: dict[str, Tensor] = {}
     for name in (field.name for field in fields(model)):
-        value, inner = getattr(model, name), {}
+        value = getattr(model, name)
+        inner = {}
         if isinstance(value, Tensor):
             tensors[name] = value
         elif isinstance(value, Signals):
@@ -254,7 +255,9 @@ def _function_sizes(
         Entries of each argument, and rows and columns of the value.
     """
     square = tensors["noise"] if "noise" in tensors else tensors["B"]
-    n, k, m = len(square), tensors["residual/targets"].shape[1], header["input_dim"]
+    n = len(square)
+    k = tensors["residual/targets"].shape[1]
+    m = header["input_dim"]
     if max(n, _plain("input_dim", m)) > _MOST:
         raise DataError(f"the model has more than {_MOST} states, outputs or inputs")
     return ([n, m], [n, 1]) if name == "nominal" else ([n], [n, k])
@@ -269,11 +272,16 @@ def _described(key: str, function: Any, tensors: dict[str, Tensor]) -> dict[str,
             for part in ("code", "constants")
         }
         return {"kind": "operations", "sizes": function.sizes, "shape": function.shape}
-    kind, source, parameters = "function", function, {}
+    kind = "function"
+    source = function
+    parameters = {}
     if isinstance(function, partial) and not function.args:
-        kind, source, parameters = "partial", function.func, dict(function.keywords)
+        kind = "partial"
+        source = function.func
+        parameters = dict(function.keywords)
     elif is_dataclass(function) and not isinstance(function, type):
-        kind, source = "dataclass", type(function)
+        kind = "dataclass"
+        source = type(function)
         parameters = {
             field.name: getattr(function, field.name)
             for field in fields(function)
@@ -316,7 +324,9 @@ def _function(
             )
         code, constants = (tensors[part].numpy() for part in ("code", "constants"))
         return CasadiFunction(function_of_tape(code, constants, arguments, value))
-    kind, name, parameters = entry["kind"], entry["path"], entry["parameters"]
+    kind = entry["kind"]
+    name = entry["path"]
+    parameters = entry["parameters"]
     if not isinstance(parameters, dict):
         raise DataError(f"{key} has no parameters by name")
     source = _imported(name) if name in MODEL_CODE else trusted_code(name, trusted)

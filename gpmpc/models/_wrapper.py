@@ -61,7 +61,8 @@ class Wrapper(TensorModel):
     @property
     def signals(self) -> Signals:
         """Names and time step, where the model knows them; further states are named, too."""
-        inner, further = signals_of(self.model), self._further_names
+        inner = signals_of(self.model)
+        further = self._further_names
         if not further or not inner.state_names:
             return inner
         names = (*inner.state_names, *further)
@@ -115,11 +116,9 @@ class LinearWrapper(Wrapper):
             states @ Z.T + inputs @ W.T,
             covariance,
         )
-        mean, A, B = (
-            states @ L.T + inputs @ M.T,
-            np.tile(L, (K, 1, 1)),
-            np.tile(M, (K, 1, 1)),
-        )
+        mean = states @ L.T + inputs @ M.T
+        A = np.tile(L, (K, 1, 1))
+        B = np.tile(M, (K, 1, 1))
         mean[:, :n] += inner.mean
         A[:, :n] += inner.B @ Z
         A[:, :n, :n] += inner.A
@@ -197,10 +196,8 @@ class DelayedModel(LinearWrapper):
         every = np.eye(
             (D + 1) * m
         )  # of the inputs on their way and the one before them
-        acting, moved = (
-            w * every[:m] + (1 - w) * every[m : 2 * m],
-            np.vstack([np.zeros((n, len(every))), every[m:]]),
-        )
+        acting = w * every[:m] + (1 - w) * every[m : 2 * m]
+        moved = np.vstack([np.zeros((n, len(every))), every[m:]])
         Z, L = (
             np.hstack([np.zeros((len(part), n)), part[:, : D * m]])
             for part in (acting, moved)
@@ -241,7 +238,8 @@ class DelayedModel(LinearWrapper):
         Raises:
             ShapeError: Another number of inputs.
         """
-        queue, w = self._queue(belief, inputs), self._share
+        queue = self._queue(belief, inputs)
+        w = self._share
         for k in range(self.lead):
             belief = propagator(
                 self.model,
@@ -325,9 +323,12 @@ class DisturbedModel(LinearWrapper):
     @cached_property
     def matrices(self) -> tuple[Array, Array, Array, Array]:
         """Of the linear part: E d is added to f(x, u), and d moves on by Phi."""
-        n, k, m = self.model.state_dim, self.state_dim, self.input_dim
+        n = self.model.state_dim
+        k = self.state_dim
+        m = self.input_dim
         L = np.zeros((k, k))
-        L[:n, n:], L[n:, n:] = to_array(self.effect), np.diag(self.decay)
+        L[:n, n:] = to_array(self.effect)
+        L[n:, n:] = np.diag(self.decay)
         return np.zeros((m, k)), np.eye(m), L, np.zeros((k, m))
 
     def augmented(self, belief: Gaussian, std: Sequence[float]) -> Gaussian:
@@ -421,7 +422,8 @@ class NoisyModel(Wrapper):
         found = linearize(self.model, states, inputs, covariance)
         if found.covariance is None:
             return found
-        g, at = self.log_noise.linearize(states, inputs), list(self.outputs)
+        g = self.log_noise.linearize(states, inputs)
+        at = list(self.outputs)
         V = found.covariance + to_array(self._constant)
         V[:, at, at] += np.exp(
             g.mean + np.einsum("kii->ki", cast(Array, g.covariance)) / 2

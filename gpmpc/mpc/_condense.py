@@ -71,7 +71,9 @@ def condense(
         bounds.rate_lower.size + rows.lower.size,
     )
     lower, upper = np.empty((2, size + count))
-    P, q, G = np.empty((size, size)), np.empty(size), np.empty((count, size))
+    P = np.empty((size, size))
+    q = np.empty(size)
+    G = np.empty((count, size))
     program = CondensedProgram(P, q, G, lower, upper, np.empty((0, m, p + m + 1)))
     given = cost, bounds, stages, start, references, rows
     if call_unchecked(_condense, *given, program) <= _LARGEST_GROWTH:
@@ -89,12 +91,11 @@ def _condense(cost, bounds, stages, start, references, rows, program):
         program.G,
         0.0,
     )
-    P[:], G[:] = 0.0, 0.0
+    P[:] = 0.0
+    G[:] = 0.0
     for k in range(H):
-        R, following = (
-            cost.input[min(k, len(cost.input) - 1)],
-            cost.input[min(k + 1, len(cost.input) - 1)],
-        )
+        R = cost.input[min(k, len(cost.input) - 1)]
+        following = cost.input[min(k + 1, len(cost.input) - 1)]
         for i in range(m):
             for j in range(m):
                 P[k * m + i, k * m + j] = 2.0 * R[i, j]
@@ -125,10 +126,15 @@ def _add_varying_stages(cost, stages, rows, H, P, G):
         len(stages.A) - 1,
         cost.squares,
     )
-    E, D = rows.E, rows.D
+    E = rows.E
+    D = rows.D
     r = E.shape[1]
-    M, MA, MB = _zeros(p, p), _zeros(p, p), _zeros(p, m)
-    A, transposed, B = _zeros(p, p), np.empty((p, p)), _zeros(p, m)
+    M = _zeros(p, p)
+    MA = _zeros(p, p)
+    MB = _zeros(p, m)
+    A = _zeros(p, p)
+    transposed = np.empty((p, p))
+    B = _zeros(p, m)
     BM = np.empty((H, m, p))  # 2 B_k' M_{k+1}
     for k in range(
         H - 1, -1, -1
@@ -150,9 +156,12 @@ def _add_varying_stages(cost, stages, rows, H, P, G):
             combine_rows(MA, p, transposed[i], 0, p, M[i])
         if len(Z) > 0:
             _add_inputs_of_square(Z[k], stages.B[at], BM[k], P[k * m :, k * m :])
-    gamma, following, row = _zeros(p, H * m), _zeros(p, H * m), _zeros(1, H * m)[0]
+    gamma = _zeros(p, H * m)
+    following = _zeros(p, H * m)
+    row = _zeros(1, H * m)[0]
     for k in range(H):  # forward: Gamma_{k+1}
-        at, width = min(k, last), (k + 1) * m
+        at = min(k, last)
+        width = (k + 1) * m
         for i in range(p):
             combine_rows(gamma, p, stages.A[at, i], 0, k * m, following[i])
             for j in range(m):
@@ -174,7 +183,8 @@ def _add_varying_stages(cost, stages, rows, H, P, G):
 @njit_inner
 def _add_inputs_of_square(Z, B, BM, P):
     """Adds what weighs u_k in z'Zz: alone and with s_{k+1} to its block of P, with what came before to 2 B'M."""
-    m, n = len(BM), len(Z) - len(BM) - 1
+    m = len(BM)
+    n = len(Z) - len(BM) - 1
     for a in range(m):
         for b in range(m):
             P[a, b] += 2.0 * Z[n + a, n + b]
@@ -188,12 +198,12 @@ def _add_inputs_of_square(Z, B, BM, P):
 def _add_constant_stages(cost, stages, E, H, P, G):
     """``_add_varying_stages`` for one A, B and E."""
     (p, m), r, size = stages.B.shape[1:], len(E), len(P)
-    X, transposed = _zeros(size, p), _zeros(p, p)  # row l m + a of X: column a of A^l B
-    W, T, same = (
-        _padded(cost.state[0]),
-        _padded(cost.terminal),
-        np.array_equal(cost.state[0], cost.terminal),
-    )
+    # row l m + a of X: column a of A^l B
+    X = _zeros(size, p)
+    transposed = _zeros(p, p)
+    W = _padded(cost.state[0])
+    T = _padded(cost.terminal)
+    same = np.array_equal(cost.state[0], cost.terminal)
     for i in range(p):
         for j in range(p):
             transposed[j, i] = stages.A[0, i, j]
@@ -201,25 +211,27 @@ def _add_constant_stages(cost, stages, E, H, P, G):
             X[a, i] = stages.B[0, i, a]
     for row in range(m, size):
         combine_rows(transposed, p, X[row - m], 0, p, X[row])
-    strip, stage, end = (
-        _zeros(p, size + 8),
-        _zeros(1, size + 8)[0],
-        _zeros(1, size + 8)[0],
-    )
+    strip = _zeros(p, size + 8)
+    stage = _zeros(1, size + 8)[0]
+    end = _zeros(1, size + 8)[0]
     for row in range(size):
         for i in range(p):
             strip[i, row] = X[row, i]
-    sums, weighed = _zeros(m, size), _zeros(1, p + 8)[0]
+    sums = _zeros(m, size)
+    weighed = _zeros(1, p + 8)[0]
     for k in range(H):
         # Block (j, j - d) is the sum over l <= k = H - 1 - j of X_l' W X_{l + d}, the last with the terminal weight.
-        j, start = H - 1 - k, k * m
+        j = H - 1 - k
+        start = k * m
         for a in range(m):
             _weigh(W, X[start + a], weighed)
             combine_rows(strip, p, weighed, start, size - start, stage)
             if not same:
                 _weigh(T, X[start + a], weighed)
                 combine_rows(strip, p, weighed, start, size - start, end)
-            ends, total, out = stage if same else end, sums[a], P[j * m + a]
+            ends = stage if same else end
+            total = sums[a]
+            out = P[j * m + a]
             for d in range(j + 1):
                 for b in range(m):
                     out[(j - d) * m + b] += 2.0 * (
@@ -239,19 +251,15 @@ def _add_constant_stages(cost, stages, E, H, P, G):
 @njit_inner
 def _write_gradient_and_bounds(cost, bounds, stages, start, references, rows, program):
     """Writes q by the adjoint recursion, and the bounds of the stacked constraints, in input coordinates."""
-    A, B, Z, targets, last = (
-        stages.A,
-        stages.B,
-        cost.squares,
-        references.states,
-        len(stages.A) - 1,
-    )
+    A = stages.A
+    B = stages.B
+    Z = cost.squares
+    targets = references.states
+    last = len(stages.A) - 1
     (H, m), n, p = references.inputs.shape, targets.shape[1], len(start)
-    q, previous, free = (
-        program.q.reshape(H, m),
-        references.previous_input,
-        np.empty((H + 1, p)),
-    )
+    q = program.q.reshape(H, m)
+    previous = references.previous_input
+    free = np.empty((H + 1, p))
     copy(start, free[0])
     for k in range(H):
         for i in range(p):
@@ -260,7 +268,9 @@ def _write_gradient_and_bounds(cost, bounds, stages, start, references, rows, pr
             )
     q[:] = 0.0
     W = _padded(cost.state[0])
-    error, gradient, pulled = np.empty(p), np.zeros(p + 8), np.zeros(p)
+    error = np.empty(p)
+    gradient = np.zeros(p + 8)
+    pulled = np.zeros(p)
     for k in range(H - 1, -1, -1):
         R = cost.input[min(k, len(cost.input) - 1)]
         for j in range(m):
@@ -290,7 +300,9 @@ def _write_gradient_and_bounds(cost, bounds, stages, start, references, rows, pr
                 q[k, i - n] += slope
         pulled[:] = 0.0
         for i in range(p):
-            weight, row, reach = gradient[i], A[min(k, last), i], B[min(k, last), i]
+            weight = gradient[i]
+            row = A[min(k, last), i]
+            reach = B[min(k, last), i]
             for j in range(p):
                 pulled[j] += weight * row[j]
             for j in range(m):
@@ -302,10 +314,13 @@ def _write_gradient_and_bounds(cost, bounds, stages, start, references, rows, pr
 def condense_with_feedback(cost, bounds, stages, start, references, rows):
     """``condense`` in feedback coordinates."""
     (p, m), r, E, D = stages.B.shape[1:], rows.E.shape[1], rows.E, rows.D
-    H, limited = len(references.inputs), bounds.rate_lower.size
-    size, count = H * m, H * m + limited + H * r
+    H = len(references.inputs)
+    limited = bounds.rate_lower.size
+    size = H * m
+    count = H * m + limited + H * r
     feedback, hessians = optimal_feedback(cost, stages, references)
-    P, G = np.zeros((size, size)), np.zeros((count, size))
+    P = np.zeros((size, size))
+    G = np.zeros((count, size))
     reach, following, factors = (
         _zeros(p + m, size),
         _zeros(p, size),
@@ -313,7 +328,9 @@ def condense_with_feedback(cost, bounds, stages, start, references, rows):
     )  # of s_k and u_{k-1}; of s_{k+1}
     inputs = _zeros(m, size)  # of u_k
     for k in range(H):
-        at, here, width = min(k, len(stages.A) - 1), k * m, (k + 1) * m
+        at = min(k, len(stages.A) - 1)
+        here = k * m
+        width = (k + 1) * m
         for i in range(m):
             for j in range(m):
                 P[here + i, here + j] = 2.0 * hessians[k, i, j]
@@ -332,17 +349,16 @@ def condense_with_feedback(cost, bounds, stages, start, references, rows):
             combine_rows(reach, p + m, factors, 0, width, following[i])
         copy_matrix(following, reach[:p])
         for e in range(r):
-            factors[:p], factors[p:] = E[min(k, len(E) - 1), e], 0.0
+            factors[:p] = E[min(k, len(E) - 1), e]
+            factors[p:] = 0.0
             if len(D) > 0:
                 factors[p:] = D[k, e]
             combine_rows(reach, p + m, factors, 0, width, inputs[0])
             copy(inputs[0], G[size + limited + k * r + e, :width])
             inputs[0, here:width] = 0.0
-    previous, lower, upper = (
-        references.previous_input,
-        np.full(size + count, -np.inf),
-        np.full(size + count, np.inf),
-    )
+    previous = references.previous_input
+    lower = np.full(size + count, -np.inf)
+    upper = np.full(size + count, np.inf)
     program = CondensedProgram(P, np.zeros(size), G, lower, upper, feedback)
     free_inputs, free = expand(stages, start, feedback, previous, program.q)
     _write_bounds(bounds, rows, free_inputs, free, previous, size, program)
@@ -353,29 +369,26 @@ def condense_with_feedback(cost, bounds, stages, start, references, rows):
 def _write_bounds(bounds, rows, inputs, states, previous_input, unbounded, program):
     """Writes bounds of the stacked constraints after the unbounded ones, given what inputs and states are at v = 0."""
     (H, m), limited, E, D = inputs.shape, bounds.rate_lower.size, rows.E, rows.D
-    lower, upper = program.lower, program.upper
-    first, r = unbounded + H * m, E.shape[1]
+    lower = program.lower
+    upper = program.upper
+    first = unbounded + H * m
+    r = E.shape[1]
     for k in range(H):
         for i in range(m):
             at = unbounded + k * m + i
-            lower[at], upper[at] = (
-                bounds.lower[k, i] - inputs[k, i],
-                bounds.upper[k, i] - inputs[k, i],
-            )
+            lower[at] = bounds.lower[k, i] - inputs[k, i]
+            upper[at] = bounds.upper[k, i] - inputs[k, i]
             if limited > 0:
                 rate = inputs[k, i] - (inputs[k - 1, i] if k > 0 else previous_input[i])
                 at = first + k * m + i
-                lower[at], upper[at] = (
-                    bounds.rate_lower[k, i] - rate,
-                    bounds.rate_upper[k, i] - rate,
-                )
+                lower[at] = bounds.rate_lower[k, i] - rate
+                upper[at] = bounds.rate_upper[k, i] - rate
         for e in range(r):
-            at, value = (
-                first + limited + k * r + e,
-                dot(E[min(k, len(E) - 1), e], states[k + 1], E.shape[2]),
-            )
+            at = first + limited + k * r + e
+            value = dot(E[min(k, len(E) - 1), e], states[k + 1], E.shape[2])
             value += dot(D[k, e], inputs[k], m) if len(D) > 0 else 0.0
-            lower[at], upper[at] = rows.lower[k, e] - value, rows.upper[k, e] - value
+            lower[at] = rows.lower[k, e] - value
+            upper[at] = rows.upper[k, e] - value
 
 
 @njit_inner

@@ -63,10 +63,8 @@ class Reference:
         if not plain or self.signals is not UNKNOWN:
             check_signals(self.signals)
             self._read_names()
-        shape, wide = (
-            np.shape(self.states),
-            None if self.inputs is None else np.shape(self.inputs),
-        )
+        shape = np.shape(self.states)
+        wide = None if self.inputs is None else np.shape(self.inputs)
         if len(shape) == 1:
             if wide is not None and len(wide) != 1:
                 raise ShapeError(f"inputs of a set point must be (m,); got {wide}")
@@ -105,7 +103,8 @@ class Reference:
         Raises:
             DataError: Its own names are others.
         """
-        states, inputs = self.states, self.inputs
+        states = self.states
+        inputs = self.inputs
         if self.signals.state_names and signals.state_names:
             names = self.signals.state_names
             states = sorted_columns(
@@ -314,12 +313,12 @@ class Request(NamedTuple):
             belief = belief.in_order(signals.state_names)
         if reference.signals is not UNKNOWN:
             reference = reference.in_order(signals)
-        reference, n, m = reference.over(horizon), problem.state_dim, problem.input_dim
-        state, covariance, states = (
-            _array(belief.mean),
-            _array(belief.covariance),
-            _array(reference.states),
-        )
+        reference = reference.over(horizon)
+        n = problem.state_dim
+        m = problem.input_dim
+        state = _array(belief.mean)
+        covariance = _array(belief.covariance)
+        states = _array(reference.states)
         if state.shape != (n,) or states.shape != (horizon + 1, n):
             expected = f"({n},) and ({horizon + 1}, {n})"
             raise ShapeError(
@@ -334,20 +333,20 @@ class Request(NamedTuple):
             raise ShapeError(
                 f"reference inputs must have shape ({horizon}, {m}); got {inputs.shape}"
             )
-        last, guess = (
-            _array(initial_input if previous is None else previous.input),
-            np.empty((horizon, m)),
-        )
+        last = _array(initial_input if previous is None else previous.input)
+        guess = np.empty((horizon, m))
         usable = (
             previous is not None
             and previous.applicable
             and np.shape(previous.inputs) == guess.shape
         )
         made = previous if usable else None
-        first, guessed = (_NO_PLAN if made is None else _array(made.inputs)), None
+        first = _NO_PLAN if made is None else _array(made.inputs)
+        guessed = None
         if plan is not None:
             first, guessed = _read_plan(plan, horizon, n, m)
-        given, limits = (state, covariance, states, inputs), problem.inputs.sides
+        given = (state, covariance, states, inputs)
+        limits = problem.inputs.sides
         finite = call_unchecked(_check, *given, last, first, limits, guess)
         if not finite[3]:
             last = _array(initial_input)
@@ -495,10 +494,8 @@ def _check(state, covariance, states, inputs, last, plan, limits, guess):
     (H, m), (lower, upper) = guess.shape, limits
     for k in range(H):
         for j in range(m):
-            u, at = (
-                plan[min(k + 1, len(plan) - 1), j] if len(plan) > 0 else last[j],
-                min(k, len(lower) - 1),
-            )
+            u = plan[min(k + 1, len(plan) - 1), j] if len(plan) > 0 else last[j]
+            at = min(k, len(lower) - 1)
             guess[k, j] = min(max(u, lower[at, j]), upper[at, j])
     belief = _is_finite(state) and _is_finite(covariance.ravel())
     return (

@@ -41,8 +41,10 @@ class Tracking:
     angles: Sequence[int] = ()
 
     def __post_init__(self) -> None:
-        Q, R = _weight("Q", self.Q), _weight("R", self.R)
-        lowest, n = np.linalg.eigvalsh(R).min(), Q.shape[-1]
+        Q = _weight("Q", self.Q)
+        R = _weight("R", self.R)
+        lowest = np.linalg.eigvalsh(R).min()
+        n = Q.shape[-1]
         if lowest <= 0:
             raise SettingError(
                 "R",
@@ -77,7 +79,8 @@ class Tracking:
         Raises:
             SettingError: They are for another number of stages.
         """
-        Q, R = by_stage("Q", self.Q, horizon, 2), by_stage("R", self.R, horizon, 2)
+        Q = by_stage("Q", self.Q, horizon, 2)
+        R = by_stage("R", self.R, horizon, 2)
         return np.concatenate([Q[:-1], self.terminal[None]]), R
 
 

@@ -28,7 +28,8 @@ class BeyondData(NamedTuple):
 
     def __str__(self) -> str:
         """A line that says what to do."""
-        reference, data = _in_words(self.reference), _in_words(self.data)
+        reference = _in_words(self.reference)
+        data = _in_words(self.data)
         what = f"the reference of {self.name} is {reference}, its data {data}"
         return f"{what}: learn from data there, too"
 
@@ -67,7 +68,8 @@ def beyond_data(model: DynamicsModel, reference: Any) -> list[BeyondData]:
         if column.angle:
             middle = 0.5 * (column.low + column.high)
             values = values - TURN * np.round((values - middle) / TURN)
-        low, high = float(values.min()), float(values.max())
+        low = float(values.min())
+        high = float(values.max())
         excess = max(column.low - low, high - column.high)
         width = column.high - column.low
         if excess <= _SMALL * width or excess <= _SMALL * column.lengthscale:
@@ -92,9 +94,11 @@ def _columns(model: Any) -> list[_Column]:
 
 def _columns_of(gp: GPPosterior, states: list[int], angles: list[int]) -> list[_Column]:
     """The columns of the states that a GP sees, an angle as its sine and cosine."""
-    features, lengthscales = to_array(gp.features), to_array(gp.lengthscales)
+    features = to_array(gp.features)
+    lengthscales = to_array(gp.lengthscales)
     shortest = lengthscales.min(axis=0)
-    columns, at = [], 0
+    columns = []
+    at = 0
     for state in states:
         if state in angles:
             low, high = _arc(np.arctan2(features[:, at], features[:, at + 1]))
@@ -103,7 +107,8 @@ def _columns_of(gp: GPPosterior, states: list[int], angles: list[int]) -> list[_
             at += 2
             continue
         values = features[:, at]
-        low, high = float(values.min()), float(values.max())
+        low = float(values.min())
+        high = float(values.max())
         columns.append(_Column(state, low, high, float(shortest[at])))
         at += 1
     return sorted(columns)

@@ -59,7 +59,12 @@ _ROUNDING = 1e-9
 
 # Why a step is not healthy; the number is that of the kernel.
 _HEALTHY, _INNOVATION, _PROMISE, _NOVELTY, _VIOLATION, _FAILURES, _SATURATED = range(7)
-_FROZEN, _BIAS, _AWAY, _RISING, _CLIMBING, _STANDING = 7, 8, 9, 10, 11, 12
+_FROZEN = 7
+_BIAS = 8
+_AWAY = 9
+_RISING = 10
+_CLIMBING = 11
+_STANDING = 12
 
 
 class Judgement(NamedTuple):
@@ -85,7 +90,8 @@ class FlightJudgement(NamedTuple):
     def of(cls, steps: Sequence[Judgement]) -> "FlightJudgement":
         """The judgement of a flight by those of its steps."""
         levels = [judgement.level for judgement in steps]
-        suspicious, lost = levels.count("suspicious"), levels.count("lost")
+        suspicious = levels.count("suspicious")
+        lost = levels.count("lost")
         if not steps:
             return cls()
         if lost:
@@ -161,7 +167,8 @@ class _Memory(NamedTuple):
 _TRAVEL, _LOST_AT, _VIOLATION_THEN, _STUCK_AT, _COST_BEFORE, _NEAREST, _NUMBERS = range(
     7
 )
-_RINGS, _LENGTH = 7, 2 * _GROWTH[1] + 1
+_RINGS = 7
+_LENGTH = 2 * _GROWTH[1] + 1
 _SIGNED = _WINDOW  # where the rings of each state begin, one below the other
 _CHANGED = _SIGNED + _BIAS_WINDOW
 _ORDERED = _CHANGED + _MEMORY
@@ -180,7 +187,9 @@ class _Store(NamedTuple):
 
 @njit_noalloc
 def _memory_in(store):
-    states, rings, counts = store.states, store.rings, store.counts
+    states = store.states
+    rings = store.rings
+    counts = store.counts
     return _Memory(
         states[:_SIGNED],
         states[_SIGNED:_CHANGED],
@@ -246,7 +255,8 @@ class FlightJudge:
         noise: Any = None,
         names: tuple[Sequence[str], Sequence[str]] = ((), ()),
     ):
-        n, m = problem.state_dim, problem.input_dim
+        n = problem.state_dim
+        m = problem.input_dim
         angles = np.zeros(n)
         angles[list(problem.cost.angles)] = 1.0
         own_noise = np.zeros(n) if noise is None else np.asarray(noise, dtype=float)
@@ -303,10 +313,13 @@ class FlightJudge:
             reference: What it is to be from now on (H + 1, n), or a set point (n,).
             decision: What the controller decided on it; None where it was not called.
         """
-        last_means, last_covariances = self._means, self._covariances
-        self._means, self._covariances = self._no_means, self._no_covariances
+        last_means = self._means
+        last_covariances = self._covariances
+        self._means = self._no_means
+        self._covariances = self._no_covariances
         input = self._no_input
-        novelty, violation = math.nan, 0.0
+        novelty = math.nan
+        violation = 0.0
         if decision is not None:
             input = _float64(decision.input)
             if decision.applicable:
@@ -416,7 +429,8 @@ def _judge(
     qualities,
 ):
     """Takes a step into the memory; returns why it is not healthy, which entry that is about, and a number."""
-    n, horizon = len(measured), len(means) - 1
+    n = len(measured)
+    horizon = len(means) - 1
     settings = _Settings(
         table[:n],
         table[n : 2 * n],
@@ -445,7 +459,8 @@ def _judge(
 
 @njit_noalloc
 def _judge_step(settings, memory, reading):
-    counts, numbers = memory.counts, memory.numbers
+    counts = memory.counts
+    numbers = memory.numbers
     k = counts[_STEPS]
     slot = k % _WINDOW
     if counts[_LOOK_AHEAD] == 0 and reading.applied:
@@ -464,7 +479,8 @@ def _judge_step(settings, memory, reading):
     cost_grows = _is_growing(memory.costs, k, half)
     memory.far[slot] = 1.0 if reading.novelty > _FAR else 0.0
     memory.failed[slot] = 0.0 if reading.applied else 1.0
-    failures, far = _total(memory.failed), _total(memory.far)
+    failures = _total(memory.failed)
+    far = _total(memory.far)
     predicts_well = state < 0 and biased < 0 and far == 0.0
     was_nearer = memory.distances[(k - 2 * half) % _LENGTH] < distance
     share = 0.0  # of the cost from which the plans were to bring it down
@@ -516,8 +532,10 @@ def _read_news(settings, memory, reading):
     """What the end of the reference tells that no plan has known before, in the cost's metric."""
     counts = memory.counts
     n = len(reading.measured)
-    now, end = reading.reference[0], reading.reference[-1]
-    square, size = 0.0, 0.0
+    now = reading.reference[0]
+    end = reading.reference[-1]
+    square = 0.0
+    size = 0.0
     for i in range(n):
         step = _wrapped(end[i] - memory.horizon_end[i], settings.angles[i])
         size += settings.weights[i, i] * end[i] * end[i]
@@ -546,7 +564,8 @@ def _read_news(settings, memory, reading):
 @njit_noalloc
 def _follow_cost(memory, reading):
     """What the plan costs; the largest while its reference was news is what it falls from."""
-    counts, numbers = memory.counts, memory.numbers
+    counts = memory.counts
+    numbers = memory.numbers
     cost = reading.cost
     if counts[_SINCE_NEWS] == 0 and cost > numbers[_COST_BEFORE]:
         numbers[_COST_BEFORE] = cost
@@ -556,8 +575,10 @@ def _follow_cost(memory, reading):
 @njit_noalloc
 def _plan_cost(settings, means, references):
     """The squared distances of a plan's means (H + 1, n) from their references, weighed: of all, and of the first."""
-    H, n = len(means) - 1, means.shape[1]
-    total, first = 0.0, 0.0
+    H = len(means) - 1
+    n = means.shape[1]
+    total = 0.0
+    first = 0.0
     for k in range(H):
         weights = settings.terminal if k == H - 1 else settings.weights
         wanted = references[min(k + 1, len(references) - 1)]
@@ -595,20 +616,26 @@ def _judge_innovation(settings, memory, reading):
     innovations do not cancel each other in a longer one.
     """
     counts = memory.counts
-    k, changes = counts[_STEPS], counts[_CHANGES]
-    slot, signed_slot, place = k % _WINDOW, k % _BIAS_WINDOW, changes % _MEMORY
+    k = counts[_STEPS]
+    changes = counts[_CHANGES]
+    slot = k % _WINDOW
+    signed_slot = k % _BIAS_WINDOW
+    place = changes % _MEMORY
     known = min(changes, _MEMORY)
     is_judged = changes >= _FEWEST
     # Half the squared difference of white innovations is their variance; the median of
     # a chi-square of one degree is 0.455, and that of a few is uncertain.
     scale = (1.0 + _DOUBT / max(known, 1)) / 0.455 / 2.0
     has_change = False
-    worst, worst_ratio = -1, _LARGEST_RATIO * _WINDOW
-    biased, bias = -1, _LARGEST_BIAS * _BIAS_WINDOW
+    worst = -1
+    worst_ratio = _LARGEST_RATIO * _WINDOW
+    biased = -1
+    bias = _LARGEST_BIAS * _BIAS_WINDOW
     for i in range(len(reading.measured)):
         innovation = reading.measured[i] - reading.expected[i]
         innovation = _wrapped(innovation, settings.angles[i])
-        ratio, signed = 0.0, 0.0
+        ratio = 0.0
+        signed = 0.0
         if is_judged:
             memory.variance[i] = scale * memory.ordered[known // 2, i]
         if innovation == innovation:
@@ -629,9 +656,11 @@ def _judge_innovation(settings, memory, reading):
         memory.ratios[slot, i] = ratio
         memory.signed[signed_slot, i] = signed
         if memory.ratio[i] > worst_ratio:
-            worst, worst_ratio = i, memory.ratio[i]
+            worst = i
+            worst_ratio = memory.ratio[i]
         if abs(memory.bias[i]) > bias:
-            biased, bias = i, abs(memory.bias[i])
+            biased = i
+            bias = abs(memory.bias[i])
         change = innovation - memory.innovation[i]
         memory.innovation[i] = innovation
         if change == change:
@@ -651,7 +680,9 @@ def _remember(memory, changes, i, value):
     if changes < _MEMORY:
         j = changes
     else:
-        oldest, j, end = memory.changes[place, i], 0, _MEMORY - 1
+        oldest = memory.changes[place, i]
+        j = 0
+        end = _MEMORY - 1
         while j < end:  # the first that is no less than the oldest: itself
             middle = (j + end) // 2
             if memory.ordered[middle, i] < oldest:
@@ -700,8 +731,11 @@ def _measure_distance(settings, memory, reading):
     for i in range(n):
         if memory.start[i] != memory.start[i]:
             memory.start[i] = reading.measured[i]
-    now, end = reading.reference[0], reading.reference[-1]
-    square, travel, noise = 0.0, 0.0, 0.0
+    now = reading.reference[0]
+    end = reading.reference[-1]
+    square = 0.0
+    travel = 0.0
+    noise = 0.0
     for i in range(n):
         off = _wrapped(reading.measured[i] - now[i], settings.angles[i])
         way = _wrapped(end[i] - memory.start[i], settings.angles[i])
@@ -728,7 +762,8 @@ def _measure_distance(settings, memory, reading):
 def _follow_promise(memory, reading, distance, least):
     """What steps cost in truth over what the plan before them promised; 0 where that is not known."""
     counts = memory.counts
-    k, h = counts[_STEPS], counts[_LOOK_AHEAD]
+    k = counts[_STEPS]
+    h = counts[_LOOK_AHEAD]
     if h == 0:
         return 0.0
     slot = k % h
@@ -787,7 +822,8 @@ def _judge_bounds(settings, memory, reading, distance, least):
 @njit_noalloc
 def _is_standing(memory, reading, distance, least):
     """Whether it has come no nearer for long, while half of the way is still before it."""
-    counts, numbers = memory.counts, memory.numbers
+    counts = memory.counts
+    numbers = memory.numbers
     is_nearer = distance < 0.9 * numbers[_NEAREST]
     if is_nearer or counts[_SINCE_NEWS] == 0:
         numbers[_NEAREST] = distance
@@ -801,7 +837,8 @@ def _is_standing(memory, reading, distance, least):
 @njit_noalloc
 def _judge_violation(memory, reading):
     """Whether plans have missed a constraint for long, and the last by no less than the first."""
-    counts, numbers = memory.counts, memory.numbers
+    counts = memory.counts
+    numbers = memory.numbers
     if not reading.violation > 1e-6:
         counts[_VIOLATED] = 0
         return False

@@ -105,11 +105,16 @@ class CondensedProgram(NamedTuple):
 def expand(stages, start, feedback, previous_input, unknowns):
     """Inputs (H, m) and states s_0 .. s_H (H + 1, p) of the unknowns v (H m,)."""
     p, m = stages.B.shape[1:]
-    H, last = len(unknowns) // m, len(stages.A) - 1
-    inputs, states = unknowns.copy().reshape(H, m), np.empty((H + 1, p))
+    H = len(unknowns) // m
+    last = len(stages.A) - 1
+    inputs = unknowns.copy().reshape(H, m)
+    states = np.empty((H + 1, p))
     copy(start, states[0])
     for k in range(H):
-        s, u, after, at = states[k], inputs[k], states[k + 1], min(k, last)
+        s = states[k]
+        u = inputs[k]
+        after = states[k + 1]
+        at = min(k, last)
         if len(feedback) > 0:
             before = inputs[k - 1] if k > 0 else previous_input
             for i in range(m):
@@ -185,21 +190,20 @@ def finite_horizon_lqr(A, B, Q, R, terminal, horizon):
     A, B, Q and R are of H stages or of one that is constant; where all are, the recursion ends where P settles.
     """
     (n, m), constant = B.shape[1:], len(A) == len(Q) == len(R) == 1
-    gains, hessians = np.zeros((horizon, m, n)), np.empty((horizon, m, m))
-    P, following, PB, PC = (
-        terminal.copy(),
-        np.empty((n, n)),
-        np.empty((n, m)),
-        np.empty((n, n)),
-    )
-    closed, factor, RK = np.empty((n, n)), np.empty((m, m)), np.empty((m, n))
+    gains = np.zeros((horizon, m, n))
+    hessians = np.empty((horizon, m, m))
+    P = terminal.copy()
+    following = np.empty((n, n))
+    PB = np.empty((n, m))
+    PC = np.empty((n, n))
+    closed = np.empty((n, n))
+    factor = np.empty((m, m))
+    RK = np.empty((m, n))
     for k in range(horizon - 1, -1, -1):
-        A_k, B_k, K, D = (
-            A[min(k, len(A) - 1)],
-            B[min(k, len(B) - 1)],
-            gains[k],
-            hessians[k],
-        )
+        A_k = A[min(k, len(A) - 1)]
+        B_k = B[min(k, len(B) - 1)]
+        K = gains[k]
+        D = hessians[k]
         R_k = R[min(k, len(R) - 1)]
         product(P, B_k, PB)
         copy_matrix(R_k, D)
@@ -216,11 +220,13 @@ def finite_horizon_lqr(A, B, Q, R, terminal, horizon):
         copy_matrix(Q[min(k, len(Q) - 1)], following)
         add_transposed_product(closed, PC, following)
         add_transposed_product(K, RK, following)
-        change, size = 0.0, 0.0
+        change = 0.0
+        size = 0.0
         for i in range(n):
             for j in range(i + 1):
                 value = 0.5 * (following[i, j] + following[j, i])
-                change, size = max(change, abs(value - P[i, j])), max(size, abs(value))
+                change = max(change, abs(value - P[i, j]))
+                size = max(size, abs(value))
                 P[i, j] = P[j, i] = value
         if constant and change <= _SETTLED * size:
             for j in range(k):
@@ -240,7 +246,8 @@ def optimal_feedback(cost, stages, references):
     (p, m), targets, squares = stages.B.shape[1:], references.states, cost.squares
     incremental = cost.penalized == INCREMENTS
     (H, n), e = targets.shape, p + (m if incremental or len(squares) > 0 else 0)
-    A, B = np.zeros((H, e + 1, e + 1)), np.zeros((H, e + 1, m))
+    A = np.zeros((H, e + 1, e + 1))
+    B = np.zeros((H, e + 1, m))
     weights = np.zeros(
         (H if len(squares) > 0 else len(cost.state), e + 1, e + 1)
     )  # of stages 1 .. H - 1
@@ -251,7 +258,8 @@ def optimal_feedback(cost, stages, references):
     for k in range(len(squares)):
         _add_square(squares[k], targets[k], terminal if k == H - 1 else weights[k], p)
     for k in range(H):
-        at, shift = min(k, len(stages.A) - 1), A[k, :, e]
+        at = min(k, len(stages.A) - 1)
+        shift = A[k, :, e]
         shift[e] = 1.0
         copy_matrix(stages.A[at], A[k, :p, :p])
         copy_matrix(stages.B[at], B[k, :p])
@@ -274,7 +282,8 @@ def optimal_feedback(cost, stages, references):
     feedback = np.zeros((H, m, p + m + 1))
     for k in range(H):
         for i in range(m):
-            F, K = feedback[k, i], gains[k, i]
+            F = feedback[k, i]
+            K = gains[k, i]
             for j in range(e):
                 F[j] = -K[j]
             if incremental:
@@ -290,10 +299,12 @@ def optimal_feedback(cost, stages, references):
 @njit_noalloc
 def _add_square(Z, target, W, p):
     """Adds z'Zz, z = [x; u; 1], to a weight W of [s - r; u; 1]."""
-    n, e = len(target), len(W) - 1
+    n = len(target)
+    e = len(W) - 1
     m = e - p
     for i in range(n + m):
-        row, constant = i if i < n else p + i - n, Z[i, n + m] + dot(Z[i], target, n)
+        row = i if i < n else p + i - n
+        constant = Z[i, n + m] + dot(Z[i], target, n)
         for j in range(n + m):
             W[row, j if j < n else p + j - n] += Z[i, j]
         W[row, e] += constant

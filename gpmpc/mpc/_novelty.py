@@ -62,7 +62,8 @@ def _learned_part(model: DynamicsModel) -> AffineForm | None:
         return getattr(model, "affine_form", None)
     if callable(model.B) or not isinstance(model.residual, GPPosterior):
         return None
-    states, angles = list(model.states), tuple(model.angles)
+    states = list(model.states)
+    angles = tuple(model.angles)
     B = torch.as_tensor(model.B)
     return AffineForm(model.residual, B=B, states=states, angles=angles)
 

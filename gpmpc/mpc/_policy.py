@@ -81,10 +81,8 @@ def command(
     Raises:
         SolverFailure: The policy is ``"raise"``, or there is nothing to fall back on.
     """
-    previous, reference = (
-        None if last is None else last.plan,
-        reference.over(controller.horizon),
-    )
+    previous = None if last is None else last.plan
+    reference = reference.over(controller.horizon)
     known = {
         key: value
         for key, value in (("parameters", parameters), ("plan", plan))
@@ -160,7 +158,8 @@ class ControlLoop:
         self.controller = controller
         self.on_failure: OnFailure = on_failure
         self.last: Command | None = None
-        self.failures, self._steps = 0, 0
+        self.failures = 0
+        self._steps = 0
         self.judgement: Judgement | None = None
         self._judge: FlightJudge | None = None
         self._before: Command | None = None  # the one before the last
@@ -193,7 +192,8 @@ class ControlLoop:
         known = self.last, self.on_failure, self._steps, parameters, plan
         self._before = self.last
         self.last = command(self.controller, belief, wanted, *known)
-        self.failures, self._steps = self.failures + self.last.failed, self._steps + 1
+        self.failures = self.failures + self.last.failed
+        self._steps = self._steps + 1
         self.judgement = self._judged(belief, wanted, self.last)
         return self.last.input.copy()
 
@@ -233,10 +233,8 @@ class ControlLoop:
             )
         if np.isfinite(plan.means).all() and np.isfinite(state).all():
             if self._gains is None or self._gains[0] is not plan:
-                gains, none = (
-                    getattr(self.controller, "gains", None),
-                    np.zeros((*plan.inputs.shape, len(state))),
-                )
+                gains = getattr(self.controller, "gains", None)
+                none = np.zeros((*plan.inputs.shape, len(state)))
                 self._gains = plan, none if gains is None else gains(plan)
             error = state - _state_along(plan.means, min(share, len(plan.inputs)))
             cost = getattr(getattr(self.controller, "problem", None), "cost", None)
@@ -311,7 +309,8 @@ def _conclude(
             step, f"{reason} (no earlier plan and no reference input to fall back on)"
         )
     input = _within_bounds(controller, np.array(known, dtype=float), last)
-    H, n = reference.horizon, reference.states.shape[1]
+    H = reference.horizon
+    n = reference.states.shape[1]
     unknown = np.full((H + 1, n), np.nan), np.full((H + 1, n, n), np.nan)
     return Command(
         input,

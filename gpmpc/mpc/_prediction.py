@@ -161,20 +161,16 @@ class PredictionModel:
                 "prediction",
                 f"must be PredictionSettings(...); got {type(settings).__name__}",
             )
-        self.propagator, self.problem, self.horizon = propagator, problem, horizon
-        self.settings, self.points = (
-            settings,
-            horizon if settings.form == "trajectory" else 1,
-        )
+        self.propagator = propagator
+        self.problem = problem
+        self.horizon = horizon
+        self.settings = settings
+        self.points = horizon if settings.form == "trajectory" else 1
         self._set_model(model)
-        inputs, rates = (
-            problem.inputs.by_stage(horizon),
-            problem.input_rates.by_stage(horizon),
-        )
-        self._limits, rated = (
-            (*inputs, *rates),
-            horizon if problem.input_rates.finite else 0,
-        )
+        inputs = problem.inputs.by_stage(horizon)
+        rates = problem.input_rates.by_stage(horizon)
+        self._limits = (*inputs, *rates)
+        rated = horizon if problem.input_rates.finite else 0
         self.bounds = InputBounds(*inputs, *[side[:rated] for side in rates])
         self.constraints = ConstraintRows(problem, horizon, settings.covariance)
         self.costs = StageCosts(problem, horizon, self.linearizer)
@@ -209,7 +205,8 @@ class PredictionModel:
         plan: Any = None,
     ) -> Request:
         """The arguments of a controller's ``control``, whose dimensions are checked, with the disturbance estimate."""
-        problem, H = self.problem, self.horizon
+        problem = self.problem
+        H = self.horizon
         request = Request.read(
             problem,
             H,
@@ -260,19 +257,24 @@ class PredictionModel:
 
         Covariances are those of the last plan, unshifted: they depend on the time since the last measurement.
         """
-        H, n, problem = self.horizon, self.problem.state_dim, self.problem
-        means, covariances = np.empty((H + 1, n)), np.zeros((H + 1, n, n))
+        H = self.horizon
+        n = self.problem.state_dim
+        problem = self.problem
+        means = np.empty((H + 1, n))
+        covariances = np.zeros((H + 1, n, n))
         means[0] = request.state
         if self.linearizer.covariance != "none":
             covariances[0] = request.covariance
         if self.settings.form == "velocity":
-            means[1:], covariances[1:] = request.state, covariances[0]
+            means[1:] = request.state
+            covariances[1:] = covariances[0]
             return Plan(
                 self.linearizer.state(means, covariances),
                 request.constant_guess,
                 covariances,
             )
-        inputs, last = request.initial_guess, request.previous
+        inputs = request.initial_guess
+        last = request.previous
         if request.states is not None:
             means[1:] = request.states[1:]
         elif last is not None:
@@ -282,10 +284,8 @@ class PredictionModel:
                     request.state - last.means[1], problem.cost.angles
                 )
         else:
-            targets, shares = (
-                request.references.states,
-                np.linspace(1.0, 0.0, H + 1)[1:, None],
-            )
+            targets = request.references.states
+            shares = np.linspace(1.0, 0.0, H + 1)[1:, None]
             means[1:] = targets + shares * (request.state - targets[0])
             if problem.cost.penalized == "deviations":
                 inputs = request.references.inputs.clip(
@@ -317,7 +317,8 @@ class PredictionModel:
         """``linearize`` at the first guesses of many requests, all stages of all of them in one call."""
         if not requests:
             return []
-        K, T = self.points, len(requests)
+        K = self.points
+        T = len(requests)
         plans = list(map(self.initial_guess, requests))
         states, inputs, covariances = (
             np.concatenate([s[:K] for s in parts]) for parts in zip(*plans, strict=True)
@@ -341,7 +342,8 @@ class PredictionModel:
 
     def predict(self, plan: Plan, stages: Stages, request: Request) -> Prediction:
         """Covariances, rows and cost for stages that were linearised at a plan; see ``linearize``."""
-        covariances, mode = plan.covariances, self.linearizer.covariance
+        covariances = plan.covariances
+        mode = self.linearizer.covariance
         cost = self.costs.at(plan, request.parameters)
         if mode == "zero_order":
             covariances = self._covariances(stages, cost, request.covariance)
@@ -520,18 +522,15 @@ class PredictionModel:
         (m, n), Z = (self.problem.input_dim, self.problem.state_dim), cost.squares
         if not self.settings.feedback:
             return np.zeros((self.horizon, m, n))
-        A, B = np.ascontiguousarray(A[:, :n, :n]), np.ascontiguousarray(B[:, :n])
-        Q, R, terminal = (
-            np.ascontiguousarray(cost.state[:1, 0]),
-            cost.input[:1],
-            cost.terminal[0],
-        )
+        A = np.ascontiguousarray(A[:, :n, :n])
+        B = np.ascontiguousarray(B[:, :n])
+        Q = np.ascontiguousarray(cost.state[:1, 0])
+        R = cost.input[:1]
+        terminal = cost.terminal[0]
         if len(Z):
-            Q, R, terminal = (
-                Q + Z[:1, :n, :n],
-                R + Z[:1, n:-1, n:-1],
-                terminal + Z[-1, :n, :n],
-            )
+            Q = Q + Z[:1, :n, :n]
+            R = R + Z[:1, n:-1, n:-1]
+            terminal = terminal + Z[-1, :n, :n]
         return call_unchecked(finite_horizon_lqr, A, B, Q, R, terminal, self.horizon)[0]
 
     def _covariances(self, stages: Stages, cost: QuadraticCost, start: Array) -> Array:
@@ -573,11 +572,15 @@ def _predict_covariances(A, B, V, start, gains, covariances):
 
     The gains (H, m, n) are of each stage.
     """
-    n, m, held = B.shape[1], B.shape[2], len(A) - 1
-    closed, moved = np.empty((n, n)), np.empty((n, n))
+    n = B.shape[1]
+    m = B.shape[2]
+    held = len(A) - 1
+    closed = np.empty((n, n))
+    moved = np.empty((n, n))
     copy_matrix(start, covariances[0])
     for k in range(len(covariances) - 1):
-        at, after = min(k, held), covariances[k + 1]
+        at = min(k, held)
+        after = covariances[k + 1]
         for i in range(n):
             for j in range(n):
                 closed[i, j] = A[at, i, j]

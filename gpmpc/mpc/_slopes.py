@@ -31,7 +31,8 @@ def slope_covariances(model: Any, state: Array, input: Array) -> Array:
         state: Where (n,).
         input: Where (m,).
     """
-    n, m = len(state), len(input)
+    n = len(state)
+    m = len(input)
     if isinstance(model, GPPosterior):
         return _of_gp(model, np.concatenate([state, input]))
     if isinstance(model, LinearWrapper):
@@ -44,7 +45,8 @@ def slope_covariances(model: Any, state: Array, input: Array) -> Array:
         return covariances
     if isinstance(model, ResidualModel) and not callable(model.B):
         z, v, slopes = model.features.linearize(state[None], input[None])
-        columns, inputs = model.features.columns, list(model.inputs)
+        columns = model.features.columns
+        inputs = list(model.inputs)
         by_state = np.eye(n, n + m)[columns]
         if slopes is not None:
             by_state = slopes[0][:, None] * by_state
@@ -57,8 +59,10 @@ def slope_covariances(model: Any, state: Array, input: Array) -> Array:
 
 def _of_gp(gp: GPPosterior, at: Array) -> Array:
     """Covariances (k, d, d) of the derivatives of GPs at a point (d,)."""
-    points, lengthscales = to_array(gp.features), to_array(gp.lengthscales)
-    signal_variances, factors = to_array(gp.signal_variance), to_array(gp.cholesky)
+    points = to_array(gp.features)
+    lengthscales = to_array(gp.lengthscales)
+    signal_variances = to_array(gp.signal_variance)
+    factors = to_array(gp.cholesky)
     covariances = []
     for lengthscale, variance, factor in zip(
         lengthscales, signal_variances, factors, strict=True

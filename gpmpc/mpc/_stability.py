@@ -143,7 +143,8 @@ def stability(
     """Returns what a loop does near its reference; see ``GPMPC.stability``."""
     followed = read_reference(reference).in_order(prediction.signals)
     _check(prediction, plant, ahead)
-    horizon, problem = prediction.horizon, prediction.problem
+    horizon = prediction.horizon
+    problem = prediction.problem
     points = _points(prediction, followed, parameters)
     if not points:
         return Stability(
@@ -189,7 +190,8 @@ def _safe_disturbance_gain(loops: "list[_Loop]", disturbance_gain: float) -> flo
         return disturbance_gain
     if not bears(0.0):
         return math.nan
-    safe, unsafe = 0.0, disturbance_gain
+    safe = 0.0
+    unsafe = disturbance_gain
     while unsafe - safe > _GAIN_TOLERANCE:
         middle = 0.5 * (safe + unsafe)
         if bears(middle):
@@ -245,7 +247,8 @@ def _points(
         inputs[len(given) :] = given[-1]
     steps = state_difference(states[1:], states[:-1], prediction.angles)
     steps = np.vstack([steps, np.zeros_like(states[:1])]) if len(steps) else 0 * states
-    last, n = len(states) - 1, states.shape[1]
+    last = len(states) - 1
+    n = states.shape[1]
     chosen = np.unique(np.linspace(0, max(last - 1, 0), _POINTS).round().astype(int))
     rows = np.hstack([states, steps, inputs])[chosen]
     points = []
@@ -281,12 +284,16 @@ class _RestSearch:
         target_input: Array,
         parameters: Any,
     ):
-        self._prediction, self._parameters = prediction, parameters
-        self._target, self._step, self._target_input = target, step, target_input
+        self._prediction = prediction
+        self._parameters = parameters
+        self._target = target
+        self._step = step
+        self._target_input = target_input
 
     def find(self) -> _Point | None:
         """The point by Gauss-Newton steps from the target on; None where they find none within the input's bounds."""
-        prediction, n = self._prediction, len(self._target)
+        prediction = self._prediction
+        n = len(self._target)
         input = prediction.initial_input.copy()
         state = self._target.copy()
         pending = _pending(prediction.model)
@@ -302,7 +309,9 @@ class _RestSearch:
                     break
                 change = 0.5 * change
                 there = self._at(state + change[:n], input + change[n:])
-            state, input, here = state + change[:n], input + change[n:], there
+            state = state + change[:n]
+            input = input + change[n:]
+            here = there
             sizes = np.maximum(1.0, np.abs(np.concatenate([state, input])))
             if (np.abs(change) <= _SETTLED * sizes).all():
                 break
@@ -315,9 +324,11 @@ class _RestSearch:
 
     def _at(self, state: Array, input: Array) -> _Unrest:
         prediction = self._prediction
-        n, m = len(state), len(input)
+        n = len(state)
+        m = len(input)
         model = linearize(prediction.model, state[None], input[None], covariance=False)
-        A, B = model.A[0], model.B[0]
+        A = model.A[0]
+        B = model.B[0]
         moved = state_difference(model.mean[:1], state[None], prediction.angles)[0]
         missing = moved - self._step
         cost = _cost_at(prediction, state, input, self._parameters)
@@ -372,7 +383,8 @@ class _Loop:
         plant: DynamicsModel | None,
         ahead: DelayedModel | None,
     ):
-        self._point, self.horizon = point, prediction.horizon
+        self._point = point
+        self.horizon = prediction.horizon
         velocity = prediction.settings.form == "velocity"
         self._disturbance_gain = (
             1.0 if velocity else prediction.settings.disturbance_gain
@@ -416,7 +428,8 @@ class _Loop:
             return False
         _, (scales, _) = matrix_balance(loop, permute=False, separate=True)
         values, left, right = eig(loop, left=True)
-        left, right = left * scales[:, None], right / scales[:, None]
+        left = left * scales[:, None]
+        right = right / scales[:, None]
         left = left / np.linalg.norm(left, axis=0)
         right = right / np.linalg.norm(right, axis=0)
         return any(
@@ -484,8 +497,10 @@ class _Loop:
             disturbance_gain: L; the controller's own by default.
         """
         L = self._disturbance_gain if disturbance_gain is None else disturbance_gain
-        A, B = self._point.A, self._point.B
-        A_p, C = self._plant.A, self._plant.C
+        A = self._point.A
+        B = self._point.B
+        A_p = self._plant.A
+        C = self._plant.C
         B_p = np.where(self._plant.moved, gain, 1.0)[:, None] * self._plant.B
         n, m = B.shape
         p = len(A_p)
@@ -550,7 +565,8 @@ def _of_stages(weights: Array, horizon: int) -> Array:
 
 def _wide(Q: Array, squares: Array) -> Array:
     """The weight of (s, d, u_{-1}) of a stage, with that of its outputs where there is one (1 or 0, ...)."""
-    n, m = len(Q), squares.shape[-1] - 1 - len(Q)
+    n = len(Q)
+    m = squares.shape[-1] - 1 - len(Q)
     weight = np.zeros((2 * n + m, 2 * n + m))
     weight[:n, :n] = Q
     known = np.r_[:n, 2 * n : 2 * n + m]
@@ -580,8 +596,10 @@ def _linear_plant(
     at[own[: len(others)]] = point.state[others]
     at[queue] = np.tile(point.input, len(queue) // m)
     local = linearize(plant, at[None], point.input[None], covariance=False)
-    A, B = np.zeros((p + count * m, p + count * m)), np.zeros((p + count * m, m))
-    A[:p, :p], B[:p] = local.A[0], local.B[0]
+    A = np.zeros((p + count * m, p + count * m))
+    B = np.zeros((p + count * m, m))
+    A[:p, :p] = local.A[0]
+    B[:p] = local.B[0]
     if count:
         A[p:-m, p + m :] = np.eye((count - 1) * m)
         B[-m:] = np.eye(m)
@@ -603,7 +621,8 @@ def _look_ahead(
 
     Rows are linear functions of the closed loop's own state.
     """
-    n, m = ahead.model.state_dim, ahead.input_dim
+    n = ahead.model.state_dim
+    m = ahead.input_dim
     local = linearize(
         ahead.model, point.state[None, :n], point.input[None], covariance=False
     )

@@ -55,12 +55,10 @@ class StageLinearizer:
     def __init__(
         self, model: DynamicsModel, propagator: Propagator, covariance: Covariance
     ):
-        self.model, self.propagator, self.covariance, self._n = (
-            model,
-            propagator,
-            covariance,
-            model.state_dim,
-        )
+        self.model = model
+        self.propagator = propagator
+        self.covariance = covariance
+        self._n = model.state_dim
         first_order = getattr(propagator, "first_order", False)
         self.at_points = covariance == "none" or (
             covariance == "zero_order" and first_order
@@ -149,7 +147,8 @@ class StageLinearizer:
         moved, d = differentiate(
             self.propagator, self.model, *self._tensors(states, covariances, inputs)
         )
-        A, S = d.mean_by_mean, moved.belief.covariance
+        A = d.mean_by_mean
+        S = moved.belief.covariance
         passed = A @ moved.cross_covariance  # mean equivalence passes nothing on
         V, _ = nearest_positive_semidefinite(S - (passed + passed.mT) / 2)
         return tuple(map(to_array, (moved.belief.mean, A, d.mean_by_input, V)))
@@ -170,7 +169,8 @@ class StageLinearizer:
         covariances = covariances * np.eye(n)
         belief, input = self._tensors(states[:, :n], covariances, inputs)
         moved, d = differentiate(self.propagator, self.model, belief, input)
-        sd, sd_next = belief.variance.sqrt(), moved.belief.variance.clamp_min(0).sqrt()
+        sd = belief.variance.sqrt()
+        sd_next = moved.belief.variance.clamp_min(0).sqrt()
         # d Sigma_cc = 2 sd_c d sd_c, and backwards; where the next deviation is zero it has no derivative.
         backwards = torch.where(
             sd_next > 0, 0.5 / torch.where(sd_next > 0, sd_next, 1.0), 0.0
@@ -190,10 +190,8 @@ class StageLinearizer:
         lower = torch.cat(
             [backwards * by_mean, backwards * by_variance * twice], dim=-1
         )
-        A, B = (
-            torch.cat([upper, lower], dim=-2),
-            torch.cat([d.mean_by_input, backwards * by_input], dim=-2),
-        )
+        A = torch.cat([upper, lower], dim=-2)
+        B = torch.cat([d.mean_by_input, backwards * by_input], dim=-2)
         return *map(
             to_array, (torch.cat([moved.belief.mean, sd_next], dim=-1), A, B)
         ), np.zeros_like(covariances)
@@ -221,21 +219,18 @@ class StageCosts:
     """The cost of a problem's stages: the weights alone, ``quadratic``, and the squares of outputs along a plan."""
 
     def __init__(self, problem: Problem, horizon: int, linearizer: StageLinearizer):
-        n, m, cost, self._linearizer = (
-            problem.state_dim,
-            problem.input_dim,
-            problem.cost,
-            linearizer,
-        )
+        n = problem.state_dim
+        m = problem.input_dim
+        cost = problem.cost
+        self._linearizer = linearizer
         self.outputs, (Q, R) = problem.outputs, cost.by_stage(horizon)
         for output in self.outputs:
             by_stage("weight", output.weight, horizon, 2)
             by_stage("reference", output.reference, horizon, 1)
-        self._Q, own = Q, linearizer.weight(Q[-1:])[0]
-        Q, R = (
-            Q if cost.Q.ndim > 2 else cost.Q[None],
-            R if cost.R.ndim > 2 else cost.R[None],
-        )
+        self._Q = Q
+        own = linearizer.weight(Q[-1:])[0]
+        Q = Q if cost.Q.ndim > 2 else cost.Q[None]
+        R = R if cost.R.ndim > 2 else cost.R[None]
         W, own, R = (
             np.ascontiguousarray(part) for part in (linearizer.weight(Q), own, R)
         )
@@ -277,17 +272,17 @@ class ConstraintRows:
     """
 
     def __init__(self, problem: Problem, horizon: int, covariance: Covariance):
-        n, self._horizon, self._covariance = problem.state_dim, horizon, covariance
+        n = problem.state_dim
+        self._horizon = horizon
+        self._covariance = covariance
         self._smooth: list[tuple[Inequality, slice]] = []
         self._plain = np.zeros((0, 0, problem.input_dim))  # no row holds inputs
         elastic: list[bool] = []
-        F, kappa, prices, lower, upper = (
-            [np.empty((0, n))],
-            [],
-            [],
-            [np.empty((horizon, 0))],
-            [np.empty((horizon, 0))],
-        )
+        F = [np.empty((0, n))]
+        kappa = []
+        prices = []
+        lower = [np.empty((horizon, 0))]
+        upper = [np.empty((horizon, 0))]
         for constraint in problem.constraints:
             rows, below, above = constraint.rows(horizon)
             if constraint.stages is not None:
@@ -297,24 +292,26 @@ class ConstraintRows:
                         f"must be of 1 .. {horizon}; got {max(constraint.stages)}",
                     )
                 outside = [k for k in range(horizon) if k + 1 not in constraint.stages]
-                below[outside], above[outside] = -np.inf, np.inf
+                below[outside] = -np.inf
+                above[outside] = np.inf
             sides = int(np.isfinite(below).sum() + np.isfinite(above).sum())
             if isinstance(constraint, Inequality):
                 first = sum(map(len, F))
                 self._smooth.append((constraint, slice(first, first + len(rows))))
                 rows = np.zeros((len(rows), n))
-            F, lower, upper = [*F, rows], [*lower, below], [*upper, above]
+            F = [*F, rows]
+            lower = [*lower, below]
+            upper = [*upper, above]
             kappa += [
                 0.0 if covariance == "none" else constraint.standard_deviations(sides)
             ] * len(rows)
             prices += [problem.price(constraint)] * len(rows)
             elastic += [constraint.penalty == "elastic"] * len(rows)
-        self._F, self._lower, self._upper = (
-            np.concatenate(F),
-            np.hstack(lower),
-            np.hstack(upper),
-        )
-        self._kappa, self.prices = np.array(kappa), np.array(prices)
+        self._F = np.concatenate(F)
+        self._lower = np.hstack(lower)
+        self._upper = np.hstack(upper)
+        self._kappa = np.array(kappa)
+        self.prices = np.array(prices)
         self.elastic = np.array(elastic, dtype=bool)
         self.signs = np.where(np.isfinite(self._upper).any(axis=0), 1.0, -1.0)
         self.applies = np.isfinite(self._lower) | np.isfinite(self._upper)
@@ -323,7 +320,8 @@ class ConstraintRows:
             self._kappa if covariance == "zero_order" else np.zeros(self.per_stage)
         )
         self._margins = np.tile(margins, (horizon, 1))
-        self.smooth, self._fixed = bool(self._smooth), None
+        self.smooth = bool(self._smooth)
+        self._fixed = None
         if not (
             self.smooth
             or margins.any()
@@ -346,18 +344,14 @@ class ConstraintRows:
         """
         if self._fixed is not None:
             return self._fixed
-        lower, upper, F, D = (
-            self._lower.copy(),
-            self._upper.copy(),
-            self._F[None],
-            self._plain,
-        )
+        lower = self._lower.copy()
+        upper = self._upper.copy()
+        F = self._F[None]
+        D = self._plain
         if self._smooth:
             means = np.ascontiguousarray(plan.states[1:, : F.shape[2]])
-            F, D = (
-                np.repeat(F, self._horizon, axis=0),
-                np.zeros((self._horizon, self.per_stage, D.shape[2])),
-            )
+            F = np.repeat(F, self._horizon, axis=0)
+            D = np.zeros((self._horizon, self.per_stage, D.shape[2]))
             for constraint, where in self._smooth:
                 values, F[:, where], D[:, where] = constraint.expand(
                     means, plan.inputs, parameters
@@ -375,11 +369,9 @@ class ConstraintRows:
 
     def _rows(self, F: Array, covariances: Array) -> Array:
         """E (K, r, p) of gradients F (K, r, n) at covariances of the states (K, n, n); one of either stands for all."""
-        K, n, weight = (
-            max(len(F), len(covariances)),
-            F.shape[2],
-            self.signs * self._kappa,
-        )
+        K = max(len(F), len(covariances))
+        n = F.shape[2]
+        weight = self.signs * self._kappa
         if self._covariance not in ("full", "diagonal"):
             return F
         F, covariances = (
@@ -425,7 +417,9 @@ def price_violations(prices, rows, plan, hard_price):
     E, D, lower, upper = rows
     total = 0.0
     for k in range(len(lower)):
-        at, s, u = min(k, len(E) - 1), plan.states[k + 1], plan.inputs[k]
+        at = min(k, len(E) - 1)
+        s = plan.states[k + 1]
+        u = plan.inputs[k]
         for e in range(len(prices)):
             value = dot(E[at, e], s, len(s)) + (
                 dot(D[k, e], u, len(u)) if len(D) > 0 else 0.0

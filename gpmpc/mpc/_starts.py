@@ -133,20 +133,21 @@ class ManyStarts:
         criterion: Criterion | None = None,
         budget: float | None = None,
     ):
-        self.controller, self.planner = (
-            controller,
-            controller if planner is None else planner,
-        )
+        self.controller = controller
+        self.planner = controller if planner is None else planner
         for one in (self.controller, self.planner):
             if one.prediction.settings.form != "trajectory":
                 raise SettingError(
                     "controller",
                     "must be of form 'trajectory', whose plans may start anywhere",
                 )
-        self.problem, self.horizon = controller.problem, controller.horizon
+        self.problem = controller.problem
+        self.horizon = controller.horizon
         self.initial_input = controller.initial_input
         self.signals = controller.signals
-        H, m, angles = self.horizon, self.problem.input_dim, self.problem.cost.angles
+        H = self.horizon
+        m = self.problem.input_dim
+        angles = self.problem.cost.angles
         if guesses is None:
             guesses = [None, *kicks(self.problem, H, self.initial_input)]
         shapes = [np.shape(guess) for guess in guesses if guess is not None]
@@ -564,10 +565,12 @@ class ManyStarts:
         self, state: Array, reference: Reference
     ) -> Iterator[tuple[Reference, tuple[Array, Array]]]:
         """Goals and guesses, inputs and states, guess by guess, the nearest goals first."""
-        goals, H = list(self._goals(state, reference)), self.horizon
+        goals = list(self._goals(state, reference))
+        H = self.horizon
         for guess, goal in product(self.guesses, goals):
             if guess is None:
-                shares, targets = np.linspace(1.0, 0.0, H + 1)[:, None], goal.states
+                shares = np.linspace(1.0, 0.0, H + 1)[:, None]
+                targets = goal.states
                 yield (
                     goal,
                     (
@@ -587,7 +590,8 @@ class ManyStarts:
                 )
 
     def _goals(self, state: Array, reference: Reference) -> Iterator[Reference]:
-        angles, moves = list(self.problem.cost.angles), []
+        angles = list(self.problem.cost.angles)
+        moves = []
         for angle, count in zip(angles, self.turns, strict=True):
             off = (state[angle] - reference.states[-1, angle]) / (2 * np.pi)
             around = range(int(np.floor(off)) - count, int(np.ceil(off)) + count + 1)
@@ -608,11 +612,10 @@ def kicks(
 
     ``share`` is the way from the initial input to its bounds.
     """
-    drift, length = (
-        np.tile(np.asarray(initial_input, dtype=float), (horizon, 1)),
-        max(1, horizon // 6),
-    )
-    found, bounds = [drift], (problem.inputs.upper, problem.inputs.lower)
+    drift = np.tile(np.asarray(initial_input, dtype=float), (horizon, 1))
+    length = max(1, horizon // 6)
+    found = [drift]
+    bounds = (problem.inputs.upper, problem.inputs.lower)
     for j, sides in product(range(problem.input_dim), (bounds, bounds[::-1])):
         if np.isfinite([side[j] for side in sides]).all():
             inputs = drift.copy()

@@ -87,20 +87,25 @@ class NMPC:
         initial_input: Sequence[float],
         tolerance: float = 1e-10,
     ):
-        n, m = len(plant.dynamics.state_names), len(plant.dynamics.input_names)
+        n = len(plant.dynamics.state_names)
+        m = len(plant.dynamics.input_names)
         self.signals = signals_of(plant)
         self.initial_input = check_controller(
             problem, n, m, horizon, initial_input, self.signals.input_names
         )
         check_number("tolerance", tolerance, above=0)
-        self.plant, self.problem, self.horizon = plant, problem, horizon
+        self.plant = plant
+        self.problem = problem
+        self.horizon = horizon
         self._solver, self._bounds = _build(plant, problem, horizon, tolerance)
 
     def control(
         self, belief: Gaussian, reference: Reference, previous: Decision | None = None
     ) -> Decision:
         """Solves the problem from the belief's mean along a reference; see ``Controller.control``."""
-        n, m, H = self.problem.state_dim, self.problem.input_dim, self.horizon
+        n = self.problem.state_dim
+        m = self.problem.input_dim
+        H = self.horizon
         start = perf_counter()
         request = Request.read(
             self.problem,
@@ -114,10 +119,8 @@ class NMPC:
         if not request.finite:
             return request.failed_decision(Status.INVALID_MEASUREMENT)
         (targets, inputs, last), (lower, upper) = request.references, self._bounds
-        guess, states = (
-            request.constant_guess.clip(*self.problem.inputs.by_stage(H)),
-            [request.state],
-        )
+        guess = request.constant_guess.clip(*self.problem.inputs.by_stage(H))
+        states = [request.state]
         for u in guess:
             states.append(np.array(self.plant.successor(states[-1], u), dtype=float))
         unknowns = np.zeros(len(lower["x"]))
@@ -133,10 +136,8 @@ class NMPC:
         }
         with interrupts_after():
             solution = self._solver(x0=unknowns, p=parameters, **bounds)
-        stats, found = (
-            self._solver.stats(),
-            {key: np.array(solution[key]).ravel() for key in ("x", "g")},
-        )
+        stats = self._solver.stats()
+        found = {key: np.array(solution[key]).ravel() for key in ("x", "g")}
         means = np.vstack([request.state, found["x"][: H * n].reshape(H, n)])
         inputs = found["x"][H * n : H * (n + m)].reshape(H, m)
         status = _STATUSES.get(stats["return_status"], Status.NUMERICAL_TROUBLE)
@@ -195,7 +196,9 @@ class LQR:
                 "constraints",
                 "LQR knows the bounds of inputs only; leave those of states out",
             )
-        self.model, self.problem, self.horizon = model, problem, horizon
+        self.model = model
+        self.problem = problem
+        self.horizon = horizon
         self._linearize = StageLinearizer(model, Linearization(), "none")
         self._cost = StageCosts(problem, horizon, self._linearize).quadratic
 
@@ -225,16 +228,20 @@ class LQR:
         feedback, _ = optimal_feedback(self._cost, stages, request.references)
         if not np.isfinite(feedback).all():
             return request.failed_decision(Status.NUMERICAL_TROUBLE)
-        states, inputs, boxes = [x], [], (self.problem.inputs, self.problem.input_rates)
+        states = [x]
+        inputs = []
+        boxes = (self.problem.inputs, self.problem.input_rates)
         (low, high), (down, up) = (box.by_stage(self.horizon) for box in boxes)
         for k, (A, B, offset, F) in enumerate(zip(*stages[:3], feedback, strict=True)):
             u = F @ np.concatenate([x, last, [1.0]])
             # The box last: where it and the rates contradict each other, the input must at least exist.
             u = u.clip(last + down[k], last + up[k]).clip(low[k], high[k])
-            x, last = A @ x + B @ u + offset, u
+            x = A @ x + B @ u + offset
+            last = u
             states.append(x)
             inputs.append(u)
-        means, inputs = np.array(states), np.array(inputs)
+        means = np.array(states)
+        inputs = np.array(inputs)
         finite = np.isfinite(means).all() and np.isfinite(inputs).all()
         status = Status.SOLVED if finite else Status.NUMERICAL_TROUBLE
         timing = Timing(modelled - began, 0.0, perf_counter() - modelled)
@@ -279,15 +286,11 @@ class StateFormMPC:
         self.prediction = PredictionModel(
             model, propagator, problem, horizon, initial_input, prediction
         )
-        self.initial_input, self.problem, self.horizon = (
-            self.prediction.initial_input,
-            problem,
-            horizon,
-        )
-        self.solver, self.options = (
-            solver,
-            TIGHT.get(solver, {}) if options is None else options,
-        )
+        self.initial_input = self.prediction.initial_input
+        self.problem = problem
+        self.horizon = horizon
+        self.solver = solver
+        self.options = TIGHT.get(solver, {}) if options is None else options
         problem.check_plain("StateFormMPC")
         self.signals = self.prediction.signals
         self._build(constraints)
@@ -298,10 +301,8 @@ class StateFormMPC:
         """Decides the input for one step; see ``GPMPC.control``."""
         from cvxpy.error import SolverError
 
-        request, began = (
-            self.prediction.read(belief, reference, previous),
-            perf_counter(),
-        )
+        request = self.prediction.read(belief, reference, previous)
+        began = perf_counter()
         if not request.finite:
             return request.failed_decision(Status.INVALID_MEASUREMENT)
         try:
@@ -317,7 +318,8 @@ class StateFormMPC:
             )
         modelled = perf_counter()
         self._set(prediction, request)
-        built, program = perf_counter(), self._program
+        built = perf_counter()
+        program = self._program
         try:
             with (
                 warnings.catch_warnings()
@@ -369,15 +371,15 @@ class StateFormMPC:
         """Makes the CVXPY problem with its parameters."""
         import cvxpy
 
-        model, problem, H, m = (
-            self.prediction,
-            self.problem,
-            self.horizon,
-            self.problem.input_dim,
-        )
+        model = self.prediction
+        problem = self.problem
+        H = self.horizon
+        m = self.problem.input_dim
         (Q, R), rows = problem.cost.by_stage(H), model.constraints
         weights = [_factor(blocks) for blocks in model.linearizer.weight(Q)]
-        p, K, r = len(weights[0]), model.points, rows.per_stage
+        p = len(weights[0])
+        K = model.points
+        r = rows.per_stage
         self._states, self._inputs = s, u = (
             cvxpy.Variable((H + 1, p)),
             cvxpy.Variable((H, m)),
@@ -386,11 +388,10 @@ class StateFormMPC:
             [cvxpy.Parameter(shape) for shape in ((p, p), (p, m), (p,))]
             for _ in range(K)
         ]
-        self._start, self._targets = (
-            cvxpy.Parameter(p),
-            cvxpy.Parameter((H, p), value=np.zeros((H, p))),
-        )
-        self._wanted, self._last = cvxpy.Parameter((H, m)), cvxpy.Parameter(m)
+        self._start = cvxpy.Parameter(p)
+        self._targets = cvxpy.Parameter((H, p), value=np.zeros((H, p)))
+        self._wanted = cvxpy.Parameter((H, m))
+        self._last = cvxpy.Parameter(m)
         rates = u - cvxpy.vstack(
             [cvxpy.reshape(self._last, (1, m), order="C"), *([u[:-1]] if H > 1 else [])]
         )
@@ -411,11 +412,9 @@ class StateFormMPC:
             rules.append(s[k + 1] == A @ s[k] + B @ u[k] + c)
         self._rows = [cvxpy.Parameter((r, p)) for _ in range(K if r else 0)]
         if r:
-            self._bounds, hard, applies = (
-                cvxpy.Parameter((H, r)),
-                np.isinf(rows.prices),
-                rows.applies,
-            )
+            self._bounds = cvxpy.Parameter((H, r))
+            hard = np.isinf(rows.prices)
+            applies = rows.applies
             slack = np.zeros((H, r))
             if rows.soft:
                 slack = cvxpy.multiply(
@@ -450,11 +449,10 @@ class StateFormMPC:
                 parameter.value = value
         targets = np.zeros(self._targets.shape)
         targets[:, : self.problem.state_dim] = request.references.states
-        self._start.value, self._targets.value = prediction.plan.states[0], targets
-        self._wanted.value, self._last.value = (
-            request.references.inputs,
-            request.references.previous_input,
-        )
+        self._start.value = prediction.plan.states[0]
+        self._targets.value = targets
+        self._wanted.value = request.references.inputs
+        self._last.value = request.references.previous_input
         if self._rows:
             (E, _, lower, upper), sign = (
                 prediction.rows,
@@ -476,8 +474,12 @@ def _build(
     """IPOPT on the unknowns (x_1 .. x_H, u_0 .. u_{H-1}, slacks), and the bounds of unknowns and constraints."""
     problem.check_plain("NMPC")
     successor_function(plant)  # says what CasADi cannot follow
-    n, m, H, goal = problem.state_dim, problem.input_dim, horizon, problem.cost
-    x0, last = casadi.SX.sym("x0", n), casadi.SX.sym("last", m)
+    n = problem.state_dim
+    m = problem.input_dim
+    H = horizon
+    goal = problem.cost
+    x0 = casadi.SX.sym("x0", n)
+    last = casadi.SX.sym("last", m)
     x, u, r, wanted = (
         casadi.SX.sym(name, size, H)
         for name, size in (("x", n), ("u", m), ("r", n), ("wanted", m))
@@ -500,14 +502,13 @@ def _build(
         casadi.vertcat(*plant.successor(s, v))
         for s, v in zip(before, casadi.horzsplit(u), strict=True)
     ]
-    constraints, g = [casadi.vec(x - casadi.horzcat(*after))], [np.zeros((2, H * n))]
+    constraints = [casadi.vec(x - casadi.horzcat(*after))]
+    g = [np.zeros((2, H * n))]
     if problem.input_rates.finite:
         constraints.append(casadi.vec(rates))
         g.append(np.array(problem.input_rates.by_stage(H)).reshape(2, -1))
-    unknowns, box = (
-        [casadi.vec(x), casadi.vec(u)],
-        [np.tile([[-np.inf], [np.inf]], H * n)],
-    )
+    unknowns = [casadi.vec(x), casadi.vec(u)]
+    box = [np.tile([[-np.inf], [np.inf]], H * n)]
     box.append(np.array(problem.inputs.by_stage(H)).reshape(2, -1))
     rows = ConstraintRows(problem, H, "none")
     E, _, lower, upper = rows.at(
@@ -515,10 +516,8 @@ def _build(
     )
     soft = np.flatnonzero(np.isfinite(rows.prices))
     if rows.per_stage:
-        slack, values = (
-            casadi.SX.sym("slack", len(soft), H),
-            casadi.mtimes(casadi.DM(E[0]), x),
-        )
+        slack = casadi.SX.sym("slack", len(soft), H)
+        values = casadi.mtimes(casadi.DM(E[0]), x)
         for e, given in zip(
             soft, casadi.vertsplit(slack) if soft.size else [], strict=True
         ):

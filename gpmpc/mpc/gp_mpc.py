@@ -153,11 +153,9 @@ class GPMPC:
         ):
             rule = f"form {prediction.form!r} is one quadratic program, so 1"
             raise SettingError("iterations", f"{rule}; got {iterations}")
-        self.initial_input, self.problem, self.horizon = (
-            self.prediction.initial_input,
-            problem,
-            horizon,
-        )
+        self.initial_input = self.prediction.initial_input
+        self.problem = problem
+        self.horizon = horizon
         self.iterations = iterations
         self.solver = DualActiveSet() if solver is None else solver
         check_method("solver", self.solver, "solve", "DualActiveSet()")
@@ -451,10 +449,8 @@ class GPMPC:
         """
         own = [None] * len(beliefs) if parameters is None else parameters
         asked = zip(beliefs, references, previous, own, strict=True)
-        requests, began = (
-            [self.prediction.read(*question) for question in asked],
-            perf_counter(),
-        )
+        requests = [self.prediction.read(*question) for question in asked]
+        began = perf_counter()
         known = [request for request in requests if request.finite]
         try:
             made = iter(self.prediction.linearize_many(known))
@@ -563,10 +559,8 @@ class NonlinearGPMPC(GPMPC):
         iterations: int = 100,
         tolerance: float = 1e-5,
     ):
-        settings, start = (
-            PredictionSettings(covariance=covariance),
-            (problem, horizon, initial_input),
-        )
+        settings = PredictionSettings(covariance=covariance)
+        start = (problem, horizon, initial_input)
         super().__init__(
             model,
             propagator,

@@ -169,10 +169,8 @@ class Box(Constraint):
         above, below = (
             np.flatnonzero(np.isfinite(side).any(axis=0)) for side in (upper, lower)
         )
-        F, none = (
-            np.eye(self.size)[np.concatenate([above, below])],
-            np.full((horizon, self.size), math.inf),
-        )
+        F = np.eye(self.size)[np.concatenate([above, below])]
+        none = np.full((horizon, self.size), math.inf)
         return (
             F,
             np.hstack([-none[:, above], lower[:, below]]),
@@ -194,7 +192,8 @@ class Halfspaces(Constraint):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        F, f = read_numbers("F", self.F), read_numbers("f", self.f)
+        F = read_numbers("F", self.F)
+        f = read_numbers("f", self.f)
         if F.ndim != 2 or f.ndim not in (1, 2) or f.shape[-1] != len(F):
             raise SettingError(
                 "F, f",

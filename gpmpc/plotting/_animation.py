@@ -63,15 +63,14 @@ def save_animation(
 @styled
 def _scene(run: "Run") -> tuple[Figure, Callable[[int], None]]:
     """The figure, and the function of a step's number that draws it."""
-    plane, up = [run.pose["x"], run.pose["y"]], run.pose["z"]
+    plane = [run.pose["x"], run.pose["y"]]
+    up = run.pose["z"]
     sign, axis_name = (
         (-1, "-z") if run.metadata.get("frames", {}).get("z axis") != "up" else (1, "z")
     )
-    states, references, plans = (
-        run.states[:, plane],
-        run.references[:, plane],
-        run.plan_means[:, :, plane],
-    )
+    states = run.states[:, plane]
+    references = run.references[:, plane]
+    plans = run.plan_means[:, :, plane]
     covariances = run.plan_covariances[:, :, plane][..., plane]
     whole: Any = np.isfinite(plans).all(axis=2)  # a shorter plan ends in NaN
 
@@ -90,7 +89,8 @@ def _scene(run: "Run") -> tuple[Figure, Callable[[int], None]]:
     height.set(xlabel="time [s]", ylabel=f"height, {axis_name} [m]")
     # The last plans lead on from where the flight ends; those of failed solves may be anywhere.
     drawn = np.concatenate([states, references, plans[whole & ~run.failed[:, None]]])
-    low, high = drawn.min(axis=0), drawn.max(axis=0)
+    low = drawn.min(axis=0)
+    high = drawn.max(axis=0)
     _look_at(above, (low + high) / 2, 0.56 * max((high - low).max(), 1.0))
 
     complete = plans[
@@ -139,7 +139,8 @@ def _scene(run: "Run") -> tuple[Figure, Callable[[int], None]]:
                 line.set_data(*points.T)
         target.set_data(*references[k, :, None])
         climbed.set_data(run.times[: k + 1], sign * run.states[: k + 1, up])
-        stages, spread = plans[k][whole[k]], covariances[k][whole[k]]
+        stages = plans[k][whole[k]]
+        spread = covariances[k][whole[k]]
         _look_at(
             near,
             (stages.min(axis=0) + stages.max(axis=0)) / 2

@@ -20,7 +20,9 @@ if TYPE_CHECKING:
     from gpmpc.systems import System
 
 Array = np.ndarray
-_WIDTH, _HEIGHT = 640, 480  # of MuJoCo's off-screen buffer
+# of MuJoCo's off-screen buffer
+_WIDTH = 640
+_HEIGHT = 480
 
 
 def film(
@@ -92,12 +94,10 @@ class _Scene:
     """What is rendered of one step."""
 
     def __init__(self, mujoco: Any, run: "Run", dynamics: Any, enlarged: float):
-        self.mujoco, self.run, self.positions, self.enlarged = (
-            mujoco,
-            run,
-            dynamics.positions,
-            enlarged,
-        )
+        self.mujoco = mujoco
+        self.run = run
+        self.positions = dynamics.positions
+        self.enlarged = enlarged
         self.model = dynamics.model
         self.data, self.scene = (
             mujoco.MjData(self.model),
@@ -116,24 +116,26 @@ class _Scene:
 
     def render(self, k: int) -> Array:
         """The picture (height, width, 3) of step k; a camera follows what has a position."""
-        mujoco, run = self.mujoco, self.run
+        mujoco = self.mujoco
+        run = self.run
         self.data.qpos[:] = self.positions(run.states[k])
         mujoco.mj_forward(self.model, self.data)
-        camera, option = mujoco.MjvCamera(), mujoco.MjvOption()
+        camera = mujoco.MjvCamera()
+        option = mujoco.MjvOption()
         mujoco.mjv_defaultFreeCamera(self.model, camera)
         if self.axes:
             camera.lookat[:] = run.states[k, self.axes]
-            camera.distance, camera.elevation, camera.azimuth = 2.2, -25, 120
+            camera.distance = 2.2
+            camera.elevation = -25
+            camera.azimuth = 120
         every = mujoco.mjtCatBit.mjCAT_ALL
         mujoco.mjv_updateScene(
             self.model, self.data, option, None, camera, every, self.scene
         )
         if self.axes:
             self._draw_paths(k)
-        view, pixels = (
-            mujoco.MjrRect(0, 0, _WIDTH, _HEIGHT),
-            np.empty((_HEIGHT, _WIDTH, 3), dtype=np.uint8),
-        )
+        view = mujoco.MjrRect(0, 0, _WIDTH, _HEIGHT)
+        pixels = np.empty((_HEIGHT, _WIDTH, 3), dtype=np.uint8)
         mujoco.mjr_render(view, self.scene, self.rendering)
         mujoco.mjr_readPixels(pixels, None, view, self.rendering)
         return pixels[::-1]
@@ -141,17 +143,13 @@ class _Scene:
     def _draw_paths(self, k: int) -> None:
         """Adds the reference, what was flown before step k, and the plan with its tube."""
         run = self.run
-        plan, covariances = (
-            run.plan_means[k][:, self.axes],
-            run.plan_covariances[k][:, self.axes][..., self.axes],
-        )
+        plan = run.plan_means[k][:, self.axes]
+        covariances = run.plan_covariances[k][:, self.axes][..., self.axes]
         finite = np.isfinite(plan).all(axis=1) & np.isfinite(covariances).all(
             axis=(1, 2)
         )
-        capsule, ellipsoid = (
-            self.mujoco.mjtGeom.mjGEOM_CAPSULE,
-            self.mujoco.mjtGeom.mjGEOM_ELLIPSOID,
-        )
+        capsule = self.mujoco.mjtGeom.mjGEOM_CAPSULE
+        ellipsoid = self.mujoco.mjtGeom.mjGEOM_ELLIPSOID
         flown = run.states[max(0, k - 200) : k + 1, self.axes]
         for points, color in (
             (self.thinned, REFERENCE),

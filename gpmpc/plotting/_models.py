@@ -33,7 +33,8 @@ _PER_PAGE = 24  # channels drawn
 @styled
 def calibration_figure(calibration: "Calibration") -> Figure:
     """Coverage against its nominal level (dashed), log density and error over the steps ahead, a column a state."""
-    n, steps = len(calibration.names), range(1, calibration.horizon + 1)
+    n = len(calibration.names)
+    steps = range(1, calibration.horizon + 1)
     order = sorted(range(len(calibration.levels)), key=calibration.levels.__getitem__)
     colours = colormaps["Blues"](
         np.linspace(1.0, 0.5, len(order))[::-1]
@@ -89,7 +90,8 @@ def innovations_figure(
     """Draws each measured value's innovations over their standard deviation, and the share outside of 95 %."""
     deviations = run.innovation_covariances.diagonal(dim1=-2, dim2=-1).sqrt()
     white = (run.innovations / deviations).cpu().numpy()
-    p, times = white.shape[1], time_step * np.arange(len(white))
+    p = white.shape[1]
+    times = time_step * np.arange(len(white))
     figure, axes = make_figure(
         7.0,
         1.0 + 1.4 * p,
@@ -120,7 +122,8 @@ def innovations_figure(
 @styled
 def judgement_figure(judgement: "Judgement") -> Figure:
     """Draws the errors over the steps for every predictor, with coverage and width of the model's intervals below."""
-    steps, n = judgement.steps, len(judgement.groups)
+    steps = judgement.steps
+    n = len(judgement.groups)
     figure, axes = make_figure(
         2.6 * n, 4.8, 2, n, gridspec_kw={"height_ratios": [3, 1.6]}
     )

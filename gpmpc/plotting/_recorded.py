@@ -57,21 +57,18 @@ def expected(run: "Run", states: list[int]) -> tuple[np.ndarray, np.ndarray]:
 @styled
 def tracking_figure(run: "Run") -> Figure:
     """Draws every tracked state and angle over time against its reference, and below it the error with the tube."""
-    said, names, units = (
-        run.metadata.get("run", {}),
-        list(run.state_names),
-        run.metadata.get("units", {}),
-    )
-    angles, z_down = (
-        said.get("angles", "").split(),
-        run.metadata.get("frames", {}).get("z axis") != "up",
-    )
+    said = run.metadata.get("run", {})
+    names = list(run.state_names)
+    units = run.metadata.get("units", {})
+    angles = said.get("angles", "").split()
+    z_down = run.metadata.get("frames", {}).get("z axis") != "up"
     tracked = dict.fromkeys([*said.get("tracked", "").split(), *angles])
     states = [names.index(name) for name in tracked if name in names] or list(
         range(len(names))
     )
     mean, std = expected(run, states)
-    n, heights = len(states), {"height_ratios": [3, 2]}
+    n = len(states)
+    heights = {"height_ratios": [3, 2]}
     figure, axes = make_figure(
         2.9 * max(n, 2), 4.8, 2, n, _title_of(run), sharex=True, gridspec_kw=heights
     )
@@ -80,11 +77,9 @@ def tracking_figure(run: "Run") -> Figure:
     for (above, below), i, predicted, deviation in zip(
         axes.T, states, mean.T, std.T, strict=True
     ):
-        state, reference, unit = (
-            run.states[:, i],
-            run.references[:, i],
-            units.get(f"state.{names[i]}", ""),
-        )
+        state = run.states[:, i]
+        reference = run.references[:, i]
+        unit = units.get(f"state.{names[i]}", "")
         if names[i] in angles:  # at the turn that is nearest to where it was
             reference = reference + whole_turns(state - reference)
             predicted = predicted + whole_turns(state - predicted)
@@ -92,10 +87,8 @@ def tracking_figure(run: "Run") -> Figure:
         above.plot(run.times, reference, linewidth=1.2, label="reference", **dashed)
         above.set_title(name_of(names[i], unit, z_down))
         below.axhline(0, linewidth=1, **dashed)
-        low, high = (
-            predicted - reference - 2 * deviation,
-            predicted - reference + 2 * deviation,
-        )
+        low = predicted - reference - 2 * deviation
+        high = predicted - reference + 2 * deviation
         tube = {
             "color": TUBE,
             "alpha": 0.7,
@@ -117,7 +110,8 @@ def tracking_figure(run: "Run") -> Figure:
 @styled
 def inputs_figure(run: "Run") -> Figure:
     """Draws what acted, over time, with its bounds."""
-    m, units = len(run.input_names), run.metadata.get("units", {})
+    m = len(run.input_names)
+    units = run.metadata.get("units", {})
     figure, axes = make_figure(7.2, 1.6 * m + 1.0, m, 1, _title_of(run), sharex=True)
     for axis, name, values, bounds in zip(
         axes.flat, run.input_names, run.inputs.T, run.input_bounds.T, strict=True
@@ -222,13 +216,15 @@ def _title_of(run: "Run") -> str:
 
 def _draw_bounds(axis: Axes, inputs: np.ndarray, bounds: np.ndarray) -> None:
     """Draws lines where they are near; where they are so far that the input would be flat beside them, words."""
-    low, high = float(inputs.min()), float(inputs.max())
+    low = float(inputs.min())
+    high = float(inputs.max())
     span = max(high - low, 1e-3 * max(abs(low), abs(high), 1e-3))
     limits = bounds[np.isfinite(bounds)]
     near = limits[(low - 2 * span <= limits) & (limits <= high + 2 * span)]
     for limit in near:
         axis.axhline(limit, color=_BOUND, linestyle=DASHED, linewidth=1, label="bound")
-    low, high = min([low, *near]), max([high, *near])
+    low = min([low, *near])
+    high = max([high, *near])
     axis.set_ylim(
         low - 0.12 * max(high - low, span), high + 0.25 * max(high - low, span)
     )

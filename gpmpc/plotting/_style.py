@@ -19,7 +19,10 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 BLUE, VERMILION, GREEN, _PURPLE = "#0072b2", "#d55e00", "#009e73", "#cc79a7"
 ORANGE, SKY, BLACK, GREY = "#e69f00", "#56b4e9", "#000000", "0.45"
 COLOURS = (BLUE, VERMILION, GREEN, _PURPLE, ORANGE, SKY, BLACK, GREY)
-FLOWN, REFERENCE, TUBE, PLAN = BLUE, VERMILION, SKY, GREEN
+FLOWN = BLUE
+REFERENCE = VERMILION
+TUBE = SKY
+PLAN = GREEN
 DASHES: tuple[Any, ...] = (
     "-",
     (0, (5, 2)),

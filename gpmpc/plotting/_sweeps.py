@@ -55,7 +55,8 @@ def over_variable(
     if max(map(len, positions)) * len(positions) > 40:
         axis.tick_params(axis="x", labelrotation=30)
     values = [v for line in lines for group in line.values for v in group]
-    low, high = min(values, default=0), max(values, default=0)
+    low = min(values, default=0)
+    high = max(values, default=0)
     if logarithmic and low > 0 and high > 3 * low:
         axis.set_yscale("log")
         plain_numbers(axis.yaxis, few=high < 30 * low)
@@ -160,7 +161,8 @@ def search_figure(
         4.4 + 4.0 * bool(importances), 3.4, columns=1 + bool(importances)
     )
     values = np.array(costs)
-    finite, best = np.isfinite(values), np.minimum.accumulate(values)
+    finite = np.isfinite(values)
+    best = np.minimum.accumulate(values)
     axis.plot(
         np.flatnonzero(finite),
         values[finite],
@@ -194,10 +196,8 @@ def search_figure(
     axis.xaxis.set_major_locator(MaxNLocator(integer=True))
     legend_below(figure, [axis])
     for beside in bars:
-        names, shares = (
-            [clipped(name, 60) for name in importances],
-            [100 * share for share in importances.values()],
-        )
+        names = [clipped(name, 60) for name in importances]
+        shares = [100 * share for share in importances.values()]
         drawn = beside.barh(names[::-1], shares[::-1], color=COLOURS[0], height=0.5)
         beside.bar_label(drawn, fmt="%.0f %%", padding=3)
         beside.set(xlabel="importance [%]", xlim=(0, 115))

@@ -47,15 +47,18 @@ def expand(model: Any, state: Tensor, input: Tensor) -> _Expansion | None:
         return None
     from gpmpc import _kernels as kernels  # loads numba
 
-    batch, gp = state.shape[:-1], form.f
+    batch = state.shape[:-1]
+    gp = form.f
     flat = arrays[1].reshape(-1, gp.state_dim)
     found = kernels.point_with_jacobian(
         gp.packed, flat, arrays[2].reshape(len(flat), gp.input_dim)
     )
     parts = [torch.from_numpy(part.reshape(*batch, *part.shape[1:])) for part in found]
-    mean, A = parts[0] + gp.offset, parts[2]
+    mean = parts[0] + gp.offset
+    A = parts[2]
     if form.A is not None:
-        mean, A = mean + state, A + form.A
+        mean = mean + state
+        A = A + form.A
     return _Expansion(Gaussian(mean, torch.diag_embed(parts[1])), A, *parts[3:])
 
 
@@ -111,10 +114,8 @@ class MeanEquivalence(NoisyPropagator):
         self, model: Any, belief: Gaussian, input: Tensor | None = None
     ) -> tuple[Propagation, Sensitivity] | None:
         """``propagate`` with all derivatives in closed form; None where there is none."""
-        input, certain = (
-            checked_input(model, belief, input),
-            Gaussian(belief.mean, torch.zeros_like(belief.covariance)),
-        )
+        input = checked_input(model, belief, input)
+        certain = Gaussian(belief.mean, torch.zeros_like(belief.covariance))
         if (
             found := Linearization(self.process_noise).differentiate(
                 model, certain, input

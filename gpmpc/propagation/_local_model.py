@@ -61,7 +61,9 @@ def linearize(
             f"a local model needs an output a state; got {belief.dim} states, {model.output_dim} outputs"
         )
     moved, d = differentiate(propagator, model, belief, input)
-    batch, n, p = belief.mean.shape[:-1], belief.dim, belief.dim + belief.dim**2
+    batch = belief.mean.shape[:-1]
+    n = belief.dim
+    p = belief.dim + belief.dim**2
     of_mean, mean_by_covariance, mean_by_input, by_mean, by_covariance, by_input = map(
         to_array, vars(d).values()
     )
@@ -69,10 +71,8 @@ def linearize(
         [to_array(belief.covariance), to_array(moved.belief.covariance)]
     )
     roots, (_, r), (_, U) = square_roots(covariances)
-    means, u = (
-        np.stack([to_array(belief.mean), to_array(moved.belief.mean)]),
-        to_array(input.expand(*batch, -1)),
-    )
+    means = np.stack([to_array(belief.mean), to_array(moved.belief.mean)])
+    u = to_array(input.expand(*batch, -1))
     s, s_next = np.concatenate([means, roots.reshape(2, *batch, n * n)], axis=-1)
     # dSigma = E S + S E for a change E of the root: a derivative D by Sigma becomes 2 D S.
     twice = 2 * roots[0][..., None, :, :]

@@ -58,7 +58,8 @@ class MomentMatching(NoisyPropagator):
             of = torch.eye(
                 d.covariance_by_mean.shape[-2], dtype=f.M.dtype, device=f.M.device
             )[..., None]
-            by_mean, by_input = of * d.covariance_by_mean, of * d.covariance_by_input
+            by_mean = of * d.covariance_by_mean
+            by_input = of * d.covariance_by_input
             by_covariance = of[..., None] * d.covariance_by_covariance
             d = replace(
                 d,
@@ -84,13 +85,13 @@ class MomentMatching(NoisyPropagator):
                 f"got {type(model).__name__}. "
                 "Possible with any model: MeanEquivalence, Linearization, Unscented, MonteCarlo"
             )
-        f, cross, batch = form.f, form.A is not None, belief.mean.shape[:-1]
+        f = form.f
+        cross = form.A is not None
+        batch = belief.mean.shape[:-1]
         if form.states is not None:
             S = belief.covariance[..., form.states, :][..., form.states]
-            belief, input = (
-                Gaussian(belief.mean[..., form.states], S),
-                input[..., form.inputs],
-            )
+            belief = Gaussian(belief.mean[..., form.states], S)
+            input = input[..., form.inputs]
         if (
             arrays := host_arrays(f.weights, belief.mean, belief.covariance, input)
         ) is None:
@@ -128,10 +129,15 @@ def _next_moments(
     form: AffineForm, belief: Gaussian, input: Tensor, f: Latent
 ) -> tuple[Tensor, Tensor, Tensor]:
     """mu+ (*batch, n), Sigma+ (*batch, n, n) and Cov[x, x+] (*batch, n, n), by the module's text."""
-    M, V, S, A = f.M, f.V, belief.covariance, form.A
+    M = f.M
+    V = f.V
+    S = belief.covariance
+    A = form.A
     cross = (S if form.states is None else S[..., form.states]) @ f.J.mT
     if form.B is not None:
-        M, V, cross = M @ form.B.mT, form.B @ V @ form.B.mT, cross @ form.B.mT
+        M = M @ form.B.mT
+        V = form.B @ V @ form.B.mT
+        cross = cross @ form.B.mT
     if A is None:
         return M, V, cross
     half = A @ cross
@@ -145,16 +151,20 @@ def _next_moments(
 
 def _derivatives(form: AffineForm, S: Tensor, f: Latent) -> Sensitivity:
     """The derivatives of mu+ and Sigma+ at a belief with covariance S (*batch, n, n)."""
-    A, B, n, m = form.A, form.B, S.shape[-1], 0 if form.G is None else form.G.shape[1]
-    J, dM_dS, dM_du = (
-        _whole(f.J, form.states, n),
-        _whole(f.dM_dS, form.states, n, 2),
-        _whole(f.dM_du, form.inputs, m),
-    )
-    dV_dmu, dV_dS = _whole(f.dV_dmu, form.states, n), _whole(f.dV_dS, form.states, n, 2)
+    A = form.A
+    B = form.B
+    n = S.shape[-1]
+    m = 0 if form.G is None else form.G.shape[1]
+    J = _whole(f.J, form.states, n)
+    dM_dS = _whole(f.dM_dS, form.states, n, 2)
+    dM_du = _whole(f.dM_du, form.inputs, m)
+    dV_dmu = _whole(f.dV_dmu, form.states, n)
+    dV_dS = _whole(f.dV_dS, form.states, n, 2)
     dV_du = _whole(f.dV_du, form.inputs, m)
     if B is not None:
-        J, dM_du, dM_dS = B @ J, B @ dM_du, torch.einsum("ia,...acd->...icd", B, dM_dS)
+        J = B @ J
+        dM_du = B @ dM_du
+        dM_dS = torch.einsum("ia,...acd->...icd", B, dM_dS)
         dV_dmu, dV_du = (
             torch.einsum("ia,jb,...abc->...ijc", B, B, d) for d in (dV_dmu, dV_du)
         )

@@ -82,10 +82,8 @@ def moments(
         belief.covariance[..., None, :, :],
         input[..., None, :],
     )
-    terms, pairs = (
-        _output_terms(model, slice(None), *at),
-        _chunks(model, belief, diagonal),
-    )
+    terms = _output_terms(model, slice(None), *at)
+    pairs = _chunks(model, belief, diagonal)
     weighted = model.weights * terms.q
     slope = (weighted[..., None, :] @ terms.z @ terms.G)[..., 0, :]
     V = _symmetric_from_pairs(
@@ -102,24 +100,25 @@ def moments_with_jacobian(
     cross: bool = True,
 ) -> Latent:
     """The moments of f at x ~ N(mu, S), and their derivatives by mu, S and u; ``cross`` adds those of J."""
-    n, axis = model.state_dim, belief.mean.dim() - 1
+    n = model.state_dim
+    axis = belief.mean.dim() - 1
     at = (
         belief.mean[..., None, :],
         belief.covariance[..., None, :, :],
         input[..., None, :],
     )
-    terms, pairs = (
-        _output_terms(model, slice(None), *at),
-        _chunks(model, belief, diagonal),
-    )
+    terms = _output_terms(model, slice(None), *at)
+    pairs = _chunks(model, belief, diagonal)
     w = terms.z @ terms.G  # dlog q_ai / dmu
     c = (model.features[:, n:] - input[..., None, :])[
         ..., None, :, :
     ] * model.lengthscales[:, None, n:] ** -2
     A = terms.G.mT * model.lengthscales[:, None, :n] ** -2  # G' D, symmetric
     weighted = model.weights * terms.q
-    M, once = weighted.sum(-1), weighted[..., None] * w
-    J, dM_dS = once.sum(-2), (once.mT @ w - M[..., None, None] * A) / 2
+    M = weighted.sum(-1)
+    once = weighted[..., None] * w
+    J = once.sum(-2)
+    dM_dS = (once.mT @ w - M[..., None, None] * A) / 2
     dJ = ()
     if cross:  # dJ/dS = 1/2 [sum_i beta_i q_i w_i w_i w_i - three times A with J],   dJ/du = sum_i beta_i q_i w_i c_i'
         third = torch.stack([(once * w[..., d, None]).mT @ w for d in range(n)], dim=-3)
@@ -145,19 +144,19 @@ def _output_terms(
     model: GPPosterior, a: Any, mu: Tensor, S: Tensor, u: Tensor
 ) -> _OutputTerms:
     """The terms of outputs a (k,) at mu (*batch, k, n), S (*batch, k, n, n) and u (*batch, k, m), or one for all."""
-    n, lengthscales = model.state_dim, model.lengthscales[a]
+    n = model.state_dim
+    lengthscales = model.lengthscales[a]
     D = lengthscales[:, :n] ** -2
-    nu, control = (
-        model.features[:, :n] - mu[..., None, :],
-        model.features[:, n:] - u[..., None, :],
-    )
+    nu = model.features[:, :n] - mu[..., None, :]
+    control = model.features[:, n:] - u[..., None, :]
     half_logdet, factor, T = _conditioned(S, D)
     whitened = torch.linalg.solve_triangular(
         factor, (nu * D.sqrt()[:, None, :]).mT, upper=False
     )
     certain = (control / lengthscales[:, None, n:]).square().sum(-1)
     exponent = (certain + whitened.square().sum(-2)) / 2 + half_logdet[..., None]
-    root, eye = D.sqrt(), torch.eye(n, dtype=D.dtype, device=D.device)
+    root = D.sqrt()
+    eye = torch.eye(n, dtype=D.dtype, device=D.device)
     inverse = torch.cholesky_solve(
         eye.expand_as(factor), factor
     )  # cholesky_inverse has no right forward derivative

@@ -58,7 +58,9 @@ class Unscented(NoisyPropagator):
         check_number("beta", beta)
         check_number("kappa", kappa)
         super().__init__(process_noise)
-        self.alpha, self.beta, self.kappa = alpha, beta, kappa
+        self.alpha = alpha
+        self.beta = beta
+        self.kappa = kappa
 
     def differentiate(
         self, model: Any, belief: Gaussian, input: Tensor | None = None
@@ -67,7 +69,8 @@ class Unscented(NoisyPropagator):
 
         Where Sigma is singular its root has no derivative in the null space; zero is taken there.
         """
-        input, n = checked_input(model, belief, input), belief.dim
+        input = checked_input(model, belief, input)
+        n = belief.dim
         r, U = torch.linalg.eigh(belief.covariance)
         r = r.clamp_min(0).sqrt()
         steps, points, controls = self._points(
@@ -121,7 +124,8 @@ class Unscented(NoisyPropagator):
                 by[..., n + n * n :],
             )
 
-        of_means, of_covariances = parts(mean_by), parts(covariance_by)
+        of_means = parts(mean_by)
+        of_covariances = parts(covariance_by)
         moments = self._moments(model, belief, steps, expansion.belief)
         moved = self._projected(model, *moments)
         return moved, Sensitivity(*of_means, *of_covariances)
@@ -136,13 +140,12 @@ class Unscented(NoisyPropagator):
 
     def _weights(self, belief: Gaussian) -> tuple[Tensor, Tensor]:
         """Of the points in the mean and in the covariance (2n + 1,)."""
-        n, spread = belief.dim, self._spread(belief.dim)
+        n = belief.dim
+        spread = self._spread(belief.dim)
         of_mean = belief.mean.new_full((2 * n + 1,), 1 / (2 * spread))
         of_covariance = of_mean.clone()
-        of_mean[0], of_covariance[0] = (
-            1 - n / spread,
-            2 - n / spread - self.alpha**2 + self.beta,
-        )
+        of_mean[0] = 1 - n / spread
+        of_covariance[0] = 2 - n / spread - self.alpha**2 + self.beta
         return of_mean, of_covariance
 
     def _points(
@@ -200,7 +203,8 @@ class MonteCarlo(NoisyPropagator):
         check_number("samples", samples, least=2, whole=True)
         check_number("seed", seed, least=0, whole=True)
         super().__init__(process_noise)
-        self.samples, self.seed = samples, seed
+        self.samples = samples
+        self.seed = seed
 
     def _moved(
         self, model: Any, belief: Gaussian, input: Tensor
@@ -212,7 +216,8 @@ class MonteCarlo(NoisyPropagator):
         steps = torch.from_numpy(normal).to(belief.mean) @ square_root(
             belief.covariance
         )  # (*batch, samples, n)
-        means, spread = [], 0.0
+        means = []
+        spread = 0.0
         for chunk in steps.split(_CHUNK, dim=-2):
             points = belief.mean[..., None, :] + chunk
             moved = model.predict(

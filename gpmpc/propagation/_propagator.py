@@ -145,7 +145,9 @@ def by_autograd(
     propagator: Propagator, model: Any, belief: Gaussian, input: Tensor | None = None
 ) -> tuple[Propagation, Sensitivity]:
     """``differentiate`` by torch autograd, for any propagator and model that torch can follow."""
-    input, n, k = checked_input(model, belief, input), belief.dim, model.output_dim
+    input = checked_input(model, belief, input)
+    n = belief.dim
+    k = model.output_dim
     with torch.inference_mode(
         False
     ):  # inference tensors, constants too, could not be saved for backward

@@ -82,34 +82,35 @@ class CvxpySolver:
 
         began = perf_counter()
         P, q, G, lower, upper = problem
-        n, M = len(q), len(lower)
+        n = len(q)
+        M = len(lower)
         equal = (lower == upper) & (upper < ABSENT)
         kinds = (equal, (upper < ABSENT) & ~equal, (lower > -ABSENT) & ~equal)
         program, y, sides = _compile(
             threading.get_ident(), n, *(kind.tobytes() for kind in kinds)
         )
         factor = np.linalg.cholesky(P).T
-        free, back = (
-            -cho_solve((factor, False), q),
-            solve_triangular(factor, np.eye(n)),
-        )  # back = L^-T
-        columns, offset = (
-            np.concatenate([back, G @ back]),
-            np.concatenate([free, G @ free]),
-        )
+        # back = L^-T
+        free = -cho_solve((factor, False), q)
+        back = solve_triangular(factor, np.eye(n))
+        columns = np.concatenate([back, G @ back])
+        offset = np.concatenate([free, G @ free])
         for members, sign, rows, bound, _ in sides:
-            rows.value, bound.value = (
-                columns[members],
-                ((lower if sign < 0 else upper) - offset)[members],
-            )
+            rows.value = columns[members]
+            bound.value = ((lower if sign < 0 else upper) - offset)[members]
         warm = False
         if isinstance(warm_start, QPSolution) and len(warm_start.x) == n:
-            warm, y.value = True, factor @ (warm_start.x - free)
-        built, best, least = perf_counter(), None, np.inf
+            warm = True
+            y.value = factor @ (warm_start.x - free)
+        built = perf_counter()
+        best = None
+        least = np.inf
         for options in (
             (TIGHT.get(self.name, {}), {}) if self.options is None else (self.options,)
         ):
-            status, x, multipliers = Status.NUMERICAL_TROUBLE, np.zeros(n), np.zeros(M)
+            status = Status.NUMERICAL_TROUBLE
+            x = np.zeros(n)
+            multipliers = np.zeros(M)
             with warnings.catch_warnings(), suppress(cvxpy.SolverError):
                 warnings.simplefilter(
                     "ignore"
@@ -150,7 +151,8 @@ class CvxpySolver:
             if status is Status.SOLVED and residual <= self.tolerance:
                 return solution
             if best is None or residual < least:
-                best, least = solution, residual
+                best = solution
+                least = residual
         assert best is not None
         if best.status is Status.SOLVED:
             best.record[layout.STATUS] = layout.NUMERICAL_TROUBLE
@@ -170,14 +172,13 @@ def _compile(
     """
     import cvxpy
 
-    y, sides = cvxpy.Variable(n), []
+    y = cvxpy.Variable(n)
+    sides = []
     for kind, sign in ((equal, 1.0), (above, 1.0), (below, -1.0)):
         members = np.frombuffer(kind, dtype=bool)
         if members.any():
-            rows, bound = (
-                cvxpy.Parameter((members.sum(), n)),
-                cvxpy.Parameter(members.sum()),
-            )
+            rows = cvxpy.Parameter((members.sum(), n))
+            bound = cvxpy.Parameter(members.sum())
             at = rows @ y
             constraint = (
                 at == bound

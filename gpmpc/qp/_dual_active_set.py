@@ -27,13 +27,11 @@ from gpmpc.qp._workspace import new_memory, prepare_memory
 Array = NDArray[np.float64]
 
 # Local names save look-ups; ``tuple.__new__`` takes half the time of a named tuple's own constructor.
-_NO_RECORD, _MISUSE, _FLOAT, _empty, _new = (
-    layout.NO_RECORD,
-    layout.MISUSE,
-    np.dtype(float),
-    np.empty,
-    tuple.__new__,
-)
+_NO_RECORD = layout.NO_RECORD
+_MISUSE = layout.MISUSE
+_FLOAT = np.dtype(float)
+_empty = np.empty
+_new = tuple.__new__
 _run = solve  # until it is compiled
 _ITERATIONS_PER_CONSTRAINT = (
     10  # default limit, beyond which the iteration is taken to cycle
@@ -101,7 +99,8 @@ class DualActiveSet:
             problem = QuadraticProgram.from_stacked(*problem)
             plan = self._plan(problem.G.shape, prices)
         (P, q, G, lower, upper), (caps, memory, size, where) = problem, plan
-        record, status = _empty(size), _MISUSE
+        record = _empty(size)
+        status = _MISUSE
         try:
             guess = _NO_RECORD if warm_start is None else warm_start.record  # type: ignore[union-attr]
             if P.dtype is q.dtype is G.dtype is lower.dtype is upper.dtype is _FLOAT:
@@ -142,7 +141,8 @@ class DualActiveSet:
     ) -> tuple[Array, Array, int, slice]:
         """Returns caps, memory, the record's length, and where x is in it, for a shape of G."""
         m, n = shape
-        caps, limit = multiplier_caps(prices, n, m), self._limit(n + m)
+        caps = multiplier_caps(prices, n, m)
+        limit = self._limit(n + m)
         if self.time_limit is not None:
             limit = min(limit, _ITERATIONS_PER_LOOK)
         memory = new_memory(
@@ -189,7 +189,8 @@ class DualActiveSet:
                 memory,
                 record,
             )
-        M, done = len(problem.lower), record[layout.ITERATIONS]
+        M = len(problem.lower)
+        done = record[layout.ITERATIONS]
 
         def late() -> bool:
             return (
@@ -197,7 +198,8 @@ class DualActiveSet:
             )
 
         while status == layout.ITERATION_LIMIT and not late() and done < self._limit(M):
-            guess, record = record, np.empty_like(record)
+            guess = record
+            record = np.empty_like(record)
             status = solve(*problem, guess, memory, record)
             done += record[layout.ITERATIONS]
         record[layout.ITERATIONS] = done
@@ -205,7 +207,8 @@ class DualActiveSet:
             record[layout.STATUS] = layout.TIME_LIMIT
         stopped = status == layout.ITERATION_LIMIT and self.iteration_limit is not None
         if not stopped and not _is_certain(record, problem):
-            guess, record = record, record.copy()
+            guess = record
+            record = record.copy()
             guess[layout.TAG] = 0.0  # the factor is computed anew
             solve(*problem, guess, memory, record)
             record[layout.ITERATIONS] += done
@@ -222,7 +225,9 @@ class Prepared:
     def __init__(
         self, solver: DualActiveSet, problem: QuadraticProgram, prices: ArrayLike | None
     ):
-        self._P, self._G, self._solver = problem.P, problem.G, solver
+        self._P = problem.P
+        self._G = problem.G
+        self._solver = solver
         _, memory, size, _ = self._plan = solver._plan(
             problem.G.shape, prices, prepared=True
         )
@@ -246,7 +251,8 @@ class Prepared:
         """
         began = perf_counter()  # line by line as in ``DualActiveSet.solve``: a call costs a tenth of a small solve
         P, G, (caps, memory, size, where) = self._P, self._G, self._plan
-        record, status = _empty(size), _MISUSE
+        record = _empty(size)
+        status = _MISUSE
         try:
             guess = _NO_RECORD if warm_start is None else warm_start.record  # type: ignore[union-attr]
             if q.dtype is lower.dtype is upper.dtype is _FLOAT:

@@ -89,15 +89,23 @@ def iterate(work, k, count, margin, iterations, batches):
         whether a constraint was passed over because it contradicts others by what may be rounding, and whether any was
         violated.
     """
-    vectors, indices, n = work.vectors, work.indices, len(work.q)
+    vectors = work.vectors
+    indices = work.indices
+    n = len(work.q)
     M = n + len(work.G)
-    p, chosen, begins, violated, passed = 0, -1 - count, count < 0, False, False
+    p = 0
+    chosen = -1 - count
+    begins = count < 0
+    violated = False
+    passed = False
     complete = True  # whether y and the list are those of all constraints
     while count != 0:
         if not begins:
             if iterations >= work.limit:
                 return ITERATION_LIMIT, k, iterations, batches, passed, True
-            p, chosen, violated = most_violated(vectors, indices, count), 0, True
+            p = most_violated(vectors, indices, count)
+            chosen = 0
+            violated = True
             if complete and batches < _BATCHES:
                 chosen = choose_bad(
                     vectors, indices, _BAD * vectors[EXCESS, p], count, n - k
@@ -117,10 +125,9 @@ def iterate(work, k, count, margin, iterations, batches):
                 if vectors[EXCESS, p] * vectors[SCALE, p] > _HOPELESS * size:
                     _write_ray(work, k, p)
                     return INFEASIBLE, k, iterations, batches, passed, True
-                vectors[MU, p], passed = (
-                    mu_p,
-                    True,
-                )  # what it gained on the way belongs to no working set
+                # what it gained on the way belongs to no working set
+                vectors[MU, p] = mu_p
+                passed = True
                 ignore_violations(vectors, p)
                 unsettled = not work.soft  # else refinement has to do
             if work.soft:
@@ -154,21 +161,23 @@ def _satisfy_constraint(work, k, p):
     Returns:
         False if it contradicts the working ones, the size of the working set, and how many entered or left.
     """
-    vectors, names, factor, changes = work.vectors, work.indices[NAME], work.factor, 0
-    mu, r, solved, least, most = (
-        vectors[MU],
-        vectors[R],
-        vectors[SOLVED_K],
-        vectors[LEAST],
-        vectors[MOST],
-    )
+    vectors = work.vectors
+    names = work.indices[NAME]
+    factor = work.factor
+    changes = 0
+    mu = vectors[MU]
+    r = vectors[R]
+    solved = vectors[SOLVED_K]
+    least = vectors[LEAST]
+    most = vectors[MOST]
     above = mu[p] > 0.0 or (mu[p] == 0.0 and vectors[Y, p] > vectors[UPPER, p])
     sense = (
         1.0 if above == (mu[p] == 0.0) else -1.0
     )  # the direction of mu_p, which comes back from a cap
     _write_slot(work, k, p, above)
     _solve_slot(work, k, p)
-    violation, K_pp = (vectors[Y, p] - vectors[BOUND, k]) * sense, vectors[DIAGONAL, k]
+    violation = (vectors[Y, p] - vectors[BOUND, k]) * sense
+    K_pp = vectors[DIAGONAL, k]
     while True:
         # step direction:  r = K_WW^-1 K_Wp,  d = K_pp - K_pW r;  mu_p moves by t, mu_W by -t r and y_p by -t d
         scale(1.0, solved, r, k)
@@ -222,7 +231,8 @@ def _satisfy_constraint(work, k, p):
 @inline_njit
 def _first_blocking(vectors, names, k, sense, step):
     """Returns the longest step up to ``step`` that keeps the multipliers in range, and the slot that ends it (or k)."""
-    r, size = vectors[R], 0.0
+    r = vectors[R]
+    size = 0.0
     for i in range(k):
         size = max(size, abs(r[i]))
     blocking = k
@@ -232,19 +242,18 @@ def _first_blocking(vectors, names, k, sense, step):
             end = vectors[LEAST, i] if rate > 0.0 else vectors[MOST, i]
             room = (vectors[MU, abs(names[i]) - 1] - end) / rate
             if room < step:
-                step, blocking = max(room, 0.0), i
+                step = max(room, 0.0)
+                blocking = i
     return step, blocking
 
 
 @inline_njit
 def _distance_to_span(work, k):
     """Returns ``d = |w_p - sum r_i w_i|^2``, p in slot k, as a sum of squares, which cannot cancel."""
-    rest, row, places, n = (
-        work.vectors[SCRATCH],
-        work.rows[work.indices[PLACE, k]],
-        work.indices[PLACE],
-        len(work.q),
-    )
+    rest = work.vectors[SCRATCH]
+    row = work.rows[work.indices[PLACE, k]]
+    places = work.indices[PLACE]
+    n = len(work.q)
     scale(1.0, row, rest, n)
     subtract_rows(rest, work.rows, places, work.vectors[R], k, n)
     return dot(rest, rest, n)
@@ -253,12 +262,15 @@ def _distance_to_span(work, k):
 @inline_njit
 def _write_ray(work, k, p):
     """Writes Farkas' proof that p contradicts the working constraints to mu: ``C' ray = 0``, ``ray' bounds < 0``."""
-    vectors, names = work.vectors, work.indices[NAME]
-    mu, sense = vectors[MU], 1.0 if vectors[Y, p] > vectors[UPPER, p] else -1.0
+    vectors = work.vectors
+    names = work.indices[NAME]
+    mu = vectors[MU]
+    sense = 1.0 if vectors[Y, p] > vectors[UPPER, p] else -1.0
     for i in range(len(mu)):
         mu[i] = 0.0
     for i in range(k):
-        w, ray = abs(names[i]) - 1, -sense * vectors[R, i]
+        w = abs(names[i]) - 1
+        ray = -sense * vectors[R, i]
         if (
             ray * names[i] >= 0.0 or vectors[LOWER, w] == vectors[UPPER, w]
         ):  # else rounding: it cannot pull that way
@@ -269,7 +281,8 @@ def _write_ray(work, k, p):
 @inline_njit
 def add_constraints(work, k, count):
     """Adds the first ``count`` candidates to the working set, but for those that depend on others; returns its size."""
-    vectors, solved = work.vectors, work.vectors[SOLVED_K]
+    vectors = work.vectors
+    solved = work.vectors[SOLVED_K]
     for i in range(count):
         name = work.indices[CANDIDATES, i]
         p = abs(name) - 1
@@ -290,12 +303,16 @@ def add_constraints(work, k, count):
 @inline_njit
 def _write_slot(work, k, p, above):
     """Writes constraint p, at its upper bound (``above``) or its lower one, to slot k."""
-    vectors, places, n = work.vectors, work.indices[PLACE], len(work.q)
+    vectors = work.vectors
+    places = work.indices[PLACE]
+    n = len(work.q)
     if work.tag != 0.0:
-        places[k], row = p, work.rows[n + len(work.G) + p]
+        places[k] = p
+        row = work.rows[n + len(work.G) + p]
         vectors[DIAGONAL, k] = row[p]
     else:
-        row, size = work.rows[places[k]], int(vectors[END, p])
+        row = work.rows[places[k]]
+        size = int(vectors[END, p])
         if p >= n:
             for i in range(0, n, 8):
                 store(row, i, load_some(work.G[p - n], i))
@@ -305,7 +322,9 @@ def _write_slot(work, k, p, above):
             row[p] = 1.0
         solve_transposed(work.L, size, row)
         vectors[DIAGONAL, k] = dot(row, row, size)
-    low, high, cap = vectors[LOWER, p], vectors[UPPER, p], vectors[CAP, p]
+    low = vectors[LOWER, p]
+    high = vectors[UPPER, p]
+    cap = vectors[CAP, p]
     work.indices[NAME, k] = p + 1 if above else -(p + 1)
     vectors[BOUND, k] = high if above else low
     vectors[LEAST, k] = -cap if low == high or not above else 0.0
@@ -316,7 +335,8 @@ def _write_slot(work, k, p, above):
 @inline_njit
 def _solve_slot(work, k, p):
     """Writes L_K^-1 K_Wp for constraint p in slot k."""
-    solved, places = work.vectors[SOLVED_K], work.indices[PLACE]
+    solved = work.vectors[SOLVED_K]
+    places = work.indices[PLACE]
     if work.tag != 0.0:
         row = work.rows[len(work.q) + len(work.G) + p]
         for i in range(k):
@@ -349,7 +369,9 @@ def restore_constraints(work, count, factor):
 @inline_njit
 def _drop_constraint(work, k, slot):
     """Drops the constraint in a slot from the working set of k, and from ``SOLVED``; those behind move up, k too."""
-    vectors, names, places = work.vectors, work.indices[NAME], work.indices[PLACE]
+    vectors = work.vectors
+    names = work.indices[NAME]
+    places = work.indices[PLACE]
     delete_row(
         work.factor, k, slot, vectors[SOLVED_K], vectors[COSINES], vectors[SINES]
     )
@@ -367,23 +389,23 @@ def _drop_wrong_multipliers(work, k):
 
     Any working set is a valid start of a dual method once this is done.
     """
-    vectors, names, solved, trial = (
-        work.vectors,
-        work.indices[NAME],
-        work.vectors[SOLVED_K],
-        work.vectors[R],
-    )
+    vectors = work.vectors
+    names = work.indices[NAME]
+    solved = work.vectors[SOLVED_K]
+    trial = work.vectors[R]
     for i in range(k):
         solved[i] = vectors[FREE_VALUE, i] - vectors[BOUND, i]
     solve_lower(work.factor, k, solved)
     while True:
         scale(1.0, solved, trial, k)
         solve_transposed(work.factor, k, trial)
-        worst, slot = 0.0, k
+        worst = 0.0
+        slot = k
         for i in range(k):
             outside = max(trial[i] - vectors[MOST, i], vectors[LEAST, i] - trial[i])
             if outside > worst:
-                worst, slot = outside, i
+                worst = outside
+                slot = i
         if slot == k:
             break
         p = abs(names[slot]) - 1
@@ -399,7 +421,9 @@ def _drop_wrong_multipliers(work, k):
 @inline_njit
 def _minimise(work, k):
     """Writes the minimiser of the Lagrangian, ``P x = -(q + C'mu)``, to the first n entries of y."""
-    n, vectors, y = len(work.q), work.vectors, work.vectors[Y]
+    n = len(work.q)
+    vectors = work.vectors
+    y = work.vectors[Y]
     if work.soft:  # constraints at their caps have multipliers, too
         add_multipliers(work, k)
         scale(-1.0, vectors[SLOPE], y, n)
@@ -420,19 +444,23 @@ def _minimise(work, k):
 @inline_njit
 def multiply_constraints(work):
     """Writes ``y[n:] = G y[:n]``."""
-    y, n = work.vectors[Y], len(work.q)
+    y = work.vectors[Y]
+    n = len(work.q)
     multiply_to_ends(work.G, work.vectors[END][n:], y, y[n:])
 
 
 @inline_njit
 def add_multipliers(work, k):
     """Writes ``SLOPE = q + C' mu``; only where rows are soft can others than the working ones have a multiplier."""
-    n, mu, slope = len(work.q), work.vectors[MU], work.vectors[SLOPE]
+    n = len(work.q)
+    mu = work.vectors[MU]
+    slope = work.vectors[SLOPE]
     for i in range(0, n, 8):
         store(slope, i, load_some(work.q, i) + load(mu, i))
     for i in range(len(work.G) if work.soft else k):
         p = n + i if work.soft else abs(work.indices[NAME, i]) - 1
         if p >= n and mu[p] != 0.0:
-            weight, row = mu[p], work.G[p - n]
+            weight = mu[p]
+            row = work.G[p - n]
             for j in range(0, int(work.vectors[END, p]), 8):
                 store(slope, j, load(slope, j) + weight * load_some(row, j))

@@ -88,7 +88,9 @@ _NOISE = 2e-14  # violation that a constraint which depends on others may be lef
 _LATER = 1e-11  # violation, as a share of the length of q, that waits for the refined x
 _ROUNDS = 10  # returns from the residuals to the iteration
 _REFINEMENTS = 3
-_FINE, _FINEST = 2e-10, 1e-15  # residuals at which refinement stops
+# residuals at which refinement stops
+_FINE = 2e-10
+_FINEST = 1e-15
 _DOUBT = 3e-7  # times the shares that cancellation left of the pivots: the largest residual of a solution
 _ILL = 5e-4  # such a share: what else x violates is seen of the best x only
 _OLD = 1000  # changes after which a factor is computed anew
@@ -102,7 +104,8 @@ _UNDEFINED = (
 @compiled(allocates=False, locked=True)
 def solve(P, q, G, lower, upper, guess, memory, out):
     """Solves one program; ``memory`` is of ``gpmpc.qp._workspace``, ``guess`` a record or empty. Returns a status."""
-    n, M = P.shape[0], len(P) + len(G)
+    n = P.shape[0]
+    M = len(P) + len(G)
     shaped = (
         P.shape[1] == n
         and len(q) == n
@@ -120,7 +123,8 @@ def solve(P, q, G, lower, upper, guess, memory, out):
     longest = undefined = zeros()
     for i in range(0, n, 8):
         length = load_some(q, i) * load(work.vectors[SCALE], i)
-        longest, undefined = larger(longest, length), undefined + 0.0 * length
+        longest = larger(longest, length)
+        undefined = undefined + 0.0 * length
     least = NONE * largest(longest)  # length of x that is none
     if (
         share == 0.0
@@ -155,36 +159,45 @@ def _is_dense_matrix(A):
 @inline_njit
 def _solve_opened(work, guess, least, pivots, out):
     """Solves the program in the workspace, and writes the record ``out``."""
-    vectors, names, factor, n = (
-        work.vectors,
-        work.indices[NAME],
-        work.factor,
-        len(work.q),
-    )
-    M, y, mu = n + len(work.G), vectors[Y], vectors[MU]
+    vectors = work.vectors
+    names = work.indices[NAME]
+    factor = work.factor
+    n = len(work.q)
+    M = n + len(work.G)
+    y = vectors[Y]
+    mu = vectors[MU]
     k, guessed = _start(work, guess, out)
-    margin, fine = _LATER / NONE * least, _FINE
-    iterations, rounds = np.int64(0), 0  # for a literal numba compiles callees anew
-    status, passed, moved = NUMERICAL_TROUBLE, False, False
+    margin = _LATER / NONE * least
+    fine = _FINE
+    # for a literal numba compiles callees anew
+    iterations = np.int64(0)
+    rounds = 0
+    status = NUMERICAL_TROUBLE
+    passed = False
+    moved = False
     interrupted = len(guess) > 0 and guess[STATUS] == ITERATION_LIMIT
     batches = np.int64(
         _BATCHES if interrupted else 0
     )  # with single steps only the dual objective cannot fall
-    count, near = -1 - guessed, 0.0
+    count = -1 - guessed
+    near = 0.0
     while True:
         if rounds > 0:
             count = list_violated(vectors, work.indices, M, -near)
             if count == 0:
                 break
             if fine > _FINEST:  # a small violation is believed of the best x only
-                fine, count, moved = _FINEST, 0, True
+                fine = _FINEST
+                count = 0
+                moved = True
         if count != 0:
             status, k, iterations, batches, passed_now, violated = iterate(
                 work, k, count, margin, iterations, batches
             )
             if status != SOLVED:
                 break
-            moved, passed = moved or violated, passed or passed_now
+            moved = moved or violated
+            passed = passed or passed_now
         share = pivots
         for i in range(k):
             p = abs(names[i]) - 1
@@ -206,20 +219,19 @@ def _solve_opened(work, guess, least, pivots, out):
         rounds += 1
         if (not moved and margin == 0.0) or rounds == _ROUNDS or worst >= _UNDEFINED:
             break
-        margin, moved = 0.0, False
+        margin = 0.0
+        moved = False
         near = (
             worst * size / share if fine > _FINEST else 0.0
         )  # what the error of x may hide
     unsure = passed or rounds == _ROUNDS  # of the violations that are left
     if unsure and status == SOLVED and _worst_violation(work, least) > _NOISE:
         status = NUMERICAL_TROUBLE
-    out[STATUS], out[ITERATIONS], out[WORKING], out[VARIABLES], out[CONSTRAINTS] = (
-        status,
-        iterations,
-        k,
-        n,
-        M,
-    )
+    out[STATUS] = status
+    out[ITERATIONS] = iterations
+    out[WORKING] = k
+    out[VARIABLES] = n
+    out[CONSTRAINTS] = M
     out[TAG], out[AGE] = work.tag if status == SOLVED else 0.0, out[AGE] + iterations
     scale(1.0, y, out[HEADER:], n)
     scale(1.0, mu, out[HEADER + n :], M)
@@ -239,14 +251,17 @@ def _start(work, guess, out):
     Returns:
         How many constraints work already, and how many are guessed to, and are candidates.
     """
-    n, vectors, mu = len(work.q), work.vectors, work.vectors[MU]
+    n = len(work.q)
+    vectors = work.vectors
+    mu = work.vectors[MU]
     M = n + len(work.G)
     out[AGE] = 0.0
     for i in range(n + 1):
         work.indices[PLACE, i] = i
     if work.soft and len(guess) > 0:
         for p in range(n, M):
-            value, cap = guess[HEADER + n + p], vectors[CAP, p]
+            value = guess[HEADER + n + p]
+            cap = vectors[CAP, p]
             if (
                 abs(value) >= cap
                 and abs(vectors[UPPER if value > 0.0 else LOWER, p]) < np.inf
@@ -280,10 +295,8 @@ def _read_bounds(vectors, lower, upper, least):
     """Copies the bounds, with absent ones infinite, and clears mu; returns False if any are crossed or undefined."""
     wrong = zeros()
     for p in range(0, len(lower), 8):
-        low, high = (
-            _remove_absent(load_some(lower, p)),
-            _remove_absent(load_some(upper, p)),
-        )
+        low = _remove_absent(load_some(lower, p))
+        high = _remove_absent(load_some(upper, p))
         wrong = wrong + clip(
             high - low, -1.0, 0.0
         )  # infinity less infinity is undefined, and so none of a bound
@@ -318,14 +331,21 @@ def _measure_rows(work):
 
     Returns what cancellation left of the pivots of P, as a share of P_ii; zero if a length is not finite.
     """
-    n, G, units, ends = len(work.q), work.G, work.vectors[SCRATCH], work.vectors[END]
-    scale_of, cancelled, undefined = work.vectors[SCALE], 1.0, 0.0
+    n = len(work.q)
+    G = work.G
+    units = work.vectors[SCRATCH]
+    ends = work.vectors[END]
+    scale_of = work.vectors[SCALE]
+    cancelled = 1.0
+    undefined = 0.0
     store(units, n // 8 * 8, zeros())
     for i in range(n):
         scale_of[i] = units[i] = 1.0 / math.sqrt(work.P[i, i])
         cancelled = max(cancelled, work.L[i, i] * work.L[i, i] * work.P[i, i])
     for p in range(len(G)):
-        row, squares, end = G[p], zeros(), 0
+        row = G[p]
+        squares = zeros()
+        end = 0
         for j in range(0, n, 8):
             values = load_some(row, j) * load(units, j)
             squares = squares + values * values
@@ -343,13 +363,17 @@ def _refine(work, k, least, fine):
     Returns:
         The residual, the length of x that it is a share of, and whether x moved.
     """
-    worst, size, best, moved = np.inf, 0.0, np.inf, False
+    worst = np.inf
+    size = 0.0
+    best = np.inf
+    moved = False
     for attempt in range(_REFINEMENTS + 1):
         add_multipliers(work, k)
         worst, size = _measure_residuals(work, k, least)
         if worst <= fine or attempt == _REFINEMENTS or not worst < 0.5 * best:
             break
-        best, moved = worst, True
+        best = worst
+        moved = True
         _take_newton_step(work, k)
     return worst, size, moved
 
@@ -365,13 +389,11 @@ def _measure_residuals(work, k, least):
 
     Fills ``GRADIENT = P x + slope`` and ``REST = y_W - b``, where slope = q + C'mu.
     """
-    vectors, n, y, scale, gradient = (
-        work.vectors,
-        len(work.q),
-        work.vectors[Y],
-        work.vectors[SCALE],
-        work.vectors[GRADIENT],
-    )
+    vectors = work.vectors
+    n = len(work.q)
+    y = work.vectors[Y]
+    scale = work.vectors[SCALE]
+    gradient = work.vectors[GRADIENT]
     multiply(work.P, n, y, n, gradient)
     size = math.sqrt(max(dot(gradient, y, n), least * least, _TINY))
     lengths = shifts = entries = nothing = zeros()
@@ -379,17 +401,19 @@ def _measure_residuals(work, k, least):
         rest = load_some(gradient[:n], i) + load_some(vectors[SLOPE][:n], i)
         store(gradient, i, rest)
         length = rest * load(scale, i)
-        lengths, shifts = (
-            larger(lengths, length),
-            larger(shifts, length * load(scale, i)),
-        )
-        entries, nothing = larger(entries, load_some(y[:n], i)), nothing + 0.0 * length
-    worst, undefined = largest(lengths) / size, total(nothing)
+        lengths = larger(lengths, length)
+        shifts = larger(shifts, length * load(scale, i))
+        entries = larger(entries, load_some(y[:n], i))
+        nothing = nothing + 0.0 * length
+    worst = largest(lengths) / size
+    undefined = total(nothing)
     worst = max(worst, 0.01 * largest(shifts) / max(largest(entries), _TINY))
     for i in range(k):
-        p, b = abs(work.indices[NAME, i]) - 1, vectors[BOUND, i]
+        p = abs(work.indices[NAME, i]) - 1
+        b = vectors[BOUND, i]
         vectors[REST, i] = y[p] - b
-        rest, length = abs(y[p] - b), size * scale[p]
+        rest = abs(y[p] - b)
+        length = size * scale[p]
         undefined += 0.0 * rest
         if rest > 1e-15 * length:  # then by the row's own terms too
             own = max(abs(b), 1e-6 * length)
@@ -404,13 +428,13 @@ def _measure_residuals(work, k, least):
 @inline_njit
 def _take_newton_step(work, k):
     """Takes one Newton step on the working set for the residuals; multipliers stay in range."""
-    vectors, places, n = work.vectors, work.indices[PLACE], len(work.q)
-    y, change, trial, subtract = (
-        vectors[Y],
-        vectors[SCRATCH],
-        vectors[R],
-        vectors[GRADIENT],
-    )
+    vectors = work.vectors
+    places = work.indices[PLACE]
+    n = len(work.q)
+    y = vectors[Y]
+    change = vectors[SCRATCH]
+    trial = vectors[R]
+    subtract = vectors[GRADIENT]
     scale(1.0, subtract, change, n)
     solve_transposed(work.L, n, change)
     multiply_rows(work.rows, places, k, change, n, trial)
@@ -434,11 +458,14 @@ def _take_newton_step(work, k):
 @inline_njit
 def _worst_violation(work, least):
     """Returns the largest violation beyond what multipliers pay for, as a share of its bound or, a thousandth, of x."""
-    vectors, y, worst = work.vectors, work.vectors[Y], 0.0
+    vectors = work.vectors
+    y = work.vectors[Y]
+    worst = 0.0
     size = math.sqrt(max(abs(dot(vectors[SLOPE], y, len(work.q))), least * least))
     for p in range(len(work.q) + len(work.G)):
         if abs(vectors[MU, p]) < vectors[CAP, p]:
-            above, below = y[p] - vectors[UPPER, p], vectors[LOWER, p] - y[p]
+            above = y[p] - vectors[UPPER, p]
+            below = vectors[LOWER, p] - y[p]
             bound = vectors[UPPER, p] if above > below else vectors[LOWER, p]
             rest = max(above, below) - vectors[NEGLIGIBLE, p]
             worst = max(worst, rest / max(1e-3 * size * vectors[SCALE, p], abs(bound)))

@@ -51,10 +51,8 @@ def rescue(
     P, q, G, lower, upper = problem
     result = record.copy()
     try:
-        lower, upper = (
-            np.where(lower <= -ABSENT, -np.inf, lower),
-            np.where(upper >= ABSENT, np.inf, upper),
-        )
+        lower = np.where(lower <= -ABSENT, -np.inf, lower)
+        upper = np.where(upper >= ABSENT, np.inf, upper)
         for dependent in _DEPENDENT:
             solve = _Solve((P, q, G, lower, upper), caps, dependent, late)
             result[layout.STATUS] = solve.run(
@@ -79,26 +77,33 @@ class _Solve:
 
     def __init__(self, problem: tuple, caps: Array, dependent: float, late: Callable):
         P, q, G, lower, upper = problem
-        n, M = len(q), len(lower)
+        n = len(q)
+        M = len(lower)
         D = _power_of_two(np.sqrt(np.diagonal(P)))
         E = np.concatenate(
             [1.0 / D, _power_of_two(np.abs(G * D).max(axis=1, initial=0.0))]
         )
-        self.D, self.E, self.n = D, E, n
-        self.P, self.q, self.C = (
-            P * np.outer(D, D),
-            q * D,
-            np.vstack([np.eye(n), G * D * E[n:, None]]),
-        )
-        self.lower, self.upper = lower * E, upper * E
-        self.caps, self.G, self.bounds, self.late = caps / E, G, (lower, upper), late
+        self.D = D
+        self.E = E
+        self.n = n
+        self.P = P * np.outer(D, D)
+        self.q = q * D
+        self.C = np.vstack([np.eye(n), G * D * E[n:, None]])
+        self.lower = lower * E
+        self.upper = upper * E
+        self.caps = caps / E
+        self.G = G
+        self.bounds = (lower, upper)
+        self.late = late
         self.L = np.linalg.cholesky(self.P)
         self.columns = solve_triangular(self.L, self.C.T, lower=True)  # L^-1 C'
         self.norms = np.sqrt((self.columns**2).sum(axis=0))
         self.dependent = dependent / np.diagonal(self.L).min()
         self.working: dict[int, int] = {}
-        self.x, self.mu = np.zeros((2, n)), np.zeros((2, M))
-        self.iterations, self.ray = 0, None
+        self.x = np.zeros((2, n))
+        self.mu = np.zeros((2, M))
+        self.iterations = 0
+        self.ray = None
 
     def run(self, names: Array, limit: int) -> int:
         """Changes the working set until no constraint is violated; returns the status."""
@@ -124,7 +129,9 @@ class _Solve:
 
     def write(self, record: Array) -> None:
         """Writes x, multipliers (or Farkas' ray) and working set to a record."""
-        n, M, k = self.n, len(self.E), len(self.working)
+        n = self.n
+        M = len(self.E)
+        k = len(self.working)
         multipliers = self.mu.sum(axis=0) * self.E if self.ray is None else self.ray
         x = self.x.sum(axis=0) * self.D
         if not (np.isfinite(x).all() and np.isfinite(multipliers).all()):
@@ -141,7 +148,8 @@ class _Solve:
 
     def _range(self, p: int, side: int) -> tuple[float, float]:
         """The range of a multiplier at the upper (+1) or lower (-1) bound."""
-        equality, cap = self.lower[p] == self.upper[p], self.caps[p]
+        equality = self.lower[p] == self.upper[p]
+        cap = self.caps[p]
         return (-cap if equality or side < 0 else 0.0), (
             cap if equality or side > 0 else 0.0
         )
@@ -172,18 +180,18 @@ class _Solve:
             self._factorise()
             if not self._refine():
                 return False
-            worst, wrong, end = 0.0, -1, 0.0
+            worst = 0.0
+            wrong = -1
+            end = 0.0
             for p, side in self.working.items():
                 least, most = self._range(p, side)
                 outside = (
                     max(self.mu[0, p] - most, least - self.mu[0, p]) * self.norms[p]
                 )
                 if outside > worst:
-                    worst, wrong, end = (
-                        outside,
-                        p,
-                        most if self.mu[0, p] > most else least,
-                    )
+                    worst = outside
+                    wrong = p
+                    end = most if self.mu[0, p] > most else least
             if wrong < 0:
                 return True
             self._drop(wrong, end if np.isfinite(end) else 0.0)
@@ -195,8 +203,11 @@ class _Solve:
 
     def _refine(self) -> bool:
         """Newton's method on the working set with residuals free of rounding; False if it does not converge."""
-        W, x, mu = np.array(list(self.working), dtype=int), self.x, self.mu
-        C, b = self.C[W], np.array([self._bound(*w) for w in self.working.items()])
+        W = np.array(list(self.working), dtype=int)
+        x = self.x
+        mu = self.mu
+        C = self.C[W]
+        b = np.array([self._bound(*w) for w in self.working.items()])
         others = np.setdiff1d(np.flatnonzero(mu[0]), W)  # soft rows at their caps
         for _ in range(_CORRECTIONS):
             r1 = _sum_products(
@@ -209,10 +220,8 @@ class _Solve:
                 ],
                 self.q,
             )
-            r2, slope = (
-                _sum_products([(C, x[0]), (C, x[1])], -b),
-                solve_triangular(self.L, r1, lower=True),
-            )
+            r2 = _sum_products([(C, x[0]), (C, x[1])], -b)
+            slope = solve_triangular(self.L, r1, lower=True)
             along = solve_triangular(self.R, r2, trans="T")
             part = self.Q.T @ slope
             dx = solve_triangular(
@@ -225,18 +234,17 @@ class _Solve:
                 return False
             if np.abs(dx).max() <= _CONVERGED * size:
                 box = self.n > W  # bounds of variables hold exactly
-                x[0, W[box]], x[1, W[box]] = b[box], 0.0
+                x[0, W[box]] = b[box]
+                x[1, W[box]] = 0.0
                 return True
         return False
 
     def _most_violated(self, passed: set[int]) -> tuple[int, int, int, float]:
         """The constraint violated most, the bound, the direction in which its multiplier moves, and by how much."""
-        y, mu = (
-            _sum_products(
-                [(self.C, self.x[0]), (self.C, self.x[1])], np.zeros(len(self.C))
-            ),
-            self.mu[0],
+        y = _sum_products(
+            [(self.C, self.x[0]), (self.C, self.x[1])], np.zeros(len(self.C))
         )
+        mu = self.mu[0]
         sizes = np.abs(self.C) @ np.abs(self.x[0])
         above = np.where(
             np.isfinite(self.upper), y - self.upper, -np.inf
@@ -273,22 +281,23 @@ class _Solve:
         start = mu[p]
         while True:
             self._factorise()
-            W, rest, r = (
-                list(self.working),
-                self.columns[:, p],
-                np.zeros(len(self.working)),
-            )
+            W = list(self.working)
+            rest = self.columns[:, p]
+            r = np.zeros(len(self.working))
             for _ in range(
                 2
             ):  # the combination r of the working columns nearest to p's; twice is enough
                 part = self.Q.T @ rest
-                rest, r = rest - self.Q @ part, r + solve_triangular(self.R, part)
+                rest = rest - self.Q @ part
+                r = r + solve_triangular(self.R, part)
             square = rest @ rest
             free = np.sqrt(square) > self.dependent * self.norms[p]
             step = violation / square if free else np.inf
             least, most = self._range(p, side)
             room = most - mu[p] if sense > 0 else mu[p] - least
-            capped, leaving, end = room < step, -1, 0.0
+            capped = room < step
+            leaving = -1
+            end = 0.0
             step = min(step, room)
             noise = 1e-14 * np.abs(r * self.norms[W]).max(initial=0.0)
             for w, rate in zip(W, sense * r, strict=True):
@@ -296,7 +305,9 @@ class _Solve:
                 if abs(rate) * self.norms[w] > noise:
                     room = max(0.0, (mu[w] - (least if rate > 0.0 else most)) / rate)
                     if room < step:
-                        step, leaving, end = room, w, least if rate > 0.0 else most
+                        step = room
+                        leaving = w
+                        end = least if rate > 0.0 else most
             if step == np.inf or (not free and violation <= rounding):
                 self.r = r
                 self.mu[:, p] = start, 0.0
@@ -315,12 +326,12 @@ class _Solve:
 
     def _prove(self, p: int, sense: int) -> bool:
         """Whether the last contradiction has Farkas' proof, which becomes the ray."""
-        W, sides = (
-            np.array(list(self.working), dtype=int),
-            np.array(list(self.working.values()), dtype=int),
-        )
+        W = np.array(list(self.working), dtype=int)
+        sides = np.array(list(self.working.values()), dtype=int)
         used = np.abs(self.r) * self.norms[W] > self.dependent * self.norms[p]
-        W, sides, r = W[used], sides[used], self.r[used]
+        W = W[used]
+        sides = sides[used]
+        r = self.r[used]
         Q, R = qr(self.columns[:, W], mode="economic")
         for _ in range(3):
             rest = _sum_products([(self.C[W].T, -r)], self.C[p])
@@ -330,7 +341,8 @@ class _Solve:
         # where a bound cannot pull that way it is rounding
         wrong = (-sense * r * sides < 0.0) & (self.lower[W] < self.upper[W])
         ray = np.zeros(len(self.E))
-        ray[W], ray[p] = np.where(wrong, 0.0, -sense * r), sense
+        ray[W] = np.where(wrong, 0.0, -sense * r)
+        ray[p] = sense
         proven = proves_infeasibility(ray * self.E, self.G, *self.bounds)
         self.ray = ray * self.E if proven else None
         return proven
@@ -343,9 +355,11 @@ def _power_of_two(sizes: Array) -> Array:
 
 def _add(parts: Array, where, change: Array) -> None:
     """Adds to a sum of two floats, of which the second holds what the first rounds off."""
-    high, low = parts[0, where], parts[1, where] + change
+    high = parts[0, where]
+    low = parts[1, where] + change
     total = high + low
-    parts[0, where], parts[1, where] = total, low - (total - high)
+    parts[0, where] = total
+    parts[1, where] = low - (total - high)
 
 
 def _sum_products(products: list[tuple[Array, Array]], constant: Array) -> Array:
@@ -353,18 +367,22 @@ def _sum_products(products: list[tuple[Array, Array]], constant: Array) -> Array
     terms = [constant[:, None]]
     for A, v in products:
         product = A * v
-        A_high, v_high = _leading_half(A), _leading_half(v)
-        A_low, v_low = A - A_high, v - v_high
+        A_high = _leading_half(A)
+        v_high = _leading_half(v)
+        A_low = A - A_high
+        v_low = v - v_high
         terms += [
             product,
             ((A_high * v_high - product) + A_high * v_low + A_low * v_high)
             + A_low * v_low,
         ]
-    total, rest = np.concatenate(terms, axis=1), np.zeros(len(constant))
+    total = np.concatenate(terms, axis=1)
+    rest = np.zeros(len(constant))
     while total.shape[1] > 1:
         if total.shape[1] % 2:
             total = np.column_stack([total, np.zeros(len(constant))])
-        a, b = total[:, ::2], total[:, 1::2]
+        a = total[:, ::2]
+        b = total[:, 1::2]
         total = a + b
         part = total - a
         rest += ((a - (total - part)) + (b - part)).sum(axis=1)

@@ -87,8 +87,11 @@ class PrimalActiveSet:
     ) -> QPSolution:
         """The minimiser, from a warm start of any kind; see ``QPSolver``."""
         began = perf_counter()
-        n, M = len(problem.q), len(problem.lower)
-        rows, start, names = _one_sided(problem), np.zeros(n), np.zeros(0)
+        n = len(problem.q)
+        M = len(problem.lower)
+        rows = _one_sided(problem)
+        start = np.zeros(n)
+        names = np.zeros(0)
         given = as_record(warm_start, n, M)
         if len(given) and (given[layout.VARIABLES], given[layout.CONSTRAINTS]) == (
             n,
@@ -140,7 +143,9 @@ class PrimalActiveSet:
         working = list(np.flatnonzero(rows.equality | guessed))
         still = full_steps = 0
         for iteration in range(limit):
-            A, d, multipliers = rows.A[working], np.full(n, np.nan), nothing
+            A = rows.A[working]
+            d = np.full(n, np.nan)
+            multipliers = nothing
             with suppress(
                 ValueError
             ):  # from SciPy: not finite, or no longer positive definite
@@ -177,11 +182,9 @@ class PrimalActiveSet:
 
 def _one_sided(problem: QuadraticProgram) -> _Rows:
     """Every bound that is there as one row ``a'x <= h`` of unit length (zero rows stay zero)."""
-    lower, upper, C = (
-        problem.lower,
-        problem.upper,
-        np.vstack([np.eye(len(problem.q)), problem.G]),
-    )
+    lower = problem.lower
+    upper = problem.upper
+    C = np.vstack([np.eye(len(problem.q)), problem.G])
     equal = lower == upper
     above = np.flatnonzero(upper < ABSENT)
     below = np.flatnonzero((lower > -ABSENT) & ~equal)
@@ -196,10 +199,8 @@ def _one_sided(problem: QuadraticProgram) -> _Rows:
 
 def _phase_1(rows: _Rows, start: Array, M: int) -> tuple[Array, Array | None]:
     """A feasible point (``start`` if it is one) and None, or ``start`` and a ray (M,) that may prove there is none."""
-    A, h = (
-        np.vstack([rows.A, -rows.A[rows.equality]]),
-        np.concatenate([rows.h, -rows.h[rows.equality]]),
-    )
+    A = np.vstack([rows.A, -rows.A[rows.equality]])
+    h = np.concatenate([rows.h, -rows.h[rows.equality]])
     if (A @ start <= h).all():
         return start, None
     n = len(start)
@@ -240,7 +241,9 @@ def _minimise_on_rows(
     Q, R, order = qr(A.T, pivoting=True)
     pivots = np.abs(np.diagonal(R))
     rank = int(np.sum(pivots > _RANK * pivots[0])) if len(pivots) else 0
-    Q1, Q2, R = Q[:, :rank], Q[:, rank:], R[:rank, :rank]
+    Q1 = Q[:, :rank]
+    Q2 = Q[:, rank:]
+    R = R[:rank, :rank]
     d = Q1 @ solve_triangular(R, gap[order[:rank]], trans="T")
     if Q2.shape[1]:
         reduced = cho_factor(Q2.T @ P @ Q2)
@@ -256,10 +259,8 @@ def _step_length(
     """Kappa in [0, 1] and the row that blocks, if one does."""
     speed = rows.A @ d
     speed[working] = 0.0
-    room, towards = (
-        np.maximum(rows.h - rows.A @ x, 0.0),
-        speed > _STILL * np.linalg.norm(d),
-    )
+    room = np.maximum(rows.h - rows.A @ x, 0.0)
+    towards = speed > _STILL * np.linalg.norm(d)
     kappas = np.where(towards, room / np.where(towards, speed, 1.0), 1.0)
     blocking = int(
         np.argmin(np.append(kappas, 1.0))

@@ -169,10 +169,8 @@ class QuadraticProgram(_Arrays):
     ) -> "QuadraticProgram":
         """Checks a program with bounds (M,) on the stacked constraints ``[x; Gx]``."""
         (n, m), P, q, G = _check_matrices(P, q, G)
-        lower, upper = (
-            _as_float_array("lower", lower, (n + m,)),
-            _as_float_array("upper", upper, (n + m,)),
-        )
+        lower = _as_float_array("lower", lower, (n + m,))
+        upper = _as_float_array("upper", upper, (n + m,))
         _check_bounds(n, lower, upper, ("lower", "upper", "lower", "upper"))
         return cls.unchecked(P, q, G, lower, upper)
 
@@ -209,10 +207,8 @@ def _check_matrices(
     rows = np.shape(G) if G is not None else (0, n)
     if len(rows) != 2:
         raise ProblemError(f"G must be a matrix of {n} columns; got shape {rows}")
-    P, q = (
-        _as_float_array("P", P, (n, n), finite=True),
-        _as_float_array("q", q, (n,), finite=True),
-    )
+    P = _as_float_array("P", P, (n, n), finite=True)
+    q = _as_float_array("q", q, (n,), finite=True)
     G = (
         np.zeros((0, n))
         if G is None

@@ -112,9 +112,14 @@ class QPSolution(NamedTuple):
             zero: What counts as no x at all, as a share of the free minimiser.
         """
         (P, q, G, lower, upper), caps = self.arrays, self.caps
-        x, multipliers = self.x, self.multipliers
-        sizes, up, down = np.abs(multipliers), multipliers > 0, multipliers < 0
-        rows, slope, n = G @ x, P @ x, len(x)
+        x = self.x
+        multipliers = self.multipliers
+        sizes = np.abs(multipliers)
+        up = multipliers > 0
+        down = multipliers < 0
+        rows = G @ x
+        slope = P @ x
+        n = len(x)
         units = np.sqrt(np.diagonal(P))
         free = (np.abs(q) / units).max()
         zero = max(1e-4 * (units * np.abs(x)).max(), zero * free)
@@ -144,7 +149,8 @@ class QPSolution(NamedTuple):
 
         support = multipliers[up] * upper[up], multipliers[down] * lower[down]
         capped = (sizes >= caps) & np.isfinite(caps)
-        curvature, gain = x @ slope, q @ x
+        curvature = x @ slope
+        gain = q @ x
         gap = abs(
             curvature
             + gain
@@ -208,8 +214,10 @@ def make_solution(
         build_seconds: Time spent on building or compiling the problem [s].
         solve_seconds: Time spent on solving it [s].
     """
-    x, multipliers = np.asarray(x, dtype=float), np.asarray(multipliers, dtype=float)
-    n, M = len(problem.q), sum(problem.G.shape)
+    x = np.asarray(x, dtype=float)
+    multipliers = np.asarray(multipliers, dtype=float)
+    n = len(problem.q)
+    M = sum(problem.G.shape)
     if x.shape != (n,) or multipliers.shape != (M,):
         raise ProblemError(
             f"a solution needs x of shape {(n,)} and multipliers {(M,)}; got {x.shape}, {multipliers.shape}"

@@ -11,7 +11,8 @@ from gpmpc._compiled import inline_njit, njit_noalloc
 from gpmpc._kernels._simd import load, load_some, store, total, zeros
 from gpmpc._kernels.linalg import dot, four_dots
 
-_LANES, _BLOCK = 8, 4
+_LANES = 8
+_BLOCK = 4
 _ROUNDING = 2.3e-16  # times n: share of P_ii below which a pivot is rounding
 _SKEW = 1e-10  # largest |P - P'| accepted, as a share of the largest diagonal entry
 
@@ -41,12 +42,10 @@ def multiply_rows(A, places, count, vector, size, product):
     """Writes ``product[i] = A[places[i]] . vector``."""
     i = 0
     while i + 4 <= count:
-        r0, r1, r2, r3 = (
-            A[places[i]],
-            A[places[i + 1]],
-            A[places[i + 2]],
-            A[places[i + 3]],
-        )
+        r0 = A[places[i]]
+        r1 = A[places[i + 1]]
+        r2 = A[places[i + 2]]
+        r3 = A[places[i + 3]]
         four_dots((r0, r1, r2, r3), vector, size, product[i:])
         i += 4
     while i < count:
@@ -59,18 +58,20 @@ def subtract_rows(target, rows, places, factors, count, size):
     """Writes ``target -= sum_i factors[i] rows[places[i]]``."""
     i = 0
     while i + 4 <= count:
-        r0, r1, r2, r3 = (
-            rows[places[i]],
-            rows[places[i + 1]],
-            rows[places[i + 2]],
-            rows[places[i + 3]],
-        )
-        f0, f1, f2, f3 = factors[i], factors[i + 1], factors[i + 2], factors[i + 3]
+        r0 = rows[places[i]]
+        r1 = rows[places[i + 1]]
+        r2 = rows[places[i + 2]]
+        r3 = rows[places[i + 3]]
+        f0 = factors[i]
+        f1 = factors[i + 1]
+        f2 = factors[i + 2]
+        f3 = factors[i + 3]
         for j in range(size):
             target[j] -= f0 * r0[j] + f1 * r1[j] + f2 * r2[j] + f3 * r3[j]
         i += 4
     while i < count:
-        row, f = rows[places[i]], factors[i]
+        row = rows[places[i]]
+        f = factors[i]
         for j in range(size):
             target[j] -= f * row[j]
         i += 1
@@ -81,25 +82,27 @@ def solve_lower(L, k, a):
     """Writes ``a <- L^-1 a``."""
     i = 0
     while i + 4 <= k:
-        r0, r1, r2, r3 = L[i], L[i + 1], L[i + 2], L[i + 3]
+        r0 = L[i]
+        r1 = L[i + 1]
+        r2 = L[i + 2]
+        r3 = L[i + 3]
         s0 = s1 = s2 = s3 = zeros()
         whole = i // _LANES * _LANES
         for j in range(0, whole, _LANES):
             x = load(a, j)
-            s0, s1, s2, s3 = (
-                s0 + load(r0, j) * x,
-                s1 + load(r1, j) * x,
-                s2 + load(r2, j) * x,
-                s3 + load(r3, j) * x,
-            )
-        a0, a1, a2, a3 = (
-            a[i] - total(s0),
-            a[i + 1] - total(s1),
-            a[i + 2] - total(s2),
-            a[i + 3] - total(s3),
-        )
+            s0 = s0 + load(r0, j) * x
+            s1 = s1 + load(r1, j) * x
+            s2 = s2 + load(r2, j) * x
+            s3 = s3 + load(r3, j) * x
+        a0 = a[i] - total(s0)
+        a1 = a[i + 1] - total(s1)
+        a2 = a[i + 2] - total(s2)
+        a3 = a[i + 3] - total(s3)
         if whole < i:
-            x0, x1, x2, x3 = a[whole], a[whole + 1], a[whole + 2], a[whole + 3]
+            x0 = a[whole]
+            x1 = a[whole + 1]
+            x2 = a[whole + 2]
+            x3 = a[whole + 3]
             a0 -= (
                 r0[whole] * x0
                 + r0[whole + 1] * x1
@@ -128,7 +131,10 @@ def solve_lower(L, k, a):
         a1 = (a1 - r1[i] * a0) * r1[i + 1]
         a2 = (a2 - r2[i] * a0 - r2[i + 1] * a1) * r2[i + 2]
         a3 = (a3 - r3[i] * a0 - r3[i + 1] * a1 - r3[i + 2] * a2) * r3[i + 3]
-        a[i], a[i + 1], a[i + 2], a[i + 3] = a0, a1, a2, a3
+        a[i] = a0
+        a[i + 1] = a1
+        a[i + 2] = a2
+        a[i + 3] = a3
         i += 4
     while i < k:
         a[i] = (a[i] - dot(L[i], a, i)) * L[i, i]
@@ -141,18 +147,25 @@ def solve_transposed(L, end, a):
     j = end
     while j % 4:
         j -= 1
-        row, f = L[j], a[j] * L[j, j]
+        row = L[j]
+        f = a[j] * L[j, j]
         a[j] = f
         for i in range(j):
             a[i] -= f * row[i]
     while j > 0:
         j -= 4
-        r0, r1, r2, r3 = L[j], L[j + 1], L[j + 2], L[j + 3]
+        r0 = L[j]
+        r1 = L[j + 1]
+        r2 = L[j + 2]
+        r3 = L[j + 3]
         a3 = a[j + 3] * r3[j + 3]
         a2 = (a[j + 2] - a3 * r3[j + 2]) * r2[j + 2]
         a1 = (a[j + 1] - a3 * r3[j + 1] - a2 * r2[j + 1]) * r1[j + 1]
         a0 = (a[j] - a3 * r3[j] - a2 * r2[j] - a1 * r1[j]) * r0[j]
-        a[j], a[j + 1], a[j + 2], a[j + 3] = a0, a1, a2, a3
+        a[j] = a0
+        a[j + 1] = a1
+        a[j + 2] = a2
+        a[j + 3] = a3
         for i in range(j):
             a[i] -= a0 * r0[i] + a1 * r1[i] + a2 * r2[i] + a3 * r3[i]
 
@@ -174,7 +187,10 @@ def delete_row(L, k, gone, solved, cosines, sines):
     """
     left = solved[gone]
     for i in range(gone + 1, k):
-        row, above, rest, below = L[i], L[i - 1], L[i, gone], solved[i]
+        row = L[i]
+        above = L[i - 1]
+        rest = L[i, gone]
+        below = solved[i]
         for j in range(gone):
             above[j] = row[j]
         for j in range(gone + 1, i):
@@ -185,7 +201,8 @@ def delete_row(L, k, gone, solved, cosines, sines):
             )
         diagonal = 1.0 / row[i]
         reciprocal = 1.0 / math.sqrt(rest * rest + diagonal * diagonal)
-        cosines[i], sines[i] = rest * reciprocal, diagonal * reciprocal
+        cosines[i] = rest * reciprocal
+        sines[i] = diagonal * reciprocal
         above[i - 1] = reciprocal
         solved[i - 1], left = (
             cosines[i] * left + sines[i] * below,
@@ -201,7 +218,9 @@ def factorise(P, L):
     predictive control where no state depends on later inputs, then has as short a row L^-T c. Rows of L are padded to a
     multiple of eight; its upper triangle is undefined.
     """
-    n, largest, skewed = len(P), 0.0, 0
+    n = len(P)
+    largest = 0.0
+    skewed = 0
     for i in range(n):
         largest = max(largest, abs(P[i, i]))
     for i in range(n):
@@ -229,7 +248,8 @@ def _finish_last_rows(P, L, top):
         for j in range(0, n, _LANES):
             store(L[i], j, load_some(P[i], j))
     for i in range(n - 1, top - 1, -1):
-        row, pivot = L[i], L[i, i]
+        row = L[i]
+        pivot = L[i, i]
         if not _is_pivot(pivot, P[i, i], n):
             return False
         reciprocal = 1.0 / math.sqrt(pivot)
@@ -237,7 +257,8 @@ def _finish_last_rows(P, L, top):
             store(row, j, load(row, j) * reciprocal)
         row[i] = reciprocal
         for k in range(top, i):
-            target, factor = L[k], row[k]
+            target = L[k]
+            factor = row[k]
             for j in range(0, k + 1, _LANES):
                 store(target, j, load(target, j) - factor * load(row, j))
     return True
@@ -246,23 +267,30 @@ def _finish_last_rows(P, L, top):
 @inline_njit
 def _finish_four_rows(P, L, top):
     """Writes rows ``top`` to ``top + 3``, given those below; returns False where a pivot is none."""
-    n, end = len(P), top + _BLOCK
-    p0, p1, p2, p3 = P[top], P[top + 1], P[top + 2], P[top + 3]
-    t0, t1, t2, t3 = L[top], L[top + 1], L[top + 2], L[top + 3]
+    n = len(P)
+    end = top + _BLOCK
+    p0 = P[top]
+    p1 = P[top + 1]
+    p2 = P[top + 2]
+    p3 = P[top + 3]
+    t0 = L[top]
+    t1 = L[top + 1]
+    t2 = L[top + 2]
+    t3 = L[top + 3]
     for j in range(
         0, end, _LANES
     ):  # P less what the rows of L below take off: registers hold all of it
-        a0, a1, a2, a3 = (
-            load_some(p0, j),
-            load_some(p1, j),
-            load_some(p2, j),
-            load_some(p3, j),
-        )
+        a0 = load_some(p0, j)
+        a1 = load_some(p1, j)
+        a2 = load_some(p2, j)
+        a3 = load_some(p3, j)
         for s in range(end, n):
             row = L[s]
             x = load(row, j)
-            a0, a1 = a0 - row[top] * x, a1 - row[top + 1] * x
-            a2, a3 = a2 - row[top + 2] * x, a3 - row[top + 3] * x
+            a0 = a0 - row[top] * x
+            a1 = a1 - row[top + 1] * x
+            a2 = a2 - row[top + 2] * x
+            a3 = a3 - row[top + 3] * x
         store(t0, j, a0)
         store(t1, j, a1)
         store(t2, j, a2)
@@ -270,11 +298,15 @@ def _finish_four_rows(P, L, top):
     # the block of four by four: its pivots d, and what of which row to subtract from which
     d3 = t3[top + 3]
     r3 = 1.0 / d3
-    m23, m13, m03 = t3[top + 2] * r3, t3[top + 1] * r3, t3[top] * r3
+    m23 = t3[top + 2] * r3
+    m13 = t3[top + 1] * r3
+    m03 = t3[top] * r3
     d2 = t2[top + 2] - m23 * t3[top + 2]
     r2 = 1.0 / d2
-    e21, e20 = t2[top + 1] - m23 * t3[top + 1], t2[top] - m23 * t3[top]
-    m12, m02 = e21 * r2, e20 * r2
+    e21 = t2[top + 1] - m23 * t3[top + 1]
+    e20 = t2[top] - m23 * t3[top]
+    m12 = e21 * r2
+    m02 = e20 * r2
     d1 = t1[top + 1] - m13 * t3[top + 1] - m12 * e21
     r1 = 1.0 / d1
     e10 = t1[top] - m13 * t3[top] - m12 * e20
@@ -283,7 +315,10 @@ def _finish_four_rows(P, L, top):
     good = _is_pivot(d3, p3[top + 3], n) & _is_pivot(d2, p2[top + 2], n)
     if not (good & _is_pivot(d1, p1[top + 1], n) & _is_pivot(d0, p0[top], n)):
         return False
-    g3, g2, g1, g0 = math.sqrt(r3), math.sqrt(r2), math.sqrt(r1), 1.0 / math.sqrt(d0)
+    g3 = math.sqrt(r3)
+    g2 = math.sqrt(r2)
+    g1 = math.sqrt(r1)
+    g0 = 1.0 / math.sqrt(d0)
     for j in range(0, end, _LANES):
         a3 = load(t3, j)
         a2 = load(t2, j) - m23 * a3
@@ -293,5 +328,8 @@ def _finish_four_rows(P, L, top):
         store(t1, j, g1 * a1)
         store(t2, j, g2 * a2)
         store(t3, j, g3 * a3)
-    t0[top], t1[top + 1], t2[top + 2], t3[top + 3] = g0, g1, g2, g3
+    t0[top] = g0
+    t1[top + 1] = g1
+    t2[top + 2] = g2
+    t3[top + 3] = g3
     return True

@@ -28,38 +28,38 @@ def restore_limits(vectors, p):
 
     With mu_p = 0 it must stay within its bounds; at a cap it must stay outside the bound that it violates.
     """
-    low, high, mu = vectors[LOWER, p], vectors[UPPER, p], vectors[MU, p]
+    low = vectors[LOWER, p]
+    high = vectors[UPPER, p]
+    mu = vectors[MU, p]
     allowed_low = low - (TOLERATED * abs(low) + vectors[NEGLIGIBLE, p])
     allowed_high = high + (TOLERATED * abs(high) + vectors[NEGLIGIBLE, p])
     if mu > 0.0:
-        allowed_low, allowed_high = (
-            high - (TOLERATED * abs(high) + vectors[NEGLIGIBLE, p]),
-            np.inf,
-        )
+        allowed_low = high - (TOLERATED * abs(high) + vectors[NEGLIGIBLE, p])
+        allowed_high = np.inf
     elif mu < 0.0:
-        allowed_low, allowed_high = (
-            -np.inf,
-            low + (TOLERATED * abs(low) + vectors[NEGLIGIBLE, p]),
-        )
-    vectors[ALLOWED_LOW, p], vectors[ALLOWED_HIGH, p] = allowed_low, allowed_high
+        allowed_low = -np.inf
+        allowed_high = low + (TOLERATED * abs(low) + vectors[NEGLIGIBLE, p])
+    vectors[ALLOWED_LOW, p] = allowed_low
+    vectors[ALLOWED_HIGH, p] = allowed_high
 
 
 @inline_njit
 def ignore_violations(vectors, p):
     """Lets constraint p count as satisfied whatever its value: it is a working one, or cannot be told from one."""
-    vectors[ALLOWED_LOW, p], vectors[ALLOWED_HIGH, p] = -np.inf, np.inf
+    vectors[ALLOWED_LOW, p] = -np.inf
+    vectors[ALLOWED_HIGH, p] = np.inf
 
 
 @inline_njit
 def list_violated(vectors, indices, M, margin):
     """Lists the constraints violated by more than ``margin``, in units of ``SCALE``; returns how many."""
-    y, low, high, scale = (
-        vectors[Y],
-        vectors[ALLOWED_LOW],
-        vectors[ALLOWED_HIGH],
-        vectors[SCALE],
-    )
-    excess, violated, count = vectors[EXCESS], indices[VIOLATED], 0
+    y = vectors[Y]
+    low = vectors[ALLOWED_LOW]
+    high = vectors[ALLOWED_HIGH]
+    scale = vectors[SCALE]
+    excess = vectors[EXCESS]
+    violated = indices[VIOLATED]
+    count = 0
     for p in range(M):
         excess[p] = max(y[p] - high[p], low[p] - y[p]) - margin * scale[p]
         count += excess[p] > 0.0
@@ -76,13 +76,12 @@ def list_violated(vectors, indices, M, margin):
 @inline_njit
 def keep_violated(work, margin, count):
     """Computes the listed constraints anew, from x = y[:n]; keeps the violated ones, and returns how many."""
-    vectors, y, excess, violated = (
-        work.vectors,
-        work.vectors[Y],
-        work.vectors[EXCESS],
-        work.indices[VIOLATED],
-    )
-    kept, n = 0, len(work.q)
+    vectors = work.vectors
+    y = work.vectors[Y]
+    excess = work.vectors[EXCESS]
+    violated = work.indices[VIOLATED]
+    kept = 0
+    n = len(work.q)
     for i in range(count):
         p = violated[i]
         if p >= n:
@@ -98,7 +97,8 @@ def keep_violated(work, margin, count):
 @inline_njit
 def most_violated(vectors, indices, count):
     """Returns the listed constraint with the largest excess."""
-    excess, violated = vectors[EXCESS], indices[VIOLATED]
+    excess = vectors[EXCESS]
+    violated = indices[VIOLATED]
     worst = violated[0]
     for i in range(1, count):
         if excess[violated[i]] > excess[worst]:
@@ -112,7 +112,9 @@ def choose_bad(vectors, indices, threshold, count, room):
 
     Returns how many there are, at most ``room``; none where but one is that bad.
     """
-    candidates, bad, chosen = indices[CANDIDATES], 0, 0
+    candidates = indices[CANDIDATES]
+    bad = 0
+    chosen = 0
     for i in range(count):
         p = indices[VIOLATED, i]
         if vectors[EXCESS, p] > threshold:
@@ -128,7 +130,8 @@ def choose_bad(vectors, indices, threshold, count, room):
 @inline_njit
 def choose_guess(vectors, indices, M, names):
     """Makes candidates of the guessed constraints, at no cap, whose bound is there; returns how many."""
-    candidates, chosen = indices[CANDIDATES], 0
+    candidates = indices[CANDIDATES]
+    chosen = 0
     for name in names:
         if 1.0 <= abs(name) <= M:
             p = int(abs(name)) - 1

@@ -31,7 +31,10 @@ MU, Y, EXCESS = (
     10,
 )  # multipliers; C x, so that the first n are the point; violations in units of ``SCALE``
 # by variable (n,): -L^-T q, so that L x = v without working constraints (-q if prepared); q + C'mu; P x + q + C'mu
-V, SLOPE, GRADIENT, SCRATCH = 11, 12, 13, 14
+V = 11
+SLOPE = 12
+GRADIENT = 13
+SCRATCH = 14
 # and by slot of the working set (k,): b_p; c_p'x at the unconstrained minimiser; the range of the multiplier, which is
 # [0, cap] at an upper bound, [-cap, 0] at a lower one and [-cap, cap] for an equality; K_pp
 BOUND, FREE_VALUE, LEAST, MOST, DIAGONAL = range(15, 20)
@@ -96,7 +99,8 @@ def prepare_memory(memory: Array, G: Array) -> None:
     w = solve_triangular(
         L, np.vstack([np.eye(n), G]).T, lower=True, trans="T", check_finite=False
     ).T  # L^-T c_p
-    rows[:, :n], K[:, : n + m] = w, w @ w.T
+    rows[:, :n] = w
+    K[:, : n + m] = w @ w.T
     memory[0, _TAG] = 1.0 + zlib.crc32(w.tobytes())
 
 
@@ -109,8 +113,11 @@ def padded(size):
 @inline_njit
 def open_workspace(P, q, G, memory):
     """Returns the workspace in ``memory``."""
-    n, settings, whole = len(q), memory[0], 1 + _VECTORS
-    L, rows = whole + _INDICES, whole + _INDICES + n
+    n = len(q)
+    settings = memory[0]
+    whole = 1 + _VECTORS
+    L = whole + _INDICES
+    rows = whole + _INDICES + n
     factor = len(memory) - n - 1
     return Workspace(
         P, q, G, memory[L:rows], memory[rows:factor], memory[factor:], memory[1:whole],

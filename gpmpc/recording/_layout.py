@@ -55,10 +55,12 @@ def layout(run: Run) -> str:
         "minLogLevel": 1,
         "topicToRender": "/log",
     }
-    left, share = "RosOut!log", 25
+    left = "RosOut!log"
+    share = 25
     if "/pose" in run.channels:
         panels["3D!scene"] = _scene("Position" in groups, "Attitude" in groups)
-        left, share = _split("column", "3D!scene", left, 78), 50
+        left = _split("column", "3D!scene", left, 78)
+        share = 50
     whole = {
         "configById": panels,
         "globalVariables": {},

@@ -34,11 +34,14 @@ if TYPE_CHECKING:
     from gpmpc.systems import System
 
 
-STEP, PLAN, QP = "/step", "/plan", "/qp"
+STEP = "/step"
+PLAN = "/plan"
+QP = "/qp"
 TOPICS = {STEP: "Step", PLAN: "Plan", QP: "QuadraticProgram"}
 TIMING = ("model", "build", "solve", "total")
 RESIDUALS = ("primal", "dual", "gap")
-POSITION, ATTITUDE = ("x", "y", "z"), ("roll", "pitch", "yaw")
+POSITION = ("x", "y", "z")
+ATTITUDE = ("roll", "pitch", "yaw")
 QP_ARRAYS = ("P", "q", "G", "lower", "upper", "softness", "x", "multipliers")
 
 FIELDS = {
@@ -109,7 +112,8 @@ class RecordedSystem:
             raise ShapeError(
                 f"input bounds must be (2, {len(self.input_names)}); got {np.shape(self.input_bounds)}"
             )
-        states, inputs = self.state_names, self.input_names
+        states = self.state_names
+        inputs = self.input_names
         for key, given, names in (
             ("units", self.units, (*states, *inputs)),
             ("pose", self.pose, POSITION + ATTITUDE),
@@ -254,11 +258,9 @@ class StepCopy:
             "belief_covariance": (n, n),
         }
         if decision is not None:
-            H, solution, program = (
-                len(decision.inputs),
-                decision.solution,
-                decision.problem,
-            )
+            H = len(decision.inputs)
+            solution = decision.solution
+            program = decision.problem
             arrays |= {
                 name: getattr(decision, name)
                 for name in ("inputs", "means", "covariances")
@@ -288,10 +290,8 @@ class StepCopy:
                 raise ShapeError(
                     f"step {step.k}: {name} must be {shape}; got {arrays[name].shape}"
                 )
-        self.data, self._shapes = (
-            b"".join(arrays.values()),
-            {name: array.shape for name, array in arrays.items()},
-        )
+        self.data = b"".join(arrays.values())
+        self._shapes = {name: array.shape for name, array in arrays.items()}
 
     @cached_property
     def arrays(self) -> dict[str, Array]:
@@ -318,11 +318,9 @@ class Encoder:
     """Serialises steps of a system as messages."""
 
     def __init__(self, system: RecordedSystem):
-        self._states, self._inputs, self._time_step = (
-            system.state_names,
-            system.input_names,
-            system.time_step,
-        )
+        self._states = system.state_names
+        self._inputs = system.input_names
+        self._time_step = system.time_step
         self._schema = FileDescriptorSet(
             file=[descriptor(self._states, self._inputs)]
         ).SerializeToString()
@@ -354,7 +352,9 @@ class Encoder:
 
     def encode(self, copy: StepCopy) -> Iterator[tuple[str, bytes]]:
         """Yields topics and messages of a step."""
-        step, decision, arrays = copy.step, copy.step.decision, copy.arrays
+        step = copy.step
+        decision = copy.step.decision
+        arrays = copy.arrays
         head = {"time": step.time, "k": step.k}
         solution = None if decision is None else decision.solution
         if solution is not None:
@@ -387,7 +387,8 @@ class Encoder:
         )
         yield STEP, message.SerializeToString()
         if decision is not None:
-            means, stds = arrays["means"], deviations(arrays["covariances"])
+            means = arrays["means"]
+            stds = deviations(arrays["covariances"])
             plan = self._plan(covariances=arrays["covariances"].tobytes(), **head)
             inputs = [
                 *({"input": self._input(values)} for values in arrays["inputs"]),

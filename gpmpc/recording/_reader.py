@@ -511,7 +511,8 @@ def _steps(
     }
     names = {"State": states, "Input": inputs, "Timing": TIMING}
     for field, name in _ATTRIBUTES.items():
-        kind, values = FIELDS["Step"][field], [getattr(step, field) for step in steps]
+        kind = FIELDS["Step"][field]
+        values = [getattr(step, field) for step in steps]
         if kind in names:
             found[name] = _table(values, names[kind])
         else:
@@ -534,11 +535,9 @@ def _plans(
     states: tuple[str, ...],
     inputs: tuple[str, ...],
 ) -> dict[str, Array]:
-    H, n, m = (
-        max((len(plan.stages) - 1 for plan in plans), default=0),
-        len(states),
-        len(inputs),
-    )
+    H = max((len(plan.stages) - 1 for plan in plans), default=0)
+    n = len(states)
+    m = len(inputs)
     if (needed := 8 * len(steps) * (H + 1) * (n * n + n + m)) > room(path):
         raise RecordingError(
             f"{path}: a plan of {H} stages would make arrays of {needed / 1e6:.0f} MB with the others"
@@ -551,7 +550,8 @@ def _plans(
     rows = {key: row for row, key in enumerate(_numbered(steps))}
     for key, plan in zip(_numbered(plans), plans, strict=True):
         if key in rows:  # else the step is lost
-            row, H = rows[key], len(plan.stages) - 1
+            row = rows[key]
+            H = len(plan.stages) - 1
             arrays["plan_means"][row, : H + 1] = _table(
                 (stage.mean for stage in plan.stages), states
             )
@@ -565,8 +565,10 @@ def _plans(
 
 
 def _problem(message: Any) -> RecordedProblem:
-    n, m = message.variables, message.rows
-    M, has_solution = n + m, bool(message.x or message.multipliers)
+    n = message.variables
+    m = message.rows
+    M = n + m
+    has_solution = bool(message.x or message.multipliers)
     shapes = (
         (n, n),
         (n,),
@@ -610,7 +612,8 @@ def recover(path: str | Path, output: str | Path) -> Run:
     Raises:
         RecordingError: There is no run to recover, or the output cannot be written.
     """
-    path, output = Path(path), Path(output)
+    path = Path(path)
+    output = Path(output)
     run = read_run(path)
     try:
         if output.exists() and path.exists() and output.samefile(path):

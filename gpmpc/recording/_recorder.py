@@ -88,16 +88,20 @@ class McapRecorder:
         self.address: str | None = (
             None  #: where a viewer finds the live view, such as ``ws://127.0.0.1:8765``
         )
-        self._n, self._m = len(system.state_names), len(system.input_names)
-        self._record_problems, self._chunk_size = record_problems, chunk_size
+        self._n = len(system.state_names)
+        self._m = len(system.input_names)
+        self._record_problems = record_problems
+        self._chunk_size = chunk_size
         self._encoder = Encoder(system)
         self._waiting: list[StepCopy] = []
-        self._bytes, self._steps = 0, 0
+        self._bytes = 0
+        self._steps = 0
         self._waiting_since = -math.inf  # when the chunk's first step was [s]
         self._topics: dict[int, str] = {}  # by channel, as far as they are written
         self._level = "healthy"  # of the last judgement
         self._error: str | None = None  # why no more steps are taken
-        self._closed, self._server = False, None
+        self._closed = False
+        self._server = None
         self._sink = _Sink(self.path)
         self._context = context = (
             foxglove.Context()
@@ -129,10 +133,8 @@ class McapRecorder:
         self._writer.attach(name=CONFIG, data=config.encode(), **attached)
         self._writer.flush()
         self._save(sync=True)
-        self._channels, self._log = (
-            self._encoder.channels(context),
-            LogChannel("/log", context=context),
-        )
+        self._channels = self._encoder.channels(context)
+        self._log = LogChannel("/log", context=context)
         self._scene = Scene(context, system)
         if live:
             try:
@@ -244,7 +246,8 @@ class McapRecorder:
         except OSError as error:
             self._end(f"the recording stopped and is unfinished: {error.strerror}")
             raise RecordingError(self._error) from error
-        self._bytes, self._last = 0, time.perf_counter()
+        self._bytes = 0
+        self._last = time.perf_counter()
 
     def _end(self, reason: str) -> None:
         self._error = f"{self.path}: {reason}"
@@ -260,7 +263,8 @@ class _Sink:
     """
 
     def __init__(self, path: Path):
-        self._data, self._position = bytearray(), 0
+        self._data = bytearray()
+        self._position = 0
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             self.descriptor = os.open(
@@ -295,7 +299,8 @@ class _Sink:
 
     def save(self, sync: bool) -> None:
         """Writes what was collected, and puts it on the disk if asked to."""
-        left, self._data = memoryview(self._data), bytearray()
+        left = memoryview(self._data)
+        self._data = bytearray()
         while left:
             left = left[os.write(self.descriptor, left) :]
         if sync:
@@ -304,7 +309,8 @@ class _Sink:
 
 def _failure(copy: StepCopy, nanoseconds: int) -> Log:
     """Says what went wrong at a step."""
-    status, failed = copy.status, copy.step.failed
+    status = copy.status
+    failed = copy.step.failed
     policy = "; the policy for failures chose the input" if failed else ""
     return Log(
         timestamp=Timestamp(sec=nanoseconds // 10**9, nsec=nanoseconds % 10**9),

@@ -15,13 +15,13 @@ from gpmpc.recording._messages import ATTITUDE, POSITION, RecordedSystem, StepCo
 
 Array = np.ndarray
 
-DISPLAY, WORLD, VEHICLE = "display", "world", "vehicle"
+DISPLAY = "display"
+WORLD = "world"
+VEHICLE = "vehicle"
 _INTERVAL = 1 / 30  # [s]
 _SIGMAS = 2.0  # radius of the tube in standard deviations
-_TUBE, _LINE = (
-    fg.Color(r=0.0, g=0.45, b=0.7, a=0.18),
-    fg.Color(r=0.0, g=0.45, b=0.7, a=0.9),
-)
+_TUBE = fg.Color(r=0.0, g=0.45, b=0.7, a=0.18)
+_LINE = fg.Color(r=0.0, g=0.45, b=0.7, a=0.9)
 
 
 class Scene:
@@ -58,10 +58,8 @@ class Scene:
         self._next = copy.step.time + _INTERVAL * (
             1 - 1e-6
         )  # a step of just the interval is drawn every time
-        state, plan = (
-            copy.arrays["state"],
-            copy.arrays.get("means", np.zeros((0, len(copy.arrays["state"])))),
-        )
+        state = copy.arrays["state"]
+        plan = copy.arrays.get("means", np.zeros((0, len(copy.arrays["state"]))))
         states = np.vstack([state, copy.arrays["reference"], plan])
         points = _selected(states, self._position).tolist()
         places = [fg.Vector3(x=x, y=y, z=z) for x, y, z in points]

@@ -39,7 +39,8 @@ from gpmpc.systems import (
     attitude_for_thrust_direction,
 )
 
-_OUTER, _INNER = slice(0, 6), slice(6, 12)
+_OUTER = slice(0, 6)
+_INNER = slice(6, 12)
 
 
 @dataclass(frozen=True)
@@ -120,7 +121,8 @@ def cascade_loop(
         raise ShapeError(
             f"a cascade flies the states and inputs of Coupled; got {names}"
         )
-    horizon, ratio = cascade.outer.horizon, cascade.ratio
+    horizon = cascade.outer.horizon
+    ratio = cascade.ratio
     slow = Signals(
         Translational.state_names, Translational.input_names, ratio * plant.time_step
     )
@@ -150,7 +152,9 @@ def cascade_loop(
         calls[1],
         _INNER,
     )
-    states, inputs, angles = [simulator.mean], [], np.zeros(3)
+    states = [simulator.mean]
+    inputs = []
+    angles = np.zeros(3)
     thrust: Any = None  # the command of the outer step under way
     attitude: Any = None  # what the inner controller is to follow
     for j in range(steps * ratio):

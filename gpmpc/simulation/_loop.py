@@ -108,12 +108,12 @@ class Flight:
         self.rows: list[tuple[Step, Array, Array, int, Timing, bool]] = []
         self.last: Command | None = None
         self.error: SolverFailure | Diverged | None = None
-        self.simulator, self._references, self.time_step = (
-            simulator,
-            references,
-            time_step,
-        )
-        self._states, self._on_step, self._judge = states, on_step, judge
+        self.simulator = simulator
+        self._references = references
+        self.time_step = time_step
+        self._states = states
+        self._on_step = on_step
+        self._judge = judge
         own = range(len(simulator.mean))[states]
         self._angles = [i for i, j in enumerate(own) if j in simulator.angles]
 
@@ -129,7 +129,9 @@ class Flight:
 
         ``ahead`` are the reference states from this step on (H + 1, n).
         """
-        part, k, decision = self._states, len(self.rows), last.decision
+        part = self._states
+        k = len(self.rows)
+        decision = last.decision
         learned = None if decision is None else decision.learned
         measured = belief.mean.cpu().numpy().astype(float)[part]
         expected_now = self.rows[-1][1] if self.rows else np.full_like(measured, np.nan)
@@ -170,7 +172,8 @@ class Flight:
         steps, means, covariances, iterations, timings, far = zip(
             *self.rows, strict=True
         )
-        part, end = self._states, self.simulator
+        part = self._states
+        end = self.simulator
         if last is None:
             last = self._references.states[: len(steps) + 1][-1]
         return Rollout(
@@ -396,7 +399,8 @@ def _fly(
     for k in range(steps):
         if not (flying := [flight for flight in flights if flight.error is None]):
             return
-        time, moving = round(k * flights[0].time_step, 9), []
+        time = round(k * flights[0].time_step, 9)
+        moving = []
         beliefs = [flight.simulator.measure(time) for flight in flying]
         ahead = window(references, k, controller.horizon)
         decided = _decide(

@@ -104,13 +104,12 @@ class PlantSimulator:
             raise SettingError(
                 "disturbances", f"must be a list of them; got {disturbances!r}"
             )
-        n, m = len(plant.state_names), len(plant.input_names)
-        self.plant, self.disturbances, self.noise, self._steps = (
-            plant,
-            disturbances,
-            noise or Noise(),
-            0,
-        )
+        n = len(plant.state_names)
+        m = len(plant.input_names)
+        self.plant = plant
+        self.disturbances = disturbances
+        self.noise = noise or Noise()
+        self._steps = 0
         for key, length, names in (
             ("process", n, plant.state_names),
             ("measurement", n, plant.state_names),
@@ -189,7 +188,8 @@ class PlantSimulator:
             return Diverged(
                 self._steps, f"the simulator has ended its episode, at state {state}"
             )
-        self.mean, self._steps = self._add_noise("process", state), self._steps + 1
+        self.mean = self._add_noise("process", state)
+        self._steps = self._steps + 1
         return applied
 
     def _add_noise(self, source: str, value: Array) -> Array:
@@ -205,14 +205,18 @@ class ModelSimulator:
     """Simulates a model loop from a belief, or from a mean (n,) with the paper's standard deviation of 0.1."""
 
     def __init__(self, loop: ModelLoop, initial: Any):
-        self.loop, self._steps = loop, 0
-        model, n = loop.model, loop.model.state_dim
+        self.loop = loop
+        self._steps = 0
+        model = loop.model
+        n = loop.model.state_dim
         to: Any = {"device": model.device, "dtype": model.dtype}
-        mean, covariance = initial, 0.1**2 * torch.eye(n, **to)
+        mean = initial
+        covariance = 0.1**2 * torch.eye(n, **to)
         names = signals_of(model).state_names
         if isinstance(initial, Gaussian):
             initial = initial.in_order(names)
-            mean, covariance = initial.mean, initial.covariance
+            mean = initial.mean
+            covariance = initial.covariance
         state = _check_state(mean, n, names)
         self._belief = Gaussian(torch.as_tensor(state, **to), covariance.to(**to))
 
@@ -247,7 +251,8 @@ class ModelSimulator:
                 self._steps,
                 f"the model's belief is not finite any more; its mean is {belief.mean}",
             )
-        self._belief, self._steps = belief, self._steps + 1
+        self._belief = belief
+        self._steps = self._steps + 1
         return input
 
 

@@ -29,12 +29,10 @@ from gpmpc._files import remove_partial, write_whole
 from gpmpc._provenance import flattened, is_of_this_code, own_code, provenance
 from gpmpc.exceptions import DataError, GpmpcError, SettingError
 
-METRICS, ERROR, CONFIG, RECORDING = (
-    "metrics.json",
-    "error.json",
-    "config.yaml",
-    "run.mcap",
-)
+METRICS = "metrics.json"
+ERROR = "error.json"
+CONFIG = "config.yaml"
+RECORDING = "run.mcap"
 PLAN = "sweep-"  # begins the names of the files that say which runs a sweep asked for
 _LOCK = ".lock"  # locked by who works on the folder; stays, empty
 LONGEST_NAME = 150  # characters of a folder's name; file systems take 255 bytes
@@ -174,7 +172,8 @@ def folder_name(choices: Sequence[str]) -> str:
 
 def difference(then: Mapping[str, Any], now: Mapping[str, Any]) -> str:
     """Returns in words where two settings differ, the first three of their leaves; empty where they are equal."""
-    a, b = flattened(then), flattened(now)
+    a = flattened(then)
+    b = flattened(now)
     differing = [
         f"{k}: {a.get(k)!r} then, {b.get(k)!r} now"
         for k in dict.fromkeys([*a, *b])

@@ -99,10 +99,8 @@ class Report:
     @cached_property
     def measures(self) -> dict[str, str]:
         """The measures that any run has, and what each is called, with both units where runs are of both subsystems."""
-        known, unit = (
-            self.runs[[*MEASURES]].notna().any(),
-            " or ".join(sorted({*self.runs.unit} - {""})) or "m",
-        )
+        known = self.runs[[*MEASURES]].notna().any()
+        unit = " or ".join(sorted({*self.runs.unit} - {""})) or "m"
         return {
             name: label.format(unit=unit)
             for name, (label, _) in MEASURES.items()
@@ -150,7 +148,10 @@ def read_report(tree: str | Path) -> Report:
     tree = Path(tree)
     if not tree.is_dir():
         raise DataError(f"{tree}: no such folder")
-    runs, plans, unread, skipped = [], [], set(), []
+    runs = []
+    plans = []
+    unread = set()
+    skipped = []
     results = {
         path.parent: path
         for name in (ERROR, METRICS)
@@ -300,11 +301,9 @@ def _suspicion(content: Mapping[str, Any]) -> str:
 def _origin(content: Mapping[str, Any]) -> dict[str, str]:
     """Returns date, commit and machine of a run, as far as it tells them."""
     about = content.get("provenance") or {}
-    git, machine, versions = (
-        about.get("git") or {},
-        about.get("machine") or {},
-        about.get("versions") or {},
-    )
+    git = about.get("git") or {}
+    machine = about.get("machine") or {}
+    versions = about.get("versions") or {}
     commit = (
         f"{git['commit'][:10]}{', changed' if git.get('dirty') else ''}"
         if git

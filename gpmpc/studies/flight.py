@@ -102,7 +102,8 @@ class Experiment:
         check_policy(self.on_failure)
         if self.loop not in ("plant", "model"):
             raise SettingError("loop", f"must be 'plant' or 'model'; got {self.loop!r}")
-        plant, system = self.flown, self.system
+        plant = self.flown
+        system = self.system
         if system.signals != plant.signals:
             raise SettingError(
                 "plant",
@@ -179,7 +180,8 @@ class Experiment:
         What a trainer supposes of columns that never move follows from the system's
         limits, where its ``prior_lengthscale`` is None.
         """
-        angles, known = self.system.angle_indices, self.system.nominal
+        angles = self.system.angle_indices
+        known = self.system.nominal
         residual = getattr(self.train, "predicts", None) == "difference"
         residual = residual and bool(angles or known)
         train: Any = self.train
@@ -203,10 +205,8 @@ class Experiment:
         It is what the model has learned of it; a controller that knows the plant knows its noise as well. A plan of
         means alone leaves out everything.
         """
-        model, none = (
-            training.posterior if training else self.model,
-            np.zeros(self._dimensions[0]),
-        )
+        model = training.posterior if training else self.model
+        none = np.zeros(self._dimensions[0])
         settings = getattr(self.controller, "keywords", {}).get("prediction")
         predicts_means_alone = getattr(settings, "covariance", "") == "none"
         holds_noise = getattr(self.propagator, "process_noise", False)
@@ -275,7 +275,9 @@ def run_trial(
         SolverFailure: A solve failed, and the policy is ``"raise"`` or there was nothing to fall back on.
         Diverged: The system left the finite numbers in its first step.
     """
-    training, model, before = None, experiment.model, []
+    training = None
+    model = experiment.model
+    before = []
     if experiment.learns and model is None:
         data = experiment.training_rows()
         training = experiment.learn(data, experiment.seed)
@@ -302,8 +304,10 @@ def _error(experiment: Experiment, flown: Flown, last: int = 0) -> float:
 
 
 def _tracking_error(experiment: Experiment, flown: Flown, last: int = 0) -> Any:
-    system, rollout = experiment.system, flown.rollout
-    states, references = rollout.states[-last:], rollout.references[-last:]
+    system = experiment.system
+    rollout = flown.rollout
+    states = rollout.states[-last:]
+    references = rollout.references[-last:]
     return tracking_error(
         states, references, system.tracked_indices, system.angle_indices
     )
@@ -370,12 +374,12 @@ def metrics(experiment: Experiment, flown: Flown) -> dict[str, Any]:
     flight no longer follows its reference (``find_loss``, by its judgement, or it diverged). One that diverged has no
     RMSE: None.
     """
-    rollout, problem, training = flown.rollout, flown.controller.problem, flown.training
-    system, horizon, total = (
-        experiment.system,
-        flown.controller.horizon,
-        _error(experiment, flown),
-    )
+    rollout = flown.rollout
+    problem = flown.controller.problem
+    training = flown.training
+    system = experiment.system
+    horizon = flown.controller.horizon
+    total = _error(experiment, flown)
     axes = _tracking_error(experiment, flown).axes.tolist()
     rmse: dict[str, Any] = dict(zip(system.tracked, axes, strict=True)) | {
         "total": total
@@ -495,8 +499,12 @@ def _judgement(flown: Flown) -> dict[str, Any]:
 
 def _lost(experiment: Experiment, flown: Flown) -> dict[str, Any] | None:
     """Returns step, time [s] and reason of a flight's loss; None where it was not lost."""
-    system, rollout, found = experiment.system, flown.rollout, []
-    unit, axes, angles = system.unit, system.tracked_indices, system.angle_indices
+    system = experiment.system
+    rollout = flown.rollout
+    found = []
+    unit = system.unit
+    axes = system.tracked_indices
+    angles = system.angle_indices
     if loss := find_loss(rollout.states, rollout.references, axes, system.lost, angles):
         found.append(
             (
@@ -518,23 +526,20 @@ def _lost(experiment: Experiment, flown: Flown) -> dict[str, Any] | None:
 
 def summary(result: Mapping[str, Any]) -> Table:
     """Returns a run's metrics in words, a line each; what there is nothing to say of has none."""
-    settings, times, rmse, unit = (
-        result["settings"],
-        result["times"],
-        result["rmse"],
-        result["unit"],
-    )
+    settings = result["settings"]
+    times = result["times"]
+    rmse = result["rmse"]
+    unit = result["unit"]
     options, (system, plant, model) = (
         settings["options"],
         (settings.get(k) or {} for k in ("system", "plant", "model")),
     )
     along = "" if options["trajectory"] == "goal" else f" along {options['trajectory']}"
-    training, lost, far = (
-        result["training"],
-        result.get("lost"),
-        result.get("far_from_data"),
-    )
-    error, stopped = result.get("error_at_end"), _counted(result.get("suboptimal", {}))
+    training = result["training"]
+    lost = result.get("lost")
+    far = result.get("far_from_data")
+    error = result.get("error_at_end")
+    stopped = _counted(result.get("suboptimal", {}))
     axes = ", ".join(
         f"{k} {v:.3g}" for k, v in rmse.items() if v is not None and k != "total"
     )

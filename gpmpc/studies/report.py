@@ -252,12 +252,11 @@ def _figures(report: Report) -> dict[str, bytes]:
     drawn: dict[str, bytes] = {}
     for index, variable in enumerate(report.variables):
         positions = sorted({values[index] for values in report.cells}, key=in_order)
-        at, lines = (
-            report.runs.cell.map(lambda cell, i=index: report.cells[cell][i]),
-            _lines(report, index),
-        )
+        at = report.runs.cell.map(lambda cell, i=index: report.cells[cell][i])
+        lines = _lines(report, index)
         for name in (name for name in _telling(report) if name in _DRAWN):
-            numbers, series = report.runs[name].dropna(), []
+            numbers = report.runs[name].dropna()
+            series = []
             for label, cells in lines.items():
                 of = numbers[report.runs.cell.isin(cells)]
                 series.append(
@@ -355,7 +354,8 @@ def compare(report: Report, a: str, b: str) -> list[Comparison]:
         first, second = first.align(
             second
         )  # a row a combination of the other settings, a column a seed
-        left_out, both = [], first.notna() & second.notna()
+        left_out = []
+        both = first.notna() & second.notna()
         while (
             both.size and not both.to_numpy().all()
         ):  # what lacks the largest share of its runs is left out
@@ -421,15 +421,18 @@ def _test(
     """Compares paired values (n,)."""
     d = a - b
     signed = stats.rankdata(np.abs(d[d != 0])) * np.sign(d[d != 0])
-    mean, interval, wilcoxon, t_test = d[0], (d[0], d[0]), np.nan, np.nan
+    mean = d[0]
+    interval = (d[0], d[0])
+    wilcoxon = np.nan
+    t_test = np.nan
     standardised = np.copysign(np.inf, mean) if mean else 0.0
     if np.ptp(d):  # else all are equal, and so is their mean without rounding
-        t, mean, wilcoxon = stats.ttest_rel(a, b), d.mean(), stats.wilcoxon(d).pvalue
-        interval, t_test, standardised = (
-            tuple(t.confidence_interval()),
-            t.pvalue,
-            t.statistic / np.sqrt(len(d)),
-        )
+        t = stats.ttest_rel(a, b)
+        mean = d.mean()
+        wilcoxon = stats.wilcoxon(d).pvalue
+        interval = tuple(t.confidence_interval())
+        t_test = t.pvalue
+        standardised = t.statistic / np.sqrt(len(d))
     return Comparison(
         measure=measure,
         medians=(float(np.median(a)), float(np.median(b))),

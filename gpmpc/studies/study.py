@@ -93,7 +93,8 @@ class TrialStore:
             )
             file.flush()
             os.fsync(file.fileno())
-        self._separator, self.records[fingerprint] = "", record
+        self._separator = ""
+        self.records[fingerprint] = record
 
 
 def run_study(

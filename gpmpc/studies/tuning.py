@@ -64,7 +64,9 @@ class Search:
         warnings.simplefilter(
             "ignore", optuna.exceptions.ExperimentalWarning
         )  # of this sampler and the importances
-        self._optuna, self._seed, kinds = optuna, seed, optuna.distributions
+        self._optuna = optuna
+        self._seed = seed
+        kinds = optuna.distributions
         self._study = optuna.create_study(direction="minimize")
         self._space: dict[str, Any] = {}
         for key, values in space.items():
@@ -119,7 +121,8 @@ class Search:
             base: Cost of the settings as they are without the search; None where that flight was lost.
             command: That flies the best candidate.
         """
-        keys, matter = [*self._space], self.importances()
+        keys = [*self._space]
+        matter = self.importances()
         data = [
             {"candidate": i, "cost": cost, **self.candidates[i]}
             for i, cost in enumerate(self.costs)

@@ -106,10 +106,17 @@ class Rotational:
     def derivative(self, x: Any, u: Any) -> list[Any]:
         """d/dt (phi, p, theta, q, psi, r) [rad/s, rad/s^2]."""
         (p, q, r), (ixx, iyy, izz) = (x[1], x[3], x[5]), self.inertia
-        a1, a3, a5 = (iyy - izz) / ixx, (izz - ixx) / iyy, (ixx - iyy) / izz  # [-]
+        # [-]
+        a1 = (iyy - izz) / ixx
+        a3 = (izz - ixx) / iyy
+        a5 = (ixx - iyy) / izz
         a2, a4 = self.gyroscopic  # a2 W, a4 W [1/s]
-        b1, b2, b3 = self.arm / ixx, self.arm / iyy, self.arm / izz  # [1/(kg m)]
-        roll, pitch = a1 * q * r + a2 * q + b1 * u[0], a3 * p * r - a4 * p + b2 * u[1]
+        # [1/(kg m)]
+        b1 = self.arm / ixx
+        b2 = self.arm / iyy
+        b3 = self.arm / izz
+        roll = a1 * q * r + a2 * q + b1 * u[0]
+        pitch = a3 * p * r - a4 * p + b2 * u[1]
         return [p, roll, q, pitch, r, a5 * p * q + b3 * u[2]]
 
 
@@ -287,10 +294,12 @@ def approach_attitudes(
     Roll and pitch (K, 2) [rad], from the first of them on, are asked for ``hold`` inner steps each; times [s].
     """
     left = np.exp(-time_step / response_time)  # of the way, after one step
-    states, at = np.zeros((count, 6)), angles[0]
+    states = np.zeros((count, 6))
+    at = angles[0]
     for j in range(count):
         wanted = angles[j // hold]
-        states[j, [0, 2]], states[j, [1, 3]] = at, (wanted - at) / response_time
+        states[j, [0, 2]] = at
+        states[j, [1, 3]] = (wanted - at) / response_time
         at = wanted + left * (at - wanted)
     return states
 

@@ -40,7 +40,8 @@ class Simulator:
 
     def reset(self, seed: int) -> Array:
         """Starts an episode; returns its first state (n,)."""
-        self._now, self.ended = self._reset(seed), False
+        self._now = self._reset(seed)
+        self.ended = False
         return self._now.copy()
 
     def successor(self, x: Any, u: Any) -> Array:

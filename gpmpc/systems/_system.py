@@ -82,7 +82,9 @@ class System:
         states, inputs = (
             _names(self.dynamics, key) for key in ("state_names", "input_names")
         )
-        n, m, every = len(states), len(inputs), (*states, *inputs)
+        n = len(states)
+        m = len(inputs)
+        every = (*states, *inputs)
         self._set("name", self.name or type(self.dynamics).__name__)
         if unknown := set(self.units) - {*every}:
             raise SettingError(
@@ -197,11 +199,9 @@ class System:
         """
         if hasattr(self.dynamics, "successor"):
             return list(self._check_length("successor", self.dynamics.successor(x, u)))
-        f, h, n = (
-            self.dynamics.derivative,
-            self.time_step / self.substeps,
-            len(self.dynamics.state_names),
-        )
+        f = self.dynamics.derivative
+        h = self.time_step / self.substeps
+        n = len(self.dynamics.state_names)
         x = [x[i] for i in range(n)]
         for _ in range(self.substeps):
             k1 = self._check_length("derivative", f(x, u))
@@ -224,7 +224,8 @@ class System:
         if self.references is not None:
             return self.references(trajectory, count, self.time_step)
         times = self.time_step * np.arange(count)
-        positions, states = trajectory(times), np.tile(np.array(self.goal), (count, 1))
+        positions = trajectory(times)
+        states = np.tile(np.array(self.goal), (count, 1))
         if positions.shape[1:] != (len(self.tracked),):
             what = f"must prescribe {', '.join(self.tracked)} of {self.name}"
             raise ShapeError(
@@ -258,10 +259,8 @@ class System:
             )
         if self.stateful:
             return
-        x, u = (
-            list(self.goal if self.start is None else self.start),
-            list(self.initial_input),
-        )
+        x = list(self.goal if self.start is None else self.start)
+        u = list(self.initial_input)
         try:
             entries = [float(entry) for entry in self.successor(x, u)]
         except GpmpcError:

@@ -35,7 +35,8 @@ class DoubleIntegrator(_Body):
 
     mass: float = 1.0  #: [kg]
 
-    state_names, input_names = ("position", "velocity"), ("force",)
+    state_names = ("position", "velocity")
+    input_names = ("force",)
 
     def derivative(self, x: Any, u: Any) -> list[Any]:
         """d/dt (position, velocity) [m/s, m/s^2]."""
@@ -67,7 +68,8 @@ class Pendulum(_Body):
     length: float = 1.0  #: [m]
     damping: float = 0.05  #: of the joint [N m s]
 
-    state_names, input_names = ("angle", "rate"), ("torque",)
+    state_names = ("angle", "rate")
+    input_names = ("torque",)
     may_be_zero = ("damping",)
 
     def derivative(self, x: Any, u: Any) -> list[Any]:
@@ -108,15 +110,15 @@ class CartPole(_Body):
     pole_mass: float = 0.1  #: of the uniform pole [kg]
     half_length: float = 0.5  #: from the hinge to the pole's centre of mass [m]
 
-    state_names, input_names = ("position", "velocity", "angle", "rate"), ("force",)
+    state_names = ("position", "velocity", "angle", "rate")
+    input_names = ("force",)
 
     def derivative(self, x: Any, u: Any) -> list[Any]:
         """d/dt (position, velocity, angle, rate) [m/s, m/s^2, rad/s, rad/s^2]."""
-        total, moment = (
-            self.cart_mass + self.pole_mass,
-            self.pole_mass * self.half_length,
-        )
-        s, c = sin(x[2]), cos(x[2])
+        total = self.cart_mass + self.pole_mass
+        moment = self.pole_mass * self.half_length
+        s = sin(x[2])
+        c = cos(x[2])
         push = (u[0] + moment * x[3] * x[3] * s) / total
         turn = (GRAVITY * s - c * push) / (
             self.half_length * (4 / 3 - self.pole_mass * c * c / total)
@@ -169,10 +171,8 @@ class DoublePendulum(_Body):
     )  #: of the links about their centres of mass [kg m^2]
     actuated: Literal["elbow", "shoulder"] = "elbow"  #: an acrobot, or a pendubot
 
-    state_names, input_names = (
-        ("shoulder", "shoulder_rate", "elbow", "elbow_rate"),
-        ("torque",),
-    )
+    state_names = ("shoulder", "shoulder_rate", "elbow", "elbow_rate")
+    input_names = ("torque",)
     words = ("actuated",)
 
     def __post_init__(self) -> None:
@@ -187,7 +187,10 @@ class DoublePendulum(_Body):
             self.inertias,
             self.first_length,
         )
-        a, da, b, db = x[0], x[1], x[2], x[3]
+        a = x[0]
+        da = x[1]
+        b = x[2]
+        db = x[3]
         # D (dda, ddb) + h + phi = torques
         coupling = m2 * l1 * c2
         d11 = m1 * c1**2 + m2 * (l1**2 + c2**2) + 2 * coupling * cos(b) + i1 + i2
@@ -327,14 +330,14 @@ class StirredTank(_Body):
     capacity: float = 239.0  #: rho Cp, of the fluid [J/(L K)]
     transfer: float = 5.0e4  #: U A, to the coolant [J/(min K)]
 
-    state_names, input_names = ("concentration", "temperature"), ("coolant",)
+    state_names = ("concentration", "temperature")
+    input_names = ("coolant",)
 
     def derivative(self, x: Any, u: Any) -> list[Any]:
         """d/dt (concentration, temperature) [mol/(L s), K/s]."""
-        exchange, reaction = (
-            self.flow / self.volume,
-            self.rate * exp(-self.activation / x[1]) * x[0],
-        )  # per minute
+        # per minute
+        exchange = self.flow / self.volume
+        reaction = self.rate * exp(-self.activation / x[1]) * x[0]
         cooling = self.transfer / (self.volume * self.capacity) * (u[0] - x[1])
         warming = (
             exchange * (self.feed_temperature - x[1])

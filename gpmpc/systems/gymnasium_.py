@@ -59,11 +59,10 @@ class _Environment(Simulator):
                 what = f"the {kind} space must be a Box of one dimension"
                 raise SettingError("environment", f"{what}; got {space}{remedy}")
         action = spaces["action"]
-        self._observe, self.limits = (
-            observe,
-            (action.low.astype(float), action.high.astype(float)),
-        )
-        n, m = len(self.reset(0)), len(action.low)
+        self._observe = observe
+        self.limits = (action.low.astype(float), action.high.astype(float))
+        n = len(self.reset(0))
+        m = len(action.low)
         self.state_names = tuple(state_names or [f"x{i + 1}" for i in range(n)])
         self.input_names = tuple(input_names or [f"u{i + 1}" for i in range(m)])
         if (found := (len(self.state_names), len(self.input_names))) != (n, m):
@@ -163,7 +162,8 @@ def make_environment(system: System | str, **settings: Any) -> Any:
 
         def __init__(self) -> None:
             n = len(flown.state_names)
-            lower, upper = np.array(flown.input_lower), np.array(flown.input_upper)
+            lower = np.array(flown.input_lower)
+            upper = np.array(flown.input_upper)
             self.observation_space = gymnasium.spaces.Box(
                 -np.inf, np.inf, (n,), np.float64
             )

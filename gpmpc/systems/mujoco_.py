@@ -55,17 +55,16 @@ class _Joints(_Model):
         substeps: int = 1,
     ):
         super().__init__(path, actuators)
-        model, joint = self.model, self.mujoco.mjtJoint
+        model = self.model
+        joint = self.mujoco.mjtJoint
         kinds = {int(joint.mjJNT_SLIDE), int(joint.mjJNT_HINGE)}
         found = self.indices("joint", joints)
         if model.njnt != len(found) or not set(model.jnt_type.tolist()) <= kinds:
             what = f"must name all {model.njnt} joints of {path}, hinges and slides; name sensors of other models"
             raise SettingError("joints", f"{what}; got {list(joints)}")
-        self.substeps, q, v = (
-            substeps,
-            model.jnt_qposadr[found],
-            model.jnt_dofadr[found],
-        )
+        self.substeps = substeps
+        q = model.jnt_qposadr[found]
+        v = model.jnt_dofadr[found]
         # Where the states stand in MuJoCo's own: time, qpos, qvel, act.
         self._order = np.concatenate(
             [1 + q, 1 + model.nq + v, 1 + model.nq + model.nv + np.arange(model.na)]
@@ -80,7 +79,8 @@ class _Joints(_Model):
 
     def positions(self, state: Array) -> Array:
         """The positions of the model's joints (nq,), in MuJoCo's order, in a state (n,)."""
-        found, count = np.empty(self.model.nq), self.model.nq
+        found = np.empty(self.model.nq)
+        count = self.model.nq
         found[self._order[:count] - 1] = state[:count]
         return found
 
@@ -88,11 +88,10 @@ class _Joints(_Model):
         """The next state (n,) or states (n, T) from a state and an input, or T of each."""
         states, inputs = numbers(x, u)
         single = states.ndim == 1
-        states, inputs = (
-            states.reshape(len(states), -1),
-            inputs.reshape(len(inputs), -1),
-        )
-        count, model = states.shape[1], self.model
+        states = states.reshape(len(states), -1)
+        inputs = inputs.reshape(len(inputs), -1)
+        count = states.shape[1]
+        model = self.model
         initial = np.zeros((count, 1 + model.nq + model.nv + model.na))
         initial[:, self._order] = states.T
         control = np.zeros((count, self.substeps, model.nu))
@@ -130,18 +129,17 @@ class _Sensors(_Model, Simulator):
             model.sensor_adr[i] + np.arange(d)
             for i, d in zip(found, sizes, strict=True)
         ]
-        self._places, self._observe, self.substeps, self._delay = (
-            np.concatenate(places),
-            observe,
-            substeps,
-            input_delay,
-        )
+        self._places = np.concatenate(places)
+        self._observe = observe
+        self.substeps = substeps
+        self._delay = input_delay
         own = [
             f"{name}{k + 1}" if d > 1 else name
             for name, d in zip(sensors, sizes, strict=True)
             for k in range(d)
         ]
-        self.state_names, self.input_names = tuple(state_names or own), tuple(actuators)
+        self.state_names = tuple(state_names or own)
+        self.input_names = tuple(actuators)
         if (n := len(self.reset(0))) != len(self.state_names):
             raise SettingError(
                 "state_names", f"must be {n} names; got {len(self.state_names)}"

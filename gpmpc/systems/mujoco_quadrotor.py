@@ -17,7 +17,9 @@ from gpmpc.systems.mujoco_ import mujoco_system
 
 _MODEL = Path(__file__).with_name("quadrotor.xml")
 ROTORS = ("u1", "u2", "u3", "u4")
-_DRAG, _MASS = 0.25, 0.5  # of the model [N s/m], [kg]
+# of the model [N s/m], [kg]
+_DRAG = 0.25
+_MASS = 0.5
 
 
 @dataclass(frozen=True)
@@ -58,11 +60,10 @@ class RigidBody:
         """d/dt of the twelve states [m/s, m/s^2, rad/s, rad/s^2]."""
         (p, q, r), (ixx, iyy, izz) = (x[7], x[9], x[11]), self.inertia
         s1, c1, s2, c2, s3, c3 = (f(x[i]) for i in (6, 8, 10) for f in (sin, cos))
-        lift, turned = (u[0] + u[1] + u[2] + u[3]) / self.mass, q * s1 + r * c1
-        roll, pitch = (
-            self.arm * (u[0] - u[1] - u[2] + u[3]),
-            self.arm * (u[2] + u[3] - u[0] - u[1]),
-        )
+        lift = (u[0] + u[1] + u[2] + u[3]) / self.mass
+        turned = q * s1 + r * c1
+        roll = self.arm * (u[0] - u[1] - u[2] + u[3])
+        pitch = self.arm * (u[2] + u[3] - u[0] - u[1])
         return [
             x[1],
             lift * (c3 * s2 * c1 + s3 * s1),
@@ -97,7 +98,8 @@ def mujoco_quadrotor(
     """
     check_number("mass", mass, above=0, unit="[kg]")
     check_numbers("wind", wind, 3, unit="[m/s]")
-    names, hover = RigidBody.state_names, [_MASS * GRAVITY / 4] * 4
+    names = RigidBody.state_names
+    hover = [_MASS * GRAVITY / 4] * 4
     units = dict.fromkeys(("x", "y", "z"), "m") | dict.fromkeys(
         ("vx", "vy", "vz"), "m/s"
     )
@@ -129,7 +131,8 @@ def mujoco_quadrotor(
         pose={name: name for name in ("x", "y", "z", "roll", "pitch", "yaw")},
     )
     flown.dynamics.positions = _joint_positions
-    model, vehicle = flown.dynamics.model, flown.dynamics.model.body("vehicle").id
+    model = flown.dynamics.model
+    vehicle = flown.dynamics.model.body("vehicle").id
     model.body_mass[vehicle] = mass
     flown.dynamics.mujoco.mj_setConst(
         model, flown.dynamics.data

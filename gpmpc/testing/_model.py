@@ -59,7 +59,8 @@ def _check_attributes(model: DynamicsModel) -> None:
     require(
         hasattr(model, "device"), "device says where the model lives", "it is missing"
     )
-    noise, k = getattr(model, "noise_covariance", None), model.output_dim
+    noise = getattr(model, "noise_covariance", None)
+    k = model.output_dim
     right = (
         isinstance(noise, Tensor)
         and tuple(noise.shape) == (k, k)
@@ -116,7 +117,9 @@ def _check_predict(model: DynamicsModel, x: Tensor, u: Tensor, exact: float) -> 
 def _check_linearize(
     model: DynamicsModel, x: Tensor, u: Tensor, exact: float, numeric: float
 ) -> None:
-    n, m, k = model.state_dim, model.input_dim, model.output_dim
+    n = model.state_dim
+    m = model.input_dim
+    k = model.output_dim
     states, inputs = (part.double().cpu().numpy().copy() for part in (x, u))
     before = states.copy(), inputs.copy()
     found = model.linearize(states, inputs)
@@ -128,7 +131,8 @@ def _check_linearize(
     )
     shapes = {"mean": (k,), "A": (k, n), "B": (k, m), "covariance": (k, k)}
     for name, shape in shapes.items():
-        got, expected = getattr(found, name), (len(x), *shape)
+        got = getattr(found, name)
+        expected = (len(x), *shape)
         right = (
             isinstance(got, np.ndarray)
             and got.dtype == np.float64
@@ -171,10 +175,8 @@ def _check_linearize(
         require_close(promise, torch.from_numpy(getattr(means, name)), got, exact)
     one = model.linearize(states[1:2], inputs[1:2])
     for name in shapes:
-        alone, among = (
-            torch.from_numpy(getattr(one, name)[0]),
-            torch.from_numpy(getattr(found, name)[1]),
-        )
+        alone = torch.from_numpy(getattr(one, name)[0])
+        among = torch.from_numpy(getattr(found, name)[1])
         require_close(
             f"linearize: K points are the loop over them ({name})", alone, among, exact
         )
@@ -222,7 +224,8 @@ def _check_same(
 
 def _numeric_jacobian(model: DynamicsModel, x: Tensor, u: Tensor) -> Tensor:
     """Central differences of the mean by (x, u) (K, k, n + m)."""
-    joint, n = torch.cat([x, u], dim=1), model.state_dim
+    joint = torch.cat([x, u], dim=1)
+    n = model.state_dim
     columns = []
     for j in range(joint.shape[1]):
         size = torch.finfo(model.dtype).eps ** (1 / 3) * max(

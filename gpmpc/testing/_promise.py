@@ -19,7 +19,8 @@ def require_close(
     floor: float = 1.0,
 ) -> None:
     """Raises unless two tensors differ by at most a part of the expected one's size (of ``floor`` if that is more)."""
-    got, expected = got.detach().double(), expected.detach().double()
+    got = got.detach().double()
+    expected = expected.detach().double()
     require(
         got.shape == expected.shape,
         promise,

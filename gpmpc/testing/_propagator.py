@@ -34,7 +34,8 @@ class _Case:
     def __call__(
         self, belief: Gaussian | None = None, input: Tensor | None = None
     ) -> Propagation:
-        belief, input = belief or self.belief, self.input if input is None else input
+        belief = belief or self.belief
+        input = self.input if input is None else input
         return self.propagator.propagate(self.model, belief, input)
 
     def comparable(self, covariance: Tensor) -> Tensor:
@@ -86,7 +87,8 @@ def check_propagator(
         process_noise = bool(getattr(propagator, "process_noise", False))
 
     def case(model: Any) -> _Case:
-        n, like = model.state_dim, {"dtype": model.dtype, "device": model.device}
+        n = model.state_dim
+        like = {"dtype": model.dtype, "device": model.device}
         root = 0.2 * torch.eye(n, **like) + 0.05 * torch.ones(n, n, **like).tril(-1)
         belief = Gaussian(torch.linspace(0.3, -0.4, n, **like), root @ root.mT)
         noise = (
@@ -141,12 +143,12 @@ def _small_gp(predicts: Any) -> GPPosterior:
 
 def _linear_model() -> ResidualModel:
     """x+ = A x + B u + c, learned so well that nothing is left to a GP, in a class that every method takes."""
-    A, B, c = [[0.9, 0.3], [-0.2, 0.8]], [[0.0], [0.5]], [0.1, -0.2]
+    A = [[0.9, 0.3], [-0.2, 0.8]]
+    B = [[0.0], [0.5]]
+    c = [0.1, -0.2]
     nominal = Affine(*(torch.tensor(part, dtype=torch.float64) for part in (A, B, c)))
-    zero, tiny = (
-        torch.zeros(1, 3, dtype=torch.float64),
-        torch.full((2,), 1e-24, dtype=torch.float64),
-    )
+    zero = torch.zeros(1, 3, dtype=torch.float64)
+    tiny = torch.full((2,), 1e-24, dtype=torch.float64)
     gp = GPPosterior.from_hyperparameters(
         zero, zero[:, :2], zero.expand(2, 3) + 1, tiny, tiny, 1, "value"
     )
@@ -175,7 +177,9 @@ def _check_parts(
 
 
 def _check_result(case: _Case) -> None:
-    at, n, k = case.belief, case.model.state_dim, case.model.output_dim
+    at = case.belief
+    n = case.model.state_dim
+    k = case.model.output_dim
     before = at.mean.clone(), at.covariance.clone(), case.input.clone()
     result = case()
     for name, old, new in zip(
@@ -196,10 +200,8 @@ def _check_result(case: _Case) -> None:
         "deficit": (),
     }
     for name, value in _parts(result).items():
-        right, got = (
-            tuple(value.shape) == shapes[name] and value.dtype == at.mean.dtype,
-            f"{tuple(value.shape)}",
-        )
+        right = tuple(value.shape) == shapes[name] and value.dtype == at.mean.dtype
+        got = f"{tuple(value.shape)}"
         require(
             right,
             f"{name} has shape {shapes[name]} for one belief, and its type",
@@ -219,7 +221,8 @@ def _check_result(case: _Case) -> None:
     off = result.belief.covariance - torch.diag(result.belief.variance)
     promise = "a diagonal method predicts no correlation"
     require(not (case.diagonal and bool(off.any())), promise, f"got {off.tolist()}")
-    again, called = case().belief, case.propagator(case.model, at, case.input)
+    again = case().belief
+    called = case.propagator(case.model, at, case.input)
     for promise, other in (
         ("the same belief gives the same result", again),
         ("calling it propagates", called),
@@ -231,13 +234,16 @@ def _check_result(case: _Case) -> None:
 
 
 def _check_without_covariance(case: _Case) -> None:
-    at, plain = case.belief, case.model.predict(case.belief.mean, case.input)
+    at = case.belief
+    plain = case.model.predict(case.belief.mean, case.input)
     expected = {"mean": plain.mean, "covariance": case.comparable(plain.covariance)}
 
     def result(scale: float) -> dict[str, Tensor]:
         return _parts(case(Gaussian(at.mean, scale * at.covariance)))
 
-    certain, wide, narrow = result(0.0), result(1e-2), result(1e-6)
+    certain = result(0.0)
+    wide = result(1e-2)
+    narrow = result(1e-6)
     _check_parts(
         "without covariance it is the plain prediction", certain, expected, 1e-8
     )
@@ -277,10 +283,8 @@ def _check_batch(case: _Case) -> None:
     for batch in ((4,), (2, 2)):
         means, covariances, inputs = (part.unflatten(0, batch) for part in parts)
         for name, got in _parts(case(Gaussian(means, covariances), inputs)).items():
-            expected, floor = (
-                torch.stack([each[name] for each in alone]).unflatten(0, batch),
-                1e-4,
-            )
+            expected = torch.stack([each[name] for each in alone]).unflatten(0, batch)
+            floor = 1e-4
             promise = f"a batch is the loop over its members, here of shape {batch}"
             require_close(
                 promise,
@@ -295,7 +299,8 @@ def _check_batch(case: _Case) -> None:
 def _check_single_precision(case: _Case) -> None:
     if not hasattr(case.model, "to"):
         return
-    model, at = case.model.to(dtype=torch.float32), case.belief
+    model = case.model.to(dtype=torch.float32)
+    at = case.belief
     belief = Gaussian(at.mean.float(), at.covariance.float())
     single = _parts(case.propagator.propagate(model, belief, case.input.float()))
     for name, got in single.items():
@@ -315,7 +320,8 @@ def _check_single_precision(case: _Case) -> None:
 
 def _check_monte_carlo(case: _Case) -> None:
     """The claimed moments against the sample means that they are, in standard errors."""
-    at, claimed = case.belief, _parts(case())
+    at = case.belief
+    claimed = _parts(case())
     generator = torch.Generator().manual_seed(1)
     normal = torch.randn(_DRAWS, at.dim, generator=generator, dtype=torch.float64).to(
         at.mean
@@ -346,17 +352,16 @@ def _check_monte_carlo(case: _Case) -> None:
 
 
 def _check_first_order_correlation(case: _Case) -> None:
-    at, scale = case.belief, 1e-6
+    at = case.belief
+    scale = 1e-6
     x, u = (
         np.ascontiguousarray(part[None].double().cpu().numpy())
         for part in (at.mean, case.input)
     )
     A = torch.from_numpy(linearize(case.model, x, u, covariance=False).A[0]).to(at.mean)
     got = case(Gaussian(at.mean, scale * at.covariance)).cross_covariance / scale
-    promise, floor = (
-        "the cross covariance Cov[x, x+] is S A' to first order",
-        float(at.covariance.abs().max()),
-    )
+    promise = "the cross covariance Cov[x, x+] is S A' to first order"
+    floor = float(at.covariance.abs().max())
     require_close(
         promise, got, at.covariance @ A.mT, 1e-3 + case.sampling_error, floor=floor
     )
@@ -367,11 +372,10 @@ def _check_linear(case: _Case) -> None:
         result = case()
     except UnsupportedModel:
         return  # a method may take other models only
-    S, A = case.belief.covariance, case.model.nominal.A
-    mean, covariance = (
-        case.model.nominal(case.belief.mean, case.input),
-        case.comparable(A @ S @ A.mT),
-    )
+    S = case.belief.covariance
+    A = case.model.nominal.A
+    mean = case.model.nominal(case.belief.mean, case.input)
+    covariance = case.comparable(A @ S @ A.mT)
     expected = {"mean": mean, "covariance": covariance, "cross covariance": S @ A.mT}
     _check_parts(
         "on a linear model it is exact",
@@ -384,7 +388,8 @@ def _check_linear(case: _Case) -> None:
 
 def _check_derivatives(case: _Case) -> None:
     """All six of ``differentiate``, each along two directions."""
-    at, u = case.belief, case.input
+    at = case.belief
+    u = case.input
     moved, d = differentiate(case.propagator, case.model, at, u)
     require_close(
         "differentiate: the belief is propagate's",
@@ -393,10 +398,8 @@ def _check_derivatives(case: _Case) -> None:
         1e-9,
         "the mean",
     )
-    generator, start = (
-        torch.Generator().manual_seed(2),
-        {"mean": at.mean, "covariance": at.covariance, "input": u},
-    )
+    generator = torch.Generator().manual_seed(2)
+    start = {"mean": at.mean, "covariance": at.covariance, "input": u}
     for by, value in 2 * list(start.items()):
         direction = torch.randn(
             value.shape, generator=generator, dtype=torch.float64

@@ -35,7 +35,9 @@ def check_qp_solver(solver: QPSolver, tolerance: float = 1e-6) -> None:
     for known in (*_small(), *_constructed()):
         solution = _solve(solver, known.name, known.problem, None)
         _check(solution, known, tolerance)
-        first, n, right = solution.x.copy(), len(solution.x), solution.active_set
+        first = solution.x.copy()
+        n = len(solution.x)
+        right = solution.active_set
         solver.solve(QuadraticProgram(2.0 * np.eye(n), np.ones(n)))
         require(
             np.array_equal(first, solution.x),
@@ -78,20 +80,14 @@ def check_qp_solver(solver: QPSolver, tolerance: float = 1e-6) -> None:
 
 def _small() -> list[_Known]:
     """Problems that can be solved by hand; some have more active constraints than variables, or repeat rows."""
-    book, centre = (
-        "Nocedal and Wright, Numerical Optimization (2006), example",
-        np.array([3.0, -0.5, -7.0]),
-    )
-    P, G = (
-        [[6.0, 2.0, 1.0], [2.0, 5.0, 2.0], [1.0, 2.0, 4.0]],
-        [[1.0, 0.0, 1.0], [0.0, 1.0, 1.0]],
-    )
+    book = "Nocedal and Wright, Numerical Optimization (2006), example"
+    centre = np.array([3.0, -0.5, -7.0])
+    P = [[6.0, 2.0, 1.0], [2.0, 5.0, 2.0], [1.0, 2.0, 4.0]]
+    G = [[1.0, 0.0, 1.0], [0.0, 1.0, 1.0]]
     equalities = QuadraticProgram(P, [-8.0, -3.0, -3.0], G, [3.0, 0.0], [3.0, 0.0])
-    rows, lower, upper = (
-        [[-1.0, 2.0], [1.0, 2.0], [1.0, -2.0]],
-        [-_INF, -1e30, -_INF],
-        [2.0, 6.0, 2.0],
-    )
+    rows = [[-1.0, 2.0], [1.0, 2.0], [1.0, -2.0]]
+    lower = [-_INF, -1e30, -_INF]
+    upper = [2.0, 6.0, 2.0]
     inequalities = QuadraticProgram(
         2.0 * np.eye(2), [-2.0, -5.0], rows, lower, upper, lb=[0.0, 0.0]
     )
@@ -101,10 +97,8 @@ def _small() -> list[_Known]:
     redundant = QuadraticProgram(
         [[2.0]], [-4.0], [[1.0], [2.0]], [-_INF, -_INF], [1.5, 2.0]
     )
-    fan, apex = (
-        np.array([[np.cos(a), np.sin(a)] for a in np.linspace(0.1, 1.4, 7)]),
-        np.array([1.0, 2.0]),
-    )
+    fan = np.array([[np.cos(a), np.sin(a)] for a in np.linspace(0.1, 1.4, 7)])
+    apex = np.array([1.0, 2.0])
     lines = QuadraticProgram(
         np.diag([1.0, 3.0]), [-9.0, -20.0], fan, np.full(7, -_INF), fan @ apex
     )
@@ -165,21 +159,23 @@ def _constructed(count: int = 12) -> Iterator[_Known]:
     """Random problems built backwards from a chosen minimiser, active set and multipliers (which are then unique)."""
     rng = np.random.default_rng(2017)
     for number in range(count):
-        n, m = int(rng.integers(2, 25)), int(rng.integers(1, 30))
+        n = int(rng.integers(2, 25))
+        m = int(rng.integers(1, 30))
         root = rng.standard_normal((n, n))
-        P, G, x = (
-            root @ root.T + np.eye(n),
-            rng.standard_normal((m, n)),
-            rng.standard_normal(n),
-        )
+        P = root @ root.T + np.eye(n)
+        G = rng.standard_normal((m, n))
+        x = rng.standard_normal(n)
         C = np.vstack([np.eye(n), G])
         active = rng.choice(n + m, size=int(rng.integers(0, n)), replace=False)
         sides = rng.choice([-1.0, 1.0], size=len(active))
         multipliers = np.zeros(n + m)
         multipliers[active] = sides * rng.uniform(0.1, 10.0, size=len(active))
         below, above = rng.uniform(0.1, 2.0, (2, n + m))
-        below[active[sides < 0]], above[active[sides > 0]] = 0.0, 0.0
-        lower, upper, q = C @ x - below, C @ x + above, -P @ x - C.T @ multipliers
+        below[active[sides < 0]] = 0.0
+        above[active[sides > 0]] = 0.0
+        lower = C @ x - below
+        upper = C @ x + above
+        q = -P @ x - C.T @ multipliers
         problem = QuadraticProgram(P, q, G, lower[n:], upper[n:], lower[:n], upper[:n])
         yield _Known(
             f"constructed problem {number} (n = {n}, m = {m})", problem, x, multipliers
@@ -188,7 +184,9 @@ def _constructed(count: int = 12) -> Iterator[_Known]:
 
 def _infeasible() -> dict[str, QuadraticProgram]:
     """Problems that no point satisfies."""
-    eye, rows, sides = np.eye(2), [[1.0, 0.0], [0.0, 1.0], [1.0, 1.0]], [1.0, 1.0, 3.0]
+    eye = np.eye(2)
+    rows = [[1.0, 0.0], [0.0, 1.0], [1.0, 1.0]]
+    sides = [1.0, 1.0, 3.0]
     return {
         "two opposite rows": QuadraticProgram(
             eye, [0.0, 0.0], [[1.0, 1.0], [-1.0, -1.0]], [-_INF, -_INF], [1.0, -2.0]

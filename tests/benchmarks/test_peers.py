@@ -21,7 +21,8 @@ from gpmpc.qp import DualActiveSet, QuadraticProgram
 from gpmpc.status import Status
 from gpmpc.systems import System, Translational, step
 
-H, HOVER = 3, np.array([7.26, 0.0, 0.0])
+H = 3
+HOVER = np.array([7.26, 0.0, 0.0])
 PROBLEM = Problem(
     Tracking([1.0] * 6, [1.0] * 3),
     inputs=Box([7.2, -0.008, -0.008], [7.4, 0.008, 0.008]),
@@ -30,7 +31,8 @@ PROBLEM = Problem(
 
 @pytest.fixture(scope="module")
 def gp():
-    random, plant = np.random.default_rng(0), System(Translational(), 1.0, 1)
+    random = np.random.default_rng(0)
+    plant = System(Translational(), 1.0, 1)
     states = random.uniform(-1.5, 1.5, (30, 6))
     inputs = HOVER + random.uniform(-1.0, 1.0, (30, 3)) * [0.6, 0.1, 0.1]
     changes = (
@@ -38,7 +40,8 @@ def gp():
         - states
     )
     features = np.concatenate([states, inputs], axis=1)
-    scales, signal = np.tile(4.0 * features.std(0), (6, 1)), 10.0 * changes.var(0)
+    scales = np.tile(4.0 * features.std(0), (6, 1))
+    signal = 10.0 * changes.var(0)
     parts = map(torch.from_numpy, (features, changes, scales, signal, 1e-5 * signal))
     offset = torch.from_numpy(changes.mean(0))  # as a trained model has one
     return GPPosterior.from_hyperparameters(*parts, 3, "difference", offset)
@@ -60,7 +63,8 @@ def instances():
 
 def cost_of(gp, instance, plan):
     """By torch, from the posterior's predictions alone."""
-    x, total = instance.belief.mean, 0.0
+    x = instance.belief.mean
+    total = 0.0
     for u, target in zip(plan, torch.from_numpy(instance.targets), strict=True):
         x = gp.predict(x, u).mean
         total = total + (x - target).square().sum()
@@ -156,7 +160,8 @@ def test_all_contenders_that_are_here_agree(gp, instances, optimum):
         solve = make()
         first = solve(instances[0], None)
         assert (np.abs(first.inputs - optimum) <= accuracy).all(), name
-        warm, cold = solve(instances[1], first), solve(instances[1], None)
+        warm = solve(instances[1], first)
+        cold = solve(instances[1], None)
         for answer in (warm, cold):
             assert kkt_residual(gp, PROBLEM, instances[1], answer.inputs) < 1e-3, name
         assert (np.abs(warm.inputs - cold.inputs) <= accuracy).all(), name
@@ -166,10 +171,13 @@ def test_all_contenders_that_are_here_agree(gp, instances, optimum):
 def test_daqp_in_the_controller_decides_the_same(gp, instances):
     cases = one_program(gp, PROBLEM, H)
     for name in ("gpmpc, mean only", "gpmpc, zero order"):
-        first, second = cases[name](), cases[f"{name}, DAQP inside"]()
-        mine, other = None, None
+        first = cases[name]()
+        second = cases[f"{name}, DAQP inside"]()
+        mine = None
+        other = None
         for instance in [*instances, instances[0]]:
-            mine, other = first(instance, mine), second(instance, other)
+            mine = first(instance, mine)
+            other = second(instance, other)
             assert other.status is Status.SOLVED
             assert np.allclose(mine.inputs, other.inputs, rtol=0, atol=1e-7)
 

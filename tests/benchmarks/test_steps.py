@@ -24,11 +24,9 @@ from gpmpc.systems import step
 
 @pytest.mark.parametrize("n", [2, 6])
 def test_the_gps_of_the_pendulums_predict_them(n):
-    gp, plant, states = (
-        pendulum_gp(n, 300),
-        pendulum_plant(n),
-        pendulum_references(n, 30),
-    )
+    gp = pendulum_gp(n, 300)
+    plant = pendulum_plant(n)
+    states = pendulum_references(n, 30)
     predicted = gp.predict(
         torch.from_numpy(states), torch.zeros(30, n // 2, dtype=torch.float64)
     ).mean.numpy()
@@ -79,6 +77,7 @@ def test_a_step_starts_from_the_decision_before():
     controller = controllers(gp, 3)["zero order"]
     steps = record_steps(gp, controller, 4)
     stepping = WarmStarted(controller, steps)
-    first, second = stepping(), stepping()
+    first = stepping()
+    second = stepping()
     assert np.array_equal(first.inputs, controller.control(*steps[0], None).inputs)
     assert np.array_equal(second.inputs, controller.control(*steps[1], first).inputs)

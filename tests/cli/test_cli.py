@@ -130,7 +130,8 @@ def test_a_mistake_is_one_clear_line_and_leaves_nothing_behind(
     "arguments", [["tables", "draws=0"], ["run", "--help"], ["table"]], ids=" ".join
 )
 def test_a_copy_of_a_process_answers_as_the_command_does(arguments, tmp_path):
-    copy, command = forked(*arguments, cwd=tmp_path), gpmpc(*arguments, cwd=tmp_path)
+    copy = forked(*arguments, cwd=tmp_path)
+    command = gpmpc(*arguments, cwd=tmp_path)
     assert (copy.returncode, copy.stdout, copy.stderr) == (
         command.returncode,
         command.stdout,

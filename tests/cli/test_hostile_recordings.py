@@ -128,7 +128,8 @@ def run_of(found):
     class Run:
         path = Path("run.mcap")
         config = found if isinstance(found, str) else yaml.safe_dump(found)
-        state_names, input_names = runs.STATES, runs.INPUTS
+        state_names = runs.STATES
+        input_names = runs.INPUTS
 
     return Run
 
@@ -387,7 +388,8 @@ class Watch:
     """Notes, and stops, whatever a file may not lead to while it is read."""
 
     def __init__(self):
-        self.on, self.seen = False, []
+        self.on = False
+        self.seen = []
         sys.addaudithook(self)
 
     def __call__(self, event, given):
@@ -395,7 +397,8 @@ class Watch:
             return
         acts = event.startswith(ACTING)
         if event == "open":
-            mode, flags = given[1] or "", given[2] or 0
+            mode = given[1] or ""
+            flags = given[2] or 0
             acts = bool({*"wax+"} & {*str(mode)}) or bool(flags & WRITING)
         if acts:
             self.seen.append(f"{event} {given!r:.200}")
@@ -415,7 +418,8 @@ def read_hostile(folder, told):
     for road in (load_model, load_flyable):
         road(folder / "good.safetensors")
     calibrate(folder / "good.mcap")
-    watch, outcomes = Watch(), {}
+    watch = Watch()
+    outcomes = {}
     for path in sorted(folder.glob("hostile*")):
         roads = (calibrate,) if path.suffix == ".mcap" else (load_model, load_flyable)
         for road in roads:

@@ -220,7 +220,8 @@ def test_what_is_no_recording_is_refused_in_one_line_that_names_it(
     folder, tmp_path, monkeypatch
 ):
     (tmp_path / "run.mcap").write_bytes((folder / "run.mcap").read_bytes())
-    reasons, parser = foreign(tmp_path), COMMANDS["log"].parser("log")
+    reasons = foreign(tmp_path)
+    parser = COMMANDS["log"].parser("log")
     before = sorted(tmp_path.iterdir())
     monkeypatch.chdir(tmp_path)
     for name, reason in reasons.items():

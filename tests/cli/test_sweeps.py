@@ -70,7 +70,8 @@ def test_a_run_leaves_a_folder_that_says_everything(single):
 def test_the_recording_holds_the_flight_and_its_decisions(single):
     cwd, _ = single
     (path,) = (cwd / "tree").glob("*/run.mcap")
-    run, found = read_run(path), json.loads((path.parent / "metrics.json").read_text())
+    run = read_run(path)
+    found = json.loads((path.parent / "metrics.json").read_text())
     assert run.finished
     assert run.failed.tolist() == [False, False, True, False]
     assert np.isnan(run.measured[2]).all()

@@ -275,7 +275,8 @@ class Terminal:
 
     def type(self, text, until):
         os.write(self._fd, text.encode())
-        shown, deadline = "", time.monotonic() + 20
+        shown = ""
+        deadline = time.monotonic() + 20
         while until not in shown:
             assert time.monotonic() < deadline, (
                 f"{until!r} was not shown after {text!r}: {shown!r}"

@@ -18,7 +18,8 @@ INNER = Excitation(
     [1] * 6, [1] * 3, [0, 0, 0], dither=[0.05] * 3, noise=[1e-4, 1e-3] * 3
 )
 DATA = ExcitedData(OUTER, INNER, samples=60)
-POSITION, ATTITUDE = translational(), rotational(substeps=1)
+POSITION = translational()
+ATTITUDE = rotational(substeps=1)
 
 
 def by_input(plant, x, u):

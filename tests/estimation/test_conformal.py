@@ -10,14 +10,17 @@ from gpmpc.exceptions import DataError, SettingError, ShapeError
 from gpmpc.gaussian import Gaussian
 from gpmpc.propagation import Linearization
 
-H, F = 5, torch.float64
+H = 5
+F = torch.float64
 
 
 class Walk:
     """x+ = 0.9 x + u, with a noise that the model believes in."""
 
     state_dim = output_dim = 2
-    input_dim, dtype, device = 2, F, torch.device("cpu")
+    input_dim = 2
+    dtype = F
+    device = torch.device("cpu")
 
     def __init__(self, std):
         self.noise_covariance = std**2 * torch.eye(2, dtype=F)
@@ -29,13 +32,15 @@ class Walk:
 def log(steps, seed):
     """A plant with noise of heavy tails and a standard deviation of three, where the model says one."""
     rng = np.random.default_rng(seed)
-    x, u = [np.zeros(2)], rng.normal(size=(steps, 2))
+    x = [np.zeros(2)]
+    u = rng.normal(size=(steps, 2))
     for k in range(steps):
         x.append(0.9 * x[-1] + u[k] + 3 / np.sqrt(3) * rng.standard_t(3, size=2))
     return np.array(x), u
 
 
-MODEL, PROPAGATOR = Walk(1.0), Linearization(process_noise=True)
+MODEL = Walk(1.0)
+PROPAGATOR = Linearization(process_noise=True)
 
 
 def share_that_holds(kappas, seed, rows=None):
@@ -79,12 +84,15 @@ def test_too_few_windows_promise_nothing():
 
 @pytest.mark.parametrize("plant", ["noisy", "worse with time", "hostile"])
 def test_an_adaptive_tube_holds_in_the_long_run_whatever_the_plant_does(plant):
-    probability, rate, T = 0.9, 0.05, 1000
+    probability = 0.9
+    rate = 0.05
+    T = 1000
     scores = np.abs(np.random.default_rng(0).normal(size=(99, H)))
     tube = AdaptiveTube(
         ConformalTube(scores, [[1.0, 0.0]]), probability, rate, largest=10.0
     )
-    rng, covariances = np.random.default_rng(1), np.tile(np.eye(2), (H + 1, 1, 1))
+    rng = np.random.default_rng(1)
+    covariances = np.tile(np.eye(2), (H + 1, 1, 1))
     for t in range(T):
         size = {"noisy": 1.0, "worse with time": 1 + 2 * t / T, "hostile": 0.0}[plant]
         x = size * rng.normal(size=2)
@@ -108,7 +116,8 @@ def test_an_adaptive_tube_holds_in_the_long_run_whatever_the_plant_does(plant):
 def test_a_tube_that_aims_lower_keeps_the_upper_limit_of_its_violations_at_what_is_allowed(
     eta, size
 ):
-    T, rng = 3000, np.random.default_rng(0)
+    T = 3000
+    rng = np.random.default_rng(0)
     quantiles = norm.ppf(np.arange(1, 400) / 400)[
         :, None
     ]  # of a noise that the plant's is ``size`` times

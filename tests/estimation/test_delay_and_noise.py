@@ -20,13 +20,12 @@ def pendulum(x, u):
 
 def log(steps, delay, seed, feedback=0.0, std=(1e-3, 0.02), rho=0.0):
     """States and inputs of a flight; noise is an AR(1) process of these standard deviations."""
-    rng, whole = np.random.default_rng(seed), int(np.ceil(delay))
+    rng = np.random.default_rng(seed)
+    whole = int(np.ceil(delay))
     share = delay - (whole - 1)
-    states, inputs, noise = (
-        [np.array([0.3, 0.0])],
-        [np.zeros(1)] * (whole + 1),
-        np.zeros(2),
-    )
+    states = [np.array([0.3, 0.0])]
+    inputs = [np.zeros(1)] * (whole + 1)
+    noise = np.zeros(2)
     for _ in range(steps):
         inputs.append(rng.uniform(-1, 1, 1) - feedback * states[-1][1:])
         acting = (
@@ -83,8 +82,10 @@ def test_states_that_rest_or_repeat_others_change_no_delay():
 
 def feedback_alone(steps, delay, noise):
     """A log of a pendulum whose torque is a function of its state and nothing else."""
-    rng, gain = np.random.default_rng(0), np.array([[1.0, 0.3]])
-    states, inputs = [np.array([0.5, 0.0])], [np.zeros(1)] * (delay + 1)
+    rng = np.random.default_rng(0)
+    gain = np.array([[1.0, 0.3]])
+    states = [np.array([0.5, 0.0])]
+    inputs = [np.zeros(1)] * (delay + 1)
     for _ in range(steps):
         inputs.append(-gain @ states[-1])
         after = pendulum(states[-1], inputs[-1 - delay])
@@ -126,10 +127,8 @@ def test_a_little_excitation_beside_a_feedback_is_enough():
 
 
 def test_a_delay_is_found_where_the_angle_of_a_spinning_pendulum_wraps():
-    states, inputs = (
-        [np.array([3.0, 6.0])],
-        np.random.default_rng(1).normal(size=(300, 1)),
-    )
+    states = [np.array([3.0, 6.0])]
+    inputs = np.random.default_rng(1).normal(size=(300, 1))
     for k in range(300):
         states.append(pendulum(states[-1], 2 + inputs[max(k - 3, 0)]))
     wrapped = np.array(states)

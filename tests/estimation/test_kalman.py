@@ -27,19 +27,20 @@ from gpmpc.propagation import (
 )
 from gpmpc.testing import check_model
 
-F, STEP = torch.float64, 0.05
+F = torch.float64
+STEP = 0.05
 
 
 class Known:
     """A known function of state and input with process noise."""
 
-    input_dim, dtype, device = 1, F, torch.device("cpu")
+    input_dim = 1
+    dtype = F
+    device = torch.device("cpu")
 
     def __init__(self, function, noise):
-        self.function, self.noise_covariance = (
-            function,
-            torch.diag(torch.tensor(noise, dtype=F) ** 2),
-        )
+        self.function = function
+        self.noise_covariance = torch.diag(torch.tensor(noise, dtype=F) ** 2)
         self.state_dim = self.output_dim = len(noise)
 
     def predict(self, state, input):
@@ -47,10 +48,8 @@ class Known:
         return Gaussian(mean, mean.new_zeros(*mean.shape, len(self.noise_covariance)))
 
 
-A, B = (
-    torch.tensor([[1.0, 0.1], [-0.3, 0.9]], dtype=F),
-    torch.tensor([[0.0], [0.1]], dtype=F),
-)
+A = torch.tensor([[1.0, 0.1], [-0.3, 0.9]], dtype=F)
+B = torch.tensor([[0.0], [0.1]], dtype=F)
 LINEAR = Known(lambda x, u: x @ A.mT + u @ B.mT, [0.05, 0.1])
 
 
@@ -73,10 +72,8 @@ def simulated(model, steps, seed, measurement, prior=PRIOR):
             rng.multivariate_normal(np.zeros(len(covariance)), covariance.numpy())
         )
 
-    states, inputs = (
-        [prior.mean + noise(prior.covariance)],
-        torch.from_numpy(rng.normal(size=(steps, 1))),
-    )
+    states = [prior.mean + noise(prior.covariance)]
+    inputs = torch.from_numpy(rng.normal(size=(steps, 1)))
     for u in inputs:
         states.append(model.predict(states[-1], u).mean + noise(model.noise_covariance))
     x = torch.stack(states)
@@ -88,9 +85,12 @@ def simulated(model, steps, seed, measurement, prior=PRIOR):
 
 def conditioned(inputs, measured, H, R):
     """Means and covariances of all states of the linear model given all measurements, from their joint Gaussian."""
-    T, n = len(measured), 2
-    mean, covariance = torch.zeros(T, n, dtype=F), torch.zeros(T, n, T, n, dtype=F)
-    mean[0], covariance[0, :, 0] = PRIOR.mean, PRIOR.covariance
+    T = len(measured)
+    n = 2
+    mean = torch.zeros(T, n, dtype=F)
+    covariance = torch.zeros(T, n, T, n, dtype=F)
+    mean[0] = PRIOR.mean
+    covariance[0, :, 0] = PRIOR.covariance
     for k in range(1, T):
         mean[k] = A @ mean[k - 1] + B @ inputs[k - 1]
         for j in range(k):
@@ -99,9 +99,11 @@ def conditioned(inputs, measured, H, R):
         covariance[k, :, k] = (
             A @ covariance[k - 1, :, k - 1] @ A.mT + LINEAR.noise_covariance
         )
-    whole, big_H = covariance.reshape(T * n, T * n), torch.block_diag(*[H] * T)
+    whole = covariance.reshape(T * n, T * n)
+    big_H = torch.block_diag(*[H] * T)
     seen = torch.isfinite(measured.flatten())
-    big_H, y = big_H[seen], measured.flatten()[seen]
+    big_H = big_H[seen]
+    y = measured.flatten()[seen]
     S = big_H @ whole @ big_H.mT + torch.block_diag(*[R] * T)[seen][:, seen]
     gain = torch.linalg.solve(S, big_H @ whole).mT
     after = mean.flatten() + gain @ (y - big_H @ mean.flatten())
@@ -117,7 +119,9 @@ def test_filter_and_smoother_of_a_linear_system_are_the_conditional_gaussian_als
     both = Measurement.of_states(2, [0, 1], [0.1, 0.3])
     _, inputs, measured = simulated(LINEAR, 12, 0, both)
     measured[3] = torch.nan
-    measured[5, 0], measured[7, 1], measured[8, 0] = torch.nan, torch.nan, torch.inf
+    measured[5, 0] = torch.nan
+    measured[7, 1] = torch.nan
+    measured[8, 0] = torch.inf
     run = kind(LINEAR, both).run(PRIOR, inputs, measured)
     measured[8, 0] = torch.nan
     mean, covariance = conditioned(
@@ -161,7 +165,9 @@ def test_estimates_from_sine_and_cosine_of_an_angle_are_consistent(kind):
 
     sensor = Measurement(2, 0.05**2 * torch.eye(2, dtype=F), bearing)
     check_model(sensor)
-    filter, errors, covariances = kind(PENDULUM, sensor), [], []
+    filter = kind(PENDULUM, sensor)
+    errors = []
+    covariances = []
     for seed in range(12):
         x, inputs, measured = simulated(PENDULUM, 40, seed, sensor)
         measured[
@@ -239,7 +245,8 @@ def exact_update(P, H, R, mean, y):
         C = P @ h
         S = h @ C + r
         if S:
-            mean, P = mean + C * ((value - h @ mean) / S), P - np.outer(C, C) / S
+            mean = mean + C * ((value - h @ mean) / S)
+            P = P - np.outer(C, C) / S
     return mean.astype(float), P.astype(float)
 
 
@@ -278,7 +285,8 @@ def test_an_update_is_exact_however_wide_or_singular_the_prior_and_however_good_
     kind, name
 ):
     P, H, R = (np.asarray(part, dtype=float) for part in WIDE[name])
-    rng, n = np.random.default_rng(0), len(P)
+    rng = np.random.default_rng(0)
+    n = len(P)
     mean = rng.normal(size=n)
     y = H @ mean + rng.normal(size=len(H)) * np.sqrt(np.diag(H @ P @ H.T) + R)
     y = np.full_like(y, (H @ mean).mean()) if name == "certain" else y
@@ -327,8 +335,10 @@ def test_a_smoother_keeps_its_digits_where_the_prior_says_nothing():
 def test_two_good_sensors_that_contradict_each_other_move_other_states_little(
     variance,
 ):
-    P, H = random_covariance(5, 1.0), [[1, 2, 0.3, 0, 1], [1, 2, 0.3, 0, 1]]
-    rows, mean = torch.tensor(H, dtype=F), np.zeros(5)
+    P = random_covariance(5, 1.0)
+    H = [[1, 2, 0.3, 0, 1], [1, 2, 0.3, 0, 1]]
+    rows = torch.tensor(H, dtype=F)
+    mean = np.zeros(5)
     y = [1.0, 1.5]
     expected, covariance = exact_update(P, H, [variance] * 2, mean, y)
     sensor = Measurement(5, variance * torch.eye(2, dtype=F), lambda x: x @ rows.mT)
@@ -375,7 +385,8 @@ def test_a_disturbance_that_nobody_measures_is_estimated_through_a_delay():
     model = DelayedModel(disturbed, 2)
     sensor = Measurement.of_states(5, [0], [0.01])
     filter = KalmanFilter.extended(model, sensor)
-    x, queue = PRIOR.mean, torch.zeros(2, 1, dtype=F)
+    x = PRIOR.mean
+    queue = torch.zeros(2, 1, dtype=F)
     belief = model.augmented(disturbed.augmented(PRIOR, [1.0]), queue)
     for k in range(80):
         u = torch.sin(torch.tensor([0.3 * k], dtype=F))
@@ -388,10 +399,8 @@ def test_a_disturbance_that_nobody_measures_is_estimated_through_a_delay():
 
 
 def test_errors_that_are_too_large_or_too_small_for_their_covariance_are_inconsistent():
-    errors, P = (
-        torch.from_numpy(np.random.default_rng(0).normal(size=(200, 3))),
-        torch.eye(3).expand(200, 3, 3),
-    )
+    errors = torch.from_numpy(np.random.default_rng(0).normal(size=(200, 3)))
+    P = torch.eye(3).expand(200, 3, 3)
     assert normalized_errors(errors, P).consistent
     assert normalized_errors(errors, P / 1.5).mean == pytest.approx(
         1.5 * normalized_errors(errors, P).mean

@@ -20,7 +20,8 @@ B = np.array([[0.005], [0.1]])
 def motion(steps, process, sensors, seed=0):
     """States as they are seen (steps + 1, n), and inputs."""
     rng = np.random.default_rng(seed)
-    states, inputs = [rng.normal(0.0, 0.3, 2)], rng.uniform(-1, 1, (steps, 1))
+    states = [rng.normal(0.0, 0.3, 2)]
+    inputs = rng.uniform(-1, 1, (steps, 1))
     for u in inputs:
         after = A @ states[-1] + B @ u + 0.02 * np.sin(3 * states[-1])
         states.append(after + rng.normal(0.0, 1.0, 2) * process)
@@ -68,7 +69,8 @@ def test_the_model_predicts_the_same_with_the_noise_of_the_process():
         model, rows = learned(0.3 * sensors, sensors, kind)
         found = separate_noise(model, rows)
         at = torch.tensor([0.1, -0.2], dtype=torch.float64), torch.zeros(1).double()
-        before, after = model.predict(*at), found.model.predict(*at)
+        before = model.predict(*at)
+        after = found.model.predict(*at)
         assert torch.equal(before.mean, after.mean)
         assert torch.equal(before.covariance, after.covariance)
         noise = found.model.noise_covariance.diagonal()

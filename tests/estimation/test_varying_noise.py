@@ -26,7 +26,8 @@ def sigma(rates, varies):
 
 def log(steps, seed, varies):
     """A flight of a damped pendulum under random pushes, whose noise is in proportion to its rate."""
-    rng, states = np.random.default_rng(seed), [np.array([0.3, 0.0])]
+    rng = np.random.default_rng(seed)
+    states = [np.array([0.3, 0.0])]
     inputs = np.repeat(rng.uniform(-4, 4, (steps // 4 + 1, 1)), 4, axis=0)[:steps]
     for u in inputs:
         angle, rate = states[-1]

@@ -312,7 +312,8 @@ def test_the_nonlinear_controller_starts_from_the_references_own_inputs():
     from gpmpc.mpc.problem import Problem, Tracking
 
     rng = np.random.default_rng(0)
-    states, inputs = rng.normal(size=(40, 2)), rng.normal(size=(40, 1))
+    states = rng.normal(size=(40, 2))
+    inputs = rng.normal(size=(40, 1))
     after = states * 0.5 + inputs * [[1.0, 0.3]]
     import torch
 

@@ -50,7 +50,8 @@ def test_nobody_on_the_front_is_dominated_and_everybody_else_is(points):
 def test_where_more_time_has_to_buy_something_every_member_does_and_nobody_else(
     points, least
 ):
-    times, costs = [t for t, _ in points], [c for _, c in points]
+    times = [t for t, _ in points]
+    costs = [c for _, c in points]
     found = pareto_front(times, costs, least)
     front = sorted(
         {point for point, member in zip(points, found, strict=True) if member}
@@ -63,15 +64,14 @@ def test_where_more_time_has_to_buy_something_every_member_does_and_nobody_else(
 def test_the_cost_is_the_sum_of_what_every_step_pays(rng):
     roots = rng.normal(size=(6, 6)), rng.normal(size=(3, 3))
     weights = Problem(Tracking(*(root @ root.T + np.eye(len(root)) for root in roots)))
-    x, r, u, before = (
-        rng.normal(size=(8, 6)),
-        rng.normal(size=(8, 6)),
-        rng.normal(size=(7, 3)),
-        [1.0, -2.0, 0.5],
-    )
+    x = rng.normal(size=(8, 6))
+    r = rng.normal(size=(8, 6))
+    u = rng.normal(size=(7, 3))
+    before = [1.0, -2.0, 0.5]
     paid = 0.0
     for k in range(7):
-        e, v = x[k + 1] - r[k + 1], u[k] - (u[k - 1] if k else before)
+        e = x[k + 1] - r[k + 1]
+        v = u[k] - (u[k - 1] if k else before)
         paid += e @ weights.cost.Q @ e + v @ weights.cost.R @ v
     assert tracking_cost(
         weights.cost.Q, weights.cost.R, x, r, u, before

@@ -57,11 +57,9 @@ def test_a_controller_in_the_leagues_interface_plans_at_50_hz_and_drives_one_joi
     robot, joint
 ):
     who = pilot(true_model(robot), robot, horizon=25, programs=3, wild=False)
-    controller, rhs, x = (
-        league_controller(Interface, who),
-        right_hand_side(),
-        np.array([3.15, -0.02, 0.0, 0.1]),
-    )
+    controller = league_controller(Interface, who)
+    rhs = right_hand_side()
+    x = np.array([3.15, -0.02, 0.0, 0.1])
     torques = []
     for k in range(40):
         torques.append(controller.get_control_output(x, 0.002 * k))
@@ -96,16 +94,15 @@ def test_where_no_plan_leads_up_the_motor_brakes_its_joint_for_a_while_before_th
 
 
 def test_hanging_is_below_and_upright_above_the_line():
-    hanging, upright = state_of([0.0, 0.0, 1.0, 2.0]), state_of([np.pi, 0.0, 0.0, 0.0])
+    hanging = state_of([0.0, 0.0, 1.0, 2.0])
+    upright = state_of([np.pi, 0.0, 0.0, 0.0])
     assert np.array_equal(hanging, [-np.pi, 1.0, 0.0, 2.0])
     assert heights(np.array([hanging, upright])) == pytest.approx([-0.5, 0.5])
 
 
 def test_every_parameter_of_the_wrong_body_is_wrong_by_the_share_and_seeds_differ():
-    true, bodies = (
-        double_pendulum("elbow").dynamics,
-        [wrong_system("acrobot", 0.15, seed).dynamics for seed in (0, 1)],
-    )
+    true = double_pendulum("elbow").dynamics
+    bodies = [wrong_system("acrobot", 0.15, seed).dynamics for seed in (0, 1)]
     for body in bodies:
         for key in ("masses", "first_length", "centres", "inertias"):
             ratio = np.array(getattr(body, key)) / np.array(getattr(true, key))
@@ -114,7 +111,8 @@ def test_every_parameter_of_the_wrong_body_is_wrong_by_the_share_and_seeds_diffe
 
 
 def test_learned_from_are_calm_transitions_without_a_torque_on_the_passive_joint():
-    states, torques = np.zeros((101, 4)), np.zeros((100, 2))
+    states = np.zeros((101, 4))
+    torques = np.zeros((100, 2))
     torques[:, 1] = np.repeat([1.0, 2.5], 50)
     torques[80:, 0] = 1.0
     states[:20, 2] = 30.0
@@ -144,10 +142,8 @@ def test_a_body_fitted_to_five_seconds_of_random_torques_predicts_others_as_the_
 
 
 def test_a_residual_learned_from_random_torques_predicts_better_than_the_wrong_body():
-    nominal, data = (
-        casadi_model(wrong_system("pendubot", 0.15, 3)),
-        transitions(random_record("pendubot", 5.0, 0), "pendubot"),
-    )
+    nominal = casadi_model(wrong_system("pendubot", 0.15, 3))
+    data = transitions(random_record("pendubot", 5.0, 0), "pendubot")
     test = transitions(random_record("pendubot", 5.0, 1), "pendubot")
     model = learn(data, nominal, points=80)
     truth = true_model("pendubot").predict(test.states, test.inputs).mean
@@ -186,7 +182,8 @@ def test_the_board_is_sorted_and_says_what_share_of_draws_is_above_the_best():
 def test_what_was_learned_is_kept_in_a_file_and_not_learned_again_by_the_same_code(
     monkeypatch, tmp_path
 ):
-    data, learned = transitions(random_record("acrobot", 5.0, 0), "acrobot"), []
+    data = transitions(random_record("acrobot", 5.0, 0), "acrobot")
+    learned = []
 
     def learned_model(robot, kind, seed):
         learned.append(
@@ -229,10 +226,8 @@ folder.mkdir(parents=True)
 
 
 def test_the_leagues_script_flies_the_file_that_was_written(monkeypatch, tmp_path):
-    source, script = (
-        tmp_path / "src" / "python",
-        tmp_path / "leaderboard" / "pendubot" / "simulation_v3",
-    )
+    source = tmp_path / "src" / "python"
+    script = tmp_path / "leaderboard" / "pendubot" / "simulation_v3"
     (source / "double_pendulum" / "controller").mkdir(parents=True)
     (source / "double_pendulum" / "__init__.py").write_text("")
     (source / "double_pendulum" / "controller" / "abstract_controller.py").write_text(
@@ -266,7 +261,8 @@ def test_draws_that_were_played_are_read_and_not_played_again(monkeypatch, tmp_p
 
     def play(who, robot, seed):
         played.append(seed)
-        who.seconds, who.searched = [0.5, 0.002], [True, False]
+        who.seconds = [0.5, 0.002]
+        who.searched = [True, False]
         return Play(seed / 1000, np.zeros((1, 4)), np.zeros((0, 2)))
 
     monkeypatch.setattr(realaigym, "play", play)
@@ -344,12 +340,13 @@ def test_a_mistake_is_one_line_and_exit_code_2(arguments, message, monkeypatch, 
 
 def test_our_equations_are_those_of_the_leagues_simulator(rng):
     plants = pytest.importorskip("double_pendulum.model.plant")
-    plant, ours = (
-        plants.DoublePendulumPlant(model_pars=realaigym.league_parameters([6.0, 6.0])),
-        right_hand_side(),
+    plant = plants.DoublePendulumPlant(
+        model_pars=realaigym.league_parameters([6.0, 6.0])
     )
+    ours = right_hand_side()
     for _ in range(20):
-        x, torques = rng.normal(size=4) * [2.0, 2.0, 10.0, 10.0], rng.uniform(-6, 6, 2)
+        x = rng.normal(size=4) * [2.0, 2.0, 10.0, 10.0]
+        torques = rng.uniform(-6, 6, 2)
         assert np.allclose(
             ours(0.0, x, torques), plant.rhs(0.0, x, torques), rtol=1e-9, atol=1e-9
         )

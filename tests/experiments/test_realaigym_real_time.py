@@ -28,14 +28,18 @@ from gpmpc.systems import double_pendulum
 
 def leagues(robot, torque_of, count, delay=0, response=1.0, noise=0.0):
     """States (T + 1, 4) of the league's pendulum, hanging at first, and what was asked for (T, 2)."""
-    rhs, rng, last = right_hand_side(), np.random.default_rng(0), np.zeros(2)
-    states, asked = [np.zeros(4)], []
+    rhs = right_hand_side()
+    rng = np.random.default_rng(0)
+    last = np.zeros(2)
+    states = [np.zeros(4)]
+    asked = []
     for k in range(count):
         seen = states[max(0, k - delay)] + np.array(
             [0.0, 0.0, 1.0, 1.0]
         ) * noise * rng.normal(size=4)
         asked.append(torque_of(seen, k * INPUT))
-        last, x = np.clip(last + response * (asked[-1] - last), -6, 6), states[-1]
+        last = np.clip(last + response * (asked[-1] - last), -6, 6)
+        x = states[-1]
         for _ in range(2):  # the midpoint rule
             x = x + INPUT / 2 * rhs(0.0, x + INPUT / 4 * rhs(0.0, x, last), last)
         states.append(x)
@@ -87,7 +91,9 @@ def test_a_plan_acts_after_the_time_that_its_search_has_and_never_if_that_is_too
 
 
 def test_a_late_decision_leaves_the_last_plan_flying_until_it_is_known(monkeypatch):
-    who, decided = timed_pilot(monkeypatch, 0.01, 0.029), []  # 15 inputs
+    # 15 inputs
+    who = timed_pilot(monkeypatch, 0.01, 0.029)
+    decided = []
     for k in range(150):
         who.torques(np.array([np.pi + 0.01, 0.0, 0.0, 0.0]), INPUT * k)
         decided.append(len(who.seconds))
@@ -117,10 +123,8 @@ def test_all_starts_are_taken_for_a_plan_that_is_not_good_and_again_and_again_wi
 def test_rates_are_found_from_angles_whatever_the_noise_of_the_rates():
     record = random_record("acrobot", 2.0, 0)[0]
     states = np.array([state_of(x) for x in record.states])
-    rates, filter_ = (
-        np.random.default_rng(0).normal(0, 0.5, (len(states), 2)),
-        RateFilter(),
-    )
+    rates = np.random.default_rng(0).normal(0, 0.5, (len(states), 2))
+    filter_ = RateFilter()
     filter_.restart(states[0])
     noisy = states + rates @ np.array([[0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
     found = np.array([filter_(measured) for measured in noisy])

@@ -347,16 +347,12 @@ def test_our_rotational_flight_with_the_authors_yaw_residue_gives_the_papers_row
         def transitions(self, system, trajectory, name=""):
             ours = NMPC_DATA.transitions(system, Elliptical())
             theirs = PaperData(paper_data).transitions(system, trajectory, name)
-            states, inputs, moved = (
-                ours.states.clone(),
-                ours.inputs.clone(),
-                ours.next_states.clone(),
-            )
-            states[:, 4:], inputs[:, 2], moved[:, 4:] = (
-                theirs.states[:, 4:],
-                theirs.inputs[:, 2],
-                theirs.next_states[:, 4:],
-            )
+            states = ours.states.clone()
+            inputs = ours.inputs.clone()
+            moved = ours.next_states.clone()
+            states[:, 4:] = theirs.states[:, 4:]
+            inputs[:, 2] = theirs.inputs[:, 2]
+            moved[:, 4:] = theirs.next_states[:, 4:]
             return Transitions(states, inputs, moved)
 
     experiment = tables(
@@ -391,7 +387,8 @@ def test_the_measures_of_a_fit_are_those_of_its_predictions_in_the_units_of_the_
     )
     gp = train(cell.data, seed=full["seed"], penalty=SoftLimits(), restarts=0).posterior
     plain = gp.predict(cell.data.states, cell.data.inputs)
-    raw, factor = Wave().transitions(None, Hover()).next_states, cell.scaling.factor
+    raw = Wave().transitions(None, Hover()).next_states
+    factor = cell.scaling.factor
     predicted = torch.distributions.Normal(
         cell.scaling.restore(plain.mean),
         (plain.variance + gp.noise_variance).sqrt() * factor,
@@ -416,10 +413,8 @@ def test_the_measures_of_a_fit_are_those_of_its_predictions_in_the_units_of_the_
     assert full["largest_projection"] == pytest.approx(projected, abs=1e-12)
     small = [r for r in records if (r["subsystem"], r["size"]) == (subsystem, 5)]
     for record in small:  # 5 rows of 25 are not held out; of 6 states each
-        inside, held_out = (
-            150 * record["coverage_95"],
-            120 * record["held_out_coverage_95"],
-        )
+        inside = 150 * record["coverage_95"]
+        held_out = 120 * record["held_out_coverage_95"]
         assert held_out == pytest.approx(round(held_out))
         assert -1e-9 <= inside - held_out <= 30 + 1e-9
 

@@ -22,7 +22,8 @@ from gpmpc.gp import Transitions, load_posterior
 from gpmpc.models import load_model
 from tests.gp.small_models import SAVE, as_before, posterior, residual_model
 
-MEMORY, SECONDS = 300 * 2**20, 5.0
+MEMORY = 300 * 2**20
+SECONDS = 5.0
 
 
 def flipped(content, rng):
@@ -37,12 +38,14 @@ def cut(content, rng):
 
 
 def without_a_piece(content, rng):
-    start, length = rng.randrange(len(content)), rng.choice([1, 8, 100])
+    start = rng.randrange(len(content))
+    length = rng.choice([1, 8, 100])
     return content[:start] + content[start + length :]
 
 
 def overwritten(content, rng):
-    start, length = rng.randrange(len(content)), rng.choice([1, 4, 64])
+    start = rng.randrange(len(content))
+    length = rng.choice([1, 4, 64])
     return (
         content[:start]
         + rng.choice([bytes(length), b"\xff" * length, rng.randbytes(length)])
@@ -51,7 +54,8 @@ def overwritten(content, rng):
 
 
 def repeated(content, rng):
-    start, length = rng.randrange(len(content)), rng.choice([1, 30, 500])
+    start = rng.randrange(len(content))
+    length = rng.choice([1, 30, 500])
     return content[: start + length] + content[start:]
 
 
@@ -62,7 +66,8 @@ def rezipped(change):
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             members = {name: archive.read(name) for name in archive.namelist()}
         change(members, rng)
-        out, small = io.BytesIO(), sum(map(len, members.values())) < 2**24
+        out = io.BytesIO()
+        small = sum(map(len, members.values())) < 2**24
         with zipfile.ZipFile(
             out,
             "w",
@@ -233,7 +238,8 @@ def a_tensor_elsewhere(header, rng):
 
 @reheaded
 def tensors_swapped(header, rng):
-    one, other = a_tensor(header, rng), a_tensor(header, rng)
+    one = a_tensor(header, rng)
+    other = a_tensor(header, rng)
     one["data_offsets"], other["data_offsets"] = (
         other["data_offsets"],
         one["data_offsets"],
@@ -353,7 +359,9 @@ def main(kind, count, seed):
         "transitions": Transitions.load,
         "csv": from_csv,
     }[kind]
-    rng, said, slowest = random.Random(seed), Counter(), 0.0
+    rng = random.Random(seed)
+    said = Counter()
+    slowest = 0.0
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "file.npz"
         if kind == "csv":
@@ -366,7 +374,8 @@ def main(kind, count, seed):
         else:
             SAVE[type(made)](made, path)
         parts = ZIP if kind in ("transitions", "old") else SAFETENSORS
-        whole, same = path.read_bytes(), content(load(path))
+        whole = path.read_bytes()
+        same = content(load(path))
         before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
         size = (
             int(Path("/proc/self/statm").read_text().split()[0])

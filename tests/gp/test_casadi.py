@@ -26,14 +26,16 @@ CASES = {
 @pytest.mark.parametrize("make", CASES.values(), ids=CASES.keys())
 def test_values_and_jacobians_are_those_of_predict(make):
     model = make()
-    n, m = model.state_dim, model.input_dim
+    n = model.state_dim
+    m = model.input_dim
     function = casadi_function(model)
     assert (function.name(), function.name_in(), function.name_out()) == (
         "gp",
         ["state", "input"],
         ["mean", "variance"],
     )
-    x, u = casadi.MX.sym("x", n), casadi.MX.sym("u", m)
+    x = casadi.MX.sym("x", n)
+    u = casadi.MX.sym("u", m)
     mean, variance = function(x, u)
     q = casadi.vertcat(x, u)
     everything = casadi.Function(
@@ -42,7 +44,8 @@ def test_values_and_jacobians_are_those_of_predict(make):
         [mean, variance, casadi.jacobian(mean, q), casadi.jacobian(variance, q)],
     )
     for _ in range(5):
-        state, control = torch.randn(n), torch.randn(m)
+        state = torch.randn(n)
+        control = torch.randn(m)
         at, by_state, by_input = predict_with_jacobian(model, state, control)
         # The variance at a query that is one vector, whose derivatives torch can follow.
         spread = torch.autograd.functional.jacobian(
@@ -72,7 +75,8 @@ def test_an_ill_conditioned_model_loses_no_more_digits_than_torch():
         1,
     )
     assert float(torch.linalg.cond(gp.cholesky).max()) > 1e4
-    state, control = 0.3 * torch.ones(2), torch.zeros(1)
+    state = 0.3 * torch.ones(2)
+    control = torch.zeros(1)
     mean, variance = casadi_function(gp)(state.numpy(), control.numpy())
     at = gp.predict(state, control)
     assert np.abs(mean.full()[:, 0] - at.mean.numpy()).max() < 1e-8 * float(
@@ -114,8 +118,10 @@ def test_the_function_can_be_stored_expanded_and_compiled(tmp_path, monkeypatch)
 
 def test_ipopt_steers_through_the_model():
     gp = posterior(size=40, predicts="difference", n=1)
-    dynamics, horizon = casadi_function(gp), 4
-    x, u = casadi.MX.sym("x", 1, horizon), casadi.MX.sym("u", 1, horizon)
+    dynamics = casadi_function(gp)
+    horizon = 4
+    x = casadi.MX.sym("x", 1, horizon)
+    u = casadi.MX.sym("u", 1, horizon)
     start = 0.3
     before = casadi.horzcat(start, x[:, :-1])
     moved, variance = dynamics.map(horizon)(before, u)

@@ -111,10 +111,8 @@ def test_a_file_that_declares_more_than_it_can_hold_is_refused(tmp_path):
 
 
 def test_an_array_that_declares_more_than_it_holds_is_refused(tmp_path):
-    path, header = (
-        tmp_path / "data.npz",
-        "{'descr': '<f8', 'fortran_order': False, 'shape': (100000, 2), }",
-    )
+    path = tmp_path / "data.npz"
+    header = "{'descr': '<f8', 'fortran_order': False, 'shape': (100000, 2), }"
     with zipfile.ZipFile(path, "w") as archive:
         for name in arrays():
             archive.writestr(

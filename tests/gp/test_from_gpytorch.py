@@ -35,10 +35,8 @@ class Model(gpytorch.models.ExactGP):
     def __init__(self, x, y, kernel, mean=None, likelihood=None, batch=()):
         likelihood = likelihood or GaussianLikelihood(batch_shape=torch.Size(batch))
         super().__init__(x, y, likelihood)
-        self.mean_module, self.covar_module = (
-            mean or ZeroMean(batch_shape=torch.Size(batch)),
-            kernel,
-        )
+        self.mean_module = mean or ZeroMean(batch_shape=torch.Size(batch))
+        self.covar_module = kernel
 
     def forward(self, x):
         return gpytorch.distributions.MultivariateNormal(
@@ -179,7 +177,8 @@ def test_any_kernel_predicts_what_gpytorch_does(kind, size):
     step = 1e-5
     for d in range(3):
         shift = step * torch.eye(3)[d]
-        ahead, behind = query + shift, query - shift
+        ahead = query + shift
+        behind = query - shift
         slope = (
             gp.predict(ahead[:, :2], ahead[:, 2:]).mean
             - gp.predict(behind[:, :2], behind[:, 2:]).mean
@@ -199,7 +198,9 @@ def matern_dynamics(predicts="next_state", size=40):
 
 
 def test_leading_batch_dimensions_are_those_of_the_query():
-    gp, x, u = matern_dynamics(), torch.rand(2, 3, 2), torch.rand(2, 3, 1)
+    gp = matern_dynamics()
+    x = torch.rand(2, 3, 2)
+    u = torch.rand(2, 3, 1)
     whole = gp.predict(x, u)
     assert whole.covariance.shape == (2, 3, 2, 2)
     single = gp.predict(x[1, 2], u[1, 2])
@@ -210,8 +211,10 @@ def test_leading_batch_dimensions_are_those_of_the_query():
 
 
 def test_a_difference_model_adds_the_state():
-    x, u = torch.rand(4, 2), torch.rand(4, 1)
-    plain, difference = matern_dynamics(), matern_dynamics("difference")
+    x = torch.rand(4, 2)
+    u = torch.rand(4, 1)
+    plain = matern_dynamics()
+    difference = matern_dynamics("difference")
     assert torch.allclose(difference.predict(x, u).mean, plain.predict(x, u).mean + x)
     jacobians = [predict_with_jacobian(gp, x, u)[1] for gp in (plain, difference)]
     assert torch.allclose(jacobians[1] - jacobians[0], torch.eye(2).expand(4, 2, 2))
@@ -221,11 +224,9 @@ def test_a_difference_model_adds_the_state():
     "propagator", [MeanEquivalence(), Linearization(), Unscented(), MonteCarlo(500)]
 )
 def test_every_sampling_and_expanding_propagation_takes_any_kernel(propagator):
-    gp, at, control = (
-        matern_dynamics(),
-        Gaussian(torch.tensor([0.2, -0.4]), 0.01 * torch.eye(2)),
-        torch.rand(1),
-    )
+    gp = matern_dynamics()
+    at = Gaussian(torch.tensor([0.2, -0.4]), 0.01 * torch.eye(2))
+    control = torch.rand(1)
     sampled = MonteCarlo(20_000, seed=3)(gp, at, control)
     belief = propagator(gp, at, control)
     assert torch.allclose(belief.mean, sampled.mean, atol=0.05)
@@ -266,7 +267,8 @@ def test_a_frozen_model_knows_its_sizes_noise_and_type_and_can_be_moved():
     )
     assert gp.noise_covariance.shape == (2, 2)
     single = gp.to(dtype=torch.float32)
-    x, u = torch.rand(5, 2), torch.rand(5, 1)
+    x = torch.rand(5, 2)
+    u = torch.rand(5, 1)
     assert single.dtype == torch.float32
     assert torch.allclose(
         single.predict(x.float(), u.float()).mean.double(),
@@ -281,7 +283,8 @@ def test_a_frozen_model_knows_its_sizes_noise_and_type_and_can_be_moved():
 
 
 def test_what_happens_to_the_model_afterwards_does_not_reach_the_frozen_one():
-    model, query = one_output(20, ScaleKernel(MaternKernel())), torch.rand(4, 3)
+    model = one_output(20, ScaleKernel(MaternKernel()))
+    query = torch.rand(4, 3)
     gp = KernelPosterior.from_gpytorch(model, input_dim=0, predicts="value")
     before = gp.predict(query).mean
     shaken(model, seed=7)
@@ -427,15 +430,14 @@ class DeepKernel(gpytorch.models.ExactGP):
         self.covar_module = ScaleKernel(RBFKernel(ard_num_dims=2))
         layers = torch.nn.Linear(3, 5), torch.nn.Tanh(), torch.nn.Linear(5, 2)
         self.network = torch.nn.Sequential(*layers)
-        self.lower, self.upper = (
-            torch.full((2,), torch.inf),
-            torch.full((2,), -torch.inf),
-        )
+        self.lower = torch.full((2,), torch.inf)
+        self.upper = torch.full((2,), -torch.inf)
 
     def forward(self, x):
         seen = self.network(x)
         if self.training:  # as GPyTorch's ScaleToBounds
-            self.lower, self.upper = seen.amin(0).detach(), seen.amax(0).detach()
+            self.lower = seen.amin(0).detach()
+            self.upper = seen.amax(0).detach()
         seen = (seen - self.lower) / (self.upper - self.lower)
         return gpytorch.distributions.MultivariateNormal(
             self.mean_module(seen), self.covar_module(seen)
@@ -468,7 +470,8 @@ def test_a_forward_that_moves_all_points_alike_is_the_same_model():
 
 def test_a_prior_that_depends_on_the_points_beside_is_none():
     def ranged(model, x):
-        low, high = x.amin(-2, keepdim=True), x.amax(-2, keepdim=True)
+        low = x.amin(-2, keepdim=True)
+        high = x.amax(-2, keepdim=True)
         return its_prior(model, x, (x - low) / (high - low))
 
     model = with_forward(SE_ARD["single"](20), ranged)
@@ -487,7 +490,8 @@ def test_a_model_whose_parts_have_other_names_is_refused_by_what_is_missing():
 
 
 def test_a_model_that_has_predicted_is_frozen_as_before():
-    model, query = SE_ARD["batch"](20), data(4, seed=5)[0]
+    model = SE_ARD["batch"](20)
+    query = data(4, seed=5)[0]
     model(query.expand(2, -1, -1)).mean.sum()
     assert_equal(model, from_gpytorch)
 
@@ -514,7 +518,8 @@ def sgpr(size=120, points=12, outputs=2):
 
 @pytest.mark.parametrize(("corrected", "method"), [(False, "sgpr"), (True, "fitc")])
 def test_a_frozen_sparse_model_predicts_what_gpytorch_does(corrected, method):
-    model, query = sgpr(), data(7, seed=5)[0]
+    model = sgpr()
+    query = data(7, seed=5)[0]
     with gpytorch.settings.sgpr_diagonal_correction(corrected):
         mean, variance = theirs(model, query)
         gp = from_gpytorch(model, input_dim=1, predicts="value")
@@ -523,10 +528,8 @@ def test_a_frozen_sparse_model_predicts_what_gpytorch_does(corrected, method):
     if (
         method == "sgpr" and leaves_out
     ):  # GPyTorch leaves out what the inducing points do not explain: kxx - qxx
-        kernel, Z = (
-            model.covar_module.base_kernel,
-            model.covar_module.inducing_points.detach(),
-        )
+        kernel = model.covar_module.base_kernel
+        Z = model.covar_module.inducing_points.detach()
         with torch.no_grad():
             across = kernel(Z, query).to_dense()
             variance = variance + gp.signal_variance

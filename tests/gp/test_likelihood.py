@@ -46,7 +46,8 @@ def test_the_gradient_is_that_of_the_value():
 
 def test_the_value_is_minus_the_log_of_the_gaussian_density():
     x, y, theta = problem(15)
-    length, sf2 = np.exp(theta[0, :4]), np.exp(2 * theta[0, 4])
+    length = np.exp(theta[0, :4])
+    sf2 = np.exp(2 * theta[0, 4])
     squares = (((x[:, None] - x[None]) / length) ** 2).sum(-1)
     covariance = sf2 * np.exp(-squares / 2) + np.exp(
         2 * (theta[0, 4] - theta[0, 5])
@@ -71,10 +72,8 @@ def test_a_kernel_matrix_that_is_not_positive_definite_has_infinite_likelihood()
 @pytest.mark.parametrize("size", [1, 2, 255, 256, 257, 600])
 def test_the_likelihood_in_place_is_the_likelihood_call_after_call(size):
     x, y, theta = problem(size)
-    in_place, separate = (
-        NegativeLogMarginalLikelihood(x, y[:, 0], in_place=True),
-        NegativeLogMarginalLikelihood(x, y[:, 0], in_place=False),
-    )
+    in_place = NegativeLogMarginalLikelihood(x, y[:, 0], in_place=True)
+    separate = NegativeLogMarginalLikelihood(x, y[:, 0], in_place=False)
     for point in (theta[0], theta[1], theta[0]):
         (value, gradient), (expected, slopes) = in_place(point), separate(point)
         assert value == pytest.approx(expected, rel=1e-10, abs=1e-9)

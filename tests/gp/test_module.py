@@ -12,10 +12,8 @@ from tests.gp.small_models import posterior, residual_model
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
 def test_the_module_is_predict(predicts, dtype):
     gp = posterior(n=3, m=2, predicts=predicts).to(dtype=dtype)
-    state, control = (
-        torch.randn(4, 5, 3, dtype=dtype),
-        torch.randn(4, 5, 2, dtype=dtype),
-    )
+    state = torch.randn(4, 5, 3, dtype=dtype)
+    control = torch.randn(4, 5, 2, dtype=dtype)
     mean, variance = PosteriorModule(gp)(state, control)
     at = gp.predict(state, control)
     close = {"rtol": 0, "atol": 1e-12 if dtype == torch.float64 else 1e-4}
@@ -28,13 +26,15 @@ def test_an_exported_program_predicts_any_batch_after_a_round_trip_through_a_fil
     tmp_path,
 ):
     gp = posterior(m=1, predicts="difference")
-    example, batch = (torch.randn(3, 2), torch.randn(3, 1)), torch.export.Dim("batch")
+    example = (torch.randn(3, 2), torch.randn(3, 1))
+    batch = torch.export.Dim("batch")
     program = torch.export.export(
         PosteriorModule(gp), example, dynamic_shapes=({0: batch}, {0: batch})
     )
     torch.export.save(program, tmp_path / "gp.pt2")
     exported = torch.export.load(tmp_path / "gp.pt2").module()
-    state, control = torch.randn(7, 2), torch.randn(7, 1)
+    state = torch.randn(7, 2)
+    control = torch.randn(7, 1)
     mean, variance = exported(state, control)
     at = gp.predict(state, control)
     assert torch.allclose(mean, at.mean, rtol=0, atol=1e-12)

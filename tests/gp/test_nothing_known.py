@@ -95,7 +95,8 @@ def test_away_from_an_input_that_never_moved_nothing_is_known_and_it_is_named(
 def test_a_model_of_hover_data_is_not_wrong_by_more_than_it_says():
     rng = np.random.default_rng(1)
     gp = train(hover(), restarts=0).posterior
-    x, u = rng.uniform(-1.5, 1.5, (200, 2)), rng.uniform(-1, 1, (200, 2))
+    x = rng.uniform(-1.5, 1.5, (200, 2))
+    u = rng.uniform(-1, 1, (200, 2))
     belief = gp.predict(torch.tensor(x), torch.tensor(u))
     error = torch.tensor(plant(x, u)) - belief.mean
     inside = error.abs() < 2 * (belief.variance + gp.noise_variance).sqrt()
@@ -105,7 +106,8 @@ def test_a_model_of_hover_data_is_not_wrong_by_more_than_it_says():
 @pytest.mark.parametrize("value", [0.0, 2.0, -7.5, 293.15, 1e5])
 def test_a_state_at_a_set_point_is_unknown_elsewhere_whatever_its_value(value, caplog):
     data = hover()
-    states, next_states = data.states.clone(), data.next_states.clone()
+    states = data.states.clone()
+    next_states = data.next_states.clone()
     states[:, 0] = next_states[:, 0] = value
     gp = train(Transitions(states, data.inputs, next_states), restarts=0).posterior
     assert (deviations(gp, [value, 0.1], [0.1, REST]) < 0.1).all()
@@ -160,7 +162,8 @@ ONE_ROW = {
 def test_one_row_knows_little_beside_itself_and_says_so_once(name, caplog):
     data = hover(rows=1)
     gp = ONE_ROW[name](data).posterior
-    at, control = data.states[0].tolist(), data.inputs[0].tolist()
+    at = data.states[0].tolist()
+    control = data.inputs[0].tolist()
     assert (
         gp.predict(data.states, data.inputs).mean - data.next_states
     ).abs().max() < 0.1
@@ -318,7 +321,8 @@ def test_what_moves_outside_the_subset_of_a_sparse_training_is_learned(caplog):
     second = np.sin(2e6 * x[:, 1])
     values = np.column_stack([np.sin(2 * x[:, 0]) + second, second])
     trainer = SparseTrainer(inducing=40, subset=40, restarts=0, iterations=40)
-    features, targets = torch.from_numpy(x), torch.from_numpy(values)
+    features = torch.from_numpy(x)
+    targets = torch.from_numpy(values)
     gp = trainer.fit(features, targets, 0, "value", seed=0).posterior
     error = (gp.predict(features).mean - targets).square().mean(0).sqrt()
     assert (error < 0.05).all()
@@ -329,11 +333,13 @@ def test_a_refit_learns_what_moves_by_now():
     first = Trainer(restarts=0)(hover()).posterior
     ignored = Trainer(restarts=0, prior_lengthscale="no_effect")(hover()).posterior
     rng = np.random.default_rng(2)
-    x, u = rng.uniform(-2, 2, (60, 2)), rng.uniform(-1, 1, (60, 2))
+    x = rng.uniform(-2, 2, (60, 2))
+    u = rng.uniform(-1, 1, (60, 2))
     moving = Transitions(x, u, plant(x, u))
     for posterior in (first, ignored):
         gp = Trainer(restarts=0).refit(posterior, moving).posterior
-        x, u = rng.uniform(-1, 1, (100, 2)), rng.uniform(-1, 1, (100, 2))
+        x = rng.uniform(-1, 1, (100, 2))
+        u = rng.uniform(-1, 1, (100, 2))
         error = gp.predict(torch.tensor(x), torch.tensor(u)).mean.numpy() - plant(x, u)
         assert np.sqrt((error**2).mean()) < 0.03
 
@@ -349,12 +355,14 @@ def test_an_output_that_changes_by_now_is_learned_by_a_refit():
 
 def test_appended_points_are_known_where_the_column_was_at_rest():
     gp = Trainer(restarts=0)(hover()).posterior
-    x, u = np.array([[0.3, 0.2]]), np.array([[0.1, REST + 2.0]])
+    x = np.array([[0.3, 0.2]])
+    u = np.array([[0.1, REST + 2.0]])
     assert (deviations(gp, [0.3, 0.2], [0.1, REST + 2.0]) > 0.9).all()
     larger = append_transitions(gp, Transitions(x, u, plant(x, u)))
     assert (deviations(larger, [0.3, 0.2], [0.1, REST + 2.0]) < 0.1).all()
     single = larger.to(dtype=torch.float32)
-    x, u = torch.tensor([0.3, 0.2]), torch.tensor([0.1, REST + 4.0])
+    x = torch.tensor([0.3, 0.2])
+    u = torch.tensor([0.1, REST + 4.0])
     far = single.predict(x.float(), u.float()).variance / single.signal_variance
     assert (far > 0.8).all()
 
@@ -362,8 +370,11 @@ def test_appended_points_are_known_where_the_column_was_at_rest():
 @pytest.mark.parametrize("predicts", ["next_state", "difference"])
 def test_what_was_at_rest_is_learned_while_flying(predicts):
     gp = Trainer(restarts=0, predicts=predicts)(hover(rows=80)).posterior
-    rng, learning = np.random.default_rng(5), OnlineLearning()
-    state, alone, changed = np.array([0.5, 0.0]), [], []
+    rng = np.random.default_rng(5)
+    learning = OnlineLearning()
+    state = np.array([0.5, 0.0])
+    alone = []
+    changed = []
     learned = Learned(
         ChangedModel(gp, learning), state, np.full(2, np.nan), np.empty(0), np.empty(0)
     )
@@ -386,7 +397,8 @@ def test_what_was_at_rest_is_learned_while_flying(predicts):
         for model in (learned.model, gp)
     )
     assert (here < 0.1 * there).all()
-    point, u = torch.from_numpy(state), torch.from_numpy(control)
+    point = torch.from_numpy(state)
+    u = torch.from_numpy(control)
     assert np.allclose(learned.model.predict(point, u).variance.numpy(), here)
 
 
@@ -397,7 +409,10 @@ def test_a_plan_that_moves_what_never_moved_is_new_and_outside_its_data():
     )
     gp = Trainer(restarts=0, predicts="difference")(hover(rows=80)).posterior
     controller = GPMPC(gp, Linearization(), problem, 10, [0.0, REST])
-    state, decision, novelties, missed = np.array([1.0, 0.0]), None, [], []
+    state = np.array([1.0, 0.0])
+    decision = None
+    novelties = []
+    missed = []
     for _ in range(20):
         belief = Gaussian(torch.tensor(state), 1e-8 * torch.eye(2))
         decision = controller.control(belief, Reference(np.zeros((11, 2))), decision)
@@ -416,7 +431,8 @@ def test_a_plan_that_moves_what_never_moved_is_new_and_outside_its_data():
 def flight(rows=50, seed=0):
     """A recording: states (rows + 1, 2) and inputs (rows, 2)."""
     rng = np.random.default_rng(seed)
-    states, inputs = [rng.uniform(-1, 1, 2)], rng.uniform(-1, 1, (rows, 2))
+    states = [rng.uniform(-1, 1, 2)]
+    inputs = rng.uniform(-1, 1, (rows, 2))
     for control in inputs:
         states.append(plant(states[-1][None], control[None])[0])
     return np.array(states), inputs
@@ -455,13 +471,15 @@ def test_copies_of_few_rows_are_said_once_with_the_rule(name, caplog):
 def log_at_rest():
     """Most of a recording whose sensors are quantised stands still."""
     x, u = flight(40)
-    x, u = np.vstack([x, np.tile(x[-1], (100, 1))]), np.vstack([u, np.zeros((100, 2))])
+    x = np.vstack([x, np.tile(x[-1], (100, 1))])
+    u = np.vstack([u, np.zeros((100, 2))])
     return Transitions(x[:-1], u, x[1:])
 
 
 def log_with_a_state_that_stays():
     x, u = flight()
-    before, after = x[:-1].copy(), x[1:].copy()
+    before = x[:-1].copy()
+    after = x[1:].copy()
     before[:, 1] = after[:, 1] = np.repeat([1.0, 2.0], 25)
     return Transitions(before, u, after)
 

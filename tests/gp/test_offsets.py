@@ -64,10 +64,8 @@ TRAINERS = {
 
 
 def assert_same_training(trainer, x, y, by, targets_by=0.0):
-    here, there = (
-        trainer.fit(x, y, 1, "value"),
-        trainer.fit(x + by, y + targets_by, 1, "value"),
-    )
+    here = trainer.fit(x, y, 1, "value")
+    there = trainer.fit(x + by, y + targets_by, 1, "value")
     assert np.abs(here.objective - there.objective).max() < 0.01
     at = on_grid(data(20, seed=1)[0])
     (ours, *slopes), (theirs, *their_slopes) = (
@@ -187,10 +185,8 @@ def everything(gp, by):
 @pytest.mark.parametrize("sparse", [False, True], ids=["exact", "sparse"])
 def test_predictions_and_exports_are_those_of_the_shifted_model(by, choice, sparse):
     with backend(choice):
-        here, there = (
-            everything(posterior(sparse=sparse), 0.0),
-            everything(posterior(by, sparse=sparse), by),
-        )
+        here = everything(posterior(sparse=sparse), 0.0)
+        there = everything(posterior(by, sparse=sparse), by)
     for ours, theirs in zip(here, there, strict=True):
         assert torch.allclose(ours, theirs, rtol=1e-7, atol=1e-8 if sparse else 1e-10)
 
@@ -239,18 +235,14 @@ def test_propagations_are_those_of_the_shifted_model(propagator, atol, choice):
 
 @pytest.mark.parametrize("predicts", ["next_state", "difference"])
 def test_the_local_model_of_a_shifted_state_is_shifted(predicts):
-    by, covariance = (
-        torch.tensor([1e8, -3e6, 1e7]),
-        torch.tensor([[0.09, 0.02], [0.02, 0.04]]),
-    )
+    by = torch.tensor([1e8, -3e6, 1e7])
+    covariance = torch.tensor([[0.09, 0.02], [0.02, 0.04]])
     targets_by = by[:2] if predicts == "next_state" else 0.0
     said = []
     for shift, of_targets in ((torch.zeros(3), 0.0), (by, targets_by)):
         x, u = query(shift)
-        gp, belief = (
-            posterior(shift, of_targets, predicts=predicts),
-            Gaussian(x[0], covariance),
-        )
+        gp = posterior(shift, of_targets, predicts=predicts)
+        belief = Gaussian(x[0], covariance)
         moved = MomentMatching()(gp, belief, u[0])
         local = linearize(MomentMatching(), gp, belief, u[0])
         said.append([moved.mean - shift[:2], moved.covariance, local.A, local.B])

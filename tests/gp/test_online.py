@@ -29,7 +29,8 @@ def transitions(rows, n=3, m=2, seed=0):
 
 
 def posterior(data, noise=1e-3, predicts="next_state", offset=None):
-    n, d = data.state_dim, data.features.shape[1]
+    n = data.state_dim
+    d = data.features.shape[1]
     targets = (
         data.next_states - data.states if predicts == "difference" else data.next_states
     )
@@ -59,8 +60,10 @@ def fresh(gp):
 
 
 def assert_equal(one, other, tolerance=1e-9):
-    query, control = torch.linspace(-2, 2, 12).reshape(4, 3), torch.zeros(4, 2)
-    ours, theirs = one.predict(query, control), other.predict(query, control)
+    query = torch.linspace(-2, 2, 12).reshape(4, 3)
+    control = torch.zeros(4, 2)
+    ours = one.predict(query, control)
+    theirs = other.predict(query, control)
     assert torch.equal(one.features, other.features)
     assert torch.equal(one.targets, other.targets)
     assert torch.allclose(one.cholesky, other.cholesky, rtol=0, atol=tolerance)
@@ -77,7 +80,8 @@ def assert_equal(one, other, tolerance=1e-9):
 @pytest.mark.parametrize("predicts", ["next_state", "difference"])
 @pytest.mark.parametrize("new", [1, 7])
 def test_conditioning_is_the_posterior_of_all_points(predicts, new):
-    data, offset = transitions(40 + new), torch.tensor([0.3, -1.0, 0.0])
+    data = transitions(40 + new)
+    offset = torch.tensor([0.3, -1.0, 0.0])
     grown = append_transitions(
         posterior(data[:40], predicts=predicts, offset=offset), data[40:]
     )
@@ -115,7 +119,8 @@ def test_dropping_nothing_changes_nothing():
 @pytest.mark.parametrize("noise", [1e-6, 1e-2])
 def test_hundreds_of_random_changes_leave_no_error_behind(noise, rng):
     data = transitions(900)
-    gp, seen = posterior(data[:60], noise), 60
+    gp = posterior(data[:60], noise)
+    seen = 60
     for _ in range(250):
         new = int(rng.integers(1, 4))
         gp = remove_points(
@@ -129,7 +134,8 @@ def test_hundreds_of_random_changes_leave_no_error_behind(noise, rng):
 
 def test_the_old_posterior_is_as_it_was():
     data = transitions(30)
-    gp, same = posterior(data[:25]), posterior(data[:25])
+    gp = posterior(data[:25])
+    same = posterior(data[:25])
     append_transitions(gp, data[25:])
     remove_points(gp, [0, 12])
     assert_equal(gp, same, 0)
@@ -147,12 +153,11 @@ def test_points_that_are_there_already_do_no_harm(noise):
 
 def test_what_was_told_is_believed_and_what_was_forgotten_is_not():
     data = transitions(60)
-    gp, new = posterior(data[:50], 1e-6), data[50:51]
+    gp = posterior(data[:50], 1e-6)
+    new = data[50:51]
     grown = append_transitions(gp, new)
-    before, after = (
-        gp.predict(new.states, new.inputs),
-        grown.predict(new.states, new.inputs),
-    )
+    before = gp.predict(new.states, new.inputs)
+    after = grown.predict(new.states, new.inputs)
     assert (after.variance < before.variance).all()
     assert torch.allclose(after.mean, new.next_states, atol=1e-2)
     assert_equal(remove_points(grown, 50), gp)
@@ -166,7 +171,8 @@ def test_single_precision_posteriors_can_be_updated_too():
         ),
         [0],
     )
-    query, control = data.states, data.inputs
+    query = data.states
+    control = data.inputs
     assert gp.dtype == torch.float32
     assert gp.has_observation_noise
     exact = posterior(data[1:], 1e-2).predict(query, control).mean

@@ -27,7 +27,8 @@ def posterior(size=30, n=2, m=1, predicts="next_state", seed=0):
 def test_predictions_are_gpytorchs_at_every_size(size):
     gp = posterior(size, n=3, m=2)
     model = to_gpytorch(gp)
-    states, inputs = torch.rand(6, 3), torch.rand(6, 2)
+    states = torch.rand(6, 3)
+    inputs = torch.rand(6, 2)
     with (
         exact_inference(),
         torch.no_grad(),
@@ -40,8 +41,10 @@ def test_predictions_are_gpytorchs_at_every_size(size):
 
 
 def test_a_difference_model_adds_the_state():
-    state, control = torch.rand(4, 2), torch.rand(4, 1)
-    next_state, difference = posterior(), posterior(predicts="difference")
+    state = torch.rand(4, 2)
+    control = torch.rand(4, 1)
+    next_state = posterior()
+    difference = posterior(predicts="difference")
     assert torch.allclose(
         difference.predict(state, control).mean,
         next_state.predict(state, control).mean + state,
@@ -49,7 +52,9 @@ def test_a_difference_model_adds_the_state():
 
 
 def test_batches_and_transforms_agree_with_single_predictions():
-    gp, states, inputs = posterior(), torch.rand(3, 5, 2), torch.rand(3, 5, 1)
+    gp = posterior()
+    states = torch.rand(3, 5, 2)
+    inputs = torch.rand(3, 5, 1)
     batch = gp.predict(states, inputs)
     single = gp.predict(states[1, 2], inputs[1, 2])
     assert torch.allclose(batch.mean[1, 2], single.mean, atol=1e-14)
@@ -156,7 +161,9 @@ def test_data_that_cannot_be_learned_from_are_refused_with_the_rule(
 
 @pytest.mark.parametrize("predicts", ["next_state", "difference"])
 def test_the_jacobian_of_the_mean_is_that_of_autograd(predicts):
-    gp, state, control = posterior(predicts=predicts), torch.rand(2), torch.rand(1)
+    gp = posterior(predicts=predicts)
+    state = torch.rand(2)
+    control = torch.rand(1)
     belief, by_state, by_input = gp.predict_with_jacobian(state, control)
     reference = torch.func.jacrev(lambda x, u: gp.predict(x, u).mean, argnums=(0, 1))(
         state, control
@@ -170,12 +177,11 @@ def test_a_posterior_of_scaled_data_speaks_physical_units_after_unscaling():
     gp = posterior()
     features = Scaling(torch.tensor([1.0, -3.0, 10.0]), torch.tensor([2.0, 0.1, 50.0]))
     targets = Scaling(torch.tensor([5.0, -7.0]), torch.tensor([100.0, 0.01]))
-    physical, scaled = gp.unscaled(features, targets), torch.rand(6, 3)
+    physical = gp.unscaled(features, targets)
+    scaled = torch.rand(6, 3)
     query = features.restore(scaled)
-    ours, theirs = (
-        physical.predict(query[:, :2], query[:, 2:]),
-        gp.predict(scaled[:, :2], scaled[:, 2:]),
-    )
+    ours = physical.predict(query[:, :2], query[:, 2:])
+    theirs = gp.predict(scaled[:, :2], scaled[:, 2:])
     assert torch.allclose(ours.mean, targets.restore(theirs.mean), rtol=1e-12)
     assert torch.allclose(
         ours.variance, theirs.variance * targets.factor**2, rtol=1e-10
@@ -195,7 +201,8 @@ def test_a_posterior_of_scaled_data_speaks_physical_units_after_unscaling():
 
 
 def test_a_value_model_may_have_any_number_of_outputs():
-    inputs, targets = torch.rand(12, 4), torch.rand(12, 1)
+    inputs = torch.rand(12, 4)
+    targets = torch.rand(12, 1)
     settings = (torch.ones(1, 4), torch.ones(1), torch.full((1,), 1e-4))
     gp = GPPosterior.from_hyperparameters(
         inputs, targets, *settings, input_dim=1, predicts="value"
@@ -211,7 +218,9 @@ def test_a_value_model_may_have_any_number_of_outputs():
 
 
 def test_a_posterior_in_single_precision_predicts_nearly_the_same():
-    gp, state, control = posterior(), torch.rand(4, 2), torch.rand(4, 1)
+    gp = posterior()
+    state = torch.rand(4, 2)
+    control = torch.rand(4, 1)
     single = gp.to(dtype=torch.float32)
     assert (single.dtype, single.precision.dtype, gp.dtype) == (
         torch.float32,

@@ -17,10 +17,8 @@ from tests.gp.small_models import residual_model
 
 def transitions(rows, seed=0):
     generator = torch.Generator().manual_seed(seed)
-    x, u = (
-        4 * torch.rand(rows, 2, generator=generator) - 2,
-        torch.rand(rows, 1, generator=generator),
-    )
+    x = 4 * torch.rand(rows, 2, generator=generator) - 2
+    u = torch.rand(rows, 1, generator=generator)
     moved = torch.stack(
         [torch.sin(2 * x[:, 0]) + u[:, 0], 100 * torch.cos(x[:, 1])], dim=1
     )
@@ -81,7 +79,8 @@ def test_the_information_of_a_point_is_the_divergence_of_the_posteriors_with_and
 
 def test_points_are_chosen_one_after_the_other_as_if_each_was_dropped():
     gp = posterior(transitions(25))
-    left, names = gp, list(range(25))
+    left = gp
+    names = list(range(25))
     for chosen in least_informative(gp, 12):
         position = int(information(left).argmin())
         assert names.pop(position) == chosen
@@ -97,11 +96,9 @@ def test_of_two_equal_points_one_is_the_first_to_go():
 
 @pytest.mark.parametrize("rule", ["oldest", "least_informative"])
 def test_a_window_is_held_and_what_just_came_stays(rule):
-    data, gp, window = (
-        transitions(60),
-        posterior(transitions(60)[:20]),
-        SlidingWindow(30, rule),
-    )
+    data = transitions(60)
+    gp = posterior(transitions(60)[:20])
+    window = SlidingWindow(30, rule)
     for first in range(20, 60, 4):
         new = data[first : first + 4]
         gp = window(gp, new)
@@ -119,10 +116,12 @@ def test_the_oldest_points_go_first():
 
 
 def test_least_informative_points_are_a_better_loss_than_the_oldest():
-    data, held_out = transitions(150), transitions(200, seed=1)
+    data = transitions(150)
+    held_out = transitions(200, seed=1)
     errors = {}
     for rule in ("oldest", "least_informative"):
-        gp, window = posterior(data[:40]), SlidingWindow(40, rule)
+        gp = posterior(data[:40])
+        window = SlidingWindow(40, rule)
         for i in range(40, 150):
             gp = window(gp, data[i : i + 1])
         off = gp.predict(held_out.states, held_out.inputs).mean - held_out.next_states

@@ -45,7 +45,8 @@ def problem(rows=150, noise=1e-2, seed=0, spread=1.0):
 
 def textbook(Z, x, y, query, method, lengthscales, signal_variance, noise_variance):
     """Mean and variance from the formulas with their inverses (Quinonero-Candela and Rasmussen, 2005, section 5)."""
-    means, variances = [], []
+    means = []
+    variances = []
     for a in range(len(lengthscales)):
 
         def k(p, q, a=a):
@@ -93,7 +94,8 @@ def test_the_frozen_posterior_has_the_textbooks_mean_and_variance(method, noise)
 @pytest.mark.parametrize("method", ["sgpr", "fitc"])
 def test_with_every_point_as_inducing_point_it_is_the_exact_gp(method):
     x, y, settings = problem(60)
-    offset, query = torch.tensor([0.5, -1.0]), problem(40, seed=1)[0]
+    offset = torch.tensor([0.5, -1.0])
+    query = problem(40, seed=1)[0]
     more = settings | {"input_dim": 1, "predicts": "value", "offset": offset}
     exact = GPPosterior.from_hyperparameters(x, y, **more).predict(
         query[:, :2], query[:, 2:]
@@ -226,21 +228,18 @@ def test_a_frozen_sparse_model_is_conditioned_and_moment_matched_like_any_other(
         grown.predict(new.states, new.inputs).variance
         < gp.predict(new.states, new.inputs).variance
     ).all()
-    back, query = remove_points(grown, [40, 41, 42]), torch.rand(5, 2)
+    back = remove_points(grown, [40, 41, 42])
+    query = torch.rand(5, 2)
     assert torch.allclose(
         back.predict(query, query[:, :1]).mean,
         gp.predict(query, query[:, :1]).mean,
         atol=1e-8,
     )
     assert len(SlidingWindow(40, "least_informative")(gp, new)) == 40
-    at, control = (
-        Gaussian(torch.tensor([0.3, -0.2]), 0.05 * torch.eye(2)),
-        torch.zeros(1),
-    )
-    matched, sampled = (
-        MomentMatching()(gp, at, control),
-        MonteCarlo(20_000)(gp, at, control),
-    )
+    at = Gaussian(torch.tensor([0.3, -0.2]), 0.05 * torch.eye(2))
+    control = torch.zeros(1)
+    matched = MomentMatching()(gp, at, control)
+    sampled = MonteCarlo(20_000)(gp, at, control)
     error = (sampled.covariance.diagonal() / 20_000).sqrt()
     assert ((matched.mean - sampled.mean).abs() < 5 * error).all()
     assert torch.allclose(matched.covariance, sampled.covariance, atol=0.03)
@@ -270,10 +269,8 @@ def test_informative_points_differ_and_stop_where_nothing_is_left():
 
 def transitions(rows, noise=1e-2, seed=0):
     generator = torch.Generator().manual_seed(seed)
-    x, u = (
-        4 * torch.rand(rows, 2, generator=generator) - 2,
-        2 * torch.rand(rows, 1, generator=generator) - 1,
-    )
+    x = 4 * torch.rand(rows, 2, generator=generator) - 2
+    u = 2 * torch.rand(rows, 1, generator=generator) - 1
     moved = torch.stack(
         [x[:, 0] + 0.2 * x[:, 1], x[:, 1] - torch.sin(2 * x[:, 0]) + u[:, 0]], dim=1
     )
@@ -285,7 +282,8 @@ def transitions(rows, noise=1e-2, seed=0):
     [{}, {"method": "fitc"}, {"predicts": "difference", "scaling": standardize}],
 )
 def test_training_sums_up_many_transitions_in_a_few_points(settings, caplog):
-    data, held_out = transitions(600), transitions(200, noise=0.0, seed=1)
+    data = transitions(600)
+    held_out = transitions(200, noise=0.0, seed=1)
     trainer = SparseTrainer(
         inducing=40, subset=50, restarts=0, iterations=15, **settings
     )

@@ -35,10 +35,8 @@ def trained():
 
 
 def assert_same(loaded, saved):
-    x, u = (
-        torch.randn(50, saved.state_dim, dtype=saved.dtype),
-        torch.randn(50, saved.input_dim, dtype=saved.dtype),
-    )
+    x = torch.randn(50, saved.state_dim, dtype=saved.dtype)
+    u = torch.randn(50, saved.input_dim, dtype=saved.dtype)
     for state, control in ((x, u), (x[0], u[0])):
         (ours, *ours_by), (theirs, *theirs_by) = (
             predict_with_jacobian(m, state, control) for m in (loaded, saved)
@@ -77,7 +75,8 @@ def assert_same(loaded, saved):
     ],
 )
 def test_what_is_loaded_predicts_what_was_saved_bit_by_bit(make, tmp_path):
-    model, path = make(), tmp_path / "model.safetensors"
+    model = make()
+    path = tmp_path / "model.safetensors"
     SAVE[type(model)](model, path)
     loaded = LOAD[type(model)](path)
     assert loaded.dtype == model.dtype
@@ -113,7 +112,8 @@ def test_a_factor_that_no_hyperparameters_give_is_kept(tmp_path):
 
 
 def test_the_file_is_plain_arrays_and_a_readable_header(tmp_path):
-    gp, path = posterior(predicts="difference"), tmp_path / "gp.safetensors"
+    gp = posterior(predicts="difference")
+    path = tmp_path / "gp.safetensors"
     save_posterior(gp, path, {"states": ["x", "y"], "units": ["m", "m"]})
     with safetensors.safe_open(path, framework="numpy") as file:
         assert np.array_equal(file.get_tensor("features"), gp.features.numpy())
@@ -169,7 +169,8 @@ def test_another_process_predicts_the_same_bits(tmp_path):
     "make", [posterior, residual_model], ids=["posterior", "residual"]
 )
 def test_a_file_cut_anywhere_is_refused(make, tmp_path):
-    model, path = make(), tmp_path / "model.safetensors"
+    model = make()
+    path = tmp_path / "model.safetensors"
     SAVE[type(model)](model, path)
     whole = path.read_bytes()
     for size in {*range(0, len(whole), 37), *range(len(whole) - 30, len(whole))}:
@@ -179,9 +180,11 @@ def test_a_file_cut_anywhere_is_refused(make, tmp_path):
 
 
 def test_a_flipped_bit_anywhere_is_refused_or_harmless(tmp_path):
-    gp, path = posterior(size=6), tmp_path / "gp.safetensors"
+    gp = posterior(size=6)
+    path = tmp_path / "gp.safetensors"
     save_posterior(gp, path)
-    whole, refused = path.read_bytes(), 0
+    whole = path.read_bytes()
+    refused = 0
     for position in range(0, len(whole), 3):
         changed = bytearray(whole)
         changed[position] ^= 1 << position % 8
@@ -197,7 +200,8 @@ def test_a_flipped_bit_anywhere_is_refused_or_harmless(tmp_path):
 
 
 def test_a_flipped_bit_in_the_data_is_refused(tmp_path):
-    gp, path = posterior(), tmp_path / "gp.safetensors"
+    gp = posterior()
+    path = tmp_path / "gp.safetensors"
     save_posterior(gp, path)
     whole = path.read_bytes()
     for name in ("features", "targets", "lengthscales", "noise_variance", "weights"):

@@ -33,7 +33,8 @@ from gpmpc.gp._search import column_std
 
 def pendulum(rows=60, noise=1e-3, seed=0):
     rng = np.random.default_rng(seed)
-    x, u = rng.uniform(-2, 2, (rows, 2)), rng.uniform(-1, 1, (rows, 1))
+    x = rng.uniform(-2, 2, (rows, 2))
+    u = rng.uniform(-1, 1, (rows, 1))
     moved = np.column_stack(
         [x[:, 0] + 0.1 * x[:, 1], x[:, 1] - np.sin(x[:, 0]) + u[:, 0]]
     )
@@ -46,7 +47,8 @@ def pendulum(rows=60, noise=1e-3, seed=0):
 
 
 def test_training_finds_the_noise_and_predicts_held_out_rows():
-    data, held_out = pendulum(120, noise=1e-2), pendulum(200, noise=0.0, seed=1)
+    data = pendulum(120, noise=1e-2)
+    held_out = pendulum(200, noise=0.0, seed=1)
     gp = train(data).posterior
     assert torch.allclose(gp.noise_variance.sqrt(), torch.full((2,), 1e-2), rtol=0.3)
     error = gp.predict(held_out.states, held_out.inputs).mean - held_out.next_states
@@ -64,7 +66,8 @@ def test_next_states_and_differences_are_learned_equally_well():
 
 
 def test_the_same_seed_gives_the_same_numbers_and_more_starts_never_a_worse_optimum():
-    first, second = train(pendulum(), seed=3), train(pendulum(), seed=3)
+    first = train(pendulum(), seed=3)
+    second = train(pendulum(), seed=3)
     assert np.array_equal(first.theta, second.theta)
     single = train(pendulum(), seed=3, restarts=0)
     assert (first.objective <= single.objective + 1e-6).all()
@@ -73,7 +76,9 @@ def test_the_same_seed_gives_the_same_numbers_and_more_starts_never_a_worse_opti
 
 
 def test_the_gpytorch_model_of_a_training_predicts_the_same():
-    training, states, inputs = train(pendulum(30)), torch.rand(4, 2), torch.rand(4, 1)
+    training = train(pendulum(30))
+    states = torch.rand(4, 2)
+    inputs = torch.rand(4, 1)
     with torch.no_grad():
         theirs = to_gpytorch(training.posterior)(
             torch.cat([states, inputs], dim=1).expand(2, -1, -1)
@@ -85,10 +90,8 @@ def test_the_gpytorch_model_of_a_training_predicts_the_same():
 
 def test_the_penalty_keeps_signal_to_noise_and_lengthscales_within_its_limits():
     data = pendulum(40, noise=0.0)
-    free, limited = (
-        train(data).theta,
-        train(data, penalty=SoftLimits(signal_to_noise=50.0)).theta,
-    )
+    free = train(data).theta
+    limited = train(data, penalty=SoftLimits(signal_to_noise=50.0)).theta
     assert (free[:, -1] > np.log(200)).all()
     assert (limited[:, -1] < 1.2 * np.log(50)).all()
     near = train(data, penalty=SoftLimits(lengthscale_factor=2.0)).theta
@@ -99,7 +102,8 @@ def test_the_penalty_keeps_signal_to_noise_and_lengthscales_within_its_limits():
 
 
 def test_the_penalty_is_the_papers_and_its_gradient_is_right():
-    theta, log_spread = np.array([1.0, -2.0, 0.5, 7.0]), np.array([0.3, 0.1])
+    theta = np.array([1.0, -2.0, 0.5, 7.0])
+    log_spread = np.array([0.3, 0.1])
     value, gradient = SoftLimits()(theta, log_spread)
     expected = (
         sum(((theta[:2] - log_spread) / np.log(100)) ** 30)
@@ -116,15 +120,18 @@ def test_the_penalty_is_the_papers_and_its_gradient_is_right():
 
 def test_an_input_that_is_known_to_have_no_effect_has_none():
     data = pendulum(40)
-    states, moved = data.states.clone(), data.next_states.clone()
-    states[:, 1], moved[:, 1] = 0.5, 0.5
+    states = data.states.clone()
+    moved = data.next_states.clone()
+    states[:, 1] = 0.5
+    moved[:, 1] = 0.5
     known = {"prior_lengthscale": "no_effect", "prior_deviation": None}
     huge = Transitions(states * torch.tensor([1.0, 1e10]), data.inputs, moved)
     long = train(huge, restarts=0, **known).posterior.lengthscales
     assert float(long[0, 1]) > 1e17
     still = Transitions(states, data.inputs, moved)
     gp = train(still, penalty=SoftLimits(), **known).posterior
-    near, far = torch.tensor([[0.3, 0.5]]), torch.tensor([[0.3, 2.0]])
+    near = torch.tensor([[0.3, 0.5]])
+    far = torch.tensor([[0.3, 2.0]])
     control = torch.tensor([[0.1]])
     assert torch.allclose(
         gp.predict(near, control).mean, gp.predict(far, control).mean, atol=1e-9
@@ -181,7 +188,8 @@ def test_when_all_starts_fail_the_output_is_named():
 
 def test_a_search_that_begins_with_a_subset_ends_at_the_same_optimum():
     data = pendulum(420, noise=1e-2)
-    everywhere, first_a_part = train(data, subset=None), train(data, subset=100)
+    everywhere = train(data, subset=None)
+    first_a_part = train(data, subset=100)
     assert np.allclose(first_a_part.objective, everywhere.objective, rtol=1e-6)
     assert np.allclose(first_a_part.theta, everywhere.theta, atol=0.02)
     assert (
@@ -190,7 +198,8 @@ def test_a_search_that_begins_with_a_subset_ends_at_the_same_optimum():
 
 
 def test_a_start_that_is_known_is_searched_from_over_all_points():
-    data, trainer = pendulum(120, noise=1e-2), Trainer(restarts=0, subset=40)
+    data = pendulum(120, noise=1e-2)
+    trainer = Trainer(restarts=0, subset=40)
     first = trainer(data)
     again = trainer.refit(first.posterior)
     assert again.evaluations < first.evaluations
@@ -205,7 +214,8 @@ def test_a_subset_is_searched_first_where_there_are_more_points_and_other_starts
     assert np.array_equal(same.theta, whole.theta)
     assert same.evaluations == whole.evaluations
     assert not np.array_equal(fewer.explored, whole.explored)
-    start, again = whole.posterior, {}
+    start = whole.posterior
+    again = {}
     for restarts in (0, 1):
         again[restarts] = [
             Trainer(restarts=restarts, subset=subset)(data, start=start)
@@ -375,7 +385,8 @@ def test_tables_of_a_graph_are_learned_apart_from_it():
 
 
 def test_a_refit_and_a_start_need_a_posterior_and_transitions_that_fit_it():
-    trainer, gp = Trainer(restarts=0), train(pendulum(8), restarts=0).posterior
+    trainer = Trainer(restarts=0)
+    gp = train(pendulum(8), restarts=0).posterior
     other = Transitions(torch.zeros(3, 3), torch.zeros(3, 1), torch.zeros(3, 3))
     with pytest.raises(
         ShapeError,
@@ -425,7 +436,8 @@ def test_what_takes_long_tells_where_it_is(caplog, monkeypatch):
 def test_a_time_limit_ends_every_outputs_search_with_the_best_found_so_far(
     caplog, monkeypatch
 ):
-    data, ticks = pendulum(40), count()
+    data = pendulum(40)
+    ticks = count()
     converged = train(data)
     clock = SimpleNamespace(perf_counter=lambda: float(next(ticks)))  # a second a look
     for module in (_search, _training):
@@ -450,7 +462,8 @@ def test_a_time_limit_ends_every_outputs_search_with_the_best_found_so_far(
 def test_a_time_limit_waits_for_one_start_that_succeeds(
     monkeypatch, failing, late_after, explored
 ):
-    starts, search = count(), _search.OutputSearch._minimize
+    starts = count()
+    search = _search.OutputSearch._minimize
 
     def one_fails(self, start, iterations):
         number = next(starts)
@@ -476,7 +489,9 @@ def test_a_time_limit_waits_for_one_start_that_succeeds(
 def test_a_time_limit_leaves_one_start_on_the_subset_and_an_iteration_over_all_points(
     monkeypatch,
 ):
-    data, search, sizes = pendulum(60, noise=1e-2), _search.OutputSearch._minimize, []
+    data = pendulum(60, noise=1e-2)
+    search = _search.OutputSearch._minimize
+    sizes = []
     converged = train(data, subset=20)
     monkeypatch.setattr(
         _search.OutputSearch,

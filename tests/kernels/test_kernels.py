@@ -100,7 +100,8 @@ def case(arguments, at, shift):
 )
 def test_values_and_derivatives_agree_with_torch(name, arguments, at, shift):
     gp, at, u = case(arguments, at, shift)
-    mu, S = at.mean, at.covariance
+    mu = at.mean
+    S = at.covariance
 
     def by_torch(mu, S, u):
         return moments(gp, Gaussian(mu, S), u)
@@ -164,7 +165,9 @@ def test_the_moments_agree_with_a_fifty_digit_evaluation(
 @pytest.mark.parametrize("size", [1, 7, 8, 9, 189, 500])
 @pytest.mark.parametrize("diagonal", [False, True])
 def test_padding_and_tiles_change_nothing(size, diagonal):
-    gp, at, u = model(size=size, n=3, m=1, noise=1e-2), belief(3), control(1)
+    gp = model(size=size, n=3, m=1, noise=1e-2)
+    at = belief(3)
+    u = control(1)
     M, V, J = moments(gp, at, u)
     mine = differentiated(
         packed(gp), *numbers(at.mean, at.covariance, u), diagonal=diagonal
@@ -186,10 +189,16 @@ def test_padding_and_tiles_change_nothing(size, diagonal):
 
 @pytest.mark.parametrize("spread", [0.3, 1e-3])
 def test_derivatives_agree_with_finite_differences(spread):
-    gp, at, u = model(n=3, m=2), belief(3, spread=spread), control(2).numpy()
-    mu, S, gps = at.mean.numpy(), at.covariance.numpy(), packed(gp)
+    gp = model(n=3, m=2)
+    at = belief(3, spread=spread)
+    u = control(2).numpy()
+    mu = at.mean.numpy()
+    S = at.covariance.numpy()
+    gps = packed(gp)
     rng = np.random.default_rng(0)
-    d_mu, d_S, d_u = rng.normal(size=3), rng.normal(size=(3, 3)), rng.normal(size=2)
+    d_mu = rng.normal(size=3)
+    d_S = rng.normal(size=(3, 3))
+    d_u = rng.normal(size=2)
     d_S = d_S @ d_S.T * spread**2
     step = 1e-5
 
@@ -222,7 +231,9 @@ def test_derivatives_in_the_covariance_are_symmetric():
 
 
 def test_outputs_need_not_be_as_many_as_states():
-    gp, at, u = model(n=4, m=1), belief(4), control(1)
+    gp = model(n=4, m=1)
+    at = belief(4)
+    u = control(1)
     whole = differentiated(packed(gp), *numbers(at.mean, at.covariance, u))
     rows = [2, 0]
     few = pack(
@@ -270,7 +281,9 @@ def test_exponents_that_overflow_belong_to_nothing_that_counts():
     ("n", "m", "size"), [(1, 0, 5), (2, 1, 20), (3, 4, 33), (6, 3, 50)]
 )
 def test_the_expansion_at_a_point_agrees_with_torch(n, m, size):
-    gp, x, u = model(size=size, n=n, m=m), belief(n).mean, control(m)
+    gp = model(size=size, n=n, m=m)
+    x = belief(n).mean
+    u = control(m)
 
     def mean(x, u):
         return gp.predict(x, u).mean
@@ -279,7 +292,8 @@ def test_the_expansion_at_a_point_agrees_with_torch(n, m, size):
         return gp.predict(x, u).covariance.diagonal()
 
     point = at_one(kernels.point_with_jacobian, packed(gp), *numbers(x, u))
-    jacrev, both = torch.func.jacrev, (0, 1)
+    jacrev = torch.func.jacrev
+    both = (0, 1)
     close(point.M, mean(x, u), 1e-12)
     close(point.variance, variance(x, u), 1e-10)
     for mine, other in zip(
@@ -309,7 +323,9 @@ def test_the_expansion_at_a_point_agrees_with_torch(n, m, size):
 
 @pytest.mark.parametrize("covariance", [0.0, 1e-14])
 def test_without_covariance_the_moments_are_the_expansion_at_the_mean(covariance):
-    gp, x, u = model(n=3, m=2), belief(3).mean, control(2)
+    gp = model(n=3, m=2)
+    x = belief(3).mean
+    u = control(2)
     d = differentiated(packed(gp), *numbers(x, covariance * torch.eye(3), u))
     point = at_one(kernels.point_with_jacobian, packed(gp), *numbers(x, u))
     close(d.M, point.M, 1e-11)
@@ -335,10 +351,8 @@ def test_variances_at_several_points_are_reduced_as_each_alone(size):
     def together(columns, rows, totals):
         reduce_variances(columns, len(columns), rows, totals)
 
-    expected, totals = (
-        [alone(mine.precision.inverse_cholesky[1], row) for row in q],
-        np.zeros(8),
-    )
+    expected = [alone(mine.precision.inverse_cholesky[1], row) for row in q]
+    totals = np.zeros(8)
     together(mine.columns[1], q, totals)
     assert np.allclose(totals, expected, rtol=1e-12, atol=0)
 
@@ -346,10 +360,8 @@ def test_variances_at_several_points_are_reduced_as_each_alone(size):
 def test_many_points_are_the_loop_over_them():
     gps = packed(model(n=3, m=2))
     beliefs = [belief(3, seed=s) for s in range(4)]
-    mu, S = (
-        np.stack([b.mean for b in beliefs]),
-        np.stack([b.covariance for b in beliefs]),
-    )
+    mu = np.stack([b.mean for b in beliefs])
+    S = np.stack([b.covariance for b in beliefs])
     u = np.linspace(-1, 1, 8).reshape(4, 2)
     together = [
         kernels.linearize(gps, mu, u, True, np.zeros(3), False),
@@ -374,7 +386,9 @@ def test_many_points_are_the_loop_over_them():
 
 
 def test_threads_do_not_disturb_each_other():
-    gps, S, u = packed(model(size=60, n=3, m=1)), 0.1 * np.eye(3), np.zeros(1)
+    gps = packed(model(size=60, n=3, m=1))
+    S = 0.1 * np.eye(3)
+    u = np.zeros(1)
     points = np.random.default_rng(0).normal(size=(16, 3))
     alone = [differentiated(gps, point, S, u).dV_dS for point in points]
     with ThreadPoolExecutor(4) as pool:
@@ -385,8 +399,11 @@ def test_threads_do_not_disturb_each_other():
 
 
 def test_inputs_may_be_read_only_transposed_or_lists():
-    gps, at, u = packed(model()), belief(), np.zeros(1)
-    mu, S = at.mean.numpy().copy(), np.asfortranarray(at.covariance.numpy())
+    gps = packed(model())
+    at = belief()
+    u = np.zeros(1)
+    mu = at.mean.numpy().copy()
+    S = np.asfortranarray(at.covariance.numpy())
     mu.flags.writeable = False
     for a, b in zip(
         valued(gps, mu, S, u), valued(gps, mu.tolist(), S.tolist(), [0.0]), strict=True
@@ -454,10 +471,9 @@ def test_near_zero_the_exponentials_without_reduction_are_the_same_to_the_last_b
 @pytest.mark.parametrize("dims", [1, 3, 6])
 def test_sizes_over_points_are_the_largest_ones(dims):
     rows = np.random.default_rng(dims).standard_normal((dims, 48))
-    rows[0, 29], rows[-1, 7] = (
-        -8.0,
-        np.nan,
-    )  # NaN is passed over: such a pair stays NaN in either way
+    # NaN is passed over: such a pair stays NaN in either way
+    rows[0, 29] = -8.0
+    rows[-1, 7] = np.nan
 
     @numba.njit
     def sizes(rows):
@@ -476,12 +492,11 @@ def test_loops_over_points_may_use_the_widest_registers():
     anew = numba.njit(
         _gp_point.linearize_points.py_func
     )  # the kernel itself may have been loaded
-    x, u, out = (
-        np.zeros((1, 2)),
-        np.zeros((1, 1)),
-        (np.zeros((1, 2)), np.zeros((1, 2, 2)), np.zeros((1, 2, 1))),
-    )
-    memory, none = np.empty(7 * gps.arrays.points.shape[1] + 8), np.zeros((0, 2, 2))
+    x = np.zeros((1, 2))
+    u = np.zeros((1, 1))
+    out = (np.zeros((1, 2)), np.zeros((1, 2, 2)), np.zeros((1, 2, 1)))
+    memory = np.empty(7 * gps.arrays.points.shape[1] + 8)
+    none = np.zeros((0, 2, 2))
     anew(gps.arrays, none, (np.zeros(2), False), x, u, memory, (*out, none))
     assert '"prefer-vector-width"="512"' in anew.inspect_llvm(anew.signatures[0])
 
@@ -530,7 +545,8 @@ def test_the_kernels_load_no_torch_of_their_own():
 
 
 def test_the_sine_and_cosine_of_lanes_are_exact_to_round_off_and_stay_within_one(rng):
-    sine, cosine = by_lanes(_simd.sine), by_lanes(_simd.cosine)
+    sine = by_lanes(_simd.sine)
+    cosine = by_lanes(_simd.cosine)
     for scale in (1.0, 100.0, 1e6):
         x = rng.uniform(-scale, scale, 8000)
         assert np.abs(sine(x) - np.sin(x)).max() < 4e-16

@@ -9,7 +9,8 @@ from gpmpc.gp.casadi_ import tape_of
 from gpmpc.models import CasadiFunction, KnownModel, RollOut
 from gpmpc.systems import double_pendulum, step
 
-X, U = casadi.SX.sym("x", 3), casadi.SX.sym("u", 2)
+X = casadi.SX.sym("x", 3)
+U = casadi.SX.sym("u", 2)
 EVERY = casadi.vertcat(
     X[0] / X[1] - casadi.atan2(X[2], U[0]) + casadi.sqrt(1 + X[0] ** 2),
     casadi.exp(-X[1]) * casadi.fmin(X[0], U[1])
@@ -30,8 +31,10 @@ FUNCTIONS = casadi.Function("f", [X, U], [EVERY]), casadi.Function("f", [X], [MA
 
 @pytest.mark.parametrize("function", FUNCTIONS, ids=["vector", "matrix"])
 def test_a_tape_has_the_values_and_derivatives_of_casadi(function, rng):
-    compiled, plain = CasadiFunction(function), CasadiFunction(function)
-    plain.tape, names = None, function.name_in()
+    compiled = CasadiFunction(function)
+    plain = CasadiFunction(function)
+    plain.tape = None
+    names = function.name_in()
     plain._expansion = function.factory(
         "e", names, ["o0", *(f"jac:o0:{name}" for name in names)]
     )
@@ -55,22 +58,27 @@ def test_expressions_of_matrices_are_expanded_and_other_calls_have_no_tape():
 
 
 def test_a_known_model_is_rolled_out_in_one_call_under_a_feedback_within_bounds(rng):
-    system, H = double_pendulum("shoulder"), 12
-    x, u = casadi.SX.sym("x", 4), casadi.SX.sym("u", 1)
+    system = double_pendulum("shoulder")
+    H = 12
+    x = casadi.SX.sym("x", 4)
+    u = casadi.SX.sym("u", 1)
     function = casadi.Function(
         "successor", [x, u], [casadi.vertcat(*system.successor(x, u))]
     )
     model = KnownModel(CasadiFunction(function), 4, 1)
-    planned, gains = rng.normal(size=(2, H, 4)), rng.normal(size=(2, H, 1, 4))
+    planned = rng.normal(size=(2, H, 4))
+    gains = rng.normal(size=(2, H, 1, 4))
     limits = (
         *(np.full((H, 1), limit) for limit in (-6.0, 6.0, -3.0, 3.0)),
         np.array([0.5]),
     )
     feedback = Feedback(planned, rng.uniform(-4, 4, (2, H, 1)), gains, *limits)
-    starts, gust = rng.normal(size=(2, 4)), np.array([0.0, 0.1, 0.0, 0.0])
+    starts = rng.normal(size=(2, 4))
+    gust = np.array([0.0, 0.1, 0.0, 0.0])
     states, inputs = RollOut(model)(starts, feedback, gust)
     for t in range(2):
-        state, last = starts[t], 0.5
+        state = starts[t]
+        last = 0.5
         for k in range(H):
             wanted = feedback.inputs[t, k, 0] + gains[t, k, 0] @ (state - planned[t, k])
             last = np.clip(np.clip(wanted, last - 3, last + 3), -6, 6)
@@ -83,13 +91,15 @@ def test_a_known_model_is_rolled_out_in_one_call_under_a_feedback_within_bounds(
 def test_roll_outs_of_functions_without_a_value_at_zero_are_those_of_the_function(
     count, rng
 ):
-    x, u = casadi.SX.sym("x", 2), casadi.SX.sym("u", 1)
+    x = casadi.SX.sym("x", 2)
+    u = casadi.SX.sym("u", 1)
     after = casadi.vertcat(
         x[0] + 0.1 * (u[0] - casadi.sqrt(x[0])),
         x[1] + 0.1 * casadi.log(x[0]) / casadi.atan2(x[0], x[1]),
     )
     function = casadi.Function("f", [x, u], [after])
-    starts, inputs = rng.uniform(1, 2, (count, 2)), rng.uniform(0.5, 1, (count, 5, 1))
+    starts = rng.uniform(1, 2, (count, 2))
+    inputs = rng.uniform(0.5, 1, (count, 5, 1))
     states = RollOut(KnownModel(CasadiFunction(function), 2, 1)).open_loop(
         starts, inputs
     )

@@ -13,7 +13,8 @@ from gpmpc.propagation import Linearization
 from gpmpc.status import Status
 from tests.learning.test_online import MODEL, NOISE, PROBLEM, STEP, cart
 
-STEPS, HORIZON = 120, 8
+STEPS = 120
+HORIZON = 8
 NAN = np.nan
 WIND = 0.6
 TIME = STEP * np.arange(STEPS + HORIZON + 1)
@@ -114,7 +115,8 @@ def flown(learning, fault, wind=0.0, seed=0):
     noise = np.random.default_rng(seed)
     loop = ControlLoop(controller_of(learning))
     state = SINE[0].copy()
-    errors, decisions = [], []
+    errors = []
+    decisions = []
     for k in range(STEPS):
         input = loop.input(sensor(k, state), SINE[k : k + HORIZON + 1])
         state = cart(state, input, wind=wind if k >= 40 else 0.0)

@@ -18,7 +18,8 @@ from gpmpc.mpc.problem import Box, Problem, Tracking
 from gpmpc.propagation import Linearization
 from gpmpc.testing import check_model
 
-STEP, NOISE = 0.1, np.array([1e-3, 1e-2])
+STEP = 0.1
+NOISE = np.array([1e-3, 1e-2])
 PROBLEM = Problem(Tracking([10.0, 1.0], [0.01]), Box([-5.0], [5.0]))
 
 
@@ -30,7 +31,8 @@ def cart(x, u, gain=1.0, wind=0.0):
 
 def learned_model():
     rng = np.random.default_rng(0)
-    x, u = rng.uniform(-2, 2, (60, 2)), rng.uniform(-4, 4, (60, 1))
+    x = rng.uniform(-2, 2, (60, 2))
+    u = rng.uniform(-4, 4, (60, 1))
     after = np.array(
         [cart(a, b) + rng.normal(0, NOISE) for a, b in zip(x, u, strict=True)]
     )
@@ -48,9 +50,12 @@ def flown(learning, changed=None, steps=120, seed=0, sensor=0.0):
     loop = ControlLoop(
         controller if learning is None else LearningController(controller, learning)
     )
-    time, rng = STEP * np.arange(steps + 9), np.random.default_rng(seed)
+    time = STEP * np.arange(steps + 9)
+    rng = np.random.default_rng(seed)
     reference = np.stack([np.sin(time), np.cos(time)], axis=1)
-    x, errors, decisions = reference[0].copy(), [], []
+    x = reference[0].copy()
+    errors = []
+    decisions = []
     for k in range(steps):
         u = loop.input(x + sensor * rng.normal(size=2), reference[k : k + 9])
         x = cart(x, u, **(changed or {}) if k >= 40 else {}) + rng.normal(0, NOISE)
@@ -84,11 +89,13 @@ def test_a_plant_that_changes_is_followed_again_within_seconds(changed):
 
 
 def test_learning_is_switched_off_where_the_old_plant_comes_back_and_no_measurement_is_lost_on_the_way():
-    steps, learning = [], OnlineLearning()
+    steps = []
+    learning = OnlineLearning()
     learned = Learned(
         ChangedModel(MODEL), np.zeros(2), np.full(2, np.nan), np.empty(0), np.empty(0)
     )
-    rng, x = np.random.default_rng(1), np.zeros(2)
+    rng = np.random.default_rng(1)
+    x = np.zeros(2)
     for k in range(150):
         u = rng.uniform(-3, 3, 1)
         x = cart(x, u, wind=0.6 if 40 <= k < 80 else 0.0) + rng.normal(0, NOISE)
@@ -105,10 +112,8 @@ def test_equal_seeds_give_equal_bits_and_one_controller_flies_many_flights():
     assert np.array_equal(one[0], again[0])
     assert [d.learned.version for d in one[1]] == [d.learned.version for d in again[1]]
     controller = LearningController(GPMPC(MODEL, Linearization(), PROBLEM, 8, [0.0]))
-    x, reference = (
-        Gaussian.certain(np.array([0.5, 0.0])),
-        Reference(np.zeros(2)).over(8),
-    )
+    x = Gaussian.certain(np.array([0.5, 0.0]))
+    reference = Reference(np.zeros(2)).over(8)
     first = controller.control(x, reference)
     second = controller.control(x, reference, first)
     controller.control(x, reference, second)
@@ -124,7 +129,8 @@ def test_a_decision_that_was_not_applied_is_no_point_and_learning_goes_on_with_w
     shifted = replace(
         before, means=np.concatenate([before.means[1:], before.means[-1:]])
     )
-    state, reference = Gaussian.certain(before.means[2]), Reference(before.means)
+    state = Gaussian.certain(before.means[2])
+    reference = Reference(before.means)
     after = controller.control(state, reference, shifted).learned
     assert after.active
     assert after.model.change is before.learned.model.change
@@ -137,7 +143,8 @@ def test_a_decision_that_was_not_applied_is_no_point_and_learning_goes_on_with_w
 
 def changed_residual():
     rng = np.random.default_rng(0)
-    x, u = rng.uniform(-2, 2, (40, 2)), rng.uniform(-2, 2, (40, 1))
+    x = rng.uniform(-2, 2, (40, 2))
+    u = rng.uniform(-2, 2, (40, 1))
     after = np.array([cart(a, b) for a, b in zip(x, u, strict=True)]) + rng.normal(
         0, NOISE, (40, 2)
     )
@@ -156,17 +163,20 @@ def test_a_changed_model_keeps_the_promises_of_a_model_and_its_last_innovation_i
     changed,
 ):
     rng = np.random.default_rng(2)
-    x, u = rng.uniform(-1, 1, (12, 2)), rng.uniform(-1, 1, (12, 1))
+    x = rng.uniform(-1, 1, (12, 2))
+    u = rng.uniform(-1, 1, (12, 1))
     after = np.array([cart(a, b, gain=0.8) for a, b in zip(x, u, strict=True)])
     seen = [changed.error(*row) for row in zip(x, u, after, strict=True)]
-    noise, model = np.full(len(seen[0][1]), 1e-6), changed
+    noise = np.full(len(seen[0][1]), 1e-6)
+    model = changed
     for point, error, _ in seen[:-1]:
         model = model.with_point(point, error, noise)
     model = model.later(1.0)
     check_model(model, torch.from_numpy(x), torch.from_numpy(u))
     point, error, _ = model.error(x[-1], u[-1], after[-1])
     larger = model.with_point(point, error, noise)
-    found, at = larger.last_innovation(), torch.from_numpy(point[None])
+    found = larger.last_innovation()
+    at = torch.from_numpy(point[None])
     d = model.posterior.predict(
         at[:, : -model.gp.input_dim - 1], at[:, -model.gp.input_dim - 1 :]
     )
@@ -193,7 +203,9 @@ def taught(model, points, rng):
 
 def check_exact(model):
     """The factor, the weights and predictions are those of a GP on the same points."""
-    gp, size, now = model.posterior, len(model), model.change[0]
+    gp = model.posterior
+    size = len(model)
+    now = model.change[0]
     difference = (gp.features[:, None] - gp.features) / gp.lengthscales[:, None, None]
     K = gp.signal_variance[:, None, None] * torch.exp(
         -0.5 * difference.square().sum(-1)
@@ -204,13 +216,15 @@ def check_exact(model):
     weights = torch.cholesky_solve(gp.targets.mT[..., None], L)[..., 0]
     np.testing.assert_allclose(gp.cholesky, L, rtol=1e-8, atol=1e-10)
     np.testing.assert_allclose(gp.weights, weights, rtol=1e-7, atol=1e-8)
-    x, u = np.random.default_rng(0).normal(size=(2, 2)), np.zeros((2, 1))
+    x = np.random.default_rng(0).normal(size=(2, 2))
+    u = np.zeros((2, 1))
     z = torch.from_numpy(np.column_stack([x, u, np.full(2, model.time)]))
     k = gp.signal_variance[:, None, None] * torch.exp(
         -0.5
         * ((z[:, None] - gp.features) / gp.lengthscales[:, None, None]).square().sum(-1)
     )
-    found, alone = model.linearize(x, u), model.model.linearize(x, u)
+    found = model.linearize(x, u)
+    alone = model.model.linearize(x, u)
     np.testing.assert_allclose(
         found.mean - alone.mean,
         (k @ weights[..., None])[..., 0].mT,

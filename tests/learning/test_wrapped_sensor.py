@@ -14,7 +14,9 @@ from gpmpc.propagation import Linearization
 from gpmpc.simulation import ModelLoop, closed_loop
 from gpmpc.systems import System
 
-STEP, STEPS, HORIZON = 0.05, 120, 8
+STEP = 0.05
+STEPS = 120
+HORIZON = 8
 NOISE = np.array([1e-4, 1e-3])
 PROBLEM = Problem(Tracking([10.0, 1.0], [0.01], angles=[0]), Box([-15.0], [15.0]))
 TIME = STEP * np.arange(STEPS + HORIZON + 1)
@@ -35,7 +37,8 @@ def shown(x):
 
 def data():
     rng = np.random.default_rng(0)
-    x, u = rng.uniform([-4, -3], [4, 3], (120, 2)), rng.uniform(-12, 12, (120, 1))
+    x = rng.uniform([-4, -3], [4, 3], (120, 2))
+    u = rng.uniform(-12, 12, (120, 1))
     after = np.array([moved(*row) for row in zip(x, u, strict=True)])
     return Transitions(shown(x), u, shown(after + rng.normal(0, NOISE, (120, 2))))
 
@@ -52,8 +55,11 @@ def controller(**settings):
 
 def flown(control, sensor):
     """Inputs and decisions of a flight that swings across half a turn."""
-    loop, rng, x = ControlLoop(control), np.random.default_rng(1), SWING[0]
-    inputs, decisions = [], []
+    loop = ControlLoop(control)
+    rng = np.random.default_rng(1)
+    x = SWING[0]
+    inputs = []
+    decisions = []
     for k in range(STEPS):
         inputs.append(loop.input(sensor(x), SWING[k : k + HORIZON + 1]))
         decisions.append(loop.last.decision)
@@ -83,7 +89,8 @@ def test_a_sensor_that_wraps_gives_the_flight_of_one_that_counts_turns(make):
 
 
 def test_angles_of_the_cost_alone_are_known_to_learning_as_well():
-    rng, plain = np.random.default_rng(0), data()
+    rng = np.random.default_rng(0)
+    plain = data()
     x = rng.uniform([2.0, -3], [4.2, 3], (60, 2))
     u = rng.uniform(-12, 12, (60, 1))
     after = np.array([moved(*row) for row in zip(x, u, strict=True)])
@@ -94,7 +101,8 @@ def test_angles_of_the_cost_alone_are_known_to_learning_as_well():
     control = GPMPC(posterior, Linearization(), PROBLEM, HORIZON, [0.0])
     assert LearningController(control)._model.angles == [0]
     changed = ChangedModel(posterior, further_angles=[0])
-    at, torque = np.array([3.13, 2.0]), np.array([1.0])
+    at = np.array([3.13, 2.0])
+    torque = np.array([1.0])
     errors = [
         changed.error(at, torque, sensor(moved(at, torque)))[1]
         for sensor in (np.array, shown)
@@ -106,7 +114,8 @@ def test_angles_of_the_cost_alone_are_known_to_learning_as_well():
 class Hanging:
     """A pendulum whose angle is zero where it hangs."""
 
-    state_names, input_names = ("angle", "rate"), ("torque",)
+    state_names = ("angle", "rate")
+    input_names = ("torque",)
 
     def derivative(self, x, u):
         return np.stack([x[1], -9.81 * np.sin(x[0]) - 0.2 * x[1] + u[0]])

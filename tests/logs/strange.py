@@ -64,7 +64,8 @@ def pendulum(rows=400, seed=0):
     """A pendulum under torques that change every fifth row; with its time t."""
     rng = np.random.default_rng(seed)
     torques = np.repeat(rng.uniform(-3, 3, rows // 5 + 1), 5)
-    angle, rate = 0.3, 0.0
+    angle = 0.3
+    rate = 0.0
     table = []
     for k in range(rows):
         table.append((STEP * k, angle, rate, torques[k]))
@@ -178,7 +179,8 @@ def _protobuf(names, topic):
         message = kind(**dict(zip(names, values, strict=True)))
         if stamp is not None:
             seconds, nanos = divmod(_nanoseconds(stamp), 10**9)
-            message.timestamp.seconds, message.timestamp.nanos = seconds, nanos
+            message.timestamp.seconds = seconds
+            message.timestamp.nanos = nanos
         return message.SerializeToString()
 
     schema = descriptor_pb2.FileDescriptorSet(file=[file]).SerializeToString()

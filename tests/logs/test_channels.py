@@ -229,7 +229,8 @@ def test_what_is_lost_of_a_damaged_bag_is_said_with_its_times(tmp_path):
         read_log(path, BAG_MAPPING)
     log = read_log(path, BAG_MAPPING, partial=True)
     _, text = findings(log)["damaged"]
-    begin, end = chunk.message_start_time / 1e9, chunk.message_end_time / 1e9
+    begin = chunk.message_start_time / 1e9
+    end = chunk.message_end_time / 1e9
     assert f"the messages from {begin} to {end} s is damaged" in text
     lost = round((end - begin) / STEP)
     assert abs(len(log) - (ROWS - lost)) <= 3

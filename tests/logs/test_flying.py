@@ -38,11 +38,10 @@ BODY = StateSpace(
 
 def dynamics(kinematics, nominal, theta, inputs, dim, **model):
     """What ``load_flyable`` would return, with a GP on the last output."""
-    rng, o = np.random.default_rng(0), len(kinematics.output_names)
-    z, y = (
-        torch.from_numpy(rng.normal(size=(20, dim))),
-        torch.from_numpy(rng.normal(size=(20, 1))),
-    )
+    rng = np.random.default_rng(0)
+    o = len(kinematics.output_names)
+    z = torch.from_numpy(rng.normal(size=(20, dim)))
+    y = torch.from_numpy(rng.normal(size=(20, 1)))
     one = torch.ones(1, dtype=torch.float64)
     gp = GPPosterior.from_hyperparameters(
         z, y, 2 * torch.ones(1, dim, dtype=torch.float64), one, 0.1 * one, 0, "value"

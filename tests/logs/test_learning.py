@@ -133,7 +133,8 @@ def pendulum_log(friction, rows=900, seed=0, noise=0.02):
     rng = np.random.default_rng(seed)
     runs = []
     for number in range(3):
-        x, table = np.array([0.3, 0.0]), []
+        x = np.array([0.3, 0.0])
+        table = []
         torques = np.repeat(rng.uniform(-8, 8, rows // 10), 10)
         for u in torques:
             table.append((*x, u))
@@ -181,7 +182,8 @@ def spinning_log(kind, rows=400):
         "states": {"angle": angle, "rate": ["rate"]},
         "inputs": {"torque": ["u"]},
     }
-    time, nothing = 0.02 * np.arange(rows), np.empty((rows, 0))
+    time = 0.02 * np.arange(rows)
+    nothing = np.empty((rows, 0))
     runs = [LogRun(f"{i}", time, shown, torques[:, None], nothing) for i in range(2)]
     return Log(LogMapping.from_dict(mapping), 0.02, tuple(runs))
 
@@ -317,10 +319,8 @@ def test_intervals_follow_a_rougher_run_and_never_its_future(flights):
     windows = as_log(flights[:2]).windows(20, 20, 2)
     rng = np.random.default_rng(0)
     rough = np.where(windows.runs == 1, 3.0, 1.0)[:, None, None]
-    errors, claimed = (
-        rough * rng.normal(size=(len(windows), 2, 12)),
-        np.ones((len(windows), 2, 12)),
-    )
+    errors = rough * rng.normal(size=(len(windows), 2, 12))
+    claimed = np.ones((len(windows), 2, 12))
     scaled = follow_errors(windows, errors, claimed, (10, 20))
     late = windows.times > 2
     for run, std in ((0, 1.0), (1, 3.0)):
@@ -338,7 +338,8 @@ def test_intervals_follow_a_rougher_run_and_never_its_future(flights):
 
 def test_chosen_rows_cover_what_is_rare():
     rng = np.random.default_rng(0)
-    frequent, rare = rng.normal(0, 0.01, (3000, 2)), rng.uniform(-1, 1, (150, 2))
+    frequent = rng.normal(0, 0.01, (3000, 2))
+    rare = rng.uniform(-1, 1, (150, 2))
     rows = choose_rows(np.vstack([frequent, rare]), 40)
     assert (rows >= 3000).sum() > 12
     assert len(set(rows.tolist())) == len(rows) <= 40

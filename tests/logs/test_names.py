@@ -21,7 +21,8 @@ ROWS[:, 0] = 0.05 * np.arange(40)
 
 
 class Swapped:
-    state_names, input_names = ("rate", "angle"), ("torque",)
+    state_names = ("rate", "angle")
+    input_names = ("torque",)
 
     def derivative(self, x, u):
         return [x[1] + u[0], x[0]]
@@ -65,7 +66,8 @@ def test_columns_of_one_name_in_a_log_are_no_names(tmp_path):
 @pytest.mark.parametrize("said", ["signals", "metadata"])
 def test_a_model_file_flies_only_the_system_that_it_names(tmp_path, said):
     data = RandomData(samples=10).transitions(pendulum(0.1))
-    path, metadata = tmp_path / "model.safetensors", None
+    path = tmp_path / "model.safetensors"
+    metadata = None
     if said == "metadata":  # as before models carried names
         data = Transitions(data.states, data.inputs, data.next_states)
         metadata = {"states": ["angle", "rate"], "inputs": ["torque"], "time_step": 0.1}

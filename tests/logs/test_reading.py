@@ -39,7 +39,9 @@ BODY = {
 
 def pendulum_table(rows=400, seed=0):
     rng = np.random.default_rng(seed)
-    angle, rate, table = 0.3, 0.0, []
+    angle = 0.3
+    rate = 0.0
+    table = []
     torques = np.repeat(rng.uniform(-3, 3, rows // 5 + 1), 5)
     for k in range(rows):
         table.append((0.02 * k, angle, rate, torques[k]))
@@ -161,7 +163,8 @@ def test_every_kind_of_file_gives_the_same_log(tmp_path):
 
 
 def test_runs_are_told_apart_by_file_or_by_column_and_splits_are_by_run(tmp_path):
-    one, other = pendulum_table(100), pendulum_table(120, seed=1)
+    one = pendulum_table(100)
+    other = pendulum_table(120, seed=1)
     files = [written(tmp_path, one, "one.csv"), written(tmp_path, other, "other.csv")]
     log = read_log(files, PENDULUM)
     train, held_out = log.split(["other"])

@@ -317,7 +317,8 @@ def test_another_way_of_writing_gives_the_same_log(tmp_path, name):
 def test_a_time_in_another_unit_is_noted(tmp_path, unit):
     table = flight_of(0)
     if unit == 1e-12:
-        table, time = table.assign(t=unit * table["t"]), "t"
+        table = table.assign(t=unit * table["t"])
+        time = "t"
     else:
         time = {"column": "t", "unit": unit}
     table.to_csv(tmp_path / "log.csv", index=False)

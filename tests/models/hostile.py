@@ -43,7 +43,8 @@ from gpmpc.models import (
 )
 from tests.gp.small_models import posterior, residual_model
 
-MEMORY, SECONDS = 300 * 2**20, 5.0
+MEMORY = 300 * 2**20
+SECONDS = 5.0
 F = torch.float64
 
 
@@ -86,7 +87,8 @@ def noisy():
 
 def learned(kinematics, nominal, inputs, parameters, features):
     """What a log could have taught, with a GP on the last output."""
-    space, outputs = kinematics.space, len(kinematics.output_names)
+    space = kinematics.space
+    outputs = len(kinematics.output_names)
     gp = posterior(n=1, m=features - 1, predicts="value")
     gp = type(gp).from_hyperparameters(
         gp.features, gp.targets, torch.ones(1, features, dtype=F),
@@ -216,10 +218,8 @@ def a_field_added(header, arrays, rng):
 
 def a_model_inside_another(header, arrays, rng):
     node = {key: value for key, value in header.items() if key != "memory_order"}
-    depth, kind = (
-        rng.choice([1, 3, 30, 300]),
-        rng.choice(["DelayedModel", "NoisyModel"]),
-    )
+    depth = rng.choice([1, 3, 30, 300])
+    kind = rng.choice(["DelayedModel", "NoisyModel"])
     for _ in range(depth):
         node = {"kind": kind, "model": node, "delay": rng.choice([1, 0.5, 1e5])}
     header |= node
@@ -253,7 +253,8 @@ def a_shape(header, arrays, rng):
 
 
 def another_name(header, arrays, rng):
-    name, other = rng.choice([*arrays]), rng.choice([*arrays])
+    name = rng.choice([*arrays])
+    other = rng.choice([*arrays])
     prefix = name.rpartition("/")[0]
     new = rng.choice(
         [other, f"B/{other}", f"{prefix}/A", "noise", "B", "effect", "model/B"]
@@ -272,11 +273,10 @@ MUTATIONS = [
 
 def check_predicts(model):
     """Predicts and linearises; what comes out has the right shape."""
-    n, m = model.state_dim, model.input_dim
-    x, u = (
-        torch.full((3, n), 0.1, dtype=model.dtype),
-        torch.full((3, m), 0.2, dtype=model.dtype),
-    )
+    n = model.state_dim
+    m = model.input_dim
+    x = torch.full((3, n), 0.1, dtype=model.dtype)
+    u = torch.full((3, m), 0.2, dtype=model.dtype)
     with warnings.catch_warnings(), np.errstate(all="ignore"):
         warnings.simplefilter("ignore")
         belief = model.predict(x, u)
@@ -293,7 +293,9 @@ def address_space():
 def main(count, seed):
     torch.set_num_threads(1)
     torch.set_default_dtype(torch.float64)
-    rng, said, slowest = random.Random(seed), Counter(), (0.0, "")
+    rng = random.Random(seed)
+    said = Counter()
+    slowest = (0.0, "")
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "model.safetensors"
         good = {}

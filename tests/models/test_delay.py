@@ -35,11 +35,11 @@ def test_a_delayed_model_is_a_model(delay, m):
 
 @pytest.mark.parametrize("delay", [1, 3])
 def test_an_input_acts_as_many_steps_later_as_the_delay_is(delay):
-    model, inner, inputs = DelayedModel(gp(), delay), gp(), draw(5, 8, 1)
-    z, x = (
-        model.augmented(Gaussian.certain(torch.zeros(2)), np.zeros((delay, 1))).mean,
-        torch.zeros(2),
-    )
+    model = DelayedModel(gp(), delay)
+    inner = gp()
+    inputs = draw(5, 8, 1)
+    z = model.augmented(Gaussian.certain(torch.zeros(2)), np.zeros((delay, 1))).mean
+    x = torch.zeros(2)
     for k in range(8):
         z = model.predict(z, inputs[k]).mean
         x = inner.predict(x, inputs[k - delay] if k >= delay else torch.zeros(1)).mean
@@ -50,13 +50,11 @@ def test_a_fraction_of_a_step_mixes_the_two_inputs_that_act_in_it():
     class Integrator(
         torch.nn.Module
     ):  # the exact answer is the mean of the input over the step
-        state_dim, input_dim, output_dim, dtype, device = (
-            1,
-            1,
-            1,
-            F,
-            torch.device("cpu"),
-        )
+        state_dim = 1
+        input_dim = 1
+        output_dim = 1
+        dtype = F
+        device = torch.device("cpu")
         noise_covariance = torch.zeros(1, 1, dtype=F)
 
         def predict(self, state, input):
@@ -72,12 +70,12 @@ def test_a_fraction_of_a_step_mixes_the_two_inputs_that_act_in_it():
 def test_looking_ahead_is_what_the_delayed_model_does_with_the_inputs_on_their_way(
     delay,
 ):
-    model, propagator = DelayedModel(gp(), delay), Linearization(process_noise=True)
-    queue, now = (
-        0.5 * draw(6, model.pending, 1),
-        Gaussian(torch.tensor([0.1, -0.2]), 0.01 * torch.eye(2, dtype=F)),
-    )
-    ahead, whole = model.ahead(propagator, now, queue), model.augmented(now, queue)
+    model = DelayedModel(gp(), delay)
+    propagator = Linearization(process_noise=True)
+    queue = 0.5 * draw(6, model.pending, 1)
+    now = Gaussian(torch.tensor([0.1, -0.2]), 0.01 * torch.eye(2, dtype=F))
+    ahead = model.ahead(propagator, now, queue)
+    whole = model.augmented(now, queue)
     next_input = torch.zeros(1, dtype=F)
     for _ in range(model.lead):
         whole = propagator(model, whole, next_input)
@@ -115,7 +113,8 @@ def test_models_are_saved_and_loaded_whole(model, tmp_path):
     save_model(model, tmp_path / "m.safetensors", {"states": ["a", "b"]})
     loaded = load_model(tmp_path / "m.safetensors")
     assert type(loaded) is type(model)
-    x, u = draw(8, 4, model.state_dim).numpy(), draw(9, 4, 1).numpy()
+    x = draw(8, 4, model.state_dim).numpy()
+    u = draw(9, 4, 1).numpy()
     for ours, theirs in zip(model.linearize(x, u), loaded.linearize(x, u), strict=True):
         assert np.array_equal(ours, theirs)
     assert torch.equal(model.noise_covariance, loaded.noise_covariance)

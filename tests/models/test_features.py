@@ -25,7 +25,8 @@ from gpmpc.models import (
 from gpmpc.propagation import Linearization, MomentMatching, MonteCarlo, Unscented
 from gpmpc.testing import check_model
 
-STEP, F = 0.1, torch.float64
+STEP = 0.1
+F = torch.float64
 
 
 def draw(seed, *shape):
@@ -49,7 +50,8 @@ class Damped:
 
 
 def pendulum_in_casadi(damping=0.2):
-    x, u = casadi.SX.sym("x", 2), casadi.SX.sym("u", 1)
+    x = casadi.SX.sym("x", 2)
+    u = casadi.SX.sym("u", 1)
     turn = x[1] + STEP * (-9.81 * casadi.sin(x[0]) - damping * x[1] + u)
     return casadi.Function(
         "pendulum", [x, u], [casadi.vertcat(x[0] + STEP * turn, turn)]
@@ -70,8 +72,10 @@ def rotation_in_casadi():
 
 def every_operation():
     """An effect that no path leads to, of each operation that a compiled loop knows."""
-    x, c = casadi.SX.sym("x", 2), casadi
-    a, b = 1 + x[0] ** 2, x[1]
+    x = casadi.SX.sym("x", 2)
+    c = casadi
+    a = 1 + x[0] ** 2
+    b = x[1]
     first = (
         c.sqrt(a)
         + c.log(a) * c.tan(b / 9)
@@ -135,7 +139,8 @@ def test_a_model_with_features_is_a_model(name):
 
 
 def test_torch_and_casadi_give_the_same_expansion():
-    x, u = draw(8, 6, 2).numpy(), draw(9, 6, 1).numpy()
+    x = draw(8, 6, 2).numpy()
+    u = draw(9, 6, 1).numpy()
     for ours, theirs in zip(
         MODELS["effect in torch"]().linearize(x, u),
         MODELS["all in CasADi"]().linearize(x, u),
@@ -145,7 +150,9 @@ def test_torch_and_casadi_give_the_same_expansion():
 
 
 def test_a_turn_more_changes_nothing_and_a_column_that_is_left_out_neither():
-    model, x, u = with_angles(), draw(8, 5, 4), draw(9, 5, 2)
+    model = with_angles()
+    x = draw(8, 5, 4)
+    u = draw(9, 5, 2)
     moved = model.predict(x, u)
     turn = x + torch.tensor(
         [2 * torch.pi, 0, 7.0, -4 * torch.pi]
@@ -161,7 +168,8 @@ def test_a_turn_more_changes_nothing_and_a_column_that_is_left_out_neither():
 @pytest.mark.parametrize("name", ["angles", "effect in torch"])
 def test_a_belief_moves_through_features_as_sampling_says(name, propagator):
     model = MODELS[name]()
-    n, m = model.state_dim, model.input_dim
+    n = model.state_dim
+    m = model.input_dim
     belief = Gaussian(0.3 * draw(1, n), 0.0003 * torch.eye(n, dtype=F))
     sampled = MonteCarlo(50_000)(model, belief, draw(2, m))
     found = propagator(model, belief, draw(2, m))
@@ -172,7 +180,8 @@ def test_a_belief_moves_through_features_as_sampling_says(name, propagator):
 
 
 def observed(rows=60, seed=0):
-    x, u = draw(seed, rows, 2) * torch.tensor([3.0, 2.0]), draw(seed + 1, rows, 1)
+    x = draw(seed, rows, 2) * torch.tensor([3.0, 2.0])
+    u = draw(seed + 1, rows, 1)
     return Transitions(x, u, pendulum(x, u))
 
 
@@ -181,7 +190,8 @@ def test_with_sine_and_cosine_a_pendulum_is_predicted_at_angles_that_were_never_
     model = ResidualModel.train(
         Affine.identity(2, 1), seen, angles=[0], trainer=Trainer(restarts=0)
     )
-    x, u = observed(40, seed=5).states, observed(40, seed=5).inputs
+    x = observed(40, seed=5).states
+    u = observed(40, seed=5).inputs
     far = x + torch.tensor([6 * torch.pi, 0.0])
     error = (model.predict(far, u).mean - pendulum(far, u)).abs().max()
     assert float(error) < 0.02
@@ -191,7 +201,8 @@ def test_with_sine_and_cosine_a_pendulum_is_predicted_at_angles_that_were_never_
 
 
 def test_an_effect_that_depends_on_the_state_is_learned():
-    x, u = draw(0, 60, 2), draw(1, 60, 1)
+    x = draw(0, 60, 2)
+    u = draw(1, 60, 1)
     force = (0.5 * x[:, 1].sin())[:, None, None]
     noise = 1e-3 * draw(3, 60, 2)
     seen = Transitions(x, u, pendulum(x, u) + (rotation(x) * force)[..., 0] + noise)
@@ -212,7 +223,8 @@ def test_an_effect_that_depends_on_the_state_is_learned():
 
 def test_lags_are_shifted_and_a_velocity_that_is_not_measured_is_found_in_them():
     lags = Lags(1, 1, states=1, inputs=2)
-    angles, inputs = np.arange(6.0)[:, None], 10 + np.arange(5.0)[:, None]
+    angles = np.arange(6.0)[:, None]
+    inputs = 10 + np.arange(5.0)[:, None]
     data = lags.transitions(angles, inputs)
     assert data.states.tolist() == [[2, 1, 11, 10], [3, 2, 12, 11], [4, 3, 13, 12]]
     assert data.inputs.tolist() == [[12], [13], [14]]
@@ -220,7 +232,8 @@ def test_lags_are_shifted_and_a_velocity_that_is_not_measured_is_found_in_them()
         data.states, data.inputs
     )  # the learned part moves the first entry only
     assert shifted[:, 1:].tolist() == data.next_states[:, 1:].tolist()
-    x, u = [torch.tensor([0.5, 0.0], dtype=F)], draw(4, 150, 1)
+    x = [torch.tensor([0.5, 0.0], dtype=F)]
+    u = draw(4, 150, 1)
     for k in range(150):
         x.append(pendulum(x[-1], u[k]))
     measured = torch.stack(x)[:, :1].numpy()
@@ -259,7 +272,8 @@ def test_a_nominal_model_and_an_effect_are_saved_by_the_path_they_are_imported_f
     model = with_effect(nominal, effect)
     save_model(model, tmp_path / "m.safetensors")
     loaded = load_model(tmp_path / "m.safetensors", trusted=["tests"])
-    x, u = draw(8, 6, 2), draw(9, 6, 1)
+    x = draw(8, 6, 2)
+    u = draw(9, 6, 1)
     for ours, theirs in zip(
         model.linearize(x.numpy(), u.numpy()),
         loaded.linearize(x.numpy(), u.numpy()),
@@ -276,10 +290,9 @@ def test_code_without_a_path_is_refused_and_so_is_a_path_that_leads_nowhere(
     ):
         save_model(with_effect(lambda x, u: x), tmp_path / "m")
     save_model(with_effect(), tmp_path / "m")
-    x, u = (
-        casadi.MX.sym("x", 2),
-        casadi.MX.sym("u", 1),
-    )  # a table is no operation that a file holds
+    # a table is no operation that a file holds
+    x = casadi.MX.sym("x", 2)
+    u = casadi.MX.sym("u", 1)
     table = casadi.interpolant("table", "linear", [[0.0, 1.0]], [0.0, 2.0])
     with pytest.raises(
         UnsupportedModel, match="nominal is code that a file cannot name"
@@ -327,7 +340,8 @@ def test_misuse_is_refused(settings, error, rule):
 @pytest.mark.parametrize("name", ["angles", "effect in torch"])
 def test_torch_can_follow_the_jacobian_which_is_that_of_the_fast_road(name):
     model = MODELS[name]()
-    x, u = draw(8, 5, model.state_dim), draw(9, 5, model.input_dim)
+    x = draw(8, 5, model.state_dim)
+    u = draw(9, 5, model.input_dim)
     fast, A, B = predict_with_jacobian(model, x, u)
     followed, slow_A, slow_B = predict_with_jacobian(
         model, x.clone().requires_grad_(), u
@@ -340,11 +354,9 @@ def test_torch_can_follow_the_jacobian_which_is_that_of_the_fast_road(name):
 @pytest.mark.parametrize("name", ["angles", "fewer outputs", "all in CasADi"])
 def test_a_model_with_features_is_exported_to_casadi(name):
     model = MODELS[name]()
-    function, x, u = (
-        casadi_function(model),
-        draw(8, model.state_dim),
-        draw(9, model.input_dim),
-    )
+    function = casadi_function(model)
+    x = draw(8, model.state_dim)
+    u = draw(9, model.input_dim)
     belief = model.predict(x, u)
     mean, variance = function(x.numpy(), u.numpy())
     np.testing.assert_allclose(mean.full()[:, 0], belief.mean.numpy(), atol=1e-11)

@@ -65,9 +65,11 @@ def six_hostile_models(good, canary):
     }
     contents = {}
     for name, found in headers.items():
-        prefix, inner = "", found
+        prefix = ""
+        inner = found
         while "model" in inner:
-            prefix, inner = f"{prefix}model/", inner["model"]
+            prefix = f"{prefix}model/"
+            inner = inner["model"]
         own = {f"{prefix}{key}": array for key, array in arrays.items()}
         whole = {
             key: header[key] for key in ("format", "format_version", "kernel")
@@ -128,7 +130,8 @@ def test_code_of_a_package_is_loaded_where_the_caller_names_it_and_the_error_say
         match=r"nominal is the code 'tests.models.hostile:pull'.*trusted=\['tests'\].*model.trusted=\[tests\]",
     ):
         load_model(path)
-    x, u = torch.ones(1, 2, dtype=torch.float64), torch.ones(1, 2, dtype=torch.float64)
+    x = torch.ones(1, 2, dtype=torch.float64)
+    u = torch.ones(1, 2, dtype=torch.float64)
     for trusted in (["tests"], ("other", "tests.models")):
         loaded = load_model(path, trusted=trusted)
         assert torch.equal(loaded.predict(x, u).mean, with_code().predict(x, u).mean)
@@ -159,7 +162,8 @@ def test_a_function_that_gpmpc_lists_needs_no_trust(saved):
         header["memory_order"]["noise"] = [0, 1]
 
     model = load_model(saved(residual_model(), sine))
-    x, u = torch.ones(1, 2, dtype=torch.float64), torch.ones(1, 2, dtype=torch.float64)
+    x = torch.ones(1, 2, dtype=torch.float64)
+    u = torch.ones(1, 2, dtype=torch.float64)
     assert model.predict(x, u).mean.shape == (1, 2)
 
 

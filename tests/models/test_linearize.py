@@ -19,7 +19,8 @@ from gpmpc.models import (
     linearize_by_autograd,
 )
 
-N, M = 3, 2
+N = 3
+M = 2
 
 
 def draw(seed, *shape):
@@ -47,13 +48,11 @@ def posterior(predicts="next_state", n=N, m=M, k=N):
 class Bare:
     """Has nothing but what every model must have."""
 
-    state_dim, input_dim, output_dim, dtype, device = (
-        N,
-        M,
-        N,
-        torch.float64,
-        torch.device("cpu"),
-    )
+    state_dim = N
+    input_dim = M
+    output_dim = N
+    dtype = torch.float64
+    device = torch.device("cpu")
     noise_covariance = torch.zeros(N, N, dtype=torch.float64)
 
     def predict(self, state, input):
@@ -87,7 +86,8 @@ MODELS = {
 @pytest.mark.parametrize("name", MODELS)
 def test_an_expansion_is_the_derivative_of_the_prediction(name, points):
     model = MODELS[name]()
-    x, u = draw(8, points, N), draw(9, points, M)
+    x = draw(8, points, N)
+    u = draw(9, points, M)
     found = linearize(model, x.numpy(), u.numpy())
     belief = model.predict(x, u)
     A, B = torch.func.vmap(
@@ -110,7 +110,8 @@ def test_an_expansion_is_the_derivative_of_the_prediction(name, points):
 )
 def test_a_float32_model_converts_by_itself(name):
     model = MODELS[name]()
-    x, u = draw(8, 4, N).numpy(), draw(9, 4, M).numpy()
+    x = draw(8, 4, N).numpy()
+    u = draw(9, 4, M).numpy()
     for got, expected in zip(
         model.to(dtype=torch.float32).linearize(x, u),
         model.linearize(x, u),
@@ -124,7 +125,8 @@ def test_what_is_slow_is_logged_once(caplog):
     class Slow(Bare):
         pass
 
-    x, u = np.zeros((2, N)), np.zeros((2, M))
+    x = np.zeros((2, N))
+    u = np.zeros((2, M))
     with caplog.at_level(logging.WARNING):
         for _ in range(3):
             linearize_by_autograd(Slow(), x, u)
@@ -155,13 +157,13 @@ def test_points_that_do_not_fit_are_an_error():
 
 
 def test_a_nominal_model_in_casadi_is_the_one_in_torch():
-    x, u = casadi.SX.sym("x", N), casadi.SX.sym("u", M)
+    x = casadi.SX.sym("x", N)
+    u = casadi.SX.sym("u", M)
     after = x + 0.1 * casadi.vertcat(casadi.sin(x[1]), x[2] * u[0], u[1] - x[0])
-    theirs, ours = (
-        residual(CasadiFunction(casadi.Function("f", [x, u], [after]))),
-        residual(pendulum),
-    )
-    points, inputs = draw(8, 5, N), draw(9, 5, M)
+    theirs = residual(CasadiFunction(casadi.Function("f", [x, u], [after])))
+    ours = residual(pendulum)
+    points = draw(8, 5, N)
+    inputs = draw(9, 5, M)
     for _ in range(2):
         for got, expected in zip(theirs.linearize(points.numpy(), inputs.numpy()), ours.linearize(
             points.numpy(), inputs.numpy()), strict=True):  # fmt: skip

@@ -38,7 +38,8 @@ def draw(seed, *shape):
 
 def gp(outputs, predicts, noise=0.01, by_input=1.0):
     ones = torch.ones(outputs, dtype=F)
-    scales, targets = 1 + draw(3, outputs, 3).abs(), 0.3 * draw(2, 25, outputs)
+    scales = 1 + draw(3, outputs, 3).abs()
+    targets = 0.3 * draw(2, 25, outputs)
     scales[:, 2] /= by_input
     return GPPosterior.from_hyperparameters(
         draw(1, 25, 3), targets, scales, ones, noise * ones, 1, predicts
@@ -85,9 +86,14 @@ def test_a_noisy_model_is_a_model_and_what_holds_it_is_one(inner, outputs):
 
 
 def test_all_noise_is_in_the_prediction_and_the_mean_stays():
-    model, x, u = noisy(), draw(7, 6, 2), draw(8, 6, 1)
-    inner, g = model.model, model.log_noise.predict(x, u)
-    belief, alone, noise = model.predict(x, u), inner.predict(x, u), model.noise(x, u)
+    model = noisy()
+    x = draw(7, 6, 2)
+    u = draw(8, 6, 1)
+    inner = model.model
+    g = model.log_noise.predict(x, u)
+    belief = model.predict(x, u)
+    alone = inner.predict(x, u)
+    noise = model.noise(x, u)
     assert torch.equal(belief.mean, alone.mean)
     assert torch.equal(belief.covariance, alone.covariance + noise)
     assert torch.equal(noise[:, 0, 0], torch.full((6,), 0.01, dtype=F))
@@ -129,7 +135,8 @@ def test_moments_have_no_closed_form():
 
 
 def test_a_filter_is_that_of_the_noise_at_the_belief():
-    model, sensor = noisy(), Measurement.of_states(2, [0], std=[0.1])
+    model = noisy()
+    sensor = Measurement.of_states(2, [0], std=[0.1])
     at = model.noise(QUIET.mean, PUSH)
     fixed = residual(at)
     same = NoisyModel(MODELS["residual"], model.log_noise, (1,))
@@ -169,7 +176,9 @@ def test_the_tube_of_a_controller_holds_the_noise_where_it_goes(covariance, kind
 def test_a_file_holds_both_parts(tmp_path):
     model = DelayedModel(noisy("residual", (1, 0)), 1)
     save_model(model, tmp_path / "m.safetensors")
-    read, x, u = load_model(tmp_path / "m.safetensors"), draw(7, 6, 3), draw(8, 6, 1)
+    read = load_model(tmp_path / "m.safetensors")
+    x = draw(7, 6, 3)
+    u = draw(8, 6, 1)
     assert read.model.outputs == [1, 0]
     assert torch.equal(read.predict(x, u).covariance, model.predict(x, u).covariance)
 

@@ -52,8 +52,10 @@ def belief(spread=0.3):
 
 @pytest.mark.parametrize("nominal", [AFFINE, nonlinear])
 def test_the_prediction_is_the_nominal_one_and_the_residual_where_it_acts(nominal):
-    x, u = torch.rand(4, 3), torch.rand(4, 2)
-    found, d = model(nominal).predict(x, u), gp().predict(x[:, [2, 0]], u[:, [1]])
+    x = torch.rand(4, 3)
+    u = torch.rand(4, 2)
+    found = model(nominal).predict(x, u)
+    d = gp().predict(x[:, [2, 0]], u[:, [1]])
     assert torch.allclose(found.mean, nominal(x, u) + d.mean @ B.T)
     assert torch.allclose(found.covariance, B @ d.covariance @ B.T)
     assert torch.allclose(
@@ -63,7 +65,10 @@ def test_the_prediction_is_the_nominal_one_and_the_residual_where_it_acts(nomina
 
 @pytest.mark.parametrize("nominal", [AFFINE, nonlinear])
 def test_the_jacobian_is_that_of_finite_differences(nominal):
-    known, x, u, step = model(nominal), torch.rand(2, 4, 3), torch.rand(2, 4, 2), 1e-6
+    known = model(nominal)
+    x = torch.rand(2, 4, 3)
+    u = torch.rand(2, 4, 2)
+    step = 1e-6
     _, by_state, by_input = predict_with_jacobian(known, x, u)
     for d in range(3):
         shift = step * torch.eye(3)[d]
@@ -80,7 +85,9 @@ def test_the_jacobian_is_that_of_finite_differences(nominal):
 
 
 def test_moment_matching_with_an_affine_nominal_model_is_what_sampling_finds():
-    known, at, control = model(), belief(), torch.tensor([0.3, -0.5])
+    known = model()
+    at = belief()
+    control = torch.tensor([0.3, -0.5])
     exact = MomentMatching().propagate(known, at, control)
     found = [
         MonteCarlo(20_000, seed=seed).propagate(known, at, control)
@@ -98,7 +105,9 @@ def test_moment_matching_with_an_affine_nominal_model_is_what_sampling_finds():
 
 
 def test_a_nonlinear_nominal_model_goes_with_every_other_propagation():
-    known, at, control = model(nonlinear), belief(0.05), torch.tensor([0.3, -0.5])
+    known = model(nonlinear)
+    at = belief(0.05)
+    control = torch.tensor([0.3, -0.5])
     with pytest.raises(
         UnsupportedModel,
         match="Possible with any model: MeanEquivalence, Linearization, Unscented",
@@ -116,10 +125,8 @@ def test_a_nonlinear_nominal_model_goes_with_every_other_propagation():
 
 def transitions(rows, noise=1e-3, seed=0):
     generator = torch.Generator().manual_seed(seed)
-    x, u = (
-        3 * torch.rand(rows, 3, generator=generator) - 1.5,
-        torch.rand(rows, 2, generator=generator),
-    )
+    x = 3 * torch.rand(rows, 3, generator=generator) - 1.5
+    u = torch.rand(rows, 2, generator=generator)
     moved = AFFINE(x, u) + torch.sin(2 * x[:, :1]) * torch.tensor([0.0, 0.5, 1.0])
     return Transitions(x, u, moved + noise * torch.randn(rows, 3, generator=generator))
 
@@ -162,7 +169,8 @@ def test_a_residual_model_learns_while_it_runs():
     )
     grown = known.append(data[20:])
     assert len(grown.residual) == 60
-    x, u = transitions(20, seed=1).states, transitions(20, seed=1).inputs
+    x = transitions(20, seed=1).states
+    u = transitions(20, seed=1).inputs
     assert (
         grown.predict(x, u).covariance[:, 2, 2]
         < known.predict(x, u).covariance[:, 2, 2]
@@ -180,7 +188,8 @@ def test_a_residual_model_learns_while_it_runs():
 
 
 def test_a_residual_model_can_be_moved_to_single_precision():
-    x, u = torch.rand(4, 3), torch.rand(4, 2)
+    x = torch.rand(4, 3)
+    u = torch.rand(4, 2)
     single = model().to(dtype=torch.float32)
     assert torch.allclose(
         single.predict(x.float(), u.float()).mean.double(),

@@ -60,22 +60,23 @@ MODELS = {
 
 @pytest.mark.parametrize("kind", MODELS)
 def test_a_roll_out_obeys_the_model_and_the_feedback_within_its_bounds(kind):
-    model, random = MODELS[kind](), np.random.default_rng(0)
-    T, H, n, m = 3, 6, model.state_dim, 2
-    planned, inputs, gains = (
-        random.normal(size=(T, H + 1, n)),
-        random.normal(size=(T, H, m)),
-        random.normal(size=(H, m, n)),
-    )
+    model = MODELS[kind]()
+    random = np.random.default_rng(0)
+    T = 3
+    H = 6
+    n = model.state_dim
+    m = 2
+    planned = random.normal(size=(T, H + 1, n))
+    inputs = random.normal(size=(T, H, m))
+    gains = random.normal(size=(H, m, n))
     bounds = [
         np.array(side)
         for side in ([-0.8, -np.inf], [0.9, np.inf], [-np.inf, -0.7], [np.inf, 0.6])
     ]
-    last, disturbance = np.array([0.1, 0.2]), 0.1 * random.normal(size=n)
-    start, limits = (
-        random.normal(size=(T, n)),
-        [np.tile(bound, (H, 1)) for bound in bounds],
-    )
+    last = np.array([0.1, 0.2])
+    disturbance = 0.1 * random.normal(size=n)
+    start = random.normal(size=(T, n))
+    limits = [np.tile(bound, (H, 1)) for bound in bounds]
     states, applied = RollOut(model)(
         start, Feedback(planned, inputs, gains[None], *limits, last), disturbance
     )
@@ -98,12 +99,11 @@ def test_a_roll_out_obeys_the_model_and_the_feedback_within_its_bounds(kind):
 
 
 def test_plans_may_have_gains_of_their_own():
-    model, random = MODELS["differences"](), np.random.default_rng(1)
-    planned, inputs, gains = (
-        random.normal(size=(2, 5, 3)),
-        random.normal(size=(2, 4, 2)),
-        random.normal(size=(2, 4, 2, 3)),
-    )
+    model = MODELS["differences"]()
+    random = np.random.default_rng(1)
+    planned = random.normal(size=(2, 5, 3))
+    inputs = random.normal(size=(2, 4, 2))
+    gains = random.normal(size=(2, 4, 2, 3))
     free = [np.full((4, 2), side) for side in (-np.inf, np.inf, -np.inf, np.inf)]
     rest = (*free, np.zeros(2))
     both = RollOut(model)(planned[:, 0], Feedback(planned, inputs, gains, *rest))
@@ -116,7 +116,8 @@ def test_plans_may_have_gains_of_their_own():
 
 
 def test_starts_of_whole_numbers_and_strided_disturbances_are_taken_as_they_are():
-    roll_out, inputs = RollOut(MODELS["differences"]()), np.zeros((1, 3, 2))
+    roll_out = RollOut(MODELS["differences"]())
+    inputs = np.zeros((1, 3, 2))
     wide = np.arange(9.0).reshape(3, 3) / 10
     expected = roll_out.open_loop(
         np.array([[1.0, 0.0, 1.0]]), inputs, wide[:, 0].copy()

@@ -19,7 +19,8 @@ from gpmpc.models import Affine, DelayedModel, DisturbedModel, Lags, ResidualMod
 from gpmpc.models._residual import train_residual
 from gpmpc.propagation import Linearization, MonteCarlo, Unscented
 
-STEP, F = 0.05, torch.float64
+STEP = 0.05
+F = torch.float64
 IDENTITY = Affine.identity(2, 1)
 EXACT = Trainer(restarts=0)
 
@@ -39,7 +40,9 @@ def shown(x, lowest=-np.pi):
 
 def flight(start, torque, steps=150, seed=0):
     """States (steps + 1, 2), whose angles count turns, and inputs (steps, 1)."""
-    rng, states, inputs = np.random.default_rng(seed), [np.array(start)], []
+    rng = np.random.default_rng(seed)
+    states = [np.array(start)]
+    inputs = []
     for _ in range(steps):
         inputs.append(rng.uniform(-torque, torque, 1))
         states.append(pendulum(states[-1], inputs[-1]))
@@ -102,7 +105,8 @@ def test_appended_rows_that_wrap_teach_what_rows_do_that_count_turns(window):
 
 def test_targets_of_differences_leave_out_the_turns_of_declared_angles_alone():
     data = transitions("hanging")
-    plain, declared = data.targets("difference"), data.targets("difference", [0])
+    plain = data.targets("difference")
+    declared = data.targets("difference", [0])
     assert plain[:, 0].abs().max() > 6.0
     assert declared[:, 0].abs().max() < 1.0
     assert torch.equal(plain[:, 1], declared[:, 1])
@@ -137,8 +141,13 @@ def test_predictions_go_on_without_a_jump_where_an_angle_passes_half_a_turn(nomi
 class Wrapping:
     """A model of the own that wraps its angle, and says that it is one."""
 
-    state_dim, output_dim, input_dim, angles = 2, 2, 1, (0,)
-    dtype, device, noise_covariance = F, torch.device("cpu"), 1e-6 * torch.eye(2).to(F)
+    state_dim = 2
+    output_dim = 2
+    input_dim = 1
+    angles = (0,)
+    dtype = F
+    device = torch.device("cpu")
+    noise_covariance = 1e-6 * torch.eye(2).to(F)
 
     def predict(self, state, input):
         mean = wrapping_pendulum(state, input)
@@ -249,7 +258,8 @@ def test_honest_large_steps_are_no_turns(steps, caplog):
 
 
 def test_every_difference_of_states_leaves_whole_turns_out_of_arrays_and_tensors():
-    one, other = np.array([[3.1, 5.0], [-9.0, 0.0]]), np.array([[-3.1, -5.0]])
+    one = np.array([[3.1, 5.0], [-9.0, 0.0]])
+    other = np.array([[-3.1, -5.0]])
     for kind in (np.array, torch.tensor):
         found = state_difference(kind(one), kind(other), [0])
         assert np.allclose(found, [[6.2 - 2 * np.pi, 10.0], [-5.9 + 2 * np.pi, 5.0]])

@@ -7,14 +7,15 @@ from numba import njit
 from gpmpc.gaussian import Gaussian
 from gpmpc.models import Linearized
 
-MASS, LENGTH, CENTRE, GRAVITY = (
-    (0.523, 0.626),
-    0.2,
-    (0.2, 0.256),
-    9.81,
-)  # [kg], [m], [m], [m/s^2]
+# [kg], [m], [m], [m/s^2]
+MASS = (0.523, 0.626)
+LENGTH = 0.2
+CENTRE = (0.2, 0.256)
+GRAVITY = 9.81
 INERTIA = (0.0319, 0.0509)  # about the joints [kg m^2]
-PENDUBOT, ACROBOT = 0, 1  # the driven joint: shoulder, elbow
+# the driven joint: shoulder, elbow
+PENDUBOT = 0
+ACROBOT = 1
 UPRIGHT = np.array(
     [np.pi, 0.0, 0.0, 0.0]
 )  # angle from hanging down, relative angle of the second link; their rates
@@ -27,15 +28,11 @@ def derivative(x, u, joint):
     (m1, m2), (r1, r2), (I1, I2) = MASS, CENTRE, INERTIA
     q1, q2, v1, v2 = x
     h = m2 * LENGTH * r2
-    M11, M12, M22 = (
-        I1 + I2 + m2 * LENGTH**2 + 2 * h * np.cos(q2),
-        I2 + h * np.cos(q2),
-        I2,
-    )
-    gravity1, gravity2 = (
-        GRAVITY * (m1 * r1 + m2 * LENGTH) * np.sin(q1),
-        GRAVITY * m2 * r2 * np.sin(q1 + q2),
-    )
+    M11 = I1 + I2 + m2 * LENGTH**2 + 2 * h * np.cos(q2)
+    M12 = I2 + h * np.cos(q2)
+    M22 = I2
+    gravity1 = GRAVITY * (m1 * r1 + m2 * LENGTH) * np.sin(q1)
+    gravity2 = GRAVITY * m2 * r2 * np.sin(q1 + q2)
     f1 = (
         h * np.sin(q2) * (2 * v1 * v2 + v2 * v2)
         - gravity1
@@ -71,7 +68,9 @@ def advance(x, u, joint):
 def expand_at(states, inputs, joint):
     """Next states, and their exact derivatives, by a complex step in each direction."""
     K = len(states)
-    mean, A, B = np.empty((K, 4)), np.empty((K, 4, 4)), np.empty((K, 4, 1))
+    mean = np.empty((K, 4))
+    A = np.empty((K, 4, 4))
+    B = np.empty((K, 4, 1))
     for k in range(K):
         mean[k] = advance(states[k] + 0j, inputs[k, 0] + 0j, joint).real
         for j in range(4):
@@ -87,13 +86,11 @@ def expand_at(states, inputs, joint):
 class DoublePendulum:
     """The pendulum itself as a model without uncertainty."""
 
-    state_dim, output_dim, input_dim, dtype, device = (
-        4,
-        4,
-        1,
-        torch.float64,
-        torch.device("cpu"),
-    )
+    state_dim = 4
+    output_dim = 4
+    input_dim = 1
+    dtype = torch.float64
+    device = torch.device("cpu")
     noise_covariance = torch.zeros(4, 4)
 
     def __init__(self, joint):

@@ -9,19 +9,19 @@ from gpmpc.gp import GPPosterior
 class LinearGaussian:
     """x+ = A x + B u + c + w, w ~ N(0, W)."""
 
-    dtype, device = torch.float64, torch.device("cpu")
+    dtype = torch.float64
+    device = torch.device("cpu")
 
     def __init__(self, A, B, c=None, W=None):
-        self.A, self.B = torch.tensor(A), torch.tensor(B)
+        self.A = torch.tensor(A)
+        self.B = torch.tensor(B)
         n, m = self.B.shape
         self.c = torch.zeros(n) if c is None else torch.tensor(c)
         self.W = torch.zeros(n, n) if W is None else torch.tensor(W)
-        self.state_dim, self.output_dim, self.input_dim, self.noise_covariance = (
-            n,
-            n,
-            m,
-            torch.zeros(n, n),
-        )
+        self.state_dim = n
+        self.output_dim = n
+        self.input_dim = m
+        self.noise_covariance = torch.zeros(n, n)
 
     def predict(self, state, input=None):
         mean = state @ self.A.mT + input @ self.B.mT + self.c

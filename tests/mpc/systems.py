@@ -71,7 +71,8 @@ class LinearPlant:
         self.input_names = tuple(f"u{i}" for i in range(model.input_dim))
 
     def successor(self, x, u):
-        n, m = len(self.A), len(self.B[0])
+        n = len(self.A)
+        m = len(self.B[0])
         return [
             self.c[i]
             + sum(self.A[i][j] * x[j] for j in range(n))
@@ -83,10 +84,8 @@ class LinearPlant:
 def quadrotor_gp(N=60, seed=0):
     """Six GPs on transitions of the integrated translational quadrotor; the hyperparameters are set, not trained."""
     rng = np.random.default_rng(seed)
-    x, u = (
-        rng.uniform(-1, 1, (N, 6)),
-        HOVER + rng.uniform(-1, 1, (N, 3)) * [3, 0.4, 0.4],
-    )
+    x = rng.uniform(-1, 1, (N, 6))
+    u = HOVER + rng.uniform(-1, 1, (N, 3)) * [3, 0.4, 0.4]
     y = np.array([step(QUADROTOR, a, b) for a, b in zip(x, u, strict=True)])
     lengthscales = torch.tensor([[10.0, 2.0, 10.0, 2.0, 10.0, 2.0, 6.0, 1.0, 1.0]] * 6)
     return GPPosterior.from_hyperparameters(

@@ -66,13 +66,12 @@ def test_iterated_programs_reach_the_optimum_of_the_nonlinear_method(propagator)
 
 
 def test_dual_primal_and_state_form_give_the_same_inputs():
-    gp, active = quadrotor_gp(), 0
+    gp = quadrotor_gp()
+    active = 0
     asked = (gp, Linearization(), problem(0.02), H, HOVER)
-    ours, primal, state_form = (
-        GPMPC(*asked),
-        GPMPC(*asked, solver=PrimalActiveSet()),
-        StateFormMPC(*asked),
-    )
+    ours = GPMPC(*asked)
+    primal = GPMPC(*asked, solver=PrimalActiveSet())
+    state_form = StateFormMPC(*asked)
     for belief, reference in questions(5, 0.0):
         plan = ours.control(belief, reference)
         active += len(plan.solution.active_set)
@@ -85,17 +84,16 @@ def test_dual_primal_and_state_form_give_the_same_inputs():
 
 def test_a_bound_that_takes_a_large_step_of_the_inputs_is_kept_by_iterated_programs_only():
     """Thrust and tilt multiply: where both have to change at once, one linearisation at the last inputs is far off."""
-    gp, limit = quadrotor_gp(150), 0.05
+    gp = quadrotor_gp(150)
+    limit = 0.05
     sides = np.full(6, np.inf)
     sides[0] = limit
     bounded = replace(
         problem(0.5), constraints=[Box(None, sides, probability=0.99, penalty=100)]
     )
     start = np.array([0.0, 0.4, 0.0, 0.0, 0.0, -0.5])
-    belief, reference = (
-        Gaussian.certain(start),
-        Reference(np.stack([start, [0.2, 0.4, 0.0, 0.0, 0.3, 0.5]])),
-    )
+    belief = Gaussian.certain(start)
+    reference = Reference(np.stack([start, [0.2, 0.4, 0.0, 0.0, 0.3, 0.5]]))
     reached = []
     for iterations in (1, 30):
         asked = (gp, Linearization(process_noise=True), bounded, 1, HOVER)

@@ -71,7 +71,10 @@ def flown(iterations, tolerance=None):
         known(system), Linearization(), problem, 15, system.initial_input, MEANS,
         iterations=iterations, tolerance=tolerance,
     )  # fmt: skip
-    state, decision, cost, programs = np.zeros(6), None, 0.0, []
+    state = np.zeros(6)
+    decision = None
+    cost = 0.0
+    programs = []
     for k in range(60):
         goal = np.zeros(6)
         goal[[0, 2]] = [(0.0, 0.0), (1.5, 0.5), (-1.5, 0.0)][k // 20]

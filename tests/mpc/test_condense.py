@@ -86,7 +86,9 @@ def at(array, k):
 def stacked_response(stages, start, H):
     """Gamma (H, p, H, m) and s^0 (H, p), a product at a time."""
     p, m = stages.B.shape[1:]
-    gamma, free, s = np.zeros((H, p, H, m)), np.zeros((H, p)), start
+    gamma = np.zeros((H, p, H, m))
+    free = np.zeros((H, p))
+    s = start
     for k in range(H):
         free[k] = s = at(stages.A, k) @ s + at(stages.c, k)
         if k:
@@ -97,16 +99,19 @@ def stacked_response(stages, start, H):
 
 @pytest.mark.parametrize("terminal", ["own", "the same"])
 def test_constant_stages_are_stages_that_vary_and_do_not(terminal, rng):
-    n, m, r, blocks, H = 3, 2, 2, 4, 9
-    Q, R = spd(rng, n), spd(rng, m)
+    n = 3
+    m = 2
+    r = 2
+    blocks = 4
+    H = 9
+    Q = spd(rng, n)
+    R = spd(rng, m)
     T = spd(rng, n) if terminal == "own" else Q
     condenser = Condensing(
         Problem(Tracking(Q, R, terminal=T, penalized="inputs")), H, blocks
     )
-    stages, start = (
-        random_stages(rng, n * blocks, m, H, held=True),
-        rng.normal(size=n * blocks),
-    )
+    stages = random_stages(rng, n * blocks, m, H, held=True)
+    start = rng.normal(size=n * blocks)
     references = random_references(rng, H, n, m)
     rows = state_rows(
         rng.normal(size=(1, r, n * blocks)), -np.ones((H, r)), np.ones((H, r))
@@ -130,18 +135,21 @@ def test_constant_stages_are_stages_that_vary_and_do_not(terminal, rng):
 @pytest.mark.parametrize("held", [True, False], ids=["held", "varying"])
 @pytest.mark.parametrize("penalized", PENALIZED)
 def test_the_condensed_problem_is_the_stacked_one(H, blocks, held, penalized, rng):
-    n, m, r, p = 3, 2, 4, 3 * blocks
-    Q, T, R = spd(rng, n), spd(rng, n), spd(rng, m)
+    n = 3
+    m = 2
+    r = 4
+    p = 3 * blocks
+    Q = spd(rng, n)
+    T = spd(rng, n)
+    R = spd(rng, m)
     problem = Problem(
         Tracking(Q, R, terminal=T, penalized=penalized),
         input_rates=Box([-1.0, -2.0], [1.0, np.inf]),
     )
     condenser = Condensing(problem, H, blocks)
-    stages, start, references = (
-        random_stages(rng, p, m, H, held),
-        rng.normal(size=p),
-        random_references(rng, H, n, m),
-    )
+    stages = random_stages(rng, p, m, H, held)
+    start = rng.normal(size=p)
+    references = random_references(rng, H, n, m)
     rows = state_rows(
         rng.normal(size=(len(stages.A), r, p)), np.zeros((H, r)), np.ones((H, r))
     )
@@ -200,12 +208,17 @@ def test_the_condensed_problem_is_the_stacked_one(H, blocks, held, penalized, rn
 
 def test_in_increments_it_is_the_papers_problem(rng):
     """Cao, Lai and Alam (2017), (38)-(39) with the missing factor 2, on s = [mu; vec S] of three states."""
-    n, m, H = 3, 2, 5
+    n = 3
+    m = 2
+    H = 5
     p = n + n * n
-    Q, R = spd(rng, n), spd(rng, m)
+    Q = spd(rng, n)
+    R = spd(rng, m)
     A, B, *_ = random_stages(rng, p, m, H, held=True)
     A[0, :, n:] = 0.0  # as at a measured state
-    s0, before, last = rng.normal(size=p), rng.normal(size=p), rng.normal(size=m)
+    s0 = rng.normal(size=p)
+    before = rng.normal(size=p)
+    last = rng.normal(size=m)
     targets = rng.normal(size=(H, n))
     condenser = Condensing(Problem(Tracking(Q, R, penalized="inputs")), H, n + 1)
     c = s0 - A[0] @ before - B[0] @ last
@@ -223,8 +236,10 @@ def test_in_increments_it_is_the_papers_problem(rng):
             for i in range(H)
         ]
     )
-    T_z, T_u = np.kron(np.tri(H), np.eye(p)), np.kron(np.tri(H), np.eye(m))
-    Q_tilde, R_tilde = np.kron(np.eye(H), Qbar), np.kron(np.eye(H), R)
+    T_z = np.kron(np.tri(H), np.eye(p))
+    T_u = np.kron(np.tri(H), np.eye(m))
+    Q_tilde = np.kron(np.eye(H), Qbar)
+    R_tilde = np.kron(np.eye(H), R)
     r = np.zeros((H, p))
     r[:, :n] = targets
     paper_P = 2 * (B_tilde.T @ T_z.T @ Q_tilde @ T_z @ B_tilde + T_u.T @ R_tilde @ T_u)
@@ -243,9 +258,16 @@ def test_in_increments_it_is_the_papers_problem(rng):
 @pytest.mark.parametrize("held", [True, False], ids=["held", "varying"])
 @pytest.mark.parametrize("penalized", PENALIZED)
 def test_feedback_coordinates_give_the_same_plan(penalized, held, rated, rng):
-    n, m, r, blocks, H = 3, 2, 2, 2, 8
-    p, solver = n * blocks, DualActiveSet()
-    Q, T, R = spd(rng, n), spd(rng, n), spd(rng, m)
+    n = 3
+    m = 2
+    r = 2
+    blocks = 2
+    H = 8
+    p = n * blocks
+    solver = DualActiveSet()
+    Q = spd(rng, n)
+    T = spd(rng, n)
+    R = spd(rng, m)
     rates = {"input_rates": Box([-0.4, -0.3], [0.4, np.inf])} if rated else {}
     problem = Problem(
         Tracking(Q, R, terminal=T, penalized=penalized),
@@ -253,18 +275,17 @@ def test_feedback_coordinates_give_the_same_plan(penalized, held, rated, rng):
         **rates,
     )
     condenser = Condensing(problem, H, blocks)
-    stages, start, references = (
-        random_stages(rng, p, m, H, held),
-        rng.normal(size=p),
-        random_references(rng, H, n, m),
-    )
+    stages = random_stages(rng, p, m, H, held)
+    start = rng.normal(size=p)
+    references = random_references(rng, H, n, m)
     rows = state_rows(
         rng.normal(size=(len(stages.A), r, p)),
         np.full((H, r), -3.0),
         np.full((H, r), 4.0),
     )
     price = np.full(H * r, 2.0)
-    found, plain = [], condenser.condense(stages, start, references, rows)
+    found = []
+    plain = condenser.condense(stages, start, references, rows)
     assert len(plain.feedback) == 0
     other = condense_with_feedback(
         condenser.cost, condenser.bounds, stages, start, references, rows
@@ -293,35 +314,37 @@ def test_feedback_coordinates_give_the_same_plan(penalized, held, rated, rng):
 def test_weights_by_stage_outputs_and_rows_of_inputs_make_the_stacked_problem_in_both_coordinates(
     penalized, held, rng
 ):
-    n, m, r, blocks, H = 3, 2, 2, 2, 6
-    p, z = n * blocks, n + m + 1
-    Q, R = (
-        np.array([spd(rng, n) for _ in range(H)]),
-        np.array([spd(rng, m) for _ in range(H)]),
-    )
+    n = 3
+    m = 2
+    r = 2
+    blocks = 2
+    H = 6
+    p = n * blocks
+    z = n + m + 1
+    Q = np.array([spd(rng, n) for _ in range(H)])
+    R = np.array([spd(rng, m) for _ in range(H)])
     outputs = rng.normal(size=(H, 2, z))
     problem = Problem(
         Tracking(Q, R, terminal=spd(rng, n), penalized=penalized),
         inputs=Box([-0.4] * m, [0.5] * m),
     )
     condenser = Condensing(problem, H, blocks, outputs.mT @ outputs)
-    stages, start, references = (
-        random_stages(rng, p, m, H, held),
-        rng.normal(size=p),
-        random_references(rng, H, n, m),
-    )
-    E, D = rng.normal(size=(H, r, p)), rng.normal(size=(H, r, m))
+    stages = random_stages(rng, p, m, H, held)
+    start = rng.normal(size=p)
+    references = random_references(rng, H, n, m)
+    E = rng.normal(size=(H, r, p))
+    D = rng.normal(size=(H, r, m))
     rows = StageRows(E, D, np.full((H, r), -3.0), np.full((H, r), 1.0))
     W, _ = problem.cost.by_stage(H)
 
     def cost_and_rows(inputs):
-        s, total, values = start, 0.0, []
+        s = start
+        total = 0.0
+        values = []
         for k, u in enumerate(inputs):
             s = at(stages.A, k) @ s + at(stages.B, k) @ u + at(stages.c, k)
-            error, before = (
-                s.reshape(blocks, n).copy(),
-                inputs[k - 1] if k else references.previous_input,
-            )
+            error = s.reshape(blocks, n).copy()
+            before = inputs[k - 1] if k else references.previous_input
             error[0] -= references.states[k]
             v = {
                 "inputs": u,
@@ -333,7 +356,8 @@ def test_weights_by_stage_outputs_and_rows_of_inputs_make_the_stacked_problem_in
             values.append(at(E, k) @ s + D[k] @ u)
         return total, np.array(values)
 
-    rest, plans = cost_and_rows(np.zeros((H, m))), []
+    rest = cost_and_rows(np.zeros((H, m)))
+    plans = []
     with_feedback = condense_with_feedback(
         condenser.cost, condenser.bounds, stages, start, references, rows
     )
@@ -374,9 +398,9 @@ def test_an_unstable_plant_is_condensed_in_feedback_coordinates_and_the_plan_is_
     rng,
 ):
     """x+ = 2 x + u over 50 stages: 2^100 stands beside R in P, and nothing of R is left."""
-    H, problem = (
-        50,
-        Problem(Tracking([1.0], [1.0], penalized="inputs"), inputs=Box([-3.0], [3.0])),
+    H = 50
+    problem = Problem(
+        Tracking([1.0], [1.0], penalized="inputs"), inputs=Box([-3.0], [3.0])
     )
     condenser = Condensing(problem, H, 1)
     stages = Stages(np.array([[[2.0]]]), np.array([[[1.0]]]), np.zeros((1, 1)))
@@ -427,23 +451,19 @@ def programs_of_the_double_pendulum(starts, seed):
 
     Six poses count as upright, a turn apart. Every solution is checked against the stages and the bounds.
     """
-    H, rng, solver, counts = (
-        60,
-        np.random.default_rng(seed),
-        DualActiveSet(),
-        np.zeros(2, dtype=int),
-    )
+    H = 60
+    rng = np.random.default_rng(seed)
+    solver = DualActiveSet()
+    counts = np.zeros(2, dtype=int)
     bounds = {"inputs": Box([-6.0], [6.0])}
     for joint, penalized, _ in product(
         (ACROBOT, PENDUBOT), ("inputs", "increments"), range(starts)
     ):
-        problem, model = (
-            Problem(
-                Tracking([100.0, 100.0, 1.0, 1.0], [1e-3], penalized=penalized),
-                **bounds,
-            ),
-            DoublePendulum(joint),
+        problem = Problem(
+            Tracking([100.0, 100.0, 1.0, 1.0], [1e-3], penalized=penalized),
+            **bounds,
         )
+        model = DoublePendulum(joint)
         condenser = Condensing(problem, H, 1)
         start = np.concatenate([rng.uniform(-np.pi, np.pi, 2), rng.uniform(-15, 15, 2)])
         for turns in product((0, 1), (-1, 0, 1)):

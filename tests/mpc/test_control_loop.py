@@ -12,7 +12,8 @@ from gpmpc.status import Status
 from gpmpc.systems import double_integrator
 from tests.mpc.small_models import double_integrator as model
 
-BOX, RATES = Box([-1.0], [0.8]), Box([-0.3], [0.2])
+BOX = Box([-1.0], [0.8])
+RATES = Box([-0.3], [0.2])
 PROBLEM = Problem(Tracking([1.0, 0.1], [0.05]), BOX, RATES)
 GOAL = np.array([1.0, 0.0])
 
@@ -26,7 +27,8 @@ def moved(x, u):
 
 
 def test_five_lines_steer_somebody_elses_plant_to_a_set_point():
-    loop, x = ControlLoop(controller()), np.zeros(2)
+    loop = ControlLoop(controller())
+    x = np.zeros(2)
     loop.warm_up(x, GOAL)
     assert loop.last is None
     for _ in range(60):
@@ -40,14 +42,17 @@ def test_whatever_happens_an_input_is_finite_and_within_bounds_and_rates(
     on_failure, rng
 ):
     hard = Problem(PROBLEM.cost, BOX, RATES, [Box(None, [np.inf, 0.1], penalty=None)])
-    loop, x, last = ControlLoop(controller(hard), on_failure), np.zeros(2), np.zeros(1)
+    loop = ControlLoop(controller(hard), on_failure)
+    x = np.zeros(2)
+    last = np.zeros(1)
     for k in range(60):
         measured = x + 0.3 * rng.normal(size=2) if k % 3 else np.array([np.nan, 0.0])
         u = loop.input(measured, GOAL)
         assert np.isfinite(u).all()
         assert BOX.lower[0] - 1e-9 <= u[0] <= BOX.upper[0] + 1e-9
         assert -0.3 - 1e-9 <= u[0] - last[0] <= 0.2 + 1e-9
-        x, last = moved(x, u), u
+        x = moved(x, u)
+        last = u
     assert 20 < loop.failures < 60
     assert loop.last.status is not None
 
@@ -69,10 +74,8 @@ def test_its_inputs_are_those_of_the_simulation():
     ids=lambda solver: type(solver).__name__,
 )
 def test_another_solver_steers_alike_from_step_to_step(solver):
-    loops, x = (
-        [ControlLoop(controller()), ControlLoop(controller(solver=solver))],
-        np.zeros(2),
-    )
+    loops = [ControlLoop(controller()), ControlLoop(controller(solver=solver))]
+    x = np.zeros(2)
     for _ in range(8):
         ours, theirs = (loop.input(x, GOAL) for loop in loops)
         assert np.allclose(theirs, ours, atol=1e-6)

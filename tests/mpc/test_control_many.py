@@ -117,7 +117,8 @@ def test_compiled_and_torch_answer_alike():
 
 
 def test_one_that_cannot_be_answered_spoils_no_other():
-    asked, questions = controller("velocity", "full", MomentMatching()), beliefs(3)
+    asked = controller("velocity", "full", MomentMatching())
+    questions = beliefs(3)
     questions[1] = Gaussian(questions[1].mean, -torch.eye(6))  # no covariance
     many = asked.control_many(questions, [REFERENCE] * 3, [None] * 3)
     assert [d.status for d in many] == [
@@ -171,14 +172,10 @@ def test_stages_stay_on_the_device_of_the_model(covariance, propagator):
     ids=lambda v: v if isinstance(v, str) else type(v).__name__,
 )
 def test_a_model_on_a_gpu_gives_the_same_answers(form, covariance, propagator):
-    here, there = (
-        controller(form, covariance, propagator),
-        controller(form, covariance, propagator, GP.to("cuda")),
-    )
-    first, before = (
-        here.control_many(beliefs(4), [REFERENCE] * 4, [None] * 4),
-        [None] * 4,
-    )
+    here = controller(form, covariance, propagator)
+    there = controller(form, covariance, propagator, GP.to("cuda"))
+    first = here.control_many(beliefs(4), [REFERENCE] * 4, [None] * 4)
+    before = [None] * 4
     assert_same(there.control_many(beliefs(4), [REFERENCE] * 4, before), first)
     second = here.control_many(beliefs(4, seed=1), [REFERENCE] * 4, first)
     assert_same(there.control_many(beliefs(4, seed=1), [REFERENCE] * 4, first), second)

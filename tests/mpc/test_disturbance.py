@@ -50,7 +50,9 @@ def moved(model, state, input, unknown=UNKNOWN):
 
 def flown(asked, model=PENDULUM, unknown=UNKNOWN, steps=40):
     """States and decisions; the plant is the model and what it does not know."""
-    states, decisions, last = [np.zeros(2)], [], None
+    states = [np.zeros(2)]
+    decisions = []
+    last = None
     for _ in range(steps):
         last = asked.control(Gaussian.certain(states[-1]), AT_REST, last)
         assert last.status is Status.SOLVED
@@ -89,10 +91,8 @@ def test_without_an_estimate_it_does():
 
 
 def test_a_model_that_is_right_is_left_alone():
-    plain, told = (
-        flown(controller(), unknown=0.0),
-        flown(controller(disturbance_gain=1.0), unknown=0.0),
-    )
+    plain = flown(controller(), unknown=0.0)
+    told = flown(controller(disturbance_gain=1.0), unknown=0.0)
     assert np.allclose(plain[0], told[0], rtol=0, atol=1e-9)
     assert np.abs([decision.disturbance for decision in told[1]]).max() < 1e-12
 
@@ -132,7 +132,8 @@ def test_a_measurement_that_is_missing_leaves_the_estimate_as_it_is():
 def test_compiled_torch_batched_and_state_form_agree(covariance):
     asked = controller(covariance=covariance, disturbance_gain=0.7)
     states, decisions = flown(asked, steps=4)
-    belief, before = Gaussian.certain(states[-1]), decisions[-1]
+    belief = Gaussian.certain(states[-1])
+    before = decisions[-1]
     answer = asked.control(belief, AT_REST, before)
     in_cvxpy = controller(StateFormMPC, covariance=covariance, disturbance_gain=0.7)
     others = [in_cvxpy.control(belief, AT_REST, before)]
@@ -173,7 +174,8 @@ def test_a_gain_out_of_range_is_refused(kind, settings, rule):
 
 @pytest.mark.parametrize("iterations", [1, 30])
 def test_a_controller_for_another_model_is_one_that_was_made_with_it(iterations):
-    other, inputs = pendulum_posterior(seed=3), 2.0 * np.ones((H, 1))
+    other = pendulum_posterior(seed=3)
+    inputs = 2.0 * np.ones((H, 1))
     asked = controller(
         covariance="none", rolled_out=True, iterations=iterations
     ).with_model(other)
@@ -181,6 +183,7 @@ def test_a_controller_for_another_model_is_one_that_was_made_with_it(iterations)
         model=other, covariance="none", rolled_out=True, iterations=iterations
     )
     question = Gaussian.certain([0.3, -0.2]), AT_REST, None, None, inputs
-    found, expected = asked.control(*question), made.control(*question)
+    found = asked.control(*question)
+    expected = made.control(*question)
     assert np.array_equal(found.means, expected.means)
     assert np.array_equal(found.inputs, expected.inputs)

@@ -91,7 +91,9 @@ def test_a_vehicle_that_was_pushed_out_of_its_lane_comes_back_and_does_not_spin(
             KnownModel(slide, 3, 1), Linearization(), problem, 15, [0.0],
             PredictionSettings(covariance="none"),
         )  # fmt: skip
-        state, decision, worst = np.array([0.2, 0.0, 0.0]), None, 0.0
+        state = np.array([0.2, 0.0, 0.0])
+        decision = None
+        worst = 0.0
         for _ in range(60):
             decision = controller.control(
                 Gaussian.certain(state), Reference(np.zeros(3)), decision

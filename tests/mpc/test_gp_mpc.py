@@ -56,7 +56,9 @@ def at_origin(horizon):
 
 def fly(controller, start, reference, steps):
     """States, inputs and decisions of a closed loop on the true quadrotor."""
-    states, decisions, last = [np.asarray(start, dtype=float)], [], None
+    states = [np.asarray(start, dtype=float)]
+    decisions = []
+    last = None
     for _ in range(steps):
         last = controller.control(Gaussian.certain(states[-1]), reference, last)
         assert last.status is Status.SOLVED
@@ -70,7 +72,8 @@ def fly(controller, start, reference, steps):
 
 @pytest.mark.parametrize("penalized", ["inputs", "deviations", "increments"])
 def test_on_a_linear_model_all_forms_are_the_nonlinear_benchmark(penalized, rng):
-    model, H = linear_gaussian(3, 2), 6
+    model = linear_gaussian(3, 2)
+    H = 6
     bounds = Box(
         [-0.6, -np.inf, -0.6],
         [np.inf, 0.5, np.inf],
@@ -81,7 +84,8 @@ def test_on_a_linear_model_all_forms_are_the_nonlinear_benchmark(penalized, rng)
     cost = Tracking(
         [2.0, 1.0, 0.5], [0.3, 0.2], terminal=[5.0, 5.0, 1.0], penalized=penalized
     )
-    box, rates = Box([-0.7, -0.5], [0.7, 0.4]), Box([-0.5] * 2, [0.5] * 2)
+    box = Box([-0.7, -0.5], [0.7, 0.4])
+    rates = Box([-0.5] * 2, [0.5] * 2)
     problem = Problem(cost, box, rates, [bounds])
     controllers = [
         GPMPC(
@@ -96,7 +100,9 @@ def test_on_a_linear_model_all_forms_are_the_nonlinear_benchmark(penalized, rng)
         if f != "velocity" or c != "full"
     ]
     benchmark = NMPC(LinearPlant(model), problem, H, [0.0, 0.0])
-    state, last, worked = np.array([0.4, -0.3, 0.2]), None, 0
+    state = np.array([0.4, -0.3, 0.2])
+    last = None
+    worked = 0
     for _ in range(5):
         reference = Reference(
             0.5 * rng.normal(size=(H + 1, 3)), 0.3 * rng.normal(size=(H, 2))
@@ -115,14 +121,15 @@ def test_on_a_linear_model_all_forms_are_the_nonlinear_benchmark(penalized, rng)
 
 
 def test_it_is_the_exact_least_squares_solution_and_predicts_the_exact_covariances(rng):
-    model, H = linear_gaussian(2, 1), 5
-    problem, state = (
-        Problem(Tracking([3.0, 0.5], [0.2], penalized="inputs")),
-        rng.normal(size=2),
-    )
+    model = linear_gaussian(2, 1)
+    H = 5
+    problem = Problem(Tracking([3.0, 0.5], [0.2], penalized="inputs"))
+    state = rng.normal(size=2)
     reference = Reference(rng.normal(size=(H + 1, 2)))
     A, B, c, V = (part.numpy() for part in (model.A, model.B, model.c, model.V))
-    free, gamma, x = [], np.zeros((H, 2, H)), state
+    free = []
+    gamma = np.zeros((H, 2, H))
+    x = state
     for i in range(H):
         x = A @ x + c
         free.append(x)
@@ -161,21 +168,20 @@ def test_it_is_the_exact_least_squares_solution_and_predicts_the_exact_covarianc
 
 @pytest.mark.parametrize(("form", "covariance"), PAIRS)
 def test_bounds_and_rates_are_kept_for_thirty_steps(form, covariance):
-    problem, H = quadrotor_problem(input_rates=Box([-2, -0.1, -0.1], [2, 0.1, 0.1])), 4
+    problem = quadrotor_problem(input_rates=Box([-2, -0.1, -0.1], [2, 0.1, 0.1]))
+    H = 4
     moves = propagator(covariance)
     if covariance in ("full", "diagonal") and form == "trajectory":
         moves = MeanEquivalence()  # half the time; the bounds do not care
-    controller, steps = (
-        GPMPC(
-            gp(),
-            moves,
-            problem,
-            H,
-            HOVER,
-            prediction=PredictionSettings(form=form, covariance=covariance),
-        ),
-        30,
+    controller = GPMPC(
+        gp(),
+        moves,
+        problem,
+        H,
+        HOVER,
+        prediction=PredictionSettings(form=form, covariance=covariance),
     )
+    steps = 30
     states, inputs, decisions = fly(
         controller, [0.8, 0.0, -0.6, 0.0, 0.5, 0.0], at_origin(H), steps
     )
@@ -195,13 +201,11 @@ def test_bounds_and_rates_are_kept_for_thirty_steps(form, covariance):
 def expected_cost(problem, model, moves, state, inputs, reference, covariance):
     """The nonlinear problem's cost, chance margins (H, n) and inputs (H, m) with their graph."""
     u = torch.tensor(inputs, requires_grad=True)
-    belief, Q, means, variances, cost = (
-        Gaussian.certain(torch.tensor(state)),
-        torch.tensor(problem.cost.Q),
-        [],
-        [],
-        0.0,
-    )
+    belief = Gaussian.certain(torch.tensor(state))
+    Q = torch.tensor(problem.cost.Q)
+    means = []
+    variances = []
+    cost = 0.0
     for k, control in enumerate(u):
         if covariance == "diagonal":
             belief = Gaussian(belief.mean, torch.diag_embed(belief.variance))
@@ -229,7 +233,8 @@ def expected_cost(problem, model, moves, state, inputs, reference, covariance):
 def test_more_iterations_end_in_a_kkt_point_of_the_nonlinear_problem(covariance, moves):
     H = 3
     limits = Box([-np.inf, -0.35] * 3, [np.inf, 0.9] * 3, probability=0.9, penalty=None)
-    problem, reference = quadrotor_problem(constraints=[limits]), at_origin(H)
+    problem = quadrotor_problem(constraints=[limits])
+    reference = at_origin(H)
     state = np.array([0.8, -0.1, -0.4, 0.1, 0.3, 0.0])
     model = gp(20 if isinstance(moves, MomentMatching) else 60)
 
@@ -264,8 +269,10 @@ def test_more_iterations_end_in_a_kkt_point_of_the_nonlinear_problem(covariance,
     cost, rows, outside, u, means = exact(decision.inputs)
     assert outside < 1e-6
     assert np.allclose(decision.means[1:], means.detach(), atol=1e-7)
-    solution, m = decision.solution, 3
-    z_rates, z_states = solution.z[: H * m], solution.z[H * m :]
+    solution = decision.solution
+    m = 3
+    z_rates = solution.z[: H * m]
+    z_states = solution.z[H * m :]
     assert np.abs(z_states).max() > 1e-3  # a chance constraint works
     total = cost + (rows.flatten() * torch.tensor(z_states)).sum()
     gradient = torch.autograd.grad(total, u)[0].numpy().ravel()
@@ -275,14 +282,10 @@ def test_more_iterations_end_in_a_kkt_point_of_the_nonlinear_problem(covariance,
 
 
 def test_zero_order_ends_where_its_own_tightening_holds():
-    H, limits = (
-        4,
-        Box([-np.inf, -0.5] * 3, [np.inf, 0.9] * 3, probability=0.9, penalty=None),
-    )
-    problem, state = (
-        quadrotor_problem(constraints=[limits]),
-        np.array([0.8, -0.1, -0.4, 0.1, 0.3, 0.0]),
-    )
+    H = 4
+    limits = Box([-np.inf, -0.5] * 3, [np.inf, 0.9] * 3, probability=0.9, penalty=None)
+    problem = quadrotor_problem(constraints=[limits])
+    state = np.array([0.8, -0.1, -0.4, 0.1, 0.3, 0.0])
     controller = GPMPC(
         gp(), Linearization(), problem, H, HOVER, iterations=30, tolerance=1e-7
     )
@@ -314,11 +317,13 @@ def test_too_few_iterations_say_so():
     ("form", "covariance"), [pair for pair in PAIRS if pair[1] != "none"]
 )
 def test_a_higher_confidence_keeps_further_from_the_bound(form, covariance):
-    H, state = 3, np.array([0.5, 0.0, 0.0, 0.0, 0.0, 0.0])
+    H = 3
+    state = np.array([0.5, 0.0, 0.0, 0.0, 0.0, 0.0])
     reference = Reference(
         np.tile([1.0, 1.0, 0, 0, 0, 0], (H + 1, 1)), np.tile(HOVER, (H, 1))
     )
-    highest, last = [], None
+    highest = []
+    last = None
     for confidence in (0.6, 0.9, 0.99):
         limits = Box(
             [-np.inf] * 6,
@@ -351,10 +356,8 @@ def test_a_higher_confidence_keeps_further_from_the_bound(form, covariance):
 @pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize("price", [None, 100.0], ids=["hard", "soft"])
 def test_a_horizon_of_fifty_with_state_bounds_stays_feasible(form, price):
-    H, limits = (
-        50,
-        Box([-1.5, -0.8] * 3, [1.5, 0.8] * 3, probability=0.95, penalty=price),
-    )
+    H = 50
+    limits = Box([-1.5, -0.8] * 3, [1.5, 0.8] * 3, probability=0.95, penalty=price)
     covariance = "zero_order"
     controller = GPMPC(
         gp(),
@@ -372,7 +375,8 @@ def test_a_horizon_of_fifty_with_state_bounds_stays_feasible(form, price):
 
 
 def test_feedback_keeps_a_long_horizon_feasible_where_open_loop_is_not():
-    model, H = linear_gaussian(2, 1), 50
+    model = linear_gaussian(2, 1)
+    H = 50
     model = replace(
         model,
         A=torch.tensor([[1.0, 0.2], [0.0, 1.0]]),
@@ -383,10 +387,8 @@ def test_feedback_keeps_a_long_horizon_feasible_where_open_loop_is_not():
         Tracking([1.0, 0.1], [0.1], penalized="inputs"),
         constraints=[Box([-1.5, -2.0], [1.5, 2.0], probability=0.95, penalty=None)],
     )
-    belief, reference = (
-        Gaussian.certain(np.array([0.3, 0.0])),
-        Reference(np.zeros((H + 1, 2))),
-    )
+    belief = Gaussian.certain(np.array([0.3, 0.0]))
+    reference = Reference(np.zeros((H + 1, 2)))
     closed, opened = (
         GPMPC(
             model,
@@ -418,17 +420,16 @@ def test_feedback_keeps_a_long_horizon_feasible_where_open_loop_is_not():
 
 
 def test_soft_bounds_cost_what_they_are_said_to_cost():
-    model, H = linear_gaussian(3, 2), 4
+    model = linear_gaussian(3, 2)
+    H = 4
     limits = Box([-0.2] * 3, [0.2] * 3, probability=0.95, kappa=0.0, penalty=0.3)
     problem = Problem(
         Tracking([1.0] * 3, [0.3] * 2, penalized="inputs"),
         inputs=Box([-0.3] * 2, [0.3] * 2),
         constraints=[limits],
     )
-    belief, reference = (
-        Gaussian.certain(np.array([1.0, -0.5, 0.3])),
-        Reference(np.zeros((H + 1, 3))),
-    )
+    belief = Gaussian.certain(np.array([1.0, -0.5, 0.3]))
+    reference = Reference(np.zeros((H + 1, 3)))
     convex = GPMPC(model, Linearization(), problem, H, [0.0] * 2).control(
         belief, reference
     )
@@ -622,7 +623,8 @@ def test_a_reference_that_does_not_belong_is_refused():
 def test_the_compiled_rollout_is_the_one_stage_by_stage(
     covariance, feedback, process_noise
 ):
-    H, propagator = 6, Linearization(process_noise=process_noise)
+    H = 6
+    propagator = Linearization(process_noise=process_noise)
     settings = PredictionSettings(covariance=covariance, feedback=feedback)
     compiled, by_torch = (
         GPMPC(gp(), propagator, quadrotor_problem(), H, HOVER, settings)
@@ -645,7 +647,8 @@ def test_the_compiled_rollout_is_the_one_stage_by_stage(
 def test_noise_of_observations_widens_what_is_predicted_by_its_variance_on_request(
     form, covariance, evaluated
 ):
-    state, found = Gaussian.certain(np.array([0.3, 0.0, -0.2, 0.1, 0.2, 0.0])), []
+    state = Gaussian.certain(np.array([0.3, 0.0, -0.2, 0.1, 0.2, 0.0]))
+    found = []
     for noise in (False, True):
         how = Linearization(process_noise=noise)
         controller = GPMPC(
@@ -668,11 +671,10 @@ def test_noise_of_observations_widens_what_is_predicted_by_its_variance_on_reque
 def test_each_part_of_a_decision_takes_its_own_time_and_questions_share_the_model(
     monkeypatch,
 ):
-    model, H = linear_gaussian(2, 1), 3
-    problem, reference = (
-        Problem(Tracking([1.0, 1.0], [0.1])),
-        Reference(np.zeros((H + 1, 2)), np.zeros((H, 1))),
-    )
+    model = linear_gaussian(2, 1)
+    H = 3
+    problem = Problem(Tracking([1.0, 1.0], [0.1]))
+    reference = Reference(np.zeros((H + 1, 2)), np.zeros((H, 1)))
     controller = GPMPC(model, Linearization(), problem, H, [0.0], iterations=1)
     at = Gaussian.certain(np.ones(2))
     looks = iter([0.0, 1.0, 11.0, 111.0, 1111.0])

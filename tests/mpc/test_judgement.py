@@ -147,7 +147,8 @@ def test_reasons_name_states_and_inputs():
 
 def judged_alone(judge, frozen_from):
     """Judgements of a point that is to stand still, and whose first sensor freezes."""
-    rng, told = np.random.default_rng(0), []
+    rng = np.random.default_rng(0)
+    told = []
     for k in range(30):
         measured = rng.normal(0.0, 0.01, 2)
         if k >= frozen_from:
@@ -186,7 +187,8 @@ def test_decisions_that_cannot_be_applied_are_suspicious_from_the_third_on():
 
 def test_plans_far_from_all_data_are_suspicious_until_it_is_where_it_should_be():
     for place, level in ([0.0, "healthy"], [1.0, "suspicious"]):
-        judge, x = FlightJudge(CONTROLLER.problem), np.array([place, 0.0])
+        judge = FlightJudge(CONTROLLER.problem)
+        x = np.array([place, 0.0])
         plan = plan_of(x, plan_novelty=0.95)
         told = [judge.judge(x, np.zeros(2), plan).level for _ in range(4)]
         assert told == ["healthy", "healthy", level, level]
@@ -227,7 +229,9 @@ def test_a_jump_of_the_set_point_is_no_alarm(preview):
     if preview:
         told = fly(references=states, noise=None).judgements
     else:
-        told, x, loop = [], np.zeros(2), ControlLoop(CONTROLLER)
+        told = []
+        x = np.zeros(2)
+        loop = ControlLoop(CONTROLLER)
         for k in range(80):
             u = loop.input(x, states[k])
             told.append(loop.judgement)
@@ -249,7 +253,8 @@ def test_every_loop_judges_alike():
 
 
 def test_what_a_judge_saw_of_a_flight_is_no_part_of_the_next():
-    first, again = fly(Frozen([0], 40 * T)), fly()
+    first = fly(Frozen([0], 40 * T))
+    again = fly()
     assert first.judgement.level != "healthy"
     assert again.judgement.level == "healthy"
 
@@ -277,7 +282,9 @@ def test_a_controller_without_a_problem_is_judged_by_its_innovations():
 
 
 def test_a_flight_is_what_its_steps_say():
-    well, odd, gone = Judgement(), Judgement("suspicious", "a"), Judgement("lost", "b")
+    well = Judgement()
+    odd = Judgement("suspicious", "a")
+    gone = Judgement("lost", "b")
     of = FlightJudgement.of
     assert of([]) == of([well, well]) == FlightJudgement()
     assert of([odd, well]) == FlightJudgement(suspicious=1)

@@ -15,7 +15,9 @@ from gpmpc.mpc.problem import Box, Problem, Tracking
 from gpmpc.propagation import Linearization
 from tests.mpc.small_models import double_integrator
 
-H, UPPER, STD = 6, 0.3, np.array([0.01, 0.02])
+H = 6
+UPPER = 0.3
+STD = np.array([0.01, 0.02])
 FAR = Reference(np.tile([1.0, 0.0], (H + 1, 1)), np.zeros((H, 1)))  # beyond the bound
 START = Gaussian.certain(np.zeros(2))
 
@@ -37,7 +39,8 @@ def controller(probability=0.95, **settings):
 
 
 def test_bounds_are_moved_by_the_kappas_of_the_reference():
-    asked, plain = controller(), None
+    asked = controller()
+    plain = None
     for kappas in (np.full(H, 1.6448536269514722), np.linspace(1.0, 4.0, H)):
         found = asked.control(START, replace(FAR, kappas=kappas))
         sd = np.sqrt(found.covariances[1:, 0, 0])
@@ -52,7 +55,8 @@ def test_bounds_are_moved_by_the_kappas_of_the_reference():
 
 
 def test_a_set_point_keeps_its_kappas():
-    asked, kappas = controller(), np.full(H, 3.0)
+    asked = controller()
+    kappas = np.full(H, 3.0)
     point = asked.control(START, Reference(FAR.states[0], np.zeros(1), kappas))
     assert np.array_equal(
         point.inputs, asked.control(START, replace(FAR, kappas=kappas)).inputs
@@ -68,18 +72,17 @@ def test_a_bound_on_the_mean_stays_one():
 
 
 def test_an_adaptive_tube_brings_the_violations_to_what_is_allowed_where_the_noise_is_larger_than_learned():
-    asked, rng = controller(), np.random.default_rng(0)
+    asked = controller()
+    rng = np.random.default_rng(0)
     outside = {}
     for name in ("as learned", "adapted"):
         tube = ConformalTube(
             np.abs(np.random.default_rng(1).normal(size=(200, H))), [[1.0, 0.0]]
         )
-        adaptive, x, last, count = (
-            AdaptiveTube(tube, 0.95, rate=0.05),
-            np.zeros(2),
-            None,
-            0,
-        )
+        adaptive = AdaptiveTube(tube, 0.95, rate=0.05)
+        x = np.zeros(2)
+        last = None
+        count = 0
         for _ in range(250):
             adaptive.observe(x)
             kappas = adaptive.kappas if name == "adapted" else None

@@ -16,13 +16,16 @@ from gpmpc.propagation import MeanEquivalence
 from gpmpc.status import Status
 from tests.mpc.small_models import LinearGaussian, double_integrator, pendulum_posterior
 
-A, B = np.array([[1.0, 0.5], [0.0, 1.0]]), np.array([[0.125], [0.5]])
-Q, R = np.array([[3.0, 0.4], [0.4, 0.5]]), np.array([[0.2]])
+A = np.array([[1.0, 0.5], [0.0, 1.0]])
+B = np.array([[0.125], [0.5]])
+Q = np.array([[3.0, 0.4], [0.4, 0.5]])
+R = np.array([[0.2]])
 
 
 @pytest.mark.parametrize("penalized", ["inputs", "deviations", "increments"])
 def test_without_bounds_it_is_the_optimum_of_a_linear_model(penalized, rng):
-    H, model = 6, double_integrator(c=[0.1, -0.2])
+    H = 6
+    model = double_integrator(c=[0.1, -0.2])
     problem = Problem(Tracking(Q, R, terminal=3 * Q, penalized=penalized))
     reference = Reference(rng.normal(size=(H + 1, 2)), rng.normal(size=(H, 1)))
     state = Gaussian.certain(rng.normal(size=2))
@@ -54,12 +57,10 @@ def test_the_stationary_gain_solves_the_riccati_equation():
 
 
 def test_a_long_horizon_gives_the_stationary_gain(rng):
-    controller, state = (
-        LQR(
-            double_integrator(), Problem(Tracking(Q, R, penalized="inputs")), 60, [0.0]
-        ),
-        rng.normal(size=2),
+    controller = LQR(
+        double_integrator(), Problem(Tracking(Q, R, penalized="inputs")), 60, [0.0]
     )
+    state = rng.normal(size=2)
     decision = controller.control(Gaussian.certain(state), Reference(np.zeros((61, 2))))
     assert np.allclose(decision.input, -dlqr(A, B, Q, R) @ state, atol=1e-9)
 
@@ -78,11 +79,10 @@ def test_a_growing_mode_out_of_reach_has_no_gain():
 
 
 def test_reference_inputs_feed_forward():
-    H, model = 5, double_integrator()
-    states, wanted = (
-        [np.array([0.2, -0.1])],
-        np.array([[0.3], [0.1], [-0.4], [0.2], [0.0]]),
-    )
+    H = 5
+    model = double_integrator()
+    states = [np.array([0.2, -0.1])]
+    wanted = np.array([[0.3], [0.1], [-0.4], [0.2], [0.0]])
     for u in wanted:
         states.append(A @ states[-1] + B @ u)
     controller = LQR(model, Problem(Tracking(Q, R, penalized="deviations")), H, [0.0])
@@ -122,7 +122,9 @@ def test_an_input_without_effect_stays_at_rest():
 
 
 def test_it_brings_a_learned_pendulum_to_rest():
-    model, state, decision = pendulum_posterior(), np.array([0.8, 0.0]), None
+    model = pendulum_posterior()
+    state = np.array([0.8, 0.0])
+    decision = None
     controller = LQR(
         model,
         Problem(
@@ -204,12 +206,11 @@ class Watched(LinearGaussian):
 def test_the_local_models_are_taken_at_the_state_and_then_along_the_reference(
     known, rng
 ):
-    model, H = Watched(A.tolist(), B.tolist()), 4
-    states, wanted, state = (
-        rng.normal(size=(H + 1, 2)),
-        rng.normal(size=(H, 1)),
-        rng.normal(size=2),
-    )
+    model = Watched(A.tolist(), B.tolist())
+    H = 4
+    states = rng.normal(size=(H + 1, 2))
+    wanted = rng.normal(size=(H, 1))
+    state = rng.normal(size=2)
     reference = Reference(states, wanted if known else None)
     LQR(model, Problem(Tracking(Q, R, penalized="inputs")), H, [0.3]).control(
         Gaussian.certain(state), reference
@@ -236,10 +237,10 @@ def test_a_model_that_is_not_finite_or_grows_beyond_all_numbers_is_numerical_tro
 
 
 def test_a_state_that_is_part_of_a_graph_is_answered_like_any_other():
-    controller, reference = (
-        LQR(double_integrator(), Problem(Tracking(Q, R, penalized="inputs")), 3, [0.2]),
-        Reference(np.zeros((4, 2))),
+    controller = LQR(
+        double_integrator(), Problem(Tracking(Q, R, penalized="inputs")), 3, [0.2]
     )
+    reference = Reference(np.zeros((4, 2)))
     state = torch.tensor([0.3, -0.2], requires_grad=True)
     ours = controller.control(Gaussian(2 * state, torch.zeros(2, 2)), reference)
     assert np.array_equal(
@@ -248,12 +249,10 @@ def test_a_state_that_is_part_of_a_graph_is_answered_like_any_other():
 
 
 def test_the_gain_over_a_long_horizon_is_stationary_and_exists_for_any_system(rng):
-    A, B, Q, R = (
-        rng.normal(size=(1, 4, 4)),
-        rng.normal(size=(1, 4, 2)),
-        np.eye(4),
-        np.eye(2),
-    )
+    A = rng.normal(size=(1, 4, 4))
+    B = rng.normal(size=(1, 4, 2))
+    Q = np.eye(4)
+    R = np.eye(2)
     gains, hessians = finite_horizon_lqr(A, B, Q[None], R[None], Q, 500)
     varying, same = finite_horizon_lqr(
         np.repeat(A, 500, axis=0), np.repeat(B, 500, axis=0), Q[None], R[None], Q, 500

@@ -21,7 +21,12 @@ from gpmpc.mpc._sqp import (
 )
 from gpmpc.mpc._stages import Plan, keep_rates, price_violations
 
-H, N, M, P, R = 3, 2, 2, 4, 2  # stages, states, inputs, entries of s, rows
+# stages, states, inputs, entries of s, rows
+H = 3
+N = 2
+M = 2
+P = 4
+R = 2
 
 
 def definite(rng, *shape):
@@ -43,8 +48,10 @@ class Case:
         self.references = References(
             rng.normal(size=(H, N)), rng.normal(size=(H, M)), rng.normal(size=M)
         )
-        low, high = rng.normal(size=(H, R)) - 1.0, rng.normal(size=(H, R)) + 1.0
-        low[:, 0], high[0, 1] = -np.inf, np.inf
+        low = rng.normal(size=(H, R)) - 1.0
+        high = rng.normal(size=(H, R)) + 1.0
+        low[:, 0] = -np.inf
+        high[0, 1] = np.inf
         self.rows = StageRows(
             rng.normal(size=(H, R, P)),
             rng.normal(size=(H if inputs else 0, R, M)),
@@ -59,12 +66,11 @@ class Case:
             )
             for _ in range(2)
         )
-        self.A, self.after = rng.normal(size=(H, P, P)), 2 * rng.normal(size=(H, P))
-        self.prices, self.row_price, self.defect_prices = (
-            np.array([3.0, np.inf]),
-            7.0,
-            rng.uniform(0, 2, P),
-        )
+        self.A = rng.normal(size=(H, P, P))
+        self.after = 2 * rng.normal(size=(H, P))
+        self.prices = np.array([3.0, np.inf])
+        self.row_price = 7.0
+        self.defect_prices = rng.uniform(0, 2, P)
         self.z = rng.normal(size=(H, R))
 
     @property
@@ -142,7 +148,8 @@ def test_multipliers_of_the_dynamics_are_what_a_push_of_a_state_costs(
         for i in range(P):
             values = []
             for push in (0.5, -0.5):
-                states, moved = case.plan.states.copy(), push * np.eye(P)[i]
+                states = case.plan.states.copy()
+                moved = push * np.eye(P)[i]
                 for j in range(k, H):
                     states[j + 1] += moved
                     moved = case.A[j + 1] @ moved if j + 1 < H else moved
@@ -209,7 +216,8 @@ def test_an_update_gives_the_curvature_that_a_step_showed_and_stays_positive_def
     rng,
 ):
     for turn in (1.0, -1.0, 0.0):
-        P_, step = definite(rng, 5), rng.normal(size=5)
+        P_ = definite(rng, 5)
+        step = rng.normal(size=5)
         B = P_.copy()
         change = turn * definite(rng, 5) @ step
         _update(B, step, change)
@@ -235,7 +243,8 @@ def test_between_two_plans_every_part_moves_by_the_same_share(rng):
 
 
 def test_the_smallest_cost_is_that_of_a_thousandth_of_the_cheapest_input():
-    R_, wide = np.diag([4.0, 9.0]), np.full(2, np.inf)
+    R_ = np.diag([4.0, 9.0])
+    wide = np.full(2, np.inf)
     assert _smallest_cost(R_, -wide, wide, np.zeros(2)) == pytest.approx(4e-6)
     assert _smallest_cost(R_, -wide, wide, np.array([-10.0, 0.5])) == pytest.approx(
         9e-6
@@ -248,12 +257,12 @@ def test_the_smallest_cost_is_that_of_a_thousandth_of_the_cheapest_input():
 
 def test_inputs_are_moved_one_after_the_other_to_within_their_rates(rng):
     for stages in (1, H):
-        low, high = (
-            -rng.uniform(0.1, 0.5, (stages, M)),
-            rng.uniform(0.1, 0.5, (stages, M)),
-        )
-        inputs, last = rng.normal(size=(H, M)), rng.normal(size=M)
-        expected, before = [], last
+        low = -rng.uniform(0.1, 0.5, (stages, M))
+        high = rng.uniform(0.1, 0.5, (stages, M))
+        inputs = rng.normal(size=(H, M))
+        last = rng.normal(size=M)
+        expected = []
+        before = last
         for k, u in enumerate(inputs):
             at = min(k, stages - 1)
             before = np.clip(u, before + low[at], before + high[at])

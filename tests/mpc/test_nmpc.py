@@ -12,7 +12,8 @@ from gpmpc.systems import Map, Rotational, System, Translational, step
 
 
 class DoubleIntegrator:
-    state_names, input_names = ("x", "v"), ("a",)
+    state_names = ("x", "v")
+    input_names = ("a",)
 
     def derivative(self, x, u):
         return [x[1], u[0]]
@@ -20,9 +21,13 @@ class DoubleIntegrator:
 
 def test_on_a_linear_plant_it_is_the_least_squares_solution(rng):
     plant = System(DoubleIntegrator(), time_step=0.5, substeps=1)
-    H, Q, R = 5, np.array([3.0, 0.5]), np.array([0.2])
-    state, reference = rng.normal(size=2), rng.normal(size=(H + 1, 2))
-    A, B = np.array([[1, 0.5], [0, 1]]), np.array([0.125, 0.5])
+    H = 5
+    Q = np.array([3.0, 0.5])
+    R = np.array([0.2])
+    state = rng.normal(size=2)
+    reference = rng.normal(size=(H + 1, 2))
+    A = np.array([[1, 0.5], [0, 1]])
+    B = np.array([0.125, 0.5])
     free = np.array([np.linalg.matrix_power(A, i + 1) @ state for i in range(H)])
     response = np.zeros((H, 2, H))
     for i in range(H):
@@ -48,14 +53,18 @@ def test_on_a_linear_plant_it_is_the_least_squares_solution(rng):
     ids=["map", "integrated"],
 )
 def test_no_small_change_of_the_plan_is_cheaper(plant, rng):
-    H, Q, R = 4, np.array([20.0, 1, 20, 1, 20, 1]), np.array([1.0, 1, 1])
-    state, reference = 0.1 * rng.normal(size=6), 0.3 * rng.normal(size=(H + 1, 6))
+    H = 4
+    Q = np.array([20.0, 1, 20, 1, 20, 1])
+    R = np.array([1.0, 1, 1])
+    state = 0.1 * rng.normal(size=6)
+    reference = 0.3 * rng.normal(size=(H + 1, 6))
     initial = [7.26, 0, 0] if isinstance(plant, System) else [0, 0, 0]
     controller = NMPC(plant, Problem(Tracking(Q, R, penalized="inputs")), H, initial)
     decision = controller.control(Gaussian.certain(state), Reference(reference))
 
     def cost(inputs):
-        x, total = state, 0.0
+        x = state
+        total = 0.0
         for u, r in zip(inputs, reference[1:], strict=True):
             x = step(plant, x, u)
             total += Q @ (x - r) ** 2 + R @ u**2
@@ -156,7 +165,8 @@ class Scripted:
     horizon = 2
 
     def __init__(self, *statuses):
-        self.statuses, self.seen = list(statuses), []
+        self.statuses = list(statuses)
+        self.seen = []
 
     def control(self, belief, reference, previous=None):
         self.seen.append((belief.mean, reference.states, previous))
@@ -174,10 +184,8 @@ class Scripted:
 
 def test_the_loop_hands_on_state_references_and_the_last_decision():
     controller = Scripted(Status.SOLVED, Status.SOLVED, Status.SOLVED)
-    plant, references = (
-        System(DoubleIntegrator(), time_step=1.0, substeps=1),
-        np.arange(10.0).reshape(5, 2),
-    )
+    plant = System(DoubleIntegrator(), time_step=1.0, substeps=1)
+    references = np.arange(10.0).reshape(5, 2)
     rollout = closed_loop(plant, controller, references, np.zeros(2), 3)
     assert np.allclose(rollout.states, [[0, 0], [0.5, 1], [2, 2], [4.5, 3]])
     assert rollout.inputs.shape == (3, 1)
@@ -214,10 +222,8 @@ def test_too_few_references_are_refused_before_the_first_step():
 
 def test_soft_bounds_of_one_state_leave_the_others_free():
     plant = System(DoubleIntegrator(), time_step=0.5, substeps=1)
-    state, reference = (
-        Gaussian.certain(np.array([0.2, 0.1])),
-        Reference(np.full((6, 2), 1.0)),
-    )
+    state = Gaussian.certain(np.array([0.2, 0.1]))
+    reference = Reference(np.full((6, 2), 1.0))
     wide = Box([-np.inf, -9.0], [np.inf, 9.0], probability=0.95, penalty=1.0)
     free, bounded = (
         NMPC(
@@ -268,7 +274,8 @@ def test_a_soft_state_bound_costs_what_it_says_on_either_side(price):
     """One step of x+ = x + u: minimise (x - r)^2 + u^2 + price v on a grid finer than the answer."""
 
     class Shifted:
-        state_names, input_names = ("x",), ("u",)
+        state_names = ("x",)
+        input_names = ("u",)
 
         def derivative(self, x, u):
             return [x[0] + u[0]]
@@ -310,28 +317,33 @@ def test_the_last_state_has_its_own_weight_and_inputs_are_weighed_as_asked(
     penalized, rng
 ):
     """No small change of the plan is cheaper by the problem's own words."""
-    plant, H = System(DoubleIntegrator(), time_step=0.5, substeps=1), 4
-    Q, T, R = np.array([[2.0, 0.3], [0.3, 1.0]]), np.diag([9.0, 0.1]), np.array([[0.4]])
+    plant = System(DoubleIntegrator(), time_step=0.5, substeps=1)
+    H = 4
+    Q = np.array([[2.0, 0.3], [0.3, 1.0]])
+    T = np.diag([9.0, 0.1])
+    R = np.array([[0.4]])
     controller = NMPC(
         plant, Problem(Tracking(Q, R, terminal=T, penalized=penalized)), H, [0.7]
     )
-    state, reference = (
-        rng.normal(size=2),
-        Reference(rng.normal(size=(H + 1, 2)), rng.normal(size=(H, 1))),
-    )
+    state = rng.normal(size=2)
+    reference = Reference(rng.normal(size=(H + 1, 2)), rng.normal(size=(H, 1)))
     decision = controller.control(Gaussian.certain(state), reference)
 
     def cost(inputs):
-        x, total, last = state, 0.0, np.array([0.7])
+        x = state
+        total = 0.0
+        last = np.array([0.7])
         for k, u in enumerate(inputs):
             x = step(plant, x, u)
-            error, weight = x - reference.states[k + 1], T if k == H - 1 else Q
+            error = x - reference.states[k + 1]
+            weight = T if k == H - 1 else Q
             v = {
                 "inputs": u,
                 "deviations": u - reference.inputs[k],
                 "increments": u - last,
             }[penalized]
-            total, last = total + error @ weight @ error + v @ R @ v, u
+            total = total + error @ weight @ error + v @ R @ v
+            last = u
         return total
 
     best = cost(decision.inputs)

@@ -33,7 +33,8 @@ PROPAGATORS = {
     "unscented": Unscented(),
     "monte carlo": MonteCarlo(samples=40),
 }
-Q, R = np.array([[3.0, 0.4], [0.4, 0.5]]), np.array([0.2])
+Q = np.array([[3.0, 0.4], [0.4, 0.5]])
+R = np.array([0.2])
 SPREAD = torch.tensor([[0.02, 0.005], [0.005, 0.03]])
 KINDS = [NonlinearGPMPC, SLSQP]
 
@@ -61,10 +62,14 @@ def request_of(problem, H, at=None, last=0.3, reference=None):
 def test_the_adjoint_gradient_is_that_of_torch_and_of_finite_differences(
     name, penalized, rng
 ):
-    H, propagator, model = 4, PROPAGATORS[name], pendulum_posterior()
+    H = 4
+    propagator = PROPAGATORS[name]
+    model = pendulum_posterior()
     problem = Problem(Tracking(Q, R, terminal=2 * Q, penalized=penalized))
     baseline = SLSQP(model, propagator, problem, H, [0.0])
-    inputs, reference, last = rng.normal(size=(H, 1)), swing(H), np.array([0.3])
+    inputs = rng.normal(size=(H, 1))
+    reference = swing(H)
+    last = np.array([0.3])
     found = baseline.evaluate(inputs, request_of(problem, H))
 
     def by_torch(u):
@@ -88,7 +93,8 @@ def test_the_adjoint_gradient_is_that_of_torch_and_of_finite_differences(
         rtol=1e-9,
         atol=1e-10,
     )
-    direction, step = rng.normal(size=H), 1e-5
+    direction = rng.normal(size=H)
+    step = 1e-5
     ends = [
         baseline.evaluate(inputs.ravel() + s * direction, request_of(problem, H)).cost
         for s in (step, -step)
@@ -102,13 +108,12 @@ def test_the_adjoint_gradient_is_that_of_torch_and_of_finite_differences(
     "name", ["mean equivalence", "linearisation", "moment matching"]
 )
 def test_margins_of_chance_constraints_and_their_jacobian(name, rng):
-    H, limits = (
-        4,
-        Box([-1.0, -np.inf], [0.8, 1.5], probability=0.95, kappa=2.0, penalty=None),
-    )
+    H = 4
+    limits = Box([-1.0, -np.inf], [0.8, 1.5], probability=0.95, kappa=2.0, penalty=None)
     problem = Problem(Tracking(Q, R, penalized="inputs"), constraints=[limits])
     baseline = SLSQP(pendulum_posterior(), PROPAGATORS[name], problem, H, [0.0])
-    request, plan = request_of(problem, H), rng.normal(size=H)
+    request = request_of(problem, H)
+    plan = rng.normal(size=H)
     shot = baseline.evaluate(plan, request)
     deviation = np.sqrt(shot.covariances[1:].diagonal(axis1=1, axis2=2))
     mu = shot.means[1:]
@@ -118,7 +123,8 @@ def test_margins_of_chance_constraints_and_their_jacobian(name, rng):
         mu[:, 1] + 2 * deviation[:, 1] - 1.5,
     ]
     assert np.allclose(shot.margins, np.transpose(expected).ravel())
-    direction, step = rng.normal(size=H), 1e-5
+    direction = rng.normal(size=H)
+    step = 1e-5
     ends = [baseline.evaluate(plan + s * direction, request) for s in (step, -step)]
     assert np.allclose(
         (ends[0].margins - ends[1].margins) / (2 * step),
@@ -129,10 +135,12 @@ def test_margins_of_chance_constraints_and_their_jacobian(name, rng):
 
 def condensed(H, problem, state, reference, last):
     """The quadratic program of the double integrator with W = 0.01 I: P, q, rows and bounds."""
-    A, B = np.array([[1.0, 0.5], [0.0, 1.0]]), np.array([0.125, 0.5])
+    A = np.array([[1.0, 0.5], [0.0, 1.0]])
+    B = np.array([0.125, 0.5])
     free = np.array([np.linalg.matrix_power(A, i + 1) @ state for i in range(H)])
     response = np.zeros((H, 2, H))
-    S, spread = np.zeros((2, 2)), []
+    S = np.zeros((2, 2))
+    spread = []
     for i in range(H):
         S = A @ S @ A.T + 0.01 * np.eye(2)
         spread.append(np.sqrt(S.diagonal()))
@@ -156,7 +164,8 @@ def condensed(H, problem, state, reference, last):
         - 2 * float(problem.cost.R[0, 0]) * D.T @ offset
     )
     rates = np.eye(H) - np.eye(H, k=-1)
-    start, kappa = last * np.eye(H)[0], problem.constraints[0].standard_deviations()
+    start = last * np.eye(H)[0]
+    kappa = problem.constraints[0].standard_deviations()
     rows = np.concatenate([rates, response[:, 1]])
     upper = np.concatenate(
         [
@@ -172,25 +181,21 @@ def condensed(H, problem, state, reference, last):
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("penalized", ["inputs", "increments"])
 def test_on_a_linear_model_the_optimum_is_the_quadratic_programs(kind, penalized):
-    H, limits = (
-        6,
-        Box(
-            [-np.inf, -np.inf],
-            [np.inf, 0.35],
-            probability=0.95,
-            kappa=0.5,
-            penalty=None,
-        ),
+    H = 6
+    limits = Box(
+        [-np.inf, -np.inf],
+        [np.inf, 0.35],
+        probability=0.95,
+        kappa=0.5,
+        penalty=None,
     )
     bounds = {"inputs": Box([-1.0], [0.3]), "input_rates": Box([-0.25], [0.25])}
     problem = Problem(
         Tracking(Q, R, penalized=penalized), constraints=[limits], **bounds
     )
-    model, state, reference = (
-        double_integrator(W=(0.01 * np.eye(2)).tolist()),
-        np.array([0.2, -0.4]),
-        np.ones((7, 2)),
-    )
+    model = double_integrator(W=(0.01 * np.eye(2)).tolist())
+    state = np.array([0.2, -0.4])
+    reference = np.ones((7, 2))
     best = DualActiveSet().solve(condensed(H, problem, state, reference, 0.1))
     assert (best.active_set != 0).sum() >= 3
     controller = kind(model, Linearization(), problem, H, [0.1], tolerance=1e-8)
@@ -202,20 +207,20 @@ def test_on_a_linear_model_the_optimum_is_the_quadratic_programs(kind, penalized
 
 
 class DoubleIntegrator:
-    state_names, input_names = ("x", "v"), ("a",)
+    state_names = ("x", "v")
+    input_names = ("a",)
 
     def derivative(self, x, u):
         return [x[1], u[0]]
 
 
 def test_on_a_certain_model_it_is_nonlinear_mpc_of_the_true_plant(rng):
-    H, limits = 5, Box([-np.inf, -0.4], [np.inf, 0.4], probability=0.95, penalty=None)
+    H = 5
+    limits = Box([-np.inf, -0.4], [np.inf, 0.4], probability=0.95, penalty=None)
     problem = Problem(Tracking(Q, R), inputs=Box(None, [0.5]), constraints=[limits])
     plant = System(DoubleIntegrator(), time_step=0.5, substeps=1)
-    state, reference = (
-        Gaussian.certain(np.array([0.1, 0.2])),
-        Reference(rng.normal(size=(H + 1, 2))),
-    )
+    state = Gaussian.certain(np.array([0.1, 0.2]))
+    reference = Reference(rng.normal(size=(H + 1, 2)))
     ours = NonlinearGPMPC(
         double_integrator(), MeanEquivalence(), problem, H, [0.1]
     ).control(state, reference)
@@ -243,15 +248,15 @@ def constrained(penalty=None):
     ],
 )
 def test_bounds_are_kept_and_no_feasible_perturbation_is_cheaper(name, kind, rng):
-    H, problem, model = 4, constrained(), pendulum_posterior()
+    H = 4
+    problem = constrained()
+    model = pendulum_posterior()
     controller = kind(model, PROPAGATORS[name], problem, H, [0.3], tolerance=1e-6)
     at = belief((0.3, 0.8), SPREAD / 20)
     decision = controller.control(at, swing(H))
     assert decision.status is Status.SOLVED
-    baseline, request = (
-        SLSQP(model, PROPAGATORS[name], problem, H, [0.3]),
-        request_of(problem, H, at),
-    )
+    baseline = SLSQP(model, PROPAGATORS[name], problem, H, [0.3])
+    request = request_of(problem, H, at)
     found = baseline.evaluate(decision.inputs, request)
     assert found.margins.max() < 1e-6
     assert np.abs(np.diff(decision.inputs[:, 0], prepend=0.3)).max() < 1.5 + 1e-7
@@ -276,7 +281,8 @@ def test_bounds_are_kept_and_no_feasible_perturbation_is_cheaper(name, kind, rng
 
 
 def test_a_generic_optimizer_finds_the_same_plan():
-    H, decisions = 5, []
+    H = 5
+    decisions = []
     for kind in KINDS:
         controller = kind(
             pendulum_posterior(), MomentMatching(), constrained(), H, [0.3]
@@ -288,7 +294,9 @@ def test_a_generic_optimizer_finds_the_same_plan():
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_warm_start_takes_fewer_iterations(kind):
-    H, cold, warm = 6, 0, 0
+    H = 6
+    cold = 0
+    warm = 0
     controller = kind(
         pendulum_posterior(),
         Linearization(),
@@ -308,16 +316,14 @@ def test_a_warm_start_takes_fewer_iterations(kind):
 
 @pytest.mark.parametrize("price", [20.0, 50.0])
 def test_soft_bounds_give_way_and_their_price_is_at_its_minimum(price, rng):
-    H, problem = 4, constrained(price)
+    H = 4
+    problem = constrained(price)
     settings = pendulum_posterior(), Linearization()
-    controller, hard = (
-        NonlinearGPMPC(*settings, problem, H, [0.3]),
-        SLSQP(*settings, constrained(), H, [0.3]),
-    )
-    at, reference = (
-        belief((0.9, 0.5), SPREAD / 20),
-        swing(H, 1.3),
-    )  # beyond its bound already
+    controller = NonlinearGPMPC(*settings, problem, H, [0.3])
+    hard = SLSQP(*settings, constrained(), H, [0.3])
+    # beyond its bound already
+    at = belief((0.9, 0.5), SPREAD / 20)
+    reference = swing(H, 1.3)
     decision = controller.control(at, reference)
     assert decision.status is Status.SOFT_BOUND_MISSED
     assert decision.means[1, 0] > 0.75
@@ -336,7 +342,8 @@ def test_soft_bounds_give_way_and_their_price_is_at_its_minimum(price, rng):
 
 
 def test_an_exact_penalty_keeps_what_can_be_kept():
-    H, at = 5, belief((0.3, 0.8), SPREAD / 20)
+    H = 5
+    at = belief((0.3, 0.8), SPREAD / 20)
     plans = [
         NonlinearGPMPC(
             pendulum_posterior(), Linearization(), constrained(penalty), H, [0.3]

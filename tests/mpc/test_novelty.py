@@ -22,7 +22,8 @@ MODES = ["full", "diagonal", "zero_order", "none"]
 
 def transitions(rows=60, unstable=0.0, noise=1e-3):
     rng = np.random.default_rng(0)
-    states, inputs = rng.uniform(-1, 1, (rows, 2)), rng.uniform(-1, 1, (rows, 1))
+    states = rng.uniform(-1, 1, (rows, 2))
+    inputs = rng.uniform(-1, 1, (rows, 1))
     after = states + 0.1 * np.stack(
         [states[:, 1], np.sin(states[:, 0]) + inputs[:, 0]], axis=1
     )
@@ -50,7 +51,8 @@ def decide(chosen, place):
 @pytest.mark.parametrize("form", ["trajectory", "velocity"])
 def test_every_mode_knows_whether_its_plan_is_among_the_data(gp, mode, form):
     chosen = controller(gp, mode, form=form)
-    among, beyond = decide(chosen, 0.2), decide(chosen, 4e3)
+    among = decide(chosen, 0.2)
+    beyond = decide(chosen, 4e3)
     assert 0.0 < among.novelty < 0.2
     assert not among.far_from_data
     assert 0.95 < beyond.novelty < 1.5  # what is added adds up
@@ -65,7 +67,8 @@ def test_moments_may_be_matched(gp, mode):
 
 @pytest.mark.parametrize("mode", ["none", "zero_order"])
 def test_it_is_the_added_deviation_over_that_of_what_was_learned(gp, mode):
-    chosen, state = controller(gp, mode), np.full(2, 0.9)
+    chosen = controller(gp, mode)
+    state = np.full(2, 0.9)
     decision = None
     for _ in range(5):  # until the stages are those of the plan
         decision = chosen.control(Gaussian.certain(state), Reference(state), decision)
@@ -115,7 +118,8 @@ def test_a_state_that_only_its_noise_moves_is_not_far_from_its_data():
     gp = GPPosterior.from_hyperparameters(
         features, targets, ones.expand(1, 2), 1e-12 * ones, 1e-8 * ones, 1
     )
-    belief, cost = Gaussian.certain([0.1]), Tracking([1.0], [0.1])
+    belief = Gaussian.certain([0.1])
+    cost = Tracking([1.0], [0.1])
     decision = GPMPC(gp, Linearization(), Problem(cost), 10, [0.0]).control(
         belief, Reference([0.1])
     )
@@ -163,7 +167,8 @@ def test_models_around_gps_know_it_too(gp, mode):
 
 
 def test_a_plan_of_means_is_measured_when_it_is_read_and_not_before(gp, monkeypatch):
-    asked, linearize = [], GPPosterior.linearize
+    asked = []
+    linearize = GPPosterior.linearize
 
     def counted(self, states, inputs, covariance=True):
         asked.append(covariance)

@@ -21,10 +21,8 @@ from tests.mpc.double_pendulum import ACROBOT, DoublePendulum
 from tests.mpc.systems import LinearPlant, linear_gaussian
 
 H = 7
-STATE, GOAL = (
-    np.array([0.4, -0.3, 0.2]),
-    Reference(np.array([0.1, 0.2, -0.1]), np.array([0.05, -0.1])),
-)
+STATE = np.array([0.4, -0.3, 0.2])
+GOAL = Reference(np.array([0.1, 0.2, -0.1]), np.array([0.05, -0.1]))
 BOX = Box([-0.3] * 2, [0.25] * 2)
 
 
@@ -47,7 +45,8 @@ def planned(
 @pytest.mark.parametrize("form", FORMS)
 def test_a_linear_output_costs_what_tracking_does(form, covariance):
     """x - r and u as outputs with the weights Q and R, beside a cost that is next to nothing."""
-    Q, R = np.diag([3.0, 0.5, 1.0]) + 0.1, np.diag([0.2, 0.4])
+    Q = np.diag([3.0, 0.5, 1.0]) + 0.1
+    R = np.diag([0.2, 0.4])
     tracking = planned(
         Problem(Tracking(Q, R + 1e-9 * np.eye(2), penalized="inputs"), BOX),
         covariance,
@@ -69,8 +68,10 @@ def test_a_linear_output_costs_what_tracking_does(form, covariance):
 def test_weights_and_bounds_by_stage_are_those_of_the_program_with_its_states_left_in(
     penalized, rng
 ):
-    Q, R = rng.uniform(0.1, 2.0, (H, 3)), rng.uniform(0.1, 1.0, (H, 2))
-    low, high = rng.uniform(-0.3, -0.1, (H, 2)), rng.uniform(0.1, 0.3, (H, 2))
+    Q = rng.uniform(0.1, 2.0, (H, 3))
+    R = rng.uniform(0.1, 1.0, (H, 2))
+    low = rng.uniform(-0.3, -0.1, (H, 2))
+    high = rng.uniform(0.1, 0.3, (H, 2))
     cost = Tracking(
         *(weights[:, :, None] * np.eye(weights.shape[1]) for weights in (Q, R)),
         penalized=penalized,
@@ -97,7 +98,8 @@ def test_weights_and_bounds_by_stage_are_those_of_the_program_with_its_states_le
 
 def tip(x, u, p):
     """Place of a double pendulum's tip over the one that p says, and the power that its motor takes."""
-    elbow, hand = x[..., 0], x[..., 0] + x[..., 1]
+    elbow = x[..., 0]
+    hand = x[..., 0] + x[..., 1]
     place = [
         torch.sin(elbow) + torch.sin(hand) - p[..., 0],
         torch.cos(elbow) + torch.cos(hand) - p[..., 1],
@@ -109,7 +111,8 @@ def casadi_tip():
     x, u, p = (
         casadi.SX.sym(name, size) for name, size in (("x", 4), ("u", 1), ("p", 2))
     )
-    elbow, hand = x[0], x[0] + x[1]
+    elbow = x[0]
+    hand = x[0] + x[1]
     place = (
         casadi.sin(elbow) + casadi.sin(hand) - p[0],
         casadi.cos(elbow) + casadi.cos(hand) - p[1],
@@ -122,8 +125,11 @@ def casadi_tip():
 @pytest.mark.parametrize("y", [tip, casadi_tip()], ids=["torch", "CasADi"])
 def test_an_iterated_plan_is_where_the_cost_of_its_outputs_has_no_slope(y):
     """The gradient of the true cost in the inputs, by differences of a roll-out, vanishes: KKT without bounds."""
-    model, steps, R = DoublePendulum(ACROBOT), 12, 1e-2
-    place, start = np.array([0.5, 1.6]), np.array([0.2, 0.1, 0.0, 0.0])
+    model = DoublePendulum(ACROBOT)
+    steps = 12
+    R = 1e-2
+    place = np.array([0.5, 1.6])
+    start = np.array([0.2, 0.1, 0.0, 0.0])
     problem = Problem(
         Tracking([0.0, 0.0, 0.02, 0.02], [R], penalized="inputs"),
         outputs=[LeastSquares(y, [5.0, 5.0, 1.0])],
@@ -146,7 +152,8 @@ def test_an_iterated_plan_is_where_the_cost_of_its_outputs_has_no_slope(y):
     assert plan.iterations > 3
 
     def cost(inputs):
-        x, total = start, 0.0
+        x = start
+        total = 0.0
         for u in inputs:
             x = model.successor(x, u)
             out = tip(torch.tensor(x), torch.tensor(u), torch.tensor(place)).numpy()
@@ -166,7 +173,8 @@ def test_an_iterated_plan_is_where_the_cost_of_its_outputs_has_no_slope(y):
 
 def test_a_constraint_of_states_and_inputs_is_kept_and_touched():
     """An input stays above x_3^2 - 0.2, whether it is said in torch or in CasADi."""
-    x, u = casadi.SX.sym("x", 3), casadi.SX.sym("u", 2)
+    x = casadi.SX.sym("x", 3)
+    u = casadi.SX.sym("u", 2)
     limits = [
         lambda x, u: x[:, 2] ** 2 - u[:, 0] - 0.2,
         casadi.Function("limit", [x, u], [x[2] ** 2 - u[0] - 0.2]),
@@ -188,7 +196,8 @@ def test_a_constraint_of_states_and_inputs_is_kept_and_touched():
 
 
 def test_a_plan_that_is_handed_over_is_where_the_iteration_starts():
-    model, goal = DoublePendulum(ACROBOT), Reference(np.zeros(4))
+    model = DoublePendulum(ACROBOT)
+    goal = Reference(np.zeros(4))
     cost = Tracking([1.0] * 4, [1e-3], penalized="inputs")
     settings = {"prediction": PredictionSettings(covariance="none"), "tolerance": 1e-9}
     args = model, Linearization(), Problem(cost, Box([-6.0], [6.0])), 15, [0.0]
@@ -212,7 +221,8 @@ def test_a_plan_that_is_handed_over_is_where_the_iteration_starts():
 
 
 def test_a_plan_that_leaves_the_data_is_flagged_and_one_among_them_is_not(rng):
-    states, inputs = rng.uniform(-1, 1, (60, 2)), rng.uniform(-1, 1, (60, 1))
+    states = rng.uniform(-1, 1, (60, 2))
+    inputs = rng.uniform(-1, 1, (60, 1))
     after = states + 0.1 * np.stack(
         [np.sin(3 * states[:, 1]), np.sin(3 * inputs[:, 0])], axis=1
     )
@@ -235,7 +245,8 @@ def test_a_plan_that_leaves_the_data_is_flagged_and_one_among_them_is_not(rng):
 
 
 def test_mistakes_are_one_clear_error():
-    tracking, at = Tracking([1.0] * 3, [0.1] * 2), Gaussian.certain(STATE)
+    tracking = Tracking([1.0] * 3, [0.1] * 2)
+    at = Gaussian.certain(STATE)
     for output, message in (
         ((1.0, [1.0]), "y: must be a function; got float"),
         ((len, [-1.0]), "weight: must be positive semidefinite"),
@@ -289,11 +300,9 @@ def test_mistakes_are_one_clear_error():
 
 
 def test_functions_are_looked_at_where_a_flight_starts_also_with_references_and_weights_by_stage():
-    cost, start, weight = (
-        Tracking([1.0] * 3, [1.0] * 2),
-        (STATE, np.zeros(2)),
-        np.stack([np.eye(3)] * H),
-    )
+    cost = Tracking([1.0] * 3, [1.0] * 2)
+    start = (STATE, np.zeros(2))
+    weight = np.stack([np.eye(3)] * H)
     Problem(
         cost, outputs=[LeastSquares(lambda x: x, weight, np.zeros((H, 3)))]
     ).check_start(*start)

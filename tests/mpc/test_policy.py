@@ -8,7 +8,8 @@ from gpmpc.mpc._policy import command
 from gpmpc.mpc.problem import Box, Problem, Tracking
 from gpmpc.status import Status
 
-STATE, FAR = Gaussian.certain(np.zeros(1)), Reference(np.zeros((5, 1)))
+STATE = Gaussian.certain(np.zeros(1))
+FAR = Reference(np.zeros((5, 1)))
 LOST = Gaussian.certain(np.array([np.nan]))
 
 
@@ -18,7 +19,8 @@ class Planner:
     horizon = 4
 
     def __init__(self, *failing):
-        self.failing, self.previous = failing, []
+        self.failing = failing
+        self.previous = []
 
     def control(self, belief, reference, previous=None):
         k = len(self.previous)
@@ -27,10 +29,8 @@ class Planner:
         inputs = (
             np.full((4, 1), 666.0) if failed else 10.0 * k + np.arange(4.0)[:, None]
         )
-        means, covariances = (
-            np.arange(5.0)[:, None] + 100 * k,
-            np.arange(5.0)[:, None, None] + 100 * k,
-        )
+        means = np.arange(5.0)[:, None] + 100 * k
+        covariances = np.arange(5.0)[:, None, None] + 100 * k
         status = Status.ITERATION_LIMIT if failed else Status.SOLVED
         return Decision(
             inputs[0], inputs, means, covariances, status, 1, Timing(0.0, 0.0, 0.0)
@@ -38,7 +38,8 @@ class Planner:
 
 
 def run(planner, steps, on_failure, beliefs=None, reference=FAR):
-    last, commands = None, []
+    last = None
+    commands = []
     for k in range(steps):
         last = command(
             planner, beliefs[k] if beliefs else STATE, reference, last, on_failure, k
@@ -144,7 +145,9 @@ def test_before_the_first_plan_the_reference_input_is_applied_within_the_bounds_
 @pytest.mark.parametrize("on_failure", ["previous_plan", "hold"])
 def test_before_the_first_plan_each_step_applies_its_own_reference_input(on_failure):
     """What was applied for want of a plan is no plan, and is not gone on along."""
-    planner, last, applied = Planner(0, 1, 2), None, []
+    planner = Planner(0, 1, 2)
+    last = None
+    applied = []
     for k in range(4):
         reference = Reference(np.zeros((5, 1)), 100.0 + k + np.arange(4.0)[:, None])
         last = command(planner, STATE, reference, last, on_failure, k)

@@ -27,8 +27,10 @@ def gp():
     )
 
 
-STATE, INPUT = np.array([0.3, -0.2]), np.array([0.5])
-ALONG, BY_INPUT = np.array([1.0, -2.0]), np.array([0.7])
+STATE = np.array([0.3, -0.2])
+INPUT = np.array([0.5])
+ALONG = np.array([1.0, -2.0])
+BY_INPUT = np.array([0.7])
 
 
 def by_differences(gp, along, by_input, width=1e-4):
@@ -68,7 +70,8 @@ def test_models_around_a_gp_are_looked_through(gp):
 
 def test_an_angle_is_seen_through_its_sine_and_cosine():
     rng = np.random.default_rng(0)
-    states, inputs = rng.uniform(-1, 1, (30, 2)), rng.uniform(-1, 1, (30, 1))
+    states = rng.uniform(-1, 1, (30, 2))
+    inputs = rng.uniform(-1, 1, (30, 1))
     after = states + 0.1 * np.sin(states[:, :1]) + rng.normal(0, 0.01, (30, 2))
     model = ResidualModel.train(
         Affine.identity(2, 1),
@@ -77,7 +80,8 @@ def test_an_angle_is_seen_through_its_sine_and_cosine():
         trainer=Trainer(restarts=0),
     )
     found = slope_covariances(model, STATE, INPUT)
-    sine, cosine = np.sin(STATE[0]), np.cos(STATE[0])
+    sine = np.sin(STATE[0])
+    cosine = np.cos(STATE[0])
     direct = slope_covariances(
         model.residual, np.array([sine, cosine, STATE[1]]), INPUT
     )
@@ -88,15 +92,18 @@ def test_an_angle_is_seen_through_its_sine_and_cosine():
 class Pendulum:
     """Its state lies on a circle, off which no data say anything."""
 
-    state_names, input_names = ("cosine", "sine", "rate"), ("torque",)
+    state_names = ("cosine", "sine", "rate")
+    input_names = ("torque",)
 
     def derivative(self, x, u):
         return [-x[1] * x[2], x[0] * x[2], 15.0 * x[1] + 3.0 * u[0]]
 
 
 def test_growth_in_a_direction_without_data_is_no_warning_but_that_of_the_plant_is():
-    plant, rng = System(Pendulum(), time_step=0.05), np.random.default_rng(0)
-    angles, torques = rng.uniform(-np.pi, np.pi, 200), rng.uniform(-2, 2, (200, 1))
+    plant = System(Pendulum(), time_step=0.05)
+    rng = np.random.default_rng(0)
+    angles = rng.uniform(-np.pi, np.pi, 200)
+    torques = rng.uniform(-2, 2, (200, 1))
     rates = rng.uniform(-8, 8, 200)
     states = np.column_stack([np.cos(angles), np.sin(angles), rates])
     after = step_many(plant, states, torques) + rng.normal(0, 0.001, (200, 3))

@@ -92,7 +92,8 @@ def test_a_regulator_at_its_origin_has_no_trouble(penalized, tolerance):
         iterations=20,
         tolerance=tolerance,
     )
-    state, last = np.array([0.8, 0.0]), None
+    state = np.array([0.8, 0.0])
+    last = None
     for _ in range(120):
         last = controller.control(
             Gaussian.certain(state), Reference(np.zeros((9, 2))), last
@@ -139,7 +140,9 @@ def test_what_is_called_solved_is_within_ten_times_the_tolerance(quadrotor, tole
         iterations=80,
         tolerance=tolerance,
     )
-    random, last, before = np.random.default_rng(1), None, HOVER
+    random = np.random.default_rng(1)
+    last = None
+    before = HOVER
     for _ in range(20):
         belief = Gaussian.certain(0.5 * random.uniform(-1, 1, 6))
         reference = Reference(np.tile(0.5 * random.uniform(-1, 1, 6), (6, 1)))
@@ -172,12 +175,10 @@ def test_plans_of_the_program_keep_their_rates_whatever_the_unit_of_the_inputs(
         prediction=PredictionSettings(covariance="none"),
         iterations=10,
     )
-    state, last, before, bitten = (
-        np.array([0.8, 0.0]),
-        None,
-        np.array([1.234567 * scale]),
-        0,
-    )
+    state = np.array([0.8, 0.0])
+    last = None
+    before = np.array([1.234567 * scale])
+    bitten = 0
     for _ in range(20):
         last = controller.control(
             Gaussian.certain(state), Reference(np.zeros((9, 2))), last
@@ -186,10 +187,10 @@ def test_plans_of_the_program_keep_their_rates_whatever_the_unit_of_the_inputs(
         rates = np.diff(last.inputs, axis=0, prepend=before[None])
         assert np.abs(rates).max() <= bound + 1e-9 * max(1.0, np.abs(last.inputs).max())
         bitten += int((np.abs(np.diff(last.inputs[:, 0])) > 0.999 * bound).sum())
-        state, before = (
-            model.predict(torch.tensor(state), torch.tensor(last.input)).mean.numpy(),
-            last.input,
-        )
+        state = model.predict(
+            torch.tensor(state), torch.tensor(last.input)
+        ).mean.numpy()
+        before = last.input
     assert bitten > 10
 
 
@@ -232,7 +233,10 @@ def test_compiled_and_torch_and_another_solver_iterate_alike(
         GPMPC(*arguments, **solver, iterations=60, tolerance=1e-7)
         for solver in ({}, told)
     )
-    random, last, before, programs = np.random.default_rng(2), None, None, 0
+    random = np.random.default_rng(2)
+    last = None
+    before = None
+    programs = 0
     for _ in range(8):
         belief = Gaussian(
             torch.tensor(0.4 * random.uniform(-1, 1, 6)), 1e-4 * torch.eye(6)
@@ -261,10 +265,8 @@ def test_the_order_in_memory_of_what_is_asked_changes_nothing(quadrotor):
     )
     controller = GPMPC(quadrotor, Linearization(), problem, 5, HOVER, iterations=30)
     random = np.random.default_rng(3)
-    states, inputs = (
-        0.3 * random.uniform(-1, 1, (6, 6)),
-        HOVER + 0.1 * random.uniform(-1, 1, (5, 3)),
-    )
+    states = 0.3 * random.uniform(-1, 1, (6, 6))
+    inputs = HOVER + 0.1 * random.uniform(-1, 1, (5, 3))
     S = torch.tensor(np.cov(random.normal(size=(6, 40)))) * 1e-3
     plain = controller.control(
         Gaussian(torch.tensor(states[0]), S), Reference(states, inputs)
@@ -319,7 +321,8 @@ def test_from_no_plan_at_all_few_programs_reach_a_kkt_point_at_any_horizon(
             for part in (0.3 * np.sin(time + axis), 0.3 * np.cos(time + axis))
         ]
     )
-    belief, previous = Gaussian.certain(references[0]), None
+    belief = Gaussian.certain(references[0])
+    previous = None
     if start == "hover":
         zeros = np.zeros((horizon + 1, 6, 6))
         plan = (
@@ -342,13 +345,11 @@ def test_from_no_plan_at_all_few_programs_reach_a_kkt_point_at_any_horizon(
 class Table:
     """A pendulum-like model that is known for |x_i| <= 6 only."""
 
-    state_dim, input_dim, output_dim, dtype, device = (
-        2,
-        1,
-        2,
-        torch.float64,
-        torch.device("cpu"),
-    )
+    state_dim = 2
+    input_dim = 1
+    output_dim = 2
+    dtype = torch.float64
+    device = torch.device("cpu")
     noise_covariance = torch.zeros(2, 2, dtype=torch.float64)
 
     def predict(self, state, input):
@@ -361,15 +362,11 @@ class Table:
         mean = np.stack(
             [x + 0.1 * v, v + 0.1 * (3 * np.sin(x) * v + inputs[:, 0])], axis=1
         )
-        A, B = (
-            np.tile(np.eye(2), (len(x), 1, 1)),
-            np.tile([[0.0], [0.1]], (len(x), 1, 1)),
-        )
-        A[:, 0, 1], A[:, 1, 0], A[:, 1, 1] = (
-            0.1,
-            0.3 * np.cos(x) * v,
-            1 + 0.3 * np.sin(x),
-        )
+        A = np.tile(np.eye(2), (len(x), 1, 1))
+        B = np.tile([[0.0], [0.1]], (len(x), 1, 1))
+        A[:, 0, 1] = 0.1
+        A[:, 1, 0] = 0.3 * np.cos(x) * v
+        A[:, 1, 1] = 1 + 0.3 * np.sin(x)
         return Linearized(mean, A, B, np.zeros((len(x), 2, 2)) if covariance else None)
 
 
@@ -400,16 +397,15 @@ def test_the_first_step_from_the_last_plan_needs_no_roll_out_and_ends_where_othe
     controller = GPMPC(
         quadrotor, Linearization(), problem, 10, HOVER, settings, iterations=20
     )
-    roll_out, rolled = controller.prediction.roll_out, []
+    roll_out = controller.prediction.roll_out
+    rolled = []
     monkeypatch.setattr(
         controller.prediction,
         "roll_out",
         lambda *given: rolled.append(1) or roll_out(*given),
     )
-    reference, moved = (
-        Reference(np.tile([0.5, 0.0] * 3, (11, 1))),
-        Gaussian.certain(np.array([-0.3, 0.2] * 3)),
-    )
+    reference = Reference(np.tile([0.5, 0.0] * 3, (11, 1)))
+    moved = Gaussian.certain(np.array([-0.3, 0.2] * 3))
     last = controller.control(Gaussian.certain(np.zeros(6)), reference)
     assert rolled
     rolled.clear()
@@ -425,7 +421,8 @@ def test_the_first_step_from_the_last_plan_needs_no_roll_out_and_ends_where_othe
 
 
 def test_inputs_that_lead_a_model_out_of_its_numbers_begin_a_plan_at_the_state():
-    x, u = casadi.SX.sym("x"), casadi.SX.sym("u")
+    x = casadi.SX.sym("x")
+    u = casadi.SX.sym("u")
     runaway = KnownModel(
         CasadiFunction(casadi.Function("f", [x, u], [x + 0.1 * (x**3 + u)])), 1, 1
     )
@@ -436,7 +433,8 @@ def test_inputs_that_lead_a_model_out_of_its_numbers_begin_a_plan_at_the_state()
     controller = GPMPC(
         runaway, Linearization(), problem, 12, [0.0], settings, iterations=30
     )
-    belief, reference = Gaussian.certain(np.array([0.5])), Reference(np.zeros((13, 1)))
+    belief = Gaussian.certain(np.array([0.5]))
+    reference = Reference(np.zeros((13, 1)))
     last = controller.control(belief, reference)
     request = controller.prediction.read(
         belief, reference, last, plan=np.full((12, 1), 50.0)

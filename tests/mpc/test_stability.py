@@ -162,7 +162,9 @@ def test_an_estimate_that_is_too_quick_for_a_delay_is_named_and_flights_agree():
         controller = late_integrator(disturbance_gain, bounds=bounds)
         known = controller.stability(np.zeros(1 + LATE))
         on_their_way = deque([np.zeros(1)] * LATE, LATE)
-        state, plan, positions = np.zeros(1), None, []
+        state = np.zeros(1)
+        plan = None
+        positions = []
         goal = Reference(np.array([1.0] + [0.0] * LATE))
         for _ in range(150):
             belief = np.concatenate([state, *on_their_way])
@@ -234,7 +236,8 @@ def test_what_nothing_weighs_may_stand_still():
 def test_of_learned_integrators_a_little_growth_does_not_count():
     system = double_integrator()
     rng = np.random.default_rng(0)
-    states, inputs = rng.uniform(-1, 1, (60, 2)), rng.uniform(-1, 1, (60, 1))
+    states = rng.uniform(-1, 1, (60, 2))
+    inputs = rng.uniform(-1, 1, (60, 1))
     after = np.array([step(system, x, u) for x, u in zip(states, inputs, strict=True)])
     after += rng.normal(0, 1e-3, after.shape)
     gp = Trainer(restarts=0)(Transitions(states, inputs, after), seed=0).posterior

@@ -32,11 +32,9 @@ def residual():
         1,
         "value",
     )
-    A, B, c = (
-        torch.tensor([[1.0, 0.2], [0.0, 0.9]]),
-        torch.tensor([[0.0], [0.2]]),
-        torch.tensor([0.0, 0.1]),
-    )
+    A = torch.tensor([[1.0, 0.2], [0.0, 0.9]])
+    B = torch.tensor([[0.0], [0.2]])
+    c = torch.tensor([0.0, 0.1])
     affine = Affine(*(part.double() for part in (A, B, c)))
     return ResidualModel(
         affine, gp, torch.tensor([[0.1], [0.3]], dtype=torch.float64), [1], [0], 1
@@ -61,10 +59,8 @@ def stage_at(mode, propagator, model, belief, input, disturbance=None):
 def test_the_shortcut_gives_the_same_stage(model, noise):
     model = model()
     root = torch.tensor([[0.2, 0.0], [0.1, 0.3]], dtype=torch.float64)
-    belief, input = (
-        Gaussian(torch.tensor([0.3, -0.2], dtype=torch.float64), root @ root.mT),
-        0.4 * torch.ones(1).double(),
-    )
+    belief = Gaussian(torch.tensor([0.3, -0.2], dtype=torch.float64), root @ root.mT)
+    input = 0.4 * torch.ones(1).double()
     _, short = stage_at(
         "zero_order", Linearization(process_noise=noise), model, belief, input
     )
@@ -76,12 +72,11 @@ def test_the_shortcut_gives_the_same_stage(model, noise):
 
 
 def test_a_model_may_give_views_and_other_types():
-    model, rng = pendulum_posterior(), np.random.default_rng(0)
-    states, inputs, covariances = (
-        rng.normal(size=(5, 2)),
-        rng.normal(size=(5, 1)),
-        np.zeros((5, 2, 2)),
-    )
+    model = pendulum_posterior()
+    rng = np.random.default_rng(0)
+    states = rng.normal(size=(5, 2))
+    inputs = rng.normal(size=(5, 1))
+    covariances = np.zeros((5, 2, 2))
 
     class Views:
         state_dim = model.state_dim
@@ -114,12 +109,11 @@ def test_a_model_may_give_views_and_other_types():
 
 @pytest.mark.parametrize("mode", ["full", "diagonal", "zero_order", "none"])
 def test_stages_of_many_points_are_those_of_each(mode):
-    model, rng = pendulum_posterior(), np.random.default_rng(0)
-    means, inputs, roots = (
-        rng.normal(size=(5, 2)),
-        rng.normal(size=(5, 1)),
-        0.2 * rng.normal(size=(5, 2, 2)),
-    )
+    model = pendulum_posterior()
+    rng = np.random.default_rng(0)
+    means = rng.normal(size=(5, 2))
+    inputs = rng.normal(size=(5, 1))
+    roots = 0.2 * rng.normal(size=(5, 2, 2))
     covariances = roots @ roots.mT
     linearizer = StageLinearizer(model, MomentMatching(), mode)
     states = linearizer.state(means, covariances)
@@ -159,7 +153,9 @@ def belief_at(mode, s, covariance):
 def test_a_stage_is_the_derivative_of_its_own_map_and_goes_through_its_point(
     mode, propagator
 ):
-    model, input, h = pendulum_posterior(), torch.tensor([0.4]), 1e-6
+    model = pendulum_posterior()
+    input = torch.tensor([0.4])
+    h = 1e-6
     propagator = MeanEquivalence() if mode == "none" else propagator
     root = torch.tensor([[0.2, 0.05], [0.05, 0.3]])
     s = extended(mode, Gaussian(torch.tensor([0.3, -0.2]), root @ root))
@@ -200,7 +196,8 @@ def test_a_stage_is_the_derivative_of_its_own_map_and_goes_through_its_point(
 
 def test_what_a_stage_adds_is_what_does_not_pass_through():
     """Sigma+ = A Sigma A' + V where a feedback can act, whatever the propagator."""
-    model, input = pendulum_posterior(), torch.tensor([0.4])
+    model = pendulum_posterior()
+    input = torch.tensor([0.4])
     root = torch.tensor([[0.1, 0.02], [0.02, 0.15]])
     belief = Gaussian(torch.tensor([0.3, -0.2]), root @ root)
     propagator = Linearization(process_noise=True)
@@ -218,12 +215,11 @@ def test_what_a_stage_adds_is_what_does_not_pass_through():
 
 @pytest.mark.parametrize("mode", ["full", "diagonal", "zero_order", "none"])
 def test_a_disturbance_moves_the_mean_and_nothing_else(mode):
-    model, input = pendulum_posterior(), torch.tensor([0.4])
+    model = pendulum_posterior()
+    input = torch.tensor([0.4])
     propagator = MeanEquivalence() if mode == "none" else Linearization()
-    belief, pushed = (
-        Gaussian(torch.tensor([0.3, -0.2]), 0.04 * torch.eye(2)),
-        np.array([0.1, -0.3]),
-    )
+    belief = Gaussian(torch.tensor([0.3, -0.2]), 0.04 * torch.eye(2))
+    pushed = np.array([0.1, -0.3])
     _, before = stage_at(mode, propagator, model, belief, input)
     _, after = stage_at(mode, propagator, model, belief, input, pushed)
     for name in ("c", "next"):

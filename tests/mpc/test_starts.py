@@ -28,8 +28,10 @@ from gpmpc.systems import cart_pole, double_pendulum, pendulum, step
 
 
 def known(system):
-    n, m = len(system.state_names), len(system.input_names)
-    x, u = casadi.SX.sym("x", n), casadi.SX.sym("u", m)
+    n = len(system.state_names)
+    m = len(system.input_names)
+    x = casadi.SX.sym("x", n)
+    u = casadi.SX.sym("u", m)
     return KnownModel(
         CasadiFunction(
             casadi.Function("f", [x, u], [casadi.vertcat(*system.successor(x, u))])
@@ -225,7 +227,8 @@ def test_a_reference_that_moves_is_followed_by_plans_alone():
 
 
 def test_the_search_is_never_worse_than_any_of_its_starts():
-    reference, state = Reference(np.zeros(2)), Gaussian.certain(np.array([2.5, 3.0]))
+    reference = Reference(np.zeros(2))
+    state = Gaussian.certain(np.array([2.5, 3.0]))
     many = pendulums(turns=3)
     found = many.control(state, reference)
     goals = [2 * np.pi * turn for turn in (-1, 0, 1, 2)]
@@ -255,7 +258,8 @@ def test_the_plan_obeys_the_dynamics_and_may_end_a_full_turn_away():
 
 
 def test_a_sensor_that_takes_a_turn_off_changes_nothing():
-    many, reference = pendulums(), Reference(np.zeros(2))
+    many = pendulums()
+    reference = Reference(np.zeros(2))
     first = many.control(Gaussian.certain(np.array([5.5, 2.0])), reference)
     states = [first.means[1] - turn for turn in ([0.0, 0.0], [2 * np.pi, 0.0])]
     inputs = [
@@ -266,11 +270,9 @@ def test_a_sensor_that_takes_a_turn_off_changes_nothing():
 
 
 def test_the_users_criterion_chooses_and_a_spent_budget_ends_the_search():
-    state, reference, seen = (
-        Gaussian.certain(np.array([np.pi, 0.0])),
-        Reference(np.zeros(2)),
-        [],
-    )
+    state = Gaussian.certain(np.array([np.pi, 0.0]))
+    reference = Reference(np.zeros(2))
+    seen = []
 
     def to_the_right(decision, goal):
         seen.append(goal.states[-1, 0])
@@ -290,7 +292,8 @@ def test_the_users_criterion_chooses_and_a_spent_budget_ends_the_search():
 
 
 def test_a_plan_that_does_not_lead_to_the_goal_is_given_up_and_a_good_one_is_not():
-    state, reference = Gaussian.certain(np.array([np.pi, 0.0])), Reference(np.zeros(2))
+    state = Gaussian.certain(np.array([np.pi, 0.0]))
+    reference = Reference(np.zeros(2))
     one = controller(pendulum(), [1.0, 0.01], [0.01], 30)
     many = pendulums()
     many.control(state, reference, one.control(state, reference))
@@ -359,17 +362,16 @@ def test_goals_are_the_nearest_turns_of_each_angle_seen_from_the_end_of_the_refe
 
 
 def test_a_guess_is_a_line_to_the_goal_or_what_its_inputs_lead_to():
-    system, H = pendulum(), 4
+    system = pendulum()
+    H = 4
     inputs = np.array([[0.5], [-0.5], [1.0], [0.0]])
     many = ManyStarts(
         controller(system, [1.0, 0.01], [0.01], H),
         guesses=[None, inputs, 1e308 * inputs],
         turns=2,
     )
-    state, targets = (
-        np.array([0.3, -0.2]),
-        np.stack([np.linspace(0.0, 1.0, 5), np.ones(5)], axis=1),
-    )
+    state = np.array([0.3, -0.2])
+    targets = np.stack([np.linspace(0.0, 1.0, 5), np.ones(5)], axis=1)
     found = list(many._candidates(state, Reference(targets)))
     assert len(found) == 6  # guess by guess, two goals each
     for goal, (given, states) in found[:2]:
@@ -443,7 +445,8 @@ def test_kicks_push_every_input_to_both_sides_within_its_bounds():
 @pytest.mark.parametrize("starts", [3, pytest.param(20, marks=pytest.mark.slow)])
 def test_no_solve_of_a_double_pendulum_from_a_wild_start_breaks_down(starts):
     # 2 joints x starts x 6 goals x 4 guesses: 960 solves, each iterated, over 1.2 s
-    count, rng = 0, np.random.default_rng(7)
+    count = 0
+    rng = np.random.default_rng(7)
     for actuated in ("elbow", "shoulder"):
         system = double_pendulum(actuated)
         one = controller(system, [10.0, 0.1, 10.0, 0.1], [0.01], 60, 20)
@@ -477,7 +480,8 @@ def test_between_decisions_the_plan_is_followed_under_its_feedback():
     system = pendulum()
     fine = pendulum(time_step=system.time_step / 10)
     many = pendulums()
-    loop, plain = ControlLoop(many), ControlLoop(many)
+    loop = ControlLoop(many)
+    plain = ControlLoop(many)
     with pytest.raises(SettingError, match="call input first"):
         loop.input_between(np.zeros(2), 0.5)
     state = np.array([0.05, 0.0])
@@ -503,16 +507,15 @@ def test_a_plan_that_cannot_be_improved_is_searched_for_anew():
     ]  # far from the state: no program of this controller succeeds
     parts = pendulum(), [1.0, 0.01], [0.01], 30
     many = ManyStarts(controller(*parts, constraints=walls), controller(*parts, 15))
-    state, reference = Gaussian.certain(np.array([1.0, 0.0])), Reference(np.zeros(2))
+    state = Gaussian.certain(np.array([1.0, 0.0]))
+    reference = Reference(np.zeros(2))
     first = many.control(state, reference)
     assert many.control(state, reference, first).applicable
 
 
 def test_plans_are_made_start_by_start_from_any_start_on():
-    many, question = (
-        pendulums(3),
-        (Gaussian.certain(np.array([np.pi, 0.3])), Reference(np.zeros(2))),
-    )
+    many = pendulums(3)
+    question = (Gaussian.certain(np.array([np.pi, 0.3])), Reference(np.zeros(2)))
     every = list(many.plans(*question))
     assert len(every) == len(many)
     later = list(many.plans(*question, first=2))

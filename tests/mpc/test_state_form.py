@@ -57,7 +57,9 @@ def test_it_gives_the_inputs_of_the_condensed_program(form, covariance, prices):
     controllers = [GPMPC(*arguments, iterations=1), StateFormMPC(*arguments)]
     if not prices:
         controllers.append(GPMPC(*arguments, CvxpySolver(), iterations=1))
-    state, last, worked = np.array([0.8, 0.2, -0.4, 0.1, 0.3, 0.0]), None, 0
+    state = np.array([0.8, 0.2, -0.4, 0.1, 0.3, 0.0])
+    last = None
+    worked = 0
     for _ in range(3):
         decisions = [
             c.control(Gaussian.certain(state), REFERENCE, last) for c in controllers

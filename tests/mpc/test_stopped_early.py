@@ -19,12 +19,12 @@ from gpmpc.simulation import closed_loop
 from gpmpc.status import Status
 from tests.mpc.systems import HOVER, QUADROTOR, quadrotor_gp
 
-GP, H, STEPS = quadrotor_gp(60), 12, 20
-LOWER, UPPER, RATE = (
-    np.array([3.0, -0.5, -0.5]),
-    np.array([12.0, 0.5, 0.5]),
-    np.array([2.0, 0.3, 0.3]),
-)
+GP = quadrotor_gp(60)
+H = 12
+STEPS = 20
+LOWER = np.array([3.0, -0.5, -0.5])
+UPPER = np.array([12.0, 0.5, 0.5])
+RATE = np.array([2.0, 0.3, 0.3])
 PROBLEM = Problem(
     Tracking([10.0, 1.0] * 3, [0.1] * 3),
     inputs=Box(LOWER, UPPER),
@@ -114,7 +114,9 @@ def test_the_plan_at_a_limit_is_the_best_that_the_iteration_got_to(limit):
     """Its cost falls from limit to limit, down to the optimum, by an evaluation that is not the iteration's own."""
 
     def of_the_mean(plan):
-        x, before, total = torch.tensor(START), HOVER, 0.0
+        x = torch.tensor(START)
+        before = HOVER
+        total = 0.0
         for u in plan:
             x = GP.predict(x, torch.tensor(u)).mean
             total += x.numpy() @ PROBLEM.cost.Q @ x.numpy() + (
@@ -123,10 +125,8 @@ def test_the_plan_at_a_limit_is_the_best_that_the_iteration_got_to(limit):
             before = u
         return float(total)
 
-    at, reference = (
-        Gaussian.certain(START),
-        Reference(REFERENCES.states[: H + 1], REFERENCES.inputs[:H]),
-    )
+    at = Gaussian.certain(START)
+    reference = Reference(REFERENCES.states[: H + 1], REFERENCES.inputs[:H])
 
     def cost(count):
         controller = convex(covariance="none", iterations=count, tolerance=1e-14)

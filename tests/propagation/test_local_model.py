@@ -31,9 +31,13 @@ def F(propagator, model, s, u):
 @pytest.mark.parametrize("make", MODELS.values(), ids=MODELS.keys())
 @pytest.mark.parametrize("name", ALL)
 def test_the_local_model_is_the_derivative_of_the_step(name, make):
-    model, propagator = make(), ALL[name]()
-    n, m = model.state_dim, model.input_dim
-    at, u, step = belief(n), torch.full((m,), 0.3), 1e-6
+    model = make()
+    propagator = ALL[name]()
+    n = model.state_dim
+    m = model.input_dim
+    at = belief(n)
+    u = torch.full((m,), 0.3)
+    step = 1e-6
     local = linearize(propagator, model, at, u)
     s = extended_state(at)
     assert local.A.shape == (n + n * n, n + n * n)
@@ -55,7 +59,8 @@ def test_the_local_model_is_the_derivative_of_the_step(name, make):
 
 @pytest.mark.parametrize("name", ALL)
 def test_from_a_measured_state_the_columns_for_the_root_vanish(name):
-    model, u = gp(), torch.tensor([0.2])
+    model = gp()
+    u = torch.tensor([0.2])
     at = Gaussian(torch.tensor([0.3, -0.1]), torch.zeros(2, 2))
     local = linearize(ALL[name](), model, at, u)
     assert not local.A[:, 2:].any()
@@ -68,8 +73,11 @@ def test_from_a_measured_state_the_columns_for_the_root_vanish(name):
 
 @pytest.mark.parametrize("name", ALL)
 def test_a_plan_of_stages_is_the_loop_over_them(name):
-    model, propagator, H = gp(predicts="difference"), ALL[name](), 4
-    means, inputs = torch.randn(H, 2), torch.randn(H, 1)
+    model = gp(predicts="difference")
+    propagator = ALL[name]()
+    H = 4
+    means = torch.randn(H, 2)
+    inputs = torch.randn(H, 1)
     covariances = torch.stack([belief(scale=0.2 * k).covariance for k in range(H)])
     together = linearize(propagator, model, Gaussian(means, covariances), inputs)
     for k in range(H):
@@ -87,7 +95,9 @@ def test_a_plan_of_stages_is_the_loop_over_them(name):
 
 @pytest.mark.parametrize("name", ALL)
 def test_linearising_along_inputs_follows_the_rollout(name):
-    model, propagator, inputs = gp(), ALL[name](), 0.5 * torch.randn(3, 5, 1)
+    model = gp()
+    propagator = ALL[name]()
+    inputs = 0.5 * torch.randn(3, 5, 1)
     at = Gaussian(0.3 * torch.randn(3, 2), belief().covariance.expand(3, 2, 2))
     beliefs = rollout(propagator, model, at, inputs)
     before = [torch.cat([now[:, None], later[:, :-1]], dim=1) for now, later in (
@@ -112,7 +122,8 @@ def test_linearising_along_inputs_follows_the_rollout(name):
 
 @pytest.mark.parametrize("name", DETERMINISTIC)
 def test_an_autonomous_model_needs_no_input(name):
-    model, propagator = gp(m=0), DETERMINISTIC[name]()
+    model = gp(m=0)
+    propagator = DETERMINISTIC[name]()
     local = linearize(propagator, model, belief())
     assert local.B.shape == (6, 0)
     assert rollout(propagator, model, belief(), torch.zeros(3, 0)).mean.shape == (3, 2)
@@ -147,7 +158,8 @@ def test_the_derivative_of_the_root_agrees_with_finite_differences(eigenvalues):
     U = torch.linalg.qr(torch.randn(3, 3)).Q
     S = U @ torch.diag(torch.tensor(eigenvalues)) @ U.T
     change = torch.randn(3, 3)
-    change, step = change + change.T, 1e-3 * min(eigenvalues)
+    change = change + change.T
+    step = 1e-3 * min(eigenvalues)
     _, derivative = torch.func.jvp(square_root, (S,), (change,))
     numeric = (square_root(S + step * change) - square_root(S - step * change)) / (
         2 * step

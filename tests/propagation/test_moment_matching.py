@@ -47,13 +47,20 @@ def belief(n=2, spread=0.3, seed=1, rank=None):
 def by_mpmath(gp, at, control):
     """The textbook formulas of the module in 50 digits, from the same hyperparameters and data."""
     with mpmath.workdps(50):
-        n, size = gp.state_dim, len(gp)
+        n = gp.state_dim
+        size = len(gp)
         x = mpmath.matrix(gp.features.tolist())
-        mu, u = at.mean.tolist(), control.tolist()
+        mu = at.mean.tolist()
+        u = control.tolist()
         S = mpmath.matrix(at.covariance.tolist())
         length = [[mpmath.mpf(v) for v in row] for row in gp.lengthscales.tolist()]
-        sf2, sn2 = gp.signal_variance.tolist(), gp.noise_variance.tolist()
-        mean, cross, q, beta, precision = [], mpmath.matrix(n, n), [], [], []
+        sf2 = gp.signal_variance.tolist()
+        sn2 = gp.noise_variance.tolist()
+        mean = []
+        cross = mpmath.matrix(n, n)
+        q = []
+        beta = []
+        precision = []
         for a in range(n):
             K = mpmath.matrix(size, size)
             for i in range(size):
@@ -67,7 +74,8 @@ def by_mpmath(gp, at, control):
             precision.append(K**-1)
             beta.append(precision[a] * mpmath.matrix(gp.targets[:, a].tolist()))
             Lam = mpmath.diag([v**2 for v in length[a][:n]])
-            inverse, det = (S + Lam) ** -1, mpmath.det(S * Lam**-1 + mpmath.eye(n))
+            inverse = (S + Lam) ** -1
+            det = mpmath.det(S * Lam**-1 + mpmath.eye(n))
             qs = []
             for i in range(size):
                 nu = mpmath.matrix([x[i, d] - mu[d] for d in range(n)])
@@ -91,7 +99,8 @@ def by_mpmath(gp, at, control):
                 inverse_a = mpmath.diag([1 / v**2 for v in length[a][:n]])
                 inverse_b = mpmath.diag([1 / v**2 for v in length[b][:n]])
                 R = S * (inverse_a + inverse_b) + mpmath.eye(n)
-                RS, det = R**-1 * S, mpmath.det(R)
+                RS = R**-1 * S
+                det = mpmath.det(R)
 
                 def k(c, i):
                     state = sum(
@@ -148,7 +157,8 @@ def by_mpmath(gp, at, control):
 def test_the_moments_agree_with_a_fifty_digit_evaluation(
     case, arguments, at, tolerance
 ):
-    gp, control = model(size=7, **arguments), torch.tensor([0.4])
+    gp = model(size=7, **arguments)
+    control = torch.tensor([0.4])
     at = belief(**at)
     if case == "far from the data":
         at = Gaussian(at.mean + 6.0, at.covariance)
@@ -168,15 +178,15 @@ def test_the_moments_agree_with_a_fifty_digit_evaluation(
 @pytest.mark.parametrize("predicts", ["next_state", "difference"])
 @pytest.mark.parametrize(("n", "m"), [(1, 0), (2, 1), (3, 2)])
 def test_the_moments_agree_with_monte_carlo(n, m, predicts):
-    gp, at, control = (
-        model(size=15, n=n, m=m, noise=1e-2, predicts=predicts),
-        belief(n),
-        torch.full((m,), 0.3),
-    )
-    samples, chunk = 1_000_000, 20_000
+    gp = model(size=15, n=n, m=m, noise=1e-2, predicts=predicts)
+    at = belief(n)
+    control = torch.full((m,), 0.3)
+    samples = 1_000_000
+    chunk = 20_000
     root = torch.linalg.cholesky(at.covariance)
     generator = torch.Generator().manual_seed(7)
-    states, moved = [], []
+    states = []
+    moved = []
     for _ in range(samples // chunk):
         x = at.mean + torch.randn(chunk, n, generator=generator) @ root.T
         prediction = gp.predict(x, control.expand(chunk, m))
@@ -185,7 +195,8 @@ def test_the_moments_agree_with_monte_carlo(n, m, predicts):
             prediction.mean
             + prediction.variance.sqrt() * torch.randn(chunk, n, generator=generator)
         )
-    states, moved = torch.cat(states), torch.cat(moved)
+    states = torch.cat(states)
+    moved = torch.cat(moved)
     exact = MomentMatching(process_noise=False).propagate(gp, at, control)
     assert float(exact.deficit) == 0
 
@@ -208,10 +219,8 @@ def test_without_covariance_it_is_the_plain_prediction(predicts):
     gp = model(predicts=predicts)
     for control in torch.linspace(-1, 1, 5)[:, None]:
         at = Gaussian(torch.tensor([0.3, -0.4]), torch.zeros(2, 2))
-        plain, matched = (
-            gp.predict(at.mean, control),
-            MomentMatching(process_noise=False).propagate(gp, at, control),
-        )
+        plain = gp.predict(at.mean, control)
+        matched = MomentMatching(process_noise=False).propagate(gp, at, control)
         assert torch.allclose(matched.belief.mean, plain.mean, rtol=0, atol=1e-10)
         assert torch.allclose(
             matched.belief.covariance, plain.covariance, rtol=0, atol=1e-10
@@ -220,7 +229,9 @@ def test_without_covariance_it_is_the_plain_prediction(predicts):
 
 
 def test_a_vanishing_covariance_approaches_the_plain_prediction_linearly():
-    gp, at, control = model(), belief(), torch.tensor([0.2])
+    gp = model()
+    at = belief()
+    control = torch.tensor([0.2])
     plain = gp.predict(at.mean, control).mean
     gaps = [
         float(
@@ -255,7 +266,9 @@ def test_a_batch_is_the_loop_over_its_members():
 
 @pytest.mark.parametrize("spread", [0.3, 0.0])
 def test_derivatives_by_torch_agree_with_finite_differences(spread):
-    gp, at, control = model(), belief(spread=spread), torch.tensor([0.2])
+    gp = model()
+    at = belief(spread=spread)
+    control = torch.tensor([0.2])
     direction = torch.tensor([[0.5, 0.2], [0.2, 0.3]])
 
     def along(t):
@@ -299,8 +312,10 @@ def test_the_public_class_is_differentiable_where_covariances_have_equal_eigenva
 
 
 def test_vmap_maps_over_beliefs():
-    gp, means = model(), torch.randn(3, 2)
-    S, control = belief().covariance, torch.tensor([0.2])
+    gp = model()
+    means = torch.randn(3, 2)
+    S = belief().covariance
+    control = torch.tensor([0.2])
     mapped = torch.func.vmap(lambda mean: moments(gp, Gaussian(mean, S), control)[1])(
         means
     )
@@ -322,11 +337,11 @@ def test_wide_beliefs_far_from_the_data_neither_overflow_nor_lose_the_prior():
 
 
 def test_the_result_is_semidefinite_and_observation_noise_is_added_unless_it_is_refused():
-    gp, at, control = model(noise=1e-8), belief(spread=1e-3), torch.tensor([0.1])
-    latent, noisy = (
-        MomentMatching(process_noise=False)(gp, at, control),
-        MomentMatching()(gp, at, control),
-    )
+    gp = model(noise=1e-8)
+    at = belief(spread=1e-3)
+    control = torch.tensor([0.1])
+    latent = MomentMatching(process_noise=False)(gp, at, control)
+    noisy = MomentMatching()(gp, at, control)
     assert float(torch.linalg.eigvalsh(latent.covariance).min()) >= -1e-18
     assert torch.allclose(
         noisy.covariance - latent.covariance, torch.diag(gp.noise_variance), atol=1e-14

@@ -56,11 +56,9 @@ def gp(n=2, m=1, predicts="next_state", outputs=None, noise=1e-2):
 
 def linear(noise=0.04):
     """x+ = A x + B u + c + d, d of a prior that no data have told anything: variance Q near 0, noise sn2."""
-    A, B, c = (
-        torch.tensor([[0.9, 0.4], [-0.3, 0.8]]),
-        torch.tensor([[0.2], [0.7]]),
-        torch.tensor([0.5, -1.0]),
-    )
+    A = torch.tensor([[0.9, 0.4], [-0.3, 0.8]])
+    B = torch.tensor([[0.2], [0.7]])
+    c = torch.tensor([0.5, -1.0])
     far = torch.full((1, 3), 1e6)  # so far off that the prior is all there is
     d = GPPosterior.from_hyperparameters(
         far,
@@ -84,8 +82,12 @@ def belief(n=2, scale=1.0):
 )
 @pytest.mark.parametrize("process_noise", [False, True])
 def test_a_linear_gaussian_system_is_propagated_exactly(name, process_noise):
-    model, at, u = linear(), belief(), torch.tensor([0.7])
-    A, B, c = model.nominal.A, model.nominal.B, model.nominal.c
+    model = linear()
+    at = belief()
+    u = torch.tensor([0.7])
+    A = model.nominal.A
+    B = model.nominal.B
+    c = model.nominal.c
     Q = torch.diag(torch.tensor([0.03, 0.05])) + process_noise * 0.04 * torch.eye(2)
     result = DETERMINISTIC[name](process_noise=process_noise).propagate(model, at, u)
     assert torch.allclose(result.belief.mean, A @ at.mean + B @ u + c, atol=1e-12)
@@ -97,7 +99,9 @@ def test_a_linear_gaussian_system_is_propagated_exactly(name, process_noise):
 
 
 def test_mean_equivalence_of_a_linear_system_forgets_the_state_covariance_only():
-    model, at, u = linear(), belief(), torch.tensor([0.7])
+    model = linear()
+    at = belief()
+    u = torch.tensor([0.7])
     result = MeanEquivalence(process_noise=False).propagate(model, at, u)
     assert torch.allclose(result.belief.mean, model.nominal(at.mean, u), atol=1e-12)
     assert torch.allclose(
@@ -107,7 +111,10 @@ def test_mean_equivalence_of_a_linear_system_forgets_the_state_covariance_only()
 
 
 def test_monte_carlo_of_a_linear_system_is_exact_up_to_its_standard_error():
-    model, at, u, samples = linear(), belief(), torch.tensor([0.7]), 100_000
+    model = linear()
+    at = belief()
+    u = torch.tensor([0.7])
+    samples = 100_000
     A = model.nominal.A
     result = MonteCarlo(samples, 3, process_noise=False).propagate(model, at, u)
     spread = A @ at.covariance @ A.T
@@ -130,7 +137,9 @@ def test_monte_carlo_of_a_linear_system_is_exact_up_to_its_standard_error():
 
 
 def test_monte_carlo_says_the_same_for_the_same_seed_and_another_thing_for_another():
-    model, at, u = gp(), belief(), torch.zeros(1)
+    model = gp()
+    at = belief()
+    u = torch.zeros(1)
     first, again, other = (
         MonteCarlo(500, seed=seed)(model, at, u).mean for seed in (1, 1, 2)
     )
@@ -139,11 +148,13 @@ def test_monte_carlo_says_the_same_for_the_same_seed_and_another_thing_for_anoth
 
 
 def test_the_order_of_accuracy_on_a_nonlinear_model_is_as_stated():
-    model, u = gp(), torch.tensor([0.2])
+    model = gp()
+    u = torch.tensor([0.2])
 
     def errors(propagator, scale):
         at = belief(scale=scale)
-        exact, ours = MomentMatching()(model, at, u), propagator(model, at, u)
+        exact = MomentMatching()(model, at, u)
+        ours = propagator(model, at, u)
         return torch.stack(
             [
                 (ours.mean - exact.mean).abs().max(),
@@ -170,8 +181,10 @@ def test_the_order_of_accuracy_on_a_nonlinear_model_is_as_stated():
 @pytest.mark.parametrize("name", ALL)
 @pytest.mark.parametrize("predicts", ["next_state", "difference"])
 def test_an_autonomous_model_takes_no_input_or_one_of_no_columns(name, predicts):
-    model, at = gp(m=0, predicts=predicts), belief()
-    without, empty = ALL[name]()(model, at), ALL[name]()(model, at, torch.zeros(0))
+    model = gp(m=0, predicts=predicts)
+    at = belief()
+    without = ALL[name]()(model, at)
+    empty = ALL[name]()(model, at, torch.zeros(0))
     assert torch.equal(without.mean, empty.mean)
     assert torch.equal(without.covariance, empty.covariance)
     batch = Gaussian(at.mean.expand(3, 2), at.covariance.expand(3, 2, 2))
@@ -182,11 +195,11 @@ def test_an_autonomous_model_takes_no_input_or_one_of_no_columns(name, predicts)
 
 @pytest.mark.parametrize("name", ALL)
 def test_observation_noise_is_added_unless_it_is_refused(name):
-    model, at, u = gp(noise=0.02), belief(), torch.tensor([0.3])
-    latent, noisy = (
-        ALL[name](process_noise=False).propagate(model, at, u),
-        ALL[name]().propagate(model, at, u),
-    )
+    model = gp(noise=0.02)
+    at = belief()
+    u = torch.tensor([0.3])
+    latent = ALL[name](process_noise=False).propagate(model, at, u)
+    noisy = ALL[name]().propagate(model, at, u)
     assert torch.equal(latent.belief.mean, noisy.belief.mean)
     assert torch.equal(latent.cross_covariance, noisy.cross_covariance)
     assert torch.allclose(
@@ -213,11 +226,11 @@ def test_noise_of_a_residual_model_acts_where_the_residual_does(name):
 
 @pytest.mark.parametrize("name", [name for name in ALL if name != "moment matching"])
 def test_a_function_with_other_outputs_than_states_is_propagated_too(name):
-    model, at, u = gp(predicts="value", outputs=3), belief(), torch.tensor([0.1])
-    result, exact = (
-        ALL[name]().propagate(model, at, u),
-        MomentMatching().propagate(model, at, u),
-    )
+    model = gp(predicts="value", outputs=3)
+    at = belief()
+    u = torch.tensor([0.1])
+    result = ALL[name]().propagate(model, at, u)
+    exact = MomentMatching().propagate(model, at, u)
     assert result.belief.mean.shape == (3,)
     assert result.cross_covariance.shape == (2, 3)
     assert torch.allclose(result.belief.mean, exact.belief.mean, atol=0.15)
@@ -261,7 +274,8 @@ class TestBadInput:
 
     @pytest.mark.parametrize("value", [torch.nan, torch.inf])
     def test_entries_that_are_not_finite(self, name, value):
-        at, bad = belief(), torch.tensor([0.1, value])
+        at = belief()
+        bad = torch.tensor([0.1, value])
         self.refused(
             name,
             DataError,
@@ -335,7 +349,9 @@ def test_settings_out_of_range_are_refused():
 
 @pytest.mark.parametrize("samples", [3, 2500])  # 2500 are predicted in three parts
 def test_monte_carlo_gives_the_sample_moments_of_its_draws(samples):
-    model, at, u = gp(), belief(), torch.tensor([0.3])
+    model = gp()
+    at = belief()
+    u = torch.tensor([0.3])
     found = MonteCarlo(samples, 4, process_noise=False).propagate(model, at, u)
     steps = torch.from_numpy(
         np.random.default_rng(4).standard_normal((samples, 2))

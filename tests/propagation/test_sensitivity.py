@@ -73,7 +73,8 @@ PROPAGATORS = [
     ids=lambda p: f"{type(p).__name__}{sorted(vars(p).items())}",
 )
 def test_closed_forms_are_autograds_derivatives(propagator, name, batch, choice):
-    gp, at = MODELS[name], belief(3)
+    gp = MODELS[name]
+    at = belief(3)
     at = Gaussian(
         at.mean + 0.3 * draw(*batch, 3), at.covariance.expand(*batch, 3, 3).clone()
     )
@@ -108,7 +109,9 @@ def test_closed_forms_are_autograds_derivatives(propagator, name, batch, choice)
     ids=_name,
 )
 def test_closed_forms_by_torch_can_be_differentiated_again(propagator):
-    gp, at, control = MODELS["difference"], belief(3), torch.zeros(2)
+    gp = MODELS["difference"]
+    at = belief(3)
+    control = torch.zeros(2)
     step = torch.tensor([1e-5, 0.0, 0.0])
 
     def slope(mean):
@@ -123,7 +126,8 @@ def test_closed_forms_by_torch_can_be_differentiated_again(propagator):
 
 
 def test_a_root_without_derivative_counts_as_constant_in_closed_form_too():
-    gp, flat = MODELS["difference"], draw(3, 1)
+    gp = MODELS["difference"]
+    flat = draw(3, 1)
     for covariance in (torch.zeros(3, 3), flat @ flat.T):
         at = Gaussian(draw(3), covariance)
         _, closed_form = differentiate(Unscented(), gp, at, torch.zeros(2))
@@ -141,7 +145,9 @@ def test_nobody_has_derivatives_too():
 
 
 def test_the_evaluation_can_be_forced_and_refuses_what_it_cannot_do():
-    gp, state, control = MODELS["next state"], torch.zeros(3), torch.zeros(2)
+    gp = MODELS["next state"]
+    state = torch.zeros(3)
+    control = torch.zeros(2)
     with backend("torch"):
         by_torch = gp.predict_with_jacobian(state, control)
     with backend("compiled"):
@@ -164,7 +170,8 @@ def test_the_evaluation_can_be_forced_and_refuses_what_it_cannot_do():
 
 
 def test_transforms_and_forward_mode_fall_back_to_torch_unasked():
-    gp, control = MODELS["next state"], torch.zeros(2)
+    gp = MODELS["next state"]
+    control = torch.zeros(2)
     states = draw(3, 3)
     mapped = torch.func.vmap(lambda x: gp.predict_with_jacobian(x, control)[1])(states)
     assert torch.allclose(
@@ -186,7 +193,8 @@ def test_a_float32_model_is_answered_by_torch_in_float32():
 
 
 def value_model(n, m, k):
-    features, targets = draw(20, n + m), draw(20, k)
+    features = draw(20, n + m)
+    targets = draw(20, k)
     scales = 0.7 + draw(k, n + m).abs()
     return GPPosterior.from_hyperparameters(
         features,
@@ -208,7 +216,9 @@ def value_model(n, m, k):
 def test_functions_with_more_or_fewer_outputs_than_states_have_derivatives_too(
     propagator, n, k
 ):
-    gp, at, control = value_model(n, 1, k), belief(n), draw(1)
+    gp = value_model(n, 1, k)
+    at = belief(n)
+    control = draw(1)
     found, d = differentiate(propagator, gp, at, control)
     step = 1e-6
     for c in range(n):
@@ -232,7 +242,8 @@ def test_functions_with_more_or_fewer_outputs_than_states_have_derivatives_too(
 
 
 def test_no_gradient_flows_through_a_local_model():
-    gp, control = MODELS["difference"], torch.zeros(2, requires_grad=True)
+    gp = MODELS["difference"]
+    control = torch.zeros(2, requires_grad=True)
     local = linearize(MomentMatching(), gp, Gaussian.certain([0.1, 0.2, 0.3]), control)
     assert not local.A.requires_grad
     assert not local.c.requires_grad
@@ -241,7 +252,8 @@ def test_no_gradient_flows_through_a_local_model():
 @pytest.mark.parametrize("choice", ["auto", "torch"])
 @pytest.mark.parametrize("propagator", [*PROPAGATORS[:4], Unscented()], ids=_name)
 def test_beliefs_and_inputs_belong_together_or_are_refused(propagator, choice):
-    gp, at = MODELS["next state"], belief(3)
+    gp = MODELS["next state"]
+    at = belief(3)
     batch = Gaussian(at.mean + draw(2, 3, 3), at.covariance.expand(2, 3, 3, 3))
     control = draw(2)
     with backend(choice):
@@ -277,7 +289,8 @@ def test_a_covariance_that_is_not_symmetric_is_refused():
 
 def test_models_whose_hyperparameters_carry_gradients_are_answered_by_torch():
     log_scale = torch.zeros(2, 3, requires_grad=True)
-    features, targets = draw(12, 3), draw(12, 2)
+    features = draw(12, 3)
+    targets = draw(12, 2)
 
     def mean(scale):
         gp = GPPosterior.from_hyperparameters(
@@ -302,7 +315,8 @@ def test_models_whose_hyperparameters_carry_gradients_are_answered_by_torch():
 
 
 def test_inference_mode_stops_no_derivative():
-    gp, at = MODELS["next state"], belief(3)
+    gp = MODELS["next state"]
+    at = belief(3)
     outside = linearize(Unscented(), gp, at, torch.zeros(2))
     with torch.inference_mode():
         inside = linearize(Unscented(), gp, belief(3), torch.zeros(2))

@@ -11,10 +11,15 @@ from gpmpc.propagation import Unscented
 class Quadratic:
     """x+ = g'x + 1/2 x'H x, one function of n states, without noise."""
 
-    dtype, device, output_dim, input_dim = torch.float64, torch.device("cpu"), 1, 0
+    dtype = torch.float64
+    device = torch.device("cpu")
+    output_dim = 1
+    input_dim = 0
 
     def __init__(self, g, H):
-        self.g, self.H, self.state_dim = g, H, len(g)
+        self.g = g
+        self.H = H
+        self.state_dim = len(g)
         self.noise_covariance = torch.zeros(1, 1)
 
     def predict(self, state, input=None):
@@ -28,7 +33,8 @@ def test_with_beta_of_two_a_quadratic_of_one_state_is_exact_whatever_alpha(
     alpha, curvature
 ):
     """Which is what beta is for (van der Merwe, 2004): Var[g x + 1/2 h x^2] = g^2 s + 1/2 h^2 s^2 about zero."""
-    model, s = Quadratic(torch.tensor([0.7]), torch.tensor([[curvature]])), 0.4
+    model = Quadratic(torch.tensor([0.7]), torch.tensor([[curvature]]))
+    s = 0.4
     moved = Unscented(alpha, beta=2.0).propagate(
         model, Gaussian(torch.zeros(1), torch.tensor([[s]]))
     )
@@ -50,7 +56,8 @@ def test_moments_of_a_quadratic_of_three_states_are_those_of_the_points_worked_o
 
     The variance is g'S g + (n + lambda) sum d_j^2 + (beta - alpha^2) (sum d_j)^2.
     """
-    g, root = torch.randn(3), torch.randn(3, 3)
+    g = torch.randn(3)
+    root = torch.randn(3, 3)
     H = root + root.T
     root = root @ root.T / 4  # symmetric, and so the root of its square
     S = root @ root

@@ -20,16 +20,20 @@ def exact_solution(problem, lower=None, upper=None):
         lower: (M,) bounds to use in place of the program's own.
         upper: (M,) likewise.
     """
-    P, q, G = rational(problem.P), rational(problem.q), rational(problem.G)
-    n, M = len(q), len(problem.lower)
+    P = rational(problem.P)
+    q = rational(problem.q)
+    G = rational(problem.G)
+    n = len(q)
+    M = len(problem.lower)
     C = np.vstack([rational(np.eye(n)), G])
-    low, high = (
-        _bounds(problem.lower if lower is None else lower),
-        _bounds(problem.upper if upper is None else upper),
-    )
+    low = _bounds(problem.lower if lower is None else lower)
+    high = _bounds(problem.upper if upper is None else upper)
     answers = solve_linear(P, np.column_stack([C.T, q]))  # P^-1 [C', q]
-    K, y = C @ answers[:, :M], -(C @ answers[:, M])
-    mu, working = zeros(M), {}  # constraint: +1 at its upper bound, -1 at its lower one
+    K = C @ answers[:, :M]
+    y = -(C @ answers[:, M])
+    # constraint: +1 at its upper bound, -1 at its lower one
+    mu = zeros(M)
+    working = {}
     while True:
         excess = [_excess(y[p], low[p], high[p]) for p in range(M)]
         p = max(range(M), key=lambda i: excess[i] ** 2 / (K[i, i] or 1))
@@ -37,7 +41,8 @@ def exact_solution(problem, lower=None, upper=None):
             x = -(answers[:, M] + answers[:, :M] @ mu)
             _prove_optimal(P, q, C, low, high, x, mu)
             return x
-        side, left = (1 if high[p] is not None and y[p] > high[p] else -1), excess[p]
+        side = 1 if high[p] is not None and y[p] > high[p] else -1
+        left = excess[p]
         while True:
             members = list(working)
             r = solve_linear(K[np.ix_(members, members)], K[members, p][:, None])[:, 0]
@@ -51,14 +56,16 @@ def exact_solution(problem, lower=None, upper=None):
             full = left / direction[p] if direction[p] > 0 else None
             if full is None and leaving is None:
                 ray = zeros(M)
-                ray[members], ray[p] = -side * r, Fraction(side)
+                ray[members] = -side * r
+                ray[p] = Fraction(side)
                 _prove_infeasible(C, low, high, ray)
                 return None
             blocked = full is None or (leaving is not None and blocks[leaving] < full)
             step = blocks[leaving] if blocked else full
             mu[members] -= side * step * r
             mu[p] += side * step
-            y, left = y - side * step * direction, left - step * direction[p]
+            y = y - side * step * direction
+            left = left - step * direction[p]
             if not blocked:
                 working[p] = side
                 break

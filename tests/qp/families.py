@@ -7,28 +7,29 @@ from gpmpc.qp import QuadraticProgram
 
 def base(rng, feasible=True, whole=False):
     """P, q, G and stacked bounds of a program of up to four variables, small integers or normal numbers."""
-    n, m = int(rng.integers(1, 5)), int(rng.integers(1, 7))
+    n = int(rng.integers(1, 5))
+    m = int(rng.integers(1, 7))
     draw = (
         (lambda *shape: rng.integers(-3, 4, shape).astype(float))
         if whole
         else (lambda *s: rng.standard_normal(s))
     )
     root = draw(n, n)
-    P, q, G = (
-        root @ root.T + np.eye(n) * (1.0 if whole else 0.1),
-        3.0 * draw(n),
-        draw(m, n),
-    )
+    P = root @ root.T + np.eye(n) * (1.0 if whole else 0.1)
+    q = 3.0 * draw(n)
+    G = draw(m, n)
     P = (P + P.T) / 2
     C = np.vstack([np.eye(n), G])
     centre = C @ draw(n)
     widths = (
         rng.integers(0, 3, (2, n + m)) if whole else rng.uniform(0.0, 2.0, (2, n + m))
     )
-    lower, upper = centre - widths[0], centre + widths[1]
+    lower = centre - widths[0]
+    upper = centre + widths[1]
     if not feasible:
         shift = 2.0 * draw(n + m)
-        lower, upper = lower + shift, upper + shift
+        lower = lower + shift
+        upper = upper + shift
     lower[rng.random(n + m) < 0.4] = -np.inf
     upper[rng.random(n + m) < 0.4] = np.inf
     return P, q, G, lower, upper
@@ -45,7 +46,8 @@ def magnitude(rng, low, high):
 def huge_bounds(rng):
     """A side, or a variable's or row's place, of 1e3 to 1e15 (or 1e19) beside sides of order one; equalities too."""
     P, q, G, lower, upper = base(rng)
-    n, M = len(q), len(lower)
+    n = len(q)
+    M = len(lower)
     for p in np.flatnonzero(rng.random(M) < 0.6):
         size = 1e19 if rng.random() < 0.1 else magnitude(rng, 3, 15)
         kind = rng.integers(0, 4)
@@ -54,44 +56,45 @@ def huge_bounds(rng):
         elif kind == 1:
             upper[p] = size
         elif kind == 2:
-            lower[p], upper[p] = -size, size * rng.uniform(0.1, 1.0)
+            lower[p] = -size
+            upper[p] = size * rng.uniform(0.1, 1.0)
         elif p >= n and np.isfinite(upper[p]):
             lower[p] = upper[p]
     if rng.random() < 0.2:  # the whole program far from zero
         far = magnitude(rng, 3, 12) * rng.standard_normal(n)
         values = np.vstack([np.eye(n), G]) @ far
-        q, lower, upper = q - P @ far, lower + values, upper + values
+        q = q - P @ far
+        lower = lower + values
+        upper = upper + values
     return program(P, q, G, lower, upper)
 
 
 def nearly_infeasible(rng):
     """Two rows, three, or a row and the box that contradict each other by 1e-3 to 1e-12, or miss that by as much."""
     P, q, G, lower, upper = base(rng)
-    n, size = len(q), magnitude(rng, -3, 3)
+    n = len(q)
+    size = magnitude(rng, -3, 3)
     gap = rng.choice([-1.0, 1.0]) * magnitude(rng, -12, -3) * size
-    lower[:], upper[:] = (
-        np.where(rng.random(len(lower)) < 0.7, -np.inf, lower),
-        np.where(rng.random(len(upper)) < 0.7, np.inf, upper),
-    )
+    lower[:] = np.where(rng.random(len(lower)) < 0.7, -np.inf, lower)
+    upper[:] = np.where(rng.random(len(upper)) < 0.7, np.inf, upper)
     a = rng.standard_normal(n)
     kind = rng.integers(0, 3)
     if kind == 0:
         scale = rng.choice([1.0, 2.0, magnitude(rng, -3, 3)])
-        more, low, high = (
-            [a, scale * a],
-            [-np.inf, scale * (size + gap)],
-            [size, np.inf],
-        )
+        more = [a, scale * a]
+        low = [-np.inf, scale * (size + gap)]
+        high = [size, np.inf]
     elif kind == 1:
         b = rng.standard_normal(n)
-        more, low, high = (
-            [a, b, a + b],
-            [-np.inf, -np.inf, 2.0 * size + gap],
-            [size, size, np.inf],
-        )
+        more = [a, b, a + b]
+        low = [-np.inf, -np.inf, 2.0 * size + gap]
+        high = [size, size, np.inf]
     else:
-        more, low, high = [np.abs(a)], [np.abs(a).sum() * size + gap], [np.inf]
-        lower[:n], upper[:n] = -np.inf, size
+        more = [np.abs(a)]
+        low = [np.abs(a).sum() * size + gap]
+        high = [np.inf]
+        lower[:n] = -np.inf
+        upper[:n] = size
     order = rng.permutation(len(G) + len(more))
     G = np.vstack([G, more])[order]
     lower[n:], upper[n:] = lower[n:], upper[n:]
@@ -104,7 +107,9 @@ def parallel_rows(rng):
     """Zero rows, and rows that repeat others or combinations of them, scaled, exactly or up to 1e-3 .. 1e-13."""
     P, q, G, lower, upper = base(rng, whole=rng.random() < 0.5)
     n = len(q)
-    G, low, high = list(G), list(lower[n:]), list(upper[n:])
+    G = list(G)
+    low = list(lower[n:])
+    high = list(upper[n:])
     for _ in range(int(rng.integers(1, 4))):
         kind, i, j = rng.integers(0, 4), *rng.integers(0, len(G), 2)
         scale = rng.choice([1.0, -1.0, 2.0, 0.125, magnitude(rng, -6, 6)])
@@ -140,7 +145,8 @@ def small_direction(rng):
     G[-1, -1] = share
     b = np.append(rng.integers(-2, 3, n - 1), 0.0) * float(rng.random() < 0.5)
     b[-1] = b[:-1].sum() + share * magnitude(rng, -3, 4)
-    P, q = np.eye(n), rng.standard_normal(n) * float(rng.random() < 0.5)
+    P = np.eye(n)
+    q = rng.standard_normal(n) * float(rng.random() < 0.5)
     upper = b if rng.random() < 0.7 else np.full(n, np.inf)
     order = rng.permutation(n)
     return program(
@@ -155,29 +161,35 @@ def small_direction(rng):
 def scaled(rng):
     """All data, the cost, the rows or the variables multiplied by 1e-12 .. 1e12, one or several of these."""
     P, q, G, lower, upper = base(rng, feasible=rng.random() < 0.9)
-    n, m = len(q), len(G)
+    n = len(q)
+    m = len(G)
     kinds = rng.random(4) < 0.4
     if kinds[0]:
         s = magnitude(rng, -12, 12)
-        P, q, G, lower, upper = s * P, s * q, s * G, s * lower, s * upper
+        P = s * P
+        q = s * q
+        G = s * G
+        lower = s * lower
+        upper = s * upper
     if kinds[1]:
         s = magnitude(rng, -12, 12)
-        P, q = s * P, s * q
+        P = s * P
+        q = s * q
     if kinds[2]:
         s = 10.0 ** rng.uniform(-12, 12, m)
-        G, lower, upper = s[:, None] * G, lower.copy(), upper.copy()
+        G = s[:, None] * G
+        lower = lower.copy()
+        upper = upper.copy()
         lower[n:], upper[n:] = s * lower[n:], s * upper[n:]
     if kinds[3]:
         s = magnitude(rng, -12, 12) ** (
             rng.uniform(-1, 1, n) if rng.random() < 0.7 else np.ones(n)
         )
-        P, q, G, lower, upper = (
-            P * np.outer(s, s),
-            q * s,
-            G * s,
-            lower.copy(),
-            upper.copy(),
-        )
+        P = P * np.outer(s, s)
+        q = q * s
+        G = G * s
+        lower = lower.copy()
+        upper = upper.copy()
         P = (P + P.T) / 2
         lower[:n], upper[:n] = lower[:n] / s, upper[:n] / s
     finite = np.concatenate([lower, upper])
@@ -213,7 +225,8 @@ def degenerate(rng):
 def equalities(rng):
     """Equalities in place of rows, as many as there are variables or more, that agree or do not."""
     P, q, G, lower, upper = base(rng, whole=rng.random() < 0.7)
-    n, m = len(q), len(G)
+    n = len(q)
+    m = len(G)
     b = G @ rng.integers(-3, 4, n)
     if rng.random() < 0.3:
         b = b + rng.integers(0, 2, m) * magnitude(rng, -9, 0)

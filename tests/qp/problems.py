@@ -12,12 +12,11 @@ def integer_problem(
 
     With ``feasible=True`` the bounds admit an integer point, on which many of them hold with equality.
     """
-    n, m = int(rng.integers(1, 9)), int(rng.integers(0, 15))
+    n = int(rng.integers(1, 9))
+    m = int(rng.integers(0, 15))
     root = rng.integers(-2, 3, (n, n))
-    P, q = (
-        (root.T @ root + np.eye(n)).astype(float),
-        rng.integers(-5, 6, n).astype(float),
-    )
+    P = (root.T @ root + np.eye(n)).astype(float)
+    q = rng.integers(-5, 6, n).astype(float)
     G = rng.integers(-2, 3, (m, n)).astype(float)
     if m > 2 and rng.random() < 0.5:
         G[0], G[2] = G[1], 2.0 * G[1]

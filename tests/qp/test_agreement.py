@@ -17,15 +17,15 @@ from tests.qp.problems import (
     worst_residual,
 )
 
-DAQP_SOLVED, DAQP_INFEASIBLE = (
-    (1, 2),
-    (-1, -6),
-)  # -6: infeasible by its presolve of equal or crossed bounds
+# -6: infeasible by its presolve of equal or crossed bounds
+DAQP_SOLVED = (1, 2)
+DAQP_INFEASIBLE = (-1, -6)
 
 
 def daqp_solution(problem: QuadraticProgram):
     """(x, solved or not) from DAQP, which reads only contiguous arrays rightly."""
-    lower, upper = np.maximum(problem.lower, -1e30), np.minimum(problem.upper, 1e30)
+    lower = np.maximum(problem.lower, -1e30)
+    upper = np.minimum(problem.upper, 1e30)
     x, _, flag, _ = daqp.solve(
         problem.P.copy(), problem.q.copy(), problem.G.copy(), upper, lower, np.zeros(len(lower), dtype=np.int32),
         primal_tol=1e-9,
@@ -57,10 +57,12 @@ def test_no_disagreement_with_daqp_on_integer_problems_feasible_and_infeasible(
 
 @pytest.mark.parametrize("feasible", [True, None])
 def test_no_disagreement_with_clarabel_on_integer_problems(feasible):
-    rng, clarabel = np.random.default_rng([7, bool(feasible)]), CvxpySolver()
+    rng = np.random.default_rng([7, bool(feasible)])
+    clarabel = CvxpySolver()
     for _ in range(60):
         problem = integer_problem(rng, feasible)
-        theirs, ours = clarabel.solve(problem), changing(problem)
+        theirs = clarabel.solve(problem)
+        ours = changing(problem)
         assert ours.status is theirs.status
         if ours.status.solved:
             assert distance(problem, ours.x, theirs.x) < 1e-6
@@ -68,11 +70,13 @@ def test_no_disagreement_with_clarabel_on_integer_problems(feasible):
 
 @pytest.mark.parametrize("feasible", [True, None])
 def test_the_papers_algorithm_finds_what_the_dual_method_finds(feasible):
-    rng, primal = np.random.default_rng([8, bool(feasible)]), PrimalActiveSet()
+    rng = np.random.default_rng([8, bool(feasible)])
+    primal = PrimalActiveSet()
     for _ in range(600):
         problem = integer_problem(rng, feasible)
         guess = rng.integers(-1, 2, len(problem.lower)) if rng.random() < 0.5 else None
-        dual, solution = changing(problem), primal.solve(problem, guess)
+        dual = changing(problem)
+        solution = primal.solve(problem, guess)
         assert solution.status is dual.status
         if dual.status.solved:
             assert worst_residual(solution) < 1e-9
@@ -84,7 +88,8 @@ numbers = st.integers(-3, 3).map(float)
 
 @st.composite
 def small_problems(draw):
-    n, m = draw(st.integers(1, 4)), draw(st.integers(0, 6))
+    n = draw(st.integers(1, 4))
+    m = draw(st.integers(0, 6))
     root = np.array(draw(st.lists(numbers, min_size=n * n, max_size=n * n))).reshape(
         n, n
     )
@@ -92,12 +97,11 @@ def small_problems(draw):
     q = np.array(draw(st.lists(numbers, min_size=n, max_size=n)))
     G = np.array(draw(st.lists(numbers, min_size=m * n, max_size=m * n))).reshape(m, n)
     bound = st.one_of(st.none(), numbers)
-    lower, upper = [], []
+    lower = []
+    upper = []
     for _ in range(n + m):
-        low, width = (
-            draw(bound),
-            draw(st.one_of(st.none(), st.sampled_from([0.0, 0.5, 2.0]))),
-        )
+        low = draw(bound)
+        width = draw(st.one_of(st.none(), st.sampled_from([0.0, 0.5, 2.0])))
         lower.append(-np.inf if low is None else low)
         upper.append(np.inf if width is None else (0.0 if low is None else low) + width)
     guess = draw(st.lists(st.sampled_from([-1, 0, 1]), min_size=n + m, max_size=n + m))

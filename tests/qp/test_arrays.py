@@ -33,7 +33,8 @@ def test_an_odd_array_is_read_as_what_it_is(odd, position, rng):
         if not np.isfinite(arrays[position]).all() or position == 0:
             pytest.skip("has no integer form")
         if position >= 3:
-            arrays[3], arrays[4] = np.full(15, -3.0), np.full(15, 4.0)
+            arrays[3] = np.full(15, -3.0)
+            arrays[4] = np.full(15, 4.0)
     given = list(arrays)
     given[position] = odd(arrays[position])
     expected = solve_stacked(*arrays)
@@ -54,7 +55,8 @@ def test_an_odd_array_is_read_as_what_it_is(odd, position, rng):
 
 def test_an_axis_of_length_one_may_have_any_stride():
     """NumPy calls such arrays contiguous whatever their strides; the solve then ended in memory never written to."""
-    wide, rows = np.arange(1.0, 10.0).reshape(3, 3), np.array([[1.0, 2.0]])
+    wide = np.arange(1.0, 10.0).reshape(3, 3)
+    rows = np.array([[1.0, 2.0]])
     one = QuadraticProgram(wide[:1, :1], [-3.0], rows.T, [-9.0, -9.0], [1.0, 1.0])
     several = QuadraticProgram(
         np.eye(2), [-3.0, 0.0], np.ones((4, 2))[::2][:1], [-9.0], [1.0]
@@ -87,10 +89,8 @@ def test_a_record_with_gaps_is_a_warm_start_too(rng):
     problem = feasible_problem(rng, 6, 9)
     cold = DualActiveSet().solve(problem)
     gappy = cold._replace(record=np.repeat(cold.record, 2)[::2])
-    prepared, vectors = (
-        DualActiveSet().prepare(problem.P, problem.G),
-        (problem.q, problem.lower, problem.upper),
-    )
+    prepared = DualActiveSet().prepare(problem.P, problem.G)
+    vectors = (problem.q, problem.lower, problem.upper)
     for solution in (
         DualActiveSet().solve(problem, gappy),
         prepared.solve(*vectors, gappy),

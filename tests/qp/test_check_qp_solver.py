@@ -29,7 +29,8 @@ class Liar:
     """An honest solver with one flaw."""
 
     def __init__(self, flaw):
-        self.flaw, self.shared = flaw, np.zeros(0)
+        self.flaw = flaw
+        self.shared = np.zeros(0)
 
     def solve(self, problem, warm_start=None):
         return self.flaw(self, problem, warm_start)

@@ -92,7 +92,8 @@ def test_a_vertex_met_by_many_more_constraints_than_variables_is_found(solve, n,
 
 @ALL
 def test_equalities_alone_give_the_solution_of_their_kkt_system(solve, rng):
-    n, m = 8, 5
+    n = 8
+    m = 5
     problem = feasible_problem(rng, n, m)
     b = problem.G @ rng.standard_normal(n)
     solution = solve(QuadraticProgram(problem.P, problem.q, problem.G, b, b))
@@ -166,7 +167,8 @@ def test_badly_scaled_variables_are_no_reason_for_a_false_infeasible(solve, scal
 @DUAL
 def test_a_fixed_variable_stays_where_it_is_put(solve, rng):
     problem = feasible_problem(rng, 5, 0)
-    lb, ub = problem.lb.copy(), problem.ub.copy()
+    lb = problem.lb.copy()
+    ub = problem.ub.copy()
     lb[2] = ub[2] = 0.7
     solution = solve(QuadraticProgram(problem.P, problem.q, lb=lb, ub=ub))
     assert solution.x[2] == pytest.approx(0.7, abs=1e-12)

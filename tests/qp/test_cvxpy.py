@@ -39,7 +39,8 @@ def test_several_solvers_behind_cvxpy_find_our_minimiser_and_multipliers(name, r
     solver = CvxpySolver(name, options)
     for n, m in ((3, 0), (4, 6), (12, 20)):
         problem = feasible_problem(rng, n, m)
-        ours, theirs = DualActiveSet().solve(problem), solver.solve(problem)
+        ours = DualActiveSet().solve(problem)
+        theirs = solver.solve(problem)
         assert theirs.status is Status.SOLVED
         assert distance(problem, ours.x, theirs.x) < 1e-6
         np.testing.assert_allclose(theirs.multipliers, ours.multipliers, atol=1e-4)
@@ -87,7 +88,8 @@ def test_a_minimiser_far_from_zero_costs_no_digits(rng):
     for _ in range(20):
         basis = np.linalg.qr(rng.normal(size=(30, 30)))[0]
         P = (basis * np.geomspace(4.0, 2e5, 30)) @ basis.T
-        P, centre = (P + P.T) / 2, np.tile([7.0, 0.0, 0.0], 10)
+        P = (P + P.T) / 2
+        centre = np.tile([7.0, 0.0, 0.0], 10)
         q = -P @ (centre + rng.normal(scale=0.1, size=30))
         problem = QuadraticProgram(P, q, lb=centre - 0.1, ub=centre + 0.1)
         ours = DualActiveSet().solve(problem)

@@ -12,7 +12,9 @@ from tests.qp.exact import exact_solution, rational
 from tests.qp.families import FAMILIES
 from tests.qp.problems import changing, prepared, primal
 
-SLICE, STUDY, UNSOLVED = 60, 2000, 1e-3
+SLICE = 60
+STUDY = 2000
+UNSOLVED = 1e-3
 ROUNDING = Fraction(1, 10**14)
 
 
@@ -73,10 +75,8 @@ def solves_up_to_rounding(problem, x):
 
 def proves_infeasibility_up_to_rounding(problem, ray):
     """Whether a change of the entries of C by 1e-14 of themselves makes the ray Farkas' proof (Oettli, Prager)."""
-    y, C = (
-        rational(ray),
-        np.vstack([rational(np.eye(len(problem.q))), rational(problem.G)]),
-    )
+    y = rational(ray)
+    C = np.vstack([rational(np.eye(len(problem.q))), rational(problem.G)])
     if not (abs(C.T @ y) <= ROUNDING * (abs(C.T) @ abs(y))).all():
         return False
     return (
@@ -91,10 +91,12 @@ def proves_infeasibility_up_to_rounding(problem, ray):
 
 def unsolved(family, solve, count):
     """How many of ``count`` programs are left unsolved; an answer that is wrong fails at once."""
-    rng, left = np.random.default_rng([14, list(FAMILIES).index(family)]), 0
+    rng = np.random.default_rng([14, list(FAMILIES).index(family)])
+    left = 0
     for number in range(count):
         problem = FAMILIES[family](rng)
-        exact, solution = exact_solution(problem), solve(problem)
+        exact = exact_solution(problem)
+        solution = solve(problem)
         case = f"{family} {number}: {solution.status.name}"
         if solution.status is Status.SOLVED:
             if exact is None or error(problem, solution.x, exact) > 1e-6:
@@ -141,14 +143,13 @@ def test_no_answer_of_two_thousand_is_wrong(family, solve):
 def test_rows_at_prices_beyond_their_multipliers_have_the_exact_solution_of_hard_ones(
     family,
 ):
-    rng, solver, feasible = (
-        np.random.default_rng([15, list(FAMILIES).index(family)]),
-        DualActiveSet(),
-        0,
-    )
+    rng = np.random.default_rng([15, list(FAMILIES).index(family)])
+    solver = DualActiveSet()
+    feasible = 0
     for number in range(20):
         problem = FAMILIES[family](rng)
-        exact, hard = exact_solution(problem), changing(problem)
+        exact = exact_solution(problem)
+        hard = changing(problem)
         if exact is not None and hard.status.solved:
             prices = np.full(
                 len(problem.G),

@@ -27,7 +27,8 @@ def test_the_iteration_limit_returns_a_dual_iterate_from_which_the_next_solve_go
     assert full.iterations > 6
     limited = DualActiveSet(iteration_limit=3)
     prepared = limited.prepare(problem.P, problem.G)
-    solution, objectives = None, []
+    solution = None
+    objectives = []
     for _ in range(full.iterations):
         if mode == "prepared":
             solution = prepared.solve(problem.q, problem.lower, problem.upper, solution)
@@ -155,7 +156,8 @@ def test_the_solver_works_where_no_compiled_code_can_be_kept(tmp_path):
 @pytest.mark.slow
 def test_no_disagreement_on_ten_thousand_more_integer_problems():
     solver = DualActiveSet()
-    rng, primal = np.random.default_rng(99), PrimalActiveSet()
+    rng = np.random.default_rng(99)
+    primal = PrimalActiveSet()
     for _ in range(10000):
         problem = integer_problem(rng, True if rng.random() < 0.5 else None)
         assert solver.solve(problem).status is primal.solve(problem).status
@@ -165,11 +167,9 @@ def crowded_vertex(rng):
     """More rows than variables through one vertex, the solution; some are repeated or sums of others."""
     n = int(rng.integers(18, 40))
     m = int(rng.integers(n, 4 * n))
-    root, G, vertex = (
-        rng.standard_normal((n, n)),
-        rng.standard_normal((m, n)),
-        rng.standard_normal(n),
-    )
+    root = rng.standard_normal((n, n))
+    G = rng.standard_normal((m, n))
+    vertex = rng.standard_normal(n)
     if rng.random() < 0.3:
         root, G, vertex = (np.round(2.0 * part) for part in (root, G, vertex))
     G[m // 2 :] = G[: m - m // 2] + G[rng.integers(0, m // 2, m - m // 2)] * (
@@ -209,7 +209,8 @@ def test_rows_that_depend_on_each_other_but_for_rounding_are_no_obstacle(mode, r
     for _ in range(20):
         n = int(rng.integers(18, 40))
         m = int(rng.integers(2 * n, 6 * n))
-        root, vertex = rng.standard_normal((n, n)), np.round(3 * rng.standard_normal(n))
+        root = rng.standard_normal((n, n))
+        vertex = np.round(3 * rng.standard_normal(n))
         P = root @ root.T / n + 1e-4 * np.eye(n)
         G = rng.standard_normal((m, n // 2)) @ rng.standard_normal((n // 2, n))
         multipliers = rng.uniform(0, 1, m) * (rng.random(m) < 0.5)

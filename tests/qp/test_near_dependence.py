@@ -9,7 +9,8 @@ from gpmpc.status import Status
 
 def near_dependent_problem(rng, feasible=True):
     """Rows that repeat a few others up to 2^-10 .. 2^-50, with bounds met by a point; or missed by a hair."""
-    n, m = int(rng.integers(2, 10)), int(rng.integers(4, 20))
+    n = int(rng.integers(2, 10))
+    m = int(rng.integers(4, 20))
     root = rng.integers(-16, 17, (n, n)) / 8.0
     base = rng.integers(-16, 17, (max(1, m // 4), n)) / 8.0
     G = base[rng.integers(0, len(base), m)] * np.exp2(rng.integers(-3, 4, m))[:, None]
@@ -18,15 +19,11 @@ def near_dependent_problem(rng, feasible=True):
         * rng.integers(-3, 4, (m, n))
         * (rng.random((m, 1)) < 0.5)
     )
-    P, q = (
-        root @ root.T + 10.0 ** rng.integers(-6, 3) * np.eye(n),
-        rng.integers(-160, 161, n) / 16.0,
-    )
+    P = root @ root.T + 10.0 ** rng.integers(-6, 3) * np.eye(n)
+    q = rng.integers(-160, 161, n) / 16.0
     values = np.vstack([np.eye(n), G]) @ (rng.integers(-32, 33, n) / 16.0)
-    lower, upper = (
-        values - rng.integers(0, 3, n + m),
-        values + rng.integers(0, 3, n + m),
-    )
+    lower = values - rng.integers(0, 3, n + m)
+    upper = values + rng.integers(0, 3, n + m)
     if not feasible:
         G[1], lower[n], upper[n], upper[n + 1] = -G[0], -np.inf, values[n], np.inf
         lower[n + 1] = -values[n] + 10.0 ** rng.uniform(-13, -5)
@@ -40,7 +37,8 @@ def near_dependent_problem(rng, feasible=True):
 def test_what_is_called_solved_is_optimal_and_what_is_called_infeasible_is(
     mode, feasible, soft, rng
 ):
-    solver, solved = DualActiveSet(), 0
+    solver = DualActiveSet()
+    solved = 0
     for _ in range(250):
         problem = near_dependent_problem(rng, feasible)
         prices = 10.0 ** rng.uniform(-3, 10, len(problem.G))

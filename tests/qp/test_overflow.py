@@ -52,8 +52,10 @@ def test_bounds_that_keep_it_finite_give_the_solution(mode, name):
 @pytest.mark.parametrize("mode", ["prepared", "changing"])
 def test_one_overflowing_entry_is_seen_wherever_it_stands(size, mode):
     for place in range(size):
-        P, q = np.ones(size), np.ones(size)
-        P[place], q[place] = 1e-155, -1e155
+        P = np.ones(size)
+        q = np.ones(size)
+        P[place] = 1e-155
+        q[place] = -1e155
         free = np.full(size, np.inf)
         solution = solve_in(mode, np.diag(P), q, np.zeros((0, size)), -free, free)
         assert solution.status is Status.NUMERICAL_TROUBLE
@@ -78,7 +80,8 @@ def test_a_proper_problem_that_the_kernel_refuses_is_not_answered_by_what_memory
 
 @pytest.mark.parametrize("mode", ["prepared", "changing"])
 def test_a_row_whose_norm_overflows_is_not_taken_for_one_that_is_kept(mode):
-    q, upper = np.array([1.0, -2.0, 1.0]), np.array([np.inf, np.inf, np.inf, -1.0])
+    q = np.array([1.0, -2.0, 1.0])
+    upper = np.array([np.inf, np.inf, np.inf, -1.0])
     solution = solve_in(
         mode, np.eye(3), q, np.array([[1e300, 2e300, 0.0]]), np.full(4, -np.inf), upper
     )

@@ -135,7 +135,8 @@ def test_a_bound_of_1e20_or_more_is_none(bound):
 
 
 def test_lists_and_integers_are_converted_and_the_givers_arrays_stay_as_they_are():
-    P, G = [[2, 0], [0, 2]], np.asfortranarray([[1, 2], [3, 4]])
+    P = [[2, 0], [0, 2]]
+    G = np.asfortranarray([[1, 2], [3, 4]])
     problem = QuadraticProgram(P, [1, 1], G, h_upper=[1, 1])
     assert problem.G.flags.c_contiguous
     assert problem.G.dtype == np.float64
@@ -144,7 +145,8 @@ def test_lists_and_integers_are_converted_and_the_givers_arrays_stay_as_they_are
 
 
 def test_unstacking_and_stacking_bounds_are_inverse(rng):
-    lower, upper = -rng.random(5), rng.random(5)
+    lower = -rng.random(5)
+    upper = rng.random(5)
     problem = QuadraticProgram.from_stacked(
         EYE, np.zeros(2), rng.random((3, 2)), lower, upper
     )

@@ -22,8 +22,11 @@ def excess(value, lower, upper):
 def by_definition(solution):
     """Primal and dual residual, duality gap."""
     (P, q, G, lower, upper), caps = solution.arrays, solution.caps
-    x, y, n = solution.x, solution.multipliers, len(q)
-    C, M = np.vstack([np.eye(n), G]), len(lower)
+    x = solution.x
+    y = solution.multipliers
+    n = len(q)
+    C = np.vstack([np.eye(n), G])
+    M = len(lower)
     units = [np.sqrt(P[i, i]) for i in range(n)]
     free = max(abs(q[i]) / units[i] for i in range(n))
     zero = max(1e-4 * max(units[i] * abs(x[i]) for i in range(n)), 1e-12 * free)
@@ -62,16 +65,19 @@ def by_definition(solution):
 
 def random_claim(rng, soft=False, absent=False, scale=1.0):
     """A program and any x with any multipliers as its solution."""
-    n, m = int(rng.integers(1, 5)), int(rng.integers(1, 5))
+    n = int(rng.integers(1, 5))
+    m = int(rng.integers(1, 5))
     root = rng.normal(size=(n, n))
-    P, q, G = root @ root.T + np.eye(n), rng.normal(size=n), rng.normal(size=(m, n))
-    lower, upper = -rng.uniform(0.1, 2, n + m), rng.uniform(0.1, 2, n + m)
-    x, y = (
-        scale * rng.normal(size=n),
-        scale * rng.normal(size=n + m) * (rng.random(n + m) < 0.7),
-    )
+    P = root @ root.T + np.eye(n)
+    q = rng.normal(size=n)
+    G = rng.normal(size=(m, n))
+    lower = -rng.uniform(0.1, 2, n + m)
+    upper = rng.uniform(0.1, 2, n + m)
+    x = scale * rng.normal(size=n)
+    y = scale * rng.normal(size=n + m) * (rng.random(n + m) < 0.7)
     if absent:
-        lower[0], upper[-1] = -np.inf, 1e20
+        lower[0] = -np.inf
+        upper[-1] = 1e20
         y[0], y[-1] = -abs(y[0]), abs(y[-1])
     claim = make_solution(
         QuadraticProgram.from_stacked(P, q, G, lower, upper), Status.SOLVED, x, y
@@ -156,8 +162,10 @@ def test_a_solution_from_parts_holds_each_of_them(rng):
 @pytest.mark.parametrize("scale", [1e-9, 1.0, 1e9])
 def test_a_ray_proves_what_it_contradicts_and_nothing_else(scale):
     """x + y <= 1 and x + y >= 2: the sum with weights 1 and -1 is 0 <= -1."""
-    G, wide = np.ones((2, 2)), np.full(2, np.inf)
-    lower, upper = np.append(-wide, [-np.inf, 2.0]), np.append(wide, [1.0, np.inf])
+    G = np.ones((2, 2))
+    wide = np.full(2, np.inf)
+    lower = np.append(-wide, [-np.inf, 2.0])
+    upper = np.append(wide, [1.0, np.inf])
 
     def proves(ray, low=lower, high=upper):
         return proves_infeasibility(scale * np.array(ray), G, low, high)

@@ -22,8 +22,11 @@ DUAL = pytest.mark.parametrize("solve", [prepared, changing])
 
 def with_slacks(problem, prices, curvature=1e-6):
     """The problem in (x, v+, v-): G x - v+ + v- within bounds, v >= 0, at the prices."""
-    n, m, hard = len(problem.q), len(problem.h_lower), np.isinf(prices)
-    linear, P = np.where(hard, 0.0, prices), curvature * np.eye(n + 2 * m)
+    n = len(problem.q)
+    m = len(problem.h_lower)
+    hard = np.isinf(prices)
+    linear = np.where(hard, 0.0, prices)
+    P = curvature * np.eye(n + 2 * m)
     P[:n, :n] = problem.P
     return QuadraticProgram(
         P,
@@ -123,17 +126,21 @@ def test_a_hard_box_stays_hard_however_dear_the_soft_rows(solve):
 
 @DUAL
 def test_soft_problems_in_a_row_have_the_same_answers_warm_and_cold(solve, rng):
-    n, m = 8, 20
+    n = 8
+    m = 20
     problem = conflicting_problem(rng, n, m)
     prices = 10.0 ** rng.uniform(-1.0, 1.0, m)
-    last, at_caps = None, 0
+    last = None
+    at_caps = 0
     for _ in range(60):
-        shift, turn = rng.uniform(-2.0, 2.0, m), rng.standard_normal(n)
+        shift = rng.uniform(-2.0, 2.0, m)
+        turn = rng.standard_normal(n)
         following = QuadraticProgram(
             problem.P, problem.q + 3.0 * turn, problem.G, problem.h_lower + shift, problem.h_upper + shift, problem.lb,
             problem.ub,
         )  # fmt: skip
-        last, cold = solve(following, prices, last), solve(following, prices)
+        last = solve(following, prices, last)
+        cold = solve(following, prices)
         assert last.status is cold.status is Status.SOLVED
         assert worst_residual(last) < 1e-9
         np.testing.assert_allclose(last.x, cold.x, atol=1e-9)

@@ -70,7 +70,8 @@ def test_the_same_question_gets_the_same_bits(solve, rng):
     for _ in range(20):
         problem = integer_problem(rng)
         guess = rng.integers(-1, 2, len(problem.lower))
-        first, second = solve(problem, guess), solve(problem, guess)
+        first = solve(problem, guess)
+        second = solve(problem, guess)
         assert first.status is second.status
         np.testing.assert_array_equal(first.x, second.x)
         np.testing.assert_array_equal(first.multipliers, second.multipliers)
@@ -78,13 +79,11 @@ def test_the_same_question_gets_the_same_bits(solve, rng):
 
 def test_strided_fortran_read_only_and_integer_inputs_give_the_same_bits(rng):
     problem = feasible_problem(rng, 6, 9)
-    P, q, G, lower, upper = (
-        problem.P,
-        np.round(problem.q),
-        problem.G,
-        problem.lower,
-        problem.upper,
-    )
+    P = problem.P
+    q = np.round(problem.q)
+    G = problem.G
+    lower = problem.lower
+    upper = problem.upper
 
     def strided(array):
         return np.repeat(array, 3, axis=-1)[..., ::3]
@@ -134,7 +133,9 @@ def test_a_prepared_program_that_has_solved_others_gives_the_bits_of_a_new_one(
 ):
     """The factor of the working set comes with the guess, not from the memory of the solver."""
     problem = feasible_problem(rng, n, m)
-    used, last, changes = DualActiveSet().prepare(problem.P, problem.G), None, 0
+    used = DualActiveSet().prepare(problem.P, problem.G)
+    last = None
+    changes = 0
     for k in range(60):
         q = problem.q + (0.0 if k % 3 == 0 else 2.0) * rng.standard_normal(n)
         guess = rng.integers(-1, 2, n + m) if k % 7 == 6 else last

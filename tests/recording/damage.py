@@ -17,16 +17,15 @@ from gpmpc.recording import _messages
 from tests.recording import runs
 
 MAGIC = b"\x89MCAP0\r\n"
-FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, ATTACHMENT, METADATA, DATA_END = (
-    2,
-    3,
-    4,
-    5,
-    6,
-    9,
-    12,
-    15,
-)  # opcodes of MCAP
+# opcodes of MCAP
+FOOTER = 2
+SCHEMA = 3
+CHANNEL = 4
+MESSAGE = 5
+CHUNK = 6
+ATTACHMENT = 9
+METADATA = 12
+DATA_END = 15
 HUGE = (
     2**16,
     2**20,
@@ -103,10 +102,8 @@ def chunk(content, compression="zstd", size=None, crc=None, compressed=None):
         compression, bytes
     )
     compressed = packed(content) if compressed is None else compressed
-    size, crc = (
-        len(content) if size is None else size,
-        zlib.crc32(content) if crc is None else crc,
-    )
+    size = len(content) if size is None else size
+    crc = zlib.crc32(content) if crc is None else crc
     return CHUNK, struct.pack("<QQQI", 0, 0, size, crc) + text(
         compression
     ) + struct.pack("<Q", len(compressed)) + compressed
@@ -187,7 +184,8 @@ def overwrite(data, rng):
 
 
 def insert_or_delete(data, rng):
-    start, length = int(rng.integers(len(data))), int(rng.integers(1, 200))
+    start = int(rng.integers(len(data)))
+    length = int(rng.integers(1, 200))
     return data[:start] + (
         rng.bytes(length) + data[start:] if rng.integers(2) else data[start + length :]
     )
@@ -284,10 +282,8 @@ def renumber(data, rng):
     def change(found):
         i = int(rng.integers(len(found)))
         opcode, content = found[i]
-        place, number = (
-            int(rng.choice([0, 2, 6])),
-            struct.pack("<H", int(rng.choice([0, 1, 2, 9, 65535]))),
-        )
+        place = int(rng.choice([0, 2, 6]))
+        number = struct.pack("<H", int(rng.choice([0, 1, 2, 9, 65535])))
         found[i] = opcode, content[:place] + number + content[place + 2 :]
         return found
 
@@ -307,7 +303,8 @@ def edit_message(data, rng):
             if opcode == MESSAGE and content[0] in (1, 2, 3)
         ]
         i = _pick(rng, messages)
-        head, content = found[i][1][:22], found[i][1][22:]
+        head = found[i][1][:22]
+        content = found[i][1][22:]
         message = classes[("Step", "Plan", "QuadraticProgram")[head[0] - 1]].FromString(
             content
         )
@@ -416,11 +413,9 @@ def zeros(size, compression):
             if compression == "zstd"
             else lz4.frame.LZ4FrameCompressor()
         )
-        block, crc, parts = (
-            bytes(2**22),
-            0,
-            [make.begin()] if compression == "lz4" else [],
-        )
+        block = bytes(2**22)
+        crc = 0
+        parts = [make.begin()] if compression == "lz4" else []
         for start in range(0, size, len(block)):
             piece = block[: size - start]
             parts.append(make.compress(piece))
@@ -432,7 +427,8 @@ def zeros(size, compression):
 def bomb(data, rng, largest=2**31):
     """Chunks of very little that unfold to very much, or say so."""
     found = section(data)
-    kind, compression = rng.integers(5), _pick(rng, ["zstd", "lz4"])
+    kind = rng.integers(5)
+    compression = _pick(rng, ["zstd", "lz4"])
     if kind == 0:  # honest about its size
         size = int(rng.choice([2**26, largest]))
         packed, crc = zeros(size, compression)
@@ -465,8 +461,10 @@ def bomb(data, rng, largest=2**31):
 def well_formed_bomb(data, rng):
     """Plans and quadratic programs of zeros: every number in its place, and far too many of them."""
     classes = _messages.message_classes(_messages.descriptor(runs.STATES, runs.INPUTS))
-    n, found = len(runs.STATES), section(data)
-    kind, many = rng.integers(3), int(rng.choice([3, 40]))
+    n = len(runs.STATES)
+    found = section(data)
+    kind = rng.integers(3)
+    many = int(rng.choice([3, 40]))
     if kind == 0:
         stages = int(rng.choice([3000, 30000]))
         plan = classes["Plan"](
@@ -493,7 +491,8 @@ def well_formed_bomb(data, rng):
         )
     else:
         step = classes["Step"](k=1, belief_covariance=[0.0] * (n * n))
-        message, many = (1, step.SerializeToString()), many * 1000
+        message = (1, step.SerializeToString())
+        many = many * 1000
     content = struct.pack("<HIQQ", message[0], 0, 0, 0) + message[1]
     chunks = [
         chunk(joined([(MESSAGE, content)] * max(1, min(many, 2**23 // len(content)))))

@@ -13,7 +13,9 @@ from gpmpc.mpc import Decision, Timing
 from gpmpc.recording import McapRecorder, RecordedSystem, Step
 from gpmpc.status import Status
 
-n, m, H = 6, 3, 10
+n = 6
+m = 3
+H = 10
 
 
 def record(path, steps):
@@ -23,7 +25,8 @@ def record(path, steps):
     )
     recorder = McapRecorder(path, system, config="seed: 7\n", metadata={"seed": 7})
     for k in range(steps):
-        inputs, means = rng.standard_normal((H, m)), rng.standard_normal((H + 1, n))
+        inputs = rng.standard_normal((H, m))
+        means = rng.standard_normal((H + 1, n))
         covariances = np.tile(np.eye(n), (H + 1, 1, 1))
         decision = Decision(
             inputs[0],

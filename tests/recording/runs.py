@@ -7,7 +7,8 @@ from gpmpc.qp import DualActiveSet, QuadraticProgram
 from gpmpc.recording import McapRecorder, RecordedSystem, Step
 from gpmpc.status import Status
 
-STATES, INPUTS = ("x", "vx", "y", "vy", "z", "vz"), ("U1", "ux", "uy")
+STATES = ("x", "vx", "y", "vy", "z", "vz")
+INPUTS = ("U1", "ux", "uy")
 UNITS = {
     "x": "m",
     "vx": "m/s",
@@ -48,7 +49,8 @@ def make_step(
     prices=None,
     variables=6,
 ):
-    n, m = len(STATES), len(INPUTS)
+    n = len(STATES)
+    m = len(INPUTS)
     roots = rng.standard_normal((horizon + 1, n, n))
     program = problem(rng, variables) if qp else None
     solution = DualActiveSet().solve(program, prices=prices) if qp else None

@@ -25,7 +25,9 @@ from gpmpc.exceptions import GpmpcError
 from gpmpc.recording import layout, read_run, recover, replay
 from tests.recording import damage
 
-MEMORY, SECONDS = 2**31, 60  # enough to see how much too much is taken
+# enough to see how much too much is taken
+MEMORY = 2**31
+SECONDS = 60
 ARRAYS = (
     "steps",
     "times",
@@ -119,7 +121,8 @@ def operations(path):
 def examine(path, original):
     """What came of every operation, and what the largest of them took."""
     Path("/proc/self/clear_refs").write_text("5")  # resets the peak
-    found, slowest = {}, 0.0
+    found = {}
+    slowest = 0.0
     for name, operation in operations(path):
         signal.alarm(SECONDS)  # ends the process, and so the study
         start = time.process_time()
@@ -133,7 +136,8 @@ def examine(path, original):
 
 
 def study(recording, seed, first, end):
-    original, data = read_run(recording), recording.read_bytes()
+    original = read_run(recording)
+    data = recording.read_bytes()
     replay(original, int(original.steps[0]))  # compiles
     kinds = (*damage.DAMAGES, *damage.DAMAGES, *damage.EDITS)
     with tempfile.TemporaryDirectory() as folder:

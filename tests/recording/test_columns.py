@@ -10,7 +10,8 @@ from tests.recording import runs
 
 @pytest.fixture(scope="module")
 def flown(tmp_path_factory):
-    path, rng = tmp_path_factory.mktemp("run") / "run.mcap", np.random.default_rng(3)
+    path = tmp_path_factory.mktemp("run") / "run.mcap"
+    rng = np.random.default_rng(3)
     outcomes = [
         (Status.SOLVED, False),
         (Status.INFEASIBLE, True),

@@ -78,11 +78,9 @@ def test_three_thousand_damaged_recordings_are_never_believed_and_do_no_harm(rec
 def test_no_flipped_bit_of_the_configuration_or_the_metadata_passes_unseen(
     recorded, tmp_path, seed
 ):
-    data, rng, path = (
-        recorded[0].read_bytes(),
-        np.random.default_rng(seed),
-        tmp_path / "flipped.mcap",
-    )
+    data = recorded[0].read_bytes()
+    rng = np.random.default_rng(seed)
+    path = tmp_path / "flipped.mcap"
     for _ in range(100):
         path.write_bytes(damage.flip_text(data, rng))
         with contextlib.suppress(
@@ -106,10 +104,8 @@ CHANGES = {
 def test_a_file_of_which_a_record_is_lost_or_repeated_is_not_finished(
     recorded, tmp_path, change
 ):
-    path, found = (
-        tmp_path / "changed.mcap",
-        list(damage.records(recorded[0].read_bytes()[len(damage.MAGIC) :])),
-    )
+    path = tmp_path / "changed.mcap"
+    found = list(damage.records(recorded[0].read_bytes()[len(damage.MAGIC) :]))
     read_again = 0
     for i, (kind, _) in enumerate(found):
         if kind in (damage.CHUNK, damage.METADATA, damage.ATTACHMENT):
@@ -130,7 +126,8 @@ def test_a_file_of_which_a_record_is_lost_or_repeated_is_not_finished(
 def test_a_chunk_whose_last_record_is_shorter_than_it_says_ends_an_unfinished_run(
     recorded, tmp_path, compression
 ):
-    path, found = tmp_path / "cut.mcap", damage.section(recorded[0].read_bytes())
+    path = tmp_path / "cut.mcap"
+    found = damage.section(recorded[0].read_bytes())
     i = max(i for i, (kind, _) in enumerate(found) if kind == damage.CHUNK)
     content, last = (
         damage.joined(part)
@@ -173,8 +170,10 @@ def channel(message):
 def test_a_plan_belongs_to_the_step_of_its_number_wherever_it_stands(
     recorded, tmp_path
 ):
-    path, steps = recorded[0], recorded[1]
-    changed, rng = tmp_path / "changed.mcap", np.random.default_rng(0)
+    path = recorded[0]
+    steps = recorded[1]
+    changed = tmp_path / "changed.mcap"
+    rng = np.random.default_rng(0)
     for lost in (0, 7, 19):
 
         def change(messages, lost=lost):
@@ -200,7 +199,8 @@ def test_a_plan_belongs_to_the_step_of_its_number_wherever_it_stands(
 
 
 def test_a_plan_whose_step_is_lost_is_left_out(recorded, tmp_path):
-    path, steps = recorded[0], recorded[1]
+    path = recorded[0]
+    steps = recorded[1]
     changed = tmp_path / "changed.mcap"
 
     def change(messages):
@@ -216,7 +216,8 @@ def test_a_plan_whose_step_is_lost_is_left_out(recorded, tmp_path):
 
 
 def test_numbers_that_come_again_keep_their_own_plans(tmp_path):
-    path, rng = tmp_path / "run.mcap", np.random.default_rng(0)
+    path = tmp_path / "run.mcap"
+    rng = np.random.default_rng(0)
     steps = [runs.make_step(k, rng) for k in (0, 1, 2, 0, 1)]  # two flights in one file
     with runs.recorder(path) as recorder:
         for step in steps:
@@ -227,7 +228,8 @@ def test_numbers_that_come_again_keep_their_own_plans(tmp_path):
 
 
 def test_a_shorter_plan_ends_in_nothing(tmp_path):
-    path, rng = tmp_path / "run.mcap", np.random.default_rng(0)
+    path = tmp_path / "run.mcap"
+    rng = np.random.default_rng(0)
     steps = [
         runs.make_step(k, rng, horizon=horizon) for k, horizon in enumerate((3, 5, 1))
     ]
@@ -259,7 +261,8 @@ def test_a_damaged_configuration_is_left_out_and_the_steps_are_not(recorded, tmp
 
 
 def test_a_recording_of_the_largest_steps_is_read(tmp_path):
-    path, rng = tmp_path / "run.mcap", np.random.default_rng(0)
+    path = tmp_path / "run.mcap"
+    rng = np.random.default_rng(0)
     step = runs.make_step(0, rng, qp=False)
     H = 21_000  # of a plan of zeros: 7.4 MB, half of what is shared with the writer, and more as messages
     zeros = replace(
@@ -278,7 +281,8 @@ def test_a_recording_of_the_largest_steps_is_read(tmp_path):
 
 @pytest.mark.parametrize("compression", ["zstd", "lz4", ""])
 def test_a_file_that_another_tool_compressed_is_read(recorded, tmp_path, compression):
-    path, found = tmp_path / "other.mcap", damage.section(recorded[0].read_bytes())
+    path = tmp_path / "other.mcap"
+    found = damage.section(recorded[0].read_bytes())
     chunks = [
         (kind, damage.inside(content) if kind == damage.CHUNK else content)
         for kind, content in found
@@ -296,7 +300,8 @@ def test_a_file_that_another_tool_compressed_is_read(recorded, tmp_path, compres
 
 
 def test_a_frame_that_does_not_say_its_size_is_read(recorded, tmp_path):
-    path, found = tmp_path / "other.mcap", damage.section(recorded[0].read_bytes())
+    path = tmp_path / "other.mcap"
+    found = damage.section(recorded[0].read_bytes())
     silent = zstandard.ZstdCompressor(write_content_size=False)
     for i, (kind, content) in enumerate(found):
         if kind == damage.CHUNK:
@@ -307,14 +312,16 @@ def test_a_frame_that_does_not_say_its_size_is_read(recorded, tmp_path):
 
 
 def test_metadata_and_configuration_may_stand_behind_the_messages(recorded, tmp_path):
-    path, found = tmp_path / "other.mcap", damage.section(recorded[0].read_bytes())
+    path = tmp_path / "other.mcap"
+    found = damage.section(recorded[0].read_bytes())
     behind = [
         record for record in found if record[0] in (damage.METADATA, damage.ATTACHMENT)
     ]
     path.write_bytes(
         damage.sealed([record for record in found if record not in behind] + behind)
     )
-    run, expected = read_run(path), read_run(recorded[0])
+    run = read_run(path)
+    expected = read_run(recorded[0])
     assert run.finished
     assert (run.metadata, run.config) == (expected.metadata, expected.config)
     np.testing.assert_array_equal(run.states, expected.states)
@@ -322,7 +329,8 @@ def test_metadata_and_configuration_may_stand_behind_the_messages(recorded, tmp_
 
 @pytest.mark.parametrize("size", [0, 2**20, 2**40, 2**63])
 def test_a_chunk_that_says_another_size_ends_what_is_read(recorded, tmp_path, size):
-    path, found = tmp_path / "changed.mcap", damage.section(recorded[0].read_bytes())
+    path = tmp_path / "changed.mcap"
+    found = damage.section(recorded[0].read_bytes())
     chunks = [i for i, (kind, _) in enumerate(found) if kind == damage.CHUNK]
     content = found[chunks[2]][1]
     found[chunks[2]] = (

@@ -14,7 +14,8 @@ from gpmpc.plotting import inputs_figure, tracking_figure
 from gpmpc.recording import McapRecorder, RecordedSystem, _recorder, read_run
 from tests.recording import runs
 
-ODD, GONE = Judgement("suspicious", "odd"), Judgement("lost", "gone")
+ODD = Judgement("suspicious", "odd")
+GONE = Judgement("lost", "gone")
 TOLD = [None, Judgement(), ODD, ODD, GONE, Judgement()]
 
 

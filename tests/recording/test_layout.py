@@ -25,16 +25,16 @@ FLOWN = {
 
 
 def record(path, states, inputs, steps=3, **settings):
-    n, m, H = len(states), len(inputs), 2
+    n = len(states)
+    m = len(inputs)
+    H = 2
     rng = np.random.default_rng(0)
     with McapRecorder(
         path, RecordedSystem(states, inputs, time_step=0.1, **settings)
     ) as recorder:
         for k in range(steps):
-            means, covariances = (
-                rng.standard_normal((H + 1, n)),
-                np.tile(np.eye(n), (H + 1, 1, 1)),
-            )
+            means = rng.standard_normal((H + 1, n))
+            covariances = np.tile(np.eye(n), (H + 1, 1, 1))
             decision = Decision(
                 input=np.zeros(m), inputs=np.zeros((H, m)), means=means, covariances=covariances,
                 status=Status.SOLVED, iterations=1, timing=Timing(0.001, 0.002, 0.003),
@@ -50,7 +50,8 @@ def record(path, states, inputs, steps=3, **settings):
 def shown(request, tmp_path_factory):
     """What was flown, its recording and its layout."""
     system = FLOWN[request.param]
-    states, inputs = system.state_names, system.input_names
+    states = system.state_names
+    inputs = system.input_names
     bounds = np.array([-np.ones(len(inputs)), np.ones(len(inputs))])
     path = record(
         tmp_path_factory.mktemp("run") / "run.mcap",
@@ -94,7 +95,8 @@ def test_every_path_is_a_number_of_the_recording_or_a_state_in_words(shown):
 
 def test_every_state_and_every_input_with_its_bounds_is_plotted(shown):
     flown, _, made = shown
-    states, inputs = FLOWN[flown].state_names, FLOWN[flown].input_names
+    states = FLOWN[flown].state_names
+    inputs = FLOWN[flown].input_names
     groups = [(group, states) for group in ("reference", "state", "measured")]
     groups += [(group, inputs) for group in ("input", "input_lower", "input_upper")]
     assert {
@@ -183,7 +185,9 @@ def test_states_stand_below_each_other_in_tabs_by_what_they_are(shown):
         for kind in ("expected", "innovation")
     ]
     assert uncertain == kinds
-    first, rest, shares = tabs["Solver"]["first"], tabs["Solver"]["second"], []
+    first = tabs["Solver"]["first"]
+    rest = tabs["Solver"]["second"]
+    shares = []
     for node in (tabs["Solver"], rest):
         assert node["direction"] == "column"
         shares.append(node["splitPercentage"])

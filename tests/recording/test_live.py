@@ -95,7 +95,9 @@ def recorder(tmp_path):
 
 def test_a_viewer_receives_every_step_at_once_and_the_file_holds_it_as_well(recorder):
     classes = _messages.message_classes(_messages.descriptor(runs.STATES, runs.INPUTS))
-    steps, seen, rng = [], {"/step": [], "/plan/tube": []}, np.random.default_rng(0)
+    steps = []
+    seen = {"/step": [], "/plan/tube": []}
+    rng = np.random.default_rng(0)
     with Viewer(recorder.address) as viewer:
         topics = viewer.subscribe(*seen)
         while min(map(len, seen.values())) < 10 and len(steps) < 200:

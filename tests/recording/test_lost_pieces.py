@@ -22,7 +22,8 @@ MOST_OF_A_CHUNK = 22  # steps of two seconds, and one more
 @pytest.fixture(scope="module")
 def flight(tmp_path_factory):
     """A flight of 20 s, which is simulated in less, and its steps by number."""
-    path, rng = tmp_path_factory.mktemp("flight") / "run.mcap", np.random.default_rng(0)
+    path = tmp_path_factory.mktemp("flight") / "run.mcap"
+    rng = np.random.default_rng(0)
     steps = [runs.make_step(k, rng, horizon=3, qp=False) for k in range(STEPS)]
     with runs.recorder(path, chunk_size=256 * 1024) as recorder:
         for step in steps:
@@ -113,7 +114,8 @@ def test_a_chunk_holds_two_seconds_of_flight_or_so(flight, tmp_path):
 
 
 def test_a_chunk_of_short_steps_is_worth_its_entries_in_the_index(tmp_path):
-    path, rng = tmp_path / "run.mcap", np.random.default_rng(0)
+    path = tmp_path / "run.mcap"
+    rng = np.random.default_rng(0)
     step = runs.make_step(0, rng, horizon=1, qp=False)
     system = RecordedSystem(runs.STATES, runs.INPUTS, time_step=10.0)
     with _recorder.McapRecorder(path, system) as recorder:
@@ -238,7 +240,8 @@ def test_a_recording_of_which_no_step_is_left_is_refused(small, tmp_path):
     data, _ = small
     for _, start, _ in chunk_spans(data):
         data = spoiled(data, start + 200)
-    path, output = tmp_path / "gone.mcap", tmp_path / "recovered.mcap"
+    path = tmp_path / "gone.mcap"
+    output = tmp_path / "recovered.mcap"
     path.write_bytes(data)
     message = r"gone\.mcap: no step of it can be read: 4 of 4 chunks cannot be read"
     with pytest.raises(RecordingError, match=message):
@@ -250,7 +253,8 @@ def test_a_recording_of_which_no_step_is_left_is_refused(small, tmp_path):
 
 def test_what_is_recovered_says_what_it_lost(small, tmp_path):
     data, steps = small
-    path, output = tmp_path / "damaged.mcap", tmp_path / "recovered.mcap"
+    path = tmp_path / "damaged.mcap"
+    output = tmp_path / "recovered.mcap"
     path.write_bytes(spoiled(data, chunk_spans(data)[1][1] + 200))
     assert recover(path, output).path == output
     run = read_run(output)

@@ -42,7 +42,8 @@ pytestmark = pytest.mark.skipif(
 @pytest.fixture(scope="module", params=["finished", "recovered"])
 def path(request, tmp_path_factory):
     """A file that was closed, and one that was cut in the middle and recovered."""
-    path, rng = tmp_path_factory.mktemp("run") / "run.mcap", np.random.default_rng(0)
+    path = tmp_path_factory.mktemp("run") / "run.mcap"
+    rng = np.random.default_rng(0)
     with runs.recorder(path) as recorder:
         for k in range(STEPS):
             status = Status.INFEASIBLE if k == 7 else Status.SOLVED
@@ -88,7 +89,8 @@ def test_another_reader_finds_every_channel_metadata_attachment_and_message(path
         ["node", str(SCRIPT), str(path)], capture_output=True, text=True, check=False
     )
     assert output.returncode == 0, output.stderr
-    found, expected = json.loads(output.stdout)[way], ours(path)
+    found = json.loads(output.stdout)[way]
+    expected = ours(path)
     assert found == expected
     topics = {
         "/step",

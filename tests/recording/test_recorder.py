@@ -88,9 +88,11 @@ def test_the_quality_of_every_solution_is_recorded(recorded):
 
 @pytest.mark.parametrize("rows", [0, 1, 8])
 def test_the_whole_active_set_is_recorded_however_many_constraints_work(tmp_path, rows):
-    path, rng = tmp_path / "run.mcap", np.random.default_rng(0)
+    path = tmp_path / "run.mcap"
+    rng = np.random.default_rng(0)
     step = runs.make_step(0, rng)
-    G, wide = rng.standard_normal((rows, 6)), np.full(rows, 100.0)
+    G = rng.standard_normal((rows, 6))
+    wide = np.full(rows, 100.0)
     program = QuadraticProgram(
         np.eye(6), np.full(6, 9.0), G, -wide, wide, -np.ones(6), np.ones(6)
     )
@@ -111,7 +113,8 @@ def test_the_whole_active_set_is_recorded_however_many_constraints_work(tmp_path
 
 
 def test_a_program_without_solution_is_recorded_hard_and_without_one(tmp_path):
-    path, rng = tmp_path / "run.mcap", np.random.default_rng(0)
+    path = tmp_path / "run.mcap"
+    rng = np.random.default_rng(0)
     step = runs.make_step(0, rng)
     program = step.decision.problem
     with runs.recorder(path) as recorder:
@@ -144,12 +147,14 @@ def test_a_replayed_step_gives_the_same_answer(recorded):
 
 
 def test_soft_rows_are_replayed_soft(tmp_path):
-    rng, path = np.random.default_rng(0), tmp_path / "soft.mcap"
+    rng = np.random.default_rng(0)
+    path = tmp_path / "soft.mcap"
     prices = np.where(np.arange(8) % 2, 0.05, np.inf)
     step = runs.make_step(0, rng, prices=prices)
     with runs.recorder(path) as recorder:
         recorder.record(step)
-    run, solution = read_run(path), step.decision.solution
+    run = read_run(path)
+    solution = step.decision.solution
     np.testing.assert_allclose(replay(run, 0).x, solution.x, rtol=0, atol=1e-9)
     np.testing.assert_allclose(run.residuals[0], solution.residuals(), atol=1e-15)
     hard = solution._replace(caps=np.full_like(solution.caps, np.inf))
@@ -157,7 +162,8 @@ def test_soft_rows_are_replayed_soft(tmp_path):
 
 
 def test_a_run_without_problems_has_none_to_replay_and_to_judge(tmp_path):
-    path, rng = tmp_path / "run.mcap", np.random.default_rng(0)
+    path = tmp_path / "run.mcap"
+    rng = np.random.default_rng(0)
     steps = [runs.make_step(0, rng), runs.make_step(1, rng, qp=False)]
     with runs.recorder(path, record_problems=False) as recorder:
         for step in steps:
@@ -209,7 +215,8 @@ def test_the_file_says_where_it_comes_from_before_the_first_message(recorded):
 
 
 def test_chunks_are_small_compressed_and_indexed(tmp_path):
-    path, rng = tmp_path / "run.mcap", np.random.default_rng(0)
+    path = tmp_path / "run.mcap"
+    rng = np.random.default_rng(0)
     step = runs.make_step(0, rng, variables=100)  # 90 kB
     with runs.recorder(path, chunk_size=256 * 1024) as recorder:
         for k in range(10):
@@ -261,7 +268,8 @@ def test_the_tube_is_the_two_sigma_ellipsoid_of_the_predicted_position(recorded)
 
 
 def test_pictures_are_drawn_no_more_than_thirty_times_a_second(tmp_path):
-    path, rng = tmp_path / "run.mcap", np.random.default_rng(0)
+    path = tmp_path / "run.mcap"
+    rng = np.random.default_rng(0)
     step = runs.make_step(0, rng)
     with runs.recorder(path, time_step=0.001) as recorder:
         for k in range(1000):
@@ -271,7 +279,8 @@ def test_pictures_are_drawn_no_more_than_thirty_times_a_second(tmp_path):
 
 
 def test_failures_are_logged_with_advice(tmp_path):
-    path, rng = tmp_path / "run.mcap", np.random.default_rng(0)
+    path = tmp_path / "run.mcap"
+    rng = np.random.default_rng(0)
     with runs.recorder(path) as recorder:
         recorder.record(runs.make_step(0, rng))
         recorder.record(runs.make_step(1, rng, status=Status.INFEASIBLE, failed=True))
@@ -286,7 +295,8 @@ def test_failures_are_logged_with_advice(tmp_path):
 
 
 def test_a_run_that_ends_in_an_error_is_recorded_up_to_there(tmp_path):
-    path, rng = tmp_path / "run.mcap", np.random.default_rng(0)
+    path = tmp_path / "run.mcap"
+    rng = np.random.default_rng(0)
 
     def run_into_trouble():
         with runs.recorder(path) as recorder:
@@ -301,7 +311,8 @@ def test_a_run_that_ends_in_an_error_is_recorded_up_to_there(tmp_path):
 
 
 def test_a_recorded_step_is_a_copy(tmp_path):
-    path, step = tmp_path / "run.mcap", runs.make_step(0, np.random.default_rng(0))
+    path = tmp_path / "run.mcap"
+    step = runs.make_step(0, np.random.default_rng(0))
     expected = step.state.copy()
     with runs.recorder(path) as recorder:
         recorder.record(step)
@@ -391,7 +402,8 @@ def disk_of(room):
 
 @pytest.mark.parametrize("room", [20_000, 200_000])
 def test_a_full_disk_is_reported_and_leaves_no_file_that_looks_finished(tmp_path, room):
-    path, rng = tmp_path / "run.mcap", np.random.default_rng(0)
+    path = tmp_path / "run.mcap"
+    rng = np.random.default_rng(0)
     steps = [runs.make_step(k, rng, qp=k > 0) for k in range(20)]
 
     def record_too_much():
@@ -415,7 +427,8 @@ def test_a_full_disk_is_reported_and_leaves_no_file_that_looks_finished(tmp_path
 def test_a_disk_that_fills_up_with_the_index_leaves_a_file_without_footer(tmp_path):
     whole = tmp_path / "whole.mcap"
     runs.record_run(whole, steps=20)
-    path, rng = tmp_path / "run.mcap", np.random.default_rng(0)
+    path = tmp_path / "run.mcap"
+    rng = np.random.default_rng(0)
     recorder = runs.recorder(path)
     room = whole.stat().st_size - 300  # the last chunk fits, the index does not
     with disk_of(room):
@@ -442,7 +455,8 @@ def test_a_disk_that_is_full_from_the_start_is_reported_at_the_start(tmp_path):
 
 def test_a_step_that_no_chunk_can_take_is_refused(tmp_path):
     step = runs.make_step(0, np.random.default_rng(0))
-    program, rows = step.decision.problem, 200_000
+    program = step.decision.problem
+    rows = 200_000
     large = QuadraticProgram(
         program.P, program.q, np.ones((rows, 6)), np.zeros(rows), np.ones(rows)
     )
@@ -472,10 +486,8 @@ def test_the_largest_step_that_is_allowed_is_written_and_one_byte_more_is_refuse
 
 
 def test_after_an_error_every_further_step_says_so(tmp_path):
-    recorder, step = (
-        runs.recorder(tmp_path / "run.mcap"),
-        runs.make_step(0, np.random.default_rng(0), variables=200),
-    )
+    recorder = runs.recorder(tmp_path / "run.mcap")
+    step = runs.make_step(0, np.random.default_rng(0), variables=200)
     with (
         disk_of(10_000),
         pytest.raises(RecordingError, match="unfinished: File too large"),
@@ -487,7 +499,8 @@ def test_after_an_error_every_further_step_says_so(tmp_path):
 
 
 def test_a_recorder_that_is_dropped_leaves_a_file_that_is_not_finished(tmp_path):
-    recorder, rng = runs.recorder(tmp_path / "run.mcap"), np.random.default_rng(0)
+    recorder = runs.recorder(tmp_path / "run.mcap")
+    rng = np.random.default_rng(0)
     for k in range(200):
         recorder.record(runs.make_step(k, rng))
     del recorder

@@ -17,7 +17,8 @@ def metadata(path):
 
 @pytest.mark.parametrize("cut", [0, 200, 40_000])
 def test_a_recovered_file_tells_so_and_counts_what_it_holds(cut, tmp_path):
-    path, output = tmp_path / "run.mcap", tmp_path / "recovered.mcap"
+    path = tmp_path / "run.mcap"
+    output = tmp_path / "recovered.mcap"
     steps = runs.record_run(path, steps=20)
     whole = path.read_bytes()
     path.write_bytes(whole[: len(whole) - cut])

@@ -18,13 +18,12 @@ from gpmpc.recording import read_run, recover
 from tests.recording import runs
 
 ENDLESS = Path(__file__).with_name("endless.py")
-MESSAGE, CHUNK, ATTACHMENT, METADATA, DATA_END = (
-    0x05,
-    0x06,
-    0x09,
-    0x0C,
-    0x0F,
-)  # opcodes of MCAP
+# opcodes of MCAP
+MESSAGE = 0x05
+CHUNK = 0x06
+ATTACHMENT = 0x09
+METADATA = 0x0C
+DATA_END = 0x0F
 MAGIC = 8  # [bytes]
 
 
@@ -99,7 +98,8 @@ def start():
 
 
 def test_a_run_killed_at_twenty_random_moments_is_recovered_every_time(start, tmp_path):
-    rng, steps = np.random.default_rng(), []
+    rng = np.random.default_rng()
+    steps = []
     for i in range(20):
         path = tmp_path / f"{i}.mcap"
         process = start(path)
@@ -122,7 +122,8 @@ def test_a_run_killed_at_twenty_random_moments_is_recovered_every_time(start, tm
 
 
 def test_a_killed_run_loses_at_most_its_last_chunk(start, tmp_path):
-    path, count = tmp_path / "run.mcap", 400
+    path = tmp_path / "run.mcap"
+    count = 400
     process = start(path, count)
     assert start.output.readline() == "recorded\n"
     os.kill(process, signal.SIGKILL)
@@ -167,7 +168,8 @@ def test_a_file_cut_before_its_configuration_is_whole_does_not_pretend_to_have_o
     finished, tmp_path
 ):
     data = finished.read_bytes()
-    path, output = tmp_path / "cut.mcap", tmp_path / "recovered.mcap"
+    path = tmp_path / "cut.mcap"
+    output = tmp_path / "recovered.mcap"
     path.write_bytes(data[: data.index(b"seed: 7\n") + 4])
     recover(path, output)
     with output.open("rb") as file:
@@ -179,7 +181,8 @@ def test_a_damaged_chunk_ends_what_is_recovered(finished, tmp_path):
     with finished.open("rb") as file:
         chunks = make_reader(file).get_summary().chunk_indexes
     data[chunks[-1].chunk_start_offset + 100] ^= 0xFF
-    path, output = tmp_path / "damaged.mcap", tmp_path / "recovered.mcap"
+    path = tmp_path / "damaged.mcap"
+    output = tmp_path / "recovered.mcap"
     path.write_bytes(data)
     assert (
         0
@@ -194,7 +197,8 @@ def test_a_finished_file_is_copied_with_nothing_lost(finished, tmp_path):
     found = recover(finished, output)
     assert found.finished
     assert np.ptp(found.times) == pytest.approx(1.9)
-    before, after = read_run(finished), read_run(output)
+    before = read_run(finished)
+    after = read_run(output)
     np.testing.assert_array_equal(before.plan_means, after.plan_means)
     assert after.finished
     assert before.metadata == after.metadata

@@ -24,7 +24,8 @@ def spreads(n, rng):
 
 def record(path, states, outcomes, rng, **settings):
     """A step a second, of the statuses and of whether they count as failed; the steps."""
-    n, steps = len(states), []
+    n = len(states)
+    steps = []
     with McapRecorder(
         path, RecordedSystem(states, ("u",), time_step=1.0, **settings)
     ) as recorder:
@@ -71,7 +72,8 @@ def turn(quaternion):
 
 @pytest.fixture(scope="module")
 def flown(tmp_path_factory):
-    path, rng = tmp_path_factory.mktemp("run") / "run.mcap", np.random.default_rng(4)
+    path = tmp_path_factory.mktemp("run") / "run.mcap"
+    rng = np.random.default_rng(4)
     outcomes = [(Status.SOLVED, False)] * 5 + [
         (Status.INFEASIBLE, True),
         (Status.ITERATION_LIMIT, False),
@@ -119,10 +121,8 @@ def test_the_tube_has_an_ellipsoid_of_two_standard_deviations_at_every_stage(flo
             [place(s.pose.position) for s in spheres], step.decision.means[:, [0, 2, 4]]
         )
         for sphere, covariance in zip(spheres, step.decision.covariances, strict=True):
-            directions, radii = (
-                turn(sphere.pose.orientation),
-                np.array(place(sphere.size)) / 2,
-            )
+            directions = turn(sphere.pose.orientation)
+            radii = np.array(place(sphere.size)) / 2
             covariance = covariance[np.ix_([0, 2, 4], [0, 2, 4])]
             np.testing.assert_allclose(
                 directions @ np.diag(radii**2) @ directions.T,
@@ -162,7 +162,8 @@ def test_every_solve_that_failed_is_logged_the_louder_the_more_it_mattered(flown
 
 def test_an_axis_that_no_state_is_is_zero(tmp_path, rng):
     path = tmp_path / "run.mcap"
-    outcomes, pose = [(Status.SOLVED, False)] * 3, {"x": "x", "z": "z"}
+    outcomes = [(Status.SOLVED, False)] * 3
+    pose = {"x": "x", "z": "z"}
     steps = record(path, ("z", "x", "phi"), outcomes, rng, z_down=False, pose=pose)
     for message, step in zip(decoded(path, "/pose"), steps, strict=True):
         assert place(message.pose.position) == [step.state[1], 0, step.state[0]]

@@ -44,7 +44,8 @@ def records(path):
 
 @pytest.fixture(scope="module")
 def path(tmp_path_factory):
-    path, rng = tmp_path_factory.mktemp("run") / "run.mcap", np.random.default_rng(1)
+    path = tmp_path_factory.mktemp("run") / "run.mcap"
+    rng = np.random.default_rng(1)
     with runs.recorder(path) as recorder:
         recorder.record(runs.make_step(0, rng))
         recorder.record(runs.make_step(7, rng, status=Status.INFEASIBLE, failed=True))
@@ -130,7 +131,8 @@ def test_a_file_describes_itself(path):
 
 
 def test_what_is_not_said_is_unknown_unbounded_or_empty(tmp_path):
-    path, rng = tmp_path / "run.mcap", np.random.default_rng(0)
+    path = tmp_path / "run.mcap"
+    rng = np.random.default_rng(0)
     of_system = {"units": {}, "input_bounds": None, "pose": {}, "z_down": False}
     with runs.recorder(path, config="", metadata=None, **of_system) as recorder:
         for k in range(3):
@@ -189,7 +191,8 @@ def test_steps_are_written_when_enough_wait_or_enough_time_has_passed(
 def test_the_beginning_and_the_end_of_a_file_are_flushed_to_the_disk(
     tmp_path, monkeypatch
 ):
-    path, sizes = tmp_path / "run.mcap", []
+    path = tmp_path / "run.mcap"
+    sizes = []
     monkeypatch.setattr(
         _recorder.os, "fsync", lambda _: sizes.append(path.stat().st_size)
     )
@@ -241,10 +244,8 @@ def test_names_are_limited_different_and_known():
 
 @pytest.mark.parametrize("system", [translational(), rotational()])
 def test_a_system_is_described_by_its_own_names_bounds_and_pose(system):
-    own, other = (
-        RecordedSystem.of(system),
-        RecordedSystem.of(system, [[-9.0] * 3, [9.0] * 3]),
-    )
+    own = RecordedSystem.of(system)
+    other = RecordedSystem.of(system, [[-9.0] * 3, [9.0] * 3])
     assert (own.state_names, own.input_names) == (
         tuple(system.state_names),
         tuple(system.input_names),
@@ -262,7 +263,8 @@ def test_a_system_is_described_by_its_own_names_bounds_and_pose(system):
 
 
 def test_a_layout_of_one_state_has_no_tab_for_what_is_not_there(tmp_path):
-    path, step = tmp_path / "run.mcap", runs.make_step(0, np.random.default_rng(0))
+    path = tmp_path / "run.mcap"
+    step = runs.make_step(0, np.random.default_rng(0))
     system = RecordedSystem(("x",), ("u",), 0.1)
     part = replace(
         step, reference=np.zeros(1), state=np.zeros(1), measured=np.zeros(1), input=np.zeros(1), decision=None,
@@ -280,7 +282,8 @@ def test_what_a_file_may_unfold_to_is_counted_to_the_byte(path, monkeypatch):
     assert _records.room(path) == 64 * 2**20 + 300 * path.stat().st_size
     with path.open("rb") as file:
         reader = make_reader(file)
-        messages, summary = len([*reader.iter_messages()]), reader.get_summary()
+        messages = len([*reader.iter_messages()])
+        summary = reader.get_summary()
     room = sum(chunk.uncompressed_size for chunk in summary.chunk_indexes)
     monkeypatch.setattr(_records, "room", lambda _: room)
     assert len([*_records.whole_records(path)]) > messages

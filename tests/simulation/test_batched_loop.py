@@ -24,7 +24,8 @@ from gpmpc.systems import (
 )
 from tests.mpc.systems import HOVER, QUADROTOR, quadrotor_gp
 
-H, STEPS = 3, 8
+H = 3
+STEPS = 8
 GP = quadrotor_gp(20)
 REFERENCES = Reference(np.zeros((STEPS + H, 6)), np.tile(HOVER, (STEPS + H - 1, 1)))
 START = np.array([0.3, 0.0, -0.2, 0.0, 0.1, 0.0])
@@ -116,7 +117,8 @@ def test_a_trial_gives_the_same_numbers_in_a_crowd_and_alone(
 
 @pytest.mark.parametrize("chunk", [1, 2, 50])
 def test_the_size_of_a_chunk_changes_no_number(chunk):
-    asked, seeds = controller("full", MomentMatching()), [7, 0, 3, 12, 5]
+    asked = controller("full", MomentMatching())
+    seeds = [7, 0, 3, 12, 5]
     for ours, theirs in zip(
         fly(asked, seeds, chunk=chunk), fly(asked, seeds), strict=True
     ):
@@ -190,7 +192,8 @@ def test_a_trial_that_fails_stops_no_other():
 class Explosive:
     """x' = x^3: it leaves the finite numbers from far out only."""
 
-    state_names, input_names = ("x",), ("u",)
+    state_names = ("x",)
+    input_names = ("u",)
 
     def derivative(self, x, u):
         return [x[0] * x[0] * x[0] + u[0]]
@@ -210,10 +213,8 @@ class Proportional:
 
 
 def test_a_controller_that_answers_one_by_one_flies_many_too_and_divergence_is_one_trials_own():
-    plant, initial = (
-        System(Explosive(), time_step=0.5),
-        Gaussian(torch.zeros(1), 4 * torch.eye(1)),
-    )
+    plant = System(Explosive(), time_step=0.5)
+    initial = Gaussian(torch.zeros(1), 4 * torch.eye(1))
     asked = (plant, Proportional(), np.zeros((20, 1)), initial, 15)
     flown = closed_loops(*asked, 12)
     assert any("Diverged: step" in trial.error for trial in flown if trial.error)
@@ -232,8 +233,10 @@ def test_a_controller_that_answers_one_by_one_flies_many_too_and_divergence_is_o
     ids=lambda plant: f"{type(plant).__name__} {type(plant.dynamics).__name__}",
 )
 def test_many_plants_step_as_one_does(plant, rng):
-    n, m = len(plant.dynamics.state_names), len(plant.dynamics.input_names)
-    states, inputs = 0.3 * rng.normal(size=(5, n)), 0.3 * rng.normal(size=(5, m))
+    n = len(plant.dynamics.state_names)
+    m = len(plant.dynamics.input_names)
+    states = 0.3 * rng.normal(size=(5, n))
+    inputs = 0.3 * rng.normal(size=(5, m))
     expected = [step(plant, x, u) for x, u in zip(states, inputs, strict=True)]
     assert np.allclose(
         step_many(plant, states, inputs), expected, rtol=1e-14, atol=1e-15
@@ -280,9 +283,7 @@ def test_misuse_is_refused_before_the_first_step(settings, error, message):
     ids=["mean", "linearised", "moment-matched"],
 )
 def test_flights_with_the_model_on_a_gpu_are_those_on_the_cpu(covariance, propagator):
-    here, there = (
-        controller(covariance, propagator),
-        controller(covariance, propagator, GP.to("cuda")),
-    )
+    here = controller(covariance, propagator)
+    there = controller(covariance, propagator, GP.to("cuda"))
     for ours, theirs in zip(fly(there), fly(here), strict=True):
         assert_same(ours.result, theirs.result)

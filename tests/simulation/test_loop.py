@@ -17,7 +17,8 @@ from gpmpc.systems import Map, System, Translational, step
 class Cart:
     """A mass on a rail."""
 
-    state_names, input_names = ("x", "v"), ("a",)
+    state_names = ("x", "v")
+    input_names = ("a",)
 
     def derivative(self, x, u):
         return [x[1], u[0]]
@@ -39,7 +40,8 @@ class Feedback:
     horizon = 3
 
     def __init__(self, failing=()):
-        self.failing, self.seen = failing, []
+        self.failing = failing
+        self.seen = []
 
     def control(self, belief, reference, previous=None):
         k = len(self.seen)
@@ -47,7 +49,8 @@ class Feedback:
         input = -np.array([[1.0, 1.5]]) @ (belief.mean.numpy() - reference.states[0])
         status = Status.ITERATION_LIMIT if k in self.failing else Status.SOLVED
         means = np.tile(belief.mean.numpy(), (4, 1))
-        inputs, covariances = np.tile(input, (3, 1)), np.zeros((4, 2, 2))
+        inputs = np.tile(input, (3, 1))
+        covariances = np.zeros((4, 2, 2))
         return Decision(
             input, inputs, means, covariances, status, 5, Timing(0.1, 0.2, 0.3)
         )
@@ -83,11 +86,9 @@ def test_states_follow_the_plant_from_what_acted():
 
 def test_the_same_seed_gives_the_same_numbers_and_another_one_others():
     noise = Noise(**ALL_NOISE)
-    first, again, other = (
-        fly(noise=noise, seed=3),
-        fly(noise=noise, seed=3),
-        fly(noise=noise, seed=4),
-    )
+    first = fly(noise=noise, seed=3)
+    again = fly(noise=noise, seed=3)
+    other = fly(noise=noise, seed=4)
     assert np.array_equal(first.states, again.states)
     assert np.array_equal(first.measured, again.measured)
     assert not np.array_equal(first.states, other.states)
@@ -148,7 +149,8 @@ def test_a_gust_acts_in_its_window_and_is_integrated():
 
 def test_a_gust_moves_the_next_state_of_a_plant_without_derivative():
     class InSteps:
-        state_names, input_names = Cart.state_names, Cart.input_names
+        state_names = Cart.state_names
+        input_names = Cart.input_names
 
         def successor(self, x, u):
             return [x[0] + 0.1 * x[1], x[1] + 0.1 * u[0]]
@@ -252,10 +254,8 @@ def test_references_with_inputs_are_handed_on_window_by_window():
 @pytest.fixture(scope="module")
 def model():
     rng = np.random.default_rng(0)
-    x, u = (
-        torch.from_numpy(rng.normal(size=(40, 2))),
-        torch.from_numpy(3 * rng.normal(size=(40, 1))),
-    )
+    x = torch.from_numpy(rng.normal(size=(40, 2)))
+    u = torch.from_numpy(3 * rng.normal(size=(40, 1)))
     after = torch.from_numpy(
         np.array([step(PLANT, a, b) for a, b in zip(x.numpy(), u.numpy(), strict=True)])
     )
@@ -272,7 +272,8 @@ def model():
 
 
 def test_a_model_loop_carries_mean_and_covariance_on(model):
-    controller, propagator = Feedback(), MomentMatching()
+    controller = Feedback()
+    propagator = MomentMatching()
     flight = fly(20, controller, ModelLoop(model, propagator, time_step=0.1))
     belief = Gaussian(torch.from_numpy(START), 0.1**2 * torch.eye(2))
     for k in range(20):

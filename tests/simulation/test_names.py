@@ -34,7 +34,8 @@ from gpmpc.systems import Coupled, Rotational, System, Translational, pendulum, 
 class Swapped:
     """A pendulum whose states are named in another order."""
 
-    state_names, input_names = ("rate", "angle"), ("torque",)
+    state_names = ("rate", "angle")
+    input_names = ("torque",)
 
     def derivative(self, x, u):
         return [np.float64(15.0) * x[1] + u[0], x[0]]
@@ -44,7 +45,8 @@ PLANT = pendulum(0.1)
 PROBLEM = Problem(Tracking([1.0, 0.1], [0.1], penalized="inputs"))
 START = pd.Series({"rate": -0.4, "angle": 0.3})
 GOAL = pd.Series({"rate": 0.0, "angle": 0.2})
-NUMBERS, TARGET = np.array([0.3, -0.4]), np.array([0.2, 0.0])
+NUMBERS = np.array([0.3, -0.4])
+TARGET = np.array([0.2, 0.0])
 
 
 @pytest.fixture(scope="module")
@@ -250,7 +252,8 @@ def test_filters_sort_beliefs_inputs_and_measurements_by_name(model):
 def test_beliefs_over_further_states_are_sorted_and_propagators_refuse_another_order(
     model,
 ):
-    belief, named = Gaussian.certain(NUMBERS), Gaussian.certain(START)
+    belief = Gaussian.certain(NUMBERS)
+    named = Gaussian.certain(START)
     delayed = DelayedModel(model, 1)
     effect = torch.eye(2, dtype=torch.float64)
     disturbed = DisturbedModel(model, effect, [0.1, 0.1])
@@ -293,7 +296,8 @@ def test_a_cascade_checks_both_loops():
 
 def test_a_flight_of_another_time_step_joins_no_data(controller):
     data = RandomData(samples=15).transitions(PLANT)
-    learning, flight = EpisodicLearning(), fly(controller)
+    learning = EpisodicLearning()
+    flight = fly(controller)
     assert learning.with_flight(data, flight).signals == PLANT.signals
     with pytest.raises(SettingError, match="the data has time steps of 0.1 s"):
         learning.with_flight(data, replace(flight, time_step=0.5))

@@ -14,12 +14,11 @@ from gpmpc.status import Status
 from gpmpc.systems import Coupled, System
 from tests.mpc.systems import QUADROTOR, quadrotor_gp
 
-H, STEPS = 3, 12
-LOWER, UPPER, RATE = (
-    np.array([5.0, -0.2, -0.2]),
-    np.array([9.0, 0.2, 0.2]),
-    np.array([0.5, 0.1, 0.1]),
-)
+H = 3
+STEPS = 12
+LOWER = np.array([5.0, -0.2, -0.2])
+UPPER = np.array([9.0, 0.2, 0.2])
+RATE = np.array([0.5, 0.1, 0.1])
 PROBLEM = Problem(
     Tracking([1] * 6, [1] * 3), inputs=Box(LOWER, UPPER), input_rates=Box(-RATE, RATE)
 )
@@ -28,7 +27,8 @@ FAR = np.array(
     [1e6, 1.0, 1.0]
 )  # the inputs that belong to the reference, outside of everything
 REFERENCES = Reference(np.zeros((STEPS + H, 6)), np.tile(FAR, (STEPS + H - 1, 1)))
-START, NOTHING = np.zeros(6), (np.zeros((H + 1, 6)), np.zeros((H + 1, 6, 6)))
+START = np.zeros(6)
+NOTHING = (np.zeros((H + 1, 6)), np.zeros((H + 1, 6, 6)))
 
 
 def spoilt(plan, row, column, value):
@@ -56,14 +56,19 @@ LIES = {
 class Liar:
     """Moves its inputs about within box and rates; calls its plans solved, ``lies`` (steps to kinds) too."""
 
-    horizon, problem, initial_input = H, PROBLEM, FIRST
+    horizon = H
+    problem = PROBLEM
+    initial_input = FIRST
 
     def __init__(self, lies=(), status=Status.SOLVED):
-        self.lies, self.asked, self.status = dict(lies), 0, status
+        self.lies = dict(lies)
+        self.asked = 0
+        self.status = status
         self.draws = np.random.default_rng(0)
 
     def control(self, belief, reference, previous=None):
-        k, self.asked = self.asked, self.asked + 1
+        k = self.asked
+        self.asked = self.asked + 1
         plan = [self.initial_input if previous is None else previous.input]
         for _ in range(H):
             plan.append(
@@ -76,10 +81,8 @@ class Liar:
             if k in self.lies
             else np.array(plan[1:])
         )
-        means, covariances = (
-            np.tile(belief.mean.numpy(), (H + 1, 1)),
-            np.zeros((H + 1, 6, 6)),
-        )
+        means = np.tile(belief.mean.numpy(), (H + 1, 1))
+        covariances = np.zeros((H + 1, 6, 6))
         suboptimal = not self.status.solved
         return Decision(
             plan[0],
@@ -171,7 +174,8 @@ def test_many_at_once_are_looked_at_one_by_one(kind):
 
 @pytest.mark.parametrize("kind", LIES)
 def test_a_loop_of_ones_own_is_stopped_where_the_policy_says_so(kind):
-    state, reference = Gaussian.certain(START), Reference(REFERENCES.states[: H + 1])
+    state = Gaussian.certain(START)
+    reference = Reference(REFERENCES.states[: H + 1])
     with pytest.raises(
         SolverFailure,
         match="step 7: its plan, SOLVED, is not finite or out of its bounds or shape",
@@ -217,10 +221,8 @@ def test_what_misses_a_bound_by_rounding_is_put_onto_it():
 
 
 def test_a_reference_that_is_not_finite_is_nothing_to_fall_back_on():
-    lost, reference = (
-        Gaussian.certain(START * np.nan),
-        Reference(REFERENCES.states[: H + 1], np.full((H, 3), np.nan)),
-    )
+    lost = Gaussian.certain(START * np.nan)
+    reference = Reference(REFERENCES.states[: H + 1], np.full((H, 3), np.nan))
     with pytest.raises(SolverFailure, match="no reference input to fall back on"):
         command(Liar(), lost, reference, None, "hold")
 
@@ -262,7 +264,8 @@ def test_a_controller_without_declared_bounds_is_held_to_finite_inputs_of_the_pl
 
 
 def test_a_recorder_is_told_that_the_policy_chose_the_input():
-    lies, told = {1: "nan", 3: "two inputs"}, []
+    lies = {1: "nan", 3: "two inputs"}
+    told = []
     closed_loop(
         QUADROTOR,
         Liar(lies),

@@ -32,7 +32,8 @@ def metrics_of(error, steps=20, failing=0, constraints=()):
     states = references.copy()
     states[:, 0] = error
     statuses = (Status.INFEASIBLE,) * failing + (Status.SOLVED,) * (steps - failing)
-    nothing, timing = np.full((steps, 6), np.nan), Timing(1e-3, 1e-4, 2e-3)
+    nothing = np.full((steps, 6), np.nan)
+    timing = Timing(1e-3, 1e-4, 2e-3)
     rollout = Rollout(
         states, np.zeros((steps + 1, 6, 6)), states[:-1], np.ones((steps, 3)), references, nothing,
         np.full((steps, 6, 6), np.nan), statuses, np.ones(steps, int), (timing,) * steps, 1.0,

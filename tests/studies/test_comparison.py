@@ -45,7 +45,8 @@ def test_the_statistics_of_pairs_are_those_of_scipy_and_of_their_definitions(
 ):
     a = rng.uniform(0.1, 0.2, pairs)
     b = a + 0.01 * rng.normal(0.3, 1.0, pairs)
-    ours, theirs = compared(tmp_path, a, b), stats.ttest_rel(a, b)
+    ours = compared(tmp_path, a, b)
+    theirs = stats.ttest_rel(a, b)
     assert ours.pairs == pairs
     assert ours.medians == pytest.approx((np.median(a), np.median(b)))
     assert ours.difference == pytest.approx((a - b).mean())
@@ -62,7 +63,8 @@ def test_the_statistics_of_pairs_are_those_of_scipy_and_of_their_definitions(
 
 def test_swapped_groups_turn_the_signs_and_keep_the_tests(tmp_path, rng):
     a, b = rng.uniform(0.1, 0.2, size=(2, 8))
-    ours, turned = compared(tmp_path / "ab", a, b), compared(tmp_path / "ba", b, a)
+    ours = compared(tmp_path / "ab", a, b)
+    turned = compared(tmp_path / "ba", b, a)
     assert turned.medians == ours.medians[::-1]
     assert (turned.wilcoxon, turned.t_test) == pytest.approx(
         (ours.wilcoxon, ours.t_test)

@@ -42,10 +42,13 @@ ON_THE_PLANT = partial(NMPC, problem=PROBLEM, horizon=2, initial_input=HOVER)
 class Blind:
     """Applies a law of the state, whatever it is asked for; a call takes the seconds that ``seconds`` gives."""
 
-    horizon, problem, initial_input = 1, replace(PROBLEM, inputs=Box()), HOVER
+    horizon = 1
+    problem = replace(PROBLEM, inputs=Box())
+    initial_input = HOVER
 
     def __init__(self, plant, law, seconds=lambda: 0.0):
-        self.law, self.seconds = law, seconds
+        self.law = law
+        self.seconds = seconds
 
     def control(self, belief, reference, previous=None):
         inputs = np.array([self.law(belief.mean.numpy())], dtype=float)
@@ -204,7 +207,8 @@ def test_an_offset_and_a_short_flight_are_no_loss(trajectory):
 
 
 def test_a_plan_leaves_out_the_process_noise_of_the_plant_unless_its_covariances_hold_it():
-    noisy, latent = Noise(process=[1e-3] * 6), Linearization(process_noise=False)
+    noisy = Noise(process=[1e-3] * 6)
+    latent = Linearization(process_noise=False)
     for settings, expected in (
         ({"noise": noisy}, 1e-3),
         ({"noise": noisy, "propagator": latent}, 1e-3),
@@ -374,8 +378,11 @@ def test_the_order_of_choices_does_not_matter_for_the_name():
 )
 def test_what_a_run_supposes_of_columns_at_rest_follows_from_the_limits(settings):
     rng = np.random.default_rng(0)
-    states, inputs = rng.uniform(-1, 1, (20, 6)), rng.uniform(-0.5, 0.5, (20, 3))
-    states[:, 4], states[:, 5], inputs[:, :2] = 1.0, 0.0, [7.26, 0.1]
+    states = rng.uniform(-1, 1, (20, 6))
+    inputs = rng.uniform(-0.5, 0.5, (20, 3))
+    states[:, 4] = 1.0
+    states[:, 5] = 0.0
+    inputs[:, :2] = [7.26, 0.1]
     data = Transitions(states, inputs, rng.uniform(-1, 1, (20, 6)))
     flown = experiment(train=Trainer(restarts=0, **settings))
     gp = flown.learn(data, seed=0).posterior

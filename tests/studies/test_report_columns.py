@@ -37,11 +37,14 @@ def test_failed_solves_have_a_column_if_any_run_has_some(failing, tmp_path):
 
 def test_a_comparison_stands_in_the_page_and_in_the_text_if_there_is_one(tmp_path):
     for seed in range(2):
-        choices, settings = [f"seed={seed}"], SETTINGS | {"seed": seed}
+        choices = [f"seed={seed}"]
+        settings = SETTINGS | {"seed": seed}
         made_up_run(tmp_path, choices, settings, result=metrics_of(0.1))
-    found, lines = report(tmp_path), ["first line of it", "second line of it"]
+    found = report(tmp_path)
+    lines = ["first line of it", "second line of it"]
     for name in ("report.md", "report.html"):
-        with_it, without = documents(found, lines)[name], documents(found)[name]
+        with_it = documents(found, lines)[name]
+        without = documents(found)[name]
         assert all(
             line in with_it and line not in without for line in [*lines, "Comparison"]
         )

@@ -89,10 +89,8 @@ def test_a_failure_is_kept_with_its_kind_and_where_it_was_raised(tmp_path):
 
 
 def test_a_result_of_other_settings_or_none_is_refused(tmp_path):
-    folder, about = (
-        RunFolder(tmp_path),
-        record(["b=2", "a=1"], {"seed": 7, "steps": 3}, "gpmpc run"),
-    )
+    folder = RunFolder(tmp_path)
+    about = record(["b=2", "a=1"], {"seed": 7, "steps": 3}, "gpmpc run")
     folder.finish(about)
     assert (
         folder.result()

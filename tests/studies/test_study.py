@@ -84,7 +84,8 @@ def test_what_is_missing_is_run_and_records_stand_in_the_order_of_the_trials(
     trials = [
         Trial({"name": c}, c, seed, f"print{seed}") for seed, c in conditions.items()
     ]
-    store, told = TrialStore(tmp_path / "trials.jsonl"), []
+    store = TrialStore(tmp_path / "trials.jsonl")
+    told = []
     store.append("print6", {"name": "of an older study", "seed": 6, "square": 36})
     records = run_study(fail, trials, store, 7, told.append)
     assert started == [(3, 7), (4, 7), (5, 7)]
@@ -178,7 +179,8 @@ def test_a_fingerprint_differs_with_settings_arrays_and_code_and_with_nothing_el
 def test_a_model_is_trained_once_for_its_code_settings_data_and_seed(
     tmp_path, monkeypatch
 ):
-    rng, calls = np.random.default_rng(0), []
+    rng = np.random.default_rng(0)
+    calls = []
     states = torch.from_numpy(rng.normal(size=(12, 1)))
     data = Transitions(states, torch.zeros(12, 1) + states**2, 0.5 * states)
 
@@ -193,7 +195,8 @@ def test_a_model_is_trained_once_for_its_code_settings_data_and_seed(
     paths = {path, *(trained_model(train, *each, tmp_path) for each in others)}
     assert len(paths) == len(calls) == 4
     assert sorted(paths) == sorted((tmp_path / "models").iterdir())
-    model, query = read_model(path), torch.zeros(1, 1)
+    model = read_model(path)
+    query = torch.zeros(1, 1)
     assert model is read_model(path)
     assert model.state_dim == model.input_dim == 1
     assert torch.isfinite(model.predict(query, query).mean).all()

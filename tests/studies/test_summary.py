@@ -169,8 +169,10 @@ def test_a_state_at_which_a_constraint_is_no_number_does_not_keep_it():
 
 def rollout_of(errors, **changes):
     """A flight of ``PLANT`` so far from its reference along x, y and z [m], each row a state."""
-    errors, n = np.array(errors, dtype=float), 6
-    steps, references = len(errors) - 1, np.zeros((len(errors), n))
+    errors = np.array(errors, dtype=float)
+    n = 6
+    steps = len(errors) - 1
+    references = np.zeros((len(errors), n))
     references[:, 0] = 0.5 * np.arange(len(errors))
     states = references.copy()
     states[:, ::2] += errors

@@ -19,8 +19,11 @@ from gpmpc.studies.flight import Experiment, Flown, run_trial
 from gpmpc.systems import pendulum, translational
 from gpmpc.trajectories import Elliptical
 
-PLANT, PENDULUM = translational(), pendulum()
-ROLLOUT, MODEL, STEP = object(), SimpleNamespace(name="model"), object()
+PLANT = translational()
+PENDULUM = pendulum()
+ROLLOUT = object()
+MODEL = SimpleNamespace(name="model")
+STEP = object()
 
 
 def steering(model=None, **made):
@@ -56,11 +59,9 @@ def loops(monkeypatch):
 def test_a_flight_goes_from_the_first_reference_along_all_that_its_last_plan_sees(
     loops,
 ):
-    heavy, noise, gust = (
-        translational(mass=0.9),
-        Noise(process=[0.1] * 6),
-        SimpleNamespace(disturb_plant=None),
-    )
+    heavy = translational(mass=0.9)
+    noise = Noise(process=[0.1] * 6)
+    gust = SimpleNamespace(disturb_plant=None)
     told = []
     chosen = experiment(plant=heavy, noise=noise, seed=4, on_failure="raise")
     object.__setattr__(chosen, "disturbances", (gust,))
@@ -159,7 +160,9 @@ def test_a_flight_that_diverges_is_what_was_flown_of_it_or_raises_where_that_is_
 def test_episodes_are_flown_with_seeds_of_their_own_and_the_model_of_the_best_flies_last(
     monkeypatch,
 ):
-    errors, flown, learned = [3.0, 1.0, 2.0], [], []
+    errors = [3.0, 1.0, 2.0]
+    flown = []
+    learned = []
 
     def learn(_, data, seed):
         learned.append((list(data), seed))
@@ -213,10 +216,8 @@ def test_a_system_with_angles_or_something_known_learns_what_is_left_of_the_diff
     train.predicts = "difference"
     angles = PENDULUM.angle_indices
     assert angles
-    plain, turning = (
-        experiment(train=train),
-        experiment(train=train, system=PENDULUM, trajectory=None),
-    )
+    plain = experiment(train=train)
+    turning = experiment(train=train, system=PENDULUM, trajectory=None)
     assert plain.learn("rows", 3) == ("rows", 3)
     assert turning.learn("rows", 3) == ("residual", train, "rows", angles, None, 3)
     known = experiment(train=train, system=replace(PLANT, nominal=PLANT))

@@ -42,7 +42,8 @@ def test_a_search_comes_near_the_least_cost_and_knows_what_mattered():
 
 
 def test_a_search_of_one_seed_proposes_the_same_and_goes_on_as_if_it_had_never_stopped():
-    whole, part = searched(12), searched(6)
+    whole = searched(12)
+    part = searched(6)
     assert part.candidates == whole.candidates[:6]
     assert searched(12).candidates == whole.candidates
     assert searched(12, seed=1).candidates != whole.candidates

@@ -23,7 +23,8 @@ def test_the_names_are_those_of_the_subsystems():
 
 def test_the_attitude_turns_as_the_rotational_subsystem_does(rng):
     rotational = Rotational(inertia=(0.004, 0.005, 0.009))
-    x, u = rng.normal(size=12), rng.normal(size=4)
+    x = rng.normal(size=12)
+    u = rng.normal(size=4)
     assert Coupled(rotational=rotational).derivative(x, u)[6:] == rotational.derivative(
         x[6:], u[1:]
     )
@@ -38,7 +39,8 @@ def test_an_attitude_held_for_a_thrust_direction_moves_it_as_the_translational_s
 ):
     for _ in range(20):
         phi, theta, U1 = *rng.uniform(-1.2, 1.2, size=2), rng.uniform(1, 20)
-        ux, uy = np.cos(phi) * np.sin(theta), -np.sin(phi)
+        ux = np.cos(phi) * np.sin(theta)
+        uy = -np.sin(phi)
         angles = attitude_for_thrust_direction(np.array(ux), np.array(uy))
         position = rng.normal(size=6)
         x = np.concatenate([position, [angles[0], 0, angles[1], 0, 0, 0]])
@@ -54,8 +56,10 @@ def test_an_attitude_held_for_a_thrust_direction_moves_it_as_the_translational_s
 
 
 def test_the_frozen_attitude_of_the_papers_data_is_this_plant_held_there(rng):
-    x, U1 = np.zeros(12), 9.0
-    x[:6], x[[6, 8]] = rng.normal(size=6), QUARTER
+    x = np.zeros(12)
+    U1 = 9.0
+    x[:6] = rng.normal(size=6)
+    x[[6, 8]] = QUARTER
     ux, uy, _ = thrust_direction(QUARTER, QUARTER, 0.0)
     frozen = Translational(frozen_attitude=(QUARTER, QUARTER))
     assert np.allclose(
@@ -93,9 +97,11 @@ def test_the_attitude_for_a_direction_is_found_at_any_yaw(rng):
 
 def test_floats_numpy_and_casadi_pass_through_the_same_formula(rng):
     plant = System(Coupled(), time_step=0.05, substeps=2)
-    x, u = casadi.SX.sym("x", 12), casadi.SX.sym("u", 4)
+    x = casadi.SX.sym("x", 12)
+    u = casadi.SX.sym("u", 4)
     symbolic = casadi.Function("f", [x, u], [casadi.vertcat(*plant.successor(x, u))])
-    state, control = rng.normal(size=12), rng.normal(size=4)
+    state = rng.normal(size=12)
+    control = rng.normal(size=4)
     assert np.allclose(
         np.array(symbolic(state, control)).ravel(),
         step(plant, state, control),

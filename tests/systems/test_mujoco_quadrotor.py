@@ -19,11 +19,10 @@ def test_states_and_positions_of_joints_are_those_of_one_attitude(rng):
     vehicle = mujoco_quadrotor().dynamics
     for _ in range(5):
         state = np.zeros(12)
-        state[0:6:2], state[6::2] = (
-            rng.normal(size=3),
-            rng.uniform([-3, -1.5, -3], [3, 1.5, 3]),
-        )
-        vehicle.data.qpos[:], vehicle.data.qvel[:] = vehicle.positions(state), 0
+        state[0:6:2] = rng.normal(size=3)
+        state[6::2] = rng.uniform([-3, -1.5, -3], [3, 1.5, 3])
+        vehicle.data.qpos[:] = vehicle.positions(state)
+        vehicle.data.qvel[:] = 0
         vehicle.mujoco.mj_forward(vehicle.model, vehicle.data)
         assert vehicle._measure() == pytest.approx(state, abs=1e-9)
 
@@ -31,12 +30,14 @@ def test_states_and_positions_of_joints_are_those_of_one_attitude(rng):
 def test_without_drag_and_with_little_lag_it_is_the_rigid_body():
     flown = mujoco_quadrotor(mass=0.6, substeps=1)
     model = flown.dynamics.model
-    model.dof_damping[:], model.actuator_dynprm[:, 0] = 0, 0.004
+    model.dof_damping[:] = 0
+    model.actuator_dynprm[:, 0] = 0.004
     body = replace(flown.nominal, dynamics=RigidBody(0.6, (0.0032, 0.0032, 0.0055)))
     state = known = flown.dynamics.reset(0)
     thrusts = np.add(flown.initial_input, [0.03, -0.03, 0.02, -0.01])
     for _ in range(60):
-        state, known = step(flown, state, thrusts), step(body, known, thrusts)
+        state = step(flown, state, thrusts)
+        known = step(body, known, thrusts)
     assert np.abs(state[6:]).max() > 0.1
     assert state == pytest.approx(known, abs=0.02)
 
@@ -46,7 +47,8 @@ def test_wind_pushes_by_drag_and_thrusts_may_act_late():
     state = step(windy, windy.dynamics.reset(0), np.array(windy.initial_input))
     assert state[1] == pytest.approx(0.25 * 4 / 0.5 * 0.005, rel=0.01)
     late = mujoco_quadrotor(input_delay=2)
-    state, speeds = late.dynamics.reset(0), []
+    state = late.dynamics.reset(0)
+    speeds = []
     for _ in range(3):
         state = step(late, state, np.full(4, 2.0))
         speeds.append(state[5])

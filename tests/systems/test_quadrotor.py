@@ -34,8 +34,10 @@ def test_the_authors_data_obey_the_map(paper_data, trajectory, subsystem):
 
 
 def test_the_map_is_the_right_hand_side(rng):
-    x, u = rng.normal(size=6), rng.normal(size=3)
-    m, g = 0.74, 9.81
+    x = rng.normal(size=6)
+    u = rng.normal(size=3)
+    m = 0.74
+    g = 9.81
     expected = [x[1], u[1] * u[0] / m, x[3], u[2] * u[0] / m, x[5], g - 0.5 * u[0] / m]
     assert np.allclose(step(System(Map(FROZEN), 1.0), x, u), expected, rtol=1e-15)
 
@@ -63,7 +65,8 @@ def test_the_rotational_coefficients_are_the_decoded_ones():
 def test_the_integrated_plant_agrees_with_an_adaptive_integrator(dynamics, rng):
     plant = System(dynamics, time_step=0.3, substeps=10)
     for _ in range(5):
-        x, u = rng.normal(size=6), 0.1 * rng.normal(size=3)
+        x = rng.normal(size=6)
+        u = 0.1 * rng.normal(size=3)
         exact = solve_ivp(
             lambda _, s, u=u: dynamics.derivative(s, u),
             (0, 0.3),
@@ -77,7 +80,9 @@ def test_the_integrated_plant_agrees_with_an_adaptive_integrator(dynamics, rng):
 
 
 def test_one_substep_is_exact_for_the_translational_subsystem(rng):
-    x, u, h = rng.normal(size=6), np.array([8.0, 0.2, -0.1]), 1.3
+    x = rng.normal(size=6)
+    u = np.array([8.0, 0.2, -0.1])
+    h = 1.3
     vertical = np.sqrt(1 - u[1] ** 2 - u[2] ** 2)
     acceleration = np.array(
         [u[1] * u[0], u[2] * u[0], -vertical * u[0]]
@@ -95,10 +100,12 @@ def test_one_substep_is_exact_for_the_translational_subsystem(rng):
 @pytest.mark.parametrize("dynamics", DYNAMICS, ids=repr)
 def test_casadi_and_numpy_pass_through_the_same_formula(plant, dynamics, rng):
     plant = plant(dynamics)
-    x, u = casadi.SX.sym("x", 6), casadi.SX.sym("u", 3)
+    x = casadi.SX.sym("x", 6)
+    u = casadi.SX.sym("u", 3)
     symbolic = casadi.Function("f", [x, u], [casadi.vertcat(*plant.successor(x, u))])
     for scale in (0.3, 3.0):  # beyond ux^2 + uy^2 = 1 as well
-        state, control = rng.normal(size=6), scale * rng.normal(size=3)
+        state = rng.normal(size=6)
+        control = scale * rng.normal(size=3)
         assert np.allclose(
             np.array(symbolic(state, control)).ravel(),
             step(plant, state, control),
@@ -114,7 +121,8 @@ def test_no_thrust_direction_beyond_the_horizontal_exists():
 
 @pytest.mark.parametrize("u", [(7.0, 1.0, 0.0), (7.0, 0.9, 0.9), (0.0, 0.0, 0.0)])
 def test_the_derivative_exists_at_and_beyond_a_horizontal_thrust(u):
-    x, control = casadi.SX.sym("x", 6), casadi.SX.sym("u", 3)
+    x = casadi.SX.sym("x", 6)
+    control = casadi.SX.sym("u", 3)
     jacobian = casadi.jacobian(
         casadi.vertcat(*System(Map(Translational()), 1.0).successor(x, control)),
         control,
@@ -126,7 +134,8 @@ def test_the_derivative_exists_at_and_beyond_a_horizontal_thrust(u):
 
 def test_the_exact_attitude_points_the_thrust_where_it_is_asked(rng):
     phi, theta = rng.uniform(-1.4, 1.4, size=(2, 100))
-    ux, uy = np.cos(phi) * np.sin(theta), -np.sin(phi)
+    ux = np.cos(phi) * np.sin(theta)
+    uy = -np.sin(phi)
     assert np.allclose(
         attitude_for_thrust_direction(ux, uy), np.column_stack([phi, theta]), atol=1e-12
     )

@@ -20,7 +20,8 @@ def flown_up(name, *words):
     chosen = experiment(f"system={name}", "model.restarts=0", *words)
     with one_thread():
         flown = run_trial(chosen)
-    system, last = chosen.system, round(1 / chosen.system.time_step)
+    system = chosen.system
+    last = round(1 / chosen.system.time_step)
     errors = (
         flown.rollout.states[-last:, system.angle_indices]
         - np.array(system.goal)[system.angle_indices]
@@ -33,12 +34,11 @@ def test_a_pendulum_swings_up_whichever_turn_it_starts_in():
     assert error < 0.05
     found = metrics(chosen, flown)
     assert found["error_at_end"] < 0.05 < 0.5 < found["rmse"]["total"]
-    model, cost = flown.training.posterior, flown.controller.problem.cost
+    model = flown.training.posterior
+    cost = flown.controller.problem.cost
     assert (model.angles, cost.angles) == ([0], (0,))
-    x, u = (
-        torch.tensor([[0.5, 1.0]], dtype=torch.float64),
-        torch.tensor([[0.3]], dtype=torch.float64),
-    )
+    x = torch.tensor([[0.5, 1.0]], dtype=torch.float64)
+    u = torch.tensor([[0.3]], dtype=torch.float64)
     turn = torch.tensor([[2 * np.pi, 0.0]], dtype=torch.float64)
     assert torch.allclose(
         model.predict(x + turn, u).mean - turn, model.predict(x, u).mean, atol=1e-9

@@ -45,7 +45,8 @@ ALL = [
 
 
 class Spring:
-    state_names, input_names = ("position", "speed"), ("force",)
+    state_names = ("position", "speed")
+    input_names = ("force",)
 
     def __init__(self, derivative=lambda x, u: [x[1], u[0] - sin(x[0])]):
         self.derivative = derivative
@@ -59,13 +60,13 @@ ENDLESS = Spring(
 
 @pytest.mark.parametrize("system", ALL, ids=lambda system: system.name)
 def test_one_formula_takes_floats_arrays_and_symbols(system, rng):
-    n, m = len(system.state_names), len(system.input_names)
+    n = len(system.state_names)
+    m = len(system.input_names)
     start = np.array(system.goal if system.start is None else system.start)
-    states, inputs = (
-        start + 0.01 * rng.normal(size=(5, n)),
-        np.array(system.initial_input) + 0.01 * rng.normal(size=m),
-    )
-    x, u = casadi.SX.sym("x", n), casadi.SX.sym("u", m)
+    states = start + 0.01 * rng.normal(size=(5, n))
+    inputs = np.array(system.initial_input) + 0.01 * rng.normal(size=m)
+    x = casadi.SX.sym("x", n)
+    u = casadi.SX.sym("u", m)
     symbolic = casadi.Function("f", [x, u], [casadi.vertcat(*system.successor(x, u))])
     many = step_many(system, states, np.tile(inputs, (5, 1)))
     for state, after in zip(states, many, strict=True):
@@ -82,10 +83,8 @@ def energy(system, x):
             1
         ] ** 2 + d.mass * GRAVITY * d.length / 2 * np.cos(x[0])
     if system.name == "cart_pole":
-        across, up = (
-            x[1] + d.half_length * x[3] * np.cos(x[2]),
-            d.half_length * x[3] * np.sin(x[2]),
-        )
+        across = x[1] + d.half_length * x[3] * np.cos(x[2])
+        up = d.half_length * x[3] * np.sin(x[2])
         turning = d.pole_mass * (2 * d.half_length) ** 2 / 24 * x[3] ** 2
         moving = d.cart_mass * x[1] ** 2 / 2 + d.pole_mass * (across**2 + up**2) / 2
         return moving + turning + d.pole_mass * GRAVITY * d.half_length * np.cos(x[2])
@@ -113,7 +112,8 @@ def energy(system, x):
     ids=["pendulum", "cart_pole", "acrobot", "double_pendulum"],
 )
 def test_without_input_and_friction_energy_is_conserved(system, start):
-    state, system = np.array(start), replace(system, substeps=20)
+    state = np.array(start)
+    system = replace(system, substeps=20)
     for _ in range(40):
         state = step(system, state, np.zeros(1))
     assert energy(system, state) == pytest.approx(energy(system, start), rel=1e-7)
@@ -123,11 +123,9 @@ def test_without_input_and_friction_energy_is_conserved(system, start):
 def test_a_motor_of_the_double_pendulum_adds_torque_times_rate_of_its_joint_to_the_energy(
     actuated, joint
 ):
-    system, state, torque = (
-        double_pendulum(actuated),
-        np.array([2.0, 1.0, 0.5, -1.0]),
-        np.array([1.5]),
-    )
+    system = double_pendulum(actuated)
+    state = np.array([2.0, 1.0, 0.5, -1.0])
+    torque = np.array([1.5])
     system = replace(system, time_step=1e-4)
     after = step(system, state, torque)
     work = torque[0] * (state[joint] + after[joint]) / 2 * 1e-4
@@ -137,7 +135,8 @@ def test_a_motor_of_the_double_pendulum_adds_torque_times_rate_of_its_joint_to_t
 
 
 def test_the_reactors_operating_point_is_an_unstable_equilibrium():
-    system, point = stirred_tank(), np.array([0.5, 350.0])
+    system = stirred_tank()
+    point = np.array([0.5, 350.0])
     assert step(system, point, np.array([300.0])) == pytest.approx(point, rel=1e-5)
     state = np.array([0.5, 350.5])
     for _ in range(60):

@@ -84,10 +84,8 @@ def with_belief(result, mean=None, covariance=None):
 
 
 def five_per_cent_too_sure(model, belief, input):
-    plain, result = (
-        model.predict(belief.mean, input).covariance,
-        exact(model, belief, input),
-    )
+    plain = model.predict(belief.mean, input).covariance
+    result = exact(model, belief, input)
     return with_belief(
         result, covariance=plain + 0.95 * (result.belief.covariance - plain)
     )
@@ -101,7 +99,8 @@ def noise_that_nobody_asked_for(model, belief, input):
 
 
 def standard_deviations_for_variances(model, belief, input):
-    result, S = exact(model, belief, input), belief.covariance
+    result = exact(model, belief, input)
+    S = belief.covariance
     return with_belief(
         result,
         mean=result.belief.mean + 0.1 * (S.diagonal(dim1=-2, dim2=-1) + 1e-30).sqrt(),
