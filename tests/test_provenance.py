@@ -65,7 +65,7 @@ def test_the_code_of_a_wheel_is_that_of_its_checkout(checkout):
         "gpmpc/_dynamics.py",
         "gpmpc/_compiled.py",
         "gpmpc/trajectories.py",
-        "gpmpc/learning.py",
+        "gpmpc/learning/_step.py",
         "gpmpc/estimation/_kalman.py",
         "gpmpc/cli/_study.py",
         "gpmpc/systems/quadrotor.xml",

@@ -25,7 +25,12 @@ from gpmpc.gp import (
     train,
 )
 from gpmpc.gp._data_checks import constant_columns
-from gpmpc.learning import ChangedModel, Learned, OnlineLearning
+from gpmpc.learning import (
+    ChangedModel,
+    LearningState,
+    OnlineLearning,
+    learn_from_step,
+)
 from gpmpc.models import Affine, ResidualModel
 from gpmpc.mpc import GPMPC, Reference
 from gpmpc.mpc.problem import Box, Problem, Tracking
@@ -375,9 +380,7 @@ def test_what_was_at_rest_is_learned_while_flying(predicts):
     state = np.array([0.5, 0.0])
     alone = []
     changed = []
-    learned = Learned(
-        ChangedModel(gp, learning), state, np.full(2, np.nan), np.empty(0), np.empty(0)
-    )
+    learned = LearningState.begin(ChangedModel(gp, learning), state)
     for k in range(120):
         feedback = -0.5 * state[0] - state[1] + 0.2 * rng.normal()
         other = REST if k < 20 else REST + 0.4 * np.sin(0.3 * k)
@@ -388,7 +391,7 @@ def test_what_was_at_rest_is_learned_while_flying(predicts):
         after = plant(state[None], control[None])[0] + 1e-3 * rng.normal(size=2)
         alone.append(np.abs(after - first.mean[0]).max())
         changed.append(np.abs(after - second.mean[0]).max())
-        learned = learning.learn(learned, control, after)
+        learned = learn_from_step(learned, control, after)
         state = after
     assert learned.active
     assert np.mean(changed[80:]) < 0.2 * np.mean(alone[80:])

@@ -1,4 +1,4 @@
-"""A sensor that shows an angle within a turn changes no flight, and teaches nobody that the plant has changed."""
+"""A sensor that shows an angle within a turn changes no flight and teaches nothing."""
 
 import numpy as np
 import pytest
@@ -104,7 +104,7 @@ def test_angles_of_the_cost_alone_are_known_to_learning_as_well():
     at = np.array([3.13, 2.0])
     torque = np.array([1.0])
     errors = [
-        changed.error(at, torque, sensor(moved(at, torque)))[1]
+        changed.error(at, torque, sensor(moved(at, torque))).error
         for sensor in (np.array, shown)
     ]
     assert np.allclose(errors[0], errors[1], atol=1e-12)

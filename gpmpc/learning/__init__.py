@@ -1,0 +1,70 @@
+"""Learning what has changed: within a flight, step by step, or from flight to flight.
+
+Online learning (``OnlineLearning``, ``LearningController``) estimates the change d of
+the plant since its model f was learned:
+
+    x[k+1] = f(x[k], u[k]) + B d(phi(x[k], u[k]), t[k])
+
+d is a GP over what the model's own GP sees, phi, and over the time t, so that it
+forgets in its kernel (a product of kernels in space and time: Bartels, Lahr, Carron and
+Zeilinger, 2026),
+
+    k_a = share^2 sf2_a exp(-1/2 sum_d (phi_d - phi'_d)^2 / l_ad^2)
+          exp(-1/2 (t - t')^2 / memory^2).
+
+Length-scales and signal variances are the model's: the plant may differ by a share of
+what was learned. Where nothing was seen lately d is zero, and with one point it is the
+estimate of a constant disturbance.
+
+Each step of the flight becomes a point of the change, whether that is used or not. The
+model with its change and the one without predict each step before they see it: the
+change is used once its log densities, summed over a window of steps, lead by a margin,
+and ceases to be used once they trail. The model's noise is scaled by what successive
+errors differ by, in the median, where that is more. A decision that fails with the
+change is taken without it.
+
+One wrong measurement spoils two transitions, the one into it and the one out of it, and
+their errors have opposite signs; those of another plant agree. So a measurement that
+neither chance nor the noise of late explains is in doubt: it is held back, and teaches
+nothing before the next one has explained it. That one is compared with three
+predictions:
+
+* over both steps, from the last state that was trusted: then the measurement between
+  was wrong;
+* over one step, from the measurement in doubt: then the plant was moved, or its sensor;
+* over one step, from the measurement in doubt, by the change that the step into it has
+  taught: then the plant is another one. What was seen before is forgotten, and this
+  change is used at once.
+
+Where one of the first two holds, both steps are left out. The third has to be better
+than these by as much as one step may count for. It needs further confirmations: one for
+each step that nothing has explained of late, two at most, as where a sensor is noisy or
+shows another unit for a second, and one for every time that its square is ``surprise``
+times what ``share`` expects. A sensor that repeats itself to the last digit while the
+model moves the plant confirms nothing. Where nothing holds, the next measurement is in
+doubt in its turn, and the model as it was learned plans until one is explained. Steps
+in doubt may end the use of a change, and never begin it, with one exception: where
+several outputs err in the proportion in which an input acts on them, no single sensor
+is wrong, and the change is tried for the one step until it is confirmed.
+
+``_step`` holds this procedure, ``_changed_model`` the model f + B d, ``_state`` what
+one step hands to the next.
+
+Learning between flights (``EpisodicLearning``) adds their transitions to the data.
+"""
+
+from gpmpc.learning._changed_model import ChangedModel
+from gpmpc.learning._controller import LearningController
+from gpmpc.learning._episodic import EpisodicLearning
+from gpmpc.learning._settings import OnlineLearning
+from gpmpc.learning._state import LearningState
+from gpmpc.learning._step import learn_from_step
+
+__all__ = [
+    "ChangedModel",
+    "EpisodicLearning",
+    "LearningController",
+    "LearningState",
+    "OnlineLearning",
+    "learn_from_step",
+]

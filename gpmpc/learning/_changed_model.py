@@ -1,0 +1,340 @@
+"""The model f + B d: a model that was learned before, and its change, a GP."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any, NamedTuple, cast
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gpmpc._angles import angles_of, state_difference
+from gpmpc._dynamics import Array, DynamicsModel, Linearized, linearize, to_array
+from gpmpc._kernels import Window
+from gpmpc._kernels import linearize as linearize_gps
+from gpmpc.exceptions import UnsupportedModel
+from gpmpc.gaussian import Gaussian
+from gpmpc.gp import GPPosterior
+from gpmpc.gp._online import least_informative
+from gpmpc.learning._innovation import LARGEST_LEAD, Innovation, LearningStep
+from gpmpc.learning._settings import OnlineLearning
+from gpmpc.models import Features
+from gpmpc.models._wrapper import Wrapper
+
+
+class ChangeWindows(NamedTuple):
+    """The GPs of the change, and those that will follow when the window is full."""
+
+    current: Window  #: the GPs of d over (phi, u, t); at first without points
+    #: the GPs without the points that go next, while their factor is being made
+    successor: Window | None
+
+
+class ModelError(NamedTuple):
+    """What a transition says of the change."""
+
+    point: Array  #: (phi, u, t) (d,)
+    error: Array  #: what d was there (k,)
+    latent_variance: Array  #: variance of the model alone there (k,)
+
+
+class Comparison(NamedTuple):
+    """Innovations of a step, by the model with its change and by the one without."""
+
+    with_change: Innovation
+    without_change: Innovation
+    model: "ChangedModel"  #: with the step as a further point of its change
+
+    def planned(self, active: bool) -> Innovation:
+        """Returns the innovation of the model that plans.
+
+        Args:
+            active: Whether the change is used.
+        """
+        return self.with_change if active else self.without_change
+
+    @property
+    def lead(self) -> float:
+        """Lead of the change's log density, as far as one step may count."""
+        lead = self.with_change.log_density - self.without_change.log_density
+        return max(-LARGEST_LEAD, min(lead, LARGEST_LEAD))
+
+
+@dataclass(frozen=True)
+class ChangedModel(Wrapper):
+    """A model and its change.
+
+    Raises:
+        UnsupportedModel: Another model, or a ``ResidualModel`` whose B is a function of
+            the state.
+    """
+
+    model: DynamicsModel  #: f: a ``GPPosterior`` of next states, or a ``ResidualModel``
+    #: how d is learned
+    learning: OnlineLearning = field(default_factory=OnlineLearning)
+    time: float = 0.0  #: t of all predictions [steps]
+    #: further states that are angles, besides those of the model: a sensor may show
+    #: them within a turn
+    further_angles: Sequence[int] = ()
+
+    def __post_init__(self) -> None:
+        if (
+            not isinstance(self.gp, GPPosterior)
+            or self.gp.device.type != "cpu"
+            or callable(self.B)
+        ):
+            raise UnsupportedModel(
+                "learning while flying needs a GPPosterior or a ResidualModel with a "
+                f"constant B, in host memory; got {type(self.model).__name__}"
+            )
+
+    @cached_property
+    def gp(self) -> GPPosterior:
+        """The GP that the model was learned with."""
+        return cast(GPPosterior, getattr(self.model, "residual", self.model))
+
+    @cached_property
+    def features(self) -> Features:
+        """The map from state and input to what d sees of them."""
+        if self.gp is not self.model:
+            return cast(Any, self.model).features
+        n = self.model.state_dim
+        m = self.model.input_dim
+        return Features(list(range(n)), list(range(m)), [], n, m)
+
+    @cached_property
+    def B(self) -> Tensor:
+        """Matrix B (n, k), by which d acts on the states."""
+        if self.gp is not self.model:
+            return cast(Any, self.model).B
+        return torch.eye(self.gp.output_dim, dtype=self.gp.dtype)
+
+    @cached_property
+    def B_array(self) -> Array:
+        """B (n, k) as an array."""
+        return to_array(self.B)
+
+    @cached_property
+    def B_inverse(self) -> Array:
+        """Pseudo-inverse of B (k, n): the part of an error of f that d can explain."""
+        return np.asarray(np.linalg.pinv(self.B_array), dtype=np.float64)
+
+    @cached_property
+    def gp_noise(self) -> Array:
+        """Noise variances of the model's GP (k,)."""
+        return to_array(self.gp.noise_variance)
+
+    @cached_property
+    def signal(self) -> Array:
+        """Prior variances of d (k,)."""
+        return self.learning.share**2 * to_array(self.gp.signal_variance)
+
+    @cached_property
+    def angles(self) -> list[int]:  # type: ignore[override]
+        """Indices of the states that are angles."""
+        return sorted({*angles_of(self.model), *self.further_angles})
+
+    @cached_property
+    def change(self) -> ChangeWindows:
+        """The GPs of d; without points at first."""
+        gp = self.gp
+        time_scale = np.full(gp.output_dim, self.learning.memory)
+        lengthscales = np.column_stack([to_array(gp.lengthscales), time_scale])
+        window = Window.empty(
+            lengthscales, self.signal, gp.state_dim, self.learning.points
+        )
+        return ChangeWindows(current=window, successor=None)
+
+    def __len__(self) -> int:
+        return self.change.current.arrays.size
+
+    def later(self, steps: float) -> "ChangedModel":
+        """Returns the model some steps later."""
+        return self._copy_with(time=self.time + steps)
+
+    def without_points(self) -> "ChangedModel":
+        """Returns the model without any point of the change."""
+        return replace(self)  # a new object has no ``change`` yet
+
+    def with_point(
+        self, point: Array, target: Array, noise_variance: Array
+    ) -> "ChangedModel":
+        """Returns the model with a further point of the change.
+
+        A fifth of the points goes at once when the window is full. The factor of those
+        that remain is made beforehand, some rows with every new point.
+
+        Args:
+            point: (phi, u, t) (d,).
+            target: What d is there (k,).
+            noise_variance: Of the target (k,).
+
+        Raises:
+            SettingError: The noise is too small.
+        """
+        capacity = self.learning.points
+        leaving = max(1, capacity // 5)  # points that go at once
+        step = len(self) - (capacity - leaving)  # of the ``leaving`` before they go
+        current, successor = self.change
+        if step > 0 and successor is None:
+            successor = current.without(self._first_to_go(leaving))
+        if successor is not None and step == leaving:
+            current = successor
+            successor = None
+        elif successor is not None:
+            # Rows cost the square of their number: so every step does as much.
+            rows = int((capacity - leaving) * (step / leaving) ** (1 / 3))
+            successor = successor.append(point, target, noise_variance, rows=rows)
+        current = current.append(point, target, noise_variance)
+        return self._copy_with(change=ChangeWindows(current, successor))
+
+    def _first_to_go(self, count: int) -> Sequence[int]:
+        """Indices of the points of the change that go first."""
+        if self.learning.remove == "oldest":
+            return range(count)
+        return least_informative(self.posterior, count)
+
+    def _copy_with(self, **changes: Any) -> "ChangedModel":
+        """Copies the model with what it has computed, but for some attributes."""
+        other = object.__new__(type(self))
+        other.__dict__.update(self.__dict__ | changes)
+        return other
+
+    def error(self, state: Array, input: Array, next_state: Array) -> ModelError:
+        """Computes what a transition says of the change.
+
+        Args:
+            state: x (n,).
+            input: u (m,).
+            next_state: Measured after it (n,).
+        """
+        states = state[None]
+        inputs = input[None]
+        prediction = linearize(self.model, states, inputs)
+        z, v, _ = self.features.linearize(states, inputs)
+        error = state_difference(next_state, prediction.mean[0], self.angles)
+        covariance = cast(Array, prediction.covariance)[0]
+        return ModelError(
+            point=np.concatenate([z[0], v[0], [self.time]]),
+            error=self.B_inverse @ error,
+            latent_variance=self.explainable_variance(covariance),
+        )
+
+    def explainable_variance(self, covariance: Array) -> Array:
+        """Variances (*batch, k) of the part of a state that d can explain.
+
+        Args:
+            covariance: Of the state (*batch, n, n).
+        """
+        return ((self.B_inverse @ covariance) * self.B_inverse).sum(-1)
+
+    def compare(self, step: LearningStep) -> Comparison:
+        """Compares predictions of a step with the change and without it."""
+        model = self.with_point(step.point, step.error, step.noise_variance)
+        last = model.last_innovation()
+        change_variance = last.variance - step.noise_variance
+        latent = self.remaining(step.latent_variance, change_variance, self.signal)
+        return Comparison(
+            with_change=Innovation(last.error, last.variance + latent),
+            without_change=Innovation(
+                step.error, step.noise_variance + step.latent_variance
+            ),
+            model=model,
+        )
+
+    def last_innovation(self) -> Innovation:
+        """Innovation of the last point of the change, predicted by those before it.
+
+        With L the factor and v = L^-1 y, L_NN^2 is the variance, noise included, and
+        v_N L_NN the error.
+        """
+        column = self.change.current.columns[:, len(self) - 1]
+        root = column[:, len(self) - 1]
+        return Innovation(error=column[:, -1] * root, variance=root**2)
+
+    def remaining(self, latent: Any, variance: Any, signal: Any) -> Any:
+        """What the model alone does not know (*batch, k), less what d's points saw.
+
+        Where its ``latent`` variance is more than d's prior variance, the ``signal``,
+        it knows nothing, as where an input moves that its data held still. There an
+        error teaches both at once, and of the excess as large a part is left as of the
+        signal is in d's own ``variance``. All three are NumPy's arrays, or torch's.
+        """
+        excess = (latent - signal).clip(0.0)
+        left = (variance / signal).clip(None, 1.0)
+        return latent - excess * (1.0 - left)
+
+    @property
+    def posterior(self) -> GPPosterior:
+        """The GPs of d as tensors."""
+        window = self.change.current
+        arrays = window.arrays
+        size = len(self)
+        k, d = arrays.inverse_squares.shape
+        targets = window.data[d : d + k, :size].T
+        factor = window.columns[:, :size, :size].transpose(0, 2, 1)
+        return GPPosterior(
+            features=torch.from_numpy(arrays.points[:, :size].T),
+            targets=torch.from_numpy(targets),
+            lengthscales=torch.from_numpy(arrays.inverse_squares**-0.5),
+            signal_variance=torch.from_numpy(np.exp(arrays.log_signal)),
+            noise_variance=torch.from_numpy(self.gp_noise),
+            offset=torch.from_numpy(np.zeros(k)),
+            cholesky=torch.from_numpy(factor),
+            weights=torch.from_numpy(arrays.weights[:, :size]),
+            input_dim=self.gp.input_dim + 1,
+            predicts="value",
+        )
+
+    @property
+    def noise_covariance(self) -> Tensor:
+        """Covariance of the observations (n, n)."""
+        return self.model.noise_covariance
+
+    def predict(self, state: Tensor, input: Tensor) -> Gaussian:
+        """Predicts the next state at x (*batch, n) and u (*batch, m), without noise."""
+        belief = self.model.predict(state, input)
+        if not len(self):
+            return belief
+        z, v = self.features(state, input)
+        time = torch.full_like(state[..., :1], self.time)
+        d = self.posterior.predict(z, torch.cat([v, time], dim=-1))
+        B_inverse = torch.as_tensor(self.B_inverse).to(belief.mean)
+        latent = ((B_inverse @ belief.covariance) * B_inverse).sum(-1)
+        signal = torch.as_tensor(self.signal).to(belief.mean)
+        variance = self.remaining(latent, d.variance, signal) + d.variance
+        mean = belief.mean + d.mean @ self.B.mT
+        return Gaussian(mean, self.B @ torch.diag_embed(variance) @ self.B.mT)
+
+    def linearize(
+        self, states: Array, inputs: Array, covariance: bool = True
+    ) -> Linearized:
+        """Linearises at K points (K, n), (K, m): the model and its change apart."""
+        model = linearize(self.model, states, inputs, covariance)
+        if not len(self):
+            return model
+        z, v, slope = self.features.linearize(states, inputs)
+        inputs_and_time = np.empty((len(v), v.shape[1] + 1))
+        inputs_and_time[:, :-1] = v
+        inputs_and_time[:, -1] = self.time
+        no_offset = np.zeros(self.gp.output_dim)
+        mean, by_features, by_inputs, change_covariance = linearize_gps(
+            self.change.current, z, inputs_and_time, covariance, no_offset, False
+        )
+        by_state, by_input = self.features.chain(
+            by_features, by_inputs[..., :-1], slope
+        )
+        B = self.B_array
+        V = model.covariance
+        if V is not None and change_covariance is not None:
+            variance = np.diagonal(change_covariance, axis1=1, axis2=2)
+            latent = self.explainable_variance(V)
+            variance = variance + self.remaining(latent, variance, self.signal)
+            V = (B * variance[:, None, :]) @ B.T
+        return Linearized(
+            mean=model.mean + mean @ B.T,
+            A=model.A + B @ by_state,
+            B=model.B + B @ by_input,
+            covariance=V,
+        )

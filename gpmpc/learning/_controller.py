@@ -1,0 +1,93 @@
+"""A controller that learns from every step before it decides."""
+
+from dataclasses import replace
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from gpmpc._dynamics import Array, to_array
+from gpmpc.exceptions import DataError, SettingError
+from gpmpc.gaussian import Gaussian
+from gpmpc.learning._changed_model import ChangedModel
+from gpmpc.learning._settings import OnlineLearning
+from gpmpc.learning._state import LearningState
+from gpmpc.learning._step import learn_from_step
+from gpmpc.mpc import Decision, Reference
+from gpmpc.mpc._controller import check_arguments, check_method
+from gpmpc.mpc.gp_mpc import GPMPC
+from gpmpc.status import Status
+
+
+class LearningController:
+    """Controls by the model of a controller and by what the flight says of its change.
+
+    What was learned travels with the decisions (``Decision.learned``): one controller
+    flies any number of flights, and a flight begins where there is no decision before.
+
+    Raises:
+        SettingError: The controller cannot change its model.
+        UnsupportedModel: No change of its model can be learned.
+    """
+
+    def __init__(self, controller: GPMPC, learning: OnlineLearning | None = None):
+        check_method("controller", controller, "with_model", "GPMPC(...)")
+        self.controller = controller
+        self.learning = OnlineLearning() if learning is None else learning
+        self.problem = controller.problem
+        self.horizon = controller.horizon
+        self.initial_input = controller.initial_input
+        self.signals = controller.signals
+        self._model = ChangedModel(
+            controller.prediction.model,
+            self.learning,
+            further_angles=self.problem.cost.angles,
+        )
+
+    def control(
+        self,
+        belief: Gaussian,
+        reference: Reference,
+        previous: Decision | None = None,
+        parameters: Any = None,
+    ) -> Decision:
+        """Learns from the last step, and decides; see ``Controller.control``."""
+        start = perf_counter()
+        check_arguments(belief, reference)
+        if belief.names:
+            belief = belief.in_order(self.signals.state_names)
+        learned = self._learn(to_array(belief.mean).copy(), previous)
+        controller = self.controller
+        if learned.planning is not None:
+            controller = self.controller.with_model(learned.planning)
+        options = {} if parameters is None else {"parameters": parameters}
+        learning_time = perf_counter() - start
+
+        decision = controller.control(belief, reference, previous, **options)
+        if learned.planning is not None and _has_failed(decision):
+            learning_time += decision.timing.total
+            learned = learned.without_change()
+            decision = self.controller.control(belief, reference, previous, **options)
+        timing = replace(decision.timing, model=decision.timing.model + learning_time)
+        return replace(decision, timing=timing, learned=learned)
+
+    def _learn(self, measured: Array, previous: Decision | None) -> LearningState:
+        """Returns what the flight has taught up to a measurement (n,)."""
+        learned = None if previous is None else previous.learned
+        if previous is None or learned is None:
+            return LearningState.begin(self._model, measured)
+        if not np.isfinite(measured).all():
+            return learned.later()
+        if not np.array_equal(previous.means[0], learned.state):
+            return learned.after_gap(measured)
+        try:
+            return learn_from_step(learned, previous.input, measured)
+        except (SettingError, DataError):
+            # The points contradict each other beyond double precision.
+            return LearningState.begin(self._model, measured, learned.version + 1)
+
+
+def _has_failed(decision: Decision) -> bool:
+    """Returns whether a decision on a finite measurement must not be applied."""
+    failed = not decision.applicable
+    return failed and decision.status is not Status.INVALID_MEASUREMENT

@@ -1,0 +1,157 @@
+"""What a flight has taught, and the measurement that is in doubt."""
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple, cast
+
+import numpy as np
+
+from gpmpc._angles import state_difference
+from gpmpc._dynamics import Array, linearize
+from gpmpc.learning._changed_model import ChangedModel
+from gpmpc.learning._innovation import Innovation, LearningStep
+
+
+class Expectation(NamedTuple):
+    """A prediction of where the plant is."""
+
+    mean: Array  #: of the state (n,)
+    covariance: Array  #: of the state (n, n)
+    by_input: Array  #: derivative of the mean by the last input (n, m)
+
+    @classmethod
+    def certain(cls, state: Array) -> "Expectation":
+        """Returns the expectation of a state (n,) that is known."""
+        n = len(state)
+        return cls(state, np.zeros((n, n)), np.zeros((n, 0)))
+
+
+class Doubt(NamedTuple):
+    """A measurement that is held back until the next one explains it."""
+
+    expected: Expectation  #: where the plant is if the measurement was wrong
+    noise_ratios: Array  #: of ``LearningState``, without the steps in doubt (w,)
+    #: the model whose change only the steps in doubt have taught, in case that the
+    #: plant is another one; None where they teach nothing
+    new_plant: ChangedModel | None
+    missing: int  #: steps that have still to confirm ``new_plant``
+    steps: int  #: for which nothing has explained what is measured
+    tries_new_plant: bool = False  #: whether ``new_plant`` plans before it is confirmed
+
+
+@dataclass(frozen=True)
+class LearningState:
+    """What a flight has taught so far."""
+
+    model: ChangedModel  #: the model with its change
+    state: Array  #: measured at the last step (n,)
+    #: of the model alone in the last step, as far as a change can explain it (k,); NaN
+    #: where it is unknown
+    error: Array
+    #: squared differences of successive errors over those expected of the model's
+    #: noise, of the last steps (w,)
+    noise_ratios: Array
+    #: by how much the log density with the change exceeds that without, of the last
+    #: steps
+    leads: Array
+    active: bool = False  #: whether the change is used
+    version: int = 0  #: how often the model that plans has changed
+    #: steps that nothing has explained, less those that went as predicted since then
+    unexplained: int = 0
+    doubt: Doubt | None = None  #: where the last measurement is held back
+
+    @classmethod
+    def begin(
+        cls, model: ChangedModel, state: Array, version: int = 0
+    ) -> "LearningState":
+        """Returns the state of a flight that begins at a measured state (n,)."""
+        return cls(
+            model=model,
+            state=state,
+            error=np.full(len(model.gp_noise), np.nan),
+            noise_ratios=np.empty(0),
+            leads=np.empty(0),
+            version=version,
+        )
+
+    @property
+    def planning(self) -> ChangedModel | None:
+        """The model that plans now; None for the one without a change."""
+        if self.doubt is not None and self.doubt.tries_new_plant:
+            return self.doubt.new_plant
+        lasting = self.doubt is not None and self.doubt.steps > 1
+        return self.model if self.active and not lasting else None
+
+    @property
+    def size(self) -> int:
+        """Number of points of the model that plans."""
+        change = self.planning
+        return len(self.model.gp) + (0 if change is None else len(change))
+
+    def later(self) -> "LearningState":
+        """Returns the same a step later."""
+        return replace(self, model=self.model.later(1.0))
+
+    def with_measurement(
+        self, state: Array, error: Array, noise_ratios: Array
+    ) -> "LearningState":
+        """Returns the state after a further measurement (n,)."""
+        was_tried = self.doubt is not None and self.doubt.tries_new_plant
+        return replace(
+            self,
+            state=state,
+            error=error,
+            noise_ratios=noise_ratios,
+            # A change that was tried for a step ends.
+            version=self.version + was_tried,
+        )
+
+    def without_change(self) -> "LearningState":
+        """Returns the state after a decision with the change has failed."""
+        doubt = self.doubt
+        if doubt is not None:
+            doubt = doubt._replace(tries_new_plant=False)
+        return replace(self, active=False, version=self.version + 1, doubt=doubt)
+
+    def without_doubt(self, doubt: Doubt) -> "LearningState":
+        """Returns the state without the steps that were in doubt."""
+        unknown = np.full_like(self.error, np.nan)
+        return replace(self, error=unknown, noise_ratios=doubt.noise_ratios, doubt=None)
+
+    def after_gap(self, state: Array) -> "LearningState":
+        """Returns the state after steps without a measurement, at the next one (n,).
+
+        Nothing is known of the step that led to it.
+        """
+        after = replace(
+            self,
+            state=state,
+            error=np.full_like(self.error, np.nan),
+            version=self.version + self.active,
+            doubt=None,
+        )
+        return after.later()
+
+    def expect(self, start: Expectation, step: LearningStep) -> Expectation:
+        """Predicts where the plant is after a step from ``start``.
+
+        The model is the one with the change if that is used.
+        """
+        model = self.model if self.active else self.model.model
+        local = linearize(model, start.mean[None], step.input[None])
+        A = local.A[0]
+        B = self.model.B_array
+        latent = cast(Array, local.covariance)[0]
+        noise = (B * step.noise_variance) @ B.T
+        return Expectation(
+            mean=local.mean[0],
+            covariance=A @ start.covariance @ A.T + latent + noise,
+            by_input=local.B[0],
+        )
+
+    def innovation(self, expected: Expectation) -> Innovation:
+        """Computes the innovation of the measured state, as far as d can explain it."""
+        error = state_difference(self.state, expected.mean, self.model.angles)
+        return Innovation(
+            error=self.model.B_inverse @ error,
+            variance=self.model.explainable_variance(expected.covariance),
+        )

@@ -1,0 +1,253 @@
+"""One step of online learning: is it learned, put in doubt, or does it end a doubt?
+
+The package's text describes the procedure.
+"""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+from scipy.stats import chi2
+
+from gpmpc._angles import state_difference
+from gpmpc._dynamics import Array
+from gpmpc.learning._changed_model import ChangedModel, Comparison
+from gpmpc.learning._innovation import LARGEST_LEAD, Innovation, LearningStep
+from gpmpc.learning._settings import OnlineLearning
+from gpmpc.learning._state import Doubt, Expectation, LearningState
+
+# Differences of errors that say how large the noise is: at least, and at most.
+_FEWEST_RATIOS = 3
+_MOST_RATIOS = 100
+_MISALIGNED = 0.1  # part of errors that no input explains, in deviations, at most
+_PATIENCE = 2  # further confirmations for steps that nothing explained, at most
+
+
+def learn_from_step(
+    learning: LearningState, input: Array, measured: Array
+) -> LearningState:
+    """Learns from one step of a flight.
+
+    Args:
+        learning: What the steps before have taught, with the state measured last.
+        input: Applied in the step (m,).
+        measured: State measured after it (n,).
+    """
+    model = learning.model
+    input = np.asarray(input, dtype=float)
+    observed = model.error(learning.state, input, measured)
+    noise_ratios = _with_noise_ratio(learning, observed.error)
+    seen = learning.with_measurement(measured, observed.error, noise_ratios)
+    if len(noise_ratios) < _FEWEST_RATIOS:
+        return seen.later()
+    step = LearningStep(
+        state=learning.state,
+        input=input,
+        next_state=measured,
+        point=observed.point,
+        error=observed.error,
+        latent_variance=observed.latent_variance,
+        noise_variance=_noise_variance(noise_ratios, model),
+    )
+    comparison = model.compare(step)
+    if learning.doubt is not None:
+        return _resolve_doubt(seen, step, comparison, learning.doubt)
+    innovation = comparison.planned(learning.active)
+    surprising = innovation.largest_square > model.learning.surprise
+    if not surprising and not step.repeats.all():
+        return _accept(seen, comparison)
+    expected = seen.expect(Expectation.certain(learning.state), step)
+    if surprising or _is_frozen(seen, step, expected):
+        return _put_in_doubt(seen, step, comparison, expected)
+    return seen.later()
+
+
+def _with_noise_ratio(learning: LearningState, error: Array) -> Array:
+    """Returns the noise ratios (w,) with the one of a further error (k,)."""
+    squares = (error - learning.error) ** 2 / learning.model.gp_noise
+    ratio = float(squares.mean()) / 2.0
+    if not np.isfinite(ratio):
+        return learning.noise_ratios
+    return np.append(learning.noise_ratios, ratio)[-_MOST_RATIOS:]
+
+
+def _noise_variance(noise_ratios: Array, model: ChangedModel) -> Array:
+    """Returns the noise (k,) of the model, or of the last steps where that is more.
+
+    What changes slowly has no part in differences of successive errors, and a jump no
+    weight in their median.
+    """
+    noise = model.gp_noise
+    outputs = len(noise)
+    median = float(np.sort(noise_ratios)[len(noise_ratios) // 2])
+    return noise * max(1.0, median * outputs / _chi2_median(outputs))
+
+
+@cache
+def _chi2_median(degrees: int) -> float:
+    return float(chi2.median(degrees))
+
+
+def _accept(seen: LearningState, comparison: Comparison) -> LearningState:
+    """Makes a step a point of the change, and decides whether the change is used."""
+    unexplained = max(0, seen.unexplained - 1)
+    learned = replace(seen, model=comparison.model, unexplained=unexplained)
+    return _count_lead(learned, comparison.lead)
+
+
+def _count_lead(seen: LearningState, lead: float) -> LearningState:
+    """Decides whether the change is used, by its lead over the last steps."""
+    settings = seen.model.learning
+    leads = np.append(seen.leads, lead)[-settings.window :]
+    total = float(leads.sum())
+    active = total >= 0 if seen.active else total > settings.margin
+    version = seen.version + (active or seen.active)
+    return replace(seen, leads=leads, active=active, version=version).later()
+
+
+def _count_doubtful_lead(seen: LearningState, lead: float) -> LearningState:
+    """Counts a step in doubt, which may end the use of a change but not begin it."""
+    return _count_lead(seen, lead) if seen.active else seen.later()
+
+
+def _put_in_doubt(
+    seen: LearningState,
+    step: LearningStep,
+    comparison: Comparison,
+    expected: Expectation,
+) -> LearningState:
+    """Holds a measurement back that no prediction explains.
+
+    Args:
+        seen: With the measurement.
+        step: The step that led to it.
+        comparison: Of the predictions of the step.
+        expected: Where the plant is if all measurements in doubt are wrong.
+    """
+    settings = seen.model.learning
+    if seen.doubt is None:
+        unexplained = seen.unexplained
+        steps = 1
+        noise_ratios = seen.noise_ratios[:-1]
+    else:
+        unexplained = min(seen.unexplained + 1, _PATIENCE)
+        steps = seen.doubt.steps + 1
+        noise_ratios = seen.doubt.noise_ratios
+
+    new_plant = None
+    missing = 1 + unexplained
+    tries_new_plant = False
+    if not _is_frozen(seen, step, expected):
+        alone = seen.model.without_points().compare(step)
+        new_plant = alone.model.later(1.0)
+        missing += int(alone.with_change.largest_square / settings.surprise)
+        tries_new_plant = missing == 1 and _acts_like_input(
+            innovation=comparison.planned(seen.active),
+            by_input=seen.model.B_inverse @ expected.by_input,
+            surprise=settings.surprise,
+        )
+
+    in_doubt = replace(
+        seen,
+        unexplained=unexplained,
+        doubt=Doubt(
+            expected=expected,
+            noise_ratios=noise_ratios,
+            new_plant=new_plant,
+            missing=missing,
+            steps=steps,
+            tries_new_plant=tries_new_plant,
+        ),
+        version=seen.version + tries_new_plant,
+    )
+    return _count_doubtful_lead(in_doubt, comparison.lead)
+
+
+def _is_frozen(seen: LearningState, step: LearningStep, expected: Expectation) -> bool:
+    """Returns whether a sensor repeats itself exactly while the plant moves."""
+    motion = state_difference(expected.mean, step.state, seen.model.angles)
+    threshold = seen.model.learning.surprise * np.diagonal(expected.covariance)
+    return bool(((motion**2 > threshold) & step.repeats).any())
+
+
+def _acts_like_input(innovation: Innovation, by_input: Array, surprise: float) -> bool:
+    """Returns whether several outputs err in the proportion in which inputs act.
+
+    One wrong sensor is wrong alone, and several are not wrong in that proportion.
+
+    Args:
+        innovation: Of the model that plans.
+        by_input: Derivative of what it predicted by the input (k, m).
+        surprise: Squared error over its variance from which on an output errs.
+    """
+    deviation = np.sqrt(innovation.variance)
+    errors = innovation.error / deviation
+    effects = by_input / deviation[:, None]
+    coefficients, _, rank, _ = np.linalg.lstsq(effects, errors, rcond=None)
+    several = np.count_nonzero(errors**2 > surprise) > 1
+    remaining = np.linalg.norm(errors - effects @ coefficients)
+    aligned = remaining <= _MISALIGNED * np.linalg.norm(errors)
+    return bool(several and aligned and rank < len(errors))
+
+
+def _resolve_doubt(
+    seen: LearningState, step: LearningStep, comparison: Comparison, doubt: Doubt
+) -> LearningState:
+    """Explains the measurement in doubt by the one after it."""
+    settings = seen.model.learning
+    # The measurement was wrong: what is measured follows from the state before it.
+    expected = seen.expect(doubt.expected, step)
+    if_wrong = seen.innovation(expected)
+    # The plant was moved: what is measured follows from the measurement in doubt.
+    if_moved = comparison.planned(seen.active)
+
+    density_to_beat = max(if_wrong.log_density, if_moved.log_density) + LARGEST_LEAD
+    new_plant = _confirm_new_plant(doubt, step, density_to_beat, settings)
+    if new_plant is not None and doubt.missing == 1:
+        return _switch_plant(seen, new_plant)
+    if new_plant is not None:
+        confirmed = Doubt(
+            expected=expected,
+            noise_ratios=doubt.noise_ratios,
+            new_plant=new_plant.later(1.0),
+            missing=doubt.missing - 1,
+            steps=doubt.steps + 1,
+        )
+        return _count_doubtful_lead(replace(seen, doubt=confirmed), comparison.lead)
+    if min(if_moved.largest_square, if_wrong.largest_square) <= settings.surprise:
+        return _count_doubtful_lead(seen.without_doubt(doubt), comparison.lead)
+    return _put_in_doubt(seen, step, comparison, expected)
+
+
+def _confirm_new_plant(
+    doubt: Doubt, step: LearningStep, density_to_beat: float, settings: OnlineLearning
+) -> ChangedModel | None:
+    """Returns the new plant of a doubt with a step that it explains; None otherwise.
+
+    Args:
+        doubt: The doubt.
+        step: A further step.
+        density_to_beat: Log density that the new plant's has to exceed.
+        settings: Those of the learning.
+    """
+    if doubt.new_plant is None or step.repeats.all():
+        return None
+    comparison = doubt.new_plant.compare(step)
+    innovation = comparison.with_change
+    explained = innovation.largest_square <= settings.surprise
+    if explained and innovation.log_density > density_to_beat:
+        return comparison.model
+    return None
+
+
+def _switch_plant(seen: LearningState, new_plant: ChangedModel) -> LearningState:
+    """Forgets what was seen, and uses the change of another plant."""
+    switched = replace(
+        seen,
+        model=new_plant,
+        leads=seen.leads[:0],
+        active=True,
+        version=seen.version + 1,
+        doubt=None,
+    )
+    return switched.later()
