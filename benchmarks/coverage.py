@@ -28,10 +28,11 @@ from gpmpc.cli._settings import compose, settings
 from gpmpc.datasets import RandomData
 from gpmpc.estimation import SeparatedNoise, separate_noise
 from gpmpc.gp import Trainer, Transitions, standardize
+from gpmpc.models._residual import train_residual
 from gpmpc.propagation import MomentMatching, Unscented, best_propagator
 from gpmpc.simulation import Noise
 from gpmpc.studies._document import Table, terminal
-from gpmpc.studies.flight import Experiment, run_trial, train_residual
+from gpmpc.studies.flight import Experiment, run_trial
 from gpmpc.systems import System, cos, exp, sin
 
 #: standard deviations of each state's noise, as the process's or as the sensors'

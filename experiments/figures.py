@@ -37,7 +37,7 @@ from gpmpc.propagation import Linearization, MomentMatching
 from gpmpc.simulation import ModelLoop, Noise, Rollout, closed_loop, rehearse
 from gpmpc.studies._document import Document, Table
 from gpmpc.studies.study import (
-    Trial,
+    TrialSpec,
     derived_seed,
     fingerprint,
     random_rows,
@@ -303,7 +303,7 @@ class Figures:
         """Transitions by their source; each is flown once."""
         return {}
 
-    def trials(self, folder: Path) -> list[Trial]:
+    def trials(self, folder: Path) -> list[TrialSpec]:
         """Returns every flight, its GPs trained; trained ones are kept in ``folder``.
 
         Raises:
@@ -366,7 +366,7 @@ class Figures:
                 )  # all rows have the same seeds: their differences are paired
                 flown = replace(condition, drawn=trial == 0)
                 trials.append(
-                    Trial(
+                    TrialSpec(
                         labels | {"trial": trial},
                         flown,
                         seed,
@@ -461,7 +461,7 @@ class Figures:
         return Condition(row, trained(learned), reference, states, *bounds, **rest)
 
     @staticmethod
-    def run_trial(trial: Trial) -> dict:
+    def run_trial(trial: TrialSpec) -> dict:
         """Flies one trial and measures it."""
         condition = trial.condition
         controller = condition.controller()

@@ -41,7 +41,7 @@ from gpmpc.plotting._style import (
 )
 from gpmpc.studies._document import MISSING, Document, Table, number
 from gpmpc.studies.flight import Experiment, run_trial
-from gpmpc.studies.study import Trial, fingerprint, read_model, trained_model
+from gpmpc.studies.study import TrialSpec, fingerprint, read_model, trained_model
 from gpmpc.trajectories import Trajectory
 
 LOST = 5.0  # [m] from the reference, some hundred times what is usual: nothing to compare costs with
@@ -177,7 +177,7 @@ class Quality:
         found = [(f, H) for f in self.experiments for H in horizons if f.longest >= H]
         return list(dict.fromkeys([(TRUTH, horizons[-1]), *found]))
 
-    def trials(self, folder: Path) -> list[Trial]:
+    def trials(self, folder: Path) -> list[TrialSpec]:
         """Returns every flight; cases take turns. GPs are trained once a trajectory and kept in ``folder``."""
         models = {}
         for name, trajectory in self.trajectories.items():
@@ -224,11 +224,11 @@ class Quality:
                     model and model.name,  # names the rows that it learned from
                 ]
             )
-            trials.append(Trial(labels, condition, seed, named))
+            trials.append(TrialSpec(labels, condition, seed, named))
         return trials
 
     @staticmethod
-    def run_trial(trial: Trial) -> dict:
+    def run_trial(trial: TrialSpec) -> dict:
         """Flies one trial.
 
         Raises:

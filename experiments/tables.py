@@ -43,7 +43,7 @@ from gpmpc.plotting._style import VERMILION, legend_below, make_figure, styled
 from gpmpc.plotting._sweeps import draw_quartiles
 from gpmpc.propagation import MomentMatching
 from gpmpc.studies._document import MISSING, Document, Table, number, with_range
-from gpmpc.studies.study import Trial, derived_seed, fingerprint, random_rows
+from gpmpc.studies.study import TrialSpec, derived_seed, fingerprint, random_rows
 from gpmpc.trajectories import Trajectory
 
 MEASURES = {
@@ -122,7 +122,7 @@ class Tables:
         if not self.trajectories:
             raise SettingError("trajectory", "choose at least one")
 
-    def trials(self, folder: Path | None = None) -> list[Trial]:
+    def trials(self, folder: Path | None = None) -> list[TrialSpec]:
         """Returns every draw, in the order of the tables.
 
         Raises:
@@ -165,7 +165,9 @@ class Tables:
                             "size": size,
                         }
                         name = fingerprint(settings, arrays)
-                        trials.append(Trial(labels | {"draw": draw}, fit, seed, name))
+                        trials.append(
+                            TrialSpec(labels | {"draw": draw}, fit, seed, name)
+                        )
         return trials
 
     def _scaled(
@@ -200,7 +202,7 @@ class Tables:
         return data, next_states, tuple(system.tracked_indices)
 
     @staticmethod
-    def run_trial(trial: Trial) -> dict:
+    def run_trial(trial: TrialSpec) -> dict:
         """Trains and scores one draw."""
         fit = trial.condition
         data = trial.condition.data

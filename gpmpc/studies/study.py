@@ -1,8 +1,10 @@
-"""Runs every condition of a study with every seed, and keeps each record as soon as it is there.
+"""Runs every condition of a study with every seed, and keeps each record at once.
 
-A *trial* is one condition with one seed. Trials are independent: they run in worker processes of one thread each, and
-the record of a finished one is appended to a file under the fingerprint of everything that it depends on. A study that
-was killed at any moment goes on where it stopped.
+    conditions x seeds -> trials -> those without a record are run -> store -> tables
+
+Trials are independent: they run in worker processes of one thread each. The record of a
+finished one is appended to a file, under the fingerprint of everything that it depends
+on, so a study that was killed at any moment goes on where it stopped.
 """
 
 import hashlib
@@ -30,27 +32,42 @@ from gpmpc.studies._document import Document, Table
 
 
 @dataclass(frozen=True)
-class Trial:
-    """One condition with one seed."""
+class TrialSpec:
+    """One condition with one seed: a trial that can be run."""
 
-    #: first entries of its record, plain data: what the condition is called, which trial it is
+    #: first entries of its record, plain data: what the condition is called, which trial
+    #: it is
     labels: Mapping[str, Any]
-    condition: Any  #: what ``run_trial`` needs of it; it can be pickled
-    seed: int  #: of all random numbers
-    fingerprint: str  #: names everything that the numbers of the record depend on
+    #: what ``run_trial`` needs of the condition; it can be pickled
+    condition: Any
+    #: of all random numbers
+    seed: int
+    #: names everything that the numbers of the record depend on
+    fingerprint: str
+
+
+RunTrial = Callable[[TrialSpec], dict[str, Any]]
 
 
 class Study(Protocol):
-    """A published result: which trials it needs, and how its tables follow from their records."""
+    """A published result: which trials it needs, and how tables follow from records."""
 
-    name: str  # of its documents
-    trial_name: str  # what its trials are called in JSON
-    lost_is_result: bool  # whether a trial that raises, such as a lost flight, is a result like any other
-    run_trial: Callable[[Trial], dict[str, Any]]
+    #: of its documents
+    name: str
+    #: what its trials are called in JSON
+    trial_name: str
+    #: whether a trial that raises, such as a lost flight, is a result like any other
+    lost_is_result: bool
+    #: runs one trial
+    run_trial: RunTrial
+    #: processes; None takes one a core
     workers: int | None
 
-    def trials(self, folder: Path) -> list[Trial]:
-        """Returns every trial in the order of the tables; trained models are kept in ``folder``."""
+    def trials(self, folder: Path) -> list[TrialSpec]:
+        """Returns every trial in the order of the tables.
+
+        Trained models are kept in ``folder``.
+        """
         ...
 
     def summary(self, records: Sequence[dict]) -> tuple[list[Table], list[str]]:
@@ -62,57 +79,22 @@ class Study(Protocol):
         ...
 
 
-class TrialStore:
-    """Records of finished trials in a file of one JSON object a line; a line that a crash cut short is skipped.
-
-    Args:
-        path: The file; the first ``append`` makes it.
-    """
-
-    def __init__(self, path: Path):
-        self.path = path
-        self.records: dict[str, dict] = {}
-        text = (
-            path.read_text(encoding="utf-8", errors="replace") if path.exists() else ""
-        )
-        for line in text.splitlines():
-            with suppress(ValueError, KeyError, TypeError):
-                entry = json.loads(line)
-                self.records[entry["fingerprint"]] = entry["record"]
-        self._separator = (
-            "\n" if text and not text.endswith("\n") else ""
-        )  # behind a line that was cut short
-
-    def append(self, fingerprint: str, record: dict) -> None:
-        """Keeps a record; it is on the disk when this returns."""
-        with self.path.open("a", encoding="utf-8") as file:
-            file.write(
-                self._separator
-                + json.dumps({"fingerprint": fingerprint, "record": record})
-                + "\n"
-            )
-            file.flush()
-            os.fsync(file.fileno())
-        self._separator = ""
-        self.records[fingerprint] = record
-
-
 def run_study(
-    run_trial: Callable[[Trial], dict[str, Any]],
-    trials: Sequence[Trial],
-    store: TrialStore,
+    run_trial: RunTrial,
+    trials: Sequence[TrialSpec],
+    store: "TrialStore",
     workers: int | None = None,
     progress: Callable[[dict], None] = lambda record: None,
 ) -> list[dict]:
     """Runs the trials that the store does not hold yet.
 
     Args:
-        run_trial: From a trial to plain data. What it raises as a ``GpmpcError``, or of linear algebra, is the trial's
-            ``error``; the others go on.
+        run_trial: From a trial to plain data. What it raises as a ``GpmpcError``, or of
+            linear algebra, is the trial's ``error``; the others go on.
         trials: All of the study.
         store: Where records are kept.
         workers: Processes; None takes one a core.
-        progress: Called with every record, found or new.
+        progress: Called with every record, whether it was there or is new.
 
     Returns:
         One record a trial, in their order.
@@ -120,35 +102,30 @@ def run_study(
     Raises:
         GpmpcError: A worker process died.
     """
-    missing = list(
-        {
-            trial.fingerprint: trial
-            for trial in trials
-            if trial.fingerprint not in store.records
-        }.values()
-    )
+    missing: dict[str, TrialSpec] = {}
     for trial in trials:
         if trial.fingerprint in store.records:
             progress(store.records[trial.fingerprint])
+        else:
+            missing[trial.fingerprint] = trial
+    jobs = list(missing.values())
+    run = partial(_run_in_worker, run_trial)
     try:
-        with closing(
-            in_processes(partial(_record, run_trial), missing, workers)
-        ) as finished:
+        with closing(in_processes(run, jobs, workers)) as finished:
             for index, record in finished:
-                store.append(missing[index].fingerprint, record)
+                store.append(jobs[index].fingerprint, record)
                 progress(record)
     except BrokenProcessPool as error:
         raise GpmpcError(
-            "a worker process died (out of memory?); the same command goes on where it stopped"
+            "a worker process died (out of memory?); "
+            "the same command goes on where it stopped"
         ) from error
     return [store.records[trial.fingerprint] | dict(trial.labels) for trial in trials]
 
 
 @report_compilation()
-def _record(
-    run_trial: Callable[[Trial], dict[str, Any]], trial: Trial
-) -> dict[str, Any]:
-    """Runs one trial in a worker process."""
+def _run_in_worker(run_trial: RunTrial, trial: TrialSpec) -> dict[str, Any]:
+    """Runs one trial in a worker process; returns its record."""
     record = {**trial.labels, "seed": trial.seed}
     try:
         with one_thread():
@@ -157,34 +134,39 @@ def _record(
         return record | {"error": str(error)}
 
 
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """Keeps numerical libraries to one thread, so that sums have one order whatever the machine."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        with threadpool_limits(1):
-            yield
-    finally:
-        torch.set_num_threads(before)
+class TrialStore:
+    """Records of finished trials, in a file of one JSON object a line.
 
+    A line that a crash cut short is skipped.
 
-def derived_seed(*parts: int) -> int:
-    """Returns a seed of its own for every sequence of whole numbers below 2^32, among those of one length."""
-    return int(np.random.SeedSequence(parts).generate_state(1)[0])
-
-
-def random_rows(count: int, size: int, seed: int, key: str = "size") -> list[int]:
-    """Returns ``size`` of ``count`` rows, drawn at random and sorted; those of one seed are nested over sizes.
-
-    Raises:
-        SettingError: There are fewer rows than the setting ``key`` asks for.
+    Args:
+        path: The file; the first ``append`` makes it.
     """
-    if size > count:
-        raise SettingError(
-            key, f"must be at most {count}, the rows of the data; got {size}"
-        )
-    return np.sort(np.random.default_rng(seed).permutation(count)[:size]).tolist()
+
+    def __init__(self, path: Path):
+        self.path = path
+        #: by fingerprint
+        self.records: dict[str, dict] = {}
+        text = ""
+        if path.exists():
+            text = path.read_text(encoding="utf-8", errors="replace")
+        for line in text.splitlines():
+            with suppress(ValueError, KeyError, TypeError):
+                entry = json.loads(line)
+                self.records[entry["fingerprint"]] = entry["record"]
+        self._cut_short = text != "" and not text.endswith("\n")
+
+    def append(self, fingerprint: str, record: dict) -> None:
+        """Keeps a record; it is on the disk when this returns."""
+        line = json.dumps({"fingerprint": fingerprint, "record": record}) + "\n"
+        if self._cut_short:
+            line = "\n" + line
+        with self.path.open("a", encoding="utf-8") as file:
+            file.write(line)
+            file.flush()
+            os.fsync(file.fileno())
+        self._cut_short = False
+        self.records[fingerprint] = record
 
 
 def fingerprint(settings: Any, arrays: Sequence[Any] = ()) -> str:
@@ -204,12 +186,51 @@ def fingerprint(settings: Any, arrays: Sequence[Any] = ()) -> str:
     text = json.dumps(content, sort_keys=True, default=str)
     digest = hashlib.sha256(text.encode())
     for array in arrays:
-        values = None if array is None else np.ascontiguousarray(array)
+        if array is None:
+            digest.update(json.dumps(None).encode())
+            continue
+        values = np.ascontiguousarray(array)
         # Shapes keep two arrays apart from others of the same bytes.
-        shape = None if values is None else [values.dtype.str, *values.shape]
+        shape = [values.dtype.str, *values.shape]
         digest.update(json.dumps(shape).encode())
-        digest.update(b"" if values is None else values.tobytes())
+        digest.update(values.tobytes())
     return digest.hexdigest()[:32]
+
+
+def derived_seed(*parts: int) -> int:
+    """Returns a seed for a sequence of whole numbers below 2^32.
+
+    Sequences of one length have seeds of their own.
+    """
+    return int(np.random.SeedSequence(parts).generate_state(1)[0])
+
+
+def random_rows(count: int, size: int, seed: int, key: str = "size") -> list[int]:
+    """Draws ``size`` of ``count`` rows; those of one seed are nested over sizes.
+
+    Returns:
+        The rows, sorted.
+
+    Raises:
+        SettingError: There are fewer rows than the setting ``key`` asks for.
+    """
+    if size > count:
+        raise SettingError(
+            key, f"must be at most {count}, the rows of the data; got {size}"
+        )
+    return np.sort(np.random.default_rng(seed).permutation(count)[:size]).tolist()
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Keeps numerical libraries to one thread, so that sums have one order everywhere."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        with threadpool_limits(1):
+            yield
+    finally:
+        torch.set_num_threads(before)
 
 
 def trained_model(
@@ -229,7 +250,8 @@ def trained_model(
     if not path.exists():
         path.parent.mkdir(parents=True, exist_ok=True)
         with one_thread():
-            save_model(train(data, seed=seed).posterior, path)
+            training = train(data, seed=seed)
+            save_model(training.posterior, path)
     return path
 
 

@@ -13,7 +13,7 @@ from gpmpc.exceptions import GpmpcError, SettingError
 from gpmpc.gp import Trainer, Transitions
 from gpmpc.studies import study as studied
 from gpmpc.studies.study import (
-    Trial,
+    TrialSpec,
     TrialStore,
     derived_seed,
     fingerprint,
@@ -82,7 +82,8 @@ def test_what_is_missing_is_run_and_records_stand_in_the_order_of_the_trials(
 ):
     conditions = {3: "good", 4: "bad", 5: "singular", 6: "good"}
     trials = [
-        Trial({"name": c}, c, seed, f"print{seed}") for seed, c in conditions.items()
+        TrialSpec({"name": c}, c, seed, f"print{seed}")
+        for seed, c in conditions.items()
     ]
     store = TrialStore(tmp_path / "trials.jsonl")
     told = []
@@ -113,7 +114,7 @@ def test_what_is_missing_is_run_and_records_stand_in_the_order_of_the_trials(
 def test_other_errors_end_the_study_and_a_worker_that_died_is_named(
     tmp_path, started, monkeypatch
 ):
-    trials = [Trial({}, None, seed=0, fingerprint="a")]
+    trials = [TrialSpec({}, None, seed=0, fingerprint="a")]
     with pytest.raises(ZeroDivisionError):
         run_study(lambda _: 1 / 0, trials, TrialStore(tmp_path / "trials.jsonl"))
 

@@ -14,8 +14,9 @@ from gpmpc.learning import EpisodicLearning, OnlineLearning
 from gpmpc.mpc import PredictionSettings
 from gpmpc.mpc.problem import Problem, Tracking
 from gpmpc.simulation import ModelLoop, Noise
-from gpmpc.studies import flight as studied
+from gpmpc.studies import _experiment, _flight
 from gpmpc.studies.flight import Experiment, Flown, run_trial
+from gpmpc.studies.study import random_rows
 from gpmpc.systems import pendulum, translational
 from gpmpc.trajectories import Elliptical
 
@@ -47,9 +48,9 @@ def experiment(**changes):
 def loops(monkeypatch):
     """What was rehearsed, and what was flown, in their order."""
     calls = []
-    monkeypatch.setattr(studied, "rehearse", lambda *given: calls.append(given))
+    monkeypatch.setattr(_flight, "rehearse", lambda *given: calls.append(given))
     monkeypatch.setattr(
-        studied,
+        _flight,
         "closed_loop",
         lambda *given, **more: calls.append((given, more)) or ROLLOUT,
     )
@@ -117,7 +118,7 @@ def test_a_controller_that_knows_the_plant_is_made_of_it(loops):
 
 @pytest.mark.parametrize("propagator", [None, "mine"])
 def test_a_model_loop_is_flown_in_the_models_own_world(propagator, loops, monkeypatch):
-    monkeypatch.setattr(studied, "best_propagator", lambda model: ("best for", model))
+    monkeypatch.setattr(_flight, "best_propagator", lambda model: ("best for", model))
     run_trial(
         experiment(
             loop="model", propagator=propagator, system=translational(time_step=0.25)
@@ -129,7 +130,7 @@ def test_a_model_loop_is_flown_in_the_models_own_world(propagator, loops, monkey
 
 def test_a_controller_that_learns_while_it_flies_is_wrapped(loops, monkeypatch):
     monkeypatch.setattr(
-        studied, "LearningController", lambda *given: steering(given=given)
+        _flight, "LearningController", lambda *given: steering(given=given)
     )
     online = OnlineLearning()
     run_trial(experiment(learning=online))
@@ -145,7 +146,7 @@ def test_a_flight_that_diverges_is_what_was_flown_of_it_or_raises_where_that_is_
     def diverge(*_, **__):
         raise error
 
-    monkeypatch.setattr(studied, "closed_loop", diverge)
+    monkeypatch.setattr(_flight, "closed_loop", diverge)
     with pytest.raises(Diverged):
         run_trial(experiment())
     error.flown = ROLLOUT
@@ -174,9 +175,9 @@ def test_episodes_are_flown_with_seeds_of_their_own_and_the_model_of_the_best_fl
 
     monkeypatch.setattr(Experiment, "training_rows", lambda _: ["rows"])
     monkeypatch.setattr(Experiment, "learn", learn)
-    monkeypatch.setattr(studied, "_fly", fly)
+    monkeypatch.setattr(_flight, "_fly", fly)
     monkeypatch.setattr(
-        studied, "_error", lambda _, flown: errors[int(flown.rollout[-1]) - 1]
+        _flight, "rmse", lambda _, flown: errors[int(flown.rollout[-1]) - 1]
     )
     monkeypatch.setattr(
         EpisodicLearning, "with_flight", lambda _, data, rollout: [*data, rollout]
@@ -204,10 +205,14 @@ def test_episodes_are_flown_with_seeds_of_their_own_and_the_model_of_the_best_fl
 def test_a_system_with_angles_or_something_known_learns_what_is_left_of_the_difference(
     monkeypatch,
 ):
-    monkeypatch.setattr(studied, "train_residual", lambda *given: ("residual", *given))
-    monkeypatch.setattr(studied, "successor_function", lambda known: ("after", known))
     monkeypatch.setattr(
-        studied, "CasadiFunction", lambda function: ("function", function)
+        _experiment, "train_residual", lambda **given: ("residual", *given.values())
+    )
+    monkeypatch.setattr(
+        _experiment, "successor_function", lambda known: ("after", known)
+    )
+    monkeypatch.setattr(
+        _experiment, "CasadiFunction", lambda function: ("function", function)
     )
 
     def train(data, seed):
@@ -261,7 +266,7 @@ def test_rows_are_of_the_systems_dimensions_and_as_many_as_asked_for():
     assert len(drawn(size=5)) == 5
     assert np.array_equal(
         drawn(size=2, seed=1).states,
-        Rows(6, 3).rows[studied.random_rows(5, 2, 1)].states,
+        Rows(6, 3).rows[random_rows(5, 2, 1)].states,
     )
     for n, m in ((6, 2), (5, 3)):
         with pytest.raises(

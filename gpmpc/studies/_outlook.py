@@ -1,4 +1,4 @@
-"""What can be said of a flight before it begins: whether its loop settles, and whether its data reach its reference."""
+"""Judges a flight before it begins: does its loop settle, do its data reach far enough."""
 
 import math
 from contextlib import suppress
@@ -16,9 +16,12 @@ from gpmpc.mpc import GPMPC, Reference, beyond_data
 class Outlook:
     """What was known of a flight before it."""
 
-    spectral_radius: float | None = None  #: ``Stability``'s; None where not judged
-    shortest_horizon: int | None = None  #: likewise
-    warnings: tuple[str, ...] = ()  #: what may go wrong and what to do, a line each
+    #: ``Stability``'s; None where not judged
+    spectral_radius: float | None = None
+    #: ``Stability``'s; None where not judged
+    shortest_horizon: int | None = None
+    #: what may go wrong and what to do, a line each
+    warnings: tuple[str, ...] = ()
 
 
 def outlook(
@@ -28,22 +31,22 @@ def outlook(
 
     Args:
         controller: Of the flight.
-        model: That was learned for it; None where the controller knows the plant.
+        model: The one learned for it; None where the controller knows the plant.
         reference: Of all steps.
     """
-    warnings: list[str] = []
+    far_from_data: list[str] = []
     if model is not None:
-        warnings += map(str, beyond_data(model, reference))
+        far_from_data = [str(warning) for warning in beyond_data(model, reference)]
     stability = None
     if isinstance(controller, GPMPC):
-        # what cannot be judged, such as outputs of parameters, is no reason not to fly
+        # What cannot be judged, such as outputs of parameters, is no reason not to fly.
         with suppress(GpmpcError, np.linalg.LinAlgError):
             stability = controller.stability(reference)
     if stability is None:
-        return Outlook(warnings=tuple(warnings))
+        return Outlook(warnings=tuple(far_from_data))
     radius = stability.spectral_radius
     return Outlook(
         spectral_radius=radius if math.isfinite(radius) else None,
         shortest_horizon=stability.shortest_horizon,
-        warnings=(*stability.warnings, *warnings),
+        warnings=(*stability.warnings, *far_from_data),
     )

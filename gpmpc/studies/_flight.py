@@ -1,0 +1,205 @@
+"""Flies an experiment: learns a model, makes the controller, closes the loop."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from gpmpc._dynamics import DynamicsModel
+from gpmpc.exceptions import Diverged
+from gpmpc.gp import Training
+from gpmpc.learning import EpisodicLearning, LearningController, OnlineLearning
+from gpmpc.metrics import tracking_error
+from gpmpc.mpc import Reference
+from gpmpc.propagation import best_propagator
+from gpmpc.simulation import ModelLoop, Rollout, Step, closed_loop, rehearse
+from gpmpc.studies._experiment import Experiment
+from gpmpc.studies._outlook import Outlook, outlook
+from gpmpc.studies.study import derived_seed
+from gpmpc.systems import System
+
+#: called before the first step with the controller and the training; returns what is
+#: called with every step
+Prepare = Callable[[Any, Training | None], Callable[[Step], None]]
+Warn = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Flown:
+    """An experiment that was flown."""
+
+    #: every step, as arrays
+    rollout: Rollout
+    #: the ``Controller`` that steered, with its ``problem``
+    controller: Any
+    #: what was learned; None where the controller knows the plant
+    training: Training | None
+    #: where and why the system left the finite numbers, and the rollout ends; None where
+    #: it did not
+    diverged: Diverged | None = None
+    #: the episodes
+    before: tuple["Flown", ...] = ()
+    #: what was known before it began
+    outlook: Outlook = field(default_factory=Outlook)
+
+
+def run_trial(
+    experiment: Experiment,
+    prepare: Prepare | None = None,
+    warn: Warn | None = None,
+) -> Flown:
+    """Trains and flies.
+
+    Args:
+        experiment: All of it.
+        prepare: Called before the first step with the controller and the training; what
+            it returns is called with every step.
+        warn: Called before the first step with each line of what may go wrong in the
+            flight.
+
+    Raises:
+        SettingError: More rows are asked for than there are, or settings that do not fit
+            each other.
+        DataError: The data cannot be read.
+        TrainingError: An output could not be trained.
+        SolverFailure: A solve failed, and the policy is ``"raise"`` or there was nothing
+            to fall back on.
+        Diverged: The system left the finite numbers in its first step.
+    """
+    training = None
+    model = experiment.model
+    episodes: list[Flown] = []
+    if experiment.learns and model is None:
+        if isinstance(experiment.learning, EpisodicLearning):
+            episodes = _fly_episodes(experiment, experiment.learning, prepare, warn)
+            best = min(episodes, key=lambda episode: rmse(experiment, episode))
+            training = best.training
+        else:
+            training = experiment.learn(experiment.training_rows(), experiment.seed)
+        model = None if training is None else training.posterior
+    flown = _fly(experiment, model=model, training=training, prepare=prepare, warn=warn)
+    return replace(flown, before=tuple(episodes))
+
+
+def _fly_episodes(
+    experiment: Experiment,
+    learning: EpisodicLearning,
+    prepare: Prepare | None,
+    warn: Warn | None,
+) -> list[Flown]:
+    """Flies the episodes, each with what was learned from all flights before it."""
+    rows = experiment.training_rows()
+    episodes: list[Flown] = []
+    for k in range(learning.episodes):
+        training = experiment.learn(rows, experiment.seed)
+        episode = replace(experiment, seed=derived_seed(experiment.seed, k))
+        flown = _fly(
+            episode,
+            model=training.posterior,
+            training=training,
+            prepare=prepare,
+            warn=warn,
+        )
+        rows = learning.with_flight(rows, flown.rollout)
+        episodes.append(flown)
+    return episodes
+
+
+def _fly(
+    experiment: Experiment,
+    model: DynamicsModel | None,
+    training: Training | None,
+    prepare: Prepare | None,
+    warn: Warn | None,
+) -> Flown:
+    """Flies with a model, or on the plant's own where the controller learns none."""
+    plant = experiment.flown
+    planner = experiment.controller(model if experiment.learns else plant)
+    controller = planner
+    if isinstance(experiment.learning, OnlineLearning):
+        controller = LearningController(planner, experiment.learning)
+    system = _steered_system(experiment, model)
+    reference = _reference(experiment, controller)
+    start = _start(plant, reference)
+    expected = outlook(planner, model if experiment.learns else None, reference)
+    if warn is not None:
+        for warning in expected.warnings:
+            warn(warning)
+    rehearse(system, controller, reference, start)
+    on_step = None if prepare is None else prepare(controller, training)
+    diverged = None
+    try:
+        rollout = closed_loop(
+            system,
+            controller,
+            reference,
+            start,
+            experiment.steps,
+            noise=experiment.noise,
+            disturbances=experiment.disturbances,
+            on_failure=experiment.on_failure,
+            seed=experiment.seed,
+            on_step=on_step,
+        )
+    except Diverged as error:
+        if error.flown is None:
+            raise
+        rollout = error.flown
+        diverged = error
+    return Flown(
+        rollout=rollout,
+        controller=controller,
+        training=training,
+        diverged=diverged,
+        outlook=expected,
+    )
+
+
+def _steered_system(
+    experiment: Experiment, model: DynamicsModel | None
+) -> System | ModelLoop:
+    """Returns the plant, or the model rolled on itself."""
+    plant = experiment.flown
+    if experiment.loop == "plant" or model is None:
+        return plant
+    propagator = experiment.propagator or best_propagator(model)
+    return ModelLoop(model, propagator, time_step=plant.time_step)
+
+
+def _reference(experiment: Experiment, controller: Any) -> Reference:
+    """Returns what is followed, up to the end of the last step's plan.
+
+    Its inputs are those at rest, which the controller falls back on where the very first
+    solve fails.
+    """
+    states = experiment.references(experiment.steps + controller.horizon + 1)
+    resting_input = np.asarray(controller.initial_input)
+    return Reference(states, np.tile(resting_input, (len(states) - 1, 1)))
+
+
+def _start(plant: System, reference: Reference) -> Any:
+    """Returns the first state (n,); None where a simulator starts where it starts."""
+    if getattr(plant.dynamics, "stateful", False):
+        return None
+    return reference.states[0] if plant.start is None else plant.start
+
+
+def rmse(experiment: Experiment, flown: Flown, states: slice = slice(None)) -> float:
+    """Returns the RMSE of the states of a flight; infinite where it diverged."""
+    total = float(errors_of(experiment, flown, states).total)
+    if flown.diverged is not None or not np.isfinite(total):
+        return np.inf
+    return total
+
+
+def errors_of(experiment: Experiment, flown: Flown, states: slice = slice(None)) -> Any:
+    """Returns the tracking error of the states of a flight, the first of them left out."""
+    system = experiment.system
+    rollout = flown.rollout
+    return tracking_error(
+        rollout.states[states],
+        rollout.references[states],
+        system.tracked_indices,
+        system.angle_indices,
+    )
