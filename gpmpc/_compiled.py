@@ -22,12 +22,48 @@ from contextlib import suppress
 from functools import cache, partial
 from pathlib import Path
 from threading import Lock
-from typing import Any
+from typing import Any, ParamSpec, Protocol, TypeVar, overload
 
 import numba
 from numba.extending import register_jitable
 
 _compiling = Lock()
+
+
+P = ParamSpec("P")
+R = TypeVar("R", covariant=True)
+
+
+class Kernel(Protocol[P, R]):
+    """A compiled function that Python calls."""
+
+    def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R:
+        """Runs the kernel after numba's look at the arguments' types."""
+        ...
+
+    @property
+    def unchecked(self) -> Callable[P, R]:
+        """Runs the kernel without a look at the arguments, from the second call on.
+
+        For callers that always pass arguments of the same types, by position, and
+        contiguous arrays. Where arguments are named tuples, that look takes longer than
+        many a kernel.
+        """
+        ...
+
+
+@overload
+def compiled(function: Callable[P, R]) -> Kernel[P, R]: ...
+
+
+@overload
+def compiled(
+    *,
+    allocates: bool = True,
+    kernel: bool = True,
+    inline: bool = False,
+    locked: bool = False,
+) -> Callable[[Callable[P, R]], Kernel[P, R]]: ...
 
 
 def compiled(
@@ -37,7 +73,7 @@ def compiled(
     kernel: bool = True,
     inline: bool = False,
     locked: bool = False,
-) -> Callable:
+) -> Any:
     """Compiles ``function`` at its first call.
 
     Args:
@@ -61,20 +97,20 @@ def compiled(
         "forceinline": inline,
     }
     options |= _PRIVATE_OPTIONS[kernel] | ({} if allocates else {"_nrt": False})
-    return (
-        _jit_cached(function, options)
-        if kernel
-        else register_jitable(**options)(function)
-    )
+    if not kernel:
+        return register_jitable(**options)(function)
+    dispatcher = _jit_cached(function, options)
+    _offer_unchecked_calls(dispatcher)
+    return dispatcher
 
 
-njit_inner = partial(compiled, kernel=False)
+njit_inner: Any = partial(compiled, kernel=False)
 """Compiles a part of other compiled functions."""
 
-njit_noalloc = partial(njit_inner, allocates=False)
+njit_noalloc: Any = partial(njit_inner, allocates=False)
 """Compiles a part of other compiled functions that makes no arrays but views."""
 
-inline_njit = partial(njit_noalloc, inline=True)
+inline_njit: Any = partial(njit_noalloc, inline=True)
 """Compiles such a function into each of its callers."""
 
 # numba optimises every function that a kernel calls, and makes machine code of it, before it does so for the kernel,
@@ -157,6 +193,17 @@ def _jit_cached(function: Callable, options: dict) -> Callable:
     return kernel
 
 
+def _offer_unchecked_calls(kernel: Any) -> None:
+    """Gives a kernel its attribute ``unchecked``; see ``Kernel``."""
+
+    def call_and_remember(*arguments: Any) -> Any:
+        result = kernel(*arguments)
+        kernel.unchecked = unchecked_entry_point(kernel)
+        return result
+
+    kernel.unchecked = call_and_remember
+
+
 def sources_stamp(module: str) -> bytes:
     """A hash of the sources of a module and of all those it imports, directly or not, from its own package or this one.
 
@@ -222,19 +269,3 @@ def unchecked_entry_point(kernel: Any) -> Callable:
         return next(iter(kernel.overloads.values())).entry_point
     except (AttributeError, StopIteration):  # another numba
         return kernel
-
-
-_entry_points: dict[Callable, Callable] = {}
-
-
-def call_unchecked(kernel: Callable, *arguments: Any) -> Any:
-    """Calls a kernel whose callers always pass arguments of the same types, without looking at them from then on.
-
-    Where arguments are named tuples, that look takes longer than many a kernel. All arrays have to be contiguous.
-    """
-    entry = _entry_points.get(kernel)
-    if entry is not None:
-        return entry(*arguments)
-    found = kernel(*arguments)
-    _entry_points[kernel] = unchecked_entry_point(kernel)
-    return found

@@ -11,7 +11,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gpmpc._compiled import call_unchecked
 from gpmpc._kernels._gp_moments import evaluate_moments
 from gpmpc._kernels._gp_point import expand_points, linearize_points
 from gpmpc._kernels._packed import Array, GPArrays, Packed, pack
@@ -94,8 +93,7 @@ def linearize(
     memory = np.empty((2 * (n + m) + 1 + kept) * packed.arrays.points.shape[1] + 8)
     columns = packed.columns if covariance else V
     offset = np.ascontiguousarray(offset, dtype=np.float64)
-    call_unchecked(
-        linearize_points,
+    linearize_points.unchecked(
         packed.arrays,
         columns,
         (offset, adds_state),
@@ -115,9 +113,7 @@ def point_with_jacobian(packed: Packed, x: Array, u: Array) -> Expansion:
     m = packed.input_dim
     shapes = [(k,), (k,), (k, n), (k, m), (k, n), (k, m), (k, n, n), (k, n, m)]
     out = Expansion(*[np.empty((len(x), *shape)) for shape in shapes])
-    call_unchecked(
-        expand_points, packed.arrays, packed.precision.inverse_cholesky, x, u, out
-    )
+    expand_points.unchecked(packed.arrays, packed.precision.inverse_cholesky, x, u, out)
     return out
 
 
@@ -156,8 +152,7 @@ def moments(
         (d, n, m),
     ]
     out = Moments(*[np.zeros((H, *shape)) for shape in shapes])
-    call_unchecked(
-        evaluate_moments,
+    evaluate_moments.unchecked(
         derivatives,
         bool(diagonal),
         packed.arrays,

@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from gpmpc._compiled import call_unchecked, compiled
+from gpmpc._compiled import compiled
 from gpmpc._kernels._gp_point import _write_kernel
 from gpmpc._kernels._packed import COLUMNS, Array, GPArrays, aligned
 from gpmpc._kernels._simd import load, store, use_widest_registers
@@ -87,8 +87,8 @@ class Window:
             columns = own
         rows = N if rows is None else rows
         new = np.concatenate([point, target, noise])
-        if not call_unchecked(
-            _append, self.data, new, data, arrays, columns, self.rows, rows
+        if not _append.unchecked(
+            self.data, new, data, arrays, columns, self.rows, rows
         ):
             raise SettingError(
                 "noise",

@@ -33,7 +33,7 @@ import torch
 from scipy.stats import beta
 
 from gpmpc._angles import angles_of, full_turns, state_difference
-from gpmpc._compiled import call_unchecked, compiled
+from gpmpc._compiled import compiled
 from gpmpc._dynamics import Array, DynamicsModel, to_array
 from gpmpc.exceptions import DataError, SettingError, ShapeError, check_number
 from gpmpc.gaussian import Gaussian
@@ -224,8 +224,7 @@ class AdaptiveTube:
         self._step += 1
         numbers = (self.rate, self.allowed, self.largest)
         parts = (self.kappas, self.alphas, self.counts, self.misses)
-        call_unchecked(
-            _observe,
+        _observe.unchecked(
             state,
             self.tube.rows,
             self._bounds,
@@ -255,8 +254,7 @@ class AdaptiveTube:
         if len(self.tube.angles) and np.isfinite(self._last_state).all():
             means = means + full_turns(self._last_state - means[0], self.tube.angles)
         bounds = self._bounds[self._step % self.tube.horizon]
-        call_unchecked(
-            _remember,
+        _remember.unchecked(
             means,
             covariances,
             self.noise,

@@ -9,7 +9,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gpmpc._compiled import call_unchecked
 from gpmpc._dynamics import (
     Array,
     Linearized,
@@ -194,7 +193,7 @@ class CasadiFunction:
             points = np.ascontiguousarray(np.hstack(arguments))
             values = np.empty((K, size))
             jacobians = np.empty((K, size, points.shape[1]))
-            call_unchecked(linearize_tape, self.tape, points, values, jacobians)
+            linearize_tape.unchecked(self.tape, points, values, jacobians)
             parts = [values, *np.split(jacobians, np.cumsum(self.sizes)[:-1], axis=2)]
         else:
             if K not in self._mapped:

@@ -5,7 +5,6 @@ from typing import Any
 import numpy as np
 import torch
 
-from gpmpc._compiled import call_unchecked
 from gpmpc._dynamics import Array, DynamicsModel, linearize, to_array
 from gpmpc._kernels import GPArrays
 from gpmpc._kernels.gp_rollout import (
@@ -52,9 +51,7 @@ class RollOut:
             else np.ascontiguousarray(disturbance, dtype=float)
         )
         if self._gps is not None:
-            call_unchecked(
-                roll_out_gps, self._gps, feedback, start, added, states, inputs
-            )
+            roll_out_gps.unchecked(self._gps, feedback, start, added, states, inputs)
             return states, inputs
         gains = np.broadcast_to(feedback.gains, (T, *feedback.gains.shape[1:]))
         states[:, 0] = start

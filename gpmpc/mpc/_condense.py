@@ -23,7 +23,7 @@ coordinates are used where the diagonal of P exceeds that of the last stage, whi
 
 import numpy as np
 
-from gpmpc._compiled import call_unchecked, compiled, njit_inner, njit_noalloc
+from gpmpc._compiled import compiled, njit_inner, njit_noalloc
 from gpmpc._kernels.linalg import aligned_rows, combine_rows, copy, copy_matrix, dot
 from gpmpc.exceptions import ShapeError
 from gpmpc.mpc._linear_quadratic import (
@@ -76,9 +76,9 @@ def condense(
     G = np.empty((count, size))
     program = CondensedProgram(P, q, G, lower, upper, np.empty((0, m, p + m + 1)))
     given = cost, bounds, stages, start, references, rows
-    if call_unchecked(_condense, *given, program) <= _LARGEST_GROWTH:
+    if _condense.unchecked(*given, program) <= _LARGEST_GROWTH:
         return program
-    return call_unchecked(condense_with_feedback, *given)
+    return condense_with_feedback.unchecked(*given)
 
 
 @compiled

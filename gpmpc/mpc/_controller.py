@@ -14,7 +14,7 @@ import numpy as np
 
 from gpmpc._angles import full_turns
 from gpmpc._arrays import names_of, read_array, sorted_columns
-from gpmpc._compiled import call_unchecked, compiled, njit_inner
+from gpmpc._compiled import compiled, njit_inner
 from gpmpc.exceptions import (
     DataError,
     SettingError,
@@ -347,10 +347,10 @@ class Request(NamedTuple):
             first, guessed = _read_plan(plan, horizon, n, m)
         given = (state, covariance, states, inputs)
         limits = problem.inputs.sides
-        finite = call_unchecked(_check, *given, last, first, limits, guess)
+        finite = _check.unchecked(*given, last, first, limits, guess)
         if not finite[3]:
             last = _array(initial_input)
-            call_unchecked(_check, *given, last, first, limits, guess)
+            _check.unchecked(*given, last, first, limits, guess)
         kappas = None if reference.kappas is None else _array(reference.kappas)
         for name, values, known in (
             ("states", states, finite[1]),

@@ -15,7 +15,6 @@ import numpy as np
 import torch
 
 from gpmpc._angles import full_turns, state_difference
-from gpmpc._compiled import call_unchecked
 from gpmpc._dynamics import linearize
 from gpmpc._kernels.gp_rollout import Feedback
 from gpmpc.exceptions import SettingError
@@ -386,8 +385,7 @@ class Foresight:
             self._model, flight.states[:-1], flight.inputs, covariance=False
         )
         cost = self.controller.problem.cost
-        gains = call_unchecked(
-            finite_horizon_lqr,
+        gains = finite_horizon_lqr.unchecked(
             np.ascontiguousarray(local.A),
             np.ascontiguousarray(local.B),
             np.ascontiguousarray(first_weight(cost.Q)[None]),

@@ -26,7 +26,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from scipy.stats import chi2
 
-from gpmpc._compiled import call_unchecked, compiled, njit_noalloc
+from gpmpc._compiled import compiled, njit_noalloc
 from gpmpc._dynamics import to_array
 from gpmpc.exceptions import UnsupportedModel
 from gpmpc.mpc._controller import Decision
@@ -332,8 +332,7 @@ class FlightJudge:
         references = _float64(reference)
         if references.ndim == 1:
             references = references[None]
-        code, index, value = call_unchecked(
-            _judge,
+        code, index, value = _judge.unchecked(
             self._table,
             self._bounds,
             self._store,

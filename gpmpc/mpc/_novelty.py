@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from gpmpc._compiled import call_unchecked, compiled
+from gpmpc._compiled import compiled
 from gpmpc._dynamics import Array, DynamicsModel, linearize, to_array
 from gpmpc.gp import GPPosterior
 from gpmpc.gp._posterior import AffineForm
@@ -107,7 +107,7 @@ def novelty_of(
     added: Array, noise: Array, covariances: Array, scales: DataScales
 ) -> float:
     """The novelty of a plan whose stages add covariances (K, n, n), with the noise (n,), up to some (H + 1, n, n)."""
-    return float(call_unchecked(_novelty, added, noise, covariances, *scales))
+    return float(_novelty.unchecked(added, noise, covariances, *scales))
 
 
 def measure_novelty(

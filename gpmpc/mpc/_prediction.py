@@ -33,7 +33,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from gpmpc._angles import angles_of, full_turns, state_difference
-from gpmpc._compiled import call_unchecked, compiled
+from gpmpc._compiled import compiled
 from gpmpc._dynamics import DynamicsModel, check_next_states, linearize
 from gpmpc._kernels.gp_rollout import Feedback
 from gpmpc._kernels.linalg import copy_matrix, product
@@ -380,8 +380,7 @@ class PredictionModel:
 
     def violation(self, prediction: Prediction, request: Request) -> float:
         """By how much the plan of a prediction misses a bound, at most."""
-        return call_unchecked(
-            largest_violation,
+        return largest_violation.unchecked(
             prediction.rows,
             self.bounds,
             prediction.plan,
@@ -390,8 +389,7 @@ class PredictionModel:
 
     def stage_costs(self, prediction: Prediction, request: Request) -> Array:
         """What each stage of the plan of a prediction costs (H,)."""
-        return call_unchecked(
-            evaluate_stages,
+        return evaluate_stages.unchecked(
             prediction.cost,
             prediction.plan.states,
             prediction.plan.inputs,
@@ -415,8 +413,7 @@ class PredictionModel:
         references = request.references
         targets = references.states
         turns = full_turns(states[1:] - targets, self.problem.cost.angles)
-        stages = call_unchecked(
-            evaluate_stages,
+        stages = evaluate_stages.unchecked(
             self.costs.at(plan, request.parameters),
             plan.states,
             inputs,
@@ -531,14 +528,13 @@ class PredictionModel:
             Q = Q + Z[:1, :n, :n]
             R = R + Z[:1, n:-1, n:-1]
             terminal = terminal + Z[-1, :n, :n]
-        return call_unchecked(finite_horizon_lqr, A, B, Q, R, terminal, self.horizon)[0]
+        return finite_horizon_lqr.unchecked(A, B, Q, R, terminal, self.horizon)[0]
 
     def _covariances(self, stages: Stages, cost: QuadraticCost, start: Array) -> Array:
         """Sigma_0 .. Sigma_H (H + 1, n, n) of stages under the feedback of each."""
         covariances = np.empty((self.horizon + 1, *start.shape))
         gains = self.gains(stages.A, stages.B, cost)
-        call_unchecked(
-            _predict_covariances,
+        _predict_covariances.unchecked(
             stages.A,
             stages.B,
             stages.V,

@@ -25,7 +25,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from gpmpc._compiled import call_unchecked, compiled, njit_inner
+from gpmpc._compiled import compiled, njit_inner
 from gpmpc._kernels.linalg import dot
 from gpmpc.exceptions import DataError, ProblemError
 from gpmpc.mpc._controller import Request
@@ -119,8 +119,7 @@ def measure_continuity(
     reference or of the state. On plants that bend much, the plans of one program a step
     are not consistent; iterating each of them is slower and, on swing-ups, no better.
     """
-    measures = call_unchecked(
-        _measure_step,
+    measures = _measure_step.unchecked(
         prediction.cost,
         PriceTerms(request.references, prices, 0.0),
         prediction.rows,
@@ -139,8 +138,7 @@ def measure_continuity(
 def smallest_cost(model: PredictionModel, request: Request) -> float:
     """What an input costs that is small beside the last one: the cheapest of them."""
     lower, upper = model.problem.inputs.first
-    return call_unchecked(
-        _smallest_cost,
+    return _smallest_cost.unchecked(
         model.costs.quadratic.input[0],
         lower,
         upper,
@@ -250,8 +248,7 @@ class Iteration:
         if multipliers.size:
             largest = float(np.abs(multipliers).max())
             self._row_price = max(self._row_price, 2.0 * largest)
-        forecast = call_unchecked(
-            _forecast_step,
+        forecast = _forecast_step.unchecked(
             prediction.cost,
             self._terms,
             self._defect_prices,
@@ -313,8 +310,7 @@ class Iteration:
             rows = trial.rows
             if not self._model.constraints.smooth:  # bounds stay those of the program
                 rows = prediction.rows._replace(E=trial.rows.E)
-            merit = call_unchecked(
-                _merit,
+            merit = _merit.unchecked(
                 trial.cost,
                 self._terms,
                 self._defect_prices,

@@ -27,7 +27,6 @@ import numpy as np
 from scipy.linalg import eig, matrix_balance
 
 from gpmpc._angles import state_difference
-from gpmpc._compiled import call_unchecked
 from gpmpc._dynamics import DynamicsModel, linearize, to_array
 from gpmpc.exceptions import SettingError
 from gpmpc.models import DelayedModel
@@ -544,8 +543,7 @@ def _laws(A: Array, B: Array, cost: QuadraticCost, horizon: int) -> list[_Law]:
     weights = np.stack([_wide(Q, squares[i : i + 1]) for i, Q in enumerate(weights)])
     if len(weights) > 1:  # from those of s_1 .. s_{H-1} to those of s_0 .. s_{H-1}
         weights = np.concatenate([weights[:1], weights[:-1]])
-    gains = call_unchecked(
-        finite_horizon_lqr,
+    gains = finite_horizon_lqr.unchecked(
         transition[None],
         effect[None],
         weights,

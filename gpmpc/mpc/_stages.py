@@ -23,7 +23,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 import torch
 
-from gpmpc._compiled import call_unchecked, compiled
+from gpmpc._compiled import compiled
 from gpmpc._dynamics import DynamicsModel, linearize, tensors_for, to_array
 from gpmpc._kernels.linalg import dot
 from gpmpc.exceptions import SettingError
@@ -121,9 +121,7 @@ class StageLinearizer:
         if disturbance is not None:
             after = after.copy()
             after[:, : self._n] += disturbance
-        return Stages(
-            A, B, call_unchecked(_constants, A, B, after, states, inputs), after, V
-        )
+        return Stages(A, B, _constants.unchecked(A, B, after, states, inputs), after, V)
 
     def _points(self, states: Array, inputs: Array, _: Array) -> tuple[Array, ...]:
         found = linearize(self.model, states, inputs, self.covariance == "zero_order")
@@ -363,7 +361,7 @@ class ConstraintRows:
             if kappas is None
             else np.where(self._margins > 0, kappas[:, None], 0.0)
         )
-        call_unchecked(_tighten, F, margins, covariances, lower, upper)
+        _tighten.unchecked(F, margins, covariances, lower, upper)
         E = self._rows(F, covariances[1 : stages + 1])
         return StageRows(np.ascontiguousarray(E), D, lower, upper)
 

@@ -22,7 +22,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from gpmpc._compiled import call_unchecked
 from gpmpc._dynamics import DynamicsModel, linearize
 from gpmpc.exceptions import SettingError, check_number
 from gpmpc.gaussian import Gaussian
@@ -579,8 +578,7 @@ def _expand(
 ) -> Plan:
     """The plan that the solution of a program means."""
     unknowns = np.ascontiguousarray(solution.x, dtype=np.float64)
-    inputs, states = call_unchecked(
-        expand,
+    inputs, states = expand.unchecked(
         prediction.stages,
         prediction.plan.states[0],
         program.feedback,
