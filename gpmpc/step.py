@@ -19,21 +19,20 @@ class Step:
     reference: np.ndarray  # what the state was to be (n,)
     state: np.ndarray  # the plant's true state, or the mean of a model's belief (n,)
     measured: np.ndarray  # its measurement, as the controller got it (n,)
-    input: (
-        np.ndarray
-    )  # the input that was applied (m,); after a failure not the decision's
-    # what the controller decided, with its plan, status, timing and quadratic program; None where it was not called,
-    # or returned inputs of another shape
+    # the input that was applied (m,); after a failure not the decision's
+    input: np.ndarray
+    # what the controller decided, with its plan, status, timing and quadratic program;
+    # None where it was not called, or returned inputs of another shape
     decision: "Decision | None"
-    innovation: (
-        np.ndarray
-    )  # measured minus predicted one step ago (n,); NaN at the first step
-    belief_covariance: (
-        np.ndarray
-    )  # Covariance of the belief of the state (n, n); zero with a plant in the loop
+    # measured minus predicted one step ago (n,); NaN at the first step
+    innovation: np.ndarray
+    # covariance of the belief of the state (n, n); zero with a plant in the loop
+    belief_covariance: np.ndarray
     gp_size: int = 0  # transitions that the model holds; 0 without a Gaussian process
     gp_version: int = 0  # how often the model has changed since the start
-    failed: bool = False  # the decision was not applied; ``input`` comes from the policy for failures
+    # the decision was not applied; ``input`` comes from the policy for failures
+    failed: bool = False
     status: "Status | None" = None  # how the solve ended; the decision's if omitted
-    # whether the flight is healthy, suspicious or lost so far, and why; None where nobody judged it
+    # whether the flight is healthy, suspicious or lost so far, and why; None where
+    # nobody judged it
     judgement: "Judgement | None" = None

@@ -1,8 +1,10 @@
-"""Applies the declared policy where a controller fails, and checks every input before it reaches a plant.
+"""Applies the declared policy where a controller fails, and checks every input.
 
-A failed iterate is never applied and never handed on: the next call gets the last plan that was applicable, shifted as
-if it had been made one step ago, with what was really applied as its first input. A plan that is used up holds its last
-input. Inputs beyond a bound by rounding are put onto it; others count as failed, whatever the status of a decision.
+A failed iterate is never applied and never handed on: the next call gets the last plan
+that was applicable, shifted as if it had been made one step ago, with what was really
+applied as its first input. A plan that is used up holds its last input. Inputs beyond a
+bound by rounding are put onto it; others count as failed, whatever the status of a
+decision.
 """
 
 from collections.abc import Sequence
@@ -38,7 +40,8 @@ from gpmpc.status import Status
 
 OnFailure = Literal["previous_plan", "hold", "raise"]
 
-_ROUNDING = 1e-4  # share of an input or of 1, whichever is more, by which a loose solver may miss a bound
+# Share of an input, or of 1 if that is more, by which a loose solver may miss a bound.
+_ROUNDING = 1e-4
 
 
 @dataclass(frozen=True)
@@ -46,13 +49,15 @@ class Command:
     """What one step applies, and what the next one needs."""
 
     input: np.ndarray  #: applied (m,)
-    #: how the step's own solve ended; ``INVALID_MEASUREMENT`` where the controller was not called,
-    #: ``NUMERICAL_TROUBLE`` where it called a plan solved that must not reach a plant
+    #: how the step's own solve ended; ``INVALID_MEASUREMENT`` where the controller was
+    #: not called, ``NUMERICAL_TROUBLE`` where it called a plan solved that must not
+    #: reach a plant
     status: Status
-    #: of the controller, with this status; None where it was not called or returned inputs of another shape
+    #: of the controller, with this status; None where it was not called or returned
+    #: inputs of another shape
     decision: Decision | None
-    #: the last applicable decision, shifted to this step; before the first one that is not, with what was applied as
-    #: its ``input``; None where nothing was
+    #: the last applicable decision, shifted to this step; before the first one that is
+    #: not, with what was applied as its ``input``; None where nothing was
     plan: Decision | None
 
     @property
@@ -61,7 +66,7 @@ class Command:
         return self.decision is None or not self.decision.applicable
 
 
-def command(
+def decide(
     controller: Controller,
     belief: Gaussian,
     reference: Reference,
@@ -71,32 +76,40 @@ def command(
     parameters: Any = None,
     plan: Any = None,
 ) -> Command:
-    """Decides one step's input by a controller where the belief is finite, or by the policy where that has none.
+    """Decides one step's input: by the controller, or by the policy where that fails.
 
-    ``"previous_plan"`` goes on along the last applicable plan, ``"hold"`` keeps the last input applied, ``"raise"``
-    stops. Before the first such plan, the first two take the reference's own input if there is one, else the
-    controller's initial input, within its input and rate bounds. ``last`` is the command of the step before, None at
-    the first; ``step`` is for the message; for parameters and plan see ``ControlLoop.input``.
+    ``"previous_plan"`` goes on along the last applicable plan, ``"hold"`` keeps the
+    last input applied, ``"raise"`` stops. Before the first such plan, the first two
+    take the reference's own input if there is one, else the controller's initial input,
+    within its input and rate bounds.
+
+    Args:
+        controller: It is called where the belief is finite.
+        belief: What is known of the state.
+        reference: Over the horizon, or a set point.
+        last: Command of the step before; None at the first.
+        on_failure: The policy.
+        step: Number of the step, for messages.
+        parameters: As for ``ControlLoop.input``; not handed over where it is None.
+        plan: Likewise.
 
     Raises:
         SolverFailure: The policy is ``"raise"``, or there is nothing to fall back on.
     """
-    previous = None if last is None else last.plan
     reference = reference.over(controller.horizon)
-    known = {
-        key: value
-        for key, value in (("parameters", parameters), ("plan", plan))
-        if value is not None
-    }
-    decision = (
-        controller.control(belief, reference, previous, **known)
-        if _is_finite(belief)
-        else None
-    )
+    options: dict[str, Any] = {}
+    if parameters is not None:
+        options["parameters"] = parameters
+    if plan is not None:
+        options["plan"] = plan
+    decision = None
+    if _is_finite(belief):
+        previous = None if last is None else last.plan
+        decision = controller.control(belief, reference, previous, **options)
     return _conclude(controller, decision, reference, last, on_failure, step)
 
 
-def commands(
+def decide_many(
     controller: Controller,
     beliefs: Sequence[Gaussian],
     reference: Reference,
@@ -104,50 +117,61 @@ def commands(
     on_failure: OnFailure = "raise",
     step: int = 0,
 ) -> list[Command | SolverFailure]:
-    """``command`` for many systems that follow one reference; where it would raise ``SolverFailure``, that instead.
+    """Decides for many systems that follow one reference; see ``decide``.
 
-    A controller with ``control_many`` is called once for all of them.
+    Where that would raise ``SolverFailure``, the error is returned instead. A
+    controller with ``control_many`` is called once for all of them.
     """
-    finite = [t for t, belief in enumerate(beliefs) if _is_finite(belief)]
+    reference = reference.over(controller.horizon)
+    finite = [i for i, belief in enumerate(beliefs) if _is_finite(belief)]
     plans = [None if command is None else command.plan for command in last]
-    many = getattr(controller, "control_many", None)
-    if many is None:
-        found = [controller.control(beliefs[t], reference, plans[t]) for t in finite]
+    control_many = getattr(controller, "control_many", None)
+    if control_many is None or len(beliefs) == 1:
+        decided = [controller.control(beliefs[i], reference, plans[i]) for i in finite]
     else:
-        found = many(
-            [beliefs[t] for t in finite],
+        decided = control_many(
+            [beliefs[i] for i in finite],
             [reference] * len(finite),
-            [plans[t] for t in finite],
+            [plans[i] for i in finite],
         )
-    decisions = dict(zip(finite, found, strict=True))
-    outcomes: list[Command | SolverFailure] = []
-    for t, before in enumerate(last):
+    decisions = dict(zip(finite, decided, strict=True))
+    commands: list[Command | SolverFailure] = []
+    for i, last_command in enumerate(last):
         try:
-            outcomes.append(
-                _conclude(
-                    controller, decisions.get(t), reference, before, on_failure, step
-                )
+            command: Command | SolverFailure = _conclude(
+                controller,
+                decisions.get(i),
+                reference,
+                last_command,
+                on_failure,
+                step,
             )
         except SolverFailure as failure:
-            outcomes.append(failure)
-    return outcomes
+            command = failure
+        commands.append(command)
+    return commands
 
 
 class ControlLoop:
-    """Steers a plant that is not ours: holds what one step needs of the last, and returns an input that may be applied.
+    """Steers a plant that is not ours, step by step.
 
-    What ``input`` returns is finite, and within the bounds and rates of the controller's problem, whatever happened: a
-    measurement that is not finite, a program without a solution, an error of the numbers. Before the first plan that
-    is the reference's input, or the controller's initial one.
+    It holds what one step needs of the last. What ``input`` returns is finite, and
+    within the bounds and rates of the controller's problem, whatever happened: a
+    measurement that is not finite, a program without a solution, an error of the
+    numbers. Before the first plan that is the reference's input, or the controller's
+    initial one.
 
     Args:
         controller: With a problem and an initial input.
-        on_failure: ``"previous_plan"`` goes on along the last plan, ``"hold"`` keeps the last input, ``"raise"`` stops.
+        on_failure: ``"previous_plan"`` goes on along the last plan, ``"hold"`` keeps
+            the last input, ``"raise"`` stops.
 
     Attributes:
-        last: Command of the last step: its input, decision and status; None before the first.
+        last: Command of the last step: its input, decision and status; None before the
+            first.
         failures: Number of steps whose input the policy chose.
-        judgement: Whether the last step was healthy, suspicious or lost, and why; None before the first.
+        judgement: Whether the last step was healthy, suspicious or lost, and why; None
+            before the first.
 
     Raises:
         SettingError: No such policy.
@@ -159,13 +183,12 @@ class ControlLoop:
         self.on_failure: OnFailure = on_failure
         self.last: Command | None = None
         self.failures = 0
-        self._steps = 0
         self.judgement: Judgement | None = None
+        self._steps = 0
         self._judge: FlightJudge | None = None
-        self._before: Command | None = None  # the one before the last
-        self._gains: tuple[Decision, np.ndarray] | None = (
-            None  # of the last plan that they were needed of
-        )
+        self._before_last: Command | None = None
+        # The last plan whose feedback was needed, and its gains (H, m, n).
+        self._gains: tuple[Decision, np.ndarray] | None = None
 
     def input(
         self, state: Any, reference: Any, parameters: Any = None, plan: Any = None
@@ -175,42 +198,61 @@ class ControlLoop:
         Args:
             state: Measured (n,), or a ``Gaussian``.
             reference: A set point (n,), states (H + 1, n), or a ``Reference``.
-            parameters: Of the controller's outputs and smooth constraints, where it has any.
-            plan: To start from in the place of the last one: inputs (H, m), or these and states (H + 1, n).
+            parameters: Of the controller's outputs and smooth constraints, where it has
+                any.
+            plan: To start from in the place of the last one: inputs (H, m), or these
+                and states (H + 1, n).
 
         Raises:
-            ShapeError: State, reference, parameters or plan have other dimensions than the controller.
+            ShapeError: State, reference, parameters or plan have other dimensions than
+                the controller.
             SolverFailure: The policy is ``"raise"``.
         """
+        signals = signals_of(self.controller)
         belief = state
         if not isinstance(state, Gaussian):
-            names = signals_of(self.controller).state_names
-            belief = Gaussian.certain(read_array("state", state, names))
-        wanted = read_reference(reference)
-        if wanted.signals is not UNKNOWN:
-            wanted = wanted.in_order(signals_of(self.controller))
-        known = self.last, self.on_failure, self._steps, parameters, plan
-        self._before = self.last
-        self.last = command(self.controller, belief, wanted, *known)
+            mean = read_array("state", state, signals.state_names)
+            belief = Gaussian.certain(mean)
+        followed = read_reference(reference)
+        if followed.signals is not UNKNOWN:
+            followed = followed.in_order(signals)
+        self._before_last = self.last
+        self.last = decide(
+            self.controller,
+            belief,
+            followed,
+            last=self.last,
+            on_failure=self.on_failure,
+            step=self._steps,
+            parameters=parameters,
+            plan=plan,
+        )
         self.failures = self.failures + self.last.failed
         self._steps = self._steps + 1
-        self.judgement = self._judged(belief, wanted, self.last)
+        self.judgement = self._judge_step(belief, followed, self.last)
         return self.last.input.copy()
 
-    def _judged(self, belief: Gaussian, wanted: Reference, last: Command) -> Judgement:
-        """The judgement of the last command."""
+    def _judge_step(
+        self, belief: Gaussian, reference: Reference, command: Command
+    ) -> Judgement:
+        """Returns the judgement of a command."""
         measured = to_array(belief.mean)
         if self._judge is None:
-            input_dim = len(last.input)
-            self._judge = FlightJudge.of(self.controller, len(measured), input_dim)
-        states = np.asarray(wanted.states, dtype=float)
-        return self._judge.judge(measured, states, last.decision)
+            self._judge = FlightJudge.of(
+                self.controller,
+                state_dim=len(measured),
+                input_dim=len(command.input),
+            )
+        states = np.asarray(reference.states, dtype=float)
+        return self._judge.judge(measured, states, command.decision)
 
     def input_between(self, state: Any, share: float) -> np.ndarray:
-        """Returns the input to apply until the next decision (m,): the plan's, corrected by its feedback.
+        """Returns the input to apply until the next decision (m,).
 
-        For plants that take inputs more often than there is time to decide. The feedback is that of the controller's
-        method ``gains``, at the stage of the plan that the time falls into; a late decision goes on along the plan.
+        It is the plan's, corrected by its feedback, for plants that take inputs more
+        often than there is time to decide. The feedback is that of the controller's
+        method ``gains``, at the stage of the plan that the time falls into; a late
+        decision goes on along the plan.
 
         Args:
             state: Measured (n,).
@@ -225,32 +267,47 @@ class ControlLoop:
         check_number("share", share, least=0)
         plan = self.last.plan
         state = read_array("state", state, signals_of(self.controller).state_names)
-        stage = min(int(share), len(plan.inputs) - 1)
-        input = plan.inputs[stage]
         if state.shape != plan.means.shape[1:]:
             raise ShapeError(
                 f"state must have shape {plan.means.shape[1:]}; got {state.shape}"
             )
+        horizon = len(plan.inputs)
+        stage = min(int(share), horizon - 1)
+        input = plan.inputs[stage]
         if np.isfinite(plan.means).all() and np.isfinite(state).all():
-            if self._gains is None or self._gains[0] is not plan:
-                gains = getattr(self.controller, "gains", None)
-                none = np.zeros((*plan.inputs.shape, len(state)))
-                self._gains = plan, none if gains is None else gains(plan)
-            error = state - _state_along(plan.means, min(share, len(plan.inputs)))
-            cost = getattr(getattr(self.controller, "problem", None), "cost", None)
-            error -= full_turns(error, () if cost is None else cost.angles)
-            input = input - self._gains[1][stage] @ error
-        return _within_bounds(self.controller, input, self._before)
+            planned_state = _state_along(plan.means, min(share, horizon))
+            error = self._short_way(state - planned_state)
+            input = input - self._gains_of(plan)[stage] @ error
+        return _within_bounds(self.controller, input, self._before_last)
+
+    def _gains_of(self, plan: Decision) -> np.ndarray:
+        """Returns the gains (H, m, n) of a plan's feedback; zero without any."""
+        if self._gains is None or self._gains[0] is not plan:
+            method = getattr(self.controller, "gains", None)
+            gains = np.zeros((*plan.inputs.shape, plan.means.shape[1]))
+            if method is not None:
+                gains = method(plan)
+            self._gains = (plan, gains)
+        return self._gains[1]
+
+    def _short_way(self, error: np.ndarray) -> np.ndarray:
+        """Returns an error (n,) without full turns of the cost's angles."""
+        cost = getattr(getattr(self.controller, "problem", None), "cost", None)
+        angles = () if cost is None else cost.angles
+        return error - full_turns(error, angles)
 
     def warm_up(self, state: Any, reference: Any, parameters: Any = None) -> None:
-        """Decides twice and forgets it, so that everything is compiled before the loop starts."""
+        """Decides twice and forgets it: everything is then compiled beforehand."""
         rehearsal = ControlLoop(self.controller, "previous_plan")
         for _ in range(2):
             rehearsal.input(state, reference, parameters)
 
 
 def _state_along(states: np.ndarray, time: float) -> np.ndarray:
-    """The state (n,) at a time in steps from s_0 on, by the cubic through the four nearest of s_0 .. s_H (H + 1, n)."""
+    """Returns the state (n,) at a time in steps from s_0 on.
+
+    It lies on the cubic through the four nearest of s_0 .. s_H (H + 1, n).
+    """
     count = min(4, len(states))
     first = min(max(int(time) - 1, 0), len(states) - count)
     nodes = np.arange(first, first + count)
@@ -263,9 +320,8 @@ def check_policy(on_failure: str) -> None:
 
 
 def _is_finite(belief: Gaussian) -> bool:
-    return bool(
-        torch.isfinite(belief.mean).all() and torch.isfinite(belief.covariance).all()
-    )
+    mean_is_finite = torch.isfinite(belief.mean).all()
+    return bool(mean_is_finite and torch.isfinite(belief.covariance).all())
 
 
 def _conclude(
@@ -276,94 +332,135 @@ def _conclude(
     on_failure: OnFailure,
     step: int,
 ) -> Command:
-    """The command of a decision; of none, where the controller was not called."""
+    """Returns the command for a decision, None where the controller was not called."""
     status = Status.INVALID_MEASUREMENT if decision is None else decision.status
     reason = status.advice
     if decision is not None and decision.applicable:
         fits = _has_right_shape(controller, decision, last)
-        if fits and (checked := _admit(controller, decision, last)) is not None:
-            return Command(checked.input, status, checked, checked)
-        reason = f"its plan, {status.name}, is not finite or out of its bounds or shape; its input: {decision.input}"
+        plan = _admit(controller, decision, last) if fits else None
+        if plan is not None:
+            return Command(plan.input, status, decision=plan, plan=plan)
+        reason = (
+            f"its plan, {status.name}, is not finite or out of its bounds or shape; "
+            f"its input: {decision.input}"
+        )
         status = Status.NUMERICAL_TROUBLE
         decision = replace(decision, status=status, suboptimal=False) if fits else None
     if on_failure == "raise":
         raise SolverFailure(step, reason)
-    if last is not None and last.plan is not None and last.plan.applicable:
-        rows = (plan := last.plan).inputs, plan.means, plan.covariances
-        inputs, means, covariances = (
-            np.concatenate([part[1:], part[-1:]]) for part in rows
-        )
-        first = last.input if on_failure == "hold" else inputs[0]
-        shifted = replace(
-            _with_first(plan, inputs, first), means=means, covariances=covariances
-        )
-        if (admitted := _admit(controller, shifted, last)) is not None:
-            return Command(admitted.input, status, decision, admitted)
-    known = (
-        getattr(controller, "initial_input", None)
-        if reference.inputs is None
-        else reference.inputs[0]
+    plan = _continue_last_plan(controller, last, on_failure)
+    if plan is None:
+        plan = _plan_without_prediction(controller, reference, last, status)
+    if plan is None:
+        rule = "no earlier plan and no reference input to fall back on"
+        raise SolverFailure(step, f"{reason} ({rule})")
+    return Command(plan.input, status, decision=decision, plan=plan)
+
+
+def _continue_last_plan(
+    controller: Controller, last: Command | None, on_failure: OnFailure
+) -> Decision | None:
+    """Returns the last plan one step on; None where there is none to be applied."""
+    if last is None or last.plan is None or not last.plan.applicable:
+        return None
+    plan = last.plan
+    inputs = _shifted(plan.inputs)
+    first = last.input if on_failure == "hold" else inputs[0]
+    shifted = replace(
+        _with_first(plan, inputs, first),
+        means=_shifted(plan.means),
+        covariances=_shifted(plan.covariances),
     )
-    if known is None or not np.isfinite(known).all():
-        raise SolverFailure(
-            step, f"{reason} (no earlier plan and no reference input to fall back on)"
-        )
-    input = _within_bounds(controller, np.array(known, dtype=float), last)
+    return _admit(controller, shifted, last)
+
+
+def _shifted(rows: np.ndarray) -> np.ndarray:
+    """Returns rows one step on, the last one repeated."""
+    return np.concatenate([rows[1:], rows[-1:]])
+
+
+def _plan_without_prediction(
+    controller: Controller,
+    reference: Reference,
+    last: Command | None,
+    status: Status,
+) -> Decision | None:
+    """Returns the reference's input, or the controller's initial one, as a plan.
+
+    None where neither is known. The plan is not applicable: it predicts nothing.
+    """
+    known_input = getattr(controller, "initial_input", None)
+    if reference.inputs is not None:
+        known_input = reference.inputs[0]
+    if known_input is None or not np.isfinite(known_input).all():
+        return None
+    input = _within_bounds(controller, np.array(known_input, dtype=float), last)
     H = reference.horizon
     n = reference.states.shape[1]
-    unknown = np.full((H + 1, n), np.nan), np.full((H + 1, n, n), np.nan)
-    return Command(
-        input,
-        status,
-        decision,
-        Decision(input, np.tile(input, (H, 1)), *unknown, status, 0, Timing()),
+    return Decision(
+        input=input,
+        inputs=np.tile(input, (H, 1)),
+        means=np.full((H + 1, n), np.nan),
+        covariances=np.full((H + 1, n, n), np.nan),
+        status=status,
+        iterations=0,
+        timing=Timing(),
     )
 
 
 def _has_right_shape(
     controller: Controller, decision: Decision, last: Command | None
 ) -> bool:
-    """Whether the inputs of a decision have the shapes (m,) and (H, m)."""
+    """Tells whether the inputs of a decision have the shapes (m,) and (H, m)."""
     problem = getattr(controller, "problem", None)
-    m = (
-        problem.input_dim
-        if isinstance(problem, Problem)
-        else (decision if last is None else last).input.size
-    )
-    return (
-        decision.input.shape == (m,) == np.shape(decision.inputs)[1:]
-        and len(decision.inputs) > 0
-    )
+    if isinstance(problem, Problem):
+        m = problem.input_dim
+    elif last is not None:
+        m = last.input.size
+    else:
+        m = decision.input.size
+    inputs_fit = np.shape(decision.inputs)[1:] == (m,) and len(decision.inputs) > 0
+    return decision.input.shape == (m,) and inputs_fit
 
 
 def _admit(
     controller: Controller, plan: Decision, last: Command | None
 ) -> Decision | None:
-    """A plan, its first input put onto the bounds that it misses by rounding; None where it must not be applied."""
+    """Returns a plan, its first input put onto the bounds that it misses by rounding.
+
+    None where it must not be applied.
+    """
     input = _within_bounds(controller, plan.input, last)
-    off = np.abs(input - plan.input)
-    if (
-        not (off <= _ROUNDING * np.maximum(1.0, np.abs(input))).all()
-        or not np.isfinite(plan.inputs).all()
-    ):
-        return None  # off is NaN where an input is not finite
-    return _with_first(plan, plan.inputs, input) if off.any() else plan
+    miss = np.abs(input - plan.input)
+    tolerance = _ROUNDING * np.maximum(1.0, np.abs(input))
+    is_rounding = (miss <= tolerance).all()  # the miss of a NaN is a NaN
+    if not is_rounding or not np.isfinite(plan.inputs).all():
+        return None
+    if not miss.any():
+        return plan
+    return _with_first(plan, plan.inputs, input)
 
 
 def _within_bounds(
     controller: Controller, input: np.ndarray, last: Command | None
 ) -> np.ndarray:
-    """The nearest input in the box of the controller's problem, where it has one, and among these within its rates."""
+    """Returns the nearest input in the box and, among these, within the rates.
+
+    Without a problem of the controller, that is the input itself.
+    """
     problem = getattr(controller, "problem", None)
     if not isinstance(problem, Problem):
         return input
-    before = getattr(controller, "initial_input", None) if last is None else last.input
-    if before is not None:
+    last_input = getattr(controller, "initial_input", None)
+    if last is not None:
+        last_input = last.input
+    if last_input is not None:
         down, up = problem.input_rates.first
-        input = np.minimum(np.maximum(input, before + down), before + up)
+        input = np.minimum(np.maximum(input, last_input + down), last_input + up)
     low, high = problem.inputs.first
     return np.minimum(np.maximum(input, low), high)
 
 
 def _with_first(plan: Decision, inputs: np.ndarray, first: np.ndarray) -> Decision:
+    """Returns a plan with other inputs (H, m), the first of them replaced."""
     return replace(plan, input=first, inputs=np.concatenate([first[None], inputs[1:]]))

@@ -1,8 +1,12 @@
-"""Closed loops: a controller on a plant or on a model, with noise, disturbances and many seeds."""
+"""Closed loops of a controller and a plant or a model.
+
+With noise, disturbances and many seeds.
+"""
 
 from gpmpc.simulation._cascade_loop import Cascade, cascade_loop
 from gpmpc.simulation._disturbances import Disturbance, Dropout, Gust, Replaced
-from gpmpc.simulation._loop import Rollout, Trial, closed_loop, closed_loops, rehearse
+from gpmpc.simulation._loop import Trial, closed_loop, closed_loops, rehearse
+from gpmpc.simulation._rollout import Rollout
 from gpmpc.simulation._simulator import ModelLoop, Noise
 from gpmpc.step import Step
 

@@ -1,11 +1,13 @@
-"""Flies the whole quadrotor: a cascade of two controllers at two rates, on the twelve states.
+"""Flies the whole quadrotor: a cascade of two controllers at two rates, on 12 states.
 
-The outer controller, on the translational subsystem, decides the thrust U1 and its direction (ux, uy), once a second
-say; the direction, by eq. (2) of Cao, Lai and Alam (2017) inverted, is the attitude that the inner one, on the
-rotational subsystem, takes the vehicle to. (With the plant in the loop an inner loop at 1 Hz is unworkable; 20 Hz flies
-well.) The references of the angular rates are those of a first-order approach to the attitude,
-(angle_d - angle) / response time. Each controller has its own policy for failures: while the outer one goes on along
-its last plan, the inner one keeps the vehicle upright, and the other way round.
+The outer controller, on the translational subsystem, decides the thrust U1 and its
+direction (ux, uy), once a second say; the direction, by eq. (2) of Cao, Lai and Alam
+(2017) inverted, is the attitude that the inner one, on the rotational subsystem, takes
+the vehicle to. (With the plant in the loop an inner loop at 1 Hz is unworkable; 20 Hz
+flies well.) The references of the angular rates are those of a first-order approach to
+the attitude, (angle_d - angle) / response time. Each controller has its own policy for
+failures: while the outer one goes on along its last plan, the inner one keeps the
+vehicle upright, and the other way round.
 """
 
 from collections.abc import Callable, Sequence
@@ -19,17 +21,13 @@ from gpmpc._angles import wrap
 from gpmpc.exceptions import Diverged, ShapeError, check_number
 from gpmpc.gaussian import Gaussian
 from gpmpc.mpc import Controller, FlightJudge, Reference
-from gpmpc.mpc._policy import OnFailure, check_policy, command
+from gpmpc.mpc._policy import Command, OnFailure, decide
 from gpmpc.signals import Signals
 from gpmpc.simulation._disturbances import Disturbance
-from gpmpc.simulation._loop import (
-    Flight,
-    Rollout,
-    check_belongs,
-    check_references,
-    window,
-)
-from gpmpc.simulation._simulator import Noise, PlantSimulator, step_together
+from gpmpc.simulation._flight import Flight
+from gpmpc.simulation._rollout import Rollout
+from gpmpc.simulation._scenario import Scenario, check_belongs
+from gpmpc.simulation._simulator import Noise, Simulator, step_together
 from gpmpc.step import Step
 from gpmpc.systems import (
     Coupled,
@@ -42,17 +40,21 @@ from gpmpc.systems import (
 _OUTER = slice(0, 6)
 _INNER = slice(6, 12)
 
+Recorder = Callable[[Literal["outer", "inner"], Step], None]
+
 
 @dataclass(frozen=True)
 class Cascade:
-    """An outer and an inner controller, and how the one's inputs are the other's references.
+    """An outer and an inner controller, whose references are the outer one's inputs.
 
     Raises:
         SettingError: A ratio below 1, or a response time that is not positive.
     """
 
-    outer: Controller  #: on states x, vx, y, vy, z, vz [m, m/s] and inputs U1 [N], ux, uy [-]
-    inner: Controller  #: on states phi, p, theta, q, psi, r [rad, rad/s] and inputs U2, U3, U4 [N]
+    #: on states x, vx, y, vy, z, vz [m, m/s] and inputs U1 [N], ux, uy [-]
+    outer: Controller
+    #: on states phi, p, theta, q, psi, r [rad, rad/s] and inputs U2, U3, U4 [N]
+    inner: Controller
     ratio: int = 20  #: inner steps an outer step
     response_time: float = 0.1  #: of the approach to a new attitude [s]
 
@@ -63,11 +65,16 @@ class Cascade:
     def attitude_reference(
         self, planned: np.ndarray, angles: np.ndarray, phase: int
     ) -> Reference:
-        """What the inner controller is to follow over its horizon, with no moments as the inputs that belong to it.
+        """Returns what the inner controller is to follow over its horizon.
 
-        It is asked ``phase`` inner steps after the outer step began, at roll, pitch and yaw (3,) [rad]; yaw is to be
-        zero. ``planned`` are the outer plan's inputs from that step on (H, 3): the inner horizon looks beyond the first
-        where it reaches the next outer step, and holds the last.
+        Yaw is to be zero. The inputs that belong to the reference are no moments.
+
+        Args:
+            planned: Inputs of the outer plan (H, 3), from its current step on. Where
+                the inner horizon reaches the next outer step, it looks beyond the
+                first, and holds the last.
+            angles: Roll, pitch and yaw now (3,) [rad].
+            phase: Number of inner steps since the outer step began.
         """
         ahead = phase + np.arange(self.inner.horizon + 1)
         direction = planned[np.minimum(ahead // self.ratio, len(planned) - 1)]
@@ -84,8 +91,10 @@ class CascadeRollout:
 
     states: np.ndarray  # (K r + 1, 12) of the plant at the inner rate
     inputs: np.ndarray  # (K r, 4) that were applied, U1 .. U4 [N]
-    outer: Rollout  # at its own rate: states x .. vz, inputs U1, ux, uy as they were decided
-    inner: Rollout  # at its own rate: states phi .. r, its references the attitudes to be reached
+    # at its own rate: states x .. vz, inputs U1, ux, uy as they were decided
+    outer: Rollout
+    # at its own rate: states phi .. r, its references the attitudes to be reached
+    inner: Rollout
 
 
 def cascade_loop(
@@ -99,102 +108,196 @@ def cascade_loop(
     disturbances: Sequence[Disturbance] = (),
     on_failure: OnFailure = "raise",
     seed: int = 0,
-    on_step: Callable[[Literal["outer", "inner"], Step], None] | None = None,
+    on_step: Recorder | None = None,
 ) -> CascadeRollout:
-    """Flies a cascade over K outer ``steps``; arguments are those of ``closed_loop``, at two rates.
+    """Flies a cascade at two rates.
 
-    The ``plant`` has the twelve states at the inner rate, such as ``gpmpc.systems.coupled()``; ``initial`` is a state
-    (12,) or a ``Gaussian``. ``references`` are of the outer loop, states x, vx, y, vy, z, vz (steps + horizon, 6) or
-    more, one an outer step. Noise acts every inner step. ``on_step`` is called with the loop and its step: of the outer
-    one as it begins, of the inner one as it ends.
+    Args:
+        plant: The twelve states at the inner rate, such as
+            ``gpmpc.systems.coupled()``.
+        cascade: Both controllers.
+        references: States x, vx, y, vy, z, vz of the outer loop
+            (steps + horizon, 6) or more, one an outer step.
+        initial: A state (12,) or a ``Gaussian``.
+        steps: Number of outer steps.
+        noise: As for ``closed_loop``; it acts every inner step.
+        disturbances: As for ``closed_loop``.
+        on_failure: As for ``closed_loop``; of either controller.
+        seed: Of all random numbers.
+        on_step: Called with the loop and its step: of the outer one as it begins, of
+            the inner one as it ends.
 
     Raises:
         ShapeError: The plant has other states, or references are too few.
         SolverFailure: Its step is that of the controller that failed.
         Diverged: Its step is an inner one.
     """
-    check_policy(on_failure)
-    if (names := (plant.state_names, plant.input_names)) != (
-        Coupled.state_names,
-        Coupled.input_names,
-    ):
+    names = (plant.state_names, plant.input_names)
+    if names != (Coupled.state_names, Coupled.input_names):
         raise ShapeError(
             f"a cascade flies the states and inputs of Coupled; got {names}"
         )
-    horizon = cascade.outer.horizon
-    ratio = cascade.ratio
-    slow = Signals(
-        Translational.state_names, Translational.input_names, ratio * plant.time_step
+    scenario = Scenario(
+        system=plant,
+        controller=cascade.outer,
+        references=references,
+        initial=initial,
+        steps=steps,
+        noise=noise,
+        disturbances=disturbances,
+        on_failure=on_failure,
+        name="the outer loop",
+        signals=Signals(
+            Translational.state_names,
+            Translational.input_names,
+            time_step=cascade.ratio * plant.time_step,
+        ),
     )
-    fast = Signals(Rotational.state_names, Rotational.input_names, plant.time_step)
-    check_belongs(cascade.outer, slow, "the outer loop")
-    check_belongs(cascade.inner, fast, "the inner loop")
-    references = check_references(references, steps, horizon, slow)
-    simulator = PlantSimulator(plant, initial, disturbances, noise, seed)
-    calls: Any = (
-        (None, None)
-        if on_step is None
-        else [partial(on_step, loop) for loop in ("outer", "inner")]
-    )
-    outer = Flight(
-        simulator,
-        references,
-        ratio * plant.time_step,
-        FlightJudge.of(cascade.outer, 6, 3, (slow.state_names, slow.input_names)),
-        calls[0],
-        _OUTER,
-    )
-    inner = Flight(
-        simulator,
-        references,
-        plant.time_step,
-        FlightJudge.of(cascade.inner, 6, 3, (fast.state_names, fast.input_names)),
-        calls[1],
-        _INNER,
-    )
-    states = [simulator.mean]
-    inputs = []
-    angles = np.zeros(3)
-    thrust: Any = None  # the command of the outer step under way
-    attitude: Any = None  # what the inner controller is to follow
-    for j in range(steps * ratio):
-        (k, phase), time, before = (
-            divmod(j, ratio),
-            round(j * plant.time_step, 9),
-            (states[-1], simulator.covariance),
+    flight = _CascadeFlight(scenario, cascade, seed, on_step)
+    for inner_step in range(steps * cascade.ratio):
+        flight.advance(inner_step)
+    return flight.rollout()
+
+
+class _CascadeFlight:
+    """A cascade under way."""
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        cascade: Cascade,
+        seed: int,
+        on_step: Recorder | None,
+    ):
+        inner_time_step = scenario.system.time_step
+        inner_signals = Signals(
+            Rotational.state_names, Rotational.input_names, inner_time_step
         )
-        belief = simulator.measure(time)
-        if phase == 0:
-            ahead = window(references, k, horizon)
-            thrust = command(
-                cascade.outer, _part(belief, _OUTER), ahead, outer.last, on_failure, k
+        check_belongs(cascade.inner, inner_signals, "the inner loop")
+        self._scenario = scenario
+        self._cascade = cascade
+        self._inner_time_step = inner_time_step
+        self._simulator = scenario.simulator(seed)
+        self._outer = _flight_of_loop(
+            "outer",
+            simulator=self._simulator,
+            controller=cascade.outer,
+            signals=scenario.signals,
+            states=_OUTER,
+            on_step=on_step,
+        )
+        self._inner = _flight_of_loop(
+            "inner",
+            simulator=self._simulator,
+            controller=cascade.inner,
+            signals=inner_signals,
+            states=_INNER,
+            on_step=on_step,
+        )
+        self._states = [self._simulator.mean]
+        self._inputs: list[np.ndarray] = []
+        self._angles = np.zeros(3)  # as they were measured last [rad]
+        self._thrust: Command | None = None  # of the outer step under way
+        self._attitude: Reference | None = None  # that the inner controller follows
+
+    def advance(self, inner_step: int) -> None:
+        """Flies one inner step; the outer controller decides at each ``ratio``-th."""
+        scenario = self._scenario
+        cascade = self._cascade
+        outer_step, phase = divmod(inner_step, cascade.ratio)
+        time = round(inner_step * self._inner_time_step, 9)
+        state = self._simulator.state
+        belief = self._simulator.measure(time)
+        outer_reference = scenario.reference_from(outer_step)
+        if self._thrust is None or phase == 0:
+            self._thrust = decide(
+                cascade.outer,
+                _part(belief, _OUTER),
+                outer_reference,
+                last=self._outer.last,
+                on_failure=scenario.on_failure,
+                step=outer_step,
             )
-        # Attitudes start from where the vehicle is, or was when that was last known.
-        measured = belief.mean.numpy()[6::2]
-        angles = measured if np.isfinite(measured).all() else angles
-        planned = thrust.input[None] if thrust.plan is None else thrust.plan.inputs
-        attitude = cascade.attitude_reference(planned, angles, phase)
-        moments = command(
-            cascade.inner, _part(belief, _INNER), attitude, inner.last, on_failure, j
+        thrust = self._thrust
+        attitude = self._attitude_reference(thrust, belief, phase)
+        moments = decide(
+            cascade.inner,
+            _part(belief, _INNER),
+            attitude,
+            last=self._inner.last,
+            on_failure=scenario.on_failure,
+            step=inner_step,
         )
-        (applied,) = step_together(
-            [simulator], time, [np.append(thrust.input[:1], moments.input)]
-        )
-        if isinstance(applied, Diverged):
-            raise applied
+        decided_input = np.append(thrust.input[:1], moments.input)
+        (input,) = step_together([self._simulator], time, [decided_input])
+        if isinstance(input, Diverged):
+            raise input
         if phase == 0:
-            ahead = window(references, k, horizon).states
-            outer.add(before, belief, thrust.input, thrust, ahead)
-        inner.add(before, belief, applied[1:], moments, attitude.states)
-        states.append(simulator.mean)
-        inputs.append(applied)
-    return CascadeRollout(
-        np.array(states),
-        np.array(inputs),
-        outer.rollout(),
-        inner.rollout(attitude.states[1]),
+            self._outer.add(
+                state=state,
+                belief=belief,
+                command=thrust,
+                input=thrust.input,
+                reference=outer_reference.states,
+            )
+        self._inner.add(
+            state=state,
+            belief=belief,
+            command=moments,
+            input=input[1:],
+            reference=attitude.states,
+        )
+        self._attitude = attitude
+        self._states.append(self._simulator.mean)
+        self._inputs.append(input)
+
+    def _attitude_reference(
+        self, thrust: Command, belief: Gaussian, phase: int
+    ) -> Reference:
+        """Returns what the inner controller is to follow under an outer command."""
+        measured = belief.mean.numpy()[6::2]
+        if np.isfinite(measured).all():
+            self._angles = measured
+        planned = thrust.input[None]
+        if thrust.plan is not None:
+            planned = thrust.plan.inputs
+        return self._cascade.attitude_reference(planned, self._angles, phase)
+
+    def rollout(self) -> CascadeRollout:
+        """Returns what was flown."""
+        assert self._attitude is not None
+        outer_end = self._scenario.reference_state(len(self._outer.steps))
+        return CascadeRollout(
+            states=np.array(self._states),
+            inputs=np.array(self._inputs),
+            outer=self._outer.rollout(outer_end),
+            inner=self._inner.rollout(self._attitude.states[1]),
+        )
+
+
+def _flight_of_loop(
+    loop: Literal["outer", "inner"],
+    *,
+    simulator: Simulator,
+    controller: Controller,
+    signals: Signals,
+    states: slice,
+    on_step: Recorder | None,
+) -> Flight:
+    """Returns the flight of one of the two loops, about to start."""
+    names = (signals.state_names, signals.input_names)
+    assert signals.time_step is not None
+    return Flight(
+        simulator=simulator,
+        time_step=signals.time_step,
+        judge=FlightJudge.of(
+            controller, state_dim=len(names[0]), input_dim=len(names[1]), names=names
+        ),
+        on_step=None if on_step is None else partial(on_step, loop),
+        states=states,
     )
 
 
 def _part(belief: Gaussian, states: slice) -> Gaussian:
+    """Returns the belief of some of the states."""
     return Gaussian(belief.mean[states], belief.covariance[states, states])

@@ -1,7 +1,8 @@
 """Disturbances: wind, another payload, a sensor that drops out.
 
-A disturbance says, step by step, which plant really acts and what is really measured. Times are those at which a step
-begins: a window that opens within a step acts from the next one on.
+A disturbance says, step by step, which plant really acts and what is really measured.
+Times are those at which a step begins: a window that opens within a step acts from the
+next one on.
 """
 
 from collections.abc import Mapping, Sequence
@@ -21,11 +22,14 @@ class Disturbance(Protocol):
     """Something that a controller does not know of."""
 
     def disturb_plant(self, plant: System, time: float) -> System:
-        """Returns the plant that acts in the step from a time [s] on, in the place of the given one."""
+        """Returns the plant that acts in the place of another, from a time [s] on.
+
+        It acts for one step.
+        """
         return plant
 
     def disturb_measurement(self, state: np.ndarray, time: float) -> np.ndarray:
-        """Returns what is measured of a state (n,) at a time [s], in the place of the given one."""
+        """Returns what is measured at a time [s] in the place of a state (n,)."""
         return state
 
 
@@ -47,13 +51,14 @@ class _Window(Disturbance):
 
 @dataclass(frozen=True)
 class Gust(_Window):
-    """A constant push on single states over a time window, integrated by the plant like any other force.
+    """A constant push on single states over a time window.
 
-    (Where the dynamics give the next state, it is added to that.)
+    The plant integrates it like any other force. (Where the dynamics give the next
+    state, it is added to that.)
     """
 
-    #: what is added to the derivative of a state, by its name: ``{"vx": 2.0}`` is an acceleration of 2 m/s^2, the force
-    #: over the mass [unit of the state / s]
+    #: what is added to the derivative of a state, by its name: ``{"vx": 2.0}`` is an
+    #: acceleration of 2 m/s^2, the force over the mass [unit of the state / s]
     rates: Mapping[str, float]
     start: float = 0.0  #: when it begins [s]
     stop: float = inf  #: when it ends [s]
@@ -61,15 +66,18 @@ class Gust(_Window):
     def __post_init__(self) -> None:
         super().__post_init__()
         if not isinstance(self.rates, Mapping) or not self.rates:
-            raise SettingError(
-                "rates",
-                f"must map names of states to numbers, like {{'vx': 2.0}}; got {self.rates!r}",
-            )
+            rule = "must map names of states to numbers, like {'vx': 2.0}"
+            raise SettingError("rates", f"{rule}; got {self.rates!r}")
         for name, rate in self.rates.items():
             check_number(f"rates.{name}", rate)
 
     def disturb_plant(self, plant: System, time: float) -> System:
-        """Returns the plant with the push, inside the window; raises where it has no such state, or no equations."""
+        """Returns the plant with the push, inside the window.
+
+        Raises:
+            SettingError: The plant has no such state.
+            UnsupportedModel: It has no equations.
+        """
         for name in self.rates:
             if name not in plant.state_names:
                 known = ", ".join(plant.state_names)
@@ -78,9 +86,8 @@ class Gust(_Window):
                 )
         if not self.acts(time):
             return plant
-        return _pushed(
-            plant, tuple(float(self.rates.get(name, 0.0)) for name in plant.state_names)
-        )
+        rates = [float(self.rates.get(name, 0.0)) for name in plant.state_names]
+        return _pushed(plant, tuple(rates))
 
 
 @dataclass(frozen=True)
@@ -92,11 +99,15 @@ class Replaced(_Window):
     stop: float = inf  #: when it ends [s]
 
     def disturb_plant(self, plant: System, time: float) -> System:
-        """Returns the other plant, inside the window; raises where it has other states, inputs or time steps."""
+        """Returns the other plant, inside the window.
+
+        Raises:
+            ShapeError: It has other states, inputs or another time step.
+        """
         if plant.signals != self.plant.signals:
             raise ShapeError(
-                f"a plant must be replaced by one of the same states, inputs, step {plant.signals}; "
-                f"got {self.plant.signals}"
+                "a plant must be replaced by one of the same states, inputs, step "
+                f"{plant.signals}; got {self.plant.signals}"
             )
         return self.plant if self.acts(time) else plant
 
@@ -107,20 +118,24 @@ class Dropout(_Window):
 
     start: float  #: when it begins [s]
     stop: float  #: when it ends [s]
-    #: which ones, from 0; all by default. Without position, for one: 0 to 5 of a ``Coupled`` plant
+    #: which ones, from 0; all by default. Without position, for one: 0 to 5 of a
+    #: ``Coupled`` plant
     entries: Sequence[int] | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.entries is not None:
-            object.__setattr__(
-                self, "entries", tuple(np.asarray(self.entries).tolist())
-            )
+            entries = tuple(np.asarray(self.entries).tolist())
+            object.__setattr__(self, "entries", entries)
         for entry in self.entries or ():
             check_number("entries", entry, least=0, whole=True)
 
     def disturb_plant(self, plant: System, time: float) -> System:
-        """Returns the plant; raises where it has no such entry."""
+        """Returns the plant.
+
+        Raises:
+            SettingError: It has no such entry.
+        """
         n = len(plant.state_names)
         for entry in self.entries or ():
             if entry >= n:
@@ -133,23 +148,35 @@ class Dropout(_Window):
         """Returns NaN inside the window."""
         if not self.acts(time):
             return state
-        lost = state.copy()
-        lost[slice(None) if self.entries is None else list(self.entries)] = np.nan
-        return lost
+        measured = state.copy()
+        if self.entries is None:
+            measured[:] = np.nan
+        else:
+            measured[list(self.entries)] = np.nan
+        return measured
 
 
 @lru_cache(maxsize=8)
 def _pushed(plant: System, rates: tuple[float, ...]) -> System:
-    """A system with constants (n,) added to its right-hand side, or to its next state."""
+    """Returns a plant with constants (n,) added to its equations.
+
+    They are added to its right-hand side, or to its next state.
+    """
     if plant.stateful:
         raise UnsupportedModel(
-            "a gust needs equations, which a simulator has not. Possible with any plant: Replaced"
+            "a gust needs equations, which a simulator has not. "
+            "Possible with any plant: Replaced"
         )
-    method = "successor" if hasattr(plant.dynamics, "successor") else "derivative"
-    of = getattr(plant.dynamics, method)
+    dynamics = plant.dynamics
+    method = "successor" if hasattr(dynamics, "successor") else "derivative"
+    function = getattr(dynamics, method)
 
     def pushed(x: Any, u: Any) -> list[Any]:
-        return [entry + rate for entry, rate in zip(of(x, u), rates, strict=True)]
+        entries = zip(function(x, u), rates, strict=True)
+        return [entry + rate for entry, rate in entries]
 
-    names = {"state_names": plant.state_names, "input_names": plant.input_names}
-    return replace(plant, dynamics=SimpleNamespace(**names, **{method: pushed}))
+    pushed_dynamics = SimpleNamespace(
+        state_names=plant.state_names, input_names=plant.input_names
+    )
+    setattr(pushed_dynamics, method, pushed)
+    return replace(plant, dynamics=pushed_dynamics)

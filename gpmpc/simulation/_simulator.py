@@ -1,13 +1,14 @@
-"""Simulates what stands at the other end of a control loop: a plant, or the learned model itself.
+"""Simulators of what a controller steers: a plant, or the learned model itself.
 
-A plant has a state that is stepped, disturbed and measured with noise. A model loop, as in the figures of Cao, Lai and
-Alam (2017), takes the model's own prediction for the next state, mean and covariance carried on; the true plant never
-enters. It shows how a controller and a model get on with each other, not how a vehicle flies.
+A plant has a state that is stepped, disturbed and measured with noise. A model loop, as
+in the figures of Cao, Lai and Alam (2017), takes the model's own prediction for the
+next state, mean and covariance carried on; the true plant never enters. It shows how a
+controller and a model get on with each other, not how a vehicle flies.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 import torch
@@ -25,9 +26,12 @@ from gpmpc.exceptions import (
 from gpmpc.gaussian import Gaussian
 from gpmpc.propagation import Propagator
 from gpmpc.signals import Signals, signals_of
+from gpmpc.simulation._disturbances import Disturbance
 from gpmpc.systems import System, step, step_many
 
 Array = np.ndarray
+
+_INITIAL_DEVIATION = 0.1  # of a model loop that starts from a mean
 
 
 @dataclass(frozen=True)
@@ -59,7 +63,9 @@ class ModelLoop:
 
 @dataclass(frozen=True)
 class Noise:
-    """White Gaussian noise, as standard deviations; every source draws from a stream of its own.
+    """White Gaussian noise, as standard deviations.
+
+    Every source draws from a stream of its own.
 
     Raises:
         SettingError: An entry is negative or no number.
@@ -67,7 +73,8 @@ class Noise:
 
     process: Sequence[float] | None = None  #: added to every next state (n,)
     measurement: Sequence[float] | None = None  #: added to what is measured (n,)
-    #: added to every input that is applied (m,): an actuator's, or the dither that makes data informative
+    #: added to every input that is applied (m,): an actuator's, or the dither that
+    #: makes data informative
     input: Sequence[float] | None = None
 
     def __post_init__(self) -> None:
@@ -75,112 +82,138 @@ class Noise:
             if values is not None:
                 listed = values.tolist() if hasattr(values, "tolist") else values
                 if not isinstance(listed, Sequence) or isinstance(listed, str):
-                    what = f"must be a list of standard deviations, one for every {key if key == 'input' else 'state'}"
-                    raise SettingError(f"noise.{key}", f"{what}; got {values!r}")
+                    entry = "input" if key == "input" else "state"
+                    rule = (
+                        f"must be a list of standard deviations, one for every {entry}"
+                    )
+                    raise SettingError(f"noise.{key}", f"{rule}; got {values!r}")
                 check_numbers(f"noise.{key}", listed, len(listed), least=0)
 
 
-class PlantSimulator:
-    """Simulates a plant with noise and disturbances, each of which changes what the one before left.
+class SystemState(NamedTuple):
+    """State of a simulated system: a plant's own, or the belief of a model loop."""
 
-    ``initial`` is a state (n,), or a belief that it is drawn from; None for a simulator, which starts an episode.
+    mean: Array  # (n,)
+    covariance: Array  # (n, n); zero of a plant
+
+    def part(self, states: slice) -> "SystemState":
+        """Returns that of some of the states."""
+        return SystemState(self.mean[states], self.covariance[states, states])
+
+
+class PlantSimulator:
+    """Simulates a plant with noise and disturbances.
+
+    Each disturbance changes what the one before left.
+
+    Args:
+        plant: The system.
+        initial: A state (n,), or a belief that it is drawn from; None for a simulator,
+            which starts an episode.
+        disturbances: What acts on the plant and its measurements.
+        noise: On states, measurements and inputs.
+        seed: Of all random numbers.
+
+    Attributes:
+        mean: The state (n,).
+        covariance: Zero (n, n).
     """
 
     def __init__(
         self,
         plant: System,
         initial: Any,
-        disturbances: Any = (),
+        disturbances: Sequence[Disturbance] = (),
         noise: Noise | None = None,
         seed: int = 0,
     ):
         check_number("seed", seed, least=0, whole=True)
         if not isinstance(plant, System):
-            what = "must be a plant, such as System(dynamics, 0.1), or a ModelLoop"
-            raise SettingError("system", f"{what}; got {type(plant).__name__}")
+            rule = "must be a plant, such as System(dynamics, 0.1), or a ModelLoop"
+            raise SettingError("system", f"{rule}; got {type(plant).__name__}")
         if not isinstance(noise, Noise | None):
             raise SettingError("noise", f"must be Noise(...); got {noise!r}")
         if not isinstance(disturbances, Sequence):
             raise SettingError(
                 "disturbances", f"must be a list of them; got {disturbances!r}"
             )
-        n = len(plant.state_names)
-        m = len(plant.input_names)
         self.plant = plant
         self.disturbances = disturbances
-        self.noise = noise or Noise()
+        self.noise = _read_noise(noise or Noise(), plant)
         self._steps = 0
-        for key, length, names in (
-            ("process", n, plant.state_names),
-            ("measurement", n, plant.state_names),
-            ("input", m, plant.input_names),
-        ):
-            values = getattr(self.noise, key)
-            if values is None:
-                continue
-            if len(values) != length:
-                raise ShapeError(
-                    f"noise.{key} must have {length} standard deviations; got {len(values)}"
-                )
-            ordered: Any = read_array(f"noise.{key}", values, names)
-            self.noise = replace(self.noise, **{key: ordered})
-        # One stream a source: whether states are measured with noise changes nothing about the wind.
-        sources = "initial", "process", "measurement", "input"
-        streams = map(
-            np.random.default_rng, np.random.SeedSequence(seed).spawn(len(sources))
-        )
-        self._streams: dict[str, np.random.Generator] = dict(
-            zip(sources, streams, strict=True)
-        )
+        # One stream a source: whether states are measured with noise changes nothing
+        # about the wind.
+        sources = ("initial", "process", "measurement", "input")
+        seeds = np.random.SeedSequence(seed).spawn(len(sources))
+        self._streams = {
+            source: np.random.default_rng(own_seed)
+            for source, own_seed in zip(sources, seeds, strict=True)
+        }
+        self.mean = self._initial_state(initial, seed)
+        self.covariance = np.zeros((len(self.mean), len(self.mean)))
+        # A disturbance that does not fit is found before the first step.
+        self._disturbed_plant(0.0)
+
+    def _initial_state(self, initial: Any, seed: int) -> Array:
+        """Returns the state (n,) that a flight starts from."""
+        plant = self.plant
+        n = len(plant.state_names)
         if initial is None:
             if not plant.stateful:
                 raise SettingError(
                     "initial", "must be a state; a simulator alone starts by itself"
                 )
             initial = plant.dynamics.reset(seed)
-        drawn = isinstance(initial, Gaussian)
-        if drawn:
-            initial = initial.in_order(plant.state_names)
-        state = initial.mean if drawn else initial
-        self.mean = _check_state(state, n, plant.state_names)
-        self.covariance = np.zeros((n, n))
-        if drawn:
-            self.mean = self._streams["initial"].multivariate_normal(
-                self.mean, to_array(initial.covariance)
-            )
-        self._disturbed_plant(
-            0.0
-        )  # a disturbance that does not fit is found before the first step
+        if not isinstance(initial, Gaussian):
+            return _check_state(initial, n, plant.state_names)
+        belief = initial.in_order(plant.state_names)
+        mean = _check_state(belief.mean, n, plant.state_names)
+        covariance = to_array(belief.covariance)
+        return self._streams["initial"].multivariate_normal(mean, covariance)
 
     @property
     def angles(self) -> list[int]:
         """Indices of the states that are angles."""
         return self.plant.angle_indices
 
+    @property
+    def state(self) -> SystemState:
+        """The state, without a covariance."""
+        return SystemState(self.mean, self.covariance)
+
     def measure(self, time: float) -> Gaussian:
-        """Measures the state; the measurement is taken for certain: controllers of this package filter nothing."""
+        """Returns a measurement of the state at a time [s].
+
+        It is taken for certain: controllers of this package filter nothing.
+        """
         measured = self._add_noise("measurement", self.mean)
         for disturbance in self.disturbances:
             measured = disturbance.disturb_measurement(measured, time)
         return Gaussian.certain(measured)
 
     def _disturbed_plant(self, time: float) -> System:
+        """Returns the plant that acts in the step from a time [s] on."""
         plant = self.plant
         for disturbance in self.disturbances:
             plant = disturbance.disturb_plant(plant, time)
         return plant
 
-    def _applied(self, input: Array) -> Array:
-        if np.shape(input) != (shape := (len(self.plant.input_names),)):
+    def _noisy_input(self, input: Array) -> Array:
+        """Returns what reaches the plant of an input (m,)."""
+        shape = (len(self.plant.input_names),)
+        if np.shape(input) != shape:
             raise ShapeError(
                 f"the plant takes inputs of shape {shape}; got {np.shape(input)}"
             )
         return self._add_noise("input", input)
 
-    def _arrive(self, state: Array, applied: Array) -> Array | Diverged:
-        """Returns the input that was applied, or why the plant cannot go on from its next state."""
+    def _arrive(self, state: Array, input: Array) -> Array | Diverged:
+        """Moves to the next state (n,), with noise.
+
+        Returns the input that was applied, or why the plant cannot go on from there.
+        """
         if not np.isfinite(state).all():
-            before = f"it was {self.mean}, input {applied}"
+            before = f"it was {self.mean}, input {input}"
             return Diverged(
                 self._steps, f"the plant's state is not finite any more; {before}"
             )
@@ -189,46 +222,80 @@ class PlantSimulator:
                 self._steps, f"the simulator has ended its episode, at state {state}"
             )
         self.mean = self._add_noise("process", state)
-        self._steps = self._steps + 1
-        return applied
+        self._steps += 1
+        return input
 
     def _add_noise(self, source: str, value: Array) -> Array:
+        """Returns a value with the noise of a source."""
         deviations = getattr(self.noise, source)
         if deviations is None:
             return value
-        return value + np.asarray(deviations, dtype=float) * self._streams[
-            source
-        ].standard_normal(len(value))
+        drawn = self._streams[source].standard_normal(len(value))
+        return value + np.asarray(deviations, dtype=float) * drawn
+
+
+def _read_noise(noise: Noise, plant: System) -> Noise:
+    """Returns noise as arrays in the order of a plant's names.
+
+    Raises:
+        ShapeError: It has another number of entries.
+        DataError: It has other names.
+    """
+    names_by_source = {
+        "process": plant.state_names,
+        "measurement": plant.state_names,
+        "input": plant.input_names,
+    }
+    ordered: dict[str, Any] = {}
+    for source, names in names_by_source.items():
+        deviations = getattr(noise, source)
+        if deviations is None:
+            continue
+        if len(deviations) != len(names):
+            rule = f"noise.{source} must have {len(names)} standard deviations"
+            raise ShapeError(f"{rule}; got {len(deviations)}")
+        ordered[source] = read_array(f"noise.{source}", deviations, names)
+    return replace(noise, **ordered)
 
 
 class ModelSimulator:
-    """Simulates a model loop from a belief, or from a mean (n,) with the paper's standard deviation of 0.1."""
+    """Simulates a model loop.
+
+    Args:
+        loop: The model and how its belief is carried on.
+        initial: A belief, or its mean (n,) with the paper's standard deviation of 0.1.
+    """
 
     def __init__(self, loop: ModelLoop, initial: Any):
         self.loop = loop
         self._steps = 0
         model = loop.model
-        n = loop.model.state_dim
-        to: Any = {"device": model.device, "dtype": model.dtype}
+        n = model.state_dim
+        options: Any = {"device": model.device, "dtype": model.dtype}
         mean = initial
-        covariance = 0.1**2 * torch.eye(n, **to)
+        covariance = _INITIAL_DEVIATION**2 * torch.eye(n, **options)
         names = signals_of(model).state_names
         if isinstance(initial, Gaussian):
-            initial = initial.in_order(names)
-            mean = initial.mean
-            covariance = initial.covariance
-        state = _check_state(mean, n, names)
-        self._belief = Gaussian(torch.as_tensor(state, **to), covariance.to(**to))
+            belief = initial.in_order(names)
+            mean = belief.mean
+            covariance = belief.covariance
+        mean = torch.as_tensor(_check_state(mean, n, names), **options)
+        self._belief = Gaussian(mean, covariance.to(**options))
 
     @property
     def mean(self) -> Array:
-        """Of the belief (n,)."""
+        """Mean of the belief (n,)."""
         return to_array(self._belief.mean)
 
     @property
     def covariance(self) -> Array:
-        """Of the belief (n, n)."""
+        """Covariance of the belief (n, n)."""
         return to_array(self._belief.covariance)
+
+    @property
+    def state(self) -> SystemState:
+        """The belief, as arrays."""
+        return SystemState(self.mean, self.covariance)
 
     @property
     def angles(self) -> list[int]:
@@ -240,19 +307,21 @@ class ModelSimulator:
         return self._belief
 
     def step(self, input: Array) -> Array | Diverged:
-        """Carries the belief one step on; returns the input, or why it cannot go on."""
+        """Carries the belief one step on.
+
+        Returns the input (m,), or why the belief cannot go on.
+        """
         control = torch.as_tensor(np.asarray(input, dtype=float)).to(self._belief.mean)
         belief = self.loop.propagator(self.loop.model, self._belief, control)
-        if not bool(
-            torch.isfinite(belief.mean).all()
-            and torch.isfinite(belief.covariance).all()
-        ):
+        mean_is_finite = torch.isfinite(belief.mean).all()
+        covariance_is_finite = torch.isfinite(belief.covariance).all()
+        if not (mean_is_finite and covariance_is_finite):
             return Diverged(
                 self._steps,
                 f"the model's belief is not finite any more; its mean is {belief.mean}",
             )
         self._belief = belief
-        self._steps = self._steps + 1
+        self._steps += 1
         return input
 
 
@@ -262,26 +331,37 @@ Simulator = PlantSimulator | ModelSimulator
 def step_together(
     simulators: Sequence[Any], time: float, inputs: Sequence[Array]
 ) -> list[Array | Diverged]:
-    """Steps simulators of one plant from a time [s] on, several plants in one evaluation.
+    """Steps simulators of one plant from a time [s] on, in one evaluation.
 
-    Returns the inputs that were applied, or why a simulator cannot go on.
+    Model loops are stepped one by one.
+
+    Returns:
+        The inputs (m,) that were applied, or why a simulator cannot go on.
     """
-    if not simulators or isinstance(simulators[0], ModelSimulator):
-        return [s.step(input) for s, input in zip(simulators, inputs, strict=True)]
-    applied = [s._applied(input) for s, input in zip(simulators, inputs, strict=True)]
-    plant = simulators[0]._disturbed_plant(
-        time
-    )  # disturbances look at the time, not at a trial
+    if not simulators:
+        return []
+    if isinstance(simulators[0], ModelSimulator):
+        return [
+            simulator.step(input)
+            for simulator, input in zip(simulators, inputs, strict=True)
+        ]
+    noisy_inputs = [
+        simulator._noisy_input(input)
+        for simulator, input in zip(simulators, inputs, strict=True)
+    ]
+    # Disturbances look at the time, not at a trial.
+    plant = simulators[0]._disturbed_plant(time)
     with np.errstate(over="ignore", invalid="ignore"):
         if len(simulators) == 1:
-            states: Any = [step(plant, simulators[0].mean, applied[0])]
+            next_states: Any = [step(plant, simulators[0].mean, noisy_inputs[0])]
         else:
-            states = step_many(
-                plant, np.array([s.mean for s in simulators]), np.array(applied)
-            )
+            states = np.array([simulator.mean for simulator in simulators])
+            next_states = step_many(plant, states, np.array(noisy_inputs))
     return [
-        s._arrive(state, input)
-        for s, state, input in zip(simulators, states, applied, strict=True)
+        simulator._arrive(state, input)
+        for simulator, state, input in zip(
+            simulators, next_states, noisy_inputs, strict=True
+        )
     ]
 
 

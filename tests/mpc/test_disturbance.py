@@ -10,7 +10,7 @@ from gpmpc.exceptions import SettingError
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import backend
 from gpmpc.mpc import PredictionSettings, Reference
-from gpmpc.mpc._policy import command
+from gpmpc.mpc._policy import decide
 from gpmpc.mpc.baselines import StateFormMPC
 from gpmpc.mpc.gp_mpc import GPMPC
 from gpmpc.mpc.problem import Box, Problem, Tracking
@@ -119,9 +119,9 @@ def test_what_was_applied_counts_and_not_what_was_planned():
 def test_a_measurement_that_is_missing_leaves_the_estimate_as_it_is():
     asked = controller(disturbance_gain=1.0)
     states, _ = flown(asked, steps=5)
-    last = command(asked, Gaussian.certain(states[-1]), AT_REST, None, "previous_plan")
+    last = decide(asked, Gaussian.certain(states[-1]), AT_REST, None, "previous_plan")
     last = replace(last, plan=replace(last.plan, disturbance=UNKNOWN))
-    blind = command(
+    blind = decide(
         asked, Gaussian.certain(np.full(2, np.nan)), AT_REST, last, "previous_plan"
     )
     assert blind.status is Status.INVALID_MEASUREMENT

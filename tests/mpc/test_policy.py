@@ -4,7 +4,7 @@ import pytest
 from gpmpc.exceptions import SettingError, SolverFailure
 from gpmpc.gaussian import Gaussian
 from gpmpc.mpc import ControlLoop, Decision, Reference, Timing
-from gpmpc.mpc._policy import command
+from gpmpc.mpc._policy import decide
 from gpmpc.mpc.problem import Box, Problem, Tracking
 from gpmpc.status import Status
 
@@ -41,7 +41,7 @@ def run(planner, steps, on_failure, beliefs=None, reference=FAR):
     last = None
     commands = []
     for k in range(steps):
-        last = command(
+        last = decide(
             planner, beliefs[k] if beliefs else STATE, reference, last, on_failure, k
         )
         commands.append(last)
@@ -150,7 +150,7 @@ def test_before_the_first_plan_each_step_applies_its_own_reference_input(on_fail
     applied = []
     for k in range(4):
         reference = Reference(np.zeros((5, 1)), 100.0 + k + np.arange(4.0)[:, None])
-        last = command(planner, STATE, reference, last, on_failure, k)
+        last = decide(planner, STATE, reference, last, on_failure, k)
         applied.append(last.input[0])
     assert applied == [100, 101, 102, 30]
     assert last.plan.status.solved

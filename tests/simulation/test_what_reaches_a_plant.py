@@ -6,7 +6,7 @@ import pytest
 from gpmpc.exceptions import ShapeError, SolverFailure
 from gpmpc.gaussian import Gaussian
 from gpmpc.mpc import Decision, Reference, Timing
-from gpmpc.mpc._policy import command, commands
+from gpmpc.mpc._policy import decide, decide_many
 from gpmpc.mpc.problem import Box, Problem, Tracking
 from gpmpc.propagation import Linearization
 from gpmpc.simulation import Cascade, ModelLoop, cascade_loop, closed_loop, closed_loops
@@ -180,14 +180,14 @@ def test_a_loop_of_ones_own_is_stopped_where_the_policy_says_so(kind):
         SolverFailure,
         match="step 7: its plan, SOLVED, is not finite or out of its bounds or shape",
     ):
-        command(Liar({0: kind}), state, reference, None, "raise", 7)
-    (first,) = commands(Liar({0: kind}), [state], reference, [None], "hold", 7)
+        decide(Liar({0: kind}), state, reference, None, "raise", 7)
+    (first,) = decide_many(Liar({0: kind}), [state], reference, [None], "hold", 7)
     assert first.failed
     assert np.array_equal(
         first.input, Liar.initial_input
     )  # there is nothing else to hold
-    good = command(Liar(), state, reference)
-    held = command(Liar({0: kind}), state, reference, good, "hold")
+    good = decide(Liar(), state, reference)
+    held = decide(Liar({0: kind}), state, reference, good, "hold")
     assert held.failed
     assert held.status is Status.NUMERICAL_TROUBLE
     assert np.array_equal(held.input, good.input)
@@ -208,7 +208,7 @@ def test_what_misses_a_bound_by_rounding_is_put_onto_it():
                 Timing(0.0, 0.0, 0.0),
             )
 
-    asked = command(
+    asked = decide(
         Loose(), Gaussian.certain(START), Reference(REFERENCES.states[: H + 1])
     )
     assert asked.input.tolist() == [7.5, 0.1, -0.1 + 1e-7]
@@ -224,7 +224,7 @@ def test_a_reference_that_is_not_finite_is_nothing_to_fall_back_on():
     lost = Gaussian.certain(START * np.nan)
     reference = Reference(REFERENCES.states[: H + 1], np.full((H, 3), np.nan))
     with pytest.raises(SolverFailure, match="no reference input to fall back on"):
-        command(Liar(), lost, reference, None, "hold")
+        decide(Liar(), lost, reference, None, "hold")
 
 
 def test_a_controller_without_declared_bounds_is_held_to_finite_inputs_of_the_plants_number():
