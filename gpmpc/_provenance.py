@@ -84,7 +84,7 @@ def is_of_this_code(about: Mapping[str, Any], settings: Any = None) -> bool:
 
 
 def source_fingerprint(package: Path) -> str:
-    """Returns 32 digits that differ where any source file of gpmpc or its experiments does.
+    """Returns 32 digits that differ where any source file of gpmpc does.
 
     They are the same in a checkout and in what is installed from it, wherever that lies,
     whenever its files were written, and with either kind of line ending.
@@ -96,9 +96,6 @@ def source_fingerprint(package: Path) -> str:
         GpmpcError: No file has one of the endings that are looked for.
     """
     files = _source_files(package, "gpmpc")
-    # In a checkout the experiments stand beside the package, in a wheel inside it.
-    if "gpmpc/experiments/tables.py" not in files:
-        files |= _source_files(package.parent / "experiments", "gpmpc/experiments")
     for ending in _SOURCES:
         if not any(name.endswith(ending) for name in files):
             raise GpmpcError(

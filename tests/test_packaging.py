@@ -37,7 +37,11 @@ def test_the_wheel_carries_the_settings_the_printed_figures_and_its_types(wheel)
     settings = {str(path.relative_to(ROOT)) for path in (ROOT / "conf").rglob("*.yaml")}
     assert {f"gpmpc/{name}" for name in settings} <= set(names)
     assert "gpmpc/py.typed" in names
-    results = {path.name for path in (ROOT / "experiments").iterdir() if path.is_file()}
+    results = {
+        path.name
+        for path in (ROOT / "gpmpc" / "experiments").iterdir()
+        if path.is_file()
+    }
     assert {
         "paper_tables.csv",
         "paper_timings.csv",

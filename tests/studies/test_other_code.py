@@ -43,7 +43,7 @@ print(json.dumps([gpmpc.__file__, store.records[name]["variance"]]))
 @pytest.fixture
 def copy(tmp_path):
     """A copy of the checkout's code, compiled kernels included."""
-    for name in ("gpmpc", "experiments", "conf"):
+    for name in ("gpmpc", "conf"):
         shutil.copytree(ROOT / name, tmp_path / "copy" / name)
     return tmp_path / "copy"
 

@@ -15,9 +15,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from gpmpc._files import write_whole
-from gpmpc.estimation import KalmanFilter, Measurement, estimate_delay
-from gpmpc.experiments.realaigym import (
+from benchmarks.realaigym import (
     INPUT,
     TORQUE,
     Array,
@@ -26,6 +24,8 @@ from gpmpc.experiments.realaigym import (
     state_of,
     torque_limits,
 )
+from gpmpc._files import write_whole
+from gpmpc.estimation import KalmanFilter, Measurement, estimate_delay
 from gpmpc.gaussian import Gaussian
 from gpmpc.models import Affine, DisturbedModel, KnownModel, RollOut
 

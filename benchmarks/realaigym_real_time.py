@@ -15,8 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from gpmpc._kernels.gp_rollout import Feedback
-from gpmpc.experiments.realaigym import (
+from benchmarks.realaigym import (
     BRAKE,
     INPUT,
     PLAN,
@@ -28,6 +27,7 @@ from gpmpc.experiments.realaigym import (
     state_of,
     upright,
 )
+from gpmpc._kernels.gp_rollout import Feedback
 from gpmpc.gaussian import Gaussian
 from gpmpc.models import RollOut
 from gpmpc.mpc import GPMPC, ControlLoop, Decision, ManyStarts, Reference

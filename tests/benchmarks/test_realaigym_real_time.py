@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from gpmpc.experiments import realaigym_real_time, realaigym_robustness
-from gpmpc.experiments.realaigym import (
+from benchmarks import realaigym_real_time, realaigym_robustness
+from benchmarks.realaigym import (
     ACTUATED,
     INPUT,
     JOINTS,
@@ -19,9 +19,9 @@ from gpmpc.experiments.realaigym import (
     right_hand_side,
     state_of,
 )
-from gpmpc.experiments.realaigym_film import film
-from gpmpc.experiments.realaigym_real_time import real_time_pilot
-from gpmpc.experiments.realaigym_robustness import RateFilter, Watchful, robustness
+from benchmarks.realaigym_film import film
+from benchmarks.realaigym_real_time import real_time_pilot
+from benchmarks.realaigym_robustness import RateFilter, Watchful, robustness
 from gpmpc.models import KnownModel, RollOut
 from gpmpc.systems import double_pendulum
 

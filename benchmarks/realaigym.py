@@ -1,6 +1,6 @@
 """Plays the double pendulum of the RealAIGym league (simulation board of 2025): swing up from anywhere, and stay there.
 
-``python -m gpmpc.experiments.realaigym robot=acrobot model=residual seeds=0,1 draws=3`` learns a model, lets the
+``python -m benchmarks.realaigym robot=acrobot model=residual seeds=0,1 draws=3`` learns a model, lets the
 league's own classes disturb and simulate, and prints the board with a row of ours. Models: ``true`` (the published
 equations and parameters), ``residual`` (a rigid body, each of whose parameters is 15 % wrong at first, is fitted by
 least squares, and a GP learns what is left) and ``gp`` (a GP alone). They are learned from 60 s: 20 s of random torque,
@@ -289,7 +289,7 @@ ENTRY = '''\
 from pathlib import Path
 
 from double_pendulum.controller.abstract_controller import AbstractController
-from gpmpc.experiments.realaigym import league_controller, pilot, read_model
+from benchmarks.realaigym import league_controller, pilot, read_model
 
 leaderboard_config = {{
     "csv_path": "{name}/sim_swingup.csv",
@@ -366,7 +366,7 @@ def play_robustness(entry: Path, robot: str, kind: str, size: int) -> str:
     """The parts of the league's robustness board, with a number of values of each quantity, as a table."""
     from double_pendulum.controller.abstract_controller import AbstractController
 
-    from gpmpc.experiments.realaigym_robustness import Watchful, robustness
+    from benchmarks.realaigym_robustness import Watchful, robustness
 
     path = beside(entry, ".safetensors")
     model = read_model(robot, kind, path)
@@ -390,7 +390,7 @@ def play_robustness(entry: Path, robot: str, kind: str, size: int) -> str:
 
 def play_film(entry: Path, robot: str, kind: str) -> Path:
     """Writes the first 8 s of draw 100 as a GIF beside an entry."""
-    from gpmpc.experiments.realaigym_film import film
+    from benchmarks.realaigym_film import film
 
     path = beside(entry, ".gif")
     model = read_model(robot, kind, beside(entry, ".safetensors"))
@@ -840,7 +840,7 @@ def _real_time_pilot(model: Any, robot: str) -> Any:
 
     Few starts have converged after their programs: with one program a decision 60 % of their plans are lost.
     """
-    from gpmpc.experiments.realaigym_real_time import real_time_pilot
+    from benchmarks.realaigym_real_time import real_time_pilot
 
     return real_time_pilot(make_parts(model, RATES[robot], kept=3), JOINTS[robot])
 

@@ -7,7 +7,7 @@ from matplotlib.animation import FuncAnimation, PillowWriter
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from gpmpc.experiments.realaigym import INPUT, LENGTHS, LINE, TORQUE, Play
+from benchmarks.realaigym import INPUT, LENGTHS, LINE, TORQUE, Play
 
 RATE = 20  # frames a second
 

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from gpmpc.exceptions import SettingError
-from gpmpc.experiments import realaigym
-from gpmpc.experiments.realaigym import (
+from benchmarks import realaigym
+from benchmarks.realaigym import (
     ACTUATED,
     BRAKE,
     PAUSE,
@@ -37,6 +36,7 @@ from gpmpc.experiments.realaigym import (
     write_entry,
     wrong_system,
 )
+from gpmpc.exceptions import SettingError
 from gpmpc.models import KnownModel
 from gpmpc.systems import double_pendulum, step_many
 
