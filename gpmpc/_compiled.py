@@ -1,25 +1,29 @@
-"""Compilation of the package's kernels by numba: serial, mostly without the interpreter's lock, once per machine.
+"""Compiles the package's kernels with numba: serial, and once per machine.
 
-A kernel is what Python calls: ``compiled``. What only other compiled functions call is ``njit_inner``, ``njit_noalloc``
-or ``inline_njit``: it has no machine code of its own but is optimised inside each kernel that it is a part of, which
-saves more than half of the time that compilation takes.
+A kernel is what Python calls: ``compiled``. What only other compiled functions call is
+``njit_inner``, ``njit_noalloc`` or ``inline_njit``: it has no machine code of its own
+but is optimised inside each kernel that it is a part of, which saves more than half of
+the time that compilation takes. Kernels let go of the interpreter's lock, unless they
+are ``locked``.
 
-numba keeps the machine code beside the source, or in the user's cache folder when the installation is read-only. When
-neither can be written it refuses to cache; the kernels are then compiled anew in each process. Sums may be reordered
-(that is what makes them vectorise); infinities and NaN keep their meaning. A kernel's results are the same to the last
-bit whether it was compiled in this process or loaded, and whatever else was.
+numba keeps the machine code beside the source, or in the user's cache folder when the
+installation is read-only. When neither can be written it refuses to cache; the kernels
+are then compiled anew in each process. Sums may be reordered (that is what makes them
+vectorise); infinities and NaN keep their meaning. A kernel's results are the same to
+the last bit whether it was compiled in this process or loaded, and whatever else was.
 
-A kernel contains what it calls and the constants that it reads, wherever they are written; numba looks at the kernel's
-own file only. So what is kept here is valid for one state of all modules of the package that the kernel's module
-imports, directly or not.
+A kernel contains what it calls and the constants that it reads, wherever they are
+written; numba looks at the kernel's own file only. So machine code is loaded only if no
+module of the package that the kernel's module imports, directly or not, has changed.
 """
 
 import hashlib
+import inspect
 import re
 import sys
 from collections.abc import Callable
 from contextlib import suppress
-from functools import cache, partial
+from functools import cache, partial, update_wrapper
 from pathlib import Path
 from threading import Lock
 from typing import Any, ParamSpec, Protocol, TypeVar, overload
@@ -27,27 +31,27 @@ from typing import Any, ParamSpec, Protocol, TypeVar, overload
 import numba
 from numba.extending import register_jitable
 
+P = ParamSpec("P")
+R = TypeVar("R")
+R_co = TypeVar("R_co", covariant=True)
+
 _compiling = Lock()
 
 
-P = ParamSpec("P")
-R = TypeVar("R", covariant=True)
-
-
-class Kernel(Protocol[P, R]):
+class Kernel(Protocol[P, R_co]):
     """A compiled function that Python calls."""
 
-    def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R:
-        """Runs the kernel after numba's look at the arguments' types."""
+    def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R_co:
+        """Runs the kernel after numba has looked at the arguments' types."""
         ...
 
     @property
-    def unchecked(self) -> Callable[P, R]:
-        """Runs the kernel without a look at the arguments, from the second call on.
+    def unchecked(self) -> Callable[P, R_co]:
+        """Runs the kernel without that look, from its second call on.
 
-        For callers that always pass arguments of the same types, by position, and
-        contiguous arrays. Where arguments are named tuples, that look takes longer than
-        many a kernel.
+        For callers that always pass arguments of the same types, and contiguous arrays,
+        by place or by name. Where arguments are named tuples, the look takes longer
+        than many a kernel.
         """
         ...
 
@@ -58,66 +62,73 @@ def compiled(function: Callable[P, R]) -> Kernel[P, R]: ...
 
 @overload
 def compiled(
-    *,
-    allocates: bool = True,
-    kernel: bool = True,
-    inline: bool = False,
-    locked: bool = False,
+    *, allocates: bool = True, locked: bool = False
 ) -> Callable[[Callable[P, R]], Kernel[P, R]]: ...
 
 
 def compiled(
-    function: Callable | None = None,
-    *,
-    allocates: bool = True,
-    kernel: bool = True,
-    inline: bool = False,
-    locked: bool = False,
+    function: Callable | None = None, *, allocates: bool = True, locked: bool = False
 ) -> Any:
-    """Compiles ``function`` at its first call.
+    """Compiles a function that Python calls, at its first call; a decorator.
 
     Args:
-        function: The function; this is a decorator.
-        allocates: False if it, and all that it calls, make no array but views of those they are given. numba then
-            counts no references: an atomic operation for each view, which is 40 % of a solve of two microseconds.
-        kernel: Whether Python calls its machine code. Otherwise only other compiled functions do, which is cheaper to
-            compile; in Python it stays the function that it is.
-        inline: Whether its code is put into each of its callers. A call hands over an array as seven numbers, so that
-            one with a dozen arrays takes longer than the work on a few short vectors.
-        locked: Whether it keeps the interpreter's lock, as a kernel of microseconds may: two threads are then never in
-            it at once and can share its workspace. To let go of the lock takes a fortieth of a microsecond.
+        function: The function.
+        allocates: False if it, and all that it calls, make no arrays but views of those
+            they are given. numba then counts no references: an atomic operation for
+            each view, which is 40 % of a solve of two microseconds.
+        locked: Whether it keeps the interpreter's lock, as a kernel of microseconds
+            may: two threads are then never in it at once and can share its workspace.
+            To let go of the lock takes a fortieth of a microsecond.
     """
     if function is None:
-        return partial(
-            compiled, allocates=allocates, kernel=kernel, inline=inline, locked=locked
-        )
-    options = {
-        "nogil": not locked,
+        return partial(compiled, allocates=allocates, locked=locked)
+    options = _options(allocates) | _KERNEL_OPTIONS | {"nogil": not locked}
+    kernel = _jit_cached(function, options)
+    kernel.unchecked = _unchecked_call(function, kernel)
+    return kernel
+
+
+def njit_inner(function: Callable[P, R]) -> Callable[P, R]:
+    """Compiles a part of other compiled functions; in Python it stays as it is."""
+    options = _options(allocates=True) | _INNER_OPTIONS
+    return register_jitable(**options)(function)
+
+
+def njit_noalloc(function: Callable[P, R]) -> Callable[P, R]:
+    """Compiles a part of other compiled functions that makes no arrays but views."""
+    options = _options(allocates=False) | _INNER_OPTIONS
+    return register_jitable(**options)(function)
+
+
+def inline_njit(function: Callable[P, R]) -> Callable[P, R]:
+    """Puts the code of a function that makes no arrays into each of its callers.
+
+    A call hands over an array as seven numbers, so that one with a dozen arrays takes
+    longer than the work on a few short vectors.
+    """
+    options = _options(allocates=False) | _INNER_OPTIONS
+    return register_jitable(**options, forceinline=True)(function)
+
+
+def _options(allocates: bool) -> dict[str, Any]:
+    """Returns numba's options that all compiled functions share."""
+    options: dict[str, Any] = {
+        "nogil": True,
         "fastmath": {"reassoc", "contract", "nsz"},
-        "forceinline": inline,
     }
-    options |= _PRIVATE_OPTIONS[kernel] | ({} if allocates else {"_nrt": False})
-    if not kernel:
-        return register_jitable(**options)(function)
-    dispatcher = _jit_cached(function, options)
-    _offer_unchecked_calls(dispatcher)
-    return dispatcher
+    if not allocates:
+        options["_nrt"] = False
+    return options
 
 
-njit_inner: Any = partial(compiled, kernel=False)
-"""Compiles a part of other compiled functions."""
-
-njit_noalloc: Any = partial(njit_inner, allocates=False)
-"""Compiles a part of other compiled functions that makes no arrays but views."""
-
-inline_njit: Any = partial(njit_noalloc, inline=True)
-"""Compiles such a function into each of its callers."""
-
-# numba optimises every function that a kernel calls, and makes machine code of it, before it does so for the kernel,
-# which contains it all. No public interface prevents that, nor does one prevent a kernel from running another kernel's
-# copy of what both call. Where a numba without these private parts is installed, kernels are compiled as it does by
-# itself: slower to start, and their last digits depend on what was loaded before. ``tests/test_compiled.py`` notices.
-_PRIVATE_OPTIONS: dict[bool, dict[str, Any]] = {True: {}, False: {}}
+# numba optimises every function that a kernel calls, and makes machine code of it,
+# before it does so for the kernel, which contains it all. No public interface prevents
+# that, nor does one prevent a kernel from running another kernel's copy of what both
+# call. Where a numba without these private parts is installed, kernels are compiled as
+# it does by itself: slower to start, and their last digits depend on what was loaded
+# before. ``tests/test_compiled.py`` notices.
+_KERNEL_OPTIONS: dict[str, Any] = {}
+_INNER_OPTIONS: dict[str, Any] = {}
 with suppress(ImportError):
     from numba.core.codegen import JITCodeLibrary
     from numba.core.compiler import Compiler
@@ -125,8 +136,9 @@ with suppress(ImportError):
     class _KernelLibrary(JITCodeLibrary):
         """A kernel's machine code, with its own copies of all that it calls.
 
-        numba lets the linker take any other copy of the same name: that of another kernel that was loaded earlier. They
-        are optimised, and so rounded, each in its own way.
+        numba lets the linker take any other copy of the same name: that of another
+        kernel that was loaded earlier. They are optimised, and so rounded, each in its
+        own way.
         """
 
         def _finalize_final_module(self):
@@ -136,7 +148,10 @@ with suppress(ImportError):
             super()._finalize_final_module()
 
     class _InnerLibrary(JITCodeLibrary):
-        """LLVM's intermediate code of a part of kernels: linked into them, neither optimised nor assembled before."""
+        """LLVM's intermediate code of a part of kernels.
+
+        It is linked into them, and neither optimised nor assembled before.
+        """
 
         class _NoEngine:
             def set_env(self, name, environment):
@@ -152,7 +167,7 @@ with suppress(ImportError):
             self._finalized = True
 
         def get_pointer_to_function(self, name):
-            """Nothing: Python calls the function itself."""
+            """Returns nothing: Python calls the function itself."""
             return 0
 
     class _KernelCompiler(Compiler):
@@ -163,67 +178,72 @@ with suppress(ImportError):
                 self.state.library = self.library(
                     self.state.targetctx.codegen(), self.state.func_id.func_qualname
                 )
-                self.state.library.enable_object_caching()  # as numba does where it makes a library of its own
+                # as numba does where it makes a library of its own
+                self.state.library.enable_object_caching()
             return super().define_pipelines()
 
     class _InnerCompiler(_KernelCompiler):
         library = _InnerLibrary
 
-    # nothing in C calls a kernel, and Python no inner function: ways in take a tenth of the time
-    _PRIVATE_OPTIONS[True] = {
-        "pipeline_class": _KernelCompiler,
-        "no_cfunc_wrapper": True,
-    }
-    _PRIVATE_OPTIONS[False] = {
-        "pipeline_class": _InnerCompiler,
-        "no_cfunc_wrapper": True,
-        "no_cpython_wrapper": True,
-    }
+    # nothing in C calls a kernel, and Python no inner function: to make these ways in
+    # would take a tenth of the time of compilation
+    _KERNEL_OPTIONS.update(pipeline_class=_KernelCompiler, no_cfunc_wrapper=True)
+    _INNER_OPTIONS.update(
+        pipeline_class=_InnerCompiler, no_cfunc_wrapper=True, no_cpython_wrapper=True
+    )
 
 
-def _jit_cached(function: Callable, options: dict) -> Callable:
+def _jit_cached(function: Callable, options: dict[str, Any]) -> Any:
     try:
         kernel: Any = numba.njit(cache=True, **options)(function)
     except RuntimeError:  # "cannot cache function ...: no locator available"
         return numba.njit(**options)(function)
     with suppress(AttributeError):  # another numba: edits of other files go unseen
         index = kernel._cache._cache_file
-        # compared before anything else in the index is read, which may name modules that are gone
+        # the version is compared before anything else in the index is read, which may
+        # name modules that are gone
         index._version = f"{index._version} {sources_stamp(function.__module__).hex()}"
     return kernel
 
 
-def _offer_unchecked_calls(kernel: Any) -> None:
-    """Gives a kernel its attribute ``unchecked``; see ``Kernel``."""
+def _unchecked_call(function: Callable, kernel: Any) -> Callable:
+    """Makes a function's ``Kernel.unchecked``.
 
-    def call_and_remember(*arguments: Any) -> Any:
-        result = kernel(*arguments)
-        kernel.unchecked = unchecked_entry_point(kernel)
-        return result
+    Machine code takes its arguments by place alone. A function that has the kernel's
+    parameters puts them in place, and costs no dictionary of names as ``**kwargs``
+    would.
+    """
 
-    kernel.unchecked = call_and_remember
+    def run_first(*arguments: Any) -> Any:
+        value = kernel(*arguments)
+        namespace["run"] = unchecked_entry_point(kernel)
+        return value
+
+    names = ", ".join(inspect.signature(function).parameters)
+    namespace: dict[str, Any] = {"run": run_first}
+    exec(f"def unchecked({names}): return run({names})", namespace)
+    return update_wrapper(namespace["unchecked"], function)
 
 
 def sources_stamp(module: str) -> bytes:
-    """A hash of the sources of a module and of all those it imports, directly or not, from its own package or this one.
+    """Returns a hash of the sources of a module and of all that it imports.
 
-    The modules must have been imported: of others no kernel can contain anything. Imports are to be absolute.
+    Modules that it imports indirectly count too; those of other packages than its own
+    and this one do not. The modules must have been imported: of others no kernel can
+    contain anything. Imports are to be absolute.
     """
     packages = {name.partition(".")[0] for name in (module, __name__)}
     pending = [module]
-    seen = {}
+    digests: dict[str, bytes] = {}
     while pending:
         name = pending.pop()
-        if (
-            name not in seen
-            and name.partition(".")[0] in packages
-            and name in sys.modules
-        ):
-            seen[name], imported = _read_source(
-                getattr(sys.modules[name], "__file__", None)
-            )
-            pending += imported
-    return hashlib.sha256(b"".join(seen[name] for name in sorted(seen))).digest()
+        package = name.partition(".")[0]
+        if name in digests or package not in packages or name not in sys.modules:
+            continue
+        file = getattr(sys.modules[name], "__file__", None)
+        digests[name], imported = _read_source(file)
+        pending += imported
+    return hashlib.sha256(b"".join(digests[name] for name in sorted(digests))).digest()
 
 
 _IMPORT = re.compile(
@@ -233,7 +253,7 @@ _IMPORT = re.compile(
 
 @cache
 def _read_source(path: str | None) -> tuple[bytes, list[str]]:
-    """The hash of a file, and the names in its import statements that can be modules."""
+    """Returns a file's hash, and the names in its imports that can be modules."""
     try:
         source = Path(path or "").read_text(encoding="utf-8")
     except OSError:  # in an archive, or no file at all
@@ -249,9 +269,10 @@ def _read_source(path: str | None) -> tuple[bytes, list[str]]:
 
 
 def compile_for(kernel: Any, signature: str) -> None:
-    """Compiles ``kernel`` for one signature and no other: it then refuses other types with ``TypeError``.
+    """Compiles a kernel for one signature and no other.
 
-    Without this numba would quietly build a second kernel for Fortran-ordered or integer arrays.
+    It then refuses other types with ``TypeError``. Without this numba would quietly
+    build a second kernel for Fortran-ordered or integer arrays.
     """
     with _compiling:
         if not kernel.signatures:
@@ -260,10 +281,11 @@ def compile_for(kernel: Any, signature: str) -> None:
 
 
 def unchecked_entry_point(kernel: Any) -> Callable:
-    """The machine code of a compiled kernel, called without numba's look at the arguments, a quarter of a microsecond.
+    """Returns the machine code of a compiled kernel, which checks no argument's type.
 
-    The caller has to see to it that each argument is a NumPy array of the right dtype; other objects and other numbers
-    of axes raise ``TypeError``, strides are the kernel's business.
+    The caller has to see to it that each argument is a NumPy array of the right dtype;
+    other objects and other numbers of axes raise ``TypeError``, strides are the
+    kernel's business.
     """
     try:
         return next(iter(kernel.overloads.values())).entry_point

@@ -210,7 +210,7 @@ def test_numba_still_has_the_private_parts_that_are_used_here():
         3.0,
         2.0,
     )  # as a part of the kernel, and in Python
-    anew = numba.njit(**gpmpc._compiled._PRIVATE_OPTIONS[True])(
+    anew = numba.njit(**gpmpc._compiled._KERNEL_OPTIONS)(
         kernel.py_func
     )  # ``kernel`` may have been loaded
     anew(1.0)
@@ -226,7 +226,8 @@ def test_numba_still_has_the_private_parts_that_are_used_here():
 
 
 def test_without_numbas_private_parts_kernels_compile_in_its_own_way(monkeypatch):
-    monkeypatch.setattr(gpmpc._compiled, "_PRIVATE_OPTIONS", {True: {}, False: {}})
+    monkeypatch.setattr(gpmpc._compiled, "_KERNEL_OPTIONS", {})
+    monkeypatch.setattr(gpmpc._compiled, "_INNER_OPTIONS", {})
 
     @gpmpc._compiled.njit_noalloc
     def inner(x):
@@ -246,3 +247,14 @@ def test_another_numba_caches_in_its_own_way(monkeypatch):
 
     monkeypatch.setattr(numba, "njit", lambda **options: lambda function: Kernel())
     assert isinstance(gpmpc._compiled.compiled(len), Kernel)
+
+
+def test_unchecked_calls_take_arguments_by_place_and_by_name():
+    @gpmpc._compiled.compiled
+    def divide(x, y):
+        return x / y
+
+    for _ in range(2):  # compiled, and then straight to the machine code
+        assert divide.unchecked(1.0, 2.0) == divide.unchecked(y=2.0, x=1.0) == 0.5
+    with pytest.raises(TypeError, match="y"):
+        divide.unchecked(1.0)
