@@ -29,9 +29,16 @@ from benchmarks.timing import (
 )
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior
-from gpmpc.mpc import Controller, Decision, PredictionSettings, Reference
-from gpmpc.mpc.gp_mpc import GPMPC
-from gpmpc.mpc.problem import Box, Problem, Tracking
+from gpmpc.mpc import (
+    GPMPC,
+    Box,
+    Controller,
+    Decision,
+    PredictionSettings,
+    Problem,
+    Reference,
+    Tracking,
+)
 from gpmpc.plotting import png
 from gpmpc.propagation import Linearization, MomentMatching, differentiate
 from gpmpc.simulation import closed_loop
