@@ -1,4 +1,22 @@
-"""Logs of real systems: reading, checking, learning from them, and judging what was learned."""
+"""Logs of real systems: reading, checking, learning from them, and judging the models.
+
+How ``read_log`` makes rows of files, and where each step is:
+
+1. file          ``_formats`` finds the reader by the file's ending; one file a format.
+                 To add a format, see there. It returns tables by topic (``_file``).
+2. channels      ``_signals`` reads the columns that the mapping names (``_mapping``),
+                 in SI units (``_units``), without what nobody measured (``_dropouts``).
+3. clock         ``_clocks`` orders the stamps; ``_resampling`` makes one grid for all
+                 topics; ``_run_tables`` puts the signals of a run on it.
+4. rows          ``_usable_rows`` leaves out rows at rest or without a value, and marks
+                 where pieces begin.
+5. frames        ``_frames`` brings rigid bodies to ENU and FLU axes, after
+6. conventions   ``_conventions`` has checked that their columns fit each other; if not,
+                 it searches what they mean instead (``_interpretations``).
+7. log           ``_log``: the runs, with what was noticed on the way (``_findings``).
+
+``_read_log`` holds these steps in their order; ``_inspection`` looks at a file before.
+"""
 
 from gpmpc.logs._fitting import fit_nominal
 from gpmpc.logs._inspection import Inspection, inspect_log
@@ -7,7 +25,7 @@ from gpmpc.logs._kinematics import RigidBody
 from gpmpc.logs._learning import Learned, learn
 from gpmpc.logs._log import Log
 from gpmpc.logs._mapping import LogMapping
-from gpmpc.logs._reading import read_log
+from gpmpc.logs._read_log import read_log
 from gpmpc.logs._rollouts import LogModel, MultirotorNominal
 from gpmpc.logs._storage import (
     LogDynamics,

@@ -1,200 +1,104 @@
-"""Reads CSV text as a table, whoever wrote it.
+"""Reads CSV files as tables; how a file is written is found out by ``_csv_text``.
 
-Programs differ in the encoding, the delimiter, the decimal mark and where they put
-comments. Each is recognised by the text itself, or refused by its name; none is guessed
-from the language of the machine. The text is read line by line, so that what it takes
-is the table.
+The size of the text is counted before anything of it is parsed, and it is parsed part
+by part, so that the texts in its cells are counted before there are many.
 """
 
-import codecs
+import gzip
 import io
-import re
-from collections.abc import Iterator
-from itertools import chain, islice
-from typing import NamedTuple
+import warnings
+from pathlib import Path
+from typing import Any
 
 import pandas as pd
 
+from gpmpc._bounds import Room
 from gpmpc.exceptions import DataError
-
-DELIMITERS = ",;\t"
-_COMMENT = re.compile(r"\s*(#|%|//)\s*")
-_DECIMAL_COMMA = re.compile(r"\s*[+-]?\d+,\d+([eE][+-]?\d+)?\s*")
-_SAMPLE = 50  # lines that the decimal mark is looked for in
-_START = 1000  # bytes that the encoding is looked for in
-_ENCODINGS = (  # the longer marks first: that of UTF-32 begins as that of UTF-16
-    (codecs.BOM_UTF32_LE, "utf-32"),
-    (codecs.BOM_UTF32_BE, "utf-32"),
-    (codecs.BOM_UTF16_LE, "utf-16"),
-    (codecs.BOM_UTF16_BE, "utf-16"),
+from gpmpc.logs._csv_text import DELIMITERS, CsvText, open_csv
+from gpmpc.logs._file import (
+    NUMBER_BYTES,
+    TEXT_BYTES,
+    LogFile,
+    ReadOptions,
+    check_column_count,
+    run_name,
 )
+from gpmpc.logs._findings import Finding
+
+LONGEST_LINE = 2**20  # of a text file [bytes]
+_DELIMITERS = [mark.encode() for mark in DELIMITERS]
+_CELLS_PER_PART = 500_000  # that are parsed at once
+_QUOTED_COPIES = 3  # further ones of a text in quotes, which may stand over many lines
+# Before version 3, pandas reads some numbers wrong in their last digit otherwise.
+_EXACT: dict[str, Any] = {}
+if int(pd.__version__.split(".")[0]) < 3:
+    _EXACT = {"float_precision": "round_trip"}
 
 
-class CsvText(NamedTuple):
-    """The text of a CSV file in the form that pandas reads, and how it is written."""
-
-    text: "_Text"  #: the names of the columns and the rows, without comments
-    names: list[str]  #: of the columns
-    delimiter: str
-    decimal: str  #: the decimal mark
-
-    @property
-    def is_cut(self) -> bool:
-        """Whether the last line has no end, known where all is read.
-
-        It may be cut within a number, and is left out.
-        """
-        return self.text.lines.cut
-
-
-def open_csv(label: str, file: io.BufferedReader) -> CsvText:
-    """Finds out how a CSV file is written.
-
-    Args:
-        label: The file's name, for errors.
-        file: The text, unpacked. Its first line names the columns. Lines that begin
-            with #, % or // are comments; the last one before the first line names the
-            columns where that line holds numbers.
-
-    Raises:
-        DataError: It is no such text; the message says why.
-    """
-    lines = _Lines(label, file)
-    head = list(islice(lines, 1 + _SAMPLE))
-    if head and lines.comment and _holds_numbers(head[0]):
-        head.insert(0, lines.comment)
-    if not head:
-        raise DataError(f"{label}: holds no line with the names of the columns")
-    delimiter = max(DELIMITERS, key=lambda mark: len(_fields(head[0], mark)))
-    names = [name.strip() for name in _fields(head[0], delimiter)]
-    if len(set(names)) < len(names) or _holds_numbers(head[0]):
-        raise DataError(
-            f"{label}: the first line must name every column differently; got "
-            f"{', '.join(names)}"
-        )
-    return CsvText(
-        text=_Text(head, lines),
-        names=names,
-        delimiter=delimiter,
-        decimal=_decimal_mark(label, names, head[1:], delimiter),
-    )
+def read_csv(path: Path, options: ReadOptions) -> LogFile:
+    """Reads a file, packed or not, as one table."""
+    room = Room(path)
+    _check_text(path, room)
+    with _open(path) as file:
+        csv = open_csv(str(path), file)
+        with warnings.catch_warnings():  # of rows that are longer than the header
+            warnings.simplefilter("error", pd.errors.ParserWarning)
+            table = _read_in_parts(csv, room)
+    findings: tuple[Finding, ...] = ()
+    if csv.is_cut:
+        text = "the last line has no end, and may be cut within a number: left out"
+        findings = (Finding("cut line", run_name(path), 1, text),)
+    return LogFile({"": table.rename(columns=str.strip)}, findings)
 
 
-class _Lines(Iterator[str]):
-    """The lines of a file that are neither blank nor comments, but a cut last one."""
-
-    def __init__(self, label: str, file: io.BufferedReader):
-        self.encoding = _find_encoding(file.peek(_START)[:_START])
-        self.comment = ""  # before the first line, the last one
-        self.cut = False
-        self._label = label
-        self._text = io.TextIOWrapper(file, encoding=self.encoding)
-        self._count = 0
-        self._began = False
-
-    def __next__(self) -> str:
-        while True:
-            line = self._read_line()
-            if not line:
-                raise StopIteration
-            if not line.endswith("\n") and self._began:
-                self.cut = True
-                raise StopIteration
-            comment = _COMMENT.match(line)
-            if comment is None and line.strip():
-                self._began = True
-                return line
-            if comment is not None and not self._began:
-                self.comment = line[comment.end() :]
-
-    def _read_line(self) -> str:
-        """The next line with its end; empty behind the last."""
-        self._count += 1
-        try:
-            return self._text.readline()
-        except UnicodeDecodeError as error:
-            byte = f"byte 0x{error.object[error.start]:02x} near line {self._count}"
-            name = self.encoding.removesuffix("-sig").upper()
-            raise DataError(
-                f"{self._label}: {byte} is no text in {name}: save the file as UTF-8"
-            ) from error
+def _open(path: Path) -> io.BufferedReader:
+    """Opens a file, unpacked where it is packed."""
+    if path.name.lower().endswith(".gz"):
+        return io.BufferedReader(gzip.GzipFile(path))
+    return path.open("rb")
 
 
-class _Text(io.TextIOBase):
-    """Lines as a file that pandas reads, those of the head before all others."""
-
-    def __init__(self, head: list[str], lines: _Lines):
-        self.lines = lines
-        self._all_lines = chain(head, lines)
-        self._rest = ""
-
-    def read(self, size: int | None = -1, /) -> str:
-        """The next ``size`` characters, all of them where it is negative."""
-        length = len(self._rest)
-        parts = [self._rest]
-        while size is None or size < 0 or length < size:
-            line = next(self._all_lines, "")
-            if not line:
-                break
-            parts.append(line)
-            length += len(line)
-        text = "".join(parts)
-        end = len(text) if size is None or size < 0 else size
-        self._rest = text[end:]
-        return text[:end]
+def _check_text(path: Path, room: Room) -> None:
+    """Counts what a text file unfolds to, before anything of it is parsed."""
+    with _open(path) as file:
+        first_line = file.readline(LONGEST_LINE)
+        check_column_count(path, _count_delimiters(first_line) + 1)
+        block = first_line
+        copies = 1
+        while block:
+            lines = max(block.count(b"\n"), block.count(b"\r"))
+            if len(block) == LONGEST_LINE and not lines:
+                raise DataError(f"{path}: has a line of more than {LONGEST_LINE} bytes")
+            if b'"' in block:
+                copies = 1 + _QUOTED_COPIES
+            cells = _count_delimiters(block) + lines
+            room.take(copies * len(block) + NUMBER_BYTES * cells, "its text")
+            block = file.read(LONGEST_LINE)
 
 
-def _find_encoding(start: bytes) -> str:
-    """The encoding of a text by its first bytes: UTF-8, or what its mark says."""
-    for mark, encoding in _ENCODINGS:
-        if start.startswith(mark):
-            return encoding
-    if start.count(0) <= len(start) // 4:
-        return "utf-8-sig"
-    # every second byte of Latin letters is zero
-    return "utf-16-le" if start[1:2] == b"\0" else "utf-16-be"
+def _count_delimiters(text: bytes) -> int:
+    return max(text.count(delimiter) for delimiter in _DELIMITERS)
 
 
-def _fields(line: str, delimiter: str) -> list[str]:
-    """The fields of one line, without their quotes."""
-    frame = pd.read_csv(
-        io.StringIO(line),
-        sep=delimiter,
-        header=None,
-        dtype=str,
-        keep_default_na=False,
+def _read_in_parts(csv: CsvText, room: Room) -> pd.DataFrame:
+    """Parses text part by part, so that texts are counted before there are many."""
+    parts: list[pd.DataFrame] = []
+    text_columns: set[Any] = set()
+    with pd.read_csv(
+        csv.text,
+        sep=csv.delimiter,
+        decimal=csv.decimal,
+        chunksize=max(_CELLS_PER_PART // len(csv.names), 1),
+        index_col=False,
         skipinitialspace=True,
-    )
-    return frame.iloc[0].tolist()
-
-
-def _holds_numbers(line: str) -> bool:
-    """Whether a field of a line is a number; the name of a column is none."""
-    delimiter = max(DELIMITERS, key=line.count)
-    for field in line.split(delimiter):
-        try:
-            float(field.strip().strip('"').replace(",", "."))
-        except ValueError:
-            continue
-        return True
-    return False
-
-
-def _decimal_mark(
-    label: str, names: list[str], lines: list[str], delimiter: str
-) -> str:
-    """The decimal mark of the first rows.
-
-    Raises:
-        DataError: The comma is the delimiter as well as the decimal mark.
-    """
-    samples = [_fields(line, delimiter) for line in lines]
-    if any(_DECIMAL_COMMA.fullmatch(field) for fields in samples for field in fields):
-        return ","
-    width = min((len(fields) for fields in samples), default=0)
-    if delimiter == "," and width >= 2 * len(names) > 2:
-        raise DataError(
-            f"{label}: the rows have {width} fields and the header {len(names)}: is the "
-            "comma the decimal mark too? separate columns by semicolons"
-        )
-    return "."
+        **_EXACT,
+    ) as reader:
+        for part in reader:
+            texts = part.select_dtypes(exclude=["number", "bool"])
+            room.take(TEXT_BYTES * texts.size, "its texts")
+            text_columns.update(texts.columns)
+            parts.append(part)
+    # Numbers in a column that also holds texts become objects, like texts.
+    numbers = sum(part[column].size for part in parts for column in text_columns)
+    room.take(TEXT_BYTES * numbers, "its texts")
+    return pd.concat(parts, ignore_index=True)

@@ -29,8 +29,8 @@ VARIED = 0.3  # of the usual change: changes below it are of a sensor without st
 def sentinels(values: Array) -> np.ndarray:
     """Finds sentinels in a column.
 
-    A known sentinel is one where it lies far beyond the range of all other values. Where
-    those do not move, or there are none, only negative and huge ones are certain.
+    A known sentinel is one where it lies far beyond the range of all other values.
+    Where those do not move, or there are none, only negative and huge ones are certain.
 
     Args:
         values: Of one column in the units of the file (K,).
@@ -47,8 +47,8 @@ def sentinels(values: Array) -> np.ndarray:
         return candidates & ((values < 0) | (np.abs(values) >= HUGE))
     lowest = measured.min()
     highest = measured.max()
-    reach = FAR * max(highest - lowest, abs(lowest), abs(highest))
-    return candidates & ((values < lowest - reach) | (values > highest + reach))
+    margin = FAR * max(highest - lowest, abs(lowest), abs(highest))
+    return candidates & ((values < lowest - margin) | (values > highest + margin))
 
 
 def zero_dropouts(states: Array) -> np.ndarray:
@@ -118,7 +118,7 @@ def changes_rarely(column: Array, moving: np.ndarray) -> bool:
 
 
 def _usual_change(changes: Array) -> Array:
-    """Median of each column's changes (K, n) that are not zero (n,); zero of none."""
+    """Returns the median of each column's changes (K, n) but zeros (n,); 0 of none."""
     nonzero = np.where(changes > 0, changes, np.nan)
     usual = np.zeros(changes.shape[1])
     moves = (changes > 0).any(axis=0)
@@ -127,7 +127,7 @@ def _usual_change(changes: Array) -> Array:
 
 
 def _stretches(rows: np.ndarray) -> list[tuple[int, int]]:
-    """First row, and row after the last, of each run of true entries (K,)."""
+    """Lists the first row, and the one after the last, of each stretch of true ones."""
     edges = np.diff(np.concatenate([[False], rows, [False]]).astype(int))
     begins = np.flatnonzero(edges == 1)
     ends = np.flatnonzero(edges == -1)

@@ -1,4 +1,7 @@
-"""Says how the messages of a bag's channel are read: ROS 2, JSON, or protobuf."""
+"""Finds the decoder of the messages of a bag's channel: ROS 2, JSON, or protobuf.
+
+Another encoding is entered in ``find_decoder``.
+"""
 
 import json
 from collections.abc import Callable, Iterable
@@ -8,7 +11,7 @@ from mcap.records import Channel, Schema
 
 from gpmpc._bounds import Room
 from gpmpc.exceptions import GpmpcError
-from gpmpc.logs._file import MOST_COLUMNS
+from gpmpc.logs._file import MOST_COLUMNS, first_line, needs_extra
 from gpmpc.logs._ros2 import LISTED, Cells, Decode, ros2_decoder
 
 _Fields = Iterable[tuple[str, Any]]
@@ -17,11 +20,11 @@ READ = "cdr with ros2msg, json, and protobuf are"
 
 
 class UnreadError(Exception):
-    """Messages of a kind that is not read; the text says why."""
+    """Messages are of a kind that is not read; the text says why."""
 
 
-def decoder(channel: Channel, schema: Schema | None, room: Room) -> Decode:
-    """Returns what reads the numbers of a channel's messages with their paths.
+def find_decoder(channel: Channel, schema: Schema | None, room: Room) -> Decode:
+    """Returns the function that reads the numbers of a channel's messages.
 
     Raises:
         UnreadError: Messages of this kind are not read; the text says why.
@@ -33,21 +36,21 @@ def decoder(channel: Channel, schema: Schema | None, room: Room) -> Decode:
             text = schema.data.decode()
             return ros2_decoder(schema.name, text, room)
         if message == "json":
-            return _json
+            return _decode_json
         if message == "protobuf" and schema and definition == "protobuf":
             return _protobuf_decoder(schema)
     except GpmpcError:
         raise
     except ImportError as error:
-        raise UnreadError(f"it needs pip install 'gpmpc[logs]' ({error})") from error
+        raise UnreadError(f"it {needs_extra(error)}") from error
     except Exception as error:  # whatever a library raises on a definition
-        reason = " ".join(str(error).split()) or type(error).__name__
+        reason = first_line(error)
         raise UnreadError(f"its definition cannot be read ({reason})") from error
     described = f"{message or 'nothing'} with {definition or 'no definition'}"
     raise UnreadError(f"it is encoded as {described}, which is not read; {READ}")
 
 
-def _json(data: bytes) -> Cells:
+def _decode_json(data: bytes) -> Cells:
     _check_length(data)
     content = json.loads(data)
     if not isinstance(content, dict):
@@ -74,12 +77,12 @@ def _protobuf_decoder(schema: Schema) -> Decode:
 
 
 def _json_fields(value: Any) -> _Fields | None:
-    """The fields of an object; None of what is none."""
+    """Returns the fields of an object; None of what is none."""
     return value.items() if isinstance(value, dict) else None
 
 
 def _protobuf_fields(value: Any) -> _Fields | None:
-    """The fields of a message, and of those inside it that are set.
+    """Returns the fields of a message, and of those inside it that are set.
 
     Numbers that are not set are zero, as everywhere in protobuf. None of what is no
     message.

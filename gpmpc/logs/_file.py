@@ -1,34 +1,56 @@
-"""What a log file holds: tables of numbers, one a stream, and what was noticed."""
+"""Defines readers of log formats: options in, tables of numbers out."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import pandas as pd
 
 from gpmpc.exceptions import DataError
-from gpmpc.logs._log import Finding
+from gpmpc.logs._findings import Finding
 from gpmpc.recording import Flaw
 
 #: column of the times [s] that a message carries or was logged at; no field of a
 #: message has this name
 STAMP = "(stamp)"
-NUMBER = 32  # of a number in a table, and of its copies on the way there [bytes]
-TEXT = 64  # of a short text in a table, or of another Python object [bytes]
+NUMBER_BYTES = 32  # of a number in a table, and of its copies on the way there
+TEXT_BYTES = 64  # of a short text in a table, or of another Python object
 MOST_COLUMNS = 4096  # of a table; with many more, pandas takes seconds for any
 
-Streams = dict[str, pd.DataFrame]
+Tables = dict[str, pd.DataFrame]  # by topic; "" where a file has a single table
+
+
+@dataclass(frozen=True)
+class ReadOptions:
+    """Says which part of a file is read, and whether damage is an error."""
+
+    topics: tuple[str, ...] = ()  # that are read; none for all
+    partial: bool = False  # take what is whole of an unfinished or damaged file
+    stamp: str = ""  # times of a bag's messages: "header", "log", or "" (see ``_bag``)
 
 
 class LogFile(NamedTuple):
-    """The content of a log file."""
+    """The content of a log file, as it was written: nothing is interpreted yet."""
 
-    streams: Streams  # a table a topic, or a single one under the empty name
+    tables: Tables
     findings: tuple[Finding, ...] = ()  # what was left out
 
 
+class LogReader(Protocol):
+    """Reads files of one format.
+
+    A reader counts what it will allocate (``gpmpc._bounds.Room``) before it does, and
+    may raise whatever its library raises: ``read_file`` makes a ``DataError`` of it.
+    """
+
+    def __call__(self, path: Path, options: ReadOptions) -> LogFile:
+        """Reads the tables of a file; those of ``options.topics`` if there are any."""
+        ...
+
+
 def run_name(path: Path) -> str:
-    """The name of the run that a file holds: the file's, without its ending."""
+    """Returns the name of the run that a file holds: the file's, without its ending."""
     return path.name.removesuffix(".gz").rsplit(".", 1)[0]
 
 
@@ -40,6 +62,24 @@ def check_column_count(path: Path, count: int, what: str = "it") -> None:
         )
 
 
+def first_line(error: Exception) -> str:
+    """Returns the text of an error on one line, or its class where it has no text."""
+    return " ".join(str(error).split()) or type(error).__name__
+
+
+def needs_extra(error: ImportError) -> str:
+    """Says which extra of the package brings the library that is missing."""
+    return f"needs pip install 'gpmpc[logs]' ({error})"
+
+
 def flaw_findings(path: Path, flaws: Sequence[Flaw]) -> list[Finding]:
-    """What is wrong with a recording or a bag, as findings."""
+    """Returns what is wrong with a recording or a bag, as findings."""
     return [Finding(flaw.kind, run_name(path), flaw.count, flaw.text) for flaw in flaws]
+
+
+def unread_columns(path: Path, names: Sequence[str]) -> tuple[Finding, ...]:
+    """Returns the finding of columns that hold no numbers; none where all do."""
+    if not names:
+        return ()
+    text = f"{', '.join(names[:5])}: no columns of numbers, left out"
+    return (Finding("not read", run_name(path), len(names), text),)

@@ -35,7 +35,7 @@ NAMES = {  # by the axes: of the world, and of the body
 
 
 def with_frame_of_files(mapping: "LogMapping", files: Sequence[Path]) -> "LogMapping":
-    """The mapping, with the frame that files of this kind have where it says none.
+    """Returns the mapping, with the frame of this kind of files where it says none.
 
     Raises:
         SettingError: It says none, and the files are of two kinds.
@@ -52,21 +52,21 @@ def with_frame_of_files(mapping: "LogMapping", files: Sequence[Path]) -> "LogMap
 
 
 def attitudes_to_enu(attitudes: Array, axes: str) -> Array:
-    """Attitudes (..., 4) of a FLU body in an ENU world, of those in other axes."""
+    """Turns attitudes (..., 4) to those of a FLU body in an ENU world."""
     if axes == "enu":
         return attitudes
     return quaternion_product(quaternion_product(NED_TURN, attitudes), FRD_TURN)
 
 
 def axes_to_enu(axes: str, frame: str) -> Array:
-    """The matrix (3, 3) that brings vectors in "world" or "body" axes to ENU or FLU."""
+    """Returns the matrix (3, 3) that brings vectors of a frame to ENU or FLU axes."""
     if axes == "enu":
         return np.eye(3)
     return NED if frame == "world" else FRD
 
 
 def velocities_to_world(states: Array, frame: str) -> Array:
-    """Velocities (..., 3) of states in world axes."""
+    """Returns the velocities (..., 3) of states in world axes."""
     velocities = states[..., 7:10]
     if frame == "world":
         return velocities
@@ -74,7 +74,7 @@ def velocities_to_world(states: Array, frame: str) -> Array:
 
 
 def rates_to_body(states: Array, frame: str) -> Array:
-    """Angular rates (..., 3) of states in body axes."""
+    """Returns the angular rates (..., 3) of states in body axes."""
     rates = states[..., 10:13]
     if frame == "body":
         return rates
@@ -82,32 +82,32 @@ def rates_to_body(states: Array, frame: str) -> Array:
 
 
 class Claim:
-    """What a mapping says of the states of a rigid body."""
+    """A mapping's claim of what the states of a rigid body are."""
 
     def __init__(self, mapping: "LogMapping") -> None:
         self.position, self.attitude, self.velocity, self.rate = mapping.of("states")
         self.velocity_frame = self.velocity.frame or "world"
         self.rate_frame = self.rate.frame or "body"
         self.frame = mapping.frame or "enu"
-        self.axes = {s.name: mapping.axes_of(s) for s in mapping.of("states")}
+        self.axes = {
+            signal.name: mapping.axes_of(signal) for signal in mapping.of("states")
+        }
 
     def to_enu(self, signal: "Signal", frame: str) -> Array:
-        """The matrix (3, 3) that brings a vector of the file to ENU or FLU axes."""
+        """Returns the matrix (3, 3) from the file's axes of a frame to ENU or FLU."""
         return axes_to_enu(self.axes[signal.name], frame)
 
     def turn_axes(self, states: Array) -> Array:
-        """States (..., 13) in ENU and FLU axes, in the frames that the mapping says."""
+        """Turns states (..., 13) to ENU and FLU axes, in the frames of the mapping."""
         p, q, v, w = np.split(states, [3, 7, 10], axis=-1)
-        parts = [
-            p @ self.to_enu(self.position, "world"),
-            attitudes_to_enu(q, self.axes[self.attitude.name]),
-            v @ self.to_enu(self.velocity, self.velocity_frame),
-            w @ self.to_enu(self.rate, self.rate_frame),
-        ]
-        return np.concatenate(parts, axis=-1)
+        position = p @ self.to_enu(self.position, "world")
+        attitude = attitudes_to_enu(q, self.axes[self.attitude.name])
+        velocity = v @ self.to_enu(self.velocity, self.velocity_frame)
+        rate = w @ self.to_enu(self.rate, self.rate_frame)
+        return np.concatenate([position, attitude, velocity, rate], axis=-1)
 
     def read(self, states: Array) -> Array:
-        """States (..., 13) as the package has them."""
+        """Returns states (..., 13) in ``gpmpc.logs``' axes and frames."""
         states = self.turn_axes(states)
         velocities = velocities_to_world(states, self.velocity_frame)
         rates = rates_to_body(states, self.rate_frame)

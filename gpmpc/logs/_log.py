@@ -1,6 +1,7 @@
-"""Logs of a real or simulated system: runs of measured states, inputs and context at equal time steps, with their gaps.
+"""Logs of a real or simulated system: runs at equal time steps, with their gaps.
 
-Nothing is interpolated over a gap: a run consists of pieces, and transitions, windows and episodes stay inside a piece.
+A run has measured states, inputs and context. Nothing is interpolated over a gap: a run
+consists of pieces, and transitions, windows and episodes stay inside a piece.
 """
 
 from collections.abc import Iterator, Sequence
@@ -14,19 +15,10 @@ import torch
 from gpmpc.calibration import Recording
 from gpmpc.exceptions import DataError, SettingError, check_number
 from gpmpc.gp import Transitions
+from gpmpc.logs._findings import Finding
 from gpmpc.logs._kinematics import Array, StateSpace
 from gpmpc.logs._mapping import LogMapping
 from gpmpc.signals import Signals
-
-
-@dataclass(frozen=True)
-class Finding:
-    """What was noticed in a run, and what was done about it."""
-
-    kind: str  # such as "gap", "repeated stamp", "at rest"
-    run: str
-    count: int  # rows, or gaps
-    text: str
 
 
 @dataclass(frozen=True)
@@ -49,27 +41,30 @@ class LogRun:
         return list(zip(self.begins, (*self.begins[1:], len(self)), strict=True))
 
     def starts(self, past: int, ahead: int, stride: int = 1) -> np.ndarray:
-        """Lists the rows that have ``past`` rows before and ``ahead`` after them in their own piece."""
+        """Lists the rows with ``past`` rows before and ``ahead`` behind in their piece."""
         return np.concatenate(
             [np.arange(begin + past, end - ahead, stride) for begin, end in self.pieces]
         ).astype(int)
 
     def part(self, begin: int, end: int, name: str) -> "LogRun":
-        """The rows from ``begin`` to before ``end`` as a run of its own."""
+        """Returns the rows from ``begin`` to before ``end`` as a run of its own."""
         rows = slice(begin, end)
-        begins = (0, *(b - begin for b in self.begins if begin < b < end))
-        arrays = (
-            self.time[rows],
-            self.states[rows],
-            self.inputs[rows],
-            self.context[rows],
+        return LogRun(
+            name=f"{self.name}, {name}",
+            time=self.time[rows],
+            states=self.states[rows],
+            inputs=self.inputs[rows],
+            context=self.context[rows],
+            begins=(0, *(b - begin for b in self.begins if begin < b < end)),
         )
-        return LogRun(f"{self.name}, {name}", *arrays, begins=begins)
 
 
 @dataclass(frozen=True)
 class Windows:
-    """W windows of a log: the measured past and what came after; row k of ``states`` goes with row k of ``inputs``."""
+    """W windows of a log: the measured past, and what came after.
+
+    Row k of ``states`` goes with row k of ``inputs``.
+    """
 
     space: StateSpace  #: of the states
     time_step: float  #: [s]
@@ -85,15 +80,18 @@ class Windows:
         return len(self.states)
 
     def __getitem__(self, rows: Any) -> "Windows":
-        parts = {
-            name: getattr(self, name)[rows]
-            for name in ("states", "inputs", "context", "runs", "times")
-        }
-        return replace(self, **parts)
+        return replace(
+            self,
+            states=self.states[rows],
+            inputs=self.inputs[rows],
+            context=self.context[rows],
+            runs=self.runs[rows],
+            times=self.times[rows],
+        )
 
     @property
     def ahead(self) -> int:
-        """Rows after the start."""
+        """Number of rows after the start."""
         return self.states.shape[1] - self.past - 1
 
 
@@ -119,11 +117,12 @@ class Log:
 
     def __repr__(self) -> str:
         pieces = sum(len(run.begins) for run in self.runs)
-        return f"Log({len(self)} rows, {len(self.runs)} runs, {pieces} pieces, {1 / self.time_step:g} Hz)"
+        rate = f"{1 / self.time_step:g} Hz"
+        return f"Log({len(self)} rows, {len(self.runs)} runs, {pieces} pieces, {rate})"
 
     @property
     def space(self) -> StateSpace:
-        """Of the states."""
+        """The space of the states."""
         return self.mapping.space
 
     @property
@@ -137,12 +136,13 @@ class Log:
 
     @property
     def signals(self) -> Signals:
-        """Names of states and inputs, and time step; columns of two topics may share one."""
-        states = self.space.names
-        inputs = self.input_names
+        """Names of states and inputs, and time step.
+
+        Names are left out where two are equal, such as columns of two topics.
+        """
         return Signals(
-            states if len(set(states)) == len(states) else (),
-            inputs if len(set(inputs)) == len(inputs) else (),
+            _unless_repeated(self.space.names),
+            _unless_repeated(self.input_names),
             self.time_step,
         )
 
@@ -158,38 +158,36 @@ class Log:
                 raise SettingError(
                     "held_out", f"no such run {name!r}; there are {', '.join(names)}"
                 )
-        if not 0 < len(set(held_out)) < len(names):
+        count = len(set(held_out))
+        if not 0 < count < len(names):
             raise SettingError(
                 "held_out",
-                f"must leave runs on both sides; got {len(set(held_out))} of {len(names)}",
+                f"must leave runs on both sides; got {count} of {len(names)}",
             )
-        sides = (
-            [run for run in self.runs if (run.name in held_out) == held]
-            for held in (False, True)
-        )
-        first, last = (replace(self, runs=tuple(side)) for side in sides)
-        return first, last
+        for_learning = tuple(run for run in self.runs if run.name not in held_out)
+        for_judging = tuple(run for run in self.runs if run.name in held_out)
+        return replace(self, runs=for_learning), replace(self, runs=for_judging)
 
     def split_by_time(self, share: float) -> tuple["Log", "Log"]:
-        """Splits every run: a log of the first ``share`` of its rows, and one of the others."""
+        """Splits every run: into its first ``share`` of rows, and the others."""
         check_number("share", share, above=0)
-        cuts = [
-            (run, min(max(round(share * len(run)), 1), len(run) - 1))
-            for run in self.runs
-        ]
-        first = tuple(run.part(0, cut, "first part") for run, cut in cuts)
-        last = tuple(run.part(cut, len(run), "last part") for run, cut in cuts)
-        return replace(self, runs=first), replace(self, runs=last)
+        first = []
+        last = []
+        for run in self.runs:
+            cut = min(max(round(share * len(run)), 1), len(run) - 1)
+            first.append(run.part(0, cut, "first part"))
+            last.append(run.part(cut, len(run), "last part"))
+        return replace(self, runs=tuple(first)), replace(self, runs=tuple(last))
 
     def transitions(self) -> Transitions:
-        """All transitions from one row to the next inside a piece, as data of GPs."""
-        cut = self.windows(1)
-        now = cut.states[:, 0]
-        after = cut.states[:, 1]
-        return Transitions(now, cut.inputs[:, 0], after, self.signals)
+        """Returns all transitions between rows inside a piece, as data of GPs."""
+        pairs = self.windows(1)
+        return Transitions(
+            pairs.states[:, 0], pairs.inputs[:, 0], pairs.states[:, 1], self.signals
+        )
 
     def episodes(self) -> list[Recording]:
-        """Every piece of two rows or more as a recording for ``gpmpc.calibration``."""
+        """Returns every piece of two rows or more as a recording for calibration."""
         return [
             Recording(
                 torch.from_numpy(run.states[a:b].copy()),
@@ -204,44 +202,61 @@ class Log:
     def windows(
         self, ahead: int, past: int = 0, stride: int = 1, most: int | None = None
     ) -> Windows:
-        """Cuts windows that lie inside a piece each.
+        """Cuts windows each of which lies inside a piece.
 
         Args:
             ahead: Rows after the start of each.
             past: Rows before it.
             stride: Rows from one start to the next.
-            most: Windows, about; the stride follows from it.
+            most: Number of windows, about; the stride follows from it.
 
         Raises:
             DataError: No piece is as long.
         """
-        for key, value, least in (
-            ("ahead", ahead, 0),
-            ("past", past, 0),
-            ("stride", stride, 1),
-        ):
-            check_number(key, value, least=least, whole=True)
-        lengths = [b - a for run in self.runs for a, b in run.pieces]
+        check_number("ahead", ahead, least=0, whole=True)
+        check_number("past", past, least=0, whole=True)
+        check_number("stride", stride, least=1, whole=True)
+        lengths = [end - begin for run in self.runs for begin, end in run.pieces]
         if most is not None:
-            stride = max(
-                -(-sum(max(length - ahead - past, 0) for length in lengths) // most), 1
+            starts_in_all = sum(max(length - ahead - past, 0) for length in lengths)
+            stride = max(-(-starts_in_all // most), 1)
+        starts = [run.starts(past, ahead, stride) for run in self.runs]
+        if not sum(len(rows) for rows in starts):
+            raise DataError(
+                f"windows of {past + ahead + 1} rows need a piece as long; the longest "
+                f"has {max(lengths)}"
             )
         offsets = np.arange(-past, ahead + 1)
-        parts = []
-        for number, run in enumerate(self.runs):
-            starts = run.starts(past, ahead, stride)
-            rows = starts[:, None] + offsets
-            before = run.context[rows[:, : past + 1]]
-            numbers = np.full(len(rows), number)
-            parts.append(
-                (run.states[rows], run.inputs[rows], before, numbers, run.time[starts])
-            )
-        arrays = [np.concatenate(one) for one in zip(*parts, strict=True)]
-        if not len(arrays[0]):
-            raise DataError(
-                f"windows of {past + ahead + 1} rows need a piece as long; the longest has {max(lengths)}"
-            )
-        return Windows(self.space, self.time_step, past, stride, *arrays)
+        states = []
+        inputs = []
+        context = []
+        runs = []
+        times = []
+        for number, (run, starts_of_run) in enumerate(
+            zip(self.runs, starts, strict=True)
+        ):
+            rows = starts_of_run[:, None] + offsets
+            states.append(run.states[rows])
+            inputs.append(run.inputs[rows])
+            context.append(run.context[rows[:, : past + 1]])
+            runs.append(np.full(len(rows), number))
+            times.append(run.time[starts_of_run])
+        return Windows(
+            space=self.space,
+            time_step=self.time_step,
+            past=past,
+            stride=stride,
+            states=np.concatenate(states),
+            inputs=np.concatenate(inputs),
+            context=np.concatenate(context),
+            runs=np.concatenate(runs),
+            times=np.concatenate(times),
+        )
 
     def __iter__(self) -> Iterator[LogRun]:
         return iter(self.runs)
+
+
+def _unless_repeated(names: tuple[str, ...]) -> tuple[str, ...]:
+    """Returns names; none where one comes twice."""
+    return names if len(set(names)) == len(names) else ()

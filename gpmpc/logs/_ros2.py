@@ -12,7 +12,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 from gpmpc._bounds import Room
-from gpmpc.logs._file import MOST_COLUMNS, TEXT
+from gpmpc.logs._file import MOST_COLUMNS, TEXT_BYTES
 
 LISTED = 64  # entries of a list that become columns, at most
 _STEP = 1024  # of a step of a plan [bytes]
@@ -54,9 +54,13 @@ class _Step(NamedTuple):
     length: int | None  # of a fixed list; None: a single value
     counted: bool = False  # whether the list's length stands before it
 
+    @property
+    def is_list(self) -> bool:
+        return self.counted or self.length is not None
+
 
 def ros2_decoder(name: str, definition: str, room: Room) -> Decode:
-    """Returns what reads the numbers of a message with their paths.
+    """Returns the function that reads the numbers of a message with their paths.
 
     Args:
         name: Of the type, such as "geometry_msgs/msg/Pose".
@@ -71,7 +75,7 @@ def ros2_decoder(name: str, definition: str, room: Room) -> Decode:
 
     def plan(type_name: str) -> list[_Step]:
         if type_name not in plans:
-            plans[type_name] = _flat(type_name, types)
+            plans[type_name] = _flat_steps(type_name, types)
             room.take(_STEP * len(plans[type_name]), f"the message {type_name}")
         return plans[type_name]
 
@@ -80,7 +84,7 @@ def ros2_decoder(name: str, definition: str, room: Room) -> Decode:
 
 
 def _definitions(name: str, text: str) -> dict[str, str]:
-    """The definitions of a text, by the short names of their types."""
+    """Returns the definitions of a text, by the short names of their types."""
     types = dict(_BUILTIN)
     for number, part in enumerate(_SEPARATOR.split(text)):
         title = _TITLE.search(part)
@@ -92,11 +96,12 @@ def _definitions(name: str, text: str) -> dict[str, str]:
 
 
 def _short(name: str) -> str:
-    """The name of a type without the folder that ROS 2 puts into it."""
+    """Returns the name of a type without the folder that ROS 2 puts into it."""
     return name.replace("/msg/", "/")
 
 
-def _fields(type_name: str, text: str) -> list[_Step]:
+def _parse_definition(type_name: str, text: str) -> list[_Step]:
+    """Parses the fields of a type, those of the types inside it not yet."""
     package = type_name.rpartition("/")[0]
     fields = []
     for line in text.splitlines():
@@ -119,35 +124,49 @@ def _fields(type_name: str, text: str) -> list[_Step]:
     return fields
 
 
-def _flat(type_name: str, types: dict[str, str]) -> list[_Step]:
-    """The steps of a message and of the messages inside it, one after the other."""
-    steps: list[_Step] = []
-    numbers = 0
-    fields: dict[str, list[_Step]] = {}
+def _flat_steps(type_name: str, types: dict[str, str]) -> list[_Step]:
+    """Lists the steps of a message and of the messages inside it, in their order."""
+    flattening = _Flattening(type_name, types)
+    flattening.add(type_name, prefix="", outer_types=())
+    return flattening.steps
 
-    def add(name: str, prefix: str, outer: tuple[str, ...]) -> None:
-        nonlocal numbers
-        if name not in types:
+
+class _Flattening:
+    """Collects the steps of a message and of the messages inside it."""
+
+    def __init__(self, type_name: str, types: dict[str, str]) -> None:
+        self.steps: list[_Step] = []
+        self._type_name = type_name
+        self._types = types  # definitions, by the names of the types
+        self._fields: dict[str, list[_Step]] = {}  # by type
+        self._numbers = 0
+
+    def add(self, name: str, prefix: str, outer_types: tuple[str, ...]) -> None:
+        """Adds the steps of a type, whose paths begin with the prefix."""
+        if name not in self._types:
             raise ValueError(f"the definition of {name} is missing")
-        if name in outer:
+        if name in outer_types:
             raise ValueError(f"a message of type {name} holds itself")
-        if name not in fields:
+        for field in self._fields_of(name):
+            path = f"{prefix}{field.path}"
+            is_message = field.type in self._types or "/" in field.type
+            if is_message and not field.is_list:
+                self.add(field.type, f"{path}.", (*outer_types, name))
+                continue
+            self.steps.append(field._replace(path=path))
+            self._numbers += min(field.length or 1, LISTED)
+            if self._numbers > MOST_COLUMNS:
+                raise ValueError(
+                    f"{self._type_name} holds more than {MOST_COLUMNS} numbers"
+                )
+
+    def _fields_of(self, name: str) -> list[_Step]:
+        if name not in self._fields:
             # A message without fields has a byte: IDL knows no empty structures.
             empty = _Step("", "empty", None)
-            fields[name] = _fields(name, types[name]) or [empty]
-        for field in fields[name]:
-            is_list = field.counted or field.length is not None
-            is_message = field.type in types or "/" in field.type
-            if is_message and not is_list:
-                add(field.type, f"{prefix}{field.path}.", (*outer, name))
-                continue
-            steps.append(field._replace(path=f"{prefix}{field.path}"))
-            numbers += min(field.length or 1, LISTED)
-            if numbers > MOST_COLUMNS:
-                raise ValueError(f"{type_name} holds more than {MOST_COLUMNS} numbers")
-
-    add(type_name, "", ())
-    return steps
+            fields = _parse_definition(name, self._types[name])
+            self._fields[name] = fields or [empty]
+        return self._fields[name]
 
 
 class _Message:
@@ -173,7 +192,7 @@ class _Message:
         cells: Cells = {}
         for step in plan:
             values = self.values(step)
-            if step.counted or step.length is not None:
+            if step.is_list:
                 for i, value in enumerate(values):
                     cells[f"{step.path}[{i}]"] = float(value)
             elif values:
@@ -181,7 +200,7 @@ class _Message:
         return cells
 
     def values(self, step: _Step) -> tuple[float, ...]:
-        """Moves over a step; its numbers, if it has some and they are not many."""
+        """Moves over a step, and returns its numbers; none where they are many."""
         count = 1 if step.length is None else step.length
         if step.counted:
             count = self.length()
@@ -195,12 +214,12 @@ class _Message:
         if count > len(self.data) - self.position:  # each has a byte at least
             raise ValueError(f"it ends within {step.path}")
         if step.type == "string":
-            self.room.take(TEXT * count, "the texts of its messages")
+            self.room.take(TEXT_BYTES * count, "the texts of its messages")
             for _ in range(count):
                 self.scalars("B", self.length())
             return ()
         inner = self.plan(step.type)
-        self.room.take(TEXT * count * len(inner), "the lists of its messages")
+        self.room.take(TEXT_BYTES * count * len(inner), "the lists of its messages")
         for _ in range(count):
             for inner_step in inner:
                 self.values(inner_step)
@@ -211,7 +230,7 @@ class _Message:
         return int(self.scalars("I", 1)[0])
 
     def scalars(self, code: str, count: int) -> tuple[float, ...]:
-        """Reads so many numbers of one kind; only moves over more than ``LISTED``."""
+        """Reads ``count`` numbers of one kind; only moves over more than ``LISTED``."""
         size = struct.calcsize(f"={code}")
         begin = 4 + -(-(self.position - 4) // size) * size if count else self.position
         end = begin + size * count

@@ -1,4 +1,4 @@
-"""Units of a log's columns: the SI unit that values come out in, and the factor.
+"""Converts units of a log's columns to SI units.
 
 A unit is a symbol, or products and quotients of symbols: "deg", "m/s2", "N m", "km/h".
 An unknown unit is an error: to take it as it stands would leave feet as metres.
@@ -13,7 +13,7 @@ from gpmpc.exceptions import SettingError
 
 
 class Conversion(NamedTuple):
-    """What one of a unit is."""
+    """The value of one of a unit."""
 
     unit: str  #: the SI unit
     factor: float  #: how many of it
@@ -64,7 +64,7 @@ _FACTOR = re.compile(r"([A-Za-z%]+)\^?(-?\d?)")
 
 
 def conversion(key: str, unit: str) -> Conversion:
-    """Finds what one of a unit is in SI units.
+    """Returns what one of a unit is in SI units.
 
     Args:
         key: The setting that names the unit, for the error.
@@ -99,7 +99,7 @@ def is_known(unit: str) -> bool:
 
 
 def _product(key: str, unit: str, text: str) -> Conversion:
-    """What a product of symbols such as "N m" or "s2", a part of ``unit``, is."""
+    """Returns what a product of symbols is, such as "N m" or "s2" in ``unit``."""
     names = []
     factor = 1.0
     for part in re.split(r"[ *]+", text.strip()):

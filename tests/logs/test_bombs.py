@@ -18,7 +18,7 @@ sys.path.append(str(Path(__file__).resolve().parents[2]))
 from gpmpc._bounds import Room, room
 from gpmpc.exceptions import DataError, SettingError
 from gpmpc.logs import LogMapping, read_log
-from gpmpc.logs._readers import read_file
+from gpmpc.logs._formats import read_file
 from tests.logs import strange
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -265,7 +265,7 @@ def test_a_column_that_names_as_many_runs_as_rows_is_refused(tmp_path):
 def test_a_text_that_stands_once_in_a_parquet_file_is_kept_once(tmp_path):
     path = strange.parquet_of_one_long_text(tmp_path / "arm.parquet", rows=100_000)
     tracemalloc.start()
-    table = read_file(path).streams[""]
+    table = read_file(path).tables[""]
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert len(table["note"].iloc[-1]) == 2**20

@@ -15,7 +15,7 @@ sys.path.append(str(Path(__file__).resolve().parents[2]))
 from gpmpc._bounds import Room
 from gpmpc.exceptions import DataError
 from gpmpc.logs import read_log
-from gpmpc.logs._readers import read_file
+from gpmpc.logs._formats import read_file
 from gpmpc.logs._ros2 import ros2_decoder
 from tests.logs import strange
 from tests.logs.strange import BAG_MAPPING, STEP, TABLE_MAPPING
@@ -75,7 +75,7 @@ def test_one_bag_may_hold_all_encodings(tmp_path):
     topics["/motor"] = topics["/motor"]._replace(encoding="json")
     topics["/other"] = topics["/arm"]._replace(encoding="protobuf")
     path = strange.write_bag(tmp_path / "arm.mcap", topics)
-    streams = read_file(path).streams
+    streams = read_file(path).tables
     assert set(streams) == {"/arm", "/motor", "/other"}
     np.testing.assert_array_equal(streams["/arm"]["angle"], streams["/other"]["angle"])
 
@@ -105,7 +105,7 @@ def test_numbers_of_a_ros_2_message_are_those_of_the_reference_decoder(tmp_path)
             }
             writer.write_message("/all", schema, message, k, k)
         writer.finish()
-    table = read_file(tmp_path / "all.mcap").streams["/all"]
+    table = read_file(tmp_path / "all.mcap").tables["/all"]
     with (tmp_path / "all.mcap").open("rb") as file:
         reader = make_reader(file, decoder_factories=[DecoderFactory()])
         expected = [m.decoded_message for m in reader.iter_decoded_messages()]
@@ -165,7 +165,7 @@ def test_a_definition_that_cannot_be_read_is_named(tmp_path, definition, expecte
         tmp_path / "arm.mcap", data, size=1000, definition=definition
     )
     if expected is None:
-        assert list(read_file(path).streams["/arm"])[1:] == ["angle"]
+        assert list(read_file(path).tables["/arm"])[1:] == ["angle"]
         return
     with pytest.raises(DataError, match=expected):
         read_file(path, ["/arm"])
@@ -180,7 +180,7 @@ def test_what_nobody_asked_for_refuses_no_bag_and_is_counted(tmp_path):
     text = f"{ROWS} messages of 1 other topics: left out"
     assert findings(log) == {"not asked for": (ROWS, text)}
     file = read_file(path)  # all topics: those that can be read
-    assert set(file.streams) == {"/arm", "/motor"}
+    assert set(file.tables) == {"/arm", "/motor"}
     assert findings(file)["not read"][0] == ROWS
     assert "encoded as cbor" in findings(file)["not read"][1]
     topics["/arm"] = topics["/camera"]
@@ -244,7 +244,7 @@ def test_checksums_of_foreign_bags_are_checked(tmp_path):
     path = strange.write_bag(tmp_path / "arm.mcap", topics, chunk_size=10**6)
     with path.open("rb") as file:
         (chunk,) = make_reader(file).get_summary().chunk_indexes
-    expected = read_file(path).streams["/arm"]
+    expected = read_file(path).tables["/arm"]
     whole = path.read_bytes()
     begin = chunk.chunk_start_offset + 60
     for position in range(begin, begin + chunk.compressed_size - 20, 7):
@@ -252,7 +252,7 @@ def test_checksums_of_foreign_bags_are_checked(tmp_path):
         spoilt[position] ^= 1 << position % 8
         path.write_bytes(spoilt)
         try:
-            table = read_file(path).streams["/arm"]
+            table = read_file(path).tables["/arm"]
         except DataError:
             continue
         assert table.equals(expected)
@@ -302,11 +302,11 @@ def test_a_ulog_is_what_pyulog_reads(tmp_path):
     path = strange.ulog(tmp_path / "a.ulg", ulog_topics(), sync_every=50)
     expected = {data.name: data.data for data in ULog(str(path)).data_list}
     file = read_file(path)
-    assert set(file.streams) == set(expected) == {"arm", "other"}
+    assert set(file.tables) == set(expected) == {"arm", "other"}
     assert not file.findings
     for name, columns in expected.items():
         for column in set(columns) - {"timestamp"}:
-            np.testing.assert_array_equal(file.streams[name][column], columns[column])
+            np.testing.assert_array_equal(file.tables[name][column], columns[column])
     log = read_log(path, ULOG_MAPPING)
     assert len(log) == ROWS
     assert findings(log) == {
@@ -345,21 +345,21 @@ def test_sections_that_were_appended_to_a_ulog_are_read(tmp_path):
     flags = bytes(8) + b"\1" + bytes(7) + struct.pack("<QQQ", len(first), 0, 0)
     start = first.index(b"B")
     path.write_bytes(first[: start + 1] + flags + first[start + 41 :] + late)
-    table = read_file(path, ["arm"], partial=True).streams["arm"]
+    table = read_file(path, ["arm"], partial=True).tables["arm"]
     assert (len(table), table["timestamp"].iloc[-1]) == (ROWS + 1, 100.0)
 
 
 def test_a_recording_of_this_package_is_one_whoever_has_rewritten_it(tmp_path):
     runs.record_run(tmp_path / "run.mcap")
-    expected = read_file(tmp_path / "run.mcap").streams[""]
+    expected = read_file(tmp_path / "run.mcap").tables[""]
     content = (tmp_path / "run.mcap").read_bytes()
     foreign = content.replace(b"\5\0\0\0gpmpc", b"\5\0\0\0other", 1)
     (tmp_path / "other.mcap").write_bytes(foreign)
     file = read_file(tmp_path / "other.mcap", [""], partial=True)
-    assert file.streams[""].equals(expected)
+    assert file.tables[""].equals(expected)
     (tmp_path / "cut.mcap").write_bytes(content[: len(content) * 3 // 4])
     with pytest.raises(DataError, match="gpmpc log recover rescues it"):
         read_file(tmp_path / "cut.mcap", [""])
     file = read_file(tmp_path / "cut.mcap", [""], partial=True)
     assert "it was not finished" in findings(file)["unfinished"][1]
-    assert 0 < len(file.streams[""]) <= len(expected)
+    assert 0 < len(file.tables[""]) <= len(expected)

@@ -8,7 +8,7 @@ import pytest
 
 from gpmpc.exceptions import DataError
 from gpmpc.logs import read_log
-from gpmpc.logs._readers import read_file
+from gpmpc.logs._formats import read_file
 
 MAPPING = {"time": "t", "states": {"x": ["x"]}, "inputs": {"u": ["u"]}}
 TABLE = pandas.DataFrame(
@@ -26,7 +26,7 @@ def parse(folder, content):
     (folder / "log.csv").write_bytes(content)
     file = read_file(folder / "log.csv")
     assert not file.findings
-    return file.streams[""]
+    return file.tables[""]
 
 
 @pytest.mark.parametrize(

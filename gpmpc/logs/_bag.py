@@ -23,51 +23,41 @@ from mcap.records import Channel, Chunk, Schema
 
 from gpmpc._bounds import Room
 from gpmpc.exceptions import DataError, GpmpcError
-from gpmpc.logs._encodings import UnreadError, decoder
+from gpmpc.logs._bag_clocks import choose_times
+from gpmpc.logs._encodings import UnreadError, find_decoder
 from gpmpc.logs._file import (
-    NUMBER,
+    NUMBER_BYTES,
     STAMP,
-    TEXT,
+    TEXT_BYTES,
     LogFile,
+    ReadOptions,
     check_column_count,
+    first_line,
     flaw_findings,
     run_name,
 )
-from gpmpc.logs._log import Finding
+from gpmpc.logs._findings import Finding
 from gpmpc.logs._ros2 import Cells, Decode
 from gpmpc.recording import NO_CHECKSUMS, Flaw, bag_flaws
 from gpmpc.recording._flaws import WRONG_COUNT
 from gpmpc.recording._frames import BROKEN, agrees, unfolded
 
 MAGIC = b"\x89MCAP0\r\n"
-SAME_CLOCK = 1.0  # [s] between two clocks that are taken for one
 _UNSEEN = (NO_CHECKSUMS, WRONG_COUNT)  # flaws that no record shows by itself
 _PROFILE = b"\5\0\0\0gpmpc"
 _RECORDING = "gpmpc.Step"  # the definition of a recording's steps
 _HEAD = struct.Struct("<BQ")  # kind and length of a record
 _MESSAGE = struct.Struct("<HIQQ")  # channel, number, time of the log, of publishing
-_RECORD = 256  # what a record costs [bytes]: its time, counted as memory
-_CHANNEL = 16_384  # what a channel and its definition cost [bytes], as above
-_DECODED = 2048  # what a message costs that is decoded [bytes], as above
+_RECORD_BYTES = 256  # what a record costs: its time, counted as memory
+_CHANNEL_BYTES = 16_384  # what a channel and its definition cost, as above
+_DECODED_BYTES = 2048  # what a message costs that is decoded, as above
 _COPIES = 4  # of the bytes of a message that is decoded
 _LISTED_DAMAGES = 5  # each by its text
-_STAMP_FIELDS = [  # seconds and nanoseconds, as ROS 2, ROS 1, Foxglove and protobuf say
-    (f"{place}.{seconds}", f"{place}.{nanoseconds}")
-    for place in ("header.stamp", "stamp", "timestamp")
-    for seconds, nanoseconds in (
-        ("sec", "nanosec"),
-        ("sec", "nsec"),
-        ("secs", "nsecs"),
-        ("seconds", "nanos"),
-    )
-]
-
-
 _Parsed = TypeVar("_Parsed", Chunk, Schema, Channel)
 
 
 class _Damaged(Exception):
-    """What a file holds does not agree with what it says."""
+    """The content of a file does not agree with what the file says."""
 
 
 class _Record(NamedTuple):
@@ -76,7 +66,7 @@ class _Record(NamedTuple):
 
 
 @dataclass
-class _Topic:
+class _TopicTable:
     """The messages of a topic that were decoded, a column a number."""
 
     columns: dict[str, array] = field(default_factory=dict)
@@ -86,11 +76,12 @@ class _Topic:
     def append(self, log_time: int, cells: Cells, room: Room) -> None:
         """Adds a message; where it has no number that others have, NaN stands."""
         rows = len(self.log_times)
-        new = [path for path in cells if path not in self.columns]
-        absent = len(self.columns) + len(new) - len(cells)
-        size = TEXT * (len(cells) + absent) + NUMBER * rows * len(new)
+        new_paths = [path for path in cells if path not in self.columns]
+        absent = len(self.columns) + len(new_paths) - len(cells)
+        size = TEXT_BYTES * (len(cells) + absent)
+        size += NUMBER_BYTES * rows * len(new_paths)
         room.take(size, "the numbers of its messages")
-        for path in new:
+        for path in new_paths:
             self.columns[path] = array("d", [np.nan]) * rows
         for path, value in cells.items():
             self.columns[path].append(value)
@@ -98,6 +89,24 @@ class _Topic:
             for path in self.columns.keys() - cells.keys():
                 self.columns[path].append(np.nan)
         self.log_times.append(log_time)
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Returns the columns as arrays (K,)."""
+        return {path: np.array(column) for path, column in self.columns.items()}
+
+    def seconds(self) -> np.ndarray:
+        """Returns the times (K,) [s] at which the messages were logged."""
+        return np.array(self.log_times, dtype=np.uint64) / 1e9
+
+    def as_frame(self, times: np.ndarray) -> pd.DataFrame:
+        """Makes a table in the order of the log, which files need not keep.
+
+        Args:
+            times: Of the messages, in the order of the file (K,) [s].
+        """
+        order = np.argsort(np.array(self.log_times), kind="stable")
+        frame = pd.DataFrame({STAMP: times} | self.arrays())
+        return frame.iloc[order].reset_index(drop=True)
 
 
 @dataclass
@@ -111,37 +120,34 @@ class _Channel:
 
 
 def has_own_profile(path: Path) -> bool:
-    """Whether the head of an MCAP file says that this package has written it."""
+    """Tells whether the head of an MCAP file says that this package has written it."""
     with path.open("rb") as file:
         # The profile with its length is the first field of the first record.
         head = file.read(len(MAGIC) + _HEAD.size + len(_PROFILE))
     return head.endswith(_PROFILE)
 
 
-def read_bag(
-    path: Path, topics: tuple[str, ...], partial: bool, stamp: str = ""
-) -> LogFile | None:
-    """Reads the topics of a bag: those that are named, or all.
-
-    None where no topic is named and the file is a recording of this package, whoever
-    has rewritten it.
+def read_bag(path: Path, options: ReadOptions) -> LogFile | None:
+    """Reads the topics of a bag: those of ``options``, or all.
 
     Args:
         path: An MCAP file.
-        topics: Their names; none for all that can be read.
-        partial: Takes what is whole of a file that is damaged or cut off.
-        stamp: The times of the messages: "header", "log", or "" (see ``_clocks``).
+        options: See ``ReadOptions``.
+
+    Returns:
+        The tables; None where no topic is named and the file is a recording of this
+        package, whoever has rewritten it.
 
     Raises:
-        DataError: The file is damaged, a topic is missing or cannot be read.
+        DataError: The file is damaged, or a topic is missing or cannot be read.
     """
     unseen_flaws = [flaw for flaw in bag_flaws(path) if flaw.kind in _UNSEEN]
-    if not partial:
-        _check_counts(path, unseen_flaws)
-    bag = _Bag(path, topics, partial, Room(path))
+    bag = _Bag(path, options, Room(path))
     try:
+        if not options.partial:
+            _check_counts(unseen_flaws)
         for record in _records(path, bag.room, bag.note_damage):
-            bag.take(record)
+            bag.add(record)
             if bag.is_recording:
                 return None
     except _Damaged as error:
@@ -150,73 +156,80 @@ def read_bag(
             "partial=true takes what is whole"
         ) from error
     bag.check_topics()
-    clocks = _clocks(path, bag.tables, stamp, alone=not topics)
-    streams = {
-        name: _table(bag.tables[name], clocks.times[name]) for name in bag.tables
+    clocks = choose_times(
+        path=path,
+        columns={name: table.arrays() for name, table in bag.tables.items()},
+        logged={name: table.seconds() for name, table in bag.tables.items()},
+        stamp=options.stamp,
+        topic_by_topic=not options.topics,
+    )
+    tables = {
+        name: table.as_frame(clocks.times[name]) for name, table in bag.tables.items()
     }
-    findings = bag.findings() + flaw_findings(path, unseen_flaws)
-    return LogFile(streams, (*findings, *clocks.findings))
+    findings = [
+        *bag.findings(),
+        *flaw_findings(path, unseen_flaws),
+        *clocks.findings,
+    ]
+    return LogFile(tables, tuple(findings))
 
 
-def _check_counts(path: Path, flaws: list[Flaw]) -> None:
-    """Raises ``DataError`` where an index counts otherwise than there is."""
+def _check_counts(flaws: list[Flaw]) -> None:
+    """Raises ``_Damaged`` where an index counts otherwise than there is."""
     reasons = [flaw.text for flaw in flaws if flaw.kind == WRONG_COUNT]
     if reasons:
-        raise DataError(
-            f"{path}: the bag cannot be read to its end ({'; '.join(reasons)}); "
-            "partial=true takes what is whole"
-        )
+        raise _Damaged("; ".join(reasons))
 
 
 @dataclass
 class _Bag:
-    """What was read of a file so far."""
+    """The content of a file, as far as it was read."""
 
     path: Path
-    topics: tuple[str, ...]  # that are asked for; none for all
-    partial: bool  # whether what is whole will do
+    options: ReadOptions
     room: Room
     schemas: dict[int, Schema] = field(default_factory=dict)
     channels: dict[int, _Channel] = field(default_factory=dict)
-    tables: dict[str, _Topic] = field(default_factory=dict)  # by topic
+    tables: dict[str, _TopicTable] = field(default_factory=dict)  # by topic
     damages: Counter[str] = field(default_factory=Counter)  # how often, by their texts
     is_recording: bool = False  # of this package, and no topic is asked for
 
     def note_damage(self, text: str) -> None:
         """Counts what is broken, or raises ``_Damaged`` where all has to be whole."""
-        if not self.partial:
+        if not self.options.partial:
             raise _Damaged(text)
         self.damages[text] += 1
 
-    def take(self, record: _Record) -> None:
-        """Takes a schema, a channel or a message; all else is nothing to read."""
+    def add(self, record: _Record) -> None:
+        """Adds a schema, a channel or a message; all else is nothing to read."""
         kind, content = record
         number = int.from_bytes(content[:2], "little")
         try:
             if kind == Opcode.MESSAGE:
-                self._take_message(content)
+                self._add_message(content)
             elif kind == Opcode.SCHEMA and number not in self.schemas:
-                self.room.take(_CHANNEL, "its definitions")
-                schema = self.schemas[number] = _parsed(Schema, content)
-                is_of_run = schema.name == _RECORDING and not any(self.topics)
-                self.is_recording = self.is_recording or is_of_run
+                self.room.take(_CHANNEL_BYTES, "its definitions")
+                schema = _parsed(Schema, content)
+                self.schemas[number] = schema
+                if schema.name == _RECORDING and not any(self.options.topics):
+                    self.is_recording = True
             elif kind == Opcode.CHANNEL and number not in self.channels:
-                self.room.take(_CHANNEL, "its channels")
+                self.room.take(_CHANNEL_BYTES, "its channels")
                 self.channels[number] = self._channel(_parsed(Channel, content))
         except _Damaged as error:
             self.note_damage(str(error))
 
     def _channel(self, channel: Channel) -> _Channel:
-        """How a channel's messages are read; not at all if nobody asked for them."""
-        if self.topics and channel.topic not in self.topics:
+        """Finds the decoder of a channel's messages; none if nobody asked for them."""
+        if self.options.topics and channel.topic not in self.options.topics:
             return _Channel(channel.topic, decode=None)
         try:
             schema = self.schemas.get(channel.schema_id)
-            return _Channel(channel.topic, decoder(channel, schema, self.room))
+            return _Channel(channel.topic, find_decoder(channel, schema, self.room))
         except UnreadError as error:
             return _Channel(channel.topic, decode=None, refusal=str(error))
 
-    def _take_message(self, content: bytes) -> None:
+    def _add_message(self, content: bytes) -> None:
         """Counts a message, and decodes it if its topic was asked for."""
         if len(content) < _MESSAGE.size:
             raise _Damaged("a message is shorter than its head")
@@ -228,20 +241,20 @@ class _Bag:
         if channel.decode is None:
             return
         data = content[_MESSAGE.size :]
-        self.room.take(_DECODED + _COPIES * len(data), "its messages")
-        table = self.tables.setdefault(channel.topic, _Topic())
+        self.room.take(_DECODED_BYTES + _COPIES * len(data), "its messages")
+        table = self.tables.setdefault(channel.topic, _TopicTable())
         try:
             cells = channel.decode(data)
         except GpmpcError:
             raise
         except Exception as error:  # whatever a library raises on a damaged message
             table.malformed += 1
-            if self.partial:
+            if self.options.partial:
                 return
-            reason = " ".join(str(error).split()) or type(error).__name__
+            reason = first_line(error)[:200]
             raise DataError(
                 f"{self.path}: message {channel.messages} of {channel.topic} cannot be "
-                f"read: {reason[:200]}; partial=true leaves it out"
+                f"read: {reason}; partial=true leaves it out"
             ) from error
         table.append(log_time, cells, self.room)
         check_column_count(self.path, len(table.columns), channel.topic)
@@ -250,32 +263,25 @@ class _Bag:
         """Raises ``DataError`` where a topic that was asked for cannot be read."""
         channels = self.channels.values()
         for channel in channels:
-            if channel.refusal and channel.topic in self.topics:
+            if channel.refusal and channel.topic in self.options.topics:
                 raise DataError(
                     f"{self.path}: topic {channel.topic}: {channel.refusal}"
                 )
-        known = {channel.topic for channel in channels}
-        for topic in self.topics:
-            if topic in known and topic not in self.tables:
+        present = {channel.topic for channel in channels}
+        for topic in self.options.topics:
+            if topic in present and topic not in self.tables:
                 raise DataError(f"{self.path}: topic {topic!r} has no message")
-            if topic not in known:
-                listed = ", ".join(sorted(known)) or "no topics"
+            if topic not in present:
+                listed = ", ".join(sorted(present)) or "no topics"
                 what = f"topic {topic!r} is missing"
                 if not topic:
                     what = "a bag has topics, and the mapping names none for a signal"
                 raise DataError(f"{self.path}: {what}; it has {listed}")
 
     def findings(self) -> list[Finding]:
-        """What was not read, lost or damaged, with numbers."""
+        """Returns what was not read, lost or damaged, with numbers."""
         run = run_name(self.path)
-        findings = []
-        for text, count in self.damages.most_common(_LISTED_DAMAGES):
-            often = f" ({count} times)" if count > 1 else ""
-            findings.append(Finding("damaged", run, count, f"{text}{often}: lost"))
-        unlisted = self.damages.total() - sum(finding.count for finding in findings)
-        if unlisted:
-            text = f"{unlisted} other places are damaged: lost"
-            findings.append(Finding("damaged", run, unlisted, text))
+        findings = self._damage_findings(run)
         for topic, table in self.tables.items():
             count = table.malformed
             if count:
@@ -286,13 +292,32 @@ class _Bag:
             if channel.refusal and count:
                 text = f"{count} messages of {channel.topic}: {channel.refusal}"
                 findings.append(Finding("not read", run, count, text))
-        asked = self.topics or {channel.topic for channel in self.channels.values()}
-        others = [c for c in self.channels.values() if c.topic not in asked]
-        count = sum(channel.messages for channel in others)
-        if count:
-            text = f"{count} messages of {len(others)} other topics: left out"
-            findings.append(Finding("not asked for", run, count, text))
+        if self.options.topics:
+            findings += self._unread_findings(run)
         return findings
+
+    def _damage_findings(self, run: str) -> list[Finding]:
+        findings = []
+        for text, count in self.damages.most_common(_LISTED_DAMAGES):
+            often = f" ({count} times)" if count > 1 else ""
+            findings.append(Finding("damaged", run, count, f"{text}{often}: lost"))
+        unlisted = self.damages.total() - sum(finding.count for finding in findings)
+        if unlisted:
+            text = f"{unlisted} other places are damaged: lost"
+            findings.append(Finding("damaged", run, unlisted, text))
+        return findings
+
+    def _unread_findings(self, run: str) -> list[Finding]:
+        unread = [
+            channel
+            for channel in self.channels.values()
+            if channel.topic not in self.options.topics
+        ]
+        count = sum(channel.messages for channel in unread)
+        if not count:
+            return []
+        text = f"{count} messages of {len(unread)} other topics: left out"
+        return [Finding("not asked for", run, count, text)]
 
 
 def _records(
@@ -324,22 +349,30 @@ def _records(
                 return
             head = _HEAD.pack(kind, len(content))
             checksum = zlib.crc32(content, zlib.crc32(head, checksum))
-            room.take(_RECORD, "its records")
-            if kind != Opcode.CHUNK:
+            room.take(_RECORD_BYTES, "its records")
+            if kind == Opcode.CHUNK:
+                yield from _records_of_chunk(content, position, room, note_damage)
+            else:
                 yield record
-                continue
-            where = f"at byte {position}"
-            try:
-                chunk = _parsed(Chunk, content)
-                begin = chunk.message_start_time
-                end = chunk.message_end_time
-                where = f"with the messages from {begin / 1e9} to {end / 1e9} s"
-                yield from _inside(_unfold(chunk, room), room)
-            except _Damaged as error:
-                note_damage(f"a chunk {where} is damaged: {error}")
+
+
+def _records_of_chunk(
+    content: bytes, position: int, room: Room, note_damage: Callable[[str], None]
+) -> Iterator[_Record]:
+    """Yields the records of a chunk that stands at a position, up to damage."""
+    where = f"at byte {position}"
+    try:
+        chunk = _parsed(Chunk, content)
+        begin = chunk.message_start_time / 1e9
+        end = chunk.message_end_time / 1e9
+        where = f"with the messages from {begin} to {end} s"
+        yield from _inside(_unfold(chunk, room), room)
+    except _Damaged as error:
+        note_damage(f"a chunk {where} is damaged: {error}")
 
 
 def _next_record(file: BinaryIO, size: int) -> _Record | None:
+    """Reads the next record of a file of ``size`` bytes; None where there is none."""
     head = file.read(_HEAD.size)
     if len(head) < _HEAD.size:
         return None
@@ -369,108 +402,14 @@ def _inside(data: bytes, room: Room) -> Iterator[_Record]:
         position = begin + length
         if position > len(data):
             raise _Damaged("it ends within a record")
-        room.take(_RECORD, "its records")
+        room.take(_RECORD_BYTES, "its records")
         if kind in (Opcode.MESSAGE, Opcode.SCHEMA, Opcode.CHANNEL):
             yield _Record(kind, data[begin:position])
 
 
 def _parsed(kind: type[_Parsed], content: bytes) -> _Parsed:
-    """Parses a record that is none of a message."""
+    """Parses a schema, a channel or a chunk."""
     try:
         return kind.read(ReadDataStream(BytesIO(content)))
     except Exception as error:  # whatever the library raises on damaged records
         raise _Damaged(f"a {kind.__name__.lower()} record is broken") from error
-
-
-class _Clocks(NamedTuple):
-    """The times (K,) [s] of the messages by topic."""
-
-    times: dict[str, np.ndarray]
-    findings: tuple[Finding, ...] = ()
-
-
-def _clocks(path: Path, tables: dict[str, _Topic], stamp: str, alone: bool) -> _Clocks:
-    """Chooses between the stamps in the messages and the times of the log.
-
-    Unless the mapping decides, messages have the times of their stamps where all topics
-    are stamped by one clock, and those of the log otherwise. A topic without stamps has
-    the log's clock. So topics have time in common whenever the log can have it.
-
-    Args:
-        path: Of the file.
-        tables: By topic.
-        stamp: "header", "log", or "" for the rule above.
-        alone: Whether each topic is looked at for itself.
-    """
-    logged = {topic: _log_times(table) for topic, table in tables.items()}
-    stamped = {topic: _stamps(table) for topic, table in tables.items()}
-    headers = {topic: times for topic, times in stamped.items() if times is not None}
-    bare = [topic for topic in tables if topic not in headers]
-    if stamp == "header" and bare:
-        raise DataError(
-            f"{path}: stamp: header, but the messages of {bare[0]} carry no stamps"
-        )
-    if stamp == "log" or not headers:
-        return _Clocks(logged)
-    chosen = _Clocks(logged | headers)
-    if stamp == "header" or alone:
-        return chosen
-    reference = bare[0] if bare else next(iter(headers))
-    offsets = {
-        topic: _offset(topic, reference, logged, chosen.times) for topic in headers
-    }
-    farthest = max(offsets, key=lambda topic: abs(offsets[topic]))
-    if abs(offsets[farthest]) <= SAME_CLOCK:
-        return chosen
-    text = (
-        f"the stamps of {farthest} are {offsets[farthest]:.6g} s off the clock of "
-        f"{reference}: all times are those of the log (stamp: header | log decides)"
-    )
-    return _Clocks(logged, (Finding("times of the log", run_name(path), 1, text),))
-
-
-def _offset(
-    topic: str,
-    reference: str,
-    logged: dict[str, np.ndarray],
-    times: dict[str, np.ndarray],
-) -> float:
-    """By how much a topic's clock is ahead of another's, as the log sees them [s]."""
-    order = np.argsort(logged[reference])
-    behind = (logged[reference] - times[reference])[order]
-    finite = np.isfinite(behind)
-    if not finite.any():
-        return np.inf
-    expected = np.interp(
-        logged[topic], logged[reference][order][finite], behind[finite]
-    )
-    return float(np.nanmedian(expected - (logged[topic] - times[topic])))
-
-
-def _stamps(table: _Topic) -> np.ndarray | None:
-    """The stamps (K,) [s] in a topic's messages; None where they carry none.
-
-    They carry none where all are equal, such as zero. A single zero is a time: a
-    simulated clock begins with it.
-    """
-    for seconds, nanoseconds in _STAMP_FIELDS:
-        if seconds in table.columns and nanoseconds in table.columns:
-            times = np.array(table.columns[seconds])
-            times += np.array(table.columns[nanoseconds]) / 1e9
-            finite = times[np.isfinite(times)]
-            is_set = len(finite) > 0 and (np.ptp(finite) > 0 or finite[0] != 0)
-            is_stuck = len(finite) > 1 and np.ptp(finite) == 0
-            return times if is_set and not is_stuck else None
-    return None
-
-
-def _log_times(table: _Topic) -> np.ndarray:
-    """The times (K,) [s] at which a topic's messages were logged."""
-    return np.array(table.log_times, dtype=np.uint64) / 1e9
-
-
-def _table(topic: _Topic, times: np.ndarray) -> pd.DataFrame:
-    """The messages of a topic in the order of the log, which files need not keep."""
-    order = np.argsort(np.array(topic.log_times), kind="stable")
-    columns = {STAMP: times} | {k: np.array(v) for k, v in topic.columns.items()}
-    return pd.DataFrame(columns).iloc[order].reset_index(drop=True)

@@ -1,0 +1,107 @@
+"""The formats of log files, and the reading of a file of any of them.
+
+A file becomes one table per topic, or a single table under the empty name. Nothing is
+interpreted here. Memory and time stay in proportion to the file's size: what a file
+declares or unfolds to is counted before it is allocated (``gpmpc._bounds``).
+
+To add a format, write its reader in a file of its own, as a function with the signature
+of ``LogReader`` (``_npz`` is a short example), and enter it in ``READERS``.
+"""
+
+from collections.abc import Iterable
+from pathlib import Path
+
+from gpmpc.exceptions import DataError, GpmpcError
+from gpmpc.logs._csv import read_csv
+from gpmpc.logs._file import (
+    LogFile,
+    LogReader,
+    ReadOptions,
+    Tables,
+    first_line,
+    needs_extra,
+)
+from gpmpc.logs._mcap import read_mcap
+from gpmpc.logs._npz import read_npz
+from gpmpc.logs._parquet import read_parquet
+from gpmpc.logs._ulog import read_ulog
+
+#: by the ending of the file's name, in front of which ".gz" is left out
+READERS: dict[str, LogReader] = {
+    ".csv": read_csv,
+    ".tsv": read_csv,
+    ".parquet": read_parquet,
+    ".npz": read_npz,
+    ".mcap": read_mcap,
+    ".ulg": read_ulog,
+}
+
+
+def read_file(
+    path: str | Path,
+    topics: Iterable[str] = (),
+    partial: bool = False,
+    stamp: str = "",
+) -> LogFile:
+    """Reads the tables of a log file.
+
+    Args:
+        path: Of the file.
+        topics: Those that are read; all by default.
+        partial: Takes what is whole of a file that is unfinished or damaged.
+        stamp: The times of a bag's messages: "header", "log", or by the rule of
+            ``gpmpc.logs._bag``.
+
+    Raises:
+        DataError: The file cannot be read, or holds no rows.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise DataError(f"{path}: no such file")
+    read = _find_reader(path)
+    options = ReadOptions(topics=tuple(topics), partial=partial, stamp=stamp)
+    try:
+        file = read(path, options)
+    except GpmpcError:
+        raise
+    except ImportError as error:
+        reason = needs_extra(error)
+        raise DataError(f"{path}: this kind of file {reason}") from error
+    except Exception as error:  # whatever a library raises on a damaged file
+        reason = first_line(error)[:300]
+        raise DataError(f"{path}: cannot be read ({reason})") from error
+    _check_topics(path, file.tables, options.topics)
+    _check_column_names(path, file.tables)
+    if not any(len(table) for table in file.tables.values()):
+        reasons = "; ".join(finding.text for finding in file.findings[:2])
+        because = f" ({reasons})" if reasons else ""
+        raise DataError(f"{path}: holds no rows{because}")
+    return file
+
+
+def _find_reader(path: Path) -> LogReader:
+    name = path.name.lower().removesuffix(".gz")
+    for ending, reader in READERS.items():
+        if name.endswith(ending):
+            return reader
+    raise DataError(f"{path}: unknown kind of file; known are {', '.join(READERS)}")
+
+
+def _check_topics(path: Path, tables: Tables, topics: Iterable[str]) -> None:
+    missing = [topic for topic in topics if topic not in tables]
+    if not missing:
+        return
+    if not missing[0]:
+        raise DataError(
+            f"{path}: has topics, and the mapping names none for one of its signals"
+        )
+    present = ", ".join(sorted(topic for topic in tables if topic)) or "no topics"
+    raise DataError(f"{path}: topic {missing[0]!r} is missing; it has {present}")
+
+
+def _check_column_names(path: Path, tables: Tables) -> None:
+    for topic, table in tables.items():
+        if table.columns.has_duplicates:
+            duplicate = table.columns[table.columns.duplicated()][0]
+            where = f"{path}, {topic}" if topic else str(path)
+            raise DataError(f"{where}: column {duplicate!r} stands there twice")

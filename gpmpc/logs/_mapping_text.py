@@ -1,0 +1,72 @@
+"""Reads the YAML text of a mapping; what would take for ever is refused."""
+
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from gpmpc.exceptions import SettingError
+
+_LONGEST = 2**16  # of a mapping's text [characters]
+_DEEPEST = 10  # levels of a mapping's text
+
+
+def load_mapping_text(path: str | Path) -> Any:
+    """Reads a YAML file as plain data.
+
+    Raises:
+        SettingError: The file cannot be read, has a key twice, or its structure is
+            such that it would take for ever.
+    """
+    try:
+        with Path(path).open(encoding="utf-8") as file:
+            text = file.read(_LONGEST + 1)
+        if len(text) > _LONGEST:
+            raise SettingError("mapping", f"{path} has more than {_LONGEST} characters")
+        _check_structure(text)
+        return yaml.load(text, Loader=_UniqueKeys)
+    except SettingError:
+        raise
+    except (
+        OSError,
+        ValueError,  # of numbers and dates that are none
+        RecursionError,
+        yaml.YAMLError,
+    ) as error:
+        name = " ".join(str(path).split())
+        reason = " ".join(str(error).split())
+        raise SettingError(
+            "mapping", f"{name:.200} cannot be read ({reason:.300})"
+        ) from error
+
+
+class _UniqueKeys(yaml.SafeLoader):
+    """Reads YAML in which no mapping has a key twice, of which the last would win."""
+
+    def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
+        content = super().construct_mapping(node, deep)
+        if len(content) < len(node.value):
+            keys = [self.construct_object(key, deep=True) for key, _ in node.value]
+            key, _ = Counter(keys).most_common(1)[0]
+            raise SettingError("mapping", f"holds the key {key!r:.80} twice")
+        return content
+
+
+def _check_structure(text: str) -> None:
+    """Raises ``SettingError`` of YAML that takes for ever, though it is short.
+
+    A few aliases of aliases stand for more than any memory holds, and the time of
+    nested brackets grows with the square of their depth.
+    """
+    depth = 0
+    for event in yaml.parse(text, Loader=yaml.SafeLoader):
+        if isinstance(event, yaml.AliasEvent):
+            raise SettingError(
+                "mapping",
+                f"has an alias, *{event.anchor}; write out what it stands for",
+            )
+        depth += isinstance(event, yaml.CollectionStartEvent)
+        depth -= isinstance(event, yaml.CollectionEndEvent)
+        if depth > _DEEPEST:
+            raise SettingError("mapping", f"is nested deeper than {_DEEPEST} levels")

@@ -1,0 +1,97 @@
+"""Reads NumPy archives: each array is a column, or several where it has two axes."""
+
+import math
+import zipfile
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pandas as pd
+
+from gpmpc._bounds import Room
+from gpmpc.exceptions import DataError
+from gpmpc.logs._file import (
+    NUMBER_BYTES,
+    TEXT_BYTES,
+    LogFile,
+    ReadOptions,
+    check_column_count,
+    unread_columns,
+)
+
+
+class _DeclaredArray(NamedTuple):
+    """What the head of an array says before its values are read."""
+
+    shape: tuple[int, ...]
+    dtype: np.dtype
+
+    @property
+    def is_table(self) -> bool:
+        """Whether it has columns of numbers or short texts."""
+        return len(self.shape) in (1, 2) and self.dtype.kind in "biufSU"
+
+    @property
+    def is_number(self) -> bool:
+        return self.dtype.kind in "biuf"
+
+
+def read_npz(path: Path, options: ReadOptions) -> LogFile:
+    """Reads the arrays of an archive as the columns of one table."""
+    declared = _declared_arrays(path)
+    tables = {name: array for name, array in declared.items() if array.is_table}
+    _take_memory(path, tables)
+    columns: dict[str, np.ndarray] = {}  # pandas names arrays of different lengths
+    with np.load(path, allow_pickle=False) as archive:
+        for name, array in tables.items():
+            values = archive[name]
+            if len(array.shape) == 1:
+                columns[name] = values
+                continue
+            for i, column in enumerate(values.T):
+                columns[f"{name}[{i}]"] = column
+    unread = sorted(declared.keys() - tables.keys())
+    return LogFile({"": pd.DataFrame(columns)}, unread_columns(path, unread))
+
+
+def _take_memory(path: Path, tables: dict[str, _DeclaredArray]) -> None:
+    """Counts what arrays take before they are read."""
+    room = Room(path)
+    check_column_count(
+        path, sum(math.prod(array.shape[1:]) for array in tables.values())
+    )
+    for name, array in tables.items():
+        bytes_per_cell = NUMBER_BYTES
+        if not array.is_number:
+            bytes_per_cell = TEXT_BYTES + 2 * array.dtype.itemsize
+        what = f"array {name!r} of shape {array.shape}"
+        room.take(math.prod(array.shape) * bytes_per_cell, what)
+
+
+def _declared_arrays(path: Path) -> dict[str, _DeclaredArray]:
+    """Reads the heads of the arrays of an archive."""
+    arrays = {}
+    with zipfile.ZipFile(path) as archive:
+        for member in archive.infolist():
+            name = member.filename.removesuffix(".npy")
+            if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+                raise DataError(f"{path}: array {name!r} is compressed in another way")
+            array = _read_head(archive, member)
+            size = math.prod(array.shape) * array.dtype.itemsize
+            is_too_short = array.dtype.kind != "O" and size > member.file_size
+            if min(array.shape, default=0) < 0 or is_too_short:
+                raise DataError(f"{path}: array {name!r} is shorter than its head says")
+            arrays[name] = array
+    return arrays
+
+
+def _read_head(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> _DeclaredArray:
+    with archive.open(member) as file:
+        version = np.lib.format.read_magic(file)
+        if version == (1, 0):
+            shape, _, dtype = np.lib.format.read_array_header_1_0(file)
+        elif version == (2, 0):
+            shape, _, dtype = np.lib.format.read_array_header_2_0(file)
+        else:  # of structured arrays, which are no columns
+            return _DeclaredArray(shape=(), dtype=np.dtype(object))
+    return _DeclaredArray(shape=shape, dtype=dtype)

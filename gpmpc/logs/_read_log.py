@@ -1,0 +1,160 @@
+"""Reads log files as a ``Log``: files to tables, to runs, to usable rows."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from gpmpc._bounds import Room
+from gpmpc.exceptions import DataError
+from gpmpc.logs._conventions import read_rigid_bodies
+from gpmpc.logs._file import Tables, run_name
+from gpmpc.logs._findings import Finding, RunFindings
+from gpmpc.logs._formats import read_file
+from gpmpc.logs._frames import with_frame_of_files
+from gpmpc.logs._log import Log, LogRun
+from gpmpc.logs._mapping import LogMapping
+from gpmpc.logs._run_tables import RunTable, tabulate
+from gpmpc.logs._signals import check_column
+from gpmpc.logs._usable_rows import select_rows, usual_spread
+
+SHORTEST_STEP = 1e-5  # [s] of rows that are measured one by one
+LONGEST_STEP = 3600.0  # [s] likewise
+MOST_RUNS = 100  # in a file, unless each has
+FEWEST_ROWS = 10
+
+
+def read_log(
+    files: str | Path | Sequence[str | Path],
+    mapping: LogMapping | Mapping[str, Any] | str | Path,
+    partial: bool = False,
+) -> Log:
+    """Reads the runs of one file or several.
+
+    Args:
+        files: Each ends in .csv, .csv.gz, .tsv, .parquet, .npz, .mcap (of this package
+            or of ROS 2) or .ulg.
+        mapping: What the columns mean: a YAML file, plain data or a ``LogMapping``.
+        partial: Takes what is whole of unfinished or damaged files; findings say what
+            is lost.
+
+    Raises:
+        DataError: A file, topic or column is missing or cannot be used; the text says
+            where and why.
+        SettingError: The mapping is wrong.
+    """
+    paths = _as_paths(files)
+    mapping = with_frame_of_files(_as_mapping(mapping), paths)
+    findings: list[Finding] = []
+    tables = _read_run_tables(paths, mapping, partial, findings)
+    step = _time_step(tables, paths[0], mapping, findings)
+    spread = usual_spread([mapping.split(table.values).states for table in tables])
+    runs = []
+    for table in tables:
+        run_findings = RunFindings(table.name, findings)
+        run = select_rows(table, step, spread, mapping, run_findings)
+        if run is not None:
+            runs.append(run)
+    _check_content(runs, paths, findings)
+    if mapping.model == "rigid_body":
+        runs, remarks = read_rigid_bodies(runs, step, mapping)
+        findings += remarks
+    return Log(
+        mapping=mapping, time_step=step, runs=tuple(runs), findings=tuple(findings)
+    )
+
+
+def _as_paths(files: str | Path | Sequence[str | Path]) -> list[Path]:
+    if isinstance(files, str | Path):
+        return [Path(files)]
+    return [Path(file) for file in files]
+
+
+def _as_mapping(mapping: LogMapping | Mapping[str, Any] | str | Path) -> LogMapping:
+    if isinstance(mapping, LogMapping):
+        return mapping
+    if isinstance(mapping, str | Path):
+        return LogMapping.load(mapping)
+    return LogMapping.from_dict(mapping)
+
+
+def _read_run_tables(
+    paths: Sequence[Path], mapping: LogMapping, partial: bool, findings: list[Finding]
+) -> list[RunTable]:
+    """Reads all files, and makes one table of each run in them."""
+    topics = {signal.topic for signal in mapping.signals}
+    tables: dict[str, RunTable] = {}  # by run
+    for path in paths:
+        file = read_file(path, topics, partial=partial, stamp=mapping.stamp)
+        findings.extend(file.findings)
+        room = Room(path)
+        for run, tables_of_run in _split_into_runs(path, file.tables, mapping):
+            if run in tables:
+                raise DataError(
+                    f"run {run!r} comes from two files: give the files different names"
+                )
+            where = f"{path}, run {run}" if mapping.run else str(path)
+            run_findings = RunFindings(run, findings)
+            tables[run] = tabulate(where, tables_of_run, mapping, run_findings, room)
+    if not tables:
+        raise DataError("no log file was given")
+    return list(tables.values())
+
+
+def _split_into_runs(
+    path: Path, tables: Tables, mapping: LogMapping
+) -> Iterator[tuple[str, Tables]]:
+    """Yields the runs of a file with their names: one, or those that a column names."""
+    if not mapping.run:
+        yield run_name(path), tables
+        return
+    table = tables.get("", pd.DataFrame())
+    check_column(str(path), table, mapping.run)
+    count = table[mapping.run].nunique()
+    if count > MOST_RUNS and count > len(table) / FEWEST_ROWS:
+        raise DataError(
+            f"{path}: column {mapping.run!r} names {count} runs in {len(table)} rows; "
+            f"a run has {FEWEST_ROWS} at least"
+        )
+    for run, rows in table.groupby(mapping.run, sort=False):
+        yield f"{run_name(path)}:{run}", {"": rows}
+
+
+def _time_step(
+    tables: Sequence[RunTable],
+    first_path: Path,
+    mapping: LogMapping,
+    findings: list[Finding],
+) -> float:
+    """Returns the time step [s] of a log: its rate's, or the usual one of its rows."""
+    steps = np.concatenate([np.diff(table.time) for table in tables])
+    if not len(steps):
+        reason = "no two rows have different stamps"
+        if mapping.rate:
+            reason = f"a rate of {mapping.rate:g} Hz leaves a single row"
+        raise DataError(f"{first_path}: {reason}")
+    if mapping.rate:
+        return 1 / mapping.rate
+    step = float(np.median(steps))
+    if not SHORTEST_STEP <= step <= LONGEST_STEP:
+        text = f"rows are {step:.3g} s apart: is the unit of the time right?"
+        findings.append(Finding("time step", tables[0].name, 1, text))
+    return step
+
+
+def _check_content(
+    runs: Sequence[LogRun], paths: Sequence[Path], findings: Sequence[Finding]
+) -> None:
+    """Raises ``DataError`` where nothing can be learned from the usable rows."""
+    if not runs:
+        others = " and others" if len(paths) > 1 else ""
+        reasons = "; ".join(f"{f.run}: {f.text}" for f in findings[-3:])
+        raise DataError(f"{paths[0]}{others}: no row can be used ({reasons})")
+    has_inputs = runs[0].inputs.shape[1] > 0
+    if has_inputs and all(np.ptp(run.inputs, axis=0).max() == 0 for run in runs):
+        raise DataError(
+            "no input changes in any row: the system is at rest, and nothing can be "
+            "learned of it"
+        )

@@ -1,0 +1,210 @@
+"""Makes one grid of times for all topics of a run, and resamples values to it.
+
+A grid over a jump of ten days would take all memory, so it is made piece by piece.
+"""
+
+from collections.abc import Mapping
+from functools import reduce
+from typing import NamedTuple
+
+import numpy as np
+
+from gpmpc._angles import wrap
+from gpmpc._bounds import Room
+from gpmpc.exceptions import DataError
+from gpmpc.logs._clocks import JUMP, Stamps, find_jumps
+from gpmpc.logs._file import NUMBER_BYTES
+from gpmpc.logs._findings import RunFindings
+from gpmpc.logs._kinematics import (
+    Array,
+    quaternion_inverse,
+    quaternion_product,
+    rotation_quaternion,
+    rotation_vector,
+)
+
+STAMP_RESOLUTION = 1e-6  # [s]: float64 seconds since 1970 resolve a quarter of it
+COPIES = 2  # of a grid's values, while signals are put on it
+
+
+class Grid(NamedTuple):
+    """Times (G,) [s] at which a run has rows, and where its pieces begin."""
+
+    time: Array
+    breaks: np.ndarray  # (G,) rows before which time ran backwards, or jumped
+
+
+def grid_of_rows(
+    stamps: Stamps, columns: int, max_gap: float | None, room: Room
+) -> Grid:
+    """Takes the stamps of a single table as they are.
+
+    Args:
+        stamps: Of its rows.
+        columns: How many will be put on the grid.
+        max_gap: From the mapping [s].
+        room: What the rows will take is taken from it.
+    """
+    rows = len(stamps.time)
+    room.take(_memory(rows, columns), f"{rows} rows of {columns} columns")
+    breaks = stamps.after_reversal.copy()
+    breaks[find_jumps(stamps.time, max_gap) + 1] = True
+    return Grid(stamps.time, breaks)
+
+
+def grid_at_rate(
+    stamps: Mapping[str, Stamps],
+    rate: float,
+    columns: int,
+    max_gap: float | None,
+    where: str,
+    findings: RunFindings,
+    room: Room,
+) -> Grid:
+    """Makes equal time steps in the pieces that all topics have in common.
+
+    Args:
+        stamps: By topic.
+        rate: [Hz].
+        columns: How many will be put on the grid.
+        max_gap: From the mapping [s].
+        where: Names the file and the run, for errors.
+        findings: Takes how many rows have no time in common with others.
+        room: What the rows will take is taken from it.
+
+    Raises:
+        DataError: The topics have no time in common, or the grid would be too large.
+    """
+    common = _common_pieces(stamps, max_gap, where, findings)
+    steps = (common[:, 1] - common[:, 0]) * rate * (1 + 1e-12)
+    resolution_in_steps = min(STAMP_RESOLUTION * rate, 0.1)
+    lengths = np.floor(steps + resolution_in_steps) + 1
+    rows = float(lengths.sum())
+    what = f"{rows:.6g} rows of {columns} columns at a rate of {rate:g} Hz"
+    if (max_gap or 0.0) > JUMP:
+        what += f", with gaps of up to {max_gap:g} s (max_gap),"
+    room.take(_memory(rows, columns), what)
+
+    counts = lengths.astype(int)
+    first_rows = np.r_[0, np.cumsum(lengths)[:-1]].astype(int)
+    begins = np.repeat(common[:, 0], counts)
+    row_in_piece = np.arange(len(begins)) - np.repeat(first_rows, counts)
+    breaks = np.zeros(len(begins), dtype=bool)
+    breaks[first_rows[1:]] = True
+    return Grid(begins + row_in_piece / rate, breaks)
+
+
+def _memory(rows: float, columns: int) -> float:
+    """Returns what a run's rows take while they are worked on [bytes]."""
+    return rows * columns * COPIES * NUMBER_BYTES
+
+
+def _common_pieces(
+    stamps: Mapping[str, Stamps],
+    max_gap: float | None,
+    where: str,
+    findings: RunFindings,
+) -> Array:
+    """Finds the pieces (C, 2) [s] that all topics have in common."""
+    pieces = {
+        topic: cut_pieces(topic_stamps.time, max_gap)
+        for topic, topic_stamps in stamps.items()
+    }
+    common = reduce(intersect_pieces, pieces.values())
+    if not len(common):
+        hint = ": stamp: log takes the times of the log" if any(stamps) else ""
+        raise DataError(
+            f"{where}: the topics {', '.join(stamps)} have no time in common{hint}"
+        )
+    for topic, pieces_of_topic in pieces.items():
+        count = count_rows_alone(stamps[topic].time, pieces_of_topic, common)
+        text = f"{count} rows of {topic} have no time in common with others: left out"
+        findings.add("no time in common", count, text)
+    return common
+
+
+def cut_pieces(time: Array, max_gap: float | None) -> Array:
+    """Returns begins and ends (P, 2) [s] of the pieces between jumps."""
+    jumps = find_jumps(time, max_gap)
+    begins = time[np.r_[0, jumps + 1]]
+    ends = time[np.r_[jumps, len(time) - 1]]
+    return np.column_stack([begins, ends])
+
+
+def intersect_pieces(pieces: Array, others: Array) -> Array:
+    """Intersects two lists of pieces (P, 2) in the order of time; returns (C, 2)."""
+    common = []
+    i = 0
+    j = 0
+    while i < len(pieces) and j < len(others):
+        begin = max(pieces[i, 0], others[j, 0])
+        end = min(pieces[i, 1], others[j, 1])
+        if begin < end:
+            common.append((begin, end))
+        if pieces[i, 1] < others[j, 1]:
+            i += 1
+        else:
+            j += 1
+    return np.array(common).reshape(-1, 2)
+
+
+def count_rows_alone(time: Array, pieces: Array, common: Array) -> int:
+    """Counts the rows of a topic in pieces (P, 2) of which nothing is in common."""
+    # the first common piece that ends behind the begin of each
+    candidates = np.searchsorted(common[:, 1], pieces[:, 0])
+    nearest = common[np.minimum(candidates, len(common) - 1)]
+    is_alone = (nearest[:, 1] < pieces[:, 0]) | (nearest[:, 0] > pieces[:, 1])
+    ends = np.searchsorted(time, pieces[:, 1], side="right")
+    rows = ends - np.searchsorted(time, pieces[:, 0])
+    return int(rows[is_alone].sum())
+
+
+def resample(
+    time: Array,
+    values: Array,
+    grid: Array,
+    rule: str,
+    max_gap: float,
+    angles: bool = False,
+) -> Array:
+    """Computes values (G, c) at the times of a grid from samples.
+
+    Args:
+        time: Of the samples, increasing (K,) [s].
+        values: Of the samples (K, c); those with a NaN are left out.
+        grid: (G,) [s].
+        rule: "hold" takes the last sample, "linear" interpolates, "spherical"
+            interpolates quaternions.
+        max_gap: Values are NaN where two samples are farther apart [s], as they are
+            beyond all samples.
+        angles: Whether values are angles [rad], between which the rule "linear" goes
+            the short way round.
+    """
+    present = np.isfinite(values).all(axis=1)
+    time = time[present]
+    values = values[present]
+    if not len(time):
+        return np.full((len(grid), values.shape[1]), np.nan)
+    sample = np.searchsorted(time, grid + STAMP_RESOLUTION, side="right") - 1
+    before = np.clip(sample, 0, None)
+    after = np.clip(sample + 1, None, len(time) - 1)
+    lag = grid - time[before]
+    span = time[after] - time[before]
+    if rule == "hold":
+        usable = (sample >= 0) & (lag <= max_gap)
+        return np.where(usable[:, None], values[before], np.nan)
+
+    fraction = np.divide(lag, span, out=np.zeros_like(lag), where=span > 0)[:, None]
+    start = values[before]
+    end = values[after]
+    if rule == "spherical":
+        turn = rotation_vector(quaternion_product(quaternion_inverse(start), end))
+        resampled = quaternion_product(start, rotation_quaternion(fraction * turn))
+    elif angles:
+        resampled = start + fraction * wrap(end - start)
+    else:
+        resampled = start + fraction * (end - start)
+    is_on_sample = lag <= STAMP_RESOLUTION
+    is_between = (sample < len(time) - 1) & (span <= max_gap)
+    usable = (sample >= 0) & (is_on_sample | is_between)
+    return np.where(usable[:, None], resampled, np.nan)

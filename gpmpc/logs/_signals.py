@@ -1,0 +1,161 @@
+"""Makes signals in SI units of the columns of a table; NaN where a value is missing."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import pandas as pd
+from scipy.spatial.transform import Rotation
+
+from gpmpc.exceptions import DataError
+from gpmpc.logs._dropouts import sentinels, zero_dropouts
+from gpmpc.logs._findings import RunFindings
+from gpmpc.logs._kinematics import Array
+from gpmpc.logs._mapping import Signal
+
+LISTED_COLUMNS = 12  # of a table, where one is missing
+LARGEST_ANGLE = 4 * np.pi  # [rad]; larger ones are rather degrees
+NORM_TOLERANCE = 0.05  # of unit quaternions
+
+
+def read_column(label: str, table: pd.DataFrame, column: str) -> Array:
+    """Reads a column of numbers (K,).
+
+    Args:
+        label: Names the table, for errors.
+        table: With K rows.
+        column: Its name.
+
+    Raises:
+        DataError: The column is missing, or holds something else.
+    """
+    check_column(label, table, column)
+    values = table[column]
+    numbers = pd.to_numeric(values, errors="coerce").to_numpy(dtype=float)
+    is_wrong = np.isnan(numbers) & ~values.isna().to_numpy()
+    if is_wrong.any():
+        row = int(np.argmax(is_wrong))
+        raise DataError(
+            f"{label}: row {row + 1}, column {column!r} is {values.iloc[row]!r}; "
+            "expected a number"
+        )
+    return numbers
+
+
+def check_column(label: str, table: pd.DataFrame, column: str) -> None:
+    """Raises ``DataError`` where a table has no such column."""
+    if column in table:
+        return
+    listed = ", ".join(map(str, table.columns[:LISTED_COLUMNS]))
+    if len(table.columns) > LISTED_COLUMNS:
+        listed += ", ..."
+    raise DataError(f"{label}: column {column!r} is missing; it has {listed}")
+
+
+def empty_zero_dropouts(
+    label: str, table: pd.DataFrame, signals: Sequence[Signal], findings: RunFindings
+) -> pd.DataFrame:
+    """Empties the rows in which all states are zero, because no sensor was read."""
+    columns = [
+        column
+        for signal in signals
+        if signal.role == "states"
+        for column in signal.columns
+    ]
+    states = [read_column(label, table, column) for column in columns]
+    if not states:
+        return table
+    dropouts = zero_dropouts(np.column_stack(states))
+    count = int(dropouts.sum())
+    if not count:
+        return table
+    text = f"{count} rows with zeros for all states: left out"
+    findings.add("all zero", count, text)
+    emptied = table.astype(dict.fromkeys(columns, float))
+    emptied.loc[dropouts, columns] = np.nan
+    return emptied
+
+
+def read_signal(
+    label: str, table: pd.DataFrame, signal: Signal, findings: RunFindings
+) -> Array:
+    """Reads a signal (K, c) in the units and conventions of ``gpmpc.logs``.
+
+    Args:
+        label: Names the table, for errors.
+        table: With K rows.
+        signal: Says which columns, and in which units.
+        findings: Takes what is missing.
+
+    Raises:
+        DataError: A column cannot be read, angles are rather in degrees, or quaternions
+            have no unit length.
+    """
+    columns = [
+        _without_sentinels(column, read_column(label, table, column), findings)
+        for column in signal.columns
+    ]
+    values = np.column_stack(columns) * signal.factors
+    values[~np.isfinite(values)] = np.nan
+    absent = np.asarray(np.isnan(values).any(axis=1))
+    text = f"{absent.sum()} rows of {signal.name} without a value: left out"
+    findings.add("missing value", absent.sum(), text)
+    if signal.kind == "quaternion":
+        return _unit_quaternions(label, values, signal, findings)
+    _check_angles(label, values, signal)
+    if signal.kind == "euler":
+        return _euler_to_quaternions(values, present=~absent)
+    return values
+
+
+def _without_sentinels(column: str, numbers: Array, findings: RunFindings) -> Array:
+    """Puts NaN where a logger wrote a number for a missing value."""
+    is_sentinel = sentinels(numbers)
+    if is_sentinel.any():
+        listed = ", ".join(f"{n:g}" for n in np.unique(numbers[is_sentinel])[:3])
+        count = is_sentinel.sum()
+        text = f"{count} rows of {column} hold {listed}, no measurement: left out"
+        findings.add("sentinel", count, text)
+    return np.where(is_sentinel, np.nan, numbers)
+
+
+def _check_angles(label: str, values: Array, signal: Signal) -> None:
+    """Raises ``DataError`` where angles that are said to be radians are too large."""
+    if signal.kind not in ("angle", "euler") or signal.unit != "rad":
+        return
+    largest = float(np.nanmax(np.abs(values), initial=0.0))
+    if largest > LARGEST_ANGLE:
+        raise DataError(
+            f"{label}: {signal.name} reaches {largest:.4g} rad: are these degrees? "
+            "(unit: deg)"
+        )
+
+
+def _euler_to_quaternions(angles: Array, present: np.ndarray) -> Array:
+    """Makes quaternions (K, 4) of roll, pitch and yaw (K, 3) [rad]."""
+    quaternions = np.full((len(angles), 4), np.nan)
+    turns = Rotation.from_euler("ZYX", angles[present, ::-1])
+    quaternions[present] = turns.as_quat()
+    return quaternions
+
+
+def _unit_quaternions(
+    label: str, values: Array, signal: Signal, findings: RunFindings
+) -> Array:
+    """Makes unit quaternions (x, y, z, w) whose sign does not flip."""
+    if signal.order == "wxyz":
+        values = values[:, [1, 2, 3, 0]]
+    norms = np.linalg.norm(values, axis=1)
+    is_off = np.abs(norms - 1) > NORM_TOLERANCE
+    if is_off.any():
+        row = int(np.argmax(is_off))
+        raise DataError(
+            f"{label}: {signal.name} in row {row + 1} has norm {norms[row]:.4g}; "
+            "expected unit quaternions"
+        )
+    values = values / norms[:, None]
+    present = np.flatnonzero(np.isfinite(norms))
+    flips = np.einsum("ij,ij->i", values[present[1:]], values[present[:-1]]) < 0
+    text = f"{flips.sum()} times: turned back"
+    findings.add("quaternion flips its sign", flips.sum(), text)
+    values[present[1:]] *= np.where(np.cumsum(flips) % 2, -1.0, 1.0)[:, None]
+    return values

@@ -1,0 +1,240 @@
+"""Leaves out the rows that are no measurement of a moving system, and marks the pieces.
+
+Left out are rows outside the ranges of ``keep``, at rest, without a value, or that
+repeat the row before because a sensor was silent. Where rows are missing, a new piece
+begins.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.ndimage import binary_dilation, maximum_filter1d, minimum_filter1d
+
+from gpmpc.exceptions import DataError
+from gpmpc.logs._clocks import JUMP
+from gpmpc.logs._dropouts import changes_rarely, frozen_rows
+from gpmpc.logs._findings import RunFindings
+from gpmpc.logs._kinematics import Array
+from gpmpc.logs._log import LogRun
+from gpmpc.logs._mapping import LogMapping
+from gpmpc.logs._run_tables import RunTable
+
+REST_TIME = 0.5  # [s] for which nothing moves at rest
+REST_SHARE = 0.1  # of a state's usual spread that counts as no movement
+MOST_HELD = 0.5  # of the rows; beyond, a signal has another rate than its table
+SHORT_STEP = 0.5  # time steps; a shorter one is uneven
+LONG_STEP = 1.5  # time steps likewise, where the mapping names no largest gap
+
+
+def usual_spread(states: Sequence[Array]) -> Array:
+    """Returns half of the range (n,) that holds 80 % of the rows of all runs.
+
+    Args:
+        states: Of each run (K, n); rows with a NaN do not count.
+
+    Raises:
+        DataError: No row has a value of every state.
+    """
+    present = np.concatenate([rows[np.isfinite(rows).all(axis=1)] for rows in states])
+    if not len(present):
+        raise DataError("no row has a value of every state")
+    low, high = np.quantile(present, [0.1, 0.9], axis=0)
+    return (high - low) / 2
+
+
+def select_rows(
+    table: RunTable,
+    step: float,
+    spread: Array,
+    mapping: LogMapping,
+    findings: RunFindings,
+) -> LogRun | None:
+    """Makes a run of the rows of a table that can be used.
+
+    Args:
+        table: Of the run.
+        step: Time step of the log [s].
+        spread: See ``usual_spread`` (n,).
+        mapping: Says what is left out.
+        findings: Of the run, which takes what is left out.
+
+    Returns:
+        The run; None where less than two rows are left.
+
+    Raises:
+        DataError: A signal changes in so few rows that its sensor was silent, or slow.
+    """
+    values = mapping.split(table.values)
+    rows = _RowSelection(len(table.time), findings)
+    rows.leave_out(table.outside, "outside of keep", "outside the ranges of keep")
+    if mapping.rest == "drop":
+        at_rest = _at_rest(values.states, values.inputs, spread, step)
+        rows.leave_out(at_rest, "at rest", "where nothing moves")
+    is_missing = np.asarray(np.isnan(table.values).any(axis=1))
+    rows.leave_out(is_missing, "missing value", "in a gap or without a value")
+    if mapping.held == "drop":
+        _leave_out_held_values(rows, table.name, values.states, mapping)
+        motion = _motion(values.states, spread, step)
+        _note_held_sensors(values.states, motion, mapping, findings)
+    used = np.flatnonzero(rows.usable)
+    if len(used) < 2:
+        text = "no row can be used: the run is left out"
+        findings.add("nothing left", len(table.time), text)
+        return None
+    breaks = _find_breaks(table, used, step, mapping, findings)
+    values = mapping.split(table.values[used])
+    return LogRun(
+        name=table.name,
+        time=table.time[used],
+        states=values.states,
+        inputs=values.inputs,
+        context=values.context,
+        begins=(0, *(np.flatnonzero(breaks) + 1).tolist()),
+    )
+
+
+class _RowSelection:
+    """The rows of a run that are usable so far."""
+
+    def __init__(self, count: int, findings: RunFindings) -> None:
+        self.usable = np.ones(count, dtype=bool)
+        self._findings = findings
+
+    def leave_out(self, rows: np.ndarray, kind: str, text: str) -> None:
+        """Leaves out rows (K,), and notes those that were usable until now."""
+        count = (rows & self.usable).sum()
+        text = f"{count} of {len(rows)} rows {text}: left out"
+        self._findings.add(kind, count, text)
+        self.usable[rows] = False
+
+
+def _leave_out_held_values(
+    rows: _RowSelection, run: str, states: Array, mapping: LogMapping
+) -> None:
+    """Leaves out rows in which a whole signal of the states repeats the row before."""
+    for signal, columns in zip(
+        mapping.of("states"), mapping.space.columns, strict=True
+    ):
+        if len(signal.columns) < 2:  # a single one may repeat by its resolution
+            continue
+        repeats = (states[1:, columns] == states[:-1, columns]).all(axis=1)
+        held = np.r_[False, repeats] & rows.usable
+        usable = rows.usable.sum()
+        if held.sum() >= max(usable - 1, 1):
+            raise DataError(
+                f"run {run}: {signal.name} never changes: its sensor was silent; "
+                "leave it out, or held: use"
+            )
+        if held.sum() > MOST_HELD * max(usable, 1):
+            changes = (rows.usable & ~held).sum()
+            raise DataError(
+                f"run {run}: {signal.name} changes in {changes} of {usable} rows only: "
+                "its own rate is lower; state a lower rate, or held: use"
+            )
+        text = f"where {signal.name} repeats the row before"
+        rows.leave_out(held, "held value", text)
+
+
+def _note_held_sensors(
+    states: Array, motion: np.ndarray, mapping: LogMapping, findings: RunFindings
+) -> None:
+    """Notes single columns that repeat while others move.
+
+    They stay in: a wheel at rest repeats its speed, too, and then starts with a jump.
+    """
+    for signal, columns in zip(
+        mapping.of("states"), mapping.space.columns, strict=True
+    ):
+        if signal.is_attitude:
+            continue
+        for index, name in enumerate(signal.columns, start=columns.start):
+            others_move = np.any(np.delete(motion, index, axis=1), axis=1)
+            column = states[:, index]
+            frozen = frozen_rows(column, others_move)
+            if frozen.any():
+                text = (
+                    f"{frozen.sum()} rows in which {name} stays at its value, and then "
+                    "jumps or ends, while others move: was the sensor silent? left in"
+                )
+                findings.add("held sensor", frozen.sum(), text)
+            elif changes_rarely(column, others_move):
+                changes = int((np.diff(column) != 0).sum())
+                text = (
+                    f"{name} changes in {changes} of {len(column)} rows only, while "
+                    "others move: is its own rate lower? state a lower rate; left in"
+                )
+                findings.add("held sensor", len(column) - 1 - changes, text)
+
+
+def _find_breaks(
+    table: RunTable,
+    used: np.ndarray,
+    step: float,
+    mapping: LogMapping,
+    findings: RunFindings,
+) -> np.ndarray:
+    """Finds the used rows behind which a new piece begins, and notes gaps.
+
+    Args:
+        table: Of the run.
+        used: Rows (U,) that are used.
+        step: Time step of the log [s].
+        mapping: Says how long a gap may be.
+        findings: Takes the gaps between neighbouring rows.
+
+    Returns:
+        Whether a piece ends with each used row but the last (U - 1,).
+    """
+    longest = LONG_STEP * step
+    if mapping.max_gap and not mapping.rate:
+        longest = mapping.max_gap
+    steps = np.diff(table.time[used])
+    is_uneven = (steps > longest) | (steps < SHORT_STEP * step)
+    are_apart = np.diff(used) > 1
+    breaks = table.breaks[used[1:]]
+    is_jump = breaks & (steps > JUMP)  # which has its own finding
+    _note_gaps(steps[is_uneven & ~are_apart & ~is_jump], step, findings)
+    return is_uneven | are_apart | breaks
+
+
+def _note_gaps(uneven: Array, step: float, findings: RunFindings) -> None:
+    """Notes uneven time steps (G,) [s] between neighbouring rows."""
+    if not len(uneven):
+        return
+    shortest = uneven.min()
+    longest = uneven.max()
+    if shortest > step:
+        text = f"{len(uneven)} gaps, up to {longest:.3g} s: boundaries"
+    else:
+        text = (
+            f"{len(uneven)} steps of {shortest:.3g} to {longest:.3g} s: boundaries "
+            "(a rate resamples)"
+        )
+    findings.add("gap", len(uneven), text)
+
+
+def _motion(states: Array, spread: Array, step: float) -> np.ndarray:
+    """Tells which states move around a row (K, n): by a tenth of their usual spread."""
+    size = min(max(round(REST_TIME / step), 3), len(states))
+    return _range_within(np.nan_to_num(states), size) > REST_SHARE * spread
+
+
+def _at_rest(states: Array, inputs: Array, spread: Array, step: float) -> np.ndarray:
+    """Finds rows (K,) of stretches in which inputs stay and no state moves much.
+
+    A state that does not move changes by a tenth of its usual spread at most.
+    """
+    size = max(round(REST_TIME / step), 3)
+    if len(states) < size or not inputs.shape[1]:
+        return np.zeros(len(states), dtype=bool)
+    limit = np.concatenate([REST_SHARE * spread, np.zeros(inputs.shape[1])])
+    values = np.nan_to_num(np.concatenate([states, inputs], axis=1))
+    is_still = (_range_within(values, size) <= limit).all(axis=1)
+    return binary_dilation(is_still, np.ones(2 * (size // 2) + 1))
+
+
+def _range_within(values: Array, size: int) -> Array:
+    """Returns the range of values (K, c) within ``size`` rows around each."""
+    highest = maximum_filter1d(values, size, axis=0)
+    lowest = minimum_filter1d(values, size, axis=0)
+    return highest - lowest
