@@ -1,6 +1,6 @@
-"""What data cannot teach: columns that never move, states that never follow, copies.
+"""Checks of training data: columns that never move, states that never follow, copies.
 
-A training goes on all the same. What it could not learn it says in one line of the log,
+A training goes on all the same. The log says in one line what could not be learned,
 with the rule and the way out.
 """
 
@@ -13,22 +13,21 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from gpmpc.gp._prior_scales import PriorScales
-from gpmpc.gp._transitions import Transitions
+from gpmpc.gp._transitions import Transitions, check_transitions
+from gpmpc.gp._wrapped import warn_of_turns
 
 _log = logging.getLogger(__name__)
 
 #: Part of its magnitude by which a column moves for round-off alone: twelve of the 52
-#: bits of a number. A feature of spread 1 around 1e9, which is 2e-9, moves.
+#: bits of a number. A feature of standard deviation 1 around 1e9, 1e-9 of it, moves.
 ROUND_OFF = 2**12 * np.finfo(np.float64).eps
 #: What a column moves by at most, in its own unit, where it does not move: solvers and
 #: simulators leave residues of as much.
 RESOLUTION = 1e-9
-_SHOWN = 6  # columns that a line names; of more it says how many
 
 
 class Columns(NamedTuple):
-    """What is known of the columns of features and targets beside their numbers."""
+    """Names and magnitudes of the columns of features and targets."""
 
     features: Sequence[str]  #: names (d,)
     outputs: Sequence[str]  #: names (k,)
@@ -40,25 +39,42 @@ class Columns(NamedTuple):
 
     @property
     def units(self) -> NDArray[np.float64]:
-        """What ``prior_deviation`` counts in (k,)."""
-        return (
-            np.ones(len(self.outputs)) if self.deviations is None else self.deviations
-        )
+        """Units that ``prior_deviation`` counts in (k,)."""
+        if self.deviations is None:
+            return np.ones(len(self.outputs))
+        return self.deviations
 
     @classmethod
-    def of(cls, features: Tensor, targets: Tensor, input_dim: int, predicts: str):
-        """Columns of states and inputs without names, which are counted from 1."""
-        d = features.shape[1]
-        k = targets.shape[1]
-        states = [f"state {i + 1}" for i in range(d - input_dim)]
-        inputs = [f"input {i + 1}" for i in range(input_dim)]
+    def numbered(
+        cls, features: Tensor, targets: Tensor, input_dim: int, predicts: str
+    ) -> "Columns":
+        """Names states, inputs and outputs by numbers from 1.
+
+        Args:
+            features: x~ = (x, u) (N, n + m).
+            targets: (N, k).
+            input_dim: m.
+            predicts: What the targets mean.
+        """
+        output_count = targets.shape[1]
+        states = _numbered("state", features.shape[1] - input_dim)
+        inputs = _numbered("input", input_dim)
         outputs = states
         if predicts == "value":
-            outputs = [f"output {a + 1}" for a in range(k)]
+            outputs = _numbered("output", output_count)
         magnitudes = None
         if predicts == "difference":
-            magnitudes = features[:, :k].abs().amax(dim=0).numpy()
+            magnitudes = features[:, :output_count].abs().amax(dim=0).numpy()
         return cls(features=states + inputs, outputs=outputs, magnitudes=magnitudes)
+
+    @classmethod
+    def of_transitions(cls, transitions: Transitions, predicts: str) -> "Columns":
+        """Names the columns of GPs that learn next states, or differences."""
+        states, inputs = signal_names(transitions)
+        magnitudes = None
+        if predicts == "difference":
+            magnitudes = transitions.states.abs().amax(dim=0).numpy()
+        return cls(features=states + inputs, outputs=states, magnitudes=magnitudes)
 
 
 class Constants(NamedTuple):
@@ -68,8 +84,13 @@ class Constants(NamedTuple):
     outputs: NDArray[np.bool_]  #: (k,)
 
     @classmethod
-    def of(cls, features: Tensor, targets: Tensor, columns: Columns, resolution: float):
-        """Those of features (N, d) and targets (N, k) in the units of the data."""
+    def find(
+        cls, features: Tensor, targets: Tensor, columns: Columns, resolution: float
+    ) -> "Constants":
+        """Finds the columns of features (N, d) and targets (N, k) that never move.
+
+        Both are in the units of the data.
+        """
         return cls(
             features=constant_columns(features.numpy(), resolution),
             outputs=constant_columns(targets.numpy(), resolution, columns.magnitudes),
@@ -81,11 +102,11 @@ def constant_columns(
     resolution: float = RESOLUTION,
     magnitudes: np.ndarray | None = None,
 ) -> NDArray[np.bool_]:
-    """Which columns (d,) of (N, d) move by no more than round-off or ``resolution``.
+    """Finds the columns (d,) of (N, d) that move by no more than ``resolution``.
 
-    Round-off is relative to the columns' own magnitudes or to ``magnitudes`` (d,), the
-    larger of both: it is that of the numbers that a column holds or is the difference
-    of.
+    A column does not move, either, by round-off. That is relative to the columns' own
+    magnitudes or to ``magnitudes`` (d,), the larger of both: to the numbers that a
+    column holds or is the difference of.
     """
     largest = np.abs(columns).max(axis=0)
     if magnitudes is not None:
@@ -93,81 +114,56 @@ def constant_columns(
     return np.ptp(columns, axis=0) <= np.maximum(ROUND_OFF * largest, resolution)
 
 
+def column_std(columns: np.ndarray, constant: np.ndarray | None = None) -> np.ndarray:
+    """Computes the standard deviation (d,) of columns (N, d).
+
+    Of a constant column it takes the magnitude, or 1 where that is zero.
+
+    Args:
+        columns: (N, d).
+        constant: Which of them are constant (d,); by default as ``constant_columns``
+            finds.
+    """
+    constant = constant_columns(columns) if constant is None else constant
+    shifted = columns - columns[0]
+    magnitude = np.abs(columns).max(axis=0)
+    magnitude = np.where(magnitude > RESOLUTION, magnitude, 1.0)
+    unit = np.where(constant, magnitude, np.abs(shifted).max(axis=0))
+    deviation = (shifted / unit).std(axis=0, ddof=min(1, len(columns) - 1))
+    return unit * np.where(constant, 1.0, deviation)
+
+
 def signal_names(transitions: Transitions) -> tuple[list[str], list[str]]:
-    """Names of the states and of the inputs: the data's own, or numbers from 1."""
+    """Returns the names of the states and of the inputs, or numbers from 1."""
     states = list(transitions.signals.state_names)
     inputs = list(transitions.signals.input_names)
     if not states:
-        states = [f"state {i + 1}" for i in range(transitions.state_dim)]
+        states = _numbered("state", transitions.state_dim)
     if not inputs:
-        inputs = [f"input {i + 1}" for i in range(transitions.input_dim)]
+        inputs = _numbered("input", transitions.input_dim)
     return states, inputs
 
 
-def columns_of(transitions: Transitions, predicts: str) -> Columns:
-    """The columns of GPs that learn next states, or differences, of transitions."""
-    states, inputs = signal_names(transitions)
-    magnitudes = None
-    if predicts == "difference":
-        magnitudes = transitions.states.abs().amax(dim=0).numpy()
-    return Columns(features=states + inputs, outputs=states, magnitudes=magnitudes)
+def _numbered(word: str, count: int) -> list[str]:
+    return [f"{word} {i + 1}" for i in range(count)]
 
 
-def warn_of_constants(
-    features: Tensor,
-    targets: Tensor,
-    columns: Columns,
-    constants: Constants,
-    prior: PriorScales,
-    resolution: float,
-) -> None:
-    """Names in the log what the data hold still, and what is supposed of it instead.
+def checked_targets(transitions: Transitions, predicts: str) -> Tensor:
+    """Returns the targets (N, n) of transitions; the log names what looks wrong.
 
-    What a setting says is known is not named: a feature of an infinite length-scale,
-    and outputs whose deviation the search is to find.
+    Raises:
+        SettingError: They are no ``Transitions``.
+        UnsupportedModel: The GPs predict values, which transitions do not hold.
     """
-    size = len(features)
-    unknown_features = constants.features & np.isfinite(prior.lengthscales)
-    lengths = _numbers(prior.lengthscales[unknown_features])
-    unknown_outputs = np.zeros_like(constants.outputs)
-    deviations = ""
-    if prior.deviations is not None:
-        unknown_outputs = constants.outputs
-        deviations = _numbers(prior.deviations[unknown_outputs])
-    if size == 1 and (unknown_features.any() or unknown_outputs.any()):
-        _log.warning(
-            "training: one row says nothing of how anything varies. Supposed are "
-            "length-scales of %s (prior_lengthscale) and deviations of %s "
-            "(prior_deviation)",
-            lengths or "infinity",
-            deviations or "what is found",
-        )
-        return
-    if unknown_features.any():
-        _log.warning(
-            "training: never moves by more than %.1g (resolution) in the %d rows: %s. "
-            "What it changes is not known: away from that value predictions return to "
-            "the prior, over a length-scale of %s (prior_lengthscale; 'no_effect' "
-            "where it is known to change nothing)",
-            resolution,
-            size,
-            _listed(columns.features, features[0], unknown_features),
-            lengths,
-        )
-    if unknown_outputs.any():
-        _log.warning(
-            "training: never changes by more than %.1g (resolution) in the targets of "
-            "the %d rows: %s. How much it varies elsewhere is not known: supposed is a "
-            "deviation of %s (prior_deviation)",
-            resolution,
-            size,
-            _listed(columns.outputs, targets[0], unknown_outputs),
-            deviations,
-        )
+    check_transitions(transitions)
+    targets = transitions.targets(predicts)
+    warn_of_turns(transitions)
+    warn_of_transitions(transitions)
+    return targets
 
 
 def warn_of_transitions(transitions: Transitions) -> None:
-    """Says in the log where transitions look like a mistake of whoever made them.
+    """Logs where transitions look like a mistake of whoever made them.
 
     Next states that all equal the states, though the states move, are no system's: the
     shift by a row was forgotten. And most of the rows that move are copies of others:
@@ -176,8 +172,8 @@ def warn_of_transitions(transitions: Transitions) -> None:
     """
     states = transitions.states
     next_states = transitions.next_states
-    moved = (states != next_states).any(dim=1)
-    if not bool(moved.any()):
+    moving = (states != next_states).any(dim=1)
+    if not bool(moving.any()):
         if not constant_columns(states.numpy()).all():
             _log.warning(
                 "training: next_states equal states in all %d rows, though the states "
@@ -187,7 +183,7 @@ def warn_of_transitions(transitions: Transitions) -> None:
                 len(states),
             )
         return
-    rows = torch.cat([transitions.features, next_states], dim=1)[moved]
+    rows = torch.cat([transitions.features, next_states], dim=1)[moving]
     distinct = len(np.unique(rows.numpy(force=True), axis=0))
     if 2 * distinct <= len(rows):
         _log.warning(
@@ -197,17 +193,3 @@ def warn_of_transitions(transitions: Transitions) -> None:
             distinct,
             len(rows),
         )
-
-
-def _numbers(values: NDArray[np.float64]) -> str:
-    """Different numbers, in ascending order."""
-    return ", ".join(f"{value:.3g}" for value in np.unique(values))
-
-
-def _listed(names: Sequence[str], values: Tensor, chosen: NDArray[np.bool_]) -> str:
-    """The chosen columns with the value that each holds, or how many they are."""
-    indices = np.flatnonzero(chosen).tolist()
-    texts = [f"{names[i]} ({float(values[i]):.6g})" for i in indices]
-    if len(texts) <= _SHOWN:
-        return ", ".join(texts)
-    return ", ".join(texts[:_SHOWN]) + f" and {len(texts) - _SHOWN} more"

@@ -1,4 +1,4 @@
-"""What a training supposes of columns that never move in its data.
+"""Prior scales of what never moves in the data of a training.
 
 No likelihood depends on the length-scale of a feature that never moved, nor says how
 much an output varies that was never seen to. What is left is a prior, and it has to be
@@ -12,7 +12,7 @@ controller follows it. One who knows the ranges says so.
 
 import math
 from collections.abc import Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple, TypeGuard, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +22,8 @@ from gpmpc.gp._scaling import Scaling
 
 NO_EFFECT = "no_effect"  # in the place of the length-scale of a feature without any
 PriorLengthscale = float | Literal["no_effect"]
+#: A trainer's setting: for all features or one each; None for one unit of the data.
+PriorLengthscales = PriorLengthscale | Sequence[PriorLengthscale] | None
 
 
 class PriorScales(NamedTuple):
@@ -33,53 +35,73 @@ class PriorScales(NamedTuple):
     deviations: NDArray[np.float64] | None
 
     @classmethod
-    def of(cls, trainer: Any, d: int, units: NDArray[np.float64]) -> "PriorScales":
-        """Those that a trainer's settings ask for, of d features and k outputs.
+    def of_settings(
+        cls,
+        prior_lengthscale: PriorLengthscales,
+        prior_deviation: float | None,
+        units: NDArray[np.float64],
+        feature_count: int,
+    ) -> "PriorScales":
+        """Reads the settings of a trainer.
 
-        ``units`` (k,) are what its ``prior_deviation`` counts in.
+        Args:
+            prior_lengthscale: The setting.
+            prior_deviation: The setting.
+            units: What ``prior_deviation`` counts in (k,).
+            feature_count: d.
 
         Raises:
             SettingError: ``prior_lengthscale`` is a list of another number of features.
         """
-        setting = trainer.prior_lengthscale
-        if not _is_list(setting):
-            setting = [1.0 if setting is None else setting] * d
-        if len(setting) != d:
+        values = _lengthscale_list(prior_lengthscale)
+        if not _is_list(prior_lengthscale):
+            values = values * feature_count
+        if len(values) != feature_count:
             raise SettingError(
                 "prior_lengthscale",
-                f"must be one number, or {d}, one a feature; got {len(setting)}",
+                f"must be one number, or {feature_count}, one a feature; "
+                f"got {len(values)}",
             )
-        deviation = trainer.prior_deviation
-        return cls(
-            lengthscales=np.array([math.inf if s == NO_EFFECT else s for s in setting]),
-            deviations=None if deviation is None else deviation * units,
-        )
+        lengthscales = [math.inf if v == NO_EFFECT else float(v) for v in values]
+        deviations = None if prior_deviation is None else prior_deviation * units
+        return cls(lengthscales=np.array(lengthscales), deviations=deviations)
 
-    def of_scaled_targets(self, targets: Scaling) -> "PriorScales":
-        """The same for targets that are scaled already."""
+    def for_scaled_targets(self, scaling: Scaling) -> "PriorScales":
+        """Returns the same for targets that are scaled already."""
         if self.deviations is None:
             return self
-        return self._replace(deviations=self.deviations / targets.factor.numpy())
+        return self._replace(deviations=self.deviations / scaling.factor.numpy())
 
 
-def check_prior_scales(trainer: Any) -> None:
-    """Raises ``SettingError`` unless settings of columns at rest are right."""
-    setting = trainer.prior_lengthscale
-    for value in (
-        setting if _is_list(setting) else [1.0 if setting is None else setting]
-    ):
-        if value != NO_EFFECT:
-            try:
-                check_number("prior_lengthscale", value, above=0)
-            except GpmpcError as error:
-                raise SettingError(
-                    "prior_lengthscale",
-                    f"must be numbers above 0, or {NO_EFFECT!r}; got {value!r}",
-                ) from error
-    if trainer.prior_deviation is not None:
-        check_number("prior_deviation", trainer.prior_deviation, above=0)
-    check_number("resolution", trainer.resolution, least=0)
+def check_prior_settings(
+    prior_lengthscale: PriorLengthscales,
+    prior_deviation: float | None,
+    resolution: float,
+) -> None:
+    """Raises ``SettingError`` unless the settings of columns at rest are right."""
+    for value in _lengthscale_list(prior_lengthscale):
+        if value == NO_EFFECT:
+            continue
+        try:
+            check_number("prior_lengthscale", value, above=0)
+        except GpmpcError as error:
+            raise SettingError(
+                "prior_lengthscale",
+                f"must be numbers above 0, or {NO_EFFECT!r}; got {value!r}",
+            ) from error
+    if prior_deviation is not None:
+        check_number("prior_deviation", prior_deviation, above=0)
+    check_number("resolution", resolution, least=0)
 
 
-def _is_list(setting: Any) -> bool:
+def _lengthscale_list(setting: PriorLengthscales) -> list[PriorLengthscale]:
+    """The setting as a list, of one entry where it is for all features."""
+    if setting is None:
+        return [1.0]
+    if _is_list(setting):
+        return list(setting)
+    return [cast(PriorLengthscale, setting)]
+
+
+def _is_list(setting: PriorLengthscales) -> TypeGuard[Sequence[PriorLengthscale]]:
     return isinstance(setting, Sequence) and not isinstance(setting, str)

@@ -1,59 +1,63 @@
-"""The search for one output's hyperparameters by maximum marginal likelihood, which has many local optima.
+"""The search for one output's hyperparameters by maximum marginal likelihood.
 
-They differ by a factor of a hundred in prediction error. So the search explores a few iterations of L-BFGS (Byrd, Lu,
-Nocedal and Zhu, 1995) from the paper's starting point and from random ones, and goes on to convergence from the best
-two. (On the paper's data a single start reached the best known optimum for about 75 % of the outputs; four starts and
-two finalists for about 98 %, at two and a half times the evaluations.) Of many points a random subset is searched
-first; one more search goes on from what it found over all of them.
+The likelihood has many local optima, which differ by a factor of a hundred in
+prediction error. So the search explores a few iterations of L-BFGS (Byrd, Lu, Nocedal
+and Zhu, 1995) from the paper's starting point and from random ones, and goes on to
+convergence from the best two. (On the paper's data a single start reached the best
+known optimum for about 75 % of the outputs; four starts and two finalists for about
+98 %, at two and a half times the evaluations.) Of many points a random subset is
+searched first; one more search over all of them goes on from its optimum.
 
-theta = (log length-scales, log sf, log(sf / sn)), in a wide box around the data's standard deviations.
+theta = (log length-scales, log sf, log(sf / sn)), in a wide box around the data's
+standard deviations.
 """
 
 import logging
 import math
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
-import torch
 from scipy.optimize import minimize
-from torch import Tensor
 
-from gpmpc.exceptions import SettingError, ShapeError, check_number
-from gpmpc.gaussian import check_tensors
-from gpmpc.gp._data_checks import RESOLUTION, constant_columns
-from gpmpc.gp._kernel import IGNORED, check_posterior
+from gpmpc.exceptions import SettingError, check_number
+from gpmpc.gp._data_checks import column_std
+from gpmpc.gp._kernel import IGNORED
 from gpmpc.gp._likelihood import FAILED, NegativeLogMarginalLikelihood
-from gpmpc.gp._posterior import GPPosterior
-from gpmpc.gp._scaling import Scaling
 
 _log = logging.getLogger(__name__)
 _EXPLORATION = 16  # L-BFGS iterations from every start, before ...
 _FINALISTS = 2  # ... this many of the best go on to convergence
 _ITERATIONS = 1000  # of the search to convergence, at most
 _PLAIN_RATIO = 10.0  # sf / sn where the search begins
-_LONGER = 1.0  # mean of log l over log std(x~) at the random starts: smooth dynamics prefer long length-scales
-_SMOOTH = 5.0  # length-scale of an output that never changes, in spreads of its inputs
+# Mean of log l over log std(x~) at the random starts: smooth dynamics prefer long
+# length-scales.
+_LONGER = 1.0
+# Length-scale of an output that never changes, in standard deviations of its inputs.
+_SMOOTH = 5.0
 _REPEATED = 1e4  # sf / sn of such an output, at most: the data repeat themselves
-_SMALL = (
-    3e-9  # part of its magnitude: targets that vary by less vary as their magnitude
-)
-_LENGTHSCALE_LIMIT = 1e4  # the box holds length-scales within this factor of their input's standard deviation
+# Part of its magnitude: targets that vary by less vary as their magnitude.
+_SMALL = 3e-9
+# The box holds length-scales within this factor of their input's standard deviation.
+_LENGTHSCALE_LIMIT = 1e4
 _LOG_INTERVAL = 5.0  # [s]
+
+Penalty = Callable[[np.ndarray, np.ndarray], tuple[float, np.ndarray]]
 
 
 @dataclass(frozen=True)
 class SoftLimits:
-    """Soft walls around length-scales and signal-to-noise ratio, where the data leave them open.
+    """Soft walls around length-scales and signal-to-noise ratio.
 
-    ((log l_d - log std(x~_d)) / log r)^p summed over d, and (log(sf / sn) / log s)^p; the penalties of PILCO
-    (Deisenroth, 2010) and of the experiment of Cao, Lai and Alam (2017). Nearly flat inside, steep outside.
+    ((log l_d - log std(x~_d)) / log r)^p summed over d, and (log(sf / sn) / log s)^p;
+    the penalties of PILCO (Deisenroth, 2010) and of the experiment of Cao, Lai and Alam
+    (2017). Nearly flat inside, steep outside, for where the data leave them open.
     """
 
-    lengthscale_factor: float = (
-        100.0  #: r, how far a length-scale may be from its input's standard deviation
-    )
+    #: r, how far a length-scale may be from its input's standard deviation
+    lengthscale_factor: float = 100.0
     signal_to_noise: float = 1000.0  #: s, how large sf / sn may be
     power: int = 30  #: p, even
 
@@ -67,44 +71,93 @@ class SoftLimits:
     def __call__(
         self, theta: np.ndarray, log_std: np.ndarray
     ) -> tuple[float, np.ndarray]:
-        """Value and gradient (d + 2,) at theta, given the logarithms of the inputs' standard deviations (d,)."""
+        """Computes value and gradient (d + 2,) at theta.
+
+        Args:
+            theta: (log l, log sf, log(sf / sn)) (d + 2,).
+            log_std: Logarithms of the inputs' standard deviations (d,).
+        """
         width = np.full(len(theta), np.log(self.lengthscale_factor))
         width[-1] = np.log(self.signal_to_noise)
         position = np.append(theta[:-2] - log_std, [0.0, theta[-1]]) / width
-        return (position**self.power).sum(), self.power * position ** (
-            self.power - 1
-        ) / width
+        value = (position**self.power).sum()
+        gradient = self.power * position ** (self.power - 1) / width
+        return value, gradient
+
+
+class SearchSettings(Protocol):
+    """The settings of a trainer that its searches use; see ``Trainer``."""
+
+    @property
+    def penalty(self) -> Penalty | None: ...
+    @property
+    def restarts(self) -> int: ...
+    @property
+    def tolerance(self) -> float: ...
+    @property
+    def signal_to_noise_limit(self) -> float: ...
+    @property
+    def time_limit(self) -> float | None: ...
+
+
+class SearchInputs(NamedTuple):
+    """The inputs of all GPs in scaled units."""
+
+    points: np.ndarray  #: x~ (N, d)
+    std: np.ndarray  #: standard deviations (d,); see ``column_std``
+    constant: np.ndarray  #: which inputs never move (d,)
+    prior_lengthscales: np.ndarray  #: of those that never move (d,)
+
+
+class SearchResult(NamedTuple):
+    """Where the search for an output's hyperparameters ended."""
+
+    theta: np.ndarray  #: (d + 2,), in scaled units
+    objective: float  #: FAILED or more where every start failed
+    #: objectives where the exploration from each start ended (restarts + 1,); NaN for
+    #: starts that the time limit left out
+    explored: list[float]
+
+
+class Optimum(NamedTuple):
+    """Where one run of L-BFGS ended."""
+
+    theta: np.ndarray
+    objective: float
 
 
 class OutputSearch:
-    """The search for one output's hyperparameters, in scaled units, with a ``Trainer``'s settings.
+    """The search for one output's hyperparameters, in scaled units.
 
-    ``std`` (d,) is of the inputs (N, d), see ``column_std``; ``constant`` (d,) which of
-    them are, and ``prior`` (d,) the length-scales of those. From the deadline on, by
-    the clock of ``time.perf_counter`` [s], the best found so far is taken.
+    Args:
+        name: What the log calls the output.
+        inputs: Those of the GP.
+        targets: (N,).
+        settings: A ``Trainer``.
+        deadline: Time from which on the best theta so far is taken, by the clock of
+            ``time.perf_counter`` [s].
     """
 
     def __init__(
         self,
         name: str,
-        inputs: np.ndarray,
+        inputs: SearchInputs,
         targets: np.ndarray,
-        std: np.ndarray,
-        constant: np.ndarray,
-        prior: np.ndarray,
-        settings: Any,
+        settings: SearchSettings,
         deadline: float,
     ):
         self._name = name
-        self._inputs = inputs
+        self._inputs = inputs.points
         self._targets = targets
         self._settings = settings
         self._deadline = deadline
+        self._constant = inputs.constant
         # An input that is known to have no effect drops out of the kernel.
-        ignored = constant & np.isinf(prior)
-        self._log_prior = np.log(np.where(ignored, IGNORED * std, prior))
-        self._constant = constant
-        self._log_std = np.log(np.where(constant & ~ignored, prior, std))
+        prior = inputs.prior_lengthscales
+        ignored = inputs.constant & np.isinf(prior)
+        self._log_prior = np.log(np.where(ignored, IGNORED * inputs.std, prior))
+        at_rest = inputs.constant & ~ignored
+        self._log_std = np.log(np.where(at_rest, prior, inputs.std))
         self._log_output = np.log(_output_std(targets))
         self._box = search_box(
             self._log_std, self._log_output, settings.signal_to_noise_limit
@@ -117,85 +170,100 @@ class OutputSearch:
         first: np.ndarray | None,
         perturbations: np.ndarray,
         rows: np.ndarray | None,
-    ) -> tuple[np.ndarray, float, list[float]]:
-        """Gives theta, its objective (FAILED or more where every start failed), and those where the exploration ended.
+    ) -> SearchResult:
+        """Searches from all starts.
 
         Args:
-            first: theta of the first start (d + 2,); None takes l = std(x~), sf = std(y), sn = std(y) / 10.
-            perturbations: Standard normal (restarts + 1, d + 2); the first row is not used.
-            rows: The subset that the search begins with; None for all points from the start.
+            first: theta of the first start (d + 2,); None takes l = std(x~),
+                sf = std(y), sn = std(y) / 10.
+            perturbations: Standard normal (restarts + 1, d + 2); the first row is not
+                used.
+            rows: The subset that the search begins with; None for all points from the
+                start.
         """
-        plain = np.append(self._log_std, [self._log_output, np.log(_PLAIN_RATIO)])
-        longer = np.append(np.full(len(self._log_std), _LONGER), [0.0, 0.0])
-        starts = [
-            plain if first is None else first,
-            *(plain + longer + shift for shift in perturbations[1:]),
-        ]
-        self._see(slice(None) if rows is None else rows)
-        ends: list[tuple[np.ndarray, float]] = []
-        for start in starts:
-            ends.append(self._minimize(start, _EXPLORATION))
-            if self._is_late() and min(value for _, value in ends) < FAILED:
-                break
-        best = sorted(ends, key=lambda end: end[1])[:_FINALISTS]
+        starts = self._starts(first, perturbations)
+        self._use_points(rows)
+        optima = self._explore(starts)
+        finalists = sorted(optima, key=lambda optimum: optimum.objective)[:_FINALISTS]
         if not self._is_late():
-            best = [self._minimize(theta, _ITERATIONS) for theta, _ in best]
-        theta, value = min(best, key=lambda end: end[1])
+            finalists = [self._minimize(f.theta, _ITERATIONS) for f in finalists]
+        best = min(finalists, key=lambda optimum: optimum.objective)
         if rows is not None:
-            self._see(slice(None))
-            theta, value = self._minimize(theta, _ITERATIONS)
+            self._use_points(None)
+            best = self._minimize(best.theta, _ITERATIONS)
         if self._is_late():
             _log.info(
                 "training: %s: its share of time_limit=%g s is over",
                 self._name,
                 self._settings.time_limit,
             )
+        theta = best.theta
         # The likelihood says nothing of an input that never moved: the prior does.
         theta[:-2][self._constant] = self._log_prior[self._constant]
-        return (
-            theta,
-            value,
-            [end[1] for end in ends] + [math.nan] * (len(starts) - len(ends)),
-        )
+        explored = [optimum.objective for optimum in optima]
+        explored += [math.nan] * (len(starts) - len(optima))
+        return SearchResult(theta, best.objective, explored)
 
-    def unsearched(self, deviation: float) -> tuple[np.ndarray, float, list[float]]:
-        """What is supposed of an output that never changes, in the place of a search.
+    def prior_result(self, deviation: float) -> SearchResult:
+        """Returns hyperparameters of an output that never changes, without a search.
 
         The likelihood only ever asks for less signal and longer length-scales: for
         certainty everywhere, from data that have not seen the output vary. So the
-        signal has the prior's ``deviation``, and the length-scales are some spreads of
-        the inputs: among the data the output is known, far from them it is not. A
-        single row leaves the noise open as well: that of the plain start.
+        signal has the prior's ``deviation``, and the length-scales are some standard
+        deviations of the inputs: among the data the output is known, far from them it
+        is not. A single row leaves the noise open as well: that of the plain start.
         """
-        lengths = self._log_std + np.log(_SMOOTH)
-        lengths[self._constant] = self._log_prior[self._constant]
+        log_lengthscales = self._log_std + np.log(_SMOOTH)
+        log_lengthscales[self._constant] = self._log_prior[self._constant]
         signal = max(deviation, np.abs(self._targets).max())
         ratio = min(_REPEATED, self._settings.signal_to_noise_limit)
         if len(self._targets) == 1:
             ratio = min(_PLAIN_RATIO, ratio)
-        theta = np.append(lengths, [np.log(signal), np.log(ratio)])
-        self._see(slice(None))
+        theta = np.append(log_lengthscales, [np.log(signal), np.log(ratio)])
+        self._use_points(None)
         value = self._likelihood(theta)[0]
         self.evaluations += 1
-        value = float(value) if np.isfinite(value) else FAILED
-        return theta, value, [value] + [math.nan] * self._settings.restarts
+        objective = float(value) if np.isfinite(value) else FAILED
+        explored = [objective] + [math.nan] * self._settings.restarts
+        return SearchResult(theta, objective, explored)
 
-    def _see(self, rows: Any) -> None:
-        """Takes the likelihood of some of the points."""
-        self._likelihood = NegativeLogMarginalLikelihood(
-            self._inputs[rows], self._targets[rows]
-        )
-        self._size = len(self._targets[rows])
+    def _starts(
+        self, first: np.ndarray | None, perturbations: np.ndarray
+    ) -> list[np.ndarray]:
+        """The points where the exploration begins."""
+        plain = np.append(self._log_std, [self._log_output, np.log(_PLAIN_RATIO)])
+        longer = np.append(np.full(len(self._log_std), _LONGER), [0.0, 0.0])
+        starts = [plain if first is None else first]
+        starts += [plain + longer + shift for shift in perturbations[1:]]
+        return starts
 
-    def _minimize(self, start: np.ndarray, iterations: int) -> tuple[np.ndarray, float]:
-        """The end point of L-BFGS and its objective."""
-        outcome = minimize(
+    def _explore(self, starts: list[np.ndarray]) -> list[Optimum]:
+        """Minimises for some iterations from every start, or until it is late."""
+        optima: list[Optimum] = []
+        for start in starts:
+            optima.append(self._minimize(start, _EXPLORATION))
+            one_succeeded = any(optimum.objective < FAILED for optimum in optima)
+            if self._is_late() and one_succeeded:
+                break
+        return optima
+
+    def _use_points(self, rows: np.ndarray | None) -> None:
+        """Takes the likelihood of some of the points; of all for None."""
+        chosen = slice(None) if rows is None else rows
+        targets = self._targets[chosen]
+        self._likelihood = NegativeLogMarginalLikelihood(self._inputs[chosen], targets)
+        self._size = len(targets)
+
+    def _minimize(self, start: np.ndarray, iterations: int) -> Optimum:
+        """Minimises the objective by L-BFGS in the box."""
+        lower, upper = self._box
+        result = minimize(
             self._objective,
-            np.clip(start, *self._box),
+            np.clip(start, lower, upper),
             jac=True,
             method="L-BFGS-B",
-            bounds=np.column_stack(self._box),
-            callback=self._look_at_clock,
+            bounds=np.column_stack([lower, upper]),
+            callback=self._stop_at_deadline,
             options={
                 "ftol": self._settings.tolerance,
                 "gtol": 1e-6,
@@ -203,17 +271,17 @@ class OutputSearch:
                 "maxfun": 5 * iterations,
             },
         )
-        return outcome.x, float(outcome.fun)
+        return Optimum(result.x, float(result.fun))
 
     def _is_late(self) -> bool:
         return time.perf_counter() >= self._deadline
 
-    def _look_at_clock(self, _: np.ndarray) -> None:
+    def _stop_at_deadline(self, _: np.ndarray) -> None:
         if self._is_late():
             raise StopIteration  # which ends scipy's search where it is
 
     def _objective(self, theta: np.ndarray) -> tuple[float, np.ndarray]:
-        """Negative log marginal likelihood plus penalty, and the gradient."""
+        """Computes the negative log marginal likelihood plus penalty, and gradient."""
         with np.errstate(over="ignore", invalid="ignore"):
             value, gradient = self._likelihood(theta)
         self.evaluations += 1
@@ -221,116 +289,57 @@ class OutputSearch:
             value = FAILED
             gradient = np.zeros_like(theta)
         elif self._settings.penalty is not None:
-            wall, slope = self._settings.penalty(theta, self._log_std)
-            value = value + wall
+            penalty, slope = self._settings.penalty(theta, self._log_std)
+            value = value + penalty
             gradient = gradient + slope
         if time.perf_counter() - self._last_log > _LOG_INTERVAL:
             self._last_log = time.perf_counter()
-            text = "training: %s, %d points: evaluation %d, minus log evidence %.8g"
-            _log.info(text, self._name, self._size, self.evaluations, value)
+            _log.info(
+                "training: %s, %d points: evaluation %d, minus log evidence %.8g",
+                self._name,
+                self._size,
+                self.evaluations,
+                value,
+            )
         return value, gradient
+
+
+class SearchBox(NamedTuple):
+    """Bounds of theta (d + 2,)."""
+
+    lower: np.ndarray
+    upper: np.ndarray
 
 
 def search_box(
     log_inputs: np.ndarray, log_output: float, signal_to_noise_limit: float
-) -> tuple[np.ndarray, ...]:
-    """The least and the largest theta (d + 2,), around the logarithms of the data's standard deviations."""
-    reach = np.full(len(log_inputs) + 2, np.log(_LENGTHSCALE_LIMIT))
-    reach[-2:] = np.log(1e6), np.log(signal_to_noise_limit)
-    centre = np.append(log_inputs, [log_output, 0.0])
-    return centre - reach, centre + reach
+) -> SearchBox:
+    """Returns bounds of theta around the logarithms of the data's standard deviations.
 
-
-def column_std(columns: np.ndarray, constant: np.ndarray | None = None) -> np.ndarray:
-    """The standard deviation (d,) of columns (N, d).
-
-    Of a constant column its magnitude, or 1 where that is none; ``constant`` (d,) says
-    which are, by default those of ``constant_columns``.
+    Args:
+        log_inputs: Those of the inputs (d,).
+        log_output: That of the output.
+        signal_to_noise_limit: Largest sf / sn, and the inverse of the least.
     """
-    constant = constant_columns(columns) if constant is None else constant
-    away = columns - columns[0]
-    reach = np.abs(away).max(axis=0)
-    magnitude = np.abs(columns).max(axis=0)
-    unit = np.where(constant, np.where(magnitude > RESOLUTION, magnitude, 1.0), reach)
-    return unit * np.where(
-        constant, 1.0, (away / unit).std(axis=0, ddof=min(1, len(columns) - 1))
-    )
+    half_width = np.full(len(log_inputs) + 2, np.log(_LENGTHSCALE_LIMIT))
+    half_width[-2] = np.log(1e6)
+    half_width[-1] = np.log(signal_to_noise_limit)
+    middle = np.append(log_inputs, [log_output, 0.0])
+    return SearchBox(lower=middle - half_width, upper=middle + half_width)
 
 
 def plain_theta(std: np.ndarray, targets: np.ndarray) -> np.ndarray:
-    """Where the search begins (d + 2,): l = std(x~), sf = std(y), sn = std(y) / 10."""
+    """Returns theta (d + 2,) where the search begins.
+
+    l = std(x~), sf = std(y), sn = std(y) / 10.
+    """
     return np.append(np.log(std), np.log([_output_std(targets), _PLAIN_RATIO]))
 
 
 def _output_std(targets: np.ndarray) -> float:
-    """The standard deviation of scaled targets (N,), or their magnitude.
+    """Computes the standard deviation of scaled targets (N,), or their magnitude.
 
     Where the prior mean is far from them, signals are of their magnitude.
     """
     small = np.ptp(targets) <= _SMALL * np.abs(targets).max()
     return float(column_std(targets[:, None], np.array([small]))[0])
-
-
-class TrainingData(NamedTuple):
-    """What a training learns from, in the units of the data, and how it is scaled."""
-
-    features: Tensor  #: (N, d)
-    targets: Tensor  #: (N, k)
-    feature_scaling: Scaling
-    target_scaling: Scaling
-
-
-def training_data(
-    features: Tensor, targets: Tensor, input_dim: int, predicts: str, scaling: Any
-) -> TrainingData:
-    """Features and targets apart from any graph, and the scalings of both; errors are those of ``Trainer.fit``."""
-    given = {"features": features, "targets": targets}
-    check_tensors(**given)
-    for name, value in given.items():
-        if value.device.type != "cpu":
-            raise SettingError(
-                name,
-                f"must be in host memory for training ({name}.cpu()); got {value.device}",
-            )
-    check_posterior(given, input_dim, predicts)
-    features = features.detach()
-    targets = targets.detach()
-    n = features.shape[1] - input_dim
-    names = [f"x{i + 1}" for i in range(n)] + [f"u{i + 1}" for i in range(input_dim)]
-    outputs = [f"y{a + 1}" for a in range(targets.shape[1])]
-    return TrainingData(
-        features=features,
-        targets=targets,
-        feature_scaling=scaling(features, names),
-        target_scaling=scaling(targets, outputs),
-    )
-
-
-def restored_theta(
-    theta: np.ndarray, features: Scaling, targets: Scaling
-) -> np.ndarray:
-    """Rows (log l, log sf, log(sf / sn)) in the units of the data, from those in scaled units."""
-    shift = np.tile(
-        np.append(features.factor.log().numpy(), [0.0, 0.0]), (len(theta), 1)
-    )
-    shift[:, -2] = targets.factor.log().numpy()
-    return theta + shift
-
-
-def log_hyperparameters(
-    posterior: GPPosterior, features: Scaling, targets: Scaling
-) -> np.ndarray:
-    """Rows (log l, log sf, log(sf / sn)), one an output (k, d + 2), of a posterior, in scaled units."""
-    k = len(targets.factor)
-    d = len(features.factor)
-    if posterior.lengthscales.shape != (k, d):
-        got = tuple(posterior.lengthscales.shape[::-1])
-        rule = f"the posterior to start from must have {d} features and {k} outputs"
-        raise ShapeError(f"{rule}; got {got[0]} and {got[1]}")
-    parts = posterior.lengthscales, posterior.signal_variance, posterior.noise_variance
-    length, sf2, sn2 = (part.to("cpu", torch.float64) for part in parts)
-    deviation = (sf2.sqrt() / targets.factor).log()
-    ratio = (sf2 / sn2).log() / 2
-    return torch.column_stack(
-        [(length / features.factor).log(), deviation, ratio]
-    ).numpy()

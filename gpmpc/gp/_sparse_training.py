@@ -1,9 +1,11 @@
-"""Training of sparse GPs on thousands of transitions, hyperparameters and inducing points together.
+"""Training of sparse GPs on thousands of transitions.
 
-The hyperparameters start where exact training on a random subset ends; the inducing points start greedily, each where
-the outputs' conditional variances given those before it, in units of their noise, add up to the most (Burt, Rasmussen
-and van der Wilk, 2020, section 4). What they leave unexplained, on average, is added to the noise. Then L-BFGS
-maximises the collapsed bound over all of it, in O(N M^2) an output and evaluation.
+Hyperparameters and inducing points are trained together. The hyperparameters start
+where exact training on a random subset ends; the inducing points start greedily, each
+where the outputs' conditional variances given those before it, in units of their noise,
+add up to the most (Burt, Rasmussen and van der Wilk, 2020, section 4). What they leave
+unexplained, on average, is added to the noise. Then L-BFGS maximises the collapsed
+bound over all of it, in O(N M^2) an output and evaluation.
 """
 
 import logging
@@ -11,7 +13,7 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import get_args
+from typing import NamedTuple, get_args
 
 import numpy as np
 import torch
@@ -23,23 +25,14 @@ from gpmpc.gp._data_checks import (
     RESOLUTION,
     Columns,
     Constants,
-    columns_of,
-    warn_of_constants,
-    warn_of_transitions,
+    checked_targets,
+    column_std,
 )
 from gpmpc.gp._kernel import Hyperparameters, Predicts, kernel_matrix
 from gpmpc.gp._likelihood import FAILED
-from gpmpc.gp._prior_scales import PriorLengthscale, PriorScales
+from gpmpc.gp._prior_scales import PriorLengthscales
 from gpmpc.gp._scaling import Scaling, centre, identity
-from gpmpc.gp._search import (
-    TrainingData,
-    column_std,
-    log_hyperparameters,
-    plain_theta,
-    restored_theta,
-    search_box,
-    training_data,
-)
+from gpmpc.gp._search import plain_theta, search_box
 from gpmpc.gp._sparse import (
     JITTER,
     Method,
@@ -49,28 +42,35 @@ from gpmpc.gp._sparse import (
     sparse_posterior,
 )
 from gpmpc.gp._training import Trainer, Training
-from gpmpc.gp._transitions import Transitions, check_transitions
-from gpmpc.gp._wrapped import warn_of_turns
+from gpmpc.gp._training_data import (
+    TrainingData,
+    read_training_data,
+    restored_theta,
+    scaled_theta,
+)
+from gpmpc.gp._transitions import Transitions
 
 _log = logging.getLogger(__name__)
 _EVERY = 10  # iterations between two lines of the log
 _TOLERANCE = 1e-7  # relative decrease of the objective at which L-BFGS stops
-_SIGNAL_TO_NOISE = (
-    1e4  # the box holds sf / sn within this factor of one, as that of ``Trainer``
-)
+# The box holds sf / sn within this factor of one, as that of ``Trainer``.
+_SIGNAL_TO_NOISE = 1e4
 
 
 @dataclass(frozen=True)
 class SparseTrainer:
-    """Fits one sparse SE-ARD GP per output, over inducing points that all share; progress is logged.
+    """Fits one sparse SE-ARD GP per output, over inducing points that all share.
+
+    Progress is logged.
 
     Raises:
         SettingError: A setting is out of range.
     """
 
     inducing: int = 100  #: M; no more than there are distinct points
-    #: ``"sgpr"`` (Titsias, 2009) never overfits and may overestimate the noise; ``"fitc"`` (Snelson and Ghahramani,
-    #: 2006) has a noise of its own at every point and may underestimate it (Bauer, van der Wilk and Rasmussen, 2016)
+    #: ``"sgpr"`` (Titsias, 2009) never overfits and may overestimate the noise;
+    #: ``"fitc"`` (Snelson and Ghahramani, 2006) has a noise of its own at every point
+    #: and may underestimate it (Bauer, van der Wilk and Rasmussen, 2016)
     method: Method = "sgpr"
     predicts: Predicts = "next_state"  #: what the GPs learn, as in ``Trainer``
     #: how features and targets are scaled for training, as in ``Trainer``
@@ -80,7 +80,7 @@ class SparseTrainer:
     restarts: int = 1  #: random starts of that one
     #: of features that never move in the data, and of outputs that never change; all
     #: three as in ``Trainer``
-    prior_lengthscale: PriorLengthscale | Sequence[PriorLengthscale] | None = None
+    prior_lengthscale: PriorLengthscales = None
     prior_deviation: float | None = 1.0
     resolution: float = RESOLUTION
 
@@ -89,25 +89,27 @@ class SparseTrainer:
             check_number(key, getattr(self, key), least=1, whole=True)
         check_number("iterations", self.iterations, least=0, whole=True)
         check_choice("method", self.method, get_args(Method))
-        replace(self._exact(), scaling=self.scaling)  # which checks the others
+        replace(self._exact_trainer(), scaling=self.scaling)  # checks the others
 
     def __call__(self, transitions: Transitions, seed: int = 0) -> Training:
-        """Trains on transitions; ``seed`` is that of the subset and of its random starts.
+        """Trains on transitions.
+
+        Args:
+            transitions: The data.
+            seed: Of the subset and of its random starts.
 
         Raises:
-            TrainingError: No start of the subset's training succeeded for an output, which is named; or the inducing
-                points learned nothing but noise of it where the subset's training learned more.
+            TrainingError: No start of the subset's training succeeded for an output,
+                which is named; or the inducing points learned nothing but noise of it
+                where the subset's training learned more.
         """
-        check_transitions(transitions)
-        targets = transitions.targets(self.predicts)
-        warn_of_transitions(transitions)
-        warn_of_turns(transitions)
+        targets = checked_targets(transitions, self.predicts)
         training = self.fit(
             transitions.features,
             targets,
             transitions.input_dim,
             seed=seed,
-            columns=columns_of(transitions, self.predicts),
+            columns=Columns.of_transitions(transitions, self.predicts),
         )
         return training.with_signals(transitions.signals)
 
@@ -124,128 +126,76 @@ class SparseTrainer:
 
         Arguments are those of ``Trainer.fit``.
         """
-        begin = time.perf_counter()
+        start_time = time.perf_counter()
         check_number("seed", seed, least=0, whole=True)
-        predicts = predicts or self.predicts
-        data = training_data(features, targets, input_dim, predicts, self.scaling)
-        features, targets, feature_scaling, target_scaling = data
-        if columns is None:
-            columns = Columns.of(features, targets, input_dim, predicts)
-        constants = Constants.of(features, targets, columns, self.resolution)
-        prior = PriorScales.of(self, features.shape[1], columns.units)
-        warn_of_constants(features, targets, columns, constants, prior, self.resolution)
-        fixed = constants.outputs & (prior.deviations is not None)
-        # A stationary kernel depends on differences; those from one of the points are exact, wherever the data lie.
-        feature_scaling = Scaling(features[0], feature_scaling.factor)
-        x = feature_scaling.scale(features)
-        y = target_scaling.scale(targets)
-        chosen = np.random.default_rng(seed).permutation(len(x))[: self.subset]
-        unit = torch.from_numpy(column_std(features.numpy(), constants.features))
-        unit = unit / feature_scaling.factor
-        # Exact GPs of a subset, which may have seen at rest what moves elsewhere.
-        part = TrainingData(
-            features[chosen], y[chosen], identity(features), identity(y)
-        )
-        at_rest = Constants.of(
-            features[chosen], targets[chosen], columns, self.resolution
-        )
-        exact = self._exact().fit_known(
-            part,
-            at_rest,
-            prior.of_scaled_targets(target_scaling),
+        data = read_training_data(
+            features,
+            targets,
             input_dim,
-            "value",
-            seed,
+            predicts=predicts or self.predicts,
+            columns=columns,
+            settings=self,
         )
-        theta = log_hyperparameters(exact.posterior, feature_scaling, identity(y))
-        moving = at_rest.features & ~constants.features
-        theta[:, :-2][:, moving] = np.log(unit.numpy())[moving]
-        for a in np.flatnonzero(at_rest.outputs & ~constants.outputs):
-            theta[a] = plain_theta(unit.numpy(), y[:, a].numpy())
-        Z = x[
-            informative_points(
-                x, Hyperparameters.from_theta(torch.from_numpy(theta)), self.inducing
-            )
-        ]
-        text = "sparse training: %d inducing points chosen among %d after %.1f s"
-        _log.info(text, len(Z), len(x), time.perf_counter() - begin)
+        # A stationary kernel depends on differences; those from one of the points are
+        # exact, wherever the data lie.
+        scaling = Scaling(data.features[0], data.feature_scaling.factor)
+        x = scaling.scale(data.features)
+        y = data.scaled_targets
+        std = torch.from_numpy(data.feature_std) / scaling.factor
+
+        rows = np.random.default_rng(seed).permutation(len(x))[: self.subset]
+        subset = self._subset_data(data, rows)
+        exact = self._exact_trainer().fit_data(subset, seed)
+        theta = scaled_theta(exact.posterior, scaling, subset.target_scaling)
+        _start_what_moved_elsewhere(theta, data, subset, std.numpy(), y.numpy())
+        kernel = Hyperparameters.from_theta(torch.from_numpy(theta))
+        Z = x[informative_points(x, kernel, self.inducing)]
+        _log.info(
+            "sparse training: %d inducing points chosen among %d after %.1f s",
+            len(Z),
+            len(x),
+            time.perf_counter() - start_time,
+        )
         theta = self._with_unexplained(theta, Z, x, y)
-        unsearched = np.zeros(theta.shape, dtype=bool)
-        unsearched[fixed] = True
-        unsearched[:, :-2][:, constants.features] = True
-        bound = _Bound(self, x, y, unit, theta, Z, unsearched)
+
+        bound = _NegativeBound(
+            x, y, std, method=self.method, iterations=self.iterations
+        )
+        bound.start_at(theta, Z, fixed=_fixed_entries(theta, data))
         initial = bound.values()
-        bound.maximize()
-        if failed := np.flatnonzero(~np.isfinite(objective := bound.values())).tolist():
-            raise TrainingError(
-                failed,
-                "the inducing points' kernel matrix is not positive definite: take fewer",
-            )
+        bound.minimize()
+        objective = bound.values()
+        _check_finite(objective)
         gains = _noise_alone(y) - objective
-        gains[fixed] = np.inf  # there is nothing to learn of them
+        gains[data.unsearched_outputs] = np.inf  # there is nothing to learn of them
         self._check_learned(
             gains,
-            _noise_alone(y[chosen]) - exact.objective,
-            x.shape[1] + 2,
+            exact_gains=_noise_alone(y[rows]) - exact.objective,
+            parameters=x.shape[1] + 2,
         )
-        theta, Z = bound.parts(torch.from_numpy(bound.best))
-        kernel = Hyperparameters.from_theta(theta)
-        scaled = sparse_posterior(
-            Z, x, y, kernel, input_dim, predicts, self.method, JITTER
+
+        best = bound.unpack(torch.from_numpy(bound.best))
+        scaled_posterior = sparse_posterior(
+            best.inducing,
+            x,
+            y,
+            Hyperparameters.from_theta(best.theta),
+            input_dim=data.input_dim,
+            predicts=data.predicts,
+            method=self.method,
+            jitter=JITTER,
         )
-        posterior = scaled.unscaled(feature_scaling, target_scaling)
-        theta = restored_theta(theta.numpy(), feature_scaling, target_scaling)
         return Training(
-            posterior,
-            theta,
-            objective,
-            initial[:, None],
-            bound.evaluations,
-            time.perf_counter() - begin,
+            posterior=scaled_posterior.unscaled(scaling, data.target_scaling),
+            theta=restored_theta(best.theta.numpy(), scaling, data.target_scaling),
+            objective=objective,
+            explored=initial[:, None],
+            evaluations=bound.evaluations,
+            seconds=time.perf_counter() - start_time,
         )
 
-    def _with_unexplained(
-        self, theta: np.ndarray, Z: Tensor, x: Tensor, y: Tensor
-    ) -> np.ndarray:
-        """Adds to the noise what the inducing points leave unexplained of the signal, on average.
-
-        Else the bound is so low where the search begins that its first step leaves for a model of noise alone.
-        """
-        if self.method == "fitc":  # has that noise of its own
-            return theta
-        kernel = Hyperparameters.from_theta(torch.from_numpy(theta))
-        _, sf2, sn2 = kernel
-        with torch.no_grad():
-            sums = data_sums(
-                inducing_factor(Z, kernel, JITTER), Z, x, y, kernel, self.method
-            )
-        explained = sums.gram.diagonal(dim1=-2, dim2=-1).sum(-1)
-        sn2 = sn2 + (sf2 - explained * sn2 / len(x)).clamp_min(0)
-        return np.column_stack([theta[:, :-1], (sf2 / sn2).log().numpy() / 2])
-
-    def _check_learned(
-        self, gains: np.ndarray, exact_gains: np.ndarray, parameters: int
-    ) -> None:
-        """Raises, or warns in the log, where the GPs are no better than noise alone.
-
-        Gains are log evidence over that of noise alone (k,), ``exact_gains`` those of the exact GPs of the subset; one
-        below the number of an output's parameters is none (Akaike, 1974).
-        """
-        nothing = [a for a, gain in enumerate(gains) if -np.inf < gain < parameters]
-        failed = [a for a in nothing if exact_gains[a] > parameters]
-        if failed:
-            raise TrainingError(
-                failed,
-                f"{self.inducing} inducing points learned nothing but noise of output {', '.join(map(str, failed))}, "
-                f"where exact GPs of {self.subset} points learned more: raise inducing",
-            )
-        if nothing:
-            _log.warning(
-                "sparse training: nothing but noise was found in output %s",
-                ", ".join(map(str, nothing)),
-            )
-
-    def _exact(self) -> Trainer:
+    def _exact_trainer(self) -> Trainer:
+        """The trainer of the subset."""
         return Trainer(
             predicts=self.predicts,
             scaling=identity,
@@ -256,131 +206,262 @@ class SparseTrainer:
             resolution=self.resolution,
         )
 
+    def _subset_data(self, data: TrainingData, rows: np.ndarray) -> TrainingData:
+        """Some rows with scaled targets, which may hold still what moves elsewhere."""
+        features = data.features[rows]
+        scaled_targets = data.scaled_targets
+        constants = Constants.find(
+            features, data.targets[rows], data.columns, self.resolution
+        )
+        return TrainingData(
+            features=features,
+            targets=scaled_targets[rows],
+            input_dim=data.input_dim,
+            predicts="value",
+            feature_scaling=identity(data.features),
+            target_scaling=identity(scaled_targets),
+            columns=data.columns,
+            constants=constants,
+            prior=data.prior.for_scaled_targets(data.target_scaling),
+        )
+
+    def _with_unexplained(
+        self, theta: np.ndarray, Z: Tensor, x: Tensor, y: Tensor
+    ) -> np.ndarray:
+        """Adds to the noise what the inducing points leave unexplained, on average.
+
+        Else the bound is so low where the search begins that its first step leaves for
+        a model of noise alone.
+        """
+        if self.method == "fitc":  # has that noise of its own
+            return theta
+        kernel = Hyperparameters.from_theta(torch.from_numpy(theta))
+        with torch.no_grad():
+            Lz = inducing_factor(Z, kernel, JITTER)
+            sums = data_sums(Lz, Z, x, y, kernel, self.method)
+        explained = sums.gram.diagonal(dim1=-2, dim2=-1).sum(-1)
+        signal = kernel.signal_variance
+        noise = kernel.noise_variance
+        noise = noise + (signal - explained * noise / len(x)).clamp_min(0)
+        return np.column_stack([theta[:, :-1], (signal / noise).log().numpy() / 2])
+
+    def _check_learned(
+        self, gains: np.ndarray, exact_gains: np.ndarray, parameters: int
+    ) -> None:
+        """Raises, or warns in the log, where the GPs are no better than noise alone.
+
+        A gain below the number of an output's parameters is none (Akaike, 1974).
+
+        Args:
+            gains: Log evidence over that of noise alone (k,).
+            exact_gains: The same of the exact GPs of the subset (k,).
+            parameters: Number of an output's parameters.
+        """
+        nothing = [a for a, gain in enumerate(gains) if -np.inf < gain < parameters]
+        failed = [a for a in nothing if exact_gains[a] > parameters]
+        if failed:
+            outputs = ", ".join(map(str, failed))
+            raise TrainingError(
+                failed,
+                f"{self.inducing} inducing points learned nothing but noise of output "
+                f"{outputs}, where exact GPs of {self.subset} points learned more: "
+                "raise inducing",
+            )
+        if nothing:
+            _log.warning(
+                "sparse training: nothing but noise was found in output %s",
+                ", ".join(map(str, nothing)),
+            )
+
+
+def _start_what_moved_elsewhere(
+    theta: np.ndarray,
+    data: TrainingData,
+    subset: TrainingData,
+    std: np.ndarray,
+    targets: np.ndarray,
+) -> None:
+    """Writes to theta (k, d + 2) the plain start of what only the subset held still.
+
+    Args:
+        theta: Rows that the subset's training has found.
+        data: All data.
+        subset: The subset.
+        std: Standard deviations of the scaled features (d,).
+        targets: Scaled (N, k).
+    """
+    moves = subset.constants.features & ~data.constants.features
+    theta[:, :-2][:, moves] = np.log(std)[moves]
+    changes = subset.constants.outputs & ~data.constants.outputs
+    for a in np.flatnonzero(changes):
+        theta[a] = plain_theta(std, targets[:, a])
+
+
+def _fixed_entries(theta: np.ndarray, data: TrainingData) -> np.ndarray:
+    """Which entries of theta (k, d + 2) are not searched: those of what never moves."""
+    fixed = np.zeros(theta.shape, dtype=bool)
+    fixed[data.unsearched_outputs] = True
+    fixed[:, :-2][:, data.constants.features] = True
+    return fixed
+
+
+def _check_finite(objective: np.ndarray) -> None:
+    """Raises ``TrainingError`` where the bound of an output (k,) does not exist."""
+    failed = np.flatnonzero(~np.isfinite(objective)).tolist()
+    if failed:
+        raise TrainingError(
+            failed,
+            "the inducing points' kernel matrix is not positive definite: take fewer",
+        )
+
 
 def _noise_alone(targets: Tensor) -> np.ndarray:
-    """The least negative log evidence (k,) of targets (N, k) as noise alone; minus infinity where all are zero."""
-    return (
-        len(targets) / 2 * (2 * math.pi * math.e * targets.square().mean(0)).log()
-    ).numpy()
+    """The least negative log evidence (k,) of targets (N, k) as noise alone.
+
+    Minus infinity where all are zero.
+    """
+    variance = targets.square().mean(0)
+    return (len(targets) / 2 * (2 * math.pi * math.e * variance).log()).numpy()
 
 
 def informative_points(
     features: Tensor, hyperparameters: Sequence[Tensor], count: int
 ) -> list[int]:
-    """Chooses rows of features (N, d): each where most is unexplained by those before it.
+    """Chooses rows of features (N, d): each where most is unexplained by those before.
 
-    A pivoted Cholesky factorisation of sum_a K_a / sn2_a's diagonal. Fewer than ``count`` come back where nothing is
-    left to explain: less than round-off of every output's variance.
+    A pivoted Cholesky factorisation of sum_a K_a / sn2_a's diagonal. Fewer than
+    ``count`` come back where nothing is left to explain: less than round-off of every
+    output's variance.
     """
     lengthscales, signal_variance, noise_variance = hyperparameters
-    left = signal_variance[:, None].repeat(1, len(features))
-    rows = features.new_zeros(
-        len(lengthscales), min(count, len(features)), len(features)
-    )
+    round_off = 1e-10 * signal_variance
+    unexplained = signal_variance[:, None].repeat(1, len(features))
+    most = min(count, len(features))
+    rows = features.new_zeros(len(lengthscales), most, len(features))
     chosen: list[int] = []
-    for step in range(rows.shape[1]):
-        i = int((left / noise_variance[:, None]).sum(0).argmax())
-        if bool((left[:, i] <= 1e-10 * signal_variance).all()):
+    for step in range(most):
+        i = int((unexplained / noise_variance[:, None]).sum(0).argmax())
+        if bool((unexplained[:, i] <= round_off).all()):
             break
         row = kernel_matrix(
             features[i : i + 1], features, lengthscales, signal_variance
         )[:, 0]
         row = row - (rows[:, :step, i][:, None, :] @ rows[:, :step])[:, 0]
-        # An output to which this point is nothing new gives a row of round-off: none, rather.
-        new = left[:, i] > 1e-10 * signal_variance
-        rows[:, step] = torch.where(
-            new[:, None], row / left[:, i].clamp_min(1e-300).sqrt()[:, None], 0.0
-        )
-        left = (left - rows[:, step].square()).clamp_min(0)
-        left[:, i] = 0
+        pivot = unexplained[:, i].clamp_min(1e-300).sqrt()
+        # An output to which this point is nothing new gives a row of round-off: none,
+        # rather.
+        is_new = unexplained[:, i] > round_off
+        rows[:, step] = torch.where(is_new[:, None], row / pivot[:, None], 0.0)
+        unexplained = (unexplained - rows[:, step].square()).clamp_min(0)
+        unexplained[:, i] = 0
         chosen.append(i)
     return chosen
 
 
-class _Bound:
-    """Minus the collapsed bound of all outputs over one vector: their theta, and Z in units of the features' spread."""
+class _Point(NamedTuple):
+    """A point of the search: hyperparameters and inducing points."""
+
+    theta: Tensor  #: (k, d + 2)
+    inducing: Tensor  #: Z (M, d)
+
+
+class _NegativeBound:
+    """Minus the collapsed bound of all outputs, over one vector.
+
+    The vector holds the outputs' theta, and Z in units of the features' standard
+    deviations.
+    """
 
     def __init__(
-        self,
-        trainer: SparseTrainer,
-        x: Tensor,
-        y: Tensor,
-        unit: Tensor,
-        theta: np.ndarray,
-        Z: Tensor,
-        unsearched: np.ndarray,
+        self, x: Tensor, y: Tensor, std: Tensor, method: Method, iterations: int
     ):
-        self._unsearched = unsearched  # entries of theta (k, d + 2) that stay
-        self._trainer = trainer
         self._x = x
         self._y = y
-        self._unit = unit
-        self._shape = theta.shape
-        self.best = np.append(
-            theta.ravel(), (Z / unit).numpy().ravel()
-        )  #: the start, or the best point evaluated since
+        self._std = std
+        self._method: Method = method
+        self._max_iterations = iterations
+        self._outputs = y.shape[1]
+        self._theta_size = y.shape[1] * (x.shape[1] + 2)
+        self.best = np.empty(0)  #: the start, or the best point evaluated since
         self.evaluations = 0
+        self._fixed = np.empty(0, dtype=bool)
         self._least = np.inf
         self._iterations = 0
 
-    def maximize(self) -> None:
-        """Searches by L-BFGS in a box around the data that holds the start."""
-        log_inputs = self._unit.log().numpy()
-        trainer = self._trainer
-        boxes = [
-            search_box(log_inputs, own, _SIGNAL_TO_NOISE)
-            for own in np.log(column_std(self._y.numpy()))
-        ]
-        smallest, largest = (
-            (edge / self._unit).numpy() for edge in (self._x.amin(0), self._x.amax(0))
-        )
-        margin = 0.1 * (largest - smallest)
-        count = (len(self.best) - self._shape[0] * self._shape[1]) // len(smallest)
-        lower, upper = (np.concatenate(side) for side in zip(*boxes, strict=True))
-        lower = np.minimum(
-            np.append(lower, np.tile(smallest - margin, count)), self.best
-        )
-        upper = np.maximum(
-            np.append(upper, np.tile(largest + margin, count)), self.best
-        )
-        stays = np.append(
-            self._unsearched.ravel(),
-            np.zeros(self.best.size - self._unsearched.size, dtype=bool),
-        )
-        lower[stays] = upper[stays] = self.best[stays]
-        if self._trainer.iterations:  # of none L-BFGS-B makes one
-            limits = {
-                "maxiter": trainer.iterations,
-                "maxfun": 3 * trainer.iterations + 1,
-            }
-            minimize(
-                self,
-                self.best,
-                jac=True,
-                method="L-BFGS-B",
-                bounds=np.column_stack([lower, upper]),
-                callback=self._report,
-                options={"ftol": _TOLERANCE, "gtol": 1e-6, **limits},
-            )
+    def start_at(self, theta: np.ndarray, Z: Tensor, fixed: np.ndarray) -> None:
+        """Sets the start.
 
-    def parts(self, vector: Tensor) -> tuple[Tensor, Tensor]:
-        """Rows of theta (k, d + 2) and Z (M, d)."""
-        split = self._shape[0] * self._shape[1]
-        return vector[:split].reshape(self._shape), vector[split:].reshape(
-            -1, len(self._unit)
-        ) * self._unit
+        Args:
+            theta: (k, d + 2).
+            Z: (M, d).
+            fixed: Entries of theta that are not searched (k, d + 2).
+        """
+        scaled = (Z / self._std).numpy().ravel()
+        self.best = np.append(theta.ravel(), scaled)
+        self._fixed = np.append(fixed.ravel(), np.zeros(scaled.size, dtype=bool))
+
+    def minimize(self) -> None:
+        """Searches by L-BFGS in a box around the data that holds the start."""
+        if not self._max_iterations:  # of none L-BFGS-B makes one
+            return
+        minimize(
+            self,
+            self.best,
+            jac=True,
+            method="L-BFGS-B",
+            bounds=self._bounds(),
+            callback=self._report,
+            options={
+                "ftol": _TOLERANCE,
+                "gtol": 1e-6,
+                "maxiter": self._max_iterations,
+                "maxfun": 3 * self._max_iterations + 1,
+            },
+        )
+
+    def _bounds(self) -> np.ndarray:
+        """Lower and upper bounds of the vector in two columns."""
+        log_std = self._std.log().numpy()
+        boxes = [
+            search_box(log_std, log_output, _SIGNAL_TO_NOISE)
+            for log_output in np.log(column_std(self._y.numpy()))
+        ]
+        smallest = (self._x.amin(0) / self._std).numpy()
+        largest = (self._x.amax(0) / self._std).numpy()
+        margin = 0.1 * (largest - smallest)
+        inducing = (len(self.best) - self._theta_size) // len(smallest)
+        lower = np.concatenate(
+            [*(box.lower for box in boxes), np.tile(smallest - margin, inducing)]
+        )
+        upper = np.concatenate(
+            [*(box.upper for box in boxes), np.tile(largest + margin, inducing)]
+        )
+        lower = np.minimum(lower, self.best)
+        upper = np.maximum(upper, self.best)
+        lower[self._fixed] = self.best[self._fixed]
+        upper[self._fixed] = self.best[self._fixed]
+        return np.column_stack([lower, upper])
+
+    def unpack(self, vector: Tensor) -> _Point:
+        """Reads the rows of theta (k, d + 2) and Z (M, d)."""
+        theta = vector[: self._theta_size].reshape(self._outputs, -1)
+        scaled = vector[self._theta_size :].reshape(-1, len(self._std))
+        return _Point(theta=theta, inducing=scaled * self._std)
 
     def values(self) -> np.ndarray:
-        """Minus the bound of every output (k,) at the best point; infinite where a matrix is not positive definite."""
+        """Computes minus the bound of every output (k,) at the best point.
+
+        Infinite where a matrix is not positive definite.
+        """
         with torch.no_grad():
-            return self._bounds(torch.from_numpy(self.best)).numpy()
+            return self._evaluate(torch.from_numpy(self.best)).numpy()
 
     def __call__(self, vector: np.ndarray) -> tuple[float, np.ndarray]:
-        """The sum over the outputs, and its gradient."""
+        """Computes the sum over the outputs, and its gradient."""
         self.evaluations += 1
         variables = torch.from_numpy(vector.copy()).requires_grad_()
         with torch.enable_grad():
-            total = self._bounds(variables).sum()
+            total = self._evaluate(variables).sum()
             value = float(total.detach())
             gradient = np.full_like(vector, np.nan)
             if math.isfinite(value):
@@ -402,12 +483,17 @@ class _Bound:
                 self._least,
             )
 
-    def _bounds(self, vector: Tensor) -> Tensor:
-        theta, Z = self.parts(vector)
+    def _evaluate(self, vector: Tensor) -> Tensor:
+        """Minus the bound of every output (k,)."""
+        point = self.unpack(vector)
         try:
-            kernel = Hyperparameters.from_theta(theta)
             return -collapsed_bound(
-                Z, self._x, self._y, kernel, self._trainer.method, JITTER
+                point.inducing,
+                self._x,
+                self._y,
+                Hyperparameters.from_theta(point.theta),
+                method=self._method,
+                jitter=JITTER,
             )
         except (SettingError, torch.linalg.LinAlgError):  # pyright: ignore[reportPrivateImportUsage]
-            return torch.full(self._shape[:1], torch.inf, dtype=torch.float64)
+            return torch.full((self._outputs,), torch.inf, dtype=torch.float64)

@@ -1,8 +1,8 @@
 import pytest
 
 from gpmpc.exceptions import DataError
-from gpmpc.gp import _training
-from gpmpc.gp._training import available_memory
+from gpmpc.gp import _memory
+from gpmpc.gp._memory import available_memory
 
 
 def write(path, text):
@@ -62,12 +62,12 @@ def test_a_training_that_does_not_fit_is_refused_with_the_points_that_would(
 ):
     needed = 8 * 1000**2 * (2 + 2)  # [bytes]
     for free in (needed, None):
-        monkeypatch.setattr(_training, "available_memory", lambda free=free: free)
-        _training._check_memory(1000, 2)
-    monkeypatch.setattr(_training, "available_memory", lambda: needed - 1)
+        monkeypatch.setattr(_memory, "available_memory", lambda free=free: free)
+        _memory.check_memory(1000, 2)
+    monkeypatch.setattr(_memory, "available_memory", lambda: needed - 1)
     with pytest.raises(DataError, match="train on 999 points or fewer"):
-        _training._check_memory(1000, 2)
-    monkeypatch.setattr(_training, "available_memory", lambda: 2**30)
+        _memory.check_memory(1000, 2)
+    monkeypatch.setattr(_memory, "available_memory", lambda: 2**30)
     message = "exact GPs of 20000 points and 3 outputs need 14.9 GiB, 2.98 GiB a kernel matrix; 1 GiB are available: "
     with pytest.raises(DataError, match=f"{message}train on 5181 points or fewer"):
-        _training._check_memory(20_000, 3)
+        _memory.check_memory(20_000, 3)

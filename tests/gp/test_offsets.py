@@ -23,9 +23,8 @@ from gpmpc.gp import (
     remove_points,
     standardize,
 )
-from gpmpc.gp._data_checks import constant_columns
+from gpmpc.gp._data_checks import column_std, constant_columns
 from gpmpc.gp._likelihood import NegativeLogMarginalLikelihood
-from gpmpc.gp._search import column_std
 from gpmpc.gp._sparse import collapsed_bound, sparse_posterior
 from gpmpc.gp.casadi_ import casadi_function
 from gpmpc.gp.module import PosteriorModule

@@ -28,7 +28,7 @@ from gpmpc.gp import (
     to_gpytorch,
     train,
 )
-from gpmpc.gp._search import column_std
+from gpmpc.gp._data_checks import column_std
 
 
 def pendulum(rows=60, noise=1e-3, seed=0):
@@ -228,7 +228,7 @@ def test_a_subset_is_searched_first_where_there_are_more_points_and_other_starts
 def test_what_does_not_fit_the_memory_is_refused_with_the_numbers_and_a_way_out(
     monkeypatch,
 ):
-    monkeypatch.setattr("gpmpc.gp._training.available_memory", lambda: 2 * 2**20)
+    monkeypatch.setattr("gpmpc.gp._memory.available_memory", lambda: 2 * 2**20)
     with pytest.raises(DataError) as refused:
         train(pendulum(400))
     assert str(refused.value) == (
@@ -236,7 +236,7 @@ def test_what_does_not_fit_the_memory_is_refused_with_the_numbers_and_a_way_out(
         "available: train on 256 points or fewer, or sparse GPs (SparseTrainer)"
     )
     assert len(train(pendulum(250), restarts=0, tolerance=1e-3).posterior) == 250
-    monkeypatch.setattr("gpmpc.gp._training.available_memory", lambda: None)
+    monkeypatch.setattr("gpmpc.gp._memory.available_memory", lambda: None)
     assert len(train(pendulum(20), restarts=0).posterior) == 20
 
 
@@ -471,7 +471,7 @@ def test_a_time_limit_waits_for_one_start_that_succeeds(
             self.__class__, "_is_late", lambda _: number + 1 >= late_after
         )
         return (
-            (start, 2 * _search.FAILED)
+            _search.Optimum(start, 2 * _search.FAILED)
             if number == failing
             else search(self, start, iterations)
         )
