@@ -1,0 +1,699 @@
+"""The checks of a flight's step, compiled.
+
+``judge_step`` takes a step into the memory of its flight, measures what several checks
+need of it, and returns the first alarm; its tuple ``alarms`` is the list of checks, in
+the order in which they are named to the user. What they are for is told in
+``_judgement``.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from scipy.stats import chi2
+
+from gpmpc._compiled import compiled, njit_noalloc
+
+Array = np.ndarray
+
+WINDOW = 8  # steps over which innovations, novelty and failures are looked at
+BIAS_WINDOW = 16  # steps over which innovations are to cancel each other
+_CHANGES = 40  # differences of innovations that say how large the sensors' noise is
+_FEWEST = 4  # of them, before any innovation is judged
+_DOUBT = 10.0  # differences, for as many of which their median is taken twice
+_GROWTH = (6, 20)  # least and most steps in each half of a window of growth
+_LONG = 20  # steps that a promise is followed for at most
+_RING = 2 * _GROWTH[1] + 1  # steps that distances and costs are remembered for
+_RARE = 1e-6  # probability of a window's innovations below which they are no chance
+_LARGEST_RATIO = float(chi2.isf(_RARE, WINDOW)) / WINDOW  # of their mean square
+_LARGEST_BIAS = 3.0  # deviations of the model, which one error may keep for long
+_CAP = 12.0  # most that one innovation counts for: no outlier decides alone
+_LARGEST_SIGNED = 6.0  # most that one counts for, with its sign
+_MISSED_MOTION = 0.05  # share of what moves in a step that a good model may miss
+_FORGETTING = 0.8  # share of the largest motion's square that counts one step later
+_BROKEN = 4.0  # how many times a promise may be paid
+_MATERIAL = 0.02  # share of the way travelled below which no distance matters
+_FEW = 3  # steps of a window: failures, or plans far from the data
+_FAR = 0.9  # novelty from which on a model says little more than before any data
+_VIOLATED = 1e-6  # violation of a constraint from which on it counts as missed
+_CLIMBED = 0.1  # of its first cost, from which on plans that cost ever more count
+_RISEN = 2.0  # of its first cost, from which on they are lost
+_ROUNDING = 1e-9
+_MEDIAN = 0.455  # of a chi-square of one degree
+
+# Why a step is not healthy.
+HEALTHY = 0
+INNOVATION = 1
+PROMISE = 2
+NOVELTY = 3
+VIOLATION = 4
+FAILURES = 5
+SATURATED = 6
+FROZEN = 7
+BIAS = 8
+AWAY = 9
+RISING = 10
+CLIMBING = 11
+STANDING = 12
+
+# What a flight has shown so far of each state. Rings are filled in turns.
+STATE_MEMORY = np.dtype(
+    [
+        ("innovation", np.float64),  # the last one; NaN where there was none
+        ("ratios", np.float64, WINDOW),  # squared innovations over their variances
+        ("ratio", np.float64),  # their sum
+        ("deviations", np.float64, BIAS_WINDOW),  # innovations over their deviations
+        ("bias", np.float64),  # their sum
+        ("changes", np.float64, _CHANGES),  # squared differences of innovations
+        ("ordered_changes", np.float64, _CHANGES),
+        ("sensor_variance", np.float64),  # the sensors' part of the innovations
+        ("motion", np.float64),  # largest squared predicted motion, forgotten slowly
+        ("measured", np.float64),  # the last measurement
+        ("repeats", np.float64),  # for how many steps the sensor has shown the same
+        ("is_coarse", np.float64),  # 1 where it has gone on after showing the same
+        ("start", np.float64),  # the first measurement
+        ("horizon_end", np.float64),  # the end of the last reference
+        ("next_reference", np.float64),  # its value for this step
+    ]
+)
+# What it has shown of all states together.
+FLIGHT_MEMORY = np.dtype(
+    [
+        ("step", np.int64),  # number of the step, from 0
+        ("changes", np.int64),  # differences of innovations so far
+        ("look_ahead", np.int64),  # steps that a promise is followed for; 0 at first
+        ("since_news", np.int64),  # steps since the reference's end has moved
+        ("since_nearer", np.int64),  # steps since the plant came nearer to it
+        ("violated", np.int64),  # steps for which plans have missed a constraint
+        ("lost", np.int64),  # why it is lost, or ``HEALTHY``
+        ("travel", np.float64),  # from the start to the reference's end
+        ("distance_when_lost", np.float64),
+        ("first_violation", np.float64),
+        ("distance_at_bound", np.float64),  # when an input came to stay at its bound
+        ("first_cost", np.float64),  # largest of plans while the reference was news
+        ("nearest", np.float64),  # distance
+        ("distances", np.float64, _RING),
+        ("costs", np.float64, _RING),  # of plans
+        ("news", np.float64, _RING),  # squared moves of the reference's end
+        ("paid", np.float64, _RING),  # squared distances
+        ("promised", np.float64, _RING),  # by the plan of a step for the next steps
+        ("far", np.float64, WINDOW),  # 1 where a plan was far from the data
+        ("failed", np.float64, WINDOW),  # 1 where a decision was not applied
+    ]
+)
+
+
+class Settings(NamedTuple):
+    """What stays the same through a flight; n states and m inputs."""
+
+    weights: Array  # of the states (n, n)
+    terminal: Array  # of the last predicted one (n, n)
+    model_noise: Array  # variances of a next state that plans leave out (n,)
+    angles: Array  # 1 where a state is an angle (n,)
+    lower: Array  # bounds of the inputs (m,)
+    upper: Array  # (m,)
+
+
+class Memory(NamedTuple):
+    """What a flight has shown so far."""
+
+    states: Array  # (n,) of ``STATE_MEMORY``
+    flight: Array  # (1,) of ``FLIGHT_MEMORY``
+    at_bound: Array  # for how many steps an input has stayed at a bound (m,)
+
+
+class Reading(NamedTuple):
+    """What is known of one step."""
+
+    measured: Array  # (n,)
+    reference: Array  # from this step on, to its end or as far as known (H + 1, n)
+    last_means: Array  # of the plan before, which started one step ago (H + 1, n)
+    last_covariances: Array  # (H + 1, n, n); NaN without a plan
+    means: Array  # of the new plan (H + 1, n); NaN without one
+    input: Array  # applied now (m,)
+    novelty: float
+    violation: float
+
+
+class Alarm(NamedTuple):
+    """What a check says of a step."""
+
+    reason: int  # ``HEALTHY`` where it is
+    entry: int  # the state or input that it is about
+    value: float  # that the words name
+
+
+_WELL = Alarm(HEALTHY, entry=0, value=0.0)
+
+
+class _Distance(NamedTuple):
+    """How far the plant is from its reference, in the cost's metric."""
+
+    now: float
+    least: float  # that matters
+
+
+class _Course(NamedTuple):
+    """Where distances and costs have gone, for several checks."""
+
+    distance: float  # from the reference, in the cost's metric
+    matters: bool  # whether the distance does
+    promise_ratio: float  # what steps cost over what was promised; 0 if not known
+    cost_ratio: float  # plan's cost over the first one; 0 while the reference is news
+    distance_grows: bool  # faster and faster
+    cost_climbs: bool  # faster and faster, while the distance has grown
+
+
+def new_state_memory(count: int) -> Array:
+    """Returns the memory of states (count,) at the start of a flight."""
+    states = np.zeros(count, STATE_MEMORY)
+    states["ordered_changes"] = np.inf
+    unknown = ("innovation", "measured", "start", "horizon_end", "next_reference")
+    for field in unknown:
+        states[field] = np.nan
+    return states
+
+
+@compiled(locked=True, allocates=False)
+def judge_step(settings, memory, reading):
+    """Takes a step into the memory; returns the first alarm of the checks."""
+    flight = memory.flight[0]
+    horizon = len(reading.means) - 1
+    cost, promised = _plan_distances(settings, reading.means, reading.reference)
+    is_applied = cost == cost
+    if flight.look_ahead == 0 and is_applied:
+        flight.look_ahead = min(horizon, _LONG)
+
+    innovation, bias = _check_innovations(settings, memory, reading)
+    frozen = _check_sensors(memory, reading.measured)
+    distance = _measure_distance(settings, memory, reading)
+    _read_news(settings, memory, reading.reference)
+    _remember_first_cost(flight, cost)
+    promise_ratio = _follow_promise(flight, distance, promised, horizon)
+    course = _follow_course(flight, distance, cost, promise_ratio)
+    far_plans = _count_far_plans(flight, reading.novelty)
+    predicts_well = (
+        innovation.reason == HEALTHY and bias.reason == HEALTHY and far_plans == 0.0
+    )
+    lost = _check_lost(flight, course, cost, predicts_well)
+    alarms = (  # in the order in which they are named
+        lost,
+        frozen,
+        innovation,
+        bias,
+        _check_climbing(course, predicts_well),
+        _check_promise(course),
+        _check_failures(flight, is_applied),
+        _check_novelty(flight, course, far_plans, reading.novelty),
+        _check_violation(flight, reading.violation),
+        _check_standing(flight, distance, horizon),
+        _check_bounds(settings, memory, reading.input, distance, horizon),
+    )
+    flight.step += 1
+    return _first(alarms)
+
+
+@njit_noalloc
+def _first(alarms):
+    """The first alarm of several."""
+    for alarm in alarms:
+        if alarm.reason != HEALTHY:
+            return alarm
+    return _WELL
+
+
+@njit_noalloc
+def _check_innovations(settings, memory, reading):
+    """The states whose innovations are no chance: by a window's squares, and by bias.
+
+    The first alarm is that of the largest mean square in a window, the second that of
+    innovations which do not cancel each other in a longer one (Bar-Shalom, Li and
+    Kirubarajan, 2001, section 5.4).
+    """
+    flight = memory.flight[0]
+    largest = _WELL
+    most_biased = _WELL
+    largest_sum = _LARGEST_RATIO * WINDOW
+    largest_bias = _LARGEST_BIAS * BIAS_WINDOW
+    has_change = False
+    for i in range(len(memory.states)):
+        state = memory.states[i]
+        innovation = _wrapped(
+            reading.measured[i] - reading.last_means[1, i], settings.angles[i]
+        )
+        ratio, deviation = _score_innovation(settings, flight, state, reading, i)
+        slot = flight.step % WINDOW
+        state.ratio += ratio - state.ratios[slot]
+        state.ratios[slot] = ratio
+        slot = flight.step % BIAS_WINDOW
+        state.bias += deviation - state.deviations[slot]
+        state.deviations[slot] = deviation
+        if state.ratio > largest_sum:
+            largest_sum = state.ratio
+            largest = Alarm(INNOVATION, i, math.sqrt(largest_sum / WINDOW))
+        if abs(state.bias) > largest_bias:
+            largest_bias = abs(state.bias)
+            most_biased = Alarm(BIAS, i, largest_bias / BIAS_WINDOW)
+        if _remember_change(flight, state, innovation):
+            has_change = True
+    flight.changes += has_change
+    return largest, most_biased
+
+
+@njit_noalloc
+def _score_innovation(settings, flight, state, reading, i):
+    """A state's squared innovation over its variance, and itself over its deviation.
+
+    The variance is the predicted one, the noise that the model has learned, that of
+    the sensors and a share of what moves. Of an error of the model each step may have
+    all; of the sensors' noise the mean of a window has little.
+    """
+    is_judged = flight.changes >= _FEWEST
+    if is_judged:
+        state.sensor_variance = _sensor_variance(flight, state)
+    expected = reading.last_means[1, i]
+    innovation = _wrapped(reading.measured[i] - expected, settings.angles[i])
+    if innovation != innovation:
+        return 0.0, 0.0
+    motion = expected - reading.last_means[0, i]
+    motion = max(motion * motion, _FORGETTING * state.motion)
+    state.motion = motion
+    if not is_judged:
+        return 0.0, 0.0
+    size = _ROUNDING * max(1.0, abs(reading.measured[i]))
+    variance = size * size + reading.last_covariances[1, i, i] + settings.model_noise[i]
+    variance += _MISSED_MOTION * _MISSED_MOTION * motion
+    ratio = innovation * innovation / (variance + state.sensor_variance)
+    ratio = min(ratio, _CAP)
+    deviation = innovation / math.sqrt(variance + state.sensor_variance / BIAS_WINDOW)
+    deviation = min(max(deviation, -_LARGEST_SIGNED), _LARGEST_SIGNED)
+    return ratio, deviation
+
+
+@njit_noalloc
+def _sensor_variance(flight, state):
+    """The variance of a state's sensor, by the median of its changes.
+
+    Half the squared difference of white innovations is their variance; the median of
+    few differences is uncertain.
+    """
+    count = min(flight.changes, _CHANGES)
+    scale = (1.0 + _DOUBT / max(count, 1)) / _MEDIAN / 2.0
+    return scale * state.ordered_changes[count // 2]
+
+
+@njit_noalloc
+def _remember_change(flight, state, innovation):
+    """Remembers how an innovation differs from the last; returns whether it is known.
+
+    One that is not is taken for what the last was.
+    """
+    change = innovation - state.innovation
+    state.innovation = innovation
+    is_known = change == change
+    if is_known:
+        _insert_change(flight, state, change * change)
+    elif flight.changes > 0:
+        last = state.changes[(flight.changes - 1) % _CHANGES]
+        _insert_change(flight, state, last)
+    return is_known
+
+
+@njit_noalloc
+def _insert_change(flight, state, value):
+    """Puts a value into the ring of a state's changes, and in its place in order."""
+    slot = flight.changes % _CHANGES
+    ordered = state.ordered_changes
+    if flight.changes < _CHANGES:
+        j = flight.changes
+    else:
+        j = _find(ordered, state.changes[slot])
+        while j < _CHANGES - 1 and ordered[j + 1] < value:
+            ordered[j] = ordered[j + 1]
+            j += 1
+    while j > 0 and ordered[j - 1] > value:
+        ordered[j] = ordered[j - 1]
+        j -= 1
+    ordered[j] = value
+    state.changes[slot] = value
+
+
+@njit_noalloc
+def _find(ordered, value):
+    """The first index of ordered values at which one is no less than a value."""
+    low = 0
+    high = len(ordered) - 1
+    while low < high:
+        middle = (low + high) // 2
+        if ordered[middle] < value:
+            low = middle + 1
+        else:
+            high = middle
+    return low
+
+
+@njit_noalloc
+def _check_sensors(memory, measured):
+    """A state that is measured the same to the last digit while others change.
+
+    A sensor that has shown the same before, and then gone on, has coarse steps: it may.
+    """
+    changing = 0
+    for i in range(len(measured)):
+        state = memory.states[i]
+        if measured[i] == state.measured:
+            state.repeats += 1.0
+        else:
+            if state.repeats > 0.0:
+                state.is_coarse = 1.0
+            state.repeats = 0.0
+            changing += 1
+        state.measured = measured[i]
+    if changing == 0 or memory.flight[0].changes < _FEWEST:
+        return _WELL
+    for i in range(len(measured)):
+        state = memory.states[i]
+        if state.repeats >= WINDOW // 2 and state.is_coarse == 0.0:
+            return Alarm(FROZEN, i, state.repeats)
+    return _WELL
+
+
+@njit_noalloc
+def _measure_distance(settings, memory, reading):
+    """The distance from the reference in the cost's metric, and the least that matters.
+
+    No distance matters that is small beside the way travelled, or beside noise.
+    """
+    flight = memory.flight[0]
+    n = len(reading.measured)
+    for i in range(n):
+        state = memory.states[i]
+        if state.start != state.start:
+            state.start = reading.measured[i]
+    now = reading.reference[0]
+    end = reading.reference[-1]
+    square = 0.0
+    travel = 0.0
+    noise = 0.0
+    for i in range(n):
+        state = memory.states[i]
+        off = _wrapped(reading.measured[i] - now[i], settings.angles[i])
+        way = _wrapped(end[i] - state.start, settings.angles[i])
+        for j in range(n):
+            weight = settings.weights[i, j]
+            if weight != 0.0:
+                other = _wrapped(reading.measured[j] - now[j], settings.angles[j])
+                square += weight * off * other
+                other = _wrapped(end[j] - memory.states[j].start, settings.angles[j])
+                travel += weight * way * other
+        variance = settings.model_noise[i] + state.sensor_variance
+        predicted = reading.last_covariances[1, i, i]
+        if predicted == predicted:
+            variance += predicted
+        size = _ROUNDING * max(1.0, abs(reading.measured[i]))
+        noise += settings.weights[i, i] * (variance + size * size)
+    travel = math.sqrt(max(0.0, travel))
+    if travel == travel:
+        flight.travel = max(flight.travel, travel)
+    least = max(_MATERIAL * flight.travel, 4.0 * math.sqrt(noise))
+    return _Distance(math.sqrt(max(0.0, square)), least)
+
+
+@njit_noalloc
+def _read_news(settings, memory, reference):
+    """Remembers what a reference tells that no plan has known before."""
+    flight = memory.flight[0]
+    move = _move_of_end(settings, memory, reference[-1])
+    if move > 0.0 or flight.step == 0:
+        flight.since_news = 0
+    else:
+        flight.since_news += 1
+    flight.news[flight.step % max(flight.look_ahead, 1)] = move
+    now = reference[0]
+    following = reference[min(1, len(reference) - 1)]
+    is_as_announced = True
+    for i in range(len(now)):
+        state = memory.states[i]
+        off = _wrapped(now[i] - state.next_reference, settings.angles[i])
+        if abs(off) > _ROUNDING * max(1.0, abs(now[i])):
+            is_as_announced = False
+        state.next_reference = following[i]
+        state.horizon_end = reference[-1, i]
+    if not is_as_announced:  # no plan has promised anything of this
+        for j in range(_RING):
+            flight.promised[j] = np.nan
+
+
+@njit_noalloc
+def _move_of_end(settings, memory, end):
+    """The squared move of a reference's end in the cost's metric; 0 for rounding."""
+    square = 0.0
+    size = 0.0
+    for i in range(len(end)):
+        move = _wrapped(end[i] - memory.states[i].horizon_end, settings.angles[i])
+        size += settings.weights[i, i] * end[i] * end[i]
+        for j in range(len(end)):
+            if settings.weights[i, j] != 0.0:
+                other = end[j] - memory.states[j].horizon_end
+                other = _wrapped(other, settings.angles[j])
+                square += settings.weights[i, j] * move * other
+    return square if square > 1e-12 * max(1.0, size) else 0.0
+
+
+@njit_noalloc
+def _remember_first_cost(flight, cost):
+    """Remembers the largest cost of plans while their reference was news.
+
+    It is what the cost is to fall from.
+    """
+    if flight.since_news == 0 and cost > flight.first_cost:
+        flight.first_cost = cost
+
+
+@njit_noalloc
+def _plan_distances(settings, means, references):
+    """Squared distances of a plan from its references: of all stages, and of the first.
+
+    Means are (H + 1, n); the first stages are as many as a promise is followed for. In
+    contrast to the stage costs of a decision these are distances alone, which any
+    controller's plan has and a measurement can be compared with.
+    """
+    H = len(means) - 1
+    n = means.shape[1]
+    total = 0.0
+    first = 0.0
+    for k in range(H):
+        weights = settings.terminal if k == H - 1 else settings.weights
+        target = references[min(k + 1, len(references) - 1)]
+        for i in range(n):
+            off = _wrapped(means[k + 1, i] - target[i], settings.angles[i])
+            for j in range(n):
+                if weights[i, j] != 0.0:
+                    other = _wrapped(means[k + 1, j] - target[j], settings.angles[j])
+                    total += weights[i, j] * off * other
+        if k == _LONG - 1:
+            first = total
+    return total, total if H <= _LONG else first
+
+
+@njit_noalloc
+def _follow_promise(flight, distance, promised, horizon):
+    """What steps cost over what a plan promised for them; 0 where it is not known.
+
+    In optimal control the cost falls by what is paid (Gruene and Rantzer, 2008,
+    section 3).
+    """
+    k = flight.step
+    h = flight.look_ahead
+    if h == 0:
+        return 0.0
+    slot = k % h
+    nearer = distance.now
+    if k > 0:  # one wrong measurement costs nothing
+        nearer = min(nearer, flight.distances[(k - 1) % _RING])
+    flight.paid[slot] = nearer * nearer
+    # What noise costs was not promised, nor what is done early for what came later.
+    allowed = flight.promised[slot] + 0.25 * h * distance.least * distance.least
+    is_comparable = min(horizon, _LONG) == h
+    flight.promised[slot] = promised if is_comparable else np.nan
+    if k < h or flight.changes <= _FEWEST:  # the noise is not known yet
+        return 0.0
+    paid = 0.0
+    for j in range(h):
+        paid += flight.paid[j]
+        allowed += flight.news[j]
+    ratio = paid / (allowed + 1e-300)
+    return ratio if ratio == ratio else 0.0
+
+
+@njit_noalloc
+def _follow_course(flight, distance, cost, promise_ratio):
+    """Remembers distance and cost; returns where they have gone."""
+    k = flight.step
+    flight.distances[k % _RING] = distance.now
+    flight.costs[k % _RING] = cost
+    half = min(max(flight.look_ahead // 2, _GROWTH[0]), _GROWTH[1])
+    was_away = flight.distances[(k - half) % _RING] > distance.least
+    was_nearer = flight.distances[(k - 2 * half) % _RING] < distance.now
+    cost_ratio = 0.0
+    if flight.since_news > _LONG and flight.first_cost > 0.0:
+        cost_ratio = cost / flight.first_cost
+    return _Course(
+        distance=distance.now,
+        matters=distance.now > distance.least,
+        promise_ratio=promise_ratio,
+        cost_ratio=cost_ratio,
+        distance_grows=was_away and _is_growing(flight.distances, k, half),
+        cost_climbs=was_away and was_nearer and _is_growing(flight.costs, k, half),
+    )
+
+
+@njit_noalloc
+def _is_growing(ring, k, half):
+    """Whether value k is the largest of a window, and its growth has not slowed down.
+
+    The second half of the window is compared with the first.
+    """
+    size = len(ring)
+    last = ring[k % size]
+    middle = ring[(k - half) % size]
+    first = ring[(k - 2 * half) % size]
+    if k < 2 * half or not last > middle > first:
+        return False
+    for j in range(2 * half):
+        if ring[(k - j) % size] > last:
+            return False
+    return last - middle >= 0.8 * (middle - first) and last > 1.2 * middle
+
+
+@njit_noalloc
+def _check_lost(flight, course, cost, predicts_well):
+    """A plant that runs away, by its distance or by what its plans cost.
+
+    It stays lost until it has come back by half.
+    """
+    if flight.lost != HEALTHY and course.distance < 0.5 * flight.distance_when_lost:
+        flight.lost = HEALTHY
+    if flight.lost == HEALTHY and course.matters:
+        is_far = course.distance > flight.travel
+        is_broken = course.promise_ratio > _BROKEN
+        if course.distance_grows and is_broken and is_far:
+            flight.lost = AWAY
+        elif course.cost_climbs and predicts_well and course.cost_ratio > _RISEN:
+            flight.lost = RISING
+        flight.distance_when_lost = course.distance
+    if flight.lost == AWAY:
+        return Alarm(AWAY, 0, course.distance)
+    if flight.lost == RISING:
+        return Alarm(RISING, 0, cost / flight.first_cost)
+    return _WELL
+
+
+@njit_noalloc
+def _check_climbing(course, predicts_well):
+    """Plans that cost ever more although the model predicts well."""
+    climbs = course.cost_climbs and predicts_well and course.cost_ratio > _CLIMBED
+    if climbs and course.matters:
+        return Alarm(CLIMBING, 0, course.cost_ratio)
+    return _WELL
+
+
+@njit_noalloc
+def _check_promise(course):
+    """Steps that cost several times what was promised."""
+    if course.matters and course.promise_ratio > _BROKEN:
+        return Alarm(PROMISE, 0, course.promise_ratio)
+    return _WELL
+
+
+@njit_noalloc
+def _check_failures(flight, is_applied):
+    """Decisions of a window that could not be applied."""
+    flight.failed[flight.step % WINDOW] = 0.0 if is_applied else 1.0
+    failures = _total(flight.failed)
+    if failures >= _FEW:
+        return Alarm(FAILURES, 0, failures)
+    return _WELL
+
+
+@njit_noalloc
+def _count_far_plans(flight, novelty):
+    """How many plans of a window were far from the model's data."""
+    flight.far[flight.step % WINDOW] = 1.0 if novelty > _FAR else 0.0
+    return _total(flight.far)
+
+
+@njit_noalloc
+def _check_novelty(flight, course, far_plans, novelty):
+    """Plans far from the data, on a way that is long or not as promised."""
+    is_on_its_way = course.distance > 0.5 * flight.travel
+    is_doubtful = course.promise_ratio > 0.5 * _BROKEN
+    if far_plans >= _FEW and course.matters and (is_on_its_way or is_doubtful):
+        return Alarm(NOVELTY, 0, novelty)
+    return _WELL
+
+
+@njit_noalloc
+def _check_violation(flight, violation):
+    """Plans that have missed a constraint for long, the last no less than the first."""
+    if not violation > _VIOLATED:
+        flight.violated = 0
+        return _WELL
+    if flight.violated == 0:
+        flight.first_violation = violation
+    flight.violated += 1
+    is_long = flight.violated > 2 * WINDOW
+    if is_long and violation >= 0.9 * flight.first_violation:
+        return Alarm(VIOLATION, 0, violation)
+    return _WELL
+
+
+@njit_noalloc
+def _check_standing(flight, distance, horizon):
+    """No way made for long, while half of it is still ahead."""
+    if distance.now < 0.9 * flight.nearest or flight.since_news == 0:
+        flight.nearest = distance.now
+        flight.since_nearer = 0
+        return _WELL
+    flight.since_nearer += 1
+    is_far = distance.now > max(distance.least, 0.5 * flight.travel)
+    if is_far and flight.since_nearer > 3 * max(_LONG, horizon):
+        return Alarm(STANDING, 0, float(flight.since_nearer))
+    return _WELL
+
+
+@njit_noalloc
+def _check_bounds(settings, memory, input, distance, horizon):
+    """An input that has stayed at a bound for long while the distance did not fall."""
+    flight = memory.flight[0]
+    alarm = _WELL
+    for j in range(len(settings.lower)):
+        size = _ROUNDING * max(1.0, abs(input[j]))
+        is_low = input[j] <= settings.lower[j] + size
+        if is_low or input[j] >= settings.upper[j] - size:
+            if memory.at_bound[j] == 0:
+                flight.distance_at_bound = distance.now
+            memory.at_bound[j] += 1
+        else:
+            memory.at_bound[j] = 0
+        is_long = memory.at_bound[j] > 2 * max(_LONG, horizon)
+        falls = distance.now < max(distance.least, 0.95 * flight.distance_at_bound)
+        if is_long and distance.now >= distance.least and not falls:
+            alarm = Alarm(SATURATED, j, float(memory.at_bound[j]))
+    return alarm
+
+
+@njit_noalloc
+def _total(values):
+    total = 0.0
+    for value in values:
+        total += value
+    return total
+
+
+@njit_noalloc
+def _wrapped(value, is_angle):
+    """A difference, of angles within half a turn."""
+    if is_angle == 0.0:
+        return value
+    return value - 2.0 * math.pi * np.round(value / (2.0 * math.pi))
