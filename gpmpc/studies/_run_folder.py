@@ -1,15 +1,16 @@
-"""Keeps a run in a folder that says whether the run is finished, what its results are and what made it.
+"""Keeps a run in a folder: is it finished, what are its results, what made it.
 
     config.yaml    the resolved settings
     run.mcap       every step
-    metrics.json   the results; written last and in one piece: where it is, the run is finished
+    metrics.json   the results; written last and in one piece: where it is, the run is
+                   finished
     error.json     why it failed, where it did
 
-Any number of processes can work on one tree of such folders: who works on a folder holds a lock on it, which the system
-takes back from a process that dies.
+Any number of processes can work on one tree of such folders: who works on a folder holds
+a lock on it, which the system takes back from a process that dies.
 
-A finished run is one of the code that flew it. It is not thrown away where the code has changed since, but whoever
-shows its numbers says so: ``of_other_code`` tells.
+A finished run is one of the code that flew it. It is not thrown away where the code has
+changed since, but whoever shows its numbers says so: ``of_other_code`` tells.
 """
 
 import hashlib
@@ -33,7 +34,7 @@ METRICS = "metrics.json"
 ERROR = "error.json"
 CONFIG = "config.yaml"
 RECORDING = "run.mcap"
-PLAN = "sweep-"  # begins the names of the files that say which runs a sweep asked for
+PLAN = "sweep-"  # beginning of the names of the files that list a sweep's runs
 _LOCK = ".lock"  # locked by who works on the folder; stays, empty
 LONGEST_NAME = 150  # characters of a folder's name; file systems take 255 bytes
 
@@ -46,7 +47,7 @@ class Busy(GpmpcError):
 class RunFolder:
     """One run's folder."""
 
-    path: Path  # where it is
+    path: Path  #: where it is
 
     @property
     def finished(self) -> bool:
@@ -63,7 +64,11 @@ class RunFolder:
 
     @contextmanager
     def locked(self, wait: bool = True) -> Iterator[None]:
-        """Makes the folder, clears it of half-written files and keeps other processes from working on it meanwhile."""
+        """Makes the folder, clears it of half-written files and holds its lock.
+
+        Raises:
+            Busy: Another process holds the lock, and ``wait`` is false.
+        """
         self.path.mkdir(parents=True, exist_ok=True)
         file = os.open(self.path / _LOCK, os.O_RDWR | os.O_CREAT, 0o666)
         try:
@@ -86,28 +91,37 @@ class RunFolder:
     def fail(self, error: BaseException, about: Mapping[str, Any]) -> None:
         """Keeps why the run failed, with the traceback."""
         kind = type(error).__name__
-        what = {"error": " ".join(str(error).split()) or kind, "kind": kind}
-        trace = "".join(traceback.format_exception(error))
-        write_whole(
-            self.path / ERROR,
-            json.dumps({**about, **what, "traceback": trace}, indent=1) + "\n",
-        )
+        content = {
+            **about,
+            "error": " ".join(str(error).split()) or kind,
+            "kind": kind,
+            "traceback": "".join(traceback.format_exception(error)),
+        }
+        write_whole(self.path / ERROR, json.dumps(content, indent=1) + "\n")
 
     def result(self, settings: Mapping[str, Any] | None = None) -> dict[str, Any]:
-        """Reads the result of the finished run."""
+        """Reads the result of the finished run.
+
+        Raises:
+            DataError: The file is none that a run writes.
+            SettingError: The run has other settings than ``settings``.
+        """
         path = self.path / METRICS
         try:
             content = json.loads(path.read_text(encoding="utf-8"))
-            before = content["settings"]
+            settings_of_run = content["settings"]
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise DataError(
                 f"{path}: is not what a run writes: {type(error).__name__}: {error}"
             ) from error
-        if settings is not None and (differs := difference(before, settings)):
-            reason = f"{self.path} holds a finished run of other settings ({differs})"
+        if settings is None:
+            return content
+        differing = difference(settings_of_run, settings)
+        if differing:
             raise SettingError(
                 "folder",
-                f"{reason}; choose another folder, or remove that one to fly it again",
+                f"{self.path} holds a finished run of other settings ({differing}); "
+                "choose another folder, or remove that one to fly it again",
             )
         return content
 
@@ -115,19 +129,28 @@ class RunFolder:
 def record(
     choices: Sequence[str], settings: Mapping[str, Any], command: str
 ) -> dict[str, Any]:
-    """Returns the beginning of metrics.json and error.json: what was asked for and what made it."""
-    about = {
+    """Returns the beginning of metrics.json and error.json: what was asked, what made it.
+
+    Args:
+        choices: What distinguishes the run, ``key=value`` each.
+        settings: All that its numbers depend on.
+        command: That flies it.
+    """
+    return {
         "schema": 1,
         "choices": list(choices),
         "settings": dict(settings),
         "seed": settings.get("seed"),
+        "provenance": {
+            **provenance(),
+            "command": command,
+            "own_code": own_code(settings),
+        },
     }
-    made = provenance() | {"command": command, "own_code": own_code(settings)}
-    return about | {"provenance": made}
 
 
 def of_other_code(result: Mapping[str, Any]) -> str:
-    """Returns what flew a run that this code did not fly; empty where it was this code.
+    """Returns which code flew a run; empty where it was this code.
 
     Args:
         result: Content of ``metrics.json``.
@@ -146,7 +169,9 @@ def describe_code(about: Mapping[str, Any]) -> str:
     """
     version = _mapping(about.get("versions")).get("gpmpc")
     git = _mapping(about.get("git"))
-    words = [f"gpmpc {version}" if version else "a gpmpc that did not say which"]
+    words = ["a gpmpc that did not say which"]
+    if version:
+        words = [f"gpmpc {version}"]
     if git.get("commit"):
         words.append(f"commit {str(git['commit'])[:10]}")
     if git.get("dirty"):
@@ -155,31 +180,40 @@ def describe_code(about: Mapping[str, Any]) -> str:
 
 
 def _mapping(value: Any) -> Mapping[str, Any]:
-    """Returns a part of a file that is to be by name; nothing where it is not."""
+    """Returns a part of a file as a mapping, empty where it is none."""
     return value if isinstance(value, Mapping) else {}
 
 
 def folder_name(choices: Sequence[str]) -> str:
-    """Returns a name for a run of these choices, ``key=value`` each; runs of other choices have other names."""
+    """Returns a name for a run of these choices, ``key=value`` each.
+
+    Runs of other choices have other names.
+    """
     text = ",".join(sorted(choices)) or "default"
     name = re.sub(r"[^\w=.,+\-\[\]@]", "_", text, flags=re.ASCII)[:LONGEST_NAME]
-    # Equal up to upper and lower case is equal on some file systems; a comma in a choice could be one between two.
-    if name == text == text.lower() and not any("," in choice for choice in choices):
+    # A comma in a choice could be one between two, and names that are equal up to upper
+    # and lower case are equal on some file systems.
+    has_comma = any("," in choice for choice in choices)
+    if name == text == text.lower() and not has_comma:
         return name
-    text = json.dumps(sorted(choices))
-    return f"{name}-{hashlib.sha256(text.encode()).hexdigest()[:10]}"
+    digest = hashlib.sha256(json.dumps(sorted(choices)).encode()).hexdigest()
+    return f"{name}-{digest[:10]}"
 
 
 def difference(then: Mapping[str, Any], now: Mapping[str, Any]) -> str:
-    """Returns in words where two settings differ, the first three of their leaves; empty where they are equal."""
-    a = flattened(then)
-    b = flattened(now)
-    differing = [
-        f"{k}: {a.get(k)!r} then, {b.get(k)!r} now"
-        for k in dict.fromkeys([*a, *b])
-        if a.get(k) != b.get(k)
-    ]
-    return ", ".join(
-        differing[:3]
-        + ([f"and {len(differing) - 3} more"] if len(differing) > 3 else [])
-    )
+    """Returns the first three leaves in which two settings differ, in words.
+
+    Empty where they are equal.
+    """
+    leaves_then = flattened(then)
+    leaves_now = flattened(now)
+    differing = []
+    for key in dict.fromkeys([*leaves_then, *leaves_now]):
+        value_then = leaves_then.get(key)
+        value_now = leaves_now.get(key)
+        if value_then != value_now:
+            differing.append(f"{key}: {value_then!r} then, {value_now!r} now")
+    shown = differing[:3]
+    if len(differing) > 3:
+        shown.append(f"and {len(differing) - 3} more")
+    return ", ".join(shown)

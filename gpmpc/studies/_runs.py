@@ -1,19 +1,20 @@
-"""Puts a tree of runs together: what was varied, the results, what failed and what is missing.
+"""Puts a tree of runs together: what was varied, the results, what failed or is missing.
 
-A *cell* is one combination of the varied settings; its runs differ in their seed. Missing is only what a sweep asked
-for, in the plans that it leaves in the tree. Runs are read from their ``metrics.json`` and ``error.json`` alone. Those
-may be damaged, or of any other origin: numbers are finite and texts are one printable line from here on, and a run that
-cannot give them is skipped, with the reason.
+A *cell* is one combination of the varied settings; its runs differ in their seed.
+Missing is only what a sweep asked for, in the plans that it leaves in the tree. Runs are
+read from their ``metrics.json`` and ``error.json`` alone. Those may be damaged, or of any
+other origin: numbers are finite and texts are one printable line from here on, and a run
+that cannot give them is skipped, with the reason.
 """
 
 import json
 import math
 import shlex
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import pandas as pd
 
@@ -23,6 +24,8 @@ from gpmpc.studies._document import plain_text
 from gpmpc.studies._run_folder import ERROR, METRICS, PLAN, describe_code, folder_name
 
 SEED = "seed"
+_DEFAULT = "default"  # value of a setting that nobody chose and no run tells
+# Whatever the content of a damaged file may raise.
 _DAMAGE = (
     OSError,
     ValueError,
@@ -31,65 +34,71 @@ _DAMAGE = (
     AttributeError,
     ArithmeticError,
     RecursionError,
-)  # of a file
+)
 
 Choices = dict[str, str]
-Row = dict[str, Any]  # of a cell
+Result = Mapping[str, Any]  # content of metrics.json or error.json
 
 
-# Label with its unit, where {unit} stands for that of the runs' positions or angles, and the number of a run's result.
-MEASURES: dict[str, tuple[str, Callable[[Mapping[str, Any]], float | None]]] = {
-    "rmse": ("RMSE [{unit}]", lambda r: r["rmse"]["total"]),
-    "outside": (
-        "steps outside bounds [%]",
-        lambda r: max(
-            (100 * v["rate"] for v in r["violations"].values()), default=None
-        ),
-    ),
-    "failed": (
+class Measure(NamedTuple):
+    """A number that runs are tabulated by."""
+
+    #: with its unit; {unit} stands for that of the runs' positions or angles
+    label: str
+    #: takes it from the result of a run; None where the run has none
+    of: Callable[[Result], float | None]
+
+
+def _outside(result: Result) -> float | None:
+    """Returns the steps outside the constraint that was broken most often [%]."""
+    rates = [100 * violation["rate"] for violation in result["violations"].values()]
+    return max(rates, default=None)
+
+
+MEASURES: dict[str, Measure] = {
+    "rmse": Measure("RMSE [{unit}]", lambda result: result["rmse"]["total"]),
+    "outside": Measure("steps outside bounds [%]", _outside),
+    "failed": Measure(
         "failed solves [%]",
-        lambda r: 100 * sum(r["failures"].values()) / r["steps"],
+        lambda result: 100 * sum(result["failures"].values()) / result["steps"],
     ),
-    "decision": (
+    "decision": Measure(
         "decision, median [ms]",
-        lambda r: 1e3 * r["times"]["total"]["median"],
+        lambda result: 1e3 * result["times"]["total"]["median"],
     ),
-    "training": ("training [s]", lambda r: r["times"]["training"]),
+    "training": Measure("training [s]", lambda result: result["times"]["training"]),
 }
-
-
-_ABSENT = {
-    "folder": None,
-    "unit": "",
-    "settings": {},
-    "origin": {},
-    "code": "",
-    "lost": "",
-    "suspicious": "",
-    "error": "",
-} | dict.fromkeys(MEASURES)
 
 
 @dataclass(frozen=True)
 class Report:
     """A tree of runs.
 
-    ``runs`` has a row for every run that is there or was asked for, cell by cell and seed by seed. Its columns are
-    ``cell``, the position in ``cells``; ``seed``, a text; ``state``: "finished", "failed", "missing" (there is nothing
-    of it) or "skipped" (it cannot be read); the measures, NaN where the run has none;
-    ``lost``, ``suspicious`` (at its end) and ``error``, since when and why; ``folder``; ``unit`` of the errors;
-    ``settings`` by dotted key; ``origin``: date, commit and machine; ``code``: names the code that made
-    it, "" where there is none or it does not tell.
+    ``runs`` has a row for every run that is there or was asked for, cell by cell and seed
+    by seed. Its columns are
+
+    - ``cell``, the position in ``cells``, and ``seed``, a text;
+    - ``state``: "finished", "failed", "missing" (there is nothing of it) or "skipped" (it
+      cannot be read);
+    - the measures, NaN where the run has none;
+    - ``lost``, ``suspicious`` (at its end) and ``error``: since when and why;
+    - ``folder``; ``unit`` of the errors; ``settings`` by dotted key;
+    - ``origin``: date, commit and machine; ``code``: names the code that made it, "" where
+      there is none or it does not tell.
     """
 
-    tree: Path  #: where it is
-    variables: tuple[str, ...]  #: settings that were varied, without the seed
-    constants: Choices  #: what was asked for of all runs alike
-    cells: tuple[tuple[str, ...], ...]  #: values of the variables, in order
-    runs: pd.DataFrame  #: see above
-    skipped: tuple[
-        str, ...
-    ] = ()  #: what could not be read of it, with the reason, one line each
+    #: where it is
+    tree: Path
+    #: settings that were varied, without the seed
+    variables: tuple[str, ...]
+    #: what was asked for of all runs alike
+    constants: Choices
+    #: values of the variables, in order
+    cells: tuple[tuple[str, ...], ...]
+    #: see above
+    runs: pd.DataFrame
+    #: what could not be read of it, with the reason, one line each
+    skipped: tuple[str, ...] = ()
 
     @cached_property
     def there(self) -> list[Any]:
@@ -98,44 +107,45 @@ class Report:
 
     @cached_property
     def measures(self) -> dict[str, str]:
-        """The measures that any run has, and what each is called, with both units where runs are of both subsystems."""
-        known = self.runs[[*MEASURES]].notna().any()
+        """Labels of the measures that any run has.
+
+        They hold both units where runs are of both subsystems.
+        """
+        has_number = self.runs[[*MEASURES]].notna().any()
         unit = " or ".join(sorted({*self.runs.unit} - {""})) or "m"
         return {
-            name: label.format(unit=unit)
-            for name, (label, _) in MEASURES.items()
-            if known[name]
+            name: measure.label.format(unit=unit)
+            for name, measure in MEASURES.items()
+            if has_number[name]
         }
 
     def base_settings(self) -> list[str]:
         """Returns the settings that all runs share, one ``key: value`` each."""
         first, *others = self.there
-        shared = (
-            item
-            for item in first.settings.items()
-            if all(item in run.settings.items() for run in others)
-        )
+        shared = [
+            (key, value)
+            for key, value in first.settings.items()
+            if all((key, value) in run.settings.items() for run in others)
+        ]
         return [plain_text(f"{key}: {json.dumps(value)}") for key, value in shared]
 
     def commands(self) -> list[str]:
-        """Returns the commands that fill the cells in which runs are missing or failed, one a cell.
+        """Returns the commands that fly what is missing or failed, one a cell.
 
         Skipped runs are not among them: a run is not flown over what lies in its folder.
         """
+        to_fly = self.runs[self.runs.state.isin(("missing", "failed"))]
         commands = []
-        for cell, runs in self.runs[
-            self.runs.state.isin(("missing", "failed"))
-        ].groupby("cell"):
-            chosen = self.constants | dict(
-                zip(self.variables, self.cells[cell], strict=True)
-            )
-            settings = _spelled(
-                {key: value for key, value in chosen.items() if value != "default"}
-            )
-            sweep = [f"{SEED}={','.join(runs.seed)}", f"folder={self.tree}"]
-            commands.append(
-                plain_text(shlex.join(["gpmpc", "run", "-m", *settings, *sweep]))
-            )
+        for cell, runs in to_fly.groupby("cell"):
+            varied = dict(zip(self.variables, self.cells[cell], strict=True))
+            choices = {
+                key: value
+                for key, value in (self.constants | varied).items()
+                if value != _DEFAULT
+            }
+            words = ["gpmpc", "run", "-m", *_overrides(choices)]
+            words += [f"{SEED}={','.join(runs.seed)}", f"folder={self.tree}"]
+            commands.append(plain_text(shlex.join(words)))
         return commands
 
 
@@ -148,98 +158,169 @@ def read_report(tree: str | Path) -> Report:
     tree = Path(tree)
     if not tree.is_dir():
         raise DataError(f"{tree}: no such folder")
-    runs = []
-    plans = []
-    unread = set()
-    skipped = []
-    results = {
-        path.parent: path
-        for name in (ERROR, METRICS)
-        for path in sorted(tree.rglob(name))
-    }
-    for path in [*results.values(), *sorted(tree.rglob(f"{PLAN}*.json"))]:
-        planned = path.name.startswith(PLAN)
+    files = _read_files(tree)
+    if not files.runs:
+        if files.skipped:
+            raise DataError(files.skipped[0])
+        raise DataError(f"{tree}: holds no run, finished or failed")
+    return _put_together(tree, [*files.runs, *_not_there(files)], files.skipped)
+
+
+@dataclass(frozen=True)
+class _Run:
+    """One run, there or not; see ``Report``."""
+
+    choices: Choices
+    state: str
+    folder: Path | None = None
+    unit: str = ""
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    origin: Mapping[str, str] = field(default_factory=dict)
+    code: str = ""
+    lost: str = ""
+    suspicious: str = ""
+    error: str = ""
+    measures: Mapping[str, float | None] = field(default_factory=dict)
+
+    def setting(self, key: str) -> str:
+        """Returns the value of a setting that was not chosen; empty if it is not told."""
+        value = self.settings.get(f"options.{key}")
+        if value is None:
+            value = self.settings.get(key, "")
+        if isinstance(value, bool) or value is None:
+            return json.dumps(value)
+        if isinstance(value, int | float | str):
+            return plain_text(str(value))
+        return ""
+
+    def row(self) -> dict[str, Any]:
+        """Returns its columns in ``Report.runs`` but for cell and seed."""
+        columns = dict(vars(self))
+        del columns["choices"], columns["measures"]
+        return columns | {name: self.measures.get(name) for name in MEASURES}
+
+
+@dataclass
+class _Files:
+    """The files of a tree: runs, plans, and what cannot be read."""
+
+    runs: list[_Run] = field(default_factory=list)
+    plans: list[Choices] = field(default_factory=list)
+    skipped: list[str] = field(default_factory=list)  # with the reason, a line each
+    unread_folders: set[str] = field(default_factory=set)  # names
+
+
+def _read_files(tree: Path) -> _Files:
+    """Reads the results and the plans below a folder."""
+    files = _Files()
+    result_paths: dict[Path, Path] = {}  # by folder; metrics stand for an older error
+    for name in (ERROR, METRICS):
+        result_paths |= {path.parent: path for path in sorted(tree.rglob(name))}
+    for path in result_paths.values():
         try:
-            content = json.loads(path.read_text(encoding="utf-8"))
-            if planned:
-                plans += [_parsed(choices) for choices in content["runs"]]
-            else:
-                runs.append((_parsed(content["choices"]), _run(path, content)))
+            content = _read_json(path)
+            files.runs.append(_read_run(path, content))
         except _DAMAGE as error:
-            lacking = f"it lacks {error}; of an older version?"
-            reason = (
-                lacking
-                if isinstance(error, KeyError)
-                else f"{type(error).__name__}: {error}"
-            )
-            skipped.append(
-                plain_text(
-                    f"{path}: is not what a {'sweep' if planned else 'run'} writes: {reason}"
-                )
-            )
-            unread.add(path.parent.name)
-    if not runs:
-        raise DataError(
-            skipped[0] if skipped else f"{tree}: holds no run, finished or failed"
-        )
-    there = {frozenset(choices.items()) for choices, _ in runs}
-    for plan in plans:
-        if frozenset(plan.items()) not in there:
-            state = "skipped" if folder_name(_spelled(plan)) in unread else "missing"
-            runs.append((plan, _ABSENT | {"state": state}))
-    return Report(tree, *_cells(runs), tuple(skipped))
+            files.skipped.append(_why_skipped(path, "run", error))
+            files.unread_folders.add(path.parent.name)
+    for path in sorted(tree.rglob(f"{PLAN}*.json")):
+        try:
+            planned_runs = _read_json(path)["runs"]
+            files.plans += [_parsed(choices) for choices in planned_runs]
+        except _DAMAGE as error:
+            files.skipped.append(_why_skipped(path, "sweep", error))
+            files.unread_folders.add(path.parent.name)
+    return files
 
 
-def _cells(
-    runs: list[tuple[Choices, Row]],
-) -> tuple[tuple[str, ...], Choices, tuple[tuple[str, ...], ...], pd.DataFrame]:
-    """Returns what was varied, what was not, the combinations that there are, and the runs by combination and seed."""
-    keys = dict.fromkeys([*(key for choices, _ in runs for key in choices), SEED])
-    # A run that did not choose had a setting; of one that is not there it is that of the others.
-    usual = {
-        key: [
-            _setting(run, key)
-            for choices, run in runs
-            if run["settings"] and key not in choices
-        ]
-        for key in keys
-    }
-    filled = []
-    for choices, run in runs:
-        guesses = {
-            key: _setting(run, key) or next(iter(usual[key]), "") or "default"
-            for key in keys
-        }
-        filled.append(
-            {key: choices.get(key) or guess for key, guess in guesses.items()}
-        )
-    values = {key: {choices[key] for choices in filled} for key in keys if key != SEED}
+def _read_json(path: Path) -> Any:
+    return json.loads(path.read_text(encoding="utf-8"))
+
+
+def _why_skipped(path: Path, writer: str, error: Exception) -> str:
+    reason = f"{type(error).__name__}: {error}"
+    if isinstance(error, KeyError):
+        reason = f"it lacks {error}; of an older version?"
+    return plain_text(f"{path}: is not what a {writer} writes: {reason}")
+
+
+def _not_there(files: _Files) -> list[_Run]:
+    """Returns the runs that were planned and are missing or cannot be read."""
+    there = {frozenset(run.choices.items()) for run in files.runs}
+    absent = []
+    for choices in files.plans:
+        if frozenset(choices.items()) in there:
+            continue
+        name = folder_name(_overrides(choices))
+        state = "skipped" if name in files.unread_folders else "missing"
+        absent.append(_Run(choices, state))
+    return absent
+
+
+def _put_together(tree: Path, runs: Sequence[_Run], skipped: Sequence[str]) -> Report:
+    """Finds what was varied, and sorts the runs by cell and seed."""
+    all_choices = _completed_choices(runs)
+    values: dict[str, set[str]] = {}
+    for choices in all_choices:
+        for key, value in choices.items():
+            values.setdefault(key, set()).add(value)
+    del values[SEED]
     variables = tuple(sorted(key for key in values if len(values[key]) > 1))
-    constants = {
-        key: value
-        for key, (value, *more) in values.items()
-        if not more and value != "default"
-    }
-    found: dict[tuple[tuple[str, ...], str], Row] = {}
-    for choices, (_, run) in zip(filled, runs, strict=True):
-        place = tuple(choices[key] for key in variables), choices[SEED]
-        if (
-            run["state"] == "finished" or place not in found
-        ):  # what is there comes first
-            found[place] = run
-    cells = tuple(
-        sorted(
-            {values for values, _ in found}, key=lambda values: [*map(in_order, values)]
-        )
+    constants: Choices = {}
+    for key in values:
+        if len(values[key]) == 1:
+            (constants[key],) = values[key]
+    constants = {key: value for key, value in constants.items() if value != _DEFAULT}
+
+    by_place: dict[tuple[tuple[str, ...], str], _Run] = {}
+    for choices, run in zip(all_choices, runs, strict=True):
+        cell = tuple(choices[key] for key in variables)
+        place = (cell, choices[SEED])
+        if run.state == "finished" or place not in by_place:
+            by_place[place] = run
+    cells = tuple(sorted({cell for cell, _ in by_place}, key=_values_in_order))
+    position = {cell: i for i, cell in enumerate(cells)}
+    places = sorted(
+        by_place, key=lambda place: (position[place[0]], in_order(place[1]))
     )
-    number = {values: i for i, values in enumerate(cells)}
-    order = sorted(found, key=lambda place: (number[place[0]], in_order(place[1])))
     rows = [
-        found[values, seed] | {"cell": number[values], "seed": seed}
-        for values, seed in order
+        by_place[cell, seed].row() | {"cell": position[cell], "seed": seed}
+        for cell, seed in places
     ]
     types = dict.fromkeys(MEASURES, float) | {"cell": int}
-    return variables, constants, cells, pd.DataFrame(rows, dtype=object).astype(types)
+    return Report(
+        tree=tree,
+        variables=variables,
+        constants=constants,
+        cells=cells,
+        runs=pd.DataFrame(rows, dtype=object).astype(types),
+        skipped=tuple(skipped),
+    )
+
+
+def _completed_choices(runs: Sequence[_Run]) -> list[Choices]:
+    """Returns the choices of every run, with a value for each key that any run chose.
+
+    A run that did not choose has its setting; one that is not there has that of the
+    first other run that did not choose.
+    """
+    keys = dict.fromkeys([*(key for run in runs for key in run.choices), SEED])
+    usual = {key: _usual_setting(runs, key) for key in keys}
+    return [
+        {
+            key: run.choices.get(key) or run.setting(key) or usual[key] or _DEFAULT
+            for key in keys
+        }
+        for run in runs
+    ]
+
+
+def _usual_setting(runs: Iterable[_Run], key: str) -> str:
+    """Returns the setting of the first run that is there and did not choose."""
+    for run in runs:
+        if run.settings and key not in run.choices:
+            return run.setting(key)
+    return ""
 
 
 def in_order(value: str) -> tuple[int, float, str]:
@@ -250,46 +331,61 @@ def in_order(value: str) -> tuple[int, float, str]:
         return 1, 0.0, value
 
 
-def _run(path: Path, content: Mapping[str, Any]) -> Row:
-    """Returns a run that finished or failed, from its result."""
+def _values_in_order(values: Sequence[str]) -> list[tuple[int, float, str]]:
+    return [in_order(value) for value in values]
+
+
+def _read_run(path: Path, content: Result) -> _Run:
+    """Returns a run that finished or failed, from the content of its file."""
+    choices = _parsed(content["choices"])
     settings = content["settings"]
-    if not isinstance(settings, Mapping) or not isinstance(
-        settings.get("options", {}), Mapping
-    ):
+    options = settings.get("options", {}) if isinstance(settings, Mapping) else None
+    if not isinstance(options, Mapping):
         raise TypeError("settings and their options are not by name")
-    run = _ABSENT | {
-        "folder": path.parent,
-        "settings": flattened(settings),
-        "origin": _origin(content),
-        "code": _code(content),
-    }
+    origin = _origin(content)
+    code = _code(content)
     if path.name == ERROR:
-        return run | {"state": "failed", "error": plain_text(content["error"])}
-    numbers = {name: of(content) for name, (_, of) in MEASURES.items()}
-    for name, value in numbers.items():
-        if value is not None and (
-            type(value) not in (int, float) or not math.isfinite(value)
-        ):
+        return _Run(
+            choices=choices,
+            state="failed",
+            folder=path.parent,
+            settings=flattened(settings),
+            origin=origin,
+            code=code,
+            error=plain_text(content["error"]),
+        )
+    measures = {name: measure.of(content) for name, measure in MEASURES.items()}
+    for name, value in measures.items():
+        if value is not None and not _is_finite_number(value):
             raise ValueError(f"{name}: must be a finite number; got {value!r:.80}")
+    lost = _loss(content)
+    return _Run(
+        choices=choices,
+        state="finished",
+        folder=path.parent,
+        unit=plain_text(content["unit"]),
+        settings=flattened(settings),
+        origin=origin,
+        code=code,
+        lost=lost,
+        suspicious="" if lost else _suspicion(content),
+        measures=measures,
+    )
+
+
+def _is_finite_number(value: Any) -> bool:
+    return type(value) in (int, float) and math.isfinite(value)
+
+
+def _loss(content: Result) -> str:
+    """Returns since when and why a run was lost; empty where it was not."""
     lost = content.get("lost") or ""
-    lost = plain_text(
-        ", ".join(f"{k} {v}" for k, v in lost.items())
-        if isinstance(lost, Mapping)
-        else str(lost)
-    )
-    return (
-        run
-        | numbers
-        | {
-            "state": "finished",
-            "lost": lost,
-            "suspicious": "" if lost else _suspicion(content),
-            "unit": plain_text(content["unit"]),
-        }
-    )
+    if isinstance(lost, Mapping):
+        lost = ", ".join(f"{key} {value}" for key, value in lost.items())
+    return plain_text(str(lost))
 
 
-def _suspicion(content: Mapping[str, Any]) -> str:
+def _suspicion(content: Result) -> str:
     """Returns since when and why a run was suspicious at its end, as far as it tells."""
     judgement = content.get("judgement") or {}
     if judgement.get("level") != "suspicious":
@@ -298,55 +394,50 @@ def _suspicion(content: Mapping[str, Any]) -> str:
     return plain_text(text)
 
 
-def _origin(content: Mapping[str, Any]) -> dict[str, str]:
+def _origin(content: Result) -> dict[str, str]:
     """Returns date, commit and machine of a run, as far as it tells them."""
-    about = content.get("provenance") or {}
-    git = about.get("git") or {}
-    machine = about.get("machine") or {}
-    versions = about.get("versions") or {}
-    commit = (
-        f"{git['commit'][:10]}{', changed' if git.get('dirty') else ''}"
-        if git
-        else versions.get("gpmpc")
-    )
-    made = ", ".join(
+    provenance = content.get("provenance") or {}
+    git = provenance.get("git") or {}
+    if git:
+        commit = git["commit"][:10]
+        if git.get("dirty"):
+            commit += ", changed"
+    else:
+        commit = (provenance.get("versions") or {}).get("gpmpc")
+    machine = [
         f"{value} cores" if key == "cores" else str(value)
-        for key, value in machine.items()
-    )
-    named = {"date": about.get("created"), "commit": commit, "machine": made}
-    return {key: plain_text(str(value)) for key, value in named.items() if value}
+        for key, value in (provenance.get("machine") or {}).items()
+    ]
+    origin = {
+        "date": provenance.get("created"),
+        "commit": commit,
+        "machine": ", ".join(machine),
+    }
+    return {key: plain_text(str(value)) for key, value in origin.items() if value}
 
 
-def _code(content: Mapping[str, Any]) -> str:
+def _code(content: Result) -> str:
     """Returns a text that differs where the code of two runs differs, as far as they tell.
 
     Older runs tell their commit or version alone.
     """
-    about = content.get("provenance") or {}
-    own_code = about.get("own_code") or {}
-    named = about.get("code") or describe_code(about)
-    return plain_text(json.dumps([named, own_code], sort_keys=True))
+    provenance = content.get("provenance") or {}
+    of_gpmpc = provenance.get("code") or describe_code(provenance)
+    of_user = provenance.get("own_code") or {}
+    return plain_text(json.dumps([of_gpmpc, of_user], sort_keys=True))
 
 
 def _parsed(choices: Any) -> Choices:
     """Returns choices, ``key=value`` each, by key."""
     if not isinstance(choices, list):
         raise TypeError(f"choices must be a list; got {choices!r:.80}")
-    return {
-        key: value
-        for key, _, value in (plain_text(choice).partition("=") for choice in choices)
-    }
+    parsed = {}
+    for choice in choices:
+        key, _, value = plain_text(choice).partition("=")
+        parsed[key] = value
+    return parsed
 
 
-def _spelled(choices: Choices) -> list[str]:
+def _overrides(choices: Choices) -> list[str]:
+    """Returns choices by key as ``key=value`` each."""
     return [f"{key}={value}" if value else key for key, value in choices.items()]
-
-
-def _setting(run: Row, key: str) -> str:
-    """Returns the value that a run had which did not choose; empty where its settings do not tell."""
-    settings = run["settings"]
-    value = settings.get(f"options.{key}")
-    value = settings.get(key, "") if value is None else value
-    if isinstance(value, bool) or value is None:
-        return json.dumps(value)
-    return plain_text(str(value)) if isinstance(value, int | float | str) else ""

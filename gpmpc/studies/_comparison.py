@@ -1,0 +1,277 @@
+"""Compares two groups of runs of a report, seed by seed.
+
+Runs of one seed share their training rows and their noise. What else was varied is
+averaged within a seed first, so that a seed counts once, and over the same for every
+seed. The signed-rank test (Wilcoxon, 1945) decides, which asks only that the differences
+are spread symmetrically; Student's t-test beside it asks for normal ones. Wall times are
+not compared: one group is flown after the other, and what the machine did meanwhile is no
+property of either.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+from scipy import stats
+
+from gpmpc.exceptions import DataError, SettingError
+from gpmpc.studies._runs import SEED, Report, in_order
+
+_WALL_TIMES = ("decision", "training")
+_LEVEL = 0.05
+# With n pairs the smallest two-sided p-value of the signed-rank test is 2^(1 - n).
+_FEWEST_PAIRS = 6
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Whether group A differs from group B in one measure.
+
+    The p-values are NaN where all differences are equal.
+    """
+
+    measure: str
+    #: of A and of B, over the pairs
+    medians: tuple[float, float]
+    #: of A - B over the pairs
+    quartiles: tuple[float, float, float]
+    #: mean of A - B over the pairs
+    difference: float
+    #: of that mean, 95 %, by Student's t
+    interval: tuple[float, float]
+    #: two-sided p-value of the signed-rank test
+    wilcoxon: float
+    #: two-sided p-value of the paired t-test
+    t_test: float
+    #: share of the signed ranks that are positive minus that of the negative (Kerby, 2014)
+    rank_biserial: float
+    #: mean over standard deviation of the differences (Cohen's d_z)
+    standardised: float
+    pairs: int
+    #: seeds and other settings of which A or B lacks runs
+    left_out: tuple[str, ...] = ()
+
+    @property
+    def verdict(self) -> str:
+        """The verdict in words."""
+        if self.pairs < _FEWEST_PAIRS:
+            return (
+                f"undecided: {self.pairs} pairs cannot show anything at 5 %; "
+                f"fly {_FEWEST_PAIRS} seeds or more"
+            )
+        if self.difference != 0 and self.interval[0] == self.interval[1]:
+            return (
+                "undecided: every seed gave the same, so all are one; "
+                "vary what the seed draws (data.size, noise)"
+            )
+        if self.wilcoxon < _LEVEL:
+            relation = "larger" if self.rank_biserial > 0 else "smaller"
+            return f"A is {relation} than B"
+        return "no difference shown"
+
+
+def compare(report: Report, a: str, b: str) -> list[Comparison]:
+    """Compares two groups of a report's runs, seed by seed, in every measure.
+
+    Args:
+        report: All runs.
+        a: Choices that say what belongs to group A, such as ``controller=lqr`` or
+            ``data.size=50,horizon=1``.
+        b: Those of group B.
+
+    Raises:
+        SettingError: A choice that was not varied, a value that does not occur, or runs
+            of both subsystems.
+        DataError: The groups have no two seeds in common.
+    """
+    runs_of_a = _runs_of_group(report, "A", a)
+    runs_of_b = _runs_of_group(report, "B", b)
+    units = {*runs_of_a.unit, *runs_of_b.unit}
+    if len(units) > 1:
+        raise SettingError(
+            "compare",
+            "errors in m and in rad have no common mean; "
+            "add subsystem=... to both groups",
+        )
+    comparisons = []
+    for measure in report.measures:
+        if measure in _WALL_TIMES:
+            continue
+        # A row a combination of the other settings, a column a seed.
+        values_of_a = runs_of_a.pivot(index="others", columns="seed", values=measure)
+        values_of_b = runs_of_b.pivot(index="others", columns="seed", values=measure)
+        values_of_a, values_of_b = values_of_a.align(values_of_b)
+        in_both = values_of_a.notna() & values_of_b.notna()
+        complete, left_out = _drop_gaps(in_both)
+        mean_of_a = _mean_by_seed(values_of_a, complete)
+        mean_of_b = _mean_by_seed(values_of_b, complete)
+        if len(mean_of_a) >= 2:
+            comparisons.append(_test(measure, mean_of_a, mean_of_b, left_out))
+    if not comparisons:
+        raise DataError(
+            f"{report.tree}: runs of {a} and {b} have fewer than two seeds in common"
+        )
+    return comparisons
+
+
+def _runs_of_group(report: Report, group: str, text: str) -> pd.DataFrame:
+    """Returns the finished runs of a group.
+
+    The column ``others`` says what else was varied, and ``seed`` is as it is chosen.
+    """
+    choices = {}
+    for choice in text.split(","):
+        key, value = _parse_choice(report, group, choice)
+        choices[key] = value
+    others = {}
+    for cell, values in enumerate(report.cells):
+        varied = dict(zip(report.variables, values, strict=True))
+        if choices.items() <= varied.items():
+            others[cell] = ", ".join(
+                f"{key}={value}" for key, value in varied.items() if key not in choices
+            )
+    is_finished = report.runs.state == "finished"
+    runs = report.runs[is_finished & report.runs.cell.isin(others)]
+    return runs.assign(others=runs.cell.map(others), seed=f"{SEED}=" + runs.seed)
+
+
+def _parse_choice(report: Report, group: str, choice: str) -> tuple[str, str]:
+    """Returns key and value of one choice, both of which must occur in the report."""
+    key, _, value = choice.partition("=")
+    if key not in report.variables:
+        varied = ", ".join(report.variables) or "nothing"
+        raise SettingError(
+            f"compare {group}",
+            f"must choose among what was varied, {varied}; got {choice!r}",
+        )
+    index = report.variables.index(key)
+    values = dict.fromkeys(cell[index] for cell in report.cells)
+    if value not in values:
+        raise SettingError(
+            f"compare {group}",
+            f"{key} was varied over {', '.join(values)}; got {value!r}",
+        )
+    return key, value
+
+
+def _drop_gaps(in_both: pd.DataFrame) -> tuple[pd.DataFrame, tuple[str, ...]]:
+    """Drops rows and columns until every run that is left is in both groups.
+
+    What lacks the largest share of its runs goes first.
+
+    Returns:
+        The table that is left, and the names of what was dropped.
+    """
+    left_out: list[str] = []
+    while in_both.size and not in_both.to_numpy().all():
+        gaps_by_row = (~in_both).mean(axis=1)
+        gaps_by_seed = (~in_both).mean(axis=0)
+        if gaps_by_seed.max() >= gaps_by_row.max():
+            worst = gaps_by_seed.idxmax()
+            in_both = in_both.drop(columns=worst)
+        else:
+            worst = gaps_by_row.idxmax()
+            in_both = in_both.drop(index=worst)
+        left_out.append(str(worst))
+    left_out.sort(key=_settings_before_seeds)
+    return in_both, tuple(left_out)
+
+
+def _settings_before_seeds(name: str) -> tuple[bool, tuple[int, float, str]]:
+    is_seed = name.startswith(f"{SEED}=")
+    return is_seed, in_order(name.removeprefix(f"{SEED}="))
+
+
+def _mean_by_seed(values: pd.DataFrame, complete: pd.DataFrame) -> np.ndarray:
+    """Returns the mean over the other settings, of every seed that is complete."""
+    return values.loc[complete.index, complete.columns].mean(axis=0).to_numpy()
+
+
+def _test(
+    measure: str, a: np.ndarray, b: np.ndarray, left_out: tuple[str, ...]
+) -> Comparison:
+    """Compares paired values (n,)."""
+    differences = a - b
+    signed_ranks = _signed_ranks(differences)
+    rank_biserial = 0.0
+    if len(signed_ranks):
+        rank_biserial = signed_ranks.sum() / np.abs(signed_ranks).sum()
+    if np.ptp(differences) != 0:
+        t = stats.ttest_rel(a, b)
+        mean = differences.mean()
+        interval = tuple(t.confidence_interval())
+        wilcoxon = stats.wilcoxon(differences).pvalue
+        t_test = t.pvalue
+        standardised = t.statistic / np.sqrt(len(differences))
+    else:  # all are equal, and so is their mean without rounding
+        mean = differences[0]
+        interval = (mean, mean)
+        wilcoxon = np.nan
+        t_test = np.nan
+        standardised = np.copysign(np.inf, mean) if mean else 0.0
+    return Comparison(
+        measure=measure,
+        medians=(float(np.median(a)), float(np.median(b))),
+        quartiles=tuple(np.quantile(differences, [0.25, 0.5, 0.75])),
+        difference=mean,
+        interval=interval,
+        wilcoxon=wilcoxon,
+        t_test=t_test,
+        rank_biserial=rank_biserial,
+        standardised=standardised,
+        pairs=len(differences),
+        left_out=left_out,
+    )
+
+
+def _signed_ranks(differences: np.ndarray) -> np.ndarray:
+    """Returns the ranks of the sizes of all differences but zeros, with their signs."""
+    nonzero = differences[differences != 0]
+    return stats.rankdata(np.abs(nonzero)) * np.sign(nonzero)
+
+
+def sentences(
+    report: Report, comparisons: Sequence[Comparison], a: str, b: str
+) -> list[str]:
+    """Returns a line a measure, with everything that a reader needs to doubt it."""
+    head = (
+        f"A: {a}; B: {b}; pairs are seeds, what else was varied is averaged within a "
+        "seed. Times are not compared."
+    )
+    left_out_of_all = [
+        name
+        for name in comparisons[0].left_out
+        if all(name in comparison.left_out for comparison in comparisons)
+    ]
+    if left_out_of_all:
+        names = "; ".join(left_out_of_all)
+        head += f" Left out, since A or B lacks runs of it: {names}."
+    lines = [head]
+    for comparison in comparisons:
+        line = _sentence(report.measures[comparison.measure], comparison)
+        others = [name for name in comparison.left_out if name not in left_out_of_all]
+        if others:
+            line += f"; left out as well: {'; '.join(others)}"
+        lines.append(line)
+    return lines
+
+
+def _sentence(label: str, comparison: Comparison) -> str:
+    """Returns verdict, medians, differences and tests of one measure."""
+    c = comparison
+    low, median, high = c.quartiles
+    parts = [
+        f"{label}: {c.verdict}. Medians {c.medians[0]:.4g} and {c.medians[1]:.4g}",
+        f"differences {median:.3g} [{low:.3g}, {high:.3g}]",
+    ]
+    if c.interval[0] != c.interval[1]:
+        parts += [
+            f"Wilcoxon signed-rank p = {c.wilcoxon:.3g}, "
+            f"rank-biserial {c.rank_biserial:.2f}",
+            f"mean difference {c.difference:.3g} "
+            f"(95 %: {c.interval[0]:.3g} to {c.interval[1]:.3g}), "
+            f"paired t-test p = {c.t_test:.3g}, d_z {c.standardised:.2f}",
+        ]
+    parts.append(f"n = {c.pairs}")
+    return "; ".join(parts)
