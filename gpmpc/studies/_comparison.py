@@ -2,10 +2,10 @@
 
 Runs of one seed share their training rows and their noise. What else was varied is
 averaged within a seed first, so that a seed counts once, and over the same for every
-seed. The signed-rank test (Wilcoxon, 1945) decides, which asks only that the differences
-are spread symmetrically; Student's t-test beside it asks for normal ones. Wall times are
-not compared: one group is flown after the other, and what the machine did meanwhile is no
-property of either.
+seed. The signed-rank test (Wilcoxon, 1945) decides, which asks only that the
+differences are spread symmetrically; Student's t-test beside it asks for normal ones.
+Wall times are not compared: one group is flown after the other, and what the machine
+did meanwhile is no property of either.
 """
 
 from collections.abc import Sequence
@@ -44,7 +44,8 @@ class Comparison:
     wilcoxon: float
     #: two-sided p-value of the paired t-test
     t_test: float
-    #: share of the signed ranks that are positive minus that of the negative (Kerby, 2014)
+    #: share of the signed ranks that are positive minus that of the negative (Kerby,
+    #: 2014)
     rank_biserial: float
     #: mean over standard deviation of the differences (Cohen's d_z)
     standardised: float

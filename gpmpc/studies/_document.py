@@ -175,7 +175,7 @@ def number(value: float) -> str:
 
 
 def with_range(low: float, middle: float, high: float) -> str:
-    """Returns a number and, on a second line, the range around it unless it is empty."""
+    """Returns a number and, on a second line, the range around it if there is one."""
     if low == high:
         return number(middle)
     return f"{number(middle)}\n[{number(low)}, {number(high)}]"
@@ -207,7 +207,7 @@ def _not_empty(
 
 
 def _terminal_table(table: Table) -> TerminalTable:
-    """Returns a table whose columns are flush right where all their cells are numbers."""
+    """Returns a table whose columns of numbers are flush right."""
     shown = TerminalTable(
         title=Text(f"\n{table.title}") if table.title else None,
         title_justify="left",

@@ -46,9 +46,9 @@ class Experiment:
     trajectory: Trajectory | None
     #: whose transitions are learned; names, units and references are its own
     system: System
-    #: from transitions and a ``seed`` to a ``Training``, such as a ``Trainer``; one that
-    #: learns differences sees the system's angles as sine and cosine, and learns what
-    #: the system's nominal model misses
+    #: from transitions and a ``seed`` to a ``Training``, such as a ``Trainer``; one
+    #: that learns differences sees the system's angles as sine and cosine, and learns
+    #: what the system's nominal model misses
     train: Callable[..., Training]
     #: from a model, or from a ``plant`` where its first argument is called so, to a
     #: ``Controller``
@@ -66,8 +66,8 @@ class Experiment:
     seed: int = 0
     #: what stands at the other end: the plant, or the learned model rolled on itself
     loop: Literal["plant", "model"] = "plant"
-    #: the controller's own, if it has one. A model loop carries its belief on with it, or
-    #: as ``best_propagator`` does
+    #: the controller's own, if it has one. A model loop carries its belief on with it,
+    #: or as ``best_propagator`` does
     propagator: Propagator | None = None
     #: on the plant
     noise: Noise | None = None
@@ -210,7 +210,7 @@ class Experiment:
             )
 
     def _check_plant(self) -> None:
-        """Raises where noise or disturbances do not fit the plant, before a training."""
+        """Raises, before a training, where noise or disturbances do not fit."""
         for disturbance in self.disturbances:
             if not hasattr(disturbance, "disturb_plant"):
                 raise SettingError(
@@ -248,8 +248,8 @@ class Experiment:
 def _prior_lengthscales(system: System, sine_and_cosine: bool) -> list[float]:
     """Returns the lengthscales that a GP supposes of columns that never move.
 
-    One unit, or a tenth of the range of the limits, whichever is less: from one limit to
-    the other predictions forget what they know. More would do harm where limits are
+    One unit, or a tenth of the range of the limits, whichever is less: from one limit
+    to the other predictions forget what they know. More would do harm where limits are
     wide: on its way back to the prior a mean has a slope that nobody has seen, and a
     controller follows it.
 

@@ -35,8 +35,8 @@ class Flown:
     controller: Any
     #: what was learned; None where the controller knows the plant
     training: Training | None
-    #: where and why the system left the finite numbers, and the rollout ends; None where
-    #: it did not
+    #: where and why the system left the finite numbers, and the rollout ends; None
+    #: where it did not
     diverged: Diverged | None = None
     #: the episodes
     before: tuple["Flown", ...] = ()
@@ -59,12 +59,12 @@ def run_trial(
             flight.
 
     Raises:
-        SettingError: More rows are asked for than there are, or settings that do not fit
-            each other.
+        SettingError: More rows are asked for than there are, or settings that do not
+            fit each other.
         DataError: The data cannot be read.
         TrainingError: An output could not be trained.
-        SolverFailure: A solve failed, and the policy is ``"raise"`` or there was nothing
-            to fall back on.
+        SolverFailure: A solve failed, and the policy is ``"raise"`` or there was
+            nothing to fall back on.
         Diverged: The system left the finite numbers in its first step.
     """
     training = None
@@ -170,8 +170,8 @@ def _steered_system(
 def _reference(experiment: Experiment, controller: Any) -> Reference:
     """Returns what is followed, up to the end of the last step's plan.
 
-    Its inputs are those at rest, which the controller falls back on where the very first
-    solve fails.
+    Its inputs are those at rest, which the controller falls back on where the very
+    first solve fails.
     """
     states = experiment.references(experiment.steps + controller.horizon + 1)
     resting_input = np.asarray(controller.initial_input)
@@ -194,7 +194,7 @@ def rmse(experiment: Experiment, flown: Flown, states: slice = slice(None)) -> f
 
 
 def errors_of(experiment: Experiment, flown: Flown, states: slice = slice(None)) -> Any:
-    """Returns the tracking error of the states of a flight, the first of them left out."""
+    """Returns the tracking error of the states of a flight but the first of them."""
     system = experiment.system
     rollout = flown.rollout
     return tracking_error(

@@ -1,4 +1,4 @@
-"""Measures a flight: errors, broken bounds, failures, losses and times, as plain data."""
+"""Measures a flight: errors, broken bounds, failures, loss and times, as plain data."""
 
 from collections import Counter
 from contextlib import suppress
@@ -23,9 +23,9 @@ def metrics(experiment: Experiment, flown: Flown) -> dict[str, Any]:
     """Returns the results of a flight as plain data.
 
     Everything that differs between equal runs is under ``times``. ``judgement`` is what
-    the steps said while it flew (``gpmpc.mpc.FlightJudge``). ``lost`` says since when and
-    why a flight does not follow its reference: by ``find_loss``, by its judgement, or
-    since it diverged. One that diverged has no RMSE: None.
+    the steps said while it flew (``gpmpc.mpc.FlightJudge``). ``lost`` says since when
+    and why a flight does not follow its reference: by ``find_loss``, by its judgement,
+    or since it diverged. One that diverged has no RMSE: None.
     """
     rollout = flown.rollout
     return {
@@ -60,7 +60,7 @@ def _rmse_by_axis(experiment: Experiment, flown: Flown) -> dict[str, float | Non
 
 
 def _error_at_end(experiment: Experiment, flown: Flown) -> float | None:
-    """Returns the distance of the last state from its reference; None if it diverged."""
+    """Returns how far the last state is from its reference; None if it diverged."""
     if not np.isfinite(rmse(experiment, flown)):
         return None
     return rmse(experiment, flown, states=slice(-2, None))
@@ -109,7 +109,7 @@ def _finite_or_none(number: float) -> float | None:
 
 
 def _judgement(flown: Flown) -> dict[str, Any]:
-    """Returns level, reason, first step and counts of what the steps said of a flight."""
+    """Returns level, reason, first step and counts of the judgements of the steps."""
     judgement = flown.rollout.judgement
     diverged = flown.diverged
     if diverged is not None and judgement.level != "lost":
@@ -120,7 +120,7 @@ def _judgement(flown: Flown) -> dict[str, Any]:
 
 
 def _loss(experiment: Experiment, flown: Flown) -> dict[str, Any] | None:
-    """Returns step, time [s] and reason of a flight's loss; None where it was not lost."""
+    """Returns step, time [s] and reason of a loss; None where it was not lost."""
     system = experiment.system
     rollout = flown.rollout
     losses: list[tuple[int, str]] = []  # step and reason
@@ -168,10 +168,11 @@ def _violations(flown: Flown) -> dict[str, dict[str, Any]]:
 def _violation_rates(
     problem: Problem, horizon: int, rollout: Rollout
 ) -> dict[str, Any]:
-    """Returns how often bounds of inputs and constraints of states were broken, by name.
+    """Returns how often bounds of inputs and constraints of states were broken.
 
     Of states the flown ones count, with the sides that a first predicted state has: a
-    constraint of later stages alone asks nothing of them. All boxes are one, "states";
+    constraint of later stages alone asks nothing of them. By name: all boxes are one,
+    "states";
     of another kind each constraint is counted for itself.
     """
     lower, upper = problem.inputs.by_stage(horizon)

@@ -1,4 +1,4 @@
-"""Judges a flight before it begins: does its loop settle, do its data reach far enough."""
+"""Judges a flight before it begins: its stability, and how far its data reach."""
 
 import math
 from contextlib import suppress

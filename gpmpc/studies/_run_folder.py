@@ -6,8 +6,8 @@
                    finished
     error.json     why it failed, where it did
 
-Any number of processes can work on one tree of such folders: who works on a folder holds
-a lock on it, which the system takes back from a process that dies.
+Any number of processes can work on one tree of such folders: who works on a folder
+holds a lock on it, which the system takes back from a process that dies.
 
 A finished run is one of the code that flew it. It is not thrown away where the code has
 changed since, but whoever shows its numbers says so: ``of_other_code`` tells.
@@ -129,7 +129,7 @@ class RunFolder:
 def record(
     choices: Sequence[str], settings: Mapping[str, Any], command: str
 ) -> dict[str, Any]:
-    """Returns the beginning of metrics.json and error.json: what was asked, what made it.
+    """Returns the beginning of metrics.json and error.json: settings and provenance.
 
     Args:
         choices: What distinguishes the run, ``key=value`` each.

@@ -1,10 +1,10 @@
-"""Puts a tree of runs together: what was varied, the results, what failed or is missing.
+"""Reads a tree of runs: what was varied, the results, what failed or is missing.
 
 A *cell* is one combination of the varied settings; its runs differ in their seed.
-Missing is only what a sweep asked for, in the plans that it leaves in the tree. Runs are
-read from their ``metrics.json`` and ``error.json`` alone. Those may be damaged, or of any
-other origin: numbers are finite and texts are one printable line from here on, and a run
-that cannot give them is skipped, with the reason.
+Missing is only what a sweep asked for, in the plans that it leaves in the tree. Runs
+are read from their ``metrics.json`` and ``error.json`` alone. Those may be damaged, or
+of any other origin: numbers are finite and texts are one printable line from here on,
+and a run that cannot give them is skipped, with the reason.
 """
 
 import json
@@ -74,17 +74,17 @@ MEASURES: dict[str, Measure] = {
 class Report:
     """A tree of runs.
 
-    ``runs`` has a row for every run that is there or was asked for, cell by cell and seed
-    by seed. Its columns are
+    ``runs`` has a row for every run that is there or was asked for, cell by cell and
+    seed by seed. Its columns are
 
     - ``cell``, the position in ``cells``, and ``seed``, a text;
-    - ``state``: "finished", "failed", "missing" (there is nothing of it) or "skipped" (it
-      cannot be read);
+    - ``state``: "finished", "failed", "missing" (there is nothing of it) or "skipped"
+      (it cannot be read);
     - the measures, NaN where the run has none;
     - ``lost``, ``suspicious`` (at its end) and ``error``: since when and why;
     - ``folder``; ``unit`` of the errors; ``settings`` by dotted key;
-    - ``origin``: date, commit and machine; ``code``: names the code that made it, "" where
-      there is none or it does not tell.
+    - ``origin``: date, commit and machine; ``code``: names the code that made it, ""
+      where there is none or it does not tell.
     """
 
     #: where it is
@@ -132,7 +132,8 @@ class Report:
     def commands(self) -> list[str]:
         """Returns the commands that fly what is missing or failed, one a cell.
 
-        Skipped runs are not among them: a run is not flown over what lies in its folder.
+        Skipped runs are not among them: a run is not flown over what lies in its
+        folder.
         """
         to_fly = self.runs[self.runs.state.isin(("missing", "failed"))]
         commands = []
@@ -183,7 +184,7 @@ class _Run:
     measures: Mapping[str, float | None] = field(default_factory=dict)
 
     def setting(self, key: str) -> str:
-        """Returns the value of a setting that was not chosen; empty if it is not told."""
+        """Returns the value of a setting that was not chosen; empty if unknown."""
         value = self.settings.get(f"options.{key}")
         if value is None:
             value = self.settings.get(key, "")
@@ -386,7 +387,7 @@ def _loss(content: Result) -> str:
 
 
 def _suspicion(content: Result) -> str:
-    """Returns since when and why a run was suspicious at its end, as far as it tells."""
+    """Returns since when and why a run was suspicious at its end, as it tells."""
     judgement = content.get("judgement") or {}
     if judgement.get("level") != "suspicious":
         return ""
@@ -417,9 +418,9 @@ def _origin(content: Result) -> dict[str, str]:
 
 
 def _code(content: Result) -> str:
-    """Returns a text that differs where the code of two runs differs, as far as they tell.
+    """Returns a text that differs where the code of two runs differs.
 
-    Older runs tell their commit or version alone.
+    Older runs tell only their commit or version.
     """
     provenance = content.get("provenance") or {}
     of_gpmpc = provenance.get("code") or describe_code(provenance)

@@ -162,7 +162,7 @@ def _origins(report: Report, key: str) -> list[str]:
 
 
 def _links(report: Report, folder: Path) -> dict[str, str]:
-    """Returns the runs' folders as seen from the report's, by their name in the tree."""
+    """Returns the runs as seen from ``folder``, by their name in the tree."""
     return {
         plain_text(str(run.folder.relative_to(report.tree))): os.path.relpath(
             run.folder.resolve(), folder
@@ -222,7 +222,7 @@ def _quartiles(report: Report, measures: Sequence[str]) -> np.ndarray:
 
 
 def _table(report: Report, measures: Sequence[str]) -> Table:
-    """Returns a row a cell: what was varied, the seeds, the quartiles of the measures."""
+    """Returns a row a cell: values of the variables, seeds, quartiles of measures."""
     counts = _states(report).to_dict("records")
     quartiles = _quartiles(report, measures)
     rows = []

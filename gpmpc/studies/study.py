@@ -30,13 +30,15 @@ from gpmpc.models import DynamicsModel, load_model, save_model
 from gpmpc.parallel import in_processes
 from gpmpc.studies._document import Document, Table
 
+_LinAlgError = torch.linalg.LinAlgError  # pyright: ignore[reportPrivateImportUsage]
+
 
 @dataclass(frozen=True)
 class TrialSpec:
     """One condition with one seed: a trial that can be run."""
 
-    #: first entries of its record, plain data: what the condition is called, which trial
-    #: it is
+    #: first entries of its record, plain data: what the condition is called, which
+    #: trial it is
     labels: Mapping[str, Any]
     #: what ``run_trial`` needs of the condition; it can be pickled
     condition: Any
@@ -130,7 +132,7 @@ def _run_in_worker(run_trial: RunTrial, trial: TrialSpec) -> dict[str, Any]:
     try:
         with one_thread():
             return record | run_trial(trial)
-    except (GpmpcError, torch.linalg.LinAlgError) as error:  # pyright: ignore[reportPrivateImportUsage]
+    except (GpmpcError, _LinAlgError) as error:
         return record | {"error": str(error)}
 
 
@@ -223,7 +225,7 @@ def random_rows(count: int, size: int, seed: int, key: str = "size") -> list[int
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Keeps numerical libraries to one thread, so that sums have one order everywhere."""
+    """Keeps numerical libraries to one thread, so that sums have one order."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:

@@ -1,10 +1,10 @@
-"""Searches settings for the least cost by tree-structured Parzen estimators, with Optuna.
+"""Searches settings for the least cost, with Optuna.
 
-The estimators are those of Bergstra et al. (2011). Candidates come in batches, whose
-costs are all told before the next one. The random numbers of a candidate follow from the
-seed and from its number, and its proposal from the costs told before: a search that is
-repeated, or that goes on where it was killed with costs from files, proposes the same
-candidates bit for bit.
+The search uses tree-structured Parzen estimators (Bergstra et al., 2011). Candidates
+come in batches, whose costs are all told before the next one. The random numbers of a
+candidate follow from the seed and from its number, and its proposal from the costs told
+before: a search that is repeated, or that goes on where it was killed with costs from
+files, proposes the same candidates bit for bit.
 """
 
 import math
@@ -30,8 +30,8 @@ from gpmpc.studies.study import derived_seed
 _FEWEST_FOR_IMPORTANCE = 8  # candidates
 _BEST_IN_TABLE = 10  # candidates
 _LEGEND = (
-    "cost: of states and increments of the inputs along the true flight, per step, mean "
-    "over the seeds, with the weights that the settings have which are not searched. "
+    "cost: of states and increments of the inputs along the true flight, per step, "
+    "mean over the seeds, with the weights of the settings that are not searched. "
     "Importance: share of the variance of being among the best tenth (PED-ANOVA; "
     "Watanabe, Bansal and Hutter, 2023)."
 )
