@@ -59,4 +59,4 @@ $(ENV): pyproject.toml constraints.txt
 	@touch $@
 
 clean:
-	rm -rf .venv .venv-floors outputs
+	rm -rf .venv .venv-floors outputs docs/_build docs/api

@@ -7,10 +7,18 @@ author = "the gpmpc authors"
 copyright = author
 version = release = installed("gpmpc")
 
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
+extensions = [
+    "myst_parser",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.autosummary",
+    "sphinx.ext.napoleon",
+]
+templates_path = ["_templates"]
+autosummary_generate = True  # a page for every object that a room offers
+autosummary_ignore_module_all = False
 myst_enable_extensions = ["colon_fence"]
 myst_heading_anchors = 3
-exclude_patterns = ["_build"]
+exclude_patterns = ["_build", "_templates"]
 highlight_language = "none"  # of blocks that name none: commands and what they print
 suppress_warnings = [
     "ref.python"
