@@ -12,17 +12,8 @@ from pathlib import Path
 import numpy as np
 import pandas
 
-from gpmpc.logs import (
-    LogDynamics,
-    LogMapping,
-    LogModel,
-    MultirotorNominal,
-    RigidBody,
-    learn,
-    load_flyable,
-    read_log,
-    save_learned,
-)
+from gpmpc.logs import LogMapping, learn, load_flyable, read_log, save_learned
+from gpmpc.models import LogDynamics, LogModel, MultirotorNominal, RigidBodyKinematics
 from gpmpc.mpc import PredictionSettings
 from gpmpc.mpc.gp_mpc import GPMPC
 from gpmpc.mpc.problem import Box, Problem, Tracking
@@ -77,7 +68,7 @@ def data_sheet() -> LogDynamics:
     """A rigid body without drag, by the numbers of the data sheet."""
     lever = np.array([[ARM], [ARM], [YAW]]) / np.array(INERTIA)[:, None]
     theta = np.r_[4 / MASS, 0.0, 0.0, 0.0, 0.0, 0.0, (lever * SIGNS).ravel()]
-    body = RigidBody(LogMapping.from_dict(MAPPING).space)
+    body = RigidBodyKinematics(LogMapping.from_dict(MAPPING).space)
     return LogDynamics(
         LogModel(
             body, MultirotorNominal(4, torque=True, thrusts=True), theta, (0,) * 6

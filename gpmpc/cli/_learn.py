@@ -13,7 +13,7 @@ from gpmpc._files import write_whole
 from gpmpc._provenance import code_fingerprint, provenance
 from gpmpc.cli._command import Result
 from gpmpc.cli._settings import write_files, writing
-from gpmpc.logs import Judgement, Learned, Log
+from gpmpc.logs import IdentifiedModel, Judgement, Log
 from gpmpc.plotting import judgement_figure, png
 from gpmpc.studies._document import Document, Table, number, terminal
 from gpmpc.studies._run_folder import describe_code
@@ -148,7 +148,7 @@ class _FileMemory(dict[str, Any]):
 
 
 def _report(
-    learned: Learned, judgement: Judgement, train: Log, held_out: Log
+    learned: IdentifiedModel, judgement: Judgement, train: Log, held_out: Log
 ) -> Document:
     """Makes the report: errors beside the baselines, coverage and width, and every candidate."""
     groups = [
@@ -213,7 +213,7 @@ def _report(
 
 
 def _card(
-    learned: Learned, judgement: Judgement, train: Log, held_out: Log
+    learned: IdentifiedModel, judgement: Judgement, train: Log, held_out: Log
 ) -> Document:
     """Makes the model card: data, ranges, what was left out, what is learned and why, and what must not be trusted."""
     names = [*train.space.names, *train.input_names]

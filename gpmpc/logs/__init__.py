@@ -16,19 +16,27 @@ How ``read_log`` makes rows of files, and where each step is:
 7. log           ``_log``: the runs, with what was noticed on the way (``_findings``).
 
 ``_read_log`` holds these steps in their order; ``_inspection`` looks at a file before.
+
+How ``learn`` makes a model of a log:
+
+1. structures    ``_structures`` has the simplest model, and what may be added to it. The
+                 models themselves are those of ``gpmpc.models``.
+2. parameters    ``_fitting`` fits nominal models on rollouts.
+3. residuals     ``_output_gps`` trains GPs on what a nominal model leaves.
+4. choice        ``_learning`` compares structures on held-out runs.
+5. noise         ``_noise`` finds the noise behind the errors of held-out rollouts.
+
+``_judging`` judges what was learned beside baselines; ``_storage`` stores it.
 """
 
 from gpmpc.logs._fitting import fit_nominal
 from gpmpc.logs._inspection import Inspection, inspect_log
 from gpmpc.logs._judging import Judgement, judge
-from gpmpc.logs._kinematics import RigidBody
-from gpmpc.logs._learning import Learned, learn
+from gpmpc.logs._learning import IdentifiedModel, learn
 from gpmpc.logs._log import Log
 from gpmpc.logs._mapping import LogMapping
 from gpmpc.logs._read_log import read_log
-from gpmpc.logs._rollouts import LogModel, MultirotorNominal
 from gpmpc.logs._storage import (
-    LogDynamics,
     SavedModel,
     load_flyable,
     load_learned,
@@ -36,15 +44,11 @@ from gpmpc.logs._storage import (
 )
 
 __all__ = [
+    "IdentifiedModel",
     "Inspection",
     "Judgement",
-    "Learned",
     "Log",
-    "LogDynamics",
     "LogMapping",
-    "LogModel",
-    "MultirotorNominal",
-    "RigidBody",
     "SavedModel",
     "fit_nominal",
     "inspect_log",

@@ -7,8 +7,8 @@ from functools import partial
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from gpmpc._dynamics import Array
 from gpmpc.logs._frames import FRD_TURN, NAMES, NED_TURN, Claim, attitudes_to_enu
-from gpmpc.logs._kinematics import Array, quaternion_inverse, quaternion_product
 from gpmpc.logs._mapping import Signal
 from gpmpc.logs._mapping_advice import (
     advise_columns,
@@ -16,6 +16,7 @@ from gpmpc.logs._mapping_advice import (
     advise_turned_body,
 )
 from gpmpc.logs._units import DEGREE
+from gpmpc.models._quaternions import quaternion_inverse, quaternion_product
 
 RARE = 1.25  # mistakes that a rare one counts for
 

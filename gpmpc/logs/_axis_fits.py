@@ -14,8 +14,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from gpmpc._dynamics import Array
 from gpmpc.logs._frames import FRD, NED
-from gpmpc.logs._kinematics import Array
 
 QUANTILES = (0.5, 0.75, 0.9, 0.97, 0.99)  # of absolute values
 FEWEST = 50  # vectors that say something

@@ -11,10 +11,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from gpmpc._dynamics import Array
 from gpmpc.exceptions import DataError
 from gpmpc.logs._file import run_name
 from gpmpc.logs._findings import Finding
-from gpmpc.logs._kinematics import Array
 
 SAME_CLOCK = 1.0  # [s] between two clocks that are taken for one
 _STAMP_FIELDS = [  # seconds and nanoseconds, as ROS 2, ROS 1, Foxglove and protobuf say

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
-from gpmpc.logs._kinematics import Array
+from gpmpc._dynamics import Array
 
 NAMED = 3  # channels that are named where many have the same remark
 MOSTLY_REPEATED = 0.5  # share of repeated values from which a channel is slow

@@ -9,8 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from gpmpc._dynamics import Array
 from gpmpc.exceptions import DataError
-from gpmpc.logs._kinematics import Array
 
 # of the rows; beyond, the file does not hold one run in the order of time
 MOST_OUT_OF_ORDER = 0.05

@@ -29,12 +29,12 @@ from gpmpc.logs._interpretations import (
     Interpretation,
     InterpretationSearch,
 )
-from gpmpc.logs._kinematics import GRAVITY
 from gpmpc.logs._log import LogRun
 from gpmpc.logs._mapping import LogMapping
 from gpmpc.logs._mapping_advice import advise_turned_body
 from gpmpc.logs._motion_windows import LONGEST_LAG, cut_motion_windows
 from gpmpc.logs._relations import HALF, TILT_FITS, MotionRelations, fits_tilt
+from gpmpc.models._kinematics import GRAVITY
 
 _RIGID_BODY = [("vector", 3), ("quaternion", 3), ("vector", 3), ("vector", 3)]
 FITS = 0.75  # misfit below which an axis may fit

@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from gpmpc.logs._kinematics import Array
+from gpmpc._dynamics import Array
 
 BLOCKS = 16
 BLOCK_ROWS = 4096  # at most

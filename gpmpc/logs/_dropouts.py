@@ -7,7 +7,7 @@ measurement by what stands around it.
 
 import numpy as np
 
-from gpmpc.logs._kinematics import Array
+from gpmpc._dynamics import Array
 
 # What loggers write for "no value": round numbers, and the ends of integer types.
 SENTINELS = np.array(

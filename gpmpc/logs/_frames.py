@@ -12,13 +12,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from gpmpc._dynamics import Array
 from gpmpc.exceptions import SettingError
-from gpmpc.logs._kinematics import (
-    Array,
-    quaternion_inverse,
-    quaternion_product,
-    rotate,
-)
+from gpmpc.models._quaternions import quaternion_inverse, quaternion_product, rotate
 
 if TYPE_CHECKING:
     from gpmpc.logs._mapping import LogMapping, Signal

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 
+from gpmpc._dynamics import Array
 from gpmpc.exceptions import DataError
 from gpmpc.logs._channel_figures import (
     ChannelFigures,
@@ -25,7 +26,6 @@ from gpmpc.logs._channel_figures import (
 from gpmpc.logs._delays import Delay, delay_table, find_delays
 from gpmpc.logs._file import STAMP
 from gpmpc.logs._formats import read_file
-from gpmpc.logs._kinematics import Array
 from gpmpc.logs._log import Log
 from gpmpc.logs._mapping import TIME_UNITS, LogMapping
 from gpmpc.logs._read_log import read_log

@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from gpmpc._dynamics import Array
 from gpmpc.logs._attitude_interpretations import AttitudeInterpretation
 from gpmpc.logs._axis_fits import AxisFit
 from gpmpc.logs._frames import FRD, NAMES, NED, Claim
@@ -18,7 +19,6 @@ from gpmpc.logs._interpretations import (
     unit_and_axes,
     unit_factor,
 )
-from gpmpc.logs._kinematics import Array
 from gpmpc.logs._mapping import Signal
 from gpmpc.logs._mapping_advice import advise_columns
 from gpmpc.logs._relations import MotionRelations, Relation

@@ -13,6 +13,7 @@ from functools import cache
 
 import numpy as np
 
+from gpmpc._dynamics import Array
 from gpmpc.logs._attitude_interpretations import RARE, AttitudeInterpretation
 from gpmpc.logs._axis_fits import (
     CHANGE,
@@ -25,10 +26,10 @@ from gpmpc.logs._axis_fits import (
     misfits,
 )
 from gpmpc.logs._frames import FRD, NED
-from gpmpc.logs._kinematics import GRAVITY, Array
 from gpmpc.logs._mapping import Signal
 from gpmpc.logs._relations import MotionRelations, fits_tilt, tilt_misfits
 from gpmpc.logs._units import DEGREE, conversion
+from gpmpc.models._kinematics import GRAVITY
 
 LEAST_AGREEMENT = 0.7  # sum of three correlations, to be worth while
 AGREEMENT = 0.15  # in that sum, which is more than chance

@@ -1,73 +1,59 @@
-"""Learns a model from a log; what is learned is decided by rollouts on runs that it was not fitted to.
+"""Learns a model from a log: its structure, its parameters, its GPs and its noise.
 
-Nominal models of growing size are fitted on rollouts and compared; then a GP on each group of outputs, with targets
-averaged over 1, 5 or 10 rows, stays only where the rollouts of held-out runs get better. The noise comes from those
-rollouts as well.
+Nominal models of growing size are fitted on rollouts and compared on runs that they were
+not fitted to. Then a GP on each group of outputs, with targets averaged over 1, 5 or 10
+rows, stays only where the rollouts of held-out runs get better. The noise comes from
+those rollouts as well.
 """
 
-import warnings
-from collections.abc import Callable, MutableMapping
+from collections.abc import Callable, MutableMapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-import torch
-from scipy.cluster.vq import kmeans2
-from scipy.spatial import cKDTree
 
-from gpmpc.exceptions import DataError, check_number
-from gpmpc.gp import Trainer, standardize
-from gpmpc.gp._data_checks import Columns
+from gpmpc._dynamics import Array
+from gpmpc.exceptions import check_number
 from gpmpc.gp._wrapped import warn_of_turns
 from gpmpc.logs._fitting import (
-    NominalFit,
-    OutputNoise,
-    fit_least_squares,
-    fit_noise,
-    fit_nominal,
-)
-from gpmpc.logs._kinematics import Array, Increments, RigidBody
-from gpmpc.logs._log import Log
-from gpmpc.logs._rollouts import (
     PAST,
     STEPS,
-    AffineNominal,
-    LogModel,
-    MultirotorNominal,
-    OutputGP,
-    finite_errors,
+    NominalFit,
+    fit_least_squares,
+    fit_nominal,
 )
+from gpmpc.logs._log import Log
+from gpmpc.logs._noise import fit_noise
+from gpmpc.logs._output_gps import train_output_gp
+from gpmpc.logs._structures import (
+    LATE,
+    Candidate,
+    GroupGP,
+    Structure,
+    additions,
+    simplest_structure,
+)
+from gpmpc.models._log_dynamics import OutputNoise
+from gpmpc.models._log_model import LogModel, OutputGP
+from gpmpc.models._parametric import AffineNominal
 
-AVERAGES = (1, 5, 10)  # rows over which the targets of a GP are averaged
-LATE = 3  # rows by which motors may act late
-# structures
-FEEDBACK = "feedback"
-LATE_INPUTS = f"inputs {LATE} rows late"
-JUDGED = (10, 50)  # steps whose errors decide
-GAIN = 0.01  # least relative improvement for which a model may grow
-LOSS = 0.05  # most relative loss in any group at any step
-WINDOWS = 200  # of a fold
-Grow = Callable[[Any], LogModel | None]
+_AVERAGES = (1, 5, 10)  # rows over which the targets of a GP are averaged
+_JUDGED = (10, 50)  # steps whose errors decide
+_GAIN = 0.01  # least relative improvement for which a model may grow
+_LOSS = 0.05  # most relative loss in any group at any step
+_WINDOWS = 200  # of a fold
 
 
 @dataclass(frozen=True)
-class Candidate:
-    """One model structure and how its rollouts on held-out runs went."""
-
-    name: str
-    errors: Array  # (len(JUDGED), groups) mean Euclidean or geodesic error
-    chosen: bool = False
-
-
-@dataclass(frozen=True)
-class Learned:
-    """What was learned from a log."""
+class IdentifiedModel:
+    """A model identified from a log, and the record of its identification."""
 
     model: LogModel  #: fitted to all runs
     noise: OutputNoise  #: of its outputs
     fit: NominalFit  #: of the nominal part, to all runs
     candidates: tuple[Candidate, ...]  #: every structure that was tried, in order
-    ranges: Array  #: smallest and largest value (2, n + m) of the states and inputs in the log
+    #: smallest and largest value (2, n + m) of the states and inputs in the log
+    ranges: Array
     runs: tuple[str, ...]  #: names of the runs
     state_names: tuple[str, ...]  #: as the file's columns are called (n,)
     input_names: tuple[str, ...]  #: likewise (m,)
@@ -83,7 +69,7 @@ def learn(
     progress: Callable[[str], None] = lambda text: None,
     memory: MutableMapping[str, Any] | None = None,
     for_control: bool = False,
-) -> Learned:
+) -> IdentifiedModel:
     """Learns a model of the outputs behind a log.
 
     Args:
@@ -92,10 +78,10 @@ def learn(
         steps: Of the rollouts.
         seed: Of every random number.
         progress: Called with a line at each stage.
-        memory: Holds what the stages came to, as plain data: those of an earlier call with equal arguments are not
-            computed again.
-        for_control: Leaves out what predicts such runs and no controller can plan with: the feedback of the controller
-            that flew, and inputs that act late.
+        memory: Holds results of the stages, as plain data: those of an earlier call with
+            equal arguments are not computed again.
+        for_control: Leaves out what predicts such runs and no controller can plan with:
+            the feedback of the controller that flew, and inputs that act late.
 
     Raises:
         DataError: The log is too short for rollouts of that many steps.
@@ -103,89 +89,35 @@ def learn(
     """
     check_number("points", points, least=10, whole=True)
     check_number("steps", steps, least=2, whole=True)
-    warn_of_turns(
-        log.transitions(), log.space.angles, "Say kind: angle of it in the mapping"
+    advice = "Say kind: angle of it in the mapping"
+    warn_of_turns(log.transitions(), log.space.angles, advice)
+    search = Search(
+        log=log,
+        points=points,
+        steps=steps,
+        seed=seed,
+        progress=progress,
+        memory={} if memory is None else memory,
     )
-    folds = _split(log)
-    cuts = [held_out.windows(steps, PAST + LATE, most=WINDOWS) for _, held_out in folds]
-    memory = {} if memory is None else memory
-    candidates: list[Candidate] = []
-    best = 0  # the number of the best candidate
-    models: list[LogModel] = []  # of it, one a fold
-
-    def errors(trained: list[LogModel]) -> Array:
-        at = [min(step, steps) for step in JUDGED]
-        found = np.concatenate(
-            [
-                finite_errors(cut, model, at)
-                for cut, model in zip(cuts, trained, strict=True)
-            ]
-        )
-        return log.space.distances(found).mean(axis=0)
-
-    def is_best(name: str, errors: Array) -> bool:
-        nonlocal best
-        candidates.append(Candidate(name, errors))
-        better = len(candidates) == 1 or _is_better(candidates[-1], candidates[best])
-        best = len(candidates) - 1 if better else best
-        return better
-
-    name, structure, options = _structures(log)
-    for words, grow in options.items():
-        trial = grow(structure)
-        if trial is None or (for_control and words in (FEEDBACK, LATE_INPUTS)):
-            continue
-        trial_name = f"{name}, {words}" if words else name
-        progress(f"{trial_name}: fitted on rollouts of {steps} steps")
-        if trial_name not in memory:
-            starts = zip(models or [structure] * len(folds), folds, strict=True)
-            memory[trial_name] = [
-                _fit(trial, model, train, steps).model.theta.tolist()
-                for model, (train, _) in starts
-            ]
-        fitted = [
-            replace(trial, theta=np.array(theta, dtype=float))
-            for theta in memory[trial_name]
-        ]
-        if is_best(trial_name, errors(fitted)):
-            models = fitted
-            name = trial_name
-            structure = trial
-    choice: dict[str, int] = {}
-    groups = structure.kinematics.output_groups
-    for group, outputs in groups.items():
-        base = [(model, train) for model, (train, _) in zip(models, folds, strict=True)]
-        for average in AVERAGES:
-            averages = {**choice, group: average}.items()
-            words = f"{name}, GP on {' and '.join(f'{of} (averaged over {rows})' for of, rows in averages)}"
-            progress(words)
-            trained = []
-            learning = (outputs, average, points, seed)
-            if words not in memory:
-                trained = [_with_gp(model, train, *learning) for model, train in base]
-                memory[words] = errors(trained).tolist()
-            if is_best(words, np.array(memory[words])):
-                models = trained or [
-                    _with_gp(model, train, *learning) for model, train in base
-                ]
-                choice[group] = average
-    progress(f"chosen: {candidates[best].name}")
-    candidates[best] = replace(candidates[best], chosen=True)
+    search.consider(simplest_structure(log))
+    for addition in additions(log):
+        structure = search.best.structure.extended(addition)
+        if structure is not None and (addition.for_control or not for_control):
+            search.consider(structure)
+    for group in search.output_groups:
+        for rows in _AVERAGES:
+            search.consider(search.best.structure.with_gp(GroupGP(group, rows)))
+    progress(f"chosen: {search.best.structure.name}")
     progress("noise from the errors of held-out rollouts")
-    noise = fit_noise(models, [held_out for _, held_out in folds], steps)
+    noise = search.fit_noise()
     progress("the chosen structure, fitted to all runs")
-    fit = _fit(structure, models[0], log, steps)
-    gps = tuple(
-        _train(fit.model, log, groups[group], average, points, seed)
-        for group, average in choice.items()
-    )
-    values = np.concatenate([np.hstack([run.states, run.inputs]) for run in log])
-    return Learned(
-        model=replace(fit.model, gps=gps),
+    fit = search.fit_to_all_runs()
+    return IdentifiedModel(
+        model=replace(fit.model, gps=search.train_on_all_runs(fit.model)),
         noise=noise,
         fit=fit,
-        candidates=tuple(candidates),
-        ranges=np.stack([values.min(axis=0), values.max(axis=0)]),
+        candidates=search.candidates,
+        ranges=_ranges(log),
         runs=tuple(run.name for run in log),
         state_names=log.mapping.column_names("states"),
         input_names=log.mapping.column_names("inputs"),
@@ -194,159 +126,221 @@ def learn(
     )
 
 
-def _is_better(candidate: Candidate, incumbent: Candidate) -> bool:
-    """Whether a candidate's errors are smaller on the whole, and in no group at no step much larger."""
-    ratio = np.log(
-        np.maximum(candidate.errors, 1e-12) / np.maximum(incumbent.errors, 1e-12)
-    )
-    return bool(ratio.mean() < -GAIN and ratio.max() < LOSS)
+def _ranges(log: Log) -> Array:
+    """Returns the smallest and the largest value of states and inputs (2, n + m)."""
+    values = np.concatenate([np.hstack([run.states, run.inputs]) for run in log])
+    return np.stack([values.min(axis=0), values.max(axis=0)])
 
 
-def _structures(log: Log) -> tuple[str, LogModel, dict[str, Grow]]:
-    """A name, the simplest model, and what is added to it one after the other; None where an addition has no sense."""
-    if log.mapping.model != "rigid_body":
-        kinematics = Increments(log.space)
-        o = log.space.error_dim
-        options: dict[str, Grow] = {
-            "": lambda model: model,
-            "least squares": lambda model: replace(
-                model, nominal=AffineNominal(kinematics)
-            ),
-            "disturbance": lambda model: replace(model, history=(PAST,) * o),
-        }
-        zero = AffineNominal(kinematics, fitted=False)
-        return "increments", LogModel(kinematics, zero, np.empty(0), (0,) * o), options
-    options = {
-        "": lambda model: model,
-        "force disturbance": lambda model: replace(
-            model, history=(PAST,) * 3 + (0,) * 3
-        ),
-        "motor torque": lambda model: replace(
-            model, nominal=replace(model.nominal, torque=True)
-        ),
-        FEEDBACK: lambda model: replace(
-            model, nominal=replace(model.nominal, feedback=True)
-        ),
-        LATE_INPUTS: lambda model: (
-            replace(model, lag=LATE) if model.nominal.torque else None
-        ),
-        "torque disturbance": lambda model: (
-            replace(model, history=model.history[:3] + (PAST,) * 3)
-            if model.nominal.torque
-            else None
-        ),
-    }
-    volts = [signal.unit for signal in log.mapping.of("context")][:1] in (["V"], ["mV"])
-    voltage = (
-        float(np.median(np.concatenate([run.context[:, 0] for run in log])))
-        if volts
-        else 0.0
-    )
-    thrusts = all(signal.unit == "N" for signal in log.mapping.of("inputs"))
-    nominal = MultirotorNominal(len(log.input_names), voltage=voltage, thrusts=thrusts)
-    return (
-        "rigid body",
-        LogModel(RigidBody(log.space), nominal, np.empty(0), (0,) * 6),
-        options,
-    )
+class Fold(NamedTuple):
+    """A split of a log into runs that models are fitted to, and held-out runs."""
+
+    train: Log
+    held_out: Log
 
 
-def _split(log: Log) -> list[tuple[Log, Log]]:
-    """Two folds by run; of a single run by time."""
+class Contender(NamedTuple):
+    """A structure with one model of each fold."""
+
+    structure: Structure
+    models: list[LogModel]
+    candidate: int  # its index among the candidates
+
+
+class Search:
+    """A search for the structure whose rollouts of held-out runs are best.
+
+    Args:
+        log: All runs.
+        points: Rows that a GP is trained on.
+        steps: Of the rollouts.
+        seed: Of every random number.
+        progress: Called with a line for each structure.
+        memory: By the key of a structure, the parameters of its nominal model by fold,
+            or, where it has GPs, its errors.
+    """
+
+    def __init__(
+        self,
+        log: Log,
+        points: int,
+        steps: int,
+        seed: int,
+        progress: Callable[[str], None],
+        memory: MutableMapping[str, Any],
+    ):
+        self._log = log
+        self._points = points
+        self._steps = steps
+        self._seed = seed
+        self._progress = progress
+        self._memory = memory
+        self._folds = split_folds(log)
+        self._windows = [
+            fold.held_out.windows(steps, past=PAST + LATE, most=_WINDOWS)
+            for fold in self._folds
+        ]
+        self._candidates: list[Candidate] = []
+        self._best: Contender | None = None
+
+    @property
+    def best(self) -> Contender:
+        """The best structure so far.
+
+        Raises:
+            ValueError: None was considered.
+        """
+        if self._best is None:
+            raise ValueError("no structure was considered")
+        return self._best
+
+    @property
+    def output_groups(self) -> dict[str, tuple[int, ...]]:
+        """Groups of outputs of the best structure, by name."""
+        return self.best.structure.model.kinematics.output_groups
+
+    @property
+    def candidates(self) -> tuple[Candidate, ...]:
+        """All structures that were considered, in order; the best one is chosen."""
+        candidates = list(self._candidates)
+        best = self.best.candidate
+        candidates[best] = replace(candidates[best], chosen=True)
+        return tuple(candidates)
+
+    def consider(self, structure: Structure) -> None:
+        """Makes a structure the best one if its rollouts are better."""
+        if structure.gps:
+            self._consider_gps(structure)
+        else:
+            self._consider_nominal(structure)
+
+    def _consider_nominal(self, structure: Structure) -> None:
+        """Considers a structure without GPs."""
+        self._progress(f"{structure.name}: fitted on rollouts of {self._steps} steps")
+        if structure.key not in self._memory:
+            models = self._fit_folds(structure)
+            self._memory[structure.key] = [model.theta.tolist() for model in models]
+        parameters = self._memory[structure.key]
+        models = [
+            replace(structure.model, theta=np.array(theta, dtype=float))
+            for theta in parameters
+        ]
+        if self._is_better(structure, self._errors(models)):
+            self._make_best(structure, models)
+
+    def _consider_gps(self, structure: Structure) -> None:
+        """Considers a structure with GPs, of which the last one is new."""
+        self._progress(structure.name)
+        models = None
+        if structure.key not in self._memory:
+            models = self._train_folds(structure)
+            self._memory[structure.key] = self._errors(models).tolist()
+        errors = np.array(self._memory[structure.key])
+        if self._is_better(structure, errors):
+            self._make_best(structure, models or self._train_folds(structure))
+
+    def _is_better(self, structure: Structure, errors: Array) -> bool:
+        """Adds a candidate; returns whether it is better than the best one so far."""
+        self._candidates.append(Candidate(structure.name, errors))
+        if self._best is None:
+            return True
+        return is_improvement(errors, self._candidates[self._best.candidate].errors)
+
+    def _make_best(self, structure: Structure, models: list[LogModel]) -> None:
+        """Makes the last candidate the best structure."""
+        self._best = Contender(structure, models, len(self._candidates) - 1)
+
+    def _errors(self, models: Sequence[LogModel]) -> Array:
+        """Computes mean errors of rollouts (steps, groups) on the held-out runs."""
+        steps = [min(step, self._steps) for step in _JUDGED]
+        errors = [
+            model.rollout_errors(windows, steps)
+            for windows, model in zip(self._windows, models, strict=True)
+        ]
+        return self._log.space.distances(np.concatenate(errors)).mean(axis=0)
+
+    def _fit_folds(self, structure: Structure) -> list[LogModel]:
+        """Fits the nominal model to each fold, from the best parameters so far."""
+        simpler = [structure.model] * len(self._folds)
+        if self._best is not None:
+            simpler = self._best.models
+        fits = [
+            fit_structure(structure.model, model, fold.train, self._steps)
+            for model, fold in zip(simpler, self._folds, strict=True)
+        ]
+        return [fit.model for fit in fits]
+
+    def _train_folds(self, structure: Structure) -> list[LogModel]:
+        """Trains the last GP of a structure on each fold, beside those before it."""
+        earlier = len(structure.gps) - 1
+        models = []
+        for model, fold in zip(self.best.models, self._folds, strict=True):
+            gp = self._train(structure.gps[-1], model, fold.train)
+            models.append(replace(model, gps=(*model.gps[:earlier], gp)))
+        return models
+
+    def _train(self, gp: GroupGP, model: LogModel, log: Log) -> OutputGP:
+        """Trains a GP on a group of outputs."""
+        return train_output_gp(
+            model=model,
+            log=log,
+            outputs=self.output_groups[gp.group],
+            rows=gp.rows,
+            points=self._points,
+            seed=self._seed,
+        )
+
+    def fit_noise(self) -> OutputNoise:
+        """Fits the noise of the best structure to the held-out runs."""
+        held_out = [fold.held_out for fold in self._folds]
+        return fit_noise(self.best.models, held_out, self._steps)
+
+    def fit_to_all_runs(self) -> NominalFit:
+        """Fits the nominal model of the best structure to all runs."""
+        structure = self.best.structure
+        first = self.best.models[0]
+        return fit_structure(structure.model, first, self._log, self._steps)
+
+    def train_on_all_runs(self, model: LogModel) -> tuple[OutputGP, ...]:
+        """Trains the GPs of the best structure on all runs."""
+        gps = self.best.structure.gps
+        return tuple(self._train(gp, model, self._log) for gp in gps)
+
+
+def is_improvement(errors: Array, best: Array) -> bool:
+    """Returns whether errors are smaller on the whole, and none is much larger."""
+    logarithms = np.log(np.maximum(errors, 1e-12) / np.maximum(best, 1e-12))
+    return bool(logarithms.mean() < -_GAIN and logarithms.max() < _LOSS)
+
+
+def split_folds(log: Log) -> list[Fold]:
+    """Splits a log into two folds by run; a single run by time."""
     if len(log.runs) == 1:
         halves = log.split_by_time(0.5)
         log = replace(log, runs=tuple(half.runs[0] for half in halves))
     names = [run.name for run in sorted(log.runs, key=len)]
-    return [log.split(names[i::2]) for i in range(2)]
+    folds = []
+    for i in range(2):
+        train, held_out = log.split(names[i::2])
+        folds.append(Fold(train, held_out))
+    return folds
 
 
-def _fit(structure: LogModel, simpler: LogModel, log: Log, steps: int) -> NominalFit:
-    """Fits a structure's nominal part, from the parameters that a simpler model has in common with it."""
-    nominal = structure.nominal
-    if (
-        isinstance(nominal, AffineNominal) and nominal.fitted
-    ):  # linear in its many parameters
-        return NominalFit(
-            replace(
-                fit_least_squares(nominal.kinematics, log), history=structure.history
-            ),
-            np.empty(0),
-        )
-    known = dict(zip(simpler.nominal.parameter_names, simpler.theta, strict=False))
-    pairs = zip(nominal.parameter_names, nominal.start, strict=True)
-    return fit_nominal(
-        structure,
-        np.array([known.get(name, start) for name, start in pairs]),
-        log,
-        steps,
-    )
+def fit_structure(
+    structure: LogModel, simpler: LogModel, log: Log, steps: int
+) -> NominalFit:
+    """Fits the nominal part of a structure.
 
-
-def _with_gp(model: LogModel, log: Log, *learning: Any) -> LogModel:
-    return replace(model, gps=(*model.gps, _train(model, log, *learning)))
-
-
-def _train(
-    model: LogModel,
-    log: Log,
-    outputs: tuple[int, ...],
-    average: int,
-    points: int,
-    seed: int,
-) -> OutputGP:
-    """Trains a GP on what the nominal part leaves of some outputs, averaged over some rows."""
-    cut = log.windows(average, model.lag)
-    at = slice(cut.past, cut.past + average)
-    x = cut.states[:, at]
-    u = cut.inputs[:, cut.past - model.lag : cut.past - model.lag + average]
-    c = np.broadcast_to(cut.context[:, -1:], (*x.shape[:-1], cut.context.shape[-1]))
-    after = cut.states[:, cut.past + 1 : cut.past + average + 1]
-    if model.kinematics.space.angles:  # may go round by more than half a turn
-        seen = model.kinematics.outputs(x, after, cut.time_step).mean(axis=1)
-    else:
-        seen = model.kinematics.outputs(x[:, 0], after[:, -1], cut.time_step * average)
-    y = seen - model.nominal.outputs(model.theta, x, u, c).mean(axis=1)
-    middle = average // 2
-    z = model.kinematics.features(x[:, middle], u[:, middle], c[:, middle])
-    rows = choose_rows(z, points, seed)
-    trainer = Trainer(predicts="value", scaling=standardize, restarts=1, tolerance=1e-6)
-    y = np.ascontiguousarray(y[rows][:, list(outputs)])
-    inputs = log.mapping.column_names("inputs")
-    context = log.mapping.column_names("context")
-    columns = Columns(
-        features=model.kinematics.feature_names(inputs, context),
-        outputs=[model.kinematics.output_names[a] for a in outputs],
-    )
-    training = trainer.fit(
-        torch.from_numpy(z[rows]),
-        torch.from_numpy(y),
-        0,
-        "value",
-        seed,
-        columns=columns,
-    )
-    return OutputGP(outputs, training.posterior)
-
-
-def choose_rows(features: Array, count: int, seed: int = 0) -> np.ndarray:
-    """Chooses rows nearest to the centres of k-means that begins with farthest points, so that rare states count.
-
-    Features (N, d) are standardised here; where there are no more than ``count``, all rows are chosen.
+    The search begins at the parameters that a simpler model has in common with it.
     """
-    if not len(features):
-        raise DataError("no row to choose from")
-    if len(features) <= count:
-        return np.arange(len(features))
-    z = (features - features.mean(axis=0)) / np.maximum(features.std(axis=0), 1e-12)
-    sample = z[np.random.default_rng(seed).permutation(len(z))[: 10 * count]]
-    chosen = [0]
-    distance = np.full(len(sample), np.inf)
-    while len(chosen) < count:  # farthest points (Gonzalez, 1985)
-        distance = np.minimum(
-            distance, np.square(sample - sample[chosen[-1]]).sum(axis=1)
-        )
-        chosen.append(int(distance.argmax()))
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # a centre that loses its members stays
-        centres = kmeans2(sample, sample[chosen], iter=5, minit="matrix")[0]
-    return np.unique(cKDTree(z).query(centres)[1])
+    nominal = structure.nominal
+    if isinstance(nominal, AffineNominal) and nominal.fitted:
+        # It is linear in its many parameters.
+        model = fit_least_squares(nominal.kinematics, log)
+        model = replace(model, history=structure.history)
+        return NominalFit(model, standard_errors=np.empty(0))
+    names = simpler.nominal.parameter_names
+    known = dict(zip(names, simpler.theta, strict=False))
+    start = zip(nominal.parameter_names, nominal.start, strict=True)
+    theta0 = np.array([known.get(name, value) for name, value in start])
+    return fit_nominal(structure, theta0, log, steps)

@@ -7,17 +7,18 @@ consists of pieces, and transitions, windows and episodes stay inside a piece.
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 import torch
 
+from gpmpc._dynamics import Array
 from gpmpc.calibration import Recording
 from gpmpc.exceptions import DataError, SettingError, check_number
 from gpmpc.gp import Transitions
 from gpmpc.logs._findings import Finding
-from gpmpc.logs._kinematics import Array, StateSpace
 from gpmpc.logs._mapping import LogMapping
+from gpmpc.models._state_space import StateSpace
+from gpmpc.models._windows import Windows
 from gpmpc.signals import Signals
 
 
@@ -57,42 +58,6 @@ class LogRun:
             context=self.context[rows],
             begins=(0, *(b - begin for b in self.begins if begin < b < end)),
         )
-
-
-@dataclass(frozen=True)
-class Windows:
-    """W windows of a log: the measured past, and what came after.
-
-    Row k of ``states`` goes with row k of ``inputs``.
-    """
-
-    space: StateSpace  #: of the states
-    time_step: float  #: [s]
-    past: int  #: rows before the start of each; the start is row ``past``
-    stride: int  #: rows from one start to the next
-    states: Array  #: (W, past + ahead + 1, n)
-    inputs: Array  #: (W, past + ahead + 1, m)
-    context: Array  #: at the start, held through a prediction (W, past + 1, c)
-    runs: np.ndarray  #: number of the run that each is from (W,)
-    times: Array  #: of the starts (W,) [s]
-
-    def __len__(self) -> int:
-        return len(self.states)
-
-    def __getitem__(self, rows: Any) -> "Windows":
-        return replace(
-            self,
-            states=self.states[rows],
-            inputs=self.inputs[rows],
-            context=self.context[rows],
-            runs=self.runs[rows],
-            times=self.times[rows],
-        )
-
-    @property
-    def ahead(self) -> int:
-        """Number of rows after the start."""
-        return self.states.shape[1] - self.past - 1
 
 
 @dataclass(frozen=True)

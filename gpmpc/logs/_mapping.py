@@ -11,15 +11,16 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
+from gpmpc._dynamics import Array
 from gpmpc.exceptions import (
     SettingError,
     check_choice,
     check_number,
     check_numbers,
 )
-from gpmpc.logs._kinematics import Array, StateGroup, StateSpace
 from gpmpc.logs._mapping_text import load_mapping_text
 from gpmpc.logs._units import Conversion, conversion
+from gpmpc.models._state_space import StateGroup, StateSpace
 
 Role = Literal["states", "inputs", "context"]
 ROLES: tuple[Role, ...] = ("states", "inputs", "context")

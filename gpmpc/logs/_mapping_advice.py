@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from gpmpc.logs._kinematics import Array
+from gpmpc._dynamics import Array
 from gpmpc.logs._mapping import Signal
 
 

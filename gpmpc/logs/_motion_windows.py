@@ -5,9 +5,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from gpmpc._dynamics import Array
 from gpmpc.logs._axis_fits import FEWEST
 from gpmpc.logs._frames import Claim
-from gpmpc.logs._kinematics import Array
 from gpmpc.logs._log import LogRun
 
 WINDOWS = 600  # of a run that are looked at

@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from gpmpc._dynamics import Array
 from gpmpc.logs._attitude_interpretations import (
     AttitudeInterpretation,
     attitude_interpretations,
@@ -29,16 +30,15 @@ from gpmpc.logs._axis_fits import (
     misfits,
 )
 from gpmpc.logs._frames import Claim
-from gpmpc.logs._kinematics import (
-    GRAVITY,
-    Array,
+from gpmpc.logs._mapping import Signal
+from gpmpc.logs._motion_windows import HALF_WIDE, MotionWindows
+from gpmpc.models._kinematics import GRAVITY
+from gpmpc.models._quaternions import (
     quaternion_inverse,
     quaternion_product,
     rotate,
     rotation_vector,
 )
-from gpmpc.logs._mapping import Signal
-from gpmpc.logs._motion_windows import HALF_WIDE, MotionWindows
 
 LEAST_CLOCK_LAG = 0.1  # [s] of the attitude behind the position that is said
 HALF = 0.5  # of the claim's misfit, which a better interpretation has to stay below

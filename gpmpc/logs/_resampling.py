@@ -11,12 +11,12 @@ import numpy as np
 
 from gpmpc._angles import wrap
 from gpmpc._bounds import Room
+from gpmpc._dynamics import Array
 from gpmpc.exceptions import DataError
 from gpmpc.logs._clocks import JUMP, Stamps, find_jumps
 from gpmpc.logs._file import NUMBER_BYTES
 from gpmpc.logs._findings import RunFindings
-from gpmpc.logs._kinematics import (
-    Array,
+from gpmpc.models._quaternions import (
     quaternion_inverse,
     quaternion_product,
     rotation_quaternion,

@@ -7,6 +7,7 @@ import numpy as np
 import pandas as pd
 
 from gpmpc._bounds import Room
+from gpmpc._dynamics import Array
 from gpmpc.exceptions import DataError
 from gpmpc.logs._clocks import (
     ORDER_ROWS,
@@ -17,7 +18,6 @@ from gpmpc.logs._clocks import (
 )
 from gpmpc.logs._file import STAMP, Tables
 from gpmpc.logs._findings import RunFindings
-from gpmpc.logs._kinematics import Array
 from gpmpc.logs._mapping import TIME_UNITS, LogMapping
 from gpmpc.logs._resampling import Grid, grid_at_rate, grid_of_rows, resample
 from gpmpc.logs._signals import empty_zero_dropouts, read_column, read_signal

@@ -6,10 +6,10 @@ import numpy as np
 import pandas as pd
 from scipy.spatial.transform import Rotation
 
+from gpmpc._dynamics import Array
 from gpmpc.exceptions import DataError
 from gpmpc.logs._dropouts import sentinels, zero_dropouts
 from gpmpc.logs._findings import RunFindings
-from gpmpc.logs._kinematics import Array
 from gpmpc.logs._mapping import Signal
 
 LISTED_COLUMNS = 12  # of a table, where one is missing

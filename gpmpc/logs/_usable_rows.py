@@ -10,11 +10,11 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.ndimage import binary_dilation, maximum_filter1d, minimum_filter1d
 
+from gpmpc._dynamics import Array
 from gpmpc.exceptions import DataError
 from gpmpc.logs._clocks import JUMP
 from gpmpc.logs._dropouts import changes_rarely, frozen_rows
 from gpmpc.logs._findings import RunFindings
-from gpmpc.logs._kinematics import Array
 from gpmpc.logs._log import LogRun
 from gpmpc.logs._mapping import LogMapping
 from gpmpc.logs._run_tables import RunTable

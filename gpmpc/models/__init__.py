@@ -1,12 +1,41 @@
-"""Dynamics models: the protocol, and models made of a known part and a learned one."""
+"""Models of dynamics: the protocol, and models of a known part and a learned one.
+
+All models with a GP are one family: a nominal model, and GPs on what it leaves,
+
+    y[k] = nominal(x[k], u[k]) + d(phi(x[k], u[k])),     x[k+1] = step(x[k], y[k]).
+
+They differ in what y is. Of a ``ResidualModel`` it is the next state itself, and
+derivatives are exact. Of a ``LogModel``, made for measured flights, it is outputs such
+as accelerations, which kinematics turn into a movement; ``LogDynamics`` makes a
+``DynamicsModel`` of it. All are rolled out by the recursion of ``_roll_out``, and stored
+by ``save_model`` and ``load_model``. Wrappers around any of them are linear but for the
+model inside: a delay, disturbances as states; or they add noise.
+
+A new structure has one of these places:
+
+- a nominal model with parameters that are fitted, such as those of a ``System``: a
+  ``ParametricNominal`` in ``_parametric``, which ``gpmpc.logs`` fits and compares;
+- a model with a past, such as ARX: a state with earlier values in ``_lags``, or rows of
+  ``Windows`` before the start, as ``LogModel.history`` and ``LogModel.lag`` read them;
+- other movements of states by outputs: kinematics in ``_kinematics``;
+- further states that are linear: a ``LinearWrapper``.
+"""
 
 from gpmpc._dynamics import DynamicsModel, Linearized, linearize, linearize_by_autograd
-from gpmpc.models._features import Features, Lags
-from gpmpc.models._nominal import Affine, CasadiFunction, KnownModel
+from gpmpc.models._casadi_function import CasadiFunction
+from gpmpc.models._delayed import DelayedModel
+from gpmpc.models._disturbed import DisturbedModel
+from gpmpc.models._features import Features
+from gpmpc.models._kinematics import RigidBodyKinematics
+from gpmpc.models._lags import Lags
+from gpmpc.models._log_dynamics import LogDynamics
+from gpmpc.models._log_model import LogModel
+from gpmpc.models._noisy import NoisyModel
+from gpmpc.models._nominal import Affine, KnownModel
+from gpmpc.models._parametric import MultirotorNominal
 from gpmpc.models._residual import ResidualModel
 from gpmpc.models._roll_out import RollOut
 from gpmpc.models._storage import load_model, save_model
-from gpmpc.models._wrapper import DelayedModel, DisturbedModel, NoisyModel
 
 __all__ = [
     "Affine",
@@ -18,8 +47,12 @@ __all__ = [
     "KnownModel",
     "Lags",
     "Linearized",
+    "LogDynamics",
+    "LogModel",
+    "MultirotorNominal",
     "NoisyModel",
     "ResidualModel",
+    "RigidBodyKinematics",
     "RollOut",
     "linearize",
     "linearize_by_autograd",

@@ -1,9 +1,12 @@
-"""Rolls a model's mean out under a feedback towards plans: compiled where it is GPs, an affine part and a tape."""
+"""Rollouts of a model's mean, open loop or under a feedback towards plans.
 
-from typing import Any
+Models that are GPs, an affine part and a tape are rolled out by compiled code.
+"""
+
+from collections.abc import Callable
 
 import numpy as np
-import torch
+from torch import Tensor
 
 from gpmpc._dynamics import Array, DynamicsModel, linearize, to_array
 from gpmpc._kernels import GPArrays
@@ -15,113 +18,203 @@ from gpmpc._kernels.gp_rollout import (
     Feedback,
     roll_out_gps,
 )
-from gpmpc._kernels.tape import NO_TAPE
+from gpmpc._kernels.tape import NO_TAPE, Tape
 from gpmpc.gp._backend import host_arrays
 from gpmpc.gp._posterior import AffineForm
 from gpmpc.models._features import Features
 
 
-class RollOut:
-    """Rolls out the mean of one model of next states, from any number of starts in one call.
+def iterate(step: Callable[[int, Array], Array], start: Array, steps: int) -> Array:
+    """Iterates x[k+1] = step(k, x[k]).
 
-    A model whose ``affine_form`` or ``tape`` is not None takes one compiled call; any other one call for each stage,
-    of its ``predict_mean`` where it has that method, else of ``linearize``.
+    Args:
+        step: Maps the stage k and states x[k] (..., n) to x[k+1] (..., n).
+        start: x[0] (..., n).
+        steps: Number of iterations.
+
+    Returns:
+        x[0], .., x[steps] (..., steps + 1, n).
+    """
+    states = np.empty((*start.shape[:-1], steps + 1, start.shape[-1]))
+    states[..., 0, :] = start
+    state = start
+    for k in range(steps):
+        state = step(k, state)
+        states[..., k + 1, :] = state
+    return states
+
+
+class RollOut:
+    """Rollouts of the mean of one model of next states, from any number of starts.
+
+    A model whose ``affine_form`` or ``tape`` is not None takes one compiled call. Any
+    other takes one call for each stage: of its ``predict_mean`` where it has that
+    method, else of ``linearize``.
     """
 
     def __init__(self, model: DynamicsModel):
         self._model = model
-        self._gps = None
-        form: AffineForm | None = getattr(model, "affine_form", None)
-        if form is not None and host_arrays(form.f.weights) is not None:
-            self._gps = _compiled_form(form, model.state_dim, model.input_dim)
-        elif getattr(model, "tape", None) is not None:
-            self._gps = _known_form(model)
+        self._compiled_model = _compiled_model(model)
 
     def __call__(
         self, start: Array, feedback: Feedback, disturbance: Array | None = None
     ) -> tuple[Array, Array]:
-        """Returns states (T, H + 1, n) and inputs (T, H, m) from x_0 (T, n) on; a disturbance (n,) is added at each."""
-        (T, H, m), n = feedback.inputs.shape, start.shape[1]
+        """Rolls the model out under a feedback.
+
+        Args:
+            start: x_0 of each of T rollouts (T, n).
+            feedback: The plans (T, H, m), gains and bounds.
+            disturbance: Added to every next state (n,); zero by default.
+
+        Returns:
+            The states (T, H + 1, n) and the inputs (T, H, m).
+        """
+        T, H, m = feedback.inputs.shape
+        n = start.shape[1]
+        start = np.ascontiguousarray(start, dtype=float)
+        if disturbance is None:
+            disturbance = np.zeros(n)
+        disturbance = np.ascontiguousarray(disturbance, dtype=float)
+        if self._compiled_model is None:
+            return self._stage_by_stage(start, feedback, disturbance)
         states = np.empty((T, H + 1, n))
         inputs = np.empty((T, H, m))
-        start = np.ascontiguousarray(start, dtype=float)
-        added = (
-            np.zeros(n)
-            if disturbance is None
-            else np.ascontiguousarray(disturbance, dtype=float)
+        roll_out_gps.unchecked(
+            model=self._compiled_model,
+            feedback=feedback,
+            start=start,
+            disturbance=disturbance,
+            states=states,
+            inputs=inputs,
         )
-        if self._gps is not None:
-            roll_out_gps.unchecked(self._gps, feedback, start, added, states, inputs)
-            return states, inputs
-        gains = np.broadcast_to(feedback.gains, (T, *feedback.gains.shape[1:]))
-        states[:, 0] = start
-        last = feedback.previous_input
-        for k in range(H):
-            u = (
-                feedback.inputs[:, k]
-                + (gains[:, k] @ (states[:, k] - feedback.states[:, k])[..., None])[
-                    ..., 0
-                ]
-            )
-            u = np.minimum(
-                np.maximum(u, last + feedback.rate_lower[k]),
-                last + feedback.rate_upper[k],
-            )
-            last = inputs[:, k] = np.minimum(
-                np.maximum(u, feedback.lower[k]), feedback.upper[k]
-            )
-            states[:, k + 1] = (
-                self._mean(np.ascontiguousarray(states[:, k]), last) + added
-            )
         return states, inputs
 
     def open_loop(
         self, start: Array, inputs: Array, disturbance: Array | None = None
     ) -> Array:
-        """Returns the states (T, H + 1, n) that inputs (T, H, m) lead to from x_0 (T, n), without bounds."""
-        (T, H, m), n = inputs.shape, start.shape[1]
-        gains = np.zeros((1, H, m, n))
-        free = np.full((H, m), np.inf)
-        planned = np.zeros((T, H, n))
-        inputs = np.ascontiguousarray(inputs, dtype=float)
-        law = Feedback(planned, inputs, gains, -free, free, -free, free, np.zeros(m))
-        return self(start, law, disturbance)[0]
+        """Rolls the model out under fixed inputs, without bounds.
 
-    def _mean(self, states: Array, inputs: Array) -> Array:
-        if (method := getattr(self._model, "predict_mean", None)) is not None:
-            return method(states, inputs)
+        Args:
+            start: x_0 of each of T rollouts (T, n).
+            inputs: (T, H, m).
+            disturbance: Added to every next state (n,); zero by default.
+
+        Returns:
+            The states (T, H + 1, n).
+        """
+        T, H, m = inputs.shape
+        n = start.shape[1]
+        unbounded = np.full((H, m), np.inf)
+        no_feedback = Feedback(
+            states=np.zeros((T, H, n)),
+            inputs=np.ascontiguousarray(inputs, dtype=float),
+            gains=np.zeros((1, H, m, n)),
+            lower=-unbounded,
+            upper=unbounded,
+            rate_lower=-unbounded,
+            rate_upper=unbounded,
+            previous_input=np.zeros(m),
+        )
+        states, _ = self(start, no_feedback, disturbance)
+        return states
+
+    def _stage_by_stage(
+        self, start: Array, feedback: Feedback, disturbance: Array
+    ) -> tuple[Array, Array]:
+        """Rolls the model out by one call of it for each stage."""
+        T, H, m = feedback.inputs.shape
+        inputs = np.empty((T, H, m))
+
+        def step(k: int, states: Array) -> Array:
+            previous = inputs[:, k - 1] if k > 0 else feedback.previous_input
+            u = _feedback_input(feedback, k, states, previous)
+            inputs[:, k] = u
+            return self._next_states(states, u) + disturbance
+
+        return iterate(step, start, H), inputs
+
+    def _next_states(self, states: Array, inputs: Array) -> Array:
+        """Computes the mean of the next states (T, n)."""
+        states = np.ascontiguousarray(states)
+        predict_mean = getattr(self._model, "predict_mean", None)
+        if predict_mean is not None:
+            return predict_mean(states, inputs)
         return linearize(self._model, states, inputs, covariance=False).mean
 
 
+def _feedback_input(
+    feedback: Feedback, k: int, states: Array, previous_input: Array
+) -> Array:
+    """Computes the inputs (T, m) of a feedback at stage k, within its bounds."""
+    T = len(states)
+    gains = np.broadcast_to(feedback.gains[:, k], (T, *feedback.gains.shape[2:]))
+    deviation = states - feedback.states[:, k]
+    u = feedback.inputs[:, k] + (gains @ deviation[..., None])[..., 0]
+    u = np.maximum(u, previous_input + feedback.rate_lower[k])
+    u = np.minimum(u, previous_input + feedback.rate_upper[k])
+    u = np.maximum(u, feedback.lower[k])
+    return np.minimum(u, feedback.upper[k])
+
+
+def _compiled_model(model: DynamicsModel) -> AffineGPs | None:
+    """Returns a model's arrays for compiled code; None where it is not of that form."""
+    form: AffineForm | None = getattr(model, "affine_form", None)
+    if form is not None and host_arrays(form.f.weights) is not None:
+        return _compiled_form(form, model.state_dim, model.input_dim)
+    tape: Tape | None = getattr(model, "tape", None)
+    if tape is not None:
+        return _compiled_tape(tape, model.state_dim, model.input_dim)
+    return None
+
+
 def _compiled_form(form: AffineForm, n: int, m: int) -> AffineGPs:
-    """The arrays of an affine form, with everything that None stands for."""
-    states = list(range(n)) if form.states is None else form.states
+    """Returns the arrays of an affine form, with the defaults for all that is None."""
     inputs = list(range(m)) if form.inputs is None else form.inputs
-    features = Features(states, inputs, form.angles, n, m)
+    features = Features(
+        states=list(range(n)) if form.states is None else form.states,
+        inputs=inputs,
+        angles=form.angles,
+        state_dim=n,
+        input_dim=m,
+    )
     kinds = np.full(features.dim, PLAIN)
     kinds[features.sines] = SINE
     kinds[features.sines + 1] = COSINE
-    zero = torch.zeros((), dtype=torch.float64)
-    shapes = ((n, n), (n, m), (n,))
-    parts = zip((form.A, form.G, form.c), shapes, strict=True)
-    A, G, c = (
-        to_array((zero if part is None else part).expand(shape).contiguous())
-        for part, shape in parts
-    )
-    B = np.eye(n) if form.B is None else to_array(form.B)
-    places = features.columns, kinds, np.array(inputs, dtype=np.intp)
-    tape = NO_TAPE if form.tape is None else form.tape
     return AffineGPs(
-        form.f.packed.arrays, to_array(form.f.offset), A, G, c, B, *places, tape
+        f=form.f.packed.arrays,
+        offset=to_array(form.f.offset),
+        A=_array_or_zeros(form.A, (n, n)),
+        G=_array_or_zeros(form.G, (n, m)),
+        c=_array_or_zeros(form.c, (n,)),
+        B=np.eye(n) if form.B is None else to_array(form.B),
+        states=features.columns,
+        kinds=kinds,
+        inputs=np.array(inputs, dtype=np.intp),
+        tape=NO_TAPE if form.tape is None else form.tape,
     )
 
 
-def _known_form(model: Any) -> AffineGPs:
-    """The arrays of a tape alone, without a GP."""
-    n = model.state_dim
-    m = model.input_dim
-    none = np.empty((0, 0))
-    nothing = GPArrays(none, none, np.empty(0), none, 0)
-    empty = np.empty(0, dtype=np.intp)
-    affine = np.zeros((n, n)), np.zeros((n, m)), np.zeros(n), np.empty((n, 0))
-    return AffineGPs(nothing, np.empty(0), *affine, empty, empty, empty, model.tape)
+def _array_or_zeros(tensor: Tensor | None, shape: tuple[int, ...]) -> Array:
+    """Converts a tensor to an array of a shape; None to zeros."""
+    if tensor is None:
+        return np.zeros(shape)
+    return to_array(tensor.expand(shape).contiguous())
+
+
+def _compiled_tape(tape: Tape, n: int, m: int) -> AffineGPs:
+    """Returns the arrays of a tape alone, without a GP."""
+    no_points = np.empty((0, 0))
+    no_indices = np.empty(0, dtype=np.intp)
+    no_gps = GPArrays(no_points, no_points, np.empty(0), no_points, 0)
+    return AffineGPs(
+        f=no_gps,
+        offset=np.empty(0),
+        A=np.zeros((n, n)),
+        G=np.zeros((n, m)),
+        c=np.zeros(n),
+        B=np.empty((n, 0)),
+        states=no_indices,
+        kinds=no_indices,
+        inputs=no_indices,
+        tape=tape,
+    )

@@ -16,7 +16,8 @@ import torch
 from gpmpc._arrays import read_array
 from gpmpc._functions import call
 from gpmpc.exceptions import DataError, SettingError, ShapeError, check_choice
-from gpmpc.models._nominal import CasadiFunction, linearize_function
+from gpmpc.models._casadi_function import CasadiFunction
+from gpmpc.models._nominal import linearize_function
 
 Array = np.ndarray
 

@@ -37,7 +37,8 @@ def slope_covariances(model: Any, state: Array, input: Array) -> Array:
         return _of_gp(model, np.concatenate([state, input]))
     if isinstance(model, LinearWrapper):
         within = model.model.state_dim
-        Z, W = model.matrices[:2]
+        Z = model.linear_part.Z
+        W = model.linear_part.W
         inner = slope_covariances(model.model, state[:within], Z @ state + W @ input)
         seen = np.vstack([np.eye(within, n + m), np.hstack([Z, W])])
         covariances = np.zeros((n, n + m, n + m))

@@ -11,15 +11,13 @@ import torch
 
 from gpmpc.exceptions import SettingError
 from gpmpc.gp import GPPosterior
-from gpmpc.logs import LogDynamics, LogModel, MultirotorNominal, RigidBody
-from gpmpc.logs._fitting import OutputNoise
-from gpmpc.logs._kinematics import (
-    Increments,
-    StateGroup,
-    StateSpace,
-    rotation_quaternion,
-)
-from gpmpc.logs._rollouts import AffineNominal, OutputGP
+from gpmpc.models import LogDynamics, LogModel, MultirotorNominal, RigidBodyKinematics
+from gpmpc.models._kinematics import Increments
+from gpmpc.models._log_dynamics import OutputNoise
+from gpmpc.models._log_model import OutputGP
+from gpmpc.models._parametric import AffineNominal
+from gpmpc.models._quaternions import rotation_quaternion
+from gpmpc.models._state_space import StateGroup, StateSpace
 from gpmpc.testing import check_model
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))
@@ -56,7 +54,7 @@ def dynamics(kinematics, nominal, theta, inputs, dim, **model):
 def test_what_was_learned_obeys_the_protocol_of_models():
     rng = np.random.default_rng(1)
     nominal = MultirotorNominal(4, torque=True)
-    body = dynamics(RigidBody(BODY), nominal, rng.normal(size=18), 4, 12)
+    body = dynamics(RigidBodyKinematics(BODY), nominal, rng.normal(size=18), 4, 12)
     x = np.hstack(
         [
             rng.normal(size=(5, 3)),
@@ -83,7 +81,9 @@ def test_what_no_controller_can_plan_with_is_named():
     with pytest.raises(
         SettingError, match="inputs that act 3 rows late, which no controller"
     ):
-        dynamics(RigidBody(BODY), MultirotorNominal(4), np.zeros(6), 4, 12, lag=3)
+        dynamics(
+            RigidBodyKinematics(BODY), MultirotorNominal(4), np.zeros(6), 4, 12, lag=3
+        )
 
 
 def test_the_guide_flies_learns_and_flies_what_was_learned(tmp_path):

@@ -12,9 +12,6 @@ import pytest
 from gpmpc.exceptions import DataError, SettingError, ShapeError
 from gpmpc.logs import (
     LogMapping,
-    LogModel,
-    MultirotorNominal,
-    RigidBody,
     fit_nominal,
     judge,
     learn,
@@ -22,11 +19,13 @@ from gpmpc.logs import (
     read_log,
     save_learned,
 )
-from gpmpc.logs._fitting import error_variances, follow_errors
-from gpmpc.logs._kinematics import Increments, rotation_quaternion
-from gpmpc.logs._learning import _train, choose_rows
 from gpmpc.logs._log import Log, LogRun
-from gpmpc.logs._rollouts import AffineNominal
+from gpmpc.logs._noise import error_variances, follow_errors
+from gpmpc.logs._output_gps import choose_rows, train_output_gp
+from gpmpc.models import LogModel, MultirotorNominal, RigidBodyKinematics
+from gpmpc.models._kinematics import Increments
+from gpmpc.models._parametric import AffineNominal
+from gpmpc.models._quaternions import rotation_quaternion
 
 EXAMPLE = runpy.run_path(
     str(Path(__file__).resolve().parents[2] / "examples" / "own_log.py")
@@ -64,7 +63,7 @@ def flights():
 
 def test_the_outputs_of_a_rigid_body_are_those_that_moved_it():
     rng = np.random.default_rng(0)
-    body = RigidBody(MAPPING.space)
+    body = RigidBodyKinematics(MAPPING.space)
     states = np.hstack(
         [
             rng.normal(size=(40, 3)),
@@ -87,7 +86,10 @@ def test_parameters_come_back_from_rollouts_within_their_standard_errors_also_wi
 ):
     log = as_log(flights, gaps=(700,))
     model = LogModel(
-        RigidBody(log.space), MultirotorNominal(4, torque=True), np.empty(0), FORCE_ONLY
+        RigidBodyKinematics(log.space),
+        MultirotorNominal(4, torque=True),
+        np.empty(0),
+        FORCE_ONLY,
     )
     truth = {"drag_xy": EXAMPLE["DRAG"], "torque_x1": 30.0, "torque_y2": -30.0}
     spoiled = [flight.copy() for flight in flights]
@@ -209,7 +211,8 @@ def test_a_rate_of_turning_is_averaged_over_more_than_half_a_turn():
     kinematics = Increments(log.space)
     nominal = AffineNominal(kinematics, fitted=False)
     model = LogModel(kinematics, nominal, np.empty(0), (0, 0))
-    gp = _train(model, log, (0,), 20, 30, 0)  # in 20 rows it turns by 3.6 rad
+    # in 20 rows it turns by 3.6 rad
+    gp = train_output_gp(model, log, outputs=(0,), rows=20, points=30, seed=0)
     assert gp.posterior.targets.min() > 6.0
 
 
@@ -262,7 +265,7 @@ def test_the_same_rows_in_pieces_of_one_run_or_another_log_give_the_same_model(f
         runs=tuple(replace(run, time=run.time + 100 * (run.time > 7)) for run in one),
     )
     model = LogModel(
-        RigidBody(one.space), MultirotorNominal(4), np.empty(0), FORCE_ONLY
+        RigidBodyKinematics(one.space), MultirotorNominal(4), np.empty(0), FORCE_ONLY
     )
     fits = [fit_nominal(model, None, log, steps=10).model.theta for log in (one, other)]
     np.testing.assert_allclose(*fits, rtol=0, atol=1e-9)
@@ -348,7 +351,7 @@ def test_chosen_rows_cover_what_is_rare():
 def test_misuse_is_named(flights):
     log = as_log(flights[:1])
     model = LogModel(
-        RigidBody(log.space), MultirotorNominal(4), np.empty(0), FORCE_ONLY
+        RigidBodyKinematics(log.space), MultirotorNominal(4), np.empty(0), FORCE_ONLY
     )
     with pytest.raises(ShapeError, match="theta0 must have 6 entries"):
         fit_nominal(model, np.zeros(3), log)

@@ -10,7 +10,8 @@ from scipy.spatial.transform import Rotation
 from gpmpc._angles import wrap
 from gpmpc.exceptions import DataError, SettingError
 from gpmpc.logs import read_log
-from gpmpc.logs._kinematics import StateGroup, StateSpace, rotate, rotation_quaternion
+from gpmpc.models._quaternions import rotate, rotation_quaternion
+from gpmpc.models._state_space import StateGroup, StateSpace
 
 PENDULUM = {
     "time": {"column": "t"},

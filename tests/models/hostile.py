@@ -26,21 +26,28 @@ from gpmpc import systems
 from gpmpc.exceptions import DataError, SettingError
 from gpmpc.gp import _storage
 from gpmpc.gp.casadi_ import successor_function
-from gpmpc.logs import load_flyable, load_learned
-from gpmpc.logs._fitting import TIME_CONSTANTS, NominalFit, OutputNoise
-from gpmpc.logs._kinematics import Increments, RigidBody, StateGroup, StateSpace
-from gpmpc.logs._learning import Candidate, Learned
-from gpmpc.logs._rollouts import AffineNominal, LogModel, MultirotorNominal, OutputGP
-from gpmpc.logs._storage import LogDynamics, save_learned
+from gpmpc.logs import IdentifiedModel, load_flyable, load_learned
+from gpmpc.logs._fitting import NominalFit
+from gpmpc.logs._storage import save_learned
+from gpmpc.logs._structures import Candidate
 from gpmpc.models import (
     CasadiFunction,
     DelayedModel,
     DisturbedModel,
+    LogDynamics,
+    LogModel,
+    MultirotorNominal,
     NoisyModel,
     ResidualModel,
+    RigidBodyKinematics,
     load_model,
     save_model,
 )
+from gpmpc.models._kinematics import Increments
+from gpmpc.models._log_dynamics import TIME_CONSTANTS, OutputNoise
+from gpmpc.models._log_model import OutputGP
+from gpmpc.models._parametric import AffineNominal
+from gpmpc.models._state_space import StateGroup, StateSpace
 from tests.gp.small_models import posterior, residual_model
 
 MEMORY = 300 * 2**20
@@ -99,7 +106,7 @@ def learned(kinematics, nominal, inputs, parameters, features):
         kinematics, nominal, theta, (20,) * outputs, 0, (OutputGP((outputs - 1,), gp),)
     )
     names = tuple(f"u{i}" for i in range(inputs))
-    return Learned(
+    return IdentifiedModel(
         model=model,
         noise=OutputNoise(
             np.full((len(TIME_CONSTANTS), outputs), 0.1),
@@ -132,7 +139,9 @@ def of_a_quadrotor_log():
         StateGroup("velocity", ("vx", "vy", "vz")),
         StateGroup("rate", ("p", "q", "r")),
     ))  # fmt: skip
-    return learned(RigidBody(space), MultirotorNominal(4, torque=True), 4, 18, 12)
+    return learned(
+        RigidBodyKinematics(space), MultirotorNominal(4, torque=True), 4, 18, 12
+    )
 
 
 def load_with_code(path):

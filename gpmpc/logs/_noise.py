@@ -1,0 +1,244 @@
+"""Noise of a model of a log, from the errors of its rollouts.
+
+To first order the error of a rollout after k steps is the sum of the responses to the
+noise of every output at every step and to the error of the measured start. So its
+variance is linear in the variances of the sources, here for each output white noise and
+first-order autoregressions with a few time constants, and for each measured entry white
+measurement noise. Non-negative least squares on the mean squared errors at several steps
+find the variances. Errors one step ahead alone, on filtered rows, would understate them
+many times.
+"""
+
+import itertools
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from scipy.optimize import nnls
+
+from gpmpc._dynamics import Array
+from gpmpc.logs._fitting import PAST
+from gpmpc.logs._log import Log
+from gpmpc.models._log_dynamics import TIME_CONSTANTS, OutputNoise
+from gpmpc.models._log_model import LogModel
+from gpmpc.models._windows import Windows
+
+_STEPS = (1, 2, 3, 5, 7, 10, 15, 20, 30, 50)  # whose errors are explained
+_WINDOWS = 2000  # of a fold, whose errors count
+_LINEARIZED = 200  # of a fold, along which rollouts are linearised: these are slow
+_DIFFERENCE = 1e-6
+# times of the longest prediction: after which an error is forgotten, that a one weighs
+_FORGOTTEN = 6.0
+_PRIOR = 1.0
+
+
+def error_variances(
+    model: LogModel, windows: Windows, noise: OutputNoise, steps: Sequence[int]
+) -> Array:
+    """Computes the variances (W, steps, e) of a model's errors.
+
+    Args:
+        model: With its parameters.
+        windows: W of them, from whose starts is predicted.
+        noise: Of the model.
+        steps: After the starts.
+    """
+    variances = np.concatenate([noise.outputs.ravel(), noise.measurement])
+    return _responses(model, windows, steps) @ variances
+
+
+def follow_errors(
+    windows: Windows, errors: Array, variances: Array, steps: Sequence[int]
+) -> Array:
+    """Scales claimed variances by the errors of earlier predictions of the same run.
+
+    A run may be calmer or rougher than those that the noise was fitted to. For each
+    entry of the state and each step the scale is the mean of squared errors over claimed
+    variances of the predictions that were over before, weighted by exp(-age / (6 T)),
+    with a one of the weight T added, and T the time of the longest prediction (adaptive
+    conformal inference by variances instead of quantiles; Gibbs and Candes, 2021).
+
+    Args:
+        windows: W of them.
+        errors: Of predictions (W, steps, e).
+        variances: Claimed (W, steps, e).
+        steps: After the starts of the windows.
+
+    Returns:
+        The scaled variances (W, steps, e).
+    """
+    longest = max(steps) * windows.time_step
+    prior = _PRIOR * longest
+    scaled = variances.copy()
+    for run in np.unique(windows.runs):
+        rows = np.flatnonzero(windows.runs == run)
+        times = windows.times[rows]
+        spacing = float(times[-1] - times[0]) / max(len(rows) - 1, 1)
+        for k, step in enumerate(steps):
+            # A prediction that is just over has the age of half a step.
+            age = times[:, None] - times - (step - 0.5) * windows.time_step
+            decay = np.exp(-np.maximum(age, 0) / (_FORGOTTEN * longest))
+            weights = np.where(age > 0, spacing * decay, 0.0)
+            claimed = np.maximum(variances[rows, k], 1e-300)
+            ratios = errors[rows, k] ** 2 / claimed
+            total = prior + weights.sum(axis=1, keepdims=True)
+            scaled[rows, k] *= (prior + weights @ ratios) / total
+    return scaled
+
+
+class _FoldErrors(NamedTuple):
+    """Errors of the windows of one fold."""
+
+    squared: Array  # of rollouts (W, steps, e)
+    responses: Array  # to the sources, of fewer windows (V, steps, e, sources)
+    squared_residuals: Array  # of outputs one step ahead (W, o)
+
+
+def fit_noise(
+    models: Sequence[LogModel], logs: Sequence[Log], most: int
+) -> OutputNoise:
+    """Fits the noise that explains the errors of rollouts on held-out runs.
+
+    Where these do not tell the outputs of a group apart, as x from y while the heading
+    turns, the outputs share as the squares of their residuals one step ahead do.
+
+    Args:
+        models: One for each fold.
+        logs: The runs that the model of each fold was not fitted to.
+        most: Steps of the rollouts.
+    """
+    steps = [step for step in _STEPS if step <= most]
+    folds = [
+        _fold_errors(model, log, steps, most)
+        for model, log in zip(models, logs, strict=True)
+    ]
+    squared = np.concatenate([fold.squared for fold in folds]).mean(axis=0)
+    responses = np.concatenate([fold.responses for fold in folds]).mean(axis=0)
+    residuals = np.concatenate([fold.squared_residuals for fold in folds]).mean(axis=0)
+    relative = responses / np.maximum(squared, 1e-300)[..., None]
+    relative = relative.reshape(-1, responses.shape[-1])
+    factor = np.maximum(relative.max(axis=0), 1e-300)
+    sharing = _sharing_rows(models[0], factor, residuals)
+    regressors = np.vstack([relative / factor, sharing])
+    targets = np.r_[np.ones(len(relative)), np.zeros(len(sharing))]
+    variances = nnls(regressors, targets)[0] / factor
+    output_sources = len(TIME_CONSTANTS) * len(residuals)
+    return OutputNoise(
+        outputs=variances[:output_sources].reshape(len(TIME_CONSTANTS), -1),
+        measurement=variances[output_sources:],
+    )
+
+
+def _fold_errors(
+    model: LogModel, log: Log, steps: Sequence[int], most: int
+) -> _FoldErrors:
+    """Computes the errors of a fold, and its responses to the sources of noise."""
+    windows = log.windows(most, past=max(model.past, PAST), most=_WINDOWS)
+    stride = -(-len(windows) // _LINEARIZED)
+    past = windows.past
+    states = windows.states[:, past]
+    next_states = windows.states[:, past + 1]
+    inputs = windows.inputs[:, past - model.lag]
+    modelled = model.outputs(states, inputs, windows.context[:, past])
+    modelled = modelled + model.disturbance(windows)
+    measured = model.kinematics.outputs(states, next_states, windows.time_step)
+    return _FoldErrors(
+        squared=np.square(model.rollout_errors(windows, steps)),
+        responses=_responses(model, windows[::stride], steps),
+        squared_residuals=np.square(measured - modelled),
+    )
+
+
+def _sharing_rows(model: LogModel, factor: Array, residuals: Array) -> Array:
+    """Returns rows of least squares by which the outputs of a group share.
+
+    They are zero where the variances of two outputs share as the residuals do.
+
+    Args:
+        model: Has the groups.
+        factor: Of each source's variance in the least squares (sources,).
+        residuals: Mean squared residuals of the outputs (o,).
+    """
+    rows = []
+    o = len(residuals)
+    for first_source in range(0, len(TIME_CONSTANTS) * o, o):
+        for group in model.kinematics.output_groups.values():
+            for i, j in itertools.pairwise(group):
+                pair = [first_source + i, first_source + j]
+                scale = factor[pair] * np.maximum(residuals[[i, j]], 1e-300)
+                row = np.zeros(len(factor))
+                row[pair] = scale.min() / scale * [1.0, -1.0]
+                rows.append(row)
+    return np.array(rows).reshape(-1, len(factor))
+
+
+def _responses(model: LogModel, windows: Windows, steps: Sequence[int]) -> Array:
+    """Computes the variances of errors by a unit variance of every source.
+
+    Returns:
+        (W, steps, e, sources), the sources those of the outputs by time constant, then
+        the measurements.
+    """
+    A, B = _linearized_rollout(model, windows, max(steps))
+    W = len(windows)
+    e = A.shape[-1]
+    o = B.shape[-1]
+    output_sources = len(TIME_CONSTANTS) * o
+    responses = np.empty((W, len(steps), e, output_sources + e))
+    for s, step in enumerate(steps):
+        by_start = np.broadcast_to(np.eye(e), (W, e, e))
+        by_output = np.empty((step, W, e, o))
+        for i in range(step - 1, -1, -1):
+            by_output[i] = by_start @ B[:, i]
+            by_start = by_start @ A[:, i]
+        for t, constant in enumerate(TIME_CONSTANTS):
+            rho = np.exp(-windows.time_step / max(constant, 1e-9))
+            columns = slice(t * o, (t + 1) * o)
+            responses[:, s, :, columns] = _coloured_sum(by_output, rho)
+        responses[:, s, :, output_sources:] = np.square(by_start) + np.eye(e)
+    return responses
+
+
+def _coloured_sum(G: Array, rho: float) -> Array:
+    """Computes the sum over i, j of rho^|i - j| G_i G_j (W, e, o), in one pass."""
+    tail = np.zeros(G.shape[1:])
+    total = np.zeros(G.shape[1:])
+    for g in G:
+        total += g * (g + 2 * tail)
+        tail = rho * (tail + g)
+    return total
+
+
+def _linearized_rollout(
+    model: LogModel, windows: Windows, steps: int
+) -> tuple[Array, Array]:
+    """Linearises the steps of rollouts by forward differences.
+
+    Returns:
+        Derivatives of each step by the state (W, K, e, e) and by the outputs
+        (W, K, e, o).
+    """
+    space = windows.space
+    kinematics = model.kinematics
+    dt = windows.time_step
+    start = windows.past - model.lag
+    predicted = model.rollout(windows, steps)
+    first = windows.states[:, windows.past : windows.past + 1]
+    x = np.concatenate([first, predicted[:, :-1]], axis=1)
+    u = windows.inputs[:, start : start + steps]
+    c = windows.context[:, windows.past][:, None]
+    c = np.broadcast_to(c, (*x.shape[:-1], c.shape[-1]))
+    d = model.disturbance(windows)[:, None]
+    y = model.outputs(x, u, c) + d
+    after = kinematics.step(x, y, dt)
+    by_state = []
+    for h in _DIFFERENCE * np.eye(space.error_dim):
+        displaced = space.displace(x, h)
+        displaced_outputs = model.outputs(displaced, u, c) + d
+        displaced_after = kinematics.step(displaced, displaced_outputs, dt)
+        by_state.append(space.difference(displaced_after, after) / _DIFFERENCE)
+    by_output = []
+    for h in _DIFFERENCE * np.eye(y.shape[-1]):
+        displaced_after = kinematics.step(x, y + h, dt)
+        by_output.append(space.difference(displaced_after, after) / _DIFFERENCE)
+    return np.stack(by_state, axis=-1), np.stack(by_output, axis=-1)

@@ -1,0 +1,120 @@
+"""GPs on what the nominal part of a model of a log leaves."""
+
+import warnings
+
+import numpy as np
+import torch
+from scipy.cluster.vq import kmeans2
+from scipy.spatial import cKDTree
+
+from gpmpc._dynamics import Array
+from gpmpc.exceptions import DataError
+from gpmpc.gp import Trainer, standardize
+from gpmpc.gp._data_checks import Columns
+from gpmpc.logs._log import Log
+from gpmpc.models._log_model import LogModel, OutputGP
+
+
+def train_output_gp(
+    model: LogModel,
+    log: Log,
+    outputs: tuple[int, ...],
+    rows: int,
+    points: int,
+    seed: int,
+) -> OutputGP:
+    """Trains a GP on the residual of the nominal part of a model.
+
+    Args:
+        model: With fitted parameters.
+        log: The data.
+        outputs: Those that the GP adds to.
+        rows: Rows over which features and targets are averaged.
+        points: Rows that the GP is trained on.
+        seed: Of the choice of rows, and of the training.
+    """
+    features, residuals = _mean_residuals(model, log, rows)
+    chosen = choose_rows(features, points, seed)
+    targets = np.ascontiguousarray(residuals[chosen][:, list(outputs)])
+    columns = Columns(
+        features=model.kinematics.feature_names(
+            log.mapping.column_names("inputs"), log.mapping.column_names("context")
+        ),
+        outputs=[model.kinematics.output_names[output] for output in outputs],
+    )
+    trainer = Trainer(predicts="value", scaling=standardize, restarts=1, tolerance=1e-6)
+    training = trainer.fit(
+        torch.from_numpy(features[chosen]),
+        torch.from_numpy(targets),
+        0,
+        "value",
+        seed,
+        columns=columns,
+    )
+    return OutputGP(outputs, training.posterior)
+
+
+def _mean_residuals(model: LogModel, log: Log, rows: int) -> tuple[Array, Array]:
+    """Computes features (N, d) and residuals (N, o) of the means over some rows.
+
+    The features are those of the row in the middle.
+    """
+    kinematics = model.kinematics
+    windows = log.windows(rows, past=model.lag)
+    start = windows.past
+    states = windows.states[:, start : start + rows]
+    next_states = windows.states[:, start + 1 : start + rows + 1]
+    first_input = start - model.lag
+    inputs = windows.inputs[:, first_input : first_input + rows]
+    context = windows.context[:, -1:]
+    context = np.broadcast_to(context, (*states.shape[:-1], context.shape[-1]))
+    if kinematics.space.angles:  # these may turn by more than half a turn
+        outputs = kinematics.outputs(states, next_states, windows.time_step)
+        measured = outputs.mean(axis=1)
+    else:
+        duration = windows.time_step * rows
+        measured = kinematics.outputs(states[:, 0], next_states[:, -1], duration)
+    nominal = model.nominal.outputs(model.theta, states, inputs, context).mean(axis=1)
+    middle = rows // 2
+    features = kinematics.features(
+        states[:, middle], inputs[:, middle], context[:, middle]
+    )
+    return features, measured - nominal
+
+
+def choose_rows(features: Array, count: int, seed: int = 0) -> np.ndarray:
+    """Chooses rows nearest to the centres of k-means.
+
+    It begins with farthest points, so that rare states count.
+
+    Args:
+        features: (N, d); they are standardised here.
+        count: Number of rows; all N where there are no more.
+        seed: Of the rows among which the centres are found.
+
+    Raises:
+        DataError: There is no row.
+    """
+    if not len(features):
+        raise DataError("no row to choose from")
+    if len(features) <= count:
+        return np.arange(len(features))
+    deviations = np.maximum(features.std(axis=0), 1e-12)
+    z = (features - features.mean(axis=0)) / deviations
+    sample = z[np.random.default_rng(seed).permutation(len(z))[: 10 * count]]
+    farthest = _farthest_points(sample, count)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # a centre that loses its members stays
+        centres = kmeans2(sample, sample[farthest], iter=5, minit="matrix")[0]
+    return np.unique(cKDTree(z).query(centres)[1])
+
+
+def _farthest_points(points: Array, count: int) -> list[int]:
+    """Chooses points each of which is farthest from those before (Gonzalez, 1985)."""
+    chosen = [0]
+    squared_distance = np.full(len(points), np.inf)
+    while len(chosen) < count:
+        to_last = np.square(points - points[chosen[-1]]).sum(axis=1)
+        squared_distance = np.minimum(squared_distance, to_last)
+        chosen.append(int(squared_distance.argmax()))
+    return chosen

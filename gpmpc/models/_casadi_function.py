@@ -1,0 +1,124 @@
+"""Functions that are written in CasADi, as parts of models."""
+
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gpmpc._dynamics import Array, to_array
+from gpmpc.exceptions import UnsupportedModel
+
+
+class CasadiFunction:
+    """A function that is written in CasADi, linearised at all points in one call.
+
+    Its operations are read once and run by compiled loops (``gpmpc._kernels.tape``), or
+    by CasADi where it calls what is no expression. It serves as nominal model, (state
+    (n,), input (m,)) to the next state (n,), and as effect B(x), state (n,) to (n, k).
+    It is evaluated in double precision on the CPU, and torch cannot differentiate it.
+
+    Raises:
+        UnsupportedModel: It is no CasADi function, or has no argument, or more than one
+            value.
+    """
+
+    def __init__(self, function: Any):
+        from gpmpc.gp.casadi_ import tape_of  # loads CasADi
+
+        is_function = hasattr(function, "n_in")
+        if not is_function or function.n_out() != 1 or not function.n_in():
+            rule = "CasadiFunction takes a CasADi function of one value"
+            raise UnsupportedModel(f"{rule}; got {function!r}")
+        if any(function.size2_in(i) != 1 for i in range(function.n_in())):
+            rule = "a CasADi function takes vectors (column by column)"
+            raise UnsupportedModel(f"{rule}; got {function!r}")
+        self.function = function
+        self.tape = tape_of(function)
+        self.shape = function.size1_out(0), function.size2_out(0)
+        self.sizes = [function.size1_in(i) for i in range(function.n_in())]
+        self._mapped_expansions: dict[int, Any] = {}  # by the number of points
+
+    @cached_property
+    def _expansion(self) -> Any:
+        """Value and derivatives as a CasADi function."""
+        arguments = self.function.name_in()
+        value = self.function.name_out(0)
+        jacobians = [f"jac:{value}:{argument}" for argument in arguments]
+        return self.function.factory("expansion", arguments, [value, *jacobians])
+
+    def check_sizes(self, arguments: tuple[int, ...], value: tuple[int, int]) -> None:
+        """Raises ``UnsupportedModel`` unless arguments and value have these sizes."""
+        if (tuple(self.sizes), self.shape) != (arguments, value):
+            rule = f"must map vectors of {arguments} entries to a matrix of {value}"
+            raise UnsupportedModel(
+                f"a CasADi function of this model {rule}; got {self.function}"
+            )
+
+    def __call__(self, *arguments: Tensor) -> Tensor:
+        """Computes the value (*batch, rows), or (*batch, rows, columns) of a matrix.
+
+        Args:
+            arguments: (*batch, d_i) each.
+        """
+        like = arguments[0]
+        points = [
+            to_array(argument).reshape(-1, size)
+            for argument, size in zip(arguments, self.sizes, strict=True)
+        ]
+        values, *_ = self.linearize(*points)
+        value = torch.as_tensor(values, dtype=like.dtype, device=like.device)
+        return value.reshape(*like.shape[:-1], *value.shape[1:])
+
+    def linearize(self, *arguments: Array) -> tuple[Array, ...]:
+        """Computes values and derivatives at K points.
+
+        Args:
+            arguments: (K, d_i) each.
+
+        Returns:
+            The values (K, rows) and their derivatives by each argument (K, rows, d_i);
+            of a matrix (K, rows, columns) and (K, rows, columns, d_i).
+        """
+        has_tape = self.tape is not None
+        linearize = self._linearize_tape if has_tape else self._linearize_by_casadi
+        parts = linearize(*arguments)
+        rows, columns = self.shape
+        if columns > 1:  # a matrix goes column by column
+            K = len(arguments[0])
+            parts = [
+                part.reshape(K, columns, rows, *part.shape[2:]).swapaxes(1, 2)
+                for part in parts
+            ]
+        return tuple(np.ascontiguousarray(part) for part in parts)
+
+    def _linearize_tape(self, *arguments: Array) -> list[Array]:
+        """Linearises by compiled loops: (K, size), and (K, size, d_i) each."""
+        from gpmpc._kernels.tape import linearize_tape  # loads numba
+
+        K = len(arguments[0])
+        rows, columns = self.shape
+        points = np.ascontiguousarray(np.hstack(arguments))
+        values = np.empty((K, rows * columns))
+        jacobian = np.empty((K, rows * columns, points.shape[1]))
+        linearize_tape.unchecked(self.tape, points, values, jacobian)
+        ends = np.cumsum(self.sizes)[:-1]
+        return [values, *np.split(jacobian, ends, axis=2)]
+
+    def _linearize_by_casadi(self, *arguments: Array) -> list[Array]:
+        """Linearises by CasADi: (K, size), and (K, size, d_i) each."""
+        K = len(arguments[0])
+        rows, columns = self.shape
+        size = rows * columns
+        if K not in self._mapped_expansions:
+            self._mapped_expansions[K] = self._expansion.map(K)
+        expansion = self._mapped_expansions[K]
+        value, *jacobians = [
+            part.full() for part in expansion.call([a.T for a in arguments])
+        ]
+        values = value.reshape(rows, K, columns).transpose(1, 2, 0).reshape(K, size)
+        by_arguments = [
+            jacobian.reshape(size, K, -1).swapaxes(0, 1) for jacobian in jacobians
+        ]
+        return [values, *by_arguments]

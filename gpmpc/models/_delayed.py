@@ -1,0 +1,169 @@
+"""Models whose inputs act late."""
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gpmpc._arrays import read_array
+from gpmpc._dynamics import DynamicsModel, check_next_states
+from gpmpc.exceptions import ShapeError, check_number
+from gpmpc.gaussian import Gaussian
+from gpmpc.models._wrapper import LinearPart, LinearWrapper
+from gpmpc.signals import signals_of
+
+
+@dataclass(frozen=True)
+class DelayedModel(LinearWrapper):
+    """A model whose input acts late, by a whole or a fractional number of steps.
+
+    The state holds the pending inputs, those on their way: z = (x, u_{k-D}, ..,
+    u_{k-1}), D the delay rounded up. With a delay of D - 1 + w steps, 0 < w <= 1, the
+    input that acts within step k changes from u_{k-D} to u_{k-D+1} after the part w of
+    it; the model takes their mean, exact to first order in the time step (Franklin,
+    Powell and Workman, 1998, section 4.3, for linear systems):
+
+        x[k+1] = f(x[k], w u_{k-D} + (1 - w) u_{k-D+1}),
+
+    and the other inputs move on by a place. A controller plans with it, or, with fewer
+    states, with the undelayed model from the state to which the pending inputs will have
+    led (``ahead``; the prediction of Smith, 1957, in state space).
+
+    Raises:
+        SettingError: The delay is no positive number, or the model does not predict next
+            states.
+    """
+
+    model: DynamicsModel  #: without the delay, of n states and m inputs
+    delay: float  #: in steps, more than zero; a fraction is allowed
+
+    def __post_init__(self) -> None:
+        check_number("delay", self.delay, above=0, unit="[steps]")
+        check_next_states(self.model)
+
+    @property
+    def pending(self) -> int:
+        """Number of pending inputs, D: the delay rounded up."""
+        return math.ceil(self.delay)
+
+    @property
+    def _older_weight(self) -> float:
+        """Part w of a step in which the older of two inputs acts."""
+        return self.delay - (self.pending - 1)
+
+    @property
+    def _further_names(self) -> list[str]:
+        """Names of the pending inputs, the oldest first."""
+        names = signals_of(self.model).input_names
+        if not names:
+            names = tuple(f"u{i + 1}" for i in range(self.input_dim))
+        ages = range(self.pending, 0, -1)
+        return [f"{name}[k-{age}]" for age in ages for name in names]
+
+    @property
+    def state_dim(self) -> int:
+        """Number of states, n + D m."""
+        return self.model.state_dim + self.pending * self.model.input_dim
+
+    @property
+    def noise_covariance(self) -> Tensor:
+        """Covariance of the observations' noise; pending inputs have none."""
+        return self._padded(self.model.noise_covariance)
+
+    @cached_property
+    def linear_part(self) -> LinearPart:
+        """The matrices Z, W, L and M.
+
+        A mean of the two oldest inputs acts, and the others move on by a place.
+        """
+        n = self.model.state_dim
+        m = self.input_dim
+        D = self.pending
+        w = self._older_weight
+        # By the queue (u_{k-D}, .., u_{k-1}, u_k), the pending inputs and the new one:
+        queue = np.eye((D + 1) * m)
+        acting_by_queue = w * queue[:m] + (1 - w) * queue[m : 2 * m]
+        next_by_queue = np.vstack([np.zeros((n, len(queue))), queue[m:]])
+        new = slice(D * m, None)
+        pending = slice(0, D * m)
+        return LinearPart(
+            Z=np.hstack([np.zeros((m, n)), acting_by_queue[:, pending]]),
+            W=acting_by_queue[:, new],
+            L=np.hstack([np.zeros((n + D * m, n)), next_by_queue[:, pending]]),
+            M=next_by_queue[:, new],
+        )
+
+    def augmented(self, belief: Gaussian, inputs: Any) -> Gaussian:
+        """Returns the belief over z, from one over x.
+
+        Args:
+            belief: Over x (*batch, n).
+            inputs: u_{k-D} .. u_{k-1} (D, m), the oldest first.
+
+        Raises:
+            ShapeError: Another number of inputs.
+        """
+        belief = belief.in_order(signals_of(self.model).state_names)
+        pending = self._pending_inputs(belief, inputs).flatten(-2)
+        batch = belief.mean.shape[:-1]
+        pending = pending.expand(*batch, self.pending * self.input_dim)
+        mean = torch.cat([belief.mean, pending], dim=-1)
+        return Gaussian(mean, self._padded(belief.covariance))
+
+    @cached_property
+    def remaining(self) -> DynamicsModel:
+        """The model to plan with from the state of ``ahead``.
+
+        It has no delay, or one of the fraction of a step.
+        """
+        if self._older_weight == 1:
+            return self.model
+        return DelayedModel(self.model, self._older_weight)
+
+    @property
+    def lead(self) -> int:
+        """Number of steps by which ``ahead`` looks ahead: a reference begins later."""
+        return math.floor(self.delay)
+
+    def ahead(self, propagator: Any, belief: Gaussian, inputs: Any) -> Gaussian:
+        """Predicts the belief over the state of ``remaining`` after pending inputs.
+
+        Args:
+            propagator: Moves the belief, with the process noise or without.
+            belief: Over the x of now (*batch, n).
+            inputs: u_{k-D} .. u_{k-1} (D, m), the oldest first.
+
+        Raises:
+            ShapeError: Another number of inputs.
+        """
+        pending = self._pending_inputs(belief, inputs)
+        w = self._older_weight
+        for k in range(self.lead):
+            acting = pending[k]
+            if w != 1:
+                acting = w * pending[k] + (1 - w) * pending[k + 1]
+            belief = propagator(self.model, belief, acting)
+        if w == 1:
+            return belief
+        return DelayedModel(self.model, w).augmented(belief, pending[-1:])
+
+    def _pending_inputs(self, belief: Gaussian, inputs: Any) -> Tensor:
+        """Reads pending inputs (D, m) as a tensor like the belief's."""
+        if not isinstance(inputs, Tensor) or inputs.is_complex():
+            names = signals_of(self.model).input_names
+            inputs = np.array(read_array("inputs", inputs, names))
+        pending = torch.as_tensor(
+            inputs, dtype=belief.mean.dtype, device=belief.mean.device
+        )
+        shape = (self.pending, self.input_dim)
+        if pending.shape != shape:
+            rule = (
+                f"a delay of {self.delay:g} steps needs the last inputs {shape}, "
+                "the oldest first"
+            )
+            raise ShapeError(f"{rule}; got {tuple(pending.shape)}")
+        return pending

@@ -1,0 +1,130 @@
+"""Models whose noise varies with state and input."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gpmpc._dynamics import (
+    Array,
+    DynamicsModel,
+    Linearized,
+    check_next_states,
+    linearize,
+    to_array,
+)
+from gpmpc.exceptions import SettingError, ShapeError
+from gpmpc.gaussian import Gaussian
+from gpmpc.gp import GPPosterior
+from gpmpc.models._tensors import check_like, move
+from gpmpc.models._wrapper import Wrapper
+
+
+@dataclass(frozen=True)
+class NoisyModel(Wrapper):
+    """A model whose predictions contain its noise, a GP on its logarithm.
+
+        x[k+1] = f(x[k], u[k]) + e[k],   e_i ~ N(0, sigma_i^2(x, u))
+        log sigma_i^2 = g_i ~ N(m_i, v_i) a posteriori
+
+    (Goldberg, Williams and Bishop, 1998). The variance that is used is the mean of
+    sigma_i^2 given the data, exp(m_i + v_i / 2). Everything that predicts counts the
+    noise once: the covariances of ``predict`` and ``linearize`` contain all of it and
+    ``noise_covariance`` is zero, so that a propagator gives the same with
+    ``process_noise`` and without. Linearisations hold the covariance at their points.
+    ``MomentMatching``, which has no closed form for it, raises ``UnsupportedModel``.
+
+    Raises:
+        SettingError: ``outputs`` are no distinct outputs of the model, which predicts
+            next states, or type or device of the GPs are others.
+        ShapeError: The GPs have other states, inputs or outputs.
+    """
+
+    model: DynamicsModel  #: f, of n states and m inputs
+    log_noise: GPPosterior  #: g, over (x, u), with ``predicts="value"``: an output each
+    #: the states whose noise g describes, in its order; the others keep that of the model
+    outputs: Sequence[int]
+
+    to = move
+
+    def __post_init__(self) -> None:
+        n, m = check_next_states(self.model)
+        g = self.log_noise
+        if getattr(g, "predicts", None) != "value":
+            got = repr(g.predicts) if isinstance(g, GPPosterior) else type(g).__name__
+            rule = "must be a GPPosterior, and must predict 'value'"
+            raise SettingError("log_noise", f"{rule}; got {got}")
+        check_like("log_noise", g, self)
+        _check_outputs(self.outputs, n)
+        k = len(self.outputs)
+        dimensions = (g.state_dim, g.input_dim, g.output_dim)
+        if dimensions != (n, m, k):
+            rule = f"log_noise must have {n} states, {m} inputs and {k} outputs"
+            raise ShapeError(f"{rule}; got {dimensions}")
+
+    @property
+    def noise_covariance(self) -> Tensor:
+        """Zero (n, n): ``predict`` contains the noise."""
+        return torch.zeros_like(self.model.noise_covariance)
+
+    def noise(self, state: Tensor, input: Tensor) -> Tensor:
+        """Computes the covariance of the noise (*batch, n, n).
+
+        Args:
+            state: (*batch, n).
+            input: (*batch, m).
+        """
+        g = self.log_noise.predict(state, input)
+        variances = (g.mean + g.variance / 2).exp() @ self._selection
+        return self._constant_noise + torch.diag_embed(variances)
+
+    def predict(self, state: Tensor, input: Tensor) -> Gaussian:
+        """Predicts the next state with its noise.
+
+        Args:
+            state: (*batch, n).
+            input: (*batch, m).
+        """
+        belief = self.model.predict(state, input)
+        return Gaussian(belief.mean, belief.covariance + self.noise(state, input))
+
+    def linearize(
+        self, states: Array, inputs: Array, covariance: bool = True
+    ) -> Linearized:
+        """Linearises f at K points (K, n), (K, m); covariances contain the noise."""
+        inner = linearize(self.model, states, inputs, covariance)
+        if inner.covariance is None:
+            return inner
+        g = self.log_noise.linearize(states, inputs)
+        assert g.covariance is not None
+        log_variances = np.einsum("kii->ki", g.covariance)
+        outputs = list(self.outputs)
+        V = inner.covariance + to_array(self._constant_noise)
+        V[:, outputs, outputs] += np.exp(g.mean + log_variances / 2)
+        return inner._replace(covariance=V)
+
+    @cached_property
+    def _selection(self) -> Tensor:
+        """Rows of the identity (k, n), one for each of the outputs."""
+        identity = torch.eye(self.state_dim, dtype=self.dtype, device=self.device)
+        return identity[list(self.outputs)]
+
+    @cached_property
+    def _constant_noise(self) -> Tensor:
+        """Covariance of the model's noise without the outputs of g (n, n)."""
+        is_constant = 1 - self._selection.sum(0)
+        return is_constant[:, None] * self.model.noise_covariance * is_constant
+
+
+def _check_outputs(outputs: Sequence[int], n: int) -> None:
+    """Raises ``SettingError`` unless outputs are distinct indices of n states."""
+    is_list = hasattr(outputs, "__len__") and len(outputs) > 0
+    if not is_list or not all(type(i) is int for i in outputs):
+        rule = "must be a list of whole numbers"
+        raise SettingError("outputs", f"{rule}; got {outputs!r}")
+    if len(set(outputs)) < len(outputs) or not set(outputs) <= set(range(n)):
+        rule = f"must be distinct, of 0 .. {n - 1}"
+        raise SettingError("outputs", f"{rule}; got {list(outputs)}")

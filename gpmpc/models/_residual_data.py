@@ -1,0 +1,188 @@
+"""Data of a residual GP: the error of a nominal model, as far as an effect B reaches it."""
+
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from functools import partial
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from gpmpc._angles import state_difference, whole_turns
+from gpmpc._dynamics import to_array
+from gpmpc._functions import call
+from gpmpc.exceptions import SettingError, ShapeError
+from gpmpc.gaussian import check_tensors
+from gpmpc.gp import Transitions
+from gpmpc.gp._data_checks import RESOLUTION, Columns, signal_names
+from gpmpc.models._features import Features
+from gpmpc.models._nominal import linearize_function
+
+Nominal = Callable[[Tensor, Tensor], Tensor]
+Effect = Tensor | Callable[[Tensor], Tensor]
+
+
+def nominal_next_state(
+    nominal: Nominal, state: Tensor, input: Tensor, angles: Sequence[int]
+) -> Tensor:
+    """Computes f0 (*batch, n) with a check of its shape.
+
+    A wrong number of states would otherwise be broadcast. A function that wraps angles
+    gives them within half a turn of the state's: plans count turns.
+
+    Raises:
+        SettingError: The value is no tensor.
+        ShapeError: It has another shape than the state.
+    """
+    value = call("nominal", nominal, state, input)
+    if not isinstance(value, Tensor):
+        got = type(value).__name__
+        raise SettingError("nominal", f"must give a torch tensor; got {got}")
+    if value.shape != state.shape:
+        rule = "nominal must give next states of the states' shape"
+        got = tuple(value.shape)
+        raise ShapeError(f"{rule} {tuple(state.shape)}; got {got}")
+    if not len(angles) or hasattr(nominal, "linearize"):
+        return value
+    columns = list(angles)
+    turns = torch.zeros_like(value)
+    turns[..., columns] = whole_turns((value - state)[..., columns])
+    return value - turns
+
+
+def effect_matrix(B: Effect, state: Tensor) -> Tensor:
+    """Computes B (n, k), or of a function (*batch, n, k), at states (*batch, n).
+
+    Raises:
+        ShapeError: It has another number of rows.
+    """
+    if not callable(B):
+        check_tensors(B=B)
+        _check_rows(B, state.shape[-1:])
+        return B
+    value: Any = call("B", B, state)
+    check_tensors(B=value)
+    if value.shape == state.shape:  # one output
+        value = value[..., None]
+    _check_rows(value, state.shape)
+    return value
+
+
+def _check_rows(B: Tensor, rows: torch.Size) -> None:
+    """Raises ``ShapeError`` unless an effect has these dimensions besides its last."""
+    if B.shape[:-1] != rows:
+        expected = ", ".join(map(str, rows))
+        got = tuple(B.shape)
+        raise ShapeError(f"B must be ({expected}, k), a row a state; got {got}")
+
+
+class ResidualData(NamedTuple):
+    """What a residual GP is trained on."""
+
+    features: Tensor  # of states and inputs (N, d)
+    targets: Tensor  # the least-squares part of the error of f0 (N, k)
+
+
+def residual_data(
+    nominal: Nominal,
+    B: Effect,
+    features: Features,
+    transitions: Transitions,
+    like: Tensor,
+) -> ResidualData:
+    """Computes features and targets of a residual GP.
+
+    Args:
+        nominal: f0.
+        B: Effect of the GP.
+        features: What the GP sees.
+        transitions: N of them.
+        like: Has the type and the device of what is computed.
+
+    Raises:
+        SettingError: The columns of B depend on each other.
+    """
+    states = transitions.states.to(device=like.device, dtype=like.dtype)
+    inputs = transitions.inputs.to(device=like.device, dtype=like.dtype)
+    next_states = transitions.next_states.to(device=like.device, dtype=like.dtype)
+    effect = effect_matrix(B, states)
+    if int(torch.linalg.matrix_rank(effect).min()) < effect.shape[-1]:
+        rule = "must have linearly independent columns"
+        raise SettingError("B", f"{rule}: equal effects cannot be distinguished")
+    predicted = nominal_next_state(nominal, states, inputs, features.angles)
+    error = state_difference(next_states, predicted, features.angles)
+    # torch.linalg.lstsq gives other last digits from call to call.
+    Q, R = torch.linalg.qr(effect)
+    if callable(B):
+        columns = torch.linalg.solve_triangular(R, Q.mT @ error[..., None], upper=True)
+        targets = columns[..., 0]
+    else:
+        targets = torch.linalg.solve_triangular(R, Q.mT @ error.mT, upper=True).mT
+    return ResidualData(torch.cat(features(states, inputs), dim=1), targets)
+
+
+def residual_columns(
+    transitions: Transitions, B: Effect, features: Features
+) -> Columns:
+    """Describes features and targets of a residual: their names and magnitudes.
+
+    A residual is the difference of two states, seen through the pseudo-inverse of B,
+    and its round-off is that of the states. Where no data were seen it may be as much
+    as a step changes: there the nominal model is right, or it is not.
+    """
+    pseudo_inverse = torch.linalg.pinv(effect_matrix(B, transitions.states))
+    states = transitions.states
+    next_states = transitions.next_states
+    larger = torch.maximum(states.abs(), next_states.abs())
+    magnitudes = (pseudo_inverse.abs() @ larger[..., None]).amax(dim=0)[:, 0]
+    steps = (pseudo_inverse @ (next_states - states)[..., None])[..., 0]
+    deviations = steps.std(dim=0, correction=0)
+    deviations = torch.where(deviations > RESOLUTION, deviations, 1.0)
+    return Columns(
+        features=_feature_names(transitions, features),
+        outputs=_output_names(transitions, B, pseudo_inverse),
+        magnitudes=magnitudes.detach().numpy(force=True),
+        deviations=deviations.detach().numpy(force=True),
+    )
+
+
+def _feature_names(transitions: Transitions, features: Features) -> list[str]:
+    """Names the features, and the selected inputs."""
+    states, inputs = signal_names(transitions)
+    names: list[str] = []
+    for i in features.states:
+        if i in features.angles:
+            names += [f"sine of {states[i]}", f"cosine of {states[i]}"]
+        else:
+            names.append(states[i])
+    return names + [inputs[j] for j in features.inputs]
+
+
+def _output_names(
+    transitions: Transitions, B: Effect, pseudo_inverse: Tensor
+) -> list[str]:
+    """Names the outputs of a residual: by the states where B is the identity."""
+    if not callable(B):
+        identity = torch.eye(len(pseudo_inverse)).to(pseudo_inverse)
+        if torch.equal(pseudo_inverse, identity):
+            states, _ = signal_names(transitions)
+            return [f"what is missed of {name}" for name in states]
+    outputs = pseudo_inverse.shape[-2]
+    return [f"output {a + 1} of the residual" for a in range(outputs)]
+
+
+def check_derivatives(nominal: Nominal, B: Effect, transitions: Transitions) -> None:
+    """Raises ``SettingError`` where torch cannot follow a function.
+
+    Training asks for no derivative: only a controller would come upon it. Errors of
+    shape are left to the computation of the residuals, which names all rows.
+    """
+    x = to_array(transitions.states[:2])
+    u = to_array(transitions.inputs[:2])
+    with suppress(ShapeError):
+        if not hasattr(nominal, "linearize"):
+            checked = partial(nominal_next_state, nominal, angles=())
+            linearize_function(checked, transitions.states, x, u)
+        if callable(B) and not hasattr(B, "linearize"):
+            checked_effect = partial(effect_matrix, B)
+            linearize_function(checked_effect, transitions.states, x)

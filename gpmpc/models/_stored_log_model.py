@@ -1,0 +1,278 @@
+"""Models of logs in files: their layout, and its checks.
+
+The header has ``groups``, ``kinematics``, ``nominal``, ``history``, ``lag``, ``gps``,
+``names`` and ``time_step``; the tensors are ``theta``, ``noise/...`` and those of the
+GPs, ``gp0/...``. ``gpmpc.logs`` adds the record of the identification.
+"""
+
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gpmpc._dynamics import Array
+from gpmpc.exceptions import DataError, SettingError, check_choice, check_number
+from gpmpc.gp._storage import (
+    consistent,
+    posterior_of_parts,
+    posterior_parts,
+    read_model,
+)
+from gpmpc.models._kinematics import Increments, Kinematics, RigidBodyKinematics
+from gpmpc.models._log_dynamics import TIME_CONSTANTS, LogDynamics, OutputNoise
+from gpmpc.models._log_model import LogModel, OutputGP
+from gpmpc.models._older_files import STILL
+from gpmpc.models._parametric import AffineNominal, MultirotorNominal
+from gpmpc.models._state_space import StateGroup, StateSpace
+from gpmpc.models._stored_values import tensors_below, texts
+from gpmpc.signals import Signals
+
+LOG_MODEL = "LogModel"  # the kind of the files
+_RIGID_BODY = "RigidBody"  # as files call its kinematics
+_KINDS_OF_GROUPS = ("vector", "angle", "quaternion")
+_LONGEST = 10_000  # rows that a model from a file looks back
+_SLOWEST = 1e9  # time step of a model from a file [s]
+_MOST = 2048  # states, inputs or context of a model from a file
+
+
+class NamedLogModel(NamedTuple):
+    """A model of a log, with its noise and the names of its signals."""
+
+    model: LogModel
+    noise: OutputNoise
+    state_names: tuple[str, ...]
+    input_names: tuple[str, ...]
+    context_names: tuple[str, ...]
+    time_step: float
+
+
+def log_model_parts(
+    path: Path, named: NamedLogModel
+) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    """Returns the header and the tensors of a model of a log.
+
+    Raises:
+        SettingError: The nominal model is a user's own, which a file of numbers cannot
+            hold.
+    """
+    model = named.model
+    tensors = {
+        "theta": torch.from_numpy(model.theta),
+        "noise/outputs": torch.from_numpy(named.noise.outputs),
+        "noise/measurement": torch.from_numpy(named.noise.measurement),
+    }
+    gps = []
+    for i, gp in enumerate(model.gps):
+        gp_header, gp_tensors = posterior_parts(path, gp.posterior)
+        gps.append([gp.outputs, gp_header])
+        for key, tensor in gp_tensors.items():
+            tensors[f"gp{i}/{key}"] = tensor
+    is_rigid_body = isinstance(model.kinematics, RigidBodyKinematics)
+    header = {
+        "groups": [asdict(group) for group in model.kinematics.space.groups],
+        "kinematics": _RIGID_BODY if is_rigid_body else "Increments",
+        "nominal": _nominal_header(model.nominal),
+        "history": model.history,
+        "lag": model.lag,
+        "gps": gps,
+        "names": [named.state_names, named.input_names, named.context_names],
+        "time_step": named.time_step,
+    }
+    return header, tensors
+
+
+def _nominal_header(nominal: Any) -> list[Any]:
+    """Returns the name and the settings of a nominal model."""
+    name = type(nominal).__name__
+    if isinstance(nominal, MultirotorNominal):
+        return [name, asdict(nominal)]
+    if isinstance(nominal, AffineNominal):
+        return [name, {"fitted": nominal.fitted}]
+    rule = "only nominal models of gpmpc.models can be saved"
+    raise SettingError("nominal", f"{rule}; got {name}")
+
+
+def read_log_dynamics(path: Path) -> LogDynamics:
+    """Reads a model of a log that a controller can plan with.
+
+    Raises:
+        DataError: The file is damaged, of another kind or of a newer format.
+        SettingError: No controller can plan with the model.
+    """
+    header, tensors = read_model(path, LOG_MODEL)
+    with consistent(path, f"not a readable {LOG_MODEL}"):
+        named = log_model_of_parts(path, header, tensors)
+    if named.context_names:
+        context = ", ".join(named.context_names)
+        rule = f"needs a context ({context}), which is not known in flight"
+        raise SettingError("model", f"{path} {rule}")
+    return LogDynamics(
+        model=named.model,
+        input_dim=len(named.input_names),
+        time_step=named.time_step,
+        noise=named.noise,
+        signals=Signals(named.state_names, named.input_names, named.time_step),
+    )
+
+
+def log_model_of_parts(
+    path: Path, header: Mapping[str, Any], tensors: Mapping[str, Tensor]
+) -> NamedLogModel:
+    """Makes a model of a log of a file's header and tensors.
+
+    Raises:
+        DataError: The parts do not belong together.
+    """
+    state_values, input_values, context_values, *_ = header["names"]
+    input_names = texts("input_names", input_values)
+    context_names = texts("context_names", context_values)
+    kinematics = _kinematics(header["kinematics"], _space(header["groups"]))
+    features = kinematics.features(
+        states=kinematics.space.origin[None],
+        inputs=np.zeros((1, len(input_names))),
+        context=np.zeros((1, len(context_names))),
+    )
+    feature_count = features.shape[1]
+    gps = []
+    for i, (outputs, posterior_header) in enumerate(header["gps"]):
+        posterior_tensors = tensors_below(f"gp{i}", tensors)
+        posterior = posterior_of_parts(path, posterior_header, posterior_tensors)
+        gps.append(OutputGP(tuple(outputs), posterior))
+        _check_gp(gps[-1], feature_count)
+    model = LogModel(
+        kinematics=kinematics,
+        nominal=_nominal(header["nominal"], kinematics, input_names, context_names),
+        theta=tensors["theta"].numpy(),
+        history=tuple(header["history"]),
+        lag=header["lag"],
+        gps=tuple(gps),
+    )
+    noise = OutputNoise(
+        outputs=tensors["noise/outputs"].numpy(),
+        measurement=tensors["noise/measurement"].numpy(),
+    )
+    named = NamedLogModel(
+        model=model,
+        noise=noise,
+        state_names=texts("state_names", state_values),
+        input_names=input_names,
+        context_names=context_names,
+        time_step=header["time_step"],
+    )
+    _check_named(named)
+    _check_model(model, feature_count)
+    _check_noise(noise, kinematics)
+    return named
+
+
+def _space(groups: Any) -> StateSpace:
+    """Makes a state space of the groups in a header."""
+    state_groups = []
+    for fields in groups:
+        entries = texts("entries", fields["entries"])
+        group = StateGroup(**fields | {"entries": entries})
+        check_choice("kind", group.kind, _KINDS_OF_GROUPS)
+        if not entries or (group.kind == "quaternion" and len(entries) != 4):
+            raise DataError(f"a {group.kind} cannot have {len(entries)} entries")
+        state_groups.append(group)
+    return StateSpace(tuple(state_groups))
+
+
+def _kinematics(name: str, space: StateSpace) -> Kinematics:
+    """Makes kinematics of their name in a file."""
+    if name != _RIGID_BODY:
+        return Increments(space)
+    groups = [(group.kind, len(group.entries)) for group in space.groups]
+    vector = ("vector", 3)
+    if groups != [vector, ("quaternion", 4), vector, vector]:
+        raise DataError("a rigid body has position, attitude, velocity and rate")
+    return RigidBodyKinematics(space)
+
+
+def _nominal(
+    name_and_settings: Any,
+    kinematics: Kinematics,
+    input_names: tuple[str, ...],
+    context_names: tuple[str, ...],
+) -> MultirotorNominal | AffineNominal:
+    """Makes a nominal model of its name and settings."""
+    name, settings = name_and_settings
+    if name != "MultirotorNominal":
+        return AffineNominal(kinematics, settings.get("fitted", name != STILL))
+    motors = settings["motors"]
+    inputs = len(input_names)
+    if type(motors) is not int or motors != inputs:
+        raise DataError(f"a multirotor of {inputs} inputs has no {motors!r:.80} motors")
+    voltage = settings.get("voltage", 0.0)
+    check_number("voltage", voltage, least=0)
+    if voltage and not context_names:
+        raise DataError("a multirotor whose voltage counts has it in its context")
+    if not isinstance(kinematics, RigidBodyKinematics):
+        raise DataError("a multirotor is a rigid body")
+    return MultirotorNominal(**settings)
+
+
+def _check_gp(gp: OutputGP, feature_count: int) -> None:
+    """Raises ``DataError`` unless a GP predicts its outputs of the features."""
+    posterior = gp.posterior
+    dimensions = (posterior.state_dim, posterior.input_dim, posterior.output_dim)
+    expected = (feature_count, 0, len(gp.outputs))
+    if posterior.predicts != "value" or dimensions != expected:
+        rule = f"a GP must predict {gp.outputs!r:.80} of {feature_count} features"
+        raise DataError(rule)
+
+
+def _check_named(named: NamedLogModel) -> None:
+    """Raises unless names and time step are those of the model."""
+    n = named.model.kinematics.space.dim
+    if max(n, len(named.input_names), len(named.context_names)) > _MOST:
+        raise DataError(f"the model has more than {_MOST} states or inputs")
+    check_number("time_step", named.time_step, above=0, unit="[s]")
+    if named.time_step > _SLOWEST:
+        raise DataError(f"time_step must be {_SLOWEST:g} s at most")
+    if len(named.state_names) != n:
+        raise DataError(f"must have {n} names of states; got {named.state_names}")
+
+
+def _check_model(model: LogModel, feature_count: int) -> None:
+    """Raises unless parameters, rows of the past and outputs are those of the model."""
+    _check_rows("lag", model.lag)
+    for rows in model.history:
+        _check_rows("history", rows)
+    outputs = len(model.kinematics.output_names)
+    if not isinstance(model.nominal, AffineNominal):
+        check_shape("theta", model.theta, (len(model.nominal.parameter_names),))
+    elif model.nominal.fitted:
+        check_shape("theta", model.theta, (outputs * (feature_count + 1),))
+    if not np.isfinite(model.theta).all():
+        raise DataError("theta must be finite")
+    for gp in model.gps:
+        in_range = all(type(i) is int and 0 <= i < outputs for i in gp.outputs)
+        if not in_range or len(set(gp.outputs)) < len(gp.outputs):
+            raise DataError(f"a GP must predict outputs; got {gp.outputs!r:.80}")
+
+
+def _check_rows(key: str, rows: Any) -> None:
+    """Raises unless a number of rows of the past is one."""
+    check_number(key, rows, least=0, whole=True, unit="[rows]")
+    if rows > _LONGEST:
+        raise DataError(f"{key} must be {_LONGEST} rows at most; got {rows}")
+
+
+def _check_noise(noise: OutputNoise, kinematics: Kinematics) -> None:
+    """Raises ``DataError`` unless the noise is that of a model with kinematics."""
+    outputs = len(kinematics.output_names)
+    check_shape("noise/outputs", noise.outputs, (len(TIME_CONSTANTS), outputs))
+    check_shape("noise/measurement", noise.measurement, (kinematics.space.error_dim,))
+    if not all(np.isfinite(a).all() for a in (noise.outputs, noise.measurement)):
+        raise DataError("noise must be finite")
+
+
+def check_shape(key: str, array: Array, shape: tuple[int, ...]) -> None:
+    """Raises ``DataError`` unless an array has a shape."""
+    if array.shape != shape:
+        raise DataError(f"{key} must have shape {shape}; got {array.shape}")

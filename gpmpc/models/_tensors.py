@@ -1,0 +1,30 @@
+"""Types and devices of models that are made of tensors and other models."""
+
+from dataclasses import fields
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gpmpc._dynamics import check_destination
+from gpmpc.exceptions import SettingError
+from gpmpc.models._nominal import Affine
+
+
+def move(model: Any, device: Any = None, dtype: torch.dtype | None = None) -> Any:
+    """Copies a model to another device or type; functions are taken as they are."""
+    check_destination(device, dtype)
+    parts = {field.name: getattr(model, field.name) for field in fields(model)}
+    for name, part in parts.items():
+        if isinstance(part, Tensor) or hasattr(part, "state_dim"):
+            parts[name] = part.to(device=device, dtype=dtype)
+        elif isinstance(part, Affine):
+            parts[name] = move(part, device, dtype)
+    return type(model)(**parts)
+
+
+def check_like(name: str, part: Any, model: Any) -> None:
+    """Raises ``SettingError`` unless a part has the type and the device of a model."""
+    if (part.dtype, part.device) != (model.dtype, model.device):
+        rule = f"must be {model.dtype} on {model.device} like the model"
+        raise SettingError(name, f"{rule}; got {part.dtype} on {part.device}")
