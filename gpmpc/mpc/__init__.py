@@ -8,7 +8,8 @@ from gpmpc.mpc._linear_quadratic import dlqr
 from gpmpc.mpc._policy import ControlLoop
 from gpmpc.mpc._prediction import PredictionSettings
 from gpmpc.mpc._stability import Stability
-from gpmpc.mpc._starts import ManyStarts, kicks
+from gpmpc.mpc._start_guesses import kicks
+from gpmpc.mpc._starts import ManyStarts
 from gpmpc.mpc.gp_mpc import GPMPC, NonlinearGPMPC
 from gpmpc.mpc.problem import Box, Halfspaces, Inequality, Problem
 

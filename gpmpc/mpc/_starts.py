@@ -4,15 +4,15 @@ A program's solution is a local one, of H stages. Where no plan is at hand that 
 the goal, at the beginning or after a disturbance, many are made: what the controller
 itself would do, programs from every pair of a goal and a guess, and what relays lead to
 that push with all the inputs have, in the rhythm of the plant. Each is flown on in the
-model until the goal is held (``_foresight``). The flight that costs least is improved as
-a whole, and followed under its feedback.
+model until the goal is held (``_foresight``). The flight that costs least is improved
+as a whole, and followed under its feedback.
 """
 
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cmp_to_key
-from itertools import islice, product
+from itertools import islice
 from math import inf
 from time import perf_counter
 from typing import Any, NamedTuple
@@ -21,7 +21,7 @@ import numpy as np
 import torch
 
 from gpmpc._angles import full_turns
-from gpmpc.exceptions import SettingError, ShapeError, check_number
+from gpmpc.exceptions import SettingError, check_number
 from gpmpc.gaussian import Gaussian
 from gpmpc.mpc._controller import (
     Array,
@@ -33,8 +33,8 @@ from gpmpc.mpc._controller import (
 from gpmpc.mpc._foresight import Flight, Foresight, Question, Trajectory
 from gpmpc.mpc._linear_quadratic import References, evaluate_cost
 from gpmpc.mpc._stages import StageCosts, StageLinearizer
+from gpmpc.mpc._start_guesses import Starts, kicks, turned
 from gpmpc.mpc.gp_mpc import GPMPC
-from gpmpc.mpc.problem import Problem
 from gpmpc.propagation import Linearization
 from gpmpc.status import Status
 
@@ -47,6 +47,25 @@ _ROOM = 1.3  # cost of a flight that may still be improved, in that of the cheap
 _IMPROVED = 3  # flights that are
 _ALIKE = 0.05  # share of the range of a plan's inputs by which the same plan may differ
 _KEPT = 1e-3  # share of its cost by which a new plan may be dearer than the last one
+
+
+class _Situation(NamedTuple):
+    """The arguments of ``control`` at one step."""
+
+    belief: Gaussian
+    reference: Reference  # over the horizon
+    previous: Decision | None
+    parameters: Any
+
+    @property
+    def state(self) -> Array:
+        """Mean of the belief (n,)."""
+        return self.belief.mean.numpy()
+
+    @property
+    def end(self) -> Array:
+        """The last reference state (n,)."""
+        return self.reference.states[-1]
 
 
 class _Memory(NamedTuple):
@@ -63,12 +82,47 @@ class _Memory(NamedTuple):
 
     @classmethod
     def of_plan(cls, goal: Array, costs: Array) -> "_Memory":
-        """That of the controller's own plan to a set point."""
+        """Returns that of the controller's own plan to a set point."""
         cost = float(costs.sum())
-        return cls(goal, cost, cost, float(costs.max()), 0, costs, None)
+        return cls(
+            goal=goal,
+            promised=cost,
+            remaining=cost,
+            dearest=float(costs.max()),
+            age=0,
+            costs=costs,
+            flight=None,
+        )
+
+    @classmethod
+    def of_flight(
+        cls, goal: Array, flight: Flight, horizon: int, last: "_Memory | None"
+    ) -> "_Memory":
+        """Returns that of a flight that was found.
+
+        What a flight to the same goal promised and cost before still counts.
+        """
+        promised = flight.cost
+        dearest = float(flight.costs.max())
+        if last is not None:
+            promised = max(promised, last.promised)
+            dearest = max(dearest, last.dearest)
+        return cls(
+            goal=goal,
+            promised=promised,
+            remaining=flight.cost,
+            dearest=dearest,
+            age=0,
+            costs=flight.costs[:horizon],
+            flight=flight,
+            arrives=flight.arrives,
+        )
 
     def continued(self, costs: Array) -> "_Memory":
-        """After one more decision of the controller, for a plan with these costs."""
+        """Returns it after one more decision of the controller, with its plan's costs.
+
+        Costs are those of the stages (H,).
+        """
         return self._replace(
             dearest=max(self.dearest, float(costs.max())),
             age=self.age + 1,
@@ -77,13 +131,30 @@ class _Memory(NamedTuple):
         )
 
     def followed(self, flight: Flight, horizon: int) -> "_Memory":
-        """After one more decision along a flight, from that decision on."""
+        """Returns it after one more decision along a flight, from that decision on."""
         return self._replace(
             remaining=self.remaining - float(self.costs[0]),
             age=self.age + 1,
             costs=flight.costs[:horizon],
             flight=flight,
         )
+
+    def passed(self, decision: Decision, horizon: int) -> "_Memory":
+        """Returns it with its flight from a decision's step on.
+
+        A failed step may have left that behind. Of a flight that is no longer than a
+        horizon a plan of H stages sees as much: it is dropped.
+        """
+        if self.flight is None:
+            return self
+        expected = (self.flight.states == decision.means[0]).all(axis=1)
+        passed_stages = np.flatnonzero(expected)
+        flight = None
+        if len(passed_stages):
+            flight = self.flight.after(int(passed_stages[0]))
+        if flight is not None and len(flight) <= horizon:
+            flight = None
+        return self._replace(flight=flight)
 
 
 @dataclass(frozen=True)
@@ -92,29 +163,98 @@ class _FollowedDecision(Decision):
 
     memory: _Memory | None = None
 
+    @classmethod
+    def of(cls, decision: Decision, memory: _Memory) -> "_FollowedDecision":
+        """Returns a decision with what it leaves for the next one."""
+        values = {
+            field.name: getattr(decision, field.name) for field in fields(Decision)
+        }
+        return cls(**values, memory=memory)
+
+
+class _FlightSearch:
+    """The flights that a search has made so far."""
+
+    def __init__(
+        self,
+        foresight: Foresight,
+        question: Question,
+        controller: GPMPC,
+        deadline: float,
+    ):
+        self._foresight = foresight
+        self._question = question
+        self._deadline = deadline
+        self._flights: list[Flight] = []
+        self._lowest = inf  # cost of a flight that arrives
+        self.best_controller = controller  # whose flight that is
+
+    @property
+    def is_late(self) -> bool:
+        """Whether the time is over, and some flight is at hand."""
+        return bool(self._flights) and perf_counter() > self._deadline
+
+    def add(self, flight: Flight) -> None:
+        """Adds a flight that was made before."""
+        self._flights.append(flight)
+
+    def fly(self, beginning: Trajectory) -> None:
+        """Adds the flight from a beginning, unless it costs much more than another."""
+        limit = _ROOM * self._lowest
+        flight = self._foresight.fly(beginning, self._question, limit)
+        if flight is None:
+            return
+        self._flights.append(flight)
+        if flight.arrives and flight.cost < self._lowest:
+            self._lowest = flight.cost
+            self.best_controller = beginning.controller
+
+    def best(self) -> Flight | None:
+        """Returns the best flight, after the first few were improved; None without."""
+        foresight = self._foresight
+        question = self._question
+        if not self._flights:
+            return None
+        flights = sorted(self._flights, key=cmp_to_key(_order))
+        best = foresight.hold(flights[0], question)
+        for flight in flights[:_IMPROVED]:
+            if not flight.arrives or perf_counter() > self._deadline:
+                break
+            held = best
+            if flight is not flights[0]:
+                held = foresight.hold(flight, question)
+            improved = foresight.improve(held, question)
+            if improved.is_better_than(best):
+                best = improved
+        return foresight.with_gains(best)
+
 
 class ManyStarts:
-    """Follows what a search found, improved as ``controller`` does; searches where that does not lead to the goal.
+    """Follows what a search found, and searches where that does not lead to the goal.
 
-    A search flies its starts on in the controller's own model until the goal is held, up
-    to four horizons or 200 stages; what ``controller`` does by itself, from its last plan
-    and without one, is among them. The cheapest that holds the goal is followed under
-    its feedback. It is searched again where a disturbance makes the rest of the way
-    dearer, and where the goal is not held in the end.
+    What is followed is improved as ``controller`` does. A search flies its starts on in
+    the controller's own model until the goal is held, up to four horizons or 200
+    stages; what ``controller`` does by itself, from its last plan and without one, is
+    among them. The cheapest that holds the goal is followed under its feedback. It is
+    searched again where a disturbance makes the rest of the way dearer, and where the
+    goal is not held in the end.
 
     A reference that moves, or a criterion, is judged by the plans of H stages alone.
     Then it is searched where there is no plan.
 
-    Angles are those of the cost. The goal of a plan is the full turn of the reference that its end is nearest to.
+    Angles are those of the cost. The goal of a plan is the full turn of the reference
+    that its end is nearest to.
 
     Args:
         controller: Of form ``"trajectory"``; takes every step from a plan.
-        planner: Takes the starts; more programs a step than ``controller`` are of use. ``controller`` by default.
-        guesses: Inputs (H, m) that a guess rolls out from the state, or None for a line from the state to the goal;
-            by default the line and those of ``kicks``.
-        turns: How many full turns of each angle count as goals, the nearest first; one number for all or one each.
-        criterion: What of a plan is to be small, of the decision and the reference in its turns; by default its cost,
-            flown on.
+        planner: Takes the starts; more programs a step than ``controller`` are of use.
+            ``controller`` by default.
+        guesses: Inputs (H, m) that a guess rolls out from the state, or None for a line
+            from the state to the goal; by default the line and those of ``kicks``.
+        turns: How many full turns of each angle count as goals, the nearest first; one
+            number for all or one each.
+        criterion: What of a plan is to be small, of the decision and the reference in
+            its turns; by default its cost, flown on.
         budget: Time after which no further start is taken, once a plan is found [s];
             None for no limit. A search takes a second or several; what ``controller``
             does by itself is flown first, whatever the budget.
@@ -145,31 +285,21 @@ class ManyStarts:
         self.horizon = controller.horizon
         self.initial_input = controller.initial_input
         self.signals = controller.signals
-        H = self.horizon
-        m = self.problem.input_dim
-        angles = self.problem.cost.angles
         if guesses is None:
-            guesses = [None, *kicks(self.problem, H, self.initial_input)]
-        shapes = [np.shape(guess) for guess in guesses if guess is not None]
-        if any(shape != (H, m) for shape in shapes):
-            raise ShapeError(f"guesses must be None or inputs ({H}, {m}); got {shapes}")
-        self.guesses = guesses
-        self.turns = [turns] * len(angles) if isinstance(turns, int) else list(turns)
-        if len(self.turns) != len(angles) or min(self.turns, default=1) < 1:
-            raise SettingError(
-                "turns",
-                f"must be whole numbers from 1 on, one for each of {len(angles)} angles",
-            )
+            guesses = [None, *kicks(self.problem, self.horizon, self.initial_input)]
+        self.starts = Starts(self.planner, guesses, turns)
+        self.guesses = self.starts.guesses
+        self.turns = self.starts.turns
         if budget is not None:
             check_number("budget", budget, above=0, unit="[s]")
+        self.budget = budget
         self._judges_flights = criterion is None
         self.criterion = self._cost if criterion is None else criterion
         means = StageLinearizer(controller.prediction.model, Linearization(), "none")
-        self._weights = StageCosts(self.problem, H, means).quadratic
+        self._weights = StageCosts(self.problem, self.horizon, means).quadratic
         self._foresight = Foresight(controller)
         is_certain = controller.prediction.settings.covariance == "none"
         self._has_tubes = bool(self.problem.constraints) and not is_certain
-        self.budget = budget
 
     def control(
         self,
@@ -188,44 +318,63 @@ class ManyStarts:
         if previous is not None and self._can_continue(previous):
             turns = full_turns(state - previous.means[1], self.problem.cost.angles)
             belief = replace(belief, mean=belief.mean - torch.as_tensor(turns))
+        situation = _Situation(belief, reference, previous, parameters)
         if self._judges_flights and _is_set_point(reference):
-            decision = self._follow_flight(belief, reference, previous, parameters)
-        else:
-            decision = self._follow_plan(belief, reference, previous, parameters)
-        return decision
+            return self._follow_flight(situation)
+        return self._follow_plan(situation)
+
+    def plans(
+        self,
+        belief: Gaussian,
+        reference: Reference,
+        previous: Decision | None = None,
+        parameters: Any = None,
+        first: int = 0,
+    ) -> Iterator[tuple[Decision, float]]:
+        """Makes the decisions of ``len(self)`` starts, from the ``first`` on.
+
+        Each comes with its criterion, infinite if it is not applicable.
+        """
+        starts = self.starts.of(belief.mean.numpy(), reference.over(self.horizon))
+        for start in islice(starts, first, None):
+            decision = self.planner.control(
+                belief,
+                start.goal,
+                previous,
+                parameters,
+                plan=(start.inputs, start.states),
+            )
+            yield decision, self._judge(decision, start.goal)
+
+    def __len__(self) -> int:
+        return len(self.starts)
+
+    def gains(self, decision: Decision) -> Array:
+        """Returns those of ``controller``."""
+        return self.controller.gains(decision)
 
     def _can_continue(self, previous: Decision) -> bool:
         return previous.applicable and len(previous.means) == self.horizon + 1
 
-    def _follow_plan(
-        self,
-        belief: Gaussian,
-        reference: Reference,
-        previous: Decision | None,
-        parameters: Any,
-    ) -> Decision:
-        """The last plan, improved or kept; that of a search where there is none."""
+    def _follow_plan(self, situation: _Situation) -> Decision:
+        """Returns the last plan, improved or kept; a new one where there is none."""
+        previous = situation.previous
         if previous is not None and self._can_continue(previous):
-            decision = self._improve(belief, reference, previous, parameters)
+            decision = self._improve(situation, previous)
             if decision.applicable:
                 return decision
-        return self._search_plan(belief, reference, previous, parameters)
+        return self._search_plan(situation)
 
-    def _search_plan(
-        self,
-        belief: Gaussian,
-        reference: Reference,
-        previous: Decision | None,
-        parameters: Any,
-    ) -> Decision:
-        """The plan that the criterion likes best: the controller's own, or one of all starts."""
+    def _search_plan(self, situation: _Situation) -> Decision:
+        """Returns the plan that the criterion likes best.
+
+        That is the controller's own, or one of all starts.
+        """
+        belief, reference, previous, parameters = situation
         deadline = self._deadline()
-        last = None if previous is None else replace(previous, solution=None)
+        last = _without_solution(previous)
         best = self.controller.control(belief, reference, last, parameters)
-        turns = full_turns(
-            best.means[-1] - reference.states[-1], self.problem.cost.angles
-        )
-        lowest = self._judge(best, _moved(reference, turns))
+        lowest = self._judge(best, self._nearest_turn(reference, best.means[-1]))
         for decision, value in self.plans(belief, reference, last, parameters):
             if value < lowest:
                 best = decision
@@ -234,110 +383,96 @@ class ManyStarts:
                 break
         return best
 
-    def _follow_flight(
-        self,
-        belief: Gaussian,
-        reference: Reference,
-        previous: Decision | None,
-        parameters: Any,
-    ) -> Decision:
-        """The decision on the way to a set point that was found, or on a new one."""
-        question = self._question(belief, reference, previous, parameters)
-        memory = self._memory(previous, reference)
-        known = None
+    def _follow_flight(self, situation: _Situation) -> Decision:
+        """Returns the decision on the way to a set point that was found, or a new one.
+
+        Steps of a flight are followed as long as it costs what it was to cost; once it
+        is no longer than a horizon, the controller's own plans are.
+        """
+        question = self._question(situation)
+        memory = self._memory(situation)
+        previous = situation.previous
+        current = None  # what is left of the flight that was followed
         if memory is not None and memory.flight is not None:
-            known = self._rest(memory.flight, memory, belief, question)
-            memory = memory.followed(known, self.horizon)
-            if self._is_as_promised(known, memory):
-                return self._along(known, memory, belief, question, previous)
+            current = self._remaining_flight(memory.flight, memory, situation, question)
+            memory = memory.followed(current, self.horizon)
+            if self._is_as_promised(current, memory):
+                return self._along(current, memory, situation, question)
         elif previous is not None and self._can_continue(previous):
-            decision = self._improve(belief, reference, previous, parameters)
+            decision = self._improve(situation, previous)
             costs = self._foresight.meter(decision.means, decision.inputs, question)
             if decision.applicable and not self._is_lost(costs, memory):
-                if memory is None:
-                    memory = _Memory.of_plan(np.array(reference.states[-1]), costs)
-                else:
-                    memory = memory.continued(costs)
-                return _remembering(decision, memory)
-        flight = self._search_flight(belief, question, previous, known)
+                next_memory = _Memory.of_plan(np.array(situation.end), costs)
+                if memory is not None:
+                    next_memory = memory.continued(costs)
+                return _FollowedDecision.of(decision, next_memory)
+        flight = self._search_flight(situation, question, current)
         if flight is None:
-            return self._search_plan(belief, reference, previous, parameters)
-        promised = flight.cost
-        dearest = float(flight.costs.max())
-        if memory is not None:
-            promised = max(promised, memory.promised)
-            dearest = max(dearest, memory.dearest)
-        memory = _Memory(
-            goal=np.array(reference.states[-1]),
-            promised=promised,
-            remaining=flight.cost,
-            dearest=dearest,
-            age=0,
-            costs=flight.costs[: self.horizon],
+            return self._search_plan(situation)
+        memory = _Memory.of_flight(
+            goal=np.array(situation.end),
             flight=flight,
-            arrives=flight.arrives,
+            horizon=self.horizon,
+            last=memory,
         )
-        return self._along(flight, memory, belief, question, previous)
+        return self._along(flight, memory, situation, question)
 
-    def _rest(
-        self, flight: Flight, memory: _Memory, belief: Gaussian, question: Question
+    def _remaining_flight(
+        self,
+        flight: Flight,
+        memory: _Memory,
+        situation: _Situation,
+        question: Question,
     ) -> Flight:
-        """What is left of a flight, from the state that its first stage led to.
+        """Returns what is left of a flight, from the state that its stage led to.
 
         Where a disturbance made it dearer than it was to be, it is improved.
         """
         foresight = self._foresight
-        state = belief.mean.numpy()
-        rest = foresight.follow(flight.after(1), state, question, memory.dearest)
+        remaining = foresight.follow(
+            flight.after(1), situation.state, question, memory.dearest
+        )
         promised = memory.remaining - float(memory.costs[0])
-        if rest.arrives and rest.cost > promised + _DRIFT * memory.promised:
-            rest = foresight.improve(rest, question, 1, _CORRECTIONS)
-            rest = foresight.with_gains(rest)
-        return rest
+        limit = promised + _DRIFT * memory.promised
+        if remaining.arrives and remaining.cost > limit:
+            remaining = foresight.improve(
+                remaining, question, rounds=1, programs=_CORRECTIONS
+            )
+            remaining = foresight.with_gains(remaining)
+        return remaining
 
-    def _is_as_promised(self, rest: Flight, memory: _Memory) -> bool:
-        """Whether the rest of a flight costs about what it was to cost, and arrives if it was to."""
+    def _is_as_promised(self, flight: Flight, memory: _Memory) -> bool:
+        """Tells whether a flight costs what it was to, and arrives if it was to."""
         limit = memory.remaining + _RISE * memory.promised
-        return rest.cost <= limit and (rest.arrives or not memory.arrives)
+        return flight.cost <= limit and (flight.arrives or not memory.arrives)
 
-    def _question(
-        self,
-        belief: Gaussian,
-        reference: Reference,
-        previous: Decision | None,
-        parameters: Any,
-    ) -> Question:
-        last_input = self.initial_input
+    def _question(self, situation: _Situation) -> Question:
+        """Returns what the controller is asked on the way, beside its last plan."""
+        previous = situation.previous
+        previous_input = self.initial_input
         disturbance = None
         if previous is not None:
-            last_input = np.asarray(previous.input, dtype=float)
+            previous_input = np.asarray(previous.input, dtype=float)
             disturbance = previous.disturbance
         return Question(
-            belief.covariance, reference, parameters, last_input, disturbance
+            covariance=situation.belief.covariance,
+            reference=situation.reference,
+            parameters=situation.parameters,
+            previous_input=previous_input,
+            disturbance=disturbance,
         )
 
-    def _memory(
-        self, previous: Decision | None, reference: Reference
-    ) -> _Memory | None:
-        """What the last decision left, its flight from that decision on; None for another goal."""
+    def _memory(self, situation: _Situation) -> _Memory | None:
+        """Returns what the last decision left; None for another goal."""
+        previous = situation.previous
         if not isinstance(previous, _FollowedDecision) or previous.memory is None:
             return None
-        memory = previous.memory
-        if not np.array_equal(memory.goal, reference.states[-1]):
+        if not np.array_equal(previous.memory.goal, situation.end):
             return None
-        if memory.flight is not None:  # which a failed step may have left behind
-            expected = (memory.flight.states == previous.means[0]).all(axis=1)
-            passed = np.flatnonzero(expected)
-            flight = None
-            if len(passed):
-                flight = memory.flight.after(int(passed[0]))
-            if flight is not None and len(flight) <= self.horizon:
-                flight = None  # from here on a plan of H stages sees as much
-            memory = memory._replace(flight=flight)
-        return memory
+        return previous.memory.passed(previous, self.horizon)
 
     def _is_lost(self, costs: Array, memory: _Memory | None) -> bool:
-        """Whether a plan of stages with these costs (H,) is to be searched anew."""
+        """Tells whether a plan of stages with costs (H,) is to be searched anew."""
         if memory is None:
             return not self._foresight.arrives(costs)
         if self._foresight.arrives(costs, memory.dearest):
@@ -350,78 +485,54 @@ class ManyStarts:
         self,
         flight: Flight,
         memory: _Memory,
-        belief: Gaussian,
+        situation: _Situation,
         question: Question,
-        previous: Decision | None,
     ) -> Decision:
-        """The decision whose plan are the first stages of a flight."""
-        H = self.horizon
-        means = flight.states[: H + 1]
-        inputs = flight.inputs[:H]
-        reference = question.reference
-        turns = full_turns(means[-1] - reference.states[-1], self.problem.cost.angles)
-        goal = _moved(reference, turns)
+        """Returns the decision whose plan are the first stages of a flight."""
+        means = flight.states[: self.horizon + 1]
+        inputs = flight.inputs[: self.horizon]
         decision = self.controller.control(
-            belief, goal, previous, question.parameters, (inputs, means)
+            situation.belief,
+            self._nearest_turn(question.reference, means[-1]),
+            situation.previous,
+            question.parameters,
+            plan=(inputs, means),
         )
-        return _remembering(_with_plan(decision, inputs, means), memory)
+        return _FollowedDecision.of(_with_plan(decision, inputs, means), memory)
 
     def _search_flight(
-        self,
-        belief: Gaussian,
-        question: Question,
-        previous: Decision | None,
-        known: Flight | None,
+        self, situation: _Situation, question: Question, current: Flight | None
     ) -> Flight | None:
-        """The cheapest flight of all starts; None where the controller fails in every one."""
-        foresight = self._foresight
-        deadline = self._deadline()
-        flights = []
-        if known is not None and np.isfinite(known.cost):
-            flights.append(known)
-        limit = inf
-        steering = self.controller
-        lowest = inf
-        for beginning in self._alone(belief, previous):
-            flight = foresight.fly(beginning, question, limit)
-            if flight is not None:
-                flights.append(flight)
-                if flight.arrives and flight.cost < lowest:
-                    lowest = flight.cost
-                    limit = _ROOM * lowest
-                    steering = beginning.controller
-            if flights and perf_counter() > deadline:
-                break
-        for states, inputs in self._beginnings(belief, question, previous):
-            if flights and perf_counter() > deadline:
-                break
-            beginning = Trajectory(steering, states, inputs)
-            flight = foresight.fly(beginning, question, limit)
-            if flight is not None:
-                flights.append(flight)
-                if flight.arrives:
-                    limit = min(limit, _ROOM * flight.cost)
-        if not flights:
-            return None
-        flights.sort(key=cmp_to_key(_order))
-        best = foresight.hold(flights[0], question)
-        for flight in flights[:_IMPROVED]:
-            if not flight.arrives or perf_counter() > deadline:
-                break
-            held = best
-            if flight is not flights[0]:
-                held = foresight.hold(flight, question)
-            improved = foresight.improve(held, question)
-            if improved.is_better_than(best):
-                best = improved
-        best = foresight.with_gains(best)
-        return foresight.follow(best, belief.mean.numpy(), question)
+        """Returns the cheapest flight of all starts, under its feedback.
 
-    def _alone(
-        self, belief: Gaussian, previous: Decision | None
-    ) -> Iterator[Trajectory]:
-        """The controller by itself: from its last plan, without one, and with shorter horizons."""
-        here = belief.mean.numpy()[None]
+        ``current`` is what is left of the flight that was followed. None where the
+        controller fails in every one.
+        """
+        search = _FlightSearch(
+            self._foresight, question, self.controller, self._deadline()
+        )
+        if current is not None and np.isfinite(current.cost):
+            search.add(current)
+        for beginning in self._alone(situation):
+            search.fly(beginning)
+            if search.is_late:
+                break
+        for states, inputs in self._beginnings(situation, question):
+            if search.is_late:
+                break
+            search.fly(Trajectory(search.best_controller, states, inputs))
+        best = search.best()
+        if best is None:
+            return None
+        return self._foresight.follow(best, situation.state, question)
+
+    def _alone(self, situation: _Situation) -> Iterator[Trajectory]:
+        """Makes beginnings of the controller by itself.
+
+        That is from its last plan, without one, and with shorter horizons.
+        """
+        previous = situation.previous
+        here = situation.state[None]
         nothing = np.empty((0, self.problem.input_dim))
         if previous is not None and self._can_continue(previous):
             yield Trajectory(self.controller, here, nothing, previous)
@@ -429,49 +540,46 @@ class ManyStarts:
             yield Trajectory(controller, here, nothing)
 
     def _beginnings(
-        self, belief: Gaussian, question: Question, previous: Decision | None
+        self, situation: _Situation, question: Question
     ) -> Iterator[tuple[Array, Array]]:
-        """States and inputs of the plans of all starts, and of relays."""
+        """Makes states and inputs of the plans of all starts, and of relays."""
         foresight = self._foresight
-        state = belief.mean.numpy()
-        last = None if previous is None else replace(previous, solution=None)
-        tried: list[Array] = []
+        state = situation.state
+        last = _without_solution(situation.previous)
+        different: list[Array] = []
         for decision, value in self.plans(
-            belief, question.reference, last, question.parameters
+            situation.belief, question.reference, last, question.parameters
         ):
-            if value < inf and not any(_are_alike(decision.inputs, u) for u in tried):
-                tried.append(decision.inputs)
-                states = decision.means
-                inputs = decision.inputs
-                if not self.planner.prediction.settings.rolled_out:
-                    gains = self._plan_gains(
-                        self.planner, decision, question.parameters
-                    )
-                    states, inputs = foresight.roll_out(
-                        states, inputs, gains, state, question
-                    )
-                if np.isfinite(states).all():
-                    yield states, inputs
+            inputs = decision.inputs
+            states = decision.means
+            if value == inf or any(_are_alike(inputs, other) for other in different):
+                continue
+            different.append(inputs)
+            if not self.planner.prediction.settings.rolled_out:
+                gains = self._plan_gains(self.planner, decision, question.parameters)
+                states, inputs = foresight.roll_out(
+                    states, inputs, gains, state, question
+                )
+            if np.isfinite(states).all():
+                yield states, inputs
         yield from foresight.relays(state, question)
 
-    def _improve(
-        self,
-        belief: Gaussian,
-        reference: Reference,
-        previous: Decision,
-        parameters: Any,
-    ) -> Decision:
-        """The controller's decision from the last plan, or that plan kept, where it costs less."""
-        turns = full_turns(
-            previous.means[-1] - reference.states[-1], self.problem.cost.angles
-        )
-        goal = _moved(reference, turns)
+    def _improve(self, situation: _Situation, previous: Decision) -> Decision:
+        """Returns the controller's decision from the last plan.
+
+        Where that plan costs less, it is kept.
+        """
+        goal = self._nearest_turn(situation.reference, previous.means[-1])
         inputs = np.concatenate([previous.inputs[1:], previous.inputs[-1:]])
         means = np.concatenate([previous.means[1:], previous.means[-1:]])
         decision = self.controller.control(
-            belief, goal, previous, parameters, (inputs, means)
+            situation.belief,
+            goal,
+            previous,
+            situation.parameters,
+            plan=(inputs, means),
         )
-        question = self._question(belief, goal, previous, parameters)
+        question = self._question(situation._replace(reference=goal))
         limit = inf
         if decision.applicable:
             if self._has_tubes:
@@ -480,25 +588,33 @@ class ManyStarts:
             limit = cost / (1.0 + _KEPT)
         if self._plan_cost(means, inputs, question) >= limit:
             return decision
-        gains = self._plan_gains(self.controller, previous, parameters)
+        gains = self._plan_gains(self.controller, previous, situation.parameters)
         gains = np.concatenate([gains[1:], gains[-1:]])
         states, inputs = self._foresight.roll_out(
-            means, inputs, gains, belief.mean.numpy(), question
+            means, inputs, gains, situation.state, question
         )
         if self._plan_cost(states, inputs, question) < limit:
             return _with_plan(decision, inputs, states)
         return decision
 
+    def _nearest_turn(self, reference: Reference, end: Array) -> Reference:
+        """Returns the turn of a reference whose end is nearest to a state (n,)."""
+        turns = full_turns(end - reference.states[-1], self.problem.cost.angles)
+        return turned(reference, turns)
+
     def _plan_gains(
         self, controller: GPMPC, decision: Decision, parameters: Any
     ) -> Array:
-        own = parameters
-        if own is not None:
-            own = read_parameters(own, self.horizon)
-        return controller.gains(decision, own)
+        """Returns the gains (H, m, n) of a controller along a plan."""
+        if parameters is None:
+            return controller.gains(decision, None)
+        return controller.gains(decision, read_parameters(parameters, self.horizon))
 
     def _plan_cost(self, means: Array, inputs: Array, question: Question) -> float:
-        """The cost of a plan, violated constraints included; infinite where it is not finite."""
+        """Returns the cost of a plan, violated constraints included.
+
+        It is infinite where it is not finite.
+        """
         cost = self._tracking_cost(
             means, inputs, question.reference, question.previous_input
         )
@@ -507,34 +623,11 @@ class ManyStarts:
         return cost if np.isfinite(cost) else inf
 
     def _deadline(self) -> float:
-        """The time of ``perf_counter`` after which a search takes no further start."""
+        """Returns the time of ``perf_counter`` after which no further start is taken."""
         return inf if self.budget is None else perf_counter() + self.budget
 
-    def plans(
-        self,
-        belief: Gaussian,
-        reference: Reference,
-        previous: Decision | None = None,
-        parameters: Any = None,
-        first: int = 0,
-    ) -> Iterator[tuple[Decision, float]]:
-        """Makes the decisions of ``len(self)`` starts, from the ``first`` on, one by one.
-
-        Each comes with its criterion, infinite if it is not applicable.
-        """
-        candidates = self._candidates(belief.mean.numpy(), reference.over(self.horizon))
-        for goal, guess in islice(candidates, first, None):
-            yield self._try(self.planner, belief, goal, previous, parameters, guess)
-
-    def __len__(self) -> int:
-        return len(self.guesses) * math.prod(self.turns)
-
-    def gains(self, decision: Decision) -> Array:
-        """Those of ``controller``."""
-        return self.controller.gains(decision)
-
     def _cost(self, decision: Decision, reference: Reference) -> float:
-        """The tracking cost of a plan."""
+        """Returns the tracking cost of a decision's plan."""
         return self._tracking_cost(
             decision.means, decision.inputs, reference, decision.inputs[0]
         )
@@ -542,128 +635,62 @@ class ManyStarts:
     def _tracking_cost(
         self, means: Array, inputs: Array, reference: Reference, previous_input: Array
     ) -> float:
-        wanted = np.zeros_like(inputs)
+        """Returns the tracking cost of means (H + 1, n) and inputs (H, m)."""
+        reference_inputs = np.zeros_like(inputs)
         if reference.inputs is not None:
-            wanted = np.asarray(reference.inputs)
+            reference_inputs = np.asarray(reference.inputs)
         targets = np.asarray(reference.states[1:])
-        references = References(targets, wanted, previous_input)
+        references = References(targets, reference_inputs, previous_input)
         return evaluate_cost(self._weights, means, inputs, references, 1.0)
 
-    def _try(
-        self, controller: GPMPC, belief: Gaussian, goal: Reference, *more: Any
-    ) -> tuple[Decision, float]:
-        """A controller's decision on its arguments, and its criterion: infinite where it is not applicable."""
-        decision = controller.control(belief, goal, *more)
-        return decision, self._judge(decision, goal)
-
     def _judge(self, decision: Decision, goal: Reference) -> float:
-        """The criterion of a decision; infinite where it is not applicable."""
+        """Returns the criterion of a decision; infinite where it is not applicable."""
         value = self.criterion(decision, goal) if decision.applicable else inf
         return value if np.isfinite(value) else inf
 
-    def _candidates(
-        self, state: Array, reference: Reference
-    ) -> Iterator[tuple[Reference, tuple[Array, Array]]]:
-        """Goals and guesses, inputs and states, guess by guess, the nearest goals first."""
-        goals = list(self._goals(state, reference))
-        H = self.horizon
-        for guess, goal in product(self.guesses, goals):
-            if guess is None:
-                shares = np.linspace(1.0, 0.0, H + 1)[:, None]
-                targets = goal.states
-                yield (
-                    goal,
-                    (
-                        np.tile(self.initial_input, (H, 1)),
-                        targets + shares * (state - targets[0]),
-                    ),
-                )
-            else:
-                yield (
-                    goal,
-                    (
-                        guess,
-                        self.planner.prediction.lead(
-                            state, np.asarray(guess, dtype=float)
-                        ),
-                    ),
-                )
-
-    def _goals(self, state: Array, reference: Reference) -> Iterator[Reference]:
-        angles = list(self.problem.cost.angles)
-        moves = []
-        for angle, count in zip(angles, self.turns, strict=True):
-            off = (state[angle] - reference.states[-1, angle]) / (2 * np.pi)
-            around = range(int(np.floor(off)) - count, int(np.ceil(off)) + count + 1)
-            moves.append(sorted(around, key=lambda k: abs(k - off))[:count])
-        chosen = list(product(*moves))
-        turns = np.zeros((len(chosen), len(state)))
-        turns[:, angles] = 2 * np.pi * np.array(chosen).reshape(len(turns), len(angles))
-        distances = np.abs(state - reference.states[-1] - turns)[:, angles].sum(axis=1)
-        return (
-            _moved(reference, turns[i]) for i in np.argsort(distances, kind="stable")
-        )
-
-
-def kicks(
-    problem: Problem, horizon: int, initial_input: Array, share: float = 0.5
-) -> list[Array]:
-    """The initial input held (H, m); for each bounded input a push and a pull, and a pull and a push, of H/6 stages.
-
-    ``share`` is the way from the initial input to its bounds.
-    """
-    drift = np.tile(np.asarray(initial_input, dtype=float), (horizon, 1))
-    length = max(1, horizon // 6)
-    found = [drift]
-    bounds = (problem.inputs.upper, problem.inputs.lower)
-    for j, sides in product(range(problem.input_dim), (bounds, bounds[::-1])):
-        if np.isfinite([side[j] for side in sides]).all():
-            inputs = drift.copy()
-            for part, side in zip(
-                (slice(0, length), slice(length, 2 * length)), sides, strict=True
-            ):
-                inputs[part, j] += share * (side[j] - initial_input[j])
-            found.append(inputs)
-    return found
-
-
-def _moved(reference: Reference, turns: Array) -> Reference:
-    return replace(reference, states=np.asarray(reference.states, dtype=float) + turns)
-
 
 def _is_set_point(reference: Reference) -> bool:
-    """Whether a reference (H + 1, n) stands still."""
+    """Tells whether a reference (H + 1, n) stands still."""
     states = np.asarray(reference.states)
-    inputs = (
-        np.zeros((1, 1)) if reference.inputs is None else np.asarray(reference.inputs)
-    )
-    return bool((states == states[0]).all() and (inputs == inputs[0]).all())
+    if not (states == states[0]).all():
+        return False
+    if reference.inputs is None:
+        return True
+    inputs = np.asarray(reference.inputs)
+    return bool((inputs == inputs[0]).all())
 
 
 def _are_alike(inputs: Array, others: Array) -> bool:
-    """Whether two plans are one, but for the tolerance that they were solved to."""
+    """Tells whether two plans are one, but for the tolerance of their solves."""
     return bool(np.allclose(inputs, others, atol=_ALIKE * np.ptp(others)))
 
 
 def _order(one: Flight, other: Flight) -> int:
-    """Below zero where a flight is better than another."""
+    """Returns a number below zero where a flight is better than another."""
     return int(other.is_better_than(one)) - int(one.is_better_than(other))
 
 
+def _without_solution(previous: Decision | None) -> Decision | None:
+    """Returns a decision that no solve is warm-started from."""
+    return None if previous is None else replace(previous, solution=None)
+
+
 def _with_plan(decision: Decision, inputs: Array, means: Array) -> Decision:
-    """A decision for another plan, which is applicable."""
-    changes: dict[str, Any] = {
-        "stage_costs": np.empty(0),
-        "violation": math.nan,
-        "steps": (),
-    }
-    if not decision.applicable:
-        changes["status"] = Status.ITERATION_LIMIT
-        changes["suboptimal"] = True
-        changes["covariances"] = np.zeros((*means.shape, means.shape[1]))
-    return replace(decision, input=inputs[0], inputs=inputs, means=means, **changes)
-
-
-def _remembering(decision: Decision, memory: _Memory) -> Decision:
-    parts = {part.name: getattr(decision, part.name) for part in fields(Decision)}
-    return _FollowedDecision(**parts, memory=memory)
+    """Returns a decision for another plan, which is applicable."""
+    changed = replace(
+        decision,
+        input=inputs[0],
+        inputs=inputs,
+        means=means,
+        stage_costs=np.empty(0),
+        violation=math.nan,
+        steps=(),
+    )
+    if decision.applicable:
+        return changed
+    return replace(
+        changed,
+        status=Status.ITERATION_LIMIT,
+        suboptimal=True,
+        covariances=np.zeros((*means.shape, means.shape[1])),
+    )

@@ -354,7 +354,7 @@ def test_goals_are_the_nearest_turns_of_each_angle_seen_from_the_end_of_the_refe
         product(*around),
         key=lambda turns: np.abs(off - 2 * np.pi * np.array(turns)).sum(),
     )
-    goals = list(many._goals(state, reference))
+    goals = list(many.starts.goals(state, reference))
     assert len(goals) == 6
     for goal, turns in zip(goals, expected, strict=True):
         moved = 2 * np.pi * np.array([turns[0], 0, turns[1], 0])
@@ -372,9 +372,9 @@ def test_a_guess_is_a_line_to_the_goal_or_what_its_inputs_lead_to():
     )
     state = np.array([0.3, -0.2])
     targets = np.stack([np.linspace(0.0, 1.0, 5), np.ones(5)], axis=1)
-    found = list(many._candidates(state, Reference(targets)))
+    found = list(many.starts.of(state, Reference(targets)))
     assert len(found) == 6  # guess by guess, two goals each
-    for goal, (given, states) in found[:2]:
+    for goal, given, states in found[:2]:
         assert np.allclose(states[0], state)
         assert np.allclose(states[-1], goal.states[-1])
         for k in range(H + 1):
@@ -382,14 +382,14 @@ def test_a_guess_is_a_line_to_the_goal_or_what_its_inputs_lead_to():
                 states[k], goal.states[k] + (1 - k / H) * (state - goal.states[0])
             )
         assert np.array_equal(given, np.tile(system.initial_input, (H, 1)))
-    for _, (given, states) in found[2:4]:
+    for _, given, states in found[2:4]:
         assert given is inputs
         for k in range(H):
             assert np.allclose(
                 states[k + 1], step(system, states[k], given[k]), rtol=1e-7, atol=1e-9
             )
         assert np.array_equal(states[0], state)
-    for _, (_, states) in found[4:]:  # which leads nowhere
+    for _, _, states in found[4:]:  # which leads nowhere
         assert np.array_equal(states, np.tile(state, (H + 1, 1)))
 
 
@@ -461,10 +461,10 @@ def test_no_solve_of_a_double_pendulum_from_a_wild_start_breaks_down(starts):
                 ]
             )
             state[3] = rng.uniform(-15, 15)
-            for goal, guess in list(
-                many._candidates(state, Reference(np.zeros(4)).over(60))
+            for goal, *guess in list(
+                many.starts.of(state, Reference(np.zeros(4)).over(60))
             )[:: 1 if starts > 3 else 5]:
-                found = one.control(Gaussian.certain(state), goal, plan=guess)
+                found = one.control(Gaussian.certain(state), goal, plan=tuple(guess))
                 count += 1
                 assert (
                     found.status in (Status.SOLVED, Status.ITERATION_LIMIT)

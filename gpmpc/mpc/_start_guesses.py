@@ -1,0 +1,136 @@
+"""Goals and first guesses that a search starts from."""
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from itertools import product
+from typing import NamedTuple
+
+import numpy as np
+
+from gpmpc.exceptions import SettingError, ShapeError
+from gpmpc.mpc._controller import Array, Reference
+from gpmpc.mpc.gp_mpc import GPMPC
+from gpmpc.mpc.problem import Problem
+
+
+class Start(NamedTuple):
+    """A goal, and a first guess of the plan that leads to it."""
+
+    goal: Reference  # the reference in one of its turns
+    inputs: Array  # (H, m)
+    states: Array  # (H + 1, n)
+
+
+class Starts:
+    """Every pair of a goal and a guess.
+
+    Args:
+        planner: It is to plan from them.
+        guesses: Inputs (H, m), or None for a line from the state to the goal.
+        turns: How many full turns of each angle count as goals.
+
+    Raises:
+        SettingError: Turns that are no positive numbers, one for each angle.
+        ShapeError: Guesses of another shape.
+    """
+
+    def __init__(
+        self,
+        planner: GPMPC,
+        guesses: Sequence[Array | None],
+        turns: int | Sequence[int],
+    ):
+        self._planner = planner
+        self._angles = list(planner.problem.cost.angles)
+        H = planner.horizon
+        m = planner.problem.input_dim
+        shapes = [np.shape(guess) for guess in guesses if guess is not None]
+        if any(shape != (H, m) for shape in shapes):
+            raise ShapeError(f"guesses must be None or inputs ({H}, {m}); got {shapes}")
+        self.guesses = guesses
+        count = len(self._angles)
+        self.turns = [turns] * count if isinstance(turns, int) else list(turns)
+        if len(self.turns) != count or min(self.turns, default=1) < 1:
+            rule = f"must be whole numbers from 1 on, one for each of {count} angles"
+            raise SettingError("turns", rule)
+
+    def __len__(self) -> int:
+        return len(self.guesses) * math.prod(self.turns)
+
+    def of(self, state: Array, reference: Reference) -> Iterator[Start]:
+        """Makes the starts at a state, guess by guess, the nearest goals first."""
+        goals = list(self.goals(state, reference))
+        for guess, goal in product(self.guesses, goals):
+            if guess is None:
+                yield self._line(state, goal)
+            else:
+                inputs = np.asarray(guess, dtype=float)
+                states = self._planner.prediction.lead(state, inputs)
+                yield Start(goal, inputs=guess, states=states)
+
+    def _line(self, state: Array, goal: Reference) -> Start:
+        """Returns a guess that moves from a state to the goal in a line."""
+        H = self._planner.horizon
+        offset = state - goal.states[0]
+        states = goal.states + np.linspace(1.0, 0.0, H + 1)[:, None] * offset
+        inputs = np.tile(self._planner.initial_input, (H, 1))
+        return Start(goal, inputs=inputs, states=states)
+
+    def goals(self, state: Array, reference: Reference) -> Iterator[Reference]:
+        """Makes the turns of a reference whose ends are nearest to a state."""
+        end = reference.states[-1]
+        turns_by_angle = []
+        for angle, count in zip(self._angles, self.turns, strict=True):
+            distance = (state[angle] - end[angle]) / (2 * np.pi)  # in full turns
+            lowest = int(np.floor(distance)) - count
+            highest = int(np.ceil(distance)) + count
+            nearest = sorted(
+                range(lowest, highest + 1),
+                key=lambda turn, distance=distance: abs(turn - distance),
+            )
+            turns_by_angle.append(nearest[:count])
+        choices = list(product(*turns_by_angle))
+        turns = np.zeros((len(choices), len(state)))
+        counts = np.array(choices).reshape(len(choices), len(self._angles))
+        turns[:, self._angles] = 2 * np.pi * counts
+        distances = np.abs(state - end - turns)[:, self._angles].sum(axis=1)
+        for i in np.argsort(distances, kind="stable"):
+            yield turned(reference, turns[i])
+
+
+def turned(reference: Reference, turns: Array) -> Reference:
+    """Returns a reference, moved by full turns (n,) of its angles."""
+    states = np.asarray(reference.states, dtype=float)
+    return replace(reference, states=states + turns)
+
+
+def kicks(
+    problem: Problem, horizon: int, initial_input: Array, share: float = 0.5
+) -> list[Array]:
+    """Returns guesses of inputs (H, m) that push the plant to and fro.
+
+    The first holds the initial input; for each bounded input follow a push and a pull,
+    and a pull and a push, of H/6 stages each.
+
+    Args:
+        problem: With bounds of the inputs.
+        horizon: H.
+        initial_input: Where all inputs begin and end (m,).
+        share: How far a push goes, of the way from the initial input to its bounds.
+    """
+    drift = np.tile(np.asarray(initial_input, dtype=float), (horizon, 1))
+    length = max(1, horizon // 6)
+    upper = problem.inputs.upper
+    lower = problem.inputs.lower
+    guesses = [drift]
+    for j, (first, second) in product(
+        range(problem.input_dim), ((upper, lower), (lower, upper))
+    ):
+        if not np.isfinite([first[j], second[j]]).all():
+            continue
+        inputs = drift.copy()
+        inputs[:length, j] += share * (first[j] - initial_input[j])
+        inputs[length : 2 * length, j] += share * (second[j] - initial_input[j])
+        guesses.append(inputs)
+    return guesses
