@@ -1,4 +1,4 @@
-"""Flies a controller on in its own model, and says what each stage of a flight costs.
+"""Flies a controller on in its own model.
 
 A program sees H stages, and a swing-up may take many more: the plan of least cost over
 H stages may lean for ever where its inputs can hold it. What a plan is worth shows when
@@ -14,17 +14,16 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from gpmpc._angles import full_turns, state_difference
+from gpmpc._angles import full_turns
 from gpmpc._dynamics import linearize
 from gpmpc._kernels.gp_rollout import Feedback
 from gpmpc.exceptions import SettingError
 from gpmpc.gaussian import Gaussian
 from gpmpc.models import RollOut
-from gpmpc.mpc._controller import FEASIBLE, Decision, Reference, Timing
+from gpmpc.mpc._controller import Decision, Reference, Timing
 from gpmpc.mpc._linear_quadratic import finite_horizon_lqr
-from gpmpc.mpc._stages import ConstraintRows, Plan
+from gpmpc.mpc._stage_meter import StageMeter, first_weight, held, rows_over
 from gpmpc.mpc.gp_mpc import GPMPC
-from gpmpc.mpc.problem import Problem
 from gpmpc.status import Status
 
 Array = np.ndarray
@@ -61,11 +60,11 @@ class Flight:
 
     @property
     def cost(self) -> float:
-        """Of all stages."""
+        """Cost of all stages."""
         return float(self.costs.sum())
 
     def is_better_than(self, other: "Flight") -> bool:
-        """Whether it alone arrives, or costs less.
+        """Tells whether it alone arrives, or costs less.
 
         Where none arrives, both are held at their ends for as long as the longer takes.
         """
@@ -80,14 +79,13 @@ class Flight:
         return self.cost + float(self.costs[-1]) * (length - len(self))
 
     def after(self, stages: int) -> "Flight":
-        """What is left of it after some stages."""
-        gains = None if self.gains is None else self.gains[stages:]
+        """Returns what is left of it after some stages."""
         return Flight(
-            self.states[stages:],
-            self.inputs[stages:],
-            self.costs[stages:],
-            self.arrives,
-            gains,
+            states=self.states[stages:],
+            inputs=self.inputs[stages:],
+            costs=self.costs[stages:],
+            arrives=self.arrives,
+            gains=None if self.gains is None else self.gains[stages:],
         )
 
 
@@ -101,7 +99,10 @@ class Question(NamedTuple):
     disturbance: Array | None = None  # of the model (n,)
 
     def over(self, horizon: int) -> "Question":
-        """The question to a controller of another horizon: what ends sooner is held."""
+        """Returns the question to a controller of another horizon.
+
+        What ends sooner is held.
+        """
         if self.reference.horizon == horizon:
             return self
         reference = self.reference
@@ -115,16 +116,18 @@ class Question(NamedTuple):
         return self._replace(reference=Reference(states, inputs), parameters=parameters)
 
     def after(self, stages: int) -> "Question":
-        """The question some stages later: parameters by stage move on, the last one held."""
+        """Returns the question some stages later.
+
+        Parameters by stage move on, the last one held.
+        """
         if self.parameters is None or np.ndim(self.parameters) < 2:
             return self
         count = len(self.parameters)
-        return self._replace(
-            parameters=rows_over(self.parameters, stages + count)[stages:]
-        )
+        parameters = rows_over(self.parameters, stages + count)[stages:]
+        return self._replace(parameters=parameters)
 
     def belief(self, state: Array) -> Gaussian:
-        """The belief with a mean (n,)."""
+        """Returns the belief with a mean (n,)."""
         return Gaussian(torch.as_tensor(np.ascontiguousarray(state)), self.covariance)
 
 
@@ -135,87 +138,6 @@ class Trajectory(NamedTuple):
     states: Array  # (K + 1, n)
     inputs: Array  # (K, m)
     previous: Decision | None = None  # the controller's last plan
-
-
-class StageMeter:
-    """Costs of stages as they are paid, outputs and violated constraints included.
-
-    Weights are those of the first stage, wherever a stage stands; angles count within
-    half a turn. Constraints of a part of the horizon only do not count.
-    """
-
-    def __init__(self, problem: Problem, horizon: int):
-        self._problem = problem
-        self._horizon = horizon
-        self._Q = first_weight(problem.cost.Q)
-        self._R = first_weight(problem.cost.R)
-        self._rows = ConstraintRows(problem, horizon, "none")
-        self._always = self._rows.applies.all(axis=0)
-
-    def __call__(self, states: Array, inputs: Array, question: Question) -> Array:
-        """Costs (L,) of states (L + 1, n) and inputs (L, m), infinite beyond a hard bound.
-
-        The reference is that of the question; beyond its end it stands still.
-        """
-        cost = self._problem.cost
-        reference = question.reference
-        targets = held(np.asarray(reference.states)[1:], len(inputs))
-        error = state_difference(states[1:], targets, cost.angles)
-        penalized = inputs
-        if cost.penalized == "deviations":
-            penalized = inputs - held(np.asarray(reference.inputs), len(inputs))
-        elif cost.penalized == "increments":
-            before = question.previous_input[None]
-            penalized = np.diff(inputs, axis=0, prepend=before)
-        costs = np.einsum("ki,ij,kj->k", error, self._Q, error)
-        costs += np.einsum("ki,ij,kj->k", penalized, self._R, penalized)
-        costs += self.functions(states, inputs, question.parameters)
-        return costs
-
-    def functions(self, states: Array, inputs: Array, parameters: Any) -> Array:
-        """What outputs and violated constraints of stages cost (L,); see ``__call__``."""
-        costs = np.zeros(len(inputs))
-        if not (self._problem.outputs or self._rows.per_stage):
-            return costs
-        H = self._horizon
-        for first in range(0, len(inputs), H):
-            part = slice(first, first + H)
-            after = held(states[1:][part], H)
-            steered = held(inputs[part], H)
-            own = None
-            if parameters is not None:
-                own = rows_over(parameters, first + H)[first:]
-            parts = self._outputs(after, steered, own)
-            parts += self._violations(after, steered, own)
-            costs[part] = parts[: len(inputs[part])]
-        return costs
-
-    def _outputs(self, states: Array, inputs: Array, parameters: Any) -> Array:
-        points = np.hstack([states, inputs, np.ones((self._horizon, 1))])
-        costs = np.zeros(self._horizon)
-        for output in self._problem.outputs:
-            squares = output.squares(states, inputs, parameters)
-            costs += np.einsum("ki,kij,kj->k", points, squares, points)
-        return costs
-
-    def _violations(self, states: Array, inputs: Array, parameters: Any) -> Array:
-        if not self._rows.per_stage:
-            return np.zeros(self._horizon)
-        n = states.shape[1]
-        certain = np.zeros((self._horizon + 1, n, n))
-        plan = Plan(np.vstack([states[:1], states]), inputs, certain)
-        rows = self._rows.at(plan, certain, 1, parameters)
-        E = np.broadcast_to(rows.E, (self._horizon, *rows.E.shape[1:]))
-        values = np.einsum("kri,ki->kr", E, states)
-        if len(rows.D):
-            values += np.einsum("kri,ki->kr", rows.D, inputs)
-        outside = np.maximum(values - rows.upper, rows.lower - values).clip(0.0)
-        outside = outside[:, self._always]
-        prices = self._rows.prices[self._always]
-        hard = np.isinf(prices)
-        costs = outside[:, ~hard] @ prices[~hard]
-        costs[(outside[:, hard] > FEASIBLE).any(axis=1)] = np.inf
-        return costs
 
 
 class Foresight:
@@ -239,28 +161,31 @@ class Foresight:
     def _with_horizon(
         self, horizon: int, iterations: int | None, tolerance: float
     ) -> GPMPC | None:
-        """The controller with another horizon; None where its problem is of this one."""
-        own = self.controller
-        constraints = own.problem.constraints
+        """Returns the controller with another horizon.
+
+        None where its problem is of this one.
+        """
+        controller = self.controller
+        constraints = controller.problem.constraints
         if any(constraint.stages is not None for constraint in constraints):
             return None
         try:
             return GPMPC(
                 self._model,
-                own.prediction.propagator,
-                own.problem,
+                controller.prediction.propagator,
+                controller.problem,
                 horizon,
-                own.initial_input.tolist(),
-                own.prediction.settings,
-                own.solver,
-                iterations,
-                tolerance,
+                controller.initial_input.tolist(),
+                prediction=controller.prediction.settings,
+                solver=controller.solver,
+                iterations=iterations,
+                tolerance=tolerance,
             )
         except SettingError:
             return None
 
     def arrives(self, costs: Array, dearest: float = 0.0) -> bool:
-        """Whether the goal is held at the end of stages with these costs (L,).
+        """Tells whether the goal is held at the end of stages with costs (L,).
 
         ``dearest`` is the cost of a stage before, where one is known.
         """
@@ -272,7 +197,10 @@ class Foresight:
     def fly(
         self, beginning: Trajectory, question: Question, limit: float = np.inf
     ) -> Flight | None:
-        """The flight along a trajectory, and on as the controller steers from its end.
+        """Flies along a trajectory, and on as its controller steers from its end.
+
+        The flight ends where the goal is held, where the plant stands still, or where
+        it has become too long.
 
         Returns:
             None where it costs more than ``limit``, or the controller fails.
@@ -280,44 +208,51 @@ class Foresight:
         costs = self.meter(beginning.states, beginning.inputs, question)
         if not np.isfinite(costs).all():
             return None
-        steering = _Steering(self, beginning, costs, question)
-        while steering.paid <= limit:
-            if steering.stages >= self.controller.horizon:
-                flight = steering.flight()
-                is_long = steering.stages >= self.longest
+        growing = _GrowingFlight(self, beginning, costs, question)
+        while growing.paid <= limit:
+            if growing.stages >= self.controller.horizon:
+                flight = growing.flight()
+                is_long = growing.stages >= self.longest
                 if flight.arrives or is_long or self._stands(flight.costs):
                     return flight
-            if not steering.advance():
+            if not growing.advance():
                 return None
         return None
 
     def hold(self, flight: Flight, question: Question) -> Flight:
-        """The flight and a horizon more, as the controller steers from its end."""
+        """Returns a flight and a horizon more, as the controller steers from its end.
+
+        It is the flight itself where the controller fails.
+        """
         beginning = Trajectory(
             self.controller, flight.states, flight.inputs, flight.plan
         )
-        steering = _Steering(self, beginning, flight.costs, question)
+        growing = _GrowingFlight(self, beginning, flight.costs, question)
         for _ in range(self.controller.horizon):
-            if not steering.advance():
+            if not growing.advance():
                 return flight
-        return steering.flight()
+        return growing.flight()
 
     def _stands(self, costs: Array) -> bool:
-        """Whether the last stages, as many as the goal is to be held for, cost the same."""
+        """Tells whether the last stages cost the same.
+
+        They are as many as the goal is to be held for.
+        """
         last = costs[-self._hold :]
         return bool(np.ptp(last) <= _STANDSTILL * last.max())
 
     def step(self, state: Array, input: Array, question: Question) -> Array:
-        """The next state (n,) of the model."""
+        """Returns the next state (n,) of the model."""
         return self._roll_out.open_loop(
             state[None], input[None, None], question.disturbance
         )[0, 1]
 
     def relays(self, state: Array, question: Question) -> Iterator[tuple[Array, Array]]:
-        """States and inputs of relays: inputs at their bounds, each up to a swing that comes nearer to the goal.
+        """Makes states and inputs of relays, up to swings that come nearer to the goal.
 
-        Relays switch one input where one state passes through its value at the start:
-        with a rate they take the plant's own rhythm, whatever it is, and pump.
+        Relays switch one input between its bounds where one state passes through its
+        value at the start: with a rate they take the plant's own rhythm, whatever it
+        is, and pump.
         """
         controller = self.controller
         m = controller.problem.input_dim
@@ -338,7 +273,7 @@ class Foresight:
     def follow(
         self, flight: Flight, state: Array, question: Question, dearest: float = 0.0
     ) -> Flight:
-        """The flight under its feedback, from another state at its beginning.
+        """Returns a flight under its feedback, from another state at its beginning.
 
         For ``dearest`` see ``arrives``.
         """
@@ -346,12 +281,18 @@ class Foresight:
         states, inputs = self.roll_out(
             flight.states, flight.inputs, flight.gains, state, question
         )
-        if not np.isfinite(states).all():
-            costs = np.full(len(inputs), np.inf)
-            return Flight(states, inputs, costs, False, flight.gains)
-        costs = self.meter(states, inputs, question)
-        arrives = self.arrives(costs, dearest)
-        return Flight(states, inputs, costs, arrives, flight.gains)
+        costs = np.full(len(inputs), np.inf)
+        arrives = False
+        if np.isfinite(states).all():
+            costs = self.meter(states, inputs, question)
+            arrives = self.arrives(costs, dearest)
+        return Flight(
+            states=states,
+            inputs=inputs,
+            costs=costs,
+            arrives=arrives,
+            gains=flight.gains,
+        )
 
     def roll_out(
         self,
@@ -361,26 +302,33 @@ class Foresight:
         state: Array,
         question: Question,
     ) -> tuple[Array, Array]:
-        """States (L + 1, n) and inputs (L, m) of u_k - K_k (x - x_k) from a state on."""
+        """Returns states (L + 1, n) and inputs (L, m) of the law u_k - K_k (x - x_k).
+
+        They start from ``state`` (n,), keep the bounds and rates of the inputs, and
+        follow ``states`` (L + 1, n) and ``inputs`` (L, m) with ``gains`` (L, m, n).
+        """
         length = len(inputs)
         problem = self.controller.problem
         lower, upper = (held(side, length) for side in problem.inputs.sides)
         down, up = (held(side, length) for side in problem.input_rates.sides)
         law = Feedback(
-            np.ascontiguousarray(states[None, :-1]),
-            np.ascontiguousarray(inputs[None]),
-            np.ascontiguousarray(-gains[None]),
-            lower,
-            upper,
-            down,
-            up,
-            np.ascontiguousarray(question.previous_input),
+            states=np.ascontiguousarray(states[None, :-1]),
+            inputs=np.ascontiguousarray(inputs[None]),
+            gains=np.ascontiguousarray(-gains[None]),
+            lower=lower,
+            upper=upper,
+            rate_lower=down,
+            rate_upper=up,
+            previous_input=np.ascontiguousarray(question.previous_input),
         )
-        rolled, steered = self._roll_out(state[None], law, question.disturbance)
-        return rolled[0], steered[0]
+        # One trajectory in the batch.
+        rolled_states, rolled_inputs = self._roll_out(
+            state[None], law, question.disturbance
+        )
+        return rolled_states[0], rolled_inputs[0]
 
     def with_gains(self, flight: Flight) -> Flight:
-        """The flight with the gains of the regulator of its own stages."""
+        """Returns a flight with the gains of the regulator of its own stages."""
         local = linearize(
             self._model, flight.states[:-1], flight.inputs, covariance=False
         )
@@ -402,40 +350,55 @@ class Foresight:
         rounds: int = _ROUNDS,
         programs: int = _PROGRAMS,
     ) -> Flight:
-        """A cheaper flight from programs over all of its stages; itself where there is none."""
+        """Returns a cheaper flight from programs over all of its stages.
+
+        It is the flight itself where there is none.
+
+        Args:
+            flight: The flight.
+            question: What the controller is asked at its beginning.
+            rounds: How often it is solved at most, the turns of its goal read anew.
+            programs: Quadratic programs of a round.
+        """
         length = len(flight)
         controller = self._with_horizon(length, programs, _TOLERANCE)
         if controller is None:
             return flight
-        asked = question.over(length)
-        targets = np.asarray(asked.reference.states)
+        whole = question.over(length)
+        targets = np.asarray(whole.reference.states)
         state = flight.states[0]
         last = no_plan(question.previous_input, len(state), length)
         angles = controller.problem.cost.angles
         for _ in range(rounds):
             turns = full_turns(flight.states - targets, angles)
             plan = controller.control(
-                asked.belief(state),
-                Reference(targets + turns, asked.reference.inputs),
+                whole.belief(state),
+                Reference(targets + turns, whole.reference.inputs),
                 last,
-                asked.parameters,
-                (flight.inputs, flight.states),
+                whole.parameters,
+                plan=(flight.inputs, flight.states),
             )
             if not plan.applicable:
                 break
-            gains = np.zeros((length, *np.shape(plan.inputs)[1:], len(state)))
-            towards = Flight(plan.means, plan.inputs, flight.costs, True, gains)
-            other = self.follow(towards, state, question)
-            if not (other.arrives and other.cost < flight.cost):
+            no_gains = np.zeros((length, *np.shape(plan.inputs)[1:], len(state)))
+            planned = Flight(
+                states=plan.means,
+                inputs=plan.inputs,
+                costs=flight.costs,
+                arrives=True,
+                gains=no_gains,
+            )
+            candidate = self.follow(planned, state, question)
+            if not (candidate.arrives and candidate.cost < flight.cost):
                 break
-            gain = flight.cost - other.cost
-            flight = replace(other, gains=None, plan=flight.plan)
-            if gain <= _GAIN * flight.cost:
+            saving = flight.cost - candidate.cost
+            flight = replace(candidate, gains=None, plan=flight.plan)
+            if saving <= _GAIN * flight.cost:
                 break
         return flight
 
 
-class _Steering:
+class _GrowingFlight:
     """A flight that grows, stage by stage, as a controller steers from its end."""
 
     def __init__(
@@ -448,7 +411,7 @@ class _Steering:
         self._foresight = foresight
         self._controller = beginning.controller
         self._question = question
-        self._asked = question.over(beginning.controller.horizon)
+        self._question_over_horizon = question.over(beginning.controller.horizon)
         self._states = list(beginning.states)
         self._inputs = list(beginning.inputs)
         self._costs = list(costs)
@@ -461,7 +424,7 @@ class _Steering:
 
     @property
     def stages(self) -> int:
-        """As many as it has now."""
+        """Number of stages so far."""
         return len(self._inputs)
 
     @property
@@ -469,24 +432,24 @@ class _Steering:
         return self._inputs[-1] if self._inputs else self._question.previous_input
 
     def advance(self) -> bool:
-        """Adds a stage; whether the controller found an input for it."""
+        """Adds a stage; returns whether the controller found an input for it."""
         state = self._states[-1]
-        asked = self._asked.after(self.stages)
+        asked = self._question_over_horizon.after(self.stages)
         plan = self._controller.control(
             asked.belief(state), asked.reference, self._plan, asked.parameters
         )
         if not plan.applicable:
             return False
-        after = self._foresight.step(state, plan.input, self._question)
+        next_state = self._foresight.step(state, plan.input, self._question)
         question = self._question.after(self.stages)
         question = question._replace(previous_input=self._last_input)
         costs = self._foresight.meter(
-            np.array([state, after]), plan.input[None], question
+            np.array([state, next_state]), plan.input[None], question
         )
         cost = float(costs[0])
         if not np.isfinite(cost):
             return False
-        self._states.append(after)
+        self._states.append(next_state)
         self._inputs.append(plan.input)
         self._costs.append(cost)
         self.paid += cost
@@ -494,20 +457,22 @@ class _Steering:
         return True
 
     def flight(self) -> Flight:
-        """What it is now."""
+        """Returns what was flown so far."""
         costs = np.array(self._costs)
-        arrives = self._foresight.arrives(costs)
         return Flight(
-            np.array(self._states),
-            np.array(self._inputs),
-            costs,
-            arrives,
+            states=np.array(self._states),
+            inputs=np.array(self._inputs),
+            costs=costs,
+            arrives=self._foresight.arrives(costs),
             plan=self._plan,
         )
 
 
 def _swings(costs: Array) -> list[int]:
-    """The first stages (at most four) whose costs are the lowest so far, and lower than those around."""
+    """Returns the first stages (at most four) at which a swing turns.
+
+    Their costs are the lowest so far, and lower than those around.
+    """
     stages: list[int] = []
     lowest = costs[0]
     for k in range(1, len(costs) - 1):
@@ -518,28 +483,17 @@ def _swings(costs: Array) -> list[int]:
     return stages[:_SWINGS]
 
 
-def held(part: Array, count: int) -> Array:
-    """The first rows of a part, the last one repeated up to a count."""
-    part = part[:count]
-    if len(part) < count:
-        part = np.concatenate([part, np.repeat(part[-1:], count - len(part), axis=0)])
-    return np.ascontiguousarray(part)
-
-
-def rows_over(parameters: Any, count: int) -> Array:
-    """Parameters of a number of stages (count, q), from (q,) or those of others."""
-    return held(np.atleast_2d(np.asarray(parameters, dtype=float)), count)
-
-
-def first_weight(weight: Array) -> Array:
-    """The weight of the first stage, from one for all or those by stage."""
-    return weight.reshape(-1, *weight.shape[-2:])[0]
-
-
 def no_plan(last_input: Array, state_dim: int, horizon: int) -> Decision:
-    """A decision without a plan: what counts of it is the input that was applied."""
-    inputs = np.tile(last_input, (horizon, 1))
-    means = np.full((horizon + 1, state_dim), np.nan)
-    covariances = np.full((horizon + 1, state_dim, state_dim), np.nan)
-    status = Status.ITERATION_LIMIT
-    return Decision(last_input, inputs, means, covariances, status, 0, Timing())
+    """Returns a decision without a plan.
+
+    What counts of it is the input that was applied.
+    """
+    return Decision(
+        input=last_input,
+        inputs=np.tile(last_input, (horizon, 1)),
+        means=np.full((horizon + 1, state_dim), np.nan),
+        covariances=np.full((horizon + 1, state_dim, state_dim), np.nan),
+        status=Status.ITERATION_LIMIT,
+        iterations=0,
+        timing=Timing(),
+    )

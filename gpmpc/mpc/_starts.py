@@ -623,7 +623,7 @@ class ManyStarts:
         return cost if np.isfinite(cost) else inf
 
     def _deadline(self) -> float:
-        """Returns the time of ``perf_counter`` after which no further start is taken."""
+        """Returns the ``perf_counter`` after which no further start is taken."""
         return inf if self.budget is None else perf_counter() + self.budget
 
     def _cost(self, decision: Decision, reference: Reference) -> float:

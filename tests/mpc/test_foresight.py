@@ -19,7 +19,8 @@ from gpmpc.mpc import (
     Reference,
     Tracking,
 )
-from gpmpc.mpc._foresight import Flight, Foresight, Question, StageMeter, Trajectory
+from gpmpc.mpc._foresight import Flight, Foresight, Question, Trajectory
+from gpmpc.mpc._stage_meter import StageMeter
 from gpmpc.propagation import Linearization
 from gpmpc.systems import cart_pole, pendulum, step
 

@@ -1,0 +1,128 @@
+"""The costs of stages as they are paid, one by one, over any number of stages.
+
+The stage costs of a decision (``Decision.stage_costs``) are those of its program: with
+the weights of H stages, the terminal one at the end, and spreads. What is flown on has
+more stages than that and no end, so each is weighed here as the first one of a program.
+"""
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from gpmpc._angles import state_difference
+from gpmpc.mpc._controller import FEASIBLE
+from gpmpc.mpc._stages import ConstraintRows, Plan
+from gpmpc.mpc.problem import Problem
+
+if TYPE_CHECKING:
+    from gpmpc.mpc._foresight import Question
+
+Array = np.ndarray
+
+
+class StageMeter:
+    """Costs of stages as they are paid, outputs and violated constraints included.
+
+    Weights are those of the first stage, wherever a stage stands; angles count within
+    half a turn. Constraints of a part of the horizon only do not count.
+    """
+
+    def __init__(self, problem: Problem, horizon: int):
+        self._problem = problem
+        self._horizon = horizon
+        self._Q = first_weight(problem.cost.Q)
+        self._R = first_weight(problem.cost.R)
+        self._rows = ConstraintRows(problem, horizon, "none")
+        self._always = self._rows.applies.all(axis=0)
+
+    def __call__(self, states: Array, inputs: Array, question: "Question") -> Array:
+        """Returns the costs (L,) of states (L + 1, n) and inputs (L, m).
+
+        They are infinite beyond a hard bound. The reference is that of the question;
+        beyond its end it stands still.
+        """
+        cost = self._problem.cost
+        reference = question.reference
+        targets = held(np.asarray(reference.states)[1:], len(inputs))
+        error = state_difference(states[1:], targets, cost.angles)
+        penalized = inputs
+        if cost.penalized == "deviations":
+            penalized = inputs - held(np.asarray(reference.inputs), len(inputs))
+        elif cost.penalized == "increments":
+            before = question.previous_input[None]
+            penalized = np.diff(inputs, axis=0, prepend=before)
+        costs = np.einsum("ki,ij,kj->k", error, self._Q, error)
+        costs += np.einsum("ki,ij,kj->k", penalized, self._R, penalized)
+        costs += self.functions(states, inputs, question.parameters)
+        return costs
+
+    def functions(self, states: Array, inputs: Array, parameters: Any) -> Array:
+        """Returns the costs of outputs and of violated constraints (L,).
+
+        They are evaluated for a horizon at a time; see ``__call__``.
+        """
+        count = len(inputs)
+        costs = np.zeros(count)
+        if not (self._problem.outputs or self._rows.per_stage):
+            return costs
+        H = self._horizon
+        next_states = states[1:]
+        for first in range(0, count, H):
+            end = min(first + H, count)
+            chunk_states = held(next_states[first:end], H)
+            chunk_inputs = held(inputs[first:end], H)
+            chunk_parameters = None
+            if parameters is not None:
+                chunk_parameters = rows_over(parameters, first + H)[first:]
+            chunk = self._outputs(chunk_states, chunk_inputs, chunk_parameters)
+            chunk += self._violations(chunk_states, chunk_inputs, chunk_parameters)
+            costs[first:end] = chunk[: end - first]
+        return costs
+
+    def _outputs(self, states: Array, inputs: Array, parameters: Any) -> Array:
+        """Returns the costs of outputs at next states (H, n) and inputs (H, m)."""
+        points = np.hstack([states, inputs, np.ones((self._horizon, 1))])
+        costs = np.zeros(self._horizon)
+        for output in self._problem.outputs:
+            squares = output.squares(states, inputs, parameters)
+            costs += np.einsum("ki,kij,kj->k", points, squares, points)
+        return costs
+
+    def _violations(self, states: Array, inputs: Array, parameters: Any) -> Array:
+        """Returns the prices of violated constraints (H,), infinite of hard ones."""
+        if not self._rows.per_stage:
+            return np.zeros(self._horizon)
+        n = states.shape[1]
+        certain = np.zeros((self._horizon + 1, n, n))
+        plan = Plan(np.vstack([states[:1], states]), inputs, certain)
+        rows = self._rows.at(plan, certain, 1, parameters)
+        E = np.broadcast_to(rows.E, (self._horizon, *rows.E.shape[1:]))
+        values = np.einsum("kri,ki->kr", E, states)
+        if len(rows.D):
+            values += np.einsum("kri,ki->kr", rows.D, inputs)
+        excess = np.maximum(values - rows.upper, rows.lower - values).clip(0.0)
+        excess = excess[:, self._always]
+        prices = self._rows.prices[self._always]
+        hard = np.isinf(prices)
+        costs = excess[:, ~hard] @ prices[~hard]
+        costs[(excess[:, hard] > FEASIBLE).any(axis=1)] = np.inf
+        return costs
+
+
+def held(rows: Array, count: int) -> Array:
+    """Returns the first rows, the last one repeated up to a count."""
+    rows = rows[:count]
+    missing = count - len(rows)
+    if missing > 0:
+        rows = np.concatenate([rows, np.repeat(rows[-1:], missing, axis=0)])
+    return np.ascontiguousarray(rows)
+
+
+def rows_over(parameters: Any, count: int) -> Array:
+    """Returns parameters of stages (count, q), from (q,) or those of others."""
+    return held(np.atleast_2d(np.asarray(parameters, dtype=float)), count)
+
+
+def first_weight(weight: Array) -> Array:
+    """Returns the weight of the first stage, from one for all or those by stage."""
+    return weight.reshape(-1, *weight.shape[-2:])[0]
