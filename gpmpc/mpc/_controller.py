@@ -1,7 +1,7 @@
 """The protocol of controllers: from a belief and a reference to a decision.
 
-A controller keeps nothing between calls: what it needs of its last plan is part of the ``Decision`` that it returns,
-and is handed to it again as ``previous``.
+A controller keeps nothing between calls: what it needs of its last plan is part of the
+``Decision`` that it returns, and is handed to it again as ``previous``.
 """
 
 import math
@@ -14,7 +14,7 @@ import numpy as np
 
 from gpmpc._angles import full_turns
 from gpmpc._arrays import names_of, read_array, sorted_columns
-from gpmpc._compiled import compiled, njit_inner
+from gpmpc._compiled import compiled
 from gpmpc.exceptions import (
     DataError,
     SettingError,
@@ -32,55 +32,58 @@ from gpmpc.status import Status
 Array = np.ndarray
 
 _FAR = 0.9  # a novelty
-FEASIBLE = 1e-3  # by how much a suboptimal plan may miss hard bounds, in their units: a next step mends it
+# By how much a suboptimal plan may miss hard bounds, in their units: a next step mends
+# it.
+FEASIBLE = 1e-3
 KEPT = 1e-5  # by how much a bound may be missed that counts as kept, in its unit
-_NO_PLAN = np.empty((0, 0))
 _FLOAT64 = np.dtype(np.float64)
 
 
 @dataclass(frozen=True)
 class Reference:
-    """What a controller is to follow over its horizon H, from the current time on.
+    """A path for a controller to follow over its horizon H, from the current time on.
 
     Raises:
-        ShapeError: They do not belong together.
+        ShapeError: States, inputs and kappas do not belong together.
     """
 
-    states: Array  #: r_0 .. r_H (H + 1, n); r_0 belongs to the current time. Or a set point (n,), for any horizon
-    #: u*_0 .. u*_{H-1} (H, m), the inputs that belong to it where they are known; (m,) for a set point
+    #: r_0 .. r_H (H + 1, n); r_0 belongs to the current time. Or a set point (n,), for
+    #: any horizon
+    states: Array
+    #: u*_0 .. u*_{H-1} (H, m), the inputs that belong to it where they are known; (m,)
+    #: for a set point
     inputs: Array | None = None
-    #: standard deviations (H,) between the means and the sides of chance constraints, by stage, in the place of the
-    #: problem's, such as those of an ``AdaptiveTube``; for covariances of ``zero_order``
+    #: standard deviations (H,) between the means and the sides of chance constraints,
+    #: by stage, in the place of the problem's, such as those of an ``AdaptiveTube``; for
+    #: covariances of ``zero_order``
     kappas: Array | None = None
     #: names of states and inputs, where they are known: by default of a series'
     #: entries, or of a table's columns. A controller sorts by them
     signals: Signals = UNKNOWN
 
     def __post_init__(self) -> None:
-        plain = type(self.states) is np.ndarray and (
-            self.inputs is None or type(self.inputs) is np.ndarray
-        )
-        if not plain or self.signals is not UNKNOWN:
+        states_plain = type(self.states) is np.ndarray
+        inputs_plain = self.inputs is None or type(self.inputs) is np.ndarray
+        if self.signals is not UNKNOWN or not (states_plain and inputs_plain):
             check_signals(self.signals)
             self._read_names()
-        shape = np.shape(self.states)
-        wide = None if self.inputs is None else np.shape(self.inputs)
-        if len(shape) == 1:
-            if wide is not None and len(wide) != 1:
-                raise ShapeError(f"inputs of a set point must be (m,); got {wide}")
+        states_shape = np.shape(self.states)
+        inputs_shape = None if self.inputs is None else np.shape(self.inputs)
+        if len(states_shape) == 1:
+            if inputs_shape is not None and len(inputs_shape) != 1:
+                rule = "inputs of a set point must be (m,)"
+                raise ShapeError(f"{rule}; got {inputs_shape}")
             return
-        if len(shape) != 2 or shape[0] < 2:
-            raise ShapeError(
-                f"reference states must be (H + 1, n), H of 1 or more; got {shape}"
-            )
-        if wide is not None and (len(wide) != 2 or wide[0] != shape[0] - 1):
-            raise ShapeError(
-                f"reference inputs must be ({shape[0] - 1}, m); got {wide}"
-            )
-        if self.kappas is not None and np.shape(self.kappas) != (self.horizon,):
-            raise ShapeError(
-                f"kappas must be ({self.horizon},); got {np.shape(self.kappas)}"
-            )
+        if len(states_shape) != 2 or states_shape[0] < 2:
+            rule = "reference states must be (H + 1, n), H of 1 or more"
+            raise ShapeError(f"{rule}; got {states_shape}")
+        H = states_shape[0] - 1
+        if inputs_shape is not None and (
+            len(inputs_shape) != 2 or inputs_shape[0] != H
+        ):
+            raise ShapeError(f"reference inputs must be ({H}, m); got {inputs_shape}")
+        if self.kappas is not None and np.shape(self.kappas) != (H,):
+            raise ShapeError(f"kappas must be ({H},); got {np.shape(self.kappas)}")
 
     def _read_names(self) -> None:
         """Turns series and tables into arrays, whose names are known then."""
@@ -98,7 +101,7 @@ class Reference:
                 object.__setattr__(self, key, array)
 
     def in_order(self, signals: Signals) -> "Reference":
-        """The reference, its columns sorted by names; itself where they are not known.
+        """Returns the reference, its columns sorted by names, where they are known.
 
         Raises:
             DataError: Its own names are others.
@@ -118,13 +121,13 @@ class Reference:
         return Reference(states, inputs, self.kappas)
 
     def over(self, horizon: int) -> "Reference":
-        """The reference itself, or a set point repeated over a horizon."""
+        """Returns the reference itself, or a set point repeated over a horizon."""
         if np.ndim(self.states) == 2:
             return self
-        inputs = (
-            None if self.inputs is None else np.tile(_array(self.inputs), (horizon, 1))
-        )
-        states = np.tile(_array(self.states), (horizon + 1, 1))
+        states = np.tile(_as_array(self.states), (horizon + 1, 1))
+        inputs = None
+        if self.inputs is not None:
+            inputs = np.tile(_as_array(self.inputs), (horizon, 1))
         return Reference(states, inputs, self.kappas, self.signals)
 
     @property
@@ -134,7 +137,7 @@ class Reference:
 
 
 def read_reference(value: Any) -> Reference:
-    """A reference, or the one of a set point (n,) or of states (H + 1, n).
+    """Returns a reference, given as one, a set point (n,) or states (H + 1, n).
 
     Raises:
         DataError: They are no real numbers.
@@ -161,26 +164,30 @@ class Timing:
 
 @dataclass(frozen=True)
 class Decision:
-    """What a controller decided at one step."""
+    """The input that a controller decided on at one step, with its plan."""
 
     input: Array  #: to apply now (m,)
     inputs: Array  #: planned (H, m); the first row is ``input``
-    means: Array  #: predicted means of the states (H + 1, n), from the current state on
-    covariances: Array  #: of these (H + 1, n, n); zero where the controller does not predict them
+    #: predicted means of the states (H + 1, n), from the current state on
+    means: Array
+    #: of these (H + 1, n, n); zero where the controller does not predict them
+    covariances: Array
     status: Status  #: how the solve ended
     iterations: int  #: of the solver
     timing: Timing  #: of the parts
-    problem: QuadraticProgram | None = None  #: that was solved last, where there is one
-    solution: QPSolution | None = (
-        None  #: of it: active set, multipliers, residuals; a warm start for the next
-    )
-    #: estimate of the model's constant error (n,), added to its mean at every stage; None where nothing is estimated
+    #: that was solved last, where there is one
+    problem: QuadraticProgram | None = None
+    #: of it: active set, multipliers, residuals; a warm start for the next
+    solution: QPSolution | None = None
+    #: estimate of the model's constant error (n,), added to its mean at every stage;
+    #: None where nothing is estimated
     disturbance: Array | None = None
-    #: the solve stopped short of its tolerance, at a limit say, with a plan that keeps its bounds and that steps
-    #: towards the optimum led to (Scokaert, Mayne and Rawlings, 1999)
+    #: the solve stopped short of its tolerance, at a limit say, with a plan that keeps
+    #: its bounds and that steps towards the optimum led to (Scokaert, Mayne and
+    #: Rawlings, 1999)
     suboptimal: bool = False
-    #: predicted cost of each stage of the plan (H,), that of x_{k+1} and u_k; empty where
-    #: it is not known
+    #: predicted cost of each stage of the plan (H,), that of x_{k+1} and u_k; empty
+    #: where it is not known
     stage_costs: Array = field(default_factory=lambda: np.empty(0))
     #: by how much the plan misses a bound, in the bound's unit: smooth constraints are
     #: taken at its means; soft ones may be missed. Zero but for rounding where all are
@@ -188,53 +195,62 @@ class Decision:
     violation: float = math.nan
     #: lengths of the steps that its programs took, squared in the metric of the cost
     steps: tuple[float, ...] = ()
-    #: ``novelty``, or what measures it when it is read: a plan of means alone does not pay for variances
+    #: ``novelty``, or what measures it when it is read: a plan of means alone does not
+    #: pay for variances
     plan_novelty: float | Callable[[], float] = math.nan
-    #: what the flight has taught a controller that learns (``gpmpc.learning``), for its next decision; with ``size``,
-    #: the points of the model that decided, and ``version``, how often it has changed
+    #: what the flight has taught a controller that learns (``gpmpc.learning``), for its
+    #: next decision; with ``size``, the points of the model that decided, and
+    #: ``version``, how often it has changed
     learned: Any = None
 
     def __post_init__(self) -> None:
-        object.__setattr__(
-            self, "input", np.array(self.input, dtype=float)
-        )  # no view of the plan
+        # a copy, no view of the plan
+        object.__setattr__(self, "input", np.array(self.input, dtype=float))
 
     @property
     def applicable(self) -> bool:
-        """Whether the plan may be applied, and started from; the inputs of another decision are a failed iterate."""
+        """Whether the plan may be applied, and started from.
+
+        The inputs of a decision that is not applicable are a failed iterate.
+        """
         return self.status.solved or self.suboptimal
 
     @cached_property
     def novelty(self) -> float:
-        """How far the plan is from what the model knows: near 0 among data, 1 where it says no more than they do.
+        """Distance of the plan from what the model knows: near 0 among data.
 
-        The largest of two ratios over all stages and states: the deviation that a stage adds without its noise, over
-        the deviation of what the model has learned (1 at most); and the deviation predicted for a stage, over the
-        range of that state in the data (half a turn for an angle), which has no bound. NaN for models without GPs, or
-        whose GPs act as the state says (a callable B).
+        1 where the model says no more than the data. It is the largest of two ratios
+        over all stages and states: the deviation that a stage adds without its noise,
+        over the deviation of what the model has learned (1 at most); and the deviation
+        predicted for a stage, over the range of that state in the data (half a turn for
+        an angle), which has no bound. NaN for models without GPs, or whose GPs act as
+        the state says (a callable B).
 
-        Of a plan without variances it is measured when it is first read, by the model as it is then: read it before
-        the next decision of a controller that learns.
+        Of a plan without variances it is measured when it is first read, by the model
+        as it is then: read it before the next decision of a controller that learns.
         """
-        found = self.plan_novelty
-        if callable(found):
-            found = found()
-            object.__setattr__(self, "plan_novelty", found)
-        return found
+        novelty = self.plan_novelty
+        if callable(novelty):
+            novelty = novelty()
+            object.__setattr__(self, "plan_novelty", novelty)
+        return novelty
 
     @property
     def far_from_data(self) -> bool:
-        """Whether the plan leaves the data behind: its model says little more there than the data alone."""
+        """Whether the plan leaves the data behind.
+
+        Its model says little more there than the data alone.
+        """
         return self.novelty > _FAR
 
     @property
     def cost(self) -> float:
-        """The predicted cost of the plan, all stages together; NaN where it is not known."""
+        """Predicted cost of the plan, all stages together; NaN where it is unknown."""
         return float(self.stage_costs.sum()) if len(self.stage_costs) else math.nan
 
     @property
     def program_violation(self) -> float:
-        """By how much the solution of the last program misses a bound of it; NaN without one.
+        """By how much the last program's solution misses a bound; NaN without one.
 
         Of smooth constraints the program holds what they are at the plan before: the
         plan itself may miss them by more, ``violation``.
@@ -266,28 +282,26 @@ class Controller(Protocol):
 
 
 class Request(NamedTuple):
-    """The arguments of ``control``, validated and converted to contiguous float64 arrays."""
+    """The arguments of ``control``, validated, as contiguous float64 arrays."""
 
     state: Array  # mean of the belief (n,)
     covariance: Array  # of the belief (n, n)
-    references: References  # r_1 .. r_H, reference inputs (zero where there are none), and the input before this step
-    #: inputs (H, m) within their bounds: those handed over; else the last plan's, one step on, the last one repeated;
-    #: else the previous input repeated
+    #: r_1 .. r_H, reference inputs (zero where there are none), and the input before
+    #: this step
+    references: References
+    #: inputs (H, m) within their bounds: those handed over; else the last plan's, one
+    #: step on, the last one repeated; else the previous input repeated
     initial_guess: Array
-    finite: (
-        bool  # whether the belief is; one that is not is a bad measurement, not misuse
-    )
-    disturbance: Array | None = (
-        None  # added to the model's mean at every stage (n,); None where nothing is estimated
-    )
+    #: whether the belief is; one that is not is a bad measurement, not misuse
+    finite: bool
+    #: added to the model's mean at every stage (n,); None where nothing is estimated
+    disturbance: Array | None = None
     parameters: Array | None = None  # of the smooth constraints, by stage (H, q)
     kappas: Array | None = None  # of the reference (H,), where it has some
-    previous: Decision | None = (
-        None  # the last one, where its plan may be started from and has this horizon
-    )
-    states: Array | None = (
-        None  # a first guess of x_0 .. x_H (H + 1, n), where one was handed over
-    )
+    #: the last decision, where its plan may be started from and has this horizon
+    previous: Decision | None = None
+    #: a first guess of x_0 .. x_H (H + 1, n), where one was handed over
+    states: Array | None = None
 
     @classmethod
     def read(
@@ -303,10 +317,20 @@ class Request(NamedTuple):
     ) -> "Request":
         """Validates the arguments of ``Controller.control`` for H stages of a problem.
 
-        ``initial_input`` is taken for the previous one where there is no decision before; of one that is not applicable
-        only ``input`` counts: what was applied. For ``plan``, and the errors, see
-        ``GPMPC.control``. ``signals`` are the controller's, by which a belief and a
-        reference with names are sorted.
+        Args:
+            problem: Weights and bounds.
+            horizon: H.
+            initial_input: The previous input where there is no decision before (m,).
+            belief: Of the state; sorted by names where it has some.
+            reference: Over the horizon; likewise.
+            previous: The last decision; of one that is not applicable only ``input``
+                counts, what was applied.
+            plan: To start from; see ``GPMPC.control``.
+            signals: Names of the controller, by which belief and reference are sorted.
+
+        Raises:
+            ShapeError: See ``GPMPC.control``.
+            DataError: Likewise.
         """
         check_arguments(belief, reference)
         if belief.names:
@@ -314,59 +338,36 @@ class Request(NamedTuple):
         if reference.signals is not UNKNOWN:
             reference = reference.in_order(signals)
         reference = reference.over(horizon)
-        n = problem.state_dim
-        m = problem.input_dim
-        state = _array(belief.mean)
-        covariance = _array(belief.covariance)
-        states = _array(reference.states)
-        if state.shape != (n,) or states.shape != (horizon + 1, n):
-            expected = f"({n},) and ({horizon + 1}, {n})"
-            raise ShapeError(
-                f"state and reference must have shapes {expected}; got {state.shape} and {states.shape}"
-            )
-        inputs = (
-            np.zeros((horizon, m))
-            if reference.inputs is None
-            else _array(reference.inputs)
-        )
-        if inputs.shape != (horizon, m):
-            raise ShapeError(
-                f"reference inputs must have shape ({horizon}, {m}); got {inputs.shape}"
-            )
-        last = _array(initial_input if previous is None else previous.input)
-        guess = np.empty((horizon, m))
-        usable = (
-            previous is not None
-            and previous.applicable
-            and np.shape(previous.inputs) == guess.shape
-        )
-        made = previous if usable else None
-        first = _NO_PLAN if made is None else _array(made.inputs)
-        guessed = None
+        n = problem.cost.Q.shape[-1]
+        m = problem.cost.R.shape[-1]
+        state = _as_array(belief.mean)
+        covariance = _as_array(belief.covariance)
+        finite = _is_finite(state) and _is_finite(covariance)
+        targets = _read_targets(reference, state, horizon, n)
+        target_inputs = _read_target_inputs(reference, horizon, m)
+        kappas = _read_kappas(reference)
+        last_decision = previous if _can_continue(previous, horizon, m) else None
+        last_input = _read_last_input(previous, initial_input)
+        states = None
         if plan is not None:
-            first, guessed = _read_plan(plan, horizon, n, m)
-        given = (state, covariance, states, inputs)
-        limits = problem.inputs.sides
-        finite = _check.unchecked(*given, last, first, limits, guess)
-        if not finite[3]:
-            last = _array(initial_input)
-            _check.unchecked(*given, last, first, limits, guess)
-        kappas = None if reference.kappas is None else _array(reference.kappas)
-        for name, values, known in (
-            ("states", states, finite[1]),
-            ("inputs", inputs, finite[2]),
-        ):
-            if not known:
-                raise DataError(
-                    f"reference {name} must be finite; got {values[~np.isfinite(values)][0]}"
-                )
-        if kappas is not None and not np.isfinite(kappas).all():
-            raise DataError(f"reference kappas must be finite; got {kappas}")
-        if problem.cost.angles and guessed is None and finite[0]:
-            states = _unwrapped(states, state, made, problem.cost.angles)
-        references = References(states[1:], inputs, last)
-        more: dict[str, Any] = {"kappas": kappas, "previous": made, "states": guessed}
-        return cls(state, covariance, references, guess, finite[0], **more)
+            guess, states = _read_plan(plan, horizon, n, m)
+        elif last_decision is not None:
+            guess = _shift(_as_array(last_decision.inputs))
+        else:
+            guess = np.tile(last_input, (horizon, 1))
+        if problem.cost.angles and states is None and finite:
+            targets = _unwrap(targets, state, last_decision, problem.cost.angles)
+        lower, upper = problem.inputs.sides
+        return cls(
+            state=state,
+            covariance=covariance,
+            references=References(targets[1:], target_inputs, last_input),
+            initial_guess=np.minimum(np.maximum(guess, lower), upper),
+            finite=finite,
+            kappas=kappas,
+            previous=last_decision,
+            states=states,
+        )
 
     @property
     def constant_guess(self) -> Array:
@@ -376,12 +377,84 @@ class Request(NamedTuple):
     def failed_decision(
         self, status: Status, iterations: int = 0, timing: Timing | None = None
     ) -> Decision:
-        """The decision of a step without a usable solve: the initial guess, and no prediction."""
-        (H, n), inputs = self.references.states.shape, self.initial_guess
-        unknown = np.full((H + 1, n), np.nan), np.full((H + 1, n, n), np.nan)
+        """Returns the decision of a step without a usable solve.
+
+        It holds the initial guess, and no prediction.
+        """
+        H, n = self.references.states.shape
         return Decision(
-            inputs[0], inputs, *unknown, status, iterations, timing or Timing()
+            input=self.initial_guess[0],
+            inputs=self.initial_guess,
+            means=np.full((H + 1, n), np.nan),
+            covariances=np.full((H + 1, n, n), np.nan),
+            status=status,
+            iterations=iterations,
+            timing=timing or Timing(),
         )
+
+
+def _read_targets(reference: Reference, state: Array, horizon: int, n: int) -> Array:
+    """Returns finite reference states (H + 1, n); checks the state's dimension, too."""
+    targets = _as_array(reference.states)
+    if state.shape != (n,) or targets.shape != (horizon + 1, n):
+        rule = f"must have shapes ({n},) and ({horizon + 1}, {n})"
+        got = f"{state.shape} and {targets.shape}"
+        raise ShapeError(f"state and reference {rule}; got {got}")
+    _check_finite("states", targets)
+    return targets
+
+
+def _read_target_inputs(reference: Reference, horizon: int, m: int) -> Array:
+    """Returns finite reference inputs (H, m), zero where there are none."""
+    if reference.inputs is None:
+        return np.zeros((horizon, m))
+    inputs = _as_array(reference.inputs)
+    if inputs.shape != (horizon, m):
+        rule = f"must have shape ({horizon}, {m})"
+        raise ShapeError(f"reference inputs {rule}; got {inputs.shape}")
+    _check_finite("inputs", inputs)
+    return inputs
+
+
+def _read_kappas(reference: Reference) -> Array | None:
+    """Returns finite kappas (H,), where the reference has some."""
+    if reference.kappas is None:
+        return None
+    kappas = _as_array(reference.kappas)
+    if not np.isfinite(kappas).all():
+        raise DataError(f"reference kappas must be finite; got {kappas}")
+    return kappas
+
+
+def _check_finite(name: str, values: Array) -> None:
+    """Raises ``DataError`` unless a part of a reference is finite."""
+    if not _is_finite(values):
+        got = values[~np.isfinite(values)][0]
+        raise DataError(f"reference {name} must be finite; got {got}")
+
+
+def _can_continue(previous: Decision | None, horizon: int, m: int) -> bool:
+    """Returns whether a decision has a plan of this horizon to start from."""
+    if previous is None or not previous.applicable:
+        return False
+    return np.shape(previous.inputs) == (horizon, m)
+
+
+def _read_last_input(previous: Decision | None, initial_input: Array) -> Array:
+    """Returns the input before this step (m,): the initial one where it is unknown."""
+    if previous is not None:
+        last_input = _as_array(previous.input)
+        if _is_finite(last_input):
+            return last_input
+    return _as_array(initial_input)
+
+
+def _shift(inputs: Array) -> Array:
+    """Returns planned inputs (H, m), one step on, the last one repeated."""
+    shifted = np.empty_like(inputs)
+    shifted[:-1] = inputs[1:]
+    shifted[-1] = inputs[-1]
+    return shifted
 
 
 def check_arguments(belief: Any, reference: Any) -> None:
@@ -395,13 +468,14 @@ def check_arguments(belief: Any, reference: Any) -> None:
 
 
 def check_method(key: str, value: object, method: str, example: str) -> None:
-    """Raises ``SettingError`` unless a setting is an object (no class of them) with a method."""
+    """Raises ``SettingError`` unless a setting is an object with a method.
+
+    A class of such objects is none.
+    """
     if isinstance(value, type) or not hasattr(value, method):
         got = f"the class {value.__name__}" if isinstance(value, type) else repr(value)
-        raise SettingError(
-            key,
-            f"must be an object with the method {method!r}, such as {example}; got {got}",
-        )
+        rule = f"must be an object with the method {method!r}, such as {example}"
+        raise SettingError(key, f"{rule}; got {got}")
 
 
 def check_controller(
@@ -412,41 +486,55 @@ def check_controller(
     initial_input: Any,
     input_names: Sequence[str] = (),
 ) -> Array:
-    """Checks the settings that every controller has against its model; returns the initial input as an array (m,)."""
+    """Checks the settings that every controller has against its model.
+
+    Args:
+        problem: Weights and bounds.
+        states: Number of states of the model, n.
+        inputs: Number of its inputs, m.
+        horizon: H.
+        initial_input: (m,).
+        input_names: Of the model, where they are known.
+
+    Returns:
+        The initial input as an array (m,).
+
+    Raises:
+        SettingError: One of them does not fit.
+    """
     if not isinstance(problem, Problem):
-        raise SettingError(
-            "problem", f"must be Problem(...); got {type(problem).__name__}"
-        )
+        got = type(problem).__name__
+        raise SettingError("problem", f"must be Problem(...); got {got}")
     check_number("horizon", horizon, least=1, whole=True)
     if names_of(initial_input):
         initial_input = read_array("initial_input", initial_input, input_names)
     check_numbers("initial_input", initial_input, inputs)
     if (problem.state_dim, problem.input_dim) != (states, inputs):
+        rule = f"must weigh {states} states and {inputs} inputs"
         got = f"{problem.state_dim} and {problem.input_dim}"
-        raise SettingError(
-            "problem", f"must weigh {states} states and {inputs} inputs; got {got}"
-        )
+        raise SettingError("problem", f"{rule}; got {got}")
     return np.array(initial_input, dtype=float)
 
 
-def _array(value: Any, key: str = "a state, a reference or a plan") -> Array:
-    """A tensor or array as contiguous float64 in host memory.
+def _as_array(value: Any, key: str = "a state, a reference or a plan") -> Array:
+    """Converts a tensor or array to contiguous float64 in host memory.
 
-    ``DataError`` where it is no real numbers.
+    Raises:
+        DataError: It is no real numbers.
     """
     if type(value) is not np.ndarray and hasattr(value, "detach"):
         try:
             value = value.numpy()
         except (RuntimeError, TypeError):  # on another device, or part of a graph
             value = value.numpy(force=True)
-    if type(value) is not np.ndarray or value.dtype is not _FLOAT64:
+    if type(value) is not np.ndarray or value.dtype != _FLOAT64:
         value = read_array(key, value)
     return np.ascontiguousarray(value)
 
 
 def read_parameters(parameters: Any, horizon: int) -> Array:
     """Returns finite parameters of every stage (H, q), given as these or as (q,)."""
-    values = np.atleast_1d(_array(parameters, "parameters"))
+    values = np.atleast_1d(_as_array(parameters, "parameters"))
     if values.ndim == 1:
         values = np.tile(values, (horizon, 1))
     if values.ndim != 2 or len(values) != horizon:
@@ -459,55 +547,50 @@ def read_parameters(parameters: Any, horizon: int) -> Array:
 
 
 def _read_plan(plan: Any, horizon: int, n: int, m: int) -> tuple[Array, Array | None]:
-    """The inputs of a plan, after one more row, and its states where it has some."""
+    """Returns inputs (H, m) of a plan, and its states (H + 1, n) where it has some."""
     inputs, states = plan if isinstance(plan, tuple) else (plan, None)
-    inputs = _array(inputs, "inputs of a plan")
-    states = None if states is None else _array(states, "states of a plan")
-    if inputs.shape != (horizon, m) or (
-        states is not None and states.shape != (horizon + 1, n)
-    ):
+    inputs = _as_array(inputs, "inputs of a plan")
+    fits = inputs.shape == (horizon, m)
+    finite = bool(np.isfinite(inputs).all())
+    got = f"{inputs.shape}"
+    if states is not None:
+        states = _as_array(states, "states of a plan")
+        fits = fits and states.shape == (horizon + 1, n)
+        finite = finite and bool(np.isfinite(states).all())
+        got = f"{inputs.shape}, {states.shape}"
+    if not fits:
         shapes = f"inputs ({horizon}, {m}), or these and states ({horizon + 1}, {n})"
-        raise ShapeError(
-            f"a plan must be {shapes}; got {inputs.shape}{'' if states is None else f', {states.shape}'}"
-        )
-    if not (
-        np.isfinite(inputs).all() and (states is None or np.isfinite(states).all())
-    ):
+        raise ShapeError(f"a plan must be {shapes}; got {got}")
+    if not finite:
         raise DataError("a plan to start from must be finite")
-    return np.vstack([inputs[:1], inputs]), states
+    return inputs, states
 
 
-def _unwrapped(
-    states: Array, state: Array, previous: Decision | None, angles: Sequence[int]
+def _unwrap(
+    targets: Array, state: Array, previous: Decision | None, angles: Sequence[int]
 ) -> Array:
-    """References (H + 1, n) whose angles are moved by full turns towards the plan, or the state where none is."""
-    plan = np.tile(state, (len(states), 1))
+    """Returns references (H + 1, n) whose angles are moved by full turns.
+
+    They move towards the last plan, or towards the state where there is none.
+    """
+    plan = np.tile(state, (len(targets), 1))
     if previous is not None:
         plan[1:] = np.concatenate([previous.means[2:], previous.means[-1:]])
         plan[1:] += full_turns(state - previous.means[1], angles)
-    return states + full_turns(plan - states, angles)
+    return targets + full_turns(plan - targets, angles)
+
+
+def _is_finite(values: Array) -> bool:
+    """Returns whether all numbers of a contiguous array are finite.
+
+    NumPy takes 2 us for it, of which a control step would pay five times.
+    """
+    return _all_finite.unchecked(values.ravel())
 
 
 @compiled(locked=True)
-def _check(state, covariance, states, inputs, last, plan, limits, guess):
-    """Writes the initial guess; returns whether belief, reference states and inputs, and last input are finite."""
-    (H, m), (lower, upper) = guess.shape, limits
-    for k in range(H):
-        for j in range(m):
-            u = plan[min(k + 1, len(plan) - 1), j] if len(plan) > 0 else last[j]
-            at = min(k, len(lower) - 1)
-            guess[k, j] = min(max(u, lower[at, j]), upper[at, j])
-    belief = _is_finite(state) and _is_finite(covariance.ravel())
-    return (
-        belief,
-        _is_finite(states.ravel()),
-        _is_finite(inputs.ravel()),
-        _is_finite(last),
-    )
-
-
-@njit_inner
-def _is_finite(values):
+def _all_finite(values):
+    """Returns whether all numbers (d,) are finite."""
     total = 0.0
     for value in values:
         total += value * 0.0

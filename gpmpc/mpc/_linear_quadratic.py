@@ -1,67 +1,74 @@
-"""Computes gains of the linear-quadratic regulator, u = -K x, by the Riccati recursion.
+"""The linear-quadratic problem at a plan: its parts, its solution's plan, and its cost.
 
-For x_{k+1} = A_k x_k + B_k u_k and the cost sum_{k=0..H-1} |x_k|^2_Q + |u_k|^2_R + |x_H|^2_T (Q and R may be other
-matrices at each stage), backward from P_H = T
-(Anderson and Moore, 1990, section 2.4; the second line keeps P positive semidefinite whatever is rounded):
+    minimise    sum_{k=0..H-1} |s_{k+1} - r_{k+1}|^2_W + |v_k|^2_R + z_k' Z_k z_k
+    subject to  s_{k+1} = A_k s_k + B_k u_k + c_k,
+                bounds on u_k, on u_k - u_{k-1} and on E_k s_{k+1} + D_k u_k
 
-    D_k = R + B_k' P_{k+1} B_k,   K_k = D_k^-1 B_k' P_{k+1} A_k
-    P_k = Q + K_k' R K_k + (A_k - B_k K_k)' P_{k+1} (A_k - B_k K_k)
+s holds what is predicted of the belief N(mu, Sigma); the *covariance* mode says what:
 
-R is positive definite, so that every step exists whatever A and B are.
+* ``full``: s = [mu; vec S] with the symmetric root S = Sigma^(1/2) (Cao, Lai and Alam,
+  2017, section 4.1).
+* ``diagonal``: s = [mu; standard deviations]; correlations are dropped at every stage.
+* ``zero_order``: s = mu; covariances are predicted beside the optimisation as if the
+  inputs did not change them (Hewing, Kabzan and Zeilinger, 2020; Zanelli, Frey,
+  Messerer and Diehl, 2021).
+* ``none``: s = mu, through the model's mean at a certain state.
 """
 
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
 from gpmpc._compiled import compiled, njit_inner, njit_noalloc
-from gpmpc._kernels.linalg import (
-    add_transposed_product,
-    copy,
-    copy_matrix,
-    dot,
-    product,
-    solve_positive,
-)
-from gpmpc.exceptions import SettingError
+from gpmpc._kernels.linalg import copy, dot
 
 Array = np.ndarray
 
+Covariance = Literal["full", "diagonal", "zero_order", "none"]
+COVARIANCES = ("full", "diagonal", "zero_order", "none")
+
 INPUTS, DEVIATIONS, INCREMENTS = range(3)
 
-_SETTLED = (
-    1e-12  # relative change of P at which the gains of a constant system have converged
-)
-_LONGEST = 10_000  # stages after which they are taken to have
-_STABLE = 1e-9  # by how much an eigenvalue may lie outside the unit circle by rounding
+
+class Plan(NamedTuple):
+    """States and inputs over the horizon, which need not obey the dynamics."""
+
+    states: Array  # s_0 .. s_H (H + 1, p); s_0 is the current one
+    inputs: Array  # u_0 .. u_{H-1} (H, m)
+    covariances: Array  # Sigma_0 .. Sigma_H (H + 1, n, n)
 
 
 class Stages(NamedTuple):
-    """Affine stages s_{k+1} = A_k s_k + B_k u_k + c_k: K = H along a plan, or K = 1 that is held over the horizon."""
+    """Affine stages s_{k+1} = A_k s_k + B_k u_k + c_k.
+
+    There are K = H of them along a plan, or K = 1 that is held over the horizon.
+    """
 
     A: Array  # (K, p, p)
     B: Array  # (K, p, m)
     c: Array  # (K, p); the defects of the plan are part of it
-    next: Array = np.empty(
-        (0, 0)
-    )  # where the dynamics lead from the points of the plan, F(s_k, u_k) (K, p)
-    V: Array = np.empty(
-        (0, 0, 0)
-    )  # what a stage adds to A Sigma A' (K, n, n), in the mode ``zero_order``; else zero
+    # next states F(s_k, u_k) at the points of the plan (K, p)
+    next: Array = np.empty((0, 0))
+    # what a stage adds to A Sigma A' in the mode ``zero_order``, else zero (K, n, n)
+    V: Array = np.empty((0, 0, 0))
 
 
 class QuadraticCost(NamedTuple):
-    """Weights of a cost, the sum of |s_{k+1} - r_{k+1}|^2_W + |v_k|^2_R + z'Z z, z = [x_{k+1}; u_k; 1], x the mean."""
+    """Weights of the sum of |s_{k+1} - r_{k+1}|^2_W + |v_k|^2_R + z'Z z.
+
+    z = [x_{k+1}; u_k; 1], where x is the mean in s.
+    """
 
     state: Array  # W of s_1 .. s_{H-1} (H or 1, p / n, n, n)
     terminal: Array  # W of s_H (p / n, n, n)
     input: Array  # R (H or 1, m, m)
     penalized: int  # what R weighs: INPUTS, DEVIATIONS or INCREMENTS
-    squares: Array  # Z of linearised outputs (H, n + m + 1, n + m + 1), or (0, n + m + 1, n + m + 1)
+    # Z of linearised outputs (H, n + m + 1, n + m + 1), or none: (0, n + m + 1, ...)
+    squares: Array
 
 
 class References(NamedTuple):
-    """What is tracked."""
+    """The states and inputs to track, and the input before them."""
 
     states: Array  # r_1 .. r_H of the mean (H, n); the rest of s is to be zero
     inputs: Array  # (H, m), used where R weighs deviations
@@ -89,8 +96,9 @@ class StageRows(NamedTuple):
 class CondensedProgram(NamedTuple):
     """min 1/2 v'P v + q'v under lower <= [v; G v] <= upper.
 
-    The last of the stacked constraints are the bounds of inputs, of increments (where there are such) and of E s, stage
-    by stage: all of them in input coordinates, all after H m unbounded v in feedback coordinates.
+    The last of the stacked constraints are the bounds of inputs, of increments (where
+    there are such) and of E s, stage by stage: all of them in input coordinates, all
+    after H m unbounded v in feedback coordinates.
     """
 
     P: Array  # (H m, H m)
@@ -98,12 +106,14 @@ class CondensedProgram(NamedTuple):
     G: Array  # (rows, H m)
     lower: Array  # (H m + rows,)
     upper: Array  # (H m + rows,)
-    feedback: Array  # F_k of u_k = F_k [s_k; u_{k-1}; 1] + v_k (H, m, p + m + 1); (0, m, p + m + 1) where u = v
+    # F_k of u_k = F_k [s_k; u_{k-1}; 1] + v_k (H, m, p + m + 1); (0, m, p + m + 1)
+    # where u = v
+    feedback: Array
 
 
 @compiled
 def expand(stages, start, feedback, previous_input, unknowns):
-    """Inputs (H, m) and states s_0 .. s_H (H + 1, p) of the unknowns v (H m,)."""
+    """Returns inputs (H, m) and states s_0 .. s_H (H + 1, p) of unknowns v (H m,)."""
     p, m = stages.B.shape[1:]
     H = len(unknowns) // m
     last = len(stages.A) - 1
@@ -111,27 +121,30 @@ def expand(stages, start, feedback, previous_input, unknowns):
     states = np.empty((H + 1, p))
     copy(start, states[0])
     for k in range(H):
+        stage = min(k, last)
         s = states[k]
         u = inputs[k]
-        after = states[k + 1]
-        at = min(k, last)
+        next_s = states[k + 1]
         if len(feedback) > 0:
-            before = inputs[k - 1] if k > 0 else previous_input
+            last_u = inputs[k - 1] if k > 0 else previous_input
             for i in range(m):
                 F = feedback[k, i]
-                u[i] += F[p + m] + dot(F, s, p) + dot(F[p:], before, m)
+                u[i] += F[p + m] + dot(F, s, p) + dot(F[p:], last_u, m)
         for i in range(p):
-            after[i] = (
-                stages.c[at, i]
-                + dot(stages.A[at, i], s, p)
-                + dot(stages.B[at, i], u, m)
+            next_s[i] = (
+                stages.c[stage, i]
+                + dot(stages.A[stage, i], s, p)
+                + dot(stages.B[stage, i], u, m)
             )
     return inputs, states
 
 
 @compiled
 def evaluate_cost(cost, states, inputs, references, constant):
-    """The cost of states s_0 .. s_H (H + 1, p) and inputs (H, m), with ``constant`` in the place of the 1 of z."""
+    """Returns the cost of states s_0 .. s_H (H + 1, p) and inputs (H, m).
+
+    ``constant`` stands in the place of the 1 of z.
+    """
     total = 0.0
     for stage_cost in evaluate_stages(cost, states, inputs, references, constant):
         total += stage_cost
@@ -140,7 +153,10 @@ def evaluate_cost(cost, states, inputs, references, constant):
 
 @compiled
 def evaluate_stages(cost, states, inputs, references, constant):
-    """The costs of the stages (H,) whose sum ``evaluate_cost`` is; stage k is that of s_{k+1} and u_k."""
+    """Returns the costs (H,) whose sum is ``evaluate_cost``.
+
+    Stage k is that of s_{k+1} and u_k.
+    """
     targets = references.states
     H, n = targets.shape
     m = inputs.shape[1]
@@ -179,136 +195,8 @@ def evaluate_stages(cost, states, inputs, references, constant):
 
 @njit_inner
 def weight_of_stage(cost, k, H):
-    """W of s_{k+1} (p / n, n, n)."""
+    """Returns W of s_{k+1} (p / n, n, n)."""
     return cost.terminal if k == H - 1 else cost.state[min(k, len(cost.state) - 1)]
-
-
-@compiled
-def finite_horizon_lqr(A, B, Q, R, terminal, horizon):
-    """Gains K_0 .. K_{H-1} (H, m, n) and the Hessians D_k of the cost in u_k (H, m, m).
-
-    A, B, Q and R are of H stages or of one that is constant; where all are, the recursion ends where P settles.
-    """
-    (n, m), constant = B.shape[1:], len(A) == len(Q) == len(R) == 1
-    gains = np.zeros((horizon, m, n))
-    hessians = np.empty((horizon, m, m))
-    P = terminal.copy()
-    following = np.empty((n, n))
-    PB = np.empty((n, m))
-    PC = np.empty((n, n))
-    closed = np.empty((n, n))
-    factor = np.empty((m, m))
-    RK = np.empty((m, n))
-    for k in range(horizon - 1, -1, -1):
-        A_k = A[min(k, len(A) - 1)]
-        B_k = B[min(k, len(B) - 1)]
-        K = gains[k]
-        D = hessians[k]
-        R_k = R[min(k, len(R) - 1)]
-        product(P, B_k, PB)
-        copy_matrix(R_k, D)
-        add_transposed_product(B_k, PB, D)
-        add_transposed_product(PB, A_k, K)
-        copy_matrix(D, factor)
-        solve_positive(factor, K)
-        product(B_k, K, closed)
-        for i in range(n):
-            for j in range(n):
-                closed[i, j] = A_k[i, j] - closed[i, j]
-        product(P, closed, PC)
-        product(R_k, K, RK)
-        copy_matrix(Q[min(k, len(Q) - 1)], following)
-        add_transposed_product(closed, PC, following)
-        add_transposed_product(K, RK, following)
-        change = 0.0
-        size = 0.0
-        for i in range(n):
-            for j in range(i + 1):
-                value = 0.5 * (following[i, j] + following[j, i])
-                change = max(change, abs(value - P[i, j]))
-                size = max(size, abs(value))
-                P[i, j] = P[j, i] = value
-        if constant and change <= _SETTLED * size:
-            for j in range(k):
-                copy_matrix(K, gains[j])
-                copy_matrix(D, hessians[j])
-            break
-    return gains, hessians
-
-
-@compiled
-def optimal_feedback(cost, stages, references):
-    """The feedback F (H, m, p + m + 1) that minimises the cost without bounds, u_k = F_k [s_k; u_{k-1}; 1].
-
-    It is that of the regulator of [s_k - r_k; u_{k-1}; 1], without u_{k-1} where nothing weighs it, whose input is the
-    penalized v. The second result is half the Hessian of the cost in what is added to each u_k (H, m, m).
-    """
-    (p, m), targets, squares = stages.B.shape[1:], references.states, cost.squares
-    incremental = cost.penalized == INCREMENTS
-    (H, n), e = targets.shape, p + (m if incremental or len(squares) > 0 else 0)
-    A = np.zeros((H, e + 1, e + 1))
-    B = np.zeros((H, e + 1, m))
-    weights = np.zeros(
-        (H if len(squares) > 0 else len(cost.state), e + 1, e + 1)
-    )  # of stages 1 .. H - 1
-    terminal = np.zeros((e + 1, e + 1))
-    add_blocks(cost.terminal, terminal)
-    for k in range(len(weights)):
-        add_blocks(cost.state[min(k, len(cost.state) - 1)], weights[k])
-    for k in range(len(squares)):
-        _add_square(squares[k], targets[k], terminal if k == H - 1 else weights[k], p)
-    for k in range(H):
-        at = min(k, len(stages.A) - 1)
-        shift = A[k, :, e]
-        shift[e] = 1.0
-        copy_matrix(stages.A[at], A[k, :p, :p])
-        copy_matrix(stages.B[at], B[k, :p])
-        for i in range(p):
-            shift[i] = stages.c[at, i] - (targets[k, i] if i < n else 0.0)
-            if k > 0:
-                shift[i] += dot(stages.A[at, i], targets[k - 1], n)
-            if cost.penalized == DEVIATIONS:
-                shift[i] += dot(stages.B[at, i], references.inputs[k], m)
-        for i in range(e - p):
-            B[k, p + i, i] = 1.0
-            if cost.penalized == DEVIATIONS:
-                shift[p + i] = references.inputs[k, i]
-        if incremental:
-            copy_matrix(B[k], A[k, :, p:e])
-    before = np.concatenate((weights[:1], weights))[
-        : H if len(weights) > 1 else 1
-    ]  # of stages 0 .. H - 1
-    gains, hessians = finite_horizon_lqr(A, B, before, cost.input, terminal, H)
-    feedback = np.zeros((H, m, p + m + 1))
-    for k in range(H):
-        for i in range(m):
-            F = feedback[k, i]
-            K = gains[k, i]
-            for j in range(e):
-                F[j] = -K[j]
-            if incremental:
-                F[p + i] += 1.0
-            F[p + m] = -K[e] + (
-                references.inputs[k, i] if cost.penalized == DEVIATIONS else 0.0
-            )
-            if k > 0:
-                F[p + m] += dot(K, targets[k - 1], n)
-    return feedback, hessians
-
-
-@njit_noalloc
-def _add_square(Z, target, W, p):
-    """Adds z'Zz, z = [x; u; 1], to a weight W of [s - r; u; 1]."""
-    n = len(target)
-    e = len(W) - 1
-    m = e - p
-    for i in range(n + m):
-        row = i if i < n else p + i - n
-        constant = Z[i, n + m] + dot(Z[i], target, n)
-        for j in range(n + m):
-            W[row, j if j < n else p + j - n] += Z[i, j]
-        W[row, e] += constant
-        W[e, row] += constant
 
 
 @njit_noalloc
@@ -319,22 +207,3 @@ def add_blocks(W, M):
         for i in range(n):
             for j in range(n):
                 M[b * n + i, b * n + j] += W[b, i, j]
-
-
-def dlqr(A: Array, B: Array, Q: Array, R: Array) -> Array:
-    """The gain K (m, n) of u = -K x that minimises sum_k |x_k|^2_Q + |u_k|^2_R under x_{k+1} = A x_k + B u_k for ever.
-
-    Raises:
-        SettingError: The inputs do not reach a mode that grows.
-    """
-    A, B, Q, R = (np.ascontiguousarray(matrix, dtype=float) for matrix in (A, B, Q, R))
-    K = finite_horizon_lqr(A[None], B[None], Q[None], R[None], Q, _LONGEST)[0][0]
-    if (
-        not np.isfinite(K).all()
-        or np.abs(np.linalg.eigvals(A - B @ K)).max() > 1 + _STABLE
-    ):
-        raise SettingError(
-            "A, B, Q",
-            "there is no stationary gain: the inputs do not reach a growing mode",
-        )
-    return K

@@ -1,19 +1,23 @@
-"""Sequential quadratic programming for plans whose states need not obey the dynamics yet (multiple shooting).
+"""Sequential quadratic programming for plans with defects (multiple shooting).
 
-A program's solution is a step from one plan to the next. One step a control step is taken whole (the real-time
-iteration of Diehl, Bock and Schloeder, 2005). Where more are taken, a step is as long as it lowers the exact penalty
+A program's solution is a step from one plan to the next. One step a control step is
+taken whole (the real-time iteration of Diehl, Bock and Schloeder, 2005). Where more are
+taken, a step is as long as it lowers the exact penalty
 
     cost + price of violated rows + sum_k mu' |F(s_k, u_k) - s_{k+1}|
 
-with mu above the multipliers of the dynamics (Nocedal and Wright, 2006, section 18.3). Beside each length stands a
-second candidate: the dynamics rolled out under the feedback u = u' - K (x - x') towards the plan that the program
-proposes. It has no defects, and exists where inputs alone would lead an unstable plant away.
+with mu above the multipliers of the dynamics (Nocedal and Wright, 2006, section 18.3).
+Beside each length stands a second candidate: the dynamics rolled out under the feedback
+u = u' - K (x - x') towards the plan that the program proposes. It has no defects, and
+exists where inputs alone would lead an unstable plant away.
 
-A plan is judged by its relative offset (Bates and Watts, 1981): the Gauss-Newton step in the metric of the cost,
-relative to the root of the cost, which is the cosine between the residuals and what a plan can change of them; and by
-its defects, relative to the states. Gauss-Newton misses the curvature of the dynamics. Where that makes it creep,
-damped BFGS updates put it into the program (Nocedal and Wright, 2006, procedure 18.2). They are made of plans that
-obey the dynamics, whose gradients are those of the problem: an iteration that creeps goes on along roll-outs.
+A plan is judged by its relative offset (Bates and Watts, 1981): the Gauss-Newton step
+in the metric of the cost, relative to the root of the cost, which is the cosine between
+the residuals and what a plan can change of them; and by its defects, relative to the
+states. Gauss-Newton misses the curvature of the dynamics. Where that makes it creep,
+damped BFGS updates put it into the program (Nocedal and Wright, 2006, procedure 18.2).
+They are made of plans that obey the dynamics, whose gradients are those of the problem:
+an iteration that creeps goes on along roll-outs.
 """
 
 import math
@@ -28,27 +32,25 @@ import torch
 from gpmpc._compiled import compiled, njit_inner
 from gpmpc._kernels.linalg import dot
 from gpmpc.exceptions import DataError, ProblemError
+from gpmpc.mpc._constraints import price_violations
 from gpmpc.mpc._controller import Request
 from gpmpc.mpc._linear_quadratic import (
     CondensedProgram,
+    Plan,
     References,
     evaluate_cost,
     weight_of_stage,
 )
-from gpmpc.mpc._prediction import Prediction, PredictionModel
-from gpmpc.mpc._stages import Plan, price_violations
+from gpmpc.mpc._linearization import LocalProblem, PredictionModel
+from gpmpc.mpc._roll_out import roll_out
 from gpmpc.qp import QPSolution
 from gpmpc.status import Status
 
 Array = np.ndarray
 
 _TORCH_FAILURE = torch.linalg.LinAlgError  # pyright: ignore[reportPrivateImportUsage]
-FAILURES = (
-    DataError,
-    ProblemError,
-    np.linalg.LinAlgError,
-    _TORCH_FAILURE,
-)  # no finite numbers
+# No finite numbers.
+FAILURES = (DataError, ProblemError, np.linalg.LinAlgError, _TORCH_FAILURE)
 _SUFFICIENT_DECREASE = 1e-4  # of what the program promised (Armijo)
 _STEP_LENGTHS = [2.0**-k for k in range(11)]
 # Share of the cost below which a difference says nothing: posteriors with
@@ -72,8 +74,16 @@ _NEARLY = 5.0  # tolerances, within which an iteration that stalls has arrived
 _TINY = 1e-300
 
 
+class PriceTerms(NamedTuple):
+    """References and prices, which a cost needs besides its weights."""
+
+    references: References
+    prices: Array  # of violated rows (r,), infinite for hard ones
+    row_price: float  # of those
+
+
 class StepForecast(NamedTuple):
-    """What the step from a plan to a proposed one promises."""
+    """The promise of the step from a plan to a proposed one."""
 
     cost: float  # of the plan, with the price of its violated rows
     promised: float  # likewise of the proposed plan, as the program sees it
@@ -83,6 +93,13 @@ class StepForecast(NamedTuple):
     defect_prices: Array  # above the multipliers of the dynamics (p,)
 
 
+class StepMeasures(NamedTuple):
+    """The cost of a plan, and the length of a program's step away from it."""
+
+    cost: float  # of the plan, with the price of its violated rows
+    step: float  # the step's length in the metric of the cost, squared
+
+
 class Continuity(NamedTuple):
     """Whether a program's step is one more along the last plan."""
 
@@ -90,216 +107,178 @@ class Continuity(NamedTuple):
     step: float  # its length in the metric of the cost, squared
 
 
-class StepMeasures(NamedTuple):
-    """How far a program led from the plan that it was made at."""
+class Iterate(NamedTuple):
+    """The problem at the next plan of an iteration, and how the iteration ends."""
 
-    cost: float  # of the plan, with the price of its violated rows
-    step: float  # the step's length in the metric of the cost, squared
+    local: LocalProblem
+    status: Status | None  # None where it goes on
 
 
-class PriceTerms(NamedTuple):
-    """What costs are reckoned with besides their weights."""
+class Progress(NamedTuple):
+    """Sizes of an iteration's steps.
 
-    references: References
-    prices: Array  # of violated rows (r,), infinite for hard ones
-    row_price: float  # of those
+    The size of a step is the larger of relative offset and defect.
+    """
+
+    size: float = math.inf  # of the last step
+    rate: float = 1.0  # its ratio to the one before
+    last_rate: float = 1.0
+    is_first: bool = False  # whether it was the first step
+    creeps: bool = False  # whether steps near the solution became little smaller
+
+    def after(self, size: float) -> "Progress":
+        """Returns the progress after one more step."""
+        is_first = math.isinf(self.size)
+        rate = 1.0 if is_first else size / self.size
+        near = _NOISE < size**2 < _NEAR**2
+        creeps = self.creeps or (near and not is_first and rate > _CREEP)
+        return Progress(
+            size=size,
+            rate=rate,
+            last_rate=self.rate,
+            is_first=is_first,
+            creeps=creeps,
+        )
+
+    def is_converged(self, tolerance: float) -> bool:
+        """Returns whether the last step led to within the tolerance of a solution.
+
+        It also has where rounding lets it come no nearer.
+        """
+        if self.size**2 <= _NOISE and self.rate * self.last_rate > _STALL:
+            return True
+        if self.size <= tolerance:
+            return True
+        # The solution is better than the plan by about the slower of two rates.
+        slower = max(self.rate, self.last_rate)
+        return self.size * slower <= tolerance * (1.0 - slower)
 
 
 def measure_continuity(
-    model: PredictionModel,
+    prediction: PredictionModel,
     request: Request,
-    prediction: Prediction,
+    local: LocalProblem,
     proposed: Plan,
-    prices: Array,
+    row_prices: Array,
 ) -> Continuity:
-    """Whether a step is one more along the last plan, and how long it is.
+    """Tells whether a step is one more along the last plan, and how long it is.
 
     Then one program is enough, as in the real-time iteration. A step that leads much
     further than the last one, and is not slight beside the cost, answers a jump of the
     reference or of the state. On plants that bend much, the plans of one program a step
     are not consistent; iterating each of them is slower and, on swing-ups, no better.
     """
-    measures = _measure_step.unchecked(
-        prediction.cost,
-        PriceTerms(request.references, prices, 0.0),
-        prediction.rows,
-        prediction.plan,
-        proposed,
-    )
+    terms = PriceTerms(request.references, row_prices, 0.0)
+    measures = _measure_step.unchecked(local, terms, proposed)
     step = measures.step
     last_steps = () if request.previous is None else request.previous.steps
     if len(last_steps) == 0:
         return Continuity(continues=True, step=step)
-    slight = _SLIGHT * (measures.cost + smallest_cost(model, request))
+    slight = _SLIGHT * (measures.cost + smallest_cost(prediction, request))
     continues = step <= max(slight, _FURTHER * last_steps[0])
     return Continuity(continues=continues, step=step)
 
 
-def smallest_cost(model: PredictionModel, request: Request) -> float:
-    """What an input costs that is small beside the last one: the cheapest of them."""
-    lower, upper = model.problem.inputs.first
-    return _smallest_cost.unchecked(
-        model.costs.quadratic.input[0],
-        lower,
-        upper,
-        request.references.previous_input,
-    )
+def smallest_cost(prediction: PredictionModel, request: Request) -> float:
+    """Returns the cost of an input that is small beside the last one, the cheapest."""
+    lower, upper = prediction.problem.inputs.first
+    R = prediction.costs.quadratic.input[0]
+    return _smallest_cost.unchecked(R, lower, upper, request.references.previous_input)
 
 
-class Iteration:
-    """Chooses the steps of one request's iteration, and says where it ends: at a tolerance of offset and defects."""
+class Globalization:
+    """Chooses the steps of one request's iteration, and says where it ends.
+
+    Args:
+        prediction: Of the controller.
+        request: Of the decision.
+        tolerance: Of relative offset and defects.
+        row_prices: Of violated rows (r,), infinite for hard ones.
+
+    Attributes:
+        steps: Lengths of the programs' steps, squared in the metric of the cost.
+    """
 
     def __init__(
         self,
-        model: PredictionModel,
+        prediction: PredictionModel,
         request: Request,
         tolerance: float,
-        prices: Array,
+        row_prices: Array,
     ):
-        self._prices = prices
-        self._model = model
+        self._prediction = prediction
         self._request = request
         self._tolerance = tolerance
-        self._smallest = smallest_cost(model, request)
-        self._defect_prices = np.zeros(model.costs.quadratic.terminal[:, 0].size)
-        self._row_price = 0.0
-        self._size = math.inf  # of the last step, relative; see the module's text
-        self._rate = 1.0  # of two sizes
-        self._creeps = False
-        self.steps: list[float] = []  # lengths of the programs' steps, squared
-        self._obeys = False  # whether the last plan obeyed the dynamics
-        # Steps and changes of the gradient.
-        self._updates: deque[tuple[Array, Array]] = deque(maxlen=_MEMORY)
-        # Inputs, gradient of the Lagrangian, multipliers.
-        self._last: tuple[Array, Array, Array] | None = None
+        self._smallest_cost = smallest_cost(prediction, request)
+        self._terms = PriceTerms(request.references, row_prices, 0.0)
+        weight = prediction.costs.quadratic.terminal
+        self._defect_prices = np.zeros(weight[:, 0].size)
+        self._curvature = CurvatureUpdates()
+        self._progress = Progress()
+        self.steps: list[float] = []
 
     def correct(
-        self, program: CondensedProgram, prediction: Prediction
+        self, program: CondensedProgram, local: LocalProblem
     ) -> CondensedProgram:
-        """A program made at a prediction, with the curvature that the last steps showed, where the iteration creeps."""
-        if len(program.feedback):  # there the unknowns are other ones at every plan
-            return program
-        inputs = prediction.plan.inputs.ravel()
-        gradient = program.P @ inputs + program.q
-        both_obey = self._obeys and _obeys_dynamics(prediction)
-        if self._last is not None and both_obey:
-            last_inputs, last_gradient, z = self._last
-            near = _NOISE < self._size**2 < _NEAR**2
-            if near and np.any(inputs != last_inputs):
-                change = gradient + program.G.T @ z - last_gradient
-                self._updates.append((inputs - last_inputs, change))
-        if not (self._updates and self._creeps):
-            return program
-        P = program.P.copy()
-        for step, change in self._updates:
-            _update(P, step, change)
-        return program._replace(P=P, q=gradient - P @ inputs)
+        """Returns a program with the curvature that the last steps showed."""
+        return self._curvature.correct(program, local, self._progress)
 
-    def __call__(
+    def step(
         self,
-        prediction: Prediction,
+        local: LocalProblem,
         program: CondensedProgram,
         solution: QPSolution,
         proposed: Plan,
-    ) -> tuple[Prediction, Status | None]:
-        """The prediction at the next plan, and how the iteration ends: None where it goes on.
+    ) -> Iterate:
+        """Takes a step towards the plan that a program proposes.
 
-        The program was made at the ``prediction``; ``proposed`` is the plan that its solution means.
+        Args:
+            local: The problem that the program was made of.
+            program: The condensed problem.
+            solution: Of the program.
+            proposed: The plan that the solution means.
         """
-        first = math.isinf(self._size)
-        self._remember(program, solution, prediction)
-        forecast = self._forecast(prediction, solution, proposed)
+        self._curvature.remember(program, solution, local)
+        forecast = self._forecast(local, solution, proposed)
         self.steps.append(forecast.curvature)
-        arrived = self._judge(forecast, first)
-        if arrived:
-            return prediction._replace(plan=proposed), Status.SOLVED
-        trial = self._search_line(prediction, program, proposed, forecast, first)
+        scale = forecast.cost + self._smallest_cost
+        offset = math.sqrt(forecast.curvature / scale)
+        self._progress = self._progress.after(max(offset, forecast.defect))
+        if self._progress.is_converged(self._tolerance):
+            return Iterate(local._replace(plan=proposed), Status.SOLVED)
+        trial = self._search_line(local, program, proposed, forecast)
         if trial is not None:
-            return trial, None
-        # What could still be gained: the offset's square is a share of the cost.
-        if self._size**2 <= _ROUND_OFF:
-            return prediction._replace(plan=proposed), Status.SOLVED
-        if self._size**2 <= _SLIGHT and self._size <= _NEARLY * self._tolerance:
-            return prediction, Status.SOLVED
-        if self._updates:  # they may be what misleads
-            self._updates.clear()
-            self._last = None
-            return prediction, None
-        return prediction, Status.STALLED
-
-    def _remember(
-        self, program: CondensedProgram, solution: QPSolution, prediction: Prediction
-    ) -> None:
-        """Keeps the gradient of the Lagrangian, of which the next update is made."""
-        if len(program.feedback):
-            return
-        inputs = prediction.plan.inputs.ravel()
-        gradient = program.P @ inputs + program.q
-        if len(solution.z):
-            gradient = gradient + program.G.T @ solution.z
-        self._last = inputs, gradient, solution.z
-        self._obeys = _obeys_dynamics(prediction)
+            return Iterate(trial, None)
+        return self._end_without_step(local, proposed)
 
     def _forecast(
-        self, prediction: Prediction, solution: QPSolution, proposed: Plan
+        self, local: LocalProblem, solution: QPSolution, proposed: Plan
     ) -> StepForecast:
-        """What a step promises, under prices above the multipliers of its program."""
-        multipliers = _row_multipliers(solution, prediction)
+        """Returns the promise of a step, under prices above its multipliers."""
+        multipliers = _row_multipliers(solution, local)
         if multipliers.size:
             largest = float(np.abs(multipliers).max())
-            self._row_price = max(self._row_price, 2.0 * largest)
+            row_price = max(self._terms.row_price, 2.0 * largest)
+            self._terms = self._terms._replace(row_price=row_price)
         forecast = _forecast_step.unchecked(
-            prediction.cost,
-            self._terms,
-            self._defect_prices,
-            prediction.stages.A,
-            prediction.stages.next,
-            prediction.rows,
-            prediction.plan,
-            proposed,
-            multipliers,
+            local, self._terms, self._defect_prices, proposed, multipliers
         )
         self._defect_prices = forecast.defect_prices
         return forecast
 
-    @property
-    def _terms(self) -> PriceTerms:
-        return PriceTerms(self._request.references, self._prices, self._row_price)
-
-    def _judge(self, forecast: StepForecast, first: bool) -> bool:
-        """Whether the proposed plan is within the tolerance, or as near as rounding lets it come."""
-        offset = math.sqrt(forecast.curvature / (forecast.cost + self._smallest))
-        size = max(offset, forecast.defect)
-        last_rate = self._rate
-        self._rate = 1.0 if first else size / self._size
-        self._size = size
-        near = _NOISE < size**2 < _NEAR**2
-        if near and not first and self._rate > _CREEP:
-            self._creeps = True
-        if size**2 <= _NOISE and self._rate * last_rate > _STALL:
-            return True
-        if size <= self._tolerance:
-            return True
-        # The solution is better than the plan by about the slower of two rates.
-        slower = max(self._rate, last_rate)
-        return size * slower <= self._tolerance * (1.0 - slower)
-
     def _search_line(
         self,
-        prediction: Prediction,
+        local: LocalProblem,
         program: CondensedProgram,
         proposed: Plan,
         forecast: StepForecast,
-        first: bool,
-    ) -> Prediction | None:
-        """The prediction at the first trial plan whose merit is lower by enough; None where there is none."""
+    ) -> LocalProblem | None:
+        """Returns the first trial whose merit is lower by enough; None without one."""
+        progress = self._progress
         slope = forecast.promised - forecast.curvature - forecast.merit
-        # The last plan, one step on.
-        continued = self._request.previous is not None and self._request.states is None
-        far = self._size > _NEAR and not (first and continued)
-        invisible = self._size**2 <= _ROUND_OFF  # what can be gained is lost in merits
-        obeying = self._creeps or far
-        for length, trial in self._trials(prediction, program, proposed, obeying):
+        # What can be gained is lost in the rounding of merits.
+        invisible = progress.size**2 <= _ROUND_OFF
+        for length, trial in self._trials(local, program, proposed):
             if invisible:
                 return trial
             largest_merit = (
@@ -307,54 +286,135 @@ class Iteration:
                 + _SUFFICIENT_DECREASE * length * min(slope, 0.0)
                 + _ROUND_OFF * abs(forecast.merit)
             )
-            rows = trial.rows
-            if not self._model.constraints.smooth:  # bounds stay those of the program
-                rows = prediction.rows._replace(E=trial.rows.E)
-            merit = _merit.unchecked(
-                trial.cost,
-                self._terms,
-                self._defect_prices,
-                trial.stages.next,
-                rows,
-                trial.plan,
-            )
+            judged = trial
+            if not self._prediction.constraints.smooth:
+                # bounds stay those of the program
+                judged = trial._replace(rows=local.rows._replace(E=trial.rows.E))
+            merit = _merit.unchecked(judged, self._terms, self._defect_prices)
             if merit <= largest_merit:
                 return trial
         return None
 
     def _trials(
-        self,
-        prediction: Prediction,
-        program: CondensedProgram,
-        proposed: Plan,
-        obeying: bool,
-    ) -> Iterator[tuple[float, Prediction]]:
-        """Lengths of the step to a proposed plan, and predictions there or at the plan that obeys the dynamics.
+        self, local: LocalProblem, program: CondensedProgram, proposed: Plan
+    ) -> Iterator[tuple[float, LocalProblem]]:
+        """Yields lengths of the step to a proposed plan, and problems there.
 
-        Far from a solution the second of these leads further, and where the iteration creeps its gradients are needed;
-        it comes first where moments are linearised, too, since they overshoot. Means are linearised at once near a
-        solution, as a first step from the last plan is taken to be: the plan there will be taken.
+        Each length has two: at the plan itself, and at one that obeys the dynamics.
         """
-        model = self._model
+        prediction = self._prediction
         request = self._request
-        order = (True, False)
-        if model.linearizer.at_points and not obeying:
-            order = (False, True)
-        for length, obeys in product(_STEP_LENGTHS, order):
-            target = _between(prediction.plan, proposed, length)
+        for length, obeys in product(_STEP_LENGTHS, self._order_of_trials()):
+            target = _between(local.plan, proposed, length)
             try:
                 if obeys:
-                    feedback = program.feedback
-                    trial = model.roll_out(target, prediction, feedback, request)
+                    trial = roll_out(
+                        prediction, target, local, program.feedback, request
+                    )
                 else:
-                    trial = model.linearize(model.canonical(target), request)
+                    trial = prediction.linearize(prediction.canonical(target), request)
             except FAILURES:  # a trial plan may lead the model out of its numbers
                 continue
             yield length, trial
 
+    def _order_of_trials(self) -> tuple[bool, bool]:
+        """Returns whether the first and the second trial of a length obey the dynamics.
+
+        Far from a solution plans that obey lead further, and where the iteration creeps
+        their gradients are needed; they come first where moments are linearised, too,
+        since these overshoot. Means are linearised at once near a solution, as a first
+        step from the last plan is taken to be: the plan there will be taken.
+        """
+        progress = self._progress
+        request = self._request
+        continued = request.previous is not None and request.states is None
+        far = progress.size > _NEAR and not (progress.is_first and continued)
+        if self._prediction.linearizer.at_points and not (progress.creeps or far):
+            return False, True
+        return True, False
+
+    def _end_without_step(self, local: LocalProblem, proposed: Plan) -> Iterate:
+        """Returns how an iteration ends, or goes on, whose line search found no plan."""
+        size = self._progress.size
+        # What could still be gained: the offset's square is a share of the cost.
+        if size**2 <= _ROUND_OFF:
+            return Iterate(local._replace(plan=proposed), Status.SOLVED)
+        if size**2 <= _SLIGHT and size <= _NEARLY * self._tolerance:
+            return Iterate(local, Status.SOLVED)
+        if self._curvature.forget():  # the updates may be what misleads
+            return Iterate(local, None)
+        return Iterate(local, Status.STALLED)
+
+
+class LagrangianGradient(NamedTuple):
+    """The gradient of a program's Lagrangian at the plan that it was made at."""
+
+    inputs: Array  # of the plan (H m,)
+    gradient: Array  # by the inputs (H m,)
+    row_multipliers: Array  # of the program (rows,)
+    obeys: bool  # whether the plan obeyed the dynamics
+
+
+class HessianUpdate(NamedTuple):
+    """A step of the inputs, and the change of the gradient along it."""
+
+    step: Array  # (H m,)
+    gradient_change: Array  # (H m,)
+
+
+class CurvatureUpdates:
+    """The curvature of the dynamics that an iteration's last steps showed."""
+
+    def __init__(self) -> None:
+        self._updates: deque[HessianUpdate] = deque(maxlen=_MEMORY)
+        self._last: LagrangianGradient | None = None
+
+    def remember(
+        self, program: CondensedProgram, solution: QPSolution, local: LocalProblem
+    ) -> None:
+        """Keeps the gradient of the Lagrangian, of which the next update is made."""
+        if len(program.feedback):
+            return
+        inputs = local.plan.inputs.ravel()
+        gradient = program.P @ inputs + program.q
+        row_multipliers = solution.z
+        if len(row_multipliers):
+            gradient = gradient + program.G.T @ row_multipliers
+        obeys = _obeys_dynamics(local)
+        self._last = LagrangianGradient(inputs, gradient, row_multipliers, obeys)
+
+    def correct(
+        self, program: CondensedProgram, local: LocalProblem, progress: Progress
+    ) -> CondensedProgram:
+        """Returns a program with the curvature added, where the iteration creeps."""
+        if len(program.feedback):  # there the unknowns are other ones at every plan
+            return program
+        inputs = local.plan.inputs.ravel()
+        gradient = program.P @ inputs + program.q
+        last = self._last
+        if last is not None and last.obeys and _obeys_dynamics(local):
+            near = _NOISE < progress.size**2 < _NEAR**2
+            if near and np.any(inputs != last.inputs):
+                change = gradient + program.G.T @ last.row_multipliers - last.gradient
+                self._updates.append(HessianUpdate(inputs - last.inputs, change))
+        if not (self._updates and progress.creeps):
+            return program
+        P = program.P.copy()
+        for update in self._updates:
+            _update(P, update.step, update.gradient_change)
+        return program._replace(P=P, q=gradient - P @ inputs)
+
+    def forget(self) -> bool:
+        """Forgets all updates; returns whether there were any."""
+        if not self._updates:
+            return False
+        self._updates.clear()
+        self._last = None
+        return True
+
 
 def _between(plan: Plan, other: Plan, length: float) -> Plan:
-    """The plan at a length of the step from one to another."""
+    """Returns the plan at a length of the step from one to another."""
     if length == 1.0:
         return other
     return Plan(
@@ -364,33 +424,34 @@ def _between(plan: Plan, other: Plan, length: float) -> Plan:
     )
 
 
-def _row_multipliers(solution: QPSolution, prediction: Prediction) -> Array:
-    """Those of the rows of the states (H, r); the last of a program's."""
-    shape = prediction.rows.lower.shape
-    count = prediction.rows.lower.size
-    return solution.z[len(solution.z) - count :].reshape(shape)
+def _row_multipliers(solution: QPSolution, local: LocalProblem) -> Array:
+    """Returns those of the rows of the states (H, r), a program's last ones."""
+    row_multipliers = solution.z
+    count = local.rows.lower.size
+    last_rows = row_multipliers[len(row_multipliers) - count :]
+    return last_rows.reshape(local.rows.lower.shape)
 
 
-def _obeys_dynamics(prediction: Prediction) -> bool:
-    """Whether a plan has no defects but for rounding."""
-    states = prediction.plan.states
-    defects = np.abs(prediction.stages.next - states[1:])
+def _obeys_dynamics(local: LocalProblem) -> bool:
+    """Returns whether a plan has no defects but for rounding."""
+    states = local.plan.states
+    defects = np.abs(local.stages.next - states[1:])
     return bool(defects.max() <= _OBEYS * max(1.0, np.abs(states).max()))
 
 
 @compiled
-def _smallest_cost(R, lower, upper, last):
-    """The cost of an input that is small beside the last one: of the cheapest."""
+def _smallest_cost(R, lower, upper, previous_input):
+    """Returns the cost of an input that is small beside the last one, the cheapest."""
     least = np.inf
     for j in range(len(R)):
-        size = min(max(1.0, abs(last[j])), upper[j] - lower[j]) * _SMALL
+        size = min(max(1.0, abs(previous_input[j])), upper[j] - lower[j]) * _SMALL
         least = min(least, R[j, j] * size * size)
     return least + _TINY
 
 
 @njit_inner
 def _cost_of_step(cost, references, plan, proposed):
-    """What a step from a plan to a proposed one would cost as a plan of its own, without references."""
+    """Returns the cost of a step as a plan of its own, without references."""
     zero = References(
         0.0 * references.states,
         0.0 * references.inputs,
@@ -403,57 +464,71 @@ def _cost_of_step(cost, references, plan, proposed):
 
 @njit_inner
 def _priced_cost(cost, terms, rows, plan):
-    """The cost of a plan, and the price of its violated rows."""
+    """Returns the cost of a plan, with the price of its violated rows."""
     total = evaluate_cost(cost, plan.states, plan.inputs, terms.references, 1.0)
     return total + price_violations(terms.prices, rows, plan, terms.row_price)
 
 
 @compiled
-def _measure_step(cost, terms, rows, plan, proposed):
-    """The ``StepMeasures`` of a program's step."""
-    here = _priced_cost(cost, terms, rows, plan)
-    step = _cost_of_step(cost, terms.references, plan, proposed)
-    return StepMeasures(here, step)
+def _measure_step(local, terms, proposed):
+    """Returns the ``StepMeasures`` of a program's step."""
+    cost = _priced_cost(local.cost, terms, local.rows, local.plan)
+    step = _cost_of_step(local.cost, terms.references, local.plan, proposed)
+    return StepMeasures(cost, step)
 
 
 @compiled
-def _forecast_step(cost, terms, defect_prices, A, after, rows, plan, proposed, z):
-    """The ``StepForecast`` of a step from a plan to a proposed one."""
+def _forecast_step(local, terms, defect_prices, proposed, multipliers):
+    """Returns the ``StepForecast`` of a step from a plan to a proposed one.
+
+    The multipliers (H, r) are those of the rows.
+    """
+    states = local.plan.states
+    after = local.stages.next
     H, p = after.shape
     defects = np.zeros(p)
-    largest = 0.0
-    reach = 1.0
+    largest_defect = 0.0
+    largest_state = 1.0
     for k in range(H):
         for i in range(p):
-            defect = abs(after[k, i] - plan.states[k + 1, i])
+            defect = abs(after[k, i] - states[k + 1, i])
             defects[i] += defect
-            largest = max(largest, defect)
-            reach = max(reach, abs(plan.states[k + 1, i]))
-    here = _priced_cost(cost, terms, rows, plan)
-    promised = _priced_cost(cost, terms, rows, proposed)
-    curvature = _cost_of_step(cost, terms.references, plan, proposed)
-    costates = _costates(cost, A, proposed, terms.references.states, rows.E, z)
+            largest_defect = max(largest_defect, defect)
+            largest_state = max(largest_state, abs(states[k + 1, i]))
+    cost = _priced_cost(local.cost, terms, local.rows, local.plan)
+    promised = _priced_cost(local.cost, terms, local.rows, proposed)
+    curvature = _cost_of_step(local.cost, terms.references, local.plan, proposed)
+    targets = terms.references.states
+    costates = _costates(
+        local.cost, local.stages.A, proposed, targets, local.rows.E, multipliers
+    )
     prices = defect_prices.copy()
     for k in range(H):
         for i in range(p):
             prices[i] = max(prices[i], 1.5 * abs(costates[k, i]))
-    merit = here + dot(defects, prices, p)
-    return StepForecast(here, promised, curvature, largest / reach, merit, prices)
+    merit = cost + dot(defects, prices, p)
+    relative_defect = largest_defect / largest_state
+    return StepForecast(cost, promised, curvature, relative_defect, merit, prices)
 
 
 @compiled
-def _merit(cost, terms, defect_prices, after, rows, plan):
-    """The exact penalty function at a plan, within the bounds of ``rows``."""
-    merit = _priced_cost(cost, terms, rows, plan)
+def _merit(local, terms, defect_prices):
+    """Returns the exact penalty function at the plan of a problem."""
+    states = local.plan.states
+    after = local.stages.next
+    merit = _priced_cost(local.cost, terms, local.rows, local.plan)
     for k in range(len(after)):
         for i in range(after.shape[1]):
-            merit += defect_prices[i] * abs(after[k, i] - plan.states[k + 1, i])
+            merit += defect_prices[i] * abs(after[k, i] - states[k + 1, i])
     return merit
 
 
 @compiled
-def _costates(cost, A, plan, targets, E, z):
-    """Multipliers of the dynamics (H, p): the derivatives of cost and rows by s_1 .. s_H, through all that follows."""
+def _costates(cost, A, plan, targets, E, multipliers):
+    """Returns multipliers of the dynamics (H, p).
+
+    They are derivatives of cost and rows by s_1 .. s_H, through all that follows.
+    """
     states = plan.states
     inputs = plan.inputs
     Z = cost.squares
@@ -463,10 +538,10 @@ def _costates(cost, A, plan, targets, E, z):
     costates = np.zeros((H, p))
     for k in range(H - 1, -1, -1):
         weight = weight_of_stage(cost, k, H)
-        out = costates[k]
+        costate = costates[k]
         rows = E[min(k, len(E) - 1)]
         for i in range(n if len(Z) > 0 else 0):
-            out[i] += 2.0 * (
+            costate[i] += 2.0 * (
                 dot(Z[k, i], states[k + 1], n)
                 + dot(Z[k, i, n:], inputs[k], m)
                 + Z[k, i, n + m]
@@ -476,23 +551,26 @@ def _costates(cost, A, plan, targets, E, z):
                 error = states[k + 1, i // n * n + j] - (
                     targets[k, j] if i < n else 0.0
                 )
-                out[i] += 2.0 * weight[i // n, i % n, j] * error
+                costate[i] += 2.0 * weight[i // n, i % n, j] * error
             for e in range(len(rows)):
-                out[i] += rows[e, i] * z[k, e]
+                costate[i] += rows[e, i] * multipliers[k, e]
             if k < H - 1:
                 for j in range(p):
-                    out[i] += A[k + 1, j, i] * costates[k + 1, j]
+                    costate[i] += A[k + 1, j, i] * costates[k + 1, j]
     return costates
 
 
-def _update(P: Array, step: Array, change: Array) -> None:
-    """Updates P towards P step = change, damped so that it stays positive definite (Powell, 1978)."""
+def _update(P: Array, step: Array, gradient_change: Array) -> None:
+    """Updates P towards P step = gradient_change, so that it stays positive definite.
+
+    It is damped for that (Powell, 1978).
+    """
     product_with_step = P @ step
     curvature = step @ product_with_step
-    shown = step @ change
-    share = 1.0
-    if shown < 0.2 * curvature:
-        share = 0.8 * curvature / (curvature - shown)
-    damped = share * change + (1.0 - share) * product_with_step
+    new_curvature = step @ gradient_change
+    damping = 1.0
+    if new_curvature < 0.2 * curvature:
+        damping = 0.8 * curvature / (curvature - new_curvature)
+    damped = damping * gradient_change + (1.0 - damping) * product_with_step
     P += np.outer(damped, damped) / (step @ damped)
     P -= np.outer(product_with_step, product_with_step) / curvature

@@ -1,0 +1,383 @@
+"""Rows of the states' constraints, tightened by covariances and linearised along plans.
+
+P(g'x <= f) >= eta is g'mu + kappa sd <= f for a Gaussian, sd = sqrt(g'Sigma g), and
+g'mu - kappa sd >= f on the other side. Where s holds the covariance, sd is in the row:
+|S g|, or |diag(g) sd|, linearised at the plan (both are homogeneous, so the row has no
+constant). (The paper writes S_jj for it, which is right for a diagonal S only.) Both
+are convex: the row asks for no more than the constraint itself. In the mode
+``zero_order`` the bounds move inwards by kappa sd of the covariances predicted beside
+the program.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from gpmpc._compiled import compiled
+from gpmpc._kernels.linalg import dot
+from gpmpc.exceptions import SettingError
+from gpmpc.mpc._linear_quadratic import Covariance, Plan, StageRows
+from gpmpc.mpc.problem import Constraint, Inequality, Problem
+from gpmpc.propagation._local_model import square_roots
+
+Array = np.ndarray
+
+
+class _Rows(NamedTuple):
+    """The rows of one constraint, or of all of them stacked."""
+
+    F: Array  # gradients by the mean (r, n), zero for smooth constraints
+    lower: Array  # (H, r)
+    upper: Array  # (H, r)
+    kappa: Array  # standard deviations between means and sides (r,)
+    prices: Array  # of violations (r,), infinite where rows are hard
+    elastic: Array  # whether a row gives way where it cannot be kept (r,)
+
+
+class _SmoothRows(NamedTuple):
+    """An ``Inequality`` and the columns of its rows among all of them."""
+
+    constraint: Inequality
+    columns: slice
+
+
+class ConstraintRows:
+    """The rows of a problem's constraints, r a stage.
+
+    A box has one row for each entry with a bound, upper ones first.
+
+    Attributes:
+        soft: Whether a violation of any has a price.
+        prices: Of the rows (r,), infinite where they are hard.
+        elastic: Whether a row gives way where it cannot be kept (r,).
+        gives_way: Whether any does.
+        signs: 1 where a row has upper bounds, -1 where it has lower ones (r,).
+        applies: Whether a row has a bound at a stage (H, r).
+        smooth: Whether there is any ``Inequality``.
+        per_stage: r.
+    """
+
+    def __init__(self, problem: Problem, horizon: int, covariance: Covariance):
+        parts = [
+            _rows_of(constraint, problem, horizon, covariance)
+            for constraint in problem.constraints
+        ]
+        rows = _stack(parts, problem.state_dim, horizon)
+        smooth = _find_smooth(problem.constraints, parts)
+        self.prices = rows.prices
+        self.elastic = rows.elastic
+        self.gives_way = bool(rows.elastic.any())
+        self.signs = np.where(np.isfinite(rows.upper).any(axis=0), 1.0, -1.0)
+        self.applies = np.isfinite(rows.lower) | np.isfinite(rows.upper)
+        self.per_stage = len(rows.kappa)
+        self.soft = bool(np.isfinite(rows.prices).any())
+        self.smooth = bool(smooth)
+        holds_covariance = covariance in ("full", "diagonal")
+        tightens = covariance == "zero_order" and bool(rows.kappa.any())
+        self._rows: _FixedRows | _PlanRows
+        if smooth or tightens or (self.per_stage and holds_covariance):
+            self._rows = _PlanRows(
+                rows, smooth, self.signs, problem.input_dim, covariance
+            )
+        else:
+            self._rows = _FixedRows(rows, problem.input_dim, covariance)
+
+    def at(
+        self,
+        plan: Plan,
+        covariances: Array,
+        stages: int,
+        parameters: Array | None = None,
+        kappas: Array | None = None,
+    ) -> StageRows:
+        """Returns the rows at a plan, tightened by covariances.
+
+        Args:
+            plan: Where smooth constraints are linearised.
+            covariances: Of the states (H + 1, n, n).
+            stages: Number of stage models, H or 1.
+            parameters: Of smooth constraints by stage (H, q).
+            kappas: By stage (H,), in the place of those of the constraints.
+        """
+        return self._rows.at(plan, covariances, stages, parameters, kappas)
+
+
+class _FixedRows:
+    """Rows that no plan and no covariance moves."""
+
+    def __init__(self, rows: _Rows, input_dim: int, covariance: Covariance):
+        n = rows.F.shape[1]
+        kappa = np.zeros(len(rows.F))
+        self._rows = StageRows(
+            E=_by_belief(rows.F[None], np.zeros((1, n, n)), covariance, kappa),
+            D=np.zeros((0, 0, input_dim)),  # no row holds inputs
+            lower=rows.lower,
+            upper=rows.upper,
+        )
+
+    def at(
+        self,
+        plan: Plan,
+        covariances: Array,
+        stages: int,
+        parameters: Array | None,
+        kappas: Array | None,
+    ) -> StageRows:
+        """Returns the rows; see ``ConstraintRows.at``."""
+        return self._rows
+
+
+class _PlanRows:
+    """Rows that depend on a plan: tightened by its covariances, or linearised at it."""
+
+    def __init__(
+        self,
+        rows: _Rows,
+        smooth: Sequence[_SmoothRows],
+        signs: Array,
+        input_dim: int,
+        covariance: Covariance,
+    ):
+        horizon = len(rows.lower)
+        self._linear = rows
+        self._smooth = smooth
+        self._no_inputs = np.zeros((0, 0, input_dim))
+        self._covariance = covariance
+        self._signed_kappa = signs * rows.kappa
+        margins = rows.kappa if covariance == "zero_order" else np.zeros(len(signs))
+        self._margins = np.tile(margins, (horizon, 1))
+
+    def at(
+        self,
+        plan: Plan,
+        covariances: Array,
+        stages: int,
+        parameters: Array | None,
+        kappas: Array | None,
+    ) -> StageRows:
+        """Returns the rows; see ``ConstraintRows.at``."""
+        lower = self._linear.lower.copy()
+        upper = self._linear.upper.copy()
+        F = self._linear.F[None]
+        D = self._no_inputs
+        if self._smooth:
+            F, D = self._linearize_smooth(plan, parameters, upper)
+        margins = self._margins
+        if kappas is not None:
+            margins = np.where(self._margins > 0, kappas[:, None], 0.0)
+        _tighten.unchecked(F, margins, covariances, lower, upper)
+        E = _by_belief(
+            F, covariances[1 : stages + 1], self._covariance, self._signed_kappa
+        )
+        return StageRows(np.ascontiguousarray(E), D, lower, upper)
+
+    def _linearize_smooth(
+        self, plan: Plan, parameters: Array | None, upper: Array
+    ) -> tuple[Array, Array]:
+        """Returns gradients of all rows by state and input; moves the smooth bounds."""
+        linear = self._linear.F
+        H, r = upper.shape
+        means = np.ascontiguousarray(plan.states[1:, : linear.shape[1]])
+        F = np.repeat(linear[None], H, axis=0)
+        D = np.zeros((H, r, plan.inputs.shape[1]))
+        for constraint, columns in self._smooth:
+            values, by_state, by_input = constraint.expand(
+                means, plan.inputs, parameters
+            )
+            F[:, columns] = by_state
+            D[:, columns] = by_input
+            upper[:, columns] += np.einsum("kri,ki->kr", by_state, means) - values
+            upper[:, columns] += np.einsum("kri,ki->kr", by_input, plan.inputs)
+        return F, D
+
+
+def _by_belief(
+    F: Array, covariances: Array, mode: Covariance, signed_kappa: Array
+) -> Array:
+    """Returns the gradients E (K, r, p) of rows by s.
+
+    Args:
+        F: Gradients by the mean (K, r, n), or one for all stages (1, r, n).
+        covariances: Of the states (K, n, n), or one for all stages.
+        mode: What s holds of the covariance.
+        signed_kappa: Deviations of the rows (r,), negative for lower bounds.
+    """
+    if mode not in ("full", "diagonal"):
+        return F
+    K = max(len(F), len(covariances))
+    F = np.broadcast_to(F, (K, *F.shape[1:]))
+    covariances = np.broadcast_to(covariances, (K, *covariances.shape[1:]))
+    if mode == "diagonal":
+        variances = np.diagonal(covariances, axis1=1, axis2=2).clip(0)
+        by_deviations = _slopes_by_deviations(F, np.sqrt(variances))
+        return np.concatenate([F, signed_kappa[:, None] * by_deviations], axis=2)
+    by_root = _slopes_by_root(F, square_roots(covariances)[0])
+    by_root = signed_kappa[:, None, None] * by_root
+    n = F.shape[2]
+    return np.concatenate([F, by_root.reshape(K, -1, n * n)], axis=2)
+
+
+def _slopes_by_deviations(F: Array, deviations: Array) -> Array:
+    """Returns derivatives (K, r, n) of |diag(g) sd| by sd (K, n), g the rows of F."""
+    weighed = F * deviations[:, None]
+    norms = np.linalg.norm(weighed, axis=-1, keepdims=True)
+    return np.divide(F * weighed, norms, out=np.abs(F), where=norms > 0)
+
+
+def _slopes_by_root(F: Array, roots: Array) -> Array:
+    """Returns derivatives (K, r, n, n) of |S g| by S (K, n, n), g the rows of F."""
+    weighed = F @ roots
+    norms = np.linalg.norm(weighed, axis=-1, keepdims=True)
+    zero = np.zeros_like(weighed)
+    directions = np.divide(weighed, norms, out=zero, where=norms > 0)  # S g / |S g|
+    return F[..., None] * directions[:, :, None, :]
+
+
+def _rows_of(
+    constraint: Constraint, problem: Problem, horizon: int, covariance: Covariance
+) -> _Rows:
+    """Returns the rows of one constraint."""
+    F, lower, upper = constraint.rows(horizon)
+    if constraint.stages is not None:
+        _leave_out_other_stages(tuple(constraint.stages), lower, upper)
+    r = len(F)
+    kappa = 0.0
+    if covariance != "none":
+        sides = int(np.isfinite(lower).sum() + np.isfinite(upper).sum())
+        kappa = constraint.standard_deviations(sides)
+    if isinstance(constraint, Inequality):
+        F = np.zeros((r, problem.state_dim))
+    return _Rows(
+        F=F,
+        lower=lower,
+        upper=upper,
+        kappa=np.full(r, kappa),
+        prices=np.full(r, problem.price(constraint)),
+        elastic=np.full(r, constraint.penalty == "elastic"),
+    )
+
+
+def _leave_out_other_stages(
+    stages: Sequence[int], lower: Array, upper: Array
+) -> None:
+    """Removes the bounds (H, r) of all stages but some of 1 .. H."""
+    horizon = len(lower)
+    if max(stages) > horizon:
+        rule = f"must be of 1 .. {horizon}"
+        raise SettingError("stages", f"{rule}; got {max(stages)}")
+    others = [k for k in range(horizon) if k + 1 not in stages]
+    lower[others] = -np.inf
+    upper[others] = np.inf
+
+
+def _stack(parts: Sequence[_Rows], n: int, horizon: int) -> _Rows:
+    """Returns the rows of all constraints, one below the other."""
+    if not parts:
+        return _Rows(
+            F=np.empty((0, n)),
+            lower=np.empty((horizon, 0)),
+            upper=np.empty((horizon, 0)),
+            kappa=np.empty(0),
+            prices=np.empty(0),
+            elastic=np.empty(0, dtype=bool),
+        )
+    return _Rows(
+        F=np.concatenate([part.F for part in parts]),
+        lower=np.hstack([part.lower for part in parts]),
+        upper=np.hstack([part.upper for part in parts]),
+        kappa=np.concatenate([part.kappa for part in parts]),
+        prices=np.concatenate([part.prices for part in parts]),
+        elastic=np.concatenate([part.elastic for part in parts]),
+    )
+
+
+def _find_smooth(
+    constraints: Sequence[Constraint], parts: Sequence[_Rows]
+) -> list[_SmoothRows]:
+    """Returns the smooth constraints with their places among all rows."""
+    smooth = []
+    first = 0
+    for constraint, part in zip(constraints, parts, strict=True):
+        end = first + len(part.F)
+        if isinstance(constraint, Inequality):
+            smooth.append(_SmoothRows(constraint, slice(first, end)))
+        first = end
+    return smooth
+
+
+@compiled
+def _tighten(F, kappa, covariances, lower, upper):
+    """Moves the bounds of the rows (H, r) inwards by kappa (H, r) deviations."""
+    count, r, n = F.shape
+    for k in range(len(lower)):
+        stage = min(k, count - 1)
+        for e in range(r):
+            variance = 0.0
+            for i in range(n):
+                if F[stage, e, i] != 0.0:
+                    spread = dot(covariances[k + 1, i], F[stage, e], n)
+                    variance += F[stage, e, i] * spread
+            margin = kappa[k, e] * math.sqrt(max(variance, 0.0))
+            lower[k, e] += margin
+            upper[k, e] -= margin
+
+
+@compiled
+def price_violations(prices, rows, plan, hard_price):
+    """Returns what violations along a plan cost.
+
+    Rows without a declared price cost ``hard_price`` per unit.
+    """
+    E, D, lower, upper = rows
+    total = 0.0
+    for k in range(len(lower)):
+        stage = min(k, len(E) - 1)
+        s = plan.states[k + 1]
+        u = plan.inputs[k]
+        for e in range(len(prices)):
+            value = dot(E[stage, e], s, len(s)) + (
+                dot(D[k, e], u, len(u)) if len(D) > 0 else 0.0
+            )
+            outside = max(0.0, value - upper[k, e], lower[k, e] - value)
+            total += (hard_price if prices[e] == np.inf else prices[e]) * outside
+    return total
+
+
+@compiled
+def largest_violation(rows, bounds, plan, previous_input):
+    """Returns by how much a plan misses a bound of states, inputs or increments."""
+    E, D, lower, upper = rows
+    largest = 0.0
+    for k in range(len(plan.inputs)):
+        s = plan.states[k + 1]
+        u = plan.inputs[k]
+        for e in range(lower.shape[1]):
+            value = dot(E[min(k, len(E) - 1), e], s, len(s))
+            if len(D) > 0:
+                value += dot(D[k, e], u, len(u))
+            largest = max(largest, value - upper[k, e], lower[k, e] - value)
+        for j in range(len(u)):
+            largest = max(largest, u[j] - bounds.upper[k, j], bounds.lower[k, j] - u[j])
+            if len(bounds.rate_lower) > 0:
+                last = plan.inputs[k - 1, j] if k > 0 else previous_input[j]
+                rate = u[j] - last
+                largest = max(
+                    largest,
+                    rate - bounds.rate_upper[k, j],
+                    bounds.rate_lower[k, j] - rate,
+                )
+    return largest
+
+
+@compiled
+def keep_rates(inputs, previous_input, lower, upper):
+    """Moves inputs (H, m), one after the other, to within rates from the one before."""
+    for k in range(len(inputs)):
+        stage = min(k, len(lower) - 1)
+        for j in range(len(previous_input)):
+            last = inputs[k - 1, j] if k > 0 else previous_input[j]
+            inputs[k, j] = min(
+                max(inputs[k, j], last + lower[stage, j]), last + upper[stage, j]
+            )

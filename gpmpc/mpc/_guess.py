@@ -1,0 +1,186 @@
+"""What a decision starts from: its arguments, the disturbance estimate, a first plan.
+
+A constant error of the model leaves an offset between reference and state. The form
+``velocity`` has none: the error is in both of two steps, and not in their difference.
+To ``trajectory`` an estimate of it may be added (Pannocchia and Rawlings, 2003), which
+an observer moves by its gain L towards what the last step showed:
+
+    d_k = (1 - L) d_{k-1} + L (mu_k - f(mu_{k-1}, u_{k-1}))
+"""
+
+from typing import Any
+
+import numpy as np
+
+from gpmpc._angles import full_turns, state_difference
+from gpmpc._dynamics import linearize
+from gpmpc.exceptions import SettingError, ShapeError
+from gpmpc.gaussian import Gaussian
+from gpmpc.mpc._constraints import keep_rates
+from gpmpc.mpc._controller import Decision, Reference, Request, read_parameters
+from gpmpc.mpc._linear_quadratic import Plan
+from gpmpc.mpc._linearization import PredictionModel
+
+Array = np.ndarray
+
+
+def read_request(
+    prediction: PredictionModel,
+    belief: Gaussian,
+    reference: Reference,
+    previous: Decision | None,
+    parameters: Any = None,
+    plan: Any = None,
+) -> Request:
+    """Reads the arguments of a controller's ``control``; see ``GPMPC.control``.
+
+    The disturbance estimate is part of the request.
+    """
+    horizon = prediction.horizon
+    request = Request.read(
+        problem=prediction.problem,
+        horizon=horizon,
+        initial_input=prediction.initial_input,
+        belief=belief,
+        reference=reference,
+        previous=previous,
+        plan=plan,
+        signals=prediction.signals,
+    )
+    if parameters is not None:
+        request = request._replace(parameters=read_parameters(parameters, horizon))
+    _check_reference(prediction, reference, request)
+    if not request.finite:
+        return request
+    if prediction.settings.disturbance_gain:
+        disturbance = _estimate_disturbance(prediction, request)
+        request = request._replace(disturbance=disturbance)
+    if plan is not None and request.states is None:
+        states = prediction.lead(
+            request.state, request.initial_guess, request.disturbance
+        )
+        request = request._replace(states=states)
+    return request
+
+
+def _check_reference(
+    prediction: PredictionModel, reference: Reference, request: Request
+) -> None:
+    """Raises an error where a reference lacks inputs, or has kappas without a use."""
+    deviations = prediction.problem.cost.penalized == "deviations"
+    if reference.inputs is None and deviations:
+        shape = f"({prediction.horizon}, {prediction.input_dim})"
+        rule = f"penalized 'deviations' needs reference inputs {shape}"
+        raise ShapeError(f"{rule}; got none")
+    mode = prediction.settings.covariance
+    if request.kappas is not None and mode != "zero_order":
+        rule = "are for covariances of 'zero_order'"
+        raise SettingError("kappas", f"{rule}; this controller has {mode!r}")
+
+
+def _estimate_disturbance(prediction: PredictionModel, request: Request) -> Array:
+    """Returns d_k (n,); zero without a last decision.
+
+    It comes from the estimate of the last decision and from the state that its input
+    led to.
+    """
+    previous = request.previous
+    if previous is None:
+        return np.zeros(prediction.state_dim)
+    last_estimate = previous.disturbance
+    if last_estimate is None:
+        last_estimate = np.zeros_like(request.state)
+    last_input = request.references.previous_input[None]
+    local = linearize(
+        prediction.model, previous.means[:1], last_input, covariance=False
+    )
+    error = state_difference(request.state, local.mean[0], prediction.angles)
+    gain = prediction.settings.disturbance_gain
+    return last_estimate + gain * (error - last_estimate)
+
+
+def initial_guess(prediction: PredictionModel, request: Request) -> Plan:
+    """Returns the plan handed over, or the last plan, shifted by a stage.
+
+    Without one it is a line from the state to the last reference along the others, and
+    its inputs are the previous one, or the reference's where R weighs deviations.
+    Inputs handed over alone lead to the model's states; where these are not finite, the
+    plan's are x_0. The form ``velocity`` holds the belief and the previous input.
+    """
+    if prediction.settings.form == "velocity":
+        return _hold_belief(prediction, request)
+    means = _guess_means(prediction, request)
+    inputs = _guess_inputs(prediction, request)
+    covariances = _guess_covariances(prediction, request, means, inputs)
+    return prediction.plan_of(means, inputs, covariances)
+
+
+def _hold_belief(prediction: PredictionModel, request: Request) -> Plan:
+    """Returns the belief and the previous input over the whole horizon."""
+    count = prediction.horizon + 1
+    means = np.tile(request.state, (count, 1))
+    covariances = np.zeros((count, prediction.state_dim, prediction.state_dim))
+    if prediction.settings.covariance != "none":
+        covariances[:] = request.covariance
+    return prediction.plan_of(means, request.constant_guess, covariances)
+
+
+def _guess_means(prediction: PredictionModel, request: Request) -> Array:
+    """Returns the means of the first plan (H + 1, n)."""
+    H = prediction.horizon
+    angles = prediction.problem.cost.angles
+    means = np.empty((H + 1, prediction.state_dim))
+    means[0] = request.state
+    previous = request.previous
+    if request.states is not None:
+        means[1:] = request.states[1:]
+    elif previous is not None:
+        means[1:H] = previous.means[2:]
+        means[H] = previous.means[H]
+        if angles:  # a sensor may have taken a turn off
+            means[1:] += full_turns(request.state - previous.means[1], angles)
+    else:
+        targets = request.references.states
+        remaining = np.linspace(1.0, 0.0, H + 1)[1:, None]
+        means[1:] = targets + remaining * (request.state - targets[0])
+    return means
+
+
+def _guess_inputs(prediction: PredictionModel, request: Request) -> Array:
+    """Returns the inputs of the first plan (H, m), within bounds and rates."""
+    problem = prediction.problem
+    inputs = request.initial_guess
+    is_first = request.previous is None and request.states is None
+    if is_first and problem.cost.penalized == "deviations":
+        bounds = problem.inputs
+        inputs = request.references.inputs.clip(bounds.lower, bounds.upper)
+    if problem.input_rates.finite:
+        lower, upper = problem.input_rates.sides
+        inputs = inputs.copy()
+        keep_rates(inputs, request.references.previous_input, lower, upper)
+    return inputs
+
+
+def _guess_covariances(
+    prediction: PredictionModel, request: Request, means: Array, inputs: Array
+) -> Array:
+    """Returns the covariances at which the first plan is linearised (H + 1, n, n).
+
+    They are those of the last plan, unshifted: they depend on the time since the last
+    measurement. Without a plan they are those of the stages at certain states.
+    """
+    n = prediction.state_dim
+    covariances = np.zeros((prediction.horizon + 1, n, n))
+    if prediction.settings.covariance != "none":
+        covariances[0] = request.covariance
+    if prediction.linearizer.at_points:
+        return covariances
+    if request.previous is not None:
+        covariances[1:] = request.previous.covariances[1:]
+        return covariances
+    stages = prediction.point_linearizer(means[:-1], inputs, covariances[1:])
+    predicted = prediction.predict_covariances(
+        stages, prediction.costs.quadratic, request.covariance
+    )
+    covariances[1:] = predicted[1:]
+    return covariances

@@ -1,0 +1,175 @@
+"""Plans that obey the dynamics: roll-outs under a feedback towards a plan.
+
+The feedback u = u' - K (x - x') leads towards the plan (x', u') and exists where inputs
+alone would lead an unstable plant away. Its inputs keep their bounds. Gains are those
+of the last program where it was condensed in feedback coordinates, else of the
+regulator of the stages.
+"""
+
+import numpy as np
+
+from gpmpc._angles import full_turns
+from gpmpc._kernels.gp_rollout import Feedback
+from gpmpc.mpc._controller import Request
+from gpmpc.mpc._linear_quadratic import Plan, Stages, evaluate_stages
+from gpmpc.mpc._linearization import LocalProblem, PredictionModel
+
+Array = np.ndarray
+
+
+def roll_out(
+    prediction: PredictionModel,
+    target: Plan,
+    local: LocalProblem,
+    feedback: Array,
+    request: Request,
+) -> LocalProblem:
+    """Returns the problem at the plan that obeys the dynamics towards another plan.
+
+    Args:
+        prediction: Of the controller.
+        target: The plan to follow.
+        local: The problem whose stages give the gains where ``feedback`` is empty.
+        feedback: Of a program, F_k (H, m, p + m + 1).
+        request: Of the decision.
+    """
+    if prediction.linearizer.at_points:
+        plan = _follow(prediction, target, local, feedback, request)
+        return prediction.linearize(plan, request)
+    return _roll_out_belief(prediction, target, local, feedback, request)
+
+
+def close_defects(
+    prediction: PredictionModel,
+    ending: LocalProblem,
+    local: LocalProblem,
+    feedback: Array,
+    request: Request,
+) -> LocalProblem:
+    """Returns a problem whose plan is rolled out towards its own, so that it obeys.
+
+    It is the problem itself where the roll-out overflows. Where dynamics are linearised
+    at points, stages and covariances stay as they are.
+
+    Args:
+        prediction: Of the controller.
+        ending: The problem whose plan may have defects.
+        local: The problem that was linearised last, whose feedback is followed.
+        feedback: Of its program; see ``roll_out``.
+        request: Of the decision.
+    """
+    if not prediction.linearizer.at_points:
+        obeying = _roll_out_belief(prediction, ending.plan, local, feedback, request)
+        return obeying if np.isfinite(obeying.plan.states).all() else ending
+    plan = _follow(prediction, ending.plan, local, feedback, request)
+    if not np.isfinite(plan.states).all():
+        return ending
+    rows = ending.rows
+    if prediction.constraints.smooth:
+        rows = prediction.constraints.at(
+            plan,
+            ending.covariances,
+            prediction.points,
+            request.parameters,
+            request.kappas,
+        )
+    cost = prediction.costs.at(plan, request.parameters)
+    return ending._replace(plan=plan, rows=rows, cost=cost)
+
+
+def cost_of_inputs(
+    prediction: PredictionModel, inputs: Array, request: Request
+) -> float:
+    """Returns what the plan costs that inputs (H, m) lead to.
+
+    Each stage's angles count in the turn nearest to its reference.
+    """
+    states = prediction.lead(request.state, inputs, request.disturbance)
+    n = prediction.state_dim
+    plan = prediction.plan_of(states, inputs, np.zeros((len(states), n, n)))
+    references = request.references
+    targets = references.states
+    turns = full_turns(states[1:] - targets, prediction.problem.cost.angles)
+    cost = prediction.costs.at(plan, request.parameters)
+    stage_costs = evaluate_stages.unchecked(
+        cost, plan.states, inputs, references._replace(states=targets + turns), 1.0
+    )
+    return float(stage_costs.sum())
+
+
+def _follow(
+    prediction: PredictionModel,
+    target: Plan,
+    local: LocalProblem,
+    feedback: Array,
+    request: Request,
+) -> Plan:
+    """Returns the plan that the means obey under a feedback towards another one."""
+    limits = prediction.limits
+    law = Feedback(
+        states=target.states[None],
+        inputs=target.inputs[None],
+        gains=_gains_of_means(prediction, local, feedback)[None],
+        lower=limits.lower,
+        upper=limits.upper,
+        rate_lower=limits.rate_lower,
+        rate_upper=limits.rate_upper,
+        previous_input=request.references.previous_input,
+    )
+    states, inputs = prediction.roll_out_means(
+        target.states[:1], law, request.disturbance
+    )
+    return Plan(states[0], inputs[0], target.covariances)
+
+
+def _roll_out_belief(
+    prediction: PredictionModel,
+    target: Plan,
+    local: LocalProblem,
+    feedback: Array,
+    request: Request,
+) -> LocalProblem:
+    """Returns ``roll_out`` of a belief whose means depend on its covariances."""
+    linearizer = prediction.linearizer
+    n = prediction.state_dim
+    gains = _gains_of_means(prediction, local, feedback)
+    limits = prediction.limits
+    last_input = request.references.previous_input
+    states = target.states.copy()
+    inputs = target.inputs.copy()
+    covariances = target.covariances.copy()
+    parts = []
+    for k in range(prediction.horizon):
+        off = states[k, :n] - target.states[k, :n]
+        input = target.inputs[k] + gains[k] @ off
+        lowest = last_input + limits.rate_lower[k]
+        highest = last_input + limits.rate_upper[k]
+        input = np.clip(input, lowest, highest)
+        inputs[k] = np.clip(input, limits.lower[k], limits.upper[k])
+        last_input = inputs[k]
+        stage = linearizer(
+            states[k : k + 1],
+            inputs[k : k + 1],
+            covariances[k : k + 1],
+            request.disturbance,
+        )
+        states[k + 1] = stage.next[0]
+        _, after = linearizer.moments(stage.next, covariances[k + 1 : k + 2])
+        covariances[k + 1] = after[0]
+        parts.append(stage)
+    stages = Stages._make(map(np.concatenate, zip(*parts, strict=True)))
+    return prediction.assemble(Plan(states, inputs, covariances), stages, request)
+
+
+def _gains_of_means(
+    prediction: PredictionModel, local: LocalProblem, feedback: Array
+) -> Array:
+    """Returns gains (H, m, n) of a feedback on the means, u = u' + gains (x - x').
+
+    They are a program's, or the regulator's of the stages of a problem.
+    """
+    gains = feedback
+    if not len(feedback):
+        stages = local.stages
+        gains = -prediction.gains(stages.A, stages.B, local.cost)
+    return np.ascontiguousarray(gains[:, :, : prediction.state_dim])
