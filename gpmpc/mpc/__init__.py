@@ -4,9 +4,9 @@ from gpmpc.mpc._controller import Controller, Decision, Reference, Request, Timi
 from gpmpc.mpc._cost import LeastSquares, Tracking
 from gpmpc.mpc._data_range import BeyondData, beyond_data
 from gpmpc.mpc._judgement import FlightJudge, FlightJudgement, Judgement
-from gpmpc.mpc._linear_quadratic import dlqr
+from gpmpc.mpc._linearization import PredictionSettings
 from gpmpc.mpc._policy import ControlLoop
-from gpmpc.mpc._prediction import PredictionSettings
+from gpmpc.mpc._riccati import dlqr
 from gpmpc.mpc._stability import Stability
 from gpmpc.mpc._start_guesses import kicks
 from gpmpc.mpc._starts import ManyStarts

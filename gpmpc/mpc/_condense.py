@@ -77,8 +77,9 @@ def condense(
         ShapeError: An array is not contiguous: the kernel ignores strides.
     """
     read_arrays = (*stages, start, rows.E, rows.D, references.states, cost.squares)
-    if not all(array.flags.c_contiguous for array in read_arrays):
-        raise ShapeError("stages, rows and references must be contiguous arrays")
+    for array in read_arrays:
+        if not array.flags.c_contiguous:
+            raise ShapeError("stages, rows and references must be contiguous arrays")
     p, m = stages.B.shape[1:]
     size = bounds.lower.size
     row_count = bounds.rate_lower.size + rows.lower.size
@@ -90,9 +91,7 @@ def condense(
         upper=np.empty(size + row_count),
         feedback=np.empty((0, m, p + m + 1)),
     )
-    growth = _condense.unchecked(
-        cost, bounds, stages, start, references, rows, program
-    )
+    growth = _condense.unchecked(cost, bounds, stages, start, references, rows, program)
     if growth <= _LARGEST_GROWTH:
         return program
     return condense_with_feedback.unchecked(

@@ -144,7 +144,7 @@ class _PlanRows:
         self._linear = rows
         self._smooth = smooth
         self._no_inputs = np.zeros((0, 0, input_dim))
-        self._covariance = covariance
+        self._covariance: Covariance = covariance
         self._signed_kappa = signs * rows.kappa
         margins = rows.kappa if covariance == "zero_order" else np.zeros(len(signs))
         self._margins = np.tile(margins, (horizon, 1))
@@ -259,9 +259,7 @@ def _rows_of(
     )
 
 
-def _leave_out_other_stages(
-    stages: Sequence[int], lower: Array, upper: Array
-) -> None:
+def _leave_out_other_stages(stages: Sequence[int], lower: Array, upper: Array) -> None:
     """Removes the bounds (H, r) of all stages but some of 1 .. H."""
     horizon = len(lower)
     if max(stages) > horizon:
@@ -285,8 +283,9 @@ def _stack(parts: Sequence[_Rows], n: int, horizon: int) -> _Rows:
         )
     return _Rows(
         F=np.concatenate([part.F for part in parts]),
-        lower=np.hstack([part.lower for part in parts]),
-        upper=np.hstack([part.upper for part in parts]),
+        # kernels ignore strides, and stacked columns may lie column by column
+        lower=np.ascontiguousarray(np.hstack([part.lower for part in parts])),
+        upper=np.ascontiguousarray(np.hstack([part.upper for part in parts])),
         kappa=np.concatenate([part.kappa for part in parts]),
         prices=np.concatenate([part.prices for part in parts]),
         elastic=np.concatenate([part.elastic for part in parts]),

@@ -14,7 +14,7 @@ more. A plan that costs nothing has no scale; what it would cost to be beside it
 
 import numpy as np
 
-from gpmpc.mpc._prediction import Prediction
+from gpmpc.mpc._linearization import LocalProblem
 
 Array = np.ndarray
 
@@ -24,19 +24,19 @@ WORTH = 2.0
 _TINY = 1e-12
 
 
-def violations(prediction: Prediction, elastic: Array) -> Array:
+def violations(local: LocalProblem, elastic: Array) -> Array:
     """By how much a plan misses each elastic row at each stage (H, r), zero where it is kept."""
-    E, D, lower, upper = prediction.rows
-    states = prediction.plan.states[1:]
+    E, D, lower, upper = local.rows
+    states = local.plan.states[1:]
     values = np.einsum("kri,ki->kr", _by_stage(E, len(states)), states)
     if len(D):
-        values = values + np.einsum("krj,kj->kr", D, prediction.plan.inputs)
+        values = values + np.einsum("krj,kj->kr", D, local.plan.inputs)
     outside = np.maximum(values - upper, lower - values)
     return np.maximum(0.0, outside)[:, elastic]
 
 
 def elastic_price(
-    prediction: Prediction,
+    local: LocalProblem,
     free_cost: float,
     last_cost: float,
     elastic: Array,
@@ -45,14 +45,14 @@ def elastic_price(
     """The price of elastic rows, from the plan without them.
 
     Args:
-        prediction: With the plan that minimises the cost alone.
+        local: With the plan that minimises the cost alone.
         free_cost: Of that plan, J0.
         last_cost: Of the last plan.
         elastic: Which of the r rows are elastic (r,).
         Q: Weight of the states (n, n), or of those of each stage (H, n, n).
     """
-    missed = violations(prediction, elastic)
-    gradients = _by_stage(prediction.rows.E, len(missed))
+    missed = violations(local, elastic)
+    gradients = _by_stage(local.rows.E, len(missed))
     gradients = gradients[:, elastic, : Q.shape[-1]]
     n = Q.shape[-1]
     of_stages = _by_stage(Q.reshape(-1, n, n), len(missed))

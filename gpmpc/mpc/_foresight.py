@@ -21,7 +21,7 @@ from gpmpc.exceptions import SettingError
 from gpmpc.gaussian import Gaussian
 from gpmpc.models import RollOut
 from gpmpc.mpc._controller import Decision, Reference, Timing
-from gpmpc.mpc._linear_quadratic import finite_horizon_lqr
+from gpmpc.mpc._riccati import finite_horizon_lqr
 from gpmpc.mpc._stage_meter import StageMeter, first_weight, held, rows_over
 from gpmpc.mpc.gp_mpc import GPMPC
 from gpmpc.status import Status

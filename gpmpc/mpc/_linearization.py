@@ -24,7 +24,7 @@ is of the covariances only: the bounds of the inputs hold for u_k. ``full`` and
 propagator.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
@@ -70,6 +70,9 @@ Array = np.ndarray
 
 Form = Literal["trajectory", "velocity"]
 FORMS = ("trajectory", "velocity")
+
+#: from states, inputs and covariances at K points to next s, A, B and V
+_Linearize = Callable[[Array, Array, Array], tuple[Array, Array, Array, Array]]
 
 
 @dataclass(frozen=True)
@@ -139,9 +142,7 @@ class LocalProblem(NamedTuple):
 
     def violation(self, bounds: InputBounds, previous_input: Array) -> float:
         """Returns by how much the plan misses a bound, at most."""
-        return largest_violation.unchecked(
-            self.rows, bounds, self.plan, previous_input
-        )
+        return largest_violation.unchecked(self.rows, bounds, self.plan, previous_input)
 
 
 class PredictionModel:
@@ -359,14 +360,13 @@ class StageLinearizer:
         self.noise = np.zeros(self._n)
         if self._noise is not None:
             self.noise = np.ascontiguousarray(np.diagonal(self._noise))
-        by_mode = {
+        by_mode: dict[str, _Linearize] = {
             "full": self._linearize_roots,
             "diagonal": self._linearize_deviations,
             "zero_order": self._linearize_moments,
         }
-        if self.at_points:
-            self._linearize = self._linearize_means
-        else:
+        self._linearize: _Linearize = self._linearize_means
+        if not self.at_points:
             self._linearize = by_mode[covariance]
 
     def __call__(
@@ -500,7 +500,9 @@ class StageLinearizer:
         sd_by_sd = sd_by_variance * variance_by_variance * variance_by_sd
         lower = torch.cat([sd_by_mean, sd_by_sd], dim=-1)
         A = torch.cat([upper, lower], dim=-2)
-        B = torch.cat([slopes.mean_by_input, sd_by_variance * variance_by_input], dim=-2)
+        B = torch.cat(
+            [slopes.mean_by_input, sd_by_variance * variance_by_input], dim=-2
+        )
         after = torch.cat([step.belief.mean, next_sd], dim=-1)
         return to_array(after), to_array(A), to_array(B), np.zeros_like(covariances)
 

@@ -33,15 +33,10 @@ from gpmpc.models import DelayedModel
 from gpmpc.models._wrapper import Wrapper
 from gpmpc.mpc._controller import Reference, read_parameters, read_reference
 from gpmpc.mpc._cost import FunctionNotFinite
-from gpmpc.mpc._linear_quadratic import (
-    DEVIATIONS,
-    INCREMENTS,
-    QuadraticCost,
-    finite_horizon_lqr,
-)
-from gpmpc.mpc._prediction import PredictionModel
+from gpmpc.mpc._linear_quadratic import DEVIATIONS, INCREMENTS, Plan, QuadraticCost
+from gpmpc.mpc._linearization import PredictionModel
+from gpmpc.mpc._riccati import finite_horizon_lqr
 from gpmpc.mpc._slopes import slope_covariances
-from gpmpc.mpc._stages import Plan
 
 Array = np.ndarray
 

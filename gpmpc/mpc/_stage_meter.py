@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gpmpc._angles import state_difference
+from gpmpc.mpc._constraints import ConstraintRows
 from gpmpc.mpc._controller import FEASIBLE
-from gpmpc.mpc._stages import ConstraintRows, Plan
+from gpmpc.mpc._linear_quadratic import Plan
 from gpmpc.mpc.problem import Problem
 
 if TYPE_CHECKING:

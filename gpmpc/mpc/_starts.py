@@ -32,7 +32,7 @@ from gpmpc.mpc._controller import (
 )
 from gpmpc.mpc._foresight import Flight, Foresight, Question, Trajectory
 from gpmpc.mpc._linear_quadratic import References, evaluate_cost
-from gpmpc.mpc._stages import StageCosts, StageLinearizer
+from gpmpc.mpc._linearization import StageCosts, StageLinearizer
 from gpmpc.mpc._start_guesses import Starts, kicks, turned
 from gpmpc.mpc.gp_mpc import GPMPC
 from gpmpc.propagation import Linearization

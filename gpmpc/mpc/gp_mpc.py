@@ -728,11 +728,10 @@ def _is_usable(program: CondensedProgram, solution: QPSolution, plan: Plan) -> b
         return False
     if _hard_violation(solution) > FEASIBLE:
         return False
+    unknowns = plan.inputs.ravel()
     if len(program.feedback):
-        unknowns_of_plan = 0.0 * solution.x
-    else:
-        unknowns_of_plan = plan.inputs.ravel()
-    of_plan = solution._replace(x=unknowns_of_plan)
+        unknowns = 0.0 * solution.x
+    of_plan = solution._replace(x=unknowns)
     plan_is_infeasible = _hard_violation(of_plan) > FEASIBLE
     return plan_is_infeasible or solution.objective <= of_plan.objective
 

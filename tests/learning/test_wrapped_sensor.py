@@ -6,8 +6,7 @@ import pytest
 from gpmpc.gp import Trainer, Transitions
 from gpmpc.learning import ChangedModel, EpisodicLearning, LearningController
 from gpmpc.models import Affine, ResidualModel
-from gpmpc.mpc import ControlLoop
-from gpmpc.mpc._prediction import PredictionSettings
+from gpmpc.mpc import ControlLoop, PredictionSettings
 from gpmpc.mpc.gp_mpc import GPMPC
 from gpmpc.mpc.problem import Box, Problem, Tracking
 from gpmpc.propagation import Linearization

@@ -16,7 +16,7 @@ from gpmpc.mpc import (
     Reference,
     Tracking,
 )
-from gpmpc.mpc._sqp import Iteration
+from gpmpc.mpc._sqp import Globalization
 from gpmpc.propagation import Linearization
 from gpmpc.status import Status
 from gpmpc.systems import cart_pole, pendulum, planar_quadrotor, step
@@ -189,7 +189,7 @@ def test_a_first_plan_stands_where_more_programs_lead_the_model_out_of_its_numbe
     def fails(*arguments):
         raise DataError("beyond the model's numbers")
 
-    monkeypatch.setattr(Iteration, "__call__", fails)
+    monkeypatch.setattr(Globalization, "step", fails)
     decision = controller.control(at, reference)
     assert decision.status is Status.SOLVED
     assert decision.iterations == 1

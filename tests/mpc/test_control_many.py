@@ -7,7 +7,7 @@ import torch
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import backend
 from gpmpc.mpc import PredictionSettings, Reference
-from gpmpc.mpc._stages import StageLinearizer
+from gpmpc.mpc._linearization import StageLinearizer
 from gpmpc.mpc.gp_mpc import GPMPC
 from gpmpc.mpc.problem import Box, Problem, Tracking
 from gpmpc.propagation import Linearization, MeanEquivalence, MomentMatching, Unscented

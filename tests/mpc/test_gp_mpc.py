@@ -11,8 +11,8 @@ from gpmpc.gaussian import Gaussian
 from gpmpc.gp import backend
 from gpmpc.mpc import Reference, gp_mpc
 from gpmpc.mpc._controller import Timing
-from gpmpc.mpc._prediction import FORMS, PredictionSettings
-from gpmpc.mpc._stages import COVARIANCES
+from gpmpc.mpc._linear_quadratic import COVARIANCES
+from gpmpc.mpc._linearization import FORMS, PredictionSettings
 from gpmpc.mpc.baselines import NMPC
 from gpmpc.mpc.gp_mpc import GPMPC
 from gpmpc.mpc.problem import Box, Problem, Tracking

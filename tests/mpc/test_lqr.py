@@ -8,7 +8,7 @@ from gpmpc.exceptions import SettingError, ShapeError
 from gpmpc.gaussian import Gaussian
 from gpmpc.models import linearize_by_autograd
 from gpmpc.mpc import Reference
-from gpmpc.mpc._linear_quadratic import dlqr, finite_horizon_lqr
+from gpmpc.mpc._riccati import dlqr, finite_horizon_lqr
 from gpmpc.mpc.baselines import LQR
 from gpmpc.mpc.gp_mpc import NonlinearGPMPC
 from gpmpc.mpc.problem import Box, Problem, Tracking

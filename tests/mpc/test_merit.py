@@ -3,13 +3,17 @@
 import numpy as np
 import pytest
 
+from gpmpc.mpc._constraints import keep_rates, price_violations
 from gpmpc.mpc._linear_quadratic import (
     INCREMENTS,
+    Plan,
     QuadraticCost,
     References,
     StageRows,
+    Stages,
     evaluate_cost,
 )
+from gpmpc.mpc._linearization import LocalProblem
 from gpmpc.mpc._sqp import (
     PriceTerms,
     _between,
@@ -19,7 +23,6 @@ from gpmpc.mpc._sqp import (
     _smallest_cost,
     _update,
 )
-from gpmpc.mpc._stages import Plan, keep_rates, price_violations
 
 # stages, states, inputs, entries of s, rows
 H = 3
@@ -74,6 +77,18 @@ class Case:
         self.z = rng.normal(size=(H, R))
 
     @property
+    def local(self):
+        stages = Stages(
+            A=self.A,
+            B=np.zeros((H, P, M)),
+            c=np.zeros((H, P)),
+            next=self.after,
+            V=np.zeros((H, N, N)),
+        )
+        covariances = np.zeros((H + 1, N, N))
+        return LocalProblem(self.plan, stages, covariances, self.rows, self.cost)
+
+    @property
     def terms(self):
         return PriceTerms(self.references, self.prices, self.row_price)
 
@@ -116,9 +131,7 @@ def test_violated_rows_cost_their_price_and_hard_ones_the_given_one(
 def test_the_merit_is_cost_price_and_weighed_defects(squares, inputs, rng):
     for _ in range(10):
         case = Case(rng, squares, inputs)
-        found = _merit(
-            case.cost, case.terms, case.defect_prices, case.after, case.rows, case.plan
-        )
+        found = _merit(case.local, case.terms, case.defect_prices)
         defects = (
             np.abs(case.after - case.plan.states[1:]).sum(axis=0) @ case.defect_prices
         )
@@ -167,17 +180,7 @@ def test_what_a_step_promises_is_measured_against_what_the_plan_costs(
     for _ in range(5):
         case = Case(rng, squares, inputs)
         before = np.full(P, known)
-        forecast = _forecast_step(
-            case.cost,
-            case.terms,
-            before,
-            case.A,
-            case.after,
-            case.rows,
-            case.plan,
-            case.proposed,
-            case.z,
-        )
+        forecast = _forecast_step(case.local, case.terms, before, case.proposed, case.z)
         zero = References(*(np.zeros_like(part) for part in case.references))
         step = [b - a for a, b in zip(case.plan[:2], case.proposed[:2], strict=True)]
         missed = np.abs(case.after - case.plan.states[1:])

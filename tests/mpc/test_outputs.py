@@ -10,8 +10,8 @@ from gpmpc.gaussian import Gaussian
 from gpmpc.gp import Transitions, train
 from gpmpc.models import Affine, ResidualModel
 from gpmpc.mpc import ControlLoop, LeastSquares, Reference
-from gpmpc.mpc._prediction import FORMS, PredictionSettings
-from gpmpc.mpc._stages import COVARIANCES
+from gpmpc.mpc._linear_quadratic import COVARIANCES
+from gpmpc.mpc._linearization import FORMS, PredictionSettings
 from gpmpc.mpc.baselines import LQR, NMPC, StateFormMPC
 from gpmpc.mpc.gp_mpc import GPMPC
 from gpmpc.mpc.problem import Box, Inequality, Problem, Tracking

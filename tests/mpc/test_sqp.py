@@ -13,7 +13,9 @@ from gpmpc.exceptions import DataError
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior, backend
 from gpmpc.models import CasadiFunction, KnownModel
-from gpmpc.mpc import Decision, PredictionSettings, Reference, Timing
+from gpmpc.mpc import Decision, PredictionSettings, Reference, Timing, _sqp
+from gpmpc.mpc._guess import initial_guess, read_request
+from gpmpc.mpc._roll_out import roll_out
 from gpmpc.mpc.gp_mpc import GPMPC
 from gpmpc.mpc.problem import Box, Problem, Tracking
 from gpmpc.propagation import Linearization
@@ -397,13 +399,13 @@ def test_the_first_step_from_the_last_plan_needs_no_roll_out_and_ends_where_othe
     controller = GPMPC(
         quadrotor, Linearization(), problem, 10, HOVER, settings, iterations=20
     )
-    roll_out = controller.prediction.roll_out
     rolled = []
-    monkeypatch.setattr(
-        controller.prediction,
-        "roll_out",
-        lambda *given: rolled.append(1) or roll_out(*given),
-    )
+
+    def counted_roll_out(*arguments):
+        rolled.append(1)
+        return roll_out(*arguments)
+
+    monkeypatch.setattr(_sqp, "roll_out", counted_roll_out)
     reference = Reference(np.tile([0.5, 0.0] * 3, (11, 1)))
     moved = Gaussian.certain(np.array([-0.3, 0.2] * 3))
     last = controller.control(Gaussian.certain(np.zeros(6)), reference)
@@ -436,14 +438,12 @@ def test_inputs_that_lead_a_model_out_of_its_numbers_begin_a_plan_at_the_state()
     belief = Gaussian.certain(np.array([0.5]))
     reference = Reference(np.zeros((13, 1)))
     last = controller.control(belief, reference)
-    request = controller.prediction.read(
-        belief, reference, last, plan=np.full((12, 1), 50.0)
+    request = read_request(
+        controller.prediction, belief, reference, last, plan=np.full((12, 1), 50.0)
     )
     assert request.states is not None
-    assert (
-        controller.prediction.initial_guess(request).states.ravel().tolist()
-        == [0.5] * 13
-    )
+    guess = initial_guess(controller.prediction, request)
+    assert guess.states.ravel().tolist() == [0.5] * 13
     decision = controller.control(belief, reference, last, plan=np.full((12, 1), 50.0))
     assert decision.status is Status.SOLVED
     assert np.allclose(decision.inputs, last.inputs, atol=1e-4)

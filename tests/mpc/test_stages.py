@@ -8,7 +8,7 @@ from gpmpc.gaussian import Gaussian, square_root
 from gpmpc.gp import GPPosterior
 from gpmpc.models import Affine, Linearized, ResidualModel
 from gpmpc.mpc._linear_quadratic import Stages
-from gpmpc.mpc._stages import StageLinearizer
+from gpmpc.mpc._linearization import StageLinearizer
 from gpmpc.propagation import Linearization, MeanEquivalence, MomentMatching, Unscented
 from tests.mpc.small_models import double_integrator, pendulum_posterior
 

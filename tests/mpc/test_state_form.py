@@ -8,8 +8,8 @@ import pytest
 from gpmpc.exceptions import SettingError
 from gpmpc.gaussian import Gaussian
 from gpmpc.mpc import Reference
-from gpmpc.mpc._prediction import FORMS, PredictionSettings
-from gpmpc.mpc._stages import COVARIANCES
+from gpmpc.mpc._linear_quadratic import COVARIANCES
+from gpmpc.mpc._linearization import FORMS, PredictionSettings
 from gpmpc.mpc.baselines import StateFormMPC
 from gpmpc.mpc.gp_mpc import GPMPC
 from gpmpc.mpc.problem import Box, Problem, Tracking

@@ -19,8 +19,9 @@ from gpmpc.mpc._controller import (
     Timing,
     check_controller,
 )
-from gpmpc.mpc._linear_quadratic import Stages, optimal_feedback
-from gpmpc.mpc._stages import StageCosts, StageLinearizer
+from gpmpc.mpc._linear_quadratic import Stages
+from gpmpc.mpc._linearization import StageCosts, StageLinearizer
+from gpmpc.mpc._riccati import optimal_feedback
 from gpmpc.mpc.problem import Problem
 from gpmpc.propagation import Linearization
 from gpmpc.signals import signals_of

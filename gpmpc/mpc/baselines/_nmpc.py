@@ -24,6 +24,7 @@ from gpmpc._interrupts import interrupts_after
 from gpmpc.exceptions import check_number
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp.casadi_ import successor_function
+from gpmpc.mpc._constraints import ConstraintRows
 from gpmpc.mpc._controller import (
     FEASIBLE,
     Decision,
@@ -32,7 +33,7 @@ from gpmpc.mpc._controller import (
     Timing,
     check_controller,
 )
-from gpmpc.mpc._stages import ConstraintRows, Plan
+from gpmpc.mpc._linear_quadratic import Plan
 from gpmpc.mpc.problem import Problem
 from gpmpc.signals import signals_of
 from gpmpc.status import Status

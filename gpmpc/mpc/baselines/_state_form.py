@@ -25,6 +25,7 @@ import numpy as np
 from gpmpc._dynamics import DynamicsModel
 from gpmpc.exceptions import DataError, SettingError
 from gpmpc.gaussian import Gaussian
+from gpmpc.mpc._constraints import ConstraintRows
 from gpmpc.mpc._controller import (
     FEASIBLE,
     KEPT,
@@ -33,9 +34,14 @@ from gpmpc.mpc._controller import (
     Request,
     Timing,
 )
-from gpmpc.mpc._prediction import Prediction, PredictionModel, PredictionSettings
+from gpmpc.mpc._guess import initial_guess, read_request
+from gpmpc.mpc._linear_quadratic import Plan
+from gpmpc.mpc._linearization import (
+    LocalProblem,
+    PredictionModel,
+    PredictionSettings,
+)
 from gpmpc.mpc._sqp import FAILURES
-from gpmpc.mpc._stages import ConstraintRows, Plan
 from gpmpc.mpc.problem import Problem
 from gpmpc.propagation import Propagator
 from gpmpc.qp._cvxpy import STATUSES, TIGHT
@@ -98,7 +104,7 @@ class StateFormMPC:
         self, belief: Gaussian, reference: Reference, previous: Decision | None = None
     ) -> Decision:
         """Decides the input for one step; see ``GPMPC.control``."""
-        request = self.prediction.read(belief, reference, previous)
+        request = read_request(self.prediction, belief, reference, previous)
         start = perf_counter()
         if not request.finite:
             return request.failed_decision(Status.INVALID_MEASUREMENT)
@@ -126,7 +132,9 @@ class StateFormMPC:
         means, covariances = linearizer.moments(states, prediction.covariances)
         plan = Plan(states, inputs, prediction.covariances)
         planned = prediction._replace(plan=plan)
-        violation = self.prediction.violation(planned, request)
+        violation = planned.violation(
+            self.prediction.bounds, request.references.previous_input
+        )
         if status is Status.SOLVED and violation > KEPT:
             status = Status.SOFT_BOUND_MISSED
         return Decision(
@@ -139,17 +147,17 @@ class StateFormMPC:
             timing=timing,
             disturbance=request.disturbance,
             suboptimal=suboptimal,
-            stage_costs=self.prediction.stage_costs(planned, request),
+            stage_costs=planned.stage_costs(request.references),
             violation=violation,
         )
 
-    def _linearize(self, request: Request) -> Prediction:
+    def _linearize(self, request: Request) -> LocalProblem:
         """Returns the prediction along the first guess.
 
         Raises:
             DataError: It is not finite.
         """
-        guess = self.prediction.initial_guess(request)
+        guess = initial_guess(self.prediction, request)
         prediction = self.prediction.linearize(guess, request)
         if not all(np.isfinite(part).all() for part in prediction.stages):
             raise DataError("the stages are not finite")
@@ -281,7 +289,7 @@ class _StateFormProgram:
             rules.append(excess[np.flatnonzero(rows.applies[k])] <= 0.0)
         return price, rules
 
-    def set_parameters(self, prediction: Prediction, request: Request) -> None:
+    def set_parameters(self, prediction: LocalProblem, request: Request) -> None:
         """Gives all parameters their values of this step."""
         stages = prediction.stages
         for point in range(self._points):
