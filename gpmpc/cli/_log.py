@@ -15,7 +15,7 @@ from gpmpc.cli._settings import writing
 from gpmpc.cli._terminal import print_error
 from gpmpc.exceptions import DataError, GpmpcError, SettingError
 from gpmpc.recording import Run, layout, read_run, recover
-from gpmpc.recording._messages import LEVELS
+from gpmpc.recording._schema import LEVELS
 from gpmpc.studies._document import Document, Table, plain_text, terminal
 
 CUT = "unfinished or damaged; this is what could be read"

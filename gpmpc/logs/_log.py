@@ -42,7 +42,7 @@ class LogRun:
         return list(zip(self.begins, (*self.begins[1:], len(self)), strict=True))
 
     def starts(self, past: int, ahead: int, stride: int = 1) -> np.ndarray:
-        """Lists the rows with ``past`` rows before and ``ahead`` behind in their piece."""
+        """Lists rows with ``past`` rows before and ``ahead`` behind in their piece."""
         return np.concatenate(
             [np.arange(begin + past, end - ahead, stride) for begin, end in self.pieces]
         ).astype(int)

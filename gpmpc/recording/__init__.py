@@ -1,11 +1,33 @@
-"""Recordings of runs in MCAP files: writing, live view, reading, replaying, recovering."""
+"""Recordings of runs in MCAP files: writing, live view, reading, replaying, recovering.
+
+Written by ``_recorder`` into ``_sink``: a step is copied and encoded (``_encoding``) as
+messages (``_schema``), and drawn (``_scene``). Read by ``_read_run``: the bytes of the
+file are taken apart (``_frames``, ``_index``), what is whole is found behind damage
+(``_records``, ``_chunk_search``) and sorted (``_content``), then decoded
+(``_decoding``) to a ``Run`` (``_run``). ``_recovery`` writes what is whole to a new
+file.
+
+To record one more number of a step, add
+
+1. a field with a new number to ``message Step`` in ``_schema.PROTO``,
+2. its value to ``Encoder._step_message`` in ``_encoding``,
+3. an attribute to ``Run``, with its column in ``Run.columns``, in ``_run``,
+4. the line that reads it to ``_make_run`` in ``_read_run``.
+
+To record one more topic, add a message to ``_schema.PROTO`` and its topic to
+``TOPICS``, yield it in ``Encoder.encode``, and read it in
+``_decoding.decode_messages``. Files without the field or topic are still read: protobuf
+gives zeros, and no messages.
+"""
 
 from gpmpc.recording._bags import bag_flaws
 from gpmpc.recording._flaws import NO_CHECKSUMS, Flaw
 from gpmpc.recording._layout import layout
-from gpmpc.recording._messages import RecordedSystem
-from gpmpc.recording._reader import Run, read_run, recover, replay
+from gpmpc.recording._read_run import read_run
 from gpmpc.recording._recorder import McapRecorder
+from gpmpc.recording._recovery import recover
+from gpmpc.recording._run import Run, replay
+from gpmpc.recording._system import RecordedSystem
 from gpmpc.step import Step
 
 __all__ = [

@@ -1,4 +1,4 @@
-"""Names what can be wrong with a recording: what is missing, altered, or not vouched for."""
+"""Names what can be wrong with a recording: what is missing, altered, or unvouched."""
 
 from dataclasses import dataclass
 

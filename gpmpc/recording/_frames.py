@@ -57,7 +57,7 @@ _CLASSES: dict[int, Any] = {
 
 
 class Frame(NamedTuple):
-    """A record's bytes and where they stand."""
+    """The bytes of a record and the place where they stand."""
 
     kind: int  # opcode
     start: int  # of its head in the file or chunk
@@ -65,17 +65,17 @@ class Frame(NamedTuple):
 
     @property
     def content_start(self) -> int:
-        """Where the content stands."""
+        """The place of the content."""
         return self.start + HEAD.size
 
     @property
     def end(self) -> int:
-        """Where the next record stands."""
+        """The place of the next record."""
         return self.content_start + len(self.content)
 
 
 def read_frame(stream: BinaryIO | BytesIO, start: int, end: int) -> Frame | None:
-    """Reads the record at ``start``; none where it does not end at ``end`` at last."""
+    """Reads the record at ``start``; None where it does not end before ``end``."""
     stream.seek(start)
     head = stream.read(HEAD.size)
     if len(head) < HEAD.size:
@@ -106,7 +106,7 @@ def _check_attachment(content: bytes) -> None:
 
 
 def chunk_length(chunk: Chunk) -> int:
-    """Says how long the content of a chunk's record is, without what follows it."""
+    """Returns the length of the content of a chunk's record [bytes]."""
     return _CHUNK_HEAD.size + 4 + len(chunk.compression) + 8 + len(chunk.data)
 
 
@@ -138,7 +138,7 @@ def stored_checksum(content: bytes) -> int:
 
 
 def agrees(stored: int, computed: int) -> bool:
-    """Whether a checksum is right, or there is none."""
+    """Tells whether a checksum is right, or there is none."""
     return stored in (0, computed)
 
 
@@ -154,7 +154,7 @@ def frames(data: bytes) -> Iterator[Frame]:
         position = frame.end
 
 
-def topics_of_chunk(data: bytes, known: Container[int]) -> dict[int, str]:
+def topics_of_chunk(data: bytes, known_channels: Container[int]) -> dict[int, str]:
     """Reads the topics by channel out of a chunk and what follows it.
 
     A chunk is unfolded only where an index of messages behind it is of a channel that
@@ -166,7 +166,7 @@ def topics_of_chunk(data: bytes, known: Container[int]) -> dict[int, str]:
         for frame in records
         if frame.kind == Opcode.MESSAGE_INDEX
     }
-    if all(number in known for number in indexed):
+    if all(number in known_channels for number in indexed):
         return {}
     topics = {}
     for frame in records:

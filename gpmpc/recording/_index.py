@@ -12,7 +12,7 @@ from collections import Counter
 from dataclasses import dataclass, field
 from functools import cached_property
 from io import BytesIO
-from typing import BinaryIO
+from typing import BinaryIO, NamedTuple
 
 from mcap.opcode import Opcode
 from mcap.records import (
@@ -51,19 +51,31 @@ _KINDS = (
     Opcode.SUMMARY_OFFSET,
 )
 
-Place = tuple[int, int]  # where a record starts, and its length with its head
+
+class Place(NamedTuple):
+    """The place of a record in a file."""
+
+    start: int
+    length: int  # with its head
 
 
 @dataclass
-class Content:
-    """What was read of the data."""
+class Inventory:
+    """What is in the data of a file: as its index says, or as it was read."""
 
-    messages: Counter[int] = field(default_factory=Counter)  # by channel
     schemas: dict[int, Schema] = field(default_factory=dict)
     channels: dict[int, Channel] = field(default_factory=dict)
     chunks: list[Place] = field(default_factory=list)
     attachments: list[Place] = field(default_factory=list)
     metadata: list[Place] = field(default_factory=list)
+
+    def places(self) -> dict[str, list[Place]]:
+        """Returns the places of records by what they are."""
+        return {
+            "chunks": self.chunks,
+            "attachments": self.attachments,
+            "metadata": self.metadata,
+        }
 
 
 @dataclass
@@ -74,11 +86,7 @@ class Index:
     has_checksum: bool = False
     flaw: str = ""  # why it is not to be believed
     statistics: Statistics | None = None
-    schemas: dict[int, Schema] = field(default_factory=dict)
-    channels: dict[int, Channel] = field(default_factory=dict)
-    chunks: list[Place] = field(default_factory=list)
-    attachments: list[Place] = field(default_factory=list)
-    metadata: list[Place] = field(default_factory=list)
+    inventory: Inventory = field(default_factory=Inventory)
 
     @property
     def sound(self) -> bool:
@@ -88,55 +96,60 @@ class Index:
     @cached_property
     def _starts(self) -> list[int]:
         """Where the records of the data stand that it names, and their last one."""
-        records = [*self.chunks, *self.attachments, *self.metadata]
-        return sorted([start for start, _ in records] + [self.start - DATA_END_SIZE])
+        places = [p for places in self.inventory.places().values() for p in places]
+        return sorted([p.start for p in places] + [self.start - DATA_END_SIZE])
 
     def next_place(self, position: int) -> int:
-        """Where the next record of the data stands that it names, or their end."""
+        """Returns where the next record stands that it names, or the data's end."""
         following = bisect_left(self._starts, position)
         return self._starts[following] if following < len(self._starts) else self.start
 
-    def disagreements(self, content: Content) -> list[Flaw]:
-        """Says what it counts otherwise than the data hold."""
+    def disagreements(self, present: Inventory, messages: Counter[int]) -> list[Flaw]:
+        """Says what it counts otherwise than the data hold.
+
+        Args:
+            present: What was read of the data.
+            messages: How many were read, by channel.
+        """
         if self.flaw:
             return [Flaw(DAMAGED_INDEX, 1, f"its index is damaged: {self.flaw}")]
-        flaws = []
-        for name, (stated, present) in self._counts(content).items():
-            if stated != present:
-                text = f"its index counts {stated} {name}; there are {present}"
-                flaws.append(Flaw(WRONG_COUNT, 1, text))
-        for name in ("chunks", "attachments", "metadata"):
-            stated_places = getattr(self, name)
+        texts = self._other_counts(present, messages)
+        present_places = present.places()
+        for name, places in self.inventory.places().items():
             # A writer may leave a kind of index out.
-            if stated_places and sorted(stated_places) != getattr(content, name):
-                text = f"its index names other places of {name}"
-                flaws.append(Flaw(WRONG_COUNT, 1, text))
-        for name in ("schemas", "channels"):
-            stated_records = getattr(self, name)
-            if stated_records and stated_records != getattr(content, name):
-                text = f"its index repeats other {name}"
-                flaws.append(Flaw(WRONG_COUNT, 1, text))
-        return flaws
+            if places and sorted(places) != present_places[name]:
+                texts.append(f"its index names other places of {name}")
+        stated = self.inventory
+        if stated.schemas and stated.schemas != present.schemas:
+            texts.append("its index repeats other schemas")
+        if stated.channels and stated.channels != present.channels:
+            texts.append("its index repeats other channels")
+        return [Flaw(WRONG_COUNT, 1, text) for text in texts]
 
-    def _counts(self, content: Content) -> dict[str, tuple[int, int]]:
-        """Counts of the statistics and of the data, by what they count."""
+    def _other_counts(self, present: Inventory, messages: Counter[int]) -> list[str]:
+        """Names the counts of the statistics that the data do not have."""
         statistics = self.statistics
         if statistics is None:
-            return {}
+            return []
         counts = {
-            "messages": (statistics.message_count, content.messages.total()),
-            "schemas": (statistics.schema_count, len(content.schemas)),
-            "channels": (statistics.channel_count, len(content.channels)),
-            "chunks": (statistics.chunk_count, len(content.chunks)),
-            "attachments": (statistics.attachment_count, len(content.attachments)),
-            "metadata": (statistics.metadata_count, len(content.metadata)),
+            "messages": (statistics.message_count, messages.total()),
+            "schemas": (statistics.schema_count, len(present.schemas)),
+            "channels": (statistics.channel_count, len(present.channels)),
+            "chunks": (statistics.chunk_count, len(present.chunks)),
+            "attachments": (statistics.attachment_count, len(present.attachments)),
+            "metadata": (statistics.metadata_count, len(present.metadata)),
         }
-        by_channel = statistics.channel_message_counts
-        for channel in sorted(by_channel.keys() | content.messages.keys()):
-            known = content.channels.get(channel)
-            name = f"messages of {known.topic if known else f'channel {channel}'}"
-            counts[name] = by_channel.get(channel, 0), content.messages[channel]
-        return counts
+        stated_messages = statistics.channel_message_counts
+        for number in sorted(stated_messages.keys() | messages.keys()):
+            channel = present.channels.get(number)
+            topic = f"channel {number}" if channel is None else channel.topic
+            stated = stated_messages.get(number, 0)
+            counts[f"messages of {topic}"] = (stated, messages[number])
+        return [
+            f"its index counts {stated} {name}; there are {count}"
+            for name, (stated, count) in counts.items()
+            if stated != count
+        ]
 
 
 def read_index(file: BinaryIO, size: int) -> Index | None:
@@ -167,9 +180,8 @@ def read_index(file: BinaryIO, size: int) -> Index | None:
     except BROKEN:
         index.flaw = "a record of it cannot be read"
         return index
-    if any(stated != present for stated, present in offsets) or (
-        offsets_start and not start <= offsets_start <= footer_start
-    ):
+    is_outside = offsets_start and not start <= offsets_start <= footer_start
+    if is_outside or any(stated != present for stated, present in offsets):
         index.flaw = "its parts are not where it says"
     return index
 
@@ -184,29 +196,38 @@ def _read_records(index: Index, data: bytes) -> list[tuple[Place, Place]]:
         frame = read_frame(stream, position, len(data))
         if frame is None:
             raise RuntimeError("a record does not fit")
-        start, length = groups.get(frame.kind, (index.start + position, 0))
-        groups[frame.kind] = start, length + frame.end - frame.start
+        group = groups.get(frame.kind, Place(index.start + position, 0))
+        length = group.length + frame.end - frame.start
+        groups[frame.kind] = Place(group.start, length)
         position = frame.end
         if frame.kind in _KINDS:
             record = parsed(frame.kind, frame.content)
             if isinstance(record, SummaryOffset):
-                stated[record.group_opcode] = record.group_start, record.group_length
+                place = Place(record.group_start, record.group_length)
+                stated[record.group_opcode] = place
             else:
                 _add(index, record)
     # A writer may name a part that is empty.
-    return [(place, groups.get(kind, (place[0], 0))) for kind, place in stated.items()]
+    return [
+        (place, groups.get(kind, Place(place.start, 0)))
+        for kind, place in stated.items()
+    ]
 
 
 def _add(index: Index, record: McapRecord) -> None:
+    """Adds a record to the index."""
     if isinstance(record, Statistics):
         index.statistics = record
     elif isinstance(record, Schema):
-        index.schemas[record.id] = record
+        index.inventory.schemas[record.id] = record
     elif isinstance(record, Channel):
-        index.channels[record.id] = record
+        index.inventory.channels[record.id] = record
     elif isinstance(record, ChunkIndex):
-        index.chunks.append((record.chunk_start_offset, record.chunk_length))
+        place = Place(record.chunk_start_offset, record.chunk_length)
+        index.inventory.chunks.append(place)
     elif isinstance(record, AttachmentIndex):
-        index.attachments.append((record.offset, record.length))
+        place = Place(record.offset, record.length)
+        index.inventory.attachments.append(place)
     elif isinstance(record, MetadataIndex):
-        index.metadata.append((record.offset, record.length))
+        place = Place(record.offset, record.length)
+        index.inventory.metadata.append(place)

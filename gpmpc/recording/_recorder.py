@@ -1,4 +1,4 @@
-"""Records every step of a run in a file that explains itself and survives a crash, and shows it live.
+"""Records the steps of a run in a file that survives a crash, and shows them live.
 
 ``record`` copies the step; the copies that wait are serialised and written as one
 compressed chunk, of two seconds of the flight or so. A run killed at any moment loses
@@ -9,28 +9,31 @@ from is on the disk before the first step.
 import contextlib
 import json
 import math
-import os
 import platform
 import time
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import foxglove
-from filelock import lock_descriptor
 from foxglove.channels import LogChannel
 from foxglove.mcap import MCAPWriteOptions
 from foxglove.messages import Log, LogLevel, Timestamp
 
 from gpmpc._provenance import flattened, provenance
 from gpmpc.exceptions import RecordingError, check_number
+from gpmpc.recording._encoding import Encoder, StepCopy
 from gpmpc.recording._frames import LARGEST, topics_of_chunk
-from gpmpc.recording._messages import Encoder, RecordedSystem, StepCopy
-from gpmpc.recording._records import CHANNELS, CONFIG
 from gpmpc.recording._scene import WORLD, Scene
+from gpmpc.recording._schema import CHANNELS_METADATA, CONFIG_ATTACHMENT
+from gpmpc.recording._sink import Sink
+from gpmpc.recording._system import RecordedSystem
 from gpmpc.step import Step
 
-_INTERVAL = 1.0  # [s] of the clock after which the next step ends a chunk
+if TYPE_CHECKING:
+    from gpmpc.mpc import Judgement
+
+_LONGEST_WAIT = 1.0  # [s] of the clock after which the next step ends a chunk
 _SPAN = 2.0  # [s] of the flight in a chunk; a simulated one takes less than it lasts
 _LEAST = 8 * 1024  # numbers [bytes] for which a chunk is worth its own entries
 _PORT = 8765  # of the live view, if it is free
@@ -40,11 +43,13 @@ class McapRecorder:
     """Writes the steps of one run to an MCAP file; a context manager.
 
     Args:
-        path: The file, such as ``run.mcap``; its folder is made, an older file is replaced.
+        path: The file, such as ``run.mcap``; its folder is made, an older file is
+            replaced.
         system: What is recorded.
-        config: The resolved configuration, as YAML text or as plain data (written as JSON, which is YAML).
+        config: The resolved configuration, as YAML text or as plain data (written as
+            JSON, which is YAML).
         metadata: More to know of the run, such as its seed.
-        record_problems: Keep every step's quadratic program, so that it can be replayed.
+        record_problems: Keep the quadratic programs, so that they can be replayed.
         chunk_size: Numbers [bytes] that wait in memory at most, if more than one step
             does; what a killed run loses.
         live: Serve every step to viewers as well, at ``address``.
@@ -65,94 +70,64 @@ class McapRecorder:
         live: bool = False,
     ):
         check_number("chunk_size", chunk_size, least=1, whole=True, unit="[bytes]")
-        about = flattened(
-            provenance() | {"host": platform.node()} | dict(metadata or {})
-        )
-        about = {key: str(value) for key, value in about.items()}
-        about |= {
-            "state_names": " ".join(system.state_names),
-            "input_names": " ".join(system.input_names),
-        }
-        frames = {
-            "positions": WORLD,
-            "z axis": "down" if system.z_down else "up",
-            "display": "z axis up",
-        }
-        config = (
-            config
-            if isinstance(config, str)
-            else json.dumps(config, indent=2, default=str)
-        )
+        described = _describe(system, metadata or {})
 
         self.path = Path(path)
-        self.address: str | None = (
-            None  #: where a viewer finds the live view, such as ``ws://127.0.0.1:8765``
-        )
+        #: where a viewer finds the live view, such as ``ws://127.0.0.1:8765``
+        self.address: str | None = None
         self._n = len(system.state_names)
         self._m = len(system.input_names)
         self._record_problems = record_problems
         self._chunk_size = chunk_size
         self._encoder = Encoder(system)
         self._waiting: list[StepCopy] = []
-        self._bytes = 0
+        self._bytes = 0  # of the steps that wait
         self._steps = 0
         self._waiting_since = -math.inf  # when the chunk's first step was [s]
         self._topics: dict[int, str] = {}  # by channel, as far as they are written
         self._level = "healthy"  # of the last judgement
         self._error: str | None = None  # why no more steps are taken
+        self._last_saved = 0.0  # [s] of the clock
         self._closed = False
-        self._server = None
-        self._sink = _Sink(self.path)
-        self._context = context = (
-            foxglove.Context()
-        )  # its channels live as long as it does
-        # ``_end_chunk`` ends chunks, and each is written in one piece.
-        options: Any = {
-            "chunk_size": None,
-            "disable_seeking": True,
-            "compression_threads": 0,
-            "compression_level": 1,
-        }
-        options = MCAPWriteOptions(profile="gpmpc", **options)
-        self._writer = foxglove.open_mcap(
-            self._sink, context=context, writer_options=options
-        )
-        described = {
-            "run": about,
-            "units": system.field_units,
-            "frames": frames,
-            "pose": dict(system.pose),
-        }
+        self._server: Any = None
+        self._sink = Sink(self.path)
+        self._context = foxglove.Context()  # its channels live as long as it does
+        self._writer = _open_writer(self._sink, self._context)
+        self._write_description(described, config)
+        self._channels = self._encoder.channels(self._context)
+        self._log = LogChannel("/log", context=self._context)
+        self._scene = Scene(self._context, system)
+        if live:
+            self._server = _start_server(self.path.name, self._context)
+            self.address = f"ws://127.0.0.1:{self._server.port}"
+
+    def _write_description(
+        self,
+        described: Mapping[str, Mapping[str, str]],
+        config: Mapping[str, Any] | str,
+    ) -> None:
+        """Puts on the disk where the file comes from."""
         for name, pairs in described.items():
-            self._writer.write_metadata(name, pairs)
-        attached: Any = {
-            "media_type": "application/yaml",
-            "log_time": 0,
-            "create_time": 0,
-        }
-        self._writer.attach(name=CONFIG, data=config.encode(), **attached)
+            self._writer.write_metadata(name, dict(pairs))
+        if not isinstance(config, str):
+            config = json.dumps(config, indent=2, default=str)
+        self._writer.attach(
+            name=CONFIG_ATTACHMENT,
+            data=config.encode(),
+            media_type="application/yaml",
+            log_time=0,
+            create_time=0,
+        )
         self._writer.flush()
         self._save(sync=True)
-        self._channels = self._encoder.channels(context)
-        self._log = LogChannel("/log", context=context)
-        self._scene = Scene(context, system)
-        if live:
-            try:
-                self._server = foxglove.start_server(
-                    name=self.path.name, port=_PORT, context=context
-                )
-            except RuntimeError:  # the port is taken
-                self._server = foxglove.start_server(
-                    name=self.path.name, port=0, context=context
-                )
-            self.address = f"ws://127.0.0.1:{self._server.port}"
 
     def record(self, step: Step) -> None:
         """Takes a copy of a step.
 
         Raises:
             ShapeError: An array does not fit the names of states and inputs.
-            RecordingError: An earlier step could not be written, the recorder is closed, or a step is too large.
+            RecordingError: An earlier step could not be written, the recorder is
+                closed, or a step is too large.
         """
         if self._error is not None:
             raise RecordingError(self._error)
@@ -160,7 +135,8 @@ class McapRecorder:
         size = len(copy.data)
         if 4 * size > LARGEST:
             raise RecordingError(
-                f"{self.path}: a step of {size} bytes is too large; at most {LARGEST // 4}"
+                f"{self.path}: a step of {size} bytes is too large; at most "
+                f"{LARGEST // 4}"
             )
         if self._bytes == 0:
             self._waiting_since = step.time
@@ -172,7 +148,7 @@ class McapRecorder:
             self._end_chunk()
 
     def close(self, outcome: str = "complete") -> None:
-        """Writes what waits and finishes the file; how the run ended is kept as metadata.
+        """Writes what waits and finishes the file; ``outcome`` is kept as metadata.
 
         Raises:
             RecordingError: It could not be written; the file is left unfinished.
@@ -182,9 +158,8 @@ class McapRecorder:
         if self._error is not None:
             raise RecordingError(self._error)
         self._end_chunk()
-        self._writer.write_metadata(
-            "end", {"steps": str(self._steps), "outcome": outcome}
-        )
+        end = {"steps": str(self._steps), "outcome": outcome}
+        self._writer.write_metadata("end", end)
         self._writer.close()
         self._save(sync=True)
         self._closed = True
@@ -199,18 +174,17 @@ class McapRecorder:
         if error is None or kind is None:
             self.close()
             return
+        # A run that ended in an error has been recorded up to there.
         with contextlib.suppress(RecordingError):  # most likely the same error
-            self.close(
-                f"{kind.__name__}: {error}"
-            )  # a run that ended in an error has been recorded up to there
+            self.close(f"{kind.__name__}: {error}")
 
     def _is_chunk_full(self, step: Step) -> bool:
-        """Whether the steps that wait are to be written now."""
+        """Tells whether the steps that wait are to be written now."""
         if self._bytes > min(self._chunk_size, LARGEST // 8):
             return True
         if step.time - self._waiting_since >= _SPAN and self._bytes >= _LEAST:
             return True
-        return time.perf_counter() - self._last > _INTERVAL
+        return time.perf_counter() - self._last_saved > _LONGEST_WAIT
 
     def _end_chunk(self) -> None:
         """Writes what waits, and behind it the topics of channels that are new."""
@@ -220,115 +194,113 @@ class McapRecorder:
         if new_topics:
             self._topics |= new_topics
             pairs = {str(number): topic for number, topic in self._topics.items()}
-            self._writer.write_metadata(CHANNELS, pairs)
+            self._writer.write_metadata(CHANNELS_METADATA, pairs)
         self._save()
 
     def _serialise(self) -> None:
         """Logs the steps that wait: into the open chunk, and to viewers."""
         for copy in self._waiting:
             stamp = round(copy.step.time * 1e9)
-            for topic, message in self._encoder.encode(copy):
-                self._channels[topic].log(message, log_time=stamp)
+            for topic, encoded in self._encoder.encode(copy):
+                self._channels[topic].log(encoded, log_time=stamp)
             self._scene.log(copy, stamp)
             if copy.step.failed or not copy.status.solved:
-                self._log.log(_failure(copy, stamp), log_time=stamp)
+                self._log.log(_failure_log(copy, stamp), log_time=stamp)
             judgement = copy.step.judgement
             if judgement is not None and judgement.level != self._level:
                 self._level = judgement.level
-                self._log.log(_judgement(copy, stamp), log_time=stamp)
+                message = _judgement_log(copy.step, judgement, stamp)
+                self._log.log(message, log_time=stamp)
         self._steps += len(self._waiting)
         self._waiting.clear()
 
     def _save(self, sync: bool = False) -> None:
-        """Saves what was written: it is safe from now on if this process dies, with ``sync`` if the machine does."""
+        """Saves what was written, so that it is safe if this process dies.
+
+        With ``sync`` it is safe if the machine does.
+        """
         try:
             self._sink.save(sync)
         except OSError as error:
             self._end(f"the recording stopped and is unfinished: {error.strerror}")
             raise RecordingError(self._error) from error
         self._bytes = 0
-        self._last = time.perf_counter()
+        self._last_saved = time.perf_counter()
 
     def _end(self, reason: str) -> None:
+        """Takes no more steps, for a reason."""
         self._error = f"{self.path}: {reason}"
         if self._server is not None:
             self._server.stop()
-        os.close(self._sink.descriptor)  # other processes may write the file
+        self._sink.close()
 
 
-class _Sink:
-    """Collects what the library writes until it is saved, so that an error of the disk reaches the caller.
-
-    (A writer that is not closed adds a footer when it is collected: what is never saved does no harm.)
-    """
-
-    def __init__(self, path: Path):
-        self._data = bytearray()
-        self._position = 0
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            self.descriptor = os.open(
-                path, os.O_WRONLY | os.O_CREAT | getattr(os, "O_BINARY", 0), 0o666
-            )
-        except OSError as error:
-            raise RecordingError(
-                f"{path}: cannot be written: {error.strerror}"
-            ) from error
-        if not lock_descriptor(self.descriptor, blocking=False):
-            os.close(self.descriptor)
-            raise RecordingError(f"{path}: another process is recording to this file")
-        os.ftruncate(self.descriptor, 0)
-
-    @property
-    def unsaved(self) -> bytes:
-        """What was written since it was saved."""
-        return bytes(self._data)
-
-    def write(self, data: bytes | bytearray) -> int:
-        """Takes all of the data."""
-        self._data += data
-        self._position += len(data)
-        return len(data)
-
-    def seek(self, offset: int, whence: int = 0) -> int:
-        """Returns the position, which the library reads although it does not seek."""
-        return self._position
-
-    def flush(self) -> None:
-        """Does nothing: see ``save``."""
-
-    def save(self, sync: bool) -> None:
-        """Writes what was collected, and puts it on the disk if asked to."""
-        left = memoryview(self._data)
-        self._data = bytearray()
-        while left:
-            left = left[os.write(self.descriptor, left) :]
-        if sync:
-            os.fsync(self.descriptor)
+def _describe(
+    system: RecordedSystem, metadata: Mapping[str, Any]
+) -> dict[str, dict[str, str]]:
+    """Returns the metadata of a file by their names."""
+    run = provenance() | {"host": platform.node()} | dict(metadata)
+    about = {key: str(value) for key, value in flattened(run).items()}
+    about["state_names"] = " ".join(system.state_names)
+    about["input_names"] = " ".join(system.input_names)
+    return {
+        "run": about,
+        "units": system.field_units,
+        "frames": {
+            "positions": WORLD,
+            "z axis": "down" if system.z_down else "up",
+            "display": "z axis up",
+        },
+        "pose": dict(system.pose),
+    }
 
 
-def _failure(copy: StepCopy, nanoseconds: int) -> Log:
+def _open_writer(sink: Sink, context: foxglove.Context) -> Any:
+    """Opens a writer that ends a chunk when it is flushed, and writes it as a whole."""
+    options = MCAPWriteOptions(
+        profile="gpmpc",
+        chunk_size=None,
+        disable_seeking=True,
+        compression_threads=0,
+        compression_level=1,
+    )
+    output: Any = sink
+    return foxglove.open_mcap(output, context=context, writer_options=options)
+
+
+def _start_server(name: str, context: foxglove.Context) -> Any:
+    """Starts the live view at its usual port, or at any other."""
+    try:
+        return foxglove.start_server(name=name, port=_PORT, context=context)
+    except RuntimeError:  # the port is taken
+        return foxglove.start_server(name=name, port=0, context=context)
+
+
+def _failure_log(copy: StepCopy, nanoseconds: int) -> Log:
     """Says what went wrong at a step."""
     status = copy.status
     failed = copy.step.failed
     policy = "; the policy for failures chose the input" if failed else ""
     return Log(
-        timestamp=Timestamp(sec=nanoseconds // 10**9, nsec=nanoseconds % 10**9),
+        timestamp=_timestamp(nanoseconds),
         level=LogLevel.Error if failed else LogLevel.Warning,
         name="gpmpc",
         message=f"step {copy.step.k}: {status.name}: {status.advice}{policy}",
     )
 
 
-def _judgement(copy: StepCopy, nanoseconds: int) -> Log:
+def _judgement_log(step: Step, judgement: "Judgement", nanoseconds: int) -> Log:
     """Says that a flight is healthy, suspicious or lost from a step on, and why."""
-    judgement: Any = copy.step.judgement
     return Log(
-        timestamp=Timestamp(sec=nanoseconds // 10**9, nsec=nanoseconds % 10**9),
+        timestamp=_timestamp(nanoseconds),
         level=_LOG_LEVELS[judgement.level],
         name="gpmpc",
-        message=f"from step {copy.step.k} on {judgement}",
+        message=f"from step {step.k} on {judgement}",
     )
+
+
+def _timestamp(nanoseconds: int) -> Timestamp:
+    return Timestamp(sec=nanoseconds // 10**9, nsec=nanoseconds % 10**9)
 
 
 _LOG_LEVELS = {

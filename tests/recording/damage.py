@@ -13,7 +13,7 @@ import numpy as np
 import zstandard
 from mcap.writer import Writer
 
-from gpmpc.recording import _messages
+from gpmpc.recording import _schema
 from tests.recording import runs
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -292,8 +292,8 @@ def renumber(data, rng):
 
 def edit_message(data, rng):
     """Fields of a message that no longer belong together."""
-    classes = _messages.message_classes(
-        _messages.descriptor(runs.STATES, runs.INPUTS, "bytes")
+    classes = _schema.message_classes(
+        _schema.descriptor(runs.STATES, runs.INPUTS, arrays_as_bytes=True)
     )
 
     def change(found):
@@ -460,7 +460,7 @@ def bomb(data, rng, largest=2**31):
 
 def well_formed_bomb(data, rng):
     """Plans and quadratic programs of zeros: every number in its place, and far too many of them."""
-    classes = _messages.message_classes(_messages.descriptor(runs.STATES, runs.INPUTS))
+    classes = _schema.message_classes(_schema.descriptor(runs.STATES, runs.INPUTS))
     n = len(runs.STATES)
     found = section(data)
     kind = rng.integers(3)

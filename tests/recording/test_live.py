@@ -13,7 +13,7 @@ import foxglove
 import numpy as np
 import pytest
 
-from gpmpc.recording import _messages, read_run
+from gpmpc.recording import _schema, read_run
 from tests.recording import runs
 
 
@@ -94,7 +94,7 @@ def recorder(tmp_path):
 
 
 def test_a_viewer_receives_every_step_at_once_and_the_file_holds_it_as_well(recorder):
-    classes = _messages.message_classes(_messages.descriptor(runs.STATES, runs.INPUTS))
+    classes = _schema.message_classes(_schema.descriptor(runs.STATES, runs.INPUTS))
     steps = []
     seen = {"/step": [], "/plan/tube": []}
     rng = np.random.default_rng(0)

@@ -12,7 +12,13 @@ import pytest
 import zstandard
 
 from gpmpc.exceptions import RecordingError
-from gpmpc.recording import RecordedSystem, _recorder, read_run, recover
+from gpmpc.recording import (
+    McapRecorder,
+    RecordedSystem,
+    _recorder,
+    read_run,
+    recover,
+)
 from tests.recording import damage, runs, study
 
 STEPS = 200  # of the flight
@@ -118,7 +124,7 @@ def test_a_chunk_of_short_steps_is_worth_its_entries_in_the_index(tmp_path):
     rng = np.random.default_rng(0)
     step = runs.make_step(0, rng, horizon=1, qp=False)
     system = RecordedSystem(runs.STATES, runs.INPUTS, time_step=10.0)
-    with _recorder.McapRecorder(path, system) as recorder:
+    with McapRecorder(path, system) as recorder:
         for k in range(40):
             recorder.record(replace(step, k=k, time=10.0 * k))
     chunks = chunk_spans(path.read_bytes())

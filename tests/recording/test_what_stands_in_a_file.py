@@ -10,10 +10,12 @@ from mcap_protobuf.decoder import DecoderFactory
 
 from gpmpc.exceptions import RecordingError, SettingError, ShapeError
 from gpmpc.recording import (
+    McapRecorder,
     RecordedSystem,
-    _reader,
+    _decoding,
     _recorder,
     _records,
+    _sink,
     layout,
     read_run,
     recover,
@@ -179,7 +181,7 @@ def test_steps_are_written_when_enough_wait_or_enough_time_has_passed(
                 found.append(len(read_run(recorder.path).times))
             assert found == written
     monkeypatch.setattr(_recorder.time, "perf_counter", lambda: next(clock))
-    monkeypatch.setattr(_recorder, "_INTERVAL", 1.5)
+    monkeypatch.setattr(_recorder, "_LONGEST_WAIT", 1.5)
     with runs.recorder(tmp_path / "timed.mcap", chunk_size=10**9) as recorder:
         found = []
         for step in steps:
@@ -193,9 +195,7 @@ def test_the_beginning_and_the_end_of_a_file_are_flushed_to_the_disk(
 ):
     path = tmp_path / "run.mcap"
     sizes = []
-    monkeypatch.setattr(
-        _recorder.os, "fsync", lambda _: sizes.append(path.stat().st_size)
-    )
+    monkeypatch.setattr(_sink.os, "fsync", lambda _: sizes.append(path.stat().st_size))
     with runs.recorder(path, chunk_size=1) as recorder:
         assert sizes == [path.stat().st_size]
         recorder.record(runs.make_step(0, np.random.default_rng(0), qp=False))
@@ -270,7 +270,7 @@ def test_a_layout_of_one_state_has_no_tab_for_what_is_not_there(tmp_path):
         step, reference=np.zeros(1), state=np.zeros(1), measured=np.zeros(1), input=np.zeros(1), decision=None,
         innovation=np.zeros(1), belief_covariance=np.eye(1), status=Status.SOLVED,
     )  # fmt: skip
-    with _recorder.McapRecorder(path, system) as recorder:
+    with McapRecorder(path, system) as recorder:
         recorder.record(part)
     text = layout(read_run(path))
     assert '"title": "States"' in text
@@ -295,9 +295,9 @@ def test_what_a_file_may_unfold_to_is_counted_to_the_byte(path, monkeypatch):
     rows, (H, n, m) = 2, (5, 6, 3)
     needed = 8 * rows * (H + 1) * (n + n * n + m)  # of means, covariances and inputs
     monkeypatch.undo()
-    monkeypatch.setattr(_reader, "room", lambda _: needed)
+    monkeypatch.setattr(_decoding, "room", lambda _: needed)
     assert read_run(path).plan_means.shape == (rows, H + 1, n)
-    monkeypatch.setattr(_reader, "room", lambda _: needed - 1)
+    monkeypatch.setattr(_decoding, "room", lambda _: needed - 1)
     with pytest.raises(
         RecordingError,
         match="a plan of 5 stages would make arrays of 0 MB with the others",
