@@ -122,8 +122,8 @@ class Scene:
         )
         self._path.log(path, log_time=moment.nanoseconds)
         points = _selected(means, self._position)
-        rows = _selected(covariances.mT, self._position)
-        spatial = _selected(rows.mT, self._position)  # (H + 1, 3, 3)
+        columns = _selected(covariances, self._position)
+        spatial = _selected(columns.mT, self._position)  # (H + 1, 3, 3)
         entity = fg.SceneEntity(
             id="plan",
             spheres=_tube(points, spatial),
