@@ -1,12 +1,9 @@
-"""Gaussian process models of dynamics: data, training, and the frozen posterior that predicts."""
+"""Gaussian process models of dynamics: data, training, and posteriors that predict."""
 
 from gpmpc.gp._backend import backend
-from gpmpc.gp._gpytorch import (
-    KernelPosterior,
-    exact_inference,
-    from_gpytorch,
-    to_gpytorch,
-)
+from gpmpc.gp._gpytorch import from_gpytorch, to_gpytorch
+from gpmpc.gp._gpytorch_checks import exact_inference
+from gpmpc.gp._gpytorch_posteriors import KernelPosterior
 from gpmpc.gp._kernel import Hyperparameters
 from gpmpc.gp._online import (
     SlidingWindow,

@@ -1,8 +1,8 @@
-"""The choice between compiled loops and torch, in which the closed forms of a posterior both exist.
+"""The choice between compiled loops and torch for the closed forms of a posterior.
 
-The loops of ``gpmpc._kernels`` are many times faster, on one thread, for float64 numbers in host memory. Torch
-evaluates everything else: other devices and types, and whatever autograd or a function transform follows. The two give
-the same numbers.
+The loops of ``gpmpc._kernels`` are many times faster, on one thread, for float64
+numbers in host memory. Torch evaluates everything else: other devices and types, and
+whatever autograd or a function transform follows. The two give the same numbers.
 """
 
 from collections.abc import Iterator
@@ -24,10 +24,13 @@ _chosen: ContextVar[_Backend] = ContextVar("backend", default="auto")
 
 @contextmanager
 def backend(choice: _Backend) -> Iterator[None]:
-    """Forces ``"compiled"`` or ``"torch"`` within a ``with`` block; ``"auto"`` leaves the choice to each call.
+    """Forces ``"compiled"`` or ``"torch"`` within a ``with`` block.
+
+    ``"auto"`` leaves the choice to each call.
 
     Raises:
-        SettingError: Another word; within the block, ``"compiled"`` where only torch can evaluate.
+        SettingError: Another word; within the block, ``"compiled"`` where only torch
+            can evaluate.
     """
     check_choice("backend", choice, get_args(_Backend))
     token = _chosen.set(choice)
@@ -38,7 +41,11 @@ def backend(choice: _Backend) -> Iterator[None]:
 
 
 def host_arrays(*tensors: Tensor) -> list[Array] | None:
-    """Returns the tensors as arrays for the compiled loops; None where torch has to evaluate, or is to."""
+    """Returns the tensors as arrays for the compiled loops; None for torch.
+
+    Raises:
+        SettingError: The backend is ``"compiled"``, and only torch can evaluate.
+    """
     choice = _chosen.get()
     if choice == "torch":
         return None
@@ -46,6 +53,9 @@ def host_arrays(*tensors: Tensor) -> list[Array] | None:
     if arrays is not None and all(tensor.dtype is torch.float64 for tensor in tensors):
         return arrays
     if choice == "compiled":
-        rule = "the compiled loops take float64 in host memory that is no part of a graph or a function transform"
-        raise SettingError("backend", rule)
+        raise SettingError(
+            "backend",
+            "the compiled loops take float64 in host memory that is no part of a graph "
+            "or a function transform",
+        )
     return None

@@ -1,12 +1,17 @@
-"""The negative log marginal likelihood of one SE-ARD GP and its gradient (Rasmussen and Williams, 2006, chapter 5).
+"""The negative log marginal likelihood of one SE-ARD GP, and its gradient.
 
-Over theta = (log l (d), log sf, log(sf / sn)), with eqs. (2.30) and (5.9) (Cao, Lai and Alam, 2017, eq. (9)):
+Rasmussen and Williams (2006), chapter 5.
 
-    L(theta)      = 1/2 y' K^-1 y + 1/2 log|K| + N/2 log(2 pi),              K = sf2 E + sn2 I
-    dL/dtheta     = 1/2 tr(W dK/dtheta),                                     W = K^-1 - (K^-1 y)(K^-1 y)'
-    dL/dlog l_d   = 1/2 sum_ij M_ij (z_id - z_jd)^2 = sum_{i<j} M_ij (z_id - z_jd)^2,     M = W o sf2 E,  z = x / l
+Over theta = (log l (d), log sf, log(sf / sn)), with eqs. (2.30) and (5.9) (Cao, Lai and
+Alam, 2017, eq. (9)):
 
-One Cholesky factorisation and no (N, N, d) intermediate: a quarter of the time of GPyTorch's automatic differentiation.
+    L(theta)    = 1/2 y' K^-1 y + 1/2 log|K| + N/2 log(2 pi),   K = sf2 E + sn2 I
+    dL/dtheta   = 1/2 tr(W dK/dtheta),         W = K^-1 - (K^-1 y)(K^-1 y)'
+    dL/dlog l_d = 1/2 sum_ij M_ij (z_id - z_jd)^2
+                = sum_{i<j} M_ij (z_id - z_jd)^2,     M = W o sf2 E,  z = x / l
+
+One Cholesky factorisation and no (N, N, d) intermediate: a quarter of the time of
+GPyTorch's automatic differentiation.
 """
 
 import numpy as np
@@ -14,17 +19,21 @@ from scipy.linalg import blas, lapack
 
 from gpmpc.gp._kernel import centred
 
-FAILED = 1e12  # objective where the kernel matrix is not positive definite: finite, so that a line search steps back
+# objective where the kernel matrix is not positive definite: finite, so that a line
+# search steps back
+FAILED = 1e12
 
 _IN_PLACE = 400  # points from which one array for everything is the faster way as well
 _BLOCK = 256  # columns at a time: a block and its mirror image fit the cache
 
 
 class NegativeLogMarginalLikelihood:
-    """Evaluates the closed form: value and gradient (d + 2,) at theta; infinite where K is not positive definite.
+    """Evaluates value and gradient (d + 2,) in closed form.
 
-    The features are (N, d), the targets (N,). ``in_place`` keeps everything in one N x N array, 200 MB at N = 5000; by
-    default from 400 points on, where that is faster. One call at a time: the array is this object's.
+    The value is infinite where K is not positive definite. The features are (N, d), the
+    targets (N,). ``in_place`` keeps everything in one N x N array, 200 MB at N = 5000;
+    by default from 400 points on, where that is faster. One call at a time: the array
+    is this object's.
     """
 
     def __init__(
@@ -37,21 +46,21 @@ class NegativeLogMarginalLikelihood:
         self._square = np.empty((size, size), order="F") if in_place else None
 
     def __call__(self, theta: np.ndarray) -> tuple[float, np.ndarray]:
-        """Value and gradient (d + 2,)."""
+        """Computes value and gradient (d + 2,) at theta."""
         d = self._x.shape[1]
         z = self._x * np.exp(-theta[:d])
         sf2 = float(np.exp(2 * theta[d]))
         sn2 = float(np.exp(2 * (theta[d] - theta[d + 1])))
-        found = (
-            self._small(z, sf2, sn2)
-            if self._square is None
-            else self._large(self._square, z, sf2, sn2)
-        )
-        return (np.inf, np.zeros_like(theta)) if found is None else found
+        evaluate = self._small if self._square is None else self._large
+        result = evaluate(z, sf2, sn2)
+        if result is None:
+            return np.inf, np.zeros_like(theta)
+        return result
 
     def _small(
         self, z: np.ndarray, sf2: float, sn2: float
     ) -> tuple[float, np.ndarray] | None:
+        """Uses an array for each matrix; None where K is not positive definite."""
         size, d = z.shape
         half_squares = -np.einsum("id,id->i", z, z) / 2
         signal = z @ z.T
@@ -65,26 +74,28 @@ class NegativeLogMarginalLikelihood:
         if info:
             return None
         weights, value = self._weights_and_value(factor)
-        inverse, _ = lapack.dlauum(
-            _triangular_inverse(factor), lower=1, overwrite_c=1
-        )  # K^-1 = L^-T L^-1
-        W = blas.dsyr(
-            -1.0, weights, a=inverse, lower=1, overwrite_a=1
-        ).T  # upper triangle; zeros below
+        # K^-1 = L^-T L^-1
+        inverse, _ = lapack.dlauum(_triangular_inverse(factor), lower=1, overwrite_c=1)
+        # The upper triangle, with zeros below.
+        W = blas.dsyr(-1.0, weights, a=inverse, lower=1, overwrite_a=1).T
         trace = W.trace()
         M = np.multiply(W, signal, out=W)
         gradient = np.empty(d + 2)
-        gradient[:d] = (M.sum(axis=0) + M.sum(axis=1)) @ (z * z) - 2 * np.einsum(
-            "id,id->d", M @ z, z
-        )
+        sums = M.sum(axis=0) + M.sum(axis=1)
+        gradient[:d] = sums @ (z * z) - 2 * np.einsum("id,id->d", M @ z, z)
         gradient[d] = 2 * M.sum() - sf2 * trace + sn2 * trace
         gradient[d + 1] = -sn2 * trace
         return value, gradient
 
     def _large(
-        self, square: np.ndarray, z: np.ndarray, sf2: float, sn2: float
+        self, z: np.ndarray, sf2: float, sn2: float
     ) -> tuple[float, np.ndarray] | None:
-        """Uses one array: above its diagonal sf2 E, which stays; below it K, then L, then K^-1."""
+        """Uses one array; None where K is not positive definite.
+
+        Above its diagonal stands sf2 E, which stays; below it K, then L, then K^-1.
+        """
+        square = self._square
+        assert square is not None
         _fill(square, z, sf2, sn2)
         # LAPACK leaves the other half alone: clean = 0.
         factor, info = lapack.dpotrf(square, lower=1, clean=0, overwrite_a=1)
@@ -96,11 +107,12 @@ class NegativeLogMarginalLikelihood:
             return None
         trace = inverse.trace() - weights @ weights  # of W
         by_lengthscale, total = _sums(square, z, weights)
-        return value, np.append(
-            by_lengthscale, [2 * total + (sf2 + sn2) * trace, -sn2 * trace]
-        )
+        by_signal = 2 * total + (sf2 + sn2) * trace
+        by_ratio = -sn2 * trace
+        return value, np.append(by_lengthscale, [by_signal, by_ratio])
 
     def _weights_and_value(self, factor: np.ndarray) -> tuple[np.ndarray, float]:
+        """Computes K^-1 y (N,) and the value from the factor of K."""
         weights, _ = lapack.dpotrs(factor, self._y, lower=1)
         value = (
             self._y @ weights / 2
@@ -128,7 +140,11 @@ def _fill(square: np.ndarray, z: np.ndarray, sf2: float, sn2: float) -> None:
 def _sums(
     square: np.ndarray, z: np.ndarray, weights: np.ndarray
 ) -> tuple[np.ndarray, float]:
-    """sum_{i>j} M_ij (z_id - z_jd)^2 (d,), and sum_{i>j} M_ij, over block columns and the rows that mirror them."""
+    """Sums over block columns and the rows that mirror them.
+
+    Returns:
+        sum_{i>j} M_ij (z_id - z_jd)^2 (d,), and sum_{i>j} M_ij.
+    """
     by_lengthscale = np.zeros(z.shape[1])
     total = 0.0
     for begin in range(0, len(z), _BLOCK):
@@ -147,7 +163,10 @@ def _sums(
 
 
 def _triangular_inverse(lower: np.ndarray) -> np.ndarray:
-    """The inverse of a lower triangular matrix (N, N), by halves: twice as fast as LAPACK's dtrtri at N = 189."""
+    """Inverts a lower triangular matrix (N, N) by halves.
+
+    That is twice as fast as LAPACK's dtrtri at N = 189.
+    """
     size = len(lower)
     if size <= 64:
         return lapack.dtrtri(lower, lower=1)[0]
@@ -155,7 +174,6 @@ def _triangular_inverse(lower: np.ndarray) -> np.ndarray:
     inverse = np.zeros((size, size), order="F")
     inverse[:half, :half] = _triangular_inverse(lower[:half, :half])
     inverse[half:, half:] = _triangular_inverse(lower[half:, half:])
-    inverse[half:, :half] = -inverse[half:, half:] @ (
-        lower[half:, :half] @ inverse[:half, :half]
-    )
+    corner = lower[half:, :half] @ inverse[:half, :half]
+    inverse[half:, :half] = -inverse[half:, half:] @ corner
     return inverse

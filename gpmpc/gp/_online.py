@@ -1,18 +1,23 @@
-r"""Points that come and go while a controller runs, in O(N^2) each: K + sn2 I is not factorised anew.
+r"""Adds and removes points while a controller runs, in O(N^2) each.
 
-Adding points extends the Cholesky factor by rows, L21' = L^-1 K(X, X*), L22 L22' = K(X*, X*) + sn2 I - L21 L21';
-removing one changes only the block below it (``gpmpc._kernels._window``). The weights are solved for from the factor
-each time, so that no error is carried along with them.
+K + sn2 I is not factorised anew.
 
-The least informative point is the one whose removal changes the posterior over functions least, in Kullback-Leibler
-divergence. With and without y_i the two posteriors differ by one factor of the likelihood, which depends on f(x~_i)
-alone; so the leave-one-out formulas (Rasmussen and Williams, 2006, eq. (5.12)) give their divergence from
-P = (K + sn2 I)^-1 and beta = P (y - offset):
+Adding points extends the Cholesky factor by rows, L21' = L^-1 K(X, X*), L22 L22' =
+K(X*, X*) + sn2 I - L21 L21'; removing one changes only the block below it
+(``gpmpc._kernels._window``). The weights are solved for from the factor each time, so
+that no error is carried along with them.
 
-    KL_i = 1/2 sum_a [ e_ai - 1 - log e_ai + beta_ai^2 (1 / P_aii - sn2_a) ],     e_ai = sn2_a P_aii
+The least informative point is the one whose removal changes the posterior over
+functions least, in Kullback-Leibler divergence. With and without y_i the two posteriors
+differ by one factor of the likelihood, which depends on f(x~_i) alone; so the
+leave-one-out formulas (Rasmussen and Williams, 2006, eq. (5.12)) give their divergence
+from P = (K + sn2 I)^-1 and beta = P (y - offset):
 
-(e is the variance of f(x~_i) with y_i over that without.) Of the pseudo-observations of a sparse model, whose noise is
-correlated, only the variances are counted.
+    KL_i = 1/2 sum_a [ e_ai - 1 - log e_ai + beta_ai^2 (1 / P_aii - sn2_a) ]
+    e_ai = sn2_a P_aii
+
+(e is the variance of f(x~_i) with y_i over that without.) Of the pseudo-observations of
+a sparse model, whose noise is correlated, only the variances are counted.
 """
 
 import logging
@@ -39,15 +44,20 @@ from gpmpc.gp._posterior import GPPosterior
 from gpmpc.gp._transitions import Transitions, check_transitions
 
 _log = logging.getLogger(__name__)
-_MANY = 0.2  # where more than this part of the points is removed, one factorisation costs less than the updates
+# where more than this part of the points is removed, one factorisation costs less than
+# the updates
+_MANY = 0.2
 
 
 def append_transitions(posterior: GPPosterior, transitions: Transitions) -> GPPosterior:
-    """Appends transitions to a posterior's data; the hyperparameters stay (``Trainer.refit`` trains them).
+    """Appends transitions to a posterior's data.
+
+    The hyperparameters stay; ``Trainer.refit`` trains them.
 
     Raises:
         ShapeError: The transitions have other dimensions.
-        UnsupportedModel: The GPs predict values, which transitions do not hold: ``append_points``.
+        UnsupportedModel: The GPs predict values, which transitions do not hold: use
+            ``append_points``.
         SettingError: The larger kernel matrix is not positive definite in this dtype.
     """
     targets = targets_of(posterior, transitions)
@@ -57,57 +67,81 @@ def append_transitions(posterior: GPPosterior, transitions: Transitions) -> GPPo
 def append_points(
     posterior: GPPosterior, features: Tensor, targets: Tensor
 ) -> GPPosterior:
-    """Appends points x~ = (x, u) (p, n + m) with targets (p, k) to a posterior's data."""
+    """Appends points to a posterior's data.
+
+    Args:
+        posterior: The posterior.
+        features: x~ = (x, u) (p, n + m).
+        targets: (p, k).
+
+    Raises:
+        ShapeError: The points have other dimensions.
+        SettingError: The larger kernel matrix is not positive definite in this dtype.
+        DataError: An entry is not finite.
+    """
+    features, targets = _checked_points(posterior, features, targets)
+    size = len(posterior)
+    p = len(features)
+    signal_variance = posterior.signal_variance
+    lengthscales = posterior.lengthscales
+    cross = kernel_matrix(posterior.features, features, lengthscales, signal_variance)
+    corner = kernel_matrix(features, features, lengthscales, signal_variance)
+
+    # One pass over the factor serves the new rows and the first half of the weights.
+    old_residuals = (posterior.targets - posterior.offset).mT[..., None]  # (k, N, 1)
+    right = torch.cat([cross, old_residuals], dim=-1)
+    right = torch.linalg.solve_triangular(posterior.cholesky, right, upper=False)
+    L21 = right[..., :p].mT
+    half_old = right[..., p:]
+    corner = corner - L21 @ L21.mT
+    corner.diagonal(dim1=-2, dim2=-1).add_(posterior.noise_variance[:, None])
+    L22, info = torch.linalg.cholesky_ex(corner)
+    check_positive_definite(info, signal_variance, posterior.noise_variance)
+    cholesky = posterior.cholesky.new_empty(posterior.output_dim, size + p, size + p)
+    cholesky[:, :size, :size] = posterior.cholesky
+    cholesky[:, :size, size:] = 0
+    cholesky[:, size:, :size] = L21
+    cholesky[:, size:, size:] = L22
+
+    new_residuals = (targets - posterior.offset).mT[..., None]
+    half_new = torch.linalg.solve_triangular(
+        L22, new_residuals - L21 @ half_old, upper=False
+    )
+    half = torch.cat([half_old, half_new], dim=-2)
+    weights = torch.linalg.solve_triangular(cholesky.mT, half, upper=True)[..., 0]
+    return replace(
+        posterior,
+        features=torch.cat([posterior.features, features]),
+        targets=torch.cat([posterior.targets, targets]),
+        cholesky=cholesky,
+        weights=weights,
+    )
+
+
+def _checked_points(
+    posterior: GPPosterior, features: Tensor, targets: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Converts points to the posterior's type, and checks that they belong to it."""
     check_tensors(features=features, targets=targets)
     for key, value in (("features", features), ("targets", targets)):
         if value.is_complex():
             raise SettingError(key, f"must be real numbers; got {value.dtype}")
     features = features.to(posterior.features)
     targets = targets.to(posterior.features)
-    given = {"features": features, "targets": targets}
-    check_posterior(given, posterior.input_dim, posterior.predicts, posterior.dtype)
-    if (got := (features.shape[1], targets.shape[1])) != (
-        posterior.features.shape[1],
-        posterior.output_dim,
-    ):
+    check_posterior(
+        {"features": features, "targets": targets},
+        posterior.input_dim,
+        posterior.predicts,
+        posterior.dtype,
+    )
+    d = features.shape[1]
+    k = targets.shape[1]
+    if d != posterior.features.shape[1] or k != posterior.output_dim:
         raise ShapeError(
-            f"points must have features and targets like those of {posterior}; got {got[0]} and {got[1]}"
+            f"points must have features and targets like those of {posterior}; "
+            f"got {d} and {k}"
         )
-    size = len(posterior)
-    p = len(features)
-    scales = posterior.lengthscales
-    sf2 = posterior.signal_variance
-    old_targets = (posterior.targets - posterior.offset).mT[..., None]  # (k, N, 1)
-    new_targets = (targets - posterior.offset).mT[..., None]
-    # One pass over the factor serves the new rows and the first half of the weights.
-    right = torch.cat(
-        [kernel_matrix(posterior.features, features, scales, sf2), old_targets], dim=-1
-    )
-    right = torch.linalg.solve_triangular(posterior.cholesky, right, upper=False)
-    L21 = right[..., :p].mT
-    w1 = right[..., p:]
-    corner = kernel_matrix(features, features, scales, sf2) - L21 @ L21.mT
-    corner.diagonal(dim1=-2, dim2=-1).add_(posterior.noise_variance[:, None])
-    L22, info = torch.linalg.cholesky_ex(corner)
-    check_positive_definite(info, sf2, posterior.noise_variance)
-    cholesky = posterior.cholesky.new_empty(posterior.output_dim, size + p, size + p)
-    cholesky[:, :size, :size] = posterior.cholesky
-    cholesky[:, :size, size:] = 0
-    cholesky[:, size:, :size] = L21
-    cholesky[:, size:, size:] = L22
-    w2 = torch.linalg.solve_triangular(L22, new_targets - L21 @ w1, upper=False)
-    weights = torch.linalg.solve_triangular(
-        cholesky.mT, torch.cat([w1, w2], dim=-2), upper=True
-    )[..., 0]
-    features = torch.cat([posterior.features, features])
-    targets = torch.cat([posterior.targets, targets])
-    return replace(
-        posterior,
-        features=features,
-        targets=targets,
-        cholesky=cholesky,
-        weights=weights,
-    )
+    return features, targets
 
 
 def remove_points(
@@ -120,67 +154,79 @@ def remove_points(
         DataError: No point is left.
     """
     size = len(posterior)
-    removed = _indices(indices, size)
+    removed = _checked_indices(indices, size)
     if not removed:
         return posterior
-    kept = torch.tensor(
+    remaining = torch.tensor(
         sorted(set(range(size)).difference(removed)), device=posterior.device
     )
-    if not len(kept):
+    if not len(remaining):
         raise DataError(
-            f"a posterior needs at least one point; removing {len(removed)} of {size} leaves none"
+            f"a posterior needs at least one point; removing {len(removed)} of {size} "
+            "leaves none"
         )
-    if (
-        posterior.device.type != "cpu"
-        or posterior.cholesky.requires_grad
-        or len(removed) > _MANY * size
-    ):
-        rows = posterior.cholesky[:, kept]
-        first = removed[0]  # nothing changes above it
-        cholesky = rows[:, :, kept]
-        cholesky[:, first:, first:] = torch.linalg.cholesky(
-            rows[:, first:, first:] @ rows[:, first:, first:].mT
-        )
+    in_host_memory = posterior.device.type == "cpu"
+    in_graph = posterior.cholesky.requires_grad
+    if in_host_memory and not in_graph and len(removed) <= _MANY * size:
+        cholesky = _drop_one_by_one(posterior.cholesky, removed)
     else:
-        columns = np.ascontiguousarray(posterior.cholesky.mT.detach().numpy())
-        for index in reversed(removed):
-            before = columns
-            columns = np.empty_like(columns[:, 1:, 1:], order="C")
-            drop_point(before, index, columns)
-        cholesky = torch.from_numpy(columns).mT
-    targets = posterior.targets[kept]
-    half = torch.linalg.solve_triangular(
-        cholesky, (targets - posterior.offset).mT[..., None], upper=False
-    )
+        cholesky = _refactorize(posterior.cholesky, remaining, first=removed[0])
+    targets = posterior.targets[remaining]
+    residuals = (targets - posterior.offset).mT[..., None]
+    half = torch.linalg.solve_triangular(cholesky, residuals, upper=False)
     weights = torch.linalg.solve_triangular(cholesky.mT, half, upper=True)[..., 0]
     return replace(
         posterior,
-        features=posterior.features[kept],
+        features=posterior.features[remaining],
         targets=targets,
         cholesky=cholesky,
         weights=weights,
     )
 
 
+def _drop_one_by_one(cholesky: Tensor, removed: list[int]) -> Tensor:
+    """Drops points from factors (k, N, N) by rank-one updates."""
+    columns = np.ascontiguousarray(cholesky.mT.detach().numpy())
+    for index in reversed(removed):
+        smaller = np.empty_like(columns[:, 1:, 1:], order="C")
+        drop_point(columns, index, smaller)
+        columns = smaller
+    return torch.from_numpy(columns).mT
+
+
+def _refactorize(cholesky: Tensor, remaining: Tensor, first: int) -> Tensor:
+    """Factorises again without some points, of which ``first`` is the first."""
+    rows = cholesky[:, remaining]
+    smaller = rows[:, :, remaining]
+    # Nothing changes above the first point.
+    block = rows[:, first:, first:]
+    smaller[:, first:, first:] = torch.linalg.cholesky(block @ block.mT)
+    return smaller
+
+
 def targets_of(posterior: GPPosterior, transitions: Transitions) -> Tensor:
-    """The targets (N, n) that a posterior's GPs have for transitions; errors are those of ``append_transitions``."""
+    """Returns the targets (N, n) that a posterior's GPs have for transitions.
+
+    Errors are those of ``append_transitions``.
+    """
     check_transitions(transitions, posterior)
     return transitions.targets(posterior.predicts)
 
 
 @dataclass(frozen=True)
 class SlidingWindow:
-    """Appends new points to a posterior and removes others until it holds no more than a given number.
+    """Appends points to a posterior and removes others that exceed a given number.
 
-    New points stay under either rule, unless they alone are more than that (which is logged).
+    New points stay under either rule, unless they alone are more than that (which is
+    logged).
 
     Raises:
         SettingError: Fewer than one point, or an unknown rule.
     """
 
     points: int  #: how many points the posterior may hold
-    #: which go first. ``"oldest"`` costs O(N^2) a point; ``"least_informative"`` needs the inverse of the kernel
-    #: matrix, O(N^3) a call
+    #: which go first. ``"oldest"`` costs O(N^2) a point; ``"least_informative"`` needs
+    #: the inverse of the kernel matrix, O(N^3) a call
     remove: Literal["oldest", "least_informative"] = "oldest"
 
     def __post_init__(self) -> None:
@@ -188,11 +234,15 @@ class SlidingWindow:
         check_choice("remove", self.remove, ("oldest", "least_informative"))
 
     def __call__(self, posterior: GPPosterior, transitions: Transitions) -> GPPosterior:
-        """The posterior with the transitions, held to ``points`` points; errors are those of ``append_transitions``."""
+        """Appends transitions, and removes what exceeds ``points``.
+
+        Errors are those of ``append_transitions``.
+        """
         if not isinstance(posterior, GPPosterior):
             got = type(posterior).__name__
             raise UnsupportedModel(
-                f"a window is for a GPPosterior (ResidualModel.append takes one); got {got}"
+                "a window is for a GPPosterior (ResidualModel.append takes one); "
+                f"got {got}"
             )
         targets = targets_of(posterior, transitions)
         return self.append(posterior, transitions.features, targets)
@@ -200,7 +250,7 @@ class SlidingWindow:
     def append(
         self, posterior: GPPosterior, features: Tensor, targets: Tensor
     ) -> GPPosterior:
-        """The posterior with points x~ (p, n + m) and their targets (p, k), held to ``points`` points."""
+        """Appends points x~ (p, n + m) with targets (p, k), and removes others."""
         larger = append_points(posterior, features, targets)
         removable = len(posterior)
         if len(features) > self.points:
@@ -211,19 +261,24 @@ class SlidingWindow:
             )
             larger = remove_points(larger, range(removable))
             removable = len(features)
-        if (excess := len(larger) - self.points) <= 0:
+        excess = len(larger) - self.points
+        if excess <= 0:
             return larger
-        oldest = self.remove == "oldest"
-        return remove_points(
-            larger,
-            range(excess) if oldest else least_informative(larger, excess, removable),
-        )
+        if self.remove == "oldest":
+            return remove_points(larger, range(excess))
+        return remove_points(larger, least_informative(larger, excess, removable))
 
 
 def least_informative(
     posterior: GPPosterior, count: int, candidates: int | None = None
 ) -> list[int]:
-    """Which of the first ``candidates`` points to drop, each the least informative when those before it are gone."""
+    """Chooses points to drop, each the least informative without those before it.
+
+    Args:
+        posterior: The posterior.
+        count: How many points go.
+        candidates: How many of the first points may go; all by default.
+    """
     P = posterior.precision.clone()
     beta = posterior.weights.clone()
     noise = _noise_variances(posterior)
@@ -235,7 +290,8 @@ def least_informative(
         i = int(torch.where(allowed, score, torch.inf).argmin())
         chosen.append(i)
         allowed[i] = False
-        # Leaving i out is conditioning the precision matrix: the block inverse of what remains.
+        # Leaving i out is conditioning the precision matrix: the block inverse of what
+        # remains.
         column = P[:, :, i].clone()
         pivot = P[:, i, i].clone()
         beta -= column * (beta[:, i] / pivot)[:, None]
@@ -245,13 +301,17 @@ def least_informative(
 
 
 def _divergence(P: Tensor, beta: Tensor, noise: Tensor) -> Tensor:
-    """KL_i (N,) from the diagonals of P, beta and the noise variances (k, N)."""
+    """Computes KL_i (N,) from diagonals of P, beta and noise variances (k, N)."""
     e = (noise * P).clamp(max=1.0)
     return (e - 1 - e.log() + beta**2 * (1 - e) / P).sum(0) / 2
 
 
 def _noise_variances(posterior: GPPosterior) -> Tensor:
-    """Of the targets (k, N): sn2, or what the factor of pseudo-observations has on its diagonal beyond the kernel."""
+    """Returns the noise variances of the targets (k, N).
+
+    They are sn2, or what the factor of pseudo-observations has on its diagonal beyond
+    the kernel.
+    """
     nominal = posterior.noise_variance[:, None].expand_as(posterior.weights)
     if posterior.has_observation_noise:
         return nominal
@@ -259,17 +319,20 @@ def _noise_variances(posterior: GPPosterior) -> Tensor:
     return diagonal.clamp_min(torch.finfo(posterior.dtype).eps)
 
 
-def _indices(indices: Sequence[int] | Tensor, size: int) -> list[int]:
-    """Different indices from 0 to size - 1 in ascending order; negative ones count from the end, as everywhere."""
-    given = np.atleast_1d(np.asarray(indices)).tolist()
-    if any(
-        isinstance(i, bool) or not isinstance(i, int) or not -size <= i < size
-        for i in given
-    ):
-        raise SettingError(
-            "indices", f"must be whole numbers from {-size} to {size - 1}; got {given}"
-        )
-    found = sorted({i % size for i in given})
-    if len(found) != len(given):
-        raise SettingError("indices", f"must be different; got {given}")
-    return found
+def _checked_indices(indices: Sequence[int] | Tensor, size: int) -> list[int]:
+    """Returns different indices from 0 to size - 1 in ascending order.
+
+    Negative ones count from the end, as everywhere.
+    """
+    values = np.atleast_1d(np.asarray(indices)).tolist()
+    for i in values:
+        is_whole = isinstance(i, int) and not isinstance(i, bool)
+        if not is_whole or not -size <= i < size:
+            raise SettingError(
+                "indices",
+                f"must be whole numbers from {-size} to {size - 1}; got {values}",
+            )
+    different = sorted({i % size for i in values})
+    if len(different) != len(values):
+        raise SettingError("indices", f"must be different; got {values}")
+    return different

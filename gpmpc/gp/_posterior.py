@@ -1,14 +1,16 @@
 """Exact GPs with the SE-ARD kernel, frozen to plain tensors: data and prediction.
 
-One GP per output with the squared exponential kernel with automatic relevance determination,
+One GP per output with the squared exponential kernel with automatic relevance
+determination,
 
     k_a(x~, x~') = sf2_a exp(-1/2 sum_d (x~_d - x~'_d)^2 / l_ad^2),   x~ = (x, u)
 
-Rasmussen and Williams (2006), eqs. (2.25)-(2.26), Algorithm 2.1; the GP model of Cao, Lai and Alam (2017). A posterior
-is in physical units: an affine scaling of the data is only another parametrisation of such a GP.
+Rasmussen and Williams (2006), eqs. (2.25)-(2.26), Algorithm 2.1; the GP model of Cao,
+Lai and Alam (2017). A posterior is in physical units: an affine scaling of the data is
+only another parametrisation of such a GP.
 """
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -26,7 +28,7 @@ from gpmpc._dynamics import (
 )
 from gpmpc.gaussian import Gaussian, check_tensors, constant_arrays
 from gpmpc.gp._backend import host_arrays
-from gpmpc.gp._kernel import Hyperparameters, Predicts, check_posterior, factorize
+from gpmpc.gp._kernel import Predicts, check_posterior, factorize
 from gpmpc.gp._scaling import Scaling
 from gpmpc.signals import UNKNOWN, Signals, check_signals
 
@@ -35,9 +37,10 @@ if TYPE_CHECKING:
 
 
 class AffineForm(NamedTuple):
-    """A model x+ = A x + G u + c + f0(x, u) + B f(x_s, u_s); without f0 and angles moments go through it exactly.
+    """A model x+ = A x + G u + c + f0(x, u) + B f(x_s, u_s).
 
-    None stands for A = 0, G = 0, c = 0, B = I, or a selection of everything.
+    Without f0 and angles moments go through it exactly. None stands for A = 0, G = 0,
+    c = 0, B = I, or a selection of everything.
     """
 
     f: "GPPosterior"  #: the latent functions
@@ -47,18 +50,21 @@ class AffineForm(NamedTuple):
     B: Tensor | None = None  #: (n, k)
     states: list[int] | None = None  #: the states that f depends on
     inputs: list[int] | None = None  #: the inputs that f depends on
-    angles: tuple[
-        int, ...
-    ] = ()  #: those of ``states`` that f sees as (sine, cosine), at their place
+    #: those of ``states`` that f sees as (sine, cosine), at their place
+    angles: tuple[int, ...] = ()
     tape: Any = None  #: f0 as a ``gpmpc._kernels.tape.Tape``; None for zero
 
 
 @dataclass(frozen=True, eq=False)
 class GPPosterior(TensorModel):
-    """Exact GPs, one per output, over the same N points; a training, ``from_hyperparameters`` or a file makes them."""
+    """Exact GPs, one per output, over the same N points.
+
+    A training, ``from_hyperparameters`` or a file makes them.
+    """
 
     features: Tensor  #: x~ = (x, u) of the training points (N, n + m)
-    targets: Tensor  #: of the GPs (N, k): next states, differences x[k+1] - x[k] (k = n), or any values
+    #: of the GPs (N, k): next states, differences x[k+1] - x[k] (k = n), or any values
+    targets: Tensor
     lengthscales: Tensor  #: l (k, n + m), one row an output
     signal_variance: Tensor  #: sf2 (k,)
     noise_variance: Tensor  #: sn2 (k,)
@@ -87,61 +93,69 @@ class GPPosterior(TensorModel):
         """Factorises K + sn2 I and solves for the weights.
 
         Args:
-            inputs: The GPs' inputs x~ = (x, u) (N, d), d = n + m, float64 like all that follows.
+            inputs: The GPs' inputs x~ = (x, u) (N, d), d = n + m, float64 like all that
+                follows.
             targets: (N, k); k = n unless ``predicts="value"``.
             lengthscales: (k, d).
             signal_variance: (k,).
             noise_variance: (k,).
             input_dim: m, how many of the last columns of ``inputs`` are controls.
-            predicts: ``"next_state"``; ``"difference"`` for targets x[k+1] - x[k]; or ``"value"`` for any function of
-                (x, u) with k outputs, such as the residual of a known model.
+            predicts: ``"next_state"``; ``"difference"`` for targets x[k+1] - x[k]; or
+                ``"value"`` for any function of (x, u) with k outputs, such as the
+                residual of a known model.
             offset: Constant prior means (k,); zero by default.
             signals: Names of states and inputs, and time step, where they are known.
 
         Raises:
             ShapeError: The shapes do not belong together, or there is no row.
-            SettingError: A hyperparameter is not positive, a dtype or device differs, or the kernel matrix is not
-                positive definite.
+            SettingError: A hyperparameter is not positive, a dtype or device differs,
+                or the kernel matrix is not positive definite.
             DataError: An entry is not finite.
         """
         check_tensors(targets=targets)
         offset = torch.zeros_like(targets[:1].flatten()) if offset is None else offset
-        kernel = Hyperparameters(lengthscales, signal_variance, noise_variance)
-        given: dict[str, Tensor] = {
+        tensors: dict[str, Tensor] = {
             "inputs": inputs,
             "targets": targets,
-            **kernel._asdict(),
+            "lengthscales": lengthscales,
+            "signal_variance": signal_variance,
+            "noise_variance": noise_variance,
             "offset": offset,
         }
-        check_posterior(given, input_dim, predicts)
+        check_posterior(tensors, input_dim, predicts)
         check_signals(signals)
         signals.check_sizes(inputs.shape[1] - input_dim, input_dim)
-        inputs, targets, *scales, offset = (value.clone() for value in given.values())
-        kernel = Hyperparameters(*scales)
-        cholesky = factorize(inputs, *kernel)
-        rights = (targets - offset).mT[
-            ..., None
-        ]  # one after another: torch copies the factors it is given
-        weights = torch.stack(
-            [
-                torch.cholesky_solve(b, L)[:, 0]
-                for b, L in zip(rights, cholesky, strict=True)
-            ]
+        inputs, targets, lengthscales, signal_variance, noise_variance, offset = (
+            tensor.clone() for tensor in tensors.values()
         )
+        cholesky = factorize(inputs, lengthscales, signal_variance, noise_variance)
+        residuals = (targets - offset).mT[..., None]
+        # One after another: torch copies the factors it is given.
+        weights = [
+            torch.cholesky_solve(residual, factor)[:, 0]
+            for residual, factor in zip(residuals, cholesky, strict=True)
+        ]
         return cls(
-            inputs,
-            targets,
-            *kernel,
-            offset,
-            cholesky,
-            weights,
-            input_dim,
-            predicts,
-            signals,
+            features=inputs,
+            targets=targets,
+            lengthscales=lengthscales,
+            signal_variance=signal_variance,
+            noise_variance=noise_variance,
+            offset=offset,
+            cholesky=cholesky,
+            weights=torch.stack(weights),
+            input_dim=input_dim,
+            predicts=predicts,
+            signals=signals,
         )
 
     def unscaled(self, features: Scaling, targets: Scaling) -> "GPPosterior":
-        """Converts GPs that were trained on scaled features x~ (n + m,) and targets (k,) to physical units."""
+        """Converts GPs that were trained on scaled data to physical units.
+
+        Args:
+            features: The scaling of x~ (n + m,).
+            targets: The scaling of the targets (k,).
+        """
         return replace(
             self,
             features=features.restore(self.features),
@@ -168,12 +182,15 @@ class GPPosterior(TensorModel):
         return len(self.features)
 
     def __repr__(self) -> str:
-        sizes = f"{len(self)} points, n={self.state_dim}, m={self.input_dim}, k={self.output_dim}"
-        return f"GPPosterior({sizes}, predicts={self.predicts!r}, {self.dtype} on {self.device})"
+        return (
+            f"GPPosterior({len(self)} points, n={self.state_dim}, m={self.input_dim}, "
+            f"k={self.output_dim}, predicts={self.predicts!r}, "
+            f"{self.dtype} on {self.device})"
+        )
 
     @property
     def noise_covariance(self) -> Tensor:
-        """Of the observations (k, k), diagonal."""
+        """Covariance of the observations (k, k), diagonal."""
         return torch.diag(self.noise_variance)
 
     @cached_property
@@ -186,10 +203,10 @@ class GPPosterior(TensorModel):
         """The arrays of the compiled loops, for a float64 model in host memory."""
         from gpmpc._kernels import pack  # loads numba
 
-        kernel = self.lengthscales.numpy(), self.signal_variance.numpy()
         return pack(
             self.features.numpy(),
-            *kernel,
+            self.lengthscales.numpy(),
+            self.signal_variance.numpy(),
             self.cholesky.numpy(),
             self.weights.numpy(),
             self.state_dim,
@@ -201,14 +218,19 @@ class GPPosterior(TensorModel):
         return constant_arrays(self.weights) is not None and self.dtype is torch.float64
 
     @cached_property
-    def _prior(self) -> tuple[Array, bool]:
-        """The prior means (k,) in host memory, and whether the state is added to a prediction."""
-        return self.offset.numpy(), self.predicts == "difference"
+    def _offset_array(self) -> Array:
+        """The prior means (k,) in host memory."""
+        return self.offset.numpy()
+
+    @cached_property
+    def _adds_state(self) -> bool:
+        """Whether a prediction is the state and what the GPs predict."""
+        return self.predicts == "difference"
 
     @property
     def affine_form(self) -> AffineForm:
-        """Next states (A = 0) or differences (A = I) as moments are composed of them."""
-        return AffineForm(self, self._eye if self.predicts == "difference" else None)
+        """The model as moments are composed: A = 0, or A = I for differences."""
+        return AffineForm(self, A=self._eye if self._adds_state else None)
 
     @property
     def _eye(self) -> Tensor:
@@ -216,7 +238,10 @@ class GPPosterior(TensorModel):
 
     @property
     def has_observation_noise(self) -> bool:
-        """Whether ``targets`` are observations with noise sn2, not a sparse model's pseudo-observations."""
+        """Whether ``targets`` are observations with noise sn2.
+
+        Those of a sparse model are pseudo-observations instead.
+        """
         diagonal = (self.signal_variance + self.noise_variance)[:, None]
         error = (self.cholesky.square().sum(-1) - diagonal).abs()
         return bool((error <= torch.finfo(self.dtype).eps ** 0.75 * diagonal).all())
@@ -224,104 +249,145 @@ class GPPosterior(TensorModel):
     def to(
         self, device: str | torch.device | None = None, dtype: torch.dtype | None = None
     ) -> "GPPosterior":
-        """Copies the posterior to another device, or to another type: float32 or float64."""
+        """Copies the posterior to another device or type, float32 or float64."""
         check_destination(device, dtype)
-        tensors = {
-            f.name: v
-            for f in fields(self)
-            if isinstance(v := getattr(self, f.name), Tensor)
-        }
-        moved: dict[str, Any] = {
-            name: value.to(device=device, dtype=dtype)
-            for name, value in tensors.items()
-        }
-        return replace(self, **moved)
+
+        def copy(tensor: Tensor) -> Tensor:
+            return tensor.to(device=device, dtype=dtype)
+
+        return replace(
+            self,
+            features=copy(self.features),
+            targets=copy(self.targets),
+            lengthscales=copy(self.lengthscales),
+            signal_variance=copy(self.signal_variance),
+            noise_variance=copy(self.noise_variance),
+            offset=copy(self.offset),
+            cholesky=copy(self.cholesky),
+            weights=copy(self.weights),
+        )
 
     def predict(self, state: Tensor, input: Tensor | None = None) -> Gaussian:
-        """The next state's distribution at a certain state and input (Rasmussen and Williams, 2006, eq. (2.25)).
+        """Predicts the next state at a certain state and input.
+
+        Rasmussen and Williams (2006), eqs. (2.25) and (2.26).
 
         Args:
             state: x (*batch, n).
             input: u (*batch, m); may be left out where m = 0.
 
         Returns:
-            Mean (*batch, k) and diagonal covariance (*batch, k, k) of the latent function: observation noise is not
-            added.
+            Mean (*batch, k) and diagonal covariance (*batch, k, k) of the latent
+            function: observation noise is not added.
 
         Raises:
             ShapeError: State or input do not fit the model.
         """
-        k, _ = self._correlations(state, input)
-        return self._belief(k, state)
+        return self._belief(self._correlations(state, input).k, state)
 
     def linearize(
         self, states: Array, inputs: Array, covariance: bool = True
     ) -> Linearized:
-        """Linearises the mean at K points (K, n), (K, m): by the compiled kernels where they can, else by torch."""
-        if (host_arrays() if self._on_host else host_arrays(self.weights)) is not None:
+        """Linearises the mean at K points (K, n), (K, m).
+
+        The compiled kernels do it where they can, else torch.
+        """
+        arrays = host_arrays() if self._on_host else host_arrays(self.weights)
+        if arrays is not None:
             from gpmpc import _kernels as kernels  # loads numba
 
-            return Linearized(
-                *kernels.linearize(
-                    self.packed, states, inputs, covariance, *self._prior
-                )
+            mean, A, B, V = kernels.linearize(
+                self.packed,
+                states,
+                inputs,
+                covariance,
+                self._offset_array,
+                self._adds_state,
             )
+            return Linearized(mean=mean, A=A, B=B, covariance=V)
         x, u = tensors_for(self, states, inputs)
-        k, difference = self._correlations(x, u)
-        A, B = self._jacobian(k, difference)
-        V = to_array(self._belief(k, x).covariance) if covariance else None
-        return Linearized(to_array(self._mean(k, x)), to_array(A), to_array(B), V)
+        correlations = self._correlations(x, u)
+        jacobian = self._jacobian(correlations)
+        V = None
+        if covariance:
+            V = to_array(self._belief(correlations.k, x).covariance)
+        return Linearized(
+            mean=to_array(self._mean(correlations.k, x)),
+            A=to_array(jacobian.by_state),
+            B=to_array(jacobian.by_input),
+            covariance=V,
+        )
 
     def predict_with_jacobian(
         self, state: Tensor, input: Tensor | None = None
     ) -> tuple[Gaussian, Tensor, Tensor]:
-        """``predict``, and its mean's derivatives by state (*batch, k, n) and input (*batch, k, m), all by torch."""
-        k, difference = self._correlations(state, input)
-        return self._belief(k, state), *self._jacobian(k, difference)
+        """Predicts with the mean's derivatives, by torch.
+
+        Returns:
+            What ``predict`` gives, and the derivatives by state (*batch, k, n) and by
+            input (*batch, k, m).
+        """
+        correlations = self._correlations(state, input)
+        jacobian = self._jacobian(correlations)
+        belief = self._belief(correlations.k, state)
+        return belief, jacobian.by_state, jacobian.by_input
 
     def variance_reduction(
         self, k: Tensor, outputs: list[int] | slice = slice(None)
     ) -> Tensor:
-        """|L_a^-1 k_a|^2 (*batch, k) of correlations k (*batch, k, N): by how much the data reduce the variance.
+        """Computes how far the data reduce the variance, |L_a^-1 k_a|^2 (*batch, k).
 
-        The batch goes to the right-hand side's columns: broadcast against it, L would be copied for every member.
+        Args:
+            k: Correlations with the points (*batch, k, N).
+            outputs: The GPs that they belong to.
         """
+        # The batch goes to the right-hand side's columns: broadcast against it, L would
+        # be copied for every member.
         columns = k.unsqueeze(0).flatten(0, -3).movedim(0, -1)  # (k, N, batch)
-        squares = (
-            torch.linalg.solve_triangular(self.cholesky[outputs], columns, upper=False)
-            .square()
-            .sum(-2)
-        )
-        return squares.mT.reshape(k.shape[:-1])
+        factor = self.cholesky[outputs]
+        whitened = torch.linalg.solve_triangular(factor, columns, upper=False)
+        return whitened.square().sum(-2).mT.reshape(k.shape[:-1])
 
-    def _correlations(
-        self, state: Tensor, input: Tensor | None
-    ) -> tuple[Tensor, Tensor]:
-        """k(x~_i, x~) (*batch, k, N) and (x~_i - x~) / l (*batch, k, N, d)."""
+    def _correlations(self, state: Tensor, input: Tensor | None) -> "_Correlations":
+        """Computes the correlations of a query with the points."""
         input = state[..., :0] if input is None else input
         check_query(self, state, input)
         query = torch.cat([state, input], dim=-1)
-        difference = (self.features - query[..., None, :])[
-            ..., None, :, :
-        ] / self.lengthscales[:, None, :]
-        return self.signal_variance[:, None] * torch.exp(
-            -difference.square().sum(-1) / 2
-        ), difference
+        difference = self.features - query[..., None, :]  # (*batch, N, d)
+        scaled = difference[..., None, :, :] / self.lengthscales[:, None, :]
+        k = self.signal_variance[:, None] * torch.exp(-scaled.square().sum(-1) / 2)
+        return _Correlations(k=k, difference=scaled)
 
     def _mean(self, k: Tensor, state: Tensor) -> Tensor:
+        """Computes the mean (*batch, k) from correlations (*batch, k, N)."""
         mean = (k * self.weights).sum(-1) + self.offset
-        return mean + state if self.predicts == "difference" else mean
+        return mean + state if self._adds_state else mean
 
     def _belief(self, k: Tensor, state: Tensor) -> Gaussian:
+        """Computes mean and covariance from correlations (*batch, k, N)."""
         variance = (self.signal_variance - self.variance_reduction(k)).clamp_min(0)
         return Gaussian(self._mean(k, state), torch.diag_embed(variance))
 
-    def _jacobian(self, k: Tensor, difference: Tensor) -> tuple[Tensor, Tensor]:
-        """The mean's derivatives by state and input, from what ``_correlations`` gives."""
-        weighted = (k * self.weights)[..., None, :]  # (*batch, k, 1, N)
-        jacobian = (weighted @ (difference / self.lengthscales[:, None, :]))[..., 0, :]
+    def _jacobian(self, correlations: "_Correlations") -> "_Jacobian":
+        """Computes the mean's derivatives."""
+        weighted = (correlations.k * self.weights)[..., None, :]  # (*batch, k, 1, N)
+        slopes = correlations.difference / self.lengthscales[:, None, :]
+        jacobian = (weighted @ slopes)[..., 0, :]
         by_state = jacobian[..., : self.state_dim]
-        by_input = jacobian[..., self.state_dim :]
-        if self.predicts == "difference":
+        if self._adds_state:
             by_state = by_state + self._eye
-        return by_state, by_input
+        return _Jacobian(by_state=by_state, by_input=jacobian[..., self.state_dim :])
+
+
+class _Correlations(NamedTuple):
+    """Correlations of a query x~ with the points x~_i."""
+
+    k: Tensor  #: k(x~_i, x~) (*batch, k, N)
+    difference: Tensor  #: (x~_i - x~) / l (*batch, k, N, d)
+
+
+class _Jacobian(NamedTuple):
+    """Derivatives of a mean."""
+
+    by_state: Tensor  #: (*batch, k, n)
+    by_input: Tensor  #: (*batch, k, m)

@@ -1,4 +1,4 @@
-"""Affine scalings of data columns of very different ranges, before training and back."""
+"""Affine scalings of data columns, before training and back."""
 
 import logging
 from collections.abc import Sequence
@@ -15,7 +15,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Scaling:
-    """One affine map a column, scaled = (value - offset) / factor."""
+    """An affine map of every column, scaled = (value - offset) / factor."""
 
     offset: Tensor  #: (d,), in the units of the data
     factor: Tensor  #: (d,), in the units of the data; positive
@@ -24,7 +24,8 @@ class Scaling:
         check_tensors(offset=self.offset, factor=self.factor)
         if self.offset.shape != self.factor.shape or self.offset.dim() != 1:
             raise ShapeError(
-                f"offset and factor must both be (d,); got {tuple(self.offset.shape)} and {tuple(self.factor.shape)}"
+                f"offset and factor must both be (d,); got {tuple(self.offset.shape)} "
+                f"and {tuple(self.factor.shape)}"
             )
         if not bool((self.factor > 0).all()):
             raise SettingError(
@@ -33,37 +34,39 @@ class Scaling:
             )
 
     def scale(self, values: Tensor) -> Tensor:
-        """Scaled values (..., d) from values in the units of the data."""
+        """Scales values (..., d) in the units of the data."""
         return (values - self.offset) / self.factor
 
     def restore(self, scaled: Tensor) -> Tensor:
-        """Values (..., d) in the units of the data from scaled values."""
+        """Restores values (..., d) in the units of the data from scaled ones."""
         return scaled * self.factor + self.offset
 
 
 def identity(columns: Tensor, names: Sequence[str] = ()) -> Scaling:
     """Leaves columns (N, d) as they are."""
-    return Scaling(torch.zeros_like(columns[0]), torch.ones_like(columns[0]))
+    return Scaling(
+        offset=torch.zeros_like(columns[0]), factor=torch.ones_like(columns[0])
+    )
 
 
 def centre(columns: Tensor, names: Sequence[str] = ()) -> Scaling:
     """Maps columns (N, d) to mean zero and keeps their units."""
-    return Scaling(
-        columns[0] + (columns - columns[0]).mean(dim=0), torch.ones_like(columns[0])
-    )
+    mean = columns[0] + (columns - columns[0]).mean(dim=0)
+    return Scaling(offset=mean, factor=torch.ones_like(mean))
 
 
 def standardize(
     columns: Tensor, names: Sequence[str], resolution: float = 0.0
 ) -> Scaling:
-    """Maps columns (N, d) to mean zero and standard deviation one; a constant column to zero.
+    """Maps columns (N, d) to mean zero and standard deviation one.
 
-    A column whose range is at most ``resolution``, in the units of the data, counts as constant; the log names it.
+    A constant column is mapped to zero. A column whose range is at most ``resolution``,
+    in the units of the data, counts as constant; the log names it.
     """
     constant = _constant(columns, names, resolution)
+    deviation = columns.std(dim=0, correction=0)
     return Scaling(
-        columns.mean(dim=0),
-        torch.where(constant, 1.0, columns.std(dim=0, correction=0)),
+        offset=columns.mean(dim=0), factor=torch.where(constant, 1.0, deviation)
     )
 
 
@@ -74,9 +77,10 @@ def min_max(
     high: float = 0.9,
     resolution: float = 0.0,
 ) -> Scaling:
-    """Maps the range of each column (N, d) onto [low, high]; a constant column, as in ``standardize``, to the middle.
+    """Maps the range of each column (N, d) onto [low, high].
 
-    Else a solver's round-off in a channel at rest would be blown up to the full interval.
+    A constant column, as in ``standardize``, is mapped to the middle: else a solver's
+    round-off in a channel at rest would be blown up to the full interval.
 
     Raises:
         SettingError: low is not below high.
@@ -88,21 +92,23 @@ def min_max(
     # A constant column keeps its unit, so that what little it moves stays as little.
     factor = torch.where(constant, 1.0, (largest - smallest) / (high - low))
     middle = (smallest + largest) / 2 - (low + high) / 2
-    return Scaling(torch.where(constant, middle, smallest - low * factor), factor)
+    offset = torch.where(constant, middle, smallest - low * factor)
+    return Scaling(offset=offset, factor=factor)
 
 
 def _constant(columns: Tensor, names: Sequence[str], resolution: float) -> Tensor:
-    """Which columns (d,) do not move; a note in the log names them."""
+    """Finds the columns (d,) that do not move; a note in the log names them."""
     if columns.dim() != 2 or len(names) != columns.shape[1]:
         raise ShapeError(
-            f"columns (N, d) need d names; got {tuple(columns.shape)} and {len(names)} names"
+            f"columns (N, d) need d names; got {tuple(columns.shape)} and "
+            f"{len(names)} names"
         )
-    moved = columns.amax(dim=0) - columns.amin(dim=0)
-    if bool((moved <= resolution).any()):
-        which = ", ".join(
-            f"{n} (moves by {m:.0e})"
-            for n, m in zip(names, moved, strict=True)
-            if m <= resolution
-        )
-        _log.info("constant columns are centred, not scaled: %s", which)
-    return moved <= resolution
+    ranges = columns.amax(dim=0) - columns.amin(dim=0)
+    constant = ranges <= resolution
+    if bool(constant.any()):
+        texts = [
+            f"{names[i]} (moves by {ranges[i]:.0e})"
+            for i in torch.nonzero(constant)[:, 0].tolist()
+        ]
+        _log.info("constant columns are centred, not scaled: %s", ", ".join(texts))
+    return constant

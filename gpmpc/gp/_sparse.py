@@ -1,24 +1,33 @@
-r"""Sparse GPs: M inducing points stand for N data points, for O(M^2) a prediction instead of O(N^2).
+r"""Sparse GPs: M inducing points stand for N data points.
 
-With inducing points Z, Kzz = Lz Lz' and the correlations Kzx with the data, the predictive distributions of SGPR
-(Titsias, 2009, eq. (6); "VFE") and FITC (Snelson and Ghahramani, 2006, eq. (8)) are
+A prediction takes O(M^2) instead of O(N^2).
+
+With inducing points Z, Kzz = Lz Lz' and the correlations Kzx with the data, the
+predictive distributions of SGPR (Titsias, 2009, eq. (6); "VFE") and FITC (Snelson and
+Ghahramani, 2006, eq. (8)) are
 
     mean = k' beta,   variance = sf2 - k' C k,       k = k(Z, x~)
-    C    = Kzz^-1 - (Kzz + Kzx Lam^-1 Kxz)^-1,       Lam = sn2 I  (SGPR)   or   diag(Kxx - Qxx) + sn2 I  (FITC)
+    C    = Kzz^-1 - (Kzz + Kzx Lam^-1 Kxz)^-1
+    Lam  = sn2 I  (SGPR)   or   diag(Kxx - Qxx) + sn2 I  (FITC)
 
-which is an exact GP on M pseudo-observations with correlated noise, K + R = C^-1, and frozen to a ``GPPosterior`` on
-Z. With A = Lz^-1 Kzx Lam^-1/2 and A A' = U diag(b) U',
+which is an exact GP on M pseudo-observations with correlated noise, K + R = C^-1, and
+frozen to a ``GPPosterior`` on Z. With A = Lz^-1 Kzx Lam^-1/2 and A A' = U diag(b) U',
 
-    C = Lz^-T U diag(b / (1 + b)) U' Lz^-1,   beta = Lz^-T U diag(1 / (1 + b)) U' A Lam^-1/2 (y - offset)
-    cholesky of C^-1:  R', where Q R = diag(sqrt((1 + b) / b)) U' Lz'    (never squared: C^-1 is huge where b is small)
+    C    = Lz^-T U diag(b / (1 + b)) U' Lz^-1
+    beta = Lz^-T U diag(1 / (1 + b)) U' A Lam^-1/2 (y - offset)
+    cholesky of C^-1:  R', where Q R = diag(sqrt((1 + b) / b)) U' Lz'
 
-The collapsed bound of Titsias (2009, eq. (9)), for FITC without its last term, measures Z and hyperparameters:
+(R is never squared: C^-1 is huge where b is small.)
+
+The collapsed bound of Titsias (2009, eq. (9)), for FITC without its last term, measures
+Z and hyperparameters:
 
     log N(y | 0, Q + Lam) - tr(Kxx - Qxx) / (2 sn2),     Q = A~' A~,  A~ = Lz^-1 Kzx
 
-It depends on the data through sums over the points alone: with r = Lam^-1/2 y they are A A', A r, r'r and log|Lam|. So
-the points come in blocks that fit the cache, each computed once more for the derivatives (checkpoints: Griewank and
-Walther, 2008, chapter 12): memory stays that of a block, for any N.
+It depends on the data through sums over the points alone: with r = Lam^-1/2 y they are
+A A', A r, r'r and log|Lam|. So the points come in blocks that fit the cache, each
+computed once more for the derivatives (checkpoints: Griewank and Walther, 2008, chapter
+12): memory stays that of a block, for any N.
 """
 
 import math
@@ -35,16 +44,17 @@ from gpmpc.gp._posterior import GPPosterior
 Method = Literal["sgpr", "fitc"]
 JITTER = 1e-8  # of Kzz, in units of sf2
 _ENTRIES = 200_000  # of a block of A
-_UNINFORMED = 1e-10  # directions in which the data inform less than this (b) get a pseudo-noise of 1 / this
+# directions in which the data inform less than this (b) get a pseudo-noise of 1 / this
+_UNINFORMED = 1e-10
 
 
 class _Sums(NamedTuple):
-    """The sums over the data, of every output: A A' (k, M, M), A r (k, M), r'r (k,) and log|Lam| (k,)."""
+    """Sums over the data, of every output."""
 
-    gram: Tensor
-    projections: Tensor
-    squares: Tensor
-    logdet: Tensor
+    gram: Tensor  #: A A' (k, M, M)
+    projections: Tensor  #: A r (k, M)
+    squares: Tensor  #: r'r (k,)
+    logdet: Tensor  #: log|Lam| (k,)
 
 
 def sparse_posterior(
@@ -57,7 +67,7 @@ def sparse_posterior(
     method: Method = "sgpr",
     jitter: float | None = None,
 ) -> GPPosterior:
-    """Freezes a sparse GP with prior mean zero to M pseudo-observations; errors as of ``from_hyperparameters``.
+    """Freezes a sparse GP with prior mean zero to M pseudo-observations.
 
     Args:
         inducing: Z (M, d), shared by all outputs.
@@ -67,11 +77,18 @@ def sparse_posterior(
         input_dim: m, how many of the last features are controls.
         predicts: What the targets mean.
         method: ``"sgpr"`` or ``"fitc"``.
-        jitter: Added to the diagonal of Kzz, in units of sf2; by default only where it is needed. ``SettingError``
-            where Kzz is not positive definite.
+        jitter: Added to the diagonal of Kzz, in units of sf2; by default only where it
+            is needed.
+
+    Raises:
+        SettingError: Kzz is not positive definite. Further errors are those of
+            ``GPPosterior.from_hyperparameters``.
     """
-    given = {"features": features, "targets": targets, **hyperparameters._asdict()}
-    check_posterior(given, input_dim, predicts)
+    check_posterior(
+        {"features": features, "targets": targets, **hyperparameters._asdict()},
+        input_dim,
+        predicts,
+    )
     try:
         Lz = inducing_factor(inducing, hyperparameters, jitter or 0.0)
     except SettingError:
@@ -83,25 +100,23 @@ def sparse_posterior(
     b, U = torch.linalg.eigh(sums.gram)
     b = b.clamp_min(_UNINFORMED)
     upper = torch.linalg.qr(((1 + b) / b).sqrt()[..., None] * (Lz @ U).mT).R
-    cholesky = (
-        upper * upper.diagonal(dim1=-2, dim2=-1).sign()[..., None]
-    ).mT.contiguous()
+    signs = upper.diagonal(dim1=-2, dim2=-1).sign()
+    cholesky = (upper * signs[..., None]).mT.contiguous()
     projections = U.mT @ sums.projections[..., None]
-    weights = torch.linalg.solve_triangular(
-        Lz.mT, U @ (projections / (1 + b)[..., None]), upper=True
-    )
+    shrunk = U @ (projections / (1 + b)[..., None])
+    weights = torch.linalg.solve_triangular(Lz.mT, shrunk, upper=True)
     pseudo_targets = (cholesky @ (cholesky.mT @ weights))[..., 0].mT
-    kernel = Hyperparameters(*(value.clone() for value in hyperparameters))
-    offset = torch.zeros_like(pseudo_targets[0])
     return GPPosterior(
-        inducing.clone(),
-        pseudo_targets,
-        *kernel,
-        offset,
-        cholesky,
-        weights[..., 0],
-        input_dim,
-        predicts,
+        features=inducing.clone(),
+        targets=pseudo_targets,
+        lengthscales=hyperparameters.lengthscales.clone(),
+        signal_variance=hyperparameters.signal_variance.clone(),
+        noise_variance=hyperparameters.noise_variance.clone(),
+        offset=torch.zeros_like(pseudo_targets[0]),
+        cholesky=cholesky,
+        weights=weights[..., 0],
+        input_dim=input_dim,
+        predicts=predicts,
     )
 
 
@@ -113,110 +128,181 @@ def collapsed_bound(
     method: Method = "sgpr",
     jitter: float = JITTER,
 ) -> Tensor:
-    """The bound on the log marginal likelihood (SGPR), or FITC's own log marginal likelihood, of every output (k,).
+    """Computes the bound on the log marginal likelihood of every output (k,).
 
-    Arguments and errors are as for ``sparse_posterior``; ``backward`` differentiates it by inducing points and
-    hyperparameters.
+    With FITC it is that method's own log marginal likelihood. ``backward``
+    differentiates it by inducing points and hyperparameters. Arguments and errors are
+    as for ``sparse_posterior``.
     """
-    if (outputs := targets.shape[1]) > 1:
-        kernels = [
-            Hyperparameters(*(value[a, None] for value in hyperparameters))
-            for a in range(outputs)
-        ]
-        columns = targets.split(1, dim=1)
-        return torch.cat(
-            [
-                collapsed_bound(inducing, features, *of, method, jitter)
-                for of in zip(columns, kernels, strict=True)
-            ]
+    bounds = [
+        _output_bound(
+            inducing,
+            features,
+            targets[:, a, None],
+            hyperparameters.of_output(a),
+            method,
+            jitter,
         )
-    Lz = inducing_factor(inducing, hyperparameters, jitter)
-    sums = data_sums(Lz, inducing, features, targets, hyperparameters, method)
-    LB = torch.linalg.cholesky(
-        sums.gram + torch.eye(len(inducing), dtype=Lz.dtype, device=Lz.device)
+        for a in range(targets.shape[1])
+    ]
+    return torch.cat(bounds)
+
+
+def _output_bound(
+    inducing: Tensor,
+    features: Tensor,
+    targets: Tensor,
+    kernel: Hyperparameters,
+    method: Method,
+    jitter: float,
+) -> Tensor:
+    """Computes the bound of one output (1,), whose targets are (N, 1)."""
+    size = len(features)
+    Lz = inducing_factor(inducing, kernel, jitter)
+    sums = data_sums(Lz, inducing, features, targets, kernel, method)
+    eye = torch.eye(len(inducing), dtype=Lz.dtype, device=Lz.device)
+    LB = torch.linalg.cholesky(sums.gram + eye)
+    projections = torch.linalg.solve_triangular(
+        LB, sums.projections[..., None], upper=False
     )
-    explained = (
-        torch.linalg.solve_triangular(LB, sums.projections[..., None], upper=False)
-        .square()
-        .sum((-2, -1))
-    )
+    explained = projections.square().sum((-2, -1))
     logdet = 2 * LB.diagonal(dim1=-2, dim2=-1).log().sum(-1) + sums.logdet
-    bound = (
-        -(len(features) * math.log(2 * math.pi) + logdet + sums.squares - explained) / 2
-    )
+    bound = -(size * math.log(2 * math.pi) + logdet + sums.squares - explained) / 2
     if method == "fitc":
         return bound
     trace = sums.gram.diagonal(dim1=-2, dim2=-1).sum(-1)
-    prior = (
-        len(features) * hyperparameters.signal_variance / hyperparameters.noise_variance
-    )
+    prior = size * kernel.signal_variance / kernel.noise_variance
     return bound - (prior - trace) / 2
 
 
 def data_sums(
     Lz: Tensor, Z: Tensor, x: Tensor, y: Tensor, kernel: Hyperparameters, method: Method
 ) -> _Sums:
-    """The sums over all points, of every output, in blocks."""
+    """Computes the sums over all points, of every output, in blocks.
+
+    Args:
+        Lz: Factor of Kzz (k, M, M).
+        Z: Inducing points (M, d).
+        x: Points (N, d).
+        y: Targets (N, k).
+        kernel: Hyperparameters of the k GPs.
+        method: ``"sgpr"`` or ``"fitc"``.
+    """
+    outputs = [
+        _output_sums(Lz[a, None], Z, x, y[:, a, None], kernel.of_output(a), method)
+        for a in range(y.shape[1])
+    ]
+    return _Sums(
+        gram=torch.cat([sums.gram for sums in outputs]),
+        projections=torch.cat([sums.projections for sums in outputs]),
+        squares=torch.cat([sums.squares for sums in outputs]),
+        logdet=torch.cat([sums.logdet for sums in outputs]),
+    )
+
+
+def _output_sums(
+    Lz: Tensor, Z: Tensor, x: Tensor, y: Tensor, kernel: Hyperparameters, method: Method
+) -> _Sums:
+    """Computes the sums of one output, whose targets are (N, 1)."""
     step = max(_ENTRIES // len(Z), 64)
-    outputs = []
-    for a in range(y.shape[1]):
-        total: Any = 0.0, 0.0, 0.0, 0.0
-        for rows in (slice(begin, begin + step) for begin in range(0, len(x), step)):
-            block: Any = (
-                Lz[a, None],
+    recomputes = torch.is_grad_enabled() and step < len(x)
+    total: _Sums | None = None
+    for begin in range(0, len(x), step):
+        rows = slice(begin, begin + step)
+        if recomputes:
+            # ``checkpoint`` passes tensors on to ``backward`` only as plain arguments.
+            block: Any = checkpoint(
+                _block_sums,
+                Lz,
                 Z,
                 x[rows],
-                y[rows, a, None],
-                *(value[a, None] for value in kernel),
+                y[rows],
+                kernel.lengthscales,
+                kernel.signal_variance,
+                kernel.noise_variance,
+                method,
+                use_reentrant=True,
+                preserve_rng_state=False,
+            )
+        else:
+            block = _block_sums(
+                Lz,
+                Z,
+                x[rows],
+                y[rows],
+                kernel.lengthscales,
+                kernel.signal_variance,
+                kernel.noise_variance,
                 method,
             )
-            if torch.is_grad_enabled() and step < len(x):
-                part: Any = checkpoint(
-                    _block_sums, *block, use_reentrant=True, preserve_rng_state=False
-                )
-            else:
-                part = _block_sums(*block)
-            total = [t + p for t, p in zip(total, part, strict=True)]
-        outputs.append(total)
-    return _Sums(*(torch.cat(of_one) for of_one in zip(*outputs, strict=True)))
+        block = _Sums(*block)
+        if total is None:
+            total = block
+        else:
+            total = _Sums(
+                gram=total.gram + block.gram,
+                projections=total.projections + block.projections,
+                squares=total.squares + block.squares,
+                logdet=total.logdet + block.logdet,
+            )
+    assert total is not None  # there is a point
+    return total
 
 
 def inducing_factor(inducing: Tensor, kernel: Hyperparameters, jitter: float) -> Tensor:
-    """Lz (k, M, M), the Cholesky factor of Kzz with a jitter in units of sf2; raises where there is none."""
+    """Computes Lz (k, M, M), the Cholesky factor of Kzz with a jitter.
+
+    Args:
+        inducing: Z (M, d).
+        kernel: Hyperparameters of k GPs.
+        jitter: Added to the diagonal, in units of sf2.
+
+    Raises:
+        SettingError: A matrix is not positive definite.
+    """
     Kzz = kernel_matrix(inducing, inducing, kernel.lengthscales, kernel.signal_variance)
-    Kzz = Kzz + torch.diag_embed(
-        (jitter * kernel.signal_variance)[:, None].expand(-1, len(inducing))
-    )
-    Lz, info = torch.linalg.cholesky_ex(Kzz)
+    added = (jitter * kernel.signal_variance)[:, None].expand(-1, len(inducing))
+    Lz, info = torch.linalg.cholesky_ex(Kzz + torch.diag_embed(added))
     if bool(info.any()):
+        output = int(torch.nonzero(info)[0])
         raise SettingError(
             "inducing",
-            f"their kernel matrix of output {int(torch.nonzero(info)[0])} is not positive definite: points too near "
-            "each other for its length-scales; take fewer, or a larger jitter",
+            f"their kernel matrix of output {output} is not positive definite: points "
+            "too near each other for its length-scales; take fewer, or a larger jitter",
         )
     return Lz
 
 
 def _block_sums(
-    Lz: Tensor, Z: Tensor, x: Tensor, y: Tensor, *kernel_and_method: Any
-) -> _Sums:
-    *tensors, method = kernel_and_method
-    kernel = Hyperparameters(*tensors)
-    _, signal_variance, noise_variance = kernel
+    Lz: Tensor,
+    Z: Tensor,
+    x: Tensor,
+    y: Tensor,
+    lengthscales: Tensor,
+    signal_variance: Tensor,
+    noise_variance: Tensor,
+    method: Method,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Computes what a block of points adds to the fields of ``_Sums``."""
+    kernel = Hyperparameters(lengthscales, signal_variance, noise_variance)
     whitened = torch.linalg.solve_triangular(Lz, _cross(Z, x, kernel), upper=False)
     Lam = noise_variance[:, None].expand(-1, len(x))
     if method == "fitc":
-        Lam = (signal_variance[:, None] - whitened.square().sum(-2)).clamp_min(0) + Lam
+        explained = whitened.square().sum(-2)
+        Lam = (signal_variance[:, None] - explained).clamp_min(0) + Lam
     root = Lam.sqrt()
     A = whitened / root[:, None, :]
     r = y.mT / root
-    return _Sums(
-        A @ A.mT, (A @ r[..., None])[..., 0], r.square().sum(-1), Lam.log().sum(-1)
-    )
+    gram = A @ A.mT
+    projections = (A @ r[..., None])[..., 0]
+    return gram, projections, r.square().sum(-1), Lam.log().sum(-1)
 
 
 def _cross(inducing: Tensor, features: Tensor, kernel: Hyperparameters) -> Tensor:
-    """Kzx (k, M, N) by one matrix product an output; around a common centre, so that little cancels."""
+    """Computes Kzx (k, M, N) by one matrix product an output.
+
+    The points are taken around a common centre, so that little cancels.
+    """
     centre = inducing.detach().mean(0)
     scales = kernel.lengthscales[:, None, :]
     z = (inducing - centre) / scales

@@ -50,6 +50,8 @@ from gpmpc.gp._training_data import (
 )
 from gpmpc.gp._transitions import Transitions
 
+_LinAlgError = torch.linalg.LinAlgError  # pyright: ignore[reportPrivateImportUsage]
+
 _log = logging.getLogger(__name__)
 _EVERY = 10  # iterations between two lines of the log
 _TOLERANCE = 1e-7  # relative decrease of the objective at which L-BFGS stops
@@ -495,5 +497,5 @@ class _NegativeBound:
                 method=self._method,
                 jitter=JITTER,
             )
-        except (SettingError, torch.linalg.LinAlgError):  # pyright: ignore[reportPrivateImportUsage]
+        except (SettingError, _LinAlgError):
             return torch.full((self._outputs,), torch.inf, dtype=torch.float64)

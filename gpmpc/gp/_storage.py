@@ -1,16 +1,20 @@
-"""Files of models: a safetensors file of plain arrays with a header, which no damaged or foreign file passes for.
+"""Files of models: plain arrays in a safetensors file, with a header.
 
-The metadata entry ``gpmpc`` holds the header as JSON: kind, dimensions, versions, names and units where they are known,
-and a checksum of everything; any safetensors library opens the file where gpmpc is not installed. Reading runs no code,
-and the declared sizes are compared with the file's before memory is allocated.
+The metadata entry ``gpmpc`` holds the header as JSON: kind, dimensions, versions, names
+and units where they are known, and a checksum of everything; so no damaged or foreign
+file passes for a model. Any safetensors library opens the file where gpmpc is not
+installed. Reading runs no code, and the declared sizes are compared with the file's
+before memory is allocated.
 
-The Cholesky factor is stored (its lower triangle): factorising again would give other last digits, and the factor of a
-posterior that was updated or made sparse does not follow from its hyperparameters at all. The header also keeps the
-order in which a tensor's dimensions lie in memory, because BLAS rounds differently for each; so a loaded model predicts
-bit by bit what the saved one does.
+The Cholesky factor is stored (its lower triangle): factorising again would give other
+last digits, and the factor of a posterior that was updated or made sparse does not
+follow from its hyperparameters at all. The header also keeps the order in which a
+tensor's dimensions lie in memory, because BLAS rounds differently for each; so a loaded
+model predicts bit by bit what the saved one does.
 
-Transitions, and the models of gpmpc 1, are ``.npz``: a zip of ``.npy`` arrays, each with its own CRC-32, and mostly of
-a ``header.json`` with a checksum of itself and of the arrays' names, sizes and CRCs.
+Transitions, and the models of gpmpc 1, are ``.npz``: a zip of ``.npy`` arrays, each
+with its own CRC-32, and mostly of a ``header.json`` with a checksum of itself and of
+the arrays' names, sizes and CRCs.
 """
 
 import hashlib
@@ -20,7 +24,6 @@ import math
 import zipfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +45,16 @@ _VERSION = 2
 _DTYPES = {torch.float64: "float64", torch.float32: "float32"}
 _LONGEST = 2**20  # characters of a header
 _HEADER = "header.json"
+_POSTERIOR_TENSORS = (
+    "features",
+    "targets",
+    "lengthscales",
+    "signal_variance",
+    "noise_variance",
+    "offset",
+    "cholesky",
+    "weights",
+)
 _EXPANSION = 20  # times what a file holds: more than numbers shrink by
 
 
@@ -53,15 +66,19 @@ def save_posterior(
     Args:
         posterior: On any device; float64 or float32.
         path: The file; ``.safetensors`` by convention.
-        metadata: Kept in the header, such as names and units of states and inputs; what JSON can hold.
+        metadata: Kept in the header, such as names and units of states and inputs; what
+            JSON can hold.
 
     Raises:
-        UnsupportedModel: It is of a derived class, whose own parts this format does not hold.
+        UnsupportedModel: It is of a derived class, whose own parts this format does not
+            hold.
         SettingError: It is in another floating-point type, or the metadata are no JSON.
-        DataError: The folder does not exist, or the posterior is inconsistent and could not be read again.
+        DataError: The folder does not exist, or the posterior is inconsistent and could
+            not be read again.
     """
     path = new_file(path)
-    write_model(path, "GPPosterior", *posterior_parts(path, posterior), metadata)
+    header, tensors = posterior_parts(path, posterior)
+    write_model(path, "GPPosterior", header, tensors, metadata)
 
 
 def load_posterior(path: str | Path) -> GPPosterior:
@@ -71,18 +88,28 @@ def load_posterior(path: str | Path) -> GPPosterior:
         DataError: The file is missing, damaged, of another kind or of a newer format.
     """
     path = existing_file(path, "a saved GPPosterior")
-    return posterior_of_parts(path, *read_model(path, "GPPosterior"))
+    header, tensors = read_model(path, "GPPosterior")
+    return posterior_of_parts(path, header, tensors)
 
 
 def load_metadata(path: str | Path) -> dict[str, Any]:
-    """Reads the header of a model file: kind, dimensions, versions, and the metadata it was saved with."""
-    return _content(existing_file(path, "a saved model"), "model", header_only=True)[0]
+    """Reads the header of a model file.
+
+    It has kind, dimensions, versions, and the metadata that the model was saved with.
+    """
+    path = existing_file(path, "a saved model")
+    header, _ = _content(path, "model", header_only=True)
+    return header
 
 
 def posterior_parts(
     path: Path, posterior: GPPosterior
 ) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    """The header and the tensors of a posterior, after a check that they could be read again."""
+    """Returns the header and the tensors of a posterior.
+
+    Raises:
+        DataError: They could not be read again.
+    """
     if type(posterior) is not GPPosterior:
         raise UnsupportedModel(
             f"only a GPPosterior can be saved; got {type(posterior).__name__}"
@@ -96,11 +123,7 @@ def posterior_parts(
         "points": len(posterior),
         "signals": posterior.signals.to_header(),
     }
-    tensors = {
-        f.name: v
-        for f in fields(posterior)
-        if isinstance(v := getattr(posterior, f.name), Tensor)
-    }
+    tensors = {name: getattr(posterior, name) for name in _POSTERIOR_TENSORS}
     posterior_of_parts(path, header, tensors)
     return header, tensors
 
@@ -108,19 +131,22 @@ def posterior_parts(
 def posterior_of_parts(
     path: Path, header: Any, tensors: Mapping[str, Tensor]
 ) -> GPPosterior:
-    """Builds a posterior of a file's header and tensors, after a check of everything."""
-    settings = "input_dim", "predicts", "signals"
-    names = [f.name for f in fields(GPPosterior) if f.name not in settings]
-    with consistent(path, f"not a consistent posterior of {', '.join(names)}"):
-        found = {name: tensors[name] for name in names}
+    """Builds a posterior of a file's header and tensors, after checks.
+
+    Raises:
+        DataError: They do not belong together.
+    """
+    names = ", ".join(_POSTERIOR_TENSORS)
+    with consistent(path, f"not a consistent posterior of {names}"):
+        parts = {name: tensors[name] for name in _POSTERIOR_TENSORS}
         predicts = header["predicts"]
         m = header["input_dim"]
-        check_posterior(found, m, predicts, found["features"].dtype)
+        check_posterior(parts, m, predicts, parts["features"].dtype)
         signals = Signals.from_header(header.get("signals"))
-        signals.check_sizes(found["features"].shape[1] - m, m)
-    if not bool((found["cholesky"].diagonal(dim1=-2, dim2=-1) > 0).all()):
+        signals.check_sizes(parts["features"].shape[1] - m, m)
+    if not bool((parts["cholesky"].diagonal(dim1=-2, dim2=-1) > 0).all()):
         raise DataError(f"{path}: the diagonal of cholesky must be positive")
-    return GPPosterior(**found, input_dim=m, predicts=predicts, signals=signals)
+    return GPPosterior(**parts, input_dim=m, predicts=predicts, signals=signals)
 
 
 @contextmanager
@@ -135,12 +161,12 @@ def consistent(path: Path, otherwise: str) -> Iterator[None]:
 
 
 def brief(value: Any) -> str:
-    """What stands in a file, in one short line."""
+    """Shortens what stands in a file to one line."""
     return f"{' '.join(str(value).split()):.80}"
 
 
 def _reason(error: Exception) -> str:
-    """The text of an error in one line; its kind where it has no text."""
+    """Returns the text of an error in one line; its kind where it has no text."""
     return f"{' '.join(str(error).split()) or type(error).__name__:.500}"
 
 
@@ -156,11 +182,17 @@ def write_model(
         if value.dtype not in _DTYPES:
             raise SettingError(
                 name,
-                f"must be one of {', '.join(_DTYPES.values())} to be saved; got {value.dtype}",
+                f"must be one of {', '.join(_DTYPES.values())} to be saved; "
+                f"got {value.dtype}",
             )
     tensors = {name: value.detach() for name, value in tensors.items()}
     arrays = {
         name: _packed(name, value).cpu().contiguous().numpy()
+        for name, value in tensors.items()
+    }
+    # Dimensions from the outermost to the innermost.
+    memory_order = {
+        name: sorted(range(value.dim()), key=value.stride, reverse=True)
         for name, value in tensors.items()
     }
     header = {
@@ -169,10 +201,7 @@ def write_model(
         "kind": kind,
         "kernel": "SE-ARD",
         **header,
-        "memory_order": {  # of the dimensions, from the outermost to the innermost
-            name: sorted(range(value.dim()), key=value.stride, reverse=True)
-            for name, value in tensors.items()
-        },
+        "memory_order": memory_order,
         "versions": versions(("gpmpc", "torch", "gpytorch", "numpy")),
         "created": now(),
         "metadata": dict(metadata or {}),
@@ -187,9 +216,13 @@ def write_model(
 
 
 def read_model(path: Path, kind: str) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    """Reads the header and the tensors of a model file of a kind, in host memory; errors are of ``load_posterior``."""
+    """Reads the header and the tensors of a model file of a kind, in host memory.
+
+    Errors are those of ``load_posterior``.
+    """
     header, arrays = _content(path, kind)
-    for got, expected in ((header.get("kind"), kind), (header.get("kernel"), "SE-ARD")):
+    for key, expected in (("kind", kind), ("kernel", "SE-ARD")):
+        got = header.get(key)
         if got != expected:
             raise DataError(f"{path}: holds a {brief(got)}; expected a {expected}")
     try:
@@ -197,10 +230,12 @@ def read_model(path: Path, kind: str) -> tuple[dict[str, Any], dict[str, Tensor]
             raise ValueError(
                 "the checksum of its parts differs from the one in its header"
             )
-        return header, {
-            name: _restored(name, arrays.pop(name), header["memory_order"][name])
-            for name in list(arrays)
-        }
+        tensors: dict[str, Tensor] = {}
+        for name in list(arrays):
+            order = header["memory_order"][name]
+            # An array goes as soon as its tensor is there: no second copy of all.
+            tensors[name] = _restored(name, arrays.pop(name), order)
+        return header, tensors
     except Exception as error:
         raise DataError(
             f"{path}: damaged; expected a saved {kind} ({_reason(error)})"
@@ -208,24 +243,24 @@ def read_model(path: Path, kind: str) -> tuple[dict[str, Any], dict[str, Tensor]
 
 
 def write_npz(header: dict[str, Any], arrays: Mapping[str, np.ndarray]) -> bytes:
-    """The content of a ``.npz`` file that holds a header and named arrays, uncompressed."""
+    """Returns the content of an uncompressed ``.npz`` file of a header and arrays."""
     content = io.BytesIO()
     np.savez(content, allow_pickle=False, **arrays)
     with zipfile.ZipFile(content, "a") as archive:
-        archive.writestr(
-            _HEADER,
-            json.dumps(header | {"checksum": _npz_checksum(header, archive)}, indent=2),
-        )
+        header = header | {"checksum": _npz_checksum(header, archive)}
+        archive.writestr(_HEADER, json.dumps(header, indent=2))
     return content.getvalue()
 
 
 def read_npz(
     path: Path, names: tuple[str, ...] | None = None
 ) -> tuple[Any, dict[str, np.ndarray]]:
-    """The header, None where there is none, and the arrays of a file, all of them or those of the given names.
+    """Reads the header of a file, None where there is none, and its arrays.
 
-    Damage makes zipfile, json and NumPy raise whatever they come upon first: callers take any exception for one and
-    name the file.
+    Arrays are all of them, or those of the given names.
+
+    Damage makes zipfile, json and NumPy raise whatever they come upon first: callers
+    take any exception for one and name the file.
     """
     size = path.stat().st_size
     with zipfile.ZipFile(path) as archive:
@@ -241,29 +276,25 @@ def read_npz(
             name, is_array, _ = info.filename.rpartition(".npy")
             if is_array and (not names or name in names):
                 _check_array_size(archive, info)
-        header = (
-            json.loads(archive.read(_HEADER)) if _HEADER in archive.namelist() else None
-        )
-        if (
-            isinstance(header, dict)
-            and header.get("checksum", expected := _npz_checksum(header, archive))
-            != expected
-        ):
-            raise ValueError(
-                "the checksum of its parts differs from the one in its header"
-            )
-        if (damaged := archive.testzip()) is not None:  # compares the CRCs
+        header = None
+        if _HEADER in archive.namelist():
+            header = json.loads(archive.read(_HEADER))
+        if isinstance(header, dict):
+            expected = _npz_checksum(header, archive)
+            if header.get("checksum", expected) != expected:
+                raise ValueError(
+                    "the checksum of its parts differs from the one in its header"
+                )
+        damaged = archive.testzip()  # compares the CRCs
+        if damaged is not None:
             raise ValueError(f"{damaged} is damaged")
     with np.load(path, allow_pickle=False) as file:
-        return header, {
-            name: file[name]
-            for name in file.files
-            if name != _HEADER and (not names or name in names)
-        }
+        chosen = [n for n in file.files if n != _HEADER and (not names or n in names)]
+        return header, {name: file[name] for name in chosen}
 
 
 def _check_array_size(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> None:
-    """Raises ``ValueError`` of an array that says to be larger or smaller than it is."""
+    """Raises ``ValueError`` where an array says to be larger or smaller than it is."""
     with archive.open(info) as member:
         version = np.lib.format.read_magic(member)
         if version == (1, 0):
@@ -281,7 +312,7 @@ def _check_array_size(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> None:
 def _content(
     path: Path, kind: str, header_only: bool = False
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """The header and the arrays of a model file; damage makes libraries raise whatever they meet first."""
+    """Reads the header and the arrays of a model file."""
     try:
         if _is_npz(path):
             header, arrays = read_npz(path)
@@ -291,13 +322,15 @@ def _content(
                 if len(text) > _LONGEST:
                     raise ValueError(f"its header is longer than {_LONGEST} characters")
                 header = json.loads(text)
-                wanted = (
-                    [] if header_only or not isinstance(header, dict) else file.keys()
-                )
-                arrays = {name: file.get_tensor(name) for name in wanted}
-    except Exception as error:
-        what = f"damaged, or not a file of this package; expected a saved {kind}"
-        raise DataError(f"{path}: {what} ({_reason(error)})") from error
+                names = file.keys()
+                if header_only or not isinstance(header, dict):
+                    names = []
+                arrays = {name: file.get_tensor(name) for name in names}
+    except Exception as error:  # damage makes libraries raise whatever they meet first
+        raise DataError(
+            f"{path}: damaged, or not a file of this package; expected a saved {kind} "
+            f"({_reason(error)})"
+        ) from error
     if not isinstance(header, dict) or header.get("format") != _FORMAT:
         raise DataError(f"{path}: a file of something else; expected a saved {kind}")
     version = header.get("format_version")
@@ -320,28 +353,30 @@ def _without_checksum(header: dict[str, Any]) -> dict[str, Any]:
 
 
 def _npz_checksum(header: dict[str, Any], archive: zipfile.ZipFile) -> str:
-    parts = sorted(
-        (i.filename, i.file_size, i.CRC)
-        for i in archive.infolist()
-        if i.filename.endswith(".npy")
+    members = sorted(
+        (info.filename, info.file_size, info.CRC)
+        for info in archive.infolist()
+        if info.filename.endswith(".npy")
     )
-    return hashlib.sha256(
-        json.dumps([_without_checksum(header), parts], sort_keys=True).encode()
-    ).hexdigest()
+    text = json.dumps([_without_checksum(header), members], sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def _checksum(header: dict[str, Any], arrays: Mapping[str, np.ndarray]) -> str:
-    found = hashlib.sha256(
-        json.dumps(_without_checksum(header), sort_keys=True).encode()
-    )
+    text = json.dumps(_without_checksum(header), sort_keys=True)
+    digest = hashlib.sha256(text.encode())
     for name in sorted(arrays):
-        found.update(f"{name} {arrays[name].dtype} {arrays[name].shape}".encode())
-        found.update(arrays[name].data if arrays[name].size else b"")
-    return found.hexdigest()
+        array = arrays[name]
+        digest.update(f"{name} {array.dtype} {array.shape}".encode())
+        digest.update(array.data if array.size else b"")
+    return digest.hexdigest()
 
 
 def _packed(name: str, value: Tensor) -> Tensor:
-    """A factor (k, N, N) as its lower triangle, row by row (k, N (N + 1) / 2); anything else as it is."""
+    """Packs a factor (k, N, N) to its lower triangle, row by row (k, N (N + 1) / 2).
+
+    Anything else stays as it is.
+    """
     if not name.endswith("cholesky"):
         return value
     rows, columns = torch.tril_indices(*value.shape[-2:], device=value.device)
@@ -349,26 +384,35 @@ def _packed(name: str, value: Tensor) -> Tensor:
 
 
 def _restored(name: str, stored: np.ndarray, order: list[int]) -> Tensor:
-    """The tensor of an array, lying in memory as it did when it was saved."""
+    """Returns the tensor of an array, lying in memory as it did when it was saved.
+
+    Args:
+        name: Of the tensor: a factor is stored as its lower triangle.
+        stored: The array of the file.
+        order: The tensor's dimensions from the outermost to the innermost.
+    """
     if stored.dtype.name not in _DTYPES.values():
         raise ValueError(
-            f"{name} must be of type {' or '.join(_DTYPES.values())}; got {stored.dtype}"
+            f"{name} must be of type {' or '.join(_DTYPES.values())}; "
+            f"got {stored.dtype}"
         )
-    shape = stored.shape
-    triangular = name.endswith("cholesky")
+    is_triangle = name.endswith("cholesky")
     size = math.isqrt(2 * stored.shape[-1])
-    whole = (len(stored), size, size) if triangular else shape
-    if sorted(order) != list(range(len(whole))) or (
-        triangular and shape != (len(stored), size * (size + 1) // 2)
-    ):
-        raise ValueError(f"{name} of shape {shape} cannot lie in the order {order}")
-    inverse = sorted(range(len(whole)), key=order.__getitem__)
-    array = np.zeros([whole[d] for d in order], stored.dtype).transpose(
-        inverse
-    )  # pages that nobody writes are free
-    if not triangular:
+    shape = (len(stored), size, size) if is_triangle else stored.shape
+    is_order = sorted(order) == list(range(len(shape)))
+    fits = not is_triangle or stored.shape == (len(stored), size * (size + 1) // 2)
+    if not is_order or not fits:
+        raise ValueError(
+            f"{name} of shape {stored.shape} cannot lie in the order {order}"
+        )
+    inverse_order = sorted(range(len(shape)), key=order.__getitem__)
+    # Pages that nobody writes are free.
+    in_memory = np.zeros([shape[i] for i in order], stored.dtype)
+    array = in_memory.transpose(inverse_order)
+    if is_triangle:
+        for row in range(size):
+            start = row * (row + 1) // 2
+            array[:, row, : row + 1] = stored[:, start : start + row + 1]
+    else:
         array[...] = stored
-    for row in range(size if triangular else 0):
-        start = row * (row + 1) // 2
-        array[:, row, : row + 1] = stored[:, start : start + row + 1]
     return torch.from_numpy(array)

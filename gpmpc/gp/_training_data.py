@@ -68,7 +68,7 @@ class TrainingData:
 
     @property
     def unsearched_outputs(self) -> NDArray[np.bool_]:
-        """Outputs (k,) that never change and have a prior deviation, so need no search."""
+        """Outputs (k,) that never change and have a prior deviation."""
         return self.constants.outputs & (self.prior.deviations is not None)
 
 

@@ -1,8 +1,9 @@
 """Observed transitions (x[k], u[k]) -> x[k+1], the data of a dynamics model.
 
-They come from arrays, an ``.npz`` file, a CSV file with named columns, or the text format in which Cao, Lai and Alam
-published their data, and are finite float64 of matching shapes; errors name file, row and column.
-Names and time step stand with them where they are known: tables of pandas and CSV files have names.
+They come from arrays, an ``.npz`` file, a CSV file with named columns, or the text
+format in which Cao, Lai and Alam published their data, and are finite float64 of
+matching shapes; errors name file, row and column. Names and time step stand with them
+where they are known: tables of pandas and CSV files have names.
 """
 
 import csv
@@ -38,8 +39,8 @@ _EXPECTED = "a file of transitions"
 class Transitions:
     """N observed transitions of a system with n states and m inputs, as float64.
 
-    Columns of tables are sorted by name, next states like the states: by the same names,
-    or by these with one prefix or suffix (``next_angle``, ``next_rate``).
+    Columns of tables are sorted by name, next states like the states: by the same
+    names, or by these with one prefix or suffix (``next_angle``, ``next_rate``).
 
     Raises:
         ShapeError: The three do not belong together, there is no row, or there are not
@@ -47,7 +48,9 @@ class Transitions:
         DataError: An entry is not finite (its row and column are named, from 1), or no
             number; or a table has other columns than its names say.
 
-    >>> data = Transitions(states=[[0.0], [1.0]], inputs=[[0.5], [0.5]], next_states=[[1.0], [2.0]])
+    >>> data = Transitions(
+    ...     states=[[0.0], [1.0]], inputs=[[0.5], [0.5]], next_states=[[1.0], [2.0]]
+    ... )
     >>> len(data), data[1:].states.tolist()
     (2, [[1.0]])
     """
@@ -69,12 +72,7 @@ class Transitions:
         ) -> None: ...
 
     def __post_init__(self) -> None:
-        check_signals(self.signals)
-        signals = Signals(
-            self.signals.state_names or names_of(self.states),
-            self.signals.input_names or names_of(self.inputs),
-            self.signals.time_step,
-        )
+        signals = signals_of_tables(self.signals, self.states, self.inputs)
         tables = {
             "states": _real("states", self.states, signals.state_names),
             "inputs": _real("inputs", self.inputs, signals.input_names),
@@ -84,18 +82,19 @@ class Transitions:
         for name, value in tables.items():
             if value.dim() != 2:
                 raise ShapeError(
-                    f"{name} must have two dimensions (rows, columns); got shape {tuple(value.shape)}"
+                    f"{name} must have two dimensions (rows, columns); "
+                    f"got shape {tuple(value.shape)}"
                 )
-            for row, column in torch.nonzero(~torch.isfinite(value))[:1].tolist():
-                got = (
-                    f"{float(value[row, column])} in row {row + 1}, column {column + 1}"
-                )
-                raise DataError(f"{name} must be finite; got {got}")
+            _check_finite(name, value)
             object.__setattr__(self, name, value)
-        x, u, after = (tuple(getattr(self, name).shape) for name in _NAMES)
+        x = tuple(self.states.shape)
+        u = tuple(self.inputs.shape)
+        after = tuple(self.next_states.shape)
         if x != after or x[0] != u[0] or not x[0]:
-            rule = "states (N, n), inputs (N, m), next_states (N, n) need the same n and number N of rows, one or more"
-            raise ShapeError(f"{rule}; got {x}, {u} and {after}")
+            raise ShapeError(
+                "states (N, n), inputs (N, m), next_states (N, n) need the same n and "
+                f"number N of rows, one or more; got {x}, {u} and {after}"
+            )
         signals.check_sizes(self.state_dim, self.input_dim)
 
     def __len__(self) -> int:
@@ -120,24 +119,25 @@ class Transitions:
         return torch.cat([self.states, self.inputs], dim=1)
 
     def targets(self, predicts: str, angles: Sequence[int] = ()) -> Tensor:
-        """What GPs that predict ``"next_state"`` or ``"difference"`` learn of them (N, n).
+        """Returns what GPs learn that predict next states or differences (N, n).
 
-        Differences of ``angles``, indices of states in rad, are taken within half a turn: a sensor may wrap them.
+        Differences of ``angles``, indices of states in rad, are taken within half a
+        turn: a sensor may wrap them.
 
         Raises:
             UnsupportedModel: They predict values, which transitions do not hold.
         """
         if predicts == "value":
             raise UnsupportedModel(
-                "transitions hold no targets of GPs with predicts='value': use append_points, "
-                "or fit(features, targets, ...) of a trainer"
+                "transitions hold no targets of GPs with predicts='value': use "
+                "append_points, or fit(features, targets, ...) of a trainer"
             )
         if predicts == "difference":
             return state_difference(self.next_states, self.states, angles)
         return self.next_states
 
     def __getitem__(self, rows: slice | Sequence[int]) -> "Transitions":
-        """The transitions of some rows, in the order given."""
+        """Returns the transitions of some rows, in their order."""
         return Transitions(
             self.states[rows], self.inputs[rows], self.next_states[rows], self.signals
         )
@@ -151,7 +151,7 @@ class Transitions:
 
     @classmethod
     def load(cls, path: str | Path) -> "Transitions":
-        """Reads what ``save`` wrote, or NumPy's ``savez`` of arrays with the same names.
+        """Reads what ``save`` wrote, or ``numpy.savez`` of arrays with the same names.
 
         Raises:
             DataError: The file is missing, damaged, or not such a file.
@@ -168,27 +168,39 @@ class Transitions:
             )
         if not arrays["states"].size:
             raise DataError(f"{path}: holds no states")
-        states, inputs, next_states = (arrays[name] for name in _NAMES)
-        return _with_path(path, states, inputs, next_states, signals)
+        return _from_file(
+            path,
+            states=arrays["states"],
+            inputs=arrays["inputs"],
+            next_states=arrays["next_states"],
+            signals=signals,
+        )
 
     @classmethod
     def from_text(
         cls, path: str | Path, state_dim: int = 6, input_dim: int = 3
     ) -> "Transitions":
-        """Reads blank-separated columns x[k] (n), u[k] (m), x[k+1] (n), the format of Cao, Lai and Alam's data.
+        """Reads blank-separated columns x[k] (n), u[k] (m), x[k+1] (n).
+
+        That is the format of Cao, Lai and Alam's data.
 
         Raises:
-            DataError: The file is missing, a row has another number of columns, or an entry is no finite number.
+            DataError: The file is missing, a row has another number of columns, or an
+                entry is no finite number.
         """
         check_number("state_dim", state_dim, least=1, whole=True)
         check_number("input_dim", input_dim, least=0, whole=True)
         n = state_dim
         width = 2 * state_dim + input_dim
         lines = enumerate(map(str.split, _text(path).splitlines()), start=1)
-        table = _table(
-            path, lines, {number: number - 1 for number in range(1, width + 1)}, width
+        places = {number: number - 1 for number in range(1, width + 1)}
+        table = _table(path, lines, places, width)
+        return _from_file(
+            path,
+            states=table[:, :n],
+            inputs=table[:, n:-n],
+            next_states=table[:, -n:],
         )
-        return _with_path(path, table[:, :n], table[:, n:-n], table[:, -n:])
 
     @classmethod
     def from_csv(
@@ -202,71 +214,64 @@ class Transitions:
         """Reads named columns of a CSV file with a header line.
 
         Args:
-            path: The file; separated by commas, or by semicolons or tabs where the header has them.
+            path: The file; separated by commas, or by semicolons or tabs where the
+                header has them.
             states: Names of the columns x[k].
             inputs: Names of the columns u[k].
-            next_states: Names of the columns x[k+1], sorted as the states where they are
-                the states' names with a prefix or suffix. ``None`` takes the file for
-                one recording at equal time steps: the next row's states are the next
-                states, and the last row only serves as such.
+            next_states: Names of the columns x[k+1], sorted as the states where they
+                are the states' names with a prefix or suffix. ``None`` takes the file
+                for one recording at equal time steps: the next row's states are the
+                next states, and the last row only serves as such.
             time_step: Between the two states of a row [s], where it is known.
 
         Raises:
             SettingError: One name was given where a list of them belongs.
             DataError: The file or a column is missing, or an entry is no finite number.
         """
-        for key, names in (
-            ("states", states),
-            ("inputs", inputs),
-            ("next_states", next_states or ()),
-        ):
-            if isinstance(names, str) or not isinstance(names, Iterable):
-                raise SettingError(
-                    key, f"must be a list of column names; got {names!r}"
-                )
+        _check_name_list("states", states)
+        _check_name_list("inputs", inputs)
+        _check_name_list("next_states", next_states or ())
         states = list(states)
         inputs = list(inputs)
-        next_states = None if next_states is None else list(next_states)
         if not states:
             raise SettingError("states", "must name a column; got none")
-        text = _text(path)
-        reader = csv.reader(
-            io.StringIO(text), delimiter=max(",;\t", key=text.partition("\n")[0].count)
-        )
-        try:
-            (_, header), *lines = [(reader.line_num, fields) for fields in reader] or [
-                (1, [])
-            ]
-        except csv.Error as error:
-            raise DataError(
-                f"{path}: row {reader.line_num} cannot be read ({error})"
-            ) from error
-        header = [name.strip() for name in header]
-        wanted = [*states, *inputs, *(next_states or ())]
-        for name in wanted:
-            if header.count(name) != 1:
-                problem = "stands there twice" if name in header else "is missing"
-                raise DataError(
-                    f"{path}: column {name!r} {problem}; the header has {', '.join(header) or 'no columns'}"
-                )
-        places = {name: header.index(name) for name in wanted}
-        table = _table(path, lines, places, len(header), least=1 if next_states else 2)
-        signals = Signals(list(states), list(inputs), time_step)
-        column = list(places).index
-        x, u, after = (
-            table[:, list(map(column, part))]
-            for part in (states, inputs, next_states or states)
-        )
-        if next_states:
-            named = _without_affixes(list(next_states), signals.state_names)
-            order = order_of(named, signals.state_names)
-            after = after if order is None else after[:, order]
-            return _with_path(path, x, u, after, signals)
-        return _with_path(path, x[:-1], u[:-1], after[1:], signals)
+        is_recording = not next_states
+        next_names = list(next_states or states)
+        header, lines = _csv_lines(path)
+        columns = [*states, *inputs, *next_names]
+        _check_header(path, header, columns)
+        places = {name: header.index(name) for name in columns}
+        table = _table(path, lines, places, len(header), least=2 if is_recording else 1)
+        index = {name: i for i, name in enumerate(places)}
+        x = table[:, [index[name] for name in states]]
+        u = table[:, [index[name] for name in inputs]]
+        after = table[:, [index[name] for name in next_names]]
+        signals = Signals(states, inputs, time_step)
+        if is_recording:
+            return _from_file(path, x[:-1], u[:-1], after[1:], signals)
+        stems = _without_affixes(next_names, signals.state_names)
+        order = order_of(stems, signals.state_names)
+        if order is not None:
+            after = after[:, order]
+        return _from_file(path, x, u, after, signals)
+
+
+def signals_of_tables(signals: Signals, states: Any, inputs: Any) -> Signals:
+    """Returns signals with the names of tables' columns where they have none.
+
+    Raises:
+        SettingError: They are no ``Signals``.
+    """
+    check_signals(signals)
+    return Signals(
+        state_names=signals.state_names or names_of(states),
+        input_names=signals.input_names or names_of(inputs),
+        time_step=signals.time_step,
+    )
 
 
 def check_transitions(transitions: Any, model: Any = None) -> None:
-    """Raises unless these are transitions, of as many states and inputs as a model, where one is given, has."""
+    """Raises unless these are transitions, and fit a model where there is one."""
     if not isinstance(transitions, Transitions):
         raise SettingError(
             "transitions", f"must be Transitions(...); got {type(transitions).__name__}"
@@ -280,17 +285,28 @@ def check_transitions(transitions: Any, model: Any = None) -> None:
         signals_of(model).check("the model", transitions.signals, "transitions")
 
 
+def _check_finite(name: str, value: Tensor) -> None:
+    """Raises ``DataError``, with row and column, unless a table is finite."""
+    bad = torch.nonzero(~torch.isfinite(value))
+    if len(bad):
+        row, column = bad[0].tolist()
+        raise DataError(
+            f"{name} must be finite; got {float(value[row, column])} in row {row + 1}, "
+            f"column {column + 1}"
+        )
+
+
 def _real(key: str, values: Any, names: Sequence[str] = ()) -> Tensor:
-    """A table of numbers as float64, its columns in the order of the names."""
-    real = isinstance(values, Tensor) and values.dtype != torch.bool
-    if real and not (values.is_complex() or values.requires_grad):
+    """Reads a table of numbers as float64, its columns in the order of the names."""
+    is_tensor = isinstance(values, Tensor) and values.dtype != torch.bool
+    if is_tensor and not values.is_complex() and not values.requires_grad:
         return values.to(torch.float64)
     rule = "must be numbers in rows and columns"
     return torch.from_numpy(np.array(read_array(key, values, names, rule)))
 
 
 def _real_next(values: Any, states: Any, signals: Signals) -> Tensor:
-    """Next states as float64, whose columns stand in the order of the states'.
+    """Reads next states as float64, their columns in the order of the states'.
 
     Raises:
         DataError: Both are tables, and no column says which state it belongs to.
@@ -312,7 +328,7 @@ def _real_next(values: Any, states: Any, signals: Signals) -> Tensor:
 
 
 def _without_affixes(labels: Sequence[Any], names: Sequence[Any]) -> Sequence[Any]:
-    """The names in labels that are these between one prefix and one suffix."""
+    """Strips from labels one prefix and one suffix around the names, if there are."""
     if not all(isinstance(label, str) for label in (*labels, *names)):
         return labels
     for name in names:
@@ -320,6 +336,46 @@ def _without_affixes(labels: Sequence[Any], names: Sequence[Any]) -> Sequence[An
         if found and {f"{prefix}{each}{suffix}" for each in names} == set(labels):
             return [label.removeprefix(prefix).removesuffix(suffix) for label in labels]
     return labels
+
+
+def _check_name_list(key: str, names: Any) -> None:
+    """Raises ``SettingError`` where one name stands in the place of a list."""
+    if isinstance(names, str) or not isinstance(names, Iterable):
+        raise SettingError(key, f"must be a list of column names; got {names!r}")
+
+
+def _csv_lines(path: str | Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
+    """Reads the header of a CSV file, and its lines with their numbers.
+
+    Raises:
+        DataError: The file is missing, or a line cannot be read.
+    """
+    text = _text(path)
+    first_line = text.partition("\n")[0]
+    delimiter = max(",;\t", key=first_line.count)
+    reader = csv.reader(io.StringIO(text), delimiter=delimiter)
+    try:
+        lines = [(reader.line_num, fields) for fields in reader]
+    except csv.Error as error:
+        raise DataError(
+            f"{path}: row {reader.line_num} cannot be read ({error})"
+        ) from error
+    if not lines:
+        return [], []
+    header = [name.strip() for name in lines[0][1]]
+    return header, lines[1:]
+
+
+def _check_header(path: str | Path, header: list[str], names: list[str]) -> None:
+    """Raises ``DataError`` unless each name stands in the header once."""
+    for name in names:
+        if header.count(name) == 1:
+            continue
+        problem = "stands there twice" if name in header else "is missing"
+        raise DataError(
+            f"{path}: column {name!r} {problem}; "
+            f"the header has {', '.join(header) or 'no columns'}"
+        )
 
 
 def _text(path: str | Path) -> str:
@@ -337,23 +393,31 @@ def _table(
     width: int,
     least: int = 1,
 ) -> np.ndarray:
-    """The numbers in the columns, at the places by their names, of ``least`` or more lines that are not empty."""
+    """Reads the numbers of a file's columns (N, d); empty lines do not count.
+
+    Args:
+        path: The file, for messages.
+        lines: The number and the fields of each line.
+        columns: The place of each column by its name.
+        width: Number of fields that a line must have.
+        least: Least number of lines.
+    """
     rows = []
     for line, fields in lines:
-        if fields and len(fields) != width:
+        if not fields:
+            continue
+        if len(fields) != width:
             raise DataError(
                 f"{path}: row {line} has {len(fields)} columns; expected {width}"
             )
-        if fields:
-            rows.append(
-                [
-                    _number(path, line, name, fields[place])
-                    for name, place in columns.items()
-                ]
-            )
+        row = [
+            _number(path, line, name, fields[place]) for name, place in columns.items()
+        ]
+        rows.append(row)
     if len(rows) < least:
         raise DataError(
-            f"{path}: the file holds {len(rows)} rows; expected {least} or more, of {width} columns"
+            f"{path}: the file holds {len(rows)} rows; expected {least} or more, "
+            f"of {width} columns"
         )
     return np.array(rows)
 
@@ -365,18 +429,20 @@ def _number(path: str | Path, row: int, column: int | str, field: str) -> float:
         value = np.nan
     if not np.isfinite(value) or "_" in field:  # Python takes 1_0 for 10
         raise DataError(
-            f"{path}: row {row}, column {column} is {field.strip()!r}; expected a finite number"
+            f"{path}: row {row}, column {column} is {field.strip()!r}; "
+            "expected a finite number"
         )
     return value
 
 
-def _with_path(
+def _from_file(
     path: str | Path,
     states: Any,
     inputs: Any,
     next_states: Any,
     signals: Signals = UNKNOWN,
 ) -> Transitions:
+    """Makes transitions; the message of an error names the file."""
     try:
         return Transitions(states, inputs, next_states, signals)
     except GpmpcError as error:

@@ -1,10 +1,12 @@
-"""Finds states that jump by whole turns: angles that a sensor shows within a turn, and that nobody declared.
+"""Finds angles that a sensor shows within a turn, and that nobody declared.
 
-A model that takes such a jump for a change of the state learns that a pendulum is thrown by a turn where it passes
-the seam. An angle that wraps has three marks, which honest large steps do not have together: there are steps of almost
-a turn and, but for these, only steps that are far smaller; without the turn the large ones are as small as the others;
-and all values lie within one turn. Where values lie farther apart, as where a simulator counts turns in its states and
-wraps in its next states, the large steps have to be whole turns as exactly as the others are small.
+A model that takes such a jump for a change of the state learns that a pendulum is
+thrown by a turn where it passes the seam. An angle that wraps has three marks, which
+honest large steps do not have together: there are steps of almost a turn and, but for
+these, only steps that are far smaller; without the turn the large ones are as small as
+the others; and all values lie within one turn. Where values lie farther apart, as where
+a simulator counts turns in its states and wraps in its next states, the large steps
+have to be whole turns as exactly as the others are small.
 """
 
 import logging
@@ -29,8 +31,8 @@ _AS_SMALL = (
 
 
 DECLARE = (
-    "Declare angles, in rad (train_residual or ResidualModel.train with angles={columns}), "
-    "or let them count turns (numpy.unwrap)"
+    "Declare angles, in rad (train_residual or ResidualModel.train with "
+    "angles={columns}), or let them count turns (numpy.unwrap)"
 )
 
 
@@ -43,7 +45,10 @@ class Turn(NamedTuple):
 
 
 # Many honest states reach hundreds, few of them 6: what counts for degrees is stricter.
-_TURNS = Turn(TURN, "2 pi", 1 / 6), Turn(360.0, "360", 1 / 36)
+_TURNS = (
+    Turn(size=TURN, words="2 pi", far_smaller=1 / 6),
+    Turn(size=360.0, words="360", far_smaller=1 / 36),
+)
 
 
 class WrappedColumn(NamedTuple):
@@ -73,47 +78,55 @@ def wrapped_columns(
 def warn_of_turns(
     transitions: Transitions, angles: Sequence[int] = (), remedy: str = DECLARE
 ) -> None:
-    """Logs which states jump by whole turns although they are not among the declared angles.
+    """Logs which states jump by whole turns although they are no declared angles.
 
     Args:
         transitions: What a model is about to learn from.
         angles: Indices of the states that are declared.
-        remedy: What the message tells the user to do; ``{columns}`` stands for the indices.
+        remedy: What the message tells the user to do; ``{columns}`` stands for the
+            indices.
     """
     columns = wrapped_columns(
         transitions.states.numpy(force=True), transitions.next_states.numpy(force=True)
     )
-    undeclared = [found for found in columns if found.column not in angles]
+    undeclared = [wrapped for wrapped in columns if wrapped.column not in angles]
     if not undeclared:
         return
-    what = "; ".join(
-        f"column {found.column + 1} of the states jumps by whole turns ({found.turn}) "
-        f"in {found.rows} of {len(transitions)} rows"
-        for found in undeclared
-    )
+    jumps = [
+        f"column {wrapped.column + 1} of the states jumps by whole turns "
+        f"({wrapped.turn}) in {wrapped.rows} of {len(transitions)} rows"
+        for wrapped in undeclared
+    ]
     _log.warning(
-        "%s, as an angle does that is shown within one turn: jumps are learned as motion. %s",
-        what,
-        remedy.format(columns=[found.column for found in undeclared]),
+        "%s, as an angle does that is shown within one turn: jumps are learned as "
+        "motion. %s",
+        "; ".join(jumps),
+        remedy.format(columns=[wrapped.column for wrapped in undeclared]),
     )
 
 
 def _jumps(before: NDArray[np.float64], after: NDArray[np.float64], turn: Turn) -> int:
-    """How many steps of a column (N,) are whole turns; none unless that is what they are."""
+    """Counts the steps of a column (N,) that are whole turns.
+
+    Zero unless the column has all marks of an angle that wraps.
+    """
     steps = (after - before) / turn.size
     large = np.abs(steps) > 0.5
-    others = np.abs(steps[~large])
+    small_steps = np.abs(steps[~large])
     count = int(large.sum())
-    if not count or len(others) < 2:
+    if not count or len(small_steps) < 2:
         return 0
-    largest_other = float(others.max())
+    largest_small = float(small_steps.max())
     remainder = float(np.abs(steps[large] - np.round(steps[large])).max())
     lowest = min(before.min(), after.min())
     highest = max(before.max(), after.max())
     if highest - lowest <= (1 + 2 * _SLACK) * turn.size:
-        far_smaller = turn.far_smaller
-        small = _AS_SMALL * largest_other + _SLACK
-    else:
-        far_smaller = min(turn.far_smaller, _FAR_SMALLER_APART)
-        small = min(_AS_SMALL * largest_other, _EXACT) if count > 1 else 0.0
-    return count if largest_other <= far_smaller and remainder <= small else 0
+        step_limit = turn.far_smaller
+        remainder_limit = _AS_SMALL * largest_small + _SLACK
+    else:  # values lie farther apart than a turn
+        step_limit = min(turn.far_smaller, _FAR_SMALLER_APART)
+        remainder_limit = 0.0
+        if count > 1:
+            remainder_limit = min(_AS_SMALL * largest_small, _EXACT)
+    wraps = largest_small <= step_limit and remainder <= remainder_limit
+    return count if wraps else 0

@@ -1,14 +1,17 @@
-"""A learned model as a CasADi function, for users with an optimal control problem and IPOPT of their own.
+"""A learned model as a CasADi function, for optimal control problems of one's own.
 
-    mean_a = offset_a + sum_i beta_ai k_ai (+ x_a),   variance_a = sf2_a - |L_a^-1 k_a|^2,   k_ai = k_a(x~_i, x~)
+    mean_a     = offset_a + sum_i beta_ai k_ai (+ x_a)
+    variance_a = sf2_a - |L_a^-1 k_a|^2,               k_ai = k_a(x~_i, x~)
 
-is written with a dozen matrix nodes of CasADi's MX, whatever N, from which CasADi derives exact Jacobians and Hessians
-(Andersson, Gillis, Horn, Rawlings and Diehl, 2019). Importing this file loads CasADi; ``gpmpc.gp`` does not.
+is written with a dozen matrix nodes of CasADi's MX, whatever N, from which CasADi
+derives exact Jacobians and Hessians (Andersson, Gillis, Horn, Rawlings and Diehl,
+2019). Expressions of CasADi become tapes for the compiled kernels (``tape_of``), and
+tapes expressions. Importing this file loads CasADi; ``gpmpc.gp`` does not.
 """
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import casadi
 import numpy as np
@@ -22,38 +25,57 @@ from gpmpc.gp._posterior import GPPosterior
 Array = np.ndarray
 
 
-def casadi_function(model: Any, name: str = "gp") -> casadi.Function:
-    """Builds ``model.predict`` as a CasADi function (state, input) -> (mean, variance), in physical units.
+class _Prediction(NamedTuple):
+    """A prediction as an expression."""
 
-    Over a horizon use ``function.map(H)``, which takes columns (n, H) and (m, H).
+    mean: casadi.MX  #: (k,)
+    variance: casadi.MX  #: (k,)
+
+
+def casadi_function(model: Any, name: str = "gp") -> casadi.Function:
+    """Builds ``model.predict`` as a CasADi function (state, input) -> (mean, variance).
+
+    All are in physical units. Over a horizon use ``function.map(H)``, which takes
+    columns (n, H) and (m, H).
 
     Args:
-        model: A posterior, or a residual model whose nominal model and effect are numbers (``Affine``, a tensor) or
-            written in CasADi (``CasadiFunction``); it is evaluated in double precision.
+        model: A posterior, or a residual model whose nominal model and effect are
+            numbers (``Affine``, a tensor) or written in CasADi (``CasadiFunction``); it
+            is evaluated in double precision.
         name: Of the function.
 
     Returns:
-        A function of ``state`` (n,) and ``input`` (m,) that gives ``mean`` (k,) and ``variance`` (k,), the diagonal of
-        the predicted covariance, without observation noise. The mean is of the next state (a model of differences
-        has added the state), or of the value that the model predicts.
+        A function of ``state`` (n,) and ``input`` (m,) that gives ``mean`` (k,) and
+        ``variance`` (k,), the diagonal of the predicted covariance, without observation
+        noise. The mean is of the next state (a model of differences has added the
+        state), or of the value that the model predicts.
 
     Raises:
-        UnsupportedModel: The nominal model or the effect is a Python function, or it is another model.
+        UnsupportedModel: The nominal model or the effect is a Python function, or it is
+            another model.
     """
     x = casadi.MX.sym("state", model.state_dim)
     u = casadi.MX.sym("input", model.input_dim)
     if isinstance(model, GPPosterior):
-        mean, variance = _moments(model, x, u)
-        mean = mean + x if model.predicts == "difference" else mean
+        mean, variance = _predict_gps(model, x, u)
+        if model.predicts == "difference":
+            mean = mean + x
     else:
-        mean, variance = _residual(model, x, u)
+        mean, variance = _predict_residual_model(model, x, u)
     return casadi.Function(
         name, [x, u], [mean, variance], ["state", "input"], ["mean", "variance"]
     )
 
 
 def successor_function(plant: Any) -> casadi.Function:
-    """Writes the next state of a plant, such as a ``System``, as a CasADi function of state (n,) and input (m,)."""
+    """Writes the next state of a plant as a CasADi function of state and input.
+
+    Args:
+        plant: Such as a ``System``.
+
+    Raises:
+        SettingError: Its dynamics cannot be written in CasADi.
+    """
     x = casadi.SX.sym("x", len(plant.dynamics.state_names))
     u = casadi.SX.sym("u", len(plant.dynamics.input_names))
     entries = call_dynamics(plant.successor, x, u)
@@ -72,66 +94,72 @@ def _check_numbers(function: casadi.Function) -> None:
             raise SettingError("dynamics", f"{DYNAMICS_RULE}; got {got}")
 
 
-def _residual(model: Any, x: casadi.MX, u: casadi.MX) -> tuple[casadi.MX, casadi.MX]:
-    """Mean and variance (n,) of a residual model whose functions are numbers or written in CasADi."""
+def _predict_residual_model(model: Any, x: casadi.MX, u: casadi.MX) -> _Prediction:
+    """Predicts by a residual model of numbers and of functions written in CasADi."""
     nominal: Any = getattr(model, "nominal", None)
     B: Any = getattr(model, "B", None)
-    known: Any = getattr(nominal, "function", None)
-    effect: Any = getattr(B, "function", None)
-    affine = all(hasattr(nominal, part) for part in "ABc")
-    if not (known is not None or affine) or not (
-        effect is not None or isinstance(B, torch.Tensor)
-    ):
-        got = type(model).__name__ + (
-            f" of a nominal {type(nominal).__name__}" if nominal is not None else ""
-        )
+    is_affine = all(hasattr(nominal, part) for part in "ABc")
+    nominal_function: Any = getattr(nominal, "function", None)
+    effect_function: Any = getattr(B, "function", None)
+    nominal_known = is_affine or nominal_function is not None
+    effect_known = isinstance(B, torch.Tensor) or effect_function is not None
+    if not nominal_known or not effect_known:
+        got = type(model).__name__
+        if nominal is not None:
+            got += f" of a nominal {type(nominal).__name__}"
         raise UnsupportedModel(
-            f"CasADi can take a GPPosterior, or a ResidualModel of Affine, CasadiFunction and numbers; got {got}"
+            "CasADi can take a GPPosterior, or a ResidualModel of Affine, "
+            f"CasadiFunction and numbers; got {got}"
         )
-    seen: list[Any] = []  # angles as sine and cosine
+    features: list[Any] = []
     for i in model.states:
-        seen += [casadi.sin(x[i]), casadi.cos(x[i])] if i in model.angles else [x[i]]
-    features, selected = (
-        casadi.vertcat(casadi.MX(0, 1), *some)
-        for some in (seen, [u[i] for i in model.inputs])
-    )
-    mean, variance = _moments(model.residual, features, selected)
-    matrix = _numbers(B) if effect is None else effect(x)
-    if affine:
-        A, G, c = (_numbers(getattr(nominal, part)) for part in "ABc")
-        moved = A @ x + G @ u + c
+        if i in model.angles:
+            features += [casadi.sin(x[i]), casadi.cos(x[i])]
+        else:
+            features.append(x[i])
+    inputs = [u[i] for i in model.inputs]
+    residual = _predict_gps(model.residual, _column(features), _column(inputs))
+    effect = _numbers(B) if effect_function is None else effect_function(x)
+    if is_affine or nominal_function is None:
+        A = _numbers(nominal.A)
+        G = _numbers(nominal.B)
+        c = _numbers(nominal.c)
+        nominal_mean = A @ x + G @ u + c
     else:
-        moved = nominal.function(x, u)
-    return moved + matrix @ mean, matrix**2 @ variance
+        nominal_mean = nominal_function(x, u)
+    return _Prediction(
+        mean=nominal_mean + effect @ residual.mean,
+        variance=effect**2 @ residual.variance,
+    )
 
 
-def _moments(
-    gp: GPPosterior, x: casadi.MX, u: casadi.MX
-) -> tuple[casadi.MX, casadi.MX]:
-    """Mean (k,) and variance (k,) of the GPs at x and u."""
-    points = _numbers(gp.features)
+def _column(entries: list[Any]) -> casadi.MX:
+    """Joins entries to a column, which may be empty."""
+    return casadi.vertcat(casadi.MX(0, 1), *entries)
+
+
+def _predict_gps(gp: GPPosterior, x: casadi.MX, u: casadi.MX) -> _Prediction:
+    """Predicts the GPs at x and u."""
     size = len(gp)
+    points = _numbers(gp.features)
     difference = points - casadi.repmat(casadi.vertcat(x, u).T, size, 1)  # (N, d)
-    exponents = (
-        difference**2 @ _numbers(gp.lengthscales.mT.double() ** -2) / -2
-    )  # (N, k)
-    k = casadi.exp(exponents) * casadi.repmat(_numbers(gp.signal_variance).T, size, 1)
+    inverse_squares = _numbers(gp.lengthscales.mT.double() ** -2)
+    exponents = difference**2 @ inverse_squares / -2  # (N, k)
+    signal = casadi.repmat(_numbers(gp.signal_variance).T, size, 1)
+    k = casadi.exp(exponents) * signal
     mean = casadi.sum1(k * _numbers(gp.weights.mT)).T + _numbers(gp.offset)
-    variance = []
+    variances = []
     lower = casadi.Sparsity.lower(size)
+    eye = torch.eye(size, dtype=torch.float64)
     for a, column in enumerate(casadi.horzsplit(k)):
-        # The factor's inverse, since CasADi cannot serialise its triangular solve; both lose the same digits.
-        eye = torch.eye(size, dtype=torch.float64)
-        inverse = torch.linalg.solve_triangular(
-            gp.cholesky[a].detach().double().cpu(), eye, upper=False
-        )
+        # The factor's inverse, since CasADi cannot serialise its triangular solve; both
+        # lose the same digits.
+        factor = gp.cholesky[a].detach().double().cpu()
+        inverse = torch.linalg.solve_triangular(factor, eye, upper=False)
         entries = casadi.DM(lower, inverse.numpy().T[np.triu_indices(size)])
-        variance.append(
-            casadi.fmax(
-                0, float(gp.signal_variance[a]) - casadi.sumsqr(entries @ column)
-            )
-        )
-    return mean, casadi.vertcat(*variance)
+        reduction = casadi.sumsqr(entries @ column)
+        variances.append(casadi.fmax(0, float(gp.signal_variance[a]) - reduction))
+    return _Prediction(mean=mean, variance=casadi.vertcat(*variances))
 
 
 def _numbers(tensor: torch.Tensor) -> casadi.DM:
@@ -139,35 +167,39 @@ def _numbers(tensor: torch.Tensor) -> casadi.DM:
 
 
 def tape_of(function: casadi.Function) -> tapes.Tape | None:
-    """Reads the operations of a CasADi function of dense vectors; None where there are others than a tape has.
+    """Reads the operations of a CasADi function of dense vectors.
 
-    The value is taken column by column, the arguments one after the other.
+    The value is taken column by column, the arguments one after the other. None where
+    there are other operations than a tape has.
     """
     try:
         function = function if function.is_a("SXFunction") else function.expand()
     except RuntimeError:  # it calls what is no expression
         return None
-    if not all(function.sparsity_in(i).is_dense() for i in range(function.n_in())):
+    arguments = range(function.n_in())
+    if not all(function.sparsity_in(i).is_dense() for i in arguments):
         return None
-    sizes = [function.numel_in(i) for i in range(function.n_in())]
-    first = np.concatenate([[0], np.cumsum(sizes)])
+    sizes = [function.numel_in(i) for i in arguments]
+    offsets = np.concatenate([[0], np.cumsum(sizes)])
     places = function.sparsity_out(0).find()
     code = np.zeros((function.n_instructions(), 4), dtype=np.int64)
     constants = np.zeros(len(code))
     for k, row in enumerate(code):
-        row[0] = function.instruction_id(k)
-        inputs = function.instruction_input(k)
-        outputs = function.instruction_output(k)
-        if row[0] not in tapes.OPERATIONS:
+        operation = function.instruction_id(k)
+        if operation not in tapes.OPERATIONS:
             return None
-        row[1] = places[outputs[1]] if row[0] == tapes.OUTPUT else outputs[0]
-        if row[0] == tapes.INPUT:
-            row[2] = first[inputs[0]] + inputs[1]
-        elif row[0] == tapes.CONST:
+        operands = function.instruction_input(k)
+        results = function.instruction_output(k)
+        row[0] = operation
+        row[1] = places[results[1]] if operation == tapes.OUTPUT else results[0]
+        if operation == tapes.INPUT:
+            argument, entry = operands
+            row[2] = offsets[argument] + entry
+        elif operation == tapes.CONST:
             constants[k] = function.instruction_constant(k)
         else:
-            row[2 : 2 + len(inputs)] = inputs
-            row[3] = inputs[-1]
+            row[2 : 2 + len(operands)] = operands
+            row[3] = operands[-1]
     return tapes.Tape(code, constants, function.sz_w(), function.numel_out(0))
 
 
@@ -176,8 +208,8 @@ def function_of_tape(
 ) -> casadi.Function:
     """Writes a tape as a CasADi function again: the inverse of ``tape_of``.
 
-    Its arguments and its value are made as large as ``sizes`` and ``shape`` say: who has
-    them from a file compares them with something first.
+    Its arguments and its value are made as large as ``sizes`` and ``shape`` say: who
+    has them from a file compares them with something first.
 
     Raises:
         DataError: Code (K, 4) and constants (K,) are no tape's, or a size is none.
@@ -189,41 +221,56 @@ def function_of_tape(
                 f"a size must be a whole number, zero or more; got {size!r}"
             )
     arguments = [casadi.SX.sym(f"argument{i}", size) for i, size in enumerate(sizes)]
-    entries: Any = casadi.vertcat(*arguments).elements()
+    entries = _run_tape(rows, constants.tolist(), casadi.vertcat(*arguments))
+    places = sorted(entries)
     count = shape[0] * shape[1]
+    if places and places[-1] >= count:
+        raise DataError(f"a value of {count} entries has none at {places[-1]}")
+    # Made at once: an entry that is added to a sparse vector moves all those behind it.
+    sparsity = casadi.Sparsity(count, 1, [0, len(places)], places)
+    column = casadi.SX(sparsity, casadi.vertcat(*(entries[place] for place in places)))
+    return casadi.Function("function", arguments, [casadi.reshape(column, *shape)])
+
+
+def _run_tape(
+    rows: list[list[int]], constants: list[float], arguments: casadi.SX
+) -> dict[int, casadi.SX]:
+    """Runs the operations of a tape; returns the entries of its value by their place.
+
+    Raises:
+        DataError: An operation is unknown, or takes what there is not.
+    """
+    elements: Any = arguments.elements()
     work: dict[int, casadi.SX] = {}
     value: dict[int, casadi.SX] = {}
     try:
-        for (operation, to, first, last), constant in zip(
-            rows, constants.tolist(), strict=True
-        ):
+        for row, constant in zip(rows, constants, strict=True):
+            operation, target, first, last = row
             if operation == tapes.OUTPUT:
-                value[to] = work[first]
+                value[target] = work[first]
             elif operation == tapes.INPUT:
-                work[to] = entries[first]
+                work[target] = elements[first]
             elif operation == tapes.CONST:
-                work[to] = casadi.SX(constant)
+                work[target] = casadi.SX(constant)
             elif operation in tapes.TWO_OPERANDS:
-                work[to] = casadi.SX.binary(operation, work[first], work[last])
+                work[target] = casadi.SX.binary(operation, work[first], work[last])
             elif operation in tapes.OPERATIONS:
-                work[to] = casadi.SX.unary(operation, work[first])
+                work[target] = casadi.SX.unary(operation, work[first])
             else:
                 raise DataError(f"there is no operation {operation}")
     except (IndexError, KeyError, RuntimeError, ValueError) as error:
         raise DataError(
             f"a function's operations do not follow from each other ({error})"
         ) from error
-    places = sorted(value)
-    if places and places[-1] >= count:
-        raise DataError(f"a value of {count} entries has none at {places[-1]}")
-    # Made at once: an entry that is added to a sparse vector moves all those behind it.
-    sparsity = casadi.Sparsity(count, 1, [0, len(places)], places)
-    column = casadi.SX(sparsity, casadi.vertcat(*(value[place] for place in places)))
-    return casadi.Function("function", arguments, [casadi.reshape(column, *shape)])
+    return value
 
 
 def _tape_rows(code: Array, constants: Array) -> list[list[int]]:
-    """The rows of a tape's code as whole numbers; ``DataError`` where they are none."""
+    """Reads the rows of a tape's code as whole numbers.
+
+    Raises:
+        DataError: They are none.
+    """
     if code.ndim != 2 or code.shape[1] != 4 or constants.shape != code.shape[:1]:
         raise DataError(
             f"code (K, 4) and constants (K,) must be of equal length; "

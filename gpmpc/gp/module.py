@@ -1,8 +1,9 @@
-"""A learned model as a torch module, for places without gpmpc: torch.export, ONNX, a C++ runtime.
+"""A learned model as a torch module, for torch.export, ONNX or a C++ runtime.
 
 With ``onnx`` and ``onnxscript`` installed,
 
-    torch.onnx.export(PosteriorModule(posterior), (state, input), "gp.onnx", dynamo=True)
+    torch.onnx.export(PosteriorModule(posterior), (state, input), "gp.onnx",
+    dynamo=True)
 """
 
 import torch
@@ -13,9 +14,13 @@ from gpmpc.gp._posterior import GPPosterior
 
 
 class PosteriorModule(torch.nn.Module):
-    """``GPPosterior.predict`` as a module: (state (*batch, n), input (*batch, m)) to mean and variance (*batch, k).
+    """``GPPosterior.predict`` as a module.
 
-    Its type and device are the posterior's; of anything else it raises ``UnsupportedModel``.
+    It maps state (*batch, n) and input (*batch, m) to mean and variance (*batch, k).
+    Its type and device are the posterior's.
+
+    Raises:
+        UnsupportedModel: The model is no ``GPPosterior``.
     """
 
     features: Tensor
@@ -30,14 +35,14 @@ class PosteriorModule(torch.nn.Module):
         if not isinstance(posterior, GPPosterior):
             got = type(posterior).__name__
             raise UnsupportedModel(
-                f"PosteriorModule takes a GPPosterior, such as a model's .residual; got {got}"
+                "PosteriorModule takes a GPPosterior, such as a model's .residual; "
+                f"got {got}"
             )
         eye = torch.eye(len(posterior), dtype=posterior.dtype, device=posterior.device)
-        # ONNX has no triangular solve. |L^-1 k|^2 loses fewer digits than k' (K + sn2 I)^-1 k.
-        self._add(
-            "inverse_factor",
-            torch.linalg.solve_triangular(posterior.cholesky, eye, upper=False),
-        )
+        # ONNX has no triangular solve. |L^-1 k|^2 loses fewer digits than
+        # k' (K + sn2 I)^-1 k.
+        inverse = torch.linalg.solve_triangular(posterior.cholesky, eye, upper=False)
+        self._add("inverse_factor", inverse)
         self._add(
             "inverse_lengthscales", posterior.lengthscales.reciprocal()[:, None, :]
         )
@@ -52,13 +57,14 @@ class PosteriorModule(torch.nn.Module):
         )
 
     def forward(self, state: Tensor, input: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean and variance of the latent next state, in physical units."""
+        """Computes mean and variance of the latent next state, in physical units."""
         query = torch.cat([state, input], dim=-1)
-        z = (self.features - query[..., None, :])[
-            ..., None, :, :
-        ] * self.inverse_lengthscales
+        difference = self.features - query[..., None, :]
+        z = difference[..., None, :, :] * self.inverse_lengthscales
         k = self.signal_variance[:, None] * torch.exp((z * z).sum(-1) * -0.5)
         mean = (k * self.weights).sum(-1) + self.offset
         whitened = (self.inverse_factor @ k[..., None])[..., 0]
         variance = (self.signal_variance - (whitened * whitened).sum(-1)).clamp_min(0)
-        return (mean + state if self.adds_state else mean), variance
+        if self.adds_state:
+            mean = mean + state
+        return mean, variance
