@@ -1,6 +1,7 @@
-"""Whether a reference leaves the range of the data that a model was learned from.
+"""Tells whether a reference leaves the range of the data that a model was learned from.
 
-A GP knows nothing beyond its data: its mean goes back to the prior's, and a controller follows it there.
+A GP knows nothing beyond its data: its mean goes back to the prior's, and a controller
+follows it there.
 """
 
 from typing import Any, NamedTuple
@@ -27,11 +28,13 @@ class BeyondData(NamedTuple):
     data: tuple[float, float]  #: those of the data
 
     def __str__(self) -> str:
-        """A line that says what to do."""
+        """Returns a line that says what to do."""
         reference = _in_words(self.reference)
         data = _in_words(self.data)
-        what = f"the reference of {self.name} is {reference}, its data {data}"
-        return f"{what}: learn from data there, too"
+        return (
+            f"the reference of {self.name} is {reference}, its data {data}: "
+            "learn from data there, too"
+        )
 
 
 def _in_words(limits: tuple[float, float]) -> str:
@@ -40,7 +43,7 @@ def _in_words(limits: tuple[float, float]) -> str:
 
 
 class _Column(NamedTuple):
-    """What a GP has seen of a state."""
+    """The range of a state that a GP has seen."""
 
     state: int
     low: float
@@ -50,14 +53,16 @@ class _Column(NamedTuple):
 
 
 def beyond_data(model: DynamicsModel, reference: Any) -> list[BeyondData]:
-    """Returns the states whose reference leaves the range of the data of a model's GPs, in their order.
+    """Returns the states whose reference leaves the range of the data of a model's GPs.
 
-    By more than a tenth of that range, and of the shortest lengthscale of the state: what a GP does not depend on may
-    be anything. States that no GP sees are left out, and models without data have none.
+    They are in their order. It leaves it by more than a tenth of that range, and of the
+    shortest lengthscale of the state: what a GP does not depend on may be anything.
+    States that no GP sees are left out, and models without data have none.
 
     Args:
         model: What was learned; models around it are looked through.
-        reference: A set point (n,), or states of any number of steps (K, n), as for a controller.
+        reference: A set point (n,), or states of any number of steps (K, n), as for a
+            controller.
     """
     signals = signals_of(model)
     states = np.atleast_2d(read_reference(reference).in_order(signals).states)
@@ -77,13 +82,14 @@ def beyond_data(model: DynamicsModel, reference: Any) -> list[BeyondData]:
         name = f"x{column.state + 1}"
         if signals.state_names:
             name = signals.state_names[column.state]
-        data = (column.low, column.high)
-        beyond.append(BeyondData(name, (low, high), data))
+        beyond.append(
+            BeyondData(name, reference=(low, high), data=(column.low, column.high))
+        )
     return beyond
 
 
 def _columns(model: Any) -> list[_Column]:
-    """What the GPs of a model have seen of its states, in the order of these."""
+    """Returns what the GPs of a model have seen of its states, in the order of these."""
     if isinstance(model, GPPosterior):
         return _columns_of(model, list(range(model.state_dim)), [])
     if isinstance(model, ResidualModel):
@@ -93,29 +99,28 @@ def _columns(model: Any) -> list[_Column]:
 
 
 def _columns_of(gp: GPPosterior, states: list[int], angles: list[int]) -> list[_Column]:
-    """The columns of the states that a GP sees, an angle as its sine and cosine."""
+    """Returns the columns of the states that a GP sees, an angle as sine and cosine."""
     features = to_array(gp.features)
     lengthscales = to_array(gp.lengthscales)
     shortest = lengthscales.min(axis=0)
     columns = []
-    at = 0
+    j = 0  # the feature that is next
     for state in states:
-        if state in angles:
-            low, high = _arc(np.arctan2(features[:, at], features[:, at + 1]))
-            shorter = float(shortest[at : at + 2].min())
-            columns.append(_Column(state, low, high, shorter, angle=True))
-            at += 2
-            continue
-        values = features[:, at]
-        low = float(values.min())
-        high = float(values.max())
-        columns.append(_Column(state, low, high, float(shortest[at])))
-        at += 1
+        is_angle = state in angles
+        width = 2 if is_angle else 1
+        if is_angle:
+            low, high = _arc(np.arctan2(features[:, j], features[:, j + 1]))
+        else:
+            low = float(features[:, j].min())
+            high = float(features[:, j].max())
+        lengthscale = float(shortest[j : j + width].min())
+        columns.append(_Column(state, low, high, lengthscale, angle=is_angle))
+        j += width
     return sorted(columns)
 
 
 def _arc(angles: Array) -> tuple[float, float]:
-    """Beginning and end of the shortest arc that holds angles [rad]."""
+    """Returns beginning and end of the shortest arc that holds angles [rad]."""
     ordered = np.sort(angles)
     gaps = np.append(np.diff(ordered), ordered[0] + TURN - ordered[-1])
     widest = int(np.argmax(gaps))

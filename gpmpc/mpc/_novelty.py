@@ -1,4 +1,4 @@
-"""How far a plan is from what its model knows.
+"""Measures how far a plan is from what its model knows.
 
 Two things may be too large, each beside what the data alone would say:
 
@@ -29,14 +29,17 @@ _ROWS = 16  # of a kernel matrix that tell observations from pseudo-observations
 class DataScales(NamedTuple):
     """What a model's data say of each state (n,)."""
 
-    added: Array  #: variance of what is learned of a step; zero where nothing is
-    reached: (
-        Array  #: range; infinite where a GP does not see the state, or it never moved
-    )
+    variances: Array  #: of what is learned of a step; zero where nothing is
+    #: of the state in the data; infinite where no GP sees it, or it never moved
+    ranges: Array
 
 
 def data_scales(model: DynamicsModel) -> DataScales | None:
-    """The scales of GPs, of a residual with a constant B, and of both with delays or disturbances; else None."""
+    """Returns the scales of a model's data; None where they are not known.
+
+    They are for GPs, for a residual with a constant B, and for both with delays or
+    disturbances.
+    """
     n = model.state_dim
     if isinstance(model, DelayedModel | DisturbedModel):
         inner = data_scales(model.model)
@@ -45,19 +48,25 @@ def data_scales(model: DynamicsModel) -> DataScales | None:
     if form is None:
         return None
     B = np.eye(n) if form.B is None else to_array(form.B)
-    return DataScales(B**2 @ _learned_variances(form.f), _ranges(form, n))
+    return DataScales(
+        variances=B**2 @ _learned_variances(form.f), ranges=_ranges(form, n)
+    )
 
 
 def _with_further_states(scales: DataScales, n: int) -> DataScales:
-    """For n states, of which nothing is learned of those that are further ones."""
-    further = n - len(scales.added)
-    added = np.append(scales.added, np.zeros(further))
-    reached = np.append(scales.reached, np.full(further, np.inf))
-    return DataScales(added, reached)
+    """Returns scales for n states: of those that are further ones nothing is learned."""
+    further = n - len(scales.variances)
+    return DataScales(
+        variances=np.append(scales.variances, np.zeros(further)),
+        ranges=np.append(scales.ranges, np.full(further, np.inf)),
+    )
 
 
 def _learned_part(model: DynamicsModel) -> AffineForm | None:
-    """The GPs of a model, where they act and what they see; what is known besides may be any function."""
+    """Returns the GPs of a model, where they act and what they see.
+
+    What is known besides may be any function.
+    """
     if not isinstance(model, ResidualModel):
         return getattr(model, "affine_form", None)
     if callable(model.B) or not isinstance(model.residual, GPPosterior):
@@ -69,24 +78,26 @@ def _learned_part(model: DynamicsModel) -> AffineForm | None:
 
 
 def _learned_variances(gp: GPPosterior) -> Array:
-    """Of what each GP learned (k,): its targets' variance, or its prior's, if that is less.
+    """Returns the variances of what each GP learned (k,).
 
-    A GP that found nothing but noise is not asked to know more than to within the noise.
+    That is the variance of its targets, or of its prior, if that is less. A GP that
+    found nothing but noise is not asked to know more than to within the noise.
     """
     signal = to_array(gp.signal_variance)
     rows = gp.cholesky[:, :_ROWS, :_ROWS].square().sum(-1)
     noise = to_array(rows) - signal[:, None]
-    # The noise of pseudo-observations differs from one to the next, and their spread says nothing.
+    # The noise of pseudo-observations differs from one to the next, and their variance
+    # says nothing.
     if (np.ptp(noise, axis=1) > 1e-6 * (signal + noise[:, 0])).any():
         return signal
     noise = noise[:, 0].clip(0.0)
-    spread = to_array(gp.targets.var(dim=0, correction=0))
-    constant = spread <= 0.0
-    return np.where(constant, signal, np.maximum(np.minimum(signal, spread), noise))
+    targets = to_array(gp.targets.var(dim=0, correction=0))
+    learned = np.maximum(np.minimum(signal, targets), noise)
+    return np.where(targets <= 0.0, signal, learned)
 
 
 def _ranges(form: AffineForm, n: int) -> Array:
-    """Of the states in the data (n,)."""
+    """Returns the ranges of the states in the data (n,)."""
     ranges = np.full(n, np.inf)
     features = to_array(form.f.features)
     widths = features.max(axis=0) - features.min(axis=0)
@@ -106,7 +117,14 @@ def _ranges(form: AffineForm, n: int) -> Array:
 def novelty_of(
     added: Array, noise: Array, covariances: Array, scales: DataScales
 ) -> float:
-    """The novelty of a plan whose stages add covariances (K, n, n), with the noise (n,), up to some (H + 1, n, n)."""
+    """Returns the novelty of a plan.
+
+    Args:
+        added: Covariances that its stages add (K, n, n).
+        noise: Variances that are part of them whatever the model knows (n,).
+        covariances: Predicted up to each stage (H + 1, n, n).
+        scales: Of the model's data.
+    """
     return float(_novelty.unchecked(added, noise, covariances, *scales))
 
 
@@ -117,12 +135,15 @@ def measure_novelty(
     covariances: Array,
     scales: DataScales,
 ) -> float:
-    """The same of states (H, n) and inputs (H, m) of a plan, at which the model is asked for its variances."""
-    found = linearize(model, states, inputs)
-    assert found.covariance is not None
-    quiet = np.zeros(len(scales.added))
-    added = np.ascontiguousarray(found.covariance, dtype=np.float64)
-    return novelty_of(added, quiet, covariances, scales)
+    """Returns the novelty of a plan of states (H, n) and inputs (H, m).
+
+    The model is asked for its variances there.
+    """
+    local = linearize(model, states, inputs)
+    assert local.covariance is not None
+    no_noise = np.zeros(len(scales.variances))
+    added = np.ascontiguousarray(local.covariance, dtype=np.float64)
+    return novelty_of(added, no_noise, covariances, scales)
 
 
 def later(
@@ -132,19 +153,19 @@ def later(
     covariances: Array,
     scales: DataScales,
 ) -> partial[float]:
-    """``measure_novelty`` of a plan's means (H + 1, n), when it is called."""
+    """Returns what measures the novelty of a plan's means (H + 1, n) when called."""
     return partial(measure_novelty, model, means[:-1], inputs, covariances, scales)
 
 
 @compiled
-def _novelty(added, noise, covariances, learned, reached):
+def _novelty(added, noise, covariances, variances, ranges):
     largest = 0.0
     for k in range(len(added)):
-        for i in range(len(learned)):
-            if learned[i] > 0.0:
-                ratio = (added[k, i, i] - noise[i]) / learned[i]
+        for i in range(len(variances)):
+            if variances[i] > 0.0:
+                ratio = (added[k, i, i] - noise[i]) / variances[i]
                 largest = max(largest, min(ratio, 1.0))
     for k in range(1, len(covariances)):
-        for i in range(len(reached)):
-            largest = max(largest, covariances[k, i, i] / reached[i] ** 2)
+        for i in range(len(ranges)):
+            largest = max(largest, covariances[k, i, i] / ranges[i] ** 2)
     return np.sqrt(largest)

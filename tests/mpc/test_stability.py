@@ -22,7 +22,8 @@ from gpmpc.mpc import (
     Reference,
     Tracking,
 )
-from gpmpc.mpc._stability import _Loop, _points
+from gpmpc.mpc._linear_loop import LinearLoop
+from gpmpc.mpc._rest_points import rest_points
 from gpmpc.propagation import Linearization
 from gpmpc.systems import double_integrator, step
 
@@ -106,8 +107,8 @@ def test_the_linear_loop_is_what_the_controller_does_near_its_rest(changes):
     prediction = controller.prediction
     further = prediction.problem.state_dim - 4
     reference = Reference(np.array(LEVELS + [0.0] * further), np.array(VOLTAGES))
-    (point,) = _points(prediction, reference, None)
-    loop = _Loop(prediction, point, None, None).matrix(40)
+    (point,) = rest_points(prediction, reference, None)
+    loop = LinearLoop(prediction, point, None, None).matrix(40)
     settled, plan = steps_from(controller, reference, point.state, None, 300)
     rest = settled[-1]
     apart = 1e-5 * np.random.default_rng(0).normal(size=len(rest))

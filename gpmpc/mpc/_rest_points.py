@@ -1,0 +1,225 @@
+"""Points at which a loop is to rest, or to move as its reference does."""
+
+import math
+from contextlib import suppress
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from gpmpc._angles import state_difference
+from gpmpc._dynamics import linearize
+from gpmpc.models import DelayedModel
+from gpmpc.models._wrapper import Wrapper
+from gpmpc.mpc._controller import Reference, read_parameters
+from gpmpc.mpc._cost import FunctionNotFinite
+from gpmpc.mpc._linear_quadratic import DEVIATIONS, INCREMENTS, Plan, QuadraticCost
+from gpmpc.mpc._linearization import PredictionModel
+
+Array = np.ndarray
+
+_POINTS = 10  # of a trajectory
+_ITERATIONS = 20  # towards a point of rest
+_HALVINGS = 10  # of a step that does not improve
+_ROUNDING = 1e-6  # relative rise of a value that counts as none
+_SETTLED = 1e-3  # last change of a point of rest, relative to its size or 1
+_AT_REST = 1e-2  # largest step of a state at rest, likewise: learned models drift
+_NEGLIGIBLE = 1e-3  # weight of what no cost weighs, in the largest one
+_PRICE = 1e3  # of a state that does not rest, in the largest weight
+
+
+class RestPoint(NamedTuple):
+    """A point where the loop is to rest, or to move as its reference does."""
+
+    state: Array  # (n,)
+    input: Array  # (m,)
+    A: Array  # (n, n) of the model there
+    B: Array  # (n, m)
+    cost: QuadraticCost
+
+
+def rest_points(
+    prediction: PredictionModel, reference: Reference, parameters: Any
+) -> list[RestPoint]:
+    """Returns the points at which the law can be judged.
+
+    They are those of a set point, or of some steps of a trajectory; without those whose
+    functions are not finite, and those that no input within the bounds holds.
+    """
+    states = np.atleast_2d(np.asarray(reference.states, dtype=float))
+    inputs = _reference_inputs(reference, (len(states), prediction.problem.input_dim))
+    steps = np.zeros_like(states)  # of the reference; none at its end
+    steps[:-1] = state_difference(states[1:], states[:-1], prediction.angles)
+    last = len(states) - 1
+    n = states.shape[1]
+    chosen = np.unique(np.linspace(0, max(last - 1, 0), _POINTS).round().astype(int))
+    rows = np.hstack([states, steps, inputs])[chosen]
+    points = []
+    for row in np.unique(rows, axis=0):
+        state, step, input = np.split(row, [n, 2 * n])
+        search = _RestSearch(
+            prediction,
+            target=state,
+            step=step,
+            target_input=input,
+            parameters=parameters,
+        )
+        with suppress(FunctionNotFinite):
+            point = search.find()
+            if point is not None:
+                points.append(point)
+    return points
+
+
+def _reference_inputs(reference: Reference, shape: tuple[int, int]) -> Array:
+    """Returns the inputs of every step, the last one held; zero without any."""
+    inputs = np.zeros(shape)
+    if reference.inputs is not None:
+        known = np.atleast_2d(np.asarray(reference.inputs, dtype=float))
+        inputs[: len(known)] = known
+        inputs[len(known) :] = known[-1]
+    return inputs
+
+
+def pending_inputs(model: Any) -> list[int]:
+    """Returns the indices of a model's states that are inputs on their way.
+
+    The oldest come first.
+    """
+    if not isinstance(model, Wrapper):
+        return []
+    within = pending_inputs(model.model)
+    if not isinstance(model, DelayedModel):
+        return within
+    return within + list(range(model.model.state_dim, model.state_dim))
+
+
+class _Unrest(NamedTuple):
+    """What a state and an input cost, and by how far they are from rest."""
+
+    A: Array  # (n, n) of the model there
+    B: Array  # (n, m)
+    defect: Array  # of the step that the state is to make (n,)
+    cost: QuadraticCost
+    hessian: Array  # half of it, by state and input (n + m, n + m)
+    gradient: Array  # half of it (n + m,)
+    value: float  # infinite where the model has none
+
+
+class _RestSearch:
+    """Finds the cheapest state that some input holds, or moves as the reference does.
+
+    Args:
+        prediction: Model, cost and bounds of the controller.
+        target: State of the reference (n,).
+        step: How far the state is to move in a step (n,).
+        target_input: Input of the reference (m,).
+        parameters: Of the outputs.
+    """
+
+    def __init__(
+        self,
+        prediction: PredictionModel,
+        target: Array,
+        step: Array,
+        target_input: Array,
+        parameters: Any,
+    ):
+        self._prediction = prediction
+        self._parameters = parameters
+        self._target = target
+        self._step = step
+        self._target_input = target_input
+
+    def find(self) -> RestPoint | None:
+        """Returns the point, by Gauss-Newton steps from the target on.
+
+        None where they find none within the input's bounds.
+        """
+        prediction = self._prediction
+        n = len(self._target)
+        input = prediction.initial_input.copy()
+        state = self._target.copy()
+        pending = pending_inputs(prediction.model)
+        state[pending] = np.tile(input, len(pending) // len(input))
+        current = self._at(state, input)
+        for _ in range(_ITERATIONS):
+            if not math.isfinite(current.value):
+                return None
+            change = -np.linalg.solve(current.hessian, current.gradient)
+            candidate = self._at(state + change[:n], input + change[n:])
+            for _ in range(_HALVINGS):
+                if candidate.value <= current.value * (1.0 + _ROUNDING):
+                    break
+                change = 0.5 * change
+                candidate = self._at(state + change[:n], input + change[n:])
+            state = state + change[:n]
+            input = input + change[n:]
+            current = candidate
+            sizes = np.maximum(1.0, np.abs(np.concatenate([state, input])))
+            if (np.abs(change) <= _SETTLED * sizes).all():
+                break
+        lower, upper = prediction.problem.inputs.first
+        within = (lower < input) & (input < upper)
+        rests = np.abs(current.defect) <= _AT_REST * np.maximum(1.0, np.abs(state))
+        if not (within.all() and rests.all()):
+            return None
+        return RestPoint(state, input, A=current.A, B=current.B, cost=current.cost)
+
+    def _at(self, state: Array, input: Array) -> _Unrest:
+        """Returns cost and defect at a state (n,) and an input (m,)."""
+        prediction = self._prediction
+        n = len(state)
+        m = len(input)
+        model = linearize(prediction.model, state[None], input[None], covariance=False)
+        A = model.A[0]
+        B = model.B[0]
+        moved = state_difference(model.mean[:1], state[None], prediction.angles)[0]
+        defect = moved - self._step
+        cost = _cost_at(prediction, state, input, self._parameters)
+        error = np.concatenate([state - self._target, input])
+        hessian = np.zeros((n + m, n + m))
+        hessian[:n, :n] = cost.state[0, 0]
+        if cost.penalized == DEVIATIONS:
+            error[n:] -= self._target_input
+        if cost.penalized != INCREMENTS:
+            hessian[n:, n:] = cost.input[0]
+        gradient = hessian @ error
+        value = error @ gradient
+        if len(cost.squares):
+            z = np.concatenate([state, input, [1.0]])
+            hessian = hessian + cost.squares[0, :-1, :-1]
+            gradient = gradient + (cost.squares[0] @ z)[:-1]
+            value = value + z @ cost.squares[0] @ z
+        largest = np.abs(hessian).max() or 1.0
+        rows = np.hstack([A - np.eye(n), B])
+        price = _PRICE * largest
+        hessian = hessian + _NEGLIGIBLE * largest * np.eye(n + m)
+        hessian = hessian + price * rows.T @ rows
+        gradient = gradient + price * rows.T @ defect
+        value = float(value + price * defect @ defect)
+        if not (np.isfinite(hessian).all() and np.isfinite(gradient).all()):
+            value = math.inf
+        return _Unrest(
+            A=A,
+            B=B,
+            defect=defect,
+            cost=cost,
+            hessian=hessian,
+            gradient=gradient,
+            value=value,
+        )
+
+
+def _cost_at(
+    prediction: PredictionModel, state: Array, input: Array, parameters: Any
+) -> QuadraticCost:
+    """Returns the cost of the means, its outputs linearised at one point."""
+    H = prediction.horizon
+    values = None if parameters is None else read_parameters(parameters, H)
+    plan = Plan(
+        states=np.tile(state, (H + 1, 1)),
+        inputs=np.tile(input, (H, 1)),
+        covariances=np.zeros((H + 1, len(state), len(state))),
+    )
+    cost = prediction.costs.at(plan, values)
+    return cost._replace(state=cost.state[:, :1], terminal=cost.terminal[:1])
