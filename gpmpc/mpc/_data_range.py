@@ -89,7 +89,7 @@ def beyond_data(model: DynamicsModel, reference: Any) -> list[BeyondData]:
 
 
 def _columns(model: Any) -> list[_Column]:
-    """Returns what the GPs of a model have seen of its states, in the order of these."""
+    """Returns what the GPs of a model have seen, in the order of its states."""
     if isinstance(model, GPPosterior):
         return _columns_of(model, list(range(model.state_dim)), [])
     if isinstance(model, ResidualModel):

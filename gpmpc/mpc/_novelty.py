@@ -2,13 +2,14 @@
 
 Two things may be too large, each beside what the data alone would say:
 
-* what a stage adds: the deviation of the latent function there, over that of what it was learned from. As long as GPs
-  know more than the spread of their targets it is below one, and it is no more than one. The prior's own deviation is
-  no measure: long length-scales go with signals ten to forty times as wide as the data, so that the ratio to it would
-  stay small far beyond them;
-* what has grown up to a stage: the predicted deviation of a state, over the range of that state in the data (half a
-  turn for an angle). Above one the prediction says less than that the state is somewhere among the data, and that has
-  no bound.
+* what a stage adds: the deviation of the latent function there, over that of what it
+  was learned from. As long as GPs know more than the spread of their targets it is
+  below one, and it is no more than one. The prior's own deviation is no measure: long
+  length-scales go with signals ten to forty times as wide as the data, so that the
+  ratio to it would stay small far beyond them;
+* what has grown up to a stage: the predicted deviation of a state, over the range of
+  that state in the data (half a turn for an angle). Above one the prediction says less
+  than that the state is somewhere among the data, and that has no bound.
 """
 
 from functools import partial
@@ -54,7 +55,7 @@ def data_scales(model: DynamicsModel) -> DataScales | None:
 
 
 def _with_further_states(scales: DataScales, n: int) -> DataScales:
-    """Returns scales for n states: of those that are further ones nothing is learned."""
+    """Returns scales for n states: of further ones nothing is learned."""
     further = n - len(scales.variances)
     return DataScales(
         variances=np.append(scales.variances, np.zeros(further)),

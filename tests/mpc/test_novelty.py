@@ -131,17 +131,17 @@ def test_scales_of_angles_of_what_never_moved_and_of_pseudo_observations():
     turned = ResidualModel.train(Affine.identity(2, 1), data, angles=[0])
     scales = data_scales(turned)
     assert scales is not None
-    assert scales.reached[0] == np.pi
-    assert scales.reached[1] == pytest.approx(np.ptp(data.states[:, 1].numpy()))
+    assert scales.ranges[0] == np.pi
+    assert scales.ranges[1] == pytest.approx(np.ptp(data.states[:, 1].numpy()))
     still = replace(data, states=data.states * torch.tensor([1.0, 0.0]))
     kept = train(still, restarts=0).posterior
     scales = data_scales(kept)
     assert scales is not None
-    assert scales.reached[1] == np.inf
+    assert scales.ranges[1] == np.inf
     sparse = SparseTrainer(inducing=20, restarts=0)(data).posterior
     scales = data_scales(sparse)
     assert scales is not None
-    assert scales.added == pytest.approx(sparse.signal_variance.numpy())
+    assert scales.variances == pytest.approx(sparse.signal_variance.numpy())
 
 
 @pytest.mark.parametrize("mode", ["none", "zero_order"])
@@ -150,8 +150,8 @@ def test_models_around_gps_know_it_too(gp, mode):
     delayed = DelayedModel(gp, 1.0)
     scales = data_scales(delayed)
     assert scales is not None
-    assert scales.added.tolist()[2:] == [0.0]
-    assert scales.reached.tolist()[2:] == [np.inf]
+    assert scales.variances.tolist()[2:] == [0.0]
+    assert scales.ranges.tolist()[2:] == [np.inf]
     problem = Problem(Tracking([1.0, 1.0, 0.0], [0.1]), Box([-1.0], [1.0]))
     settings = PredictionSettings(covariance=mode)
     chosen = GPMPC(delayed, Linearization(), problem, 5, [0.0], settings)
