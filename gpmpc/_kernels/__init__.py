@@ -1,10 +1,20 @@
-"""Predictions of Gaussian processes at certain and uncertain points with their derivatives, by compiled loops.
+"""Predictions of GPs at certain and uncertain points, and derivatives, compiled.
 
-``gpmpc.propagation._moments`` states the mathematics and serves torch; here the closed forms and their first
-derivatives are evaluated for ``Packed`` arrays, on one thread. They belong to the k latent functions f of x~ = (x, u),
-with x ~ N(mu, S) and u certain; callers add the previous state, observation noise or a nearest semidefinite covariance.
-Every function takes H points along a first dimension, which all results have in front. Nothing is kept between calls:
-any number of threads may call at once.
+``_packed``      the arrays that all loops read, and ``_window`` those of GPs whose
+                 points come one at a time
+``_gp_point``    mean and variance at certain points; ``_gp_moments`` the exact moments
+                 at uncertain ones, with ``_pair_sums``, where their time goes
+``gp_rollout``   roll-outs of the mean of GPs in an affine model; ``tape`` evaluates
+                 functions that are lists of scalar operations
+``_rows``        vector algebra over training points; ``linalg`` small matrices
+``_simd``        eight numbers in a register: the type ``Lanes`` and its functions
+
+``gpmpc.propagation._moments`` states the mathematics and serves torch; here the closed
+forms and their first derivatives are evaluated for ``Packed`` arrays, on one thread.
+They belong to the k latent functions f of x~ = (x, u), with x ~ N(mu, S) and u certain;
+callers add the previous state, observation noise or a nearest semidefinite covariance.
+Every function takes H points along a first dimension, which all results have in front.
+Nothing is kept between calls: any number of threads may call at once.
 """
 
 from typing import NamedTuple
@@ -12,7 +22,7 @@ from typing import NamedTuple
 import numpy as np
 
 from gpmpc._kernels._gp_moments import evaluate_moments
-from gpmpc._kernels._gp_point import expand_points, linearize_points
+from gpmpc._kernels._gp_point import PointArrays, expand_points, linearize_points
 from gpmpc._kernels._packed import Array, GPArrays, Packed, pack
 from gpmpc._kernels._window import Window
 from gpmpc.exceptions import ShapeError
@@ -20,6 +30,7 @@ from gpmpc.exceptions import ShapeError
 __all__ = [
     "Expansion",
     "GPArrays",
+    "LinearizedGPs",
     "Moments",
     "Packed",
     "Window",
@@ -46,7 +57,8 @@ class Expansion(NamedTuple):
 class Moments(NamedTuple):
     """Moments of f, x ~ N(mu, S), and their derivatives.
 
-    For symmetric dS: dV_ab = dV_dmu[a, b] . dmu + sum_cd dV_dS[a, b, c, d] dS[c, d] + dV_du[a, b] . du; so dM, dJ.
+    For symmetric dS: dV_ab = dV_dmu[a, b] . dmu + sum_cd dV_dS[a, b, c, d] dS[c, d]
+    + dV_du[a, b] . du; so dM, dJ.
     """
 
     M: Array  #: E[f] (k,)
@@ -61,6 +73,15 @@ class Moments(NamedTuple):
     dJ_du: Array  #: (k, n, m)
 
 
+class LinearizedGPs(NamedTuple):
+    """Means of GPs at K points and their derivatives."""
+
+    mean: Array  #: (K, k)
+    A: Array  #: by the state (K, k, n)
+    B: Array  #: by the input (K, k, m)
+    covariance: Array | None  #: diagonal (K, k, k); None where it was not wanted
+
+
 def linearize(
     packed: Packed | Window,
     x: Array,
@@ -68,12 +89,19 @@ def linearize(
     covariance: bool,
     offset: Array,
     adds_state: bool,
-) -> tuple[Array, Array, Array, Array | None]:
-    """Linearises k GPs with prior means ``offset`` (k,) at K states x (K, n) and inputs u (K, m).
+) -> LinearizedGPs:
+    """Linearises k GPs at K states x (K, n) and inputs u (K, m).
 
-    ``adds_state`` says that they predict differences x+ - x (k = n). Returns means (K, k), their derivatives by x
-    (K, k, n) and by u (K, k, m), and covariances (K, k, k), which take most of the time, or None. Raises ShapeError
-    where x or u do not fit.
+    Args:
+        packed: The GPs.
+        x: States (K, n).
+        u: Inputs (K, m).
+        covariance: Whether covariances are wanted, which take most of the time.
+        offset: Prior means of the GPs (k,).
+        adds_state: Whether the GPs predict differences x+ - x (k = n).
+
+    Raises:
+        ShapeError: x or u do not fit.
     """
     K = len(x)
     k = len(packed.arrays.weights)
@@ -81,40 +109,64 @@ def linearize(
     m = packed.input_dim
     if x.shape != (K, n) or u.shape != (K, m):
         raise ShapeError(
-            f"the model takes states (K, {n}) and inputs (K, {m}); got {x.shape} and {u.shape}"
+            f"the model takes states (K, {n}) and inputs (K, {m}); got {x.shape} and "
+            f"{u.shape}"
         )
-    x = np.ascontiguousarray(x, dtype=np.float64)
-    u = np.ascontiguousarray(u, dtype=np.float64)
-    M = np.empty((K, k))
-    A = np.empty((K, k, n))
-    B = np.empty((K, k, m))
-    V = np.zeros((K if covariance else 0, k, k))
-    kept = k * (-(-K // 4) * 4) if covariance else 0
-    memory = np.empty((2 * (n + m) + 1 + kept) * packed.arrays.points.shape[1] + 8)
-    columns = packed.columns if covariance else V
-    offset = np.ascontiguousarray(offset, dtype=np.float64)
-    linearize_points.unchecked(
-        packed.arrays,
-        columns,
-        (offset, adds_state),
-        x,
-        u,
-        memory,
-        (M, A, B, V),
+    padded = packed.arrays.points.shape[1]
+    solve_rows = k * (-(-K // 4) * 4) if covariance else 0  # K rounded up to fours
+    memory = np.empty((2 * (n + m) + 1 + solve_rows) * padded + 8)
+    linearized = PointArrays(
+        mean=np.empty((K, k)),
+        A=np.empty((K, k, n)),
+        B=np.empty((K, k, m)),
+        covariance=np.zeros((K if covariance else 0, k, k)),
     )
-    return M, A, B, V if covariance else None
+    linearize_points.unchecked(
+        gp=packed.arrays,
+        columns=packed.columns if covariance else linearized.covariance,
+        offset=np.ascontiguousarray(offset, dtype=np.float64),
+        adds_state=adds_state,
+        x=np.ascontiguousarray(x, dtype=np.float64),
+        u=np.ascontiguousarray(u, dtype=np.float64),
+        memory=memory,
+        out=linearized,
+    )
+    return LinearizedGPs(
+        mean=linearized.mean,
+        A=linearized.A,
+        B=linearized.B,
+        covariance=linearized.covariance if covariance else None,
+    )
 
 
 def point_with_jacobian(packed: Packed, x: Array, u: Array) -> Expansion:
-    """Mean and variance at states x (H, n) and inputs u (H, m), with the derivatives that linearisation needs."""
-    x, u = _points(packed, x, u)
+    """Returns mean and variance at states x (H, n) and inputs u (H, m), expanded.
+
+    Raises ShapeError where x or u do not fit.
+    """
+    x, u = _contiguous_points(packed, x, u)
+    H = len(x)
     k = packed.output_dim
     n = packed.state_dim
     m = packed.input_dim
-    shapes = [(k,), (k,), (k, n), (k, m), (k, n), (k, m), (k, n, n), (k, n, m)]
-    out = Expansion(*[np.empty((len(x), *shape)) for shape in shapes])
-    expand_points.unchecked(packed.arrays, packed.precision.inverse_cholesky, x, u, out)
-    return out
+    expansion = Expansion(
+        M=np.empty((H, k)),
+        variance=np.empty((H, k)),
+        J=np.empty((H, k, n)),
+        dM_du=np.empty((H, k, m)),
+        dvariance_dx=np.empty((H, k, n)),
+        dvariance_du=np.empty((H, k, m)),
+        d2M_dx2=np.empty((H, k, n, n)),
+        d2M_dxdu=np.empty((H, k, n, m)),
+    )
+    expand_points.unchecked(
+        gp=packed.arrays,
+        inverse_cholesky=packed.precision.inverse_cholesky,
+        x=x,
+        u=u,
+        out=expansion,
+    )
+    return expansion
 
 
 def moments(
@@ -125,12 +177,20 @@ def moments(
     diagonal: bool = False,
     derivatives: bool = False,
 ) -> Moments:
-    """The exact moments of f, x ~ N(mu, S) with mu (H, n) and positive semidefinite S (H, n, n), at inputs u (H, m).
+    """Returns the exact moments of f at x ~ N(mu, S) and inputs u.
 
-    ``diagonal`` leaves the covariances between outputs at zero; without ``derivatives`` their arrays are empty. Raises
-    ShapeError where mu, S or u do not fit.
+    Args:
+        packed: The GPs.
+        mu: Mean states (H, n).
+        S: Positive semidefinite covariances (H, n, n).
+        u: Certain inputs (H, m).
+        diagonal: Leaves the covariances between outputs at zero.
+        derivatives: Whether derivatives are wanted; else their arrays are empty.
+
+    Raises:
+        ShapeError: mu, S or u do not fit.
     """
-    mu, u = _points(packed, mu, u)
+    mu, u = _contiguous_points(packed, mu, u)
     S = np.array(S, dtype=np.float64, order="C")
     H = len(mu)
     k = packed.output_dim
@@ -139,34 +199,33 @@ def moments(
     if S.shape != (H, n, n):
         raise ShapeError(f"S must have shape {(H, n, n)}; got {S.shape}")
     d = k if derivatives else 0
-    shapes = [
-        (k,),
-        (k, k),
-        (k, n),
-        (d, n, n),
-        (d, m),
-        (d, k, n),
-        (d, k, n, n),
-        (d, k, m),
-        (d, n, n, n),
-        (d, n, m),
-    ]
-    out = Moments(*[np.zeros((H, *shape)) for shape in shapes])
-    evaluate_moments.unchecked(
-        derivatives,
-        bool(diagonal),
-        packed.arrays,
-        packed.precision,
-        mu,
-        S,
-        u,
-        out,
+    moments = Moments(
+        M=np.zeros((H, k)),
+        V=np.zeros((H, k, k)),
+        J=np.zeros((H, k, n)),
+        dM_dS=np.zeros((H, d, n, n)),
+        dM_du=np.zeros((H, d, m)),
+        dV_dmu=np.zeros((H, d, k, n)),
+        dV_dS=np.zeros((H, d, k, n, n)),
+        dV_du=np.zeros((H, d, k, m)),
+        dJ_dS=np.zeros((H, d, n, n, n)),
+        dJ_du=np.zeros((H, d, n, m)),
     )
-    return out
+    evaluate_moments.unchecked(
+        gp=packed.arrays,
+        precision=packed.precision,
+        mu=mu,
+        S=S,
+        u=u,
+        diagonal=bool(diagonal),
+        derivatives=bool(derivatives),
+        out=moments,
+    )
+    return moments
 
 
-def _points(packed: Packed, x: Array, u: Array) -> tuple[Array, Array]:
-    """Fresh contiguous (H, n) and (H, m), the one type the kernels are compiled for."""
+def _contiguous_points(packed: Packed, x: Array, u: Array) -> tuple[Array, Array]:
+    """Copies (H, n) and (H, m) to the one type that kernels are compiled for."""
     x = np.array(x, dtype=np.float64, order="C")
     u = np.array(u, dtype=np.float64, order="C")
     H = len(x)
@@ -174,6 +233,7 @@ def _points(packed: Packed, x: Array, u: Array) -> tuple[Array, Array]:
     m = packed.input_dim
     if x.shape != (H, n) or u.shape != (H, m):
         raise ShapeError(
-            f"the model takes states (H, {n}) and inputs (H, {m}); got {x.shape} and {u.shape}"
+            f"the model takes states (H, {n}) and inputs (H, {m}); got {x.shape} and "
+            f"{u.shape}"
         )
     return x, u

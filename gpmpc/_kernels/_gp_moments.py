@@ -1,38 +1,35 @@
-r"""The exact moments of k GPs at uncertain states x ~ N(mu, S) and their first derivatives, with explicit vectors.
+r"""The exact moments of k GPs at uncertain states x ~ N(mu, S) and their derivatives.
 
-Specification: ``gpmpc.propagation._moments``, whose letters these are. (Without explicit vectors the loops take four
-times as long.) With c_ai = D_a (u_i - u) of the controls and G_ab = (I + S (D_a + D_b))^-1, exponents change by
+The specification is ``gpmpc.propagation._moments``: its letters are used here, and its
+equations (1) to (7). Loops run over explicit vectors; without these they take four
+times as long. With c_ai = D_a (u_i - u) of the controls and G_ab = (I + S (D_a +
+D_b))^-1, exponents change by
 
-    dlog q_ai = w_ai . dmu + 1/2 <w_ai w_ai' - G_a' D_a, dS> + c_ai . du,                  w_ai = G_a' z_ai
-    dlog Q_ij = y_ij . dmu + 1/2 <y_ij y_ij' - G_ab' (D_a + D_b), dS> + (c_ai + c_bj) . du,
-    y_ij = y_ai + y_bj,  y_ai = G_ab' z_ai = w_ai + F_a z_ai,  F_a = G_ab' - G_a' = -G_ab' D_b G_a S
-    dV_ab = sum_ij P_ij dlog Q_ij + U_ij d(log Q_ij - log q_ai - log q_bj),   P_ij = U_ij expm1(delta_ij)
+    (8)   dlog q_ai = w_ai . dmu + 1/2 <w_ai w_ai' - G_a' D_a, dS> + c_ai . du
+          w_ai = G_a' z_ai
+    (9)   dlog Q_ij = y_ij . dmu + 1/2 <y_ij y_ij' - G_ab' (D_a + D_b), dS>
+                      + (c_ai + c_bj) . du
+          y_ij = y_ai + y_bj,   y_ai = G_ab' z_ai = w_ai + F_a z_ai
+    (10)  F_a = G_ab' - G_a' = -G_ab' D_b G_a S
+    (11)  dV_ab = sum_ij P_ij dlog Q_ij + U_ij d(log Q_ij - log q_ai - log q_bj)
+          P_ij = U_ij expm1(delta_ij)
 
-with U_ij = beta_ai beta_bj q_ai q_bj, or E_ij q_ai q_aj, E = beta_a beta_a' - (K_a + sn2_a I)^-1, for a = b. One pass
-over the N^2 pairs of points of a pair of outputs collects row sums p_i, column sums p_j and g_j = sum_i R_ij z_ai of
-
-    P_ij = weight_i weight_j expm1(delta_ij),   delta_ij = rise_i + fall_j + left_i . z_bj,   left_i = T_ab z_ai
-
-with weights beta q and R = P for a != b, where the rest of the sum is a product of single sums. For a = b the weights
-are q, P_ij has the factor E_ij and runs over i >= j, and R = E q q exp(delta). Derivatives are algebra on the sums.
-Four rows i meet sixteen columns j in registers: eight independent chains are what two multiply-adds per cycle with a
-latency of four ask for. From delta = 300 on a pair counts for nothing, and the exponent may stay there. Where a bound
-says that delta is small for all pairs, as for beliefs that are narrow beside the length-scales, expm1 needs no
-reduction, a quarter of all instructions.
+with U_ij = beta_ai beta_bj q_ai q_bj, or E_ij q_ai q_aj, E = beta_a beta_a' - (K_a +
+sn2_a I)^-1, for a = b. The rest of dV_aa is that of -|L_a^-1 q_a|^2: (8) with the
+weights -2 e_i, e_i = q_i [(K + sn2 I)^-1 q]_i. ``_pair_sums`` takes one pass over the
+N^2 pairs of points of a pair of outputs, from which derivatives are algebra on sums.
 """
 
-import math
 from typing import NamedTuple
 
 import numpy as np
 from numpy import ndarray
 
-from gpmpc._compiled import compiled, inline_njit, njit_inner, njit_noalloc
+from gpmpc._compiled import compiled, njit_inner, njit_noalloc
 from gpmpc._kernels._packed import GPArrays
+from gpmpc._kernels._pair_sums import allocate_pair_terms, sum_pairs
 from gpmpc._kernels._rows import (
     add_products,
-    largest_size,
-    largest_square,
     multiply,
     project,
     reduce_variance,
@@ -40,17 +37,7 @@ from gpmpc._kernels._rows import (
     second_moments,
     transform,
 )
-from gpmpc._kernels._simd import (
-    NEAR_ZERO,
-    exp,
-    expm1,
-    expm1_near_zero,
-    load,
-    store,
-    total,
-    use_widest_registers,
-    zeros,
-)
+from gpmpc._kernels._simd import exp, load, store, use_widest_registers
 from gpmpc._kernels.linalg import (
     add_product,
     aligned_rows,
@@ -72,7 +59,7 @@ class _Belief(NamedTuple):
 
 
 class _OutputTerms(NamedTuple):
-    """What each output has alone: vectors over the points, matrices, and sums over the points."""
+    """Terms of single outputs: vectors over the points, matrices, and sums."""
 
     z: ndarray  # (k, n, P)
     Tz: ndarray  # T_a z_ai (k, n, P)
@@ -89,128 +76,134 @@ class _OutputTerms(NamedTuple):
     e_second: ndarray  # sum_i e_i z_i z_i' (k, n, n)
 
 
-class _Work(NamedTuple):
-    """What the sum over pairs of points reads, the sums, and memory to work in."""
+class _Scratch(NamedTuple):
+    """Memory to work in; nobody relies on its content after a call but on G_ab."""
 
-    rise: ndarray  # (P,)
-    fall: ndarray  # (P,)
-    left: ndarray  # (n, P)
-    weighted_z: ndarray  # weight_i z_i (n, P)
-    p_i: ndarray  # row sums (P,)
-    p_j: ndarray  # column sums (P,)
-    g: ndarray  # (n, P)
     row: ndarray  # (P,)
-    other: ndarray  # (P,)
-    G_ab: ndarray  # (n, n), like those that follow
-    F: ndarray
-    x: ndarray
-    y: ndarray
+    other_row: ndarray  # (P,)
+    G_ab: ndarray  # of the pair of outputs (n, n)
+    F: ndarray  # (n, n), like those that follow
+    X: ndarray
+    Y: ndarray
     H: ndarray
 
 
-@compiled
-def evaluate_moments(derivatives, diagonal, gp, precision, mu, S, u, out):
-    """Writes the arrays of ``gpmpc._kernels.Moments`` at mu (H, n), S (H, n, n) and u (H, m).
+class _Gradient(NamedTuple):
+    """Derivatives of one moment by the belief and the input."""
 
-    The arrays of ``out`` are full of zeros; those of derivatives are empty where these are not wanted.
+    dmu: ndarray  # (n,)
+    dS: ndarray  # symmetric (n, n)
+    du: ndarray  # (m,)
+
+
+@compiled
+def evaluate_moments(gp, precision, mu, S, u, diagonal, derivatives, out):
+    """Writes ``gpmpc._kernels.Moments`` at mu (H, n), S (H, n, n) and u (H, m).
+
+    The arrays of ``out`` are full of zeros; those of derivatives are empty where these
+    are not wanted.
     """
     use_widest_registers()
-    (k, padded), n, m = gp.weights.shape, mu.shape[1], u.shape[1]
-    rows, (terms, work) = aligned_rows(n + m, padded), _make_terms(k, n, padded)
+    k, padded = gp.weights.shape
+    n = mu.shape[1]
+    m = u.shape[1]
+    points = aligned_rows(n + m, padded)
+    terms = _allocate_output_terms(k, n, padded)
+    pair = allocate_pair_terms(n, padded)
+    scratch = _allocate_scratch(n, padded)
     for h in range(len(mu)):
-        belief = _Belief(gp, S[h], rows[:n], rows[n : n + m])
-        for d in range(n + m):
-            at = mu[h, d] if d < n else u[h, d - n]
-            row = rows[d]
-            point = gp.points[d]
-            for j in range(padded):
-                row[j] = point[j] - at
+        belief = _Belief(gp=gp, S=S[h], x=points[:n], u=points[n : n + m])
+        _centre_points(gp.points, mu[h], u[h], points)
         for a in range(k):
-            _evaluate_output(belief, a, terms, work)
+            _evaluate_output(belief, a, terms, scratch)
             out.M[h, a] = terms.M[a]
             multiply_transposed(terms.G[a], terms.first[a], out.J[h, a])
             if derivatives:
-                to = (out.J[h, a], out.dM_dS[h, a], out.dM_du[h, a])
-                sums = (terms.first[a], terms.second[a])
-                _differentiate_sum(
-                    terms.weighted[a], 1.0, belief, a, terms, sums, work, to
-                )
-                _differentiate_J(
-                    belief, a, terms, out.J[h, a], out.dJ_dS[h, a], out.dJ_du[h, a]
-                )
+                _differentiate_mean(belief, a, h, terms, scratch, out)
         for a in range(k):
-            reduction = reduce_variance(
-                precision.inverse_cholesky[a], terms.q[a], work.row
-            )
-            out.V[h, a, a] = np.exp(gp.log_signal[a]) - reduction
+            out.V[h, a, a] = _evaluate_variance(gp, precision, a, terms, scratch)
             if derivatives:
-                to = out.dV_dmu[h, a, a], out.dV_dS[h, a, a], out.dV_du[h, a, a]
-                sums = terms.e_first[a], terms.e_second[a]
-                multiply(
-                    work.row, terms.q[a], work.row
-                )  # (K_a + sn2_a I)^-1 q_a becomes e
-                terms.e[a] = _differentiate_sum(
-                    work.row, -2.0, belief, a, terms, sums, work, to
-                )
+                _differentiate_variance(belief, a, h, terms, scratch, out)
             for b in range(a, a + 1 if diagonal else k):
+                E = precision.centred[a]
                 P_sum = _evaluate_pair(
-                    belief, a, b, terms, precision.centred[a], derivatives, work
+                    belief, a, b, terms, E, derivatives, pair, scratch
                 )
                 out.V[h, a, b] += P_sum
                 out.V[h, b, a] = out.V[h, a, b]
                 if derivatives:
-                    to = out.dV_dmu[h, a, b], out.dV_dS[h, a, b], out.dV_du[h, a, b]
-                    _differentiate_pair(belief, a, b, terms, P_sum, work, to)
-                    out.dV_dmu[h, b, a], out.dV_dS[h, b, a], out.dV_du[h, b, a] = to
+                    gradient = _Gradient(
+                        dmu=out.dV_dmu[h, a, b],
+                        dS=out.dV_dS[h, a, b],
+                        du=out.dV_du[h, a, b],
+                    )
+                    _differentiate_pair(
+                        belief, a, b, terms, P_sum, pair, scratch, gradient
+                    )
+                    out.dV_dmu[h, b, a] = gradient.dmu
+                    out.dV_dS[h, b, a] = gradient.dS
+                    out.dV_du[h, b, a] = gradient.du
 
 
 @njit_inner
-def _make_terms(k, n, padded):
-    vectors = aligned_rows(2 * k * n, padded).reshape(2, k, n, padded)
-    rows = aligned_rows(2 * k, padded)
-    squares = np.zeros((4, k, n, n))
-    sums = np.zeros((2, k, n))
-    numbers = np.zeros((3, k))
-    single = (
-        vectors[0],
-        vectors[1],
-        rows[:k],
-        rows[k:],
-        squares[0],
-        squares[1],
-        numbers[0],
-        numbers[1],
-    )
-    terms = _OutputTerms(*single, sums[0], squares[2], numbers[2], sums[1], squares[3])
-    w = aligned_rows(3 * n + 6, padded)
-    square = np.empty((5, n, n))
-    of_points = (
-        w[0],
-        w[1],
-        w[6 : 6 + n],
-        w[6 + n : 6 + 2 * n],
-        w[2],
-        w[3],
-        w[6 + 2 * n :],
-        w[4],
-        w[5],
-    )
-    return terms, _Work(
-        *of_points, square[0], square[1], square[2], square[3], square[4]
+def _allocate_output_terms(k, n, padded):
+    return _OutputTerms(
+        z=aligned_rows(k * n, padded).reshape(k, n, padded),
+        Tz=aligned_rows(k * n, padded).reshape(k, n, padded),
+        q=aligned_rows(k, padded),
+        weighted=aligned_rows(k, padded),
+        G=np.zeros((k, n, n)),
+        T=np.zeros((k, n, n)),
+        half_logdet=np.zeros(k),
+        M=np.zeros(k),
+        first=np.zeros((k, n)),
+        second=np.zeros((k, n, n)),
+        e=np.zeros(k),
+        e_first=np.zeros((k, n)),
+        e_second=np.zeros((k, n, n)),
     )
 
 
 @njit_inner
-def _evaluate_output(belief, a, terms, work):
-    """Fills the terms of output a, but for ``second`` and the sums over e."""
+def _allocate_scratch(n, padded):
+    return _Scratch(
+        row=aligned_rows(1, padded)[0],
+        other_row=aligned_rows(1, padded)[0],
+        G_ab=np.empty((n, n)),
+        F=np.empty((n, n)),
+        X=np.empty((n, n)),
+        Y=np.empty((n, n)),
+        H=np.empty((n, n)),
+    )
+
+
+@njit_noalloc
+def _centre_points(points, mu, u, centred):
+    """Writes x_i - mu and u_i - u (n + m, P)."""
+    n = len(mu)
+    for d in range(len(centred)):
+        centre = mu[d] if d < n else u[d - n]
+        row = centred[d]
+        point = points[d]
+        for j in range(len(row)):
+            row[j] = point[j] - centre
+
+
+@njit_inner
+def _evaluate_output(belief, a, terms, scratch):
+    """Fills the terms of output a, but for ``second`` and the sums over e.
+
+    q is E[k_a(x~_i, x~)]; M holds (1), and G' first is J, (2).
+    """
     use_widest_registers()
     gp = belief.gp
     n = len(belief.S)
-    log_q = work.row
-    whiten = work.x
+    log_q = scratch.row
+    whiten = scratch.X
     D = gp.inverse_squares[a, :n]
     D_u = gp.inverse_squares[a, n:]
-    # log q_i = log sf2 - 1/2 log|I + S D| - 1/2 |W (x_i - mu)|^2 - 1/2 (u_i - u)' D_u (u_i - u)
+    # log q_i = log sf2 - 1/2 log|I + S D| - 1/2 |W (x_i - mu)|^2
+    #           - 1/2 (u_i - u)' D_u (u_i - u)
     terms.half_logdet[a] = condition(belief.S, D, whiten, terms.G[a])
     log_q[:] = gp.log_signal[a] - terms.half_logdet[a]
     transform(whiten, belief.x, terms.Tz[a])
@@ -231,54 +224,106 @@ def _evaluate_output(belief, a, terms, work):
     project(terms.weighted[a], terms.z[a], terms.first[a])
 
 
+@njit_inner
+def _differentiate_mean(belief, a, h, terms, scratch, out):
+    """Writes the derivatives of M_a and J_a at point h: (8) with the weights beta q."""
+    _differentiate_sum(
+        terms.weighted[a],
+        1.0,
+        belief,
+        a,
+        terms,
+        scratch,
+        terms.first[a],
+        terms.second[a],
+        _Gradient(dmu=out.J[h, a], dS=out.dM_dS[h, a], du=out.dM_du[h, a]),
+    )
+    _differentiate_J(belief, a, terms, out.J[h, a], out.dJ_dS[h, a], out.dJ_du[h, a])
+
+
 @njit_noalloc
-def _differentiate_sum(v, factor, belief, a, terms, sums, work, to):
-    """Writes ``factor`` sum_i v_i dlog q_ai; fills the sums of v_i z_i and v_i z_i z_i', and returns that of v_i."""
-    (first, second), (dmu, dS, du) = sums, to
+def _evaluate_variance(gp, precision, a, terms, scratch):
+    """Returns sf2_a - |L_a^-1 q_a|^2 of (4); (K_a + sn2_a I)^-1 q_a is in the row."""
+    reduction = reduce_variance(precision.inverse_cholesky[a], terms.q[a], scratch.row)
+    return np.exp(gp.log_signal[a]) - reduction
+
+
+@njit_noalloc
+def _differentiate_variance(belief, a, h, terms, scratch, out):
+    """Writes the derivatives of -|L_a^-1 q_a|^2 at point h: (8) with weights -2 e."""
+    e = scratch.row
+    multiply(e, terms.q[a], e)  # from (K_a + sn2_a I)^-1 q_a
+    terms.e[a] = _differentiate_sum(
+        e,
+        -2.0,
+        belief,
+        a,
+        terms,
+        scratch,
+        terms.e_first[a],
+        terms.e_second[a],
+        _Gradient(
+            dmu=out.dV_dmu[h, a, a], dS=out.dV_dS[h, a, a], du=out.dV_du[h, a, a]
+        ),
+    )
+
+
+@njit_noalloc
+def _differentiate_sum(v, factor, belief, a, terms, scratch, first, second, gradient):
+    """Writes ``factor`` sum_i v_i dlog q_ai, by (8), and returns sum_i v_i.
+
+    Fills the sums ``first`` of v_i z_i and ``second`` of v_i z_i z_i'.
+    """
+    dmu = gradient.dmu
+    dS = gradient.dS
+    du = gradient.du
     n = len(belief.S)
-    total = row_sum(v)
+    v_sum = row_sum(v)
     G = terms.G[a]
     D = belief.gp.inverse_squares[a]
-    x = work.x
+    X = scratch.X  # sum_i v_i w_i w_i'
     project(v, terms.z[a], first)
     project(v, belief.u, du)
-    second_moments(v, terms.z[a], work.other, second)
-    congruence(G, second, work.y, x)
+    second_moments(v, terms.z[a], scratch.other_row, second)
+    congruence(G, second, scratch.Y, X)
     multiply_transposed(G, first, dmu)
     for c in range(n):
         dmu[c] *= factor
         for d in range(c + 1):
-            value = (
-                factor
-                * (x[c, d] + x[d, c] - total * (G[d, c] * D[d] + G[c, d] * D[c]))
-                / 4
-            )
+            G_D = G[d, c] * D[d] + G[c, d] * D[c]
+            value = factor * (X[c, d] + X[d, c] - v_sum * G_D) / 4
             dS[c, d] = dS[d, c] = value
     for c in range(len(du)):
         du[c] *= factor * D[n + c]
-    return total
+    return v_sum
 
 
 @njit_inner
 def _differentiate_J(belief, a, terms, J, dJ_dS, dJ_du):
-    """dJ/dS = 1/2 sum beta q (w w w - three times G'D with w), dJ/du = sum beta q w c'."""
-    (n, padded), G, D = belief.x.shape, terms.G[a], belief.gp.inverse_squares[a]
+    """Writes the derivatives of J = sum_i beta_i q_i w_i, (8) once more.
+
+    dJ/dS = 1/2 sum beta q (w w w - three times G'D with w), dJ/du = sum beta q w c'.
+    """
+    n, padded = belief.x.shape
+    G = terms.G[a]
+    D = belief.gp.inverse_squares[a]
     w = aligned_rows(n, padded)
-    work = aligned_rows(2, padded)
+    weighted_w = aligned_rows(1, padded)[0]
+    weighted_ww = aligned_rows(1, padded)[0]
     sums = np.empty(n)
-    A = np.empty((n, n))
+    A = np.empty((n, n))  # G' D
     for c in range(n):
         for d in range(n):
             A[c, d] = G[d, c] * D[d]
     transform(np.ascontiguousarray(G.T), terms.z[a], w)
     for c in range(n):
-        multiply(terms.weighted[a], w[c], work[0])
-        project(work[0], belief.u, dJ_du[c])
+        multiply(terms.weighted[a], w[c], weighted_w)
+        project(weighted_w, belief.u, dJ_du[c])
         for d in range(len(belief.u)):
             dJ_du[c, d] *= D[n + d]
         for d in range(c + 1):
-            multiply(work[0], w[d], work[1])
-            project(work[1], w, sums)
+            multiply(weighted_w, w[d], weighted_ww)
+            project(weighted_ww, w, sums)
             for e in range(d + 1):
                 value = (sums[e] - A[c, d] * J[e] - A[c, e] * J[d] - A[d, e] * J[c]) / 2
                 dJ_dS[c, d, e] = dJ_dS[c, e, d] = dJ_dS[d, c, e] = value
@@ -286,209 +331,72 @@ def _differentiate_J(belief, a, terms, J, dJ_dS, dJ_du):
 
 
 @njit_inner
-def _evaluate_pair(belief, a, b, terms, E, derivatives, work):
-    """Returns sum_ij P_ij; its parts go to ``work``, and so does G_ab."""
+def _evaluate_pair(belief, a, b, terms, E, derivatives, pair, scratch):
+    """Returns sum_ij P_ij of (4); fills the terms of the pair, and G_ab.
+
+    delta_ij = delta_i + delta_j + (T_ab z_ai) . z_bj is (5), with r of (6).
+    """
     gp = belief.gp
     n = len(belief.S)
-    T_ab = work.F
-    whiten = work.x
+    T_ab = scratch.F
     D_a = gp.inverse_squares[a, :n]
     D_b = gp.inverse_squares[b, :n]
-    r = (
-        terms.half_logdet[a]
-        + terms.half_logdet[b]
-        - condition(belief.S, D_a + D_b, whiten, work.G_ab)
-    )
-    product(work.G_ab, belief.S, T_ab)
+    r = terms.half_logdet[a] + terms.half_logdet[b]
+    r -= condition(belief.S, D_a + D_b, scratch.X, scratch.G_ab)
+    product(scratch.G_ab, belief.S, T_ab)
     symmetrize(T_ab)
-    # rise_i = r - 1/2 z_ai' T_ab D_b T_a z_ai,   fall_j = -1/2 z_bj' T_ab D_a T_b z_bj
-    work.fall[:] = 0.0
-    transform(T_ab, terms.z[b], work.left)
-    add_products(D_a * -0.5, work.left, terms.Tz[b], work.fall)
-    work.rise[:] = r
-    transform(T_ab, terms.z[a], work.left)
-    add_products(D_b * -0.5, work.left, terms.Tz[a], work.rise)
-    weights_i, weights_j = (
-        (terms.q[a], terms.q[b]) if a == b else (terms.weighted[a], terms.weighted[b])
+    pair.delta_j[:] = 0.0
+    transform(T_ab, terms.z[b], pair.T_z)
+    add_products(D_a * -0.5, pair.T_z, terms.Tz[b], pair.delta_j)
+    pair.delta_i[:] = r
+    transform(T_ab, terms.z[a], pair.T_z)
+    add_products(D_b * -0.5, pair.T_z, terms.Tz[a], pair.delta_i)
+    same = a == b
+    weights_i = terms.q[a] if same else terms.weighted[a]
+    weights_j = terms.q[b] if same else terms.weighted[b]
+    return sum_pairs(
+        pair,
+        weights_i,
+        weights_j,
+        terms.z[a],
+        terms.z[b],
+        E,
+        gp.size,
+        same,
+        derivatives,
     )
-    for d in range(n):
-        multiply(weights_i, terms.z[a, d], work.weighted_z[d])
-    across = math.sqrt(
-        largest_square(work.left) * largest_square(terms.z[b])
-    )  # Cauchy and Schwarz
-    near = largest_size(work.rise) + largest_size(work.fall) + across <= NEAR_ZERO
-    _sum_pairs(
-        gp.size, a == b, near, derivatives, work, (weights_i, weights_j), terms.z[b], E
-    )
-    multiply(work.p_i, weights_i, work.p_i)
-    multiply(work.p_j, weights_j, work.p_j)
-    if derivatives:
-        for d in range(n):
-            multiply(work.g[d], weights_j, work.g[d])
-    return row_sum(work.p_j)
-
-
-@njit_noalloc
-def _sum_pairs(size, same, near, derivatives, work, weights, z, E):
-    """Writes the sums over i and j of ``work`` before they are multiplied by the weight of their own point."""
-    use_widest_registers()
-    (n, padded), (weights_i, weights_j) = z.shape, weights
-    work.p_j[:] = 0.0
-    if derivatives:
-        work.p_i[:] = 0.0
-        work.g[:] = 0.0
-    at = 0
-    for i in range(0, size, 4):
-        w0 = weights_i[i]
-        w1 = weights_i[i + 1]
-        w2 = weights_i[i + 2]
-        w3 = weights_i[i + 3]
-        s0 = s1 = s2 = s3 = zeros()
-        for j in range(0, i // 16 * 16 + 16 if same else padded, 16):
-            P = _expm1_of_block(near, work.rise, work.fall, work.left, z, i, j)
-            if same:
-                R, P = _multiply_block(P, E, at)
-                at += 64
-            else:
-                R = P
-            (a0, b0), (a1, b1), (a2, b2), (a3, b3) = P
-            store(
-                work.p_j, j, load(work.p_j, j) + w0 * a0 + w1 * a1 + w2 * a2 + w3 * a3
-            )
-            store(
-                work.p_j,
-                j + 8,
-                load(work.p_j, j + 8) + w0 * b0 + w1 * b1 + w2 * b2 + w3 * b3,
-            )
-            if derivatives:
-                u = load(weights_j, j)
-                v = load(weights_j, j + 8)
-                s0 = s0 + a0 * u + b0 * v
-                s1 = s1 + a1 * u + b1 * v
-                s2 = s2 + a2 * u + b2 * v
-                s3 = s3 + a3 * u + b3 * v
-                (a0, b0), (a1, b1), (a2, b2), (a3, b3) = R
-                for d in range(n):
-                    g = work.g[d]
-                    y = work.weighted_z[d]
-                    y0 = y[i]
-                    y1 = y[i + 1]
-                    y2 = y[i + 2]
-                    y3 = y[i + 3]
-                    store(g, j, load(g, j) + y0 * a0 + y1 * a1 + y2 * a2 + y3 * a3)
-                    store(
-                        g, j + 8, load(g, j + 8) + y0 * b0 + y1 * b1 + y2 * b2 + y3 * b3
-                    )
-        if derivatives:
-            work.p_i[i] = total(s0)
-            work.p_i[i + 1] = total(s1)
-            work.p_i[i + 2] = total(s2)
-            work.p_i[i + 3] = total(s3)
-
-
-@inline_njit
-def _expm1_of_block(near, rise, fall, left, z, i, j):
-    """expm1(delta) of the rows from i and the columns from j on."""
-    a = load(fall, j)
-    b = load(fall, j + 8)
-    a0 = a + rise[i]
-    a1 = a + rise[i + 1]
-    a2 = a + rise[i + 2]
-    a3 = a + rise[i + 3]
-    b0 = b + rise[i]
-    b1 = b + rise[i + 1]
-    b2 = b + rise[i + 2]
-    b3 = b + rise[i + 3]
-    for d in range(len(z)):
-        a = load(z[d], j)
-        b = load(z[d], j + 8)
-        x = left[d]
-        a0 = a0 + x[i] * a
-        a1 = a1 + x[i + 1] * a
-        a2 = a2 + x[i + 2] * a
-        a3 = a3 + x[i + 3] * a
-        b0 = b0 + x[i] * b
-        b1 = b1 + x[i + 1] * b
-        b2 = b2 + x[i + 2] * b
-        b3 = b3 + x[i + 3] * b
-    if near:
-        a0 = expm1_near_zero(a0)
-        a1 = expm1_near_zero(a1)
-        a2 = expm1_near_zero(a2)
-        a3 = expm1_near_zero(a3)
-        b0 = expm1_near_zero(b0)
-        b1 = expm1_near_zero(b1)
-        b2 = expm1_near_zero(b2)
-        b3 = expm1_near_zero(b3)
-    else:
-        a0 = expm1(a0)
-        a1 = expm1(a1)
-        a2 = expm1(a2)
-        a3 = expm1(a3)
-        b0 = expm1(b0)
-        b1 = expm1(b1)
-        b2 = expm1(b2)
-        b3 = expm1(b3)
-    return (a0, b0), (a1, b1), (a2, b2), (a3, b3)
-
-
-@inline_njit
-def _multiply_block(values, E, at):
-    """E exp(delta) and E expm1(delta), from expm1(delta); ``at`` is where E of these rows and columns stands."""
-    (a0, b0), (a1, b1), (a2, b2), (a3, b3) = values
-    e0 = load(E, at)
-    e1 = load(E, at + 16)
-    e2 = load(E, at + 32)
-    e3 = load(E, at + 48)
-    f0 = load(E, at + 8)
-    f1 = load(E, at + 24)
-    f2 = load(E, at + 40)
-    f3 = load(E, at + 56)
-    a0 = a0 * e0
-    a1 = a1 * e1
-    a2 = a2 * e2
-    a3 = a3 * e3
-    b0 = b0 * f0
-    b1 = b1 * f1
-    b2 = b2 * f2
-    b3 = b3 * f3
-    P = (a0, b0), (a1, b1), (a2, b2), (a3, b3)
-    return (
-        (a0 + e0, b0 + f0),
-        (a1 + e1, b1 + f1),
-        (a2 + e2, b2 + f2),
-        (a3 + e3, b3 + f3),
-    ), P
 
 
 @njit_inner
-def _differentiate_pair(belief, a, b, terms, P_sum, work, to):
-    """Adds the derivatives of the pair's sum to those of V_ab."""
-    dmu, dS, du = to
+def _differentiate_pair(belief, a, b, terms, P_sum, pair, scratch, gradient):
+    """Adds the derivatives of sum_ij P_ij to those of V_ab, by (11)."""
+    dmu = gradient.dmu
+    dS = gradient.dS
+    du = gradient.du
     n = len(belief.S)
     same = a == b
-    G_ab = work.G_ab
-    x = work.x
-    y = work.y
-    H = work.H
+    G_ab = scratch.G_ab
+    X = scratch.X
+    Y = scratch.Y
+    H = scratch.H
     D_a = belief.gp.inverse_squares[a]
     D_b = belief.gp.inverse_squares[b]
     sums = np.empty((2, n))
     controls = np.empty((2, len(du)))
-    # y = sum_ij P_ij (z_ai + z_bj) (z_ai + z_bj)' + U_ij (z_ai z_bj' + z_bj z_ai')
-    second_moments(work.p_i, terms.z[a], work.row, x)
-    second_moments(work.p_j, terms.z[b], work.row, y)
+    # Y = sum_ij P_ij (z_ai + z_bj) (z_ai + z_bj)' + U_ij (z_ai z_bj' + z_bj z_ai')
+    second_moments(pair.p_i, terms.z[a], scratch.row, X)
+    second_moments(pair.p_j, terms.z[b], scratch.row, Y)
     for c in range(n):
-        project(work.g[c], terms.z[b], H[c])
+        project(pair.g[c], terms.z[b], H[c])
         for d in range(n if not same else 0):  # in g of a = b is R, not P
             H[c, d] += terms.first[a, c] * terms.first[b, d]
     for c in range(n):
         for d in range(n):
-            y[c, d] += x[c, d] + H[c, d] + H[d, c]
-    congruence(G_ab, y, x, H)
+            Y[c, d] += X[c, d] + H[c, d] + H[d, c]
+    congruence(G_ab, Y, X, H)
     # dmu: sum_ij P_ij y_ij
-    project(work.p_i, terms.z[a], sums[0])
-    project(work.p_j, terms.z[b], sums[1])
+    project(pair.p_i, terms.z[a], sums[0])
+    project(pair.p_j, terms.z[b], sums[1])
     for c in range(n):
         sums[0, c] += sums[1, c]
     multiply_transposed(G_ab, sums[0], sums[1])
@@ -496,13 +404,14 @@ def _differentiate_pair(belief, a, b, terms, P_sum, work, to):
         dmu[c] += sums[1, c]
         for d in range(n):
             H[c, d] -= P_sum * G_ab[d, c] * (D_a[d] + D_b[d])
-    # U_ij = beta_ai beta_bj q_ai q_bj, or E_ij q_ai q_aj: what F_a and F_b make of the sums of each output alone
-    e_share = 1.0 if same else 0.0
-    U_sum = terms.M[a] * terms.M[b] - e_share * terms.e[a]
-    _add_difference((dmu, H), terms, a, U_sum, terms.M[b], e_share, (D_a, D_b), work)
-    _add_difference((dmu, H), terms, b, U_sum, terms.M[a], e_share, (D_b, D_a), work)
-    project(work.p_i, belief.u, controls[0])
-    project(work.p_j, belief.u, controls[1])
+    # U_ij = beta_ai beta_bj q_ai q_bj, or E_ij q_ai q_aj: F_a and F_b times the sums of
+    # each output alone
+    e_factor = 1.0 if same else 0.0
+    U_sum = terms.M[a] * terms.M[b] - e_factor * terms.e[a]
+    _add_difference(terms, a, D_a, D_b, U_sum, terms.M[b], e_factor, scratch, dmu, H)
+    _add_difference(terms, b, D_b, D_a, U_sum, terms.M[a], e_factor, scratch, dmu, H)
+    project(pair.p_i, belief.u, controls[0])
+    project(pair.p_j, belief.u, controls[1])
     for c in range(len(du)):
         du[c] += controls[0, c] * D_a[n + c] + controls[1, c] * D_b[n + c]
     for c in range(n):
@@ -512,32 +421,36 @@ def _differentiate_pair(belief, a, b, terms, P_sum, work, to):
 
 
 @njit_noalloc
-def _add_difference(to, terms, a, U_sum, M, e_share, scales, work):
-    """Adds sum_i U_i F z_i to dmu and sum_i U_i (y_i y_i' - w_i w_i') - sum_ij U_ij F D to dS, F = G_ab' - G_a'.
+def _add_difference(terms, a, D, D_other, U_sum, M_other, e_factor, scratch, dmu, dS):
+    """Adds the part of output a in the second term of (11), with F = F_a of (10).
 
-    U_i = sum_j U_ij = M beta_i q_i - e_share e_i, y_i = G_ab' z_i, w_i = G_a' z_i.
+    To dmu it adds sum_i U_i F z_i, to dS sum_i U_i (y_i y_i' - w_i w_i') - sum_ij U_ij
+    F D, where y_i = G_ab' z_i, w_i = G_a' z_i and U_i = sum_j U_ij = M_other beta_i q_i
+    - e_factor e_i.
     """
-    (dmu, dS), (D, D_other) = to, scales
-    F = work.F
-    moment = work.y
-    x = work.x
+    F = scratch.F
+    moment = scratch.Y
+    X = scratch.X
     G_a = terms.G[a]
-    G_ab = work.G_ab
+    G_ab = scratch.G_ab
     n = len(F)
     for c in range(n):
         for d in range(n):
             F[c, d] = 0.0
             for e in range(n):
                 F[c, d] -= G_ab[e, c] * D_other[e] * terms.T[a, e, d]
-            moment[c, d] = M * terms.second[a, c, d] - e_share * terms.e_second[a, c, d]
+            moment[c, d] = (
+                M_other * terms.second[a, c, d] - e_factor * terms.e_second[a, c, d]
+            )
     for c in range(n):
         for d in range(n):
-            dmu[c] += F[c, d] * (M * terms.first[a, d] - e_share * terms.e_first[a, d])
+            first = M_other * terms.first[a, d] - e_factor * terms.e_first[a, d]
+            dmu[c] += F[c, d] * first
             dS[c, d] -= U_sum * F[c, d] * D[d]
     # G_ab' X G_ab - G_a' X G_a = F X G_ab + (F X G_a)'
-    product(F, moment, x)
-    add_product(x, G_ab, dS)
-    product(x, G_a, moment)
+    product(F, moment, X)
+    add_product(X, G_ab, dS)
+    product(X, G_a, moment)
     for c in range(n):
         for d in range(n):
             dS[c, d] += moment[d, c]

@@ -1,8 +1,8 @@
 """The posterior's arrays in the order in which compiled loops read them.
 
-A vector over the training points is a row: contiguous, N padded to P, a multiple of 16 (two vector registers), by
-copies of the last point with weight zero, which change no sum. The inputs x~ = (x, u) are such rows: n states, then m
-controls.
+A vector over the training points is a row: contiguous, N padded to P, a multiple of 16
+(two vector registers), by copies of the last point with weight zero, which change no
+sum. The inputs x~ = (x, u) are such rows: n states, then m controls.
 """
 
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ from gpmpc.exceptions import ShapeError
 
 Array = NDArray[np.float64]
 
-# of a block of pairs of points
+# the size of a block of pairs of points
 ROWS = 4
 COLUMNS = 16
 
@@ -34,13 +34,14 @@ class GPArrays(NamedTuple):
 
 
 class Precision(NamedTuple):
-    """(K + sn2 I)^-1 of k GPs in two forms, as lower triangles."""
+    """(K + sn2 I)^-1 of k GPs in two forms, as lower triangles (k, size)."""
 
-    #: L_a^-1, four rows after four rows: of rows i to i + 3 the columns before i + 4, rounded up to a multiple of 8,
-    #: with zeros above the diagonal (k, size)
+    #: L_a^-1, four rows after four rows: of rows i to i + 3 the columns before i + 4,
+    #: rounded up to a multiple of 8, with zeros above the diagonal
     inverse_cholesky: Array
-    #: E_a = beta_a beta_a' - (K_a + sn2_a I)^-1, doubled below the diagonal, so that sums over i >= j suffice; block of
-    #: 4 x 16 after block, rows of blocks one after the other (k, size)
+    #: E_a = beta_a beta_a' - (K_a + sn2_a I)^-1, doubled below the diagonal, so that
+    #: sums over i >= j suffice; block of 4 x 16 after block, rows of blocks one after
+    #: the other
     centred: Array
 
 
@@ -60,44 +61,52 @@ class Packed:
 
     @cached_property
     def columns(self) -> Array:
-        """L by columns (k, N, N); a view where the factor lies in memory so, as LAPACK makes it."""
+        """L by columns (k, N, N).
+
+        It is a view where the factor lies in memory so, as LAPACK makes it.
+        """
         return np.ascontiguousarray(self.cholesky.transpose(0, 2, 1))
 
     @cached_property
     def precision(self) -> Precision:
-        """What exact moments and derivatives of the variance read."""
-        (k, padded), size = self.arrays.weights.shape, self.arrays.size
-        starts = range(0, padded, ROWS)
+        """The inverses that exact moments and derivatives of the variance read."""
+        size = self.arrays.size
+        padded = self.arrays.weights.shape[1]
         inverse = []
         centred = []
-        for factor, beta in zip(
-            self.cholesky, self.arrays.weights[:, :size], strict=True
-        ):
-            square = np.zeros((padded, padded))
-            square[:size, :size], _ = scipy.linalg.lapack.dtrtri(factor, lower=1)
-            inverse.append(
-                np.concatenate(
-                    [square[i : i + ROWS, : i // 8 * 8 + 8].ravel() for i in starts]
-                )
-            )
-            precision, _ = scipy.linalg.lapack.dpotri(
-                factor, lower=1
-            )  # the lower triangle
-            square[:size, :size] = np.tril(
-                np.multiply.outer(2 * beta, beta) - 2 * precision
-            )
-            np.fill_diagonal(square, square.diagonal() / 2)
-            rows = (
-                square[i : i + ROWS, : i // COLUMNS * COLUMNS + COLUMNS] for i in starts
-            )
-            blocks = (
-                row.reshape(ROWS, -1, COLUMNS).swapaxes(0, 1).ravel() for row in rows
-            )
-            centred.append(np.concatenate(list(blocks)))
-        found = Precision(aligned((k, len(inverse[0]))), aligned((k, len(centred[0]))))
-        found.inverse_cholesky[:] = inverse
-        found.centred[:] = centred
-        return found
+        for a in range(self.output_dim):
+            factor = self.cholesky[a]
+            beta = self.arrays.weights[a, :size]
+            inverse.append(_inverse_by_four_rows(factor, padded))
+            centred.append(_centred_by_blocks(factor, beta, padded))
+        return Precision(
+            inverse_cholesky=_aligned_copy(inverse), centred=_aligned_copy(centred)
+        )
+
+
+def _inverse_by_four_rows(factor: Array, padded: int) -> Array:
+    """Returns the inverse of a factor as ``Precision.inverse_cholesky`` (size,)."""
+    size = len(factor)
+    square = np.zeros((padded, padded))
+    square[:size, :size], _ = scipy.linalg.lapack.dtrtri(factor, lower=1)
+    rows = [
+        square[i : i + ROWS, : i // 8 * 8 + 8].ravel() for i in range(0, padded, ROWS)
+    ]
+    return np.concatenate(rows)
+
+
+def _centred_by_blocks(factor: Array, beta: Array, padded: int) -> Array:
+    """Returns beta beta' - (L L')^-1 as ``Precision.centred`` (size,)."""
+    size = len(factor)
+    precision, _ = scipy.linalg.lapack.dpotri(factor, lower=1)  # the lower triangle
+    square = np.zeros((padded, padded))
+    square[:size, :size] = np.tril(np.multiply.outer(2 * beta, beta) - 2 * precision)
+    np.fill_diagonal(square, square.diagonal() / 2)
+    blocks = []
+    for i in range(0, padded, ROWS):
+        row = square[i : i + ROWS, : i // COLUMNS * COLUMNS + COLUMNS]
+        blocks.append(row.reshape(ROWS, -1, COLUMNS).swapaxes(0, 1).ravel())
+    return np.concatenate(blocks)
 
 
 def pack(
@@ -110,33 +119,56 @@ def pack(
 ) -> Packed:
     """Lays out exact SE-ARD GPs for the compiled kernels.
 
-    From points x~ (N, n + m), l (k, n + m), sf2 (k,), the lower factor L of K + sn2 I (k, N, N), which is kept and not
-    copied, and beta = (K + sn2 I)^-1 y (k, N). Raises ShapeError where the shapes do not belong together.
+    Args:
+        features: The points x~ (N, n + m).
+        lengthscales: l (k, n + m).
+        signal_variance: sf2 (k,).
+        cholesky: Lower factor L of K + sn2 I (k, N, N), which is kept and not copied.
+        weights: beta = (K + sn2 I)^-1 y (k, N).
+        state_dim: n.
+
+    Raises:
+        ShapeError: The shapes do not belong together.
     """
-    (size, d), k = features.shape, len(weights)
-    got = lengthscales.shape, signal_variance.shape, cholesky.shape, weights.shape
-    if got != ((k, d), (k,), (k, size, size), (k, size)):
+    size, d = features.shape
+    k = len(weights)
+    shapes = (
+        lengthscales.shape,
+        signal_variance.shape,
+        cholesky.shape,
+        weights.shape,
+    )
+    if shapes != ((k, d), (k,), (k, size, size), (k, size)):
         raise ShapeError(
-            f"l (k, d), sf2 (k,), L (k, N, N) and beta (k, N) of points {features.shape}; got {got}"
+            "l (k, d), sf2 (k,), L (k, N, N) and beta (k, N) of points "
+            f"{features.shape}; got {shapes}"
         )
     padded = -(-size // COLUMNS) * COLUMNS
     points = aligned((d, padded))
-    padded_weights = aligned((k, padded))
     points[:, :size] = features.T
     points[:, size:] = features[-1:].T
+    padded_weights = aligned((k, padded))
     padded_weights[:, :size] = weights
     arrays = GPArrays(
-        points,
-        np.ascontiguousarray(lengthscales**-2.0),
-        np.log(signal_variance),
-        padded_weights,
-        size,
+        points=points,
+        inverse_squares=np.ascontiguousarray(lengthscales**-2.0),
+        log_signal=np.log(signal_variance),
+        weights=padded_weights,
+        size=size,
     )
-    return Packed(arrays, cholesky, state_dim, d - state_dim)
+    return Packed(
+        arrays=arrays, cholesky=cholesky, state_dim=state_dim, input_dim=d - state_dim
+    )
 
 
 def aligned(shape: tuple[int, int]) -> Array:
-    """Zeros whose rows start on cache lines where they are multiples of 8."""
+    """Returns zeros; rows of a multiple of 8 numbers start on cache lines."""
     rows = aligned_rows(*shape)
     rows[:] = 0.0
     return rows
+
+
+def _aligned_copy(rows: list[Array]) -> Array:
+    copy = aligned((len(rows), len(rows[0])))
+    copy[:] = rows
+    return copy

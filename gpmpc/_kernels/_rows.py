@@ -1,4 +1,8 @@
-"""Sums and products of vectors over the training points: rows of P numbers, P a multiple of 16."""
+"""Sums and products of vectors over the training points.
+
+They are rows of P numbers, P a multiple of 16. Loops that add up several rows at once
+do so for the latency of an addition: four sums in turns hide it.
+"""
 
 from gpmpc._compiled import inline_njit, njit_noalloc
 from gpmpc._kernels._simd import (
@@ -21,7 +25,7 @@ def multiply(x, y, out):
 
 @inline_njit
 def row_sum(row):
-    """The sum of a row: numba's own adds one number after the other."""
+    """Returns the sum of a row; numba's own adds one number after the other."""
     total = 0.0
     for j in range(len(row)):
         total += row[j]
@@ -84,7 +88,7 @@ def add_products(factors, rows, others, out):
 
 @njit_noalloc
 def largest_square(rows):
-    """The largest squared length of a column; NaN is passed over."""
+    """Returns the largest squared length of a column; NaN is passed over."""
     use_widest_registers()
     most = zeros()
     for j in range(0, rows.shape[1], 8):
@@ -98,7 +102,7 @@ def largest_square(rows):
 
 @njit_noalloc
 def largest_size(row):
-    """The largest magnitude; NaN is passed over."""
+    """Returns the largest magnitude; NaN is passed over."""
     use_widest_registers()
     most = zeros()
     for j in range(0, len(row), 8):
@@ -107,18 +111,22 @@ def largest_size(row):
 
 
 @njit_noalloc
-def reduce_variance(triangle, q, solved):
-    """Returns |L^-1 q|^2 and writes (K + sn2 I)^-1 q to ``solved``, in one pass over L^-1 (``Precision``)."""
+def reduce_variance(triangle, q, solution):
+    """Returns |L^-1 q|^2 and writes (K + sn2 I)^-1 q to ``solution``.
+
+    It takes one pass over ``triangle``, L^-1 as ``Precision.inverse_cholesky``: v = L^-1
+    q, four entries at a time, whose multiples of their rows add up to L^-T v.
+    """
     use_widest_registers()
-    solved[:] = 0.0
+    solution[:] = 0.0
     total = 0.0
-    at = 0
+    start = 0
     for i in range(0, len(q), 4):
         length = i // 8 * 8 + 8
-        row0 = triangle[at : at + length]
-        row1 = triangle[at + length : at + 2 * length]
-        row2 = triangle[at + 2 * length : at + 3 * length]
-        row3 = triangle[at + 3 * length : at + 4 * length]
+        row0 = triangle[start : start + length]
+        row1 = triangle[start + length : start + 2 * length]
+        row2 = triangle[start + 2 * length : start + 3 * length]
+        row3 = triangle[start + 3 * length : start + 4 * length]
         v0 = v1 = v2 = v3 = 0.0
         for j in range(length):
             v0 += row0[j] * q[j]
@@ -126,19 +134,20 @@ def reduce_variance(triangle, q, solved):
             v2 += row2[j] * q[j]
             v3 += row3[j] * q[j]
         for j in range(length):
-            solved[j] = (
-                solved[j] + v0 * row0[j] + v1 * row1[j] + v2 * row2[j] + v3 * row3[j]
+            solution[j] = (
+                solution[j] + v0 * row0[j] + v1 * row1[j] + v2 * row2[j] + v3 * row3[j]
             )
         total += v0 * v0 + v1 * v1 + v2 * v2 + v3 * v3
-        at += 4 * length
+        start += 4 * length
     return total
 
 
 @njit_noalloc
 def reduce_variances(columns, size, q, totals):
-    """Adds |L^-1 q_h|^2 of the rows of q, a multiple of four of them, to ``totals``; q is overwritten.
+    """Adds |L^-1 q_h|^2 of the rows of q to ``totals``; q is overwritten.
 
-    Forward substitution that reads L, of which ``columns[j]`` begins with column j, once and four columns at a time.
+    Forward substitution that reads L, of which ``columns[j]`` begins with column j,
+    once and four columns at a time, for four rows of q at a time.
     """
     use_widest_registers()
     j = 0
@@ -147,20 +156,18 @@ def reduce_variances(columns, size, q, totals):
         c1 = columns[j + 1]
         c2 = columns[j + 2]
         c3 = columns[j + 3]
-        at = max(
-            0, size - (size - j - 4 + 7) // 8 * 8
-        )  # whole registers; what comes before j + 4 is done with
-        d0 = c0[at:]
-        d1 = c1[at:]
-        d2 = c2[at:]
-        d3 = c3[at:]
-        for h in range(
-            0, len(q) - 3, 4
-        ):  # with a bound of len(q) // 4 * 4 LLVM makes loops that take twice as long
-            r0 = q[h, at:size]
-            r1 = q[h + 1, at:size]
-            r2 = q[h + 2, at:size]
-            r3 = q[h + 3, at:size]
+        # whole registers; the entries before j + 4 have been solved for
+        start = max(0, size - (size - j - 4 + 7) // 8 * 8)
+        d0 = c0[start:]
+        d1 = c1[start:]
+        d2 = c2[start:]
+        d3 = c3[start:]
+        # with a bound of len(q) // 4 * 4 LLVM makes loops that take twice as long
+        for h in range(0, len(q) - 3, 4):
+            r0 = q[h, start:size]
+            r1 = q[h + 1, start:size]
+            r2 = q[h + 2, start:size]
+            r3 = q[h + 3, start:size]
             e0, e1, e2, e3 = _solve_four(c0, c1, c2, c3, j, q[h])
             f0, f1, f2, f3 = _solve_four(c0, c1, c2, c3, j, q[h + 1])
             g0, g1, g2, g3 = _solve_four(c0, c1, c2, c3, j, q[h + 2])
@@ -179,7 +186,7 @@ def reduce_variances(columns, size, q, totals):
                 r2[i] -= g0 * x0 + g1 * x1 + g2 * x2 + g3 * x3
                 r3[i] -= h0 * x0 + h1 * x1 + h2 * x2 + h3 * x3
         for h in range(len(q) // 4 * 4, len(q)):
-            r0 = q[h, at:size]
+            r0 = q[h, start:size]
             e0, e1, e2, e3 = _solve_four(c0, c1, c2, c3, j, q[h])
             totals[h] += e0 * e0 + e1 * e1 + e2 * e2 + e3 * e3
             for i in range(len(r0)):
@@ -198,7 +205,7 @@ def reduce_variances(columns, size, q, totals):
 
 @inline_njit
 def _solve_four(c0, c1, c2, c3, j, row):
-    """Entries j to j + 3 of L^-1 q; what the columns before contribute has been subtracted from ``row``."""
+    """Returns entries j to j + 3 of L^-1 q; ``row`` is q less the columns before."""
     v0 = row[j] / c0[j]
     v1 = (row[j + 1] - v0 * c0[j + 1]) / c1[j + 1]
     v2 = (row[j + 2] - v0 * c0[j + 2] - v1 * c1[j + 2]) / c2[j + 2]

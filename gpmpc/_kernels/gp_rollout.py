@@ -51,13 +51,15 @@ class Feedback(NamedTuple):
 
 
 @njit_noalloc
-def _write_means(f, offset, at, memory, means):
-    """Writes the means offset + sum_j beta_j sf2 exp(-1/2 sum_d D_d (x~_j - x~)_d^2) of GPs at one point.
+def _write_means(f, offset, point, memory, means):
+    """Writes the GPs' means at one point x~ (d,).
 
-    ``memory`` is lent to work in: eight numbers for each dimension and each GP.
+    They are offset + sum_j beta_j sf2 exp(-1/2 sum_d D_d (x~_j - x~)_d^2). ``memory`` is
+    lent to work in: eight numbers for each dimension and each GP.
     """
     use_widest_registers()
-    (dimensions, count), outputs = f.points.shape, len(offset)
+    dimensions, count = f.points.shape
+    outputs = len(offset)
     points = f.points.reshape(-1)
     weights = f.weights.reshape(-1)
     D = f.inverse_squares
@@ -66,42 +68,71 @@ def _write_means(f, offset, at, memory, means):
         store(memory, first + 8 * a, zeros())
     for j in range(0, count, 8):
         for d in range(dimensions):
-            difference = load(points, d * count + j) - at[d]
+            difference = load(points, d * count + j) - point[d]
             store(memory, 8 * d, difference * difference)
         for a in range(outputs):
             exponent = zeros() + f.log_signal[a]
             for d in range(dimensions):
                 exponent = exponent - (0.5 * D[a, d]) * load(memory, 8 * d)
             place = first + 8 * a
-            store(
-                memory,
-                place,
-                load(memory, place) + exp(exponent) * load(weights, a * count + j),
-            )
+            weighted = exp(exponent) * load(weights, a * count + j)
+            store(memory, place, load(memory, place) + weighted)
     for a in range(outputs):
         means[a] = offset[a] + total(load(memory, first + 8 * a))
 
 
+@njit_noalloc
+def _write_input(feedback, t, k, x, last_input, u):
+    """Writes the input of plan t at step k and state x, within its bounds."""
+    planned_state = feedback.states[t, k]
+    gains = feedback.gains[min(t, len(feedback.gains) - 1), k]
+    for i in range(len(u)):
+        value = feedback.inputs[t, k, i]
+        for j in range(len(x)):
+            value += gains[i, j] * (x[j] - planned_state[j])
+        value = min(
+            max(value, last_input[i] + feedback.rate_lower[k, i]),
+            last_input[i] + feedback.rate_upper[k, i],
+        )
+        u[i] = min(max(value, feedback.lower[k, i]), feedback.upper[k, i])
+
+
+@njit_noalloc
+def _write_features(model, x, u, features):
+    """Writes x~: the states that f depends on, angles as sine or cosine, and inputs."""
+    d = len(model.states)
+    for i in range(d):
+        z = x[model.states[i]]
+        if model.kinds[i] == SINE:
+            features[i] = math.sin(z)
+        elif model.kinds[i] == COSINE:
+            features[i] = math.cos(z)
+        else:
+            features[i] = z
+    for i in range(len(model.inputs)):
+        features[d + i] = u[model.inputs[i]]
+
+
 @compiled
 def roll_out_gps(model, feedback, start, disturbance, states, inputs):
-    """Writes the states (T, H + 1, n) and the inputs (T, H, m) of T roll-outs of ``AffineGPs`` from x_0 (T, n) on.
+    """Writes the states (T, H + 1, n) and inputs (T, H, m) of T roll-outs.
 
-    A disturbance (n,) is added to every next state.
+    They are of ``AffineGPs``, from x_0 (T, n) on; a disturbance (n,) is added to every
+    next state. Eight roll-outs go side by side, for the tape.
     """
     use_widest_registers()
-    f, offset, A, G, c, B, columns, kinds, chosen, tape = model
-    (T, H, m), n, d, k_dim = inputs.shape, start.shape[1], len(columns), len(offset)
-    work = aligned_rows(2, 8 + d + len(chosen) + k_dim)
-    at = work[0]
-    value = work[1]
-    sums = aligned_rows(d + len(chosen) + k_dim, 8).reshape(-1)
-    memory = aligned_rows(
-        2 * n + m + tape.work + 5, 8
-    )  # eight roll-outs side by side, for the tape
-    point = memory[: n + m]
-    known = memory[n + m : 2 * n + m]
-    places = memory[2 * n + m :]
-    memory[: 2 * n + m] = 0.0
+    T, H, m = inputs.shape
+    n = start.shape[1]
+    k_dim = len(model.offset)
+    features_dim = len(model.states) + len(model.inputs)
+    features = aligned_rows(1, 8 + features_dim + k_dim)[0]
+    means = aligned_rows(1, 8 + features_dim + k_dim)[0]
+    sums = aligned_rows(features_dim + k_dim, 8).reshape(-1)
+    points = aligned_rows(n + m, 8)  # x and u of eight roll-outs
+    f0 = aligned_rows(n, 8)
+    places = aligned_rows(model.tape.work + 5, 8)
+    points[:] = 0.0
+    f0[:] = 0.0
     for t in range(T):
         copy(start[t], states[t, 0])
     for first in range(0, T, 8):
@@ -110,45 +141,26 @@ def roll_out_gps(model, feedback, start, disturbance, states, inputs):
             for t in together:
                 x = states[t, k]
                 u = inputs[t, k]
-                planned = feedback.states[t, k]
-                gains = feedback.gains[min(t, len(feedback.gains) - 1), k]
-                for i in range(m):
-                    wanted = feedback.inputs[t, k, i]
-                    for j in range(n):
-                        wanted += gains[i, j] * (x[j] - planned[j])
-                    last = inputs[t, k - 1, i] if k > 0 else feedback.previous_input[i]
-                    wanted = min(
-                        max(wanted, last + feedback.rate_lower[k, i]),
-                        last + feedback.rate_upper[k, i],
-                    )
-                    u[i] = min(max(wanted, feedback.lower[k, i]), feedback.upper[k, i])
-                    point[n + i, t - first] = u[i]
+                last_input = inputs[t, k - 1] if k > 0 else feedback.previous_input
+                _write_input(feedback, t, k, x, last_input, u)
                 for i in range(n):
-                    point[i, t - first] = x[i]
-            if tape.size > 0:
-                run_tape(tape, point, places, known, None)
+                    points[i, t - first] = x[i]
+                for i in range(m):
+                    points[n + i, t - first] = u[i]
+            if model.tape.size > 0:
+                run_tape(model.tape, points, places, f0, None)
             for t in together:
                 x = states[t, k]
                 u = inputs[t, k]
                 after = states[t, k + 1]
-                for i in range(d):
-                    z = x[columns[i]]
-                    at[i] = (
-                        math.sin(z)
-                        if kinds[i] == SINE
-                        else math.cos(z)
-                        if kinds[i] == COSINE
-                        else z
-                    )
-                for i in range(len(chosen)):
-                    at[d + i] = u[chosen[i]]
+                _write_features(model, x, u, features)
                 if k_dim > 0:
-                    _write_means(f, offset, at, sums, value)
+                    _write_means(model.f, model.offset, features, sums, means)
                 for i in range(n):
-                    added = known[i, t - first] + c[i] + disturbance[i]
+                    added = f0[i, t - first] + model.c[i] + disturbance[i]
                     after[i] = (
                         added
-                        + dot(A[i], x, n)
-                        + dot(G[i], u, m)
-                        + dot(B[i], value, k_dim)
+                        + dot(model.A[i], x, n)
+                        + dot(model.G[i], u, m)
+                        + dot(model.B[i], means, k_dim)
                     )

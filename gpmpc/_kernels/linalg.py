@@ -1,6 +1,8 @@
-"""Dense linear algebra for compiled loops: small vectors and matrices, for which a library call costs too much.
+"""Dense linear algebra for compiled loops.
 
-Sizes come from the arrays; where rows are padded, a caller passes the number of entries that count.
+It is for small vectors and matrices, for which a library call costs too much. Sizes
+come from the arrays; where rows are padded, a caller passes the number of entries that
+count.
 """
 
 import math
@@ -13,7 +15,10 @@ from gpmpc._kernels._simd import load, store, zeros
 
 @njit_inner
 def aligned_rows(rows, length):
-    """An uninitialised matrix whose rows start on cache lines where ``length`` is a multiple of 8."""
+    """Makes an uninitialised matrix.
+
+    Its rows start on cache lines where ``length`` is a multiple of 8.
+    """
     memory = np.empty(rows * length + 8)
     skip = (-(memory.ctypes.data >> 3)) % 8
     return memory[skip : skip + rows * length].reshape(rows, length)
@@ -21,7 +26,10 @@ def aligned_rows(rows, length):
 
 @njit_noalloc
 def copy(x, y):
-    """Copies x to y: ``y[:] = x`` makes numba compile the message of an error, a second per kernel."""
+    """Copies x to y.
+
+    ``y[:] = x`` makes numba compile the message of an error, a second per kernel.
+    """
     for i in range(len(y)):
         y[i] = x[i]
 
@@ -44,7 +52,10 @@ def dot(x, y, size):
 
 @inline_njit
 def four_dots(rows, x, size, out):
-    """Writes rows[i]' x of four vectors to ``out``; x is read once, and four sums hide each other's latency."""
+    """Writes rows[i]' x of four vectors to ``out``.
+
+    x is read once, and four sums hide each other's latency.
+    """
     r0, r1, r2, r3 = rows
     s0 = 0.0
     s1 = 0.0
@@ -64,7 +75,7 @@ def four_dots(rows, x, size, out):
 
 @inline_njit
 def multiply(A, count, x, size, out):
-    """Writes A x for the first ``count`` rows and ``size`` columns of A, four rows at a time."""
+    """Writes A x for the first ``count`` rows and ``size`` columns of A."""
     i = 0
     while i + 4 <= count:
         four_dots((A[i], A[i + 1], A[i + 2], A[i + 3]), x, size, out[i:])
@@ -76,13 +87,15 @@ def multiply(A, count, x, size, out):
 
 @inline_njit
 def combine_rows(rows, count, factors, start, width, out):
-    """Writes sum_j factors[j] rows[j] over ``count`` rows, columns from ``start`` on, ``width`` of them.
+    """Writes sum_j factors[j] rows[j] over ``count`` rows.
 
-    Rows and ``out`` are padded: what lies between the last and the next whole register is written too.
+    It does so for ``width`` columns from ``start`` on, sixteen at a time, with sums of
+    four rows side by side. Rows and ``out`` are padded: what lies between the last and
+    the next whole register is written too.
     """
-    at = start
+    column = start
     end = start + width
-    while at + 8 < end:
+    while column + 8 < end:
         a = b = c = d = e = f = g = h = zeros()
         j = 0
         while j + 4 <= count:
@@ -94,35 +107,35 @@ def combine_rows(rows, count, factors, start, width, out):
             f1 = factors[j + 1]
             f2 = factors[j + 2]
             f3 = factors[j + 3]
-            a = a + f0 * load(r0, at)
-            b = b + f0 * load(r0, at + 8)
-            c = c + f1 * load(r1, at)
-            d = d + f1 * load(r1, at + 8)
-            e = e + f2 * load(r2, at)
-            f = f + f2 * load(r2, at + 8)
-            g = g + f3 * load(r3, at)
-            h = h + f3 * load(r3, at + 8)
+            a = a + f0 * load(r0, column)
+            b = b + f0 * load(r0, column + 8)
+            c = c + f1 * load(r1, column)
+            d = d + f1 * load(r1, column + 8)
+            e = e + f2 * load(r2, column)
+            f = f + f2 * load(r2, column + 8)
+            g = g + f3 * load(r3, column)
+            h = h + f3 * load(r3, column + 8)
             j += 4
         while j < count:
-            a = a + factors[j] * load(rows[j], at)
-            b = b + factors[j] * load(rows[j], at + 8)
+            a = a + factors[j] * load(rows[j], column)
+            b = b + factors[j] * load(rows[j], column + 8)
             j += 1
-        store(out, at, (a + c) + (e + g))
-        store(out, at + 8, (b + d) + (f + h))
-        at += 16
-    if at < end:
+        store(out, column, (a + c) + (e + g))
+        store(out, column + 8, (b + d) + (f + h))
+        column += 16
+    if column < end:
         a = b = c = d = zeros()
         j = 0
         while j + 4 <= count:
-            a = a + factors[j] * load(rows[j], at)
-            b = b + factors[j + 1] * load(rows[j + 1], at)
-            c = c + factors[j + 2] * load(rows[j + 2], at)
-            d = d + factors[j + 3] * load(rows[j + 3], at)
+            a = a + factors[j] * load(rows[j], column)
+            b = b + factors[j + 1] * load(rows[j + 1], column)
+            c = c + factors[j + 2] * load(rows[j + 2], column)
+            d = d + factors[j + 3] * load(rows[j + 3], column)
             j += 4
         while j < count:
-            a = a + factors[j] * load(rows[j], at)
+            a = a + factors[j] * load(rows[j], column)
             j += 1
-        store(out, at, (a + b) + (c + d))
+        store(out, column, (a + b) + (c + d))
 
 
 @njit_noalloc
@@ -184,7 +197,10 @@ def symmetrize(A):
 
 @njit_noalloc
 def solve_positive(A, X):
-    """Replaces X by A^-1 X and the lower triangle of A = L L' by L; False where a pivot is not positive."""
+    """Replaces X by A^-1 X, and the lower triangle of A = L L' by L.
+
+    Returns False where a pivot is not positive.
+    """
     n, width = X.shape
     for i in range(n):
         for j in range(i):
@@ -210,10 +226,12 @@ def solve_positive(A, X):
 
 @njit_noalloc
 def condition(S, D, whiten, G):
-    """Writes G = (I + S D)^-1 and W = C^-1 D^1/2 for S >= 0, diagonal D > 0; returns 1/2 log|I + S D|.
+    """Returns 1/2 log|I + S D| for S >= 0, diagonal D > 0; writes (I + S D)^-1 to G.
 
-    With B = D^1/2 S D^1/2 and I + B = C C', well conditioned also where S is singular, G = D^-1/2 (I + B)^-1 D^1/2 and
-    |W x|^2 = x' (S + D^-1)^-1 x. The pivots less one come without a one to cancel: a small S keeps its digits.
+    W = C^-1 D^1/2 goes to ``whiten``. With B = D^1/2 S D^1/2 and I + B = C C', well
+    conditioned also where S is singular, G = D^-1/2 (I + B)^-1 D^1/2 and |W x|^2 = x'
+    (S + D^-1)^-1 x. The pivots less one come without a one to cancel: a small S keeps
+    its digits.
     """
     n = len(S)
     half_logdet = 0.0

@@ -1,7 +1,8 @@
-"""Evaluates functions that are lists of scalar operations, at eight points at once, with derivatives.
+"""Evaluates functions that are lists of scalar operations, with derivatives.
 
-A tape is what is left of an expression of sums, products and elementary functions: one operation after the other on a
-few places of work. Compiled loops run it beside GPs, and no function of a user is compiled. Derivatives are carried
+A tape is an expression of sums, products and elementary functions as a list: one
+operation after the other on a few places of work. Compiled loops run it beside GPs, at
+eight points at once, and no function of a user is compiled. Derivatives are carried
 along forwards, tangents for every place (Griewank and Walther, 2008, section 3.1).
 """
 
@@ -55,8 +56,8 @@ OPERATIONS = frozenset(
 class Tape(NamedTuple):
     """A function of a vector z (d,)."""
 
-    #: operation, place of the result (an index into the value of an ``OUTPUT``) and places of up to two operands (an
-    #: index into z of an ``INPUT``) (K, 4)
+    #: operation, place of the result (an index into the value of an ``OUTPUT``) and
+    #: places of up to two operands (an index into z of an ``INPUT``) (K, 4)
     code: NDArray[np.int64]
     constants: Array  #: of the operations ``CONST``, by row (K,)
     work: int  #: number of places
@@ -68,9 +69,10 @@ NO_TAPE = Tape(np.empty((0, 4), dtype=np.int64), np.empty(0), 0, 0)
 
 @njit_noalloc
 def run_tape(tape, z, work, value, slopes):
-    """Writes the values (size, 8) at eight points z (d, 8); ``work`` (places + 5, 8) is lent to work in.
+    """Writes the values (size, 8) at eight points z (d, 8).
 
-    ``slopes`` is None, or the derivatives (size, d, 8) to be written and memory for those of the places (places, d, 8).
+    ``work`` (places + 5, 8) is lent to work in. ``slopes`` is None, or the derivatives
+    (size, d, 8) to be written and memory for those of the places (places, d, 8).
     """
     use_widest_registers()
     d = len(z)
@@ -103,10 +105,10 @@ def run_tape(tape, z, work, value, slopes):
                         zeros() + (1.0 if operation == INPUT and c == j else 0.0),
                     )
         else:
-            found, by_first, by_second = _operate(
+            result, by_first, by_second = _operate(
                 operation, load(work, j), load(work, last), work, 8 * tape.work
             )
-            store(work, i, found)
+            store(work, i, result)
             if slopes is not None:
                 both = operation in TWO_OPERANDS
                 for c in range(0, 8 * d, 8):
@@ -120,7 +122,8 @@ def run_tape(tape, z, work, value, slopes):
 def linearize_tape(tape, points, values, jacobians):
     """Writes the values (K, size) at K points z (K, d), and their derivatives (K, size, d)."""
     use_widest_registers()
-    (K, d), size = points.shape, tape.size
+    K, d = points.shape
+    size = tape.size
     z = aligned_rows(d, 8)
     work = aligned_rows(tape.work + 5, 8)
     value = aligned_rows(size, 8)
@@ -141,9 +144,10 @@ def linearize_tape(tape, points, values, jacobians):
 
 @inline_njit
 def _operate(operation, a, b, work, free):
-    """The values of an operation on a and b, and its derivatives by them; b is not read where it has one operand.
+    """Returns the values of an operation on a and b, and its derivatives by them.
 
-    40 entries of ``work`` from ``free`` on are written to.
+    b is not read where it has one operand. 40 entries of ``work`` from ``free`` on are
+    written to.
     """
     if operation == ADD:
         return a + b, zeros() + 1.0, zeros() + 1.0
@@ -166,20 +170,24 @@ def _operate(operation, a, b, work, free):
     store(work, free, a)
     store(work, free + 8, b)
     for lane in range(free, free + 8):
-        found = _operate_rarely(operation, work[lane], work[lane + 8])
-        work[lane + 16], work[lane + 24], work[lane + 32] = found
+        value, by_first, by_second = _operate_rarely(
+            operation, work[lane], work[lane + 8]
+        )
+        work[lane + 16] = value
+        work[lane + 24] = by_first
+        work[lane + 32] = by_second
     return load(work, free + 16), load(work, free + 24), load(work, free + 32)
 
 
 @njit_noalloc
 def _over(a, b):
-    """The quotient, infinite or NaN for b = 0, where Python raises an error."""
+    """Returns a / b, infinite or NaN for b = 0, where Python raises an error."""
     return a / b if b != 0.0 else a * np.inf
 
 
 @njit_noalloc
 def _operate_rarely(operation, a, b):
-    """``_operate`` for all other operations."""
+    """Does what ``_operate`` does for all other operations, on two numbers."""
     if operation == INV:
         return _over(1.0, a), _over(-1.0, a * a), 0.0
     if operation == EXP:
@@ -189,11 +197,8 @@ def _operate_rarely(operation, a, b):
         return math.log(a) if a > 0.0 else np.nan, _over(1.0, a), 0.0
     if operation in (POW, CONSTPOW):
         value = a**b
-        return (
-            value,
-            b * a ** (b - 1.0),
-            math.log(a) * value if operation == POW and a > 0.0 else 0.0,
-        )
+        by_exponent = math.log(a) * value if operation == POW and a > 0.0 else 0.0
+        return value, b * a ** (b - 1.0), by_exponent
     if operation == SQRT:
         root = math.sqrt(a) if a >= 0.0 else np.nan
         return root, _over(0.5, root), 0.0
@@ -209,9 +214,16 @@ def _operate_rarely(operation, a, b):
         value = math.tanh(a)
         return value, 1.0 - value * value, 0.0
     if operation == FABS:
-        return abs(a), 1.0 if a > 0.0 else -1.0 if a < 0.0 else 0.0, 0.0
+        slope = 0.0
+        if a > 0.0:
+            slope = 1.0
+        if a < 0.0:
+            slope = -1.0
+        return abs(a), slope, 0.0
     if operation == FMIN:
-        return min(a, b), 1.0 if a <= b else 0.0, 0.0 if a <= b else 1.0
+        by_first = 1.0 if a <= b else 0.0
+        return min(a, b), by_first, 1.0 - by_first
     if operation == FMAX:
-        return max(a, b), 1.0 if a >= b else 0.0, 0.0 if a >= b else 1.0
+        by_first = 1.0 if a >= b else 0.0
+        return max(a, b), by_first, 1.0 - by_first
     return a, 1.0, 0.0  # an assignment

@@ -213,7 +213,7 @@ def _by_belief(
         variances = np.diagonal(covariances, axis1=1, axis2=2).clip(0)
         by_deviations = _slopes_by_deviations(F, np.sqrt(variances))
         return np.concatenate([F, signed_kappa[:, None] * by_deviations], axis=2)
-    by_root = _slopes_by_root(F, square_roots(covariances)[0])
+    by_root = _slopes_by_root(F, square_roots(covariances).root)
     by_root = signed_kappa[:, None, None] * by_root
     n = F.shape[2]
     return np.concatenate([F, by_root.reshape(K, -1, n * n)], axis=2)

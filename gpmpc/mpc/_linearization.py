@@ -405,7 +405,7 @@ class StageLinearizer:
     def state(self, means: Array, covariances: Array) -> Array:
         """Returns the vectors s (K, p) of beliefs (K, n), (K, n, n)."""
         if self.covariance == "full":
-            roots = square_roots(covariances)[0]
+            roots = square_roots(covariances).root
             return np.concatenate((means, roots.reshape(len(means), -1)), axis=1)
         if self.covariance == "diagonal":
             variances = np.diagonal(covariances, axis1=1, axis2=2)

@@ -1,4 +1,9 @@
-"""Gaussian beliefs pushed through learned models, and the local models that control needs of that."""
+"""Propagation of Gaussian beliefs through learned models, and local models of it.
+
+``_propagator`` holds the protocol and derivatives by autograd; ``_linearization``,
+``_points`` and ``_moment_matching`` the propagators, the last on top of ``_moments``,
+the exact moments of GPs; ``_local_model`` the linear system that controllers take.
+"""
 
 from gpmpc.propagation._linearization import Linearization, MeanEquivalence
 from gpmpc.propagation._local_model import linearize, rollout

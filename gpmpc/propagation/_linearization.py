@@ -1,4 +1,4 @@
-"""Propagation through a model's expansion at the belief's mean, as in an extended Kalman filter.
+"""Propagation through a model's expansion at the belief's mean, as in an EKF.
 
 With A = dm/dx at (mu, u) and the model's own variance there,
 
@@ -17,6 +17,7 @@ from gpmpc._dynamics import predict_with_jacobian
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp._backend import host_arrays
 from gpmpc.propagation._propagator import (
+    NextMoments,
     NoisyPropagator,
     Propagation,
     Sensitivity,
@@ -24,8 +25,8 @@ from gpmpc.propagation._propagator import (
 )
 
 
-class _Expansion(NamedTuple):
-    """The model around a certain state and input."""
+class Expansion(NamedTuple):
+    """A model around certain states and inputs."""
 
     belief: Gaussian  # the prediction there
     A: Tensor  # the mean's derivative by the state (*batch, k, n)
@@ -36,45 +37,62 @@ class _Expansion(NamedTuple):
     mean_by_state_input: Tensor  # (*batch, k, n, m)
 
 
-def expand(model: Any, state: Tensor, input: Tensor) -> _Expansion | None:
-    """The expansion of GPs alone by the compiled loops; None for other models, and where those cannot evaluate."""
+def expand(model: Any, state: Tensor, input: Tensor) -> Expansion | None:
+    """Expands GPs alone by the compiled loops, at states (*batch, n) and inputs.
+
+    Returns None for other models, and where those loops cannot evaluate.
+    """
     form = getattr(model, "affine_form", None)
-    if (
-        form is None
-        or form.B is not None
-        or (arrays := host_arrays(form.f.weights, state, input)) is None
-    ):
+    if form is None or form.B is not None:
+        return None
+    gp = form.f
+    arrays = host_arrays(gp.weights, state, input)
+    if arrays is None:
         return None
     from gpmpc import _kernels as kernels  # loads numba
 
     batch = state.shape[:-1]
-    gp = form.f
-    flat = arrays[1].reshape(-1, gp.state_dim)
-    found = kernels.point_with_jacobian(
-        gp.packed, flat, arrays[2].reshape(len(flat), gp.input_dim)
-    )
-    parts = [torch.from_numpy(part.reshape(*batch, *part.shape[1:])) for part in found]
-    mean = parts[0] + gp.offset
-    A = parts[2]
+    _, states, inputs = arrays
+    states = states.reshape(-1, gp.state_dim)
+    inputs = inputs.reshape(len(states), gp.input_dim)
+    at = kernels.point_with_jacobian(gp.packed, states, inputs)
+
+    def tensor(rows: kernels.Array) -> Tensor:
+        return torch.from_numpy(rows.reshape(*batch, *rows.shape[1:]))
+
+    mean = tensor(at.M) + gp.offset
+    A = tensor(at.J)
     if form.A is not None:
         mean = mean + state
         A = A + form.A
-    return _Expansion(Gaussian(mean, torch.diag_embed(parts[1])), A, *parts[3:])
+    return Expansion(
+        belief=Gaussian(mean, torch.diag_embed(tensor(at.variance))),
+        A=A,
+        B=tensor(at.dM_du),
+        variance_by_state=tensor(at.dvariance_dx),
+        variance_by_input=tensor(at.dvariance_du),
+        mean_by_state2=tensor(at.d2M_dx2),
+        mean_by_state_input=tensor(at.d2M_dxdu),
+    )
 
 
 class Linearization(NoisyPropagator):
     """First order, with the model's noise unless ``process_noise=False``."""
 
-    first_order = True  #: mean, derivatives and variance of the model at the belief's mean are all that it takes
+    #: needs the model's mean, derivatives and variance at the belief's mean alone
+    first_order = True
 
     def differentiate(
         self, model: Any, belief: Gaussian, input: Tensor | None = None
     ) -> tuple[Propagation, Sensitivity] | None:
-        """``propagate`` with all derivatives in closed form; None where there is none."""
+        """Propagates with all derivatives in closed form; None where there is none."""
         input = checked_input(model, belief, input)
-        if (expansion := expand(model, belief.mean, input)) is None:
+        expansion = expand(model, belief.mean, input)
+        if expansion is None:
             return None
         A = expansion.A
+        moments = _first_order(belief, expansion.belief, A)
+        # of A S A': A changes with the mean and the input
         AS = A @ belief.covariance
         by_mean = torch.einsum("...ip,...jpc->...ijc", AS, expansion.mean_by_state2)
         by_input = torch.einsum(
@@ -82,30 +100,26 @@ class Linearization(NoisyPropagator):
         )
         by_covariance = torch.einsum("...ic,...jd->...ijcd", A, A)
         sensitivity = Sensitivity(
-            A,
-            torch.zeros_like(expansion.mean_by_state2),
-            expansion.B,
-            by_mean
+            mean_by_mean=A,
+            mean_by_covariance=torch.zeros_like(expansion.mean_by_state2),
+            mean_by_input=expansion.B,
+            covariance_by_mean=by_mean
             + by_mean.transpose(-3, -2)
-            + torch.diag_embed(expansion.variance_by_state.mT).movedim(-3, -1),
-            (by_covariance + by_covariance.mT) / 2,
-            by_input
+            + on_diagonal(expansion.variance_by_state),
+            covariance_by_covariance=(by_covariance + by_covariance.mT) / 2,
+            covariance_by_input=by_input
             + by_input.transpose(-3, -2)
-            + torch.diag_embed(expansion.variance_by_input.mT).movedim(-3, -1),
+            + on_diagonal(expansion.variance_by_input),
         )
-        return self._projected(
-            model, *_first_order(belief, expansion.belief, A)
-        ), sensitivity
+        return self._add_noise(model, moments), sensitivity
 
-    def _moved(
-        self, model: Any, belief: Gaussian, input: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        at_mean, A, _ = predict_with_jacobian(model, belief.mean, input)
-        return _first_order(belief, at_mean, A)
+    def _next_moments(self, model: Any, belief: Gaussian, input: Tensor) -> NextMoments:
+        prediction, A, _ = predict_with_jacobian(model, belief.mean, input)
+        return _first_order(belief, prediction, A)
 
 
 class MeanEquivalence(NoisyPropagator):
-    """The prediction at the belief's mean, as ``Linearization`` but without the uncertainty of the state.
+    """The prediction at the belief's mean, without the uncertainty of the state.
 
     State and next state come out uncorrelated.
     """
@@ -113,33 +127,39 @@ class MeanEquivalence(NoisyPropagator):
     def differentiate(
         self, model: Any, belief: Gaussian, input: Tensor | None = None
     ) -> tuple[Propagation, Sensitivity] | None:
-        """``propagate`` with all derivatives in closed form; None where there is none."""
+        """Propagates with all derivatives in closed form; None where there is none."""
         input = checked_input(model, belief, input)
         certain = Gaussian(belief.mean, torch.zeros_like(belief.covariance))
-        if (
-            found := Linearization(self.process_noise).differentiate(
-                model, certain, input
-            )
-        ) is None:
+        first_order = Linearization(self.process_noise)
+        result = first_order.differentiate(model, certain, input)
+        if result is None:
             return None
-        moved, d = found
-        return moved, replace(
-            d, covariance_by_covariance=torch.zeros_like(d.covariance_by_covariance)
+        propagation, sensitivity = result
+        zeros = torch.zeros_like(sensitivity.covariance_by_covariance)
+        return propagation, replace(sensitivity, covariance_by_covariance=zeros)
+
+    def _next_moments(self, model: Any, belief: Gaussian, input: Tensor) -> NextMoments:
+        prediction = model.predict(belief.mean, input)
+        covariance = prediction.covariance
+        return NextMoments(
+            mean=prediction.mean,
+            covariance=covariance,
+            cross_covariance=covariance.new_zeros(*belief.mean.shape, prediction.dim),
         )
 
-    def _moved(
-        self, model: Any, belief: Gaussian, input: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        moved = model.predict(belief.mean, input)
-        return (
-            moved.mean,
-            moved.covariance,
-            moved.covariance.new_zeros(*belief.mean.shape, moved.dim),
-        )
+
+def on_diagonal(variance: Tensor) -> Tensor:
+    """Returns derivatives of variances (*batch, k, j) as of a diagonal covariance's.
+
+    The result is (*batch, k, k, j).
+    """
+    return torch.diag_embed(variance.mT).movedim(-3, -1)
 
 
-def _first_order(
-    belief: Gaussian, at_mean: Gaussian, A: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
+def _first_order(belief: Gaussian, prediction: Gaussian, A: Tensor) -> NextMoments:
     S = belief.covariance
-    return at_mean.mean, at_mean.covariance + A @ S @ A.mT, S @ A.mT
+    return NextMoments(
+        mean=prediction.mean,
+        covariance=prediction.covariance + A @ S @ A.mT,
+        cross_covariance=S @ A.mT,
+    )

@@ -1,18 +1,18 @@
-"""The belief's dynamics as a linear system in an extended state and the input, for convex controllers.
+"""The belief's dynamics as a linear system, for convex controllers.
 
-With the extended state s = [mu; vec(S)], S = Sigma^(1/2) the symmetric root, p = n + n^2 (Cao, Lai and Alam, 2017,
-section 4.1),
+With the extended state s = [mu; vec(S)], S = Sigma^(1/2) the symmetric root, p = n +
+n^2 (Cao, Lai and Alam, 2017, section 4.1),
 
     s+ = F(s, u)  ~  A s + B u + c,    A = dF/ds,  B = dF/du,  c = F(s, u) - A s - B u
 
-Sigma = S S', so dSigma = dS S' + S dS'; the root's derivative solves dS S + S dS = dSigma
-(``gaussian.square_root_differential``). Where Sigma = 0 (a measured state) the columns of A for S vanish, because
-Sigma+ depends on S to second order only; where Sigma+ is singular the root has no derivative, and its rows are zero in
-the null space.
+Sigma = S S', so dSigma = dS S' + S dS'; the root's derivative solves dS S + S dS =
+dSigma (``gaussian.square_root_differential``). Where Sigma = 0 (a measured state) the
+columns of A for S vanish, because Sigma+ depends on S to second order only; where
+Sigma+ is singular the root has no derivative, and its rows are zero in the null space.
 """
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -21,7 +21,7 @@ from torch import Tensor
 from gpmpc._dynamics import Array, tensors_for, to_array
 from gpmpc.exceptions import ShapeError
 from gpmpc.gaussian import Gaussian, check_tensors
-from gpmpc.propagation._propagator import Propagator, differentiate
+from gpmpc.propagation._propagator import Propagator, Sensitivity, differentiate
 
 
 @dataclass(frozen=True)
@@ -32,86 +32,135 @@ class LocalModel:
     B: Tensor  #: (*batch, p, m)
     c: Tensor  #: (*batch, p)
     next: Gaussian  #: the next belief itself
-    next_state: Tensor  #: it as an extended state, F(s, u) (*batch, p)
+    next_state: Tensor  #: the next belief as an extended state, F(s, u) (*batch, p)
 
     def __call__(self, s: Tensor, input: Tensor) -> Tensor:
-        """The next extended state (*batch, p)."""
+        """Returns the next extended state (*batch, p)."""
         return (self.A @ s[..., None] + self.B @ input[..., None])[..., 0] + self.c
 
 
-def square_roots(covariances: Array) -> tuple[Array, Array, Array]:
-    """The symmetric roots (*batch, n, n) of covariances, their eigenvalues (*batch, n) and eigenvectors."""
+class Roots(NamedTuple):
+    """Symmetric roots U diag(r) U' of covariances."""
+
+    root: Array  # (*batch, n, n)
+    r: Array  # eigenvalues of the roots (*batch, n)
+    U: Array  # eigenvectors (*batch, n, n)
+
+
+def square_roots(covariances: Array) -> Roots:
+    """Returns the symmetric roots of covariances (*batch, n, n)."""
     eigenvalues, U = np.linalg.eigh(covariances)
     r = np.sqrt(np.maximum(eigenvalues, 0.0))
-    return (U * r[..., None, :]) @ U.mT, r, U
+    return Roots(root=(U * r[..., None, :]) @ U.mT, r=r, U=U)
 
 
 def linearize(
     propagator: Propagator, model: Any, belief: Gaussian, input: Tensor | None = None
 ) -> LocalModel:
-    """Linearises the next belief at a belief and an input, or along a plan when both have a leading dimension H.
+    """Linearises the next belief at a belief and an input, or along a plan.
 
-    A local model is a constant: no gradient flows through it, and torch's function transforms do not apply. Arguments
+    Along a plan both have a leading dimension H. A local model is a constant: no
+    gradient flows through it, and torch's function transforms do not apply. Arguments
     are those of ``differentiate``.
     """
     belief = Gaussian(belief.mean.detach(), belief.covariance.detach())
     input = belief.mean[..., :0] if input is None else input.detach()
     if model.output_dim != belief.dim:
         raise ShapeError(
-            f"a local model needs an output a state; got {belief.dim} states, {model.output_dim} outputs"
+            f"a local model needs an output a state; got {belief.dim} states, "
+            f"{model.output_dim} outputs"
         )
-    moved, d = differentiate(propagator, model, belief, input)
+    propagation, sensitivity = differentiate(propagator, model, belief, input)
+    after = propagation.belief
     batch = belief.mean.shape[:-1]
-    n = belief.dim
-    p = belief.dim + belief.dim**2
-    of_mean, mean_by_covariance, mean_by_input, by_mean, by_covariance, by_input = map(
-        to_array, vars(d).values()
+    covariances = np.stack([to_array(belief.covariance), to_array(after.covariance)])
+    roots = square_roots(covariances)  # of the belief and of the next one
+    means = np.stack([to_array(belief.mean), to_array(after.mean)])
+    vectors = roots.root.reshape(*means.shape[:-1], -1)
+    s, s_next = np.concatenate([means, vectors], axis=-1)
+    A, B = _extended_derivatives(
+        sensitivity, root=roots.root[0], next_r=roots.r[1], next_U=roots.U[1]
     )
-    covariances = np.stack(
-        [to_array(belief.covariance), to_array(moved.belief.covariance)]
-    )
-    roots, (_, r), (_, U) = square_roots(covariances)
-    means = np.stack([to_array(belief.mean), to_array(moved.belief.mean)])
     u = to_array(input.expand(*batch, -1))
-    s, s_next = np.concatenate([means, roots.reshape(2, *batch, n * n)], axis=-1)
-    # dSigma = E S + S E for a change E of the root: a derivative D by Sigma becomes 2 D S.
-    twice = 2 * roots[0][..., None, :, :]
-    mean_by_root = (mean_by_covariance @ twice).reshape(*batch, n, n * n)
-    by_root = (by_covariance @ twice[..., None, :, :]).reshape(*batch, n, n, n * n)
-    # In the basis U of the next root, entry ij of its derivative is that of dSigma+ over r_i + r_j.
-    total = r[..., :, None] + r[..., None, :]
-    inverse = (total > 0) / np.maximum(total, np.finfo(float).tiny)
-    change = _congruence(U.mT, np.concatenate([by_mean, by_root, by_input], axis=-1))
-    lower = _congruence(U, change * inverse[..., None]).reshape(*batch, n * n, -1)
-    A = np.concatenate(
-        [np.concatenate([of_mean, mean_by_root], axis=-1), lower[..., :p]], axis=-2
-    )
-    B = np.concatenate([mean_by_input, lower[..., p:]], axis=-2)
     c = s_next - (A @ s[..., None] + B @ u[..., None])[..., 0]
-    A, B, c, after = tensors_for(model, A, B, c, s_next)
-    return LocalModel(A, B, c, moved.belief, after)
+    tensors = tensors_for(model, A, B, c, s_next)
+    return LocalModel(
+        A=tensors[0], B=tensors[1], c=tensors[2], next=after, next_state=tensors[3]
+    )
+
+
+def _extended_derivatives(
+    sensitivity: Sensitivity, root: Array, next_r: Array, next_U: Array
+) -> tuple[Array, Array]:
+    """Returns A (*batch, p, p) and B (*batch, p, m), for roots in place of covariances.
+
+    ``root`` (*batch, n, n) is the belief's, next_U diag(next_r) next_U' the next one's.
+    """
+    batch = root.shape[:-2]
+    n = root.shape[-1]
+    p = n + n**2
+    # dSigma = E S + S E for a change E of the root S: a derivative D by Sigma becomes
+    # 2 D S
+    twice = 2 * root[..., None, :, :]
+    mean_by_root = to_array(sensitivity.mean_by_covariance) @ twice
+    by_root = to_array(sensitivity.covariance_by_covariance) @ twice[..., None, :, :]
+    covariance_by = np.concatenate(
+        [
+            to_array(sensitivity.covariance_by_mean),
+            by_root.reshape(*batch, n, n, n * n),
+            to_array(sensitivity.covariance_by_input),
+        ],
+        axis=-1,
+    )
+    # in the basis U of the next root, entry ij of its derivative is that of dSigma+
+    # over r_i + r_j
+    total = next_r[..., :, None] + next_r[..., None, :]
+    inverse = (total > 0) / np.maximum(total, np.finfo(float).tiny)
+    rotated = _congruence(next_U.mT, covariance_by)
+    root_by = _congruence(next_U, rotated * inverse[..., None])
+    root_by = root_by.reshape(*batch, n * n, -1)
+    mean_by_mean = to_array(sensitivity.mean_by_mean)
+    mean_by_root = mean_by_root.reshape(*batch, n, n * n)
+    mean_by_state = np.concatenate([mean_by_mean, mean_by_root], axis=-1)
+    mean_by_input = to_array(sensitivity.mean_by_input)
+    A = np.concatenate([mean_by_state, root_by[..., :p]], axis=-2)
+    B = np.concatenate([mean_by_input, root_by[..., p:]], axis=-2)
+    return A, B
 
 
 def _congruence(U: Array, X: Array) -> Array:
-    """U X U' for as many X as wanted along the last dimension (*batch, n, n, j)."""
+    """Returns U X U' for each X along the last dimension (*batch, n, n, j)."""
     return U[..., None, :, :] @ (U @ X.reshape(*X.shape[:-2], -1)).reshape(X.shape)
 
 
 def rollout(
     propagator: Propagator, model: Any, belief: Gaussian, inputs: Tensor
 ) -> Gaussian:
-    """The beliefs at steps 1 to H: mean (*batch, H, n), covariance (*batch, H, n, n).
+    """Returns the beliefs at steps 1 to H, from one at step 0 (*batch).
 
-    From a belief at step 0 (*batch) and inputs (*batch, H, m); an autonomous model takes (*batch, H, 0).
+    Args:
+        propagator: The way to propagate them.
+        model: A ``DynamicsModel``.
+        belief: Mean (*batch, n), covariance (*batch, n, n).
+        inputs: (*batch, H, m); an autonomous model takes (*batch, H, 0).
+
+    Returns:
+        Mean (*batch, H, n), covariance (*batch, H, n, n).
+
+    Raises:
+        ShapeError: The inputs have no step.
     """
     check_tensors(inputs=inputs)
     if inputs.dim() < 2 or not inputs.shape[-2]:
         raise ShapeError(
-            f"inputs must be (*batch, H, m) with H of 1 or more; got {tuple(inputs.shape)}"
+            "inputs must be (*batch, H, m) with H of 1 or more; got "
+            f"{tuple(inputs.shape)}"
         )
     beliefs = []
     for control in inputs.unbind(-2):
         belief = propagator(model, belief, control)
         beliefs.append(belief)
-    covariance = torch.stack([b.covariance for b in beliefs], dim=-3)
-    return Gaussian(torch.stack([b.mean for b in beliefs], dim=-2), covariance)
+    return Gaussian(
+        mean=torch.stack([belief.mean for belief in beliefs], dim=-2),
+        covariance=torch.stack([belief.covariance for belief in beliefs], dim=-3),
+    )

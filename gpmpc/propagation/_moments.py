@@ -1,29 +1,37 @@
-r"""The mean and covariance of f(x~) when f is a GP and its input x~ is itself Gaussian, in torch: the specification.
+r"""The mean and covariance of f(x~) when f is a GP and its input x~ is itself Gaussian.
 
-Exact moments of an SE-ARD posterior at x~ = (x, u), x ~ N(mu, S), u certain (Girard, 2004; Deisenroth, 2010, section
-2.3; Cao, Lai and Alam, 2017, section 2). With nu_i = x_i - mu, D_a = diag(1 / l_a^2) on the states, and
+This is the specification, in torch; ``gpmpc._kernels`` computes all of it in compiled
+loops. Exact moments of an SE-ARD posterior at x~ = (x, u), x ~ N(mu, S), u certain
+(Girard, 2004; Deisenroth, 2010, section 2.3; Cao, Lai and Alam, 2017, section 2). With
+nu_i = x_i - mu, D_a = diag(1 / l_a^2) on the states, and
 
-    q_ai  = E[k_a(x~_i, x~)],   Q_ij = E[k_a(x~_i, x~) k_b(x~_j, x~)] = q_ai q_bj exp(delta_ij)
+    q_ai  = E[k_a(x~_i, x~)]
+    Q_ij  = E[k_a(x~_i, x~) k_b(x~_j, x~)] = q_ai q_bj exp(delta_ij)
 
-the textbook form of the covariance, beta_a' Q beta_b - M_a M_b, subtracts two numbers that agree to many digits where S
-is small. Here each product is centred before it is summed, which loses nothing:
+the textbook form of the covariance, beta_a' Q beta_b - M_a M_b, subtracts two numbers
+that agree to many digits where S is small. Here each product is centred before it is
+summed, which loses nothing:
 
-    mean          M_a = sum_i beta_ai q_ai
-    slope         J_a = E[df_a/dx] = dM_a/dmu = G_a' sum_i beta_ai q_ai z_ai,   z_ai = D_a nu_i,  G_a = (I + S D_a)^-1
-    input-output  Cov[x, f_a] = S J_a' (Stein, 1981)
-    covariance    V_ab = sum_ij beta_ai beta_bj q_ai q_bj expm1(delta_ij)
-                  V_aa = ... + sf2_a - |L_a^-1 q_a|^2 - sum_ij [(K_a + sn2_a I)^-1]_ij q_ai q_aj expm1(delta_ij)
-    delta_ij      = r_ab - 1/2 z_ai' T_ab D_b T_a z_ai - 1/2 z_bj' T_ab D_a T_b z_bj + z_ai' T_ab z_bj
-    r_ab          = 1/2 (log|I + S D_a| + log|I + S D_b| - log|I + S (D_a + D_b)|)
-    T_a           = G_a S,  T_ab = (I + S (D_a + D_b))^-1 S
+    (1)  mean          M_a = sum_i beta_ai q_ai
+    (2)  slope         J_a = E[df_a/dx] = dM_a/dmu = G_a' sum_i beta_ai q_ai z_ai
+                       z_ai = D_a nu_i,   G_a = (I + S D_a)^-1
+    (3)  input-output  Cov[x, f_a] = S J_a'   (Stein, 1981)
+    (4)  covariance    V_ab = sum_ij beta_ai beta_bj q_ai q_bj expm1(delta_ij)
+                       V_aa = ... + sf2_a - |L_a^-1 q_a|^2
+                              - sum_ij [(K_a + sn2_a I)^-1]_ij q_ai q_aj expm1(delta_ij)
+    (5)  delta_ij      = r_ab - 1/2 z_ai' T_ab D_b T_a z_ai
+                         - 1/2 z_bj' T_ab D_a T_b z_bj + z_ai' T_ab z_bj
+    (6)  r_ab          = 1/2 (log|I + S D_a| + log|I + S D_b| - log|I + S (D_a + D_b)|)
+    (7)  T_a           = G_a S,   T_ab = (I + S (D_a + D_b))^-1 S
 
-(delta follows from T_ab - T_a = -T_ab D_b T_a.) The controls carry no uncertainty: they only weigh the points. A kernel
-is at most sf2, so that Q_ij <= sf2_a sf2_b exp(-delta_ij): where delta is large the pair counts for nothing, and the
-exponent may stay where exp does not overflow.
+(delta follows from T_ab - T_a = -T_ab D_b T_a.) The controls carry no uncertainty: they
+only weigh the points. A kernel is at most sf2, so that Q_ij <= sf2_a sf2_b
+exp(-delta_ij): where delta is large the pair counts for nothing, and the exponent may
+stay where exp does not overflow.
 
-The mean and J have their derivatives in closed form, with dM/dS = 1/2 d2M/dmu2 (Price, 1958). Those of V come from
-reverse mode: every pair of outputs has a copy of the belief of its own, so that one pass over the sum of all entries
-gives each entry's. ``gpmpc._kernels`` computes all of this in compiled loops.
+The mean and J have their derivatives in closed form, with dM/dS = 1/2 d2M/dmu2 (Price,
+1958). Those of V come from reverse mode: every pair of outputs has a copy of the belief
+of its own, so that one pass over the sum of all entries gives each entry's.
 """
 
 from collections.abc import Sequence
@@ -35,33 +43,66 @@ from torch import Tensor
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior
 
-_ENTRIES = (
-    2**18
-)  # of what is made at once of each kind, for one pair of outputs at least
-_Pairs = tuple[list[int], list[int]]
-_NOT_WANTED: Any = None
-_LARGEST = {torch.float64: 300.0, torch.float32: 80.0}  # delta
+_LARGEST_DELTA = {torch.float64: 300.0, torch.float32: 80.0}
+#: numbers in the largest array that is made at once, for one pair of outputs at least
+_LARGEST_SIZE = 2**18
+_NOT_COMPUTED: Any = None
+
+
+class Moments(NamedTuple):
+    """Moments of f at x ~ N(mu, S)."""
+
+    M: Tensor  # E[f] (*batch, k)
+    V: Tensor  # Cov[f] (*batch, k, k)
+    J: Tensor  # E[df/dx] (*batch, k, n)
 
 
 class Latent(NamedTuple):
-    """Moments of f at x_s ~ N(mu_s, S_s), with derivatives by mu_s, S_s and u_s where they are wanted."""
+    """Moments of f at x_s ~ N(mu_s, S_s), and their derivatives if they were wanted."""
 
     M: Tensor  # E[f] (*batch, k)
     V: Tensor  # Cov[f] (*batch, k, k)
     J: Tensor  # E[df/dx_s] (*batch, k, n_s)
-    dM_dS: Tensor = _NOT_WANTED  # (*batch, k, n_s, n_s); half of dJ/dmu (Price, 1958)
-    dM_du: Tensor = _NOT_WANTED  # (*batch, k, m_s)
-    dV_dmu: Tensor = _NOT_WANTED  # (*batch, k, k, n_s)
-    dV_dS: Tensor = _NOT_WANTED  # (*batch, k, k, n_s, n_s)
-    dV_du: Tensor = _NOT_WANTED  # (*batch, k, k, m_s)
-    dJ_dS: Tensor = (
-        _NOT_WANTED  # (*batch, k, n_s, n_s, n_s); needed where A is not zero
-    )
-    dJ_du: Tensor = _NOT_WANTED  # (*batch, k, n_s, m_s); needed where A is not zero
+    dM_dS: Tensor = _NOT_COMPUTED  # (*batch, k, n_s, n_s), dJ/dmu / 2 (Price, 1958)
+    dM_du: Tensor = _NOT_COMPUTED  # (*batch, k, m_s)
+    dV_dmu: Tensor = _NOT_COMPUTED  # (*batch, k, k, n_s)
+    dV_dS: Tensor = _NOT_COMPUTED  # (*batch, k, k, n_s, n_s)
+    dV_du: Tensor = _NOT_COMPUTED  # (*batch, k, k, m_s)
+    # those of J are needed where A is not zero
+    dJ_dS: Tensor = _NOT_COMPUTED  # (*batch, k, n_s, n_s, n_s)
+    dJ_du: Tensor = _NOT_COMPUTED  # (*batch, k, n_s, m_s)
+
+
+class _Point(NamedTuple):
+    """A belief N(mu, S) and an input u for each of some outputs or pairs of them.
+
+    The axis ``outputs`` has their number of entries, or one entry for all of them.
+    """
+
+    mu: Tensor  # (*batch, outputs, n)
+    S: Tensor  # (*batch, outputs, n, n)
+    u: Tensor  # (*batch, outputs, m)
+
+    @classmethod
+    def of_all_outputs(cls, belief: Gaussian, input: Tensor) -> "_Point":
+        """Returns one belief and one input for all outputs."""
+        return cls(
+            mu=belief.mean[..., None, :],
+            S=belief.covariance[..., None, :, :],
+            u=input[..., None, :],
+        )
+
+
+class _Conditioned(NamedTuple):
+    """I + S D for a diagonal D, through I + B with B = D^1/2 S D^1/2."""
+
+    half_logdet: Tensor  # 1/2 log|I + S D| (*batch, k)
+    factor: Tensor  # the Cholesky factor of I + B (*batch, k, n, n)
+    T: Tensor  # (I + S D)^-1 S (*batch, k, n, n)
 
 
 class _OutputTerms(NamedTuple):
-    """What each output needs at a belief of its own; the letters are those of the module's text."""
+    """Terms of single outputs; the letters are those of the module's text."""
 
     z: Tensor  # (*batch, k, N, n)
     q: Tensor  # (*batch, k, N)
@@ -70,26 +111,103 @@ class _OutputTerms(NamedTuple):
     T: Tensor  # (*batch, k, n, n)
 
 
+class _Pairs(NamedTuple):
+    """Pairs of outputs that are evaluated at once: all with a = b, or none."""
+
+    a: list[int]
+    b: list[int]
+
+
 def moments(
     model: GPPosterior, belief: Gaussian, input: Tensor, diagonal: bool = False
-) -> tuple[Tensor, Tensor, Tensor]:
-    """M (*batch, k), V (*batch, k, k) and J = E[df/dx] (*batch, k, n) of the latent functions f; the module's text.
+) -> Moments:
+    """Returns the moments of the latent functions f at x ~ N(mu, S).
 
-    ``diagonal`` leaves the covariances between outputs at zero.
+    Args:
+        model: The GPs.
+        belief: N(mu, S): mean (*batch, n), covariance (*batch, n, n).
+        input: The certain control u (*batch, m).
+        diagonal: Leaves the covariances between outputs at zero.
     """
-    at = (
-        belief.mean[..., None, :],
-        belief.covariance[..., None, :, :],
-        input[..., None, :],
-    )
-    terms = _output_terms(model, slice(None), *at)
-    pairs = _chunks(model, belief, diagonal)
+    point = _Point.of_all_outputs(belief, input)
+    terms = _output_terms(model, slice(None), point)
     weighted = model.weights * terms.q
-    slope = (weighted[..., None, :] @ terms.z @ terms.G)[..., 0, :]
-    V = _symmetric_from_pairs(
-        [_pair_entries(model, *ab, *at) for ab in pairs], pairs, belief.mean.dim() - 1
+    M = weighted.sum(-1)  # (1)
+    J = (weighted[..., None, :] @ terms.z @ terms.G)[..., 0, :]  # (2)
+    pairs = _pairs_at_once(model, belief, diagonal)
+    entries = [_covariances(model, chunk, point) for chunk in pairs]  # (4)
+    V = _symmetric_from_pairs(entries, pairs, axis=belief.mean.dim() - 1)
+    return Moments(M=M + model.offset, V=V, J=J)
+
+
+def _output_terms(model: GPPosterior, a: Any, point: _Point) -> _OutputTerms:
+    """Returns z, q, 1/2 log|I + S D|, G and T of the outputs a, at their points."""
+    n = model.state_dim
+    lengthscales = model.lengthscales[a]
+    D = lengthscales[:, :n] ** -2
+    nu = model.features[:, :n] - point.mu[..., None, :]
+    control = model.features[:, n:] - point.u[..., None, :]
+    conditioned = _condition(point.S, D)
+    # log q_i = log sf2 - 1/2 log|I + S D| - 1/2 nu' (S + D^-1)^-1 nu - 1/2 |control|^2
+    root = D.sqrt()
+    whitened = torch.linalg.solve_triangular(
+        conditioned.factor, (nu * root[:, None, :]).mT, upper=False
     )
-    return weighted.sum(-1) + model.offset, V, slope
+    certain = (control / lengthscales[:, None, n:]).square().sum(-1)
+    squares = certain + whitened.square().sum(-2)
+    exponent = squares / 2 + conditioned.half_logdet[..., None]
+    # cholesky_inverse has no right forward derivative
+    eye = torch.eye(n, dtype=D.dtype, device=D.device).expand_as(conditioned.factor)
+    inverse = torch.cholesky_solve(eye, conditioned.factor)
+    G = inverse * (root[..., None, :] / root[..., :, None])
+    return _OutputTerms(
+        z=nu * D[:, None, :],
+        q=model.signal_variance[a, None] * (-exponent).exp(),
+        half_logdet=conditioned.half_logdet,
+        G=G,
+        T=conditioned.T,
+    )
+
+
+def _covariances(model: GPPosterior, pairs: _Pairs, point: _Point) -> Tensor:
+    """Returns V_ab (*batch, P) of P pairs of outputs, at their points; (4)."""
+    a = pairs.a
+    b = pairs.b
+    same = a[0] == b[0]
+    D_a = model.lengthscales[a, : model.state_dim] ** -2
+    D_b = model.lengthscales[b, : model.state_dim] ** -2
+    of_a = _output_terms(model, a, point)
+    of_b = of_a if same else _output_terms(model, b, point)
+    joint = _condition(point.S, D_a + D_b)
+    T = joint.T
+    r = of_a.half_logdet + of_b.half_logdet - joint.half_logdet  # (6)
+    delta_i = r[..., None] - _quadratic(of_a.z, T @ (D_b[:, :, None] * of_a.T)) / 2
+    delta_j = _quadratic(of_b.z, T @ (D_a[:, :, None] * of_b.T)) / 2
+    delta = of_a.z @ T @ of_b.z.mT + (delta_i[..., :, None] - delta_j[..., None, :])
+    centred = torch.expm1(delta.clamp_max(_LARGEST_DELTA[delta.dtype]))
+    if not same:
+        left = (model.weights[a] * of_a.q)[..., None, :]
+        right = (model.weights[b] * of_b.q)[..., None]
+        return (left @ centred @ right)[..., 0, 0]
+    E = model.weights[a, :, None] * model.weights[a, None, :] - model.precision[a]
+    V = (of_a.q[..., None, :] @ (E * centred) @ of_a.q[..., None])[..., 0, 0]
+    return V + model.signal_variance[a] - model.variance_reduction(of_a.q, a)
+
+
+def _condition(S: Tensor, D: Tensor) -> _Conditioned:
+    """Conditions I + S D: I + B is well conditioned, log1p keeps a small S's digits."""
+    root = D.sqrt()
+    B = root[..., :, None] * S * root[..., None, :]
+    eye = torch.eye(B.shape[-1], dtype=B.dtype, device=B.device)
+    half_logdet = torch.linalg.eigvalsh(B).log1p().sum(-1) / 2
+    factor = torch.linalg.cholesky(B + eye)
+    T = torch.cholesky_solve(B, factor) / (root[..., :, None] * root[..., None, :])
+    return _Conditioned(half_logdet=half_logdet, factor=factor, T=T)
+
+
+def _quadratic(z: Tensor, M: Tensor) -> Tensor:
+    """Returns z_i' M z_i of the rows of z (..., N, n), (..., N)."""
+    return ((z @ M) * z).sum(-1)
 
 
 def moments_with_jacobian(
@@ -97,179 +215,143 @@ def moments_with_jacobian(
     belief: Gaussian,
     input: Tensor,
     diagonal: bool = False,
-    cross: bool = True,
+    slope_derivatives: bool = True,
 ) -> Latent:
-    """The moments of f at x ~ N(mu, S), and their derivatives by mu, S and u; ``cross`` adds those of J."""
+    """Returns the moments of f at x ~ N(mu, S), and their derivatives by mu, S and u.
+
+    Args:
+        model: The GPs.
+        belief: N(mu, S): mean (*batch, n), covariance (*batch, n, n).
+        input: The certain control u (*batch, m).
+        diagonal: Leaves the covariances between outputs at zero.
+        slope_derivatives: Whether those of J are wanted too.
+    """
     n = model.state_dim
-    axis = belief.mean.dim() - 1
-    at = (
-        belief.mean[..., None, :],
-        belief.covariance[..., None, :, :],
-        input[..., None, :],
-    )
-    terms = _output_terms(model, slice(None), *at)
-    pairs = _chunks(model, belief, diagonal)
+    point = _Point.of_all_outputs(belief, input)
+    terms = _output_terms(model, slice(None), point)
+    D = model.lengthscales[:, None, :n] ** -2
+    D_u = model.lengthscales[:, None, n:] ** -2
+    A = terms.G.mT * D  # G' D, symmetric
     w = terms.z @ terms.G  # dlog q_ai / dmu
-    c = (model.features[:, n:] - input[..., None, :])[
-        ..., None, :, :
-    ] * model.lengthscales[:, None, n:] ** -2
-    A = terms.G.mT * model.lengthscales[:, None, :n] ** -2  # G' D, symmetric
+    c = (model.features[:, n:] - input[..., None, :])[..., None, :, :] * D_u
     weighted = model.weights * terms.q
     M = weighted.sum(-1)
-    once = weighted[..., None] * w
-    J = once.sum(-2)
-    dM_dS = (once.mT @ w - M[..., None, None] * A) / 2
-    dJ = ()
-    if cross:  # dJ/dS = 1/2 [sum_i beta_i q_i w_i w_i w_i - three times A with J],   dJ/du = sum_i beta_i q_i w_i c_i'
-        third = torch.stack([(once * w[..., d, None]).mT @ w for d in range(n)], dim=-3)
-        third = third - J[..., :, None, None] * A[..., None, :, :]
-        third = (
-            third
-            - A[..., :, :, None] * J[..., None, None, :]
-            - A[..., :, None, :] * J[..., None, :, None]
+    weighted_w = weighted[..., None] * w
+    J = weighted_w.sum(-2)
+    dJ_dS = _NOT_COMPUTED
+    dJ_du = _NOT_COMPUTED
+    if slope_derivatives:
+        # sum_i beta_i q_i w_i w_i w_i, less the three products of A with J
+        third = torch.stack(
+            [(weighted_w * w[..., d, None]).mT @ w for d in range(n)], dim=-3
         )
-        dJ = third / 2, once.mT @ c
-    with torch.inference_mode(False):
-        parts = [_pair_entries_with_gradient(model, ab, at, axis) for ab in pairs]
-    V, dV_dmu, dV_dS, dV_du = (
-        _symmetric_from_pairs(part, pairs, axis) for part in zip(*parts, strict=True)
-    )
-    dM_du = (weighted[..., None, :] @ c)[..., 0, :]
+        third = third - J[..., :, None, None] * A[..., None, :, :]
+        third = third - A[..., :, :, None] * J[..., None, None, :]
+        third = third - A[..., :, None, :] * J[..., None, :, None]
+        dJ_dS = third / 2
+        dJ_du = weighted_w.mT @ c
+    V = _covariances_with_gradient(model, belief, point, diagonal)
     return Latent(
-        M + model.offset, V, J, dM_dS, dM_du, dV_dmu, (dV_dS + dV_dS.mT) / 2, dV_du, *dJ
+        M=M + model.offset,
+        V=V.V,
+        J=J,
+        dM_dS=(weighted_w.mT @ w - M[..., None, None] * A) / 2,
+        dM_du=(weighted[..., None, :] @ c)[..., 0, :],
+        dV_dmu=V.dmu,
+        dV_dS=(V.dS + V.dS.mT) / 2,
+        dV_du=V.du,
+        dJ_dS=dJ_dS,
+        dJ_du=dJ_du,
     )
 
 
-def _output_terms(
-    model: GPPosterior, a: Any, mu: Tensor, S: Tensor, u: Tensor
-) -> _OutputTerms:
-    """The terms of outputs a (k,) at mu (*batch, k, n), S (*batch, k, n, n) and u (*batch, k, m), or one for all."""
-    n = model.state_dim
-    lengthscales = model.lengthscales[a]
-    D = lengthscales[:, :n] ** -2
-    nu = model.features[:, :n] - mu[..., None, :]
-    control = model.features[:, n:] - u[..., None, :]
-    half_logdet, factor, T = _conditioned(S, D)
-    whitened = torch.linalg.solve_triangular(
-        factor, (nu * D.sqrt()[:, None, :]).mT, upper=False
+class _CovarianceGradient(NamedTuple):
+    """V and its derivatives, of P pairs (*batch, P, ...) or all (*batch, k, k, ...)."""
+
+    V: Tensor
+    dmu: Tensor  # (..., n)
+    dS: Tensor  # (..., n, n)
+    du: Tensor  # (..., m)
+
+
+def _covariances_with_gradient(
+    model: GPPosterior, belief: Gaussian, point: _Point, diagonal: bool
+) -> _CovarianceGradient:
+    """Returns V and its derivatives of all pairs of outputs."""
+    axis = belief.mean.dim() - 1
+    pairs = _pairs_at_once(model, belief, diagonal)
+    with torch.inference_mode(False):
+        chunks = [_gradient_of_pairs(model, chunk, point, axis) for chunk in pairs]
+
+    def symmetric(entries: Sequence[Tensor]) -> Tensor:
+        return _symmetric_from_pairs(entries, pairs, axis)
+
+    return _CovarianceGradient(
+        V=symmetric([chunk.V for chunk in chunks]),
+        dmu=symmetric([chunk.dmu for chunk in chunks]),
+        dS=symmetric([chunk.dS for chunk in chunks]),
+        du=symmetric([chunk.du for chunk in chunks]),
     )
-    certain = (control / lengthscales[:, None, n:]).square().sum(-1)
-    exponent = (certain + whitened.square().sum(-2)) / 2 + half_logdet[..., None]
-    root = D.sqrt()
-    eye = torch.eye(n, dtype=D.dtype, device=D.device)
-    inverse = torch.cholesky_solve(
-        eye.expand_as(factor), factor
-    )  # cholesky_inverse has no right forward derivative
-    G = inverse * (root[..., None, :] / root[..., :, None])
-    return _OutputTerms(
-        nu * D[:, None, :],
-        model.signal_variance[a, None] * (-exponent).exp(),
-        half_logdet,
-        G,
-        T,
-    )
 
 
-def _pair_entries(
-    model: GPPosterior, a: list[int], b: list[int], mu: Tensor, S: Tensor, u: Tensor
-) -> Tensor:
-    """V_ab (*batch, P) of P pairs, all with a = b or none, at one belief for all or one for each (as above)."""
-    same = a[0] == b[0]
-    D_a, D_b = (model.lengthscales[one, : model.state_dim] ** -2 for one in (a, b))
-    of_a = _output_terms(model, a, mu, S, u)
-    of_b = of_a if same else _output_terms(model, b, mu, S, u)
-    half_logdet, _, T = _conditioned(S, D_a + D_b)
-    rise = of_a.half_logdet + of_b.half_logdet - half_logdet
-    rise = rise[..., None] - _quadratic(of_a.z, T @ (D_b[:, :, None] * of_a.T)) / 2
-    fall = _quadratic(of_b.z, T @ (D_a[:, :, None] * of_b.T)) / 2
-    delta = of_a.z @ T @ of_b.z.mT + (rise[..., :, None] - fall[..., None, :])
-    centred = torch.expm1(delta.clamp_max(_LARGEST[delta.dtype]))
-    if not same:
-        return (
-            (model.weights[a] * of_a.q)[..., None, :]
-            @ centred
-            @ (model.weights[b] * of_b.q)[..., None]
-        )[..., 0, 0]
-    E = model.weights[a, :, None] * model.weights[a, None, :] - model.precision[a]
-    entries = (of_a.q[..., None, :] @ (E * centred) @ of_a.q[..., None])[..., 0, 0]
-    return entries + model.signal_variance[a] - model.variance_reduction(of_a.q, a)
+def _gradient_of_pairs(
+    model: GPPosterior, pairs: _Pairs, point: _Point, axis: int
+) -> _CovarianceGradient:
+    """Returns V_ab of P pairs and its derivatives, by reverse mode of their sum."""
 
-
-def _pair_entries_with_gradient(
-    model: GPPosterior, ab: _Pairs, at: Sequence[Tensor], axis: int
-) -> tuple[Tensor, ...]:
-    """V_ab (*batch, P), and its derivatives by mu (*batch, P, n), S (*batch, P, n, n) and u (*batch, P, m)."""
-
-    def total(*copies: Tensor) -> tuple[Tensor, Tensor]:
-        entries = _pair_entries(model, *ab, *copies)
+    def total(mu: Tensor, S: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
+        entries = _covariances(model, pairs, _Point(mu=mu, S=S, u=u))
         return entries.sum(), entries
 
-    copies = [part.repeat_interleave(len(ab[0]), dim=axis) for part in at]
-    gradients, entries = torch.func.grad(total, argnums=(0, 1, 2), has_aux=True)(
-        *copies
+    count = len(pairs.a)
+    (dmu, dS, du), V = torch.func.grad(total, argnums=(0, 1, 2), has_aux=True)(
+        point.mu.repeat_interleave(count, dim=axis),
+        point.S.repeat_interleave(count, dim=axis),
+        point.u.repeat_interleave(count, dim=axis),
     )
-    return entries, *gradients
+    return _CovarianceGradient(V=V, dmu=dmu, dS=dS, du=du)
 
 
-def _chunks(model: GPPosterior, belief: Gaussian, diagonal: bool) -> list[_Pairs]:
-    """The pairs a <= b of outputs, as many in one list as are evaluated at once; first those with a = b."""
+def _pairs_at_once(
+    model: GPPosterior, belief: Gaussian, diagonal: bool
+) -> list[_Pairs]:
+    """Returns the pairs a <= b of outputs in chunks that fit into memory.
+
+    Those with a = b come first, and share no chunk with others.
+    """
     outputs = range(model.output_dim)
-    size = len(model) * (
-        len(model) + 8 * model.state_dim
-    )  # of the matrices (N, N), and of the points' terms
-    count = max(1, _ENTRIES // max(1, belief.mean.shape[:-1].numel() * size))
-    kinds = (
-        [(a, a) for a in outputs],
-        [(a, b) for b in outputs for a in range(b) if not diagonal],
-    )
-    chunks = [
-        pairs[i : i + count] for pairs in kinds for i in range(0, len(pairs), count)
-    ]
-    return [([a for a, _ in chunk], [b for _, b in chunk]) for chunk in chunks]
+    size = len(model)
+    numbers = size * (size + 8 * model.state_dim)  # of one pair's matrices and terms
+    batch = max(1, belief.mean.shape[:-1].numel() * numbers)
+    count = max(1, _LARGEST_SIZE // batch)
+    same = [(a, a) for a in outputs]
+    different = [(a, b) for b in outputs for a in range(b)]
+    chunks = []
+    for pairs in (same,) if diagonal else (same, different):
+        for first in range(0, len(pairs), count):
+            chunk = pairs[first : first + count]
+            chunks.append(_Pairs(a=[a for a, _ in chunk], b=[b for _, b in chunk]))
+    return chunks
 
 
 def _symmetric_from_pairs(
-    parts: Sequence[Tensor], pairs: Sequence[_Pairs], axis: int
+    entries: Sequence[Tensor], pairs: Sequence[_Pairs], axis: int
 ) -> Tensor:
-    """A symmetric matrix (*batch, k, k, ...) from its entries (*batch, P, ...); zero where there is none."""
-    places = {
-        pair: p
-        for p, pair in enumerate(
-            (a, b) for chunk in pairs for a, b in zip(*chunk, strict=True)
-        )
-    }
-    k = max(places)[0] + 1
-    order = [
-        places.get((min(a, b), max(a, b)), len(places))
-        for a in range(k)
-        for b in range(k)
-    ]
-    entries = torch.cat(
-        [*parts, torch.zeros_like(parts[0].narrow(axis, 0, 1))], dim=axis
-    )
-    return entries.index_select(
-        axis, torch.tensor(order, device=entries.device)
-    ).unflatten(axis, (k, k))
+    """Returns the symmetric matrix (*batch, k, k, ...) of entries (*batch, P, ...).
 
-
-def _conditioned(S: Tensor, D: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """1/2 log|I + S D|, the Cholesky factor of I + B, and T = (I + S D)^-1 S, for diagonal D.
-
-    Through B = D^1/2 S D^1/2, whose I + B is well conditioned; log1p keeps the digits of a small S.
+    It is zero where there is no entry.
     """
-    root = D.sqrt()
-    B = root[..., :, None] * S * root[..., None, :]
-    half_logdet = torch.linalg.eigvalsh(B).log1p().sum(-1) / 2
-    factor = torch.linalg.cholesky(
-        B + torch.eye(B.shape[-1], dtype=B.dtype, device=B.device)
-    )
-    return (
-        half_logdet,
-        factor,
-        torch.cholesky_solve(B, factor) / (root[..., :, None] * root[..., None, :]),
-    )
-
-
-def _quadratic(z: Tensor, M: Tensor) -> Tensor:
-    """z_i' M z_i of the rows of z (..., N, n), (..., N)."""
-    return ((z @ M) * z).sum(-1)
+    places: dict[tuple[int, int], int] = {}
+    for chunk in pairs:
+        for a, b in zip(chunk.a, chunk.b, strict=True):
+            places[a, b] = len(places)
+    k = max(places)[0] + 1
+    zero = len(places)  # the place of a zero behind all entries
+    order = []
+    for a in range(k):
+        for b in range(k):
+            order.append(places.get((min(a, b), max(a, b)), zero))
+    zeros = torch.zeros_like(entries[0].narrow(axis, 0, 1))
+    values = torch.cat([*entries, zeros], dim=axis)
+    indices = torch.tensor(order, device=values.device)
+    return values.index_select(axis, indices).unflatten(axis, (k, k))

@@ -1,20 +1,23 @@
-"""Propagation through any model without its derivatives, by points that carry the belief's moments.
+"""Propagation through any model without its derivatives, by points.
 
-The next state's covariance is theirs plus the mean of the model's own (law of total covariance).
+The points carry the belief's moments; the next state's covariance is theirs plus the
+mean of the model's own (law of total covariance).
 
-Unscented: with n states and lambda = alpha^2 (n + kappa) - n, the points are mu and mu +- sqrt(n + lambda) times the
-columns of the symmetric root of Sigma (Julier and Uhlmann, 2004; van der Merwe, 2004). The default parameters give the
-spherical cubature rule (Arasaratnam and Haykin, 2009), whose weights are positive, so that no covariance can come out
-indefinite.
+Unscented: with n states and lambda = alpha^2 (n + kappa) - n, the points are mu and
+mu +- sqrt(n + lambda) times the columns of the symmetric root of Sigma (Julier and
+Uhlmann, 2004; van der Merwe, 2004). The default parameters give the spherical cubature
+rule (Arasaratnam and Haykin, 2009), whose weights are positive, so that no covariance
+can come out indefinite.
 
-Where outputs are angles, the values of all points are moved by whole turns towards that of the first before they are
-averaged: the mean of 3.1 and -3.1 rad is pi, and not 0.
+Where outputs are angles, the values of all points are shifted by whole turns towards
+that of the first before they are averaged: the mean of 3.1 and -3.1 rad is pi, not 0.
 
-Monte Carlo: the reference for every other. Its standard error falls as one over the root of the number of samples.
+Monte Carlo: the reference for every other. Its standard error falls as one over the
+root of the number of samples.
 """
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -23,15 +26,40 @@ from torch import Tensor
 from gpmpc._angles import angles_of, whole_turns
 from gpmpc.exceptions import SettingError, check_number
 from gpmpc.gaussian import Gaussian, square_root, square_root_differential
-from gpmpc.propagation._linearization import expand
+from gpmpc.propagation._linearization import Expansion, expand, on_diagonal
 from gpmpc.propagation._propagator import (
+    NextMoments,
     NoisyPropagator,
     Propagation,
     Sensitivity,
     checked_input,
 )
 
-_CHUNK = 1000  # samples predicted at once: bounds the memory at about chunk * N * outputs numbers
+# samples predicted at once: bounds the memory at about chunk * N * outputs numbers
+_CHUNK = 1000
+
+
+class _SigmaPoints(NamedTuple):
+    """The points of an unscented transform, the mean first."""
+
+    steps: Tensor  # from the mean (*batch, 2n + 1, n)
+    states: Tensor  # (*batch, 2n + 1, n)
+    inputs: Tensor  # the same input at each (*batch, 2n + 1, m)
+
+
+class _Weights(NamedTuple):
+    """Weights of sigma points (2n + 1,)."""
+
+    mean: Tensor
+    covariance: Tensor
+
+
+class _ByParameters(NamedTuple):
+    """Derivatives by the mean, by the covariance and by the input, in that order."""
+
+    mean: Tensor  # (..., n)
+    covariance: Tensor  # (..., n, n)
+    input: Tensor  # (..., m)
 
 
 class Unscented(NoisyPropagator):
@@ -39,7 +67,8 @@ class Unscented(NoisyPropagator):
 
     Args:
         alpha: Spread of the points.
-        beta: Weight of the centre in the covariance; 2 is best for Gaussians of small alpha.
+        beta: Weight of the centre in the covariance; 2 is best for Gaussians of small
+            alpha.
         kappa: Secondary spread.
         process_noise: Whether the model's noise covariance is added.
 
@@ -65,132 +94,143 @@ class Unscented(NoisyPropagator):
     def differentiate(
         self, model: Any, belief: Gaussian, input: Tensor | None = None
     ) -> tuple[Propagation, Sensitivity] | None:
-        """``propagate`` with all derivatives, by those of the model at every point; None where it has no closed ones.
+        """Propagates with all derivatives, by those of the model at every point.
 
-        Where Sigma is singular its root has no derivative in the null space; zero is taken there.
+        Returns None where the model has no closed ones. Where Sigma is singular its
+        root has no derivative in the null space; zero is taken there.
         """
         input = checked_input(model, belief, input)
-        n = belief.dim
-        r, U = torch.linalg.eigh(belief.covariance)
-        r = r.clamp_min(0).sqrt()
-        steps, points, controls = self._points(
-            belief, U @ (r[..., :, None] * U.mT), input
-        )
-        if (expansion := expand(model, points, controls)) is None:
+        eigenvalues, U = torch.linalg.eigh(belief.covariance)
+        r = eigenvalues.clamp_min(0).sqrt()
+        root = U @ (r[..., :, None] * U.mT)
+        points = self._sigma_points(belief, root, input)
+        expansion = expand(model, points.states, points.inputs)
+        if expansion is None:
             return None
-        of_mean, of_covariance = self._weights(belief)
-
-        # Of every point by [mu, vec(root), u] (*batch, 2n + 1, k, p): point 1 + j moves with column j of the root.
-        one = math.sqrt(self._spread(n)) * torch.eye(
-            n, dtype=steps.dtype, device=steps.device
+        mean_by, covariance_by = self._derivatives(belief.dim, expansion)
+        by_mean = _by_covariance_of_root(mean_by, belief, r, U)
+        by_covariance = _by_covariance_of_root(covariance_by, belief, r, U)
+        sensitivity = Sensitivity(
+            mean_by_mean=by_mean.mean,
+            mean_by_covariance=by_mean.covariance,
+            mean_by_input=by_mean.input,
+            covariance_by_mean=by_covariance.mean,
+            covariance_by_covariance=by_covariance.covariance,
+            covariance_by_input=by_covariance.input,
         )
-        ways = torch.cat([torch.zeros_like(one[:1]), one, -one])[:, None, None, :]
+        moments = self._moments(model, belief, points.steps, expansion.belief)
+        return self._add_noise(model, moments), sensitivity
+
+    def _derivatives(self, n: int, expansion: Expansion) -> tuple[Tensor, Tensor]:
+        """Returns those of mean (*batch, k, p) and covariance (*batch, k, k, p).
+
+        They are by the p parameters [mu, vec(root), u] of the points: point 1 + j moves
+        with column j of the root, and point 1 + n + j against it.
+        """
+        weights = self._weights(expansion.A, n)
+        eye = torch.eye(n, dtype=expansion.A.dtype, device=expansion.A.device)
+        one = math.sqrt(self._spread(n)) * eye
+        shifts = torch.cat([torch.zeros_like(one[:1]), one, -one])[:, None, None, :]
 
         def by_parameters(by_state: Tensor, by_input: Tensor) -> Tensor:
-            by_root = by_state[..., :, None] * ways
+            by_root = by_state[..., :, None] * shifts
             return torch.cat([by_state, by_root.flatten(-2), by_input], dim=-1)
 
-        moves = by_parameters(expansion.A, expansion.B)
-        mean_by = torch.einsum("i,...iap->...ap", of_mean, moves)
-        mean = torch.einsum("i,...ia->...a", of_mean, expansion.belief.mean)
-        centred = expansion.belief.mean - mean[..., None, :]
-        half = torch.einsum(
-            "i,...iap,...ib->...abp",
-            of_covariance,
-            moves - mean_by[..., None, :, :],
-            centred,
-        )
-        spread_by = by_parameters(
+        values_by = by_parameters(expansion.A, expansion.B)
+        variances_by = by_parameters(
             expansion.variance_by_state, expansion.variance_by_input
         )
-        own = torch.diag_embed(
-            torch.einsum("i,...iap->...pa", of_mean, spread_by)
-        ).movedim(-3, -1)
-        covariance_by = half + half.transpose(-3, -2) + own
-
-        def parts(by: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-            by_root = by[..., n : n + n * n].unflatten(-1, (n, n))
-            count = (
-                by_root.dim() - belief.mean.dim() - 1
-            )  # dimensions of what is differentiated
-            columns = (
-                ((by_root + by_root.mT) / 2).flatten(-2 - count, -3).movedim(-3, -1)
-            )
-            # dR = L(dSigma) is linear, and L its own adjoint.
-            by_covariance = square_root_differential(r, U, columns).movedim(-1, -3)
-            return (
-                by[..., :n],
-                by_covariance.reshape(by_root.shape),
-                by[..., n + n * n :],
-            )
-
-        of_means = parts(mean_by)
-        of_covariances = parts(covariance_by)
-        moments = self._moments(model, belief, steps, expansion.belief)
-        moved = self._projected(model, *moments)
-        return moved, Sensitivity(*of_means, *of_covariances)
+        values = expansion.belief.mean
+        mean_by = torch.einsum("i,...iap->...ap", weights.mean, values_by)
+        mean = torch.einsum("i,...ia->...a", weights.mean, values)
+        half = torch.einsum(
+            "i,...iap,...ib->...abp",
+            weights.covariance,
+            values_by - mean_by[..., None, :, :],
+            values - mean[..., None, :],
+        )
+        variance_by = torch.einsum("i,...iap->...ap", weights.mean, variances_by)
+        return mean_by, half + half.transpose(-3, -2) + on_diagonal(variance_by)
 
     def _spread(self, n: int) -> float:
-        """The square of the distance of the points in units of the root: n + lambda."""
+        """Returns n + lambda: the points' squared distance in units of the root."""
         if n + self.kappa <= 0:
             raise SettingError(
                 "kappa", f"n + kappa must be positive; got {n} states and {self.kappa}"
             )
         return self.alpha**2 * (n + self.kappa)
 
-    def _weights(self, belief: Gaussian) -> tuple[Tensor, Tensor]:
-        """Of the points in the mean and in the covariance (2n + 1,)."""
-        n = belief.dim
-        spread = self._spread(belief.dim)
-        of_mean = belief.mean.new_full((2 * n + 1,), 1 / (2 * spread))
-        of_covariance = of_mean.clone()
-        of_mean[0] = 1 - n / spread
-        of_covariance[0] = 2 - n / spread - self.alpha**2 + self.beta
-        return of_mean, of_covariance
+    def _weights(self, like: Tensor, n: int) -> _Weights:
+        """Returns the weights of the points in the mean and in the covariance."""
+        spread = self._spread(n)
+        in_mean = like.new_full((2 * n + 1,), 1 / (2 * spread))
+        in_covariance = in_mean.clone()
+        in_mean[0] = 1 - n / spread
+        in_covariance[0] = 2 - n / spread - self.alpha**2 + self.beta
+        return _Weights(mean=in_mean, covariance=in_covariance)
 
-    def _points(
+    def _sigma_points(
         self, belief: Gaussian, root: Tensor, input: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Steps from the mean, points (*batch, 2n + 1, n), and the input at each."""
-        columns = (
-            math.sqrt(self._spread(belief.dim)) * root
-        )  # symmetric: rows are columns
-        steps = torch.cat(
-            [torch.zeros_like(columns[..., :1, :]), columns, -columns], dim=-2
-        )
-        points = belief.mean[..., None, :] + steps
-        return (
-            steps,
-            points,
-            input[..., None, :].expand(*points.shape[:-1], input.shape[-1]),
+    ) -> _SigmaPoints:
+        # the root is symmetric: its rows are its columns
+        columns = math.sqrt(self._spread(belief.dim)) * root
+        centre = torch.zeros_like(columns[..., :1, :])
+        steps = torch.cat([centre, columns, -columns], dim=-2)
+        return _SigmaPoints(
+            steps=steps,
+            states=belief.mean[..., None, :] + steps,
+            inputs=_repeated(input, steps),
         )
 
-    def _moved(
-        self, model: Any, belief: Gaussian, input: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        steps, points, controls = self._points(
-            belief, square_root(belief.covariance), input
-        )
-        return self._moments(model, belief, steps, model.predict(points, controls))
+    def _next_moments(self, model: Any, belief: Gaussian, input: Tensor) -> NextMoments:
+        points = self._sigma_points(belief, square_root(belief.covariance), input)
+        predictions = model.predict(points.states, points.inputs)
+        return self._moments(model, belief, points.steps, predictions)
 
     def _moments(
-        self, model: Any, belief: Gaussian, steps: Tensor, moved: Gaussian
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        of_mean, of_covariance = self._weights(belief)
-        values = _near_the_first(moved.mean, model)
-        mean = of_mean @ values
+        self, model: Any, belief: Gaussian, steps: Tensor, predictions: Gaussian
+    ) -> NextMoments:
+        """Returns the moments of predictions at the points."""
+        weights = self._weights(belief.mean, belief.dim)
+        values = _near_the_first(predictions.mean, model)
+        mean = weights.mean @ values
         centred = values - mean[..., None, :]
-        covariance = centred.mT @ (of_covariance[:, None] * centred)
-        covariance = covariance + (of_mean[:, None, None] * moved.covariance).sum(-3)
-        return mean, covariance, steps.mT @ (of_mean[1] * centred)
+        covariance = centred.mT @ (weights.covariance[:, None] * centred)
+        own = (weights.mean[:, None, None] * predictions.covariance).sum(-3)
+        return NextMoments(
+            mean=mean,
+            covariance=covariance + own,
+            cross_covariance=steps.mT @ (weights.mean[1] * centred),
+        )
+
+
+def _by_covariance_of_root(
+    by_parameters: Tensor, belief: Gaussian, r: Tensor, U: Tensor
+) -> _ByParameters:
+    """Turns derivatives by [mu, vec(root), u] (..., p) into those by mu, Sigma, u.
+
+    The root is U diag(r) U'. Its change dR = L(dSigma) is linear, and L its own adjoint
+    (``square_root_differential``).
+    """
+    n = belief.dim
+    by_root = by_parameters[..., n : n + n * n].unflatten(-1, (n, n))
+    by_root_symmetric = (by_root + by_root.mT) / 2
+    differentiated = by_root.dim() - belief.mean.dim() - 1  # dimensions of the value
+    columns = by_root_symmetric.flatten(-2 - differentiated, -3).movedim(-3, -1)
+    by_covariance = square_root_differential(r, U, columns).movedim(-1, -3)
+    return _ByParameters(
+        mean=by_parameters[..., :n],
+        covariance=by_covariance.reshape(by_root.shape),
+        input=by_parameters[..., n + n * n :],
+    )
 
 
 class MonteCarlo(NoisyPropagator):
     """Sampling; the same seed gives the same samples at every call.
 
     Args:
-        samples: How many states are drawn.
-        seed: Of the draws.
+        samples: Number of states that are drawn.
+        seed: Seed of the draws.
         process_noise: Whether the model's noise covariance is added.
 
     Raises:
@@ -206,42 +246,49 @@ class MonteCarlo(NoisyPropagator):
         self.samples = samples
         self.seed = seed
 
-    def _moved(
-        self, model: Any, belief: Gaussian, input: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        # NumPy's generator: torch's would stop a vmap around this call.
-        normal = np.random.default_rng(self.seed).standard_normal(
-            (self.samples, belief.dim)
-        )
-        steps = torch.from_numpy(normal).to(belief.mean) @ square_root(
-            belief.covariance
-        )  # (*batch, samples, n)
+    def _next_moments(self, model: Any, belief: Gaussian, input: Tensor) -> NextMoments:
+        steps = self._draw_steps(belief)
         means = []
-        spread = 0.0
+        covariances = 0.0
         for chunk in steps.split(_CHUNK, dim=-2):
-            points = belief.mean[..., None, :] + chunk
-            moved = model.predict(
-                points, input[..., None, :].expand(*points.shape[:-1], input.shape[-1])
-            )
-            means.append(moved.mean)
-            spread = spread + moved.covariance.sum(-3)
-        states = _near_the_first(torch.cat(means, dim=-2), model)
-        mean = states.mean(-2)
-        centred = states - mean[..., None, :]
-        covariance = centred.mT @ centred / (self.samples - 1) + spread / self.samples
-        cross = (steps - steps.mean(-2, keepdim=True)).mT @ centred / (self.samples - 1)
-        return mean, covariance, cross
+            states = belief.mean[..., None, :] + chunk
+            predictions = model.predict(states, _repeated(input, states))
+            means.append(predictions.mean)
+            covariances = covariances + predictions.covariance.sum(-3)
+        values = _near_the_first(torch.cat(means, dim=-2), model)
+        mean = values.mean(-2)
+        centred = values - mean[..., None, :]
+        sampled = centred.mT @ centred / (self.samples - 1)
+        centred_steps = steps - steps.mean(-2, keepdim=True)
+        return NextMoments(
+            mean=mean,
+            covariance=sampled + covariances / self.samples,
+            cross_covariance=centred_steps.mT @ centred / (self.samples - 1),
+        )
+
+    def _draw_steps(self, belief: Gaussian) -> Tensor:
+        """Draws steps from the belief's mean (*batch, samples, n)."""
+        # NumPy's generator: torch's would stop a vmap around this call.
+        generator = np.random.default_rng(self.seed)
+        normal = generator.standard_normal((self.samples, belief.dim))
+        return torch.from_numpy(normal).to(belief.mean) @ square_root(belief.covariance)
+
+
+def _repeated(input: Tensor, states: Tensor) -> Tensor:
+    """Returns an input (*batch, m) at each of some states (*batch, points, n)."""
+    return input[..., None, :].expand(*states.shape[:-1], input.shape[-1])
 
 
 def _near_the_first(values: Tensor, model: Any) -> Tensor:
-    """A model's outputs at points (*batch, points, k), moved by whole turns.
+    """Shifts a model's outputs at points (*batch, points, k) by whole turns.
 
     Those of angles come within half a turn of the first point's; all others stay.
     """
     angles = angles_of(model)
     if not angles:
         return values
-    own = values[..., angles]
-    moved = values.clone()
-    moved[..., angles] = own - whole_turns(own - own[..., :1, :])
-    return moved
+    angle_values = values[..., angles]
+    turns = whole_turns(angle_values - angle_values[..., :1, :])
+    shifted = values.clone()
+    shifted[..., angles] = angle_values - turns
+    return shifted

@@ -1,7 +1,7 @@
-"""A Gaussian belief over the state moved one step on through a model, and the derivatives of that step."""
+"""Propagates a Gaussian belief over the state through a model, with derivatives."""
 
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import torch
@@ -20,21 +20,24 @@ from gpmpc.signals import Signals, signals_of
 
 @dataclass(frozen=True)
 class Propagation:
-    """A belief moved one step on."""
+    """A belief after one step."""
 
-    belief: Gaussian  #: N(mean, covariance) of the next state; the covariance is symmetric positive semidefinite
+    #: N(mean, covariance) of the next state; symmetric positive semidefinite covariance
+    belief: Gaussian
     cross_covariance: Tensor  #: Cov[x, x+] (*batch, n, k)
-    #: how far below zero the covariance's smallest eigenvalue was before the projection (*batch,). More than round-off
-    #: of the largest entry: the model is too nearly noise-free for double precision
+    #: how far below zero the covariance's smallest eigenvalue was before the projection
+    #: (*batch,). More than round-off of the largest entry: the model is too nearly
+    #: noise-free for double precision
     deficit: Tensor
 
 
 @dataclass(frozen=True)
 class Sensitivity:
-    """Derivatives of the next belief N(mu+, Sigma+) at a belief N(mu, Sigma) and an input u; k outputs, mostly k = n.
+    """Derivatives of the next belief N(mu+, Sigma+) by the belief N(mu, Sigma) and u.
 
-    Those by Sigma are symmetric in their last two indices: d mu+_a = sum_cd mean_by_covariance[a, c, d] dSigma[c, d]
-    for symmetric dSigma.
+    There are k outputs, mostly k = n. Derivatives by Sigma are symmetric in their last
+    two indices: d mu+_a = sum_cd mean_by_covariance[a, c, d] dSigma[c, d] for symmetric
+    dSigma.
     """
 
     mean_by_mean: Tensor  #: (*batch, k, n)
@@ -45,17 +48,26 @@ class Sensitivity:
     covariance_by_input: Tensor  #: (*batch, k, k, m)
 
 
-class Propagator(Protocol):
-    """One way to move a Gaussian through a model; called, it gives the next belief alone.
+class NextMoments(NamedTuple):
+    """Moments of the next state, before process noise is added."""
 
-    A propagator with closed-form derivatives for a model has a method ``differentiate`` with the arguments of
-    ``propagate``, which returns the ``Propagation`` and its ``Sensitivity``, or None where it has none.
+    mean: Tensor  # (*batch, k)
+    covariance: Tensor  # (*batch, k, k)
+    cross_covariance: Tensor  # Cov[x, x+] (*batch, n, k)
+
+
+class Propagator(Protocol):
+    """A way to propagate a Gaussian; as a function it returns the next belief alone.
+
+    A propagator with closed-form derivatives for a model has a method ``differentiate``
+    with the arguments of ``propagate``, which returns the ``Propagation`` and its
+    ``Sensitivity``, or None where it has none.
     """
 
     def propagate(
         self, model: Any, belief: Gaussian, input: Tensor | None = None
     ) -> Propagation:
-        """Moves a belief one step on.
+        """Propagates a belief over one step.
 
         Args:
             model: A ``DynamicsModel``.
@@ -73,20 +85,22 @@ class Propagator(Protocol):
     def __call__(
         self, model: Any, belief: Gaussian, input: Tensor | None = None
     ) -> Gaussian:
-        """The next state's belief; see ``propagate``."""
+        """Returns the next state's belief; see ``propagate``."""
         return self.propagate(model, belief, input).belief
 
 
 class NoisyPropagator(Propagator):
-    """A propagator that adds the model's noise covariance to the predicted one, unless it is told not to.
+    """A propagator that adds the model's noise covariance to the predicted one.
 
     Args:
-        process_noise: Whether the noise that the model has learned moves the state, at every step: a belief is then
-            over the state that will be there. Without it a belief is over the latent function's value, as if all
-            noise were of the sensors, and several steps on its intervals are too narrow by what happens in between.
+        process_noise: Whether it does: the noise that the model has learned then moves
+            the state, at every step, and a belief is over the state that will be there.
+            Without it a belief is over the latent function's value, as if all noise
+            were of the sensors, and several steps on its intervals are too narrow by
+            what happens in between.
     """
 
-    diagonal = False  #: whether only the diagonal of the predicted covariance is kept
+    diagonal = False  #: whether only the predicted covariance's diagonal is computed
 
     def __init__(self, process_noise: bool = True):
         self.process_noise = process_noise
@@ -94,79 +108,79 @@ class NoisyPropagator(Propagator):
     def propagate(
         self, model: Any, belief: Gaussian, input: Tensor | None = None
     ) -> Propagation:
-        """Moves a belief one step on; see ``Propagator.propagate``."""
-        return self._projected(
-            model, *self._moved(model, belief, checked_input(model, belief, input))
-        )
+        """Propagates a belief over one step; see ``Propagator.propagate``."""
+        input = checked_input(model, belief, input)
+        return self._add_noise(model, self._next_moments(model, belief, input))
 
-    def _moved(
-        self, model: Any, belief: Gaussian, input: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Mean, covariance and Cov[x, x+] of the next state, without process noise."""
+    def _next_moments(self, model: Any, belief: Gaussian, input: Tensor) -> NextMoments:
+        """Returns the moments of the next state, without process noise."""
         raise NotImplementedError
 
-    def _projected(
-        self, model: Any, mean: Tensor, covariance: Tensor, cross: Tensor
-    ) -> Propagation:
+    def _add_noise(self, model: Any, moments: NextMoments) -> Propagation:
         """Adds the process noise, if any, and projects the covariance."""
+        covariance = moments.covariance
         if self.process_noise:
             covariance = covariance + model.noise_covariance
         if self.diagonal:
             covariance = torch.diag_embed(covariance.diagonal(dim1=-2, dim2=-1))
         covariance, deficit = nearest_positive_semidefinite(covariance)
-        return Propagation(Gaussian(mean, covariance), cross, deficit)
+        return Propagation(
+            belief=Gaussian(moments.mean, covariance),
+            cross_covariance=moments.cross_covariance,
+            deficit=deficit,
+        )
 
 
 def differentiate(
     propagator: Propagator, model: Any, belief: Gaussian, input: Tensor | None = None
 ) -> tuple[Propagation, Sensitivity]:
-    """Moves a belief one step on, with its derivatives.
+    """Propagates a belief over one step, with the step's derivatives.
 
     Args:
-        propagator: How.
+        propagator: The way to propagate it.
         model: A ``DynamicsModel``.
         belief: Mean (*batch, n), covariance (*batch, n, n).
         input: (*batch, m); may be left out where m = 0.
 
     Returns:
-        What ``propagator.propagate`` returns, and the derivatives. Where the covariance had to be projected they are
-        those of the projection (autograd) or of what was projected (closed form).
+        What ``propagator.propagate`` returns, and the derivatives. Where the covariance
+        had to be projected they are those of the projection (autograd) or of the matrix
+        that was projected (closed form).
     """
     closed_form = getattr(propagator, "differentiate", None)
-    if (
-        closed_form is not None
-        and (found := closed_form(model, belief, input)) is not None
-    ):
-        return found
+    if closed_form is not None:
+        result = closed_form(model, belief, input)
+        if result is not None:
+            return result
     return by_autograd(propagator, model, belief, input)
 
 
 def by_autograd(
     propagator: Propagator, model: Any, belief: Gaussian, input: Tensor | None = None
 ) -> tuple[Propagation, Sensitivity]:
-    """``differentiate`` by torch autograd, for any propagator and model that torch can follow."""
+    """Does what ``differentiate`` does by torch autograd, for any propagator and model.
+
+    torch has to be able to follow both.
+    """
     input = checked_input(model, belief, input)
     n = belief.dim
     k = model.output_dim
-    with torch.inference_mode(
-        False
-    ):  # inference tensors, constants too, could not be saved for backward
-        rows, columns = torch.tril_indices(k, k, device=belief.mean.device)
     batch = belief.mean.shape[:-1]
+    # inference tensors, constants too, could not be saved for backward
+    with torch.inference_mode(False):
+        rows, columns = torch.tril_indices(k, k, device=belief.mean.device)
 
     def step(mean: Tensor, covariance: Tensor, control: Tensor) -> tuple[Tensor, ...]:
-        out = propagator.propagate(
-            model, Gaussian(mean, covariance.unflatten(-1, (n, n))), control
-        )
-        entries = torch.cat(
-            [out.belief.mean, out.belief.covariance[..., rows, columns]], dim=-1
-        )
+        """Returns the k + k (k + 1) / 2 numbers to be differentiated, and all parts."""
+        at = Gaussian(mean, covariance.unflatten(-1, (n, n)))
+        result = propagator.propagate(model, at, control)
+        triangle = result.belief.covariance[..., rows, columns]
         return (
-            entries,
-            out.belief.mean,
-            out.belief.covariance,
-            out.cross_covariance,
-            out.deficit,
+            torch.cat([result.belief.mean, triangle], dim=-1),
+            result.belief.mean,
+            result.belief.covariance,
+            result.cross_covariance,
+            result.deficit,
         )
 
     values, (by_mean, by_covariance, by_input) = batched_jacobian(
@@ -177,26 +191,37 @@ def by_autograd(
             input.expand(*batch, input.shape[-1]),
         ),
     )
+    _, mean, covariance, cross_covariance, deficit = values
     by_covariance = by_covariance.unflatten(-1, (n, n))
     by_covariance = (by_covariance + by_covariance.mT) / 2
-    whole = torch.zeros(k, k, dtype=torch.long, device=rows.device)
-    whole[rows, columns] = whole[columns, rows] = (
-        torch.arange(len(rows), device=rows.device) + k
+    # which of the differentiated numbers each entry of the covariance is
+    places = torch.zeros(k, k, dtype=torch.long, device=rows.device)
+    in_triangle = torch.arange(len(rows), device=rows.device) + k
+    places[rows, columns] = in_triangle
+    places[columns, rows] = in_triangle
+    propagation = Propagation(
+        belief=Gaussian(mean, covariance),
+        cross_covariance=cross_covariance,
+        deficit=deficit,
     )
-    of_mean = by_mean[..., :k, :], by_covariance[..., :k, :, :], by_input[..., :k, :]
-    of_covariance = (
-        by_mean[..., whole, :],
-        by_covariance[..., whole, :, :],
-        by_input[..., whole, :],
+    sensitivity = Sensitivity(
+        mean_by_mean=by_mean[..., :k, :],
+        mean_by_covariance=by_covariance[..., :k, :, :],
+        mean_by_input=by_input[..., :k, :],
+        covariance_by_mean=by_mean[..., places, :],
+        covariance_by_covariance=by_covariance[..., places, :, :],
+        covariance_by_input=by_input[..., places, :],
     )
-    moved = Propagation(Gaussian(values[1], values[2]), values[3], values[4])
-    return moved, Sensitivity(*of_mean, *of_covariance)
+    return propagation, sensitivity
 
 
 def checked_input(model: Any, belief: Gaussian, input: Tensor | None) -> Tensor:
-    """Checks belief and control by the rules of ``Propagator.propagate``; returns the control (*batch, m).
+    """Checks belief and control by the rules of ``Propagator.propagate``.
 
     Values are checked where that is free: in host memory, outside torch's transforms.
+
+    Returns:
+        The control (*batch, m).
     """
     if not isinstance(belief, Gaussian):
         raise SettingError("belief", f"must be a Gaussian; got {type(belief).__name__}")
@@ -205,9 +230,7 @@ def checked_input(model: Any, belief: Gaussian, input: Tensor | None) -> Tensor:
     input = belief.mean[..., :0] if input is None else input
     check_tensors(input=input)
     if input.dim() == 1 and input.shape[-1] == model.input_dim:
-        input = input.expand(
-            *belief.mean.shape[:-1], model.input_dim
-        )  # one control for all
+        input = input.expand(*belief.mean.shape[:-1], model.input_dim)  # one for all
     check_query(model, belief.mean, input)
     if (
         belief.covariance.dtype != belief.mean.dtype
@@ -216,17 +239,20 @@ def checked_input(model: Any, belief: Gaussian, input: Tensor | None) -> Tensor:
         raise SettingError(
             "belief", "mean and covariance must have the same dtype and device"
         )
-    if (arrays := constant_arrays(belief.mean, belief.covariance, input)) is None:
+    arrays = constant_arrays(belief.mean, belief.covariance, input)
+    if arrays is None:
         return input
-    for name, array in zip(
-        ("the belief's mean", "the belief's covariance", "the input"),
-        arrays,
-        strict=True,
-    ):
-        if not np.isfinite(array).all():
-            raise DataError(f"{name} must be finite; got {array}")
-    _check_semidefinite(arrays[1])
+    mean, covariance, control = arrays
+    _check_finite("the belief's mean", mean)
+    _check_finite("the belief's covariance", covariance)
+    _check_finite("the input", control)
+    _check_semidefinite(covariance)
     return input
+
+
+def _check_finite(name: str, array: np.ndarray) -> None:
+    if not np.isfinite(array).all():
+        raise DataError(f"{name} must be finite; got {array}")
 
 
 def _check_semidefinite(covariance: np.ndarray) -> None:
@@ -235,16 +261,16 @@ def _check_semidefinite(covariance: np.ndarray) -> None:
     gap = np.abs(covariance - np.swapaxes(covariance, -1, -2)).max(initial=0.0)
     if gap > round_off:
         raise DataError(
-            f"the belief's covariance must be symmetric; got entries that differ by {float(gap):.3g}"
+            "the belief's covariance must be symmetric; got entries that differ by "
+            f"{float(gap):.3g}"
         )
+    eye = np.eye(covariance.shape[-1], dtype=covariance.dtype)
     try:
-        np.linalg.cholesky(
-            covariance
-            + round_off * np.eye(covariance.shape[-1], dtype=covariance.dtype)
-        )
+        np.linalg.cholesky(covariance + round_off * eye)
     except np.linalg.LinAlgError:
-        if (lowest := float(np.linalg.eigvalsh(covariance).min())) < -round_off:
+        lowest = float(np.linalg.eigvalsh(covariance).min())
+        if lowest < -round_off:
             raise DataError(
-                f"the belief's covariance must be positive semidefinite; got an eigenvalue of {lowest:.3g} "
-                f"(largest entry {float(largest):.3g})"
+                "the belief's covariance must be positive semidefinite; got an "
+                f"eigenvalue of {lowest:.3g} (largest entry {float(largest):.3g})"
             ) from None

@@ -494,10 +494,15 @@ def test_loops_over_points_may_use_the_widest_registers():
     )  # the kernel itself may have been loaded
     x = np.zeros((1, 2))
     u = np.zeros((1, 1))
-    out = (np.zeros((1, 2)), np.zeros((1, 2, 2)), np.zeros((1, 2, 1)))
     memory = np.empty(7 * gps.arrays.points.shape[1] + 8)
     none = np.zeros((0, 2, 2))
-    anew(gps.arrays, none, (np.zeros(2), False), x, u, memory, (*out, none))
+    out = _gp_point.PointArrays(
+        mean=np.zeros((1, 2)),
+        A=np.zeros((1, 2, 2)),
+        B=np.zeros((1, 2, 1)),
+        covariance=none,
+    )
+    anew(gps.arrays, none, np.zeros(2), False, x, u, memory, out)
     assert '"prefer-vector-width"="512"' in anew.inspect_llvm(anew.signatures[0])
 
 
