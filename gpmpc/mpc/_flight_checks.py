@@ -402,10 +402,10 @@ def _measure_distance(settings, memory, reading):
         for j in range(n):
             weight = settings.weights[i, j]
             if weight != 0.0:
-                other = _wrapped(reading.measured[j] - now[j], settings.angles[j])
-                square += weight * off * other
-                other = _wrapped(end[j] - memory.states[j].start, settings.angles[j])
-                travel += weight * way * other
+                off_j = _wrapped(reading.measured[j] - now[j], settings.angles[j])
+                square += weight * off * off_j
+                way_j = _wrapped(end[j] - memory.states[j].start, settings.angles[j])
+                travel += weight * way * way_j
         variance = settings.model_noise[i] + state.sensor_variance
         predicted = reading.last_covariances[1, i, i]
         if predicted == predicted:
@@ -454,9 +454,9 @@ def _move_of_end(settings, memory, end):
         size += settings.weights[i, i] * end[i] * end[i]
         for j in range(len(end)):
             if settings.weights[i, j] != 0.0:
-                other = end[j] - memory.states[j].horizon_end
-                other = _wrapped(other, settings.angles[j])
-                square += settings.weights[i, j] * move * other
+                move_j = end[j] - memory.states[j].horizon_end
+                move_j = _wrapped(move_j, settings.angles[j])
+                square += settings.weights[i, j] * move * move_j
     return square if square > 1e-12 * max(1.0, size) else 0.0
 
 
@@ -489,8 +489,8 @@ def _plan_distances(settings, means, references):
             off = _wrapped(means[k + 1, i] - target[i], settings.angles[i])
             for j in range(n):
                 if weights[i, j] != 0.0:
-                    other = _wrapped(means[k + 1, j] - target[j], settings.angles[j])
-                    total += weights[i, j] * off * other
+                    off_j = _wrapped(means[k + 1, j] - target[j], settings.angles[j])
+                    total += weights[i, j] * off * off_j
         if k == _LONG - 1:
             first = total
     return total, total if H <= _LONG else first

@@ -9,20 +9,19 @@ the goal is held.
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import product
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-import torch
 
 from gpmpc._angles import full_turns
 from gpmpc._dynamics import linearize
 from gpmpc._kernels.gp_rollout import Feedback
 from gpmpc.exceptions import SettingError
-from gpmpc.gaussian import Gaussian
 from gpmpc.models import RollOut
 from gpmpc.mpc._controller import Decision, Reference, Timing
+from gpmpc.mpc._question import Question, first_weight, held
 from gpmpc.mpc._riccati import finite_horizon_lqr
-from gpmpc.mpc._stage_meter import StageMeter, first_weight, held, rows_over
+from gpmpc.mpc._stage_meter import StageMeter
 from gpmpc.mpc.gp_mpc import GPMPC
 from gpmpc.status import Status
 
@@ -87,48 +86,6 @@ class Flight:
             arrives=self.arrives,
             gains=None if self.gains is None else self.gains[stages:],
         )
-
-
-class Question(NamedTuple):
-    """What a controller is asked at a state, beside its last plan."""
-
-    covariance: torch.Tensor  # of the belief (n, n)
-    reference: Reference  # over the horizon
-    parameters: Any
-    previous_input: Array  # the input before (m,)
-    disturbance: Array | None = None  # of the model (n,)
-
-    def over(self, horizon: int) -> "Question":
-        """Returns the question to a controller of another horizon.
-
-        What ends sooner is held.
-        """
-        if self.reference.horizon == horizon:
-            return self
-        reference = self.reference
-        inputs = reference.inputs
-        if inputs is not None:
-            inputs = held(np.asarray(inputs), horizon)
-        states = held(np.asarray(reference.states), horizon + 1)
-        parameters = self.parameters
-        if parameters is not None:
-            parameters = rows_over(parameters, horizon)
-        return self._replace(reference=Reference(states, inputs), parameters=parameters)
-
-    def after(self, stages: int) -> "Question":
-        """Returns the question some stages later.
-
-        Parameters by stage move on, the last one held.
-        """
-        if self.parameters is None or np.ndim(self.parameters) < 2:
-            return self
-        count = len(self.parameters)
-        parameters = rows_over(self.parameters, stages + count)[stages:]
-        return self._replace(parameters=parameters)
-
-    def belief(self, state: Array) -> Gaussian:
-        """Returns the belief with a mean (n,)."""
-        return Gaussian(torch.as_tensor(np.ascontiguousarray(state)), self.covariance)
 
 
 class Trajectory(NamedTuple):
@@ -434,9 +391,9 @@ class _GrowingFlight:
     def advance(self) -> bool:
         """Adds a stage; returns whether the controller found an input for it."""
         state = self._states[-1]
-        asked = self._question_over_horizon.after(self.stages)
+        now = self._question_over_horizon.after(self.stages)
         plan = self._controller.control(
-            asked.belief(state), asked.reference, self._plan, asked.parameters
+            now.belief(state), now.reference, self._plan, now.parameters
         )
         if not plan.applicable:
             return False

@@ -249,7 +249,7 @@ _ALL_WELL = Judgement()
 
 
 def _float64(values: Any) -> Array:
-    """Returns values as a contiguous array of float64, themselves where they are one."""
+    """Returns values as a contiguous array of float64, without a copy if they are."""
     is_plain = type(values) is np.ndarray and values.dtype is _FLOAT64
     if is_plain and values.flags.c_contiguous:
         return values

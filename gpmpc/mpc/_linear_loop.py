@@ -72,8 +72,8 @@ class LinearLoop:
         Another horizon has a meaning then.
         """
         cost = self._point.cost
-        parts = (cost.state[:-1], cost.input, cost.squares)
-        return all(len(part) == 0 or not np.ptp(part, axis=0).any() for part in parts)
+        weights = (cost.state[:-1], cost.input, cost.squares)
+        return all(len(W) == 0 or not np.ptp(W, axis=0).any() for W in weights)
 
     def look_ahead(self, horizon: int) -> None:
         """Computes the laws of all horizons up to one."""
@@ -210,14 +210,14 @@ def _laws(A: Array, B: Array, cost: QuadraticCost, horizon: int) -> list[_Law]:
     """
     n, m = B.shape
     none = np.zeros((n, n))
-    held = np.zeros((m, m))  # how much of u_{-1} a stage's input goes on from
+    kept_input = np.zeros((m, m))  # how much of u_{-1} a stage's input goes on from
     if cost.penalized == INCREMENTS:
-        held = np.eye(m)
+        kept_input = np.eye(m)
     transition = np.block(
         [
-            [A, np.eye(n), B @ held],
+            [A, np.eye(n), B @ kept_input],
             [none, np.eye(n), np.zeros((n, m))],
-            [np.zeros((m, 2 * n)), held],
+            [np.zeros((m, 2 * n)), kept_input],
         ]
     )
     effect = np.vstack([B, np.zeros((n, m)), np.eye(m)])
@@ -235,7 +235,7 @@ def _laws(A: Array, B: Array, cost: QuadraticCost, horizon: int) -> list[_Law]:
         horizon,
     )[0]
     feedback = -gains
-    feedback[:, :, 2 * n :] += held
+    feedback[:, :, 2 * n :] += kept_input
     return [
         _Law(
             by_state=law[:, :n],
@@ -321,10 +321,12 @@ def _look_ahead(
     local = linearize(
         ahead.model, point.state[None, :n], point.input[None], covariance=False
     )
-    share = ahead.delay - (ahead.pending - 1)
+    older_share = ahead.delay - (ahead.pending - 1)  # of a time step
     for k in range(ahead.lead):
         older = inputs[k * m : (k + 1) * m]
         newer = inputs[(k + 1) * m : (k + 2) * m]
-        acting = older if share == 1 else share * older + (1 - share) * newer
+        acting = older
+        if older_share != 1:
+            acting = older_share * older + (1 - older_share) * newer
         state = local.A[0] @ state + local.B[0] @ acting
     return state, inputs[ahead.lead * m :]

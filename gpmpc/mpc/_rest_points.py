@@ -74,9 +74,10 @@ def _reference_inputs(reference: Reference, shape: tuple[int, int]) -> Array:
     """Returns the inputs of every step, the last one held; zero without any."""
     inputs = np.zeros(shape)
     if reference.inputs is not None:
-        known = np.atleast_2d(np.asarray(reference.inputs, dtype=float))
-        inputs[: len(known)] = known
-        inputs[len(known) :] = known[-1]
+        given_inputs = np.atleast_2d(np.asarray(reference.inputs, dtype=float))
+        count = len(given_inputs)
+        inputs[:count] = given_inputs
+        inputs[count:] = given_inputs[-1]
     return inputs
 
 
@@ -173,8 +174,8 @@ class _RestSearch:
         model = linearize(prediction.model, state[None], input[None], covariance=False)
         A = model.A[0]
         B = model.B[0]
-        moved = state_difference(model.mean[:1], state[None], prediction.angles)[0]
-        defect = moved - self._step
+        move = state_difference(model.mean[:1], state[None], prediction.angles)[0]
+        defect = move - self._step
         cost = _cost_at(prediction, state, input, self._parameters)
         error = np.concatenate([state - self._target, input])
         hessian = np.zeros((n + m, n + m))

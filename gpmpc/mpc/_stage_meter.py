@@ -5,7 +5,7 @@ the weights of H stages, the terminal one at the end, and spreads. What is flown
 more stages than that and no end, so each is weighed here as the first one of a program.
 """
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -13,10 +13,8 @@ from gpmpc._angles import state_difference
 from gpmpc.mpc._constraints import ConstraintRows
 from gpmpc.mpc._controller import FEASIBLE
 from gpmpc.mpc._linear_quadratic import Plan
+from gpmpc.mpc._question import Question, first_weight, held, rows_over
 from gpmpc.mpc.problem import Problem
-
-if TYPE_CHECKING:
-    from gpmpc.mpc._foresight import Question
 
 Array = np.ndarray
 
@@ -36,7 +34,7 @@ class StageMeter:
         self._rows = ConstraintRows(problem, horizon, "none")
         self._always = self._rows.applies.all(axis=0)
 
-    def __call__(self, states: Array, inputs: Array, question: "Question") -> Array:
+    def __call__(self, states: Array, inputs: Array, question: Question) -> Array:
         """Returns the costs (L,) of states (L + 1, n) and inputs (L, m).
 
         They are infinite beyond a hard bound. The reference is that of the question;
@@ -108,22 +106,3 @@ class StageMeter:
         costs = excess[:, ~hard] @ prices[~hard]
         costs[(excess[:, hard] > FEASIBLE).any(axis=1)] = np.inf
         return costs
-
-
-def held(rows: Array, count: int) -> Array:
-    """Returns the first rows, the last one repeated up to a count."""
-    rows = rows[:count]
-    missing = count - len(rows)
-    if missing > 0:
-        rows = np.concatenate([rows, np.repeat(rows[-1:], missing, axis=0)])
-    return np.ascontiguousarray(rows)
-
-
-def rows_over(parameters: Any, count: int) -> Array:
-    """Returns parameters of stages (count, q), from (q,) or those of others."""
-    return held(np.atleast_2d(np.asarray(parameters, dtype=float)), count)
-
-
-def first_weight(weight: Array) -> Array:
-    """Returns the weight of the first stage, from one for all or those by stage."""
-    return weight.reshape(-1, *weight.shape[-2:])[0]

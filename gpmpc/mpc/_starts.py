@@ -30,9 +30,10 @@ from gpmpc.mpc._controller import (
     check_arguments,
     read_parameters,
 )
-from gpmpc.mpc._foresight import Flight, Foresight, Question, Trajectory
+from gpmpc.mpc._foresight import Flight, Foresight, Trajectory
 from gpmpc.mpc._linear_quadratic import References, evaluate_cost
 from gpmpc.mpc._linearization import StageCosts, StageLinearizer
+from gpmpc.mpc._question import Question
 from gpmpc.mpc._start_guesses import Starts, kicks, turned
 from gpmpc.mpc.gp_mpc import GPMPC
 from gpmpc.propagation import Linearization
@@ -220,10 +221,10 @@ class _FlightSearch:
         for flight in flights[:_IMPROVED]:
             if not flight.arrives or perf_counter() > self._deadline:
                 break
-            held = best
+            candidate = best
             if flight is not flights[0]:
-                held = foresight.hold(flight, question)
-            improved = foresight.improve(held, question)
+                candidate = foresight.hold(flight, question)
+            improved = foresight.improve(candidate, question)
             if improved.is_better_than(best):
                 best = improved
         return foresight.with_gains(best)

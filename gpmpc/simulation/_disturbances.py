@@ -80,9 +80,9 @@ class Gust(_Window):
         """
         for name in self.rates:
             if name not in plant.state_names:
-                known = ", ".join(plant.state_names)
+                names = ", ".join(plant.state_names)
                 raise SettingError(
-                    "rates", f"must name states of the plant, {known}; got {name!r}"
+                    "rates", f"must name states of the plant, {names}; got {name!r}"
                 )
         if not self.acts(time):
             return plant

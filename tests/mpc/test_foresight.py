@@ -1,4 +1,4 @@
-"""Stages cost what the problem says, flights end where the goal is held, and relays pump."""
+"""Stages cost what the problem says, flights end at a held goal, and relays pump."""
 
 import casadi
 import numpy as np
@@ -19,7 +19,8 @@ from gpmpc.mpc import (
     Reference,
     Tracking,
 )
-from gpmpc.mpc._foresight import Flight, Foresight, Question, Trajectory
+from gpmpc.mpc._foresight import Flight, Foresight, Trajectory
+from gpmpc.mpc._question import Question
 from gpmpc.mpc._stage_meter import StageMeter
 from gpmpc.propagation import Linearization
 from gpmpc.systems import cart_pole, pendulum, step

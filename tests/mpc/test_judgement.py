@@ -1,4 +1,4 @@
-"""A flight is called suspicious or lost when something breaks, and healthy as long as nothing does."""
+"""A flight is suspicious or lost when something breaks, and healthy otherwise."""
 
 from dataclasses import replace
 
@@ -160,7 +160,10 @@ def judged_alone(judge, frozen_from):
 def plan_of(state, **changes):
     H = 5
     return Decision(
-        np.zeros(1), np.zeros((H, 1)), np.tile(state, (H + 1, 1)), np.zeros((H + 1, 2, 2)),
+        np.zeros(1),
+        np.zeros((H, 1)),
+        np.tile(state, (H + 1, 1)),
+        np.zeros((H + 1, 2, 2)),
         **({"status": Status.SOLVED, "iterations": 1, "timing": Timing()} | changes),
     )  # fmt: skip
 

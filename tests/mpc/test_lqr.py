@@ -1,4 +1,4 @@
-"""Linear-quadratic tracking against least squares, the Riccati equation, and its own bounds."""
+"""Linear-quadratic tracking against least squares, Riccati and its own bounds."""
 
 import numpy as np
 import pytest
@@ -168,7 +168,7 @@ def test_a_bad_measurement_is_said_so_and_misuse_is_refused():
 
 @pytest.mark.parametrize("side", [-1.0, 1.0])
 def test_where_rates_and_box_contradict_each_other_no_input_leaves_the_box(side, rng):
-    """The input before was far outside, and the rates alone would keep the next ones there."""
+    """The input before was far outside; the rates alone would keep the next there."""
     problem = Problem(
         Tracking(Q, R), inputs=Box([-0.5], [0.4]), input_rates=Box([-0.1], [0.1])
     )

@@ -271,7 +271,7 @@ def test_reference_inputs_of_another_number_are_refused():
 
 @pytest.mark.parametrize("price", [0.3, 2.0])
 def test_a_soft_state_bound_costs_what_it_says_on_either_side(price):
-    """One step of x+ = x + u: minimise (x - r)^2 + u^2 + price v on a grid finer than the answer."""
+    """One step of x+ = x + u: minimise (x - r)^2 + u^2 + price v on a fine grid."""
 
     class Shifted:
         state_names = ("x",)

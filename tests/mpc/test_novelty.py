@@ -1,4 +1,4 @@
-"""How far a plan is from the data, in every covariance mode, against what can be computed by hand."""
+"""The novelty of plans in every covariance mode, against numbers worked out by hand."""
 
 import math
 from dataclasses import replace

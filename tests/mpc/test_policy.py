@@ -14,7 +14,7 @@ LOST = Gaussian.certain(np.array([np.nan]))
 
 
 class Planner:
-    """Plans (10 k, 10 k + 1, ..) at call k, unless the call is among the failing ones, which plan 666."""
+    """Plans (10 k, 10 k + 1, ..) at call k; the failing ones plan 666."""
 
     horizon = 4
 
@@ -48,7 +48,7 @@ def run(planner, steps, on_failure, beliefs=None, reference=FAR):
     return commands
 
 
-def test_the_previous_plan_gives_its_input_of_the_right_age_and_holds_the_last_when_used_up():
+def test_the_previous_plan_goes_on_and_holds_its_last_input():
     commands = run(Planner(2, 3, 4, 5, 6), 8, "previous_plan")
     assert [c.input[0] for c in commands] == [0, 10, 11, 12, 13, 13, 13, 70]
 
@@ -129,7 +129,7 @@ def test_a_misspelt_policy_is_refused():
         ControlLoop(Planner(), "held")
 
 
-def test_before_the_first_plan_the_reference_input_is_applied_within_the_bounds_and_told_to_the_controller():
+def test_before_the_first_plan_the_reference_input_is_applied():
     planner = Planner()
     planner.problem = Problem(
         Tracking([1.0], [1.0], penalized="inputs"), inputs=Box([-2.0], [2.0])

@@ -1,4 +1,7 @@
-"""Many starts find plans that one misses, over any full turn, within their time, and what was found is kept."""
+"""Many starts find plans that one misses, over any full turn, within their time.
+
+What was found is kept.
+"""
 
 from dataclasses import replace
 from itertools import product

@@ -132,7 +132,8 @@ def test_what_cannot_be_solved_is_reported():
 
 def test_importing_the_controllers_does_not_load_cvxpy():
     modules = "gpmpc.mpc, gpmpc.mpc.gp_mpc, gpmpc.mpc.baselines"
-    code = f"import sys, {modules}; print([m for m in ('cvxpy', 'hydra', 'matplotlib') if m in sys.modules])"
+    heavy = ("cvxpy", "hydra", "matplotlib")
+    code = f"import sys, {modules}; print([m for m in {heavy} if m in sys.modules])"
     loaded = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True
     ).stdout.strip()

@@ -163,7 +163,7 @@ def test_failures_are_bridged_and_counted_as_alone(policy):
 
 
 def outcome(fly_alone):
-    """What a flight came to: its rollout, or what ``Trial.error`` says of its failure."""
+    """Returns a flight's rollout, or what ``Trial.error`` says of its failure."""
     try:
         return fly_alone()
     except (SolverFailure, Diverged) as error:
@@ -212,7 +212,7 @@ class Proportional:
         )
 
 
-def test_a_controller_that_answers_one_by_one_flies_many_too_and_divergence_is_one_trials_own():
+def test_many_fly_one_by_one_and_divergence_is_one_trials_own():
     plant = System(Explosive(), time_step=0.5)
     initial = Gaussian(torch.zeros(1), 4 * torch.eye(1))
     asked = (plant, Proportional(), np.zeros((20, 1)), initial, 15)

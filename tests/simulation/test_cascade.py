@@ -164,7 +164,7 @@ def test_the_same_seed_gives_the_same_flight_and_every_inner_step_is_told():
     assert np.array_equal([step.state for step in inner], first.states[:-1, 6:])
 
 
-def test_the_attitudes_asked_for_change_with_the_plan_and_are_approached_at_first_order():
+def test_attitudes_follow_the_plan_and_are_approached_slowly():
     class Far:
         horizon = 5
 

@@ -35,7 +35,10 @@ class Exploding(Cart):
 
 
 class Feedback:
-    """u = -K (x - r), planned over three steps; keeps what it saw. ``failing``: steps that end without a solution."""
+    """u = -K (x - r), planned over three steps; keeps what it saw.
+
+    ``failing`` are steps that end without a solution.
+    """
 
     horizon = 3
 

@@ -1,4 +1,7 @@
-"""Whatever a controller says: what reaches a plant is finite and within box and rates, or the policy acts."""
+"""What reaches a plant is finite and within box and rates, or the policy acts.
+
+It does so whatever a controller says.
+"""
 
 import numpy as np
 import pytest
@@ -54,7 +57,10 @@ LIES = {
 
 
 class Liar:
-    """Moves its inputs about within box and rates; calls its plans solved, ``lies`` (steps to kinds) too."""
+    """Moves its inputs about within box and rates.
+
+    It calls its plans solved, ``lies`` (steps to kinds) too.
+    """
 
     horizon = H
     problem = PROBLEM
@@ -227,7 +233,7 @@ def test_a_reference_that_is_not_finite_is_nothing_to_fall_back_on():
         decide(Liar(), lost, reference, None, "hold")
 
 
-def test_a_controller_without_declared_bounds_is_held_to_finite_inputs_of_the_plants_number():
+def test_without_declared_bounds_inputs_are_finite_and_as_many():
     class Foreign(Liar):
         problem = initial_input = None
 

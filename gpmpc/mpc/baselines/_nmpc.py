@@ -257,6 +257,12 @@ def _build(plant: System, problem: Problem, horizon: int, tolerance: float) -> _
         "g": constraints.values,
         "p": parameters,
     }
+    solver = casadi.nlpsol("nmpc", "ipopt", program, _options(tolerance))
+    return _Program(solver, unknowns.bounds, constraints.bounds)
+
+
+def _options(tolerance: float) -> dict[str, Any]:
+    """Returns the options of CasADi and IPOPT."""
     ipopt = {
         "print_level": 0,
         "sb": "yes",
@@ -264,13 +270,7 @@ def _build(plant: System, problem: Problem, horizon: int, tolerance: float) -> _
         "max_iter": 500,
         "bound_relax_factor": 0.0,
     }
-    options: dict[str, Any] = {
-        "print_time": False,
-        "show_eval_warnings": False,
-        "ipopt": ipopt,
-    }
-    solver = casadi.nlpsol("nmpc", "ipopt", program, options)
-    return _Program(solver, unknowns.bounds, constraints.bounds)
+    return {"print_time": False, "show_eval_warnings": False, "ipopt": ipopt}
 
 
 def _sum_of_squares(weights: Array, values: casadi.SX) -> casadi.SX:

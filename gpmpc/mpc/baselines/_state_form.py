@@ -257,7 +257,7 @@ class _StateFormProgram:
         return rules
 
     def _point(self, k: int) -> int:
-        """Returns the point that stage k is linearised at: the last one for the rest."""
+        """Returns the point that stage k is linearised at; later ones share the last."""
         return min(k, self._points - 1)
 
     def _constrain_states(self, rows: ConstraintRows) -> tuple[Any, list[Any]]:
