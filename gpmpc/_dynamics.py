@@ -1,4 +1,7 @@
-"""The protocol of learned and known models x[k+1] = f(x[k], u[k]), and their linearisation at many points at once."""
+"""The protocol of models x[k+1] = f(x[k], u[k]), learned or known.
+
+Besides, their linearisation at many points at once.
+"""
 
 import logging
 from collections.abc import Callable, Sequence
@@ -20,19 +23,22 @@ _log = logging.getLogger(__name__)
 
 
 class Linearized(NamedTuple):
-    """A model's first-order expansions at K points, as C-contiguous float64 arrays."""
+    """First-order expansions of a model at K points, as C-contiguous float64 arrays."""
 
     mean: Array  #: next states f(x, u) (K, n)
     A: Array  #: derivatives of the means by the state (K, n, n)
     B: Array  #: derivatives of the means by the input (K, n, m)
-    #: of the latent next states at the points, without observation noise (K, n, n); None where not wanted
+    #: of the latent next states at the points, without observation noise (K, n, n);
+    #: None where it was not computed
     covariance: Array | None
 
 
 class DynamicsModel(Protocol):
-    """A probabilistic model of the next state; ``gpmpc.testing.check_model`` tests a model against this protocol.
+    """A probabilistic model of the next state.
 
-    ``linearize_by_autograd`` is a ready-made ``linearize`` for models that torch can differentiate.
+    ``gpmpc.testing.check_model`` tests a model against this protocol.
+    ``linearize_by_autograd`` is a ready-made ``linearize`` for models that torch can
+    differentiate.
     """
 
     @property
@@ -62,64 +68,90 @@ class DynamicsModel(Protocol):
 
     @property
     def noise_covariance(self) -> Tensor:
-        """Covariance of the observations' noise (k, k); not contained in ``predict``."""
+        """Covariance of the observations' noise (k, k); not part of ``predict``."""
         ...
 
     def predict(self, state: Tensor, input: Tensor) -> Gaussian:
-        """Predicts the latent next state at x (*batch, n) and u (*batch, m), without observation noise."""
+        """Predicts the latent next state, without observation noise.
+
+        Args:
+            state: x (*batch, n).
+            input: u (*batch, m).
+        """
         ...
 
     def linearize(
         self, states: Array, inputs: Array, covariance: bool = True
     ) -> Linearized:
-        """Linearises the mean at K points x (K, n), u (K, m), with the covariances there unless they are not wanted."""
+        """Linearises the mean at K points.
+
+        Args:
+            states: x (K, n).
+            inputs: u (K, m).
+            covariance: Whether the covariances at the points are computed.
+        """
         ...
 
 
 class TensorModel:
-    """A model whose tensors have the type and are on the device of its attribute ``_part``."""
+    """A model with the type and the device of its attribute ``_part``."""
 
     _part: Any
 
     @property
     def dtype(self) -> torch.dtype:
-        """Of every tensor."""
+        """Type of every tensor."""
         return self._part.dtype
 
     @property
     def device(self) -> torch.device:
-        """Of every tensor."""
+        """Device of every tensor."""
         return self._part.device
 
 
 def linearize(
     model: DynamicsModel, states: Array, inputs: Array, covariance: bool = True
 ) -> Linearized:
-    """Linearises a model at K points x (K, n), u (K, m), with the covariances there unless they are not wanted.
+    """Linearises a model at K points by its own ``linearize``, else by autograd.
 
-    By its method ``linearize``, or, where it has none but ``predict``, by autograd.
+    Args:
+        model: Has a method ``linearize``, or only ``predict``.
+        states: x (K, n).
+        inputs: u (K, m).
+        covariance: Whether the covariances at the points are computed.
     """
-    method = getattr(model, "linearize", partial(linearize_by_autograd, model))
+    method = getattr(model, "linearize", None)
+    if method is None:
+        return linearize_by_autograd(model, states, inputs, covariance)
     return method(states, inputs, covariance)
 
 
 def linearize_by_autograd(
     model: Any, states: Array, inputs: Array, covariance: bool = True
 ) -> Linearized:
-    """``linearize`` by one evaluation of all K points and torch autograd, for any model that has ``predict``.
+    """Linearises a model at K points by one evaluation of them and torch autograd.
 
-    The model needs ``dtype`` and ``device`` besides. It is slower than a closed form, which is logged once a class.
+    It is slower than a closed form, which is logged once for each class.
+
+    Args:
+        model: Any that has ``predict``, ``dtype`` and ``device``.
+        states: x (K, n).
+        inputs: u (K, m).
+        covariance: Whether the covariances at the points are computed.
     """
     _log_slow(type(model).__name__)
-    belief, A, B = predict_by_autograd(model, *tensors_for(model, states, inputs))
+    state, input = tensors_for(model, states, inputs)
+    belief, A, B = predict_by_autograd(model, state, input)
     V = to_array(belief.covariance) if covariance else None
     return Linearized(to_array(belief.mean), to_array(A), to_array(B), V)
 
 
 @cache
 def _log_slow(name: str) -> None:
+    """Logs once that models of a class are linearised by autograd."""
     _log.warning(
-        "%s has no linearize() of its own: torch autograd linearises it, which takes longer",
+        "%s has no linearize() of its own: torch autograd linearises it, "
+        "which takes longer",
         name,
     )
 
@@ -140,106 +172,146 @@ def to_array(tensor: Tensor) -> Array:
 def batched_jacobian(
     function: Callable[..., tuple[Tensor, ...]], arguments: Sequence[Tensor]
 ) -> tuple[tuple[Tensor, ...], list[Tensor]]:
-    """Evaluates a function and its first value's Jacobians, by one reverse pass of torch autograd over the batch.
+    """Evaluates a function and the Jacobians of its first value.
 
-    The function takes arguments (*batch, d_i), batch element by batch element, and its first value is (*batch, k); the
-    Jacobians are (*batch, k, d_i), and can be differentiated again.
+    By one reverse pass of torch autograd over the batch.
+
+    Args:
+        function: Takes the arguments, batch element by batch element; its first value
+            is (*batch, k).
+        arguments: (*batch, d_i) each.
+
+    Returns:
+        The values, and the Jacobians (*batch, k, d_i). All can be differentiated again
+        where an argument requires it.
     """
-    again = torch.is_grad_enabled() and any(
+    differentiable = torch.is_grad_enabled() and any(
         argument.requires_grad for argument in arguments
     )
     with torch.inference_mode(False), torch.enable_grad():
-        leaves = [
-            a if again and a.requires_grad else a.detach().clone().requires_grad_()
-            for a in arguments
-        ]
+        leaves = []
+        for argument in arguments:
+            if differentiable and argument.requires_grad:
+                leaves.append(argument)
+            else:
+                leaves.append(argument.detach().clone().requires_grad_())
         values = function(*leaves)
-        outputs = values[0].shape[-1]
-        eye = torch.eye(outputs, dtype=values[0].dtype, device=values[0].device)
-        weights = eye.reshape(outputs, *[1] * (values[0].dim() - 1), outputs).expand(
-            outputs, *values[0].shape
-        )
-        options = {"create_graph": again, "retain_graph": True, "allow_unused": True}
-        if not values[0].requires_grad:  # a constant
-            columns = [None] * len(leaves)
-        else:
-            try:
-                columns = torch.autograd.grad(
-                    values[0], leaves, weights, is_grads_batched=True, **options
-                )
-            except (
-                RuntimeError
-            ):  # an operation of which torch cannot vectorise the derivative
-                rows = [
-                    torch.autograd.grad(values[0], leaves, weight, **options)
-                    for weight in weights
-                ]
-                columns = [
-                    None if c[0] is None else torch.stack(c)
-                    for c in zip(*rows, strict=True)
-                ]
-        columns = [
-            a.new_zeros(outputs, *a.shape) if c is None else c
-            for a, c in zip(leaves, columns, strict=True)
-        ]
+        columns = _gradients(values[0], leaves, create_graph=differentiable)
     jacobians = [column.movedim(0, -2) for column in columns]
-    if not again:
+    if not differentiable:
         values = tuple(value.detach() for value in values)
     return values, jacobians
 
 
-def predict_with_jacobian(
-    model: Any, state: Tensor, input: Tensor
-) -> tuple[Gaussian, Tensor, Tensor]:
-    """Predicts, with the mean's derivatives by state (*batch, k, n) and input (*batch, k, m).
+def _gradients(
+    value: Tensor, leaves: Sequence[Tensor], create_graph: bool
+) -> list[Tensor]:
+    """Differentiates each entry of a value (*batch, k), summed over the batch.
 
-    By the model's ``linearize`` where torch follows nothing; else by its own method of this name, which torch can
-    differentiate and transform further, or by autograd.
+    Returns:
+        The gradients (k, *batch, d_i) by each leaf.
     """
-    if (
-        hasattr(model, "linearize")
-        and (arrays := constant_arrays(state, input)) is not None
-    ):
-        check_query(model, state, input)
-        batch = state.shape[:-1]
-        count = state.shape[:-1].numel()
-        flat = (
-            np.ascontiguousarray(a, dtype=np.float64).reshape(count, a.shape[-1])
-            for a in arrays
-        )
-        found = tensors_for(model, *model.linearize(*flat))
-        mean, A, B, covariance = (
-            part.reshape(*batch, *part.shape[1:]) for part in found
-        )
-        return Gaussian(mean, covariance), A, B
-    method = getattr(model, "predict_with_jacobian", None)
-    return (
-        predict_by_autograd(model, state, input)
-        if method is None
-        else method(state, input)
+    k = value.shape[-1]
+    zeros = [leaf.new_zeros(k, *leaf.shape) for leaf in leaves]
+    if not value.requires_grad:  # a constant
+        return zeros
+    eye = torch.eye(k, dtype=value.dtype, device=value.device)
+    directions = eye.reshape(k, *[1] * (value.dim() - 1), k).expand(k, *value.shape)
+    gradients = partial(
+        torch.autograd.grad,
+        value,
+        leaves,
+        create_graph=create_graph,
+        retain_graph=True,
+        allow_unused=True,
     )
+    try:
+        columns = gradients(directions, is_grads_batched=True)
+    except RuntimeError:  # torch cannot vectorise the derivative of some operation
+        rows = [gradients(direction) for direction in directions]
+        columns = [
+            None if column[0] is None else torch.stack(column)
+            for column in zip(*rows, strict=True)
+        ]
+    return [
+        zero if column is None else column
+        for zero, column in zip(zeros, columns, strict=True)
+    ]
 
 
-def predict_by_autograd(
-    model: Any, state: Tensor, input: Tensor
-) -> tuple[Gaussian, Tensor, Tensor]:
-    """``predict_with_jacobian`` by torch autograd, for any model that has ``predict``."""
+class Expansion(NamedTuple):
+    """A prediction, with the derivatives of its mean."""
+
+    belief: Gaussian  # mean (*batch, k), covariance (*batch, k, k)
+    A: Tensor  # by the state (*batch, k, n)
+    B: Tensor  # by the input (*batch, k, m)
+
+
+def predict_with_jacobian(model: Any, state: Tensor, input: Tensor) -> Expansion:
+    """Predicts, with the derivatives of the mean.
+
+    By the model's ``linearize`` where torch follows nothing; else by its own method of
+    this name, which torch can differentiate and transform further, or by autograd.
+
+    Args:
+        model: Has ``predict``.
+        state: (*batch, n).
+        input: (*batch, m).
+    """
+    arrays = constant_arrays(state, input)
+    if arrays is not None and hasattr(model, "linearize"):
+        check_query(model, state, input)
+        return _linearize_batch(model, arrays, state.shape[:-1])
+    method = getattr(model, "predict_with_jacobian", None)
+    if method is None:
+        return predict_by_autograd(model, state, input)
+    belief, A, B = method(state, input)
+    return Expansion(belief, A, B)
+
+
+def _linearize_batch(
+    model: Any, arrays: Sequence[np.ndarray], batch: torch.Size
+) -> Expansion:
+    """Linearises a model at states and inputs of any batch."""
+    count = batch.numel()
+    points = [
+        np.ascontiguousarray(array, dtype=np.float64).reshape(count, array.shape[-1])
+        for array in arrays
+    ]
+    mean, A, B, covariance = [
+        tensor.reshape(*batch, *tensor.shape[1:])
+        for tensor in tensors_for(model, *model.linearize(*points))
+    ]
+    return Expansion(Gaussian(mean, covariance), A, B)
+
+
+def predict_by_autograd(model: Any, state: Tensor, input: Tensor) -> Expansion:
+    """Predicts, with the derivatives of the mean, by torch autograd.
+
+    Args:
+        model: Any that has ``predict``.
+        state: (*batch, n).
+        input: (*batch, m).
+    """
 
     def prediction(x: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
         belief = call("model", model.predict, x, u)
         return belief.mean, belief.covariance
 
     (mean, covariance), (A, B) = batched_jacobian(prediction, (state, input))
-    return Gaussian(mean, covariance), A, B
+    return Expansion(Gaussian(mean, covariance), A, B)
 
 
 def check_next_states(model: Any) -> tuple[int, int]:
-    """The numbers of states and inputs of a model that predicts next states; of others a ``SettingError``."""
+    """Returns the numbers of states and inputs of a model of next states.
+
+    Raises:
+        SettingError: It predicts something else, or is no model.
+    """
     if not hasattr(model, "predict"):
-        raise SettingError(
-            "model",
-            f"must be a DynamicsModel, such as GPPosterior; got {type(model).__name__}",
-        )
+        got = type(model).__name__
+        rule = "must be a DynamicsModel, such as GPPosterior"
+        raise SettingError("model", f"{rule}; got {got}")
     if model.output_dim != model.state_dim:
         got = f"{model.state_dim} states and {model.output_dim} outputs"
         raise SettingError("model", f"must predict the next state; got {got}")
@@ -247,34 +319,39 @@ def check_next_states(model: Any) -> tuple[int, int]:
 
 
 def check_query(model: Any, state: Tensor, input: Tensor) -> None:
-    """Raises unless a state (*batch, n) and an input (*batch, m) are tensors of a model's shape, type and device."""
+    """Checks that a model can predict at a state and an input.
+
+    Raises:
+        ShapeError: They are not (*batch, n) and (*batch, m).
+        SettingError: They are no tensors, or of another type or device.
+    """
     check_tensors(state=state, input=input)
     n = model.state_dim
     m = model.input_dim
     if state.shape[-1:] != (n,) or input.shape != (*state.shape[:-1], m):
+        rule = f"the model takes a state (*batch, {n}) and an input (*batch, {m})"
         got = f"{tuple(state.shape)} and {tuple(input.shape)}"
-        raise ShapeError(
-            f"the model takes a state (*batch, {n}) and an input (*batch, {m}); got {got}"
-        )
+        raise ShapeError(f"{rule}; got {got}")
     for name, value in (("state", state), ("input", input)):
         if value.dtype != model.dtype or value.device != model.device:
+            rule = f"must be {model.dtype} on {model.device} like the model"
             got = f"{value.dtype} on {value.device}"
-            raise SettingError(
-                name,
-                f"must be {model.dtype} on {model.device} like the model; got {got}",
-            )
+            raise SettingError(name, f"{rule}; got {got}")
 
 
 def check_destination(device: Any, dtype: Any) -> None:
-    """Raises unless torch finds the device, and the type is float32 or float64; None stays where it is."""
+    """Checks that a model can move to a device and a type; None stays as it is.
+
+    Raises:
+        SettingError: torch does not find the device, or the type is neither float32 nor
+            float64.
+    """
     try:
         torch.empty(0, device=device)
     except (AssertionError, RuntimeError, TypeError) as error:
         reason = str(error).partition("\n")[0]
-        raise SettingError(
-            "device", f"must be one that torch finds here; got {device!r} ({reason})"
-        ) from error
+        rule = "must be one that torch finds here"
+        raise SettingError("device", f"{rule}; got {device!r} ({reason})") from error
     if dtype not in (None, torch.float32, torch.float64):
-        raise SettingError(
-            "dtype", f"must be torch.float32 or torch.float64; got {dtype!r}"
-        )
+        rule = "must be torch.float32 or torch.float64"
+        raise SettingError("dtype", f"{rule}; got {dtype!r}")

@@ -1,10 +1,10 @@
 """Fits the parameters of a model of a log by the errors of its rollouts.
 
-A parameter that is right one step ahead on noisy, smoothed or mistimed rows may be wrong
-fifty steps ahead. Here the residuals of the least squares are the errors of the rollouts
-themselves, as one batch of windows, each divided by the mean error of a state that does
-not move (multiple-step prediction error; Ljung, 1999, section 3.3), with a loss that is
-linear for outliers.
+A parameter that is right one step ahead on noisy, smoothed or mistimed rows may be
+wrong fifty steps ahead. Here the residuals of the least squares are the errors of the
+rollouts themselves, as one batch of windows, each divided by the mean error of a state
+that does not move (multiple-step prediction error; Ljung, 1999, section 3.3), with a
+loss that is linear for outliers.
 """
 
 from dataclasses import dataclass, replace
@@ -54,8 +54,8 @@ def fit_nominal(
 
     Args:
         model: Structure, lag and history; its own parameters do not matter.
-        theta0: Parameters at which the search begins (P,); the nominal model's ``start``
-            by default.
+        theta0: Parameters at which the search begins (P,); by default the nominal
+            model's ``start``.
         log: All of its runs are used.
         steps: Of the rollouts; errors at eight of them, evenly spread over the
             logarithm, count.

@@ -1,10 +1,10 @@
-"""Judges what was learned on runs that it never saw, beside baselines that cost nothing.
+"""Judges learned models on runs that they never saw, beside baselines.
 
 For each group of states and 1, 10 and 50 steps ahead: mean and root mean squared error
-(Euclidean, of attitudes geodesic), how often 95 % intervals hold, with the exact interval
-of that frequency (Clopper and Pearson, 1934), and how wide they are: the root mean
-variance that is claimed over the root mean squared error. Coverage alone is cheap; a
-width of one is honest.
+(Euclidean, of attitudes geodesic), how often 95 % intervals hold, with the exact
+interval of that frequency (Clopper and Pearson, 1934), and how wide they are: the root
+mean variance that is claimed over the root mean squared error. Coverage alone is cheap;
+a width of one is honest.
 """
 
 from collections.abc import Callable, Sequence
@@ -53,7 +53,7 @@ class Judgement:
 
     @property
     def losses(self) -> tuple[str, ...]:
-        """Sentences on where the model is worse than a baseline; none if it never is."""
+        """Sentences on the errors that are larger than those of a baseline."""
         model_errors = self.mean[MODEL]
         losses = []
         for name, errors in self.mean.items():

@@ -1,9 +1,9 @@
 """Learns a model from a log: its structure, its parameters, its GPs and its noise.
 
-Nominal models of growing size are fitted on rollouts and compared on runs that they were
-not fitted to. Then a GP on each group of outputs, with targets averaged over 1, 5 or 10
-rows, stays only where the rollouts of held-out runs get better. The noise comes from
-those rollouts as well.
+Nominal models of growing size are fitted on rollouts and compared on runs that they
+were not fitted to. Then a GP on each group of outputs, with targets averaged over 1, 5
+or 10 rows, stays only where the rollouts of held-out runs get better. The noise comes
+from those rollouts as well.
 """
 
 from collections.abc import Callable, MutableMapping, Sequence
@@ -78,8 +78,8 @@ def learn(
         steps: Of the rollouts.
         seed: Of every random number.
         progress: Called with a line at each stage.
-        memory: Holds results of the stages, as plain data: those of an earlier call with
-            equal arguments are not computed again.
+        memory: Holds results of the stages, as plain data: those of an earlier call
+            with equal arguments are not computed again.
         for_control: Leaves out what predicts such runs and no controller can plan with:
             the feedback of the controller that flew, and inputs that act late.
 

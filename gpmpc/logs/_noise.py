@@ -4,9 +4,9 @@ To first order the error of a rollout after k steps is the sum of the responses 
 noise of every output at every step and to the error of the measured start. So its
 variance is linear in the variances of the sources, here for each output white noise and
 first-order autoregressions with a few time constants, and for each measured entry white
-measurement noise. Non-negative least squares on the mean squared errors at several steps
-find the variances. Errors one step ahead alone, on filtered rows, would understate them
-many times.
+measurement noise. Non-negative least squares on the mean squared errors at several
+steps find the variances. Errors one step ahead alone, on filtered rows, would
+understate them many times.
 """
 
 import itertools
@@ -53,10 +53,11 @@ def follow_errors(
     """Scales claimed variances by the errors of earlier predictions of the same run.
 
     A run may be calmer or rougher than those that the noise was fitted to. For each
-    entry of the state and each step the scale is the mean of squared errors over claimed
-    variances of the predictions that were over before, weighted by exp(-age / (6 T)),
-    with a one of the weight T added, and T the time of the longest prediction (adaptive
-    conformal inference by variances instead of quantiles; Gibbs and Candes, 2021).
+    entry of the state and each step the scale is the mean of squared errors over
+    claimed variances of the predictions that were over before, weighted by exp(-age /
+    (6 T)), with a one of the weight T added, and T the time of the longest prediction
+    (adaptive conformal inference by variances instead of quantiles; Gibbs and Candes,
+    2021).
 
     Args:
         windows: W of them.

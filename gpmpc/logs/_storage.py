@@ -116,7 +116,7 @@ class SavedModel:
     signals: Signals = UNKNOWN  #: names and time step, where the file has them
 
     def check(self, system: System) -> None:
-        """Raises ``SettingError`` unless states, inputs and time step are a system's."""
+        """Raises ``SettingError`` unless signals and time step are a system's."""
         model = self.model
         signals = self.signals
         self._check_size("states", model.state_dim, signals.state_names, system)

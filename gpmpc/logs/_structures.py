@@ -80,7 +80,7 @@ class Structure:
         return replace(self, model=model, additions=(*self.additions, addition))
 
     def with_gp(self, gp: GroupGP) -> "Structure":
-        """Returns the structure with a GP on a group, in the place of an earlier one."""
+        """Returns the structure with a GP on a group; it replaces an earlier one."""
         others = [other for other in self.gps if other.group != gp.group]
         return replace(self, gps=(*others, gp))
 

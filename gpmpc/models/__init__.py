@@ -7,9 +7,10 @@ All models with a GP are one family: a nominal model, and GPs on what it leaves,
 They differ in what y is. Of a ``ResidualModel`` it is the next state itself, and
 derivatives are exact. Of a ``LogModel``, made for measured flights, it is outputs such
 as accelerations, which kinematics turn into a movement; ``LogDynamics`` makes a
-``DynamicsModel`` of it. All are rolled out by the recursion of ``_roll_out``, and stored
-by ``save_model`` and ``load_model``. Wrappers around any of them are linear but for the
-model inside: a delay, disturbances as states; or they add noise.
+``DynamicsModel`` of it. All are rolled out by the recursion ``iterate`` of
+``_roll_out`` (or its compiled form), and read by ``load_model``. Wrappers around any of
+them are linear but for the model inside: a delay, disturbances as states; or they add
+noise.
 
 A new structure has one of these places:
 

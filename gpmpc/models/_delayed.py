@@ -30,12 +30,12 @@ class DelayedModel(LinearWrapper):
         x[k+1] = f(x[k], w u_{k-D} + (1 - w) u_{k-D+1}),
 
     and the other inputs move on by a place. A controller plans with it, or, with fewer
-    states, with the undelayed model from the state to which the pending inputs will have
-    led (``ahead``; the prediction of Smith, 1957, in state space).
+    states, with the undelayed model from the state to which the pending inputs will
+    have led (``ahead``; the prediction of Smith, 1957, in state space).
 
     Raises:
-        SettingError: The delay is no positive number, or the model does not predict next
-            states.
+        SettingError: The delay is no positive number, or the model does not predict
+            next states.
     """
 
     model: DynamicsModel  #: without the delay, of n states and m inputs
@@ -76,9 +76,9 @@ class DelayedModel(LinearWrapper):
 
     @cached_property
     def linear_part(self) -> LinearPart:
-        """The matrices Z, W, L and M.
+        """Matrices by which a mean of the two oldest inputs acts.
 
-        A mean of the two oldest inputs acts, and the others move on by a place.
+        The others move on by a place.
         """
         n = self.model.state_dim
         m = self.input_dim

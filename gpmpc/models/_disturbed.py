@@ -25,8 +25,8 @@ class DisturbedModel(LinearWrapper):
         d[k+1] = Phi d[k] + w[k],     w[k] ~ N(0, diag(q)^2)
 
     A disturbance is what the model does not explain. With Phi = I it is constant until
-    something says otherwise (a random walk), as for a changed mass; with |Phi| < 1 it is
-    an AR(1) process that fades, as wind does. Predicted with the state it leaves no
+    something says otherwise (a random walk), as for a changed mass; with |Phi| < 1 it
+    is an AR(1) process that fades, as wind does. Predicted with the state it leaves no
     offset from a reference (Pannocchia and Rawlings, 2003), and its uncertainty is part
     of the tube. For a rigid body, columns of E of the velocities are a force over the
     mass, those of the rates a torque.
@@ -77,7 +77,7 @@ class DisturbedModel(LinearWrapper):
 
     @cached_property
     def linear_part(self) -> LinearPart:
-        """The matrices Z, W, L and M: E d is added to f(x, u), and d moves on by Phi."""
+        """Matrices by which E d is added to f(x, u), and d moves on by Phi."""
         n = self.model.state_dim
         k = self.state_dim
         m = self.input_dim

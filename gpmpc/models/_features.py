@@ -80,7 +80,7 @@ class Features:
             input: (*batch, m).
 
         Returns:
-            The features of the state (*batch, d), and the selected inputs (*batch, m_s).
+            The features (*batch, d), and the selected inputs (*batch, m_s).
         """
         selected_inputs = input[..., list(self.inputs)]
         features = state[..., self.columns.tolist()]
@@ -103,8 +103,8 @@ class Features:
             inputs: (K, m).
 
         Returns:
-            The features (K, d), the selected inputs (K, m_s), and the derivative of each
-            feature by its state (K, d); None where all of these are one.
+            The features (K, d), the selected inputs (K, m_s), and the derivative of
+            each feature by its state (K, d); None where all of these are one.
         """
         features = states[:, self.columns]
         selected_inputs = inputs[:, self._input_columns]
@@ -142,7 +142,7 @@ class Features:
 
 
 def _check_indices(key: str, indices: Sequence[int], count: int) -> None:
-    """Raises ``SettingError`` unless indices are different numbers from 0 to count - 1."""
+    """Raises ``SettingError`` unless indices are different, from 0 to count - 1."""
     are_integers = all(isinstance(i, int) and not isinstance(i, bool) for i in indices)
     if are_integers:
         in_range = all(0 <= i < count for i in indices)

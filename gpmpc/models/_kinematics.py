@@ -26,7 +26,7 @@ GRAVITY = np.array([0.0, 0.0, -9.80665])  # [m/s2], world
 
 @dataclass(frozen=True)
 class Increments:
-    """Kinematics whose outputs are the rates of change of every state, of any system."""
+    """Kinematics of any system, whose outputs are the rates of change of its state."""
 
     space: StateSpace
 
@@ -84,7 +84,7 @@ class Increments:
         return (*names, *inputs, *context)
 
     def coast(self, states: Array, time: float) -> Array:
-        """Returns the states unchanged: it is not known which of them are velocities."""
+        """Returns the states unchanged: which of them are velocities is not known."""
         return states
 
 

@@ -45,7 +45,7 @@ class NoisyModel(Wrapper):
 
     model: DynamicsModel  #: f, of n states and m inputs
     log_noise: GPPosterior  #: g, over (x, u), with ``predicts="value"``: an output each
-    #: the states whose noise g describes, in its order; the others keep that of the model
+    #: the states whose noise g describes, in its order; others keep that of the model
     outputs: Sequence[int]
 
     to = move

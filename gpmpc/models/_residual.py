@@ -71,13 +71,13 @@ class ResidualModel(TensorModel):
     nominal: Nominal
     residual: GPPosterior  #: d, with ``predicts="value"``
     #: effect of d (n, k), or a function of the state (*batch, n) that gives it
-    #: (*batch, n, k), in torch or by ``CasadiFunction``; (*batch, n) will do where k = 1
+    #: (*batch, n, k), in torch or by ``CasadiFunction``; (*batch, n) will do for k = 1
     B: Effect
     states: Sequence[int]  #: the states that d depends on, in its order
     inputs: Sequence[int]  #: the inputs that d depends on, in its order
     input_dim: int  #: m, all of them
-    #: those of ``states`` that are angles [rad]: d sees them as (sine, cosine), at their
-    #: place, and their differences are taken within half a turn
+    #: those of ``states`` that are angles [rad]: d sees them as (sine, cosine), at
+    #: their place, and their differences are taken within half a turn
     angles: Sequence[int] = ()
     #: covariance of the observations (n, n); by default that of d's, B diag(sn2) B',
     #: which needs a constant B

@@ -1,4 +1,4 @@
-"""Data of a residual GP: the error of a nominal model, as far as an effect B reaches it."""
+"""Data of a residual GP: the error of a nominal model, as far as B reaches it."""
 
 from collections.abc import Callable, Sequence
 from contextlib import suppress

@@ -105,7 +105,7 @@ class StateSpace:
         return np.concatenate(parts, axis=-1)
 
     def displace(self, state: Array, error: Array) -> Array:
-        """Computes the state (..., n) that differs from ``state`` by ``error`` (..., e)."""
+        """Computes the state (..., n) that lies an error (..., e) off another."""
         parts = []
         columns = zip(self.columns, self.error_columns, strict=True)
         for group, (state_columns, error_columns) in zip(

@@ -34,8 +34,9 @@ from gpmpc.models._older_files import CASADI_BY_NAME, casadi_function_by_name
 OPERATIONS = "operations"
 CODE_KINDS = ("function", "partial", "dataclass", CASADI_BY_NAME)
 _RULE = (
-    "It can be saved as a function of a module, a functools.partial of one with keyword "
-    "arguments, a dataclass of numbers with __call__, or a CasadiFunction of expressions"
+    "It can be saved as a function of a module, a functools.partial of one with "
+    "keyword arguments, a dataclass of numbers with __call__, or a CasadiFunction of "
+    "expressions"
 )
 
 

@@ -55,7 +55,7 @@ class Wrapper(TensorModel):
 
     @property
     def signals(self) -> Signals:
-        """Names and time step, where the model knows them; further states have names."""
+        """Names and time step, where the model knows them, with further states."""
         inner = signals_of(self.model)
         further_names = self._further_names
         if not further_names or not inner.state_names:
