@@ -1,24 +1,28 @@
-"""The dual active-set method: which constraints hold with equality at the minimum of a strictly convex QP?
+"""The dual active-set method of Goldfarb and Idnani (Math. Programming 27, 1983).
 
-For a working set W the minimiser over ``c_p'x = b_p, p in W`` is x = x_u - P^-1 C_W' mu with K_WW mu = y_W - b_W, where
-x_u is the unconstrained minimiser, y = C x_u and K = C P^-1 C'. The method of Goldfarb and Idnani (Math. Programming
-27, 1983, algorithm 1) keeps every multiplier in its range and moves to the most violated constraint p until none is
-violated. A multiplier at its cap, the price of a soft row, leaves with a constraint that stays violated; then mu_p is
-not zero outside the working set.
+Which constraints hold with equality at the minimum of a strictly convex QP? For a working
+set W the minimiser over ``c_p'x = b_p, p in W`` is
 
-The functions take a ``Workspace`` and the number k of its working constraints; those that change k return it.
+    x = x_u - P^-1 C_W' mu   with   K_WW mu = y_W - b_W
+
+where x_u is the unconstrained minimiser, y = C x_u and K = C P^-1 C'. The method keeps
+every multiplier in its range and moves to the most violated constraint p until none is
+violated (algorithm 1). A multiplier at its cap, the price of a soft row, leaves with a
+constraint that stays violated; then mu_p is not zero outside the working set.
+
+The functions take a workspace (``gpmpc.qp._workspace``) and the number k of its working
+constraints; those that change k return it.
 """
+
+from typing import NamedTuple
 
 import numpy as np
 
 from gpmpc._compiled import inline_njit
-from gpmpc._kernels._simd import load, load_some, store, zeros
+from gpmpc._kernels._simd import load, load_some, store
 from gpmpc._kernels.linalg import dot, multiply
 from gpmpc.qp._record import INFEASIBLE, ITERATION_LIMIT, SOLVED
 from gpmpc.qp._triangular import (
-    append_row,
-    delete_row,
-    multiply_rows,
     multiply_to_ends,
     scale,
     solve_lower,
@@ -26,221 +30,190 @@ from gpmpc.qp._triangular import (
     subtract_rows,
 )
 from gpmpc.qp._violations import (
-    choose_bad,
+    choose_badly_violated,
     ignore_violations,
-    keep_violated,
     list_violated,
     most_violated,
+    recheck_violated,
     restore_limits,
 )
-from gpmpc.qp._workspace import (
-    ALLOWED_HIGH,
-    ALLOWED_LOW,
-    BOUND,
-    CANDIDATES,
-    CAP,
-    COSINES,
-    DIAGONAL,
-    END,
-    EXCESS,
-    FREE_VALUE,
-    LEAST,
-    LOWER,
-    MOST,
-    MU,
-    NAME,
-    NEGLIGIBLE,
-    PLACE,
-    SCALE,
-    SCRATCH,
-    SINES,
-    SLOPE,
-    SOLVED_K,
-    UPPER,
-    R,
-    V,
-    Y,
+from gpmpc.qp._working_set import (
+    add_candidates,
+    add_constraint,
+    compute_factor_row,
+    constraint_in,
+    distance_to_span,
+    drop_constraint,
+    write_slot,
 )
 
-NONE = 1e-26  # share of the length of q below which x, and a violation of a bound of zero, is none
-_GUESSED_PIVOT = 1e-9  # share of K_pp: a guessed constraint that depends on the others by more is left out
-_DEPENDENT = (
-    1e-12  # d below this share of K_pp: the constraint depends on the working ones
-)
-_DOUBTFUL = 1e-4  # d below this share of K_pp is computed again without cancellation
-_ROUNDING = (
-    1e-15  # share of the bounds of a contradiction by which it may be their rounding
-)
-_HOPELESS = (
-    1e-7  # violation of a dependent constraint that is taken for a contradiction
-)
-_BATCHES = 4  # times that all badly violated constraints enter at once
-_BAD = 0.5  # those violated by more than this share of the worst
+# x, and a violation of a bound of zero, is none below this share of the length of q.
+NONE = 1e-26
+# Times that all badly violated constraints enter at once, and which are: those violated
+# by more than this share of the worst.
+BATCHES = 4
+_BADLY = 0.5
+# d below this share of K_pp: the constraint depends on the working ones.
+_DEPENDENT = 1e-12
+# d below this share of K_pp is computed again without cancellation.
+_DOUBTFUL = 1e-4
+# A contradiction may be the rounding of its bounds up to this share of them.
+_ROUNDING = 1e-15
+# A dependent constraint that is violated by more is taken for a contradiction.
+_HOPELESS = 1e-7
+
+
+class Progress(NamedTuple):
+    """The state in which the iteration ends."""
+
+    status: int  # ``SOLVED``, ``INFEASIBLE`` or ``ITERATION_LIMIT``
+    size: int  # of the working set
+    iterations: int
+    batches: int
+    violated: bool  # whether any constraint was
+    passed_over: bool  # whether one contradicts others by what may be rounding
 
 
 @inline_njit
 def iterate(work, k, count, margin, iterations, batches):
-    """Changes the working set until no constraint is violated by more than ``margin``, in units of ``SCALE``.
+    """Adds and drops constraints until none is violated by more than ``margin``.
 
-    ``count`` are, and listed; ``-1 - g`` says that y is not known yet and that g guessed candidates enter first.
-
-    Returns:
-        ``SOLVED``, ``INFEASIBLE`` or ``ITERATION_LIMIT``, the size of the working set, iterations and batches so far,
-        whether a constraint was passed over because it contradicts others by what may be rounding, and whether any was
-        violated.
+    ``count`` constraints are, and listed; their excess and the margin are in units of
+    ``norm``. ``iterations`` are the changes of the working set so far, ``batches`` the
+    times that several constraints entered at once.
     """
-    vectors = work.vectors
-    indices = work.indices
-    n = len(work.q)
-    M = n + len(work.G)
-    p = 0
-    chosen = -1 - count
-    begins = count < 0
-    violated = False
-    passed = False
-    complete = True  # whether y and the list are those of all constraints
-    while count != 0:
-        if not begins:
-            if iterations >= work.limit:
-                return ITERATION_LIMIT, k, iterations, batches, passed, True
-            p = most_violated(vectors, indices, count)
-            chosen = 0
-            violated = True
-            if complete and batches < _BATCHES:
-                chosen = choose_bad(
-                    vectors, indices, _BAD * vectors[EXCESS, p], count, n - k
-                )
-                batches += chosen > 0
-        before = k
-        k = add_constraints(work, k, chosen)
-        if not begins:
-            iterations += k - before
-        several = unsettled = begins or k > before
-        if not several:
-            mu_p = vectors[MU, p]
+    violated = count > 0
+    passed_over = False
+    all_listed = True
+    while count > 0:
+        if iterations >= work.limit:
+            return Progress(ITERATION_LIMIT, k, iterations, batches, True, passed_over)
+
+        p = most_violated(work, count)
+        candidates = 0
+        if all_listed and batches < BATCHES:
+            threshold = _BADLY * work.excess[p]
+            candidates = choose_badly_violated(work, threshold, count, work.n - k)
+            batches += candidates > 0
+        size_before = k
+        k = add_candidates(work, k, candidates)
+        several_entered = k > size_before
+        iterations += k - size_before
+
+        multipliers_fit = not several_entered
+        if not several_entered:
+            multiplier_before = work.multiplier[p]
             satisfied, k, changes = _satisfy_constraint(work, k, p)
             iterations += changes
             if not satisfied:
-                size = max(abs(vectors[Y, p]), vectors[NEGLIGIBLE, p] / NONE)
-                if vectors[EXCESS, p] * vectors[SCALE, p] > _HOPELESS * size:
+                if _is_contradiction(work, p):
                     _write_ray(work, k, p)
-                    return INFEASIBLE, k, iterations, batches, passed, True
+                    return Progress(
+                        INFEASIBLE, k, iterations, batches, True, passed_over
+                    )
                 # what it gained on the way belongs to no working set
-                vectors[MU, p] = mu_p
-                passed = True
-                ignore_violations(vectors, p)
-                unsettled = not work.soft  # else refinement has to do
-            if work.soft:
-                batches = _BATCHES  # caps may have changed x_u
-        if unsettled:
-            k = _drop_wrong_multipliers(work, k)
-        _minimise(work, k)
-        complete = several or work.soft or count == 1 or iterations >= work.limit
-        if (
-            not complete
-        ):  # first satisfy those that were seen to be violated, then look at all
-            count = keep_violated(work, margin, count)
-            complete = count == 0
-        if complete:
+                work.multiplier[p] = multiplier_before
+                ignore_violations(work, p)
+                passed_over = True
+                multipliers_fit = work.soft != 0.0  # where refinement has to do
+            if work.soft != 0.0:
+                batches = BATCHES  # caps may have changed x_u
+        if not multipliers_fit:
+            k = drop_wrong_multipliers(work, k)
+        minimise(work, k)
+
+        # first satisfy those that were seen to be violated, then look at all
+        one_listed = count == 1 or work.soft != 0.0 or iterations >= work.limit
+        all_listed = several_entered or one_listed
+        if not all_listed:
+            count = recheck_violated(work, margin, count)
+            all_listed = count == 0
+        if all_listed:
             multiply_constraints(work)
-            count = list_violated(vectors, indices, M, margin)
-        begins = False
+            count = list_violated(work, margin)
     if violated:
-        for i in range(k):  # rounding can take multipliers out of their ranges
-            p = abs(indices[NAME, i]) - 1
-            vectors[MU, p] = min(
-                max(vectors[MU, p], vectors[LEAST, i]), vectors[MOST, i]
-            )
-    return SOLVED, k, iterations, batches, passed, violated
+        _clip_multipliers(work, k)
+    return Progress(SOLVED, k, iterations, batches, violated, passed_over)
 
 
 @inline_njit
 def _satisfy_constraint(work, k, p):
-    """Moves multipliers until constraint p is satisfied: steps 1 and 2 of Goldfarb and Idnani's algorithm.
+    """Moves multipliers until constraint p is satisfied: steps 1 and 2 of algorithm 1.
 
     Returns:
-        False if it contradicts the working ones, the size of the working set, and how many entered or left.
+        False if it contradicts the working ones, the size of the working set, and how
+        many constraints entered or left.
     """
-    vectors = work.vectors
-    names = work.indices[NAME]
-    factor = work.factor
+    mu = work.multiplier
+    r = work.direction
+    upper_bound_works = mu[p] > 0.0 or (mu[p] == 0.0 and work.value[p] > work.upper[p])
+    # the direction of mu_p, which comes back from a cap
+    sense = 1.0 if upper_bound_works == (mu[p] == 0.0) else -1.0
+    write_slot(work, k, p, upper_bound_works)
+    compute_factor_row(work, k, p)
+    violation = (work.value[p] - work.bound[k]) * sense
+    K_pp = work.diagonal[k]
     changes = 0
-    mu = vectors[MU]
-    r = vectors[R]
-    solved = vectors[SOLVED_K]
-    least = vectors[LEAST]
-    most = vectors[MOST]
-    above = mu[p] > 0.0 or (mu[p] == 0.0 and vectors[Y, p] > vectors[UPPER, p])
-    sense = (
-        1.0 if above == (mu[p] == 0.0) else -1.0
-    )  # the direction of mu_p, which comes back from a cap
-    _write_slot(work, k, p, above)
-    _solve_slot(work, k, p)
-    violation = (vectors[Y, p] - vectors[BOUND, k]) * sense
-    K_pp = vectors[DIAGONAL, k]
     while True:
-        # step direction:  r = K_WW^-1 K_Wp,  d = K_pp - K_pW r;  mu_p moves by t, mu_W by -t r and y_p by -t d
-        scale(1.0, solved, r, k)
-        solve_transposed(factor, k, r)
-        d = K_pp - dot(solved, solved, k)
+        # step direction: r = K_WW^-1 K_Wp and d = K_pp - K_pW r; then mu_p moves by t,
+        # mu_W by -t r and y_p by -t d
+        scale(1.0, work.forward, r, k)
+        solve_transposed(work.factor, k, r)
+        d = K_pp - dot(work.forward, work.forward, k)
         if d < _DOUBTFUL * K_pp:
-            d = _distance_to_span(work, k)
-        # ratio test:  t = min(t1, t2);  t2 = violation / d makes p hold,  t1 takes a multiplier to the end of its range
-        step = (
-            max(0.0, violation) / d
-            if d > _DEPENDENT * K_pp and k < len(work.q)
-            else np.inf
-        )
-        room = most[k] - mu[p] if sense > 0.0 else mu[p] - least[k]
+            d = distance_to_span(work, k)
+
+        # step length: t2 = violation / d makes p hold, at ``room`` its multiplier
+        # reaches its cap, at t1 a working one reaches the end of its range
+        independent = d > _DEPENDENT * K_pp and k < work.n
+        step = max(0.0, violation) / d if independent else np.inf
+        end = work.most_multiplier[k] if sense > 0.0 else work.least_multiplier[k]
+        room = (end - mu[p]) * sense
         capped = room < step
-        step, blocking = _first_blocking(
-            vectors, names, k, sense, room if capped else step
-        )
-        if (
-            step == np.inf
-        ):  # no step ends: (r, -1) is Farkas' proof, unless rounding made the violation
+        if capped:
+            step = room
+        step, blocking = _first_blocking(work, k, sense, step)
+        if step == np.inf:  # (r, -1) is Farkas' proof, unless rounding violates p
             for i in range(k):
-                vectors[NEGLIGIBLE, p] += _ROUNDING * abs(r[i] * vectors[BOUND, i])
+                work.negligible[p] += _ROUNDING * abs(r[i] * work.bound[i])
             return False, k, changes
+
         # take the step
         for i in range(k):
-            mu[abs(names[i]) - 1] -= sense * step * r[i]
+            mu[constraint_in(work, i)] -= sense * step * r[i]
         mu[p] += sense * step
         changes += 1
-        if (
-            blocking < k
-        ):  # partial step: the blocking constraint leaves, and p is tried again
-            leaving = abs(names[blocking]) - 1
-            mu[leaving] = (
-                least[blocking] if sense * r[blocking] > 0.0 else most[blocking]
-            )
-            _drop_constraint(work, k, blocking)
+        if blocking < k:  # partial step: drop what blocks, and try p again
+            leaving = constraint_in(work, blocking)
+            mu[leaving] = _end_of_range(work, blocking, sense * r[blocking])
+            drop_constraint(work, k, blocking)
             k -= 1
-            restore_limits(vectors, leaving)
+            restore_limits(work, leaving)
             violation -= step * d
         elif capped:  # a soft row that stays violated
-            mu[p] = most[k] if sense > 0.0 else least[k]
-            restore_limits(vectors, p)
+            mu[p] = end
+            restore_limits(work, p)
             return True, k, changes
-        else:  # full step: p enters
-            append_row(factor, k, solved, d)
-            ignore_violations(vectors, p)
-            return True, k + 1, changes
+        else:  # full step: add p
+            return True, add_constraint(work, k, p, d), changes
 
 
 @inline_njit
-def _first_blocking(vectors, names, k, sense, step):
-    """Returns the longest step up to ``step`` that keeps the multipliers in range, and the slot that ends it (or k)."""
-    r = vectors[R]
-    size = 0.0
+def _first_blocking(work, k, sense, step):
+    """Returns the longest step that keeps the multipliers in range, and what ends it.
+
+    That is a slot, or k where ``step`` is not too long for any.
+    """
+    r = work.direction
+    largest = 0.0
     for i in range(k):
-        size = max(size, abs(r[i]))
+        largest = max(largest, abs(r[i]))
     blocking = k
     for i in range(k):
         rate = sense * r[i]
-        if abs(rate) > 1e-12 * size:
-            end = vectors[LEAST, i] if rate > 0.0 else vectors[MOST, i]
-            room = (vectors[MU, abs(names[i]) - 1] - end) / rate
+        if abs(rate) > 1e-12 * largest:
+            end = _end_of_range(work, i, rate)
+            room = (work.multiplier[constraint_in(work, i)] - end) / rate
             if room < step:
                 step = max(room, 0.0)
                 blocking = i
@@ -248,219 +221,123 @@ def _first_blocking(vectors, names, k, sense, step):
 
 
 @inline_njit
-def _distance_to_span(work, k):
-    """Returns ``d = |w_p - sum r_i w_i|^2``, p in slot k, as a sum of squares, which cannot cancel."""
-    rest = work.vectors[SCRATCH]
-    row = work.rows[work.indices[PLACE, k]]
-    places = work.indices[PLACE]
-    n = len(work.q)
-    scale(1.0, row, rest, n)
-    subtract_rows(rest, work.rows, places, work.vectors[R], k, n)
-    return dot(rest, rest, n)
+def _end_of_range(work, slot, rate):
+    """Returns where the range of a multiplier ends that decreases at this rate."""
+    return work.least_multiplier[slot] if rate > 0.0 else work.most_multiplier[slot]
+
+
+@inline_njit
+def _is_contradiction(work, p):
+    """Returns whether p, which depends on others, is violated by more than rounding."""
+    size = max(abs(work.value[p]), work.negligible[p] / NONE)
+    return work.excess[p] * work.norm[p] > _HOPELESS * size
 
 
 @inline_njit
 def _write_ray(work, k, p):
-    """Writes Farkas' proof that p contradicts the working constraints to mu: ``C' ray = 0``, ``ray' bounds < 0``."""
-    vectors = work.vectors
-    names = work.indices[NAME]
-    mu = vectors[MU]
-    sense = 1.0 if vectors[Y, p] > vectors[UPPER, p] else -1.0
-    for i in range(len(mu)):
-        mu[i] = 0.0
-    for i in range(k):
-        w = abs(names[i]) - 1
-        ray = -sense * vectors[R, i]
-        if (
-            ray * names[i] >= 0.0 or vectors[LOWER, w] == vectors[UPPER, w]
-        ):  # else rounding: it cannot pull that way
-            mu[w] = ray
-    mu[p] = sense
+    """Writes Farkas' proof that p contradicts the working set to the multipliers.
 
-
-@inline_njit
-def add_constraints(work, k, count):
-    """Adds the first ``count`` candidates to the working set, but for those that depend on others; returns its size."""
-    vectors = work.vectors
-    solved = work.vectors[SOLVED_K]
-    for i in range(count):
-        name = work.indices[CANDIDATES, i]
-        p = abs(name) - 1
-        outside = (
-            vectors[ALLOWED_LOW, p] > -np.inf or vectors[ALLOWED_HIGH, p] < np.inf
-        )  # of the working set
-        if outside and k < len(work.q):
-            _write_slot(work, k, p, name > 0)
-            _solve_slot(work, k, p)
-            pivot = vectors[DIAGONAL, k] - dot(solved, solved, k)
-            if pivot > _GUESSED_PIVOT * vectors[DIAGONAL, k]:
-                append_row(work.factor, k, solved, pivot)
-                ignore_violations(vectors, p)
-                k += 1
-    return k
-
-
-@inline_njit
-def _write_slot(work, k, p, above):
-    """Writes constraint p, at its upper bound (``above``) or its lower one, to slot k."""
-    vectors = work.vectors
-    places = work.indices[PLACE]
-    n = len(work.q)
-    if work.tag != 0.0:
-        places[k] = p
-        row = work.rows[n + len(work.G) + p]
-        vectors[DIAGONAL, k] = row[p]
-    else:
-        row = work.rows[places[k]]
-        size = int(vectors[END, p])
-        if p >= n:
-            for i in range(0, n, 8):
-                store(row, i, load_some(work.G[p - n], i))
-        else:
-            for i in range(0, n, 8):
-                store(row, i, zeros())
-            row[p] = 1.0
-        solve_transposed(work.L, size, row)
-        vectors[DIAGONAL, k] = dot(row, row, size)
-    low = vectors[LOWER, p]
-    high = vectors[UPPER, p]
-    cap = vectors[CAP, p]
-    work.indices[NAME, k] = p + 1 if above else -(p + 1)
-    vectors[BOUND, k] = high if above else low
-    vectors[LEAST, k] = -cap if low == high or not above else 0.0
-    vectors[MOST, k] = cap if low == high or above else 0.0
-    vectors[FREE_VALUE, k] = dot(row, vectors[V], n)
-
-
-@inline_njit
-def _solve_slot(work, k, p):
-    """Writes L_K^-1 K_Wp for constraint p in slot k."""
-    solved = work.vectors[SOLVED_K]
-    places = work.indices[PLACE]
-    if work.tag != 0.0:
-        row = work.rows[len(work.q) + len(work.G) + p]
-        for i in range(k):
-            solved[i] = row[places[i]]
-    else:
-        multiply_rows(
-            work.rows,
-            places,
-            k,
-            work.rows[places[k]],
-            int(work.vectors[END, p]),
-            solved,
-        )
-    solve_lower(work.factor, k, solved)
-
-
-@inline_njit
-def restore_constraints(work, count, factor):
-    """Makes the candidates of a prepared program the working set, whose factor is known."""
-    at = 0
-    for i in range(count):
-        name = work.indices[CANDIDATES, i]
-        p = abs(name) - 1
-        _write_slot(work, i, p, name > 0)
-        ignore_violations(work.vectors, p)
-        scale(1.0, factor[at:], work.factor[i], i + 1)
-        at += i + 1
-
-
-@inline_njit
-def _drop_constraint(work, k, slot):
-    """Drops the constraint in a slot from the working set of k, and from ``SOLVED``; those behind move up, k too."""
-    vectors = work.vectors
-    names = work.indices[NAME]
-    places = work.indices[PLACE]
-    delete_row(
-        work.factor, k, slot, vectors[SOLVED_K], vectors[COSINES], vectors[SINES]
-    )
-    place = places[slot]
-    for i in range(slot, k):
-        names[i], places[i] = names[i + 1], places[i + 1]
-        for j in range(BOUND, DIAGONAL + 1):
-            vectors[j, i] = vectors[j, i + 1]
-    places[k] = place
-
-
-@inline_njit
-def _drop_wrong_multipliers(work, k):
-    """Solves ``K_WW mu = y_W - b_W``; drops the most wrong multiplier until all are in range. Returns the size.
-
-    Any working set is a valid start of a dual method once this is done.
+    ``C' ray = 0`` and ``ray' bounds < 0``.
     """
-    vectors = work.vectors
-    names = work.indices[NAME]
-    solved = work.vectors[SOLVED_K]
-    trial = work.vectors[R]
+    sense = 1.0 if work.value[p] > work.upper[p] else -1.0
+    for i in range(work.width):
+        work.multiplier[i] = 0.0
     for i in range(k):
-        solved[i] = vectors[FREE_VALUE, i] - vectors[BOUND, i]
-    solve_lower(work.factor, k, solved)
+        w = constraint_in(work, i)
+        ray = -sense * work.direction[i]
+        # else it is rounding: the bound cannot pull that way
+        if ray * work.label[i] >= 0.0 or work.lower[w] == work.upper[w]:
+            work.multiplier[w] = ray
+    work.multiplier[p] = sense
+
+
+@inline_njit
+def drop_wrong_multipliers(work, k):
+    """Solves K_WW mu = y_W - b_W; drops the most wrong one until all are in range.
+
+    Any working set is a valid start of a dual method once this is done. Returns the
+    size of the working set.
+    """
+    trial = work.direction
+    for i in range(k):
+        work.forward[i] = work.free_value[i] - work.bound[i]
+    solve_lower(work.factor, k, work.forward)
     while True:
-        scale(1.0, solved, trial, k)
+        scale(1.0, work.forward, trial, k)
         solve_transposed(work.factor, k, trial)
         worst = 0.0
         slot = k
         for i in range(k):
-            outside = max(trial[i] - vectors[MOST, i], vectors[LEAST, i] - trial[i])
+            above = trial[i] - work.most_multiplier[i]
+            outside = max(above, work.least_multiplier[i] - trial[i])
             if outside > worst:
                 worst = outside
                 slot = i
         if slot == k:
             break
-        p = abs(names[slot]) - 1
-        _drop_constraint(work, k, slot)
+        p = constraint_in(work, slot)
+        drop_constraint(work, k, slot)
         k -= 1
-        vectors[MU, p] = 0.0
-        restore_limits(vectors, p)
+        work.multiplier[p] = 0.0
+        restore_limits(work, p)
     for i in range(k):
-        vectors[MU, abs(names[i]) - 1] = trial[i]
+        work.multiplier[constraint_in(work, i)] = trial[i]
     return k
 
 
 @inline_njit
-def _minimise(work, k):
-    """Writes the minimiser of the Lagrangian, ``P x = -(q + C'mu)``, to the first n entries of y."""
-    n = len(work.q)
-    vectors = work.vectors
-    y = work.vectors[Y]
-    if work.soft:  # constraints at their caps have multipliers, too
+def _clip_multipliers(work, k):
+    """Puts the working multipliers into their ranges, which rounding can leave."""
+    for i in range(k):
+        p = constraint_in(work, i)
+        above_least = max(work.multiplier[p], work.least_multiplier[i])
+        work.multiplier[p] = min(above_least, work.most_multiplier[i])
+
+
+@inline_njit
+def minimise(work, k):
+    """Writes the minimiser of the Lagrangian, P x = -(q + C'mu), to ``value[:n]``."""
+    n = work.n
+    x = work.value
+    if work.soft != 0.0:  # constraints at their caps have multipliers, too
         add_multipliers(work, k)
-        scale(-1.0, vectors[SLOPE], y, n)
-        solve_transposed(work.L, n, y)
-    elif work.tag != 0.0:
+        scale(-1.0, work.slope, x, n)
+        solve_transposed(work.L, n, x)
+        solve_lower(work.L, n, x)
+    elif work.tag != 0.0:  # K = C P^-1 C' begins with P^-1
         add_multipliers(work, k)
-        scale(-1.0, vectors[SLOPE], vectors[SCRATCH], n)
-        multiply(work.rows[n + len(work.G) :], n, vectors[SCRATCH], n, y)
-        return
-    else:  # L x = v - sum mu_i w_i
-        scale(1.0, vectors[V], y, n)
+        scale(-1.0, work.slope, work.scratch, n)
+        multiply(work.K, n, work.scratch, n, x)
+    else:  # L x = free_rhs - sum mu_i w_i
+        scale(1.0, work.free_rhs, x, n)
         for i in range(k):
-            vectors[SCRATCH, i] = vectors[MU, abs(work.indices[NAME, i]) - 1]
-        subtract_rows(y, work.rows, work.indices[PLACE], vectors[SCRATCH], k, n)
-    solve_lower(work.L, n, y)
+            work.scratch[i] = work.multiplier[constraint_in(work, i)]
+        subtract_rows(x, work.rows, work.place, work.scratch, k, n)
+        solve_lower(work.L, n, x)
 
 
 @inline_njit
 def multiply_constraints(work):
-    """Writes ``y[n:] = G y[:n]``."""
-    y = work.vectors[Y]
-    n = len(work.q)
-    multiply_to_ends(work.G, work.vectors[END][n:], y, y[n:])
+    """Writes the values of the rows, G x."""
+    n = work.n
+    multiply_to_ends(work.G, work.end[n:], work.value, work.value[n:])
 
 
 @inline_njit
 def add_multipliers(work, k):
-    """Writes ``SLOPE = q + C' mu``; only where rows are soft can others than the working ones have a multiplier."""
-    n = len(work.q)
-    mu = work.vectors[MU]
-    slope = work.vectors[SLOPE]
-    for i in range(0, n, 8):
-        store(slope, i, load_some(work.q, i) + load(mu, i))
-    for i in range(len(work.G) if work.soft else k):
-        p = n + i if work.soft else abs(work.indices[NAME, i]) - 1
+    """Writes ``slope = q + C' mu``.
+
+    Only where rows are soft can others than the working ones have a multiplier.
+    """
+    n = work.n
+    mu = work.multiplier
+    slope = work.slope
+    for j in range(0, n, 8):
+        store(slope, j, load_some(work.q, j) + load(mu, j))
+    for i in range(work.m if work.soft != 0.0 else k):
+        p = n + i if work.soft != 0.0 else constraint_in(work, i)
         if p >= n and mu[p] != 0.0:
             weight = mu[p]
             row = work.G[p - n]
-            for j in range(0, int(work.vectors[END, p]), 8):
+            for j in range(0, int(work.end[p]), 8):
                 store(slope, j, load(slope, j) + weight * load_some(row, j))

@@ -1,104 +1,106 @@
-"""Which constraints are violated, by how much, and which of them enter the working set together."""
+"""The selection of constraints: which are violated, by how much, which enter next."""
 
 import numpy as np
 
 from gpmpc._compiled import inline_njit
 from gpmpc._kernels.linalg import dot
-from gpmpc.qp._workspace import (
-    ALLOWED_HIGH,
-    ALLOWED_LOW,
-    CANDIDATES,
-    END,
-    EXCESS,
-    LOWER,
-    MU,
-    NEGLIGIBLE,
-    SCALE,
-    UPPER,
-    VIOLATED,
-    Y,
-)
 
-TOLERATED = 2e-14  # a violation below this share of the bound is none, whatever the constraint's other bound is
+# A violation below this share of the bound is none, whatever the other bound is.
+TOLERATED = 2e-14
 
 
 @inline_njit
-def restore_limits(vectors, p):
+def restore_limits(work, p):
     """Lets constraint p, outside the working set, count as violated again.
 
-    With mu_p = 0 it must stay within its bounds; at a cap it must stay outside the bound that it violates.
+    With a multiplier of zero it must stay within its bounds. At a cap it must stay
+    outside the bound that it violates.
     """
-    low = vectors[LOWER, p]
-    high = vectors[UPPER, p]
-    mu = vectors[MU, p]
-    allowed_low = low - (TOLERATED * abs(low) + vectors[NEGLIGIBLE, p])
-    allowed_high = high + (TOLERATED * abs(high) + vectors[NEGLIGIBLE, p])
-    if mu > 0.0:
-        allowed_low = high - (TOLERATED * abs(high) + vectors[NEGLIGIBLE, p])
+    low = work.lower[p]
+    high = work.upper[p]
+    multiplier = work.multiplier[p]
+    allowed_low = low - (TOLERATED * abs(low) + work.negligible[p])
+    allowed_high = high + (TOLERATED * abs(high) + work.negligible[p])
+    if multiplier > 0.0:
+        allowed_low = high - (TOLERATED * abs(high) + work.negligible[p])
         allowed_high = np.inf
-    elif mu < 0.0:
+    elif multiplier < 0.0:
         allowed_low = -np.inf
-        allowed_high = low + (TOLERATED * abs(low) + vectors[NEGLIGIBLE, p])
-    vectors[ALLOWED_LOW, p] = allowed_low
-    vectors[ALLOWED_HIGH, p] = allowed_high
+        allowed_high = low + (TOLERATED * abs(low) + work.negligible[p])
+    work.allowed_low[p] = allowed_low
+    work.allowed_high[p] = allowed_high
 
 
 @inline_njit
-def ignore_violations(vectors, p):
-    """Lets constraint p count as satisfied whatever its value: it is a working one, or cannot be told from one."""
-    vectors[ALLOWED_LOW, p] = -np.inf
-    vectors[ALLOWED_HIGH, p] = np.inf
+def ignore_violations(work, p):
+    """Lets constraint p count as satisfied whatever its value.
+
+    It is in the working set, or cannot be told from one that is.
+    """
+    work.allowed_low[p] = -np.inf
+    work.allowed_high[p] = np.inf
 
 
 @inline_njit
-def list_violated(vectors, indices, M, margin):
-    """Lists the constraints violated by more than ``margin``, in units of ``SCALE``; returns how many."""
-    y = vectors[Y]
-    low = vectors[ALLOWED_LOW]
-    high = vectors[ALLOWED_HIGH]
-    scale = vectors[SCALE]
-    excess = vectors[EXCESS]
-    violated = indices[VIOLATED]
+def is_watched(work, p):
+    """Returns whether constraint p can count as violated."""
+    return work.allowed_low[p] > -np.inf or work.allowed_high[p] < np.inf
+
+
+@inline_njit
+def list_violated(work, margin):
+    """Lists the constraints violated by more than ``margin``; returns how many.
+
+    The margin and ``excess`` are in units of ``norm``.
+    """
+    value = work.value
+    low = work.allowed_low
+    high = work.allowed_high
+    norm = work.norm
+    excess = work.excess
+    violated = work.violated
     count = 0
-    for p in range(M):
-        excess[p] = max(y[p] - high[p], low[p] - y[p]) - margin * scale[p]
+    for p in range(work.M):
+        excess[p] = max(value[p] - high[p], low[p] - value[p]) - margin * norm[p]
         count += excess[p] > 0.0
     if count > 0:
         count = 0
-        for p in range(M):
+        for p in range(work.M):
             if excess[p] > 0.0:
-                excess[p] /= scale[p]
+                excess[p] /= norm[p]
                 violated[count] = p
                 count += 1
     return count
 
 
 @inline_njit
-def keep_violated(work, margin, count):
-    """Computes the listed constraints anew, from x = y[:n]; keeps the violated ones, and returns how many."""
-    vectors = work.vectors
-    y = work.vectors[Y]
-    excess = work.vectors[EXCESS]
-    violated = work.indices[VIOLATED]
-    kept = 0
-    n = len(work.q)
+def recheck_violated(work, margin, count):
+    """Computes the listed constraints at the present x; keeps those still violated.
+
+    Returns how many they are.
+    """
+    value = work.value
+    excess = work.excess
+    violated = work.violated
+    n = work.n
+    remaining = 0
     for i in range(count):
         p = violated[i]
         if p >= n:
-            y[p] = dot(work.G[p - n], y, int(vectors[END, p]))
-        outside = max(y[p] - vectors[ALLOWED_HIGH, p], vectors[ALLOWED_LOW, p] - y[p])
-        excess[p] = outside / vectors[SCALE, p] - margin
+            value[p] = dot(work.G[p - n], value, int(work.end[p]))
+        outside = max(value[p] - work.allowed_high[p], work.allowed_low[p] - value[p])
+        excess[p] = outside / work.norm[p] - margin
         if excess[p] > 0.0:
-            violated[kept] = p
-            kept += 1
-    return kept
+            violated[remaining] = p
+            remaining += 1
+    return remaining
 
 
 @inline_njit
-def most_violated(vectors, indices, count):
+def most_violated(work, count):
     """Returns the listed constraint with the largest excess."""
-    excess = vectors[EXCESS]
-    violated = indices[VIOLATED]
+    excess = work.excess
+    violated = work.violated
     worst = violated[0]
     for i in range(1, count):
         if excess[violated[i]] > excess[worst]:
@@ -107,38 +109,37 @@ def most_violated(vectors, indices, count):
 
 
 @inline_njit
-def choose_bad(vectors, indices, threshold, count, room):
-    """Makes candidates of the listed constraints with an excess above ``threshold``, none at a cap.
+def choose_badly_violated(work, threshold, count, most):
+    """Makes candidates of the listed constraints with an excess above ``threshold``.
 
-    Returns how many there are, at most ``room``; none where but one is that bad.
+    Those at a cap are left out. Returns how many candidates there are, at most
+    ``most``; none where only one constraint is violated that badly.
     """
-    candidates = indices[CANDIDATES]
-    bad = 0
     chosen = 0
+    bad = 0
     for i in range(count):
-        p = indices[VIOLATED, i]
-        if vectors[EXCESS, p] > threshold:
+        p = work.violated[i]
+        if work.excess[p] > threshold:
             bad += 1
-            if chosen < room and vectors[MU, p] == 0.0:
-                candidates[chosen] = (
-                    p + 1 if vectors[Y, p] > vectors[UPPER, p] else -(p + 1)
-                )
+            if chosen < most and work.multiplier[p] == 0.0:
+                above = work.value[p] > work.upper[p]
+                work.candidates[chosen] = p + 1 if above else -(p + 1)
                 chosen += 1
     return chosen if bad > 1 else 0
 
 
 @inline_njit
-def choose_guess(vectors, indices, M, names):
-    """Makes candidates of the guessed constraints, at no cap, whose bound is there; returns how many."""
-    candidates = indices[CANDIDATES]
+def choose_guessed(work, labels):
+    """Makes candidates of the guessed constraints, at no cap, whose bound is there.
+
+    Returns how many.
+    """
     chosen = 0
-    for name in names:
-        if 1.0 <= abs(name) <= M:
-            p = int(abs(name)) - 1
-            if (
-                vectors[MU, p] == 0.0
-                and abs(vectors[UPPER if name > 0.0 else LOWER, p]) < np.inf
-            ):
-                candidates[chosen] = int(name)
+    for label in labels:
+        if 1.0 <= abs(label) <= work.M:
+            p = int(abs(label)) - 1
+            bound = work.upper[p] if label > 0.0 else work.lower[p]
+            if work.multiplier[p] == 0.0 and abs(bound) < np.inf:
+                work.candidates[chosen] = int(label)
                 chosen += 1
     return chosen

@@ -1,73 +1,98 @@
-"""The memory that the dual active-set kernels work in, besides the record that a solve writes.
+"""The memory of the dual active-set kernels, and the fields by which they read it.
 
-Asking the system for memory costs as much as a small solve, so each shape (and each prepared program) keeps its own.
-Threads may share it, since a solve keeps the interpreter's lock. It is one matrix; ``Workspace`` has few fields because
-each of an array's seven numbers is handed to each function that numba compiles, which makes up half of the time that
-compilation takes.
+Asking the system for memory costs as much as a small solve, so each shape of a program
+(and each prepared program) keeps one matrix, its *memory*. Threads may share it, since a
+solve keeps the interpreter's lock. Its rows, all padded to the same length, are
+
+    settings (1) | vectors (26) | integer vectors (4) | L | factor | rows | K
+
+In compiled code ``work = open_workspace(P, q, G, memory)`` has a field for each of them:
+``work.lower[p]``, ``work.factor[k]``, ``work.tolerance``. To add a vector, add its name
+to ``VECTORS``. A ``work`` is a handful of pointers and sizes, as a C struct would be, and
+a field becomes an array where it is read. A named tuple of these arrays would hand seven
+numbers per array to every function, which doubles the time that compilation takes.
+
+A constraint p is represented by its *row* w_p = L^-T c_p with P = L'L, so that
+K_pq = c_p'P^-1 c_q = w_p . w_q. The *working set* W is a list of k *slots*: slot i holds
+one constraint at one of its bounds, and row i of the factor of K_WW. Its *label* is p + 1
+at the upper bound and -(p + 1) at the lower one.
 """
 
 import zlib
-from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
-from gpmpc._compiled import inline_njit
 from gpmpc._kernels.linalg import aligned_rows
 
 Array = NDArray[np.float64]
 
-# Rows of ``Workspace.vectors`` by constraint (M,), box first: C = [I; G], M = n + m. Bounds are infinite where absent;
-# outside of what is allowed a constraint is violated, which a working one cannot be.
-LOWER, UPPER, ALLOWED_LOW, ALLOWED_HIGH = range(4)
-NEGLIGIBLE = 4  # violation of a bound of zero that is none
-SCALE = 5  # length of c_p in the metric of the inverse of P's diagonal
-CAP = 6  # price of a violation: the largest size of a multiplier
-END = 7  # leading entries of c_p that may not be zero, in steps of a register
-MU, Y, EXCESS = (
-    8,
-    9,
-    10,
-)  # multipliers; C x, so that the first n are the point; violations in units of ``SCALE``
-# by variable (n,): -L^-T q, so that L x = v without working constraints (-q if prepared); q + C'mu; P x + q + C'mu
-V = 11
-SLOPE = 12
-GRADIENT = 13
-SCRATCH = 14
-# and by slot of the working set (k,): b_p; c_p'x at the unconstrained minimiser; the range of the multiplier, which is
-# [0, cap] at an upper bound, [-cap, 0] at a lower one and [-cap, cap] for an equality; K_pp
-BOUND, FREE_VALUE, LEAST, MOST, DIAGONAL = range(15, 20)
-REST, SOLVED_K, R, COSINES, SINES, _VECTORS = range(
-    20, 26
-)  # residual; L_K^-1 K_Wp; K_WW^-1 K_Wp; of rotations
+SETTINGS = (
+    "limit",  # changes of the working set
+    "tolerance",  # largest residual of a solution
+    "soft",  # whether rows may be violated at a price: zero or one
+    "tag",  # which prepared program it is; zero if it is none
+    "pivot_share",  # what cancellation left of the pivots of P, as a share of P_ii
+)
 
-# Rows of ``Workspace.indices``: in the slots of the working set p + 1 at the upper bound or -(p + 1) at the lower one,
-# and the place of w_p in ``rows`` (those of slots from k on are free); the constraints with an excess; those to enter.
-NAME, PLACE, VIOLATED, CANDIDATES, _INDICES = range(5)
+VECTORS = (
+    # By constraint p < M, box first: C = [I; G], M = n + m. Absent bounds are infinite.
+    "lower",
+    "upper",
+    "allowed_low",  # outside [allowed_low, allowed_high] a constraint is violated,
+    "allowed_high",  # which a working one cannot be
+    "negligible",  # violation of a bound of zero that is none
+    "norm",  # length of c_p in the metric of the inverse of P's diagonal
+    "cap",  # price of a violation: the largest size of a multiplier
+    "end",  # leading entries of c_p that may not be zero, in whole registers
+    "multiplier",
+    "value",  # C x; the first n are the point x
+    "excess",  # violation in units of ``norm``
+    # By variable j < n.
+    "free_rhs",  # L x = free_rhs without working constraints (-q if prepared)
+    "slope",  # q + C' multiplier
+    "gradient",  # P x + q + C' multiplier
+    "scratch",
+    # By slot i < k of the working set, whose constraint is p.
+    "bound",  # b_p, the bound at which p works
+    "free_value",  # c_p'x at the unconstrained minimiser
+    "least_multiplier",  # [0, cap] is the range at an upper bound, [-cap, 0] at a
+    "most_multiplier",  # lower one, and [-cap, cap] that of an equality
+    "diagonal",  # K_pp
+    "residual",  # value - bound
+    "forward",  # L_K^-1 K_Wp: the row of the factor that p would add
+    "direction",  # K_WW^-1 K_Wp: how the working multipliers answer to that of p
+    "cosines",  # scratch of Givens rotations
+    "sines",
+)
 
-# In the first row of memory; a tag of zero: not prepared; what cancellation left of the pivots of P, a share of P_ii.
-_LIMIT, _TOLERANCE, _SOFT, _TAG, SHARE = range(5)
+INTEGER_VECTORS = (
+    "label",  # by slot: signed number of the constraint, see above
+    "place",  # by slot: where w_p is in ``rows``; from slot k on: which are free
+    "violated",  # constraints with an excess
+    "candidates",  # labels of constraints to be added
+)
 
+MATRICES = {
+    "P": ("n", "n"),
+    "G": ("m", "n"),
+    "L": ("n", "width"),  # P = L'L, with reciprocals on the diagonal
+    "factor": ("slots", "width"),  # L_K of K_WW = L_K L_K', likewise
+    "rows": ("M", "width"),  # w_p by place; by constraint if prepared
+    "K": ("M", "width"),  # C P^-1 C', if prepared
+}
 
-class Workspace(NamedTuple):
-    """A quadratic program as the kernels see it, its point and its working set W of k constraints.
+SIZES = ("n", "m", "M", "slots", "width")
 
-    A constraint p is represented by its *row* w_p = L^-T c_p, so that K_pq = c_p'P^-1 c_q = w_p . w_q.
-    """
-
-    P: Any  # (n, n)
-    q: Any  # (n,)
-    G: Any  # (m, n)
-    L: Any  # (n, n) with P = L'L
-    rows: Any  # (n + 1, n) the w_p of the working set, by place; if prepared all of them, then K (2M, M)
-    factor: Any  # (n + 1, n) L_K of K_WW = L_K L_K'
-    vectors: Any  # see above
-    indices: Any
-    limit: int  # changes of the working set
-    tolerance: float
-    soft: bool  # whether rows are soft
-    tag: float  # of a prepared program, of which L, rows, ``SCALE``, ``END`` and share are there; zero otherwise
+FIRST_INTEGER = 1 + len(VECTORS)
+FIRST_MATRIX = FIRST_INTEGER + len(INTEGER_VECTORS)
+_CAP = 1 + VECTORS.index("cap")
+_END = 1 + VECTORS.index("end")
+_LIMIT = SETTINGS.index("limit")
+_TOLERANCE = SETTINGS.index("tolerance")
+_SOFT = SETTINGS.index("soft")
+_TAG = SETTINGS.index("tag")
 
 
 def new_memory(
@@ -75,52 +100,35 @@ def new_memory(
 ) -> Array:
     """Returns memory for programs of n variables with these caps (M,)."""
     M = len(caps)
-    wide = padded(max(M, n + 2)) + 8  # kernels write whole lanes
-    rows = n + (2 * M if prepared else n + 1) + n + 1
-    memory = aligned_rows(
-        1 + _VECTORS + _INDICES + rows, wide
-    )  # loads across cache lines take twice the time
+    slots = n + 1
+    height = FIRST_MATRIX + n + slots + (M + 1) + (M if prepared else 0)
+    # kernels write whole registers; loads across cache lines take twice the time
+    width = (max(M, n + 2) + 7) // 8 * 8 + 8
+    memory = aligned_rows(height, width)
     memory[:] = 0.0
-    box = np.arange(M) < n
-    memory[0, :_TAG] = limit, tolerance, soft
-    memory[1 + CAP, :M] = caps
-    memory[1 + END, :M] = box * np.minimum(n, (np.arange(M) // 8 + 1) * 8)
+    memory[0, _LIMIT] = limit
+    memory[0, _TOLERANCE] = tolerance
+    memory[0, _SOFT] = soft
+    memory[_CAP, :M] = caps
+    registers = np.arange(n) // 8 + 1
+    memory[_END, :n] = np.minimum(n, registers * 8)
     return memory
 
 
 def prepare_memory(memory: Array, G: Array) -> None:
-    """Completes ``prepared`` memory, in which a solve has left the factor of P, with the rows w_p and K = C P^-1 C'."""
+    """Completes prepared memory in which a solve has left the factor of P.
+
+    Writes the rows w_p, K = C P^-1 C' and the tag.
+    """
     m, n = G.shape
-    _, L, rows, K, _ = np.split(
-        memory, 1 + _VECTORS + _INDICES + np.cumsum([0, n, n + m, n + m])
-    )
-    L = np.tril(L[:, :n])
+    M = n + m
+    L = np.tril(memory[FIRST_MATRIX:][:n, :n])
     np.fill_diagonal(L, 1.0 / np.diagonal(L))
-    w = solve_triangular(
-        L, np.vstack([np.eye(n), G]).T, lower=True, trans="T", check_finite=False
-    ).T  # L^-T c_p
-    rows[:, :n] = w
-    K[:, : n + m] = w @ w.T
+    C = np.vstack([np.eye(n), G])
+    w = solve_triangular(L, C.T, lower=True, trans="T", check_finite=False).T
+    first_row = FIRST_MATRIX + n + (n + 1)
+    rows = memory[first_row:]
+    K = memory[first_row + M + 1 :]
+    rows[:M, :n] = w
+    K[:M, :M] = w @ w.T
     memory[0, _TAG] = 1.0 + zlib.crc32(w.tobytes())
-
-
-@inline_njit
-def padded(size):
-    """Returns the next multiple of eight."""
-    return (size + 7) // 8 * 8
-
-
-@inline_njit
-def open_workspace(P, q, G, memory):
-    """Returns the workspace in ``memory``."""
-    n = len(q)
-    settings = memory[0]
-    whole = 1 + _VECTORS
-    L = whole + _INDICES
-    rows = whole + _INDICES + n
-    factor = len(memory) - n - 1
-    return Workspace(
-        P, q, G, memory[L:rows], memory[rows:factor], memory[factor:], memory[1:whole],
-        memory[whole:L].view(np.int64), int(settings[_LIMIT]), settings[_TOLERANCE], settings[_SOFT] != 0.0,
-        settings[_TAG],
-    )  # fmt: skip
