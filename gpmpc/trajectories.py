@@ -1,9 +1,10 @@
 """Positions that a system is to follow, as functions of time.
 
-Every trajectory is called with times t [s] of any shape and returns positions (..., d), one for each tracked state of
-the system, in its unit; ``velocity`` returns their time derivative (..., d). ``Elliptical`` and ``Lorenz``, with d = 3,
-are those of Cao, Lai and Alam (2017), section 5, decoded from the authors' data (the paper's z axis points downwards);
-the others are for everyday use and have any d.
+Every trajectory is called with times t [s] of any shape and returns positions (..., d),
+one for each tracked state of the system, in its unit; ``velocity`` returns their time
+derivative (..., d). ``Elliptical`` and ``Lorenz``, with d = 3, are those of Cao, Lai
+and Alam (2017), section 5, decoded from the authors' data (the paper's z axis points
+downwards); the others are for everyday use and have any d.
 """
 
 from collections.abc import Sequence
@@ -66,11 +67,14 @@ class Elliptical:
 
 @dataclass(frozen=True)
 class Lorenz:
-    """The paper's chaotic path: (0.7 X, -0.7 Y, Z) of the Lorenz system (Lorenz, 1963, eqs. (25)-(27)).
+    """The paper's chaotic path.
 
-    The authors sampled an adaptive Dormand-Prince 5(4) integration at its natural output points, four a step, so
-    equal steps of flight time are unequal steps of Lorenz time. Between samples the flight follows the integrator's
-    dense output, Lorenz time running linearly from one sample to the next.
+    (0.7 X, -0.7 Y, Z) of the Lorenz system (Lorenz, 1963, eqs. (25)-(27)).
+
+    The authors sampled an adaptive Dormand-Prince 5(4) integration at its natural
+    output points, four a step, so equal steps of flight time are unequal steps of
+    Lorenz time. Between samples the flight follows the integrator's dense output,
+    Lorenz time running linearly from one sample to the next.
     """
 
     sigma: float = 10.0  #: Prandtl number of the Lorenz system
@@ -103,7 +107,10 @@ class Lorenz:
         return self._state(self._lorenz_time(time)[0]) * np.array(self.scale)
 
     def velocity(self, time: np.ndarray) -> np.ndarray:
-        """Velocities (..., 3) [m/s] at times (...) [s]; at a sample, that of the interval that begins there."""
+        """Returns velocities (..., 3) [m/s] at times (...) [s].
+
+        At a sample it is that of the interval that begins there.
+        """
         lorenz_time, speed = self._lorenz_time(time)
         rate = np.moveaxis(
             self._derivative(0.0, np.moveaxis(self._state(lorenz_time), -1, 0)), 0, -1
@@ -211,9 +218,12 @@ class Hover:
 
 @dataclass(frozen=True)
 class Waypoints:
-    """A smooth path through given positions at given times; the first and the last one are held outside.
+    """A smooth path through given positions at given times.
 
-    A monotone cubic (Fritsch and Carlson, 1980) per coordinate: it passes every waypoint and overshoots none.
+    The first and the last one are held outside.
+
+    A monotone cubic (Fritsch and Carlson, 1980) per coordinate: it passes every
+    waypoint and overshoots none.
     """
 
     times: Sequence[float]  #: strictly increasing times of the waypoints [s]
@@ -242,7 +252,10 @@ class Waypoints:
         return self._path(np.clip(time, self.times[0], self.times[-1]))
 
     def velocity(self, time: np.ndarray) -> np.ndarray:
-        """Velocities (..., d) at times (...) [s]; zero before the first and after the last waypoint."""
+        """Returns velocities (..., d) at times (...) [s].
+
+        They are zero before the first and after the last waypoint.
+        """
         t = np.asarray(time, dtype=float)
         inside = (t >= self.times[0]) & (t <= self.times[-1])
         return (
@@ -252,7 +265,10 @@ class Waypoints:
 
 
 def states_along(trajectory: Trajectory, time: np.ndarray) -> np.ndarray:
-    """Translational states x, vx, y, vy, z, vz (..., 6) [m, m/s] of a flight along a trajectory at times (...) [s]."""
+    """Returns translational states x, vx, y, vy, z, vz (..., 6) [m, m/s].
+
+    They are those of a flight along a trajectory at times (...) [s].
+    """
     positions = trajectory(time)
     return np.stack([positions, trajectory.velocity(time)], axis=-1).reshape(
         *positions.shape[:-1], 6

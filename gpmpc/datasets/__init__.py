@@ -1,4 +1,7 @@
-"""Where transitions come from: random inputs, flights of our own, dithered flights, the authors' files."""
+"""Sources of transitions.
+
+They are random inputs, our own flights, dithered flights, and the authors' files.
+"""
 
 from gpmpc.datasets._flights import (
     SUBSYSTEMS,

@@ -1,12 +1,15 @@
 """Records or reads flights of the quadrotor as transitions.
 
-``NMPCData`` flies the experiment of Cao, Lai and Alam (2017), section 5, itself: unconstrained NMPC on the true plant,
-first along the trajectory with the translational subsystem, then along the attitude that those controls ask for with
-the rotational one. ``PaperData`` reads the four files that the authors published. ``ExcitedData`` flies with dither:
-where a controller tracks well, inputs are a function of states and references, and the effects of the two cannot be
-separated (Ljung, 1999, section 13.4: a closed loop has to be excited). Measured, 189 samples, median error of a GP's
-derivatives by the inputs along the elliptical flight, relative to the plant's: 4 without dither and noise, 0.1 to 0.2
-with noise alone, 0.012 and 0.003 (translational, rotational) with both.
+``NMPCData`` flies the experiment of Cao, Lai and Alam (2017), section 5, itself:
+unconstrained NMPC on the true plant, first along the trajectory with the translational
+subsystem, then along the attitude that those controls ask for with the rotational one.
+``PaperData`` reads the four files that the authors published. ``ExcitedData`` flies
+with dither: where a controller tracks well, inputs are a function of states and
+references, and the effects of the two cannot be separated (Ljung, 1999, section 13.4: a
+closed loop has to be excited). Measured, 189 samples, median error of a GP's
+derivatives by the inputs along the elliptical flight, relative to the plant's: 4
+without dither and noise, 0.1 to 0.2 with noise alone, 0.012 and 0.003 (translational,
+rotational) with both.
 """
 
 from collections.abc import Sequence
@@ -35,7 +38,10 @@ SUBSYSTEMS = ("translational", "rotational")
 
 
 def check_quadrotor(system: System, trajectory: Trajectory | None) -> Trajectory:
-    """Returns the trajectory; ``SettingError`` unless there is one, and the system is one of the quadrotor's two."""
+    """Returns the trajectory that a quadrotor's subsystem is to fly.
+
+    Raises ``SettingError`` unless there is one and the system is one of the two.
+    """
     if system.name not in SUBSYSTEMS:
         what = f"these data are of {' and '.join(SUBSYSTEMS)} alone; data=random is of any system"
         raise SettingError("data", f"{what}; got {system.name!r}")
@@ -45,10 +51,13 @@ def check_quadrotor(system: System, trajectory: Trajectory | None) -> Trajectory
 
 
 class DataSource(Protocol):
-    """Transitions of a system that follows a trajectory, which is called ``name`` where files are filed under it.
+    """Transitions of a system that follows a trajectory.
 
-    ``note`` says what a reader has to know who compares results on these data with the paper's. ``check`` raises a
-    ``SettingError`` where there are no such data of the system.
+    The trajectory is called ``name`` where files are filed under it.
+
+    ``note`` says what a reader has to know who compares results on these data with the
+    paper's. ``check`` raises a ``SettingError`` where there are no such data of the
+    system.
     """
 
     @property
@@ -104,7 +113,8 @@ class NMPCData:
     rotational: Tracking  #: how the inner subsystem is flown
     samples: int = 189  #: transitions of either subsystem
     horizon: int = 2  #: of the controller: predicted states in its cost
-    #: how thrust direction becomes attitude: ``"paper"`` or ``"exact"``; see ``attitude_for_thrust_direction``
+    #: how thrust direction becomes attitude: ``"paper"`` or ``"exact"``; see
+    #: ``attitude_for_thrust_direction``
     attitude: str = "paper"
 
     note = (
@@ -121,7 +131,10 @@ class NMPCData:
     def transitions(
         self, system: System, trajectory: Trajectory | None, name: str = ""
     ) -> Transitions:
-        """Flies the trajectory by the plants of these settings, and for the rotational subsystem its attitude."""
+        """Flies the trajectory, or its attitude, by the plants of these settings.
+
+        The rotational subsystem flies the attitude.
+        """
         along = check_quadrotor(system, trajectory)
         # Without a time step: a map goes from state to state, whatever the time is.
         signals = Signals(system.state_names, system.input_names)
@@ -164,7 +177,10 @@ class PaperData:
     def transitions(
         self, system: System, trajectory: Trajectory | None, name: str = ""
     ) -> Transitions:
-        """Reads one file; ``DataError`` where it is missing, malformed, or shorter than ``samples``."""
+        """Reads one file.
+
+        Raises ``DataError`` if it is missing, malformed, or shorter than ``samples``.
+        """
         self.check(system, trajectory)
         part = {"translational": "trans", "rotational": "rotate"}[system.name]
         path = Path(self.folder) / f"ds_nmpc_{name.capitalize()}_{part}.txt"
@@ -187,17 +203,20 @@ def _transitions(flight: Rollout, samples: int, signals: Signals) -> Transitions
 
 
 def _attitudes(flight: Rollout, convention: str) -> np.ndarray:
-    """Roll and pitch (K, 2) [rad] of the thrust directions that were decided in a flight."""
+    """Returns roll and pitch (K, 2) [rad] of a flight's decided thrust directions."""
     ux, uy = flight.inputs[:, 1:].T
     return attitude_for_thrust_direction(ux, uy, convention=convention)
 
 
 @dataclass(frozen=True)
 class Excitation:
-    """How one subsystem is flown for data: NMPC on the true system, which is shaken meanwhile.
+    """A flight of one subsystem for data.
+
+    NMPC flies the true system, which is shaken meanwhile.
 
     Raises:
-        SettingError: A list has another length than the quadrotor's six states or three inputs.
+        SettingError: A list has another length than the quadrotor's six states or three
+            inputs.
     """
 
     Q: Sequence[float]  #: state weights, the diagonal (n,)
@@ -252,9 +271,10 @@ class Excitation:
 class ExcitedData:
     """Transitions of dithered flights, to train models that fly.
 
-    The translational subsystem follows the trajectory from its beginning. The rotational one is asked for attitudes of
-    that flight in random order, each held for a while and approached at first order, as a ``Cascade`` asks for them: so
-    a few seconds at its own rate cover the whole flight's attitudes.
+    The translational subsystem follows the trajectory from its beginning. The
+    rotational one is asked for attitudes of that flight in random order, each held for
+    a while and approached at first order, as a ``Cascade`` asks for them: so a few
+    seconds at its own rate cover the whole flight's attitudes.
     """
 
     translational: Excitation  #: how the outer subsystem is flown
@@ -283,7 +303,8 @@ class ExcitedData:
     ) -> Transitions:
         """Flies the system; the inputs are those that acted, dither included.
 
-        The attitudes that the rotational one flies are those of a flight of ``translational()``.
+        The attitudes that the rotational one flies are those of a flight of
+        ``translational()``.
         """
         self.check(system, trajectory)
         outer = system if system.name == "translational" else translational()

@@ -1,4 +1,7 @@
-"""Records a system under random inputs, from random starts: data of any system, without a controller."""
+"""Records a system under random inputs, from random starts.
+
+Data of any system, without a controller.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -29,10 +32,12 @@ class RandomData:
     samples: int = 200  #: how many
     episode: int = 10  #: steps from one start; the next episode starts anew
     hold: int = 1  #: steps for which an input is held
-    #: where episodes start: ``"region"``, uniformly in the system's region, or ``"start"``, where its flights start
+    #: where episodes start: ``"region"``, uniformly in the system's region, or
+    #: ``"start"``, where its flights start
     starts: str = "region"
     amplitude: float = 1.0  #: part of the width of the input limits that is used
-    #: what the inputs are drawn about: the ``"middle"`` of their limits or the system's ``"initial_input"``
+    #: what the inputs are drawn about: the ``"middle"`` of their limits or the system's
+    #: ``"initial_input"``
     around: str = "middle"
     #: standard deviations of what is added to every next state (n,); None for none
     noise: Sequence[float] | None = None
@@ -49,7 +54,10 @@ class RandomData:
             check_number("data.noise", value, least=0)
 
     def check(self, system: System, trajectory: Trajectory | None = None) -> None:
-        """Raises unless its inputs have limits, it has a region to start from, and noise fits its states."""
+        """Raises ``SettingError`` unless the data can be made of a system.
+
+        It needs limits of its inputs, a region to start from, and noise of its size.
+        """
         for name, *limits in zip(
             system.input_names, system.input_lower, system.input_upper, strict=True
         ):
@@ -73,8 +81,8 @@ class RandomData:
     ) -> Transitions:
         """Steps the system.
 
-        An episode ends early where it is farther outside the region than the region is wide, and where a simulator
-        ends it.
+        An episode ends early where it is farther outside the region than the region is
+        wide, and where a simulator ends it.
 
         Raises:
             DataError: Its episodes end at once, over and over.

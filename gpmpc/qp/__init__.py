@@ -1,7 +1,7 @@
 """Quadratic programs and their solvers (NumPy float64).
 
-Solvers are looked up in their modules at first use: whoever needs a problem or a solution only, such as the writer of
-recordings, loads no compiler.
+Solvers are looked up in their modules at first use: whoever needs a problem or a
+solution only, such as the writer of recordings, loads no compiler.
 """
 
 import importlib

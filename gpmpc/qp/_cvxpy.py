@@ -1,18 +1,23 @@
 """The same QP through CVXPY: any solver it knows, as a reference and for comparison.
 
-CVXPY turns a problem into a solver's standard form, which takes milliseconds; with Parameters in the places that the
-rules of disciplined parametrised programming allow (Agrawal et al., 2019) it does so once per shape. A quadratic form
-with a parameter matrix is not among those places, so the problem is handed over as one of least distance (Lawson and
-Hanson, 1974, chapter 23): with P = L L' and the free minimiser x_f = -P^-1 q,
+CVXPY turns a problem into a solver's standard form, which takes milliseconds; with
+Parameters in the places that the rules of disciplined parametrised programming allow
+(Agrawal et al., 2019) it does so once per shape. A quadratic form with a parameter
+matrix is not among those places, so the problem is handed over as one of least distance
+(Lawson and Hanson, 1974, chapter 23): with P = L L' and the free minimiser x_f = -P^-1
+q,
 
-    minimise 1/2 |y|^2   subject to   lower - C x_f <= C L^-T y <= upper - C x_f,   x = x_f + L^-T y
+    minimise 1/2 |y|^2   subject to   lower - C x_f <= C L^-T y <= upper - C x_f
 
-It has the same multipliers. The cost of tracking, which no input changes, is gone: an interior-point method that weighs
-its duality gap against a cost of 6e5 stopped 1e-3 away from inputs of 0.1.
+    and   x = x_f + L^-T y
 
-Compiled problems are kept by thread, shape, and pattern of absent bounds and equalities. The duals come back signed as
-this package signs them. The answer is ``SOLVED`` only if its own residuals say so, ``INFEASIBLE``
-only with Farkas' proof.
+It has the same multipliers. The cost of tracking, which no input changes, is gone: an
+interior-point method that weighs its duality gap against a cost of 6e5 stopped 1e-3
+away from inputs of 0.1.
+
+Compiled problems are kept by thread, shape, and pattern of absent bounds and
+equalities. The duals come back signed as this package signs them. The answer is
+``SOLVED`` only if its own residuals say so, ``INFEASIBLE`` only with Farkas' proof.
 """
 
 import threading
@@ -45,7 +50,10 @@ STATUSES = {
     "user_limit": Status.ITERATION_LIMIT,
 }
 TIGHT = {"CLARABEL": {"tol_gap_abs": 1e-12, "tol_gap_rel": 1e-14, "tol_feas": 1e-12}}
-"""Options that are tried first, before the solver's own; what is not reached is judged by its residuals."""
+"""Options that are tried first, before the solver's own.
+
+A solution that misses them is judged by its residuals.
+"""
 
 
 @dataclass(frozen=True)
@@ -54,11 +62,13 @@ class CvxpySolver:
 
     Args:
         name: An installed CVXPY solver ("CLARABEL", "OSQP", "SCS", "HIGHS", ...).
-        options: The solver's own options, by its own names; if omitted, Clarabel is first asked for tight tolerances.
+        options: The solver's own options, by its own names; if omitted, Clarabel is
+            first asked for tight tolerances.
         tolerance: Largest scaled KKT residual of a solution called ``SOLVED``.
 
     Raises:
-        ProblemError: A solver that CVXPY does not find; the message lists those it finds.
+        ProblemError: A solver that CVXPY does not find; the message lists those it
+            finds.
     """
 
     name: str = "CLARABEL"
@@ -71,13 +81,17 @@ class CvxpySolver:
         installed = cvxpy.installed_solvers()
         if self.name not in installed:
             raise ProblemError(
-                f"CVXPY finds no solver named {self.name!r}; it finds {', '.join(installed)}"
+                f"CVXPY finds no solver named {self.name!r}; "
+                f"it finds {', '.join(installed)}"
             )
 
     def solve(
         self, problem: QuadraticProgram, warm_start: WarmStart = None
     ) -> QPSolution:
-        """The minimiser; a warm start's x is offered to solvers that take one. See ``QPSolver``."""
+        """Solves one problem, see ``QPSolver``.
+
+        A warm start's x is offered to solvers that take one.
+        """
         import cvxpy
 
         began = perf_counter()
@@ -165,10 +179,11 @@ class CvxpySolver:
 def _compile(
     thread: int, n: int, equal: bytes, above: bytes, below: bytes
 ) -> tuple[Any, Any, list]:
-    """Returns the problem of a thread for a pattern of bounds, its variable, and its constraints by kind.
+    """Returns the compiled problem of a thread for a pattern of bounds.
 
-    Of each kind (equalities and upper bounds have the sign +1, lower bounds -1): which of the stacked constraints
-    it holds, the sign, the parameters for their rows and bounds, and CVXPY's constraint.
+    Of each kind (equalities and upper bounds have the sign +1, lower bounds -1): which
+    of the stacked constraints it holds, the sign, the parameters for their rows and
+    bounds, and CVXPY's constraint.
     """
     import cvxpy
 

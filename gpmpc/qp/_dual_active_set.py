@@ -1,12 +1,17 @@
-"""The package's QP solver: the dual active-set method of Goldfarb and Idnani (1983), warm-started.
+"""The package's QP solver: the warm-started dual active-set method.
 
-In model predictive control one QP follows another and little changes in between, so the working set of the last
-solution is nearly that of the next. A dual method can start from any guess: it needs no feasible point, only
-multipliers of the right sign (``gpmpc.qp._dual_iteration``). What depends on P and G only can be done beforehand:
-``prepared = solver.prepare(P, G)`` once, then ``prepared.solve(q, lower, upper, last_solution)``.
+The method is that of Goldfarb and Idnani (1983).
 
-A solution that its own residuals do not support, one whose factors lost too many digits, and an infeasibility without
-Farkas' proof are tried again with doubled digits (``gpmpc.qp._dual_rescue``); what still fails is reported as
+In model predictive control one QP follows another and little changes in between, so the
+working set of the last solution is nearly that of the next. A dual method can start
+from any guess: it needs no feasible point, only multipliers of the right sign
+(``gpmpc.qp._dual_iteration``). What depends on P and G only can be done beforehand:
+``prepared = solver.prepare(P, G)`` once, then ``prepared.solve(q, lower, upper,
+last_solution)``.
+
+A solution that its own residuals do not support, one whose factors lost too many
+digits, and an infeasibility without Farkas' proof are tried again with doubled digits
+(``gpmpc.qp._dual_rescue``); what still fails is reported as
 ``Status.NUMERICAL_TROUBLE``.
 """
 
@@ -26,26 +31,35 @@ from gpmpc.qp._workspace import new_memory, prepare_memory
 
 Array = NDArray[np.float64]
 
-# Local names save look-ups; ``tuple.__new__`` takes half the time of a named tuple's own constructor.
+# Local names save look-ups; ``tuple.__new__`` takes half the time of a named tuple's
+# own constructor.
 _NO_RECORD = layout.NO_RECORD
 _MISUSE = layout.MISUSE
 _FLOAT = np.dtype(float)
 _empty = np.empty
 _new = tuple.__new__
 _run = solve  # until it is compiled
-_ITERATIONS_PER_CONSTRAINT = (
-    10  # default limit, beyond which the iteration is taken to cycle
-)
+
+# Caps (M,), memory, the record's length, and where x is in it. A plain tuple: taking a
+# named one apart costs a fortieth of a microsecond.
+Plan = tuple[Array, Array, int, slice]
+
+# default limit, beyond which the iteration is taken to cycle
+_ITERATIONS_PER_CONSTRAINT = 10
 _ITERATIONS_PER_LOOK = 25  # iterations between two looks at the clock
 
 
 @dataclass(frozen=True)
 class DualActiveSet:
-    """The dual active-set method; an object holds settings only and may serve many threads.
+    """The dual active-set method.
+
+    An object holds settings only and may serve many threads.
 
     Args:
-        tolerance: Largest residual of a solution called ``SOLVED``, as a share of its size.
-        iteration_limit: Changes of the working set before ``ITERATION_LIMIT``; ample if omitted.
+        tolerance: Largest residual of a solution called ``SOLVED``, as a share of its
+            size.
+        iteration_limit: Changes of the working set before ``ITERATION_LIMIT``; ample if
+            omitted.
         time_limit: Seconds before ``TIME_LIMIT``; none if omitted.
 
     Raises:
@@ -72,52 +86,49 @@ class DualActiveSet:
         """Solves one problem.
 
         Args:
-            problem: The QP. ``QuadraticProgram.unchecked`` builds it in a fraction of a microsecond; its arrays are
-                checked here.
-            warm_start: The solution of a similar problem, or an active set; any guess is safe.
-            prices: Of a violation of each row of G, per unit (m,); infinite where it is hard, as all are by default.
+            problem: The QP. ``QuadraticProgram.unchecked`` builds it in a fraction of a
+                microsecond; its arrays are checked here.
+            warm_start: The solution of a similar problem, or an active set; any guess
+                is safe.
+            prices: Of a violation of each row of G, per unit (m,); infinite where it is
+                hard, as all are by default.
 
         Returns:
-            The minimiser with status ``SOLVED``, or ``INFEASIBLE`` (the multipliers are then Farkas' proof),
-            ``ITERATION_LIMIT``, ``TIME_LIMIT`` (the best dual iterate) or ``NUMERICAL_TROUBLE``.
+            The minimiser with status ``SOLVED``, or ``INFEASIBLE`` (the multipliers are
+            then Farkas' proof), ``ITERATION_LIMIT``, ``TIME_LIMIT`` (the best dual
+            iterate) or ``NUMERICAL_TROUBLE``.
 
         Raises:
-            ProblemError: The problem was not checked and breaks a rule of ``QuadraticProgram``, or the prices do.
+            ProblemError: The problem was not checked and breaks a rule of
+                ``QuadraticProgram``, or the prices do.
         """
         began = perf_counter()
         try:
-            plan = (
-                self._plans[problem.G.shape]
-                if prices is None
-                else self._plan(problem.G.shape, prices)
-            )
-        except (
-            AttributeError,
-            KeyError,
-            TypeError,
-        ):  # the first of its shape, or an unchecked one without a shape
+            shape = problem.G.shape
+            plan = self._plans[shape] if prices is None else self._plan(shape, prices)
+        except (AttributeError, KeyError, TypeError):
+            # the first program of its shape, or an unchecked one without a shape
             problem = QuadraticProgram.from_stacked(*problem)
             plan = self._plan(problem.G.shape, prices)
-        (P, q, G, lower, upper), (caps, memory, size, where) = problem, plan
-        record = _empty(size)
+        P, q, G, lower, upper = problem
+        caps, memory, record_size, x_slice = plan
+        record = _empty(record_size)
         status = _MISUSE
         try:
-            guess = _NO_RECORD if warm_start is None else warm_start.record  # type: ignore[union-attr]
+            guess = _NO_RECORD
+            if warm_start is not None:
+                guess = warm_start.record  # type: ignore[union-attr]
             if P.dtype is q.dtype is G.dtype is lower.dtype is upper.dtype is _FLOAT:
                 status = _run(P, q, G, lower, upper, guess, memory, record)
-        except (
-            AttributeError,
-            TypeError,
-        ):  # not contiguous float64, or a warm start that is no solution of ours
+        except (AttributeError, TypeError):
+            # not contiguous float64, or a warm start that is no solution of ours
             pass
         if status:
             problem, record = self._solve_again(
                 problem, warm_start, plan, status, record, began
             )
-        return _new(
-            QPSolution,
-            (record[where], problem, caps, record, 0.0, perf_counter() - began),
-        )
+        seconds = perf_counter() - began
+        return _new(QPSolution, (record[x_slice], problem, caps, record, 0.0, seconds))
 
     def prepare(
         self, P: ArrayLike, G: ArrayLike | None = None, prices: ArrayLike | None = None
@@ -138,20 +149,21 @@ class DualActiveSet:
 
     def _plan(
         self, shape: tuple, prices: ArrayLike | None, prepared: bool = False
-    ) -> tuple[Array, Array, int, slice]:
-        """Returns caps, memory, the record's length, and where x is in it, for a shape of G."""
+    ) -> Plan:
+        """Returns what solves of this shape of G share; hard rows' plans are kept."""
         m, n = shape
+        M = n + m
         caps = multiplier_caps(prices, n, m)
-        limit = self._limit(n + m)
+        limit = self._limit(M)
         if self.time_limit is not None:
             limit = min(limit, _ITERATIONS_PER_LOOK)
-        memory = new_memory(
-            caps, n, limit, self.tolerance, prices is not None, prepared
-        )
-        size = layout.record_size(n, n + m, n if prepared else 0)
-        plan = caps, memory, size, slice(layout.HEADER, layout.HEADER + n)
+        soft = prices is not None
+        memory = new_memory(caps, n, limit, self.tolerance, soft, prepared)
+        record_size = layout.record_size(n, M, working=n if prepared else 0)
+        x_slice = slice(layout.HEADER, layout.HEADER + n)
+        plan = caps, memory, record_size, x_slice
         if prices is None and not prepared:
-            self._plans[m, n] = plan
+            self._plans[shape] = plan
         return plan
 
     def _limit(self, M: int) -> int:
@@ -161,12 +173,15 @@ class DualActiveSet:
         self,
         problem: QuadraticProgram,
         warm_start: WarmStart,
-        plan: tuple,
+        plan: Plan,
         status: int,
         record: Array,
         began: float,
     ) -> tuple[QuadraticProgram, Array]:
-        """Continues a solve that did not end as ``SOLVED``: checks the problem, goes on, accepts or tries again.
+        """Continues a solve that did not end as ``SOLVED``.
+
+        Checks the problem, iterates on within the limits, and accepts the result or
+        tries again with a new factor, then with doubled digits.
 
         Returns:
             The problem as it was solved, and the record.
@@ -174,51 +189,50 @@ class DualActiveSet:
         Raises:
             ProblemError: The problem breaks a rule of ``QuadraticProgram``.
         """
-        caps, memory = plan[:2]
+        caps, memory, _, _ = plan
         if status == layout.MISUSE:
-            problem = QuadraticProgram.from_stacked(
-                *problem
-            )  # raises if it is misuse indeed
-            record[:] = (
-                0.0  # of a proper problem, too: rows that overflow, P at the edge of definiteness
-            )
+            problem = QuadraticProgram.from_stacked(*problem)  # raises if it is misuse
+            # a proper problem whose rows overflow, or P at the edge of definiteness,
+            # is refused again, and leaves the record as it is
+            record[:] = 0.0
             record[layout.STATUS] = layout.NUMERICAL_TROUBLE
-            status = solve(
-                *problem,
-                as_record(warm_start, len(problem.q), len(problem.lower)),
-                memory,
-                record,
-            )
-        M = len(problem.lower)
-        done = record[layout.ITERATIONS]
+            guess = as_record(warm_start, len(problem.q), len(problem.lower))
+            status = solve(*problem, guess, memory, record)
 
         def late() -> bool:
-            return (
-                self.time_limit is not None and perf_counter() - began > self.time_limit
-            )
+            if self.time_limit is None:
+                return False
+            return perf_counter() - began > self.time_limit
 
-        while status == layout.ITERATION_LIMIT and not late() and done < self._limit(M):
-            guess = record
+        limit = self._limit(len(problem.lower))
+        iterations = record[layout.ITERATIONS]
+        while status == layout.ITERATION_LIMIT and not late() and iterations < limit:
+            guess = record  # the kernel stopped to have the clock looked at
             record = np.empty_like(record)
             status = solve(*problem, guess, memory, record)
-            done += record[layout.ITERATIONS]
-        record[layout.ITERATIONS] = done
+            iterations += record[layout.ITERATIONS]
+        record[layout.ITERATIONS] = iterations
         if status == layout.ITERATION_LIMIT and late():
             record[layout.STATUS] = layout.TIME_LIMIT
         stopped = status == layout.ITERATION_LIMIT and self.iteration_limit is not None
-        if not stopped and not _is_certain(record, problem):
-            guess = record
-            record = record.copy()
-            guess[layout.TAG] = 0.0  # the factor is computed anew
-            solve(*problem, guess, memory, record)
-            record[layout.ITERATIONS] += done
-            if not _is_certain(record, problem):
-                record = rescue(problem, caps, record, self._limit(M), late)
+        if stopped or _is_certain(record, problem):
+            return problem, record
+
+        guess = record
+        record = record.copy()
+        guess[layout.TAG] = 0.0  # the factor is computed anew
+        solve(*problem, guess, memory, record)
+        record[layout.ITERATIONS] += iterations
+        if not _is_certain(record, problem):
+            record = rescue(problem, caps, record, limit, late)
         return problem, record
 
 
 class Prepared:
-    """A problem whose P and G stay; made by ``DualActiveSet.prepare``. Read-only, and may serve many threads."""
+    """A problem whose P and G stay the same.
+
+    Made by ``DualActiveSet.prepare``; read-only, so that it may serve many threads.
+    """
 
     __slots__ = ("_G", "_P", "_plan", "_solver")
 
@@ -228,11 +242,13 @@ class Prepared:
         self._P = problem.P
         self._G = problem.G
         self._solver = solver
-        _, memory, size, _ = self._plan = solver._plan(
-            problem.G.shape, prices, prepared=True
-        )
-        # factorises P and measures the rows of G; where numbers overflow, every solve is to find that out by itself
-        if solve(*problem, layout.NO_RECORD, memory, np.empty(size)) == layout.SOLVED:
+        self._plan = solver._plan(problem.G.shape, prices, prepared=True)
+        _, memory, record_size, _ = self._plan
+        # factorises P and measures the rows of G; where numbers overflow, every solve
+        # is to find that out by itself
+        record = np.empty(record_size)
+        status = solve(*problem, layout.NO_RECORD, memory, record)
+        if status == layout.SOLVED:
             prepare_memory(memory, problem.G)
 
     def solve(
@@ -242,37 +258,49 @@ class Prepared:
 
         Args:
             q: (n,).
-            lower: (n + m,) lower bounds of x, then of the rows of G; infinite or below -1e20 where absent.
+            lower: (n + m,) lower bounds of x, then of the rows of G; infinite or below
+                -1e20 where absent.
             upper: (n + m,) upper bounds likewise.
             warm_start: The last solution, or an active set; any guess is safe.
 
         Raises:
             ProblemError: Shapes that do not match, NaN, crossed bounds.
         """
-        began = perf_counter()  # line by line as in ``DualActiveSet.solve``: a call costs a tenth of a small solve
-        P, G, (caps, memory, size, where) = self._P, self._G, self._plan
-        record = _empty(size)
+        # line by line as in ``DualActiveSet.solve``: a call costs a tenth of a small
+        # solve
+        began = perf_counter()
+        P = self._P
+        G = self._G
+        caps, memory, record_size, x_slice = self._plan
+        record = _empty(record_size)
         status = _MISUSE
         try:
-            guess = _NO_RECORD if warm_start is None else warm_start.record  # type: ignore[union-attr]
+            guess = _NO_RECORD
+            if warm_start is not None:
+                guess = warm_start.record  # type: ignore[union-attr]
             if q.dtype is lower.dtype is upper.dtype is _FLOAT:
                 status = _run(P, q, G, lower, upper, guess, memory, record)
         except (AttributeError, TypeError):
             pass
         problem = P, q, G, lower, upper
         if status:
-            problem = QuadraticProgram.unchecked(*problem)
             problem, record = self._solver._solve_again(
-                problem, warm_start, self._plan, status, record, began
+                QuadraticProgram.unchecked(P, q, G, lower, upper),
+                warm_start,
+                self._plan,
+                status,
+                record,
+                began,
             )
-        return _new(
-            QPSolution,
-            (record[where], problem, caps, record, 0.0, perf_counter() - began),
-        )
+        seconds = perf_counter() - began
+        return _new(QPSolution, (record[x_slice], problem, caps, record, 0.0, seconds))
 
 
 def _is_certain(record: Array, problem: QuadraticProgram) -> bool:
-    """Returns whether a record needs no second look; an infeasibility needs Farkas' proof."""
+    """Returns whether a record needs no second look.
+
+    An infeasible one needs Farkas' proof.
+    """
     if record[layout.STATUS] == layout.INFEASIBLE:
         ray = record[layout.HEADER + len(problem.q) :][: len(problem.lower)]
         return proves_infeasibility(ray, problem.G, problem.lower, problem.upper)

@@ -1,7 +1,7 @@
 """The dual active-set method of Goldfarb and Idnani (Math. Programming 27, 1983).
 
-Which constraints hold with equality at the minimum of a strictly convex QP? For a working
-set W the minimiser over ``c_p'x = b_p, p in W`` is
+Which constraints hold with equality at the minimum of a strictly convex QP? For a
+working set W the minimiser over ``c_p'x = b_p, p in W`` is
 
     x = x_u - P^-1 C_W' mu   with   K_WW mu = y_W - b_W
 
@@ -47,6 +47,7 @@ from gpmpc.qp._working_set import (
     write_slot,
 )
 
+UNLISTED = -1  # number of violated constraints before the working set is known
 # x, and a violation of a bound of zero, is none below this share of the length of q.
 NONE = 1e-26
 # Times that all badly violated constraints enter at once, and which are: those violated
@@ -75,36 +76,42 @@ class Progress(NamedTuple):
 
 
 @inline_njit
-def iterate(work, k, count, margin, iterations, batches):
+def iterate(work, k, count, guessed, margin, iterations, batches):
     """Adds and drops constraints until none is violated by more than ``margin``.
 
     ``count`` constraints are, and listed; their excess and the margin are in units of
-    ``norm``. ``iterations`` are the changes of the working set so far, ``batches`` the
-    times that several constraints entered at once.
+    ``norm``. ``UNLISTED`` starts from a guess instead: the first ``guessed`` candidates
+    enter before all else. ``iterations`` are the changes of the working set so far,
+    ``batches`` the times that several constraints entered at once.
     """
-    violated = count > 0
+    p = 0
+    candidates = guessed
+    starts = count == UNLISTED
+    violated = False
     passed_over = False
     all_listed = True
-    while count > 0:
-        if iterations >= work.limit:
-            return Progress(ITERATION_LIMIT, k, iterations, batches, True, passed_over)
-
-        p = most_violated(work, count)
-        candidates = 0
-        if all_listed and batches < BATCHES:
-            threshold = _BADLY * work.excess[p]
-            candidates = choose_badly_violated(work, threshold, count, work.n - k)
-            batches += candidates > 0
+    while count != 0:
+        if not starts:
+            violated = True
+            if iterations >= work.limit:
+                return Progress(
+                    ITERATION_LIMIT, k, iterations, batches, True, passed_over
+                )
+            p = most_violated(work, count)
+            candidates = 0
+            if all_listed and batches < BATCHES:
+                threshold = _BADLY * work.excess[p]
+                candidates = choose_badly_violated(work, threshold, count, work.n - k)
+                batches += candidates > 0
         size_before = k
         k = add_candidates(work, k, candidates)
-        several_entered = k > size_before
-        iterations += k - size_before
-
-        multipliers_fit = not several_entered
-        if not several_entered:
+        multipliers_fit = False
+        single = not starts and k == size_before
+        if single:
             multiplier_before = work.multiplier[p]
             satisfied, k, changes = _satisfy_constraint(work, k, p)
             iterations += changes
+            multipliers_fit = True
             if not satisfied:
                 if _is_contradiction(work, p):
                     _write_ray(work, k, p)
@@ -118,19 +125,22 @@ def iterate(work, k, count, margin, iterations, batches):
                 multipliers_fit = work.soft != 0.0  # where refinement has to do
             if work.soft != 0.0:
                 batches = BATCHES  # caps may have changed x_u
+        elif not starts:
+            iterations += k - size_before
         if not multipliers_fit:
-            k = drop_wrong_multipliers(work, k)
-        minimise(work, k)
+            k = _drop_wrong_multipliers(work, k)
+        _minimise(work, k)
 
         # first satisfy those that were seen to be violated, then look at all
-        one_listed = count == 1 or work.soft != 0.0 or iterations >= work.limit
-        all_listed = several_entered or one_listed
+        few_listed = count == 1 or work.soft != 0.0 or iterations >= work.limit
+        all_listed = few_listed or not single
         if not all_listed:
             count = recheck_violated(work, margin, count)
             all_listed = count == 0
         if all_listed:
             multiply_constraints(work)
             count = list_violated(work, margin)
+        starts = False
     if violated:
         _clip_multipliers(work, k)
     return Progress(SOLVED, k, iterations, batches, violated, passed_over)
@@ -252,7 +262,7 @@ def _write_ray(work, k, p):
 
 
 @inline_njit
-def drop_wrong_multipliers(work, k):
+def _drop_wrong_multipliers(work, k):
     """Solves K_WW mu = y_W - b_W; drops the most wrong one until all are in range.
 
     Any working set is a valid start of a dual method once this is done. Returns the
@@ -295,7 +305,7 @@ def _clip_multipliers(work, k):
 
 
 @inline_njit
-def minimise(work, k):
+def _minimise(work, k):
     """Writes the minimiser of the Lagrangian, P x = -(q + C'mu), to ``value[:n]``."""
     n = work.n
     x = work.value

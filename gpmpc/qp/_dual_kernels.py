@@ -27,11 +27,9 @@ from gpmpc._kernels._simd import (
 from gpmpc.qp._dual_iteration import (
     BATCHES,
     NONE,
+    UNLISTED,
     add_multipliers,
-    drop_wrong_multipliers,
     iterate,
-    minimise,
-    multiply_constraints,
 )
 from gpmpc.qp._record import (
     AGE,
@@ -55,10 +53,15 @@ from gpmpc.qp._violations import (
     list_violated,
     restore_limits,
 )
-from gpmpc.qp._working_set import add_candidates, constraint_in, restore_working_set
+from gpmpc.qp._working_set import constraint_in, restore_working_set
 from gpmpc.qp._workspace_type import open_workspace
 
-SIGNATURE = "i8(f8[:, ::1], f8[::1], f8[:, ::1], f8[::1], f8[::1], f8[::1], f8[:, ::1], f8[::1])"
+_VECTOR = "f8[::1]"
+_MATRIX = "f8[:, ::1]"
+SIGNATURE = (
+    f"i8({_MATRIX}, {_VECTOR}, {_MATRIX}, {_VECTOR}, {_VECTOR}, "
+    f"{_VECTOR}, {_MATRIX}, {_VECTOR})"
+)
 
 _PRESENT = np.nextafter(1e20, 0.0)  # the largest bound that is one
 # A constraint that depends on others may be left with this violation: see
@@ -70,9 +73,9 @@ _ROUNDS = 10  # returns from the residuals to the iteration
 # Residuals at which refinement stops: at first, and where x is to be as good as can be.
 _FINE = 2e-10
 _FINEST = 1e-15
-# The largest residual of a solution is this multiple of the share that cancellation left
-# of the pivots; with a smaller share than the second, violations are seen of the best x
-# only.
+# The largest residual of a solution is this multiple of the share that cancellation
+# left of the pivots; with a smaller share than the second, violations are seen of the
+# best x only.
 _DOUBT = 3e-7
 _ILL = 5e-4
 _OLD = 1000  # changes after which a factor is computed anew
@@ -119,7 +122,10 @@ def solve(P, q, G, lower, upper, guess, memory, out):
 
 @inline_njit
 def _is_dense(vector):
-    """Returns whether a vector is contiguous: an unchecked entry point does not look."""
+    """Returns whether a vector is contiguous.
+
+    An unchecked entry point does not look.
+    """
     return vector.strides[0] == vector.itemsize or len(vector) <= 1
 
 
@@ -223,7 +229,7 @@ def _remove_absent(bounds):
 @inline_njit
 def _solve_opened(work, guess, least, out):
     """Solves the program in the workspace, and writes the record ``out``."""
-    k, age = _start(work, guess, len(out))
+    k, guessed, age = _start(work, guess, len(out))
     # only single steps let the dual objective rise for sure
     interrupted = len(guess) > 0 and guess[STATUS] == ITERATION_LIMIT
     batches = BATCHES if interrupted else 0
@@ -234,10 +240,10 @@ def _solve_opened(work, guess, least, out):
     changed = False  # whether x or the working set did, since violations were listed
     rounds = 0
     status = NUMERICAL_TROUBLE
-    count = list_violated(work, margin)
+    count = UNLISTED
     while True:
-        if count > 0:
-            progress = iterate(work, k, count, margin, iterations, batches)
+        if count != 0:
+            progress = iterate(work, k, count, guessed, margin, iterations, batches)
             k = progress.size
             iterations = progress.iterations
             batches = progress.batches
@@ -281,8 +287,8 @@ def _solve_opened(work, guess, least, out):
 def _start(work, guess, record_size):
     """Starts from a guess: soft rows that stay violated, and the working set.
 
-    Returns the size of the working set and the age of its factor, with the minimiser on
-    it and multipliers in range.
+    Returns the size of the working set, how many candidates are guessed to belong to
+    it, too, and the age of its factor.
     """
     n = work.n
     M = work.M
@@ -295,6 +301,7 @@ def _start(work, guess, record_size):
     if work.tag == 0.0:
         solve_transposed(work.L, n, work.free_rhs)
     k = 0
+    candidates = 0
     age = 0.0
     if len(guess) > 0:
         first_label = HEADER + n + M
@@ -309,13 +316,9 @@ def _start(work, guess, record_size):
         if factor_is_known and candidates == len(labels) and candidates <= n:
             restore_working_set(work, candidates, guess[first_label + M :])
             k = candidates
+            candidates = 0
             age = guess[AGE]
-        else:
-            k = add_candidates(work, 0, candidates)
-    k = drop_wrong_multipliers(work, k)
-    minimise(work, k)
-    multiply_constraints(work)
-    return k, age
+    return k, candidates, age
 
 
 @inline_njit

@@ -1,9 +1,13 @@
-"""The dual active-set method with doubled digits, for the programs that float64 alone cannot decide.
+"""The dual active-set method with doubled digits.
 
-Rows that are parallel up to 1e-12, or a Hessian at the edge of definiteness, leave few of sixteen digits. Here the
-iteration of ``gpmpc.qp._dual_iteration`` is written for accuracy: variables and rows are scaled by powers of two, the
-working set has a QR factor computed anew at each change, and x and the multipliers are sums of two floats that Newton's
-method corrects by residuals without rounding error (iterative refinement, Higham, Accuracy and Stability of Numerical
+For the programs that float64 alone cannot decide.
+
+Rows that are parallel up to 1e-12, or a Hessian at the edge of definiteness, leave few
+of sixteen digits. Here the iteration of ``gpmpc.qp._dual_iteration`` is written for
+accuracy: variables and rows are scaled by powers of two, the working set has a QR
+factor computed anew at each change, and x and the multipliers are sums of two floats
+that Newton's method corrects by residuals without rounding error (iterative refinement,
+Higham, Accuracy and Stability of Numerical
 
     a = -A_W dmu - L^-1 r1,   A_W' a = -r2,   L' dx = a
 
@@ -22,10 +26,15 @@ from gpmpc.qp._solution import proves_infeasibility, zero_row_size
 
 Array = NDArray[np.float64]
 
-NEGLIGIBLE = 1e-26  # violation, as a share of the terms that it is a sum of, that doubled digits cannot tell from none
-_ROUNDING = 1e-14  # share of these terms by which a row may contradict others that it depends on: the data's rounding
-# Distances from the span of the others, as a share of the row, within which a row depends on them. Where rows that
-# differ by rounding only are taken for independent ones, x does not converge: then the next one is tried.
+# violation, as a share of the terms that it is a sum of, that doubled digits cannot
+# tell from none
+NEGLIGIBLE = 1e-26
+# share of these terms by which a row may contradict others that it depends on: the
+# data's rounding
+_ROUNDING = 1e-14
+# Distances from the span of the others, as a share of the row, within which a row
+# depends on them. Where rows that differ by rounding only are taken for independent
+# ones, x does not converge: then the next one is tried.
 _DEPENDENT = (1e-14, 1e-13, 1e-12, 1e-10)
 _CONVERGED = 1e-12  # last correction of x, as a share of its size
 _CORRECTIONS = 12
@@ -63,17 +72,17 @@ def rescue(
         solve.write(result)  # pyright: ignore[reportPossiblyUnboundVariable]
     except TimeoutError:
         result[layout.STATUS] = layout.TIME_LIMIT
-    except (
-        ArithmeticError,
-        ValueError,
-        np.linalg.LinAlgError,
-    ):  # not finite, or not positive definite once scaled
+    except (ArithmeticError, ValueError, np.linalg.LinAlgError):
+        # not finite, or not positive definite once scaled
         result[layout.STATUS] = layout.NUMERICAL_TROUBLE
     return result
 
 
 class _Solve:
-    """One program, scaled, and the state of the iteration: the working set (+1 at an upper bound), x, multipliers."""
+    """A scaled program and the state of the iteration.
+
+    The state is the working set (+1 at an upper bound), x and the multipliers.
+    """
 
     def __init__(self, problem: tuple, caps: Array, dependent: float, late: Callable):
         P, q, G, lower, upper = problem
@@ -106,7 +115,10 @@ class _Solve:
         self.ray = None
 
     def run(self, names: Array, limit: int) -> int:
-        """Changes the working set until no constraint is violated; returns the status."""
+        """Changes the working set until no constraint is violated.
+
+        Returns the status.
+        """
         self._guess(names)
         passed: set[int] = set()
         while True:
@@ -175,7 +187,10 @@ class _Solve:
         self.Q, self.R = qr(self.columns[:, list(self.working)], mode="economic")
 
     def _settle(self) -> bool:
-        """Finds x and the multipliers of the working set; drops the most wrong one until all are in range."""
+        """Finds x and the multipliers of the working set.
+
+        Drops the most wrong one until all are in range.
+        """
         while True:
             self._factorise()
             if not self._refine():
@@ -202,7 +217,10 @@ class _Solve:
         self.iterations += 1
 
     def _refine(self) -> bool:
-        """Newton's method on the working set with residuals free of rounding; False if it does not converge."""
+        """Refines x and the multipliers on the working set by Newton's method.
+
+        Residuals are free of rounding. Returns False if it does not converge.
+        """
         W = np.array(list(self.working), dtype=int)
         x = self.x
         mu = self.mu
@@ -240,7 +258,7 @@ class _Solve:
         return False
 
     def _most_violated(self, passed: set[int]) -> tuple[int, int, int, float]:
-        """The constraint violated most, the bound, the direction in which its multiplier moves, and by how much."""
+        """Returns the most violated constraint."""
         y = _sum_products(
             [(self.C, self.x[0]), (self.C, self.x[1])], np.zeros(len(self.C))
         )
@@ -265,7 +283,10 @@ class _Solve:
         return p, side, (-side if mu[p] else side), float(excess[p])
 
     def _terms_of(self, p: int, side: int) -> float:
-        """The size of the numbers whose rounding a violation may be; a zero row has those of the other rows only."""
+        """Returns the size of the numbers whose rounding a violation may be.
+
+        A zero row has those of the other rows only.
+        """
         if self.C[p].any():
             return max(abs(self._bound(p, side)), np.abs(self.C[p]) @ np.abs(self.x[0]))
         return zero_row_size(self.G, *self.bounds)
@@ -275,7 +296,8 @@ class _Solve:
     ) -> bool:
         """Moves multipliers until constraint p is satisfied.
 
-        False if it contradicts the working ones, or depends on them and is violated by no more than rounding.
+        False if it contradicts the working ones, or depends on them and is violated by
+        no more than rounding.
         """
         mu = self.mu.sum(axis=0)
         start = mu[p]
@@ -286,7 +308,9 @@ class _Solve:
             r = np.zeros(len(self.working))
             for _ in range(
                 2
-            ):  # the combination r of the working columns nearest to p's; twice is enough
+                # the combination r of the working columns nearest to p's; twice is
+                # enough
+            ):
                 part = self.Q.T @ rest
                 rest = rest - self.Q @ part
                 r = r + solve_triangular(self.R, part)
@@ -354,7 +378,10 @@ def _power_of_two(sizes: Array) -> Array:
 
 
 def _add(parts: Array, where, change: Array) -> None:
-    """Adds to a sum of two floats, of which the second holds what the first rounds off."""
+    """Adds to a sum of two floats.
+
+    The second holds what the first rounds off.
+    """
     high = parts[0, where]
     low = parts[1, where] + change
     total = high + low
@@ -363,7 +390,10 @@ def _add(parts: Array, where, change: Array) -> None:
 
 
 def _sum_products(products: list[tuple[Array, Array]], constant: Array) -> Array:
-    """``constant + sum A @ v`` as if in doubled precision (Ogita, Rump and Oishi, 2005)."""
+    """Returns ``constant + sum A @ v`` as if in doubled precision.
+
+    The method is that of Ogita, Rump and Oishi (2005).
+    """
     terms = [constant[:, None]]
     for A, v in products:
         product = A * v

@@ -1,21 +1,27 @@
-"""Algorithm 1 of Cao, Lai and Alam (2017), section 4.3: the primal active-set method, to be read beside the paper.
+"""Algorithm 1 of Cao, Lai and Alam (2017), section 4.3.
 
-Which inequalities of ``min 1/2 x'Px + q'x`` subject to ``A x <= h`` hold with equality at the minimum? Starting from a
-feasible x, the method minimises over the working rows as if they were equalities, goes there as far as the others
-allow, adds the row that blocks, and drops a row whose multiplier shows that the minimum lies inside its bound:
+The primal active-set method, to be read beside the paper.
 
-    1  d <- argmin of the QP in x + d with ``A_W d = 0``                                   (the KKT system, eq. (45))
-    2  if d = 0: stop if no multiplier is negative, else drop the row of the most negative one
-    3  else: kappa <- min(1, min over i outside W with a_i'd > 0 of (h_i - a_i'x) / a_i'd);  x <- x + kappa d
+Which inequalities of ``min 1/2 x'Px + q'x`` subject to ``A x <= h`` hold with equality
+at the minimum? Starting from a feasible x, the method minimises over the working rows
+as if they were equalities, goes there as far as the others allow, adds the row that
+blocks, and drops a row whose multiplier shows that the minimum lies inside its bound:
+
+    1  d <- argmin of the QP in x + d with ``A_W d = 0``    (the KKT system, eq. (45))
+    2  if d = 0: stop if no multiplier is negative,
+                 else drop the row of the most negative one
+    3  else:     kappa <- min(1, min over i outside W with a_i'd > 0 of
+                 (h_i - a_i'x) / a_i'd);  x <- x + kappa d
     4        if kappa < 1: add the row that blocks
 
-The printed (45b) lost the Hessian, which ``_minimise_on_rows`` keeps. ``A_W' = [Q1 Q2] [R; 0]`` (QR with column
-pivoting) covers rank-deficient working sets: d = -Q2 (Q2'PQ2)^-1 Q2'(P x + q) moves in their null space, and rows
-that depend on others get a zero multiplier. Plain NumPy, for reproduction and teaching; ``DualActiveSet`` is the one
-to control with.
+The printed (45b) lost the Hessian, which ``_minimise_on_rows`` keeps. ``A_W' = [Q1 Q2]
+[R; 0]`` (QR with column pivoting) covers rank-deficient working sets: d = -Q2
+(Q2'PQ2)^-1 Q2'(P x + q) moves in their null space, and rows that depend on others get a
+zero multiplier. Plain NumPy, for reproduction and teaching; ``DualActiveSet`` is the
+one to control with.
 
-Phase 1, which the paper leaves open, is a linear program: the least t with ``A x - t <= h``. If t = 0 its x is
-feasible; if not, its multipliers are Farkas' proof that no x is.
+Phase 1, which the paper leaves open, is a linear program: the least t with ``A x - t <=
+h``. If t = 0 its x is feasible; if not, its multipliers are Farkas' proof that no x is.
 """
 
 from contextlib import suppress
@@ -42,19 +48,21 @@ from gpmpc.status import Status
 
 Array = NDArray[np.float64]
 
-_RANK = 1e-11  # share of the largest pivot of the QR below which a working row depends on the others
+# share of the largest pivot of the QR below which a working row depends on the others
+_RANK = 1e-11
 _STILL = 1e-13  # share of the size of x below which a direction is zero
-_FULL_STEPS = (
-    2  # unhindered steps on one working set after which what is left of d is rounding
-)
+# unhindered steps on one working set after which what is left of d is rounding
+_FULL_STEPS = 2
 _INSIDE = 1e-9  # share of the size of a row by which phase 1 may miss it
-_ZERO_STEPS = (
-    20  # steps of length zero in a row after which Bland's rule breaks a possible cycle
-)
+# steps of length zero in a row after which Bland's rule breaks a possible cycle
+_ZERO_STEPS = 20
 
 
 class _Rows(NamedTuple):
-    """One-sided rows ``A x <= h``; an equality is one row that never leaves the working set."""
+    """One-sided rows ``A x <= h``.
+
+    An equality is one row that never leaves the working set.
+    """
 
     A: Array  # (r, n), of unit length
     h: Array  # (r,)
@@ -181,7 +189,10 @@ class PrimalActiveSet:
 
 
 def _one_sided(problem: QuadraticProgram) -> _Rows:
-    """Every bound that is there as one row ``a'x <= h`` of unit length (zero rows stay zero)."""
+    """Returns the bounds that are there as rows ``a'x <= h`` of unit length.
+
+    Zero rows stay zero.
+    """
     lower = problem.lower
     upper = problem.upper
     C = np.vstack([np.eye(len(problem.q)), problem.G])
@@ -198,7 +209,11 @@ def _one_sided(problem: QuadraticProgram) -> _Rows:
 
 
 def _phase_1(rows: _Rows, start: Array, M: int) -> tuple[Array, Array | None]:
-    """A feasible point (``start`` if it is one) and None, or ``start`` and a ray (M,) that may prove there is none."""
+    """Finds a feasible point, which is ``start`` if that is one.
+
+    Returns the point and None, or ``start`` and a ray (M,) that may prove that there is
+    none.
+    """
     A = np.vstack([rows.A, -rows.A[rows.equality]])
     h = np.concatenate([rows.h, -rows.h[rows.equality]])
     if (A @ start <= h).all():
@@ -226,7 +241,10 @@ def _phase_1(rows: _Rows, start: Array, M: int) -> tuple[Array, Array | None]:
 
 
 def farkas_ray(problem: QuadraticProgram) -> Array | None:
-    """Farkas' proof (M,) that no point is feasible, from phase 1; None if it finds none."""
+    """Returns Farkas' proof (M,) that no point is feasible, from phase 1.
+
+    None if it finds none.
+    """
     _, ray = _phase_1(_one_sided(problem), np.zeros(len(problem.q)), len(problem.lower))
     return None if ray is None or not proves_infeasibility(ray, *problem[2:]) else ray
 
@@ -234,9 +252,12 @@ def farkas_ray(problem: QuadraticProgram) -> Array | None:
 def _minimise_on_rows(
     P: Array, gradient: Array, A: Array, gap: Array
 ) -> tuple[Array, Array]:
-    """The minimiser d of ``1/2 d'Pd + gradient'd`` with ``A d = gap`` (zero but for rounding), and the multipliers.
+    """Minimises ``1/2 d'Pd + gradient'd`` with ``A d = gap``, zero but for rounding.
 
-    ``P d + gradient + A' multipliers = 0``; rows of A that depend on others get multiplier zero.
+    Returns the minimiser d and the multipliers.
+
+    ``P d + gradient + A' multipliers = 0``; rows of A that depend on others get
+    multiplier zero.
     """
     Q, R, order = qr(A.T, pivoting=True)
     pivots = np.abs(np.diagonal(R))

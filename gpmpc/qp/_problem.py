@@ -3,12 +3,15 @@
     minimise    1/2 x'P x + q'x
     subject to  h_lower <= G x <= h_upper,   lb <= x <= ub
 
-with P symmetric and positive definite, so that the minimiser is unique whenever the constraints can be met. The rows
-of G may depend on each other, repeat, or be zero. A bound of size 1e20 or more is none, equal bounds make an
-equality. A row with a price w may be violated by v for w v: its multiplier then reaches w, and no more. So the penalty
-is exact: a row whose multiplier stays below its price is kept (Fletcher, 1987, section 14.3).
+with P symmetric and positive definite, so that the minimiser is unique whenever the
+constraints can be met. The rows of G may depend on each other, repeat, or be zero. A
+bound of size 1e20 or more is none, equal bounds make an equality. A row with a price w
+may be violated by v for w v: its multiplier then reaches w, and no more. So the penalty
+is exact: a row whose multiplier stays below its price is kept (Fletcher, 1987, section
+14.3).
 
-Solvers see the constraints *stacked*, box first: ``lower <= C x <= upper`` with C = [I; G], M = n + m rows.
+Solvers see the constraints *stacked*, box first: ``lower <= C x <= upper`` with C = [I;
+G], M = n + m rows.
 """
 
 from typing import NamedTuple
@@ -28,16 +31,18 @@ _SYMMETRY = 1e-10  # largest |P - P'| accepted, as a share of the largest diagon
 def _as_float_array(
     name: str, value: ArrayLike, shape: tuple[int, ...], finite: bool = False
 ) -> Array:
-    """Returns ``value`` as a contiguous, writeable float64 array of that shape without NaN; itself if it is one."""
+    """Returns a contiguous, writeable float64 array of that shape without NaN.
+
+    It is ``value`` itself if that is one.
+    """
     try:
         array = np.require(value, np.float64, ["C", "A", "W"])
     except (TypeError, ValueError) as error:
         raise ProblemError(
             f"{name} must be an array of real numbers; got {value!r}"
         ) from error
-    if (
-        array.size and array.strides != np.empty(array.shape).strides
-    ):  # an axis of length 1 may have any, for NumPy
+    # for NumPy an axis of length 1 may have any stride
+    if array.size and array.strides != np.empty(array.shape).strides:
         array = array.copy()
     if array.shape != shape:
         raise ProblemError(f"{name} must have shape {shape}; got {array.shape}")
@@ -55,12 +60,13 @@ def _as_float_array(
 
 
 def _check_hessian(P: Array) -> None:
-    """Raises ``ProblemError`` unless P, which is finite, is symmetric and positive definite."""
+    """Raises ``ProblemError`` unless a finite P is symmetric and positive definite."""
     skew = np.abs(P - P.T)
     if skew.max() > _SYMMETRY * np.abs(np.diagonal(P)).max():
         i, j = np.unravel_index(np.argmax(skew), P.shape)
         raise ProblemError(
-            f"P must be symmetric; got P[{i}, {j}] = {P[i, j]:.6g} and P[{j}, {i}] = {P[j, i]:.6g}"
+            f"P must be symmetric; got P[{i}, {j}] = {P[i, j]:.6g} "
+            f"and P[{j}, {i}] = {P[j, i]:.6g}"
         )
     try:
         pivots = np.diagonal(np.linalg.cholesky(P)) ** 2
@@ -70,21 +76,26 @@ def _check_hessian(P: Array) -> None:
     if not definite:
         eigenvalues = np.linalg.eigvalsh(P)
         raise ProblemError(
-            f"P must be positive definite; its smallest eigenvalue (number 0 of {len(P)}, in ascending order) is "
-            f"{eigenvalues[0]:.6g}, the largest {eigenvalues[-1]:.6g}"
+            f"P must be positive definite; its smallest eigenvalue (number 0 of "
+            f"{len(P)}, in ascending order) is {eigenvalues[0]:.6g}, "
+            f"the largest {eigenvalues[-1]:.6g}"
         )
 
 
 def _check_bounds(
     n: int, lower: Array, upper: Array, names: tuple[str, str, str, str]
 ) -> None:
-    """Raises ``ProblemError`` where stacked bounds are crossed or cannot be met; names of the box's come first."""
+    """Raises ``ProblemError`` where stacked bounds are crossed or cannot be met.
+
+    ``names`` are those of the box's bounds, then those of the rows'.
+    """
     for i in np.flatnonzero((lower > upper) | (lower >= ABSENT) | (upper <= -ABSENT)):
         low, high = names[:2] if i < n else names[2:]
         place = f"variable {i}" if i < n else f"row {i - n}"
         if lower[i] > upper[i]:
             raise ProblemError(
-                f"{place}: {low} must not exceed {high}; got {lower[i]:.6g} > {upper[i]:.6g}"
+                f"{place}: {low} must not exceed {high}; "
+                f"got {lower[i]:.6g} > {upper[i]:.6g}"
             )
         name, value = (low, lower[i]) if lower[i] >= ABSENT else (high, upper[i])
         raise ProblemError(f"{place}: no number satisfies {name} = {value:.6g}")
@@ -99,7 +110,9 @@ class _Arrays(NamedTuple):
 
 
 class QuadraticProgram(_Arrays):
-    """``min 1/2 x'Px + q'x`` subject to ``h_lower <= Gx <= h_upper`` and ``lb <= x <= ub``, checked at construction.
+    """A convex quadratic program, checked at construction.
+
+    ``min 1/2 x'Px + q'x`` subject to ``h_lower <= Gx <= h_upper``, ``lb <= x <= ub``.
 
     Args:
         P: (n, n) symmetric positive definite.
@@ -115,11 +128,12 @@ class QuadraticProgram(_Arrays):
         upper: (M,) upper bounds likewise.
 
     Raises:
-        ProblemError: Shapes that do not match, NaN, P not symmetric (which entries) or not positive definite
-            (which eigenvalue), crossed bounds (which index).
+        ProblemError: Shapes that do not match, NaN, P not symmetric (which entries) or
+            not positive definite (which eigenvalue), crossed bounds (which index).
 
     >>> from gpmpc.qp import DualActiveSet
-    >>> solution = DualActiveSet().solve(QuadraticProgram(P=[[2, 0], [0, 2]], q=[-2, -4], ub=[0.5, 1]))
+    >>> problem = QuadraticProgram(P=[[2, 0], [0, 2]], q=[-2, -4], ub=[0.5, 1])
+    >>> solution = DualActiveSet().solve(problem)
     >>> solution.status.name, solution.x.tolist()
     ('SOLVED', [0.5, 1.0])
     """
@@ -178,7 +192,10 @@ class QuadraticProgram(_Arrays):
     def unchecked(
         P: Array, q: Array, G: Array, lower: Array, upper: Array
     ) -> "QuadraticProgram":
-        """Takes the arrays as they are, in 0.2 us; ``DualActiveSet.solve`` checks them in compiled code."""
+        """Takes the arrays as they are, in 0.2 us.
+
+        ``DualActiveSet.solve`` checks them in compiled code.
+        """
         return _new(QuadraticProgram, (P, q, G, lower, upper))
 
     def __reduce__(self):
@@ -219,10 +236,13 @@ def _check_matrices(
 
 
 def multiplier_caps(prices: ArrayLike | None, variables: int, rows: int) -> Array:
-    """Returns the largest sizes (M,) of the stacked constraints' multipliers: the prices of rows, infinity elsewhere.
+    """Returns the largest sizes (M,) of the stacked constraints' multipliers.
+
+    They are the prices of rows, and infinity elsewhere.
 
     Raises:
-        ProblemError: Another number of prices than of rows, NaN, or a price that is not positive.
+        ProblemError: Another number of prices than of rows, NaN, or a price that is not
+            positive.
     """
     caps = np.full(variables + rows, np.inf)
     if prices is not None:
@@ -235,7 +255,7 @@ def multiplier_caps(prices: ArrayLike | None, variables: int, rows: int) -> Arra
 
 
 def check_positive(settings: object, *names: str) -> None:
-    """Raises ``ProblemError`` unless each of these settings of a solver is positive, or None."""
+    """Raises ``ProblemError`` unless settings of a solver are positive or None."""
     for name in names:
         value = getattr(settings, name)
         if value is not None and not value > 0:

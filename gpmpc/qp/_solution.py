@@ -1,8 +1,9 @@
 """The solution of a quadratic program, its residuals, and the protocol of a solver.
 
-A solution is judged by its residuals, which it computes from the problem's own data; a solver's flag proves nothing.
-With the stacked constraints C = [I; G] and multipliers y (positive at upper, negative at lower bounds) the conditions
-of Karush, Kuhn and Tucker are P x + q + C'y = 0, lower <= C x <= upper, and a zero duality gap.
+A solution is judged by its residuals, which it computes from the problem's own data; a
+solver's flag proves nothing. With the stacked constraints C = [I; G] and multipliers y
+(positive at upper, negative at lower bounds) the conditions of Karush, Kuhn and Tucker
+are P x + q + C'y = 0, lower <= C x <= upper, and a zero duality gap.
 """
 
 from typing import NamedTuple, Protocol
@@ -21,32 +22,45 @@ _ROUNDING = 4e-15  # share of a sum's terms that counts as rounding
 
 
 class Residuals(NamedTuple):
-    """How far a point is from the conditions of optimality; all three are zero at the minimiser.
+    """How far a point is from the conditions of optimality.
 
-    Each is relative to the numbers that it is a sum of, so that neither units nor data of another size hide it. Where
-    these cancel, zero is what is small beside x, or very small beside the free minimiser, in the metric of P's diagonal
-    (1e-4 and 1e-12 of them).
+    All three are zero at the minimiser.
+
+    Each is relative to the numbers that it is a sum of, so that neither units nor data
+    of another size hide it. Where these cancel, zero is what is small beside x, or very
+    small beside the free minimiser, in the metric of P's diagonal (1e-4 and 1e-12 of
+    them).
     """
 
-    #: the largest violation of a hard constraint, or of a soft one beyond what its multiplier pays for; relative to the
-    #: violated bound or the constraint's own terms |c|'|x|
+    #: the largest violation of a hard constraint, or of a soft one beyond what its
+    #: multiplier pays for; relative to the violated bound or the constraint's own terms
+    #: |c|'|x|
     primal: float
-    #: the largest entry of P x + q + G'z + z_box, multipliers of absent bounds or beyond their weights counted as
-    #: wrong; relative to the entry's own terms
+    #: the largest entry of P x + q + G'z + z_box, multipliers of absent bounds or
+    #: beyond their weights counted as wrong; relative to the entry's own terms
     dual: float
-    #: |primal - dual objective|, what ``primal`` counts as violated left out; relative to x'Px, |q'x|, or the sum of
-    #: |multiplier times bound|
+    #: |primal - dual objective|, what ``primal`` counts as violated left out; relative
+    #: to x'Px, |q'x|, or the sum of |multiplier times bound|
     gap: float
 
 
 class QPSolution(NamedTuple):
-    """The minimiser with multipliers, status and residuals. Holds references to the problem's arrays, not copies."""
+    """The minimiser with multipliers, status and residuals.
 
-    x: Array  #: (n,) the minimiser; the best iterate if the status is not ``SOLVED``. A view of the record
-    #: P, q, G, and the bounds (M,) of the stacked constraints ``[x; Gx]``, as in ``QuadraticProgram``
+    Holds references to the problem's arrays, not copies.
+    """
+
+    #: (n,) the minimiser; the best iterate if the status is not ``SOLVED``. A view of
+    #: the record
+    x: Array
+    #: P, q, G, and the bounds (M,) of the stacked constraints ``[x; Gx]``, as in
+    #: ``QuadraticProgram``
     arrays: tuple[Array, Array, Array, Array, Array]
-    caps: Array  #: largest sizes (M,) of the multipliers: the prices of soft rows, infinity elsewhere
-    #: the solver's whole result in one array, and a warm start for the next solve; see ``gpmpc.qp._record``
+    #: largest sizes (M,) of the multipliers: the prices of soft rows, infinity
+    #: elsewhere
+    caps: Array
+    #: the solver's whole result in one array, and a warm start for the next solve; see
+    #: ``gpmpc.qp._record``
     record: Array
     build_seconds: float = (
         0.0  #: time spent on building or compiling the problem in this call [s]
@@ -55,12 +69,18 @@ class QPSolution(NamedTuple):
 
     @property
     def multipliers(self) -> Array:
-        """(M,) multipliers of the stacked constraints; Farkas' proof if the status is ``INFEASIBLE``."""
+        """The multipliers (M,) of the stacked constraints.
+
+        They are Farkas' proof if the status is ``INFEASIBLE``.
+        """
         return self.record[layout.HEADER + len(self.x) :][: len(self.caps)]
 
     @property
     def z(self) -> Array:
-        """(m,) multipliers of the rows of G: positive at h_upper, negative at h_lower."""
+        """The multipliers (m,) of the rows of G.
+
+        They are positive at h_upper and negative at h_lower.
+        """
         return self.multipliers[len(self.x) :]
 
     @property
@@ -80,7 +100,10 @@ class QPSolution(NamedTuple):
 
     @property
     def active_set(self) -> NDArray[np.int8]:
-        """(M,) -1 where a stacked constraint works at its lower bound, +1 at its upper bound, 0 elsewhere."""
+        """The working stacked constraints (M,).
+
+        The entry is -1 for a lower bound, +1 for an upper bound, 0 for none.
+        """
         active = np.zeros(len(self.caps), dtype=np.int8)
         names = layout.working_names(self.record, len(self.x), len(self.caps))
         active[np.abs(names).astype(int) - 1] = np.sign(names)
@@ -88,12 +111,18 @@ class QPSolution(NamedTuple):
 
     @property
     def objective(self) -> float:
-        """1/2 x'Px + q'x, with the price of violated soft rows [the unit of the cost]."""
+        """The objective 1/2 x'Px + q'x [the unit of the cost].
+
+        The price of violated soft rows is part of it.
+        """
         x, (P, q, *_), soft = self.x, self.arrays, np.isfinite(self.caps)
         return float(0.5 * x @ P @ x + q @ x + self.caps[soft] @ self.violation()[soft])
 
     def violation(self) -> Array:
-        """(M,) how far each stacked constraint lies outside its bounds, in the constraint's own unit; soft ones too."""
+        """Returns how far each stacked constraint lies outside its bounds (M,).
+
+        In the constraint's own unit; soft rows count, too.
+        """
         values, (lower, upper) = (
             np.concatenate([self.x, self.arrays[2] @ self.x]),
             self.arrays[3:],
@@ -106,7 +135,9 @@ class QPSolution(NamedTuple):
 
     @np.errstate(all="ignore")  # the multipliers of a failed solve may be anything
     def residuals(self, zero: float = 1e-12) -> Residuals:
-        """How far x and the multipliers are from the conditions of optimality; NaN where that cannot be said.
+        """Returns how far x and the multipliers are from the conditions of optimality.
+
+        The residuals are NaN where that cannot be said.
 
         Args:
             zero: What counts as no x at all, as a share of the free minimiser.
@@ -167,16 +198,25 @@ class QPSolution(NamedTuple):
 
 
 WarmStart = QPSolution | NDArray[np.number] | None
-"""The solution of a similar problem, or an active set: (M,) -1 at a lower bound, +1 at an upper one, 0 elsewhere."""
+"""The solution of a similar problem, or an active set.
+
+(M,) -1 at a lower bound, +1 at an upper one, 0 elsewhere.
+"""
 
 
 class QPSolver(Protocol):
-    """Solves strictly convex quadratic programs; ``gpmpc.testing.check_qp_solver`` checks whether an object does."""
+    """Solves strictly convex quadratic programs.
+
+    ``gpmpc.testing.check_qp_solver`` checks whether an object does.
+    """
 
     def solve(
         self, problem: QuadraticProgram, warm_start: WarmStart = None
     ) -> QPSolution:
-        """Returns the minimiser, or the status that says why there is none: the same from any warm start."""
+        """Returns the minimiser, or the status that says why there is none.
+
+        The result is the same from any warm start.
+        """
         ...
 
 
@@ -202,7 +242,9 @@ def make_solution(
     build_seconds: float = 0.0,
     solve_seconds: float = 0.0,
 ) -> QPSolution:
-    """Makes a solution of the parts that any solver has, see ``QPSolution``; all rows are hard.
+    """Makes a solution from the parts that any solver has.
+
+    See ``QPSolution``; all rows are hard.
 
     Args:
         problem: What was solved.
@@ -220,7 +262,8 @@ def make_solution(
     M = sum(problem.G.shape)
     if x.shape != (n,) or multipliers.shape != (M,):
         raise ProblemError(
-            f"a solution needs x of shape {(n,)} and multipliers {(M,)}; got {x.shape}, {multipliers.shape}"
+            f"a solution needs x of shape {(n,)} and multipliers {(M,)}; "
+            f"got {x.shape}, {multipliers.shape}"
         )
     record = layout.warm_record(
         np.nan_to_num(np.sign(multipliers) if active_set is None else active_set), n
@@ -237,7 +280,10 @@ def make_solution(
 
 
 def as_record(warm_start: WarmStart, n: int, M: int) -> Array:
-    """Whatever can be used of a warm start; ``ProblemError`` of what is no solution or active set of this size."""
+    """Returns the record of a warm start, empty if there is none.
+
+    Raises ``ProblemError`` if it is no solution or active set of this size.
+    """
     if warm_start is None:
         return layout.NO_RECORD
     if isinstance(warm_start, QPSolution):
@@ -245,18 +291,23 @@ def as_record(warm_start: WarmStart, n: int, M: int) -> Array:
     active = np.asarray(warm_start)
     if active.shape != (M,) or active.dtype.kind not in "biuf":
         raise ProblemError(
-            f"a warm start must be a solution or an active set of shape {(M,)}; got shape {active.shape}"
+            f"a warm start must be a solution or an active set of shape {(M,)}; "
+            f"got shape {active.shape}"
         )
     return layout.warm_record(np.nan_to_num(active), n)
 
 
 @np.errstate(all="ignore")  # what is not finite proves nothing
 def proves_infeasibility(ray: Array, G: Array, lower: Array, upper: Array) -> bool:
-    """Returns whether ``ray`` (M,) is Farkas' proof that no x satisfies ``lower <= [x; Gx] <= upper``.
+    """Returns whether ``ray`` (M,) is Farkas' proof that no x satisfies the bounds.
 
-    There is none if a ray y satisfies C'y = 0 and sum(y+ upper) + sum(y- lower) < 0: summing the constraints with these
-    weights gives 0 < 0. In floating point C'y is not zero. Where a variable has a bound, what is left is moved onto it;
-    where it has none, what is left must be the rounding of its own sum, for else a large x may satisfy the constraints.
+    The bounds are ``lower <= [x; Gx] <= upper``.
+
+    There is none if a ray y satisfies C'y = 0 and sum(y+ upper) + sum(y- lower) < 0:
+    summing the constraints with these weights gives 0 < 0. In floating point C'y is not
+    zero. Where a variable has a bound, what is left is moved onto it; where it has
+    none, what is left must be the rounding of its own sum, for else a large x may
+    satisfy the constraints.
     """
     n = G.shape[1]
     rest = ray[:n] + ray[n:] @ G
@@ -275,7 +326,10 @@ def proves_infeasibility(ray: Array, G: Array, lower: Array, upper: Array) -> bo
 
 
 def zero_row_size(G: Array, lower: Array, upper: Array) -> float:
-    """Returns the size of the numbers that cancelled in a zero row: that of other bounds, one at most."""
+    """Returns the size of the numbers that cancelled in a zero row.
+
+    It is that of the other bounds, but at most one.
+    """
     others = np.append(np.ones(G.shape[1], dtype=bool), G.any(axis=1))
     sizes = np.abs(np.concatenate([lower[others], upper[others]]))
     return float(min(1.0, sizes[sizes < ABSENT].max(initial=0.0) or 1.0))

@@ -1,8 +1,11 @@
-"""Dense algebra of the dual active-set kernels: products, and triangular factors L with reciprocals on the diagonal.
+"""Dense algebra of the dual active-set kernels.
 
-A factor is lower triangular and stored by rows, so that one pair of solves serves both P = L'L and K_WW = L L'. Loops
-take four rows at a time: their sums hide each other's latency. Nothing is allocated and nothing is checked. What takes
-few arrays is called, not inlined: a solve is then compiled in two thirds of the time and is a seventh faster.
+Products, and triangular factors L with reciprocals on the diagonal.
+
+A factor is lower triangular and stored by rows, so that one pair of solves serves both
+P = L'L and K_WW = L L'. Loops take four rows at a time: their sums hide each other's
+latency. Nothing is allocated and nothing is checked. What takes few arrays is called,
+not inlined: a solve is then compiled in two thirds of the time and is a seventh faster.
 """
 
 import math
@@ -26,7 +29,10 @@ def scale(factor, x, y, size):
 
 @njit_noalloc
 def multiply_to_ends(A, ends, vector, product):
-    """Writes ``product = A vector`` for rows of which ``ends`` leading entries may not be zero."""
+    """Writes ``product = A vector``; only ``ends`` leading entries of rows count.
+
+    The entries behind them are zero.
+    """
     i = 0
     while i + 4 <= len(A):
         size = int(max(max(ends[i], ends[i + 1]), max(ends[i + 2], ends[i + 3])))
@@ -37,16 +43,18 @@ def multiply_to_ends(A, ends, vector, product):
         i += 1
 
 
+@inline_njit
+def _four_rows(A, places, i):
+    """Returns the rows of A at places i to i + 3."""
+    return A[places[i]], A[places[i + 1]], A[places[i + 2]], A[places[i + 3]]
+
+
 @njit_noalloc
 def multiply_rows(A, places, count, vector, size, product):
     """Writes ``product[i] = A[places[i]] . vector``."""
     i = 0
     while i + 4 <= count:
-        r0 = A[places[i]]
-        r1 = A[places[i + 1]]
-        r2 = A[places[i + 2]]
-        r3 = A[places[i + 3]]
-        four_dots((r0, r1, r2, r3), vector, size, product[i:])
+        four_dots(_four_rows(A, places, i), vector, size, product[i:])
         i += 4
     while i < count:
         product[i] = dot(A[places[i]], vector, size)
@@ -58,10 +66,7 @@ def subtract_rows(target, rows, places, factors, count, size):
     """Writes ``target -= sum_i factors[i] rows[places[i]]``."""
     i = 0
     while i + 4 <= count:
-        r0 = rows[places[i]]
-        r1 = rows[places[i + 1]]
-        r2 = rows[places[i + 2]]
-        r3 = rows[places[i + 3]]
+        r0, r1, r2, r3 = _four_rows(rows, places, i)
         f0 = factors[i]
         f1 = factors[i + 1]
         f2 = factors[i + 2]
@@ -172,7 +177,10 @@ def solve_transposed(L, end, a):
 
 @inline_njit
 def append_row(L, k, solved, pivot):
-    """Writes row k of ``L L' = K_WW``: ``solved = L^-1 K_Wp`` and ``pivot = K_pp - |solved|^2 > 0``."""
+    """Writes row k of ``L L' = K_WW``.
+
+    With ``solved = L^-1 K_Wp`` and ``pivot = K_pp - |solved|^2 > 0``.
+    """
     row = L[k]
     scale(1.0, solved, row, k)
     row[k] = 1.0 / math.sqrt(pivot)
@@ -180,10 +188,12 @@ def append_row(L, k, solved, pivot):
 
 @njit_noalloc
 def delete_row(L, k, gone, solved, cosines, sines):
-    """Deletes row ``gone`` of L, which has k rows, and entry ``gone`` of a in ``solved = L^-1 a``.
+    """Deletes row ``gone`` of L, which has k rows.
 
-    Givens rotations restore the triangle (Golub and Van Loan, Matrix Computations, 4th ed., section 6.5.2); ``cosines``
-    and ``sines`` (k,) are scratch.
+    And entry ``gone`` of a in ``solved = L^-1 a``.
+
+    Givens rotations restore the triangle (Golub and Van Loan, Matrix Computations, 4th
+    ed., section 6.5.2); ``cosines`` and ``sines`` (k,) are scratch.
     """
     left = solved[gone]
     for i in range(gone + 1, k):
@@ -212,11 +222,14 @@ def delete_row(L, k, gone, solved, cosines, sines):
 
 @njit_noalloc
 def factorise(P, L):
-    """Writes L of ``P = L'L``; returns False unless P is symmetric, finite and positive definite.
+    """Writes L of ``P = L'L``.
 
-    Variables are eliminated from the last to the first: a constraint on the first few variables only, as all are in
-    predictive control where no state depends on later inputs, then has as short a row L^-T c. Rows of L are padded to a
-    multiple of eight; its upper triangle is undefined.
+    Returns False unless P is symmetric, finite and positive definite.
+
+    Variables are eliminated from the last to the first: a constraint on the first few
+    variables only, as all are in predictive control where no state depends on later
+    inputs, then has as short a row L^-T c. Rows of L are padded to a multiple of eight;
+    its upper triangle is undefined.
     """
     n = len(P)
     largest = 0.0
@@ -242,7 +255,10 @@ def _is_pivot(pivot, diagonal, n):
 
 @inline_njit
 def _finish_last_rows(P, L, top):
-    """Writes the rows from ``top`` on, fewer than four; returns False where a pivot is none."""
+    """Writes the rows from ``top`` on, fewer than four.
+
+    Returns False where a pivot is no positive number.
+    """
     n = len(P)
     for i in range(top, n):
         for j in range(0, n, _LANES):
@@ -266,7 +282,10 @@ def _finish_last_rows(P, L, top):
 
 @inline_njit
 def _finish_four_rows(P, L, top):
-    """Writes rows ``top`` to ``top + 3``, given those below; returns False where a pivot is none."""
+    """Writes rows ``top`` to ``top + 3``, given those below.
+
+    Returns False where a pivot is no positive number.
+    """
     n = len(P)
     end = top + _BLOCK
     p0 = P[top]
@@ -277,9 +296,8 @@ def _finish_four_rows(P, L, top):
     t1 = L[top + 1]
     t2 = L[top + 2]
     t3 = L[top + 3]
-    for j in range(
-        0, end, _LANES
-    ):  # P less what the rows of L below take off: registers hold all of it
+    # P less what the rows of L below take off: registers hold all of it
+    for j in range(0, end, _LANES):
         a0 = load_some(p0, j)
         a1 = load_some(p1, j)
         a2 = load_some(p2, j)
@@ -295,7 +313,8 @@ def _finish_four_rows(P, L, top):
         store(t1, j, a1)
         store(t2, j, a2)
         store(t3, j, a3)
-    # the block of four by four: its pivots d, and what of which row to subtract from which
+    # the block of four by four: its pivots d, and what of which row to subtract from
+    # which
     d3 = t3[top + 3]
     r3 = 1.0 / d3
     m23 = t3[top + 2] * r3

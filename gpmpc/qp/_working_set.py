@@ -18,7 +18,8 @@ from gpmpc.qp._triangular import (
 )
 from gpmpc.qp._violations import ignore_violations, is_watched
 
-# A candidate depends on the working constraints if less than this share of K_pp is left.
+# A candidate depends on the working constraints if less than this share of K_pp is
+# left.
 _CANDIDATE_PIVOT = 1e-9
 
 

@@ -1,20 +1,21 @@
 """The memory of the dual active-set kernels, and the fields by which they read it.
 
 Asking the system for memory costs as much as a small solve, so each shape of a program
-(and each prepared program) keeps one matrix, its *memory*. Threads may share it, since a
-solve keeps the interpreter's lock. Its rows, all padded to the same length, are
+(and each prepared program) keeps one matrix, its *memory*. Threads may share it, since
+a solve keeps the interpreter's lock. Its rows, all padded to the same length, are
 
-    settings (1) | vectors (26) | integer vectors (4) | L | factor | rows | K
+    settings (1) | vectors (25) | integer vectors (4) | L | factor | rows | K
 
-In compiled code ``work = open_workspace(P, q, G, memory)`` has a field for each of them:
-``work.lower[p]``, ``work.factor[k]``, ``work.tolerance``. To add a vector, add its name
-to ``VECTORS``. A ``work`` is a handful of pointers and sizes, as a C struct would be, and
-a field becomes an array where it is read. A named tuple of these arrays would hand seven
-numbers per array to every function, which doubles the time that compilation takes.
+In compiled code ``work = open_workspace(P, q, G, memory)`` has a field for each of
+them: ``work.lower[p]``, ``work.factor[k]``, ``work.tolerance``. To add a vector, add
+its name to ``VECTORS``. A ``work`` is a handful of pointers and sizes, as a C struct
+would be, and a field becomes an array where it is read. A named tuple of these arrays
+would hand seven numbers per array to every function, which doubles the time that
+compilation takes.
 
-A constraint p is represented by its *row* w_p = L^-T c_p with P = L'L, so that
-K_pq = c_p'P^-1 c_q = w_p . w_q. The *working set* W is a list of k *slots*: slot i holds
-one constraint at one of its bounds, and row i of the factor of K_WW. Its *label* is p + 1
+A constraint p is represented by its *row* w_p = L^-T c_p with P = L'L, so that K_pq =
+c_p'P^-1 c_q = w_p . w_q. The *working set* W is a list of k *slots*: slot i holds one
+constraint at one of its bounds, and row i of the factor of K_WW. Its *label* is p + 1
 at the upper bound and -(p + 1) at the lower one.
 """
 
@@ -85,8 +86,7 @@ MATRICES = {
 
 SIZES = ("n", "m", "M", "slots", "width")
 
-FIRST_INTEGER = 1 + len(VECTORS)
-FIRST_MATRIX = FIRST_INTEGER + len(INTEGER_VECTORS)
+FIRST_MATRIX = 1 + len(VECTORS) + len(INTEGER_VECTORS)
 _CAP = 1 + VECTORS.index("cap")
 _END = 1 + VECTORS.index("end")
 _LIMIT = SETTINGS.index("limit")

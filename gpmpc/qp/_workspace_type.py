@@ -16,11 +16,9 @@ from numba.extending import (
     models,
     register_model,
 )
-from numba.np.arrayobj import populate_array
 
 from gpmpc._compiled import inline_njit
 from gpmpc.qp._workspace import (
-    FIRST_INTEGER,
     FIRST_MATRIX,
     INTEGER_VECTORS,
     MATRICES,
@@ -38,7 +36,8 @@ def open_workspace(P, q, G, memory):
     factor = L[n:]
     rows = factor[n + 1 :]
     K = rows[n + len(G) + 1 :]
-    return _workspace(P, q, G, memory, L, factor, rows, K)
+    # numba passes the first argument
+    return _workspace(P, q, G, memory, L, factor, rows, K)  # pyright: ignore
 
 
 class _WorkspaceType(types.Type):
@@ -101,51 +100,62 @@ class _FieldTypes(AttributeTemplate):
 
 
 @lower_getattr_generic(_WorkspaceType)
-def _read_field(context, builder, kind, value, name):
-    work = cgutils.create_struct_proxy(kind)(context, builder, value=value)
+def _read_field(context, builder, kind, work, name):
+    model = context.data_model_manager[kind]
     if name in SIZES:
-        return getattr(work, name)
+        return model.get(builder, work, name)
     if name in SETTINGS:
-        return builder.load(_setting(builder, work, name))
+        memory = model.get(builder, work, "memory")
+        return builder.load(_setting(builder, memory, name))
     if name in _POINTERS:
-        data = getattr(work, name)
-        shape = [getattr(work, size) for size in MATRICES.get(name, ("n",))]
+        data = model.get(builder, work, name)
+        sizes = MATRICES.get(name, ("n",))
     else:
-        row = (
-            1 + VECTORS.index(name)
-            if name in VECTORS
-            else FIRST_INTEGER + INTEGER_VECTORS.index(name)
-        )
-        data = builder.gep(work.memory, [builder.mul(work.width, ir.IntType(64)(row))])
-        shape = [work.width]
+        data = _start_of_vector(builder, model, work, name)
+        sizes = ("width",)
+    shape = [model.get(builder, work, size) for size in sizes]
     return _array(context, builder, _FIELD_TYPES[name], data, shape)
 
 
 @lower_setattr_generic(_WorkspaceType)
 def _write_setting(context, builder, signature, arguments, name):
-    kind, _ = signature.args
-    work = cgutils.create_struct_proxy(kind)(context, builder, value=arguments[0])
-    builder.store(arguments[1], _setting(builder, work, name))
+    work, value = arguments
+    model = context.data_model_manager[signature.args[0]]
+    memory = model.get(builder, work, "memory")
+    builder.store(value, _setting(builder, memory, name))
 
 
-def _setting(builder, work, name):
+def _setting(builder, memory, name):
     """Returns the pointer to a setting, in the first row of memory."""
-    return builder.gep(work.memory, [ir.IntType(64)(SETTINGS.index(name))])
+    return builder.gep(memory, [ir.IntType(64)(SETTINGS.index(name))])
+
+
+def _start_of_vector(builder, model, work, name):
+    """Returns the pointer to the row of memory that a vector is."""
+    row = 1 + (VECTORS + INTEGER_VECTORS).index(name)
+    width = model.get(builder, work, "width")
+    offset = builder.mul(width, ir.IntType(64)(row))
+    return builder.gep(model.get(builder, work, "memory"), [offset])
 
 
 def _array(context, builder, kind, data, shape):
     """Returns a contiguous array of 8-byte numbers that start at ``data``."""
-    array = context.make_array(kind)(context, builder)
-    itemsize = context.get_constant(types.intp, 8)
-    strides = [itemsize]
-    for size in reversed(shape[1:]):
-        strides.insert(0, builder.mul(strides[0], size))
-    populate_array(
-        array,
-        data=builder.bitcast(data, context.get_data_type(kind.dtype).as_pointer()),
-        shape=shape,
-        strides=strides,
-        itemsize=itemsize,
-        meminfo=None,
-    )
-    return array._getvalue()
+    itemsize = ir.IntType(64)(8)
+    if len(shape) == 1:
+        size = shape[0]
+        strides = [itemsize]
+    else:
+        size = builder.mul(shape[0], shape[1])
+        strides = [builder.mul(shape[1], itemsize), itemsize]
+    members = {
+        "nitems": size,
+        "itemsize": itemsize,
+        "data": builder.bitcast(data, context.get_data_type(kind.dtype).as_pointer()),
+        "shape": cgutils.pack_array(builder, shape),
+        "strides": cgutils.pack_array(builder, strides),
+    }
+    model = context.data_model_manager[kind]
+    array = ir.Constant(model.get_value_type(), None)  # all zeros: it owns nothing
+    for name, value in members.items():
+        array = model.set(builder, array, value, name)
+    return array

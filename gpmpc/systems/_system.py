@@ -1,4 +1,4 @@
-"""Describes a system that is controlled: how it moves, what its states and inputs are called, how it is flown."""
+"""Describes a system that is controlled: its names, dynamics and task."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -27,18 +27,23 @@ UNKNOWN = "?"  # the unit of a state or an input that has none given
 
 @dataclass(frozen=True, eq=False)
 class System:
-    """A discrete-time system; whatever a run, a report, a recording or a figure says of it comes from here.
+    """A discrete-time system.
 
-    Its ``dynamics`` have the names of the n states and m inputs, in order (``state_names``, ``input_names``), and one
-    method of two: ``derivative(x, u)``, the n entries of dx/dt, or ``successor(x, u)``, those of the next state. They
-    are written once, with plain arithmetic on the entries of x and u, so that floats, NumPy arrays and CasADi
-    expressions all pass through the same formula; ``sin``, ``cos`` and ``exp`` are for all of them. A right-hand side
-    is integrated with the input held constant, by the Runge-Kutta method of order four on equal substeps.
+    Runs, reports, recordings and figures take all they say of it from here.
+
+    Its ``dynamics`` have the names of the n states and m inputs, in order
+    (``state_names``, ``input_names``), and one method of two: ``derivative(x, u)``, the
+    n entries of dx/dt, or ``successor(x, u)``, those of the next state. They are
+    written once, with plain arithmetic on the entries of x and u, so that floats, NumPy
+    arrays and CasADi expressions all pass through the same formula; ``sin``, ``cos``
+    and ``exp`` are for all of them. A right-hand side is integrated with the input held
+    constant, by the Runge-Kutta method of order four on equal substeps.
 
     Raises:
-        SettingError: A number out of range, an unknown name, tracked states of several units, or dynamics without a
-            finite value where the system starts.
-        ShapeError: A list has another length than there are states or inputs, or the dynamics have.
+        SettingError: A number out of range, an unknown name, tracked states of several
+            units, or dynamics without a finite value where the system starts.
+        ShapeError: A list has another length than there are states or inputs, or the
+            dynamics have.
     """
 
     dynamics: Any  #: names of states and inputs, and how it moves
@@ -50,30 +55,36 @@ class System:
     )  #: by name of state or input, such as ``{"x": "m"}``
     input_lower: Any = None  #: smallest inputs (m,); None where there is no limit
     input_upper: Any = None  #: largest inputs (m,)
-    initial_input: Any = None  #: the input before the first step (m,), such as the one at rest; zero by default
+    #: the input before the first step (m,), such as the one at rest; zero by default
+    initial_input: Any = None
     start: Any = None  #: where a flight begins (n,); on its reference by default
-    goal: Any = None  #: the state that is held where no trajectory is followed (n,); zero by default
+    #: the state that is held where no trajectory is followed (n,); zero by default
+    goal: Any = None
     region: Any = (
         None  #: smallest and largest states that random data start from (2, n)
     )
     angles: Sequence[
         str
     ] = ()  #: states whose errors are taken within half a turn [rad]
-    #: states that a trajectory prescribes and errors are reported of, in one unit; by default all in that of the first
+    #: states that a trajectory prescribes and errors are reported of, in one unit; by
+    #: default all in that of the first
     tracked: Sequence[str] = ()
-    #: for a state, the tracked one that it is the time derivative of, such as ``{"vx": "x"}``
+    #: for a state, the tracked one that it is the time derivative of, such as ``{"vx":
+    #: "x"}``
     rates: Mapping[str, str] = field(default_factory=dict)
-    #: a flight is not lost while its tracked states are nearer than this to their reference, in their unit; with
-    #: infinity only one that leaves the finite numbers is
+    #: a flight is not lost while its tracked states are nearer than this to their
+    #: reference, in their unit; with infinity only one that leaves the finite numbers
+    #: is
     lost: float = inf
-    #: from a trajectory, a count K and the time step to reference states (K, n), where a trajectory prescribes
-    #: something other than tracked states
+    #: from a trajectory, a count K and the time step to reference states (K, n), where
+    #: a trajectory prescribes something other than tracked states
     references: Callable[[Trajectory, int, float], Array] | None = None
-    #: states that say where it is in space and how it is turned, by x, y, z, roll, pitch, yaw; pictures show it there
+    #: states that say where it is in space and how it is turned, by x, y, z, roll,
+    #: pitch, yaw; pictures show it there
     pose: Mapping[str, str] = field(default_factory=dict)
     z_down: bool = False  #: whether the z axis of that space points downwards
-    #: what is known of it before anything is learned, as a system with its states, inputs and time step; a model of
-    #: differences learns what it misses
+    #: what is known of it before anything is learned, as a system with its states,
+    #: inputs and time step; a model of differences learns what it misses
     nominal: "System | None" = None
 
     def __post_init__(self) -> None:
@@ -168,7 +179,10 @@ class System:
 
     @cached_property
     def signals(self) -> Signals:
-        """Names of states and inputs, and time step: what data and models of it carry."""
+        """The names of states and inputs, and the time step.
+
+        Data and models of the system carry them.
+        """
         return Signals(self.state_names, self.input_names, self.time_step)
 
     @property
@@ -192,10 +206,13 @@ class System:
         return [self.state_names.index(name) for name in self.angles]
 
     def successor(self, x: Any, u: Any) -> list[Any]:
-        """The n entries of x[k+1], from the entries of x[k] and u[k]: floats, arrays, or symbols.
+        """Returns the n entries of x[k+1], from the entries of x[k] and u[k].
+
+        Entries are floats, arrays, or symbols.
 
         Raises:
-            ShapeError: The dynamics have another number of entries than there are states.
+            ShapeError: The dynamics have another number of entries than there are
+                states.
         """
         if hasattr(self.dynamics, "successor"):
             return list(self._check_length("successor", self.dynamics.successor(x, u)))
@@ -214,10 +231,13 @@ class System:
         return x
 
     def reference_states(self, trajectory: Trajectory | None, count: int) -> Array:
-        """Computes the states to follow (count, n), one per time step; the goal where there is no trajectory.
+        """Computes the states to follow (count, n), one per time step.
+
+        Without a trajectory they are the goal.
 
         Raises:
-            ShapeError: The trajectory prescribes another number of states than are tracked.
+            ShapeError: The trajectory prescribes another number of states than are
+                tracked.
         """
         if trajectory is None:
             return np.tile(np.array(self.goal), (count, 1))
@@ -249,7 +269,10 @@ class System:
         return entries
 
     def _check_dynamics(self) -> None:
-        """Evaluates the dynamics once, where the system starts; a simulator under way a step would move."""
+        """Evaluates the dynamics once, where the system starts.
+
+        A simulator under way is left alone, for a step would move it.
+        """
         if not (
             hasattr(self.dynamics, "derivative") or hasattr(self.dynamics, "successor")
         ):
@@ -303,7 +326,10 @@ def step(plant: System, state: Array, input: Array) -> Array:
 
 
 def step_many(plant: System, states: Array, inputs: Array) -> Array:
-    """The next states (T, n) of T copies of a plant, from states (T, n) and inputs (T, m), in one evaluation."""
+    """Returns the next states (T, n) of T copies of a plant, in one evaluation.
+
+    They move from states (T, n) with inputs (T, m).
+    """
     entries = call_dynamics(plant.successor, states.T, inputs.T)
     return np.stack(
         [

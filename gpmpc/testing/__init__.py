@@ -1,4 +1,7 @@
-"""Checks of your own models, propagators and QP solvers against the protocols that the rest of gpmpc relies on."""
+"""Checks of your own models, propagators and QP solvers.
+
+They hold them against the protocols that the rest of gpmpc relies on.
+"""
 
 from gpmpc.testing._model import check_model
 from gpmpc.testing._propagator import check_propagator

@@ -19,12 +19,14 @@ def check_model(
 ) -> None:
     """Checks a model against the protocol ``gpmpc.models.DynamicsModel``.
 
-    ``predict`` is called alone and in batches, twice, with arrays in awkward layouts; ``linearize`` is compared with it
-    and with its finite differences: at states (K, n) and inputs (K, m), K of 2 or more, by default standard normal
-    numbers of a seed, so give some of yours where they are of another size.
+    ``predict`` is called alone and in batches, twice, with arrays in awkward layouts;
+    ``linearize`` is compared with it and with its finite differences: at states (K, n)
+    and inputs (K, m), K of 2 or more, by default standard normal numbers of a seed, so
+    give some of yours where they are of another size.
 
     Raises:
-        AssertionError: The model breaks a promise; the message says which, and by how much.
+        AssertionError: The model breaks a promise; the message says which, and by how
+            much.
     """
     _check_attributes(model)
     generator = torch.Generator().manual_seed(seed)

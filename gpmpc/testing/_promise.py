@@ -5,7 +5,10 @@ from torch import Tensor
 
 
 def require(condition: bool, promise: str, got: str) -> None:
-    """Raises ``AssertionError`` with the promise and what was got instead, unless the condition holds."""
+    """Raises ``AssertionError`` unless the condition holds.
+
+    The message has the promise and what was got instead.
+    """
     if not condition:
         raise AssertionError(f"{promise}; {got}")
 
@@ -36,7 +39,10 @@ def require_close(
 
 
 def require_covariance(name: str, covariance: Tensor) -> None:
-    """Raises unless covariances (*batch, k, k) are finite, symmetric and positive semidefinite up to round-off."""
+    """Raises unless covariances (*batch, k, k) are what covariances are.
+
+    That is finite, symmetric, and positive semidefinite up to round-off.
+    """
     require(
         bool(torch.isfinite(covariance).all()),
         f"{name}: the covariance is finite",

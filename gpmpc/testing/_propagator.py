@@ -65,23 +65,29 @@ def check_propagator(
 ) -> None:
     """Checks a propagator against the protocol ``gpmpc.propagation.Propagator``.
 
-    It is compared with the plain prediction where nothing is uncertain, with the exact result on a linear model, with
-    Monte Carlo if it claims to be exact, with the loop over a batch, with single precision, and its derivatives with
-    finite differences.
+    It is compared with the plain prediction where nothing is uncertain, with the exact
+    result on a linear model, with Monte Carlo if it claims to be exact, with the loop
+    over a batch, with single precision, and its derivatives with finite differences.
 
     Args:
         propagator: The object to check.
-        model: A model to check it with, in float64; small GPs of next states and of differences by default.
-        exact: It claims the exact moments. Any method, exact or not, must approach the plain prediction in proportion
-            to a vanishing covariance.
-        linear: It claims to be exact where the model is linear, and first-order accurate in its input-output
-            covariance. All methods of this package but mean equivalence do.
-        diagonal: It claims the variances only, and predicts no correlation of the outputs.
-        process_noise: It adds the model's noise covariance; by default as its attribute of that name says.
-        samples: How many states it draws, if it does; its own standard error is then allowed for.
+        model: A model to check it with, in float64; small GPs of next states and of
+            differences by default.
+        exact: It claims the exact moments. Any method, exact or not, must approach the
+            plain prediction in proportion to a vanishing covariance.
+        linear: It claims to be exact where the model is linear, and first-order
+            accurate in its input-output covariance. All methods of this package but
+            mean equivalence do.
+        diagonal: It claims the variances only, and predicts no correlation of the
+            outputs.
+        process_noise: It adds the model's noise covariance; by default as its attribute
+            of that name says.
+        samples: How many states it draws, if it does; its own standard error is then
+            allowed for.
 
     Raises:
-        AssertionError: The propagator breaks a promise; the message says which, and by how much.
+        AssertionError: The propagator breaks a promise; the message says which, and by
+            how much.
     """
     if process_noise is None:
         process_noise = bool(getattr(propagator, "process_noise", False))
@@ -142,7 +148,10 @@ def _small_gp(predicts: Any) -> GPPosterior:
 
 
 def _linear_model() -> ResidualModel:
-    """x+ = A x + B u + c, learned so well that nothing is left to a GP, in a class that every method takes."""
+    """A model x+ = A x + B u + c that is known so well that a GP adds nothing.
+
+    It is of a class that every method takes.
+    """
     A = [[0.9, 0.3], [-0.2, 0.8]]
     B = [[0.0], [0.5]]
     c = [0.1, -0.2]
@@ -319,7 +328,10 @@ def _check_single_precision(case: _Case) -> None:
 
 
 def _check_monte_carlo(case: _Case) -> None:
-    """The claimed moments against the sample means that they are, in standard errors."""
+    """Compares claimed moments with the sample means that they stand for.
+
+    The differences are in standard errors.
+    """
     at = case.belief
     claimed = _parts(case())
     generator = torch.Generator().manual_seed(1)

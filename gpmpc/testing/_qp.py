@@ -14,7 +14,10 @@ _FIELDS = ("P", "q", "G", "h_lower", "h_upper", "lb", "ub")
 
 
 class _Known(NamedTuple):
-    """A problem with its minimiser; multipliers ``[z_box; z]`` are None where they are not unique."""
+    """A problem with its minimiser.
+
+    The multipliers ``[z_box; z]`` are None if they are not unique.
+    """
 
     name: str
     problem: QuadraticProgram
@@ -25,12 +28,14 @@ class _Known(NamedTuple):
 def check_qp_solver(solver: QPSolver, tolerance: float = 1e-6) -> None:
     """Checks a solver against the protocol ``gpmpc.qp.QPSolver``.
 
-    It solves problems whose minimisers and multipliers are known and problems without a solution, from warm starts that
-    are right, wrong and absurd, and from arrays in awkward layouts. ``tolerance`` is the largest error in x and
-    multipliers (relative to their size) and in scaled residuals.
+    It solves problems whose minimisers and multipliers are known and problems without a
+    solution, from warm starts that are right, wrong and absurd, and from arrays in
+    awkward layouts. ``tolerance`` is the largest error in x and multipliers (relative
+    to their size) and in scaled residuals.
 
     Raises:
-        AssertionError: The solver breaks a promise; the message says which, on which problem.
+        AssertionError: The solver breaks a promise; the message says which, on which
+            problem.
     """
     for known in (*_small(), *_constructed()):
         solution = _solve(solver, known.name, known.problem, None)
@@ -79,7 +84,10 @@ def check_qp_solver(solver: QPSolver, tolerance: float = 1e-6) -> None:
 
 
 def _small() -> list[_Known]:
-    """Problems that can be solved by hand; some have more active constraints than variables, or repeat rows."""
+    """Returns problems that can be solved by hand.
+
+    Some have more active constraints than variables, or repeat rows.
+    """
     book = "Nocedal and Wright, Numerical Optimization (2006), example"
     centre = np.array([3.0, -0.5, -7.0])
     P = [[6.0, 2.0, 1.0], [2.0, 5.0, 2.0], [1.0, 2.0, 4.0]]
@@ -156,7 +164,10 @@ def _small() -> list[_Known]:
 
 
 def _constructed(count: int = 12) -> Iterator[_Known]:
-    """Random problems built backwards from a chosen minimiser, active set and multipliers (which are then unique)."""
+    """Returns random problems with a chosen minimiser, active set and multipliers.
+
+    They are built backwards from these; the multipliers are unique.
+    """
     rng = np.random.default_rng(2017)
     for number in range(count):
         n = int(rng.integers(2, 25))
@@ -225,7 +236,10 @@ def _solve(
 
 
 def _awkward(problem: QuadraticProgram) -> QuadraticProgram:
-    """Copies a problem into every other element of larger arrays, P into Fortran order."""
+    """Copies a problem into every other element of larger arrays.
+
+    P is copied into Fortran order.
+    """
 
     def strided(array: np.ndarray) -> np.ndarray:
         return np.repeat(array, 2, axis=-1)[..., ::2]
