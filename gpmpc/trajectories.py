@@ -286,5 +286,8 @@ def _check_positions(key: str, positions: Sequence[Sequence[float]]) -> None:
         try:
             check_numbers(key, position, length)
         except SettingError:
-            what = "a position is a list of finite numbers, one per tracked state, and all have one length"
+            what = (
+                "a position is a list of finite numbers, one per tracked state, "
+                "and all have one length"
+            )
             raise SettingError(key, f"{what}; got {position}") from None

@@ -43,7 +43,8 @@ def check_quadrotor(system: System, trajectory: Trajectory | None) -> Trajectory
     Raises ``SettingError`` unless there is one and the system is one of the two.
     """
     if system.name not in SUBSYSTEMS:
-        what = f"these data are of {' and '.join(SUBSYSTEMS)} alone; data=random is of any system"
+        subsystems = " and ".join(SUBSYSTEMS)
+        what = f"these data are of {subsystems} alone; data=random is of any system"
         raise SettingError("data", f"{what}; got {system.name!r}")
     if trajectory is None:
         raise SettingError("trajectory", "these data follow one; got none")
@@ -69,7 +70,10 @@ class DataSource(Protocol):
 
 
 def check_data(data: Any, **least: int) -> None:
-    """Raises ``SettingError`` unless numbers of a data source are whole and large enough, and its attitude is known."""
+    """Raises ``SettingError`` unless the settings of a data source are possible.
+
+    Its numbers must be whole and large enough, and its attitude known.
+    """
     for key, value in least.items():
         check_number(f"data.{key}", getattr(data, key), least=value, whole=True)
     if getattr(data, "attitude", "exact") not in ATTITUDES:
@@ -118,9 +122,10 @@ class NMPCData:
     attitude: str = "paper"
 
     note = (
-        "Data: our own flights. Rotational: our yaw channels are at rest, the authors' hold their solver's residue, "
-        "scaled to full range; ours come out smaller. Lorenz: the authors' path is only approximately known; expect "
-        "the order of magnitude."
+        "Data: our own flights. Rotational: our yaw channels are at rest, the authors' "
+        "hold their solver's residue, scaled to full range; ours come out smaller. "
+        "Lorenz: the authors' path is only approximately known; expect the order of "
+        "magnitude."
     )
 
     def __post_init__(self) -> None:
@@ -169,7 +174,8 @@ class PaperData:
         check_data(self, samples=1)
         if not isinstance(self.folder, str | Path) or not Path(self.folder).is_dir():
             raise DataError(
-                f"{self.folder}: no such folder; data.folder must hold the authors' four text files"
+                f"{self.folder}: no such folder; "
+                "data.folder must hold the authors' four text files"
             )
 
     check = staticmethod(check_quadrotor)
@@ -187,7 +193,8 @@ class PaperData:
         data = Transitions.from_text(path)
         if len(data) < self.samples:
             raise DataError(
-                f"{path}: the file holds {len(data)} rows; data.samples asks for {self.samples}"
+                f"{path}: the file holds {len(data)} rows; "
+                f"data.samples asks for {self.samples}"
             )
         return data[: self.samples]
 
@@ -288,8 +295,8 @@ class ExcitedData:
     seed: int = 0  #: of dither, noise and the order of the attitudes
 
     note = (
-        "Data: our own dithered and noisy flights of integrated plants. They are made for control; the paper's figures "
-        "belong to noise-free data of the map."
+        "Data: our own dithered and noisy flights of integrated plants. They are made "
+        "for control; the paper's figures belong to noise-free data of the map."
     )
 
     def __post_init__(self) -> None:

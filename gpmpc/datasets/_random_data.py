@@ -73,7 +73,8 @@ class RandomData:
             )
         if self.noise is not None and len(self.noise) != len(system.state_names):
             raise ShapeError(
-                f"data.noise must have {len(system.state_names)} deviations; got {len(self.noise)}"
+                f"data.noise must have {len(system.state_names)} deviations; "
+                f"got {len(self.noise)}"
             )
 
     def transitions(
@@ -127,7 +128,8 @@ class RandomData:
                 states, inputs, after = map(np.array, zip(*rows, strict=True))
                 return Transitions(states, inputs, after, system.signals)
         raise DataError(
-            f"{system.name}: only {len(rows)} of {self.samples} random steps stayed near the region"
+            f"{system.name}: only {len(rows)} of {self.samples} random steps "
+            "stayed near the region"
         )
 
     def _start(self, system: System, random: np.random.Generator) -> np.ndarray:

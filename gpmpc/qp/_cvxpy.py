@@ -26,7 +26,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import lru_cache
 from time import perf_counter
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -92,77 +92,31 @@ class CvxpySolver:
 
         A warm start's x is offered to solvers that take one.
         """
-        import cvxpy
-
         began = perf_counter()
-        P, q, G, lower, upper = problem
-        n = len(q)
-        M = len(lower)
-        equal = (lower == upper) & (upper < ABSENT)
-        kinds = (equal, (upper < ABSENT) & ~equal, (lower > -ABSENT) & ~equal)
-        program, y, sides = _compile(
-            threading.get_ident(), n, *(kind.tobytes() for kind in kinds)
-        )
-        factor = np.linalg.cholesky(P).T
-        # back = L^-T
-        free = -cho_solve((factor, False), q)
-        back = solve_triangular(factor, np.eye(n))
-        columns = np.concatenate([back, G @ back])
-        offset = np.concatenate([free, G @ free])
-        for members, sign, rows, bound, _ in sides:
-            rows.value = columns[members]
-            bound.value = ((lower if sign < 0 else upper) - offset)[members]
-        warm = False
-        if isinstance(warm_start, QPSolution) and len(warm_start.x) == n:
-            warm = True
-            y.value = factor @ (warm_start.x - free)
+        compiled = _compile_for(problem)
+        transform = _Transform.of(problem)
+        transform.write_parameters(compiled, problem)
+        has_start = False
+        if isinstance(warm_start, QPSolution) and len(warm_start.x) == len(problem.q):
+            has_start = True
+            compiled.y.value = transform.factor @ (warm_start.x - transform.free)
         built = perf_counter()
+        choices = [self.options]
+        if self.options is None:
+            choices = [TIGHT.get(self.name, {}), {}]
         best = None
         least = np.inf
-        for options in (
-            (TIGHT.get(self.name, {}), {}) if self.options is None else (self.options,)
-        ):
-            status = Status.NUMERICAL_TROUBLE
-            x = np.zeros(n)
-            multipliers = np.zeros(M)
-            with warnings.catch_warnings(), suppress(cvxpy.SolverError):
-                warnings.simplefilter(
-                    "ignore"
-                )  # an inaccurate solution is judged by its residuals
-                program.solve(solver=self.name, warm_start=warm, **options)
-                status = STATUSES.get(program.status, status)
-            if status is Status.INFEASIBLE:
-                ray = farkas_ray(problem)
-                status, multipliers = (
-                    (Status.NUMERICAL_TROUBLE, multipliers)
-                    if ray is None
-                    else (status, ray)
-                )
-            elif status is not Status.NUMERICAL_TROUBLE and y.value is not None:
-                x = np.clip(free + back @ y.value, problem.lb, problem.ub)
-                for members, sign, _, _, constraint in sides:
-                    if constraint.dual_value is not None:
-                        multipliers[members] += sign * np.ravel(constraint.dual_value)
-            size = max(
-                1.0, np.abs(multipliers).max()
-            )  # beside which an interior-point method's remains are small
-            statistics = program.solver_stats
-            solution = make_solution(
-                problem,
-                status,
-                x,
-                multipliers,
-                active_set=np.sign(multipliers) * (np.abs(multipliers) > 1e-7 * size),
-                iterations=(statistics.num_iters or 0) if statistics else 0,
-                build_seconds=built - began,
-                solve_seconds=perf_counter() - built,
+        for options in choices:
+            status = self._run(compiled.program, has_start, options)
+            solution = _read_solution(problem, compiled, transform, status)
+            solution = solution._replace(
+                build_seconds=built - began, solve_seconds=perf_counter() - built
             )
-            if status is Status.INFEASIBLE:
+            if solution.status is Status.INFEASIBLE:
                 return solution
-            residual = np.nan_to_num(
-                max(solution.residuals(zero=1.0)), nan=np.inf
-            )  # no interior point reaches zero
-            if status is Status.SOLVED and residual <= self.tolerance:
+            # no interior point reaches zero
+            residual = np.nan_to_num(max(solution.residuals(zero=1.0)), nan=np.inf)
+            if solution.status is Status.SOLVED and residual <= self.tolerance:
                 return solution
             if best is None or residual < least:
                 best = solution
@@ -174,16 +128,121 @@ class CvxpySolver:
                 best.record[:] = rescue(problem, best.caps, best.record)
         return best
 
+    def _run(self, program: Any, warm_start: bool, options: dict | None) -> Status:
+        """Runs the solver; returns what it says of the result."""
+        import cvxpy
+
+        with warnings.catch_warnings(), suppress(cvxpy.SolverError):
+            # an inaccurate solution is judged by its residuals
+            warnings.simplefilter("ignore")
+            program.solve(solver=self.name, warm_start=warm_start, **(options or {}))
+            return STATUSES.get(program.status, Status.NUMERICAL_TROUBLE)
+        return Status.NUMERICAL_TROUBLE
+
+
+class _Side(NamedTuple):
+    """Constraints of one kind: equalities, upper bounds or lower bounds."""
+
+    members: NDArray[np.bool_]  # (M,) which of the stacked constraints
+    sign: float  # of their multipliers: -1 for lower bounds, else +1
+    rows: Any  # CVXPY's parameter, (members, n)
+    bound: Any  # its parameter, (members,)
+    constraint: Any  # its constraint
+
+
+class _Compiled(NamedTuple):
+    """A problem of least distance in CVXPY's form."""
+
+    program: Any
+    y: Any  # its variable (n,)
+    sides: list[_Side]
+
+
+class _Transform(NamedTuple):
+    """The change of variables x = free + back y."""
+
+    factor: Array  # (n, n) L' with P = L L'
+    back: Array  # (n, n) L^-T
+    free: Array  # (n,) the free minimiser
+
+    @classmethod
+    def of(cls, problem: QuadraticProgram) -> "_Transform":
+        """Returns the transform of a problem."""
+        factor = np.linalg.cholesky(problem.P).T
+        return cls(
+            factor=factor,
+            back=solve_triangular(factor, np.eye(len(factor))),
+            free=-cho_solve((factor, False), problem.q),
+        )
+
+    def write_parameters(self, compiled: _Compiled, problem: QuadraticProgram) -> None:
+        """Writes the rows and bounds in y."""
+        columns = np.concatenate([self.back, problem.G @ self.back])
+        offset = np.concatenate([self.free, problem.G @ self.free])
+        for side in compiled.sides:
+            bounds = problem.lower if side.sign < 0 else problem.upper
+            side.rows.value = columns[side.members]
+            side.bound.value = (bounds - offset)[side.members]
+
+
+def _read_solution(
+    problem: QuadraticProgram,
+    compiled: _Compiled,
+    transform: _Transform,
+    status: Status,
+) -> QPSolution:
+    """Returns what the solver found, with multipliers signed as in this package."""
+    x = np.zeros(len(problem.q))
+    multipliers = np.zeros(len(problem.lower))
+    y = compiled.y.value
+    if status is Status.INFEASIBLE:
+        ray = farkas_ray(problem)
+        if ray is None:
+            status = Status.NUMERICAL_TROUBLE
+        else:
+            multipliers = ray
+    elif status is not Status.NUMERICAL_TROUBLE and y is not None:
+        x = np.clip(transform.free + transform.back @ y, problem.lb, problem.ub)
+        for side in compiled.sides:
+            dual = side.constraint.dual_value
+            if dual is not None:
+                multipliers[side.members] += side.sign * np.ravel(dual)
+    # beside this size an interior-point method's remains are small
+    size = max(1.0, np.abs(multipliers).max())
+    active = np.abs(multipliers) > 1e-7 * size
+    statistics = compiled.program.solver_stats
+    return make_solution(
+        problem,
+        status,
+        x,
+        multipliers,
+        active_set=np.sign(multipliers) * active,
+        iterations=(statistics.num_iters or 0) if statistics else 0,
+    )
+
+
+def _compile_for(problem: QuadraticProgram) -> _Compiled:
+    """Returns this thread's compiled problem for a pattern of bounds."""
+    equal = (problem.lower == problem.upper) & (problem.upper < ABSENT)
+    above = (problem.upper < ABSENT) & ~equal
+    below = (problem.lower > -ABSENT) & ~equal
+    return _compile(
+        threading.get_ident(),
+        len(problem.q),
+        equal.tobytes(),
+        above.tobytes(),
+        below.tobytes(),
+    )
+
 
 @lru_cache(maxsize=64)
 def _compile(
     thread: int, n: int, equal: bytes, above: bytes, below: bytes
-) -> tuple[Any, Any, list]:
-    """Returns the compiled problem of a thread for a pattern of bounds.
+) -> _Compiled:
+    """Compiles the problem of a thread for a pattern of bounds.
 
-    Of each kind (equalities and upper bounds have the sign +1, lower bounds -1): which
-    of the stacked constraints it holds, the sign, the parameters for their rows and
-    bounds, and CVXPY's constraint.
+    ``equal``, ``above`` and ``below`` are masks (M,) of the stacked constraints that
+    are equalities, or have an upper or a lower bound.
     """
     import cvxpy
 
@@ -191,22 +250,18 @@ def _compile(
     sides = []
     for kind, sign in ((equal, 1.0), (above, 1.0), (below, -1.0)):
         members = np.frombuffer(kind, dtype=bool)
-        if members.any():
-            rows = cvxpy.Parameter((members.sum(), n))
-            bound = cvxpy.Parameter(members.sum())
-            at = rows @ y
-            constraint = (
-                at == bound
-                if kind is equal
-                else at <= bound
-                if sign > 0
-                else bound <= at
-            )
-            sides.append((members, sign, rows, bound, constraint))
-    return (
-        cvxpy.Problem(
-            cvxpy.Minimize(0.5 * cvxpy.sum_squares(y)), [side[-1] for side in sides]
-        ),
-        y,
-        sides,
-    )
+        if not members.any():
+            continue
+        rows = cvxpy.Parameter((members.sum(), n))
+        bound = cvxpy.Parameter(members.sum())
+        value = rows @ y
+        if kind is equal:
+            constraint = value == bound
+        elif sign > 0:
+            constraint = value <= bound
+        else:
+            constraint = bound <= value
+        sides.append(_Side(members, sign, rows, bound, constraint))
+    distance = cvxpy.Minimize(0.5 * cvxpy.sum_squares(y))
+    program = cvxpy.Problem(distance, [side.constraint for side in sides])
+    return _Compiled(program, y, sides)

@@ -296,7 +296,8 @@ def _start(work, guess, record_size):
         work.place[i] = i
     if work.soft != 0.0 and len(guess) > 0:
         _start_at_caps(work, guess)
-    add_multipliers(work, 0)
+    # for a literal number numba would compile the function once more
+    add_multipliers(work, np.int64(0))
     scale(-1.0, work.slope, work.free_rhs, n)
     if work.tag == 0.0:
         solve_transposed(work.L, n, work.free_rhs)

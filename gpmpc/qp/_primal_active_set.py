@@ -24,7 +24,6 @@ Phase 1, which the paper leaves open, is a linear program: the least t with ``A 
 h``. If t = 0 its x is feasible; if not, its multipliers are Farkas' proof that no x is.
 """
 
-from contextlib import suppress
 from dataclasses import dataclass
 from time import perf_counter
 from typing import NamedTuple
@@ -71,6 +70,16 @@ class _Rows(NamedTuple):
     factor: Array  # (r,) and by what that constraint was multiplied
 
 
+class _End(NamedTuple):
+    """The point at which the iteration ended."""
+
+    status: Status
+    x: Array
+    iterations: int
+    multipliers: Array | None = None  # (M,) zero if None
+    active: Array | None = None  # (M,) as in ``make_solution``; no row if None
+
+
 @dataclass(frozen=True)
 class PrimalActiveSet:
     """The paper's Algorithm 1 with phase 1; an object holds settings only.
@@ -93,99 +102,104 @@ class PrimalActiveSet:
     def solve(
         self, problem: QuadraticProgram, warm_start: WarmStart = None
     ) -> QPSolution:
-        """The minimiser, from a warm start of any kind; see ``QPSolver``."""
+        """Solves one problem, from a warm start of any kind; see ``QPSolver``."""
         began = perf_counter()
-        n = len(problem.q)
-        M = len(problem.lower)
         rows = _one_sided(problem)
-        start = np.zeros(n)
-        names = np.zeros(0)
-        given = as_record(warm_start, n, M)
-        if len(given) and (given[layout.VARIABLES], given[layout.CONSTRAINTS]) == (
-            n,
-            M,
-        ):
-            names = layout.working_names(given, n, M)
-            start = np.nan_to_num(
-                given[layout.HEADER : layout.HEADER + n], posinf=0.0, neginf=0.0
-            )
+        warm_record = as_record(warm_start, len(problem.q), len(problem.lower))
+        start, labels = _read_warm_start(warm_record, problem)
+        x, ray = _phase_1(rows, start, len(problem.lower))
+        if ray is None:
+            working = _guessed_rows(rows, x, labels)
+            end = self._iterate(problem, rows, x, working)
+        else:
+            proven = proves_infeasibility(ray, problem.G, problem.lower, problem.upper)
+            status = Status.INFEASIBLE if proven else Status.NUMERICAL_TROUBLE
+            end = _End(status, x, iterations=0, multipliers=ray)
+        solution = self._judge(problem, end)
+        return solution._replace(solve_seconds=perf_counter() - began)
 
-        def finish(status, x, multipliers, active, iterations):
-            solution = make_solution(
-                problem,
-                status,
-                x,
-                multipliers,
-                active_set=active,
-                iterations=iterations,
-            )
-            if status in (
-                Status.SOLVED,
-                Status.NUMERICAL_TROUBLE,
-            ):  # it is checked, and its last digits are found
-                solution.record[:] = rescue(problem, solution.caps, solution.record)
-                if solution.status is not Status.INFEASIBLE and not solution.is_optimal(
-                    self.tolerance
-                ):
-                    solution.record[layout.STATUS] = layout.NUMERICAL_TROUBLE
-            return solution._replace(solve_seconds=perf_counter() - began)
-
-        nothing = np.zeros(M)
-        x, ray = _phase_1(rows, start, M)
-        if ray is not None:
-            proven = proves_infeasibility(ray, *problem[2:])
-            return finish(
-                Status.INFEASIBLE if proven else Status.NUMERICAL_TROUBLE,
-                x,
-                ray,
-                nothing,
-                0,
-            )
+    def _iterate(
+        self, problem: QuadraticProgram, rows: _Rows, x: Array, working: list[int]
+    ) -> _End:
+        """Runs Algorithm 1 from a feasible x and rows that hold with equality there."""
         limit = self.iteration_limit or 200 + 20 * len(rows.h)
-        guessed = np.isin(
-            (rows.stacked + 1) * np.sign(rows.factor), names
-        )  # and they hold with equality at x
-        guessed &= np.abs(rows.A @ x - rows.h) <= _INSIDE * np.maximum(
-            1.0, np.abs(rows.h)
-        )
-        working = list(np.flatnonzero(rows.equality | guessed))
-        still = full_steps = 0
+        zero_steps = 0
+        full_steps = 0
         for iteration in range(limit):
             A = rows.A[working]
-            d = np.full(n, np.nan)
-            multipliers = nothing
-            with suppress(
-                ValueError
-            ):  # from SciPy: not finite, or no longer positive definite
+            gradient = problem.P @ x + problem.q
+            try:
                 d, multipliers = _minimise_on_rows(
-                    problem.P, problem.P @ x + problem.q, A, rows.h[working] - A @ x
+                    problem.P, gradient, A, gap=rows.h[working] - A @ x
                 )
+            except ValueError:  # from SciPy: not finite, or no longer positive definite
+                return _End(Status.NUMERICAL_TROUBLE, x, iteration)
             if not np.isfinite(d).all():
-                return finish(Status.NUMERICAL_TROUBLE, x, nothing, nothing, iteration)
-            if full_steps == _FULL_STEPS or np.abs(d).max() <= _STILL * max(
-                1.0, np.abs(x).max()
-            ):
+                return _End(Status.NUMERICAL_TROUBLE, x, iteration)
+
+            is_still = np.abs(d).max() <= _STILL * max(1.0, np.abs(x).max())
+            if is_still or full_steps == _FULL_STEPS:
                 droppable = np.where(rows.equality[working], np.inf, multipliers)
                 if not working or droppable.min() >= 0.0:
-                    stacked = _stack(rows, working, multipliers, M)
-                    active = np.zeros(M)
+                    stacked = _stack(rows, working, multipliers, len(problem.lower))
+                    active = np.zeros(len(problem.lower))
                     active[rows.stacked[working]] = np.sign(rows.factor[working])
-                    return finish(Status.SOLVED, x, stacked, active, iteration)
-                drop = (
-                    np.argmax(droppable < 0.0)
-                    if still > _ZERO_STEPS
-                    else np.argmin(droppable)
-                )
-                working.pop(int(drop))
+                    return _End(Status.SOLVED, x, iteration, stacked, active)
+                leaving = np.argmin(droppable)
+                if zero_steps > _ZERO_STEPS:  # Bland's rule
+                    leaving = np.argmax(droppable < 0.0)
+                working.pop(int(leaving))
                 full_steps = 0
                 continue
+
             kappa, blocking = _step_length(rows, x, d, working)
             x = x + kappa * d
-            still = still + 1 if kappa == 0.0 else 0
+            zero_steps = zero_steps + 1 if kappa == 0.0 else 0
             full_steps = full_steps + 1 if blocking is None else 0
             if blocking is not None:
                 working = sorted([*working, blocking])
-        return finish(Status.ITERATION_LIMIT, x, nothing, nothing, limit)
+        return _End(Status.ITERATION_LIMIT, x, limit)
+
+    def _judge(self, problem: QuadraticProgram, end: _End) -> QPSolution:
+        """Returns the solution, whose last digits are found and residuals checked."""
+        nothing = np.zeros(len(problem.lower))
+        solution = make_solution(
+            problem,
+            end.status,
+            end.x,
+            nothing if end.multipliers is None else end.multipliers,
+            active_set=nothing if end.active is None else end.active,
+            iterations=end.iterations,
+        )
+        if end.status in (Status.SOLVED, Status.NUMERICAL_TROUBLE):
+            solution.record[:] = rescue(problem, solution.caps, solution.record)
+            infeasible = solution.status is Status.INFEASIBLE
+            if not infeasible and not solution.is_optimal(self.tolerance):
+                solution.record[layout.STATUS] = layout.NUMERICAL_TROUBLE
+        return solution
+
+
+def _read_warm_start(record: Array, problem: QuadraticProgram) -> tuple[Array, Array]:
+    """Returns the point and the labels of working constraints to start from."""
+    n = len(problem.q)
+    M = len(problem.lower)
+    if not len(record):
+        return np.zeros(n), np.zeros(0)
+    if record[layout.VARIABLES] != n or record[layout.CONSTRAINTS] != M:
+        return np.zeros(n), np.zeros(0)
+    x = record[layout.HEADER : layout.HEADER + n]
+    return (
+        np.nan_to_num(x, posinf=0.0, neginf=0.0),
+        layout.working_names(record, n, M),
+    )
+
+
+def _guessed_rows(rows: _Rows, x: Array, labels: Array) -> list[int]:
+    """Returns equalities and the labelled rows that hold with equality at x."""
+    guessed = np.isin((rows.stacked + 1) * np.sign(rows.factor), labels)
+    distance = np.abs(rows.A @ x - rows.h)
+    tight = distance <= _INSIDE * np.maximum(1.0, np.abs(rows.h))
+    return list(np.flatnonzero(rows.equality | (guessed & tight)))
 
 
 def _one_sided(problem: QuadraticProgram) -> _Rows:
@@ -246,7 +260,10 @@ def farkas_ray(problem: QuadraticProgram) -> Array | None:
     None if it finds none.
     """
     _, ray = _phase_1(_one_sided(problem), np.zeros(len(problem.q)), len(problem.lower))
-    return None if ray is None or not proves_infeasibility(ray, *problem[2:]) else ray
+    if ray is None:
+        return None
+    proven = proves_infeasibility(ray, problem.G, problem.lower, problem.upper)
+    return ray if proven else None
 
 
 def _minimise_on_rows(
@@ -277,24 +294,20 @@ def _minimise_on_rows(
 def _step_length(
     rows: _Rows, x: Array, d: Array, working: list[int]
 ) -> tuple[float, int | None]:
-    """Kappa in [0, 1] and the row that blocks, if one does."""
+    """Returns kappa in [0, 1] and the row that blocks, if one does."""
     speed = rows.A @ d
     speed[working] = 0.0
     room = np.maximum(rows.h - rows.A @ x, 0.0)
     towards = speed > _STILL * np.linalg.norm(d)
     kappas = np.where(towards, room / np.where(towards, speed, 1.0), 1.0)
-    blocking = int(
-        np.argmin(np.append(kappas, 1.0))
-    )  # the last where none blocks before
-    return (
-        (float(kappas[blocking]), blocking)
-        if blocking < len(kappas) and kappas[blocking] < 1.0
-        else (1.0, None)
-    )
+    blocking = int(np.argmin(np.append(kappas, 1.0)))
+    if blocking == len(kappas) or kappas[blocking] >= 1.0:
+        return 1.0, None
+    return float(kappas[blocking]), blocking
 
 
 def _stack(rows: _Rows, which, multipliers: Array, M: int) -> Array:
-    """Multipliers (M,) of the stacked constraints from those of some one-sided rows."""
+    """Returns multipliers (M,) of stacked constraints from those of one-sided rows."""
     stacked = np.zeros(M)
     np.add.at(stacked, rows.stacked[which], multipliers * rows.factor[which])
     return stacked

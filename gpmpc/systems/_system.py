@@ -124,7 +124,8 @@ class System:
             if name not in self.tracked:
                 raise SettingError(
                     "rates",
-                    f"must be of tracked states, {', '.join(self.tracked)}; got {name!r}",
+                    f"must be of tracked states, {', '.join(self.tracked)}; "
+                    f"got {name!r}",
                 )
         if len(found := {self.units[name] for name in self.tracked}) > 1:
             raise SettingError(
@@ -264,7 +265,8 @@ class System:
         got = len(entries) if hasattr(entries, "__len__") else type(entries).__name__
         if got != (n := len(self.dynamics.state_names)):
             raise ShapeError(
-                f"{method} must give {n} entries, one for each of state_names; got {got}"
+                f"{method} must give {n} entries, one for each of state_names; "
+                f"got {got}"
             )
         return entries
 
@@ -299,7 +301,8 @@ class System:
             if not isfinite(entry):
                 raise SettingError(
                     "dynamics",
-                    f"must be finite at state {x}, input {u}; {name} is {entry} after it",
+                    f"must be finite at state {x}, input {u}; "
+                    f"{name} is {entry} after it",
                 )
 
 
@@ -314,13 +317,16 @@ def step(plant: System, state: Array, input: Array) -> Array:
         ShapeError: State or input are of another length.
         DataError: They are no real numbers, or have other names than the plant's.
     """
-    names = plant.dynamics.state_names, plant.dynamics.input_names
-    state = read_array("state", state, names[0])
-    input = read_array("input", input, names[1])
-    shapes = ((len(names[0]),), (len(names[1]),))
-    if (found := (np.shape(state), np.shape(input))) != shapes:
+    state_names = plant.dynamics.state_names
+    input_names = plant.dynamics.input_names
+    state = read_array("state", state, state_names)
+    input = read_array("input", input, input_names)
+    n = len(state_names)
+    m = len(input_names)
+    if np.shape(state) != (n,) or np.shape(input) != (m,):
         raise ShapeError(
-            f"state and input must have shapes {shapes[0]} and {shapes[1]}; got {found[0]} and {found[1]}"
+            f"state and input must have shapes {(n,)} and {(m,)}; "
+            f"got {np.shape(state)} and {np.shape(input)}"
         )
     return np.array(plant.successor(state, input), dtype=float)
 

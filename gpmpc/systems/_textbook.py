@@ -335,7 +335,9 @@ def planar_quadrotor(time_step: float = 0.05, **parameters: float) -> System:
 
 @dataclass(frozen=True)
 class StirredTank(_Body):
-    """A continuous stirred-tank reactor with an exothermic reaction A -> B at first order, steered by its coolant.
+    """A continuous stirred-tank reactor with an exothermic reaction A -> B.
+
+    The reaction is of first order, and the coolant steers it.
 
     The reactor of Henson and Seborg (1997, Nonlinear Process Control, chapter 1). Its
     operating point, 0.5 mol/L at 350 K and 300 K of the coolant, is unstable. Times are

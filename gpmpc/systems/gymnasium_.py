@@ -70,7 +70,8 @@ class _Environment(Simulator):
         self.input_names = tuple(input_names or [f"u{i + 1}" for i in range(m)])
         if (found := (len(self.state_names), len(self.input_names))) != (n, m):
             raise ShapeError(
-                f"state_names and input_names must be {n} and {m} names; got {found[0]} and {found[1]}"
+                f"state_names and input_names must be {n} and {m} names; "
+                f"got {found[0]} and {found[1]}"
             )
 
     def _reset(self, seed: int) -> Array:

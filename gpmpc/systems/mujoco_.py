@@ -69,7 +69,10 @@ class _Joints(_Model):
         kinds = {int(joint.mjJNT_SLIDE), int(joint.mjJNT_HINGE)}
         found = self.indices("joint", joints)
         if model.njnt != len(found) or not set(model.jnt_type.tolist()) <= kinds:
-            what = f"must name all {model.njnt} joints of {path}, hinges and slides; name sensors of other models"
+            what = (
+                f"must name all {model.njnt} joints of {path}, hinges and slides; "
+                "name sensors of other models"
+            )
             raise SettingError("joints", f"{what}; got {list(joints)}")
         self.substeps = substeps
         q = model.jnt_qposadr[found]

@@ -68,7 +68,9 @@ def _check_attributes(model: DynamicsModel) -> None:
         and tuple(noise.shape) == (k, k)
         and noise.dtype == model.dtype
     )
-    got = f"got {type(noise).__name__} {getattr(noise, 'dtype', '')} {tuple(getattr(noise, 'shape', ()))}"
+    dtype = getattr(noise, "dtype", "")
+    shape = tuple(getattr(noise, "shape", ()))
+    got = f"got {type(noise).__name__} {dtype} {shape}"
     require(
         right, f"noise_covariance is a {model.dtype} tensor of shape ({k}, {k})", got
     )

@@ -21,7 +21,10 @@ def require_close(
     what: str = "it",
     floor: float = 1.0,
 ) -> None:
-    """Raises unless two tensors differ by at most a part of the expected one's size (of ``floor`` if that is more)."""
+    """Raises unless two tensors differ by at most a share of the expected one's size.
+
+    The share is of ``floor`` if that is more.
+    """
     got = got.detach().double()
     expected = expected.detach().double()
     require(
@@ -29,13 +32,13 @@ def require_close(
         promise,
         f"{what} has shape {[*got.shape]}, should be {[*expected.shape]}",
     )
-    error, size = (
-        part.abs().amax() if part.numel() else 0.0
-        for part in (got - expected, expected)
+    error = _largest(got - expected)
+    bound = tolerance * max(floor, _largest(expected))
+    text = (
+        f"{what} is off by {error:.2e} (allowed {bound:.1e}):\n"
+        f"got      {got}\nexpected {expected}"
     )
-    bound = tolerance * max(floor, float(size))
-    text = f"{what} is off by {float(error):.2e} (allowed {bound:.1e}):\ngot      {got}\nexpected {expected}"
-    require(float(error) <= bound, promise, text)  # false for NaN as well
+    require(error <= bound, promise, text)  # false for NaN as well
 
 
 def require_covariance(name: str, covariance: Tensor) -> None:
@@ -60,3 +63,8 @@ def require_covariance(name: str, covariance: Tensor) -> None:
         f"{name}: the covariance is positive semidefinite",
         text,
     )
+
+
+def _largest(tensor: Tensor) -> float:
+    """Returns the largest size of an entry, zero if there is none."""
+    return float(tensor.abs().amax()) if tensor.numel() else 0.0

@@ -273,7 +273,10 @@ def _check_without_covariance(case: _Case) -> None:
         promise = (
             f"the {name} approaches the plain prediction as the covariance vanishes"
         )
-        text = f"with the covariance times 1e-2 it is {far:.2e} away, times 1e-6 still {near:.2e}"
+        text = (
+            f"with the covariance times 1e-2 it is {far:.2e} away, "
+            f"times 1e-6 still {near:.2e}"
+        )
         require(near <= rate * far + 1e-9, promise, text)
 
 
@@ -359,7 +362,10 @@ def _check_monte_carlo(case: _Case) -> None:
         off = (draws.mean(0) - claimed[name]).abs()
         worst = float((off / (error + 1e-9 * draws.abs().max() + 1e-300)).max())
         promise = f"an exact method's {name} agrees with {_DRAWS} draws of Monte Carlo"
-        text = f"it is {worst:.1f} standard errors away:\n{claimed[name].tolist()} is off by {off.tolist()}"
+        text = (
+            f"it is {worst:.1f} standard errors away:\n"
+            f"{claimed[name].tolist()} is off by {off.tolist()}"
+        )
         require(worst < 5, promise, text)
 
 
