@@ -1,4 +1,4 @@
-"""Systems that are controlled: their names, dynamics and tasks."""
+"""Systems that are controlled: what they are called, how they move, how they are flown."""
 
 from gpmpc.systems._quadrotor import (
     ATTITUDES,

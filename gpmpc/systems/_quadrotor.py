@@ -1,13 +1,10 @@
-"""The quadrotor of Cao, Lai and Alam (2017).
+"""The quadrotor of Cao, Lai and Alam (2017), whole and split into its translational and its rotational subsystem.
 
-Whole and split into its translational and its rotational subsystem.
-
-Parameters are decoded from the authors' data. The z axis points downwards. The
-translational subsystem is driven by the total thrust U1 and by the direction (ux, uy)
-of the thrust, which the attitude has to provide; the rotational subsystem provides it,
-driven by the moments' forces U2, U3, U4. The paper's x and y accelerate *along* (ux,
-uy), so they point against those of the aerospace convention, and its angles' rates are
-taken for the body rates, which is good for small angles.
+Parameters are decoded from the authors' data. The z axis points downwards. The translational subsystem is driven by the
+total thrust U1 and by the direction (ux, uy) of the thrust, which the attitude has to provide; the rotational subsystem
+provides it, driven by the moments' forces U2, U3, U4. The paper's x and y accelerate *along* (ux, uy), so they point
+against those of the aerospace convention, and its angles' rates are taken for the body rates, which is good for small
+angles.
 """
 
 import math
@@ -33,9 +30,7 @@ _ANGLE_UNITS = dict.fromkeys(("phi", "theta", "psi"), "rad") | dict.fromkeys(
 _FOLLOWS_POSITIONS: dict[str, Any] = {
     "tracked": ("x", "y", "z"),
     "rates": {"vx": "x", "vy": "y", "vz": "z"},
-    # a hundred times what a controlled one is off; twice where a fifth more mass than
-    # learned holds it
-    "lost": 10.0,
+    "lost": 10.0,  # a hundred times what a controlled one is off; twice where a fifth more mass than learned holds it
     "z_down": True,
 }
 
@@ -48,9 +43,8 @@ class Translational:
     """
 
     mass: float = 0.74  #: [kg]
-    #: Roll and pitch [rad] whose cos(phi) cos(theta) multiplies the vertical thrust;
-    #: the paper's data hold both at pi/4. None takes the factor of the inputs at psi =
-    #: 0, cos(phi) cos(theta) = sqrt(1 - ux^2 - uy^2).
+    #: Roll and pitch [rad] whose cos(phi) cos(theta) multiplies the vertical thrust; the paper's data hold both at
+    #: pi/4. None takes the factor of the inputs at psi = 0, cos(phi) cos(theta) = sqrt(1 - ux^2 - uy^2).
     frozen_attitude: tuple[float, float] | None = None
 
     state_names = ("x", "vx", "y", "vy", "z", "vz")
@@ -66,9 +60,8 @@ class Translational:
         """d/dt (x, vx, y, vy, z, vz) [m/s, m/s^2]."""
         thrust = u[0] / self.mass  # U1 / m [m/s^2]
         if self.frozen_attitude is None:
-            # No direction with ux^2 + uy^2 > 1 exists; there the thrust is horizontal:
-            # max(s, 0) = (s + |s|) / 2. The two small terms keep both roots
-            # differentiable where their argument would be zero.
+            # No direction with ux^2 + uy^2 > 1 exists; there the thrust is horizontal: max(s, 0) = (s + |s|) / 2.
+            # The two small terms keep both roots differentiable where their argument would be zero.
             squared = 1 - u[1] * u[1] - u[2] * u[2]
             vertical = (
                 (squared + (squared * squared + 1e-24) ** 0.5) / 2 + 1e-12
@@ -99,8 +92,7 @@ class Rotational:
         0.005,
         0.0089,
     )  #: principal moments Ixx, Iyy, Izz [kg m^2]
-    #: the rotors' gyroscopic terms Jr W / Ixx and Jr W / Iyy, at their constant speed W
-    #: [1/s]
+    #: the rotors' gyroscopic terms Jr W / Ixx and Jr W / Iyy, at their constant speed W [1/s]
     gyroscopic: tuple[float, float] = (0.01102, 0.01102)
 
     state_names = ("phi", "p", "theta", "q", "psi", "r")
@@ -130,12 +122,9 @@ class Rotational:
 
 @dataclass(frozen=True)
 class Coupled:
-    """A quadrotor with states of position, velocity, attitude and body rates.
+    """Position, velocity, attitude and body rates, driven by the thrust and the moments' forces.
 
-    Its inputs are the thrust and the moments' forces.
-
-    States x, vx, y, vy, z, vz [m, m/s], phi, p, theta, q, psi, r [rad, rad/s]; inputs
-    U1, U2, U3, U4 [N].
+    States x, vx, y, vy, z, vz [m, m/s], phi, p, theta, q, psi, r [rad, rad/s]; inputs U1, U2, U3, U4 [N].
     """
 
     mass: float = 0.74  #: of the vehicle [kg]
@@ -169,10 +158,7 @@ class Coupled:
 
 @dataclass(frozen=True)
 class Map:
-    """Reads a right-hand side as the next state, x[k+1] = f(x[k], u[k]).
-
-    So do the data of Cao, Lai and Alam (2017).
-    """
+    """Reads a right-hand side as the next state, x[k+1] = f(x[k], u[k]): the data of Cao, Lai and Alam (2017) do."""
 
     dynamics: Any  #: the right-hand side f
 
@@ -188,10 +174,7 @@ class Map:
 def translational(
     time_step: float = 1.0, substeps: int = 1, **parameters: Any
 ) -> System:
-    """Makes the translational subsystem.
-
-    One Runge-Kutta substep is exact: the acceleration follows from the input.
-    """
+    """Makes the translational subsystem; one Runge-Kutta substep is exact, its acceleration follows from the input."""
     return System(
         Translational(**parameters),
         time_step,
@@ -210,10 +193,7 @@ def translational(
 def rotational(
     time_step: float = 0.05, substeps: int = 10, **parameters: Any
 ) -> System:
-    """Makes the rotational subsystem at 20 Hz.
-
-    A trajectory prescribes the attitudes that a flight along it needs.
-    """
+    """Makes the rotational subsystem at 20 Hz; a trajectory prescribes the attitudes that a flight along it needs."""
     return System(
         Rotational(**parameters),
         time_step,
@@ -235,10 +215,7 @@ def rotational(
 def coupled(
     mass: float = 0.74, time_step: float = 0.05, substeps: int = 2, **parameters: Any
 ) -> System:
-    """Makes the whole quadrotor at the rate of its inner loop.
-
-    It takes a mass [kg] and the ``parameters`` of ``Rotational``.
-    """
+    """Makes the whole quadrotor at the rate of its inner loop, of a mass [kg] and ``parameters`` of ``Rotational``."""
     return System(
         Coupled(mass, Rotational(**parameters)),
         time_step,
@@ -257,10 +234,7 @@ def coupled(
 
 
 def thrust_direction(phi: Any, theta: Any, psi: Any) -> tuple[Any, Any, Any]:
-    """Returns the unit vector along the thrust (ux, uy, lift) [-].
-
-    Angles are roll, pitch and yaw [rad]; Cao et al. (2017), eq. (2).
-    """
+    """The unit vector along the thrust (ux, uy, lift) [-] of roll, pitch and yaw [rad]; Cao et al. (2017), eq. (2)."""
     ux = cos(phi) * sin(theta) * cos(psi) + sin(phi) * sin(psi)
     uy = cos(phi) * sin(theta) * sin(psi) - sin(phi) * cos(psi)
     return ux, uy, cos(phi) * cos(theta)
@@ -272,15 +246,11 @@ def attitude_for_thrust_direction(
     psi: np.ndarray | float = 0.0,
     convention: str = "exact",
 ) -> np.ndarray:
-    """Returns roll and pitch (*batch, 2) [rad] that point the thrust along (ux, uy).
+    """Roll and pitch (*batch, 2) [rad] that point the thrust along (ux, uy) at a yaw psi, by eq. (2) inverted.
 
-    At a yaw psi, by eq. (2) inverted.
-
-    Turned by -psi, eq. (2) is that of psi = 0, where ux = cos(phi) sin(theta) and uy =
-    -sin(phi) give phi = -asin(uy) and theta = asin(ux / cos(phi)). The authors' data
-    hold theta = sign(phi) asin(ux) instead, which the convention ``"paper"`` takes in
-    the place of ``"exact"``; any other is a ``SettingError``. ux and uy saturate at 1
-    and -1.
+    Turned by -psi, eq. (2) is that of psi = 0, where ux = cos(phi) sin(theta) and uy = -sin(phi) give phi = -asin(uy)
+    and theta = asin(ux / cos(phi)). The authors' data hold theta = sign(phi) asin(ux) instead, which the convention
+    ``"paper"`` takes in the place of ``"exact"``; any other is a ``SettingError``. ux and uy saturate at 1 and -1.
     """
     check_choice("attitude", convention, ATTITUDES)
     ux, uy = ux * np.cos(psi) + uy * np.sin(psi), uy * np.cos(psi) - ux * np.sin(psi)
@@ -299,13 +269,10 @@ def attitude_for_thrust_direction(
 def attitudes_along(
     trajectory: Trajectory, count: int, outer_step: float = OUTER_STEP
 ) -> np.ndarray:
-    """Roll and pitch (count, 2) [rad], one an outer step.
+    """Roll and pitch (count, 2) [rad], one an outer step, that point the thrust where the trajectory needs it.
 
-    That point the thrust where the trajectory needs it.
-
-    Between two outer steps the velocity has to change by v[k+1] - v[k], so the thrust
-    has to give the mean acceleration a = (v[k+1] - v[k]) / T beside the weight: U1 / m
-    = |a - g e_z|, ux = a_x / (U1 / m), uy = a_y / (U1 / m).
+    Between two outer steps the velocity has to change by v[k+1] - v[k], so the thrust has to give the mean acceleration
+    a = (v[k+1] - v[k]) / T beside the weight: U1 / m = |a - g e_z|, ux = a_x / (U1 / m), uy = a_y / (U1 / m).
     """
     velocities = trajectory.velocity(outer_step * np.arange(count + 1))
     force = np.diff(velocities, axis=0) / outer_step - [
@@ -322,13 +289,9 @@ def attitudes_along(
 def approach_attitudes(
     angles: np.ndarray, count: int, hold: int, time_step: float, response_time: float
 ) -> np.ndarray:
-    """Returns rotational states (count, 6) that approach one attitude after another.
+    """Rotational states (count, 6) that approach attitudes one after another at first order, as ``Cascade`` asks it to.
 
-    They do so at first order, as ``Cascade`` asks it
-    to.
-
-    Roll and pitch (K, 2) [rad], from the first of them on, are asked for ``hold`` inner
-    steps each; times [s].
+    Roll and pitch (K, 2) [rad], from the first of them on, are asked for ``hold`` inner steps each; times [s].
     """
     left = np.exp(-time_step / response_time)  # of the way, after one step
     states = np.zeros((count, 6))
@@ -344,10 +307,7 @@ def approach_attitudes(
 def rotational_states_along(
     trajectory: Trajectory, count: int, time_step: float
 ) -> np.ndarray:
-    """Returns rotational states phi, p, theta, q, psi, r (count, 6) [rad, rad/s].
-
-    There is one per inner step of a flight along the trajectory.
-    """
+    """Rotational states phi, p, theta, q, psi, r (count, 6) [rad, rad/s], one an inner step, of a flight along it."""
     hold = max(1, round(OUTER_STEP / time_step))
     angles = attitudes_along(trajectory, -(-count // hold))
     return approach_attitudes(angles, count, hold, time_step, RESPONSE_TIME)

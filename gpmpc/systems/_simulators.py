@@ -1,7 +1,4 @@
-"""The common part of systems of foreign simulators.
-
-Such a system moves on by itself, from where it stands.
-"""
+"""What systems of foreign simulators have in common: they move on by themselves, from where they stand."""
 
 from importlib import import_module
 from typing import Any
@@ -14,10 +11,7 @@ Array = np.ndarray
 
 
 def library(name: str) -> Any:
-    """Imports a library of the extra ``sim``.
-
-    Raises ``SettingError`` if it is not installed.
-    """
+    """Imports a library of the extra ``sim``; ``SettingError`` where it is not installed."""
     try:
         return import_module(name)
     except ImportError as error:
@@ -27,10 +21,7 @@ def library(name: str) -> Any:
 
 
 def numbers(x: Any, u: Any) -> tuple[Array, Array]:
-    """Returns states and inputs as arrays.
-
-    Raises ``SettingError`` if they are no numbers.
-    """
+    """Returns states and inputs as arrays; ``SettingError`` where they are no numbers."""
     try:
         return np.array(x, dtype=float), np.array(u, dtype=float)
     except (TypeError, ValueError, NotImplementedError) as error:
@@ -54,12 +45,9 @@ class Simulator:
         return self._now.copy()
 
     def successor(self, x: Any, u: Any) -> Array:
-        """Steps the simulator from a state (n,) with an input (m,).
+        """Steps the simulator from a state (n,) with an input (m,); returns the next state.
 
-        Returns the next state.
-
-        ``SettingError`` where it does not stand in that state and cannot be set to it,
-        or x and u are no numbers.
+        ``SettingError`` where it does not stand in that state and cannot be set to it, or x and u are no numbers.
         """
         state, input = numbers(x, u)
         if state.ndim != 1:

@@ -1,4 +1,4 @@
-"""Describes a system that is controlled: its names, dynamics and task."""
+"""Describes a system that is controlled: how it moves, what its states and inputs are called, how it is flown."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -27,23 +27,18 @@ UNKNOWN = "?"  # the unit of a state or an input that has none given
 
 @dataclass(frozen=True, eq=False)
 class System:
-    """A discrete-time system.
+    """A discrete-time system; whatever a run, a report, a recording or a figure says of it comes from here.
 
-    Runs, reports, recordings and figures take all they say of it from here.
-
-    Its ``dynamics`` have the names of the n states and m inputs, in order
-    (``state_names``, ``input_names``), and one method of two: ``derivative(x, u)``, the
-    n entries of dx/dt, or ``successor(x, u)``, those of the next state. They are
-    written once, with plain arithmetic on the entries of x and u, so that floats, NumPy
-    arrays and CasADi expressions all pass through the same formula; ``sin``, ``cos``
-    and ``exp`` are for all of them. A right-hand side is integrated with the input held
-    constant, by the Runge-Kutta method of order four on equal substeps.
+    Its ``dynamics`` have the names of the n states and m inputs, in order (``state_names``, ``input_names``), and one
+    method of two: ``derivative(x, u)``, the n entries of dx/dt, or ``successor(x, u)``, those of the next state. They
+    are written once, with plain arithmetic on the entries of x and u, so that floats, NumPy arrays and CasADi
+    expressions all pass through the same formula; ``sin``, ``cos`` and ``exp`` are for all of them. A right-hand side
+    is integrated with the input held constant, by the Runge-Kutta method of order four on equal substeps.
 
     Raises:
-        SettingError: A number out of range, an unknown name, tracked states of several
-            units, or dynamics without a finite value where the system starts.
-        ShapeError: A list has another length than there are states or inputs, or the
-            dynamics have.
+        SettingError: A number out of range, an unknown name, tracked states of several units, or dynamics without a
+            finite value where the system starts.
+        ShapeError: A list has another length than there are states or inputs, or the dynamics have.
     """
 
     dynamics: Any  #: names of states and inputs, and how it moves
@@ -55,36 +50,30 @@ class System:
     )  #: by name of state or input, such as ``{"x": "m"}``
     input_lower: Any = None  #: smallest inputs (m,); None where there is no limit
     input_upper: Any = None  #: largest inputs (m,)
-    #: the input before the first step (m,), such as the one at rest; zero by default
-    initial_input: Any = None
+    initial_input: Any = None  #: the input before the first step (m,), such as the one at rest; zero by default
     start: Any = None  #: where a flight begins (n,); on its reference by default
-    #: the state that is held where no trajectory is followed (n,); zero by default
-    goal: Any = None
+    goal: Any = None  #: the state that is held where no trajectory is followed (n,); zero by default
     region: Any = (
         None  #: smallest and largest states that random data start from (2, n)
     )
     angles: Sequence[
         str
     ] = ()  #: states whose errors are taken within half a turn [rad]
-    #: states that a trajectory prescribes and errors are reported of, in one unit; by
-    #: default all in that of the first
+    #: states that a trajectory prescribes and errors are reported of, in one unit; by default all in that of the first
     tracked: Sequence[str] = ()
-    #: for a state, the tracked one that it is the time derivative of, such as ``{"vx":
-    #: "x"}``
+    #: for a state, the tracked one that it is the time derivative of, such as ``{"vx": "x"}``
     rates: Mapping[str, str] = field(default_factory=dict)
-    #: a flight is not lost while its tracked states are nearer than this to their
-    #: reference, in their unit; with infinity only one that leaves the finite numbers
-    #: is
+    #: a flight is not lost while its tracked states are nearer than this to their reference, in their unit; with
+    #: infinity only one that leaves the finite numbers is
     lost: float = inf
-    #: from a trajectory, a count K and the time step to reference states (K, n), where
-    #: a trajectory prescribes something other than tracked states
+    #: from a trajectory, a count K and the time step to reference states (K, n), where a trajectory prescribes
+    #: something other than tracked states
     references: Callable[[Trajectory, int, float], Array] | None = None
-    #: states that say where it is in space and how it is turned, by x, y, z, roll,
-    #: pitch, yaw; pictures show it there
+    #: states that say where it is in space and how it is turned, by x, y, z, roll, pitch, yaw; pictures show it there
     pose: Mapping[str, str] = field(default_factory=dict)
     z_down: bool = False  #: whether the z axis of that space points downwards
-    #: what is known of it before anything is learned, as a system with its states,
-    #: inputs and time step; a model of differences learns what it misses
+    #: what is known of it before anything is learned, as a system with its states, inputs and time step; a model of
+    #: differences learns what it misses
     nominal: "System | None" = None
 
     def __post_init__(self) -> None:
@@ -124,8 +113,7 @@ class System:
             if name not in self.tracked:
                 raise SettingError(
                     "rates",
-                    f"must be of tracked states, {', '.join(self.tracked)}; "
-                    f"got {name!r}",
+                    f"must be of tracked states, {', '.join(self.tracked)}; got {name!r}",
                 )
         if len(found := {self.units[name] for name in self.tracked}) > 1:
             raise SettingError(
@@ -180,10 +168,7 @@ class System:
 
     @cached_property
     def signals(self) -> Signals:
-        """The names of states and inputs, and the time step.
-
-        Data and models of the system carry them.
-        """
+        """Names of states and inputs, and time step: what data and models of it carry."""
         return Signals(self.state_names, self.input_names, self.time_step)
 
     @property
@@ -207,13 +192,10 @@ class System:
         return [self.state_names.index(name) for name in self.angles]
 
     def successor(self, x: Any, u: Any) -> list[Any]:
-        """Returns the n entries of x[k+1], from the entries of x[k] and u[k].
-
-        Entries are floats, arrays, or symbols.
+        """The n entries of x[k+1], from the entries of x[k] and u[k]: floats, arrays, or symbols.
 
         Raises:
-            ShapeError: The dynamics have another number of entries than there are
-                states.
+            ShapeError: The dynamics have another number of entries than there are states.
         """
         if hasattr(self.dynamics, "successor"):
             return list(self._check_length("successor", self.dynamics.successor(x, u)))
@@ -232,13 +214,10 @@ class System:
         return x
 
     def reference_states(self, trajectory: Trajectory | None, count: int) -> Array:
-        """Computes the states to follow (count, n), one per time step.
-
-        Without a trajectory they are the goal.
+        """Computes the states to follow (count, n), one per time step; the goal where there is no trajectory.
 
         Raises:
-            ShapeError: The trajectory prescribes another number of states than are
-                tracked.
+            ShapeError: The trajectory prescribes another number of states than are tracked.
         """
         if trajectory is None:
             return np.tile(np.array(self.goal), (count, 1))
@@ -265,16 +244,12 @@ class System:
         got = len(entries) if hasattr(entries, "__len__") else type(entries).__name__
         if got != (n := len(self.dynamics.state_names)):
             raise ShapeError(
-                f"{method} must give {n} entries, one for each of state_names; "
-                f"got {got}"
+                f"{method} must give {n} entries, one for each of state_names; got {got}"
             )
         return entries
 
     def _check_dynamics(self) -> None:
-        """Evaluates the dynamics once, where the system starts.
-
-        A simulator under way is left alone, for a step would move it.
-        """
+        """Evaluates the dynamics once, where the system starts; a simulator under way a step would move."""
         if not (
             hasattr(self.dynamics, "derivative") or hasattr(self.dynamics, "successor")
         ):
@@ -301,8 +276,7 @@ class System:
             if not isfinite(entry):
                 raise SettingError(
                     "dynamics",
-                    f"must be finite at state {x}, input {u}; "
-                    f"{name} is {entry} after it",
+                    f"must be finite at state {x}, input {u}; {name} is {entry} after it",
                 )
 
 
@@ -317,25 +291,19 @@ def step(plant: System, state: Array, input: Array) -> Array:
         ShapeError: State or input are of another length.
         DataError: They are no real numbers, or have other names than the plant's.
     """
-    state_names = plant.dynamics.state_names
-    input_names = plant.dynamics.input_names
-    state = read_array("state", state, state_names)
-    input = read_array("input", input, input_names)
-    n = len(state_names)
-    m = len(input_names)
-    if np.shape(state) != (n,) or np.shape(input) != (m,):
+    names = plant.dynamics.state_names, plant.dynamics.input_names
+    state = read_array("state", state, names[0])
+    input = read_array("input", input, names[1])
+    shapes = ((len(names[0]),), (len(names[1]),))
+    if (found := (np.shape(state), np.shape(input))) != shapes:
         raise ShapeError(
-            f"state and input must have shapes {(n,)} and {(m,)}; "
-            f"got {np.shape(state)} and {np.shape(input)}"
+            f"state and input must have shapes {shapes[0]} and {shapes[1]}; got {found[0]} and {found[1]}"
         )
     return np.array(plant.successor(state, input), dtype=float)
 
 
 def step_many(plant: System, states: Array, inputs: Array) -> Array:
-    """Returns the next states (T, n) of T copies of a plant, in one evaluation.
-
-    They move from states (T, n) with inputs (T, m).
-    """
+    """The next states (T, n) of T copies of a plant, from states (T, n) and inputs (T, m), in one evaluation."""
     entries = call_dynamics(plant.successor, states.T, inputs.T)
     return np.stack(
         [

@@ -1,10 +1,7 @@
-"""Systems of textbooks.
+"""Systems of textbooks: double integrator, pendulums, cart-pole, planar quadrotor and a stirred-tank reactor.
 
-Double integrator, pendulums, cart-pole, planar quadrotor and a stirred-tank reactor.
-
-Angles are zero where a pole or a link stands upright, positive anticlockwise. Each
-function makes a system with a time step [s]; its other arguments are the attributes of
-the right-hand side.
+Angles are zero where a pole or a link stands upright, positive anticlockwise. Each function makes a system with a time
+step [s]; its other arguments are the attributes of the right-hand side.
 """
 
 from collections.abc import Sequence
@@ -17,10 +14,7 @@ from gpmpc.systems._system import GRAVITY, System, cos, exp, sin
 
 
 class _Body:
-    """Checks that every number is positive.
-
-    Numbers named in ``may_be_zero`` may be zero.
-    """
+    """Checks that every number is positive, or none below zero where its name stands in ``may_be_zero``."""
 
     may_be_zero: tuple[str, ...] = ()
     words: tuple[str, ...] = ()  # attributes that are no numbers
@@ -110,10 +104,7 @@ def pendulum(time_step: float = 0.05, **parameters: float) -> System:
 
 @dataclass(frozen=True)
 class CartPole(_Body):
-    """A pole hinged to a cart on a line, without friction.
-
-    The model is that of Barto, Sutton and Anderson (1983).
-    """
+    """A pole hinged to a cart on a line (Barto, Sutton and Anderson, 1983, without friction)."""
 
     cart_mass: float = 1.0  #: [kg]
     pole_mass: float = 0.1  #: of the uniform pole [kg]
@@ -136,10 +127,7 @@ class CartPole(_Body):
 
 
 def cart_pole(time_step: float = 0.05, **parameters: float) -> System:
-    """Makes a cart-pole whose pole hangs at first.
-
-    The angle is positive towards growing positions.
-    """
+    """Makes a cart-pole whose pole hangs at first; its angle is positive towards growing positions."""
     return System(
         CartPole(**parameters),
         time_step,
@@ -164,14 +152,11 @@ def cart_pole(time_step: float = 0.05, **parameters: float) -> System:
 
 @dataclass(frozen=True)
 class DoublePendulum(_Body):
-    """Two links in a vertical plane with a torque at one joint (Spong, 1995.
+    """Two links in a vertical plane with a torque at one joint (Spong, 1995, eqs. (1)-(2)).
 
-    Eqs. (1)-(2)).
-
-    ``shoulder`` is the angle of the first link from upright, ``elbow`` that of the
-    second from the first. The numbers are those identified for design C.1, model 1.1 of
-    the RealAIGym league (Wiebe et al., 2024; inertias were published about the joints,
-    0.031887 and 0.050870), whose second link is 0.3 m long; there is no friction.
+    ``shoulder`` is the angle of the first link from upright, ``elbow`` that of the second from the first. The numbers
+    are those identified for design C.1, model 1.1 of the RealAIGym league (Wiebe et al., 2024; inertias were published
+    about the joints, 0.031887 and 0.050870), whose second link is 0.3 m long; there is no friction.
     """
 
     masses: Sequence[float] = (0.5234602302, 0.6255677234)  #: of the links [kg]
@@ -234,10 +219,7 @@ def acrobot(
     time_step: float = 0.05,
     torque: float = 10.0,
 ) -> System:
-    """Makes an acrobot that hangs at first (Spong, 1995, and its table).
-
-    ``torque`` is the largest [N m].
-    """
+    """Makes an acrobot that hangs at first (Spong, 1995, and its table); ``torque`` is its largest [N m]."""
     links = DoublePendulum(masses, first_length, (0.5, 1.0), (0.083, 0.33))
     return _two_links("acrobot", links, time_step, 10, torque, (4.0, 6.0))
 
@@ -248,10 +230,7 @@ def double_pendulum(
     torque: float = 6.0,
     **parameters: Any,
 ) -> System:
-    """Makes the double pendulum of the RealAIGym league, which hangs at first.
-
-    ``torque`` is its largest [N m].
-    """
+    """Makes the double pendulum of the RealAIGym league, which hangs at first; ``torque`` is its largest [N m]."""
     links = DoublePendulum(actuated=actuated, **parameters)
     return _two_links("double_pendulum", links, time_step, 2, torque, (20.0, 30.0))
 
@@ -335,13 +314,10 @@ def planar_quadrotor(time_step: float = 0.05, **parameters: float) -> System:
 
 @dataclass(frozen=True)
 class StirredTank(_Body):
-    """A continuous stirred-tank reactor with an exothermic reaction A -> B.
+    """A continuous stirred-tank reactor with an exothermic reaction A -> B at first order, steered by its coolant.
 
-    The reaction is of first order, and the coolant steers it.
-
-    The reactor of Henson and Seborg (1997, Nonlinear Process Control, chapter 1). Its
-    operating point, 0.5 mol/L at 350 K and 300 K of the coolant, is unstable. Times are
-    in seconds here, in minutes there.
+    The reactor of Henson and Seborg (1997, Nonlinear Process Control, chapter 1). Its operating point, 0.5 mol/L at
+    350 K and 300 K of the coolant, is unstable. Times are in seconds here, in minutes there.
     """
 
     flow: float = 100.0  #: of the feed [L/min]
@@ -375,10 +351,7 @@ class StirredTank(_Body):
 
 
 def stirred_tank(time_step: float = 3.0, **parameters: float) -> System:
-    """Makes the reactor.
-
-    It is to leave its stable point of low conversion for the unstable one.
-    """
+    """Makes the reactor, which is to leave its stable point of low conversion for the unstable one."""
     return System(
         StirredTank(**parameters),
         time_step,

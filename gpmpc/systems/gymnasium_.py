@@ -1,10 +1,7 @@
-"""Takes a gymnasium environment as a system.
+"""Takes a gymnasium environment as a system, and offers this package's systems as gymnasium environments.
 
-And offers this package's systems as gymnasium environments.
-
-An environment moves on by itself: it is stepped from where it stands, and set to
-another state only where it can be (a MuJoCo environment whose observation is qpos,
-qvel). Where it ends an episode, a flight is lost. Needs ``gpmpc[sim]``.
+An environment moves on by itself: it is stepped from where it stands, and set to another state only where it can be (a
+MuJoCo environment whose observation is qpos, qvel). Where it ends an episode, a flight is lost. Needs ``gpmpc[sim]``.
 """
 
 from collections.abc import Callable, Sequence
@@ -70,8 +67,7 @@ class _Environment(Simulator):
         self.input_names = tuple(input_names or [f"u{i + 1}" for i in range(m)])
         if (found := (len(self.state_names), len(self.input_names))) != (n, m):
             raise ShapeError(
-                f"state_names and input_names must be {n} and {m} names; "
-                f"got {found[0]} and {found[1]}"
+                f"state_names and input_names must be {n} and {m} names; got {found[0]} and {found[1]}"
             )
 
     def _reset(self, seed: int) -> Array:
@@ -120,18 +116,15 @@ def gymnasium_system(
 
     Args:
         environment: Its name, such as ``"InvertedPendulum-v5"``, or one that was made.
-        observe: From an observation to the state (n,); the observation itself by
-            default.
+        observe: From an observation to the state (n,); the observation itself by default.
         state_names: Of the state; x1, x2, ... by default.
         input_names: Of the action; u1, u2, ... by default.
         time_step: [s]; by default the environment's ``dt``.
         make: Further arguments of ``gymnasium.make``.
-        settings: Of ``System``, such as ``units``, ``tracked`` and ``goal``; the
-            environment limits the inputs.
+        settings: Of ``System``, such as ``units``, ``tracked`` and ``goal``; the environment limits the inputs.
 
     Raises:
-        SettingError: There is no such environment, its spaces are not boxes of one
-            dimension, or it gives no time step.
+        SettingError: There is no such environment, its spaces are not boxes of one dimension, or it gives no time step.
         ShapeError: Names do not fit it.
     """
     dynamics = _Environment(environment, observe, state_names, input_names, make or {})
@@ -152,13 +145,10 @@ def gymnasium_system(
 
 
 def make_environment(system: System | str, **settings: Any) -> Any:
-    """Makes a gymnasium environment of a system.
+    """Makes a gymnasium environment of a system, or of one of this package's by name and settings.
 
-    The system may be one of this package's, by name and settings.
-
-    The observation is the state. The reward is minus the squared distance of the
-    tracked states from the goal; an episode ends where they are farther from it than at
-    the start, and than ``System.lost``.
+    The observation is the state. The reward is minus the squared distance of the tracked states from the goal; an
+    episode ends where they are farther from it than at the start, and than ``System.lost``.
     """
     gymnasium = library("gymnasium")
     flown: System = (
@@ -219,10 +209,7 @@ def make_environment(system: System | str, **settings: Any) -> Any:
 
 
 def register_environments() -> list[str]:
-    """Registers this package's systems as gymnasium environments.
-
-    Returns their names, such as ``gpmpc/cart_pole-v0``.
-    """
+    """Registers this package's systems as gymnasium environments, such as ``gpmpc/cart_pole-v0``; returns the names."""
     gymnasium = library("gymnasium")
     names = [f"gpmpc/{name}-v0" for name in OURS]
     for name, system in zip(names, OURS, strict=True):

@@ -1,10 +1,7 @@
-"""A quadrotor in MuJoCo whose rotors lag and which air drags on.
+"""A quadrotor in MuJoCo whose rotors lag and which air drags on, and the rigid body that is known of it.
 
-And the rigid body that is known of it.
-
-The model is ``quadrotor.xml`` beside this file. Its z axis points upwards; roll, pitch
-and yaw turn the vehicle about its own x, y and z axes, yaw first (Beard and McLain,
-2012, eqs. (3.1)-(3.3)). Needs the extra ``sim``.
+The model is ``quadrotor.xml`` beside this file. Its z axis points upwards; roll, pitch and yaw turn the vehicle about
+its own x, y and z axes, yaw first (Beard and McLain, 2012, eqs. (3.1)-(3.3)). Needs the extra ``sim``.
 """
 
 from dataclasses import dataclass
@@ -27,10 +24,7 @@ _MASS = 0.5
 
 @dataclass(frozen=True)
 class RigidBody:
-    """A rigid body that four rotors lift and turn.
-
-    The model knows neither drag nor that the rotors lag.
-    """
+    """A rigid body that four rotors lift and turn; it knows neither drag nor that the rotors lag."""
 
     mass: float = 0.4  #: [kg]
     inertia: tuple[float, float, float] = (
@@ -93,9 +87,7 @@ def mujoco_quadrotor(
     substeps: int = 8,
     known: dict[str, Any] | None = None,
 ) -> System:
-    """Makes the quadrotor by its sensors.
-
-    Its nominal model is a data sheet's rigid body.
+    """Makes the quadrotor by its sensors, with a data sheet's rigid body as the nominal model.
 
     Args:
         mass: [kg].
@@ -145,8 +137,7 @@ def mujoco_quadrotor(
     flown.dynamics.mujoco.mj_setConst(
         model, flown.dynamics.data
     )  # what follows from the mass
-    # Linear drag in a wind is drag in still air and a constant force, which gravity on
-    # the one body can bring.
+    # Linear drag in a wind is drag in still air and a constant force, which gravity on the one body can bring.
     model.opt.gravity += _DRAG * np.array(wind) / mass
     return flown
 
