@@ -15,6 +15,7 @@ for the residuals r1 of stationarity and r2 of the working set.
 """
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,7 +49,7 @@ def rescue(
     limit: int = 20,
     late: Callable[[], bool] = lambda: False,
 ) -> Array:
-    """The record of a solve that starts from the working set of another, ``record``.
+    """Returns the record of a solve that starts from the working set of another.
 
     Args:
         problem: P, q, G, lower and upper; bounds of 1e20 or more are absent.
@@ -76,6 +77,23 @@ def rescue(
         # not finite, or not positive definite once scaled
         result[layout.STATUS] = layout.NUMERICAL_TROUBLE
     return result
+
+
+class _Violated(NamedTuple):
+    """A violated constraint."""
+
+    p: int
+    side: int  # +1 if the upper bound is violated, -1 if it is the lower one
+    sense: int  # the direction in which the multiplier moves
+    amount: float
+
+
+class _Blocking(NamedTuple):
+    """The working constraint whose multiplier ends a step; p = -1 if none does."""
+
+    p: int
+    step: float
+    multiplier: float  # the end of its range
 
 
 class _Solve:
@@ -114,30 +132,33 @@ class _Solve:
         self.iterations = 0
         self.ray = None
 
-    def run(self, names: Array, limit: int) -> int:
-        """Changes the working set until no constraint is violated.
+    def run(self, labels: Array, limit: int) -> int:
+        """Changes the working set until no constraint is violated; returns the status.
 
-        Returns the status.
+        Args:
+            labels: Signed numbers of the constraints to start with.
+            limit: Changes before ``ITERATION_LIMIT``.
         """
-        self._guess(names)
-        passed: set[int] = set()
+        self._guess(labels)
+        passed_over: set[int] = set()
         while True:
-            if not self._settle():
+            if not self._correct_multipliers():
                 return layout.NUMERICAL_TROUBLE
-            p, side, sense, violation = self._most_violated(passed)
-            if p < 0:
+            violated = self._most_violated(passed_over)
+            if violated is None:
                 return layout.SOLVED
             if self.iterations >= limit:
                 return layout.ITERATION_LIMIT
-            rounding = _ROUNDING * self._terms_of(p, side)
-            if not self._step_to(p, side, sense, violation, rounding):
-                if self._prove(p, sense):
-                    return layout.INFEASIBLE
-                if violation > rounding + _ROUNDING * np.abs(self.r) @ [
-                    self._terms_of(*w) for w in self.working.items()
-                ]:
-                    return layout.NUMERICAL_TROUBLE
-                passed.add(p)
+            rounding = _ROUNDING * self._terms_of(violated.p, violated.side)
+            if self._satisfy_constraint(violated, rounding):
+                continue
+            if self._prove(violated):
+                return layout.INFEASIBLE
+            working_terms = [self._terms_of(*w) for w in self.working.items()]
+            rounding = rounding + _ROUNDING * np.abs(self.r) @ working_terms
+            if violated.amount > rounding:
+                return layout.NUMERICAL_TROUBLE
+            passed_over.add(violated.p)
 
     def write(self, record: Array) -> None:
         """Writes x, multipliers (or Farkas' ray) and working set to a record."""
@@ -159,34 +180,35 @@ class _Solve:
         return self.upper[p] if side > 0 else self.lower[p]
 
     def _range(self, p: int, side: int) -> tuple[float, float]:
-        """The range of a multiplier at the upper (+1) or lower (-1) bound."""
+        """Returns the range of a multiplier at the upper (+1) or lower (-1) bound."""
         equality = self.lower[p] == self.upper[p]
         cap = self.caps[p]
         return (-cap if equality or side < 0 else 0.0), (
             cap if equality or side > 0 else 0.0
         )
 
-    def _guess(self, names: Array) -> None:
-        """Starts with the named bounds, except those that depend on others."""
-        guess = {int(abs(name)) - 1: int(np.sign(name)) for name in names}
-        some = [
+    def _guess(self, labels: Array) -> None:
+        """Starts with the labelled bounds, except those that depend on others."""
+        guess = {int(abs(label)) - 1: int(np.sign(label)) for label in labels}
+        present = [
             p
             for p, side in guess.items()
             if np.isfinite(self._bound(p, side)) and self.norms[p] > 0.0
         ]
-        if some:
-            R, order = qr(
-                self.columns[:, some] / self.norms[some], mode="r", pivoting=True
-            )
-            good = np.abs(np.diagonal(R)) > 1e6 * self.dependent
-            self.working = {some[i]: guess[some[i]] for i in order[: len(good)][good]}
+        if not present:
+            return
+        unit_columns = self.columns[:, present] / self.norms[present]
+        R, order = qr(unit_columns, mode="r", pivoting=True)
+        independent = np.abs(np.diagonal(R)) > 1e6 * self.dependent
+        for i in order[: len(independent)][independent]:
+            self.working[present[i]] = guess[present[i]]
 
     def _factorise(self) -> None:
         if self.late():
             raise TimeoutError
         self.Q, self.R = qr(self.columns[:, list(self.working)], mode="economic")
 
-    def _settle(self) -> bool:
+    def _correct_multipliers(self) -> bool:
         """Finds x and the multipliers of the working set.
 
         Drops the most wrong one until all are in range.
@@ -257,30 +279,32 @@ class _Solve:
                 return True
         return False
 
-    def _most_violated(self, passed: set[int]) -> tuple[int, int, int, float]:
-        """Returns the most violated constraint."""
-        y = _sum_products(
-            [(self.C, self.x[0]), (self.C, self.x[1])], np.zeros(len(self.C))
-        )
+    def _most_violated(self, passed_over: set[int]) -> _Violated | None:
+        """Returns the most violated constraint, None if there is none."""
+        zero = np.zeros(len(self.C))
+        y = _sum_products([(self.C, self.x[0]), (self.C, self.x[1])], zero)
         mu = self.mu[0]
-        sizes = np.abs(self.C) @ np.abs(self.x[0])
-        above = np.where(
-            np.isfinite(self.upper), y - self.upper, -np.inf
-        ) - NEGLIGIBLE * np.abs(self.upper)
-        below = np.where(
-            np.isfinite(self.lower), self.lower - y, -np.inf
-        ) - NEGLIGIBLE * np.abs(self.lower)
+        above = np.where(np.isfinite(self.upper), y - self.upper, -np.inf)
+        above = above - NEGLIGIBLE * np.abs(self.upper)
+        below = np.where(np.isfinite(self.lower), self.lower - y, -np.inf)
+        below = below - NEGLIGIBLE * np.abs(self.lower)
         # one at a cap must stay outside its bound: it is violated where it is not
-        excess = np.where(
-            mu > 0.0, -above, np.where(mu < 0.0, -below, np.maximum(above, below))
-        )
+        excess = np.maximum(above, below)
+        excess = np.where(mu < 0.0, -below, excess)
+        excess = np.where(mu > 0.0, -above, excess)
+        sizes = np.abs(self.C) @ np.abs(self.x[0])
         excess -= NEGLIGIBLE * np.maximum(sizes, np.abs(self.q).max())
-        excess[[*self.working, *passed]] = -np.inf
+        excess[[*self.working, *passed_over]] = -np.inf
         p = int(np.argmax(np.where(self.norms > 0.0, excess / self.norms, excess)))
         if not excess[p] > 0.0:
-            return -1, 0, 0, 0.0
-        side = int(np.sign(mu[p])) or (1 if above[p] > below[p] else -1)
-        return p, side, (-side if mu[p] else side), float(excess[p])
+            return None
+        if mu[p] != 0.0:
+            side = int(np.sign(mu[p]))
+            sense = -side
+        else:
+            side = 1 if above[p] > below[p] else -1
+            sense = side
+        return _Violated(p, side, sense, float(excess[p]))
 
     def _terms_of(self, p: int, side: int) -> float:
         """Returns the size of the numbers whose rounding a violation may be.
@@ -291,65 +315,80 @@ class _Solve:
             return max(abs(self._bound(p, side)), np.abs(self.C[p]) @ np.abs(self.x[0]))
         return zero_row_size(self.G, *self.bounds)
 
-    def _step_to(
-        self, p: int, side: int, sense: int, violation: float, rounding: float
-    ) -> bool:
-        """Moves multipliers until constraint p is satisfied.
+    def _satisfy_constraint(self, violated: _Violated, rounding: float) -> bool:
+        """Moves multipliers until a constraint is satisfied.
 
-        False if it contradicts the working ones, or depends on them and is violated by
-        no more than rounding.
+        Returns False if it contradicts the working ones, or depends on them and is
+        violated by no more than rounding.
         """
+        p = violated.p
+        sense = violated.sense
+        violation = violated.amount
         mu = self.mu.sum(axis=0)
-        start = mu[p]
+        multiplier_before = mu[p]
         while True:
+            # step direction
             self._factorise()
-            W = list(self.working)
-            rest = self.columns[:, p]
-            r = np.zeros(len(self.working))
-            for _ in range(
-                2
-                # the combination r of the working columns nearest to p's; twice is
-                # enough
-            ):
-                part = self.Q.T @ rest
-                rest = rest - self.Q @ part
-                r = r + solve_triangular(self.R, part)
-            square = rest @ rest
-            free = np.sqrt(square) > self.dependent * self.norms[p]
-            step = violation / square if free else np.inf
-            least, most = self._range(p, side)
+            r, square = self._project(p)
+            independent = np.sqrt(square) > self.dependent * self.norms[p]
+
+            # step length
+            step = violation / square if independent else np.inf
+            least, most = self._range(p, violated.side)
             room = most - mu[p] if sense > 0 else mu[p] - least
             capped = room < step
-            leaving = -1
-            end = 0.0
-            step = min(step, room)
-            noise = 1e-14 * np.abs(r * self.norms[W]).max(initial=0.0)
-            for w, rate in zip(W, sense * r, strict=True):
-                least, most = self._range(w, self.working[w])
-                if abs(rate) * self.norms[w] > noise:
-                    room = max(0.0, (mu[w] - (least if rate > 0.0 else most)) / rate)
-                    if room < step:
-                        step = room
-                        leaving = w
-                        end = least if rate > 0.0 else most
-            if step == np.inf or (not free and violation <= rounding):
+            blocking = self._first_blocking(mu, sense * r, r, min(step, room))
+            step = blocking.step
+            if step == np.inf or (not independent and violation <= rounding):
                 self.r = r
-                self.mu[:, p] = start, 0.0
+                self.mu[:, p] = multiplier_before, 0.0
                 return False
-            mu[W] -= sense * step * r
+
+            # take the step
+            mu[list(self.working)] -= sense * step * r
             mu[p] += sense * step
             violation -= step * square
-            if leaving < 0:
+            if blocking.p < 0:
                 self.mu[:, p] = mu[p], 0.0
                 self.iterations += 1
                 if not capped:
-                    self.working[p] = side
+                    self.working[p] = violated.side
                 return True
-            mu[leaving] = end
-            self._drop(leaving, end)
+            mu[blocking.p] = blocking.multiplier
+            self._drop(blocking.p, blocking.multiplier)
 
-    def _prove(self, p: int, sense: int) -> bool:
-        """Whether the last contradiction has Farkas' proof, which becomes the ray."""
+    def _project(self, p: int) -> tuple[Array, float]:
+        """Returns the combination r of working columns nearest to p's.
+
+        The second value is the square of the distance that is left.
+        """
+        distance = self.columns[:, p]
+        r = np.zeros(len(self.working))
+        for _ in range(2):  # twice is enough
+            part = self.Q.T @ distance
+            distance = distance - self.Q @ part
+            r = r + solve_triangular(self.R, part)
+        return r, distance @ distance
+
+    def _first_blocking(
+        self, mu: Array, rates: Array, r: Array, step: float
+    ) -> _Blocking:
+        """Returns the longest step up to ``step``, and the constraint that ends it."""
+        noise = 1e-14 * np.abs(r * self.norms[list(self.working)]).max(initial=0.0)
+        blocking = _Blocking(-1, step, 0.0)
+        for (w, side), rate in zip(self.working.items(), rates, strict=True):
+            if abs(rate) * self.norms[w] > noise:
+                least, most = self._range(w, side)
+                end = least if rate > 0.0 else most
+                room = max(0.0, (mu[w] - end) / rate)
+                if room < blocking.step:
+                    blocking = _Blocking(w, room, end)
+        return blocking
+
+    def _prove(self, violated: _Violated) -> bool:
+        """Returns whether the last contradiction has Farkas' proof, the new ray."""
+        p = violated.p
+        sense = violated.sense
         W = np.array(list(self.working), dtype=int)
         sides = np.array(list(self.working.values()), dtype=int)
         used = np.abs(self.r) * self.norms[W] > self.dependent * self.norms[p]
@@ -373,7 +412,7 @@ class _Solve:
 
 
 def _power_of_two(sizes: Array) -> Array:
-    """The powers of two nearest to the reciprocals; one for zero."""
+    """Returns the powers of two nearest to the reciprocals; one for zero."""
     return np.exp2(-np.round(np.log2(np.where(sizes > 0.0, sizes, 1.0))))
 
 
@@ -420,6 +459,6 @@ def _sum_products(products: list[tuple[Array, Array]], constant: Array) -> Array
 
 
 def _leading_half(a: Array) -> Array:
-    """The leading 26 bits of each number."""
+    """Returns the leading 26 bits of each number."""
     shifted = 134217729.0 * a
     return shifted - (shifted - a)
