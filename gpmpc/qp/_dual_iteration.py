@@ -97,6 +97,7 @@ def iterate(work, k, count, guessed, margin, iterations, batches):
                 return Progress(
                     ITERATION_LIMIT, k, iterations, batches, True, passed_over
                 )
+            # select the violated constraint, or several at once
             p = most_violated(work, count)
             candidates = 0
             if all_listed and batches < BATCHES:
@@ -107,7 +108,7 @@ def iterate(work, k, count, guessed, margin, iterations, batches):
         k = add_candidates(work, k, candidates)
         multipliers_fit = False
         single = not starts and k == size_before
-        if single:
+        if single:  # move to p, which enters unless it stays violated
             multiplier_before = work.multiplier[p]
             satisfied, k, changes = _satisfy_constraint(work, k, p)
             iterations += changes
@@ -127,6 +128,8 @@ def iterate(work, k, count, guessed, margin, iterations, batches):
                 batches = BATCHES  # caps may have changed x_u
         elif not starts:
             iterations += k - size_before
+
+        # put the multipliers into their ranges, and x where they have their minimum
         if not multipliers_fit:
             k = _drop_wrong_multipliers(work, k)
         _minimise(work, k)
