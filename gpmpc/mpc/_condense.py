@@ -441,7 +441,7 @@ def _zeros(rows, columns):
 
 @njit_inner
 def _padded(W):
-    """Returns the blocks of a weight in rows of whole registers (p / n, n, n padded)."""
+    """Returns the blocks of a weight in rows of whole registers (p / n, n, ...)."""
     n = W.shape[1]
     padded = np.zeros((len(W), n, (n + 7) // 8 * 8))
     for b in range(len(W)):

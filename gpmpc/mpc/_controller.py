@@ -54,8 +54,8 @@ class Reference:
     #: for a set point
     inputs: Array | None = None
     #: standard deviations (H,) between the means and the sides of chance constraints,
-    #: by stage, in the place of the problem's, such as those of an ``AdaptiveTube``; for
-    #: covariances of ``zero_order``
+    #: by stage, in the place of the problem's, such as those of an ``AdaptiveTube``;
+    #: for covariances of ``zero_order``
     kappas: Array | None = None
     #: names of states and inputs, where they are known: by default of a series'
     #: entries, or of a table's columns. A controller sorts by them
@@ -274,7 +274,7 @@ class Controller(Protocol):
         """Decides the input for one step.
 
         Args:
-            belief: What is known of the state; ``Gaussian.certain(x)`` for a measured one.
+            belief: Of the state; ``Gaussian.certain(x)`` for a measured one.
             reference: Over the controller's horizon.
             previous: The last decision, to warm-start from; None at the first step.
         """

@@ -1,14 +1,15 @@
-"""Costs: weighed squares of the tracking error, of the inputs, and of outputs that are linearised along a plan.
+"""Costs: weighed squares of the tracking error, of the inputs, and of outputs.
 
-Outputs are linearised in z = [x_i; u_{i-1}], y(z') + J (z - z'), so that a step is one of Gauss-Newton. To a stage
-they add the square [z; 1]' Z [z; 1], where Z = [J, e]' W [J, e] and e = y(z') - J z' - c.
+Outputs are linearised along a plan in z = [x_i; u_{i-1}], y(z') + J (z - z'), so that a
+step is one of Gauss-Newton. To a stage they add the square [z; 1]' Z [z; 1], where
+Z = [J, e]' W [J, e] and e = y(z') - J z' - c.
 """
 
 import inspect
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -24,58 +25,63 @@ Array = np.ndarray
 Penalized = Literal["inputs", "deviations", "increments"]
 PENALIZED = ("inputs", "deviations", "increments")
 
+_WEIGHT_RULE = "must be the diagonal of a weight or a square matrix"
+
 
 @dataclass(frozen=True)
 class Tracking:
     """Costs of the distance to a reference and of the inputs.
 
     Raises:
-        SettingError: A weight is not symmetric positive semidefinite, R is zero in a direction, or a length is wrong.
+        SettingError: A weight is not symmetric positive semidefinite, R is zero in a
+            direction, or a length is wrong.
     """
 
-    Q: Any  #: state weights, the diagonal (n,) or the matrix (n, n); matrices (H, n, n) by stage
-    R: Any  #: input weights, likewise (m,), (m, m) or (H, m, m), positive definite
-    terminal: Any = None  #: weight of the last predicted state, one like Q; Q itself (its last one) by default
-    #: what R weighs: ``"inputs"``, ``"deviations"`` from the reference inputs, or ``"increments"``
+    #: state weights, the diagonal (n,) or the matrix (n, n); matrices (H, n, n) by
+    #: stage
+    Q: Any
+    #: input weights, likewise (m,), (m, m) or (H, m, m), positive definite
+    R: Any
+    #: weight of the last predicted state, one like Q; Q itself (its last one) by
+    #: default
+    terminal: Any = None
+    #: what R weighs: ``"inputs"``, ``"deviations"`` from the reference inputs, or
+    #: ``"increments"``
     penalized: Penalized = "increments"
-    #: indices of states whose error is modulo 2 pi: their references move by full turns towards the plan; None for none
+    #: indices of states whose error is modulo 2 pi: their references move by full turns
+    #: towards the plan; None for none
     angles: Sequence[int] = ()
 
     def __post_init__(self) -> None:
         Q = _weight("Q", self.Q)
         R = _weight("R", self.R)
-        lowest = np.linalg.eigvalsh(R).min()
         n = Q.shape[-1]
+        lowest = np.linalg.eigvalsh(R).min()
         if lowest <= 0:
-            raise SettingError(
-                "R",
-                f"must be positive definite; its smallest eigenvalue is {lowest:.3g}",
-            )
-        terminal = (
-            Q.reshape(-1, n, n)[-1]
-            if self.terminal is None
-            else _weight("terminal", self.terminal)
-        )
+            rule = "must be positive definite"
+            raise SettingError("R", f"{rule}; its smallest eigenvalue is {lowest:.3g}")
+        terminal = Q.reshape(-1, n, n)[-1]
+        if self.terminal is not None:
+            terminal = _weight("terminal", self.terminal)
         if terminal.shape != (n, n):
-            raise SettingError(
-                "terminal", f"must be a weight of {n} states; got {len(terminal)}"
-            )
+            rule = f"must be a weight of {n} states"
+            raise SettingError("terminal", f"{rule}; got {len(terminal)}")
         check_choice("penalized", self.penalized, PENALIZED)
         angles = tuple(self.angles or ())
         if not all(isinstance(index, int) and 0 <= index < n for index in angles):
-            raise SettingError(
-                "angles", f"must be indices of {n} states; got {self.angles!r}"
-            )
-        for key, value in (
-            ("Q", Q),
-            ("R", R),
-            ("terminal", terminal),
-            ("angles", angles),
-        ):
-            object.__setattr__(self, key, value)
+            rule = f"must be indices of {n} states"
+            raise SettingError("angles", f"{rule}; got {self.angles!r}")
+        object.__setattr__(self, "Q", Q)
+        object.__setattr__(self, "R", R)
+        object.__setattr__(self, "terminal", terminal)
+        object.__setattr__(self, "angles", angles)
 
     def by_stage(self, horizon: int) -> tuple[Array, Array]:
-        """Returns the weights of x_1 .. x_H (H, n, n), the last one the terminal one, and of v_0 .. v_{H-1} (H, m, m).
+        """Returns the weights of all stages.
+
+        Returns:
+            Those of x_1 .. x_H (H, n, n), the last one the terminal one, and of
+            v_0 .. v_{H-1} (H, m, m).
 
         Raises:
             SettingError: They are for another number of stages.
@@ -87,65 +93,91 @@ class Tracking:
 
 @dataclass(frozen=True)
 class LeastSquares:
-    """Costs of outputs y(x, u, p), weighed squares of how far they are from their references.
+    """Costs of outputs y(x, u, p): weighed squares of the distance to references.
 
     Raises:
-        SettingError: y is no function, the weight is not symmetric positive semidefinite, or a length is wrong.
+        SettingError: y is no function, the weight is not symmetric positive
+            semidefinite, or a length is wrong.
     """
 
-    #: a function of tensors, states (H, n), inputs (H, m) and, where the controller is handed ``parameters``, these (H,
-    #: q), that gives (H, d), each row of its own stage; or a CasADi function of vectors. It may take fewer: the states,
-    #: or states and inputs
+    #: a function of tensors, states (H, n), inputs (H, m) and, where the controller is
+    #: handed ``parameters``, these (H, q), that gives (H, d), each row of its own
+    #: stage; or a CasADi function of vectors. It may take fewer: the states, or states
+    #: and inputs
     y: Any
-    weight: Any  #: W, the diagonal (d,) or the matrix (d, d); matrices (H, d, d) by stage, zero where y costs nothing
+    #: W, the diagonal (d,) or the matrix (d, d); matrices (H, d, d) by stage, zero
+    #: where y costs nothing
+    weight: Any
     reference: Any = None  #: c (d,), or (H, d) by stage; zero by default
 
     def __post_init__(self) -> None:
         if not callable(self.y):
             raise SettingError("y", f"must be a function; got {type(self.y).__name__}")
         weight = _weight("weight", self.weight)
-        reference = (
-            np.zeros(weight.shape[-1])
-            if self.reference is None
-            else np.array(read_array("reference", self.reference))
-        )
-        fits = reference.ndim in (1, 2) and reference.shape[-1] == weight.shape[-1]
+        d = weight.shape[-1]
+        reference = np.zeros(d)
+        if self.reference is not None:
+            reference = np.array(read_array("reference", self.reference))
+        fits = reference.ndim in (1, 2) and reference.shape[-1] == d
         if not (fits and np.isfinite(reference).all()):
-            raise SettingError(
-                "reference",
-                f"must be {weight.shape[-1]} finite numbers, or these by stage",
-            )
+            rule = f"must be {d} finite numbers, or these by stage"
+            raise SettingError("reference", rule)
         object.__setattr__(self, "weight", weight)
         object.__setattr__(self, "reference", reference)
 
     def squares(self, states: Array, inputs: Array, parameters: Array | None) -> Array:
-        """Returns the squares Z (H, n + m + 1, n + m + 1) along a plan x_1 .. x_H, u_0 .. u_{H-1}; see the module."""
-        y, J, K = expand_function(
+        """Returns the squares Z (H, n + m + 1, n + m + 1) along a plan.
+
+        Args:
+            states: x_1 .. x_H (H, n).
+            inputs: u_0 .. u_{H-1} (H, m).
+            parameters: By stage (H, q), where y takes some.
+
+        Raises:
+            FunctionNotFinite: y or a derivative is not finite.
+        """
+        y = expand_function(
             "y", self.y, self.weight.shape[-1], states, inputs, parameters
         )
         e = (
-            y
+            y.values
             - self.reference
-            - np.einsum("kri,ki->kr", J, states)
-            - np.einsum("kri,ki->kr", K, inputs)
+            - np.einsum("kri,ki->kr", y.by_state, states)
+            - np.einsum("kri,ki->kr", y.by_input, inputs)
         )
-        rows = np.concatenate([J, K, e[..., None]], axis=2)
+        rows = np.concatenate([y.by_state, y.by_input, e[..., None]], axis=2)
         return rows.mT @ self.weight @ rows
 
 
 def by_stage(key: str, values: Array, horizon: int, dims: int) -> Array:
-    """Returns values of every stage, given of every stage (H of them) or of one (whose array has ``dims`` axes)."""
+    """Returns values of every stage.
+
+    Args:
+        key: What they are, for the message.
+        values: Of every stage, H of them, or of one.
+        horizon: H.
+        dims: Number of axes of the values of one stage.
+
+    Raises:
+        SettingError: They are for another number of stages.
+    """
     if values.ndim > dims and len(values) != horizon:
-        raise SettingError(
-            key, f"must be given for one stage or all {horizon}; got {len(values)}"
-        )
-    return np.ascontiguousarray(
-        np.broadcast_to(values, (horizon, *values.shape[values.ndim - dims :]))
-    )
+        rule = f"must be given for one stage or all {horizon}"
+        raise SettingError(key, f"{rule}; got {len(values)}")
+    shape = (horizon, *values.shape[values.ndim - dims :])
+    return np.ascontiguousarray(np.broadcast_to(values, shape))
 
 
 class FunctionNotFinite(DataError):
-    """A constraint, an output of the cost, or its gradient is not finite along a plan."""
+    """A constraint, an output of the cost, or its gradient is not finite on a plan."""
+
+
+class Expansion(NamedTuple):
+    """The values of a function along a plan, and its derivatives."""
+
+    values: Array  # (H, count)
+    by_state: Array  # (H, count, n)
+    by_input: Array  # (H, count, m)
 
 
 def expand_function(
@@ -155,62 +187,86 @@ def expand_function(
     states: Array,
     inputs: Array,
     parameters: Array | None,
-) -> tuple[Array, Array, Array]:
-    """Returns a function's values (H, count) along a plan, and its derivatives (H, count, n) and (H, count, m).
+) -> Expansion:
+    """Returns the first-order expansion of a function along a plan.
 
-    Raises ``FunctionNotFinite`` where one is not.
+    Args:
+        name: Of the function, for messages.
+        function: Of tensors, or a CasADi function; see ``LeastSquares``.
+        count: Number of its values at a stage.
+        states: x_1 .. x_H (H, n).
+        inputs: u_0 .. u_{H-1} (H, m).
+        parameters: By stage (H, q), or None.
+
+    Raises:
+        FunctionNotFinite: A value or a derivative is not finite.
+        SettingError: The function takes parameters, and there are none.
+        ShapeError: Its values have another shape.
     """
-    least, most = _arguments(function)
+    least, most = _count_arguments(function)
     arguments = [states, inputs] if parameters is None else [states, inputs, parameters]
     if len(arguments) < least:
-        raise SettingError(
-            "parameters", f"must come with every call: {name} is a function of them"
-        )
+        rule = f"must come with every call: {name} is a function of them"
+        raise SettingError("parameters", rule)
     if hasattr(function, "n_in"):
         values, *jacobians = _casadi_function(function).linearize(*arguments[:most])
     else:
-        known = [torch.as_tensor(argument) for argument in arguments[2:most]]
+        tensors = [torch.as_tensor(argument) for argument in arguments[2:most]]
+        checked = _CheckedFunction(name, function, count, tensors)
+        differentiated = arguments[: min(most, 2)]
+        values, *jacobians = linearize_function(checked, _FLOAT64, *differentiated)
+    H = len(states)
+    if values.shape != (H, count):
+        raise ShapeError(f"{name} must give ({H}, {count}); got {values.shape}")
+    by_input = np.zeros((H, count, inputs.shape[1]))
+    if len(jacobians) > 1:
+        by_input = jacobians[1]
+    expansion = Expansion(values, jacobians[0], by_input)
+    _check_finite(name, expansion, states, inputs)
+    return expansion
 
-        def stacked(*at: torch.Tensor) -> torch.Tensor:
-            rows = len(at[0])
-            of_rows = [part.expand(rows, *part.shape[1:]) for part in known]
-            value = call(name, function, *at, *of_rows)
-            if not isinstance(value, torch.Tensor) or value.shape[:1] != (rows,):
-                found = (
-                    tuple(value.shape)
-                    if isinstance(value, torch.Tensor)
-                    else type(value).__name__
-                )
-                raise ShapeError(
-                    f"{name} must give a tensor ({rows}, {count}); got {found}"
-                )
-            return value.unsqueeze(-1) if value.dim() == 1 else value
 
-        values, *jacobians = linearize_function(
-            stacked, _FLOAT64, *arguments[: min(most, 2)]
-        )
-    if values.shape != (len(states), count):
-        raise ShapeError(
-            f"{name} must give ({len(states)}, {count}); got {values.shape}"
-        )
-    by_state, by_input = [*jacobians, np.zeros((len(states), count, inputs.shape[1]))][
-        :2
-    ]
-    found = values, by_state, by_input
-    if not all(np.isfinite(part).all() for part in found):
-        k = next(
-            k
-            for k in range(len(states))
-            if not all(np.isfinite(part[k]).all() for part in found)
-        )
-        x, u = (
-            np.array2string(row[k], precision=4, max_line_width=10**6)
-            for row in (states, inputs)
-        )
-        raise FunctionNotFinite(
-            f"{name} or its gradient is not finite at x = {x}, u = {u}"
-        )
-    return values, by_state, by_input
+class _CheckedFunction:
+    """A user's function of tensors, with parameters, whose values are checked."""
+
+    def __init__(
+        self,
+        name: str,
+        function: Any,
+        count: int,
+        parameters: Sequence[torch.Tensor],
+    ):
+        self._name = name
+        self._function = function
+        self._count = count
+        self._parameters = parameters
+
+    def __call__(self, *arguments: torch.Tensor) -> torch.Tensor:
+        """Returns the values (rows, count)."""
+        rows = len(arguments[0])
+        parameters = [part.expand(rows, *part.shape[1:]) for part in self._parameters]
+        value = call(self._name, self._function, *arguments, *parameters)
+        is_tensor = isinstance(value, torch.Tensor)
+        if not is_tensor or value.shape[:1] != (rows,):
+            rule = f"{self._name} must give a tensor ({rows}, {self._count})"
+            got = tuple(value.shape) if is_tensor else type(value).__name__
+            raise ShapeError(f"{rule}; got {got}")
+        return value.unsqueeze(-1) if value.dim() == 1 else value
+
+
+def _check_finite(
+    name: str, expansion: Expansion, states: Array, inputs: Array
+) -> None:
+    """Raises ``FunctionNotFinite`` with the first point where a number is not."""
+    if all(np.isfinite(part).all() for part in expansion):
+        return
+    for k in range(len(states)):
+        if all(np.isfinite(part[k]).all() for part in expansion):
+            continue
+        x = np.array2string(states[k], precision=4, max_line_width=10**6)
+        u = np.array2string(inputs[k], precision=4, max_line_width=10**6)
+        rule = f"{name} or its gradient is not finite"
+        raise FunctionNotFinite(f"{rule} at x = {x}, u = {u}")
 
 
 _FLOAT64 = torch.empty(0, dtype=torch.float64)
@@ -218,46 +274,47 @@ _casadi_function = lru_cache(maxsize=64)(CasadiFunction)
 
 
 @lru_cache(maxsize=256)
-def _arguments(function: Any) -> tuple[int, int]:
-    """How many arguments a function takes at least and at most."""
+def _count_arguments(function: Any) -> tuple[int, int]:
+    """Returns how many arguments a function takes at least and at most."""
     if hasattr(function, "n_in"):
         return function.n_in(), function.n_in()
     try:
-        found = inspect.signature(function).parameters.values()
+        parameters = inspect.signature(function).parameters.values()
     except ValueError:  # such as torch.sin
         return 1, 1
-    positional = [
-        p for p in found if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)
-    ]
-    most = 3 if any(p.kind is p.VAR_POSITIONAL for p in found) else len(positional)
+    kinds = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
+    positional = [p for p in parameters if p.kind in kinds]
+    takes_any = any(p.kind is p.VAR_POSITIONAL for p in parameters)
+    most = 3 if takes_any else len(positional)
     return sum(p.default is p.empty for p in positional), most
 
 
 def _weight(key: str, value: Any) -> Array:
-    """A weight from its diagonal or its matrix, or from those of all stages."""
+    """Returns a weight from its diagonal or its matrix, or those of all stages."""
     weight = read_numbers(key, value, "the diagonal of a weight or a square matrix")
-    weight = np.diag(weight) if weight.ndim == 1 else weight
+    if weight.ndim == 1:
+        weight = np.diag(weight)
     if weight.ndim not in (2, 3) or weight.shape != weight.mT.shape:
-        raise SettingError(
-            key, f"must be the diagonal of a weight or a square matrix; got {value!r}"
-        )
+        raise SettingError(key, f"{_WEIGHT_RULE}; got {value!r}")
     if not np.isfinite(weight).all():
         raise SettingError(key, f"must be finite; got {value!r}")
     if not np.allclose(weight, weight.mT, rtol=1e-12, atol=0):
         raise SettingError(key, "must be symmetric")
     lowest = np.linalg.eigvalsh(weight).min()
     if lowest < -1e-12 * max(1.0, np.abs(weight).max()):
-        raise SettingError(
-            key,
-            f"must be positive semidefinite; its smallest eigenvalue is {lowest:.3g}",
-        )
+        rule = "must be positive semidefinite"
+        raise SettingError(key, f"{rule}; its smallest eigenvalue is {lowest:.3g}")
     return weight
 
 
 def read_numbers(
     key: str, value: Any, rule: str = "a list of numbers, infinite where unbounded"
 ) -> Array:
-    """An array from a list."""
+    """Returns an array of its own from a list or an array that is not empty.
+
+    Raises:
+        SettingError: It is no list of numbers.
+    """
     try:
         array = np.array(read_array(key, value))
     except DataError:

@@ -1,15 +1,19 @@
-"""What a violation costs of a bound that gives way: an elastic one that a program cannot keep.
+"""The price of violating a bound that gives way: an elastic one that cannot be kept.
 
-An exact price of 1e6 weights says that nothing matters beside the bound. Where it can be kept that is what is asked
-for. Where it cannot, as after a gust that pushed a vehicle out of its lane, such a price spends everything on coming
-back a step earlier, be it the vehicle. There a price is taken that cannot outweigh what the cost is for: with J0 and V0
-the cost and the violations, all in all, of the plan without elastic bounds, at
+An exact price of 1e6 weights says that nothing matters beside the bound. Where it can
+be kept that is what is asked for. Where it cannot, as after a gust that pushed a
+vehicle out of its lane, such a price spends everything on coming back a step earlier,
+be it the vehicle. There a price is taken that cannot outweigh what the cost is for:
+with J0 and V0 the cost and the violations, all in all, of the plan without elastic
+bounds, at
 
     price = WORTH J / V0,   J0 <= J <= 2 J0
 
-no plan that is better under it costs more than J0 + WORTH J, at most five times J0: that is what its violations may
-cost. J is the cost of the last plan within these limits: where that keeps the bound at some cost, the bound is worth
-more. A plan that costs nothing has no scale; what it would cost to be beside its reference by its violations is added.
+no plan that is better under it costs more than J0 + WORTH J, at most five times J0:
+that is what its violations may cost. J is the cost of the last plan within these
+limits: where that keeps the bound at some cost, the bound is worth more. A plan that
+costs nothing has no scale; what it would cost to be beside its reference by its
+violations is added.
 """
 
 import numpy as np
@@ -25,7 +29,7 @@ _TINY = 1e-12
 
 
 def violations(local: LocalProblem, elastic: Array) -> Array:
-    """By how much a plan misses each elastic row at each stage (H, r), zero where it is kept."""
+    """Returns by how much a plan misses each elastic row (H, r), zero where kept."""
     E, D, lower, upper = local.rows
     states = local.plan.states[1:]
     values = np.einsum("kri,ki->kr", _by_stage(E, len(states)), states)
@@ -42,7 +46,7 @@ def elastic_price(
     elastic: Array,
     Q: Array,
 ) -> float:
-    """The price of elastic rows, from the plan without them.
+    """Returns the price of elastic rows, from the plan without them.
 
     Args:
         local: With the plan that minimises the cost alone.
@@ -65,5 +69,5 @@ def elastic_price(
 
 
 def _by_stage(parts: Array, horizon: int) -> Array:
-    """What belongs to every stage, where one may stand for all."""
+    """Returns arrays of every stage, given these or one that stands for all."""
     return np.broadcast_to(parts, (horizon, *parts.shape[1:]))

@@ -93,11 +93,12 @@ class PredictionSettings:
     #: covariances predicted beside it; ``"none"``, means alone
     covariance: Covariance = "zero_order"
     #: predicts the covariances of ``"zero_order"`` under a feedback, without which no
-    #: long horizon with state constraints is feasible, and lets the iteration roll plans
-    #: out under it. The covariances of ``"full"`` and ``"diagonal"`` are those without
-    #: feedback
+    #: long horizon with state constraints is feasible, and lets the iteration roll
+    #: plans out under it. The covariances of ``"full"`` and ``"diagonal"`` are those
+    #: without feedback
     feedback: bool = True
-    #: L in [0, 1], the observer gain of the constant-disturbance estimate; 0 disables it
+    #: L in [0, 1], the observer gain of the constant-disturbance estimate; 0 disables
+    #: it
     disturbance_gain: float = 0.0
     #: ends a decision with a roll-out under the feedback, so that its plan obeys the
     #: model's dynamics however few programs it took; for ``"trajectory"``
@@ -248,7 +249,7 @@ class PredictionModel:
         return list(map(self.assemble, plans, stages, requests))
 
     def assemble(self, plan: Plan, stages: Stages, request: Request) -> LocalProblem:
-        """Returns the problem at a plan, from its stages: covariances, rows and cost."""
+        """Returns the problem at a plan from its stages: covariances, rows, cost."""
         cost = self.costs.at(plan, request.parameters)
         covariances = self._covariances_of(plan, stages, cost, request)
         previous = request.previous

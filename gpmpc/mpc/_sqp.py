@@ -334,7 +334,7 @@ class Globalization:
         return True, False
 
     def _end_without_step(self, local: LocalProblem, proposed: Plan) -> Iterate:
-        """Returns how an iteration ends, or goes on, whose line search found no plan."""
+        """Returns how an iteration ends whose line search found no plan."""
         size = self._progress.size
         # What could still be gained: the offset's square is a share of the cost.
         if size**2 <= _ROUND_OFF:

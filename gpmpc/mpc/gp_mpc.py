@@ -675,7 +675,7 @@ class _Attempt:
         )
 
     def _keeps_hard_rows(self, local: LocalProblem) -> bool:
-        """Returns whether a plan violates hard rows of the states by next to nothing."""
+        """Returns whether a plan keeps hard rows of the states, nearly."""
         prices = self._prediction.constraints.prices
         hard = np.where(np.isinf(prices), np.inf, 0.0)
         return price_violations(hard, local.rows, local.plan, 1.0) <= FEASIBLE
