@@ -1,4 +1,4 @@
-"""A model that was learned from a log obeys the protocol of models, and flies from the command line."""
+"""A model of a log obeys the protocol of models, and flies from the command line."""
 
 import re
 import shlex
@@ -102,7 +102,10 @@ def test_the_guide_flies_learns_and_flies_what_was_learned(tmp_path):
     wrong = forked(
         "run", "system=cart_pole", "model=learned/model.safetensors", cwd=tmp_path
     )
-    expected = "learned/model.safetensors has the states angle, rate; cart_pole has position, velocity, angle, rate"
+    expected = (
+        "learned/model.safetensors has the states angle, rate; "
+        "cart_pole has position, velocity, angle, rate"
+    )
     assert (wrong.returncode, wrong.stderr) == (2, f"gpmpc: model: {expected}\n")
     missing = forked("run", "system=pendulum", "model=none.safetensors", cwd=tmp_path)
     assert (missing.returncode, missing.stderr.count("\n")) == (2, 1)

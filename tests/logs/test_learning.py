@@ -1,4 +1,4 @@
-"""What is learned from logs is judged by rollouts: parameters, noise and structure of simulated flights come back."""
+"""Learning from logs by rollouts: parameters, noise and structure of flights."""
 
 import os
 import runpy
@@ -81,7 +81,7 @@ def test_the_outputs_of_a_rigid_body_are_those_that_moved_it():
     )
 
 
-def test_parameters_come_back_from_rollouts_within_their_standard_errors_also_with_outliers(
+def test_parameters_come_back_within_their_standard_errors(
     flights,
 ):
     log = as_log(flights, gaps=(700,))
@@ -105,7 +105,7 @@ def test_parameters_come_back_from_rollouts_within_their_standard_errors_also_wi
         assert 0 < found["torque_x1"][1] < 5
 
 
-def test_learning_chooses_the_motors_finds_the_noise_and_beats_what_costs_nothing(
+def test_learning_finds_motors_and_noise_and_beats_baselines(
     flights,
 ):
     log = as_log(flights, gaps=(500,))
@@ -158,7 +158,7 @@ def pendulum_log(friction, rows=900, seed=0, noise=0.02):
     return Log(mapping, 0.02, tuple(runs))
 
 
-def test_an_output_keeps_its_gp_only_where_held_out_rollouts_get_better():
+def test_a_gp_stays_only_where_held_out_rollouts_get_better():
     curved = learn(
         pendulum_log(lambda x: 9 * np.sin(x[0]) + 0.5 * x[1]), points=60, steps=20
     )
@@ -172,7 +172,7 @@ def test_an_output_keeps_its_gp_only_where_held_out_rollouts_get_better():
 
 
 def spinning_log(kind, rows=400):
-    """A pendulum that turns once a second and more, whose sensor shows an angle within a turn."""
+    """A pendulum that turns over, whose sensor shows an angle within a turn."""
     torques = np.random.default_rng(0).uniform(-8, 8, rows)
     states = [np.array([0.0, 9.0])]
     for u in torques[:-1]:
@@ -198,7 +198,7 @@ def begin(text):
     raise Begun
 
 
-def test_learning_names_an_angle_that_wraps_and_is_not_called_one(caplog):
+def test_learning_names_an_undeclared_angle_that_wraps(caplog):
     for kind, told in (("vector", 1), ("angle", 0)):
         caplog.clear()
         with pytest.raises(Begun):
@@ -206,7 +206,7 @@ def test_learning_names_an_angle_that_wraps_and_is_not_called_one(caplog):
         assert caplog.text.count("column 1 of the states jumps by whole turns") == told
 
 
-def test_a_rate_of_turning_is_averaged_over_more_than_half_a_turn():
+def test_a_rate_is_averaged_over_more_than_half_a_turn():
     log = spinning_log("angle")
     kinematics = Increments(log.space)
     nominal = AffineNominal(kinematics, fitted=False)
@@ -258,7 +258,7 @@ def test_a_model_is_the_same_after_saving_and_damage_is_named(tmp_path):
     np.testing.assert_array_equal(again.model.rollout(windows), expected)
 
 
-def test_the_same_rows_in_pieces_of_one_run_or_another_log_give_the_same_model(flights):
+def test_the_same_rows_in_other_pieces_give_the_same_model(flights):
     one = as_log(flights[:2], gaps=(700,))
     other = replace(
         one,
@@ -272,7 +272,7 @@ def test_the_same_rows_in_pieces_of_one_run_or_another_log_give_the_same_model(f
 
 
 def test_learning_is_the_same_whatever_marks_a_gap(tmp_path):
-    """Rows that are missing, rows without values, and stamps that jump leave the rows that are there as they are."""
+    """Missing rows, empty rows and stamps that jump leave the other rows as they are."""
     tables = {way: [] for way in ("missing", "empty", "jump")}
     for run in pendulum_log(lambda x: 9 * np.sin(x[0]) + 0.5 * x[1], rows=300):
         table = pandas.DataFrame(
@@ -366,7 +366,7 @@ FLIGHTS = os.environ.get("GPMPC_FLIGHTS")
 
 @pytest.mark.slow
 @pytest.mark.skipif(not FLIGHTS, reason="GPMPC_FLIGHTS names no folder of flights")
-def test_real_flights_are_predicted_better_than_by_anything_that_costs_nothing():
+def test_real_flights_are_predicted_better_than_by_baselines():
     mapping = {
         "time": "t",
         "keep": {"pz": [0.2, None]},

@@ -1,4 +1,6 @@
-"""Loads crafted models under a limit of memory: ``python -m tests.models.hostile N SEED``.
+"""Loads crafted models under a limit of memory.
+
+Also by hand: ``python -m tests.models.hostile N SEED``.
 
 Unlike a damaged file, a crafted one has the right checksum: every field of its header
 and every array may hold anything. What is loaded predicts; everything else is a

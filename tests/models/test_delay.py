@@ -1,4 +1,4 @@
-"""A model whose input acts late is a model; planning from where the inputs on their way lead is exact."""
+"""Delayed models and disturbance states obey the protocol, and look ahead exactly."""
 
 import numpy as np
 import pytest
@@ -46,7 +46,7 @@ def test_an_input_acts_as_many_steps_later_as_the_delay_is(delay):
         assert torch.allclose(z[:2], x, atol=1e-13)
 
 
-def test_a_fraction_of_a_step_mixes_the_two_inputs_that_act_in_it():
+def test_a_fraction_of_a_step_mixes_two_inputs():
     class Integrator(
         torch.nn.Module
     ):  # the exact answer is the mean of the input over the step
@@ -67,7 +67,7 @@ def test_a_fraction_of_a_step_mixes_the_two_inputs_that_act_in_it():
 
 
 @pytest.mark.parametrize("delay", [1, 3, 0.6, 2.3])
-def test_looking_ahead_is_what_the_delayed_model_does_with_the_inputs_on_their_way(
+def test_looking_ahead_agrees_with_the_delayed_model(
     delay,
 ):
     model = DelayedModel(gp(), delay)
@@ -89,7 +89,7 @@ def test_looking_ahead_is_what_the_delayed_model_does_with_the_inputs_on_their_w
         assert float(ahead.mean[2]) == float(queue[-1])
 
 
-def test_disturbance_states_are_a_model_and_move_as_sampling_says():
+def test_disturbance_states_move_as_sampling_says():
     effect = torch.tensor([[0.0, 0.1], [0.5, 0.0]], dtype=F)
     model = DisturbedModel(gp(), effect, [0.1, 0.2], [1.0, 0.8])
     check_model(model)

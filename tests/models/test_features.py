@@ -1,4 +1,4 @@
-"""A GP sees columns, angles as sine and cosine, and lagged values of a state; its effect may depend on the state."""
+"""Features of a GP: columns, sines and cosines, lags; effects of the state."""
 
 import dataclasses
 import functools
@@ -149,7 +149,7 @@ def test_torch_and_casadi_give_the_same_expansion():
         np.testing.assert_allclose(ours, theirs, atol=1e-12)
 
 
-def test_a_turn_more_changes_nothing_and_a_column_that_is_left_out_neither():
+def test_turns_and_left_out_columns_change_nothing():
     model = with_angles()
     x = draw(8, 5, 4)
     u = draw(9, 5, 2)
@@ -185,7 +185,7 @@ def observed(rows=60, seed=0):
     return Transitions(x, u, pendulum(x, u))
 
 
-def test_with_sine_and_cosine_a_pendulum_is_predicted_at_angles_that_were_never_seen():
+def test_sine_and_cosine_predict_a_pendulum_at_unseen_angles():
     seen = observed()
     model = ResidualModel.train(
         Affine.identity(2, 1), seen, angles=[0], trainer=Trainer(restarts=0)
@@ -221,7 +221,7 @@ def test_an_effect_that_depends_on_the_state_is_learned():
     )
 
 
-def test_lags_are_shifted_and_a_velocity_that_is_not_measured_is_found_in_them():
+def test_lags_shift_and_reveal_an_unmeasured_velocity():
     lags = Lags(1, 1, states=1, inputs=2)
     angles = np.arange(6.0)[:, None]
     inputs = 10 + np.arange(5.0)[:, None]
@@ -266,9 +266,7 @@ def test_lags_are_shifted_and_a_velocity_that_is_not_measured_is_found_in_them()
     ],
     ids=["numbers", "function", "partial", "dataclass", "operations", "system"],
 )
-def test_a_nominal_model_and_an_effect_are_saved_by_the_path_they_are_imported_from_or_their_operations(
-    nominal, effect, tmp_path
-):
+def test_nominal_and_effect_are_saved_by_path_or_operations(nominal, effect, tmp_path):
     model = with_effect(nominal, effect)
     save_model(model, tmp_path / "m.safetensors")
     loaded = load_model(tmp_path / "m.safetensors", trusted=["tests"])
@@ -282,9 +280,7 @@ def test_a_nominal_model_and_an_effect_are_saved_by_the_path_they_are_imported_f
         assert np.array_equal(ours, theirs)
 
 
-def test_code_without_a_path_is_refused_and_so_is_a_path_that_leads_nowhere(
-    tmp_path, monkeypatch
-):
+def test_code_without_a_path_that_leads_to_it_is_refused(tmp_path, monkeypatch):
     with pytest.raises(
         UnsupportedModel, match="nominal is code that a file cannot name"
     ):
@@ -338,7 +334,7 @@ def test_misuse_is_refused(settings, error, rule):
 
 
 @pytest.mark.parametrize("name", ["angles", "effect in torch"])
-def test_torch_can_follow_the_jacobian_which_is_that_of_the_fast_road(name):
+def test_torch_can_follow_the_jacobian_of_the_fast_road(name):
     model = MODELS[name]()
     x = draw(8, 5, model.state_dim)
     u = draw(9, 5, model.input_dim)

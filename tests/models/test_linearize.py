@@ -1,4 +1,4 @@
-"""A model linearises K points in one call; the numbers are those of its predictions' derivatives."""
+"""Linearisations of K points are the derivatives of the predictions."""
 
 import logging
 

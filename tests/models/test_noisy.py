@@ -1,4 +1,4 @@
-"""A model whose noise depends on state and input counts it once, in everything that takes a model."""
+"""A model whose noise depends on state and input counts it once, everywhere."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""A known model with a GP on what it misses, against sampling, finite differences, and a known residual."""
+"""Residual models against sampling, finite differences and known residuals."""
 
 import pytest
 import torch
@@ -51,7 +51,7 @@ def belief(spread=0.3):
 
 
 @pytest.mark.parametrize("nominal", [AFFINE, nonlinear])
-def test_the_prediction_is_the_nominal_one_and_the_residual_where_it_acts(nominal):
+def test_a_prediction_is_nominal_plus_residual_where_it_acts(nominal):
     x = torch.rand(4, 3)
     u = torch.rand(4, 2)
     found = model(nominal).predict(x, u)
@@ -84,7 +84,7 @@ def test_the_jacobian_is_that_of_finite_differences(nominal):
         assert torch.allclose(by_input[..., d], slope, atol=1e-8)
 
 
-def test_moment_matching_with_an_affine_nominal_model_is_what_sampling_finds():
+def test_moment_matching_with_an_affine_nominal_model():
     known = model()
     at = belief()
     control = torch.tensor([0.3, -0.5])
@@ -104,7 +104,7 @@ def test_moment_matching_with_an_affine_nominal_model_is_what_sampling_finds():
         )  # of Student's t with 19 degrees of freedom: 1 in 4000 each
 
 
-def test_a_nonlinear_nominal_model_goes_with_every_other_propagation():
+def test_a_nonlinear_nominal_goes_with_every_other_propagation():
     known = model(nonlinear)
     at = belief(0.05)
     control = torch.tensor([0.3, -0.5])
@@ -153,7 +153,7 @@ def test_training_finds_a_known_residual(trainer):
     )
 
 
-def test_by_default_every_state_has_a_residual_of_all_states_and_inputs():
+def test_by_default_every_state_has_a_residual_of_everything():
     known = ResidualModel.train(AFFINE, transitions(15), trainer=Trainer(restarts=0))
     assert (
         known.residual.state_dim,

@@ -59,7 +59,7 @@ MODELS = {
 
 
 @pytest.mark.parametrize("kind", MODELS)
-def test_a_roll_out_obeys_the_model_and_the_feedback_within_its_bounds(kind):
+def test_a_roll_out_obeys_the_model_and_the_bounded_feedback(kind):
     model = MODELS[kind]()
     random = np.random.default_rng(0)
     T = 3
@@ -115,7 +115,7 @@ def test_plans_may_have_gains_of_their_own():
             assert np.array_equal(found[t], alone[0])
 
 
-def test_starts_of_whole_numbers_and_strided_disturbances_are_taken_as_they_are():
+def test_integer_starts_and_strided_disturbances_are_taken():
     roll_out = RollOut(MODELS["differences"]())
     inputs = np.zeros((1, 3, 2))
     wide = np.arange(9.0).reshape(3, 3) / 10

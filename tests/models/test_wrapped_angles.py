@@ -1,4 +1,4 @@
-"""Angles that a sensor shows within a turn teach and predict what angles that count turns do, or somebody is told."""
+"""Angles within a turn teach and predict what angles that count turns do."""
 
 import logging
 
@@ -77,22 +77,20 @@ def error(model, kind):
     [shown, lambda x: shown(x, 0.0), lambda x: shown(x, -1.0)],
     ids=["-pi to pi", "0 to 2 pi", "-1 to 2 pi - 1"],
 )
-def test_a_pendulum_whose_sensor_wraps_is_learned_as_one_that_counts_turns(
-    kind, sensor
-):
+def test_a_sensor_that_wraps_teaches_what_counted_turns_do(kind, sensor):
     data = transitions(kind, sensor)
     assert error(learned(data), kind) < 1e-4
     assert error(learned(transitions(kind, np.array)), kind) < 1e-4
 
 
-def test_states_that_count_turns_beside_next_states_that_do_not_are_learned_alike():
+def test_next_states_may_wrap_where_states_count_turns():
     states, inputs = FLIGHTS["turning"]
     data = Transitions(states[:-1], inputs, shown(states[1:]))
     assert error(learned(data), "turning") < 1e-4
 
 
 @pytest.mark.parametrize("window", [None, SlidingWindow(150)], ids=["all", "window"])
-def test_appended_rows_that_wrap_teach_what_rows_do_that_count_turns(window):
+def test_appended_rows_may_wrap(window):
     wrapping, counting = (
         learned(transitions("hanging", sensor)[:100]).append(
             transitions("hanging", sensor)[100:], window
@@ -103,7 +101,7 @@ def test_appended_rows_that_wrap_teach_what_rows_do_that_count_turns(window):
     assert torch.allclose(wrapping.residual.targets, counting.residual.targets)
 
 
-def test_targets_of_differences_leave_out_the_turns_of_declared_angles_alone():
+def test_differences_leave_out_turns_of_declared_angles_alone():
     data = transitions("hanging")
     plain = data.targets("difference")
     declared = data.targets("difference", [0])
@@ -120,7 +118,7 @@ def wrapping_pendulum(x, u):
 
 
 @pytest.mark.parametrize("nominal", [None, wrapping_pendulum], ids=["none", "wraps"])
-def test_predictions_go_on_without_a_jump_where_an_angle_passes_half_a_turn(nominal):
+def test_predictions_do_not_jump_at_half_a_turn(nominal):
     model = learned(transitions("hanging"), nominal)
     angles = torch.linspace(np.pi - 0.3, np.pi + 0.3, 61, dtype=F)
     x = torch.stack([angles, torch.full_like(angles, 1.0)], dim=-1)
@@ -155,7 +153,7 @@ class Wrapping:
 
 
 @pytest.mark.parametrize("propagator", [Unscented(), MonteCarlo(4000)])
-def test_points_are_averaged_the_short_way_where_the_next_angle_wraps(propagator):
+def test_points_are_averaged_the_short_way_round(propagator):
     away = torch.tensor([np.pi, 0.0], dtype=F)
     spread = torch.diag(torch.tensor([0.04, 0.01], dtype=F))
     u = torch.zeros(1, dtype=F)
@@ -167,7 +165,7 @@ def test_points_are_averaged_the_short_way_where_the_next_angle_wraps(propagator
     )
 
 
-def test_wrappers_and_lagged_states_know_the_angles_of_their_model():
+def test_wrappers_and_lags_know_the_angles_of_their_model():
     effect = torch.tensor([[0.0], [1.0]], dtype=F)
     disturbed = DisturbedModel(HANGING, effect, [0.1])
     assert list(DelayedModel(disturbed, 2).angles) == [0]
@@ -195,7 +193,7 @@ def test_wrappers_and_lagged_states_know_the_angles_of_their_model():
     ],
     ids=["residual", "next state", "difference", "refit", "sparse"],
 )
-def test_training_says_once_which_undeclared_state_jumps_by_whole_turns(train, caplog):
+def test_training_names_an_undeclared_angle_once(train, caplog):
     with caplog.at_level(logging.WARNING, "gpmpc"):
         train(transitions("hanging"))
     told = [r.getMessage() for r in caplog.records if "whole turns" in r.getMessage()]
@@ -257,7 +255,7 @@ def test_honest_large_steps_are_no_turns(steps, caplog):
         assert warned(x[:-1], x[1:], caplog) == ""
 
 
-def test_every_difference_of_states_leaves_whole_turns_out_of_arrays_and_tensors():
+def test_differences_of_states_leave_whole_turns_out():
     one = np.array([[3.1, 5.0], [-9.0, 0.0]])
     other = np.array([[-3.1, -5.0]])
     for kind in (np.array, torch.tensor):
@@ -288,7 +286,7 @@ def test_a_calibration_counts_no_turn_as_an_error():
     assert off[0, 0] >= right[0, 0]
 
 
-def test_noise_of_a_process_is_that_of_the_motion_and_its_order_of_time_is_found():
+def test_process_noise_is_that_of_the_motion_and_ordered_in_time():
     rng, (states, inputs) = np.random.default_rng(0), FLIGHTS["hanging"]
     noisy = states + rng.normal(0, [1e-3, 1e-2], states.shape)
     found = []
