@@ -1,4 +1,4 @@
-"""Says how measured vectors follow from those of a motion: axes, signs, units and lags.
+"""Fits axes, signs, units and lags of measured vectors to those of a motion.
 
 Vectors are compared axis by axis. The *misfit* of two axes is a quantile of their
 difference over the same quantile of the larger one: 0 where they agree, about 1 where
@@ -35,7 +35,7 @@ class _AxisChanges(NamedTuple):
 
 @cache
 def axis_changes() -> _AxisChanges:
-    """Products of the mistakes that are made, the fewest first."""
+    """Lists the products of the mistakes that people make, the fewest first."""
     swaps = [np.eye(3)[list(order)] for order in ((1, 0, 2), (2, 1, 0), (0, 2, 1))]
     cycles = [np.eye(3)[list(order)] for order in ((1, 2, 0), (2, 0, 1))]
     flips = [np.diag(signs) for signs in ([-1, 1, 1], [1, -1, 1], [1, 1, -1])]
@@ -58,12 +58,12 @@ def axis_changes() -> _AxisChanges:
 
 
 def _key(matrix: Array) -> tuple[int, ...]:
-    """A matrix of whole numbers as the key of a dictionary."""
+    """Returns a matrix of whole numbers as the key of a dictionary."""
     return tuple(np.rint(matrix).astype(int).ravel().tolist())
 
 
 def count_mistakes(matrix: Array) -> float:
-    """The number of mistakes that make a change of the axes."""
+    """Counts the mistakes that make a change of the axes (3, 3)."""
     changes = axis_changes()
     matches = (changes.matrices == np.rint(matrix)).all(axis=(1, 2))
     return float(changes.costs[int(np.argmax(matches))])
@@ -82,17 +82,18 @@ class AxisFit:
 
 
 def absolute_quantiles(values: Array) -> Array:
-    """Quantiles (Q, ...) of absolute values (N, ...)."""
+    """Returns the quantiles (Q, ...) of absolute values (N, ...)."""
     places = [int(share * (len(values) - 1)) for share in QUANTILES]
     return np.partition(np.abs(values), places, axis=0)[places]
 
 
 def centred(values: Array) -> Array:
+    """Subtracts the median of values (N, ...)."""
     return values - np.median(values, axis=0)
 
 
 def misfits(measured: Array, derived: Array) -> Array:
-    """Misfits (...) of measured values to derived ones (N, ...), as this file says."""
+    """Returns the misfits (...) of measured to derived values (N, ...); see above."""
     measured = centred(measured)
     derived = centred(derived)
     sizes = np.maximum(absolute_quantiles(measured), absolute_quantiles(derived))
@@ -101,52 +102,82 @@ def misfits(measured: Array, derived: Array) -> Array:
     return ratios.min(axis=0)
 
 
+class _UnitOption(NamedTuple):
+    """The scores of all changes of axes, where one unit is supposed to be wrong."""
+
+    scores: Array  # (48,)
+    unit: int  # number of the unit; 0 is none
+    axis: int | None  # that has it; None: all three
+
+
 def _fit_axes(
     measured: Array, derived: Array, factors: Sequence[float], floor: float
 ) -> AxisFit:
-    """The change of axes and units that explains measured vectors (N, 3) best.
+    """Fits the change of axes and units that explains measured vectors (N, 3) best.
 
     One unit may be wrong: that of all axes, or of one.
+
+    Args:
+        measured: Vectors (N, 3).
+        derived: Those of the motion (N, 3).
+        factors: That wrong units make.
+        floor: Misfits below it count as this one.
     """
     measured = centred(measured)
     derived = centred(derived)
     units = [1.0, *_plausible(factors, measured, derived)]
     table = np.array([_misfit_table(measured, unit * derived) for unit in units])
     changes = axis_changes()
-    costs = changes.costs
-    each = table[:, np.arange(3), changes.sources, changes.flips]  # (U, 48, 3)
-    logs = np.log(np.maximum(each, floor))
-    plain = logs[0].sum(axis=1)
-    # The scores of all changes of axes, the unit, and its axis: None means all three.
-    options: list[tuple[Array, int, int | None]] = [(plain + CHANGE * costs, 0, None)]
-    for unit in range(1, len(units)):
-        is_unit = units[unit] in factors
-        with_unit = costs + (1 if is_unit else NO_UNIT)
-        options.append((logs[unit].sum(axis=1) + CHANGE * with_unit, unit, None))
-        for axis in range(3) if is_unit else ():
-            gain = logs[unit, :, axis] - logs[0, :, axis]
-            options.append((plain + gain + CHANGE * with_unit, unit, axis))
-    scores, unit, axis = min(options, key=lambda option: option[0].min())
-    best = int(scores.argmin())
-    axes = slice(None) if axis is None else axis
+    # of each axis, by unit and change of axes (U, 48, 3)
+    axis_misfits = table[:, np.arange(3), changes.sources, changes.flips]
+    options = _unit_options(np.log(np.maximum(axis_misfits, floor)), units, factors)
+    best = min(options, key=lambda option: option.scores.min())
+    change = int(best.scores.argmin())
+    axes = slice(None) if best.axis is None else best.axis
     scale = np.ones(3)
-    scale[axes] = units[unit]
-    misfits_of_best = each[0, best].copy()
-    misfits_of_best[axes] = each[unit, best, axes]
-    score = float(scores[best])
-    fits = float(np.log(np.maximum(misfits_of_best, floor)).sum())
+    scale[axes] = units[best.unit]
+    misfits_of_best = axis_misfits[0, change].copy()
+    misfits_of_best[axes] = axis_misfits[best.unit, change, axes]
+    score = float(best.scores[change])
+    without_cost = float(np.log(np.maximum(misfits_of_best, floor)).sum())
     return AxisFit(
-        matrix=changes.matrices[best],
+        matrix=changes.matrices[change],
         factors=scale,
         lag=0.0,
         misfits=misfits_of_best,
-        cost=(score - fits) / CHANGE,
+        cost=(score - without_cost) / CHANGE,
         score=score,
     )
 
 
+def _unit_options(
+    log_misfits: Array, units: Sequence[float], factors: Sequence[float]
+) -> list[_UnitOption]:
+    """Scores all changes of axes with each unit, for all axes or for one.
+
+    Args:
+        log_misfits: By unit, change of axes and axis (U, 48, 3).
+        units: The factor of each; the first is 1 (U,).
+        factors: That wrong units make; another factor is no unit, and costs more.
+    """
+    costs = axis_changes().costs
+    fits = log_misfits[0].sum(axis=1)
+    options = [_UnitOption(fits + CHANGE * costs, unit=0, axis=None)]
+    for unit in range(1, len(units)):
+        is_unit = units[unit] in factors
+        price = CHANGE * (costs + (1 if is_unit else NO_UNIT))
+        scores = log_misfits[unit].sum(axis=1) + price
+        options.append(_UnitOption(scores, unit, axis=None))
+        if not is_unit:
+            continue
+        for axis in range(3):
+            gain = log_misfits[unit, :, axis] - log_misfits[0, :, axis]
+            options.append(_UnitOption(fits + gain + price, unit, axis))
+    return options
+
+
 def _misfit_table(measured: Array, derived: Array) -> Array:
-    """Misfits (3, 3, 2) of each measured axis to each derived one and its negative."""
+    """Returns misfits (3, 3, 2) of measured to derived axes and to their negatives."""
     own = absolute_quantiles(measured)[:, :, None, None]
     others = absolute_quantiles(derived)[:, None, :, None]
     differences = measured[:, :, None] - derived[:, None, :]
@@ -160,7 +191,7 @@ def _misfit_table(measured: Array, derived: Array) -> Array:
 def _plausible(
     factors: Sequence[float], measured: Array, derived: Array
 ) -> list[float]:
-    """Factors that the sizes of both sides allow, and their own where it is large."""
+    """Returns the factors that the sizes allow, and their ratio where it is large."""
     large = QUANTILES.index(0.9)
     sizes = absolute_quantiles(measured)[large]
     derived_sizes = absolute_quantiles(derived)[large]
@@ -178,7 +209,7 @@ def _plausible(
 
 
 def correlation(one: Array, other: Array) -> Array:
-    """Correlations (3,) of the axes of vectors (N, 3), without glitches."""
+    """Returns the correlations (3,) of axes of vectors (N, 3), without glitches."""
     one = _without_glitches(one)
     other = _without_glitches(other)
     product = (one * other).sum(axis=0)
@@ -187,14 +218,14 @@ def correlation(one: Array, other: Array) -> Array:
 
 
 def _without_glitches(vectors: Array) -> Array:
-    """Centred vectors (N, 3) whose largest hundredth is cut off at either side."""
+    """Centres vectors (N, 3), and cuts their largest hundredth off at either side."""
     low, high = np.quantile(vectors, [0.01, 0.99], axis=0)
     clipped = np.clip(vectors, low, high)
     return clipped - clipped.mean(axis=0)
 
 
 class LaggedVectors(NamedTuple):
-    """Measured vectors at all lags, as they are correlated with others."""
+    """Measured vectors at all lags, ready to be correlated with others."""
 
     lags: Array  # (L,) [s]
     later: Array  # (L, N, 3); NaN beyond the piece
@@ -215,7 +246,7 @@ def lagged_vectors(lags: Array, later: Array) -> LaggedVectors:
 
 
 def lagged_correlations(series: LaggedVectors, derived: Array) -> Array:
-    """Correlations (L, 3, 3) of measured axes, at each lag, with derived ones."""
+    """Returns correlations (L, 3, 3) of measured axes with derived ones, by lag."""
     low, high = np.quantile(derived, [0.01, 0.99], axis=0)
     derived = np.clip(derived, low, high) - np.median(derived, axis=0)
     products = np.swapaxes(series.clipped, 1, 2) @ derived
@@ -231,7 +262,7 @@ def lagged_correlations(series: LaggedVectors, derived: Array) -> Array:
 
 
 def agreements(series: LaggedVectors, derived: Array) -> Array:
-    """At each lag (L,), the correlations of the axes in their best order, summed."""
+    """Sums the correlations of the axes in their best order, at each lag (L,)."""
     correlations = np.abs(lagged_correlations(series, derived))
     axes = np.arange(3)
     orders = np.array(list(itertools.permutations(axes)))
@@ -241,7 +272,7 @@ def agreements(series: LaggedVectors, derived: Array) -> Array:
 def fit_axes_and_lag(
     series: LaggedVectors, derived: Array, factors: Sequence[float], floor: float
 ) -> AxisFit:
-    """The change of axes and units, now or at the lag of the largest correlations."""
+    """Fits a change of axes and units, now or at the lag that correlates most."""
     now = len(series.lags) // 2
     rows = series.inside[now]
     fit = _fit_axes(series.later[now][rows], derived[rows], factors, floor)

@@ -38,7 +38,7 @@ class LogRun:
 
     @cached_property
     def pieces(self) -> list[tuple[int, int]]:
-        """First row, and row after the last, of each piece."""
+        """The first row, and the row after the last, of each piece."""
         return list(zip(self.begins, (*self.begins[1:], len(self)), strict=True))
 
     def starts(self, past: int, ahead: int, stride: int = 1) -> np.ndarray:

@@ -197,9 +197,8 @@ class LogMapping:
     #: "drop" leaves out rows in which a state's whole signal repeats the row before;
     #: "use" takes them.
     held: str = "drop"
-    rest: str = (
-        "drop"  #: "drop" leaves out parts in which nothing moves; "use" takes them
-    )
+    #: "drop" leaves out parts in which nothing moves; "use" takes them
+    rest: str = "drop"
     model: str = "none"  #: what is known of the system: "rigid_body" or "none"
     #: times of a bag's messages: "header" takes the stamps that they carry, "log" the
     #: times at which they were logged; empty takes what gives the topics time in common

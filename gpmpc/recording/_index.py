@@ -61,7 +61,7 @@ class Place(NamedTuple):
 
 @dataclass
 class Inventory:
-    """What is in the data of a file: as its index says, or as it was read."""
+    """The records of the data of a file: as its index says, or as they were read."""
 
     schemas: dict[int, Schema] = field(default_factory=dict)
     channels: dict[int, Channel] = field(default_factory=dict)
@@ -95,7 +95,7 @@ class Index:
 
     @cached_property
     def _starts(self) -> list[int]:
-        """Where the records of the data stand that it names, and their last one."""
+        """The starts of the records that it names, and of the one that ends the data."""
         places = [p for places in self.inventory.places().values() for p in places]
         return sorted([p.start for p in places] + [self.start - DATA_END_SIZE])
 

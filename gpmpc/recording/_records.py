@@ -179,7 +179,7 @@ class _DataReader:
         while self._position < self._data_end and not self._ended:
             frame = read_frame(self._file, self._position, self._size)
             if frame is None or not self._is_of_data(frame):
-                yield from self._go_on_behind(frame)
+                yield from self._resume_behind(frame)
                 continue
             before = self._checksum
             head = HEAD.pack(frame.kind, len(frame.content))
@@ -188,9 +188,9 @@ class _DataReader:
             if frame.kind == Opcode.DATA_END:
                 self._end(frame, before)
             elif frame.kind == Opcode.CHUNK:
-                yield from self._chunk(frame)
+                yield from self._records_of_chunk(frame)
             elif frame.kind in _PARSED_KINDS:
-                yield from self._record(frame)
+                yield from self._records_outside(frame)
         if self._index is not None and self._index.statistics is not None:
             yield self._index.statistics
 
@@ -211,6 +211,7 @@ class _DataReader:
         ]
 
     def _missing_end(self) -> list[Flaw]:
+        """Says whether the file has no end, or another than its index names."""
         if not self._ended:
             return [Flaw(UNFINISHED, 1, "it was not finished: it has no end")]
         if self._index is None:
@@ -222,6 +223,7 @@ class _DataReader:
         return []
 
     def _missing_checksums(self) -> list[Flaw]:
+        """Says what no checksum vouches for."""
         is_covered = self._data_checksum != 0 and self._checksum_is_right
         if is_covered or not self._messages:
             return []
@@ -245,11 +247,12 @@ class _DataReader:
         return frame.kind in _DATA_KINDS
 
     def _end(self, frame: Frame, checksum: int) -> None:
+        """Compares the checksum of all data with that of the record that ends them."""
         self._ended = True
         self._data_checksum = stored_checksum(frame.content)
         self._checksum_is_right = agrees(self._data_checksum, checksum)
 
-    def _record(self, frame: Frame) -> Iterator[McapRecord]:
+    def _records_outside(self, frame: Frame) -> Iterator[McapRecord]:
         """Yields a record that stands outside chunks."""
         place = Place(frame.start, frame.end - frame.start)
         try:
@@ -267,9 +270,9 @@ class _DataReader:
             self._unchecked += 1
         yield from self._with_channel(record)
 
-    def _chunk(self, frame: Frame) -> Iterator[McapRecord]:
+    def _records_of_chunk(self, frame: Frame) -> Iterator[McapRecord]:
         """Yields the records of a chunk, and sees to where the next record stands."""
-        has_successor = self._is_likely(frame.end)
+        has_successor = self._may_be_record(frame.end)
         try:
             chunk: Chunk = parsed(frame.kind, frame.content)
             end = frame.content_start + chunk_length(chunk)
@@ -281,29 +284,31 @@ class _DataReader:
                 self._damage.lost_chunks.append(frame.start)
                 self._search.begin = frame.end
             else:
-                yield from self._go_on_behind(None, frame.start)
+                yield from self._resume_behind(None, frame.start)
             return
         if end < frame.end and not has_successor:  # its length is wrong
             self._damage.damaged_records.append(frame.start)
             self._position = end
         self._search.begin = self._position
-        yield from self._inside(PlacedChunk(frame.start, end, chunk, data))
+        placed = PlacedChunk(start=frame.start, end=end, chunk=chunk, data=data)
+        yield from self._records_inside(placed)
 
-    def _inside(self, placed: PlacedChunk) -> Iterator[McapRecord]:
+    def _records_inside(self, placed: PlacedChunk) -> Iterator[McapRecord]:
         """Yields the records of a chunk that has not been read before."""
-        start, end, chunk, data = placed
+        chunk = placed.chunk
+        data = placed.data
         identity = (chunk.uncompressed_crc, len(data), zlib.crc32(chunk.data))
         if identity in self._identities:
             self._damage.repeated_chunks += 1
             return
         self._identities.add(identity)
-        self._inventory.chunks.append(Place(start, end - start))
+        self._inventory.chunks.append(Place(placed.start, placed.end - placed.start))
         stream = BytesIO(data)
         position = 0
         while position < len(data):
             frame = read_frame(stream, position, len(data))
             if frame is None:
-                self._damage.damaged_records.append(start)
+                self._damage.damaged_records.append(placed.start)
                 return
             position = frame.end
             if frame.kind not in _IN_CHUNKS:
@@ -311,7 +316,7 @@ class _DataReader:
             try:
                 record = parsed(frame.kind, frame.content)
             except BROKEN:
-                self._damage.damaged_records.append(start)
+                self._damage.damaged_records.append(placed.start)
                 return
             if isinstance(record, Message) and chunk.uncompressed_crc == 0:
                 self._unchecked += 1
@@ -350,6 +355,7 @@ class _DataReader:
         yield channel
 
     def _unfold(self, chunk: Chunk) -> bytes:
+        """Decompresses a chunk; ``RecordingError`` where all unfold to too much."""
         if chunk.uncompressed_size <= LARGEST:
             self._room -= chunk.uncompressed_size
         if self._room < 0:
@@ -359,7 +365,11 @@ class _DataReader:
             )
         return unfolded(chunk)
 
-    def _is_likely(self, position: int) -> bool:
+    def _has_right_length(self, frame: Frame) -> bool:
+        """Tells whether a broken record, which is no chunk, ends where another begins."""
+        return not is_like_chunk(frame.content) and self._may_be_record(frame.end)
+
+    def _may_be_record(self, position: int) -> bool:
         """Tells whether a record of the data, or the end, stands at a position."""
         if position in (self._size, self._data_end):
             return True
@@ -370,10 +380,10 @@ class _DataReader:
         kind, length = HEAD.unpack(head)
         if kind == Opcode.DATA_END:
             return bool(length == 4)
-        is_known = kind in _DATA_KINDS or kind >= _PRIVATE
-        return is_known and length <= self._size - position - HEAD.size
+        is_data_kind = kind in _DATA_KINDS or kind >= _PRIVATE
+        return is_data_kind and length <= self._size - position - HEAD.size
 
-    def _go_on_behind(
+    def _resume_behind(
         self, frame: Frame | None, start: int | None = None
     ) -> Iterator[McapRecord]:
         """Yields the records of the next whole chunk behind a broken record.
@@ -381,9 +391,9 @@ class _DataReader:
         Reading goes on behind that chunk; or behind the broken record, if its length
         is right; or with the next record that the index names; or it ends.
         """
-        start = self._position if start is None else start
-        is_other_kind = frame is not None and not is_like_chunk(frame.content)
-        if frame is not None and is_other_kind and self._is_likely(frame.end):
+        if start is None:
+            start = self._position
+        if frame is not None and self._has_right_length(frame):
             self._damage.damaged_records.append(start)
             self._position = frame.end
             return
@@ -401,4 +411,4 @@ class _DataReader:
             return
         self._position = placed.end
         self._search.begin = placed.end
-        yield from self._inside(placed)
+        yield from self._records_inside(placed)

@@ -1,4 +1,5 @@
-"""What is damaged in a bag or a recording is refused, or stands in the findings of its log."""
+"""What is damaged in a bag or a recording is refused, or stands in the findings of its
+log."""
 
 import numpy as np
 import pytest

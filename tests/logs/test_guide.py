@@ -1,4 +1,5 @@
-"""Every Python block of the guide runs, one after the other, on the files of the example."""
+"""Every Python block of the guide runs, one after the other, on the files of the
+example."""
 
 import re
 import runpy

@@ -1,4 +1,5 @@
-"""An inspection finds what was put into a log: delays, noise, repeated values, gaps, inputs that teach nothing."""
+"""An inspection finds what was put into a log: delays, noise, repeated values, gaps,
+inputs that teach nothing."""
 
 import json
 import runpy

@@ -1,4 +1,5 @@
-"""Logs come out as they were measured: what is wrong with them is named, and no gap is bridged."""
+"""Logs come out as they were measured: what is wrong with them is named, and no gap is
+bridged."""
 
 import struct
 

@@ -1,7 +1,8 @@
-"""Damages a recording in every way that a disk, a copy, an editor or an enemy may: flips, cuts, edits, bombs.
+"""Damages a recording as a disk, a copy, an editor or an enemy may.
 
-Every function gives one copy of a file's bytes. ``DAMAGES`` leave checksums as they were; ``EDITS`` put them right, so
-that a reader may believe the content, which is another.
+Every function gives one copy of a file's bytes. ``DAMAGES`` leave checksums as they
+were; ``EDITS`` put them right, so that a reader may believe the content, which is
+another.
 """
 
 import io
@@ -61,7 +62,8 @@ def joined(found):
 
 
 def sealed(found):
-    """A file of the records of a data section, all its checksums right, without the index."""
+    """A file of the records of a data section, all its checksums right, without the
+    index."""
     data = MAGIC + joined(found)
     end = joined([(DATA_END, struct.pack("<I", zlib.crc32(data)))])
     footer = struct.pack("<BQQQ", FOOTER, 20, 0, 0)
@@ -459,7 +461,8 @@ def bomb(data, rng, largest=2**31):
 
 
 def well_formed_bomb(data, rng):
-    """Plans and quadratic programs of zeros: every number in its place, and far too many of them."""
+    """Plans and quadratic programs of zeros: every number in its place, and far too
+    many of them."""
     classes = _schema.message_classes(_schema.descriptor(runs.STATES, runs.INPUTS))
     n = len(runs.STATES)
     found = section(data)
@@ -530,10 +533,28 @@ def foreign(data, rng):
 
 
 DAMAGES = (
-    flip_anywhere, flip_text, flip_head, flip_end, cut, cut_and_flip, overwrite, insert_or_delete, append, shuffle_file,
+    flip_anywhere,
+    flip_text,
+    flip_head,
+    flip_end,
+    cut,
+    cut_and_flip,
+    overwrite,
+    insert_or_delete,
+    append,
+    shuffle_file,
     huge,
-)  # fmt: skip
+)
 EDITS = (
-    shuffle_sealed, shuffle_in_chunk, flip_in_chunk, cut_in_chunk, renumber, edit_message, edit_metadata, edit_config,
-    bomb, well_formed_bomb, foreign,
-)  # fmt: skip
+    shuffle_sealed,
+    shuffle_in_chunk,
+    flip_in_chunk,
+    cut_in_chunk,
+    renumber,
+    edit_message,
+    edit_metadata,
+    edit_config,
+    bomb,
+    well_formed_bomb,
+    foreign,
+)

@@ -1,6 +1,7 @@
-"""Forks a process for every path that it reads, which records there until it is killed; says its number.
+"""Forks a process for every path that it reads, and says its number.
 
-A fork needs no start of the interpreter, so that many can be killed. A second word is a number of steps to stop after.
+The process records there until it is killed. A fork needs no start of the interpreter,
+so that many can be killed. A second word is a number of steps to stop after.
 """
 
 import os

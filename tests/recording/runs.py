@@ -1,4 +1,5 @@
-"""Small made-up runs: a point mass in the plane of x and z, with quadratic programs that are really solved."""
+"""Small made-up runs: a point mass in the plane of x and z, with quadratic programs
+that are really solved."""
 
 import numpy as np
 

@@ -1,8 +1,9 @@
 """Reads thousands of damaged copies of a recording, and says what came of each.
 
-``python study.py RECORDING SEED FIRST END`` writes a line of JSON per damaged file: the damage, what came of every
-operation, the processor time of the slowest [s], and the largest memory of the process [MB]. All are read by one
-process, whose peak the kernel resets before each: memory that one file leaves behind counts for the next.
+``python study.py RECORDING SEED FIRST END`` writes a line of JSON per damaged file: the
+damage, what came of every operation, the processor time of the slowest [s], and the
+largest memory of the process [MB]. All are read by one process, whose peak the kernel
+resets before each: memory that one file leaves behind counts for the next.
 """
 
 import contextlib
@@ -72,7 +73,8 @@ def same(run, other):
 
 
 def outcome(operation, path, original):
-    """Of an operation: "error" (of the package), "same" content, "unfinished", "other" content; or what got out."""
+    """Of an operation: "error" (of the package), "same" content, "unfinished", "other"
+    content; or what got out."""
     try:
         with contextlib.redirect_stdout(io.StringIO()):
             run = operation()

@@ -1,4 +1,5 @@
-"""A recorded run as a table: each column is the field that its name says, in the order of the messages."""
+"""A recorded run as a table: each column is the field that its name says, in the order
+of the messages."""
 
 import numpy as np
 import pytest

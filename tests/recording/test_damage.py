@@ -1,4 +1,5 @@
-"""A damaged recording is refused in one line that names it, or read as unfinished, or holds what was recorded."""
+"""A damaged recording is refused in one line that names it, or read as unfinished, or
+holds what was recorded."""
 
 import contextlib
 import json
@@ -264,7 +265,9 @@ def test_a_recording_of_the_largest_steps_is_read(tmp_path):
     path = tmp_path / "run.mcap"
     rng = np.random.default_rng(0)
     step = runs.make_step(0, rng, qp=False)
-    H = 21_000  # of a plan of zeros: 7.4 MB, half of what is shared with the writer, and more as messages
+    # A plan of zeros has 7.4 MB, half of what is shared with the writer, and more as
+    # messages.
+    H = 21_000
     zeros = replace(
         step.decision,
         inputs=np.zeros((H, 3)),

@@ -36,9 +36,14 @@ def record(path, states, inputs, steps=3, **settings):
             means = rng.standard_normal((H + 1, n))
             covariances = np.tile(np.eye(n), (H + 1, 1, 1))
             decision = Decision(
-                input=np.zeros(m), inputs=np.zeros((H, m)), means=means, covariances=covariances,
-                status=Status.SOLVED, iterations=1, timing=Timing(0.001, 0.002, 0.003),
-            )  # fmt: skip
+                input=np.zeros(m),
+                inputs=np.zeros((H, m)),
+                means=means,
+                covariances=covariances,
+                status=Status.SOLVED,
+                iterations=1,
+                timing=Timing(0.001, 0.002, 0.003),
+            )
             x = means[0]
             recorder.record(
                 Step(0.1 * k, k, x, x, x, np.zeros(m), decision, np.zeros(n), np.eye(n))
@@ -72,7 +77,8 @@ def paths_of(made):
 
 
 def at(message, path):
-    """What a plot finds at a path: names and indices from the front, as in Lichtblick's message paths."""
+    """What a plot finds at a path: names and indices from the front, as in Lichtblick's
+    message paths."""
     for name, index in re.findall(r"\.(\w+)(?:\[(\d+)\])?", path):
         assert name in message.DESCRIPTOR.fields_by_name, path
         message = getattr(message, name)
@@ -142,8 +148,11 @@ def test_the_vehicle_is_seen_in_space_where_the_states_tell_about_it(shown):
         ) == (50, 78)
     else:
         assert made["layout"] == {
-            "direction": "row", "first": "RosOut!log", "second": "Tab!plots", "splitPercentage": 25
-        }  # fmt: skip
+            "direction": "row",
+            "first": "RosOut!log",
+            "second": "Tab!plots",
+            "splitPercentage": 25,
+        }
 
 
 def test_the_shipped_layout_is_that_of_the_translational_quadrotor(tmp_path):
@@ -196,6 +205,10 @@ def test_states_stand_below_each_other_in_tabs_by_what_they_are(shown):
         [33.33, 50.0],
         "Plot!iterations",
     )
-    dashed = {line["value"].split(".")[1] for panel in made["configById"].values() for line in panel.get("paths", ())
-              if line.get("lineStyle") == "dashed"}  # fmt: skip
+    dashed = {
+        line["value"].split(".")[1]
+        for panel in made["configById"].values()
+        for line in panel.get("paths", ())
+        if line.get("lineStyle") == "dashed"
+    }
     assert dashed == {"reference", "input_lower", "input_upper"}

@@ -18,17 +18,21 @@ from tests.recording import runs
 
 
 class Viewer:
-    """A WebSocket client that knows as much of the protocols (RFC 6455, foxglove.sdk.v1) as these tests need."""
+    """A WebSocket client that knows as much of the protocols (RFC 6455,
+    foxglove.sdk.v1) as these tests need."""
 
     def __init__(self, address, origin=None):
         host, port = address.removeprefix("ws://").split(":")
         self.stream = socket.create_connection((host, int(port)), timeout=20)
         key = base64.b64encode(os.urandom(16)).decode()
         lines = [
-            f"GET / HTTP/1.1\r\nHost: {host}:{port}\r\nUpgrade: websocket\r\nConnection: Upgrade"
-        ]
-        lines += [
-            f"Sec-WebSocket-Key: {key}\r\nSec-WebSocket-Version: 13\r\nSec-WebSocket-Protocol: foxglove.sdk.v1"
+            "GET / HTTP/1.1",
+            f"Host: {host}:{port}",
+            "Upgrade: websocket",
+            "Connection: Upgrade",
+            f"Sec-WebSocket-Key: {key}",
+            "Sec-WebSocket-Version: 13",
+            "Sec-WebSocket-Protocol: foxglove.sdk.v1",
         ]
         if origin is not None:  # as a browser says which page asks
             lines.append(f"Origin: {origin}")

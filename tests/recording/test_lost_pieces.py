@@ -1,4 +1,5 @@
-"""What is damaged in a recording is left out, the rest is read, and the loss is said."""
+"""What is damaged in a recording is left out, the rest is read, and the loss is
+said."""
 
 import re
 import struct

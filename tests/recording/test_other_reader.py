@@ -1,6 +1,7 @@
-"""Another implementation of MCAP, in another language, finds in a recording all that this one wrote.
+"""Another implementation of MCAP finds in a recording all that this one wrote.
 
-Needs Node with the packages @mcap/core and fzstd, anywhere: ``NODE_PATH`` names their folder (see CONTRIBUTING.md).
+It is in another language, and needs Node with the packages @mcap/core and fzstd,
+anywhere: ``NODE_PATH`` names their folder (see CONTRIBUTING.md).
 """
 
 import base64

@@ -1,4 +1,5 @@
-"""A recording holds what happened, can be read by others, and says clearly when it could not be written."""
+"""A recording holds what happened, can be read by others, and says clearly when it
+could not be written."""
 
 import contextlib
 import gc

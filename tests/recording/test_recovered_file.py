@@ -1,4 +1,5 @@
-"""A recovered file says that it was recovered, and of how many messages; a copy of a finished one says nothing."""
+"""A recovered file says that it was recovered, and of how many messages; a copy of a
+finished one says nothing."""
 
 import numpy as np
 import pytest

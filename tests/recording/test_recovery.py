@@ -1,4 +1,5 @@
-"""A run that was killed keeps everything that had been written whole, and becomes a file that any reader opens."""
+"""A run that was killed keeps everything that had been written whole, and becomes a
+file that any reader opens."""
 
 import os
 import signal
@@ -28,7 +29,8 @@ MAGIC = 8  # [bytes]
 
 
 def walk(data):
-    """Opcodes and contents of the records, one after the other, as the format defines them."""
+    """Opcodes and contents of the records, one after the other, as the format defines
+    them."""
     start = 0
     while len(data) - start >= 9:
         opcode, length = struct.unpack_from("<BQ", data, start)
@@ -78,7 +80,8 @@ def check_recovered(path, output):
 
 @pytest.fixture(scope="module")
 def start():
-    """Starts a process that records to a path; its number, once it has said the words that are waited for."""
+    """Starts a process that records to a path; its number, once it has said the words
+    that are waited for."""
     zygote = subprocess.Popen(
         [sys.executable, str(ENDLESS)],
         stdin=subprocess.PIPE,

@@ -1,4 +1,5 @@
-"""What a recording says besides its numbers: times, colours, descriptions, limits; and that a copy loses none of it."""
+"""What a recording says besides its numbers: times, colours, descriptions, limits; and
+that a copy loses none of it."""
 
 from dataclasses import replace
 
@@ -267,9 +268,16 @@ def test_a_layout_of_one_state_has_no_tab_for_what_is_not_there(tmp_path):
     step = runs.make_step(0, np.random.default_rng(0))
     system = RecordedSystem(("x",), ("u",), 0.1)
     part = replace(
-        step, reference=np.zeros(1), state=np.zeros(1), measured=np.zeros(1), input=np.zeros(1), decision=None,
-        innovation=np.zeros(1), belief_covariance=np.eye(1), status=Status.SOLVED,
-    )  # fmt: skip
+        step,
+        reference=np.zeros(1),
+        state=np.zeros(1),
+        measured=np.zeros(1),
+        input=np.zeros(1),
+        decision=None,
+        innovation=np.zeros(1),
+        belief_covariance=np.eye(1),
+        status=Status.SOLVED,
+    )
     with McapRecorder(path, system) as recorder:
         recorder.record(part)
     text = layout(read_run(path))
