@@ -95,7 +95,7 @@ class Index:
 
     @cached_property
     def _starts(self) -> list[int]:
-        """The starts of the records that it names, and of the one that ends the data."""
+        """The starts of the records that it names, and of the data's last one."""
         places = [p for places in self.inventory.places().values() for p in places]
         return sorted([p.start for p in places] + [self.start - DATA_END_SIZE])
 

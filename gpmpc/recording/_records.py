@@ -366,7 +366,7 @@ class _DataReader:
         return unfolded(chunk)
 
     def _has_right_length(self, frame: Frame) -> bool:
-        """Tells whether a broken record, which is no chunk, ends where another begins."""
+        """Tells whether a broken record ends where another begins, and is no chunk."""
         return not is_like_chunk(frame.content) and self._may_be_record(frame.end)
 
     def _may_be_record(self, position: int) -> bool:

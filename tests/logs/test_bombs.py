@@ -203,7 +203,7 @@ def table(tmp_path):
 
 
 @pytest.mark.parametrize("rate", [1e9, 1e300])
-def test_a_rate_that_asks_for_all_memory_is_refused_with_its_rows(table, rate):
+def test_a_rate_that_asks_for_all_memory_is_refused(table, rate):
     with pytest.raises(DataError, match=r"rows of 3 columns at a rate of 1e\+\d+ Hz"):
         read_log(table, {**strange.TABLE_MAPPING, "rate": rate})
 

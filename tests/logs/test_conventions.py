@@ -349,7 +349,7 @@ def test_short_pieces_are_judged_together(tmp_path):
         read_log(stored(tmp_path, table), MAPPING)
 
 
-def test_euler_angles_near_the_gimbal_lock_are_read_and_their_signs_are_named(tmp_path):
+def test_euler_angles_near_gimbal_lock_and_their_signs(tmp_path):
     angles = ["roll", "pitch", "yaw"]
     euler = {"columns": angles, "kind": "euler", "unit": "rad", "order": "xyzw"}
     mapping = with_states(attitude=euler)

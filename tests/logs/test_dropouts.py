@@ -50,7 +50,7 @@ def test_a_sentinel_is_no_measurement(tmp_path, value, column):
     assert np.abs(log.runs[0].states).max() < 5
 
 
-def test_a_sentinel_does_not_leak_into_its_neighbours_by_resampling(tmp_path):
+def test_a_sentinel_does_not_leak_by_resampling(tmp_path):
     table = swing()
     table.loc[500, "angle"] = -9999
     log = read(tmp_path, table, rate=130)

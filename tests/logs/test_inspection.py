@@ -145,7 +145,7 @@ def test_what_holds_for_hundreds_of_channels_is_one_line(tmp_path):
     )
 
 
-def test_a_log_that_contradicts_its_mapping_is_inspected_all_the_same(table, tmp_path):
+def test_a_log_that_contradicts_its_mapping_is_inspected(table, tmp_path):
     table.assign(u=0.0).to_csv(tmp_path / "log.csv", index=False)
     mapping = LogMapping.from_dict(
         {"time": "t", "states": {"x": ["a"]}, "inputs": {"u": ["u"]}}

@@ -33,7 +33,7 @@ def log(path, header="t,state.angle,state.rate,input.torque", mapping=PENDULUM):
     return read_log(path, mapping)
 
 
-def test_transitions_and_episodes_of_a_log_carry_its_names_and_rate(tmp_path):
+def test_transitions_and_episodes_carry_names_and_rate(tmp_path):
     read = log(tmp_path / "log.csv")
     assert read.signals.state_names == ("angle", "rate")
     assert read.signals.time_step == pytest.approx(0.05)
@@ -42,7 +42,7 @@ def test_transitions_and_episodes_of_a_log_carry_its_names_and_rate(tmp_path):
         assert made.signals == read.signals
 
 
-def test_a_file_of_a_recording_is_read_with_the_names_of_its_system(tmp_path):
+def test_a_recording_is_read_with_the_names_of_its_system(tmp_path):
     log(tmp_path / "log.csv")
     names = {"states": ["state.angle", "state.rate"], "inputs": ["input.torque"]}
     read = Transitions.from_csv(tmp_path / "log.csv", **names)

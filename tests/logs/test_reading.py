@@ -134,7 +134,7 @@ def test_no_transition_or_window_goes_over_a_gap(tmp_path):
     assert all(w.tobytes() in whole_windows for w in windows.states)
 
 
-def test_a_resampled_log_has_the_same_rows_whenever_its_clock_began(tmp_path):
+def test_resampled_rows_do_not_depend_on_when_the_clock_began(tmp_path):
     table = pendulum_table(100)
     first, later = (
         read_log(
@@ -164,7 +164,7 @@ def test_every_kind_of_file_gives_the_same_log(tmp_path):
         np.testing.assert_array_equal(other.runs[0].inputs, log.runs[0].inputs)
 
 
-def test_runs_are_told_apart_by_file_or_by_column_and_splits_are_by_run(tmp_path):
+def test_runs_are_told_apart_by_file_or_by_column(tmp_path):
     one = pendulum_table(100)
     other = pendulum_table(120, seed=1)
     files = [written(tmp_path, one, "one.csv"), written(tmp_path, other, "other.csv")]
@@ -181,7 +181,7 @@ def test_runs_are_told_apart_by_file_or_by_column_and_splits_are_by_run(tmp_path
         log.split(["c"])
 
 
-def test_stamps_that_repeat_or_run_backwards_are_counted_and_left_out(tmp_path):
+def test_repeated_and_backward_stamps_are_counted(tmp_path):
     table = pendulum_table()
     table.loc[50, "t"] = table.loc[49, "t"]
     table.loc[[100, 101], "t"] -= 0.5
@@ -206,7 +206,7 @@ def test_missing_values_are_boundaries(tmp_path):
     assert kinds(log)["missing value"] == 31
 
 
-def test_resampling_interpolates_states_holds_inputs_and_leaves_gaps_open(tmp_path):
+def test_resampling_interpolates_states_and_holds_inputs(tmp_path):
     table = pendulum_table(4000)
     rng = np.random.default_rng(0)
     t = table["t"] + rng.uniform(-0.004, 0.004, len(table))
@@ -239,7 +239,7 @@ def test_an_angle_that_wraps_is_interpolated_the_short_way_round(tmp_path):
     assert np.abs(away - away[0]).max() < 1e-9
 
 
-def test_a_sample_that_is_repeated_while_the_system_moves_is_no_measurement(tmp_path):
+def test_a_repeated_sample_of_a_moving_system_is_left_out(tmp_path):
     table = body_table()
     table.loc[[100, 101, 102], ["px", "py", "pz"]] = table.loc[
         99, ["px", "py", "pz"]
@@ -270,7 +270,7 @@ def test_parts_at_rest_are_left_out_unless_asked_for(tmp_path):
         read_log(written(tmp_path, rest), PENDULUM)
 
 
-def test_a_quaternion_whose_sign_flips_is_the_attitude_that_it_is(tmp_path):
+def test_a_quaternion_whose_sign_flips_is_the_same_attitude(tmp_path):
     table = body_table()
     q = Rotation.from_euler("ZYX", table[["yaw", "pitch", "roll"]].to_numpy()).as_quat()
     q[120:180] *= -1
@@ -435,7 +435,7 @@ def test_a_px4_log_is_read(tmp_path):
     np.testing.assert_allclose(run.states[:, 0], np.sin(np.arange(100) / 10), atol=1e-6)
 
 
-def test_differences_of_states_are_inverse_to_displacements_and_geodesic():
+def test_state_differences_are_inverse_to_displacements():
     space = StateSpace(
         (
             StateGroup("p", ("x", "y"), "m"),

@@ -86,7 +86,7 @@ def at(message, path):
     return message
 
 
-def test_every_path_is_a_number_of_the_recording_or_a_state_in_words(shown):
+def test_every_path_is_a_field_of_the_recording(shown):
     _, path, made = shown
     with path.open("rb") as file:
         decoded = make_reader(
@@ -124,7 +124,7 @@ def test_every_panel_has_its_place_and_every_place_its_panel(shown):
     assert sorted(placed) == sorted(made["configById"])
 
 
-def test_the_vehicle_is_seen_in_space_where_the_states_tell_about_it(shown):
+def test_the_vehicle_is_seen_where_states_tell_about_it(shown):
     flown, path, made = shown
     scene = made["configById"].get("3D!scene")
     assert (scene is None) == (flown == "pendulum")
@@ -155,12 +155,12 @@ def test_the_vehicle_is_seen_in_space_where_the_states_tell_about_it(shown):
         }
 
 
-def test_the_shipped_layout_is_that_of_the_translational_quadrotor(tmp_path):
+def test_the_shipped_layout_is_of_the_translational_quadrotor(tmp_path):
     runs.record_run(tmp_path / "run.mcap", steps=2)
     assert SHIPPED.read_text() == layout(read_run(tmp_path / "run.mcap"))
 
 
-def test_titles_have_units_and_bounds_are_drawn_only_where_there_are_any(tmp_path):
+def test_units_and_bounds_are_shown_where_there_are_any(tmp_path):
     path = record(
         tmp_path / "run.mcap",
         ("x", "vx"),

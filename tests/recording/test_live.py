@@ -97,7 +97,7 @@ def recorder(tmp_path):
     recorder.close()
 
 
-def test_a_viewer_receives_every_step_at_once_and_the_file_holds_it_as_well(recorder):
+def test_a_viewer_receives_every_step_at_once(recorder):
     classes = _schema.message_classes(_schema.descriptor(runs.STATES, runs.INPUTS))
     steps = []
     seen = {"/step": [], "/plan/tube": []}
@@ -134,7 +134,7 @@ def test_a_second_live_view_takes_another_port(recorder, tmp_path):
             viewer.subscribe("/step")
 
 
-def test_the_live_view_listens_on_this_machine_alone_and_takes_no_orders(recorder):
+def test_the_live_view_listens_on_this_machine_alone(recorder):
     port = int(recorder.address.rpartition(":")[2])
     for other_address in ("127.0.0.2", "::1"):  # what stands for any other interface
         with pytest.raises(OSError, match=r"refused|unreachable|Cannot assign"):
@@ -145,7 +145,7 @@ def test_the_live_view_listens_on_this_machine_alone_and_takes_no_orders(recorde
     assert greeting["capabilities"] == []  # a viewer sets, publishes and calls nothing
 
 
-def test_the_library_cannot_tell_pages_apart_which_the_documents_say(recorder):
+def test_the_library_cannot_tell_pages_apart(recorder):
     """Where this fails, foxglove-sdk has learned to check: let the recorder use it."""
     options = inspect.signature(foxglove.start_server).parameters
     assert not [name for name in options if "origin" in name.lower()]

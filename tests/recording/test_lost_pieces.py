@@ -120,7 +120,7 @@ def test_a_chunk_holds_two_seconds_of_flight_or_so(flight, tmp_path):
     assert min(counts[:-1]) >= 20
 
 
-def test_a_chunk_of_short_steps_is_worth_its_entries_in_the_index(tmp_path):
+def test_a_chunk_of_short_steps_is_worth_its_index_entries(tmp_path):
     path = tmp_path / "run.mcap"
     rng = np.random.default_rng(0)
     step = runs.make_step(0, rng, horizon=1, qp=False)
@@ -134,9 +134,7 @@ def test_a_chunk_of_short_steps_is_worth_its_entries_in_the_index(tmp_path):
 
 
 @pytest.mark.parametrize("end", ["finished", "killed"])
-def test_a_spoiled_byte_costs_no_more_than_the_chunk_that_it_lies_in(
-    flight, tmp_path, end
-):
+def test_a_spoiled_byte_costs_one_chunk_at_most(flight, tmp_path, end):
     data, steps = flight
     chunks = chunk_spans(data)
     first = chunks[0][1]
@@ -299,7 +297,7 @@ def test_an_index_vouches_for_channels_that_damage_hides(small, tmp_path):
     assert is_right(run, steps)
 
 
-def test_files_of_the_first_edition_are_read_and_their_losses_counted(small, tmp_path):
+def test_older_files_are_read_and_their_losses_counted(small, tmp_path):
     data, steps = small
 
     def renumbered(content):  # from 0 on
@@ -429,7 +427,7 @@ def test_a_file_without_checksums_names_its_altered_structure(small, tmp_path, c
     assert {kind, "no checksums"} <= {*kinds(run)}, run.flaws
 
 
-def test_other_names_in_the_metadata_than_in_the_schema_are_named(small, tmp_path):
+def test_names_that_differ_from_the_schema_are_named(small, tmp_path):
     data = without_checksums(small[0]).replace(b"x vx y vy z vz", b"x vx y vy z wz")
     run = read(data, tmp_path)
     assert run.state_names == runs.STATES
@@ -526,9 +524,7 @@ FORMS = {
 
 
 @pytest.mark.parametrize("form", FORMS)
-def test_a_mutated_recording_is_refused_or_named_and_its_steps_are_right(
-    small, tmp_path, form
-):
+def test_a_mutated_recording_is_refused_or_named(small, tmp_path, form):
     data, steps = small
     mutated = FORMS[form](data)
     has_checksums = form != "without checksums"

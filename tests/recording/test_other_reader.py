@@ -85,7 +85,7 @@ def ours(path):
 
 
 @pytest.mark.parametrize("way", ["stream", "indexed"])
-def test_another_reader_finds_every_channel_metadata_attachment_and_message(path, way):
+def test_another_reader_finds_everything(path, way):
     output = subprocess.run(
         ["node", str(SCRIPT), str(path)], capture_output=True, text=True, check=False
     )

@@ -88,7 +88,7 @@ def test_the_quality_of_every_solution_is_recorded(recorded):
 
 
 @pytest.mark.parametrize("rows", [0, 1, 8])
-def test_the_whole_active_set_is_recorded_however_many_constraints_work(tmp_path, rows):
+def test_the_whole_active_set_is_recorded(tmp_path, rows):
     path = tmp_path / "run.mcap"
     rng = np.random.default_rng(0)
     step = runs.make_step(0, rng)
@@ -113,7 +113,7 @@ def test_the_whole_active_set_is_recorded_however_many_constraints_work(tmp_path
     np.testing.assert_array_equal(run.problems[0].x, solution.x)
 
 
-def test_a_program_without_solution_is_recorded_hard_and_without_one(tmp_path):
+def test_a_program_without_solution_is_recorded(tmp_path):
     path = tmp_path / "run.mcap"
     rng = np.random.default_rng(0)
     step = runs.make_step(0, rng)
@@ -179,7 +179,7 @@ def test_a_run_without_problems_has_none_to_replay_and_to_judge(tmp_path):
         replay(run, 0)
 
 
-def test_the_file_says_where_it_comes_from_before_the_first_message(recorded):
+def test_the_file_says_first_where_it_comes_from(recorded):
     path, _ = recorded
     run = read_run(path)
     about = run.metadata["run"]
@@ -250,7 +250,7 @@ def test_any_reader_finds_a_field_by_the_plants_names(recorded):
         assert list(proto.P) == step.decision.problem.P.ravel().tolist()
 
 
-def test_the_tube_is_the_two_sigma_ellipsoid_of_the_predicted_position(recorded):
+def test_the_tube_is_the_two_sigma_ellipsoid(recorded):
     path, steps = recorded
     updates = decoded(path, "/plan/tube")
     assert len(updates) == len(steps)
@@ -402,7 +402,7 @@ def disk_of(room):
 
 
 @pytest.mark.parametrize("room", [20_000, 200_000])
-def test_a_full_disk_is_reported_and_leaves_no_file_that_looks_finished(tmp_path, room):
+def test_a_full_disk_leaves_no_file_that_looks_finished(tmp_path, room):
     path = tmp_path / "run.mcap"
     rng = np.random.default_rng(0)
     steps = [runs.make_step(k, rng, qp=k > 0) for k in range(20)]
@@ -425,7 +425,7 @@ def test_a_full_disk_is_reported_and_leaves_no_file_that_looks_finished(tmp_path
     assert (len(run.times) > 0) == (room > 50_000)
 
 
-def test_a_disk_that_fills_up_with_the_index_leaves_a_file_without_footer(tmp_path):
+def test_a_disk_full_at_the_index_leaves_no_footer(tmp_path):
     whole = tmp_path / "whole.mcap"
     runs.record_run(whole, steps=20)
     path = tmp_path / "run.mcap"
@@ -443,7 +443,7 @@ def test_a_disk_that_fills_up_with_the_index_leaves_a_file_without_footer(tmp_pa
     assert len(run.times) == 20
 
 
-def test_a_disk_that_is_full_from_the_start_is_reported_at_the_start(tmp_path):
+def test_a_disk_full_from_the_start_is_reported_at_once(tmp_path):
     path = tmp_path / "run.mcap"
     with (
         pytest.raises(RecordingError, match="unfinished: File too large"),
@@ -469,9 +469,7 @@ def test_a_step_that_no_chunk_can_take_is_refused(tmp_path):
     assert len(read_run(tmp_path / "run.mcap").times) == 1
 
 
-def test_the_largest_step_that_is_allowed_is_written_and_one_byte_more_is_refused(
-    tmp_path, monkeypatch
-):
+def test_the_largest_allowed_step_is_written_and_no_larger(tmp_path, monkeypatch):
     step = runs.make_step(0, np.random.default_rng(0))
     with runs.recorder(tmp_path / "run.mcap") as recorder:
         monkeypatch.setattr(_recorder, "LARGEST", 0)
@@ -499,7 +497,7 @@ def test_after_an_error_every_further_step_says_so(tmp_path):
     assert not read_run(tmp_path / "run.mcap").finished
 
 
-def test_a_recorder_that_is_dropped_leaves_a_file_that_is_not_finished(tmp_path):
+def test_a_dropped_recorder_leaves_an_unfinished_file(tmp_path):
     recorder = runs.recorder(tmp_path / "run.mcap")
     rng = np.random.default_rng(0)
     for k in range(200):

@@ -100,7 +100,7 @@ def start():
     zygote.stdout.close()
 
 
-def test_a_run_killed_at_twenty_random_moments_is_recovered_every_time(start, tmp_path):
+def test_runs_killed_at_random_moments_are_recovered(start, tmp_path):
     rng = np.random.default_rng()
     steps = []
     for i in range(20):
@@ -167,9 +167,7 @@ def test_a_file_cut_anywhere_gives_back_its_whole_chunks(finished, tmp_path):
         check_recovered(path, tmp_path / "recovered.mcap")
 
 
-def test_a_file_cut_before_its_configuration_is_whole_does_not_pretend_to_have_one(
-    finished, tmp_path
-):
+def test_a_file_cut_within_its_configuration_has_none(finished, tmp_path):
     data = finished.read_bytes()
     path = tmp_path / "cut.mcap"
     output = tmp_path / "recovered.mcap"

@@ -95,7 +95,7 @@ def of(state):
     return state[[0, 2, 4]], Rotation.from_euler("ZYX", state[[10, 8, 6]]).as_matrix()
 
 
-def test_the_vehicle_its_reference_and_its_plan_stand_and_turn_as_the_states_say(flown):
+def test_vehicle_reference_and_plan_are_where_states_say(flown):
     path, steps = flown
     for topic, states in (
         ("/pose", [[step.state] for step in steps]),
@@ -122,7 +122,7 @@ def test_the_line_of_the_plan_passes_the_predicted_positions(flown):
         )
 
 
-def test_the_tube_has_an_ellipsoid_of_two_standard_deviations_at_every_stage(flown):
+def test_the_tube_has_an_ellipsoid_at_every_stage(flown):
     path, steps = flown
     for message, step in zip(decoded(path, "/plan/tube"), steps, strict=True):
         spheres = message.entities[0].spheres
@@ -155,7 +155,7 @@ def test_the_frames_lead_from_the_display_to_the_vehicle(flown):
         assert place(message.translation) == [0, 0, 0]
 
 
-def test_every_solve_that_failed_is_logged_the_louder_the_more_it_mattered(flown):
+def test_failed_solves_are_logged_by_how_much_they_mattered(flown):
     path, _ = flown
     failed, limited = decoded(path, "/log")
     assert (failed.level, limited.level) == (failed.ERROR, limited.WARNING)

@@ -82,7 +82,7 @@ def test_every_message_has_the_time_of_its_step(path):
     assert [proto.time for proto in steps] == pytest.approx([0.0] * 3 + [0.7] * 3)
 
 
-def test_the_plan_has_the_colour_of_the_state_and_its_tube_is_see_through(path):
+def test_the_plan_has_the_states_colour_and_a_clear_tube(path):
     with path.open("rb") as file:
         reader = make_reader(file, decoder_factories=[DecoderFactory()])
         updates = [
@@ -160,9 +160,7 @@ def test_what_is_not_said_is_unknown_unbounded_or_empty(tmp_path):
     assert run.novelties[3] != run.novelties[3]  # NaN: nothing was planned
 
 
-def test_steps_are_written_when_enough_wait_or_enough_time_has_passed(
-    tmp_path, monkeypatch
-):
+def test_steps_are_written_when_enough_wait_or_time_passed(tmp_path, monkeypatch):
     steps = [runs.make_step(k, np.random.default_rng(k), qp=False) for k in range(3)]
     clock = iter(np.arange(100.0))  # [s], one a look
     monkeypatch.setattr(_recorder.time, "perf_counter", lambda: 0.0)
@@ -191,9 +189,7 @@ def test_steps_are_written_when_enough_wait_or_enough_time_has_passed(
         assert found == [0, 2, 2]
 
 
-def test_the_beginning_and_the_end_of_a_file_are_flushed_to_the_disk(
-    tmp_path, monkeypatch
-):
+def test_begin_and_end_of_a_file_are_flushed_to_the_disk(tmp_path, monkeypatch):
     path = tmp_path / "run.mcap"
     sizes = []
     monkeypatch.setattr(_sink.os, "fsync", lambda _: sizes.append(path.stat().st_size))
@@ -313,7 +309,7 @@ def test_what_a_file_may_unfold_to_is_counted_to_the_byte(path, monkeypatch):
         read_run(path)
 
 
-def test_a_file_that_says_no_more_than_the_names_is_a_run_without_steps(tmp_path):
+def test_a_file_with_names_alone_is_a_run_without_steps(tmp_path):
     path = tmp_path / "bare.mcap"
     for about, message in (
         ({"state_names": "x y", "input_names": "u"}, None),
