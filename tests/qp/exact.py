@@ -1,8 +1,11 @@
-"""Quadratic programs solved in rational arithmetic, where nothing is rounded and nothing needs a tolerance.
+"""Quadratic programs solved in rational arithmetic.
 
-A float is a rational number, so a program has one exact answer. It is found by the dual method of Goldfarb and Idnani
-(1983), which cannot cycle because each full step raises the dual objective, and proven before it is returned: a
-minimiser by the conditions of Karush, Kuhn and Tucker, an infeasibility by Farkas' lemma.
+Nothing is rounded there, and nothing needs a tolerance.
+
+A float is a rational number, so a program has one exact answer. It is found by the dual
+method of Goldfarb and Idnani (1983), which cannot cycle because each full step raises
+the dual objective, and proven before it is returned: a minimiser by the conditions of
+Karush, Kuhn and Tucker, an infeasibility by Farkas' lemma.
 """
 
 from fractions import Fraction

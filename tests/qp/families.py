@@ -1,4 +1,4 @@
-"""Families of small programs that are awkward for floating point, each with any number of members."""
+"""Families of small programs that are awkward for floating point."""
 
 import numpy as np
 
@@ -6,7 +6,10 @@ from gpmpc.qp import QuadraticProgram
 
 
 def base(rng, feasible=True, whole=False):
-    """P, q, G and stacked bounds of a program of up to four variables, small integers or normal numbers."""
+    """Draws P, q, G and stacked bounds of a program of up to four variables.
+
+    Numbers are small integers or normally distributed.
+    """
     n = int(rng.integers(1, 5))
     m = int(rng.integers(1, 7))
     draw = (
@@ -44,7 +47,10 @@ def magnitude(rng, low, high):
 
 
 def huge_bounds(rng):
-    """A side, or a variable's or row's place, of 1e3 to 1e15 (or 1e19) beside sides of order one; equalities too."""
+    """A bound, or a variable's or row's place, of 1e3 to 1e15 (or 1e19).
+
+    The others are of order one; there are equalities, too.
+    """
     P, q, G, lower, upper = base(rng)
     n = len(q)
     M = len(lower)
@@ -70,7 +76,10 @@ def huge_bounds(rng):
 
 
 def nearly_infeasible(rng):
-    """Two rows, three, or a row and the box that contradict each other by 1e-3 to 1e-12, or miss that by as much."""
+    """Rows that contradict each other by 1e-3 to 1e-12, or miss that by as much.
+
+    They are two rows, three, or a row and the box.
+    """
     P, q, G, lower, upper = base(rng)
     n = len(q)
     size = magnitude(rng, -3, 3)
@@ -104,7 +113,10 @@ def nearly_infeasible(rng):
 
 
 def parallel_rows(rng):
-    """Zero rows, and rows that repeat others or combinations of them, scaled, exactly or up to 1e-3 .. 1e-13."""
+    """Zero rows, and rows that repeat others or combinations of them, scaled.
+
+    They do so exactly or up to 1e-3 .. 1e-13.
+    """
     P, q, G, lower, upper = base(rng, whole=rng.random() < 0.5)
     n = len(q)
     G = list(G)
@@ -137,7 +149,10 @@ def parallel_rows(rng):
 
 
 def small_direction(rng):
-    """Equalities that leave a small share of one variable: 1e-3 to 1e-12, and the solution as far away as it asks."""
+    """Equalities that leave a small share of one variable.
+
+    1e-3 to 1e-12, and the solution as far away as it asks.
+    """
     n = int(rng.integers(2, 5))
     share = magnitude(rng, -12, -3)
     G = np.eye(n)
@@ -159,7 +174,7 @@ def small_direction(rng):
 
 
 def scaled(rng):
-    """All data, the cost, the rows or the variables multiplied by 1e-12 .. 1e12, one or several of these."""
+    """Data, cost, rows or variables (one or several) multiplied by 1e-12 .. 1e12."""
     P, q, G, lower, upper = base(rng, feasible=rng.random() < 0.9)
     n = len(q)
     m = len(G)
@@ -198,14 +213,21 @@ def scaled(rng):
 
 
 def small_numbers(rng):
-    """The matrices of order one, and q and the bounds of order 1e-3 .. 1e-15: the solution is that small."""
+    """The matrices of order one, and q and the bounds of order 1e-3 .. 1e-15.
+
+    The solution is that small.
+    """
     P, q, G, lower, upper = base(rng)
     s = magnitude(rng, -15, -3)
     return program(P, s * q, G, s * lower, s * upper)
 
 
 def degenerate(rng):
-    """Small integers: ties, and vertices met by more rows than variables, on which the solution often lies."""
+    """Small integers.
+
+    Ties, and vertices met by more rows than variables, on which the solution often
+    lies.
+    """
     P, q, G, lower, upper = base(rng, whole=True)
     n = len(q)
     vertex = rng.integers(-2, 3, n).astype(float)
@@ -223,7 +245,7 @@ def degenerate(rng):
 
 
 def equalities(rng):
-    """Equalities in place of rows, as many as there are variables or more, that agree or do not."""
+    """Equalities in place of rows, no fewer than variables, that agree or do not."""
     P, q, G, lower, upper = base(rng, whole=rng.random() < 0.7)
     n = len(q)
     m = len(G)
@@ -238,6 +260,13 @@ def equalities(rng):
 FAMILIES = {
     function.__name__: function
     for function in (
-        huge_bounds, nearly_infeasible, parallel_rows, small_direction, scaled, small_numbers, degenerate, equalities,
+        huge_bounds,
+        nearly_infeasible,
+        parallel_rows,
+        small_direction,
+        scaled,
+        small_numbers,
+        degenerate,
+        equalities,
     )
-}  # fmt: skip
+}

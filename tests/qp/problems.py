@@ -1,4 +1,7 @@
-"""Random quadratic programs for the tests: degenerate by integers, ill-conditioned, badly scaled."""
+"""Random quadratic programs for the tests.
+
+Degenerate by integers, ill-conditioned, badly scaled.
+"""
 
 import numpy as np
 
@@ -8,9 +11,12 @@ from gpmpc.qp import DualActiveSet, PrimalActiveSet, QuadraticProgram
 def integer_problem(
     rng: np.random.Generator, feasible: bool | None = None
 ) -> QuadraticProgram:
-    """Small integers everywhere: ties, repeated rows, vertices met by too many constraints.
+    """Small integers everywhere.
 
-    With ``feasible=True`` the bounds admit an integer point, on which many of them hold with equality.
+    Ties, repeated rows, vertices met by too many constraints.
+
+    With ``feasible=True`` the bounds admit an integer point, on which many of them hold
+    with equality.
     """
     n = int(rng.integers(1, 9))
     m = int(rng.integers(0, 15))
@@ -32,7 +38,10 @@ def integer_problem(
 def feasible_problem(
     rng: np.random.Generator, n: int, m: int, condition: float = 1e2
 ) -> QuadraticProgram:
-    """A feasible problem whose Hessian has eigenvalues spread over ``condition``; about half of the bounds matter."""
+    """A feasible problem whose Hessian has eigenvalues spread over ``condition``.
+
+    About half of the bounds matter.
+    """
     basis = np.linalg.qr(rng.standard_normal((n, n)))[0]
     eigenvalues = np.geomspace(1.0, condition, n) if n > 1 else np.ones(1)
     P = basis @ np.diag(eigenvalues) @ basis.T

@@ -1,4 +1,4 @@
-"""Our solvers against each other and against two that others wrote (DAQP, Clarabel), on problems made to be awkward."""
+"""Our solvers, DAQP and Clarabel agree on problems made to be awkward."""
 
 import daqp
 import numpy as np
@@ -27,9 +27,14 @@ def daqp_solution(problem: QuadraticProgram):
     lower = np.maximum(problem.lower, -1e30)
     upper = np.minimum(problem.upper, 1e30)
     x, _, flag, _ = daqp.solve(
-        problem.P.copy(), problem.q.copy(), problem.G.copy(), upper, lower, np.zeros(len(lower), dtype=np.int32),
+        problem.P.copy(),
+        problem.q.copy(),
+        problem.G.copy(),
+        upper,
+        lower,
+        np.zeros(len(lower), dtype=np.int32),
         primal_tol=1e-9,
-    )  # fmt: skip
+    )
     assert flag in DAQP_SOLVED + DAQP_INFEASIBLE
     return x, flag in DAQP_SOLVED
 

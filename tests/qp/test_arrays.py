@@ -1,4 +1,7 @@
-"""The kernels are called without numba's look at the arguments: whatever is given, no memory is misread."""
+"""The kernels are called without numba's look at the arguments.
+
+Whatever is given, no memory is misread.
+"""
 
 import pickle
 
@@ -54,7 +57,10 @@ def test_an_odd_array_is_read_as_what_it_is(odd, position, rng):
 
 
 def test_an_axis_of_length_one_may_have_any_stride():
-    """NumPy calls such arrays contiguous whatever their strides; the solve then ended in memory never written to."""
+    """NumPy calls such arrays contiguous whatever their strides.
+
+    The solve then ended in memory never written to.
+    """
     wide = np.arange(1.0, 10.0).reshape(3, 3)
     rows = np.array([[1.0, 2.0]])
     one = QuadraticProgram(wide[:1, :1], [-3.0], rows.T, [-9.0, -9.0], [1.0, 1.0])

@@ -1,4 +1,4 @@
-"""A time limit that is not reached leaves the iteration limit in force, and the iterates what they are."""
+"""A time limit that is not reached changes neither iteration limit nor iterates."""
 
 import numpy as np
 import pytest

@@ -84,7 +84,10 @@ def test_an_iteration_limit_is_translated(rng):
 
 
 def test_a_minimiser_far_from_zero_costs_no_digits(rng):
-    """The thrust that carries the vehicle makes x'Px huge; what is to be found is a small change of it."""
+    """The thrust that carries the vehicle makes x'Px huge.
+
+    What is to be found is a small change of it.
+    """
     for _ in range(20):
         basis = np.linalg.qr(rng.normal(size=(30, 30)))[0]
         P = (basis * np.geomspace(4.0, 2e5, 30)) @ basis.T

@@ -1,4 +1,7 @@
-"""Small programs against rational arithmetic: what is called solved is, what is called infeasible is."""
+"""Small programs against rational arithmetic.
+
+What is called solved is, what is called infeasible is.
+"""
 
 from fractions import Fraction
 
@@ -26,7 +29,10 @@ def guessed(problem):
 
 
 def error(problem, x, exact):
-    """The largest error of x as a share of x: of its largest entry, and of the largest in the units of P's diagonal."""
+    """The largest error of x as a share of x.
+
+    Of its largest entry, and of the largest in the units of P's diagonal.
+    """
     if not np.isfinite(x).all():
         return np.inf
     units = np.sqrt(np.diagonal(problem.P))
@@ -43,7 +49,10 @@ def error(problem, x, exact):
 
 
 def row_sizes(problem, x):
-    """The size of the numbers whose rounding a violation may be: a constraint's bounds and own terms."""
+    """The size of the numbers whose rounding a violation may be.
+
+    A constraint's bounds and own terms.
+    """
     sizes = np.abs(np.stack([problem.lower, problem.upper]))
     terms = np.append(np.abs(x), np.abs(problem.G) @ np.abs(x))
     sizes = np.maximum(np.where(np.isfinite(sizes), sizes, 0.0).max(axis=0), terms)
@@ -54,9 +63,12 @@ def row_sizes(problem, x):
 
 
 def solves_up_to_rounding(problem, x):
-    """Whether x solves the program with bounds that are wider by rounding: 2e-14 of a row's terms, or any part of it.
+    """Whether x solves the program with bounds that are wider by rounding.
 
-    The solutions for all parts lie on a line from the one with the whole, twice as far as that with half.
+    2e-14 of a row's terms, or any part of it.
+
+    The solutions for all parts lie on a line from the one with the whole, twice as far
+    as that with half.
     """
     slack = 2e-14 * row_sizes(problem, x)
     whole = exact_solution(problem, problem.lower - slack, problem.upper + slack)
@@ -74,7 +86,10 @@ def solves_up_to_rounding(problem, x):
 
 
 def proves_infeasibility_up_to_rounding(problem, ray):
-    """Whether a change of the entries of C by 1e-14 of themselves makes the ray Farkas' proof (Oettli, Prager)."""
+    """Whether the ray proves infeasibility once entries of C change by 1e-14.
+
+    The bound on the change is that of Oettli and Prager.
+    """
     y = rational(ray)
     C = np.vstack([rational(np.eye(len(problem.q))), rational(problem.G)])
     if not (abs(C.T @ y) <= ROUNDING * (abs(C.T) @ abs(y))).all():
@@ -90,7 +105,10 @@ def proves_infeasibility_up_to_rounding(problem, ray):
 
 
 def unsolved(family, solve, count):
-    """How many of ``count`` programs are left unsolved; an answer that is wrong fails at once."""
+    """How many of ``count`` programs are left unsolved.
+
+    An answer that is wrong fails at once.
+    """
     rng = np.random.default_rng([14, list(FAMILIES).index(family)])
     left = 0
     for number in range(count):
@@ -198,7 +216,7 @@ def test_what_only_looks_like_a_contradiction_is_solved(solve, share):
 
 
 @pytest.mark.parametrize("solve", [changing, prepared, primal])
-def test_a_zero_row_that_misses_zero_by_rounding_proves_nothing_and_one_that_misses_it_by_more_does(
+def test_a_zero_row_proves_infeasibility_beyond_rounding_only(
     solve,
 ):
     for bound, status in ((-1e-17, Status.SOLVED), (-1e-6, Status.INFEASIBLE)):
@@ -213,9 +231,12 @@ def test_residuals_are_the_same_in_all_units(scale, rng):
     problem = FAMILIES["huge_bounds"](rng)
     solution = PrimalActiveSet().solve(problem)
     scaled = QuadraticProgram.from_stacked(
-        scale * problem.P, scale * problem.q, scale * problem.G,
-        np.append(problem.lb, scale * problem.h_lower), np.append(problem.ub, scale * problem.h_upper),
-    )  # fmt: skip
+        scale * problem.P,
+        scale * problem.q,
+        scale * problem.G,
+        np.append(problem.lb, scale * problem.h_lower),
+        np.append(problem.ub, scale * problem.h_upper),
+    )
     moved = solution.x * 1.01
     multipliers = solution.multipliers * 0.9
     before = make_solution(problem, Status.SOLVED, moved, multipliers).residuals()

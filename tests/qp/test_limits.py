@@ -42,7 +42,8 @@ def test_the_iteration_limit_returns_a_dual_iterate_from_which_the_next_solve_go
         assert solution.residuals().primal > 0.0
     assert solution.status.solved
     np.testing.assert_allclose(solution.x, full.x, atol=1e-9)
-    # a dual method climbs: each stop is a lower bound on the optimum, better than the one before
+    # a dual method climbs: each stop is a lower bound on the optimum, better than the
+    # one before
     assert (np.diff(objectives) > 0.0).all()
     assert len(objectives) > 2
 
@@ -106,7 +107,8 @@ START = """
 import numpy as np
 from gpmpc.qp import DualActiveSet
 from gpmpc.qp._dual_kernels import solve
-solution = DualActiveSet().prepare(np.eye(3), np.ones((1, 3))).solve(np.ones(3), np.full(4, -0.5), np.full(4, 0.5))
+prepared = DualActiveSet().prepare(np.eye(3), np.ones((1, 3)))
+solution = prepared.solve(np.ones(3), np.full(4, -0.5), np.full(4, 0.5))
 assert solution.is_optimal(1e-12), solution
 print(sum(solve.stats.cache_misses.values()))
 """
@@ -116,10 +118,14 @@ def first_solve(folder, **environment):
     """How many kernels a new process must compile for its first solve."""
     return int(
         subprocess.run(
-            [sys.executable, "-c", START], capture_output=True, text=True, check=True, cwd=folder,
+            [sys.executable, "-c", START],
+            capture_output=True,
+            text=True,
+            check=True,
+            cwd=folder,
             env=os.environ | {"PYTHONPATH": str(folder)} | environment,
         ).stdout
-    )  # fmt: skip
+    )
 
 
 def copy_of_the_package(folder):
@@ -164,7 +170,10 @@ def test_no_disagreement_on_ten_thousand_more_integer_problems():
 
 
 def crowded_vertex(rng):
-    """More rows than variables through one vertex, the solution; some are repeated or sums of others."""
+    """More rows than variables through one vertex, the solution.
+
+    Some are repeated or sums of others.
+    """
     n = int(rng.integers(18, 40))
     m = int(rng.integers(n, 4 * n))
     root = rng.standard_normal((n, n))
@@ -195,16 +204,24 @@ def test_vertices_where_many_rows_meet_are_found_without_cycling(mode, rng):
         )
         assert solution.status is Status.SOLVED
         x, _, flag, _ = daqp.solve(
-            problem.P.copy(), problem.q.copy(), problem.G.copy(), np.minimum(problem.upper, 1e30),
-            np.maximum(problem.lower, -1e30), np.zeros(len(problem.lower), dtype=np.int32), primal_tol=1e-10,
-        )  # fmt: skip
+            problem.P.copy(),
+            problem.q.copy(),
+            problem.G.copy(),
+            np.minimum(problem.upper, 1e30),
+            np.maximum(problem.lower, -1e30),
+            np.zeros(len(problem.lower), dtype=np.int32),
+            primal_tol=1e-10,
+        )
         assert flag == 1
         np.testing.assert_allclose(solution.x, x, atol=1e-7 * np.abs(vertex).max())
 
 
 @pytest.mark.parametrize("mode", ["prepared", "changing"])
 def test_rows_that_depend_on_each_other_but_for_rounding_are_no_obstacle(mode, rng):
-    """Two to six times as many rows as variables meet in a vertex, and span half of the space."""
+    """Two to six times as many rows as variables meet in a vertex.
+
+    They span half of the space.
+    """
     solver = DualActiveSet()
     for _ in range(20):
         n = int(rng.integers(18, 40))
@@ -228,7 +245,7 @@ def test_rows_that_depend_on_each_other_but_for_rounding_are_no_obstacle(mode, r
 
 
 def test_a_second_look_keeps_the_time_limit(rng):
-    """A program that one float does not decide, large enough for the doubled digits to take seconds."""
+    """A program that takes the doubled digits seconds, and one float cannot decide."""
     problem = feasible_problem(rng, 60, 120)
     G = np.vstack([problem.G, problem.G + 1e-9 * rng.standard_normal(problem.G.shape)])
     low, high = (

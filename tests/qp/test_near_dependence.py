@@ -1,4 +1,7 @@
-"""Rows that are all but dependent, bounds that contradict each other by a hair: ``SOLVED`` is to be true there too."""
+"""Rows that are all but dependent, bounds that contradict each other by a hair.
+
+``SOLVED`` is to be true there too.
+"""
 
 import numpy as np
 import pytest
@@ -8,7 +11,10 @@ from gpmpc.status import Status
 
 
 def near_dependent_problem(rng, feasible=True):
-    """Rows that repeat a few others up to 2^-10 .. 2^-50, with bounds met by a point; or missed by a hair."""
+    """Rows that repeat a few others up to 2^-10 .. 2^-50, with bounds met by a point.
+
+    Or missed by a hair.
+    """
     n = int(rng.integers(2, 10))
     m = int(rng.integers(4, 20))
     root = rng.integers(-16, 17, (n, n)) / 8.0
@@ -58,7 +64,7 @@ def test_what_is_called_solved_is_optimal_and_what_is_called_infeasible_is(
 
 
 def test_a_multiplier_on_the_way_to_a_contradiction_is_taken_back(rng):
-    """It had grown to 2.6e10 before the row was found to contradict others by 1e-9, and was handed out."""
+    """A multiplier of 2.6e10 was handed out with a row that missed others by 1e-9."""
     for _ in range(500):
         solution = DualActiveSet().solve(near_dependent_problem(rng))
         working = solution.active_set != 0

@@ -1,4 +1,4 @@
-"""Numbers beyond the range of float64 end in a status, neither in a solution nor in an exception."""
+"""Numbers beyond the range of float64 end in a status, not in an exception."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Residuals, objective and violations are those of their definitions, written out entry by entry."""
+"""Residuals, objective and violations agree with definitions, entry by entry."""
 
 import numpy as np
 import pytest

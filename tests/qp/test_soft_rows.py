@@ -21,7 +21,10 @@ DUAL = pytest.mark.parametrize("solve", [prepared, changing])
 
 
 def with_slacks(problem, prices, curvature=1e-6):
-    """The problem in (x, v+, v-): G x - v+ + v- within bounds, v >= 0, at the prices."""
+    """The problem in (x, v+, v-).
+
+    G x - v+ + v- within bounds, v >= 0, at the prices.
+    """
     n = len(problem.q)
     m = len(problem.h_lower)
     hard = np.isinf(prices)
@@ -136,9 +139,14 @@ def test_soft_problems_in_a_row_have_the_same_answers_warm_and_cold(solve, rng):
         shift = rng.uniform(-2.0, 2.0, m)
         turn = rng.standard_normal(n)
         following = QuadraticProgram(
-            problem.P, problem.q + 3.0 * turn, problem.G, problem.h_lower + shift, problem.h_upper + shift, problem.lb,
+            problem.P,
+            problem.q + 3.0 * turn,
+            problem.G,
+            problem.h_lower + shift,
+            problem.h_upper + shift,
+            problem.lb,
             problem.ub,
-        )  # fmt: skip
+        )
         last = solve(following, prices, last)
         cold = solve(following, prices)
         assert last.status is cold.status is Status.SOLVED
@@ -154,7 +162,10 @@ def test_soft_problems_in_a_row_have_the_same_answers_warm_and_cold(solve, rng):
 def test_a_multiplier_beyond_what_its_row_may_pay_is_a_dual_residual(
     solve, side, price
 ):
-    """min 1/2 x^2 with the row |x| >= 100 at the price w a unit: x = w. At any other x the multiplier is no price."""
+    """min 1/2 x^2 with the row |x| >= 100 at the price w a unit.
+
+    X = w. At any other x the multiplier is no price.
+    """
     bounds = ([100.0], [np.inf]) if side > 0 else ([-np.inf], [-100.0])
     solution = solve(QuadraticProgram(np.eye(1), [0.0], [[1.0]], *bounds), [price])
     assert solution.x[0] == pytest.approx(side * price)

@@ -50,8 +50,9 @@ def test_residuals_see_a_point_that_is_moved_and_multipliers_that_are_changed(
     )
 
 
-def test_a_feasible_stationary_point_with_a_multiplier_of_the_wrong_sign_is_not_optimal():
-    # min 1/2 x^2 on -1 <= x <= 1: at x = 1 the multiplier -1 is stationary, but says "at the lower bound".
+def test_a_multiplier_of_the_wrong_sign_is_not_optimal():
+    # min 1/2 x^2 on -1 <= x <= 1: at x = 1 the multiplier -1 is stationary, but says
+    # "at the lower bound".
     problem = QuadraticProgram([[1.0]], [0.0], lb=[-1.0], ub=[1.0])
     claim = make_solution(problem, Status.SOLVED, [1.0], [-1.0])
     assert claim.residuals().dual == 0.0

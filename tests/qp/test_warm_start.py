@@ -1,4 +1,7 @@
-"""Any warm start, right or absurd, gives the same answer; the right one gives it at once."""
+"""Any warm start, right or absurd, gives the same answer.
+
+The right one gives it at once.
+"""
 
 import numpy as np
 import pytest
@@ -131,7 +134,7 @@ def test_a_solution_is_a_copy_that_later_solves_leave_alone(solve, rng):
 def test_a_prepared_program_that_has_solved_others_gives_the_bits_of_a_new_one(
     n, m, rng
 ):
-    """The factor of the working set comes with the guess, not from the memory of the solver."""
+    """The factor of the working set comes with the guess, not from solver memory."""
     problem = feasible_problem(rng, n, m)
     used = DualActiveSet().prepare(problem.P, problem.G)
     last = None

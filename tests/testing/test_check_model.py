@@ -1,4 +1,7 @@
-"""The check itself: our own models pass, and each broken promise is found out and named."""
+"""The check itself.
+
+Our own models pass, and each broken promise is found out and named.
+"""
 
 from dataclasses import dataclass
 
@@ -210,11 +213,13 @@ class NoDimension(Honest):
         (MovesTheMean, "a batch is the loop over its members; the mean is off by"),
         (
             WrongShape,
-            r"mean \(\*batch, k\) and covariance .*; got \(\(4, 1\), \(4, 1, 1\)\), should be \(\(4, 2\), ",
+            r"mean \(\*batch, k\) and covariance .*; "
+            r"got \(\(4, 1\), \(4, 1, 1\)\), should be \(\(4, 2\), ",
         ),
         (
             Lopsided,
-            "the covariance is symmetric; an entry and its mirror image differ by 1.00e-06",
+            "the covariance is symmetric; "
+            "an entry and its mirror image differ by 1.00e-06",
         ),
         (
             Indefinite,
@@ -224,11 +229,13 @@ class NoDimension(Honest):
         (Dices, "the same arguments give the same result"),
         (
             WrongSlope,
-            "linearize: A agrees with finite differences of predict; it is off by 1.00e-03",
+            "linearize: A agrees with finite differences of predict; "
+            "it is off by 1.00e-03",
         ),
         (
             TransposedSlope,
-            r"B is a C-contiguous float64 array of shape \(4, 2, 1\); got float64 \(4, 1, 2\)",
+            r"B is a C-contiguous float64 array of shape \(4, 2, 1\); "
+            r"got float64 \(4, 1, 2\)",
         ),
         (FortranOrder, "A is a C-contiguous float64 array"),
         (
@@ -242,7 +249,8 @@ class NoDimension(Honest):
         ),
         (
             NoiseOfAnotherShape,
-            r"noise_covariance is a torch.float64 tensor of shape \(2, 2\); got Tensor .* \(2,\)",
+            r"noise_covariance is a torch.float64 tensor of shape \(2, 2\); "
+            r"got Tensor .* \(2,\)",
         ),
         (NoDimension, "output_dim is a whole number, 1 or more; got None"),
     ],

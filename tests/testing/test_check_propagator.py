@@ -1,4 +1,8 @@
-"""The check itself: our own propagators pass with every model, and each broken promise is found out and named."""
+"""The check itself.
+
+Our own propagators pass with every model, and each broken promise is found out and
+named.
+"""
 
 from dataclasses import replace
 
