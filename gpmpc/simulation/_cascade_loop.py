@@ -202,32 +202,16 @@ class _CascadeFlight:
 
     def advance(self, inner_step: int) -> None:
         """Flies one inner step; the outer controller decides at each ``ratio``-th."""
-        scenario = self._scenario
-        cascade = self._cascade
-        outer_step, phase = divmod(inner_step, cascade.ratio)
+        outer_step, phase = divmod(inner_step, self._cascade.ratio)
         time = round(inner_step * self._inner_time_step, 9)
         state = self._simulator.state
         belief = self._simulator.measure(time)
-        outer_reference = scenario.reference_from(outer_step)
+        outer_reference = self._scenario.reference_from(outer_step)
         if self._thrust is None or phase == 0:
-            self._thrust = decide(
-                cascade.outer,
-                _part(belief, _OUTER),
-                outer_reference,
-                last=self._outer.last,
-                on_failure=scenario.on_failure,
-                step=outer_step,
-            )
+            self._thrust = self._decide_thrust(belief, outer_reference, outer_step)
         thrust = self._thrust
         attitude = self._attitude_reference(thrust, belief, phase)
-        moments = decide(
-            cascade.inner,
-            _part(belief, _INNER),
-            attitude,
-            last=self._inner.last,
-            on_failure=scenario.on_failure,
-            step=inner_step,
-        )
+        moments = self._decide_moments(belief, attitude, inner_step)
         decided_input = np.append(thrust.input[:1], moments.input)
         (input,) = step_together([self._simulator], time, [decided_input])
         if isinstance(input, Diverged):
@@ -250,6 +234,32 @@ class _CascadeFlight:
         self._attitude = attitude
         self._states.append(self._simulator.mean)
         self._inputs.append(input)
+
+    def _decide_thrust(
+        self, belief: Gaussian, reference: Reference, step: int
+    ) -> Command:
+        """Returns the command of the outer loop."""
+        return decide(
+            self._cascade.outer,
+            _part(belief, _OUTER),
+            reference,
+            last=self._outer.last,
+            on_failure=self._scenario.on_failure,
+            step=step,
+        )
+
+    def _decide_moments(
+        self, belief: Gaussian, attitude: Reference, step: int
+    ) -> Command:
+        """Returns the command of the inner loop."""
+        return decide(
+            self._cascade.inner,
+            _part(belief, _INNER),
+            attitude,
+            last=self._inner.last,
+            on_failure=self._scenario.on_failure,
+            step=step,
+        )
 
     def _attitude_reference(
         self, thrust: Command, belief: Gaussian, phase: int

@@ -106,37 +106,14 @@ class NMPC:
         )
         if not request.finite:
             return request.failed_decision(Status.INVALID_MEASUREMENT)
-        program = self._program
-        references = request.references
-        parameters = np.concatenate(
-            [
-                request.state,
-                references.previous_input,
-                references.states.ravel(),
-                references.inputs.ravel(),
-            ]
-        )
+        parameters = _parameters(request)
         with interrupts_after():
-            solution = program.solver(
-                x0=self._guess(request),
-                p=parameters,
-                lbx=program.unknowns.lower,
-                ubx=program.unknowns.upper,
-                lbg=program.constraints.lower,
-                ubg=program.constraints.upper,
-            )
-        stats = program.solver.stats()
-        unknowns = np.array(solution["x"]).ravel()
-        values = np.array(solution["g"]).ravel()
+            solution = self._program.solve(self._guess(request), parameters)
+        unknowns = solution.unknowns
         means = np.vstack([request.state, unknowns[: H * n].reshape(H, n)])
         inputs = unknowns[H * n : H * (n + m)].reshape(H, m)
-        status = _STATUSES.get(stats["return_status"], Status.NUMERICAL_TROUBLE)
-        violation = np.max(
-            [
-                program.unknowns.violation(unknowns),
-                program.constraints.violation(values),
-            ]
-        )
+        status = solution.status
+        violation = solution.violation
         stopped = status not in (Status.SOLVED, Status.INFEASIBLE)
         return Decision(
             input=inputs[0],
@@ -144,7 +121,7 @@ class NMPC:
             means=means,
             covariances=np.zeros((H + 1, n, n)),
             status=status,
-            iterations=stats["iter_count"],
+            iterations=solution.iterations,
             timing=Timing(solve=perf_counter() - start),
             suboptimal=stopped and bool(violation <= FEASIBLE),
             violation=max(0.0, float(violation)),
@@ -175,12 +152,45 @@ class _Bounds(NamedTuple):
         return np.maximum(self.lower - values, values - self.upper).max()
 
 
+class _Solution(NamedTuple):
+    """Where IPOPT ended."""
+
+    unknowns: Array  # x_1 .. x_H, u_0 .. u_{H-1} and slacks
+    status: Status
+    iterations: int
+    violation: float  # largest one of bounds and constraints; below zero inside all
+
+
 class _Program(NamedTuple):
     """The nonlinear program of a step, and IPOPT for it."""
 
     solver: casadi.Function
     unknowns: _Bounds  # of x_1 .. x_H, u_0 .. u_{H-1} and slacks
     constraints: _Bounds
+
+    def solve(self, guess: Array, parameters: Array) -> _Solution:
+        """Solves the program from a guess of its unknowns."""
+        solution = self.solver(
+            x0=guess,
+            p=parameters,
+            lbx=self.unknowns.lower,
+            ubx=self.unknowns.upper,
+            lbg=self.constraints.lower,
+            ubg=self.constraints.upper,
+        )
+        stats = self.solver.stats()
+        unknowns = np.array(solution["x"]).ravel()
+        values = np.array(solution["g"]).ravel()
+        violations = [
+            self.unknowns.violation(unknowns),
+            self.constraints.violation(values),
+        ]
+        return _Solution(
+            unknowns=unknowns,
+            status=_STATUSES.get(stats["return_status"], Status.NUMERICAL_TROUBLE),
+            iterations=stats["iter_count"],
+            violation=np.max(violations),  # NaN where one is
+        )
 
 
 class _Entries:
@@ -207,6 +217,19 @@ class _Entries:
         """The bounds of all of them."""
         lower, upper = np.hstack(self._bounds)
         return _Bounds(lower, upper)
+
+
+def _parameters(request: Request) -> Array:
+    """Returns the values of the program's parameters."""
+    references = request.references
+    return np.concatenate(
+        [
+            request.state,
+            references.previous_input,
+            references.states.ravel(),
+            references.inputs.ravel(),
+        ]
+    )
 
 
 def _build(plant: System, problem: Problem, horizon: int, tolerance: float) -> _Program:

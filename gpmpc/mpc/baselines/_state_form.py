@@ -199,18 +199,7 @@ class _StateFormProgram:
         self._previous_input = cvxpy.Parameter(m)
 
         increments = self._increments()
-        penalized = {
-            "inputs": self.inputs,
-            "deviations": self.inputs - self._reference_inputs,
-            "increments": increments,
-        }[problem.cost.penalized]
-        cost = sum(
-            cvxpy.sum_squares(penalized[k] @ _factor(R[k : k + 1])) for k in range(H)
-        )
-        cost += sum(
-            cvxpy.sum_squares((self.states[k + 1] - self._targets[k]) @ weights[k])
-            for k in range(H)
-        )
+        cost = self._tracking_cost(weights, R, increments)
         rules = [
             self.states[0] == self._start,
             *_within(self.inputs, *problem.inputs.by_stage(H)),
@@ -232,6 +221,23 @@ class _StateFormProgram:
                 "constraints",
                 "must be convex, and parametrised as CVXPY's rules (DPP) ask",
             )
+
+    def _tracking_cost(self, weights: list[Array], R: Array, increments: Any) -> Any:
+        """Returns the cost of states, by factors of their weights, and of inputs."""
+        import cvxpy
+
+        penalized = {
+            "inputs": self.inputs,
+            "deviations": self.inputs - self._reference_inputs,
+            "increments": increments,
+        }[self._problem.cost.penalized]
+        stages = range(self._horizon)
+        errors = [self.states[k + 1] - self._targets[k] for k in stages]
+        cost = sum(
+            cvxpy.sum_squares(penalized[k] @ _factor(R[k : k + 1])) for k in stages
+        )
+        cost += sum(cvxpy.sum_squares(errors[k] @ weights[k]) for k in stages)
+        return cost
 
     def _increments(self) -> Any:
         """Returns u_k - u_{k-1} (H, m) as an expression."""
@@ -257,7 +263,7 @@ class _StateFormProgram:
         return rules
 
     def _point(self, k: int) -> int:
-        """Returns the point that stage k is linearised at; later ones share the last."""
+        """Returns the point of stage k; later stages share the last one."""
         return min(k, self._points - 1)
 
     def _constrain_states(self, rows: ConstraintRows) -> tuple[Any, list[Any]]:
