@@ -1,31 +1,36 @@
-"""Checks whether the uncertainty that a model and a propagator state can be believed, one step ahead and many.
+"""Checks whether predicted uncertainty can be believed, one step ahead and many.
 
-Held-out recordings are predicted from every one of their states k = 1 to H steps ahead, with the inputs that were
-applied, and compared with what was measured, per step and state: root mean squared error, negative log predictive
-density (Quinonero-Candela et al., 2006), how often central intervals hold the measurement (Gneiting, Balabdaoui and
-Raftery, 2007), and their width. k = 1 from a certain state is the usual check of the model alone.
+Held-out recordings are predicted from every one of their states k = 1 to H steps ahead,
+with the inputs that were applied, and compared with what was measured, per step and
+state: root mean squared error, negative log predictive density (Quinonero-Candela et
+al., 2006), how often central intervals hold the measurement (Gneiting, Balabdaoui and
+Raftery, 2007), and their width. k = 1 from a certain state is the usual check of the
+model alone.
 
-Which noise an interval holds decides whether it can be believed. What scatters the targets of one step is in all of
-them, once: what a model has learned of noise. Whether it moves the state, and adds up from step to step, or is the
-sensors' alone, shows from the second step on. By default it moves the state: that is right for wind and for wear, and
-cautious where sensors are noisy. Where the sensors' part is known, it is said apart.
+Which noise an interval holds decides whether it can be believed. What scatters the
+targets of one step is in all of them, once: what a model has learned of noise. Whether
+it moves the state, and adds up from step to step, or is the sensors' alone, shows from
+the second step on. By default it moves the state: that is right for wind and for wear,
+and cautious where sensors are noisy. Where the sensors' part is known, it is said
+apart.
 
-Predictions from neighbouring states overlap, so their errors are correlated: the effective number of samples is smaller
-than the count, the more so the larger k. Intervals of a coverage count those that do not overlap.
+Predictions from neighbouring states overlap, so their errors are correlated: the
+effective number of samples is smaller than the count, the more so the larger k.
+Intervals of a coverage count those that do not overlap.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from gpmpc._angles import angles_of, whole_turns
-from gpmpc._arrays import names_of, read_array
+from gpmpc._arrays import read_array
 from gpmpc._dynamics import DynamicsModel
 from gpmpc.exceptions import (
     DataError,
@@ -36,6 +41,7 @@ from gpmpc.exceptions import (
 )
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import Transitions
+from gpmpc.gp._transitions import signals_of_tables
 from gpmpc.metrics import (
     binomial_interval,
     interval_coverage,
@@ -43,12 +49,14 @@ from gpmpc.metrics import (
     negative_log_predictive_density,
 )
 from gpmpc.propagation import Propagator, best_propagator
-from gpmpc.signals import UNKNOWN, Signals, check_signals, signals_of
+from gpmpc.signals import UNKNOWN, Signals, signals_of
 
 if TYPE_CHECKING:
     import pandas
 
-CHUNK = 64  # starts propagated at once: bounds the memory of moment matching at about CHUNK N^2 numbers
+# Starts propagated at once: bounds the memory of moment matching at about CHUNK N^2
+# numbers.
+CHUNK = 64
 
 
 @dataclass(frozen=True)
@@ -72,24 +80,14 @@ class Recording:
         ) -> None: ...
 
     def __post_init__(self) -> None:
-        check_signals(self.signals)
-        signals = Signals(
-            self.signals.state_names or names_of(self.states),
-            self.signals.input_names or names_of(self.inputs),
-            self.signals.time_step,
-        )
+        signals = signals_of_tables(self.signals, self.states, self.inputs)
         object.__setattr__(self, "signals", signals)
-        for name, names in (
-            ("states", signals.state_names),
-            ("inputs", signals.input_names),
-        ):
+        column_names = {"states": signals.state_names, "inputs": signals.input_names}
+        for name, names in column_names.items():
             array = read_array(f"{name} of a recording", getattr(self, name), names)
             object.__setattr__(self, name, torch.from_numpy(np.array(array)))
-        if (
-            self.states.dim() != 2
-            or self.inputs.dim() != 2
-            or not 0 < len(self.inputs) == len(self.states) - 1
-        ):
+        are_tables = self.states.dim() == 2 and self.inputs.dim() == 2
+        if not are_tables or not 0 < len(self.inputs) == len(self.states) - 1:
             raise ShapeError(
                 "a recording has states (K + 1, n) and inputs (K, m), K of 1 or more; "
                 f"got {tuple(self.states.shape)} and {tuple(self.inputs.shape)}"
@@ -104,44 +102,48 @@ class Recording:
 
     @classmethod
     def chained(cls, transitions: Transitions) -> list["Recording"]:
-        """Finds the runs in transitions: one goes on while a row's next state is the following row's state."""
-        goes_on = (
-            (transitions.next_states[:-1] == transitions.states[1:]).all(dim=1).tolist()
-        )
-        ends = [
-            0,
-            *(k + 1 for k, same in enumerate(goes_on) if not same),
-            len(transitions),
-        ]
-        runs = [transitions[begin:end] for begin, end in pairwise(ends)]
-        return [
-            cls(torch.cat([run.states, run.next_states[-1:]]), run.inputs, run.signals)
-            for run in runs
-        ]
+        """Finds the runs in transitions.
+
+        A run goes on while a row's next state is the following row's state.
+        """
+        same = transitions.next_states[:-1] == transitions.states[1:]
+        last_rows = torch.nonzero(~same.all(dim=1))[:, 0].tolist()
+        ends = [0, *(row + 1 for row in last_rows), len(transitions)]
+        recordings = []
+        for begin, end in pairwise(ends):
+            run = transitions[begin:end]
+            states = torch.cat([run.states, run.next_states[-1:]])
+            recordings.append(cls(states, run.inputs, run.signals))
+        return recordings
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """How predictions of k = 1 to H steps fared, for n states and L levels."""
+    """A comparison of predictions of 1 to H steps, for n states and L levels."""
 
-    names: tuple[str, ...]  # of the n states
-    levels: tuple[float, ...]  # of the intervals
-    samples: Tensor  # (H,) predictions compared at each step
-    rmse: Tensor  # (H, n) root mean squared error, in the units of each state
-    nlpd: Tensor  # (H, n) negative log predictive density; lower is better
-    coverage: Tensor  # (H, n, L) part of the measurements inside the central interval of each level
-    width: Tensor  # (H, n) root mean predicted variance over the RMSE: one is honest, less claims too much
-    independent: Tensor  # (H,) predictions that do not overlap, at most
-    noise: str = ""  # which noise the intervals hold, in words
+    names: tuple[str, ...]  #: of the n states
+    levels: tuple[float, ...]  #: of the intervals
+    samples: Tensor  #: predictions compared at each step (H,)
+    rmse: Tensor  #: root mean squared error (H, n), in the units of each state
+    nlpd: Tensor  #: negative log predictive density (H, n); lower is better
+    #: part of the measurements inside the central interval of each level (H, n, L)
+    coverage: Tensor
+    #: root mean predicted variance over the RMSE (H, n): one is honest, less claims too
+    #: much
+    width: Tensor
+    independent: Tensor  #: predictions that do not overlap, at most (H,)
+    noise: str = ""  #: which noise the intervals hold, in words
 
     def coverage_interval(
         self, step: int, state: int, level: int
     ) -> tuple[float, float]:
-        """Computes the exact 95 % interval of a coverage (Clopper and Pearson, 1934), from its three indices."""
+        """Computes the exact 95 % interval of a coverage from its three indices.
+
+        Clopper and Pearson (1934).
+        """
         trials = int(self.independent[step])
-        return binomial_interval(
-            round(float(self.coverage[step, state, level]) * trials), trials
-        )
+        successes = round(float(self.coverage[step, state, level]) * trials)
+        return binomial_interval(successes, trials)
 
     @property
     def horizon(self) -> int:
@@ -149,25 +151,25 @@ class Calibration:
         return len(self.samples)
 
     def to_pandas(self) -> "pandas.DataFrame":
-        """Returns a row a step and state: step, state, samples, rmse, nlpd, width, and coverage_<level> for each."""
+        """Returns a table with a row a step and state.
+
+        Its columns are step, state, samples, rmse, nlpd, width, and coverage_<level>
+        for each level.
+        """
         import pandas
 
         n = len(self.names)
-        steps, samples = (
-            t.repeat_interleave(n)
-            for t in (torch.arange(1, self.horizon + 1), self.samples)
-        )
-        table: dict[str, Any] = {
-            "step": steps,
+        columns: dict[str, Any] = {
+            "step": torch.arange(1, self.horizon + 1).repeat_interleave(n),
             "state": self.names * self.horizon,
-            "samples": samples,
+            "samples": self.samples.repeat_interleave(n),
+            "rmse": self.rmse.ravel(),
+            "nlpd": self.nlpd.ravel(),
+            "width": self.width.ravel(),
         }
-        table |= {key: getattr(self, key).ravel() for key in ("rmse", "nlpd", "width")}
-        table |= {
-            f"coverage_{level:g}": self.coverage[..., j].ravel()
-            for j, level in enumerate(self.levels)
-        }
-        return pandas.DataFrame(table)
+        for j, level in enumerate(self.levels):
+            columns[f"coverage_{level:g}"] = self.coverage[..., j].ravel()
+        return pandas.DataFrame(columns)
 
 
 def calibrate(
@@ -182,107 +184,188 @@ def calibrate(
 ) -> Calibration:
     """Predicts held-out recordings from every state, and compares.
 
-    Predictions hold the model's noise once in every case: at each step, where the propagator adds the process noise
-    (all do by default), else at the last one alone, as if it were of the sensors. ``Calibration.noise`` says which.
+    Predictions hold the model's noise once in every case: at each step, where the
+    propagator adds the process noise (all do by default), else at the last one alone,
+    as if it were of the sensors. ``Calibration.noise`` says which.
 
     Args:
         model: What was learned, from other recordings.
-        recordings: Measured states and applied inputs. A start counts for the steps that its recording still holds.
-        propagator: How the belief moves; as ``best_propagator`` of ``gpmpc.propagation`` does by default.
+        recordings: Measured states and applied inputs. A start counts for the steps
+            that its recording still holds.
+        propagator: How the belief moves; as ``best_propagator`` of
+            ``gpmpc.propagation`` does by default.
         horizon: H, the longest prediction in steps.
         levels: Of the central intervals.
         names: Of the states; by default as the model or the first recording calls them,
             or x1, x2, ...
-        angles: Indices of the states that are angles [rad], whose errors are taken within half a turn; by default
-            those of the model.
-        measurement_noise: Standard deviations of the sensors that the states were measured with (n,), where they are
-            known: starts are then as uncertain, and what is compared. The model's noise has to be that of the process
-            alone (``gpmpc.estimation.separate_noise``), or it counts theirs once more.
+        angles: Indices of the states that are angles [rad], whose errors are taken
+            within half a turn; by default those of the model.
+        measurement_noise: Standard deviations of the sensors that the states were
+            measured with (n,), where they are known: starts are then as uncertain, and
+            what is compared. The model's noise has to be that of the process alone
+            (``gpmpc.estimation.separate_noise``), or it counts theirs once more.
 
     Raises:
         ShapeError: Recordings, model or names do not belong together.
-        SettingError: A level is not between 0 and 1, no recording is as long as the horizon, or a deviation of the
-            sensors is negative.
+        SettingError: A level is not between 0 and 1, no recording is as long as the
+            horizon, or a deviation of the sensors is negative.
     """
     recordings = [recordings] if isinstance(recordings, Recording) else list(recordings)
     propagator = best_propagator(model) if propagator is None else propagator
-    own = signals_of(model).state_names
-    if not own and recordings:
-        own = recordings[0].signals.state_names
-    names = tuple(names or own) or tuple(f"x{i + 1}" for i in range(model.state_dim))
+    names = _state_names(names, model, recordings)
     check_number("horizon", horizon, least=1, whole=True)
     _check(model, recordings, horizon, levels, names)
-    n = model.state_dim
     turning = angles_of(model) if angles is None else list(angles)
-    like: dict[str, Any] = {"dtype": model.dtype, "device": model.device}
-    holds_noise = bool(getattr(propagator, "process_noise", False))
-    sensors = torch.zeros(n, **like)
-    if measurement_noise is not None:
-        deviations = list(measurement_noise)
-        check_numbers("measurement_noise", deviations, n, least=0)
-        sensors = torch.tensor(deviations, **like).square()
-    added = sensors
-    if not holds_noise and measurement_noise is None:
-        added = model.noise_covariance.diagonal()
-    start = torch.diag(sensors)
-
-    found: list[list[tuple[Tensor, ...]]] = [[] for _ in range(horizon)]
+    noise = _assumed_noise(model, propagator, measurement_noise)
+    predictions: list[list[_Predictions]] = [[] for _ in range(horizon)]
     with torch.no_grad():
         for recording in recordings:
-            x = recording.states.to(**like)
-            u = recording.inputs.to(**like)
-            K = len(recording)
-            for first in range(0, K, CHUNK):
-                mean = x[first : min(first + CHUNK, K)]
-                belief = Gaussian(mean, start.expand(len(mean), n, n))
-                for k in range(min(horizon, K - first)):
-                    last = min(
-                        first + CHUNK, K - k
-                    )  # from here on k + 1 steps would outlast the recording
-                    belief = Gaussian(
-                        belief.mean[: last - first], belief.covariance[: last - first]
-                    )
-                    belief = propagator(model, belief, u[first + k : last + k])
-                    mean = belief.mean.double().cpu()
-                    variance = (belief.variance + added).double().cpu()
-                    observed = recording.states[first + k + 1 : last + k + 1].clone()
-                    turns = whole_turns((observed - mean)[:, turning])
-                    observed[:, turning] -= turns
-                    found[k].append((mean, variance, observed))
-    steps = [
-        tuple(torch.cat(parts) for parts in zip(*step, strict=True)) for step in found
+            for step, compared in _predict_recording(
+                model, propagator, recording, horizon, noise, turning
+            ):
+                predictions[step].append(compared)
+    columns = [_columns(_joined(step)) for step in predictions]
+    rmse = _table(columns, lambda c: math.sqrt(mean_squared_error(c.mean, c.observed)))
+    deviation = _table(columns, lambda c: math.sqrt(c.variance.mean()))
+    independent = [
+        sum(len(recording) // k for recording in recordings)
+        for k in range(1, horizon + 1)
     ]
-    columns = [
-        [[part[:, i : i + 1] for part in step] for i in range(n)] for step in steps
-    ]
-
-    def table(measure: Callable[[Tensor, Tensor, Tensor], Any]) -> Tensor:
-        return torch.tensor(
-            [[measure(*column) for column in step] for step in columns],
-            dtype=torch.float64,
-        )
-
-    rmse = table(lambda m, v, y: math.sqrt(mean_squared_error(m, y)))
     return Calibration(
-        names,
-        tuple(levels),
-        torch.tensor([len(mean) for mean, _, _ in steps]),
-        rmse,
-        table(negative_log_predictive_density),
-        table(lambda m, v, y: [interval_coverage(m, v, y, level) for level in levels]),
-        table(lambda m, v, y: math.sqrt(v.mean())) / rmse,
-        torch.tensor(
-            [
-                sum(len(recording) // k for recording in recordings)
-                for k in range(1, horizon + 1)
-            ]
+        names=names,
+        levels=tuple(levels),
+        samples=torch.tensor([len(step[0].mean) for step in columns]),
+        rmse=rmse,
+        nlpd=_table(
+            columns,
+            lambda c: negative_log_predictive_density(c.mean, c.variance, c.observed),
         ),
-        _noise_in_words(holds_noise, measurement_noise is not None),
+        coverage=_table(
+            columns,
+            lambda c: [
+                interval_coverage(c.mean, c.variance, c.observed, level)
+                for level in levels
+            ],
+        ),
+        width=deviation / rmse,
+        independent=torch.tensor(independent),
+        noise=_noise_in_words(noise.moves_state, measurement_noise is not None),
     )
 
 
+class _Noise(NamedTuple):
+    """The noise that predictions hold."""
+
+    moves_state: bool  #: whether the propagator adds the process noise at every step
+    start: Tensor  #: covariance of the states where predictions begin (n, n)
+    last: Tensor  #: variances added to what is compared (n,)
+
+
+class _Predictions(NamedTuple):
+    """Predictions of one number of steps, and what was measured; all (S, n)."""
+
+    mean: Tensor
+    variance: Tensor
+    observed: Tensor
+
+
+def _assumed_noise(
+    model: DynamicsModel,
+    propagator: Propagator,
+    measurement_noise: Sequence[float] | None,
+) -> _Noise:
+    """Returns the noise of predictions; see ``calibrate``."""
+    n = model.state_dim
+    moves_state = bool(getattr(propagator, "process_noise", False))
+    sensors = torch.zeros(n, dtype=model.dtype, device=model.device)
+    if measurement_noise is not None:
+        deviations = list(measurement_noise)
+        check_numbers("measurement_noise", deviations, n, least=0)
+        sensors = torch.tensor(
+            deviations, dtype=model.dtype, device=model.device
+        ).square()
+    last = sensors
+    if not moves_state and measurement_noise is None:
+        last = model.noise_covariance.diagonal()
+    return _Noise(moves_state=moves_state, start=torch.diag(sensors), last=last)
+
+
+def _predict_recording(
+    model: DynamicsModel,
+    propagator: Propagator,
+    recording: Recording,
+    horizon: int,
+    noise: _Noise,
+    angles: Sequence[int],
+) -> Iterator[tuple[int, _Predictions]]:
+    """Predicts from every state of a recording, some starts at once.
+
+    Yields:
+        The number of steps ahead, less one, and predictions of as many steps.
+    """
+    n = model.state_dim
+    size = len(recording)
+    states = recording.states.to(dtype=model.dtype, device=model.device)
+    inputs = recording.inputs.to(dtype=model.dtype, device=model.device)
+    for first in range(0, size, CHUNK):
+        mean = states[first : min(first + CHUNK, size)]
+        belief = Gaussian(mean, noise.start.expand(len(mean), n, n))
+        for k in range(min(horizon, size - first)):
+            # From here on k + 1 steps would outlast the recording.
+            last = min(first + CHUNK, size - k)
+            count = last - first
+            belief = Gaussian(belief.mean[:count], belief.covariance[:count])
+            belief = propagator(model, belief, inputs[first + k : last + k])
+            mean = belief.mean.double().cpu()
+            variance = (belief.variance + noise.last).double().cpu()
+            observed = recording.states[first + k + 1 : last + k + 1].clone()
+            observed[:, angles] -= whole_turns((observed - mean)[:, angles])
+            yield k, _Predictions(mean=mean, variance=variance, observed=observed)
+
+
+def _joined(parts: list[_Predictions]) -> _Predictions:
+    """Joins predictions of the same number of steps."""
+    return _Predictions(
+        mean=torch.cat([part.mean for part in parts]),
+        variance=torch.cat([part.variance for part in parts]),
+        observed=torch.cat([part.observed for part in parts]),
+    )
+
+
+def _columns(predictions: _Predictions) -> list[_Predictions]:
+    """Splits predictions into those of each state (S, 1)."""
+    return [
+        _Predictions(
+            mean=predictions.mean[:, i : i + 1],
+            variance=predictions.variance[:, i : i + 1],
+            observed=predictions.observed[:, i : i + 1],
+        )
+        for i in range(predictions.mean.shape[1])
+    ]
+
+
+def _table(
+    columns: list[list[_Predictions]], measure: Callable[[_Predictions], Any]
+) -> Tensor:
+    """Measures the predictions of every step and state (H, n, ...)."""
+    values = [[measure(column) for column in step] for step in columns]
+    return torch.tensor(values, dtype=torch.float64)
+
+
+def _state_names(
+    names: Sequence[str], model: DynamicsModel, recordings: list[Recording]
+) -> tuple[str, ...]:
+    """Returns the names of the states, the model's or the first recording's."""
+    if names:
+        return tuple(names)
+    known = signals_of(model).state_names
+    if not known and recordings:
+        known = recordings[0].signals.state_names
+    return tuple(known) or tuple(f"x{i + 1}" for i in range(model.state_dim))
+
+
 def _noise_in_words(moves_the_state: bool, sensors_known: bool) -> str:
-    """Which noise predicted intervals hold."""
+    """Says which noise predicted intervals hold."""
     if moves_the_state and sensors_known:
         return "the model's noise at every step, the sensors' at the first and the last"
     if moves_the_state:
@@ -299,19 +382,18 @@ def _check(
     levels: Sequence[float],
     names: tuple[str, ...],
 ) -> None:
+    """Raises unless model, recordings, levels and names belong together."""
     n = model.state_dim
     m = model.input_dim
     if model.output_dim != n:
         raise ShapeError(
             f"the model must predict its {n} states; it has {model.output_dim} outputs"
         )
-    sizes = {
-        (recording.states.shape[1], recording.inputs.shape[1])
-        for recording in recordings
-    }
+    sizes = {(r.states.shape[1], r.inputs.shape[1]) for r in recordings}
     if sizes != {(n, m)}:
         raise ShapeError(
-            f"recordings must have the model's {n} states and {m} inputs; got {sizes or 'no recording'}"
+            f"recordings must have the model's {n} states and {m} inputs; "
+            f"got {sizes or 'no recording'}"
         )
     for recording in recordings:
         signals_of(model).check("the model", recording.signals, "the recording")

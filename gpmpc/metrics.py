@@ -1,4 +1,4 @@
-"""Computes how good predictions and flights are, and how far those numbers can be believed."""
+"""Measures of predictions and flights, and how far those numbers can be believed."""
 
 import math
 from collections.abc import Sequence
@@ -17,9 +17,10 @@ from gpmpc.gaussian import check_tensors
 def mean_squared_error(
     predicted: Tensor, observed: Tensor, angles: Sequence[int] = ()
 ) -> float:
-    """Computes the squared error summed over the outputs, averaged over the samples; both (N, n).
+    """Computes the squared error summed over outputs, averaged over samples.
 
-    ``angles`` are outputs whose errors are taken within half a turn [rad].
+    Both are (N, n); ``angles`` are outputs whose errors are taken within half a turn
+    [rad].
     """
     _check_alike(predicted=predicted, observed=observed)
     errors = state_difference(predicted, observed, angles)
@@ -29,7 +30,9 @@ def mean_squared_error(
 def negative_log_predictive_density(
     mean: Tensor, variance: Tensor, observed: Tensor, angles: Sequence[int] = ()
 ) -> float:
-    """Computes -log N(observed; mean, variance), averaged over samples and outputs; all (N, n). Lower is better.
+    """Computes -log N(observed; mean, variance), averaged over samples and outputs.
+
+    All are (N, n). Lower is better.
 
     ``angles`` are outputs whose errors are taken within half a turn [rad].
 
@@ -48,25 +51,26 @@ def interval_coverage(
     level: float = 0.95,
     angles: Sequence[int] = (),
 ) -> float:
-    """Computes the part of observations inside the central interval of a level; all (N, n). Ideal: the level.
+    """Computes the part of observations inside the central interval of a level.
+
+    All are (N, n). Ideal is the level.
 
     ``angles`` are outputs whose errors are taken within half a turn [rad].
     """
     _check_alike(mean=mean, variance=variance, observed=observed)
     if not 0 < level < 1:
         raise SettingError("level", f"must lie between 0 and 1; got {level}")
-    half_width = (
-        torch.special.ndtri(torch.tensor((1 + level) / 2, dtype=variance.dtype))
-        * variance.sqrt()
-    )
+    probability = torch.tensor((1 + level) / 2, dtype=variance.dtype)
+    half_width = torch.special.ndtri(probability) * variance.sqrt()
     errors = state_difference(observed, mean, angles)
     return float((errors.abs() <= half_width).double().mean())
 
 
-def _check_alike(**given: Tensor) -> None:
-    check_tensors(**given)
-    if len({value.shape for value in given.values()}) > 1:
-        got = ", ".join(f"{key} {tuple(value.shape)}" for key, value in given.items())
+def _check_alike(**tensors: Tensor) -> None:
+    """Raises ``ShapeError`` unless all tensors have one shape."""
+    check_tensors(**tensors)
+    if len({value.shape for value in tensors.values()}) > 1:
+        got = ", ".join(f"{key} {tuple(value.shape)}" for key, value in tensors.items())
         raise ShapeError(f"all must have one shape (N, n); got {got}")
 
 
@@ -74,10 +78,9 @@ def _check_alike(**given: Tensor) -> None:
 class _TrackingError:
     """Root mean squared distance from the references."""
 
-    axes: np.ndarray  # (j,) of every state looked at, in its unit
-    total: (
-        float  # root of the mean of their summed squares: over x, y, z the distance [m]
-    )
+    axes: np.ndarray  #: of every state looked at, in its unit (j,)
+    #: root of the mean of their summed squares: over x, y, z the distance [m]
+    total: float
 
 
 def tracking_error(
@@ -86,14 +89,20 @@ def tracking_error(
     axes: Sequence[int],
     angles: Sequence[int] = (),
 ) -> _TrackingError:
-    """Computes how far a flight was from its references, the initial state left out: nobody steered there.
+    """Computes how far a flight was from its references.
 
-    States and references are (K + 1, n), K of 1 or more; ``axes`` are the states to look at, all in one unit, and
-    ``angles`` those of them whose errors are taken within half a turn [rad].
+    The initial state is left out: nobody steered there.
+
+    States and references are (K + 1, n), K of 1 or more; ``axes`` are the states to
+    look at, all in one unit, and ``angles`` those of them whose errors are taken within
+    half a turn [rad].
     """
     with np.errstate(over="ignore", invalid="ignore"):
-        squares = np.square(_errors(states, references, axes, angles))[1:].mean(axis=0)
-        return _TrackingError(np.sqrt(squares), float(np.sqrt(squares.sum())))
+        errors = _errors(states, references, axes, angles)
+        squares = np.square(errors)[1:].mean(axis=0)
+        return _TrackingError(
+            axes=np.sqrt(squares), total=float(np.sqrt(squares.sum()))
+        )
 
 
 def _errors(
@@ -102,12 +111,9 @@ def _errors(
     axes: Sequence[int],
     angles: Sequence[int],
 ) -> np.ndarray:
-    """Differences on some axes (K + 1, j), those of angles within half a turn."""
-    if (
-        np.ndim(states) != 2
-        or np.shape(states) != np.shape(references)
-        or len(states) < 2
-    ):
+    """Computes differences on some axes (K + 1, j); of angles, within half a turn."""
+    same_shape = np.shape(states) == np.shape(references)
+    if np.ndim(states) != 2 or not same_shape or len(states) < 2:
         got = f"{np.shape(states)} and {np.shape(references)}"
         raise ShapeError(
             f"states and references must both be (K + 1, n), K of 1 or more; got {got}"
@@ -122,11 +128,11 @@ def _errors(
 
 @dataclass(frozen=True)
 class _Loss:
-    """Where a flight was lost."""
+    """The step at which a flight was lost."""
 
-    step: int  # the first step k whose state is too far off
-    distance: float  # from its reference
-    limit: float  # how far it may be
+    step: int  #: the first step k whose state is too far off
+    distance: float  #: from its reference
+    limit: float  #: how far it may be
 
 
 def find_loss(
@@ -136,39 +142,37 @@ def find_loss(
     least: float = 0.0,
     angles: Sequence[int] = (),
 ) -> _Loss | None:
-    """Finds where a flight is farther from its reference than the reference ever goes from where the flight began.
+    """Finds where a flight no longer follows its reference.
 
-    There the system would have been nearer had it never moved: it no longer follows. That holds for any system and any
-    units; a reference that hardly moves needs a ``least``, such as ``System.lost``: no flight is lost that is nearer.
-    Arguments are those of ``tracking_error``. Returns the first such step, or None.
+    It is farther from its reference than the reference ever goes from where the flight
+    began: there the system would have been nearer had it never moved. That holds for
+    any system and any units; a reference that hardly moves needs a ``least``, such as
+    ``System.lost``: no flight is lost that is nearer. Arguments are those of
+    ``tracking_error``. Returns the first such step, or None.
     """
     with np.errstate(over="ignore", invalid="ignore"):
-        distances = np.linalg.norm(_errors(states, references, axes, angles), axis=1)
-        still = np.broadcast_to(
-            np.asarray(states)[0], np.shape(references)
-        )  # had it never moved
-        limit = max(
-            least,
-            float(
-                np.linalg.norm(_errors(still, references, axes, angles), axis=1).max()
-            ),
-        )
-    beyond = ~(distances <= limit)  # what is no number is nowhere near
-    k = int(np.argmax(beyond))
-    return _Loss(k, float(distances[k]), limit) if beyond[k] else None
+        errors = _errors(states, references, axes, angles)
+        distances = np.linalg.norm(errors, axis=1)
+        at_rest = np.broadcast_to(np.asarray(states)[0], np.shape(references))
+        errors_at_rest = _errors(at_rest, references, axes, angles)
+        farthest = float(np.linalg.norm(errors_at_rest, axis=1).max())
+    limit = max(least, farthest)
+    lost = ~(distances <= limit)  # what is no number is nowhere near
+    k = int(np.argmax(lost))
+    if not lost[k]:
+        return None
+    return _Loss(step=k, distance=float(distances[k]), limit=limit)
 
 
 @dataclass(frozen=True)
 class _ViolationRate:
-    """How often bounds were broken."""
+    """The rate at which bounds were broken."""
 
-    violations: int  # steps at which any entry was outside
-    steps: int  # all of them
-    worst: (
-        float  # largest distance outside, in the entry's unit; 0 where there was none
-    )
-    low: float  # lower end of the interval for the probability of a violation
-    high: float  # its upper end
+    violations: int  #: steps at which any entry was outside
+    steps: int  #: all of them
+    worst: float  #: largest distance outside, in the entry's unit; 0 for none
+    low: float  #: lower end of the interval for the probability of a violation
+    high: float  #: its upper end
 
     @property
     def rate(self) -> float:
@@ -179,19 +183,19 @@ class _ViolationRate:
 def violation_rate(
     values: np.ndarray, lower: np.ndarray, upper: np.ndarray, tolerance: float = 1e-9
 ) -> _ViolationRate:
-    """Counts how often states or inputs were outside their bounds, with the 95 % interval of ``binomial_interval``.
+    """Counts how often states or inputs were outside their bounds.
 
-    The interval takes steps for independent. Those of one flight are not: pool several seeds, and read it as a lower
-    limit of the doubt. Values are (K, d), one row a step, and bounds (d,), infinite where there is none; a solver's
-    round-off may be ``tolerance`` outside.
+    The rate has the 95 % interval of ``binomial_interval``. The interval takes steps
+    for independent. Those of one flight are not: pool several seeds, and read it as a
+    lower limit of the doubt. Values are (K, d), one row a step, and bounds (d,),
+    infinite where there is none; a solver's round-off may be ``tolerance`` outside.
     """
-    values, lower, upper = (np.asarray(a, dtype=float) for a in (values, lower, upper))
-    if (
-        values.ndim != 2
-        or not len(values)
-        or lower.shape != values.shape[1:]
-        or upper.shape != values.shape[1:]
-    ):
+    values = np.asarray(values, dtype=float)
+    lower = np.asarray(lower, dtype=float)
+    upper = np.asarray(upper, dtype=float)
+    entries = values.shape[1:]
+    have_bounds = lower.shape == entries and upper.shape == entries
+    if values.ndim != 2 or not len(values) or not have_bounds:
         got = f"{values.shape}, {lower.shape}, {upper.shape}"
         raise ShapeError(
             f"values must be (K, d) with bounds (d,), K of 1 or more; got {got}"
@@ -205,21 +209,24 @@ def violation_rate(
     # A value that is no number keeps no bound.
     inside = (values >= lower - tolerance) & (values <= upper + tolerance)
     violations = int((~inside.all(axis=1)).sum())
-    outside = np.fmax.reduce(
-        np.maximum(lower - values, values - upper), axis=None, initial=0.0
-    )
+    distances = np.maximum(lower - values, values - upper)
+    low, high = binomial_interval(violations, len(values))
     return _ViolationRate(
-        violations,
-        len(values),
-        float(outside),
-        *binomial_interval(violations, len(values)),
+        violations=violations,
+        steps=len(values),
+        worst=float(np.fmax.reduce(distances, axis=None, initial=0.0)),
+        low=low,
+        high=high,
     )
 
 
 def binomial_interval(
     successes: int, trials: int, level: float = 0.95
 ) -> tuple[float, float]:
-    """Computes the exact interval for a probability from ``successes`` of ``trials`` (Clopper and Pearson, 1934)."""
+    """Computes the exact interval for a probability from ``successes`` of ``trials``.
+
+    Clopper and Pearson (1934).
+    """
     if not 0 <= successes <= trials or trials < 1:
         raise SettingError(
             "successes",
@@ -230,7 +237,10 @@ def binomial_interval(
 
 
 def time_quantiles(seconds: np.ndarray) -> dict[str, float]:
-    """Computes "median", "p95" and "p99" (95 % and 99 % quantile), and the "largest" of wall times (K,) [s]."""
+    """Computes quantiles of wall times (K,) [s].
+
+    They are the "median", "p95" and "p99" (95 % and 99 %), and the "largest".
+    """
     if np.ndim(seconds) != 1 or not len(seconds):
         raise ShapeError(
             f"seconds must be (K,), K of 1 or more; got {np.shape(seconds)}"
@@ -248,14 +258,16 @@ def tracking_cost(
     previous_input: Sequence[float] | np.ndarray,
     angles: Sequence[int] = (),
 ) -> float:
-    """Computes the cost of a flight per step: 1/K (sum_k |x_k - r_k|^2_Q + sum_k |u_k - u_{k-1}|^2_R).
+    """Computes the cost of a flight per step.
 
-    Q is (n, n) and R (m, m); states and references are (K + 1, n), of which the first cost nothing, inputs (K, m), and
-    the previous input u_{-1} (m,). ``angles`` are states whose errors are taken within half a turn [rad].
+    1/K (sum_k |x_k - r_k|^2_Q + sum_k |u_k - u_{k-1}|^2_R).
+
+    Q is (n, n) and R (m, m); states and references are (K + 1, n), of which the first
+    cost nothing, inputs (K, m), and the previous input u_{-1} (m,). ``angles`` are
+    states whose errors are taken within half a turn [rad].
     """
     errors = state_difference(states[1:], references[1:], angles)
     increments = np.diff(inputs, axis=0, prepend=np.atleast_2d(previous_input))
-    cost = np.einsum("ki,ij,kj", errors, Q, errors) + np.einsum(
-        "ki,ij,kj", increments, R, increments
-    )
-    return float(cost / len(inputs))
+    tracking = np.einsum("ki,ij,kj", errors, Q, errors)
+    control = np.einsum("ki,ij,kj", increments, R, increments)
+    return float((tracking + control) / len(inputs))

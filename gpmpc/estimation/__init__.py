@@ -1,4 +1,7 @@
-"""Estimation of what is not measured: states, disturbances, delays, noise; and how far predictions can be believed."""
+"""Estimation of what is not measured: states, disturbances, delays and noise.
+
+Conformal tubes say how far predictions can be believed.
+"""
 
 from gpmpc.estimation._conformal import AdaptiveTube, ConformalTube
 from gpmpc.estimation._consistency import (

@@ -1,11 +1,12 @@
 """A Gaussian given a measurement, in square-root form.
 
-With Sigma = L L', a measurement y = H x + v and v ~ N(0, N), the posterior covariance is
+With Sigma = L L', a measurement y = H x + v and v ~ N(0, N), the posterior covariance
+is
 
     Sigma+ = L (I - Y' (Y Y' + N)^-1 Y) L',     Y = H L
 
-and Sigma - K S K' takes two numbers of the size of Sigma from each other: where Sigma is
-1e16 times N no digit is left. Here L itself is turned into a root of Sigma+, by an
+and Sigma - K S K' takes two numbers of the size of Sigma from each other: where Sigma
+is 1e16 times N no digit is left. Here L itself is turned into a root of Sigma+, by an
 orthogonal matrix T that makes the array lower triangular (Kailath, Sayed and Hassibi,
 2000, chapter 12):
 
@@ -13,13 +14,13 @@ orthogonal matrix T that makes the array lower triangular (Kailath, Sayed and Ha
     [L  0      ]     [G        L+]
 
 T is made of reflections of Householder. The columns of the prior, which are large, come
-before those of the noise, so that large and small entries are not mixed (Cox and Higham,
-1998): the error of a standard deviation is round-off of the prior's, relatively that of
-Sigma+ the root of what Sigma - K S K' loses.
+before those of the noise, so that large and small entries are not mixed (Cox and
+Higham, 1998): the error of a standard deviation is round-off of the prior's, relatively
+that of Sigma+ the root of what Sigma - K S K' loses.
 
-Sensors that are perfect, or nearly, are taken one by one instead. What one of them shows
-of what others have shown already is round-off of its row, and must not be taken for
-knowledge: two such sensors that contradict each other would move other states.
+Sensors that are perfect, or nearly, are taken one by one instead. What one of them
+shows of what others have shown already is round-off of its row, and must not be taken
+for knowledge: two such sensors that contradict each other would move other states.
 """
 
 from typing import NamedTuple
@@ -28,33 +29,34 @@ import torch
 from torch import Tensor
 
 _ROUND_OFF = 16.0  # of a sum of products, in units of the last place of its largest
-_PERFECT = 1e-6  # deviation of a sensor's noise over what it shows: below, it is nearly perfect
+# deviation of a sensor's noise over what it shows: below, it is nearly perfect
+_PERFECT = 1e-6
 
 
 class Conditioned(NamedTuple):
-    """What a measurement leaves of a Gaussian."""
+    """A Gaussian after a measurement."""
 
     gain: Tensor  #: K (*batch, n, p): the mean moves by K times the innovation
     root: Tensor  #: L+ (*batch, n, n), with L+ L+' the posterior covariance
 
     @property
     def covariance(self) -> Tensor:
-        """Of the posterior (*batch, n, n): symmetric and positive semidefinite."""
+        """Covariance (*batch, n, n): symmetric and positive semidefinite."""
         return squared(self.root)
 
 
 def squared(root: Tensor) -> Tensor:
-    """L L' (*batch, n, n) of a root L, symmetric to the last digit."""
+    """Computes L L' (*batch, n, n) of a root L, symmetric to the last digit."""
     covariance = root @ root.mT
     return (covariance + covariance.mT) / 2
 
 
 def covariance_root(covariance: Tensor) -> Tensor:
-    """A root L (*batch, n, n) with L L' = Sigma: Cholesky's where Sigma has one.
+    """Computes a root L (*batch, n, n) with L L' = Sigma.
 
-    Of singular covariances it is that of the correlations, times the deviations: a small
-    variance beside a large one keeps its digits. What is left of a variance by
-    cancellation, round-off of it, is none.
+    It is Cholesky's where Sigma has one. Of singular covariances it is that of the
+    correlations, times the deviations: a small variance beside a large one keeps its
+    digits. What is left of a variance by cancellation, round-off of it, is none.
     """
     factor, info = torch.linalg.cholesky_ex(covariance)
     variances = covariance.diagonal(dim1=-2, dim2=-1).clamp_min(0)
@@ -67,29 +69,33 @@ def covariance_root(covariance: Tensor) -> Tensor:
     inverse = torch.where(deviations > 0, 1 / deviations, 0.0)
     correlations = inverse[..., :, None] * covariance * inverse[..., None, :]
     eigenvalues, vectors = torch.linalg.eigh((correlations + correlations.mT) / 2)
-    kept = eigenvalues > covariance.shape[-1] * eps * eigenvalues[..., -1:]
-    lengths = torch.where(kept, eigenvalues, 0.0).sqrt()
+    positive = eigenvalues > covariance.shape[-1] * eps * eigenvalues[..., -1:]
+    lengths = torch.where(positive, eigenvalues, 0.0).sqrt()
     root = deviations[..., :, None] * vectors * lengths[..., None, :]
     return torch.where(singular[..., None, None], root, factor)
 
 
 def seen_through(root: Tensor, cross_covariance: Tensor) -> Tensor:
-    """Y (*batch, p, n) of Cov[x, y] = L Y' (*batch, n, p), the least one if L is singular.
+    """Computes Y (*batch, p, n) of Cov[x, y] = L Y' (*batch, n, p).
 
-    Y = H L where the measurement is linear, and the best linear one elsewhere.
+    It is the least one if L is singular. Y = H L where the measurement is linear, and
+    the best linear one elsewhere.
     """
     regular = bool((root.diagonal(dim1=-2, dim2=-1) > 0).all())
     if regular and torch.equal(root, root.tril()):
         solved = torch.linalg.solve_triangular(root, cross_covariance, upper=False)
         return solved.mT
-    # Rows in the units of their deviations: small states are not lost beside large ones.
+    # Rows in the units of their deviations: small states are not lost beside large
+    # ones.
     deviations = root.norm(dim=-1, keepdim=True)
     inverse = torch.where(deviations > 0, 1 / deviations, 0.0)
     return (torch.linalg.pinv(inverse * root) @ (inverse * cross_covariance)).mT
 
 
 def unexplained(covariance: Tensor, seen: Tensor) -> Tensor:
-    """What Y does not explain of Cov[y] (*batch, p, p): the error of linearisation.
+    """Computes the part of Cov[y] (*batch, p, p) that Y does not explain.
+
+    That is the error of linearisation.
 
     Entries that are round-off of Cov[y] are zero.
     """
@@ -102,14 +108,16 @@ def unexplained(covariance: Tensor, seen: Tensor) -> Tensor:
 
 
 def condition(root: Tensor, seen: Tensor, noise: Tensor) -> Conditioned:
-    """A Gaussian of root L given a measurement that sees it through Y, with noise N.
+    """Conditions a Gaussian of root L on a measurement that sees it through Y.
 
     Args:
         root: L (*batch, n, n).
         seen: Y = H L (*batch, p, n); a row of zeros shows nothing.
-        noise: N (*batch, p, p), positive semidefinite: zero for what is measured exactly.
+        noise: N (*batch, p, p), positive semidefinite: zero for what is measured
+            exactly.
     """
-    batch, p, n = seen.shape[:-2], *seen.shape[-2:]
+    batch = seen.shape[:-2]
+    p, n = seen.shape[-2:]
     noise = noise.expand(*batch, p, p)
     root = root.expand(*batch, n, n)
     noise_root, info = torch.linalg.cholesky_ex(noise)
@@ -124,11 +132,11 @@ def condition(root: Tensor, seen: Tensor, noise: Tensor) -> Conditioned:
     gain = torch.linalg.solve_triangular(
         innovation_root, triangular[..., p:, :p], upper=False, left=False
     )
-    return Conditioned(gain, triangular[..., p:, p:])
+    return Conditioned(gain=gain, root=triangular[..., p:, p:])
 
 
 def _one_by_one(root: Tensor, seen: Tensor, noise: Tensor) -> Conditioned:
-    """``condition``, by one scalar measurement after the other, also perfect ones."""
+    """Conditions by one scalar measurement after the other, also perfect ones."""
     batch = seen.shape[:-2]
     p = seen.shape[-2]
     unit_lower, variances = _decorrelated(noise)
@@ -150,7 +158,7 @@ def _one_by_one(root: Tensor, seen: Tensor, noise: Tensor) -> Conditioned:
     gain = torch.linalg.solve_triangular(
         unit_lower, gains[..., p:, :], upper=False, left=False, unitriangular=True
     )
-    return Conditioned(gain, factor[..., p:, :])
+    return Conditioned(gain=gain, root=factor[..., p:, :])
 
 
 def _corrected(factor: Tensor, row: Tensor, variance: Tensor) -> tuple[Tensor, Tensor]:
@@ -165,9 +173,9 @@ def _corrected(factor: Tensor, row: Tensor, variance: Tensor) -> tuple[Tensor, T
         Gains (*batch, q), zero where nothing is shown, and the factor given the
         measurement (*batch, q, n).
     """
-    total = row.square().sum(-1) + variance
-    shown = total > 0
-    scale = torch.where(shown, total, 1.0).sqrt()
+    innovation = row.square().sum(-1) + variance
+    shown = innovation > 0
+    scale = torch.where(shown, innovation, 1.0).sqrt()
     largest = row.abs().argmax(-1, keepdim=True)
     pivot = torch.zeros_like(row).scatter(-1, largest, 1.0)
     entry = row.gather(-1, largest)
@@ -178,7 +186,8 @@ def _corrected(factor: Tensor, row: Tensor, variance: Tensor) -> tuple[Tensor, T
     along = weight[..., None] * (factor @ normal[..., None])[..., 0]
     reflected = factor - along[..., :, None] * normal[..., None, :]
     noise = -along * variance.sqrt()[..., None]
-    # The pivot's column has become that of the measurement, and the noise takes its place.
+    # The pivot's column has become that of the measurement, and the noise takes its
+    # place.
     replaced = shown[..., None, None] & (pivot[..., None, :] > 0)
     corrected = torch.where(replaced, noise[..., :, None], reflected)
     covariances = (factor @ row[..., None])[..., 0]
@@ -187,7 +196,11 @@ def _corrected(factor: Tensor, row: Tensor, variance: Tensor) -> tuple[Tensor, T
 
 
 def _decorrelated(noise: Tensor) -> tuple[Tensor, Tensor]:
-    """T (*batch, p, p), unit lower triangular, and d >= 0 (*batch, p): N = T diag(d) T'."""
+    """Factorises N = T diag(d) T'.
+
+    Returns:
+        T (*batch, p, p), unit lower triangular, and d >= 0 (*batch, p).
+    """
     p = noise.shape[-1]
     unit_lower = torch.eye(p, dtype=noise.dtype, device=noise.device)
     unit_lower = unit_lower.expand(noise.shape).clone()

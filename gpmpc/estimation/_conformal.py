@@ -1,24 +1,32 @@
-"""Tubes that hold: how many standard deviations a bound needs, from predictions that were compared with what happened.
+"""Conformal tubes: how many standard deviations a bound needs.
 
-A chance constraint g'x <= f moves its bound inwards by kappa sd, and a Gaussian takes kappa = Phi^-1(eta). Models are
-wrong in ways that their covariance does not say. Here kappa of each stage k is a quantile of the scores
+That follows from predictions that were compared with what happened.
+
+A chance constraint g'x <= f moves its bound inwards by kappa sd, and a Gaussian takes
+kappa = Phi^-1(eta). Models are wrong in ways that their covariance does not say. Here
+kappa of each stage k is a quantile of the scores
 
     s = max_g g'(x_k - mu_k) / sqrt(g' Sigma_k g)
 
-of held-out k-step predictions: the ceil((N + 1) eta)-th smallest of N scores holds a new one with probability eta or
-more, whatever their distribution (split conformal prediction: Vovk, Gammerman and Shafer, 2005; Lei et al., 2018),
-where the new score and the N are exchangeable: windows that do not overlap, flown as the plant will be.
+of held-out k-step predictions: the ceil((N + 1) eta)-th smallest of N scores holds a
+new one with probability eta or more, whatever their distribution (split conformal
+prediction: Vovk, Gammerman and Shafer, 2005; Lei et al., 2018), where the new score and
+the N are exchangeable: windows that do not overlap, flown as the plant will be.
 
-``AdaptiveTube`` corrects it while it runs (Gibbs and Candes, 2021): with err = 1 where a prediction did not hold,
+``AdaptiveTube`` corrects it while it runs (Gibbs and Candes, 2021): with err = 1 where
+a prediction did not hold,
 
-    alpha <- alpha + rate (1 - eta - err),    kappa = quantile of the scores at 1 - alpha
+    alpha <- alpha + rate (1 - eta - err)
+    kappa  = quantile of the scores at 1 - alpha
 
-Whatever the plant does, of T predictions of stage k no more than T a + a / rate + k + 1 do not hold, a = 1 - eta the
-share it aims at, as long as no score exceeds ``largest``: alpha begins at a, and below zero, where kappa is the
-largest, only predictions made before can miss.
+Whatever the plant does, of T predictions of stage k no more than T a + a / rate + k + 1
+do not hold, a = 1 - eta the share it aims at, as long as no score exceeds ``largest``:
+alpha begins at a, and below zero, where kappa is the largest, only predictions made
+before can miss.
 
-To be at or below 1 - eta with confidence it has to aim lower. Of T decisions m may be misses, m the largest number
-whose exact upper 95 % limit (Clopper and Pearson, 1934) is at or below 1 - eta; so ``decisions=T`` aims at
+To be at or below 1 - eta with confidence it has to aim lower. Of T decisions m may be
+misses, m the largest number whose exact upper 95 % limit (Clopper and Pearson, 1934) is
+at or below 1 - eta; so ``decisions=T`` aims at
 
     a = (m - k - 1) / (T + 1 / rate).
 """
@@ -26,7 +34,7 @@ whose exact upper 95 % limit (Clopper and Pearson, 1934) is at or below 1 - eta;
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -42,18 +50,15 @@ from gpmpc.propagation import Propagator, rollout
 
 @dataclass(frozen=True)
 class ConformalTube:
-    """Scores of held-out predictions, and the numbers of standard deviations that follow from them."""
+    """Scores of held-out predictions, and the standard deviations that follow."""
 
     scores: Array  #: those of each stage in a column (N, H), which are sorted
     rows: Array  #: the directions g (r, n) that were compared
     angles: Sequence[int] = ()  #: states whose errors are taken within half a turn
 
     def __post_init__(self) -> None:
-        object.__setattr__(
-            self,
-            "scores",
-            np.ascontiguousarray(np.sort(self.scores, axis=0), dtype=float),
-        )
+        scores = np.sort(self.scores, axis=0)
+        object.__setattr__(self, "scores", np.ascontiguousarray(scores, dtype=float))
         object.__setattr__(self, "rows", np.ascontiguousarray(self.rows, dtype=float))
 
     @classmethod
@@ -75,56 +80,49 @@ class ConformalTube:
             states: x_0 .. x_T at equal time steps (T + 1, n).
             inputs: u_0 .. u_{T-1} (T, m) or one more.
             horizon: H.
-            rows: Directions g (r, n); both sides of every state by default. A bound on the first state from above alone
-                is [[1, 0, ..]]: fewer directions, a smaller kappa.
-            angles: Indices of the states that are angles [rad], whose errors are taken within half a turn; by default
-                those of the model.
+            rows: Directions g (r, n); both sides of every state by default. A bound on
+                the first state from above alone is [[1, 0, ..]]: fewer directions, a
+                smaller kappa.
+            angles: Indices of the states that are angles [rad], whose errors are taken
+                within half a turn; by default those of the model.
 
         Raises:
             ShapeError: States, inputs or rows do not belong together.
             DataError: The log is shorter than the horizon, or a score is not finite.
         """
         check_number("horizon", horizon, least=1, whole=True)
-        x, u = (
-            torch.as_tensor(np.asarray(part), dtype=model.dtype, device=model.device)
-            for part in (states, inputs)
-        )
+        x = torch.as_tensor(np.asarray(states), dtype=model.dtype, device=model.device)
+        u = torch.as_tensor(np.asarray(inputs), dtype=model.dtype, device=model.device)
         if x.dim() != 2 or u.dim() != 2 or len(u) not in (len(x) - 1, len(x)):
             got = f"{tuple(x.shape)} and {tuple(u.shape)}"
             raise ShapeError(
                 f"states (T + 1, n) and inputs (T, m) must be one log; got {got}"
             )
-        at = np.arange(0, len(x) - horizon, horizon)[:, None] + np.arange(
-            1, horizon + 1
-        )
+        begins = np.arange(0, len(x) - horizon, horizon)
+        steps = begins[:, None] + np.arange(1, horizon + 1)  # (windows, H)
         n = x.shape[1]
-        if not len(at):
+        if not len(steps):
             raise DataError(
                 f"a log of {len(x)} states has no window of {horizon} steps"
             )
-        G = (
-            np.vstack([np.eye(n), -np.eye(n)])
-            if rows is None
-            else np.atleast_2d(np.asarray(rows, dtype=float))
-        )
+        both_sides = np.vstack([np.eye(n), -np.eye(n)])
+        G = both_sides if rows is None else _as_rows(rows)
         if G.shape[1] != n:
             raise ShapeError(f"rows must be (r, {n}); got {G.shape}")
-        predicted = rollout(
-            propagator, model, Gaussian.certain(x[at[:, 0] - 1]), u[at - 1]
-        )
-        deviation = np.sqrt(
-            np.einsum("ri,khij,rj->khr", G, to_array(predicted.covariance), G)
-        )
+        starts = Gaussian.certain(x[begins])
+        predicted = rollout(propagator, model, starts, u[steps - 1])
+        covariance = to_array(predicted.covariance)
+        deviation = np.sqrt(np.einsum("ri,khij,rj->khr", G, covariance, G))
         if not (deviation > 0).all():
             raise DataError(
                 "a direction has no variance: predict with the process noise"
             )
         turning = angles_of(model) if angles is None else list(angles)
-        errors = to_array(state_difference(x[at], predicted.mean, turning))
+        errors = to_array(state_difference(x[steps], predicted.mean, turning))
         scores = (errors @ G.T / deviation).max(-1)
         if not np.isfinite(scores).all():
             raise DataError("a score is not finite: a prediction or a state is not")
-        return cls(scores, G, turning)
+        return cls(scores=scores, rows=G, angles=turning)
 
     @property
     def horizon(self) -> int:
@@ -132,18 +130,20 @@ class ConformalTube:
         return self.scores.shape[1]
 
     def kappas(self, probability: float) -> Array:
-        """The number of standard deviations of each stage that holds with a probability eta (H,).
+        """Returns the standard deviations of each stage that hold with eta (H,).
 
         Raises:
             SettingError: The probability does not lie between 0 and 1.
-            DataError: There are fewer than eta / (1 - eta) scores: no number of them says so much.
+            DataError: There are fewer than eta / (1 - eta) scores: no number of them
+                says so much.
         """
         _check_probability(probability)
         rank = math.ceil((len(self.scores) + 1) * probability - 1e-9)
         if rank > len(self.scores):
             need = math.ceil(probability / (1 - probability) - 1e-9)
             raise DataError(
-                f"a probability of {probability:g} needs {need} windows or more; got {len(self.scores)}"
+                f"a probability of {probability:g} needs {need} windows or more; "
+                f"got {len(self.scores)}"
             )
         return self.scores[rank - 1].copy()
 
@@ -156,15 +156,20 @@ class AdaptiveTube:
     Args:
         tube: Scores to begin with.
         probability: eta.
-        rate: By how much one prediction that did not hold moves alpha; larger adapts faster and varies more, at rare
-            violations most of all. By default (1 - eta) / 5.
-        noise: Covariance of the measurements of what ``observe`` is given (n, n); none by default.
-        largest: The largest number of standard deviations; twice the largest score of all by default.
-        decisions: After how many predictions of a stage the exact upper 95 % limit of the share that did not hold is to
-            be at or below 1 - eta; by default the share itself is brought to 1 - eta.
+        rate: By how much one prediction that did not hold moves alpha; larger adapts
+            faster and varies more, at rare violations most of all. By default (1 - eta)
+            / 5.
+        noise: Covariance of the measurements of what ``observe`` is given (n, n); none
+            by default.
+        largest: The largest number of standard deviations; twice the largest score of
+            all by default.
+        decisions: After how many predictions of a stage the exact upper 95 % limit of
+            the share that did not hold is to be at or below 1 - eta; by default the
+            share itself is brought to 1 - eta.
 
     Raises:
-        SettingError: A probability not between 0 and 1, a rate that is not positive, or too few decisions to say so.
+        SettingError: A probability not between 0 and 1, a rate that is not positive, or
+            too few decisions to say so.
     """
 
     def __init__(
@@ -179,59 +184,47 @@ class AdaptiveTube:
         _check_probability(probability)
         rate = (1.0 - probability) / 5.0 if rate is None else rate
         check_number("rate", rate, above=0)
-        H, (r, n) = tube.horizon, tube.rows.shape
-        largest = (
-            2.0 * max(float(tube.scores.max()), 1.0) if largest is None else largest
-        )
+        H = tube.horizon
+        r, n = tube.rows.shape
+        if largest is None:
+            largest = 2.0 * max(float(tube.scores.max()), 1.0)
         check_number("largest", largest, above=0)
         self.tube = tube
         self.probability = float(probability)
         self.rate = float(rate)
         self.largest = float(largest)
-        self.noise = (
-            np.zeros((n, n))
-            if noise is None
-            else np.ascontiguousarray(noise, dtype=float)
-        )
+        self.noise = np.zeros((n, n))
+        if noise is not None:
+            self.noise = np.ascontiguousarray(noise, dtype=float)
         self.allowed = np.full(H, 1.0 - probability)  # a of each stage
         if decisions is not None:
-            check_number("decisions", decisions, least=1, whole=True)
-            spare = np.arange(1, H + 1) + 1
-            self.allowed = (_most_misses(1.0 - probability, decisions) - spare) / (
-                decisions + 1.0 / rate
-            )
-            if not (self.allowed > 0).all():
-                raise SettingError(
-                    "decisions",
-                    f"are too few for a probability of {probability:g}; got {decisions}",
-                )
-        self.kappas, self.alphas = np.empty(H), self.allowed.copy()
+            self.allowed = _aimed_misses(probability, rate, decisions, H)
+        self.kappas = np.empty(H)
+        self.alphas = self.allowed.copy()
         self.counts = np.zeros(H)
         self.misses = np.zeros(H)
-        self._bounds = np.full(
-            (H, H, r), np.nan
-        )  # of the plans of the last H steps, by stage and direction
+        # Of the plans of the last H steps, by stage and direction.
+        self._bounds = np.full((H, H, r), np.nan)
         self._step = 0
-        # Plans count turns from the state that they began at, which a sensor may wrap. So states and plans are moved
-        # by whole turns to where this state, the last one, goes on without jumps.
+        # Plans count turns from the state that they began at, which a sensor may wrap.
+        # So states and plans are moved by whole turns to where this state, the last
+        # one, goes on without jumps.
         self._last_state = np.full(n, np.nan)
         self.observe(np.full(n, np.nan))  # nothing yet: kappas alone
         self._step = 0
 
     def observe(self, state: Any) -> Array:
-        """Compares a state (n,) with what the plans before it said; returns kappa of each stage (H,)."""
+        """Compares a state (n,) with the plans before it; returns kappas (H,)."""
         state = self._without_jumps(np.ascontiguousarray(state, dtype=np.float64))
         self._step += 1
-        numbers = (self.rate, self.allowed, self.largest)
-        parts = (self.kappas, self.alphas, self.counts, self.misses)
         _observe.unchecked(
             state,
             self.tube.rows,
             self._bounds,
             self._step,
-            numbers,
+            _Adaptation(self.rate, self.allowed, self.largest),
             self.tube.scores,
-            parts,
+            _StageState(self.kappas, self.alphas, self.counts, self.misses),
         )
         return self.kappas
 
@@ -241,13 +234,12 @@ class AdaptiveTube:
         Args:
             means: As a decision has them (H + 1, n).
             covariances: Likewise (H + 1, n, n).
-            stages: Whether each stage's prediction counts (H,), or each of its directions (H, r), such as where the
-                plan touches a bound: how often bounds are violated there is what alpha follows then. By default all do.
+            stages: Whether each stage's prediction counts (H,), or each of its
+                directions (H, r), such as where the plan touches a bound: how often
+                bounds are violated there is what alpha follows then. By default all do.
         """
-        means, covariances = (
-            np.ascontiguousarray(part, dtype=np.float64)
-            for part in (means, covariances)
-        )
+        means = np.ascontiguousarray(means, dtype=np.float64)
+        covariances = np.ascontiguousarray(covariances, dtype=np.float64)
         expected = self.tube.horizon + 1, self.tube.rows.shape[1]
         if means.shape != expected:
             raise ShapeError(f"means must be {expected}; got {means.shape}")
@@ -266,7 +258,7 @@ class AdaptiveTube:
             bounds[~np.asarray(stages, dtype=bool)] = np.nan
 
     def _without_jumps(self, state: Array) -> Array:
-        """The state (n,) whose angles are within half a turn of the last ones."""
+        """Moves the angles of a state (n,) to within half a turn of the last ones."""
         if not len(self.tube.angles) or not np.isfinite(state).all():
             return state
         if np.isfinite(self._last_state).all():
@@ -276,13 +268,17 @@ class AdaptiveTube:
 
     @property
     def violations(self) -> Array:
-        """The share of the predictions that did not hold, by stage (H,); NaN before the first."""
+        """Part of the predictions that did not hold (H,); NaN before the first."""
         return np.divide(
             self.misses,
             self.counts,
             out=np.full_like(self.misses, np.nan),
             where=self.counts > 0,
         )
+
+
+def _as_rows(rows: Any) -> Array:
+    return np.atleast_2d(np.asarray(rows, dtype=float))
 
 
 def _check_probability(probability: float) -> None:
@@ -292,25 +288,60 @@ def _check_probability(probability: float) -> None:
         )
 
 
-def _most_misses(share: float, decisions: int) -> int:
-    """The largest number of misses in so many decisions whose exact upper 95 % limit is at or below a share."""
-    misses = np.arange(int(share * decisions) + 1)
+def _aimed_misses(
+    probability: float, rate: float, decisions: int, horizon: int
+) -> Array:
+    """Computes the part of misses to aim at, by stage (H,); see the module's text.
+
+    Raises:
+        SettingError: The decisions are too few.
+    """
+    check_number("decisions", decisions, least=1, whole=True)
+    spare = np.arange(1, horizon + 1) + 1
+    misses = _most_misses(1.0 - probability, decisions)
+    aimed = (misses - spare) / (decisions + 1.0 / rate)
+    if not (aimed > 0).all():
+        raise SettingError(
+            "decisions",
+            f"are too few for a probability of {probability:g}; got {decisions}",
+        )
+    return aimed
+
+
+def _most_misses(rate: float, decisions: int) -> int:
+    """Finds the most misses whose exact upper 95 % limit is at or below a rate."""
+    misses = np.arange(int(rate * decisions) + 1)
     limits = beta.ppf(0.95, misses + 1, np.maximum(decisions - misses, 1))
-    return int((limits <= share).sum()) - 1
+    return int((limits <= rate).sum()) - 1
+
+
+class _Adaptation(NamedTuple):
+    """The settings of the adaptation."""
+
+    rate: float
+    allowed: Array  #: a of each stage (H,)
+    largest: float  #: largest kappa
+
+
+class _StageState(NamedTuple):
+    """What is adapted or counted for each stage (H,)."""
+
+    kappas: Array
+    alphas: Array
+    counts: Array  #: predictions that were compared
+    misses: Array  #: those that did not hold
 
 
 @compiled(locked=True)
-def _observe(state, rows, bounds, step, numbers, scores, parts):
-    """Updates alpha and kappa of each stage (H,) by a state (n,); ``bounds`` (H, H, r) hold the last plans."""
-    (N, H), (rate, allowed, largest), (kappas, alphas, counts, misses) = (
-        scores.shape,
-        numbers,
-        parts,
-    )
-    for k in range(
-        H
-    ):  # the plan of k + 1 steps ago said where the state would be at its stage k
-        # a bound that does not count is NaN
+def _observe(state, rows, bounds, step, adaptation, scores, stages):
+    """Updates alpha and kappa of each stage by a state (n,).
+
+    ``bounds`` (H, H, r) are those of the last plans.
+    """
+    N, H = scores.shape
+    for k in range(H):
+        # The plan of k + 1 steps ago said where the state would be at its stage k.
+        # A bound that does not count is NaN.
         counted = False
         known = True
         outside = False
@@ -324,13 +355,16 @@ def _observe(state, rows, bounds, step, numbers, scores, parts):
             known = known and (bound != bound or value == value)
             outside = outside or value > bound
         if counted and known:
-            counts[k] += 1.0
-            misses[k] += 1.0 if outside else 0.0
-            alphas[k] = min(
-                alphas[k] + rate * (allowed[k] - (1.0 if outside else 0.0)), 1.0
-            )
-        rank = math.ceil((N + 1) * (1.0 - alphas[k]) - 1e-9)
-        kappas[k] = largest if rank > N else scores[max(rank, 1) - 1, k]
+            miss = 1.0 if outside else 0.0
+            stages.counts[k] += 1.0
+            stages.misses[k] += miss
+            change = adaptation.rate * (adaptation.allowed[k] - miss)
+            stages.alphas[k] = min(stages.alphas[k] + change, 1.0)
+        rank = math.ceil((N + 1) * (1.0 - stages.alphas[k]) - 1e-9)
+        if rank > N:
+            stages.kappas[k] = adaptation.largest
+        else:
+            stages.kappas[k] = scores[max(rank, 1) - 1, k]
     bounds[step % H] = np.nan  # until a plan of this step is remembered
 
 

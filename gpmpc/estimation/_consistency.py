@@ -1,9 +1,11 @@
-"""Consistency of estimates: whether errors are as large as their covariances say.
+"""Consistency of estimates: are errors as large as their covariances say?
 
-The normalised estimation error squared e' P^-1 e (NEES), e the error of an estimate of covariance P, and the normalised
-innovation squared nu' S^-1 nu (NIS) have the mean n, the number of entries, where an estimator is consistent; over N
-independent ones N times the mean is chi-square of N n degrees of freedom (Bar-Shalom, Li and Kirubarajan, 2001, section
-5.4). Too large a mean: the estimator is overconfident. Innovations of a consistent filter are white.
+The normalised estimation error squared e' P^-1 e (NEES), e the error of an estimate of
+covariance P, and the normalised innovation squared nu' S^-1 nu (NIS) have the mean n,
+the number of entries, where an estimator is consistent; over N independent ones N times
+the mean is chi-square of N n degrees of freedom (Bar-Shalom, Li and Kirubarajan, 2001,
+section 5.4). Too large a mean: the estimator is overconfident. Innovations of a
+consistent filter are white.
 """
 
 from dataclasses import dataclass
@@ -33,7 +35,7 @@ class Consistency:
 
     @property
     def mean(self) -> float:
-        """Per degree of freedom: 1 where errors are as large as their covariances say."""
+        """Mean per degree of freedom: 1 where the covariances are right."""
         return float(self.values.sum() / self.degrees.sum())
 
     @property
@@ -45,52 +47,54 @@ class Consistency:
 def normalized_errors(
     errors: Any, covariances: Any, level: float = 0.95, independent: int | None = None
 ) -> Consistency:
-    """Computes normalised squared errors: NEES of estimation errors, NIS of innovations.
+    """Computes normalised squared errors.
+
+    They are the NEES of estimation errors, or the NIS of innovations.
 
     Args:
-        errors: (..., n); entries that are not finite (nothing was measured) are left out.
+        errors: (..., n); entries that are not finite (nothing was measured) are left
+            out.
         covariances: Of the errors (..., n, n).
         level: Probability of the band.
-        independent: How many of the errors are independent, for the band; all by default. Estimates of one run are
-            correlated in time, those of different runs are not.
+        independent: How many of the errors are independent, for the band; all by
+            default. Estimates of one run are correlated in time, those of different
+            runs are not.
 
     Raises:
         ShapeError: The two do not belong together.
         DataError: No error is finite.
     """
-    e, P = (
-        torch.as_tensor(part, dtype=torch.float64) for part in (errors, covariances)
-    )
-    if P.shape != (*e.shape, e.shape[-1]):
+    e = torch.as_tensor(errors, dtype=torch.float64)
+    P = torch.as_tensor(covariances, dtype=torch.float64)
+    n = e.shape[-1]
+    if P.shape != (*e.shape, n):
         raise ShapeError(
-            f"errors (..., n) need covariances (..., n, n); got {tuple(e.shape)} and {tuple(P.shape)}"
+            f"errors (..., n) need covariances (..., n, n); got {tuple(e.shape)} and "
+            f"{tuple(P.shape)}"
         )
-    e = e.reshape(-1, e.shape[-1])
-    P = P.reshape(-1, *P.shape[-2:])
+    e = e.reshape(-1, n)
+    P = P.reshape(-1, n, n)
     missing = ~torch.isfinite(e)
-    keep = ~missing.all(-1)
-    if not bool(keep.any()):
+    measured = ~missing.all(-1)
+    if not bool(measured.any()):
         raise DataError("no error is finite")
-    e = e[keep]
-    P = P[keep]
-    missing = missing[keep]
-    P = torch.where(
-        missing[:, :, None] | missing[:, None, :],
-        torch.eye(e.shape[-1], dtype=P.dtype),
-        P,
-    )
+    e = e[measured]
+    P = P[measured]
+    missing = missing[measured]
+    # A missing entry counts as an error of zero that is independent of the others.
+    in_missing = missing[:, :, None] | missing[:, None, :]
+    P = torch.where(in_missing, torch.eye(n, dtype=P.dtype), P)
     e = torch.where(missing, 0.0, e)
     values = (e * torch.linalg.solve(P, e[..., None])[..., 0]).sum(-1).numpy()
     degrees = (~missing).sum(-1).numpy()
-    total = float(degrees.mean()) * (
-        len(values) if independent is None else independent
-    )
+    count = len(values) if independent is None else independent
+    total = float(degrees.mean()) * count
     low, high = chi2.ppf([(1 - level) / 2, (1 + level) / 2], total) / total
-    return Consistency(values, degrees, (float(low), float(high)))
+    return Consistency(values=values, degrees=degrees, band=(float(low), float(high)))
 
 
 def estimation_errors(belief: Gaussian, states: Any, angles: Any = ()) -> Tensor:
-    """The errors x - mu (..., n) of beliefs, those of angles within half a turn."""
+    """Computes the errors x - mu (..., n) of beliefs; of angles, within half a turn."""
     truth = torch.as_tensor(states, dtype=belief.mean.dtype)
     return state_difference(truth, belief.mean, angles)
 
@@ -98,15 +102,16 @@ def estimation_errors(belief: Gaussian, states: Any, angles: Any = ()) -> Tensor
 def autocorrelation(
     innovations: Any, covariances: Any, lag: int = 1
 ) -> tuple[float, float]:
-    """The autocorrelation of whitened innovations (T, p), and the 95 % limit of its size where they are white.
+    """Computes the autocorrelation of whitened innovations (T, p).
+
+    Returns:
+        The autocorrelation, and the 95 % limit of its size where they are white.
 
     Raises:
         DataError: Fewer than two pairs are finite.
     """
-    e, S = (
-        torch.as_tensor(part, dtype=torch.float64)
-        for part in (innovations, covariances)
-    )
+    e = torch.as_tensor(innovations, dtype=torch.float64)
+    S = torch.as_tensor(covariances, dtype=torch.float64)
     white = (e / S.diagonal(dim1=-2, dim2=-1).sqrt()).numpy()
     first = white[:-lag]
     second = white[lag:]
@@ -117,6 +122,6 @@ def autocorrelation(
         )
     a = first[pairs]
     b = second[pairs]
-    return float((a * b).sum() / np.sqrt((a**2).sum() * (b**2).sum())), float(
-        1.96 / np.sqrt(len(a))
-    )
+    correlation = (a * b).sum() / np.sqrt((a**2).sum() * (b**2).sum())
+    limit = 1.96 / np.sqrt(len(a))
+    return float(correlation), float(limit)

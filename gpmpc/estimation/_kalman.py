@@ -1,15 +1,18 @@
-"""Kalman filters for learned models: estimates of the state from what sensors show, with their covariance.
+"""Kalman filters for learned models: estimates of the state with their covariance.
 
     predict:   N(mu-, Sigma-) = propagator(model, N(mu, Sigma), u)
-    update:    K = Cov[x, y] (Cov[y] + R)^-1,   mu = mu- + K (y - E[y]),   Sigma = Sigma- - K (Cov[y] + R) K'
+    update:    K = Cov[x, y] (Cov[y] + R)^-1
+               mu = mu- + K (y - E[y]),   Sigma = Sigma- - K (Cov[y] + R) K'
 
-with the moments of y = h(x) + v, v ~ N(0, R), by a propagator as well: a measurement is a ``DynamicsModel`` without
-inputs. By first-order linearisation this is the extended Kalman filter, by the unscented transform the unscented one
-(Julier and Uhlmann, 2004), by moment matching the assumed-density filter of Deisenroth, Huber and Hanebeck (2009).
+with the moments of y = h(x) + v, v ~ N(0, R), by a propagator as well: a measurement is
+a ``DynamicsModel`` without inputs. By first-order linearisation this is the extended
+Kalman filter, by the unscented transform the unscented one (Julier and Uhlmann, 2004),
+by moment matching the assumed-density filter of Deisenroth, Huber and Hanebeck (2009).
 Entries of y that are not finite are missing, and the others are used.
 
-The update is computed from a root of Sigma-, not by the difference that it is written with
-(``gpmpc.estimation._conditioning``): a prior may be 1e16 times as wide as a sensor's noise, and a sensor perfect.
+The update is computed from a root of Sigma-, not by the difference that it is written
+with (``gpmpc.estimation._conditioning``): a prior may be 1e16 times as wide as a
+sensor's noise, and a sensor perfect.
 """
 
 from collections import deque
@@ -65,7 +68,9 @@ class Measurement(TensorModel):
     ]  #: h, from x (*batch, n) to y (*batch, p), in torch
     angles: Sequence[
         int
-    ] = ()  #: entries of y that are angles [rad]: their differences are taken within half a turn
+        #: entries of y that are angles [rad]: their differences are taken within half a
+        #: turn
+    ] = ()
     input_dim = 0
     _part = property(lambda self: self.noise_covariance)
 
@@ -93,9 +98,14 @@ class Measurement(TensorModel):
         std: Sequence[float],
         angles: Sequence[int] = (),
     ) -> "Measurement":
-        """A measurement of some of n states, whose noise has these standard deviations.
+        """Measures some of n states.
 
-        ``angles`` are those of the measured states that sensors show modulo one turn, by their place among them.
+        Args:
+            state_dim: n.
+            states: Indices of the measured states.
+            std: Standard deviations of their noise.
+            angles: Those of the measured states that sensors show modulo one turn, by
+                their place among them.
 
         Raises:
             SettingError: A state is out of range, or a standard deviation is negative.
@@ -107,7 +117,12 @@ class Measurement(TensorModel):
             )
         check_numbers("std", std, len(states), least=0)
         R = torch.diag(torch.tensor(list(std), dtype=torch.float64) ** 2)
-        return cls(state_dim, R, _Selection(states, state_dim), angles)
+        return cls(
+            state_dim=state_dim,
+            noise_covariance=R,
+            function=_Selection(states, state_dim),
+            angles=angles,
+        )
 
     @property
     def output_dim(self) -> int:
@@ -115,20 +130,18 @@ class Measurement(TensorModel):
         return len(self.noise_covariance)
 
     def predict(self, state: Tensor, input: Tensor | None = None) -> Gaussian:
-        """What is measured at a certain state (*batch, p), without the noise."""
+        """Predicts the measurement (*batch, p) at a certain state, without noise."""
         check_query(self, state, state[..., :0] if input is None else input)
         value = call("function", self.function, state)
-        if not isinstance(value, Tensor) or value.shape != (
-            *state.shape[:-1],
-            self.output_dim,
-        ):
-            got = (
-                tuple(value.shape)
-                if isinstance(value, Tensor)
-                else type(value).__name__
+        expected = (*state.shape[:-1], self.output_dim)
+        if not isinstance(value, Tensor) or value.shape != expected:
+            got: Any = type(value).__name__
+            if isinstance(value, Tensor):
+                got = tuple(value.shape)
+            raise ShapeError(
+                f"the measurement must give (*batch, {self.output_dim}) at "
+                f"{tuple(state.shape)}; got {got}"
             )
-            at = f"(*batch, {self.output_dim}) at {tuple(state.shape)}"
-            raise ShapeError(f"the measurement must give {at}; got {got}")
         return Gaussian(value, value.new_zeros(*value.shape, self.output_dim))
 
     def linearize(
@@ -141,7 +154,10 @@ class Measurement(TensorModel):
         value, A = linearize_function(function, self, states)
         K, p = value.shape
         return Linearized(
-            value, A, np.zeros((K, p, 0)), np.zeros((K, p, p)) if covariance else None
+            mean=value,
+            A=A,
+            B=np.zeros((K, p, 0)),
+            covariance=np.zeros((K, p, p)) if covariance else None,
         )
 
 
@@ -156,14 +172,13 @@ class _Selection:
         return state[..., self.states]
 
     def linearize(self, states: Array) -> tuple[Array, Array]:
-        return np.ascontiguousarray(states[:, self.states]), np.tile(
-            self.matrix, (len(states), 1, 1)
-        )
+        value = np.ascontiguousarray(states[:, self.states])
+        return value, np.tile(self.matrix, (len(states), 1, 1))
 
 
 @dataclass(frozen=True)
 class Update:
-    """A belief after a measurement, and by how much the measurement differed from what was expected."""
+    """A belief after a measurement, and the innovation."""
 
     belief: Gaussian  #: over the state (*batch, n)
     innovation: Tensor  #: y - E[y] (*batch, p), NaN where nothing was measured
@@ -182,7 +197,7 @@ class FilterRun:
 
 
 def _without_noise(observer: Propagator) -> Propagator:
-    """The observer as one that adds no noise."""
+    """Returns the observer as one that adds no noise."""
     if not getattr(observer, "process_noise", False):
         return observer
     quiet: Any = copy(observer)
@@ -194,13 +209,16 @@ class KalmanFilter:
     """Estimates the state of a model from measurements.
 
     Args:
-        model: A ``DynamicsModel``; disturbance states or pending inputs are estimated with the others.
+        model: A ``DynamicsModel``; disturbance states or pending inputs are estimated
+            with the others.
         measurement: What sensors show.
         propagator: How beliefs move, with the process noise.
-        observer: How the moments of the measurement are computed; their noise is left to the update, which adds it.
+        observer: How the moments of the measurement are computed; their noise is left
+            to the update, which adds it.
 
     Raises:
-        SettingError: Model and measurement have different states, or the propagator adds no process noise.
+        SettingError: Model and measurement have different states, or the propagator
+            adds no process noise.
     """
 
     def __init__(
@@ -231,24 +249,26 @@ class KalmanFilter:
 
     @classmethod
     def extended(cls, model: DynamicsModel, measurement: Measurement) -> "KalmanFilter":
-        """The extended Kalman filter: first-order linearisation of model and measurement."""
+        """Makes the extended Kalman filter: both are linearised to first order."""
         return cls(model, measurement)
 
     @classmethod
     def unscented(
         cls, model: DynamicsModel, measurement: Measurement
     ) -> "KalmanFilter":
-        """The unscented Kalman filter."""
-        return cls(model, measurement, Unscented(), Unscented())
+        """Makes the unscented Kalman filter."""
+        return cls(model, measurement, propagator=Unscented(), observer=Unscented())
 
     def predict(self, belief: Gaussian, input: Any) -> Gaussian:
-        """Moves a belief (*batch, n) on by a step with the input that was applied (*batch, m)."""
+        """Moves a belief (*batch, n) on by a step with an applied input (*batch, m)."""
         belief = belief.in_order(self._names.state_names)
         acting = _like(belief, "input", input, self._names.input_names)
         return self.propagator(self.model, belief, acting)
 
     def update(self, belief: Gaussian, measured: Any) -> Update:
-        """Corrects a belief (*batch, n) by a measurement y (*batch, p), whose entries that are not finite are missing.
+        """Corrects a belief (*batch, n) by a measurement y (*batch, p).
+
+        Entries of y that are not finite are missing.
 
         Raises:
             ShapeError: y has another number of entries.
@@ -264,37 +284,52 @@ class KalmanFilter:
         view = self._view(belief)
         missing = ~torch.isfinite(y)
         innovation = state_difference(y, view.mean, self.measurement.angles)
-        # A missing entry shows nothing, with a noise that has nothing to do with others.
-        apart = missing[..., None] | missing[..., None, :]
-        noise = torch.where(
-            apart, torch.eye(len(R)).to(R), view.linearization_error + R
-        )
+        # A missing entry shows nothing, with a noise that is independent of others.
+        unrelated = missing[..., None] | missing[..., None, :]
+        eye = torch.eye(len(R)).to(R)
+        noise = torch.where(unrelated, eye, view.linearization_error + R)
         seen = torch.where(missing[..., None], 0.0, view.seen)
         posterior = condition(view.root, seen, noise)
         correction = posterior.gain @ torch.where(missing, 0.0, innovation)[..., None]
+        corrected = Gaussian(belief.mean + correction[..., 0], posterior.covariance)
         return Update(
-            Gaussian(belief.mean + correction[..., 0], posterior.covariance),
-            torch.where(missing, torch.nan, innovation),
-            view.covariance + R,
+            belief=corrected,
+            innovation=torch.where(missing, torch.nan, innovation),
+            covariance=view.covariance + R,
         )
 
     def _view(self, belief: Gaussian) -> "_View":
-        """What the sensors show of a belief (*batch, n), without their noise."""
+        """Computes what sensors show of a belief (*batch, n), without their noise."""
         root = covariance_root(belief.covariance)
         if getattr(self.observer, "first_order", False):
             nothing = checked_input(self.measurement, belief, None)
             value, H, _ = predict_with_jacobian(self.measurement, belief.mean, nothing)
             seen = H @ root
-            covariance = squared(seen) + value.covariance
-            return _View(root, seen, value.mean, covariance, value.covariance)
-        moved = self.observer.propagate(self.measurement, belief)
-        covariance = moved.belief.covariance
-        seen = seen_through(root, moved.cross_covariance)
-        error = unexplained(covariance, seen)
-        return _View(root, seen, moved.belief.mean, covariance, error)
+            return _View(
+                root=root,
+                seen=seen,
+                mean=value.mean,
+                covariance=squared(seen) + value.covariance,
+                linearization_error=value.covariance,
+            )
+        propagated = self.observer.propagate(self.measurement, belief)
+        covariance = propagated.belief.covariance
+        seen = seen_through(root, propagated.cross_covariance)
+        return _View(
+            root=root,
+            seen=seen,
+            mean=propagated.belief.mean,
+            covariance=covariance,
+            linearization_error=unexplained(covariance, seen),
+        )
 
     def run(self, belief: Gaussian, inputs: Any, measured: Any) -> FilterRun:
-        """Filters a log of inputs (T, m) and measurements (T + 1, p) from a belief before the first of them (n,).
+        """Filters a log.
+
+        Args:
+            belief: Before the first measurement (n,).
+            inputs: (T, m).
+            measured: (T + 1, p).
 
         Raises:
             ShapeError: There is not one measurement more than inputs.
@@ -304,31 +339,31 @@ class KalmanFilter:
         measured = _like(belief, "measurements", measured, self._measured_names)
         if len(measured) != len(inputs) + 1:
             raise ShapeError(
-                f"T inputs belong to T + 1 measurements; got {len(inputs)} and {len(measured)}"
+                f"T inputs belong to T + 1 measurements; got {len(inputs)} and "
+                f"{len(measured)}"
             )
         predicted = [belief]
         updates = [self.update(belief, measured[0])]
-        crosses = belief.covariance.new_zeros(len(inputs), *belief.covariance.shape)
+        n = belief.dim
+        cross_covariances = belief.covariance.new_zeros(len(inputs), n, n)
         for k, input in enumerate(inputs):
-            moved = self.propagator.propagate(self.model, updates[-1].belief, input)
-            predicted.append(moved.belief)
-            crosses[k] = moved.cross_covariance
-            updates.append(self.update(moved.belief, measured[k + 1]))
-        innovations, covariances = (
-            torch.stack([getattr(u, k) for u in updates])
-            for k in ("innovation", "covariance")
-        )
+            step = self.propagator.propagate(self.model, updates[-1].belief, input)
+            predicted.append(step.belief)
+            cross_covariances[k] = step.cross_covariance
+            updates.append(self.update(step.belief, measured[k + 1]))
         return FilterRun(
-            _stacked(predicted),
-            _stacked([u.belief for u in updates]),
-            crosses,
-            innovations,
-            covariances,
+            predicted=_stacked(predicted),
+            filtered=_stacked([update.belief for update in updates]),
+            cross_covariances=cross_covariances,
+            innovations=torch.stack([update.innovation for update in updates]),
+            innovation_covariances=torch.stack(
+                [update.covariance for update in updates]
+            ),
         )
 
 
 class _View(NamedTuple):
-    """What sensors show of a belief N(mu, L L')."""
+    """A belief N(mu, L L') as sensors show it."""
 
     root: Tensor  # L (*batch, n, n)
     seen: Tensor  # Y of Cov[x, y] = L Y' (*batch, p, n)
@@ -338,10 +373,11 @@ class _View(NamedTuple):
 
 
 def smooth(run: FilterRun) -> Gaussian:
-    """The beliefs given the whole log (T + 1, n): the smoother of Rauch, Tung and Striebel (1965).
+    """Computes the beliefs given the whole log (T + 1, n).
 
-    With the covariances Cov[x_k, x_{k+1}] of the propagator, which makes it the unscented one of Sarkka (2008) where
-    the filter is unscented.
+    This is the smoother of Rauch, Tung and Striebel (1965), with the covariances
+    Cov[x_k, x_{k+1}] of the propagator, which makes it the unscented one of Sarkka
+    (2008) where the filter is unscented.
     """
     mean = run.filtered.mean[-1]
     covariance = run.filtered.covariance[-1]
@@ -362,12 +398,15 @@ def smooth(run: FilterRun) -> Gaussian:
 
 
 class LateMeasurements:
-    """A filter in a loop whose measurements may come late: it goes back to their time, and forward again.
+    """A filter in a loop whose measurements may come late.
+
+    It goes back to their time, and forward again.
 
     Args:
         filter: The filter.
         belief: At the first step, before its measurement (n,).
-        longest: Steps that a measurement may be late; each takes its part of the time where one is.
+        longest: Steps that a measurement may be late; each takes its part of the time
+            where one is.
 
     Raises:
         SettingError: ``longest`` is no whole number of zero or more.
@@ -377,14 +416,13 @@ class LateMeasurements:
         check_number("longest", longest, least=0, whole=True)
         self.filter = filter
         self.belief = belief
-        self._before: deque[Gaussian] = deque(
-            [belief], longest + 1
-        )  # beliefs before the measurements of each step
+        # Beliefs before the measurements of each step.
+        self._before: deque[Gaussian] = deque([belief], longest + 1)
         self._inputs: deque[Any] = deque(maxlen=longest)
         self._measured: deque[list[Any]] = deque([[]], longest + 1)
 
     def step(self, input: Any) -> Gaussian:
-        """Goes on by a step, in which an input (m,) was applied; returns the belief over the state then."""
+        """Goes on by a step with an applied input (m,); returns the belief after it."""
         self._inputs.append(input)
         self.belief = self.filter.predict(self.belief, input)
         self._before.append(self.belief)
@@ -392,7 +430,10 @@ class LateMeasurements:
         return self.belief
 
     def measure(self, measured: Any, age: int = 0) -> Gaussian:
-        """Takes a measurement (p,) of the state ``age`` steps ago; returns the belief over the state now.
+        """Takes a measurement (p,) of the state ``age`` steps ago.
+
+        Returns:
+            The belief over the state now.
 
         Raises:
             SettingError: It is older than the filter remembers, or from the future.
@@ -401,7 +442,8 @@ class LateMeasurements:
         if age >= len(self._before):
             raise SettingError(
                 "age",
-                f"must be at most {len(self._before) - 1} steps, which are remembered; got {age}",
+                f"must be at most {len(self._before) - 1} steps, which are remembered; "
+                f"got {age}",
             )
         self._measured[-1 - age].append(measured)
         for k in range(-1 - age, 0):
@@ -414,7 +456,7 @@ class LateMeasurements:
 
 
 def _measured_names(measurement: Any, state_names: Sequence[str]) -> tuple[str, ...]:
-    """The names of y where it is some of the states; nothing is known otherwise."""
+    """Returns the names of y where it is some of the states; none otherwise."""
     function = getattr(measurement, "function", None)
     if not state_names or not isinstance(function, _Selection):
         return ()
@@ -422,7 +464,7 @@ def _measured_names(measurement: Any, state_names: Sequence[str]) -> tuple[str, 
 
 
 def _like(belief: Gaussian, key: str, value: Any, names: Sequence[str]) -> Tensor:
-    """Numbers as a tensor of a belief's type on its device, in the order of names."""
+    """Converts numbers to a tensor like a belief's, in the order of names."""
     if not isinstance(value, Tensor) or value.is_complex():
         value = np.array(read_array(key, value, names))
     return torch.as_tensor(value, dtype=belief.mean.dtype, device=belief.mean.device)

@@ -1,13 +1,15 @@
-"""Which part of the noise that a model has learned moves the state, and which is of the sensors that showed it.
+"""Separates the noise that a model has learned into the process' and the sensors'.
 
-Both scatter the targets of one step alike. Several steps on they differ: noise of the process adds up, noise of the
-sensors does not. In the order of time they can be told apart: with y_k = x_k + v_k, v ~ N(0, R), the error of one step
+Both scatter the targets of one step alike. Several steps on they differ: noise of the
+process adds up, noise of the sensors does not. In the order of time they can be told
+apart: with y_k = x_k + v_k, v ~ N(0, R), the error of one step
 
     e_{k+1} = y_{k+1} - f(y_k) = w_k + v_{k+1} - A_k v_k,    E[e_{k+1} e_k'] = -A_k R,
 
-is correlated with the one before, which shared v_k, and noise of the process is not. R is estimated by weighted least
-squares from all products of successive errors, an entry a state; what is within two standard errors of zero is zero.
-Noise of the process is what is left of the noise that was learned, Q = N - R - A R A'.
+is correlated with the one before, which shared v_k, and noise of the process is not. R
+is estimated by weighted least squares from all products of successive errors, an entry
+a state; what is within two standard errors of zero is zero. Noise of the process is
+what is left of the noise that was learned, Q = N - R - A R A'.
 """
 
 from dataclasses import dataclass, replace
@@ -15,12 +17,10 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
-from gpmpc._angles import angles_of, state_difference
 from gpmpc._dynamics import Array, DynamicsModel, linearize, to_array
-from gpmpc.estimation._noise import _residuals
+from gpmpc.estimation._noise import follows_previous, residuals
 from gpmpc.exceptions import DataError, UnsupportedModel
 from gpmpc.gp import GPPosterior, Transitions
 from gpmpc.models import ResidualModel
@@ -35,9 +35,8 @@ class SeparatedNoise:
 
     model: DynamicsModel  #: the same predictions, with the noise of the process alone
     process: Tensor  #: variances of what moves the state in a step (n,)
-    measurement: (
-        Tensor  #: variances of the sensors (n,); zero where none can be told from zero
-    )
+    #: variances of the sensors (n,); zero where none can be told from zero
+    measurement: Tensor
 
 
 def separate_noise(
@@ -46,13 +45,15 @@ def separate_noise(
     """Separates the noise of a model that was learned from measured states.
 
     Args:
-        model: GPs of next states or differences, or a ``ResidualModel`` with a constant B.
-        transitions: Those of the training, in their order of time; a few hundred. Where x[k+1] of a row is not x[k] of
-            the next, a new run begins.
+        model: GPs of next states or differences, or a ``ResidualModel`` with a constant
+            B.
+        transitions: Those of the training, in their order of time; a few hundred. Where
+            x[k+1] of a row is not x[k] of the next, a new run begins.
         block: Rows that are left out together when one of them is predicted.
 
     Raises:
-        UnsupportedModel: Another model, or one that was learned from pseudo-observations.
+        UnsupportedModel: Another model, or one that was learned from
+            pseudo-observations.
         ShapeError: The transitions have other dimensions.
         DataError: Fewer than twenty rows follow one another.
     """
@@ -67,11 +68,13 @@ def separate_noise(
         raise UnsupportedModel(
             "the noise of GPs of observed rows can be separated, not of sparse ones"
         )
-    errors = to_array(_residuals(model, transitions, block)[0])
-    later = _successors(model, transitions)
+    errors = to_array(residuals(model, transitions, block).errors)
+    successive = follows_previous(model, transitions)
+    later = 1 + np.flatnonzero(successive.cpu().numpy())
     if len(later) < _PAIRS:
         raise DataError(
-            f"separate_noise needs {_PAIRS} rows that follow one another; got {len(later)}"
+            f"separate_noise needs {_PAIRS} rows that follow one another; "
+            f"got {len(later)}"
         )
     states = to_array(transitions.states)
     A = linearize(model, states, to_array(transitions.inputs), covariance=False).A
@@ -79,46 +82,38 @@ def separate_noise(
     correlated = _shared_errors(errors[later - 1], errors[later], A[later])
     scatter = (errors**2).mean(axis=0)
     # As a part of what was learned: errors of rows that were trained on are smaller.
-    share = np.divide(
-        correlated, scatter, out=np.zeros_like(scatter), where=scatter > 0
-    )
-    measurement = share.clip(0.0, 1.0) * learned
+    part = np.divide(correlated, scatter, out=np.zeros_like(scatter), where=scatter > 0)
+    measurement = part.clip(0.0, 1.0) * learned
     passed_on = (A[later] ** 2).mean(axis=0) @ measurement
     process = np.maximum(learned - measurement - passed_on, _FLOOR * learned)
-    quiet = _with_noise(model, gp, torch.from_numpy(process))
+    process_variance = torch.from_numpy(process)
     return SeparatedNoise(
-        quiet, torch.from_numpy(process), torch.from_numpy(measurement)
+        model=_with_noise(model, gp, process_variance),
+        process=process_variance,
+        measurement=torch.from_numpy(measurement),
     )
-
-
-def _successors(model: Any, transitions: Transitions) -> NDArray[np.intp]:
-    """Rows that begin where the row before ended, to round-off."""
-    after = transitions.next_states[:-1]
-    now = transitions.states[1:]
-    gap = state_difference(after, now, angles_of(model)).abs().amax(1)
-    successive = gap <= 1e-12 + 1e-9 * now.abs().amax(1)
-    return 1 + np.flatnonzero(successive.cpu().numpy())
 
 
 def _shared_errors(before: Array, after: Array, A: Array) -> Array:
-    """The variances R (n,) of what successive errors (K, n) share, E[after before'] = -A R; A is (K, n, n).
+    """Estimates the variances R (n,) of what successive errors share.
 
-    Zero where the estimate is within two standard errors of it.
+    E[after before'] = -A R; the errors are (K, n), A is (K, n, n). Zero where the
+    estimate is within two standard errors of it.
     """
     scatter = (after**2).mean(axis=0)
     weights = np.divide(1.0, scatter, out=np.zeros_like(scatter), where=scatter > 0)
     products = np.einsum("kij,ki,kj,i->j", A, after, before, weights)
     information = np.einsum("kij,i->j", A**2, weights)
-    known = information > 0
-    shared = np.divide(-products, information, out=np.zeros_like(products), where=known)
-    deviation = np.sqrt(
-        np.divide(scatter, information, out=np.zeros_like(products), where=known)
-    )
+    observed = information > 0
+    zero = np.zeros_like(products)
+    shared = np.divide(-products, information, out=zero.copy(), where=observed)
+    variance = np.divide(scatter, information, out=zero.copy(), where=observed)
+    deviation = np.sqrt(variance)
     return np.where(shared > 2.0 * deviation, shared, 0.0)
 
 
 def _with_noise(model: Any, gp: GPPosterior, process: Tensor) -> Any:
-    """The model with other noise in what it predicts, (n,): its means and what it does not know stay."""
+    """Replaces the noise (n,) of a model; its means and latent variances stay."""
     if gp is model:
         return replace(gp, noise_variance=process.to(gp.noise_variance))
     B = torch.as_tensor(model.B).to(gp.noise_variance)
@@ -126,6 +121,5 @@ def _with_noise(model: Any, gp: GPPosterior, process: Tensor) -> Any:
     # Of each output the largest part that a state it acts on has left.
     left = process.to(learned) / learned
     parts = torch.stack([left[B[:, a] != 0].max() for a in range(gp.output_dim)])
-    return replace(
-        model, residual=replace(gp, noise_variance=parts * gp.noise_variance)
-    )
+    quieter = replace(gp, noise_variance=parts * gp.noise_variance)
+    return replace(model, residual=quieter)
