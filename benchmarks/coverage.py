@@ -23,7 +23,7 @@ from rich.console import Console
 
 from benchmarks.timing import use_one_thread
 from gpmpc.calibration import Calibration, Recording, calibrate
-from gpmpc.cli._run import experiment_of
+from gpmpc.cli._experiment import experiment_of
 from gpmpc.cli._settings import compose, settings
 from gpmpc.datasets import RandomData
 from gpmpc.estimation import SeparatedNoise, separate_noise

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from gpmpc.cli._run import experiment_of
+from gpmpc.cli._experiment import experiment_of
 from gpmpc.cli._settings import compose, settings
 from gpmpc.gp.casadi_ import successor_function
 from gpmpc.models import CasadiFunction, KnownModel

@@ -20,7 +20,7 @@ import torch
 from rich.console import Console
 
 from benchmarks.timing import own_source
-from gpmpc.cli._run import experiment_of
+from gpmpc.cli._experiment import experiment_of
 from gpmpc.cli._settings import compose, settings
 from gpmpc.gp import Transitions
 from gpmpc.mpc.problem import Tracking

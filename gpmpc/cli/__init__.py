@@ -1,6 +1,7 @@
 """The command ``gpmpc``: thin entries over the package; the only importer of hydra.
 
-What stands here is there before any library: Ctrl-C ends the command with one line from its first moment on.
+What stands here is there before any library: Ctrl-C ends the command with one line from
+its first moment on.
 """
 
 import signal
@@ -36,7 +37,7 @@ def main() -> None:
         from gpmpc.cli._terminal import usable_streams
 
         with usable_streams():
-            from gpmpc.cli._command import main as command
+            from gpmpc.cli._main import main as command
 
             command()
     except BaseException as error:  # whatever a library made of the interrupt

@@ -11,7 +11,7 @@ from rich.console import Console
 from gpmpc import logs
 from gpmpc._files import write_whole
 from gpmpc._provenance import code_fingerprint, provenance
-from gpmpc.cli._command import Result
+from gpmpc.cli._commands import Result
 from gpmpc.cli._settings import write_files, writing
 from gpmpc.logs import IdentifiedModel, Judgement, Log
 from gpmpc.plotting import judgement_figure, png

@@ -10,7 +10,7 @@ import pandas as pd
 from rich.console import Console
 
 from gpmpc._files import write_whole
-from gpmpc.cli._command import Result
+from gpmpc.cli._commands import Result
 from gpmpc.cli._settings import writing
 from gpmpc.cli._terminal import print_error
 from gpmpc.exceptions import DataError, GpmpcError, SettingError

@@ -92,9 +92,9 @@ def settings(own: str | None = None) -> Iterator[None]:
 def find_modules_here() -> None:
     """Lets ``_target_`` name modules of the working folder, behind all installed ones.
 
-    Only where they are to be called: whoever asks for help, or presses TAB, in a folder of
-    somebody else's runs nothing of it. Hydra, which imports what is called like a plugin
-    of its own, has looked for plugins before.
+    Only where they are to be called: whoever asks for help, or presses TAB, in a folder
+    of somebody else's runs nothing of it. Hydra, which imports what is called like a
+    plugin of its own, has looked for plugins before.
     """
     try:
         here = os.getcwd()

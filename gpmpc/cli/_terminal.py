@@ -125,7 +125,8 @@ def progress_bar(
 ) -> "Progress":
     """Returns a bar with how much is done, for how long, and how long it will still take.
 
-    ``completed`` says how much is done, whenever the bar is drawn; by default its task is told.
+    ``completed`` says how much is done, whenever the bar is drawn; by default its task
+    is told.
     """
     from rich import progress
 

@@ -1,7 +1,10 @@
 """``gpmpc tune``: searches settings for the least closed-loop cost of flights.
 
-A search is written as a sweep, and has no memory but the folders of its runs: the same command proposes the same
-candidates, and those that are finished are not flown again.
+    choices -> space -> batches of candidates -> flights with every seed -> costs ->
+    search
+
+A search is written as a sweep, and has no memory but the folders of its runs: the same
+command proposes the same candidates, and those that are finished are not flown again.
 """
 
 import math
@@ -11,11 +14,13 @@ from collections.abc import Mapping, Sequence
 from typing import Any, cast
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from omegaconf import OmegaConf
+from hydra.core.override_parser.types import Override
+from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 
-from gpmpc.cli._command import Result
-from gpmpc.cli._run import choices, experiment_of
+from gpmpc.cli._commands import Result
+from gpmpc.cli._experiment import experiment_of
+from gpmpc.cli._run import choices
 from gpmpc.cli._settings import without_hydra, write_files
 from gpmpc.cli._sweep import Job, Sweep
 from gpmpc.exceptions import DataError, GpmpcError, SettingError, check_number
@@ -25,16 +30,100 @@ from gpmpc.studies._document import terminal
 from gpmpc.studies._run_folder import RECORDING
 from gpmpc.studies.tuning import Interval, Search
 
+Candidate = Mapping[str, Any]  # values by setting
 
-def tune(given: Namespace) -> Result:
-    """Searches, and writes the candidates, a figure of what mattered and the command that flies the best one."""
+
+class Tuning:
+    """The flights of a search, and their costs.
+
+    Args:
+        runs: The folders that the flights are kept in.
+        fixed: Overrides of every flight.
+        seeds: Flights a candidate.
+    """
+
+    def __init__(self, runs: Sweep, fixed: Sequence[str], seeds: int):
+        self.runs = runs
+        self.fixed = fixed
+        self.seeds = seeds
+        self.base = without_hydra(runs.config)
+        #: all that were flown, or are being flown
+        self.jobs: list[Job] = []
+        _check_base(self.base)
+        # The cost has the weights of this controller, whatever is searched.
+        self._controller: Any = experiment_of(self.base).controller
+
+    def overrides(self, candidate: Candidate) -> list[str]:
+        """Returns the overrides of the flights of a candidate, without the seed."""
+        return [*self.fixed, *_overrides(candidate, self.base)]
+
+    def costs(self, candidates: Sequence[Candidate]) -> list[float]:
+        """Flies candidates with every seed; returns the mean cost of each."""
+        jobs_of_candidates = [self._jobs(candidate) for candidate in candidates]
+        by_folder = {
+            job.folder.path: job for jobs in jobs_of_candidates for job in jobs
+        }
+        batch = [*by_folder.values()]
+        self.runs.check(batch)
+        self.jobs.extend(batch)
+        self.runs.fly(batch)
+        return [
+            sum(_cost(job, self._controller.keywords) for job in jobs) / self.seeds
+            for jobs in jobs_of_candidates
+        ]
+
+    def _jobs(self, candidate: Candidate) -> list[Job]:
+        """Returns the flights of a candidate, one a seed."""
+        overrides = self.overrides(candidate)
+        first_seed = self.base.seed
+        return [
+            self.runs.job([*overrides, f"seed={first_seed + i}"])
+            for i in range(self.seeds)
+        ]
+
+
+def tune(arguments: Namespace) -> Result:
+    """Searches, and writes the candidates, what mattered and how the best one flies."""
     for key in ("trials", "batch", "seeds"):
-        check_number(f"--{key}", getattr(given, key), least=1, whole=True)
-    space, fixed = _space(given.overrides)
+        check_number(f"--{key}", getattr(arguments, key), least=1, whole=True)
+    space, fixed = _space(arguments.overrides)
     console = Console()
-    runs = Sweep(given.config_name, fixed, console)
-    base = without_hydra(runs.config)
-    first = runs.config.seed
+    runs = Sweep(arguments.config_name, fixed, console)
+    tuning = Tuning(runs, fixed, arguments.seeds)
+    search = Search(space, runs.config.seed)
+    total = (arguments.trials + 1) * arguments.seeds
+    with runs.progress(tuning.jobs, total) as describe:
+        (unchanged_cost,) = tuning.costs([{}])
+        for start in range(0, arguments.trials, arguments.batch):
+            candidates = search.ask(min(arguments.batch, arguments.trials - start))
+            search.tell(tuning.costs(candidates))
+            describe(f"flying; least cost {search.costs[search.best]:.4g}")
+    best = search.candidates[search.best]
+    least_cost = search.costs[search.best]
+    if not math.isfinite(least_cost):
+        raise GpmpcError(f"tune: every flight was lost or failed; see {runs.tree}")
+    command = _command(arguments, tuning, best)
+    base_cost = unchanged_cost if math.isfinite(unchanged_cost) else None
+    document = search.document(base_cost, command)
+    files = document.files("tuning") | {"tuning.html": document.html()}
+    written = write_files(runs.tree, files)
+    console.print(terminal(document.tables, document.lead))
+    console.out(f"to fly the best one: {command}", written, sep="\n", highlight=False)
+    runs.print_other_code()
+    data = {
+        "folder": str(runs.tree),
+        "best": best,
+        "cost": least_cost,
+        "unchanged": unchanged_cost,
+        "of_other_code": [str(path) for path in runs.of_other_code],
+        "importances": search.importances(),
+        "command": command,
+    }
+    return Result(data)
+
+
+def _check_base(base: DictConfig) -> None:
+    """Raises where flights would have no cost."""
     if base.recorder != "mcap":
         raise SettingError(
             "recorder",
@@ -43,124 +132,100 @@ def tune(given: Namespace) -> Result:
     if base.steps < 2:
         raise SettingError(
             "steps",
-            f"must be 2 or more: the cost counts from the second state on; got {base.steps}",
+            "must be 2 or more: the cost counts from the second state on; "
+            f"got {base.steps}",
         )
-    search = Search(space, first)
-    controller: Any = experiment_of(
-        base
-    ).controller  # whose weights the cost has, whatever is searched
 
-    def jobs_of(candidate: Mapping[str, Any]) -> list[Job]:
-        overrides = [*fixed, *_overrides(candidate, base)]
-        return [runs.job([*overrides, f"seed={first + i}"]) for i in range(given.seeds)]
 
-    def fly(candidates: Sequence[Mapping[str, Any]]) -> list[float]:
-        groups = [jobs_of(candidate) for candidate in candidates]
-        batch = {job.folder.path: job for group in groups for job in group}
-        runs.check([*batch.values()])
-        flying.extend(batch.values())
-        runs.fly([*batch.values()])
-        return [
-            sum(_cost(job, controller.keywords) for job in group) / given.seeds
-            for group in groups
-        ]
-
-    flying: list[Job] = []
-    with runs.progress(flying, (given.trials + 1) * given.seeds) as describe:
-        (unchanged,) = fly([{}])
-        for start in range(0, given.trials, given.batch):
-            search.tell(fly(search.ask(min(given.batch, given.trials - start))))
-            describe(f"flying; least cost {search.costs[search.best]:.4g}")
-    if not math.isfinite(search.costs[search.best]):
-        raise GpmpcError(f"tune: every flight was lost or failed; see {runs.tree}")
-    own = [] if given.config_name == "tune" else ["--config-name", given.config_name]
-    own += ["--config-dir", given.config_dir] if given.config_dir else []
-    best = choices([*fixed, *_overrides(search.candidates[search.best], base)])
-    command = shlex.join(["gpmpc", "run", *own, *best, f"folder={runs.tree / 'best'}"])
-    document = search.document(unchanged if math.isfinite(unchanged) else None, command)
-    where = write_files(
-        runs.tree, document.files("tuning") | {"tuning.html": document.html()}
-    )
-    console.print(terminal(document.tables, document.lead))
-    console.out(f"to fly the best one: {command}", where, sep="\n", highlight=False)
-    runs.tell_other_code()
-    data = {
-        "folder": str(runs.tree),
-        "best": search.candidates[search.best],
-        "cost": search.costs[search.best],
-    }
-    return Result(
-        data
-        | {
-            "unchanged": unchanged,
-            "of_other_code": [str(path) for path in runs.of_other_code],
-            "importances": search.importances(),
-            "command": command,
-        }
-    )
+def _command(arguments: Namespace, tuning: Tuning, best: Candidate) -> str:
+    """Returns the command that flies a candidate into a folder of its own."""
+    words = ["gpmpc", "run"]
+    if arguments.config_name != "tune":
+        words += ["--config-name", arguments.config_name]
+    if arguments.config_dir:
+        words += ["--config-dir", arguments.config_dir]
+    words += choices(tuning.overrides(best))
+    words.append(f"folder={tuning.runs.tree / 'best'}")
+    return shlex.join(words)
 
 
 def _space(
     overrides: Sequence[str],
 ) -> tuple[dict[str, Interval | Sequence[str]], list[str]]:
     """Returns what is searched, by setting, and the settings that stay."""
-    space: dict[str, Any] = {}
-    fixed: list[Any] = []
+    space: dict[str, Interval | Sequence[str]] = {}
+    fixed: list[str] = []
     for override in OverridesParser.create().parse_overrides([*overrides]):
         key = override.get_key_element()
-        value = cast(Any, override.value())
-        if key in ("seed", "folder", "launcher") and override.is_sweep_override():
-            raise SettingError(key, "cannot be searched; seeds are many by --seeds")
         if not override.is_sweep_override():
-            fixed.append(override.input_line)
-        elif override.is_interval_sweep():
-            whole = isinstance(value.start, int)
-            logarithmic = "log" in value.tags
-            if not value.start < value.end or (logarithmic and value.start <= 0):
-                raise SettingError(
-                    key,
-                    f"must rise{', from above 0' * logarithmic}; got {override.input_line}",
-                )
-            space[key] = Interval(value.start, value.end, logarithmic, whole)
-        else:
-            space[key] = [*override.sweep_string_iterator()]
-            if not space[key]:
-                raise SettingError(key, "holds no value to search")
+            fixed.append(str(override.input_line))
+            continue
+        if key in ("seed", "folder", "launcher"):
+            raise SettingError(key, "cannot be searched; seeds are many by --seeds")
+        if override.is_interval_sweep():
+            space[key] = _interval(key, override)
+            continue
+        values = [*override.sweep_string_iterator()]
+        if not values:
+            raise SettingError(key, "holds no value to search")
+        space[key] = values
     if not space:
         raise GpmpcError(
-            "tune: names nothing to search, such as horizon=1,5,10 or 'horizon=int(interval(1,30))'"
+            "tune: names nothing to search, such as horizon=1,5,10 or "
+            "'horizon=int(interval(1,30))'"
         )
     return space, fixed
 
 
-def _overrides(candidate: Mapping[str, Any], base: Any) -> list[str]:
-    """Returns the settings of a candidate; ``KEY.i`` is entry i of the list KEY, whose others stay."""
+def _interval(key: str, override: Override) -> Interval:
+    """Returns the interval of an override ``KEY=interval(LOW,HIGH)``."""
+    interval = cast(Any, override.value())
+    logarithmic = "log" in interval.tags
+    if not interval.start < interval.end or (logarithmic and interval.start <= 0):
+        condition = "must rise, from above 0" if logarithmic else "must rise"
+        raise SettingError(key, f"{condition}; got {override.input_line}")
+    return Interval(
+        low=interval.start,
+        high=interval.end,
+        logarithmic=logarithmic,
+        whole=isinstance(interval.start, int),
+    )
+
+
+def _overrides(candidate: Candidate, base: DictConfig) -> list[str]:
+    """Returns the settings of a candidate.
+
+    ``KEY.i`` is entry i of the list KEY, whose others stay.
+    """
     lists: dict[str, list] = {}
-    plain = []
+    overrides = []
     for key, value in candidate.items():
         parent, _, last = key.rpartition(".")
-        if last.isdecimal():
-            before = OmegaConf.select(base, parent)
-            if not OmegaConf.is_list(before) or int(last) >= len(before):
-                raise SettingError(
-                    key, f"{parent} is no list with such an entry; got {before}"
-                )
-            lists.setdefault(parent, list(before))[int(last)] = value
-        else:
-            plain.append(f"{key}={value}")
-    return plain + [
-        f"{key}=[{','.join(map(str, values))}]" for key, values in lists.items()
-    ]
+        if not last.isdecimal():
+            overrides.append(f"{key}={value}")
+            continue
+        before: Any = OmegaConf.select(base, parent)
+        if not OmegaConf.is_list(before) or int(last) >= len(before):
+            raise SettingError(
+                key, f"{parent} is no list with such an entry; got {before}"
+            )
+        lists.setdefault(parent, list(before))[int(last)] = value
+    for key, values in lists.items():
+        overrides.append(f"{key}=[{','.join(map(str, values))}]")
+    return overrides
 
 
 def _cost(job: Job, controller: Mapping[str, Any]) -> float:
-    """Returns the cost of a run with the weights of a controller; infinite where it was lost or failed."""
+    """Returns the cost of a run with the weights of a controller.
+
+    Infinite where the run was lost or failed.
+    """
     if not job.folder.finished or job.folder.result().get("lost"):
         return math.inf
     run = read_run(job.folder.path / RECORDING)
-    cost = controller["problem"].cost
     if not run.whole:  # the cost of the steps that are left would be too low
         raise DataError(f"{run.path}: {'; '.join(flaw.text for flaw in run.flaws)}")
+    cost = controller["problem"].cost
     return tracking_cost(
         cost.Q,
         cost.R,

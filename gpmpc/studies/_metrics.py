@@ -172,8 +172,7 @@ def _violation_rates(
 
     Of states the flown ones count, with the sides that a first predicted state has: a
     constraint of later stages alone asks nothing of them. By name: all boxes are one,
-    "states";
-    of another kind each constraint is counted for itself.
+    "states"; of another kind each constraint is counted for itself.
     """
     lower, upper = problem.inputs.by_stage(horizon)
     rates = {"inputs": violation_rate(rollout.inputs, lower[0], upper[0])}

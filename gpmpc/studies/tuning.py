@@ -31,7 +31,8 @@ _FEWEST_FOR_IMPORTANCE = 8  # candidates
 _BEST_IN_TABLE = 10  # candidates
 _LEGEND = (
     "cost: of states and increments of the inputs along the true flight, per step, "
-    "mean over the seeds, with the weights of the settings that are not searched. "
+    "mean over the seeds, with the weights that the settings have which are not "
+    "searched. "
     "Importance: share of the variance of being among the best tenth (PED-ANOVA; "
     "Watanabe, Bansal and Hutter, 2023)."
 )

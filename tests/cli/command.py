@@ -13,7 +13,7 @@ IMPORTED = [
     "gpytorch",
     "cvxpy",
     "matplotlib.pyplot",
-    "gpmpc.cli._command",
+    "gpmpc.cli._main",
     "gpmpc.recording",
 ]
 IMPORTED += [

@@ -11,9 +11,9 @@ import pytest
 import yaml
 from omegaconf import OmegaConf
 
-from gpmpc.cli import _flights
+from gpmpc.cli._experiment import plain_data
+from gpmpc.cli._recorded import errors_of_settings, experiment_of_run
 from gpmpc.cli._recorded_settings import checked_settings, read_settings
-from gpmpc.cli._run import plain_data
 from gpmpc.cli._settings import compose, settings
 from gpmpc.exceptions import DataError, SettingError
 from gpmpc.recording import read_run
@@ -117,7 +117,7 @@ def test_a_hostile_recording_is_refused_in_one_line_and_nothing_happens(words, f
 def test_settings_that_call_anything_else_are_refused_at_every_depth(name):
     found = six_hostile_settings()[name]
     with pytest.raises(DataError, match=r"its settings (call|import) '") as told:
-        _flights._experiment_of(run_of(found), [])
+        experiment_of_run(run_of(found), [])
     assert "\n" not in str(told.value)
     assert str(told.value).startswith("run.mcap: ")
 
@@ -138,7 +138,7 @@ NOT_CALLED = [
     "os.system", "builtins.eval", "builtins.exec", "subprocess.run", "pickle.loads", "numpy.load", "torch.load",
     "gpmpc._files.write_whole", "gpmpc._files.os.system", "gpmpc.gp.Transitions.load", "gpmpc.gp.save_posterior",
     "gpmpc.models.save_model", "gpmpc.recording.recover", "gpmpc.systems._simulators.library",
-    "gpmpc.systems._simulators.import_module", "gpmpc.cli._run.run_one", "gpmpc.cli._run.instantiate",
+    "gpmpc.systems._simulators.import_module", "gpmpc.cli._run.run_one", "gpmpc.cli._experiment.instantiate",
     "gpmpc.systems.gymnasium_.register_environments", "gpmpc.systems.gymnasium_.make_environment",
     "gpmpc.systems.pendulum.__globals__", "gpmpc.systems.System.__init__", "gpmpc", "hydra.utils.instantiate",
     "hydra.utils.call", "omegaconf.OmegaConf.load", "functools.partial", "importlib.import_module",
@@ -281,7 +281,7 @@ def test_the_largest_settings_are_read_in_a_second_or_two(text):
     ids=" ".join,
 )  # fmt: skip
 def test_settings_of_an_ordinary_flight_describe_the_same_as_before(words):
-    from gpmpc.cli._run import experiment_of, experiment_of_file
+    from gpmpc.cli._experiment import experiment_of, experiment_of_file
 
     found = flight(*words)
     with settings():
@@ -310,26 +310,26 @@ def test_a_package_that_is_trusted_may_be_called_and_no_more_than_its_own_code(
     monkeypatch.delitem(sys.modules, CANARY, raising=False)
     own = put(flight(), "system", {"_target_": f"{CANARY}.vehicle", "mass": 0.8})
     with pytest.raises(DataError, match=f"--trust {CANARY}"):
-        _flights._experiment_of(run_of(own), [])
+        experiment_of_run(run_of(own), [])
     assert str(folder) not in sys.path
     assert not (folder / "fired").exists()
-    system = _flights._experiment_of(run_of(own), [CANARY]).system
+    system = experiment_of_run(run_of(own), [CANARY]).system
     assert system.dynamics.mass == 0.8
     (folder / "fired").unlink()
     for name in ("np.save", "Path.write_text", "Path"):
         hostile = put(flight(), "model.scaling", {"_target_": f"{CANARY}.{name}"})
         with pytest.raises(DataError, match=f"which {CANARY} only imports"):
-            _flights._experiment_of(run_of(hostile), [CANARY])
+            experiment_of_run(run_of(hostile), [CANARY])
     with pytest.raises(DataError, match="cannot be imported here"):
-        _flights._experiment_of(
+        experiment_of_run(
             run_of(put(flight(), "model", {"_target_": f"{CANARY}.nothing"})), [CANARY]
         )
     with pytest.raises(SettingError, match="--trust: os is no package to trust"):
-        _flights._experiment_of(run_of(own), ["os"])
+        experiment_of_run(run_of(own), ["os"])
     hostile = put(own, "model.scaling", {"_target_": "shutil.rmtree", "path": "x"})
     monkeypatch.delitem(sys.modules, CANARY)
     with pytest.raises(DataError, match=r"shutil.rmtree.*which no settings"):
-        _flights._experiment_of(run_of(hostile), [CANARY])
+        experiment_of_run(run_of(hostile), [CANARY])
     assert not (folder / "fired").exists()  # names are compared before any import
 
 
@@ -360,8 +360,8 @@ def test_whom_a_saved_model_may_trust_the_caller_says_and_not_the_recording():
 )  # fmt: skip
 def test_settings_that_describe_no_flight_are_one_line_with_the_recordings_name(change):
     def learn():
-        experiment = _flights._experiment_of(run_of(change(flight())), [])
-        with _flights._settings_of(run_of("")):
+        experiment = experiment_of_run(run_of(change(flight())), [])
+        with errors_of_settings(run_of("")):
             experiment.learn(experiment.training_rows(), 0)
 
     with pytest.raises(DataError, match=r"^run\.mcap: [^\n]+$"):
@@ -371,7 +371,7 @@ def test_settings_that_describe_no_flight_are_one_line_with_the_recordings_name(
 def test_a_recording_and_its_settings_must_be_of_one_system():
     found = flight("system=pendulum", "controller=lqr")
     with pytest.raises(DataError, match="describe another system than it recorded"):
-        _flights._experiment_of(run_of(found), [])
+        experiment_of_run(run_of(found), [])
 
 
 # The twelve hostile files: six recordings of above, six models of tests/models/test_hostile_models.py.
@@ -413,7 +413,7 @@ def read_hostile(folder, told):
     from gpmpc.models import load_model
 
     def calibrate(path):
-        _flights._experiment_of(read_run(path), [])
+        experiment_of_run(read_run(path), [])
 
     for road in (load_model, load_flyable):
         road(folder / "good.safetensors")

@@ -14,7 +14,7 @@ sys.path.append(str(Path(__file__).resolve().parents[1] / "recording"))
 import damage
 import runs
 
-from gpmpc.cli._command import COMMANDS
+from gpmpc.cli._commands import COMMANDS
 from gpmpc.cli._log import log
 from gpmpc.exceptions import GpmpcError
 from gpmpc.recording import layout, read_run

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from gpmpc._provenance import code_fingerprint
-from gpmpc.cli import _flights
+from gpmpc.cli import _calibrate
 from gpmpc.plotting._recorded import expected
 from gpmpc.recording import read_run
 from tests.cli.command import forked, gpmpc
@@ -94,9 +94,9 @@ def test_a_flight_is_predicted_and_what_cannot_be_predicted_or_filmed_is_said_in
     assert read_run(recording).metadata["run"]["code"] == code_fingerprint()
     # a flight of other code: the model is learned again, by this code
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(_flights, "is_of_this_code", lambda about: False)
+    monkeypatch.setattr(_calibrate, "is_of_this_code", lambda about: False)
     given = {"run": Path("tree"), "to": None, "flights": [], "steps": 3, "trust": []}
-    _flights.calibrate(argparse.Namespace(**given))
+    _calibrate.calibrate(argparse.Namespace(**given))
     said = "was flown by other code: the model that is judged is what this code learns"
     assert said in capsys.readouterr().out
     (written,) = (tmp_path / "tree").glob("*/calibration/calibration.md")

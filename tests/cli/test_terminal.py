@@ -15,7 +15,7 @@ import time
 
 import pytest
 
-from gpmpc.cli._command import COMMANDS
+from gpmpc.cli._commands import COMMANDS
 from gpmpc.cli._completion import candidates
 from gpmpc.cli._run import _was_interrupted
 from gpmpc.cli._terminal import Output

@@ -8,7 +8,7 @@ from importlib.util import find_spec
 
 import pytest
 
-from gpmpc.cli._run import log_to_mlflow
+from gpmpc.cli._mlflow import log_to_mlflow
 from tests.cli.command import forked
 
 TINY = ["steps=3", "data.samples=25", "model.restarts=0", "tracker=mlflow"]

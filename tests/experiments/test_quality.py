@@ -11,7 +11,7 @@ from hydra import compose, initialize_config_dir
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gpmpc.cli._run import experiment_of
+from gpmpc.cli._experiment import experiment_of
 from gpmpc.exceptions import SettingError
 from gpmpc.experiments.quality import (
     FAMILIES,

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import yaml
 
-from gpmpc.cli._command import COMMANDS
+from gpmpc.cli._commands import COMMANDS
 from gpmpc.logs import LogMapping
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -20,7 +20,7 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 import numpy as np
 
-from gpmpc.cli._command import COMMANDS
+from gpmpc.cli._commands import COMMANDS
 from gpmpc.cli._log import log
 from gpmpc.exceptions import GpmpcError
 from gpmpc.recording import layout, read_run, recover, replay

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from hydra import compose, initialize_config_dir
 
-from gpmpc.cli._run import experiment_of
+from gpmpc.cli._experiment import experiment_of
 from gpmpc.datasets import Excitation, ExcitedData
 from gpmpc.exceptions import Diverged, SettingError
 from gpmpc.gp import Trainer, Transitions

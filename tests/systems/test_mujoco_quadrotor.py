@@ -7,7 +7,7 @@ import pytest
 
 pytest.importorskip("mujoco")
 
-from gpmpc.cli._run import experiment_of
+from gpmpc.cli._experiment import experiment_of
 from gpmpc.cli._settings import compose, settings
 from gpmpc.exceptions import SettingError
 from gpmpc.studies.flight import metrics, run_trial

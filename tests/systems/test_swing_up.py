@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from gpmpc.cli._run import experiment_of
+from gpmpc.cli._experiment import experiment_of
 from gpmpc.cli._settings import compose, settings
 from gpmpc.studies.flight import metrics, run_trial
 from gpmpc.studies.study import one_thread

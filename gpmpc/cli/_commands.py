@@ -1,0 +1,337 @@
+"""Lists the commands: what each is for, its arguments, and the module that runs it.
+
+To add a command NAME, add an entry to ``COMMANDS`` and a module ``_NAME.py`` with a
+function ``NAME``. It takes the parsed arguments, or the composed settings of
+``conf/NAME.yaml`` where it has some, and returns a ``Result``.
+"""
+
+import argparse
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple, NoReturn
+
+from gpmpc.exceptions import GpmpcError
+
+#: options that every command takes
+FLAGS = ("--json", "--quiet", "--debug")
+
+
+class Result(NamedTuple):
+    """What a command returns."""
+
+    #: plain data, which ``--json`` prints
+    data: Any = None
+    #: the exit code
+    code: int = 0
+
+
+@dataclass(frozen=True)
+class Argument:
+    """An argument or an option of a command, as ``add_argument`` takes it."""
+
+    names: tuple[str, ...]
+    options: Mapping[str, Any] = field(default_factory=dict)
+
+
+class Parser(argparse.ArgumentParser):
+    """A parser that raises an error of this package instead of exiting."""
+
+    def error(self, message: str) -> NoReturn:
+        raise GpmpcError(f"{message}; {self.prog} --help shows how")
+
+
+@dataclass(frozen=True)
+class Subcommand:
+    """One command of ``gpmpc``."""
+
+    #: for the list of all
+    summary: str
+    #: module of ``gpmpc.cli`` with the function of the command's name. It is imported
+    #: when the command runs, and with it the heavy libraries: help and completion stay
+    #: quick
+    module: str
+    arguments: Sequence[Argument] = ()
+    #: whether it has a file in ``conf/``, whose settings follow its name
+    has_settings: bool = False
+
+    def parser(self, name: str) -> Parser:
+        """Returns the parser of what follows the command's name."""
+        summary = self.summary[0].lower() + self.summary[1:]
+        parser = Parser(
+            prog=f"gpmpc {name}",
+            description=f"gpmpc {name}: {summary}.",
+            add_help=not self.has_settings,
+        )
+        for argument in self.arguments:
+            parser.add_argument(*argument.names, **argument.options)
+        return parser
+
+    @property
+    def choices(self) -> dict[str, list[str] | None]:
+        """Values of every argument and option by name.
+
+        Empty where any value goes, None for a flag, which takes none.
+        """
+        choices: dict[str, list[str] | None] = {"-h": None, "--help": None}
+        for argument in self.arguments:
+            values = None
+            if argument.options.get("action") != "store_true":
+                values = [*argument.options.get("choices", ())]
+            choices |= dict.fromkeys(argument.names, values)
+        return choices
+
+
+def _argument(*names: str, **options: Any) -> Argument:
+    return Argument(names, options)
+
+
+def _flag(*names: str, **options: Any) -> Argument:
+    return Argument(names, {"action": "store_true", **options})
+
+
+def _folder(help: str) -> Argument:
+    return _argument("--to", type=Path, metavar="DIR", help=help)
+
+
+# What follows a command with settings is listed by ``gpmpc COMMAND --help`` from conf/.
+_SETTINGS = [
+    _flag("-h", "--help"),
+    _flag("--cfg"),
+    _argument("--config-name"),
+    _argument("--config-dir"),
+    _argument("overrides", nargs="*"),
+]
+_RECORDED = "a run's folder, one with runs below it, or a recording (.mcap)"
+_TRUST = _argument(
+    "--trust",
+    action="append",
+    default=[],
+    metavar="PACKAGE",
+    help="a package of yours whose code the recording's settings may call; repeatable",
+)
+
+COMMANDS = {
+    "run": Subcommand(
+        "Trains a model, flies with it, records; with -m a sweep of many flights",
+        module="_run",
+        arguments=[_flag("--multirun", "-m"), *_SETTINGS],
+        has_settings=True,
+    ),
+    "tune": Subcommand(
+        "Searches settings for the least closed-loop cost",
+        module="_tune",
+        arguments=[
+            _argument("--trials", type=int, default=40),
+            _argument("--batch", type=int, default=4),
+            _argument("--seeds", type=int, default=1),
+            *_SETTINGS,
+        ],
+        has_settings=True,
+    ),
+    "tables": Subcommand(
+        "Computes Tables 1 and 2 of Cao, Lai and Alam (2017)",
+        module="_study",
+        arguments=_SETTINGS,
+        has_settings=True,
+    ),
+    "figures": Subcommand(
+        "Flies figures 2 to 4 and section 5.2, also with the plant in the loop",
+        module="_study",
+        arguments=_SETTINGS,
+        has_settings=True,
+    ),
+    "quality": Subcommand(
+        "Measures closed-loop cost over the time of a decision",
+        module="_study",
+        arguments=_SETTINGS,
+        has_settings=True,
+    ),
+    "new": Subcommand(
+        "Writes a project of your own: a system, its settings, a script and a test",
+        module="_new",
+        arguments=[
+            _argument(
+                "name",
+                metavar="NAME",
+                help="of the system: letters, digits and _, a letter first",
+            ),
+            _folder("an empty folder, or one to be made (NAME)"),
+        ],
+    ),
+    "report": Subcommand(
+        "Tabulates all runs below a folder; compares two groups of them",
+        module="_report",
+        arguments=[
+            _argument(
+                "tree",
+                type=Path,
+                metavar="OUTPUTS",
+                help="a folder with runs anywhere below it",
+            ),
+            _folder("where the documents go (OUTPUTS/report)"),
+            _argument(
+                "--compare",
+                nargs=2,
+                metavar=("A", "B"),
+                help="choices that make two groups, such as controller=lqr "
+                "controller=convex: a paired test over the seeds",
+            ),
+        ],
+    ),
+    "plot": Subcommand(
+        "Draws recorded flights as figures and an animation",
+        module="_plot",
+        arguments=[
+            _argument("run", type=Path, metavar="RUN", help=_RECORDED),
+            _folder("where the figures go (RUN/figures)"),
+            _argument(
+                "--format",
+                choices=("png", "pdf", "svg"),
+                default="png",
+                help="of the figures (png)",
+            ),
+            _flag("--no-animation", help="figures only: they take a second"),
+            _flag(
+                "--film",
+                help="a system of MuJoCo: the animation as MuJoCo renders it",
+            ),
+            _TRUST,
+        ],
+    ),
+    "calibrate": Subcommand(
+        "Predicts recorded flights with a run's model, and judges it",
+        module="_calibrate",
+        arguments=[
+            _argument(
+                "run",
+                type=Path,
+                metavar="RUN",
+                help="a run's folder or recording; its model is learned again",
+            ),
+            _argument(
+                "flights",
+                type=Path,
+                nargs="*",
+                metavar="FLIGHT",
+                help=f"what is predicted (RUN): {_RECORDED}",
+            ),
+            _argument(
+                "--steps",
+                type=int,
+                default=50,
+                help="length of the longest prediction (50)",
+            ),
+            _folder("where all goes (RUN/calibration)"),
+            _TRUST,
+        ],
+    ),
+    "learn": Subcommand(
+        "Learns a model from logs and judges it on held-out runs",
+        module="_learn",
+        arguments=[
+            _argument(
+                "mapping",
+                type=Path,
+                help="a YAML file that says what the columns mean",
+            ),
+            _argument(
+                "files",
+                type=Path,
+                nargs="+",
+                metavar="FILE",
+                help="logs: CSV, Parquet, npz, MCAP, ULog",
+            ),
+            _argument(
+                "--held-out",
+                nargs="+",
+                metavar="RUN",
+                default=[],
+                help="runs to judge it on (a fifth of all)",
+            ),
+            _folder("folder for the model, its report and its card (learned)"),
+            _argument(
+                "--points",
+                type=int,
+                default=300,
+                help="training rows of a GP, at most (300)",
+            ),
+            _argument(
+                "--steps",
+                type=int,
+                default=50,
+                help="longest prediction it is judged by (50)",
+            ),
+            _argument(
+                "--seed", type=int, default=0, help="seed of all random choices (0)"
+            ),
+            _flag(
+                "--for-control",
+                help="a model to plan with: without the feedback of the controller that "
+                "flew, without delayed inputs",
+            ),
+            _flag("--partial", help="read unfinished files as far as they are whole"),
+        ],
+    ),
+    "log": Subcommand(
+        "Shows, rescues or exports a recording, writes its layout, inspects logs",
+        module="_log",
+        arguments=[
+            _argument(
+                "action",
+                choices=["info", "recover", "export", "layout", "inspect"],
+                help="info: channels, times, how the solves ended; recover: what is "
+                "whole in an unfinished file, as a new one; export: the steps as a "
+                "table, a row each; layout: for Foxglove or Lichtblick, fitting the "
+                "recording; inspect: rates, gaps, repeated values, noise, delays and "
+                "excitation of any log, on one page",
+            ),
+            _argument(
+                "file",
+                type=Path,
+                help="an MCAP file, finished or not; inspect: any log",
+            ),
+            _argument(
+                "output",
+                type=Path,
+                nargs="?",
+                help="where it goes; FILE with .recovered.mcap, .csv (or .parquet), "
+                ".layout.json, .inspection.html",
+            ),
+            _argument(
+                "--mapping",
+                type=Path,
+                help="inspect: a YAML file that says what the columns mean",
+            ),
+        ],
+    ),
+    "warmup": Subcommand(
+        "Compiles the numerical kernels now, instead of at the first flight",
+        module="_warmup",
+    ),
+    "completion": Subcommand(
+        "Prints a script that completes a line at TAB",
+        module="_completion",
+        arguments=[
+            _argument(
+                "shell",
+                nargs="?",
+                choices=["bash", "zsh", "fish"],
+                help='for its profile: eval "$(gpmpc completion bash)"',
+            ),
+            _argument(
+                "--line",
+                metavar="LINE",
+                help="print what may come next after this beginning of a line",
+            ),
+        ],
+    ),
+    "version": Subcommand(
+        "Prints the versions of what computes, and the processor", module="_version"
+    ),
+    "help": Subcommand(
+        "Explains a command",
+        module="_help",
+        arguments=[_argument("name", metavar="COMMAND", nargs="?")],
+    ),
+}

@@ -1,0 +1,225 @@
+"""Makes the objects of a flight from its settings.
+
+    settings -> checked -> merged, each part as it will be called -> Experiment
+
+Those that a user gives may call anything; those out of a file are checked first.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from hashlib import sha256
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+from hydra.utils import instantiate
+from omegaconf import DictConfig, OmegaConf, open_dict
+
+from gpmpc._dynamics import DynamicsModel
+from gpmpc.cli._recorded_settings import checked_settings
+from gpmpc.cli._settings import folder_of
+from gpmpc.exceptions import SettingError, check_number
+from gpmpc.logs import SavedModel
+from gpmpc.simulation import Noise
+from gpmpc.studies.flight import Experiment
+from gpmpc.systems import System
+
+#: settings that a result does not depend on
+ASIDE = ("launcher", "folder", "live", "tracker")
+_GROUPS = (
+    "data",
+    "trajectory",
+    "system",
+    "model",
+    "controller",
+    "propagation",
+    "solver",
+    "learning",
+)
+_NEEDED_GROUPS = ("data", "trajectory", "system", "model", "controller")
+# Settings that no object takes, and their values.
+_CHOICES = {
+    "recorder": ("mcap", "none"),
+    "tracker": ("mlflow", "none"),
+    "live": (True, False),
+}
+
+
+def experiment_of(config: DictConfig) -> Experiment:
+    """Makes the objects that a user's settings describe; they may call anything."""
+    return _made(_merged(DictConfig(plain_data(config))))
+
+
+def experiment_of_file(settings: dict[str, Any], trusted: Sequence[str]) -> Experiment:
+    """Makes the objects that settings out of a file describe.
+
+    Args:
+        settings: Plain data (``read_settings``).
+        trusted: Packages whose code they may call, besides what ``gpmpc._trust`` lists.
+
+    Raises:
+        DataError: They call something else.
+    """
+    merged = plain_data(_merged(DictConfig(settings)))
+    return _made(DictConfig(checked_settings(merged, trusted)))
+
+
+def plain_data(config: DictConfig) -> dict[str, Any]:
+    """Returns settings with everything resolved."""
+    data: Any = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+    return data
+
+
+def plain_settings(config: DictConfig, options: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns all that a result depends on, as plain data.
+
+    Args:
+        config: The settings.
+        options: The chosen option by group, which is kept under ``options``.
+    """
+    settings = plain_data(config)
+    path = settings["model"].get("path")
+    if path:
+        settings["model"]["sha256"] = sha256(Path(path).read_bytes()).hexdigest()
+    kept = {key: value for key, value in settings.items() if key not in ASIDE}
+    return kept | {"options": {group: options.get(group) for group in _GROUPS}}
+
+
+def _merged(config: DictConfig) -> DictConfig:
+    """Checks settings and completes their parts, each as it will be called.
+
+    A nominal system and a plant are whole systems, the controller has its propagator
+    and its solver.
+    """
+    _check(config)
+    with open_dict(config):
+        nominal = config.nominal
+        if nominal and "_target_" not in nominal:
+            config.nominal = OmegaConf.merge(config.system, nominal)
+        changes = {
+            key: value
+            for key, value in (config.plant or {}).items()
+            if value != config.system.get(key)
+        }
+        config.plant = OmegaConf.merge(config.system, changes) if changes else None
+        for group, argument in (("propagation", "propagator"), ("solver", "solver")):
+            if not config.get(group):
+                continue
+            if argument not in config.controller:
+                raise SettingError(
+                    group, "this controller has none to choose; leave it out"
+                )
+            config.controller[argument] = config[group]
+    return config
+
+
+def _made(config: DictConfig) -> Experiment:
+    """Makes the objects of merged settings."""
+    system = _system_of(config.system)
+    if config.nominal:
+        system = replace(system, nominal=_system_of(config.nominal))
+    with open_dict(config):
+        size = config.data.pop("size")
+        _complete_controller(config.controller, system)
+    ((name, trajectory),) = config.trajectory.items()
+    data = instantiate(config.data, _convert_="all")
+    controller = instantiate(config.controller, _convert_="all")
+    disturbances = instantiate(config.disturbances, _convert_="all")
+    train = instantiate(config.model, _convert_="all")
+    model = _saved_model(train, system)
+    if config.nominal and getattr(train, "predicts", None) != "difference":
+        raise SettingError(
+            "nominal", "needs model=difference_gp, which learns what it misses"
+        )
+    noise = Noise(**config.noise) if any(config.noise.values()) else None
+    learning = None
+    if config.get("learning"):
+        learning = instantiate(config.learning, _convert_="all")
+    return Experiment(
+        data=data,
+        trajectory=instantiate(trajectory, _convert_="all"),
+        system=system,
+        train=train,
+        controller=controller,
+        plant=_system_of(config.plant) if config.plant else None,
+        name=name,
+        size=size,
+        steps=config.steps,
+        seed=config.seed,
+        loop=config.loop,
+        propagator=getattr(controller, "keywords", {}).get("propagator"),
+        noise=noise,
+        disturbances=disturbances,
+        on_failure=config.on_failure,
+        learning=learning,
+        model=model,
+    )
+
+
+def _saved_model(train: Any, system: System) -> DynamicsModel | None:
+    """Returns the model out of a file; None where the settings train one."""
+    if not isinstance(train, SavedModel):
+        return None
+    train.check(system)
+    return train.model
+
+
+def _complete_controller(controller: DictConfig, system: System) -> None:
+    """Sets what the controller and its problem leave to the system."""
+    _set_where_null(controller, "initial_input", system.initial_input)
+    problem = controller.problem
+    if problem.cost.get("Q") is None or problem.cost.get("R") is None:
+        raise SettingError(
+            "controller.problem.cost",
+            f"has no weights Q and R; {system.name} is to bring them",
+        )
+    _set_where_null(problem.cost, "angles", system.angle_indices)
+    _set_where_null(problem.inputs, "lower", system.input_lower)
+    _set_where_null(problem.inputs, "upper", system.input_upper)
+
+
+def _set_where_null(config: DictConfig, key: str, numbers: Sequence[float]) -> None:
+    if config.get(key) is None:
+        config[key] = list(numbers)
+
+
+def _system_of(settings: Any) -> System:
+    """Makes the system that the settings ``system`` describe."""
+    system = instantiate(settings, _convert_="all")
+    if not isinstance(system, System):
+        raise SettingError(
+            "system",
+            "_target_ must name a function that returns a gpmpc.systems.System; "
+            f"got {type(system).__name__}",
+        )
+    return system
+
+
+def _check(config: DictConfig) -> None:
+    """Raises where a setting that no object takes is none of its choices.
+
+    Likewise where a group has no option.
+    """
+    folder_of(config.folder)
+    check_number("horizon", config.horizon, least=1, whole=True)
+    if not OmegaConf.is_list(config.disturbances):
+        raise SettingError(
+            "disturbances", f"must be a list; got {config.disturbances!r}"
+        )
+    for key, values in _CHOICES.items():
+        if config[key] is not None and config[key] not in values:
+            names = " or ".join(map(repr, values))
+            raise SettingError(key, f"must be {names}; got {config[key]!r}")
+    if config.tracker == "mlflow" and find_spec("mlflow") is None:
+        raise SettingError("tracker", "needs MLflow: pip install mlflow")
+    if config.live and config.recorder != "mcap":
+        raise SettingError(
+            "live", f"needs recorder=mcap; got recorder={config.recorder}"
+        )
+    for group in _NEEDED_GROUPS:
+        if not config.get(group):
+            raise SettingError(group, "choose one")
+    if len(config.trajectory) != 1:
+        raise SettingError(
+            "trajectory", f"choose one; got {', '.join(config.trajectory)}"
+        )

@@ -1,0 +1,89 @@
+"""``gpmpc plot``: draws recorded flights as figures and an animation."""
+
+import argparse
+import shutil
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from gpmpc.cli._commands import Result
+from gpmpc.cli._log import condition
+from gpmpc.cli._recorded import experiment_of_run, recordings
+from gpmpc.cli._settings import writing
+from gpmpc.cli._terminal import print_error
+from gpmpc.exceptions import DataError, RecordingError
+from gpmpc.plotting import (
+    animate,
+    film,
+    inputs_figure,
+    timing_figure,
+    tracking_figure,
+)
+from gpmpc.recording import Run, read_run
+
+
+def plot(arguments: argparse.Namespace) -> Result:
+    """Draws a recorded flight, or every one below a folder."""
+    paths = recordings(arguments.run)
+    if len(paths) == 1:
+        folder = arguments.to or paths[0].parent / "figures"
+        return Result(_plot(arguments, paths[0], folder))
+    plotted = []
+    code = 0
+    for path in paths:
+        folder = path.parent / "figures"
+        if arguments.to:
+            folder = arguments.to / path.parent.relative_to(arguments.run)
+        try:
+            plotted.append(_plot(arguments, path, folder))
+        except (DataError, RecordingError) as error:
+            print_error(str(error))
+            code = 2
+    return Result({"runs": plotted}, code)
+
+
+def _plot(arguments: argparse.Namespace, path: Path, folder: Path) -> dict[str, Any]:
+    """Draws one flight; returns where it is drawn."""
+    run = read_run(path)
+    if not len(run.times):
+        raise DataError(f"{path}: holds no step")
+    animation = _animation(arguments, run)
+    written = []
+    with writing(folder, "to"), Console().status("drawing"):
+        folder.mkdir(parents=True, exist_ok=True)
+        figures = {
+            "tracking": tracking_figure(run),
+            "inputs": inputs_figure(run),
+            "timing": timing_figure(run),
+        }
+        for name, figure in figures.items():
+            file = f"{name}.{arguments.format}"
+            figure.savefig(folder / file, dpi=150)
+            written.append(file)
+        if animation is not None:
+            for file in _animation_files():
+                animation(run, path=folder / file)
+                written.append(file)
+    note = "" if run.finished else f"; {len(run.times)} steps: {condition(run)}"
+    print(f"written to {folder}: {', '.join(written)}{note}")
+    return {"folder": str(folder), "written": written, "finished": run.finished}
+
+
+def _animation(arguments: argparse.Namespace, run: Run) -> Callable[..., None] | None:
+    """Returns what animates a flight; None where it is not asked for or cannot be."""
+    if arguments.film:
+        return partial(film, system=experiment_of_run(run, arguments.trust).flown)
+    has_position = {"x", "y", "z"} <= run.pose.keys()
+    if arguments.no_animation or not has_position:
+        return None
+    return animate
+
+
+def _animation_files() -> list[str]:
+    """Returns the animation's files: MP4 where there is ffmpeg."""
+    if shutil.which("ffmpeg"):
+        return ["flight.gif", "flight.mp4"]
+    return ["flight.gif"]

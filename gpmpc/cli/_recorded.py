@@ -1,0 +1,67 @@
+"""Finds recorded flights, and makes what the settings in them describe."""
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from gpmpc._trust import trusted_packages
+from gpmpc.cli._recorded_settings import read_settings
+from gpmpc.cli._settings import find_modules_here, one_line
+from gpmpc.exceptions import DataError
+from gpmpc.recording import Run
+from gpmpc.studies._run_folder import RECORDING
+
+if TYPE_CHECKING:
+    from gpmpc.studies.flight import Experiment
+
+_NO_SETTINGS = "holds no settings, which gpmpc run puts into its recordings"
+
+
+def recordings(run: Path) -> list[Path]:
+    """Returns the recordings that a run's folder, one above it, or a file stands for."""
+    if not run.is_dir():
+        return [run]
+    if (run / RECORDING).exists():
+        return [run / RECORDING]
+    paths = sorted(run.rglob(RECORDING))
+    if not paths:
+        raise DataError(f"{run}: holds no {RECORDING}, nor does a folder below it")
+    return paths
+
+
+def experiment_of_run(run: Run, trust: Sequence[str]) -> "Experiment":
+    """Makes what the settings in a recording describe.
+
+    They may call code of the packages in ``trust``, besides gpmpc's own.
+
+    Raises:
+        DataError: The recording holds no settings, or such that describe another
+            flight, none, or call other code.
+    """
+    trusted = trusted_packages("--trust", trust)
+    if not run.config.strip():
+        raise DataError(f"{run.path}: {_NO_SETTINGS}")
+    from gpmpc.cli._experiment import experiment_of_file  # loads torch
+
+    with errors_of_settings(run):
+        settings = read_settings(run.config)
+        if not {"system", "controller", "folder"} <= settings.keys():
+            raise DataError(_NO_SETTINGS)
+        if trusted:  # else nothing in the working folder may be imported
+            find_modules_here()
+        experiment = experiment_of_file(settings, trusted)
+        system = experiment.system
+        described = (system.state_names, system.input_names)
+        if described != (run.state_names, run.input_names):
+            raise DataError("its settings describe another system than it recorded")
+    return experiment
+
+
+@contextmanager
+def errors_of_settings(run: Run) -> Iterator[None]:
+    """Turns whatever settings that nobody has checked raise into one error."""
+    try:
+        yield
+    except Exception as error:
+        raise DataError(f"{run.path}: {one_line(error)}") from error
