@@ -1,5 +1,7 @@
 """The command ``gpmpc``: thin entries over the package; the only importer of hydra.
 
+    main -> _main (words to a command) -> _commands (the list) -> _NAME (the command)
+
 What stands here is there before any library: Ctrl-C ends the command with one line from
 its first moment on.
 """
@@ -19,7 +21,10 @@ def main() -> None:
         raise KeyboardInterrupt
 
     def interrupt_again(lost: "sys.UnraisableHookArgs") -> None:
-        """Interrupts once more what was interrupted inside a finaliser: Python would print a traceback and go on."""
+        """Interrupts once more where an interrupt was lost inside a finaliser.
+
+        Python would print a traceback and go on.
+        """
         if issubclass(lost.exc_type, KeyboardInterrupt):
             signal.setitimer(signal.ITIMER_REAL, 0.05)  # once this call is over
         else:

@@ -267,8 +267,8 @@ COMMANDS = {
             ),
             _flag(
                 "--for-control",
-                help="a model to plan with: without the feedback of the controller that "
-                "flew, without delayed inputs",
+                help="a model to plan with: without the feedback of the controller "
+                "that flew, without delayed inputs",
             ),
             _flag("--partial", help="read unfinished files as far as they are whole"),
         ],

@@ -1,7 +1,11 @@
-"""``gpmpc learn``: from log files and a mapping to a saved model, a report on held-out runs, and a model card."""
+"""``gpmpc learn``: from log files and a mapping to a model, a report and a model card.
+
+logs -> training and held-out runs -> learned -> judged -> model, report, card
+"""
 
 import argparse
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,89 +24,117 @@ from gpmpc.studies._run_folder import describe_code
 from gpmpc.studies.study import fingerprint
 
 _MODEL = "model.safetensors"
-_HELD_NOISE = (
+_JUDGED_STEPS = (1, 10, 50)  # ahead, besides the longest
+_NOISE = (
     "the noise of the outputs, which adds up, and that of the sensors, which does not, "
     "as fitted to held-out rollouts"
 )
 
 
-def learn(given: argparse.Namespace) -> Result:
-    """Learns from logs, judges on held-out runs, and writes model, report and card; goes on where it stopped."""
+def learn(arguments: argparse.Namespace) -> Result:
+    """Learns from logs, judges on held-out runs, and writes model, report and card.
+
+    The same command goes on where it stopped.
+    """
     console = Console(soft_wrap=True, highlight=False, markup=False)
-    folder = given.to or Path("learned")
-    log = logs.read_log(given.files, given.mapping, given.partial)
+    folder = arguments.to or Path("learned")
+    log = logs.read_log(arguments.files, arguments.mapping, arguments.partial)
     console.print(repr(log))
     for finding in log.findings:
         console.print(f"  {finding.run}: {finding.kind}: {finding.text}")
-    train, held_out = _split(log, given.held_out)
+    train, held_out = _split(log, arguments.held_out)
     with writing(folder, "to"):
         folder.mkdir(parents=True, exist_ok=True)
-        settings = repr(
-            (train.mapping, given.points, given.steps, given.seed, given.for_control)
+        learned, judgement = _learn_and_judge(
+            arguments, train, held_out, folder=folder, console=console
         )
-        rows = [
-            array for run in train for array in (run.states, run.inputs, run.context)
-        ]
-        memory = _FileMemory(folder / "progress.json", fingerprint(settings, rows))
-        if memory.begun_anew:
-            console.print(memory.begun_anew)
-        with console.status("learning") as status:
-
-            def show(stage: str) -> None:
-                status.update(stage)
-                console.print(f"  {stage}")
-
-            learned = logs.learn(
-                train,
-                given.points,
-                given.steps,
-                given.seed,
-                show,
-                memory,
-                given.for_control,
-            )
-            status.update("judging on held-out runs")
-            steps = sorted(
-                {step for step in (1, 10, 50) if step <= given.steps} | {given.steps}
-            )
-            judgement = logs.judge(learned, held_out, train, steps)
         logs.save_learned(learned, folder / _MODEL)
-        document = _report(learned, judgement, train, held_out)
-        card = _card(learned, judgement, train, held_out).markdown()
-        write_files(
-            folder,
-            document.files("report")
-            | {"report.html": document.html(), "card.md": card},
-            "to",
-        )
-    Console().print(terminal(document.tables[:1]))
+        report = _report(learned, judgement, train, held_out)
+        card = _card(learned, judgement, train, held_out)
+        files = report.files("report")
+        files["report.html"] = report.html()
+        files["card.md"] = card.markdown()
+        write_files(folder, files, "to")
+    Console().print(terminal(report.tables[:1]))
     for line in judgement.losses:
         console.print(f"loses: {line}")
     console.print(f"written to {folder}: {_MODEL}, report.html, report.md, card.md")
-    return Result(
-        {
-            "folder": str(folder),
-            "losses": judgement.losses,
-            "rows": document.data.to_dict("records"),
-        }
+    data = {
+        "folder": str(folder),
+        "losses": judgement.losses,
+        "rows": report.data.to_dict("records"),
+    }
+    return Result(data)
+
+
+def _learn_and_judge(
+    arguments: argparse.Namespace,
+    train: Log,
+    held_out: Log,
+    folder: Path,
+    console: Console,
+) -> tuple[Learned, Judgement]:
+    """Learns with a memory of finished stages, and judges what was learned."""
+    memory = _FileMemory(folder / "progress.json", _fingerprint(arguments, train))
+    if memory.begun_anew:
+        console.print(memory.begun_anew)
+    with console.status("learning") as status:
+
+        def show(stage: str) -> None:
+            status.update(stage)
+            console.print(f"  {stage}")
+
+        learned = logs.learn(
+            train,
+            points=arguments.points,
+            steps=arguments.steps,
+            seed=arguments.seed,
+            progress=show,
+            memory=memory,
+            for_control=arguments.for_control,
+        )
+        status.update("judging on held-out runs")
+        longest = arguments.steps
+        steps = {step for step in _JUDGED_STEPS if step <= longest} | {longest}
+        judgement = logs.judge(learned, held_out, train, sorted(steps))
+    return learned, judgement
+
+
+def _fingerprint(arguments: argparse.Namespace, train: Log) -> str:
+    """Returns a text that differs where code, data or settings differ."""
+    settings = (
+        train.mapping,
+        arguments.points,
+        arguments.steps,
+        arguments.seed,
+        arguments.for_control,
     )
+    arrays = []
+    for run in train:
+        arrays += [run.states, run.inputs, run.context]
+    return fingerprint(repr(settings), arrays)
 
 
-def _split(log: Log, held_out: list[str]) -> tuple[Log, Log]:
+def _split(log: Log, held_out: Sequence[str]) -> tuple[Log, Log]:
+    """Returns the runs to learn from and those to judge on.
+
+    Where nobody chose, a fifth of the runs is held out, of all lengths; of one run the
+    last fifth.
+    """
     if held_out:
-        return log.split(held_out)
+        return log.split([*held_out])
     names = [run.name for run in sorted(log.runs, key=len)]
     if len(names) == 1:
         return log.split_by_time(0.8)
-    return log.split(
-        names[:: max(len(names) // max(len(names) // 5, 1), 1)][
-            : max(len(names) // 5, 1)
-        ]
-    )
+    count = max(len(names) // 5, 1)
+    every = max(len(names) // count, 1)
+    return log.split(names[::every][:count])
 
 
 class _FileMemory(dict[str, Any]):
-    """Outcomes of stages, kept in a JSON file; other code, data or settings begin it anew.
+    """Outcomes of stages, kept in a JSON file.
+
+    Other code, data or settings begin it anew.
 
     Args:
         path: The file.
@@ -118,7 +150,7 @@ class _FileMemory(dict[str, Any]):
         self.begun_anew = ""
         try:
             content = json.loads(path.read_text(encoding="utf-8"))
-            known = content["fingerprint"] == fingerprint
+            is_of_this_call = content["fingerprint"] == fingerprint
             stages = dict(content["stages"])
             code = content.get("code")
         except FileNotFoundError:
@@ -126,7 +158,7 @@ class _FileMemory(dict[str, Any]):
         except (OSError, ValueError, KeyError, TypeError, RecursionError):
             self.begun_anew = f"{path}: is not whole; all is learned anew"
             return
-        if known:
+        if is_of_this_call:
             super().__init__(stages)
         elif code != self._code:
             self.begun_anew = (
@@ -150,112 +182,97 @@ class _FileMemory(dict[str, Any]):
 def _report(
     learned: IdentifiedModel, judgement: Judgement, train: Log, held_out: Log
 ) -> Document:
-    """Makes the report: errors beside the baselines, coverage and width, and every candidate."""
-    groups = [
-        f"{group} [{unit}]"
-        for group, unit in zip(judgement.groups, judgement.units, strict=True)
+    """Returns errors beside the baselines, coverage and width, and every candidate."""
+    notes = [
+        "A width of 1 claims the spread that the errors have; the interval in brackets "
+        "is the exact one of Clopper and Pearson for windows that do not overlap.",
+        f"Intervals hold {_NOISE}.",
     ]
-    errors = []
-    intervals = []
-    for k, step in enumerate(judgement.steps):
-        for name, mean in judgement.mean.items():
-            pairs = zip(mean[k], judgement.rmse[name][k], strict=True)
-            errors.append(
-                [step, name, *(f"{number(m)}\n[RMSE {number(r)}]" for m, r in pairs)]
-            )
-        each = zip(
-            judgement.coverage[k],
-            judgement.coverage_interval[k],
-            judgement.width[k],
-            strict=True,
-        )
-        texts = (
-            f"{share:.1%}\n[{low:.1%}, {high:.1%}]\nwidth {width:.2f}"
-            for share, (low, high), width in each
-        )
-        intervals.append([step, *texts])
-    candidates = [
-        [
-            "chosen" if c.chosen else "",
-            c.name,
-            *(" / ".join(map(number, errors)) for errors in c.errors.T),
-        ]
-        for c in learned.candidates
-    ]
-    heading = "Candidates: mean error of held-out rollouts, 10 / 50 steps ahead"
-    level = f"{judgement.level:.0%} intervals: coverage and width"
+    lists = {}
+    if judgement.losses:
+        notes.append("The model loses to a baseline: see below.")
+        lists["Where the model loses"] = judgement.losses
+    else:
+        notes.append("The model loses to no baseline.")
+    runs = ", ".join(run.name for run in held_out)
     return Document(
-        "What was learned, judged on runs that it never saw",
-        [
-            Table(
-                ["steps ahead", "predictor", *groups],
-                errors,
-                "Mean error",
-                sections=True,
-            ),
-            Table(["steps ahead", *judgement.groups], intervals, level),
-            Table(["", "model", *groups], candidates, heading),
+        title="What was learned, judged on runs that it never saw",
+        tables=[
+            _table_of_errors(judgement),
+            _table_of_intervals(judgement),
+            _table_of_candidates(learned, judgement),
         ],
-        judgement.to_pandas(),
-        lead=f"{judgement.windows} predictions on {', '.join(run.name for run in held_out)}; "
-        f"learned from {len(train)} rows of {len(train.runs)} runs.",
-        notes=[
-            "A width of 1 claims the spread that the errors have; the interval in brackets is the exact one of Clopper "
-            "and Pearson for windows that do not overlap.",
-            f"Intervals hold {_HELD_NOISE}.",
-            "The model loses to no baseline."
-            if not judgement.losses
-            else "The model loses to a baseline: see below.",
-        ],
-        lists={"Where the model loses": judgement.losses} if judgement.losses else {},
+        data=judgement.to_pandas(),
+        lead=(
+            f"{judgement.windows} predictions on {runs}; "
+            f"learned from {len(train)} rows of {len(train.runs)} runs."
+        ),
+        notes=notes,
+        lists=lists,
         images={"report.png": png(judgement_figure(judgement))},
     )
+
+
+def _groups(judgement: Judgement) -> list[str]:
+    """Returns the headers of the groups of states with their units."""
+    named = zip(judgement.groups, judgement.units, strict=True)
+    return [f"{group} [{unit}]" for group, unit in named]
+
+
+def _table_of_errors(judgement: Judgement) -> Table:
+    rows = []
+    for k, step in enumerate(judgement.steps):
+        for name, mean in judgement.mean.items():
+            errors = zip(mean[k], judgement.rmse[name][k], strict=True)
+            texts = [
+                f"{number(error)}\n[RMSE {number(rmse)}]" for error, rmse in errors
+            ]
+            rows.append([step, name, *texts])
+    header = ["steps ahead", "predictor", *_groups(judgement)]
+    return Table(header, rows, "Mean error", sections=True)
+
+
+def _table_of_intervals(judgement: Judgement) -> Table:
+    rows = []
+    for k, step in enumerate(judgement.steps):
+        texts = []
+        for g in range(len(judgement.groups)):
+            low, high = judgement.coverage_interval[k][g]
+            coverage = f"{judgement.coverage[k][g]:.1%}\n[{low:.1%}, {high:.1%}]"
+            texts.append(f"{coverage}\nwidth {judgement.width[k][g]:.2f}")
+        rows.append([step, *texts])
+    title = f"{judgement.level:.0%} intervals: coverage and width"
+    return Table(["steps ahead", *judgement.groups], rows, title)
+
+
+def _table_of_candidates(learned: Learned, judgement: Judgement) -> Table:
+    rows = []
+    for candidate in learned.candidates:
+        errors = [" / ".join(map(number, column)) for column in candidate.errors.T]
+        mark = "chosen" if candidate.chosen else ""
+        rows.append([mark, candidate.name, *errors])
+    title = "Candidates: mean error of held-out rollouts, 10 / 50 steps ahead"
+    return Table(["", "model", *_groups(judgement)], rows, title)
 
 
 def _card(
     learned: IdentifiedModel, judgement: Judgement, train: Log, held_out: Log
 ) -> Document:
-    """Makes the model card: data, ranges, what was left out, what is learned and why, and what must not be trusted."""
-    names = [*train.space.names, *train.input_names]
-    outputs = learned.model.kinematics.output_names
+    """Returns the model card.
+
+    It says what the data were, their ranges, what was left out of them, what is learned
+    and why, and what must not be trusted.
+    """
+    columns = [*train.space.names, *train.input_names]
     left_out = [
-        f"{f.run}: {f.kind}: {f.text}" for f in train.findings if f.run in learned.runs
+        f"{finding.run}: {finding.kind}: {finding.text}"
+        for finding in train.findings
+        if finding.run in learned.runs
     ]
-    with_gp = {outputs[i] for gp in learned.model.gps for i in gp.outputs}
-    without = "nominal only; a GP did not make held-out rollouts better"
-    learns = [
-        f"{name}: {'GP on the residual' if name in with_gp else without}"
-        for name in outputs
-    ]
-    doubts = [f"Loses to a baseline: {loss}" for loss in judgement.losses]
-    doubts += ["Outside the ranges below nothing was seen."]
-    if getattr(learned.model.nominal, "feedback", False):
-        doubts += [
-            "The term feedback describes the controller that flew: it predicts such flights, and says nothing of what "
-            "another controller would do. Do not control the attitude with this model."
-        ]
-    if getattr(learned.model.nominal, "torque", None) is False:
-        doubts += [
-            "The motors' torque was not found in the log: the model does not turn when the motors say so."
-        ]
-    made = provenance()
-    facts = {
-        "model": next(
-            candidate.name for candidate in learned.candidates if candidate.chosen
-        ),
-        "rows": len(train),
-        "runs": ", ".join(learned.runs),
-        "rate": f"{1 / train.time_step:g} Hz",
-        "judged on": ", ".join(run.name for run in held_out),
-        "intervals hold": _HELD_NOISE,
-        "made": made["created"],
-        "made by": describe_code(made),
-        "command": made["command"],
-    }
     return Document(
-        "Model card",
-        [
-            Table(["", ""], [*facts.items()], "What it is"),
+        title="Model card",
+        tables=[
+            Table(["", ""], _facts(learned, train, held_out), "What it is"),
             Table(
                 ["parameter", "value", "standard error"],
                 learned.fit.to_rows(),
@@ -263,14 +280,65 @@ def _card(
             ),
             Table(
                 ["channel", "lowest", "highest"],
-                [*zip(names, *learned.ranges, strict=True)],
+                [*zip(columns, *learned.ranges, strict=True)],
                 "Ranges of the data",
             ),
         ],
-        pd.DataFrame(),
+        data=pd.DataFrame(),
         lists={
-            "Outputs": learns,
-            "What must not be trusted": doubts,
+            "Outputs": _outputs(learned),
+            "What must not be trusted": _doubts(learned, judgement),
             "Left out of the data": left_out or ["nothing"],
         },
     )
+
+
+def _facts(learned: Learned, train: Log, held_out: Log) -> list[tuple[str, Any]]:
+    """Returns what a model is, and what made it."""
+    origin = provenance()
+    chosen = [candidate.name for candidate in learned.candidates if candidate.chosen]
+    return [
+        ("model", chosen[0]),
+        ("rows", len(train)),
+        ("runs", ", ".join(learned.runs)),
+        ("rate", f"{1 / train.time_step:g} Hz"),
+        ("judged on", ", ".join(run.name for run in held_out)),
+        ("intervals hold", _NOISE),
+        ("made", origin["created"]),
+        ("made by", describe_code(origin)),
+        ("command", origin["command"]),
+    ]
+
+
+def _outputs(learned: Learned) -> list[str]:
+    """Returns for every output whether a GP learned its residual."""
+    names = learned.model.kinematics.output_names
+    with_gp = {names[i] for gp in learned.model.gps for i in gp.outputs}
+    lines = []
+    for name in names:
+        if name in with_gp:
+            lines.append(f"{name}: GP on the residual")
+        else:
+            lines.append(
+                f"{name}: nominal only; a GP did not make held-out rollouts better"
+            )
+    return lines
+
+
+def _doubts(learned: Learned, judgement: Judgement) -> list[str]:
+    """Returns what must not be trusted."""
+    nominal = learned.model.nominal
+    doubts = [f"Loses to a baseline: {loss}" for loss in judgement.losses]
+    doubts.append("Outside the ranges below nothing was seen.")
+    if getattr(nominal, "feedback", False):
+        doubts.append(
+            "The term feedback describes the controller that flew: it predicts such "
+            "flights, and says nothing of what another controller would do. Do not "
+            "control the attitude with this model."
+        )
+    if getattr(nominal, "torque", None) is False:
+        doubts.append(
+            "The motors' torque was not found in the log: the model does not turn when "
+            "the motors say so."
+        )
+    return doubts

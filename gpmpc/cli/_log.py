@@ -1,6 +1,7 @@
-"""``gpmpc log``: what is in a recording, rescue an unfinished one, its steps as a table, a layout to look at it."""
+"""``gpmpc log``: shows, rescues or exports a recording, and inspects any log."""
 
 import argparse
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -39,41 +40,68 @@ def condition(run: Run) -> str:
     return reasons if run.whole else f"{CUT} ({reasons})"
 
 
-def log(given: argparse.Namespace) -> Result:
-    """Does what was asked for with a recording."""
-    action = given.action
-    file = given.file
+def log(arguments: argparse.Namespace) -> Result:
+    """Does with a recording what was asked for."""
+    action = arguments.action
+    file = arguments.file
     if action == "info":
-        if given.output:
-            raise GpmpcError(f"log info: writes nothing; got {given.output}")
+        if arguments.output:
+            raise GpmpcError(f"log info: writes nothing; got {arguments.output}")
         return _info(file)
-    output = given.output or file.parent / f"{file.stem}{_SUFFIXES[action]}"
-    if given.output and action != "recover" and output.suffix not in _ENDINGS[action]:
-        raise SettingError(
-            "output",
-            f"must end in {' or '.join(_ENDINGS[action])}; got {output.name!r}",
-        )
+    output = _output(action, file, arguments.output)
     if action == "inspect":
-        return _inspect(file, output, given.mapping)
+        return _inspect(file, output, arguments.mapping)
     if action == "recover":
-        flawed = _read_steps(file)
-        run = recover(file, output)
-        messages = sum(count for count, _ in run.channels.values())
-        note = f"{messages} messages over {np.ptp(run.times):g} s; "
-        note += (
-            "the recording was finished, nothing was missing"
-            if flawed.finished
-            else "; ".join(flaw.text for flaw in flawed.flaws)
+        return _recover(file, output)
+    if action == "layout":
+        return _layout(file, output)
+    return _export(file, output)
+
+
+def _output(action: str, file: Path, chosen: Path | None) -> Path:
+    """Returns where an action writes, by default beside the recording."""
+    if chosen is None:
+        return file.parent / f"{file.stem}{_SUFFIXES[action]}"
+    endings = _ENDINGS[action]
+    if action != "recover" and chosen.suffix not in endings:
+        raise SettingError(
+            "output", f"must end in {' or '.join(endings)}; got {chosen.name!r}"
         )
-    elif action == "layout":
-        run = _read_steps(file)
-        _write(output, layout(run))
-        note = f"open {file} in Foxglove or Lichtblick, then import it as a layout"
-    else:
-        run = _read_steps(file)
-        _write(output, _table_file(run, output.suffix))
-        note = f"{len(run.times)} rows, {len(run.columns)} columns"
-        note += "" if run.finished else f"; the recording: {condition(run)}"
+    return chosen
+
+
+def _recover(file: Path, output: Path) -> Result:
+    """Writes what is whole in an unfinished recording as a new one."""
+    flawed = _read_steps(file)
+    run = recover(file, output)
+    messages = sum(count for count, _ in run.channels.values())
+    state = "; ".join(flaw.text for flaw in flawed.flaws)
+    if flawed.finished:
+        state = "the recording was finished, nothing was missing"
+    note = f"{messages} messages over {np.ptp(run.times):g} s; {state}"
+    return _written(output, note, run)
+
+
+def _layout(file: Path, output: Path) -> Result:
+    """Writes a layout for Foxglove or Lichtblick that fits the recording."""
+    run = _read_steps(file)
+    _write(output, layout(run))
+    note = f"open {file} in Foxglove or Lichtblick, then import it as a layout"
+    return _written(output, note, run)
+
+
+def _export(file: Path, output: Path) -> Result:
+    """Writes the steps as a table, a row each."""
+    run = _read_steps(file)
+    _write(output, _table_file(run, output.suffix))
+    note = f"{len(run.times)} rows, {len(run.columns)} columns"
+    if not run.finished:
+        note += f"; the recording: {condition(run)}"
+    return _written(output, note, run)
+
+
+def _written(output: Path, note: str, run: Run) -> Result:
+    """Prints what was written of a recording."""
     print(f"written to {output}: {note}")
     return Result({"output": str(output), "flaws": _flaws(run)})
 
@@ -91,86 +119,96 @@ def _flaws(run: Run) -> list[dict[str, Any]]:
 
 
 def _info(file: Path) -> Result:
+    """Prints channels, facts and metadata of a recording."""
     run = read_run(file)
     console = Console()
     facts = _facts(run)
-    hint = (
-        ""
-        if "recovered" in run.metadata
-        else " (gpmpc log recover makes it readable for other tools)"
-    )
-    state = "finished" if run.finished else f"{CUT}{hint}"
-    if run.whole and not run.finished:
-        state = "whole, as far as can be told"
-    lines = [f"{file}: {state}", *(f"  {flaw.text}" for flaw in run.flaws)]
+    lines = [f"{file}: {_state(run)}", *(f"  {flaw.text}" for flaw in run.flaws)]
     console.print(*lines, sep="\n", soft_wrap=True, highlight=False, markup=False)
-    metadata = [
-        (n, k, v)
-        for n, pairs in run.metadata.items()
-        if n != "units"
-        for k, v in pairs.items()
-    ]
     channels = [
         (topic, schema, count) for topic, (count, schema) in run.channels.items()
     ]
-    tables = [
-        Table(head, [[plain_text(str(cell)) for cell in row] for row in rows])
-        for head, rows in (
-            (("topic", "schema", "messages"), channels),
-            (("", ""), [*facts.items()]),
-            (("metadata", "key", "value"), metadata),
-        )
-        if rows
+    metadata = [
+        (name, key, value)
+        for name, pairs in run.metadata.items()
+        if name != "units"
+        for key, value in pairs.items()
     ]
-    console.print(terminal(tables))
-    counts = {topic: count for topic, (count, _) in run.channels.items()}
+    tables = [
+        _plain_table(("topic", "schema", "messages"), channels),
+        _plain_table(("", ""), [*facts.items()]),
+        _plain_table(("metadata", "key", "value"), metadata),
+    ]
+    console.print(terminal([table for table in tables if table.rows]))
     if not len(run.times):
         print_error(f"{file}: holds no step")
-    return Result(
-        {
-            "finished": run.finished,
-            "flaws": _flaws(run),
-            "channels": counts,
-            **facts,
-            "metadata": dict(run.metadata),
-        },
-        0 if len(run.times) else 2,
-    )
+    data = {
+        "finished": run.finished,
+        "flaws": _flaws(run),
+        "channels": {topic: count for topic, (count, _) in run.channels.items()},
+        **facts,
+        "metadata": dict(run.metadata),
+    }
+    return Result(data, 0 if len(run.times) else 2)
+
+
+def _state(run: Run) -> str:
+    """Returns in words whether a recording is finished and whole."""
+    if run.finished:
+        return "finished"
+    if run.whole:
+        return "whole, as far as can be told"
+    if "recovered" in run.metadata:
+        return CUT
+    return f"{CUT} (gpmpc log recover makes it readable for other tools)"
+
+
+def _plain_table(header: Sequence[str], rows: Sequence[Sequence[Any]]) -> Table:
+    """Returns a table of texts that may come from anywhere."""
+    return Table(header, [[plain_text(str(cell)) for cell in row] for row in rows])
 
 
 def _facts(run: Run) -> dict[str, str]:
-    """The numbers of a run in words."""
-    units = run.metadata.get("units", {})
-    names = [("states", "state", run.state_names), ("inputs", "input", run.input_names)]
+    """Returns the numbers of a run in words."""
     facts = {
-        title: ", ".join(f"{n} [{units.get(f'{g}.{n}', '?')}]" for n in group)
-        for title, g, group in names
+        "states": _with_units(run, "state", run.state_names),
+        "inputs": _with_units(run, "input", run.input_names),
+        "steps": str(len(run.times)),
     }
-    K = len(run.times)
-    facts["steps"] = str(K)
-    if K:
+    if len(run.times):
         facts["time"] = f"{run.times[0]:g} to {run.times[-1]:g} s"
-        counts = {
-            status: run.statuses.count(status) for status in dict.fromkeys(run.statuses)
-        }
         facts["statuses"] = ", ".join(
-            f"{status.name} {count}" for status, count in counts.items()
+            f"{status.name} {run.statuses.count(status)}"
+            for status in dict.fromkeys(run.statuses)
         )
         facts["not applied"] = str(int(run.failed.sum()))
-        judged = [(run.judgements == level).sum() for level in LEVELS[1:]]
-        if any(judged):
-            counts = zip(LEVELS[1:], judged, strict=True)
-            steps = ", ".join(f"{level} {count}" for level, count in counts if count)
-            last = f"; at the end {run.judgements[-1]}"
-            why = f": {plain_text(run.reasons[-1])}" if run.reasons[-1] else ""
-            facts["judgement"] = f"{steps}{last}{why}"
-        median, worst = (
-            1e3 * float(f(run.timings[:, -1])) for f in (np.median, np.max)
-        )
-        facts["decision"] = f"median {median:.3g} ms, longest {worst:.3g} ms"
+        judgement = _judgement(run)
+        if judgement:
+            facts["judgement"] = judgement
+        milliseconds = 1e3 * run.timings[:, -1]
+        median = float(np.median(milliseconds))
+        longest = float(np.max(milliseconds))
+        facts["decision"] = f"median {median:.3g} ms, longest {longest:.3g} ms"
         facts["problems"] = f"{len(run.problems)} kept for replay"
     facts["configuration"] = f"{len(run.config.splitlines())} lines"
     return facts
+
+
+def _with_units(run: Run, kind: str, names: Sequence[str]) -> str:
+    units = run.metadata.get("units", {})
+    return ", ".join(f"{name} [{units.get(f'{kind}.{name}', '?')}]" for name in names)
+
+
+def _judgement(run: Run) -> str:
+    """Returns how many steps were suspicious or lost; empty where none was."""
+    counts = {level: int((run.judgements == level).sum()) for level in LEVELS[1:]}
+    if not any(counts.values()):
+        return ""
+    steps = ", ".join(f"{level} {count}" for level, count in counts.items() if count)
+    text = f"{steps}; at the end {run.judgements[-1]}"
+    if run.reasons[-1]:
+        text += f": {plain_text(run.reasons[-1])}"
+    return text
 
 
 def _table_file(run: Run, ending: str) -> str | bytes:
@@ -188,47 +226,47 @@ def _table_file(run: Run, ending: str) -> str | bytes:
 
 
 def _inspect(file: Path, output: Path, mapping_file: Path | None) -> Result:
-    from gpmpc.logs import (
-        LogMapping,
-        inspect_log,
-    )  # loads torch, which what is above does without
+    """Writes a page about a log: streams, channels, delays and excitation."""
+    # Loads torch, which the other actions do without.
+    from gpmpc.logs import LogMapping, inspect_log
     from gpmpc.plotting import inspection_figure, png
 
     mapping = LogMapping.load(mapping_file) if mapping_file else None
-    found = inspect_log(file, mapping)
-    follows = pd.DataFrame(
-        [*found.follows.items()], columns=["input", "explained by the states"]
+    inspection = inspect_log(file, mapping)
+    channels = inspection.channels.reset_index()
+    excitation = pd.DataFrame(
+        [*inspection.follows.items()], columns=["input", "explained by the states"]
     )
-    frames = {
-        "Streams": found.streams,
-        "Channels": found.channels.reset_index(),
-        "Delays between correlated channels": found.delays,
-        "Excitation": follows,
-    }
-    tables = [
-        Table([*frame], frame.to_numpy(object).tolist(), title)
-        for title, frame in frames.items()
-        if title in ("Streams", "Channels") or len(frame)
+    shown = [
+        _frame_table(inspection.streams, "Streams"),
+        _frame_table(channels, "Channels"),
+    ]
+    if_any = [
+        _frame_table(inspection.delays, "Delays between correlated channels"),
+        _frame_table(excitation, "Excitation"),
     ]
     page = Document(
-        found.title,
-        tables,
-        frames["Channels"],
-        lists={"Beware": found.warnings or ["nothing was found"]},
-        images={"inspection.png": png(inspection_figure(found), dpi=100)},
+        title=inspection.title,
+        tables=[*shown, *(table for table in if_any if table.rows)],
+        data=channels,
+        lists={"Beware": inspection.warnings or ["nothing was found"]},
+        images={"inspection.png": png(inspection_figure(inspection), dpi=100)},
     )
     _write(output, page.html())
-    Console().print(terminal(tables[:2]))
-    Console(soft_wrap=True, highlight=False, markup=False).print(
-        *found.warnings, f"written to {output}", sep="\n"
-    )
-    return Result(
-        {
-            "output": str(output),
-            "warnings": [*found.warnings],
-            "channels": page.data.to_dict("records"),
-        }
-    )
+    Console().print(terminal(shown))
+    lines = [*inspection.warnings, f"written to {output}"]
+    console = Console(soft_wrap=True, highlight=False, markup=False)
+    console.print(*lines, sep="\n")
+    data = {
+        "output": str(output),
+        "warnings": [*inspection.warnings],
+        "channels": page.data.to_dict("records"),
+    }
+    return Result(data)
+
+
+def _frame_table(frame: pd.DataFrame, title: str) -> Table:
+    return Table([*frame], frame.to_numpy(object).tolist(), title)
 
 
 def _write(output: Path, content: str | bytes) -> None:

@@ -1,4 +1,4 @@
-"""Runs the command line: from the words behind ``gpmpc`` to a command and its exit code.
+"""Runs the command line, from the words behind ``gpmpc`` to an exit code.
 
     words -> flags of all commands -> command -> parsed arguments -> settings ->
     function

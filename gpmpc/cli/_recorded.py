@@ -19,7 +19,7 @@ _NO_SETTINGS = "holds no settings, which gpmpc run puts into its recordings"
 
 
 def recordings(run: Path) -> list[Path]:
-    """Returns the recordings that a run's folder, one above it, or a file stands for."""
+    """Returns the recordings of a run's folder, of one above it, or of a file."""
     if not run.is_dir():
         return [run]
     if (run / RECORDING).exists():

@@ -1,4 +1,4 @@
-"""Settings of commands: how they are composed, and a user's mistake in them as one line."""
+"""Composes the settings of commands, and explains a mistake in them in one line."""
 
 import difflib
 import os
@@ -22,16 +22,10 @@ import gpmpc
 from gpmpc._files import write_whole
 from gpmpc.exceptions import GpmpcError, SettingError
 
-ENDINGS = (
-    ".safetensors",
-    ".safetensors'",
-    '.safetensors"',
-)  # of files of models, quoted or not
-_EXTRAS = {
-    "submitit_slurm": "slurm",
-    "submitit_local": "slurm",
-    "ray": "ray",
-}  # that bring a launcher
+# Of files of models, quoted or not.
+_MODEL_ENDINGS = (".safetensors", ".safetensors'", '.safetensors"')
+# Extras of this package that bring a launcher.
+_EXTRAS = {"submitit_slurm": "slurm", "submitit_local": "slurm", "ray": "ray"}
 
 
 def folder_of(folder: Any) -> Path:
@@ -43,7 +37,7 @@ def folder_of(folder: Any) -> Path:
 
 @contextmanager
 def writing(folder: Path, key: str = "folder") -> Iterator[None]:
-    """Turns errors of writing to ``folder`` into one of the setting ``key``, which named it."""
+    """Turns errors of writing to ``folder`` into one of the setting that named it."""
     try:
         yield
     except OSError as error:
@@ -55,7 +49,11 @@ def writing(folder: Path, key: str = "folder") -> Iterator[None]:
 def write_files(
     folder: Path, files: Mapping[str, str | bytes], key: str = "folder"
 ) -> str:
-    """Writes files, each in one piece, and makes the folder; returns the line that says so."""
+    """Writes files, each in one piece, and makes the folder.
+
+    Returns:
+        The line that says so.
+    """
     with writing(folder, key):
         for name, content in files.items():
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
@@ -64,7 +62,10 @@ def write_files(
 
 
 def config_folder() -> Path:
-    """Returns the settings' folder: beside the package's modules in a wheel, beside the package in a checkout."""
+    """Returns the settings' folder.
+
+    It is inside the package in a wheel, beside the package in a checkout.
+    """
     package = Path(gpmpc.__file__).resolve().parent
     installed = package / "conf"
     return installed if installed.is_dir() else package.parent / "conf"
@@ -72,7 +73,7 @@ def config_folder() -> Path:
 
 @contextmanager
 def settings(own: str | None = None) -> Iterator[None]:
-    """Lets Hydra find the package's settings, and those in a folder ``own`` behind them."""
+    """Lets Hydra find the package's settings, and behind them those in ``own``."""
     if own is not None:
         folder = Path(own)
         if not folder.is_dir():
@@ -107,20 +108,24 @@ def find_modules_here() -> None:
 
 
 def compose(name: str, overrides: Sequence[str] = ()) -> DictConfig:
-    """Returns the settings of ``conf/NAME.yaml`` with overrides; Hydra's own are ``HydraConfig.get()`` from then on."""
+    """Returns the settings of ``conf/NAME.yaml`` with overrides.
+
+    Hydra's own are ``HydraConfig.get()`` from then on.
+    """
     config = hydra.compose(name, [*overrides], return_hydra_config=True)
     HydraConfig.instance().set_config(config)
     return without_hydra(config)
 
 
 def model_file(override: str) -> list[str]:
-    """Returns an override; in the place of ``model=FILE``, of a file or several, the option that reads it."""
+    """Returns an override, or for ``model=FILE`` the choices that read the file.
+
+    ``FILE`` may be several, of a sweep.
+    """
     key, _, value = override.partition("=")
-    return (
-        ["model=saved", f"model.path={value}"]
-        if key == "model" and value.endswith(ENDINGS)
-        else [override]
-    )
+    if key == "model" and value.endswith(_MODEL_ENDINGS):
+        return ["model=saved", f"model.path={value}"]
+    return [override]
 
 
 def without_hydra(config: DictConfig) -> DictConfig:
@@ -131,49 +136,49 @@ def without_hydra(config: DictConfig) -> DictConfig:
 
 
 def setting_names(name: str, overrides: Sequence[str] = ()) -> list[str]:
-    """Returns every setting of ``conf/NAME.yaml``, dotted; each after the node that holds it."""
+    """Returns every setting of ``conf/NAME.yaml``, dotted, behind its node."""
+    settings = OmegaConf.to_container(hydra.compose(name, [*overrides]), resolve=False)
+    return _dotted_keys(settings)
 
-    def keys(node: object, prefix: str = "") -> list[str]:
-        if not isinstance(node, dict):
-            return []
-        return [
-            key
-            for k, value in node.items()
-            for key in (f"{prefix}{k}", *keys(value, f"{prefix}{k}."))
-        ]
 
-    return keys(
-        OmegaConf.to_container(hydra.compose(name, [*overrides]), resolve=False)
-    )
+def _dotted_keys(node: object, prefix: str = "") -> list[str]:
+    """Returns the keys of nested mappings, dotted; each behind that of its node."""
+    if not isinstance(node, dict):
+        return []
+    keys = []
+    for key, value in node.items():
+        dotted = f"{prefix}{key}"
+        keys += [dotted, *_dotted_keys(value, f"{dotted}.")]
+    return keys
 
 
 def group_options(name: str) -> dict[str, list[str]]:
-    """Returns the options of every group that ``conf/NAME.yaml`` chooses from; not every command has every group."""
-    defaults = OmegaConf.load(config_folder() / f"{name}.yaml").defaults
-    keys = [
-        key
-        for entry in defaults
-        if OmegaConf.is_dict(entry)
-        for key in entry
-        if not key.startswith("override ")
-    ]
-    options = GlobalHydra.instance().config_loader().get_group_options
-    found = {key: options(key.partition("@")[0]) for key in sorted(keys)}
-    for other in (
-        entry for entry in defaults if isinstance(entry, str) and entry != "_self_"
-    ):
-        found |= group_options(other)
-    return found
+    """Returns the options of every group that ``conf/NAME.yaml`` chooses from."""
+    get_options = GlobalHydra.instance().config_loader().get_group_options
+    groups = []
+    other_files = []
+    for entry in OmegaConf.load(config_folder() / f"{name}.yaml").defaults:
+        if OmegaConf.is_dict(entry):
+            groups += [key for key in entry if not key.startswith("override ")]
+        elif isinstance(entry, str) and entry != "_self_":
+            other_files.append(entry)
+    options = {group: get_options(group.partition("@")[0]) for group in sorted(groups)}
+    for other in other_files:
+        options |= group_options(other)
+    return options
 
 
 def help_text(name: str) -> str:
-    """Returns what ``gpmpc COMMAND --help`` prints: how it is used, its choices, every setting with its value."""
+    """Returns what ``gpmpc COMMAND --help`` prints: use, choices and settings."""
     choices = "\n".join(
         f"{key}: {', '.join(options)}" for key, options in group_options(name).items()
     )
     every = OmegaConf.to_yaml(compose(name))
     header = HydraConfig.get().help.header
-    return f"{header}\n\nChoices:\n\n{choices}\n\nEvery setting, with its default:\n\n{every}"
+    return (
+        f"{header}\n\nChoices:\n\n{choices}\n\n"
+        f"Every setting, with its default:\n\n{every}"
+    )
 
 
 def explain(error: Exception, name: str) -> str | None:
@@ -184,36 +189,46 @@ def explain(error: Exception, name: str) -> str | None:
         return _of_settings(error, name)
     if isinstance(error, OSError):
         return f"{error.filename}: {error.strerror}" if error.filename else str(error)
-    if name and isinstance(
-        error, TypeError | ValueError | ArithmeticError
-    ):  # a value that no check foresaw
+    # A value that no check foresaw.
+    if name and isinstance(error, TypeError | ValueError | ArithmeticError):
         reason = " ".join(str(error).split()) or type(error).__name__
         return f"{reason}; is a setting of the wrong kind? --debug shows where"
     return None
 
 
 def nearest(name: str, known: Iterable[str]) -> str:
-    """Returns what a misspelt name stands for, as a question; of a name without dots the last parts are compared."""
-    part = (lambda key: key) if "." in name else (lambda key: key.rpartition(".")[2])
+    """Returns what a misspelt name may stand for, as a question.
+
+    Of a name without dots the last parts are compared.
+    """
+
+    def compared(key: str) -> str:
+        return key.lower() if "." in name else key.rpartition(".")[2].lower()
+
+    names = [*known]
     close = difflib.get_close_matches(
-        name.lower(), {part(key).lower() for key in known}, n=1
+        name.lower(), {compared(key) for key in names}, n=1
     )
-    meant = sorted(
-        (key for key in known if part(key).lower() in close),
-        key=lambda key: key.count("."),
-    )
-    meant = [key for key in meant if "." not in key] or meant[:3]
-    return f" (did you mean {' or '.join(map(repr, meant))}?)" if meant else ""
+    meant = [key for key in names if compared(key) in close]
+    meant.sort(key=lambda key: key.count("."))
+    without_dots = [key for key in meant if "." not in key]
+    shown = without_dots or meant[:3]
+    return f" (did you mean {' or '.join(map(repr, shown))}?)" if shown else ""
 
 
 def _of_settings(error: Exception, name: str) -> str:
-    """Returns an error of Hydra or OmegaConf in one line, in the words of this package where it is a common one."""
+    """Returns an error of Hydra or OmegaConf in one line.
+
+    A common one is said in the words of this package.
+    """
     text = str(error)
     if unknown := re.match(r"Could not override '([^']+)'", text):
         with settings():
-            return f"unknown setting {unknown[1]!r}{nearest(unknown[1], setting_names(name))}"
+            question = nearest(unknown[1], setting_names(name))
+        return f"unknown setting {unknown[1]!r}{question}"
     option = re.search(
-        r"Could not find '([^'/]+)/([^']+)'\s+Available options in '[^']+':\n((?:\t.*\n)+)",
+        r"Could not find '([^'/]+)/([^']+)'\s+"
+        r"Available options in '[^']+':\n((?:\t.*\n)+)",
         text,
     )
     if option and (extra := _EXTRAS.get(option[2].removeprefix("launcher/"))):
@@ -223,14 +238,18 @@ def _of_settings(error: Exception, name: str) -> str:
         available = f"available are {', '.join(known)}{nearest(option[2], known)}"
         return f"{option[1]}: no such option {option[2]!r}; {available}"
     if isinstance(error, OverrideParseException):
-        rule = f"{error.override!r}: cannot be read; a setting is written SETTING=VALUE"
-        return f"{rule}, in single quotes where the value holds brackets, braces, commas or spaces"
+        return (
+            f"{error.override!r}: cannot be read; a setting is written SETTING=VALUE, "
+            "in single quotes where the value holds brackets, braces, commas or spaces"
+        )
     if unlocated := re.match(r"Error locating target '([^']+)'", text):
         return f"_target_: no such class or function {unlocated[1]!r}"
     if isinstance(error, MissingMandatoryValue):
-        return f"{error.full_key}: this setting has no default; give it as {error.full_key}=VALUE"
+        key = error.full_key
+        return f"{key}: this setting has no default; give it as {key}=VALUE"
     if ambiguous := re.match(r"Ambiguous value for argument '([^=]+)=([^']+)'", text):
-        listed = f"{ambiguous[1]}: a list is written in brackets, {ambiguous[1]}=[{ambiguous[2]}]"
+        key = ambiguous[1]
+        listed = f"{key}: a list is written in brackets, {key}=[{ambiguous[2]}]"
         return f"{listed}; a sweep takes -m" if name == "run" else listed
     lines = [
         line.strip()
@@ -241,7 +260,7 @@ def _of_settings(error: Exception, name: str) -> str:
 
 
 def own_error(error: BaseException | None) -> GpmpcError | None:
-    """Returns the error of this package that another one was raised from, or is; None where there is none."""
+    """Returns the error of this package that another one is, or was raised from."""
     while error is not None and not isinstance(error, GpmpcError):
         error = error.__cause__
     return error
@@ -250,4 +269,5 @@ def own_error(error: BaseException | None) -> GpmpcError | None:
 def one_line(error: BaseException) -> str:
     """Returns the reason of an error in one line."""
     ours = own_error(error)
-    return " ".join((str(ours) if ours else f"{type(error).__name__}: {error}").split())
+    reason = f"{type(error).__name__}: {error}" if ours is None else str(ours)
+    return " ".join(reason.split())

@@ -1,4 +1,7 @@
-"""Standard streams that may be closed, full, or left by their reader; the console and progress bar of long commands."""
+"""Guards the standard streams, and makes the console and bar of long commands.
+
+The streams may be closed, full, or left by their reader.
+"""
 
 import logging
 import os
@@ -11,9 +14,8 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.progress import Progress
 
-_SEARCH = (
-    "gpmpc.gp._search"  # logs single evaluations, where a bar says how far the work is
-)
+# Logs single evaluations, where a bar says how far the work is.
+_SEARCH = "gpmpc.gp._search"
 
 
 class Output:
@@ -38,12 +40,11 @@ class Output:
         except OSError as error:
             if not self.broken:
                 self.broken = True
-                os.dup2(
-                    os.open(os.devnull, os.O_WRONLY), self._stream.fileno()
-                )  # for what is still in its buffer
-                if not isinstance(
-                    error, BrokenPipeError
-                ):  # the reader of a pipe, such as head, has seen enough
+                # For what is still in its buffer.
+                nowhere = os.open(os.devnull, os.O_WRONLY)
+                os.dup2(nowhere, self._stream.fileno())
+                # The reader of a pipe, such as head, may have seen enough.
+                if not isinstance(error, BrokenPipeError):
                     print_error(
                         f"cannot write to the standard output: {error.strerror}"
                     )
@@ -52,11 +53,13 @@ class Output:
 
 @contextmanager
 def usable_streams() -> Iterator[None]:
-    """Makes both streams exist and take every letter; where the standard output takes nothing, the command ends."""
+    """Makes both streams exist and take every letter.
+
+    Where the standard output takes nothing, the command ends.
+    """
     for name in ("stdout", "stderr"):
-        if (
-            getattr(sys, name) is None
-        ):  # closed; else the next file that is opened would take its place
+        # The next file that is opened would take the place of a closed one.
+        if getattr(sys, name) is None:
             setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115
         with suppress(AttributeError):  # not of a file
             getattr(sys, name).reconfigure(errors="backslashreplace")
@@ -75,13 +78,17 @@ def usable_streams() -> Iterator[None]:
 
 @contextmanager
 def redirected_output(to: str) -> Iterator[None]:
-    """Sends the standard output of this process and of those started inside to "output", "error" or "nowhere"."""
+    """Sends the standard output to "output", "error" or "nowhere".
+
+    Likewise that of the processes that are started inside.
+    """
     if to == "output":
         yield
         return
     sys.stdout.flush()
     before = os.dup(1)
-    os.dup2(2 if to == "error" else os.open(os.devnull, os.O_WRONLY), 1)
+    target = 2 if to == "error" else os.open(os.devnull, os.O_WRONLY)
+    os.dup2(target, 1)
     try:
         yield
     finally:
@@ -96,7 +103,10 @@ def print_error(line: str) -> None:
 
 
 def logging_console() -> "Console":
-    """Returns a console that the package's log lines go to as well, each text once, without a search's evaluations."""
+    """Returns a console that the log lines of the package go to as well.
+
+    Each text goes there once, and a search's evaluations do not.
+    """
     from rich.console import Console
     from rich.logging import RichHandler
 
@@ -123,7 +133,7 @@ def logging_console() -> "Console":
 def progress_bar(
     console: "Console", completed: Callable[[], int] | None = None
 ) -> "Progress":
-    """Returns a bar with how much is done, for how long, and how long it will still take.
+    """Returns a bar with how much is done, since when, and how long it will take.
 
     ``completed`` says how much is done, whenever the bar is drawn; by default its task
     is told.
