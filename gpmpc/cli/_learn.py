@@ -73,7 +73,7 @@ def _learn_and_judge(
     held_out: Log,
     folder: Path,
     console: Console,
-) -> tuple[Learned, Judgement]:
+) -> tuple[IdentifiedModel, Judgement]:
     """Learns with a memory of finished stages, and judges what was learned."""
     memory = _FileMemory(folder / "progress.json", _fingerprint(arguments, train))
     if memory.begun_anew:
@@ -245,7 +245,7 @@ def _table_of_intervals(judgement: Judgement) -> Table:
     return Table(["steps ahead", *judgement.groups], rows, title)
 
 
-def _table_of_candidates(learned: Learned, judgement: Judgement) -> Table:
+def _table_of_candidates(learned: IdentifiedModel, judgement: Judgement) -> Table:
     rows = []
     for candidate in learned.candidates:
         errors = [" / ".join(map(number, column)) for column in candidate.errors.T]
@@ -293,7 +293,9 @@ def _card(
     )
 
 
-def _facts(learned: Learned, train: Log, held_out: Log) -> list[tuple[str, Any]]:
+def _facts(
+    learned: IdentifiedModel, train: Log, held_out: Log
+) -> list[tuple[str, Any]]:
     """Returns what a model is, and what made it."""
     origin = provenance()
     chosen = [candidate.name for candidate in learned.candidates if candidate.chosen]
@@ -310,7 +312,7 @@ def _facts(learned: Learned, train: Log, held_out: Log) -> list[tuple[str, Any]]
     ]
 
 
-def _outputs(learned: Learned) -> list[str]:
+def _outputs(learned: IdentifiedModel) -> list[str]:
     """Returns for every output whether a GP learned its residual."""
     names = learned.model.kinematics.output_names
     with_gp = {names[i] for gp in learned.model.gps for i in gp.outputs}
@@ -325,7 +327,7 @@ def _outputs(learned: Learned) -> list[str]:
     return lines
 
 
-def _doubts(learned: Learned, judgement: Judgement) -> list[str]:
+def _doubts(learned: IdentifiedModel, judgement: Judgement) -> list[str]:
     """Returns what must not be trusted."""
     nominal = learned.model.nominal
     doubts = [f"Loses to a baseline: {loss}" for loss in judgement.losses]

@@ -1,6 +1,7 @@
 """Draws the results; the only package that imports matplotlib.
 
-Every function returns a ``Figure`` made without pyplot, so nothing global is touched and no window opens.
+Every function returns a ``Figure`` made without pyplot, so nothing global is touched
+and no window opens.
 """
 
 from gpmpc.plotting._animation import animate

@@ -1,8 +1,9 @@
-"""Animates a flight: where the vehicle was, what it planned, and how certain the plan was.
+"""Animates a flight: the way flown, the plan, and how certain the plan was.
 
-Left the whole flight from above (x, y) and its height, right what the controller saw: its plan with 2-sigma ellipses of
-the predicted positions. These are often far smaller than the plan is long; they are then drawn enlarged, and the factor
-is written into the picture.
+Left the whole flight from above (x, y) and its height, right what the controller saw:
+its plan with 2-sigma ellipses of the predicted positions. These are often far smaller
+than the plan is long; they are then drawn enlarged, and the factor is written into the
+picture.
 """
 
 from collections.abc import Callable
@@ -22,9 +23,11 @@ from gpmpc.plotting._style import DASHED, FLOWN, PLAN, REFERENCE, TUBE, styled
 if TYPE_CHECKING:
     from gpmpc.recording import Run
 
-_FRAMES, _RATE = 150, 15  # at most so many, steps are left out evenly; frames a second
+_FRAMES = 150  # at most; steps are left out evenly
+_RATE = 15  # frames a second
 _FACTORS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
-_VISIBLE = 0.06  # an ellipse's half axis, as a share of the view, from which on it is large enough
+# Half axis of an ellipse, as a share of the view, from which on it is large enough.
+_VISIBLE = 0.06
 
 
 def animate(run: "Run", path: str | Path) -> None:
@@ -87,7 +90,8 @@ def _scene(run: "Run") -> tuple[Figure, Callable[[int], None]]:
         axis.set_aspect("equal", adjustable="box")
     (dashes,) = height.plot(run.times, sign * run.references[:, up], **dashed)
     height.set(xlabel="time [s]", ylabel=f"height, {axis_name} [m]")
-    # The last plans lead on from where the flight ends; those of failed solves may be anywhere.
+    # The last plans lead on from where the flight ends; those of failed solves may be
+    # anywhere.
     drawn = np.concatenate([states, references, plans[whole & ~run.failed[:, None]]])
     low = drawn.min(axis=0)
     high = drawn.max(axis=0)

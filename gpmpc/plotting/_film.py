@@ -1,4 +1,4 @@
-"""Films a recorded flight of a MuJoCo model, rendered without a screen: vehicle, reference, plan and its tube."""
+"""Films a recorded flight of a MuJoCo model, rendered without a screen."""
 
 import os
 from importlib import import_module
@@ -32,27 +32,30 @@ def film(
     frames: int = 100,
     enlarged: float = 1.0,
 ) -> None:
-    """Writes a flight as MuJoCo renders it, as a GIF, or as an MP4 by the file's ending.
+    """Writes a flight as MuJoCo renders it, as a GIF or an MP4 by the file's ending.
 
     Reference, plan and tube are drawn where the recording's ``pose`` has x, y and z.
 
     Args:
         run: A recording.
-        system: What flew: its ``dynamics`` have a MuJoCo ``model``, and ``positions`` from a state (n,) to those of the
-            model's joints (nq,), as a system of joints has.
+        system: What flew: its ``dynamics`` have a MuJoCo ``model``, and ``positions``
+            from a state (n,) to those of the model's joints (nq,), as a system of
+            joints has.
         path: The file, .gif or .mp4 (which needs ffmpeg).
         frames: At most so many; steps are left out evenly.
         enlarged: Factor of the tube's 2-sigma ellipsoids.
 
     Raises:
         SettingError: There is no off-screen rendering here.
-        UnsupportedModel: The system is none of MuJoCo whose state says where its joints are, or no step was recorded.
+        UnsupportedModel: The system is none of MuJoCo whose state says where its joints
+            are, or no step was recorded.
     """
     if not len(run.times) or not (
         hasattr(system.dynamics, "model") and hasattr(system.dynamics, "positions")
     ):
         raise UnsupportedModel(
-            f"{run.path}: a film needs steps of a MuJoCo model, and its joints' positions"
+            f"{run.path}: a film needs steps of a MuJoCo model, "
+            "and its joints' positions"
         )
     try:
         mujoco = import_module("mujoco")
@@ -62,8 +65,11 @@ def film(
         ).GLContext(_WIDTH, _HEIGHT)
         context.make_current()
     except Exception as error:  # of ctypes, of PyOpenGL, of a driver
-        what = "no off-screen rendering by MuJoCo here; gpmpc.plotting.animate draws flights without it"
-        raise SettingError("film", f"{what} ({error})") from error
+        raise SettingError(
+            "film",
+            "no off-screen rendering by MuJoCo here; gpmpc.plotting.animate draws "
+            f"flights without it ({error})",
+        ) from error
     try:
         scene = _Scene(mujoco, run, system.dynamics, enlarged)
         figure = Figure(figsize=(_WIDTH / 80, _HEIGHT / 80))
@@ -91,7 +97,7 @@ def film(
 
 
 class _Scene:
-    """What is rendered of one step."""
+    """The scene of a flight, rendered step by step."""
 
     def __init__(self, mujoco: Any, run: "Run", dynamics: Any, enlarged: float):
         self.mujoco = mujoco
@@ -99,10 +105,8 @@ class _Scene:
         self.positions = dynamics.positions
         self.enlarged = enlarged
         self.model = dynamics.model
-        self.data, self.scene = (
-            mujoco.MjData(self.model),
-            mujoco.MjvScene(self.model, 2000),
-        )
+        self.data = mujoco.MjData(self.model)
+        self.scene = mujoco.MjvScene(self.model, 2000)
         self.rendering = mujoco.MjrContext(
             self.model, mujoco.mjtFontScale.mjFONTSCALE_100
         )
@@ -115,7 +119,10 @@ class _Scene:
         self.thinned = run.references[:: max(1, len(run.times) // 300)][:, self.axes]
 
     def render(self, k: int) -> Array:
-        """The picture (height, width, 3) of step k; a camera follows what has a position."""
+        """Returns the picture (height, width, 3) of step k.
+
+        A camera follows a vehicle that has a position.
+        """
         mujoco = self.mujoco
         run = self.run
         self.data.qpos[:] = self.positions(run.states[k])
@@ -141,7 +148,7 @@ class _Scene:
         return pixels[::-1]
 
     def _draw_paths(self, k: int) -> None:
-        """Adds the reference, what was flown before step k, and the plan with its tube."""
+        """Adds the reference, the way flown so far, and the plan with its tube."""
         run = self.run
         plan = run.plan_means[k][:, self.axes]
         covariances = run.plan_covariances[k][:, self.axes][..., self.axes]

@@ -1,4 +1,4 @@
-"""Draws how far the predictions of a model can be believed, and what is in the log that it is learned from."""
+"""Draws how good the predictions of a model are, and what is in a log."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -32,7 +32,10 @@ _PER_PAGE = 24  # channels drawn
 
 @styled
 def calibration_figure(calibration: "Calibration") -> Figure:
-    """Coverage against its nominal level (dashed), log density and error over the steps ahead, a column a state."""
+    """Draws coverage, log density and error over the steps ahead, a column a state.
+
+    The nominal levels of coverage are dashed.
+    """
     n = len(calibration.names)
     steps = range(1, calibration.horizon + 1)
     order = sorted(range(len(calibration.levels)), key=calibration.levels.__getitem__)
@@ -87,7 +90,10 @@ def calibration_figure(calibration: "Calibration") -> Figure:
 def innovations_figure(
     run: "FilterRun", time_step: float = 1.0, names: list[str] | None = None
 ) -> Figure:
-    """Draws each measured value's innovations over their standard deviation, and the share outside of 95 %."""
+    """Draws the innovations of each measured value over their standard deviation.
+
+    The legend says how many are outside of 95 %.
+    """
     deviations = run.innovation_covariances.diagonal(dim1=-2, dim2=-1).sqrt()
     white = (run.innovations / deviations).cpu().numpy()
     p = white.shape[1]
@@ -107,7 +113,8 @@ def innovations_figure(
             if seen.any()
             else np.nan
         )
-        label = f"{outside:.1f} % outside (5 % expected), {100 * float((~seen).mean()):.0f} % missing"
+        missing = 100 * float((~seen).mean())
+        label = f"{outside:.1f} % outside (5 % expected), {missing:.0f} % missing"
         axis.plot(
             times[seen], white[seen, i], ".", color=BLUE, markersize=3, label=label
         )
@@ -121,7 +128,10 @@ def innovations_figure(
 
 @styled
 def judgement_figure(judgement: "Judgement") -> Figure:
-    """Draws the errors over the steps for every predictor, with coverage and width of the model's intervals below."""
+    """Draws the errors over the steps for every predictor.
+
+    Below stand coverage and width of the model's intervals.
+    """
     steps = judgement.steps
     n = len(judgement.groups)
     figure, axes = make_figure(

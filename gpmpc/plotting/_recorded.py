@@ -1,7 +1,7 @@
 """Figures of one recorded flight.
 
-Cao, Lai and Alam (2017), figures 2 to 4, show positions and inputs over time. The tube here is what the controller
-expected one step before, with two standard deviations.
+Cao, Lai and Alam (2017), figures 2 to 4, show positions and inputs over time. The tube
+here is what the controller expected one step before, with two standard deviations.
 """
 
 import textwrap
@@ -37,18 +37,19 @@ _STAGES = {"model": BLUE, "build": SKY, "solve": VERMILION}
 
 
 def expected(run: "Run", states: list[int]) -> tuple[np.ndarray, np.ndarray]:
-    """Means and standard deviations (K, j) that were predicted one step before; NaN where nothing was.
+    """Returns means and standard deviations (K, j) that were predicted one step before.
 
-    What is predicted is the state itself: the noise that the plan leaves out belongs to it.
+    NaN where nothing was.
+
+    What is predicted is the state itself: the noise that the plan leaves out belongs to
+    it.
     """
     mean, std = np.full((2, len(run.times), len(states)), np.nan)
     if run.plan_means.shape[1] > 1:
-        said = run.metadata.get("run", {}).get("noise_std", "").split()
-        noise = (
-            np.array(said, dtype=float)
-            if len(said) == len(run.state_names)
-            else np.zeros(len(run.state_names))
-        )
+        noise = np.zeros(len(run.state_names))
+        noise_std = run.metadata.get("run", {}).get("noise_std", "").split()
+        if len(noise_std) == len(noise):
+            noise = np.array(noise_std, dtype=float)
         mean[1:] = run.plan_means[:-1, 1, states]
         std[1:] = np.hypot(run.plan_stds[:-1, 1, states], noise[states])
     return mean, std
@@ -56,7 +57,10 @@ def expected(run: "Run", states: list[int]) -> tuple[np.ndarray, np.ndarray]:
 
 @styled
 def tracking_figure(run: "Run") -> Figure:
-    """Draws every tracked state and angle over time against its reference, and below it the error with the tube."""
+    """Draws every tracked state and angle over time against its reference.
+
+    Below it stands the error with the tube.
+    """
     said = run.metadata.get("run", {})
     names = list(run.state_names)
     units = run.metadata.get("units", {})
@@ -138,7 +142,7 @@ def inputs_figure(run: "Run") -> Figure:
 
 @styled
 def timing_figure(run: "Run") -> Figure:
-    """Draws where the time of every decision went, and how the totals are distributed."""
+    """Draws the parts of the time of every decision, and the totals' distribution."""
     milliseconds = 1e3 * run.timings
     widths = {"width_ratios": [3, 2]}
     figure, ((over_time, distribution),) = make_figure(
@@ -156,10 +160,10 @@ def timing_figure(run: "Run") -> Figure:
         )
         bottom = bottom + stage
     total = np.sort(milliseconds[:, -1])
-    total = (
-        total[total > 0] if total.any() else total
-    )  # a controller that was not asked took no time
-    # A first step that compiles, and those that waited for a core, would leave nothing to be seen of the others.
+    if total.any():
+        total = total[total > 0]  # a controller that was not asked took no time
+    # A first step that compiles, and those that waited for a core, would leave nothing
+    # to be seen of the others.
     most_of_them = float(np.quantile(total, 0.98, method="inverted_cdf"))
     ceiling = 1.15 * min(most_of_them, 5 * float(np.median(total))) or 1.0
     over_time.set(
@@ -196,26 +200,23 @@ def _edges(run: "Run") -> np.ndarray:
 
 
 def _duration(milliseconds: float) -> str:
-    return (
-        f"{milliseconds:.3g} ms"
-        if milliseconds < 999.5
-        else f"{milliseconds / 1e3:.3g} s"
-    )
+    if milliseconds < 999.5:
+        return f"{milliseconds:.3g} ms"
+    return f"{milliseconds / 1e3:.3g} s"
 
 
 def _title_of(run: "Run") -> str:
     """Returns what was run: the command, or the file."""
     command = run.metadata.get("run", {}).get("command", "")
-    return textwrap.fill(
-        command if command.startswith("gpmpc") else str(run.path),
-        90,
-        max_lines=2,
-        placeholder=" ...",
-    )
+    title = command if command.startswith("gpmpc") else str(run.path)
+    return textwrap.fill(title, 90, max_lines=2, placeholder=" ...")
 
 
 def _draw_bounds(axis: Axes, inputs: np.ndarray, bounds: np.ndarray) -> None:
-    """Draws lines where they are near; where they are so far that the input would be flat beside them, words."""
+    """Draws bounds as lines where they are near, else as words.
+
+    They are far where the input would be flat beside them.
+    """
     low = float(inputs.min())
     high = float(inputs.max())
     span = max(high - low, 1e-3 * max(abs(low), abs(high), 1e-3))
@@ -253,7 +254,7 @@ def _spans(steps: np.ndarray) -> list[tuple[int, int]]:
 
 
 def _mark_failures(run: "Run", *axes: Axes) -> None:
-    """Draws a mark at every step whose decision was not applied, and shades those that were suspicious or lost."""
+    """Marks steps whose decision was not applied; shades suspicious and lost ones."""
     edges = _edges(run).tolist()
     for axis in axes:
         for level, colour in _LEVELS.items():

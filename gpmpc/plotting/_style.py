@@ -1,7 +1,7 @@
-"""Sets how every figure looks: colours, lines, grid, type, names with units, legends below the axes, titles.
+"""Sets how every figure looks: colours, lines, names with units, legends, titles.
 
-``gpmpc.mplstyle`` holds matplotlib's own settings, for scripts too. Lines differ in their dashes as well as in their
-colours, so that a black and white print can be read.
+``gpmpc.mplstyle`` holds matplotlib's own settings, for scripts too. Lines differ in
+their dashes as well as in their colours, so that a black and white print can be read.
 """
 
 import io
@@ -16,8 +16,14 @@ from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-BLUE, VERMILION, GREEN, _PURPLE = "#0072b2", "#d55e00", "#009e73", "#cc79a7"
-ORANGE, SKY, BLACK, GREY = "#e69f00", "#56b4e9", "#000000", "0.45"
+BLUE = "#0072b2"
+VERMILION = "#d55e00"
+GREEN = "#009e73"
+_PURPLE = "#cc79a7"
+ORANGE = "#e69f00"
+SKY = "#56b4e9"
+BLACK = "#000000"
+GREY = "0.45"
 COLOURS = (BLUE, VERMILION, GREEN, _PURPLE, ORANGE, SKY, BLACK, GREY)
 FLOWN = BLUE
 REFERENCE = VERMILION
@@ -62,18 +68,18 @@ def make_figure(
 
 
 def name_of(name: str, unit: str = "", z_down: bool = True) -> str:
-    """Returns the full name of a state or input with its unit, such as ``z, downwards [m]``."""
+    """Returns the name of a state or input with its unit, as ``z, downwards [m]``."""
     full = "z, downwards" if name == "z" and z_down else _NAMES.get(name, name)
     return f"{full} [{unit}]" if unit not in ("", "1", "?") else full
 
 
 def clipped(text: str, most: int) -> str:
-    """Returns a text of at most so many characters, the rest of a longer one as dots."""
+    """Returns a text of at most ``most`` characters; a longer one ends in dots."""
     return text if len(text) <= most else f"{text[: most - 4]} ..."
 
 
 def plain_numbers(axis: Axis, few: bool) -> None:
-    """Labels a logarithmic axis by plain numbers; over few decades by 2 and 5 between them as well."""
+    """Labels a logarithmic axis by plain numbers; over few decades by 2 and 5 too."""
     axis.set_major_locator(
         LogLocator(subs=(1, 2, 5)) if few else LogLocator(numticks=5)
     )
@@ -82,7 +88,10 @@ def plain_numbers(axis: Axis, few: bool) -> None:
 
 
 def legend_below(figure: Figure, axes: Iterable[Axes]) -> None:
-    """Puts one legend for all axes below them, each label once, in as many columns as the figure's width holds."""
+    """Puts one legend for all axes below them, each label once.
+
+    It has as many columns as the figure's width holds.
+    """
     found = {
         label: handle
         for axis in axes
@@ -100,7 +109,7 @@ def legend_below(figure: Figure, axes: Iterable[Axes]) -> None:
 
 
 def png(figure: Figure, dpi: int = 150) -> bytes:
-    """The figure as PNG."""
+    """Returns the figure as PNG."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=dpi)
     return buffer.getvalue()

@@ -41,8 +41,9 @@ def over_variable(
 
     Args:
         title: Name of the variable.
-        positions: Its values, as text and in their order. Numbers stand at their place on the axis, which is
-            logarithmic where they span a decade, and medians over them are joined; words stand side by side.
+        positions: Its values, as text and in their order. Numbers stand at their place
+            on the axis, which is logarithmic where they span a decade, and medians over
+            them are joined; words stand side by side.
         label: Of the measure, with its unit.
         lines: What else was varied, a line each; those without a number are left out.
         logarithmic: Whether the axis is, where the values span enough for it.
@@ -73,13 +74,12 @@ def draw_quartiles(
     """Draws median, quartiles and every value of each line at each position."""
     numbers = _numbers(positions)
     wide = numbers is not None and numbers[0] > 0 and numbers[-1] >= 10 * numbers[0]
-    at = (
-        np.arange(float(len(positions)))
-        if numbers is None
-        else np.log10(numbers)
-        if wide
-        else numbers
-    )
+    if numbers is None:
+        at = np.arange(float(len(positions)))
+    elif wide:
+        at = np.log10(numbers)
+    else:
+        at = numbers
     gap = float(np.diff(at).min(initial=np.inf)) if len(at) > 1 else 1.0
 
     def place(x: np.ndarray) -> np.ndarray:
@@ -139,18 +139,16 @@ def _numbers(positions: Sequence[str]) -> np.ndarray | None:
         numbers = np.array([float(position) for position in positions])
     except ValueError:
         return None
-    return (
-        numbers
-        if np.isfinite(numbers).all() and len(set(numbers)) == len(numbers)
-        else None
-    )
+    if not np.isfinite(numbers).all() or len(set(numbers)) < len(numbers):
+        return None
+    return numbers
 
 
 @styled
 def search_figure(
     costs: Sequence[float], importances: Mapping[str, float], unchanged: float | None
 ) -> Figure:
-    """Draws the costs of a search over its candidates, and beside them how much each setting mattered.
+    """Draws the costs of a search over its candidates, and how much settings mattered.
 
     Args:
         costs: In the order of the candidates; infinite ones stand at the upper edge.

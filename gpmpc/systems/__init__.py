@@ -1,4 +1,4 @@
-"""Systems that are controlled: what they are called, how they move, how they are flown."""
+"""Systems that are controlled: their names, their dynamics, how they are flown."""
 
 from gpmpc.systems._quadrotor import (
     ATTITUDES,

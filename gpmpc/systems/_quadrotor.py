@@ -1,10 +1,11 @@
-"""The quadrotor of Cao, Lai and Alam (2017), whole and split into its translational and its rotational subsystem.
+"""The quadrotor of Cao, Lai and Alam (2017), whole and split into its two subsystems.
 
-Parameters are decoded from the authors' data. The z axis points downwards. The translational subsystem is driven by the
-total thrust U1 and by the direction (ux, uy) of the thrust, which the attitude has to provide; the rotational subsystem
-provides it, driven by the moments' forces U2, U3, U4. The paper's x and y accelerate *along* (ux, uy), so they point
-against those of the aerospace convention, and its angles' rates are taken for the body rates, which is good for small
-angles.
+Parameters are decoded from the authors' data. The z axis points downwards. The
+translational subsystem is driven by the total thrust U1 and by the direction (ux, uy)
+of the thrust, which the attitude has to provide; the rotational subsystem provides it,
+driven by the moments' forces U2, U3, U4. The paper's x and y accelerate *along* (ux,
+uy), so they point against those of the aerospace convention, and its angles' rates are
+taken for the body rates, which is good for small angles.
 """
 
 import math
@@ -30,7 +31,9 @@ _ANGLE_UNITS = dict.fromkeys(("phi", "theta", "psi"), "rad") | dict.fromkeys(
 _FOLLOWS_POSITIONS: dict[str, Any] = {
     "tracked": ("x", "y", "z"),
     "rates": {"vx": "x", "vy": "y", "vz": "z"},
-    "lost": 10.0,  # a hundred times what a controlled one is off; twice where a fifth more mass than learned holds it
+    # a hundred times what a controlled one is off; twice where a fifth more mass than
+    # learned holds it
+    "lost": 10.0,
     "z_down": True,
 }
 
@@ -43,8 +46,9 @@ class Translational:
     """
 
     mass: float = 0.74  #: [kg]
-    #: Roll and pitch [rad] whose cos(phi) cos(theta) multiplies the vertical thrust; the paper's data hold both at
-    #: pi/4. None takes the factor of the inputs at psi = 0, cos(phi) cos(theta) = sqrt(1 - ux^2 - uy^2).
+    #: Roll and pitch [rad] whose cos(phi) cos(theta) multiplies the vertical thrust;
+    #: the paper's data hold both at pi/4. None takes the factor of the inputs at psi =
+    #: 0, cos(phi) cos(theta) = sqrt(1 - ux^2 - uy^2).
     frozen_attitude: tuple[float, float] | None = None
 
     state_names = ("x", "vx", "y", "vy", "z", "vz")
@@ -58,25 +62,27 @@ class Translational:
 
     def derivative(self, x: Any, u: Any) -> list[Any]:
         """d/dt (x, vx, y, vy, z, vz) [m/s, m/s^2]."""
+        vx, vy, vz = x[1], x[3], x[5]
+        ux, uy = u[1], u[2]
         thrust = u[0] / self.mass  # U1 / m [m/s^2]
         if self.frozen_attitude is None:
-            # No direction with ux^2 + uy^2 > 1 exists; there the thrust is horizontal: max(s, 0) = (s + |s|) / 2.
-            # The two small terms keep both roots differentiable where their argument would be zero.
-            squared = 1 - u[1] * u[1] - u[2] * u[2]
-            vertical = (
-                (squared + (squared * squared + 1e-24) ** 0.5) / 2 + 1e-12
-            ) ** 0.5
+            vertical = _vertical_direction(ux, uy)
         else:
             roll, pitch = self.frozen_attitude
             vertical = math.cos(roll) * math.cos(pitch)
-        return [
-            x[1],
-            u[1] * thrust,
-            x[3],
-            u[2] * thrust,
-            x[5],
-            GRAVITY - vertical * thrust,
-        ]
+        return [vx, ux * thrust, vy, uy * thrust, vz, GRAVITY - vertical * thrust]
+
+
+def _vertical_direction(ux: Any, uy: Any) -> Any:
+    """Returns the vertical entry of a thrust direction, sqrt(1 - ux^2 - uy^2).
+
+    No direction with ux^2 + uy^2 > 1 exists; there the thrust is horizontal:
+    max(s, 0) = (s + |s|) / 2. The two small terms keep both roots differentiable where
+    their argument would be zero.
+    """
+    squared = 1 - ux * ux - uy * uy
+    magnitude = (squared * squared + 1e-24) ** 0.5
+    return ((squared + magnitude) / 2 + 1e-12) ** 0.5
 
 
 @dataclass(frozen=True)
@@ -87,12 +93,10 @@ class Rotational:
     """
 
     arm: float = 0.21  #: distance l from the centre of mass to a rotor [m]
-    inertia: tuple[float, float, float] = (
-        0.005,
-        0.005,
-        0.0089,
-    )  #: principal moments Ixx, Iyy, Izz [kg m^2]
-    #: the rotors' gyroscopic terms Jr W / Ixx and Jr W / Iyy, at their constant speed W [1/s]
+    #: principal moments Ixx, Iyy, Izz [kg m^2]
+    inertia: tuple[float, float, float] = (0.005, 0.005, 0.0089)
+    #: the rotors' gyroscopic terms Jr W / Ixx and Jr W / Iyy, at their constant speed W
+    #: [1/s]
     gyroscopic: tuple[float, float] = (0.01102, 0.01102)
 
     state_names = ("phi", "p", "theta", "q", "psi", "r")
@@ -105,7 +109,8 @@ class Rotational:
 
     def derivative(self, x: Any, u: Any) -> list[Any]:
         """d/dt (phi, p, theta, q, psi, r) [rad/s, rad/s^2]."""
-        (p, q, r), (ixx, iyy, izz) = (x[1], x[3], x[5]), self.inertia
+        p, q, r = x[1], x[3], x[5]
+        ixx, iyy, izz = self.inertia
         # [-]
         a1 = (iyy - izz) / ixx
         a3 = (izz - ixx) / iyy
@@ -115,22 +120,24 @@ class Rotational:
         b1 = self.arm / ixx
         b2 = self.arm / iyy
         b3 = self.arm / izz
-        roll = a1 * q * r + a2 * q + b1 * u[0]
-        pitch = a3 * p * r - a4 * p + b2 * u[1]
-        return [p, roll, q, pitch, r, a5 * p * q + b3 * u[2]]
+        p_dot = a1 * q * r + a2 * q + b1 * u[0]
+        q_dot = a3 * p * r - a4 * p + b2 * u[1]
+        r_dot = a5 * p * q + b3 * u[2]
+        return [p, p_dot, q, q_dot, r, r_dot]
 
 
 @dataclass(frozen=True)
 class Coupled:
-    """Position, velocity, attitude and body rates, driven by the thrust and the moments' forces.
+    """Position, velocity, attitude and body rates, driven by thrust and moments.
 
-    States x, vx, y, vy, z, vz [m, m/s], phi, p, theta, q, psi, r [rad, rad/s]; inputs U1, U2, U3, U4 [N].
+    States x, vx, y, vy, z, vz [m, m/s], phi, p, theta, q, psi, r [rad, rad/s]; inputs
+    U1, U2, U3, U4 [N].
     """
 
-    mass: float = 0.74  #: of the vehicle [kg]
-    rotational: Rotational = field(
-        default_factory=Rotational
-    )  #: the rotational subsystem
+    #: of the vehicle [kg]
+    mass: float = 0.74
+    #: the rotational subsystem
+    rotational: Rotational = field(default_factory=Rotational)
 
     state_names = Translational.state_names + Rotational.state_names
     input_names = ("U1", *Rotational.input_names)
@@ -140,25 +147,29 @@ class Coupled:
 
     def derivative(self, x: Any, u: Any) -> list[Any]:
         """d/dt of the twelve states [m/s, m/s^2, rad/s, rad/s^2]."""
-        ux, uy, vertical = thrust_direction(x[6], x[8], x[10])
+        vx, vy, vz = x[1], x[3], x[5]
+        phi, theta, psi = x[6], x[8], x[10]
+        ux, uy, vertical = thrust_direction(phi, theta, psi)
         thrust = u[0] / self.mass  # U1 / m [m/s^2]
-        turning = self.rotational.derivative(
-            [x[i] for i in range(6, 12)], [u[1], u[2], u[3]]
-        )
+        attitude = [x[i] for i in range(6, 12)]
+        attitude_dot = self.rotational.derivative(attitude, [u[1], u[2], u[3]])
         return [
-            x[1],
+            vx,
             ux * thrust,
-            x[3],
+            vy,
             uy * thrust,
-            x[5],
+            vz,
             GRAVITY - vertical * thrust,
-            *turning,
+            *attitude_dot,
         ]
 
 
 @dataclass(frozen=True)
 class Map:
-    """Reads a right-hand side as the next state, x[k+1] = f(x[k], u[k]): the data of Cao, Lai and Alam (2017) do."""
+    """Reads a right-hand side as the next state, x[k+1] = f(x[k], u[k]).
+
+    The data of Cao, Lai and Alam (2017) do.
+    """
 
     dynamics: Any  #: the right-hand side f
 
@@ -174,7 +185,10 @@ class Map:
 def translational(
     time_step: float = 1.0, substeps: int = 1, **parameters: Any
 ) -> System:
-    """Makes the translational subsystem; one Runge-Kutta substep is exact, its acceleration follows from the input."""
+    """Makes the translational subsystem.
+
+    One Runge-Kutta substep is exact: its acceleration follows from the input.
+    """
     return System(
         Translational(**parameters),
         time_step,
@@ -193,7 +207,10 @@ def translational(
 def rotational(
     time_step: float = 0.05, substeps: int = 10, **parameters: Any
 ) -> System:
-    """Makes the rotational subsystem at 20 Hz; a trajectory prescribes the attitudes that a flight along it needs."""
+    """Makes the rotational subsystem at 20 Hz.
+
+    A trajectory prescribes the attitudes that a flight along it needs.
+    """
     return System(
         Rotational(**parameters),
         time_step,
@@ -215,7 +232,10 @@ def rotational(
 def coupled(
     mass: float = 0.74, time_step: float = 0.05, substeps: int = 2, **parameters: Any
 ) -> System:
-    """Makes the whole quadrotor at the rate of its inner loop, of a mass [kg] and ``parameters`` of ``Rotational``."""
+    """Makes the whole quadrotor at the rate of its inner loop.
+
+    Its mass is in kg, and ``parameters`` are those of ``Rotational``.
+    """
     return System(
         Coupled(mass, Rotational(**parameters)),
         time_step,
@@ -234,7 +254,10 @@ def coupled(
 
 
 def thrust_direction(phi: Any, theta: Any, psi: Any) -> tuple[Any, Any, Any]:
-    """The unit vector along the thrust (ux, uy, lift) [-] of roll, pitch and yaw [rad]; Cao et al. (2017), eq. (2)."""
+    """Returns the unit vector along the thrust, (ux, uy, lift) [-].
+
+    Of roll, pitch and yaw [rad]; Cao et al. (2017), eq. (2).
+    """
     ux = cos(phi) * sin(theta) * cos(psi) + sin(phi) * sin(psi)
     uy = cos(phi) * sin(theta) * sin(psi) - sin(phi) * cos(psi)
     return ux, uy, cos(phi) * cos(theta)
@@ -246,11 +269,13 @@ def attitude_for_thrust_direction(
     psi: np.ndarray | float = 0.0,
     convention: str = "exact",
 ) -> np.ndarray:
-    """Roll and pitch (*batch, 2) [rad] that point the thrust along (ux, uy) at a yaw psi, by eq. (2) inverted.
+    """Returns roll and pitch (*batch, 2) [rad] that point the thrust along (ux, uy).
 
-    Turned by -psi, eq. (2) is that of psi = 0, where ux = cos(phi) sin(theta) and uy = -sin(phi) give phi = -asin(uy)
-    and theta = asin(ux / cos(phi)). The authors' data hold theta = sign(phi) asin(ux) instead, which the convention
-    ``"paper"`` takes in the place of ``"exact"``; any other is a ``SettingError``. ux and uy saturate at 1 and -1.
+    This is eq. (2) inverted, at a yaw psi. Turned by -psi, eq. (2) is that of psi = 0,
+    where ux = cos(phi) sin(theta) and uy = -sin(phi) give phi = -asin(uy) and theta =
+    asin(ux / cos(phi)). The authors' data hold theta = sign(phi) asin(ux) instead,
+    which the convention ``"paper"`` takes in the place of ``"exact"``; any other is a
+    ``SettingError``. ux and uy saturate at 1 and -1.
     """
     check_choice("attitude", convention, ATTITUDES)
     ux, uy = ux * np.cos(psi) + uy * np.sin(psi), uy * np.cos(psi) - ux * np.sin(psi)
@@ -269,45 +294,46 @@ def attitude_for_thrust_direction(
 def attitudes_along(
     trajectory: Trajectory, count: int, outer_step: float = OUTER_STEP
 ) -> np.ndarray:
-    """Roll and pitch (count, 2) [rad], one an outer step, that point the thrust where the trajectory needs it.
+    """Returns roll and pitch (count, 2) [rad] along a trajectory, one an outer step.
 
-    Between two outer steps the velocity has to change by v[k+1] - v[k], so the thrust has to give the mean acceleration
-    a = (v[k+1] - v[k]) / T beside the weight: U1 / m = |a - g e_z|, ux = a_x / (U1 / m), uy = a_y / (U1 / m).
+    Between two outer steps the velocity has to change by v[k+1] - v[k], so the thrust
+    has to give the mean acceleration a = (v[k+1] - v[k]) / T beside the weight: U1 / m
+    = |a - g e_z|, ux = a_x / (U1 / m), uy = a_y / (U1 / m).
     """
     velocities = trajectory.velocity(outer_step * np.arange(count + 1))
-    force = np.diff(velocities, axis=0) / outer_step - [
-        0.0,
-        0.0,
-        GRAVITY,
-    ]  # over the mass [m/s^2]
-    direction = force / np.maximum(
-        np.linalg.norm(force, axis=1, keepdims=True), 1e-12
-    )  # of a free fall: none
+    accelerations = np.diff(velocities, axis=0) / outer_step
+    thrust = accelerations - [0.0, 0.0, GRAVITY]  # over the mass [m/s^2]
+    magnitude = np.linalg.norm(thrust, axis=1, keepdims=True)
+    direction = thrust / np.maximum(magnitude, 1e-12)  # of a free fall: none
     return attitude_for_thrust_direction(direction[:, 0], direction[:, 1])
 
 
 def approach_attitudes(
     angles: np.ndarray, count: int, hold: int, time_step: float, response_time: float
 ) -> np.ndarray:
-    """Rotational states (count, 6) that approach attitudes one after another at first order, as ``Cascade`` asks it to.
+    """Returns rotational states (count, 6) that approach attitudes at first order.
 
-    Roll and pitch (K, 2) [rad], from the first of them on, are asked for ``hold`` inner steps each; times [s].
+    As ``Cascade`` asks it to: roll and pitch (K, 2) [rad], from the first of them on,
+    are the target for ``hold`` inner steps each; times [s].
     """
-    left = np.exp(-time_step / response_time)  # of the way, after one step
+    decay = np.exp(-time_step / response_time)  # of the error, in one step
     states = np.zeros((count, 6))
-    at = angles[0]
+    attitude = angles[0]
     for j in range(count):
-        wanted = angles[j // hold]
-        states[j, [0, 2]] = at
-        states[j, [1, 3]] = (wanted - at) / response_time
-        at = wanted + left * (at - wanted)
+        target = angles[j // hold]
+        states[j, [0, 2]] = attitude
+        states[j, [1, 3]] = (target - attitude) / response_time
+        attitude = target + decay * (attitude - target)
     return states
 
 
 def rotational_states_along(
     trajectory: Trajectory, count: int, time_step: float
 ) -> np.ndarray:
-    """Rotational states phi, p, theta, q, psi, r (count, 6) [rad, rad/s], one an inner step, of a flight along it."""
+    """Returns the rotational states of a flight along a trajectory.
+
+    phi, p, theta, q, psi, r (count, 6) [rad, rad/s], one an inner step.
+    """
     hold = max(1, round(OUTER_STEP / time_step))
     angles = attitudes_along(trajectory, -(-count // hold))
     return approach_attitudes(angles, count, hold, time_step, RESPONSE_TIME)

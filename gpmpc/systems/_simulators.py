@@ -1,4 +1,4 @@
-"""What systems of foreign simulators have in common: they move on by themselves, from where they stand."""
+"""Base of the systems of foreign simulators, which move on from where they stand."""
 
 from importlib import import_module
 from typing import Any
@@ -11,7 +11,11 @@ Array = np.ndarray
 
 
 def library(name: str) -> Any:
-    """Imports a library of the extra ``sim``; ``SettingError`` where it is not installed."""
+    """Imports a library of the extra ``sim``.
+
+    Raises:
+        SettingError: It is not installed.
+    """
     try:
         return import_module(name)
     except ImportError as error:
@@ -21,7 +25,11 @@ def library(name: str) -> Any:
 
 
 def numbers(x: Any, u: Any) -> tuple[Array, Array]:
-    """Returns states and inputs as arrays; ``SettingError`` where they are no numbers."""
+    """Returns states and inputs as arrays.
+
+    Raises:
+        SettingError: They are no numbers.
+    """
     try:
         return np.array(x, dtype=float), np.array(u, dtype=float)
     except (TypeError, ValueError, NotImplementedError) as error:
@@ -45,9 +53,10 @@ class Simulator:
         return self._now.copy()
 
     def successor(self, x: Any, u: Any) -> Array:
-        """Steps the simulator from a state (n,) with an input (m,); returns the next state.
+        """Returns the next state after a step from a state (n,) with an input (m,).
 
-        ``SettingError`` where it does not stand in that state and cannot be set to it, or x and u are no numbers.
+        ``SettingError`` where it does not stand in that state and cannot be set to it,
+        or x and u are no numbers.
         """
         state, input = numbers(x, u)
         if state.ndim != 1:

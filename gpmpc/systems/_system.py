@@ -1,4 +1,4 @@
-"""Describes a system that is controlled: how it moves, what its states and inputs are called, how it is flown."""
+"""Describes a system that is controlled: its dynamics, its names, how it is flown."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -27,83 +27,111 @@ UNKNOWN = "?"  # the unit of a state or an input that has none given
 
 @dataclass(frozen=True, eq=False)
 class System:
-    """A discrete-time system; whatever a run, a report, a recording or a figure says of it comes from here.
+    """A discrete-time system, with all that reports, recordings and figures say of it.
 
-    Its ``dynamics`` have the names of the n states and m inputs, in order (``state_names``, ``input_names``), and one
-    method of two: ``derivative(x, u)``, the n entries of dx/dt, or ``successor(x, u)``, those of the next state. They
-    are written once, with plain arithmetic on the entries of x and u, so that floats, NumPy arrays and CasADi
-    expressions all pass through the same formula; ``sin``, ``cos`` and ``exp`` are for all of them. A right-hand side
-    is integrated with the input held constant, by the Runge-Kutta method of order four on equal substeps.
+    Its ``dynamics`` have the names of the n states and m inputs, in order
+    (``state_names``, ``input_names``), and one method of two: ``derivative(x, u)``, the
+    n entries of dx/dt, or ``successor(x, u)``, those of the next state. They are
+    written once, with plain arithmetic on the entries of x and u, so that floats, NumPy
+    arrays and CasADi expressions all pass through the same formula; ``sin``, ``cos``
+    and ``exp`` are for all of them. A right-hand side is integrated with the input held
+    constant, by the Runge-Kutta method of order four on equal substeps.
 
     Raises:
-        SettingError: A number out of range, an unknown name, tracked states of several units, or dynamics without a
-            finite value where the system starts.
-        ShapeError: A list has another length than there are states or inputs, or the dynamics have.
+        SettingError: A number out of range, an unknown name, tracked states of several
+            units, or dynamics without a finite value where the system starts.
+        ShapeError: A list has another length than there are states or inputs, or the
+            dynamics have.
     """
 
-    dynamics: Any  #: names of states and inputs, and how it moves
-    time_step: float = cast(float, None)  #: sampling time [s]; it has to be said
-    substeps: int = 10  #: Runge-Kutta steps per sampling time
-    name: str = ""  #: what it is called; by default as the class of its dynamics
-    units: Mapping[str, str] = field(
-        default_factory=dict
-    )  #: by name of state or input, such as ``{"x": "m"}``
-    input_lower: Any = None  #: smallest inputs (m,); None where there is no limit
-    input_upper: Any = None  #: largest inputs (m,)
-    initial_input: Any = None  #: the input before the first step (m,), such as the one at rest; zero by default
-    start: Any = None  #: where a flight begins (n,); on its reference by default
-    goal: Any = None  #: the state that is held where no trajectory is followed (n,); zero by default
-    region: Any = (
-        None  #: smallest and largest states that random data start from (2, n)
-    )
-    angles: Sequence[
-        str
-    ] = ()  #: states whose errors are taken within half a turn [rad]
-    #: states that a trajectory prescribes and errors are reported of, in one unit; by default all in that of the first
+    #: names of states and inputs, and how it moves
+    dynamics: Any
+    #: sampling time [s]; it has to be said
+    time_step: float = cast(float, None)
+    #: Runge-Kutta steps per sampling time
+    substeps: int = 10
+    #: what it is called; by default as the class of its dynamics
+    name: str = ""
+    #: by name of state or input, such as ``{"x": "m"}``
+    units: Mapping[str, str] = field(default_factory=dict)
+    #: smallest inputs (m,); None where there is no limit
+    input_lower: Any = None
+    #: largest inputs (m,)
+    input_upper: Any = None
+    #: the input before the first step (m,), such as the one at rest; zero by default
+    initial_input: Any = None
+    #: where a flight begins (n,); on its reference by default
+    start: Any = None
+    #: the state that is held where no trajectory is followed (n,); zero by default
+    goal: Any = None
+    #: smallest and largest states that random data start from (2, n)
+    region: Any = None
+    #: states whose errors are taken within half a turn [rad]
+    angles: Sequence[str] = ()
+    #: states that a trajectory prescribes and errors are reported of, in one unit; by
+    #: default all in that of the first
     tracked: Sequence[str] = ()
-    #: for a state, the tracked one that it is the time derivative of, such as ``{"vx": "x"}``
+    #: for a state, the tracked one that it is the time derivative of, such as
+    #: ``{"vx": "x"}``
     rates: Mapping[str, str] = field(default_factory=dict)
-    #: a flight is not lost while its tracked states are nearer than this to their reference, in their unit; with
-    #: infinity only one that leaves the finite numbers is
+    #: a flight is not lost while its tracked states are nearer than this to their
+    #: reference, in their unit; with infinity only one that leaves the finite numbers
+    #: is
     lost: float = inf
-    #: from a trajectory, a count K and the time step to reference states (K, n), where a trajectory prescribes
-    #: something other than tracked states
+    #: from a trajectory, a count K and the time step to reference states (K, n), where
+    #: a trajectory prescribes something other than tracked states
     references: Callable[[Trajectory, int, float], Array] | None = None
-    #: states that say where it is in space and how it is turned, by x, y, z, roll, pitch, yaw; pictures show it there
+    #: states that say where it is in space and how it is turned, by x, y, z, roll,
+    #: pitch, yaw; pictures show it there
     pose: Mapping[str, str] = field(default_factory=dict)
-    z_down: bool = False  #: whether the z axis of that space points downwards
-    #: what is known of it before anything is learned, as a system with its states, inputs and time step; a model of
-    #: differences learns what it misses
+    #: whether the z axis of that space points downwards
+    z_down: bool = False
+    #: what is known of it before anything is learned, as a system with its states,
+    #: inputs and time step; a model of differences learns what it misses
     nominal: "System | None" = None
 
     def __post_init__(self) -> None:
         check_number("time_step", self.time_step, above=0, unit="[s]")
         check_number("substeps", self.substeps, least=1, whole=True)
-        states, inputs = (
-            _names(self.dynamics, key) for key in ("state_names", "input_names")
-        )
-        n = len(states)
-        m = len(inputs)
-        every = (*states, *inputs)
+        states = _names(self.dynamics, "state_names")
+        inputs = _names(self.dynamics, "input_names")
         self._set("name", self.name or type(self.dynamics).__name__)
-        if unknown := set(self.units) - {*every}:
+        self._complete_units((*states, *inputs))
+        self._complete_tracked(states)
+        if self.lost != inf:
+            check_number("lost", self.lost, above=0)
+        self._complete_vectors(states, inputs)
+        if self.nominal is not None and self.nominal.signals != self.signals:
             raise SettingError(
-                "units",
-                f"must be of {', '.join(every)}; got {', '.join(sorted(unknown))}",
+                "nominal",
+                f"must have the states, inputs and time step {self.signals}; "
+                f"got {self.nominal.signals}",
             )
-        self._set("units", {name: self.units.get(name, UNKNOWN) for name in every})
-        tracked = self.tracked or [
-            name for name in states if self.units[name] == self.units[states[0]]
-        ]
-        for key, names in (("angles", self.angles), ("tracked", tracked)):
-            self._set(key, tuple(names))
-        named = {
-            "angles": self.angles,
-            "tracked": self.tracked,
-            "rates": self.rates,
-            "pose": self.pose.values(),
-        }
-        for key, names in named.items():
+        self._check_dynamics()
+
+    def _complete_units(self, names: Sequence[str]) -> None:
+        """Gives every state and input a unit."""
+        unknown = sorted({*self.units} - {*names})
+        if unknown:
+            raise SettingError(
+                "units", f"must be of {', '.join(names)}; got {', '.join(unknown)}"
+            )
+        self._set("units", {name: self.units.get(name, UNKNOWN) for name in names})
+
+    def _complete_tracked(self, states: Sequence[str]) -> None:
+        """Says which states are tracked, and checks every setting that names states."""
+        tracked = self.tracked
+        if not tracked:
+            unit = self.units[states[0]]
+            tracked = [name for name in states if self.units[name] == unit]
+        self._set("angles", tuple(self.angles))
+        self._set("tracked", tuple(tracked))
+        for key, names in (
+            ("angles", self.angles),
+            ("tracked", self.tracked),
+            ("rates", self.rates),
+            ("pose", self.pose.values()),
+        ):
             for name in names:
                 if name not in states:
                     raise SettingError(
@@ -113,45 +141,50 @@ class System:
             if name not in self.tracked:
                 raise SettingError(
                     "rates",
-                    f"must be of tracked states, {', '.join(self.tracked)}; got {name!r}",
+                    f"must be of tracked states, {', '.join(self.tracked)}; "
+                    f"got {name!r}",
                 )
-        if len(found := {self.units[name] for name in self.tracked}) > 1:
+        units = sorted({self.units[name] for name in self.tracked})
+        if len(units) > 1:
             raise SettingError(
-                "tracked", f"must be states of one unit; got {', '.join(sorted(found))}"
+                "tracked", f"must be states of one unit; got {', '.join(units)}"
             )
-        if self.lost != inf:
-            check_number("lost", self.lost, above=0)
-        for key, default, names in (
-            ("input_lower", (-inf,) * m, inputs),
-            ("input_upper", (inf,) * m, inputs),
-            ("initial_input", (0.0,) * m, inputs),
-            ("goal", (0.0,) * n, states),
-        ):
-            given = getattr(self, key)
-            self._set(key, default if given is None else _floats(key, given, names))
-        if any(
-            low > high
-            for low, high in zip(self.input_lower, self.input_upper, strict=True)
-        ):
+
+    def _complete_vectors(self, states: Sequence[str], inputs: Sequence[str]) -> None:
+        """Turns limits, input, goal, start and region into tuples of floats."""
+        n = len(states)
+        m = len(inputs)
+        self._set_floats("input_lower", inputs, default=(-inf,) * m)
+        self._set_floats("input_upper", inputs, default=(inf,) * m)
+        self._set_floats("initial_input", inputs, default=(0.0,) * m)
+        self._set_floats("goal", states, default=(0.0,) * n)
+        self._set_floats("start", states, default=None)
+        limits = zip(self.input_lower, self.input_upper, strict=True)
+        if any(lower > upper for lower, upper in limits):
             raise SettingError(
                 "input_lower, input_upper",
                 f"must not cross; got {self.input_lower, self.input_upper}",
             )
-        if self.start is not None:
-            self._set("start", _floats("start", self.start, states))
-        if self.region is not None:
-            if len(self.region) != 2:
-                raise SettingError(
-                    "region",
-                    f"must be the smallest and the largest states; got {self.region!r}",
-                )
-            self._set(
-                "region", tuple(_floats("region", side, states) for side in self.region)
+        if self.region is None:
+            return
+        if len(self.region) != 2:
+            raise SettingError(
+                "region",
+                f"must be the smallest and the largest states; got {self.region!r}",
             )
-        if self.nominal is not None and self.nominal.signals != self.signals:
-            rule = f"must have the states, inputs and time step {self.signals}"
-            raise SettingError("nominal", f"{rule}; got {self.nominal.signals}")
-        self._check_dynamics()
+        smallest, largest = self.region
+        self._set(
+            "region",
+            (
+                _floats("region", smallest, states),
+                _floats("region", largest, states),
+            ),
+        )
+
+    def _set_floats(self, key: str, names: Sequence[str], default: Any) -> None:
+        """Replaces a list of numbers, one a name, by a tuple; None by the default."""
+        values = getattr(self, key)
+        self._set(key, default if values is None else _floats(key, values, names))
 
     def _set(self, key: str, value: Any) -> None:
         object.__setattr__(self, key, value)
@@ -168,7 +201,7 @@ class System:
 
     @cached_property
     def signals(self) -> Signals:
-        """Names of states and inputs, and time step: what data and models of it carry."""
+        """Names of states and inputs, and time step, as data and models carry them."""
         return Signals(self.state_names, self.input_names, self.time_step)
 
     @property
@@ -192,10 +225,13 @@ class System:
         return [self.state_names.index(name) for name in self.angles]
 
     def successor(self, x: Any, u: Any) -> list[Any]:
-        """The n entries of x[k+1], from the entries of x[k] and u[k]: floats, arrays, or symbols.
+        """Returns the n entries of x[k+1], from the entries of x[k] and u[k].
+
+        They may be floats, arrays or symbols.
 
         Raises:
-            ShapeError: The dynamics have another number of entries than there are states.
+            ShapeError: The dynamics have another number of entries than there are
+                states.
         """
         if hasattr(self.dynamics, "successor"):
             return list(self._check_length("successor", self.dynamics.successor(x, u)))
@@ -214,10 +250,13 @@ class System:
         return x
 
     def reference_states(self, trajectory: Trajectory | None, count: int) -> Array:
-        """Computes the states to follow (count, n), one per time step; the goal where there is no trajectory.
+        """Returns the states to follow (count, n), one per time step.
+
+        They are the goal where there is no trajectory.
 
         Raises:
-            ShapeError: The trajectory prescribes another number of states than are tracked.
+            ShapeError: The trajectory prescribes another number of states than are
+                tracked.
         """
         if trajectory is None:
             return np.tile(np.array(self.goal), (count, 1))
@@ -234,22 +273,28 @@ class System:
         states[:, self.tracked_indices] = positions
         if self.rates:
             velocities = trajectory.velocity(times)
-            for name, of in self.rates.items():
-                states[:, self.state_names.index(name)] = velocities[
-                    :, self.tracked.index(of)
-                ]
+            for rate, position in self.rates.items():
+                column = self.state_names.index(rate)
+                states[:, column] = velocities[:, self.tracked.index(position)]
         return states
 
     def _check_length(self, method: str, entries: Any) -> Any:
-        got = len(entries) if hasattr(entries, "__len__") else type(entries).__name__
-        if got != (n := len(self.dynamics.state_names)):
+        n = len(self.dynamics.state_names)
+        count: Any = type(entries).__name__
+        if hasattr(entries, "__len__"):
+            count = len(entries)
+        if count != n:
             raise ShapeError(
-                f"{method} must give {n} entries, one for each of state_names; got {got}"
+                f"{method} must give {n} entries, one for each of state_names; "
+                f"got {count}"
             )
         return entries
 
     def _check_dynamics(self) -> None:
-        """Evaluates the dynamics once, where the system starts; a simulator under way a step would move."""
+        """Evaluates the dynamics once, where the system starts.
+
+        A simulator under way is left alone: a step would move it.
+        """
         if not (
             hasattr(self.dynamics, "derivative") or hasattr(self.dynamics, "successor")
         ):
@@ -276,12 +321,13 @@ class System:
             if not isfinite(entry):
                 raise SettingError(
                     "dynamics",
-                    f"must be finite at state {x}, input {u}; {name} is {entry} after it",
+                    f"must be finite at state {x}, input {u}; "
+                    f"{name} is {entry} after it",
                 )
 
 
 def step(plant: System, state: Array, input: Array) -> Array:
-    """The next state (n,) of a plant from a state (n,) and an input (m,).
+    """Returns the next state (n,) of a plant from a state (n,) and an input (m,).
 
     >>> from gpmpc.systems import pendulum
     >>> step(pendulum(), [0.1, 0.0], [0.0]).round(3).tolist()
@@ -291,27 +337,34 @@ def step(plant: System, state: Array, input: Array) -> Array:
         ShapeError: State or input are of another length.
         DataError: They are no real numbers, or have other names than the plant's.
     """
-    names = plant.dynamics.state_names, plant.dynamics.input_names
-    state = read_array("state", state, names[0])
-    input = read_array("input", input, names[1])
-    shapes = ((len(names[0]),), (len(names[1]),))
-    if (found := (np.shape(state), np.shape(input))) != shapes:
+    state_names = plant.dynamics.state_names
+    input_names = plant.dynamics.input_names
+    state = read_array("state", state, state_names)
+    input = read_array("input", input, input_names)
+    state_shape = (len(state_names),)
+    input_shape = (len(input_names),)
+    if np.shape(state) != state_shape or np.shape(input) != input_shape:
         raise ShapeError(
-            f"state and input must have shapes {shapes[0]} and {shapes[1]}; got {found[0]} and {found[1]}"
+            f"state and input must have shapes {state_shape} and {input_shape}; "
+            f"got {np.shape(state)} and {np.shape(input)}"
         )
     return np.array(plant.successor(state, input), dtype=float)
 
 
 def step_many(plant: System, states: Array, inputs: Array) -> Array:
-    """The next states (T, n) of T copies of a plant, from states (T, n) and inputs (T, m), in one evaluation."""
+    """Returns the next states (T, n) of T copies of a plant, in one evaluation.
+
+    Args:
+        plant: What is stepped.
+        states: (T, n).
+        inputs: (T, m).
+    """
     entries = call_dynamics(plant.successor, states.T, inputs.T)
-    return np.stack(
-        [
-            np.broadcast_to(np.asarray(entry, dtype=float), len(states))
-            for entry in entries
-        ],
-        axis=1,
-    )
+    columns = [
+        np.broadcast_to(np.asarray(entry, dtype=float), len(states))
+        for entry in entries
+    ]
+    return np.stack(columns, axis=1)
 
 
 def sin(angle: Any) -> Any:
@@ -330,10 +383,11 @@ def exp(value: Any) -> Any:
 
 
 def _names(dynamics: Any, key: str) -> tuple[str, ...]:
+    """Returns the names of the states or inputs of dynamics."""
     names = getattr(dynamics, key, None)
-    listed = isinstance(names, Sequence) and not isinstance(names, str)
+    is_list = isinstance(names, Sequence) and not isinstance(names, str)
     if (
-        not listed
+        not is_list
         or not names
         or not all(isinstance(name, str) for name in names)
         or len(set(names)) < len(names)

@@ -1,7 +1,8 @@
-"""Systems of textbooks: double integrator, pendulums, cart-pole, planar quadrotor and a stirred-tank reactor.
+"""Systems of textbooks, from the double integrator to a stirred-tank reactor.
 
-Angles are zero where a pole or a link stands upright, positive anticlockwise. Each function makes a system with a time
-step [s]; its other arguments are the attributes of the right-hand side.
+Angles are zero where a pole or a link stands upright, positive anticlockwise. Each
+function makes a system with a time step [s]; its other arguments are the attributes of
+the right-hand side.
 """
 
 from collections.abc import Sequence
@@ -14,19 +15,21 @@ from gpmpc.systems._system import GRAVITY, System, cos, exp, sin
 
 
 class _Body:
-    """Checks that every number is positive, or none below zero where its name stands in ``may_be_zero``."""
+    """Checks that every number is positive; those in ``may_be_zero`` may be zero."""
 
     may_be_zero: tuple[str, ...] = ()
     words: tuple[str, ...] = ()  # attributes that are no numbers
 
     def __post_init__(self) -> None:
         for key, value in vars(self).items():
-            limits: dict[str, Any] = {
-                "least" if key in self.may_be_zero else "above": 0
-            }
+            if key in self.words:
+                continue
             numbers = value if isinstance(value, tuple | list) else [value]
-            for number in () if key in self.words else numbers:
-                check_number(key, number, **limits)
+            for number in numbers:
+                if key in self.may_be_zero:
+                    check_number(key, number, least=0)
+                else:
+                    check_number(key, number, above=0)
 
 
 @dataclass(frozen=True)
@@ -40,7 +43,9 @@ class DoubleIntegrator(_Body):
 
     def derivative(self, x: Any, u: Any) -> list[Any]:
         """d/dt (position, velocity) [m/s, m/s^2]."""
-        return [x[1], u[0] / self.mass]
+        velocity = x[1]
+        force = u[0]
+        return [velocity, force / self.mass]
 
 
 def double_integrator(time_step: float = 0.1, **parameters: float) -> System:
@@ -74,12 +79,13 @@ class Pendulum(_Body):
 
     def derivative(self, x: Any, u: Any) -> list[Any]:
         """d/dt (angle, rate) [rad/s, rad/s^2]."""
-        torque = (
-            self.mass * GRAVITY * self.length / 2 * sin(x[0])
-            - self.damping * x[1]
-            + u[0]
-        )
-        return [x[1], torque / (self.mass * self.length**2 / 3)]
+        angle = x[0]
+        rate = x[1]
+        inertia = self.mass * self.length**2 / 3
+        weight = self.mass * GRAVITY * self.length / 2 * sin(angle)
+        friction = self.damping * rate
+        torque = weight - friction + u[0]
+        return [rate, torque / inertia]
 
 
 def pendulum(time_step: float = 0.05, **parameters: float) -> System:
@@ -93,10 +99,8 @@ def pendulum(time_step: float = 0.05, **parameters: float) -> System:
         input_lower=[-2.0],
         input_upper=[2.0],
         start=[pi, 0.0],
-        region=[
-            [-2.0, -8.0],
-            [2 * pi + 2, 8.0],
-        ],  # around the whole circle, hanging in the middle
+        # around the whole circle, hanging in the middle
+        region=[[-2.0, -8.0], [2 * pi + 2, 8.0]],
         angles=["angle"],
         rates={"rate": "angle"},
     )
@@ -104,7 +108,10 @@ def pendulum(time_step: float = 0.05, **parameters: float) -> System:
 
 @dataclass(frozen=True)
 class CartPole(_Body):
-    """A pole hinged to a cart on a line (Barto, Sutton and Anderson, 1983, without friction)."""
+    """A pole hinged to a cart on a line (Barto, Sutton and Anderson, 1983).
+
+    There is no friction.
+    """
 
     cart_mass: float = 1.0  #: [kg]
     pole_mass: float = 0.1  #: of the uniform pole [kg]
@@ -115,19 +122,24 @@ class CartPole(_Body):
 
     def derivative(self, x: Any, u: Any) -> list[Any]:
         """d/dt (position, velocity, angle, rate) [m/s, m/s^2, rad/s, rad/s^2]."""
-        total = self.cart_mass + self.pole_mass
-        moment = self.pole_mass * self.half_length
+        velocity = x[1]
+        rate = x[3]
         s = sin(x[2])
         c = cos(x[2])
-        push = (u[0] + moment * x[3] * x[3] * s) / total
-        turn = (GRAVITY * s - c * push) / (
-            self.half_length * (4 / 3 - self.pole_mass * c * c / total)
-        )
-        return [x[1], push - moment * turn * c / total, x[3], turn]
+        m = self.pole_mass
+        length = self.half_length
+        total = self.cart_mass + m
+        push = (u[0] + m * length * rate * rate * s) / total
+        rate_dot = (GRAVITY * s - c * push) / (length * (4 / 3 - m * c * c / total))
+        velocity_dot = push - m * length * rate_dot * c / total
+        return [velocity, velocity_dot, rate, rate_dot]
 
 
 def cart_pole(time_step: float = 0.05, **parameters: float) -> System:
-    """Makes a cart-pole whose pole hangs at first; its angle is positive towards growing positions."""
+    """Makes a cart-pole whose pole hangs at first.
+
+    Its angle is positive towards growing positions.
+    """
     return System(
         CartPole(**parameters),
         time_step,
@@ -152,24 +164,24 @@ def cart_pole(time_step: float = 0.05, **parameters: float) -> System:
 
 @dataclass(frozen=True)
 class DoublePendulum(_Body):
-    """Two links in a vertical plane with a torque at one joint (Spong, 1995, eqs. (1)-(2)).
+    """Two links in a vertical plane with a torque at one joint.
 
-    ``shoulder`` is the angle of the first link from upright, ``elbow`` that of the second from the first. The numbers
-    are those identified for design C.1, model 1.1 of the RealAIGym league (Wiebe et al., 2024; inertias were published
-    about the joints, 0.031887 and 0.050870), whose second link is 0.3 m long; there is no friction.
+    The equations are (1) and (2) of Spong (1995).
+
+    ``shoulder`` is the angle of the first link from upright, ``elbow`` that of the
+    second from the first. The numbers are those identified for design C.1, model 1.1 of
+    the RealAIGym league (Wiebe et al., 2024; inertias were published about the joints,
+    0.031887 and 0.050870), whose second link is 0.3 m long; there is no friction.
     """
 
     masses: Sequence[float] = (0.5234602302, 0.6255677234)  #: of the links [kg]
     first_length: float = 0.2  #: of the first link [m]
-    centres: Sequence[float] = (
-        0.2,
-        0.2556930544,
-    )  #: from each link's joint to its centre of mass [m]
-    inertias: Sequence[float] = (
-        0.0109487904,
-        0.0099708947,
-    )  #: of the links about their centres of mass [kg m^2]
-    actuated: Literal["elbow", "shoulder"] = "elbow"  #: an acrobot, or a pendubot
+    #: from each link's joint to its centre of mass [m]
+    centres: Sequence[float] = (0.2, 0.2556930544)
+    #: of the links about their centres of mass [kg m^2]
+    inertias: Sequence[float] = (0.0109487904, 0.0099708947)
+    #: an acrobot, or a pendubot
+    actuated: Literal["elbow", "shoulder"] = "elbow"
 
     state_names = ("shoulder", "shoulder_rate", "elbow", "elbow_rate")
     input_names = ("torque",)
@@ -181,36 +193,30 @@ class DoublePendulum(_Body):
 
     def derivative(self, x: Any, u: Any) -> list[Any]:
         """d/dt (shoulder, shoulder_rate, elbow, elbow_rate) [rad/s, rad/s^2]."""
-        (m1, m2), (c1, c2), (i1, i2), l1 = (
-            self.masses,
-            self.centres,
-            self.inertias,
-            self.first_length,
-        )
-        a = x[0]
-        da = x[1]
-        b = x[2]
-        db = x[3]
-        # D (dda, ddb) + h + phi = torques
+        a, a_dot, b, b_dot = x[0], x[1], x[2], x[3]
+        m1, m2 = self.masses
+        c1, c2 = self.centres
+        i1, i2 = self.inertias
+        l1 = self.first_length
+        # D (a_ddot, b_ddot) = r: the torques less those of speeds and of weights
         coupling = m2 * l1 * c2
         d11 = m1 * c1**2 + m2 * (l1**2 + c2**2) + 2 * coupling * cos(b) + i1 + i2
         d12 = m2 * c2**2 + coupling * cos(b) + i2
         d22 = m2 * c2**2 + i2
-        fall = -m2 * c2 * GRAVITY * sin(a + b)
-        r1 = (
-            coupling * sin(b) * (2 * da * db + db * db)
-            + (m1 * c1 + m2 * l1) * GRAVITY * sin(a)
-            - fall
-        )
-        r2 = -coupling * sin(b) * da * da - fall
-        r1, r2 = (r1, r2 + u[0]) if self.actuated == "elbow" else (r1 + u[0], r2)
+        weight1 = (m1 * c1 + m2 * l1) * GRAVITY * sin(a)
+        weight2 = -m2 * c2 * GRAVITY * sin(a + b)
+        speeds1 = coupling * sin(b) * (2 * a_dot * b_dot + b_dot * b_dot)
+        speeds2 = -coupling * sin(b) * a_dot * a_dot
+        r1 = speeds1 + weight1 - weight2
+        r2 = speeds2 - weight2
+        if self.actuated == "elbow":
+            r2 = r2 + u[0]
+        else:
+            r1 = r1 + u[0]
         determinant = d11 * d22 - d12 * d12
-        return [
-            da,
-            (d22 * r1 - d12 * r2) / determinant,
-            db,
-            (d11 * r2 - d12 * r1) / determinant,
-        ]
+        a_ddot = (d22 * r1 - d12 * r2) / determinant
+        b_ddot = (d11 * r2 - d12 * r1) / determinant
+        return [a_dot, a_ddot, b_dot, b_ddot]
 
 
 def acrobot(
@@ -219,9 +225,16 @@ def acrobot(
     time_step: float = 0.05,
     torque: float = 10.0,
 ) -> System:
-    """Makes an acrobot that hangs at first (Spong, 1995, and its table); ``torque`` is its largest [N m]."""
-    links = DoublePendulum(masses, first_length, (0.5, 1.0), (0.083, 0.33))
-    return _two_links("acrobot", links, time_step, 10, torque, (4.0, 6.0))
+    """Makes an acrobot that hangs at first (Spong, 1995, and its table).
+
+    ``torque`` is its largest [N m].
+    """
+    links = DoublePendulum(
+        masses, first_length, centres=(0.5, 1.0), inertias=(0.083, 0.33)
+    )
+    return _two_links(
+        "acrobot", links, time_step, substeps=10, torque=torque, rates=(4.0, 6.0)
+    )
 
 
 def double_pendulum(
@@ -230,9 +243,19 @@ def double_pendulum(
     torque: float = 6.0,
     **parameters: Any,
 ) -> System:
-    """Makes the double pendulum of the RealAIGym league, which hangs at first; ``torque`` is its largest [N m]."""
+    """Makes the double pendulum of the RealAIGym league, which hangs at first.
+
+    ``torque`` is its largest [N m].
+    """
     links = DoublePendulum(actuated=actuated, **parameters)
-    return _two_links("double_pendulum", links, time_step, 2, torque, (20.0, 30.0))
+    return _two_links(
+        "double_pendulum",
+        links,
+        time_step,
+        substeps=2,
+        torque=torque,
+        rates=(20.0, 30.0),
+    )
 
 
 def _two_links(
@@ -243,18 +266,19 @@ def _two_links(
     torque: float,
     rates: tuple[float, float],
 ) -> System:
+    """Makes a system of two links; random data start up to ``rates`` [rad/s]."""
     return System(
         links,
         time_step,
         substeps,
         name=name,
-        units=dict(
-            zip(
-                (*links.state_names, "torque"),
-                ("rad", "rad/s", "rad", "rad/s", "N m"),
-                strict=True,
-            )
-        ),
+        units={
+            "shoulder": "rad",
+            "shoulder_rate": "rad/s",
+            "elbow": "rad",
+            "elbow_rate": "rad/s",
+            "torque": "N m",
+        },
         input_lower=[-torque],
         input_upper=[torque],
         start=[pi, 0.0, 0.0, 0.0],
@@ -277,9 +301,13 @@ class PlanarQuadrotor(_Body):
 
     def derivative(self, x: Any, u: Any) -> list[Any]:
         """d/dt (x, vx, y, vy, tilt, tilt_rate) [m/s, m/s^2, rad/s, rad/s^2]."""
-        lift = (u[0] + u[1]) / self.mass
-        turn = self.arm * (u[0] - u[1]) / self.inertia
-        return [x[1], -lift * sin(x[4]), x[3], lift * cos(x[4]) - GRAVITY, x[5], turn]
+        vx, vy, tilt, tilt_rate = x[1], x[3], x[4], x[5]
+        right, left = u[0], u[1]
+        lift = (right + left) / self.mass
+        vx_dot = -lift * sin(tilt)
+        vy_dot = lift * cos(tilt) - GRAVITY
+        tilt_rate_dot = self.arm * (right - left) / self.inertia
+        return [vx, vx_dot, vy, vy_dot, tilt_rate, tilt_rate_dot]
 
 
 def planar_quadrotor(time_step: float = 0.05, **parameters: float) -> System:
@@ -298,8 +326,9 @@ def planar_quadrotor(time_step: float = 0.05, **parameters: float) -> System:
             "vx": "m/s",
             "vy": "m/s",
             "tilt_rate": "rad/s",
-        }
-        | {"right": "N", "left": "N"},
+            "right": "N",
+            "left": "N",
+        },
         input_lower=[0.0, 0.0],
         input_upper=[weight, weight],  # of each rotor: twice the weight together
         initial_input=[weight / 2, weight / 2],
@@ -314,10 +343,11 @@ def planar_quadrotor(time_step: float = 0.05, **parameters: float) -> System:
 
 @dataclass(frozen=True)
 class StirredTank(_Body):
-    """A continuous stirred-tank reactor with an exothermic reaction A -> B at first order, steered by its coolant.
+    """A stirred tank with an exothermic reaction A -> B, steered by its coolant.
 
-    The reactor of Henson and Seborg (1997, Nonlinear Process Control, chapter 1). Its operating point, 0.5 mol/L at
-    350 K and 300 K of the coolant, is unstable. Times are in seconds here, in minutes there.
+    The reactor of Henson and Seborg (1997, Nonlinear Process Control, chapter 1). Its
+    operating point, 0.5 mol/L at 350 K and 300 K of the coolant, is unstable. Times are
+    in seconds here, in minutes there.
     """
 
     flow: float = 100.0  #: of the feed [L/min]
@@ -335,23 +365,24 @@ class StirredTank(_Body):
 
     def derivative(self, x: Any, u: Any) -> list[Any]:
         """d/dt (concentration, temperature) [mol/(L s), K/s]."""
+        concentration, temperature, coolant = x[0], x[1], u[0]
         # per minute
         exchange = self.flow / self.volume
-        reaction = self.rate * exp(-self.activation / x[1]) * x[0]
-        cooling = self.transfer / (self.volume * self.capacity) * (u[0] - x[1])
-        warming = (
-            exchange * (self.feed_temperature - x[1])
-            + self.heat / self.capacity * reaction
-            + cooling
-        )
-        return [
-            (exchange * (self.feed_concentration - x[0]) - reaction) / 60,
-            warming / 60,
-        ]
+        reaction = self.rate * exp(-self.activation / temperature) * concentration
+        feeding = exchange * (self.feed_concentration - concentration)
+        feed_heating = exchange * (self.feed_temperature - temperature)
+        reaction_heating = self.heat / self.capacity * reaction
+        transfer = self.transfer / (self.volume * self.capacity)
+        coolant_heating = transfer * (coolant - temperature)
+        heating = feed_heating + reaction_heating + coolant_heating
+        return [(feeding - reaction) / 60, heating / 60]
 
 
 def stirred_tank(time_step: float = 3.0, **parameters: float) -> System:
-    """Makes the reactor, which is to leave its stable point of low conversion for the unstable one."""
+    """Makes the reactor, which starts at its stable point of low conversion.
+
+    Its goal is the unstable point.
+    """
     return System(
         StirredTank(**parameters),
         time_step,

@@ -1,7 +1,8 @@
-"""Takes a gymnasium environment as a system, and offers this package's systems as gymnasium environments.
+"""Takes gymnasium environments as systems, and offers systems as environments.
 
-An environment moves on by itself: it is stepped from where it stands, and set to another state only where it can be (a
-MuJoCo environment whose observation is qpos, qvel). Where it ends an episode, a flight is lost. Needs ``gpmpc[sim]``.
+An environment moves on by itself: it is stepped from where it stands, and set to
+another state only where it can be (a MuJoCo environment whose observation is qpos,
+qvel). Where it ends an episode, a flight is lost. Needs ``gpmpc[sim]``.
 """
 
 from collections.abc import Callable, Sequence
@@ -23,8 +24,9 @@ OURS = (
     "double_pendulum",
     "pendulum",
     "planar_quadrotor",
+    "stirred_tank",
+    "translational",
 )
-OURS += ("stirred_tank", "translational")
 
 
 class _Environment(Simulator):
@@ -65,9 +67,10 @@ class _Environment(Simulator):
         m = len(action.low)
         self.state_names = tuple(state_names or [f"x{i + 1}" for i in range(n)])
         self.input_names = tuple(input_names or [f"u{i + 1}" for i in range(m)])
-        if (found := (len(self.state_names), len(self.input_names))) != (n, m):
+        if (len(self.state_names), len(self.input_names)) != (n, m):
             raise ShapeError(
-                f"state_names and input_names must be {n} and {m} names; got {found[0]} and {found[1]}"
+                f"state_names and input_names must be {n} and {m} names; "
+                f"got {len(self.state_names)} and {len(self.input_names)}"
             )
 
     def _reset(self, seed: int) -> Array:
@@ -94,10 +97,9 @@ class _Environment(Simulator):
         return True
 
     def _state(self, observation: Any) -> Array:
-        state = np.array(
-            observation if self._observe is None else self._observe(observation),
-            dtype=float,
-        )
+        if self._observe is not None:
+            observation = self._observe(observation)
+        state = np.array(observation, dtype=float)
         if state.ndim != 1:
             raise ShapeError(f"observe must give a state (n,); got {state.shape}")
         return state
@@ -116,23 +118,23 @@ def gymnasium_system(
 
     Args:
         environment: Its name, such as ``"InvertedPendulum-v5"``, or one that was made.
-        observe: From an observation to the state (n,); the observation itself by default.
+        observe: From an observation to the state (n,); the observation itself by
+            default.
         state_names: Of the state; x1, x2, ... by default.
         input_names: Of the action; u1, u2, ... by default.
         time_step: [s]; by default the environment's ``dt``.
         make: Further arguments of ``gymnasium.make``.
-        settings: Of ``System``, such as ``units``, ``tracked`` and ``goal``; the environment limits the inputs.
+        settings: Of ``System``, such as ``units``, ``tracked`` and ``goal``; the
+            environment limits the inputs.
 
     Raises:
-        SettingError: There is no such environment, its spaces are not boxes of one dimension, or it gives no time step.
+        SettingError: There is no such environment, its spaces are not boxes of one
+            dimension, or it gives no time step.
         ShapeError: Names do not fit it.
     """
     dynamics = _Environment(environment, observe, state_names, input_names, make or {})
-    time_step = (
-        getattr(dynamics.environment.unwrapped, "dt", None)
-        if time_step is None
-        else time_step
-    )
+    if time_step is None:
+        time_step = getattr(dynamics.environment.unwrapped, "dt", None)
     if time_step is None:
         raise SettingError("time_step", "is not known of this environment; say it [s]")
     lower, upper = dynamics.limits
@@ -145,10 +147,12 @@ def gymnasium_system(
 
 
 def make_environment(system: System | str, **settings: Any) -> Any:
-    """Makes a gymnasium environment of a system, or of one of this package's by name and settings.
+    """Makes a gymnasium environment of a system.
 
-    The observation is the state. The reward is minus the squared distance of the tracked states from the goal; an
-    episode ends where they are farther from it than at the start, and than ``System.lost``.
+    The system may be one of this package's, by name and settings. The observation is
+    the state. The reward is minus the squared distance of the tracked states from the
+    goal; an episode ends where they are farther from it than at the start, and than
+    ``System.lost``.
     """
     gymnasium = library("gymnasium")
     flown: System = (
@@ -176,11 +180,10 @@ def make_environment(system: System | str, **settings: Any) -> Any:
             """Starts where the system starts, or from its region."""
             super().reset(seed=seed)
             region: Any = flown.region if flown.start is None else None
-            start: Any = (
-                flown.start or flown.goal
-                if region is None
-                else self.np_random.uniform(*region)
-            )
+            start: Any = flown.start or flown.goal
+            if region is not None:
+                lower, upper = region
+                start = self.np_random.uniform(lower, upper)
             self.state = np.array(start, dtype=float)
             self._limit = max(flown.lost, 1.001 * self._distance())
             return self.state.copy(), {}
@@ -193,13 +196,9 @@ def make_environment(system: System | str, **settings: Any) -> Any:
             with np.errstate(over="ignore", invalid="ignore"):
                 self.state = step(flown, self.state, action)
             distance = self._distance()
-            return (
-                self.state.copy(),
-                -(distance**2),
-                not distance <= self._limit,
-                False,
-                {},
-            )
+            reward = -(distance**2)
+            terminated = not distance <= self._limit
+            return self.state.copy(), reward, terminated, False, {}
 
         def _distance(self) -> float:
             errors = state_difference(self.state, flown.goal, flown.angle_indices)
@@ -209,7 +208,11 @@ def make_environment(system: System | str, **settings: Any) -> Any:
 
 
 def register_environments() -> list[str]:
-    """Registers this package's systems as gymnasium environments, such as ``gpmpc/cart_pole-v0``; returns the names."""
+    """Registers this package's systems as gymnasium environments.
+
+    Returns:
+        Their names, such as ``gpmpc/cart_pole-v0``.
+    """
     gymnasium = library("gymnasium")
     names = [f"gpmpc/{name}-v0" for name in OURS]
     for name, system in zip(names, OURS, strict=True):

@@ -1,7 +1,8 @@
-"""Takes a MuJoCo model as a system: the state is that of named joints, or what named sensors measure.
+"""Takes a MuJoCo model as a system, by its joints or by its sensors.
 
-Joints, with the activations of the actuators that have one, are a state that the model can be set to; many are stepped
-at once by ``mujoco.rollout``. Sensors show a part of it: the model then moves on by itself. Needs the extra ``sim``.
+Joints, with the activations of the actuators that have one, are a state that the model
+can be set to; many are stepped at once by ``mujoco.rollout``. Sensors show a part of
+it: the model then moves on by itself. Needs the extra ``sim``.
 """
 
 from collections.abc import Callable, Sequence
@@ -35,7 +36,11 @@ class _Model:
         self.limits = np.where(limited, low, -np.inf), np.where(limited, high, np.inf)
 
     def indices(self, kind: str, names: Sequence[str]) -> list[int]:
-        """Finds named parts of the model of a kind; ``SettingError`` where none is named, or one is not there."""
+        """Returns the indices of named parts of the model of a kind.
+
+        Raises:
+            SettingError: None is named, or one is not there.
+        """
         if not names:
             raise SettingError(f"{kind}s", f"name at least one of {self.path}")
         try:
@@ -45,7 +50,10 @@ class _Model:
 
 
 class _Joints(_Model):
-    """Dynamics of a model by its joints, all of them hinges and slides; actuators that are not named stay at zero."""
+    """Dynamics of a model by its joints, all of them hinges and slides.
+
+    Actuators that are not named stay at zero.
+    """
 
     def __init__(
         self,
@@ -60,8 +68,11 @@ class _Joints(_Model):
         kinds = {int(joint.mjJNT_SLIDE), int(joint.mjJNT_HINGE)}
         found = self.indices("joint", joints)
         if model.njnt != len(found) or not set(model.jnt_type.tolist()) <= kinds:
-            what = f"must name all {model.njnt} joints of {path}, hinges and slides; name sensors of other models"
-            raise SettingError("joints", f"{what}; got {list(joints)}")
+            raise SettingError(
+                "joints",
+                f"must name all {model.njnt} joints of {path}, hinges and slides; "
+                f"name sensors of other models; got {list(joints)}",
+            )
         self.substeps = substeps
         q = model.jnt_qposadr[found]
         v = model.jnt_dofadr[found]
@@ -78,14 +89,14 @@ class _Joints(_Model):
         self.input_names = tuple(actuators)
 
     def positions(self, state: Array) -> Array:
-        """The positions of the model's joints (nq,), in MuJoCo's order, in a state (n,)."""
-        found = np.empty(self.model.nq)
+        """Returns the positions of MuJoCo's joints (nq,) in a state (n,)."""
         count = self.model.nq
-        found[self._order[:count] - 1] = state[:count]
-        return found
+        positions = np.empty(count)
+        positions[self._order[:count] - 1] = state[:count]
+        return positions
 
     def successor(self, x: Any, u: Any) -> Array:
-        """The next state (n,) or states (n, T) from a state and an input, or T of each."""
+        """Returns the next state (n,), or states (n, T), from one or T of each."""
         states, inputs = numbers(x, u)
         single = states.ndim == 1
         states = states.reshape(len(states), -1)
@@ -106,9 +117,10 @@ class _Joints(_Model):
 
 
 class _Sensors(_Model, Simulator):
-    """Dynamics of a model by its sensors, from its first keyframe, or from its initial pose.
+    """Dynamics of a model by its sensors, from its first keyframe or initial pose.
 
-    Films need an attribute ``positions`` besides: from a state (n,) to the positions of the model's joints (nq,).
+    Films need an attribute ``positions`` besides: from a state (n,) to the positions of
+    the model's joints (nq,).
     """
 
     def __init__(
@@ -182,14 +194,16 @@ def mujoco_system(
         joints: Names of all joints, hinges and slides.
         sensors: Names, in the order of the state; without joints.
         substeps: Steps of the model per time step.
-        observation: Of sensors: ``observe``, from what they measure to the state (n,); ``state_names``, by default a
-            sensor's own, numbered where it has several values; ``input_delay``, steps after which an input acts.
-        settings: Of ``System``, such as ``units``, ``tracked`` and ``goal``; limits of the inputs are the actuators'.
+        observation: Of sensors: ``observe``, from what they measure to the state (n,);
+            ``state_names``, by default a sensor's own, numbered where it has several
+            values; ``input_delay``, steps after which an input acts.
+        settings: Of ``System``, such as ``units``, ``tracked`` and ``goal``; limits of
+            the inputs are the actuators'.
 
     Raises:
         DataError: The file is no MJCF model.
-        SettingError: A name is not there, a joint is no hinge or slide or is left out, or both joints and sensors are
-            named, or neither.
+        SettingError: A name is not there, a joint is no hinge or slide or is left out,
+            or both joints and sensors are named, or neither.
     """
     if bool(joints) == bool(sensors):
         raise SettingError(

@@ -1,7 +1,8 @@
-"""A quadrotor in MuJoCo whose rotors lag and which air drags on, and the rigid body that is known of it.
+"""A quadrotor in MuJoCo with drag and rotors that lag, and its known rigid body.
 
-The model is ``quadrotor.xml`` beside this file. Its z axis points upwards; roll, pitch and yaw turn the vehicle about
-its own x, y and z axes, yaw first (Beard and McLain, 2012, eqs. (3.1)-(3.3)). Needs the extra ``sim``.
+The model is ``quadrotor.xml`` beside this file. Its z axis points upwards; roll, pitch
+and yaw turn the vehicle about its own x, y and z axes, yaw first (Beard and McLain,
+2012, eqs. (3.1)-(3.3)). Needs the extra ``sim``.
 """
 
 from dataclasses import dataclass
@@ -24,14 +25,14 @@ _MASS = 0.5
 
 @dataclass(frozen=True)
 class RigidBody:
-    """A rigid body that four rotors lift and turn; it knows neither drag nor that the rotors lag."""
+    """A rigid body that four rotors lift and turn.
+
+    It knows neither drag nor that the rotors lag.
+    """
 
     mass: float = 0.4  #: [kg]
-    inertia: tuple[float, float, float] = (
-        0.0025,
-        0.0025,
-        0.0045,
-    )  #: principal moments of inertia [kg m^2]
+    #: principal moments of inertia [kg m^2]
+    inertia: tuple[float, float, float] = (0.0025, 0.0025, 0.0045)
     arm: float = 0.12  #: from the centre to a rotor, along x and along y [m]
     yaw: float = 0.016  #: torque about z that a rotor's thrust brings [m]
 
@@ -58,25 +59,39 @@ class RigidBody:
 
     def derivative(self, x: Any, u: Any) -> list[Any]:
         """d/dt of the twelve states [m/s, m/s^2, rad/s, rad/s^2]."""
-        (p, q, r), (ixx, iyy, izz) = (x[7], x[9], x[11]), self.inertia
-        s1, c1, s2, c2, s3, c3 = (f(x[i]) for i in (6, 8, 10) for f in (sin, cos))
+        vx, vy, vz = x[1], x[3], x[5]
+        p, q, r = x[7], x[9], x[11]
+        ixx, iyy, izz = self.inertia
+        s1, c1 = sin(x[6]), cos(x[6])  # of roll
+        s2, c2 = sin(x[8]), cos(x[8])  # of pitch
+        s3, c3 = sin(x[10]), cos(x[10])  # of yaw
         lift = (u[0] + u[1] + u[2] + u[3]) / self.mass
-        turned = q * s1 + r * c1
-        roll = self.arm * (u[0] - u[1] - u[2] + u[3])
-        pitch = self.arm * (u[2] + u[3] - u[0] - u[1])
+        vx_dot = lift * (c3 * s2 * c1 + s3 * s1)
+        vy_dot = lift * (s3 * s2 * c1 - c3 * s1)
+        vz_dot = lift * c1 * c2 - GRAVITY
+        turning = q * s1 + r * c1
+        roll_dot = p + turning * s2 / c2
+        pitch_dot = q * c1 - r * s1
+        yaw_dot = turning / c2
+        roll_torque = self.arm * (u[0] - u[1] - u[2] + u[3])
+        pitch_torque = self.arm * (u[2] + u[3] - u[0] - u[1])
+        yaw_torque = self.yaw * (u[1] + u[3] - u[0] - u[2])
+        p_dot = ((iyy - izz) * q * r + roll_torque) / ixx
+        q_dot = ((izz - ixx) * p * r + pitch_torque) / iyy
+        r_dot = ((ixx - iyy) * p * q + yaw_torque) / izz
         return [
-            x[1],
-            lift * (c3 * s2 * c1 + s3 * s1),
-            x[3],
-            lift * (s3 * s2 * c1 - c3 * s1),
-            x[5],
-            lift * c1 * c2 - GRAVITY,
-            p + turned * s2 / c2,
-            ((iyy - izz) * q * r + roll) / ixx,
-            q * c1 - r * s1,
-            ((izz - ixx) * p * r + pitch) / iyy,
-            turned / c2,
-            ((ixx - iyy) * p * q + self.yaw * (u[1] + u[3] - u[0] - u[2])) / izz,
+            vx,
+            vx_dot,
+            vy,
+            vy_dot,
+            vz,
+            vz_dot,
+            roll_dot,
+            p_dot,
+            pitch_dot,
+            q_dot,
+            yaw_dot,
+            r_dot,
         ]
 
 
@@ -87,7 +102,7 @@ def mujoco_quadrotor(
     substeps: int = 8,
     known: dict[str, Any] | None = None,
 ) -> System:
-    """Makes the quadrotor by its sensors, with a data sheet's rigid body as the nominal model.
+    """Makes the quadrotor by its sensors, with a rigid body as its nominal model.
 
     Args:
         mass: [kg].
@@ -100,14 +115,13 @@ def mujoco_quadrotor(
     check_numbers("wind", wind, 3, unit="[m/s]")
     names = RigidBody.state_names
     hover = [_MASS * GRAVITY / 4] * 4
-    units = dict.fromkeys(("x", "y", "z"), "m") | dict.fromkeys(
-        ("vx", "vy", "vz"), "m/s"
-    )
-    units |= (
-        dict.fromkeys(("roll", "pitch", "yaw"), "rad")
-        | dict.fromkeys("pqr", "rad/s")
-        | dict.fromkeys(ROTORS, "N")
-    )
+    units = {
+        **dict.fromkeys(("x", "y", "z"), "m"),
+        **dict.fromkeys(("vx", "vy", "vz"), "m/s"),
+        **dict.fromkeys(("roll", "pitch", "yaw"), "rad"),
+        **dict.fromkeys(("p", "q", "r"), "rad/s"),
+        **dict.fromkeys(ROTORS, "N"),
+    }
     flown = mujoco_system(
         _MODEL,
         ROTORS,
@@ -134,31 +148,28 @@ def mujoco_quadrotor(
     model = flown.dynamics.model
     vehicle = flown.dynamics.model.body("vehicle").id
     model.body_mass[vehicle] = mass
-    flown.dynamics.mujoco.mj_setConst(
-        model, flown.dynamics.data
-    )  # what follows from the mass
-    # Linear drag in a wind is drag in still air and a constant force, which gravity on the one body can bring.
+    # What follows from the mass.
+    flown.dynamics.mujoco.mj_setConst(model, flown.dynamics.data)
+    # Linear drag in a wind is drag in still air and a constant force, which gravity on
+    # the one body can bring.
     model.opt.gravity += _DRAG * np.array(wind) / mass
     return flown
 
 
 def _joint_positions(state: np.ndarray) -> np.ndarray:
-    """The positions of the model's joints (7,) in a state (12,)."""
-    turn = Rotation.from_euler("ZYX", np.asarray(state)[10:5:-2]).as_quat()
-    return np.array(
-        [state[0], state[2], state[4] - 1, turn[3], *turn[:3]]
-    )  # the quaternion's scalar first
+    """Returns the positions of the model's joints (7,) in a state (12,)."""
+    yaw_pitch_roll = np.asarray(state)[10:5:-2]
+    qx, qy, qz, scalar = Rotation.from_euler("ZYX", yaw_pitch_roll).as_quat()
+    return np.array([state[0], state[2], state[4] - 1, scalar, qx, qy, qz])
 
 
 def _state(measured: np.ndarray) -> np.ndarray:
-    """The states of position, velocity, quaternion and body rates."""
+    """Returns the state (12,) from position, velocity, quaternion and body rates."""
     position, velocity, quaternion, rates = np.split(measured, (3, 6, 10))
-    angles = Rotation.from_quat(quaternion[[1, 2, 3, 0]]).as_euler("ZYX")[
-        ::-1
-    ]  # scalar last
-    return (
-        np.stack([position, velocity, angles, rates])
-        .reshape(2, 2, 3)
-        .swapaxes(1, 2)
-        .ravel()
-    )
+    scalar_last = quaternion[[1, 2, 3, 0]]
+    yaw_pitch_roll = Rotation.from_quat(scalar_last).as_euler("ZYX")
+    angles = yaw_pitch_roll[::-1]
+    # Each value stands before its rate: x, vx, y, vy, ..., yaw, r.
+    translational = np.stack([position, velocity], axis=1).ravel()
+    rotational = np.stack([angles, rates], axis=1).ravel()
+    return np.concatenate([translational, rotational])
