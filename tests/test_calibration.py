@@ -80,7 +80,8 @@ def exact_covariances(steps):
 def test_the_true_model_is_calibrated_at_every_step_and_level():
     count = 400
     levels = (0.5, 0.9, 0.95)
-    # Without noise every start is exact; the recordings' starts overlap, hence the generous bound.
+    # Without noise every start is exact; the recordings' starts overlap, hence the
+    # generous bound.
     found = calibrate(
         noiseless(), runs(count, 8, noisy=False), Linearization(), 6, levels
     )

@@ -296,7 +296,7 @@ class GPPosterior(TensorModel):
         if arrays is not None:
             from gpmpc import _kernels as kernels  # loads numba
 
-            mean, A, B, V = kernels.linearize(
+            gps = kernels.linearize(
                 self.packed,
                 states,
                 inputs,
@@ -304,7 +304,9 @@ class GPPosterior(TensorModel):
                 self._offset_array,
                 self._adds_state,
             )
-            return Linearized(mean=mean, A=A, B=B, covariance=V)
+            return Linearized(
+                mean=gps.mean, A=gps.A, B=gps.B, covariance=gps.covariance
+            )
         x, u = tensors_for(self, states, inputs)
         correlations = self._correlations(x, u)
         jacobian = self._jacobian(correlations)

@@ -319,21 +319,19 @@ class ChangedModel(Wrapper):
         inputs_and_time[:, :-1] = v
         inputs_and_time[:, -1] = self.time
         no_offset = np.zeros(self.gp.output_dim)
-        mean, by_features, by_inputs, change_covariance = linearize_gps(
+        change = linearize_gps(
             self.change.current, z, inputs_and_time, covariance, no_offset, False
         )
-        by_state, by_input = self.features.chain(
-            by_features, by_inputs[..., :-1], slope
-        )
+        by_state, by_input = self.features.chain(change.A, change.B[..., :-1], slope)
         B = self.B_array
         V = model.covariance
-        if V is not None and change_covariance is not None:
-            variance = np.diagonal(change_covariance, axis1=1, axis2=2)
+        if V is not None and change.covariance is not None:
+            variance = np.diagonal(change.covariance, axis1=1, axis2=2)
             latent = self.explainable_variance(V)
             variance = variance + self.remaining(latent, variance, self.signal)
             V = (B * variance[:, None, :]) @ B.T
         return Linearized(
-            mean=model.mean + mean @ B.T,
+            mean=model.mean + change.mean @ B.T,
             A=model.A + B @ by_state,
             B=model.B + B @ by_input,
             covariance=V,

@@ -98,7 +98,9 @@ def test_an_adaptive_tube_holds_in_the_long_run_whatever_the_plant_does(plant):
         x = size * rng.normal(size=2)
         if (
             plant == "hostile"
-        ):  # just outside of the last bound of the first stage, where it is less than the largest
+            # just outside of the last bound of the first stage, where it is less than the
+            # largest
+        ):
             x = np.array([min(tube.kappas[0] + 1e-6, 9.99), 0.0])
         tube.observe(np.clip(x, -9.99, 9.99))
         tube.remember(np.zeros((H + 1, 2)), covariances)

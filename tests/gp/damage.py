@@ -1,6 +1,7 @@
 """Loads damaged files under a limit of memory; ``python -m tests.gp.damage KIND COUNT SEED`` in a process of its own.
 
-What is loaded is the undamaged content, or a ``GpmpcError`` of one line names the file; nothing takes 300 MB or 5 s.
+What is loaded is the undamaged content, or a ``GpmpcError`` of one line names the file;
+nothing takes 300 MB or 5 s.
 """
 
 import io

@@ -47,7 +47,8 @@ def test_values_and_jacobians_are_those_of_predict(make):
         state = torch.randn(n)
         control = torch.randn(m)
         at, by_state, by_input = predict_with_jacobian(model, state, control)
-        # The variance at a query that is one vector, whose derivatives torch can follow.
+        # The variance at a query that is one vector, whose derivatives torch can
+        # follow.
         spread = torch.autograd.functional.jacobian(
             lambda joint: model.predict(joint[:n], joint[n:]).variance,
             torch.cat([state, control]),

@@ -1,6 +1,7 @@
 """Where data lie must not matter: a shift of features and targets, however large, shifts what is learned, no more.
 
-All numbers are multiples of 2^-20, so that float64 holds them exactly at offsets of 1e8, where it resolves 1.5e-8.
+All numbers are multiples of 2^-20, so that float64 holds them exactly at offsets of
+1e8, where it resolves 1.5e-8.
 """
 
 import casadi
@@ -198,7 +199,8 @@ PROPAGATORS = [
     (
         Unscented(),
         3e-7,
-    ),  # its points, and the samples, are states: float64 resolves 1.5e-8 of them at 1e8
+        # its points, and the samples, are states: float64 resolves 1.5e-8 of them at 1e8
+    ),
     (MonteCarlo(300), 3e-7),
 ]
 
