@@ -1,4 +1,5 @@
-"""Tubes from held-out predictions hold as often as they say, and an adaptive one does so against any plant."""
+"""Tubes from held-out predictions hold as often as they say, and an adaptive one does
+so against any plant."""
 
 import numpy as np
 import pytest
@@ -30,7 +31,8 @@ class Walk:
 
 
 def log(steps, seed):
-    """A plant with noise of heavy tails and a standard deviation of three, where the model says one."""
+    """A plant with noise of heavy tails and a standard deviation of three, where the
+    model says one."""
     rng = np.random.default_rng(seed)
     x = [np.zeros(2)]
     u = rng.normal(size=(steps, 2))
@@ -96,11 +98,9 @@ def test_an_adaptive_tube_holds_in_the_long_run_whatever_the_plant_does(plant):
     for t in range(T):
         size = {"noisy": 1.0, "worse with time": 1 + 2 * t / T, "hostile": 0.0}[plant]
         x = size * rng.normal(size=2)
-        if (
-            plant == "hostile"
-            # just outside of the last bound of the first stage, where it is less than the
-            # largest
-        ):
+        if plant == "hostile":
+            # just outside of the last bound of the first stage, while that is less than
+            # the largest
             x = np.array([min(tube.kappas[0] + 1e-6, 9.99), 0.0])
         tube.observe(np.clip(x, -9.99, 9.99))
         tube.remember(np.zeros((H + 1, 2)), covariances)

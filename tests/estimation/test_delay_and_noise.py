@@ -1,4 +1,5 @@
-"""A delay is found in a log with an interval that holds it, and noise where a posterior has learned too little."""
+"""A delay is found in a log with an interval that holds it, and noise where a posterior
+has learned too little."""
 
 import numpy as np
 import pytest
@@ -19,7 +20,8 @@ def pendulum(x, u):
 
 
 def log(steps, delay, seed, feedback=0.0, std=(1e-3, 0.02), rho=0.0):
-    """States and inputs of a flight; noise is an AR(1) process of these standard deviations."""
+    """States and inputs of a flight; noise is an AR(1) process of these standard
+    deviations."""
     rng = np.random.default_rng(seed)
     whole = int(np.ceil(delay))
     share = delay - (whole - 1)

@@ -1,4 +1,5 @@
-"""Filters and the smoother, against conditioning of the joint Gaussian, and their consistency on a pendulum."""
+"""Filters and the smoother, against conditioning of the joint Gaussian, and their
+consistency on a pendulum."""
 
 from fractions import Fraction
 
@@ -84,7 +85,8 @@ def simulated(model, steps, seed, measurement, prior=PRIOR):
 
 
 def conditioned(inputs, measured, H, R):
-    """Means and covariances of all states of the linear model given all measurements, from their joint Gaussian."""
+    """Means and covariances of all states of the linear model given all measurements,
+    from their joint Gaussian."""
     T = len(measured)
     n = 2
     mean = torch.zeros(T, n, dtype=F)
@@ -308,7 +310,8 @@ def test_an_update_is_exact_however_wide_or_singular_the_prior_and_however_good_
 
 
 def test_a_smoother_keeps_its_digits_where_the_prior_says_nothing():
-    """Ten measurements of a position say what a velocity of unknown size was at the start."""
+    """Ten measurements of a position say what a velocity of unknown size was at the
+    start."""
     first = Measurement.of_states(2, [0], [0.1])
     track = Known(
         lambda x, u: x @ torch.tensor([[1.0, 0.1], [0.0, 1.0]], dtype=F).mT,

@@ -1,4 +1,5 @@
-"""Noise that depends on the state is found where it is, and nowhere else; intervals hold where it is quiet and loud."""
+"""Noise that depends on the state is found where it is, and nowhere else; intervals
+hold where it is quiet and loud."""
 
 import numpy as np
 import pytest
@@ -25,7 +26,8 @@ def sigma(rates, varies):
 
 
 def log(steps, seed, varies):
-    """A flight of a damped pendulum under random pushes, whose noise is in proportion to its rate."""
+    """A flight of a damped pendulum under random pushes, whose noise is in proportion
+    to its rate."""
     rng = np.random.default_rng(seed)
     states = [np.array([0.3, 0.0])]
     inputs = np.repeat(rng.uniform(-4, 4, (steps // 4 + 1, 1)), 4, axis=0)[:steps]
@@ -50,7 +52,8 @@ def driven():
 
 
 def held(model, rows, pick):
-    """The share of the rates of some rows that intervals of 95 % hold, process noise included."""
+    """The share of the rates of some rows that intervals of 95 % hold, process noise
+    included."""
     belief = model.predict(rows.states, rows.inputs)
     deviation = (belief.variance + model.noise_covariance.diagonal()).sqrt()
     return float(

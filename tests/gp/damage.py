@@ -1,4 +1,5 @@
-"""Loads damaged files under a limit of memory; ``python -m tests.gp.damage KIND COUNT SEED`` in a process of its own.
+"""Loads damaged files under a limit of memory; ``python -m tests.gp.damage KIND COUNT
+SEED`` in a process of its own.
 
 What is loaded is the undamaged content, or a ``GpmpcError`` of one line names the file;
 nothing takes 300 MB or 5 s.
@@ -213,7 +214,8 @@ def a_bomb(members, rng):
 
 
 def reheaded(change):
-    """A damage of the JSON header of a safetensors file, whose stated length is then right again."""
+    """A damage of the JSON header of a safetensors file, whose stated length is then
+    right again."""
 
     def damage(content, rng):
         length = int.from_bytes(content[:8], "little")

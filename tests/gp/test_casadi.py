@@ -1,4 +1,5 @@
-"""The CasADi function is ``predict``, values and derivatives, and IPOPT can work with it."""
+"""The CasADi function is ``predict``, values and derivatives, and IPOPT can work with
+it."""
 
 import casadi
 import numpy as np

@@ -1,4 +1,5 @@
-"""Damaged files are refused by name or read as they were, in little memory and time; see ``damage``."""
+"""Damaged files are refused by name or read as they were, in little memory and time;
+see ``damage``."""
 
 import subprocess
 import sys

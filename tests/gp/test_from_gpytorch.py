@@ -496,8 +496,7 @@ def test_a_model_that_has_predicted_is_frozen_as_before():
     assert_equal(model, from_gpytorch)
 
 
-# --- sparse ---------------------------------------------------------------------------
-# ------------------------------
+# --- sparse --------------------------------------------------------------------------
 
 
 def sgpr(size=120, points=12, outputs=2):

@@ -1,4 +1,5 @@
-"""Nothing in the training of sparse GPs prefers a direction: turned data give the turned model."""
+"""Nothing in the training of sparse GPs prefers a direction: turned data give the
+turned model."""
 
 import pytest
 import torch

@@ -1,4 +1,5 @@
-"""The module is ``predict``, alone and after torch.export, in operations that other runtimes have."""
+"""The module is ``predict``, alone and after torch.export, in operations that other
+runtimes have."""
 
 import pytest
 import torch

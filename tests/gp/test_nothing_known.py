@@ -32,8 +32,7 @@ from gpmpc.learning import (
     learn_from_step,
 )
 from gpmpc.models import Affine, ResidualModel
-from gpmpc.mpc import GPMPC, Reference
-from gpmpc.mpc.problem import Box, Problem, Tracking
+from gpmpc.mpc import GPMPC, Box, Problem, Reference, Tracking
 from gpmpc.propagation import Linearization
 from gpmpc.signals import Signals
 

@@ -1,4 +1,5 @@
-"""Where data lie must not matter: a shift of features and targets, however large, shifts what is learned, no more.
+"""Where data lie must not matter: a shift of features and targets, however large,
+shifts what is learned, no more.
 
 All numbers are multiples of 2^-20, so that float64 holds them exactly at offsets of
 1e8, where it resolves 1.5e-8.
@@ -196,11 +197,8 @@ PROPAGATORS = [
     (MomentMatching(diagonal=True, process_noise=True), 1e-10),
     (Linearization(), 1e-10),
     (MeanEquivalence(), 1e-10),
-    (
-        Unscented(),
-        3e-7,
-        # its points, and the samples, are states: float64 resolves 1.5e-8 of them at 1e8
-    ),
+    # Sigma points and samples are states, of which float64 resolves 1.5e-8 at 1e8.
+    (Unscented(), 3e-7),
     (MonteCarlo(300), 3e-7),
 ]
 

@@ -1,4 +1,5 @@
-"""What is wrong with a file is said once: the message begins with its path and names it no second time."""
+"""What is wrong with a file is said once: the message begins with its path and names it
+no second time."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,5 @@
-"""Sparse GPs frozen to pseudo-observations, against their textbook formulas, the exact GP, and each other."""
+"""Sparse GPs frozen to pseudo-observations, against their textbook formulas, the exact
+GP, and each other."""
 
 import logging
 
@@ -22,12 +23,12 @@ from gpmpc.gp import (
     Trainer,
     Transitions,
     append_transitions,
+    informative_points,
     remove_points,
     standardize,
 )
 from gpmpc.gp._kernel import kernel_matrix
 from gpmpc.gp._sparse import _cross, collapsed_bound, sparse_posterior
-from gpmpc.gp._sparse_training import informative_points
 from gpmpc.propagation import MomentMatching, MonteCarlo
 
 
@@ -44,7 +45,8 @@ def problem(rows=150, noise=1e-2, seed=0, spread=1.0):
 
 
 def textbook(Z, x, y, query, method, lengthscales, signal_variance, noise_variance):
-    """Mean and variance from the formulas with their inverses (Quinonero-Candela and Rasmussen, 2005, section 5)."""
+    """Mean and variance from the formulas with their inverses (Quinonero-Candela and
+    Rasmussen, 2005, section 5)."""
     means = []
     variances = []
     for a in range(len(lengthscales)):

@@ -1,4 +1,5 @@
-"""Models on disk: what is loaded predicts what was saved bit by bit, and no damage goes unnoticed or untold."""
+"""Models on disk: what is loaded predicts what was saved bit by bit, and no damage goes
+unnoticed or untold."""
 
 import json
 import subprocess
@@ -218,7 +219,8 @@ def test_a_flipped_bit_in_the_data_is_refused(tmp_path):
 
 
 def rewritten(path, header=None, **arrays):
-    """The file with other header entries and arrays (None drops one), and a valid checksum."""
+    """The file with other header entries and arrays (None drops one), and a valid
+    checksum."""
     said, parts = _storage._content(path, "model")
     said = said | (header or {})
     parts = {

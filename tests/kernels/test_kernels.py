@@ -1,4 +1,5 @@
-"""The compiled moments against torch's closed form and its derivatives, 50 digits, and finite differences."""
+"""The compiled moments against torch's closed form and its derivatives, 50 digits, and
+finite differences."""
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -11,8 +12,7 @@ import pytest
 import torch
 
 from gpmpc import _kernels as kernels
-from gpmpc._kernels import _gp_point, _simd
-from gpmpc._kernels._packed import pack
+from gpmpc._kernels import _gp_point, _simd, pack
 from gpmpc._kernels._rows import (
     largest_size,
     largest_square,
@@ -267,7 +267,8 @@ def test_wide_beliefs_far_from_the_data_neither_overflow_nor_lose_the_prior(
 
 
 def test_exponents_that_overflow_belong_to_nothing_that_counts():
-    # Here log(q q) is at most -897, delta reaches 5958, and log(q q) + delta is nowhere above -702.
+    # Here log(q q) is at most -897, delta reaches 5958, and log(q q) + delta is nowhere
+    # above -702.
     gp = model(lengthscale=0.02, size=12)
     at = Gaussian(torch.tensor([1.5, 1.5]), 2e-4 * torch.eye(2))
     V = moments(gp, at, torch.zeros(1))[1]

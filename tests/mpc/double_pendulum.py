@@ -24,7 +24,8 @@ STEP = 1e-30
 
 @njit
 def derivative(x, u, joint):
-    """From the equations of motion M(q) a = torques, without friction; complex numbers allowed."""
+    """From the equations of motion M(q) a = torques, without friction; complex numbers
+    allowed."""
     (m1, m2), (r1, r2), (I1, I2) = MASS, CENTRE, INERTIA
     q1, q2, v1, v2 = x
     h = m2 * LENGTH * r2

@@ -41,7 +41,8 @@ def double_integrator(**arguments):
 
 
 def pendulum_posterior(size=40, noise=1e-4, seed=0):
-    """A GP on the differences of a damped pendulum (angle, rate; torque), time step 0.2."""
+    """A GP on the differences of a damped pendulum (angle, rate; torque), time step
+    0.2."""
     generator = torch.Generator().manual_seed(seed)
     features = (2 * torch.rand(size, 3, generator=generator) - 1) * torch.tensor(
         [2.5, 3.0, 4.0]

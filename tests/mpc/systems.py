@@ -82,7 +82,8 @@ class LinearPlant:
 
 
 def quadrotor_gp(N=60, seed=0):
-    """Six GPs on transitions of the integrated translational quadrotor; the hyperparameters are set, not trained."""
+    """Six GPs on transitions of the integrated translational quadrotor; the
+    hyperparameters are set, not trained."""
     rng = np.random.default_rng(seed)
     x = rng.uniform(-1, 1, (N, 6))
     u = HOVER + rng.uniform(-1, 1, (N, 3)) * [3, 0.4, 0.4]

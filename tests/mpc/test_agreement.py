@@ -1,4 +1,5 @@
-"""Roads to one answer meet, on a few steps; ``benchmarks/agreement.py`` has the hundreds."""
+"""Roads to one answer meet, on a few steps; ``benchmarks/agreement.py`` has the
+hundreds."""
 
 from dataclasses import replace
 
@@ -8,10 +9,16 @@ import torch
 
 from gpmpc.experiments.slsqp import SLSQP
 from gpmpc.gaussian import Gaussian
-from gpmpc.mpc import PredictionSettings, Reference, Request
+from gpmpc.mpc import (
+    GPMPC,
+    Box,
+    PredictionSettings,
+    Problem,
+    Reference,
+    Request,
+    Tracking,
+)
 from gpmpc.mpc.baselines import StateFormMPC
-from gpmpc.mpc.gp_mpc import GPMPC
-from gpmpc.mpc.problem import Box, Problem, Tracking
 from gpmpc.propagation import Linearization, MomentMatching
 from gpmpc.qp import PrimalActiveSet
 from tests.mpc.systems import HOVER, quadrotor_gp
@@ -83,7 +90,8 @@ def test_dual_primal_and_state_form_give_the_same_inputs():
 
 
 def test_a_bound_that_takes_a_large_step_of_the_inputs_is_kept_by_iterated_programs_only():
-    """Thrust and tilt multiply: where both have to change at once, one linearisation at the last inputs is far off."""
+    """Thrust and tilt multiply: where both have to change at once, one linearisation at
+    the last inputs is far off."""
     gp = quadrotor_gp(150)
     limit = 0.05
     sides = np.full(6, np.inf)

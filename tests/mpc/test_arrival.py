@@ -1,4 +1,5 @@
-"""An iteration says that it has arrived, takes as many programs as it needs, and hands out what it says."""
+"""An iteration says that it has arrived, takes as many programs as it needs, and hands
+out what it says."""
 
 import numpy as np
 import pytest
@@ -156,7 +157,8 @@ def test_a_decision_tells_how_far_its_own_plan_misses_a_curved_bound(
 
 
 def test_a_first_plan_is_iterated_only_where_that_pays():
-    """A pendulum under a weak torque would lean for ever; a cart-pole is brought up at less cost."""
+    """A pendulum under a weak torque would lean for ever; a cart-pole is brought up at
+    less cost."""
     ends = {}
     for make in (pendulum, cart_pole):
         system = make()

@@ -1,4 +1,5 @@
-"""Condensing against the matrices of the stacked problem, the paper's formulas, and itself in other coordinates."""
+"""Condensing against the matrices of the stacked problem, the paper's formulas, and
+itself in other coordinates."""
 
 from itertools import product
 
@@ -6,6 +7,7 @@ import numpy as np
 import pytest
 
 from gpmpc.exceptions import ShapeError
+from gpmpc.mpc import Box, Problem, Tracking
 from gpmpc.mpc._condense import condense, condense_with_feedback
 from gpmpc.mpc._cost import PENALIZED
 from gpmpc.mpc._linear_quadratic import (
@@ -17,7 +19,6 @@ from gpmpc.mpc._linear_quadratic import (
     evaluate_cost,
     expand,
 )
-from gpmpc.mpc.problem import Box, Problem, Tracking
 from gpmpc.qp import DualActiveSet, QuadraticProgram
 from gpmpc.status import Status
 from tests.mpc.double_pendulum import ACROBOT, PENDUBOT, UPRIGHT, DoublePendulum
@@ -44,7 +45,8 @@ def random_references(rng, H, n, m):
 
 
 class Condensing:
-    """Condenses with a problem's bounds, the cost of an extended state of so many blocks, and squares of outputs."""
+    """Condenses with a problem's bounds, the cost of an extended state of so many
+    blocks, and squares of outputs."""
 
     def __init__(self, problem, H, blocks=1, squares=None):
         rates = (
@@ -207,7 +209,8 @@ def test_the_condensed_problem_is_the_stacked_one(H, blocks, held, penalized, rn
 
 
 def test_in_increments_it_is_the_papers_problem(rng):
-    """Cao, Lai and Alam (2017), (38)-(39) with the missing factor 2, on s = [mu; vec S] of three states."""
+    """Cao, Lai and Alam (2017), (38)-(39) with the missing factor 2, on s = [mu; vec S]
+    of three states."""
     n = 3
     m = 2
     H = 5
@@ -397,7 +400,8 @@ def priced(program, rows):
 def test_an_unstable_plant_is_condensed_in_feedback_coordinates_and_the_plan_is_found(
     rng,
 ):
-    """x+ = 2 x + u over 50 stages: 2^100 stands beside R in P, and nothing of R is left."""
+    """x+ = 2 x + u over 50 stages: 2^100 stands beside R in P, and nothing of R is
+    left."""
     H = 50
     problem = Problem(
         Tracking([1.0], [1.0], penalized="inputs"), inputs=Box([-3.0], [3.0])
@@ -432,7 +436,8 @@ def test_arrays_that_are_not_contiguous_are_refused(rng):
 
 
 def wild_plans(rng, model, start, goal, H):
-    """Plans to linearise along: the straight line, a rollout without torque, one with two kicks, and sheer noise."""
+    """Plans to linearise along: the straight line, a rollout without torque, one with
+    two kicks, and sheer noise."""
     line = np.linspace(0.0, 1.0, H + 1)[:, None]
     torques = np.zeros((H, 1))
     yield (1 - line) * start + line * goal, torques
@@ -447,9 +452,11 @@ def wild_plans(rng, model, start, goal, H):
 
 
 def programs_of_the_double_pendulum(starts, seed):
-    """Solves the program of every wild plan over 1.2 s; says how many were made in feedback coordinates, and how many.
+    """Solves the program of every wild plan over 1.2 s; says how many were made in
+    feedback coordinates, and how many.
 
-    Six poses count as upright, a turn apart. Every solution is checked against the stages and the bounds.
+    Six poses count as upright, a turn apart. Every solution is checked against the
+    stages and the bounds.
     """
     H = 60
     rng = np.random.default_rng(seed)
@@ -492,7 +499,8 @@ def programs_of_the_double_pendulum(starts, seed):
                 )
                 assert solution.status is Status.SOLVED
                 assert np.isfinite(moved).all()
-                # Where torques are at their bounds the states of the linear stages grow, and rounding with them.
+                # Where torques are at their bounds the states of the linear stages
+                # grow, and rounding with them.
                 assert np.abs(found).max() < 6.0 + 1e-9 * (1.0 + np.abs(moved).max())
                 counts += len(program.feedback) > 0, 1
     return counts

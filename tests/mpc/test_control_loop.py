@@ -2,9 +2,7 @@ import numpy as np
 import pytest
 
 from gpmpc.exceptions import SettingError, SolverFailure
-from gpmpc.mpc import ControlLoop, Reference
-from gpmpc.mpc.gp_mpc import GPMPC
-from gpmpc.mpc.problem import Box, Problem, Tracking
+from gpmpc.mpc import GPMPC, Box, ControlLoop, Problem, Reference, Tracking
 from gpmpc.propagation import Linearization
 from gpmpc.qp import CvxpySolver, PrimalActiveSet
 from gpmpc.simulation import closed_loop

@@ -6,10 +6,8 @@ import torch
 
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import backend
-from gpmpc.mpc import PredictionSettings, Reference
+from gpmpc.mpc import GPMPC, Box, PredictionSettings, Problem, Reference, Tracking
 from gpmpc.mpc._linearization import StageLinearizer
-from gpmpc.mpc.gp_mpc import GPMPC
-from gpmpc.mpc.problem import Box, Problem, Tracking
 from gpmpc.propagation import Linearization, MeanEquivalence, MomentMatching, Unscented
 from gpmpc.status import Status
 from tests.mpc.systems import HOVER, linear_gaussian, quadrotor_gp

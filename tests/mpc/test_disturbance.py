@@ -1,4 +1,5 @@
-"""What the model mispredicts for good is estimated, and leaves no offset between reference and state."""
+"""What the model mispredicts for good is estimated, and leaves no offset between
+reference and state."""
 
 from dataclasses import replace
 
@@ -9,11 +10,9 @@ import torch
 from gpmpc.exceptions import SettingError
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import backend
-from gpmpc.mpc import PredictionSettings, Reference
+from gpmpc.mpc import GPMPC, Box, PredictionSettings, Problem, Reference, Tracking
 from gpmpc.mpc._policy import decide
 from gpmpc.mpc.baselines import StateFormMPC
-from gpmpc.mpc.gp_mpc import GPMPC
-from gpmpc.mpc.problem import Box, Problem, Tracking
 from gpmpc.propagation import Linearization, MomentMatching
 from gpmpc.status import Status
 from tests.mpc.small_models import double_integrator, pendulum_posterior

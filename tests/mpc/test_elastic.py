@@ -1,4 +1,5 @@
-"""A bound that cannot be kept gives way where it would otherwise cost more than all that the cost is for."""
+"""A bound that cannot be kept gives way where it would otherwise cost more than all
+that the cost is for."""
 
 import numpy as np
 import pytest
@@ -16,7 +17,8 @@ H = 12
 
 
 def planned(penalty, start, goal=0.0, upper=0.5, form="trajectory"):
-    """A cart's plan whose position is to stay below a bound; the push costs next to nothing."""
+    """A cart's plan whose position is to stay below a bound; the push costs next to
+    nothing."""
     settings = {} if penalty in ("default", "free") else {"penalty": penalty}
     bound = Box([-np.inf, -np.inf], [upper, np.inf], **settings)
     problem = Problem(
@@ -65,7 +67,8 @@ def test_a_reference_beyond_a_bound_does_not_make_it_free():
 
 
 def test_a_vehicle_that_was_pushed_out_of_its_lane_comes_back_and_does_not_spin():
-    """A tyre that lets go beyond a slip: what exact bounds ask for is more than it bears."""
+    """A tyre that lets go beyond a slip: what exact bounds ask for is more than it
+    bears."""
 
     def slide(x, u):
         offset, rate, heading = x.unbind(-1)

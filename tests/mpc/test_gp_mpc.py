@@ -9,13 +9,19 @@ import torch
 from gpmpc.exceptions import SettingError, ShapeError
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import backend
-from gpmpc.mpc import Reference, gp_mpc
-from gpmpc.mpc._controller import Timing
+from gpmpc.mpc import (
+    GPMPC,
+    Box,
+    PredictionSettings,
+    Problem,
+    Reference,
+    Timing,
+    Tracking,
+    gp_mpc,
+)
 from gpmpc.mpc._linear_quadratic import COVARIANCES
-from gpmpc.mpc._linearization import FORMS, PredictionSettings
+from gpmpc.mpc._linearization import FORMS
 from gpmpc.mpc.baselines import NMPC
-from gpmpc.mpc.gp_mpc import GPMPC
-from gpmpc.mpc.problem import Box, Problem, Tracking
 from gpmpc.propagation import Linearization, MeanEquivalence, MomentMatching, rollout
 from gpmpc.qp import CvxpySolver, DualActiveSet
 from gpmpc.status import Status
@@ -199,7 +205,8 @@ def test_bounds_and_rates_are_kept_for_thirty_steps(form, covariance):
 
 
 def expected_cost(problem, model, moves, state, inputs, reference, covariance):
-    """The nonlinear problem's cost, chance margins (H, n) and inputs (H, m) with their graph."""
+    """The nonlinear problem's cost, chance margins (H, n) and inputs (H, m) with their
+    graph."""
     u = torch.tensor(inputs, requires_grad=True)
     belief = Gaussian.certain(torch.tensor(state))
     Q = torch.tensor(problem.cost.Q)

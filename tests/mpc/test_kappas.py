@@ -1,4 +1,5 @@
-"""The standard deviations that a bound is moved by can come with the reference, by stage: of a conformal tube, say."""
+"""The standard deviations that a bound is moved by can come with the reference, by
+stage: of a conformal tube, say."""
 
 from dataclasses import replace
 
@@ -9,9 +10,7 @@ import torch
 from gpmpc.estimation import AdaptiveTube, ConformalTube
 from gpmpc.exceptions import DataError, SettingError, ShapeError
 from gpmpc.gaussian import Gaussian
-from gpmpc.mpc import PredictionSettings, Reference
-from gpmpc.mpc.gp_mpc import GPMPC
-from gpmpc.mpc.problem import Box, Problem, Tracking
+from gpmpc.mpc import GPMPC, Box, PredictionSettings, Problem, Reference, Tracking
 from gpmpc.propagation import Linearization
 from tests.mpc.small_models import double_integrator
 

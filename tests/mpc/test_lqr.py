@@ -7,11 +7,9 @@ import torch
 from gpmpc.exceptions import SettingError, ShapeError
 from gpmpc.gaussian import Gaussian
 from gpmpc.models import linearize_by_autograd
-from gpmpc.mpc import Reference
-from gpmpc.mpc._riccati import dlqr, finite_horizon_lqr
+from gpmpc.mpc import Box, NonlinearGPMPC, Problem, Reference, Tracking, dlqr
+from gpmpc.mpc._riccati import finite_horizon_lqr
 from gpmpc.mpc.baselines import LQR
-from gpmpc.mpc.gp_mpc import NonlinearGPMPC
-from gpmpc.mpc.problem import Box, Problem, Tracking
 from gpmpc.propagation import MeanEquivalence
 from gpmpc.status import Status
 from tests.mpc.small_models import LinearGaussian, double_integrator, pendulum_posterior

@@ -1,4 +1,5 @@
-"""What globalises the iteration, written out in loops: prices, merit, promises, multipliers and updates."""
+"""What globalises the iteration, written out in loops: prices, merit, promises,
+multipliers and updates."""
 
 import numpy as np
 import pytest
@@ -38,7 +39,8 @@ def definite(rng, *shape):
 
 
 class Case:
-    """A cost, rows and two plans of random numbers; ``squares`` and ``inputs`` whether outputs and rows hold inputs."""
+    """A cost, rows and two plans of random numbers; ``squares`` and ``inputs`` whether
+    outputs and rows hold inputs."""
 
     def __init__(self, rng, squares=True, inputs=True):
         Z = definite(rng, H if squares else 0, N + M + 1)
@@ -144,7 +146,8 @@ def test_the_merit_is_cost_price_and_weighed_defects(squares, inputs, rng):
 def test_multipliers_of_the_dynamics_are_what_a_push_of_a_state_costs(
     squares, inputs, rng
 ):
-    """Central differences of cost and rows, with the push passed on to all later states; exact for quadratics."""
+    """Central differences of cost and rows, with the push passed on to all later
+    states; exact for quadratics."""
     case = Case(rng, squares, inputs)
     found = _costates(
         case.cost, case.A, case.plan, case.references.states, case.rows.E, case.z

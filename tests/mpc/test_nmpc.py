@@ -3,9 +3,8 @@ import pytest
 
 from gpmpc.exceptions import SettingError, ShapeError, SolverFailure
 from gpmpc.gaussian import Gaussian
-from gpmpc.mpc import Decision, Reference, Timing
+from gpmpc.mpc import Box, Decision, Problem, Reference, Timing, Tracking
 from gpmpc.mpc.baselines import NMPC
-from gpmpc.mpc.problem import Box, Problem, Tracking
 from gpmpc.simulation import closed_loop
 from gpmpc.status import Status
 from gpmpc.systems import Map, Rotational, System, Translational, step

@@ -1,4 +1,5 @@
-"""The nonlinear problem against finite differences, autograd, quadratic programs and random search."""
+"""The nonlinear problem against finite differences, autograd, quadratic programs and
+random search."""
 
 from dataclasses import replace
 
@@ -9,10 +10,8 @@ import torch
 from gpmpc.exceptions import DataError, SettingError, ShapeError
 from gpmpc.experiments.slsqp import SLSQP
 from gpmpc.gaussian import Gaussian
-from gpmpc.mpc import Reference, Request
+from gpmpc.mpc import Box, NonlinearGPMPC, Problem, Reference, Request, Tracking
 from gpmpc.mpc.baselines import NMPC
-from gpmpc.mpc.gp_mpc import NonlinearGPMPC
-from gpmpc.mpc.problem import Box, Problem, Tracking
 from gpmpc.propagation import (
     Linearization,
     MeanEquivalence,
@@ -134,7 +133,8 @@ def test_margins_of_chance_constraints_and_their_jacobian(name, rng):
 
 
 def condensed(H, problem, state, reference, last):
-    """The quadratic program of the double integrator with W = 0.01 I: P, q, rows and bounds."""
+    """The quadratic program of the double integrator with W = 0.01 I: P, q, rows and
+    bounds."""
     A = np.array([[1.0, 0.5], [0.0, 1.0]])
     B = np.array([0.125, 0.5])
     free = np.array([np.linalg.matrix_power(A, i + 1) @ state for i in range(H)])

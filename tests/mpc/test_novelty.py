@@ -10,10 +10,8 @@ import torch
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior, SparseTrainer, Transitions, train
 from gpmpc.models import Affine, DelayedModel, KnownModel, ResidualModel
-from gpmpc.mpc import PredictionSettings, Reference
+from gpmpc.mpc import GPMPC, Box, PredictionSettings, Problem, Reference, Tracking
 from gpmpc.mpc._novelty import data_scales
-from gpmpc.mpc.gp_mpc import GPMPC
-from gpmpc.mpc.problem import Box, Problem, Tracking
 from gpmpc.propagation import Linearization, MomentMatching
 
 PROBLEM = Problem(Tracking([1.0, 1.0], [0.1]), Box([-1.0], [1.0]))

@@ -1,4 +1,5 @@
-"""Costs of outputs, weights and bounds by stage, rows of inputs, and plans that are handed over."""
+"""Costs of outputs, weights and bounds by stage, rows of inputs, and plans that are
+handed over."""
 
 import casadi
 import numpy as np
@@ -9,12 +10,20 @@ from gpmpc.exceptions import DataError, SettingError, ShapeError
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import Transitions, train
 from gpmpc.models import Affine, ResidualModel
-from gpmpc.mpc import ControlLoop, LeastSquares, Reference
+from gpmpc.mpc import (
+    GPMPC,
+    Box,
+    ControlLoop,
+    Inequality,
+    LeastSquares,
+    PredictionSettings,
+    Problem,
+    Reference,
+    Tracking,
+)
 from gpmpc.mpc._linear_quadratic import COVARIANCES
-from gpmpc.mpc._linearization import FORMS, PredictionSettings
+from gpmpc.mpc._linearization import FORMS
 from gpmpc.mpc.baselines import LQR, NMPC, StateFormMPC
-from gpmpc.mpc.gp_mpc import GPMPC
-from gpmpc.mpc.problem import Box, Inequality, Problem, Tracking
 from gpmpc.propagation import Linearization
 from gpmpc.status import Status
 from tests.mpc.double_pendulum import ACROBOT, DoublePendulum
@@ -44,7 +53,8 @@ def planned(
 @pytest.mark.parametrize("covariance", COVARIANCES)
 @pytest.mark.parametrize("form", FORMS)
 def test_a_linear_output_costs_what_tracking_does(form, covariance):
-    """x - r and u as outputs with the weights Q and R, beside a cost that is next to nothing."""
+    """x - r and u as outputs with the weights Q and R, beside a cost that is next to
+    nothing."""
     Q = np.diag([3.0, 0.5, 1.0]) + 0.1
     R = np.diag([0.2, 0.4])
     tracking = planned(
@@ -97,7 +107,8 @@ def test_weights_and_bounds_by_stage_are_those_of_the_program_with_its_states_le
 
 
 def tip(x, u, p):
-    """Place of a double pendulum's tip over the one that p says, and the power that its motor takes."""
+    """Place of a double pendulum's tip over the one that p says, and the power that its
+    motor takes."""
     elbow = x[..., 0]
     hand = x[..., 0] + x[..., 1]
     place = [
@@ -124,7 +135,8 @@ def casadi_tip():
 
 @pytest.mark.parametrize("y", [tip, casadi_tip()], ids=["torch", "CasADi"])
 def test_an_iterated_plan_is_where_the_cost_of_its_outputs_has_no_slope(y):
-    """The gradient of the true cost in the inputs, by differences of a roll-out, vanishes: KKT without bounds."""
+    """The gradient of the true cost in the inputs, by differences of a roll-out,
+    vanishes: KKT without bounds."""
     model = DoublePendulum(ACROBOT)
     steps = 12
     R = 1e-2

@@ -3,9 +3,8 @@ import pytest
 
 from gpmpc.exceptions import SettingError, SolverFailure
 from gpmpc.gaussian import Gaussian
-from gpmpc.mpc import ControlLoop, Decision, Reference, Timing
+from gpmpc.mpc import Box, ControlLoop, Decision, Problem, Reference, Timing, Tracking
 from gpmpc.mpc._policy import decide
-from gpmpc.mpc.problem import Box, Problem, Tracking
 from gpmpc.status import Status
 
 STATE = Gaussian.certain(np.zeros(1))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from gpmpc.exceptions import SettingError
-from gpmpc.mpc.problem import Box, Halfspaces, Problem, Tracking
+from gpmpc.mpc import Box, Halfspaces, Problem, Tracking
 
 
 def test_diagonals_and_matrices_mean_the_same():

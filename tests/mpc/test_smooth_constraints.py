@@ -5,10 +5,18 @@ import torch
 
 from gpmpc.exceptions import DataError, SettingError, ShapeError, SolverFailure
 from gpmpc.gaussian import Gaussian
-from gpmpc.mpc import ControlLoop, PredictionSettings, Reference
+from gpmpc.mpc import (
+    GPMPC,
+    Box,
+    ControlLoop,
+    Halfspaces,
+    Inequality,
+    PredictionSettings,
+    Problem,
+    Reference,
+    Tracking,
+)
 from gpmpc.mpc.baselines import NMPC
-from gpmpc.mpc.gp_mpc import GPMPC
-from gpmpc.mpc.problem import Box, Halfspaces, Inequality, Problem, Tracking
 from gpmpc.propagation import Linearization
 from gpmpc.status import Status
 from tests.mpc.systems import LinearPlant, linear_gaussian

@@ -13,11 +13,19 @@ from gpmpc.exceptions import DataError
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior, backend
 from gpmpc.models import CasadiFunction, KnownModel
-from gpmpc.mpc import Decision, PredictionSettings, Reference, Timing, _sqp
+from gpmpc.mpc import (
+    GPMPC,
+    Box,
+    Decision,
+    PredictionSettings,
+    Problem,
+    Reference,
+    Timing,
+    Tracking,
+    _sqp,
+)
 from gpmpc.mpc._guess import initial_guess, read_request
 from gpmpc.mpc._roll_out import roll_out
-from gpmpc.mpc.gp_mpc import GPMPC
-from gpmpc.mpc.problem import Box, Problem, Tracking
 from gpmpc.propagation import Linearization
 from gpmpc.qp import DualActiveSet
 from gpmpc.status import Status
@@ -47,7 +55,8 @@ def reachable(quadrotor):
 def test_a_reference_that_can_be_reached_at_no_cost_is_reached(
     quadrotor, reachable, tolerance
 ):
-    """1e-300 asks for more than there is: it ends where every step is lost in round-off."""
+    """1e-300 asks for more than there is: it ends where every step is lost in
+    round-off."""
     problem = Problem(
         Tracking([10.0, 1.0] * 3, [0.1] * 3, penalized="deviations"), **BOX
     )
@@ -72,7 +81,8 @@ def test_a_reference_that_can_be_reached_at_no_cost_is_reached(
 @pytest.mark.parametrize("penalized", ["inputs", "increments"])
 @pytest.mark.parametrize("tolerance", [1e-6, 1e-7])
 def test_a_regulator_at_its_origin_has_no_trouble(penalized, tolerance):
-    """Data and their mirror image: the origin is an equilibrium of the mean, to which all cost vanishes."""
+    """Data and their mirror image: the origin is an equilibrium of the mean, to which
+    all cost vanishes."""
     half = pendulum_gp(2, 40)
     features, targets = (
         torch.cat([part, -part]) for part in (half.features, half.targets)
@@ -130,7 +140,8 @@ def test_the_residual_vanishes_with_the_distance_where_the_cost_does(quadrotor):
 
 @pytest.mark.parametrize("tolerance", [1e-4, 1e-6])
 def test_what_is_called_solved_is_within_ten_times_the_tolerance(quadrotor, tolerance):
-    """The stop estimates the residual of a plan that it has not rolled out; here another measures it."""
+    """The stop estimates the residual of a plan that it has not rolled out; here
+    another measures it."""
     problem = Problem(Tracking([10.0, 1.0] * 3, [0.1] * 3), **BOX)
     controller = GPMPC(
         quadrotor,

@@ -14,7 +14,8 @@ from tests.mpc.small_models import double_integrator, pendulum_posterior
 
 
 class ByDifferentiation(Linearization):
-    """Linearisation by way of the propagator's own derivatives, which say more than is needed."""
+    """Linearisation by way of the propagator's own derivatives, which say more than is
+    needed."""
 
     first_order = False
 

@@ -7,12 +7,10 @@ import pytest
 
 from gpmpc.exceptions import SettingError
 from gpmpc.gaussian import Gaussian
-from gpmpc.mpc import Reference
+from gpmpc.mpc import GPMPC, Box, PredictionSettings, Problem, Reference, Tracking
 from gpmpc.mpc._linear_quadratic import COVARIANCES
-from gpmpc.mpc._linearization import FORMS, PredictionSettings
+from gpmpc.mpc._linearization import FORMS
 from gpmpc.mpc.baselines import StateFormMPC
-from gpmpc.mpc.gp_mpc import GPMPC
-from gpmpc.mpc.problem import Box, Problem, Tracking
 from gpmpc.propagation import Linearization, MeanEquivalence
 from gpmpc.qp import CvxpySolver
 from gpmpc.status import Status

@@ -1,4 +1,5 @@
-"""A solve that stops at a limit with a plan that keeps its bounds steers all the same, and is the next start."""
+"""A solve that stops at a limit with a plan that keeps its bounds steers all the same,
+and is the next start."""
 
 from dataclasses import replace
 
@@ -9,10 +10,16 @@ import torch
 
 from gpmpc.experiments.slsqp import SLSQP
 from gpmpc.gaussian import Gaussian
-from gpmpc.mpc import PredictionSettings, Reference
+from gpmpc.mpc import (
+    GPMPC,
+    Box,
+    NonlinearGPMPC,
+    PredictionSettings,
+    Problem,
+    Reference,
+    Tracking,
+)
 from gpmpc.mpc.baselines import NMPC, StateFormMPC
-from gpmpc.mpc.gp_mpc import GPMPC, NonlinearGPMPC
-from gpmpc.mpc.problem import Box, Problem, Tracking
 from gpmpc.propagation import Linearization
 from gpmpc.qp import DualActiveSet, PrimalActiveSet
 from gpmpc.simulation import closed_loop
@@ -111,7 +118,8 @@ def test_a_vehicle_comes_home_with_plans_that_were_not_optimal_yet(kind, monkeyp
 
 @pytest.mark.parametrize("limit", [2, 4, 8])
 def test_the_plan_at_a_limit_is_the_best_that_the_iteration_got_to(limit):
-    """Its cost falls from limit to limit, down to the optimum, by an evaluation that is not the iteration's own."""
+    """Its cost falls from limit to limit, down to the optimum, by an evaluation that is
+    not the iteration's own."""
 
     def of_the_mean(plan):
         x = torch.tensor(START)

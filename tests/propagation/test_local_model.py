@@ -1,4 +1,5 @@
-"""s+ = A s + B u + c with s = [mu; vec(Sigma^1/2)]: against finite differences, limits, batches and rollouts."""
+"""s+ = A s + B u + c with s = [mu; vec(Sigma^1/2)]: against finite differences, limits,
+batches and rollouts."""
 
 import pytest
 import torch

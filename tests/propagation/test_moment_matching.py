@@ -1,4 +1,5 @@
-"""Exact moment matching against brute force: Monte Carlo, 50 digits, finite differences, and its own limits."""
+"""Exact moment matching against brute force: Monte Carlo, 50 digits, finite
+differences, and its own limits."""
 
 import mpmath
 import pytest
@@ -45,7 +46,8 @@ def belief(n=2, spread=0.3, seed=1, rank=None):
 
 
 def by_mpmath(gp, at, control):
-    """The textbook formulas of the module in 50 digits, from the same hyperparameters and data."""
+    """The textbook formulas of the module in 50 digits, from the same hyperparameters
+    and data."""
     with mpmath.workdps(50):
         n = gp.state_dim
         size = len(gp)

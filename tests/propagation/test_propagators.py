@@ -1,4 +1,5 @@
-"""What the five propagators promise, each where its answer is known, and what they say to bad input."""
+"""What the five propagators promise, each where its answer is known, and what they say
+to bad input."""
 
 import numpy as np
 import pytest
@@ -55,7 +56,8 @@ def gp(n=2, m=1, predicts="next_state", outputs=None, noise=1e-2):
 
 
 def linear(noise=0.04):
-    """x+ = A x + B u + c + d, d of a prior that no data have told anything: variance Q near 0, noise sn2."""
+    """x+ = A x + B u + c + d, d of a prior that no data have told anything: variance Q
+    near 0, noise sn2."""
     A = torch.tensor([[0.9, 0.4], [-0.3, 0.8]])
     B = torch.tensor([[0.2], [0.7]])
     c = torch.tensor([0.5, -1.0])
@@ -170,7 +172,8 @@ def test_the_order_of_accuracy_on_a_nonlinear_model_is_as_stated():
     ):
         rate = errors(propagator, 1e-2) / errors(propagator, 1e-3)
         assert float(rate[0].log10()) == pytest.approx(power, abs=0.15)
-    # Error of the covariance: Unscented sees the curvature of the model's variance, linearization does not.
+    # Error of the covariance: Unscented sees the curvature of the model's variance,
+    # linearization does not.
     rate = errors(Unscented(), 1e-2) / errors(Unscented(), 1e-3)
     assert float(rate[1].log10()) == pytest.approx(2, abs=0.15)
     assert float(

@@ -1,4 +1,5 @@
-"""Closed-form derivatives against torch autograd through the torch evaluation, for every model that has them."""
+"""Closed-form derivatives against torch autograd through the torch evaluation, for
+every model that has them."""
 
 import pytest
 import torch

@@ -1,4 +1,5 @@
-"""The unscented transform on a quadratic function, where the moments by sigma points and the exact ones are known."""
+"""The unscented transform on a quadratic function, where the moments by sigma points
+and the exact ones are known."""
 
 import pytest
 import torch
@@ -32,7 +33,8 @@ class Quadratic:
 def test_with_beta_of_two_a_quadratic_of_one_state_is_exact_whatever_alpha(
     alpha, curvature
 ):
-    """Which is what beta is for (van der Merwe, 2004): Var[g x + 1/2 h x^2] = g^2 s + 1/2 h^2 s^2 about zero."""
+    """Which is what beta is for (van der Merwe, 2004): Var[g x + 1/2 h x^2] = g^2 s +
+    1/2 h^2 s^2 about zero."""
     model = Quadratic(torch.tensor([0.7]), torch.tensor([[curvature]]))
     s = 0.4
     moved = Unscented(alpha, beta=2.0).propagate(
@@ -52,7 +54,8 @@ def test_with_beta_of_two_a_quadratic_of_one_state_is_exact_whatever_alpha(
 def test_moments_of_a_quadratic_of_three_states_are_those_of_the_points_worked_out_by_hand(
     alpha, beta, kappa
 ):
-    """Along the columns r_j of the root, d_j = 1/2 r_j'H r_j: the mean is sum d_j = 1/2 tr(H S) for all parameters.
+    """Along the columns r_j of the root, d_j = 1/2 r_j'H r_j: the mean is sum d_j = 1/2
+    tr(H S) for all parameters.
 
     The variance is g'S g + (n + lambda) sum d_j^2 + (beta - alpha^2) (sum d_j)^2.
     """

@@ -7,9 +7,16 @@ import torch
 from gpmpc.exceptions import Diverged, SettingError, ShapeError, SolverFailure
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import backend
-from gpmpc.mpc import Decision, PredictionSettings, Reference, Timing
-from gpmpc.mpc.gp_mpc import GPMPC
-from gpmpc.mpc.problem import Box, Problem, Tracking
+from gpmpc.mpc import (
+    GPMPC,
+    Box,
+    Decision,
+    PredictionSettings,
+    Problem,
+    Reference,
+    Timing,
+    Tracking,
+)
 from gpmpc.propagation import Linearization, MomentMatching
 from gpmpc.simulation import Dropout, Gust, ModelLoop, Noise, closed_loop, closed_loops
 from gpmpc.status import Status

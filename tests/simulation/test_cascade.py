@@ -5,8 +5,8 @@ import pytest
 
 from gpmpc.exceptions import SettingError, ShapeError, SolverFailure
 from gpmpc.metrics import tracking_error
+from gpmpc.mpc import Problem, Tracking
 from gpmpc.mpc.baselines import NMPC
-from gpmpc.mpc.problem import Problem, Tracking
 from gpmpc.simulation import Cascade, Dropout, Gust, Noise, Replaced, cascade_loop
 from gpmpc.status import Status
 from gpmpc.systems import Coupled, Map, Rotational, System, Translational, step

@@ -14,10 +14,8 @@ from gpmpc.gaussian import Gaussian
 from gpmpc.gp import train
 from gpmpc.learning import EpisodicLearning, LearningController
 from gpmpc.models import DelayedModel, DisturbedModel
-from gpmpc.mpc import ControlLoop, ManyStarts, Reference
+from gpmpc.mpc import GPMPC, ControlLoop, ManyStarts, Problem, Reference, Tracking
 from gpmpc.mpc.baselines import LQR, NMPC, StateFormMPC
-from gpmpc.mpc.gp_mpc import GPMPC
-from gpmpc.mpc.problem import Problem, Tracking
 from gpmpc.propagation import Linearization
 from gpmpc.signals import Signals
 from gpmpc.simulation import (

@@ -8,9 +8,8 @@ import pytest
 
 from gpmpc.exceptions import ShapeError, SolverFailure
 from gpmpc.gaussian import Gaussian
-from gpmpc.mpc import Decision, Reference, Timing
+from gpmpc.mpc import Box, Decision, Problem, Reference, Timing, Tracking
 from gpmpc.mpc._policy import decide, decide_many
-from gpmpc.mpc.problem import Box, Problem, Tracking
 from gpmpc.propagation import Linearization
 from gpmpc.simulation import Cascade, ModelLoop, cascade_loop, closed_loop, closed_loops
 from gpmpc.status import Status

@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
-from gpmpc.systems import System, Translational, step
+from gpmpc.systems import GRAVITY, System, Translational, step
 from gpmpc.systems._quadrotor import (
-    GRAVITY,
     approach_attitudes,
     attitudes_along,
     rotational_states_along,

@@ -1,4 +1,5 @@
-"""The pole of gymnasium's InvertedPendulum, learned from random motion, is balanced within bounds of cart and pole."""
+"""The pole of gymnasium's InvertedPendulum, learned from random motion, is balanced
+within bounds of cart and pole."""
 
 from dataclasses import replace
 

@@ -1,4 +1,5 @@
-"""The package's quadrotor in MuJoCo moves as its rigid body says, but for drag, wind and the lag of its rotors."""
+"""The package's quadrotor in MuJoCo moves as its rigid body says, but for drag, wind
+and the lag of its rotors."""
 
 from dataclasses import replace
 

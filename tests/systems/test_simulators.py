@@ -1,4 +1,5 @@
-"""Foreign simulators are systems like any other, and this package's systems are environments."""
+"""Foreign simulators are systems like any other, and this package's systems are
+environments."""
 
 import sys
 from functools import partial
@@ -9,8 +10,7 @@ import pytest
 from gpmpc.datasets import RandomData
 from gpmpc.exceptions import DataError, Diverged, SettingError
 from gpmpc.gp import Trainer, standardize
-from gpmpc.mpc.gp_mpc import GPMPC
-from gpmpc.mpc.problem import Box, Problem, Tracking
+from gpmpc.mpc import GPMPC, Box, Problem, Tracking
 from gpmpc.propagation import Linearization
 from gpmpc.simulation import closed_loop, closed_loops
 from gpmpc.studies.flight import Experiment, run_trial

@@ -1,4 +1,5 @@
-"""Pendulum, cart-pole and acrobot swing up from hanging with the settings that their files bring."""
+"""Pendulum, cart-pole and acrobot swing up from hanging with the settings that their
+files bring."""
 
 import numpy as np
 import pytest

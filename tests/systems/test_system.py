@@ -1,4 +1,5 @@
-"""A system says everything of itself, and what cannot be flown is refused where it is made."""
+"""A system says everything of itself, and what cannot be flown is refused where it is
+made."""
 
 from dataclasses import replace
 
