@@ -105,14 +105,29 @@ OTHER = np.random.default_rng(3).normal(size=(300, 1))
         (lambda x, u: (x, 0 * u + 0.1), "input 1 is constant"),
         (lambda x, u: (x, np.hstack([u, 0 * u + 3])), "input 2 is constant"),
         (lambda x, u: (x, np.hstack([u, u])), "inputs 1 and 2 move alike"),
-        (lambda x, u: (x, np.hstack([OTHER, u, 7 - 3 * u])), "inputs 2 and 3 move alike"),
-        (lambda x, u: (x, np.hstack([u, OTHER, u - OTHER])), "input 3 is a sum of those before"),
+        (
+            lambda x, u: (x, np.hstack([OTHER, u, 7 - 3 * u])),
+            "inputs 2 and 3 move alike",
+        ),
+        (
+            lambda x, u: (x, np.hstack([u, OTHER, u - OTHER])),
+            "input 3 is a sum of those before",
+        ),
         (lambda x, u: (0 * x + 1, u), "no state moves"),
-        (lambda x, u: feedback_alone(300, 0, 1.0), "input 1 of 0 steps before is a function of the state"),
-        (lambda x, u: feedback_alone(300, 3, 1.0), "input 1 of 0 steps before is a function of the state"),
-        (lambda x, u: feedback_alone(300, 1, 0.0), "is a function of the state, as under feedback alone"),
+        (
+            lambda x, u: feedback_alone(300, 0, 1.0),
+            "input 1 of 0 steps before is a function of the state",
+        ),
+        (
+            lambda x, u: feedback_alone(300, 3, 1.0),
+            "input 1 of 0 steps before is a function of the state",
+        ),
+        (
+            lambda x, u: feedback_alone(300, 1, 0.0),
+            "is a function of the state, as under feedback alone",
+        ),
     ],
-)  # fmt: skip
+)
 @pytest.mark.parametrize("offset", [0.0, 1e4])
 def test_a_delay_that_the_data_cannot_tell_is_refused_by_its_reason(
     change, reason, offset
@@ -168,9 +183,15 @@ def test_rows_that_were_trained_on_count_as_if_they_had_not_been():
     )
     held_out = estimate_process_noise(model, data[:20], block=20)
     without = GPPosterior.from_hyperparameters(
-        model.features[20:], model.targets[20:], model.lengthscales, model.signal_variance, model.noise_variance, 1,
-        "difference", model.offset,
-    )  # fmt: skip
+        model.features[20:],
+        model.targets[20:],
+        model.lengthscales,
+        model.signal_variance,
+        model.noise_variance,
+        1,
+        "difference",
+        model.offset,
+    )
     again = estimate_process_noise(without, data[:20])
     assert torch.allclose(held_out.variance, again.variance, rtol=1e-6)
     assert (estimate_process_noise(model, data).variance > in_sample).all()

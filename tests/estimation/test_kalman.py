@@ -268,17 +268,45 @@ WIDE = {
     "correlated": (random_covariance(6, 1e14), np.eye(6)[:4], [1.0] * 4),
     "correlated, all": (random_covariance(6, 1e16), np.eye(6), [1.0] * 6),
     "nearly singular": ([[1.0, 1 - 1e-12], [1 - 1e-12, 1.0]], [[1.0, 0.0]], [1e-6]),
-    "nearly singular, difference": ([[1.0, 1 - 1e-12], [1 - 1e-12, 1.0]], [[1.0, -1.0]], [1e-8]),
-    "singular": (7 * np.outer([1.0, 2.0, -3.0], [1.0, 2.0, -3.0]), [[1.0, 0.0, 0.0]], [1e-3]),
+    "nearly singular, difference": (
+        [[1.0, 1 - 1e-12], [1 - 1e-12, 1.0]],
+        [[1.0, -1.0]],
+        [1e-8],
+    ),
+    "singular": (
+        7 * np.outer([1.0, 2.0, -3.0], [1.0, 2.0, -3.0]),
+        [[1.0, 0.0, 0.0]],
+        [1e-3],
+    ),
     "singular and wide": (3e14 * np.ones((2, 2)), [[1.0, 0.0]], [1.0]),
-    "Hilbert's matrix": (1 / (np.arange(5)[:, None] + np.arange(5) + 1), np.eye(5)[:3], [1e-6] * 3),
+    "Hilbert's matrix": (
+        1 / (np.arange(5)[:, None] + np.arange(5) + 1),
+        np.eye(5)[:3],
+        [1e-6] * 3,
+    ),
     "perfect": (random_covariance(4, 1.0), [[1.0, 0.0, 0.0, 0.0]], [0.0]),
-    "perfect, thrice": (random_covariance(4, 1.0), [[1, 2, 0, 0], [2, 4, 0, 0], [1, 2, 0, 0]], [0.0] * 3),
-    "perfect and noisy": (random_covariance(4, 1.0), [[1, 2, 0.3, 0], [1, 2, 0.3, 0], [0, 1, 1, 1]], [0.0, 1e-3, 1e-5]),
-    "unlike scales": (random_covariance(4, 1.0), [[1, 2, 0.3, 0], [0, 2, 0.3, 1], [0, 1, 1, 1]], [1e-12, 1.0, 1e12]),
-    "unlike units": (random_covariance(4, 1e3), [[1e6, 2e6, 0, 0], [0, 2e-6, 1e-6, 1e-6]], [1e-2, 1e-18]),
+    "perfect, thrice": (
+        random_covariance(4, 1.0),
+        [[1, 2, 0, 0], [2, 4, 0, 0], [1, 2, 0, 0]],
+        [0.0] * 3,
+    ),
+    "perfect and noisy": (
+        random_covariance(4, 1.0),
+        [[1, 2, 0.3, 0], [1, 2, 0.3, 0], [0, 1, 1, 1]],
+        [0.0, 1e-3, 1e-5],
+    ),
+    "unlike scales": (
+        random_covariance(4, 1.0),
+        [[1, 2, 0.3, 0], [0, 2, 0.3, 1], [0, 1, 1, 1]],
+        [1e-12, 1.0, 1e12],
+    ),
+    "unlike units": (
+        random_covariance(4, 1e3),
+        [[1e6, 2e6, 0, 0], [0, 2e-6, 1e-6, 1e-6]],
+        [1e-2, 1e-18],
+    ),
     "certain": (np.zeros((2, 2)), [[1.0, 1.0], [1.0, 0.0]], [0.0, 0.0]),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", WIDE)
@@ -420,17 +448,57 @@ def test_errors_that_are_too_large_or_too_small_for_their_covariance_are_inconsi
 @pytest.mark.parametrize(
     ("make", "error", "rule"),
     [
-        (lambda m: KalmanFilter(LINEAR, Measurement.of_states(3, [0], [0.1])), SettingError, "measurement: must be of"),
-        (lambda m: KalmanFilter(LINEAR, m, Linearization(False)), SettingError, "propagator: must add the proc"),
-        (lambda m: KalmanFilter(LINEAR, m, MeanEquivalence(False)), SettingError, "propagator: must add the proc"),
-        (lambda m: KalmanFilter(LINEAR, m).update(PRIOR, [0.0, 1.0]), ShapeError, r"shape \(1,\); got \(2,\)"),
-        (lambda m: KalmanFilter(LINEAR, m).run(PRIOR, np.zeros((2, 1)), np.zeros((2, 1))), ShapeError, "got 2 and 2"),
-        (lambda m: Measurement.of_states(2, [2], [0.1]), SettingError, "states: must be indices from 0 to 1"),
-        (lambda m: Measurement.of_states(2, [1], [-0.1]), SettingError, "std: must be a number"),
-        (lambda m: Measurement(2, torch.eye(2), lambda x: x[..., :1]).predict(PRIOR.mean), ShapeError, "must give"),
-        (lambda m: normalized_errors([[np.nan]], [[[1.0]]]), DataError, "no error is finite"),
+        (
+            lambda m: KalmanFilter(LINEAR, Measurement.of_states(3, [0], [0.1])),
+            SettingError,
+            "measurement: must be of",
+        ),
+        (
+            lambda m: KalmanFilter(LINEAR, m, Linearization(False)),
+            SettingError,
+            "propagator: must add the proc",
+        ),
+        (
+            lambda m: KalmanFilter(LINEAR, m, MeanEquivalence(False)),
+            SettingError,
+            "propagator: must add the proc",
+        ),
+        (
+            lambda m: KalmanFilter(LINEAR, m).update(PRIOR, [0.0, 1.0]),
+            ShapeError,
+            r"shape \(1,\); got \(2,\)",
+        ),
+        (
+            lambda m: KalmanFilter(LINEAR, m).run(
+                PRIOR, np.zeros((2, 1)), np.zeros((2, 1))
+            ),
+            ShapeError,
+            "got 2 and 2",
+        ),
+        (
+            lambda m: Measurement.of_states(2, [2], [0.1]),
+            SettingError,
+            "states: must be indices from 0 to 1",
+        ),
+        (
+            lambda m: Measurement.of_states(2, [1], [-0.1]),
+            SettingError,
+            "std: must be a number",
+        ),
+        (
+            lambda m: Measurement(2, torch.eye(2), lambda x: x[..., :1]).predict(
+                PRIOR.mean
+            ),
+            ShapeError,
+            "must give",
+        ),
+        (
+            lambda m: normalized_errors([[np.nan]], [[[1.0]]]),
+            DataError,
+            "no error is finite",
+        ),
     ],
-)  # fmt: skip
+)
 def test_misuse_is_refused(make, error, rule):
     with pytest.raises(error, match=rule):
         make(Measurement.of_states(2, [0], [0.1]))

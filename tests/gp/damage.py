@@ -320,13 +320,27 @@ def a_huge_header(content, rng):
 
 BYTES = [flipped, cut, without_a_piece, overwritten, repeated]
 ZIP = [
-    members_swapped, a_member_dropped, a_member_renamed, a_header_edited, a_header_of_garbage, an_array_of_another_kind,
-    a_huge_shape, a_bomb,
-]  # fmt: skip
+    members_swapped,
+    a_member_dropped,
+    a_member_renamed,
+    a_header_edited,
+    a_header_of_garbage,
+    an_array_of_another_kind,
+    a_huge_shape,
+    a_bomb,
+]
 SAFETENSORS = [
-    a_tensor_elsewhere, tensors_swapped, a_tensor_of_another_shape, a_tensor_of_another_type, a_tensor_renamed,
-    a_tensor_dropped, a_header_edited_in_place, metadata_of_garbage, a_whole_header_of_garbage, a_huge_header,
-]  # fmt: skip
+    a_tensor_elsewhere,
+    tensors_swapped,
+    a_tensor_of_another_shape,
+    a_tensor_of_another_type,
+    a_tensor_renamed,
+    a_tensor_dropped,
+    a_header_edited_in_place,
+    metadata_of_garbage,
+    a_whole_header_of_garbage,
+    a_huge_header,
+]
 
 
 def transitions():

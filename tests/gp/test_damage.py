@@ -149,10 +149,16 @@ def test_parts_that_changed_places_are_noticed(one, other, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "load", [Transitions.load, Transitions.from_text, lambda p: Transitions.from_csv(p, ["x"], ["u"]),
-             load_posterior, load_model,
-             lambda p: save_posterior(posterior(), p)]
-)  # fmt: skip
+    "load",
+    [
+        Transitions.load,
+        Transitions.from_text,
+        lambda p: Transitions.from_csv(p, ["x"], ["u"]),
+        load_posterior,
+        load_model,
+        lambda p: save_posterior(posterior(), p),
+    ],
+)
 def test_a_path_is_one_name(load):
     for path in (["a.csv", "b.csv"], None, 3):
         with pytest.raises(

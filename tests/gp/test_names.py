@@ -266,8 +266,11 @@ def test_further_states_of_a_model_have_names_of_their_own(posterior):
     assert DelayedModel(delayed, 1).signals.state_names == ()  # two of one name
     remembered = Lags(2, 1, states=1, inputs=1).transitions(STATES, INPUTS)
     assert remembered.signals.state_names == (
-        *KNOWN.state_names, "angle[k-1]", "rate[k-1]", "torque[k-1]"
-    )  # fmt: skip
+        *KNOWN.state_names,
+        "angle[k-1]",
+        "rate[k-1]",
+        "torque[k-1]",
+    )
 
 
 def test_saved_models_carry_names_and_files_without_them_are_read(tmp_path, posterior):

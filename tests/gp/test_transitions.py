@@ -183,10 +183,15 @@ NUMBERS = [[1, 2], [3, 4]]
 @pytest.mark.parametrize(
     "values",
     [
-        NUMBERS, np.array(NUMBERS), np.array(NUMBERS, np.uint8), np.array(NUMBERS, ">f4"),
-        np.array(NUMBERS, np.float16), torch.tensor(NUMBERS), torch.tensor(NUMBERS).float(),
+        NUMBERS,
+        np.array(NUMBERS),
+        np.array(NUMBERS, np.uint8),
+        np.array(NUMBERS, ">f4"),
+        np.array(NUMBERS, np.float16),
+        torch.tensor(NUMBERS),
+        torch.tensor(NUMBERS).float(),
     ],
-)  # fmt: skip
+)
 def test_all_kinds_of_numbers_are_taken_as_doubles(values):
     data = Transitions(values, values, values)
     for taken in (data.states, data.inputs, data.next_states):
@@ -197,12 +202,15 @@ def test_all_kinds_of_numbers_are_taken_as_doubles(values):
 @pytest.mark.parametrize(
     ("values", "kind"),
     [
-        ([[True, False]] * 2, "bool"), ([["1", "2"]] * 2, "<U1"), ([[1j, 2]] * 2, "complex128"),
+        ([[True, False]] * 2, "bool"),
+        ([["1", "2"]] * 2, "<U1"),
+        ([[1j, 2]] * 2, "complex128"),
         ([[None, 1]] * 2, "object"),
-        (np.zeros((2, 2), "datetime64[s]"), r"datetime64\[s\]"), (torch.ones(2, 2, dtype=torch.bool), "torch.bool"),
+        (np.zeros((2, 2), "datetime64[s]"), r"datetime64\[s\]"),
+        (torch.ones(2, 2, dtype=torch.bool), "torch.bool"),
         (torch.ones(2, 2, dtype=torch.complex64), "torch.complex64"),
     ],
-)  # fmt: skip
+)
 def test_what_only_could_be_taken_for_numbers_is_refused(values, kind):
     with pytest.raises(
         DataError, match=f"inputs must be numbers in rows and columns; got {kind}"

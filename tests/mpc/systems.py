@@ -90,6 +90,11 @@ def quadrotor_gp(N=60, seed=0):
     y = np.array([step(QUADROTOR, a, b) for a, b in zip(x, u, strict=True)])
     lengthscales = torch.tensor([[10.0, 2.0, 10.0, 2.0, 10.0, 2.0, 6.0, 1.0, 1.0]] * 6)
     return GPPosterior.from_hyperparameters(
-        torch.tensor(np.hstack([x, u])), torch.tensor(y - x), lengthscales, torch.ones(6), torch.full((6,), 1e-4), 3,
+        torch.tensor(np.hstack([x, u])),
+        torch.tensor(y - x),
+        lengthscales,
+        torch.ones(6),
+        torch.full((6,), 1e-4),
+        3,
         "difference",
-    )  # fmt: skip
+    )

@@ -49,9 +49,15 @@ def test_an_input_that_saturates_is_no_reason_to_creep(force, tolerance):
     plans = []
     for count in (100, 400):
         controller = GPMPC(
-            cart(force), Linearization(), problem, 8, [0.0], MEANS,
-            iterations=count, tolerance=tolerance / (1 if count == 100 else 1e3),
-        )  # fmt: skip
+            cart(force),
+            Linearization(),
+            problem,
+            8,
+            [0.0],
+            MEANS,
+            iterations=count,
+            tolerance=tolerance / (1 if count == 100 else 1e3),
+        )
         decision = controller.control(
             Gaussian.certain([1.0, 0.0]), Reference(np.zeros(2))
         )
@@ -69,9 +75,15 @@ def flown(iterations, tolerance=None):
         Box(system.input_lower, system.input_upper),
     )
     controller = GPMPC(
-        known(system), Linearization(), problem, 15, system.initial_input, MEANS,
-        iterations=iterations, tolerance=tolerance,
-    )  # fmt: skip
+        known(system),
+        Linearization(),
+        problem,
+        15,
+        system.initial_input,
+        MEANS,
+        iterations=iterations,
+        tolerance=tolerance,
+    )
     state = np.zeros(6)
     decision = None
     cost = 0.0
@@ -132,9 +144,14 @@ def test_a_decision_tells_how_far_its_own_plan_misses_a_curved_bound(
             constraints=[Inequality(h=h, stages=stages)],
         )
         controller = GPMPC(
-            KnownModel(puck, 4, 2), Linearization(), problem, 8, [0.0, 0.0], MEANS,
+            KnownModel(puck, 4, 2),
+            Linearization(),
+            problem,
+            8,
+            [0.0, 0.0],
+            MEANS,
             iterations=iterations,
-        )  # fmt: skip
+        )
         start = rng.normal(size=4) * [2.0, 1.0, 2.0, 1.0]
         decision = controller.control(Gaussian.certain(start), Reference(np.zeros(4)))
         states = [torch.from_numpy(start)]
@@ -167,11 +184,18 @@ def test_a_first_plan_is_iterated_only_where_that_pays():
         problem = Problem(cost, Box(system.input_lower, system.input_upper))
         plans = [
             GPMPC(
-                known(system), Linearization(), problem, 30, [0.0], MEANS,
+                known(system),
+                Linearization(),
+                problem,
+                30,
+                [0.0],
+                MEANS,
                 iterations=count,
-            ).control(Gaussian.certain(np.array(system.start)), Reference(np.zeros(len(Q))))
+            ).control(
+                Gaussian.certain(np.array(system.start)), Reference(np.zeros(len(Q)))
+            )
             for count in (None, 1)
-        ]  # fmt: skip
+        ]
         ends[make] = np.abs(plans[0].inputs - plans[1].inputs).max()
         assert plans[0].applicable
     assert ends[pendulum] < 1e-9
@@ -182,9 +206,7 @@ def test_a_first_plan_stands_where_more_programs_lead_the_model_out_of_its_numbe
     monkeypatch,
 ):
     problem = Problem(Tracking([10.0, 1.0], [0.01]), inputs=Box([-5.0], [5.0]))
-    controller = GPMPC(
-        cart(torch.tanh), Linearization(), problem, 8, [0.0], MEANS
-    )  # fmt: skip
+    controller = GPMPC(cart(torch.tanh), Linearization(), problem, 8, [0.0], MEANS)
     at = Gaussian.certain([1.0, 0.0])
     reference = Reference(np.zeros(2))
 

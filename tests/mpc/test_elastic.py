@@ -91,9 +91,13 @@ def test_a_vehicle_that_was_pushed_out_of_its_lane_comes_back_and_does_not_spin(
             constraints=[] if penalty == "none" else [lane],
         )
         controller = GPMPC(
-            KnownModel(slide, 3, 1), Linearization(), problem, 15, [0.0],
+            KnownModel(slide, 3, 1),
+            Linearization(),
+            problem,
+            15,
+            [0.0],
             PredictionSettings(covariance="none"),
-        )  # fmt: skip
+        )
         state = np.array([0.2, 0.0, 0.0])
         decision = None
         worst = 0.0

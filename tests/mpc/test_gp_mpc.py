@@ -233,10 +233,14 @@ def expected_cost(problem, model, moves, state, inputs, reference, covariance):
 
 @pytest.mark.parametrize(
     ("covariance", "moves"),
-    [("full", Linearization()), ("diagonal", Linearization()), ("diagonal", MomentMatching(diagonal=True)),
-     ("none", MeanEquivalence())],
+    [
+        ("full", Linearization()),
+        ("diagonal", Linearization()),
+        ("diagonal", MomentMatching(diagonal=True)),
+        ("none", MeanEquivalence()),
+    ],
     ids=["full", "diagonal", "moment matching", "none"],
-)  # fmt: skip
+)
 def test_more_iterations_end_in_a_kkt_point_of_the_nonlinear_problem(covariance, moves):
     H = 3
     limits = Box([-np.inf, -0.35] * 3, [np.inf, 0.9] * 3, probability=0.9, penalty=None)
@@ -581,20 +585,38 @@ def test_bounds_that_cannot_be_kept_are_reported(iterations):
     ("changes", "message"),
     [
         ({"horizon": 0}, "horizon: must be a whole number, 1 or more; got 0"),
-        ({"problem": Problem(Tracking([1.0] * 5, [1.0] * 3))}, "must weigh 6 states and 3 inputs; got 5 and 3"),
-        ({"initial_input": [0.0]}, "initial_input: must be a list of 3 numbers"),
-        ({"prediction": {"form": "ltv"}}, "form: must be one of 'trajectory', 'velocity'; got 'ltv'"),
-        ({"prediction": {"covariance": "some"}}, "one of 'full', 'diagonal', 'zero_order', 'none'; got 'some'"),
-        ({"iterations": 0}, "iterations: must be a whole number, 1 or more; got 0"),
-        ({"iterations": 2, "prediction": {"form": "velocity"}}, "velocity' is one quadratic program, so 1; got 2"),
-        ({"tolerance": 0.0}, "tolerance: must be a number above 0"),
-        ({"prediction": {"feedback": "yes"}}, "feedback: must be true or false; got 'yes'"),
         (
-            {"problem": quadrotor_problem(constraints=[Box([0] * 6, [1] * 6)]), "solver": CvxpySolver()},
+            {"problem": Problem(Tracking([1.0] * 5, [1.0] * 3))},
+            "must weigh 6 states and 3 inputs; got 5 and 3",
+        ),
+        ({"initial_input": [0.0]}, "initial_input: must be a list of 3 numbers"),
+        (
+            {"prediction": {"form": "ltv"}},
+            "form: must be one of 'trajectory', 'velocity'; got 'ltv'",
+        ),
+        (
+            {"prediction": {"covariance": "some"}},
+            "one of 'full', 'diagonal', 'zero_order', 'none'; got 'some'",
+        ),
+        ({"iterations": 0}, "iterations: must be a whole number, 1 or more; got 0"),
+        (
+            {"iterations": 2, "prediction": {"form": "velocity"}},
+            "velocity' is one quadratic program, so 1; got 2",
+        ),
+        ({"tolerance": 0.0}, "tolerance: must be a number above 0"),
+        (
+            {"prediction": {"feedback": "yes"}},
+            "feedback: must be true or false; got 'yes'",
+        ),
+        (
+            {
+                "problem": quadrotor_problem(constraints=[Box([0] * 6, [1] * 6)]),
+                "solver": CvxpySolver(),
+            },
             "solver: soft constraints need DualActiveSet .*; got CvxpySolver",
         ),
     ],
-)  # fmt: skip
+)
 def test_misuse_is_refused_at_construction(changes, message):
     good = {"problem": quadrotor_problem(), "horizon": 3, "initial_input": HOVER}
 

@@ -165,7 +165,7 @@ def plan_of(state, **changes):
         np.tile(state, (H + 1, 1)),
         np.zeros((H + 1, 2, 2)),
         **({"status": Status.SOLVED, "iterations": 1, "timing": Timing()} | changes),
-    )  # fmt: skip
+    )
 
 
 def test_a_sensor_that_freezes_is_named_after_four_steps():

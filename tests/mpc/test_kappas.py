@@ -100,12 +100,27 @@ def test_an_adaptive_tube_brings_the_violations_to_what_is_allowed_where_the_noi
 @pytest.mark.parametrize(
     ("make", "error", "rule"),
     [
-        (lambda: replace(FAR, kappas=np.ones(H + 1)), ShapeError, r"kappas must be \(6,\); got \(7,\)"),
-        (lambda: controller().control(START, replace(FAR, kappas=np.full(H, np.nan))), DataError, "must be finite"),
-        (lambda: controller(covariance="full").control(START, replace(FAR, kappas=np.ones(H))),
-         SettingError, "kappas: are for covariances of 'zero_order'; this controller has 'full'"),
+        (
+            lambda: replace(FAR, kappas=np.ones(H + 1)),
+            ShapeError,
+            r"kappas must be \(6,\); got \(7,\)",
+        ),
+        (
+            lambda: controller().control(
+                START, replace(FAR, kappas=np.full(H, np.nan))
+            ),
+            DataError,
+            "must be finite",
+        ),
+        (
+            lambda: controller(covariance="full").control(
+                START, replace(FAR, kappas=np.ones(H))
+            ),
+            SettingError,
+            "kappas: are for covariances of 'zero_order'; this controller has 'full'",
+        ),
     ],
-)  # fmt: skip
+)
 def test_misuse_is_refused(make, error, rule):
     with pytest.raises(error, match=rule):
         make()

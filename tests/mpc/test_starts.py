@@ -436,8 +436,9 @@ def test_kicks_push_every_input_to_both_sides_within_its_bounds():
     assert [inputs[0, 0] for inputs in found] == [0.5, 1.25, 0.25]
     assert all((inputs[:, 0] >= 0).all() and not inputs[:, 1].any() for inputs in found)
     assert [inputs[:6, 0].tolist() for inputs in found[1:]] == [
-        [1.25, 1.25, 0.25, 0.25, 0.5, 0.5], [0.25, 0.25, 1.25, 1.25, 0.5, 0.5],
-    ]  # fmt: skip
+        [1.25, 1.25, 0.25, 0.25, 0.5, 0.5],
+        [0.25, 0.25, 1.25, 1.25, 0.5, 0.5],
+    ]
     assert kicks(problem, 3, np.array([0.5, 0.0]), share=1.0)[1][:, 0].tolist() == [
         2.0,
         0.0,

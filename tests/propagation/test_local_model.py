@@ -101,8 +101,10 @@ def test_linearising_along_inputs_follows_the_rollout(name):
     inputs = 0.5 * torch.randn(3, 5, 1)
     at = Gaussian(0.3 * torch.randn(3, 2), belief().covariance.expand(3, 2, 2))
     beliefs = rollout(propagator, model, at, inputs)
-    before = [torch.cat([now[:, None], later[:, :-1]], dim=1) for now, later in (
-        (at.mean, beliefs.mean), (at.covariance, beliefs.covariance))]  # fmt: skip
+    before = [
+        torch.cat([now[:, None], later[:, :-1]], dim=1)
+        for now, later in ((at.mean, beliefs.mean), (at.covariance, beliefs.covariance))
+    ]
     local = linearize(propagator, model, Gaussian(*before), inputs)
     assert beliefs.mean.shape == (3, 5, 2)
     assert local.A.shape == (3, 5, 6, 6)

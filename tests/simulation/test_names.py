@@ -205,11 +205,11 @@ def test_a_series_of_numbered_entries_and_one_without_a_model_of_names_keep_thei
         lambda controller, other: ControlLoop(controller).input(other, TARGET),
         lambda controller, other: ControlLoop(controller).input(NUMBERS, other),
         lambda controller, other: step(PLANT, other, [0.0]),
-        lambda controller, other: pendulum(0.1, mass=1.0) and System(
-            PLANT.dynamics, 0.1, start=other
+        lambda controller, other: (
+            pendulum(0.1, mass=1.0) and System(PLANT.dynamics, 0.1, start=other)
         ),
     ],
-)  # fmt: skip
+)
 def test_series_of_other_names_are_refused(controller, call):
     other = pd.Series({"angle": 0.1, "speed": 0.0})
     with pytest.raises(DataError, match="must have the names angle, rate; got angle, "):

@@ -114,9 +114,19 @@ def test_an_environment_is_learned_and_swung_up_like_any_other_system():
         Tracking([1, 1, 0.01], [0.01], penalized="inputs"), inputs=Box([-2], [2])
     )
     experiment = Experiment(
-        RandomData(samples=400, episode=40), None, system, Trainer(predicts="difference", scaling=standardize),
-        partial(GPMPC, propagator=Linearization(), problem=problem, horizon=25, initial_input=[0.0]), steps=150,
-    )  # fmt: skip
+        RandomData(samples=400, episode=40),
+        None,
+        system,
+        Trainer(predicts="difference", scaling=standardize),
+        partial(
+            GPMPC,
+            propagator=Linearization(),
+            problem=problem,
+            horizon=25,
+            initial_input=[0.0],
+        ),
+        steps=150,
+    )
     first, again = (run_trial(experiment).rollout for _ in range(2))
     assert np.abs(first.states[-20:] - [1, 0, 0]).max() < 0.05
     assert np.array_equal(first.states, again.states)
