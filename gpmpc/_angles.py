@@ -1,8 +1,8 @@
 """Differences of states some of whose entries are angles.
 
-An angle and the same angle a turn later are one direction. Where one of two states comes
-from a sensor that shows angles within a turn, their difference is off by whole turns.
-What is taken off is counted here. Arrays and tensors are taken alike.
+An angle and the same angle a turn later are one direction. Where one of two states
+comes from a sensor that shows angles within a turn, their difference is off by whole
+turns, which the functions here count and subtract. They take arrays and tensors alike.
 """
 
 from collections.abc import Sequence
@@ -15,24 +15,24 @@ TURN = 2.0 * np.pi
 
 
 def whole_turns(angle: Any) -> Any:
-    """The whole turns in angles [rad], of any shape; none in half a turn."""
+    """Returns the whole turns in angles [rad], of any shape; none in half a turn."""
     return TURN * (angle / TURN).round()
 
 
 def wrap(angle: Any) -> Any:
-    """The angles in [-pi, pi] that differ from others by whole turns [rad].
+    """Returns the angles in [-pi, pi] that differ from others by whole turns [rad].
 
-    What lies there already stays as it is, to the last digit.
+    Angles that lie there already stay as they are, to the last digit.
     """
     return angle - whole_turns(angle)
 
 
 def state_difference(one: Any, other: Any, angles: Sequence[int]) -> Any:
-    """The difference of states (..., n), whose angles are taken within half a turn.
+    """Returns the difference of states (..., n), its angles within half a turn.
 
     Args:
         one: States, as an array or a tensor.
-        other: What is taken off them, of the same kind.
+        other: States that are subtracted from them, of the same kind.
         angles: Indices of the states that are angles [rad].
     """
     difference = one - other
@@ -45,10 +45,12 @@ def state_difference(one: Any, other: Any, angles: Sequence[int]) -> Any:
 def full_turns(
     difference: NDArray[np.float64], angles: Sequence[int]
 ) -> NDArray[np.float64]:
-    """The whole turns (..., n) in differences of states; zero where they are no angles.
+    """Returns the whole turns (..., n) in differences of states.
+
+    They are zero in states that are no angles.
 
     Args:
-        difference: Of states (..., n).
+        difference: Differences of states (..., n).
         angles: Indices of the states that are angles [rad].
     """
     turns = np.zeros_like(difference)
@@ -60,5 +62,5 @@ def full_turns(
 
 
 def angles_of(model: Any) -> list[int]:
-    """Indices of a model's states, or of a measurement's entries, that are angles."""
+    """Returns the indices of a model's states, or measured entries, that are angles."""
     return list(getattr(model, "angles", ()))

@@ -1,4 +1,4 @@
-"""Bounds the memory of a file's content: a small file cannot ask for all there is."""
+"""Bounds the memory of a file's content: a small file cannot ask for all memory."""
 
 from pathlib import Path
 
@@ -10,7 +10,7 @@ _RATIO = 300  # bytes a byte of the file; recordings are compressed 2 to 10 time
 
 
 def room(path: Path) -> int:
-    """Bounds the memory that a file's content may take [bytes].
+    """Returns the memory that a file's content may take [bytes].
 
     Recordings and logs of this size hold far less.
     """
@@ -18,11 +18,10 @@ def room(path: Path) -> int:
 
 
 class Room:
-    """What is left of the memory that a file's content may take.
+    """The memory that a file's content may still take.
 
-    Readers take from it before they allocate. What costs time and hardly any memory,
-    such as records that are skipped, is counted as memory too: so time is bounded as
-    well.
+    Readers take from it before they allocate. Records that are skipped cost time and
+    hardly any memory, and are counted as memory too: so time is bounded as well.
     """
 
     def __init__(self, path: Path):

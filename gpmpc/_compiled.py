@@ -157,7 +157,7 @@ with suppress(ImportError):
             def set_env(self, name, environment):
                 """Does nothing: there is no machine code to tell its environment."""
 
-        codegen = _NoEngine()  # pyright: ignore[reportIncompatibleMethodOverride, reportAssignmentType]
+        codegen: Any = _NoEngine()
 
         def _optimize_final_module(self):
             pass

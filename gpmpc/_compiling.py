@@ -1,4 +1,7 @@
-"""Reports on the terminal that kernels are being compiled, as they are at their first use on a machine."""
+"""Reports on the terminal that kernels are being compiled.
+
+They are at their first use on a machine.
+"""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -7,26 +10,30 @@ from typing import Any
 
 @contextmanager
 def report_compilation() -> Iterator[None]:
-    """Prints that kernels are being compiled, and in the end how long it took; nothing where all are loaded."""
+    """Prints that kernels are being compiled, and in the end how long it took.
+
+    It prints nothing where all are loaded from the cache.
+    """
     from numba.core import event as events
 
-    class Clock(events.TimingListener):
-        """Tells when the first compilation starts."""
+    class Stopwatch(events.TimingListener):
+        """Times the compilation, and says when it starts."""
 
-        began = False
+        started = False
 
         def on_start(self, event: Any) -> None:
-            if not self.began:
-                self.began = True
+            if not self.started:
+                self.started = True
                 print(
-                    "compiling numerical kernels: once on this machine, about half a minute",
+                    "compiling numerical kernels: once on this machine, about half a "
+                    "minute",
                     flush=True,
                 )
             super().on_start(event)
 
-    with events.install_listener("numba:compile", Clock()) as clock:
+    with events.install_listener("numba:compile", Stopwatch()) as stopwatch:
         try:
             yield
         finally:
-            if clock.done:
-                print(f"compiled in {clock.duration:.1f} s", flush=True)
+            if stopwatch.done:
+                print(f"compiled in {stopwatch.duration:.1f} s", flush=True)

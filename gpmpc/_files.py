@@ -1,4 +1,7 @@
-"""Checks names of files, and writes files in one piece or not at all, whenever the process or the machine dies."""
+"""Checks names of files, and writes files in one piece or not at all.
+
+That holds whenever the process or the machine dies.
+"""
 
 import os
 from collections.abc import Iterator
@@ -11,9 +14,10 @@ from gpmpc.exceptions import DataError, SettingError
 
 @contextmanager
 def whole_file(path: str | Path) -> Iterator[BinaryIO]:
-    """A file to write in one piece or not at all: a neighbour, flushed to the disk and renamed if no error came.
+    """Opens a file to be written in one piece or not at all.
 
-    Behind the block both the content and the name are on the disk.
+    The block writes to a neighbour of it, which is flushed to the disk, and renamed if
+    no error came. Behind the block both the content and the name are on the disk.
     """
     path = Path(path)
     partial = path.parent / f".{path.name}.{os.getpid()}.partial"
@@ -25,9 +29,8 @@ def whole_file(path: str | Path) -> Iterator[BinaryIO]:
         os.replace(partial, path)
     finally:
         partial.unlink(missing_ok=True)
-    if (
-        os.name == "posix"
-    ):  # elsewhere a folder cannot be opened, and needs not be flushed
+    # on other systems a folder cannot be opened, and needs not be flushed
+    if os.name == "posix":
         folder = os.open(path.parent, os.O_RDONLY)
         try:
             os.fsync(folder)
@@ -36,26 +39,41 @@ def whole_file(path: str | Path) -> Iterator[BinaryIO]:
 
 
 def write_whole(path: str | Path, content: bytes | str) -> None:
-    """Writes a ``whole_file``."""
+    """Writes content to a ``whole_file``."""
+    if isinstance(content, str):
+        content = content.encode()
     with whole_file(path) as file:
-        file.write(content.encode() if isinstance(content, str) else content)
+        file.write(content)
 
 
 def remove_partial(folder: Path) -> None:
-    """Removes what processes that were killed have left of ``write_whole``, where nobody else is writing now."""
-    for left in folder.glob(".*.partial"):
-        left.unlink(missing_ok=True)
+    """Removes the partial files of processes that were killed in ``write_whole``.
+
+    Nobody else may be writing to the folder now.
+    """
+    for partial in folder.glob(".*.partial"):
+        partial.unlink(missing_ok=True)
 
 
 def existing_file(path: str | Path, expected: str) -> Path:
-    """The path of a file that is there; ``DataError`` where none is, ``SettingError`` of what is no path."""
+    """Returns the path of a file that exists.
+
+    Raises:
+        DataError: There is none.
+        SettingError: ``path`` is no path.
+    """
     if not os.path.isfile(_path(path)):
         raise DataError(f"{path}: no such file; expected {expected}")
     return Path(path)
 
 
 def new_file(path: str | Path) -> Path:
-    """The path of a file to be written; ``DataError`` without its folder, ``SettingError`` of what is no path."""
+    """Returns the path of a file to be written.
+
+    Raises:
+        DataError: Its folder does not exist.
+        SettingError: ``path`` is no path.
+    """
     path = _path(path)
     if not path.parent.is_dir():
         raise DataError(f"{path}: the folder {path.parent} does not exist")

@@ -89,7 +89,7 @@ def call_dynamics(function: Callable[..., Any], *arguments: Any) -> Any:
 
 
 def dynamics_advice(error: BaseException, packages: Sequence[str]) -> str | None:
-    """The rule that dynamics broke which failed in one of these packages; or None."""
+    """Returns the rule that dynamics broke if they failed in one of these packages."""
     foreign = _foreign_calls(error, packages)
     if not foreign:
         return None
@@ -113,7 +113,7 @@ def _check_followed(key: str, value: Tensor, arguments: tuple[Tensor, ...]) -> N
 
 
 def _advice(function: Any, error: BaseException) -> str | None:
-    """What to write in the place of what failed; None where the fault is another."""
+    """Returns what to write in place of the failed call; None of other faults."""
     if _is_of(function, _NUMBERS):  # the function itself is one of them
         foreign = [f"{_package_of(function)}.{function.__name__}"]
     else:
@@ -127,18 +127,18 @@ def _advice(function: Any, error: BaseException) -> str | None:
 
 
 def _frame_of_user(traceback: TracebackType | None) -> tuple[FrameType, int] | None:
-    """The innermost frame that a user wrote, and the line where it stopped."""
-    found = None
+    """Returns the innermost frame of a user's code, and the line where it stopped."""
+    innermost = None
     while traceback is not None:
         module = str(traceback.tb_frame.f_globals.get("__name__", ""))
         if module.partition(".")[0] not in _OURS:
-            found = traceback.tb_frame, traceback.tb_lineno
+            innermost = traceback.tb_frame, traceback.tb_lineno
         traceback = traceback.tb_next
-    return found
+    return innermost
 
 
 def _foreign_calls(error: BaseException, packages: Sequence[str]) -> list[str]:
-    """Functions of packages on the line where a user's code stopped, by its names."""
+    """Returns the packages' functions on the line where a user's code stopped."""
     frame = _frame_of_user(error.__traceback__)
     if frame is None:
         return []
@@ -147,8 +147,8 @@ def _foreign_calls(error: BaseException, packages: Sequence[str]) -> list[str]:
 
 
 def _names_on(frame: FrameType, line: int) -> Iterator[tuple[str, Any]]:
-    """Every name on a line, such as ``np.linalg.norm``, and what it stands for."""
-    known = {**frame.f_globals, **frame.f_locals}
+    """Yields each name on a line, such as ``np.linalg.norm``, and its value."""
+    variables = {**frame.f_globals, **frame.f_locals}
     name = ""
     value = None
     for instruction in _instructions(frame.f_code, line):
@@ -164,13 +164,13 @@ def _names_on(frame: FrameType, line: int) -> Iterator[tuple[str, Any]]:
             instruction.argval, str
         ):
             name = instruction.argval
-            value = known.get(instruction.argval)
+            value = variables.get(instruction.argval)
     if name:
         yield name, value
 
 
 def _instructions(code: CodeType, line: int) -> Iterator[dis.Instruction]:
-    """The instructions of one line."""
+    """Yields the instructions of one line."""
     current = None
     for instruction in dis.get_instructions(code):
         started = instruction.starts_line
@@ -183,7 +183,7 @@ def _instructions(code: CodeType, line: int) -> Iterator[dis.Instruction]:
 
 
 def _is_of(value: Any, packages: Sequence[str]) -> bool:
-    """Whether something is a function of one of these packages."""
+    """Returns whether a value is a function of one of these packages."""
     return callable(value) and _package_of(value) in packages
 
 
@@ -193,16 +193,16 @@ def _package_of(value: Any) -> str:
 
 
 def _name_in_torch(name: str) -> str:
-    """What torch calls a function of numpy or math: mostly the same."""
+    """Returns torch's name of a function of numpy or math: mostly the same."""
     path = name.split(".")[1:] or [name]
     if path[-1] in _TORCH:
         return f"torch.{_TORCH[path[-1]]}"
-    found: Any = torch
+    function: Any = torch
     for part in path:
-        found = getattr(found, part, None)
-    return f"torch.{'.'.join(path)}" if callable(found) else "what torch has"
+        function = getattr(function, part, None)
+    return f"torch.{'.'.join(path)}" if callable(function) else "what torch has"
 
 
 def _plain_name(name: str) -> str:
-    """What to write for a function of math or torch in dynamics."""
+    """Returns what to write for a function of math or torch in dynamics."""
     return _PLAIN.get(name.rpartition(".")[2], "plain arithmetic")

@@ -1,7 +1,8 @@
 """Delays Ctrl-C until a solve of CasADi has ended.
 
-CasADi does not pass a Ctrl-C during a solve on: IPOPT stops, and its caller goes on with the last iterate, so that a
-flight would continue with a failed solve and a measurement with a time that was cut short.
+CasADi does not pass a Ctrl-C during a solve on: IPOPT stops, and its caller goes on
+with the last iterate, so that a flight would continue with a failed solve and a
+measurement with a time that was cut short.
 """
 
 import signal
@@ -19,13 +20,13 @@ def interrupts_after() -> Iterator[None]:
         KeyboardInterrupt: Or what else the process does about the signal.
     """
     usual = signal.getsignal(signal.SIGINT)
-    first = []
+    received: list[tuple[Any, ...]] = []
     if threading.current_thread() is not threading.main_thread() or not callable(usual):
         yield  # nothing is raised here, or the signal is ignored
         return
 
-    def listen(*met: Any) -> None:
-        first.append(met)
+    def listen(*signal_and_frame: Any) -> None:
+        received.append(signal_and_frame)
         signal.signal(signal.SIGINT, usual)
 
     signal.signal(signal.SIGINT, listen)
@@ -33,5 +34,5 @@ def interrupts_after() -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGINT, usual)
-    if first:
-        usual(*first[0])
+    if received:
+        usual(*received[0])

@@ -1,8 +1,9 @@
 """Collects what made a result: versions, source commit, code, machine, command.
 
-A result that is kept is a result of the code that made it. Versions and commits do not name that code: a version is
-that of the last release, and a commit does not know what was changed since. So the code has a fingerprint of its own,
-and what is kept to be used again is kept under it.
+A stored result is a result of the code that made it. Versions and commits do not name
+that code: a version is that of the last release, and a commit does not know what was
+changed since. So the code has a fingerprint of its own, and results that are stored to
+be used again are stored under it.
 """
 
 import ast
@@ -34,7 +35,7 @@ _PACKAGES = ("gpmpc", "torch", "gpytorch", "numpy", "scipy", "casadi", "hydra-co
 
 
 def provenance() -> dict:
-    """What a reader needs to run the same again, as plain data."""
+    """Returns what a reader needs to run the same again, as plain data."""
     return {
         "created": now(),
         "command": " ".join([Path(sys.argv[0]).name, *sys.argv[1:]]),
@@ -52,7 +53,7 @@ def provenance() -> dict:
 
 @cache
 def code_fingerprint() -> str:
-    """Names the code of this process: see ``source_fingerprint``; read once.
+    """Returns ``source_fingerprint`` of the code of this process; it is read once.
 
     Raises:
         GpmpcError: The source is not there, as in an archive or where it was compiled
@@ -62,7 +63,7 @@ def code_fingerprint() -> str:
 
 
 def code_fingerprint_or_none() -> str | None:
-    """The same, and None where the source is not there: such a run is of no known code."""
+    """Returns ``code_fingerprint``, or None where the source is not there."""
     try:
         return code_fingerprint()
     except GpmpcError:
@@ -70,7 +71,7 @@ def code_fingerprint_or_none() -> str | None:
 
 
 def is_of_this_code(about: Mapping[str, Any], settings: Any = None) -> bool:
-    """Whether a result was made by the code that would make it now.
+    """Returns whether a result was made by the code that would make it now.
 
     Args:
         about: What ``provenance`` returned where it was made. Where that does not tell
@@ -86,8 +87,8 @@ def is_of_this_code(about: Mapping[str, Any], settings: Any = None) -> bool:
 def source_fingerprint(package: Path) -> str:
     """Returns 32 digits that differ where any source file of gpmpc does.
 
-    They are the same in a checkout and in what is installed from it, wherever that lies,
-    whenever its files were written, and with either kind of line ending.
+    They are the same in a checkout and in what is installed from it, wherever that
+    lies, whenever its files were written, and with either kind of line ending.
 
     Args:
         package: The folder ``gpmpc``.
@@ -225,16 +226,15 @@ def flattened(data: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     """Returns nested data as one dictionary, keys dotted."""
     leaves: dict[str, Any] = {}
     for key, value in data.items():
-        leaves |= (
-            flattened(value, f"{prefix}{key}.")
-            if isinstance(value, Mapping)
-            else {f"{prefix}{key}": value}
-        )
+        if isinstance(value, Mapping):
+            leaves |= flattened(value, f"{prefix}{key}.")
+        else:
+            leaves[f"{prefix}{key}"] = value
     return leaves
 
 
 def environment() -> dict[str, str | None]:
-    """What computes: the versions that matter, the BLAS library, the processor; a line each of a report of a bug."""
+    """Returns versions, BLAS library and processor, a line each of a bug report."""
     import numpy as np
 
     configuration: Any = np.show_config(mode="dicts")
@@ -250,7 +250,7 @@ def environment() -> dict[str, str | None]:
 
 
 def processor() -> str:
-    """The processor's name, where the system tells it; else its architecture."""
+    """Returns the processor's name if the system tells it; else its architecture."""
     with (
         suppress(OSError),
         open("/proc/cpuinfo", encoding="utf-8", errors="replace") as file,
@@ -262,25 +262,29 @@ def processor() -> str:
 
 
 def now() -> str:
-    """The time in UTC, to the second (ISO 8601)."""
+    """Returns the time in UTC, to the second (ISO 8601)."""
     return datetime.now(timezone.utc).isoformat(timespec="seconds")
 
 
 def versions(packages: Sequence[str] = _PACKAGES) -> dict[str, str | None]:
-    """The installed versions by name; None where a package is not installed."""
-    found: dict[str, str | None] = dict.fromkeys(packages)
+    """Returns the installed versions by name; None of packages not installed."""
+    installed: dict[str, str | None] = dict.fromkeys(packages)
     for name in packages:
         with suppress(PackageNotFoundError):
-            found[name] = version(name)
-    return found
+            installed[name] = version(name)
+    return installed
 
 
 def _git_commit() -> dict | None:
-    """Commit of the source checkout, and whether it has uncommitted changes; None for an installed package."""
+    """Returns the checkout's commit, and whether it has uncommitted changes.
+
+    Returns None for an installed package.
+    """
     root = Path(__file__).resolve().parents[1]
     if not (root / "pyproject.toml").exists():
         return None
-    # Without the lock that refreshes the index: a run that is killed would leave it, and git would refuse to commit.
+    # Without the lock that refreshes the index: a run that is killed would leave it,
+    # and git would refuse to commit.
     git = ["git", "--no-optional-locks", "-C", str(root)]
     run = partial(
         subprocess.check_output, stderr=subprocess.DEVNULL, text=True, timeout=10

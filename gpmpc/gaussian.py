@@ -1,4 +1,4 @@
-"""Gaussian beliefs N(mean, covariance), alone or in a batch, and symmetric square roots of covariances."""
+"""Gaussian beliefs N(mean, covariance), and symmetric square roots of covariances."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,24 +16,26 @@ from gpmpc.exceptions import DataError, SettingError, ShapeError
 _FLOATS = np.dtype(np.float64), np.dtype(np.float32), np.dtype(np.float16)
 
 
-def check_tensors(**given: Any) -> None:
-    """Raises ``SettingError`` unless everything given is a tensor: of an array, a list, a number."""
-    for key, value in given.items():
+def check_tensors(**values: Any) -> None:
+    """Raises ``SettingError`` of the first value by name that is no tensor."""
+    for key, value in values.items():
         if not isinstance(value, Tensor):
-            got = type(value).__name__
             raise SettingError(
                 key,
-                f"must be a torch tensor; got {got} (torch.as_tensor(..., dtype=torch.float64))",
+                f"must be a torch tensor; got {type(value).__name__} "
+                "(torch.as_tensor(..., dtype=torch.float64))",
             )
 
 
 def constant_arrays(*tensors: Tensor) -> list[NDArray[Any]] | None:
-    """Tensors as arrays; None where one is on another device, or autograd or a function transform follows it."""
+    """Returns tensors as arrays, in microseconds: control steps call it repeatedly.
+
+    Returns None where a tensor is on another device, or where autograd or a function
+    transform follows it.
+    """
     arrays = []
     try:
-        for (
-            tensor
-        ) in tensors:  # in microseconds: a step of control calls this several times
+        for tensor in tensors:
             arrays.append(tensor.numpy())
             if forward_ad.unpack_dual(tensor).tangent is not None:
                 return None
@@ -67,10 +69,11 @@ class Gaussian:
 
     @classmethod
     def certain(cls, value: Any) -> "Gaussian":
-        """A belief without doubt, such as a measured state (*batch, n), from a tensor, an array or a list.
+        """Makes a belief without doubt, such as a measured state (*batch, n).
 
-        Tensors and arrays of floating point keep their type; everything else becomes float64.
-        The labels of a series or of a table's columns become the belief's names.
+        The value is a tensor, an array or a list. Tensors and arrays of floating point
+        keep their type; everything else becomes float64. The labels of a series or of a
+        table's columns become the belief's names.
 
         >>> Gaussian.certain([1.0, 2.0]).variance.tolist()
         [0.0, 0.0]
@@ -78,32 +81,19 @@ class Gaussian:
         Raises:
             ShapeError: No vector of numbers was given.
         """
-        if isinstance(value, np.ndarray) and value.dtype in _FLOATS:
-            mean = torch.as_tensor(value)
-        elif isinstance(value, Tensor) and _is_real(value):
-            mean = value if value.is_floating_point() else value.to(torch.float64)
-        else:
-            try:
-                mean = torch.from_numpy(np.array(read_array("a state", value)))
-            except DataError as error:
-                got = str(error).partition("; got ")[2]
-                raise ShapeError(
-                    f"a state must be numbers (*batch, n); got {got}"
-                ) from error
+        mean = _as_mean(value)
         if not mean.dim():
             raise ShapeError(
                 f"a state must be numbers (*batch, n); got the single number {value!r}"
             )
-        return cls(
-            mean,
-            torch.zeros(
-                *mean.shape, mean.shape[-1], dtype=mean.dtype, device=mean.device
-            ),
-            () if isinstance(value, np.ndarray | Tensor) else names_of(value),
-        )
+        n = mean.shape[-1]
+        covariance = torch.zeros(*mean.shape, n, dtype=mean.dtype, device=mean.device)
+        has_no_labels = isinstance(value, np.ndarray | Tensor)
+        names = () if has_no_labels else names_of(value)
+        return cls(mean=mean, covariance=covariance, names=names)
 
     def in_order(self, names: Sequence[str]) -> "Gaussian":
-        """The belief in the order of names; itself where its own are not known.
+        """Returns the belief in the order of names; itself if its own are not known.
 
         Raises:
             DataError: Its own names are others.
@@ -126,25 +116,41 @@ class Gaussian:
         return self.covariance.diagonal(dim1=-2, dim2=-1)
 
 
+def _as_mean(value: Any) -> Tensor:
+    """Returns a tensor, an array or a list of numbers as a tensor of floating point."""
+    if isinstance(value, np.ndarray) and value.dtype in _FLOATS:
+        return torch.as_tensor(value)
+    if isinstance(value, Tensor) and _is_real(value):
+        return value if value.is_floating_point() else value.to(torch.float64)
+    try:
+        return torch.from_numpy(np.array(read_array("a state", value)))
+    except DataError as error:
+        got = str(error).partition("; got ")[2]
+        raise ShapeError(f"a state must be numbers (*batch, n); got {got}") from error
+
+
 def _is_real(value: Tensor) -> bool:
     return not (value.is_complex() or value.dtype == torch.bool)
 
 
 def nearest_positive_semidefinite(covariance: Tensor) -> tuple[Tensor, Tensor]:
-    """The symmetric positive semidefinite matrices (*batch, n, n) nearest in the Frobenius norm (Higham, 1988).
+    """Projects matrices (*batch, n, n) to the nearest positive semidefinite ones.
 
-    The second result is how far below zero the smallest eigenvalue was (*batch,); zero where the symmetrised matrix was
-    positive semidefinite already, which is then returned unchanged.
+    They are nearest in the Frobenius norm (Higham, 1988), and symmetric. Where the
+    symmetrised matrix is positive semidefinite already it is returned unchanged.
+
+    Returns:
+        The matrices, and how far below zero the smallest eigenvalue was (*batch,).
     """
     symmetric = (covariance + covariance.mT) / 2
-    plain = constant_arrays(symmetric) is not None
-    if plain and not bool(
-        torch.linalg.cholesky_ex(symmetric).info.any()
-    ):  # the usual case, cheaply
-        return symmetric, torch.zeros_like(symmetric[..., 0, 0])
+    if constant_arrays(symmetric) is not None:  # the usual case, cheaply
+        failed = torch.linalg.cholesky_ex(symmetric).info.any()
+        if not bool(failed):
+            return symmetric, torch.zeros_like(symmetric[..., 0, 0])
     deficit = (-torch.linalg.eigvalsh(symmetric.detach())[..., 0]).clamp_min(0)
     negative = deficit[..., None, None] > 0
-    # The derivative of eigh divides by differences of eigenvalues; where nothing is projected it gets distinct ones.
+    # The derivative of eigh divides by differences of eigenvalues; where nothing is
+    # projected it gets distinct ones.
     distinct = torch.arange(
         1, symmetric.shape[-1] + 1, dtype=symmetric.dtype, device=symmetric.device
     ).diag()
@@ -154,27 +160,38 @@ def nearest_positive_semidefinite(covariance: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def square_root(covariance: Tensor) -> Tensor:
-    """The symmetric positive semidefinite root R of a covariance (*batch, n, n), R R = Sigma, with its derivative.
+    """Returns the symmetric positive semidefinite roots R of covariances, R R = Sigma.
 
-    The derivative solves the Sylvester equation dR R + R dR = dSigma in the eigenbasis U of R: in it, entry ij of dR is
-    that of dSigma over r_i + r_j (Cao, Lai and Alam, 2017, section 4.1, need it for A). Autograd through the
-    eigendecomposition would divide by differences of eigenvalues instead. Where r_i + r_j = 0 the derivative does not
-    exist and is taken as zero; second derivatives are not provided. Eigenvalues of Sigma below zero count as zero.
+    They are (*batch, n, n) and carry their derivative, which solves the Sylvester
+    equation dR R + R dR = dSigma in the eigenbasis U of R: in it, entry ij of dR is
+    that of dSigma over r_i + r_j (Cao, Lai and Alam, 2017, section 4.1, need it for A).
+    Autograd through the eigendecomposition would divide by differences of eigenvalues
+    instead. Where r_i + r_j = 0 the derivative does not exist and is taken as zero;
+    second derivatives are not provided. Eigenvalues of Sigma below zero count as zero.
     """
     constant = covariance.detach()
     eigenvalues, U = torch.linalg.eigh((constant + constant.mT) / 2)
     r = eigenvalues.clamp_min(0).sqrt()
     R = U @ (r[..., :, None] * U.mT)
-    # One step of Newton's method from R, which is the solution already: it changes no value and carries the derivative.
-    return (
-        R + square_root_differential(r, U, (covariance - constant)[..., None])[..., 0]
-    )
+    # One step of Newton's method from R, which is the solution already: it changes no
+    # value and carries the derivative.
+    change = (covariance - constant)[..., None]
+    return R + square_root_differential(r, U, change)[..., 0]
 
 
 def square_root_differential(r: Tensor, U: Tensor, change: Tensor) -> Tensor:
-    """The change dR of the symmetric root R = U diag(r) U' for changes dSigma of R R, from dR R + R dR = dSigma.
+    """Returns the change dR of a symmetric root R = U diag(r) U'.
 
-    r is (*batch, n), U (*batch, n, n), dSigma and dR (*batch, n, n, j), j as many as wanted; zero where r_i + r_j is.
+    It solves dR R + R dR = dSigma for changes dSigma of R R, and is zero where
+    r_i + r_j is.
+
+    Args:
+        r: Eigenvalues of the root (*batch, n).
+        U: Its eigenvectors (*batch, n, n).
+        change: dSigma (*batch, n, n, j), any number of them.
+
+    Returns:
+        dR (*batch, n, n, j).
     """
     total = (r[..., :, None] + r[..., None, :])[..., None]
     rotated = _congruent(U.mT, change)
@@ -185,7 +202,7 @@ def square_root_differential(r: Tensor, U: Tensor, change: Tensor) -> Tensor:
 
 
 def _congruent(U: Tensor, matrices: Tensor) -> Tensor:
-    """U X U' for symmetric X, as many as wanted along the last dimension (*batch, n, n, j)."""
+    """Returns U X U' for symmetric X along the last dimension (*batch, n, n, j)."""
     shape = matrices.shape[-2:]
     half = U @ matrices.flatten(-2)  # its rows are of U X, one X beside the other
     return (U @ half.unflatten(-1, shape).transpose(-3, -2).flatten(-2)).unflatten(

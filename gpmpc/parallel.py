@@ -1,8 +1,9 @@
 """Independent jobs in processes of their own, one thread each.
 
-Jobs run in freshly started processes (spawn: it is safe with threads and the same on every system), one thread each. On
-Ctrl-C, which reaches the whole process group, the parent alone answers: what is running is ended, nothing hangs. Where
-the parent itself is killed, its workers end by themselves.
+Jobs run in freshly started processes (spawn: it is safe with threads and the same on
+every system), one thread each. On Ctrl-C, which reaches the whole process group, the
+parent alone answers: running jobs are ended, nothing hangs. Where the parent itself is
+killed, its workers end by themselves.
 """
 
 import os
@@ -13,13 +14,13 @@ from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
 from multiprocessing import active_children, get_context, resource_tracker
-from typing import Any, TypeVar
+from typing import TypeVar
 
 J = TypeVar("J")
 R = TypeVar("R")
 
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-_LOOK = 0.5  # between two looks at whether the parent lives [s]
+_PARENT_CHECK_INTERVAL = 0.5  # between two checks whether the parent lives [s]
 
 
 def in_processes(
@@ -28,26 +29,26 @@ def in_processes(
     """Yields (index of a job, its result), in the order in which they finish.
 
     Args:
-        function: Of a job; it and its results can be pickled. Its exceptions end the whole run.
-        jobs: Started in this order.
-        workers: Processes; None takes one a core.
+        function: Returns the result of a job; it and its results can be pickled. Its
+            exceptions end the whole run.
+        jobs: The jobs, started in this order.
+        workers: Number of processes; None takes one per core.
 
     Raises:
         BrokenProcessPool: A worker process died.
     """
     if not jobs:
         return
-    cores = (
-        len(os.sched_getaffinity(0))
-        if hasattr(os, "sched_getaffinity")
-        else os.cpu_count() or 1
-    )
-    workers = min(workers or cores, len(jobs))
-    before = set(active_children())
-    mine: dict[str, Any] = {"initializer": end_with, "initargs": (os.getpid(),)}
+    workers = min(workers or _count_cores(), len(jobs))
+    children_before = set(active_children())
     with (
         _one_thread_each(),
-        ProcessPoolExecutor(workers, get_context("spawn"), **mine) as pool,
+        ProcessPoolExecutor(
+            workers,
+            get_context("spawn"),
+            initializer=end_with,
+            initargs=(os.getpid(),),
+        ) as pool,
     ):
         try:  # around the start as well: leaving the pool waits for what was begun
             with children_ignore_interrupts():
@@ -58,20 +59,29 @@ def in_processes(
                 yield running[done], done.result()
         except BaseException:  # a failed job, Ctrl-C, or a caller that wants no more
             pool.shutdown(wait=False, cancel_futures=True)
-            for child in set(active_children()) - before:
+            for child in set(active_children()) - children_before:
                 child.terminate()
             raise
 
 
-def end_with(parent: int) -> None:
-    """Ends this process soon after its parent, whose id the parent itself states: it may be gone before this call.
+def _count_cores() -> int:
+    """Returns the number of cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
-    An orphan would compute what nobody reads, or wait for jobs that do not come, and hold the terminal's pipe open.
+
+def end_with(parent: int) -> None:
+    """Ends this process soon after its parent.
+
+    The parent itself states its id: it may be gone before this call. An orphan would
+    compute results that nobody reads, or wait for jobs that do not come, and hold the
+    terminal's pipe open.
     """
 
     def watch() -> None:
         while os.getppid() == parent:
-            time.sleep(_LOOK)
+            time.sleep(_PARENT_CHECK_INTERVAL)
         os._exit(1)
 
     threading.Thread(target=watch, daemon=True).start()
@@ -79,11 +89,13 @@ def end_with(parent: int) -> None:
 
 @contextmanager
 def children_ignore_interrupts() -> Iterator[None]:
-    """Processes started inside do not hear Ctrl-C, from their first moment on.
+    """Keeps Ctrl-C from processes started inside, from their first moment on.
 
-    This one hears it at the end of the block, or at once where it has another thread.
+    This process gets it at the end of the block, or at once where it has another
+    thread.
     """
-    resource_tracker.ensure_running()  # whenever it starts, it unblocks what is blocked here
+    # whenever the tracker starts, it unblocks the signal that is blocked here
+    resource_tracker.ensure_running()
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
@@ -93,7 +105,7 @@ def children_ignore_interrupts() -> Iterator[None]:
 
 @contextmanager
 def _one_thread_each() -> Iterator[None]:
-    """Worker processes started inside use one thread each, whatever library asks."""
+    """Gives worker processes started inside one thread each, in every library."""
     before = {name: os.environ[name] for name in THREADS if name in os.environ}
     os.environ.update(dict.fromkeys(THREADS, "1"))
     try:

@@ -1,7 +1,7 @@
-"""What says that data, a model and a plant belong together: names and the time step.
+"""Names and the time step, by which data, a model and a plant fit together.
 
-Nothing here is needed: what is not known is left out, fits everything, and is checked
-against nothing. What two sides both know has to agree.
+None of them is needed: an unknown name or time step fits everything. Where two sides
+both know one, theirs have to agree.
 """
 
 from collections.abc import Mapping, Sequence
@@ -77,50 +77,53 @@ class Signals:
         ):
             if ours and theirs and ours != theirs:
                 same = ", the same in another order" * (set(ours) == set(theirs))
-                found = f"{owner} has the {what} {', '.join(ours)}"
                 raise SettingError(
-                    key, f"{found}; {other_owner} has {', '.join(theirs)}{same}"
+                    key,
+                    f"{owner} has the {what} {', '.join(ours)}; "
+                    f"{other_owner} has {', '.join(theirs)}{same}",
                 )
         ours = self.time_step
         theirs = other.time_step
         if ours and theirs and abs(ours / theirs - 1) > SAME_STEP:
-            found = f"{owner} has time steps of {ours:g} s"
-            raise SettingError(key, f"{found}; {other_owner} has {theirs:g} s")
+            raise SettingError(
+                key,
+                f"{owner} has time steps of {ours:g} s; {other_owner} has {theirs:g} s",
+            )
 
     def to_header(self) -> dict[str, Any]:
-        """What is known, as data that JSON can hold, for the header of a file."""
-        return {
-            key: list(value) if isinstance(value, tuple) else value
-            for key, value in vars(self).items()
-            if value
-        }
+        """Returns the known values as data that JSON can hold, for a file's header."""
+        header: dict[str, Any] = {}
+        for key, value in vars(self).items():
+            if value:
+                header[key] = list(value) if isinstance(value, tuple) else value
+        return header
 
     @classmethod
     def from_header(cls, header: Any) -> "Signals":
-        """Reads what ``to_header`` gave; nothing is known where there is none of it.
+        """Reads the result of ``to_header``; None is the header of unknown signals.
 
         Raises:
             SettingError: It is something else.
         """
         if header is None:
             return cls()
-        known = {"state_names", "input_names", "time_step"}
-        if not isinstance(header, Mapping) or not header.keys() <= known:
+        keys = {"state_names", "input_names", "time_step"}
+        if not isinstance(header, Mapping) or not header.keys() <= keys:
             rule = "must be names and a time step"
             raise SettingError("signals", f"{rule}; got {header!r}")
         return cls(**header)
 
 
-UNKNOWN = Signals()  # of what says nothing
+UNKNOWN = Signals()
 
 
 def signals_of(owner: Any) -> Signals:
-    """The names and the time step of a model, a controller, data or a plant.
+    """Returns the names and the time step of a model, a controller, data or a plant.
 
-    Nothing is known of one without such an attribute ``signals``.
+    They are unknown of one without such an attribute ``signals``.
     """
-    known = getattr(owner, "signals", UNKNOWN)
-    return known if isinstance(known, Signals) else UNKNOWN
+    signals = getattr(owner, "signals", UNKNOWN)
+    return signals if isinstance(signals, Signals) else UNKNOWN
 
 
 def check_signals(value: Any) -> None:

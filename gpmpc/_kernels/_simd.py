@@ -83,9 +83,10 @@ def _define(result: types.Type, *operands: Any) -> Callable[[Callable], Any]:
 
         typed.__name__ = write.__name__
         typed.__doc__ = write.__doc__
+        function: Any = typed
         # numba reads from it the names of the arguments after the first
-        typed.__signature__ = inspect.signature(write)  # pyright: ignore[reportFunctionMemberAccess]
-        return intrinsic(typed)
+        function.__signature__ = inspect.signature(write)
+        return intrinsic(function)
 
     return make
 
@@ -254,9 +255,9 @@ def largest(builder, values):
 
 
 # exp (Cody and Waite, 1980): x = k ln 2 + r with |r| <= ln(2)/2, exp(x) = 2^k exp(r).
-# Adding _SHIFT leaves k in the lowest bits, biased as an exponent is. expm1(r) = r + r^2
-# g(r) with a polynomial g of degree 9, interpolated at the points of Chebyshev: 4e-17
-# relative to expm1. No branch and no table.
+# Adding _SHIFT leaves k in the lowest bits, biased as an exponent is. expm1(r) = r +
+# r^2 g(r) with a polynomial g of degree 9, interpolated at the points of Chebyshev:
+# 4e-17 relative to expm1. No branch and no table.
 
 _SHIFT = 6755399441055744.0 + 1023.0  # 1.5 * 2^52, and the bias of the exponent
 _PER_LN2 = 1.4426950408889634

@@ -3,7 +3,7 @@
 Both take the time to read the GPs' factors. With K + N = L L' and v = L^-1 y, a new
 point adds a row to L and an entry to v, and changes the weights L^-T v:
 
-    L+ = [L 0; w' r],     v+ = [v; (y - w'v) / r],     w = L^-1 k,     r^2 = sf2 + n - w'w
+    L+ = [L 0; w' r],   v+ = [v; (y - w'v) / r],   w = L^-1 k,   r^2 = sf2 + n - w'w
 
 n is the variance of its noise. All other entries stay, so that old and new GPs share
 them. Points go when a factor of the others takes the place of theirs; it is made

@@ -1,6 +1,7 @@
 """Roll-outs of the mean of GPs with an affine part, under a feedback towards plans.
 
-    u_k = clip(u'_k + K_k (x_k - x'_k)),   x_{k+1} = A x_k + G u_k + c + f0(x_k, u_k) + B f(phi(x_k), u_k)
+    u_k     = clip(u'_k + K_k (x_k - x'_k))
+    x_{k+1} = A x_k + G u_k + c + f0(x_k, u_k) + B f(phi(x_k), u_k)
 
 f0 is a tape; phi selects states, and takes angles as sine and cosine.
 """
@@ -38,7 +39,7 @@ class AffineGPs(NamedTuple):
 
 
 class Feedback(NamedTuple):
-    """A feedback u_k = u'_k + K_k (x_k - x'_k) towards T plans of H stages, within bounds."""
+    """A feedback u_k = u'_k + K_k (x_k - x'_k) towards T plans of H stages."""
 
     states: Array  #: x'_0 .. x'_{H-1}, and more that are not read (T, H or more, n)
     inputs: Array  #: u' (T, H, m)
@@ -54,8 +55,8 @@ class Feedback(NamedTuple):
 def _write_means(f, offset, point, memory, means):
     """Writes the GPs' means at one point x~ (d,).
 
-    They are offset + sum_j beta_j sf2 exp(-1/2 sum_d D_d (x~_j - x~)_d^2). ``memory`` is
-    lent to work in: eight numbers for each dimension and each GP.
+    They are offset + sum_j beta_j sf2 exp(-1/2 sum_d D_d (x~_j - x~)_d^2). ``memory``
+    is lent to work in: eight numbers for each dimension and each GP.
     """
     use_widest_registers()
     dimensions, count = f.points.shape

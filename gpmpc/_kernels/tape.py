@@ -120,7 +120,7 @@ def run_tape(tape, z, work, value, slopes):
 
 @compiled
 def linearize_tape(tape, points, values, jacobians):
-    """Writes the values (K, size) at K points z (K, d), and their derivatives (K, size, d)."""
+    """Writes values (K, size) and derivatives (K, size, d) at K points z (K, d)."""
     use_widest_registers()
     K, d = points.shape
     size = tape.size

@@ -26,7 +26,7 @@ from gpmpc.propagation._propagator import Propagator, Sensitivity, differentiate
 
 @dataclass(frozen=True)
 class LocalModel:
-    """s+ = A s + B u + c near a belief and an input; batched over leading dimensions."""
+    """A model s+ = A s + B u + c near a belief and an input; maybe a batch of them."""
 
     A: Tensor  #: (*batch, p, p), p = n + n^2
     B: Tensor  #: (*batch, p, m)

@@ -131,7 +131,7 @@ class MomentMatching(NoisyPropagator):
 
 
 def best_propagator(model: Any) -> Propagator:
-    """Makes ``MomentMatching()`` where a model has exact moments, else ``Unscented()``."""
+    """Makes ``MomentMatching()`` if a model has exact moments, else ``Unscented()``."""
     return MomentMatching() if _has_exact_moments(model) else Unscented()
 
 

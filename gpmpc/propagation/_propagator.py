@@ -77,7 +77,8 @@ class Propagator(Protocol):
         Raises:
             ShapeError: Belief or input do not fit the model.
             SettingError: Their dtype or device is another one.
-            DataError: An entry is not finite, or the covariance is not positive semidefinite.
+            DataError: An entry is not finite, or the covariance is not positive
+                semidefinite.
             UnsupportedModel: There is no formula for this model.
         """
         ...
