@@ -59,7 +59,7 @@ def test_an_error_inside_is_that_error():
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
-def test_ipopt_ends_a_solve_that_an_interrupt_meets_and_nmpc_passes_it_on():
+def test_nmpc_passes_an_interrupt_on_after_the_solve():
     plant = System(Translational(), time_step=1.0, substeps=1)
     controller = NMPC(
         plant,
@@ -67,11 +67,11 @@ def test_ipopt_ends_a_solve_that_an_interrupt_meets_and_nmpc_passes_it_on():
         5,
         [7.26, 0.0, 0.0],
     )
-    solver = controller._solver
+    solver = controller._program.solver
     statuses = []
 
-    class Met:
-        """Solves until the signal has come, which is in the middle of one."""
+    class InterruptedSolver:
+        """Solves until the signal has come, which is in the middle of a solve."""
 
         def __call__(self, **arguments):
             sent = threading.Event()
@@ -80,12 +80,12 @@ def test_ipopt_ends_a_solve_that_an_interrupt_meets_and_nmpc_passes_it_on():
             )
             timer.start()
             while not sent.is_set():
-                found = solver(**arguments)
+                solution = solver(**arguments)
                 statuses.append(solver.stats()["return_status"])
             timer.join()
-            return found
+            return solution
 
-    controller._solver = Met()
+    controller._program = controller._program._replace(solver=InterruptedSolver())
     with pytest.raises(KeyboardInterrupt):
         controller.control(
             Gaussian.certain(torch.zeros(6)), Reference(np.full((6, 6), 0.5))
