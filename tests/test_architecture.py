@@ -60,7 +60,7 @@ def test_recordings_are_written_and_read_without_torch_and_without_compilers():
         ("matplotlib", ["plotting", "experiments"]),
         ("casadi", ["mpc", "gp/casadi_.py"]),
         ("rich", ["cli", "studies"]),
-        ("mcap", ["recording", "logs/_bags.py", "logs/_encodings.py"]),
+        ("mcap", ["recording", "logs/_bag.py", "logs/_encodings.py"]),
         ("google.protobuf", ["recording"]),
         ("foxglove", ["recording"]),
         (
