@@ -53,9 +53,7 @@ def share_that_holds(kappas, seed, rows=None):
 
 @pytest.mark.parametrize("rows", [None, [[1.0, 0.0]]], ids=["all states", "one side"])
 @pytest.mark.parametrize("probability", [0.9, 0.95])
-def test_the_quantile_of_held_out_scores_holds_where_the_gaussian_does_not(
-    probability, rows
-):
+def test_held_out_quantiles_hold_where_the_gaussian_does_not(probability, rows):
     tubes = [
         ConformalTube.calibrate(MODEL, PROPAGATOR, *log(1000, seed), H, rows)
         for seed in range(6)
@@ -85,7 +83,7 @@ def test_too_few_windows_promise_nothing():
 
 
 @pytest.mark.parametrize("plant", ["noisy", "worse with time", "hostile"])
-def test_an_adaptive_tube_holds_in_the_long_run_whatever_the_plant_does(plant):
+def test_an_adaptive_tube_holds_in_the_long_run_for_any_plant(plant):
     probability = 0.9
     rate = 0.05
     T = 1000
@@ -115,9 +113,7 @@ def test_an_adaptive_tube_holds_in_the_long_run_whatever_the_plant_does(plant):
 
 @pytest.mark.parametrize("eta", [0.9, 0.95, 0.99])
 @pytest.mark.parametrize("size", [0.7, 1.4, 2.5])
-def test_a_tube_that_aims_lower_keeps_the_upper_limit_of_its_violations_at_what_is_allowed(
-    eta, size
-):
+def test_a_lower_aim_bounds_violations_by_what_is_allowed(eta, size):
     T = 3000
     rng = np.random.default_rng(0)
     quantiles = norm.ppf(np.arange(1, 400) / 400)[
@@ -144,7 +140,7 @@ def test_only_predictions_of_the_stages_that_are_told_count():
     assert tube.kappas[1] == 1.0 < tube.kappas[0] == tube.kappas[2] == 5.0
 
 
-def test_only_the_directions_count_in_which_a_plan_touches_a_bound():
+def test_only_directions_count_in_which_a_plan_touches_a_bound():
     tube = AdaptiveTube(
         ConformalTube(np.ones((19, 1)), [[1.0], [-1.0]]), 0.9, largest=5.0
     )
@@ -165,7 +161,7 @@ def test_only_the_directions_count_in_which_a_plan_touches_a_bound():
     assert tube.counts.tolist() == [3]
 
 
-def test_plans_are_compared_at_their_own_stage_and_those_of_failed_steps_are_left_out():
+def test_plans_compare_at_their_stage_without_failed_steps():
     tube = AdaptiveTube(ConformalTube(np.ones((19, 3)), [[1.0]]), 0.9, largest=5.0)
     covariances = np.ones((4, 1, 1))
     for t in range(8):

@@ -65,7 +65,7 @@ def test_inputs_without_an_effect_give_a_wide_interval():
 
 
 @pytest.mark.parametrize("offset", [1e3, -1e6, 1e9])
-def test_a_delay_is_found_wherever_states_and_inputs_have_their_zero(offset):
+def test_a_delay_is_found_for_any_zero_of_states_and_inputs(offset):
     states, inputs = log(300, 3, 0)
     away = estimate_delay(states + offset, inputs)
     assert away.steps == pytest.approx(3, abs=0.15)
@@ -129,9 +129,7 @@ OTHER = np.random.default_rng(3).normal(size=(300, 1))
     ],
 )
 @pytest.mark.parametrize("offset", [0.0, 1e4])
-def test_a_delay_that_the_data_cannot_tell_is_refused_by_its_reason(
-    change, reason, offset
-):
+def test_a_delay_not_in_the_data_is_refused_with_a_reason(change, reason, offset):
     states, inputs = change(*log(300, 3, 0))
     with pytest.raises(DataError, match=f"{reason}.*the data cannot tell"):
         estimate_delay(states + offset, inputs)
@@ -143,7 +141,7 @@ def test_a_little_excitation_beside_a_feedback_is_enough():
     assert found.interval[0] <= 3 <= found.interval[1]
 
 
-def test_a_delay_is_found_where_the_angle_of_a_spinning_pendulum_wraps():
+def test_a_delay_is_found_where_a_spinning_pendulum_wraps():
     states = [np.array([3.0, 6.0])]
     inputs = np.random.default_rng(1).normal(size=(300, 1))
     for k in range(300):
@@ -197,7 +195,7 @@ def test_rows_that_were_trained_on_count_as_if_they_had_not_been():
     assert (estimate_process_noise(model, data).variance > in_sample).all()
 
 
-def test_a_posterior_with_more_noise_predicts_wider_tubes_and_the_same_data():
+def test_with_process_noise_widens_tubes_and_keeps_the_data():
     data = transitions(*log(80, 0, 1))
     model = Trainer(predicts="difference", restarts=0)(data).posterior
     noise = estimate_process_noise(model, data)

@@ -115,7 +115,7 @@ def conditioned(inputs, measured, H, R):
 
 
 @pytest.mark.parametrize("kind", [KalmanFilter.extended, KalmanFilter.unscented])
-def test_filter_and_smoother_of_a_linear_system_are_the_conditional_gaussian_also_where_values_are_missing(
+def test_filter_and_smoother_are_the_conditional_gaussian(
     kind,
 ):
     both = Measurement.of_states(2, [0, 1], [0.1, 0.3])
@@ -161,7 +161,7 @@ def test_a_late_measurement_counts_as_if_it_had_come_in_time():
 
 
 @pytest.mark.parametrize("kind", [KalmanFilter.extended, KalmanFilter.unscented])
-def test_estimates_from_sine_and_cosine_of_an_angle_are_consistent(kind):
+def test_estimates_from_sine_and_cosine_are_consistent(kind):
     def bearing(x):
         return torch.stack([x[..., 0].sin(), x[..., 0].cos()], dim=-1)
 
@@ -185,7 +185,7 @@ def test_estimates_from_sine_and_cosine_of_an_angle_are_consistent(kind):
     assert abs(whiteness) < 1.5 * limit
 
 
-def test_an_angle_that_is_measured_modulo_one_turn_corrects_by_the_short_way():
+def test_an_angle_modulo_one_turn_corrects_by_the_short_way():
     sensor = Measurement.of_states(2, [0], [0.1], angles=[0])
     before = Gaussian(torch.tensor([3.1, 0.0], dtype=F), PRIOR.covariance)
     found = KalmanFilter.extended(PENDULUM, sensor).update(before, [-3.1])
@@ -193,7 +193,7 @@ def test_an_angle_that_is_measured_modulo_one_turn_corrects_by_the_short_way():
     assert 3.1 < float(found.belief.mean[0]) < 3.2
 
 
-def test_an_angle_measured_beyond_half_a_turn_has_the_same_innovation_under_sigma_points():
+def test_sigma_points_have_the_same_innovation_past_half_a_turn():
     sensor = Measurement.of_states(2, [0], [0.1], angles=[0])
 
     def wrapping(x):
@@ -213,7 +213,7 @@ def test_an_angle_measured_beyond_half_a_turn_has_the_same_innovation_under_sigm
             assert torch.allclose(found.belief.mean, exact.belief.mean, atol=loose)
 
 
-def test_a_flight_across_half_a_turn_is_estimated_as_one_away_from_it():
+def test_a_flight_across_half_a_turn_is_estimated_as_any_other():
     """The pendulum hangs at pi here: the sensor flips between both ends of its turn."""
     hanging = Known(
         lambda x, u: (
@@ -311,9 +311,7 @@ WIDE = {
 
 @pytest.mark.parametrize("name", WIDE)
 @pytest.mark.parametrize("kind", [KalmanFilter.extended, KalmanFilter.unscented])
-def test_an_update_is_exact_however_wide_or_singular_the_prior_and_however_good_the_sensors(
-    kind, name
-):
+def test_an_update_is_exact_for_any_prior_and_sensors(kind, name):
     P, H, R = (np.asarray(part, dtype=float) for part in WIDE[name])
     rng = np.random.default_rng(0)
     n = len(P)
@@ -337,7 +335,7 @@ def test_an_update_is_exact_however_wide_or_singular_the_prior_and_however_good_
     assert np.linalg.eigvalsh(covariance).min() >= -1e-15 * np.abs(covariance).max()
 
 
-def test_a_smoother_keeps_its_digits_where_the_prior_says_nothing():
+def test_a_smoother_keeps_its_digits_under_a_flat_prior():
     """Ten measurements of a position say what a velocity of unknown size was at the
     start."""
     first = Measurement.of_states(2, [0], [0.1])
@@ -363,7 +361,7 @@ def test_a_smoother_keeps_its_digits_where_the_prior_says_nothing():
 
 
 @pytest.mark.parametrize("variance", [1e-8, 1e-12, 1e-16, 1e-20, 1e-26])
-def test_two_good_sensors_that_contradict_each_other_move_other_states_little(
+def test_contradictory_good_sensors_move_other_states_little(
     variance,
 ):
     P = random_covariance(5, 1.0)
@@ -381,7 +379,7 @@ def test_two_good_sensors_that_contradict_each_other_move_other_states_little(
     assert np.allclose(found.covariance, covariance, atol=1e-12)
 
 
-def test_correlated_noise_of_nearly_perfect_sensors_is_taken_as_it_is():
+def test_correlated_noise_of_precise_sensors_is_taken_as_it_is():
     R = torch.tensor([[1e-20, 1e-20], [1e-20, 1.0]], dtype=F)
     H = torch.tensor([[1.0, 1.0], [1.0, 0.0]], dtype=F)
     sensor = Measurement(2, R, lambda x: x @ H.mT)
@@ -411,7 +409,7 @@ def test_many_beliefs_are_updated_at_once():
     assert torch.allclose(together.belief.mean[2], PRIOR.mean)
 
 
-def test_a_disturbance_that_nobody_measures_is_estimated_through_a_delay():
+def test_an_unmeasured_disturbance_is_estimated_through_a_delay():
     disturbed = DisturbedModel(LINEAR, torch.tensor([[0.0], [1.0]], dtype=F), [0.001])
     model = DelayedModel(disturbed, 2)
     sensor = Measurement.of_states(5, [0], [0.01])
@@ -429,7 +427,7 @@ def test_a_disturbance_that_nobody_measures_is_estimated_through_a_delay():
     assert 0 < float(belief.covariance[2, 2]) < 0.1
 
 
-def test_errors_that_are_too_large_or_too_small_for_their_covariance_are_inconsistent():
+def test_errors_of_the_wrong_size_are_inconsistent():
     errors = torch.from_numpy(np.random.default_rng(0).normal(size=(200, 3)))
     P = torch.eye(3).expand(200, 3, 3)
     assert normalized_errors(errors, P).consistent
@@ -504,7 +502,7 @@ def test_misuse_is_refused(make, error, rule):
         make(Measurement.of_states(2, [0], [0.1]))
 
 
-def test_the_figure_of_innovations_shows_those_that_were_measured_and_how_many_are_outside():
+def test_the_figure_shows_measured_innovations_and_those_outside():
     sensor = Measurement.of_states(2, [0, 1], [0.1, 0.3])
     _, inputs, measured = simulated(LINEAR, 60, 0, sensor)
     measured[:6, 1] = torch.nan

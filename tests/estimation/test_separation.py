@@ -63,7 +63,7 @@ def test_each_part_is_found(kind, process, sensors):
         )
 
 
-def test_the_model_predicts_the_same_with_the_noise_of_the_process():
+def test_the_model_predicts_the_same_with_process_noise():
     sensors = np.array([0.01, 0.02])
     for kind in ("gp", "features"):
         model, rows = learned(0.3 * sensors, sensors, kind)
@@ -78,7 +78,7 @@ def test_the_model_predicts_the_same_with_the_noise_of_the_process():
         assert bool((noise < 0.7 * model.noise_covariance.diagonal()).all())
 
 
-def test_intervals_of_noisy_sensors_are_honest_only_with_what_was_separated():
+def test_only_separated_noise_gives_honest_intervals():
     sensors = np.array([0.01, 0.02])
     model, rows = learned(0.1 * sensors, sensors)
     fresh = [

@@ -66,7 +66,7 @@ def test_values_and_jacobians_are_those_of_predict(make):
             assert np.abs(ours.full() - theirs.numpy()).max() < 1e-10
 
 
-def test_an_ill_conditioned_model_loses_no_more_digits_than_torch():
+def test_ill_conditioning_loses_no_more_digits_than_torch():
     gp = posterior(size=60)
     gp = GPPosterior.from_hyperparameters(
         gp.features,
@@ -87,7 +87,7 @@ def test_an_ill_conditioned_model_loses_no_more_digits_than_torch():
     assert np.abs(variance.full()[:, 0] - at.variance.numpy()).max() < 1e-10
 
 
-def test_on_a_training_point_without_noise_the_variance_is_never_negative():
+def test_the_variance_on_a_noiseless_point_is_never_negative():
     gp = GPPosterior.from_hyperparameters(
         torch.tensor([[0.5, 0.2]]),
         torch.ones(1, 1),

@@ -223,7 +223,7 @@ def test_a_difference_model_adds_the_state():
 @pytest.mark.parametrize(
     "propagator", [MeanEquivalence(), Linearization(), Unscented(), MonteCarlo(500)]
 )
-def test_every_sampling_and_expanding_propagation_takes_any_kernel(propagator):
+def test_sampling_and_expanding_propagators_take_any_kernel(propagator):
     gp = matern_dynamics()
     at = Gaussian(torch.tensor([0.2, -0.4]), 0.01 * torch.eye(2))
     control = torch.rand(1)
@@ -246,7 +246,7 @@ def test_every_sampling_and_expanding_propagation_takes_any_kernel(propagator):
     )
 
 
-def test_moment_matching_says_what_is_possible_with_other_kernels():
+def test_moment_matching_says_what_other_kernels_allow():
     with pytest.raises(
         UnsupportedModel,
         match="got KernelPosterior. Possible with any model: MeanEquivalence, Linear",
@@ -256,7 +256,7 @@ def test_moment_matching_says_what_is_possible_with_other_kernels():
         )
 
 
-def test_a_frozen_model_knows_its_sizes_noise_and_type_and_can_be_moved():
+def test_a_frozen_model_knows_its_sizes_noise_type_and_moves():
     gp = matern_dynamics()
     assert (gp.state_dim, gp.input_dim, gp.output_dim, gp.dtype, gp.device.type) == (
         2,
@@ -282,7 +282,7 @@ def test_a_frozen_model_knows_its_sizes_noise_and_type_and_can_be_moved():
         gp.predict(x, torch.zeros(5, 2))
 
 
-def test_what_happens_to_the_model_afterwards_does_not_reach_the_frozen_one():
+def test_later_changes_of_the_model_leave_the_frozen_one_alone():
     model = one_output(20, ScaleKernel(MaternKernel()))
     query = torch.rand(4, 3)
     gp = KernelPosterior.from_gpytorch(model, input_dim=0, predicts="value")
@@ -342,7 +342,7 @@ def with_transform():
         ),
     ],
 )
-def test_models_that_cannot_be_frozen_are_refused_with_the_reason(make, error, message):
+def test_models_that_cannot_be_frozen_are_refused_by_reason(make, error, message):
     with pytest.raises(error, match=message):
         from_gpytorch(make(), input_dim=0, predicts="value")
 
@@ -397,9 +397,7 @@ def with_forward(model, forward):
 
 @pytest.mark.parametrize("kind", SE_ARD)
 @pytest.mark.parametrize("name", FORWARDS)
-def test_a_forward_that_is_another_model_is_refused_and_kernel_posterior_takes_it(
-    kind, name
-):
+def test_a_changed_forward_is_left_to_kernel_posterior(kind, name):
     model = with_forward(SE_ARD[kind](20), FORWARDS[name])
     with pytest.raises(UnsupportedModel, match="forward is not the distribution") as e:
         from_gpytorch(model, input_dim=1, predicts="value")
@@ -481,7 +479,7 @@ def test_a_prior_that_depends_on_the_points_beside_is_none():
         from_gpytorch(model, input_dim=1, predicts="value")
 
 
-def test_a_model_whose_parts_have_other_names_is_refused_by_what_is_missing():
+def test_a_model_of_other_parts_is_refused_by_what_is_missing():
     model = one_output(10, RBFKernel())
     model.kernel = model.covar_module
     del model.covar_module

@@ -60,7 +60,7 @@ def test_the_value_is_minus_the_log_of_the_gaussian_density():
     ] == pytest.approx(-float(density.log_prob(torch.from_numpy(y[:, 0]))))
 
 
-def test_a_kernel_matrix_that_is_not_positive_definite_has_infinite_likelihood():
+def test_an_indefinite_kernel_matrix_has_an_infinite_likelihood():
     x = np.zeros((5, 2))
     value, gradient = NegativeLogMarginalLikelihood(x, np.ones(5))(
         np.array([0.0, 0.0, 0.0, 20.0])
@@ -70,7 +70,7 @@ def test_a_kernel_matrix_that_is_not_positive_definite_has_infinite_likelihood()
 
 
 @pytest.mark.parametrize("size", [1, 2, 255, 256, 257, 600])
-def test_the_likelihood_in_place_is_the_likelihood_call_after_call(size):
+def test_the_in_place_likelihood_is_the_same_at_every_call(size):
     x, y, theta = problem(size)
     in_place = NegativeLogMarginalLikelihood(x, y[:, 0], in_place=True)
     separate = NegativeLogMarginalLikelihood(x, y[:, 0], in_place=False)
@@ -82,7 +82,7 @@ def test_the_likelihood_in_place_is_the_likelihood_call_after_call(size):
         )
 
 
-def test_the_likelihood_in_place_is_infinite_where_the_matrix_is_not_positive_definite_and_recovers():
+def test_the_in_place_likelihood_recovers_from_indefiniteness():
     x, y, theta = problem(30)
     x[1] = x[0]
     likelihood = NegativeLogMarginalLikelihood(x, y[:, 0], in_place=True)
@@ -95,7 +95,7 @@ def test_the_likelihood_in_place_is_infinite_where_the_matrix_is_not_positive_de
     )
 
 
-def test_the_likelihood_in_place_takes_one_matrix_and_a_few_blocks():
+def test_the_in_place_likelihood_takes_one_matrix_and_blocks():
     x, y, theta = problem(1500)
     tracemalloc.start()
     NegativeLogMarginalLikelihood(x, y[:, 0], in_place=True)(theta[0])

@@ -21,7 +21,7 @@ def test_a_running_process_has_some_memory_left():
     assert free is None or free > 2**20
 
 
-def test_the_tightest_control_group_above_the_process_counts_and_file_pages_are_free(
+def test_the_tightest_control_group_counts_without_file_pages(
     tmp_path,
 ):
     groups = tmp_path / "sys/fs/cgroup"
@@ -57,7 +57,7 @@ def test_what_is_left_is_the_least_that_anybody_leaves(
     assert available_memory(tmp_path) == (None if free is None else 1024 * free)
 
 
-def test_a_training_that_does_not_fit_is_refused_with_the_points_that_would(
+def test_a_training_too_large_is_refused_with_points_that_fit(
     monkeypatch,
 ):
     needed = 8 * 1000**2 * (2 + 2)  # [bytes]

@@ -23,7 +23,7 @@ def test_the_module_is_predict(predicts, dtype):
     assert torch.allclose(variance, at.variance, **close)
 
 
-def test_an_exported_program_predicts_any_batch_after_a_round_trip_through_a_file(
+def test_an_exported_program_from_a_file_predicts_any_batch(
     tmp_path,
 ):
     gp = posterior(m=1, predicts="difference")

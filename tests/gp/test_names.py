@@ -75,13 +75,13 @@ def residual():
     ],
     ids=lambda table: ", ".join(table.columns),
 )
-def test_next_states_in_another_order_of_columns_are_sorted_like_the_states(after):
+def test_next_states_are_sorted_like_the_states(after):
     read = Transitions(STATES, INPUTS, after)
     assert torch.equal(read.next_states, data().next_states)
     assert read.signals == replace(KNOWN, time_step=None)
 
 
-def test_columns_that_are_numbers_or_pairs_are_sorted_without_being_names():
+def test_columns_of_numbers_or_pairs_are_sorted_but_no_names():
     for labels in ([0, 1], [("a", 0), ("a", 1)]):
         states = STATES.set_axis(pd.Index(labels), axis=1)
         after = AFTER.set_axis(states.columns, axis=1).iloc[:, [1, 0]]
@@ -97,7 +97,7 @@ def test_columns_of_one_name_are_no_names():
     assert torch.equal(read.next_states, data().next_states)
 
 
-def test_columns_of_our_recordings_are_named_as_their_system_names_them():
+def test_columns_of_recordings_have_the_names_of_their_system():
     measured = STATES.add_prefix("measured.")
     applied = INPUTS.add_prefix("input.")
     read = Transitions(measured, applied, measured.shift(-1, fill_value=0.0))
@@ -273,7 +273,7 @@ def test_further_states_of_a_model_have_names_of_their_own(posterior):
     )
 
 
-def test_saved_models_carry_names_and_files_without_them_are_read(tmp_path, posterior):
+def test_saved_models_carry_names_and_files_without_are_read(tmp_path, posterior):
     path = tmp_path / "model.safetensors"
     for model in (posterior, residual(), DelayedModel(residual(), 2)):
         save_model(model, path)
@@ -320,7 +320,7 @@ def test_data_of_other_names_or_time_step_join_no_model(posterior, signals, mess
         calibrate(posterior, Recording.chained(other), horizon=1)
 
 
-def test_an_attribute_of_that_name_that_is_something_else_says_nothing():
+def test_an_attribute_of_that_name_but_another_kind_is_ignored():
     class Machine:
         signals = ("SIGINT", "SIGTERM")
 

@@ -82,9 +82,7 @@ TRAINERS = {
         *((name, 0.0) for name in ("exact", "standardized", "sgpr")),
     ],
 )
-def test_away_from_an_input_that_never_moved_nothing_is_known_and_it_is_named(
-    name, round_off, caplog
-):
+def test_nothing_is_known_away_from_an_input_at_rest(name, round_off, caplog):
     gp = TRAINERS[name](hover(round_off=round_off)).posterior
     assert (deviations(gp, [0.3, 0.2], [0.1, REST]) < 0.05).all()
     assert (deviations(gp, [0.3, 0.2], [0.1, REST + 1.0]) > 0.5).all()
@@ -108,7 +106,7 @@ def test_a_model_of_hover_data_is_not_wrong_by_more_than_it_says():
 
 
 @pytest.mark.parametrize("value", [0.0, 2.0, -7.5, 293.15, 1e5])
-def test_a_state_at_a_set_point_is_unknown_elsewhere_whatever_its_value(value, caplog):
+def test_a_state_at_any_set_point_is_unknown_elsewhere(value, caplog):
     data = hover()
     states = data.states.clone()
     next_states = data.next_states.clone()
@@ -128,9 +126,7 @@ def test_round_off_does_not_move_a_column(value, rng):
 
 
 @pytest.mark.parametrize(("spread", "offset"), [(1.0, 1e9), (1e-3, 1e9), (1.0, 1e12)])
-def test_whether_a_column_moves_is_a_matter_of_resolution_not_of_magnitude(
-    spread, offset, rng
-):
+def test_a_column_moves_by_its_resolution_not_its_magnitude(spread, offset, rng):
     assert not constant_columns(
         offset + spread * (rng.uniform(size=(30, 2)) - 0.5)
     ).any()
@@ -184,9 +180,7 @@ def test_one_row_knows_little_beside_itself_and_says_so_once(name, caplog):
     ("name", "value"),
     [*((name, 7.0) for name in TRAINERS), ("exact", 0.0), ("sgpr", 1e6)],
 )
-def test_an_output_that_never_changed_is_known_among_the_data_alone(
-    name, value, caplog
-):
+def test_an_output_at_rest_is_known_among_the_data_alone(name, value, caplog):
     data = hover()
     trainer = TRAINERS[name]
     constant = torch.full_like(data.states, value)
@@ -221,7 +215,7 @@ def test_round_off_of_differences_is_relative_to_the_states(rng, caplog):
     assert float(residual.residual.signal_variance) == pytest.approx(1.0)
 
 
-def test_what_a_right_nominal_model_misses_may_be_as_much_as_a_step_elsewhere(caplog):
+def test_residuals_at_rest_may_be_a_whole_step_elsewhere(caplog):
     data = hover(noise=0.0)
     A = torch.tensor([[1.0, 0.1], [0.0, 1.0]])
     nominal = Affine(A, torch.zeros(2, 2), torch.zeros(2))
@@ -253,7 +247,7 @@ def test_columns_with_names_are_called_by_them(caplog):
     assert "rows: wind (0.5)." in caplog.text
 
 
-def test_of_many_columns_at_rest_a_few_are_named_and_the_others_counted(caplog, rng):
+def test_of_many_columns_at_rest_few_are_named_others_counted(caplog, rng):
     x = np.column_stack([rng.uniform(size=20), np.zeros((20, 9))])
     Trainer(restarts=0).fit(torch.from_numpy(x), torch.rand(20, 1), 2, "value")
     assert "state 7 (0) and 3 more." in caplog.text
@@ -314,7 +308,7 @@ def test_there_are_as_many_prior_lengthscales_as_features(make):
         make(prior_lengthscale=[1.0, 2.0])(hover())
 
 
-def test_what_moves_outside_the_subset_of_a_sparse_training_is_learned(caplog):
+def test_what_moves_outside_of_a_sparse_subset_is_learned(caplog):
     rng = np.random.default_rng(0)
     x = rng.uniform(-1, 1, (200, 2))
     chosen = np.random.default_rng(0).permutation(200)[
@@ -404,7 +398,7 @@ def test_what_was_at_rest_is_learned_while_flying(predicts):
     assert np.allclose(learned.model.predict(point, u).variance.numpy(), here)
 
 
-def test_a_plan_that_moves_what_never_moved_is_new_and_outside_its_data():
+def test_a_plan_that_moves_a_resting_column_is_outside_its_data():
     problem = Problem(
         cost=Tracking(Q=[10, 1], R=[0.1, 0.1], penalized="inputs"),
         inputs=Box([-1, -1], [1, 1]),

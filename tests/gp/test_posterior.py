@@ -153,9 +153,7 @@ def test_misuse_is_refused_with_the_rule(change, error, message):
         ),
     ],
 )
-def test_data_that_cannot_be_learned_from_are_refused_with_the_rule(
-    change, error, message
-):
+def test_data_that_teach_nothing_are_refused_with_the_rule(change, error, message):
     test_misuse_is_refused_with_the_rule(change, error, message)
 
 
@@ -173,7 +171,7 @@ def test_the_jacobian_of_the_mean_is_that_of_autograd(predicts):
     assert torch.allclose(by_input, reference[1], atol=1e-12)
 
 
-def test_a_posterior_of_scaled_data_speaks_physical_units_after_unscaling():
+def test_an_unscaled_posterior_speaks_physical_units():
     gp = posterior()
     features = Scaling(torch.tensor([1.0, -3.0, 10.0]), torch.tensor([2.0, 0.1, 50.0]))
     targets = Scaling(torch.tensor([5.0, -7.0]), torch.tensor([100.0, 0.01]))
@@ -217,7 +215,7 @@ def test_a_value_model_may_have_any_number_of_outputs():
     assert torch.allclose(belief.mean, targets, atol=0.05)
 
 
-def test_a_posterior_in_single_precision_predicts_nearly_the_same():
+def test_single_precision_predicts_nearly_the_same():
     gp = posterior()
     state = torch.rand(4, 2)
     control = torch.rand(4, 1)

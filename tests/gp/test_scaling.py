@@ -26,13 +26,13 @@ def test_standardized_columns_have_mean_zero_and_deviation_one():
     assert torch.allclose(scaled.std(0, correction=0), torch.ones(2))
 
 
-def test_min_max_fills_the_interval_and_a_constant_column_goes_to_its_middle():
+def test_min_max_fills_the_interval_constants_its_middle():
     scaled = min_max(COLUMNS, NAMES).scale(COLUMNS)
     assert torch.allclose(scaled.amin(0), torch.tensor([0.1, 0.5, 0.1]))
     assert torch.allclose(scaled.amax(0), torch.tensor([0.9, 0.5, 0.9]))
 
 
-def test_a_column_that_moves_less_than_the_resolution_counts_as_constant_and_is_noted(
+def test_motion_below_the_resolution_is_constant_and_noted(
     caplog,
 ):
     with caplog.at_level(logging.INFO, "gpmpc"):

@@ -68,7 +68,7 @@ def information(gp):
     )
 
 
-def test_the_information_of_a_point_is_the_divergence_of_the_posteriors_with_and_without_it():
+def test_information_is_the_divergence_of_with_and_without():
     gp = posterior(transitions(6))
     expected = [
         divergence_over_functions(gp, remove_points(gp, i), gp.features)
@@ -77,7 +77,7 @@ def test_the_information_of_a_point_is_the_divergence_of_the_posteriors_with_and
     assert information(gp).tolist() == pytest.approx(expected, rel=1e-5)
 
 
-def test_points_are_chosen_one_after_the_other_as_if_each_was_dropped():
+def test_points_are_chosen_in_turn_as_if_each_was_dropped():
     gp = posterior(transitions(25))
     left = gp
     names = list(range(25))
@@ -115,7 +115,7 @@ def test_the_oldest_points_go_first():
     )
 
 
-def test_least_informative_points_are_a_better_loss_than_the_oldest():
+def test_dropping_uninformative_points_beats_dropping_the_oldest():
     data = transitions(150)
     held_out = transitions(200, seed=1)
     errors = {}
@@ -130,7 +130,7 @@ def test_least_informative_points_are_a_better_loss_than_the_oldest():
 
 
 @pytest.mark.parametrize("rule", ["oldest", "least_informative"])
-def test_a_batch_larger_than_the_window_is_cut_and_the_log_says_so(rule, caplog):
+def test_a_batch_larger_than_the_window_is_cut_and_logged(rule, caplog):
     data = transitions(30)
     with caplog.at_level(logging.WARNING, "gpmpc"):
         gp = SlidingWindow(8, rule)(posterior(data[:10]), data[10:])

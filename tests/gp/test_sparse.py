@@ -71,7 +71,7 @@ def textbook(Z, x, y, query, method, lengthscales, signal_variance, noise_varian
 
 @pytest.mark.parametrize("method", ["sgpr", "fitc"])
 @pytest.mark.parametrize("noise", [1e-5, 1e-1])
-def test_the_frozen_posterior_has_the_textbooks_mean_and_variance(method, noise):
+def test_a_frozen_posterior_has_the_textbooks_mean_and_variance(method, noise):
     x, y, settings = problem(noise=noise)
     gp = sparse_posterior(
         x[:25],
@@ -111,7 +111,7 @@ def test_with_every_point_as_inducing_point_it_is_the_exact_gp(method):
 
 
 @pytest.mark.parametrize("distance", [1e2, 1e4, 1e6])
-def test_no_covariance_exceeds_the_variance_however_far_apart_the_points_are(distance):
+def test_no_covariance_of_distant_points_exceeds_the_variance(distance):
     x, _, settings = problem(40)
     far = torch.cat([x, x + distance])
     covariances = _cross(far, far, Hyperparameters(**settings))
@@ -124,7 +124,7 @@ def test_no_covariance_exceeds_the_variance_however_far_apart_the_points_are(dis
     assert covariances[:, :40, 40:].max() == 0
 
 
-def test_points_that_are_nearly_the_same_get_the_jitter_they_need():
+def test_nearly_equal_points_get_the_jitter_they_need():
     x, y, settings = problem(100, spread=20.0)
     gp = sparse_posterior(
         x, x, y, Hyperparameters(**settings), input_dim=1, predicts="value"
@@ -151,7 +151,7 @@ def test_points_that_are_nearly_the_same_get_the_jitter_they_need():
         )
 
 
-def test_the_bound_is_below_the_evidence_and_reaches_it_with_every_point():
+def test_the_bound_reaches_the_evidence_with_every_point_only():
     x, y, settings = problem(60)
     gp = GPPosterior.from_hyperparameters(
         x, y, **settings, input_dim=1, predicts="value"
@@ -196,9 +196,7 @@ def test_the_bounds_gradient_is_right():
 
 
 @pytest.mark.parametrize("method", ["sgpr", "fitc"])
-def test_the_bound_and_its_gradient_in_blocks_are_those_in_one_piece(
-    method, monkeypatch
-):
+def test_bound_and_gradient_in_blocks_are_those_in_one_piece(method, monkeypatch):
     x, y, settings = problem(150)
     leaves = [leaf.clone().requires_grad_() for leaf in (x[:12], *settings.values())]
     whole = collapsed_bound(
@@ -219,7 +217,7 @@ def test_the_bound_and_its_gradient_in_blocks_are_those_in_one_piece(
 
 
 @pytest.mark.parametrize("method", ["sgpr", "fitc"])
-def test_a_frozen_sparse_model_is_conditioned_and_moment_matched_like_any_other(method):
+def test_a_frozen_sparse_model_is_used_like_any_other(method):
     x, y, settings = problem(200, noise=1e-3)
     gp = sparse_posterior(
         x[:40], x, y, Hyperparameters(**settings), input_dim=1, method=method
@@ -249,7 +247,7 @@ def test_a_frozen_sparse_model_is_conditioned_and_moment_matched_like_any_other(
         Trainer().refit(gp)
 
 
-def test_informative_points_differ_and_stop_where_nothing_is_left():
+def test_informative_points_differ_and_end_with_the_information():
     x, _, settings = problem(100)
     chosen = torch.cat([x, x])[
         informative_points(torch.cat([x, x]), Hyperparameters(**settings), 30)
@@ -430,7 +428,7 @@ def test_the_best_point_of_a_search_is_kept(monkeypatch):
     assert (training.objective <= training.explored[:, 0]).all()
 
 
-def test_points_that_learn_nothing_where_there_is_something_are_refused():
+def test_points_that_miss_all_there_is_to_learn_are_refused():
     x, _ = sines(500, 2, 0.0, seed=0)
     y = torch.sin(2 * x).prod(1, keepdim=True)
     with pytest.raises(
@@ -453,7 +451,7 @@ def test_where_there_is_nothing_but_noise_the_log_says_so(caplog):
     assert torch.allclose(gp.noise_variance, torch.ones(2), atol=0.2)
 
 
-def test_an_output_at_rest_is_learned_and_only_what_is_supposed_of_it_is_said(caplog):
+def test_an_output_at_rest_is_learned_and_assumptions_are_said(caplog):
     x, y = sines(300, 2, 0.1, seed=0)
     with caplog.at_level(logging.WARNING, "gpmpc"):
         gp = (

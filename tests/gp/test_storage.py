@@ -86,7 +86,7 @@ def test_what_is_loaded_predicts_what_was_saved_bit_by_bit(make, tmp_path):
     assert_same(LOAD[type(model)](tmp_path / "again"), model)
 
 
-def test_a_posterior_of_a_slice_of_somebodys_array_comes_back_the_same(tmp_path):
+def test_a_posterior_of_a_slice_of_an_array_comes_back_the_same(tmp_path):
     table = torch.rand(40, 9)
     gp = GPPosterior.from_hyperparameters(
         table[::2, 1:4],
@@ -270,9 +270,7 @@ def rewritten(path, header=None, **arrays):
         ),
     ],
 )
-def test_a_file_of_other_content_is_refused_with_what_was_expected(
-    change, message, tmp_path
-):
+def test_other_content_is_refused_with_what_was_expected(change, message, tmp_path):
     path = tmp_path / "gp.safetensors"
     save_posterior(posterior(), path)
     rewritten(path, **change)

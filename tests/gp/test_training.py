@@ -65,7 +65,7 @@ def test_next_states_and_differences_are_learned_equally_well():
         assert float(error.abs().max()) < 0.02
 
 
-def test_the_same_seed_gives_the_same_numbers_and_more_starts_never_a_worse_optimum():
+def test_a_seed_repeats_and_more_starts_are_never_worse():
     first = train(pendulum(), seed=3)
     second = train(pendulum(), seed=3)
     assert np.array_equal(first.theta, second.theta)
@@ -88,7 +88,7 @@ def test_the_gpytorch_model_of_a_training_predicts_the_same():
     )
 
 
-def test_the_penalty_keeps_signal_to_noise_and_lengthscales_within_its_limits():
+def test_the_penalty_limits_signal_to_noise_and_lengthscales():
     data = pendulum(40, noise=0.0)
     free = train(data).theta
     limited = train(data, penalty=SoftLimits(signal_to_noise=50.0)).theta
@@ -186,7 +186,7 @@ def test_when_all_starts_fail_the_output_is_named():
     assert caught.value.outputs == [1]
 
 
-def test_a_search_that_begins_with_a_subset_ends_at_the_same_optimum():
+def test_a_search_begun_on_a_subset_ends_at_the_same_optimum():
     data = pendulum(420, noise=1e-2)
     everywhere = train(data, subset=None)
     first_a_part = train(data, subset=100)
@@ -206,7 +206,7 @@ def test_a_start_that_is_known_is_searched_from_over_all_points():
     assert np.allclose(again.explored[:, 0], first.objective, rtol=1e-6)
 
 
-def test_a_subset_is_searched_first_where_there_are_more_points_and_other_starts_than_a_known_one():
+def test_a_subset_comes_first_for_many_points_and_new_starts():
     data = pendulum(40, noise=1e-2)
     whole, same, fewer = (
         Trainer(restarts=0, subset=subset)(data) for subset in (None, 40, 39)
@@ -225,7 +225,7 @@ def test_a_subset_is_searched_first_where_there_are_more_points_and_other_starts
     assert not np.array_equal(again[1][0].explored, again[1][1].explored)
 
 
-def test_what_does_not_fit_the_memory_is_refused_with_the_numbers_and_a_way_out(
+def test_too_much_for_the_memory_is_refused_with_a_way_out(
     monkeypatch,
 ):
     monkeypatch.setattr("gpmpc.gp._memory.available_memory", lambda: 2 * 2**20)
@@ -273,7 +273,7 @@ def test_limits_that_are_none_are_refused(arguments, message):
         SoftLimits(*arguments)
 
 
-def test_values_of_any_kind_are_learned_from_features_and_targets():
+def test_features_and_targets_of_any_kind_are_learned_from():
     x = torch.linspace(-2, 2, 30)[:, None]
     for trainer in (
         Trainer(predicts="value", restarts=0),
@@ -360,7 +360,7 @@ TABLES = [
 @pytest.mark.parametrize(
     "trainer", [Trainer(), SparseTrainer()], ids=["exact", "sparse"]
 )
-def test_tables_that_cannot_be_learned_from_are_refused_with_the_rule(
+def test_tables_that_teach_nothing_are_refused_with_the_rule(
     trainer, change, error, message
 ):
     features, targets = two_columns()
@@ -384,7 +384,7 @@ def test_tables_of_a_graph_are_learned_apart_from_it():
     assert not gp.weights.requires_grad
 
 
-def test_a_refit_and_a_start_need_a_posterior_and_transitions_that_fit_it():
+def test_refits_and_starts_need_a_posterior_that_fits():
     trainer = Trainer(restarts=0)
     gp = train(pendulum(8), restarts=0).posterior
     other = Transitions(torch.zeros(3, 3), torch.zeros(3, 1), torch.zeros(3, 3))
@@ -433,9 +433,7 @@ def test_what_takes_long_tells_where_it_is(caplog, monkeypatch):
     assert len(told) == found.evaluations
 
 
-def test_a_time_limit_ends_every_outputs_search_with_the_best_found_so_far(
-    caplog, monkeypatch
-):
+def test_a_time_limit_ends_each_search_with_the_best_so_far(caplog, monkeypatch):
     data = pendulum(40)
     ticks = count()
     converged = train(data)
@@ -486,7 +484,7 @@ def test_a_time_limit_waits_for_one_start_that_succeeds(
     ]
 
 
-def test_a_time_limit_leaves_one_start_on_the_subset_and_an_iteration_over_all_points(
+def test_a_time_limit_leaves_one_start_and_one_iteration(
     monkeypatch,
 ):
     data = pendulum(60, noise=1e-2)

@@ -30,7 +30,7 @@ def test_single_precision_is_raised_to_double():
     )
 
 
-def test_features_are_states_beside_inputs_and_rows_can_be_chosen(transitions):
+def test_features_are_states_and_inputs_and_rows_are_chosen(transitions):
     assert torch.equal(transitions.features[:, 3:], transitions.inputs)
     assert torch.equal(transitions[[4, 1]].next_states, transitions.next_states[[4, 1]])
     assert (len(transitions[:3]), transitions.state_dim, transitions.input_dim) == (

@@ -255,9 +255,7 @@ def test_outputs_need_not_be_as_many_as_states():
 @pytest.mark.parametrize(
     ("distance", "spread"), [(0.0, 1e3), (50.0, 10.0), (1e4, 1.0), (1e4, 1e4)]
 )
-def test_wide_beliefs_far_from_the_data_neither_overflow_nor_lose_the_prior(
-    distance, spread
-):
+def test_wide_beliefs_far_from_data_keep_the_prior(distance, spread):
     gp = model(lengthscale=0.05)
     at = Gaussian(torch.full((2,), distance), spread**2 * torch.eye(2))
     mine = differentiated(packed(gp), *numbers(at.mean, at.covariance), np.zeros(1))
@@ -323,7 +321,7 @@ def test_the_expansion_at_a_point_agrees_with_torch(n, m, size):
 
 
 @pytest.mark.parametrize("covariance", [0.0, 1e-14])
-def test_without_covariance_the_moments_are_the_expansion_at_the_mean(covariance):
+def test_without_covariance_the_moments_expand_about_the_mean(covariance):
     gp = model(n=3, m=2)
     x = belief(3).mean
     u = control(2)
@@ -461,7 +459,7 @@ def test_the_exponentials_are_those_of_fifty_digits(low, high):
         ).all()
 
 
-def test_near_zero_the_exponentials_without_reduction_are_the_same_to_the_last_bit():
+def test_unreduced_exponentials_near_zero_have_the_same_bits():
     x = np.random.default_rng(1).uniform(-NEAR_ZERO, NEAR_ZERO, 2000) * np.geomspace(
         1e-12, 1, 2000
     )
@@ -550,7 +548,7 @@ def test_the_kernels_load_no_torch_of_their_own():
     ]
 
 
-def test_the_sine_and_cosine_of_lanes_are_exact_to_round_off_and_stay_within_one(rng):
+def test_sine_and_cosine_of_lanes_are_exact_and_within_one(rng):
     sine = by_lanes(_simd.sine)
     cosine = by_lanes(_simd.cosine)
     for scale in (1.0, 100.0, 1e6):

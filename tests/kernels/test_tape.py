@@ -47,7 +47,7 @@ def test_a_tape_has_the_values_and_derivatives_of_casadi(function, rng):
         assert np.allclose(found, expected, rtol=1e-12, atol=1e-12)
 
 
-def test_expressions_of_matrices_are_expanded_and_other_calls_have_no_tape():
+def test_matrix_expressions_expand_and_other_calls_have_no_tape():
     x = casadi.MX.sym("x", 2)
     assert tape_of(casadi.Function("f", [x], [casadi.sin(x) @ x.T])) is not None
     assert tape_of(casadi.Function("f", [X], [casadi.floor(X)])) is None
@@ -57,7 +57,7 @@ def test_expressions_of_matrices_are_expanded_and_other_calls_have_no_tape():
     assert tape_of(casadi.Function("f", [x], [table(x[0])])) is None
 
 
-def test_a_known_model_is_rolled_out_in_one_call_under_a_feedback_within_bounds(rng):
+def test_one_call_rolls_a_known_model_out_within_bounds(rng):
     system = double_pendulum("shoulder")
     H = 12
     x = casadi.SX.sym("x", 4)
@@ -88,9 +88,7 @@ def test_a_known_model_is_rolled_out_in_one_call_under_a_feedback_within_bounds(
 
 
 @pytest.mark.parametrize("count", [1, 3, 8, 9])
-def test_roll_outs_of_functions_without_a_value_at_zero_are_those_of_the_function(
-    count, rng
-):
+def test_roll_outs_of_functions_undefined_at_zero_are_right(count, rng):
     x = casadi.SX.sym("x", 2)
     u = casadi.SX.sym("u", 1)
     after = casadi.vertcat(
@@ -112,7 +110,7 @@ def test_roll_outs_of_functions_without_a_value_at_zero_are_those_of_the_functio
             )
 
 
-def test_a_function_without_a_finite_derivative_has_an_infinite_one_and_no_error():
+def test_an_infinite_derivative_is_returned_without_an_error():
     function = CasadiFunction(
         casadi.Function(
             "f", [X], [casadi.vertcat(casadi.sqrt(X[0]), 1 / X[1], casadi.log(X[2]))]

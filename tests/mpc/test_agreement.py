@@ -49,7 +49,7 @@ def questions(count, std):
     [Linearization(), MomentMatching()],
     ids=["linearisation", "moment matching"],
 )
-def test_iterated_programs_reach_the_optimum_of_the_nonlinear_method(propagator):
+def test_iterated_programs_reach_the_nonlinear_optimum(propagator):
     gp = quadrotor_gp()
     convex = GPMPC(
         gp,
@@ -89,7 +89,7 @@ def test_dual_primal_and_state_form_give_the_same_inputs():
     assert active
 
 
-def test_a_bound_that_takes_a_large_step_of_the_inputs_is_kept_by_iterated_programs_only():
+def test_only_iterated_programs_keep_a_bound_after_a_large_step():
     """Thrust and tilt multiply: where both have to change at once, one linearisation at
     the last inputs is far off."""
     gp = quadrotor_gp(150)

@@ -101,7 +101,7 @@ def flown(iterations, tolerance=None):
     return cost, programs
 
 
-def test_a_step_takes_one_program_where_the_plan_goes_on_and_more_after_a_jump():
+def test_one_program_continues_a_plan_and_a_jump_takes_more():
     cost, programs = flown(None)
     converged, _ = flown(100, 1e-8)
     assert cost < 1.02 * converged
@@ -134,7 +134,7 @@ def puck(x, u):
 @pytest.mark.parametrize("h", [ellipsoid, distance, energy])
 @pytest.mark.parametrize("stages", [None, [8]], ids=["all stages", "the last"])
 @pytest.mark.parametrize("iterations", [None, 1, 30])
-def test_a_decision_tells_how_far_its_own_plan_misses_a_curved_bound(
+def test_a_decision_says_how_far_its_plan_misses_a_curved_bound(
     h, stages, iterations, rng
 ):
     for _ in range(4):
@@ -202,7 +202,7 @@ def test_a_first_plan_is_iterated_only_where_that_pays():
     assert ends[cart_pole] > 0.1
 
 
-def test_a_first_plan_stands_where_more_programs_lead_the_model_out_of_its_numbers(
+def test_the_first_plan_stands_where_later_programs_fail(
     monkeypatch,
 ):
     problem = Problem(Tracking([10.0, 1.0], [0.01]), inputs=Box([-5.0], [5.0]))

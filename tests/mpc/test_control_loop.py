@@ -36,9 +36,7 @@ def test_five_lines_steer_somebody_elses_plant_to_a_set_point():
 
 
 @pytest.mark.parametrize("on_failure", ["previous_plan", "hold"])
-def test_whatever_happens_an_input_is_finite_and_within_bounds_and_rates(
-    on_failure, rng
-):
+def test_an_input_is_always_finite_and_within_bounds_and_rates(on_failure, rng):
     hard = Problem(PROBLEM.cost, BOX, RATES, [Box(None, [np.inf, 0.1], penalty=None)])
     loop = ControlLoop(controller(hard), on_failure)
     x = np.zeros(2)

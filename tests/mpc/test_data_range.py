@@ -48,7 +48,7 @@ def test_a_state_beyond_its_data_is_named_with_both_ranges(model):
     assert beyond_data(wrapped, late) == [beyond]
 
 
-def test_a_little_beyond_and_what_a_gp_does_not_depend_on_are_not_named(model):
+def test_small_excesses_and_irrelevant_columns_are_not_named(model):
     assert beyond_data(model, [1.15, -1.15, 0.0]) == []
     assert [each.name for each in beyond_data(model, [1.25, -1.25, 0.0])] == [
         "position",
@@ -64,7 +64,7 @@ def test_names_of_a_reference_sort_its_columns(model):
     assert beyond.name == "position"
 
 
-def test_a_column_that_never_moved_is_left_by_any_part_of_its_lengthscale():
+def test_a_column_at_rest_is_left_by_any_part_of_a_lengthscale():
     states = np.zeros((5, 2))
     states[:, 0] = np.linspace(-1, 1, 5)
     still = gp(states, [1.0, 1.0], Signals())
@@ -72,7 +72,7 @@ def test_a_column_that_never_moved_is_left_by_any_part_of_its_lengthscale():
     assert [each.name for each in beyond_data(still, [0.0, 0.5])] == ["x2"]
 
 
-def test_angles_are_compared_by_their_arc_and_models_without_data_have_none():
+def test_angles_compare_by_their_arc_and_no_data_give_no_range():
     rng = np.random.default_rng(0)
     states = rng.uniform(-1, 1, (60, 2))
     states[:, 0] = np.pi + 0.8 * states[:, 0]  # hanging, through half a turn

@@ -96,7 +96,7 @@ def test_a_model_that_is_right_is_left_alone():
     assert np.abs([decision.disturbance for decision in told[1]]).max() < 1e-12
 
 
-def test_the_estimate_moves_by_its_gain_towards_what_the_last_step_showed():
+def test_the_estimate_moves_by_its_gain_towards_the_last_error():
     asked = controller(disturbance_gain=0.3)
     _, decisions = flown(asked, steps=6)
     found = [decision.disturbance for decision in decisions]
@@ -115,7 +115,7 @@ def test_what_was_applied_counts_and_not_what_was_planned():
     assert np.allclose(now.disturbance, UNKNOWN, rtol=0, atol=1e-12)
 
 
-def test_a_measurement_that_is_missing_leaves_the_estimate_as_it_is():
+def test_a_missing_measurement_leaves_the_estimate_unchanged():
     asked = controller(disturbance_gain=1.0)
     states, _ = flown(asked, steps=5)
     last = decide(asked, Gaussian.certain(states[-1]), AT_REST, None, "previous_plan")
@@ -172,7 +172,7 @@ def test_a_gain_out_of_range_is_refused(kind, settings, rule):
 
 
 @pytest.mark.parametrize("iterations", [1, 30])
-def test_a_controller_for_another_model_is_one_that_was_made_with_it(iterations):
+def test_with_model_gives_the_controller_made_with_that_model(iterations):
     other = pendulum_posterior(seed=3)
     inputs = 2.0 * np.ones((H, 1))
     asked = controller(

@@ -35,7 +35,7 @@ def planned(penalty, start, goal=0.0, upper=0.5, form="trajectory"):
 
 
 @pytest.mark.parametrize("start", [[0.0, 0.0], [0.4, 0.5], [0.49, -1.0]])
-def test_where_a_bound_can_be_kept_an_elastic_one_is_the_exact_one(start):
+def test_an_elastic_bound_is_exact_where_it_can_be_kept(start):
     elastic, exact = (planned(p, start, goal=3.0) for p in ("default", "exact"))
     assert elastic.status is Status.SOLVED
     assert elastic.means[1:, 0].max() <= 0.5 + 1e-7
@@ -66,7 +66,7 @@ def test_a_reference_beyond_a_bound_does_not_make_it_free():
     assert decision.means[-1, 0] < 0.65
 
 
-def test_a_vehicle_that_was_pushed_out_of_its_lane_comes_back_and_does_not_spin():
+def test_a_vehicle_pushed_out_of_its_lane_returns_without_a_spin():
     """A tyre that lets go beyond a slip: what exact bounds ask for is more than it
     bears."""
 

@@ -59,7 +59,7 @@ def pendulum_problem(**parts):
     return Problem(cost, inputs=Box([-2.0], [2.0]), **parts)
 
 
-def test_angles_count_within_half_a_turn_and_the_reference_stands_still_at_its_end():
+def test_angles_are_wrapped_and_the_reference_rests_at_its_end():
     meter = StageMeter(pendulum_problem(), 2)
     states = np.array([[9.0, 9.0], [6.0, 1.0], [0.5, 2.0], [0.5, 0.0], [0.0, 0.0]])
     inputs = np.array([[1.0], [2.0], [0.0], [3.0]])
@@ -83,7 +83,7 @@ def test_increments_are_counted_from_the_input_before():
     assert costs == pytest.approx([4.0, 9.0, 0.0])
 
 
-def test_outputs_and_violated_constraints_count_with_their_parameters():
+def test_outputs_and_violations_count_with_their_parameters():
     def output(x, u, p):
         return x[:, :1] - p
 
@@ -107,7 +107,7 @@ def test_outputs_and_violated_constraints_count_with_their_parameters():
     assert costs == pytest.approx(expected)
 
 
-def test_a_hard_bound_is_not_for_sale_and_one_of_few_stages_does_not_count():
+def test_a_hard_bound_costs_infinity_unless_it_is_of_few_stages():
     walls = [Box([-1.0, -5.0], [1.0, 5.0], penalty=None)]
     gate = [Box([-1.0, -5.0], [1.0, 5.0], penalty=None, stages=[2])]
     states = np.array([[0.0, 0.0], [0.5, 0.0], [1.5, 0.0]])
@@ -122,7 +122,7 @@ def test_a_hard_bound_is_not_for_sale_and_one_of_few_stages_does_not_count():
     assert np.isfinite(costs[1]).all()
 
 
-def test_a_flight_is_what_the_controller_does_and_ends_where_the_goal_is_held():
+def test_a_flight_follows_the_controller_and_ends_at_the_goal():
     system = pendulum()
     one = controller(system, pendulum_problem(), 30)
     start = np.array(system.start)
@@ -144,7 +144,7 @@ def test_a_flight_is_what_the_controller_does_and_ends_where_the_goal_is_held():
         assert np.allclose(better.states[k + 1], after, rtol=1e-6, atol=1e-6)
 
 
-def test_a_flight_that_arrives_is_better_than_a_cheaper_one_that_stands():
+def test_a_flight_that_arrives_beats_a_cheaper_one_that_stands():
     states = np.zeros((4, 1))
     inputs = np.zeros((3, 1))
     arrives = Flight(states, inputs, np.array([9.0, 9.0, 0.0]), True)

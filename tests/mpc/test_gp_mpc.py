@@ -126,7 +126,7 @@ def test_on_a_linear_model_all_forms_are_the_nonlinear_benchmark(penalized, rng)
     assert worked > 100
 
 
-def test_it_is_the_exact_least_squares_solution_and_predicts_the_exact_covariances(rng):
+def test_it_is_exact_least_squares_with_exact_covariances(rng):
     model = linear_gaussian(2, 1)
     H = 5
     problem = Problem(Tracking([3.0, 0.5], [0.2], penalized="inputs"))
@@ -241,7 +241,7 @@ def expected_cost(problem, model, moves, state, inputs, reference, covariance):
     ],
     ids=["full", "diagonal", "moment matching", "none"],
 )
-def test_more_iterations_end_in_a_kkt_point_of_the_nonlinear_problem(covariance, moves):
+def test_iterations_end_in_a_kkt_point_of_the_nonlinear_problem(covariance, moves):
     H = 3
     limits = Box([-np.inf, -0.35] * 3, [np.inf, 0.9] * 3, probability=0.9, penalty=None)
     problem = quadrotor_problem(constraints=[limits])
@@ -385,7 +385,7 @@ def test_a_horizon_of_fifty_with_state_bounds_stays_feasible(form, price):
     assert decisions[-1].inputs.shape == (50, 3)
 
 
-def test_feedback_keeps_a_long_horizon_feasible_where_open_loop_is_not():
+def test_a_long_horizon_is_feasible_with_feedback_only():
     model = linear_gaussian(2, 1)
     H = 50
     model = replace(
@@ -493,7 +493,7 @@ def test_a_decision_holds_the_problem_that_it_solves():
 
 
 @pytest.mark.parametrize("iterations", [1, 5])
-def test_a_measurement_that_is_not_finite_is_not_given_to_the_solver(iterations):
+def test_a_non_finite_measurement_never_reaches_the_solver(iterations):
     controller = GPMPC(
         gp(),
         MeanEquivalence(),
@@ -535,7 +535,7 @@ def test_a_decision_that_was_not_solved_is_no_warm_start():
     )
 
 
-def test_what_was_applied_at_a_failed_step_is_where_the_next_increment_starts():
+def test_increments_start_at_the_input_applied_after_a_failure():
     problem = quadrotor_problem(input_rates=Box([-0.05] * 3, [0.05] * 3))
     controller = GPMPC(
         gp(),
@@ -673,9 +673,7 @@ def test_the_compiled_rollout_is_the_one_stage_by_stage(
 @pytest.mark.parametrize(
     ("form", "covariance"), [pair for pair in PAIRS if pair[1] != "none"]
 )
-def test_noise_of_observations_widens_what_is_predicted_by_its_variance_on_request(
-    form, covariance, evaluated
-):
+def test_observation_noise_widens_predictions_on_request(form, covariance, evaluated):
     state = Gaussian.certain(np.array([0.3, 0.0, -0.2, 0.1, 0.2, 0.0]))
     found = []
     for noise in (False, True):
@@ -697,7 +695,7 @@ def test_noise_of_observations_widens_what_is_predicted_by_its_variance_on_reque
     )  # of 1e-4; the plans differ a little
 
 
-def test_each_part_of_a_decision_takes_its_own_time_and_questions_share_the_model(
+def test_parts_of_a_decision_are_timed_and_share_the_model(
     monkeypatch,
 ):
     model = linear_gaussian(2, 1)

@@ -91,7 +91,7 @@ class Rounded(Disturbance):
 
 @pytest.mark.parametrize("seed", range(5))
 @pytest.mark.parametrize("noise", [None, NOISE])
-def test_a_flight_in_which_nothing_breaks_is_healthy_at_every_step(noise, seed):
+def test_a_flight_without_faults_is_healthy_at_every_step(noise, seed):
     rollout = fly(noise=noise, seed=seed)
     assert levels(rollout) == ["healthy"] * 80
     assert rollout.judgement == FlightJudgement()
@@ -119,7 +119,7 @@ def test_what_breaks_is_called_within_twenty_steps(broken, seed):
     assert set(told[40:60]) > {"healthy"}
 
 
-def test_a_plant_that_no_longer_obeys_is_lost_and_says_since_when():
+def test_a_plant_that_stops_obeying_is_lost_since_that_step():
     rollout = fly(Reversed(0, 40 * T), steps=120)
     judgement = rollout.judgement
     assert judgement.level == "lost"
@@ -174,7 +174,7 @@ def test_a_sensor_that_freezes_is_named_after_four_steps():
     assert told[24].reason.startswith("state 0 is measured the same for 4 steps")
 
 
-def test_decisions_that_cannot_be_applied_are_suspicious_from_the_third_on():
+def test_failed_decisions_are_suspicious_from_the_third_on():
     judge = FlightJudge(CONTROLLER.problem)
     for k in range(20):
         status = Status.INFEASIBLE if k >= 10 else Status.SOLVED
@@ -188,7 +188,7 @@ def test_decisions_that_cannot_be_applied_are_suspicious_from_the_third_on():
     assert told == Judgement()
 
 
-def test_plans_far_from_all_data_are_suspicious_until_it_is_where_it_should_be():
+def test_plans_far_from_data_are_suspicious_away_from_the_goal():
     for place, level in ([0.0, "healthy"], [1.0, "suspicious"]):
         judge = FlightJudge(CONTROLLER.problem)
         x = np.array([place, 0.0])
@@ -197,7 +197,7 @@ def test_plans_far_from_all_data_are_suspicious_until_it_is_where_it_should_be()
         assert told == ["healthy", "healthy", level, level]
 
 
-def test_a_flight_without_measurements_is_judged_again_when_they_are_back():
+def test_a_flight_is_judged_again_when_measurements_are_back():
     rollout = fly(Dropout(30 * T, 40 * T))
     told = levels(rollout)
     assert told[31:33] == ["healthy", "suspicious"]
@@ -217,7 +217,7 @@ def test_a_constraint_that_plans_keep_missing_is_suspicious():
 @pytest.mark.parametrize(
     ("horizon", "level"), [(10, "lost"), (30, "lost"), (80, "healthy")]
 )
-def test_a_tank_that_runs_away_while_every_program_is_solved_is_lost(horizon, level):
+def test_a_tank_that_runs_away_is_lost_though_programs_solve(horizon, level):
     rollout = tank(horizon)
     assert all(status.solved for status in rollout.statuses)
     assert rollout.judgement.level == level
@@ -262,7 +262,7 @@ def test_what_a_judge_saw_of_a_flight_is_no_part_of_the_next():
     assert again.judgement.level == "healthy"
 
 
-def test_a_controller_without_a_problem_is_judged_by_its_innovations():
+def test_without_a_problem_innovations_are_judged():
     class Standing:
         horizon = 5
 

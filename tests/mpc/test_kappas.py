@@ -70,7 +70,7 @@ def test_a_bound_on_the_mean_stays_one():
     assert np.array_equal(moved.inputs, asked.control(START, FAR).inputs)
 
 
-def test_an_adaptive_tube_brings_the_violations_to_what_is_allowed_where_the_noise_is_larger_than_learned():
+def test_an_adaptive_tube_holds_where_noise_exceeds_the_model():
     asked = controller()
     rng = np.random.default_rng(0)
     outside = {}

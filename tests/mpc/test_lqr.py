@@ -63,7 +63,7 @@ def test_a_long_horizon_gives_the_stationary_gain(rng):
     assert np.allclose(decision.input, -dlqr(A, B, Q, R) @ state, atol=1e-9)
 
 
-def test_an_unweighted_mode_on_the_unit_circle_falls_back_to_the_recursion():
+def test_an_unweighted_mode_of_modulus_one_uses_the_recursion():
     K = dlqr(
         np.diag([1.0, 0.5]), np.array([[0.0], [1.0]]), np.diag([0.0, 1.0]), np.eye(1)
     )
@@ -165,7 +165,7 @@ def test_a_bad_measurement_is_said_so_and_misuse_is_refused():
 
 
 @pytest.mark.parametrize("side", [-1.0, 1.0])
-def test_where_rates_and_box_contradict_each_other_no_input_leaves_the_box(side, rng):
+def test_no_input_leaves_the_box_where_rates_contradict_it(side, rng):
     """The input before was far outside; the rates alone would keep the next there."""
     problem = Problem(
         Tracking(Q, R), inputs=Box([-0.5], [0.4]), input_rates=Box([-0.1], [0.1])
@@ -201,9 +201,7 @@ class Watched(LinearGaussian):
 @pytest.mark.parametrize(
     "known", [True, False], ids=["reference inputs", "no reference inputs"]
 )
-def test_the_local_models_are_taken_at_the_state_and_then_along_the_reference(
-    known, rng
-):
+def test_local_models_are_at_the_state_then_at_the_reference(known, rng):
     model = Watched(A.tolist(), B.tolist())
     H = 4
     states = rng.normal(size=(H + 1, 2))
@@ -218,7 +216,7 @@ def test_the_local_models_are_taken_at_the_state_and_then_along_the_reference(
 
 
 @pytest.mark.parametrize("factor", [np.nan, np.inf, 1e250])
-def test_a_model_that_is_not_finite_or_grows_beyond_all_numbers_is_numerical_trouble(
+def test_a_non_finite_or_exploding_model_is_numerical_trouble(
     factor,
 ):
     controller = LQR(
@@ -234,7 +232,7 @@ def test_a_model_that_is_not_finite_or_grows_beyond_all_numbers_is_numerical_tro
     assert np.array_equal(decision.inputs, np.full((4, 1), 0.2))
 
 
-def test_a_state_that_is_part_of_a_graph_is_answered_like_any_other():
+def test_a_state_that_requires_gradients_is_like_any_other():
     controller = LQR(
         double_integrator(), Problem(Tracking(Q, R, penalized="inputs")), 3, [0.2]
     )
@@ -246,7 +244,7 @@ def test_a_state_that_is_part_of_a_graph_is_answered_like_any_other():
     )
 
 
-def test_the_gain_over_a_long_horizon_is_stationary_and_exists_for_any_system(rng):
+def test_the_gain_of_a_long_horizon_is_stationary_and_exists(rng):
     A = rng.normal(size=(1, 4, 4))
     B = rng.normal(size=(1, 4, 2))
     Q = np.eye(4)

@@ -117,9 +117,7 @@ CASES = pytest.mark.parametrize(("squares", "inputs"), [(True, True), (False, Fa
 
 
 @CASES
-def test_violated_rows_cost_their_price_and_hard_ones_the_given_one(
-    squares, inputs, rng
-):
+def test_violated_rows_cost_their_price_hard_ones_the_given(squares, inputs, rng):
     seen = set()
     for _ in range(20):
         case = Case(rng, squares, inputs)
@@ -143,9 +141,7 @@ def test_the_merit_is_cost_price_and_weighed_defects(squares, inputs, rng):
 
 
 @CASES
-def test_multipliers_of_the_dynamics_are_what_a_push_of_a_state_costs(
-    squares, inputs, rng
-):
+def test_multipliers_of_the_dynamics_are_the_cost_of_a_push(squares, inputs, rng):
     """Central differences of cost and rows, with the push passed on to all later
     states; exact for quadratics."""
     case = Case(rng, squares, inputs)
@@ -177,7 +173,7 @@ def test_multipliers_of_the_dynamics_are_what_a_push_of_a_state_costs(
 
 @CASES
 @pytest.mark.parametrize("known", [0.0, 1e6])
-def test_what_a_step_promises_is_measured_against_what_the_plan_costs(
+def test_the_promise_of_a_step_is_measured_by_the_plans_cost(
     squares, inputs, known, rng
 ):
     for _ in range(5):
@@ -218,7 +214,7 @@ def test_what_a_step_promises_is_measured_against_what_the_plan_costs(
         assert (before == known).all()
 
 
-def test_an_update_gives_the_curvature_that_a_step_showed_and_stays_positive_definite(
+def test_an_update_has_the_steps_curvature_and_stays_definite(
     rng,
 ):
     for turn in (1.0, -1.0, 0.0):
@@ -248,7 +244,7 @@ def test_between_two_plans_every_part_moves_by_the_same_share(rng):
             np.testing.assert_allclose(part, (1 - share) * a + share * b, atol=1e-15)
 
 
-def test_the_smallest_cost_is_that_of_a_thousandth_of_the_cheapest_input():
+def test_the_smallest_cost_is_of_a_thousandth_of_one_input():
     R_ = np.diag([4.0, 9.0])
     wide = np.full(2, np.inf)
     assert _smallest_cost(R_, -wide, wide, np.zeros(2)) == pytest.approx(4e-6)
@@ -261,7 +257,7 @@ def test_the_smallest_cost_is_that_of_a_thousandth_of_the_cheapest_input():
     assert _smallest_cost(0 * R_, -wide, wide, np.zeros(2)) > 0
 
 
-def test_inputs_are_moved_one_after_the_other_to_within_their_rates(rng):
+def test_inputs_are_clipped_to_their_rates_one_after_another(rng):
     for stages in (1, H):
         low = -rng.uniform(0.1, 0.5, (stages, M))
         high = rng.uniform(0.1, 0.5, (stages, M))

@@ -181,7 +181,7 @@ class Scripted:
         )
 
 
-def test_the_loop_hands_on_state_references_and_the_last_decision():
+def test_the_loop_passes_state_references_and_last_decision():
     controller = Scripted(Status.SOLVED, Status.SOLVED, Status.SOLVED)
     plant = System(DoubleIntegrator(), time_step=1.0, substeps=1)
     references = np.arange(10.0).reshape(5, 2)
@@ -238,7 +238,7 @@ def test_soft_bounds_of_one_state_leave_the_others_free():
     assert np.allclose(free.inputs, bounded.inputs, atol=1e-6)
 
 
-def test_a_bad_measurement_is_said_so_and_the_last_plan_is_handed_on():
+def test_a_bad_measurement_is_reported_and_the_plan_shifted():
     plant = System(DoubleIntegrator(), time_step=0.5, substeps=1)
     controller = NMPC(
         plant, Problem(Tracking([1.0, 0.1], [0.1], penalized="inputs")), 3, [0.0]
@@ -312,9 +312,7 @@ def test_bounds_that_contradict_each_other_are_not_called_solved():
 
 
 @pytest.mark.parametrize("penalized", ["inputs", "deviations", "increments"])
-def test_the_last_state_has_its_own_weight_and_inputs_are_weighed_as_asked(
-    penalized, rng
-):
+def test_the_last_state_has_its_weight_and_inputs_theirs(penalized, rng):
     """No small change of the plan is cheaper by the problem's own words."""
     plant = System(DoubleIntegrator(), time_step=0.5, substeps=1)
     H = 4

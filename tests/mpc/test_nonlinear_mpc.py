@@ -58,9 +58,7 @@ def request_of(problem, H, at=None, last=0.3, reference=None):
 
 @pytest.mark.parametrize("penalized", ["inputs", "deviations", "increments"])
 @pytest.mark.parametrize("name", PROPAGATORS)
-def test_the_adjoint_gradient_is_that_of_torch_and_of_finite_differences(
-    name, penalized, rng
-):
+def test_the_adjoint_gradient_is_that_of_torch_and_differences(name, penalized, rng):
     H = 4
     propagator = PROPAGATORS[name]
     model = pendulum_posterior()
@@ -214,7 +212,7 @@ class DoubleIntegrator:
         return [x[1], u[0]]
 
 
-def test_on_a_certain_model_it_is_nonlinear_mpc_of_the_true_plant(rng):
+def test_on_a_certain_model_it_is_nonlinear_mpc_of_the_plant(rng):
     H = 5
     limits = Box([-np.inf, -0.4], [np.inf, 0.4], probability=0.95, penalty=None)
     problem = Problem(Tracking(Q, R), inputs=Box(None, [0.5]), constraints=[limits])
@@ -437,7 +435,7 @@ def test_a_model_that_breaks_down_is_numerical_trouble():
     assert np.isfinite(decision.inputs).all()
 
 
-def test_a_failed_plan_is_no_warm_start_and_one_that_stopped_at_a_limit_is():
+def test_a_plan_stopped_at_a_limit_is_a_warm_start_no_failed_one():
     problem = Problem(Tracking(Q, R, penalized="inputs"))
     impatient = NonlinearGPMPC(
         pendulum_posterior(),

@@ -108,7 +108,7 @@ def test_a_deviation_beyond_the_range_of_the_data_is_above_one():
     assert decide(controller(gp, horizon=40), 0.0).novelty < 0.2
 
 
-def test_a_state_that_only_its_noise_moves_is_not_far_from_its_data():
+def test_a_state_moved_by_noise_alone_is_not_far_from_its_data():
     rng = np.random.default_rng(1)
     features = torch.from_numpy(rng.uniform(-1, 1, (60, 2)) * [1.0, 1e-4])
     targets = torch.from_numpy(rng.normal(0, 1e-4, (60, 1)))
@@ -124,7 +124,7 @@ def test_a_state_that_only_its_noise_moves_is_not_far_from_its_data():
     assert 0.0 < decision.novelty < 0.1
 
 
-def test_scales_of_angles_of_what_never_moved_and_of_pseudo_observations():
+def test_scales_of_angles_resting_columns_and_pseudo_data():
     data = transitions()
     turned = ResidualModel.train(Affine.identity(2, 1), data, angles=[0])
     scales = data_scales(turned)
@@ -164,7 +164,7 @@ def test_models_around_gps_know_it_too(gp, mode):
     assert plain < 0.2
 
 
-def test_a_plan_of_means_is_measured_when_it_is_read_and_not_before(gp, monkeypatch):
+def test_novelty_of_a_plan_of_means_is_computed_when_read(gp, monkeypatch):
     asked = []
     linearize = GPPosterior.linearize
 

@@ -75,9 +75,7 @@ def test_a_linear_output_costs_what_tracking_does(form, covariance):
 
 
 @pytest.mark.parametrize("penalized", ["inputs", "deviations", "increments"])
-def test_weights_and_bounds_by_stage_are_those_of_the_program_with_its_states_left_in(
-    penalized, rng
-):
+def test_weights_and_bounds_by_stage_match_the_sparse_program(penalized, rng):
     Q = rng.uniform(0.1, 2.0, (H, 3))
     R = rng.uniform(0.1, 1.0, (H, 2))
     low = rng.uniform(-0.3, -0.1, (H, 2))
@@ -134,7 +132,7 @@ def casadi_tip():
 
 
 @pytest.mark.parametrize("y", [tip, casadi_tip()], ids=["torch", "CasADi"])
-def test_an_iterated_plan_is_where_the_cost_of_its_outputs_has_no_slope(y):
+def test_an_iterated_plan_is_stationary_in_the_cost_of_outputs(y):
     """The gradient of the true cost in the inputs, by differences of a roll-out,
     vanishes: KKT without bounds."""
     model = DoublePendulum(ACROBOT)
@@ -207,7 +205,7 @@ def test_a_constraint_of_states_and_inputs_is_kept_and_touched():
     assert np.allclose(plans[0].inputs, plans[1].inputs, atol=1e-6)
 
 
-def test_a_plan_that_is_handed_over_is_where_the_iteration_starts():
+def test_the_iteration_starts_at_a_given_plan():
     model = DoublePendulum(ACROBOT)
     goal = Reference(np.zeros(4))
     cost = Tracking([1.0] * 4, [1e-3], penalized="inputs")
@@ -232,7 +230,7 @@ def test_a_plan_that_is_handed_over_is_where_the_iteration_starts():
     assert np.allclose(later.inputs, solved.inputs, atol=1e-6)
 
 
-def test_a_plan_that_leaves_the_data_is_flagged_and_one_among_them_is_not(rng):
+def test_a_plan_is_flagged_only_where_it_leaves_the_data(rng):
     states = rng.uniform(-1, 1, (60, 2))
     inputs = rng.uniform(-1, 1, (60, 1))
     after = states + 0.1 * np.stack(
@@ -311,7 +309,7 @@ def test_mistakes_are_one_clear_error():
         controller.control(at, GOAL, plan=np.full((7, 2), np.nan))
 
 
-def test_functions_are_looked_at_where_a_flight_starts_also_with_references_and_weights_by_stage():
+def test_functions_are_checked_where_a_flight_starts():
     cost = Tracking([1.0] * 3, [1.0] * 2)
     start = (STATE, np.zeros(2))
     weight = np.stack([np.eye(3)] * H)

@@ -69,7 +69,7 @@ def test_a_failed_iterate_is_never_handed_on(on_failure):
     assert commands[1].decision.status is Status.ITERATION_LIMIT
 
 
-def test_the_plan_handed_on_is_the_last_solved_one_as_if_made_one_step_ago():
+def test_the_next_warm_start_is_the_last_solved_plan_shifted():
     planner = Planner(1, 2)
     run(planner, 4, "previous_plan")
     aged = planner.previous[
@@ -81,14 +81,14 @@ def test_the_plan_handed_on_is_the_last_solved_one_as_if_made_one_step_ago():
     assert aged.covariances[:, 0, 0].tolist() == [2, 3, 4, 4, 4]
 
 
-def test_what_is_handed_on_begins_with_what_was_applied_when_the_input_is_held():
+def test_a_held_input_begins_the_next_warm_start():
     planner = Planner(1)
     run(planner, 3, "hold")
     assert planner.previous[2].inputs[:, 0].tolist() == [0, 2, 3, 3]
     assert planner.previous[2].input[0] == 0
 
 
-def test_a_state_that_is_not_finite_is_not_given_to_the_controller():
+def test_a_non_finite_state_never_reaches_the_controller():
     planner = Planner()
     infinite = Gaussian(STATE.mean, STATE.covariance + np.inf)
     commands = run(planner, 4, "previous_plan", [STATE, LOST, infinite, STATE])
@@ -98,7 +98,7 @@ def test_a_state_that_is_not_finite_is_not_given_to_the_controller():
     assert commands[1].decision is None
 
 
-def test_before_the_first_plan_the_references_input_is_taken_or_the_loop_stops():
+def test_before_a_plan_the_reference_input_applies_or_it_stops():
     known = Reference(np.zeros((5, 1)), np.full((4, 1), 7.0))
     assert [c.input[0] for c in run(Planner(0, 1), 3, "hold", reference=known)] == [
         7,
@@ -142,7 +142,7 @@ def test_before_the_first_plan_the_reference_input_is_applied():
 
 
 @pytest.mark.parametrize("on_failure", ["previous_plan", "hold"])
-def test_before_the_first_plan_each_step_applies_its_own_reference_input(on_failure):
+def test_before_a_plan_each_step_applies_its_reference_input(on_failure):
     """What was applied for want of a plan is no plan, and is not gone on along."""
     planner = Planner(0, 1, 2)
     last = None

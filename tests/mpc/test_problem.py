@@ -121,7 +121,7 @@ def test_kappa_is_the_quantile_of_the_probability_unless_given():
     assert joint == pytest.approx(2.3263478740408408, abs=1e-12)  # 0.99 each
 
 
-def test_a_violation_costs_nothing_to_forbid_what_is_asked_or_more_than_any_weight():
+def test_the_penalty_is_infinite_as_given_or_above_any_weight():
     problem = Problem(Tracking([1.0, 200.0], [3.0]))
     assert problem.price(Box([0.0] * 2, penalty=None)) == math.inf
     assert problem.price(Box([0.0] * 2, penalty=7.0)) == 7.0
@@ -151,7 +151,7 @@ def test_without_bounds_everything_is_free_and_bounds_may_touch():
     assert Problem(Tracking([1.0], [1.0]), Box([0.3], [0.3])).inputs.lower[0] == 0.3
 
 
-def test_bounds_of_one_stage_are_those_of_all_and_others_need_every_stage():
+def test_bounds_are_given_for_one_stage_or_for_every_stage():
     assert np.array_equal(Box([1.0, 2.0], [3.0, 4.0]).by_stage(3)[1], [[3.0, 4.0]] * 3)
     assert np.array_equal(Box([[1.0], [2.0]]).by_stage(2)[0], [[1.0], [2.0]])
     with pytest.raises(

@@ -99,7 +99,7 @@ class Pendulum:
         return [-x[1] * x[2], x[0] * x[2], 15.0 * x[1] + 3.0 * u[0]]
 
 
-def test_growth_in_a_direction_without_data_is_no_warning_but_that_of_the_plant_is():
+def test_only_growth_along_the_data_is_a_warning():
     plant = System(Pendulum(), time_step=0.05)
     rng = np.random.default_rng(0)
     angles = rng.uniform(-np.pi, np.pi, 200)

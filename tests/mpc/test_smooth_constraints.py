@@ -95,7 +95,7 @@ def test_a_moving_disc_is_passed_where_it_will_be():
 
 
 @pytest.mark.parametrize("covariance", ["zero_order", "diagonal", "full"])
-def test_an_uncertain_plan_keeps_its_standard_deviations_along_the_gradient(covariance):
+def test_an_uncertain_plan_keeps_its_margin_along_the_gradient(covariance):
     reference, at = (
         Reference(np.array([1.3, 0.2])),
         Gaussian.certain(np.array([0.0, 0.1])),
@@ -115,7 +115,7 @@ def test_an_uncertain_plan_keeps_its_standard_deviations_along_the_gradient(cova
     assert sd.min() > 0.01
 
 
-def test_a_linear_function_is_a_halfspace_and_a_box_is_a_pair_of_them():
+def test_linear_functions_are_halfspaces_and_boxes_two_of_them():
     F, f, at = (
         np.array([[1.0, 0.0], [0.6, 0.8]]),
         np.array([0.7, 0.5]),
@@ -159,7 +159,7 @@ def test_bounds_hold_at_the_stages_that_they_are_for():
         controller(Box([0.0] * 2, stages=[13]))
 
 
-def test_the_exact_price_is_paid_by_no_plan_that_can_do_without_and_by_as_little_as_must_be():
+def test_an_exact_price_is_paid_only_where_it_must_be():
     at, reference = Gaussian.certain(np.zeros(2)), Reference(np.array([3.0, 0.0]))
     soft, hard = (
         controller(Box(None, [0.4, np.inf], penalty=price)).control(at, reference)
@@ -179,7 +179,7 @@ def test_the_exact_price_is_paid_by_no_plan_that_can_do_without_and_by_as_little
     assert np.allclose(back.inputs[:4, 0], -0.15, atol=1e-7)
 
 
-def test_an_angle_is_steered_the_short_way_and_numbers_without_angles_are_as_they_were():
+def test_angles_are_steered_the_short_way_and_others_unchanged():
     cost = Tracking([1.0] * 2, [0.05] * 2, angles=[0])
     turning = GPMPC(
         integrator(), Linearization(), Problem(cost, FREE.inputs), H, [0.0] * 2

@@ -117,7 +117,7 @@ def test_a_regulator_at_its_origin_has_no_trouble(penalized, tolerance):
     assert np.abs(state).max() < 1e-9
 
 
-def test_the_residual_vanishes_with_the_distance_where_the_cost_does(quadrotor):
+def test_the_residual_vanishes_with_distance_as_the_cost_does(quadrotor):
     """The cosine alone would not: the root of the cost is as small as the gradient."""
     inputs = np.tile(HOVER, (3, 1))
     states = [np.zeros(6)]
@@ -171,9 +171,7 @@ def test_what_is_called_solved_is_within_ten_times_the_tolerance(quadrotor, tole
 @pytest.mark.parametrize(
     ("scale", "bound"), [(1.0, 0.01), (1e6, 1.0), (1e6, 1e4), (1e9, 1e7)]
 )
-def test_plans_of_the_program_keep_their_rates_whatever_the_unit_of_the_inputs(
-    scale, bound
-):
+def test_plans_keep_their_rates_in_any_unit_of_the_inputs(scale, bound):
     model = linear_gaussian(2, 1)
     model = replace(model, B=model.B / scale)
     problem = Problem(
@@ -313,9 +311,7 @@ def test_the_parts_of_the_time_are_within_what_the_step_took(quadrotor, reachabl
 
 @pytest.mark.parametrize("start", ["reference", "hover"])
 @pytest.mark.parametrize("horizon", [10, 30, 60])
-def test_from_no_plan_at_all_few_programs_reach_a_kkt_point_at_any_horizon(
-    quadrotor, horizon, start
-):
+def test_without_a_plan_few_programs_reach_a_kkt_point(quadrotor, horizon, start):
     problem = Problem(Tracking([1.0] * 6, [1.0] * 3), **BOX)
     controller = GPMPC(
         quadrotor,
@@ -384,7 +380,7 @@ class Table:
 
 
 @pytest.mark.parametrize("start", [[-3.0, 2.0], [1.0, 5.0], [4.0, 4.0]])
-def test_a_step_that_leads_the_model_out_of_its_numbers_is_shortened(start):
+def test_a_step_to_where_the_model_is_not_finite_is_shortened(start):
     problem = Problem(Tracking([10.0, 0.1], [0.01]), inputs=Box([-20.0], [20.0]))
     controller = GPMPC(
         Table(),
@@ -402,9 +398,7 @@ def test_a_step_that_leads_the_model_out_of_its_numbers_is_shortened(start):
     assert decision.iterations > 4
 
 
-def test_the_first_step_from_the_last_plan_needs_no_roll_out_and_ends_where_others_do(
-    quadrotor, monkeypatch
-):
+def test_the_first_step_of_a_warm_start_needs_no_roll_out(quadrotor, monkeypatch):
     problem = Problem(Tracking([1.0] * 6, [1.0] * 3), **BOX)
     settings = PredictionSettings(covariance="none")
     controller = GPMPC(
@@ -433,7 +427,7 @@ def test_the_first_step_from_the_last_plan_needs_no_roll_out_and_ends_where_othe
     assert np.allclose(warm.inputs, given.inputs, atol=1e-4)
 
 
-def test_inputs_that_lead_a_model_out_of_its_numbers_begin_a_plan_at_the_state():
+def test_a_guess_rests_at_the_state_where_its_inputs_overflow():
     x = casadi.SX.sym("x")
     u = casadi.SX.sym("u")
     runaway = KnownModel(

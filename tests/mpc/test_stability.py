@@ -102,7 +102,7 @@ def steps_from(controller, reference, state, plan, count):
 
 
 @pytest.mark.parametrize("changes", LOOPS.values(), ids=LOOPS)
-def test_the_linear_loop_is_what_the_controller_does_near_its_rest(changes):
+def test_the_linear_loop_is_the_controller_near_its_rest(changes):
     controller = tank_loop(40, **changes)
     prediction = controller.prediction
     further = prediction.problem.state_dim - 4
@@ -128,7 +128,7 @@ def test_the_linear_loop_is_what_the_controller_does_near_its_rest(changes):
     assert error < 5e-3 * np.abs(flights[1] - flights[0]).max()
 
 
-def test_a_horizon_too_short_for_an_inverse_response_is_named_and_flights_agree():
+def test_too_short_a_horizon_for_an_inverse_response_is_named():
     system = quadruple_tank()
     known = tank_loop(10).stability(TANK_GOAL)
     assert not known.stable
@@ -157,7 +157,7 @@ def test_a_horizon_too_short_for_an_inverse_response_is_named_and_flights_agree(
     assert tank_loop(60).stability(LEVELS).shortest_horizon == shortest
 
 
-def test_an_estimate_that_is_too_quick_for_a_delay_is_named_and_flights_agree():
+def test_too_quick_an_estimate_for_a_delay_is_named():
     def swing(disturbance_gain):
         bounds = Box([-20.0], [20.0])
         controller = late_integrator(disturbance_gain, bounds=bounds)
@@ -188,7 +188,7 @@ def test_an_estimate_that_is_too_quick_for_a_delay_is_named_and_flights_agree():
         assert circling < 0.05
 
 
-def test_the_range_of_gains_is_where_plants_of_these_gains_settle():
+def test_plants_settle_exactly_within_the_range_of_gains():
     controller = late_integrator(0.7)
     low, high = controller.stability(np.zeros(1 + LATE)).gain_range
     for gain, settles in (

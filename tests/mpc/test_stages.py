@@ -151,9 +151,7 @@ def belief_at(mode, s, covariance):
     [MomentMatching(), Linearization(), Unscented()],
     ids=lambda p: type(p).__name__,
 )
-def test_a_stage_is_the_derivative_of_its_own_map_and_goes_through_its_point(
-    mode, propagator
-):
+def test_a_stage_is_the_tangent_of_its_map_at_its_point(mode, propagator):
     model = pendulum_posterior()
     input = torch.tensor([0.4])
     h = 1e-6

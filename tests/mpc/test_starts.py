@@ -104,7 +104,7 @@ def off_upright(states, angle):
     return np.abs(wrap(states[:, angle]))
 
 
-def test_many_starts_swing_a_cart_pole_up_and_follow_their_plan_from_then_on():
+def test_many_starts_swing_a_cart_pole_up_and_follow_the_plan():
     many = cart_poles()
     states, _ = fly(many, cart_pole(), 60)
     assert many.searches == 1
@@ -113,7 +113,7 @@ def test_many_starts_swing_a_cart_pole_up_and_follow_their_plan_from_then_on():
 
 
 @pytest.mark.parametrize("horizon", [30, 60])
-def test_a_pendulum_is_up_where_the_controller_alone_gets_up_and_costs_no_more(horizon):
+def test_many_starts_cost_no_more_than_the_controller_alone(horizon):
     system = pendulum()
     parts = system, [1.0, 0.01], [0.01], horizon
     many = CountedStarts(controller(*parts), controller(*parts, 10))
@@ -135,7 +135,7 @@ def test_a_cart_pole_is_up_sooner_than_by_the_controller_alone():
     assert paid < 0.8 * paid_alone
 
 
-def test_a_push_that_makes_the_rest_of_the_way_dearer_is_a_cause_to_search_again():
+def test_a_push_that_makes_the_way_dearer_restarts_the_search():
     system = pendulum()
     many = pendulums()
     push = (30, [0.4, 3.0])
@@ -163,7 +163,7 @@ def test_noise_at_the_top_is_none():
     assert many.searches == 1
 
 
-def test_a_measurement_that_fails_on_the_way_does_not_lose_the_way():
+def test_a_failed_measurement_does_not_lose_the_plan():
     def measure(state, k):
         return np.full(2, np.nan) if k in (12, 13, 40) else state
 
@@ -248,7 +248,7 @@ def test_the_search_is_never_worse_than_any_of_its_starts():
             )
 
 
-def test_the_plan_obeys_the_dynamics_and_may_end_a_full_turn_away():
+def test_a_plan_obeys_the_dynamics_and_may_end_a_turn_away():
     system = pendulum()
     found = pendulums().control(
         Gaussian.certain(np.array([5.5, 2.0])), Reference(np.zeros(2))
@@ -272,7 +272,7 @@ def test_a_sensor_that_takes_a_turn_off_changes_nothing():
     assert np.allclose(*inputs, rtol=1e-6, atol=1e-6)
 
 
-def test_the_users_criterion_chooses_and_a_spent_budget_ends_the_search():
+def test_the_users_criterion_chooses_until_the_budget_is_spent():
     state = Gaussian.certain(np.array([np.pi, 0.0]))
     reference = Reference(np.zeros(2))
     seen = []
@@ -294,7 +294,7 @@ def test_the_users_criterion_chooses_and_a_spent_budget_ends_the_search():
     assert len(seen) == 2  # the controller's own plan, and one start
 
 
-def test_a_plan_that_does_not_lead_to_the_goal_is_given_up_and_a_good_one_is_not():
+def test_only_a_plan_that_misses_the_goal_is_given_up():
     state = Gaussian.certain(np.array([np.pi, 0.0]))
     reference = Reference(np.zeros(2))
     one = controller(pendulum(), [1.0, 0.01], [0.01], 30)
@@ -307,7 +307,7 @@ def test_a_plan_that_does_not_lead_to_the_goal_is_given_up_and_a_good_one_is_not
     assert many.searches == 0
 
 
-def test_a_spent_budget_leaves_what_the_controller_does_by_itself():
+def test_a_spent_budget_leaves_the_controllers_own_plan():
     system = pendulum()
     many = pendulums(budget=1e-9)
     state = Gaussian.certain(np.array(system.start))
@@ -318,7 +318,7 @@ def test_a_spent_budget_leaves_what_the_controller_does_by_itself():
     assert off_upright(states[-15:], 0).max() < 0.2
 
 
-def test_a_measurement_that_is_not_finite_is_said_so_and_misuse_is_refused():
+def test_non_finite_measurements_and_misuse_are_refused():
     bad = pendulums().control(
         Gaussian.certain(np.array([np.nan, 0.0])), Reference(np.zeros(2))
     )
@@ -336,7 +336,7 @@ def test_a_measurement_that_is_not_finite_is_said_so_and_misuse_is_refused():
         )
 
 
-def test_goals_are_the_nearest_turns_of_each_angle_seen_from_the_end_of_the_reference():
+def test_goals_are_the_nearest_turns_of_the_references_end():
     many = ManyStarts(
         controller(double_pendulum("elbow"), [10.0, 0.1, 10.0, 0.1], [0.01], 3),
         turns=(2, 3),
@@ -364,7 +364,7 @@ def test_goals_are_the_nearest_turns_of_each_angle_seen_from_the_end_of_the_refe
         assert np.allclose(goal.states, reference.states + moved, atol=1e-12)
 
 
-def test_a_guess_is_a_line_to_the_goal_or_what_its_inputs_lead_to():
+def test_a_guess_is_a_line_to_the_goal_or_a_roll_out():
     system = pendulum()
     H = 4
     inputs = np.array([[0.5], [-0.5], [1.0], [0.0]])
@@ -447,7 +447,7 @@ def test_kicks_push_every_input_to_both_sides_within_its_bounds():
 
 
 @pytest.mark.parametrize("starts", [3, pytest.param(20, marks=pytest.mark.slow)])
-def test_no_solve_of_a_double_pendulum_from_a_wild_start_breaks_down(starts):
+def test_wild_starts_of_a_double_pendulum_break_no_solve(starts):
     # 2 joints x starts x 6 goals x 4 guesses: 960 solves, each iterated, over 1.2 s
     count = 0
     rng = np.random.default_rng(7)
@@ -480,7 +480,7 @@ def test_no_solve_of_a_double_pendulum_from_a_wild_start_breaks_down(starts):
     assert count == (960 if starts > 3 else 30)
 
 
-def test_between_decisions_the_plan_is_followed_under_its_feedback():
+def test_between_decisions_feedback_follows_the_plan():
     system = pendulum()
     fine = pendulum(time_step=system.time_step / 10)
     many = pendulums()

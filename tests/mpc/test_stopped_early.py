@@ -91,7 +91,7 @@ STOPPED = {
 
 
 @pytest.mark.parametrize("kind", STOPPED)
-def test_a_vehicle_comes_home_with_plans_that_were_not_optimal_yet(kind, monkeypatch):
+def test_a_vehicle_comes_home_with_suboptimal_plans(kind, monkeypatch):
     controller = STOPPED[kind](monkeypatch)
     references = (
         REFERENCES
@@ -117,7 +117,7 @@ def test_a_vehicle_comes_home_with_plans_that_were_not_optimal_yet(kind, monkeyp
 
 
 @pytest.mark.parametrize("limit", [2, 4, 8])
-def test_the_plan_at_a_limit_is_the_best_that_the_iteration_got_to(limit):
+def test_the_plan_at_a_limit_is_the_best_iterate(limit):
     """Its cost falls from limit to limit, down to the optimum, by an evaluation that is
     not the iteration's own."""
 

@@ -43,7 +43,7 @@ def deviations(horizon, feedback):
 
 
 @pytest.mark.parametrize("horizon", [20, 40, 80])
-def test_a_tube_stays_narrow_where_the_input_changes_the_sign_of_its_effect(horizon):
+def test_a_tube_stays_narrow_where_the_input_changes_its_sign(horizon):
     with_feedback = deviations(horizon, feedback=True)
     assert with_feedback.max() < 2 * INITIAL_DEVIATION
     without = deviations(horizon, feedback=False)

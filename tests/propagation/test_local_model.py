@@ -143,7 +143,7 @@ def test_inputs_without_a_horizon_are_refused():
         rollout(MomentMatching(), gp(), belief(), [[0.1]])
 
 
-def test_the_symmetric_root_squares_to_the_covariance_and_is_semidefinite():
+def test_the_symmetric_root_is_semidefinite_and_squares_back():
     root = torch.randn(5, 3, 3)
     S = root @ root.mT
     R = square_root(S)
@@ -157,7 +157,7 @@ def test_the_symmetric_root_squares_to_the_covariance_and_is_semidefinite():
     [(1.0, 2.0, 5.0), (2.0, 2.0, 2.0), (1.0, 1.0, 3.0), (1e-6, 1.0, 1.0)],
     ids=["distinct", "all equal", "two equal", "nearly singular"],
 )
-def test_the_derivative_of_the_root_agrees_with_finite_differences(eigenvalues):
+def test_the_roots_derivative_agrees_with_finite_differences(eigenvalues):
     U = torch.linalg.qr(torch.randn(3, 3)).Q
     S = U @ torch.diag(torch.tensor(eigenvalues)) @ U.T
     change = torch.randn(3, 3)
@@ -176,7 +176,7 @@ def test_the_derivative_of_the_root_agrees_with_finite_differences(eigenvalues):
     "eigenvalues",
     [(0.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, 2.0, 2.0), (-1e-17, 1.0, 1.0)],
 )
-def test_where_the_root_has_no_derivative_it_is_finite_and_zero_in_the_null_space(
+def test_a_missing_derivative_is_finite_and_0_in_the_null_space(
     eigenvalues,
 ):
     U = torch.linalg.qr(torch.randn(3, 3)).Q

@@ -230,7 +230,7 @@ def test_without_covariance_it_is_the_plain_prediction(predicts):
         assert not matched.cross_covariance.any()
 
 
-def test_a_vanishing_covariance_approaches_the_plain_prediction_linearly():
+def test_a_vanishing_covariance_linearly_nears_the_prediction():
     gp = model()
     at = belief()
     control = torch.tensor([0.2])
@@ -288,7 +288,7 @@ def test_derivatives_by_torch_agree_with_finite_differences(spread):
     assert torch.allclose(reverse, forward, rtol=1e-10, atol=1e-11)
 
 
-def test_the_public_class_is_differentiable_where_covariances_have_equal_eigenvalues():
+def test_derivatives_exist_where_eigenvalues_are_equal():
     gp = model()
     gp = GPPosterior.from_hyperparameters(
         gp.features,
@@ -326,7 +326,7 @@ def test_vmap_maps_over_beliefs():
     )
 
 
-def test_wide_beliefs_far_from_the_data_neither_overflow_nor_lose_the_prior():
+def test_wide_beliefs_far_from_data_keep_the_prior():
     gp = model(lengthscale=0.05)
     for distance, spread in ((0.0, 1e3), (50.0, 10.0), (1e4, 1.0)):
         mean, covariance, _ = moments(
@@ -338,7 +338,7 @@ def test_wide_beliefs_far_from_the_data_neither_overflow_nor_lose_the_prior():
         assert torch.allclose(covariance.diagonal(), gp.signal_variance, rtol=1e-3)
 
 
-def test_the_result_is_semidefinite_and_observation_noise_is_added_unless_it_is_refused():
+def test_results_are_semidefinite_with_noise_unless_refused():
     gp = model(noise=1e-8)
     at = belief(spread=1e-3)
     control = torch.tensor([0.1])

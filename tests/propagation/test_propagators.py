@@ -100,7 +100,7 @@ def test_a_linear_gaussian_system_is_propagated_exactly(name, process_noise):
     assert float(result.deficit) == 0
 
 
-def test_mean_equivalence_of_a_linear_system_forgets_the_state_covariance_only():
+def test_mean_equivalence_forgets_only_the_state_covariance():
     model = linear()
     at = belief()
     u = torch.tensor([0.7])
@@ -112,7 +112,7 @@ def test_mean_equivalence_of_a_linear_system_forgets_the_state_covariance_only()
     assert not result.cross_covariance.any()
 
 
-def test_monte_carlo_of_a_linear_system_is_exact_up_to_its_standard_error():
+def test_monte_carlo_is_exact_up_to_its_standard_error():
     model = linear()
     at = belief()
     u = torch.tensor([0.7])
@@ -138,7 +138,7 @@ def test_monte_carlo_of_a_linear_system_is_exact_up_to_its_standard_error():
     )
 
 
-def test_monte_carlo_says_the_same_for_the_same_seed_and_another_thing_for_another():
+def test_monte_carlo_depends_on_its_seed_alone():
     model = gp()
     at = belief()
     u = torch.zeros(1)
@@ -228,7 +228,7 @@ def test_noise_of_a_residual_model_acts_where_the_residual_does(name):
 
 
 @pytest.mark.parametrize("name", [name for name in ALL if name != "moment matching"])
-def test_a_function_with_other_outputs_than_states_is_propagated_too(name):
+def test_a_function_of_more_outputs_than_states_is_propagated(name):
     model = gp(predicts="value", outputs=3)
     at = belief()
     u = torch.tensor([0.1])
@@ -239,7 +239,7 @@ def test_a_function_with_other_outputs_than_states_is_propagated_too(name):
     assert torch.allclose(result.belief.mean, exact.belief.mean, atol=0.15)
 
 
-def test_moment_matching_says_what_it_can_do_and_who_can_do_the_rest():
+def test_moment_matching_names_who_can_do_what_it_cannot():
     model = linear()
     other = ResidualModel(lambda x, u: x.sin(), model.residual, model.B, [0, 1], [0], 1)
     message = (
@@ -300,7 +300,7 @@ class TestBadInput:
         batch = Gaussian(torch.zeros(2, 2), torch.stack([torch.eye(2), at.covariance]))
         self.refused(name, DataError, message, at=batch, u=torch.zeros(2, 1))
 
-    def test_a_singular_covariance_and_round_off_below_zero_are_accepted(self, name):
+    def test_singular_covariances_and_negative_round_off_are_taken(self, name):
         for S in (torch.ones(2, 2), torch.diag(torch.tensor([1.0, -1e-15]))):
             moved = ALL[name]()(gp(), Gaussian(torch.zeros(2), 0.1 * S), torch.zeros(1))
             assert torch.isfinite(moved.covariance).all()

@@ -126,7 +126,7 @@ def test_closed_forms_by_torch_can_be_differentiated_again(propagator):
     assert torch.allclose(curvature[0], numeric, rtol=1e-6, atol=1e-7)
 
 
-def test_a_root_without_derivative_counts_as_constant_in_closed_form_too():
+def test_a_root_without_derivative_is_constant_in_closed_form():
     gp = MODELS["difference"]
     flat = draw(3, 1)
     for covariance in (torch.zeros(3, 3), flat @ flat.T):
@@ -145,7 +145,7 @@ def test_nobody_has_derivatives_too():
             assert d.covariance_by_covariance.shape == (0, 3, 3, 3, 3)
 
 
-def test_the_evaluation_can_be_forced_and_refuses_what_it_cannot_do():
+def test_a_forced_evaluation_refuses_what_it_cannot_do():
     gp = MODELS["next state"]
     state = torch.zeros(3)
     control = torch.zeros(2)
@@ -214,9 +214,7 @@ def value_model(n, m, k):
     [MeanEquivalence(), Linearization(), MomentMatching(), Unscented()],
     ids=_name,
 )
-def test_functions_with_more_or_fewer_outputs_than_states_have_derivatives_too(
-    propagator, n, k
-):
+def test_any_number_of_outputs_has_derivatives(propagator, n, k):
     gp = value_model(n, 1, k)
     at = belief(n)
     control = draw(1)
@@ -288,7 +286,7 @@ def test_a_covariance_that_is_not_symmetric_is_refused():
         MomentMatching()(MODELS["next state"], lopsided, torch.zeros(2))
 
 
-def test_models_whose_hyperparameters_carry_gradients_are_answered_by_torch():
+def test_hyperparameters_with_gradients_are_left_to_torch():
     log_scale = torch.zeros(2, 3, requires_grad=True)
     features = draw(12, 3)
     targets = draw(12, 2)
@@ -324,7 +322,7 @@ def test_inference_mode_stops_no_derivative():
     assert torch.allclose(inside.A, outside.A, atol=1e-12)
 
 
-def test_a_posterior_does_not_follow_what_becomes_of_the_tensors_it_was_made_of():
+def test_later_changes_of_its_tensors_leave_a_posterior_alone():
     features = draw(10, 3)
     gp = GPPosterior.from_hyperparameters(
         features, draw(10, 2), torch.ones(2, 3), torch.ones(2), 0.1 * torch.ones(2), 1

@@ -30,9 +30,7 @@ class Quadratic:
 
 @pytest.mark.parametrize("alpha", [1e-2, 0.3, 1.0, 1.7])
 @pytest.mark.parametrize("curvature", [0.0, 1.0, -3.0])
-def test_with_beta_of_two_a_quadratic_of_one_state_is_exact_whatever_alpha(
-    alpha, curvature
-):
+def test_with_beta_two_a_quadratic_is_exact_for_any_alpha(alpha, curvature):
     """Which is what beta is for (van der Merwe, 2004): Var[g x + 1/2 h x^2] = g^2 s +
     1/2 h^2 s^2 about zero."""
     model = Quadratic(torch.tensor([0.7]), torch.tensor([[curvature]]))
@@ -51,9 +49,7 @@ def test_with_beta_of_two_a_quadratic_of_one_state_is_exact_whatever_alpha(
     ("alpha", "beta", "kappa"),
     [(1.0, 0.0, 0.0), (0.5, 2.0, 1.0), (0.1, 1.0, -1.5), (2.0, -0.5, 3.0)],
 )
-def test_moments_of_a_quadratic_of_three_states_are_those_of_the_points_worked_out_by_hand(
-    alpha, beta, kappa
-):
+def test_moments_of_a_quadratic_are_those_worked_out_by_hand(alpha, beta, kappa):
     """Along the columns r_j of the root, d_j = 1/2 r_j'H r_j: the mean is sum d_j = 1/2
     tr(H S) for all parameters.
 

@@ -41,9 +41,7 @@ def daqp_solution(problem: QuadraticProgram):
 
 @pytest.mark.parametrize("feasible", [True, None])
 @pytest.mark.parametrize("block", range(4))
-def test_no_disagreement_with_daqp_on_integer_problems_feasible_and_infeasible(
-    block, feasible
-):
+def test_daqp_agrees_on_feasible_and_infeasible_integers(block, feasible):
     rng = np.random.default_rng([block, bool(feasible)])
     outcomes = set()
     for _ in range(600):

@@ -10,9 +10,7 @@ from tests.qp.problems import feasible_problem
 
 @pytest.mark.parametrize("mode", ["prepared", "changing"])
 @pytest.mark.parametrize("limit", [10, 40, 80])
-def test_a_solve_stops_at_its_iteration_limit_however_much_time_there_is(
-    mode, limit, rng
-):
+def test_a_solve_stops_at_its_iteration_limit_with_time_left(mode, limit, rng):
     for _ in range(4):
         problem = feasible_problem(rng, 40, 80)
         solver = DualActiveSet(iteration_limit=limit, time_limit=60.0)

@@ -20,7 +20,7 @@ def test_the_packages_own_solvers_pass(solver):
     check_qp_solver(solver)
 
 
-def test_the_packages_active_set_methods_pass_a_thousand_times_more_strictly():
+def test_our_solvers_pass_at_a_thousandth_of_the_tolerance():
     check_qp_solver(DualActiveSet(), tolerance=1e-9)
     check_qp_solver(PrimalActiveSet(), tolerance=1e-9)
 
@@ -102,7 +102,7 @@ def test_each_kind_of_liar_is_found_out(flaw, message):
         check_qp_solver(Liar(flaw))
 
 
-def test_a_solver_ends_with_any_status_but_those_of_what_made_the_program():
+def test_a_solver_ends_with_any_status_but_the_controllers_own():
     assert len(layout.STATUSES) == len(set(layout.STATUSES))
     assert set(layout.STATUSES) == set(Status) - {
         Status.INVALID_MEASUREMENT,

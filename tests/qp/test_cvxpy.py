@@ -11,14 +11,14 @@ from gpmpc.status import Status
 from tests.qp.problems import distance, feasible_problem
 
 
-def test_an_unknown_solver_is_refused_with_the_list_of_those_installed():
+def test_an_unknown_solver_is_refused_with_those_installed():
     with pytest.raises(
         ProblemError, match=r"no solver named 'GUROBIX'; it finds .*CLARABEL"
     ):
         CvxpySolver("GUROBIX")
 
 
-def test_importing_the_solvers_does_not_load_cvxpy_until_one_is_used():
+def test_cvxpy_is_loaded_only_when_it_is_used():
     code = """
 import sys
 import gpmpc.qp, gpmpc.testing
@@ -30,7 +30,7 @@ assert "cvxpy" in sys.modules
 
 
 @pytest.mark.parametrize("name", ["CLARABEL", "DAQP", "OSQP"])
-def test_several_solvers_behind_cvxpy_find_our_minimiser_and_multipliers(name, rng):
+def test_solvers_of_cvxpy_find_our_minimiser_and_multipliers(name, rng):
     options = (
         {"eps_abs": 1e-9, "eps_rel": 1e-9, "max_iter": 100000}
         if name == "OSQP"
@@ -46,7 +46,7 @@ def test_several_solvers_behind_cvxpy_find_our_minimiser_and_multipliers(name, r
         np.testing.assert_allclose(theirs.multipliers, ours.multipliers, atol=1e-4)
 
 
-def test_a_second_problem_of_the_same_shape_is_not_compiled_again(rng):
+def test_a_problem_of_the_same_shape_is_not_compiled_again(rng):
     solver = CvxpySolver()
     _compile.cache_clear()
     first = solver.solve(feasible_problem(rng, 8, 10))
@@ -68,7 +68,7 @@ def test_the_store_of_compiled_problems_stays_small():
     assert _compile.cache_info().currsize == 64
 
 
-def test_an_answer_that_its_residuals_do_not_bear_out_is_not_called_solved(rng):
+def test_an_answer_with_large_residuals_is_not_called_solved(rng):
     sloppy = CvxpySolver("OSQP", {"eps_abs": 1e-1, "eps_rel": 1e-1, "max_iter": 100000})
     problem = feasible_problem(rng, 10, 15)
     solution = sloppy.solve(problem)

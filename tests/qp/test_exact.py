@@ -158,7 +158,7 @@ def test_no_answer_of_two_thousand_is_wrong(family, solve):
         "degenerate",
     ],
 )
-def test_rows_at_prices_beyond_their_multipliers_have_the_exact_solution_of_hard_ones(
+def test_rows_priced_above_their_multipliers_are_exactly_hard(
     family,
 ):
     rng = np.random.default_rng([15, list(FAMILIES).index(family)])

@@ -19,9 +19,7 @@ PACKAGE = Path(__file__).resolve().parents[2] / "gpmpc"
 
 
 @pytest.mark.parametrize("mode", ["prepared", "changing"])
-def test_the_iteration_limit_returns_a_dual_iterate_from_which_the_next_solve_goes_on(
-    mode, rng
-):
+def test_a_solve_goes_on_from_the_iterate_at_the_limit(mode, rng):
     problem = feasible_problem(rng, 20, 30)
     full = DualActiveSet().solve(problem)
     assert full.iterations > 6
@@ -49,7 +47,7 @@ def test_the_iteration_limit_returns_a_dual_iterate_from_which_the_next_solve_go
 
 
 @pytest.mark.parametrize("mode", ["prepared", "changing"])
-def test_the_time_limit_stops_a_long_solve_and_does_not_touch_a_short_one(mode, rng):
+def test_the_time_limit_stops_a_long_solve_not_a_short_one(mode, rng):
     problem = feasible_problem(rng, 120, 300)
     full = DualActiveSet().solve(problem)
     assert full.iterations > 50
@@ -140,7 +138,7 @@ def copy_of_the_package(folder):
         target.write_text(source.read_text())
 
 
-def test_a_new_process_takes_its_kernels_from_the_cache_of_the_last_one():
+def test_a_new_process_takes_its_kernels_from_the_cache():
     DualActiveSet().prepare(
         np.eye(2)
     )  # fills the cache beside the source, unless it is there already
@@ -217,7 +215,7 @@ def test_vertices_where_many_rows_meet_are_found_without_cycling(mode, rng):
 
 
 @pytest.mark.parametrize("mode", ["prepared", "changing"])
-def test_rows_that_depend_on_each_other_but_for_rounding_are_no_obstacle(mode, rng):
+def test_rows_dependent_but_for_rounding_are_no_obstacle(mode, rng):
     """Two to six times as many rows as variables meet in a vertex.
 
     They span half of the space.

@@ -40,7 +40,7 @@ def near_dependent_problem(rng, feasible=True):
 @pytest.mark.parametrize("soft", [False, True])
 @pytest.mark.parametrize("feasible", [True, False])
 @pytest.mark.parametrize("mode", ["prepared", "changing"])
-def test_what_is_called_solved_is_optimal_and_what_is_called_infeasible_is(
+def test_solved_means_optimal_and_infeasible_means_infeasible(
     mode, feasible, soft, rng
 ):
     solver = DualActiveSet()
@@ -63,7 +63,7 @@ def test_what_is_called_solved_is_optimal_and_what_is_called_infeasible_is(
     assert solved > (200 if feasible or soft else 20)
 
 
-def test_a_multiplier_on_the_way_to_a_contradiction_is_taken_back(rng):
+def test_a_multiplier_towards_a_contradiction_is_reset(rng):
     """A multiplier of 2.6e10 was handed out with a row that missed others by 1e-9."""
     for _ in range(500):
         solution = DualActiveSet().solve(near_dependent_problem(rng))

@@ -29,7 +29,7 @@ def solve_in(mode, P, q, G, lower, upper):
 @pytest.mark.parametrize("mode", ["prepared", "changing", "primal"])
 @pytest.mark.parametrize("name", PROBLEMS)
 @pytest.mark.parametrize("rows", [0, 2])
-def test_a_minimiser_that_is_not_finite_is_never_called_a_solution(mode, name, rows):
+def test_a_non_finite_minimiser_is_never_called_a_solution(mode, name, rows):
     P, q = PROBLEMS[name]
     G = np.eye(rows, len(q))
     free = np.full(len(q) + rows, np.inf)
@@ -61,7 +61,7 @@ def test_one_overflowing_entry_is_seen_wherever_it_stands(size, mode):
         assert solution.status is Status.NUMERICAL_TROUBLE
 
 
-def test_a_proper_problem_that_the_kernel_refuses_is_not_answered_by_what_memory_held(
+def test_a_refused_problem_is_not_answered_from_stale_memory(
     monkeypatch,
 ):
     """A row whose norm overflows; zeros in memory read as SOLVED, with x = 0."""
@@ -79,7 +79,7 @@ def test_a_proper_problem_that_the_kernel_refuses_is_not_answered_by_what_memory
 
 
 @pytest.mark.parametrize("mode", ["prepared", "changing"])
-def test_a_row_whose_norm_overflows_is_not_taken_for_one_that_is_kept(mode):
+def test_a_row_whose_norm_overflows_is_not_taken_as_satisfied(mode):
     q = np.array([1.0, -2.0, 1.0])
     upper = np.array([np.inf, np.inf, np.inf, -1.0])
     solution = solve_in(

@@ -68,9 +68,7 @@ INDEFINITE = np.array([[1.0, 2.0], [2.0, 1.0]])  # eigenvalues -1 and 3
         ({"P": EYE, "q": [0, 0], "ub": [0.0, np.nan]}, "ub must not contain NaN"),
     ],
 )
-def test_a_malformed_problem_is_refused_with_the_rule_and_what_was_got(
-    arguments, message
-):
+def test_a_malformed_problem_is_refused_with_rule_and_value(arguments, message):
     with pytest.raises(ProblemError, match=message):
         QuadraticProgram(**arguments)
 
@@ -134,7 +132,7 @@ def test_a_bound_of_1e20_or_more_is_none(bound):
         assert not solution.multipliers.any()
 
 
-def test_lists_and_integers_are_converted_and_the_givers_arrays_stay_as_they_are():
+def test_lists_are_converted_and_the_callers_arrays_unchanged():
     P = [[2, 0], [0, 2]]
     G = np.asfortranarray([[1, 2], [3, 4]])
     problem = QuadraticProgram(P, [1, 1], G, h_upper=[1, 1])

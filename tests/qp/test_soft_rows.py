@@ -87,9 +87,7 @@ def test_soft_rows_solve_the_problem_written_out_with_slacks(solve, hard, n, m, 
 
 
 @DUAL
-def test_an_exact_penalty_above_the_multipliers_leaves_a_feasible_problem_as_it_is(
-    solve, rng
-):
+def test_a_large_exact_penalty_leaves_feasible_problems_alone(solve, rng):
     problem = feasible_problem(rng, 6, 9)
     hard = changing(problem, None)
     assert np.abs(hard.z).max() > 0.1
@@ -108,7 +106,7 @@ def test_rows_of_infinite_price_are_hard(solve, rng):
 
 
 @DUAL
-def test_rows_that_contradict_each_other_have_a_solution_once_they_are_soft(solve):
+def test_contradictory_rows_have_a_solution_once_soft(solve):
     G = np.array([[1.0, 1.0], [1.0, 1.0]])
     problem = QuadraticProgram(np.eye(2), np.zeros(2), G, [2.0, -np.inf], [np.inf, 1.0])
     assert DualActiveSet().solve(problem).status is Status.INFEASIBLE
@@ -128,7 +126,7 @@ def test_a_hard_box_stays_hard_however_dear_the_soft_rows(solve):
 
 
 @DUAL
-def test_soft_problems_in_a_row_have_the_same_answers_warm_and_cold(solve, rng):
+def test_a_sequence_of_soft_problems_is_the_same_warm_and_cold(solve, rng):
     n = 8
     m = 20
     problem = conflicting_problem(rng, n, m)
@@ -159,9 +157,7 @@ def test_soft_problems_in_a_row_have_the_same_answers_warm_and_cold(solve, rng):
 @DUAL
 @pytest.mark.parametrize("side", [-1.0, 1.0])
 @pytest.mark.parametrize("price", [0.5, 40.0])
-def test_a_multiplier_beyond_what_its_row_may_pay_is_a_dual_residual(
-    solve, side, price
-):
+def test_a_multiplier_above_its_rows_price_is_a_dual_residual(solve, side, price):
     """min 1/2 x^2 with the row |x| >= 100 at the price w a unit.
 
     X = w. At any other x the multiplier is no price.

@@ -32,9 +32,7 @@ def test_a_solution_parts_are_those_of_the_stacked_problem(solved):
 
 
 @pytest.mark.parametrize("sign", [-1.0, 1.0])
-def test_residuals_see_a_point_that_is_moved_and_multipliers_that_are_changed(
-    solved, rng, sign
-):
+def test_residuals_see_a_moved_point_and_changed_multipliers(solved, rng, sign):
     problem, solution = solved
     assert solution.is_optimal(1e-9)
     moved = make_solution(

@@ -80,7 +80,7 @@ def test_the_same_question_gets_the_same_bits(solve, rng):
         np.testing.assert_array_equal(first.multipliers, second.multipliers)
 
 
-def test_strided_fortran_read_only_and_integer_inputs_give_the_same_bits(rng):
+def test_memory_layout_and_integers_give_the_same_bits(rng):
     problem = feasible_problem(rng, 6, 9)
     P = problem.P
     q = np.round(problem.q)
@@ -131,9 +131,7 @@ def test_a_solution_is_a_copy_that_later_solves_leave_alone(solve, rng):
 
 
 @pytest.mark.parametrize(("n", "m"), [(1, 1), (6, 9), (20, 40)])
-def test_a_prepared_program_that_has_solved_others_gives_the_bits_of_a_new_one(
-    n, m, rng
-):
+def test_a_used_prepared_program_gives_the_bits_of_a_new_one(n, m, rng):
     """The factor of the working set comes with the guess, not from solver memory."""
     problem = feasible_problem(rng, n, m)
     used = DualActiveSet().prepare(problem.P, problem.G)

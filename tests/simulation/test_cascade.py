@@ -87,7 +87,7 @@ def test_each_loop_is_told_to_a_recorder_at_its_own_rate():
         assert np.array_equal([step.innovation for step in told[1:]], expected)
 
 
-def test_the_attitude_comes_to_where_the_outer_plan_points_the_thrust():
+def test_the_attitude_reaches_the_outer_plans_thrust_direction():
     flight = fly(Lorenz(), 8)
     ends = flight.states[18::20, 6:][
         :8
@@ -147,7 +147,7 @@ def test_without_any_measurement_for_a_moment_both_plans_go_on():
         fly(Elliptical(), 5, disturbances=[Dropout(2.0, 2.1)])
 
 
-def test_the_same_seed_gives_the_same_flight_and_every_inner_step_is_told():
+def test_a_seed_repeats_a_flight_and_inner_steps_are_reported():
     told = []
     first = fly(
         Elliptical(),

@@ -87,7 +87,7 @@ def test_states_follow_the_plant_from_what_acted():
     assert flight.iterations.tolist() == [5] * 30
 
 
-def test_the_same_seed_gives_the_same_numbers_and_another_one_others():
+def test_numbers_depend_on_the_seed_alone():
     noise = Noise(**ALL_NOISE)
     first = fly(noise=noise, seed=3)
     again = fly(noise=noise, seed=3)
@@ -150,7 +150,7 @@ def test_a_gust_acts_in_its_window_and_is_integrated():
     assert np.abs(np.delete(pushed, range(5, 10), axis=0)).max() == 0
 
 
-def test_a_gust_moves_the_next_state_of_a_plant_without_derivative():
+def test_a_gust_moves_a_plant_without_derivative():
     class InSteps:
         state_names = Cart.state_names
         input_names = Cart.input_names
@@ -185,7 +185,7 @@ def test_disturbances_add_up_in_their_order():
     assert np.allclose(flight.states[1], expected, atol=1e-14)
 
 
-def test_a_dropout_is_bridged_by_the_policy_counted_and_never_seen():
+def test_a_dropout_is_bridged_counted_and_never_seen():
     controller = Feedback()
     flight = fly(
         controller=controller,
@@ -212,7 +212,7 @@ def test_every_failure_is_counted_with_step_and_status():
     assert np.array_equal(flight.inputs[2], flight.inputs[1])
 
 
-def test_every_plan_that_leaves_the_data_behind_is_counted_with_its_step():
+def test_plans_that_leave_the_data_are_counted_by_step():
     class Astray(Feedback):
         def control(self, belief, reference, previous=None):
             return replace(

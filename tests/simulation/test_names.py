@@ -177,9 +177,7 @@ def test_a_control_loop_sorts_states_and_references_by_name(controller):
     assert np.array_equal(*between)
 
 
-def test_a_series_of_numbered_entries_and_one_without_a_model_of_names_keep_their_order(
-    model, controller
-):
+def test_numbered_entries_and_unnamed_models_keep_their_order(model, controller):
     plain = fly(controller).states
     assert np.array_equal(fly(controller, initial=pd.Series(NUMBERS)).states, plain)
     unknown = gp_mpc(replace(model, signals=Signals()))
@@ -247,7 +245,7 @@ def test_filters_sort_beliefs_inputs_and_measurements_by_name(model):
         filter.update(moved, pd.Series({"x": 0.3, "y": -0.5}))
 
 
-def test_beliefs_over_further_states_are_sorted_and_propagators_refuse_another_order(
+def test_beliefs_are_sorted_and_another_order_is_refused(
     model,
 ):
     belief = Gaussian.certain(NUMBERS)

@@ -225,7 +225,7 @@ def test_what_misses_a_bound_by_rounding_is_put_onto_it():
     assert not asked.failed
 
 
-def test_a_reference_that_is_not_finite_is_nothing_to_fall_back_on():
+def test_a_non_finite_reference_is_no_fallback():
     lost = Gaussian.certain(START * np.nan)
     reference = Reference(REFERENCES.states[: H + 1], np.full((H, 3), np.nan))
     with pytest.raises(SolverFailure, match="no reference input to fall back on"):

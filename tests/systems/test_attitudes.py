@@ -17,9 +17,7 @@ from gpmpc.trajectories import Elliptical, Hover, Lorenz, states_along
     "trajectory", [Elliptical(), Lorenz()], ids=["elliptical", "lorenz"]
 )
 @pytest.mark.parametrize("outer_step", [0.5, 1.0])
-def test_a_thrust_along_them_takes_the_velocity_from_one_reference_to_the_next(
-    trajectory, outer_step
-):
+def test_thrust_along_them_follows_the_reference_velocities(trajectory, outer_step):
     vehicle = Translational()
     plant = System(vehicle, outer_step, 1)
     states = states_along(trajectory, outer_step * np.arange(31))
@@ -35,7 +33,7 @@ def test_hovering_is_level():
     assert not rotational_states_along(Hover(), 50, 0.05).any()
 
 
-def test_an_attitude_is_approached_at_first_order_with_the_rate_that_belongs_to_it():
+def test_an_attitude_is_approached_with_its_rate_at_first_order():
     angles = np.array([[0.1, -0.2], [0.3, 0.0]])
     states = approach_attitudes(angles, 8, 4, 0.05, 0.1)
     assert np.array_equal(

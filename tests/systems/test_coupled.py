@@ -34,9 +34,7 @@ def test_the_attitude_turns_as_the_rotational_subsystem_does(rng):
 
 
 @pytest.mark.parametrize("mass", [0.74, 1.1])
-def test_an_attitude_held_for_a_thrust_direction_moves_it_as_the_translational_subsystem(
-    mass, rng
-):
+def test_a_held_attitude_moves_as_the_translational_subsystem(mass, rng):
     for _ in range(20):
         phi, theta, U1 = *rng.uniform(-1.2, 1.2, size=2), rng.uniform(1, 20)
         ux = np.cos(phi) * np.sin(theta)
@@ -55,7 +53,7 @@ def test_an_attitude_held_for_a_thrust_direction_moves_it_as_the_translational_s
         assert np.allclose(moved[:6], expected, atol=1e-9)
 
 
-def test_the_frozen_attitude_of_the_papers_data_is_this_plant_held_there(rng):
+def test_the_papers_frozen_attitude_is_this_plant_held_there(rng):
     x = np.zeros(12)
     U1 = 9.0
     x[:6] = rng.normal(size=6)

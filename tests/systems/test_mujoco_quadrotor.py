@@ -16,7 +16,7 @@ from gpmpc.systems import step
 from gpmpc.systems.mujoco_quadrotor import RigidBody, mujoco_quadrotor
 
 
-def test_states_and_positions_of_joints_are_those_of_one_attitude(rng):
+def test_states_and_joint_positions_are_of_one_attitude(rng):
     vehicle = mujoco_quadrotor().dynamics
     for _ in range(5):
         state = np.zeros(12)
@@ -58,7 +58,7 @@ def test_wind_pushes_by_drag_and_thrusts_may_act_late():
         mujoco_quadrotor(mass=0.0)
 
 
-def test_it_is_flown_from_the_command_line_on_top_of_its_data_sheet():
+def test_it_is_flown_from_the_command_line_on_its_data_sheet():
     with settings():
         chosen = experiment_of(
             compose("run", ["system=mujoco_quadrotor", "data.samples=60", "steps=60"])

@@ -75,14 +75,14 @@ def lagging(tmp_path):
 @pytest.mark.filterwarnings(
     "ignore:.*A Box observation space m.*imum value is -?infinity.*:UserWarning"
 )
-def test_our_systems_are_environments_that_pass_gymnasiums_checker(name):
+def test_our_systems_pass_gymnasiums_environment_checker(name):
     from gymnasium.utils.env_checker import check_env
 
     assert f"gpmpc/{name}-v0" in register_environments()
     check_env(gymnasium.make(f"gpmpc/{name}-v0").unwrapped, skip_render_check=True)
 
 
-def test_an_environment_of_ours_moves_as_its_system_and_ends_where_it_is_lost():
+def test_our_environment_moves_as_its_system_and_ends_when_lost():
     environment, system = make_environment("planar_quadrotor"), planar_quadrotor()
     state, _ = environment.reset(seed=0)
     assert np.array_equal(state, system.start)
@@ -103,7 +103,7 @@ def taken(**settings):
     return gymnasium_system("Pendulum-v1", goal=[1, 0, 0], **(names | settings))
 
 
-def test_an_environment_is_learned_and_swung_up_like_any_other_system():
+def test_an_environment_is_learned_and_swung_up_like_a_system():
     system = taken(units={"rate": "rad/s", "cosine": "1", "sine": "1"})
     assert (system.time_step, system.input_lower, system.input_upper) == (
         0.05,
@@ -153,7 +153,7 @@ class Pushing:
         )
 
 
-def test_where_an_environment_ends_its_episode_the_flight_ends_as_lost():
+def test_an_episode_that_ends_is_a_lost_flight():
     system = gymnasium_system(
         make_environment("double_integrator"), time_step=0.1, tracked=["x1"]
     )
@@ -166,9 +166,7 @@ def test_where_an_environment_ends_its_episode_the_flight_ends_as_lost():
         closed_loops(system, Pushing(), np.zeros((3, 2)), None, 2, seeds=2)
 
 
-def test_a_mujoco_model_moves_alike_by_joints_and_by_sensors_one_or_many_at_a_time(
-    cart, rng
-):
+def test_mujoco_joints_and_sensors_agree_for_one_and_for_many(cart, rng):
     joints = mujoco_system(cart, ["push"], joints=["slider", "hinge"], substeps=4)
     sensors = mujoco_system(
         cart, ["push"], sensors=["position", "angle", "velocity", "rate"], substeps=4

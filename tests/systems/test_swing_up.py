@@ -58,7 +58,7 @@ def test_an_acrobot_swings_up_by_its_elbow_alone():
     assert error < 0.2
 
 
-def test_the_papers_protocol_sees_angles_as_they_are_and_a_users_own_may_be_named():
+def test_the_papers_protocol_keeps_angles_which_can_be_set():
     chosen = experiment(
         "system=pendulum", "model=exact_gp", "model.restarts=0", "data.samples=12"
     )

@@ -121,9 +121,7 @@ def test_without_input_and_friction_energy_is_conserved(system, start):
 
 
 @pytest.mark.parametrize(("actuated", "joint"), [("shoulder", 1), ("elbow", 3)])
-def test_a_motor_of_the_double_pendulum_adds_torque_times_rate_of_its_joint_to_the_energy(
-    actuated, joint
-):
+def test_a_motor_adds_torque_times_joint_rate_to_the_energy(actuated, joint):
     system = double_pendulum(actuated)
     state = np.array([2.0, 1.0, 0.5, -1.0])
     torque = np.array([1.5])
@@ -145,7 +143,7 @@ def test_the_reactors_operating_point_is_an_unstable_equilibrium():
     assert abs(state[1] - 350) > 5
 
 
-def test_a_trajectory_prescribes_the_tracked_states_and_their_rates():
+def test_a_trajectory_gives_the_tracked_states_and_their_rates():
     moving = Waypoints([0.0, 1.0], [[0.0], [1.0]])
     states = double_integrator(time_step=0.1).reference_states(moving, 11)
     assert np.array_equal(states[:, 0], moving(np.linspace(0, 1, 11))[:, 0])
