@@ -14,10 +14,8 @@ from gpmpc.gaussian import Gaussian
 from gpmpc.gp import Trainer, Transitions
 from gpmpc.gp.casadi_ import successor_function
 from gpmpc.models import Affine, KnownModel, ResidualModel
-from gpmpc.mpc import Reference
+from gpmpc.mpc import GPMPC, Inequality, LeastSquares, Problem, Reference, Tracking
 from gpmpc.mpc.baselines import NMPC
-from gpmpc.mpc.gp_mpc import GPMPC
-from gpmpc.mpc.problem import Inequality, LeastSquares, Problem, Tracking
 from gpmpc.propagation import Linearization
 from gpmpc.systems import System, step, step_many
 

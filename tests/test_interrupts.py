@@ -10,9 +10,8 @@ import torch
 
 from gpmpc._interrupts import interrupts_after
 from gpmpc.gaussian import Gaussian
-from gpmpc.mpc import Reference
+from gpmpc.mpc import Problem, Reference, Tracking
 from gpmpc.mpc.baselines import NMPC
-from gpmpc.mpc.problem import Problem, Tracking
 from gpmpc.systems import System, Translational
 
 

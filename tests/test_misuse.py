@@ -13,10 +13,17 @@ from gpmpc.exceptions import DataError, GpmpcError, SettingError, ShapeError
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior, Trainer, Transitions, append_points, train
 from gpmpc.models import Affine, DelayedModel, Lags, ResidualModel
-from gpmpc.mpc import ControlLoop, Reference
+from gpmpc.mpc import (
+    GPMPC,
+    Box,
+    ControlLoop,
+    LeastSquares,
+    NonlinearGPMPC,
+    Problem,
+    Reference,
+    Tracking,
+)
 from gpmpc.mpc.baselines import StateFormMPC
-from gpmpc.mpc.gp_mpc import GPMPC, NonlinearGPMPC
-from gpmpc.mpc.problem import Box, LeastSquares, Problem, Tracking
 from gpmpc.propagation import Linearization, MomentMatching, rollout
 from gpmpc.qp import DualActiveSet
 from gpmpc.simulation import Gust, ModelLoop, Noise, closed_loop, closed_loops

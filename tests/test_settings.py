@@ -8,10 +8,8 @@ import pytest
 from gpmpc import datasets
 from gpmpc.datasets import Excitation
 from gpmpc.exceptions import SettingError
-from gpmpc.mpc import PredictionSettings
+from gpmpc.mpc import GPMPC, PredictionSettings, Problem, Tracking
 from gpmpc.mpc.baselines import NMPC
-from gpmpc.mpc.gp_mpc import GPMPC
-from gpmpc.mpc.problem import Problem, Tracking
 from gpmpc.propagation import Linearization
 from gpmpc.simulation import Cascade, Dropout, Gust
 from gpmpc.systems import Coupled, Map, Rotational, System, Translational

@@ -13,8 +13,7 @@ from gpmpc.learning import (
     OnlineLearning,
     learn_from_step,
 )
-from gpmpc.mpc import ControlLoop, Reference
-from gpmpc.mpc.gp_mpc import GPMPC
+from gpmpc.mpc import GPMPC, ControlLoop, Reference
 from gpmpc.propagation import Linearization
 from gpmpc.status import Status
 from tests.learning.test_online import MODEL, NOISE, PROBLEM, STEP, cart

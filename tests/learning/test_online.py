@@ -18,9 +18,7 @@ from gpmpc.learning import (
     learn_from_step,
 )
 from gpmpc.models import Affine, ResidualModel
-from gpmpc.mpc import ControlLoop, Reference
-from gpmpc.mpc.gp_mpc import GPMPC
-from gpmpc.mpc.problem import Box, Problem, Tracking
+from gpmpc.mpc import GPMPC, Box, ControlLoop, Problem, Reference, Tracking
 from gpmpc.propagation import Linearization
 from gpmpc.testing import check_model
 

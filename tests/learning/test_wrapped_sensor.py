@@ -6,9 +6,7 @@ import pytest
 from gpmpc.gp import Trainer, Transitions
 from gpmpc.learning import ChangedModel, EpisodicLearning, LearningController
 from gpmpc.models import Affine, ResidualModel
-from gpmpc.mpc import ControlLoop, PredictionSettings
-from gpmpc.mpc.gp_mpc import GPMPC
-from gpmpc.mpc.problem import Box, Problem, Tracking
+from gpmpc.mpc import GPMPC, Box, ControlLoop, PredictionSettings, Problem, Tracking
 from gpmpc.propagation import Linearization
 from gpmpc.simulation import ModelLoop, closed_loop
 from gpmpc.systems import System

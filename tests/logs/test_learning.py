@@ -11,6 +11,7 @@ import pytest
 
 from gpmpc.exceptions import DataError, SettingError, ShapeError
 from gpmpc.logs import (
+    Log,
     LogMapping,
     fit_nominal,
     judge,
@@ -19,7 +20,7 @@ from gpmpc.logs import (
     read_log,
     save_learned,
 )
-from gpmpc.logs._log import Log, LogRun
+from gpmpc.logs._log import LogRun
 from gpmpc.logs._noise import error_variances, follow_errors
 from gpmpc.logs._output_gps import choose_rows, train_output_gp
 from gpmpc.models import LogModel, MultirotorNominal, RigidBodyKinematics

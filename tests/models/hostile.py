@@ -28,9 +28,8 @@ from gpmpc import systems
 from gpmpc.exceptions import DataError, SettingError
 from gpmpc.gp import _storage
 from gpmpc.gp.casadi_ import successor_function
-from gpmpc.logs import IdentifiedModel, load_flyable, load_learned
+from gpmpc.logs import IdentifiedModel, load_flyable, load_learned, save_learned
 from gpmpc.logs._fitting import NominalFit
-from gpmpc.logs._storage import save_learned
 from gpmpc.logs._structures import Candidate
 from gpmpc.models import (
     CasadiFunction,

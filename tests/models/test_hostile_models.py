@@ -304,7 +304,7 @@ def test_a_long_tape_becomes_a_function_in_linear_time():
 
 
 def test_a_log_model_that_does_not_fit_together_is_refused(tmp_path):
-    from gpmpc.logs._storage import save_learned
+    from gpmpc.logs import save_learned
     from tests.models.hostile import of_a_quadrotor_log
 
     path = tmp_path / "m.safetensors"

@@ -5,8 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from gpmpc.mpc import Timing
-from gpmpc.mpc.problem import Box
+from gpmpc.mpc import Box, Timing
 from gpmpc.simulation import Rollout
 from gpmpc.status import Status
 from gpmpc.studies._run_folder import PLAN, RunFolder, folder_name, record

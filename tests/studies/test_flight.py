@@ -13,10 +13,8 @@ from gpmpc.cli._experiment import experiment_of
 from gpmpc.datasets import Excitation, ExcitedData
 from gpmpc.exceptions import Diverged, SettingError
 from gpmpc.gp import Trainer, Transitions
-from gpmpc.mpc import Decision, Timing
+from gpmpc.mpc import GPMPC, Box, Decision, Problem, Timing, Tracking
 from gpmpc.mpc.baselines import NMPC
-from gpmpc.mpc.gp_mpc import GPMPC
-from gpmpc.mpc.problem import Box, Problem, Tracking
 from gpmpc.propagation import Linearization
 from gpmpc.simulation import Noise
 from gpmpc.status import Status

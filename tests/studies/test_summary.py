@@ -8,8 +8,7 @@ import pytest
 from rich.console import Console
 
 from gpmpc.exceptions import Diverged
-from gpmpc.mpc import FlightJudgement, Judgement, Timing
-from gpmpc.mpc.problem import Box, Halfspaces, Inequality
+from gpmpc.mpc import Box, FlightJudgement, Halfspaces, Inequality, Judgement, Timing
 from gpmpc.simulation import Rollout
 from gpmpc.status import Status
 from gpmpc.studies._document import terminal

@@ -3,7 +3,7 @@
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-from gpmpc.plotting._sweeps import Series, over_variable
+from gpmpc.plotting import Series, over_variable
 
 
 @pytest.mark.parametrize(

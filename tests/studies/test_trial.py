@@ -11,8 +11,7 @@ import torch
 from gpmpc.exceptions import Diverged, SettingError, ShapeError
 from gpmpc.gp import Transitions
 from gpmpc.learning import EpisodicLearning, OnlineLearning
-from gpmpc.mpc import PredictionSettings
-from gpmpc.mpc.problem import Problem, Tracking
+from gpmpc.mpc import PredictionSettings, Problem, Tracking
 from gpmpc.simulation import ModelLoop, Noise
 from gpmpc.studies import _experiment, _flight
 from gpmpc.studies.flight import Experiment, Flown, run_trial
