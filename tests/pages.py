@@ -1,4 +1,5 @@
-"""Follows a page of the documentation as a reader would: writes its files, runs its Python and commands in order."""
+"""Follows a page of the documentation as a reader would: writes its files, runs its
+Python and commands in order."""
 
 import re
 import shlex
@@ -22,7 +23,8 @@ def read(path):
 def follow(path, folder, given="", section=""):
     """Does what a page, or what follows a heading of it, says in a folder.
 
-    Where Python is given that its blocks build upon, its commands are not run; a block with ", ...)" is an excerpt.
+    Where Python is given that its blocks build upon, its commands are not run; a block
+    with ", ...)" is an excerpt.
 
     Returns:
         The names that its Python leaves, and what each command printed.

@@ -14,7 +14,8 @@ HORIZON = 5
 
 
 def flight(folder, failed=()):
-    """Along x and back in y, a plan of five steps ahead at every step; a failed solve's plan is anywhere."""
+    """Along x and back in y, a plan of five steps ahead at every step; a failed solve's
+    plan is anywhere."""
     record_run(folder / "run.mcap", STEPS)
     run = read_run(folder / "run.mcap")
     along = np.zeros((STEPS + HORIZON, len(run.state_names)))

@@ -1,4 +1,5 @@
-"""The house keeps its shape: layers look downwards, and importing a module loads no library it does not need."""
+"""The house keeps its shape: layers look downwards, and importing a module loads no
+library it does not need."""
 
 import re
 import subprocess
@@ -11,7 +12,8 @@ ROOT = Path(__file__).resolve().parents[1]
 
 
 def test_every_import_contract_is_kept():
-    # In a process of its own: the linter's logging configuration silences every logger that exists.
+    # In a process of its own: the linter's logging configuration silences every logger
+    # that exists.
     code = "from importlinter.cli import lint_imports; raise SystemExit(lint_imports(no_cache=True))"
     linted = subprocess.run(
         [sys.executable, "-c", code],

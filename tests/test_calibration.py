@@ -1,4 +1,5 @@
-"""Calibration of predictions many steps ahead: right on systems whose uncertainty is known, telling on wrong ones."""
+"""Calibration of predictions many steps ahead: right on systems whose uncertainty is
+known, telling on wrong ones."""
 
 import io
 import math
@@ -54,7 +55,8 @@ noiseless = partial(LinearGaussian, noise_covariance=0 * NOISE)
 
 
 def runs(count, steps, noisy=True):
-    """Runs whose first state is known exactly and whose others are measured: one start each would be exact."""
+    """Runs whose first state is known exactly and whose others are measured: one start
+    each would be exact."""
     recordings = []
     for _ in range(count):
         states = [torch.randn(2)]

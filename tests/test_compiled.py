@@ -1,4 +1,5 @@
-"""What is compiled once is used again, until a source that it was compiled from has changed."""
+"""What is compiled once is used again, until a source that it was compiled from has
+changed."""
 
 import os
 import subprocess
@@ -33,7 +34,8 @@ def double(x):
 
 @pytest.fixture
 def package(tmp_path):
-    """A package of a kernel, the function that it calls, the constant which that reads, and a file of no concern."""
+    """A package of a kernel, the function that it calls, the constant which that reads,
+    and a file of no concern."""
     folder = tmp_path / "tiny"
     folder.mkdir()
     texts = {
@@ -49,7 +51,8 @@ def package(tmp_path):
 
 
 def run(package, **environment):
-    """The kernel's answer to 1 in a new process, and whether its machine code was there already."""
+    """The kernel's answer to 1 in a new process, and whether its machine code was there
+    already."""
     result = subprocess.run(
         [sys.executable, "-B", "-c", "import tiny.other, tiny.kernel"], capture_output=True, text=True, check=True,
         env=os.environ | {"PYTHONPATH": f"{package.parent}{os.pathsep}{ROOT}"} | environment,
@@ -114,7 +117,8 @@ def second(x):
 def test_a_kernel_runs_its_own_copy_of_what_it_calls_whatever_was_loaded_or_compiled_before(
     tmp_path,
 ):
-    """Copies of one function differ by rounding; here by a factor, so that it is seen on any machine."""
+    """Copies of one function differ by rounding; here by a factor, so that it is seen
+    on any machine."""
     (tmp_path / "own.py").write_text(OWN)
 
     def run(factor, code):
@@ -178,7 +182,8 @@ def test_the_stamp_of_a_kernel_covers_constants_and_callees_and_spares_the_rest(
 
 
 def test_numba_still_has_the_private_parts_that_are_used_here():
-    """Where one has moved, see ``gpmpc._compiled``: kernels compile for longer, and edits of other files go unseen."""
+    """Where one has moved, see ``gpmpc._compiled``: kernels compile for longer, and
+    edits of other files go unseen."""
     from numba.core.codegen import JITCodeLibrary
     from numba.core.compiler import Compiler
     from numba.core.cpu import CPUTargetOptions

@@ -1,4 +1,5 @@
-"""The documentation holds: its blocks run in an empty folder, its links lead somewhere, its pages are short.
+"""The documentation holds: its blocks run in an empty folder, its links lead somewhere,
+its pages are short.
 
 ``tests/test_guides.py`` and ``tests/logs`` follow the guides.
 """
@@ -205,7 +206,8 @@ def test_no_page_is_long_and_every_page_is_in_the_site():
 
 
 def public(module):
-    """The names that a module offers: those of ``__all__``, else the classes and functions that it defines."""
+    """The names that a module offers: those of ``__all__``, else the classes and
+    functions that it defines."""
     names = getattr(module, "__all__", None)
     if names is None:
         names = [

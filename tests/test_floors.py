@@ -1,4 +1,5 @@
-"""The lowest versions that are promised are those that ``make floors`` installs and tries."""
+"""The lowest versions that are promised are those that ``make floors`` installs and
+tries."""
 
 import re
 import runpy
@@ -81,8 +82,9 @@ def test_the_smoke_tests_are_there_and_the_workflow_runs_them():
 def test_no_floor_is_one_with_which_a_command_was_seen_to_fail():
     """Seen with older ones.
 
-    foxglove-sdk 0.23 has no ``MCAPWriter.flush``, numpy 2.1 saves a keyword as an array,
-    and rich 14.0 refuses a status within a progress bar, which ``gpmpc tune`` shows.
+    foxglove-sdk 0.23 has no ``MCAPWriter.flush``, numpy 2.1 saves a keyword as an
+    array, and rich 14.0 refuses a status within a progress bar, which ``gpmpc tune``
+    shows.
     """
     lowest = TOOL["floors"](
         TOOL["tomllib"].loads((ROOT / "pyproject.toml").read_text())

@@ -1,4 +1,5 @@
-"""What the guides show runs as it stands: files are written, Python runs in order, commands succeed."""
+"""What the guides show runs as it stands: files are written, Python runs in order,
+commands succeed."""
 
 import shlex
 

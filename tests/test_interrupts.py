@@ -1,4 +1,5 @@
-"""A Ctrl-C that CasADi would keep to itself reaches the command, and the solve that it met has ended."""
+"""A Ctrl-C that CasADi would keep to itself reaches the command, and the solve that it
+met has ended."""
 
 import os
 import signal

@@ -1,4 +1,5 @@
-"""Whoever imports a module on its own and mixes up types or shapes is told the rule and what was got, at once."""
+"""Whoever imports a module on its own and mixes up types or shapes is told the rule and
+what was got, at once."""
 
 from functools import partial
 

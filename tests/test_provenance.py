@@ -1,4 +1,5 @@
-"""A result is named by the code that made it: one fingerprint, wherever that code lies and whenever it was written."""
+"""A result is named by the code that made it: one fingerprint, wherever that code lies
+and whenever it was written."""
 
 import os
 import shutil

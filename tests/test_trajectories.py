@@ -25,7 +25,8 @@ def test_the_velocity_is_the_derivative_of_the_position(trajectory):
     step = 1e-6
     numeric = (trajectory(times + step) - trajectory(times - step)) / (2 * step)
     scale = 1 + np.abs(numeric).max()
-    # Lorenz: the dense output of an integration at tolerance 1e-3 obeys the equation to about that.
+    # Lorenz: the dense output of an integration at tolerance 1e-3 obeys the equation to
+    # about that.
     assert (
         np.abs(trajectory.velocity(times) - numeric).max()
         < (2e-3 if isinstance(trajectory, Lorenz) else 1e-7) * scale
@@ -114,7 +115,8 @@ def test_lorenz_by_default_is_the_papers_with_its_second_axis_turned():
 def test_lorenz_passes_the_ends_of_the_accepted_steps_whatever_the_samples_between_them(
     samples,
 ):
-    """Of K samples a step, every K-th is the end of one: the same points of the same integration."""
+    """Of K samples a step, every K-th is the end of one: the same points of the same
+    integration."""
     ends = Lorenz(samples_per_step=samples, duration=40.0)(samples * np.arange(10.0))
     assert np.allclose(
         ends, Lorenz(samples_per_step=4, duration=40.0)(4.0 * np.arange(10)), rtol=1e-12

@@ -1,4 +1,5 @@
-"""The command as a user calls it, and the same from a process that is a copy of one which has imported everything."""
+"""The command as a user calls it, and the same from a process that is a copy of one
+which has imported everything."""
 
 import multiprocessing
 import os
@@ -44,9 +45,11 @@ def gpmpc(*arguments, cwd, **environment):
 
 
 def forked(*arguments, cwd, **environment):
-    """The same in a copy of a process that has imported everything, which takes seconds: for what asks no more.
+    """The same in a copy of a process that has imported everything, which takes
+    seconds: for what asks no more.
 
-    It is the command's entry point with a process, a folder, arguments and streams of its own.
+    It is the command's entry point with a process, a folder, arguments and streams of
+    its own.
     """
     with tempfile.TemporaryDirectory() as folder:
         streams = [Path(folder) / name for name in ("out", "err")]

@@ -1,4 +1,5 @@
-"""The command line as a user meets it: help, results, and one clear line for every mistake."""
+"""The command line as a user meets it: help, results, and one clear line for every
+mistake."""
 
 import json
 from pathlib import Path

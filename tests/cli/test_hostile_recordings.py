@@ -374,7 +374,8 @@ def test_a_recording_and_its_settings_must_be_of_one_system():
         experiment_of_run(run_of(found), [])
 
 
-# The twelve hostile files: six recordings of above, six models of tests/models/test_hostile_models.py.
+# The twelve hostile files: six recordings of above, six models of
+# tests/models/test_hostile_models.py.
 
 WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND
 ACTING = (
@@ -406,7 +407,8 @@ class Watch:
 
 
 def read_hostile(folder, told):
-    """Reads every file of a folder under a watch, and writes what was said and what happened."""
+    """Reads every file of a folder under a watch, and writes what was said and what
+    happened."""
     os.chdir(folder)
     sys.path.insert(0, str(folder))  # the worst case: what a file names can be imported
     from gpmpc.logs import load_flyable

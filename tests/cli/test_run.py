@@ -1,4 +1,5 @@
-"""What one flight tells: that it was lost, that it waits for a compiler, and how well it foresaw itself."""
+"""What one flight tells: that it was lost, that it waits for a compiler, and how well
+it foresaw itself."""
 
 import argparse
 import json
@@ -158,7 +159,8 @@ def test_the_band_of_the_figure_holds_as_many_positions_as_two_deviations_promis
     run = read_run(next(tmp_path.glob("tree/*/run.mcap")))
     mean, std = expected(run, [0, 2, 4])
     inside = np.abs(run.states[:, ::2] - mean)[1:] <= 2 * std[1:]
-    # 447 draws of 95.45 % and four standard errors; the learned noise is uncertain by a twentieth.
+    # 447 draws of 95.45 % and four standard errors; the learned noise is uncertain by a
+    # twentieth.
     assert 0.90 < inside.mean() < 0.99
 
 

@@ -1,4 +1,5 @@
-"""One flight and many of them, as a user meets them: results, resumption, and one clear line for every mistake."""
+"""One flight and many of them, as a user meets them: results, resumption, and one clear
+line for every mistake."""
 
 import importlib.util
 import json

@@ -1,4 +1,5 @@
-"""What surrounds a command: pipes, full disks, folders that are gone, Ctrl-C, TAB, and where help is looked for."""
+"""What surrounds a command: pipes, full disks, folders that are gone, Ctrl-C, TAB, and
+where help is looked for."""
 
 import fcntl
 import json
@@ -453,7 +454,8 @@ def _kill_and_wait_for_the_pipe(command, cwd, begun, ended_by):
     parent = subprocess.Popen(
         command, cwd=cwd, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, start_new_session=True,
         env=os.environ | {"PYTHONPATH": path},
-        preexec_fn=lambda: signal.signal(signal.SIGHUP, signal.SIG_DFL),  # which nohup sets to be ignored
+        # which nohup sets to be ignored
+        preexec_fn=lambda: signal.signal(signal.SIGHUP, signal.SIG_DFL),
     )  # fmt: skip
     try:
         deadline = time.monotonic() + SECONDS
@@ -471,7 +473,8 @@ def _kill_and_wait_for_the_pipe(command, cwd, begun, ended_by):
 
 
 def test_ctrl_c_in_a_terminal_reaches_no_worker_while_it_starts(tmp_path):
-    """Workers that are still importing would print their tracebacks between the lines of the parent."""
+    """Workers that are still importing would print their tracebacks between the lines
+    of the parent."""
     starting = "import os, signal\nif __name__ == '__mp_main__':\n    os.kill(os.getpid(), signal.SIGINT)\n"
     (tmp_path / "pool.py").write_text(
         f"{starting}{POOL.replace('time.sleep(120)', 'pass')}"

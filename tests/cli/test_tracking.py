@@ -19,7 +19,8 @@ RESULT = {
 
 
 class Store(types.ModuleType):
-    """Takes what MLflow's functions of these names take, and holds it to MLflow's documented limits."""
+    """Takes what MLflow's functions of these names take, and holds it to MLflow's
+    documented limits."""
 
     def __init__(self):
         super().__init__("mlflow")

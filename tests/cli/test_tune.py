@@ -1,4 +1,5 @@
-"""``gpmpc tune`` as a user meets it: the command that flies the best one, resumption, one line for a mistake."""
+"""``gpmpc tune`` as a user meets it: the command that flies the best one, resumption,
+one line for a mistake."""
 
 import json
 import re

@@ -1,4 +1,5 @@
-"""Two groups of runs held against each other: the statistics are those of independent implementations."""
+"""Two groups of runs held against each other: the statistics are those of independent
+implementations."""
 
 from dataclasses import replace
 from itertools import product
@@ -32,7 +33,8 @@ def fly(tree, controller, seed, error, **more):
 
 
 def compared(tree, first, second):
-    """The comparison of the errors of LQR with those of the convex controller, a pair a seed."""
+    """The comparison of the errors of LQR with those of the convex controller, a pair a
+    seed."""
     for seed, errors in enumerate(zip(first, second, strict=True)):
         for controller, error in zip(("lqr", "convex"), errors, strict=True):
             fly(tree, controller, seed, error)
@@ -53,7 +55,8 @@ def test_the_statistics_of_pairs_are_those_of_scipy_and_of_their_definitions(
     assert ours.interval == pytest.approx(tuple(theirs.confidence_interval(0.95)))
     assert ours.t_test == pytest.approx(theirs.pvalue)
     assert ours.standardised == pytest.approx(theirs.statistic / np.sqrt(pairs))
-    # The exact null distribution of the signed ranks: every sign of every rank is as likely as the other.
+    # The exact null distribution of the signed ranks: every sign of every rank is as
+    # likely as the other.
     ranks = 1 + np.argsort(np.argsort(np.abs(a - b)))
     signed = np.sign(a - b) @ ranks
     assert ours.rank_biserial == pytest.approx(signed / ranks.sum())
@@ -78,7 +81,8 @@ def test_swapped_groups_turn_the_signs_and_keep_the_tests(tmp_path, rng):
 
 
 def test_a_verdict_is_given_below_five_percent_and_not_above(tmp_path):
-    """Of six pairs p is 2 / 64 where all agree, and 4 / 64 where the smallest difference contradicts the others."""
+    """Of six pairs p is 2 / 64 where all agree, and 4 / 64 where the smallest
+    difference contradicts the others."""
     sizes = np.array([1, 2, 3, 4, 5, 6]) * 1e-3
     found = compared(tmp_path / "agree", 0.2 + sizes, np.full(6, 0.2))
     assert (found.wilcoxon, found.verdict) == (

@@ -1,4 +1,5 @@
-"""One small document, written out in every format: nothing is lost, doubled or out of its place."""
+"""One small document, written out in every format: nothing is lost, doubled or out of
+its place."""
 
 import io
 

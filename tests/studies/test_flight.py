@@ -38,7 +38,8 @@ ON_THE_PLANT = partial(NMPC, problem=PROBLEM, horizon=2, initial_input=HOVER)
 
 
 class Blind:
-    """Applies a law of the state, whatever it is asked for; a call takes the seconds that ``seconds`` gives."""
+    """Applies a law of the state, whatever it is asked for; a call takes the seconds
+    that ``seconds`` gives."""
 
     horizon = 1
     problem = replace(PROBLEM, inputs=Box())

@@ -1,4 +1,5 @@
-"""A kernel is changed in a copy of the package: what was computed before is not shown as what that code computes."""
+"""A kernel is changed in a copy of the package: what was computed before is not shown
+as what that code computes."""
 
 import json
 import os

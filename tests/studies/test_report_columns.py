@@ -1,4 +1,5 @@
-"""A measure that is zero in every run takes no column where there is little room, and one where it is not."""
+"""A measure that is zero in every run takes no column where there is little room, and
+one where it is not."""
 
 import pytest
 from rich.console import Console

@@ -1,4 +1,5 @@
-"""A tree with damaged runs, lost flights and whatever a user wrote: every document is written, and none obeys."""
+"""A tree with damaged runs, lost flights and whatever a user wrote: every document is
+written, and none obeys."""
 
 import csv
 import io

@@ -1,4 +1,5 @@
-"""Folders of runs have names of their own, and in what two runs were asked differently is said in words."""
+"""Folders of runs have names of their own, and in what two runs were asked differently
+is said in words."""
 
 import json
 from itertools import combinations

@@ -1,4 +1,5 @@
-"""A study keeps each record when it is there and runs what is missing; its seeds and names follow from settings."""
+"""A study keeps each record when it is there and runs what is missing; its seeds and
+names follow from settings."""
 
 import json
 import os
@@ -66,7 +67,8 @@ def fail(trial):
 
 @pytest.fixture
 def started(monkeypatch):
-    """Trials in the order of their start, in this process; they finish in the opposite order."""
+    """Trials in the order of their start, in this process; they finish in the opposite
+    order."""
     started = []
 
     def in_processes(function, jobs, workers):

@@ -167,7 +167,8 @@ def test_a_state_at_which_a_constraint_is_no_number_does_not_keep_it():
 
 
 def rollout_of(errors, **changes):
-    """A flight of ``PLANT`` so far from its reference along x, y and z [m], each row a state."""
+    """A flight of ``PLANT`` so far from its reference along x, y and z [m], each row a
+    state."""
     errors = np.array(errors, dtype=float)
     n = 6
     steps = len(errors) - 1

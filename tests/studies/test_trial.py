@@ -1,4 +1,5 @@
-"""A trial is put together from its experiment: what is learned from, what flies, and from where."""
+"""A trial is put together from its experiment: what is learned from, what flies, and
+from where."""
 
 from dataclasses import replace
 from functools import partial
