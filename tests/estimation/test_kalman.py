@@ -238,7 +238,8 @@ def test_a_flight_across_half_a_turn_is_estimated_as_any_other():
 
 
 def exact_update(P, H, R, mean, y):
-    """Mean and covariance given measurements of independent noise, in rational numbers."""
+    """Mean and covariance given measurements of independent noise, in rational
+    numbers."""
     P, H, mean, y, R = (
         np.vectorize(Fraction, otypes=[object])(np.asarray(part, dtype=float))
         for part in (P, H, mean, y, R)

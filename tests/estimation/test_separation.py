@@ -1,4 +1,5 @@
-"""Noise of the process and of the sensors, told apart on motions whose noise is known."""
+"""Noise of the process and of the sensors, told apart on motions whose noise is
+known."""
 
 from functools import partial
 

@@ -194,7 +194,8 @@ def a_huge_shape(members, rng):
             (1,) * 70,
         ]
     )
-    header = f"{{'descr': '{rng.choice(['<f8', '<f4', '|i1'])}', 'fortran_order': False, 'shape': {shape}, }}"
+    dtype = rng.choice(["<f8", "<f4", "|i1"])
+    header = f"{{'descr': '{dtype}', 'fortran_order': False, 'shape': {shape}, }}"
     version, length = rng.choice([(b"\x01\x00", 2), (b"\x02\x00", 4), (b"\x03\x00", 4)])
     members[name] = (
         b"\x93NUMPY"
@@ -428,7 +429,8 @@ def main(kind, count, seed):
     print(
         kind,
         dict(said),
-        f"slowest {slowest:.2f} s, grown by {grown / 1024:.0f} MB at most (the damaging itself too)",
+        f"slowest {slowest:.2f} s, grown by {grown / 1024:.0f} MB at most "
+        "(the damaging itself too)",
     )
 
 

@@ -67,7 +67,8 @@ def test_what_only_looks_like_numbers_is_refused(column, compressed, tmp_path):
     (np.savez_compressed if compressed else np.savez)(path, **arrays(inputs=column))
     with pytest.raises(
         DataError,
-        match=r"data\.npz: (inputs must be numbers|not a readable .npz file of transitions)",
+        match=r"data\.npz: (inputs must be numbers|not a readable .npz file of "
+        r"transitions)",
     ):
         Transitions.load(path)
     with pytest.raises(
@@ -122,7 +123,8 @@ def test_an_array_that_declares_more_than_it_holds_is_refused(tmp_path):
             )
     with pytest.raises(
         DataError,
-        match=r"data\.npz: not a readable .npz file of transitions \(states.npy is an array of shape",
+        match=r"data\.npz: not a readable .npz file of transitions \(states.npy is an "
+        r"array of shape",
     ):
         Transitions.load(path)
 

@@ -1,4 +1,5 @@
-"""Freezing trained GPyTorch models: SE-ARD ones, sparse ones, and those of any kernel."""
+"""Freezing trained GPyTorch models: SE-ARD ones, sparse ones, and those of any
+kernel."""
 
 import gpytorch
 import pytest

@@ -68,6 +68,9 @@ def test_a_training_too_large_is_refused_with_points_that_fit(
     with pytest.raises(DataError, match="train on 999 points or fewer"):
         _memory.check_memory(1000, 2)
     monkeypatch.setattr(_memory, "available_memory", lambda: 2**30)
-    message = "exact GPs of 20000 points and 3 outputs need 14.9 GiB, 2.98 GiB a kernel matrix; 1 GiB are available: "
+    message = (
+        "exact GPs of 20000 points and 3 outputs need 14.9 GiB, 2.98 GiB a kernel "
+        "matrix; 1 GiB are available: "
+    )
     with pytest.raises(DataError, match=f"{message}train on 5181 points or fewer"):
         _memory.check_memory(20_000, 3)

@@ -38,7 +38,8 @@ def posterior(data, noise=1e-2):
 
 
 def divergence_over_functions(one, other, points):
-    """KL(one || other) of the posteriors of f at the points, summed over the outputs."""
+    """KL(one || other) of the posteriors of f at the points, summed over the
+    outputs."""
     total = 0.0
     for a in range(one.output_dim):
         belief = []

@@ -150,8 +150,10 @@ def test_another_process_predicts_the_same_bits(tmp_path):
     gp = posterior(size=60, n=3)
     save_posterior(gp, tmp_path / "gp.safetensors")
     code = (
-        "import sys, torch; torch.set_num_threads(1); from gpmpc.gp import load_posterior;"
-        "b = load_posterior(sys.argv[1]).predict(torch.full((3,), 0.3).double(), torch.full((1,), 0.1).double());"
+        "import sys, torch; torch.set_num_threads(1); "
+        "from gpmpc.gp import load_posterior;"
+        "b = load_posterior(sys.argv[1]).predict("
+        "torch.full((3,), 0.3).double(), torch.full((1,), 0.1).double());"
         "print([v.hex() for v in (*b.mean.tolist(), *b.variance.tolist())])"
     )
     command = [sys.executable, "-c", code, str(tmp_path / "gp.safetensors")]
@@ -193,7 +195,8 @@ def test_a_flipped_bit_anywhere_is_refused_or_harmless(tmp_path):
         try:
             loaded = load_posterior(path)
         except DataError as error:
-            assert str(error).startswith(f"{path}: ")  # noqa: PT017 - most positions raise, some cannot matter
+            # most positions raise, some cannot matter
+            assert str(error).startswith(f"{path}: ")  # noqa: PT017
             refused += 1
         else:
             assert_same(loaded, gp)
@@ -213,7 +216,8 @@ def test_a_flipped_bit_in_the_data_is_refused(tmp_path):
         )
         with pytest.raises(
             DataError,
-            match=r"gp\.safetensors: damaged; expected a saved GPPosterior \(the checksum",
+            match=r"gp\.safetensors: damaged; "
+            r"expected a saved GPPosterior \(the checksum",
         ):
             load_posterior(path)
 
@@ -328,7 +332,8 @@ def test_what_cannot_be_saved_says_what_to_do(tmp_path):
     }
     with pytest.raises(
         SettingError,
-        match="features: must be one of float64, float32 to be saved; got torch.bfloat16",
+        match="features: must be one of float64, float32 to be saved; "
+        "got torch.bfloat16",
     ):
         save_posterior(GPPosterior(**parts | short), tmp_path / "gp.safetensors")
     with pytest.raises(

@@ -232,7 +232,8 @@ def test_too_much_for_the_memory_is_refused_with_a_way_out(
     with pytest.raises(DataError) as refused:
         train(pendulum(400))
     assert str(refused.value) == (
-        "exact GPs of 400 points and 2 outputs need 0.00477 GiB, 0.00119 GiB a kernel matrix; 0.00195 GiB are "
+        "exact GPs of 400 points and 2 outputs need 0.00477 GiB, 0.00119 GiB a kernel "
+        "matrix; 0.00195 GiB are "
         "available: train on 256 points or fewer, or sparse GPs (SparseTrainer)"
     )
     assert len(train(pendulum(250), restarts=0, tolerance=1e-3).posterior) == 250
@@ -407,7 +408,8 @@ def test_refits_and_starts_need_a_posterior_that_fits():
         trainer(pendulum(8), start=train(pendulum(8), restarts=0))
     with pytest.raises(
         ShapeError,
-        match="the posterior to start from must have 4 features and 3 outputs; got 3 and 2",
+        match="the posterior to start from must have 4 features and 3 outputs; "
+        "got 3 and 2",
     ):
         trainer(other, start=gp)
     values = GPPosterior(**vars(gp) | {"predicts": "value"})
@@ -427,7 +429,10 @@ def test_what_takes_long_tells_where_it_is(caplog, monkeypatch):
     monkeypatch.setattr(_search, "_LOG_INTERVAL", 0.0)
     with caplog.at_level(logging.INFO, "gpmpc"):
         found = train(data, restarts=0)
-    text = r"training: output (\d) of 2, 12 points: evaluation (\d+), minus log evidence .*"
+    text = (
+        r"training: output (\d) of 2, 12 points: evaluation (\d+), "
+        r"minus log evidence .*"
+    )
     told = [re.fullmatch(text, record.message) for record in caplog.records]
     assert [one[1] for one in told] == sorted(one[1] for one in told)
     assert len(told) == found.evaluations

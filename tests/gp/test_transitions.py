@@ -46,7 +46,8 @@ def test_features_are_states_and_inputs_and_rows_are_chosen(transitions):
         (
             ((4, 2), (3, 1), (4, 2)),
             ShapeError,
-            r"same n and number N of rows, one or more; got \(4, 2\), \(3, 1\) and \(4, 2\)",
+            r"same n and number N of rows, one or more; "
+            r"got \(4, 2\), \(3, 1\) and \(4, 2\)",
         ),
         (
             ((4, 2), (4, 1), (4, 3)),

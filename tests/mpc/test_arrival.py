@@ -44,7 +44,8 @@ def cart(force):
 )
 @pytest.mark.parametrize("tolerance", [1e-4, 1e-6])
 def test_an_input_that_saturates_is_no_reason_to_creep(force, tolerance):
-    """Gauss-Newton alone creeps at a rate of .64 here, or overshoots by 1.64, for ever."""
+    """Gauss-Newton alone creeps at a rate of .64 here, or overshoots by 1.64, for
+    ever."""
     problem = Problem(Tracking([10.0, 1.0], [0.01]), inputs=Box([-5.0], [5.0]))
     plans = []
     for count in (100, 400):
@@ -68,7 +69,8 @@ def test_an_input_that_saturates_is_no_reason_to_creep(force, tolerance):
 
 
 def flown(iterations, tolerance=None):
-    """Cost and programs of a planar quadrotor that jumps from set point to set point."""
+    """Cost and programs of a planar quadrotor that jumps from set point to set
+    point."""
     system = planar_quadrotor()
     problem = Problem(
         Tracking([10.0, 1.0, 10.0, 1.0, 1.0, 0.1], [0.1, 0.1]),

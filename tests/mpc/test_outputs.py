@@ -302,7 +302,8 @@ def test_mistakes_are_one_clear_error():
     )
     with pytest.raises(
         ShapeError,
-        match=r"a plan must be inputs \(7, 2\), or these and states \(8, 3\); got \(3, 2\)",
+        match=r"a plan must be inputs \(7, 2\), or these and states \(8, 3\); "
+        r"got \(3, 2\)",
     ):
         controller.control(at, GOAL, plan=np.zeros((3, 2)))
     with pytest.raises(DataError, match="a plan to start from must be finite"):

@@ -32,7 +32,8 @@ def test_diagonals_and_matrices_mean_the_same():
         ({"terminal": [1.0]}, "terminal: must be a weight of 2 states; got 1"),
         (
             {"penalized": "rates"},
-            "penalized: must be one of 'inputs', 'deviations', 'increments'; got 'rates'",
+            "penalized: must be one of 'inputs', 'deviations', 'increments'; "
+            "got 'rates'",
         ),
     ],
 )

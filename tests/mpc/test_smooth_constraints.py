@@ -85,7 +85,10 @@ def test_a_disc_in_the_way_is_passed_without_touching_it(h):
 
 def test_a_moving_disc_is_passed_where_it_will_be():
     goal = np.array([1.3, 0.0])
-    places = lambda k: CENTRE + [[0.0, 0.02 * (k + i + 1)] for i in range(H)]  # noqa: E731
+
+    def places(k):
+        return CENTRE + [[0.0, 0.02 * (k + i + 1)] for i in range(H)]
+
     states = flown(controller(Inequality(disc)), goal, parameters=places)
     distances = [
         np.linalg.norm(x - CENTRE - [0.0, 0.02 * k]) for k, x in enumerate(states)
@@ -213,7 +216,8 @@ def test_mistakes_are_one_clear_error():
     assert (blind.applicable, blind.status) == (False, Status.FUNCTION_NOT_FINITE)
     with pytest.raises(
         SolverFailure,
-        match="step 0: a constraint or output, or its gradient, is not finite along the",
+        match="step 0: a constraint or output, or its gradient, "
+        "is not finite along the",
     ):
         ControlLoop(
             controller(Inequality(lambda x: x[:, 0].log())), on_failure="raise"

@@ -151,7 +151,8 @@ def test_the_plan_at_a_limit_is_the_best_iterate(limit):
 
 
 def test_a_plan_that_breaks_a_hard_bound_is_not_applied():
-    """There is no time to stop before the bound, so none of the programs can be solved."""
+    """There is no time to stop before the bound, so none of the programs can be
+    solved."""
     limits = Box([-np.inf] * 6, [0.95, *[np.inf] * 5], probability=0.95, penalty=None)
     problem = replace(PROBLEM, constraints=[limits])
     at = Gaussian.certain(np.array([0.9, 3.0, 0.0, 0.0, 0.0, 0.0]))

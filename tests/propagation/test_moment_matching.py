@@ -353,7 +353,8 @@ def test_results_are_semidefinite_with_noise_unless_refused():
 def test_a_belief_of_another_dimension_is_refused():
     with pytest.raises(
         ShapeError,
-        match=r"a state \(\*batch, 2\) and an input \(\*batch, 1\); got \(3,\) and \(1,\)",
+        match=r"a state \(\*batch, 2\) and an input \(\*batch, 1\); "
+        r"got \(3,\) and \(1,\)",
     ):
         MomentMatching()(model(), belief(3), torch.zeros(1))
     with pytest.raises(ShapeError, match=r"got \(2,\) and \(2,\)"):

@@ -243,7 +243,8 @@ def test_moment_matching_names_who_can_do_what_it_cannot():
     model = linear()
     other = ResidualModel(lambda x, u: x.sin(), model.residual, model.B, [0, 1], [0], 1)
     message = (
-        "MomentMatching needs a GPPosterior, or a ResidualModel of an Affine nominal model and one; got ResidualModel. "
+        "MomentMatching needs a GPPosterior, or a ResidualModel of an Affine nominal "
+        "model and one; got ResidualModel. "
         "Possible with any model: MeanEquivalence, Linearization, Unscented, MonteCarlo"
     )
     with pytest.raises(UnsupportedModel) as caught:
@@ -295,7 +296,10 @@ class TestBadInput:
 
     def test_an_indefinite_covariance_by_how_much(self, name):
         at = Gaussian(torch.zeros(2), torch.tensor([[1.0, 1.5], [1.5, 1.0]]))
-        message = r"must be positive semidefinite; got an eigenvalue of -0\.5 \(largest entry 1\.5\)"
+        message = (
+            r"must be positive semidefinite; "
+            r"got an eigenvalue of -0\.5 \(largest entry 1\.5\)"
+        )
         self.refused(name, DataError, message, at=at)
         batch = Gaussian(torch.zeros(2, 2), torch.stack([torch.eye(2), at.covariance]))
         self.refused(name, DataError, message, at=batch, u=torch.zeros(2, 1))
@@ -308,7 +312,10 @@ class TestBadInput:
     def test_a_belief_in_another_precision_than_the_model(self, name):
         at = belief()
         single = Gaussian(at.mean.float(), at.covariance.float())
-        message = "state: must be torch.float64 on cpu like the model; got torch.float32 on cpu"
+        message = (
+            "state: must be torch.float64 on cpu like the model; "
+            "got torch.float32 on cpu"
+        )
         self.refused(name, SettingError, message, at=single)
         self.refused(
             name,

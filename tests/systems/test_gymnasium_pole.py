@@ -25,7 +25,8 @@ WORDS = [
     "data.starts=start",
     "controller.problem.cost.Q=[1,1,0.1,0.1]",
     "controller.problem.cost.R=[0.01]",
-    "controller.problem.constraints=[{_target_: gpmpc.mpc.problem.Box, lower: [-0.9,-0.15,-inf,-inf], "
+    "controller.problem.constraints=[{_target_: gpmpc.mpc.problem.Box, "
+    "lower: [-0.9,-0.15,-inf,-inf], "
     "upper: [0.9,0.15,inf,inf]}]",
     "steps=300",
 ]

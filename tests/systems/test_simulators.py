@@ -252,7 +252,8 @@ def test_misuse_of_simulators_is_one_clear_line(cart, tmp_path, monkeypatch):
         (
             lambda: mujoco_system(cart, ["push"], joints=["slider", "hing"]),
             SettingError,
-            "joints: Invalid name 'hing'. Valid names: .*'hinge'.*'slider'.* in .*cart.xml",
+            "joints: Invalid name 'hing'. Valid names: .*'hinge'.*'slider'.* "
+            "in .*cart.xml",
         ),
         (
             lambda: mujoco_system(cart, ["pull"], joints=["slider", "hinge"]),

@@ -239,7 +239,8 @@ def test_misuse_is_refused_where_the_system_is_made(settings, error, message):
 def test_a_trajectory_of_another_number_of_positions_is_refused():
     with pytest.raises(
         ShapeError,
-        match="trajectory: must prescribe angle of pendulum; got positions of 3 numbers",
+        match="trajectory: must prescribe angle of pendulum; "
+        "got positions of 3 numbers",
     ):
         pendulum().reference_states(Hover([0, 0, 0]), 3)
 
