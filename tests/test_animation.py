@@ -50,6 +50,6 @@ def test_every_plan_lies_in_the_left_view_the_last_one_too(tmp_path):
         assert low < y.min() <= y.max() < high
 
 
-def test_the_plan_of_a_failed_solve_does_not_make_the_flight_a_dot(tmp_path):
+def test_a_failed_solves_plan_does_not_shrink_the_flight(tmp_path):
     for (left, right), *_ in left_views(flight(tmp_path, failed=[4])):
         assert right - left < 60  # [m], of a path of 36

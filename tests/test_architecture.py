@@ -35,7 +35,7 @@ def test_the_qp_solvers_load_no_torch(module):
     assert loaded == "[]"
 
 
-def test_the_gp_modules_load_neither_optimisation_nor_settings_nor_figures():
+def test_gp_modules_load_no_optimiser_settings_or_figures():
     forbidden = ["hydra", "cvxpy", "mcap", "casadi", "matplotlib", "rich"]
     code = f"import sys, gpmpc.gp, gpmpc.models, gpmpc.propagation; print([m for m in {forbidden} if m in sys.modules])"
     loaded = subprocess.run(
@@ -44,7 +44,7 @@ def test_the_gp_modules_load_neither_optimisation_nor_settings_nor_figures():
     assert loaded == "[]"
 
 
-def test_recordings_are_written_and_read_without_torch_and_without_compilers():
+def test_recordings_need_neither_torch_nor_compilers():
     forbidden = ["torch", "numba", "scipy", "hydra", "matplotlib", "pandas"]
     code = f"import sys, gpmpc.recording; print([m for m in {forbidden} if m in sys.modules])"
     loaded = subprocess.run(
@@ -87,7 +87,7 @@ def test_a_heavy_library_has_one_door(library, rooms):
     ]
 
 
-def test_no_private_interface_of_hydra_omegaconf_or_argparse_is_used():
+def test_nothing_private_of_hydra_omegaconf_or_argparse_is_used():
     private = re.compile(r"hydra\._internal|omegaconf\._|\._get_node\(|\._actions\b")
     sources = ROOT.glob("gpmpc/**/*.py")
     assert not [
@@ -97,7 +97,7 @@ def test_no_private_interface_of_hydra_omegaconf_or_argparse_is_used():
     ]
 
 
-def test_published_results_stand_below_the_command_line_and_above_everything_else():
+def test_published_results_stand_just_below_the_command_line():
     above = re.compile(
         r"^\s*(?:from|import) gpmpc\.(?:cli|experiments)\b", re.MULTILINE
     )

@@ -254,7 +254,7 @@ def test_the_report_is_a_data_frame():
     assert frame["state"].tolist() == ["angle", "rate"] * 2
 
 
-def test_a_coverages_interval_is_exact_and_counts_what_does_not_overlap():
+def test_a_coverages_interval_is_exact_and_counts_no_overlaps():
     assert example().coverage_interval(0, 0, 1) == binomial_interval(18, 20)
     assert example().coverage_interval(1, 0, 1) == binomial_interval(4, 5)
     found = calibrate(LinearGaussian(), [*runs(3, 7), *runs(2, 3)], Linearization(), 4)
@@ -267,7 +267,7 @@ def test_a_coverages_interval_is_exact_and_counts_what_does_not_overlap():
     assert (narrow.width / honest.width).numpy() == pytest.approx(1 / 3)
 
 
-def test_the_figure_has_a_column_for_each_state_and_a_row_for_each_measure():
+def test_the_figure_has_states_as_columns_and_measures_as_rows():
     figure = calibration_figure(example())
     assert len(figure.axes) == 6
     assert [axis.get_title() for axis in figure.axes[:2]] == ["angle", "rate"]

@@ -61,7 +61,7 @@ def run(package, **environment):
     return float(answer), int(hits) == 1
 
 
-def test_machine_code_is_used_again_until_a_file_that_went_into_it_changes(package):
+def test_machine_code_is_reused_until_one_of_its_files_changes(package):
     assert run(package) == (2.0, False)
     (package / "other.py").write_text("A = 3\n")
     assert run(package) == (2.0, True)
@@ -84,7 +84,7 @@ print(kernel(Pair(1.0, 2.0)), sum(kernel.stats.cache_hits.values()))
 """
 
 
-def test_machine_code_for_a_class_that_has_moved_is_compiled_anew(package):
+def test_code_for_a_class_that_has_moved_is_compiled_anew(package):
     pair = "from typing import NamedTuple\nclass Pair(NamedTuple):\n    x: float\n    y: float\n"
     for module in ("here", "there"):
         (package / f"{module}.py").write_text(pair)
@@ -114,9 +114,7 @@ def second(x):
 )
 
 
-def test_a_kernel_runs_its_own_copy_of_what_it_calls_whatever_was_loaded_or_compiled_before(
-    tmp_path,
-):
+def test_a_kernel_runs_its_own_copy_of_its_callees(tmp_path):
     """Copies of one function differ by rounding; here by a factor, so that it is seen
     on any machine."""
     (tmp_path / "own.py").write_text(OWN)
@@ -137,7 +135,7 @@ def test_a_kernel_runs_its_own_copy_of_what_it_calls_whatever_was_loaded_or_comp
     assert run("7", "second(1.0), first(1.0)") == [15.0, 2.0]
 
 
-def test_where_nothing_can_be_kept_kernels_are_compiled_all_the_same(package):
+def test_kernels_compile_where_no_cache_can_be_written(package):
     (package / "__pycache__").write_text("in the way of the cache beside the source")
     nowhere = str(package / "other.py")  # a file: no folder can be made below it
     for _ in range(2):
@@ -146,7 +144,7 @@ def test_where_nothing_can_be_kept_kernels_are_compiled_all_the_same(package):
         ) == (2.0, False)
 
 
-def test_the_stamp_of_a_kernel_covers_constants_and_callees_and_spares_the_rest():
+def test_a_kernels_stamp_covers_just_its_constants_and_callees():
     import gpmpc.qp._dual_active_set
     import gpmpc.qp._primal_active_set
 
@@ -230,7 +228,7 @@ def test_numba_still_has_the_private_parts_that_are_used_here():
     )
 
 
-def test_without_numbas_private_parts_kernels_compile_in_its_own_way(monkeypatch):
+def test_kernels_compile_without_numbas_private_parts(monkeypatch):
     monkeypatch.setattr(gpmpc._compiled, "_KERNEL_OPTIONS", {})
     monkeypatch.setattr(gpmpc._compiled, "_INNER_OPTIONS", {})
 

@@ -9,9 +9,7 @@ import pytest
 from gpmpc._compiling import report_compilation
 
 
-def test_compiling_is_told_once_with_its_time_and_a_call_of_what_is_compiled_is_not(
-    capsys,
-):
+def test_compiling_is_announced_once_with_its_time(capsys):
     @numba.njit
     def inner(x):
         return x + 1

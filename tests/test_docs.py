@@ -41,7 +41,7 @@ references = states_along(Elliptical(), np.arange(60.0))
 """  # what the pages speak of: a plant, transitions, a model, a controller
 
 
-def test_eleven_tasks_of_a_newcomer_are_done_from_an_empty_folder(page, tmp_path):
+def test_a_newcomers_eleven_tasks_work_from_an_empty_folder(page, tmp_path):
     names, printed = page("docs/how_to.md")
     assert read("docs/how_to.md").count("\n## ") == 11
     assert "(docs/how_to.md)" in read("README.md")
@@ -90,7 +90,7 @@ def test_eleven_tasks_of_a_newcomer_are_done_from_an_empty_folder(page, tmp_path
     assert torch.equal(*predictions)
 
 
-def test_the_first_five_minutes_print_what_the_readme_shows_and_end_at_a_goal(page):
+def test_the_first_five_minutes_print_what_the_readme_shows(page):
     names, (flown, drawn, info, _) = page("docs/start.md")
     (shown,) = [
         text
@@ -218,7 +218,7 @@ def public(module):
     return {key: getattr(module, key) for key in names if not key.startswith("_")}
 
 
-def test_every_name_that_a_room_offers_or_that_settings_pages_and_examples_use_is_documented():
+def test_every_name_that_is_offered_or_used_is_documented():
     listed = [
         importlib.import_module(name)
         for name in re.findall(r"^   (gpmpc[\w.]*)$", read("docs/api.md"), re.MULTILINE)

@@ -57,7 +57,7 @@ def test_the_example_of_the_readme_swings_a_pendulum_up(tmp_path, monkeypatch, c
     assert (tmp_path / "swing_up.png").exists()
 
 
-def test_the_example_of_a_system_of_ones_own_follows_its_waypoints(
+def test_the_example_of_a_custom_system_follows_its_waypoints(
     tmp_path, monkeypatch, capsys
 ):
     monkeypatch.setattr(sys, "argv", ["own_system.py", str(tmp_path)])
@@ -69,9 +69,7 @@ def test_the_example_of_a_system_of_ones_own_follows_its_waypoints(
     assert (tmp_path / "own_system.png").stat().st_size > 10_000
 
 
-def test_the_example_of_a_log_learns_from_its_own_files_and_leaves_a_figure(
-    tmp_path, capsys
-):
+def test_the_example_of_a_log_learns_and_leaves_a_figure(tmp_path, capsys):
     names = runpy.run_path(str(EXAMPLES / "own_log.py"))
     names["main"](tmp_path)
     assert {path.name for path in tmp_path.iterdir()} == {
@@ -86,9 +84,7 @@ def test_the_example_of_a_log_learns_from_its_own_files_and_leaves_a_figure(
 
 
 @pytest.mark.slow
-def test_a_quadrotor_in_mujoco_flies_better_with_what_its_logs_teach_than_with_its_data_sheet(
-    tmp_path,
-):
+def test_a_mujoco_quadrotor_flies_better_by_its_logs(tmp_path):
     pytest.importorskip("mujoco")
     found = runpy.run_path(str(EXAMPLES / "mujoco_flight.py"))["main"](tmp_path)
     assert (
@@ -101,9 +97,7 @@ def test_a_quadrotor_in_mujoco_flies_better_with_what_its_logs_teach_than_with_i
     )
 
 
-def test_the_example_of_a_payload_learns_from_flights_and_corrects_what_is_new(
-    tmp_path, monkeypatch
-):
+def test_the_example_of_a_payload_learns_and_corrects(tmp_path, monkeypatch):
     pytest.importorskip("mujoco")
     monkeypatch.setattr(sys, "argv", ["payload.py", str(tmp_path)])
     errors = [
@@ -118,7 +112,7 @@ def test_the_example_of_a_payload_learns_from_flights_and_corrects_what_is_new(
     assert not film.exists() or film.stat().st_size > 100_000
 
 
-def test_the_example_of_a_wall_keeps_the_cart_behind_it_as_often_as_it_says(
+def test_the_example_of_a_wall_keeps_its_promised_probability(
     tmp_path, monkeypatch, capsys
 ):
     monkeypatch.setattr(sys, "argv", ["wall.py", str(tmp_path)])
@@ -132,9 +126,7 @@ def test_the_example_of_a_wall_keeps_the_cart_behind_it_as_often_as_it_says(
     assert (tmp_path / "wall.png").stat().st_size > 10_000
 
 
-def test_the_example_of_a_reactor_earns_more_than_at_its_operating_point_and_stays_cool(
-    tmp_path, monkeypatch
-):
+def test_the_example_of_a_reactor_earns_more_and_stays_cool(tmp_path, monkeypatch):
     monkeypatch.setattr(sys, "argv", ["reactor.py", str(tmp_path)])
     names = runpy.run_path(str(EXAMPLES / "reactor.py"), run_name="__main__")
     economic, held = (flight.states for flight in names["flights"].values())
@@ -143,9 +135,7 @@ def test_the_example_of_a_reactor_earns_more_than_at_its_operating_point_and_sta
     assert (tmp_path / "reactor.png").stat().st_size > 10_000
 
 
-def test_the_example_of_moving_obstacles_reaches_its_goal_and_touches_none(
-    tmp_path, monkeypatch
-):
+def test_the_example_of_moving_obstacles_touches_none(tmp_path, monkeypatch):
     monkeypatch.setattr(sys, "argv", ["obstacles.py", str(tmp_path)])
     names = runpy.run_path(str(EXAMPLES / "obstacles.py"), run_name="__main__")
     assert names["away"] < 0.2
@@ -154,7 +144,7 @@ def test_the_example_of_moving_obstacles_reaches_its_goal_and_touches_none(
     assert (tmp_path / "obstacles.png").stat().st_size > 10_000
 
 
-def test_the_example_of_learning_while_flying_finds_the_heavier_vehicle(
+def test_the_example_of_online_learning_finds_the_added_mass(
     tmp_path, monkeypatch, capsys
 ):
     monkeypatch.setattr(sys, "argv", ["learning.py", str(tmp_path)])

@@ -23,7 +23,7 @@ def project(*dependencies, **extras):
     }
 
 
-def test_every_requirement_of_the_package_its_build_and_its_extras_has_its_floor():
+def test_every_requirement_has_its_floor():
     asked = project(
         "numpy>=2.2",
         "hydra-core>=1.3.8,<1.5",

@@ -96,7 +96,7 @@ def test_a_function_that_loses_its_derivative_is_refused(written):
 
 
 @pytest.mark.parametrize("horizon", [1, 3])
-def test_constants_and_functions_of_parameters_alone_need_no_derivative(horizon):
+def test_functions_of_parameters_alone_need_no_derivative(horizon):
     for function, parameters in (
         (lambda x: torch.ones(len(x), dtype=F), None),
         (lambda x, u, p: p[:, 0], np.arange(3.0)[:horizon, None]),
@@ -120,7 +120,7 @@ def transitions():
     return Transitions(x, u, x + 0.1 * u)
 
 
-def test_a_nominal_model_of_numpy_is_refused_when_it_is_trained_with():
+def test_training_refuses_a_nominal_model_of_numpy():
     trainer = Trainer(restarts=0)
     for nominal, advice in (
         (lambda x, u: np.sin(x), "torch.sin for np.sin"),
@@ -176,7 +176,7 @@ def plant(function):
     return System(Dynamics(), 0.1)
 
 
-def test_dynamics_of_math_are_refused_where_arrays_or_expressions_come():
+def test_dynamics_of_math_refuse_arrays_and_expressions():
     system = plant(math.sin)
     assert np.isfinite(step(system, STATE, [0.0])).all()
     with pytest.raises(

@@ -10,7 +10,7 @@ def test_mean_and_covariance_must_belong_together():
         Gaussian(torch.zeros(3), torch.eye(2))
 
 
-def test_the_variance_is_the_diagonal_of_every_covariance_in_a_batch():
+def test_the_variance_is_the_diagonal_of_every_covariance():
     covariance = torch.randn(4, 3, 3)
     assert torch.equal(
         Gaussian(torch.zeros(4, 3), covariance).variance[2], covariance[2].diagonal()
@@ -18,7 +18,7 @@ def test_the_variance_is_the_diagonal_of_every_covariance_in_a_batch():
 
 
 @pytest.mark.parametrize("batch", [(), (5,), (2, 3)])
-def test_the_projection_is_semidefinite_nearest_and_says_how_far_it_went(batch):
+def test_the_projection_is_the_nearest_semidefinite_matrix(batch):
     generator = torch.Generator().manual_seed(1)
     matrix = torch.randn(*batch, 4, 4, generator=generator)
     projected, deficit = nearest_positive_semidefinite(matrix)

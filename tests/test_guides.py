@@ -11,9 +11,7 @@ from tests.cli.command import forked
 from tests.pages import BLOCK, read
 
 
-def test_a_system_of_ones_own_is_flown_learned_swept_reported_recorded_and_calibrated(
-    page, tmp_path
-):
+def test_the_guide_of_a_custom_system_runs_from_start_to_end(page, tmp_path):
     names, (flown, *_, calibrated, heavier, swept, report) = page(
         "docs/guide_system.md"
     )

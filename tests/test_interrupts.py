@@ -38,7 +38,7 @@ def test_a_second_one_does_not_wait():
         assert [swallow(), swallow()] == [True, False]
 
 
-def test_without_an_interrupt_and_in_another_thread_nothing_happens():
+def test_nothing_happens_without_an_interrupt_or_in_a_thread():
     with interrupts_after():
         pass
     done = []

@@ -20,7 +20,7 @@ from gpmpc.metrics import (
 AXES = (0, 2, 4)  # x, y, z of the translational states
 
 
-def test_the_mean_squared_error_sums_over_outputs_and_averages_over_samples():
+def test_the_mean_squared_error_sums_outputs_averages_samples():
     assert (
         mean_squared_error(torch.tensor([[1.0, 2.0], [0.0, 0.0]]), torch.zeros(2, 2))
         == 2.5
@@ -53,7 +53,7 @@ def test_a_level_outside_zero_and_one_is_refused():
         interval_coverage(torch.zeros(1, 1), torch.ones(1, 1), torch.zeros(1, 1), 95)
 
 
-def test_the_tracking_error_is_that_of_the_axes_and_of_the_distance_without_the_start():
+def test_the_tracking_error_leaves_out_the_start():
     states = np.zeros((3, 6))
     references = np.zeros((3, 6))
     states[0] = 100.0  # where nobody steered
@@ -68,9 +68,7 @@ def test_the_tracking_error_is_that_of_the_axes_and_of_the_distance_without_the_
 
 @pytest.mark.parametrize("scale", [1e-9, 1.0, 1e9])
 @pytest.mark.parametrize("shift", [0.0, -3.0])
-def test_a_flight_is_lost_where_it_would_have_been_nearer_had_it_never_moved(
-    scale, shift
-):
+def test_a_flight_is_lost_where_standing_still_would_be_nearer(scale, shift):
     references = (
         np.outer(np.arange(6.0), [3, 0, 4]) + shift
     )  # 25 from its start in the end
@@ -90,7 +88,7 @@ def test_a_flight_is_lost_where_it_would_have_been_nearer_had_it_never_moved(
         assert find_loss(scale * near, scale * references, axes=range(3)) is None
 
 
-def test_what_hovers_is_lost_beyond_the_least_distance_and_what_is_no_number_is_lost_anyway():
+def test_a_hover_is_lost_beyond_the_least_distance_or_by_nan():
     references = np.zeros((4, 6))
     drifting = np.outer(
         np.arange(4.0), [1, 50, 0, 50, 0, 50]

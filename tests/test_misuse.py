@@ -83,7 +83,7 @@ def controller(kind=GPMPC, **changed):
 
 
 @pytest.mark.parametrize("value", [[0.1, 0.2], (0.1, 0.2), np.array([0.1, 0.2])])
-def test_a_certain_belief_from_numbers_is_float64_to_the_last_digit(value):
+def test_a_certain_belief_from_numbers_is_exactly_float64(value):
     assert torch.equal(Gaussian.certain(value).mean, torch.tensor([0.1, 0.2], dtype=F))
 
 
@@ -280,7 +280,7 @@ def test_a_nominal_model_that_does_not_fit_is_not_broadcast(settings, error, rul
         )
 
 
-def test_a_residual_model_refuses_a_nominal_of_another_size_when_it_predicts():
+def test_a_residual_model_refuses_a_nominal_of_another_size():
     model = residual()
     wrong = ResidualModel(
         lambda x, u: x[..., :1], model.residual, model.B, model.states, model.inputs, 1
@@ -472,7 +472,7 @@ def refuses(call, value):
 
 
 @pytest.mark.parametrize("kind", NO_NUMBERS)
-def test_what_is_no_number_gets_one_line_wherever_numbers_are_taken(kind):
+def test_what_is_no_number_is_refused_in_one_line_everywhere(kind):
     value = NO_NUMBERS[kind]
     for name, call in TAKES_NUMBERS.items():
         assert refuses(call, value), name

@@ -32,7 +32,7 @@ def wheel(tmp_path_factory):
     return path
 
 
-def test_the_wheel_carries_the_settings_the_printed_figures_and_its_types(wheel):
+def test_the_wheel_carries_settings_printed_figures_and_types(wheel):
     names = zipfile.ZipFile(wheel).namelist()
     settings = {str(path.relative_to(ROOT)) for path in (ROOT / "conf").rglob("*.yaml")}
     assert {f"gpmpc/{name}" for name in settings} <= set(names)
@@ -53,14 +53,12 @@ def test_the_wheel_carries_the_settings_the_printed_figures_and_its_types(wheel)
     assert not [name for name in names if name.startswith(("tests/", "benchmarks/"))]
 
 
-def test_the_code_of_the_wheel_has_the_fingerprint_of_the_checkout(wheel, tmp_path):
+def test_the_wheel_has_the_fingerprint_of_the_checkout(wheel, tmp_path):
     zipfile.ZipFile(wheel).extractall(tmp_path)
     assert source_fingerprint(tmp_path / "gpmpc") == code_fingerprint()
 
 
-def test_an_installed_package_finds_its_settings_from_an_empty_directory(
-    wheel, tmp_path
-):
+def test_an_installed_package_finds_its_settings(wheel, tmp_path):
     site = tmp_path / "site"
     empty = tmp_path / "empty"
     empty.mkdir()

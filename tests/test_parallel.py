@@ -25,7 +25,7 @@ def die(seed):
     return seed
 
 
-def test_every_result_comes_with_the_number_of_its_job_whichever_finished_first():
+def test_every_result_comes_with_the_number_of_its_job():
     seeds = [0, 3, 1]
     found = dict(in_processes(draw, seeds, 2))
     assert sorted(found) == [0, 1, 2]
@@ -37,7 +37,7 @@ def test_a_worker_that_dies_is_one_clear_error():
         list(in_processes(die, range(3), 2))
 
 
-def test_an_interrupt_between_the_starts_of_two_workers_ends_the_first(monkeypatch):
+def test_an_interrupt_between_two_starts_ends_the_first_worker(monkeypatch):
     submitted = []
     submit = ProcessPoolExecutor.submit
 

@@ -35,7 +35,7 @@ def checkout(tmp_path):
     return tmp_path
 
 
-def test_the_code_is_the_same_wherever_it_lies_and_whenever_it_was_written(checkout):
+def test_the_fingerprint_ignores_the_codes_place_and_date(checkout):
     assert source_fingerprint(checkout / "gpmpc") == code_fingerprint()
     for path in checkout.rglob("*.py"):
         path.write_bytes(path.read_bytes().replace(b"\n", b"\r\n"))
@@ -88,7 +88,7 @@ def test_any_file_that_changes_moves_or_goes_makes_it_other_code(name, checkout)
     assert len({code_fingerprint(), changed, moved, removed}) == 4
 
 
-def test_every_file_of_the_package_is_code_or_known_to_change_no_number():
+def test_every_file_is_code_or_known_to_change_no_number():
     listed = ["git", "ls-files", "gpmpc"]
     tracked = subprocess.run(listed, cwd=ROOT, capture_output=True, text=True)
     names = tracked.stdout.split()
@@ -98,9 +98,7 @@ def test_every_file_of_the_package_is_code_or_known_to_change_no_number():
     assert endings - SHOWN_ONLY == {*_provenance._SOURCES}
 
 
-def test_a_package_without_its_source_files_is_refused_by_the_ending_that_is_missing(
-    tmp_path, monkeypatch
-):
+def test_a_package_without_its_sources_is_refused(tmp_path, monkeypatch):
     (tmp_path / "gaussian.py").write_text("x = 1\n")
     with pytest.raises(GpmpcError, match=r"holds no \*\.xml"):
         source_fingerprint(tmp_path)
@@ -115,13 +113,13 @@ def test_a_package_without_its_source_files_is_refused_by_the_ending_that_is_mis
     assert not is_of_this_code(provenance())
 
 
-def test_what_does_not_say_which_code_made_it_was_made_by_other_code():
+def test_a_result_that_names_no_code_is_of_other_code():
     assert is_of_this_code(provenance())
     assert not is_of_this_code({})
     assert not is_of_this_code(provenance() | {"code": "0" * 32})
 
 
-def test_the_fingerprint_is_read_once_a_process_and_takes_less_than_a_flight_notices():
+def test_the_fingerprint_is_read_once_a_process_and_is_quick():
     code_fingerprint()
     began = time.perf_counter()
     code_fingerprint()
@@ -162,7 +160,7 @@ SETTINGS = {
 }
 
 
-def test_code_of_the_users_own_counts_with_what_it_imports_and_nothing_installed(own):
+def test_the_users_code_counts_with_its_uninstalled_imports(own):
     before = own_code(SETTINGS)
     assert sorted(before) == ["my_robot", "my_script"]
 
@@ -178,7 +176,7 @@ def test_code_of_the_users_own_counts_with_what_it_imports_and_nothing_installed
     assert changed("my_constants.py", "MASS = 2.0\n") == {"my_robot", "my_script"}
 
 
-def test_a_result_of_own_code_that_changed_since_is_one_of_other_code(own):
+def test_a_result_of_own_code_changed_since_is_of_other_code(own):
     about = provenance() | {"own_code": own_code(SETTINGS)}
     assert is_of_this_code(about, SETTINGS)
     assert not is_of_this_code(provenance(), SETTINGS)

@@ -41,7 +41,7 @@ def test_the_elliptical_trajectory_is_the_papers():
     assert np.allclose(Elliptical()(j), expected, atol=1e-13)
 
 
-def test_lorenz_is_sampled_four_times_an_accepted_step_of_an_adaptive_integration():
+def test_lorenz_is_sampled_four_times_an_accepted_step():
     times = Lorenz()._samples
     spacing = np.diff(times)[:188].reshape(-1, 4)
     assert np.allclose(
@@ -104,7 +104,7 @@ def test_misuse_is_refused_with_the_rule(build, message):
         build()
 
 
-def test_lorenz_by_default_is_the_papers_with_its_second_axis_turned():
+def test_the_default_lorenz_is_the_papers_with_one_axis_turned():
     """(0.7 X, -0.7 Y, Z) from (-1.79, -3.13, 12.74), Cao, Lai and Alam (2017), (27)."""
     assert np.allclose(
         Lorenz()(np.array(0.0)), [0.7 * -1.79, -0.7 * -3.13, 12.74], rtol=1e-14
@@ -112,9 +112,7 @@ def test_lorenz_by_default_is_the_papers_with_its_second_axis_turned():
 
 
 @pytest.mark.parametrize("samples", [1, 2, 4])
-def test_lorenz_passes_the_ends_of_the_accepted_steps_whatever_the_samples_between_them(
-    samples,
-):
+def test_lorenz_passes_the_ends_of_the_accepted_steps(samples):
     """Of K samples a step, every K-th is the end of one: the same points of the same
     integration."""
     ends = Lorenz(samples_per_step=samples, duration=40.0)(samples * np.arange(10.0))
@@ -130,13 +128,13 @@ def test_lorenz_passes_the_ends_of_the_accepted_steps_whatever_the_samples_betwe
         ("duration", 0.0), ("sigma", np.nan), ("rho", "a"), ("beta", np.inf), ("start", (1.0, 2.0)), ("scale", (1, 2)),
     ],
 )  # fmt: skip
-def test_a_setting_of_lorenz_that_makes_no_sense_is_refused_by_name(setting, value):
+def test_a_senseless_setting_of_lorenz_is_refused_by_name(setting, value):
     with pytest.raises(SettingError, match=setting):
         Lorenz(**{setting: value})
 
 
 @pytest.mark.parametrize("time", [-0.1, 20.1])
-def test_lorenz_is_defined_from_its_start_to_its_duration_both_included(time):
+def test_lorenz_is_defined_from_start_to_duration_inclusive(time):
     trajectory = Lorenz(duration=20.0)
     assert np.isfinite(trajectory(np.array([0.0, 20.0]))).all()
     for call in (trajectory, trajectory.velocity):

@@ -60,9 +60,7 @@ def own_package(tmp_path, monkeypatch):
     "name",
     ["arm.Arm", "arm.make", "arm.heavy", "arm.Arm.mass", "arm:make", "arm.vehicle"],
 )
-def test_a_trusted_packages_own_code_is_found_and_what_it_calls_gpmpcs_by(
-    name, own_package
-):
+def test_a_trusted_packages_code_and_its_names_are_found(name, own_package):
     path = f"{own_package}.{name}"
     assert _trust.is_trusted(path, [own_package])
     assert callable(_trust.trusted_code(path, [own_package]))
@@ -124,7 +122,7 @@ def listed():
         yield name, getattr(importlib.import_module(module), attribute)
 
 
-def test_all_that_settings_call_in_conf_is_listed_and_all_that_is_listed_is_there():
+def test_what_conf_calls_is_listed_and_what_is_listed_exists():
     called = set()
     for path in (*ROOT.glob("conf/**/*.yaml"), *ROOT.glob("docs/*.md")):
         called |= set(re.findall(r"_target_: (gpmpc\.[\w.]+)", path.read_text()))
@@ -160,14 +158,14 @@ CODE = {
 }
 
 
-def test_code_whose_arguments_are_guarded_is_listed_under_one_name():
+def test_code_with_guarded_arguments_has_one_listed_name():
     by_name = dict(listed())
     for guarded in _recorded_settings._ARGUMENTS:
         code = by_name[guarded]
         assert [name for name in by_name if by_name[name] is code] == [guarded]
 
 
-def test_every_argument_of_listed_code_that_could_take_a_text_was_looked_at():
+def test_every_text_argument_of_listed_code_was_looked_at():
     looked_at = WORDS | FILES_THAT_ARE_READ | GUARDED | NAMES | NUMBERS | CODE
     unknown = []
     for name, code in listed():

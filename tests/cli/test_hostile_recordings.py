@@ -103,7 +103,7 @@ def folder(tmp_path):
 
 
 @pytest.mark.parametrize("words", [["calibrate"], ["plot", "--film"]], ids=" ".join)
-def test_a_hostile_recording_is_refused_in_one_line_and_nothing_happens(words, folder):
+def test_a_hostile_recording_is_refused_and_nothing_happens(words, folder):
     record(folder / "run.mcap", six_hostile_settings()["module"])
     before = sorted(path.name for path in folder.iterdir())
     done = forked(*words, "run.mcap", cwd=folder)
@@ -114,7 +114,7 @@ def test_a_hostile_recording_is_refused_in_one_line_and_nothing_happens(words, f
 
 
 @pytest.mark.parametrize("name", [*six_hostile_settings()])
-def test_settings_that_call_anything_else_are_refused_at_every_depth(name):
+def test_settings_that_call_other_code_are_refused_at_any_depth(name):
     found = six_hostile_settings()[name]
     with pytest.raises(DataError, match=r"its settings (call|import) '") as told:
         experiment_of_run(run_of(found), [])
@@ -248,7 +248,7 @@ def aliases(levels):
     ],
     ids=lambda value: value[:40],
 )
-def test_settings_that_are_no_plain_names_and_values_are_refused_at_once(text, rule):
+def test_settings_other_than_plain_names_and_values_are_refused(text, rule):
     began = time.process_time()
     with pytest.raises(DataError, match=rule) as told:
         read_settings(text)
@@ -280,7 +280,7 @@ def test_the_largest_settings_are_read_in_a_second_or_two(text):
     ],
     ids=" ".join,
 )  # fmt: skip
-def test_settings_of_an_ordinary_flight_describe_the_same_as_before(words):
+def test_an_ordinary_flights_settings_describe_the_same_flight(words):
     from gpmpc.cli._experiment import experiment_of, experiment_of_file
 
     found = flight(*words)
@@ -302,9 +302,7 @@ def test_settings_of_an_ordinary_flight_describe_the_same_as_before(words):
     assert {*experiment.controller.keywords} == {*expected.controller.keywords}
 
 
-def test_a_package_that_is_trusted_may_be_called_and_no_more_than_its_own_code(
-    folder, monkeypatch
-):
+def test_a_trusted_package_may_call_just_its_own_code(folder, monkeypatch):
     monkeypatch.chdir(folder)
     monkeypatch.setattr(sys, "path", [*sys.path])
     monkeypatch.delitem(sys.modules, CANARY, raising=False)
@@ -333,7 +331,7 @@ def test_a_package_that_is_trusted_may_be_called_and_no_more_than_its_own_code(
     assert not (folder / "fired").exists()  # names are compared before any import
 
 
-def test_whom_a_saved_model_may_trust_the_caller_says_and_not_the_recording():
+def test_the_caller_says_whom_a_saved_model_may_trust():
     model = {"_target_": "gpmpc.logs.load_flyable", "path": "x", "trusted": ["evil"]}
     for trusted in ([], ["my_robot"]):
         assert checked_settings(model, trusted)["trusted"] == trusted
@@ -358,7 +356,7 @@ def test_whom_a_saved_model_may_trust_the_caller_says_and_not_the_recording():
         lambda f: put(f, "seed", [1]), lambda f: put(f, "steps", 1.5), lambda f: put(f, "loop", {}),
     ],
 )  # fmt: skip
-def test_settings_that_describe_no_flight_are_one_line_with_the_recordings_name(change):
+def test_settings_of_no_flight_get_one_line_with_the_files_name(change):
     def learn():
         experiment = experiment_of_run(run_of(change(flight())), [])
         with errors_of_settings(run_of("")):
@@ -439,9 +437,7 @@ def read_hostile(folder, told):
     told.write_text(json.dumps({"outcomes": outcomes, "seen": watch.seen}))
 
 
-def test_twelve_hostile_files_are_refused_and_nothing_is_imported_called_or_written(
-    folder, tmp_path_factory
-):
+def test_twelve_hostile_files_are_refused_and_none_acts(folder, tmp_path_factory):
     from gpmpc.models import save_model
     from tests.gp.small_models import residual_model
     from tests.models.test_hostile_models import six_hostile_models
@@ -489,9 +485,7 @@ def test_a_folder_of_somebody_else_brings_no_plugin(words, tmp_path):
     assert not plugin.with_name("fired").exists()
 
 
-def test_a_saved_model_flies_by_code_of_ones_own_where_that_is_trusted(
-    tmp_path, monkeypatch
-):
+def test_a_saved_model_flies_by_ones_own_trusted_code(tmp_path, monkeypatch):
     import torch
 
     from gpmpc.models import ResidualModel, save_model

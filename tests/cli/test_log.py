@@ -84,7 +84,7 @@ def spoil(data, starts):
     return bytes(changed)
 
 
-def test_recover_of_a_recording_without_a_step_left_writes_no_file(folder, tmp_path):
+def test_recovering_a_recording_without_a_step_writes_no_file(folder, tmp_path):
     data = (folder / "run.mcap").read_bytes()
     starts = chunk_starts(data)
     (tmp_path / "spoiled.mcap").write_bytes(spoil(data, starts))
@@ -216,9 +216,7 @@ def foreign(folder):
     }
 
 
-def test_what_is_no_recording_is_refused_in_one_line_that_names_it(
-    folder, tmp_path, monkeypatch
-):
+def test_what_is_no_recording_is_refused_by_its_name(folder, tmp_path, monkeypatch):
     (tmp_path / "run.mcap").write_bytes((folder / "run.mcap").read_bytes())
     reasons = foreign(tmp_path)
     parser = COMMANDS["log"].parser("log")
@@ -296,9 +294,7 @@ def test_a_mistake_is_one_clear_line(folder, arguments, message):
     assert result.stderr.count("\n") == 1
 
 
-def test_a_folder_of_runs_is_drawn_run_by_run_and_one_that_cannot_be_read_is_named(
-    tmp_path,
-):
+def test_a_folder_of_runs_is_drawn_and_a_damaged_run_named(tmp_path):
     for name in ("a", "b"):
         runs.record_run(tmp_path / name / "run.mcap", steps=3)
     (tmp_path / "c").mkdir()

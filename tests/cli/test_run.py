@@ -33,9 +33,7 @@ GYROSCOPE = (
     ],
     ids=["falls", "diverges"],
 )
-def test_a_lost_flight_is_finished_and_readable_and_has_an_exit_code_of_its_own(
-    choices, reason, tmp_path
-):
+def test_a_lost_flight_is_readable_and_has_its_own_exit_code(choices, reason, tmp_path):
     done = forked("run", *TINY, *choices, "steps=9", cwd=tmp_path)
     assert done.returncode == 3, done.stderr
     assert "lost " in done.stdout
@@ -58,9 +56,7 @@ def test_a_lost_flight_is_finished_and_readable_and_has_an_exit_code_of_its_own(
     assert forked("report", "tree", cwd=tmp_path).returncode == 0
 
 
-def test_a_sweep_names_the_flights_that_were_lost_also_when_they_were_flown_before(
-    tmp_path,
-):
+def test_a_sweep_names_lost_flights_and_those_flown_before(tmp_path):
     sweep = ["run", "-m", *TINY, "plant.mass=0.74,100", "trajectory=hover", "steps=9"]
     for before in (0, 2):
         done = forked(*sweep, "recorder=none", cwd=tmp_path)
@@ -74,9 +70,7 @@ def test_a_sweep_names_the_flights_that_were_lost_also_when_they_were_flown_befo
         assert ": lost: from step " in line
 
 
-def test_a_flight_is_predicted_and_what_cannot_be_predicted_or_filmed_is_said_in_one_line(
-    tmp_path, monkeypatch, capsys
-):
+def test_a_flight_is_predicted_or_one_line_says_why_not(tmp_path, monkeypatch, capsys):
     assert forked("run", *TINY, "steps=9", cwd=tmp_path).returncode == 0
     done = forked("calibrate", "tree", "--steps", "12", "--json", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
@@ -142,7 +136,7 @@ def test_who_is_not_lost_is_not_called_so(tmp_path):
     ("trajectory", "controller"),
     [("elliptical", "convex"), ("lorenz", "convex"), ("lorenz", "nmpc")],
 )
-def test_the_band_of_the_figure_holds_as_many_positions_as_two_deviations_promise(
+def test_the_figures_band_covers_two_standard_deviations(
     trajectory, controller, tmp_path
 ):
     choices = [

@@ -5,9 +5,7 @@ import logging
 from gpmpc.cli._terminal import logging_console
 
 
-def test_what_the_package_logs_is_told_once_and_a_searchs_evaluations_not_at_all(
-    capsys,
-):
+def test_log_messages_show_once_and_a_searchs_steps_never(capsys):
     log = logging.getLogger("gpmpc")
     before = log.handlers, log.propagate, log.level
     try:

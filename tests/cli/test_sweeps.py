@@ -101,7 +101,7 @@ def test_a_recorded_flight_is_drawn(single):
     assert "Ignoring" not in done.stderr
 
 
-def test_the_attitude_alone_is_flown_recorded_drawn_and_reported_in_radians(tmp_path):
+def test_the_attitude_alone_is_flown_and_reported_in_radians(tmp_path):
     settings = [
         "system=rotational",
         "trajectory=lorenz",
@@ -143,7 +143,7 @@ def change_code(folder, code):
     return content
 
 
-def test_a_finished_run_of_other_code_stays_and_is_said_to_be_one(single, tmp_path):
+def test_a_finished_run_of_other_code_stays_and_is_named(single, tmp_path):
     shutil.copytree(single[0] / "tree", tmp_path / "tree")
     (folder,) = (tmp_path / "tree").iterdir()
     original = json.loads((folder / "metrics.json").read_text())
@@ -173,9 +173,7 @@ def test_a_finished_run_of_other_code_stays_and_is_said_to_be_one(single, tmp_pa
         assert json.loads((folder / "metrics.json").read_text()) == content
 
 
-def test_finished_runs_are_not_flown_again_and_other_settings_do_not_pass_for_them(
-    single,
-):
+def test_finished_runs_are_kept_and_other_settings_refused(single):
     cwd, _ = single
     (folder,) = (cwd / "tree").iterdir()
     found = json.loads((folder / "metrics.json").read_text())
@@ -193,7 +191,7 @@ def test_finished_runs_are_not_flown_again_and_other_settings_do_not_pass_for_th
     )
 
 
-def test_a_run_is_of_the_users_own_code_and_says_so_where_that_has_changed(tmp_path):
+def test_a_run_says_where_the_users_own_code_has_changed(tmp_path):
     (tmp_path / "my_plant.py").write_text(
         "from gpmpc.systems import pendulum\nMASS = 1.0\n"
         "def make(**settings):\n    return pendulum(mass=MASS)\n"
@@ -303,7 +301,7 @@ def test_a_mistake_is_one_clear_line_and_leaves_nothing_behind(
     assert not list(tmp_path.iterdir())
 
 
-def test_a_mistake_that_the_flight_finds_is_kept_with_its_traceback(tmp_path):
+def test_a_mistake_found_in_flight_is_kept_with_its_traceback(tmp_path):
     done = forked("run", *TINY, "data.size=26", cwd=tmp_path)
     assert done.returncode == 2
     assert "data.size: must be at most 25, the rows of the data; got 26" in done.stderr
@@ -360,7 +358,7 @@ def test_every_launcher_gives_the_same_numbers(launcher, sweep, tmp_path):
     assert results(tmp_path / "tree") == sweep[1]
 
 
-def test_a_killed_sweep_goes_on_and_ends_as_if_nothing_had_happened(sweep, tmp_path):
+def test_a_killed_sweep_goes_on_as_if_nothing_had_happened(sweep, tmp_path):
     tree = tmp_path / "tree"
     killed = start(*SWEPT, "folder=tree", cwd=tmp_path)
     deadline = time.monotonic() + 120
@@ -375,9 +373,7 @@ def test_a_killed_sweep_goes_on_and_ends_as_if_nothing_had_happened(sweep, tmp_p
     assert results(tree) == sweep[1]
 
 
-def test_a_sweep_does_not_take_a_finished_run_of_other_settings_for_its_own(
-    sweep, tmp_path
-):
+def test_a_sweep_refuses_a_finished_run_of_other_settings(sweep, tmp_path):
     tree = tmp_path / "tree"
     shutil.copytree(sweep[0], tree)
     again = forked(*SWEPT, "folder=tree", cwd=tmp_path)
@@ -408,7 +404,7 @@ def test_a_sweep_does_not_take_a_finished_run_of_other_settings_for_its_own(
     assert len(list(tree.glob("*/metrics.json"))) == 3
 
 
-def test_a_sweep_and_a_report_say_how_many_runs_are_of_other_code(sweep, tmp_path):
+def test_a_sweep_and_a_report_count_the_runs_of_other_code(sweep, tmp_path):
     tree = tmp_path / "tree"
     shutil.copytree(sweep[0], tree)
     first, second, *_ = sorted(path.parent for path in tree.glob("*/metrics.json"))

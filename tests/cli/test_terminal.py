@@ -34,9 +34,7 @@ def shell(line, cwd, **environment):
 
 
 @pytest.mark.parametrize("command", ["--help", "run --cfg", "log --help"])
-def test_a_standard_output_that_takes_nothing_ends_the_command_in_one_line(
-    command, tmp_path
-):
+def test_a_full_standard_output_ends_the_command_in_one_line(command, tmp_path):
     full = shell(f"$GPMPC {command} > /dev/full", tmp_path)
     assert (full.returncode, full.stderr) == (
         1,
@@ -65,7 +63,7 @@ def test_closed_streams_and_those_of_other_letters_do_no_harm(tmp_path):
         ) == (2, 1, True)
 
 
-def test_what_cannot_be_written_is_no_error_that_a_command_could_take_for_one_of_a_file():
+def test_a_failed_write_is_not_taken_for_an_error_of_a_file():
     with open("/dev/full", "w") as full:
         output = Output(full)
         output.write("text")
@@ -143,7 +141,7 @@ def test_help_is_found_before_and_behind_a_command(command, tmp_path):
     assert f"gpmpc {command}" in answers[0].stdout
 
 
-def test_the_version_names_what_computes_wherever_it_is_asked_for(tmp_path):
+def test_the_version_names_what_computes_at_every_place(tmp_path):
     versions = {
         forked(*words, cwd=tmp_path).stdout
         for words in (["--version"], ["run", "--version"], ["plot", "-V"])
@@ -157,7 +155,7 @@ def test_the_version_names_what_computes_wherever_it_is_asked_for(tmp_path):
     )
 
 
-def test_json_alone_stands_on_the_standard_output_and_quiet_leaves_it_empty(tmp_path):
+def test_standard_output_holds_just_json_and_nothing_if_quiet(tmp_path):
     run = ["run", *TINY, "folder=tree"]
     flown = forked(*run, "--json", cwd=tmp_path)
     assert flown.returncode == 0, flown.stderr
@@ -399,7 +397,7 @@ def test_ctrl_c_in_the_middle_of_flights_is_one_line(command, tmp_path):
     assert (flying.returncode, shown) == (130, f"\ninterrupted{advice}\n")
 
 
-def test_an_error_that_came_up_while_an_interrupt_was_dealt_with_is_the_interrupt():
+def test_an_error_while_handling_an_interrupt_is_the_interrupt():
     def clean_up_badly():
         try:
             raise KeyboardInterrupt
@@ -426,9 +424,7 @@ if __name__ == "__main__":
 @pytest.mark.parametrize(
     "ended_by", [signal.SIGKILL, signal.SIGTERM, signal.SIGHUP], ids=str
 )
-def test_workers_end_with_a_parent_that_is_killed_and_let_its_pipe_go(
-    ended_by, tmp_path
-):
+def test_workers_of_a_killed_parent_end_and_release_its_pipe(ended_by, tmp_path):
     (tmp_path / "pool.py").write_text(POOL)
     _kill_and_wait_for_the_pipe([sys.executable, "pool.py"], tmp_path, "b", ended_by)
 

@@ -46,9 +46,7 @@ class Store(types.ModuleType):
         self.seen["artifacts"] = folder
 
 
-def test_settings_become_parameters_numbers_metrics_and_files_artifacts(
-    monkeypatch, tmp_path
-):
+def test_settings_metrics_and_files_reach_the_tracker(monkeypatch, tmp_path):
     for name in ("MLFLOW_EXPERIMENT_NAME", "MLFLOW_EXPERIMENT_ID"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setitem(sys.modules, "mlflow", store := Store())
@@ -59,9 +57,7 @@ def test_settings_become_parameters_numbers_metrics_and_files_artifacts(
     assert store.seen["artifacts"] == str(tmp_path)
 
 
-def test_a_tracker_that_is_unknown_or_not_installed_is_named_before_anything_flies(
-    tmp_path,
-):
+def test_an_unknown_or_absent_tracker_is_named_before_a_flight(tmp_path):
     wrong = [("comet", "tracker: must be 'mlflow' or 'none'; got 'comet'")]
     if find_spec("mlflow") is None:
         wrong.append(("mlflow", "tracker: needs MLflow: pip install mlflow"))
@@ -87,7 +83,7 @@ def test_a_run_is_found_in_mlflow_with_its_numbers_and_files(tmp_path):
     assert found.info.status == "FINISHED"
 
 
-def test_a_tracker_that_fails_leaves_the_run_finished_and_says_so(tmp_path):
+def test_a_failing_tracker_leaves_the_run_finished_and_says_so(tmp_path):
     pytest.importorskip("mlflow")
     run = forked("run", *TINY, cwd=tmp_path, MLFLOW_TRACKING_URI="nowhere://x")
     assert run.returncode == 0

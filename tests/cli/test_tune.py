@@ -43,7 +43,7 @@ def tune(folder, trials, cwd):
     return json.loads(done.stdout)
 
 
-def test_a_search_goes_on_where_it_stopped_and_its_best_settings_fly(tmp_path):
+def test_a_search_resumes_and_its_best_settings_fly(tmp_path):
     tune("tree", "2", tmp_path)
     flown = {
         path: path.stat().st_mtime_ns for path in tmp_path.glob("tree/*/metrics.json")

@@ -33,9 +33,7 @@ def by_input(plant, x, u):
 
 
 @pytest.mark.parametrize(("system", "flown"), [(POSITION, OUTER), (ATTITUDE, INNER)])
-def test_transitions_are_the_systems_with_the_noise_and_inputs_that_acted(
-    system, flown
-):
+def test_transitions_hold_the_noise_and_inputs_that_acted(system, flown):
     data = DATA.transitions(system, Elliptical())
     stepped = [
         step(system, x, u)
@@ -56,7 +54,7 @@ def test_the_seed_decides_the_flight():
     assert not np.array_equal(first, other)
 
 
-def test_a_model_learns_from_dither_what_the_inputs_do_and_cannot_without():
+def test_a_model_learns_the_inputs_effect_just_with_dither():
     def error(dither):
         source = replace(DATA, translational=replace(OUTER, dither=dither))
         data = source.transitions(POSITION, Elliptical())

@@ -59,9 +59,7 @@ def test_the_velocity_reaches_the_reference_two_samples_ahead(elliptical):
     )  # what the input weights leave
 
 
-def test_the_rotational_data_steer_to_the_attitude_of_the_controls_two_samples_ahead(
-    elliptical,
-):
+def test_rotational_data_steer_to_attitudes_two_samples_ahead(elliptical):
     u = elliptical["translational"].inputs[2:, 1:].numpy()
     asked = attitude_for_thrust_direction(u[:, 0], u[:, 1], convention="paper")
     assert (
@@ -128,7 +126,7 @@ def test_the_authors_files_are_asked_for_by_name(tmp_path):
 
 
 @pytest.mark.parametrize("samples", [0, -1, 1.5, None, "abc", True])
-def test_samples_of_the_authors_files_are_a_positive_whole_number(samples, tmp_path):
+def test_the_authors_samples_are_a_positive_whole_number(samples, tmp_path):
     with pytest.raises(
         SettingError, match="data.samples: must be a whole number, 1 or more"
     ):

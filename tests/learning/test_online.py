@@ -76,7 +76,7 @@ def rms(errors):
 
 
 @pytest.mark.parametrize("sensor", [0.0, 0.03])
-def test_a_plant_that_does_not_change_is_flown_as_without_learning(sensor):
+def test_an_unchanged_plant_is_flown_as_without_learning(sensor):
     for seed in range(2):
         plain, learning = (
             flown(way, seed=seed, sensor=sensor)[0] for way in (None, OnlineLearning())
@@ -164,9 +164,7 @@ def changed_residual():
 @pytest.mark.parametrize(
     "changed", [ChangedModel(MODEL), changed_residual()], ids=["posterior", "residual"]
 )
-def test_a_changed_model_is_a_model_with_a_last_innovation(
-    changed,
-):
+def test_a_changed_model_is_a_model_with_a_last_innovation(changed):
     rng = np.random.default_rng(2)
     x = rng.uniform(-1, 1, (12, 2))
     u = rng.uniform(-1, 1, (12, 1))

@@ -10,9 +10,7 @@ from tests.cli.command import forked
 TINY = ["model.restarts=0", "horizon=3", f"noise.process={[0.01] * 6}".replace(" ", "")]
 
 
-def test_a_recorded_flight_shows_when_the_change_was_used_and_a_second_one_is_equal(
-    tmp_path,
-):
+def test_a_recorded_flight_shows_its_learning_and_repeats(tmp_path):
     gust = (
         "disturbances=[{_target_: gpmpc.simulation.Gust, rates: {vx: 0.5}, start: 10}]"
     )
@@ -37,9 +35,7 @@ def test_a_recorded_flight_shows_when_the_change_was_used_and_a_second_one_is_eq
     assert np.array_equal(*found)
 
 
-def test_episodes_are_recorded_and_the_flight_that_counts_has_the_model_of_the_best(
-    tmp_path,
-):
+def test_the_flight_that_counts_has_the_best_episodes_model(tmp_path):
     done = forked(
         "run",
         *TINY,

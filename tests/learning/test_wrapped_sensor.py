@@ -74,7 +74,7 @@ def flown(control, sensor):
     ],
     ids=["plans", "learning", "velocity", "disturbance"],
 )
-def test_a_sensor_that_wraps_gives_the_flight_of_one_that_counts_turns(make):
+def test_a_wrapping_sensor_gives_the_flight_of_an_unwrapped_one(make):
     (counting, _), (wrapping, decisions) = (
         flown(make(), sensor) for sensor in (np.array, shown)
     )
@@ -128,7 +128,7 @@ class WrappingSensor:
         return shown(measured)
 
 
-def test_flights_are_learned_from_and_their_innovations_hold_no_turns():
+def test_learned_flights_have_innovations_without_turns():
     plant = System(Hanging(), STEP, angles=["angle"])
     recorded = []
     flight = closed_loop(

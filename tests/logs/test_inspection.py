@@ -155,7 +155,7 @@ def test_a_log_that_contradicts_its_mapping_is_inspected(table, tmp_path):
     assert any("cannot be learned from: no input" in text for text in found.warnings)
 
 
-def test_learn_writes_a_model_a_report_and_a_card_and_names_mistakes(tmp_path):
+def test_learn_writes_its_three_files_and_names_mistakes(tmp_path):
     import yaml
 
     example = runpy.run_path(str(ROOT / "examples" / "own_log.py"))
@@ -209,7 +209,7 @@ def test_learn_writes_a_model_a_report_and_a_card_and_names_mistakes(tmp_path):
     )
 
 
-def test_outcomes_of_stages_are_used_again_or_a_line_says_why_they_are_not(tmp_path):
+def test_stage_results_are_reused_or_a_line_says_why_not(tmp_path):
     path = tmp_path / "progress.json"
     memory = _FileMemory(path, "name")
     assert memory == {}

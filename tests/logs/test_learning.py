@@ -82,9 +82,7 @@ def test_the_outputs_of_a_rigid_body_are_those_that_moved_it():
     )
 
 
-def test_parameters_come_back_within_their_standard_errors(
-    flights,
-):
+def test_parameters_come_back_within_their_standard_errors(flights):
     log = as_log(flights, gaps=(700,))
     model = LogModel(
         RigidBodyKinematics(log.space),
@@ -106,9 +104,7 @@ def test_parameters_come_back_within_their_standard_errors(
         assert 0 < found["torque_x1"][1] < 5
 
 
-def test_learning_finds_motors_and_noise_and_beats_baselines(
-    flights,
-):
+def test_learning_finds_motors_and_noise_and_beats_baselines(flights):
     log = as_log(flights, gaps=(500,))
     train, held_out = log.split(["flight 2"])
     learned = learn(train, points=20, steps=20)

@@ -67,9 +67,7 @@ def test_a_fraction_of_a_step_mixes_two_inputs():
 
 
 @pytest.mark.parametrize("delay", [1, 3, 0.6, 2.3])
-def test_looking_ahead_agrees_with_the_delayed_model(
-    delay,
-):
+def test_looking_ahead_agrees_with_the_delayed_model(delay):
     model = DelayedModel(gp(), delay)
     propagator = Linearization(process_noise=True)
     queue = 0.5 * draw(6, model.pending, 1)

@@ -121,9 +121,7 @@ def test_foreign_code_is_refused_before_anything_is_imported(
     assert sorted(p.name for p in tmp_path.iterdir()) == [f"{CANARY}.py", path.name]
 
 
-def test_code_of_a_trusted_package_is_loaded(
-    saved,
-):
+def test_code_of_a_trusted_package_is_loaded(saved):
     path = saved(with_code())
     with pytest.raises(
         DataError,

@@ -52,7 +52,7 @@ def flown(model, horizon, **changes):
     return lines, metrics(chosen, flight)
 
 
-def test_a_horizon_that_loses_the_goal_is_said_before_the_flight_and_kept(model):
+def test_a_horizon_that_loses_the_goal_is_said_before_flight(model):
     lines, found = flown(model, 2)
     (line,) = lines
     assert line.startswith("horizon 2: the loop runs away from its reference")
@@ -86,7 +86,7 @@ def test_a_goal_beyond_the_data_is_said_whatever_flies(model):
     assert found["outlook"]["spectral_radius"] is None
 
 
-def test_the_command_says_it_once_on_the_standard_error_and_in_its_table(tmp_path):
+def test_the_command_says_it_once_on_stderr_and_in_its_table(tmp_path):
     settings = ["system=pendulum", "horizon=2", "steps=2", "data.samples=60"]
     settings += ["model.restarts=0", "recorder=none", "folder=tree"]
     done = forked("run", *settings, cwd=tmp_path)

@@ -42,9 +42,7 @@ def compared(tree, first, second):
 
 
 @pytest.mark.parametrize("pairs", [6, 9, 15])
-def test_the_statistics_of_pairs_are_those_of_scipy_and_of_their_definitions(
-    pairs, tmp_path, rng
-):
+def test_paired_statistics_are_scipys_and_their_definitions(pairs, tmp_path, rng):
     a = rng.uniform(0.1, 0.2, pairs)
     b = a + 0.01 * rng.normal(0.3, 1.0, pairs)
     ours = compared(tmp_path, a, b)
@@ -112,9 +110,7 @@ def test_groups_without_two_seeds_in_common_are_refused(tmp_path):
     assert compare(report(tmp_path), *GROUPS)[0].pairs == 2
 
 
-def test_the_words_name_what_only_one_measure_lacks_there_and_what_all_lack_at_the_top(
-    tmp_path,
-):
+def test_the_text_names_gaps_of_one_measure_and_gaps_of_all(tmp_path):
     for seed in range(8):
         fly(tmp_path, "lqr", seed, 0.1)
         if seed != 7:

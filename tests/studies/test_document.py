@@ -196,7 +196,7 @@ def test_a_terminal_shows_sections_details_and_notes():
     )
 
 
-def test_a_spreadsheet_takes_nothing_for_a_formula_and_numbers_for_numbers():
+def test_a_spreadsheet_reads_numbers_and_no_formulas():
     assert DOCUMENT.csv() == "'=name,n\n'@x,1.5\n-2.5e-3,2.0\n'-a,3.0\n"
 
 

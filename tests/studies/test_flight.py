@@ -86,7 +86,7 @@ def numbers(experiment):
     return found
 
 
-def test_the_same_seed_gives_the_same_numbers_and_another_one_others():
+def test_a_seed_gives_the_same_numbers_and_another_one_others():
     noise = Noise(measurement=[0.01] * 6)
     first, again, other = (
         numbers(experiment(noise=noise, seed=seed)) for seed in (3, 3, 4)
@@ -96,7 +96,7 @@ def test_the_same_seed_gives_the_same_numbers_and_another_one_others():
     assert first["training"]["size"] == 20
 
 
-def test_the_rows_of_a_seed_are_nested_and_in_the_order_of_the_flight():
+def test_a_seeds_rows_are_nested_and_in_the_flights_order():
     everything = experiment(size=None).training_rows().features.numpy()
     small, large = (
         experiment(size=size, seed=1).training_rows().features.numpy()
@@ -111,7 +111,7 @@ def test_the_rows_of_a_seed_are_nested_and_in_the_order_of_the_flight():
     assert set(places[0]) < set(places[1])
 
 
-def test_a_model_loop_never_meets_the_plant_and_the_true_model_needs_no_data():
+def test_a_model_loop_needs_no_plant_a_true_model_no_data():
     flown = run_trial(experiment(loop="model"))
     assert np.trace(flown.rollout.covariances[-1]) > 0
     known = run_trial(experiment(controller=ON_THE_PLANT, data=None))
@@ -146,7 +146,7 @@ def test_what_cannot_be_flown_is_refused(changes, message):
         experiment(**changes)
 
 
-def test_the_rotational_subsystem_follows_the_attitudes_of_the_trajectory_at_its_own_rate():
+def test_the_rotational_subsystem_follows_at_its_own_rate():
     excited = Excitation([1] * 6, [1] * 3, [0] * 3, [0.05] * 3, [1e-4, 1e-3] * 3)
     problem = Problem(Tracking([100, 1] * 3, [1] * 3), inputs=Box([-2] * 3, [2] * 3))
     settings = {
@@ -177,7 +177,7 @@ def test_the_rotational_subsystem_follows_the_attitudes_of_the_trajectory_at_its
 @pytest.mark.parametrize(
     "law", [lambda x: [0, 0, 0], lambda x: [100, 0, 0], lambda x: [7.26, 0.6, 0]]
 )
-def test_a_flight_that_no_longer_follows_is_lost_and_says_since_when(trajectory, law):
+def test_a_lost_flight_says_since_when(trajectory, law):
     lost = blind(law, trajectory=trajectory)
     flight = run_trial(lost)
     found = metrics(lost, flight)["lost"]
@@ -205,7 +205,7 @@ def test_an_offset_and_a_short_flight_are_no_loss(trajectory):
         assert numbers(experiment(trajectory=trajectory, steps=steps))["lost"] is None
 
 
-def test_a_plan_leaves_out_the_process_noise_of_the_plant_unless_its_covariances_hold_it():
+def test_a_plan_holds_process_noise_just_with_its_covariances():
     noisy = Noise(process=[1e-3] * 6)
     latent = Linearization(process_noise=False)
     for settings, expected in (
@@ -227,7 +227,7 @@ def growing(rate):
 
 
 @pytest.mark.parametrize("growth", [1e60, 1e120])
-def test_a_flight_that_diverges_ends_in_metrics_that_can_be_written_and_say_so(growth):
+def test_a_diverged_flight_has_metrics_that_can_be_written(growth):
     told = []
     diverging = blind(growing(growth), trajectory=Hover((0, 0, -5)))
     flight = run_trial(diverging, lambda controller, training: told.append)
@@ -328,9 +328,7 @@ def test_more_rows_than_there_are_are_refused():
         run_trial(experiment(size=26))
 
 
-def test_a_folder_is_finished_when_its_metrics_are_there_and_one_process_works_on_it(
-    tmp_path,
-):
+def test_one_process_works_on_a_folder_until_it_has_metrics(tmp_path):
     folder = RunFolder(tmp_path / "run")
     with folder.locked():
         with pytest.raises(Busy), RunFolder(tmp_path / "run").locked(wait=False):
@@ -375,7 +373,7 @@ def test_the_order_of_choices_does_not_matter_for_the_name():
 @pytest.mark.parametrize(
     "settings", [{}, {"predicts": "difference"}], ids=["next states", "differences"]
 )
-def test_what_a_run_supposes_of_columns_at_rest_follows_from_the_limits(settings):
+def test_the_scales_of_columns_at_rest_follow_from_the_limits(settings):
     rng = np.random.default_rng(0)
     states = rng.uniform(-1, 1, (20, 6))
     inputs = rng.uniform(-0.5, 0.5, (20, 3))
@@ -393,7 +391,7 @@ def test_what_a_run_supposes_of_columns_at_rest_follows_from_the_limits(settings
     assert np.allclose(lengthscales[:, [4, 5, 6, 7]], 3.0)
 
 
-def test_angles_at_rest_that_a_run_sees_by_sine_and_cosine_have_one_unit():
+def test_angles_at_rest_seen_by_sine_and_cosine_have_one_unit():
     plant = replace(pendulum(), region=[[-3.0, -2.0], [3.0, 2.0]])
     rng = np.random.default_rng(0)
     states = np.column_stack([np.full(20, 0.5), rng.uniform(-1, 1, 20)])

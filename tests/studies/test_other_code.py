@@ -70,7 +70,7 @@ def run(code, *arguments, cwd):
     return done.stdout
 
 
-def test_a_changed_kernel_computes_again_what_the_old_one_had_left(
+def test_a_changed_kernel_computes_old_results_again(
     copy, tmp_path, monkeypatch, capsys
 ):
     (tmp_path / "study.py").write_text(STUDY)
@@ -90,9 +90,7 @@ def test_a_changed_kernel_computes_again_what_the_old_one_had_left(
 
 
 @pytest.mark.slow
-def test_a_wrong_factor_in_the_moments_is_seen_in_the_table_that_is_printed(
-    copy, tmp_path
-):
+def test_a_wrong_factor_in_the_moments_is_seen_in_the_table(copy, tmp_path):
     main = "from gpmpc.cli import main; main()"
     settings = ["draws=1", "sizes=[10]", "subsystem=translational", "workers=1"]
     command = ["-c", main, "tables", *settings, "folder=A"]

@@ -90,7 +90,7 @@ def test_without_a_sweep_nothing_is_missing(tmp_path):
     assert found.commands() == []
 
 
-def test_single_runs_beside_a_sweep_add_nothing_to_what_it_asked_for(tmp_path):
+def test_single_runs_beside_a_sweep_add_nothing_to_it(tmp_path):
     made_up_run(
         tmp_path,
         ["horizon=3", "seed=9"],
@@ -117,7 +117,7 @@ def test_single_runs_beside_a_sweep_add_nothing_to_what_it_asked_for(tmp_path):
     assert gaps == {("lqr", "10"): ["3"], ("nmpc", "10"): ["0", "1", "2", "3"]}
 
 
-def test_a_run_that_did_not_choose_counts_with_the_setting_that_it_had(tmp_path):
+def test_a_run_counts_with_its_default_settings(tmp_path):
     made_up_run(tmp_path, ["seed=1"], SETTINGS | {"seed": 1}, result=metrics_of(0.1))
     made_up_run(
         tmp_path,
@@ -130,7 +130,7 @@ def test_a_run_that_did_not_choose_counts_with_the_setting_that_it_had(tmp_path)
     assert found.cells == (("5",), ("10",))  # numbers by their size
 
 
-def test_every_document_holds_the_same_numbers_and_the_page_stands_alone(tree):
+def test_all_documents_hold_equal_numbers_and_the_page_is_alone(tree):
     found = report(tree)
     written = documents(found)
     rows = list(csv.DictReader(io.StringIO(written["report.csv"])))
@@ -155,7 +155,7 @@ def test_every_document_holds_the_same_numbers_and_the_page_stands_alone(tree):
     assert len(terminal_table(found).rows) == 2
 
 
-def test_a_run_that_cannot_be_read_is_named_and_the_others_are_reported(tree):
+def test_an_unreadable_run_is_named_and_the_others_reported(tree):
     old = tree / folder_name(chosen("convex", 0)[0]) / METRICS
     content = json.loads(old.read_text())
     del content["unit"]  # as an older version left it
@@ -176,9 +176,7 @@ def test_a_run_that_cannot_be_read_is_named_and_the_others_are_reported(tree):
         assert str(old) in written[name]
 
 
-def test_a_run_that_cannot_be_read_is_not_missing_and_no_command_flies_over_it(
-    tmp_path,
-):
+def test_an_unreadable_run_is_not_missing_nor_flown_over(tmp_path):
     for controller in ("convex", "lqr"):
         for seed in range(4):
             if (controller, seed) != ("lqr", 3):
@@ -255,7 +253,7 @@ def test_pairs_show_what_means_alone_do_not(tree):
         assert word in text
 
 
-def test_every_seed_is_an_average_over_the_same_and_what_is_left_out_is_named(tmp_path):
+def test_seeds_average_over_the_same_runs_and_name_the_others(tmp_path):
     def fly(controller, horizon, seed):
         choices = [f"controller={controller}", f"horizon={horizon}", f"seed={seed}"]
         settings = SETTINGS | {
@@ -295,9 +293,7 @@ def test_every_seed_is_an_average_over_the_same_and_what_is_left_out_is_named(tm
     assert "Left out" not in sentences(found, [alone], "a", "b")[0]
 
 
-def test_errors_of_both_subsystems_keep_their_units_and_are_not_averaged_together(
-    tmp_path,
-):
+def test_errors_of_both_subsystems_stay_in_their_own_units(tmp_path):
     for seed in range(6):
         for subsystem, unit in (("translational", "m"), ("rotational", "rad")):
             for controller in ("lqr", "convex"):
@@ -378,7 +374,7 @@ def test_what_is_no_tree_of_runs_is_refused(tmp_path):
         report(tmp_path)
 
 
-def test_a_thousand_runs_are_put_together_quickly_and_in_little_memory(tmp_path):
+def test_a_thousand_runs_are_reported_in_little_time_and_memory(tmp_path):
     with initialize_config_dir(str(CONF), version_base="1.3"):  # as large as real ones
         settings = OmegaConf.to_container(compose("run"), resolve=True)
     content = record([], settings | {"options": {}}, "gpmpc run") | metrics_of(0.1)
@@ -438,9 +434,7 @@ def test_a_page_says_what_made_the_runs_and_links_them(tree):
         (["7"], "linear", [7]),
     ],
 )
-def test_numbers_stand_at_their_place_on_an_axis_and_words_side_by_side(
-    positions, scale, places
-):
+def test_an_axis_places_numbers_by_value_and_words_in_order(positions, scale, places):
     lines = [Series(name, [[1.0, 2.0]] * len(positions)) for name in ("a", "b")]
     (axis,) = over_variable("x", positions, "y", lines).axes
     assert axis.get_xscale() == scale

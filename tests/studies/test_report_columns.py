@@ -36,7 +36,7 @@ def test_failed_solves_have_a_column_if_any_run_has_some(failing, tmp_path):
     assert "outside" in documents(found)["report.csv"]  # which has room for everything
 
 
-def test_a_comparison_stands_in_the_page_and_in_the_text_if_there_is_one(tmp_path):
+def test_a_comparison_stands_in_the_page_and_in_the_text(tmp_path):
     for seed in range(2):
         choices = [f"seed={seed}"]
         settings = SETTINGS | {"seed": seed}
@@ -51,7 +51,7 @@ def test_a_comparison_stands_in_the_page_and_in_the_text_if_there_is_one(tmp_pat
         )
 
 
-def test_in_a_terminal_names_begin_and_numbers_end_below_each_other():
+def test_a_terminal_aligns_names_left_and_numbers_right():
     console = Console(width=80)
     with console.capture() as capture:
         console.print(

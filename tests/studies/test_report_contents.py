@@ -104,9 +104,7 @@ WHOLE = {
 
 @pytest.mark.parametrize("name", [METRICS, ERROR])
 @pytest.mark.parametrize("damage", [*DAMAGE, *WHOLE])
-def test_one_damaged_run_is_skipped_with_its_reason_and_takes_no_other_with_it(
-    damage, name, tmp_path
-):
+def test_one_damaged_run_alone_is_skipped_with_its_reason(damage, name, tmp_path):
     for seed in range(2):
         add(tmp_path, "lqr", seed, 0.1)
     made_up_run(
@@ -399,9 +397,7 @@ def test_where_a_run_comes_from_is_told_as_far_as_it_says_so(
     assert run.origin == origin
 
 
-def test_a_figure_has_a_curve_for_what_else_was_varied_or_for_less_of_it_where_that_were_too_many(
-    tmp_path, monkeypatch
-):
+def test_a_figure_has_a_curve_for_each_other_varied_setting(tmp_path, monkeypatch):
     monkeypatch.setattr(reporting, "over_variable", lambda *arguments: arguments)
     monkeypatch.setattr(reporting, "png", lambda drawn: drawn)
     errors = {}
@@ -469,9 +465,7 @@ def test_a_figure_has_a_curve_for_what_else_was_varied_or_for_less_of_it_where_t
     ) == [0] * 23 + [5]
 
 
-def test_a_single_varied_setting_has_one_curve_and_names_that_would_be_files_already_get_a_number(
-    tmp_path, monkeypatch
-):
+def test_figures_of_one_setting_have_one_curve_and_own_names(tmp_path, monkeypatch):
     monkeypatch.setattr(reporting, "over_variable", lambda *arguments: arguments)
     monkeypatch.setattr(reporting, "png", lambda drawn: drawn)
     for value in (1, 2):

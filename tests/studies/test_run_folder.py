@@ -19,7 +19,7 @@ from gpmpc.studies._run_folder import (
 )
 
 
-def test_other_choices_have_another_folder_even_where_capitals_count_for_nothing():
+def test_other_choices_have_another_folder_ignoring_case():
     many = [
         [], ["a=1"], ["a=1", "b=2"], ["a=1,b=2"], ["a=1,b", "2"], ["a=[1,2]"], ["a=[1, 2]"], ["a=1 2"], ["a=1_2"],
         ["A=1"], ["a=1/2"], ["a=1:2"], ["x=" + 300 * "y"], ["x=" + 301 * "y"], ["a=ä"], ["a=ö"],

@@ -26,7 +26,7 @@ from gpmpc.studies.study import (
 )
 
 
-def test_a_store_finds_what_was_kept_behind_any_line_that_was_cut_short(tmp_path):
+def test_a_store_finds_records_behind_a_line_cut_short(tmp_path):
     path = tmp_path / "trials.jsonl"
     store = TrialStore(path)
     assert store.records == {}
@@ -79,9 +79,7 @@ def started(monkeypatch):
     return started
 
 
-def test_what_is_missing_is_run_and_records_stand_in_the_order_of_the_trials(
-    tmp_path, started
-):
+def test_missing_trials_run_and_records_keep_their_order(tmp_path, started):
     conditions = {3: "good", 4: "bad", 5: "singular", 6: "good"}
     trials = [
         TrialSpec({"name": c}, c, seed, f"print{seed}")
@@ -113,7 +111,7 @@ def test_what_is_missing_is_run_and_records_stand_in_the_order_of_the_trials(
     assert len(started) == 3
 
 
-def test_other_errors_end_the_study_and_a_worker_that_died_is_named(
+def test_other_errors_end_the_study_and_dead_workers_are_named(
     tmp_path, started, monkeypatch
 ):
     trials = [TrialSpec({}, None, seed=0, fingerprint="a")]
@@ -149,9 +147,7 @@ def test_rows_and_seeds_follow_from_the_seed_alone():
     )
 
 
-def test_a_fingerprint_differs_with_settings_arrays_and_code_and_with_nothing_else(
-    tmp_path, monkeypatch
-):
+def test_a_fingerprint_is_of_settings_arrays_and_code_alone(tmp_path, monkeypatch):
     array = np.arange(6.0)
     cases = [
         ({"a": 1, "b": 2}, []),
@@ -179,9 +175,7 @@ def test_a_fingerprint_differs_with_settings_arrays_and_code_and_with_nothing_el
     assert prints[3] != fingerprint([1], [array])
 
 
-def test_a_model_is_trained_once_for_its_code_settings_data_and_seed(
-    tmp_path, monkeypatch
-):
+def test_one_training_for_the_same_code_settings_data_and_seed(tmp_path, monkeypatch):
     rng = np.random.default_rng(0)
     calls = []
     states = torch.from_numpy(rng.normal(size=(12, 1)))

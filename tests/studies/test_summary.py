@@ -126,9 +126,7 @@ def test_how_a_flight_was_judged_is_said_in_a_line(judgement, line):
 @pytest.mark.parametrize(
     ("error", "outside"), [(0.04, 0), (0.06, 20), (-1.5, 20), (-0.5, 0)]
 )
-def test_states_are_counted_outside_the_tightest_bounds_that_all_boxes_have_now(
-    error, outside
-):
+def test_states_are_counted_outside_the_tightest_current_boxes(error, outside):
     narrow = np.full((2, 6), 9.0)
     narrow[:, 0] = 0.05, 0.01  # of the first stage, and of one later on
     boxes = Box(np.full(6, -1.0), np.full(6, 1.0)), Box(np.full((2, 6), -9.0), narrow)
@@ -139,7 +137,7 @@ def test_states_are_counted_outside_the_tightest_bounds_that_all_boxes_have_now(
 
 
 @pytest.mark.parametrize(("error", "outside"), [(0.3, 0), (0.6, 20)])
-def test_every_kind_of_constraint_says_how_often_flown_states_missed_it(error, outside):
+def test_every_constraint_says_how_often_states_violated_it(error, outside):
     below = Halfspaces([[1.0, 0, 0, 0, 0, 0], [-1.0, 0, 0, 0, 0, 0]], [0.5, 9.0])
     near = Inequality(lambda x: x[:, 0].abs() - 0.25)
     later = Box(np.full(6, 1.0), np.full(6, 2.0), stages=[2])  # asks no first state
@@ -156,7 +154,7 @@ def test_every_kind_of_constraint_says_how_often_flown_states_missed_it(error, o
     assert lines["inequality"].endswith(f"by up to {error - 0.25:.3g}")
 
 
-def test_a_state_at_which_a_constraint_is_no_number_does_not_keep_it():
+def test_a_constraint_of_nan_counts_as_violated():
     states = np.zeros((5, 6))
     states[:, 0] = 1.0, 4.0, -1.0, 9.0, -4.0  # the first is no result
     root = Inequality(lambda x: x[:, 0].sqrt() - 2.5)
@@ -276,7 +274,7 @@ def test_the_metrics_of_a_flight_are_written_out_in_full():
     assert measured(rollout_of(errors))["times"]["training"] is None
 
 
-def test_a_loss_is_told_from_the_first_step_beyond_and_a_divergence_besides():
+def test_a_loss_is_dated_by_its_first_step_divergence_apart():
     errors = [[0, 0, 0], [0, 0, 9], [0, 0, 12], [0, 40, 0]]
     far = "12 m from its reference, more than 10 m"
     assert measured(rollout_of(errors))["lost"] == {
@@ -304,7 +302,7 @@ def test_a_loss_is_told_from_the_first_step_beyond_and_a_divergence_besides():
     )
 
 
-def test_a_flight_that_its_judge_calls_lost_is_lost_and_one_that_diverged_is_judged_so():
+def test_a_flight_is_lost_by_its_judge_or_by_divergence():
     gone = Judgement("lost", "ever faster away")
     near = [[0, 0, 0], [0, 0, 1], [0, 0, 2], [0, 2, 0]]
     found = measured(rollout_of(near, judgements=(Judgement(), gone, gone)))

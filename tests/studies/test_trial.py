@@ -57,9 +57,7 @@ def loops(monkeypatch):
     return calls
 
 
-def test_a_flight_goes_from_the_first_reference_along_all_that_its_last_plan_sees(
-    loops,
-):
+def test_a_flight_has_references_for_all_that_its_last_plan_sees(loops):
     heavy = translational(mass=0.9)
     noise = Noise(process=[0.1] * 6)
     gust = SimpleNamespace(disturb_plant=None)
@@ -94,9 +92,7 @@ def test_a_flight_goes_from_the_first_reference_along_all_that_its_last_plan_see
     assert flown.before == ()
 
 
-def test_a_flight_begins_where_the_plant_says_and_not_at_all_where_it_keeps_its_own_state(
-    loops,
-):
+def test_a_flight_begins_where_the_plant_says(loops):
     began = replace(PLANT, start=tuple(range(6)))
     run_trial(experiment(system=began))
     assert loops[0][3] == loops[1][0][3] == tuple(range(6))
@@ -138,9 +134,7 @@ def test_a_controller_that_learns_while_it_flies_is_wrapped(loops, monkeypatch):
     assert (inner.made_of, learning) == (MODEL, online)
 
 
-def test_a_flight_that_diverges_is_what_was_flown_of_it_or_raises_where_that_is_nothing(
-    loops, monkeypatch
-):
+def test_a_diverged_flight_is_its_flown_part_or_raises(loops, monkeypatch):
     error = Diverged(3, "away")
 
     def diverge(*_, **__):
@@ -158,9 +152,7 @@ def test_a_flight_that_diverges_is_what_was_flown_of_it_or_raises_where_that_is_
     )
 
 
-def test_episodes_are_flown_with_seeds_of_their_own_and_the_model_of_the_best_flies_last(
-    monkeypatch,
-):
+def test_episodes_have_own_seeds_and_the_best_model_flies_last(monkeypatch):
     errors = [3.0, 1.0, 2.0]
     flown = []
     learned = []
@@ -202,9 +194,7 @@ def test_episodes_are_flown_with_seeds_of_their_own_and_the_model_of_the_best_fl
     assert found.rollout == "flight 4"
 
 
-def test_a_system_with_angles_or_something_known_learns_what_is_left_of_the_difference(
-    monkeypatch,
-):
+def test_a_system_with_a_nominal_or_angles_learns_a_residual(monkeypatch):
     monkeypatch.setattr(
         _experiment, "train_residual", lambda **given: ("residual", *given.values())
     )
@@ -258,7 +248,7 @@ class Rows:
         )
 
 
-def test_rows_are_of_the_systems_dimensions_and_as_many_as_asked_for():
+def test_data_have_the_systems_dimensions_and_the_asked_rows():
     def drawn(n=6, m=3, **changes):
         return experiment(data=Rows(n, m), name="mine", **changes).training_rows()
 
@@ -310,9 +300,7 @@ def test_rows_are_of_the_systems_dimensions_and_as_many_as_asked_for():
         ),
     ],
 )
-def test_what_does_not_fit_together_is_refused_before_anything_is_learned(
-    changes, message
-):
+def test_misfits_are_refused_before_anything_is_learned(changes, message):
     with pytest.raises(SettingError, match=message):
         experiment(**changes)
 
@@ -328,7 +316,7 @@ def test_noise_is_held_against_the_plant_where_there_is_one():
     experiment(noise=Noise(process=[0.1] * 5), loop="model")
 
 
-def test_what_a_learned_model_holds_for_noise_is_left_out_of_a_plan():
+def test_a_plan_leaves_out_what_a_learned_model_takes_for_noise():
     noisy = SimpleNamespace(noise_covariance=torch.diag(torch.tensor([4.0, 9.0])))
     other = SimpleNamespace(posterior=SimpleNamespace(noise_covariance=torch.eye(2)))
     assert experiment(model=noisy).unplanned_noise(None).tolist() == [2, 3]

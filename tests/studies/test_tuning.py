@@ -29,7 +29,7 @@ def searched(trials, batch=3, seed=0, of=cost):
     return search
 
 
-def test_a_search_comes_near_the_least_cost_and_knows_what_mattered():
+def test_a_search_nears_the_least_cost_and_knows_what_mattered():
     search = searched(45)
     best = search.candidates[search.best]
     assert cost(best) < 0.15  # of 45 random candidates the best one has 0.11 to 0.2
@@ -41,7 +41,7 @@ def test_a_search_comes_near_the_least_cost_and_knows_what_mattered():
     assert len(document.data) == 45
 
 
-def test_a_search_of_one_seed_proposes_the_same_and_goes_on_as_if_it_had_never_stopped():
+def test_a_search_of_one_seed_repeats_and_resumes_equally():
     whole = searched(12)
     part = searched(6)
     assert part.candidates == whole.candidates[:6]
@@ -53,7 +53,7 @@ def test_a_search_of_one_seed_proposes_the_same_and_goes_on_as_if_it_had_never_s
         assert candidate["kind"] in SPACE["kind"]
 
 
-def test_flights_that_were_lost_count_as_the_worst_and_stop_nothing():
+def test_lost_flights_count_as_the_worst_and_stop_nothing():
     search = searched(
         21,
         of=lambda candidate: math.inf if candidate["weight"] < 1 else cost(candidate),
@@ -90,7 +90,7 @@ def test_nothing_matters_where_there_is_nothing_to_tell_apart(space, costs):
     assert search.importances() == {}
 
 
-def test_numbers_are_drawn_evenly_or_evenly_in_their_logarithm_and_whole_where_asked_for():
+def test_numbers_are_drawn_evenly_by_their_kind_of_scale():
     ranges = {
         "even": Interval(1.0, 1e4), "log": Interval(1.0, 1e4, logarithmic=True),
         "whole": Interval(1, 10**4, whole=True), "whole log": Interval(1, 10**4, logarithmic=True, whole=True),
@@ -105,9 +105,7 @@ def test_numbers_are_drawn_evenly_or_evenly_in_their_logarithm_and_whole_where_a
         assert {type(value) for value in values} == {int if interval.whole else float}
 
 
-def test_a_document_holds_the_ten_best_with_ties_in_their_order_and_everything_in_the_data(
-    monkeypatch,
-):
+def test_a_document_holds_the_ten_best_and_the_data_all(monkeypatch):
     monkeypatch.setattr(tuning, "search_figure", lambda *arguments: arguments)
     monkeypatch.setattr(tuning, "png", lambda drawn: drawn)
     search = Search(
