@@ -115,8 +115,11 @@ def second(x):
 
 
 def test_a_kernel_runs_its_own_copy_of_its_callees(tmp_path):
-    """Copies of one function differ by rounding; here by a factor, so that it is seen
-    on any machine."""
+    """Whatever was loaded or compiled before.
+
+    Copies of one function differ by rounding; here by a factor, so that it is seen on
+    any machine.
+    """
     (tmp_path / "own.py").write_text(OWN)
 
     def run(factor, code):
@@ -144,7 +147,7 @@ def test_kernels_compile_where_no_cache_can_be_written(package):
         ) == (2.0, False)
 
 
-def test_a_kernels_stamp_covers_just_its_constants_and_callees():
+def test_a_kernels_stamp_covers_only_its_constants_and_callees():
     import gpmpc.qp._dual_active_set
     import gpmpc.qp._primal_active_set
 

@@ -10,6 +10,8 @@ from gpmpc._compiling import report_compilation
 
 
 def test_compiling_is_announced_once_with_its_time(capsys):
+    """A call of what is compiled already is not announced."""
+
     @numba.njit
     def inner(x):
         return x + 1

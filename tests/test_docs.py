@@ -219,6 +219,7 @@ def public(module):
 
 
 def test_every_name_that_is_offered_or_used_is_documented():
+    """Offered by a room, or used by settings, pages and examples."""
     listed = [
         importlib.import_module(name)
         for name in re.findall(r"^   (gpmpc[\w.]*)$", read("docs/api.md"), re.MULTILINE)

@@ -84,7 +84,7 @@ def test_the_example_of_a_log_learns_and_leaves_a_figure(tmp_path, capsys):
 
 
 @pytest.mark.slow
-def test_a_mujoco_quadrotor_flies_better_by_its_logs(tmp_path):
+def test_a_mujoco_quadrotor_flies_better_by_logs_than_data_sheet(tmp_path):
     pytest.importorskip("mujoco")
     found = runpy.run_path(str(EXAMPLES / "mujoco_flight.py"))["main"](tmp_path)
     assert (

@@ -302,7 +302,7 @@ def test_an_ordinary_flights_settings_describe_the_same_flight(words):
     assert {*experiment.controller.keywords} == {*expected.controller.keywords}
 
 
-def test_a_trusted_package_may_call_just_its_own_code(folder, monkeypatch):
+def test_a_trusted_package_may_call_only_its_own_code(folder, monkeypatch):
     monkeypatch.chdir(folder)
     monkeypatch.setattr(sys, "path", [*sys.path])
     monkeypatch.delitem(sys.modules, CANARY, raising=False)
@@ -438,6 +438,7 @@ def read_hostile(folder, told):
 
 
 def test_twelve_hostile_files_are_refused_and_none_acts(folder, tmp_path_factory):
+    """Nothing is imported, called or written."""
     from gpmpc.models import save_model
     from tests.gp.small_models import residual_model
     from tests.models.test_hostile_models import six_hostile_models

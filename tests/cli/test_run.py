@@ -71,6 +71,7 @@ def test_a_sweep_names_lost_flights_and_those_flown_before(tmp_path):
 
 
 def test_a_flight_is_predicted_or_one_line_says_why_not(tmp_path, monkeypatch, capsys):
+    """So is a flight filmed, or one line says why not."""
     assert forked("run", *TINY, "steps=9", cwd=tmp_path).returncode == 0
     done = forked("calibrate", "tree", "--steps", "12", "--json", cwd=tmp_path)
     assert done.returncode == 0, done.stderr

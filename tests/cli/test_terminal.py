@@ -155,7 +155,7 @@ def test_the_version_names_what_computes_at_every_place(tmp_path):
     )
 
 
-def test_standard_output_holds_just_json_and_nothing_if_quiet(tmp_path):
+def test_standard_output_holds_only_json_and_nothing_if_quiet(tmp_path):
     run = ["run", *TINY, "folder=tree"]
     flown = forked(*run, "--json", cwd=tmp_path)
     assert flown.returncode == 0, flown.stderr

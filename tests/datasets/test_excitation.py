@@ -54,7 +54,7 @@ def test_the_seed_decides_the_flight():
     assert not np.array_equal(first, other)
 
 
-def test_a_model_learns_the_inputs_effect_just_with_dither():
+def test_a_model_learns_the_inputs_effect_only_with_dither():
     def error(dither):
         source = replace(DATA, translational=replace(OUTER, dither=dither))
         data = source.transitions(POSITION, Elliptical())

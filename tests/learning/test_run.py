@@ -10,7 +10,7 @@ from tests.cli.command import forked
 TINY = ["model.restarts=0", "horizon=3", f"noise.process={[0.01] * 6}".replace(" ", "")]
 
 
-def test_a_recorded_flight_shows_its_learning_and_repeats(tmp_path):
+def test_a_recorded_flight_shows_when_it_learned_and_repeats(tmp_path):
     gust = (
         "disturbances=[{_target_: gpmpc.simulation.Gust, rates: {vx: 0.5}, start: 10}]"
     )

@@ -111,7 +111,7 @@ def test_a_seeds_rows_are_nested_and_in_the_flights_order():
     assert set(places[0]) < set(places[1])
 
 
-def test_a_model_loop_needs_no_plant_a_true_model_no_data():
+def test_a_model_loop_needs_no_plant_and_a_true_model_no_data():
     flown = run_trial(experiment(loop="model"))
     assert np.trace(flown.rollout.covariances[-1]) > 0
     known = run_trial(experiment(controller=ON_THE_PLANT, data=None))
@@ -205,7 +205,7 @@ def test_an_offset_and_a_short_flight_are_no_loss(trajectory):
         assert numbers(experiment(trajectory=trajectory, steps=steps))["lost"] is None
 
 
-def test_a_plan_holds_process_noise_just_with_its_covariances():
+def test_a_plan_holds_process_noise_if_its_covariances_do():
     noisy = Noise(process=[1e-3] * 6)
     latent = Linearization(process_noise=False)
     for settings, expected in (

@@ -130,7 +130,7 @@ def test_a_run_counts_with_its_default_settings(tmp_path):
     assert found.cells == (("5",), ("10",))  # numbers by their size
 
 
-def test_all_documents_hold_equal_numbers_and_the_page_is_alone(tree):
+def test_documents_agree_and_the_page_needs_no_other_file(tree):
     found = report(tree)
     written = documents(found)
     rows = list(csv.DictReader(io.StringIO(written["report.csv"])))

@@ -398,6 +398,7 @@ def test_where_a_run_comes_from_is_told_as_far_as_it_says_so(
 
 
 def test_a_figure_has_a_curve_for_each_other_varied_setting(tmp_path, monkeypatch):
+    """Fewer settings make curves where all of them would make too many."""
     monkeypatch.setattr(reporting, "over_variable", lambda *arguments: arguments)
     monkeypatch.setattr(reporting, "png", lambda drawn: drawn)
     errors = {}
@@ -466,6 +467,7 @@ def test_a_figure_has_a_curve_for_each_other_varied_setting(tmp_path, monkeypatc
 
 
 def test_figures_of_one_setting_have_one_curve_and_own_names(tmp_path, monkeypatch):
+    """A name that would be an existing file gets a number."""
     monkeypatch.setattr(reporting, "over_variable", lambda *arguments: arguments)
     monkeypatch.setattr(reporting, "png", lambda drawn: drawn)
     for value in (1, 2):

@@ -274,7 +274,7 @@ def test_the_metrics_of_a_flight_are_written_out_in_full():
     assert measured(rollout_of(errors))["times"]["training"] is None
 
 
-def test_a_loss_is_dated_by_its_first_step_divergence_apart():
+def test_a_loss_is_dated_by_its_first_step_beyond_the_limit():
     errors = [[0, 0, 0], [0, 0, 9], [0, 0, 12], [0, 40, 0]]
     far = "12 m from its reference, more than 10 m"
     assert measured(rollout_of(errors))["lost"] == {

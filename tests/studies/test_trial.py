@@ -93,6 +93,7 @@ def test_a_flight_has_references_for_all_that_its_last_plan_sees(loops):
 
 
 def test_a_flight_begins_where_the_plant_says(loops):
+    """A plant that keeps its own state is given no start."""
     began = replace(PLANT, start=tuple(range(6)))
     run_trial(experiment(system=began))
     assert loops[0][3] == loops[1][0][3] == tuple(range(6))
@@ -300,7 +301,7 @@ def test_data_have_the_systems_dimensions_and_the_asked_rows():
         ),
     ],
 )
-def test_misfits_are_refused_before_anything_is_learned(changes, message):
+def test_settings_that_do_not_fit_are_refused_before_learning(changes, message):
     with pytest.raises(SettingError, match=message):
         experiment(**changes)
 

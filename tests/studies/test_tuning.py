@@ -90,7 +90,7 @@ def test_nothing_matters_where_there_is_nothing_to_tell_apart(space, costs):
     assert search.importances() == {}
 
 
-def test_numbers_are_drawn_evenly_by_their_kind_of_scale():
+def test_numbers_are_drawn_on_a_linear_or_logarithmic_scale():
     ranges = {
         "even": Interval(1.0, 1e4), "log": Interval(1.0, 1e4, logarithmic=True),
         "whole": Interval(1, 10**4, whole=True), "whole log": Interval(1, 10**4, logarithmic=True, whole=True),
@@ -105,7 +105,7 @@ def test_numbers_are_drawn_evenly_by_their_kind_of_scale():
         assert {type(value) for value in values} == {int if interval.whole else float}
 
 
-def test_a_document_holds_the_ten_best_and_the_data_all(monkeypatch):
+def test_a_document_holds_the_ten_best_and_the_data_holds_all(monkeypatch):
     monkeypatch.setattr(tuning, "search_figure", lambda *arguments: arguments)
     monkeypatch.setattr(tuning, "png", lambda drawn: drawn)
     search = Search(
