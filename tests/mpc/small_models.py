@@ -5,6 +5,10 @@ import torch
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior
 
+# The choices of PredictionSettings.
+FORMS = ("trajectory", "velocity")
+COVARIANCES = ("full", "diagonal", "zero_order", "none")
+
 
 class LinearGaussian:
     """x+ = A x + B u + c + w, w ~ N(0, W)."""

@@ -10,6 +10,7 @@ from gpmpc.mpc import GPMPC, Box, PredictionSettings, Problem, Reference, Tracki
 from gpmpc.mpc._linearization import StageLinearizer
 from gpmpc.propagation import Linearization, MeanEquivalence, MomentMatching, Unscented
 from gpmpc.status import Status
+from tests.mpc.small_models import FORMS
 from tests.mpc.systems import HOVER, linear_gaussian, quadrotor_gp
 
 H = 3
@@ -24,7 +25,6 @@ MODES = [
     ("full", MomentMatching()),
     ("full", Unscented()),
 ]
-FORMS = ["velocity", "trajectory"]
 
 
 def controller(form, covariance, propagator, model=GP, feedback=True, **settings):

@@ -10,8 +10,15 @@ import torch
 from gpmpc.exceptions import SettingError
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import backend
-from gpmpc.mpc import GPMPC, Box, PredictionSettings, Problem, Reference, Tracking
-from gpmpc.mpc._policy import decide
+from gpmpc.mpc import (
+    GPMPC,
+    Box,
+    ControlLoop,
+    PredictionSettings,
+    Problem,
+    Reference,
+    Tracking,
+)
 from gpmpc.mpc.baselines import StateFormMPC
 from gpmpc.propagation import Linearization, MomentMatching
 from gpmpc.status import Status
@@ -118,11 +125,11 @@ def test_what_was_applied_counts_and_not_what_was_planned():
 def test_a_missing_measurement_leaves_the_estimate_unchanged():
     asked = controller(disturbance_gain=1.0)
     states, _ = flown(asked, steps=5)
-    last = decide(asked, Gaussian.certain(states[-1]), AT_REST, None, "previous_plan")
-    last = replace(last, plan=replace(last.plan, disturbance=UNKNOWN))
-    blind = decide(
-        asked, Gaussian.certain(np.full(2, np.nan)), AT_REST, last, "previous_plan"
-    )
+    loop = ControlLoop(asked)
+    loop.input(states[-1], AT_REST)
+    loop.last = replace(loop.last, plan=replace(loop.last.plan, disturbance=UNKNOWN))
+    loop.input(np.full(2, np.nan), AT_REST)
+    blind = loop.last
     assert blind.status is Status.INVALID_MEASUREMENT
     assert np.array_equal(blind.plan.disturbance, UNKNOWN)
 

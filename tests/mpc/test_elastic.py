@@ -8,7 +8,6 @@ import torch
 from gpmpc.gaussian import Gaussian
 from gpmpc.models import KnownModel
 from gpmpc.mpc import GPMPC, Box, PredictionSettings, Problem, Reference, Tracking
-from gpmpc.mpc._elastic import WORTH
 from gpmpc.propagation import Linearization
 from gpmpc.status import Status
 from tests.mpc.small_models import LinearGaussian
@@ -54,7 +53,7 @@ def test_where_it_cannot_its_price_cannot_outweigh_the_cost(start, form):
     # The deviation that a violation is beside the reference counts as well.
     missed = np.maximum(0.0, free.means[1:, 0] - 0.5)
     scale = 2 * free.cost + (missed**2).sum()
-    assert elastic.cost <= free.cost + WORTH * scale
+    assert elastic.cost <= free.cost + 2 * scale  # what violations may cost at most
     assert exact.cost > 1.2 * elastic.cost
     assert outside.sum() < missed.sum()
     assert np.abs(elastic.inputs).max() < np.abs(exact.inputs).max()

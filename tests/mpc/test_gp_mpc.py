@@ -19,13 +19,12 @@ from gpmpc.mpc import (
     Tracking,
     gp_mpc,
 )
-from gpmpc.mpc._linear_quadratic import COVARIANCES
-from gpmpc.mpc._linearization import FORMS
 from gpmpc.mpc.baselines import NMPC
 from gpmpc.propagation import Linearization, MeanEquivalence, MomentMatching, rollout
 from gpmpc.qp import CvxpySolver, DualActiveSet
 from gpmpc.status import Status
 from gpmpc.systems import step
+from tests.mpc.small_models import COVARIANCES, FORMS
 from tests.mpc.systems import (
     HOVER,
     QUADROTOR,

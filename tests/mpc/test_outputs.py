@@ -21,12 +21,11 @@ from gpmpc.mpc import (
     Reference,
     Tracking,
 )
-from gpmpc.mpc._linear_quadratic import COVARIANCES
-from gpmpc.mpc._linearization import FORMS
 from gpmpc.mpc.baselines import LQR, NMPC, StateFormMPC
 from gpmpc.propagation import Linearization
 from gpmpc.status import Status
 from tests.mpc.double_pendulum import ACROBOT, DoublePendulum
+from tests.mpc.small_models import COVARIANCES, FORMS
 from tests.mpc.systems import LinearPlant, linear_gaussian
 
 H = 7

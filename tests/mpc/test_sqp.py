@@ -8,11 +8,10 @@ import torch
 
 from benchmarks.kkt import Instance, kkt_residual
 from benchmarks.pendulums import pendulum_gp
-from gpmpc._dynamics import Linearized
 from gpmpc.exceptions import DataError
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior, backend
-from gpmpc.models import CasadiFunction, KnownModel
+from gpmpc.models import CasadiFunction, KnownModel, Linearized
 from gpmpc.mpc import (
     GPMPC,
     Box,

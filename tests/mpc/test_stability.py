@@ -8,11 +8,10 @@ import pytest
 import torch
 
 from benchmarks.horizons import TANK_GOAL, VOLTAGES, quadruple_tank, true_model
-from gpmpc._dynamics import linearize
 from gpmpc.exceptions import SettingError
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import Trainer, Transitions
-from gpmpc.models import Affine, DelayedModel, DisturbedModel, KnownModel
+from gpmpc.models import Affine, DelayedModel, DisturbedModel, KnownModel, linearize
 from gpmpc.mpc import (
     GPMPC,
     Box,

@@ -8,13 +8,12 @@ import pytest
 from gpmpc.exceptions import SettingError
 from gpmpc.gaussian import Gaussian
 from gpmpc.mpc import GPMPC, Box, PredictionSettings, Problem, Reference, Tracking
-from gpmpc.mpc._linear_quadratic import COVARIANCES
-from gpmpc.mpc._linearization import FORMS
 from gpmpc.mpc.baselines import StateFormMPC
 from gpmpc.propagation import Linearization, MeanEquivalence
 from gpmpc.qp import CvxpySolver
 from gpmpc.status import Status
 from gpmpc.systems import step
+from tests.mpc.small_models import COVARIANCES, FORMS
 from tests.mpc.systems import HOVER, QUADROTOR, quadrotor_gp
 
 H = 3

@@ -12,8 +12,6 @@ from fractions import Fraction
 
 import numpy as np
 
-from gpmpc.qp._problem import ABSENT
-
 
 def exact_solution(problem, lower=None, upper=None):
     """The minimiser (n,) as Fractions, or None if no point is feasible.
@@ -101,7 +99,8 @@ def solve_linear(A, B):
 
 
 def _bounds(values):
-    return [None if abs(v) >= ABSENT else Fraction(float(v)) for v in values]
+    """Bounds as fractions; one of size 1e20 or more is none."""
+    return [None if abs(v) >= 1e20 else Fraction(float(v)) for v in values]
 
 
 def _excess(value, low, high):

@@ -6,10 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from gpmpc.cli._experiment import experiment_of
-from gpmpc.cli._settings import compose, settings
 from gpmpc.studies.flight import metrics, run_trial
 from gpmpc.studies.study import one_thread
+from tests.systems.experiments import experiment
 
 pytest.importorskip("gymnasium")
 pytest.importorskip("mujoco")
@@ -43,10 +42,7 @@ class ToAndFro:
 
 
 def flown(seed):
-    with settings():
-        chosen = experiment_of(
-            compose("run", [*WORDS, f"seed={seed}", f"data.seed={seed}"])
-        )
+    chosen = experiment(*WORDS, f"seed={seed}", f"data.seed={seed}")
     chosen = replace(chosen, trajectory=ToAndFro())
     with one_thread():
         return chosen, run_trial(chosen)

@@ -8,12 +8,11 @@ import pytest
 
 pytest.importorskip("mujoco")
 
-from gpmpc.cli._experiment import experiment_of
-from gpmpc.cli._settings import compose, settings
 from gpmpc.exceptions import SettingError
 from gpmpc.studies.flight import metrics, run_trial
 from gpmpc.systems import step
 from gpmpc.systems.mujoco_quadrotor import RigidBody, mujoco_quadrotor
+from tests.systems.experiments import experiment
 
 
 def test_states_and_joint_positions_are_of_one_attitude(rng):
@@ -59,10 +58,7 @@ def test_wind_pushes_by_drag_and_thrusts_may_act_late():
 
 
 def test_it_is_flown_from_the_command_line_on_its_data_sheet():
-    with settings():
-        chosen = experiment_of(
-            compose("run", ["system=mujoco_quadrotor", "data.samples=60", "steps=60"])
-        )
+    chosen = experiment("system=mujoco_quadrotor", "data.samples=60", "steps=60")
     flown = run_trial(chosen)
     found = metrics(chosen, flown)
     assert found["lost"] is None

@@ -5,15 +5,9 @@ import numpy as np
 import pytest
 import torch
 
-from gpmpc.cli._experiment import experiment_of
-from gpmpc.cli._settings import compose, settings
 from gpmpc.studies.flight import metrics, run_trial
 from gpmpc.studies.study import one_thread
-
-
-def experiment(*words):
-    with settings():
-        return experiment_of(compose("run", list(words)))
+from tests.systems.experiments import experiment
 
 
 def flown_up(name, *words):
