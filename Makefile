@@ -40,7 +40,7 @@ lint: $(ENV)  ## Format check, linter, import contracts and types
 bench: $(ENV)  ## What everything costs on this machine, beside others; some of it: make bench ONLY="peers qp"
 	for name in $(ONLY); do .venv/bin/python -m benchmarks.$$name || exit 1; done
 
-guard: $(ENV)  ## Whether anything became slower, against reference kernels in the same run
+guard: $(ENV)  ## Whether anything became slower since the last commit, both timed in turns
 	.venv/bin/python -m benchmarks.guard
 
 docs: $(ENV)  ## The documentation as a site in docs/_build; a warning is an error

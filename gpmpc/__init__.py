@@ -6,4 +6,4 @@ The packages, from the ground up: ``gp`` (Gaussian processes), ``qp`` (quadratic
 ``logs``, ``plotting``, ``studies``, ``experiments`` (the published results), ``cli``.
 """
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
