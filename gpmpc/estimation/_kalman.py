@@ -48,7 +48,7 @@ from gpmpc.exceptions import SettingError, ShapeError, check_number, check_numbe
 from gpmpc.gaussian import Gaussian, check_tensors
 from gpmpc.models._nominal import linearize_function
 from gpmpc.propagation import Linearization, Propagator, Unscented
-from gpmpc.propagation._propagator import checked_input
+from gpmpc.propagation._propagator import checked_arguments
 from gpmpc.signals import signals_of
 
 
@@ -302,7 +302,7 @@ class KalmanFilter:
         """Computes what sensors show of a belief (*batch, n), without their noise."""
         root = covariance_root(belief.covariance)
         if getattr(self.observer, "first_order", False):
-            nothing = checked_input(self.measurement, belief, None)
+            nothing = checked_arguments(self.measurement, belief, None)
             value, H, _ = predict_with_jacobian(self.measurement, belief.mean, nothing)
             seen = H @ root
             return _View(

@@ -21,12 +21,15 @@ from gpmpc.propagation._propagator import (
     NoisyPropagator,
     Propagation,
     Sensitivity,
-    checked_input,
+    checked_arguments,
 )
 
 
-class Expansion(NamedTuple):
-    """A model around certain states and inputs."""
+class SecondOrderExpansion(NamedTuple):
+    """A model around certain states and inputs.
+
+    The mean is expanded to second order, the variance to first.
+    """
 
     belief: Gaussian  # the prediction there
     A: Tensor  # the mean's derivative by the state (*batch, k, n)
@@ -37,13 +40,15 @@ class Expansion(NamedTuple):
     mean_by_state_input: Tensor  # (*batch, k, n, m)
 
 
-def expand(model: Any, state: Tensor, input: Tensor) -> Expansion | None:
+def expand_to_second_order(
+    model: Any, state: Tensor, input: Tensor
+) -> SecondOrderExpansion | None:
     """Expands GPs alone by the compiled loops, at states (*batch, n) and inputs.
 
     Returns None for other models, and where those loops cannot evaluate.
     """
     form = getattr(model, "affine_form", None)
-    if form is None or form.B is not None:
+    if form is None or form.B is not None or form.G is not None or form.c is not None:
         return None
     gp = form.f
     arrays = host_arrays(gp.weights, state, input)
@@ -63,9 +68,9 @@ def expand(model: Any, state: Tensor, input: Tensor) -> Expansion | None:
     mean = tensor(at.M) + gp.offset
     A = tensor(at.J)
     if form.A is not None:
-        mean = mean + state
+        mean = mean + state @ form.A.mT
         A = A + form.A
-    return Expansion(
+    return SecondOrderExpansion(
         belief=Gaussian(mean, torch.diag_embed(tensor(at.variance))),
         A=A,
         B=tensor(at.dM_du),
@@ -86,8 +91,8 @@ class Linearization(NoisyPropagator):
         self, model: Any, belief: Gaussian, input: Tensor | None = None
     ) -> tuple[Propagation, Sensitivity] | None:
         """Propagates with all derivatives in closed form; None where there is none."""
-        input = checked_input(model, belief, input)
-        expansion = expand(model, belief.mean, input)
+        input = checked_arguments(model, belief, input)
+        expansion = expand_to_second_order(model, belief.mean, input)
         if expansion is None:
             return None
         A = expansion.A
@@ -128,7 +133,7 @@ class MeanEquivalence(NoisyPropagator):
         self, model: Any, belief: Gaussian, input: Tensor | None = None
     ) -> tuple[Propagation, Sensitivity] | None:
         """Propagates with all derivatives in closed form; None where there is none."""
-        input = checked_input(model, belief, input)
+        input = checked_arguments(model, belief, input)
         certain = Gaussian(belief.mean, torch.zeros_like(belief.covariance))
         first_order = Linearization(self.process_noise)
         result = first_order.differentiate(model, certain, input)

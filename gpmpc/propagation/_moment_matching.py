@@ -23,8 +23,13 @@ from torch import Tensor
 from gpmpc.exceptions import UnsupportedModel
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp._backend import host_arrays
-from gpmpc.gp._posterior import AffineForm
-from gpmpc.propagation._moments import Latent, moments, moments_with_jacobian
+from gpmpc.gp._posterior import AffineForm, GPPosterior
+from gpmpc.propagation._moments import (
+    LatentDerivatives,
+    LatentMoments,
+    moments,
+    moments_with_jacobian,
+)
 from gpmpc.propagation._points import Unscented
 from gpmpc.propagation._propagator import (
     NextMoments,
@@ -32,7 +37,7 @@ from gpmpc.propagation._propagator import (
     Propagation,
     Propagator,
     Sensitivity,
-    checked_input,
+    checked_arguments,
 )
 
 
@@ -57,10 +62,10 @@ class MomentMatching(NoisyPropagator):
         self, model: Any, belief: Gaussian, input: Tensor | None = None
     ) -> tuple[Propagation, Sensitivity]:
         """Propagates with all derivatives in closed form, compiled or by torch."""
-        input = checked_input(model, belief, input)
+        input = checked_arguments(model, belief, input)
         form = _exact_form(model)
-        f = self._latent_moments(form, belief, input, derivatives=True)
-        sensitivity = _derivatives(form, belief.covariance, f)
+        f, df = self._latent_moments_with_jacobian(form, belief, input)
+        sensitivity = _derivatives(form, belief.covariance, input.shape[-1], f, df)
         if self.diagonal:
             sensitivity = _of_diagonal(sensitivity)
         next_moments = _through_affine_part(form, belief, input, f)
@@ -68,39 +73,48 @@ class MomentMatching(NoisyPropagator):
 
     def _next_moments(self, model: Any, belief: Gaussian, input: Tensor) -> NextMoments:
         form = _exact_form(model)
-        f = self._latent_moments(form, belief, input, derivatives=False)
+        f = self._latent_moments(form, belief, input)
         return _through_affine_part(form, belief, input, f)
 
     def _latent_moments(
-        self, form: AffineForm, belief: Gaussian, input: Tensor, derivatives: bool
-    ) -> Latent:
-        """Returns the moments of f at the states and inputs that it depends on."""
-        f = form.f
-        if form.states is not None:
-            S = belief.covariance[..., form.states, :][..., form.states]
-            belief = Gaussian(belief.mean[..., form.states], S)
-            input = input[..., form.inputs]
-        arrays = host_arrays(f.weights, belief.mean, belief.covariance, input)
-        if arrays is not None:
-            _, mean, covariance, control = arrays
-            return self._compiled_moments(f, mean, covariance, control, derivatives)
-        if derivatives:
-            return moments_with_jacobian(
-                f,
-                belief,
-                input,
-                diagonal=self.diagonal,
-                slope_derivatives=form.A is not None,
-            )
-        matched = moments(f, belief, input, self.diagonal)
-        return Latent(M=matched.M, V=matched.V, J=matched.J)
+        self, form: AffineForm, belief: Gaussian, input: Tensor
+    ) -> LatentMoments:
+        """Returns the moments of f."""
+        x, u = _arguments_of_gps(form, belief, input)
+        compiled = self._compiled_moments(form.f, x, u, derivatives=False)
+        if compiled is not None:
+            return compiled[0]
+        return moments(form.f, x, u, self.diagonal)
+
+    def _latent_moments_with_jacobian(
+        self, form: AffineForm, belief: Gaussian, input: Tensor
+    ) -> tuple[LatentMoments, LatentDerivatives]:
+        """Returns the moments of f, and their derivatives."""
+        x, u = _arguments_of_gps(form, belief, input)
+        compiled = self._compiled_moments(form.f, x, u, derivatives=True)
+        if compiled is not None:
+            return compiled
+        return moments_with_jacobian(
+            form.f,
+            x,
+            u,
+            diagonal=self.diagonal,
+            slope_derivatives=form.A is not None,
+        )
 
     def _compiled_moments(
-        self, f: Any, mean: Any, covariance: Any, control: Any, derivatives: bool
-    ) -> Latent:
-        """Returns the moments of f at mean (*batch, n), by the compiled loops."""
+        self, f: GPPosterior, belief: Gaussian, input: Tensor, derivatives: bool
+    ) -> tuple[LatentMoments, LatentDerivatives] | None:
+        """Returns the moments of f by the compiled loops; None where torch has to.
+
+        Without ``derivatives`` the tensors of the derivatives are empty.
+        """
+        arrays = host_arrays(f.weights, belief.mean, belief.covariance, input)
+        if arrays is None:
+            return None
         from gpmpc import _kernels as kernels  # loads numba
 
+        _, mean, covariance, control = arrays
         batch = mean.shape[:-1]
         points = mean.reshape(-1, mean.shape[-1])
         H = len(points)
@@ -116,10 +130,12 @@ class MomentMatching(NoisyPropagator):
         def tensor(rows: kernels.Array) -> Tensor:
             return torch.from_numpy(rows.reshape(*batch, *rows.shape[1:]))
 
-        return Latent(
+        latent_moments = LatentMoments(
             M=tensor(matched.M).add_(f.offset),
             V=tensor(matched.V),
             J=tensor(matched.J),
+        )
+        latent_derivatives = LatentDerivatives(
             dM_dS=tensor(matched.dM_dS),
             dM_du=tensor(matched.dM_du),
             dV_dmu=tensor(matched.dV_dmu),
@@ -128,6 +144,7 @@ class MomentMatching(NoisyPropagator):
             dJ_dS=tensor(matched.dJ_dS),
             dJ_du=tensor(matched.dJ_du),
         )
+        return latent_moments, latent_derivatives
 
 
 def best_propagator(model: Any) -> Propagator:
@@ -152,8 +169,18 @@ def _exact_form(model: Any) -> AffineForm:
     return model.affine_form
 
 
+def _arguments_of_gps(
+    form: AffineForm, belief: Gaussian, input: Tensor
+) -> tuple[Gaussian, Tensor]:
+    """Returns the belief over the states x_s, and the inputs u_s, that f depends on."""
+    if form.states is None:
+        return belief, input
+    S = belief.covariance[..., form.states, :][..., form.states]
+    return Gaussian(belief.mean[..., form.states], S), input[..., form.inputs]
+
+
 def _through_affine_part(
-    form: AffineForm, belief: Gaussian, input: Tensor, f: Latent
+    form: AffineForm, belief: Gaussian, input: Tensor, f: LatentMoments
 ) -> NextMoments:
     """Returns mu+, Sigma+ and Cov[x, x+], by the module's text."""
     S = belief.covariance
@@ -165,75 +192,91 @@ def _through_affine_part(
         M = M @ form.B.mT
         V = form.B @ V @ form.B.mT
         C = C @ form.B.mT
+    nominal: Tensor | float = 0.0  # A mu + G u + c
+    if A is not None:
+        nominal = belief.mean @ A.mT
+    if form.G is not None:
+        nominal = nominal + input @ form.G.mT
+    if form.c is not None:
+        nominal = nominal + form.c
+    mean = M + nominal
     if A is None:
-        return NextMoments(mean=M, covariance=V, cross_covariance=C)
-    nominal = belief.mean  # of differences, where A = I
-    if form.G is not None and form.c is not None:
-        nominal = belief.mean @ A.mT + input @ form.G.mT + form.c
+        return NextMoments(mean=mean, covariance=V, cross_covariance=C)
     AC = A @ C
     return NextMoments(
-        mean=M + nominal,
+        mean=mean,
         covariance=A @ S @ A.mT + AC + AC.mT + V,
         cross_covariance=S @ A.mT + C,
     )
 
 
-def _derivatives(form: AffineForm, S: Tensor, f: Latent) -> Sensitivity:
-    """Returns the derivatives of mu+ and Sigma+ at a covariance S (*batch, n, n)."""
+def _derivatives(
+    form: AffineForm, S: Tensor, m: int, f: LatentMoments, df: LatentDerivatives
+) -> Sensitivity:
+    """Returns the derivatives of mu+ and Sigma+.
+
+    Args:
+        form: The model.
+        S: The belief's covariance (*batch, n, n).
+        m: Number of inputs.
+        f: The moments of the GPs.
+        df: Their derivatives.
+    """
     A = form.A
     n = S.shape[-1]
-    m = 0 if form.G is None else form.G.shape[1]
-    sensitivity = _derivatives_of_residual(form, f, n, m)  # of B M and B V B'
+    residual = _derivatives_of_residual(form, f, df, n, m)  # of B M and B V B'
+    if form.G is not None:
+        residual = replace(residual, mean_by_input=form.G + residual.mean_by_input)
     if A is None:
-        return sensitivity
-    J = sensitivity.mean_by_mean  # B J
-    mean_by_input = sensitivity.mean_by_input
-    # A C = (A S) J' B' changes with J ...
+        return residual
+    assert df.dJ_dS is not None  # those of J are computed where A is not zero
+    assert df.dJ_du is not None
+    BJ = residual.mean_by_mean
+    # Sigma+ has A C = A S (B J)' and its transpose. They change with J ...
     AS = A @ S
     if form.states is not None:
         AS = AS[..., form.states]
-    dJ_dS = _extend_matrix(f.dJ_dS, form.states, n)
-    by_mean = _doubled(form.B, AS, _extend(2 * f.dM_dS, form.states, n))
-    by_input = _doubled(form.B, AS, _extend(f.dJ_du, form.inputs, m))
+    dJ_dmu = 2 * df.dM_dS  # Price's theorem
+    dJ_dS = _extend_matrix(df.dJ_dS, form.states, n)
+    by_mean = _doubled(form.B, AS, _extend(dJ_dmu, form.states, n))
+    by_input = _doubled(form.B, AS, _extend(df.dJ_du, form.inputs, m))
     by_covariance = _doubled(form.B, AS, dJ_dS.flatten(-2))
     by_covariance = by_covariance.unflatten(-1, dJ_dS.shape[-2:])
-    # ... and A S A' + A S J' B' + B J S A' with S, at one J
-    outer = (
-        A[:, None, :, None] * (A + J)[..., None, :, None, :]
-        + J[..., :, None, :, None] * A[:, None, :]
-    )
+    # ... and, together with A S A', with S: A S (A + B J)' + B J S A', at one J
+    outer = torch.einsum("ic,...jd->...ijcd", A, A + BJ)
+    outer = outer + torch.einsum("...ic,jd->...ijcd", BJ, A)
     return Sensitivity(
-        mean_by_mean=A + J,
-        mean_by_covariance=sensitivity.mean_by_covariance,
-        mean_by_input=mean_by_input if form.G is None else form.G + mean_by_input,
-        covariance_by_mean=sensitivity.covariance_by_mean + by_mean,
-        covariance_by_covariance=sensitivity.covariance_by_covariance
+        mean_by_mean=A + BJ,
+        mean_by_covariance=residual.mean_by_covariance,
+        mean_by_input=residual.mean_by_input,
+        covariance_by_mean=residual.covariance_by_mean + by_mean,
+        covariance_by_covariance=residual.covariance_by_covariance
         + by_covariance
         + (outer + outer.mT) / 2,
-        covariance_by_input=sensitivity.covariance_by_input + by_input,
+        covariance_by_input=residual.covariance_by_input + by_input,
     )
 
 
 def _derivatives_of_residual(
-    form: AffineForm, f: Latent, n: int, m: int
+    form: AffineForm, f: LatentMoments, df: LatentDerivatives, n: int, m: int
 ) -> Sensitivity:
     """Returns the derivatives of B M and B V B' by all n states and m inputs."""
-    J = _extend(f.J, form.states, n)
-    dM_dS = _extend_matrix(f.dM_dS, form.states, n)
-    dM_du = _extend(f.dM_du, form.inputs, m)
-    dV_dmu = _extend(f.dV_dmu, form.states, n)
-    dV_dS = _extend_matrix(f.dV_dS, form.states, n)
-    dV_du = _extend(f.dV_du, form.inputs, m)
+    dM_dmu = _extend(f.J, form.states, n)
+    dM_dS = _extend_matrix(df.dM_dS, form.states, n)
+    dM_du = _extend(df.dM_du, form.inputs, m)
+    dV_dmu = _extend(df.dV_dmu, form.states, n)
+    dV_dS = _extend_matrix(df.dV_dS, form.states, n)
+    dV_du = _extend(df.dV_du, form.inputs, m)
     B = form.B
     if B is not None:
-        J = B @ J
+        dM_dmu = B @ dM_dmu
         dM_du = B @ dM_du
         dM_dS = torch.einsum("ia,...acd->...icd", B, dM_dS)
         dV_dmu = torch.einsum("ia,jb,...abc->...ijc", B, B, dV_dmu)
         dV_du = torch.einsum("ia,jb,...abc->...ijc", B, B, dV_du)
         dV_dS = torch.einsum("ia,jb,...abcd->...ijcd", B, B, dV_dS)
     return Sensitivity(
-        mean_by_mean=J,
+        mean_by_mean=dM_dmu,
         mean_by_covariance=dM_dS,
         mean_by_input=dM_du,
         covariance_by_mean=dV_dmu,

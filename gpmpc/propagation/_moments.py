@@ -25,9 +25,14 @@ summed, which loses nothing:
     (7)  T_a           = G_a S,   T_ab = (I + S (D_a + D_b))^-1 S
 
 (delta follows from T_ab - T_a = -T_ab D_b T_a.) The controls carry no uncertainty: they
-only weigh the points. A kernel is at most sf2, so that Q_ij <= sf2_a sf2_b
-exp(-delta_ij): where delta is large the pair counts for nothing, and the exponent may
-stay where exp does not overflow.
+only weigh the points.
+
+A kernel is at most sf2. So Q_ij is at most sf2_b q_ai and at most sf2_a q_bj, and
+
+    Q_ij^2 <= sf2_a sf2_b q_ai q_bj = sf2_a sf2_b Q_ij exp(-delta_ij)
+
+that is, Q_ij <= sf2_a sf2_b exp(-delta_ij): where delta is large the pair counts for
+nothing, and the exponent may stay where exp does not overflow.
 
 The mean and J have their derivatives in closed form, with dM/dS = 1/2 d2M/dmu2 (Price,
 1958). Those of V come from reverse mode: every pair of outputs has a copy of the belief
@@ -46,31 +51,26 @@ from gpmpc.gp import GPPosterior
 _LARGEST_DELTA = {torch.float64: 300.0, torch.float32: 80.0}
 #: numbers in the largest array that is made at once, for one pair of outputs at least
 _LARGEST_SIZE = 2**18
-_NOT_COMPUTED: Any = None
 
 
-class Moments(NamedTuple):
-    """Moments of f at x ~ N(mu, S)."""
+class LatentMoments(NamedTuple):
+    """Moments of the latent functions f at x ~ N(mu, S)."""
 
     M: Tensor  # E[f] (*batch, k)
     V: Tensor  # Cov[f] (*batch, k, k)
     J: Tensor  # E[df/dx] (*batch, k, n)
 
 
-class Latent(NamedTuple):
-    """Moments of f at x_s ~ N(mu_s, S_s), and their derivatives if they were wanted."""
+class LatentDerivatives(NamedTuple):
+    """Derivatives of ``LatentMoments`` by mu, S and u; dM/dmu is J."""
 
-    M: Tensor  # E[f] (*batch, k)
-    V: Tensor  # Cov[f] (*batch, k, k)
-    J: Tensor  # E[df/dx_s] (*batch, k, n_s)
-    dM_dS: Tensor = _NOT_COMPUTED  # (*batch, k, n_s, n_s), dJ/dmu / 2 (Price, 1958)
-    dM_du: Tensor = _NOT_COMPUTED  # (*batch, k, m_s)
-    dV_dmu: Tensor = _NOT_COMPUTED  # (*batch, k, k, n_s)
-    dV_dS: Tensor = _NOT_COMPUTED  # (*batch, k, k, n_s, n_s)
-    dV_du: Tensor = _NOT_COMPUTED  # (*batch, k, k, m_s)
-    # those of J are needed where A is not zero
-    dJ_dS: Tensor = _NOT_COMPUTED  # (*batch, k, n_s, n_s, n_s)
-    dJ_du: Tensor = _NOT_COMPUTED  # (*batch, k, n_s, m_s)
+    dM_dS: Tensor  # (*batch, k, n, n), dJ/dmu / 2 (Price, 1958)
+    dM_du: Tensor  # (*batch, k, m)
+    dV_dmu: Tensor  # (*batch, k, k, n)
+    dV_dS: Tensor  # (*batch, k, k, n, n)
+    dV_du: Tensor  # (*batch, k, k, m)
+    dJ_dS: Tensor | None  # (*batch, k, n, n, n); None where it was not wanted
+    dJ_du: Tensor | None  # (*batch, k, n, m); None where it was not wanted
 
 
 class _Point(NamedTuple):
@@ -117,10 +117,15 @@ class _Pairs(NamedTuple):
     a: list[int]
     b: list[int]
 
+    @property
+    def same(self) -> bool:
+        """Whether every pair is an output with itself."""
+        return self.a == self.b
+
 
 def moments(
     model: GPPosterior, belief: Gaussian, input: Tensor, diagonal: bool = False
-) -> Moments:
+) -> LatentMoments:
     """Returns the moments of the latent functions f at x ~ N(mu, S).
 
     Args:
@@ -136,8 +141,9 @@ def moments(
     J = (weighted[..., None, :] @ terms.z @ terms.G)[..., 0, :]  # (2)
     pairs = _pairs_at_once(model, belief, diagonal)
     entries = [_covariances(model, chunk, point) for chunk in pairs]  # (4)
-    V = _symmetric_from_pairs(entries, pairs, axis=belief.mean.dim() - 1)
-    return Moments(M=M + model.offset, V=V, J=J)
+    axis = belief.mean.dim() - 1
+    V = _symmetric_from_pairs(entries, pairs, model.output_dim, axis)
+    return LatentMoments(M=M + model.offset, V=V, J=J)
 
 
 def _output_terms(model: GPPosterior, a: Any, point: _Point) -> _OutputTerms:
@@ -173,19 +179,18 @@ def _covariances(model: GPPosterior, pairs: _Pairs, point: _Point) -> Tensor:
     """Returns V_ab (*batch, P) of P pairs of outputs, at their points; (4)."""
     a = pairs.a
     b = pairs.b
-    same = a[0] == b[0]
     D_a = model.lengthscales[a, : model.state_dim] ** -2
     D_b = model.lengthscales[b, : model.state_dim] ** -2
     of_a = _output_terms(model, a, point)
-    of_b = of_a if same else _output_terms(model, b, point)
+    of_b = of_a if pairs.same else _output_terms(model, b, point)
     joint = _condition(point.S, D_a + D_b)
     T = joint.T
     r = of_a.half_logdet + of_b.half_logdet - joint.half_logdet  # (6)
     delta_i = r[..., None] - _quadratic(of_a.z, T @ (D_b[:, :, None] * of_a.T)) / 2
-    delta_j = _quadratic(of_b.z, T @ (D_a[:, :, None] * of_b.T)) / 2
-    delta = of_a.z @ T @ of_b.z.mT + (delta_i[..., :, None] - delta_j[..., None, :])
+    delta_j = -_quadratic(of_b.z, T @ (D_a[:, :, None] * of_b.T)) / 2
+    delta = of_a.z @ T @ of_b.z.mT + (delta_i[..., :, None] + delta_j[..., None, :])
     centred = torch.expm1(delta.clamp_max(_LARGEST_DELTA[delta.dtype]))
-    if not same:
+    if not pairs.same:
         left = (model.weights[a] * of_a.q)[..., None, :]
         right = (model.weights[b] * of_b.q)[..., None]
         return (left @ centred @ right)[..., 0, 0]
@@ -216,7 +221,7 @@ def moments_with_jacobian(
     input: Tensor,
     diagonal: bool = False,
     slope_derivatives: bool = True,
-) -> Latent:
+) -> tuple[LatentMoments, LatentDerivatives]:
     """Returns the moments of f at x ~ N(mu, S), and their derivatives by mu, S and u.
 
     Args:
@@ -238,8 +243,8 @@ def moments_with_jacobian(
     M = weighted.sum(-1)
     weighted_w = weighted[..., None] * w
     J = weighted_w.sum(-2)
-    dJ_dS = _NOT_COMPUTED
-    dJ_du = _NOT_COMPUTED
+    dJ_dS = None
+    dJ_du = None
     if slope_derivatives:
         # sum_i beta_i q_i w_i w_i w_i, less the three products of A with J
         third = torch.stack(
@@ -251,10 +256,7 @@ def moments_with_jacobian(
         dJ_dS = third / 2
         dJ_du = weighted_w.mT @ c
     V = _covariances_with_gradient(model, belief, point, diagonal)
-    return Latent(
-        M=M + model.offset,
-        V=V.V,
-        J=J,
+    latent_derivatives = LatentDerivatives(
         dM_dS=(weighted_w.mT @ w - M[..., None, None] * A) / 2,
         dM_du=(weighted[..., None, :] @ c)[..., 0, :],
         dV_dmu=V.dmu,
@@ -263,6 +265,7 @@ def moments_with_jacobian(
         dJ_dS=dJ_dS,
         dJ_du=dJ_du,
     )
+    return LatentMoments(M=M + model.offset, V=V.V, J=J), latent_derivatives
 
 
 class _CovarianceGradient(NamedTuple):
@@ -284,7 +287,7 @@ def _covariances_with_gradient(
         chunks = [_gradient_of_pairs(model, chunk, point, axis) for chunk in pairs]
 
     def symmetric(entries: Sequence[Tensor]) -> Tensor:
-        return _symmetric_from_pairs(entries, pairs, axis)
+        return _symmetric_from_pairs(entries, pairs, model.output_dim, axis)
 
     return _CovarianceGradient(
         V=symmetric([chunk.V for chunk in chunks]),
@@ -335,7 +338,7 @@ def _pairs_at_once(
 
 
 def _symmetric_from_pairs(
-    entries: Sequence[Tensor], pairs: Sequence[_Pairs], axis: int
+    entries: Sequence[Tensor], pairs: Sequence[_Pairs], k: int, axis: int
 ) -> Tensor:
     """Returns the symmetric matrix (*batch, k, k, ...) of entries (*batch, P, ...).
 
@@ -345,7 +348,6 @@ def _symmetric_from_pairs(
     for chunk in pairs:
         for a, b in zip(chunk.a, chunk.b, strict=True):
             places[a, b] = len(places)
-    k = max(places)[0] + 1
     zero = len(places)  # the place of a zero behind all entries
     order = []
     for a in range(k):

@@ -26,13 +26,17 @@ from torch import Tensor
 from gpmpc._angles import angles_of, whole_turns
 from gpmpc.exceptions import SettingError, check_number
 from gpmpc.gaussian import Gaussian, square_root, square_root_differential
-from gpmpc.propagation._linearization import Expansion, expand, on_diagonal
+from gpmpc.propagation._linearization import (
+    SecondOrderExpansion,
+    expand_to_second_order,
+    on_diagonal,
+)
 from gpmpc.propagation._propagator import (
     NextMoments,
     NoisyPropagator,
     Propagation,
     Sensitivity,
-    checked_input,
+    checked_arguments,
 )
 
 # samples predicted at once: bounds the memory at about chunk * N * outputs numbers
@@ -99,12 +103,12 @@ class Unscented(NoisyPropagator):
         Returns None where the model has no closed ones. Where Sigma is singular its
         root has no derivative in the null space; zero is taken there.
         """
-        input = checked_input(model, belief, input)
+        input = checked_arguments(model, belief, input)
         eigenvalues, U = torch.linalg.eigh(belief.covariance)
         r = eigenvalues.clamp_min(0).sqrt()
         root = U @ (r[..., :, None] * U.mT)
         points = self._sigma_points(belief, root, input)
-        expansion = expand(model, points.states, points.inputs)
+        expansion = expand_to_second_order(model, points.states, points.inputs)
         if expansion is None:
             return None
         mean_by, covariance_by = self._derivatives(belief.dim, expansion)
@@ -121,7 +125,9 @@ class Unscented(NoisyPropagator):
         moments = self._moments(model, belief, points.steps, expansion.belief)
         return self._add_noise(model, moments), sensitivity
 
-    def _derivatives(self, n: int, expansion: Expansion) -> tuple[Tensor, Tensor]:
+    def _derivatives(
+        self, n: int, expansion: SecondOrderExpansion
+    ) -> tuple[Tensor, Tensor]:
         """Returns those of mean (*batch, k, p) and covariance (*batch, k, k, p).
 
         They are by the p parameters [mu, vec(root), u] of the points: point 1 + j moves

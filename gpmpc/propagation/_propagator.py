@@ -61,7 +61,12 @@ class Propagator(Protocol):
 
     A propagator with closed-form derivatives for a model has a method ``differentiate``
     with the arguments of ``propagate``, which returns the ``Propagation`` and its
-    ``Sensitivity``, or None where it has none.
+    ``Sensitivity``, or None where it has none. Two further attributes are optional, and
+    False where they are missing:
+
+    ``first_order``: it needs the model's mean, derivatives and variance at the belief's
+    mean alone; controllers and filters may then take these themselves.
+    ``diagonal``: it computes only the diagonal of the predicted covariance.
     """
 
     def propagate(
@@ -110,7 +115,7 @@ class NoisyPropagator(Propagator):
         self, model: Any, belief: Gaussian, input: Tensor | None = None
     ) -> Propagation:
         """Propagates a belief over one step; see ``Propagator.propagate``."""
-        input = checked_input(model, belief, input)
+        input = checked_arguments(model, belief, input)
         return self._add_noise(model, self._next_moments(model, belief, input))
 
     def _next_moments(self, model: Any, belief: Gaussian, input: Tensor) -> NextMoments:
@@ -163,7 +168,7 @@ def by_autograd(
 
     torch has to be able to follow both.
     """
-    input = checked_input(model, belief, input)
+    input = checked_arguments(model, belief, input)
     n = belief.dim
     k = model.output_dim
     batch = belief.mean.shape[:-1]
@@ -216,8 +221,8 @@ def by_autograd(
     return propagation, sensitivity
 
 
-def checked_input(model: Any, belief: Gaussian, input: Tensor | None) -> Tensor:
-    """Checks belief and control by the rules of ``Propagator.propagate``.
+def checked_arguments(model: Any, belief: Gaussian, input: Tensor | None) -> Tensor:
+    """Checks the belief and returns the control for its batch, by the rules of ``Propagator.propagate``.
 
     Values are checked where that is free: in host memory, outside torch's transforms.
 

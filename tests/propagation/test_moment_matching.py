@@ -8,7 +8,8 @@ import torch
 from gpmpc.exceptions import ShapeError
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior
-from gpmpc.propagation import MomentMatching
+from gpmpc.gp._posterior import AffineForm
+from gpmpc.propagation import Linearization, MomentMatching
 from gpmpc.propagation._moments import moments
 
 
@@ -359,3 +360,57 @@ def test_a_belief_of_another_dimension_is_refused():
         MomentMatching()(model(), belief(3), torch.zeros(1))
     with pytest.raises(ShapeError, match=r"got \(2,\) and \(2,\)"):
         MomentMatching()(model(), belief(), torch.zeros(2))
+
+
+class InAffineModel:
+    """GPs inside an affine model, of which only the form is read."""
+
+    def __init__(self, gp, **parts):
+        self.gp = gp
+        self.affine_form = AffineForm(gp, **parts)
+
+    def __getattr__(self, name):
+        return getattr(self.gp, name)
+
+
+A_MATRIX = torch.tensor([[0.9, 0.4], [-0.3, 0.8]])
+G_MATRIX = torch.tensor([[0.2], [0.7]])
+C_VECTOR = torch.tensor([0.5, -1.0])
+
+
+@pytest.mark.parametrize("diagonal", [False, True])
+@pytest.mark.parametrize("parts", ["A", "AG", "Ac", "G", "c", "Gc"])
+def test_a_missing_part_of_an_affine_form_is_zero(parts, diagonal):
+    gp = model()
+    at = belief()
+    u = torch.tensor([0.7])
+    values = {"A": A_MATRIX, "G": G_MATRIX, "c": C_VECTOR}
+    some = {name: values[name] for name in parts}
+    zeros = {name: torch.zeros_like(value) for name, value in values.items()}
+    propagator = MomentMatching(diagonal=diagonal)
+    result, slopes = propagator.differentiate(InAffineModel(gp, **some), at, u)
+    expected, all_slopes = propagator.differentiate(
+        InAffineModel(gp, **(zeros | some)), at, u
+    )
+    of_gps = propagator.propagate(gp, at, u)
+    affine = {**zeros, **some}
+    mean = of_gps.belief.mean + affine["A"] @ at.mean + affine["G"] @ u + affine["c"]
+    assert torch.allclose(result.belief.mean, mean, atol=1e-14)
+    assert torch.allclose(result.belief.mean, expected.belief.mean, atol=1e-14)
+    assert torch.allclose(
+        result.belief.covariance, expected.belief.covariance, atol=1e-14
+    )
+    for name, slope in vars(slopes).items():
+        assert torch.allclose(slope, getattr(all_slopes, name), atol=1e-14)
+
+
+def test_gps_with_a_matrix_a_alone_are_linearized_with_it():
+    gp = model()
+    at = belief()
+    u = torch.tensor([0.7])
+    result, slopes = Linearization().differentiate(InAffineModel(gp, A=A_MATRIX), at, u)
+    alone, slopes_alone = Linearization().differentiate(gp, at, u)
+    mean = alone.belief.mean + A_MATRIX @ at.mean
+    assert torch.allclose(result.belief.mean, mean, atol=1e-14)
+    by_mean = slopes_alone.mean_by_mean + A_MATRIX
+    assert torch.allclose(slopes.mean_by_mean, by_mean, atol=1e-14)
