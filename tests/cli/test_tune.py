@@ -12,7 +12,6 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 
 from gpmpc.cli._tune import _cost
 from gpmpc.exceptions import DataError
-from gpmpc.studies._run_folder import RECORDING
 from tests.cli.command import forked
 from tests.recording import runs
 
@@ -132,7 +131,7 @@ def test_the_help_of_tune_can_be_typed(tmp_path):
 
 
 def test_a_flight_of_which_steps_are_lost_has_no_cost(tmp_path):
-    path = tmp_path / RECORDING
+    path = tmp_path / "run.mcap"
     runs.record_run(path, steps=20)
     folder = SimpleNamespace(finished=True, path=tmp_path, result=dict)
     cost = SimpleNamespace(Q=np.eye(6), R=np.eye(3), angles=())

@@ -1,11 +1,11 @@
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 
-from gpmpc.cli._settings import config_folder
 from gpmpc.datasets import Excitation, ExcitedData
 from gpmpc.exceptions import SettingError
 from gpmpc.systems import pendulum, rotational, step, translational
@@ -18,6 +18,7 @@ INNER = Excitation(
     [1] * 6, [1] * 3, [0, 0, 0], dither=[0.05] * 3, noise=[1e-4, 1e-3] * 3
 )
 DATA = ExcitedData(OUTER, INNER, samples=60)
+CONF = Path(__file__).resolve().parents[2] / "conf"
 POSITION = translational()
 ATTITUDE = rotational(substeps=1)
 
@@ -80,7 +81,7 @@ def test_a_frozen_attitude_can_be_flown():
 
 
 def test_the_settings_that_ship_are_these():
-    with initialize_config_dir(str(config_folder()), version_base="1.3"):
+    with initialize_config_dir(str(CONF), version_base="1.3"):
         config = compose("tables", ["data=excited", "data.samples=60"])
     shipped = instantiate(config.data, _convert_="all")
     assert isinstance(shipped, ExcitedData)

@@ -1,13 +1,16 @@
 """Runs that were never flown, in the folders and with the content that real ones have."""
 
+import io
 import json
 from types import SimpleNamespace
 
 import numpy as np
+from rich.console import Console
 
 from gpmpc.mpc import Box, Timing
 from gpmpc.simulation import Rollout
 from gpmpc.status import Status
+from gpmpc.studies._document import terminal
 from gpmpc.studies._run_folder import PLAN, RunFolder, folder_name, record
 from gpmpc.studies.flight import Experiment, Flown, metrics
 from gpmpc.studies.report import report_document
@@ -43,10 +46,27 @@ def metrics_of(error, steps=20, failing=0, constraints=()):
     )
 
 
+def folder_of(tree, choices):
+    """The folder of the run of some choices in a tree."""
+    return tree / folder_name(choices)
+
+
+def record_of(settings, choices=()):
+    """What a run with settings keeps about itself."""
+    return record(list(choices), settings, "gpmpc run")
+
+
+def on_terminal(table, width):
+    """The text of a table on a terminal of ``width`` columns."""
+    stream = io.StringIO()
+    Console(file=stream, width=width).print(terminal([table]))
+    return stream.getvalue()
+
+
 def made_up_run(tree, choices, settings, result=None, error=None):
-    folder = RunFolder(tree / folder_name(choices))
+    folder = RunFolder(folder_of(tree, choices))
     folder.path.mkdir(parents=True)
-    about = record(choices, settings, "gpmpc run")
+    about = record_of(settings, choices)
     if error is None:
         folder.finish(about | result)
     else:

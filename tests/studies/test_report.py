@@ -14,10 +14,8 @@ import pytest
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
-from gpmpc._provenance import provenance
 from gpmpc.exceptions import DataError, SettingError
 from gpmpc.plotting import Series, over_variable
-from gpmpc.studies._run_folder import METRICS, folder_name, record
 from gpmpc.studies.report import compare, sentences, terminal_table
 from gpmpc.studies.report import read_report as report
 from tests.studies.made_up import (
@@ -25,9 +23,11 @@ from tests.studies.made_up import (
     add,
     chosen,
     documents,
+    folder_of,
     made_up_run,
     metrics_of,
     plan,
+    record_of,
 )
 
 CONF = Path(__file__).resolve().parents[2] / "conf"
@@ -156,11 +156,11 @@ def test_documents_agree_and_the_page_needs_no_other_file(tree):
 
 
 def test_an_unreadable_run_is_named_and_the_others_reported(tree):
-    old = tree / folder_name(chosen("convex", 0)[0]) / METRICS
+    old = folder_of(tree, chosen("convex", 0)[0]) / "metrics.json"
     content = json.loads(old.read_text())
     del content["unit"]  # as an older version left it
     old.write_text(json.dumps(content))
-    broken = tree / folder_name(chosen("lqr", 0)[0]) / METRICS
+    broken = folder_of(tree, chosen("lqr", 0)[0]) / "metrics.json"
     broken.write_text('{"choices": ')
     found = report(tree)
     assert [len(seeds(cell, "finished")) for cell in cells(found)] == [7, 5]
@@ -189,7 +189,9 @@ def test_an_unreadable_run_is_not_missing_nor_flown_over(tmp_path):
             for seed in range(4)
         ],
     )
-    (tmp_path / folder_name(chosen("lqr", 1)[0]) / METRICS).write_text('{"choices": ')
+    (folder_of(tmp_path, chosen("lqr", 1)[0]) / "metrics.json").write_text(
+        '{"choices": '
+    )
     found = report(tmp_path)
     convex, lqr = cells(found)
     assert {*convex.state} == {"finished"}
@@ -221,7 +223,7 @@ def test_a_folder_that_belongs_to_no_cell_fills_none(tmp_path):
     )
     for name in ("elsewhere", "controller=convex,horizon=3,seed=0"):
         (tmp_path / name).mkdir()
-        (tmp_path / name / METRICS).write_text("")
+        (tmp_path / name / "metrics.json").write_text("")
     convex, _ = cells(report(tmp_path))
     assert (seeds(convex, "missing"), seeds(convex, "skipped")) == (["0"], [])
 
@@ -377,7 +379,7 @@ def test_what_is_no_tree_of_runs_is_refused(tmp_path):
 def test_a_thousand_runs_are_reported_in_little_time_and_memory(tmp_path):
     with initialize_config_dir(str(CONF), version_base="1.3"):  # as large as real ones
         settings = OmegaConf.to_container(compose("run"), resolve=True)
-    content = record([], settings | {"options": {}}, "gpmpc run") | metrics_of(0.1)
+    content = record_of(settings | {"options": {}}) | metrics_of(0.1)
     for seed in range(50):
         for size in (10, 20, 50, 100, 189):
             for horizon in (1, 3, 5, 10):
@@ -386,9 +388,9 @@ def test_a_thousand_runs_are_reported_in_little_time_and_memory(tmp_path):
                     f"horizon={horizon}",
                     f"seed={seed}",
                 ]
-                folder = tmp_path / folder_name(content["choices"])
+                folder = folder_of(tmp_path, content["choices"])
                 folder.mkdir()
-                (folder / METRICS).write_text(json.dumps(content, indent=1))
+                (folder / "metrics.json").write_text(json.dumps(content, indent=1))
     tracemalloc.start()
     start = time.process_time()
     found = report(tmp_path)
@@ -411,10 +413,10 @@ def test_a_page_says_what_made_the_runs_and_links_them(tree):
     links = re.findall(r'href="([^"]*)"', html)
     assert len(links) == len(found.there) == 16
     assert all((tree / "report" / unquote(link)).resolve().is_dir() for link in links)
-    made = provenance()
+    provenance = record_of({})["provenance"]
     for text in (
-        made["created"][:10],
-        made["machine"]["processor"],
+        provenance["created"][:10],
+        provenance["machine"]["processor"],
         "Settings of all runs",
         "data.size: null",
     ):

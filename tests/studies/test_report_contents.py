@@ -10,11 +10,8 @@ from unittest.mock import patch
 
 import numpy as np
 import pytest
-from rich.console import Console
 
 from gpmpc.studies import report as reporting
-from gpmpc.studies._document import terminal
-from gpmpc.studies._run_folder import ERROR, METRICS, folder_name
 from gpmpc.studies.report import compare, report_document, sentences, terminal_table
 from gpmpc.studies.report import read_report as report
 from tests.studies.made_up import (
@@ -22,8 +19,10 @@ from tests.studies.made_up import (
     add,
     chosen,
     documents,
+    folder_of,
     made_up_run,
     metrics_of,
+    on_terminal,
     plan,
 )
 
@@ -59,9 +58,7 @@ def written_of(found):
 
 def shown(found):
     """The table as a terminal shows it."""
-    console = Console(file=io.StringIO(), width=100)
-    console.print(terminal([terminal_table(found)]))
-    return console.file.getvalue()
+    return on_terminal(terminal_table(found), width=100)
 
 
 DAMAGE = {
@@ -102,7 +99,7 @@ WHOLE = {
 }
 
 
-@pytest.mark.parametrize("name", [METRICS, ERROR])
+@pytest.mark.parametrize("name", ["metrics.json", "error.json"])
 @pytest.mark.parametrize("damage", [*DAMAGE, *WHOLE])
 def test_one_damaged_run_alone_is_skipped_with_its_reason(damage, name, tmp_path):
     for seed in range(2):
@@ -110,14 +107,14 @@ def test_one_damaged_run_alone_is_skipped_with_its_reason(damage, name, tmp_path
     made_up_run(
         tmp_path, *chosen("nmpc", 0), result=metrics_of(0.1) | {"error": "none"}
     )
-    folder = tmp_path / folder_name(chosen("nmpc", 0)[0])
-    content = json.loads((folder / METRICS).read_text()) | DAMAGE.get(damage, {})
-    (folder / METRICS).unlink()
+    folder = folder_of(tmp_path, chosen("nmpc", 0)[0])
+    content = json.loads((folder / "metrics.json").read_text()) | DAMAGE.get(damage, {})
+    (folder / "metrics.json").unlink()
     (folder / name).write_bytes(
         WHOLE.get(damage) if damage in WHOLE else json.dumps(content).encode()
     )
     found = report(tmp_path)
-    reads_it = name == ERROR and set(DAMAGE.get(damage, ())) & {*RESULT}
+    reads_it = name == "error.json" and set(DAMAGE.get(damage, ())) & {*RESULT}
     assert len(found.skipped) == (0 if reads_it else 1)
     assert all(
         line.startswith(f"{folder / name}: is not what a run writes: ")
@@ -263,7 +260,7 @@ def test_wall_times_are_not_compared(tmp_path):
     for seed in range(6):
         for controller in ("lqr", "convex"):
             add(tree, controller, seed, 0.1 * (1 + seed) + 0.01 * len(controller))
-    for path in tree.glob(f"*/{METRICS}"):
+    for path in tree.glob("*/metrics.json"):
         content = json.loads(path.read_text())
         content["times"]["training"] = content["times"]["total"]["median"] = 1.0 + (
             "lqr" in path.parent.name
@@ -290,7 +287,7 @@ def test_a_report_says_of_every_run_what_became_of_it(tmp_path):
     made_up_run(tree, *chosen("lqr", 0, horizon=10), result=metrics_of(0.5) | lost)
     made_up_run(tree, *chosen("lqr", 1, horizon=10), error="no\nluck")
     made_up_run(tree, *chosen("lqr", 2, horizon=10), result=metrics_of(0.5))
-    damaged = tree / folder_name(chosen("lqr", 2, horizon=10)[0]) / METRICS
+    damaged = folder_of(tree, chosen("lqr", 2, horizon=10)[0]) / "metrics.json"
     damaged.write_text("{")
     plan(
         tree,

@@ -1,20 +1,16 @@
 """What a run says at its end are the numbers of its metrics."""
 
-import io
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from rich.console import Console
 
 from gpmpc.exceptions import Diverged
 from gpmpc.mpc import Box, FlightJudgement, Halfspaces, Inequality, Judgement, Timing
 from gpmpc.simulation import Rollout
 from gpmpc.status import Status
-from gpmpc.studies._document import terminal
-from gpmpc.studies._run_folder import record
 from gpmpc.studies.flight import Experiment, Flown, metrics, summary
-from tests.studies.made_up import PLANT, metrics_of
+from tests.studies.made_up import PLANT, metrics_of, on_terminal, record_of
 
 OPTIONS = {
     "trajectory": "lorenz",
@@ -25,10 +21,9 @@ OPTIONS = {
 
 
 def said(result, **options):
-    stream = io.StringIO()
-    about = record([], {"seed": 0, "options": OPTIONS | options}, "gpmpc run")
-    Console(file=stream, width=200).print(terminal([summary(about | result)]))
-    lines = [line.strip() for line in stream.getvalue().splitlines()]
+    about = record_of({"seed": 0, "options": OPTIONS | options})
+    text = on_terminal(summary(about | result), width=200)
+    lines = [line.strip() for line in text.splitlines()]
     return {
         line.split("  ")[0]: line.partition("  ")[2].strip()
         for line in lines
