@@ -43,9 +43,9 @@ class LinearGaussian:
         return Gaussian(mean, self.Q.expand(*mean.shape, 2))
 
     def predict_with_jacobian(self, state, input=None):
-        at = self.predict(state, input)
+        belief = self.predict(state, input)
         return (
-            at,
+            belief,
             self.A.expand(*state.shape[:-1], 2, 2),
             B.expand(*state.shape[:-1], 2, 1),
         )
@@ -72,11 +72,11 @@ def runs(count, steps, noisy=True):
 
 def exact_covariances(steps):
     S = torch.zeros(2, 2)
-    found = []
+    covariances = []
     for _ in range(steps):
         S = A @ S @ A.T + Q
-        found.append(S)
-    return torch.stack(found)
+        covariances.append(S)
+    return torch.stack(covariances)
 
 
 def test_the_true_model_is_calibrated_at_every_step_and_level():
@@ -84,29 +84,29 @@ def test_the_true_model_is_calibrated_at_every_step_and_level():
     levels = (0.5, 0.9, 0.95)
     # Without noise every start is exact; the recordings' starts overlap, hence the
     # generous bound.
-    found = calibrate(
+    calibration = calibrate(
         noiseless(), runs(count, 8, noisy=False), Linearization(), 6, levels
     )
-    assert found.samples.tolist() == [count * (8 - k) for k in range(6)]
+    assert calibration.samples.tolist() == [count * (8 - k) for k in range(6)]
     for j, level in enumerate(levels):
         error = math.sqrt(level * (1 - level) / count)
-        assert float((found.coverage[:, :, j] - level).abs().max()) < 4 * error
+        assert float((calibration.coverage[:, :, j] - level).abs().max()) < 4 * error
     variance = exact_covariances(6).diagonal(dim1=-2, dim2=-1)
-    assert torch.allclose(found.rmse, variance.sqrt(), rtol=0.15)
+    assert torch.allclose(calibration.rmse, variance.sqrt(), rtol=0.15)
     assert torch.allclose(
-        found.nlpd, ((2 * math.pi * variance).log() + 1) / 2, atol=0.15
+        calibration.nlpd, ((2 * math.pi * variance).log() + 1) / 2, atol=0.15
     )
 
 
 def test_observations_are_calibrated_with_their_noise():
     recordings = runs(800, 1)
     arguments = {"propagator": Linearization(), "horizon": 1, "levels": (0.9,)}
-    told = calibrate(LinearGaussian(), recordings, **arguments)
-    assert float((told.coverage - 0.9).abs().max()) < 0.04
+    calibration = calibrate(LinearGaussian(), recordings, **arguments)
+    assert float((calibration.coverage - 0.9).abs().max()) < 0.04
     assert bool(
         (
             calibrate(noiseless(), recordings, **arguments).coverage
-            < told.coverage - 0.04
+            < calibration.coverage - 0.04
         ).all()
     )
 
@@ -115,12 +115,12 @@ def test_noise_of_the_process_adds_up_and_counts_once():
     """x+ = A x + B u + w: what a propagator adds at every step is what happens."""
     recordings = runs(200, 5, noisy=False)
     learned = LinearGaussian(Q=0 * Q, noise_covariance=Q)
-    found = calibrate(learned, recordings, Linearization(), 5, (0.95,))
+    calibration = calibrate(learned, recordings, Linearization(), 5, (0.95,))
     exact = calibrate(noiseless(), recordings, Linearization(), 5, (0.95,))
-    assert torch.allclose(found.width, exact.width)
-    assert torch.equal(found.coverage, exact.coverage)
-    assert float((found.coverage - 0.95).abs().max()) < 0.04
-    assert found.noise == "the model's noise at every step"
+    assert torch.allclose(calibration.width, exact.width)
+    assert torch.equal(calibration.coverage, exact.coverage)
+    assert float((calibration.coverage - 0.95).abs().max()) < 0.04
+    assert calibration.noise == "the model's noise at every step"
     latent = Linearization(process_noise=False)
     careless = calibrate(learned, recordings, latent, 5, (0.95,))
     assert torch.allclose(careless.width[0], exact.width[0])
@@ -135,7 +135,7 @@ def test_sensors_that_are_known_make_starts_and_ends_uncertain():
         recording.states[0] += torch.randn(2) @ NOISE.sqrt()
     model = LinearGaussian(Q=0 * Q, noise_covariance=Q)
     for horizon in (1, 5):
-        found = calibrate(
+        calibration = calibrate(
             model,
             recordings,
             Linearization(),
@@ -143,8 +143,8 @@ def test_sensors_that_are_known_make_starts_and_ends_uncertain():
             (0.95,),
             measurement_noise=sensors,
         )
-        assert float((found.coverage - 0.95).abs().max()) < 0.04
-        assert "the sensors' at the first and the last" in found.noise
+        assert float((calibration.coverage - 0.95).abs().max()) < 0.04
+        assert "the sensors' at the first and the last" in calibration.noise
     with pytest.raises(SettingError, match="measurement_noise: must be a list of 2"):
         calibrate(model, recordings, horizon=1, measurement_noise=[0.1])
     with pytest.raises(SettingError, match="measurement_noise"):
@@ -170,7 +170,7 @@ def test_false_confidence_shows():
 
 def test_the_batch_of_all_starts_is_the_loop_over_them():
     recordings = [*runs(3, 7), *runs(2, 3), *runs(1, CHUNK)]
-    found = calibrate(LinearGaussian(), recordings, Linearization(), 5)
+    calibration = calibrate(LinearGaussian(), recordings, Linearization(), 5)
     k = 4
     errors = []
     for recording in recordings:
@@ -181,9 +181,9 @@ def test_the_batch_of_all_starts_is_the_loop_over_them():
                     LinearGaussian(), belief, recording.inputs[t + step]
                 )
             errors.append(recording.states[t + k] - belief.mean)
-    assert int(found.samples[k - 1]) == len(errors)
+    assert int(calibration.samples[k - 1]) == len(errors)
     assert torch.allclose(
-        found.rmse[k - 1], torch.stack(errors).square().mean(0).sqrt()
+        calibration.rmse[k - 1], torch.stack(errors).square().mean(0).sqrt()
     )
 
 
@@ -257,8 +257,10 @@ def test_the_report_is_a_data_frame():
 def test_a_coverages_interval_is_exact_and_counts_no_overlaps():
     assert example().coverage_interval(0, 0, 1) == binomial_interval(18, 20)
     assert example().coverage_interval(1, 0, 1) == binomial_interval(4, 5)
-    found = calibrate(LinearGaussian(), [*runs(3, 7), *runs(2, 3)], Linearization(), 4)
-    assert found.independent.tolist() == [27, 11, 8, 3]
+    calibration = calibrate(
+        LinearGaussian(), [*runs(3, 7), *runs(2, 3)], Linearization(), 4
+    )
+    assert calibration.independent.tolist() == [27, 11, 8, 3]
     same = runs(300, 5, noisy=False)
     honest, narrow = (
         calibrate(noiseless(Q=noise), same, Linearization(), 5) for noise in (Q, Q / 9)

@@ -24,11 +24,11 @@ def test_compiling_is_announced_once_with_its_time(capsys):
     with report_compilation():
         assert outer(1.0) == 4
         assert outer(1) == 4
-    taken = time.perf_counter() - began
+    elapsed = time.perf_counter() - began
     first, last = capsys.readouterr().out.splitlines()
     assert "compiling" in first
-    told = float(re.fullmatch(r"compiled in ([\d.]+) s", last)[1])
-    assert 0 <= told <= taken + 0.05
+    reported = float(re.fullmatch(r"compiled in ([\d.]+) s", last)[1])
+    assert 0 <= reported <= elapsed + 0.05
     with report_compilation():
         outer(2.0)
     assert capsys.readouterr().out == ""

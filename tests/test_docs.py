@@ -155,14 +155,14 @@ def test_every_page_with_python_is_followed_by_a_test():
 
 def test_the_settings_that_pages_name_are_there():
     with settings():
-        known = {*setting_names("run")}
+        settings_of_run = {*setting_names("run")}
     named = {
         (path.name, name)
         for path in PAGES
         for name in re.findall(r"`(controller\.[\w.]+)=", path.read_text())
     }
     assert named
-    assert not {entry for entry in named if entry[1] not in known}
+    assert not {entry for entry in named if entry[1] not in settings_of_run}
 
 
 def anchors(path):
@@ -230,10 +230,10 @@ def test_every_name_that_is_offered_or_used_is_documented():
         for module in pkgutil.iter_modules(gpmpc.__path__, "gpmpc.")
         if module.ispkg
     ]
-    found = [room for room in rooms if not room.startswith("gpmpc._")]
+    public_rooms = [room for room in rooms if not room.startswith("gpmpc._")]
     offered = {
         (room, key)
-        for room in found
+        for room in public_rooms
         for key in getattr(importlib.import_module(room), "__all__", [])
     }
     texts = [

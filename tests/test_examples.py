@@ -86,14 +86,14 @@ def test_the_example_of_a_log_learns_and_leaves_a_figure(tmp_path, capsys):
 @pytest.mark.slow
 def test_a_mujoco_quadrotor_flies_better_by_logs_than_data_sheet(tmp_path):
     pytest.importorskip("mujoco")
-    found = runpy.run_path(str(EXAMPLES / "mujoco_flight.py"))["main"](tmp_path)
+    errors = runpy.run_path(str(EXAMPLES / "mujoco_flight.py"))["main"](tmp_path)
     assert (
-        found["learned, disturbance_gain 0"]
-        < 0.3 * found["data sheet, disturbance_gain 0"]
+        errors["learned, disturbance_gain 0"]
+        < 0.3 * errors["data sheet, disturbance_gain 0"]
     )
     assert (
-        found["learned, disturbance_gain 0"]
-        < 0.7 * found["data sheet, disturbance_gain 0.3"]
+        errors["learned, disturbance_gain 0"]
+        < 0.7 * errors["data sheet, disturbance_gain 0.3"]
     )
 
 

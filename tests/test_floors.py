@@ -24,14 +24,14 @@ def project(*dependencies, **extras):
 
 
 def test_every_requirement_has_its_floor():
-    asked = project(
+    requirements = project(
         "numpy>=2.2",
         "hydra-core>=1.3.8,<1.5",
         sim=["gymnasium[mujoco]>=1.0"],
         logs=["PyArrow>=17", "numpy>=2.10"],
         dev=["pyarrow>=9"],
     )
-    assert TOOL["floors"](asked) == {
+    assert TOOL["floors"](requirements) == {
         "hatchling": "1.27",
         "numpy": "2.10",  # the highest of several, by version and not by letter
         "hydra-core": "1.3.8",

@@ -164,11 +164,11 @@ def test_a_mistake_is_one_clear_line(arguments, message, tmp_path):
         limits = (
             "name='nan', input_lower=[-1], input_upper=[1], region=[[-1, -1], [1, 1]]"
         )
-        made = (
+        factory = (
             f"from gpmpc.systems import System\nclass D:\n    {text}\ndef make(): return System(D(), 0.1, {limits})\n"
             "def h(x): return (x[:, 0] - 1).sqrt()\n"
         )
-        (tmp_path / f"{name}_module.py").write_text(made)
+        (tmp_path / f"{name}_module.py").write_text(factory)
         h = "{_target_: hydra.utils.get_method, path: root_module.h}"
         kept = (
             f"[{{_target_: gpmpc.mpc.Inequality, h: {h}}}]" if name == "root" else "[]"

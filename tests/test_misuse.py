@@ -43,7 +43,7 @@ def data():
 def posterior(**changed):
     seen = data()
     ones = torch.ones(2, dtype=F)
-    given = {
+    hyperparameters = {
         "inputs": seen.features,
         "targets": seen.next_states,
         "lengthscales": torch.ones(2, 3, dtype=F),
@@ -51,7 +51,7 @@ def posterior(**changed):
         "noise_variance": 1e-3 * ones,
         "input_dim": 1,
     }
-    return GPPosterior.from_hyperparameters(**given | changed)
+    return GPPosterior.from_hyperparameters(**hyperparameters | changed)
 
 
 def belief():
@@ -72,14 +72,14 @@ class Short(Oscillator):
 
 
 def controller(kind=GPMPC, **changed):
-    given = {
+    settings = {
         "model": posterior(),
         "propagator": Linearization(),
         "problem": Problem(Tracking([1.0, 1.0], [1.0], penalized="inputs")),
         "horizon": 3,
         "initial_input": [0.0],
     }
-    return kind(**given | changed)
+    return kind(**settings | changed)
 
 
 @pytest.mark.parametrize("value", [[0.1, 0.2], (0.1, 0.2), np.array([0.1, 0.2])])
@@ -301,14 +301,14 @@ def test_an_affine_model_checks_its_shapes():
 
 @pytest.mark.parametrize("kind", [GPMPC, NonlinearGPMPC])
 def test_a_controller_says_what_it_takes(kind):
-    asked = controller(kind)
+    mpc = controller(kind)
     reference = np.zeros((4, 2))
-    for given in ((belief(), reference), (np.zeros(2), Reference(reference))):
+    for arguments in ((belief(), reference), (np.zeros(2), Reference(reference))):
         with pytest.raises(
             ShapeError,
             match=r"control takes a Gaussian .* and a Reference\(states\); got",
         ):
-            asked.control(*given)
+            mpc.control(*arguments)
 
 
 @pytest.mark.parametrize(
@@ -326,7 +326,7 @@ def test_a_controller_says_what_it_takes(kind):
     ],
 )
 def test_a_closed_loop_says_what_it_takes(settings, rule):
-    given = {
+    scenario = {
         "system": System(Oscillator(), 0.1),
         "controller": controller(),
         "references": np.zeros((9, 2)),
@@ -334,7 +334,7 @@ def test_a_closed_loop_says_what_it_takes(settings, rule):
         "steps": 2,
     }
     with pytest.raises(SettingError, match=rule):
-        closed_loop(**given | settings)
+        closed_loop(**scenario | settings)
 
 
 def test_a_step_of_other_lengths_is_refused():
@@ -362,11 +362,11 @@ def test_a_step_of_other_lengths_is_refused():
 def test_predictions_of_another_shape_are_not_broadcast(measure):
     tall = torch.ones(3, 1, dtype=F)
     wide = torch.ones(3, 2, dtype=F)
-    given = (
+    predictions = (
         (tall, wide) if measure is metrics.mean_squared_error else (tall, tall, wide)
     )
     with pytest.raises(ShapeError, match=r"all must have one shape \(N, n\); got"):
-        measure(*given)
+        measure(*predictions)
 
 
 def test_tracking_errors_of_axes_that_are_not_there_are_refused():
@@ -397,14 +397,14 @@ STEPS = np.zeros((9, 2))
 
 
 def fly(**changed):
-    given = {
+    scenario = {
         "system": PLANT,
         "controller": controller(),
         "references": STEPS,
         "initial": [0.0, 0.0],
         "steps": 2,
     }
-    return closed_loop(**given | changed)
+    return closed_loop(**scenario | changed)
 
 
 def in_rows(value):
@@ -412,8 +412,8 @@ def in_rows(value):
 
 
 def control(**changed):
-    given = {"belief": belief(), "reference": Reference(np.zeros(2))}
-    return controller().control(**given | changed)
+    arguments = {"belief": belief(), "reference": Reference(np.zeros(2))}
+    return controller().control(**arguments | changed)
 
 
 TAKES_NUMBERS = {

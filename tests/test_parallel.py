@@ -27,9 +27,9 @@ def die(seed):
 
 def test_every_result_comes_with_the_number_of_its_job():
     seeds = [0, 3, 1]
-    found = dict(in_processes(draw, seeds, 2))
-    assert sorted(found) == [0, 1, 2]
-    assert all(np.array_equal(found[i], draw(seed)) for i, seed in enumerate(seeds))
+    results = dict(in_processes(draw, seeds, 2))
+    assert sorted(results) == [0, 1, 2]
+    assert all(np.array_equal(results[i], draw(seed)) for i, seed in enumerate(seeds))
 
 
 def test_a_worker_that_dies_is_one_clear_error():

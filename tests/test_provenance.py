@@ -79,13 +79,13 @@ def test_any_file_that_changes_moves_or_goes_makes_it_other_code(name, checkout)
     path.write_bytes(content)
     moved_to = path.with_name(f"other{path.suffix}")
     path.rename(moved_to)
-    moved = source_fingerprint(checkout / "gpmpc")
+    moved_fingerprint = source_fingerprint(checkout / "gpmpc")
     moved_to.unlink()
     try:
         removed = source_fingerprint(checkout / "gpmpc")
     except GpmpcError:  # it was the only one of its kind
         removed = "refused"
-    assert len({code_fingerprint(), changed, moved, removed}) == 4
+    assert len({code_fingerprint(), changed, moved_fingerprint, removed}) == 4
 
 
 def test_every_file_is_code_or_known_to_change_no_number():

@@ -26,13 +26,13 @@ def nmpc(**settings):
 
 def convex(**settings):
     problem = Problem(Tracking([1.0, 1.0], [1.0], penalized="inputs"))
-    given = {
+    defaults = {
         "propagator": Linearization(),
         "problem": problem,
         "horizon": 2,
         "initial_input": [0.0],
     }
-    return GPMPC(double_integrator(), **(given | settings))
+    return GPMPC(double_integrator(), **(defaults | settings))
 
 
 def flown(**settings):
@@ -45,14 +45,14 @@ def flown(**settings):
 
 
 def excited(**settings):
-    given = {
+    defaults = {
         "Q": [1] * 6,
         "R": [1] * 3,
         "initial_input": [0] * 3,
         "dither": [0] * 3,
         "noise": [0] * 6,
     }
-    return Excitation(**(given | settings))
+    return Excitation(**(defaults | settings))
 
 
 CASES = [

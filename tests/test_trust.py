@@ -88,9 +88,11 @@ def test_what_is_no_plain_name_is_not_trusted(name, own_package):
 
 def test_code_that_is_not_there_is_named_in_one_line(own_package):
     for name in ("arm.nothing", "nothing.at_all", "broken.make"):
-        with pytest.raises(DataError, match=f"{name} cannot be imported here") as told:
+        with pytest.raises(
+            DataError, match=f"{name} cannot be imported here"
+        ) as refusal:
             _trust.trusted_code(f"{own_package}.{name}", [own_package])
-        assert "\n" not in str(told.value)
+        assert "\n" not in str(refusal.value)
 
 
 def test_a_part_of_a_package_can_be_trusted_alone(own_package):

@@ -42,14 +42,14 @@ def flight(*words):
     return json.loads(_flight(*words))
 
 
-def put(found, place, value):
+def put(document, place, value):
     """Settings with a value at a dotted place."""
     *parents, last = place.split(".")
-    node = found
+    node = document
     for key in parents:
         node = node[key]
     node[last] = value
-    return found
+    return document
 
 
 def write(text):
@@ -86,10 +86,12 @@ def six_hostile_settings():
     }
 
 
-def record(path, found):
+def record(path, document):
     """A recording with settings, given as data or as text."""
     text = (
-        found if isinstance(found, str) else OmegaConf.to_yaml(OmegaConf.create(found))
+        document
+        if isinstance(document, str)
+        else OmegaConf.to_yaml(OmegaConf.create(document))
     )
     runs.record_run(path, steps=3, config=text)
     return path
@@ -115,19 +117,19 @@ def test_a_hostile_recording_is_refused_and_nothing_happens(words, folder):
 
 @pytest.mark.parametrize("name", [*six_hostile_settings()])
 def test_settings_that_call_other_code_are_refused_at_any_depth(name):
-    found = six_hostile_settings()[name]
-    with pytest.raises(DataError, match=r"its settings (call|import) '") as told:
-        experiment_of_run(run_of(found), [])
-    assert "\n" not in str(told.value)
-    assert str(told.value).startswith("run.mcap: ")
+    document = six_hostile_settings()[name]
+    with pytest.raises(DataError, match=r"its settings (call|import) '") as refusal:
+        experiment_of_run(run_of(document), [])
+    assert "\n" not in str(refusal.value)
+    assert str(refusal.value).startswith("run.mcap: ")
 
 
-def run_of(found):
+def run_of(document):
     """What ``read_run`` would return of a recording with these settings, in part."""
 
     class Run:
         path = Path("run.mcap")
-        config = found if isinstance(found, str) else yaml.safe_dump(found)
+        config = document if isinstance(document, str) else yaml.safe_dump(document)
         state_names = runs.STATES
         input_names = runs.INPUTS
 
@@ -154,14 +156,14 @@ NOT_CALLED = [
 )  # fmt: skip
 def test_what_is_not_on_the_list_is_not_called(target, place):
     modules = {*sys.modules}
-    with pytest.raises(DataError, match=r"its settings (call|name)") as told:
+    with pytest.raises(DataError, match=r"its settings (call|name)") as refusal:
         checked_settings({"a": place({"_target_": target})}, ["my_robot"])
-    assert "\n" not in str(told.value)
+    assert "\n" not in str(refusal.value)
     assert {*sys.modules} == modules
 
 
 @pytest.mark.parametrize(
-    ("found", "rule"),
+    ("call", "rule"),
     [
         ({"_target_": 3}, "name nothing at a._target_"),
         ({"_target_": ["gpmpc.systems.pendulum"]}, "name nothing"),
@@ -208,9 +210,9 @@ def test_what_is_not_on_the_list_is_not_called(target, place):
     ],
     ids=lambda value: str(value)[:60],
 )
-def test_a_call_that_is_written_in_another_way_is_refused(found, rule):
+def test_a_call_that_is_written_in_another_way_is_refused(call, rule):
     with pytest.raises(DataError, match=rule):
-        checked_settings({"a": found}, [])
+        checked_settings({"a": call}, [])
 
 
 def aliases(levels):
@@ -250,9 +252,9 @@ def aliases(levels):
 )
 def test_settings_other_than_plain_names_and_values_are_refused(text, rule):
     began = time.process_time()
-    with pytest.raises(DataError, match=rule) as told:
+    with pytest.raises(DataError, match=rule) as refusal:
         read_settings(text)
-    assert "\n" not in str(told.value)
+    assert "\n" not in str(refusal.value)
     assert time.process_time() - began < 2.0
 
 
@@ -283,10 +285,10 @@ def test_the_largest_settings_are_read_in_a_second_or_two(text):
 def test_an_ordinary_flights_settings_describe_the_same_flight(words):
     from gpmpc.cli._experiment import experiment_of, experiment_of_file
 
-    found = flight(*words)
+    document = flight(*words)
     with settings():
-        expected = experiment_of(OmegaConf.create(found))
-    text = OmegaConf.to_yaml(OmegaConf.create(found))
+        expected = experiment_of(OmegaConf.create(document))
+    text = OmegaConf.to_yaml(OmegaConf.create(document))
     experiment = experiment_of_file(read_settings(text), [])
     for key in ("data", "trajectory", "train", "steps", "learning", "disturbances"):
         assert repr(getattr(experiment, key)) == repr(getattr(expected, key))
@@ -367,9 +369,9 @@ def test_settings_of_no_flight_get_one_line_with_the_files_name(change):
 
 
 def test_a_recording_and_its_settings_must_be_of_one_system():
-    found = flight("system=pendulum", "controller=lqr")
+    document = flight("system=pendulum", "controller=lqr")
     with pytest.raises(DataError, match="describe another system than it recorded"):
-        experiment_of_run(run_of(found), [])
+        experiment_of_run(run_of(document), [])
 
 
 # The twelve hostile files: six recordings of above, six models of
@@ -391,20 +393,20 @@ class Watch:
         self.seen = []
         sys.addaudithook(self)
 
-    def __call__(self, event, given):
+    def __call__(self, event, arguments):
         if not self.on:
             return
         acts = event.startswith(ACTING)
         if event == "open":
-            mode = given[1] or ""
-            flags = given[2] or 0
+            mode = arguments[1] or ""
+            flags = arguments[2] or 0
             acts = bool({*"wax+"} & {*str(mode)}) or bool(flags & WRITING)
         if acts:
-            self.seen.append(f"{event} {given!r:.200}")
+            self.seen.append(f"{event} {arguments!r:.200}")
             raise PermissionError(f"{event} while a file is read")
 
 
-def read_hostile(folder, told):
+def read_hostile(folder, outcome_file):
     """Reads every file of a folder under a watch, and writes what was said and what
     happened."""
     os.chdir(folder)
@@ -434,7 +436,7 @@ def read_hostile(folder, told):
             finally:
                 watch.on = False
             outcomes[f"{path.name} by {road.__name__}"] = outcome
-    told.write_text(json.dumps({"outcomes": outcomes, "seen": watch.seen}))
+    outcome_file.write_text(json.dumps({"outcomes": outcomes, "seen": watch.seen}))
 
 
 def test_twelve_hostile_files_are_refused_and_none_acts(folder, tmp_path_factory):
@@ -449,18 +451,18 @@ def test_twelve_hostile_files_are_refused_and_none_acts(folder, tmp_path_factory
     ).items():
         (folder / f"hostile_{name}.safetensors").write_bytes(content)
     record(folder / "good.mcap", flight())
-    for name, found in six_hostile_settings().items():
-        record(folder / f"hostile_{name}.mcap", found)
+    for name, document in six_hostile_settings().items():
+        record(folder / f"hostile_{name}.mcap", document)
     before = sorted(path.name for path in folder.iterdir())
-    told = tmp_path_factory.mktemp("told") / "told.json"
-    process = copied_process(target=read_hostile, args=(folder, told))
+    outcome_file = tmp_path_factory.mktemp("outcome") / "outcome.json"
+    process = copied_process(target=read_hostile, args=(folder, outcome_file))
     process.start()
     process.join(120)
     assert process.exitcode == 0
-    found = json.loads(told.read_text())
-    assert found["seen"] == []
-    assert len(found["outcomes"]) == 6 + 2 * 6
-    for name, outcome in found["outcomes"].items():
+    observed = json.loads(outcome_file.read_text())
+    assert observed["seen"] == []
+    assert len(observed["outcomes"]) == 6 + 2 * 6
+    for name, outcome in observed["outcomes"].items():
         assert outcome.startswith(str(folder / name.partition(" by ")[0])), (
             name,
             outcome,

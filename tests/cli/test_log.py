@@ -132,12 +132,12 @@ def test_every_command_says_what_is_lost(folder, tmp_path):
 
 
 def test_every_command_says_that_there_are_no_checksums(folder, tmp_path):
-    found = []
+    changed = []
     for kind, content in damage.records((folder / "run.mcap").read_bytes()[8:]):
         if kind == damage.CHUNK:
             content = content[:24] + bytes(4) + content[28:]
-        found.append((kind, bytes(4) if kind == damage.DATA_END else content))
-    data = damage.MAGIC + damage.joined(found) + damage.MAGIC
+        changed.append((kind, bytes(4) if kind == damage.DATA_END else content))
+    data = damage.MAGIC + damage.joined(changed) + damage.MAGIC
     (tmp_path / "run.mcap").write_bytes(data)
     for command in ("info", "export", "recover"):
         result = gpmpc_log(command, "run.mcap", cwd=tmp_path)

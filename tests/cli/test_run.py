@@ -41,14 +41,14 @@ def test_a_lost_flight_is_readable_and_has_its_own_exit_code(choices, reason, tm
     assert line.startswith("gpmpc: lost: from step ")
     assert reason in line
     (folder,) = (tmp_path / "tree").iterdir()
-    found = json.loads(
+    result = json.loads(
         (folder / "metrics.json").read_text(), parse_constant=pytest.fail
     )
-    assert reason in found["lost"]["reason"]
+    assert reason in result["lost"]["reason"]
     run = read_run(folder / "run.mcap")
     assert run.finished
-    assert len(run.times) == found["steps"]
-    assert run.times[found["lost"]["step"]] == found["lost"]["time"]
+    assert len(run.times) == result["steps"]
+    assert run.times[result["lost"]["step"]] == result["lost"]["time"]
     again = forked("run", *TINY, *choices, "steps=9", cwd=tmp_path)
     assert again.returncode == 3
     assert "finished before" in again.stdout
@@ -91,8 +91,14 @@ def test_a_flight_is_predicted_or_one_line_says_why_not(tmp_path, monkeypatch, c
     # a flight of other code: the model is learned again, by this code
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(_calibrate, "is_of_this_code", lambda about: False)
-    given = {"run": Path("tree"), "to": None, "flights": [], "steps": 3, "trust": []}
-    _calibrate.calibrate(argparse.Namespace(**given))
+    arguments = {
+        "run": Path("tree"),
+        "to": None,
+        "flights": [],
+        "steps": 3,
+        "trust": [],
+    }
+    _calibrate.calibrate(argparse.Namespace(**arguments))
     said = "was flown by other code: the model that is judged is what this code learns"
     assert said in capsys.readouterr().out
     (written,) = (tmp_path / "tree").glob("*/calibration/calibration.md")

@@ -20,12 +20,12 @@ SWEPT = ["run", "-m", *TINY, "data.size=10,20", "seed=range(2)"]
 
 def results(tree):
     """Every finished run's metrics by folder, without times and what made them."""
-    found = {}
+    metrics = {}
     for path in tree.glob("*/metrics.json"):
-        found[path.parent.name] = content = json.loads(path.read_text())
+        metrics[path.parent.name] = content = json.loads(path.read_text())
         assert content.pop("times")
         assert content.pop("provenance")
-    return found
+    return metrics
 
 
 @pytest.fixture(scope="module")
@@ -56,23 +56,23 @@ def test_a_run_leaves_a_folder_that_says_everything(single):
         "metrics.json",
         "run.mcap",
     ]
-    found = json.loads((folder / "metrics.json").read_text())
-    assert set(found["rmse"]) == {"x", "y", "z", "total"}
-    assert found["rmse"]["total"] < 1
-    assert found["failures"] == {"INVALID_MEASUREMENT": 1}
-    assert found["violations"]["inputs"]["steps"] == 4
-    assert found["settings"]["options"]["controller"] == "convex"
-    assert found["seed"] == 7
-    assert set(found["times"]) == {"training", "model", "build", "solve", "total"}
-    assert found["provenance"]["command"].startswith("gpmpc run data.samples=25")
-    assert found["provenance"]["versions"]["torch"]
+    metrics = json.loads((folder / "metrics.json").read_text())
+    assert set(metrics["rmse"]) == {"x", "y", "z", "total"}
+    assert metrics["rmse"]["total"] < 1
+    assert metrics["failures"] == {"INVALID_MEASUREMENT": 1}
+    assert metrics["violations"]["inputs"]["steps"] == 4
+    assert metrics["settings"]["options"]["controller"] == "convex"
+    assert metrics["seed"] == 7
+    assert set(metrics["times"]) == {"training", "model", "build", "solve", "total"}
+    assert metrics["provenance"]["command"].startswith("gpmpc run data.samples=25")
+    assert metrics["provenance"]["versions"]["torch"]
 
 
 def test_the_recording_holds_the_flight_and_its_decisions(single):
     cwd, _ = single
     (path,) = (cwd / "tree").glob("*/run.mcap")
     run = read_run(path)
-    found = json.loads((path.parent / "metrics.json").read_text())
+    metrics = json.loads((path.parent / "metrics.json").read_text())
     assert run.finished
     assert run.failed.tolist() == [False, False, True, False]
     assert np.isnan(run.measured[2]).all()
@@ -86,7 +86,7 @@ def test_the_recording_holds_the_flight_and_its_decisions(single):
     errors = np.square(
         (run.states - run.references)[1:, ::2]
     )  # x[K] is in the metrics, not in the recording
-    assert found["rmse"]["total"] ** 2 * 4 >= errors.sum()
+    assert metrics["rmse"]["total"] ** 2 * 4 >= errors.sum()
 
 
 def test_a_recorded_flight_is_drawn(single):
@@ -176,13 +176,13 @@ def test_a_finished_run_of_other_code_stays_and_is_named(single, tmp_path):
 def test_finished_runs_are_kept_and_other_settings_refused(single):
     cwd, _ = single
     (folder,) = (cwd / "tree").iterdir()
-    found = json.loads((folder / "metrics.json").read_text())
-    arguments = ["run", *found["choices"], "folder=tree"]
+    metrics = json.loads((folder / "metrics.json").read_text())
+    arguments = ["run", *metrics["choices"], "folder=tree"]
     again = forked(*arguments, cwd=cwd)
     assert again.returncode == 0, again.stderr
     assert "finished before" in again.stdout
-    found["settings"]["controller"]["tolerance"] = 1
-    (folder / "metrics.json").write_text(json.dumps(found))
+    metrics["settings"]["controller"]["tolerance"] = 1
+    (folder / "metrics.json").write_text(json.dumps(metrics))
     other = forked(*arguments, cwd=cwd)
     assert other.returncode == 2
     assert (
@@ -323,14 +323,14 @@ def sweep(tmp_path_factory):
 
 
 def test_a_sweep_flies_every_combination(sweep):
-    tree, found = sweep
-    assert len(found) == 4
-    assert len({tuple(content["choices"]) for content in found.values()}) == 4
-    assert len({content["rmse"]["total"] for content in found.values()}) == 4
-    assert "data.size=10,data.samples=25" not in found
+    tree, metrics = sweep
+    assert len(metrics) == 4
+    assert len({tuple(content["choices"]) for content in metrics.values()}) == 4
+    assert len({content["rmse"]["total"] for content in metrics.values()}) == 4
+    assert "data.size=10,data.samples=25" not in metrics
     (plan,) = tree.glob("sweep-*.json")
     assert sorted(json.loads(plan.read_text())["runs"]) == sorted(
-        c["choices"] for c in found.values()
+        c["choices"] for c in metrics.values()
     )
 
 
@@ -380,10 +380,10 @@ def test_a_sweep_refuses_a_finished_run_of_other_settings(sweep, tmp_path):
     assert again.returncode == 0, again.stderr
     assert "4 runs: 0 flown, 4 finished before, 0 failed" in again.stdout
     path = sorted(tree.glob("*/metrics.json"))[2]
-    found = json.loads(path.read_text())
-    found["settings"]["controller"]["problem"]["cost"]["Q"][0] = 7.0
-    found["settings"]["gone"] = 1
-    path.write_text(json.dumps(found))
+    metrics = json.loads(path.read_text())
+    metrics["settings"]["controller"]["problem"]["cost"]["Q"][0] = 7.0
+    metrics["settings"]["gone"] = 1
+    path.write_text(json.dumps(metrics))
     (tree / path.parent.name.replace("seed=0", "seed=1") / "metrics.json").unlink()
     refused = forked(*SWEPT, "folder=tree", cwd=tmp_path)
     assert refused.returncode == 2
@@ -399,7 +399,7 @@ def test_a_sweep_refuses_a_finished_run_of_other_settings(sweep, tmp_path):
     assert "gone: 1 then, None now" in refused.stderr
     assert "choose another folder, or remove that one to fly it again" in refused.stderr
     assert (
-        json.loads(path.read_text()) == found
+        json.loads(path.read_text()) == metrics
     )  # nothing was overwritten, nothing else flown
     assert len(list(tree.glob("*/metrics.json"))) == 3
 
@@ -426,8 +426,8 @@ def test_a_sweep_and_a_report_count_the_runs_of_other_code(sweep, tmp_path):
     assert again.returncode == 0, again.stderr
     assert "4 runs: 0 flown, 4 finished before, 0 failed" in again.stdout
     assert said in again.stdout
-    told = json.loads(forked(*SWEPT, "folder=tree", "--json", cwd=tmp_path).stdout)
-    assert told["of_other_code"] == [f"tree/{first.name}", f"tree/{second.name}"]
+    counted = json.loads(forked(*SWEPT, "folder=tree", "--json", cwd=tmp_path).stdout)
+    assert counted["of_other_code"] == [f"tree/{first.name}", f"tree/{second.name}"]
     reported = forked("report", "tree", cwd=tmp_path)
     assert reported.returncode == 0, reported.stderr
     mixed = "mixed code: the finished runs are of different code, and may differ for"
@@ -459,9 +459,9 @@ def test_failed_runs_are_named_and_stop_nothing(tmp_path):
         "data.size=99" in line and "must be at most 25" in line for line in lines
     )
     assert len(results(tmp_path / "t")) == 4
-    told = forked("report", "t", cwd=tmp_path)
-    assert told.returncode == 0, told.stderr
-    assert "4 finished in 3 cells, 2 failed, 0 missing" in told.stdout
-    assert told.stdout.count("failed: ") == 2
-    assert "to fill: gpmpc run -m" in told.stdout
-    assert "data.size=99 seed=0,1 folder=t" in told.stdout
+    reported = forked("report", "t", cwd=tmp_path)
+    assert reported.returncode == 0, reported.stderr
+    assert "4 finished in 3 cells, 2 failed, 0 missing" in reported.stdout
+    assert reported.stdout.count("failed: ") == 2
+    assert "to fill: gpmpc run -m" in reported.stdout
+    assert "data.size=99 seed=0,1 folder=t" in reported.stdout

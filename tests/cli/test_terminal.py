@@ -340,7 +340,7 @@ def test_settings_and_classes_of_the_users_own_folder_are_found(sweep, tmp_path)
     (tmp_path / "vehicle.py").write_text(
         "from gpmpc.systems import translational as mine\n"
     )
-    found = [
+    own_files = [
         "--config-dir",
         "own",
         "--config-name",
@@ -348,7 +348,7 @@ def test_settings_and_classes_of_the_users_own_folder_are_found(sweep, tmp_path)
         "controller=mine",
         "system._target_=vehicle.mine",
     ]
-    done = forked("run", *sweep, *found, *TINY, "folder=tree", cwd=tmp_path)
+    done = forked("run", *sweep, *own_files, *TINY, "folder=tree", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     (path,) = (tmp_path / "tree").glob("*/config.yaml")
     for text in ("tolerance: 0.5", "seed: 5", "vehicle.mine"):
@@ -404,9 +404,9 @@ def test_an_error_while_handling_an_interrupt_is_the_interrupt():
         finally:
             raise ValueError("clean-up")
 
-    with pytest.raises(ValueError, match="clean-up") as found:
+    with pytest.raises(ValueError, match="clean-up") as caught:
         clean_up_badly()
-    assert _was_interrupted(found.value)
+    assert _was_interrupted(caught.value)
     assert not _was_interrupted(ValueError("of the settings"))
 
 

@@ -53,25 +53,25 @@ def test_a_search_resumes_and_its_best_settings_fly(tmp_path):
     content["provenance"]["code"] = "0" * 32
     older.write_text(json.dumps(content))
     flown[older] = older.stat().st_mtime_ns
-    found = tune("tree", "4", tmp_path)
-    assert found["of_other_code"] == [str(older.parent.relative_to(tmp_path))]
+    resumed = tune("tree", "4", tmp_path)
+    assert resumed["of_other_code"] == [str(older.parent.relative_to(tmp_path))]
     assert all(path.stat().st_mtime_ns == before for path, before in flown.items())
     whole = tune("whole", "4", tmp_path)
     assert (tmp_path / "tree" / "tuning.csv").read_text() == (
         tmp_path / "whole" / "tuning.csv"
     ).read_text()
-    assert (found["best"], found["cost"]) == (whole["best"], whole["cost"])
+    assert (resumed["best"], resumed["cost"]) == (whole["best"], whole["cost"])
     assert (tmp_path / "tree" / "tuning.png").read_bytes().startswith(b"\x89PNG")
-    program, *arguments = shlex.split(found["command"])
+    program, *arguments = shlex.split(resumed["command"])
     assert program == "gpmpc"
     composed = json.loads(forked(*arguments, "--cfg", "--json", cwd=tmp_path).stdout)
     assert composed["steps"] == 4
-    assert composed["horizon"] == found["best"]["horizon"]
+    assert composed["horizon"] == resumed["best"]["horizon"]
     assert (
         composed["controller"]["problem"]["cost"]["R"][1]
-        == found["best"]["controller.problem.cost.R.1"]
+        == resumed["best"]["controller.problem.cost.R.1"]
     )
-    kind = {"convex": "GPMPC", "lqr": "LQR"}[found["best"]["controller"]]
+    kind = {"convex": "GPMPC", "lqr": "LQR"}[resumed["best"]["controller"]]
     assert composed["controller"]["_target_"].endswith(f".{kind}")
     again = forked(*arguments, "--json", cwd=tmp_path)
     assert again.returncode == 0, again.stderr

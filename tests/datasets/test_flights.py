@@ -61,9 +61,11 @@ def test_the_velocity_reaches_the_reference_two_samples_ahead(elliptical):
 
 def test_rotational_data_steer_to_attitudes_two_samples_ahead(elliptical):
     u = elliptical["translational"].inputs[2:, 1:].numpy()
-    asked = attitude_for_thrust_direction(u[:, 0], u[:, 1], convention="paper")
+    attitudes = attitude_for_thrust_direction(u[:, 0], u[:, 1], convention="paper")
     assert (
-        np.abs(elliptical["rotational"].next_states[:-2, [1, 3]].numpy() - asked).max()
+        np.abs(
+            elliptical["rotational"].next_states[:-2, [1, 3]].numpy() - attitudes
+        ).max()
         < 5e-5
     )
     assert (

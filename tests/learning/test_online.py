@@ -88,11 +88,11 @@ def test_an_unchanged_plant_is_flown_as_without_learning(sensor):
     "changed", [{"gain": 0.7}, {"wind": 0.6}], ids=["actuator", "wind"]
 )
 def test_a_plant_that_changes_is_followed_again_within_seconds(changed):
-    before, lost, found = (
+    unchanged, unlearned, learning = (
         rms(np.array([flown(way, acting, seed=seed)[0][60:] for seed in range(3)]))
         for way, acting in ((None, None), (None, changed), (OnlineLearning(), changed))
     )
-    assert found < 1.5 * before < 0.5 * lost
+    assert learning < 1.5 * unchanged < 0.5 * unlearned
 
 
 def test_learning_is_switched_off_where_the_old_plant_returns():
@@ -178,13 +178,15 @@ def test_a_changed_model_is_a_model_with_a_last_innovation(changed):
     check_model(model, torch.from_numpy(x), torch.from_numpy(u))
     point, error, _ = model.error(x[-1], u[-1], after[-1])
     larger = model.with_point(point, error, noise)
-    found = larger.last_innovation()
-    at = torch.from_numpy(point[None])
+    innovation = larger.last_innovation()
+    query = torch.from_numpy(point[None])
     d = model.posterior.predict(
-        at[:, : -model.gp.input_dim - 1], at[:, -model.gp.input_dim - 1 :]
+        query[:, : -model.gp.input_dim - 1], query[:, -model.gp.input_dim - 1 :]
     )
-    np.testing.assert_allclose(found.error, error - d.mean.numpy()[0], atol=1e-8)
-    np.testing.assert_allclose(found.variance, d.variance.numpy()[0] + 1e-6, rtol=1e-6)
+    np.testing.assert_allclose(innovation.error, error - d.mean.numpy()[0], atol=1e-8)
+    np.testing.assert_allclose(
+        innovation.variance, d.variance.numpy()[0] + 1e-6, rtol=1e-6
+    )
     alone, later = (
         abs((after - one.linearize(x, u).mean) @ changed.B_inverse.T).max()
         for one in (changed, larger)
@@ -226,16 +228,18 @@ def check_exact(model):
         -0.5
         * ((z[:, None] - gp.features) / gp.lengthscales[:, None, None]).square().sum(-1)
     )
-    found = model.linearize(x, u)
-    alone = model.model.linearize(x, u)
+    with_change = model.linearize(x, u)
+    without = model.model.linearize(x, u)
     np.testing.assert_allclose(
-        found.mean - alone.mean,
+        with_change.mean - without.mean,
         (k @ weights[..., None])[..., 0].mT,
         rtol=1e-8,
         atol=1e-10,
     )
     reduced = torch.linalg.solve_triangular(L, k.mT, upper=False).square().sum(1)
-    variance = np.diagonal(found.covariance - alone.covariance, axis1=1, axis2=2).T
+    variance = np.diagonal(
+        with_change.covariance - without.covariance, axis1=1, axis2=2
+    ).T
     np.testing.assert_allclose(
         variance, gp.signal_variance[:, None] - reduced, rtol=1e-7, atol=1e-12
     )
@@ -266,7 +270,7 @@ def test_an_older_change_stays_and_can_go_another_way():
     models = taught(
         ChangedModel(MODEL, OnlineLearning(points=30)), 60, np.random.default_rng(4)
     )
-    kept = [
+    copies = [
         [
             array.copy()
             for array in (m.posterior.cholesky.numpy(), m.posterior.weights.numpy())
@@ -280,7 +284,7 @@ def test_an_older_change_stays_and_can_go_another_way():
         same = taught(models[k], 12, np.random.default_rng(5))[-1]
         check_exact(other)
         assert torch.equal(again.posterior.weights, same.posterior.weights)
-    for model, (cholesky, weights) in zip(models[1:], kept, strict=True):
+    for model, (cholesky, weights) in zip(models[1:], copies, strict=True):
         assert np.array_equal(model.posterior.cholesky, cholesky)
         assert np.array_equal(model.posterior.weights, weights)
 

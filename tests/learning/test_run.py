@@ -14,7 +14,7 @@ def test_a_recorded_flight_shows_when_it_learned_and_repeats(tmp_path):
     gust = (
         "disturbances=[{_target_: gpmpc.simulation.Gust, rates: {vx: 0.5}, start: 10}]"
     )
-    found = []
+    flights = []
     for tree in ("first", "second"):
         done = forked(
             "run",
@@ -31,8 +31,8 @@ def test_a_recorded_flight_shows_when_it_learned_and_repeats(tmp_path):
         assert not (run.gp_sizes[:10] > 189).any()
         assert (run.gp_sizes[12:] > 189).all()
         assert run.gp_versions[-1] > run.gp_versions[10] == 0
-        found.append(run.inputs)
-    assert np.array_equal(*found)
+        flights.append(run.inputs)
+    assert np.array_equal(*flights)
 
 
 def test_the_flight_that_counts_has_the_best_episodes_model(tmp_path):

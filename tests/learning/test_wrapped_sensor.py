@@ -168,8 +168,8 @@ class WrappingModel:
         return belief
 
     def linearize(self, states, inputs, covariance=True):
-        found = self._model.linearize(states, inputs, covariance)
-        return found._replace(mean=shown(found.mean))
+        linearized = self._model.linearize(states, inputs, covariance)
+        return linearized._replace(mean=shown(linearized.mean))
 
 
 def test_a_model_loop_has_innovations_without_turns():

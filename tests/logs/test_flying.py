@@ -96,9 +96,9 @@ def test_the_guide_flies_learns_and_flies_what_was_learned(tmp_path):
             for w in shlex.split(line)[1:]
             for name in ([*map(str, tmp_path.glob(w))] if "*" in w else [w])
         ]
-        found = forked(*words, cwd=tmp_path)
-        assert found.returncode == 0, found.stderr
-    assert "learned/model.safetensors" in found.stdout
+        done = forked(*words, cwd=tmp_path)
+        assert done.returncode == 0, done.stderr
+    assert "learned/model.safetensors" in done.stdout
     wrong = forked(
         "run", "system=cart_pole", "model=learned/model.safetensors", cwd=tmp_path
     )

@@ -43,23 +43,23 @@ def test_what_was_put_in_is_found(table, tmp_path):
     table = table.drop(index=range(5000, 5075))
     table.loc[7000, "t"] = table.loc[6999, "t"]
     table.to_csv(tmp_path / "log.csv", index=False)
-    found = inspect_log(tmp_path / "log.csv")
-    stream = found.streams.iloc[0]
+    inspection = inspect_log(tmp_path / "log.csv")
+    stream = inspection.streams.iloc[0]
     # A row that is left out leaves a gap.
     assert (stream["rows"], stream["gaps"]) == (11_925, 2)
     assert (stream["repeated stamps"], stream["backward stamps"]) == (1, 0)
     assert stream["rate [Hz]"] == pytest.approx(250)
     assert stream["longest gap [s]"] == pytest.approx(0.304)
     assert stream["jitter"] < 0.1
-    noisy = found.channels.loc["noisy"]
+    noisy = inspection.channels.loc["noisy"]
     assert noisy["white noise"] == pytest.approx(0.5, rel=0.05)
     assert noisy["smoothness"] == pytest.approx(-2 / 3, abs=0.03)
-    assert "a: smoothed: its errors hang together over rows" in found.warnings
-    assert "slow: a new value every 10.0 rows" in found.warnings
-    delay = found.delays.set_index(["channel", "later channel"]).loc[("a", "late")]
+    assert "a: smoothed: its errors hang together over rows" in inspection.warnings
+    assert "slow: a new value every 10.0 rows" in inspection.warnings
+    delay = inspection.delays.set_index(["channel", "later channel"]).loc[("a", "late")]
     assert delay["rows"] == 7
     assert delay["agreement"] > 0.9
-    assert len(png(inspection_figure(found), dpi=50)) > 5000
+    assert len(png(inspection_figure(inspection), dpi=50)) > 5000
 
 
 def test_an_input_that_follows_the_states_is_named(table, tmp_path):
@@ -67,10 +67,10 @@ def test_an_input_that_follows_the_states_is_named(table, tmp_path):
     mapping = LogMapping.from_dict(
         {"time": "t", "states": {"x": ["a"]}, "inputs": {"u": ["u"], "free": ["noisy"]}}
     )
-    found = inspect_log(tmp_path / "log.csv", mapping)
-    assert found.follows["u"] > 0.99
-    assert found.follows["noisy"] < 0.1
-    assert any("u follows the states" in warning for warning in found.warnings)
+    inspection = inspect_log(tmp_path / "log.csv", mapping)
+    assert inspection.follows["u"] > 0.99
+    assert inspection.follows["noisy"] < 0.1
+    assert any("u follows the states" in warning for warning in inspection.warnings)
     table.drop(columns="t").to_csv(tmp_path / "bare.csv", index=False)
     with pytest.raises(DataError, match="no column of the time"):
         inspect_log(tmp_path / "bare.csv")
@@ -121,9 +121,11 @@ BROKEN = {
 def test_a_broken_log_is_inspected_all_the_same(table, tmp_path, name):
     spoil, remark = BROKEN[name]
     spoil(table[:3000]).to_csv(tmp_path / "log.csv", index=False)
-    found = inspect_log(tmp_path / "log.csv")
-    assert any(remark in warning for warning in found.warnings), found.warnings
-    assert len(png(inspection_figure(found), dpi=30)) > 500
+    inspection = inspect_log(tmp_path / "log.csv")
+    assert any(remark in warning for warning in inspection.warnings), (
+        inspection.warnings
+    )
+    assert len(png(inspection_figure(inspection), dpi=30)) > 500
 
 
 def test_a_broken_log_becomes_a_page_too(tmp_path):
@@ -150,9 +152,11 @@ def test_a_log_that_contradicts_its_mapping_is_inspected(table, tmp_path):
     mapping = LogMapping.from_dict(
         {"time": "t", "states": {"x": ["a"]}, "inputs": {"u": ["u"]}}
     )
-    found = inspect_log(tmp_path / "log.csv", mapping)
-    assert found.follows == {}
-    assert any("cannot be learned from: no input" in text for text in found.warnings)
+    inspection = inspect_log(tmp_path / "log.csv", mapping)
+    assert inspection.follows == {}
+    assert any(
+        "cannot be learned from: no input" in text for text in inspection.warnings
+    )
 
 
 def test_learn_writes_its_three_files_and_names_mistakes(tmp_path):
@@ -192,14 +196,14 @@ def test_learn_writes_its_three_files_and_names_mistakes(tmp_path):
     assert "What must not be trusted" in card
     assert "| thrust |" in card
     progress = tmp_path / "learned" / "progress.json"
-    kept = json.loads(progress.read_text())
-    stages = dict.fromkeys(kept["stages"], "of another version")
+    stored = json.loads(progress.read_text())
+    stages = dict.fromkeys(stored["stages"], "of another version")
     progress.write_text(json.dumps({"fingerprint": "0", "stages": stages}))
     anew = forked("learn", *arguments, cwd=tmp_path)
     assert anew.returncode == 0, anew.stderr
     assert "learned anew" not in result.stdout
     assert "learned/progress.json: is of other code of gpmpc than this" in anew.stdout
-    assert json.loads(progress.read_text()) == kept
+    assert json.loads(progress.read_text()) == stored
     wrong = forked(
         "learn", "map.yaml", "0.csv", "1.csv", "--held-out", "7", cwd=tmp_path
     )
@@ -218,16 +222,16 @@ def test_stage_results_are_reused_or_a_line_says_why_not(tmp_path):
     again = _FileMemory(path, "name")
     assert again == {"fit": [1.5]}
     assert again.begun_anew == ""
-    kept = json.loads(path.read_text())
+    stored = json.loads(path.read_text())
     older = {"fingerprint": "name of older code", "stages": {"fit": [2.5]}}
     for content, reason in (
-        (json.dumps(kept | {"fingerprint": "other"}), "is of other data or settings"),
+        (json.dumps(stored | {"fingerprint": "other"}), "is of other data or settings"),
         (json.dumps(older | {"code": "0" * 32}), "is of other code of gpmpc than this"),
         (json.dumps(older), "is of other code of gpmpc than this"),
         ('{"fingerprint": "na', "is not whole"),
         ("[]", "is not whole"),
         ("[" * 100_000, "is not whole"),
-        (json.dumps(kept | {"stages": 3}), "is not whole"),
+        (json.dumps(stored | {"stages": 3}), "is not whole"),
     ):
         path.write_text(content)
         memory = _FileMemory(path, "name")

@@ -96,12 +96,12 @@ def test_parameters_come_back_within_their_standard_errors(flights):
         flight.loc[300::500, ["vx", "vy", "vz"]] += 5.0
     for data in (log, as_log(spoiled)):
         fit = fit_nominal(model, None, data, steps=20)
-        found = {name: (value, error) for name, value, error in fit.to_rows()}
+        estimates = {name: (value, error) for name, value, error in fit.to_rows()}
         for name, value in truth.items():
-            assert abs(found[name][0] - value) < 4 * found[name][1] + 0.05 * abs(
-                value
-            ), (name, found[name])
-        assert 0 < found["torque_x1"][1] < 5
+            estimate, error = estimates[name]
+            bound = 4 * error + 0.05 * abs(value)
+            assert abs(estimate - value) < bound, (name, estimate, error)
+        assert 0 < estimates["torque_x1"][1] < 5
 
 
 def test_learning_finds_motors_and_noise_and_beats_baselines(flights):
@@ -196,11 +196,13 @@ def begin(text):
 
 
 def test_learning_names_an_undeclared_angle_that_wraps(caplog):
-    for kind, told in (("vector", 1), ("angle", 0)):
+    for kind, warnings in (("vector", 1), ("angle", 0)):
         caplog.clear()
         with pytest.raises(Begun):
             learn(spinning_log(kind), steps=10, progress=begin)
-        assert caplog.text.count("column 1 of the states jumps by whole turns") == told
+        assert (
+            caplog.text.count("column 1 of the states jumps by whole turns") == warnings
+        )
 
 
 def test_a_rate_is_averaged_over_more_than_half_a_turn():
@@ -282,7 +284,7 @@ def test_learning_is_the_same_whatever_marks_a_gap(tmp_path):
         tables["jump"].append(
             table[~gap].assign(t=table["t"] + 100.0 * (table.index >= 150))
         )
-    found = []
+    noises = []
     for way, runs in tables.items():
         files = [tmp_path / f"{number}.csv" for number in range(3)]
         for file, table in zip(files, runs, strict=True):
@@ -303,7 +305,7 @@ def test_learning_is_the_same_whatever_marks_a_gap(tmp_path):
             noise.measurement,
         ]
         windows = log.windows(10, 20, 50)
-        found.append(
+        noises.append(
             np.concatenate(
                 [
                     a.ravel()
@@ -311,8 +313,8 @@ def test_learning_is_the_same_whatever_marks_a_gap(tmp_path):
                 ]
             )
         )
-    np.testing.assert_allclose(found[1], found[0], rtol=1e-6, atol=1e-9)
-    np.testing.assert_allclose(found[2], found[0], rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(noises[1], noises[0], rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(noises[2], noises[0], rtol=1e-6, atol=1e-9)
 
 
 def test_intervals_follow_a_rougher_run_and_never_its_future(flights):
@@ -324,15 +326,15 @@ def test_intervals_follow_a_rougher_run_and_never_its_future(flights):
     scaled = follow_errors(windows, errors, claimed, (10, 20))
     late = windows.times > 2
     for run, std in ((0, 1.0), (1, 3.0)):
-        found = np.sqrt(scaled[late & (windows.runs == run)].mean(axis=(0, 2)))
-        np.testing.assert_allclose(found, std, rtol=0.1)
+        scales = np.sqrt(scaled[late & (windows.runs == run)].mean(axis=(0, 2)))
+        np.testing.assert_allclose(scales, std, rtol=0.1)
     np.testing.assert_array_equal(
         scaled[windows.times < 0.3][:, 1], 1.0
     )  # no prediction of 20 steps is over
     changed = errors * np.where(windows.times > 5, 9.0, 1.0)[:, None, None]
-    known = windows.times <= 5
+    early = windows.times <= 5
     np.testing.assert_array_equal(
-        follow_errors(windows, changed, claimed, (10, 20))[known], scaled[known]
+        follow_errors(windows, changed, claimed, (10, 20))[early], scaled[early]
     )
 
 

@@ -37,9 +37,9 @@ def test_transitions_and_episodes_carry_names_and_rate(tmp_path):
     read = log(tmp_path / "log.csv")
     assert read.signals.state_names == ("angle", "rate")
     assert read.signals.time_step == pytest.approx(0.05)
-    for made in (read.transitions(), *read.episodes()):
-        pendulum(0.05).signals.check("the plant", made.signals, "the log")
-        assert made.signals == read.signals
+    for rows in (read.transitions(), *read.episodes()):
+        pendulum(0.05).signals.check("the plant", rows.signals, "the log")
+        assert rows.signals == read.signals
 
 
 def test_a_recording_is_read_with_the_names_of_its_system(tmp_path):

@@ -186,8 +186,8 @@ def test_repeated_and_backward_stamps_are_counted(tmp_path):
     table.loc[50, "t"] = table.loc[49, "t"]
     table.loc[[100, 101], "t"] -= 0.5
     log = read_log(written(tmp_path, table), PENDULUM)
-    found = kinds(log)
-    assert (found["repeated stamp"], found["stamp runs backwards"], len(log)) == (
+    counts = kinds(log)
+    assert (counts["repeated stamp"], counts["stamp runs backwards"], len(log)) == (
         1,
         2,
         397,
@@ -259,15 +259,15 @@ def test_a_repeated_sample_of_a_moving_system_is_left_out(tmp_path):
 
 def test_parts_at_rest_are_left_out_unless_asked_for(tmp_path):
     table = pendulum_table(600)
-    rest = pandas.DataFrame(
+    standing = pandas.DataFrame(
         {"t": 0.02 * np.arange(211), "angle": 0.3, "rate": 0.0, "torque": 0.0}
     )
-    both = pandas.concat([rest, table.assign(t=table["t"] + 4.22)])
+    both = pandas.concat([standing, table.assign(t=table["t"] + 4.22)])
     log = read_log(written(tmp_path, both), PENDULUM)
     assert 195 <= kinds(log)["at rest"] <= 211
     assert len(read_log(written(tmp_path, both), {**PENDULUM, "rest": "use"})) == 811
     with pytest.raises(DataError, match="211 of 211 rows where nothing moves"):
-        read_log(written(tmp_path, rest), PENDULUM)
+        read_log(written(tmp_path, standing), PENDULUM)
 
 
 def test_a_quaternion_whose_sign_flips_is_the_same_attitude(tmp_path):
@@ -452,10 +452,10 @@ def test_state_differences_are_inverse_to_displacements():
             rotation_quaternion(rng.normal(size=(50, 3))),
         ]
     )
-    moved = space.displace(state, error)
-    np.testing.assert_allclose(space.difference(moved, state), error, atol=1e-12)
-    moved[:, 3:] *= -1
-    np.testing.assert_allclose(space.difference(moved, state), error, atol=1e-12)
+    displaced = space.displace(state, error)
+    np.testing.assert_allclose(space.difference(displaced, state), error, atol=1e-12)
+    displaced[:, 3:] *= -1
+    np.testing.assert_allclose(space.difference(displaced, state), error, atol=1e-12)
     np.testing.assert_allclose(
         space.distances(error)[:, 2], np.linalg.norm(error[:, 3:], axis=1)
     )

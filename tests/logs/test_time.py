@@ -254,9 +254,9 @@ def test_an_inspection_reads_bags_in_any_order_and_what_is_whole(tmp_path):
         tmp_path / "arm.mcap", topics, order=np.random.default_rng(0).permutation
     )
     path.write_bytes(path.read_bytes()[:-1500])
-    found = inspect_log(path)
-    assert list(found.streams["backward stamps"]) == [0, 0]
-    assert any(warning.startswith("damaged: ") for warning in found.warnings)
+    inspection = inspect_log(path)
+    assert list(inspection.streams["backward stamps"]) == [0, 0]
+    assert any(warning.startswith("damaged: ") for warning in inspection.warnings)
 
 
 def test_thousands_of_jumps_take_no_longer_than_their_rows(tmp_path):

@@ -154,9 +154,9 @@ def load_to_fly(path):
 
 
 def load_log_model(path):
-    found = load_learned(path)
+    loaded = load_learned(path)
     return LogDynamics(
-        found.model, len(found.input_names), found.time_step, found.noise
+        loaded.model, len(loaded.input_names), loaded.time_step, loaded.noise
     )
 
 

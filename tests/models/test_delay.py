@@ -95,11 +95,11 @@ def test_disturbance_states_move_as_sampling_says():
     prior = model.augmented(
         Gaussian(0.1 * draw(1, 2), 0.01 * torch.eye(2, dtype=F)), [0.3, 0.1]
     )
-    found = Linearization(process_noise=True)(model, prior, torch.zeros(1))
+    belief = Linearization(process_noise=True)(model, prior, torch.zeros(1))
     sampled = MonteCarlo(50_000, process_noise=True)(model, prior, torch.zeros(1))
-    assert torch.allclose(found.mean, sampled.mean, atol=1e-2)
-    assert torch.allclose(found.covariance, sampled.covariance, atol=3e-3)
-    assert float(found.covariance[2, 2]) == pytest.approx(0.3**2 + 0.1**2)
+    assert torch.allclose(belief.mean, sampled.mean, atol=1e-2)
+    assert torch.allclose(belief.covariance, sampled.covariance, atol=3e-3)
+    assert float(belief.covariance[2, 2]) == pytest.approx(0.3**2 + 0.1**2)
 
 
 @pytest.mark.parametrize(

@@ -153,13 +153,13 @@ def test_turns_and_left_out_columns_change_nothing():
     model = with_angles()
     x = draw(8, 5, 4)
     u = draw(9, 5, 2)
-    moved = model.predict(x, u)
+    prediction = model.predict(x, u)
     turn = x + torch.tensor(
         [2 * torch.pi, 0, 7.0, -4 * torch.pi]
     )  # state 2 is not seen
     after = model.predict(turn, u)
-    assert torch.allclose(after.mean - turn, moved.mean - x, atol=1e-12)
-    assert torch.allclose(after.covariance, moved.covariance, atol=1e-12)
+    assert torch.allclose(after.mean - turn, prediction.mean - x, atol=1e-12)
+    assert torch.allclose(after.covariance, prediction.covariance, atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -172,9 +172,9 @@ def test_a_belief_moves_through_features_as_sampling_says(name, propagator):
     m = model.input_dim
     belief = Gaussian(0.3 * draw(1, n), 0.0003 * torch.eye(n, dtype=F))
     sampled = MonteCarlo(50_000)(model, belief, draw(2, m))
-    found = propagator(model, belief, draw(2, m))
-    assert torch.allclose(found.mean, sampled.mean, atol=5e-3)
-    assert torch.allclose(found.covariance, sampled.covariance, atol=3e-4)
+    next_belief = propagator(model, belief, draw(2, m))
+    assert torch.allclose(next_belief.mean, sampled.mean, atol=5e-3)
+    assert torch.allclose(next_belief.covariance, sampled.covariance, atol=3e-4)
     with pytest.raises(UnsupportedModel, match="Possible with any model"):
         MomentMatching()(model, belief, draw(2, m))
 
@@ -243,8 +243,8 @@ def test_lags_shift_and_reveal_an_unmeasured_velocity():
         lags.nominal, seen, lags.B, angles=[0], trainer=Trainer(restarts=0)
     )
     held_out = lags.transitions(measured[100:], u[100:].numpy())
-    moved = model.predict(held_out.states, held_out.inputs).mean
-    assert float((moved - held_out.next_states).abs().max()) < 0.01
+    means = model.predict(held_out.states, held_out.inputs).mean
+    assert float((means - held_out.next_states).abs().max()) < 0.01
     check_model(model, held_out.states[:4], held_out.inputs[:4])
 
 

@@ -111,10 +111,10 @@ def test_foreign_code_is_refused_before_anything_is_imported(
     path.write_bytes(six_hostile_models(path, CANARY)[name])
     for trusted in ([], ["my_robot"]):
         modules = {*sys.modules}
-        with pytest.raises(DataError, match="is the code '") as told:
+        with pytest.raises(DataError, match="is the code '") as refusal:
             load_model(path, trusted=trusted)
-        assert str(told.value).startswith(f"{path}: ")
-        assert "\n" not in str(told.value)
+        assert str(refusal.value).startswith(f"{path}: ")
+        assert "\n" not in str(refusal.value)
         assert {*sys.modules} == modules
     with pytest.raises(DataError, match="is the code '"):
         load_flyable(path)
@@ -221,11 +221,11 @@ def one_cell(name, row, column, value):
 def test_a_crafted_model_is_refused_at_once_in_one_line(change, rule, saved):
     path = saved(with_operations(), change)
     began = time.process_time()
-    with pytest.raises(DataError, match=rule) as told:
+    with pytest.raises(DataError, match=rule) as refusal:
         load_model(path)
     assert time.process_time() - began < 2.0
-    assert str(told.value).startswith(f"{path}: ")
-    assert "\n" not in str(told.value)
+    assert str(refusal.value).startswith(f"{path}: ")
+    assert "\n" not in str(refusal.value)
 
 
 def test_models_inside_each_other_without_end_are_refused(saved):
@@ -241,9 +241,9 @@ def test_models_inside_each_other_without_end_are_refused(saved):
             for name in list(arrays):
                 arrays["model/" * depth + name] = arrays.pop(name)
 
-        with pytest.raises(DataError, match="inside each other|damaged") as told:
+        with pytest.raises(DataError, match="inside each other|damaged") as refusal:
             load_model(saved(residual_model(), deep))
-        assert "\n" not in str(told.value)
+        assert "\n" not in str(refusal.value)
 
 
 def test_a_model_of_too_many_states_is_neither_loaded_nor_saved(saved, tmp_path):

@@ -88,20 +88,20 @@ def test_an_expansion_is_the_derivative_of_the_prediction(name, points):
     model = MODELS[name]()
     x = draw(8, points, N)
     u = draw(9, points, M)
-    found = linearize(model, x.numpy(), u.numpy())
+    linearized = linearize(model, x.numpy(), u.numpy())
     belief = model.predict(x, u)
     A, B = torch.func.vmap(
         torch.func.jacrev(lambda x, u: model.predict(x, u).mean, argnums=(0, 1))
     )(x, u)
     for got, expected in zip(
-        found, (belief.mean, A, B, belief.covariance), strict=True
+        linearized, (belief.mean, A, B, belief.covariance), strict=True
     ):
         assert got.flags.c_contiguous
         assert got.dtype == np.float64
         np.testing.assert_allclose(got, expected.numpy(), atol=1e-11)
     without = linearize(model, x.numpy(), u.numpy(), covariance=False)
     assert without.covariance is None
-    for got, expected in zip(without[:3], found[:3], strict=True):
+    for got, expected in zip(without[:3], linearized[:3], strict=True):
         np.testing.assert_array_equal(got, expected)
 
 

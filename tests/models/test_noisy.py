@@ -137,8 +137,8 @@ def test_moments_have_no_closed_form():
 def test_a_filter_is_that_of_the_noise_at_the_belief():
     model = noisy()
     sensor = Measurement.of_states(2, [0], std=[0.1])
-    at = model.noise(QUIET.mean, PUSH)
-    fixed = residual(at)
+    noise = model.noise(QUIET.mean, PUSH)
+    fixed = residual(noise)
     same = NoisyModel(MODELS["residual"], model.log_noise, (1,))
     found, expected = (
         KalmanFilter.extended(one, sensor).predict(QUIET, PUSH) for one in (same, fixed)

@@ -54,10 +54,10 @@ def belief(spread=0.3):
 def test_a_prediction_is_nominal_plus_residual_where_it_acts(nominal):
     x = torch.rand(4, 3)
     u = torch.rand(4, 2)
-    found = model(nominal).predict(x, u)
+    prediction = model(nominal).predict(x, u)
     d = gp().predict(x[:, [2, 0]], u[:, [1]])
-    assert torch.allclose(found.mean, nominal(x, u) + d.mean @ B.T)
-    assert torch.allclose(found.covariance, B @ d.covariance @ B.T)
+    assert torch.allclose(prediction.mean, nominal(x, u) + d.mean @ B.T)
+    assert torch.allclose(prediction.covariance, B @ d.covariance @ B.T)
     assert torch.allclose(
         model().noise_covariance, B @ torch.diag(torch.tensor([1e-3, 2e-3])) @ B.T
     )
@@ -65,38 +65,40 @@ def test_a_prediction_is_nominal_plus_residual_where_it_acts(nominal):
 
 @pytest.mark.parametrize("nominal", [AFFINE, nonlinear])
 def test_the_jacobian_is_that_of_finite_differences(nominal):
-    known = model(nominal)
+    residual_model = model(nominal)
     x = torch.rand(2, 4, 3)
     u = torch.rand(2, 4, 2)
     step = 1e-6
-    _, by_state, by_input = predict_with_jacobian(known, x, u)
+    _, by_state, by_input = predict_with_jacobian(residual_model, x, u)
     for d in range(3):
         shift = step * torch.eye(3)[d]
         slope = (
-            known.predict(x + shift, u).mean - known.predict(x - shift, u).mean
+            residual_model.predict(x + shift, u).mean
+            - residual_model.predict(x - shift, u).mean
         ) / (2 * step)
         assert torch.allclose(by_state[..., d], slope, atol=1e-8)
     for d in range(2):
         shift = step * torch.eye(2)[d]
         slope = (
-            known.predict(x, u + shift).mean - known.predict(x, u - shift).mean
+            residual_model.predict(x, u + shift).mean
+            - residual_model.predict(x, u - shift).mean
         ) / (2 * step)
         assert torch.allclose(by_input[..., d], slope, atol=1e-8)
 
 
 def test_moment_matching_with_an_affine_nominal_model():
-    known = model()
-    at = belief()
+    residual_model = model()
+    prior = belief()
     control = torch.tensor([0.3, -0.5])
-    exact = MomentMatching().propagate(known, at, control)
-    found = [
-        MonteCarlo(20_000, seed=seed).propagate(known, at, control)
+    exact = MomentMatching().propagate(residual_model, prior, control)
+    samples = [
+        MonteCarlo(20_000, seed=seed).propagate(residual_model, prior, control)
         for seed in range(20)
     ]
     for exactly, drawn in (
-        (exact.belief.mean, torch.stack([f.belief.mean for f in found])),
-        (exact.belief.covariance, torch.stack([f.belief.covariance for f in found])),
-        (exact.cross_covariance, torch.stack([f.cross_covariance for f in found])),
+        (exact.belief.mean, torch.stack([f.belief.mean for f in samples])),
+        (exact.belief.covariance, torch.stack([f.belief.covariance for f in samples])),
+        (exact.cross_covariance, torch.stack([f.cross_covariance for f in samples])),
     ):
         z = (drawn.mean(0) - exactly) / (drawn.std(0) / 20**0.5 + 1e-15)
         assert (
@@ -105,21 +107,22 @@ def test_moment_matching_with_an_affine_nominal_model():
 
 
 def test_a_nonlinear_nominal_goes_with_every_other_propagation():
-    known = model(nonlinear)
-    at = belief(0.05)
+    residual_model = model(nonlinear)
+    prior = belief(0.05)
     control = torch.tensor([0.3, -0.5])
     with pytest.raises(
         UnsupportedModel,
         match="Possible with any model: MeanEquivalence, Linearization, Unscented",
     ):
-        MomentMatching()(known, at, control)
-    sampled = MonteCarlo(50_000)(known, at, control)
+        MomentMatching()(residual_model, prior, control)
+    sampled = MonteCarlo(50_000)(residual_model, prior, control)
     for propagator in (Linearization(), Unscented()):
-        found = propagator(known, at, control)
-        assert torch.allclose(found.mean, sampled.mean, atol=5e-3)
-        assert torch.allclose(found.covariance, sampled.covariance, atol=1e-3)
+        next_belief = propagator(residual_model, prior, control)
+        assert torch.allclose(next_belief.mean, sampled.mean, atol=5e-3)
+        assert torch.allclose(next_belief.covariance, sampled.covariance, atol=1e-3)
     assert torch.allclose(
-        MeanEquivalence()(known, at, control).mean, known.predict(at.mean, control).mean
+        MeanEquivalence()(residual_model, prior, control).mean,
+        residual_model.predict(prior.mean, control).mean,
     )
 
 
@@ -127,8 +130,10 @@ def transitions(rows, noise=1e-3, seed=0):
     generator = torch.Generator().manual_seed(seed)
     x = 3 * torch.rand(rows, 3, generator=generator) - 1.5
     u = torch.rand(rows, 2, generator=generator)
-    moved = AFFINE(x, u) + torch.sin(2 * x[:, :1]) * torch.tensor([0.0, 0.5, 1.0])
-    return Transitions(x, u, moved + noise * torch.randn(rows, 3, generator=generator))
+    next_states = AFFINE(x, u) + torch.sin(2 * x[:, :1]) * torch.tensor([0.0, 0.5, 1.0])
+    return Transitions(
+        x, u, next_states + noise * torch.randn(rows, 3, generator=generator)
+    )
 
 
 ACTS = torch.tensor([[0.0], [0.5], [1.0]])
@@ -139,50 +144,52 @@ ACTS = torch.tensor([[0.0], [0.5], [1.0]])
     [Trainer(restarts=0), SparseTrainer(inducing=15, restarts=0, iterations=5)],
 )
 def test_training_finds_a_known_residual(trainer):
-    known = ResidualModel.train(
+    learned = ResidualModel.train(
         AFFINE, transitions(40), ACTS, states=[0], inputs=[], trainer=trainer
     )
     x = torch.linspace(-1.3, 1.3, 30)[:, None].expand(-1, 3)
-    found = known.residual.predict(x[:, :1]).mean[:, 0]
-    assert torch.allclose(found, torch.sin(2 * x[:, 0]), atol=5e-3)
+    predicted = learned.residual.predict(x[:, :1]).mean[:, 0]
+    assert torch.allclose(predicted, torch.sin(2 * x[:, 0]), atol=5e-3)
     held_out = transitions(50, noise=0.0, seed=1)
     assert torch.allclose(
-        known.predict(held_out.states, held_out.inputs).mean,
+        learned.predict(held_out.states, held_out.inputs).mean,
         held_out.next_states,
         atol=2e-2,
     )
 
 
 def test_by_default_every_state_has_a_residual_of_everything():
-    known = ResidualModel.train(AFFINE, transitions(15), trainer=Trainer(restarts=0))
+    learned = ResidualModel.train(AFFINE, transitions(15), trainer=Trainer(restarts=0))
     assert (
-        known.residual.state_dim,
-        known.residual.input_dim,
-        known.residual.output_dim,
+        learned.residual.state_dim,
+        learned.residual.input_dim,
+        learned.residual.output_dim,
     ) == (3, 2, 3)
 
 
 def test_a_residual_model_learns_while_it_runs():
     data = transitions(60)
-    known = ResidualModel.train(
+    learned = ResidualModel.train(
         AFFINE, data[:20], ACTS, states=[0], inputs=[], trainer=Trainer(restarts=0)
     )
-    grown = known.append(data[20:])
+    grown = learned.append(data[20:])
     assert len(grown.residual) == 60
     x = transitions(20, seed=1).states
     u = transitions(20, seed=1).inputs
     assert (
         grown.predict(x, u).covariance[:, 2, 2]
-        < known.predict(x, u).covariance[:, 2, 2]
+        < learned.predict(x, u).covariance[:, 2, 2]
     ).all()
-    held = known
+    windowed = learned
     for i in range(20, 60):
-        held = held.append(data[i : i + 1], SlidingWindow(25, "least_informative"))
-    assert len(held.residual) == 25
+        windowed = windowed.append(
+            data[i : i + 1], SlidingWindow(25, "least_informative")
+        )
+    assert len(windowed.residual) == 25
     with pytest.raises(
         ShapeError, match="3 states and 2 inputs; got transitions with 3 and 1"
     ):
-        known.append(
+        learned.append(
             Transitions(torch.zeros(1, 3), torch.zeros(1, 1), torch.zeros(1, 3))
         )
 
@@ -199,14 +206,14 @@ def test_a_residual_model_can_be_moved_to_single_precision():
 
 
 def test_any_trainer_learns_residuals_and_nothing_else_does():
-    found = [
+    residuals = [
         ResidualModel.train(
             AFFINE, transitions(15), trainer=Trainer(predicts=predicts, restarts=0)
         ).residual
         for predicts in ("value", "difference")
     ]
-    assert found[1].predicts == "value"
-    assert torch.equal(found[0].weights, found[1].weights)
+    assert residuals[1].predicts == "value"
+    assert torch.equal(residuals[0].weights, residuals[1].weights)
     with pytest.raises(
         SettingError, match="trainer: must be a Trainer or SparseTrainer; got 3"
     ):

@@ -131,9 +131,9 @@ def test_predictions_do_not_jump_at_half_a_turn(nominal):
     assert torch.allclose(model.predict(x + turned, u).mean - turned, mean, atol=1e-9)
     for propagator in (Linearization(), Unscented(), MonteCarlo(200)):
         belief = Gaussian(x, 0.01 * torch.eye(2, dtype=F).expand(61, 2, 2))
-        moved = propagator(model, belief, u)
-        assert (moved.mean - mean).abs().max() < 0.05
-        assert moved.variance[:, 0].max() < 0.02
+        next_belief = propagator(model, belief, u)
+        assert (next_belief.mean - mean).abs().max() < 0.05
+        assert next_belief.variance[:, 0].max() < 0.02
 
 
 class Wrapping:
@@ -196,10 +196,14 @@ def test_wrappers_and_lags_know_the_angles_of_their_model():
 def test_training_names_an_undeclared_angle_once(train, caplog):
     with caplog.at_level(logging.WARNING, "gpmpc"):
         train(transitions("hanging"))
-    told = [r.getMessage() for r in caplog.records if "whole turns" in r.getMessage()]
-    assert len(told) == 1
-    assert "column 1 of the states jumps by whole turns (2 pi) in 9 of 150" in told[0]
-    assert "angles=[0]" in told[0]
+    warnings = [
+        r.getMessage() for r in caplog.records if "whole turns" in r.getMessage()
+    ]
+    assert len(warnings) == 1
+    assert (
+        "column 1 of the states jumps by whole turns (2 pi) in 9 of 150" in warnings[0]
+    )
+    assert "angles=[0]" in warnings[0]
 
 
 def warned(states, next_states, caplog, angles=()):
@@ -259,8 +263,10 @@ def test_differences_of_states_leave_whole_turns_out():
     one = np.array([[3.1, 5.0], [-9.0, 0.0]])
     other = np.array([[-3.1, -5.0]])
     for kind in (np.array, torch.tensor):
-        found = state_difference(kind(one), kind(other), [0])
-        assert np.allclose(found, [[6.2 - 2 * np.pi, 10.0], [-5.9 + 2 * np.pi, 5.0]])
+        difference = state_difference(kind(one), kind(other), [0])
+        assert np.allclose(
+            difference, [[6.2 - 2 * np.pi, 10.0], [-5.9 + 2 * np.pi, 5.0]]
+        )
     assert np.array_equal(state_difference(one, other, []), one - other)
     assert np.allclose(full_turns(one - other, [0]), [[2 * np.pi, 0], [-2 * np.pi, 0]])
     small = np.array([1e-17, -1e-9, 3.14, -3.14, np.pi, -np.pi])
@@ -289,14 +295,14 @@ def test_a_calibration_counts_no_turn_as_an_error():
 def test_process_noise_is_that_of_the_motion_and_ordered_in_time():
     rng, (states, inputs) = np.random.default_rng(0), FLIGHTS["hanging"]
     noisy = states + rng.normal(0, [1e-3, 1e-2], states.shape)
-    found = []
+    results = []
     for sensor in (np.array, shown):
         seen = sensor(noisy)
-        found.append(
+        results.append(
             estimate_process_noise(HANGING, Transitions(seen[:-1], inputs, seen[1:]))
         )
-    assert torch.allclose(found[0].variance, found[1].variance, rtol=1e-6)
-    assert torch.allclose(found[0].correlation, found[1].correlation, rtol=1e-6)
+    assert torch.allclose(results[0].variance, results[1].variance, rtol=1e-6)
+    assert torch.allclose(results[0].correlation, results[1].correlation, rtol=1e-6)
 
 
 def test_tubes_hold_across_the_seam():

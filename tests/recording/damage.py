@@ -55,16 +55,17 @@ def records(data):
         start += 9 + length
 
 
-def joined(found):
+def joined(entries):
     return b"".join(
-        struct.pack("<BQ", opcode, len(content)) + content for opcode, content in found
+        struct.pack("<BQ", opcode, len(content)) + content
+        for opcode, content in entries
     )
 
 
-def sealed(found):
+def sealed(entries):
     """A file of the records of a data section, all its checksums right, without the
     index."""
-    data = MAGIC + joined(found)
+    data = MAGIC + joined(entries)
     end = joined([(DATA_END, struct.pack("<I", zlib.crc32(data)))])
     footer = struct.pack("<BQQQ", FOOTER, 20, 0, 0)
     return data + end + footer + struct.pack("<I", zlib.crc32(footer)) + MAGIC
@@ -72,8 +73,8 @@ def sealed(found):
 
 def section(data):
     """The records of a file's data section."""
-    found = list(records(data[len(MAGIC) :]))
-    return found[: [opcode for opcode, _ in found].index(DATA_END)]
+    entries = list(records(data[len(MAGIC) :]))
+    return entries[: [opcode for opcode, _ in entries].index(DATA_END)]
 
 
 def text(value):
@@ -197,20 +198,20 @@ def append(data, rng):
     return data + _pick(rng, [b"\0", rng.bytes(30), data, MAGIC])
 
 
-def shuffle(found, rng):
+def shuffle(entries, rng):
     """Records removed, repeated or exchanged."""
-    found = list(found)
-    i, j = (int(place) for place in rng.integers(0, len(found), 2))
+    entries = list(entries)
+    i, j = (int(place) for place in rng.integers(0, len(entries), 2))
     kind = rng.integers(4)
     if kind == 0:
-        del found[i]
+        del entries[i]
     elif kind == 1:
-        found.insert(j, found[i])
+        entries.insert(j, entries[i])
     elif kind == 2:
-        found[i], found[j] = found[j], found[i]
+        entries[i], entries[j] = entries[j], entries[i]
     else:
-        found[i:j] = []
-    return found
+        entries[i:j] = []
+    return entries
 
 
 def shuffle_file(data, rng):
@@ -236,23 +237,23 @@ def huge(data, rng):
 
 def in_chunk(data, rng, change):
     """A chunk's records changed by ``change``, its checksum right."""
-    found = section(data)
-    i = _pick(rng, [i for i, (opcode, _) in enumerate(found) if opcode == CHUNK])
-    content = change(inside(found[i][1]))
-    found[i] = chunk(
+    entries = section(data)
+    i = _pick(rng, [i for i, (opcode, _) in enumerate(entries) if opcode == CHUNK])
+    content = change(inside(entries[i][1]))
+    entries[i] = chunk(
         content if isinstance(content, bytes) else joined(content),
         _pick(rng, ["zstd", "lz4", ""]),
     )
-    return sealed(found)
+    return sealed(entries)
 
 
 def shuffle_in_chunk(data, rng):
-    return in_chunk(data, rng, lambda found: shuffle(found, rng))
+    return in_chunk(data, rng, lambda entries: shuffle(entries, rng))
 
 
 def flip_in_chunk(data, rng):
-    def change(found):
-        content = joined(found)
+    def change(entries):
+        content = joined(entries)
         return _flip(content, rng.integers(0, len(content), rng.integers(1, 4)), rng)
 
     return in_chunk(data, rng, change)
@@ -261,19 +262,19 @@ def flip_in_chunk(data, rng):
 def cut_in_chunk(data, rng):
     """The chunk, a message or a schema shorter than it says, or empty."""
 
-    def change(found):
+    def change(entries):
         if rng.integers(3) == 0:
-            content = joined(found)
+            content = joined(entries)
             return content[: int(rng.integers(len(content)))]
-        i = int(rng.integers(len(found)))
-        opcode, content = found[i]
-        found[i] = (
+        i = int(rng.integers(len(entries)))
+        opcode, content = entries[i]
+        entries[i] = (
             opcode,
             content[: int(rng.integers(len(content)))]
             if rng.integers(2)
             else content[:22],
         )
-        return found
+        return entries
 
     return in_chunk(data, rng, change)
 
@@ -281,13 +282,13 @@ def cut_in_chunk(data, rng):
 def renumber(data, rng):
     """Ids and time stamps of schemas, channels and messages."""
 
-    def change(found):
-        i = int(rng.integers(len(found)))
-        opcode, content = found[i]
+    def change(entries):
+        i = int(rng.integers(len(entries)))
+        opcode, content = entries[i]
         place = int(rng.choice([0, 2, 6]))
         number = struct.pack("<H", int(rng.choice([0, 1, 2, 9, 65535])))
-        found[i] = opcode, content[:place] + number + content[place + 2 :]
-        return found
+        entries[i] = opcode, content[:place] + number + content[place + 2 :]
+        return entries
 
     return in_chunk(data, rng, change)
 
@@ -298,15 +299,15 @@ def edit_message(data, rng):
         _schema.descriptor(runs.STATES, runs.INPUTS, arrays_as_bytes=True)
     )
 
-    def change(found):
+    def change(entries):
         messages = [
             i
-            for i, (opcode, content) in enumerate(found)
+            for i, (opcode, content) in enumerate(entries)
             if opcode == MESSAGE and content[0] in (1, 2, 3)
         ]
         i = _pick(rng, messages)
-        head = found[i][1][:22]
-        content = found[i][1][22:]
+        head = entries[i][1][:22]
+        content = entries[i][1][22:]
         message = classes[("Step", "Plan", "QuadraticProgram")[head[0] - 1]].FromString(
             content
         )
@@ -335,8 +336,8 @@ def edit_message(data, rng):
                     )
                 ),
             )
-        found[i] = MESSAGE, head + message.SerializeToString()
-        return found
+        entries[i] = MESSAGE, head + message.SerializeToString()
+        return entries
 
     return in_chunk(data, rng, change)
 
@@ -378,18 +379,18 @@ def edit_metadata(data, rng):
         (METADATA, text("run")),
         (METADATA, text("run") + struct.pack("<I", 2**32 - 1)),
     ]
-    found = section(data)
-    i = _pick(rng, [i for i, (opcode, _) in enumerate(found) if opcode == METADATA])
-    found[i] = changed[0] if rng.integers(2) else _pick(rng, changed)
-    return sealed(found)
+    entries = section(data)
+    i = _pick(rng, [i for i, (opcode, _) in enumerate(entries) if opcode == METADATA])
+    entries[i] = changed[0] if rng.integers(2) else _pick(rng, changed)
+    return sealed(entries)
 
 
 def edit_config(data, rng):
     content = _pick(
         rng, [b"", b"\xff\xfe\x80", b"seed: 8\n", bytes(10**6), rng.bytes(1000)]
     )
-    found = section(data)
-    [i] = [i for i, (opcode, _) in enumerate(found) if opcode == ATTACHMENT]
+    entries = section(data)
+    [i] = [i for i, (opcode, _) in enumerate(entries) if opcode == ATTACHMENT]
     changed = [
         attachment("config.yaml", content),
         attachment("config.yaml", content, crc=0),
@@ -398,10 +399,10 @@ def edit_config(data, rng):
     changed += [
         (ATTACHMENT, b""),
         (ATTACHMENT, bytes(30)),
-        (ATTACHMENT, found[i][1][:-7]),
+        (ATTACHMENT, entries[i][1][:-7]),
     ]
-    found[i] = _pick(rng, changed)
-    return sealed(found)
+    entries[i] = _pick(rng, changed)
+    return sealed(entries)
 
 
 _zeros: dict = {}
@@ -428,7 +429,7 @@ def zeros(size, compression):
 
 def bomb(data, rng, largest=2**31):
     """Chunks of very little that unfold to very much, or say so."""
-    found = section(data)
+    entries = section(data)
     kind = rng.integers(5)
     compression = _pick(rng, ["zstd", "lz4"])
     if kind == 0:  # honest about its size
@@ -456,8 +457,8 @@ def bomb(data, rng, largest=2**31):
             "<BQHIQQ", MESSAGE, 22 + 2**24, int(rng.integers(1, 4)), 0, 0, 0
         ) + bytes(2**24)
         bombs = [chunk(content, compression)] * int(rng.choice([1, 60]))
-    place = int(rng.integers(1, len(found) + 1))
-    return sealed(found[:place] + bombs + found[place:])
+    place = int(rng.integers(1, len(entries) + 1))
+    return sealed(entries[:place] + bombs + entries[place:])
 
 
 def well_formed_bomb(data, rng):
@@ -465,7 +466,7 @@ def well_formed_bomb(data, rng):
     many of them."""
     classes = _schema.message_classes(_schema.descriptor(runs.STATES, runs.INPUTS))
     n = len(runs.STATES)
-    found = section(data)
+    entries = section(data)
     kind = rng.integers(3)
     many = int(rng.choice([3, 40]))
     if kind == 0:
@@ -501,7 +502,7 @@ def well_formed_bomb(data, rng):
         chunk(joined([(MESSAGE, content)] * max(1, min(many, 2**23 // len(content)))))
         for _ in range(min(many, 40))
     ]
-    return sealed(found + chunks)
+    return sealed(entries + chunks)
 
 
 def foreign(data, rng):

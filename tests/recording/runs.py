@@ -85,7 +85,7 @@ def make_step(
 
 def recorder(path, **settings):
     """A recorder of small chunks, so that a short run has several."""
-    given = {
+    options = {
         "chunk_size": 20_000,
         "time_step": TIME_STEP,
         "units": UNITS,
@@ -93,20 +93,20 @@ def recorder(path, **settings):
         "pose": POSE,
     } | settings
     of_system = {
-        key: given.pop(key)
+        key: options.pop(key)
         for key in ("time_step", "units", "input_bounds", "pose", "z_down")
-        if key in given
+        if key in options
     }
     system = RecordedSystem(STATES, INPUTS, **of_system)
     return McapRecorder(
-        path, system, **({"config": {"seed": 7}, "metadata": {"seed": 7}} | given)
+        path, system, **({"config": {"seed": 7}, "metadata": {"seed": 7}} | options)
     )
 
 
 def record_run(path, steps=8, **settings):
     rng = np.random.default_rng(0)
-    made = [make_step(k, rng) for k in range(steps)]
+    recorded = [make_step(k, rng) for k in range(steps)]
     with recorder(path, **settings) as to:
-        for step in made:
+        for step in recorded:
             to.record(step)
-    return made
+    return recorded

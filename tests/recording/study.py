@@ -123,18 +123,18 @@ def operations(path):
 def examine(path, original):
     """What came of every operation, and what the largest of them took."""
     Path("/proc/self/clear_refs").write_text("5")  # resets the peak
-    found = {}
+    outcomes = {}
     slowest = 0.0
     for name, operation in operations(path):
         signal.alarm(SECONDS)  # ends the process, and so the study
         start = time.process_time()
-        found[name] = outcome(operation, path, original)
+        outcomes[name] = outcome(operation, path, original)
         slowest = max(slowest, time.process_time() - start)
     signal.alarm(0)
     peak = re.search(r"VmHWM:\s*(\d+) kB", Path("/proc/self/status").read_text())
     for left in path.parent.iterdir():
         left.unlink()
-    return {"outcomes": found, "seconds": slowest, "megabytes": int(peak[1]) / 1024}
+    return {"outcomes": outcomes, "seconds": slowest, "megabytes": int(peak[1]) / 1024}
 
 
 def study(recording, seed, first, end):
@@ -157,13 +157,13 @@ def study(recording, seed, first, end):
             rng = np.random.default_rng([seed, i])
             kind = kinds[i % len(kinds)]
             path.write_bytes(kind(data, rng))
-            found = {
+            line = {
                 "seed": [seed, i],
                 "damage": kind.__name__,
                 "size": path.stat().st_size,
             }
-            found |= examine(path, original)
-            yield found | {"megabytes": found["megabytes"] - bare}
+            line |= examine(path, original)
+            yield line | {"megabytes": line["megabytes"] - bare}
 
 
 if __name__ == "__main__":

@@ -67,8 +67,8 @@ def test_every_column_is_what_its_name_says(flown):
         "SOLVED",
     ]
     assert run.columns["failed"].tolist() == [False, True, False, False]
-    told = {"status", "failed", "judgement", "reason"}
-    assert set(run.columns) == {*expected, *told}
+    verdicts = {"status", "failed", "judgement", "reason"}
+    assert set(run.columns) == {*expected, *verdicts}
 
 
 def test_a_data_frame_holds_the_columns_and_their_units(flown):

@@ -45,12 +45,12 @@ def check_study(path, seed, count):
     assert len(lines) == count
     edits = {kind.__name__ for kind in damage.EDITS}
     for line in lines:
-        found = line["outcomes"]
+        outcomes = line["outcomes"]
         believed = {"other"} if line["damage"] in edits else set()
         assert (
-            set(found.values()) <= {"error", "same", "unfinished", "done"} | believed
+            set(outcomes.values()) <= {"error", "same", "unfinished", "done"} | believed
         ), line
-        assert found.get("recovered") != "error", (
+        assert outcomes.get("recovered") != "error", (
             line
         )  # what recover writes can always be read
         assert line["megabytes"] + BARE < 300, line
@@ -89,12 +89,12 @@ def test_no_flipped_bit_of_the_metadata_passes_unseen(recorded, tmp_path, seed):
 
 
 CHANGES = {
-    "lost": lambda found, i: found[:i] + found[i + 1 :],
-    "repeated": lambda found, i: [*found[: i + 1], *found[i:]],
-    "of an unknown kind": lambda found, i: [
-        *found[:i],
-        (found[i][0] | 0x80, found[i][1]),
-        *found[i + 1 :],
+    "lost": lambda entries, i: entries[:i] + entries[i + 1 :],
+    "repeated": lambda entries, i: [*entries[: i + 1], *entries[i:]],
+    "of an unknown kind": lambda entries, i: [
+        *entries[:i],
+        (entries[i][0] | 0x80, entries[i][1]),
+        *entries[i + 1 :],
     ],
 }
 
@@ -104,12 +104,12 @@ def test_a_file_with_a_lost_or_repeated_record_is_unfinished(
     recorded, tmp_path, change
 ):
     path = tmp_path / "changed.mcap"
-    found = list(damage.records(recorded[0].read_bytes()[len(damage.MAGIC) :]))
+    entries = list(damage.records(recorded[0].read_bytes()[len(damage.MAGIC) :]))
     read_again = 0
-    for i, (kind, _) in enumerate(found):
+    for i, (kind, _) in enumerate(entries):
         if kind in (damage.CHUNK, damage.METADATA, damage.ATTACHMENT):
             path.write_bytes(
-                damage.MAGIC + damage.joined(CHANGES[change](found, i)) + damage.MAGIC
+                damage.MAGIC + damage.joined(CHANGES[change](entries, i)) + damage.MAGIC
             )
             with contextlib.suppress(
                 RecordingError
@@ -117,7 +117,7 @@ def test_a_file_with_a_lost_or_repeated_record_is_unfinished(
                 assert not read_run(path).finished, (i, kind)
                 read_again += 1
     assert read_again > 3
-    path.write_bytes(damage.MAGIC + damage.joined(found) + damage.MAGIC)
+    path.write_bytes(damage.MAGIC + damage.joined(entries) + damage.MAGIC)
     assert read_run(path).finished
 
 
@@ -126,11 +126,11 @@ def test_a_chunk_with_a_short_last_record_is_unfinished(
     recorded, tmp_path, compression
 ):
     path = tmp_path / "cut.mcap"
-    found = damage.section(recorded[0].read_bytes())
-    i = max(i for i, (kind, _) in enumerate(found) if kind == damage.CHUNK)
+    entries = damage.section(recorded[0].read_bytes())
+    i = max(i for i, (kind, _) in enumerate(entries) if kind == damage.CHUNK)
     content, last = (
         damage.joined(part)
-        for part in (damage.inside(found[i][1]), damage.inside(found[i][1])[-1:])
+        for part in (damage.inside(entries[i][1]), damage.inside(entries[i][1])[-1:])
     )
     for missing in (
         0,
@@ -139,17 +139,17 @@ def test_a_chunk_with_a_short_last_record_is_unfinished(
         len(last) - 9,
         len(last) - 1,
     ):  # of the last record: head or kind alone
-        found[i] = damage.chunk(content[: len(content) - missing], compression)
-        path.write_bytes(damage.sealed(found))
+        entries[i] = damage.chunk(content[: len(content) - missing], compression)
+        path.write_bytes(damage.sealed(entries))
         assert read_run(path).finished == (missing == 0), missing
 
 
 def with_messages(data, change):
     """The file with other messages, in one chunk, its checksums right."""
-    found = damage.section(data)
+    entries = damage.section(data)
     records = [
         record
-        for kind, content in found
+        for kind, content in entries
         if kind == damage.CHUNK
         for record in damage.inside(content)
     ]
@@ -158,7 +158,7 @@ def with_messages(data, change):
     records += [(damage.MESSAGE, content) for content in change(messages)]
     chunk = damage.chunk(damage.joined(records))
     return damage.sealed(
-        [record for record in found if record[0] not in (damage.CHUNK, 7)] + [chunk]
+        [record for record in entries if record[0] not in (damage.CHUNK, 7)] + [chunk]
     )
 
 
@@ -281,10 +281,10 @@ def test_a_recording_of_the_largest_steps_is_read(tmp_path):
 @pytest.mark.parametrize("compression", ["zstd", "lz4", ""])
 def test_a_file_that_another_tool_compressed_is_read(recorded, tmp_path, compression):
     path = tmp_path / "other.mcap"
-    found = damage.section(recorded[0].read_bytes())
+    entries = damage.section(recorded[0].read_bytes())
     chunks = [
         (kind, damage.inside(content) if kind == damage.CHUNK else content)
-        for kind, content in found
+        for kind, content in entries
     ]
     rewritten = [
         damage.chunk(damage.joined(content), compression)
@@ -300,24 +300,26 @@ def test_a_file_that_another_tool_compressed_is_read(recorded, tmp_path, compres
 
 def test_a_frame_that_does_not_say_its_size_is_read(recorded, tmp_path):
     path = tmp_path / "other.mcap"
-    found = damage.section(recorded[0].read_bytes())
+    entries = damage.section(recorded[0].read_bytes())
     silent = zstandard.ZstdCompressor(write_content_size=False)
-    for i, (kind, content) in enumerate(found):
+    for i, (kind, content) in enumerate(entries):
         if kind == damage.CHUNK:
             data = damage.joined(damage.inside(content))
-            found[i] = damage.chunk(data, compressed=silent.compress(data))
-    path.write_bytes(damage.sealed(found))
+            entries[i] = damage.chunk(data, compressed=silent.compress(data))
+    path.write_bytes(damage.sealed(entries))
     assert read_run(path).finished
 
 
 def test_metadata_may_stand_behind_the_messages(recorded, tmp_path):
     path = tmp_path / "other.mcap"
-    found = damage.section(recorded[0].read_bytes())
+    entries = damage.section(recorded[0].read_bytes())
     behind = [
-        record for record in found if record[0] in (damage.METADATA, damage.ATTACHMENT)
+        record
+        for record in entries
+        if record[0] in (damage.METADATA, damage.ATTACHMENT)
     ]
     path.write_bytes(
-        damage.sealed([record for record in found if record not in behind] + behind)
+        damage.sealed([record for record in entries if record not in behind] + behind)
     )
     run = read_run(path)
     expected = read_run(recorded[0])
@@ -329,14 +331,14 @@ def test_metadata_may_stand_behind_the_messages(recorded, tmp_path):
 @pytest.mark.parametrize("size", [0, 2**20, 2**40, 2**63])
 def test_a_chunk_that_says_another_size_ends_what_is_read(recorded, tmp_path, size):
     path = tmp_path / "changed.mcap"
-    found = damage.section(recorded[0].read_bytes())
-    chunks = [i for i, (kind, _) in enumerate(found) if kind == damage.CHUNK]
-    content = found[chunks[2]][1]
-    found[chunks[2]] = (
+    entries = damage.section(recorded[0].read_bytes())
+    chunks = [i for i, (kind, _) in enumerate(entries) if kind == damage.CHUNK]
+    content = entries[chunks[2]][1]
+    entries[chunks[2]] = (
         damage.CHUNK,
         content[:16] + struct.pack("<Q", size) + content[24:],
     )
-    path.write_bytes(damage.sealed(found))
+    path.write_bytes(damage.sealed(entries))
     run = read_run(path)
     assert not run.finished
     assert 0 < len(run.times) < len(recorded[1])

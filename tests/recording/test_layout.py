@@ -68,10 +68,10 @@ def shown(request, tmp_path_factory):
     return request.param, path, json.loads(layout(read_run(path)))
 
 
-def paths_of(made):
+def paths_of(config):
     return [
         line["value"]
-        for panel in made["configById"].values()
+        for panel in config["configById"].values()
         for line in panel.get("paths", ())
     ]
 
@@ -87,46 +87,46 @@ def at(message, path):
 
 
 def test_every_path_is_a_field_of_the_recording(shown):
-    _, path, made = shown
+    _, path, config = shown
     with path.open("rb") as file:
         decoded = make_reader(
             file, decoder_factories=[DecoderFactory()]
         ).iter_decoded_messages()
         last = {channel.topic: message for _, channel, _, message in decoded}
-    for value in paths_of(made):
+    for value in paths_of(config):
         topic, fields = re.fullmatch(r"(/\w+)((?:\.\w+(?:\[\d+\])?)+)", value).groups()
         kind = str if value == "/step.judgement" else int | float
         assert isinstance(at(last[topic], fields), kind), value
 
 
 def test_every_state_and_every_input_with_its_bounds_is_plotted(shown):
-    flown, _, made = shown
+    flown, _, config = shown
     states = FLOWN[flown].state_names
     inputs = FLOWN[flown].input_names
     groups = [(group, states) for group in ("reference", "state", "measured")]
     groups += [(group, inputs) for group in ("input", "input_lower", "input_upper")]
     assert {
         f"/step.{group}.{name}" for group, names in groups for name in names
-    } <= set(paths_of(made))
+    } <= set(paths_of(config))
 
 
 def test_every_panel_has_its_place_and_every_place_its_panel(shown):
-    _, _, made = shown
+    _, _, config = shown
 
     def leaves(node):
         if isinstance(node, str):
             return [node]
         return [*leaves(node["first"]), *leaves(node["second"])]
 
-    placed = leaves(made["layout"])
-    tabs = made["configById"]["Tab!plots"]["tabs"]
+    placed = leaves(config["layout"])
+    tabs = config["configById"]["Tab!plots"]["tabs"]
     placed += [leaf for tab in tabs for leaf in leaves(tab["layout"])]
-    assert sorted(placed) == sorted(made["configById"])
+    assert sorted(placed) == sorted(config["configById"])
 
 
 def test_the_vehicle_is_seen_where_states_tell_about_it(shown):
-    flown, path, made = shown
-    scene = made["configById"].get("3D!scene")
+    flown, path, config = shown
+    scene = config["configById"].get("3D!scene")
     assert (scene is None) == (flown == "pendulum")
     if scene is not None:
         assert set(scene["topics"]) <= set(read_run(path).channels)
@@ -143,11 +143,11 @@ def test_the_vehicle_is_seen_where_states_tell_about_it(shown):
         assert grid["size"] == grid["divisions"] == (4 if flown == "rotational" else 40)
         assert scene["cameraState"]["distance"] == (3 if flown == "rotational" else 25)
         assert (
-            made["layout"]["splitPercentage"],
-            made["layout"]["first"]["splitPercentage"],
+            config["layout"]["splitPercentage"],
+            config["layout"]["first"]["splitPercentage"],
         ) == (50, 78)
     else:
-        assert made["layout"] == {
+        assert config["layout"] == {
             "direction": "row",
             "first": "RosOut!log",
             "second": "Tab!plots",
@@ -174,9 +174,9 @@ def test_units_and_bounds_are_shown_where_there_are_any(tmp_path):
 
 
 def test_states_stand_below_each_other_in_tabs_by_what_they_are(shown):
-    flown, _, made = shown
+    flown, _, config = shown
     tabs = {
-        tab["title"]: tab["layout"] for tab in made["configById"]["Tab!plots"]["tabs"]
+        tab["title"]: tab["layout"] for tab in config["configById"]["Tab!plots"]["tabs"]
     }
     grouped = {
         "translational": ["Position", "Rates"], "rotational": ["Attitude", "Rates"],
@@ -185,7 +185,7 @@ def test_states_stand_below_each_other_in_tabs_by_what_they_are(shown):
     assert [*tabs] == [*grouped, "Inputs", "Uncertainty", "Solver"]
     uncertain = [
         panel
-        for panel in made["configById"]
+        for panel in config["configById"]
         if re.match("Plot!(expected|innovation)-", panel)
     ]
     kinds = [
@@ -195,19 +195,19 @@ def test_states_stand_below_each_other_in_tabs_by_what_they_are(shown):
     ]
     assert uncertain == kinds
     first = tabs["Solver"]["first"]
-    rest = tabs["Solver"]["second"]
+    lower = tabs["Solver"]["second"]
     shares = []
-    for node in (tabs["Solver"], rest):
+    for node in (tabs["Solver"], lower):
         assert node["direction"] == "column"
         shares.append(node["splitPercentage"])
-    assert (first, shares, rest["first"]) == (
+    assert (first, shares, lower["first"]) == (
         "Plot!timing",
         [33.33, 50.0],
         "Plot!iterations",
     )
     dashed = {
         line["value"].split(".")[1]
-        for panel in made["configById"].values()
+        for panel in config["configById"].values()
         for line in panel.get("paths", ())
         if line.get("lineStyle") == "dashed"
     }

@@ -82,11 +82,11 @@ class Viewer:
                 channels |= {
                     channel["topic"]: channel for channel in message["channels"]
                 }
-        wanted = [
+        subscriptions = [
             {"id": channels[topic]["id"], "channelId": channels[topic]["id"]}
             for topic in topics
         ]
-        self.send({"op": "subscribe", "subscriptions": wanted})
+        self.send({"op": "subscribe", "subscriptions": subscriptions})
         return {channels[topic]["id"]: topic for topic in topics}
 
 

@@ -101,8 +101,8 @@ def without_checksums(data):
 
 def rebuilt(data, change):
     """The file with other records, their lengths right, checksums and places not."""
-    found = change(list(damage.records(data[len(damage.MAGIC) :])))
-    return damage.MAGIC + damage.joined(found) + damage.MAGIC
+    records = change(list(damage.records(data[len(damage.MAGIC) :])))
+    return damage.MAGIC + damage.joined(records) + damage.MAGIC
 
 
 # --- chunks ---------------------------------------------------------------------------
@@ -223,9 +223,9 @@ def test_bytes_put_in_or_taken_out_cost_no_more_than_a_chunk(small, tmp_path):
 def test_a_chunk_that_comes_twice_is_read_once(small, tmp_path):
     data, steps = small
 
-    def twice(found):
-        rows = [i for i, (kind, _) in enumerate(found) if kind == damage.CHUNK]
-        return [*found[: rows[1]], found[rows[0]], *found[rows[1] :]]
+    def twice(records):
+        rows = [i for i, (kind, _) in enumerate(records) if kind == damage.CHUNK]
+        return [*records[: rows[1]], records[rows[0]], *records[rows[1] :]]
 
     run = read(rebuilt(data, twice), tmp_path)
     assert run.steps.tolist() == list(range(20))
@@ -285,8 +285,10 @@ def test_data_are_whole_where_only_the_index_is_damaged(small, tmp_path):
 def test_an_index_vouches_for_channels_that_damage_hides(small, tmp_path):
     data, steps = small
 
-    def without_topics(found):  # as in files of earlier versions
-        return [f for f in found if not (f[0] == damage.METADATA and b"/step" in f[1])]
+    def without_topics(records):  # as in files of earlier versions
+        return [
+            f for f in records if not (f[0] == damage.METADATA and b"/step" in f[1])
+        ]
 
     data = rebuilt(data, without_topics)
     first = chunk_spans(data)[0]
@@ -307,19 +309,19 @@ def test_older_files_are_read_and_their_losses_counted(small, tmp_path):
         number = struct.unpack_from("<I", body, 2)[0]
         return kind, body[:2] + struct.pack("<I", number - 1) + body[6:]
 
-    found = [
+    records = [
         damage.chunk(damage.joined(map(renumbered, damage.inside(content))))
         if kind == damage.CHUNK
         else (kind, content)
         for kind, content in damage.section(data)
         if kind != 7 and not (kind == damage.METADATA and b"/step" in content)
     ]
-    run = read(damage.sealed(found), tmp_path)
+    run = read(damage.sealed(records), tmp_path)
     assert run.finished
     assert is_right(run, steps)
-    rows = [i for i, (kind, _) in enumerate(found) if kind == damage.CHUNK]
-    del found[rows[2]]
-    run = read(damage.sealed(found), tmp_path)
+    rows = [i for i, (kind, _) in enumerate(records) if kind == damage.CHUNK]
+    del records[rows[2]]
+    run = read(damage.sealed(records), tmp_path)
     assert run.lost_steps == 5
     assert "between steps 9 and 15" in run.flaws[-1].text
 
@@ -341,10 +343,10 @@ def test_a_file_without_checksums_says_so(small, tmp_path):
 
 
 def test_metadata_without_a_checksum_are_named(small, tmp_path):
-    found = list(damage.records(small[0][len(damage.MAGIC) :]))
+    records = list(damage.records(small[0][len(damage.MAGIC) :]))
     changed = [
         (kind, bytes(4) if kind == damage.DATA_END else content)
-        for kind, content in found
+        for kind, content in records
     ]
     run = read(damage.MAGIC + damage.joined(changed) + damage.MAGIC, tmp_path)
     assert kinds(run) == ["no checksums"]
@@ -352,9 +354,9 @@ def test_metadata_without_a_checksum_are_named(small, tmp_path):
 
 
 def with_statistics(place, code, number):
-    def change(found):
+    def change(records):
         changed = []
-        for kind, content in found:
+        for kind, content in records:
             if kind == 11:  # statistics
                 content = bytearray(content)
                 struct.pack_into(code, content, place, number)
@@ -365,31 +367,31 @@ def with_statistics(place, code, number):
 
 
 def removed(opcode, row=0):
-    def change(found):
-        rows = [i for i, (kind, _) in enumerate(found) if kind == opcode]
-        return [*found[: rows[row]], *found[rows[row] + 1 :]]
+    def change(records):
+        rows = [i for i, (kind, _) in enumerate(records) if kind == opcode]
+        return [*records[: rows[row]], *records[rows[row] + 1 :]]
 
     return change
 
 
-def swapped(found):
-    rows = [i for i, (kind, _) in enumerate(found) if kind == damage.CHUNK]
-    found[rows[1]], found[rows[2]] = found[rows[2]], found[rows[1]]
-    return found
+def swapped(records):
+    rows = [i for i, (kind, _) in enumerate(records) if kind == damage.CHUNK]
+    records[rows[1]], records[rows[2]] = records[rows[2]], records[rows[1]]
+    return records
 
 
-def with_steps(found, count):
+def with_steps(records, count):
     return [
         damage.metadata("end", {"steps": str(count), "outcome": "complete"})
         if kind == damage.METADATA and b"outcome" in content
         else (kind, content)
-        for kind, content in found
+        for kind, content in records
     ]
 
 
-def without_summary(found):
-    end = [kind for kind, _ in found].index(damage.DATA_END)
-    return [*found[: end + 1], (damage.FOOTER, bytes(20))]
+def without_summary(records):
+    end = [kind for kind, _ in records].index(damage.DATA_END)
+    return [*records[: end + 1], (damage.FOOTER, bytes(20))]
 
 
 ALTERED = {
@@ -400,8 +402,14 @@ ALTERED = {
     "the settings are lost": (removed(damage.ATTACHMENT), "damaged index"),
     "attachments are counted otherwise": (with_statistics(14, "<I", 0), "wrong count"),
     "metadata are counted otherwise": (with_statistics(18, "<I", 9), "wrong count"),
-    "the end counts more steps": (lambda found: with_steps(found, 30), "lost steps"),
-    "the end counts fewer steps": (lambda found: with_steps(found, 3), "wrong count"),
+    "the end counts more steps": (
+        lambda records: with_steps(records, 30),
+        "lost steps",
+    ),
+    "the end counts fewer steps": (
+        lambda records: with_steps(records, 3),
+        "wrong count",
+    ),
     "messages are counted otherwise": (with_statistics(0, "<Q", 181), "wrong count"),
     "schemas are counted otherwise": (with_statistics(8, "<H", 6), "wrong count"),
     "channels are counted otherwise": (with_statistics(10, "<I", 8), "wrong count"),
@@ -412,7 +420,7 @@ ALTERED = {
     "a schema is not repeated": (removed(damage.SCHEMA), "damaged index"),
     "the data have no end": (removed(damage.DATA_END), "unfinished"),
     "a chunk is lost with the index": (
-        lambda found: without_summary(removed(damage.CHUNK, 1)(found)),
+        lambda records: without_summary(removed(damage.CHUNK, 1)(records)),
         "lost steps",
     ),
 }
@@ -440,17 +448,17 @@ def test_names_that_differ_from_the_schema_are_named(small, tmp_path):
 def chunks_moved(data, rng):
     """A chunk removed, repeated or exchanged with another."""
 
-    def change(found):
-        rows = [i for i, (kind, _) in enumerate(found) if kind == damage.CHUNK]
+    def change(records):
+        rows = [i for i, (kind, _) in enumerate(records) if kind == damage.CHUNK]
         i, j = (int(row) for row in rng.permutation(rows)[:2])
         kind = rng.integers(3)
         if kind == 0:
-            del found[i]
+            del records[i]
         elif kind == 1:
-            found.insert(j, found[i])
+            records.insert(j, records[i])
         else:
-            found[i], found[j] = found[j], found[i]
-        return found
+            records[i], records[j] = records[j], records[i]
+        return records
 
     return rebuilt(data, change)
 

@@ -90,9 +90,9 @@ def test_another_reader_finds_everything(path, way):
         ["node", str(SCRIPT), str(path)], capture_output=True, text=True, check=False
     )
     assert output.returncode == 0, output.stderr
-    found = json.loads(output.stdout)[way]
+    read = json.loads(output.stdout)[way]
     expected = ours(path)
-    assert found == expected
+    assert read == expected
     topics = {
         "/step",
         "/plan",
@@ -105,11 +105,11 @@ def test_another_reader_finds_everything(path, way):
         "/tf/display",
         "/log",
     }
-    assert set(found["channels"]) == topics
-    assert {"run", "units", "frames"} <= set(found["metadata"])
-    assert [name for name, *_ in found["attachments"]] == ["config.yaml"]
+    assert set(read["channels"]) == topics
+    assert {"run", "units", "frames"} <= set(read["metadata"])
+    assert [name for name, *_ in read["attachments"]] == ["config.yaml"]
     if path.name == "run.mcap":
-        assert found["counts"] == dict.fromkeys(topics, STEPS) | {"/log": 1}
-        assert found["metadata"]["end"] == {"steps": str(STEPS), "outcome": "complete"}
+        assert read["counts"] == dict.fromkeys(topics, STEPS) | {"/log": 1}
+        assert read["metadata"]["end"] == {"steps": str(STEPS), "outcome": "complete"}
     else:
-        assert 0 < found["counts"]["/step"] < STEPS
+        assert 0 < read["counts"]["/step"] < STEPS

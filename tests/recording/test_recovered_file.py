@@ -23,8 +23,8 @@ def test_a_recovered_file_tells_so_and_counts_what_it_holds(cut, tmp_path):
     steps = runs.record_run(path, steps=20)
     whole = path.read_bytes()
     path.write_bytes(whole[: len(whole) - cut])
-    found = recover(path, output)
-    assert found.finished == (cut == 0)
+    recovery = recover(path, output)
+    assert recovery.finished == (cut == 0)
     about = metadata(output)
     assert ("recovered" in about) == (cut > 0)
     run = read_run(output)
@@ -34,5 +34,5 @@ def test_a_recovered_file_tells_so_and_counts_what_it_holds(cut, tmp_path):
         )
     assert run.steps.tolist() == list(range(len(run.steps)))
     assert (len(run.steps) == len(steps)) == (cut < 1000)
-    np.testing.assert_array_equal(found.states, run.states)
-    assert found.path == output
+    np.testing.assert_array_equal(recovery.states, run.states)
+    assert recovery.path == output

@@ -57,8 +57,8 @@ def messages_of(run):
 
 def check_recovered(path, output):
     expected = whole_messages(path.read_bytes())
-    found = recover(path, output)
-    assert messages_of(found) == expected
+    recovery = recover(path, output)
+    assert messages_of(recovery) == expected
     with output.open("rb") as file:
         reader = make_reader(file, validate_crcs=True)
         assert len(list(reader.iter_messages())) == expected
@@ -195,9 +195,9 @@ def test_a_damaged_chunk_ends_what_is_recovered(finished, tmp_path):
 
 def test_a_finished_file_is_copied_with_nothing_lost(finished, tmp_path):
     output = tmp_path / "copy.mcap"
-    found = recover(finished, output)
-    assert found.finished
-    assert np.ptp(found.times) == pytest.approx(1.9)
+    recovery = recover(finished, output)
+    assert recovery.finished
+    assert np.ptp(recovery.times) == pytest.approx(1.9)
     before = read_run(finished)
     after = read_run(output)
     np.testing.assert_array_equal(before.plan_means, after.plan_means)

@@ -93,7 +93,7 @@ def add(tree, controller, seed, error, **how):
     made_up_run(tree, *chosen(controller, seed), result=metrics_of(error, **how))
 
 
-def documents(found, comparison=()):
+def documents(report, comparison=()):
     """Every file of a report, by name."""
-    document = report_document(found, comparison)
+    document = report_document(report, comparison)
     return document.files("report") | {"report.html": document.html()}

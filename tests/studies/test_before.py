@@ -53,37 +53,37 @@ def flown(model, horizon, **changes):
 
 
 def test_a_horizon_that_loses_the_goal_is_said_before_flight(model):
-    lines, found = flown(model, 2)
+    lines, result = flown(model, 2)
     (line,) = lines
     assert line.startswith("horizon 2: the loop runs away from its reference")
-    assert found["outlook"]["warnings"] == lines
-    assert found["outlook"]["spectral_radius"] > 1.05
-    shortest = found["outlook"]["shortest_horizon"]
+    assert result["outlook"]["warnings"] == lines
+    assert result["outlook"]["spectral_radius"] > 1.05
+    shortest = result["outlook"]["shortest_horizon"]
     assert line.endswith(f"it settles with {shortest} steps or more")
-    assert json.loads(json.dumps(found)) == found
+    assert json.loads(json.dumps(result)) == result
     settings = {
         "options": {"system": "pendulum", "trajectory": "goal", "controller": "convex"}
     }
-    rows = dict(summary(found | {"settings": settings}).rows)
+    rows = dict(summary(result | {"settings": settings}).rows)
     assert rows["before the flight"] == line
     learning, _ = flown(model, 2, learning=OnlineLearning())
     assert learning == lines
 
 
 def test_a_good_flight_is_told_nothing(model):
-    lines, found = flown(model, 20)
+    lines, result = flown(model, 20)
     assert lines == []
-    assert found["outlook"]["warnings"] == []
-    assert found["outlook"]["spectral_radius"] < 1
+    assert result["outlook"]["warnings"] == []
+    assert result["outlook"]["spectral_radius"] < 1
 
 
 def test_a_goal_beyond_the_data_is_said_whatever_flies(model):
     away = replace(pendulum(), goal=[0.0, 60.0])
     law = partial(LQR, problem=PROBLEM, horizon=5, initial_input=[0.0])
-    lines, found = flown(model, 5, system=away, controller=law)
+    lines, result = flown(model, 5, system=away, controller=law)
     (line,) = lines
     assert line.startswith(f"the reference of {away.state_names[1]} is 60, its data ")
-    assert found["outlook"]["spectral_radius"] is None
+    assert result["outlook"]["spectral_radius"] is None
 
 
 def test_the_command_says_it_once_on_stderr_and_in_its_table(tmp_path):

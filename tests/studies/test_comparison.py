@@ -9,8 +9,7 @@ import pytest
 from scipy import stats
 
 from gpmpc.exceptions import DataError
-from gpmpc.studies.report import compare, sentences
-from gpmpc.studies.report import read_report as report
+from gpmpc.studies.report import compare, read_report, sentences
 from tests.studies.made_up import made_up_run, metrics_of
 
 SETTINGS = {
@@ -38,7 +37,7 @@ def compared(tree, first, second):
     for seed, errors in enumerate(zip(first, second, strict=True)):
         for controller, error in zip(("lqr", "convex"), errors, strict=True):
             fly(tree, controller, seed, error)
-    return next(c for c in compare(report(tree), *GROUPS) if c.measure == "rmse")
+    return next(c for c in compare(read_report(tree), *GROUPS) if c.measure == "rmse")
 
 
 @pytest.mark.parametrize("pairs", [6, 9, 15])
@@ -82,20 +81,20 @@ def test_a_verdict_is_given_below_five_percent_and_not_above(tmp_path):
     """Of six pairs p is 2 / 64 where all agree, and 4 / 64 where the smallest
     difference contradicts the others."""
     sizes = np.array([1, 2, 3, 4, 5, 6]) * 1e-3
-    found = compared(tmp_path / "agree", 0.2 + sizes, np.full(6, 0.2))
-    assert (found.wilcoxon, found.verdict) == (
+    comparison = compared(tmp_path / "agree", 0.2 + sizes, np.full(6, 0.2))
+    assert (comparison.wilcoxon, comparison.verdict) == (
         pytest.approx(2 / 64),
         "A is larger than B",
     )
-    found = compared(tmp_path / "turned", 0.2 - sizes, np.full(6, 0.2))
-    assert (found.wilcoxon, found.verdict) == (
+    comparison = compared(tmp_path / "turned", 0.2 - sizes, np.full(6, 0.2))
+    assert (comparison.wilcoxon, comparison.verdict) == (
         pytest.approx(2 / 64),
         "A is smaller than B",
     )
-    found = compared(
+    comparison = compared(
         tmp_path / "contradict", 0.2 + sizes * [-1, 1, 1, 1, 1, 1], np.full(6, 0.2)
     )
-    assert (found.wilcoxon, found.verdict) == (
+    assert (comparison.wilcoxon, comparison.verdict) == (
         pytest.approx(4 / 64),
         "no difference shown",
     )
@@ -105,9 +104,9 @@ def test_groups_without_two_seeds_in_common_are_refused(tmp_path):
     for controller, seed in (("lqr", 0), ("lqr", 1), ("convex", 1), ("convex", 2)):
         fly(tmp_path, controller, seed, 0.1)
     with pytest.raises(DataError, match="fewer than two seeds in common"):
-        compare(report(tmp_path), *GROUPS)
+        compare(read_report(tmp_path), *GROUPS)
     fly(tmp_path, "convex", 0, 0.1)
-    assert compare(report(tmp_path), *GROUPS)[0].pairs == 2
+    assert compare(read_report(tmp_path), *GROUPS)[0].pairs == 2
 
 
 def test_the_text_names_gaps_of_one_measure_and_gaps_of_all(tmp_path):
@@ -115,13 +114,13 @@ def test_the_text_names_gaps_of_one_measure_and_gaps_of_all(tmp_path):
         fly(tmp_path, "lqr", seed, 0.1)
         if seed != 7:
             fly(tmp_path, "convex", seed, 0.2 + 1e-3 * seed)
-    found = compare(report(tmp_path), *GROUPS)
-    lines = sentences(report(tmp_path), found, *GROUPS)
-    assert len(lines) == 1 + len(found)
+    comparisons = compare(read_report(tmp_path), *GROUPS)
+    lines = sentences(read_report(tmp_path), comparisons, *GROUPS)
+    assert len(lines) == 1 + len(comparisons)
     assert lines[0].endswith("Left out, since A or B lacks runs of it: seed=7.")
     assert not any("seed=7" in line for line in lines[1:])
-    also = [replace(found[0], left_out=("seed=3", "seed=7")), *found[1:]]
-    lines = sentences(report(tmp_path), also, *GROUPS)
+    also = [replace(comparisons[0], left_out=("seed=3", "seed=7")), *comparisons[1:]]
+    lines = sentences(read_report(tmp_path), also, *GROUPS)
     assert lines[0].endswith("lacks runs of it: seed=7.")
     assert lines[1].endswith("left out as well: seed=3")
     assert not any("left out" in line for line in lines[2:])

@@ -201,12 +201,12 @@ def test_a_spreadsheet_reads_numbers_and_no_formulas():
 
 
 def test_the_files_are_named_after_the_document():
-    found = DOCUMENT.files("report")
-    assert list(found) == ["report.md", "report.csv", "report.tex", "a.png"]
-    assert found["report.md"] == DOCUMENT.markdown()
-    assert found["report.csv"] == DOCUMENT.csv()
-    assert found["report.tex"] == DOCUMENT.tex()
-    assert found["a.png"] == b"\x89PNG"
+    files = DOCUMENT.files("report")
+    assert list(files) == ["report.md", "report.csv", "report.tex", "a.png"]
+    assert files["report.md"] == DOCUMENT.markdown()
+    assert files["report.csv"] == DOCUMENT.csv()
+    assert files["report.tex"] == DOCUMENT.tex()
+    assert files["a.png"] == b"\x89PNG"
 
 
 def test_a_document_of_a_title_and_a_table_is_no_more_than_that():

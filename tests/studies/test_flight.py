@@ -81,9 +81,9 @@ def experiment(**changes):
 
 
 def numbers(experiment):
-    found = metrics(experiment, run_trial(experiment))
-    assert found.pop("times")["total"]["median"] >= 0
-    return found
+    result = metrics(experiment, run_trial(experiment))
+    assert result.pop("times")["total"]["median"] >= 0
+    return result
 
 
 def test_a_seed_gives_the_same_numbers_and_another_one_others():
@@ -114,9 +114,12 @@ def test_a_seeds_rows_are_nested_and_in_the_flights_order():
 def test_a_model_loop_needs_no_plant_and_a_true_model_no_data():
     flown = run_trial(experiment(loop="model"))
     assert np.trace(flown.rollout.covariances[-1]) > 0
-    known = run_trial(experiment(controller=ON_THE_PLANT, data=None))
-    assert known.training is None
-    assert metrics(experiment(controller=ON_THE_PLANT), known)["rmse"]["total"] < 0.01
+    by_true_model = run_trial(experiment(controller=ON_THE_PLANT, data=None))
+    assert by_true_model.training is None
+    assert (
+        metrics(experiment(controller=ON_THE_PLANT), by_true_model)["rmse"]["total"]
+        < 0.01
+    )
 
 
 @pytest.mark.parametrize(
@@ -160,14 +163,14 @@ def test_the_rotational_subsystem_follows_at_its_own_rate():
         controller=partial(GPMPC, **settings), size=None, steps=100,
     )  # fmt: skip
     flight = run_trial(turning)
-    found = metrics(turning, flight)
+    result = metrics(turning, flight)
     assert flight.rollout.time_step == 0.05
     assert (
         np.ptp(flight.rollout.references[:, 0]) > 0.03
     )  # [rad]: there was something to follow
-    assert set(found["rmse"]) == {"phi", "theta", "psi", "total"}
-    assert found["unit"] == "rad"
-    assert found["rmse"]["total"] < 0.005
+    assert set(result["rmse"]) == {"phi", "theta", "psi", "total"}
+    assert result["unit"] == "rad"
+    assert result["rmse"]["total"] < 0.005
 
 
 @pytest.mark.parametrize(
@@ -180,14 +183,14 @@ def test_the_rotational_subsystem_follows_at_its_own_rate():
 def test_a_lost_flight_says_since_when(trajectory, law):
     lost = blind(law, trajectory=trajectory)
     flight = run_trial(lost)
-    found = metrics(lost, flight)["lost"]
+    loss = metrics(lost, flight)["lost"]
     away = np.linalg.norm(
         (flight.rollout.states - flight.rollout.references)[:, ::2], axis=1
     )
-    assert found["time"] == found["step"]
-    assert 10 < away[found["step"]] <= away.max()
-    assert away[: found["step"]].max() < away[found["step"]]
-    assert f"{away[found['step']]:.3g} m from its reference" in found["reason"]
+    assert loss["time"] == loss["step"]
+    assert 10 < away[loss["step"]] <= away.max()
+    assert away[: loss["step"]].max() < away[loss["step"]]
+    assert f"{away[loss['step']]:.3g} m from its reference" in loss["reason"]
 
 
 @pytest.mark.parametrize("trajectory", [Elliptical(), Lorenz(), Hover((0, 0, -5))])
@@ -198,9 +201,9 @@ def test_an_offset_and_a_short_flight_are_no_loss(trajectory):
         trajectory=trajectory, data=None, controller=lambda plant: ON_THE_PLANT(PLANT, problem=problem), plant=heavy,
         steps=20,
     )  # fmt: skip
-    found = metrics(sagging, run_trial(sagging))
-    assert found["rmse"]["z"] > 3
-    assert found["lost"] is None
+    result = metrics(sagging, run_trial(sagging))
+    assert result["rmse"]["z"] > 3
+    assert result["lost"] is None
     for steps in (1, 2):
         assert numbers(experiment(trajectory=trajectory, steps=steps))["lost"] is None
 
@@ -228,16 +231,16 @@ def growing(rate):
 
 @pytest.mark.parametrize("growth", [1e60, 1e120])
 def test_a_diverged_flight_has_metrics_that_can_be_written(growth):
-    told = []
+    recorded = []
     diverging = blind(growing(growth), trajectory=Hover((0, 0, -5)))
-    flight = run_trial(diverging, lambda controller, training: told.append)
-    found = metrics(diverging, flight)
-    json.dumps(found, allow_nan=False)
-    assert found["lost"]["step"] == 1
-    assert "the plant's state is not finite any more" in found["lost"]["reason"]
-    assert set(found["rmse"].values()) == {None}
-    assert found["steps"] == flight.diverged.step == len(told) < 30
-    assert found["violations"]["inputs"]["steps"] == found["steps"]
+    flight = run_trial(diverging, lambda controller, training: recorded.append)
+    result = metrics(diverging, flight)
+    json.dumps(result, allow_nan=False)
+    assert result["lost"]["step"] == 1
+    assert "the plant's state is not finite any more" in result["lost"]["reason"]
+    assert set(result["rmse"].values()) == {None}
+    assert result["steps"] == flight.diverged.step == len(recorded) < 30
+    assert result["violations"]["inputs"]["steps"] == result["steps"]
     with pytest.raises(Diverged):  # nothing was flown
         run_trial(blind(growing(1e308), trajectory=Hover((0, 0, -5))))
 
@@ -271,13 +274,13 @@ MORE = [
 @pytest.fixture(scope="module")
 def learned():
     """Rows and what was learned from them, by system; trained once."""
-    kept = {}
+    trainings = {}
 
     def of(settings):
-        if settings.system.name not in kept:
+        if settings.system.name not in trainings:
             rows = settings.training_rows()
-            kept[settings.system.name] = rows, settings.train(rows, seed=0)
-        rows, training = kept[settings.system.name]
+            trainings[settings.system.name] = rows, settings.train(rows, seed=0)
+        rows, training = trainings[settings.system.name]
 
         class Kept:
             note = ""
@@ -386,8 +389,8 @@ def test_the_scales_of_columns_at_rest_follow_from_the_limits(settings):
     # One unit; a tenth of 4 m/s; one unit though thrusts reach 100 N; a tenth of 1.4.
     expected = [1.0, 0.4, 1.0, 0.14]
     assert np.allclose(gp.lengthscales[:, [4, 5, 6, 7]], expected)
-    known = replace(flown, train=replace(flown.train, prior_lengthscale=3.0))
-    lengthscales = known.learn(data, seed=0).posterior.lengthscales
+    with_prior = replace(flown, train=replace(flown.train, prior_lengthscale=3.0))
+    lengthscales = with_prior.learn(data, seed=0).posterior.lengthscales
     assert np.allclose(lengthscales[:, [4, 5, 6, 7]], 3.0)
 
 

@@ -16,8 +16,7 @@ from omegaconf import OmegaConf
 
 from gpmpc.exceptions import DataError, SettingError
 from gpmpc.plotting import Series, over_variable
-from gpmpc.studies.report import compare, sentences, terminal_table
-from gpmpc.studies.report import read_report as report
+from gpmpc.studies.report import compare, read_report, sentences, terminal_table
 from tests.studies.made_up import (
     SETTINGS,
     add,
@@ -37,8 +36,8 @@ def seeds(cell, state):
     return [*cell.seed[cell.state == state]]
 
 
-def cells(found):
-    return [cell for _, cell in found.runs.groupby("cell")]
+def cells(report):
+    return [cell for _, cell in report.runs.groupby("cell")]
 
 
 @pytest.fixture
@@ -56,10 +55,10 @@ def tree(tmp_path):
 
 
 def test_cells_are_made_of_what_was_varied_and_seeds_fill_them(tree):
-    found = report(tree)
-    assert found.variables == ("controller",)
-    assert found.cells == (("convex",), ("lqr",))
-    convex, lqr = cells(found)
+    report = read_report(tree)
+    assert report.variables == ("controller",)
+    assert report.cells == (("convex",), ("lqr",))
+    convex, lqr = cells(report)
     assert (
         seeds(convex, "finished") == [*convex.seed] == [str(seed) for seed in range(8)]
     )
@@ -69,7 +68,7 @@ def test_cells_are_made_of_what_was_varied_and_seeds_fill_them(tree):
 
 
 def test_the_gaps_come_with_the_command_that_fills_them(tree):
-    assert report(tree).commands() == [
+    assert read_report(tree).commands() == [
         f"gpmpc run -m controller=lqr seed=6,7 folder={tree}"
     ]
 
@@ -85,9 +84,9 @@ def test_without_a_sweep_nothing_is_missing(tmp_path):
             "options": {"controller": controller},
         }
         made_up_run(tmp_path, choices, settings, result=metrics_of(0.1))
-    found = report(tmp_path)
-    assert [[*cell.state] for cell in cells(found)] == [["finished"]] * 4
-    assert found.commands() == []
+    report = read_report(tmp_path)
+    assert [[*cell.state] for cell in cells(report)] == [["finished"]] * 4
+    assert report.commands() == []
 
 
 def test_single_runs_beside_a_sweep_add_nothing_to_it(tmp_path):
@@ -107,11 +106,11 @@ def test_single_runs_beside_a_sweep_add_nothing_to_it(tmp_path):
             for seed in range(4)
         ],
     )
-    found = report(tmp_path)
-    assert found.variables == ("controller", "horizon")
+    report = read_report(tmp_path)
+    assert report.variables == ("controller", "horizon")
     gaps = {
         values: missing
-        for values, cell in zip(found.cells, cells(found), strict=True)
+        for values, cell in zip(report.cells, cells(report), strict=True)
         if (missing := seeds(cell, "missing"))
     }
     assert gaps == {("lqr", "10"): ["3"], ("nmpc", "10"): ["0", "1", "2", "3"]}
@@ -125,16 +124,16 @@ def test_a_run_counts_with_its_default_settings(tmp_path):
         SETTINGS | {"seed": 1, "horizon": 5},
         result=metrics_of(0.1),
     )
-    found = report(tmp_path)
-    assert found.variables == ("horizon",)
-    assert found.cells == (("5",), ("10",))  # numbers by their size
+    report = read_report(tmp_path)
+    assert report.variables == ("horizon",)
+    assert report.cells == (("5",), ("10",))  # numbers by their size
 
 
 def test_documents_agree_and_the_page_needs_no_other_file(tree):
-    found = report(tree)
-    written = documents(found)
+    report = read_report(tree)
+    written = documents(report)
     rows = list(csv.DictReader(io.StringIO(written["report.csv"])))
-    errors = cells(found)[0].rmse
+    errors = cells(report)[0].rmse
     expected = np.median(errors)
     assert float(rows[0]["rmse_median [m]"]) == expected
     assert float(rows[0]["rmse_q25 [m]"]) == np.quantile(errors, 0.25)
@@ -152,7 +151,7 @@ def test_documents_agree_and_the_page_needs_no_other_file(tree):
     assert not [
         mark for mark in ("http:", "https:", "<script", "<link") if mark in html
     ]
-    assert len(terminal_table(found).rows) == 2
+    assert len(terminal_table(report).rows) == 2
 
 
 def test_an_unreadable_run_is_named_and_the_others_reported(tree):
@@ -162,15 +161,15 @@ def test_an_unreadable_run_is_named_and_the_others_reported(tree):
     old.write_text(json.dumps(content))
     broken = folder_of(tree, chosen("lqr", 0)[0]) / "metrics.json"
     broken.write_text('{"choices": ')
-    found = report(tree)
-    assert [len(seeds(cell, "finished")) for cell in cells(found)] == [7, 5]
-    assert len(found.skipped) == 2
+    report = read_report(tree)
+    assert [len(seeds(cell, "finished")) for cell in cells(report)] == [7, 5]
+    assert len(report.skipped) == 2
     for path, reason in ((old, "it lacks 'unit'"), (broken, "JSONDecodeError")):
         assert any(
             line.startswith(f"{path}: is not what a run writes") and reason in line
-            for line in found.skipped
+            for line in report.skipped
         )
-    written = documents(found)
+    written = documents(report)
     for name in ("report.md", "report.html"):
         assert "2 skipped" in written[name]
         assert str(old) in written[name]
@@ -192,16 +191,18 @@ def test_an_unreadable_run_is_not_missing_nor_flown_over(tmp_path):
     (folder_of(tmp_path, chosen("lqr", 1)[0]) / "metrics.json").write_text(
         '{"choices": '
     )
-    found = report(tmp_path)
-    convex, lqr = cells(found)
+    report = read_report(tmp_path)
+    convex, lqr = cells(report)
     assert {*convex.state} == {"finished"}
     assert [seeds(lqr, state) for state in ("finished", "skipped", "missing")] == [
         ["0", "2"],
         ["1"],
         ["3"],
     ]
-    assert found.commands() == [f"gpmpc run -m controller=lqr seed=3 folder={tmp_path}"]
-    written = documents(found)
+    assert report.commands() == [
+        f"gpmpc run -m controller=lqr seed=3 folder={tmp_path}"
+    ]
+    written = documents(report)
     assert (
         "6 finished in 2 cells, 0 failed, 1 missing, 1 skipped" in written["report.md"]
     )
@@ -224,7 +225,7 @@ def test_a_folder_that_belongs_to_no_cell_fills_none(tmp_path):
     for name in ("elsewhere", "controller=convex,horizon=3,seed=0"):
         (tmp_path / name).mkdir()
         (tmp_path / name / "metrics.json").write_text("")
-    convex, _ = cells(report(tmp_path))
+    convex, _ = cells(read_report(tmp_path))
     assert (seeds(convex, "missing"), seeds(convex, "skipped")) == (["0"], [])
 
 
@@ -232,7 +233,7 @@ def test_a_line_of_the_latex_table_never_begins_with_a_bracket(tmp_path):
     for steps in ("[1,2]", "[1]"):
         choices, settings = chosen("lqr", 0, steps=steps)
         made_up_run(tmp_path, choices, settings, result=metrics_of(0.1))
-    lines = documents(report(tmp_path))["report.tex"].splitlines()
+    lines = documents(read_report(tmp_path))["report.tex"].splitlines()
     assert any(line.startswith("{}[1,2] &") for line in lines)
     assert not any(line.lstrip().startswith("[") for line in lines)
 
@@ -240,7 +241,7 @@ def test_a_line_of_the_latex_table_never_begins_with_a_bracket(tmp_path):
 def test_pairs_show_what_means_alone_do_not(tree):
     by_measure = {
         c.measure: c
-        for c in compare(report(tree), "controller=lqr", "controller=convex")
+        for c in compare(read_report(tree), "controller=lqr", "controller=convex")
     }
     rmse = by_measure["rmse"]
     assert rmse.pairs == 6
@@ -250,7 +251,9 @@ def test_pairs_show_what_means_alone_do_not(tree):
     assert rmse.verdict == "A is larger than B"
     assert rmse.rank_biserial == 1
     assert rmse.interval[0] < rmse.difference < rmse.interval[1]
-    text = sentences(report(tree), [rmse], "controller=lqr", "controller=convex")[1]
+    text = sentences(read_report(tree), [rmse], "controller=lqr", "controller=convex")[
+        1
+    ]
     for word in ("Wilcoxon signed-rank p = 0.0312", "t-test", "rank-biserial", "n = 6"):
         assert word in text
 
@@ -277,22 +280,23 @@ def test_seeds_average_over_the_same_runs_and_name_the_others(tmp_path):
                     fly(controller, horizon, seed)
         fly("convex", 10, seed)  # lqr has but one of them
     fly("lqr", 10, 0)
-    found = report(tmp_path)
-    rmse = compare(found, "controller=lqr", "controller=convex")[0]
+    report = read_report(tmp_path)
+    rmse = compare(report, "controller=lqr", "controller=convex")[0]
     assert rmse.left_out == ("horizon=10", "seed=7")
     assert rmse.pairs == 7
     assert rmse.medians == pytest.approx(
         (0.31, 0.3)
     )  # of the horizons 1 and 5 for every seed
     assert (
-        "lacks runs of it: horizon=10; seed=7." in sentences(found, [rmse], "a", "b")[0]
+        "lacks runs of it: horizon=10; seed=7."
+        in sentences(report, [rmse], "a", "b")[0]
     )
-    assert compare(found, "horizon=1", "horizon=5")[0].left_out == ("seed=7",)
+    assert compare(report, "horizon=1", "horizon=5")[0].left_out == ("seed=7",)
     alone = compare(
-        found, "controller=convex,horizon=1", "controller=convex,horizon=5"
+        report, "controller=convex,horizon=1", "controller=convex,horizon=5"
     )[0]
     assert alone.left_out == ()
-    assert "Left out" not in sentences(found, [alone], "a", "b")[0]
+    assert "Left out" not in sentences(report, [alone], "a", "b")[0]
 
 
 def test_errors_of_both_subsystems_stay_in_their_own_units(tmp_path):
@@ -314,14 +318,14 @@ def test_errors_of_both_subsystems_stay_in_their_own_units(tmp_path):
                     settings,
                     result=metrics_of(0.1 + 0.01 * seed) | {"unit": unit},
                 )
-    found = report(tmp_path)
-    assert "RMSE [m or rad]" in documents(found)["report.md"]
+    report = read_report(tmp_path)
+    assert "RMSE [m or rad]" in documents(report)["report.md"]
     with pytest.raises(
         SettingError, match="errors in m and in rad have no common mean; add subsystem="
     ):
-        compare(found, "controller=lqr", "controller=convex")
+        compare(report, "controller=lqr", "controller=convex")
     groups = [f"controller={name},subsystem=rotational" for name in ("lqr", "convex")]
-    assert compare(found, *groups)[0].pairs == 6
+    assert compare(report, *groups)[0].pairs == 6
 
 
 def test_equal_groups_and_few_pairs_show_nothing(tmp_path):
@@ -329,19 +333,19 @@ def test_equal_groups_and_few_pairs_show_nothing(tmp_path):
         for controller in ("lqr", "convex"):
             add(tmp_path, controller, seed, 0.1 + 0.01 * seed)
     assert (
-        compare(report(tmp_path), "controller=lqr", "controller=convex")[0].verdict
+        compare(read_report(tmp_path), "controller=lqr", "controller=convex")[0].verdict
         == "no difference shown"
     )
     copies = tmp_path / "copies"
     for seed in range(7):
         add(copies, "lqr", seed, 0.2)
         add(copies, "convex", seed, 0.1)
-    found = compare(report(copies), "controller=lqr", "controller=convex")
-    assert found[0].verdict.startswith("undecided: every seed gave the same")
+    comparisons = compare(read_report(copies), "controller=lqr", "controller=convex")
+    assert comparisons[0].verdict.startswith("undecided: every seed gave the same")
     assert (
         "p ="
         not in sentences(
-            report(copies), found[:1], "controller=lqr", "controller=convex"
+            read_report(copies), comparisons[:1], "controller=lqr", "controller=convex"
         )[1]
     )
     few = tmp_path / "few"
@@ -350,7 +354,7 @@ def test_equal_groups_and_few_pairs_show_nothing(tmp_path):
         add(few, "convex", seed, 0.1)
     assert (
         "5 pairs"
-        in compare(report(few), "controller=lqr", "controller=convex")[0].verdict
+        in compare(read_report(few), "controller=lqr", "controller=convex")[0].verdict
     )
 
 
@@ -363,17 +367,17 @@ def test_equal_groups_and_few_pairs_show_nothing(tmp_path):
 )
 def test_a_group_that_is_none_is_refused(tree, group, message):
     with pytest.raises(SettingError, match=message):
-        compare(report(tree), group, "controller=lqr")
+        compare(read_report(tree), group, "controller=lqr")
 
 
 def test_what_is_no_tree_of_runs_is_refused(tmp_path):
     with pytest.raises(DataError, match="no such folder"):
-        report(tmp_path / "nowhere")
+        read_report(tmp_path / "nowhere")
     with pytest.raises(DataError, match="holds no run"):
-        report(tmp_path)
+        read_report(tmp_path)
     (tmp_path / "metrics.json").write_text('{"choices": []')
     with pytest.raises(DataError, match=r"metrics.json: is not what a run writes"):
-        report(tmp_path)
+        read_report(tmp_path)
 
 
 def test_a_thousand_runs_are_reported_in_little_time_and_memory(tmp_path):
@@ -393,12 +397,12 @@ def test_a_thousand_runs_are_reported_in_little_time_and_memory(tmp_path):
                 (folder / "metrics.json").write_text(json.dumps(content, indent=1))
     tracemalloc.start()
     start = time.process_time()
-    found = report(tmp_path)
-    documents(found)
+    report = read_report(tmp_path)
+    documents(report)
     seconds, (_, peak) = time.process_time() - start, tracemalloc.get_traced_memory()
     tracemalloc.stop()
-    assert sum(len(seeds(cell, "finished")) for cell in cells(found)) == 1000
-    assert len(found.cells) == 20
+    assert sum(len(seeds(cell, "finished")) for cell in cells(report)) == 1000
+    assert len(report.cells) == 20
     assert seconds < 20
     assert peak < 1e9
 
@@ -408,10 +412,10 @@ def test_a_page_says_what_made_the_runs_and_links_them(tree):
     made_up_run(
         tree, ["controller=nmpc", "horizon=5"], settings, result=metrics_of(0.1)
     )
-    found = report(tree)
-    html = documents(found)["report.html"]
+    report = read_report(tree)
+    html = documents(report)["report.html"]
     links = re.findall(r'href="([^"]*)"', html)
-    assert len(links) == len(found.there) == 16
+    assert len(links) == len(report.there) == 16
     assert all((tree / "report" / unquote(link)).resolve().is_dir() for link in links)
     provenance = record_of({})["provenance"]
     for text in (
@@ -421,7 +425,7 @@ def test_a_page_says_what_made_the_runs_and_links_them(tree):
         "data.size: null",
     ):
         assert text in html
-    assert "horizon: " not in "\n".join(found.base_settings())  # it was varied
+    assert "horizon: " not in "\n".join(report.base_settings())  # it was varied
 
 
 @pytest.mark.parametrize(

@@ -5,8 +5,7 @@ import pytest
 from rich.console import Console
 
 from gpmpc.studies._document import Table, terminal
-from gpmpc.studies.report import read_report as report
-from gpmpc.studies.report import terminal_table
+from gpmpc.studies.report import read_report, terminal_table
 from tests.studies.made_up import documents, made_up_run, metrics_of
 
 SETTINGS = {
@@ -27,13 +26,13 @@ def test_failed_solves_have_a_column_if_any_run_has_some(failing, tmp_path):
             made_up_run(
                 tmp_path, choices, settings, result=metrics_of(0.1, failing=some)
             )
-    found = report(tmp_path)
-    header = " ".join(terminal_table(found).header)
-    for words in (header, documents(found)["report.tex"]):
+    report = read_report(tmp_path)
+    header = " ".join(terminal_table(report).header)
+    for words in (header, documents(report)["report.tex"]):
         assert ("failed" in words) == bool(failing)
         assert "RMSE" in words
         assert "outside" not in words
-    assert "outside" in documents(found)["report.csv"]  # which has room for everything
+    assert "outside" in documents(report)["report.csv"]  # which has room for everything
 
 
 def test_a_comparison_stands_in_the_page_and_in_the_text(tmp_path):
@@ -41,11 +40,11 @@ def test_a_comparison_stands_in_the_page_and_in_the_text(tmp_path):
         choices = [f"seed={seed}"]
         settings = SETTINGS | {"seed": seed}
         made_up_run(tmp_path, choices, settings, result=metrics_of(0.1))
-    found = report(tmp_path)
+    report = read_report(tmp_path)
     lines = ["first line of it", "second line of it"]
     for name in ("report.md", "report.html"):
-        with_it = documents(found, lines)[name]
-        without = documents(found)[name]
+        with_it = documents(report, lines)[name]
+        without = documents(report)[name]
         assert all(
             line in with_it and line not in without for line in [*lines, "Comparison"]
         )

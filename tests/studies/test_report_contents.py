@@ -12,8 +12,13 @@ import numpy as np
 import pytest
 
 from gpmpc.studies import report as reporting
-from gpmpc.studies.report import compare, report_document, sentences, terminal_table
-from gpmpc.studies.report import read_report as report
+from gpmpc.studies.report import (
+    compare,
+    read_report,
+    report_document,
+    sentences,
+    terminal_table,
+)
 from tests.studies.made_up import (
     SETTINGS,
     add,
@@ -36,18 +41,18 @@ RESULT = (
 )  # what a failed run need not have
 
 
-def states(found, state):
-    return (found.runs.state == state).sum()
+def states(report, state):
+    return (report.runs.state == state).sum()
 
 
-def undrawn(found, *comparison):
+def undrawn(report, *comparison):
     with patch.object(reporting, "_figures", return_value={}):
-        return report_document(found, *comparison)
+        return report_document(report, *comparison)
 
 
-def written_of(found):
+def written_of(report):
     """Markdown, HTML, CSV and LaTeX without the figures, which take their time."""
-    document = undrawn(found)
+    document = undrawn(report)
     return {
         "md": document.markdown(),
         "html": document.html(),
@@ -56,9 +61,9 @@ def written_of(found):
     }
 
 
-def shown(found):
+def shown(report):
     """The table as a terminal shows it."""
-    return on_terminal(terminal_table(found), width=100)
+    return on_terminal(terminal_table(report), width=100)
 
 
 DAMAGE = {
@@ -113,15 +118,15 @@ def test_one_damaged_run_alone_is_skipped_with_its_reason(damage, name, tmp_path
     (folder / name).write_bytes(
         WHOLE.get(damage) if damage in WHOLE else json.dumps(content).encode()
     )
-    found = report(tmp_path)
+    report = read_report(tmp_path)
     reads_it = name == "error.json" and set(DAMAGE.get(damage, ())) & {*RESULT}
-    assert len(found.skipped) == (0 if reads_it else 1)
+    assert len(report.skipped) == (0 if reads_it else 1)
     assert all(
         line.startswith(f"{folder / name}: is not what a run writes: ")
-        for line in found.skipped
+        for line in report.skipped
     )
-    assert states(found, "finished") == 2
-    for text in (*written_of(found).values(), shown(found)):
+    assert states(report, "finished") == 2
+    for text in (*written_of(report).values(), shown(report)):
         assert "0.1" in text
 
 
@@ -141,10 +146,10 @@ def test_a_plan_that_cannot_be_read_is_skipped(tmp_path):
         )
     ):
         (tree / f"sweep-damaged{i}.json").write_text(text)
-    found = report(tree)
-    assert len(found.skipped) == 6
-    assert all("is not what a sweep writes" in line for line in found.skipped)
-    assert found.commands() == [f"gpmpc run -m controller=lqr seed=6,7 folder={tree}"]
+    report = read_report(tree)
+    assert len(report.skipped) == 6
+    assert all("is not what a sweep writes" in line for line in report.skipped)
+    assert report.commands() == [f"gpmpc run -m controller=lqr seed=6,7 folder={tree}"]
 
 
 NASTY = [
@@ -163,9 +168,9 @@ def test_what_a_user_chose_is_text_in_every_document(nasty, tmp_path):
     lost = metrics_of(0.2) | {"lost": {"why": nasty}}
     made_up_run(tmp_path, [f"controller={nasty}", "seed=0"], settings, result=lost)
     made_up_run(tmp_path, [f"controller={nasty}", "seed=1"], settings, error=nasty)
-    found = report(tmp_path)
-    written = written_of(found)
-    for text in (*written.values(), shown(found)):
+    report = read_report(tmp_path)
+    written = written_of(report)
+    for text in (*written.values(), shown(report)):
         text.encode()
         assert not set(text) & set("\x00\x1b\t\u202e")
     text = re.sub(
@@ -200,7 +205,7 @@ def test_figures_take_every_text(tmp_path):
             SETTINGS | {"options": {"controller": nasty}},
             result=metrics_of(0.2),
         )
-    written = documents(report(tmp_path))
+    written = documents(read_report(tmp_path))
     assert len({name.lower() for name in written}) == len(written) == 4 + 2 * 7
     for name in written:
         assert re.fullmatch(r"[\w.+-]{1,200}", name)
@@ -218,10 +223,13 @@ def test_a_flight_that_was_lost_is_called_so(tmp_path):
         if seed == 0:  # it diverged
             result["rmse"] = dict.fromkeys(result["rmse"])
         made_up_run(tmp_path, *chosen("lqr", seed), result=result)
-    found = report(tmp_path)
-    assert [(cell.lost != "").sum() for _, cell in found.runs.groupby("cell")] == [0, 2]
-    assert [*found.runs.groupby("cell").rmse.count()] == [6, 5]
-    written = written_of(found)
+    report = read_report(tmp_path)
+    assert [(cell.lost != "").sum() for _, cell in report.runs.groupby("cell")] == [
+        0,
+        2,
+    ]
+    assert [*report.runs.groupby("cell").rmse.count()] == [6, 5]
+    written = written_of(report)
     for text in (written["md"], written["html"]):
         for words in (
             "of those finished, 2 lost",
@@ -229,10 +237,10 @@ def test_a_flight_that_was_lost_is_called_so(tmp_path):
             "step 13, reason 14600 m away",
         ):
             assert words in text
-    assert "2 lost" in shown(found)
+    assert "2 lost" in shown(report)
     assert "2 lost" in written["tex"]
     assert [
-        row["lost"] for row in csv.DictReader(io.StringIO(written_of(found)["csv"]))
+        row["lost"] for row in csv.DictReader(io.StringIO(written_of(report)["csv"]))
     ] == ["0", "2"]
 
 
@@ -240,16 +248,16 @@ def test_a_flight_that_was_lost_is_called_so(tmp_path):
 def test_what_stands_before_quartiles_lies_between_them(outlier, tmp_path):
     for seed, error in enumerate([0.1, 0.11, 0.12, 0.13, 0.14, outlier]):
         add(tmp_path, "lqr", seed, error)
-    found = report(tmp_path)
-    (row,) = csv.DictReader(io.StringIO(written_of(found)["csv"]))
+    report = read_report(tmp_path)
+    (row,) = csv.DictReader(io.StringIO(written_of(report)["csv"]))
     low, median, high = (
         float(row[f"rmse_{part} [m]"]) for part in ("q25", "median", "q75")
     )
     assert low <= median <= high <= 0.14
     assert not any("mean" in name for name in row)
     for text in (
-        *(written_of(found)[name] for name in ("md", "tex", "html")),
-        shown(found),
+        *(written_of(report)[name] for name in ("md", "tex", "html")),
+        shown(report),
     ):
         assert "0.125" in text
         assert "Mean" not in text
@@ -266,11 +274,11 @@ def test_wall_times_are_not_compared(tmp_path):
             "lqr" in path.parent.name
         )
         path.write_text(json.dumps(content))
-    found = report(tree)
-    assert {"decision", "training"} <= set(found.measures)
-    compared = compare(found, "controller=lqr", "controller=convex")
+    report = read_report(tree)
+    assert {"decision", "training"} <= set(report.measures)
+    compared = compare(report, "controller=lqr", "controller=convex")
     assert not {"decision", "training"} & {each.measure for each in compared}
-    assert "Times are not compared" in sentences(found, compared, "a", "b")[0]
+    assert "Times are not compared" in sentences(report, compared, "a", "b")[0]
 
 
 def test_a_report_says_of_every_run_what_became_of_it(tmp_path):
@@ -297,8 +305,8 @@ def test_a_report_says_of_every_run_what_became_of_it(tmp_path):
             for seed in range(4)
         ],
     )
-    found = report(tree)
-    document = undrawn(found, ["a line"])
+    report = read_report(tree)
+    document = undrawn(report, ["a line"])
     head, made, tail = re.split(
         r"## Made\n\n(.*?)(?=## To)", document.markdown(), flags=re.DOTALL
     )
@@ -322,7 +330,7 @@ def test_a_report_says_of_every_run_what_became_of_it(tmp_path):
         f"gpmpc run -m horizon=10 controller=lqr seed=1,3 folder={tree}\n```\n\n"
         "## Settings of all runs\n\n```\ndata.size: null\nhorizon: 10\n```\n"
     )
-    origins = [run.origin for run in found.there]
+    origins = [run.origin for run in report.there]
     dates = sorted({origin["date"] for origin in origins})
     lines = [line.removeprefix("- ") for line in made.splitlines()]
     assert lines[0] == "Runs made: " + " to ".join(dict.fromkeys([dates[0], dates[-1]]))
@@ -341,7 +349,7 @@ def test_a_report_says_of_every_run_what_became_of_it(tmp_path):
         [0.15, 0.2, 0.3]
     )
     assert "outside" not in document.tex()
-    short = terminal_table(found)
+    short = terminal_table(report)
     assert short.header == [
         "controller",
         "seeds",
@@ -390,7 +398,7 @@ def test_where_a_run_comes_from_is_told_as_far_as_it_says_so(
     made_up_run(
         tmp_path, *chosen("lqr", 0), result=metrics_of(0.1) | {"provenance": provenance}
     )
-    (run,) = report(tmp_path).there
+    (run,) = read_report(tmp_path).there
     assert run.origin == origin
 
 
@@ -410,7 +418,7 @@ def test_a_figure_has_a_curve_for_each_other_varied_setting(tmp_path, monkeypatc
             SETTINGS,
             result=metrics_of(errors[horizon, size, gain], failing=i == 3),
         )
-    drawn = reporting.report_document(report(tmp_path)).images
+    drawn = reporting.report_document(read_report(tmp_path)).images
     measures = {
         "rmse": "RMSE [m]",
         "failed": "failed solves [%]",
@@ -426,8 +434,8 @@ def test_a_figure_has_a_curve_for_each_other_varied_setting(tmp_path, monkeypatc
             ("horizon", ["1", "5", "10", "20"]),
             ("size", ["50", "100", "200"]),
         ):
-            title, found, axis, _, logarithmic = drawn[f"{name}-over-{key}.png"]
-            assert (title, found, axis, logarithmic) == (
+            title, report, axis, _, logarithmic = drawn[f"{name}-over-{key}.png"]
+            assert (title, report, axis, logarithmic) == (
                 key,
                 ticks,
                 label,
@@ -480,7 +488,7 @@ def test_figures_of_one_setting_have_one_curve_and_own_names(tmp_path, monkeypat
                 tmp_path / "two", choices, SETTINGS, result=metrics_of(0.1 * value)
             )
     one, two = (
-        reporting.report_document(report(tmp_path / tree)).images
+        reporting.report_document(read_report(tmp_path / tree)).images
         for tree in ("one", "two")
     )
     assert [*one] == ["rmse-over-a-b.png", "decision-over-a-b.png"]
@@ -500,8 +508,8 @@ def test_a_comparison_is_told_with_every_number(tmp_path):
     ):
         add(tmp_path, "lqr", seed, float(first))
         add(tmp_path, "convex", seed, float(second), failing=2)
-    found = report(tmp_path)
-    compared = compare(found, "controller=lqr", "controller=convex")
+    report = read_report(tmp_path)
+    compared = compare(report, "controller=lqr", "controller=convex")
     rmse, outside, failed = compared
     assert [each.measure for each in compared] == ["rmse", "outside", "failed"]
     assert (rmse.medians, rmse.quartiles, rmse.difference) == (
@@ -525,7 +533,7 @@ def test_a_comparison_is_told_with_every_number(tmp_path):
     )
     assert failed.rank_biserial == -1
     assert np.isnan([failed.wilcoxon, failed.t_test]).all()
-    assert sentences(found, compared, "a", "b") == [
+    assert sentences(report, compared, "a", "b") == [
         "A: a; B: b; pairs are seeds, what else was varied is averaged within a seed. Times are not compared.",
         "RMSE [m]: no difference shown. Medians 6 and 4; differences 2 [0.75, 3.5]; Wilcoxon signed-rank p = 0.0781, "
         "rank-biserial 0.79; mean difference 2 (95 %: -0.0507 to 4.05), paired t-test p = 0.0543, d_z 0.90; n = 7",

@@ -86,9 +86,9 @@ def test_missing_trials_run_and_records_keep_their_order(tmp_path, started):
         for seed, c in conditions.items()
     ]
     store = TrialStore(tmp_path / "trials.jsonl")
-    told = []
+    progress = []
     store.append("print6", {"name": "of an older study", "seed": 6, "square": 36})
-    records = run_study(fail, trials, store, 7, told.append)
+    records = run_study(fail, trials, store, 7, progress.append)
     assert started == [(3, 7), (4, 7), (5, 7)]
     assert records == [
         {"name": "good", "seed": 3, "square": 9, "threads": 1},
@@ -96,7 +96,7 @@ def test_missing_trials_run_and_records_keep_their_order(tmp_path, started):
         {"name": "singular", "seed": 5, "error": "not positive definite"},
         {"name": "good", "seed": 6, "square": 36},
     ]
-    assert [record["seed"] for record in told] == [
+    assert [record["seed"] for record in progress] == [
         6,
         5,
         4,

@@ -125,9 +125,12 @@ def test_states_are_counted_outside_the_tightest_current_boxes(error, outside):
     narrow = np.full((2, 6), 9.0)
     narrow[:, 0] = 0.05, 0.01  # of the first stage, and of one later on
     boxes = Box(np.full(6, -1.0), np.full(6, 1.0)), Box(np.full((2, 6), -9.0), narrow)
-    found = metrics_of(error, constraints=boxes)["violations"]
-    assert (found["states"]["violations"], found["states"]["steps"]) == (outside, 20)
-    assert found["states"]["rate"] == outside / 20
+    violations = metrics_of(error, constraints=boxes)["violations"]
+    assert (violations["states"]["violations"], violations["states"]["steps"]) == (
+        outside,
+        20,
+    )
+    assert violations["states"]["rate"] == outside / 20
     assert "states" not in metrics_of(error)["violations"]
 
 
@@ -137,13 +140,18 @@ def test_every_constraint_says_how_often_states_violated_it(error, outside):
     near = Inequality(lambda x: x[:, 0].abs() - 0.25)
     later = Box(np.full(6, 1.0), np.full(6, 2.0), stages=[2])  # asks no first state
     result = metrics_of(error, constraints=[below, near, later, below])
-    found = result["violations"]
-    assert list(found) == ["inputs", "half-spaces 1", "half-spaces 2", "inequality"]
-    assert found["half-spaces 1"] == found["half-spaces 2"]
-    assert found["half-spaces 1"]["violations"] == outside
-    assert found["half-spaces 1"]["worst"] == pytest.approx(max(0.0, error - 0.5))
-    assert found["inequality"]["rate"] == 1.0
-    assert found["inequality"]["worst"] == pytest.approx(error - 0.25)
+    violations = result["violations"]
+    assert list(violations) == [
+        "inputs",
+        "half-spaces 1",
+        "half-spaces 2",
+        "inequality",
+    ]
+    assert violations["half-spaces 1"] == violations["half-spaces 2"]
+    assert violations["half-spaces 1"]["violations"] == outside
+    assert violations["half-spaces 1"]["worst"] == pytest.approx(max(0.0, error - 0.5))
+    assert violations["inequality"]["rate"] == 1.0
+    assert violations["inequality"]["worst"] == pytest.approx(error - 0.25)
     lines = said(result)
     assert lines["inequality"].startswith("20 of 20 steps outside (95 %: ")
     assert lines["inequality"].endswith(f"by up to {error - 0.25:.3g}")
@@ -222,12 +230,12 @@ def test_the_metrics_of_a_flight_are_written_out_in_full():
         rollout_of([[0, 0, 0], [0, 3, 0], [4, 0, 0]]),
         rollout_of([[0, 0, 0], [np.inf, 0, 0]]),
     )
-    found = measured(rollout_of(errors, **solves), training, before=episodes)
+    result = measured(rollout_of(errors, **solves), training, before=episodes)
     quantiles = {
-        name: found["times"].pop(name) for name in ("model", "build", "solve", "total")
+        name: result["times"].pop(name) for name in ("model", "build", "solve", "total")
     }
-    violations = found.pop("violations")
-    assert found == {
+    violations = result.pop("violations")
+    assert result == {
         "steps": 4,
         "unit": "m",
         "rmse": pytest.approx({"x": 1.5, "y": 3.0, "z": 2.0, "total": np.sqrt(61 / 4)}),
@@ -300,8 +308,8 @@ def test_a_loss_is_dated_by_its_first_step_beyond_the_limit():
 def test_a_flight_is_lost_by_its_judge_or_by_divergence():
     gone = Judgement("lost", "ever faster away")
     near = [[0, 0, 0], [0, 0, 1], [0, 0, 2], [0, 2, 0]]
-    found = measured(rollout_of(near, judgements=(Judgement(), gone, gone)))
-    assert found["lost"] == {"step": 1, "time": 0.2, "reason": "ever faster away"}
+    result = measured(rollout_of(near, judgements=(Judgement(), gone, gone)))
+    assert result["lost"] == {"step": 1, "time": 0.2, "reason": "ever faster away"}
     both = measured(
         rollout_of([*near, [0, 40, 0]], judgements=(Judgement(), gone, gone, gone))
     )

@@ -27,21 +27,21 @@ MODEL = SimpleNamespace(name="model")
 STEP = object()
 
 
-def steering(model=None, **made):
+def steering(model=None, **attributes):
     return SimpleNamespace(
-        horizon=3, initial_input=[7.0, 0.0, 0.1], made_of=model, **made
+        horizon=3, initial_input=[7.0, 0.0, 0.1], made_of=model, **attributes
     )
 
 
 def experiment(**changes):
-    given = {
+    settings = {
         "data": None,
         "trajectory": Elliptical(),
         "system": PLANT,
         "train": None,
         "controller": steering,
     }
-    return Experiment(**given | {"steps": 5, "model": MODEL} | changes)
+    return Experiment(**settings | {"steps": 5, "model": MODEL} | changes)
 
 
 @pytest.fixture
@@ -61,10 +61,12 @@ def test_a_flight_has_references_for_all_that_its_last_plan_sees(loops):
     heavy = translational(mass=0.9)
     noise = Noise(process=[0.1] * 6)
     gust = SimpleNamespace(disturb_plant=None)
-    told = []
+    prepared_trials = []
     chosen = experiment(plant=heavy, noise=noise, seed=4, on_failure="raise")
     object.__setattr__(chosen, "disturbances", (gust,))
-    flown = run_trial(chosen, lambda *prepared: told.append(prepared) or STEP)
+    flown = run_trial(
+        chosen, lambda *prepared: prepared_trials.append(prepared) or STEP
+    )
     rehearsed, (given, more) = loops
     system, controller, reference, start, steps = given
     assert (system, steps, controller.made_of) == (heavy, 5, MODEL)
@@ -82,7 +84,7 @@ def test_a_flight_has_references_for_all_that_its_last_plan_sees(loops):
         "on_step": STEP,
     }
     assert more == settings
-    assert told == [(controller, None)]
+    assert prepared_trials == [(controller, None)]
     assert (flown.rollout, flown.controller, flown.training, flown.diverged) == (
         ROLLOUT,
         controller,
@@ -99,12 +101,12 @@ def test_a_flight_begins_where_the_plant_says(loops):
     assert loops[0][3] == loops[1][0][3] == tuple(range(6))
     assert loops[1][1]["on_step"] is None
     own = experiment()
-    held = SimpleNamespace(
+    stateful_plant = SimpleNamespace(
         start=None, dynamics=SimpleNamespace(stateful=True), time_step=1.0
     )
-    object.__setattr__(own, "plant", held)
+    object.__setattr__(own, "plant", stateful_plant)
     run_trial(own)
-    assert loops[-1][0][0] is held
+    assert loops[-1][0][0] is stateful_plant
     assert loops[-1][0][3] is None
 
 
@@ -175,7 +177,7 @@ def test_episodes_have_own_seeds_and_the_best_model_flies_last(monkeypatch):
     monkeypatch.setattr(
         EpisodicLearning, "with_flight", lambda _, data, rollout: [*data, rollout]
     )
-    found = run_trial(
+    episodes = run_trial(
         experiment(model=None, seed=9, learning=EpisodicLearning(3)), "prepare"
     )
     seeds = [int(np.random.SeedSequence([9, k]).generate_state(1)[0]) for k in range(3)]
@@ -187,12 +189,12 @@ def test_episodes_have_own_seeds_and_the_best_model_flies_last(monkeypatch):
     assert learned == [
         (["rows", *(f"flight {i}" for i in range(1, k))], 9) for k in (1, 2, 3)
     ]
-    assert [each.rollout for each in found.before] == [
+    assert [each.rollout for each in episodes.before] == [
         "flight 1",
         "flight 2",
         "flight 3",
     ]
-    assert found.rollout == "flight 4"
+    assert episodes.rollout == "flight 4"
 
 
 def test_a_system_with_a_nominal_or_angles_learns_a_residual(monkeypatch):

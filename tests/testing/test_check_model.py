@@ -108,40 +108,41 @@ def test_an_outsiders_honest_model_passes():
 
 class ForgetsItsBatch(Honest):
     def predict(self, state, input=None):
-        at = super().predict(state, input)
+        belief = super().predict(state, input)
         return Gaussian(
-            at.mean, at.covariance.reshape(-1, 2, 2)[0].expand(at.covariance.shape)
+            belief.mean,
+            belief.covariance.reshape(-1, 2, 2)[0].expand(belief.covariance.shape),
         )
 
 
 class MovesTheMean(Honest):
     def predict(self, state, input=None):
-        at = super().predict(state, input)
+        belief = super().predict(state, input)
         return (
-            Gaussian(at.mean - at.mean.mean(0), at.covariance)
+            Gaussian(belief.mean - belief.mean.mean(0), belief.covariance)
             if state.dim() > 1
-            else at
+            else belief
         )
 
 
 class WrongShape(Honest):
     def predict(self, state, input=None):
-        at = super().predict(state, input)
-        return Gaussian(at.mean[..., :1], at.covariance[..., :1, :1])
+        belief = super().predict(state, input)
+        return Gaussian(belief.mean[..., :1], belief.covariance[..., :1, :1])
 
 
 class Lopsided(Honest):
     def predict(self, state, input=None):
-        at = super().predict(state, input)
+        belief = super().predict(state, input)
         return Gaussian(
-            at.mean, at.covariance + torch.tensor([[0.0, 1e-6], [0.0, 0.0]])
+            belief.mean, belief.covariance + torch.tensor([[0.0, 1e-6], [0.0, 0.0]])
         )
 
 
 class Indefinite(Honest):
     def predict(self, state, input=None):
-        at = super().predict(state, input)
-        return Gaussian(at.mean, at.covariance - 0.5 * torch.eye(2))
+        belief = super().predict(state, input)
+        return Gaussian(belief.mean, belief.covariance - 0.5 * torch.eye(2))
 
 
 class Scribbles(Honest):
@@ -152,33 +153,33 @@ class Scribbles(Honest):
 
 class Dices(Honest):
     def predict(self, state, input=None):
-        at = super().predict(state, input)
-        return Gaussian(at.mean + 1e-12 * torch.randn(2), at.covariance)
+        belief = super().predict(state, input)
+        return Gaussian(belief.mean + 1e-12 * torch.randn(2), belief.covariance)
 
 
 class WrongSlope(Honest):
     def linearize(self, states, inputs, covariance=True):
-        found = super().linearize(states, inputs, covariance)
-        return found._replace(A=found.A + 1e-3)
+        linearized = super().linearize(states, inputs, covariance)
+        return linearized._replace(A=linearized.A + 1e-3)
 
 
 class TransposedSlope(Honest):
     def linearize(self, states, inputs, covariance=True):
-        found = super().linearize(states, inputs, covariance)
-        return found._replace(B=np.ascontiguousarray(found.B.mT))
+        linearized = super().linearize(states, inputs, covariance)
+        return linearized._replace(B=np.ascontiguousarray(linearized.B.mT))
 
 
 class FortranOrder(Honest):
     def linearize(self, states, inputs, covariance=True):
-        found = super().linearize(states, inputs, covariance)
-        return found._replace(A=np.asfortranarray(found.A))
+        linearized = super().linearize(states, inputs, covariance)
+        return linearized._replace(A=np.asfortranarray(linearized.A))
 
 
 class AnotherPrediction(Honest):
     def linearize(self, states, inputs, covariance=True):
-        found = super().linearize(states, inputs)
-        return found._replace(
-            covariance=found.covariance + self.noise_covariance.numpy()
+        linearized = super().linearize(states, inputs)
+        return linearized._replace(
+            covariance=linearized.covariance + self.noise_covariance.numpy()
             if covariance
             else None
         )
@@ -191,8 +192,8 @@ class AlwaysCovariance(Honest):
 
 class FallsToSinglePrecision(Honest):
     def predict(self, state, input=None):
-        at = super().predict(state, input)
-        return Gaussian(at.mean.float(), at.covariance.float())
+        belief = super().predict(state, input)
+        return Gaussian(belief.mean.float(), belief.covariance.float())
 
 
 class NoiseOfAnotherShape(Honest):
