@@ -1,5 +1,7 @@
-"""Every test runs in float64 from a fixed seed, on one thread; warnings are errors (see
-pyproject.toml)."""
+"""Every test runs in float64 from a fixed seed, on one thread.
+
+Warnings are errors: see pyproject.toml.
+"""
 
 import os
 
@@ -51,8 +53,10 @@ def paper_data() -> Path:
 
 @pytest.fixture
 def page(tmp_path, monkeypatch):
-    """Does what a page of the documentation says in an empty folder, as a user has it;
-    see ``tests.pages.follow``."""
+    """Does what a page of the documentation says in an empty folder, as a user has it.
+
+    See ``tests.pages.follow``.
+    """
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(str(tmp_path))
     torch.set_default_dtype(torch.float32)

@@ -1,5 +1,7 @@
-"""Follows a page of the documentation as a reader would: writes its files, runs its
-Python and commands in order."""
+"""Follows a page of the documentation as a reader would.
+
+Its files are written; its Python and its commands run in order.
+"""
 
 import re
 import shlex

@@ -14,8 +14,10 @@ HORIZON = 5
 
 
 def flight(folder, failed=()):
-    """Along x and back in y, a plan of five steps ahead at every step; a failed solve's
-    plan is anywhere."""
+    """Records a flight along x and back in y, with plans of five steps.
+
+    The plan of a failed solve is anywhere.
+    """
     record_run(folder / "run.mcap", STEPS)
     run = read_run(folder / "run.mcap")
     along = np.zeros((STEPS + HORIZON, len(run.state_names)))

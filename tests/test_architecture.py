@@ -1,5 +1,4 @@
-"""The house keeps its shape: layers look downwards, and importing a module loads no
-library it does not need."""
+"""Layers look downwards, and importing a module loads no library it does not need."""
 
 import re
 import subprocess

@@ -1,5 +1,4 @@
-"""Calibration of predictions many steps ahead: right on systems whose uncertainty is
-known, telling on wrong ones."""
+"""Calibration is right for known uncertainty and tells of a wrong one."""
 
 import io
 import math
@@ -55,8 +54,10 @@ noiseless = partial(LinearGaussian, noise_covariance=0 * NOISE)
 
 
 def runs(count, steps, noisy=True):
-    """Runs whose first state is known exactly and whose others are measured: one start
-    each would be exact."""
+    """Makes runs with an exact first state and measured others.
+
+    One start for each run would be exact.
+    """
     recordings = []
     for _ in range(count):
         states = [torch.randn(2)]

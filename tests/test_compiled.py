@@ -1,5 +1,4 @@
-"""What is compiled once is used again, until a source that it was compiled from has
-changed."""
+"""Compiled code is reused until a source that it was compiled from has changed."""
 
 import os
 import subprocess
@@ -34,8 +33,7 @@ def double(x):
 
 @pytest.fixture
 def package(tmp_path):
-    """A package of a kernel, the function that it calls, the constant which that reads,
-    and a file of no concern."""
+    """Makes a package: a kernel, its callee, the constant of that, and another file."""
     folder = tmp_path / "tiny"
     folder.mkdir()
     texts = {
@@ -51,8 +49,7 @@ def package(tmp_path):
 
 
 def run(package, **environment):
-    """The kernel's answer to 1 in a new process, and whether its machine code was there
-    already."""
+    """Returns the kernel's answer to 1 in a new process, and if its code was cached."""
     result = subprocess.run(
         [sys.executable, "-B", "-c", "import tiny.other, tiny.kernel"], capture_output=True, text=True, check=True,
         env=os.environ | {"PYTHONPATH": f"{package.parent}{os.pathsep}{ROOT}"} | environment,
@@ -183,8 +180,10 @@ def test_a_kernels_stamp_covers_only_its_constants_and_callees():
 
 
 def test_numba_still_has_the_private_parts_that_are_used_here():
-    """Where one has moved, see ``gpmpc._compiled``: kernels compile for longer, and
-    edits of other files go unseen."""
+    """If one has moved, see ``gpmpc._compiled``.
+
+    Then kernels compile for longer, and edits of other files go unseen.
+    """
     from numba.core.codegen import JITCodeLibrary
     from numba.core.compiler import Compiler
     from numba.core.cpu import CPUTargetOptions

@@ -1,5 +1,4 @@
-"""The documentation holds: its blocks run in an empty folder, its links lead somewhere,
-its pages are short.
+"""The documentation's blocks run, its links lead somewhere, its pages are short.
 
 ``tests/test_guides.py`` and ``tests/logs`` follow the guides.
 """
@@ -206,8 +205,7 @@ def test_no_page_is_long_and_every_page_is_in_the_site():
 
 
 def public(module):
-    """The names that a module offers: those of ``__all__``, else the classes and
-    functions that it defines."""
+    """Returns the names of ``__all__``, else the classes and functions of a module."""
     names = getattr(module, "__all__", None)
     if names is None:
         names = [

@@ -1,5 +1,4 @@
-"""The lowest versions that are promised are those that ``make floors`` installs and
-tries."""
+"""The promised lowest versions are those that ``make floors`` installs and tries."""
 
 import re
 import runpy

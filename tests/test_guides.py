@@ -1,5 +1,4 @@
-"""What the guides show runs as it stands: files are written, Python runs in order,
-commands succeed."""
+"""The guides run as they stand: files are written, Python runs, commands succeed."""
 
 import shlex
 

@@ -1,5 +1,4 @@
-"""Every module of the package and of its experiments can be imported, with whatever
-versions are installed."""
+"""Every module of the package imports, with whatever versions are installed."""
 
 import importlib
 import pkgutil

@@ -1,5 +1,4 @@
-"""A Ctrl-C that CasADi would keep to itself reaches the command, and the solve that it
-met has ended."""
+"""A Ctrl-C that CasADi would keep reaches the command after the solve that it met."""
 
 import os
 import signal

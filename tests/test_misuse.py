@@ -1,5 +1,4 @@
-"""Whoever imports a module on its own and mixes up types or shapes is told the rule and
-what was got, at once."""
+"""Mixed-up types or shapes are refused at once, with the rule and what was got."""
 
 from functools import partial
 

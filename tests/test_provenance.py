@@ -1,5 +1,4 @@
-"""A result is named by the code that made it: one fingerprint, wherever that code lies
-and whenever it was written."""
+"""A result is named by its code's fingerprint, whatever that code's place and date."""
 
 import os
 import shutil

@@ -113,8 +113,7 @@ def test_the_default_lorenz_is_the_papers_with_one_axis_turned():
 
 @pytest.mark.parametrize("samples", [1, 2, 4])
 def test_lorenz_passes_the_ends_of_the_accepted_steps(samples):
-    """Of K samples a step, every K-th is the end of one: the same points of the same
-    integration."""
+    """Of K samples a step every K-th is its end: the same points of one integration."""
     ends = Lorenz(samples_per_step=samples, duration=40.0)(samples * np.arange(10.0))
     assert np.allclose(
         ends, Lorenz(samples_per_step=4, duration=40.0)(4.0 * np.arange(10)), rtol=1e-12

@@ -1,5 +1,4 @@
-"""The command as a user calls it, and the same from a process that is a copy of one
-which has imported everything."""
+"""Runs the command as a user does, or in a copy of a process that has imported it."""
 
 import multiprocessing
 import os
@@ -45,8 +44,7 @@ def gpmpc(*arguments, cwd, **environment):
 
 
 def forked(*arguments, cwd, **environment):
-    """The same in a copy of a process that has imported everything, which takes
-    seconds: for what asks no more.
+    """Runs the command in a copy of a process that has imported everything.
 
     It is the command's entry point with a process, a folder, arguments and streams of
     its own.

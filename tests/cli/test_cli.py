@@ -1,5 +1,4 @@
-"""The command line as a user meets it: help, results, and one clear line for every
-mistake."""
+"""The command line as a user meets it: help, results, one clear line for a mistake."""
 
 import json
 from pathlib import Path

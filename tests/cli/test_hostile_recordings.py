@@ -407,8 +407,7 @@ class Watch:
 
 
 def read_hostile(folder, outcome_file):
-    """Reads every file of a folder under a watch, and writes what was said and what
-    happened."""
+    """Reads every file of a folder under a watch and writes what happened."""
     os.chdir(folder)
     sys.path.insert(0, str(folder))  # the worst case: what a file names can be imported
     from gpmpc.logs import load_flyable

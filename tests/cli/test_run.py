@@ -1,5 +1,4 @@
-"""What one flight tells: that it was lost, that it waits for a compiler, and how well
-it foresaw itself."""
+"""One flight says that it was lost, that it compiles, and how well it was foreseen."""
 
 import argparse
 import json

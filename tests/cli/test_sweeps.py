@@ -1,5 +1,4 @@
-"""One flight and many of them, as a user meets them: results, resumption, and one clear
-line for every mistake."""
+"""One flight and many, as a user meets them: results, resumption, clear mistakes."""
 
 import importlib.util
 import json

@@ -1,5 +1,4 @@
-"""What surrounds a command: pipes, full disks, folders that are gone, Ctrl-C, TAB, and
-where help is looked for."""
+"""The surroundings of a command: pipes, full disks, lost folders, Ctrl-C, TAB, help."""
 
 import fcntl
 import json
@@ -469,8 +468,7 @@ def _kill_and_wait_for_the_pipe(command, cwd, begun, ended_by):
 
 
 def test_ctrl_c_in_a_terminal_reaches_no_worker_while_it_starts(tmp_path):
-    """Workers that are still importing would print their tracebacks between the lines
-    of the parent."""
+    """Workers that are still importing must print no traceback between other lines."""
     starting = "import os, signal\nif __name__ == '__mp_main__':\n    os.kill(os.getpid(), signal.SIGINT)\n"
     (tmp_path / "pool.py").write_text(
         f"{starting}{POOL.replace('time.sleep(120)', 'pass')}"

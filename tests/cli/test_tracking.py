@@ -19,8 +19,7 @@ RESULT = {
 
 
 class Store(types.ModuleType):
-    """Takes what MLflow's functions of these names take, and holds it to MLflow's
-    documented limits."""
+    """Stands in for MLflow, with the limits that MLflow documents."""
 
     def __init__(self):
         super().__init__("mlflow")

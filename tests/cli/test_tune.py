@@ -1,5 +1,4 @@
-"""``gpmpc tune`` as a user meets it: the command that flies the best one, resumption,
-one line for a mistake."""
+"""``gpmpc tune`` as a user meets it: the best command, resumption, clear mistakes."""
 
 import json
 import re

@@ -1,5 +1,4 @@
-"""What is damaged in a bag or a recording is refused, or stands in the findings of its
-log."""
+"""Damage in a bag or a recording is refused or stands in the findings of its log."""
 
 import numpy as np
 import pytest

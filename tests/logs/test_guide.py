@@ -1,5 +1,4 @@
-"""Every Python block of the guide runs, one after the other, on the files of the
-example."""
+"""Every Python block of the guide runs, in order, on the files of the example."""
 
 import re
 import runpy

@@ -1,5 +1,4 @@
-"""An inspection finds what was put into a log: delays, noise, repeated values, gaps,
-inputs that teach nothing."""
+"""An inspection finds delays, noise, repeated values, gaps and idle inputs of a log."""
 
 import json
 import runpy

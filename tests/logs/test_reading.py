@@ -1,5 +1,4 @@
-"""Logs come out as they were measured: what is wrong with them is named, and no gap is
-bridged."""
+"""Logs come out as they were measured: faults are named, and no gap is bridged."""
 
 import struct
 

@@ -77,9 +77,18 @@ def test_a_roll_out_obeys_the_model_and_the_bounded_feedback(kind):
     disturbance = 0.1 * random.normal(size=n)
     start = random.normal(size=(T, n))
     limits = [np.tile(bound, (H, 1)) for bound in bounds]
-    states, applied = RollOut(model)(
-        start, Feedback(planned, inputs, gains[None], *limits, last), disturbance
+    lower, upper, rate_lower, rate_upper = limits
+    feedback = Feedback(
+        states=planned,
+        inputs=inputs,
+        gains=gains[None],
+        lower=lower,
+        upper=upper,
+        rate_lower=rate_lower,
+        rate_upper=rate_upper,
+        previous_input=last,
     )
+    states, applied = RollOut(model)(start, feedback, disturbance)
     assert (states[:, 0] == start).all()
     for t in range(T):
         before = last
@@ -104,15 +113,26 @@ def test_plans_may_have_gains_of_their_own():
     planned = random.normal(size=(2, 5, 3))
     inputs = random.normal(size=(2, 4, 2))
     gains = random.normal(size=(2, 4, 2, 3))
-    free = [np.full((4, 2), side) for side in (-np.inf, np.inf, -np.inf, np.inf)]
-    rest = (*free, np.zeros(2))
-    both = RollOut(model)(planned[:, 0], Feedback(planned, inputs, gains, *rest))
+    free = np.full((4, 2), np.inf)
+    feedback = Feedback(
+        states=planned,
+        inputs=inputs,
+        gains=gains,
+        lower=-free,
+        upper=free,
+        rate_lower=-free,
+        rate_upper=free,
+        previous_input=np.zeros(2),
+    )
+    both = RollOut(model)(planned[:, 0], feedback)
     for t in range(2):
-        one = Feedback(planned[t : t + 1], inputs[t : t + 1], gains[t : t + 1], *rest)
-        for found, alone in zip(
-            both, RollOut(model)(planned[t : t + 1, 0], one), strict=True
-        ):
-            assert np.array_equal(found[t], alone[0])
+        plan = slice(t, t + 1)
+        one = feedback._replace(
+            states=planned[plan], inputs=inputs[plan], gains=gains[plan]
+        )
+        alone = RollOut(model)(planned[plan, 0], one)
+        for together, by_itself in zip(both, alone, strict=True):
+            assert np.array_equal(together[t], by_itself[0])
 
 
 def test_integer_starts_and_strided_disturbances_are_taken():

@@ -63,8 +63,7 @@ def joined(entries):
 
 
 def sealed(entries):
-    """A file of the records of a data section, all its checksums right, without the
-    index."""
+    """Returns a file of a data section's records with right checksums and no index."""
     data = MAGIC + joined(entries)
     end = joined([(DATA_END, struct.pack("<I", zlib.crc32(data)))])
     footer = struct.pack("<BQQQ", FOOTER, 20, 0, 0)
@@ -462,8 +461,7 @@ def bomb(data, rng, largest=2**31):
 
 
 def well_formed_bomb(data, rng):
-    """Plans and quadratic programs of zeros: every number in its place, and far too
-    many of them."""
+    """Makes plans and quadratic programs of zeros: well placed, and far too many."""
     classes = _schema.message_classes(_schema.descriptor(runs.STATES, runs.INPUTS))
     n = len(runs.STATES)
     entries = section(data)

@@ -1,5 +1,7 @@
-"""Small made-up runs: a point mass in the plane of x and z, with quadratic programs
-that are really solved."""
+"""Small made-up runs: a point mass in the plane of x and z.
+
+Their quadratic programs are really solved.
+"""
 
 import numpy as np
 

@@ -73,8 +73,10 @@ def same(run, other):
 
 
 def outcome(operation, path, original):
-    """Of an operation: "error" (of the package), "same" content, "unfinished", "other"
-    content; or what got out."""
+    """Names what came of an operation, or the exception that got out.
+
+    "error" (of the package), "same" content, "unfinished" or "other" content.
+    """
     try:
         with contextlib.redirect_stdout(io.StringIO()):
             run = operation()

@@ -1,5 +1,4 @@
-"""A recorded run as a table: each column is the field that its name says, in the order
-of the messages."""
+"""A recorded run is a table: each column is the field of its name, in order."""
 
 import numpy as np
 import pytest

@@ -1,5 +1,4 @@
-"""A damaged recording is refused in one line that names it, or read as unfinished, or
-holds what was recorded."""
+"""A damaged recording is refused in one line, read as unfinished, or read rightly."""
 
 import contextlib
 import json

@@ -77,8 +77,7 @@ def paths_of(config):
 
 
 def at(message, path):
-    """What a plot finds at a path: names and indices from the front, as in Lichtblick's
-    message paths."""
+    """Returns the value at a path, with names and indices as in Lichtblick's paths."""
     for name, index in re.findall(r"\.(\w+)(?:\[(\d+)\])?", path):
         assert name in message.DESCRIPTOR.fields_by_name, path
         message = getattr(message, name)

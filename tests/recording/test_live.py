@@ -18,8 +18,10 @@ from tests.recording import runs
 
 
 class Viewer:
-    """A WebSocket client that knows as much of the protocols (RFC 6455,
-    foxglove.sdk.v1) as these tests need."""
+    """A WebSocket client with as much of the protocols as these tests need.
+
+    The protocols are RFC 6455 and foxglove.sdk.v1.
+    """
 
     def __init__(self, address, origin=None):
         host, port = address.removeprefix("ws://").split(":")

@@ -1,5 +1,4 @@
-"""What is damaged in a recording is left out, the rest is read, and the loss is
-said."""
+"""Damaged pieces of a recording are left out, the rest is read, the loss is said."""
 
 import re
 import struct

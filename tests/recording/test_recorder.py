@@ -1,5 +1,4 @@
-"""A recording holds what happened, can be read by others, and says clearly when it
-could not be written."""
+"""A recording holds what happened, others read it, and a failed one says so."""
 
 import contextlib
 import gc

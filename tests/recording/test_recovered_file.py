@@ -1,5 +1,4 @@
-"""A recovered file says that it was recovered, and of how many messages; a copy of a
-finished one says nothing."""
+"""A recovered file says so and counts its messages; a finished one's copy does not."""
 
 import numpy as np
 import pytest

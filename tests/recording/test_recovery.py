@@ -1,5 +1,4 @@
-"""A run that was killed keeps everything that had been written whole, and becomes a
-file that any reader opens."""
+"""A killed run keeps what had been written whole, in a file that any reader opens."""
 
 import os
 import signal
@@ -29,8 +28,7 @@ MAGIC = 8  # [bytes]
 
 
 def walk(data):
-    """Opcodes and contents of the records, one after the other, as the format defines
-    them."""
+    """Yields opcodes and contents of the records in order, read as the format says."""
     start = 0
     while len(data) - start >= 9:
         opcode, length = struct.unpack_from("<BQ", data, start)
@@ -80,8 +78,10 @@ def check_recovered(path, output):
 
 @pytest.fixture(scope="module")
 def start():
-    """Starts a process that records to a path; its number, once it has said the words
-    that are waited for."""
+    """Starts a process that records to a path; returns its number.
+
+    It returns once the process has said the words that are waited for.
+    """
     zygote = subprocess.Popen(
         [sys.executable, str(ENDLESS)],
         stdin=subprocess.PIPE,

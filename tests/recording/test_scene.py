@@ -1,5 +1,4 @@
-"""What is drawn in space: the vehicle, its reference and its plan stand where the
-states say, turned as they say."""
+"""Vehicle, reference and plan are drawn where the states say, turned as they say."""
 
 import numpy as np
 import pytest
@@ -16,8 +15,7 @@ H = 3
 
 
 def spreads(n, rng):
-    """Covariances (H + 1, n, n): of variances 0.01 for few states, of any directions
-    for many."""
+    """Returns covariances (H + 1, n, n): 0.01 I for few states, random for many."""
     roots = 0.1 * (
         np.tile(np.eye(n), (H + 1, 1, 1)) if n < 6 else rng.normal(size=(H + 1, n, n))
     )
@@ -25,8 +23,7 @@ def spreads(n, rng):
 
 
 def record(path, states, outcomes, rng, **settings):
-    """A step a second, of the statuses and of whether they count as failed; the
-    steps."""
+    """Records a step a second with statuses and failures; returns the steps."""
     n = len(states)
     steps = []
     with McapRecorder(
@@ -90,8 +87,7 @@ def flown(tmp_path_factory):
 
 
 def of(state):
-    """Position and rotation matrix Rz(psi) Ry(theta) Rx(phi) of a state of the whole
-    quadrotor."""
+    """Returns position and rotation Rz(psi) Ry(theta) Rx(phi) of a whole state."""
     return state[[0, 2, 4]], Rotation.from_euler("ZYX", state[[10, 8, 6]]).as_matrix()
 
 

@@ -1,5 +1,4 @@
-"""What a recording says besides its numbers: times, colours, descriptions, limits; and
-that a copy loses none of it."""
+"""A recording holds times, colours, descriptions and limits, and so does a copy."""
 
 from dataclasses import replace
 

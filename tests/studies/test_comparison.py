@@ -1,5 +1,4 @@
-"""Two groups of runs held against each other: the statistics are those of independent
-implementations."""
+"""Two groups of runs are compared by the statistics of independent implementations."""
 
 from dataclasses import replace
 from itertools import product
@@ -32,8 +31,7 @@ def fly(tree, controller, seed, error, **more):
 
 
 def compared(tree, first, second):
-    """The comparison of the errors of LQR with those of the convex controller, a pair a
-    seed."""
+    """Compares the errors of LQR with those of the convex controller, a pair a seed."""
     for seed, errors in enumerate(zip(first, second, strict=True)):
         for controller, error in zip(("lqr", "convex"), errors, strict=True):
             fly(tree, controller, seed, error)
@@ -78,8 +76,7 @@ def test_swapped_groups_turn_the_signs_and_keep_the_tests(tmp_path, rng):
 
 
 def test_a_verdict_is_given_below_five_percent_and_not_above(tmp_path):
-    """Of six pairs p is 2 / 64 where all agree, and 4 / 64 where the smallest
-    difference contradicts the others."""
+    """Of six pairs, p is 2 / 64 if all agree and 4 / 64 if the smallest differs."""
     sizes = np.array([1, 2, 3, 4, 5, 6]) * 1e-3
     comparison = compared(tmp_path / "agree", 0.2 + sizes, np.full(6, 0.2))
     assert (comparison.wilcoxon, comparison.verdict) == (

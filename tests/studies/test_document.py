@@ -1,5 +1,4 @@
-"""One small document, written out in every format: nothing is lost, doubled or out of
-its place."""
+"""One small document in every format: nothing is lost, doubled or out of its place."""
 
 import io
 

@@ -38,8 +38,7 @@ ON_THE_PLANT = partial(NMPC, problem=PROBLEM, horizon=2, initial_input=HOVER)
 
 
 class Blind:
-    """Applies a law of the state, whatever it is asked for; a call takes the seconds
-    that ``seconds`` gives."""
+    """Applies a law of the state alone; a call takes as long as ``seconds`` gives."""
 
     horizon = 1
     problem = replace(PROBLEM, inputs=Box())

@@ -1,5 +1,4 @@
-"""A kernel is changed in a copy of the package: what was computed before is not shown
-as what that code computes."""
+"""Results of a changed kernel's old code are not shown as those of the new code."""
 
 import json
 import os

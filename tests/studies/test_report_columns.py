@@ -1,5 +1,4 @@
-"""A measure that is zero in every run takes no column where there is little room, and
-one where it is not."""
+"""A measure that is zero in every run takes no column where there is little room."""
 
 import pytest
 from rich.console import Console

@@ -1,5 +1,4 @@
-"""A tree with damaged runs, lost flights and whatever a user wrote: every document is
-written, and none obeys."""
+"""Damaged runs, lost flights and odd texts: every document is written, none obeys."""
 
 import csv
 import io

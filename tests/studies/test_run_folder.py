@@ -1,5 +1,4 @@
-"""Folders of runs have names of their own, and in what two runs were asked differently
-is said in words."""
+"""Folders of runs have own names, and two runs' different settings are put in words."""
 
 import json
 from itertools import combinations

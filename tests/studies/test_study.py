@@ -1,5 +1,7 @@
-"""A study keeps each record when it is there and runs what is missing; its seeds and
-names follow from settings."""
+"""A study keeps finished records and runs what is missing.
+
+Its seeds and names follow from its settings.
+"""
 
 import json
 import os
@@ -67,8 +69,7 @@ def fail(trial):
 
 @pytest.fixture
 def started(monkeypatch):
-    """Trials in the order of their start, in this process; they finish in the opposite
-    order."""
+    """Returns the order of trials in this process; they finish in the opposite one."""
     started = []
 
     def in_processes(function, jobs, workers):

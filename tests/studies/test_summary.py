@@ -168,8 +168,7 @@ def test_a_constraint_of_nan_counts_as_violated():
 
 
 def rollout_of(errors, **changes):
-    """A flight of ``PLANT`` so far from its reference along x, y and z [m], each row a
-    state."""
+    """A flight of ``PLANT`` so far from its reference in x, y, z [m], a row a state."""
     errors = np.array(errors, dtype=float)
     n = 6
     steps = len(errors) - 1

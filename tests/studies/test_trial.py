@@ -1,5 +1,4 @@
-"""A trial is put together from its experiment: what is learned from, what flies, and
-from where."""
+"""A trial is put together from its experiment: its data, its flight and its start."""
 
 from dataclasses import replace
 from functools import partial
