@@ -84,6 +84,9 @@ def test_nmpc_passes_an_interrupt_on_after_the_solve():
             timer.join()
             return solution
 
+        def stats(self):
+            return solver.stats()
+
     controller._program = controller._program._replace(solver=InterruptedSolver())
     with pytest.raises(KeyboardInterrupt):
         controller.control(
