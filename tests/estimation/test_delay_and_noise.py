@@ -41,13 +41,13 @@ def log(steps, delay, seed, feedback=0.0, std=(1e-3, 0.02), rho=0.0):
 @pytest.mark.parametrize("feedback", [0.0, 0.3])
 @pytest.mark.parametrize("delay", [0, 1, 3, 2.4])
 def test_a_delay_is_found_also_where_the_input_follows_the_state(delay, feedback):
-    found = estimate_delay(*log(300, delay, 0, feedback))
-    assert found.steps == pytest.approx(delay, abs=0.15)
-    assert found.interval[0] <= delay <= found.interval[1]
-    assert found.interval[1] - found.interval[0] < 0.8
+    estimate = estimate_delay(*log(300, delay, 0, feedback))
+    assert estimate.steps == pytest.approx(delay, abs=0.15)
+    assert estimate.interval[0] <= delay <= estimate.interval[1]
+    assert estimate.interval[1] - estimate.interval[0] < 0.8
     assert (
-        found.correlations.max()
-        == found.correlations[found.delays.tolist().index(found.steps)]
+        estimate.correlations.max()
+        == estimate.correlations[estimate.delays.tolist().index(estimate.steps)]
     )
 
 
@@ -59,9 +59,9 @@ def test_the_interval_holds_the_delay_as_often_as_it_says():
 
 def test_inputs_without_an_effect_give_a_wide_interval():
     states, _ = log(200, 0, 0)
-    found = estimate_delay(states, np.random.default_rng(5).normal(size=(200, 1)))
-    assert found.interval[1] - found.interval[0] > 3
-    assert found.correlations.max() < 0.4
+    estimate = estimate_delay(states, np.random.default_rng(5).normal(size=(200, 1)))
+    assert estimate.interval[1] - estimate.interval[0] > 3
+    assert estimate.correlations.max() < 0.4
 
 
 @pytest.mark.parametrize("offset", [1e3, -1e6, 1e9])
@@ -77,9 +77,9 @@ def test_a_delay_is_found_for_any_zero_of_states_and_inputs(offset):
 
 def test_states_that_rest_or_repeat_others_change_no_delay():
     states, inputs = log(300, 3, 0)
-    more = [np.full(301, 2.0), states[:, 0], states @ [1.0, -3.0]]
-    found = estimate_delay(np.column_stack([states, *more]), inputs)
-    assert found.steps == pytest.approx(3, abs=0.15)
+    uninformative = [np.full(301, 2.0), states[:, 0], states @ [1.0, -3.0]]
+    estimate = estimate_delay(np.column_stack([states, *uninformative]), inputs)
+    assert estimate.steps == pytest.approx(3, abs=0.15)
 
 
 def feedback_alone(steps, delay, noise):
@@ -137,8 +137,8 @@ def test_a_delay_not_in_the_data_is_refused_with_a_reason(change, reason, offset
 
 def test_a_little_excitation_beside_a_feedback_is_enough():
     states, inputs = log(600, 3, 0, feedback=2.0)
-    found = estimate_delay(states, inputs)
-    assert found.interval[0] <= 3 <= found.interval[1]
+    estimate = estimate_delay(states, inputs)
+    assert estimate.interval[0] <= 3 <= estimate.interval[1]
 
 
 def test_a_delay_is_found_where_a_spinning_pendulum_wraps():
@@ -148,10 +148,10 @@ def test_a_delay_is_found_where_a_spinning_pendulum_wraps():
         states.append(pendulum(states[-1], 2 + inputs[max(k - 3, 0)]))
     wrapped = np.array(states)
     wrapped[:, 0] = np.mod(wrapped[:, 0] + np.pi, 2 * np.pi) - np.pi
-    found = estimate_delay(wrapped, inputs, angles=[0])
-    assert found.steps == pytest.approx(3, abs=0.15)
+    estimate = estimate_delay(wrapped, inputs, angles=[0])
+    assert estimate.steps == pytest.approx(3, abs=0.15)
     counting = estimate_delay(states, inputs)
-    assert np.allclose(found.correlations, counting.correlations, atol=1e-4)
+    assert np.allclose(estimate.correlations, counting.correlations, atol=1e-4)
     with pytest.raises(SettingError, match=r"angles: must be indices of 2 states"):
         estimate_delay(wrapped, inputs, angles=[2])
 
@@ -163,11 +163,11 @@ def transitions(states, inputs):
 def test_noise_and_its_correlation_are_those_of_the_process():
     data = transitions(*log(2000, 0, 0, std=(2e-3, 0.03), rho=0.6))
     model = Trainer(predicts="difference", restarts=0)(data[:150]).posterior
-    found = estimate_process_noise(model, data)
-    assert torch.allclose(found.variance.sqrt(), torch.tensor([2e-3, 0.03]), rtol=0.12)
-    assert torch.allclose(found.correlation, torch.full((2,), 0.6), atol=0.12)
+    noise = estimate_process_noise(model, data)
+    assert torch.allclose(noise.variance.sqrt(), torch.tensor([2e-3, 0.03]), rtol=0.12)
+    assert torch.allclose(noise.correlation, torch.full((2,), 0.6), atol=0.12)
     assert torch.allclose(
-        found.long_run_variance / found.variance, torch.full((2,), 4.0), rtol=0.35
+        noise.long_run_variance / noise.variance, torch.full((2,), 4.0), rtol=0.35
     )
 
 

@@ -188,9 +188,9 @@ def test_estimates_from_sine_and_cosine_are_consistent(kind):
 def test_an_angle_modulo_one_turn_corrects_by_the_short_way():
     sensor = Measurement.of_states(2, [0], [0.1], angles=[0])
     before = Gaussian(torch.tensor([3.1, 0.0], dtype=F), PRIOR.covariance)
-    found = KalmanFilter.extended(PENDULUM, sensor).update(before, [-3.1])
-    assert float(found.innovation[0]) == pytest.approx(2 * np.pi - 6.2)
-    assert 3.1 < float(found.belief.mean[0]) < 3.2
+    update = KalmanFilter.extended(PENDULUM, sensor).update(before, [-3.1])
+    assert float(update.innovation[0]) == pytest.approx(2 * np.pi - 6.2)
+    assert 3.1 < float(update.belief.mean[0]) < 3.2
 
 
 def test_sigma_points_have_the_same_innovation_past_half_a_turn():
@@ -206,11 +206,11 @@ def test_sigma_points_have_the_same_innovation_past_half_a_turn():
         exact = KalmanFilter.extended(PENDULUM, sensor).update(before, y)
         for observer in (Unscented(), Unscented(alpha=0.5), MonteCarlo(20_000)):
             filter = KalmanFilter(PENDULUM, shown, observer=observer)
-            found = filter.update(before, y)
+            update = filter.update(before, y)
             loose = 0.02 if isinstance(observer, MonteCarlo) else 1e-9
-            assert float(found.innovation[0]) == pytest.approx(-0.1, abs=loose)
-            assert torch.allclose(found.covariance, exact.covariance, rtol=loose)
-            assert torch.allclose(found.belief.mean, exact.belief.mean, atol=loose)
+            assert float(update.innovation[0]) == pytest.approx(-0.1, abs=loose)
+            assert torch.allclose(update.covariance, exact.covariance, rtol=loose)
+            assert torch.allclose(update.belief.mean, exact.belief.mean, atol=loose)
 
 
 def test_a_flight_across_half_a_turn_is_estimated_as_any_other():
@@ -324,12 +324,12 @@ def test_an_update_is_exact_for_any_prior_and_sensors(kind, name):
     still = Known(lambda x, u: x, [0.1] * n)
     sensor = Measurement(n, torch.from_numpy(np.diag(R)), lambda x: x @ rows.mT)
     prior = Gaussian(torch.from_numpy(mean), torch.from_numpy(P))
-    found = kind(still, sensor).update(prior, y).belief
+    posterior = kind(still, sensor).update(prior, y).belief
     deviations = np.sqrt(np.diag(expected))
-    covariance = found.covariance.numpy()
+    covariance = posterior.covariance.numpy()
     scale = np.outer(deviations, deviations) + 1e-15 * np.abs(P)
     assert np.all(np.abs(covariance - expected) <= 1e-6 * scale)
-    missed = np.abs(found.mean.numpy() - expected_mean)
+    missed = np.abs(posterior.mean.numpy() - expected_mean)
     assert np.all(missed <= 1e-5 * deviations + 1e-13 * np.abs(expected_mean))
     assert np.array_equal(covariance, covariance.T)
     assert np.diag(covariance).min() >= 0.0
@@ -374,10 +374,10 @@ def test_contradictory_good_sensors_move_other_states_little(
     sensor = Measurement(5, variance * torch.eye(2, dtype=F), lambda x: x @ rows.mT)
     still = Known(lambda x, u: x, [0.1] * 5)
     prior = Gaussian(torch.from_numpy(mean), torch.from_numpy(P))
-    found = KalmanFilter.extended(still, sensor).update(prior, y).belief
-    missed = np.abs(found.mean.numpy() - expected)
+    posterior = KalmanFilter.extended(still, sensor).update(prior, y).belief
+    missed = np.abs(posterior.mean.numpy() - expected)
     assert missed.max() < 0.02  # the sensors differ by 0.5
-    assert np.allclose(found.covariance, covariance, atol=1e-12)
+    assert np.allclose(posterior.covariance, covariance, atol=1e-12)
 
 
 def test_correlated_noise_of_precise_sensors_is_taken_as_it_is():
@@ -385,14 +385,14 @@ def test_correlated_noise_of_precise_sensors_is_taken_as_it_is():
     H = torch.tensor([[1.0, 1.0], [1.0, 0.0]], dtype=F)
     sensor = Measurement(2, R, lambda x: x @ H.mT)
     y = torch.tensor([1.0, 0.4], dtype=F)
-    found = KalmanFilter.extended(LINEAR, sensor).update(PRIOR, y).belief
+    posterior = KalmanFilter.extended(LINEAR, sensor).update(PRIOR, y).belief
     # The second measurement less the first has a noise of its own.
     apart = [[1.0, 1.0], [0.0, -1.0]]
     mean, covariance = exact_update(
         PRIOR.covariance, apart, [1e-20, 1.0], PRIOR.mean, [1.0, -0.6]
     )
-    assert np.allclose(found.mean, mean, rtol=1e-9)
-    assert np.allclose(found.covariance, covariance, rtol=1e-9, atol=1e-18)
+    assert np.allclose(posterior.mean, mean, rtol=1e-9)
+    assert np.allclose(posterior.covariance, covariance, rtol=1e-9, atol=1e-18)
 
 
 def test_many_beliefs_are_updated_at_once():

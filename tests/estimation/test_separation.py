@@ -51,16 +51,16 @@ def learned(process, sensors, kind="gp", steps=250):
 )
 def test_each_part_is_found(kind, process, sensors):
     model, rows = learned(np.array(process), np.array(sensors), kind)
-    found = separate_noise(model, rows)
-    measurement = found.measurement.sqrt().numpy()
+    separation = separate_noise(model, rows)
+    measurement = separation.measurement.sqrt().numpy()
     assert np.allclose(measurement, sensors, atol=2e-3, rtol=0.3)
     if any(process):
-        moved = found.process.sqrt().numpy()
-        assert np.allclose(moved, process, rtol=0.35)
+        process_std = separation.process.sqrt().numpy()
+        assert np.allclose(process_std, process, rtol=0.35)
     if not any(sensors):
-        assert not found.measurement.any()
+        assert not separation.measurement.any()
         assert torch.allclose(
-            found.model.noise_covariance, model.noise_covariance, rtol=1e-12
+            separation.model.noise_covariance, model.noise_covariance, rtol=1e-12
         )
 
 
@@ -68,14 +68,14 @@ def test_the_model_predicts_the_same_with_process_noise():
     sensors = np.array([0.01, 0.02])
     for kind in ("gp", "features"):
         model, rows = learned(0.3 * sensors, sensors, kind)
-        found = separate_noise(model, rows)
+        separation = separate_noise(model, rows)
         at = torch.tensor([0.1, -0.2], dtype=torch.float64), torch.zeros(1).double()
         before = model.predict(*at)
-        after = found.model.predict(*at)
+        after = separation.model.predict(*at)
         assert torch.equal(before.mean, after.mean)
         assert torch.equal(before.covariance, after.covariance)
-        noise = found.model.noise_covariance.diagonal()
-        assert torch.allclose(noise, found.process)
+        noise = separation.model.noise_covariance.diagonal()
+        assert torch.allclose(noise, separation.process)
         assert bool((noise < 0.7 * model.noise_covariance.diagonal()).all())
 
 
@@ -85,10 +85,10 @@ def test_only_separated_noise_gives_honest_intervals():
     fresh = [
         Recording(*motion(60, 0.1 * sensors, sensors, seed)) for seed in range(1, 9)
     ]
-    found = separate_noise(model, rows)
-    known = found.measurement.sqrt().tolist()
+    separation = separate_noise(model, rows)
+    sensor_std = separation.measurement.sqrt().tolist()
     judge = partial(calibrate, propagator=Linearization(), horizon=15)
-    apart = judge(found.model, fresh, measurement_noise=known)
+    apart = judge(separation.model, fresh, measurement_noise=sensor_std)
     cautious = judge(model, fresh)
     assert float(apart.coverage[-1, :, -1].min()) > 0.88
     assert float(apart.coverage[:, :, -1].mean()) < 0.98

@@ -33,9 +33,9 @@ def log(steps, seed, varies):
     inputs = np.repeat(rng.uniform(-4, 4, (steps // 4 + 1, 1)), 4, axis=0)[:steps]
     for u in inputs:
         angle, rate = states[-1]
-        moved = rate + STEP * (-9.81 * np.sin(angle) - rate + 2.0 * u[0])
+        next_rate = rate + STEP * (-9.81 * np.sin(angle) - rate + 2.0 * u[0])
         noise = rng.normal(0, sigma(np.array([rate]), varies)[0])
-        states.append(np.array([angle + STEP * moved, moved]) + noise)
+        states.append(np.array([angle + STEP * next_rate, next_rate]) + noise)
     return Transitions(np.array(states[:-1]), inputs, np.array(states[1:]))
 
 
@@ -64,11 +64,11 @@ def held(model, rows, pick):
 
 
 def test_the_noise_is_found_where_it_is(driven):
-    rows, model, found = driven
-    assert found.outputs == (1,)
-    assert found.gain[1] > 5 * found.error[1] > 0
+    rows, model, estimate = driven
+    assert estimate.outputs == (1,)
+    assert estimate.gain[1] > 5 * estimate.error[1] > 0
     deviations = (
-        found.model.noise(rows.states, rows.inputs)
+        estimate.model.noise(rows.states, rows.inputs)
         .diagonal(dim1=1, dim2=2)
         .sqrt()
         .numpy()
@@ -78,13 +78,13 @@ def test_the_noise_is_found_where_it_is(driven):
     assert np.quantile(error, 0.9) < 0.25
     assert np.allclose(deviations[:, 0] ** 2, float(model.noise_variance[0]))
     assert torch.equal(
-        found.model.predict(rows.states, rows.inputs).mean,
+        estimate.model.predict(rows.states, rows.inputs).mean,
         model.predict(rows.states, rows.inputs).mean,
     )
 
 
 def test_intervals_hold_where_it_is_quiet_and_where_it_is_loud(driven):
-    rows, model, found = driven
+    rows, model, estimate = driven
     fresh = log(6000, 1, True)
     inside = (fresh.features >= rows.features.amin(0)) & (
         fresh.features <= rows.features.amax(0)
@@ -92,8 +92,8 @@ def test_intervals_hold_where_it_is_quiet_and_where_it_is_loud(driven):
     fresh = fresh[inside.all(1).nonzero()[:, 0].tolist()]
     quiet = fresh.states[:, 1].abs() < fresh.states[:, 1].abs().median()
     constant = with_process_noise(model, estimate_process_noise(model, rows))
-    assert 0.93 < held(found.model, fresh, quiet) < 0.97
-    assert 0.93 < held(found.model, fresh, ~quiet) < 0.97
+    assert 0.93 < held(estimate.model, fresh, quiet) < 0.97
+    assert 0.93 < held(estimate.model, fresh, ~quiet) < 0.97
     assert held(constant, fresh, quiet) > 0.985
     assert held(constant, fresh, ~quiet) < 0.915
 
@@ -102,9 +102,9 @@ def test_intervals_hold_where_it_is_quiet_and_where_it_is_loud(driven):
 def test_a_constant_noise_stays_one_and_the_model_as_it_is(seed):
     rows = log(400, seed, False)
     model = learned(rows)
-    found = estimate_varying_noise(model, rows)
-    assert found.outputs == ()
-    assert found.model is model
+    estimate = estimate_varying_noise(model, rows)
+    assert estimate.outputs == ()
+    assert estimate.model is model
 
 
 def test_the_same_seed_gives_the_same_numbers():
@@ -121,9 +121,9 @@ def test_a_state_that_is_predicted_exactly_has_a_constant_noise():
         rows.inputs,
         torch.stack([rows.states[:, 0], rows.next_states[:, 1]], dim=1),
     )
-    found = estimate_varying_noise(learned(exact), exact)
-    assert found.outputs == (1,)
-    assert torch.isfinite(found.gain).all()
+    estimate = estimate_varying_noise(learned(exact), exact)
+    assert estimate.outputs == (1,)
+    assert torch.isfinite(estimate.gain).all()
 
 
 def test_too_few_rows_are_refused():

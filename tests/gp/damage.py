@@ -369,7 +369,7 @@ def main(kind, count, seed):
         "transitions": transitions,
         "csv": transitions,
     }
-    made = makers[kind]()
+    undamaged = makers[kind]()
     load = {
         "model": load_posterior,
         "old": load_posterior,
@@ -383,14 +383,14 @@ def main(kind, count, seed):
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "file.npz"
         if kind == "csv":
-            rows = [",".join(map(repr, row)) for row in made.states.tolist()]
+            rows = [",".join(map(repr, row)) for row in undamaged.states.tolist()]
             path.write_text("\n".join(["a,b,c", *rows]))
         elif kind == "transitions":
-            made.save(path)
+            undamaged.save(path)
         elif kind == "old":
-            as_before(made, path)
+            as_before(undamaged, path)
         else:
-            SAVE[type(made)](made, path)
+            SAVE[type(undamaged)](undamaged, path)
         parts = ZIP if kind in ("transitions", "old") else SAFETENSORS
         whole = path.read_bytes()
         same = content(load(path))

@@ -127,12 +127,12 @@ def test_ipopt_steers_through_the_model():
     u = casadi.MX.sym("u", 1, horizon)
     start = 0.3
     before = casadi.horzcat(start, x[:, :-1])
-    moved, variance = dynamics.map(horizon)(before, u)
+    next_means, variance = dynamics.map(horizon)(before, u)
     reachable = float(gp.predict(torch.tensor([start]), torch.tensor([0.4])).mean)
     cost = (
         casadi.sumsqr(x - reachable) + 1e-3 * casadi.sumsqr(u) + casadi.sum2(variance)
     )
-    problem = {"x": casadi.veccat(x, u), "f": cost, "g": casadi.vec(moved - x)}
+    problem = {"x": casadi.veccat(x, u), "f": cost, "g": casadi.vec(next_means - x)}
     solver = casadi.nlpsol(
         "solver", "ipopt", problem, {"ipopt.print_level": 0, "print_time": 0}
     )

@@ -233,13 +233,13 @@ def test_sampling_and_expanding_propagators_take_any_kernel(propagator):
     assert torch.allclose(belief.mean, sampled.mean, atol=0.05)
     if not isinstance(propagator, MeanEquivalence):
         assert torch.allclose(belief.covariance, sampled.covariance, atol=0.01)
-    moved, sensitivity = differentiate(propagator, gp, at, control)
+    propagation, sensitivity = differentiate(propagator, gp, at, control)
     step = 1e-5
     shifted = [
         propagator(gp, Gaussian(at.mean, at.covariance), control + s * step).mean
         for s in (1, -1)
     ]
-    assert torch.allclose(moved.belief.mean, belief.mean)
+    assert torch.allclose(propagation.belief.mean, belief.mean)
     assert torch.allclose(
         sensitivity.mean_by_input[:, 0],
         (shifted[0] - shifted[1]) / (2 * step),

@@ -16,10 +16,10 @@ def arguments(size=150, outputs=3, d=4):
 
 
 def test_factors_made_in_place_are_the_same_bit_by_bit(monkeypatch):
-    given = arguments()
-    at_once = factorize(*given)
+    parts = arguments()
+    at_once = factorize(*parts)
     monkeypatch.setattr("gpmpc.gp._kernel._MANY", 10)
-    in_place = factorize(*given)
+    in_place = factorize(*parts)
     assert torch.equal(in_place, at_once)
     assert in_place.stride() == at_once.stride()
 

@@ -330,8 +330,8 @@ def test_an_attribute_of_that_name_but_another_kind_is_ignored():
 def test_what_is_not_known_is_checked_against_nothing(posterior):
     for signals in (Signals(), Signals(KNOWN.state_names), Signals(time_step=0.1)):
         assert append_transitions(posterior, data(signals)).signals == KNOWN
-        found = calibrate(posterior, Recording.chained(data(signals)), horizon=1)
-        assert found.names == KNOWN.state_names
+        calibration = calibrate(posterior, Recording.chained(data(signals)), horizon=1)
+        assert calibration.names == KNOWN.state_names
     unknown = replace(posterior, signals=Signals())
     assert len(append_transitions(unknown, data())) == 40
 

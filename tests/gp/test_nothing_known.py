@@ -87,11 +87,11 @@ def test_nothing_is_known_away_from_an_input_at_rest(name, round_off, caplog):
     assert (deviations(gp, [0.3, 0.2], [0.1, REST]) < 0.05).all()
     assert (deviations(gp, [0.3, 0.2], [0.1, REST + 1.0]) > 0.5).all()
     assert (deviations(gp, [0.3, 0.2], [0.1, REST - 4.0]) > 0.99).all()
-    told = [record for record in caplog.records if "never moves" in record.message]
-    assert len(told) == 1
-    assert "input 2 (0.5)" in told[0].message
-    assert "input 1" not in told[0].message
-    assert "state" not in told[0].message
+    warnings = [record for record in caplog.records if "never moves" in record.message]
+    assert len(warnings) == 1
+    assert "input 2 (0.5)" in warnings[0].message
+    assert "input 1" not in warnings[0].message
+    assert "state" not in warnings[0].message
 
 
 def test_a_model_of_hover_data_is_not_wrong_by_more_than_it_says():
@@ -192,9 +192,11 @@ def test_an_output_at_rest_is_known_among_the_data_alone(name, value, caplog):
     assert (deviations(gp, [0.0, 0.0], [0.0, REST]) < 0.03).all()
     assert (deviations(gp, [50.0, 0.0], [0.0, REST]) > 0.99).all()
     assert (gp.signal_variance >= 0.999).all()
-    told = [record for record in caplog.records if "never changes" in record.message]
-    assert len(told) == 1
-    assert f"state 1 ({value:.6g}), state 2 ({value:.6g})" in told[0].message
+    warnings = [
+        record for record in caplog.records if "never changes" in record.message
+    ]
+    assert len(warnings) == 1
+    assert f"state 1 ({value:.6g}), state 2 ({value:.6g})" in warnings[0].message
 
 
 def test_round_off_of_differences_is_relative_to_the_states(rng, caplog):
@@ -265,10 +267,10 @@ def test_one_who_knows_says_so_and_is_told_nothing(caplog):
     smaller = train(still, prior_deviation=0.01, restarts=0).posterior
     assert torch.allclose(smaller.signal_variance.sqrt(), torch.tensor(0.01))
     caplog.clear()
-    found = train(
+    without_prior = train(
         still, prior_deviation=None, prior_lengthscale="no_effect", restarts=0
     ).posterior
-    assert (found.signal_variance.sqrt() < 1e-3).all()
+    assert (without_prior.signal_variance.sqrt() < 1e-3).all()
     assert not caplog.records
 
 
@@ -447,10 +449,10 @@ WAYS = {
 def test_a_forgotten_shift_is_said_once_with_the_rule(name, caplog):
     x, u = flight()
     WAYS[name](Transitions(x[:-1], u, x[:-1]))
-    told = [r.message for r in caplog.records if "next_states" in r.message]
-    assert len(told) == 1
-    assert "next_states equal states in all 50 rows" in told[0]
-    assert "states x[:-1], next_states x[1:]" in told[0]
+    warnings = [r.message for r in caplog.records if "next_states" in r.message]
+    assert len(warnings) == 1
+    assert "next_states equal states in all 50 rows" in warnings[0]
+    assert "states x[:-1], next_states x[1:]" in warnings[0]
 
 
 @pytest.mark.parametrize("name", WAYS)
@@ -458,10 +460,10 @@ def test_copies_of_few_rows_are_said_once_with_the_rule(name, caplog):
     x, u = flight(5)
     copies = [np.tile(part, (20, 1)) for part in (x[:-1], u, x[1:])]
     WAYS[name](Transitions(*copies))
-    told = [r.message for r in caplog.records if "different" in r.message]
-    assert len(told) == 1
-    assert "only 5 of 100 rows that move are different" in told[0]
-    assert "give every row once" in told[0]
+    warnings = [r.message for r in caplog.records if "different" in r.message]
+    assert len(warnings) == 1
+    assert "only 5 of 100 rows that move are different" in warnings[0]
+    assert "give every row once" in warnings[0]
 
 
 def log_at_rest():

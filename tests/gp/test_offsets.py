@@ -214,7 +214,7 @@ def test_propagations_are_those_of_the_shifted_model(propagator, atol, choice):
     for shift in (torch.zeros(3), by):
         x, u = query(shift)
         with backend(choice):
-            moved = propagator.propagate(
+            propagation = propagator.propagate(
                 posterior(shift), Gaussian(x[0], covariance), u[0]
             )
             derivatives = differentiate(
@@ -222,9 +222,9 @@ def test_propagations_are_those_of_the_shifted_model(propagator, atol, choice):
             )[1]
         said.append(
             [
-                moved.belief.mean,
-                moved.belief.covariance,
-                moved.cross_covariance,
+                propagation.belief.mean,
+                propagation.belief.covariance,
+                propagation.cross_covariance,
                 *vars(derivatives).values(),
             ]
         )
@@ -242,9 +242,11 @@ def test_the_local_model_of_a_shifted_state_is_shifted(predicts):
         x, u = query(shift)
         gp = posterior(shift, of_targets, predicts=predicts)
         belief = Gaussian(x[0], covariance)
-        moved = MomentMatching()(gp, belief, u[0])
+        next_belief = MomentMatching()(gp, belief, u[0])
         local = linearize(MomentMatching(), gp, belief, u[0])
-        said.append([moved.mean - shift[:2], moved.covariance, local.A, local.B])
+        said.append(
+            [next_belief.mean - shift[:2], next_belief.covariance, local.A, local.B]
+        )
     for ours, theirs in zip(*said, strict=True):
         assert torch.allclose(ours, theirs, rtol=1e-6, atol=1e-7)
 

@@ -24,8 +24,10 @@ def transitions(rows, n=3, m=2, seed=0):
     generator = torch.Generator().manual_seed(seed)
     x = 4 * torch.rand(rows, n, generator=generator) - 2
     u = 2 * torch.rand(rows, m, generator=generator) - 1
-    moved = x + 0.1 * torch.sin(x.roll(1, dims=1)) + 0.1 * u[:, :1] * x
-    return Transitions(x, u, moved + 1e-3 * torch.randn(rows, n, generator=generator))
+    next_states = x + 0.1 * torch.sin(x.roll(1, dims=1)) + 0.1 * u[:, :1] * x
+    return Transitions(
+        x, u, next_states + 1e-3 * torch.randn(rows, n, generator=generator)
+    )
 
 
 def posterior(data, noise=1e-3, predicts="next_state", offset=None):

@@ -19,10 +19,10 @@ def transitions(rows, seed=0):
     generator = torch.Generator().manual_seed(seed)
     x = 4 * torch.rand(rows, 2, generator=generator) - 2
     u = torch.rand(rows, 1, generator=generator)
-    moved = torch.stack(
+    next_states = torch.stack(
         [torch.sin(2 * x[:, 0]) + u[:, 0], 100 * torch.cos(x[:, 1])], dim=1
     )
-    return Transitions(x, u, moved)
+    return Transitions(x, u, next_states)
 
 
 def posterior(data, noise=1e-2):

@@ -271,10 +271,12 @@ def transitions(rows, noise=1e-2, seed=0):
     generator = torch.Generator().manual_seed(seed)
     x = 4 * torch.rand(rows, 2, generator=generator) - 2
     u = 2 * torch.rand(rows, 1, generator=generator) - 1
-    moved = torch.stack(
+    next_states = torch.stack(
         [x[:, 0] + 0.2 * x[:, 1], x[:, 1] - torch.sin(2 * x[:, 0]) + u[:, 0]], dim=1
     )
-    return Transitions(x, u, moved + noise * torch.randn(rows, 2, generator=generator))
+    return Transitions(
+        x, u, next_states + noise * torch.randn(rows, 2, generator=generator)
+    )
 
 
 @pytest.mark.parametrize(

@@ -35,13 +35,13 @@ def pendulum(rows=60, noise=1e-3, seed=0):
     rng = np.random.default_rng(seed)
     x = rng.uniform(-2, 2, (rows, 2))
     u = rng.uniform(-1, 1, (rows, 1))
-    moved = np.column_stack(
+    next_states = np.column_stack(
         [x[:, 0] + 0.1 * x[:, 1], x[:, 1] - np.sin(x[:, 0]) + u[:, 0]]
     )
     return Transitions(
         *(
             torch.from_numpy(a)
-            for a in (x, u, moved + noise * rng.normal(size=moved.shape))
+            for a in (x, u, next_states + noise * rng.normal(size=next_states.shape))
         )
     )
 
@@ -121,14 +121,14 @@ def test_the_penalty_is_the_papers_and_its_gradient_is_right():
 def test_an_input_that_is_known_to_have_no_effect_has_none():
     data = pendulum(40)
     states = data.states.clone()
-    moved = data.next_states.clone()
+    next_states = data.next_states.clone()
     states[:, 1] = 0.5
-    moved[:, 1] = 0.5
+    next_states[:, 1] = 0.5
     known = {"prior_lengthscale": "no_effect", "prior_deviation": None}
-    huge = Transitions(states * torch.tensor([1.0, 1e10]), data.inputs, moved)
+    huge = Transitions(states * torch.tensor([1.0, 1e10]), data.inputs, next_states)
     long = train(huge, restarts=0, **known).posterior.lengthscales
     assert float(long[0, 1]) > 1e17
-    still = Transitions(states, data.inputs, moved)
+    still = Transitions(states, data.inputs, next_states)
     gp = train(still, penalty=SoftLimits(), **known).posterior
     near = torch.tensor([[0.3, 0.5]])
     far = torch.tensor([[0.3, 2.0]])
@@ -179,10 +179,10 @@ def test_one_row_can_be_trained_on():
 
 def test_when_all_starts_fail_the_output_is_named():
     data = pendulum(10)
-    moved = data.next_states.clone()
-    moved[:, 1] = 1e200 * torch.arange(1, 11)
+    next_states = data.next_states.clone()
+    next_states[:, 1] = 1e200 * torch.arange(1, 11)
     with pytest.raises(TrainingError, match="no start of 4 .* for output 1:") as caught:
-        train(Transitions(data.states, data.inputs, moved))
+        train(Transitions(data.states, data.inputs, next_states))
     assert caught.value.outputs == [1]
 
 
@@ -428,14 +428,14 @@ def test_what_takes_long_tells_where_it_is(caplog, monkeypatch):
     assert not caplog.records
     monkeypatch.setattr(_search, "_LOG_INTERVAL", 0.0)
     with caplog.at_level(logging.INFO, "gpmpc"):
-        found = train(data, restarts=0)
+        training = train(data, restarts=0)
     text = (
         r"training: output (\d) of 2, 12 points: evaluation (\d+), "
         r"minus log evidence .*"
     )
-    told = [re.fullmatch(text, record.message) for record in caplog.records]
-    assert [one[1] for one in told] == sorted(one[1] for one in told)
-    assert len(told) == found.evaluations
+    progress = [re.fullmatch(text, record.message) for record in caplog.records]
+    assert [one[1] for one in progress] == sorted(one[1] for one in progress)
+    assert len(progress) == training.evaluations
 
 
 def test_a_time_limit_ends_each_search_with_the_best_so_far(caplog, monkeypatch):
@@ -480,11 +480,11 @@ def test_a_time_limit_waits_for_one_start_that_succeeds(
         )
 
     monkeypatch.setattr(_search.OutputSearch, "_minimize", one_fails)
-    found = train(pendulum(20), time_limit=60.0)
-    assert np.isfinite(found.explored[0]).tolist() == [True] * explored + [False] * (
+    training = train(pendulum(20), time_limit=60.0)
+    assert np.isfinite(training.explored[0]).tolist() == [True] * explored + [False] * (
         4 - explored
     )
-    assert (found.explored[0] >= _search.FAILED).tolist() == [
+    assert (training.explored[0] >= _search.FAILED).tolist() == [
         k == failing and k < explored for k in range(4)
     ]
 
@@ -501,7 +501,7 @@ def test_a_time_limit_leaves_one_start_and_one_iteration(
         "_minimize",
         lambda self, *given: sizes.append(self._size) or search(self, *given),
     )
-    found = train(data, subset=20, time_limit=1e-9)
+    training = train(data, subset=20, time_limit=1e-9)
     assert sizes == [20, 60, 20, 60]
-    assert (found.objective > converged.objective).all()
-    assert len(found.posterior) == 60
+    assert (training.objective > converged.objective).all()
+    assert len(training.posterior) == 60

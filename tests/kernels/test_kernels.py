@@ -33,10 +33,10 @@ def packed(gp):
 
 def at_one(kernel, gps, *at, **settings):
     """A kernel's results at one point."""
-    found = kernel(
+    results = kernel(
         gps, *(np.asarray(part, dtype=float)[None] for part in at), **settings
     )
-    return type(found)(*(part[0] for part in found))
+    return type(results)(*(part[0] for part in results))
 
 
 def valued(gps, *at, **settings):
@@ -204,12 +204,12 @@ def test_derivatives_agree_with_finite_differences(spread):
     d_S = d_S @ d_S.T * spread**2
     step = 1e-5
 
-    def moved(t):
+    def moments_at(t):
         return valued(gps, mu + t * d_mu, S + t * d_S, u + t * d_u)
 
     numeric = [
         (after - before) / (2 * step)
-        for after, before in zip(moved(step), moved(-step), strict=True)
+        for after, before in zip(moments_at(step), moments_at(-step), strict=True)
     ]
     d = differentiated(gps, mu, S, u)
     close(d.J @ d_mu + np.tensordot(d.dM_dS, d_S) + d.dM_du @ d_u, numeric[0], 1e-7)

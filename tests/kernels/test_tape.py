@@ -40,11 +40,11 @@ def test_a_tape_has_the_values_and_derivatives_of_casadi(function, rng):
     )
     assert compiled.tape is not None
     arguments = [rng.uniform(0.2, 2, (7, size)) for size in (3, 2)[: len(names)]]
-    for found, expected in zip(
+    for value, expected in zip(
         compiled.linearize(*arguments), plain.linearize(*arguments), strict=True
     ):
-        assert found.shape == expected.shape
-        assert np.allclose(found, expected, rtol=1e-12, atol=1e-12)
+        assert value.shape == expected.shape
+        assert np.allclose(value, expected, rtol=1e-12, atol=1e-12)
 
 
 def test_matrix_expressions_expand_and_other_calls_have_no_tape():

@@ -31,8 +31,8 @@ def cart(force):
 
     def next_state(x, u):
         position, velocity = x.unbind(-1)
-        moved = velocity + 0.1 * (force(u[..., 0]) - 0.3 * velocity)
-        return torch.stack([position + 0.1 * velocity, moved], -1)
+        next_velocity = velocity + 0.1 * (force(u[..., 0]) - 0.3 * velocity)
+        return torch.stack([position + 0.1 * velocity, next_velocity], -1)
 
     return KnownModel(next_state, 2, 1)
 

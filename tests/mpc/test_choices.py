@@ -29,10 +29,10 @@ def chosen(*overrides):
 @pytest.mark.parametrize("controller", names("controller"))
 def test_every_controller_of_the_settings_flies(controller):
     make = chosen(f"controller={controller}", "horizon=3")
-    made = make(QUADROTOR if controller == "nmpc" else quadrotor_gp(20))
+    mpc = make(QUADROTOR if controller == "nmpc" else quadrotor_gp(20))
     reference = Reference(np.zeros((4, 6)), np.tile(HOVER, (3, 1)))
     assert (
-        made.control(Gaussian.certain(np.full(6, 0.2)), reference).status
+        mpc.control(Gaussian.certain(np.full(6, 0.2)), reference).status
         is Status.SOLVED
     )
 
@@ -40,8 +40,8 @@ def test_every_controller_of_the_settings_flies(controller):
 def test_all_predictions_hold_the_noise_but_the_papers():
     held = {}
     for name in ("convex", "nonlinear", "state_form", "paper"):
-        made = chosen(f"controller={name}", "horizon=2")(quadrotor_gp(20))
-        held[name] = made.prediction.propagator.process_noise
+        mpc = chosen(f"controller={name}", "horizon=2")(quadrotor_gp(20))
+        held[name] = mpc.prediction.propagator.process_noise
     assert held == dict.fromkeys(held, True) | {"paper": False}
 
 
@@ -52,9 +52,9 @@ def test_propagation_and_solver_are_chosen_by_name(propagation, solver):
         f"propagation@controller.propagator={propagation}",
         f"solver@controller.solver={solver}",
     ]
-    made = chosen("controller=convex", "horizon=2", *overrides)(quadrotor_gp(20))
+    mpc = chosen("controller=convex", "horizon=2", *overrides)(quadrotor_gp(20))
     reference = Reference(np.zeros((3, 6)))
     assert (
-        made.control(Gaussian.certain(np.full(6, 0.2)), reference).status
+        mpc.control(Gaussian.certain(np.full(6, 0.2)), reference).status
         is Status.SOLVED
     )

@@ -287,7 +287,7 @@ def test_feedback_coordinates_give_the_same_plan(penalized, held, rated, rng):
         np.full((H, r), 4.0),
     )
     price = np.full(H * r, 2.0)
-    found = []
+    solutions = []
     plain = condenser.condense(stages, start, references, rows)
     assert len(plain.feedback) == 0
     other = condense_with_feedback(
@@ -303,9 +303,9 @@ def test_feedback_coordinates_give_the_same_plan(penalized, held, rated, rng):
         z = solution.multipliers[
             -(len(problem.inputs.lower) * H * (2 if rated else 1) + H * r) :
         ]
-        found.append((inputs, states, z))
-    assert np.count_nonzero(found[0][2]) > 3
-    for one, same in zip(*found, strict=True):
+        solutions.append((inputs, states, z))
+    assert np.count_nonzero(solutions[0][2]) > 3
+    for one, same in zip(*solutions, strict=True):
         assert np.allclose(one, same, rtol=0, atol=1e-8)
     assert len(other.feedback) == H
     assert np.array_equal(other.P * np.kron(np.eye(H), np.ones((m, m))), other.P)
@@ -488,7 +488,7 @@ def programs_of_the_double_pendulum(starts, seed):
                 solution = solver.solve(
                     QuadraticProgram.unchecked(*program[:5])
                 )  # raises where P is indefinite
-                found, moved = expand(
+                plan_inputs, plan_states = expand(
                     stages,
                     start,
                     program.feedback,
@@ -496,10 +496,12 @@ def programs_of_the_double_pendulum(starts, seed):
                     solution.x,
                 )
                 assert solution.status is Status.SOLVED
-                assert np.isfinite(moved).all()
+                assert np.isfinite(plan_states).all()
                 # Where torques are at their bounds the states of the linear stages
                 # grow, and rounding with them.
-                assert np.abs(found).max() < 6.0 + 1e-9 * (1.0 + np.abs(moved).max())
+                assert np.abs(plan_inputs).max() < 6.0 + 1e-9 * (
+                    1.0 + np.abs(plan_states).max()
+                )
                 counts += len(program.feedback) > 0, 1
     return counts
 

@@ -20,7 +20,7 @@ def controller(problem=PROBLEM, **settings):
     return GPMPC(model(), Linearization(), problem, 10, [0.0], **settings)
 
 
-def moved(x, u):
+def next_state(x, u):
     return np.array([x[0] + 0.5 * x[1] + 0.125 * u[0], x[1] + 0.5 * u[0]])
 
 
@@ -30,7 +30,7 @@ def test_five_lines_steer_somebody_elses_plant_to_a_set_point():
     loop.warm_up(x, GOAL)
     assert loop.last is None
     for _ in range(60):
-        x = moved(x, loop.input(x, GOAL))
+        x = next_state(x, loop.input(x, GOAL))
     assert np.allclose(x, GOAL, atol=1e-3)
     assert loop.failures == 0
 
@@ -47,7 +47,7 @@ def test_an_input_is_always_finite_and_within_bounds_and_rates(on_failure, rng):
         assert np.isfinite(u).all()
         assert BOX.lower[0] - 1e-9 <= u[0] <= BOX.upper[0] + 1e-9
         assert -0.3 - 1e-9 <= u[0] - last[0] <= 0.2 + 1e-9
-        x = moved(x, u)
+        x = next_state(x, u)
         last = u
     assert 20 < loop.failures < 60
     assert loop.last.status is not None
@@ -75,7 +75,7 @@ def test_another_solver_steers_alike_from_step_to_step(solver):
     for _ in range(8):
         ours, theirs = (loop.input(x, GOAL) for loop in loops)
         assert np.allclose(theirs, ours, atol=1e-6)
-        x = moved(x, ours)
+        x = next_state(x, ours)
     assert [loop.failures for loop in loops] == [0, 0]
 
 

@@ -74,21 +74,18 @@ def assert_same(many, alone, tolerance=1e-9):
 def test_many_questions_get_the_answers_that_each_gets_alone(
     form, covariance, propagator, choice
 ):
-    asked = controller(form, covariance, propagator)
+    mpc = controller(form, covariance, propagator)
     with backend(choice):
-        first = asked.control_many(beliefs(4), [REFERENCE] * 4, [None] * 4)
-        assert_same(first, [asked.control(b, REFERENCE) for b in beliefs(4)])
+        first = mpc.control_many(beliefs(4), [REFERENCE] * 4, [None] * 4)
+        assert_same(first, [mpc.control(b, REFERENCE) for b in beliefs(4)])
         again = beliefs(4, seed=1)
         again[1] = Gaussian.certain(again[1].mean)  # measured
         again[2] = Gaussian.certain(np.full(6, np.nan))
         before = [*first[:3], None]
-        second = asked.control_many(again, [REFERENCE] * 4, before)
+        second = mpc.control_many(again, [REFERENCE] * 4, before)
         assert_same(
             second,
-            [
-                asked.control(b, REFERENCE, p)
-                for b, p in zip(again, before, strict=True)
-            ],
+            [mpc.control(b, REFERENCE, p) for b, p in zip(again, before, strict=True)],
         )
     assert second[2].status is Status.INVALID_MEASUREMENT
     assert all(second[t].status.solved for t in (0, 1, 3))
@@ -99,32 +96,32 @@ def test_without_feedback_and_with_another_model_too():
     other = controller(
         "trajectory", "zero_order", Linearization(), linear_gaussian(6, 3)
     )
-    for asked in (open_loop, other):
-        many = asked.control_many(beliefs(3), [REFERENCE] * 3, [None] * 3)
-        assert_same(many, [asked.control(b, REFERENCE) for b in beliefs(3)])
+    for mpc in (open_loop, other):
+        many = mpc.control_many(beliefs(3), [REFERENCE] * 3, [None] * 3)
+        assert_same(many, [mpc.control(b, REFERENCE) for b in beliefs(3)])
 
 
 def test_compiled_and_torch_answer_alike():
     for covariance, propagator in MODES:
-        asked = controller("trajectory", covariance, propagator)
-        compiled = asked.control_many(beliefs(3), [REFERENCE] * 3, [None] * 3)
+        mpc = controller("trajectory", covariance, propagator)
+        compiled = mpc.control_many(beliefs(3), [REFERENCE] * 3, [None] * 3)
         with backend("torch"):
             assert_same(
-                asked.control_many(beliefs(3), [REFERENCE] * 3, [None] * 3), compiled
+                mpc.control_many(beliefs(3), [REFERENCE] * 3, [None] * 3), compiled
             )
 
 
 def test_one_that_cannot_be_answered_spoils_no_other():
-    asked = controller("velocity", "full", MomentMatching())
+    mpc = controller("velocity", "full", MomentMatching())
     questions = beliefs(3)
     questions[1] = Gaussian(questions[1].mean, -torch.eye(6))  # no covariance
-    many = asked.control_many(questions, [REFERENCE] * 3, [None] * 3)
+    many = mpc.control_many(questions, [REFERENCE] * 3, [None] * 3)
     assert [d.status for d in many] == [
         Status.SOLVED,
         Status.NUMERICAL_TROUBLE,
         Status.SOLVED,
     ]
-    assert_same(many, [asked.control(b, REFERENCE) for b in questions])
+    assert_same(many, [mpc.control(b, REFERENCE) for b in questions])
 
 
 def test_nobody_asks():
@@ -135,9 +132,9 @@ def test_nobody_asks():
 
 
 def test_each_question_may_take_its_own_number_of_programs():
-    asked = controller("trajectory", "none", Linearization(), iterations=30)
-    many = asked.control_many(beliefs(3), [REFERENCE] * 3, [None] * 3)
-    assert_same(many, [asked.control(b, REFERENCE) for b in beliefs(3)])
+    mpc = controller("trajectory", "none", Linearization(), iterations=30)
+    many = mpc.control_many(beliefs(3), [REFERENCE] * 3, [None] * 3)
+    assert_same(many, [mpc.control(b, REFERENCE) for b in beliefs(3)])
     assert all(decision.iterations > 1 for decision in many)
 
 

@@ -48,22 +48,22 @@ def controller(kind=GPMPC, model=PENDULUM, propagator=None, **settings):
     )
 
 
-def moved(model, state, input, unknown=UNKNOWN):
+def next_state(model, state, input, unknown=UNKNOWN):
     return (
         model.predict(torch.tensor(state), torch.tensor(input)).mean.numpy() + unknown
     )
 
 
-def flown(asked, model=PENDULUM, unknown=UNKNOWN, steps=40):
+def flown(mpc, model=PENDULUM, unknown=UNKNOWN, steps=40):
     """States and decisions; the plant is the model and what it does not know."""
     states = [np.zeros(2)]
     decisions = []
     last = None
     for _ in range(steps):
-        last = asked.control(Gaussian.certain(states[-1]), AT_REST, last)
+        last = mpc.control(Gaussian.certain(states[-1]), AT_REST, last)
         assert last.status is Status.SOLVED
         decisions.append(last)
-        states.append(moved(model, states[-1], last.input, unknown))
+        states.append(next_state(model, states[-1], last.input, unknown))
     return np.array(states), decisions
 
 
@@ -98,34 +98,36 @@ def test_without_an_estimate_it_does():
 
 def test_a_model_that_is_right_is_left_alone():
     plain = flown(controller(), unknown=0.0)
-    told = flown(controller(disturbance_gain=1.0), unknown=0.0)
-    assert np.allclose(plain[0], told[0], rtol=0, atol=1e-9)
-    assert np.abs([decision.disturbance for decision in told[1]]).max() < 1e-12
+    corrected = flown(controller(disturbance_gain=1.0), unknown=0.0)
+    assert np.allclose(plain[0], corrected[0], rtol=0, atol=1e-9)
+    assert np.abs([decision.disturbance for decision in corrected[1]]).max() < 1e-12
 
 
 def test_the_estimate_moves_by_its_gain_towards_the_last_error():
-    asked = controller(disturbance_gain=0.3)
-    _, decisions = flown(asked, steps=6)
-    found = [decision.disturbance for decision in decisions]
+    mpc = controller(disturbance_gain=0.3)
+    _, decisions = flown(mpc, steps=6)
+    estimates = [decision.disturbance for decision in decisions]
     assert np.allclose(
-        found, [(1 - 0.7**k) * UNKNOWN for k in range(6)], rtol=0, atol=1e-12
+        estimates, [(1 - 0.7**k) * UNKNOWN for k in range(6)], rtol=0, atol=1e-12
     )
 
 
 def test_what_was_applied_counts_and_not_what_was_planned():
-    asked = controller(disturbance_gain=1.0)
-    last = asked.control(Gaussian.certain(np.zeros(2)), AT_REST)
-    held = replace(last, input=np.array([1.5]))
-    now = asked.control(
-        Gaussian.certain(moved(PENDULUM, np.zeros(2), held.input)), AT_REST, held
+    mpc = controller(disturbance_gain=1.0)
+    last = mpc.control(Gaussian.certain(np.zeros(2)), AT_REST)
+    applied = replace(last, input=np.array([1.5]))
+    now = mpc.control(
+        Gaussian.certain(next_state(PENDULUM, np.zeros(2), applied.input)),
+        AT_REST,
+        applied,
     )
     assert np.allclose(now.disturbance, UNKNOWN, rtol=0, atol=1e-12)
 
 
 def test_a_missing_measurement_leaves_the_estimate_unchanged():
-    asked = controller(disturbance_gain=1.0)
-    states, _ = flown(asked, steps=5)
-    loop = ControlLoop(asked)
+    mpc = controller(disturbance_gain=1.0)
+    states, _ = flown(mpc, steps=5)
+    loop = ControlLoop(mpc)
     loop.input(states[-1], AT_REST)
     loop.last = replace(loop.last, plan=replace(loop.last.plan, disturbance=UNKNOWN))
     loop.input(np.full(2, np.nan), AT_REST)
@@ -136,17 +138,17 @@ def test_a_missing_measurement_leaves_the_estimate_unchanged():
 
 @pytest.mark.parametrize("covariance", ["zero_order", "none"])
 def test_compiled_torch_batched_and_state_form_agree(covariance):
-    asked = controller(covariance=covariance, disturbance_gain=0.7)
-    states, decisions = flown(asked, steps=4)
+    mpc = controller(covariance=covariance, disturbance_gain=0.7)
+    states, decisions = flown(mpc, steps=4)
     belief = Gaussian.certain(states[-1])
     before = decisions[-1]
-    answer = asked.control(belief, AT_REST, before)
+    answer = mpc.control(belief, AT_REST, before)
     in_cvxpy = controller(StateFormMPC, covariance=covariance, disturbance_gain=0.7)
     others = [in_cvxpy.control(belief, AT_REST, before)]
     with backend("torch"):
         others += [
-            asked.control(belief, AT_REST, before),
-            *asked.control_many([belief], [AT_REST], [before]),
+            mpc.control(belief, AT_REST, before),
+            *mpc.control_many([belief], [AT_REST], [before]),
         ]
     for other, tolerance in zip(others, (1e-6, 1e-9, 1e-9), strict=True):
         assert np.allclose(other.disturbance, answer.disturbance, rtol=0, atol=1e-12)
@@ -182,14 +184,14 @@ def test_a_gain_out_of_range_is_refused(kind, settings, rule):
 def test_with_model_gives_the_controller_made_with_that_model(iterations):
     other = pendulum_posterior(seed=3)
     inputs = 2.0 * np.ones((H, 1))
-    asked = controller(
+    mpc = controller(
         covariance="none", rolled_out=True, iterations=iterations
     ).with_model(other)
-    made = controller(
+    mpc_of_other = controller(
         model=other, covariance="none", rolled_out=True, iterations=iterations
     )
     question = Gaussian.certain([0.3, -0.2]), AT_REST, None, None, inputs
-    found = asked.control(*question)
-    expected = made.control(*question)
-    assert np.array_equal(found.means, expected.means)
-    assert np.array_equal(found.inputs, expected.inputs)
+    decision = mpc.control(*question)
+    expected = mpc_of_other.control(*question)
+    assert np.array_equal(decision.means, expected.means)
+    assert np.array_equal(decision.inputs, expected.inputs)

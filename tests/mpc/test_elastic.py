@@ -104,8 +104,10 @@ def test_a_vehicle_pushed_out_of_its_lane_returns_without_a_spin():
             decision = controller.control(
                 Gaussian.certain(state), Reference(np.zeros(3)), decision
             )
-            moved = slide(torch.from_numpy(state), torch.from_numpy(decision.input))
-            state = moved.numpy()
+            next_state = slide(
+                torch.from_numpy(state), torch.from_numpy(decision.input)
+            )
+            state = next_state.numpy()
             worst = max(worst, abs(state[0]))
         ends[penalty] = worst
     assert ends["exact"] > 1.0

@@ -126,9 +126,9 @@ def test_a_flight_follows_the_controller_and_ends_at_the_goal():
     system = pendulum()
     one = controller(system, pendulum_problem(), 30)
     start = np.array(system.start)
-    asked = question(Reference(np.zeros((31, 2))))
+    at_rest = question(Reference(np.zeros((31, 2))))
     beginning = Trajectory(one, start[None], np.empty((0, 1)))
-    flight = Foresight(one).fly(beginning, asked)
+    flight = Foresight(one).fly(beginning, at_rest)
     loop = ControlLoop(one)
     state = start
     for k in range(len(flight)):
@@ -136,8 +136,8 @@ def test_a_flight_follows_the_controller_and_ends_at_the_goal():
         state = step(system, state, loop.input(state, np.zeros(2)))
     assert flight.arrives
     assert np.abs(wrap(flight.states[-4:, 0])).max() < 0.3
-    assert Foresight(one).fly(beginning, asked, 0.9 * flight.cost) is None
-    better = Foresight(one).improve(flight, asked)
+    assert Foresight(one).fly(beginning, at_rest, 0.9 * flight.cost) is None
+    better = Foresight(one).improve(flight, at_rest)
     assert better.cost <= flight.cost
     for k in range(len(better)):
         after = step(system, better.states[k], better.inputs[k])
@@ -158,8 +158,8 @@ def test_a_flight_that_arrives_beats_a_cheaper_one_that_stands():
 def test_relays_pump_at_the_bounds_in_the_rhythm_of_the_plant():
     system = pendulum()
     foresight = Foresight(controller(system, pendulum_problem(), 30))
-    asked = question(Reference(np.zeros((31, 2))))
-    relays = list(foresight.relays(np.array(system.start), asked))
+    at_rest = question(Reference(np.zeros((31, 2))))
+    relays = list(foresight.relays(np.array(system.start), at_rest))
     highest = [np.abs(wrap(states[-1, 0])) for states, _ in relays]
     assert min(highest) < 1.3  # a few swings after hanging
     for states, inputs in relays:

@@ -662,10 +662,10 @@ def test_the_compiled_rollout_is_the_one_stage_by_stage(
     first = compiled.control(belief, at_origin(H))
     with backend("torch"):
         expected = by_torch.control(belief, at_origin(H), first)
-    found = compiled.control(belief, at_origin(H), first)
-    assert np.allclose(found.inputs, expected.inputs, atol=1e-9)
-    assert np.allclose(found.means, expected.means, atol=1e-10)
-    assert np.allclose(found.covariances, expected.covariances, atol=1e-12)
+    decision = compiled.control(belief, at_origin(H), first)
+    assert np.allclose(decision.inputs, expected.inputs, atol=1e-9)
+    assert np.allclose(decision.means, expected.means, atol=1e-10)
+    assert np.allclose(decision.covariances, expected.covariances, atol=1e-12)
 
 
 @pytest.mark.parametrize("evaluated", ["auto", "torch"])
@@ -674,7 +674,7 @@ def test_the_compiled_rollout_is_the_one_stage_by_stage(
 )
 def test_observation_noise_widens_predictions_on_request(form, covariance, evaluated):
     state = Gaussian.certain(np.array([0.3, 0.0, -0.2, 0.1, 0.2, 0.0]))
-    found = []
+    covariances = []
     for noise in (False, True):
         how = Linearization(process_noise=noise)
         controller = GPMPC(
@@ -688,9 +688,9 @@ def test_observation_noise_widens_predictions_on_request(form, covariance, evalu
             ),
         )
         with backend(evaluated):
-            found.append(controller.control(state, at_origin(3)).covariances[1])
+            covariances.append(controller.control(state, at_origin(3)).covariances[1])
     assert np.allclose(
-        found[1] - found[0], gp().noise_covariance, atol=1e-6
+        covariances[1] - covariances[0], gp().noise_covariance, atol=1e-6
     )  # of 1e-4; the plans differ a little
 
 

@@ -114,9 +114,9 @@ def test_one_wrong_measurement_or_a_coarse_sensor_is_no_alarm(nothing):
 )
 @pytest.mark.parametrize("seed", range(2))
 def test_what_breaks_is_called_within_twenty_steps(broken, seed):
-    told = levels(fly(broken, seed=seed))
-    assert told[:40] == ["healthy"] * 40
-    assert set(told[40:60]) > {"healthy"}
+    judged_levels = levels(fly(broken, seed=seed))
+    assert judged_levels[:40] == ["healthy"] * 40
+    assert set(judged_levels[40:60]) > {"healthy"}
 
 
 def test_a_plant_that_stops_obeying_is_lost_since_that_step():
@@ -148,13 +148,13 @@ def test_reasons_name_states_and_inputs():
 def judged_alone(judge, frozen_from):
     """Judgements of a point that is to stand still, and whose first sensor freezes."""
     rng = np.random.default_rng(0)
-    told = []
+    judgements = []
     for k in range(30):
         measured = rng.normal(0.0, 0.01, 2)
         if k >= frozen_from:
             measured[0] = 0.005
-        told.append(judge.judge(measured, np.zeros(2), plan_of(measured)))
-    return told
+        judgements.append(judge.judge(measured, np.zeros(2), plan_of(measured)))
+    return judgements
 
 
 def plan_of(state, **changes):
@@ -169,23 +169,23 @@ def plan_of(state, **changes):
 
 
 def test_a_sensor_that_freezes_is_named_after_four_steps():
-    told = judged_alone(FlightJudge(CONTROLLER.problem), frozen_from=20)
-    assert {judgement.level for judgement in told[:24]} == {"healthy"}
-    assert told[24].reason.startswith("state 0 is measured the same for 4 steps")
+    judgements = judged_alone(FlightJudge(CONTROLLER.problem), frozen_from=20)
+    assert {judgement.level for judgement in judgements[:24]} == {"healthy"}
+    assert judgements[24].reason.startswith("state 0 is measured the same for 4 steps")
 
 
 def test_failed_decisions_are_suspicious_from_the_third_on():
     judge = FlightJudge(CONTROLLER.problem)
     for k in range(20):
         status = Status.INFEASIBLE if k >= 10 else Status.SOLVED
-        told = judge.judge(
+        judgement = judge.judge(
             np.zeros(2), np.zeros(2), plan_of(np.zeros(2), status=status)
         )
-        assert told.level == ("suspicious" if k >= 12 else "healthy")
-    assert told.reason == "8 of the last 8 decisions could not be applied"
+        assert judgement.level == ("suspicious" if k >= 12 else "healthy")
+    assert judgement.reason == "8 of the last 8 decisions could not be applied"
     for _ in range(8):
-        told = judge.judge(np.zeros(2), np.zeros(2), plan_of(np.zeros(2)))
-    assert told == Judgement()
+        judgement = judge.judge(np.zeros(2), np.zeros(2), plan_of(np.zeros(2)))
+    assert judgement == Judgement()
 
 
 def test_plans_far_from_data_are_suspicious_away_from_the_goal():
@@ -193,16 +193,16 @@ def test_plans_far_from_data_are_suspicious_away_from_the_goal():
         judge = FlightJudge(CONTROLLER.problem)
         x = np.array([place, 0.0])
         plan = plan_of(x, plan_novelty=0.95)
-        told = [judge.judge(x, np.zeros(2), plan).level for _ in range(4)]
-        assert told == ["healthy", "healthy", level, level]
+        judged_levels = [judge.judge(x, np.zeros(2), plan).level for _ in range(4)]
+        assert judged_levels == ["healthy", "healthy", level, level]
 
 
 def test_a_flight_is_judged_again_when_measurements_are_back():
     rollout = fly(Dropout(30 * T, 40 * T))
-    told = levels(rollout)
-    assert told[31:33] == ["healthy", "suspicious"]
-    assert "lost" not in told
-    assert told[-20:] == ["healthy"] * 20
+    judged_levels = levels(rollout)
+    assert judged_levels[31:33] == ["healthy", "suspicious"]
+    assert "lost" not in judged_levels
+    assert judged_levels[-20:] == ["healthy"] * 20
 
 
 def test_a_constraint_that_plans_keep_missing_is_suspicious():
@@ -210,8 +210,10 @@ def test_a_constraint_that_plans_keep_missing_is_suspicious():
     beyond = fly(law=controller(constraints=[wall]), references=np.zeros(2), noise=None)
     assert "healthy" in levels(beyond)
     impossible = Halfspaces([[1.0, 0.0], [-1.0, 0.0]], [-0.5, -0.5])
-    told = fly(law=controller(constraints=[impossible]), noise=None).judgements
-    assert any("plans miss a constraint" in judgement.reason for judgement in told)
+    judgements = fly(law=controller(constraints=[impossible]), noise=None).judgements
+    assert any(
+        "plans miss a constraint" in judgement.reason for judgement in judgements
+    )
 
 
 @pytest.mark.parametrize(
@@ -230,16 +232,16 @@ def test_a_jump_of_the_set_point_is_no_alarm(preview):
     states = np.zeros((121, 2))
     states[40:, 0] = 1.0
     if preview:
-        told = fly(references=states, noise=None).judgements
+        judgements = fly(references=states, noise=None).judgements
     else:
-        told = []
+        judgements = []
         x = np.zeros(2)
         loop = ControlLoop(CONTROLLER)
         for k in range(80):
             u = loop.input(x, states[k])
-            told.append(loop.judgement)
+            judgements.append(loop.judgement)
             x = np.array([x[0] + T * x[1] + T**2 / 2 * u[0], x[1] + T * u[0]])
-    assert {judgement.level for judgement in told} == {"healthy"}
+    assert {judgement.level for judgement in judgements} == {"healthy"}
 
 
 def test_every_loop_judges_alike():
@@ -272,7 +274,7 @@ def test_without_a_problem_innovations_are_judged():
     still = closed_loop(PLANT, Standing(), np.zeros(2), np.zeros(2), 40, noise=NOISE)
     assert still.judgement.level == "healthy"
     pushed = [Gust({"velocity": 0.5}, 2.0)]
-    moved = closed_loop(
+    disturbed = closed_loop(
         PLANT,
         Standing(),
         np.zeros(2),
@@ -281,7 +283,7 @@ def test_without_a_problem_innovations_are_judged():
         noise=NOISE,
         disturbances=pushed,
     )
-    assert moved.judgement.level == "suspicious"
+    assert disturbed.judgement.level == "suspicious"
 
 
 def test_a_flight_is_what_its_steps_say():

@@ -38,40 +38,40 @@ def controller(probability=0.95, **settings):
 
 
 def test_bounds_are_moved_by_the_kappas_of_the_reference():
-    asked = controller()
+    mpc = controller()
     plain = None
     for kappas in (np.full(H, 1.6448536269514722), np.linspace(1.0, 4.0, H)):
-        found = asked.control(START, replace(FAR, kappas=kappas))
-        sd = np.sqrt(found.covariances[1:, 0, 0])
+        decision = mpc.control(START, replace(FAR, kappas=kappas))
+        sd = np.sqrt(decision.covariances[1:, 0, 0])
         assert sd.min() > 0
-        margins = (UPPER - found.means[1:, 0]) / sd
+        margins = (UPPER - decision.means[1:, 0]) / sd
         assert (margins > kappas - 1e-6).all()
         assert np.isclose(margins, kappas, atol=1e-5).any()
-        plain = asked.control(START, FAR) if plain is None else plain
-        assert np.allclose(found.inputs, plain.inputs, atol=1e-9) == (
+        plain = mpc.control(START, FAR) if plain is None else plain
+        assert np.allclose(decision.inputs, plain.inputs, atol=1e-9) == (
             kappas[0] == kappas[-1]
         )
 
 
 def test_a_set_point_keeps_its_kappas():
-    asked = controller()
+    mpc = controller()
     kappas = np.full(H, 3.0)
-    point = asked.control(START, Reference(FAR.states[0], np.zeros(1), kappas))
+    point = mpc.control(START, Reference(FAR.states[0], np.zeros(1), kappas))
     assert np.array_equal(
-        point.inputs, asked.control(START, replace(FAR, kappas=kappas)).inputs
+        point.inputs, mpc.control(START, replace(FAR, kappas=kappas)).inputs
     )
     with pytest.raises(ShapeError, match=r"kappas must be \(6,\); got \(2,\)"):
-        asked.control(START, Reference(FAR.states[0], np.zeros(1), kappas[:2]))
+        mpc.control(START, Reference(FAR.states[0], np.zeros(1), kappas[:2]))
 
 
 def test_a_bound_on_the_mean_stays_one():
-    asked = controller(probability=None)
-    moved = asked.control(START, replace(FAR, kappas=np.full(H, 4.0)))
-    assert np.array_equal(moved.inputs, asked.control(START, FAR).inputs)
+    mpc = controller(probability=None)
+    with_kappas = mpc.control(START, replace(FAR, kappas=np.full(H, 4.0)))
+    assert np.array_equal(with_kappas.inputs, mpc.control(START, FAR).inputs)
 
 
 def test_an_adaptive_tube_holds_where_noise_exceeds_the_model():
-    asked = controller()
+    mpc = controller()
     rng = np.random.default_rng(0)
     outside = {}
     for name in ("as learned", "adapted"):
@@ -85,12 +85,12 @@ def test_an_adaptive_tube_holds_where_noise_exceeds_the_model():
         for _ in range(250):
             adaptive.observe(x)
             kappas = adaptive.kappas if name == "adapted" else None
-            last = asked.control(Gaussian.certain(x), replace(FAR, kappas=kappas), last)
+            last = mpc.control(Gaussian.certain(x), replace(FAR, kappas=kappas), last)
             adaptive.remember(last.means, last.covariances)
-            moved = asked.prediction.model.predict(
+            next_mean = mpc.prediction.model.predict(
                 torch.from_numpy(x), torch.from_numpy(last.input)
             ).mean.numpy()
-            x = moved + 3 * STD * rng.normal(size=2)
+            x = next_mean + 3 * STD * rng.normal(size=2)
             count += x[0] > UPPER
         outside[name] = count / 250
     assert outside["as learned"] > 0.15

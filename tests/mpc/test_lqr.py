@@ -39,14 +39,14 @@ def test_without_bounds_it_is_the_optimum_of_a_linear_model(penalized, rng):
 
 def test_the_stationary_gain_solves_the_riccati_equation():
     K = dlqr(A, B, Q, R)
-    moved = A - B @ K
+    closed_loop = A - B @ K
     P = sum(
-        np.linalg.matrix_power(moved.T, i)
+        np.linalg.matrix_power(closed_loop.T, i)
         @ (Q + K.T @ R @ K)
-        @ np.linalg.matrix_power(moved, i)
+        @ np.linalg.matrix_power(closed_loop, i)
         for i in range(400)
     )
-    assert np.abs(np.linalg.eigvals(moved)).max() < 1
+    assert np.abs(np.linalg.eigvals(closed_loop)).max() < 1
     assert np.allclose(
         P,
         Q + A.T @ P @ A - A.T @ P @ B @ np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A),

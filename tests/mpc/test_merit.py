@@ -121,9 +121,9 @@ def test_violated_rows_cost_their_price_hard_ones_the_given(squares, inputs, rng
     seen = set()
     for _ in range(20):
         case = Case(rng, squares, inputs)
-        found = price_violations(case.prices, case.rows, case.plan, case.row_price)
-        assert found == pytest.approx(case.price_of(case.plan), rel=1e-12)
-        seen.add(found > 0)
+        price = price_violations(case.prices, case.rows, case.plan, case.row_price)
+        assert price == pytest.approx(case.price_of(case.plan), rel=1e-12)
+        seen.add(price > 0)
     assert True in seen
 
 
@@ -131,11 +131,11 @@ def test_violated_rows_cost_their_price_hard_ones_the_given(squares, inputs, rng
 def test_the_merit_is_cost_price_and_weighed_defects(squares, inputs, rng):
     for _ in range(10):
         case = Case(rng, squares, inputs)
-        found = _merit(case.local, case.terms, case.defect_prices)
+        merit = _merit(case.local, case.terms, case.defect_prices)
         defects = (
             np.abs(case.after - case.plan.states[1:]).sum(axis=0) @ case.defect_prices
         )
-        assert found == pytest.approx(
+        assert merit == pytest.approx(
             case.cost_of(case.plan) + case.price_of(case.plan) + defects, rel=1e-12
         )
 
@@ -145,7 +145,7 @@ def test_multipliers_of_the_dynamics_are_the_cost_of_a_push(squares, inputs, rng
     """Central differences of cost and rows, with the push passed on to all later
     states; exact for quadratics."""
     case = Case(rng, squares, inputs)
-    found = _costates(
+    multipliers = _costates(
         case.cost, case.A, case.plan, case.references.states, case.rows.E, case.z
     )
 
@@ -161,12 +161,14 @@ def test_multipliers_of_the_dynamics_are_the_cost_of_a_push(squares, inputs, rng
             values = []
             for push in (0.5, -0.5):
                 states = case.plan.states.copy()
-                moved = push * np.eye(P)[i]
+                push_of_state = push * np.eye(P)[i]
                 for j in range(k, H):
-                    states[j + 1] += moved
-                    moved = case.A[j + 1] @ moved if j + 1 < H else moved
+                    states[j + 1] += push_of_state
+                    push_of_state = (
+                        case.A[j + 1] @ push_of_state if j + 1 < H else push_of_state
+                    )
                 values.append(lagrangian(states))
-            assert found[k, i] == pytest.approx(
+            assert multipliers[k, i] == pytest.approx(
                 values[0] - values[1], rel=1e-9, abs=1e-9
             )
 

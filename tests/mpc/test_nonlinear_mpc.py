@@ -67,25 +67,25 @@ def test_the_adjoint_gradient_is_that_of_torch_and_differences(name, penalized, 
     inputs = rng.normal(size=(H, 1))
     reference = swing(H)
     last = np.array([0.3])
-    found = baseline.evaluate(inputs, request_of(problem, H))
+    evaluation = baseline.evaluate(inputs, request_of(problem, H))
 
     def by_torch(u):
-        moved = rollout(propagator, model, belief(), u)
-        error = moved.mean - torch.tensor(reference.states[1:])
+        beliefs = rollout(propagator, model, belief(), u)
+        error = beliefs.mean - torch.tensor(reference.states[1:])
         W = torch.tensor(np.array([Q] * (H - 1) + [2 * Q]))
         held = {"inputs": 0 * u, "deviations": torch.tensor(reference.inputs)}
         v = u - held.get(penalized, torch.cat([torch.tensor(last)[None], u[:-1]]))
         return (
             torch.einsum("ia,iab,ib->", error, W, error)
-            + (W * moved.covariance).sum()
+            + (W * beliefs.covariance).sum()
             + 0.2 * v.square().sum()
         )
 
     u = torch.tensor(inputs, requires_grad=True)
     expected = by_torch(u)
-    assert found.cost == pytest.approx(float(expected.detach()), rel=1e-12)
+    assert evaluation.cost == pytest.approx(float(expected.detach()), rel=1e-12)
     assert np.allclose(
-        found.gradient,
+        evaluation.gradient,
         torch.autograd.grad(expected, u)[0].ravel(),
         rtol=1e-9,
         atol=1e-10,
@@ -97,7 +97,7 @@ def test_the_adjoint_gradient_is_that_of_torch_and_differences(name, penalized, 
         for s in (step, -step)
     ]
     assert (ends[0] - ends[1]) / (2 * step) == pytest.approx(
-        float(found.gradient @ direction), rel=1e-6
+        float(evaluation.gradient @ direction), rel=1e-6
     )
 
 
@@ -255,24 +255,24 @@ def test_bounds_are_kept_and_no_feasible_perturbation_is_cheaper(name, kind, rng
     assert decision.status is Status.SOLVED
     baseline = SLSQP(model, PROPAGATORS[name], problem, H, [0.3])
     request = request_of(problem, H, at)
-    found = baseline.evaluate(decision.inputs, request)
-    assert found.margins.max() < 1e-6
+    optimum = baseline.evaluate(decision.inputs, request)
+    assert optimum.margins.max() < 1e-6
     assert np.abs(np.diff(decision.inputs[:, 0], prepend=0.3)).max() < 1.5 + 1e-7
     assert (
-        found.margins.max() > -1e-5
+        optimum.margins.max() > -1e-5
     )  # a chance constraint is active: the case is not an idle one
     assert (decision.inputs >= -3).all()
     assert (decision.inputs <= 4).all()
     tried = 0
     for scale in np.repeat([1e-3, 1e-2, 0.1], 400):
-        plan = (found.plan + scale * rng.normal(size=H)).clip(-3, 4)
+        plan = (optimum.plan + scale * rng.normal(size=H)).clip(-3, 4)
         rates = np.diff(plan, prepend=0.3)
         if np.abs(rates).max() > 1.5:
             continue
         trial = baseline.evaluate(plan, request)
         if trial.margins.max() <= 0:
             tried += 1
-            assert trial.cost > found.cost - 1e-7
+            assert trial.cost > optimum.cost - 1e-7
         if tried == 50:
             break
     assert tried == 50
@@ -328,9 +328,9 @@ def test_soft_bounds_give_way_and_their_price_is_at_its_minimum(price, rng):
     request = request_of(problem, H, at, reference=reference)
 
     def objective(plan):
-        found = hard.evaluate(plan, request)
-        over = found.margins.clip(0)
-        return found.cost + price * over.sum()
+        evaluation = hard.evaluate(plan, request)
+        over = evaluation.margins.clip(0)
+        return evaluation.cost + price * over.sum()
 
     best = objective(decision.inputs)
     for scale in np.repeat([1e-4, 1e-2], 40):

@@ -165,19 +165,19 @@ def test_models_around_gps_know_it_too(gp, mode):
 
 
 def test_novelty_of_a_plan_of_means_is_computed_when_read(gp, monkeypatch):
-    asked = []
+    requests = []
     linearize = GPPosterior.linearize
 
     def counted(self, states, inputs, covariance=True):
-        asked.append(covariance)
+        requests.append(covariance)
         return linearize(self, states, inputs, covariance)
 
     monkeypatch.setattr(GPPosterior, "linearize", counted)
     decision = decide(controller(gp, "none"), 0.2)
     copied = replace(decision, suboptimal=True)
-    assert not any(asked)
+    assert not any(requests)
     known = decision.novelty
-    assert sum(asked) == 1
+    assert sum(requests) == 1
     assert decision.novelty == known == decision.plan_novelty
     assert copied.novelty == known
 

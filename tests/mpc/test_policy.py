@@ -136,9 +136,9 @@ def test_before_the_first_plan_the_reference_input_is_applied():
     reference = Reference(np.zeros((5, 1)), np.full((4, 1), 5.0))
     commands = run(planner, 3, "previous_plan", [LOST, LOST, STATE], reference)
     assert [c.input[0] for c in commands] == [2, 2, 0]
-    told = planner.previous[0]
-    assert told.input[0] == 2
-    assert not told.status.solved
+    handed_on = planner.previous[0]
+    assert handed_on.input[0] == 2
+    assert not handed_on.status.solved
 
 
 @pytest.mark.parametrize("on_failure", ["previous_plan", "hold"])

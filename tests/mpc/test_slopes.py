@@ -54,16 +54,16 @@ def by_differences(gp, along, by_input, width=1e-4):
 def test_the_covariance_of_slopes_is_that_of_differences(gp):
     covariances = slope_covariances(gp, STATE, INPUT)
     direction = np.concatenate([ALONG, BY_INPUT])
-    found = direction @ covariances @ direction
-    assert found == pytest.approx(by_differences(gp, ALONG, BY_INPUT), rel=1e-4)
+    variance = direction @ covariances @ direction
+    assert variance == pytest.approx(by_differences(gp, ALONG, BY_INPUT), rel=1e-4)
 
 
 def test_models_around_a_gp_are_looked_through(gp):
     late = DelayedModel(gp, 1)  # its input acts a step later
-    found = slope_covariances(late, np.append(STATE, INPUT), np.zeros(1))
-    assert found[:2, :3, :3] == pytest.approx(slope_covariances(gp, STATE, INPUT))
-    assert not found[2].any()
-    assert not found[:, 3].any()
+    covariances = slope_covariances(late, np.append(STATE, INPUT), np.zeros(1))
+    assert covariances[:2, :3, :3] == pytest.approx(slope_covariances(gp, STATE, INPUT))
+    assert not covariances[2].any()
+    assert not covariances[:, 3].any()
     known = KnownModel(Affine.identity(2, 1), 2, 1)
     assert not slope_covariances(known, STATE, INPUT).any()
 
@@ -79,14 +79,14 @@ def test_an_angle_is_seen_through_its_sine_and_cosine():
         angles=[0],
         trainer=Trainer(restarts=0),
     )
-    found = slope_covariances(model, STATE, INPUT)
+    covariances = slope_covariances(model, STATE, INPUT)
     sine = np.sin(STATE[0])
     cosine = np.cos(STATE[0])
     direct = slope_covariances(
         model.residual, np.array([sine, cosine, STATE[1]]), INPUT
     )
     seen = np.array([[cosine, 0, 0], [-sine, 0, 0], [0, 1, 0], [0, 0, 1]])
-    assert found == pytest.approx(seen.T @ direct @ seen)
+    assert covariances == pytest.approx(seen.T @ direct @ seen)
 
 
 class Pendulum:

@@ -195,10 +195,10 @@ def test_angles_are_steered_the_short_way_and_others_unchanged():
     assert np.array_equal(
         plain.control(near, goal).inputs, turning.control(near, goal).inputs
     )
-    moved = Gaussian.certain(
+    wrapped = Gaussian.certain(
         short.means[1] - [2 * np.pi, 0.0]
     )  # the sensor takes the turn off
-    again = turning.control(moved, goal, short)
+    again = turning.control(wrapped, goal, short)
     assert np.allclose(again.inputs[:-1], short.inputs[1:], atol=5e-2)
 
 

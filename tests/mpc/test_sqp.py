@@ -236,12 +236,12 @@ def test_compiled_and_torch_and_another_solver_iterate_alike(
         HOVER,
         PredictionSettings(covariance=covariance),
     )
-    told = (
+    reported = (
         {} if "constraints" in limits else {"solver": Other()}
     )  # prices need our own solver
     ours, other = (
         GPMPC(*arguments, **solver, iterations=60, tolerance=1e-7)
-        for solver in ({}, told)
+        for solver in ({}, reported)
     )
     random = np.random.default_rng(2)
     last = None
@@ -411,19 +411,21 @@ def test_the_first_step_of_a_warm_start_needs_no_roll_out(quadrotor, monkeypatch
 
     monkeypatch.setattr(_sqp, "roll_out", counted_roll_out)
     reference = Reference(np.tile([0.5, 0.0] * 3, (11, 1)))
-    moved = Gaussian.certain(np.array([-0.3, 0.2] * 3))
+    pushed = Gaussian.certain(np.array([-0.3, 0.2] * 3))
     last = controller.control(Gaussian.certain(np.zeros(6)), reference)
     assert rolled
     rolled.clear()
     near = Gaussian.certain(last.means[1] + 1e-3)
     assert controller.control(near, reference, last).status is Status.SOLVED
     assert not rolled
-    warm = controller.control(moved, reference, last)
+    warm = controller.control(pushed, reference, last)
     rolled.clear()
-    given = controller.control(moved, reference, last, plan=(last.inputs, last.means))
+    from_plan = controller.control(
+        pushed, reference, last, plan=(last.inputs, last.means)
+    )
     assert rolled
-    assert (last.status, warm.status, given.status) == (Status.SOLVED,) * 3
-    assert np.allclose(warm.inputs, given.inputs, atol=1e-4)
+    assert (last.status, warm.status, from_plan.status) == (Status.SOLVED,) * 3
+    assert np.allclose(warm.inputs, from_plan.inputs, atol=1e-4)
 
 
 def test_a_guess_rests_at_the_state_where_its_inputs_overflow():

@@ -94,8 +94,8 @@ def steps_from(controller, reference, state, plan, count):
     for _ in range(count):
         plan = controller.control(Gaussian.certain(state), reference, plan)
         model = controller.prediction.model
-        moved = linearize(model, state[None], plan.input[None], covariance=False)
-        state = moved.mean[0]
+        next_states = linearize(model, state[None], plan.input[None], covariance=False)
+        state = next_states.mean[0]
         states.append(state)
     return np.array(states), plan
 
@@ -115,14 +115,14 @@ def test_the_linear_loop_is_the_controller_near_its_rest(changes):
         steps_from(controller, reference, state, plan, 5)[0]
         for state in (rest, rest + apart)
     ]
-    moved = np.zeros(len(loop))
-    moved[: len(rest)] = apart
+    deviation = np.zeros(len(loop))
+    deviation[: len(rest)] = apart
     # the inputs on their way stand there twice: as the plant's states, and as told
-    moved[len(rest) : len(rest) + further] = apart[4:]
+    deviation[len(rest) : len(rest) + further] = apart[4:]
     expected = []
     for _ in range(5):
-        moved = loop @ moved
-        expected.append(moved[: len(rest)])
+        deviation = loop @ deviation
+        expected.append(deviation[: len(rest)])
     error = np.abs(flights[1] - flights[0] - np.array(expected)).max()
     assert error < 5e-3 * np.abs(flights[1] - flights[0]).max()
 
@@ -197,8 +197,8 @@ def test_plants_settle_exactly_within_the_range_of_gains():
         (high + 0.01, False),
     ):
         plant = DelayedModel(linear([[1.0]], [[0.1 * gain]]), LATE)
-        told = controller.stability(np.zeros(1 + LATE), plant=plant)
-        assert told.stable == settles
+        stability = controller.stability(np.zeros(1 + LATE), plant=plant)
+        assert stability.stable == settles
 
 
 @pytest.mark.parametrize("delay", [1.0, 1.6, 3.0])
@@ -214,9 +214,9 @@ def test_a_delay_that_is_bridged_and_one_that_is_ignored(delay):
         controller.stability(goal).spectral_radius, abs=1e-6
     )
     ignorant = loop_of(INTEGRATOR, Tracking([1.0], [1e-3]), 20, [0.0])
-    told = ignorant.stability([0.0], plant=late)
-    assert told.spectral_radius > bridged.spectral_radius + 0.1
-    assert told.stable == (delay < 1.5)
+    stability = ignorant.stability([0.0], plant=late)
+    assert stability.spectral_radius > bridged.spectral_radius + 0.1
+    assert stability.stable == (delay < 1.5)
 
 
 def test_what_nothing_weighs_may_stand_still():

@@ -97,11 +97,11 @@ def test_a_model_may_give_views_and_other_types():
     expected = StageLinearizer(model, Linearization(), "zero_order")(
         states, inputs, covariances
     )
-    found = StageLinearizer(Views(), Linearization(), "zero_order")(
+    stages = StageLinearizer(Views(), Linearization(), "zero_order")(
         states, inputs, covariances
     )
     for mine, theirs in zip(
-        found, expected._replace(V=np.tile(np.eye(2) + noise, (5, 1, 1))), strict=True
+        stages, expected._replace(V=np.tile(np.eye(2) + noise, (5, 1, 1))), strict=True
     ):
         assert mine.flags.c_contiguous
         assert mine.dtype == float
@@ -222,8 +222,8 @@ def test_a_disturbance_moves_the_mean_and_nothing_else(mode):
     _, before = stage_at(mode, propagator, model, belief, input)
     _, after = stage_at(mode, propagator, model, belief, input, pushed)
     for name in ("c", "next"):
-        moved = getattr(after, name) - getattr(before, name)
-        assert np.allclose(moved[:2], pushed, atol=1e-15)
-        assert np.allclose(moved[2:], 0.0, atol=1e-15)
+        difference = getattr(after, name) - getattr(before, name)
+        assert np.allclose(difference[:2], pushed, atol=1e-15)
+        assert np.allclose(difference[2:], 0.0, atol=1e-15)
     assert np.array_equal(after.A, before.A)
     assert np.array_equal(after.V, before.V)

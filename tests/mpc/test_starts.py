@@ -238,10 +238,10 @@ def test_the_search_is_never_worse_than_any_of_its_starts():
     reference = Reference(np.zeros(2))
     state = Gaussian.certain(np.array([2.5, 3.0]))
     many = pendulums(turns=3)
-    found = many.control(state, reference)
+    decision = many.control(state, reference)
     goals = [2 * np.pi * turn for turn in (-1, 0, 1, 2)]
-    nearest = min(goals, key=lambda goal: abs(goal - found.means[-1, 0]))
-    best = many.criterion(found, Reference(np.tile([nearest, 0.0], (31, 1))))
+    nearest = min(goals, key=lambda goal: abs(goal - decision.means[-1, 0]))
+    best = many.criterion(decision, Reference(np.tile([nearest, 0.0], (31, 1))))
     for guess in many.guesses:
         one = pendulums(turns=1, guesses=[guess])
         alone = one.control(state, reference)
@@ -255,14 +255,17 @@ def test_the_search_is_never_worse_than_any_of_its_starts():
 
 def test_a_plan_obeys_the_dynamics_and_may_end_a_turn_away():
     system = pendulum()
-    found = pendulums().control(
+    decision = pendulums().control(
         Gaussian.certain(np.array([5.5, 2.0])), Reference(np.zeros(2))
     )
-    for k, u in enumerate(found.inputs):
+    for k, u in enumerate(decision.inputs):
         assert np.allclose(
-            found.means[k + 1], step(system, found.means[k], u), rtol=1e-7, atol=1e-9
+            decision.means[k + 1],
+            step(system, decision.means[k], u),
+            rtol=1e-7,
+            atol=1e-9,
         )
-    assert found.means[-1, 0] == pytest.approx(2 * np.pi, abs=0.3)
+    assert decision.means[-1, 0] == pytest.approx(2 * np.pi, abs=0.3)
 
 
 def test_a_sensor_that_takes_a_turn_off_changes_nothing():
@@ -286,8 +289,8 @@ def test_the_users_criterion_chooses_until_the_budget_is_spent():
         seen.append(goal.states[-1, 0])
         return abs(decision.means[-1, 0] - 2 * np.pi)
 
-    found = pendulums(criterion=to_the_right).control(state, reference)
-    assert found.means[-1, 0] > np.pi
+    chosen = pendulums(criterion=to_the_right).control(state, reference)
+    assert chosen.means[-1, 0] > np.pi
     assert len(seen) > 4
     assert {0.0, 6.283185} == set(np.round(seen, 6).tolist())
     seen.clear()
@@ -316,9 +319,9 @@ def test_a_spent_budget_leaves_the_controllers_own_plan():
     system = pendulum()
     many = pendulums(budget=1e-9)
     state = Gaussian.certain(np.array(system.start))
-    found = many.control(state, Reference(np.zeros(2)))
+    decision = many.control(state, Reference(np.zeros(2)))
     alone = many.controller.control(state, Reference(np.zeros(2)))
-    assert np.allclose(found.input, alone.input)
+    assert np.allclose(decision.input, alone.input)
     states, _ = fly(many, system, 80)
     assert off_upright(states[-15:], 0).max() < 0.2
 
@@ -365,8 +368,8 @@ def test_goals_are_the_nearest_turns_of_the_references_end():
     goals = list(many.starts.goals(state, reference))
     assert len(goals) == 6
     for goal, turns in zip(goals, expected, strict=True):
-        moved = 2 * np.pi * np.array([turns[0], 0, turns[1], 0])
-        assert np.allclose(goal.states, reference.states + moved, atol=1e-12)
+        full_turns = 2 * np.pi * np.array([turns[0], 0, turns[1], 0])
+        assert np.allclose(goal.states, reference.states + full_turns, atol=1e-12)
 
 
 def test_a_guess_is_a_line_to_the_goal_or_a_roll_out():
@@ -380,24 +383,27 @@ def test_a_guess_is_a_line_to_the_goal_or_a_roll_out():
     )
     state = np.array([0.3, -0.2])
     targets = np.stack([np.linspace(0.0, 1.0, 5), np.ones(5)], axis=1)
-    found = list(many.starts.of(state, Reference(targets)))
-    assert len(found) == 6  # guess by guess, two goals each
-    for goal, given, states in found[:2]:
+    starts = list(many.starts.of(state, Reference(targets)))
+    assert len(starts) == 6  # guess by guess, two goals each
+    for goal, start_inputs, states in starts[:2]:
         assert np.allclose(states[0], state)
         assert np.allclose(states[-1], goal.states[-1])
         for k in range(H + 1):
             assert np.allclose(
                 states[k], goal.states[k] + (1 - k / H) * (state - goal.states[0])
             )
-        assert np.array_equal(given, np.tile(system.initial_input, (H, 1)))
-    for _, given, states in found[2:4]:
-        assert given is inputs
+        assert np.array_equal(start_inputs, np.tile(system.initial_input, (H, 1)))
+    for _, start_inputs, states in starts[2:4]:
+        assert start_inputs is inputs
         for k in range(H):
             assert np.allclose(
-                states[k + 1], step(system, states[k], given[k]), rtol=1e-7, atol=1e-9
+                states[k + 1],
+                step(system, states[k], start_inputs[k]),
+                rtol=1e-7,
+                atol=1e-9,
             )
         assert np.array_equal(states[0], state)
-    for _, _, states in found[4:]:  # which leads nowhere
+    for _, _, states in starts[4:]:  # which leads nowhere
         assert np.array_equal(states, np.tile(state, (H + 1, 1)))
 
 
@@ -437,10 +443,12 @@ def test_kicks_push_every_input_to_both_sides_within_its_bounds():
         Tracking([1.0], [1.0, 1.0], penalized="inputs"),
         inputs=Box([0.0, -1.0], [2.0, np.inf]),
     )
-    found = kicks(problem, 12, np.array([0.5, 0.0]))
-    assert [inputs[0, 0] for inputs in found] == [0.5, 1.25, 0.25]
-    assert all((inputs[:, 0] >= 0).all() and not inputs[:, 1].any() for inputs in found)
-    assert [inputs[:6, 0].tolist() for inputs in found[1:]] == [
+    guesses = kicks(problem, 12, np.array([0.5, 0.0]))
+    assert [inputs[0, 0] for inputs in guesses] == [0.5, 1.25, 0.25]
+    assert all(
+        (inputs[:, 0] >= 0).all() and not inputs[:, 1].any() for inputs in guesses
+    )
+    assert [inputs[:6, 0].tolist() for inputs in guesses[1:]] == [
         [1.25, 1.25, 0.25, 0.25, 0.5, 0.5],
         [0.25, 0.25, 1.25, 1.25, 0.5, 0.5],
     ]
@@ -473,15 +481,15 @@ def test_wild_starts_of_a_double_pendulum_break_no_solve(starts):
             for goal, *guess in list(
                 many.starts.of(state, Reference(np.zeros(4)).over(60))
             )[:: 1 if starts > 3 else 5]:
-                found = one.control(Gaussian.certain(state), goal, plan=tuple(guess))
+                decision = one.control(Gaussian.certain(state), goal, plan=tuple(guess))
                 count += 1
                 assert (
-                    found.status in (Status.SOLVED, Status.ITERATION_LIMIT)
-                    or found.suboptimal
-                ), found.status
-                assert np.isfinite(found.inputs).all()
-                assert np.isfinite(found.means).all()
-                assert np.abs(found.inputs).max() <= 6.0 + 1e-9
+                    decision.status in (Status.SOLVED, Status.ITERATION_LIMIT)
+                    or decision.suboptimal
+                ), decision.status
+                assert np.isfinite(decision.inputs).all()
+                assert np.isfinite(decision.means).all()
+                assert np.abs(decision.inputs).max() <= 6.0 + 1e-9
     assert count == (960 if starts > 3 else 30)
 
 

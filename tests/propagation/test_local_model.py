@@ -25,8 +25,8 @@ def F(propagator, model, s, u):
     """The next extended state, by the propagator's beliefs alone."""
     n = model.state_dim
     S = s[n:].unflatten(0, (n, n))
-    moved = propagator(model, Gaussian(s[:n], S @ S.T), u)
-    return torch.cat([moved.mean, square_root(moved.covariance).flatten()])
+    next_belief = propagator(model, Gaussian(s[:n], S @ S.T), u)
+    return torch.cat([next_belief.mean, square_root(next_belief.covariance).flatten()])
 
 
 @pytest.mark.parametrize("make", MODELS.values(), ids=MODELS.keys())

@@ -189,22 +189,24 @@ def test_the_moments_agree_with_monte_carlo(n, m, predicts):
     root = torch.linalg.cholesky(at.covariance)
     generator = torch.Generator().manual_seed(7)
     states = []
-    moved = []
+    samples_after = []
     for _ in range(samples // chunk):
         x = at.mean + torch.randn(chunk, n, generator=generator) @ root.T
         prediction = gp.predict(x, control.expand(chunk, m))
         states.append(x)
-        moved.append(
+        samples_after.append(
             prediction.mean
             + prediction.variance.sqrt() * torch.randn(chunk, n, generator=generator)
         )
     states = torch.cat(states)
-    moved = torch.cat(moved)
+    samples_after = torch.cat(samples_after)
     exact = MomentMatching(process_noise=False).propagate(gp, at, control)
     assert float(exact.deficit) == 0
 
-    z_mean = (moved.mean(0) - exact.belief.mean) / (moved.std(0) / samples**0.5)
-    centred = moved - exact.belief.mean
+    z_mean = (samples_after.mean(0) - exact.belief.mean) / (
+        samples_after.std(0) / samples**0.5
+    )
+    centred = samples_after - exact.belief.mean
     products = centred[:, :, None] * centred[:, None, :]
     z_covariance = (products.mean(0) - exact.belief.covariance) / (
         products.std(0) / samples**0.5

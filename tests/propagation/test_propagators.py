@@ -306,8 +306,10 @@ class TestBadInput:
 
     def test_singular_covariances_and_negative_round_off_are_taken(self, name):
         for S in (torch.ones(2, 2), torch.diag(torch.tensor([1.0, -1e-15]))):
-            moved = ALL[name]()(gp(), Gaussian(torch.zeros(2), 0.1 * S), torch.zeros(1))
-            assert torch.isfinite(moved.covariance).all()
+            next_belief = ALL[name]()(
+                gp(), Gaussian(torch.zeros(2), 0.1 * S), torch.zeros(1)
+            )
+            assert torch.isfinite(next_belief.covariance).all()
 
     def test_a_belief_in_another_precision_than_the_model(self, name):
         at = belief()
@@ -330,10 +332,10 @@ class TestBadInput:
             "belief: mean and covariance must have the same dtype and device",
             at=mixed,
         )
-        moved = ALL[name]()(
+        next_belief = ALL[name]()(
             gp().to(dtype=torch.float32), single, torch.zeros(1, dtype=torch.float32)
         )
-        assert moved.covariance.dtype == torch.float32
+        assert next_belief.covariance.dtype == torch.float32
 
 
 def test_settings_out_of_range_are_refused():
@@ -362,17 +364,19 @@ def test_monte_carlo_gives_the_sample_moments_of_its_draws(samples):
     model = gp()
     at = belief()
     u = torch.tensor([0.3])
-    found = MonteCarlo(samples, 4, process_noise=False).propagate(model, at, u)
+    propagation = MonteCarlo(samples, 4, process_noise=False).propagate(model, at, u)
     steps = torch.from_numpy(
         np.random.default_rng(4).standard_normal((samples, 2))
     ) @ square_root(at.covariance)
-    moved = model.predict(at.mean + steps, u.expand(samples, 1))
-    both = torch.cov(torch.cat([steps, moved.mean], dim=1).mT)
-    assert torch.allclose(found.belief.mean, moved.mean.mean(0), rtol=1e-12)
+    predictions = model.predict(at.mean + steps, u.expand(samples, 1))
+    both = torch.cov(torch.cat([steps, predictions.mean], dim=1).mT)
+    assert torch.allclose(propagation.belief.mean, predictions.mean.mean(0), rtol=1e-12)
     assert torch.allclose(
-        found.belief.covariance,
-        both[2:, 2:] + moved.covariance.mean(0),
+        propagation.belief.covariance,
+        both[2:, 2:] + predictions.covariance.mean(0),
         rtol=1e-10,
         atol=1e-14,
     )
-    assert torch.allclose(found.cross_covariance, both[:2, 2:], rtol=1e-10, atol=1e-14)
+    assert torch.allclose(
+        propagation.cross_covariance, both[:2, 2:], rtol=1e-10, atol=1e-14
+    )

@@ -81,7 +81,7 @@ def test_closed_forms_are_autograds_derivatives(propagator, name, batch, choice)
     )
     control = draw(*batch, gp.input_dim)
     with backend(choice):
-        moved, closed_form = differentiate(propagator, gp, at, control)
+        propagation, closed_form = differentiate(propagator, gp, at, control)
     with backend("torch"):
         expected, automatic = by_autograd(propagator, gp, at, control)
     pairs = [
@@ -89,10 +89,10 @@ def test_closed_forms_are_autograds_derivatives(propagator, name, batch, choice)
         for part in vars(automatic)
     ]
     pairs += [
-        (moved.belief.mean, expected.belief.mean),
-        (moved.belief.covariance, expected.belief.covariance),
-        (moved.cross_covariance, expected.cross_covariance),
-        (moved.deficit, expected.deficit),
+        (propagation.belief.mean, expected.belief.mean),
+        (propagation.belief.covariance, expected.belief.covariance),
+        (propagation.cross_covariance, expected.cross_covariance),
+        (propagation.deficit, expected.deficit),
     ]
     for mine, other in pairs:
         assert mine.shape == other.shape
@@ -218,7 +218,7 @@ def test_any_number_of_outputs_has_derivatives(propagator, n, k):
     gp = value_model(n, 1, k)
     at = belief(n)
     control = draw(1)
-    found, d = differentiate(propagator, gp, at, control)
+    propagation, d = differentiate(propagator, gp, at, control)
     step = 1e-6
     for c in range(n):
         shift = step * torch.eye(n)[c]
@@ -235,7 +235,7 @@ def test_any_number_of_outputs_has_derivatives(propagator, n, k):
             atol=1e-7,
         )
     assert d.covariance_by_covariance.shape == (k, k, n, n)
-    assert found.cross_covariance.shape == (n, k)
+    assert propagation.cross_covariance.shape == (n, k)
     with pytest.raises(ShapeError, match=f"got {n} states, {k} outputs"):
         linearize(propagator, gp, at, control)
 

@@ -35,14 +35,14 @@ def test_with_beta_two_a_quadratic_is_exact_for_any_alpha(alpha, curvature):
     1/2 h^2 s^2 about zero."""
     model = Quadratic(torch.tensor([0.7]), torch.tensor([[curvature]]))
     s = 0.4
-    moved = Unscented(alpha, beta=2.0).propagate(
+    propagation = Unscented(alpha, beta=2.0).propagate(
         model, Gaussian(torch.zeros(1), torch.tensor([[s]]))
     )
-    assert float(moved.belief.mean) == pytest.approx(curvature * s / 2, rel=1e-9)
-    assert float(moved.belief.covariance) == pytest.approx(
+    assert float(propagation.belief.mean) == pytest.approx(curvature * s / 2, rel=1e-9)
+    assert float(propagation.belief.covariance) == pytest.approx(
         0.49 * s + curvature**2 * s**2 / 2, rel=1e-9
     )
-    assert float(moved.cross_covariance) == pytest.approx(0.7 * s, rel=1e-9)
+    assert float(propagation.cross_covariance) == pytest.approx(0.7 * s, rel=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -60,19 +60,23 @@ def test_moments_of_a_quadratic_are_those_worked_out_by_hand(alpha, beta, kappa)
     H = root + root.T
     root = root @ root.T / 4  # symmetric, and so the root of its square
     S = root @ root
-    moved = Unscented(alpha, beta, kappa).propagate(
+    propagation = Unscented(alpha, beta, kappa).propagate(
         Quadratic(g, H), Gaussian(torch.zeros(3), S)
     )
     d = torch.stack([r @ H @ r for r in root]) / 2
-    assert float(moved.belief.mean) == pytest.approx(float((H * S).sum() / 2), rel=1e-9)
+    assert float(propagation.belief.mean) == pytest.approx(
+        float((H * S).sum() / 2), rel=1e-9
+    )
     variance = (
         g @ S @ g + alpha**2 * (3 + kappa) * d @ d + (beta - alpha**2) * d.sum() ** 2
     )
-    assert float(moved.belief.covariance) == pytest.approx(
+    assert float(propagation.belief.covariance) == pytest.approx(
         max(0.0, float(variance)), rel=1e-8
     )
-    assert float(moved.deficit) == pytest.approx(max(0.0, -float(variance)), rel=1e-8)
-    assert torch.allclose(moved.cross_covariance[:, 0], S @ g, rtol=1e-9)
+    assert float(propagation.deficit) == pytest.approx(
+        max(0.0, -float(variance)), rel=1e-8
+    )
+    assert torch.allclose(propagation.cross_covariance[:, 0], S @ g, rtol=1e-9)
 
 
 @pytest.mark.parametrize("setting", ["alpha", "beta", "kappa"])

@@ -38,14 +38,14 @@ def test_an_odd_array_is_read_as_what_it_is(odd, position, rng):
         if position >= 3:
             arrays[3] = np.full(15, -3.0)
             arrays[4] = np.full(15, 4.0)
-    given = list(arrays)
-    given[position] = odd(arrays[position])
+    odd_arrays = list(arrays)
+    odd_arrays[position] = odd(arrays[position])
     expected = solve_stacked(*arrays)
-    solutions = [solve_stacked(*given), solve_stacked(*given, expected)]
-    prepared = DualActiveSet().prepare(given[0], given[2])
+    solutions = [solve_stacked(*odd_arrays), solve_stacked(*odd_arrays, expected)]
+    prepared = DualActiveSet().prepare(odd_arrays[0], odd_arrays[2])
     solutions += [
-        prepared.solve(given[1], *given[3:]),
-        prepared.solve(given[1], *given[3:], expected),
+        prepared.solve(odd_arrays[1], *odd_arrays[3:]),
+        prepared.solve(odd_arrays[1], *odd_arrays[3:], expected),
     ]
     for solution in solutions:
         assert solution.status is expected.status

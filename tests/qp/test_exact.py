@@ -237,9 +237,9 @@ def test_residuals_are_the_same_in_all_units(scale, rng):
         np.append(problem.lb, scale * problem.h_lower),
         np.append(problem.ub, scale * problem.h_upper),
     )
-    moved = solution.x * 1.01
+    off_optimum = solution.x * 1.01
     multipliers = solution.multipliers * 0.9
-    before = make_solution(problem, Status.SOLVED, moved, multipliers).residuals()
-    multipliers[: len(moved)] *= scale
-    after = make_solution(scaled, Status.SOLVED, moved, multipliers).residuals()
+    before = make_solution(problem, Status.SOLVED, off_optimum, multipliers).residuals()
+    multipliers[: len(off_optimum)] *= scale
+    after = make_solution(scaled, Status.SOLVED, off_optimum, multipliers).residuals()
     np.testing.assert_allclose(after, before, rtol=1e-6, atol=1e-14)

@@ -133,22 +133,27 @@ def test_objective_and_violations_are_those_of_their_definition(soft, rng):
 
 def test_a_solution_from_parts_holds_each_of_them(rng):
     program = QuadraticProgram(np.eye(2), [1.0, 2.0], [[1.0, 1.0]], [-1.0], [1.0])
-    given = {"iterations": 7, "build_seconds": 0.25, "solve_seconds": 0.5}
-    made = make_solution(
-        program, Status.TIME_LIMIT, [3.0, 4.0], [0.0, -5.0, 6.0], **given
+    effort = {"iterations": 7, "build_seconds": 0.25, "solve_seconds": 0.5}
+    solution = make_solution(
+        program, Status.TIME_LIMIT, [3.0, 4.0], [0.0, -5.0, 6.0], **effort
     )
-    assert (made.status, made.iterations, made.build_seconds, made.solve_seconds) == (
+    assert (
+        solution.status,
+        solution.iterations,
+        solution.build_seconds,
+        solution.solve_seconds,
+    ) == (
         Status.TIME_LIMIT,
         7,
         0.25,
         0.5,
     )
-    assert (made.x.tolist(), made.z_box.tolist(), made.z.tolist()) == (
+    assert (solution.x.tolist(), solution.z_box.tolist(), solution.z.tolist()) == (
         [3.0, 4.0],
         [0.0, -5.0],
         [6.0],
     )
-    assert made.active_set.tolist() == [0, -1, 1]
+    assert solution.active_set.tolist() == [0, -1, 1]
     other = make_solution(
         program, Status.SOLVED, [0.0, 0.0], np.zeros(3), active_set=[1, 0, -1]
     )

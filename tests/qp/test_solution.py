@@ -35,10 +35,10 @@ def test_a_solution_parts_are_those_of_the_stacked_problem(solved):
 def test_residuals_see_a_moved_point_and_changed_multipliers(solved, rng, sign):
     problem, solution = solved
     assert solution.is_optimal(1e-9)
-    moved = make_solution(
+    off_optimum = make_solution(
         problem, Status.SOLVED, solution.x + sign * 1e-3, solution.multipliers
     )
-    assert not moved.is_optimal(1e-6)
+    assert not off_optimum.is_optimal(1e-6)
     working = np.flatnonzero(solution.multipliers)[0]
     changed = solution.multipliers.copy()
     changed[working] += sign * 1e-2

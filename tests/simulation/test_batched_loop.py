@@ -68,17 +68,17 @@ def controller(
     )
 
 
-def fly(asked, seeds=4, plant=QUADROTOR, initial=START, **settings):
+def fly(mpc, seeds=4, plant=QUADROTOR, initial=START, **settings):
     return closed_loops(
-        plant, asked, REFERENCES, initial, STEPS, seeds, **({"noise": NOISE} | settings)
+        plant, mpc, REFERENCES, initial, STEPS, seeds, **({"noise": NOISE} | settings)
     )
 
 
-def alone(asked, seed, plant=QUADROTOR, initial=START, **settings):
+def alone(mpc, seed, plant=QUADROTOR, initial=START, **settings):
     settings.pop("chunk", None)
     return closed_loop(
         plant,
-        asked,
+        mpc,
         REFERENCES,
         initial,
         STEPS,
@@ -115,20 +115,18 @@ def assert_same(ours, theirs, tolerance=1e-9):
 def test_a_trial_gives_the_same_numbers_in_a_crowd_and_alone(
     covariance, propagator, choice
 ):
-    asked = controller(covariance, propagator)
+    mpc = controller(covariance, propagator)
     with backend(choice):
-        for trial in fly(asked):
+        for trial in fly(mpc):
             assert trial.error is None
-            assert_same(trial.result, alone(asked, trial.seed))
+            assert_same(trial.result, alone(mpc, trial.seed))
 
 
 @pytest.mark.parametrize("chunk", [1, 2, 50])
 def test_the_size_of_a_chunk_changes_no_number(chunk):
-    asked = controller("full", MomentMatching())
+    mpc = controller("full", MomentMatching())
     seeds = [7, 0, 3, 12, 5]
-    for ours, theirs in zip(
-        fly(asked, seeds, chunk=chunk), fly(asked, seeds), strict=True
-    ):
+    for ours, theirs in zip(fly(mpc, seeds, chunk=chunk), fly(mpc, seeds), strict=True):
         assert ours.seed == theirs.seed
         assert_same(ours.result, theirs.result)
 
@@ -145,9 +143,9 @@ def test_starts_are_drawn_and_winds_blow_as_alone():
         "initial": initial,
         "disturbances": [Gust({"vx": 0.3}, start=1.0, stop=2.0)],
     }
-    asked = controller()
-    for trial in fly(asked, **settings):
-        assert_same(trial.result, alone(asked, trial.seed, **settings))
+    mpc = controller()
+    for trial in fly(mpc, **settings):
+        assert_same(trial.result, alone(mpc, trial.seed, **settings))
 
 
 # Drawn from here, some trials start where no input keeps the bounds.
@@ -156,11 +154,11 @@ SPREAD = {"initial": Gaussian(torch.tensor(START), 0.01 * torch.eye(6))}
 
 @pytest.mark.parametrize("policy", ["previous_plan", "hold"])
 def test_failures_are_bridged_and_counted_as_alone(policy):
-    asked = controller(bound=0.5)
+    mpc = controller(bound=0.5)
     settings = SPREAD | {"on_failure": policy, "disturbances": [Dropout(2.0, 2.5)]}
-    flown = fly(asked, 6, **settings)
+    flown = fly(mpc, 6, **settings)
     for trial in flown:
-        assert_same(trial.result, alone(asked, trial.seed, **settings))
+        assert_same(trial.result, alone(mpc, trial.seed, **settings))
         assert (4, Status.INVALID_MEASUREMENT) in trial.result.failures
     infeasible = {
         sum(status is Status.INFEASIBLE for status in trial.result.statuses)
@@ -190,9 +188,9 @@ def assert_each_ends_as_alone(flown, fly_alone):
 
 
 def test_a_trial_that_fails_stops_no_other():
-    asked = controller(bound=0.5)
+    mpc = controller(bound=0.5)
     assert_each_ends_as_alone(
-        fly(asked, 8, **SPREAD), lambda seed: alone(asked, seed, **SPREAD)
+        fly(mpc, 8, **SPREAD), lambda seed: alone(mpc, seed, **SPREAD)
     )
 
 
@@ -222,10 +220,10 @@ class Proportional:
 def test_many_fly_one_by_one_and_divergence_is_one_trials_own():
     plant = System(Explosive(), time_step=0.5)
     initial = Gaussian(torch.zeros(1), 4 * torch.eye(1))
-    asked = (plant, Proportional(), np.zeros((20, 1)), initial, 15)
-    flown = closed_loops(*asked, 12)
+    scenario = (plant, Proportional(), np.zeros((20, 1)), initial, 15)
+    flown = closed_loops(*scenario, 12)
     assert any("Diverged: step" in trial.error for trial in flown if trial.error)
-    assert_each_ends_as_alone(flown, lambda seed: closed_loop(*asked, seed=seed))
+    assert_each_ends_as_alone(flown, lambda seed: closed_loop(*scenario, seed=seed))
 
 
 @pytest.mark.parametrize(

@@ -66,9 +66,12 @@ def test_each_loop_is_told_to_a_recorder_at_its_own_rate():
         noise=NOISE,
         on_step=lambda loop, step: steps[loop].append(step),
     )
-    for told, loop in ((steps["outer"], flight.outer), (steps["inner"], flight.inner)):
-        assert [step.k for step in told] == list(range(len(loop.inputs)))
-        assert [step.time for step in told] == pytest.approx(
+    for reported, loop in (
+        (steps["outer"], flight.outer),
+        (steps["inner"], flight.inner),
+    ):
+        assert [step.k for step in reported] == list(range(len(loop.inputs)))
+        assert [step.time for step in reported] == pytest.approx(
             loop.time_step * np.arange(len(loop.inputs))
         )
         for name, expected in (
@@ -76,14 +79,15 @@ def test_each_loop_is_told_to_a_recorder_at_its_own_rate():
             ("measured", loop.measured),
             ("input", loop.inputs),
         ):
-            assert np.array_equal([getattr(step, name) for step in told], expected)
+            assert np.array_equal([getattr(step, name) for step in reported], expected)
         assert np.array_equal(
-            [step.reference for step in told], loop.references[: len(told)]
+            [step.reference for step in reported], loop.references[: len(reported)]
         )
         expected = [
-            step.measured - before.decision.means[1] for before, step in pairwise(told)
+            step.measured - before.decision.means[1]
+            for before, step in pairwise(reported)
         ]
-        assert np.array_equal([step.innovation for step in told[1:]], expected)
+        assert np.array_equal([step.innovation for step in reported[1:]], expected)
 
 
 def thrust_direction(roll, pitch, yaw):
@@ -154,19 +158,19 @@ def test_without_any_measurement_for_a_moment_both_plans_go_on():
 
 
 def test_a_seed_repeats_a_flight_and_inner_steps_are_reported():
-    told = []
+    reported = []
     first = fly(
         Elliptical(),
         2,
         noise=NOISE,
         seed=1,
-        on_step=lambda *step: told.append(step),
+        on_step=lambda *step: reported.append(step),
     )
     again = fly(Elliptical(), 2, noise=NOISE, seed=1)
     assert np.array_equal(first.states, again.states)
-    inner = [step for loop, step in told if loop == "inner"]
+    inner = [step for loop, step in reported if loop == "inner"]
     assert [step.k for step in inner] == list(range(40))
-    assert [i for i, (loop, _) in enumerate(told) if loop == "outer"] == [0, 21]
+    assert [i for i, (loop, _) in enumerate(reported) if loop == "outer"] == [0, 21]
     assert np.array_equal([step.state for step in inner], first.states[:-1, 6:])
 
 

@@ -224,13 +224,13 @@ def test_plans_that_leave_the_data_are_counted_by_step():
 
 
 def test_every_step_is_told_as_it_happens():
-    told = []
-    flight = fly(5, on_step=told.append, noise=Noise(**ALL_NOISE))
-    assert [s.k for s in told] == list(range(5))
-    assert [s.time for s in told] == [0, 0.1, 0.2, 0.3, 0.4]
-    assert np.array_equal([s.state for s in told], flight.states[:-1])
-    assert np.array_equal([s.measured for s in told], flight.measured)
-    assert np.array_equal([s.input for s in told], flight.inputs)
+    reported = []
+    flight = fly(5, on_step=reported.append, noise=Noise(**ALL_NOISE))
+    assert [s.k for s in reported] == list(range(5))
+    assert [s.time for s in reported] == [0, 0.1, 0.2, 0.3, 0.4]
+    assert np.array_equal([s.state for s in reported], flight.states[:-1])
+    assert np.array_equal([s.measured for s in reported], flight.measured)
+    assert np.array_equal([s.input for s in reported], flight.inputs)
 
 
 def test_references_with_inputs_are_handed_on_window_by_window():

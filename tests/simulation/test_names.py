@@ -62,8 +62,8 @@ def controller(model):
 
 
 def fly(controller, plant=PLANT, **changed):
-    given = {"references": TARGET, "initial": NUMBERS, "steps": 3}
-    return closed_loop(plant, controller, **given | changed)
+    defaults = {"references": TARGET, "initial": NUMBERS, "steps": 3}
+    return closed_loop(plant, controller, **defaults | changed)
 
 
 def test_data_of_a_system_and_what_learns_from_them_know_it(model, controller):
@@ -230,19 +230,19 @@ def test_filters_sort_beliefs_inputs_and_measurements_by_name(model):
     filter = KalmanFilter.extended(model, measurement)
     belief = Gaussian.certain(NUMBERS)
     torque = pd.Series({"torque": 0.1})
-    moved = filter.predict(Gaussian.certain(START), torque)
-    assert torch.equal(moved.mean, filter.predict(belief, [0.1]).mean)
+    prior = filter.predict(Gaussian.certain(START), torque)
+    assert torch.equal(prior.mean, filter.predict(belief, [0.1]).mean)
     seen = pd.Series({"angle": 0.3, "rate": -0.5})
-    found = filter.update(moved, seen).belief.mean
-    assert torch.equal(found, filter.update(moved, [-0.5, 0.3]).belief.mean)
+    posterior_mean = filter.update(prior, seen).belief.mean
+    assert torch.equal(posterior_mean, filter.update(prior, [-0.5, 0.3]).belief.mean)
     log = pd.DataFrame([seen, seen])
     whole = filter.run(Gaussian.certain(START), pd.DataFrame([torque]), log)
     plain = filter.run(belief, [[0.1]], [[-0.5, 0.3]] * 2)
     assert torch.equal(whole.filtered.mean, plain.filtered.mean)
     late = LateMeasurements(filter, Gaussian.certain(START))
-    assert torch.equal(late.step(torque).mean, moved.mean)
+    assert torch.equal(late.step(torque).mean, prior.mean)
     with pytest.raises(DataError, match="must have the names rate, angle; got x, y"):
-        filter.update(moved, pd.Series({"x": 0.3, "y": -0.5}))
+        filter.update(prior, pd.Series({"x": 0.3, "y": -0.5}))
 
 
 def test_beliefs_are_sorted_and_another_order_is_refused(
@@ -262,16 +262,16 @@ def test_beliefs_are_sorted_and_another_order_is_refused(
     with pytest.raises(SettingError, match="belief: .* it has rate, angle, the same"):
         Linearization()(model, named, torque)
     sorted_by_name = named.in_order(("angle", "rate"))
-    moved = Linearization()(model, sorted_by_name, torque)
-    assert torch.equal(moved.mean, Linearization()(model, belief, torque).mean)
+    next_belief = Linearization()(model, sorted_by_name, torque)
+    assert torch.equal(next_belief.mean, Linearization()(model, belief, torque).mean)
 
 
 def test_a_belief_in_order_takes_its_covariance_along():
     covariance = torch.tensor([[4.0, 1.0], [1.0, 9.0]])
     belief = Gaussian(torch.tensor([1.0, 2.0]), covariance, ("a", "b"))
-    found = belief.in_order(("b", "a"))
-    assert found.mean.tolist() == [2.0, 1.0]
-    assert found.covariance.tolist() == [[9.0, 1.0], [1.0, 4.0]]
+    reordered = belief.in_order(("b", "a"))
+    assert reordered.mean.tolist() == [2.0, 1.0]
+    assert reordered.covariance.tolist() == [[9.0, 1.0], [1.0, 4.0]]
 
 
 def test_a_cascade_checks_both_loops():

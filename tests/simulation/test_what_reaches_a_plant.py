@@ -67,13 +67,13 @@ class Liar:
 
     def __init__(self, lies=(), status=Status.SOLVED):
         self.lies = dict(lies)
-        self.asked = 0
+        self.calls = 0
         self.status = status
         self.draws = np.random.default_rng(0)
 
     def control(self, belief, reference, previous=None):
-        k = self.asked
-        self.asked = self.asked + 1
+        k = self.calls
+        self.calls = self.calls + 1
         plan = [self.initial_input if previous is None else previous.input]
         for _ in range(H):
             plan.append(
@@ -213,16 +213,16 @@ def test_what_misses_a_bound_by_rounding_is_put_onto_it():
                 Timing(0.0, 0.0, 0.0),
             )
 
-    asked = decide(
+    command = decide(
         Loose(), Gaussian.certain(START), Reference(REFERENCES.states[: H + 1])
     )
-    assert asked.input.tolist() == [7.5, 0.1, -0.1 + 1e-7]
+    assert command.input.tolist() == [7.5, 0.1, -0.1 + 1e-7]
     assert (
-        asked.plan.inputs[0].tolist()
-        == asked.plan.input.tolist()
-        == asked.input.tolist()
+        command.plan.inputs[0].tolist()
+        == command.plan.input.tolist()
+        == command.input.tolist()
     )
-    assert not asked.failed
+    assert not command.failed
 
 
 def test_a_non_finite_reference_is_no_fallback():
@@ -239,9 +239,9 @@ def test_without_declared_bounds_inputs_are_finite_and_as_many():
         def control(self, belief, reference, previous=None):
             plan = np.full((H, 3), 1e3)
             plan = (
-                LIES[self.lies[self.asked]](plan) if self.asked in self.lies else plan
+                LIES[self.lies[self.calls]](plan) if self.calls in self.lies else plan
             )
-            self.asked += 1
+            self.calls += 1
             return Decision(
                 plan[0],
                 plan,
@@ -270,7 +270,7 @@ def test_without_declared_bounds_inputs_are_finite_and_as_many():
 
 def test_a_recorder_is_told_that_the_policy_chose_the_input():
     lies = {1: "nan", 3: "two inputs"}
-    told = []
+    steps = []
     closed_loop(
         QUADROTOR,
         Liar(lies),
@@ -278,25 +278,25 @@ def test_a_recorder_is_told_that_the_policy_chose_the_input():
         START,
         5,
         on_failure="hold",
-        on_step=told.append,
+        on_step=steps.append,
     )
-    assert [step.failed for step in told] == [False, True, False, True, False]
-    assert [step.status.solved for step in told] == [True, False, True, False, True]
-    assert [step.decision is None for step in told] == [
+    assert [step.failed for step in steps] == [False, True, False, True, False]
+    assert [step.status.solved for step in steps] == [True, False, True, False, True]
+    assert [step.decision is None for step in steps] == [
         False,
         False,
         False,
         True,
         False,
     ]
-    told.clear()
+    steps.clear()
     closed_loop(
         QUADROTOR,
         Liar(status=Status.TIME_LIMIT),
         REFERENCES,
         START,
         5,
-        on_step=told.append,
+        on_step=steps.append,
     )
-    assert not any(step.failed for step in told)
-    assert np.isfinite(told[1].innovation).all()
+    assert not any(step.failed for step in steps)
+    assert np.isfinite(steps[1].innovation).all()

@@ -42,7 +42,7 @@ def test_a_held_attitude_moves_as_the_translational_subsystem(mass, rng):
         angles = attitude_for_thrust_direction(np.array(ux), np.array(uy))
         position = rng.normal(size=6)
         x = np.concatenate([position, [angles[0], 0, angles[1], 0, 0, 0]])
-        moved = step(
+        next_state = step(
             System(Coupled(mass=mass), time_step=0.7), x, np.array([U1, 0, 0, 0])
         )
         expected = step(
@@ -50,7 +50,7 @@ def test_a_held_attitude_moves_as_the_translational_subsystem(mass, rng):
             position,
             np.array([U1, ux, uy]),
         )
-        assert np.allclose(moved[:6], expected, atol=1e-9)
+        assert np.allclose(next_state[:6], expected, atol=1e-9)
 
 
 def test_the_papers_frozen_attitude_is_this_plant_held_there(rng):

@@ -60,7 +60,7 @@ def test_wind_pushes_by_drag_and_thrusts_may_act_late():
 def test_it_is_flown_from_the_command_line_on_its_data_sheet():
     chosen = experiment("system=mujoco_quadrotor", "data.samples=60", "steps=60")
     flown = run_trial(chosen)
-    found = metrics(chosen, flown)
-    assert found["lost"] is None
-    assert found["error_at_end"] < 0.03
+    figures = metrics(chosen, flown)
+    assert figures["lost"] is None
+    assert figures["error_at_end"] < 0.03
     assert flown.training.posterior.nominal is not None

@@ -87,11 +87,11 @@ def test_one_substep_is_exact_for_the_translational_subsystem(rng):
     acceleration = np.array(
         [u[1] * u[0], u[2] * u[0], -vertical * u[0]]
     ) / 0.74 + np.array([0, 0, 9.81])
-    moved = step(System(Translational(), time_step=h, substeps=1), x, u)
+    next_state = step(System(Translational(), time_step=h, substeps=1), x, u)
     assert np.allclose(
-        moved[::2], x[::2] + h * x[1::2] + h**2 / 2 * acceleration, atol=1e-11
+        next_state[::2], x[::2] + h * x[1::2] + h**2 / 2 * acceleration, atol=1e-11
     )
-    assert np.allclose(moved[1::2], x[1::2] + h * acceleration, atol=1e-11)
+    assert np.allclose(next_state[1::2], x[1::2] + h * acceleration, atol=1e-11)
 
 
 @pytest.mark.parametrize(

@@ -27,8 +27,8 @@ def flown_up(name, *words):
 def test_a_pendulum_swings_up_whichever_turn_it_starts_in():
     chosen, flown, error = flown_up("pendulum")
     assert error < 0.05
-    found = metrics(chosen, flown)
-    assert found["error_at_end"] < 0.05 < 0.5 < found["rmse"]["total"]
+    figures = metrics(chosen, flown)
+    assert figures["error_at_end"] < 0.05 < 0.5 < figures["rmse"]["total"]
     model = flown.training.posterior
     cost = flown.controller.problem.cost
     assert (model.angles, cost.angles) == ([0], (0,))

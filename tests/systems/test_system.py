@@ -227,13 +227,13 @@ def test_a_trajectory_gives_the_tracked_states_and_their_rates():
     ],
 )
 def test_misuse_is_refused_where_the_system_is_made(settings, error, message):
-    given = {
+    defaults = {
         "dynamics": Spring(),
         "time_step": 0.1,
         "units": {"position": "m", "speed": "m/s"},
     }
     with pytest.raises(error, match=message):
-        System(**(given | settings))
+        System(**(defaults | settings))
 
 
 def test_a_trajectory_of_another_number_of_positions_is_refused():
