@@ -69,9 +69,10 @@ def test_the_model_predicts_the_same_with_process_noise():
     for kind in ("gp", "features"):
         model, rows = learned(0.3 * sensors, sensors, kind)
         separation = separate_noise(model, rows)
-        at = torch.tensor([0.1, -0.2], dtype=torch.float64), torch.zeros(1).double()
-        before = model.predict(*at)
-        after = separation.model.predict(*at)
+        state = torch.tensor([0.1, -0.2], dtype=torch.float64)
+        input = torch.zeros(1, dtype=torch.float64)
+        before = model.predict(state, input)
+        after = separation.model.predict(state, input)
         assert torch.equal(before.mean, after.mean)
         assert torch.equal(before.covariance, after.covariance)
         noise = separation.model.noise_covariance.diagonal()

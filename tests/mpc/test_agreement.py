@@ -75,10 +75,10 @@ def test_iterated_programs_reach_the_nonlinear_optimum(propagator):
 def test_dual_primal_and_state_form_give_the_same_inputs():
     gp = quadrotor_gp()
     active = 0
-    asked = (gp, Linearization(), problem(0.02), H, HOVER)
-    ours = GPMPC(*asked)
-    primal = GPMPC(*asked, solver=PrimalActiveSet())
-    state_form = StateFormMPC(*asked)
+    bounded = problem(0.02)
+    ours = GPMPC(gp, Linearization(), bounded, H, HOVER)
+    primal = GPMPC(gp, Linearization(), bounded, H, HOVER, solver=PrimalActiveSet())
+    state_form = StateFormMPC(gp, Linearization(), bounded, H, HOVER)
     for belief, reference in questions(5, 0.0):
         plan = ours.control(belief, reference)
         active += len(plan.solution.active_set)
@@ -102,14 +102,21 @@ def test_only_iterated_programs_keep_a_bound_after_a_large_step():
     start = np.array([0.0, 0.4, 0.0, 0.0, 0.0, -0.5])
     belief = Gaussian.certain(start)
     reference = Reference(np.stack([start, [0.2, 0.4, 0.0, 0.0, 0.3, 0.5]]))
+    propagator = Linearization(process_noise=True)
     reached = []
     for iterations in (1, 30):
-        asked = (gp, Linearization(process_noise=True), bounded, 1, HOVER)
-        plan = GPMPC(*asked, iterations=iterations, tolerance=1e-6).control(
-            belief, reference
+        mpc = GPMPC(
+            gp,
+            propagator,
+            bounded,
+            horizon=1,
+            initial_input=HOVER,
+            iterations=iterations,
+            tolerance=1e-6,
         )
+        plan = mpc.control(belief, reference)
         assert plan.status.solved
-        after = Linearization(process_noise=True)(gp, belief, torch.tensor(plan.input))
+        after = propagator(gp, belief, torch.tensor(plan.input))
         reached.append(
             float(
                 after.mean[0]

@@ -55,19 +55,18 @@ class Condensing:
             else np.empty((2, 0, problem.input_dim))
         )
         self.bounds = InputBounds(*problem.inputs.by_stage(H), *rates)
-        (Q, R), cost, z = (
-            problem.cost.by_stage(H),
-            problem.cost,
-            problem.state_dim + problem.input_dim + 1,
-        )
+        cost = problem.cost
+        Q, R = cost.by_stage(H)
+        z = problem.state_dim + problem.input_dim + 1
         W = np.repeat(Q[:, None], blocks, axis=1)
         squares = np.empty((0, z, z)) if squares is None else squares
-        weights = (
-            W if cost.Q.ndim > 2 else np.tile(cost.Q, (1, blocks, 1, 1)),
-            W[-1],
-            R if cost.R.ndim > 2 else R[:1],
+        self.cost = QuadraticCost(
+            state=W if cost.Q.ndim > 2 else np.tile(cost.Q, (1, blocks, 1, 1)),
+            terminal=W[-1],
+            input=R if cost.R.ndim > 2 else R[:1],
+            penalized=PENALIZED.index(cost.penalized),
+            squares=squares,
         )
-        self.cost = QuadraticCost(*weights, PENALIZED.index(cost.penalized), squares)
 
     def condense(self, *arguments):
         return condense(self.cost, self.bounds, *arguments)

@@ -190,8 +190,8 @@ def test_with_model_gives_the_controller_made_with_that_model(iterations):
     mpc_of_other = controller(
         model=other, covariance="none", rolled_out=True, iterations=iterations
     )
-    question = Gaussian.certain([0.3, -0.2]), AT_REST, None, None, inputs
-    decision = mpc.control(*question)
-    expected = mpc_of_other.control(*question)
+    belief = Gaussian.certain([0.3, -0.2])
+    decision = mpc.control(belief, AT_REST, plan=inputs)
+    expected = mpc_of_other.control(belief, AT_REST, plan=inputs)
     assert np.array_equal(decision.means, expected.means)
     assert np.array_equal(decision.inputs, expected.inputs)

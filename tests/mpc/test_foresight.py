@@ -178,8 +178,7 @@ def test_a_search_under_constraints_with_parameters_keeps_them():
     cost = Tracking([1.0, 0.01, 1.0, 0.01], [0.01], penalized="inputs", angles=(2,))
     walls = [Inequality(beyond, penalty=1000.0)]
     problem = Problem(cost, inputs=Box([-10.0], [10.0]), constraints=walls)
-    parts = system, problem, 30
-    loop = ControlLoop(ManyStarts(controller(*parts)))
+    loop = ControlLoop(ManyStarts(controller(system, problem, horizon=30)))
     state = np.array(system.start)
     path = []
     for _ in range(65):

@@ -44,12 +44,13 @@ class Case:
 
     def __init__(self, rng, squares=True, inputs=True):
         Z = definite(rng, H if squares else 0, N + M + 1)
-        weights = (
-            definite(rng, H, P // N, N),
-            definite(rng, P // N, N),
-            definite(rng, 1, M),
+        self.cost = QuadraticCost(
+            state=definite(rng, H, P // N, N),
+            terminal=definite(rng, P // N, N),
+            input=definite(rng, 1, M),
+            penalized=INCREMENTS,
+            squares=Z,
         )
-        self.cost = QuadraticCost(*weights, INCREMENTS, Z)
         self.references = References(
             rng.normal(size=(H, N)), rng.normal(size=(H, M)), rng.normal(size=M)
         )

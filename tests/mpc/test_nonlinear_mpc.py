@@ -316,9 +316,9 @@ def test_a_warm_start_takes_fewer_iterations(kind):
 def test_soft_bounds_give_way_and_their_price_is_at_its_minimum(price, rng):
     H = 4
     problem = constrained(price)
-    settings = pendulum_posterior(), Linearization()
-    controller = NonlinearGPMPC(*settings, problem, H, [0.3])
-    hard = SLSQP(*settings, constrained(), H, [0.3])
+    gp = pendulum_posterior()
+    controller = NonlinearGPMPC(gp, Linearization(), problem, H, [0.3])
+    hard = SLSQP(gp, Linearization(), constrained(), H, [0.3])
     # beyond its bound already
     at = belief((0.9, 0.5), SPREAD / 20)
     reference = swing(H, 1.3)

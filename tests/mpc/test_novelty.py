@@ -72,8 +72,9 @@ def test_it_is_the_added_deviation_over_that_of_what_was_learned(gp, mode):
         decision = chosen.control(Gaussian.certain(state), Reference(state), decision)
         state = state if mode == "none" else decision.means[0]
     assert decision is not None
-    at = torch.from_numpy(decision.means[:-1]), torch.from_numpy(decision.inputs)
-    added = gp.predict(*at).variance.sqrt()
+    states = torch.from_numpy(decision.means[:-1])
+    inputs = torch.from_numpy(decision.inputs)
+    added = gp.predict(states, inputs).variance.sqrt()
     learned = gp.targets.std(dim=0, correction=0)
     near = 1e-9 if mode == "none" else 0.5  # stages of the last plan
     assert decision.novelty == pytest.approx(float((added / learned).max()), rel=near)
@@ -91,8 +92,9 @@ def test_a_linear_function_is_not_known_far_beyond_its_data(gp):
     learned = gp.targets.var(dim=0, correction=0)
     assert float((gp.signal_variance / learned).max()) > 5.0**2
     decision = decide(controller(gp, "none"), 4.0)
-    at = torch.from_numpy(decision.means[:-1]), torch.from_numpy(decision.inputs)
-    to_prior = (gp.predict(*at).variance / gp.signal_variance).sqrt()
+    states = torch.from_numpy(decision.means[:-1])
+    inputs = torch.from_numpy(decision.inputs)
+    to_prior = (gp.predict(states, inputs).variance / gp.signal_variance).sqrt()
     assert decision.far_from_data
     assert float(to_prior.max()) < 0.4
 

@@ -1,6 +1,8 @@
 """Costs of outputs, weights and bounds by stage, rows of inputs, and plans that are
 handed over."""
 
+from functools import partial
+
 import casadi
 import numpy as np
 import pytest
@@ -208,10 +210,18 @@ def test_the_iteration_starts_at_a_given_plan():
     model = DoublePendulum(ACROBOT)
     goal = Reference(np.zeros(4))
     cost = Tracking([1.0] * 4, [1e-3], penalized="inputs")
-    settings = {"prediction": PredictionSettings(covariance="none"), "tolerance": 1e-9}
-    args = model, Linearization(), Problem(cost, Box([-6.0], [6.0])), 15, [0.0]
+    mpc = partial(
+        GPMPC,
+        model,
+        Linearization(),
+        Problem(cost, Box([-6.0], [6.0])),
+        horizon=15,
+        initial_input=[0.0],
+        prediction=PredictionSettings(covariance="none"),
+        tolerance=1e-9,
+    )
     start = Gaussian.certain(np.array([0.3, -0.2, 0.0, 0.0]))
-    controller = GPMPC(*args, iterations=60, **settings)
+    controller = mpc(iterations=60)
     solved = controller.control(start, goal)
     for plan in (
         solved.inputs,
@@ -221,7 +231,7 @@ def test_the_iteration_starts_at_a_given_plan():
         again = controller.control(start, goal, plan=plan)
         assert again.iterations == 1
         assert np.allclose(again.inputs, solved.inputs, atol=1e-6)
-    loop = ControlLoop(GPMPC(*args, **settings))
+    loop = ControlLoop(mpc())
     first = loop.input(start, goal, plan=solved.inputs)
     assert np.allclose(first, solved.input, atol=1e-6)
     before = loop.last.plan

@@ -1,4 +1,5 @@
 from dataclasses import replace
+from functools import partial
 from time import perf_counter
 
 import casadi
@@ -228,21 +229,20 @@ def test_compiled_and_torch_and_another_solver_iterate_alike(
     quadrotor, covariance, limits
 ):
     problem = Problem(Tracking([10.0, 1.0] * 3, [0.1] * 3), **BOX, **limits)
-    arguments = (
+    mpc = partial(
+        GPMPC,
         quadrotor,
         Linearization(),
         problem,
-        5,
-        HOVER,
-        PredictionSettings(covariance=covariance),
+        horizon=5,
+        initial_input=HOVER,
+        prediction=PredictionSettings(covariance=covariance),
+        iterations=60,
+        tolerance=1e-7,
     )
-    reported = (
-        {} if "constraints" in limits else {"solver": Other()}
-    )  # prices need our own solver
-    ours, other = (
-        GPMPC(*arguments, **solver, iterations=60, tolerance=1e-7)
-        for solver in ({}, reported)
-    )
+    ours = mpc()
+    # Prices need our own solver.
+    other = mpc() if "constraints" in limits else mpc(solver=Other())
     random = np.random.default_rng(2)
     last = None
     before = None

@@ -50,11 +50,12 @@ def controller(system, Q, R, horizon, iterations=1, rolled_out=True, **bounds):
         **bounds,
     )
     settings = PredictionSettings(covariance="none", rolled_out=rolled_out)
-    start = problem, horizon, system.initial_input
     return GPMPC(
         known(system),
         Linearization(),
-        *start,
+        problem,
+        horizon,
+        system.initial_input,
         settings,
         iterations=iterations,
         tolerance=1e-2,
@@ -71,14 +72,23 @@ class CountedStarts(ManyStarts):
         return super().plans(*arguments, **named)
 
 
+def counted_starts(system, Q, R, horizon, iterations, **settings):
+    """Starts of a controller that takes one program, improved by ``iterations``."""
+    return CountedStarts(
+        controller(system, Q, R, horizon),
+        controller(system, Q, R, horizon, iterations),
+        **settings,
+    )
+
+
 def pendulums(iterations=15, **settings):
-    parts = pendulum(), [1.0, 0.01], [0.01], 30
-    return CountedStarts(controller(*parts), controller(*parts, iterations), **settings)
+    return counted_starts(pendulum(), [1.0, 0.01], [0.01], 30, iterations, **settings)
 
 
 def cart_poles(horizon=40):
-    parts = cart_pole(), [1.0, 0.01, 1.0, 0.01], [0.01], horizon
-    return CountedStarts(controller(*parts), controller(*parts, 10))
+    return counted_starts(
+        cart_pole(), [1.0, 0.01, 1.0, 0.01], [0.01], horizon, iterations=10
+    )
 
 
 def wrap(angle):
@@ -120,10 +130,9 @@ def test_many_starts_swing_a_cart_pole_up_and_follow_the_plan():
 @pytest.mark.parametrize("horizon", [30, 60])
 def test_many_starts_cost_no_more_than_the_controller_alone(horizon):
     system = pendulum()
-    parts = system, [1.0, 0.01], [0.01], horizon
-    many = CountedStarts(controller(*parts), controller(*parts, 10))
+    many = counted_starts(system, [1.0, 0.01], [0.01], horizon, iterations=10)
     states, paid = fly(many, system, 80)
-    alone, paid_alone = fly(controller(*parts), system, 80)
+    alone, paid_alone = fly(many.controller, system, 80)
     assert off_upright(alone[-15:], 0).max() < 0.2
     assert off_upright(states[-15:], 0).max() < 0.2
     assert paid < 1.001 * paid_alone
@@ -183,8 +192,9 @@ def test_a_plan_is_not_torn_by_the_controller_that_follows_it():
         return many._cost(decision, goal)
 
     system = cart_pole()
-    parts = system, [1.0, 0.01, 1.0, 0.01], [0.1], 80
-    many = CountedStarts(controller(*parts), controller(*parts, 10), criterion=cost)
+    many = counted_starts(
+        system, [1.0, 0.01, 1.0, 0.01], [0.1], 80, iterations=10, criterion=cost
+    )
     state = np.array(system.start)
     decision = None
     ratios = []
@@ -522,8 +532,8 @@ def test_a_plan_that_cannot_be_improved_is_searched_for_anew():
     walls = [
         Box([-9.0, -9.0], [-8.0, 9.0], penalty=None)
     ]  # far from the state: no program of this controller succeeds
-    parts = pendulum(), [1.0, 0.01], [0.01], 30
-    many = ManyStarts(controller(*parts, constraints=walls), controller(*parts, 15))
+    walled = controller(pendulum(), [1.0, 0.01], [0.01], 30, constraints=walls)
+    many = ManyStarts(walled, controller(pendulum(), [1.0, 0.01], [0.01], 30, 15))
     state = Gaussian.certain(np.array([1.0, 0.0]))
     reference = Reference(np.zeros(2))
     first = many.control(state, reference)
@@ -532,10 +542,11 @@ def test_a_plan_that_cannot_be_improved_is_searched_for_anew():
 
 def test_plans_are_made_start_by_start_from_any_start_on():
     many = pendulums(3)
-    question = (Gaussian.certain(np.array([np.pi, 0.3])), Reference(np.zeros(2)))
-    every = list(many.plans(*question))
+    belief = Gaussian.certain(np.array([np.pi, 0.3]))
+    reference = Reference(np.zeros(2))
+    every = list(many.plans(belief, reference))
     assert len(every) == len(many)
-    later = list(many.plans(*question, first=2))
+    later = list(many.plans(belief, reference, first=2))
     assert len({tuple(plan.inputs[:, 0]) for plan, _ in every}) > 2
     assert [value for _, value in later] == [value for _, value in every[2:]]
     assert all(

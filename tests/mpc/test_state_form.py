@@ -1,5 +1,6 @@
 import subprocess
 import sys
+from functools import partial
 from itertools import product
 
 import numpy as np
@@ -43,17 +44,17 @@ def problem(penalized="deviations", lower=-0.3, penalty=None):
 )
 def test_it_gives_the_inputs_of_the_condensed_program(form, covariance, prices):
     moves = MeanEquivalence() if covariance == "none" else Linearization()
-    arguments = (
-        quadrotor_gp(),
-        moves,
-        problem(PENALIZED[form], **prices),
-        H,
-        HOVER,
-        PredictionSettings(form, covariance),
-    )
-    controllers = [GPMPC(*arguments, iterations=1), StateFormMPC(*arguments)]
+    bounded = problem(PENALIZED[form], **prices)
+    settings = {
+        "horizon": H,
+        "initial_input": HOVER,
+        "prediction": PredictionSettings(form, covariance),
+    }
+    mpc = partial(GPMPC, quadrotor_gp(), moves, bounded, iterations=1, **settings)
+    state_form = StateFormMPC(quadrotor_gp(), moves, bounded, **settings)
+    controllers = [mpc(), state_form]
     if not prices:
-        controllers.append(GPMPC(*arguments, CvxpySolver(), iterations=1))
+        controllers.append(mpc(solver=CvxpySolver()))
     state = np.array([0.8, 0.2, -0.4, 0.1, 0.3, 0.0])
     last = None
     worked = 0
@@ -76,19 +77,20 @@ def test_it_gives_the_inputs_of_the_condensed_program(form, covariance, prices):
 
 
 def test_a_constraint_of_ones_own_takes_one_line():
-    arguments = (
+    state_form = partial(
+        StateFormMPC,
         quadrotor_gp(),
         MeanEquivalence(),
         problem(),
-        H,
-        HOVER,
-        PredictionSettings(covariance="none"),
+        horizon=H,
+        initial_input=HOVER,
+        prediction=PredictionSettings(covariance="none"),
     )
     belief = Gaussian.certain(np.array([0.5, 0.0, 0.5, 0.0, 0.0, 0.0]))
-    free = StateFormMPC(*arguments).control(belief, REFERENCE)
-    bound = StateFormMPC(
-        *arguments, constraints=lambda s, u: [s[1:, 0] + s[1:, 2] >= 0.8]
-    ).control(belief, REFERENCE)
+    free = state_form().control(belief, REFERENCE)
+    bound = state_form(constraints=lambda s, u: [s[1:, 0] + s[1:, 2] >= 0.8]).control(
+        belief, REFERENCE
+    )
     assert (free.means[1:, 0] + free.means[1:, 2]).min() < 0.7
     assert (bound.means[1:, 0] + bound.means[1:, 2]).min() == pytest.approx(
         0.8, abs=1e-7
@@ -108,15 +110,16 @@ def test_a_constraint_that_is_not_convex_is_refused():
 
 
 def test_what_cannot_be_solved_is_reported():
-    arguments = (
+    state_form = partial(
+        StateFormMPC,
         quadrotor_gp(),
         MeanEquivalence(),
         problem(),
-        H,
-        HOVER,
-        PredictionSettings(covariance="none"),
+        horizon=H,
+        initial_input=HOVER,
+        prediction=PredictionSettings(covariance="none"),
     )
-    controller = StateFormMPC(*arguments, constraints=lambda s, u: [u[0, 0] >= 100.0])
+    controller = state_form(constraints=lambda s, u: [u[0, 0] >= 100.0])
     assert (
         controller.control(Gaussian.certain(np.zeros(6)), REFERENCE).status
         is Status.INFEASIBLE

@@ -96,10 +96,9 @@ def test_a_record_with_gaps_is_a_warm_start_too(rng):
     cold = DualActiveSet().solve(problem)
     gappy = cold._replace(record=np.repeat(cold.record, 2)[::2])
     prepared = DualActiveSet().prepare(problem.P, problem.G)
-    vectors = (problem.q, problem.lower, problem.upper)
     for solution in (
         DualActiveSet().solve(problem, gappy),
-        prepared.solve(*vectors, gappy),
+        prepared.solve(problem.q, problem.lower, problem.upper, gappy),
     ):
         assert solution.status.solved
         np.testing.assert_allclose(solution.x, cold.x, atol=1e-9)

@@ -220,10 +220,14 @@ class Proportional:
 def test_many_fly_one_by_one_and_divergence_is_one_trials_own():
     plant = System(Explosive(), time_step=0.5)
     initial = Gaussian(torch.zeros(1), 4 * torch.eye(1))
-    scenario = (plant, Proportional(), np.zeros((20, 1)), initial, 15)
-    flown = closed_loops(*scenario, 12)
+    reference = np.zeros((20, 1))
+
+    def alone(seed):
+        return closed_loop(plant, Proportional(), reference, initial, 15, seed=seed)
+
+    flown = closed_loops(plant, Proportional(), reference, initial, 15, seeds=12)
     assert any("Diverged: step" in trial.error for trial in flown if trial.error)
-    assert_each_ends_as_alone(flown, lambda seed: closed_loop(*scenario, seed=seed))
+    assert_each_ends_as_alone(flown, alone)
 
 
 @pytest.mark.parametrize(
