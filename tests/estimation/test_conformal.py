@@ -58,15 +58,15 @@ def test_held_out_quantiles_hold_where_the_gaussian_does_not(probability, rows):
         ConformalTube.calibrate(MODEL, PROPAGATOR, *log(1000, seed), H, rows)
         for seed in range(6)
     ]
-    held = np.mean(
+    coverage = np.mean(
         [
             share_that_holds(tube.kappas(probability), 100 + s, rows)
             for s, tube in enumerate(tubes)
         ],
         axis=0,
     )
-    assert (held > probability - 0.015).all()
-    assert (held < probability + 0.03).all()
+    assert (coverage > probability - 0.015).all()
+    assert (coverage < probability + 0.03).all()
     assert (
         share_that_holds(np.full(H, 1.65 if probability == 0.95 else 1.28), 100, rows)
         < 0.8

@@ -24,14 +24,15 @@ def log(steps, delay, seed, feedback=0.0, std=(1e-3, 0.02), rho=0.0):
     deviations."""
     rng = np.random.default_rng(seed)
     whole = int(np.ceil(delay))
-    share = delay - (whole - 1)
+    fraction = delay - (whole - 1)
     states = [np.array([0.3, 0.0])]
     inputs = [np.zeros(1)] * (whole + 1)
     noise = np.zeros(2)
     for _ in range(steps):
         inputs.append(rng.uniform(-1, 1, 1) - feedback * states[-1][1:])
         acting = (
-            share * inputs[-1 - whole] + (1 - share) * inputs[-whole if whole else -1]
+            fraction * inputs[-1 - whole]
+            + (1 - fraction) * inputs[-whole if whole else -1]
         )
         noise = rho * noise + np.sqrt(1 - rho**2) * rng.normal(0, std)
         states.append(pendulum(states[-1], acting) + noise)
@@ -53,8 +54,8 @@ def test_a_delay_is_found_also_where_the_input_follows_the_state(delay, feedback
 
 def test_the_interval_holds_the_delay_as_often_as_it_says():
     hits = [estimate_delay(*log(120, 2.4, seed, std=(5e-3, 0.1))) for seed in range(40)]
-    held = sum(one.interval[0] <= 2.4 <= one.interval[1] for one in hits)
-    assert held >= 34  # of a share of 95 % of 40 in less than one of 100 cases
+    covered = sum(one.interval[0] <= 2.4 <= one.interval[1] for one in hits)
+    assert covered >= 34  # of a share of 95 % of 40 in less than one of 100 cases
 
 
 def test_inputs_without_an_effect_give_a_wide_interval():

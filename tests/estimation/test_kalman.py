@@ -115,9 +115,7 @@ def conditioned(inputs, measured, H, R):
 
 
 @pytest.mark.parametrize("kind", [KalmanFilter.extended, KalmanFilter.unscented])
-def test_filter_and_smoother_are_the_conditional_gaussian(
-    kind,
-):
+def test_filter_and_smoother_are_the_conditional_gaussian(kind):
     both = Measurement.of_states(2, [0, 1], [0.1, 0.3])
     _, inputs, measured = simulated(LINEAR, 12, 0, both)
     measured[3] = torch.nan
@@ -362,9 +360,7 @@ def test_a_smoother_keeps_its_digits_under_a_flat_prior():
 
 
 @pytest.mark.parametrize("variance", [1e-8, 1e-12, 1e-16, 1e-20, 1e-26])
-def test_contradictory_good_sensors_move_other_states_little(
-    variance,
-):
+def test_contradictory_good_sensors_move_other_states_little(variance):
     P = random_covariance(5, 1.0)
     H = [[1, 2, 0.3, 0, 1], [1, 2, 0.3, 0, 1]]
     rows = torch.tensor(H, dtype=F)

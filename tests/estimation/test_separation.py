@@ -99,9 +99,9 @@ def test_only_separated_noise_gives_honest_intervals():
 
 def test_what_cannot_be_separated_is_refused():
     model, rows = learned(np.full(2, 0.01), np.zeros(2), steps=60)
-    known = KnownModel(Affine.identity(2, 1), 2, 1)
+    nominal = KnownModel(Affine.identity(2, 1), 2, 1)
     sparse = SparseTrainer(inducing=10, restarts=0)(rows).posterior
-    for other in (known, sparse):
+    for other in (nominal, sparse):
         with pytest.raises(UnsupportedModel, match="can be separated"):
             separate_noise(other, rows)
     assert isinstance(model, GPPosterior)

@@ -51,7 +51,7 @@ def driven():
     return rows, model, estimate_varying_noise(model, rows)
 
 
-def held(model, rows, pick):
+def coverage(model, rows, pick):
     """The share of the rates of some rows that intervals of 95 % hold, process noise
     included."""
     belief = model.predict(rows.states, rows.inputs)
@@ -92,10 +92,10 @@ def test_intervals_hold_where_it_is_quiet_and_where_it_is_loud(driven):
     fresh = fresh[inside.all(1).nonzero()[:, 0].tolist()]
     quiet = fresh.states[:, 1].abs() < fresh.states[:, 1].abs().median()
     constant = with_process_noise(model, estimate_process_noise(model, rows))
-    assert 0.93 < held(estimate.model, fresh, quiet) < 0.97
-    assert 0.93 < held(estimate.model, fresh, ~quiet) < 0.97
-    assert held(constant, fresh, quiet) > 0.985
-    assert held(constant, fresh, ~quiet) < 0.915
+    assert 0.93 < coverage(estimate.model, fresh, quiet) < 0.97
+    assert 0.93 < coverage(estimate.model, fresh, ~quiet) < 0.97
+    assert coverage(constant, fresh, quiet) > 0.985
+    assert coverage(constant, fresh, ~quiet) < 0.915
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -353,8 +353,12 @@ def content(model):
     """Everything that a model or transitions hold, for a comparison to the bit."""
     if isinstance(model, torch.Tensor):
         return model.numpy().tobytes(), tuple(model.shape)
-    held = vars(model) if hasattr(model, "__dict__") else model
-    return {k: content(v) for k, v in held.items()} if isinstance(held, dict) else held
+    attributes = vars(model) if hasattr(model, "__dict__") else model
+    return (
+        {k: content(v) for k, v in attributes.items()}
+        if isinstance(attributes, dict)
+        else attributes
+    )
 
 
 def from_csv(path):

@@ -21,9 +21,7 @@ def test_a_running_process_has_some_memory_left():
     assert free is None or free > 2**20
 
 
-def test_the_tightest_control_group_counts_without_file_pages(
-    tmp_path,
-):
+def test_the_tightest_control_group_counts_without_file_pages(tmp_path):
     groups = tmp_path / "sys/fs/cgroup"
     write(tmp_path / "proc/self/cgroup", "1:cpu:/x\n0::/job/step\n")
     for folder, limit, used, pages in (
@@ -57,9 +55,7 @@ def test_what_is_left_is_the_least_that_anybody_leaves(
     assert available_memory(tmp_path) == (None if free is None else 1024 * free)
 
 
-def test_a_training_too_large_is_refused_with_points_that_fit(
-    monkeypatch,
-):
+def test_a_training_too_large_is_refused_with_points_that_fit(monkeypatch):
     needed = 8 * 1000**2 * (2 + 2)  # [bytes]
     for free in (needed, None):
         monkeypatch.setattr(_memory, "available_memory", lambda free=free: free)

@@ -23,9 +23,7 @@ def test_the_module_is_predict(predicts, dtype):
     assert torch.allclose(variance, at.variance, **close)
 
 
-def test_an_exported_program_from_a_file_predicts_any_batch(
-    tmp_path,
-):
+def test_an_exported_program_from_a_file_predicts_any_batch(tmp_path):
     gp = posterior(m=1, predicts="difference")
     example = (torch.randn(3, 2), torch.randn(3, 1))
     batch = torch.export.Dim("batch")

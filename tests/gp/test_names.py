@@ -191,15 +191,15 @@ def test_a_csv_file_names_its_columns_and_sorts_next_states(tmp_path):
 
 
 def test_names_outlast_rows_files_copies_and_processes(tmp_path):
-    known = data()
-    known.save(tmp_path / "data.npz")
+    named = data()
+    named.save(tmp_path / "data.npz")
     for other in (
-        known[2:5],
-        known[[1, 3]],
-        replace(known, inputs=known.inputs + 1),
-        pickle.loads(pickle.dumps(known)),
+        named[2:5],
+        named[[1, 3]],
+        replace(named, inputs=named.inputs + 1),
+        pickle.loads(pickle.dumps(named)),
         Transitions.load(tmp_path / "data.npz"),
-        *Recording.chained(known),
+        *Recording.chained(named),
     ):
         assert other.signals == KNOWN
 

@@ -92,9 +92,7 @@ def test_training_in_place_does_not_see_where_the_features_lie(by, monkeypatch):
 
 
 @pytest.mark.parametrize("by", FEATURES, ids=str)
-def test_training_with_a_zero_mean_ignores_shifted_features(
-    by,
-):
+def test_training_with_a_zero_mean_ignores_shifted_features(by):
     assert_same_training(Trainer(restarts=0, scaling=identity), *data(), by)
 
 
@@ -134,9 +132,9 @@ def test_a_column_moves_around_a_large_value_unless_at_rest():
     x = data()[0].numpy()
     assert np.array_equal(column_std(x + 1e8), column_std(x))
     assert not constant_columns(x + 1e8).any()
-    rest = 0.5 + 1e-12 * x
-    assert constant_columns(rest).all()
-    assert np.allclose(column_std(rest), np.abs(rest).max(axis=0))
+    at_rest = 0.5 + 1e-12 * x
+    assert constant_columns(at_rest).all()
+    assert np.allclose(column_std(at_rest), np.abs(at_rest).max(axis=0))
 
 
 def posterior(by=0.0, targets_by=0.0, sparse=False, predicts="next_state"):

@@ -32,9 +32,7 @@ def test_min_max_fills_the_interval_constants_its_middle():
     assert torch.allclose(scaled.amax(0), torch.tensor([0.9, 0.5, 0.9]))
 
 
-def test_motion_below_the_resolution_is_constant_and_noted(
-    caplog,
-):
+def test_motion_below_the_resolution_is_constant_and_noted(caplog):
     with caplog.at_level(logging.INFO, "gpmpc"):
         scaled = min_max(COLUMNS, NAMES, resolution=1e-4).scale(COLUMNS)
     assert torch.allclose(scaled[:, 2], torch.full((20,), 0.5), atol=1e-5)

@@ -124,12 +124,12 @@ def test_an_input_that_is_known_to_have_no_effect_has_none():
     next_states = data.next_states.clone()
     states[:, 1] = 0.5
     next_states[:, 1] = 0.5
-    known = {"prior_lengthscale": "no_effect", "prior_deviation": None}
+    assumed = {"prior_lengthscale": "no_effect", "prior_deviation": None}
     huge = Transitions(states * torch.tensor([1.0, 1e10]), data.inputs, next_states)
-    long = train(huge, restarts=0, **known).posterior.lengthscales
+    long = train(huge, restarts=0, **assumed).posterior.lengthscales
     assert float(long[0, 1]) > 1e17
     still = Transitions(states, data.inputs, next_states)
-    gp = train(still, penalty=SoftLimits(), **known).posterior
+    gp = train(still, penalty=SoftLimits(), **assumed).posterior
     near = torch.tensor([[0.3, 0.5]])
     far = torch.tensor([[0.3, 2.0]])
     control = torch.tensor([[0.1]])
@@ -225,9 +225,7 @@ def test_a_subset_comes_first_for_many_points_and_new_starts():
     assert not np.array_equal(again[1][0].explored, again[1][1].explored)
 
 
-def test_too_much_for_the_memory_is_refused_with_a_way_out(
-    monkeypatch,
-):
+def test_too_much_for_the_memory_is_refused_with_a_way_out(monkeypatch):
     monkeypatch.setattr("gpmpc.gp._memory.available_memory", lambda: 2 * 2**20)
     with pytest.raises(DataError) as refused:
         train(pendulum(400))
@@ -489,9 +487,7 @@ def test_a_time_limit_waits_for_one_start_that_succeeds(
     ]
 
 
-def test_a_time_limit_leaves_one_start_and_one_iteration(
-    monkeypatch,
-):
+def test_a_time_limit_leaves_one_start_and_one_iteration(monkeypatch):
     data = pendulum(60, noise=1e-2)
     search = _search.OutputSearch._minimize
     sizes = []
@@ -499,7 +495,7 @@ def test_a_time_limit_leaves_one_start_and_one_iteration(
     monkeypatch.setattr(
         _search.OutputSearch,
         "_minimize",
-        lambda self, *given: sizes.append(self._size) or search(self, *given),
+        lambda self, *arguments: sizes.append(self._size) or search(self, *arguments),
     )
     training = train(data, subset=20, time_limit=1e-9)
     assert sizes == [20, 60, 20, 60]

@@ -80,8 +80,10 @@ def test_one_call_rolls_a_known_model_out_within_bounds(rng):
         state = starts[t]
         last = 0.5
         for k in range(H):
-            wanted = feedback.inputs[t, k, 0] + gains[t, k, 0] @ (state - planned[t, k])
-            last = np.clip(np.clip(wanted, last - 3, last + 3), -6, 6)
+            fed_back = feedback.inputs[t, k, 0] + gains[t, k, 0] @ (
+                state - planned[t, k]
+            )
+            last = np.clip(np.clip(fed_back, last - 3, last + 3), -6, 6)
             assert inputs[t, k, 0] == pytest.approx(last, rel=1e-9, abs=1e-12)
             state = step(system, state, inputs[t, k]) + gust
             assert np.allclose(states[t, k + 1], state, rtol=1e-9, atol=1e-9)

@@ -21,7 +21,7 @@ from gpmpc.mpc._sqp import Globalization
 from gpmpc.propagation import Linearization
 from gpmpc.status import Status
 from gpmpc.systems import cart_pole, pendulum, planar_quadrotor, step
-from tests.mpc.test_starts import known
+from tests.mpc.test_starts import known_model
 
 MEANS = PredictionSettings(covariance="none")
 
@@ -77,7 +77,7 @@ def flown(iterations, tolerance=None):
         Box(system.input_lower, system.input_upper),
     )
     controller = GPMPC(
-        known(system),
+        known_model(system),
         Linearization(),
         problem,
         15,
@@ -186,7 +186,7 @@ def test_a_first_plan_is_iterated_only_where_that_pays():
         problem = Problem(cost, Box(system.input_lower, system.input_upper))
         plans = [
             GPMPC(
-                known(system),
+                known_model(system),
                 Linearization(),
                 problem,
                 30,
@@ -204,9 +204,7 @@ def test_a_first_plan_is_iterated_only_where_that_pays():
     assert ends[cart_pole] > 0.1
 
 
-def test_the_first_plan_stands_where_later_programs_fail(
-    monkeypatch,
-):
+def test_the_first_plan_stands_where_later_programs_fail(monkeypatch):
     problem = Problem(Tracking([10.0, 1.0], [0.01]), inputs=Box([-5.0], [5.0]))
     controller = GPMPC(cart(torch.tanh), Linearization(), problem, 8, [0.0], MEANS)
     at = Gaussian.certain([1.0, 0.0])

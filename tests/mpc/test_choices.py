@@ -38,11 +38,11 @@ def test_every_controller_of_the_settings_flies(controller):
 
 
 def test_all_predictions_hold_the_noise_but_the_papers():
-    held = {}
+    process_noise = {}
     for name in ("convex", "nonlinear", "state_form", "paper"):
         mpc = chosen(f"controller={name}", "horizon=2")(quadrotor_gp(20))
-        held[name] = mpc.prediction.propagator.process_noise
-    assert held == dict.fromkeys(held, True) | {"paper": False}
+        process_noise[name] = mpc.prediction.propagator.process_noise
+    assert process_noise == dict.fromkeys(process_noise, True) | {"paper": False}
 
 
 @pytest.mark.parametrize("propagation", names("propagation"))

@@ -118,11 +118,11 @@ def test_constant_stages_are_stages_that_vary_and_do_not(terminal, rng):
         rng.normal(size=(1, r, n * blocks)), -np.ones((H, r)), np.ones((H, r))
     )
     repeated = Stages(*(np.repeat(part, H, axis=0) for part in stages))
-    held = condenser.condense(stages, start, references, rows)
+    constant = condenser.condense(stages, start, references, rows)
     varying = condenser.condense(
         repeated, start, references, rows._replace(E=np.repeat(rows.E, H, axis=0))
     )
-    for one, other in zip(held[:5], varying[:5], strict=True):
+    for one, other in zip(constant[:5], varying[:5], strict=True):
         assert np.allclose(
             one,
             other,
@@ -356,7 +356,7 @@ def test_weights_by_stage_outputs_and_rows_make_the_stacked_qp(penalized, held, 
             values.append(at(E, k) @ s + D[k] @ u)
         return total, np.array(values)
 
-    rest = cost_and_rows(np.zeros((H, m)))
+    at_rest = cost_and_rows(np.zeros((H, m)))
     plans = []
     with_feedback = condense_with_feedback(
         condenser.cost, condenser.bounds, stages, start, references, rows
@@ -386,7 +386,7 @@ def test_weights_by_stage_outputs_and_rows_make_the_stacked_qp(penalized, held, 
                 stages, start, program.feedback, references.previous_input, solution.x
             )[0]
         )
-        assert cost_and_rows(plans[-1])[0] < rest[0]
+        assert cost_and_rows(plans[-1])[0] < at_rest[0]
     assert np.allclose(*plans, atol=1e-8)
 
 
@@ -394,9 +394,7 @@ def priced(program, rows):
     return np.concatenate([np.full(len(program.G) - rows, np.inf), np.full(rows, 2.0)])
 
 
-def test_an_unstable_plant_is_solved_in_feedback_coordinates(
-    rng,
-):
+def test_an_unstable_plant_is_solved_in_feedback_coordinates(rng):
     """x+ = 2 x + u over 50 stages: 2^100 stands beside R in P, and nothing of R is
     left."""
     H = 50

@@ -26,7 +26,7 @@ from gpmpc.propagation import Linearization
 from gpmpc.systems import cart_pole, pendulum, step
 
 
-def known(system):
+def known_model(system):
     n = len(system.state_names)
     x = casadi.SX.sym("x", n)
     u = casadi.SX.sym("u", 1)
@@ -37,7 +37,7 @@ def known(system):
 
 def controller(system, problem, horizon, iterations=1):
     return GPMPC(
-        known(system),
+        known_model(system),
         Linearization(),
         problem,
         horizon,

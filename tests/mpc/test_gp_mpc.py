@@ -694,9 +694,7 @@ def test_observation_noise_widens_predictions_on_request(form, covariance, evalu
     )  # of 1e-4; the plans differ a little
 
 
-def test_parts_of_a_decision_are_timed_and_share_the_model(
-    monkeypatch,
-):
+def test_parts_of_a_decision_are_timed_and_share_the_model(monkeypatch):
     model = linear_gaussian(2, 1)
     H = 3
     problem = Problem(Tracking([1.0, 1.0], [0.1]))

@@ -80,14 +80,14 @@ def test_reference_inputs_feed_forward():
     H = 5
     model = double_integrator()
     states = [np.array([0.2, -0.1])]
-    wanted = np.array([[0.3], [0.1], [-0.4], [0.2], [0.0]])
-    for u in wanted:
+    inputs = np.array([[0.3], [0.1], [-0.4], [0.2], [0.0]])
+    for u in inputs:
         states.append(A @ states[-1] + B @ u)
     controller = LQR(model, Problem(Tracking(Q, R, penalized="deviations")), H, [0.0])
     decision = controller.control(
-        Gaussian.certain(states[0]), Reference(np.array(states), wanted)
+        Gaussian.certain(states[0]), Reference(np.array(states), inputs)
     )
-    assert np.allclose(decision.inputs, wanted, atol=1e-10)
+    assert np.allclose(decision.inputs, inputs, atol=1e-10)
 
 
 def test_inputs_are_clipped_to_the_box_and_the_rates():
@@ -205,20 +205,20 @@ def test_local_models_are_at_the_state_then_at_the_reference(known, rng):
     model = Watched(A.tolist(), B.tolist())
     H = 4
     states = rng.normal(size=(H + 1, 2))
-    wanted = rng.normal(size=(H, 1))
+    reference_inputs = rng.normal(size=(H, 1))
     state = rng.normal(size=2)
-    reference = Reference(states, wanted if known else None)
+    reference = Reference(states, reference_inputs if known else None)
     LQR(model, Problem(Tracking(Q, R, penalized="inputs")), H, [0.3]).control(
         Gaussian.certain(state), reference
     )
     assert np.array_equal(model.seen[0], np.vstack([state, states[1:-1]]))
-    assert np.array_equal(model.seen[1], wanted if known else np.full((H, 1), 0.3))
+    assert np.array_equal(
+        model.seen[1], reference_inputs if known else np.full((H, 1), 0.3)
+    )
 
 
 @pytest.mark.parametrize("factor", [np.nan, np.inf, 1e250])
-def test_a_non_finite_or_exploding_model_is_numerical_trouble(
-    factor,
-):
+def test_a_non_finite_or_exploding_model_is_numerical_trouble(factor):
     controller = LQR(
         Watched(A.tolist(), B.tolist(), factor=factor),
         Problem(Tracking(Q, R, penalized="inputs")),

@@ -217,9 +217,7 @@ def test_the_promise_of_a_step_is_measured_by_the_plans_cost(
         assert (before == known).all()
 
 
-def test_an_update_has_the_steps_curvature_and_stays_definite(
-    rng,
-):
+def test_an_update_has_the_steps_curvature_and_stays_definite(rng):
     for turn in (1.0, -1.0, 0.0):
         P_ = definite(rng, 5)
         step = rng.normal(size=5)
@@ -237,14 +235,16 @@ def test_an_update_has_the_steps_curvature_and_stays_definite(
 def test_between_two_plans_every_part_moves_by_the_same_share(rng):
     case = Case(rng)
     assert _between(case.plan, case.proposed, 1.0) is case.proposed
-    for share in (0.0, 0.25):
+    for step_length in (0.0, 0.25):
         for part, a, b in zip(
-            _between(case.plan, case.proposed, share),
+            _between(case.plan, case.proposed, step_length),
             case.plan,
             case.proposed,
             strict=True,
         ):
-            np.testing.assert_allclose(part, (1 - share) * a + share * b, atol=1e-15)
+            np.testing.assert_allclose(
+                part, (1 - step_length) * a + step_length * b, atol=1e-15
+            )
 
 
 def test_the_smallest_cost_is_of_a_thousandth_of_one_input():

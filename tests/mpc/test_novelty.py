@@ -134,8 +134,8 @@ def test_scales_of_angles_resting_columns_and_pseudo_data():
     assert scales.ranges[0] == np.pi
     assert scales.ranges[1] == pytest.approx(np.ptp(data.states[:, 1].numpy()))
     still = replace(data, states=data.states * torch.tensor([1.0, 0.0]))
-    kept = train(still, restarts=0).posterior
-    scales = data_scales(kept)
+    posterior = train(still, restarts=0).posterior
+    scales = data_scales(posterior)
     assert scales is not None
     assert scales.ranges[1] == np.inf
     sparse = SparseTrainer(inducing=20, restarts=0)(data).posterior
@@ -178,14 +178,14 @@ def test_novelty_of_a_plan_of_means_is_computed_when_read(gp, monkeypatch):
     decision = decide(controller(gp, "none"), 0.2)
     copied = replace(decision, suboptimal=True)
     assert not any(requests)
-    known = decision.novelty
+    novelty = decision.novelty
     assert sum(requests) == 1
-    assert decision.novelty == known == decision.plan_novelty
-    assert copied.novelty == known
+    assert decision.novelty == novelty == decision.plan_novelty
+    assert copied.novelty == novelty
 
 
 def test_it_is_not_known_of_models_that_are_no_gps():
-    known = KnownModel(Affine.identity(2, 1), 2, 1)
-    decision = decide(controller(known), 0.2)
+    nominal = KnownModel(Affine.identity(2, 1), 2, 1)
+    decision = decide(controller(nominal), 0.2)
     assert math.isnan(decision.novelty)
     assert not decision.far_from_data

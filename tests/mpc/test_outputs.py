@@ -333,9 +333,9 @@ def test_functions_are_checked_where_a_flight_starts():
         Problem(
             cost, outputs=[LeastSquares(torch.log, weight, np.zeros((H, 3)))]
         ).check_start(*start)
-    kept = Inequality(lambda x, u: u.log().sum(dim=1))
+    log_of_inputs = Inequality(lambda x, u: u.log().sum(dim=1))
     with pytest.raises(
         SettingError,
         match=r"h or its gradient is not finite at x = .* where the flight starts",
     ):
-        Problem(cost, constraints=[kept]).check_start(*start)
+        Problem(cost, constraints=[log_of_inputs]).check_start(*start)

@@ -99,8 +99,8 @@ def test_a_non_finite_state_never_reaches_the_controller():
 
 
 def test_before_a_plan_the_reference_input_applies_or_it_stops():
-    known = Reference(np.zeros((5, 1)), np.full((4, 1), 7.0))
-    assert [c.input[0] for c in run(Planner(0, 1), 3, "hold", reference=known)] == [
+    reference = Reference(np.zeros((5, 1)), np.full((4, 1), 7.0))
+    assert [c.input[0] for c in run(Planner(0, 1), 3, "hold", reference=reference)] == [
         7,
         7,
         20,

@@ -40,10 +40,10 @@ def by_differences(gp, along, by_input, width=1e-4):
     ends = torch.from_numpy(middle + width * np.outer([1, -1], direction))
     kernel = (gp.lengthscales, gp.signal_variance)
     joint = kernel_matrix(ends, ends, *kernel)
-    known = kernel_matrix(gp.features, ends, *kernel)
+    cross = kernel_matrix(gp.features, ends, *kernel)
     variances = []
     for i in range(2):
-        solved = torch.linalg.solve_triangular(gp.cholesky[i], known[i], upper=False)
+        solved = torch.linalg.solve_triangular(gp.cholesky[i], cross[i], upper=False)
         covariance = joint[i] - solved.mT @ solved
         difference = torch.tensor([1.0, -1.0], dtype=torch.float64)
         spread = difference @ covariance @ difference
@@ -64,8 +64,8 @@ def test_models_around_a_gp_are_looked_through(gp):
     assert covariances[:2, :3, :3] == pytest.approx(slope_covariances(gp, STATE, INPUT))
     assert not covariances[2].any()
     assert not covariances[:, 3].any()
-    known = KnownModel(Affine.identity(2, 1), 2, 1)
-    assert not slope_covariances(known, STATE, INPUT).any()
+    nominal = KnownModel(Affine.identity(2, 1), 2, 1)
+    assert not slope_covariances(nominal, STATE, INPUT).any()
 
 
 def test_an_angle_is_seen_through_its_sine_and_cosine():
@@ -112,12 +112,14 @@ def test_only_growth_along_the_data_is_a_warning():
     cost = Tracking([1.0, 1.0, 0.01], [0.01], penalized="inputs")
     problem = Problem(cost, inputs=Box([-2.0], [2.0]))
 
-    def known(horizon):
+    def stability(horizon):
         controller = GPMPC(model, Linearization(), problem, horizon, [0.0])
         return controller.stability([1.0, 0.0, 0.0])
 
-    assert known(30).spectral_radius > 1.005  # off the circle
-    assert known(30).stable
-    assert not known(2).stable
-    (line,) = known(2).warnings
-    assert line.endswith(f"it settles with {known(30).shortest_horizon} steps or more")
+    assert stability(30).spectral_radius > 1.005  # off the circle
+    assert stability(30).stable
+    assert not stability(2).stable
+    (line,) = stability(2).warnings
+    assert line.endswith(
+        f"it settles with {stability(30).shortest_horizon} steps or more"
+    )

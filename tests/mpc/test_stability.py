@@ -129,11 +129,11 @@ def test_the_linear_loop_is_the_controller_near_its_rest(changes):
 
 def test_too_short_a_horizon_for_an_inverse_response_is_named():
     system = quadruple_tank()
-    known = tank_loop(10).stability(TANK_GOAL)
-    assert not known.stable
-    assert known.spectral_radius == pytest.approx(1.135, abs=5e-3)
-    shortest = known.shortest_horizon
-    (line,) = known.warnings
+    stability = tank_loop(10).stability(TANK_GOAL)
+    assert not stability.stable
+    assert stability.spectral_radius == pytest.approx(1.135, abs=5e-3)
+    shortest = stability.shortest_horizon
+    (line,) = stability.warnings
     assert line.startswith("horizon 10: ")
     assert line.endswith(f"it settles with {shortest} steps or more")
     ends = {}
@@ -160,7 +160,7 @@ def test_too_quick_an_estimate_for_a_delay_is_named():
     def swing(disturbance_gain):
         bounds = Box([-20.0], [20.0])
         controller = late_integrator(disturbance_gain, bounds=bounds)
-        known = controller.stability(np.zeros(1 + LATE))
+        stability = controller.stability(np.zeros(1 + LATE))
         on_their_way = deque([np.zeros(1)] * LATE, LATE)
         state = np.zeros(1)
         plan = None
@@ -172,7 +172,7 @@ def test_too_quick_an_estimate_for_a_delay_is_named():
             state = state + 0.7 * 0.1 * on_their_way[0]  # it does less than believed
             on_their_way.append(plan.input)
             positions.append(state[0])
-        return known, np.ptp(positions[-50:])
+        return stability, np.ptp(positions[-50:])
 
     quick, circling = swing(0.7)
     assert circling > 1.0
@@ -182,8 +182,8 @@ def test_too_quick_an_estimate_for_a_delay_is_named():
     assert line.startswith("disturbance_gain 0.7 is too large")
     assert line.endswith(f"{quick.safe_disturbance_gain:.2g} is safe")
     for disturbance_gain in (0.0, 0.1, quick.safe_disturbance_gain):
-        known, circling = swing(disturbance_gain)
-        assert not known.warnings
+        stability, circling = swing(disturbance_gain)
+        assert not stability.warnings
         assert circling < 0.05
 
 
@@ -223,10 +223,10 @@ def test_what_nothing_weighs_may_stand_still():
     cart = linear([[1.0, 0.1], [0.0, 1.0]], [[0.005], [0.1]])
     for penalized in ("inputs", "increments"):
         cost = Tracking([0.0, 1.0], [0.1], penalized=penalized)
-        known = loop_of(cart, cost, 10, [0.0]).stability([0.0, 0.0])
-        assert known.spectral_radius == pytest.approx(1.0, abs=1e-6)
-        assert known.stable
-        assert not known.warnings
+        stability = loop_of(cart, cost, 10, [0.0]).stability([0.0, 0.0])
+        assert stability.spectral_radius == pytest.approx(1.0, abs=1e-6)
+        assert stability.stable
+        assert not stability.warnings
     effect = torch.tensor([[0.0], [0.1]], dtype=torch.float64)
     pushed = DisturbedModel(cart, effect, [0.01])
     cost = Tracking([1.0, 0.1, 0.0], [0.1])
@@ -241,18 +241,22 @@ def test_of_learned_integrators_a_little_growth_does_not_count():
     after = np.array([step(system, x, u) for x, u in zip(states, inputs, strict=True)])
     after += rng.normal(0, 1e-3, after.shape)
     gp = Trainer(restarts=0)(Transitions(states, inputs, after), seed=0).posterior
-    known = loop_of(gp, Tracking([0.0, 1.0], [0.1]), 10, [0.0]).stability([0.0, 0.0])
-    assert known.judged
-    assert abs(known.spectral_radius - 1.0) < 1e-3
-    assert not known.warnings
+    stability = loop_of(gp, Tracking([0.0, 1.0], [0.1]), 10, [0.0]).stability(
+        [0.0, 0.0]
+    )
+    assert stability.judged
+    assert abs(stability.spectral_radius - 1.0) < 1e-3
+    assert not stability.warnings
 
 
 def test_a_mode_that_no_horizon_holds_is_said_to_be_one():
     lost = linear([[1.1, 0.0], [0.0, 0.5]], [[0.0], [1.0]])  # the input reaches nothing
-    known = loop_of(lost, Tracking([1.0, 1.0], [0.1]), 5, [0.0]).stability([0.0, 0.0])
-    assert known.shortest_horizon is None
-    assert known.horizons == 100
-    assert known.warnings[0].endswith(
+    stability = loop_of(lost, Tracking([1.0, 1.0], [0.1]), 5, [0.0]).stability(
+        [0.0, 0.0]
+    )
+    assert stability.shortest_horizon is None
+    assert stability.horizons == 100
+    assert stability.warnings[0].endswith(
         "so it does with any up to 100: change the weights"
     )
 
@@ -260,10 +264,10 @@ def test_a_mode_that_no_horizon_holds_is_said_to_be_one():
 def test_a_reference_at_which_nothing_can_rest_is_not_judged():
     stable = linear([[0.5]], [[1.0]])
     bounded = loop_of(stable, Tracking([1.0], [0.1]), 5, [0.0], bounds=Box([-1], [1]))
-    known = bounded.stability([10.0])  # it would take an input of 5
-    assert not known.judged
-    assert np.isnan(known.spectral_radius)
-    assert not known.warnings
+    stability = bounded.stability([10.0])  # it would take an input of 5
+    assert not stability.judged
+    assert np.isnan(stability.spectral_radius)
+    assert not stability.warnings
     assert bounded.stability([1.0]).judged
 
 
@@ -272,24 +276,24 @@ def test_some_points_of_a_trajectory_are_judged_with_its_inputs():
     controller = loop_of(cart, Tracking([1.0, 0.1], [0.1]), 20, [0.0])
     times = 0.1 * np.arange(200)
     moving = np.column_stack([np.sin(times), np.cos(times)])
-    known = controller.stability(Reference(moving))
-    assert len(known.states) == 10
-    off = np.linalg.norm(known.states[:, None] - moving, axis=2).min(axis=1)
+    stability = controller.stability(Reference(moving))
+    assert len(stability.states) == 10
+    off = np.linalg.norm(stability.states[:, None] - moving, axis=2).min(axis=1)
     assert off.max() < 1e-2
-    held = controller.stability([0.0, 0.0])
-    assert len(held.states) == 1
-    assert known.spectral_radius == pytest.approx(held.spectral_radius)
-    assert known.shortest_horizon == held.shortest_horizon
+    at_one_point = controller.stability([0.0, 0.0])
+    assert len(at_one_point.states) == 1
+    assert stability.spectral_radius == pytest.approx(at_one_point.spectral_radius)
+    assert stability.shortest_horizon == at_one_point.shortest_horizon
 
 
 def test_weights_by_stage_have_one_horizon():
     weights = np.tile(np.eye(4) * [1.0, 1.0, 0.0, 0.0], (10, 1, 1))
     weights[3] *= 2.0
     controller = loop_of(TANK, Tracking(weights, [0.1, 0.1]), 10, VOLTAGES)
-    known = controller.stability(TANK_GOAL)
-    assert not known.stable
-    assert known.shortest_horizon is None
-    assert known.warnings[0].endswith("try a longer one")
+    stability = controller.stability(TANK_GOAL)
+    assert not stability.stable
+    assert stability.shortest_horizon is None
+    assert stability.warnings[0].endswith("try a longer one")
     same = replace(controller.problem.cost, Q=np.tile(weights[0], (10, 1, 1)))
     alike = loop_of(TANK, same, 10, VOLTAGES).stability(TANK_GOAL)
     assert alike.shortest_horizon == tank_loop(10).stability(TANK_GOAL).shortest_horizon

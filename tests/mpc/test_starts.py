@@ -29,7 +29,7 @@ from gpmpc.status import Status
 from gpmpc.systems import cart_pole, double_pendulum, pendulum, step
 
 
-def known(system):
+def known_model(system):
     n = len(system.state_names)
     m = len(system.input_names)
     x = casadi.SX.sym("x", n)
@@ -51,7 +51,7 @@ def controller(system, Q, R, horizon, iterations=1, rolled_out=True, **bounds):
     )
     settings = PredictionSettings(covariance="none", rolled_out=rolled_out)
     return GPMPC(
-        known(system),
+        known_model(system),
         Linearization(),
         problem,
         horizon,

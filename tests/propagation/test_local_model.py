@@ -176,9 +176,7 @@ def test_the_roots_derivative_agrees_with_finite_differences(eigenvalues):
     "eigenvalues",
     [(0.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, 2.0, 2.0), (-1e-17, 1.0, 1.0)],
 )
-def test_a_missing_derivative_is_finite_and_0_in_the_null_space(
-    eigenvalues,
-):
+def test_a_missing_derivative_is_finite_and_0_in_the_null_space(eigenvalues):
     U = torch.linalg.qr(torch.randn(3, 3)).Q
     S = U @ torch.diag(torch.tensor(eigenvalues)) @ U.T
     S = (S + S.T) / 2 if any(eigenvalues) else torch.zeros(3, 3)

@@ -158,9 +158,7 @@ def test_no_answer_of_two_thousand_is_wrong(family, solve):
         "degenerate",
     ],
 )
-def test_rows_priced_above_their_multipliers_are_exactly_hard(
-    family,
-):
+def test_rows_priced_above_their_multipliers_are_exactly_hard(family):
     rng = np.random.default_rng([15, list(FAMILIES).index(family)])
     solver = DualActiveSet()
     feasible = 0
@@ -216,9 +214,7 @@ def test_what_only_looks_like_a_contradiction_is_solved(solve, share):
 
 
 @pytest.mark.parametrize("solve", [changing, prepared, primal])
-def test_a_zero_row_proves_infeasibility_beyond_rounding_only(
-    solve,
-):
+def test_a_zero_row_proves_infeasibility_beyond_rounding_only(solve):
     for bound, status in ((-1e-17, Status.SOLVED), (-1e-6, Status.INFEASIBLE)):
         problem = QuadraticProgram(
             np.eye(2), [-1.0, 2.0], np.zeros((1, 2)), h_upper=[bound]

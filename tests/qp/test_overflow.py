@@ -61,9 +61,7 @@ def test_one_overflowing_entry_is_seen_wherever_it_stands(size, mode):
         assert solution.status is Status.NUMERICAL_TROUBLE
 
 
-def test_a_refused_problem_is_not_answered_from_stale_memory(
-    monkeypatch,
-):
+def test_a_refused_problem_is_not_answered_from_stale_memory(monkeypatch):
     """A row whose norm overflows; zeros in memory read as SOLVED, with x = 0."""
     monkeypatch.setattr(np, "empty", np.zeros)
     rows = np.full((1, 3), 2e300)

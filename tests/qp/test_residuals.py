@@ -52,11 +52,11 @@ def by_definition(solution):
         price += caps[p] * missed if abs(y[p]) >= caps[p] else 0.0
         price += y[p] * bound if y[p] else 0.0
     for i in range(n):
-        rest = abs(P[i] @ x + q[i] + C[:, i] @ y) + np.abs(C[:, i]) @ stray
+        residual = abs(P[i] @ x + q[i] + C[:, i] @ y) + np.abs(C[:, i]) @ stray
         own = (
             np.abs(P[i]) @ np.abs(x) + abs(q[i]) + np.abs(C[:, i]) @ (np.abs(y) - stray)
         )
-        dual = max(dual, rest / max(own, zero * units[i]))
+        dual = max(dual, residual / max(own, zero * units[i]))
     gap = abs(x @ P @ x + q @ x + price) / max(
         abs(x @ P @ x), abs(q @ x), bounds, zero * free
     )

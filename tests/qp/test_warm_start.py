@@ -101,7 +101,7 @@ def test_memory_layout_and_integers_give_the_same_bits(rng):
     expected_lazy = solve_stacked(P, q, G, lower, upper)
     for change in (strided, np.asfortranarray, frozen):
         arrays = [change(array) for array in (P, q, G, lower, upper)]
-        kept = [array.copy() for array in arrays]
+        copies = [array.copy() for array in arrays]
         again = (
             DualActiveSet()
             .prepare(arrays[0], arrays[2])
@@ -110,7 +110,7 @@ def test_memory_layout_and_integers_give_the_same_bits(rng):
         np.testing.assert_array_equal(again.x, expected.x)
         again = solve_stacked(*arrays)
         np.testing.assert_array_equal(again.x, expected_lazy.x)
-        for array, copy in zip(arrays, kept, strict=True):
+        for array, copy in zip(arrays, copies, strict=True):
             np.testing.assert_array_equal(array, copy)
     np.testing.assert_array_equal(
         prepared.solve(q.astype(int), lower.tolist(), upper).x, expected.x
@@ -125,9 +125,9 @@ def test_memory_layout_and_integers_give_the_same_bits(rng):
 def test_a_solution_is_a_copy_that_later_solves_leave_alone(solve, rng):
     problem = feasible_problem(rng, 5, 5)
     first = solve(problem)
-    kept = first.x.copy()
+    first_x = first.x.copy()
     solve(feasible_problem(rng, 5, 5), first)
-    np.testing.assert_array_equal(first.x, kept)
+    np.testing.assert_array_equal(first.x, first_x)
 
 
 @pytest.mark.parametrize(("n", "m"), [(1, 1), (6, 9), (20, 40)])

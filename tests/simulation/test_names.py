@@ -245,9 +245,7 @@ def test_filters_sort_beliefs_inputs_and_measurements_by_name(model):
         filter.update(prior, pd.Series({"x": 0.3, "y": -0.5}))
 
 
-def test_beliefs_are_sorted_and_another_order_is_refused(
-    model,
-):
+def test_beliefs_are_sorted_and_another_order_is_refused(model):
     belief = Gaussian.certain(NUMBERS)
     named = Gaussian.certain(START)
     delayed = DelayedModel(model, 1)

@@ -192,11 +192,11 @@ def test_a_loop_of_ones_own_is_stopped_where_the_policy_says_so(kind):
         first.input, Liar.initial_input
     )  # there is nothing else to hold
     good = decide(Liar(), state, reference)
-    held = decide(Liar({0: kind}), state, reference, good, "hold")
-    assert held.failed
-    assert held.status is Status.NUMERICAL_TROUBLE
-    assert np.array_equal(held.input, good.input)
-    assert held.decision is None or not held.decision.applicable
+    command = decide(Liar({0: kind}), state, reference, good, "hold")
+    assert command.failed
+    assert command.status is Status.NUMERICAL_TROUBLE
+    assert np.array_equal(command.input, good.input)
+    assert command.decision is None or not command.decision.applicable
 
 
 def test_what_misses_a_bound_by_rounding_is_put_onto_it():

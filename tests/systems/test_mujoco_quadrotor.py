@@ -33,13 +33,13 @@ def test_without_drag_and_with_little_lag_it_is_the_rigid_body():
     model.dof_damping[:] = 0
     model.actuator_dynprm[:, 0] = 0.004
     body = replace(flown.nominal, dynamics=RigidBody(0.6, (0.0032, 0.0032, 0.0055)))
-    state = known = flown.dynamics.reset(0)
+    state = rigid = flown.dynamics.reset(0)
     thrusts = np.add(flown.initial_input, [0.03, -0.03, 0.02, -0.01])
     for _ in range(60):
         state = step(flown, state, thrusts)
-        known = step(body, known, thrusts)
+        rigid = step(body, rigid, thrusts)
     assert np.abs(state[6:]).max() > 0.1
-    assert state == pytest.approx(known, abs=0.02)
+    assert state == pytest.approx(rigid, abs=0.02)
 
 
 def test_wind_pushes_by_drag_and_thrusts_may_act_late():

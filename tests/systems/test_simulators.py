@@ -10,9 +10,10 @@ import pytest
 from gpmpc.datasets import RandomData
 from gpmpc.exceptions import DataError, Diverged, SettingError
 from gpmpc.gp import Trainer, standardize
-from gpmpc.mpc import GPMPC, Box, Problem, Tracking
+from gpmpc.mpc import GPMPC, Box, Decision, Problem, Timing, Tracking
 from gpmpc.propagation import Linearization
 from gpmpc.simulation import closed_loop, closed_loops
+from gpmpc.status import Status
 from gpmpc.studies.flight import Experiment, run_trial
 from gpmpc.systems import planar_quadrotor, step, step_many
 from gpmpc.systems.gymnasium_ import (
@@ -98,13 +99,13 @@ def test_our_environment_moves_as_its_system_and_ends_when_lost():
     assert np.hypot(state[0], state[2]) > 10
 
 
-def taken(**settings):
+def pendulum_environment(**settings):
     names = {"state_names": ["cosine", "sine", "rate"], "tracked": ["cosine", "sine"]}
     return gymnasium_system("Pendulum-v1", goal=[1, 0, 0], **(names | settings))
 
 
 def test_an_environment_is_learned_and_swung_up_like_a_system():
-    system = taken(units={"rate": "rad/s", "cosine": "1", "sine": "1"})
+    system = pendulum_environment(units={"rate": "rad/s", "cosine": "1", "sine": "1"})
     assert (system.time_step, system.input_lower, system.input_upper) == (
         0.05,
         (-2.0,),
@@ -135,12 +136,10 @@ def test_an_environment_is_learned_and_swung_up_like_a_system():
 class Pushing:
     """Always applies the same input."""
 
-    horizon, initial_input = 1, [1.0]
+    horizon = 1
+    initial_input = (1.0,)
 
     def control(self, belief, reference, previous=None):
-        from gpmpc.mpc import Decision, Timing
-        from gpmpc.status import Status
-
         n = len(belief.mean)
         return Decision(
             [1.0],
@@ -199,7 +198,8 @@ def test_an_actuators_lag_is_a_state_and_a_delay_waits(cart, lagging):
         cart, ["push"], sensors=["velocity", "tip"], observation={"input_delay": 2}
     )
     assert late.state_names == ("velocity", "tip1", "tip2", "tip3")
-    state, speeds = late.dynamics.reset(0), []
+    state = late.dynamics.reset(0)
+    speeds = []
     for _ in range(4):
         state = step(late, state, np.array([10.0]))
         speeds.append(state[0])
@@ -221,7 +221,7 @@ def test_misuse_of_simulators_is_one_clear_line(cart, tmp_path, monkeypatch):
         Worded(), observe=lambda observation: observation["a"], time_step=0.1
     )
     assert step(named, np.zeros(1), np.array([3.0])) == 1.0
-    system = taken()
+    system = pendulum_environment()
     started = system.dynamics.reset(0)
     for misuse, error, message in (
         (
