@@ -5,28 +5,29 @@ from pathlib import Path
 from gpmpc.exceptions import DataError
 
 LARGEST = 32 * 2**20  # of a record or an unfolded chunk of a recording [bytes]
-_ROOM = 64 * 2**20  # [bytes]
+_LEAST_LIMIT = 64 * 2**20  # [bytes]
 _RATIO = 300  # bytes a byte of the file; recordings are compressed 2 to 10 times
 
 
-def room(path: Path) -> int:
+def memory_limit(path: Path) -> int:
     """Returns the memory that a file's content may take [bytes].
 
     Recordings and logs of this size hold far less.
     """
-    return _ROOM + _RATIO * path.stat().st_size
+    return _LEAST_LIMIT + _RATIO * path.stat().st_size
 
 
-class Room:
+class MemoryBudget:
     """The memory that a file's content may still take.
 
     Readers take from it before they allocate. Records that are skipped cost time and
-    hardly any memory, and are counted as memory too: so time is bounded as well.
+    hardly any memory, and are counted as memory too: so time is bounded as well. Each
+    stage has a budget of its own: reading a file, and making rows of its tables.
     """
 
     def __init__(self, path: Path):
         self.path = path
-        self.size = room(path)  #: [bytes]
+        self.size = memory_limit(path)  #: [bytes]
         self.left = float(self.size)  #: [bytes]
 
     def take(self, size: float, what: str) -> None:

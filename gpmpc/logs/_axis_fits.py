@@ -4,6 +4,18 @@ Vectors are compared axis by axis. The *misfit* of two axes is a quantile of the
 difference over the same quantile of the larger one: 0 where they agree, about 1 where
 they have nothing to do with each other, 2 where one is the negative of the other. The
 smallest of five quantiles counts, so that neither glitches nor long rests decide.
+
+A fit supposes mistakes of whoever wrote the mapping: axes that changed places or signs,
+a wrong unit, a lag. The fit with the smallest score is the best one:
+
+    score = log misfit + CHANGE * cost
+    log misfit = sum over the axes of log(max(misfit, floor))
+    cost = axes cost + unit cost + lag cost                  [number of mistakes]
+
+    axes cost  fewest mistakes that make the change of the axes (``axis_changes``)
+    unit cost  0; 1 where all axes, or one, have a wrong unit; NO_UNIT where all have a
+               factor that no unit makes
+    lag cost   0; 1 where the vectors come later
 """
 
 import itertools
@@ -20,8 +32,8 @@ from gpmpc.logs._frames import FRD, NED
 QUANTILES = (0.5, 0.75, 0.9, 0.97, 0.99)  # of absolute values
 FEWEST = 50  # vectors that say something
 SHORTEST_LAG = 0.05  # [s] that is a lag
-NO_UNIT = 1.5  # mistakes that a factor counts for which no unit makes
-CHANGE = 0.7  # price of a mistake that is supposed, in logarithms of misfits
+NO_UNIT = 1.5  # mistakes that a factor costs which no unit makes
+CHANGE = 0.7  # of the score, by one mistake that is supposed
 
 
 class _AxisChanges(NamedTuple):
@@ -71,14 +83,34 @@ def count_mistakes(matrix: Array) -> float:
 
 @dataclass(frozen=True)
 class AxisFit:
-    """Measured vectors as those of a motion: factors * matrix @ vector, later."""
+    """Measured vectors as those of a motion: factors * matrix @ vector, later.
 
+    The module's text has the formula of its score.
+    """
+
+    misfits: Array  # of the axes (3,)
+    floor: float  # misfits below it count as this one
     matrix: Array = field(default_factory=lambda: np.eye(3))
     factors: Array = field(default_factory=lambda: np.ones(3))  # of the measured axes
     lag: float = 0.0  # [s] by which the measured ones come later
-    misfits: Array = field(default_factory=lambda: np.ones(3))
-    cost: float = 0.0  # number of mistakes
-    score: float = 0.0  # sum of the misfits' logarithms, with the cost
+    axes_cost: float = 0.0  # number of mistakes, likewise below
+    unit_cost: float = 0.0
+    lag_cost: float = 0.0
+
+    @property
+    def log_misfit(self) -> float:
+        """The sum of the logarithms of the misfits."""
+        return float(np.log(np.maximum(self.misfits, self.floor)).sum())
+
+    @property
+    def cost(self) -> float:
+        """The number of mistakes."""
+        return self.axes_cost + self.unit_cost + self.lag_cost
+
+    @property
+    def score(self) -> float:
+        """The score of the fit; the smaller, the better."""
+        return self.log_misfit + CHANGE * self.cost
 
 
 def absolute_quantiles(values: Array) -> Array:
@@ -103,11 +135,17 @@ def misfits(measured: Array, derived: Array) -> Array:
 
 
 class _UnitOption(NamedTuple):
-    """The scores of all changes of axes, where one unit is supposed to be wrong."""
+    """All changes of axes, where one unit is supposed to be wrong, or none."""
 
-    scores: Array  # (48,)
-    unit: int  # number of the unit; 0 is none
+    log_misfits: Array  # of each change of axes (48,)
+    unit_cost: float
+    unit: int  # number of the unit; 0 is the right one
     axis: int | None  # that has it; None: all three
+
+    @property
+    def scores(self) -> Array:
+        """The score of each change of axes (48,)."""
+        return self.log_misfits + CHANGE * (axis_changes().costs + self.unit_cost)
 
 
 def _fit_axes(
@@ -138,41 +176,37 @@ def _fit_axes(
     scale[axes] = units[best.unit]
     misfits_of_best = axis_misfits[0, change].copy()
     misfits_of_best[axes] = axis_misfits[best.unit, change, axes]
-    score = float(best.scores[change])
-    without_cost = float(np.log(np.maximum(misfits_of_best, floor)).sum())
     return AxisFit(
+        misfits=misfits_of_best,
+        floor=floor,
         matrix=changes.matrices[change],
         factors=scale,
-        lag=0.0,
-        misfits=misfits_of_best,
-        cost=(score - without_cost) / CHANGE,
-        score=score,
+        axes_cost=float(changes.costs[change]),
+        unit_cost=best.unit_cost,
     )
 
 
 def _unit_options(
     log_misfits: Array, units: Sequence[float], factors: Sequence[float]
 ) -> list[_UnitOption]:
-    """Scores all changes of axes with each unit, for all axes or for one.
+    """Lists the units with which all axes, or one, may be wrong; the first is none.
 
     Args:
         log_misfits: By unit, change of axes and axis (U, 48, 3).
         units: The factor of each; the first is 1 (U,).
-        factors: That wrong units make; another factor is no unit, and costs more.
+        factors: That wrong units make; another factor is no unit, and costs NO_UNIT.
     """
-    costs = axis_changes().costs
-    fits = log_misfits[0].sum(axis=1)
-    options = [_UnitOption(fits + CHANGE * costs, unit=0, axis=None)]
+    sums = log_misfits.sum(axis=2)  # (U, 48)
+    options = [_UnitOption(sums[0], unit_cost=0.0, unit=0, axis=None)]
     for unit in range(1, len(units)):
         is_unit = units[unit] in factors
-        price = CHANGE * (costs + (1 if is_unit else NO_UNIT))
-        scores = log_misfits[unit].sum(axis=1) + price
-        options.append(_UnitOption(scores, unit, axis=None))
+        unit_cost = 1.0 if is_unit else NO_UNIT
+        options.append(_UnitOption(sums[unit], unit_cost, unit, axis=None))
         if not is_unit:
             continue
         for axis in range(3):
-            gain = log_misfits[unit, :, axis] - log_misfits[0, :, axis]
-            options.append(_UnitOption(fits + gain + price, unit, axis))
+            change_of_axis = log_misfits[unit, :, axis] - log_misfits[0, :, axis]
+            options.append(_UnitOption(sums[0] + change_of_axis, unit_cost, unit, axis))
     return options
 
 
@@ -282,9 +316,5 @@ def fit_axes_and_lag(
         return fit
     rows = series.inside[lag]
     late = _fit_axes(series.later[lag][rows], derived[rows], factors, floor)
-    late_score = late.score + CHANGE
-    if late_score >= fit.score:
-        return fit
-    return replace(
-        late, lag=float(series.lags[lag]), cost=late.cost + 1, score=late_score
-    )
+    late = replace(late, lag=float(series.lags[lag]), lag_cost=1.0)
+    return late if late.score < fit.score else fit

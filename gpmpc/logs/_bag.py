@@ -21,7 +21,7 @@ from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, Schema
 
-from gpmpc._bounds import Room
+from gpmpc._bounds import MemoryBudget
 from gpmpc.exceptions import DataError, GpmpcError
 from gpmpc.logs._bag_clocks import choose_times
 from gpmpc.logs._encodings import UnreadError, find_decoder
@@ -73,14 +73,14 @@ class _TopicTable:
     log_times: array = field(default_factory=lambda: array("Q"))  # [ns]
     malformed: int = 0
 
-    def append(self, log_time: int, cells: Cells, room: Room) -> None:
+    def append(self, log_time: int, cells: Cells, budget: MemoryBudget) -> None:
         """Adds a message; where it has no number that others have, NaN stands."""
         rows = len(self.log_times)
         new_paths = [path for path in cells if path not in self.columns]
         absent = len(self.columns) + len(new_paths) - len(cells)
         size = TEXT_BYTES * (len(cells) + absent)
         size += NUMBER_BYTES * rows * len(new_paths)
-        room.take(size, "the numbers of its messages")
+        budget.take(size, "the numbers of its messages")
         for path in new_paths:
             self.columns[path] = array("d", [np.nan]) * rows
         for path, value in cells.items():
@@ -142,11 +142,11 @@ def read_bag(path: Path, options: ReadOptions) -> LogFile | None:
         DataError: The file is damaged, or a topic is missing or cannot be read.
     """
     unseen_flaws = [flaw for flaw in bag_flaws(path) if flaw.kind in _UNSEEN]
-    bag = _Bag(path, options, Room(path))
+    bag = _Bag(path, options, MemoryBudget(path))
     try:
         if not options.partial:
             _check_counts(unseen_flaws)
-        for record in _records(path, bag.room, bag.note_damage):
+        for record in _records(path, bag.budget, bag.note_damage):
             bag.add(record)
             if bag.is_recording:
                 return None
@@ -187,7 +187,7 @@ class _Bag:
 
     path: Path
     options: ReadOptions
-    room: Room
+    budget: MemoryBudget
     schemas: dict[int, Schema] = field(default_factory=dict)
     channels: dict[int, _Channel] = field(default_factory=dict)
     tables: dict[str, _TopicTable] = field(default_factory=dict)  # by topic
@@ -208,13 +208,13 @@ class _Bag:
             if kind == Opcode.MESSAGE:
                 self._add_message(content)
             elif kind == Opcode.SCHEMA and number not in self.schemas:
-                self.room.take(_CHANNEL_BYTES, "its definitions")
+                self.budget.take(_CHANNEL_BYTES, "its definitions")
                 schema = _parsed(Schema, content)
                 self.schemas[number] = schema
                 if schema.name == _RECORDING and not any(self.options.topics):
                     self.is_recording = True
             elif kind == Opcode.CHANNEL and number not in self.channels:
-                self.room.take(_CHANNEL_BYTES, "its channels")
+                self.budget.take(_CHANNEL_BYTES, "its channels")
                 self.channels[number] = self._channel(_parsed(Channel, content))
         except _Damaged as error:
             self.note_damage(str(error))
@@ -225,7 +225,7 @@ class _Bag:
             return _Channel(channel.topic, decode=None)
         try:
             schema = self.schemas.get(channel.schema_id)
-            return _Channel(channel.topic, find_decoder(channel, schema, self.room))
+            return _Channel(channel.topic, find_decoder(channel, schema, self.budget))
         except UnreadError as error:
             return _Channel(channel.topic, decode=None, refusal=str(error))
 
@@ -241,7 +241,7 @@ class _Bag:
         if channel.decode is None:
             return
         data = content[_MESSAGE.size :]
-        self.room.take(_DECODED_BYTES + _COPIES * len(data), "its messages")
+        self.budget.take(_DECODED_BYTES + _COPIES * len(data), "its messages")
         table = self.tables.setdefault(channel.topic, _TopicTable())
         try:
             cells = channel.decode(data)
@@ -256,7 +256,7 @@ class _Bag:
                 f"{self.path}: message {channel.messages} of {channel.topic} cannot be "
                 f"read: {reason}; partial=true leaves it out"
             ) from error
-        table.append(log_time, cells, self.room)
+        table.append(log_time, cells, self.budget)
         check_column_count(self.path, len(table.columns), channel.topic)
 
     def check_topics(self) -> None:
@@ -321,13 +321,13 @@ class _Bag:
 
 
 def _records(
-    path: Path, room: Room, note_damage: Callable[[str], None]
+    path: Path, budget: MemoryBudget, note_damage: Callable[[str], None]
 ) -> Iterator[_Record]:
     """Yields the records of the data section, those inside of chunks in their place.
 
     Args:
         path: An MCAP file.
-        room: What chunks unfold to is taken from it.
+        budget: What chunks unfold to is taken from it.
         note_damage: Takes what is broken, in words; may raise.
     """
     size = path.stat().st_size
@@ -349,15 +349,18 @@ def _records(
                 return
             head = _HEAD.pack(kind, len(content))
             checksum = zlib.crc32(content, zlib.crc32(head, checksum))
-            room.take(_RECORD_BYTES, "its records")
+            budget.take(_RECORD_BYTES, "its records")
             if kind == Opcode.CHUNK:
-                yield from _records_of_chunk(content, position, room, note_damage)
+                yield from _records_of_chunk(content, position, budget, note_damage)
             else:
                 yield record
 
 
 def _records_of_chunk(
-    content: bytes, position: int, room: Room, note_damage: Callable[[str], None]
+    content: bytes,
+    position: int,
+    budget: MemoryBudget,
+    note_damage: Callable[[str], None],
 ) -> Iterator[_Record]:
     """Yields the records of a chunk that stands at a position, up to damage."""
     where = f"at byte {position}"
@@ -366,7 +369,7 @@ def _records_of_chunk(
         begin = chunk.message_start_time / 1e9
         end = chunk.message_end_time / 1e9
         where = f"with the messages from {begin} to {end} s"
-        yield from _inside(_unfold(chunk, room), room)
+        yield from _inside(_unfold(chunk, budget), budget)
     except _Damaged as error:
         note_damage(f"a chunk {where} is damaged: {error}")
 
@@ -382,16 +385,16 @@ def _next_record(file: BinaryIO, size: int) -> _Record | None:
     return _Record(kind, file.read(length))
 
 
-def _unfold(chunk: Chunk, room: Room) -> bytes:
+def _unfold(chunk: Chunk, budget: MemoryBudget) -> bytes:
     """Decompresses a chunk; ``_Damaged`` where its size or its checksum is another."""
-    room.take(chunk.uncompressed_size, "its chunks")
+    budget.take(chunk.uncompressed_size, "its chunks")
     try:
-        return unfolded(chunk, largest=room.size)
+        return unfolded(chunk, largest=budget.size)
     except BROKEN as error:
         raise _Damaged("its size, its checksum or its compression is wrong") from error
 
 
-def _inside(data: bytes, room: Room) -> Iterator[_Record]:
+def _inside(data: bytes, budget: MemoryBudget) -> Iterator[_Record]:
     """Yields the records of an unfolded chunk."""
     position = 0
     while position < len(data):
@@ -402,7 +405,7 @@ def _inside(data: bytes, room: Room) -> Iterator[_Record]:
         position = begin + length
         if position > len(data):
             raise _Damaged("it ends within a record")
-        room.take(_RECORD_BYTES, "its records")
+        budget.take(_RECORD_BYTES, "its records")
         if kind in (Opcode.MESSAGE, Opcode.SCHEMA, Opcode.CHANNEL):
             yield _Record(kind, data[begin:position])
 

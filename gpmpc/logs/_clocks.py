@@ -19,7 +19,7 @@ MOST_FIT = 0.9  # of the rows out of order that have to fit, to be sorted
 JUMP = 60.0  # [s] from which a step of time is a jump, if it is also
 JUMP_STEPS = 100  # usual time steps: over neither is anything resampled
 ORDER_ROWS = "name the column of the runs, or order the rows"
-ORDER_TOPICS = "stamp: log takes the times of the log"
+ORDER_TOPICS = "write 'stamp: log' to take the times of logging"
 
 
 class Stamps(NamedTuple):

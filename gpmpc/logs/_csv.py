@@ -12,7 +12,7 @@ from typing import Any
 
 import pandas as pd
 
-from gpmpc._bounds import Room
+from gpmpc._bounds import MemoryBudget
 from gpmpc.exceptions import DataError
 from gpmpc.logs._csv_text import DELIMITERS, CsvText, open_csv
 from gpmpc.logs._file import (
@@ -37,13 +37,13 @@ if int(pd.__version__.split(".")[0]) < 3:
 
 def read_csv(path: Path, options: ReadOptions) -> LogFile:
     """Reads a file, packed or not, as one table."""
-    room = Room(path)
-    _check_text(path, room)
+    budget = MemoryBudget(path)
+    _check_text(path, budget)
     with _open(path) as file:
         csv = open_csv(str(path), file)
         with warnings.catch_warnings():  # of rows that are longer than the header
             warnings.simplefilter("error", pd.errors.ParserWarning)
-            table = _read_in_parts(csv, room)
+            table = _read_in_parts(csv, budget)
     findings: tuple[Finding, ...] = ()
     if csv.is_cut:
         text = "the last line has no end, and may be cut within a number: left out"
@@ -58,7 +58,7 @@ def _open(path: Path) -> io.BufferedReader:
     return path.open("rb")
 
 
-def _check_text(path: Path, room: Room) -> None:
+def _check_text(path: Path, budget: MemoryBudget) -> None:
     """Counts what a text file unfolds to, before anything of it is parsed."""
     with _open(path) as file:
         first_line = file.readline(LONGEST_LINE)
@@ -72,7 +72,7 @@ def _check_text(path: Path, room: Room) -> None:
             if b'"' in block:
                 copies = 1 + _QUOTED_COPIES
             cells = _count_delimiters(block) + lines
-            room.take(copies * len(block) + NUMBER_BYTES * cells, "its text")
+            budget.take(copies * len(block) + NUMBER_BYTES * cells, "its text")
             block = file.read(LONGEST_LINE)
 
 
@@ -80,12 +80,12 @@ def _count_delimiters(text: bytes) -> int:
     return max(text.count(delimiter) for delimiter in _DELIMITERS)
 
 
-def _read_in_parts(csv: CsvText, room: Room) -> pd.DataFrame:
+def _read_in_parts(csv: CsvText, budget: MemoryBudget) -> pd.DataFrame:
     """Parses text part by part, so that texts are counted before there are many."""
     parts: list[pd.DataFrame] = []
     text_columns: set[Any] = set()
     with pd.read_csv(
-        csv.text,
+        csv.stream,
         sep=csv.delimiter,
         decimal=csv.decimal,
         chunksize=max(_CELLS_PER_PART // len(csv.names), 1),
@@ -95,10 +95,10 @@ def _read_in_parts(csv: CsvText, room: Room) -> pd.DataFrame:
     ) as reader:
         for part in reader:
             texts = part.select_dtypes(exclude=["number", "bool"])
-            room.take(TEXT_BYTES * texts.size, "its texts")
+            budget.take(TEXT_BYTES * texts.size, "its texts")
             text_columns.update(texts.columns)
             parts.append(part)
     # Numbers in a column that also holds texts become objects, like texts.
     numbers = sum(part[column].size for part in parts for column in text_columns)
-    room.take(TEXT_BYTES * numbers, "its texts")
+    budget.take(TEXT_BYTES * numbers, "its texts")
     return pd.concat(parts, ignore_index=True)

@@ -33,7 +33,7 @@ _ENCODING_MARKS = (  # the longer marks first: that of UTF-32 begins as that of 
 class CsvText(NamedTuple):
     """The text of a CSV file in the form that pandas reads, and how it is written."""
 
-    text: "_Text"  #: the names of the columns and the rows, without comments
+    stream: "_CsvStream"  #: the names of the columns and the rows, without comments
     names: list[str]  #: of the columns
     delimiter: str
     decimal: str  #: the decimal mark
@@ -44,7 +44,7 @@ class CsvText(NamedTuple):
 
         It may be cut within a number, and is left out.
         """
-        return self.text.lines.is_cut
+        return self.stream.lines.is_cut
 
 
 def open_csv(label: str, file: io.BufferedReader) -> CsvText:
@@ -73,7 +73,7 @@ def open_csv(label: str, file: io.BufferedReader) -> CsvText:
             f"{', '.join(names)}"
         )
     return CsvText(
-        text=_Text(head, lines),
+        stream=_CsvStream(head, lines),
         names=names,
         delimiter=delimiter,
         decimal=_decimal_mark(label, names, head[1:], delimiter),
@@ -88,7 +88,7 @@ class _Lines(Iterator[str]):
         self.comment = ""  # before the first line, the last one
         self.is_cut = False  # the last line has no end
         self._label = label
-        self._text = io.TextIOWrapper(file, encoding=self.encoding)
+        self._stream = io.TextIOWrapper(file, encoding=self.encoding)
         self._count = 0
         self._began = False
 
@@ -111,7 +111,7 @@ class _Lines(Iterator[str]):
         """Reads the next line with its end; an empty one behind the last."""
         self._count += 1
         try:
-            return self._text.readline()
+            return self._stream.readline()
         except UnicodeDecodeError as error:
             byte = f"byte 0x{error.object[error.start]:02x} near line {self._count}"
             name = self.encoding.removesuffix("-sig").upper()
@@ -120,8 +120,8 @@ class _Lines(Iterator[str]):
             ) from error
 
 
-class _Text(io.TextIOBase):
-    """A file for pandas of the lines of the head and of those behind them."""
+class _CsvStream(io.TextIOBase):
+    """A text stream for pandas: the lines of the head, and those behind them."""
 
     def __init__(self, head: list[str], lines: _Lines):
         self.lines = lines

@@ -9,7 +9,7 @@ from typing import Any
 
 from mcap.records import Channel, Schema
 
-from gpmpc._bounds import Room
+from gpmpc._bounds import MemoryBudget
 from gpmpc.exceptions import GpmpcError
 from gpmpc.logs._file import MOST_COLUMNS, first_line, needs_extra
 from gpmpc.logs._ros2 import LISTED, Cells, Decode, ros2_decoder
@@ -23,7 +23,9 @@ class UnreadError(Exception):
     """Messages are of a kind that is not read; the text says why."""
 
 
-def find_decoder(channel: Channel, schema: Schema | None, room: Room) -> Decode:
+def find_decoder(
+    channel: Channel, schema: Schema | None, budget: MemoryBudget
+) -> Decode:
     """Returns the function that reads the numbers of a channel's messages.
 
     Raises:
@@ -34,7 +36,7 @@ def find_decoder(channel: Channel, schema: Schema | None, room: Room) -> Decode:
     try:
         if message == "cdr" and schema and definition == "ros2msg":
             text = schema.data.decode()
-            return ros2_decoder(schema.name, text, room)
+            return ros2_decoder(schema.name, text, budget)
         if message == "json":
             return _decode_json
         if message == "protobuf" and schema and definition == "protobuf":

@@ -40,8 +40,12 @@ class LogFile(NamedTuple):
 class LogReader(Protocol):
     """Reads files of one format.
 
-    A reader counts what it will allocate (``gpmpc._bounds.Room``) before it does, and
-    may raise whatever its library raises: ``read_file`` makes a ``DataError`` of it.
+    The time of a row is in seconds: in the column ``STAMP`` of a message, or else in
+    the column "timestamp"; another column is the mapping's to name, with its unit.
+
+    A reader counts what it will allocate (``gpmpc._bounds.MemoryBudget``) before it
+    does, and may raise whatever its library raises: ``read_file`` makes a ``DataError``
+    of it.
     """
 
     def __call__(self, path: Path, options: ReadOptions) -> LogFile:

@@ -5,11 +5,15 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Finding:
-    """Something that was noticed in a run, and what was done about it."""
+    """Something that was noticed in a run, and what was done about it.
+
+    Counts of different kinds cannot be added up: a row that is left out for a missing
+    value may also be counted as a sample with a sentinel.
+    """
 
     kind: str  # such as "gap", "repeated stamp", "at rest"
     run: str
-    count: int  # rows, or gaps
+    count: int  # of rows, samples or gaps, as the text says
     text: str
 
 

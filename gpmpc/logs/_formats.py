@@ -5,7 +5,8 @@ interpreted here. Memory and time stay in proportion to the file's size: what a 
 declares or unfolds to is counted before it is allocated (``gpmpc._bounds``).
 
 To add a format, write its reader in a file of its own, as a function with the signature
-of ``LogReader`` (``_npz`` is a short example), and enter it in ``READERS``.
+of ``LogReader``, and enter it in ``READERS``. The models are ``_npz`` for a format with
+a single table, and ``_ulog`` for one with topics.
 """
 
 from collections.abc import Iterable
@@ -26,10 +27,12 @@ from gpmpc.logs._npz import read_npz
 from gpmpc.logs._parquet import read_parquet
 from gpmpc.logs._ulog import read_ulog
 
-#: by the ending of the file's name, in front of which ".gz" is left out
+#: by the ending of the file's name
 READERS: dict[str, LogReader] = {
     ".csv": read_csv,
+    ".csv.gz": read_csv,
     ".tsv": read_csv,
+    ".tsv.gz": read_csv,
     ".parquet": read_parquet,
     ".npz": read_npz,
     ".mcap": read_mcap,
@@ -80,7 +83,7 @@ def read_file(
 
 
 def _find_reader(path: Path) -> LogReader:
-    name = path.name.lower().removesuffix(".gz")
+    name = path.name.lower()
     for ending, reader in READERS.items():
         if name.endswith(ending):
             return reader

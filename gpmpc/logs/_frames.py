@@ -3,6 +3,10 @@
 The world's axes are east, north, up (ENU) and the body's forward, left, up (FLU), so
 that gravity is ``GRAVITY`` in every log.
 Aviation, and PX4's logs, have north, east, down (NED) and forward, right, down (FRD).
+
+Two words are kept apart here: ``axes`` ("enu" or "ned") is the convention, ``frame``
+("world" or "body") is what a vector is measured in. Only the mapping's key ``frame``
+means the axes.
 """
 
 from collections.abc import Sequence
@@ -30,13 +34,13 @@ NAMES = {  # by the axes: of the world, and of the body
 }
 
 
-def with_frame_of_files(mapping: "LogMapping", files: Sequence[Path]) -> "LogMapping":
-    """Returns the mapping, with the frame of this kind of files where it says none.
+def with_axes_of_files(mapping: "LogMapping", files: Sequence[Path]) -> "LogMapping":
+    """Returns the mapping, with the axes of this kind of files where it says none.
 
     Raises:
         SettingError: It says none, and the files are of two kinds.
     """
-    if mapping.model != "rigid_body" or mapping.frame:
+    if mapping.model != "rigid_body" or mapping.axes:
         return mapping
     are_px4 = {file.suffix.lower() == ".ulg" for file in files}
     if len(are_px4) > 1:
@@ -44,7 +48,7 @@ def with_frame_of_files(mapping: "LogMapping", files: Sequence[Path]) -> "LogMap
             "frame",
             "must be enu or ned where PX4 logs, which are NED, are read with others",
         )
-    return replace(mapping, frame="ned" if are_px4 == {True} else "enu")
+    return replace(mapping, axes="ned" if are_px4 == {True} else "enu")
 
 
 def attitudes_to_enu(attitudes: Array, axes: str) -> Array:
@@ -84,8 +88,8 @@ class Claim:
         self.position, self.attitude, self.velocity, self.rate = mapping.of("states")
         self.velocity_frame = self.velocity.frame or "world"
         self.rate_frame = self.rate.frame or "body"
-        self.frame = mapping.frame or "enu"
-        self.axes = {
+        self.default_axes = mapping.axes or "enu"
+        self.axes = {  # by signal
             signal.name: mapping.axes_of(signal) for signal in mapping.of("states")
         }
 

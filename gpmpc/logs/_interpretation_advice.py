@@ -44,8 +44,8 @@ def mistakes_of(best: Interpretation, search: InterpretationSearch) -> list[str]
     """
     claim = search.claim
     if search.is_other_frame(best):
-        other = "ned" if claim.frame == "enu" else "enu"
-        world, body = NAMES[claim.frame]
+        other = "ned" if claim.default_axes == "enu" else "enu"
+        world, body = NAMES[claim.default_axes]
         other_world, other_body = NAMES[other]
         return [
             f"gravity says that all states are in {other_world} axes of the world and "

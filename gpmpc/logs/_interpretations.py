@@ -1,9 +1,19 @@
 """Searches among all interpretations of a rigid body's columns for those that fit.
 
 An interpretation says what the columns of position, attitude, velocity and rate are.
-Its score adds the logarithms of the misfits of three relations
-(``gpmpc.logs._conventions``) and a price for each mistake that it supposes: the fewest
-mistakes that explain a log come first.
+Its score has the form of that of a single fit (``gpmpc.logs._axis_fits``), over the
+three relations of ``gpmpc.logs._conventions``; the smallest one is the best. The fewest
+mistakes that explain a log come first:
+
+    score = log misfit of velocity, of rate and of tilt + CHANGE * (cost + hangs)
+    cost = OTHER_FRAME_COST                   where all is in NED instead of ENU; else:
+           attitude.cost + rate.cost
+           + 1 for the frame of the velocity, and for that of the rate, if not claimed
+           - SHARED_SOURCE                    (``_shared_by_attitude_and_rate``)
+           + cost of the position             (``_position_cost``)
+           + cost of the velocity             (``_velocity_cost``)
+
+``hangs`` is 1 where the lift points down: a body that hangs from its own top is rare.
 """
 
 import itertools
@@ -36,6 +46,10 @@ AGREEMENT = 0.15  # in that sum, which is more than chance
 DOUBTFUL = 0.2  # misfit from which another interpretation is looked for
 OTHER_FRAME_COST = 0.5  # of NED for ENU in all states: the commonest mistake
 SHARED_SOURCE = 0.75  # of a mistake: attitude and rate come from one sensor
+# Attitude and rate in NED are two mistakes if counted singly, and have one cause. No
+# cost is smaller by more than these two than the sum of its parts.
+MOST_SHARED = 2.0
+UP_IS_RARE = RARE - 1  # what makes one mistake of the axes a rare one
 # Misfits below these are noise or smoothing, and no reason to prefer an interpretation.
 FLOOR_VELOCITY = 0.05
 FLOOR_RATE = 0.1
@@ -85,14 +99,14 @@ class InterpretationSearch:
         claim = self.claim
         attitude = self.relations.claimed_attitude
         velocities = self.relations.velocities(attitude, claim.velocity_frame)
-        velocity = AxisFit(misfits=misfits(velocities.measured, velocities.derived))
+        velocity_misfits = misfits(velocities.measured, velocities.derived)
         rates = self.relations.rates(attitude, claim.rate_frame)
-        rate = AxisFit(misfits=misfits(rates.measured, rates.derived))
+        rate_misfits = misfits(rates.measured, rates.derived)
         return self._interpretation(
             attitude=attitude,
             position=np.eye(3),
-            velocity=replace(velocity, score=_score(velocity, FLOOR_VELOCITY)),
-            rate=replace(rate, score=_score(rate, FLOOR_RATE)),
+            velocity=AxisFit(velocity_misfits, floor=FLOOR_VELOCITY),
+            rate=AxisFit(rate_misfits, floor=FLOOR_RATE),
             velocity_frame=claim.velocity_frame,
             rate_frame=claim.rate_frame,
             body_axis=self.relations.body_axis(attitude),
@@ -168,19 +182,18 @@ class InterpretationSearch:
         return fit_axes_and_lag(series, derived, self.rate_factors, FLOOR_RATE)
 
     def _best_velocity_score(self, claimed: Interpretation, in_world: AxisFit) -> float:
-        """Returns a bound of the score of the velocity, from below."""
+        """Returns the log misfit of the velocity, or a bound of it from below."""
         if self._may_be_body_velocity(self.relations.claimed_attitude, claimed):
             return float(3 * np.log(FLOOR_VELOCITY))
-        return in_world.score - CHANGE * in_world.cost
+        return in_world.log_misfit
 
     def _least_rate_score(
         self, attitude: AttitudeInterpretation, rate_frame: str, rate: AxisFit
     ) -> float:
         """Returns a bound of the score of attitude and rate, from below."""
         is_other_frame = rate_frame != self.claim.rate_frame
-        # A mistake that several signals share counts once.
-        least_cost = attitude.cost + is_other_frame - 2
-        return rate.score + CHANGE * max(least_cost, -rate.cost)
+        cost = attitude.cost + rate.cost + is_other_frame
+        return rate.log_misfit + CHANGE * max(cost - MOST_SHARED, 0.0)
 
     def _least_agreement(self, claimed: Interpretation) -> float:
         """Returns the rate's correlations of which another attitude is worth while."""
@@ -243,34 +256,18 @@ class InterpretationSearch:
             lift=float(np.median((force * body_axis).sum(axis=-1))),
         )
         cost = self._cost(interpretation)
-        score = _score_with_cost(interpretation, cost)
+        score = _score(interpretation, cost)
         return replace(interpretation, cost=cost, score=score)
 
     def _cost(self, interpretation: Interpretation) -> float:
         """Counts mistakes; one that several signals share counts once."""
         if self.is_other_frame(interpretation):
             return OTHER_FRAME_COST
-        attitude = interpretation.attitude
-        cost = attitude.cost + interpretation.rate.cost
+        cost = interpretation.attitude.cost + interpretation.rate.cost
         cost += interpretation.velocity_frame != self.claim.velocity_frame
         cost += interpretation.rate_frame != self.claim.rate_frame
-        if attitude.turns_axes and _turns_rate(interpretation):
-            cost -= SHARED_SOURCE
-        fit = interpretation.velocity
-        unit, axes = unit_and_axes(interpretation.position)
-        if interpretation.velocity_frame == "body":
-            return cost + count_mistakes(axes) + (unit != 1) + fit.cost
-        if axes[2, 2] != 1 and not np.array_equal(axes, NED):
-            cost += RARE - 1  # whether z points up, gravity hardly says
-        # What the velocity is to the read position, it is to the true one by both.
-        mistakes = count_mistakes(axes)
-        if not np.array_equal(fit.matrix, np.eye(3)):
-            mistakes += count_mistakes(fit.matrix @ axes)
-        cost += mistakes
-        unit_cost = fit.cost - count_mistakes(fit.matrix) - (fit.lag != 0)
-        if unit_cost and np.allclose(fit.factors * unit, 1):
-            unit_cost = 0.0  # the unit of the position is the only one that is wrong
-        return cost + (unit != 1) + unit_cost + (fit.lag != 0)
+        cost -= _shared_by_attitude_and_rate(interpretation)
+        return cost + _position_cost(interpretation) + _velocity_cost(interpretation)
 
     def is_other_frame(self, interpretation: Interpretation) -> bool:
         """Tells whether all is in NED that is said to be in ENU, or the reverse."""
@@ -296,22 +293,63 @@ def _turns_rate(interpretation: Interpretation) -> bool:
     return np.array_equal(interpretation.rate.matrix, turned)
 
 
-def _score(fit: AxisFit, floor: float) -> float:
-    return float(np.log(np.maximum(fit.misfits, floor)).sum())
+def _shared_by_attitude_and_rate(interpretation: Interpretation) -> float:
+    """Returns what counts once where both have the wrong one of NED and ENU."""
+    if interpretation.attitude.turns_axes and _turns_rate(interpretation):
+        return SHARED_SOURCE
+    return 0.0
 
 
-def _score_with_cost(interpretation: Interpretation, cost: float) -> float:
-    """Adds the misfits' logarithms and the price of the mistakes."""
-    velocity = interpretation.velocity
-    rate = interpretation.rate
-    fits = velocity.score + rate.score - CHANGE * (velocity.cost + rate.cost)
-    score = fits + CHANGE * cost
+def _position_cost(interpretation: Interpretation) -> float:
+    """Counts the mistakes of the position: its axes and its unit."""
+    unit, axes = unit_and_axes(interpretation.position)
+    cost = count_mistakes(axes)
+    if unit != 1:
+        cost += 1
+    turns_up = axes[2, 2] != 1 and not np.array_equal(axes, NED)
+    if interpretation.velocity_frame == "world" and turns_up:
+        cost += UP_IS_RARE  # whether z points up, gravity hardly says
+    return cost
+
+
+def _velocity_cost(interpretation: Interpretation) -> float:
+    """Counts the mistakes of the velocity that are not those of the position."""
+    fit = interpretation.velocity
+    if interpretation.velocity_frame == "body":
+        return fit.cost
+    unit, axes = unit_and_axes(interpretation.position)
+    axes_cost = _world_velocity_axes_cost(fit, axes)
+    unit_cost = _world_velocity_unit_cost(fit, unit)
+    return axes_cost + unit_cost + fit.lag_cost
+
+
+def _world_velocity_axes_cost(fit: AxisFit, position_axes: Array) -> float:
+    """Counts the mistakes of the axes of a velocity in world axes.
+
+    Where it fits the position as that is read, both have the same axes, and the
+    mistakes are counted with the position. Otherwise the velocity is to the true
+    position what it is to the read one, and the read one to the true one.
+    """
+    if np.array_equal(fit.matrix, np.eye(3)):
+        return 0.0
+    return count_mistakes(fit.matrix @ position_axes)
+
+
+def _world_velocity_unit_cost(fit: AxisFit, position_unit: float) -> float:
+    """Counts a wrong unit of a velocity in world axes; 0 if the position's is wrong."""
+    if np.allclose(fit.factors * position_unit, 1):
+        return 0.0
+    return fit.unit_cost
+
+
+def _score(interpretation: Interpretation, cost: float) -> float:
+    """Returns the score of an interpretation by its number of mistakes."""
+    log_misfit = interpretation.velocity.log_misfit + interpretation.rate.log_misfit
     tilt = interpretation.tilt
     if tilt is not None and fits_tilt(tilt):
-        score += float(np.nansum(np.log(np.maximum(tilt, FLOOR_TILT))))
-    if interpretation.lift < 0:
-        score += CHANGE  # a body that hangs from its own top is rare
-    return score
+        log_misfit += float(np.nansum(np.log(np.maximum(tilt, FLOOR_TILT))))
+    hangs = 1.0 if interpretation.lift < 0 else 0.0
+    return log_misfit + CHANGE * (cost + hangs)
 
 
 def _positions_to_try(in_world: AxisFit) -> list[Array]:

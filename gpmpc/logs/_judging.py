@@ -36,7 +36,10 @@ _LINEARIZED = 100  # windows linearised at once
 
 @dataclass(frozen=True)
 class Judgement:
-    """Errors of a model and of the baselines on held-out runs."""
+    """Errors of a model and of the baselines on held-out runs.
+
+    ``gpmpc.mpc.Judgement`` is something else: it judges a step of a flight.
+    """
 
     groups: tuple[str, ...]  #: names of the groups of states
     units: tuple[str, ...]  #: of their errors

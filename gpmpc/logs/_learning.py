@@ -31,7 +31,7 @@ from gpmpc.logs._structures import (
     GroupGP,
     Structure,
     additions,
-    simplest_structure,
+    bases,
 )
 from gpmpc.models._log_dynamics import OutputNoise
 from gpmpc.models._log_model import LogModel, OutputGP
@@ -99,8 +99,9 @@ def learn(
         progress=progress,
         memory={} if memory is None else memory,
     )
-    search.consider(simplest_structure(log))
-    for addition in additions(log):
+    for base in bases(log):
+        search.consider(base)
+    for addition in additions(search.best.structure):
         structure = search.best.structure.extended(addition)
         if structure is not None and (addition.for_control or not for_control):
             search.consider(structure)
@@ -140,11 +141,11 @@ class Fold(NamedTuple):
 
 
 class Contender(NamedTuple):
-    """A structure with one model of each fold."""
+    """The structure that is best so far, with its models: those of the folds."""
 
     structure: Structure
     models: list[LogModel]
-    candidate: int  # its index among the candidates
+    candidate_index: int  # of its record among the candidates
 
 
 class Search:
@@ -156,8 +157,8 @@ class Search:
         steps: Of the rollouts.
         seed: Of every random number.
         progress: Called with a line for each structure.
-        memory: By the key of a structure, the parameters of its nominal model by fold,
-            or, where it has GPs, its errors.
+        memory: By the key of a structure without GPs, the parameters of its nominal
+            model by fold (lists of numbers); by the key of one with GPs, its errors.
     """
 
     def __init__(
@@ -174,7 +175,9 @@ class Search:
         self._steps = steps
         self._seed = seed
         self._progress = progress
-        self._memory = memory
+        # Two mappings in one, as files hold them: keys of structures with GPs differ.
+        self._known_parameters: MutableMapping[str, list[list[float]]] = memory
+        self._known_gp_errors: MutableMapping[str, list[list[float]]] = memory
         self._folds = split_folds(log)
         self._windows = [
             fold.held_out.windows(steps, past=PAST + LATE, most=_WINDOWS)
@@ -203,7 +206,7 @@ class Search:
     def candidates(self) -> tuple[Candidate, ...]:
         """All structures that were considered, in order; the best one is chosen."""
         candidates = list(self._candidates)
-        best = self.best.candidate
+        best = self.best.candidate_index
         candidates[best] = replace(candidates[best], chosen=True)
         return tuple(candidates)
 
@@ -217,38 +220,41 @@ class Search:
     def _consider_nominal(self, structure: Structure) -> None:
         """Considers a structure without GPs."""
         self._progress(f"{structure.name}: fitted on rollouts of {self._steps} steps")
-        if structure.key not in self._memory:
-            models = self._fit_folds(structure)
-            self._memory[structure.key] = [model.theta.tolist() for model in models]
-        parameters = self._memory[structure.key]
+        if structure.key not in self._known_parameters:
+            fitted = self._fit_folds(structure)
+            parameters = [model.theta.tolist() for model in fitted]
+            self._known_parameters[structure.key] = parameters
         models = [
             replace(structure.model, theta=np.array(theta, dtype=float))
-            for theta in parameters
+            for theta in self._known_parameters[structure.key]
         ]
-        if self._is_better(structure, self._errors(models)):
+        if self._enter(structure, self._errors(models)):
             self._make_best(structure, models)
 
     def _consider_gps(self, structure: Structure) -> None:
         """Considers a structure with GPs, of which the last one is new."""
         self._progress(structure.name)
         models = None
-        if structure.key not in self._memory:
+        if structure.key not in self._known_gp_errors:
             models = self._train_folds(structure)
-            self._memory[structure.key] = self._errors(models).tolist()
-        errors = np.array(self._memory[structure.key])
-        if self._is_better(structure, errors):
+            self._known_gp_errors[structure.key] = self._errors(models).tolist()
+        errors = np.array(self._known_gp_errors[structure.key])
+        if self._enter(structure, errors):
             self._make_best(structure, models or self._train_folds(structure))
 
-    def _is_better(self, structure: Structure, errors: Array) -> bool:
-        """Adds a candidate; returns whether it is better than the best one so far."""
+    def _enter(self, structure: Structure, errors: Array) -> bool:
+        """Enters a candidate; returns whether it is better than the best one so far."""
         self._candidates.append(Candidate(structure.name, errors))
         if self._best is None:
             return True
-        return is_improvement(errors, self._candidates[self._best.candidate].errors)
+        return is_improvement(
+            errors, self._candidates[self._best.candidate_index].errors
+        )
 
     def _make_best(self, structure: Structure, models: list[LogModel]) -> None:
-        """Makes the last candidate the best structure."""
-        self._best = Contender(structure, models, len(self._candidates) - 1)
+        """Makes the structure that was entered last the best one."""
+        last = len(self._candidates) - 1
+        self._best = Contender(structure, models, candidate_index=last)
 
     def _errors(self, models: Sequence[LogModel]) -> Array:
         """Computes mean errors of rollouts (steps, groups) on the held-out runs."""
@@ -265,18 +271,23 @@ class Search:
         if self._best is not None:
             simpler = self._best.models
         fits = [
-            fit_structure(structure.model, model, fold.train, self._steps)
+            fit_from(model, structure.model, fold.train, self._steps)
             for model, fold in zip(simpler, self._folds, strict=True)
         ]
         return [fit.model for fit in fits]
 
     def _train_folds(self, structure: Structure) -> list[LogModel]:
-        """Trains the last GP of a structure on each fold, beside those before it."""
-        earlier = len(structure.gps) - 1
+        """Trains the last GP of a structure on each fold, beside those before it.
+
+        ``learn`` goes through the groups one by one. So the best models have the GPs
+        before it, and behind them at most one more: the GP on the same group, averaged
+        over other rows, which the new one replaces.
+        """
+        others = len(structure.gps) - 1
         models = []
         for model, fold in zip(self.best.models, self._folds, strict=True):
             gp = self._train(structure.gps[-1], model, fold.train)
-            models.append(replace(model, gps=(*model.gps[:earlier], gp)))
+            models.append(replace(model, gps=(*model.gps[:others], gp)))
         return models
 
     def _train(self, gp: GroupGP, model: LogModel, log: Log) -> OutputGP:
@@ -297,9 +308,8 @@ class Search:
 
     def fit_to_all_runs(self) -> NominalFit:
         """Fits the nominal model of the best structure to all runs."""
-        structure = self.best.structure
-        first = self.best.models[0]
-        return fit_structure(structure.model, first, self._log, self._steps)
+        model = self.best.structure.model
+        return fit_from(self.best.models[0], model, self._log, self._steps)
 
     def train_on_all_runs(self, model: LogModel) -> tuple[OutputGP, ...]:
         """Trains the GPs of the best structure on all runs."""
@@ -326,21 +336,24 @@ def split_folds(log: Log) -> list[Fold]:
     return folds
 
 
-def fit_structure(
-    structure: LogModel, simpler: LogModel, log: Log, steps: int
-) -> NominalFit:
-    """Fits the nominal part of a structure.
+def fit_from(start_from: LogModel, model: LogModel, log: Log, steps: int) -> NominalFit:
+    """Fits the nominal part of a model.
 
-    The search begins at the parameters that a simpler model has in common with it.
+    Args:
+        start_from: The search begins at the parameters that this fitted model has in
+            common with the other.
+        model: The model, whose parameters are not known yet.
+        log: The data.
+        steps: Of the rollouts.
     """
-    nominal = structure.nominal
+    nominal = model.nominal
     if isinstance(nominal, AffineNominal) and nominal.fitted:
         # It is linear in its many parameters.
-        model = fit_least_squares(nominal.kinematics, log)
-        model = replace(model, history=structure.history)
-        return NominalFit(model, standard_errors=np.empty(0))
-    names = simpler.nominal.parameter_names
-    known = dict(zip(names, simpler.theta, strict=False))
-    start = zip(nominal.parameter_names, nominal.start, strict=True)
-    theta0 = np.array([known.get(name, value) for name, value in start])
-    return fit_nominal(structure, theta0, log, steps)
+        fitted = fit_least_squares(nominal.kinematics, log)
+        fitted = replace(fitted, history=model.history)
+        return NominalFit(fitted, standard_errors=np.empty(0))
+    names = start_from.nominal.parameter_names
+    fitted_values = dict(zip(names, start_from.theta, strict=False))
+    defaults = zip(nominal.parameter_names, nominal.start, strict=True)
+    theta0 = np.array([fitted_values.get(name, value) for name, value in defaults])
+    return fit_nominal(model, theta0, log, steps)

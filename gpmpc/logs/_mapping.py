@@ -34,8 +34,8 @@ _PLAIN_KEYS = (  # whose values are taken as they are
     "rest",
     "model",
     "stamp",
-    "frame",
 )
+_AXES_KEY = "frame"  # as files call the axes of all states
 _SIGNAL_KEYS = (
     "columns",
     "unit",
@@ -62,14 +62,16 @@ class Signal:
     #: quaternion).
     kind: str = "vector"
     order: str = "xyzw"  #: of a quaternion: "xyzw" or "wxyz"
-    #: "world" or "body", for velocities and rates of a rigid body; empty where it has
-    #: none
+    #: The frame that a rigid body's velocity or rate is measured in: "world" or "body";
+    #: empty where it has none.
     frame: str = ""
-    #: "enu" or "ned", for states of a rigid body; empty takes the mapping's frame.
+    #: The convention of the axes in both frames, for states of a rigid body: "enu" or
+    #: "ned" (see ``AXES``); empty takes the mapping's.
     axes: str = ""
     #: The values are multiplied by it: one number, or one for each column.
     scale: float | tuple[float, ...] = 1.0
-    #: [s] by which its values come later than their stamps say; they are moved back.
+    #: [s] by which its stamps are later than what was measured; the values are moved
+    #: back.
     delay: float = 0.0
     #: "hold", "linear" or "spherical"; by default states are interpolated and all else
     #: is held
@@ -203,9 +205,10 @@ class LogMapping:
     #: times of a bag's messages: "header" takes the stamps that they carry, "log" the
     #: times at which they were logged; empty takes what gives the topics time in common
     stamp: str = ""
-    #: of a rigid body's states: "enu" (the body FLU) or "ned" (the body FRD); empty
-    #: where nothing is said: "ned" in a PX4 log, and "enu" in any other.
-    frame: str = ""
+    #: The convention of the axes of a rigid body's states, under the key ``frame``:
+    #: "enu" (the body FLU) or "ned" (the body FRD); empty where nothing is said: "ned"
+    #: in a PX4 log, and "enu" in any other. A signal's ``frame`` is something else.
+    axes: str = ""
 
     def __post_init__(self) -> None:
         if self.stamp and self.time:
@@ -222,12 +225,12 @@ class LogMapping:
             ("rest", ("drop", "use")),
             ("model", ("rigid_body", "none")),
             ("stamp", ("", "header", "log")),
-            ("frame", ("", *AXES)),
         ):
             check_choice(key, getattr(self, key), choices)
-        if self.frame and self.model == "none":
+        check_choice(_AXES_KEY, self.axes, ("", *AXES))
+        if self.axes and self.model == "none":
             raise SettingError(
-                "frame", f"needs model: rigid_body; got {self.frame} without one"
+                _AXES_KEY, f"needs model: rigid_body; got {self.axes} without one"
             )
         check_choice("time.unit", self.time_unit, tuple(TIME_UNITS))
         if not self.of("states"):
@@ -281,7 +284,7 @@ class LogMapping:
 
     def axes_of(self, signal: Signal) -> str:
         """Returns the axes of a rigid body's state in the file: "enu" or "ned"."""
-        return signal.axes or self.frame or "enu"
+        return signal.axes or self.axes or "enu"
 
     def _turns_axes(self, signal: Signal) -> bool:
         """Tells whether a signal comes out in other axes than those of the file."""
@@ -329,7 +332,8 @@ class LogMapping:
         Raises:
             SettingError: A key or value is wrong.
         """
-        _check_keys("mapping", content, ("time", "keep", *_PLAIN_KEYS, *ROLES))
+        keys = ("time", "keep", *_PLAIN_KEYS, _AXES_KEY, *ROLES)
+        _check_keys("mapping", content, keys)
         signals = [signal for role in ROLES for signal in _read_signals(role, content)]
         time = content.get("time") or {}
         if isinstance(time, str):
@@ -342,6 +346,7 @@ class LogMapping:
             time=time.get("column", ""),
             time_unit=time.get("unit", "s"),
             keep=keep,
+            axes=content.get(_AXES_KEY, ""),
             **settings,
         )
 

@@ -27,9 +27,9 @@ _STEPS = (1, 2, 3, 5, 7, 10, 15, 20, 30, 50)  # whose errors are explained
 _WINDOWS = 2000  # of a fold, whose errors count
 _LINEARIZED = 200  # of a fold, along which rollouts are linearised: these are slow
 _DIFFERENCE = 1e-6
-# times of the longest prediction: after which an error is forgotten, that a one weighs
-_FORGOTTEN = 6.0
-_PRIOR = 1.0
+# Both are multiples of the time T of the longest prediction.
+_FORGETTING = 6.0  # time constant with which the weight of an earlier error decays
+_PRIOR = 1.0  # weight of the claim itself, as an error that is as large as claimed
 
 
 def error_variances(
@@ -78,7 +78,7 @@ def follow_errors(
         for k, step in enumerate(steps):
             # A prediction that is just over has the age of half a step.
             age = times[:, None] - times - (step - 0.5) * windows.time_step
-            decay = np.exp(-np.maximum(age, 0) / (_FORGOTTEN * longest))
+            decay = np.exp(-np.maximum(age, 0) / (_FORGETTING * longest))
             weights = np.where(age > 0, spacing * decay, 0.0)
             claimed = np.maximum(variances[rows, k], 1e-300)
             ratios = errors[rows, k] ** 2 / claimed
@@ -96,7 +96,7 @@ class _FoldErrors(NamedTuple):
 
 
 def fit_noise(
-    models: Sequence[LogModel], logs: Sequence[Log], most: int
+    models: Sequence[LogModel], logs: Sequence[Log], longest: int
 ) -> OutputNoise:
     """Fits the noise that explains the errors of rollouts on held-out runs.
 
@@ -106,11 +106,11 @@ def fit_noise(
     Args:
         models: One for each fold.
         logs: The runs that the model of each fold was not fitted to.
-        most: Steps of the rollouts.
+        longest: Steps of the rollouts.
     """
-    steps = [step for step in _STEPS if step <= most]
+    steps = [step for step in _STEPS if step <= longest]
     folds = [
-        _fold_errors(model, log, steps, most)
+        _fold_errors(model, log, steps, longest)
         for model, log in zip(models, logs, strict=True)
     ]
     squared = np.concatenate([fold.squared for fold in folds]).mean(axis=0)
@@ -131,12 +131,12 @@ def fit_noise(
 
 
 def _fold_errors(
-    model: LogModel, log: Log, steps: Sequence[int], most: int
+    model: LogModel, log: Log, steps: Sequence[int], longest: int
 ) -> _FoldErrors:
     """Computes the errors of a fold, and its responses to the sources of noise."""
-    windows = log.windows(most, past=max(model.past, PAST), most=_WINDOWS)
+    past = max(model.past, PAST)
+    windows = log.windows(longest, past=past, most=_WINDOWS)
     stride = -(-len(windows) // _LINEARIZED)
-    past = windows.past
     states = windows.states[:, past]
     next_states = windows.states[:, past + 1]
     inputs = windows.inputs[:, past - model.lag]

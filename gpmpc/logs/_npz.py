@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
-from gpmpc._bounds import Room
+from gpmpc._bounds import MemoryBudget
 from gpmpc.exceptions import DataError
 from gpmpc.logs._file import (
     NUMBER_BYTES,
@@ -56,7 +56,7 @@ def read_npz(path: Path, options: ReadOptions) -> LogFile:
 
 def _take_memory(path: Path, tables: dict[str, _DeclaredArray]) -> None:
     """Counts what arrays take before they are read."""
-    room = Room(path)
+    budget = MemoryBudget(path)
     check_column_count(
         path, sum(math.prod(array.shape[1:]) for array in tables.values())
     )
@@ -65,7 +65,7 @@ def _take_memory(path: Path, tables: dict[str, _DeclaredArray]) -> None:
         if not array.is_number:
             bytes_per_cell = TEXT_BYTES + 2 * array.dtype.itemsize
         what = f"array {name!r} of shape {array.shape}"
-        room.take(math.prod(array.shape) * bytes_per_cell, what)
+        budget.take(math.prod(array.shape) * bytes_per_cell, what)
 
 
 def _declared_arrays(path: Path) -> dict[str, _DeclaredArray]:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import pandas as pd
 
-from gpmpc._bounds import Room
+from gpmpc._bounds import MemoryBudget
 from gpmpc.logs._file import (
     NUMBER_BYTES,
     TEXT_BYTES,
@@ -30,7 +30,7 @@ def read_parquet(path: Path, options: ReadOptions) -> LogFile:
     """Reads a file as one table."""
     import pyarrow.parquet as pq
 
-    room = Room(path)
+    budget = MemoryBudget(path)
     with pq.ParquetFile(path) as file:
         schema = file.schema_arrow
         metadata = file.metadata
@@ -38,7 +38,7 @@ def read_parquet(path: Path, options: ReadOptions) -> LogFile:
     rows = max(metadata.num_rows, sum(group.num_rows for group in groups))
     check_column_count(path, len(schema))
     check_column_count(path, metadata.num_columns)
-    room.take(sum(group.total_byte_size for group in groups), "its pages")
+    budget.take(sum(group.total_byte_size for group in groups), "its pages")
 
     texts = _text_columns(schema, groups)
     columns = [
@@ -47,7 +47,7 @@ def read_parquet(path: Path, options: ReadOptions) -> LogFile:
         if field.name in texts or _holds_numbers(_value_type(field))
     ]
     bytes_per_row = NUMBER_BYTES * len(columns) + TEXT_BYTES * len(texts)
-    room.take(rows * bytes_per_row, f"{rows} rows of {len(columns)} columns")
+    budget.take(rows * bytes_per_row, f"{rows} rows of {len(columns)} columns")
 
     with pq.ParquetFile(path, read_dictionary=texts) as file:
         content = file.read(columns=columns if len(columns) < len(schema) else None)

@@ -5,15 +5,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 
-from gpmpc._bounds import Room
+from gpmpc._bounds import MemoryBudget
 from gpmpc.exceptions import DataError
 from gpmpc.logs._conventions import read_rigid_bodies
 from gpmpc.logs._file import Tables, run_name
 from gpmpc.logs._findings import Finding, RunFindings
 from gpmpc.logs._formats import read_file
-from gpmpc.logs._frames import with_frame_of_files
+from gpmpc.logs._frames import with_axes_of_files
 from gpmpc.logs._log import Log, LogRun
 from gpmpc.logs._mapping import LogMapping
 from gpmpc.logs._run_tables import RunTable, tabulate
@@ -34,8 +33,8 @@ def read_log(
     """Reads the runs of one file or several.
 
     Args:
-        files: Each ends in .csv, .csv.gz, .tsv, .parquet, .npz, .mcap (of this package
-            or of ROS 2) or .ulg.
+        files: Each ends in .csv, .tsv (either also with .gz), .parquet, .npz, .mcap (of
+            this package or of ROS 2) or .ulg.
         mapping: What the columns mean: a YAML file, plain data or a ``LogMapping``.
         partial: Takes what is whole of unfinished or damaged files; findings say what
             is lost.
@@ -46,7 +45,7 @@ def read_log(
         SettingError: The mapping is wrong.
     """
     paths = _as_paths(files)
-    mapping = with_frame_of_files(_as_mapping(mapping), paths)
+    mapping = with_axes_of_files(_as_mapping(mapping), paths)
     findings: list[Finding] = []
     tables = _read_run_tables(paths, mapping, partial, findings)
     step = _time_step(tables, paths[0], mapping, findings)
@@ -89,7 +88,7 @@ def _read_run_tables(
     for path in paths:
         file = read_file(path, topics, partial=partial, stamp=mapping.stamp)
         findings.extend(file.findings)
-        room = Room(path)
+        budget = MemoryBudget(path)  # of the rows; the reader had one of its own
         for run, tables_of_run in _split_into_runs(path, file.tables, mapping):
             if run in tables:
                 raise DataError(
@@ -97,7 +96,7 @@ def _read_run_tables(
                 )
             where = f"{path}, run {run}" if mapping.run else str(path)
             run_findings = RunFindings(run, findings)
-            tables[run] = tabulate(where, tables_of_run, mapping, run_findings, room)
+            tables[run] = tabulate(where, tables_of_run, mapping, run_findings, budget)
     if not tables:
         raise DataError("no log file was given")
     return list(tables.values())
@@ -110,7 +109,12 @@ def _split_into_runs(
     if not mapping.run:
         yield run_name(path), tables
         return
-    table = tables.get("", pd.DataFrame())
+    if "" not in tables:
+        raise DataError(
+            f"{path}: has topics, and is one run; run: {mapping.run} needs a file with "
+            "a single table"
+        )
+    table = tables[""]
     check_column(str(path), table, mapping.run)
     count = table[mapping.run].nunique()
     if count > MOST_RUNS and count > len(table) / FEWEST_ROWS:

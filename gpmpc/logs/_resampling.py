@@ -10,10 +10,10 @@ from typing import NamedTuple
 import numpy as np
 
 from gpmpc._angles import wrap
-from gpmpc._bounds import Room
+from gpmpc._bounds import MemoryBudget
 from gpmpc._dynamics import Array
 from gpmpc.exceptions import DataError
-from gpmpc.logs._clocks import JUMP, Stamps, find_jumps
+from gpmpc.logs._clocks import JUMP, ORDER_TOPICS, Stamps, find_jumps
 from gpmpc.logs._file import NUMBER_BYTES
 from gpmpc.logs._findings import RunFindings
 from gpmpc.models._quaternions import (
@@ -35,7 +35,7 @@ class Grid(NamedTuple):
 
 
 def grid_of_rows(
-    stamps: Stamps, columns: int, max_gap: float | None, room: Room
+    stamps: Stamps, columns: int, max_gap: float | None, budget: MemoryBudget
 ) -> Grid:
     """Takes the stamps of a single table as they are.
 
@@ -43,51 +43,46 @@ def grid_of_rows(
         stamps: Of its rows.
         columns: How many will be put on the grid.
         max_gap: From the mapping [s].
-        room: What the rows will take is taken from it.
+        budget: What the rows will take is taken from it.
     """
     rows = len(stamps.time)
-    room.take(_memory(rows, columns), f"{rows} rows of {columns} columns")
+    budget.take(_memory(rows, columns), f"{rows} rows of {columns} columns")
     breaks = stamps.after_reversal.copy()
     breaks[find_jumps(stamps.time, max_gap) + 1] = True
     return Grid(stamps.time, breaks)
 
 
 def grid_at_rate(
-    stamps: Mapping[str, Stamps],
+    pieces: Array,
     rate: float,
     columns: int,
     max_gap: float | None,
-    where: str,
-    findings: RunFindings,
-    room: Room,
+    budget: MemoryBudget,
 ) -> Grid:
-    """Makes equal time steps in the pieces that all topics have in common.
+    """Makes equal time steps in pieces.
 
     Args:
-        stamps: By topic.
+        pieces: Their begins and ends (P, 2) [s].
         rate: [Hz].
         columns: How many will be put on the grid.
-        max_gap: From the mapping [s].
-        where: Names the file and the run, for errors.
-        findings: Takes how many rows have no time in common with others.
-        room: What the rows will take is taken from it.
+        max_gap: From the mapping [s], for errors.
+        budget: What the rows will take is taken from it.
 
     Raises:
-        DataError: The topics have no time in common, or the grid would be too large.
+        DataError: The grid would be too large.
     """
-    common = _common_pieces(stamps, max_gap, where, findings)
-    steps = (common[:, 1] - common[:, 0]) * rate * (1 + 1e-12)
+    steps = (pieces[:, 1] - pieces[:, 0]) * rate * (1 + 1e-12)
     resolution_in_steps = min(STAMP_RESOLUTION * rate, 0.1)
     lengths = np.floor(steps + resolution_in_steps) + 1
     rows = float(lengths.sum())
     what = f"{rows:.6g} rows of {columns} columns at a rate of {rate:g} Hz"
     if (max_gap or 0.0) > JUMP:
         what += f", with gaps of up to {max_gap:g} s (max_gap),"
-    room.take(_memory(rows, columns), what)
+    budget.take(_memory(rows, columns), what)
 
     counts = lengths.astype(int)
     first_rows = np.r_[0, np.cumsum(lengths)[:-1]].astype(int)
-    begins = np.repeat(common[:, 0], counts)
+    begins = np.repeat(pieces[:, 0], counts)
     row_in_piece = np.arange(len(begins)) - np.repeat(first_rows, counts)
     breaks = np.zeros(len(begins), dtype=bool)
     breaks[first_rows[1:]] = True
@@ -99,20 +94,30 @@ def _memory(rows: float, columns: int) -> float:
     return rows * columns * COPIES * NUMBER_BYTES
 
 
-def _common_pieces(
+def common_pieces(
     stamps: Mapping[str, Stamps],
     max_gap: float | None,
     where: str,
     findings: RunFindings,
 ) -> Array:
-    """Finds the pieces (C, 2) [s] that all topics have in common."""
+    """Finds the pieces (C, 2) [s] that all topics have in common.
+
+    Args:
+        stamps: By topic.
+        max_gap: From the mapping [s].
+        where: Names the file and the run, for errors.
+        findings: Takes how many rows have no time in common with others.
+
+    Raises:
+        DataError: There is none.
+    """
     pieces = {
         topic: cut_pieces(topic_stamps.time, max_gap)
         for topic, topic_stamps in stamps.items()
     }
     common = reduce(intersect_pieces, pieces.values())
     if not len(common):
-        hint = ": stamp: log takes the times of the log" if any(stamps) else ""
+        hint = f": {ORDER_TOPICS}" if any(stamps) else ""
         raise DataError(
             f"{where}: the topics {', '.join(stamps)} have no time in common{hint}"
         )
@@ -159,30 +164,30 @@ def count_rows_alone(time: Array, pieces: Array, common: Array) -> int:
     return int(rows[is_alone].sum())
 
 
-def resample(
-    time: Array,
-    values: Array,
-    grid: Array,
-    rule: str,
-    max_gap: float,
-    angles: bool = False,
-) -> Array:
-    """Computes values (G, c) at the times of a grid from samples.
+class Samples(NamedTuple):
+    """Values of a signal at increasing times."""
 
-    Args:
-        time: Of the samples, increasing (K,) [s].
-        values: Of the samples (K, c); those with a NaN are left out.
-        grid: (G,) [s].
-        rule: "hold" takes the last sample, "linear" interpolates, "spherical"
-            interpolates quaternions.
-        max_gap: Values are NaN where two samples are farther apart [s], as they are
-            beyond all samples.
-        angles: Whether values are angles [rad], between which the rule "linear" goes
-            the short way round.
-    """
-    present = np.isfinite(values).all(axis=1)
-    time = time[present]
-    values = values[present]
+    time: Array  # (K,) [s]
+    values: Array  # (K, c); those with a NaN are no samples
+
+
+class Interpolation(NamedTuple):
+    """How the values between samples are found."""
+
+    #: "hold" takes the last sample, "linear" interpolates, "spherical" interpolates
+    #: quaternions.
+    rule: str
+    #: [s]; values are NaN where two samples are farther apart, as beyond all samples
+    max_gap: float
+    #: whether values are angles [rad], between which "linear" goes the short way round
+    angles: bool = False
+
+
+def resample(samples: Samples, grid: Array, interpolation: Interpolation) -> Array:
+    """Computes values (G, c) at the times of a grid (G,) [s] from samples."""
+    present = np.isfinite(samples.values).all(axis=1)
+    time = samples.time[present]
+    values = samples.values[present]
     if not len(time):
         return np.full((len(grid), values.shape[1]), np.nan)
     sample = np.searchsorted(time, grid + STAMP_RESOLUTION, side="right") - 1
@@ -190,21 +195,21 @@ def resample(
     after = np.clip(sample + 1, None, len(time) - 1)
     lag = grid - time[before]
     span = time[after] - time[before]
-    if rule == "hold":
-        usable = (sample >= 0) & (lag <= max_gap)
+    if interpolation.rule == "hold":
+        usable = (sample >= 0) & (lag <= interpolation.max_gap)
         return np.where(usable[:, None], values[before], np.nan)
 
     fraction = np.divide(lag, span, out=np.zeros_like(lag), where=span > 0)[:, None]
     start = values[before]
     end = values[after]
-    if rule == "spherical":
+    if interpolation.rule == "spherical":
         turn = rotation_vector(quaternion_product(quaternion_inverse(start), end))
         resampled = quaternion_product(start, rotation_quaternion(fraction * turn))
-    elif angles:
+    elif interpolation.angles:
         resampled = start + fraction * wrap(end - start)
     else:
         resampled = start + fraction * (end - start)
     is_on_sample = lag <= STAMP_RESOLUTION
-    is_between = (sample < len(time) - 1) & (span <= max_gap)
+    is_between = (sample < len(time) - 1) & (span <= interpolation.max_gap)
     usable = (sample >= 0) & (is_on_sample | is_between)
     return np.where(usable[:, None], resampled, np.nan)

@@ -11,7 +11,7 @@ import struct
 from collections.abc import Callable
 from typing import NamedTuple
 
-from gpmpc._bounds import Room
+from gpmpc._bounds import MemoryBudget
 from gpmpc.logs._file import MOST_COLUMNS, TEXT_BYTES
 
 LISTED = 64  # entries of a list that become columns, at most
@@ -59,13 +59,13 @@ class _Step(NamedTuple):
         return self.counted or self.length is not None
 
 
-def ros2_decoder(name: str, definition: str, room: Room) -> Decode:
+def ros2_decoder(name: str, definition: str, budget: MemoryBudget) -> Decode:
     """Returns the function that reads the numbers of a message with their paths.
 
     Args:
         name: Of the type, such as "geometry_msgs/msg/Pose".
         definition: Its text with those of the types inside it.
-        room: Of the file; plans and what is walked over are taken from it.
+        budget: Of the file; plans and what is walked over are taken from it.
 
     Raises:
         ValueError: The definition is not complete, or holds what cannot be read.
@@ -76,11 +76,11 @@ def ros2_decoder(name: str, definition: str, room: Room) -> Decode:
     def plan(type_name: str) -> list[_Step]:
         if type_name not in plans:
             plans[type_name] = _flat_steps(type_name, types)
-            room.take(_STEP * len(plans[type_name]), f"the message {type_name}")
+            budget.take(_STEP * len(plans[type_name]), f"the message {type_name}")
         return plans[type_name]
 
     whole = plan(_short(name))
-    return lambda data: _Message(data, plan, room).numbers(whole)
+    return lambda data: _Message(data, plan, budget).numbers(whole)
 
 
 def _definitions(name: str, text: str) -> dict[str, str]:
@@ -172,7 +172,9 @@ class _Flattening:
 class _Message:
     """The bytes of a message, and how far they were read."""
 
-    def __init__(self, data: bytes, plan: Callable[[str], list[_Step]], room: Room):
+    def __init__(
+        self, data: bytes, plan: Callable[[str], list[_Step]], budget: MemoryBudget
+    ):
         if len(data) < 4:
             raise ValueError(f"it has {len(data)} bytes, fewer than its head")
         kind = data[0] * 256 + data[1]
@@ -183,7 +185,7 @@ class _Message:
             )
         self.data = data
         self.plan = plan
-        self.room = room
+        self.budget = budget
         self.order = _PLAIN_CDR[kind]
         self.position = 4
 
@@ -214,12 +216,12 @@ class _Message:
         if count > len(self.data) - self.position:  # each has a byte at least
             raise ValueError(f"it ends within {step.path}")
         if step.type == "string":
-            self.room.take(TEXT_BYTES * count, "the texts of its messages")
+            self.budget.take(TEXT_BYTES * count, "the texts of its messages")
             for _ in range(count):
                 self.scalars("B", self.length())
             return ()
         inner = self.plan(step.type)
-        self.room.take(TEXT_BYTES * count * len(inner), "the lists of its messages")
+        self.budget.take(TEXT_BYTES * count * len(inner), "the lists of its messages")
         for _ in range(count):
             for inner_step in inner:
                 self.values(inner_step)

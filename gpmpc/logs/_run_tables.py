@@ -6,9 +6,9 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
-from gpmpc._bounds import Room
+from gpmpc._bounds import MemoryBudget
 from gpmpc._dynamics import Array
-from gpmpc.exceptions import DataError
+from gpmpc.exceptions import DataError, SettingError
 from gpmpc.logs._clocks import (
     ORDER_ROWS,
     ORDER_TOPICS,
@@ -18,9 +18,17 @@ from gpmpc.logs._clocks import (
 )
 from gpmpc.logs._file import STAMP, Tables
 from gpmpc.logs._findings import RunFindings
-from gpmpc.logs._mapping import TIME_UNITS, LogMapping
-from gpmpc.logs._resampling import Grid, grid_at_rate, grid_of_rows, resample
-from gpmpc.logs._signals import empty_zero_dropouts, read_column, read_signal
+from gpmpc.logs._mapping import TIME_UNITS, LogMapping, Signal
+from gpmpc.logs._resampling import (
+    Grid,
+    Interpolation,
+    Samples,
+    common_pieces,
+    grid_at_rate,
+    grid_of_rows,
+    resample,
+)
+from gpmpc.logs._signals import nan_zero_dropouts, read_column, read_signal
 
 USUAL_GAP = 1.5  # time steps; a longer one is a gap where the mapping names none
 
@@ -48,7 +56,7 @@ def tabulate(
     tables: Tables,
     mapping: LogMapping,
     findings: RunFindings,
-    room: Room,
+    budget: MemoryBudget,
 ) -> RunTable:
     """Puts the signals of a run on one grid, in the units of ``gpmpc.logs``.
 
@@ -57,7 +65,7 @@ def tabulate(
         tables: Of the run, by topic.
         mapping: Says what their columns mean.
         findings: Of the run, which takes what is wrong.
-        room: What the rows will take is taken from it.
+        budget: What the rows will take is taken from it.
 
     Raises:
         DataError: A column, the stamps or the values of a signal cannot be used.
@@ -66,27 +74,18 @@ def tabulate(
         topic: _read_topic(topic, where, tables[topic], mapping, findings)
         for topic in dict.fromkeys(signal.topic for signal in mapping.signals)
     }
-    grid = _make_grid(where, topics, mapping, findings, room)
+    grid = _make_grid(where, topics, mapping, findings, budget)
     columns = []
     for signal in mapping.signals:
         topic = topics[signal.topic]
-        columns.append(
-            _put_on_grid(
-                read_signal(topic.label, topic.table, signal, findings),
-                time=topic.stamps.time,
-                grid=grid.time,
-                rate=mapping.rate,
-                rule=signal.rule,
-                max_gap=mapping.max_gap,
-                angles=signal.kind == "angle",
-                delay=signal.delay,
-            )
-        )
+        values = read_signal(topic.label, topic.table, signal, findings)
+        samples = Samples(topic.stamps.time, values)
+        columns.append(_signal_on_grid(samples, grid, signal, mapping))
     return RunTable(
         name=findings.run,
         time=grid.time,
         values=np.concatenate(columns, axis=1),
-        outside=_rows_outside(topics, grid, mapping),
+        outside=_rows_outside(where, topics, grid, mapping),
         breaks=grid.breaks,
     )
 
@@ -98,14 +97,14 @@ def _read_topic(
     mapping: LogMapping,
     findings: RunFindings,
 ) -> _Topic:
-    """Orders the rows of a topic, and empties those in which nothing was measured."""
+    """Orders the rows of a topic, and puts NaN where no sensor was read."""
     label = f"{where}, {topic}" if topic else where
     table = _stamped_rows(topic, table, findings)
     hint = ORDER_TOPICS if topic else ORDER_ROWS
     stamps = ordered_stamps(_read_time(label, table, mapping), label, hint)
     signals = [signal for signal in mapping.signals if signal.topic == topic]
     ordered = table.iloc[stamps.rows]
-    measured = empty_zero_dropouts(label, ordered, signals, findings)
+    measured = nan_zero_dropouts(label, ordered, signals, findings)
     _note_stamps(topic, stamps, mapping, findings)
     return _Topic(label=label, table=measured, stamps=stamps)
 
@@ -163,80 +162,79 @@ def _make_grid(
     topics: Mapping[str, _Topic],
     mapping: LogMapping,
     findings: RunFindings,
-    room: Room,
+    budget: MemoryBudget,
 ) -> Grid:
     """Makes the times of a run's rows: those of its one table, or at a rate."""
     columns = sum(len(signal.group.entries) for signal in mapping.signals)
     if mapping.rate is None:
         (topic,) = topics.values()
-        return grid_of_rows(topic.stamps, columns, mapping.max_gap, room)
-    return grid_at_rate(
-        stamps={name: topic.stamps for name, topic in topics.items()},
-        rate=mapping.rate,
-        columns=columns,
-        max_gap=mapping.max_gap,
-        where=where,
-        findings=findings,
-        room=room,
-    )
+        return grid_of_rows(topic.stamps, columns, mapping.max_gap, budget)
+    stamps = {name: topic.stamps for name, topic in topics.items()}
+    pieces = common_pieces(stamps, mapping.max_gap, where, findings)
+    return grid_at_rate(pieces, mapping.rate, columns, mapping.max_gap, budget)
 
 
-def _put_on_grid(
-    values: Array,
-    *,
-    time: Array,
-    grid: Array,
-    rate: float | None,
-    rule: str,
-    max_gap: float | None,
-    angles: bool = False,
-    delay: float = 0.0,
+def _signal_on_grid(
+    samples: Samples, grid: Grid, signal: Signal, mapping: LogMapping
 ) -> Array:
-    """Resamples values (K, c) at times (K,) [s] to a grid (G,) [s], if there is need.
-
-    Args:
-        values: Of a signal.
-        time: At which they are stamped.
-        grid: Times of the rows.
-        rate: Of the grid [Hz]; None where its times are those of the values.
-        rule: See ``resample``.
-        max_gap: [s]; None takes ``USUAL_GAP``.
-        angles: See ``resample``.
-        delay: [s] by which the values come later than their stamps say.
-    """
-    if rate is None and delay == 0:
-        return values
-    usual_step = float(np.median(np.diff(time)))
-    if rate is not None:
-        usual_step = max(usual_step, 1 / rate)
-    return resample(
-        time=time,
-        values=values,
-        grid=grid + delay,
-        rule=rule,
-        max_gap=max_gap or USUAL_GAP * usual_step,
-        angles=angles,
+    """Resamples a signal to the rows of a grid (G, c), if there is need."""
+    if mapping.rate is None and signal.delay == 0:
+        return samples.values  # the rows of the grid are those of the table
+    usual_step = float(np.median(np.diff(samples.time)))
+    if mapping.rate is not None:
+        usual_step = max(usual_step, 1 / mapping.rate)
+    interpolation = Interpolation(
+        rule=signal.rule,
+        max_gap=mapping.max_gap or USUAL_GAP * usual_step,
+        angles=signal.kind == "angle",
     )
+    # What was measured at a time has a stamp that is later by the delay.
+    return resample(samples, grid.time + signal.delay, interpolation)
 
 
 def _rows_outside(
-    topics: Mapping[str, _Topic], grid: Grid, mapping: LogMapping
+    where: str, topics: Mapping[str, _Topic], grid: Grid, mapping: LogMapping
 ) -> np.ndarray:
-    """Finds the rows (G,) that lie outside the ranges of the mapping's ``keep``."""
+    """Finds the rows (G,) that lie outside the ranges of the mapping's ``keep``.
+
+    Raises:
+        DataError: A single table lacks a column of ``keep``.
+        SettingError: No topic has a column of ``keep``.
+    """
     outside = np.zeros(len(grid.time), dtype=bool)
-    for column, (low, high) in mapping.keep.items():
-        for name, topic in topics.items():
-            if column not in topic.table and name != "":
-                continue
-            values = read_column(topic.label, topic.table, column)[:, None]
-            is_outside = np.where((values >= low) & (values <= high), 0.0, 1.0)
-            on_grid = _put_on_grid(
-                is_outside,
-                time=topic.stamps.time,
-                grid=grid.time,
-                rate=mapping.rate,
-                rule="hold",
-                max_gap=np.inf,
+    for column, limits in mapping.keep.items():
+        topics_with_column = [
+            topic
+            for name, topic in topics.items()
+            if column in topic.table or name == ""
+        ]
+        if not topics_with_column:
+            raise SettingError(
+                f"keep.{column}",
+                f"no topic of the mapping has such a column in {where}; they are "
+                f"{', '.join(topics)}",
             )
-            outside |= on_grid[:, 0] > 0
+        for topic in topics_with_column:
+            outside |= _rows_outside_of(topic, column, limits, grid, mapping)
     return outside
+
+
+def _rows_outside_of(
+    topic: _Topic,
+    column: str,
+    limits: tuple[float, float],
+    grid: Grid,
+    mapping: LogMapping,
+) -> np.ndarray:
+    """Finds the rows (G,) in which the last value of a column lies outside of limits.
+
+    A missing value does so, too.
+    """
+    low, high = limits
+    values = read_column(topic.label, topic.table, column)[:, None]
+    is_outside = np.where((values >= low) & (values <= high), 0.0, 1.0)
+    if mapping.rate is not None:
+        samples = Samples(topic.stamps.time, is_outside)
+        hold = Interpolation(rule="hold", max_gap=np.inf)
+        is_outside = resample(samples, grid.time, hold)
+    return is_outside[:, 0] > 0

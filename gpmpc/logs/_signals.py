@@ -1,4 +1,9 @@
-"""Makes signals in SI units of the columns of a table; NaN where a value is missing."""
+"""Makes signals in SI units of the columns of a table; NaN where a value is missing.
+
+Findings of this file count samples of a column, a signal or a topic that hold no
+measurement. Whether a row of the log is left out for it is found out, and counted once,
+by ``_usable_rows``: resampling may go over it, and a row may lack several values.
+"""
 
 from collections.abc import Sequence
 
@@ -51,10 +56,10 @@ def check_column(label: str, table: pd.DataFrame, column: str) -> None:
     raise DataError(f"{label}: column {column!r} is missing; it has {listed}")
 
 
-def empty_zero_dropouts(
+def nan_zero_dropouts(
     label: str, table: pd.DataFrame, signals: Sequence[Signal], findings: RunFindings
 ) -> pd.DataFrame:
-    """Empties the rows in which all states are zero, because no sensor was read."""
+    """Puts NaN where all states of a row are zero, because no sensor was read."""
     columns = [
         column
         for signal in signals
@@ -70,9 +75,9 @@ def empty_zero_dropouts(
         return table
     text = f"{count} rows with zeros for all states: left out"
     findings.add("all zero", count, text)
-    emptied = table.astype(dict.fromkeys(columns, float))
-    emptied.loc[dropouts, columns] = np.nan
-    return emptied
+    with_nan = table.astype(dict.fromkeys(columns, float))
+    with_nan.loc[dropouts, columns] = np.nan
+    return with_nan
 
 
 def read_signal(
@@ -97,8 +102,8 @@ def read_signal(
     values = np.column_stack(columns) * signal.factors
     values[~np.isfinite(values)] = np.nan
     absent = np.asarray(np.isnan(values).any(axis=1))
-    text = f"{absent.sum()} rows of {signal.name} without a value: left out"
-    findings.add("missing value", absent.sum(), text)
+    text = f"{absent.sum()} samples of {signal.name} hold no value"
+    findings.add("empty sample", absent.sum(), text)
     if signal.kind == "quaternion":
         return _unit_quaternions(label, values, signal, findings)
     _check_angles(label, values, signal)

@@ -1,7 +1,19 @@
-"""Structures of models of logs, from the simplest one on.
+"""Structures of models of logs, from the simplest ones on.
 
 A structure is a nominal model with its history and lag, grown by one addition after the
-other, and GPs on groups of outputs.
+other, and GPs on groups of outputs. ``bases`` lists those that a search begins with.
+
+To add a structure for another kind of system:
+
+1. Write its nominal model beside ``MultirotorNominal`` (``gpmpc.models._parametric``),
+   and its kinematics beside ``RigidBodyKinematics`` (``gpmpc.models._kinematics``)
+   unless it is a rigid body.
+2. Return it from ``bases`` for the logs that it fits, beside other alternatives: all
+   are tried, and the best one grows. What it may grow by stands in ``additions``.
+3. Is it only for logs whose mapping says so, enter a name of it among the choices of
+   ``LogMapping.model`` (``_mapping``).
+4. Write and read its name and its settings in ``gpmpc.models._stored_log_model``
+   (``_nominal_header`` and ``_nominal``).
 """
 
 from collections.abc import Callable
@@ -18,11 +30,14 @@ from gpmpc.models._log_model import LogModel
 from gpmpc.models._parametric import AffineNominal, MultirotorNominal
 
 LATE = 3  # rows by which motors may act late
+# Rows over which the residuals before a start are averaged to a disturbance: all of the
+# past that windows are cut with.
+DISTURBANCE_ROWS = PAST
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """A model structure and the errors of its rollouts on held-out runs."""
+    """A structure that was tried: its name, and the errors on held-out runs."""
 
     name: str  #: of the structure
     errors: Array  #: mean Euclidean or geodesic error (steps, groups)
@@ -49,9 +64,9 @@ class GroupGP(NamedTuple):
 
 @dataclass(frozen=True)
 class Structure:
-    """A model without the values of its parameters."""
+    """A form of a model, without the values of its parameters."""
 
-    base: str  #: the simplest structure, such as "rigid body"
+    base: str  #: that it grew from, such as "rigid body"
     model: LogModel  #: nominal part, history and lag
     additions: tuple[Addition, ...] = ()
     gps: tuple[GroupGP, ...] = ()
@@ -85,21 +100,29 @@ class Structure:
         return replace(self, gps=(*others, gp))
 
 
-def simplest_structure(log: Log) -> Structure:
-    """Returns the simplest structure of a log's model."""
+def bases(log: Log) -> list[Structure]:
+    """Returns the structures that a search begins with, all of which are tried."""
     if log.mapping.model == "rigid_body":
-        nominal = MultirotorNominal(
-            motors=len(log.input_names),
-            voltage=_median_voltage(log),
-            thrusts=all(signal.unit == "N" for signal in log.mapping.of("inputs")),
-        )
-        model = LogModel(
-            kinematics=RigidBodyKinematics(log.space),
-            nominal=nominal,
-            theta=np.empty(0),
-            history=(0,) * 6,
-        )
-        return Structure("rigid body", model)
+        return [_multirotor_base(log)]
+    return [_increments_base(log)]
+
+
+def _multirotor_base(log: Log) -> Structure:
+    nominal = MultirotorNominal(
+        motors=len(log.input_names),
+        voltage=_median_voltage(log),
+        thrusts=all(signal.unit == "N" for signal in log.mapping.of("inputs")),
+    )
+    model = LogModel(
+        kinematics=RigidBodyKinematics(log.space),
+        nominal=nominal,
+        theta=np.empty(0),
+        history=(0,) * 6,
+    )
+    return Structure("rigid body", model)
+
+
+def _increments_base(log: Log) -> Structure:
     increments = Increments(log.space)
     model = LogModel(
         kinematics=increments,
@@ -110,10 +133,10 @@ def simplest_structure(log: Log) -> Structure:
     return Structure("increments", model)
 
 
-def additions(log: Log) -> tuple[Addition, ...]:
-    """Returns what a structure may have besides, in the order in which it is tried."""
-    if log.mapping.model == "rigid_body":
-        return _RIGID_BODY_ADDITIONS
+def additions(base: Structure) -> tuple[Addition, ...]:
+    """Returns what a base may grow by, in the order in which it is tried."""
+    if isinstance(base.model.nominal, MultirotorNominal):
+        return _MULTIROTOR_ADDITIONS
     return _INCREMENT_ADDITIONS
 
 
@@ -130,7 +153,7 @@ def _with_affine_nominal(model: LogModel) -> LogModel:
 
 
 def _with_disturbance(model: LogModel) -> LogModel:
-    return replace(model, history=(PAST,) * len(model.history))
+    return replace(model, history=(DISTURBANCE_ROWS,) * len(model.history))
 
 
 _INCREMENT_ADDITIONS = (
@@ -140,7 +163,7 @@ _INCREMENT_ADDITIONS = (
 
 
 def _with_force_disturbance(model: LogModel) -> LogModel:
-    return replace(model, history=(PAST,) * 3 + (0,) * 3)
+    return replace(model, history=(DISTURBANCE_ROWS,) * 3 + (0,) * 3)
 
 
 def _with_motor_torque(model: LogModel) -> LogModel:
@@ -160,7 +183,7 @@ def _with_late_inputs(model: LogModel) -> LogModel | None:
 def _with_torque_disturbance(model: LogModel) -> LogModel | None:
     if not _multirotor(model).torque:
         return None
-    return replace(model, history=model.history[:3] + (PAST,) * 3)
+    return replace(model, history=model.history[:3] + (DISTURBANCE_ROWS,) * 3)
 
 
 def _multirotor(model: LogModel) -> MultirotorNominal:
@@ -168,7 +191,7 @@ def _multirotor(model: LogModel) -> MultirotorNominal:
     return model.nominal
 
 
-_RIGID_BODY_ADDITIONS = (
+_MULTIROTOR_ADDITIONS = (
     Addition("force_disturbance", "force disturbance", _with_force_disturbance),
     Addition("motor_torque", "motor torque", _with_motor_torque),
     Addition("feedback", "feedback", _with_feedback, for_control=False),

@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import pandas as pd
 
-from gpmpc._bounds import Room
+from gpmpc._bounds import MemoryBudget
 from gpmpc.exceptions import DataError
 from gpmpc.logs._file import (
     MOST_COLUMNS,
@@ -86,7 +86,7 @@ def read_ulog(path: Path, options: ReadOptions) -> LogFile:
     content = path.read_bytes()
     if content[: len(_MAGIC)] != _MAGIC or len(content) < _HEADER_SIZE:
         raise DataError(f"{path}: is not a ULog file")
-    messages = _SortedMessages(options.topics, Room(path))
+    messages = _SortedMessages(options.topics, MemoryBudget(path))
     messages.sort(content)
     if (messages.lost or messages.misfits) and not options.partial:
         raise DataError(
@@ -116,9 +116,9 @@ def _topic_of(name: str, number: int) -> str:
 class _SortedMessages:
     """The messages of a file: those that pyulog gets, and those that are left out."""
 
-    def __init__(self, topics: tuple[str, ...], room: Room) -> None:
+    def __init__(self, topics: tuple[str, ...], budget: MemoryBudget) -> None:
         self._topics = topics  # that are read; none for all
-        self._room = room
+        self._budget = budget
         self._formats: dict[str, list[_Field]] = {}  # by type
         self._subscriptions: dict[int, _Subscription] = {}  # by number
         self._rows: Counter[str] = Counter()  # messages, by topic
@@ -153,7 +153,7 @@ class _SortedMessages:
         position = _HEADER_SIZE
         section_ends = [len(content)]
         while position < len(content):
-            self._room.take(_MESSAGE_BYTES, "its messages")
+            self._budget.take(_MESSAGE_BYTES, "its messages")
             while len(section_ends) > 1 and position >= section_ends[0]:
                 section_ends.pop(0)
             end = section_ends[0]
@@ -198,7 +198,7 @@ class _SortedMessages:
         except ValueError as error:
             self.refusals[topic] = str(error)
             return
-        self._room.take(_FIELD_BYTES * len(fields), "the fields of its topics")
+        self._budget.take(_FIELD_BYTES * len(fields), "the fields of its topics")
         subscription.most = sum(_SIZES[field.type] for field in fields)
         while fields and fields[-1].name.startswith("_padding"):
             fields.pop()
@@ -224,7 +224,9 @@ class _SortedMessages:
             return
         if not subscription.least <= len(message.content) - 2 <= subscription.most:
             raise ValueError("it has another length than its topic")
-        self._room.take(NUMBER_BYTES * subscription.fields, f"the messages of {topic}")
+        self._budget.take(
+            NUMBER_BYTES * subscription.fields, f"the messages of {topic}"
+        )
         self.data.append(message.whole)
 
     def findings(self, run: str) -> Iterator[Finding]:

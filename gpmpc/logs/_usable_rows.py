@@ -81,7 +81,7 @@ def select_rows(
         text = "no row can be used: the run is left out"
         findings.add("nothing left", len(table.time), text)
         return None
-    breaks = _find_breaks(table, used, step, mapping, findings)
+    ends_piece = _find_ends_of_pieces(table, used, step, mapping, findings)
     values = mapping.split(table.values[used])
     return LogRun(
         name=table.name,
@@ -89,7 +89,7 @@ def select_rows(
         states=values.states,
         inputs=values.inputs,
         context=values.context,
-        begins=(0, *(np.flatnonzero(breaks) + 1).tolist()),
+        begins=(0, *(np.flatnonzero(ends_piece) + 1).tolist()),
     )
 
 
@@ -166,14 +166,14 @@ def _note_held_sensors(
                 findings.add("held sensor", len(column) - 1 - changes, text)
 
 
-def _find_breaks(
+def _find_ends_of_pieces(
     table: RunTable,
     used: np.ndarray,
     step: float,
     mapping: LogMapping,
     findings: RunFindings,
 ) -> np.ndarray:
-    """Finds the used rows behind which a new piece begins, and notes gaps.
+    """Finds the used rows with which a piece ends, and notes gaps.
 
     Args:
         table: Of the run.
@@ -191,10 +191,10 @@ def _find_breaks(
     steps = np.diff(table.time[used])
     is_uneven = (steps > longest) | (steps < SHORT_STEP * step)
     are_apart = np.diff(used) > 1
-    breaks = table.breaks[used[1:]]
-    is_jump = breaks & (steps > JUMP)  # which has its own finding
+    is_before_break = table.breaks[used[1:]]
+    is_jump = is_before_break & (steps > JUMP)  # which has its own finding
     _note_gaps(steps[is_uneven & ~are_apart & ~is_jump], step, findings)
-    return is_uneven | are_apart | breaks
+    return is_uneven | are_apart | is_before_break
 
 
 def _note_gaps(uneven: Array, step: float, findings: RunFindings) -> None:

@@ -33,6 +33,9 @@ from gpmpc.signals import Signals
 
 LOG_MODEL = "LogModel"  # the kind of the files
 _RIGID_BODY = "RigidBody"  # as files call its kinematics
+_INCREMENTS = "Increments"
+_AFFINE_NAMES = ("AffineNominal", STILL)  # as files call that nominal model
+_MULTIROTOR_NAME = "MultirotorNominal"
 _KINDS_OF_GROUPS = ("vector", "angle", "quaternion")
 _LONGEST = 10_000  # rows that a model from a file looks back
 _SLOWEST = 1e9  # time step of a model from a file [s]
@@ -74,7 +77,7 @@ def log_model_parts(
     is_rigid_body = isinstance(model.kinematics, RigidBodyKinematics)
     header = {
         "groups": [asdict(group) for group in model.kinematics.space.groups],
-        "kinematics": _RIGID_BODY if is_rigid_body else "Increments",
+        "kinematics": _RIGID_BODY if is_rigid_body else _INCREMENTS,
         "nominal": _nominal_header(model.nominal),
         "history": model.history,
         "lag": model.lag,
@@ -183,9 +186,16 @@ def _space(groups: Any) -> StateSpace:
 
 
 def _kinematics(name: str, space: StateSpace) -> Kinematics:
-    """Makes kinematics of their name in a file."""
-    if name != _RIGID_BODY:
+    """Makes kinematics of their name in a file.
+
+    Raises:
+        DataError: There are no such kinematics, or the space is not theirs.
+    """
+    if name == _INCREMENTS:
         return Increments(space)
+    if name != _RIGID_BODY:
+        known = f"{_INCREMENTS}, {_RIGID_BODY}"
+        raise DataError(f"unknown kinematics {name!r:.80}; known are {known}")
     groups = [(group.kind, len(group.entries)) for group in space.groups]
     vector = ("vector", 3)
     if groups != [vector, ("quaternion", 4), vector, vector]:
@@ -199,10 +209,17 @@ def _nominal(
     input_names: tuple[str, ...],
     context_names: tuple[str, ...],
 ) -> MultirotorNominal | AffineNominal:
-    """Makes a nominal model of its name and settings."""
+    """Makes a nominal model of its name and settings.
+
+    Raises:
+        DataError: There is no such model, or the settings are not those of this one.
+    """
     name, settings = name_and_settings
-    if name != "MultirotorNominal":
+    if name in _AFFINE_NAMES:
         return AffineNominal(kinematics, settings.get("fitted", name != STILL))
+    if name != _MULTIROTOR_NAME:
+        names = ", ".join((*_AFFINE_NAMES, _MULTIROTOR_NAME))
+        raise DataError(f"unknown nominal model {name!r:.80}; known are {names}")
     motors = settings["motors"]
     inputs = len(input_names)
     if type(motors) is not int or motors != inputs:

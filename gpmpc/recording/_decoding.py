@@ -14,7 +14,7 @@ import numpy as np
 from google.protobuf.message import DecodeError
 from mcap.records import Message
 
-from gpmpc._bounds import room
+from gpmpc._bounds import memory_limit
 from gpmpc.exceptions import RecordingError, SettingError
 from gpmpc.recording._content import FileContent, Names
 from gpmpc.recording._problems import RecordedProblem
@@ -178,7 +178,7 @@ def plan_arrays(
     n = len(names.states)
     m = len(names.inputs)
     size = 8 * len(steps) * (horizon + 1) * (n * n + n + m)
-    if size > room(path):
+    if size > memory_limit(path):
         raise RecordingError(
             f"{path}: a plan of {horizon} stages would make arrays of "
             f"{size / 1e6:.0f} MB with the others"

@@ -26,7 +26,7 @@ from mcap.records import (
 )
 from mcap.writer import MCAP0_MAGIC
 
-from gpmpc._bounds import LARGEST, room
+from gpmpc._bounds import LARGEST, memory_limit
 from gpmpc.exceptions import RecordingError
 from gpmpc.recording._chunk_search import (
     ChunkSearch,
@@ -158,7 +158,7 @@ class _DataReader:
         self._data_end = self._size
         if self._index is not None and self._index.sound:
             self._data_end = self._index.start
-        self._room = room(path)  # left for what chunks unfold to [bytes]
+        self._memory_left = memory_limit(path)  # left for what chunks unfold to [bytes]
         self._inventory = Inventory()
         self._messages: Counter[int] = Counter()  # by channel
         self._identities: set[tuple[int, int, int]] = set()  # of chunks
@@ -357,11 +357,11 @@ class _DataReader:
     def _unfold(self, chunk: Chunk) -> bytes:
         """Decompresses a chunk; ``RecordingError`` where all unfold to too much."""
         if chunk.uncompressed_size <= LARGEST:
-            self._room -= chunk.uncompressed_size
-        if self._room < 0:
+            self._memory_left -= chunk.uncompressed_size
+        if self._memory_left < 0:
             raise RecordingError(
                 f"{self._path}: its chunks unfold to more than "
-                f"{room(self._path) / 1e6:.0f} MB"
+                f"{memory_limit(self._path) / 1e6:.0f} MB"
             )
         return unfolded(chunk)
 

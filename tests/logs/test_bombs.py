@@ -15,7 +15,7 @@ import yaml
 import zstandard
 
 sys.path.append(str(Path(__file__).resolve().parents[2]))
-from gpmpc._bounds import Room, room
+from gpmpc._bounds import MemoryBudget, memory_limit
 from gpmpc.exceptions import DataError, SettingError
 from gpmpc.logs import LogMapping, read_log
 from gpmpc.logs._formats import read_file
@@ -300,8 +300,8 @@ def test_what_is_no_column_of_an_archive_is_left_out_and_named(tmp_path):
 def test_room_is_taken_before_it_is_used(tmp_path):
     path = tmp_path / "arm.csv"
     path.write_bytes(bytes(1000))
-    left = Room(path)
-    assert left.size == room(path) == 64 * 2**20 + 300_000
+    left = MemoryBudget(path)
+    assert left.size == memory_limit(path) == 64 * 2**20 + 300_000
     left.take(left.size, "a table")
     with pytest.raises(
         DataError, match="arm.csv: a row would take more than the 67 MB"

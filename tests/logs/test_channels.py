@@ -12,7 +12,7 @@ from mcap_ros2.writer import Writer
 from pyulog import ULog
 
 sys.path.append(str(Path(__file__).resolve().parents[2]))
-from gpmpc._bounds import Room
+from gpmpc._bounds import MemoryBudget
 from gpmpc.exceptions import DataError
 from gpmpc.logs import read_log
 from gpmpc.logs._formats import read_file
@@ -124,7 +124,7 @@ def test_ros_2_numbers_are_those_of_the_reference_decoder(tmp_path):
 
 
 def test_both_byte_orders_are_read(tmp_path):
-    decode = ros2_decoder("my/A", "int16 a\nfloat64 b", Room(Path(__file__)))
+    decode = ros2_decoder("my/A", "int16 a\nfloat64 b", MemoryBudget(Path(__file__)))
     little = b"\0\1\0\0" + struct.pack("<hxxxxxxd", -2, 0.5)
     big = b"\0\0\0\0" + struct.pack(">hxxxxxxd", -2, 0.5)
     assert decode(little) == decode(big) == {"a": -2.0, "b": 0.5}

@@ -527,7 +527,7 @@ def test_a_px4_log_is_in_ned_unless_its_mapping_says_otherwise(flight, tmp_path)
     }
     mapping = {"model": "rigid_body", **topics}
     log = read_log(path, mapping)
-    assert log.mapping.frame == "ned"
+    assert log.mapping.axes == "ned"
     expected = read_log(stored(tmp_path, flight), MAPPING)
     difference = log.space.difference(log.runs[0].states, expected.runs[0].states)
     np.testing.assert_allclose(difference, 0, atol=1e-5)

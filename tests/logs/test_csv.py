@@ -98,3 +98,10 @@ def test_a_column_may_hold_a_comment_sign_in_its_name(tmp_path):
     table = parse(tmp_path, "t,motor#1\n0,1\n1,2\n")
     assert list(table) == ["t", "motor#1"]
     assert len(table) == 2
+
+
+def test_only_text_is_unpacked(tmp_path):
+    packed = tmp_path / "log.npz.gz"
+    packed.write_bytes(gzip.compress(b"an archive"))
+    with pytest.raises(DataError, match="log.npz.gz: unknown kind of file; .* .tsv.gz"):
+        read_log(packed, MAPPING)

@@ -396,6 +396,20 @@ def test_a_bag_of_several_topics_comes_to_one_grid(tmp_path):
     )
 
 
+def test_a_range_of_a_column_in_no_topic_is_refused(tmp_path):
+    bag(tmp_path / "bag.mcap")
+    with pytest.raises(SettingError, match=r"^keep.height: no topic .*/pose, /torque$"):
+        read_log(tmp_path / "bag.mcap", {**BAG, "keep": {"height": [0, None]}})
+    log = read_log(tmp_path / "bag.mcap", {**BAG, "keep": {"torque": [-99, 99]}})
+    assert "outside of keep" not in kinds(log)
+
+
+def test_a_column_of_runs_needs_a_file_without_topics(tmp_path):
+    bag(tmp_path / "bag.mcap")
+    with pytest.raises(DataError, match=r"bag.mcap: has topics, and is one run; run: "):
+        read_log(tmp_path / "bag.mcap", {**BAG, "run": "flight"})
+
+
 def test_a_bag_without_the_topic_or_without_its_end_is_named(tmp_path):
     bag(tmp_path / "bag.mcap")
     with pytest.raises(DataError, match="topic '/force' is missing; it has"):

@@ -319,6 +319,20 @@ def test_a_log_model_that_does_not_fit_together_is_refused(tmp_path):
             load_learned(path)
 
 
+@pytest.mark.parametrize("field", ["nominal", "kinematics"])
+def test_an_unknown_name_in_a_log_model_is_refused(tmp_path, field):
+    from gpmpc.logs._storage import save_learned
+    from tests.models.hostile import of_a_quadrotor_log
+
+    path = tmp_path / "m.safetensors"
+    save_learned(of_a_quadrotor_log(), path)
+    header, arrays = parts_of(path)
+    changed = {"nominal": ["RocketNominal", {}], "kinematics": "Rocket"}
+    write(path, header | {field: changed[field]}, arrays)
+    with pytest.raises(DataError, match=rf"unknown {field}[^\n]*'Rocket.*known are"):
+        load_learned(path)
+
+
 def assert_survived(count, seed):
     process = copied_process(target=hostile.main, args=(count, seed))
     process.start()

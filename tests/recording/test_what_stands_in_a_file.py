@@ -282,15 +282,15 @@ def test_a_layout_of_one_state_has_no_tab_for_what_is_not_there(tmp_path):
 
 
 def test_what_a_file_may_unfold_to_is_counted_to_the_byte(path, monkeypatch):
-    assert _records.room(path) == 64 * 2**20 + 300 * path.stat().st_size
+    assert _records.memory_limit(path) == 64 * 2**20 + 300 * path.stat().st_size
     with path.open("rb") as file:
         reader = make_reader(file)
         messages = len([*reader.iter_messages()])
         summary = reader.get_summary()
     room = sum(chunk.uncompressed_size for chunk in summary.chunk_indexes)
-    monkeypatch.setattr(_records, "room", lambda _: room)
+    monkeypatch.setattr(_records, "memory_limit", lambda _: room)
     assert len([*_records.whole_records(path)]) > messages
-    monkeypatch.setattr(_records, "room", lambda _: room - 1)
+    monkeypatch.setattr(_records, "memory_limit", lambda _: room - 1)
     with pytest.raises(
         RecordingError, match=r"run\.mcap: its chunks unfold to more than 0 MB"
     ):
@@ -298,9 +298,9 @@ def test_what_a_file_may_unfold_to_is_counted_to_the_byte(path, monkeypatch):
     rows, (H, n, m) = 2, (5, 6, 3)
     needed = 8 * rows * (H + 1) * (n + n * n + m)  # of means, covariances and inputs
     monkeypatch.undo()
-    monkeypatch.setattr(_decoding, "room", lambda _: needed)
+    monkeypatch.setattr(_decoding, "memory_limit", lambda _: needed)
     assert read_run(path).plan_means.shape == (rows, H + 1, n)
-    monkeypatch.setattr(_decoding, "room", lambda _: needed - 1)
+    monkeypatch.setattr(_decoding, "memory_limit", lambda _: needed - 1)
     with pytest.raises(
         RecordingError,
         match="a plan of 5 stages would make arrays of 0 MB with the others",
