@@ -19,8 +19,9 @@ How ``read_log`` makes rows of files, and where each step is:
 
 How ``learn`` makes a model of a log:
 
-1. structures    ``_structures`` has the simplest model, and what may be added to it. The
-                 models themselves are those of ``gpmpc.models``.
+1. structures    ``_structures`` has the simplest models, and what they may grow by. To
+                 add a structure, see there. The models themselves are those of
+                 ``gpmpc.models``.
 2. parameters    ``_fitting`` fits nominal models on rollouts.
 3. residuals     ``_output_gps`` trains GPs on what a nominal model leaves.
 4. choice        ``_learning`` compares structures on held-out runs.

@@ -47,11 +47,11 @@ class CsvText(NamedTuple):
         return self.stream.lines.is_cut
 
 
-def open_csv(label: str, file: io.BufferedReader) -> CsvText:
+def open_csv(where: str, file: io.BufferedReader) -> CsvText:
     """Finds out how a CSV file is written.
 
     Args:
-        label: The file's name, for errors.
+        where: The file's name, for errors.
         file: The text, unpacked. Its first line names the columns. Lines that begin
             with #, % or // are comments; the last one before the first line names the
             columns where that line holds numbers.
@@ -59,35 +59,35 @@ def open_csv(label: str, file: io.BufferedReader) -> CsvText:
     Raises:
         DataError: It is no such text; the message says why.
     """
-    lines = _Lines(label, file)
+    lines = _Lines(where, file)
     head = list(islice(lines, 1 + _SAMPLE))
     if head and lines.comment and _holds_numbers(head[0]):
         head.insert(0, lines.comment)
     if not head:
-        raise DataError(f"{label}: holds no line with the names of the columns")
+        raise DataError(f"{where}: holds no line with the names of the columns")
     delimiter = max(DELIMITERS, key=lambda mark: len(_split_line(head[0], mark)))
     names = [name.strip() for name in _split_line(head[0], delimiter)]
     if len(set(names)) < len(names) or _holds_numbers(head[0]):
         raise DataError(
-            f"{label}: the first line must name every column differently; got "
+            f"{where}: the first line must name every column differently; got "
             f"{', '.join(names)}"
         )
     return CsvText(
         stream=_CsvStream(head, lines),
         names=names,
         delimiter=delimiter,
-        decimal=_decimal_mark(label, names, head[1:], delimiter),
+        decimal=_decimal_mark(where, names, head[1:], delimiter),
     )
 
 
 class _Lines(Iterator[str]):
     """The lines of a file without blank ones, comments and a last one that is cut."""
 
-    def __init__(self, label: str, file: io.BufferedReader):
+    def __init__(self, where: str, file: io.BufferedReader):
         self.encoding = _find_encoding(file.peek(_START)[:_START])
         self.comment = ""  # before the first line, the last one
         self.is_cut = False  # the last line has no end
-        self._label = label
+        self._where = where
         self._stream = io.TextIOWrapper(file, encoding=self.encoding)
         self._count = 0
         self._began = False
@@ -116,7 +116,7 @@ class _Lines(Iterator[str]):
             byte = f"byte 0x{error.object[error.start]:02x} near line {self._count}"
             name = self.encoding.removesuffix("-sig").upper()
             raise DataError(
-                f"{self._label}: {byte} is no text in {name}: save the file as UTF-8"
+                f"{self._where}: {byte} is no text in {name}: save the file as UTF-8"
             ) from error
 
 
@@ -182,7 +182,7 @@ def _holds_numbers(line: str) -> bool:
 
 
 def _decimal_mark(
-    label: str, names: list[str], lines: list[str], delimiter: str
+    where: str, names: list[str], lines: list[str], delimiter: str
 ) -> str:
     """Returns the decimal mark of the first rows.
 
@@ -195,7 +195,7 @@ def _decimal_mark(
     width = min((len(fields) for fields in samples), default=0)
     if delimiter == "," and width >= 2 * len(names) > 2:
         raise DataError(
-            f"{label}: the rows have {width} fields and the header {len(names)}: is "
+            f"{where}: the rows have {width} fields and the header {len(names)}: is "
             "the comma the decimal mark too? separate columns by semicolons"
         )
     return "."

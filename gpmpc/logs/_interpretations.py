@@ -46,8 +46,8 @@ AGREEMENT = 0.15  # in that sum, which is more than chance
 DOUBTFUL = 0.2  # misfit from which another interpretation is looked for
 OTHER_FRAME_COST = 0.5  # of NED for ENU in all states: the commonest mistake
 SHARED_SOURCE = 0.75  # of a mistake: attitude and rate come from one sensor
-# Attitude and rate in NED are two mistakes if counted singly, and have one cause. No
-# cost is smaller by more than these two than the sum of its parts.
+# Attitude and rate in NED are two mistakes if counted singly, and have one cause: no
+# cost is less than the sum of its parts by more than these two.
 MOST_SHARED = 2.0
 UP_IS_RARE = RARE - 1  # what makes one mistake of the axes a rare one
 # Misfits below these are noise or smoothing, and no reason to prefer an interpretation.

@@ -7,6 +7,7 @@ consists of pieces, and transitions, windows and episodes stay inside a piece.
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -20,6 +21,15 @@ from gpmpc.logs._mapping import LogMapping
 from gpmpc.models._state_space import StateSpace
 from gpmpc.models._windows import Windows
 from gpmpc.signals import Signals
+
+
+class RunWindows(NamedTuple):
+    """W windows of one run, as in ``Windows``."""
+
+    states: Array  # (W, past + 1 + ahead, n)
+    inputs: Array  # (W, past + 1 + ahead, m)
+    context: Array  # (W, past + 1, c)
+    times: Array  # of the starts (W,) [s]
 
 
 @dataclass(frozen=True)
@@ -46,6 +56,17 @@ class LogRun:
         return np.concatenate(
             [np.arange(begin + past, end - ahead, stride) for begin, end in self.pieces]
         ).astype(int)
+
+    def windows(self, past: int, ahead: int, stride: int) -> RunWindows:
+        """Cuts windows around every ``stride``-th start; see ``Log.windows``."""
+        starts = self.starts(past, ahead, stride)
+        rows = starts[:, None] + np.arange(-past, ahead + 1)
+        return RunWindows(
+            states=self.states[rows],
+            inputs=self.inputs[rows],
+            context=self.context[rows[:, : past + 1]],
+            times=self.time[starts],
+        )
 
     def part(self, begin: int, end: int, name: str) -> "LogRun":
         """Returns the rows from ``begin`` to before ``end`` as a run of its own."""
@@ -181,42 +202,34 @@ class Log:
         check_number("ahead", ahead, least=0, whole=True)
         check_number("past", past, least=0, whole=True)
         check_number("stride", stride, least=1, whole=True)
-        lengths = [end - begin for run in self.runs for begin, end in run.pieces]
         if most is not None:
-            starts_in_all = sum(max(length - ahead - past, 0) for length in lengths)
-            stride = max(-(-starts_in_all // most), 1)
-        starts = [run.starts(past, ahead, stride) for run in self.runs]
-        if not sum(len(rows) for rows in starts):
+            stride = self._stride_for(most, rows=past + ahead)
+        parts = [run.windows(past, ahead, stride) for run in self.runs]
+        if not sum(len(part.times) for part in parts):
             raise DataError(
                 f"windows of {past + ahead + 1} rows need a piece as long; the longest "
-                f"has {max(lengths)}"
+                f"has {max(self._lengths_of_pieces())}"
             )
-        offsets = np.arange(-past, ahead + 1)
-        states = []
-        inputs = []
-        context = []
-        runs = []
-        times = []
-        for number, (run, starts_of_run) in enumerate(
-            zip(self.runs, starts, strict=True)
-        ):
-            rows = starts_of_run[:, None] + offsets
-            states.append(run.states[rows])
-            inputs.append(run.inputs[rows])
-            context.append(run.context[rows[:, : past + 1]])
-            runs.append(np.full(len(rows), number))
-            times.append(run.time[starts_of_run])
+        runs = [np.full(len(part.times), number) for number, part in enumerate(parts)]
         return Windows(
             space=self.space,
             time_step=self.time_step,
             past=past,
             stride=stride,
-            states=np.concatenate(states),
-            inputs=np.concatenate(inputs),
-            context=np.concatenate(context),
+            states=np.concatenate([part.states for part in parts]),
+            inputs=np.concatenate([part.inputs for part in parts]),
+            context=np.concatenate([part.context for part in parts]),
             runs=np.concatenate(runs),
-            times=np.concatenate(times),
+            times=np.concatenate([part.times for part in parts]),
         )
+
+    def _stride_for(self, most: int, rows: int) -> int:
+        """Returns the stride that makes about ``most`` windows of ``rows`` + 1 rows."""
+        starts = sum(max(length - rows, 0) for length in self._lengths_of_pieces())
+        return max(-(-starts // most), 1)
+
+    def _lengths_of_pieces(self) -> list[int]:
+        return [end - begin for run in self.runs for begin, end in run.pieces]
 
     def __iter__(self) -> Iterator[LogRun]:
         return iter(self.runs)

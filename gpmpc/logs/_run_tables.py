@@ -46,7 +46,7 @@ class RunTable(NamedTuple):
 class _Topic(NamedTuple):
     """The rows of a topic in the order of their stamps."""
 
-    label: str  # names the table, for errors
+    where: str  # names the table, for errors
     table: pd.DataFrame
     stamps: Stamps
 
@@ -78,7 +78,7 @@ def tabulate(
     columns = []
     for signal in mapping.signals:
         topic = topics[signal.topic]
-        values = read_signal(topic.label, topic.table, signal, findings)
+        values = read_signal(topic.where, topic.table, signal, findings)
         samples = Samples(topic.stamps.time, values)
         columns.append(_signal_on_grid(samples, grid, signal, mapping))
     return RunTable(
@@ -98,15 +98,16 @@ def _read_topic(
     findings: RunFindings,
 ) -> _Topic:
     """Orders the rows of a topic, and puts NaN where no sensor was read."""
-    label = f"{where}, {topic}" if topic else where
+    if topic:
+        where = f"{where}, {topic}"
     table = _stamped_rows(topic, table, findings)
     hint = ORDER_TOPICS if topic else ORDER_ROWS
-    stamps = ordered_stamps(_read_time(label, table, mapping), label, hint)
+    stamps = ordered_stamps(_read_time(where, table, mapping), where, hint)
     signals = [signal for signal in mapping.signals if signal.topic == topic]
     ordered = table.iloc[stamps.rows]
-    measured = nan_zero_dropouts(label, ordered, signals, findings)
+    measured = nan_zero_dropouts(where, ordered, signals, findings)
     _note_stamps(topic, stamps, mapping, findings)
-    return _Topic(label=label, table=measured, stamps=stamps)
+    return _Topic(where=where, table=measured, stamps=stamps)
 
 
 def _stamped_rows(
@@ -124,15 +125,15 @@ def _stamped_rows(
     return table[is_stamped]
 
 
-def _read_time(label: str, table: pd.DataFrame, mapping: LogMapping) -> Array:
+def _read_time(where: str, table: pd.DataFrame, mapping: LogMapping) -> Array:
     """Reads the stamps (K,) [s] of a table, in the order of the file."""
     if mapping.time:
         unit = TIME_UNITS[mapping.time_unit]
-        return read_column(label, table, mapping.time) * unit
+        return read_column(where, table, mapping.time) * unit
     column = STAMP if STAMP in table else "timestamp"
     if column not in table and mapping.rate:
         return np.arange(len(table)) / mapping.rate  # rows at a rate that is declared
-    return read_column(label, table, column)
+    return read_column(where, table, column)
 
 
 def _note_stamps(
@@ -231,7 +232,7 @@ def _rows_outside_of(
     A missing value does so, too.
     """
     low, high = limits
-    values = read_column(topic.label, topic.table, column)[:, None]
+    values = read_column(topic.where, topic.table, column)[:, None]
     is_outside = np.where((values >= low) & (values <= high), 0.0, 1.0)
     if mapping.rate is not None:
         samples = Samples(topic.stamps.time, is_outside)

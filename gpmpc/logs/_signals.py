@@ -22,42 +22,42 @@ LARGEST_ANGLE = 4 * np.pi  # [rad]; larger ones are rather degrees
 NORM_TOLERANCE = 0.05  # of unit quaternions
 
 
-def read_column(label: str, table: pd.DataFrame, column: str) -> Array:
+def read_column(where: str, table: pd.DataFrame, column: str) -> Array:
     """Reads a column of numbers (K,).
 
     Args:
-        label: Names the table, for errors.
+        where: Names the table, for errors.
         table: With K rows.
         column: Its name.
 
     Raises:
         DataError: The column is missing, or holds something else.
     """
-    check_column(label, table, column)
+    check_column(where, table, column)
     values = table[column]
     numbers = pd.to_numeric(values, errors="coerce").to_numpy(dtype=float)
     is_wrong = np.isnan(numbers) & ~values.isna().to_numpy()
     if is_wrong.any():
         row = int(np.argmax(is_wrong))
         raise DataError(
-            f"{label}: row {row + 1}, column {column!r} is {values.iloc[row]!r}; "
+            f"{where}: row {row + 1}, column {column!r} is {values.iloc[row]!r}; "
             "expected a number"
         )
     return numbers
 
 
-def check_column(label: str, table: pd.DataFrame, column: str) -> None:
+def check_column(where: str, table: pd.DataFrame, column: str) -> None:
     """Raises ``DataError`` where a table has no such column."""
     if column in table:
         return
     listed = ", ".join(map(str, table.columns[:LISTED_COLUMNS]))
     if len(table.columns) > LISTED_COLUMNS:
         listed += ", ..."
-    raise DataError(f"{label}: column {column!r} is missing; it has {listed}")
+    raise DataError(f"{where}: column {column!r} is missing; it has {listed}")
 
 
 def nan_zero_dropouts(
-    label: str, table: pd.DataFrame, signals: Sequence[Signal], findings: RunFindings
+    where: str, table: pd.DataFrame, signals: Sequence[Signal], findings: RunFindings
 ) -> pd.DataFrame:
     """Puts NaN where all states of a row are zero, because no sensor was read."""
     columns = [
@@ -66,7 +66,7 @@ def nan_zero_dropouts(
         if signal.role == "states"
         for column in signal.columns
     ]
-    states = [read_column(label, table, column) for column in columns]
+    states = [read_column(where, table, column) for column in columns]
     if not states:
         return table
     dropouts = zero_dropouts(np.column_stack(states))
@@ -81,12 +81,12 @@ def nan_zero_dropouts(
 
 
 def read_signal(
-    label: str, table: pd.DataFrame, signal: Signal, findings: RunFindings
+    where: str, table: pd.DataFrame, signal: Signal, findings: RunFindings
 ) -> Array:
     """Reads a signal (K, c) in the units and conventions of ``gpmpc.logs``.
 
     Args:
-        label: Names the table, for errors.
+        where: Names the table, for errors.
         table: With K rows.
         signal: Says which columns, and in which units.
         findings: Takes what is missing.
@@ -96,7 +96,7 @@ def read_signal(
             have no unit length.
     """
     columns = [
-        _without_sentinels(column, read_column(label, table, column), findings)
+        _without_sentinels(column, read_column(where, table, column), findings)
         for column in signal.columns
     ]
     values = np.column_stack(columns) * signal.factors
@@ -105,8 +105,8 @@ def read_signal(
     text = f"{absent.sum()} samples of {signal.name} hold no value"
     findings.add("empty sample", absent.sum(), text)
     if signal.kind == "quaternion":
-        return _unit_quaternions(label, values, signal, findings)
-    _check_angles(label, values, signal)
+        return _unit_quaternions(where, values, signal, findings)
+    _check_angles(where, values, signal)
     if signal.kind == "euler":
         return _euler_to_quaternions(values, present=~absent)
     return values
@@ -123,14 +123,14 @@ def _without_sentinels(column: str, numbers: Array, findings: RunFindings) -> Ar
     return np.where(is_sentinel, np.nan, numbers)
 
 
-def _check_angles(label: str, values: Array, signal: Signal) -> None:
+def _check_angles(where: str, values: Array, signal: Signal) -> None:
     """Raises ``DataError`` where angles that are said to be radians are too large."""
     if signal.kind not in ("angle", "euler") or signal.unit != "rad":
         return
     largest = float(np.nanmax(np.abs(values), initial=0.0))
     if largest > LARGEST_ANGLE:
         raise DataError(
-            f"{label}: {signal.name} reaches {largest:.4g} rad: are these degrees? "
+            f"{where}: {signal.name} reaches {largest:.4g} rad: are these degrees? "
             "(unit: deg)"
         )
 
@@ -144,7 +144,7 @@ def _euler_to_quaternions(angles: Array, present: np.ndarray) -> Array:
 
 
 def _unit_quaternions(
-    label: str, values: Array, signal: Signal, findings: RunFindings
+    where: str, values: Array, signal: Signal, findings: RunFindings
 ) -> Array:
     """Makes unit quaternions (x, y, z, w) whose sign does not flip."""
     if signal.order == "wxyz":
@@ -154,7 +154,7 @@ def _unit_quaternions(
     if is_off.any():
         row = int(np.argmax(is_off))
         raise DataError(
-            f"{label}: {signal.name} in row {row + 1} has norm {norms[row]:.4g}; "
+            f"{where}: {signal.name} in row {row + 1} has norm {norms[row]:.4g}; "
             "expected unit quaternions"
         )
     values = values / norms[:, None]
