@@ -30,9 +30,8 @@ from benchmarks.quadrotor import (
 from benchmarks.quadrotor_sequences import TIGHT
 from benchmarks.timing import write_results
 from gpmpc.experiments.slsqp import SLSQP
-from gpmpc.mpc import GPMPC, PredictionSettings, Request
+from gpmpc.mpc import GPMPC, Box, PredictionSettings, Request
 from gpmpc.mpc.baselines import StateFormMPC
-from gpmpc.mpc.problem import Box
 from gpmpc.propagation import Linearization, MomentMatching
 from gpmpc.qp import CvxpySolver, PrimalActiveSet
 

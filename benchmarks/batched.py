@@ -1,15 +1,19 @@
 """How many trials a second fly together, and one at a time.
 
-    .venv/bin/python -m benchmarks.batched [--device cuda] [--sizes 10 50 189] [--trials 1 10 50 200] [--steps 3]
+    .venv/bin/python -m benchmarks.batched [--device cuda] [--sizes 10 50 189] [--trials
+    1 10 50 200] [--steps 3]
 
-The quadrotor's translational subsystem with the plant in the loop, H = 10. *alone*: ``closed_loop``, a trial after
-the other, the model in host memory (compiled loops). *together*: ``closed_loops`` with the model on ``--device``; on
-the CPU that is the same compiled loops, asked for all trials at once. *torch*: the same by the torch expressions that
-answer on a GPU, here on the CPU. *mean* and *linearised* are the ``trajectory`` form with H stages a step;
-*moment-matched* is the paper's form with one exact Jacobian a step.
+The quadrotor's translational subsystem with the plant in the loop, H = 10. *alone*:
+``closed_loop``, a trial after the other, the model in host memory (compiled loops).
+*together*: ``closed_loops`` with the model on ``--device``; on the CPU that is the same
+compiled loops, asked for all trials at once. *torch*: the same by the torch expressions
+that answer on a GPU, here on the CPU. *mean* and *linearised* are the ``trajectory``
+form with H stages a step; *moment-matched* is the paper's form with one exact Jacobian
+a step.
 
-One process, one thread on the host, in turns; process time, on a GPU wall time. Trials alone are independent: no more
-than ``--alone`` of them are flown and their time is scaled. Ratios are paired; above 1 the crowd is faster. Writes
+One process, one thread on the host, in turns; process time, on a GPU wall time. Trials
+alone are independent: no more than ``--alone`` of them are flown and their time is
+scaled. Ratios are paired; above 1 the crowd is faster. Writes
 ``outputs/benchmarks/batched-DEVICE.json``.
 """
 
@@ -23,14 +27,14 @@ import torch
 from benchmarks.quadrotor import HOVER, NOISE, OUTER, TRAJECTORIES, problem, trained
 from benchmarks.timing import write_results
 from gpmpc.gp import GPPosterior, backend
-from gpmpc.mpc import PredictionSettings
-from gpmpc.mpc.gp_mpc import GPMPC
+from gpmpc.mpc import GPMPC, PredictionSettings
 from gpmpc.propagation import Linearization, MomentMatching
 from gpmpc.simulation import closed_loop, closed_loops
 from gpmpc.trajectories import states_along
 
 HORIZON = 10
-TORCH_LIMIT = 2_000_000  # T N^2 of exact moments above which torch on the CPU is left out: minutes a flight
+# T N^2 of exact moments above which torch on the CPU is left out: minutes a flight
+TORCH_LIMIT = 2_000_000
 MODES = {
     "mean": {
         "propagator": Linearization(),

@@ -1,11 +1,14 @@
-"""The whole quadrotor on learned models: two GPs at 1 and 20 Hz beside the same cascade on the true models.
+"""The whole quadrotor on learned models.
+
+Two GPs at 1 and 20 Hz beside the same cascade on the true models.
 
     .venv/bin/python -m benchmarks.cascade [--steps 189] [--seeds 5]
 
-Twelve states; outer and inner controller are convex GP-MPC, the outer one with and without an estimate of what its
-model mispredicts (``disturbance_gain``), and NMPC on the true subsystems for comparison. Flown along both trajectories
-as they are, with a gust, and with a mass that is 20 % larger than the models know. RMSE of the position, total over x,
-y, z, after every outer step. Writes ``outputs/benchmarks/cascade.json``.
+Twelve states; outer and inner controller are convex GP-MPC, the outer one with and
+without an estimate of what its model mispredicts (``disturbance_gain``), and NMPC on
+the true subsystems for comparison. Flown along both trajectories as they are, with a
+gust, and with a mass that is 20 % larger than the models know. RMSE of the position,
+total over x, y, z, after every outer step. Writes ``outputs/benchmarks/cascade.json``.
 """
 
 import argparse
@@ -18,10 +21,8 @@ from benchmarks.quadrotor import HOVER, INNER, OUTER, TRAJECTORIES, problem, tra
 from benchmarks.timing import write_results
 from gpmpc.exceptions import GpmpcError
 from gpmpc.metrics import tracking_error
-from gpmpc.mpc import PredictionSettings
+from gpmpc.mpc import GPMPC, PredictionSettings, Problem, Tracking
 from gpmpc.mpc.baselines import NMPC
-from gpmpc.mpc.gp_mpc import GPMPC
-from gpmpc.mpc.problem import Problem, Tracking
 from gpmpc.propagation import Linearization
 from gpmpc.simulation import Cascade, Gust, Noise, Replaced, cascade_loop
 from gpmpc.systems import Coupled, System

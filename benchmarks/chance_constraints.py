@@ -75,25 +75,20 @@ Array = np.ndarray
 class Plant:
     """A plant with a bound on one of its states, and a set point beyond.
 
-    Attributes:
-        successor: The next state from a state, an input and the disturbance of the step.
-        disturbances: Of every step of a flight, from a number of steps and a generator.
-        begin: Puts the plant where a flight begins; returns the state (n,).
-        log: States (T, n), inputs (T, m) and next states to learn from.
-        goal: The set point (n,).
-        turn: Steps after which the set point changes its sign; it stays by default.
-        bound: Index of the bounded state, and its bound.
-        weights: Of states and inputs.
-        limits: Of the inputs (m,), both sides.
-        quantile: Of the noise of a step, in its standard deviations; None where nobody knows it.
-        noise: Its standard deviations (n,); None likewise.
-        angles: Indices of states that the GP sees as sine and cosine.
-        stages: With a bound; all by default.
-        rate: Of the inputs, from one to the next.
-        adaptation: Rate of the adaptive tube; its default by default.
-        sides: To which the state is bounded: 1 is above.
-        steps: Of each of 20 flights, after the first 50.
-        share: Of these that touch the bound at least, roughly.
+    Attributes: successor: The next state from a state, an input and the disturbance of
+        the step. disturbances: Of every step of a flight, from a number of steps and a
+        generator. begin: Puts the plant where a flight begins; returns the state (n,).
+        log: States (T, n), inputs (T, m) and next states to learn from. goal: The set
+        point (n,). turn: Steps after which the set point changes its sign; it stays by
+        default. bound: Index of the bounded state, and its bound. weights: Of states
+        and inputs. limits: Of the inputs (m,), both sides. quantile: Of the noise of a
+        step, in its standard deviations; None where nobody knows it. noise: Its
+        standard deviations (n,); None likewise. angles: Indices of states that the GP
+        sees as sine and cosine. stages: With a bound; all by default. rate: Of the
+        inputs, from one to the next. adaptation: Rate of the adaptive tube; its default
+        by default. sides: To which the state is bounded: 1 is above. steps: Of each of
+        20 flights, after the first 50. share: Of these that touch the bound at least,
+        roughly.
     """
 
     successor: Callable[[Array, Array, Array], Array]
@@ -145,7 +140,10 @@ def pendulum_plant(kind: str) -> Plant:
 
 
 def pendulum_of_rate() -> Plant:
-    """The pendulum with a noise that grows with its rate: at the bound it is larger than on average."""
+    """The pendulum with a noise that grows with its rate.
+
+    At the bound it is larger than on average.
+    """
 
     def successor(x: Array, u: Array, w: Array) -> Array:
         return pendulum(x, u) + w * math.hypot(0.5, x[1])
@@ -321,7 +319,8 @@ class Flights:
     active: int
     distance: float
     costs: list[float]  # mean of a step, of each flight
-    errors: Array  # of the predictions of the next bounded state, in their standard deviations (T,)
+    # of the predictions of the next bounded state, in their standard deviations (T,)
+    errors: Array
 
 
 def fly(

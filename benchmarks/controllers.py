@@ -23,13 +23,21 @@ from benchmarks.quadrotor import HOVER, TRAJECTORIES, Asked, problem, recorded, 
 from benchmarks.timing import write_results
 from gpmpc.experiments.slsqp import SLSQP
 from gpmpc.gp import GPPosterior
-from gpmpc.mpc import Decision, PredictionSettings, Request, Timing
-from gpmpc.mpc.gp_mpc import GPMPC, NonlinearGPMPC
+from gpmpc.mpc import (
+    GPMPC,
+    Decision,
+    NonlinearGPMPC,
+    PredictionSettings,
+    Request,
+    Timing,
+)
 from gpmpc.propagation import Linearization, MomentMatching, differentiate
 from gpmpc.status import Status
 
 COLD = ", cold"
-STD = 0.01  # [m, m/s] of the belief: the full covariance is differentiated, as in a loop with an estimator
+# [m, m/s] of the belief: the full covariance is differentiated, as in a loop with an
+# estimator
+STD = 0.01
 
 
 def main() -> None:
@@ -67,9 +75,12 @@ def main() -> None:
 
 
 def ways(gp: GPPosterior, horizon: int) -> list[dict]:
-    """The controllers that are compared, by name: the convex ones, and the rivals that take a hundred times as long.
+    """The controllers that are compared, by name.
 
-    Whoever comes after a rival finds the caches full of it; so they take turns apart, each with the paper's form.
+    The convex ones, and the rivals that take a hundred times as long.
+
+    Whoever comes after a rival finds the caches full of it; so they take turns apart,
+    each with the paper's form.
     """
     exact = MomentMatching(process_noise=False)
     asked = (problem(), horizon, HOVER)

@@ -1,13 +1,17 @@
-"""What a step's decision costs and keeps: programs a step, a rotary pendulum in a narrow arm, a car in a lane.
+"""What a step's decision costs and keeps.
+
+Programs a step, a rotary pendulum in a narrow arm, a car in a lane.
 
     .venv/bin/python -m benchmarks.decisions [programs furuta car] [--seeds 5]
 
-``programs`` flies plants of the gallery with their exact models by one program a step, by as many as it needs (the
-default), and by the converged controller: closed-loop cost relative to the last, programs a step.
+``programs`` flies plants of the gallery with their exact models by one program a step,
+by as many as it needs (the default), and by the converged controller: closed-loop cost
+relative to the last, programs a step.
 
-``furuta`` swings a rotary pendulum up by a GP of 500 noisy rows, free and with an arm that is to stay within a box with
-95 % at every stage. ``car`` drives a figure of eight in a lane, by a GP of 500 noisy rows, where it starts beside it or
-not: without the lane, with a price of 100, with exact and with elastic bounds (the default).
+``furuta`` swings a rotary pendulum up by a GP of 500 noisy rows, free and with an arm
+that is to stay within a box with 95 % at every stage. ``car`` drives a figure of eight
+in a lane, by a GP of 500 noisy rows, where it starts beside it or not: without the
+lane, with a price of 100, with exact and with elastic bounds (the default).
 """
 
 import argparse
@@ -333,7 +337,10 @@ def rows_of_car(seed: int) -> Transitions:
 
 
 def beside(x: torch.Tensor, u: torch.Tensor, p: torch.Tensor) -> torch.Tensor:
-    """How far a car is to the left of its path; p are a point of the path and the normal there."""
+    """How far a car is to the left of its path.
+
+    P are a point of the path and the normal there.
+    """
     return p[:, 2] * (x[:, 0] - p[:, 0]) + p[:, 3] * (x[:, 1] - p[:, 1])
 
 

@@ -24,9 +24,7 @@ from gpmpc.estimation import KalmanFilter, Measurement
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior
 from gpmpc.models import DisturbedModel
-from gpmpc.mpc import Decision, PredictionSettings, Reference
-from gpmpc.mpc.gp_mpc import GPMPC
-from gpmpc.mpc.problem import Tracking
+from gpmpc.mpc import GPMPC, Decision, PredictionSettings, Reference, Tracking
 from gpmpc.propagation import Linearization
 
 GAINS = (0.0, 0.3, 1.0)
@@ -75,7 +73,7 @@ class FilteredControl:
     def control(
         self, belief: Gaussian, reference: Reference, previous: Decision | None = None
     ) -> Decision:
-        """Estimates, and decides; a flight begins where there is no previous decision."""
+        """Estimates and decides; a flight begins without a previous decision."""
         begin = perf_counter()
         if previous is None or self._belief is None:
             covariance = self.sensor**2 * torch.eye(STATES, dtype=torch.float64)

@@ -1,15 +1,19 @@
-"""What it costs not to measure: an inverted pendulum with a late input, a missing sensor, and lost measurements.
+"""What it costs not to measure.
+
+An inverted pendulum with a late input, a missing sensor, and lost measurements.
 
     .venv/bin/python -m benchmarks.estimation [--seeds 20] [--steps 200]
 
-A pendulum with a torque, sampled at 20 Hz, is learned from 30 s of random motion (the angle seen as sine and cosine)
-and made to follow two references: a slow swing around its upper position, where it is unstable, and steps between two
-angles to the sides of its lower one, which it cannot follow at once. Printed: RMSE of the angle [rad] pooled over the
-seeds, its ratio to the loop in brackets, and pendulums that fell (more than a right angle off the swing). The delay is
-three steps; it is found in the random motion by correlation.
+A pendulum with a torque, sampled at 20 Hz, is learned from 30 s of random motion (the
+angle seen as sine and cosine) and made to follow two references: a slow swing around
+its upper position, where it is unstable, and steps between two angles to the sides of
+its lower one, which it cannot follow at once. Printed: RMSE of the angle [rad] pooled
+over the seeds, its ratio to the loop in brackets, and pendulums that fell (more than a
+right angle off the swing). The delay is three steps; it is found in the random motion
+by correlation.
 
-Filters: NEES per state at every fiftieth step, with the band that holds its mean with 95 %, and the time of a step.
-Writes ``outputs/benchmarks/estimation.json``.
+Filters: NEES per state at every fiftieth step, with the band that holds its mean with
+95 %, and the time of a step. Writes ``outputs/benchmarks/estimation.json``.
 """
 
 import argparse
@@ -34,9 +38,7 @@ from gpmpc.estimation import (
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import Trainer, Transitions
 from gpmpc.models import Affine, DelayedModel, DisturbedModel, Linearized, ResidualModel
-from gpmpc.mpc import PredictionSettings, Reference
-from gpmpc.mpc.gp_mpc import GPMPC
-from gpmpc.mpc.problem import Box, Problem, Tracking
+from gpmpc.mpc import GPMPC, Box, PredictionSettings, Problem, Reference, Tracking
 from gpmpc.propagation import Linearization
 
 STEP = 0.05
@@ -156,19 +158,16 @@ def learned(states: Array, inputs: Array, delay: int) -> ResidualModel:
 class Loop(NamedTuple):
     """One way to control.
 
-    Attributes:
-        assumed: The delay that the controller believes in [steps].
-        delay: Of the plant [steps].
-        measures: What of a state is measured, NaN where nothing is; None: the state itself without noise.
-        filtered: Whether a Kalman filter estimates the state.
-        augmented: Whether the controller plans with the delayed model, not from where the inputs on their way lead.
-        noise: Factor of the noise of the plant.
-        task: The reference, ``"swing"`` or ``"steps"``.
-        against: The loop that the error is compared with.
-        gain: Of the controller's own disturbance estimate.
-        known: Whether the controller has the true model in place of the learned one.
-        drift: Standard deviation by which an angular acceleration, estimated beside the state, may change in a step
-            [rad/s per step]; 0 for none.
+    Attributes: assumed: The delay that the controller believes in [steps]. delay: Of
+        the plant [steps]. measures: What of a state is measured, NaN where nothing is;
+        None: the state itself without noise. filtered: Whether a Kalman filter
+        estimates the state. augmented: Whether the controller plans with the delayed
+        model, not from where the inputs on their way lead. noise: Factor of the noise
+        of the plant. task: The reference, ``"swing"`` or ``"steps"``. against: The loop
+        that the error is compared with. gain: Of the controller's own disturbance
+        estimate. known: Whether the controller has the true model in place of the
+        learned one. drift: Standard deviation by which an angular acceleration,
+        estimated beside the state, may change in a step [rad/s per step]; 0 for none.
     """
 
     delay: int = 0

@@ -132,7 +132,10 @@ def issue_rate(count: int = 200_000) -> float:
 
 @compiled
 def multiply_add(values, count):
-    """Twelve chains of ``count`` multiply-adds in registers: two a cycle hide a latency of four."""
+    """Twelve chains of ``count`` multiply-adds in registers.
+
+    Two a cycle hide a latency of four.
+    """
     a = load(values, 0)
     b = load(values, 8)
     c = load(values, 16)

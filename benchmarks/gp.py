@@ -1,11 +1,16 @@
-"""What one step through the GPs costs: exact moments, linearised, mean, with Jacobians, beside torch and GPyTorch.
+"""What one step through the GPs costs.
 
-    .venv/bin/python -m benchmarks.gp [--sizes 10 50 100 189 500 1000 2000] [--seconds 2] [--torch-jacobian-up-to 500]
+Exact moments, linearised, mean, with Jacobians, beside torch and GPyTorch.
 
-One process, one thread, processor time. Six outputs, six states and three inputs; at each size all calls that compute
-one quantity take turns on one posterior, ours first. Above ``--torch-jacobian-up-to`` points torch's reverse mode
-through the closed form is left out (it keeps all N x N products of the 21 pairs). Beside the times stands the largest
-relative difference of a result from ours. Writes ``outputs/benchmarks/gp.json``.
+    .venv/bin/python -m benchmarks.gp [--sizes 10 50 100 189 500 1000 2000] [--seconds
+    2] [--torch-jacobian-up-to 500]
+
+One process, one thread, processor time. Six outputs, six states and three inputs; at
+each size all calls that compute one quantity take turns on one posterior, ours first.
+Above ``--torch-jacobian-up-to`` points torch's reverse mode through the closed form is
+left out (it keeps all N x N products of the 21 pairs). Beside the times stands the
+largest relative difference of a result from ours. Writes
+``outputs/benchmarks/gp.json``.
 """
 
 import argparse

@@ -26,7 +26,10 @@ class GPyTorchLikelihood:
         )
 
     def __call__(self, theta: np.ndarray) -> tuple[float, np.ndarray]:
-        """Value and gradient (d + 2,) at theta; infinite where K is not positive definite."""
+        """Value and gradient (d + 2,) at theta.
+
+        Infinite where K is not positive definite.
+        """
         model = self._model
         model.set_hyperparameters(torch.from_numpy(theta)[None])
         model.zero_grad()

@@ -3,16 +3,17 @@
     make guard                                     # exit code 1 where a call is slower
     .venv/bin/python -m benchmarks.guard --base v0.2.0
 
-Both sides run at once, each in a process of its own, and take turns of a few calls, so that
-a slow minute of the machine slows both. Without ``--base`` the other side is the last
-commit, or the one before it where nothing has changed since. Its package is unpacked below
-``outputs/guard/``; the first run with a commit compiles it, which takes a minute.
+Both sides run at once, each in a process of its own, and take turns of a few calls, so
+that a slow minute of the machine slows both. Without ``--base`` the other side is the
+last commit, or the one before it where nothing has changed since. Its package is
+unpacked below ``outputs/guard/``; the first run with a commit compiles it, which takes
+a minute.
 
 A ratio is the median over the turns of this code's time divided by the other's, with an
 interval that holds the true median in 95 of 100 runs. A call counts as slower where the
-whole interval lies above ``MARGIN``. Since two processes lay out their memory differently,
-which can make two per cent, the processes are started anew several times. One thread,
-processor time.
+whole interval lies above ``MARGIN``. Since two processes lay out their memory
+differently, which can make two per cent, the processes are started anew several times.
+One thread, processor time.
 """
 
 import argparse
@@ -151,7 +152,7 @@ def git(*arguments: str) -> bytes:
 
 
 def unpacked(commit: str) -> Path:
-    """Returns a folder with the package of a commit, which is made where it is missing."""
+    """Returns a folder with the package of a commit; makes it if it is missing."""
     folder = FOLDER / commit
     if not folder.exists():
         partial = FOLDER / f"{commit}.partial"

@@ -1,9 +1,10 @@
 """The calls that the guard times, in a process that measures on demand.
 
-The guard starts one such process for each side, with the package of that side. A line on
-standard input names a case and a number of calls, `{"case": "program", "calls": 20}`; the
-answer is a line with the median processor time of these calls in seconds. Only the public
-doors of the package are used, so that these cases run with the code of other commits, too.
+The guard starts one such process for each side, with the package of that side. A line
+on standard input names a case and a number of calls, `{"case": "program", "calls":
+20}`; the answer is a line with the median processor time of these calls in seconds.
+Only the public doors of the package are used, so that these cases run with the code of
+other commits, too.
 """
 
 import json

@@ -40,7 +40,7 @@ VOLTAGES = [3.15, 3.15]  # [V]
 
 
 class QuadrupleTank:
-    """Four tanks and two pumps (Johansson, 2000), in the setting P+: non-minimum phase."""
+    """Four tanks and two pumps (Johansson, 2000), non-minimum phase (P+)."""
 
     state_names = ("h1", "h2", "h3", "h4")
     input_names = ("v1", "v2")

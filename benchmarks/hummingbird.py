@@ -1,9 +1,13 @@
-"""RotorPy's Hummingbird, compiled: its equations with its parameters (Folk, Paulos and Kumar, 2023).
+"""RotorPy's Hummingbird, compiled.
 
-RotorPy computes derivatives in Python and calls ``scipy.integrate.solve_ivp`` for every step of 0.01 s, which takes a
-millisecond. Here the motors' commands of its velocity controller and the derivatives are compiled, and a step is four
-of the classical Runge-Kutta method of fourth order, each half the motors' time constant long; that takes a fortieth.
-``compiled_hummingbird`` compares both with RotorPy's own at random states before anything flies.
+Its equations with its parameters (Folk, Paulos and Kumar, 2023).
+
+RotorPy computes derivatives in Python and calls ``scipy.integrate.solve_ivp`` for every
+step of 0.01 s, which takes a millisecond. Here the motors' commands of its velocity
+controller and the derivatives are compiled, and a step is four of the classical
+Runge-Kutta method of fourth order, each half the motors' time constant long; that takes
+a fortieth. ``compiled_hummingbird`` compares both with RotorPy's own at random states
+before anything flies.
 """
 
 import math

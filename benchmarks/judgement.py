@@ -1,12 +1,15 @@
-"""How often flights are judged rightly: good ones, sabotaged ones, and a tank whose horizon is too short.
+"""How often flights are judged rightly.
+
+Good ones, sabotaged ones, and a tank whose horizon is too short.
 
     .venv/bin/python -m benchmarks.judgement [good sabotaged tank cost] [--flights 100]
 
-Good flights are those of the documentation's systems, with noise, set-point jumps, waypoints, gusts and learning.
-Sabotaged ones fly well until something breaks: an input acts the other way round, the plant's mass is another, a
-sensor freezes or is late, the horizon is too short. A sabotage *shows* from the first step at which the flight's true
-states are farther from those of the same flight without it than five deviations of the noise and a twentieth of what
-it travels.
+Good flights are those of the documentation's systems, with noise, set-point jumps,
+waypoints, gusts and learning. Sabotaged ones fly well until something breaks: an input
+acts the other way round, the plant's mass is another, a sensor freezes or is late, the
+horizon is too short. A sabotage *shows* from the first step at which the flight's true
+states are farther from those of the same flight without it than five deviations of the
+noise and a twentieth of what it travels.
 """
 
 import argparse
@@ -227,7 +230,7 @@ def _gust(rates: dict[str, float], start: float, stop: float) -> Any:
 
 
 def good_flights() -> list[Scenario]:
-    """Returns a hundred flights of the documentation's kinds that come to a good end."""
+    """Returns a hundred flights of the documentation's kinds that end well."""
     flights: list[Scenario] = []
 
     def add(
@@ -331,7 +334,8 @@ def _heavier(factor: float, *names: str) -> Callable[[System, float], Any]:
     return other
 
 
-SABOTAGED = {  # settings of a flight, what is reversed, heavier, frozen and late, and when
+# settings of a flight, what is reversed, heavier, frozen and late, and when
+SABOTAGED = {
     "double integrator": (("system=double_integrator",), 5, 0, ("mass",), 0, 3),
     "pendulum": (("system=pendulum",), 20, 0, ("mass",), 0, 2),
     "cart-pole": (("system=cart_pole",), 15, 0, ("cart_mass", "pole_mass"), 2, 2),
@@ -358,7 +362,10 @@ SABOTAGED = {  # settings of a flight, what is reversed, heavier, frozen and lat
 
 
 def sabotages(name: str) -> list[Sabotage]:
-    """Returns what is done to a flight of ``SABOTAGED``; the heat of a reaction is half as much again."""
+    """Returns what is done to a flight of ``SABOTAGED``.
+
+    The heat of a reaction is half as much again.
+    """
     _, step, input, masses, state, late = SABOTAGED[name]
     factor = 1.5 if masses == ("heat",) else 2.0
     return [
@@ -389,7 +396,10 @@ def _first_farther(flown: Any, twin: Any) -> int | None:
 
 
 def first_called(flown: Any, twin: Any, since: int) -> int | None:
-    """Returns the first step from which on a flight is not healthy where its twin is; None without one."""
+    """Returns the first step from which on a flight is not healthy where its twin is.
+
+    None without one.
+    """
     for k in range(since, len(flown.judgements)):
         is_twin_healthy = (
             k >= len(twin.judgements) or twin.judgements[k].level == "healthy"

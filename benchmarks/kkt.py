@@ -1,18 +1,23 @@
-"""Relative KKT residual of a plan: one measure for solvers that stop by tests of their own.
+"""Relative KKT residual of a plan.
+
+One measure for solvers that stop by tests of their own.
 
 No solver uses it. It is the gradient of the reduced problem, the inputs alone its
 unknowns, the states those of the GPs' mean rolled out by torch,
 
-    f(U) = sum_i |x_i - r_i|^2_Q + sum_i |v_i|^2_R,   x_{i+1} = m(x_i, u_i),   lower <= U <= upper
-    g = df/dU by the discrete adjoint (Bryson and Ho, 1975, section 2.2)
+    f(U) = sum_i |x_i - r_i|^2_Q + sum_i |v_i|^2_R,   x_{i+1} = m(x_i, u_i),   lower <=
+    U <= upper g = df/dU by the discrete adjoint (Bryson and Ho, 1975, section 2.2)
 
-A plan is a KKT point exactly where the middle one of g_j, h_j (u_j - lower_j) and h_j (u_j - upper_j) is zero for
-every j, whatever positive h_j: multipliers of the box are those of the projection (Facchinei and Pang, 2003, section
-1.5.1). With h the diagonal of the Gauss-Newton Hessian all three are gradients. f is a sum of squares, so |g_j| is at
-most sqrt(2 h_j f), and the share of it that is left is the cosine between the residuals and their change with u_j
-(More, 1978, eq. (8.2)), from 0 to 1 whatever the units of the cost. Where f vanishes so does g, and the share
-need not: f is counted with what moving u_j by ``SMALL`` of its size adds to it, h_j (SMALL size)^2 / 2, the size being
-|u_j| or 1, whichever is more, but at most upper_j - lower_j. The largest share is the residual of a plan.
+A plan is a KKT point exactly where the middle one of g_j, h_j (u_j - lower_j) and h_j
+(u_j - upper_j) is zero for every j, whatever positive h_j: multipliers of the box are
+those of the projection (Facchinei and Pang, 2003, section 1.5.1). With h the diagonal
+of the Gauss-Newton Hessian all three are gradients. f is a sum of squares, so |g_j| is
+at most sqrt(2 h_j f), and the share of it that is left is the cosine between the
+residuals and their change with u_j (More, 1978, eq. (8.2)), from 0 to 1 whatever the
+units of the cost. Where f vanishes so does g, and the share need not: f is counted with
+what moving u_j by ``SMALL`` of its size adds to it, h_j (SMALL size)^2 / 2, the size
+being |u_j| or 1, whichever is more, but at most upper_j - lower_j. The largest share is
+the residual of a plan.
 """
 
 from dataclasses import dataclass
@@ -24,8 +29,7 @@ from gpmpc._dynamics import predict_with_jacobian
 from gpmpc.exceptions import SettingError, ShapeError
 from gpmpc.gaussian import Gaussian
 from gpmpc.models import DynamicsModel
-from gpmpc.mpc import Reference
-from gpmpc.mpc.problem import Problem
+from gpmpc.mpc import Problem, Reference
 
 Array = np.ndarray
 
@@ -62,11 +66,9 @@ def kkt_residual(
 ) -> float:
     """Computes how far a plan is from a KKT point; see the module's text.
 
-    Args:
-        model: Its mean is the dynamics; float64 in host memory.
-        problem: Weights, and bounds of the inputs; increments or the inputs themselves are weighed.
-        instance: Where the plan starts and what it follows.
-        inputs: The plan (H, m).
+    Args: model: Its mean is the dynamics; float64 in host memory. problem: Weights, and
+        bounds of the inputs; increments or the inputs themselves are weighed. instance:
+        Where the plan starts and what it follows. inputs: The plan (H, m).
 
     Raises:
         SettingError: The problem bounds more than inputs, or weighs deviations.

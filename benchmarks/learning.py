@@ -1,15 +1,21 @@
-"""What learning while flying is worth: a vehicle that becomes a fifth heavier, a wind that changes, and nothing at all.
+"""What learning while flying is worth.
 
-    .venv/bin/python -m benchmarks.learning [--seeds 20] [--figure docs/figures/learning.png]
-    .venv/bin/python -m benchmarks.learning --faults [--seeds 10]
+A vehicle that becomes a fifth heavier, a wind that changes, and nothing at all.
 
-The translational quadrotor with the plant in the loop, GPs of 189 dithered transitions, convex GP-MPC with H = 10, one
-step a second. At 20 s it becomes 20 % heavier, or a wind begins, which turns at 50 s; or nothing happens. Compared: the
-model as learned, without and with the controller's own disturbance estimate (gain 0.5), online learning, and a model
-that was trained on the plant that flies after the change (on the plant without wind where the wind changes), which
-flies that plant all along. RMSE of the position [m] from 5 s after a change on, pooled over the seeds; ``ratio`` is to
-the last of these, ``lost`` counts flights farther than 5 m away then. Also by how much a decision takes longer. Each
-cell is kept in ``outputs/benchmarks/learning.json`` and not flown again by the same code.
+    .venv/bin/python -m benchmarks.learning [--seeds 20] [--figure
+    docs/figures/learning.png] .venv/bin/python -m benchmarks.learning --faults [--seeds
+    10]
+
+The translational quadrotor with the plant in the loop, GPs of 189 dithered transitions,
+convex GP-MPC with H = 10, one step a second. At 20 s it becomes 20 % heavier, or a wind
+begins, which turns at 50 s; or nothing happens. Compared: the model as learned, without
+and with the controller's own disturbance estimate (gain 0.5), online learning, and a
+model that was trained on the plant that flies after the change (on the plant without
+wind where the wind changes), which flies that plant all along. RMSE of the position [m]
+from 5 s after a change on, pooled over the seeds; ``ratio`` is to the last of these,
+``lost`` counts flights farther than 5 m away then. Also by how much a decision takes
+longer. Each cell is kept in ``outputs/benchmarks/learning.json`` and not flown again by
+the same code.
 
 With ``--faults`` its sensors fail on the ellipse, in calm air and in the wind: glitches
 of one state at a time, steps without a measurement, and a second in which all of them
@@ -43,8 +49,7 @@ from benchmarks.timing import own_source, write_results
 from gpmpc._files import write_whole
 from gpmpc.gp import GPPosterior
 from gpmpc.learning import LearningController, OnlineLearning
-from gpmpc.mpc import Controller, PredictionSettings
-from gpmpc.mpc.gp_mpc import GPMPC
+from gpmpc.mpc import GPMPC, Controller, PredictionSettings
 from gpmpc.plotting import png
 from gpmpc.propagation import Linearization
 from gpmpc.simulation import (
@@ -168,7 +173,10 @@ def flights(
 
 
 def later(change: str) -> np.ndarray:
-    """The steps that count: from 5 s after a change on; all of them where there is none."""
+    """The steps that count: from 5 s after a change on.
+
+    All of them where there is none.
+    """
     k = np.arange(STEPS + 1)
     after = (k > CHANGE + 5) & ((k <= TURN) | (k > TURN + 5) | (change != "wind"))
     return after if change != "none" else k > 0

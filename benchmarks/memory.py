@@ -1,12 +1,16 @@
-"""What memory a control step takes: peak resident set of a fresh process, and what its steps allocate once it runs.
+"""What memory a control step takes.
+
+Peak resident set of a fresh process, and what its steps allocate once it runs.
 
     .venv/bin/python -m benchmarks.memory [--size 2000] [--horizon 20]
 
-A posterior of six GPs over ``size`` points is written to a file; a process of its own then loads it and steers with the
-``trajectory`` form, mean only and zero-order. ``peak`` is the operating system's count over the whole life of that
-process, libraries included (Linux). Of the steady state, after the first steps: the largest peak of what Python and
-NumPy allocate during a step (tracemalloc), and how far the resident set rose above where it was before (which sees
-compiled code and torch too). The model is as large as its Cholesky factors. Writes ``outputs/benchmarks/memory.json``.
+A posterior of six GPs over ``size`` points is written to a file; a process of its own
+then loads it and steers with the ``trajectory`` form, mean only and zero-order.
+``peak`` is the operating system's count over the whole life of that process, libraries
+included (Linux). Of the steady state, after the first steps: the largest peak of what
+Python and NumPy allocate during a step (tracemalloc), and how far the resident set rose
+above where it was before (which sees compiled code and torch too). The model is as
+large as its Cholesky factors. Writes ``outputs/benchmarks/memory.json``.
 """
 
 import argparse
@@ -81,9 +85,7 @@ def flown(file: str, covariance: str, horizon: int) -> dict:
 
     from gpmpc.gaussian import Gaussian
     from gpmpc.gp import load_posterior
-    from gpmpc.mpc import PredictionSettings, Reference
-    from gpmpc.mpc.gp_mpc import GPMPC
-    from gpmpc.mpc.problem import Box, Problem, Tracking
+    from gpmpc.mpc import GPMPC, Box, PredictionSettings, Problem, Reference, Tracking
     from gpmpc.propagation import Linearization
 
     torch.set_num_threads(1)

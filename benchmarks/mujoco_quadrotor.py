@@ -1,15 +1,19 @@
-"""A quadrotor in MuJoCo on the paper's two paths: what its flights teach, beside NMPC on the rigid body fitted to them.
+"""A quadrotor in MuJoCo on the paper's two paths.
+
+What its flights teach, beside NMPC on the rigid body fitted to them.
 
     .venv/bin/python -m benchmarks.mujoco_quadrotor [--seeds 20]
 
-The vehicle of ``system=mujoco_quadrotor``: rotors that lag by 25 ms, drag, measurements with noise, 25 Hz. A seed is
-one vehicle's history: three dithered flights of 8 s with the data sheet's rigid body, along random curves. To their 597
-steps a rigid body is fitted (mass and three moments of inertia, least squares), and GPs on 200 of them learn what it
-misses. Both are flown for 12 s along the ellipse and the Lorenz path, which begin at rest, and again with a fifth more
-mass in a wind of 4 m/s. NMPC is solved to a KKT point of 1e-6 at every step, without an estimate of disturbances: the
-nominal controller. The rigid body with ``disturbance_gain=0.3``, and the learned model with it, are flown by one
-quadratic program a step. The flights of a seed are a line of ``outputs/benchmarks/mujoco_quadrotor.jsonl``, where a
-run of the same code goes on.
+The vehicle of ``system=mujoco_quadrotor``: rotors that lag by 25 ms, drag, measurements
+with noise, 25 Hz. A seed is one vehicle's history: three dithered flights of 8 s with
+the data sheet's rigid body, along random curves. To their 597 steps a rigid body is
+fitted (mass and three moments of inertia, least squares), and GPs on 200 of them learn
+what it misses. Both are flown for 12 s along the ellipse and the Lorenz path, which
+begin at rest, and again with a fifth more mass in a wind of 4 m/s. NMPC is solved to a
+KKT point of 1e-6 at every step, without an estimate of disturbances: the nominal
+controller. The rigid body with ``disturbance_gain=0.3``, and the learned model with it,
+are flown by one quadratic program a step. The flights of a seed are a line of
+``outputs/benchmarks/mujoco_quadrotor.jsonl``, where a run of the same code goes on.
 """
 
 import argparse
@@ -184,7 +188,10 @@ def flights(seed: int) -> list[dict]:
 
 
 def summary(rows: list[dict]) -> str:
-    """A line for each vehicle and path: errors [m], their ratio (median, worst seed) and times [ms]."""
+    """A line for each vehicle and path.
+
+    Errors [m], their ratio (median, worst seed) and times [ms].
+    """
     table = pandas.DataFrame(rows)
     table["failures"] = table.groupby(["vehicle", "path"])["failures"].transform("sum")
     wide = table.pivot(

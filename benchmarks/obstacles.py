@@ -154,7 +154,7 @@ def fly(model: GPPosterior, probability: float, seed: int) -> dict:
 
 
 def margins(decision: Decision) -> Array:
-    """By how much the plan is beyond the bound of each disc and stage, negative within."""
+    """Returns the violation of each disc and stage by the plan, negative within."""
     program = decision.problem
     return program.G @ decision.solution.x - program.upper[len(program.q) :]
 

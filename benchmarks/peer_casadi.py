@@ -19,7 +19,7 @@ from gpmpc._interrupts import interrupts_after
 from gpmpc.exceptions import SettingError
 from gpmpc.gp import GPPosterior
 from gpmpc.gp.casadi_ import casadi_function
-from gpmpc.mpc.problem import Problem
+from gpmpc.mpc import Problem
 
 Array = np.ndarray
 
@@ -43,11 +43,9 @@ MAX_ITERATIONS = 200
 class Solution(NamedTuple):
     """A plan with what the next solve starts from.
 
-    Attributes:
-        inputs: (H, m).
-        unknowns: u_k and x_{k+1} (and u_k again where the last input is a state) of every stage (H, ...).
-        bound_multipliers: Of the bounds of the unknowns (H, ...).
-        dynamics_multipliers: Of x_{k+1} = m(x_k, u_k) (H, ...).
+    Attributes: inputs: (H, m). unknowns: u_k and x_{k+1} (and u_k again where the last
+        input is a state) of every stage (H, ...). bound_multipliers: Of the bounds of
+        the unknowns (H, ...). dynamics_multipliers: Of x_{k+1} = m(x_k, u_k) (H, ...).
     """
 
     inputs: Array
@@ -203,7 +201,7 @@ def _gauss_newton(w: Any, p: Any, g: Any, cost: Any, triangle: bool) -> casadi.F
 
 
 def _options(plugin: str, H: int, n: int, m: int, tolerance: float) -> dict[str, Any]:
-    """Options of a solver for H stages of n states and m inputs, the first state given."""
+    """Returns the options of a solver for H stages of n states and m inputs."""
     options: dict[str, Any] = {"print_time": False, "error_on_fail": False}
     if plugin == "ipopt":
         return options | {

@@ -1,7 +1,7 @@
 """DAQP as a QP solver of the controllers.
 
-DAQP (Arnstroem, Bemporad and Axehill, 2022), a dual active-set method in C, through the interface of its Python package
-that keeps the working set from one solve to the next.
+DAQP (Arnstroem, Bemporad and Axehill, 2022), a dual active-set method in C, through the
+interface of its Python package that keeps the working set from one solve to the next.
 """
 
 import importlib.util
@@ -28,7 +28,9 @@ def installed() -> bool:
 
 
 class Daqp:
-    """DAQP as a ``QPSolver``; the warm start is its own, from the last program of the same size.
+    """DAQP as a ``QPSolver``.
+
+    The warm start is its own, from the last program of the same size.
 
     Raises:
         SettingError: DAQP is not installed.
@@ -40,7 +42,10 @@ class Daqp:
         self._models: dict = {}
 
     def solve(self, problem: QuadraticProgram, warm_start: object = None) -> QPSolution:
-        """The minimiser; see ``gpmpc.qp.solver.QPSolver``. ``warm_start`` is not looked at."""
+        """The minimiser; see ``gpmpc.qp.solver.QPSolver``.
+
+        ``warm_start`` is not looked at.
+        """
         import daqp
 
         # Strided arrays are read wrongly by DAQP 0.11, and nothing is said.

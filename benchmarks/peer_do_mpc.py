@@ -22,7 +22,7 @@ from benchmarks.peer_casadi import (
 from gpmpc._interrupts import interrupts_after
 from gpmpc.exceptions import SettingError
 from gpmpc.gp import GPPosterior
-from gpmpc.mpc.problem import Problem
+from gpmpc.mpc import Problem
 
 MISSING = "not installed: pip install 'gpmpc[bench]'"
 
@@ -47,8 +47,8 @@ class DoMpc:
         horizon: H.
         tolerance: IPOPT's, on its own scaled optimality conditions.
 
-    Raises:
-        SettingError: do-mpc is not installed, or the problem has what this file does not hand on.
+    Raises: SettingError: do-mpc is not installed, or the problem has what this file
+        does not hand on.
     """
 
     def __init__(

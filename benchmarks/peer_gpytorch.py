@@ -1,8 +1,9 @@
 """A GPyTorch model, autograd through its rollout, and SciPy's SLSQP.
 
-The cost of a plan is rolled out through the model's own predictions, its gradient comes from ``backward``, and SLSQP
-(Kraft, 1988) keeps the inputs in their box. Predictions of the mean alone, from GPyTorch's cache, no parameter with a
-gradient: what such a user would do after reading the manual.
+The cost of a plan is rolled out through the model's own predictions, its gradient comes
+from ``backward``, and SLSQP (Kraft, 1988) keeps the inputs in their box. Predictions of
+the mean alone, from GPyTorch's cache, no parameter with a gradient: what such a user
+would do after reading the manual.
 """
 
 from typing import NamedTuple
@@ -15,7 +16,7 @@ from scipy.optimize import minimize
 from benchmarks.kkt import Instance
 from benchmarks.peer_casadi import check_problem
 from gpmpc.gp import GPPosterior, exact_inference, to_gpytorch
-from gpmpc.mpc.problem import Problem
+from gpmpc.mpc import Problem
 
 
 class Plan(NamedTuple):
@@ -33,8 +34,8 @@ class GPyTorchSlsqp:
         horizon: H.
         tolerance: SLSQP's, of the cost.
 
-    Raises:
-        SettingError: The problem weighs something else than increments, or bounds more than inputs.
+    Raises: SettingError: The problem weighs something else than increments, or bounds
+        more than inputs.
     """
 
     def __init__(
@@ -53,7 +54,7 @@ class GPyTorchSlsqp:
         )
 
     def __call__(self, instance: Instance, last: Plan | None) -> Plan:
-        """The plan from a state along a reference, started from the last one, shifted."""
+        """Plans along a reference, started from the last plan, shifted."""
         start = np.tile(instance.last, (self._horizon, 1))
         if last is not None:
             start = np.concatenate([last.inputs[1:], last.inputs[-1:]])

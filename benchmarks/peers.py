@@ -40,9 +40,7 @@ from benchmarks.timing import (
     write_results,
 )
 from gpmpc.gp import GPPosterior
-from gpmpc.mpc import Controller, Decision, PredictionSettings, Timing
-from gpmpc.mpc.gp_mpc import GPMPC
-from gpmpc.mpc.problem import Problem
+from gpmpc.mpc import GPMPC, Controller, Decision, PredictionSettings, Problem, Timing
 from gpmpc.propagation import Linearization
 from gpmpc.status import Status
 
@@ -217,7 +215,10 @@ def by_controller(controller: Controller) -> Solve:
 
 
 def _previous(instance: Instance, last: Decision | None) -> Decision:
-    """The last decision with the input that was applied; without one, no plan but an input."""
+    """The last decision with the input that was applied.
+
+    Without one, no plan but an input.
+    """
     if last is not None:  # ``dataclasses.replace`` takes as long as a program
         return Decision(
             input=instance.last, inputs=last.inputs, means=last.means, covariances=last.covariances,

@@ -1,8 +1,9 @@
 """Coupled pendulums of any number, and GPs of them: one system of every size.
 
-A row of c pendulums, each with a torque of its own and a spring to its neighbours: 2 c states, c inputs; smooth,
-nonlinear, coupled and stable to fly with any model of it. Its GPs are not trained, since hyperparameters do not change
-what a prediction costs: they come from the ranges of the data.
+A row of c pendulums, each with a torque of its own and a spring to its neighbours: 2 c
+states, c inputs; smooth, nonlinear, coupled and stable to fly with any model of it. Its
+GPs are not trained, since hyperparameters do not change what a prediction costs: they
+come from the ranges of the data.
 """
 
 from collections.abc import Sequence
@@ -80,7 +81,8 @@ def pendulum_gp(state_dim: int, size: int, seed: int = 0) -> GPPosterior:
         - states
     )
     features = np.concatenate([states, inputs], axis=1)
-    # Wider than the data, as for a smooth system, and every feature counts in every output.
+    # Wider than the data, as for a smooth system, and every feature counts in every
+    # output.
     scales = np.tile(6.0 * (features.std(0) + 1e-3), (n, 1))
     signal = 100.0 * (changes.var(0) + 1e-6)
     parts = (features, changes, scales, signal, NOISE_SHARE * signal)
@@ -90,7 +92,10 @@ def pendulum_gp(state_dim: int, size: int, seed: int = 0) -> GPPosterior:
 
 
 def pendulum_references(state_dim: int, steps: int) -> np.ndarray:
-    """Reference states (steps, n): every pendulum swings, each a little later than its neighbour."""
+    """Reference states (steps, n).
+
+    Every pendulum swings, each a little later than its neighbour.
+    """
     time = TIME_STEP * np.arange(steps)
     m = state_dim // 2
     phase = time[:, None] - 0.3 * np.arange(m)

@@ -1,18 +1,22 @@
 """How fast are the QP solvers in closed loop, beside DAQP and CVXPY with Clarabel?
 
-    .venv/bin/python -m benchmarks.qp                      # every cell of the table, about ten minutes
-    .venv/bin/python -m benchmarks.qp --horizons 50 --modes changing --slow-solvers 0
+    .venv/bin/python -m benchmarks.qp                      # every cell of the table,
+    about ten minutes .venv/bin/python -m benchmarks.qp --horizons 50 --modes changing
+    --slow-solvers 0
 
-All solvers solve one sequence of QPs in one process on one thread, each warm-started from its own last solution:
-``constant`` and ``changing`` are those of ``quadrotor_sequences``, ``elliptical`` and ``lorenz`` those of a learned
-controller on a flight, whose P and G change, with bounds of inputs and states. The solvers take turns, sequence by
-sequence, ``--passes`` times, and the fastest of a QP's passes counts: what another process on the machine does to one
-pass is not the solver's time. *Hot*: the problem has just been written to memory that stays the same, as a controller
+All solvers solve one sequence of QPs in one process on one thread, each warm-started
+from its own last solution: ``constant`` and ``changing`` are those of
+``quadrotor_sequences``, ``elliptical`` and ``lorenz`` those of a learned controller on
+a flight, whose P and G change, with bounds of inputs and states. The solvers take
+turns, sequence by sequence, ``--passes`` times, and the fastest of a QP's passes
+counts: what another process on the machine does to one pass is not the solver's time.
+*Hot*: the problem has just been written to memory that stays the same, as a controller
 would. *Flushed*: all caches are overwritten before every call.
 
-Times include everything from contiguous arrays to x, so the Python layer of either side. DAQP has two paths, each with
-contiguous arrays: ``Model.update`` + ``Model.solve`` (warm), and ``daqp.solve`` from nothing; ratios are to the faster
-one of the cell. Written to ``outputs/benchmarks/qp.json``.
+Times include everything from contiguous arrays to x, so the Python layer of either
+side. DAQP has two paths, each with contiguous arrays: ``Model.update`` +
+``Model.solve`` (warm), and ``daqp.solve`` from nothing; ratios are to the faster one of
+the cell. Written to ``outputs/benchmarks/qp.json``.
 """
 
 import argparse

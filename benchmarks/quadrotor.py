@@ -1,4 +1,7 @@
-"""The flying quadrotor that the benchmarks of the controllers share: GPs from dithered flights, and recorded steps."""
+"""The flying quadrotor that the benchmarks of the controllers share.
+
+GPs from dithered flights, and recorded steps.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,8 +12,7 @@ import torch
 from gpmpc.datasets import Excitation, ExcitedData
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior, Trainer, standardize
-from gpmpc.mpc import Controller, Decision, Reference
-from gpmpc.mpc.problem import Box, Problem, Tracking
+from gpmpc.mpc import Box, Controller, Decision, Problem, Reference, Tracking
 from gpmpc.simulation import Noise, closed_loop
 from gpmpc.systems import rotational, translational
 from gpmpc.trajectories import Elliptical, Lorenz, states_along
@@ -72,7 +74,10 @@ def problem(
 def recorded(
     controller: Controller, trajectory: str, steps: int, std: float = 0.0, seed: int = 0
 ) -> list[Asked]:
-    """The instances of a flight with the plant in the loop; ``std`` is what the controller is told to be unsure of."""
+    """The instances of a flight with the plant in the loop.
+
+    ``std`` is what the controller is told to be unsure of.
+    """
     asked: list[Asked] = []
 
     class Recording:

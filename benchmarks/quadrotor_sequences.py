@@ -19,8 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.quadrotor import HOVER, TRAJECTORIES, problem, recorded, trained
-from gpmpc.mpc.gp_mpc import GPMPC
-from gpmpc.mpc.problem import Box
+from gpmpc.mpc import GPMPC, Box
 from gpmpc.propagation import Linearization
 from gpmpc.trajectories import states_along
 
@@ -42,7 +41,8 @@ POSITION_NOISE = 0.01
 VELOCITY_NOISE = 0.05
 
 
-# Bounds that are active at about one step in ten: of ux and uy [-], and of the increments of U1 [N], ux, uy.
+# Bounds that are active at about one step in ten: of ux and uy [-], and of the
+# increments of U1 [N], ux, uy.
 TIGHT = {
     "elliptical": (0.015, [0.014, 0.004, 0.004]),
     "lorenz": (0.04, [0.2, 0.02, 0.03]),
@@ -51,7 +51,10 @@ TIGHT = {
 
 @dataclass(frozen=True)
 class SequenceProblem:
-    """One QP of a sequence: ``min 1/2 x'Px + q'x`` with ``lower <= [x; Gx] <= upper``; the box is stacked first."""
+    """One QP of a sequence: ``min 1/2 x'Px + q'x`` with ``lower <= [x; Gx] <= upper``.
+
+    The box is stacked first.
+    """
 
     P: Array
     q: Array
@@ -105,7 +108,7 @@ def _condense(A: Array, B: Array, horizon: int) -> tuple[Array, Array]:
 
 
 def _state_limits(times: Array) -> Array:
-    """The bound on each state at each time: a corridor of two seconds out of every six."""
+    """Returns the bound on each state: a corridor two seconds out of every six."""
     inside = np.mod(times, 6.0) > 4.0
     return np.where(inside[:, None], NARROW, WIDE).ravel()
 
@@ -113,7 +116,7 @@ def _state_limits(times: Array) -> Array:
 def quadrotor_sequence(
     horizon: int, changing: bool, length: int, solve, seed: int = 0
 ) -> Iterator[SequenceProblem]:
-    """The QPs of ``length`` closed-loop steps; ``solve(problem) -> x`` closes the loop."""
+    """Yields the QPs of closed-loop steps; ``solve(problem) -> x`` closes the loop."""
     rng = np.random.default_rng(seed)
     weight = np.kron(np.eye(horizon), STATE_WEIGHT)
     box = np.tile(INPUT_LIMIT, horizon)
@@ -179,7 +182,10 @@ def flight_sequence(
 def _two_sided(
     P: Array, q: Array, G: Array, lower: Array, upper: Array
 ) -> SequenceProblem:
-    """Merges rows that are equal, such as an upper and a lower bound of one state: other solvers have fewer to scan."""
+    """Merges rows that are equal, such as an upper and a lower bound of one state.
+
+    Other solvers have fewer to scan.
+    """
     n = len(q)
     rows, first, group = np.unique(G, axis=0, return_index=True, return_inverse=True)
     low = np.full(len(rows), -np.inf)

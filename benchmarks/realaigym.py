@@ -1,16 +1,21 @@
-"""Plays the double pendulum of the RealAIGym league (simulation board of 2025): swing up from anywhere, and stay there.
+"""Plays the double pendulum of the RealAIGym league (simulation board of 2025).
 
-``python -m benchmarks.realaigym robot=acrobot model=residual seeds=0,1 draws=3`` learns a model, lets the
-league's own classes disturb and simulate, and prints the board with a row of ours. Models: ``true`` (the published
-equations and parameters), ``residual`` (a rigid body, each of whose parameters is 15 % wrong at first, is fitted by
-least squares, and a GP learns what is left) and ``gp`` (a GP alone). They are learned from 60 s: 20 s of random torque,
-then four times 10 s of the league's own test under the model learned so far. They are kept in ``folder=``, with a file
-``con_gpmpc_*.py`` that flies them in the league's own scripts; ``board=script`` runs the league's unmodified one.
-``board=robustness`` flies as many values of each quantity of the robustness board as ``draws=`` says (league: 21).
-``board=film`` draws 8 s as a GIF.
-With ``time=real`` what is computed takes effect as much later as it took (``realaigym_real_time``).
+Swing up from anywhere, and stay there.
 
-The league's simulator: github.com/dfki-ric-underactuated-lab/double_pendulum, its ``src/python`` on PYTHONPATH.
+``python -m benchmarks.realaigym robot=acrobot model=residual seeds=0,1 draws=3`` learns
+a model, lets the league's own classes disturb and simulate, and prints the board with a
+row of ours. Models: ``true`` (the published equations and parameters), ``residual`` (a
+rigid body, each of whose parameters is 15 % wrong at first, is fitted by least squares,
+and a GP learns what is left) and ``gp`` (a GP alone). They are learned from 60 s: 20 s
+of random torque, then four times 10 s of the league's own test under the model learned
+so far. They are kept in ``folder=``, with a file ``con_gpmpc_*.py`` that flies them in
+the league's own scripts; ``board=script`` runs the league's unmodified one.
+``board=robustness`` flies as many values of each quantity of the robustness board as
+``draws=`` says (league: 21). ``board=film`` draws 8 s as a GIF. With ``time=real`` what
+is computed takes effect as much later as it took (``realaigym_real_time``).
+
+The league's simulator: github.com/dfki-ric-underactuated-lab/double_pendulum, its
+``src/python`` on PYTHONPATH.
 """
 
 import json
@@ -75,7 +80,9 @@ TURNS = {
     "acrobot": (2, 3),
     "pendubot": (3, 4),
 }  # of both joints, that a search without a clock takes for goals
-PUBLISHED = {  # simulation board of 2025: mean score of the best entries, acados with the true model, and MC-PILCO (GP)
+# simulation board of 2025: mean score of the best entries, acados with the true model,
+# and MC-PILCO (GP)
+PUBLISHED = {
     "acrobot": {
         "AR-EAPO": 0.658,
         "VIMPPI": 0.648,
@@ -105,7 +112,8 @@ LENGTHS = 0.2, 0.3  # [m]
 WILD = 25.0, 38.0  # rates beyond which transitions are not learned from [rad/s]
 REPLAN = 5.0  # predicted time below the line above which a plan is given up [s]
 BRAKE = 0.3  # torque against the actuated joint's rate without a plan [N m s/rad]
-PAUSE = 10  # plans' time steps that the joint is braked for after a search that found no way up
+# plans' time steps that the joint is braked for after a search that found no way up
+PAUSE = 10
 
 
 def state_of(x: Any) -> Array:
@@ -441,7 +449,8 @@ class Parts(NamedTuple):
     """What a pilot is made of."""
 
     controller: GPMPC  #: improves a plan from decision to decision
-    planner: GPMPC  #: takes several programs a start, with the fitted body alone where there is one
+    #: takes several programs a start, with the fitted body alone where there is one
+    planner: GPMPC
     guesses: list[Array | None]  #: to start from: the straight line, the drift, kicks
     criterion: Callable[
         [Decision, Reference], float
@@ -458,13 +467,10 @@ def make_parts(
 ) -> Parts:
     """Makes the parts of a pilot.
 
-    Args:
-        model: Predicts the state 20 ms later.
-        rate: Weight of both rates [s^2/rad^2]; angles have 10 [1/rad^2].
-        horizon: H, stages of 20 ms.
-        programs: Of each start.
-        wild: Whether starts with kicks are taken besides the straight line and the drift.
-        kept: Programs of a decision from a plan.
+    Args: model: Predicts the state 20 ms later. rate: Weight of both rates [s^2/rad^2];
+        angles have 10 [1/rad^2]. horizon: H, stages of 20 ms. programs: Of each start.
+        wild: Whether starts with kicks are taken besides the straight line and the
+        drift. kept: Programs of a decision from a plan.
     """
     Q = np.diag([10.0, rate, 10.0, rate])
     R = np.array([[0.01]])
@@ -508,7 +514,10 @@ def make_parts(
 
 
 def pilot(model: Any, robot: str, gain: float = 1.0, **settings: Any) -> Pilot:
-    """Makes the pilot of a model that takes all the time it likes; settings are those of ``make_parts``."""
+    """Makes the pilot of a model that takes all the time it likes.
+
+    Settings are those of ``make_parts``.
+    """
     controller, planner, guesses, criterion = make_parts(
         model, RATES[robot], **settings
     )
@@ -554,12 +563,9 @@ def play(
 ) -> Play:
     """Runs the league's simulation and disturbances, drawn from a seed.
 
-    Args:
-        who: Flies.
-        robot: ``"acrobot"`` or ``"pendubot"``.
-        seed: Of the disturbances.
-        seconds: Of 60.
-        unmodified: Also the plant's right-hand side is the league's code, which takes ten times longer than ours.
+    Args: who: Flies. robot: ``"acrobot"`` or ``"pendubot"``. seed: Of the disturbances.
+        seconds: Of 60. unmodified: Also the plant's right-hand side is the league's
+        code, which takes ten times longer than ours.
     """
     from double_pendulum.analysis.leaderboard import get_uptime
     from double_pendulum.controller.abstract_controller import AbstractController
@@ -750,7 +756,9 @@ def board(
     folder: Path,
     real_time: bool = False,
 ) -> list[dict[str, Any]]:
-    """Plays a number of draws with the model of each seed; prints and returns one row for each play.
+    """Plays a number of draws with the model of each seed.
+
+    Prints and returns one row for each play.
 
     Rows that the folder holds already are read, not played again. Those of other code
     stay in their file and are none of them.
@@ -838,7 +846,8 @@ def _play_in_real_time(model: Any, robot: str, draw: int) -> dict[str, Any]:
 def _real_time_pilot(model: Any, robot: str) -> Any:
     """The pilot of a model in real time.
 
-    Few starts have converged after their programs: with one program a decision 60 % of their plans are lost.
+    Few starts have converged after their programs: with one program a decision 60 % of
+    their plans are lost.
     """
     from benchmarks.realaigym_real_time import real_time_pilot
 

@@ -1,4 +1,7 @@
-"""Draws a flight of the league's double pendulum as a GIF: links, the tip's path of the last half second, the line."""
+"""Draws a flight of the league's double pendulum as a GIF.
+
+Links, the tip's path of the last half second, the line.
+"""
 
 from pathlib import Path
 

@@ -33,7 +33,9 @@ from gpmpc.models import RollOut
 from gpmpc.mpc import GPMPC, ControlLoop, Decision, ManyStarts, Reference
 from gpmpc.mpc._policy import Command
 
-GOOD = 1.0  # predicted time below the line up to which a plan is not compared with those of other starts [s]
+# predicted time below the line up to which a plan is not compared with those of other
+# starts [s]
+GOOD = 1.0
 
 
 class Flight(NamedTuple):
@@ -132,7 +134,10 @@ class RealTimePilot:
         return out
 
     def _think(self, state: Array, now: int) -> None:
-        """Lets both cores begin what they are free for: a decision, and a search where the flight is not good."""
+        """Lets both cores begin what they are free for.
+
+        A decision, and a search where the flight is not good.
+        """
         flight = self._flight
         if flight is not None and self._decided is None and now > flight.start:
             self._decided = self._decide(state, now, flight)
@@ -191,7 +196,10 @@ class RealTimePilot:
     def _timed(
         self, plan: Decision, begin: float, now: int, start: int, times: list[float]
     ) -> Flight:
-        """The flight of a plan whose making began at a processor time; its value is infinite where it is of no use."""
+        """The flight of a plan whose making began at a processor time.
+
+        Its value is infinite where it is of no use.
+        """
         loop = ControlLoop(self.step)
         value = inf
         if plan.applicable:

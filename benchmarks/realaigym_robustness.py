@@ -1,10 +1,13 @@
-"""Plays the league's robustness board (version 2): is the pendulum up after 10 s where something is not as expected?
+"""Plays the league's robustness board (version 2).
 
-Six parts, each a share of flights: other masses, inertias and frictions; noise on the rates; noise on the torque; a
-motor that follows slowly or overshoots; late measurements; torque pulses on both joints. The league's own class
-disturbs, simulates (its plant, too) and judges. The pilot is told nothing: a Kalman filter makes rates of the angles,
-delay and responsiveness are estimated from 0.3 s of random torques and made up for. Nothing adapts to other masses and
-frictions.
+Is the pendulum up after 10 s where something is not as expected?
+
+Six parts, each a share of flights: other masses, inertias and frictions; noise on the
+rates; noise on the torque; a motor that follows slowly or overshoots; late
+measurements; torque pulses on both joints. The league's own class disturbs, simulates
+(its plant, too) and judges. The pilot is told nothing: a Kalman filter makes rates of
+the angles, delay and responsiveness are estimated from 0.3 s of random torques and made
+up for. Nothing adapts to other masses and frictions.
 """
 
 import json
@@ -40,7 +43,10 @@ PROBE = 3.0  # their size [N m]
 
 
 class RateFilter:
-    """The steady state of a Kalman filter that knows no dynamics: accelerations are states that change at random."""
+    """The steady state of a Kalman filter that knows no dynamics.
+
+    Accelerations are states that change at random.
+    """
 
     def __init__(self) -> None:
         moves = Affine.identity(4, 1)
@@ -161,13 +167,13 @@ class Watchful:
 def robustness(
     controller: Any, robot: str, size: int, store: Path
 ) -> dict[str, list[bool]]:
-    """Which flights of each part ended upright; those of a part that the file has are read, not flown again.
+    """Which flights of each part ended upright.
 
-    Args:
-        controller: In the league's interface.
-        robot: ``"acrobot"`` or ``"pendubot"``.
-        size: Values of each quantity; the league takes 21, and 10 flights at each noise and 50 with pulses.
-        store: A JSON file, of one code.
+    Those of a part that the file has are read, not flown again.
+
+    Args: controller: In the league's interface. robot: ``"acrobot"`` or ``"pendubot"``.
+        size: Values of each quantity; the league takes 21, and 10 flights at each noise
+        and 50 with pulses. store: A JSON file, of one code.
     """
     from double_pendulum.analysis.benchmark import benchmarker
 

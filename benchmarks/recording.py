@@ -3,13 +3,16 @@
     .venv/bin/python -m benchmarks.recording                 # about a minute
     .venv/bin/python -m benchmarks.recording --horizon 20 --seconds 10
 
-A step is that of the quadrotor: n = 6, m = 3, a plan over the horizon H with covariances, and the condensed quadratic
-program (3 H variables, 6 H rows). Sixteen different steps take turns: in use, too, a step's numbers have just been
-written, and lie in the cache. Steps are a millisecond apart, so that thirty pictures a second are drawn; with
-``--apart 0.1`` every step is. Every step works for half a millisecond (arithmetic in the interpreter) and is recorded.
+A step is that of the quadrotor: n = 6, m = 3, a plan over the horizon H with
+covariances, and the condensed quadratic program (3 H variables, 6 H rows). Sixteen
+different steps take turns: in use, too, a step's numbers have just been written, and
+lie in the cache. Steps are a millisecond apart, so that thirty pictures a second are
+drawn; with ``--apart 0.1`` every step is. Every step works for half a millisecond
+(arithmetic in the interpreter) and is recorded.
 
-Reported: the time of ``record`` (median, mean, 99 % quantile; every few steps it serialises and compresses those that
-wait), and how much longer the loop takes than one without a recorder, the two taking turns.
+Reported: the time of ``record`` (median, mean, 99 % quantile; every few steps it
+serialises and compresses those that wait), and how much longer the loop takes than one
+without a recorder, the two taking turns.
 """
 
 import argparse

@@ -2,9 +2,10 @@
 
     .venv/bin/python -m benchmarks.same_bits [--only convex iterated]
 
-In an empty, a full and a half-empty cache of kernels, where none can be kept, and with the controllers flown in the
-other order, each in a process of its own with its own seed of Python's hashes; compiling takes a minute or two in four
-of them. Names what differs, and ends with 1 then.
+In an empty, a full and a half-empty cache of kernels, where none can be kept, and with
+the controllers flown in the other order, each in a process of its own with its own seed
+of Python's hashes; compiling takes a minute or two in four of them. Names what differs,
+and ends with 1 then.
 """
 
 import argparse
@@ -29,10 +30,16 @@ from benchmarks.quadrotor import (
     problem,
     trained,
 )
-from gpmpc.mpc import Controller, PredictionSettings
+from gpmpc.mpc import (
+    GPMPC,
+    Box,
+    Controller,
+    NonlinearGPMPC,
+    PredictionSettings,
+    Problem,
+    Tracking,
+)
 from gpmpc.mpc.baselines import LQR, NMPC, StateFormMPC
-from gpmpc.mpc.gp_mpc import GPMPC, NonlinearGPMPC
-from gpmpc.mpc.problem import Box, Problem, Tracking
 from gpmpc.propagation import Linearization, MomentMatching
 from gpmpc.simulation import Cascade, cascade_loop, closed_loop
 from gpmpc.systems import Coupled, System

@@ -44,7 +44,9 @@ from gpmpc.propagation import Linearization, MomentMatching, differentiate
 from gpmpc.simulation import closed_loop
 
 RECORDED_STEPS = 40
-STD = 0.01  # [rad, rad/s] of the beliefs: a full covariance is propagated, as with an estimator in the loop
+# [rad, rad/s] of the beliefs: a full covariance is propagated, as with an estimator in
+# the loop
+STD = 0.01
 # N and H that the panels hold, or the nearest ones measured
 FIGURE_SIZE = 189
 FIGURE_HORIZON = 10
@@ -180,7 +182,10 @@ def record_steps(
 def measure_size(
     gp: GPPosterior, horizons: Sequence[int], seconds: float, flushed: bool
 ) -> Iterator[dict]:
-    """Yields the rows of one model: its predictions, and the controllers at every horizon."""
+    """Yields the rows of one model.
+
+    Its predictions, and the controllers at every horizon.
+    """
     times = time_interleaved(predictions(gp), seconds, min_rounds=10, flushed=flushed)
     size = {"n": gp.state_dim, "N": len(gp)}
     for name, taken in times.items():
@@ -204,7 +209,10 @@ def measure_size(
 
 
 def predictions(gp: GPPosterior) -> dict[str, Callable[[], object]]:
-    """Builds the calls that predict one step of the GPs: mean, exact moments, exact moments with all derivatives."""
+    """Builds the calls that predict one step of the GPs.
+
+    Mean, exact moments, exact moments with all derivatives.
+    """
     n = gp.state_dim
     exact = MomentMatching()
     references = torch.from_numpy(pendulum_references(n, RECORDED_STEPS))
@@ -251,9 +259,12 @@ def table(rows: Sequence[Mapping]) -> str:
 
 
 def speed_figure(rows: Sequence[Mapping]) -> Figure:
-    """Draws milliseconds per step: above over N at one horizon, below over H at one size; one column for every n.
+    """Draws milliseconds per step.
 
-    A line is the median, the area above it reaches to the 99th percentile; hot caches where both were measured.
+    Above over N at one horizon, below over H at one size; one column for every n.
+
+    A line is the median, the area above it reaches to the 99th percentile; hot caches
+    where both were measured.
     """
     cache = "hot" if any(row["cache"] == "hot" for row in rows) else "flushed"
     rows = [row for row in rows if row["H"] is not None and row["cache"] == cache]

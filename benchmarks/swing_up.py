@@ -23,7 +23,7 @@ from benchmarks.timing import own_source
 from gpmpc.cli._experiment import experiment_of
 from gpmpc.cli._settings import compose, settings
 from gpmpc.gp import Transitions
-from gpmpc.mpc.problem import Tracking
+from gpmpc.mpc import Tracking
 from gpmpc.studies._document import Table, terminal
 from gpmpc.studies.flight import Experiment, run_trial
 from gpmpc.studies.study import TrialStore, fingerprint, one_thread

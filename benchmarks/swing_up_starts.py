@@ -1,12 +1,14 @@
-"""Swing-ups from hanging with the exact model: plain control beside searches from many starts.
+"""Swing-ups from hanging with the exact model.
+
+Plain control beside searches from many starts.
 
     .venv/bin/python -m benchmarks.swing_up_starts [pendulum cart_pole acrobot furuta]
 
 Plants of the gallery and a rotary pendulum, horizons from 30 to 80 stages, three
 weightings. Plain control takes one program a step; the search is that of the guide: the
 same controller, and a planner of ten programs a start. A flight is up from the time on
-after which all angles that are to be upright stay within 0.2 rad to its end. Each flight
-is a line of ``outputs/benchmarks/swing_up_starts.jsonl``.
+after which all angles that are to be upright stay within 0.2 rad to its end. Each
+flight is a line of ``outputs/benchmarks/swing_up_starts.jsonl``.
 """
 
 import argparse

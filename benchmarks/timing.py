@@ -76,13 +76,11 @@ def time_interleaved(
 ) -> dict[str, Times]:
     """Lets every case take a turn in each round, and times every call.
 
-    Args:
-        cases: Calls by name.
-        seconds: Processor time all of them may take together, the flushing apart [s].
-        min_rounds: Rounds at least, whatever the time.
-        max_rounds: Rounds at most.
-        flushed: Whether the caches are emptied before every call.
-        in_a_row: Calls of a turn: with one, all find the caches as another case left them.
+    Args: cases: Calls by name. seconds: Processor time all of them may take together,
+        the flushing apart [s]. min_rounds: Rounds at least, whatever the time.
+        max_rounds: Rounds at most. flushed: Whether the caches are emptied before every
+        call. in_a_row: Calls of a turn: with one, all find the caches as another case
+        left them.
 
     Raises:
         SettingError: Fewer than one round, or no time.
@@ -161,7 +159,7 @@ def describe(machine: Mapping[str, Any]) -> str:
 
 
 def markdown_table(header: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
-    """Formats rows as a Markdown table; columns but the first are aligned to the right."""
+    """Formats rows as a Markdown table, aligned to the right but for the first column."""
     cells = [[_cell(value) for value in row] for row in rows]
     widths = [
         max(len(row[i]) for row in [list(header), *cells]) for i in range(len(header))

@@ -1,14 +1,18 @@
-"""How time and memory of training grow with the number of points: exact GPs to 5000, sparse ones to 20000.
+"""How time and memory of training grow with the number of points.
 
-    .venv/bin/python -m benchmarks.training_scale                      # about ten minutes
-    .venv/bin/python -m benchmarks.training_scale --quick              # to 1000 points; a minute
-    .venv/bin/python -m benchmarks.training_scale --threads 2
+Exact GPs to 5000, sparse ones to 20000.
 
-One output of nine features; every case in a process of its own, whose peak resident set less that after the imports is
-the memory. Times are processor time (of all threads together, as many as ``--threads``): of one evaluation of the
-likelihood with its gradient, and of whole trainings with the error they end with. Beside it GPyTorch's own route, exact
-(automatic differentiation through Cholesky) and sparse (``InducingPointKernel``), to the sizes that are bearable; the
-ratio, its time over ours, is from taking turns in one process. Written to ``--out``: training_scale.json and
+    .venv/bin/python -m benchmarks.training_scale                      # about ten
+    minutes .venv/bin/python -m benchmarks.training_scale --quick              # to 1000
+    points; a minute .venv/bin/python -m benchmarks.training_scale --threads 2
+
+One output of nine features; every case in a process of its own, whose peak resident set
+less that after the imports is the memory. Times are processor time (of all threads
+together, as many as ``--threads``): of one evaluation of the likelihood with its
+gradient, and of whole trainings with the error they end with. Beside it GPyTorch's own
+route, exact (automatic differentiation through Cholesky) and sparse
+(``InducingPointKernel``), to the sizes that are bearable; the ratio, its time over
+ours, is from taking turns in one process. Written to ``--out``: training_scale.json and
 training_scale.png.
 """
 
@@ -173,12 +177,15 @@ def function(x):
 
 
 def evaluation(route: str, x, y, inducing: int):
-    """A function of nothing: the likelihood or bound and its gradient, at one point of the search."""
+    """A function of nothing.
+
+    The likelihood or bound and its gradient, at one point of the search.
+    """
     import numpy as np
     import torch
 
     from benchmarks.gpytorch_likelihood import GPyTorchLikelihood
-    from gpmpc.gp._kernel import Hyperparameters
+    from gpmpc.gp import Hyperparameters
     from gpmpc.gp._likelihood import NegativeLogMarginalLikelihood
     from gpmpc.gp._sparse import collapsed_bound
 

@@ -1,12 +1,17 @@
-"""What an estimate of the model's error is worth: a vehicle that is a fifth heavier than the data say, and noise.
+"""What an estimate of the model's error is worth.
 
-    .venv/bin/python -m benchmarks.wrong_model [--steps 189] [--seeds 5] [--figure docs/figures/wrong_mass.png]
+A vehicle that is a fifth heavier than the data say, and noise.
 
-The translational quadrotor with the plant in the loop, GPs of 189 dithered transitions of the lighter one, convex
-GP-MPC with H = 10: ``trajectory`` with several gains of its disturbance estimate, and the paper's increments, which
-have no offset by what they are. Every combination of a mass and of a noise is flown on both trajectories; RMSE of the
-position, total over x, y, z [m], pooled over the seeds. Writes ``outputs/benchmarks/wrong_model.json`` and a figure of
-how the heavier vehicle comes to its altitude.
+    .venv/bin/python -m benchmarks.wrong_model [--steps 189] [--seeds 5] [--figure
+    docs/figures/wrong_mass.png]
+
+The translational quadrotor with the plant in the loop, GPs of 189 dithered transitions
+of the lighter one, convex GP-MPC with H = 10: ``trajectory`` with several gains of its
+disturbance estimate, and the paper's increments, which have no offset by what they are.
+Every combination of a mass and of a noise is flown on both trajectories; RMSE of the
+position, total over x, y, z [m], pooled over the seeds. Writes
+``outputs/benchmarks/wrong_model.json`` and a figure of how the heavier vehicle comes to
+its altitude.
 """
 
 import argparse
@@ -21,8 +26,7 @@ from benchmarks.quadrotor import HOVER, NOISE, OUTER, TRAJECTORIES, problem, tra
 from benchmarks.timing import write_results
 from gpmpc._files import write_whole
 from gpmpc.metrics import tracking_error
-from gpmpc.mpc import PredictionSettings
-from gpmpc.mpc.gp_mpc import GPMPC
+from gpmpc.mpc import GPMPC, PredictionSettings
 from gpmpc.plotting import png
 from gpmpc.propagation import Linearization
 from gpmpc.simulation import Noise, Replaced, Rollout, closed_loop

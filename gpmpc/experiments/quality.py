@@ -1,19 +1,21 @@
-"""Closed-loop cost over the time of a decision, for every controller and propagation of the package: ``gpmpc quality``.
+"""Closed-loop cost over the time of a decision: ``gpmpc quality``.
 
-Every case flies the same flights: the quadrotor's translational subsystem, the plant in the loop, the same seeds of its
-noise. Its name is what is typed after ``gpmpc run``. The cost is the stage cost that all of them minimise, summed along
-the true flight,
+Every controller and propagation of the package flies the same flights: the quadrotor's
+translational subsystem, the plant in the loop, the same seeds of its noise. A case is
+named by what is typed after ``gpmpc run``. The cost is the stage cost that all of them
+minimise, summed along the true flight,
 
     1/K  sum_{k=1..K} |x_k - r_k|^2_Q + sum_{k=0..K-1} |u_k - u_{k-1}|^2_R
 
-divided by that of NMPC on the true model with the longest horizon. Nothing bounds a state here, so what covariances buy
-does not show; what they take does. Cases take turns, flight by flight. A decision's time is the processor time of its
-thread; compiling and loading come before.
+divided by that of NMPC on the true model with the longest horizon. Nothing bounds a
+state here, so what covariances buy does not show; what they take does. Cases take
+turns, flight by flight. A decision's time is the processor time of its thread;
+compiling and loading come before.
 """
 
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
@@ -21,57 +23,41 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
-from matplotlib.ticker import NullLocator
 
 from gpmpc.exceptions import GpmpcError, SettingError, check_number
+from gpmpc.experiments.quality_figure import front_figure
 from gpmpc.gaussian import Gaussian
 from gpmpc.metrics import tracking_cost, tracking_error
 from gpmpc.mpc import Controller, Decision, Reference
 from gpmpc.plotting import png
-from gpmpc.plotting._style import (
-    BLACK,
-    COLOURS,
-    DASHED,
-    make_figure,
-    plain_numbers,
-    styled,
-)
+from gpmpc.simulation import Rollout
 from gpmpc.studies._document import MISSING, Document, Table, number
 from gpmpc.studies.flight import Experiment, run_trial
 from gpmpc.studies.study import TrialSpec, fingerprint, read_model, trained_model
 from gpmpc.trajectories import Trajectory
 
-LOST = 5.0  # [m] from the reference, some hundred times what is usual: nothing to compare costs with
-SAME = 1e-3  # difference of two costs below which the seeds' noise hides it: it buys no time
-CURVES = 5  # in the figure
-MARKERS = ("o", "^", "s", "D", "v", "P", "X")
-# greys
-OTHERS = "0.75"
-FRONT = "0.35"
-TICKS = (-1, 0, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)  # [%]
-LINEAR = 1.0  # [%] of cost up to which the axis is linear
+#: [m] from the reference, some hundred times what is usual: no costs to compare
+LOST = 5.0
+#: difference of two costs below which the seeds' noise hides it: it buys no time
+SAME = 1e-3
 LEGEND = (
-    "cost: of the states and of the inputs' increments, over that of NMPC on the true model at the longest horizon, "
-    "geometric mean over the trajectories. ms: processor time of a decision. front: no other controller on a learned "
-    "model is as good, to 0.1 %, in less time, or better in the same."
+    "cost: of the states and of the inputs' increments, over that of NMPC on the true "
+    "model at the longest horizon, geometric mean over the trajectories. ms: processor "
+    "time of a decision. front: no other controller on a learned model is as good, to "
+    "0.1 %, in less time, or better in the same."
 )
 
 
 class Family(NamedTuple):
-    """One choice of settings, at many horizons.
+    """A choice of settings, flown at many horizons.
 
     Attributes:
         name: Kind of controller, for the reader.
-        words: What chooses it.
-        longest: The longest horizon that is worth the time.
+        words: Settings that choose it, typed after ``gpmpc run``.
     """
 
     name: str
     words: str
-    longest: float = math.inf
 
 
 TRUTH = Family("NMPC, true model", "controller=nmpc")
@@ -115,7 +101,7 @@ FAMILIES = (
 
 
 class Condition(NamedTuple):
-    """What a trial needs: its flight, and the file of the trained GPs; None where none are needed."""
+    """A flight, and the file of the trained GPs; None where none are needed."""
 
     experiment: Experiment
     model: Path | None
@@ -126,10 +112,10 @@ class Quality:
     """The flights of all cases.
 
     Attributes:
-        experiments: By family: the flight that its words mean after ``gpmpc run``.
+        experiments: Flights that the words of each family choose.
         trajectories: By name.
         settings: Of the flights and of the training, as plain data for the fingerprint.
-        horizons: H of every family, up to its longest.
+        horizons: H of every family.
         steps: Of a flight.
         seeds: Of the noise: flights on each trajectory.
         workers: Processes; more than one disturb each other's times.
@@ -160,72 +146,99 @@ class Quality:
             check_number("horizons", horizon, least=1, whole=True)
         check_number("steps", self.steps, least=1, whole=True)
         check_number("seeds", self.seeds, least=1, whole=True)
-        check_number(
-            "workers", 1 if self.workers is None else self.workers, least=1, whole=True
-        )
-        for key, chosen in (
-            ("trajectory", self.trajectories),
-            ("families", self.experiments),
-        ):
-            if not chosen:
-                raise SettingError(key, "choose at least one")
+        if self.workers is not None:
+            check_number("workers", self.workers, least=1, whole=True)
+        if not self.trajectories:
+            raise SettingError("trajectory", "choose at least one")
+        if not self.experiments:
+            raise SettingError("families", "choose at least one")
 
     @property
     def cases(self) -> list[tuple[Family, int]]:
         """Families and horizons, the reference of all costs first."""
         horizons = sorted(set(self.horizons))
-        found = [(f, H) for f in self.experiments for H in horizons if f.longest >= H]
-        return list(dict.fromkeys([(TRUTH, horizons[-1]), *found]))
+        cases = [(TRUTH, horizons[-1])]
+        for family in self.experiments:
+            cases += [(family, horizon) for horizon in horizons]
+        return list(dict.fromkeys(cases))
 
     def trials(self, folder: Path) -> list[TrialSpec]:
-        """Returns every flight; cases take turns. GPs are trained once a trajectory and kept in ``folder``."""
+        """Returns every flight; cases take turns.
+
+        GPs are trained once a trajectory and kept in ``folder``.
+        """
+        models = self._trained_models(folder)
+        return [
+            self._trial(family, horizon, trajectory, models.get(trajectory), seed)
+            for seed, trajectory, (family, horizon) in product(
+                range(self.seeds), self.trajectories, self.cases
+            )
+        ]
+
+    def _trained_models(self, folder: Path) -> dict[str, Path]:
+        """Returns the files of the GPs that learned on each trajectory.
+
+        All families learn the same ones.
+        """
+        learning = [e for e in self.experiments.values() if e.learns]
+        if not learning:
+            return {}
         models = {}
         for name, trajectory in self.trajectories.items():
-            learning = next((e for e in self.experiments.values() if e.learns), None)
-            if learning is not None:
-                learning = replace(learning, trajectory=trajectory, name=name, seed=0)
-                models[name] = trained_model(
-                    learning.learn, self.settings, learning.training_rows(), 0, folder
-                )
-        trials = []
-        for seed, (name, trajectory), (family, horizon) in product(
-            range(self.seeds), self.trajectories.items(), self.cases
-        ):
-            experiment = self.experiments[family]
-            make = experiment.controller
-            flown = replace(
-                experiment,
-                trajectory=trajectory,
-                name=name,
-                seed=seed,
-                steps=self.steps,
+            experiment = replace(learning[0], trajectory=trajectory, name=name, seed=0)
+            rows = experiment.training_rows()
+            models[name] = trained_model(
+                experiment.learn, self.settings, rows, 0, folder
             )
-            flown = replace(
-                flown,
-                controller=At(make, horizon)
-                if experiment.learns
-                else AtPlant(make, horizon),
-            )
-            labels = {
-                "family": family.name,
-                "what": family.words,
-                "H": horizon,
-                "trajectory": name,
-            }
-            model = models[name] if experiment.learns else None
-            condition = Condition(flown, model)
-            named = fingerprint(
-                [
-                    labels,
-                    self.settings,
-                    repr(trajectory),
-                    seed,
-                    self.steps,
-                    model and model.name,  # names the rows that it learned from
-                ]
-            )
-            trials.append(TrialSpec(labels, condition, seed, named))
-        return trials
+        return models
+
+    def _trial(
+        self,
+        family: Family,
+        horizon: int,
+        trajectory_name: str,
+        model: Path | None,
+        seed: int,
+    ) -> TrialSpec:
+        """Returns one flight of a case; ``model`` is what learning controllers know."""
+        experiment = self.experiments[family]
+        trajectory = self.trajectories[trajectory_name]
+        make_controller = experiment.controller
+        if experiment.learns:
+            controller = TimedOnModel(make_controller, horizon)
+        else:
+            controller = TimedOnPlant(make_controller, horizon)
+            model = None
+        flight = replace(
+            experiment,
+            controller=controller,
+            trajectory=trajectory,
+            name=trajectory_name,
+            seed=seed,
+            steps=self.steps,
+        )
+        labels = {
+            "family": family.name,
+            "what": family.words,
+            "H": horizon,
+            "trajectory": trajectory_name,
+        }
+        settings = [
+            labels,
+            self.settings,
+            repr(trajectory),
+            seed,
+            self.steps,
+            None
+            if model is None
+            else model.name,  # names the rows that it learned from
+        ]
+        return TrialSpec(
+            labels=labels,
+            condition=Condition(flight, model),
+            seed=seed,
+            fingerprint=fingerprint(settings),
+        )
 
     @staticmethod
     def run_trial(trial: TrialSpec) -> dict:
@@ -234,37 +247,25 @@ class Quality:
         Raises:
             GpmpcError: The vehicle has left its path.
         """
-        experiment, model = trial.condition
-        flown = run_trial(
-            replace(experiment, model=None if model is None else read_model(model))
-        )
-        rollout = flown.rollout
-        controller = flown.controller
-        distance = np.linalg.norm(
-            (rollout.states - rollout.references)[:, experiment.system.tracked_indices],
-            axis=1,
-        )
-        if not distance.max() <= LOST:
-            raise GpmpcError(
-                f"{LOST:g} m off its path after {int(np.argmax(~(distance <= LOST)))} steps"
-            )
-        before = controller.initial_input
+        experiment, file = trial.condition
+        model = None if file is None else read_model(file)
+        flight = run_trial(replace(experiment, model=model))
+        rollout = flight.rollout
+        controller = flight.controller
+        axes = experiment.system.tracked_indices
+        _check_on_path(rollout, axes)
+        cost = controller.problem.cost
+        error = tracking_error(rollout.states, rollout.references, axes)
         return {
             "cost": tracking_cost(
-                controller.problem.cost.Q,
-                controller.problem.cost.R,
-                rollout.states,
-                rollout.references,
-                rollout.inputs,
-                before,
+                Q=cost.Q,
+                R=cost.R,
+                states=rollout.states,
+                references=rollout.references,
+                inputs=rollout.inputs,
+                previous_input=controller.initial_input,
             ),
-            "rmse": float(
-                tracking_error(
-                    rollout.states,
-                    rollout.references,
-                    experiment.system.tracked_indices,
-                ).total
-            ),
+            "rmse": float(error.total),
             "seconds": controller.seconds[-len(rollout.inputs) :],
             "failed": len(rollout.failures),
         }
@@ -272,35 +273,36 @@ class Quality:
     def rows(self, records: Sequence[dict]) -> list[dict]:
         """Returns the cost and the times of every case.
 
-        A row holds ``median`` and ``p99`` of a decision [ms]; ``cost``, the geometric mean over the trajectories of its
-        ratio to NMPC's on the same flights, and ``cost ...`` by trajectory; ``rmse ...`` [m]; how many solves
-        ``failed``; ``front``. A case that lost a flight has none of these numbers, and ``lost`` says how.
+        A row holds ``median`` and ``p99`` of a decision [ms]; ``cost``, the geometric
+        mean over the trajectories of its ratio to NMPC's on the same flights, and
+        ``cost ...`` by trajectory; ``rmse ...`` [m]; how many solves ``failed``;
+        ``front``. A case that lost a flight has none of these numbers, and ``lost``
+        says how.
         """
-        flown: dict[tuple, dict[str, list[dict]]] = {}
+        flights: dict[tuple[str, int], dict[str, list[dict]]] = {}
         for record in records:
-            case = flown.setdefault((record["what"], record["H"]), {})
+            case = flights.setdefault((record["what"], record["H"]), {})
             case.setdefault(record["trajectory"], []).append(record)
-        truth = flown[TRUTH.words, max(self.horizons)]
-        cases = [
-            case
-            for case in self.cases
-            if case[0] in self.experiments and case[1] in self.horizons
+        truth = flights[TRUTH.words, max(self.horizons)]
+        rows = [
+            _row(family, horizon, flights[family.words, horizon], truth)
+            for family, horizon in self.cases
+            if family in self.experiments
         ]
-        rows = [_row(family, H, flown[family.words, H], truth) for family, H in cases]
         candidates = [
             row for row in rows if row["lost"] is None and row["family"] != TRUTH.name
         ]
         members = pareto_front(
-            [row["median"] for row in candidates],
-            [row["cost"] for row in candidates],
-            SAME,
+            times=[row["median"] for row in candidates],
+            costs=[row["cost"] for row in candidates],
+            least=SAME,
         )
         for row, member in zip(candidates, members, strict=True):
             row["front"] = member
         return rows
 
     def summary(self, records: Sequence[dict]) -> tuple[list[Table], list[str]]:
-        """Returns the table for a terminal."""
+        """Returns the table for a terminal, and the note below it."""
         return [_table(self.rows(records))], [LEGEND]
 
     def document(self, records: Sequence[dict]) -> Document:
@@ -312,9 +314,9 @@ class Quality:
             if row["lost"]
         ]
         return Document(
-            "Quality over time",
-            [_table(rows)],
-            pd.DataFrame(rows, dtype=object),
+            title="Quality over time",
+            tables=[_table(rows)],
+            data=pd.DataFrame(rows, dtype=object),
             notes=[LEGEND],
             lists={"Lost": lost},
             images={"quality.png": png(front_figure(rows), dpi=130)},
@@ -322,41 +324,46 @@ class Quality:
 
 
 def from_settings(
-    made: Mapping[str, Any],
+    objects: Mapping[str, Any],
     settings: Mapping[str, Any],
     flight: Callable[[str], tuple[Experiment, Any]],
 ) -> Quality:
-    """Makes the flights that ``conf/quality.yaml`` describes; arguments as in ``gpmpc.experiments.tables``.
+    """Makes the flights that ``conf/quality.yaml`` describes.
 
     Args:
-        made: See there.
-        settings: See there.
+        objects: The settings, with objects in the place of what names a class.
+        settings: The same as plain data.
         flight: From what is typed after ``gpmpc run`` to the flight and its settings.
     """
-    noise = f"noise.process=[{','.join([str(settings['noise'])] * 6)}]"
+    deviations = ",".join([str(settings["noise"])] * 6)
     only = settings["only"]
-    chosen = [
-        family
-        for family in FAMILIES
-        if family is TRUTH or only is None or str(only) in family.words
-    ]
-    flown = {family: flight(f"{family.words} {noise}") for family in chosen}
-    experiments = {family: experiment for family, (experiment, _) in flown.items()}
-    numbers = {key: settings[key] for key in ("horizons", "steps", "seeds", "workers")}
+    experiments = {}
+    plain_settings = {}
+    for family in FAMILIES:
+        if family is TRUTH or only is None or str(only) in family.words:
+            experiment, plain = flight(f"{family.words} noise.process=[{deviations}]")
+            experiments[family] = experiment
+            plain_settings[family.words] = plain
     return Quality(
-        experiments,
-        made["trajectory"],
-        {f.words: plain for f, (_, plain) in flown.items()},
-        **numbers,
+        experiments=experiments,
+        trajectories=objects["trajectory"],
+        settings=plain_settings,
+        horizons=settings["horizons"],
+        steps=settings["steps"],
+        seeds=settings["seeds"],
+        workers=settings["workers"],
     )
 
 
-class Clocked:
-    """A controller whose decisions are timed, in seconds of its thread's processor time."""
+class TimedController:
+    """A controller whose decisions are timed.
+
+    ``seconds`` are those of its thread's processor time, decision by decision.
+    """
 
     def __init__(self, controller: Controller):
         self._controller = controller
-        self.seconds = []
+        self.seconds: list[float] = []
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._controller, name)
@@ -365,52 +372,68 @@ class Clocked:
         self, belief: Gaussian, reference: Reference, previous: Decision | None = None
     ) -> Decision:
         """Decides as the controller does."""
-        began = time.thread_time_ns()
+        start = time.thread_time_ns()
         decision = self._controller.control(belief, reference, previous)
-        self.seconds.append(1e-9 * (time.thread_time_ns() - began))
+        self.seconds.append(1e-9 * (time.thread_time_ns() - start))
         return decision
 
 
-class At(NamedTuple):
-    """A controller on a learned model at another horizon, timed."""
+class TimedOnModel(NamedTuple):
+    """Makes a controller on a learned model at another horizon, timed."""
 
-    make: Any
+    make: Callable[..., Controller]
     horizon: int
 
-    def __call__(self, model: Any) -> Clocked:
+    def __call__(self, model: Any) -> TimedController:
         """Makes the controller."""
-        return Clocked(self.make(model, horizon=self.horizon))
+        return TimedController(self.make(model, horizon=self.horizon))
 
 
-class AtPlant(NamedTuple):
-    """A controller on the true model at another horizon, timed."""
+class TimedOnPlant(NamedTuple):
+    """Makes a controller on the true model at another horizon, timed.
 
-    make: Any
+    ``Experiment`` hands the plant to what calls its first argument so.
+    """
+
+    make: Callable[..., Controller]
     horizon: int
 
-    def __call__(self, plant: Any) -> Clocked:
+    def __call__(self, plant: Any) -> TimedController:
         """Makes the controller."""
-        return Clocked(self.make(plant, horizon=self.horizon))
+        return TimedController(self.make(plant, horizon=self.horizon))
+
+
+def _check_on_path(rollout: Rollout, axes: Sequence[int]) -> None:
+    """Raises ``GpmpcError`` if a vehicle was farther off its path than ``LOST``."""
+    errors = (rollout.states - rollout.references)[:, axes]
+    near = np.linalg.norm(errors, axis=1) <= LOST  # not where it is NaN
+    if not near.all():
+        step = int(np.argmax(~near))
+        raise GpmpcError(f"{LOST:g} m off its path after {step} steps")
 
 
 def pareto_front(
     times: Sequence[float], costs: Sequence[float], least: float = 0.0
 ) -> list[bool]:
-    """Returns which cases are not dominated: none is at least as good in both and better in one.
+    """Returns which cases are not dominated.
+
+    No other case is at least as good in time and cost and better in one of them.
 
     Args:
         times: Less is better.
         costs: Less is better.
-        least: What takes more time has to cost less by more than this.
+        least: Amount by which a case that takes more time has to cost less.
     """
     order = sorted(range(len(times)), key=lambda i: (times[i], costs[i]))
     members = [False] * len(order)
-    best = np.inf
-    at = np.nan
+    best_cost = math.inf
+    best_time = math.nan
     for i in order:
-        if costs[i] < best - least:
-            members[i], best, at = True, costs[i], times[i]
-        elif (times[i], costs[i]) == (at, best):  # not told apart
+        if costs[i] < best_cost - least:
+            members[i] = True
+            best_cost = costs[i]
+            best_time = times[i]
+        elif (times[i], costs[i]) == (best_time, best_cost):  # not told apart
             members[i] = True
     return members
 
@@ -418,240 +441,78 @@ def pareto_front(
 def _row(
     family: Family,
     horizon: int,
-    flown: Mapping[str, list[dict]],
+    flights: Mapping[str, list[dict]],
     truth: Mapping[str, list[dict]],
 ) -> dict:
     """Returns the row of a case, from records by trajectory."""
-    records = [record for of in flown.values() for record in of]
-    lost = next((_why(record) for record in records if "error" in record), None)
-    if lost is None and (
-        astray := next((r for of in truth.values() for r in of if "error" in r), None)
-    ):
-        lost = f"nothing to compare with: NMPC on the true model, {_why(astray)}"
+    records = _pooled(flights)
+    lost = _first_error(records)
+    if lost is None:
+        error = _first_error(_pooled(truth))
+        if error is not None:
+            lost = f"nothing to compare with: NMPC on the true model, {error}"
     row = {
         "family": family.name,
         "what": family.words,
         "H": horizon,
         "lost": lost,
         "front": False,
+        "flights": sum("error" not in record for record in records),
     }
-    row["flights"] = sum("error" not in record for record in records)
     if lost is not None:
         return row
-    sums = [
-        {name: sum(r["cost"] for r in group) for name, group in of.items()}
-        for of in (flown, truth)
-    ]
-    costs = {name: cost / sums[1][name] for name, cost in sums[0].items()}
     seconds = [second for record in records for second in record["seconds"]]
-    row |= {
-        "median": 1e3 * float(np.median(seconds)),
-        "p99": 1e3 * float(np.quantile(seconds, 0.99)),
-    }
-    row |= {"cost": float(np.exp(np.mean(np.log(list(costs.values())))))}
-    row |= {f"cost {name}": float(ratio) for name, ratio in costs.items()}
-    row |= {
-        f"rmse {name}": float(np.sqrt(np.mean([r["rmse"] ** 2 for r in of])))
-        for name, of in flown.items()
-    }
-    return row | {
-        "failed": sum(record["failed"] for record in records),
-        "samples": len(seconds),
-    }
+    costs = _cost_ratios(flights, truth)
+    row["median"] = 1e3 * float(np.median(seconds))
+    row["p99"] = 1e3 * float(np.quantile(seconds, 0.99))
+    row["cost"] = float(np.exp(np.mean(np.log(list(costs.values())))))
+    for trajectory, cost in costs.items():
+        row[f"cost {trajectory}"] = cost
+    for trajectory, group in flights.items():
+        squares = [record["rmse"] ** 2 for record in group]
+        row[f"rmse {trajectory}"] = float(np.sqrt(np.mean(squares)))
+    row["failed"] = sum(record["failed"] for record in records)
+    row["samples"] = len(seconds)
+    return row
 
 
-def _why(record: Mapping[str, Any]) -> str:
-    return f"{record['trajectory']}, seed {record['seed']}: {record['error']}"
+def _pooled(flights: Mapping[str, list[dict]]) -> list[dict]:
+    return [record for group in flights.values() for record in group]
+
+
+def _first_error(records: Iterable[Mapping[str, Any]]) -> str | None:
+    """Says which of the flights was lost first, and how; None if none was."""
+    for record in records:
+        if "error" in record:
+            return f"{record['trajectory']}, seed {record['seed']}: {record['error']}"
+    return None
+
+
+def _cost_ratios(
+    flights: Mapping[str, list[dict]], truth: Mapping[str, list[dict]]
+) -> dict[str, float]:
+    """Returns the cost of a case over that of NMPC on the true model, by trajectory."""
+    ratios = {}
+    for trajectory, group in flights.items():
+        cost = sum(record["cost"] for record in group)
+        least_cost = sum(record["cost"] for record in truth[trajectory])
+        ratios[trajectory] = float(cost / least_cost)
+    return ratios
 
 
 def _table(rows: Sequence[Mapping[str, Any]]) -> Table:
     lines = []
     for row in rows:
         if row["lost"] is None:
-            figures = [
+            cells = [
                 f"{row['cost']:.4f}",
                 number(row["median"]),
                 number(row["p99"]),
                 str(row["failed"]),
             ]
         else:
-            figures = ["lost", *[MISSING] * 3]
-        lines.append(
-            [row["what"], str(row["H"]), *figures, "●" if row["front"] else ""]
-        )
-    return Table(
-        ["gpmpc run", "H", "cost", "ms: median", "99 %", "failed", "front"],
-        lines,
-        "Quality over time",
-    )
-
-
-@styled
-def front_figure(rows: Sequence[Mapping]) -> Figure:
-    """Cost above NMPC on the true model over milliseconds a decision, with the front of the best.
-
-    A curve is one choice of settings at growing horizons: of each controller the one of least cost, of at most five
-    controllers. All others are grey dots. The members of the front are numbered, and named by what is typed after
-    ``gpmpc run``.
-
-    Args:
-        rows: Of the quality study; lost ones are counted in the corner.
-    """
-    flown = [
-        {**row, "excess": 100 * (row["cost"] - 1)}
-        for row in rows
-        if row["lost"] is None
-    ]
-    markers = {
-        horizon: MARKERS[i % len(MARKERS)]
-        for i, horizon in enumerate(sorted({row["H"] for row in rows}))
-    }
-    figure, ((axis,),) = make_figure(
-        9.0, 6.2
-    )  # at 100 dots an inch as wide as a README
-    axis.set_title(
-        f"gpmpc quality: {len({row['what'] for row in rows})} choices of settings over the horizon"
-    )
-    axis.axhline(0, color=BLACK, linewidth=0.8, linestyle=DASHED, zorder=1)
-    for row in flown:
-        axis.plot(
-            row["median"],
-            row["excess"],
-            markers[row["H"]],
-            color=OTHERS,
-            markersize=4,
-            zorder=2,
-        )
-    plain: dict[str, Any] = {"linestyle": "none", "markersize": 5.5}
-    handles = []
-    for (what, line), colour in zip(_curves(flown).items(), COLOURS, strict=False):
-        axis.plot(
-            [row["median"] for row in line],
-            [row["excess"] for row in line],
-            color=colour,
-            zorder=3,
-        )
-        for row in line:
-            axis.plot(
-                row["median"],
-                row["excess"],
-                markers[row["H"]],
-                color=colour,
-                markersize=6,
-                zorder=3,
-            )
-        handles.append(
-            Line2D([], [], color=colour, marker="o", markersize=5.5, label=what)
-        )
-    handles.append(
-        Line2D([], [], color=OTHERS, marker="o", **plain, label="other settings")
-    )
-    handles.append(
-        Line2D(
-            [], [], color=FRONT, linewidth=1.4, label="front: none is better and faster"
-        )
-    )
-    handles += [
-        Line2D([], [], color="0.4", marker=kind, **plain, label=f"H = {H}")
-        for H, kind in markers.items()
-    ]
-    _scales(axis, flown)
-    _front(
-        axis,
-        sorted(
-            (row for row in flown if row["front"]),
-            key=lambda row: (row["median"], -row["cost"]),
-        ),
-    )
-    figure.legend(handles=handles, loc="outside upper center", ncols=3, fontsize=8.5)
-    if lost := len(rows) - len(flown):
-        axis.text(
-            0.99,
-            0.98,
-            f"lost: {lost}",
-            transform=axis.transAxes,
-            ha="right",
-            va="top",
-            color=FRONT,
-        )
-    return figure
-
-
-def _curves(rows: Sequence[Mapping]) -> dict[str, list[Mapping]]:
-    """Of each controller the settings of least cost, the fastest of those equal to 0.1 %; at most ``CURVES``."""
-    lines: dict[str, list[Mapping]] = {}
-    for row in sorted(rows, key=lambda row: row["H"]):
-        lines.setdefault(row["what"], []).append(row)
-
-    def merit(what: str) -> tuple[float, float]:
-        cost = min(round(row["cost"], 3) for row in lines[what])
-        return cost, min(
-            row["median"] for row in lines[what] if round(row["cost"], 3) == cost
-        )
-
-    best: dict[str, str] = {}
-    for what in sorted(lines, key=merit):
-        best.setdefault(what.split()[0], what)
-    return {what: lines[what] for what in list(best.values())[:CURVES]}
-
-
-def _scales(axis: Axes, rows: Sequence[Mapping]) -> None:
-    axis.set_xscale("log")
-    axis.set_yscale("symlog", linthresh=LINEAR, linscale=0.4)
-    axis.set_xlabel("median time of a decision [ms], one thread")
-    axis.set_ylabel("closed-loop cost above NMPC on the true model")
-    plain_numbers(axis.xaxis, few=True)
-    values = [row["excess"] for row in rows] or [0.0]
-    times = [row["median"] for row in rows] or [1.0]
-    low = min(values)
-    high = max(values)
-    reach = [tick for tick in TICKS if low * 1.5 - 1 <= tick <= high * 1.5 + 1]
-    axis.set_yticks(reach, [f"{tick:+d} %" if tick else "0" for tick in reach])
-    axis.yaxis.set_minor_locator(NullLocator())
-    axis.set_ylim(min(1.5 * low, 0) - 0.4, 1.7 * max(high, LINEAR))
-    axis.set_xlim(min(times) / 1.7, max(times) * 1.6)
-
-
-def _front(axis: Axes, members: Sequence[Mapping]) -> None:
-    """Draws a stair that nobody is below of; its members are numbered, and named under the axis."""
-    if not members:
-        return
-    x = [row["median"] for row in members]
-    y = [row["excess"] for row in members]
-    right = axis.get_xlim()[1]
-    top = axis.get_ylim()[1]
-    stair: Any = {
-        "color": FRONT,
-        "linewidth": 1.4,
-        "zorder": 1.5,
-        "drawstyle": "steps-post",
-    }
-    axis.plot([x[0], *x, right], [top, *y, y[-1]], **stair)
-    axis.set_xlim(right=right)
-    axis.set_ylim(top=top)
-    for i, place in enumerate(zip(x, y, strict=True), 1):
-        axis.plot(
-            *place,
-            "o",
-            markersize=11,
-            markerfacecolor="none",
-            markeredgecolor=FRONT,
-            markeredgewidth=1.2,
-        )
-        beside: Any = {
-            "textcoords": "offset points",
-            "ha": "right",
-            "va": "center",
-            "weight": "bold",
-        }
-        axis.annotate(
-            str(i), place, (-9 - 9 * (i % 2), -9), **beside
-        )  # nobody is below and left of it
-    names = [
-        f"{i}  {row['what']} horizon={row['H']}" for i, row in enumerate(members, 1)
-    ]
-    handles = [Line2D([], [], linestyle="none", label=name) for name in names]
-    font: Any = {"family": "monospace", "size": 8.5}
-    axis.figure.legend(
-        handles=handles, loc="outside lower left", handlelength=0, prop=font
-    )
+            cells = ["lost", MISSING, MISSING, MISSING]
+        mark = "●" if row["front"] else ""
+        lines.append([row["what"], str(row["H"]), *cells, mark])
+    header = ["gpmpc run", "H", "cost", "ms: median", "99 %", "failed", "front"]
+    return Table(header, lines, "Quality over time")

@@ -1,31 +1,41 @@
-"""Solves nonlinear GP-MPC by SciPy's SLSQP, a generic optimiser: the reference for time in section 5.2 of the paper.
+"""Nonlinear GP-MPC by SciPy's SLSQP, a generic optimiser.
 
-    minimise over u_0 .. u_{H-1}   sum_i |mu_i - r_i|^2_Q + tr(Q Sigma_i) + |v_i|^2_R
-    subject to                     (mu_{i+1}, Sigma_{i+1}) = F(mu_i, Sigma_i, u_i), input and rate bounds,
-                                   mu_ij -+ kappa sqrt(Sigma_ij,jj) within hard state bounds
+It is the reference for time in section 5.2 of Cao, Lai and Alam (2017), and solves
+their eq. (22):
 
-(Cao, Lai and Alam, 2017, eq. (22)). States are eliminated by rolling the belief out (single shooting). Derivatives of
-cost and margins come from one sweep of the discrete adjoint (Bryson and Ho, 1975, section 2.2) over those of F, in
-s = [mu; vec Sigma]: lam_H = dphi/ds_H, lam_i = dphi/ds_i + (dF/ds)' lam_{i+1}, dphi/du_i = (dF/du)' lam_{i+1}.
+    minimise over u_0 .. u_{H-1}
+        sum_i |mu_i - r_i|^2_Q + tr(Q Sigma_i) + |v_i|^2_R
+    subject to
+        (mu_{i+1}, Sigma_{i+1}) = F(mu_i, Sigma_i, u_i),
+        input and rate bounds,
+        mu_ij -+ kappa sqrt(Sigma_ij,jj) within hard state bounds
+
+States are eliminated by rolling the belief out (single shooting). Derivatives of cost
+and margins come from one sweep of the discrete adjoint (Bryson and Ho, 1975, section
+2.2) over those of F, in s = [mu; vec Sigma]:
+
+    lam_H = dphi/ds_H
+    lam_i = dphi/ds_i + (dF/ds)' lam_{i+1}
+    dphi/du_i = (dF/du)' lam_{i+1}
 """
 
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from scipy.linalg import block_diag, solve_triangular
-from scipy.optimize import minimize
+from scipy.optimize import OptimizeResult, minimize
 
 from gpmpc._dynamics import check_next_states, tensors_for, to_array
 from gpmpc.exceptions import DataError, SettingError
 from gpmpc.gaussian import Gaussian
 from gpmpc.models import DynamicsModel
-from gpmpc.mpc import Decision, Reference, Request, Timing
+from gpmpc.mpc import Box, Decision, Problem, Reference, Request, Timing
 from gpmpc.mpc._controller import check_controller
-from gpmpc.mpc.problem import Box, Problem
-from gpmpc.propagation import Propagator, differentiate
+from gpmpc.propagation import Propagator, Sensitivity, differentiate
 from gpmpc.status import Status
 
 Array = np.ndarray
@@ -44,7 +54,7 @@ class Evaluation:
         gradient: df/dU (H m,).
         margins: g (c,), stage by stage.
         margin_jacobian: dg/dU (c, H m).
-        hessian: The Gauss-Newton Hessian of the cost of the means and inputs (H m, H m).
+        hessian: Gauss-Newton, of the cost of the means and inputs (H m, H m).
         means: mu_0 .. mu_H (H + 1, n).
         covariances: Sigma_0 .. Sigma_H (H + 1, n, n).
     """
@@ -59,6 +69,33 @@ class Evaluation:
     covariances: Array
 
 
+class RollOut(NamedTuple):
+    """Beliefs along a plan, and the derivatives of each by the one before.
+
+    s stacks mean and covariance; it has p = n + n^2 entries.
+    """
+
+    means: Array  # of stages 0 .. H (H + 1, n)
+    covariances: Array  # (H + 1, n, n)
+    by_state: Array  # dF/ds (H, p, p)
+    by_input: Array  # dF/du (H, p, m)
+
+
+class Optimum(NamedTuple):
+    """The end of all rounds."""
+
+    evaluation: Evaluation
+    status: Status
+    iterations: int
+
+
+class Scaling(NamedTuple):
+    """Coordinates w of one round, U = U_0 + T w, in which the Hessian is about I."""
+
+    T: Array  # (H m, H m)
+    cost: float  # size of the cost: what its decrease is relative to
+
+
 class SLSQP:
     """Nonlinear GP-MPC by sequential least-squares programming.
 
@@ -68,7 +105,8 @@ class SLSQP:
         problem: Weights and bounds; state bounds are hard.
         horizon: H.
         initial_input: The input before the first step (m,).
-        tolerance: Of a plan: root of the decrease of the cost in the last round, relative to the cost and the plan.
+        tolerance: Of a plan: root of the decrease of the cost in the last round,
+            relative to the cost and the plan.
         iterations: Of one decision.
 
     Raises:
@@ -85,24 +123,11 @@ class SLSQP:
         tolerance: float = 1e-5,
         iterations: int = 300,
     ):
+        state_count, input_count = check_next_states(model)
         self.initial_input = check_controller(
-            problem, *check_next_states(model), horizon, initial_input
+            problem, state_count, input_count, horizon, initial_input
         )
-        H = horizon
-        m = problem.input_dim
-        cost = problem.cost
-        boxes = [
-            box
-            for box in problem.constraints
-            if isinstance(box, Box) and box.penalty is None and not box.joint
-        ]
-        if len(boxes) < len(problem.constraints) or any(
-            box.lower.ndim > 1 or box.stages for box in boxes
-        ):
-            raise SettingError(
-                "problem",
-                "must have hard boxes (penalty=None) at all stages, or no constraints",
-            )
+        boxes = _hard_boxes(problem)
         problem.check_plain("SLSQP")
         self.model = model
         self.propagator = propagator
@@ -110,173 +135,206 @@ class SLSQP:
         self.horizon = horizon
         self.tolerance = tolerance
         self.iterations = iterations
-        self._differences = np.kron(
-            np.eye(H) - np.eye(H, k=-1), np.eye(m)
-        )  # U -> u_i - u_{i-1}, without u_{-1}
-        self._penalized = (
-            self._differences if cost.penalized == "increments" else np.eye(H * m)
-        )
+        self._set_cost()
+        self._set_margins(boxes)
+
+    def _set_cost(self) -> None:
+        """Reads the weights of all stages, and what the inputs are weighed by."""
+        H = self.horizon
+        m = self.problem.input_dim
+        cost = self.problem.cost
+        # U -> u_i - u_{i-1}, without u_{-1}
+        self._differences = np.kron(np.eye(H) - np.eye(H, k=-1), np.eye(m))
+        self._penalized = np.eye(H * m)
+        if cost.penalized == "increments":
+            self._penalized = self._differences
         self._weights, R = cost.by_stage(H)
         self._R = block_diag(*R)
-        sides = [
-            (side, sign, box)
-            for box in boxes
-            for side, sign in ((box.lower, -1.0), (box.upper, 1.0))
-        ]
-        entries = [
-            (j, sign, bound[j], box.standard_deviations())
-            for bound, sign, box in sides
-            for j in np.flatnonzero(np.isfinite(bound))
-        ]
-        state, self._sign, self._bound, self._kappa = (
-            np.array(entries, dtype=float).reshape(-1, 4).T
-        )
-        self._state = state.astype(int)
+
+    def _set_margins(self, boxes: Sequence[Box]) -> None:
+        """Makes one margin of every finite state bound.
+
+        sign (x - bound) + kappa sd <= 0 for the state x that it bounds.
+        """
+        states: list[int] = []
+        signs: list[float] = []
+        bounds: list[float] = []
+        kappas: list[float] = []
+        for box in boxes:
+            for side, sign in ((box.lower, -1.0), (box.upper, 1.0)):
+                for j in np.flatnonzero(np.isfinite(side)):
+                    states.append(int(j))
+                    signs.append(sign)
+                    bounds.append(float(side[j]))
+                    kappas.append(float(box.standard_deviations()))
+        self._state = np.array(states, dtype=int)
+        self._sign = np.array(signs, dtype=float)
+        self._bound = np.array(bounds, dtype=float)
+        self._kappa = np.array(kappas, dtype=float)
 
     def control(
         self, belief: Gaussian, reference: Reference, previous: Decision | None = None
     ) -> Decision:
-        """Solves the problem from a belief along a reference; see ``Controller.control``."""
-        began = time.perf_counter()
+        """Solves the problem along a reference; see ``Controller.control``."""
+        start = time.perf_counter()
         request = Request.read(
-            self.problem, self.horizon, self.initial_input, belief, reference, previous
+            problem=self.problem,
+            horizon=self.horizon,
+            initial_input=self.initial_input,
+            belief=belief,
+            reference=reference,
+            previous=previous,
         )
         if not request.finite:
             return request.failed_decision(Status.INVALID_MEASUREMENT)
         try:
-            found, status, count = self._minimize(request)
-        except (
-            DataError,
-            np.linalg.LinAlgError,
-            RuntimeError,
-        ):  # a trial plan led the model out of its numbers
+            optimum = self._minimize(request)
+        except (DataError, np.linalg.LinAlgError, RuntimeError):
+            # a trial plan led the model out of its numbers
             return request.failed_decision(Status.NUMERICAL_TROUBLE)
-        inputs = found.plan.reshape(self.horizon, -1)
-        timing = Timing(0.0, 0.0, time.perf_counter() - began)
-        kept = bool((found.margins <= 1e3 * FEASIBLE).all())
-        predicted = found.means, found.covariances, status, count, timing
+        evaluation = optimum.evaluation
+        inputs = evaluation.plan.reshape(self.horizon, -1)
+        keeps_bounds = bool((evaluation.margins <= 1e3 * FEASIBLE).all())
         return Decision(
-            inputs[0],
-            inputs,
-            *predicted,
-            suboptimal=kept and status is Status.ITERATION_LIMIT,
+            input=inputs[0],
+            inputs=inputs,
+            means=evaluation.means,
+            covariances=evaluation.covariances,
+            status=optimum.status,
+            iterations=optimum.iterations,
+            timing=Timing(0.0, 0.0, time.perf_counter() - start),
+            suboptimal=keeps_bounds and optimum.status is Status.ITERATION_LIMIT,
         )
 
     def evaluate(self, inputs: Array, request: Request) -> Evaluation:
-        """Cost, margins and derivatives of a plan (H, m), whose input bounds are not looked at."""
-        plan, (H, n, r) = (
-            np.asarray(inputs, dtype=float).ravel(),
-            (self.horizon, self.problem.state_dim, len(self._state)),
-        )
-        means, covariances, by_state, by_input = self._roll_out(plan, request)
+        """Computes cost, margins and derivatives of a plan (H, m).
+
+        Its input bounds are not looked at.
+        """
+        plan = np.asarray(inputs, dtype=float).ravel()
+        H = self.horizon
+        n = self.problem.state_dim
+        roll_out = self._roll_out(plan, request)
+        means = roll_out.means
+        covariances = roll_out.covariances
         errors = means[1:] - request.references.states
         weighted = np.einsum("iab,ib->ia", self._weights, errors)
-        offset = {
-            "inputs": 0.0,
-            "deviations": request.references.inputs.ravel(),
-            "increments": self._first(request.references.previous_input),
-        }
-        v = self._penalized @ plan - offset[self.problem.cost.penalized]
+        v = self._penalized @ plan - self._input_reference(request)
         cost = (
             (errors * weighted).sum()
             + (self._weights * covariances[1:]).sum()
             + v @ self._R @ v
         )
-        sd = np.sqrt(
-            covariances[1:].diagonal(axis1=-2, axis2=-1)[:, self._state].clip(0)
-        )  # (H, r)
-        slope = np.divide(self._kappa / 2, sd, out=np.zeros_like(sd), where=sd > 0)
-        seeds = np.zeros(
-            (H, 1 + H * n + H * r, n + n * n)
-        )  # by stage, row (cost, means, margins), and s
-        seeds[:, 0, :n] = 2 * weighted
-        seeds[:, 0, n:] = self._weights.reshape(H, -1)
-        for i in range(H):
-            seeds[i, 1 + i * n : 1 + (i + 1) * n, :n] = np.eye(n)
-            rows = 1 + H * n + i * r + np.arange(r)
-            seeds[i, rows, self._state], seeds[i, rows, n + self._state * (n + 1)] = (
-                self._sign,
-                slope[i],
-            )
-        jacobian = _adjoint(by_state, by_input, seeds)
-        J = jacobian[1 : 1 + H * n].reshape(H, n, -1)
+        variances = covariances[1:].diagonal(axis1=-2, axis2=-1)
+        sd = np.sqrt(variances[:, self._state].clip(0))  # (H, r)
+        jacobian = _adjoint(
+            roll_out.by_state, roll_out.by_input, self._seeds(weighted, sd)
+        )
+        J = jacobian[1 : 1 + H * n].reshape(H, n, -1)  # of the means
         hessian = 2 * np.einsum("iaj,iab,ibk->jk", J, self._weights, J, optimize=True)
         hessian += 2 * self._penalized.T @ self._R @ self._penalized
         gradient = jacobian[0] + 2 * self._penalized.T @ (self._R @ v)
         margins = self._sign * (means[1:, self._state] - self._bound) + self._kappa * sd
         return Evaluation(
-            plan,
-            float(cost),
-            gradient,
-            margins.ravel(),
-            jacobian[1 + H * n :],
-            hessian,
-            means,
-            covariances,
+            plan=plan,
+            cost=float(cost),
+            gradient=gradient,
+            margins=margins.ravel(),
+            margin_jacobian=jacobian[1 + H * n :],
+            hessian=hessian,
+            means=means,
+            covariances=covariances,
         )
 
-    def _minimize(self, request: Request) -> tuple[Evaluation, Status, int]:
-        """Rounds of SLSQP, each in inputs scaled by the Gauss-Newton Hessian, from the better of two plans."""
-        lower, upper = (
-            side.ravel() for side in self.problem.inputs.by_stage(self.horizon)
-        )
+    def _input_reference(self, request: Request) -> Array | float:
+        """Returns what the penalized inputs are measured from (H m,)."""
+        penalized = self.problem.cost.penalized
+        if penalized == "deviations":
+            return request.references.inputs.ravel()
+        if penalized == "increments":
+            return self._first(request.references.previous_input)
+        return 0.0
+
+    def _seeds(self, weighted_errors: Array, sd: Array) -> Array:
+        """Returns partial derivatives of cost, means and margins by s_1 .. s_H.
+
+        Returns:
+            (H, rows, p); the rows are the cost, H n means, H r margins.
+        """
+        H, n = weighted_errors.shape
+        r = len(self._state)
+        slope = np.divide(self._kappa / 2, sd, out=np.zeros_like(sd), where=sd > 0)
+        seeds = np.zeros((H, 1 + H * n + H * r, n + n * n))
+        seeds[:, 0, :n] = 2 * weighted_errors
+        seeds[:, 0, n:] = self._weights.reshape(H, -1)
+        for i in range(H):
+            seeds[i, 1 + i * n : 1 + (i + 1) * n, :n] = np.eye(n)
+            rows = 1 + H * n + i * r + np.arange(r)
+            seeds[i, rows, self._state] = self._sign
+            seeds[i, rows, n + self._state * (n + 1)] = slope[i]
+        return seeds
+
+    def _minimize(self, request: Request) -> Optimum:
+        """Runs rounds of SLSQP from the better of two plans.
+
+        Each is in inputs scaled by the Gauss-Newton Hessian.
+        """
+        lower_sides, upper_sides = self.problem.inputs.by_stage(self.horizon)
+        lower = lower_sides.ravel()
+        upper = upper_sides.ravel()
         starts = [
-            plan.ravel().clip(lower, upper)
+            self.evaluate(plan.ravel().clip(lower, upper), request)
             for plan in (request.constant_guess, request.initial_guess)
         ]
-        found = min((self.evaluate(plan, request) for plan in starts), key=_rank)
-        used = 0
+        current = min(starts, key=_rank)
+        iterations = 0
         for _ in range(ROUNDS):
-            scale = (
-                abs(found.cost)
-                + found.plan @ found.hessian @ found.plan
-                + np.finfo(float).tiny
-            )
-            T = solve_triangular(
-                np.linalg.cholesky(found.hessian), np.eye(len(found.plan)), lower=True
-            ).T
-            last = found
+            last = current
+            scaling = _scaling(last)
             result = self._round(
-                found, T, scale, lower, upper, request, self.iterations - used
+                start=last,
+                scaling=scaling,
+                lower=lower,
+                upper=upper,
+                request=request,
+                limit=self.iterations - iterations,
             )
-            found = self.evaluate(
-                (last.plan + T @ result.x).clip(lower, upper), request
-            )
-            used += int(result.nit)
-            settled = abs(last.cost - found.cost) <= self.tolerance**2 * scale
-            if (
-                settled
-                and (found.margins <= FEASIBLE).all()
-                and self._keeps_rates(found.plan, request)
-            ):
-                return found, Status.SOLVED, used
-            if used >= self.iterations:
-                return min(found, last, key=_rank), Status.ITERATION_LIMIT, used
-        kept = (found.margins <= FEASIBLE).all() and self._keeps_rates(
-            found.plan, request
-        )
-        return found, Status.NUMERICAL_TROUBLE if kept else Status.INFEASIBLE, used
+            plan = (last.plan + scaling.T @ result.x).clip(lower, upper)
+            current = self.evaluate(plan, request)
+            iterations += int(result.nit)
+            decrease = abs(last.cost - current.cost)
+            is_settled = decrease <= self.tolerance**2 * scaling.cost
+            if is_settled and self._is_feasible(current, request):
+                return Optimum(current, Status.SOLVED, iterations)
+            if iterations >= self.iterations:
+                better = min(current, last, key=_rank)
+                return Optimum(better, Status.ITERATION_LIMIT, iterations)
+        status = Status.INFEASIBLE
+        if self._is_feasible(current, request):
+            status = Status.NUMERICAL_TROUBLE
+        return Optimum(current, status, iterations)
 
-    def _keeps_rates(self, plan: Array, request: Request) -> bool:
-        rates = (
-            self._differences @ plan - self._first(request.references.previous_input)
-        ).reshape(self.horizon, -1)
+    def _is_feasible(self, evaluation: Evaluation, request: Request) -> bool:
+        """Returns whether a plan keeps the state bounds and the rates of the inputs."""
+        if (evaluation.margins > FEASIBLE).any():
+            return False
+        first = self._first(request.references.previous_input)
+        rates = (self._differences @ evaluation.plan - first).reshape(self.horizon, -1)
         bounds = self.problem.input_rates
-        return bool(
-            (np.maximum(rates - bounds.upper, bounds.lower - rates) <= FEASIBLE).all()
-        )
+        excess = np.maximum(rates - bounds.upper, bounds.lower - rates)
+        return bool((excess <= FEASIBLE).all())
 
     def _round(
         self,
         start: Evaluation,
-        T: Array,
-        scale: float,
+        scaling: Scaling,
         lower: Array,
         upper: Array,
         request: Request,
         limit: int,
-    ):
-        """One run in w, U = U_0 + T w."""
+    ) -> OptimizeResult:
+        """Runs SLSQP once, in w, U = U_0 + T w."""
+        T = scaling.T
         memory = [start]
 
         def at(w: Array) -> Evaluation:
@@ -285,77 +343,132 @@ class SLSQP:
                 memory[0] = self.evaluate(plan, request)
             return memory[0]
 
-        rows = [np.eye(len(T))]
-        low = [lower]
-        high = [upper]
-        if self.problem.input_rates.finite:
-            first = self._first(request.references.previous_input)
-            H = self.horizon
-            rows.append(self._differences)
-            low.append(np.tile(self.problem.input_rates.lower, H) + first)
-            high.append(np.tile(self.problem.input_rates.upper, H) + first)
-        C, low, high = (np.concatenate(parts) for parts in (rows, low, high))
-        C, low, high = C @ T, low - C @ start.plan, high - C @ start.plan
-        C = np.concatenate([C, -C])
-        b = np.concatenate([low, -high])
-        C = C[np.isfinite(b)]
-        b = b[np.isfinite(b)]
-        kept = {
+        C, b = self._input_rows(lower, upper, request)
+        b = b - C @ start.plan
+        C = C @ T
+        constraint = {
             "type": "ineq",
             "fun": lambda w: np.concatenate([C @ w - b, -at(w).margins]),
             "jac": lambda w: np.concatenate([C, -at(w).margin_jacobian @ T]),
         }
+        tolerance = 0.1 * self.tolerance**2 * scaling.cost
         return minimize(
             lambda w: at(w).cost,
             np.zeros(len(T)),
             jac=lambda w: T.T @ at(w).gradient,
             method="SLSQP",
-            constraints=[kept] if len(C) + len(start.margins) else [],
-            options={"ftol": 0.1 * self.tolerance**2 * scale, "maxiter": max(1, limit)},
+            constraints=[constraint] if len(C) + len(start.margins) else [],
+            options={"ftol": tolerance, "maxiter": max(1, limit)},
         )
 
+    def _input_rows(
+        self, lower: Array, upper: Array, request: Request
+    ) -> tuple[Array, Array]:
+        """Returns input and rate bounds as rows C U >= b."""
+        rows: list[Array] = [np.eye(len(lower))]
+        low = [lower]
+        high = [upper]
+        rates = self.problem.input_rates
+        if rates.finite:
+            first = self._first(request.references.previous_input)
+            rows.append(self._differences)
+            low.append(np.tile(rates.lower, self.horizon) + first)
+            high.append(np.tile(rates.upper, self.horizon) + first)
+        one_sided = np.concatenate(rows)
+        C = np.concatenate([one_sided, -one_sided])
+        b = np.concatenate([*low, *(-side for side in high)])
+        finite = np.isfinite(b)
+        return C[finite], b[finite]
+
     def _first(self, last: Array) -> Array:
-        """u_{-1} in the place of the first input, zeros after it (H m,)."""
+        """Returns u_{-1} in the place of the first input, zeros after it (H m,)."""
         return np.concatenate([last, np.zeros((self.horizon - 1) * len(last))])
 
-    def _roll_out(self, plan: Array, request: Request) -> tuple[Array, ...]:
-        """Means and covariances of stages 0 .. H, and dF/ds (H, p, p) and dF/du (H, p, m), p = n + n^2."""
-        n = self.problem.state_dim
+    def _roll_out(self, plan: Array, request: Request) -> RollOut:
+        """Propagates the belief along a plan, with derivatives."""
         m = self.problem.input_dim
-        belief = Gaussian(*tensors_for(self.model, request.state, request.covariance))
+        mean, covariance = tensors_for(self.model, request.state, request.covariance)
+        belief = Gaussian(mean, covariance)
         beliefs = [belief]
         by_state = []
         by_input = []
         for u in tensors_for(self.model, plan.reshape(-1, m))[0]:
-            moved, d = differentiate(self.propagator, self.model, beliefs[-1], u)
-            beliefs.append(moved.belief)
-            means = torch.cat(
-                [d.mean_by_mean, d.mean_by_covariance.reshape(n, -1)], dim=1
-            )
-            spreads = [
-                d.covariance_by_mean.reshape(-1, n),
-                d.covariance_by_covariance.reshape(n * n, -1),
-            ]
-            by_state.append(to_array(torch.cat([means, torch.cat(spreads, dim=1)])))
-            by_input.append(
-                to_array(
-                    torch.cat([d.mean_by_input, d.covariance_by_input.reshape(-1, m)])
-                )
-            )
-        means, covariances = (
-            [to_array(part) for part in parts]
-            for parts in zip(*[(b.mean, b.covariance) for b in beliefs], strict=True)
+            step, sensitivity = differentiate(self.propagator, self.model, belief, u)
+            belief = step.belief
+            beliefs.append(belief)
+            by_state.append(to_array(_by_state(sensitivity)))
+            by_input.append(to_array(_by_input(sensitivity)))
+        return RollOut(
+            means=np.array([to_array(belief.mean) for belief in beliefs]),
+            covariances=np.array([to_array(belief.covariance) for belief in beliefs]),
+            by_state=np.array(by_state),
+            by_input=np.array(by_input),
         )
-        return tuple(map(np.array, (means, covariances, by_state, by_input)))
 
 
-def _rank(found: Evaluation) -> tuple[bool, float]:
-    """Smaller for the better of two plans."""
-    return bool((found.margins > FEASIBLE).any()), found.cost
+def _hard_boxes(problem: Problem) -> list[Box]:
+    """Returns the state bounds of a problem.
+
+    Raises:
+        SettingError: It has constraints other than hard boxes at all stages.
+    """
+    boxes = []
+    for box in problem.constraints:
+        if not isinstance(box, Box) or not _is_hard_at_all_stages(box):
+            raise SettingError(
+                "problem",
+                "must have hard boxes (penalty=None) at all stages, or no constraints",
+            )
+        boxes.append(box)
+    return boxes
+
+
+def _is_hard_at_all_stages(box: Box) -> bool:
+    is_hard = box.penalty is None and not box.joint
+    return is_hard and box.lower.ndim == 1 and not box.stages
+
+
+def _by_state(sensitivity: Sensitivity) -> torch.Tensor:
+    """Returns dF/ds (p, p)."""
+    n = len(sensitivity.mean_by_mean)
+    of_mean = [
+        sensitivity.mean_by_mean,
+        sensitivity.mean_by_covariance.reshape(n, -1),
+    ]
+    of_covariance = [
+        sensitivity.covariance_by_mean.reshape(-1, n),
+        sensitivity.covariance_by_covariance.reshape(n * n, -1),
+    ]
+    return torch.cat([torch.cat(of_mean, dim=1), torch.cat(of_covariance, dim=1)])
+
+
+def _by_input(sensitivity: Sensitivity) -> torch.Tensor:
+    """Returns dF/du (p, m)."""
+    m = sensitivity.mean_by_input.shape[-1]
+    of_covariance = sensitivity.covariance_by_input.reshape(-1, m)
+    return torch.cat([sensitivity.mean_by_input, of_covariance])
+
+
+def _scaling(evaluation: Evaluation) -> Scaling:
+    """Returns the coordinates of a round that starts from a plan."""
+    plan = evaluation.plan
+    hessian = evaluation.hessian
+    cost = abs(evaluation.cost) + plan @ hessian @ plan + np.finfo(float).tiny
+    root = np.linalg.cholesky(hessian)
+    inverse = solve_triangular(root, np.eye(len(plan)), lower=True)
+    return Scaling(T=inverse.T, cost=float(cost))
+
+
+def _rank(evaluation: Evaluation) -> tuple[bool, float]:
+    """Returns a key that is smaller for the better of two plans."""
+    return bool((evaluation.margins > FEASIBLE).any()), evaluation.cost
 
 
 def _adjoint(by_state: Array, by_input: Array, seeds: Array) -> Array:
-    """Rows dphi/dU (rows, H m) of functions whose partial derivatives by s_1 .. s_H are the seeds (H, rows, p)."""
+    """Returns rows dphi/dU (rows, H m) by one sweep backwards.
+
+    The seeds (H, rows, p) are the functions' partial derivatives by s_1 .. s_H.
+    """
     H, rows, _ = seeds.shape
     jacobian = np.empty((rows, H, by_input.shape[-1]))
     adjoint = seeds[-1]

@@ -1,4 +1,7 @@
-"""The quadrotor's two subsystems as Cao, Lai and Alam (2017) learn them: the rotational one's columns are scaled."""
+"""The quadrotor's two subsystems as Cao, Lai and Alam (2017) learn them.
+
+The columns of the rotational one are scaled.
+"""
 
 from collections.abc import Sequence
 from functools import partial
@@ -16,22 +19,17 @@ SCALINGS = {
 }
 
 
-def check_subsystems(key: str, chosen: Any) -> tuple[str, ...]:
-    """Returns names of subsystems, one or several.
+def check_subsystems(key: str, names: Any) -> tuple[str, ...]:
+    """Returns names of subsystems, one or several, as a tuple.
 
     Raises:
         SettingError: There is none, or an unknown one.
     """
-    names = (
-        (chosen,)
-        if isinstance(chosen, str)
-        else tuple(chosen)
-        if isinstance(chosen, Sequence)
-        else ()
-    )
-    if not names:
+    if isinstance(names, str):
+        names = (names,)
+    if not isinstance(names, Sequence) or not names:
         raise SettingError(key, "choose at least one")
     for name in names:
         if name not in SYSTEMS:
             raise SettingError(key, f"must be among {', '.join(SYSTEMS)}; got {name!r}")
-    return names
+    return tuple(names)

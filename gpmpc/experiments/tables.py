@@ -1,29 +1,35 @@
-"""Tables 1 and 2 of Cao, Lai and Alam (2017): how well GP models predict, by trajectory, subsystem and training size.
+"""Tables 1 and 2 of Cao, Lai and Alam (2017): how well GP models predict.
 
-One trial is one draw of a training set: six GPs are trained on a random subset (sorted) of the 189 rows and predict the
-subset and all rows, one step ahead each, by moment matching. The state that goes into the first prediction has
-covariance 0.1^2 I, in the units of the model; every later one has the covariance predicted one sample earlier, while
-its mean is the data's. Reported are
+A row is a trajectory, a subsystem and a training size. One trial is one draw of a
+training set: six GPs are trained on a random subset (sorted) of the 189 rows and
+predict the subset and all rows, one step ahead each, by moment matching. The state that
+goes into the first prediction has covariance 0.1^2 I, in the units of the model; every
+later one has the covariance predicted one sample earlier, while its mean is the data's.
+Reported are
 
-    MSE               squared error summed over the six outputs, averaged over the samples, in the units of the data
-    average variance  of x, y, z (phi, theta, psi) in the covariance fed in, averaged over the samples, in model units
+    MSE               squared error summed over the six outputs, averaged over the
+                      samples, in the units of the data
+    average variance  of x, y, z (phi, theta, psi) in the covariance fed in, averaged
+                      over the samples, in the units of the model
 
-What the paper leaves open is added: the same errors of plain predictions, and whether those are calibrated.
+The errors of plain predictions, and whether those are calibrated, are added: the paper
+leaves them open.
 """
 
 import csv
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from decimal import Decimal
 from functools import cache
 from pathlib import Path
 from statistics import median
-from typing import Any
+from typing import Any, Literal, NamedTuple
 from zlib import crc32
 
 import numpy as np
 import pandas as pd
 import torch
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
 from torch import Tensor
@@ -60,9 +66,14 @@ CALIBRATION = {
 }
 SYMBOLS = {"within": "●", "below": "▼", "above": "▲"}
 LEGEND = (
-    "ours: median [min, max] over the draws. The paper's figure lies: ● within that range, ▼ below it, ▲ above it.",
+    "ours: median [min, max] over the draws. The paper's figure lies: "
+    "● within that range, ▼ below it, ▲ above it.",
     "The paper's training times: 1.12 s with 10 points, 4.01 s with 189.",
 )
+TABLE_NUMBERS = {"elliptical": 1, "lorenz": 2}  # in the paper
+TITLES = {"elliptical": "Table 1: elliptical", "lorenz": "Table 2: Lorenz"}
+
+Position = Literal["within", "below", "above"]
 
 
 @dataclass(frozen=True)
@@ -70,19 +81,21 @@ class Tables:
     """Both tables; a row is a trajectory, a subsystem and a size.
 
     Attributes:
-        data: Where transitions come from.
+        data: Source of the transitions.
         trajectories: By name.
         subsystems: Names, or one.
-        model: From transitions and a ``seed`` to a ``Training``.
+        model: Trains: from transitions and a ``seed`` to a ``Training``.
         model_settings: The same as plain data, for the fingerprint.
         sizes: Training set sizes.
         draws: Training sets a row.
         seed: Every draw's own seed derives from it.
-        state_std: Standard deviation of the state in the first prediction, in the units of the model.
+        state_std: Standard deviation of the state in the first prediction, in the units
+            of the model.
         workers: Processes; None takes one a core.
 
     Raises:
-        SettingError: A size, a draw count, a seed, a deviation or a worker count out of range.
+        SettingError: A size, a draw count, a seed, a deviation or a worker count out of
+            range.
     """
 
     data: DataSource
@@ -112,13 +125,11 @@ class Tables:
         object.__setattr__(self, "sizes", tuple(dict.fromkeys(sizes)))
         check_number("draws", self.draws, least=1, whole=True)
         check_number("seed", self.seed, least=0, whole=True)
-        check_number(
-            "workers", 1 if self.workers is None else self.workers, least=1, whole=True
-        )
+        if self.workers is not None:
+            check_number("workers", self.workers, least=1, whole=True)
         check_number("state_std", self.state_std, least=0)
-        object.__setattr__(
-            self, "subsystems", check_subsystems("subsystem", self.subsystems)
-        )
+        subsystems = check_subsystems("subsystem", self.subsystems)
+        object.__setattr__(self, "subsystems", subsystems)
         if not self.trajectories:
             raise SettingError("trajectory", "choose at least one")
 
@@ -129,162 +140,139 @@ class Tables:
             DataError: The data cannot be read.
             SettingError: A size is larger than the data.
         """
-        trials = []
+        trials: list[TrialSpec] = []
         for trajectory in self.trajectories:
             for subsystem in self.subsystems:
-                data, scaling, reported = self._scaled(trajectory, subsystem)
+                scaled = self._scaled_data(trajectory, subsystem)
                 for size in self.sizes:
-                    if size > len(data):
-                        rows = f"{len(data)}, the rows of {trajectory} {subsystem}"
-                        raise SettingError(
-                            "sizes", f"must be at most {rows}; got {size}"
-                        )
-                    fit = Fit(
-                        data, scaling, reported, size, self.model, float(self.state_std)
-                    )
-                    for draw in range(self.draws):
-                        seed = derived_seed(
-                            self.seed,
-                            *(crc32(n.encode()) for n in (trajectory, subsystem)),
-                            size,
-                            draw,
-                        )
-                        settings = [
-                            self.model_settings,
-                            self.state_std,
-                            reported,
-                            size,
-                            seed,
-                        ]
-                        arrays = [data.features, data.next_states, scaling.factor]
-                        table = {"elliptical": 1, "lorenz": 2}.get(trajectory)
-                        labels = {
-                            "table": table,
-                            "trajectory": trajectory,
-                            "subsystem": subsystem,
-                            "size": size,
-                        }
-                        name = fingerprint(settings, arrays)
-                        trials.append(
-                            TrialSpec(labels | {"draw": draw}, fit, seed, name)
-                        )
+                    trials += self._draws(trajectory, subsystem, scaled, size)
         return trials
 
-    def _scaled(
-        self, trajectory: str, name: str
-    ) -> tuple[Transitions, Scaling, tuple[int, ...]]:
-        """Returns the data in the units of the model, the scaling of the next states, the indices that are reported."""
-        system = SYSTEMS[name]
-        raw = self.data.transitions(
-            SYSTEMS[name], self.trajectories[trajectory], trajectory
+    def _draws(
+        self, trajectory: str, subsystem: str, scaled: "ScaledData", size: int
+    ) -> Iterator[TrialSpec]:
+        """Yields the draws of one row of the tables."""
+        data = scaled.transitions
+        if size > len(data):
+            limit = f"{len(data)}, the rows of {trajectory} {subsystem}"
+            raise SettingError("sizes", f"must be at most {limit}; got {size}")
+        fit = Fit(
+            data=data,
+            scaling=scaled.scaling,
+            reported=scaled.reported,
+            size=size,
+            model=self.model,
+            state_std=float(self.state_std),
         )
-        n = raw.state_dim
-        m = raw.input_dim
-        states = system.state_names
-        columns = [*states, *system.input_names, *(f"{state}+" for state in states)]
-        if len(columns) != 2 * n + m:
-            named = (
-                f"the data have {2 * n + m} columns; the subsystem names {len(columns)}"
+        names = (trajectory, subsystem)
+        checksums = [crc32(name.encode()) for name in names]
+        arrays = [data.features, data.next_states, scaled.scaling.factor]
+        for draw in range(self.draws):
+            seed = derived_seed(self.seed, *checksums, size, draw)
+            settings = [
+                self.model_settings,
+                self.state_std,
+                scaled.reported,
+                size,
+                seed,
+            ]
+            labels = {
+                "table": TABLE_NUMBERS.get(trajectory),
+                "trajectory": trajectory,
+                "subsystem": subsystem,
+                "size": size,
+                "draw": draw,
+            }
+            yield TrialSpec(
+                labels=labels,
+                condition=fit,
+                seed=seed,
+                fingerprint=fingerprint(settings, arrays),
             )
-            raise DataError(f"{trajectory} {name}: {named}")
-        scaling = SCALINGS[name](
-            torch.cat([raw.features, raw.next_states], dim=1), columns
+
+    def _scaled_data(self, trajectory: str, subsystem: str) -> "ScaledData":
+        """Returns the data of a trajectory in the units of the model."""
+        system = SYSTEMS[subsystem]
+        data = self.data.transitions(system, self.trajectories[trajectory], trajectory)
+        n = data.state_dim
+        m = data.input_dim
+        next_names = [f"{state}+" for state in system.state_names]
+        columns = [*system.state_names, *system.input_names, *next_names]
+        if len(columns) != 2 * n + m:
+            raise DataError(
+                f"{trajectory} {subsystem}: the data have {2 * n + m} columns; "
+                f"the subsystem names {len(columns)}"
+            )
+        values = torch.cat([data.features, data.next_states], dim=1)
+        scaling = SCALINGS[subsystem](values, columns)
+        states = _part(scaling, slice(0, n))
+        inputs = _part(scaling, slice(n, n + m))
+        next_states = _part(scaling, slice(n + m, None))
+        return ScaledData(
+            transitions=Transitions(
+                states.scale(data.states),
+                inputs.scale(data.inputs),
+                next_states.scale(data.next_states),
+            ),
+            scaling=next_states,
+            reported=tuple(system.tracked_indices),
         )
-        pieces = [slice(0, n), slice(n, n + m), slice(n + m, None)]
-        states, inputs, next_states = (
-            Scaling(scaling.offset[piece], scaling.factor[piece]) for piece in pieces
-        )
-        data = Transitions(
-            states.scale(raw.states),
-            inputs.scale(raw.inputs),
-            next_states.scale(raw.next_states),
-        )
-        return data, next_states, tuple(system.tracked_indices)
 
     @staticmethod
     def run_trial(trial: TrialSpec) -> dict:
         """Trains and scores one draw."""
-        fit = trial.condition
-        data = trial.condition.data
-        restore = trial.condition.scaling.restore
+        fit: Fit = trial.condition
+        data = fit.data
         subset = random_rows(len(data), fit.size, trial.seed)
         training_rows = data[subset]
         training = fit.model(training_rows, seed=trial.seed)
         posterior = training.posterior
-        means, fed, projected = predict_all(posterior, data, fit.state_std)
-        own = (
-            means
-            if fit.size == len(data)
-            else predict_all(posterior, training_rows, fit.state_std)[0]
-        )
-        plain = posterior.predict(data.states, data.inputs)
-        mean = restore(plain.mean)
-        variance = (plain.variance + posterior.noise_variance) * fit.scaling.factor**2
+        fed_on = predict_all(posterior, data, fit.state_std)
+        of_subset = fed_on
+        if fit.size != len(data):
+            of_subset = predict_all(posterior, training_rows, fit.state_std)
+        restore = fit.scaling.restore
         observed = restore(data.next_states)
-        held_out = np.setdiff1d(np.arange(len(data)), subset).tolist()
+        reported = list(fit.reported)
         return {
-            "training_mse": mean_squared_error(restore(own), observed[subset]),
-            "test_mse": mean_squared_error(restore(means), observed),
-            "average_variance": float(fed[:, list(fit.reported)].mean()),
-            "training_seconds": training.seconds,
-            "plain_training_mse": mean_squared_error(mean[subset], observed[subset]),
-            "plain_test_mse": mean_squared_error(mean, observed),
-            "nlpd": negative_log_predictive_density(mean, variance, observed),
-            "coverage_95": interval_coverage(mean, variance, observed),
-            "held_out_coverage_95": (
-                interval_coverage(
-                    mean[held_out], variance[held_out], observed[held_out]
-                )
-                if held_out
-                else None
+            "training_mse": mean_squared_error(
+                restore(of_subset.means), observed[subset]
             ),
-            "largest_projection": projected,
+            "test_mse": mean_squared_error(restore(fed_on.means), observed),
+            "average_variance": float(fed_on.variances[:, reported].mean()),
+            "training_seconds": training.seconds,
+            **_plain_scores(posterior, fit, subset),
+            "largest_projection": fed_on.largest_projection,
             "negative_log_evidence": training.objective.tolist(),
             "likelihood_evaluations": training.evaluations,
         }
 
     def summary(self, records: Sequence[dict]) -> tuple[list[Table], list[str]]:
-        """Returns both tables, and the calibration of plain predictions, for a terminal of 80 columns."""
+        """Returns the tables for a terminal of 80 columns, and the notes below them.
+
+        The last table is that of plain predictions.
+        """
         rows = summarise(records)
-        header = [
-            "",
-            "N",
-            *(f"{label}\nours     paper" for label in MEASURES.values()),
-            "time\n[s]",
-        ]
-        tables = [
-            Table(
-                header,
-                [_compact(row) for row in rows if row.trajectory == name],
-                _title(name),
-                sections=True,
-            )
-            for name in dict.fromkeys(row.trajectory for row in rows)
-        ]
+        measures = [f"{label}\nours     paper" for label in MEASURES.values()]
+        header = ["", "N", *measures, "time\n[s]"]
+        tables = _by_trajectory(rows, header, _compact)
         return [*tables, _calibration(rows, medians=True)], [*LEGEND, self.data.note]
 
     def document(self, records: Sequence[dict]) -> Document:
-        """Returns the tables with the paper's figures in columns of their own, and what lies outside our range."""
+        """Returns the tables, and what of the paper lies outside our range.
+
+        The paper's figures stand in columns of their own.
+        """
         rows = summarise(records)
-        header = [
-            "subsystem",
-            "N",
-            *(name for label in MEASURES.values() for name in (label, "paper")),
-            "time [s]",
-        ]
-        tables = [
-            Table(
-                header,
-                [_full(row) for row in rows if row.trajectory == name],
-                _title(name),
-                sections=True,
-            )
-            for name in dict.fromkeys(row.trajectory for row in rows)
-        ]
+        header = ["subsystem", "N"]
+        for label in MEASURES.values():
+            header += [label, "paper"]
+        header.append("time [s]")
+        tables = _by_trajectory(rows, header, _full)
         return Document(
-            "Tables 1 and 2",
-            [*tables, _calibration(rows)],
-            pd.DataFrame([_numbers(row) for row in rows], dtype=object),
+            title="Tables 1 and 2",
+            tables=[*tables, _calibration(rows)],
+            data=pd.DataFrame([_numbers(row) for row in rows], dtype=object),
             notes=[*LEGEND, self.data.note],
             lists={"Outside our range": differences(rows) or ["Nothing."]},
             images={"tables.png": png(_figure(records))},
@@ -293,61 +281,111 @@ class Tables:
 
 
 def from_settings(
-    made: Mapping[str, Any], settings: Mapping[str, Any], flight: Any
+    objects: Mapping[str, Any], settings: Mapping[str, Any], flight: Any
 ) -> Tables:
     """Makes the tables that ``conf/tables.yaml`` describes.
 
     Args:
-        made: The settings, with objects in the place of what names a class.
+        objects: The settings, with objects in the place of what names a class.
         settings: The same as plain data.
         flight: Not needed.
     """
-    numbers = {
-        key: settings[key] for key in ("sizes", "draws", "seed", "state_std", "workers")
-    }
-    objects = made["data"], made["trajectory"], made["subsystem"], made["model"]
-    return Tables(*objects, model_settings=settings["model"], **numbers)
+    return Tables(
+        data=objects["data"],
+        trajectories=objects["trajectory"],
+        subsystems=objects["subsystem"],
+        model=objects["model"],
+        model_settings=settings["model"],
+        sizes=settings["sizes"],
+        draws=settings["draws"],
+        seed=settings["seed"],
+        state_std=settings["state_std"],
+        workers=settings["workers"],
+    )
+
+
+class ScaledData(NamedTuple):
+    """Data of one trajectory and subsystem in the units of the model."""
+
+    transitions: Transitions
+    scaling: Scaling  # of the next states
+    reported: tuple[int, ...]  # indices of the states whose variance is reported
 
 
 @dataclass(frozen=True)
 class Fit:
-    """What one draw needs: data in the units of the model, how they are scored, how the model is trained."""
+    """One row of the tables as its draws need it."""
 
-    data: Transitions
-    scaling: Scaling
-    reported: tuple[int, ...]
-    size: int
+    data: Transitions  #: in the units of the model
+    scaling: Scaling  #: of the next states, to the units of the data
+    reported: tuple[int, ...]  #: indices of the states whose variance is reported
+    size: int  #: of the training set
     model: Callable[..., Training]
-    state_std: float
+    state_std: float  #: of the state in the first prediction
+
+
+def _part(scaling: Scaling, columns: slice) -> Scaling:
+    return Scaling(scaling.offset[columns], scaling.factor[columns])
+
+
+class FedPredictions(NamedTuple):
+    """Predictions one step ahead, each fed with the covariance of the one before."""
+
+    means: Tensor  # of the next states (N, n)
+    variances: Tensor  # of the states that were fed in (N, n)
+    #: by which a predicted covariance was moved to be positive semidefinite
+    largest_projection: float
 
 
 def predict_all(
     posterior: GPPosterior, data: Transitions, state_std: float
-) -> tuple[Tensor, Tensor, float]:
-    """Predicts one step ahead along the rows of ``data``, as the tables do.
-
-    Returns:
-        Predicted means (N, n), the variances of the states that were fed in (N, n), and the largest amount by which a
-        predicted covariance had to be projected to be positive semidefinite.
-    """
+) -> FedPredictions:
+    """Predicts one step ahead along the rows of ``data``, as the tables do."""
     propagator = MomentMatching(process_noise=False)  # as in the paper
     covariance = state_std**2 * torch.eye(data.state_dim, dtype=torch.float64)
     means = []
-    fed = []
-    projected = 0.0
+    variances = []
+    largest_projection = 0.0
     for state, control in zip(data.states, data.inputs, strict=True):
         belief = Gaussian(state, covariance)
-        fed.append(belief.variance)
+        variances.append(belief.variance)
         step = propagator.propagate(posterior, belief, control)
         means.append(step.belief.mean)
         covariance = step.belief.covariance
-        projected = max(projected, float(step.deficit))
-    return torch.stack(means), torch.stack(fed), projected
+        largest_projection = max(largest_projection, float(step.deficit))
+    return FedPredictions(
+        torch.stack(means), torch.stack(variances), largest_projection
+    )
+
+
+def _plain_scores(
+    posterior: GPPosterior, fit: Fit, subset: Sequence[int]
+) -> dict[str, float | None]:
+    """Scores predictions from certain states, in the units of the data."""
+    data = fit.data
+    observed = fit.scaling.restore(data.next_states)
+    prediction = posterior.predict(data.states, data.inputs)
+    mean = fit.scaling.restore(prediction.mean)
+    variance = prediction.variance + posterior.noise_variance
+    variance = variance * fit.scaling.factor**2
+    held_out = np.setdiff1d(np.arange(len(data)), subset).tolist()
+    held_out_coverage = None
+    if held_out:
+        held_out_coverage = interval_coverage(
+            mean[held_out], variance[held_out], observed[held_out]
+        )
+    return {
+        "plain_training_mse": mean_squared_error(mean[subset], observed[subset]),
+        "plain_test_mse": mean_squared_error(mean, observed),
+        "nlpd": negative_log_predictive_density(mean, variance, observed),
+        "coverage_95": interval_coverage(mean, variance, observed),
+        "held_out_coverage_95": held_out_coverage,
+    }
 
 
 @dataclass(frozen=True)
 class Statistic:
-    """Median and range of one measure over the draws of a row, beside the paper's figure where there is one."""
+    """One measure over the draws of a row, and the paper's figure if there is one."""
 
     values: tuple[float, ...]
     paper: Decimal | None = None
@@ -358,21 +396,21 @@ class Statistic:
         return min(self.values), median(self.values), max(self.values)
 
     @property
-    def position(self) -> str | None:
-        """Where the paper's figure lies: "within" our range, "below" or "above"; its last digit may be rounded."""
+    def position(self) -> Position | None:
+        """Place of the paper's figure; its last digit may be rounded."""
         if self.paper is None:
             return None
         half_a_digit = float(Decimal(5).scaleb(int(self.paper.as_tuple().exponent) - 1))
         if float(self.paper) + half_a_digit < min(self.values):
             return "below"
-        return (
-            "above" if float(self.paper) - half_a_digit > max(self.values) else "within"
-        )
+        if float(self.paper) - half_a_digit > max(self.values):
+            return "above"
+        return "within"
 
     @property
     def printed(self) -> str:
         """The paper's figure with the digits that it prints, and its position."""
-        if self.paper is None:
+        if self.paper is None or self.position is None:
             return MISSING
         return f"{_digits(self.paper)} {SYMBOLS[self.position]}"
 
@@ -385,199 +423,265 @@ class Row:
     subsystem: str
     size: int
     statistics: dict[str, Statistic]
-    seconds: float | None
-    failed: int
+    seconds: float | None  #: median time of a training; None if all failed
+    failed: int  #: number of draws
 
 
 @cache
 def paper_figures() -> dict[tuple[str, str, int], dict[str, Decimal]]:
-    """Returns the figures printed in the paper's Tables 1 and 2, digit by digit."""
+    """Returns the figures printed in the paper's Tables 1 and 2, digit by digit.
+
+    Keys are trajectory, subsystem and size.
+    """
+    figures = {}
     with Path(__file__).with_name("paper_tables.csv").open(encoding="utf-8") as file:
-        return {
-            (line["trajectory"], line["subsystem"], int(line["size"])): {
-                name: Decimal(line[name]) for name in MEASURES
-            }
-            for line in csv.DictReader(file)
-        }
+        for line in csv.DictReader(file):
+            row = line["trajectory"], line["subsystem"], int(line["size"])
+            figures[row] = {name: Decimal(line[name]) for name in MEASURES}
+    return figures
 
 
 def summarise(records: Sequence[dict]) -> list[Row]:
-    """Returns one row a trajectory, subsystem and size, in the order in which they come."""
+    """Returns one row for each trajectory, subsystem and size, in their order."""
     groups: dict[tuple[str, str, int], list[dict]] = {}
     for record in records:
-        groups.setdefault(
-            (record["trajectory"], record["subsystem"], record["size"]), []
-        ).append(record)
+        key = record["trajectory"], record["subsystem"], record["size"]
+        groups.setdefault(key, []).append(record)
     rows = []
-    for key, group in groups.items():
+    for (trajectory, subsystem, size), group in groups.items():
         good = [record for record in group if "error" not in record]
-        printed = paper_figures().get(key, {})
-        values = {
-            name: tuple(r[name] for r in good if r[name] is not None)
-            for name in [*MEASURES, *CALIBRATION]
-        }
-        statistics = {
-            name: Statistic(numbers, printed.get(name))
-            for name, numbers in values.items()
-            if numbers
-        }
-        seconds = (
-            median(record["training_seconds"] for record in good) if good else None
+        seconds = None
+        if good:
+            seconds = median(record["training_seconds"] for record in good)
+        row = Row(
+            trajectory=trajectory,
+            subsystem=subsystem,
+            size=size,
+            statistics=_statistics(
+                good, paper_figures().get((trajectory, subsystem, size), {})
+            ),
+            seconds=seconds,
+            failed=len(group) - len(good),
         )
-        rows.append(Row(*key, statistics, seconds, len(group) - len(good)))
+        rows.append(row)
     return rows
+
+
+def _statistics(
+    records: Sequence[dict], printed: Mapping[str, Decimal]
+) -> dict[str, Statistic]:
+    """Returns every measure that has a value, by name."""
+    statistics = {}
+    for name in (*MEASURES, *CALIBRATION):
+        values = [record[name] for record in records if record[name] is not None]
+        if values:
+            statistics[name] = Statistic(tuple(values), printed.get(name))
+    return statistics
 
 
 def differences(rows: Sequence[Row]) -> list[str]:
     """Returns one line for every figure of the paper that lies outside our range."""
     lines = []
-    for row, (name, label) in (
-        (row, measure) for row in rows for measure in MEASURES.items()
-    ):
-        statistic = row.statistics.get(name)
-        if statistic and statistic.position in ("below", "above"):
-            low, _, high = statistic.range
-            end, nearest = (
-                ("low", low) if statistic.position == "below" else ("high", high)
-            )
-            ratio = float(statistic.paper) / nearest
-            distance = f"a factor {number(max(ratio, 1 / ratio))}"
-            if 0.9 < ratio < 1.1:
-                distance = f"{100 * abs(ratio - 1):.2g} %"
-            lines.append(
-                f"{row.trajectory} {row.subsystem} {row.size}, {label}: the paper prints {_digits(statistic.paper)}, "
-                f"{distance} {statistic.position} the {end} end of our range, {number(nearest)}"
-            )
+    for row in rows:
+        for name, label in MEASURES.items():
+            statistic = row.statistics.get(name)
+            difference = None if statistic is None else _difference(statistic)
+            if difference is not None:
+                title = f"{row.trajectory} {row.subsystem} {row.size}, {label}"
+                lines.append(f"{title}: {difference}")
     return lines
 
 
-def _title(trajectory: str) -> str:
-    in_paper = {"elliptical": "Table 1: elliptical", "lorenz": "Table 2: Lorenz"}
-    return f"{in_paper.get(trajectory, trajectory)} trajectory"
+def _difference(statistic: Statistic) -> str | None:
+    """Says how far outside our range the paper's figure lies; None if it is inside."""
+    paper = statistic.paper
+    position = statistic.position
+    if paper is None or position not in ("below", "above"):
+        return None
+    low, _, high = statistic.range
+    end = "low" if position == "below" else "high"
+    nearest = low if position == "below" else high
+    ratio = float(paper) / nearest
+    distance = f"a factor {number(max(ratio, 1 / ratio))}"
+    if 0.9 < ratio < 1.1:
+        distance = f"{100 * abs(ratio - 1):.2g} %"
+    return (
+        f"the paper prints {_digits(paper)}, {distance} {position} "
+        f"the {end} end of our range, {number(nearest)}"
+    )
+
+
+def _by_trajectory(
+    rows: Sequence[Row], header: Sequence[str], cells: Callable[[Row], list[str]]
+) -> list[Table]:
+    """Returns one table for each trajectory."""
+    tables = []
+    for trajectory in dict.fromkeys(row.trajectory for row in rows):
+        lines = [cells(row) for row in rows if row.trajectory == trajectory]
+        title = f"{TITLES.get(trajectory, trajectory)} trajectory"
+        tables.append(Table(header, lines, title, sections=True))
+    return tables
 
 
 def _compact(row: Row) -> list[str]:
-    """Returns median and the paper's figure above the range, for every measure; then the time."""
+    """Returns the cells of a row, with every range below its median.
+
+    The paper's figure stands behind the median; the time comes last.
+    """
     cells = []
-    for statistic in map(row.statistics.get, MEASURES):
+    for name in MEASURES:
+        statistic = row.statistics.get(name)
         if statistic is None:
             cells.append(MISSING)
             continue
         low, middle, high = map(number, statistic.range)
-        cells.append(
-            f"{middle:8} {statistic.printed if statistic.paper else ''}".rstrip()
-            + f"\n[{low}, {high}]"
-        )
+        printed = "" if statistic.paper is None else statistic.printed
+        first_line = f"{middle:8} {printed}".rstrip()
+        cells.append(f"{first_line}\n[{low}, {high}]")
     return [row.subsystem, str(row.size), *cells, _seconds(row)]
 
 
 def _full(row: Row) -> list[str]:
-    found = [row.statistics.get(name) for name in MEASURES]
-    cells = [
-        cell
-        for s in found
-        for cell in ((with_range(*s.range), s.printed) if s else (MISSING, MISSING))
-    ]
+    """Returns the cells of a row, with the paper's figures in cells of their own."""
+    cells = []
+    for name in MEASURES:
+        statistic = row.statistics.get(name)
+        if statistic is None:
+            cells += [MISSING, MISSING]
+        else:
+            low, middle, high = statistic.range
+            cells += [with_range(low, middle, high), statistic.printed]
     return [row.subsystem, str(row.size), *cells, _seconds(row)]
 
 
 def _calibration(rows: Sequence[Row], medians: bool = False) -> Table:
     """Returns the table of plain predictions, with the ranges or with medians alone."""
-    header = [
-        "",
-        "N",
-        *(
-            label.replace(", ", "\n") if medians else label
-            for label in CALIBRATION.values()
-        ),
-    ]
+    labels = list(CALIBRATION.values())
+    title = "Plain predictions (no input covariance)"
+    if medians:
+        labels = [label.replace(", ", "\n") for label in labels]
+        title = f"{title}: medians over the draws"
     lines = []
     for row in rows:
-        found = [
-            row.statistics[name].range if name in row.statistics else None
-            for name in CALIBRATION
-        ]
-        texts = [
-            MISSING if of is None else number(of[1]) if medians else with_range(*of)
-            for of in found
-        ]
-        lines.append([f"{row.trajectory} {row.subsystem}", str(row.size), *texts])
-    over = ": medians over the draws" if medians else ""
-    return Table(
-        header, lines, f"Plain predictions (no input covariance){over}", sections=True
-    )
+        cells = [f"{row.trajectory} {row.subsystem}", str(row.size)]
+        for name in CALIBRATION:
+            cells.append(_calibration_cell(row.statistics.get(name), medians))
+        lines.append(cells)
+    return Table(["", "N", *labels], lines, title, sections=True)
+
+
+def _calibration_cell(statistic: Statistic | None, medians: bool) -> str:
+    if statistic is None:
+        return MISSING
+    low, middle, high = statistic.range
+    return number(middle) if medians else with_range(low, middle, high)
 
 
 def _numbers(row: Row) -> dict[str, Any]:
-    """Returns median, min, max, the paper's figure and its position for every measure."""
-    done = max((len(s.values) for s in row.statistics.values()), default=0)
+    """Returns the columns of the CSV file.
+
+    For every measure: median, min, max, the paper's figure and its position.
+    """
+    counts = [len(statistic.values) for statistic in row.statistics.values()]
     numbers = {
         "trajectory": row.trajectory,
         "subsystem": row.subsystem,
         "size": row.size,
-        "draws": done,
+        "draws": max(counts, default=0),
+        "failed": row.failed,
+        "training_seconds_median": row.seconds,
     }
-    numbers |= {"failed": row.failed, "training_seconds_median": row.seconds}
-    for name in [*MEASURES, *CALIBRATION]:
-        s = row.statistics.get(name)
-        low, middle, high = s.range if s else (None, None, None)
-        numbers |= {f"{name}_median": middle, f"{name}_min": low, f"{name}_max": high}
+    for name in (*MEASURES, *CALIBRATION):
+        statistic = row.statistics.get(name)
+        low = middle = high = None
+        if statistic is not None:
+            low, middle, high = statistic.range
+        numbers[f"{name}_median"] = middle
+        numbers[f"{name}_min"] = low
+        numbers[f"{name}_max"] = high
         if name in MEASURES:
-            numbers |= {
-                f"{name}_paper": s and s.paper,
-                f"{name}_paper_is": s and s.position,
-            }
+            paper = None if statistic is None else statistic.paper
+            position = None if statistic is None else statistic.position
+            numbers[f"{name}_paper"] = paper
+            numbers[f"{name}_paper_is"] = position
     return numbers
+
+
+@dataclass(frozen=True)
+class _Panel:
+    """Test errors of one trajectory and subsystem, by training size."""
+
+    ours: dict[int, list[float]] = field(default_factory=dict)
+    paper: dict[int, float] = field(default_factory=dict)
+
+
+def _panels(records: Sequence[dict]) -> dict[str, _Panel]:
+    """Returns the panels of the figure by their titles."""
+    panels: dict[str, _Panel] = {}
+    for record in records:
+        trajectory = record["trajectory"]
+        subsystem = record["subsystem"]
+        size = record["size"]
+        panel = panels.setdefault(f"{trajectory}, {subsystem}", _Panel())
+        if "error" not in record:
+            panel.ours.setdefault(size, []).append(record["test_mse"])
+        printed = paper_figures().get((trajectory, subsystem, size))
+        if printed is not None:
+            panel.paper[size] = float(printed["test_mse"])
+    return panels
 
 
 @styled
 def _figure(records: Sequence[dict]) -> Figure:
-    """Draws the test MSE over the training size beside the paper's, a panel a trajectory and subsystem."""
-    panels: dict[str, tuple[dict, dict]] = {}  # our errors and the paper's, by size
-    for record in records:
-        name = record["trajectory"], record["subsystem"]
-        ours, paper = panels.setdefault(", ".join(name), ({}, {}))
-        if "error" not in record:
-            ours.setdefault(record["size"], []).append(record["test_mse"])
-        if printed := paper_figures().get((*name, record["size"])):
-            paper[record["size"]] = float(printed["test_mse"])
+    """Draws the test MSE over the training size beside the paper's.
+
+    Each trajectory and subsystem has its panel.
+    """
+    panels = _panels(records)
     columns = min(2, len(panels))
     rows = -(-len(panels) // 2)
-    title = "Tables 1 and 2: error of held-out predictions"
-    height = 3.4 * rows + 0.8 * (rows > 1)
-    figure, axes = make_figure(4.6 * columns, height, rows, columns, title)
+    figure, axes = make_figure(
+        width=4.6 * columns,
+        height=3.4 * rows + 0.8 * (rows > 1),
+        rows=rows,
+        columns=columns,
+        title="Tables 1 and 2: error of held-out predictions",
+    )
     for axis in axes.flat[len(panels) :]:
         axis.set_visible(False)
-    for axis, (heading, (errors, paper)) in zip(
-        axes.flat, panels.items(), strict=False
-    ):
-        sizes = sorted(errors)
+    for axis, (heading, panel) in zip(axes.flat, panels.items(), strict=False):
         axis.set(title=heading, xlabel="training points N")
-        if not sizes:  # every fit failed
-            axis.set_axis_off()
-            continue
-        draws = Series(
-            "our draws, with their quartiles", [errors[size] for size in sizes]
-        )
-        draw_quartiles(axis, [draws], [str(size) for size in sizes])
-        if known := {size: paper[size] for size in sizes if size in paper}:
-            axis.plot(
-                [*known],
-                [*known.values()],
-                "o",
-                color=VERMILION,
-                markersize=6,
-                zorder=3,
-                label="paper",
-            )
-        axis.set_yscale("log")
-        axis.yaxis.set_minor_locator(NullLocator())
+        _draw_panel(axis, panel)
     legend_below(figure, axes.flat)
     figure.supylabel("test MSE")
     return figure
 
 
+def _draw_panel(axis: Axes, panel: _Panel) -> None:
+    sizes = sorted(panel.ours)
+    if not sizes:  # every fit failed
+        axis.set_axis_off()
+        return
+    errors = [panel.ours[size] for size in sizes]
+    draws = Series("our draws, with their quartiles", errors)
+    draw_quartiles(axis, [draws], [str(size) for size in sizes])
+    printed_sizes = [size for size in sizes if size in panel.paper]
+    if printed_sizes:
+        axis.plot(
+            printed_sizes,
+            [panel.paper[size] for size in printed_sizes],
+            "o",
+            color=VERMILION,
+            markersize=6,
+            zorder=3,
+            label="paper",
+        )
+    axis.set_yscale("log")
+    axis.yaxis.set_minor_locator(NullLocator())
+
+
 def _digits(value: Decimal) -> str:
+    """Writes a figure with the digits that it has."""
     if value >= Decimal("1e-3"):
         return f"{value:f}"
     mantissa, exponent = f"{value:e}".lower().split("e")
@@ -586,4 +690,4 @@ def _digits(value: Decimal) -> str:
 
 def _seconds(row: Row) -> str:
     text = MISSING if row.seconds is None else f"{row.seconds:.2f}"
-    return text if not row.failed else f"{text} ({row.failed} failed)"
+    return f"{text} ({row.failed} failed)" if row.failed else text

@@ -15,8 +15,7 @@ from benchmarks.peers import OWN, Run, converged, measure, one_program, table
 from gpmpc.exceptions import SettingError, ShapeError
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior
-from gpmpc.mpc import Reference
-from gpmpc.mpc.problem import Box, Problem, Tracking
+from gpmpc.mpc import Box, Problem, Reference, Tracking
 from gpmpc.qp import DualActiveSet, QuadraticProgram
 from gpmpc.status import Status
 from gpmpc.systems import System, Translational, step
@@ -150,7 +149,10 @@ def test_the_residual_knows_no_units_of_the_cost(gp, instances):
 
 
 def test_all_contenders_that_are_here_agree(gp, instances, optimum):
-    """Each stops by a measure of its own; what that leaves is less than a hundredth of the inputs' range."""
+    """Each stops by a measure of its own.
+
+    What that leaves is less than a hundredth of the inputs' range.
+    """
     makers = converged(gp, PROBLEM, H)
     assert (makers["do-mpc, IPOPT"] is None) == (not peer_do_mpc.installed())
     accuracy = 1e-2 * (PROBLEM.inputs.upper - PROBLEM.inputs.lower)

@@ -1,4 +1,7 @@
-"""The league's experiment: interface, equations, what is learned from, what is said without the simulator."""
+"""The league's experiment.
+
+Interface, equations, what is learned from, what is said without the simulator.
+"""
 
 import json
 import shutil
@@ -42,7 +45,10 @@ from gpmpc.systems import double_pendulum, step_many
 
 
 class Interface:
-    """What the league documents of a controller: torques of both joints for angles, rates and a time."""
+    """What the league documents of a controller.
+
+    Torques of both joints for angles, rates and a time.
+    """
 
     def get_control_output(self, x, t=None):
         return np.asarray(self.get_control_output_(x, t))
@@ -117,7 +123,8 @@ def test_learned_from_are_calm_transitions_without_a_torque_on_the_passive_joint
     torques[80:, 0] = 1.0
     states[:20, 2] = 30.0
     found = transitions([Play(0.0, states, torques)], "acrobot")
-    # of 18 windows of 10 samples, every 5: 4 begin wild, 1 spans the jump, 3 have a torque on the passive joint
+    # of 18 windows of 10 samples, every 5: 4 begin wild, 1 spans the jump, 3 have a
+    # torque on the passive joint
     assert len(found.states) == 10
     assert set(found.inputs[:, 0].tolist()) == {1.0, 2.5}
 

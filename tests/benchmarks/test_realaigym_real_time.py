@@ -1,4 +1,7 @@
-"""The league in real time, its robustness board and its film: late plans, filter, delay, responsiveness, parts."""
+"""The league in real time, its robustness board and its film.
+
+Late plans, filter, delay, responsiveness, parts.
+"""
 
 import sys
 from types import ModuleType, SimpleNamespace

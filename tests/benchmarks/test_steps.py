@@ -1,4 +1,7 @@
-"""The pendulums are what the benchmarks say, and their GPs predict them; steps are warm-started as in a loop."""
+"""The pendulums are what the benchmarks say, and their GPs predict them.
+
+Steps are warm-started as in a loop.
+"""
 
 import numpy as np
 import pytest

@@ -15,10 +15,9 @@ from hydra import compose, initialize_config_dir
 from gpmpc.datasets import PaperData
 from gpmpc.exceptions import SettingError
 from gpmpc.experiments.figures import Figures, Row
-from gpmpc.experiments.figures_tables import LOOPS, paper_seconds, summarise
+from gpmpc.experiments.figures_tables import LOOP_TITLES, paper_seconds, summarise
 from gpmpc.gp import SoftLimits, identity, train
-from gpmpc.mpc import Reference
-from gpmpc.mpc.gp_mpc import NonlinearGPMPC
+from gpmpc.mpc import NonlinearGPMPC, Reference
 from gpmpc.propagation import MomentMatching
 from gpmpc.trajectories import Elliptical, Lorenz
 from tests.cli.command import forked
@@ -292,9 +291,10 @@ def test_on_the_authors_data_the_convex_controller_tracks_within_the_printed_bou
         {**t.labels, **experiment.run_trial(t)} for t in experiment.trials(tmp_path)
     ]
     found = {(row.name, row.trajectory): row for row in summarise(records).itertuples()}
-    # The authors' stored runs: 2.98 and 0.884; one step at a time on the map, at best 2.604 and 0.115.
-    # Without bounds and one step ahead any reference can be met, but where the Lorenz curve is almost free fall (steps
-    # 100 to 107: thrust near zero, so tilts beyond 1.4 rad) the program has local minima 0.2 to 0.3 away from it.
+    # The authors' stored runs: 2.98 and 0.884; one step at a time on the map, at best
+    # 2.604 and 0.115. Without bounds and one step ahead any reference can be met, but
+    # where the Lorenz curve is almost free fall (steps 100 to 107: thrust near zero, so
+    # tilts beyond 1.4 rad) the program has local minima 0.2 to 0.3 away from it.
     for trajectory, limit, free in (
         ("elliptical", 2.75, 0.001),
         ("lorenz", 0.20, 0.05),
@@ -309,7 +309,7 @@ def test_the_nonlinear_controller_starts_from_the_references_own_inputs():
     """From the last input held, a nearly flat direction of this GP takes it hundreds of iterations."""
     from gpmpc.gaussian import Gaussian
     from gpmpc.gp import Transitions
-    from gpmpc.mpc.problem import Problem, Tracking
+    from gpmpc.mpc import Problem, Tracking
 
     rng = np.random.default_rng(0)
     states = rng.normal(size=(40, 2))
@@ -342,7 +342,7 @@ def test_the_page_has_a_table_a_loop_with_a_line_for_every_row_of_the_csv_file(
         ]
         for section in sections
     }
-    for loop, title in LOOPS.items():
+    for loop, title in LOOP_TITLES.items():
         flown = [row for row in rows if row["loop"] == loop]
         assert len(lines[title]) == 2 + len(flown) > 2
         for line, row in zip(lines[title][2:], flown, strict=True):

@@ -22,8 +22,7 @@ from gpmpc.experiments.quality import (
     pareto_front,
 )
 from gpmpc.metrics import tracking_cost
-from gpmpc.mpc.gp_mpc import GPMPC
-from gpmpc.mpc.problem import Box, Problem, Tracking
+from gpmpc.mpc import GPMPC, Box, Problem, Tracking
 from gpmpc.propagation import Linearization
 from gpmpc.studies.study import TrialStore, run_study
 from gpmpc.trajectories import Elliptical

@@ -1,4 +1,7 @@
-"""Tables 1 and 2 on small data; on the authors' data (where GPMPC_PAPER_DATA names it) against the printed figures."""
+"""Tables 1 and 2 on small data.
+
+On the authors' data (where GPMPC_PAPER_DATA names it) against the printed figures.
+"""
 
 import csv
 import io
@@ -339,7 +342,10 @@ def test_the_full_rows_are_the_papers_on_the_authors_data(
 def test_our_rotational_flight_with_the_authors_yaw_residue_gives_the_papers_row(
     paper_data, tmp_path
 ):
-    """Why our own rotational rows differ: the authors' yaw channels are solver residue, ours are at rest."""
+    """Why our own rotational rows differ.
+
+    The authors' yaw channels are solver residue, ours are at rest.
+    """
     from gpmpc.trajectories import Elliptical
     from tests.datasets.test_flights import NMPC_DATA
 
