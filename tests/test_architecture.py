@@ -13,7 +13,10 @@ ROOT = Path(__file__).resolve().parents[1]
 def test_every_import_contract_is_kept():
     # In a process of its own: the linter's logging configuration silences every logger
     # that exists.
-    code = "from importlinter.cli import lint_imports; raise SystemExit(lint_imports(no_cache=True))"
+    code = (
+        "from importlinter.cli import lint_imports; raise "
+        "SystemExit(lint_imports(no_cache=True))"
+    )
     linted = subprocess.run(
         [sys.executable, "-c", code],
         cwd=ROOT,
@@ -36,7 +39,10 @@ def test_the_qp_solvers_load_no_torch(module):
 
 def test_gp_modules_load_no_optimiser_settings_or_figures():
     forbidden = ["hydra", "cvxpy", "mcap", "casadi", "matplotlib", "rich"]
-    code = f"import sys, gpmpc.gp, gpmpc.models, gpmpc.propagation; print([m for m in {forbidden} if m in sys.modules])"
+    code = (
+        f"import sys, gpmpc.gp, gpmpc.models, gpmpc.propagation; print([m for "
+        f"m in {forbidden} if m in sys.modules])"
+    )
     loaded = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True
     ).stdout.strip()
@@ -45,7 +51,10 @@ def test_gp_modules_load_no_optimiser_settings_or_figures():
 
 def test_recordings_need_neither_torch_nor_compilers():
     forbidden = ["torch", "numba", "scipy", "hydra", "matplotlib", "pandas"]
-    code = f"import sys, gpmpc.recording; print([m for m in {forbidden} if m in sys.modules])"
+    code = (
+        f"import sys, gpmpc.recording; print([m for m in {forbidden} if m in "
+        f"sys.modules])"
+    )
     loaded = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True
     ).stdout.strip()

@@ -51,8 +51,11 @@ def package(tmp_path):
 def run(package, **environment):
     """Returns the kernel's answer to 1 in a new process, and if its code was cached."""
     result = subprocess.run(
-        [sys.executable, "-B", "-c", "import tiny.other, tiny.kernel"], capture_output=True, text=True, check=True,
-        env=os.environ | {"PYTHONPATH": f"{package.parent}{os.pathsep}{ROOT}"} | environment,
+        [sys.executable, "-B", "-c", "import tiny.other, tiny.kernel"],
+        capture_output=True, text=True, check=True,
+        env=os.environ
+        | {"PYTHONPATH": f"{package.parent}{os.pathsep}{ROOT}"}
+        | environment,
     )  # fmt: skip
     answer, hits = result.stdout.split()
     return float(answer), int(hits) == 1
@@ -82,7 +85,10 @@ print(kernel(Pair(1.0, 2.0)), sum(kernel.stats.cache_hits.values()))
 
 
 def test_code_for_a_class_that_has_moved_is_compiled_anew(package):
-    pair = "from typing import NamedTuple\nclass Pair(NamedTuple):\n    x: float\n    y: float\n"
+    pair = (
+        "from typing import NamedTuple\nclass Pair(NamedTuple):\n    x: float\n"
+        "    y: float\n"
+    )
     for module in ("here", "there"):
         (package / f"{module}.py").write_text(pair)
         (package / "kernel.py").write_text(MOVED.format(module=f"tiny.{module}"))
@@ -122,8 +128,10 @@ def test_a_kernel_runs_its_own_copy_of_its_callees(tmp_path):
     def run(factor, code):
         script = f"from own import *\nprint({code})"
         result = subprocess.run(
-            [sys.executable, "-B", "-c", script], capture_output=True, text=True, check=True,
-            env=os.environ | {"PYTHONPATH": f"{tmp_path}{os.pathsep}{ROOT}", "FACTOR": factor, "NUMBA_CACHE_DIR": ""},
+            [sys.executable, "-B", "-c", script], capture_output=True, text=True,
+            check=True,
+            env=os.environ | {"PYTHONPATH": f"{tmp_path}{os.pathsep}{ROOT}",
+                "FACTOR": factor, "NUMBA_CACHE_DIR": ""},
         )  # fmt: skip
         return [float(number) for number in result.stdout.split()]
 

@@ -28,8 +28,10 @@ from gpmpc.systems import step, translational
 from gpmpc.trajectories import Elliptical, states_along
 
 plant, rng = translational(), np.random.default_rng(0)
-states, inputs = rng.normal(0, 1, (40, 6)), [7.26, 0, 0] + rng.normal(0, 0.3, (40, 3)) * [1, 0.3, 0.3]
-transitions = Transitions(states, inputs, [step(plant, *pair) for pair in zip(states, inputs, strict=True)])
+states = rng.normal(0, 1, (40, 6))
+inputs = [7.26, 0, 0] + rng.normal(0, 0.3, (40, 3)) * [1, 0.3, 0.3]
+next_states = [step(plant, x, u) for x, u in zip(states, inputs, strict=True)]
+transitions = Transitions(states, inputs, next_states)
 gp = Trainer(restarts=0, predicts="difference")(transitions).posterior
 for name in ("gp", "before"):
     save_posterior(gp, f"{name}.safetensors")
@@ -97,7 +99,8 @@ def test_the_first_five_minutes_print_what_the_readme_shows(page):
         if text.startswith(" flight ")
     ]
     times = re.compile(
-        r"(?<=, in )[\d.]+(?= s)|(?<=decision \[ms\]).*(?=written to)|compil.*(?=flight  )",
+        r"(?<=, in )[\d.]+(?= s)|(?<=decision \[ms\]).*(?=written "
+        r"to)|compil.*(?=flight  )",
         re.DOTALL,
     )
     assert times.sub("", shown).split() == times.sub("", flown).split()

@@ -159,12 +159,16 @@ def test_a_mistake_is_one_clear_line(arguments, message, tmp_path):
         "root": "[x[1], u[0]]",
     }
     for name, rates in rows.items():
-        text = f"state_names, input_names = ('a', 'b'), ('u',)\n    def derivative(self, x, u): return {rates}\n"
+        text = (
+            f"state_names, input_names = ('a', 'b'), ('u',)\n"
+            f"    def derivative(self, x, u): return {rates}\n"
+        )
         limits = (
             "name='nan', input_lower=[-1], input_upper=[1], region=[[-1, -1], [1, 1]]"
         )
         factory = (
-            f"from gpmpc.systems import System\nclass D:\n    {text}\ndef make(): return System(D(), 0.1, {limits})\n"
+            f"from gpmpc.systems import System\nclass D:\n    {text}\n"
+            f"def make(): return System(D(), 0.1, {limits})\n"
             "def h(x): return (x[:, 0] - 1).sqrt()\n"
         )
         (tmp_path / f"{name}_module.py").write_text(factory)
@@ -175,8 +179,10 @@ def test_a_mistake_is_one_clear_line(arguments, message, tmp_path):
         weights = "[1, 1, 1]" if name == "weights" else "[1, 1]"
         problem = f"{{cost: {{Q: {weights}, R: [1]}}, constraints: {kept}}}"
         (tmp_path / "system" / f"{name}.yaml").write_text(
-            "# @package _global_\ndefaults: [override /trajectory: goal, override /data: random, _self_]\n"
-            f"system: {{_target_: {name}_module.make}}\ncontroller: {{problem: {problem}}}\n"
+            "# @package _global_\ndefaults: [override /trajectory: goal, override "
+            "/data: random, _self_]\n"
+            f"system: {{_target_: {name}_module.make}}\n"
+            f"controller: {{problem: {problem}}}\n"
         )
     before = sorted(tmp_path.rglob("*.*"))
     done = forked(*arguments, cwd=tmp_path)

@@ -155,7 +155,8 @@ def test_a_model_goes_only_where_torch_can_take_it(model):
 
 def test_models_and_data_say_what_they_are_in_one_line():
     assert repr(posterior()) == (
-        "GPPosterior(12 points, n=2, m=1, k=2, predicts='next_state', torch.float64 on cpu)"
+        "GPPosterior(12 points, n=2, m=1, k=2, predicts='next_state', torch.float64 "
+        "on cpu)"
     )
     assert repr(data()) == "Transitions(12 rows, n=2, m=1)"
 

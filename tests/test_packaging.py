@@ -63,7 +63,10 @@ def test_an_installed_package_finds_its_settings(wheel, tmp_path):
     empty = tmp_path / "empty"
     empty.mkdir()
     zipfile.ZipFile(wheel).extractall(site)
-    code = f"import gpmpc; assert gpmpc.__file__.startswith({str(site)!r}); from gpmpc.cli import main; main()"
+    code = (
+        f"import gpmpc; assert gpmpc.__file__.startswith({str(site)!r}); from "
+        f"gpmpc.cli import main; main()"
+    )
     result = subprocess.run(
         [sys.executable, "-c", code, "tables", "--cfg", "draws=3"],
         cwd=empty,

@@ -1,4 +1,4 @@
-"""A setting out of its range is refused at construction, by its name, wherever it is."""
+"""A setting out of its range is refused by its name when an object is made."""
 
 import math
 

@@ -69,7 +69,8 @@ def test_a_trusted_packages_code_and_its_names_are_found(name, own_package):
 @pytest.mark.parametrize(
     "name",
     [
-        "arm.os.system", "arm.subprocess.call", "arm.np.save", "arm.save", "arm.system", "arm.keep",
+        "arm.os.system", "arm.subprocess.call", "arm.np.save", "arm.save", "arm.system",
+        "arm.keep",
         "arm.write_whole", "arm.os.path.os.system", "arm:os.system",
     ],
 )  # fmt: skip
@@ -104,7 +105,8 @@ def test_a_part_of_a_package_can_be_trusted_alone(own_package):
 
 
 @pytest.mark.parametrize(
-    "names", ["my_robot", 3, ["my robot"], [None], ["os"], ["subprocess"], ["gpmpc"], [""],
+    "names",
+    ["my_robot", 3, ["my robot"], [None], ["os"], ["subprocess"], ["gpmpc"], [""],
               ["builtins"], ["hydra.utils"], ["../x"]]
 )  # fmt: skip
 def test_what_cannot_be_trusted_is_a_setting_of_the_wrong_kind(names):
@@ -142,7 +144,8 @@ WORDS = {"attitude", "starts", "around", "name", "solver"}
 FILES_THAT_ARE_READ = {"folder", "path"}
 GUARDED = {"trusted", "environment", "make", "options"}
 NAMES = {
-    "units", "angles", "tracked", "rates", "pose", "names", "state_names", "input_names", "actuators", "joints",
+    "units", "angles", "tracked", "rates", "pose", "names", "state_names",
+    "input_names", "actuators", "joints",
     "sensors", "observation", "known", "settings", "parameters",
 }  # fmt: skip
 NUMBERS = {"lower", "upper", "F", "f", "Q", "R", "terminal", "weight", "reference"}

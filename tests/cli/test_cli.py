@@ -49,7 +49,8 @@ def test_help_lists_the_commands_and_a_commands_settings(tmp_path):
         ),
         (
             ["tables", "trajectory=lorens"],
-            "trajectory: no such option 'lorens'; available are elliptical, goal, hover, lorenz",
+            "trajectory: no such option 'lorens'; available are elliptical, goal, "
+            "hover, lorenz",
         ),
         (["tables", "data=paper"], "data.folder: this setting has no default"),
         (["tables", "data=paper", "data.folder=nowhere"], "nowhere: no such folder"),
@@ -157,7 +158,8 @@ def test_a_copy_of_a_process_answers_as_the_command_does(arguments, tmp_path):
         ),
         (
             f"{ROW}\n" * 3,
-            "ds_nmpc_Elliptical_trans.txt: the file holds 3 rows; data.samples asks for 20",
+            "ds_nmpc_Elliptical_trans.txt: the file holds 3 rows; data.samples asks "
+            "for 20",
         ),
     ],
     ids=["14 columns", "NaN", "infinite", "too few rows"],

@@ -137,14 +137,22 @@ def run_of(document):
 
 
 NOT_CALLED = [
-    "os.system", "builtins.eval", "builtins.exec", "subprocess.run", "pickle.loads", "numpy.load", "torch.load",
-    "gpmpc._files.write_whole", "gpmpc._files.os.system", "gpmpc.gp.Transitions.load", "gpmpc.gp.save_posterior",
-    "gpmpc.models.save_model", "gpmpc.recording.recover", "gpmpc.systems._simulators.library",
-    "gpmpc.systems._simulators.import_module", "gpmpc.cli._run.run_one", "gpmpc.cli._experiment.instantiate",
-    "gpmpc.systems.gymnasium_.register_environments", "gpmpc.systems.gymnasium_.make_environment",
-    "gpmpc.systems.pendulum.__globals__", "gpmpc.systems.System.__init__", "gpmpc", "hydra.utils.instantiate",
-    "hydra.utils.call", "omegaconf.OmegaConf.load", "functools.partial", "importlib.import_module",
-    "gpmpc.systems .pendulum", "gpmpc.systems.pendulum\n", "", "gpmpc.systems:pendulum", "GPMPC.systems.pendulum",
+    "os.system", "builtins.eval", "builtins.exec", "subprocess.run", "pickle.loads",
+    "numpy.load", "torch.load",
+    "gpmpc._files.write_whole", "gpmpc._files.os.system", "gpmpc.gp.Transitions.load",
+    "gpmpc.gp.save_posterior",
+    "gpmpc.models.save_model", "gpmpc.recording.recover",
+    "gpmpc.systems._simulators.library",
+    "gpmpc.systems._simulators.import_module", "gpmpc.cli._run.run_one",
+    "gpmpc.cli._experiment.instantiate",
+    "gpmpc.systems.gymnasium_.register_environments",
+    "gpmpc.systems.gymnasium_.make_environment",
+    "gpmpc.systems.pendulum.__globals__", "gpmpc.systems.System.__init__", "gpmpc",
+    "hydra.utils.instantiate",
+    "hydra.utils.call", "omegaconf.OmegaConf.load", "functools.partial",
+    "importlib.import_module",
+    "gpmpc.systems .pendulum", "gpmpc.systems.pendulum\n", "", "gpmpc.systems:pendulum",
+    "GPMPC.systems.pendulum",
     "_frozen_importlib.__import__", "antigravity", "webbrowser.open",
 ]  # fmt: skip
 
@@ -277,8 +285,10 @@ def test_the_largest_settings_are_read_in_a_second_or_two(text):
         ["system=pendulum", "controller=lqr", "plant.mass=1.1"],
         ["controller=state_form", "trajectory=lorenz"],
         ["nominal={mass: 0.8}", "solver=clarabel", "learning=online"],
-        ["system=translational", "data=nmpc", "controller=nonlinear", "propagation=unscented"],
-        ["disturbances=[{_target_: gpmpc.simulation.Gust, rates: {vx: 0.5}, start: 2}]"],
+        ["system=translational", "data=nmpc", "controller=nonlinear",
+         "propagation=unscented"],
+        ["disturbances=[{_target_: gpmpc.simulation.Gust, rates: {vx: 0.5}, start: "
+            "2}]"],
     ],
     ids=" ".join,
 )  # fmt: skip
@@ -343,19 +353,25 @@ def test_the_caller_says_whom_a_saved_model_may_trust():
 @pytest.mark.parametrize(
     "change",
     [
-        lambda f: put(f, "system", 5), lambda f: put(f, "system", None), lambda f: put(f, "controller", "x"),
-        lambda f: put(f, "trajectory", {"a": 1, "b": 2}), lambda f: put(f, "disturbances", {"a": 1}),
+        lambda f: put(f, "system", 5), lambda f: put(f, "system", None),
+        lambda f: put(f, "controller", "x"),
+        lambda f: put(f, "trajectory", {"a": 1, "b": 2}),
+        lambda f: put(f, "disturbances", {"a": 1}),
         lambda f: put(f, "data", {"size": None}),
         lambda f: put(f, "data", {"_target_": "gpmpc.trajectories.Hover", "size": 3}),
-        lambda f: put(f, "plant", [1]), lambda f: put(f, "nominal", 3), lambda f: put(f, "noise", 3),
+        lambda f: put(f, "plant", [1]), lambda f: put(f, "nominal", 3),
+        lambda f: put(f, "noise", 3),
         lambda f: put(f, "horizon", "many"), lambda f: put(f, "controller.problem", 3),
         lambda f: put(f, "system", {"_target_": "gpmpc.systems.pendulum", "mass": "x"}),
         lambda f: put(f, "system", {"_target_": "gpmpc.systems.pendulum", "weight": 1}),
         lambda f: put(f, "system", {"_target_": "gpmpc.systems.pendulum"}),
-        lambda f: put(f, "data.samples", "???"), lambda f: put(f, "model", {"_target_": "gpmpc.qp.DualActiveSet"}),
+        lambda f: put(f, "data.samples", "???"),
+        lambda f: put(f, "model", {"_target_": "gpmpc.qp.DualActiveSet"}),
         lambda f: {key: f[key] for key in ("system", "controller", "folder")},
-        lambda f: put(f, "controller.problem.cost", {"_target_": "gpmpc.systems.pendulum", "Q": [1], "R": [1]}),
-        lambda f: put(f, "seed", [1]), lambda f: put(f, "steps", 1.5), lambda f: put(f, "loop", {}),
+        lambda f: put(f, "controller.problem.cost",
+            {"_target_": "gpmpc.systems.pendulum", "Q": [1], "R": [1]}),
+        lambda f: put(f, "seed", [1]), lambda f: put(f, "steps", 1.5),
+        lambda f: put(f, "loop", {}),
     ],
 )  # fmt: skip
 def test_settings_of_no_flight_get_one_line_with_the_files_name(change):
@@ -379,9 +395,12 @@ def test_a_recording_and_its_settings_must_be_of_one_system():
 
 WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND
 ACTING = (
-    "import", "subprocess.", "socket.", "shutil.", "os.system", "os.exec", "os.fork", "os.spawn", "os.posix_spawn",
-    "os.rename", "os.remove", "os.mkdir", "os.rmdir", "os.link", "os.symlink", "os.truncate", "os.chmod", "os.chown",
-    "os.utime", "os.putenv", "ctypes.", "webbrowser.", "urllib.", "pickle.find_class", "pty.", "signal.", "sqlite3.",
+    "import", "subprocess.", "socket.", "shutil.", "os.system", "os.exec", "os.fork",
+    "os.spawn", "os.posix_spawn",
+    "os.rename", "os.remove", "os.mkdir", "os.rmdir", "os.link", "os.symlink",
+    "os.truncate", "os.chmod", "os.chown",
+    "os.utime", "os.putenv", "ctypes.", "webbrowser.", "urllib.", "pickle.find_class",
+    "pty.", "signal.", "sqlite3.",
 )  # fmt: skip
 
 

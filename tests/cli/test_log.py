@@ -209,7 +209,8 @@ def foreign(folder):
         "pipe.mcap": "is not a file",
         "other.mcap": "is not the recording of a run",
         "nameless.mcap": "is not the recording of a run",
-        "renamed.mcap": "a name must be letters, digits and _, a letter first; got '1z'",
+        "renamed.mcap": "a name must be letters, digits and _, a letter first; got "
+        "'1z'",
         ".": "is not a file",
         "/dev/zero": "is not a file",
         "n" * 300: "File name too long",

@@ -185,8 +185,8 @@ def test_finished_runs_are_kept_and_other_settings_refused(single):
     other = forked(*arguments, cwd=cwd)
     assert other.returncode == 2
     assert (
-        "holds a finished run of other settings (controller.tolerance: 1 then, None now)"
-        in other.stderr
+        "holds a finished run of other settings (controller.tolerance: 1 then, None "
+        "now)" in other.stderr
     )
 
 
@@ -268,11 +268,13 @@ def test_a_run_says_where_the_users_own_code_has_changed(tmp_path):
         (["controller=papre"], "state_form (did you mean 'paper'?)"),
         (
             ["--hlep"],
-            "unknown option '--hlep' (did you mean '--help'?); gpmpc run --help lists what there is",
+            "unknown option '--hlep' (did you mean '--help'?); gpmpc run --help lists "
+            "what there is",
         ),
         (
             ["noise.process=0.1"],
-            "noise.process: must be a list of standard deviations, one for every state; got 0.1",
+            "noise.process: must be a list of standard deviations, one for every "
+            "state; got 0.1",
         ),
         (
             ["noise.process=[0.1]"],

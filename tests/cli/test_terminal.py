@@ -27,8 +27,10 @@ TINY = ["data.samples=25", "model.restarts=0", "steps=2", "horizon=1", "recorder
 def shell(line, cwd, **environment):
     """A line of the shell, in which $GPMPC is the command."""
     return subprocess.run(
-        ["bash", "-o", "pipefail", "-c", line], cwd=cwd, capture_output=True, timeout=SECONDS, check=False,
-        encoding="utf-8", errors="replace", env=os.environ | {"GPMPC": PATH} | environment,
+        ["bash", "-o", "pipefail", "-c", line], cwd=cwd, capture_output=True,
+        timeout=SECONDS, check=False,
+        encoding="utf-8", errors="replace",
+        env=os.environ | {"GPMPC": PATH} | environment,
     )  # fmt: skip
 
 
@@ -230,7 +232,7 @@ def test_every_word_of_the_line_is_completed(line, offered, tmp_path, monkeypatc
 
 @pytest.mark.parametrize("shell_name", ["bash", "zsh"])
 def test_a_shell_completes_at_tab_in_a_terminal(shell_name, tmp_path):
-    """A pseudo-terminal: what is typed stands on the screen, and what TAB adds to it."""
+    """A pseudo-terminal: its screen shows what is typed and what TAB adds."""
     if shutil.which(shell_name) is None:
         pytest.skip(f"{shell_name} is not installed")
     (tmp_path / "flights").mkdir()
@@ -266,7 +268,8 @@ class Terminal:
         self._fd, inner = pty.openpty()
         fcntl.ioctl(inner, termios.TIOCSWINSZ, struct.pack("HHHH", 40, 200, 0, 0))
         self._process = subprocess.Popen(
-            command, cwd=cwd, stdin=inner, stdout=inner, stderr=inner, start_new_session=True,
+            command, cwd=cwd, stdin=inner, stdout=inner, stderr=inner,
+            start_new_session=True,
             env=os.environ | environment,
         )  # fmt: skip
         os.close(inner)
@@ -447,7 +450,8 @@ def test_a_killed_joblib_sweep_leaves_no_worker(tmp_path):
 def _kill_and_wait_for_the_pipe(command, cwd, begun, ended_by):
     path = os.pathsep.join(filter(None, sys.path))
     parent = subprocess.Popen(
-        command, cwd=cwd, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, start_new_session=True,
+        command, cwd=cwd, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+        start_new_session=True,
         env=os.environ | {"PYTHONPATH": path},
         # which nohup sets to be ignored
         preexec_fn=lambda: signal.signal(signal.SIGHUP, signal.SIG_DFL),
@@ -469,12 +473,16 @@ def _kill_and_wait_for_the_pipe(command, cwd, begun, ended_by):
 
 def test_ctrl_c_in_a_terminal_reaches_no_worker_while_it_starts(tmp_path):
     """Workers that are still importing must print no traceback between other lines."""
-    starting = "import os, signal\nif __name__ == '__mp_main__':\n    os.kill(os.getpid(), signal.SIGINT)\n"
+    starting = (
+        "import os, signal\nif __name__ == '__mp_main__':\n"
+        "    os.kill(os.getpid(), signal.SIGINT)\n"
+    )
     (tmp_path / "pool.py").write_text(
         f"{starting}{POOL.replace('time.sleep(120)', 'pass')}"
     )
     done = subprocess.run(
-        [sys.executable, "pool.py"], cwd=tmp_path, capture_output=True, text=True, timeout=SECONDS, check=False,
+        [sys.executable, "pool.py"], cwd=tmp_path, capture_output=True, text=True,
+        timeout=SECONDS, check=False,
         env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
     )  # fmt: skip
     assert (done.returncode, done.stderr) == (0, "")

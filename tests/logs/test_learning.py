@@ -271,7 +271,7 @@ def test_the_same_rows_in_other_pieces_give_the_same_model(flights):
 
 
 def test_learning_is_the_same_whatever_marks_a_gap(tmp_path):
-    """Missing rows, empty rows and stamps that jump leave the other rows as they are."""
+    """Missing or empty rows and stamps that jump leave the other rows as they are."""
     tables = {way: [] for way in ("missing", "empty", "jump")}
     for run in pendulum_log(lambda x: 9 * np.sin(x[0]) + 0.5 * x[1], rows=300):
         table = pandas.DataFrame(

@@ -187,10 +187,14 @@ def write(path, header, arrays):
 
 
 VALUES = [
-    None, True, -1, 0, 1, 2, 3, 10**9, 2**31, 2**63, 10**30, 10**400, 1.5, -0.5, math.nan, math.inf,
-    1e308, "", "x" * 999, "value", "two\nlines", "subprocess:call", [], [0], [1], [1, 1], [[0]],
-    [10**7, 1], [2**31, 2**31], [0, 0], [None], ["a"], [0] * 2000, {}, {"kind": "ResidualModel"},
-    {"kind": []}, {"kind": "operations"}, {"kind": "operations", "sizes": [10**7, 1], "shape": [2, 1]},
+    None, True, -1, 0, 1, 2, 3, 10**9, 2**31, 2**63, 10**30, 10**400, 1.5, -0.5,
+    math.nan, math.inf,
+    1e308, "", "x" * 999, "value", "two\nlines", "subprocess:call", [], [0], [1],
+    [1, 1], [[0]],
+    [10**7, 1], [2**31, 2**31], [0, 0], [None], ["a"], [0] * 2000, {},
+    {"kind": "ResidualModel"},
+    {"kind": []}, {"kind": "operations"},
+    {"kind": "operations", "sizes": [10**7, 1], "shape": [2, 1]},
     {"kind": "function", "path": "os:system", "parameters": {"command": "true"}},
     {"kind": "casadi", "path": "gpmpc.systems:sin", "parameters": {"angle": 1.0}},
     {"kind": "GPPosterior"}, [[[]] * 50] * 50,
@@ -252,8 +256,10 @@ def a_shape(header, arrays, rng):
     name = rng.choice([*arrays])
     array = np.nan_to_num(arrays[name].clip(-1e30, 1e30))
     shapes = [
-        array.T, array[:0], array[None], array.ravel(), array[..., :-1], array.astype("f4"),
-        array.clip(-9, 9).astype("i8"), np.array(1.0), np.zeros((0, 10**9)), np.zeros((10**9, 0)),
+        array.T, array[:0], array[None], array.ravel(), array[..., :-1],
+        array.astype("f4"),
+        array.clip(-9, 9).astype("i8"), np.array(1.0), np.zeros((0, 10**9)),
+        np.zeros((10**9, 0)),
         np.concatenate([array, array]), np.zeros((2**20, 0, 3)), np.zeros((4000, 1)),
         array.reshape(-1, 1),
     ]  # fmt: skip
@@ -276,7 +282,8 @@ def another_name(header, arrays, rng):
 
 
 MUTATIONS = [
-    a_value, a_value, a_value, a_value_left_out, a_field_added, a_model_inside_another, numbers, numbers, a_shape,
+    a_value, a_value, a_value, a_value_left_out, a_field_added, a_model_inside_another,
+    numbers, numbers, a_shape,
     another_name,
 ]  # fmt: skip
 

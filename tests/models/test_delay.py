@@ -121,16 +121,43 @@ def test_models_are_saved_and_loaded_whole(model, tmp_path):
 @pytest.mark.parametrize(
     ("make", "error", "rule"),
     [
-        (lambda: DelayedModel(gp(), 0), SettingError, "delay: must be a number above 0"),
+        (
+            lambda: DelayedModel(gp(), 0),
+            SettingError,
+            "delay: must be a number above 0",
+        ),
         (lambda: DelayedModel("gp", 1), SettingError, "model: must be a DynamicsModel"),
-        (lambda: DelayedModel(gp(), 2).augmented(Gaussian.certain(torch.zeros(2)), [[0.0]]), ShapeError, r"\(2, 1\)"),
-        (lambda: DisturbedModel(gp(), torch.eye(3, dtype=F), [1.0] * 3), ShapeError, r"effect must be \(2, q\)"),
-        (lambda: DisturbedModel(gp(), torch.eye(2, dtype=F), [1.0]), SettingError, "std: must be a list of 2"),
-        (lambda: DisturbedModel(gp(), torch.eye(2, dtype=F), [1.0] * 2, [1.0, 1.1]), SettingError, "decay: must lie"),
-        (lambda: DisturbedModel(gp(), torch.eye(2, dtype=F), [1, 1]).augmented(Gaussian.certain(torch.zeros(2)), [1.0]),
-         SettingError, "std: must be a list of 2"),
+        (
+            lambda: DelayedModel(gp(), 2).augmented(
+                Gaussian.certain(torch.zeros(2)), [[0.0]]
+            ),
+            ShapeError,
+            r"\(2, 1\)",
+        ),
+        (
+            lambda: DisturbedModel(gp(), torch.eye(3, dtype=F), [1.0] * 3),
+            ShapeError,
+            r"effect must be \(2, q\)",
+        ),
+        (
+            lambda: DisturbedModel(gp(), torch.eye(2, dtype=F), [1.0]),
+            SettingError,
+            "std: must be a list of 2",
+        ),
+        (
+            lambda: DisturbedModel(gp(), torch.eye(2, dtype=F), [1.0] * 2, [1.0, 1.1]),
+            SettingError,
+            "decay: must lie",
+        ),
+        (
+            lambda: DisturbedModel(gp(), torch.eye(2, dtype=F), [1, 1]).augmented(
+                Gaussian.certain(torch.zeros(2)), [1.0]
+            ),
+            SettingError,
+            "std: must be a list of 2",
+        ),
     ],
-)  # fmt: skip
+)
 def test_misuse_is_refused(make, error, rule):
     with pytest.raises(error, match=rule):
         make()

@@ -125,7 +125,8 @@ def test_code_of_a_trusted_package_is_loaded(saved):
     path = saved(with_code())
     with pytest.raises(
         DataError,
-        match=r"nominal is the code 'tests.models.hostile:pull'.*trusted=\['tests'\].*model.trusted=\[tests\]",
+        match=r"nominal is the code "
+        r"'tests.models.hostile:pull'.*trusted=\['tests'\].*model.trusted=\[tests\]",
     ):
         load_model(path)
     x = torch.ones(1, 2, dtype=torch.float64)
@@ -143,7 +144,8 @@ def test_code_of_a_trusted_package_is_loaded(saved):
 
 @pytest.mark.parametrize(
     "path",
-    ["tests.models.hostile:subprocess.call", "tests.models.hostile:np.save", "tests:nothing",
+    ["tests.models.hostile:subprocess.call", "tests.models.hostile:np.save",
+     "tests:nothing",
      "tests.models.hostile:json.dumps", "tests.models.hostile:load_model"],
 )  # fmt: skip
 def test_what_a_trusted_package_imports_is_not_its_code(path, saved):
@@ -195,7 +197,8 @@ def one_cell(name, row, column, value):
         (change(input_dim=10**9), "more than 2048"),
         (change(input_dim=-1), "input_dim"),
         (change(input_dim="1"), "input_dim is neither numbers nor"),
-        (change(nominal=None), "nominal is neither numbers nor a part of a model: None"),
+        (change(nominal=None),
+         "nominal is neither numbers nor a part of a model: None"),
         (change(nominal=[1.0]), "nominal: must be a function"),
         (change(B=2.0), "B must be a list"),
         (change(angles=""), "angles is neither"),
@@ -264,7 +267,8 @@ def test_a_nominal_model_of_nothing_is_refused_where_it_is_made():
 @pytest.mark.parametrize(
     "metadata",
     [["x"], {"states": "ab"}, {"states": [1, 2]}, {"states": {"a": 1}}, {"inputs": 3},
-     {"time_step": "0.1"}, {"time_step": float("nan")}, {"time_step": 0}, {"time_step": [1]}],
+     {"time_step": "0.1"}, {"time_step": float("nan")}, {"time_step": 0},
+     {"time_step": [1]}],
     ids=str,
 )  # fmt: skip
 def test_metadata_that_describe_no_model_cannot_fly(metadata, saved):
@@ -310,9 +314,12 @@ def test_a_log_model_that_does_not_fit_together_is_refused(tmp_path):
     good = parts_of(path)
     load_learned(path)
     for changed in (
-        {"lag": 2**63}, {"lag": 0.5}, {"history": [1]}, {"time_step": -1}, {"time_step": 1e308},
-        {"nominal": ["MultirotorNominal", {"motors": 10**9}]}, {"nominal": None}, {"gps": [[[9], {}]]},
-        {"names": [["a"], [], [], []]}, {"groups": []}, {"kinematics": "RigidBody", "groups": good[0]["groups"][:2]},
+        {"lag": 2**63}, {"lag": 0.5}, {"history": [1]}, {"time_step": -1},
+        {"time_step": 1e308},
+        {"nominal": ["MultirotorNominal", {"motors": 10**9}]}, {"nominal": None},
+        {"gps": [[[9], {}]]},
+        {"names": [["a"], [], [], []]}, {"groups": []},
+        {"kinematics": "RigidBody", "groups": good[0]["groups"][:2]},
     ):  # fmt: skip
         write(path, good[0] | changed, good[1])
         with pytest.raises(DataError, match=r"^[^\n]*m\.safetensors: [^\n]*$"):

@@ -131,7 +131,8 @@ def test_what_is_slow_is_logged_once(caplog):
         for _ in range(3):
             linearize_by_autograd(Slow(), x, u)
     assert [record.getMessage() for record in caplog.records] == [
-        "Slow has no linearize() of its own: torch autograd linearises it, which takes longer"
+        "Slow has no linearize() of its own: torch autograd linearises it, which "
+        "takes longer"
     ]
 
 
@@ -165,8 +166,11 @@ def test_a_nominal_model_in_casadi_is_the_one_in_torch():
     points = draw(8, 5, N)
     inputs = draw(9, 5, M)
     for _ in range(2):
-        for got, expected in zip(theirs.linearize(points.numpy(), inputs.numpy()), ours.linearize(
-            points.numpy(), inputs.numpy()), strict=True):  # fmt: skip
+        for got, expected in zip(
+            theirs.linearize(points.numpy(), inputs.numpy()),
+            ours.linearize(points.numpy(), inputs.numpy()),
+            strict=True,
+        ):
             assert got.flags.c_contiguous
             np.testing.assert_allclose(got, expected, atol=1e-12)
     predicted = theirs.predict(points.reshape(5, 1, N), inputs.reshape(5, 1, M))

@@ -103,8 +103,13 @@ def test_all_noise_is_in_the_prediction_and_the_mean_stays():
     assert torch.allclose(noise[:, 1, 1], draws[:, 0], rtol=0.02)
     assert not noise[:, 0, 1].any()
     assert not model.noise_covariance.any()
-    assert torch.equal(model.to(dtype=torch.float32).predict(x.float(), u.float()).mean.double().round(decimals=4),
-                       belief.mean.round(decimals=4))  # fmt: skip
+    assert torch.equal(
+        model.to(dtype=torch.float32)
+        .predict(x.float(), u.float())
+        .mean.double()
+        .round(decimals=4),
+        belief.mean.round(decimals=4),
+    )
 
 
 @pytest.mark.parametrize(

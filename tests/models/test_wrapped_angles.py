@@ -111,7 +111,7 @@ def test_differences_leave_out_turns_of_declared_angles_alone():
 
 
 def wrapping_pendulum(x, u):
-    """The pendulum without damping, in torch, whose angle comes out between -pi and pi."""
+    """The pendulum without damping, in torch, with its angle between -pi and pi."""
     rate = x[..., 1] + STEP * (9.81 * x[..., 0].sin() + u[..., 0])
     angle = x[..., 0] + STEP * rate
     return torch.stack([torch.atan2(angle.sin(), angle.cos()), rate], dim=-1)
@@ -242,7 +242,9 @@ def test_degrees_and_next_states_alone_that_wrap_are_named(caplog):
     [
         lambda rng: rng.normal(0, 3, 300),
         lambda rng: np.full(300, 2 * np.pi),
-        lambda rng: rng.choice([0.01, -0.02, 6.0, -6.0], 300, p=[0.48, 0.48, 0.02, 0.02]),
+        lambda rng: rng.choice(
+            [0.01, -0.02, 6.0, -6.0], 300, p=[0.48, 0.48, 0.02, 0.02]
+        ),
         lambda rng: np.where(np.arange(300) % 50, 0.0, 25.0) + rng.normal(0, 0.02, 300),
         lambda rng: 0.05 * rng.standard_cauchy(300),
         lambda rng: np.where(np.arange(300) % 30, 0.1, -2.9),

@@ -1,4 +1,4 @@
-"""Runs that were never flown, in the folders and with the content that real ones have."""
+"""Runs that were never flown, with the folders and the content of real ones."""
 
 import io
 import json
@@ -26,7 +26,7 @@ PLANT = translational()
 
 
 def metrics_of(error, steps=20, failing=0, constraints=()):
-    """The metrics of a flight that is everywhere ``error`` [m] from its reference in x."""
+    """The metrics of a flight that is always ``error`` [m] from its reference in x."""
     problem = SimpleNamespace(
         inputs=Box(np.zeros(3), np.full(3, 10.0)), constraints=constraints
     )
@@ -37,8 +37,10 @@ def metrics_of(error, steps=20, failing=0, constraints=()):
     nothing = np.full((steps, 6), np.nan)
     timing = Timing(1e-3, 1e-4, 2e-3)
     rollout = Rollout(
-        states, np.zeros((steps + 1, 6, 6)), states[:-1], np.ones((steps, 3)), references, nothing,
-        np.full((steps, 6, 6), np.nan), statuses, np.ones(steps, int), (timing,) * steps, 1.0,
+        states, np.zeros((steps + 1, 6, 6)), states[:-1], np.ones((steps, 3)),
+        references, nothing,
+        np.full((steps, 6, 6), np.nan), statuses, np.ones(steps, int),
+        (timing,) * steps, 1.0,
     )  # fmt: skip
     experiment = Experiment(None, None, PLANT, None, lambda plant: None, steps=steps)
     return metrics(

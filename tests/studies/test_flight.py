@@ -73,7 +73,8 @@ def blind(law, **changes):
 
 def experiment(**changes):
     settings = {
-        "data": ExcitedData(EXCITED, EXCITED, samples=25), "trajectory": Elliptical(), "system": PLANT,
+        "data": ExcitedData(EXCITED, EXCITED, samples=25), "trajectory": Elliptical(),
+        "system": PLANT,
         "train": Trainer(restarts=0), "controller": CONVEX, "size": 20, "steps": 4,
     }  # fmt: skip
     return Experiment(**settings | changes)
@@ -158,7 +159,8 @@ def test_the_rotational_subsystem_follows_at_its_own_rate():
         "initial_input": [0] * 3,
     }
     turning = experiment(
-        system=rotational(substeps=5), trajectory=Lorenz(), data=ExcitedData(EXCITED, excited, samples=60),
+        system=rotational(substeps=5), trajectory=Lorenz(),
+        data=ExcitedData(EXCITED, excited, samples=60),
         controller=partial(GPMPC, **settings), size=None, steps=100,
     )  # fmt: skip
     flight = run_trial(turning)
@@ -197,7 +199,8 @@ def test_an_offset_and_a_short_flight_are_no_loss(trajectory):
     heavy = translational(mass=0.888)
     problem = replace(PROBLEM, cost=Tracking([1] * 6, [1] * 3))
     sagging = experiment(
-        trajectory=trajectory, data=None, controller=lambda plant: ON_THE_PLANT(PLANT, problem=problem), plant=heavy,
+        trajectory=trajectory, data=None,
+        controller=lambda plant: ON_THE_PLANT(PLANT, problem=problem), plant=heavy,
         steps=20,
     )  # fmt: skip
     result = metrics(sagging, run_trial(sagging))

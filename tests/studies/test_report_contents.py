@@ -152,9 +152,12 @@ def test_a_plan_that_cannot_be_read_is_skipped(tmp_path):
 
 
 NASTY = [
-    "[/nope]", "[red]x", r"\input{/etc/passwd}", "\\", "<script>alert(1)</script>", "<img src=x onerror=y>", "&amp;",
-    "a|b", "=1+1", "@SUM(A1)", "+cmd|'/C calc'!A0", "-2+3", "`rm`", "[x](javascript:y)", "$x$", r"$\frac", "%",
-    "a_b^c~d#{}", "*b*", "\x1b[31mred", "two\nlines", "tab\there", "\u202eleft", "\ud800", "nul\x00", "x" * 400,
+    "[/nope]", "[red]x", r"\input{/etc/passwd}", "\\", "<script>alert(1)</script>",
+    "<img src=x onerror=y>", "&amp;",
+    "a|b", "=1+1", "@SUM(A1)", "+cmd|'/C calc'!A0", "-2+3", "`rm`", "[x](javascript:y)",
+    "$x$", r"$\frac", "%",
+    "a_b^c~d#{}", "*b*", "\x1b[31mred", "two\nlines", "tab\there", "\u202eleft",
+    "\ud800", "nul\x00", "x" * 400,
     "ünïcödé 漢字", "{unit}", "../../up",
 ]  # fmt: skip
 
@@ -178,7 +181,10 @@ def test_what_a_user_chose_is_text_in_every_document(nasty, tmp_path):
     assert not re.search(r"<script|<img|\]\(java", text)
     assert not re.search(r"<script|<img (?!alt)", written["html"])
     commands = set(re.findall(r"\\[a-zA-Z]+", written["tex"]))
-    ours = "begin end toprule midrule bottomrule footnotesize usepackage textbackslash textasciitilde textasciicircum"
+    ours = (
+        "begin end toprule midrule bottomrule footnotesize usepackage "
+        "textbackslash textasciitilde textasciicircum"
+    )
     assert commands <= {
         f"\\{name}" for name in (*ours.split(), "textless", "textgreater", "textbar")
     }
@@ -310,22 +316,29 @@ def test_a_report_says_of_every_run_what_became_of_it(tmp_path):
         r"## Made\n\n(.*?)(?=## To)", document.markdown(), flags=re.DOTALL
     )
     assert head == (
-        "# tree\n\n4 finished in 2 cells, 1 failed, 2 missing, 1 skipped; of those finished, 1 lost, 1 suspicious."
+        "# tree\n\n4 finished in 2 cells, 1 failed, 2 missing, 1 skipped; of those "
+        "finished, 1 lost, 1 suspicious."
         " All of them: horizon=10.\n\n"
-        "| controller | seeds | RMSE [m] | steps outside bounds [%] | failed solves [%] | decision, median [ms] |\n"
+        "| controller | seeds | RMSE [m] | steps outside bounds [%] | failed solves "
+        "[%] | decision, median [ms] |\n"
         "| --- | --- | --- | --- | --- | --- |\n"
-        "| convex | 3, 1 suspicious, 1 missing | 0.2 [0.15, 0.3] | 0 | 0 [0, 5] | 3.1 |\n"
+        "| convex | 3, 1 suspicious, 1 missing | 0.2 [0.15, 0.3] | 0 | 0 [0, 5] | 3.1 "
+        "|\n"
         "| lqr | 1, 1 lost, 1 failed, 1 missing, 1 skipped | 0.5 | 0 | 0 | 3.1 |\n\n"
-        "Median [first to third quartile] over the seeds. In figures, every run is a dot.\n\n"
+        "Median [first to third quartile] over the seeds. In figures, every run is a "
+        "dot.\n\n"
         "## Comparison\n\n- a line\n\n"
         "## Failed\n\n- controller=lqr,horizon=10,seed=1: no luck\n\n"
         "## Lost\n\n- controller=lqr,horizon=10,seed=0: step 3, reason away\n\n"
-        "## Suspicious\n\n- controller=convex,horizon=10,seed=1: step 7, reason innovations\n\n"
-        f"## Skipped\n\n- {damaged}: is not what a run writes: JSONDecodeError: Expecting property name enclosed in"
+        "## Suspicious\n\n- controller=convex,horizon=10,seed=1: step 7, reason "
+        "innovations\n\n"
+        f"## Skipped\n\n- {damaged}: is not what a run writes: JSONDecodeError: "
+        f"Expecting property name enclosed in"
         " double quotes: line 1 column 2 (char 1)\n\n"
     )
     assert tail == (
-        f"## To fill the gaps\n\n```\ngpmpc run -m horizon=10 controller=convex seed=3 folder={tree}\n"
+        f"## To fill the gaps\n\n```\ngpmpc run -m horizon=10 controller=convex "
+        f"seed=3 folder={tree}\n"
         f"gpmpc run -m horizon=10 controller=lqr seed=1,3 folder={tree}\n```\n\n"
         "## Settings of all runs\n\n```\ndata.size: null\nhorizon: 10\n```\n"
     )
@@ -365,7 +378,8 @@ def test_a_report_says_of_every_run_what_became_of_it(tmp_path):
     ]
     assert (
         short.title
-        == "4 finished in 2 cells, 1 failed, 2 missing, 1 skipped; of those finished, 1 lost, 1 suspicious"
+        == "4 finished in 2 cells, 1 failed, 2 missing, 1 skipped; of those finished, "
+        "1 lost, 1 suspicious"
     )
     assert (
         document.links["controller=lqr,horizon=10,seed=1"]
@@ -497,7 +511,8 @@ def test_figures_of_one_setting_have_one_curve_and_own_names(tmp_path, monkeypat
         [[pytest.approx(0.1)], [pytest.approx(0.2)]],
     )
     assert [*two] == [
-        "rmse-over-a-b.png", "decision-over-a-b.png", "rmse-over-a-b-1.png", "decision-over-a-b-1.png"
+        "rmse-over-a-b.png", "decision-over-a-b.png", "rmse-over-a-b-1.png",
+        "decision-over-a-b-1.png"
     ]  # fmt: skip
 
 
@@ -533,10 +548,15 @@ def test_a_comparison_is_told_with_every_number(tmp_path):
     assert failed.rank_biserial == -1
     assert np.isnan([failed.wilcoxon, failed.t_test]).all()
     assert sentences(report, compared, "a", "b") == [
-        "A: a; B: b; pairs are seeds, what else was varied is averaged within a seed. Times are not compared.",
-        "RMSE [m]: no difference shown. Medians 6 and 4; differences 2 [0.75, 3.5]; Wilcoxon signed-rank p = 0.0781, "
-        "rank-biserial 0.79; mean difference 2 (95 %: -0.0507 to 4.05), paired t-test p = 0.0543, d_z 0.90; n = 7",
-        "steps outside bounds [%]: no difference shown. Medians 0 and 0; differences 0 [0, 0]; n = 7",
-        "failed solves [%]: undecided: every seed gave the same, so all are one; vary what the seed draws (data.size, "
+        "A: a; B: b; pairs are seeds, what else was varied is averaged within a seed. "
+        "Times are not compared.",
+        "RMSE [m]: no difference shown. Medians 6 and 4; differences 2 [0.75, 3.5]; "
+        "Wilcoxon signed-rank p = 0.0781, "
+        "rank-biserial 0.79; mean difference 2 (95 %: -0.0507 to 4.05), paired t-test "
+        "p = 0.0543, d_z 0.90; n = 7",
+        "steps outside bounds [%]: no difference shown. Medians 0 and 0; differences "
+        "0 [0, 0]; n = 7",
+        "failed solves [%]: undecided: every seed gave the same, so all are one; vary "
+        "what the seed draws (data.size, "
         "noise). Medians 0 and 10; differences -10 [-10, -10]; n = 7",
     ]

@@ -20,8 +20,10 @@ from gpmpc.studies._run_folder import (
 
 def test_other_choices_have_another_folder_ignoring_case():
     many = [
-        [], ["a=1"], ["a=1", "b=2"], ["a=1,b=2"], ["a=1,b", "2"], ["a=[1,2]"], ["a=[1, 2]"], ["a=1 2"], ["a=1_2"],
-        ["A=1"], ["a=1/2"], ["a=1:2"], ["x=" + 300 * "y"], ["x=" + 301 * "y"], ["a=ä"], ["a=ö"],
+        [], ["a=1"], ["a=1", "b=2"], ["a=1,b=2"], ["a=1,b", "2"], ["a=[1,2]"],
+        ["a=[1, 2]"], ["a=1 2"], ["a=1_2"],
+        ["A=1"], ["a=1/2"], ["a=1:2"], ["x=" + 300 * "y"], ["x=" + 301 * "y"], ["a=ä"],
+        ["a=ö"],
     ]  # fmt: skip
     names = [folder_name(choices) for choices in many]
     assert len({name.lower() for name in names}) == len(many)
@@ -101,7 +103,8 @@ def test_a_result_of_other_settings_or_none_is_refused(tmp_path):
     assert about["provenance"]["command"] == "gpmpc run"
     with pytest.raises(
         SettingError,
-        match=r"finished run of other settings \(steps: 3 then, 4 now\); choose another",
+        match=r"finished run of other settings \(steps: 3 then, 4 now\); choose "
+        r"another",
     ):
         folder.result({"seed": 7, "steps": 4})
     for text in ("", "[]", "{}", '{"settings": '):

@@ -290,7 +290,8 @@ def test_data_have_the_systems_dimensions_and_the_asked_rows():
                     steering, problem=Problem(Tracking([1] * 5, [1] * 3))
                 )
             },
-            "controller.problem: weighs 5 states and 3 inputs; translational has 6 and 3",
+            "controller.problem: weighs 5 states and 3 inputs; translational has 6 "
+            "and 3",
         ),
         (
             {
@@ -298,7 +299,8 @@ def test_data_have_the_systems_dimensions_and_the_asked_rows():
                     steering, problem=Problem(Tracking([1] * 6, [1] * 2))
                 )
             },
-            "controller.problem: weighs 6 states and 2 inputs; translational has 6 and 3",
+            "controller.problem: weighs 6 states and 2 inputs; translational has 6 "
+            "and 3",
         ),
     ],
 )

@@ -93,7 +93,8 @@ def test_nothing_matters_where_there_is_nothing_to_tell_apart(space, costs):
 def test_numbers_are_drawn_on_a_linear_or_logarithmic_scale():
     ranges = {
         "even": Interval(1.0, 1e4), "log": Interval(1.0, 1e4, logarithmic=True),
-        "whole": Interval(1, 10**4, whole=True), "whole log": Interval(1, 10**4, logarithmic=True, whole=True),
+        "whole": Interval(1, 10**4, whole=True),
+        "whole log": Interval(1, 10**4, logarithmic=True, whole=True),
     }  # fmt: skip
     search = Search(ranges, 0)
     for _ in range(40):
@@ -152,7 +153,8 @@ def test_a_document_holds_the_ten_best_and_the_data_holds_all(monkeypatch):
     nothing = search.document(None, "")
     assert (
         nothing.lead
-        == "12 candidates; cost of the best lost or failed, of the settings as they are —."
+        == "12 candidates; cost of the best lost or failed, of the settings as they "
+        "are —."
     )
     assert [table.title for table in nothing.tables] == ["Best candidates"]
     assert [row[:2] for row in nothing.tables[0].rows] == [
