@@ -21,8 +21,7 @@ GIVEN = """
 import numpy as np
 import torch
 from gpmpc.gp import Trainer, Transitions, save_posterior
-from gpmpc.mpc.gp_mpc import GPMPC
-from gpmpc.mpc.problem import Box, Problem, Tracking
+from gpmpc.mpc import GPMPC, Box, Problem, Tracking
 from gpmpc.propagation import Linearization
 from gpmpc.systems import step, translational
 from gpmpc.trajectories import Elliptical, states_along
