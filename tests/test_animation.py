@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from gpmpc.plotting._animation import _scene
+from gpmpc.plotting._animation import draw_flight
 from gpmpc.plotting._style import PLAN
 from gpmpc.recording import read_run
 from tests.recording.runs import record_run
@@ -36,16 +36,16 @@ def flight(folder, failed=()):
 
 
 def left_views(run):
-    """Limits of the view from above, and the plan that is drawn there, step by step."""
-    figure, draw = _scene(run)
-    above = figure.axes[0]
+    """Yields the limits of the view from above, and the plan drawn there, by step."""
+    picture = draw_flight(run)
+    above = picture.figure.axes[0]
     (plan,) = [line for line in above.lines if line.get_color() == PLAN]
     for k in range(STEPS):
-        draw(k)
+        picture.draw(k)
         yield above.get_xlim(), above.get_ylim(), plan.get_xdata(), plan.get_ydata()
 
 
-def test_every_plan_lies_in_the_left_view_the_last_one_too(tmp_path):
+def test_every_plan_lies_in_the_left_view(tmp_path):
     for (left, right), (low, high), x, y in left_views(flight(tmp_path)):
         assert len(x) == HORIZON + 1
         assert left < x.min() <= x.max() < right

@@ -1,4 +1,4 @@
-"""Animates a flight: the way flown, the plan, and how certain the plan was.
+"""Animates a flight: the path flown, the plan, and how certain the plan was.
 
 Left the whole flight from above (x, y) and its height, right what the controller saw:
 its plan with 2-sigma ellipses of the predicted positions. These are often far smaller
@@ -7,8 +7,9 @@ picture.
 """
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.animation import FFMpegWriter, FuncAnimation, PillowWriter
@@ -23,10 +24,13 @@ from gpmpc.plotting._style import DASHED, FLOWN, PLAN, REFERENCE, TUBE, styled
 if TYPE_CHECKING:
     from gpmpc.recording import Run
 
-_FRAMES = 150  # at most; steps are left out evenly
-_RATE = 15  # frames a second
-_FACTORS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
-# Half axis of an ellipse, as a share of the view, from which on it is large enough.
+Array = np.ndarray
+
+_MOST_FRAMES = 150  # of longer flights, steps are left out evenly
+_FRAME_RATE = 15  # frames per second
+_DPI = 80
+_MAGNIFICATIONS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
+# Half axis of an ellipse that is large enough, in widths of the view.
 _VISIBLE = 0.06
 
 
@@ -36,12 +40,16 @@ def animate(run: "Run", path: str | Path) -> None:
     Args:
         run: A recording whose ``pose`` has x, y and z.
         path: The file, .gif or .mp4 (which needs ffmpeg).
+
+    Raises:
+        UnsupportedModel: The recording has no step, or no position in space.
     """
     if not {"x", "y", "z"} <= run.pose.keys() or not len(run.times):
         raise UnsupportedModel(
             f"{run.path}: an animation needs steps with positions x, y and z"
         )
-    save_animation(*_scene(run), len(run.times), path)
+    picture = draw_flight(run)
+    save_animation(picture.figure, picture.draw, len(run.times), path)
 
 
 def save_animation(
@@ -49,148 +57,265 @@ def save_animation(
     draw: Callable[[int], None],
     steps: int,
     path: str | Path,
-    frames: int = _FRAMES,
+    most_frames: int = _MOST_FRAMES,
 ) -> None:
-    """Writes a figure that is drawn anew for evenly chosen steps, as ``animate``."""
-    shown = np.unique(np.linspace(0, steps - 1, min(frames, steps)).astype(int))
-    writer = (
-        FFMpegWriter(fps=_RATE)
-        if Path(path).suffix == ".mp4"
-        else PillowWriter(fps=_RATE)
+    """Writes an animation of a figure that ``draw`` draws anew for a step.
+
+    Args:
+        figure: What is drawn.
+        draw: Draws the step whose number it is given.
+        steps: Number of steps; of more than ``most_frames``, evenly chosen ones.
+        path: The file, .gif or .mp4.
+        most_frames: Largest number of frames.
+    """
+    frame_count = min(most_frames, steps)
+    frames = np.unique(np.linspace(0, steps - 1, frame_count).astype(int))
+    writer_class = FFMpegWriter if Path(path).suffix == ".mp4" else PillowWriter
+    animation = FuncAnimation(
+        figure, draw, frames=frames, blit=False, cache_frame_data=False
     )
-    FuncAnimation(figure, draw, frames=shown, blit=False, cache_frame_data=False).save(
-        str(path), writer, dpi=80
-    )
+    animation.save(str(path), writer_class(fps=_FRAME_RATE), dpi=_DPI)
 
 
 @styled
-def _scene(run: "Run") -> tuple[Figure, Callable[[int], None]]:
-    """The figure, and the function of a step's number that draws it."""
-    plane = [run.pose["x"], run.pose["y"]]
-    up = run.pose["z"]
-    sign, axis_name = (
-        (-1, "-z") if run.metadata.get("frames", {}).get("z axis") != "up" else (1, "z")
-    )
-    states = run.states[:, plane]
-    references = run.references[:, plane]
-    plans = run.plan_means[:, :, plane]
-    covariances = run.plan_covariances[:, :, plane][..., plane]
-    whole: Any = np.isfinite(plans).all(axis=2)  # a shorter plan ends in NaN
+def draw_flight(run: "Run") -> "FlightPicture":
+    """Draws the first step of a flight, laid out for all of them."""
+    picture = FlightPicture(_read_flight(run))
+    picture.draw(0)
+    picture.figure.draw_without_rendering()
+    # Once is enough: nothing that needs room changes.
+    picture.figure.set_layout_engine("none")
+    return picture
 
-    figure = Figure(figsize=(10, 5.4), layout="constrained")
-    FigureCanvasAgg(figure)
-    grid = figure.add_gridspec(2, 2, width_ratios=[1, 1.15], height_ratios=[2.4, 1])
-    above, height, near = (
-        figure.add_subplot(grid[place]) for place in ((0, 0), (1, 0), (slice(None), 1))
+
+@dataclass(frozen=True)
+class _Flight:
+    """A recorded flight of K steps, seen from above and by its height."""
+
+    times: Array  # (K,) [s]
+    positions: Array  # (K, 2) x and y [m]
+    heights: Array  # (K,) upwards [m]
+    reference_positions: Array  # (K, 2)
+    reference_heights: Array  # (K,)
+    plans: Array  # (K, H + 1, 2) planned positions; NaN behind a shorter plan's end
+    plan_covariances: Array  # (K, H + 1, 2, 2)
+    plan_stds: Array  # (K, H + 1, 2)
+    is_planned: Array  # (K, H + 1) whether the plan has that stage
+    failed: Array  # (K,) whether the solve failed
+    distances: Array  # (K,) from the reference [cm]
+    height_name: str
+
+
+def _read_flight(run: "Run") -> _Flight:
+    """Takes what is drawn out of a recording."""
+    plane = [run.pose["x"], run.pose["y"]]
+    z = run.pose["z"]
+    z_is_up = run.metadata.get("frames", {}).get("z axis") == "up"
+    upwards = 1 if z_is_up else -1
+    plans = run.plan_means[:, :, plane]
+    errors = (run.states - run.references)[:, [*plane, z]]
+    return _Flight(
+        times=run.times,
+        positions=run.states[:, plane],
+        heights=upwards * run.states[:, z],
+        reference_positions=run.references[:, plane],
+        reference_heights=upwards * run.references[:, z],
+        plans=plans,
+        plan_covariances=run.plan_covariances[:, :, plane][..., plane],
+        plan_stds=run.plan_stds[:, :, plane],
+        is_planned=np.isfinite(plans[..., 0]) & np.isfinite(plans[..., 1]),
+        failed=run.failed,
+        distances=100 * np.linalg.norm(errors, axis=1),
+        height_name="z" if z_is_up else "-z",
     )
-    dashed: dict[str, Any] = {"color": REFERENCE, "linewidth": 1, "linestyle": DASHED}
-    for axis in (above, near):
-        axis.plot(*references.T, **dashed)
+
+
+class FlightPicture:
+    """A figure of a flight, drawn anew for each step."""
+
+    def __init__(self, flight: _Flight):
+        self.figure = Figure(figsize=(10, 5.4), layout="constrained")
+        FigureCanvasAgg(self.figure)
+        grid = self.figure.add_gridspec(
+            2, 2, width_ratios=[1, 1.15], height_ratios=[2.4, 1]
+        )
+        self._flight = flight
+        self._overview = _MapPanel(self.figure.add_subplot(grid[0, 0]), flight)
+        self._height = _HeightPanel(self.figure.add_subplot(grid[1, 0]), flight)
+        self._close_up = _MapPanel(self.figure.add_subplot(grid[:, 1]), flight)
+        self._close_up.plan.set(marker="o", markersize=3)
+        self._half_width = _half_width_of_plans(flight)
+        self._tube = _Tube(
+            self._close_up.axis, _magnification(flight, self._half_width)
+        )
+        _look_at_flight(self._overview.axis, flight)
+        (self._target,) = self._close_up.axis.plot(
+            [], [], "x", color=REFERENCE, markersize=8, zorder=4
+        )
+        self.figure.legend(
+            [self._height.flown, self._height.reference, self._close_up.plan],
+            ["flown", "reference", "plan"],
+            loc="outside lower center",
+            ncols=3,
+            frameon=False,
+        )
+        self._title = self.figure.suptitle(" ", fontsize="medium")
+
+    def draw(self, k: int) -> None:
+        """Draws step k."""
+        flight = self._flight
+        self._overview.draw(k)
+        self._height.draw(k)
+        self._close_up.draw(k)
+        self._target.set_data(*flight.reference_positions[k, :, None])
+        self._follow_plan(k)
+        stages = flight.is_planned[k]
+        self._tube.draw(flight.plans[k][stages], flight.plan_covariances[k][stages])
+        remark = "; solve failed" if flight.failed[k] else ""
+        self._title.set_text(
+            f"{flight.times[k]:.4g} s: "
+            f"{flight.distances[k]:.1f} cm from the reference{remark}"
+        )
+
+    def _follow_plan(self, k: int) -> None:
+        """Moves the close-up to the middle of a complete plan, else to the vehicle."""
+        plan = self._flight.plans[k]
+        if self._flight.is_planned[k].all():
+            centre = (plan.min(axis=0) + plan.max(axis=0)) / 2
+        else:
+            centre = self._flight.positions[k]
+        _look_at(self._close_up.axis, centre, self._half_width)
+
+
+class _MapPanel:
+    """A view from above: reference, flown path, plan, and the vehicle."""
+
+    def __init__(self, axis: Axes, flight: _Flight):
+        self.axis = axis
+        self._flight = flight
+        axis.plot(
+            *flight.reference_positions.T,
+            color=REFERENCE,
+            linewidth=1,
+            linestyle=DASHED,
+        )
         axis.set(xlabel="x [m]", ylabel="y [m]")
         axis.set_aspect("equal", adjustable="box")
-    (dashes,) = height.plot(run.times, sign * run.references[:, up], **dashed)
-    height.set(xlabel="time [s]", ylabel=f"height, {axis_name} [m]")
-    # The last plans lead on from where the flight ends; those of failed solves may be
-    # anywhere.
-    drawn = np.concatenate([states, references, plans[whole & ~run.failed[:, None]]])
-    low = drawn.min(axis=0)
-    high = drawn.max(axis=0)
-    _look_at(above, (low + high) / 2, 0.56 * max((high - low).max(), 1.0))
+        (self.flown,) = axis.plot([], [], color=FLOWN, linewidth=1.6)
+        (self.plan,) = axis.plot([], [], color=PLAN, linewidth=1.4)
+        (self.vehicle,) = axis.plot([], [], "o", color=FLOWN, markersize=7, zorder=5)
 
-    complete = plans[
-        whole.all(axis=1)
-    ]  # half the width of the view that almost every plan fits into [m]
-    half = (
-        max(0.62 * float(np.quantile(np.ptp(complete, axis=1).max(axis=1), 0.98)), 0.5)
-        if len(complete)
-        else 1.0
-    )
-    stds = run.plan_stds[:, :, plane][whole]
-    largest = 2 * float(np.median(stds.max(axis=1))) if len(stds) else 0.0
-    fitting = (factor for factor in _FACTORS if factor * largest >= _VISIBLE * 2 * half)
-    factor = next(fitting, _FACTORS[-1]) if largest > 0 else 1
-    enlarged = f", the tube {factor} times enlarged" if factor > 1 else ""
-    near.set_title(f"plan with its 2-sigma tube{enlarged}", fontsize="medium")
-    trails = [
-        axis.plot([], [], color=FLOWN, linewidth=1.6)[0] for axis in (above, near)
-    ]
-    ahead = [axis.plot([], [], color=PLAN, linewidth=1.4)[0] for axis in (above, near)]
-    ahead[1].set(marker="o", markersize=3)
-    dots = [
-        axis.plot([], [], "o", color=FLOWN, markersize=7, zorder=5)[0]
-        for axis in (above, near)
-    ]
-    (target,) = near.plot([], [], "x", color=REFERENCE, markersize=8, zorder=4)
-    (climbed,) = height.plot([], [], color=FLOWN, linewidth=1.6)
-    shown = [climbed, dashes, ahead[1]]
-    figure.legend(
-        shown,
-        ["flown", "reference", "plan"],
-        loc="outside lower center",
-        ncols=3,
-        frameon=False,
-    )
-    clock = figure.suptitle(" ", fontsize="medium")
-    tubes: list = []
+    def draw(self, k: int) -> None:
+        """Draws step k."""
+        self.flown.set_data(*self._flight.positions[: k + 1].T)
+        self.plan.set_data(*self._flight.plans[k].T)
+        self.vehicle.set_data(*self._flight.positions[k : k + 1].T)
 
-    def draw(k: int) -> None:
-        for lines, points in (
-            (trails, states[: k + 1]),
-            (ahead, plans[k]),
-            (dots, states[k : k + 1]),
-        ):
-            for line in lines:
-                line.set_data(*points.T)
-        target.set_data(*references[k, :, None])
-        climbed.set_data(run.times[: k + 1], sign * run.states[: k + 1, up])
-        stages = plans[k][whole[k]]
-        spread = covariances[k][whole[k]]
-        _look_at(
-            near,
-            (stages.min(axis=0) + stages.max(axis=0)) / 2
-            if whole[k].all()
-            else states[k],
-            half,
+
+class _HeightPanel:
+    """The flown height over the time, against its reference."""
+
+    def __init__(self, axis: Axes, flight: _Flight):
+        self._flight = flight
+        (self.reference,) = axis.plot(
+            flight.times,
+            flight.reference_heights,
+            color=REFERENCE,
+            linewidth=1,
+            linestyle=DASHED,
         )
-        while tubes:
-            tubes.pop().remove()
-        if spread.any():
-            squared, directions = np.linalg.eigh(spread)
-            minor, major = (
-                4 * factor * np.sqrt(squared.clip(0)).T
-            )  # whole axes of the 2-sigma ellipses
-            angles = np.degrees(np.arctan2(directions[:, 1, 1], directions[:, 0, 1]))
-            look: Any = {
-                "facecolors": TUBE,
-                "edgecolors": FLOWN,
-                "alpha": 0.45,
-                "linewidths": 0.6,
-                "zorder": 1,
-            }
-            where: Any = {
-                "units": "xy",
-                "offsets": stages,
-                "transOffset": near.transData,
-            }
-            tubes.append(
-                near.add_collection(
-                    EllipseCollection(major, minor, angles, **where, **look)
-                )
-            )
-        distance = 100 * np.linalg.norm((run.states - run.references)[k, [*plane, up]])
-        failed = "; solve failed" if run.failed[k] else ""
-        clock.set_text(
-            f"{run.times[k]:.4g} s: {distance:.1f} cm from the reference{failed}"
+        axis.set(xlabel="time [s]", ylabel=f"height, {flight.height_name} [m]")
+        (self.flown,) = axis.plot([], [], color=FLOWN, linewidth=1.6)
+
+    def draw(self, k: int) -> None:
+        """Draws the flight up to step k."""
+        self.flown.set_data(self._flight.times[: k + 1], self._flight.heights[: k + 1])
+
+
+class _Tube:
+    """The 2-sigma ellipses of a plan's positions, magnified where they are small."""
+
+    def __init__(self, axis: Axes, magnification: int):
+        self._axis = axis
+        self._magnification = magnification
+        self._ellipses: EllipseCollection | None = None
+        enlarged = ""
+        if magnification > 1:
+            enlarged = f", the tube {magnification} times enlarged"
+        axis.set_title(f"plan with its 2-sigma tube{enlarged}", fontsize="medium")
+
+    def draw(self, means: Array, covariances: Array) -> None:
+        """Draws ellipses of means (H, 2) and covariances (H, 2, 2) for the last ones.
+
+        Nothing is drawn of a plan that is certain.
+        """
+        if self._ellipses is not None:
+            self._ellipses.remove()
+            self._ellipses = None
+        if not covariances.any():
+            return
+        variances, directions = np.linalg.eigh(covariances)
+        half_axes = 2 * np.sqrt(variances.clip(0))
+        minor, major = 2 * self._magnification * half_axes.T
+        major_direction = directions[:, :, 1]
+        self._ellipses = EllipseCollection(
+            widths=major,
+            heights=minor,
+            angles=np.degrees(np.arctan2(major_direction[:, 1], major_direction[:, 0])),
+            units="xy",
+            offsets=means,
+            offset_transform=self._axis.transData,
+            facecolors=TUBE,
+            edgecolors=FLOWN,
+            alpha=0.45,
+            linewidths=0.6,
+            zorder=1,
         )
-
-    draw(0)
-    figure.draw_without_rendering()
-    figure.set_layout_engine("none")  # once is enough: nothing that needs room changes
-    return figure, draw
+        self._axis.add_collection(self._ellipses)
 
 
-def _look_at(axis: Axes, centre: np.ndarray, half: float) -> None:
+def _look_at_flight(axis: Axes, flight: _Flight) -> None:
+    """Sets the limits of a view so that the whole flight lies in it, plans included.
+
+    The last plans lead on from where the flight ends; those of failed solves may be
+    anywhere.
+    """
+    trusted_stages = flight.is_planned & ~flight.failed[:, None]
+    points = np.concatenate(
+        [flight.positions, flight.reference_positions, flight.plans[trusted_stages]]
+    )
+    low = points.min(axis=0)
+    high = points.max(axis=0)
+    _look_at(axis, (low + high) / 2, 0.56 * max((high - low).max(), 1.0))
+
+
+def _look_at(axis: Axes, centre: Array, half_width: float) -> None:
+    """Sets the limits of a square view [m]."""
+    x, y = centre
     axis.set(
-        xlim=(centre[0] - half, centre[0] + half),
-        ylim=(centre[1] - half, centre[1] + half),
+        xlim=(x - half_width, x + half_width),
+        ylim=(y - half_width, y + half_width),
     )
+
+
+def _half_width_of_plans(flight: _Flight) -> float:
+    """Returns half the width of a view that almost every plan fits into [m]."""
+    complete_plans = flight.plans[flight.is_planned.all(axis=1)]
+    if not len(complete_plans):
+        return 1.0
+    lengths = np.ptp(complete_plans, axis=1).max(axis=1)
+    return max(0.62 * float(np.quantile(lengths, 0.98)), 0.5)
+
+
+def _magnification(flight: _Flight, half_width: float) -> int:
+    """Returns the least factor by which a typical ellipse can be seen in a view."""
+    stds = flight.plan_stds[flight.is_planned]
+    if not len(stds):
+        return 1
+    half_axis = 2 * float(np.median(stds.max(axis=1)))
+    if not half_axis > 0:  # so that NaN ends here too
+        return 1
+    for factor in _MAGNIFICATIONS:
+        if factor * half_axis >= _VISIBLE * 2 * half_width:
+            return factor
+    return _MAGNIFICATIONS[-1]

@@ -1,10 +1,13 @@
 """Films a recorded flight of a MuJoCo model, rendered without a screen."""
 
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib import import_module
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from types import ModuleType
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -20,9 +23,22 @@ if TYPE_CHECKING:
     from gpmpc.systems import System
 
 Array = np.ndarray
-# of MuJoCo's off-screen buffer
+
+# Size of MuJoCo's off-screen buffer, in pixels.
 _WIDTH = 640
 _HEIGHT = 480
+_MOST_SHAPES = 2000  # of a scene
+_MOST_REFERENCES = 300  # drawn, at least; of more, some are left out evenly
+_TRAIL = 200  # steps of the flown path that are drawn
+_LEGEND = (("reference", REFERENCE), ("flown", FLOWN), ("plan and its tube", PLAN))
+
+
+class _JointDynamics(Protocol):
+    """Dynamics whose states say where the joints of a MuJoCo model are."""
+
+    model: Any
+
+    def positions(self, state: Array, /) -> Array: ...
 
 
 def film(
@@ -38,11 +54,11 @@ def film(
 
     Args:
         run: A recording.
-        system: What flew: its ``dynamics`` have a MuJoCo ``model``, and ``positions``
-            from a state (n,) to those of the model's joints (nq,), as a system of
-            joints has.
+        system: The system that flew: its ``dynamics`` have a MuJoCo ``model``, and
+            ``positions`` from a state (n,) to those of the model's joints (nq,), as a
+            system of joints has.
         path: The file, .gif or .mp4 (which needs ffmpeg).
-        frames: At most so many; steps are left out evenly.
+        frames: Largest number of frames; steps are left out evenly.
         enlarged: Factor of the tube's 2-sigma ellipsoids.
 
     Raises:
@@ -50,19 +66,32 @@ def film(
         UnsupportedModel: The system is none of MuJoCo whose state says where its joints
             are, or no step was recorded.
     """
-    if not len(run.times) or not (
-        hasattr(system.dynamics, "model") and hasattr(system.dynamics, "positions")
-    ):
+    dynamics = system.dynamics
+    shows_joints = hasattr(dynamics, "model") and hasattr(dynamics, "positions")
+    if not len(run.times) or not shows_joints:
         raise UnsupportedModel(
             f"{run.path}: a film needs steps of a MuJoCo model, "
             "and its joints' positions"
         )
+    with _off_screen() as mujoco:
+        scene = _Scene(mujoco, run, dynamics, enlarged)
+        picture = _FilmPicture(scene, run.times)
+        save_animation(picture.figure, picture.draw, len(run.times), path, frames)
+        scene.free()
+
+
+@contextmanager
+def _off_screen() -> Iterator[ModuleType]:
+    """Lends MuJoCo's module while it can render without a screen.
+
+    Raises:
+        SettingError: It cannot here.
+    """
     try:
         mujoco = import_module("mujoco")
-        chosen = "MUJOCO_GL" in os.environ or "DISPLAY" in os.environ
-        context = import_module(
-            "mujoco.gl_context" if chosen else "mujoco.egl"
-        ).GLContext(_WIDTH, _HEIGHT)
+        is_chosen = "MUJOCO_GL" in os.environ or "DISPLAY" in os.environ
+        library = import_module("mujoco.gl_context" if is_chosen else "mujoco.egl")
+        context = library.GLContext(_WIDTH, _HEIGHT)
         context.make_current()
     except Exception as error:  # of ctypes, of PyOpenGL, of a driver
         raise SettingError(
@@ -71,119 +100,187 @@ def film(
             f"flights without it ({error})",
         ) from error
     try:
-        scene = _Scene(mujoco, run, system.dynamics, enlarged)
-        figure = Figure(figsize=(_WIDTH / 80, _HEIGHT / 80))
-        figure.set_layout_engine("none")  # the picture fills it
-        FigureCanvasAgg(figure)
-        image = figure.add_axes((0, 0, 1, 1)).imshow(scene.render(0), aspect="auto")
-        image.axes.set_axis_off()
-        clock = figure.text(0.02, 0.95, "")
-        legend = (
-            (("reference", REFERENCE), ("flown", FLOWN), ("plan and its tube", PLAN))
-            if scene.axes
-            else ()
-        )
-        for i, (name, color) in enumerate(legend):
-            figure.text(0.02, 0.02 + 0.04 * i, name, color=color, weight="bold")
-
-        def draw(k: int) -> None:
-            image.set_data(scene.render(k))
-            clock.set_text(f"{run.times[k]:.2f} s")
-
-        save_animation(figure, draw, len(run.times), path, frames)
-        scene.rendering.free()
+        yield mujoco
     finally:
         context.free()
 
 
-class _Scene:
-    """The scene of a flight, rendered step by step."""
+class _FilmPicture:
+    """A figure that is filled by the rendered scene, with the time and a legend."""
 
-    def __init__(self, mujoco: Any, run: "Run", dynamics: Any, enlarged: float):
-        self.mujoco = mujoco
-        self.run = run
-        self.positions = dynamics.positions
-        self.enlarged = enlarged
-        self.model = dynamics.model
-        self.data = mujoco.MjData(self.model)
-        self.scene = mujoco.MjvScene(self.model, 2000)
-        self.rendering = mujoco.MjrContext(
-            self.model, mujoco.mjtFontScale.mjFONTSCALE_100
+    def __init__(self, scene: "_Scene", times: Array):
+        self._scene = scene
+        self._times = times
+        self.figure = Figure(figsize=(_WIDTH / 80, _HEIGHT / 80))
+        self.figure.set_layout_engine("none")  # the picture fills it
+        FigureCanvasAgg(self.figure)
+        axis = self.figure.add_axes((0, 0, 1, 1))
+        self._image = axis.imshow(scene.render(0), aspect="auto")
+        axis.set_axis_off()
+        self._clock = self.figure.text(0.02, 0.95, "")
+        if scene.axes:
+            self._add_legend()
+
+    def _add_legend(self) -> None:
+        for i, (name, colour) in enumerate(_LEGEND):
+            height = 0.02 + 0.04 * i
+            self.figure.text(0.02, height, name, color=colour, weight="bold")
+
+    def draw(self, k: int) -> None:
+        """Draws step k."""
+        self._image.set_data(self._scene.render(k))
+        self._clock.set_text(f"{self._times[k]:.2f} s")
+
+
+class _Scene:
+    """The scene of a flight, rendered step by step.
+
+    Args:
+        mujoco: The module, with a current context of rendering.
+        run: The flight.
+        dynamics: The model that flew.
+        magnification: Factor of the tube's 2-sigma ellipsoids.
+    """
+
+    def __init__(
+        self,
+        mujoco: ModuleType,
+        run: "Run",
+        dynamics: _JointDynamics,
+        magnification: float,
+    ):
+        self._mujoco = mujoco
+        self._run = run
+        self._dynamics = dynamics
+        self._magnification = magnification
+        self._data = mujoco.MjData(dynamics.model)
+        self._scene = mujoco.MjvScene(dynamics.model, _MOST_SHAPES)
+        self._rendering = mujoco.MjrContext(
+            dynamics.model, mujoco.mjtFontScale.mjFONTSCALE_100
         )
-        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self.rendering)
-        self.axes = (
-            [run.pose[axis] for axis in "xyz"]
-            if {"x", "y", "z"} <= run.pose.keys()
-            else []
-        )
-        self.thinned = run.references[:: max(1, len(run.times) // 300)][:, self.axes]
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._rendering)
+        # Indices of the states that are the position in space; empty where there are
+        # none.
+        self.axes: list[int] = []
+        if {"x", "y", "z"} <= run.pose.keys():
+            self.axes = [run.pose[axis] for axis in "xyz"]
+        stride = max(1, len(run.times) // _MOST_REFERENCES)
+        self._reference_path = run.references[::stride][:, self.axes]
+
+    def free(self) -> None:
+        """Frees what MuJoCo has of the scene on the graphics card."""
+        self._rendering.free()
 
     def render(self, k: int) -> Array:
         """Returns the picture (height, width, 3) of step k.
 
         A camera follows a vehicle that has a position.
         """
-        mujoco = self.mujoco
-        run = self.run
-        self.data.qpos[:] = self.positions(run.states[k])
-        mujoco.mj_forward(self.model, self.data)
-        camera = mujoco.MjvCamera()
-        option = mujoco.MjvOption()
-        mujoco.mjv_defaultFreeCamera(self.model, camera)
+        mujoco = self._mujoco
+        model = self._dynamics.model
+        self._data.qpos[:] = self._dynamics.positions(self._run.states[k])
+        mujoco.mj_forward(model, self._data)
+        mujoco.mjv_updateScene(
+            model,
+            self._data,
+            mujoco.MjvOption(),
+            None,
+            self._camera(k),
+            mujoco.mjtCatBit.mjCAT_ALL,
+            self._scene,
+        )
         if self.axes:
-            camera.lookat[:] = run.states[k, self.axes]
+            self._add_paths(k)
+            self._add_tube(k)
+        return self._pixels()
+
+    def _camera(self, k: int) -> Any:
+        """Returns a camera at the vehicle; MuJoCo's own without a position."""
+        camera = self._mujoco.MjvCamera()
+        self._mujoco.mjv_defaultFreeCamera(self._dynamics.model, camera)
+        if self.axes:
+            camera.lookat[:] = self._run.states[k, self.axes]
             camera.distance = 2.2
             camera.elevation = -25
             camera.azimuth = 120
-        every = mujoco.mjtCatBit.mjCAT_ALL
-        mujoco.mjv_updateScene(
-            self.model, self.data, option, None, camera, every, self.scene
-        )
-        if self.axes:
-            self._draw_paths(k)
-        view = mujoco.MjrRect(0, 0, _WIDTH, _HEIGHT)
+        return camera
+
+    def _pixels(self) -> Array:
+        """Returns the rendered scene (height, width, 3), the upper row first."""
+        view = self._mujoco.MjrRect(0, 0, _WIDTH, _HEIGHT)
         pixels = np.empty((_HEIGHT, _WIDTH, 3), dtype=np.uint8)
-        mujoco.mjr_render(view, self.scene, self.rendering)
-        mujoco.mjr_readPixels(pixels, None, view, self.rendering)
+        self._mujoco.mjr_render(view, self._scene, self._rendering)
+        self._mujoco.mjr_readPixels(pixels, None, view, self._rendering)
         return pixels[::-1]
 
-    def _draw_paths(self, k: int) -> None:
-        """Adds the reference, the way flown so far, and the plan with its tube."""
-        run = self.run
-        plan = run.plan_means[k][:, self.axes]
-        covariances = run.plan_covariances[k][:, self.axes][..., self.axes]
-        finite = np.isfinite(plan).all(axis=1) & np.isfinite(covariances).all(
-            axis=(1, 2)
-        )
-        capsule = self.mujoco.mjtGeom.mjGEOM_CAPSULE
-        ellipsoid = self.mujoco.mjtGeom.mjGEOM_ELLIPSOID
-        flown = run.states[max(0, k - 200) : k + 1, self.axes]
-        for points, color in (
-            (self.thinned, REFERENCE),
-            (flown, FLOWN),
-            (plan[finite], PLAN),
-        ):
-            for begin, end in pairwise(points):
-                if geom := self._add(
-                    capsule, np.zeros(3), np.zeros(3), np.eye(3), to_rgba(color)
-                ):
-                    self.mujoco.mjv_connector(geom, capsule, 0.008, begin, end)
-        for mean, covariance in zip(plan[finite], covariances[finite], strict=True):
-            squared, turn = np.linalg.eigh(covariance)
-            turn[:, 0] *= np.sign(np.linalg.det(turn))
-            axes = np.maximum(2 * self.enlarged * np.sqrt(np.maximum(squared, 0)), 1e-3)
-            self._add(ellipsoid, axes, mean, turn, to_rgba(PLAN, 0.15))
+    def _plan(self, k: int) -> tuple[Array, Array]:
+        """Returns means (H, 3) and covariances (H, 3, 3) of the planned positions."""
+        means = self._run.plan_means[k][:, self.axes]
+        covariances = self._run.plan_covariances[k][:, self.axes][..., self.axes]
+        has_mean = np.isfinite(means).all(axis=1)
+        has_covariance = np.isfinite(covariances).all(axis=(1, 2))
+        is_finite = has_mean & has_covariance
+        return means[is_finite], covariances[is_finite]
 
-    def _add(
-        self, kind: Any, size: Array, place: Array, turn: Array, color: Any
+    def _add_paths(self, k: int) -> None:
+        """Adds the reference, the path flown so far, and the plan."""
+        flown_path = self._run.states[max(0, k - _TRAIL) : k + 1, self.axes]
+        planned_path, _ = self._plan(k)
+        self._add_path(self._reference_path, REFERENCE)
+        self._add_path(flown_path, FLOWN)
+        self._add_path(planned_path, PLAN)
+
+    def _add_path(self, points: Array, colour: str) -> None:
+        """Adds thin rods from point to point."""
+        capsule = self._mujoco.mjtGeom.mjGEOM_CAPSULE
+        for begin, end in pairwise(points):
+            rod = self._add_shape(
+                capsule,
+                size=np.zeros(3),
+                position=np.zeros(3),
+                rotation=np.eye(3),
+                colour=to_rgba(colour),
+            )
+            if rod is not None:
+                self._mujoco.mjv_connector(rod, capsule, 0.008, begin, end)
+
+    def _add_tube(self, k: int) -> None:
+        """Adds the 2-sigma ellipsoids of the planned positions."""
+        means, covariances = self._plan(k)
+        for mean, covariance in zip(means, covariances, strict=True):
+            variances, rotation = np.linalg.eigh(covariance)
+            rotation[:, 0] *= np.sign(np.linalg.det(rotation))
+            stds = np.sqrt(np.maximum(variances, 0))
+            half_axes = np.maximum(2 * self._magnification * stds, 1e-3)
+            self._add_shape(
+                self._mujoco.mjtGeom.mjGEOM_ELLIPSOID,
+                size=half_axes,
+                position=mean,
+                rotation=rotation,
+                colour=to_rgba(PLAN, 0.15),
+            )
+
+    def _add_shape(
+        self,
+        kind: Any,
+        *,
+        size: Array,
+        position: Array,
+        rotation: Array,
+        colour: tuple[float, float, float, float],
     ) -> Any:
-        """Adds a shape; None where the scene is full."""
-        if self.scene.ngeom == self.scene.maxgeom:
+        """Adds a shape and returns it; None where the scene is full."""
+        if self._scene.ngeom == self._scene.maxgeom:
             return None
-        geom = self.scene.geoms[self.scene.ngeom]
-        self.mujoco.mjv_initGeom(
-            geom, kind, size, place, turn.ravel(), np.array(color, dtype=np.float32)
+        shape = self._scene.geoms[self._scene.ngeom]
+        self._mujoco.mjv_initGeom(
+            shape,
+            kind,
+            size,
+            position,
+            rotation.ravel(),
+            np.array(colour, dtype=np.float32),
         )
-        geom.emission = 0.5
-        self.scene.ngeom += 1
-        return geom
+        shape.emission = 0.5
+        self._scene.ngeom += 1
+        return shape

@@ -1,9 +1,10 @@
 """Draws how good the predictions of a model are, and what is in a log."""
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from matplotlib import colormaps
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, PercentFormatter
 
@@ -20,14 +21,25 @@ from gpmpc.plotting._style import (
 )
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
     from gpmpc.calibration import Calibration
     from gpmpc.estimation import FilterRun
     from gpmpc.logs import Inspection, Judgement
 
-_BASELINES = tuple(
-    zip((GREY, *COLOURS[1:5]), "s^vDP", strict=True)
-)  # told apart without colour by their markers
-_PER_PAGE = 24  # channels drawn
+# Colour and marker of each baseline: markers tell them apart without colour.
+_BASELINE_STYLES = tuple(zip((GREY, *COLOURS[1:5]), "s^vDP", strict=True))
+_NORMAL_95 = 1.96  # standard deviations that hold 95 % of a normal variable
+_CHANNELS_PER_PAGE = 24
+_MOST_GAPS = 200  # drawn
+
+
+class _Level(NamedTuple):
+    """A nominal level of coverage."""
+
+    column: int  # in ``Calibration.coverage``
+    value: float
+    colour: np.ndarray
 
 
 @styled
@@ -37,53 +49,79 @@ def calibration_figure(calibration: "Calibration") -> Figure:
     The nominal levels of coverage are dashed.
     """
     n = len(calibration.names)
-    steps = range(1, calibration.horizon + 1)
-    order = sorted(range(len(calibration.levels)), key=calibration.levels.__getitem__)
-    colours = colormaps["Blues"](
-        np.linspace(1.0, 0.5, len(order))[::-1]
-    )  # the wider the interval, the darker
-    line = {"marker": "o" if calibration.horizon <= 30 else None, "markersize": 3}
-    figure, axes = make_figure(1.5 + 2.4 * n, 6.0, 3, n, sharex=True)
-    for i, (above, density, error) in enumerate(axes.T):
-        above.set_title(calibration.names[i], fontsize="medium")
-        for j, colour in zip(order, colours, strict=True):
-            above.axhline(
-                calibration.levels[j], color=colour, linestyle=DASHED, linewidth=1
-            )
-            above.plot(steps, calibration.coverage[:, i, j], color=colour, **line)
-        density.plot(steps, calibration.nlpd[:, i], color=colours[-1], **line)
-        error.plot(steps, calibration.rmse[:, i], color=colours[-1], **line)
-        above.set_ylim(0, 1.04)
-        above.yaxis.set_major_formatter(PercentFormatter(1))
-        above.tick_params(labelleft=i == 0)
+    figure, axes = make_figure(
+        width=1.5 + 2.4 * n, height=6.0, rows=3, columns=n, sharex=True
+    )
+    levels = _levels(calibration)
+    for i, (coverage, density, error) in enumerate(axes.T):
+        coverage.set_title(calibration.names[i], fontsize="medium")
+        _draw_coverage(coverage, calibration, i, levels)
+        coverage.tick_params(labelleft=i == 0)
+        widest = levels[-1]
+        _draw_over_steps(density, calibration, calibration.nlpd[:, i], widest.colour)
+        _draw_over_steps(error, calibration, calibration.rmse[:, i], widest.colour)
         density.yaxis.set_major_locator(MaxNLocator(nbins=5))
-        error.set_ylim(bottom=0)
         error.yaxis.set_major_locator(MaxNLocator(nbins=5))
         error.xaxis.set_major_locator(MaxNLocator(integer=True, nbins=6, min_n_ticks=1))
-    lowest = 0.0
-    for j, colour in zip(
-        order, colours, strict=True
-    ):  # a level is named at its line, or just above the last name
-        height = max(calibration.levels[j], lowest)
-        place: Any = {
-            "xycoords": ("axes fraction", "data"),
-            "va": "center",
-            "fontsize": "small",
-        }
-        axes[0, -1].annotate(
-            f"{100 * calibration.levels[j]:g} %", (1.03, height), color=colour, **place
-        )
-        lowest = height + 0.085
-    for axis, label in zip(
-        axes[:, 0], ("coverage", "negative log density", "RMSE"), strict=True
-    ):
-        axis.set_ylabel(label)
-    label = "steps ahead"
+        error.set_ylim(bottom=0)
+    _name_levels(axes[0, -1], levels)
+    axes[0, 0].set_ylabel("coverage")
+    axes[1, 0].set_ylabel("negative log density")
+    axes[2, 0].set_ylabel("RMSE")
+    x_label = "steps ahead"
     if calibration.noise:
-        label += f"; intervals hold {calibration.noise}"
-    figure.supxlabel(label, fontsize="medium")
+        x_label += f"; intervals hold {calibration.noise}"
+    figure.supxlabel(x_label, fontsize="medium")
     figure.align_ylabels(axes[:, 0])
     return figure
+
+
+def _levels(calibration: "Calibration") -> list[_Level]:
+    """Returns the levels by size; the wider the interval, the darker its colour."""
+    values = calibration.levels
+    order = sorted(range(len(values)), key=values.__getitem__)
+    colours = colormaps["Blues"](np.linspace(1.0, 0.5, len(order))[::-1])
+    return [
+        _Level(column=column, value=values[column], colour=colour)
+        for column, colour in zip(order, colours, strict=True)
+    ]
+
+
+def _draw_coverage(
+    axis: Axes, calibration: "Calibration", state: int, levels: list[_Level]
+) -> None:
+    """Draws how often the intervals of each level held a state."""
+    for level in levels:
+        axis.axhline(level.value, color=level.colour, linestyle=DASHED, linewidth=1)
+        coverage = calibration.coverage[:, state, level.column]
+        _draw_over_steps(axis, calibration, coverage, level.colour)
+    axis.set_ylim(0, 1.04)
+    axis.yaxis.set_major_formatter(PercentFormatter(1))
+
+
+def _draw_over_steps(
+    axis: Axes, calibration: "Calibration", values: "Tensor", colour: np.ndarray
+) -> None:
+    """Draws values (H,) over the steps ahead, with a marker each where they are few."""
+    steps = range(1, calibration.horizon + 1)
+    marker = "o" if calibration.horizon <= 30 else None
+    axis.plot(steps, values, color=colour, marker=marker, markersize=3)
+
+
+def _name_levels(axis: Axes, levels: list[_Level]) -> None:
+    """Names each level beside its line, or just above the last name."""
+    lowest = 0.0
+    for level in levels:
+        height = max(level.value, lowest)
+        axis.annotate(
+            f"{100 * level.value:g} %",
+            (1.03, height),
+            xycoords=("axes fraction", "data"),
+            va="center",
+            fontsize="small",
+            color=level.colour,
+        )
+        lowest = height + 0.085
 
 
 @styled
@@ -94,36 +132,39 @@ def innovations_figure(
 
     The legend says how many are outside of 95 %.
     """
-    deviations = run.innovation_covariances.diagonal(dim1=-2, dim2=-1).sqrt()
-    white = (run.innovations / deviations).cpu().numpy()
-    p = white.shape[1]
-    times = time_step * np.arange(len(white))
+    stds = run.innovation_covariances.diagonal(dim1=-2, dim2=-1).sqrt()
+    normalized = (run.innovations / stds).cpu().numpy()
+    p = normalized.shape[1]
+    times = time_step * np.arange(len(normalized))
+    if names is None:
+        names = [f"y{i + 1}" for i in range(p)]
     figure, axes = make_figure(
-        7.0,
-        1.0 + 1.4 * p,
-        p,
-        1,
-        "innovations over their standard deviation",
+        width=7.0,
+        height=1.0 + 1.4 * p,
+        rows=p,
+        title="innovations over their standard deviation",
         sharex=True,
     )
     for i, axis in enumerate(axes.flat):
-        seen = np.isfinite(white[:, i])
-        outside = (
-            100 * float((np.abs(white[seen, i]) > 1.96).mean())
-            if seen.any()
-            else np.nan
-        )
-        missing = 100 * float((~seen).mean())
-        label = f"{outside:.1f} % outside (5 % expected), {missing:.0f} % missing"
-        axis.plot(
-            times[seen], white[seen, i], ".", color=BLUE, markersize=3, label=label
-        )
-        for limit in (-1.96, 1.96):
-            axis.axhline(limit, color=VERMILION, linewidth=0.8)
-        axis.set_ylabel(names[i] if names is not None else f"y{i + 1}")
-        axis.legend(loc="upper right", fontsize="small")
+        _draw_innovations(axis, times, normalized[:, i])
+        axis.set_ylabel(names[i])
     axes[-1, 0].set_xlabel("time [s]")
     return figure
+
+
+def _draw_innovations(axis: Axes, times: np.ndarray, normalized: np.ndarray) -> None:
+    """Draws one value's innovations (K,), NaN where it was not measured."""
+    is_measured = np.isfinite(normalized)
+    measured = normalized[is_measured]
+    missing = 100 * float((~is_measured).mean())
+    outside = np.nan
+    if len(measured):
+        outside = 100 * float((np.abs(measured) > _NORMAL_95).mean())
+    label = f"{outside:.1f} % outside (5 % expected), {missing:.0f} % missing"
+    axis.plot(times[is_measured], measured, ".", color=BLUE, markersize=3, label=label)
+    for limit in (-_NORMAL_95, _NORMAL_95):
+        axis.axhline(limit, color=VERMILION, linewidth=0.8)
+    axis.legend(loc="upper right", fontsize="small")
 
 
 @styled
@@ -132,68 +173,81 @@ def judgement_figure(judgement: "Judgement") -> Figure:
 
     Below stand coverage and width of the model's intervals.
     """
-    steps = judgement.steps
     n = len(judgement.groups)
     figure, axes = make_figure(
-        2.6 * n, 4.8, 2, n, gridspec_kw={"height_ratios": [3, 1.6]}
+        width=2.6 * n,
+        height=4.8,
+        rows=2,
+        columns=n,
+        gridspec_kw={"height_ratios": [3, 1.6]},
     )
-    for g, (axis, below) in enumerate(axes.T):
-        others = (item for item in judgement.mean.items() if item[0] != "model")
-        for (name, mean), (colour, marker) in zip(others, _BASELINES, strict=False):
-            errors = np.where(np.isfinite(mean[:, g]), mean[:, g], np.nan)
-            axis.loglog(
-                steps,
-                errors,
-                color=colour,
-                marker=marker,
-                markersize=4,
-                linewidth=1,
-                label=name,
-            )
-        axis.loglog(
-            steps,
-            judgement.mean["model"][:, g],
-            color=BLUE,
-            marker="o",
-            linewidth=2,
-            label="model",
-        )
-        axis.set(title=judgement.groups[g], ylabel=f"mean error [{judgement.units[g]}]")
-        share, (low, high) = (
-            judgement.coverage[:, g],
-            judgement.coverage_interval[:, g].T,
-        )
-        bars = np.maximum([share - low, high - share], 0)
-        below.errorbar(steps, share, bars, color=BLUE, marker="o", capsize=3)
-        below.plot(
-            steps, judgement.width[:, g], color=VERMILION, marker="s", linestyle="--"
-        )
-        below.axhline(judgement.level, color="0.6", linewidth=0.8)
-        below.set(xscale="log", ylim=(0.5, 1.5), xlabel="steps ahead")
-        for each in (axis, below):
-            each.set_xticks(steps, [str(step) for step in steps])
-            each.minorticks_off()
+    for group, (above, below) in enumerate(axes.T):
+        _draw_errors(above, judgement, group)
+        _draw_intervals(below, judgement, group)
+        for axis in (above, below):
+            axis.set_xticks(judgement.steps, [str(step) for step in judgement.steps])
+            axis.minorticks_off()
     axes[1, 0].set_ylabel("coverage (solid)\nwidth (dashed)")
     legend_below(figure, axes[0])
     return figure
 
 
+def _draw_errors(axis: Axes, judgement: "Judgement", group: int) -> None:
+    """Draws the mean errors of a group of states, of the baselines and of the model."""
+    baselines = [name for name in judgement.mean if name != "model"]
+    for name, (colour, marker) in zip(baselines, _BASELINE_STYLES, strict=False):
+        errors = judgement.mean[name][:, group]
+        axis.loglog(
+            judgement.steps,
+            np.where(np.isfinite(errors), errors, np.nan),
+            color=colour,
+            marker=marker,
+            markersize=4,
+            linewidth=1,
+            label=name,
+        )
+    axis.loglog(
+        judgement.steps,
+        judgement.mean["model"][:, group],
+        color=BLUE,
+        marker="o",
+        linewidth=2,
+        label="model",
+    )
+    axis.set(
+        title=judgement.groups[group],
+        ylabel=f"mean error [{judgement.units[group]}]",
+    )
+
+
+def _draw_intervals(axis: Axes, judgement: "Judgement", group: int) -> None:
+    """Draws coverage and width of the model's intervals for a group of states."""
+    steps = judgement.steps
+    coverage = judgement.coverage[:, group]
+    low, high = judgement.coverage_interval[:, group].T
+    bars = np.maximum([coverage - low, high - coverage], 0)
+    axis.errorbar(steps, coverage, bars, color=BLUE, marker="o", capsize=3)
+    axis.plot(
+        steps, judgement.width[:, group], color=VERMILION, marker="s", linestyle="--"
+    )
+    axis.axhline(judgement.level, color="0.6", linewidth=0.8)
+    axis.set(xscale="log", ylim=(0.5, 1.5), xlabel="steps ahead")
+
+
 @styled
 def inspection_figure(inspection: "Inspection") -> Figure:
     """Draws each channel over the time, with its gaps, on one page."""
-    channels = [*inspection.lines.items()][:_PER_PAGE]
+    channels = list(inspection.lines.items())[:_CHANNELS_PER_PAGE]
     if not channels:
-        figure, axes = make_figure(10, 2, 1, 1)
-        axes[0, 0].set_axis_off()
-        axes[0, 0].text(0.5, 0.5, "no channel of numbers", ha="center", va="center")
-        figure.suptitle(inspection.title, fontsize=10)
-        return figure
+        return _empty_page(inspection.title)
     columns = 2 if len(channels) > 6 else 1
     rows = -(-len(channels) // columns)
-    figure, axes = make_figure(10, 1.1 * rows + 1, rows, columns, sharex=True)
-    for axis, (name, line) in zip(axes.T.flat, channels, strict=False):
-        axis.plot(*line, color=BLUE, linewidth=0.7)
-        for begin, end in inspection.gaps[:200]:
+    figure, axes = make_figure(
+        width=10, height=1.1 * rows + 1, rows=rows, columns=columns, sharex=True
+    )
+    for axis, (name, (times, values)) in zip(axes.T.flat, channels, strict=False):
+        axis.plot(times, values, color=BLUE, linewidth=0.7)
+        for begin, end in inspection.gaps[:_MOST_GAPS]:
             axis.axvspan(begin, end, color=ORANGE, alpha=0.4, linewidth=0)
         axis.set_ylabel(name, rotation=0, ha="right", va="center", fontsize=7)
         axis.tick_params(labelsize=7)
@@ -202,4 +256,13 @@ def inspection_figure(inspection: "Inspection") -> Figure:
     for axis in axes.T.flat[len(channels) :]:
         axis.set_visible(False)
     figure.suptitle(inspection.title, fontsize=10)
+    return figure
+
+
+def _empty_page(title: str) -> Figure:
+    """Draws the page of a log without a channel of numbers."""
+    figure, ((axis,),) = make_figure(width=10, height=2)
+    axis.set_axis_off()
+    axis.text(0.5, 0.5, "no channel of numbers", ha="center", va="center")
+    figure.suptitle(title, fontsize=10)
     return figure

@@ -1,11 +1,11 @@
-"""Figures of one recorded flight.
+"""Draws one recorded flight: how it tracked, what acted, how long it took.
 
 Cao, Lai and Alam (2017), figures 2 to 4, show positions and inputs over time. The tube
 here is what the controller expected one step before, with two standard deviations.
 """
 
 import textwrap
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -34,25 +34,43 @@ if TYPE_CHECKING:
 
 _BOUND = GREY
 _STAGES = {"model": BLUE, "build": SKY, "solve": VERMILION}
+_LEVELS = {"suspicious": ORANGE, "lost": VERMILION}
 
 
 def expected(run: "Run", states: list[int]) -> tuple[np.ndarray, np.ndarray]:
     """Returns means and standard deviations (K, j) that were predicted one step before.
 
-    NaN where nothing was.
-
-    What is predicted is the state itself: the noise that the plan leaves out belongs to
-    it.
+    They are NaN where nothing was predicted. What is predicted is the state itself: the
+    noise that the plan leaves out belongs to it.
     """
-    mean, std = np.full((2, len(run.times), len(states)), np.nan)
+    shape = (len(run.times), len(states))
+    mean = np.full(shape, np.nan)
+    std = np.full(shape, np.nan)
     if run.plan_means.shape[1] > 1:
-        noise = np.zeros(len(run.state_names))
-        noise_std = run.metadata.get("run", {}).get("noise_std", "").split()
-        if len(noise_std) == len(noise):
-            noise = np.array(noise_std, dtype=float)
+        noise_std = _unplanned_noise(run)
         mean[1:] = run.plan_means[:-1, 1, states]
-        std[1:] = np.hypot(run.plan_stds[:-1, 1, states], noise[states])
+        std[1:] = np.hypot(run.plan_stds[:-1, 1, states], noise_std[states])
     return mean, std
+
+
+def _unplanned_noise(run: "Run") -> np.ndarray:
+    """Returns standard deviations (n,) of the noise that the plans leave out."""
+    n = len(run.state_names)
+    words = run.metadata.get("run", {}).get("noise_std", "").split()
+    if len(words) != n:
+        return np.zeros(n)
+    return np.array(words, dtype=float)
+
+
+class _Tracked(NamedTuple):
+    """A state that follows a reference, at K steps."""
+
+    title: str  # its name with its unit
+    unit: str
+    flown: np.ndarray  # (K,)
+    reference: np.ndarray  # (K,)
+    expected: np.ndarray  # (K,) mean that was predicted one step before
+    expected_std: np.ndarray  # (K,)
 
 
 @styled
@@ -61,54 +79,98 @@ def tracking_figure(run: "Run") -> Figure:
 
     Below it stands the error with the tube.
     """
-    said = run.metadata.get("run", {})
-    names = list(run.state_names)
-    units = run.metadata.get("units", {})
-    angles = said.get("angles", "").split()
-    z_down = run.metadata.get("frames", {}).get("z axis") != "up"
-    tracked = dict.fromkeys([*said.get("tracked", "").split(), *angles])
-    states = [names.index(name) for name in tracked if name in names] or list(
-        range(len(names))
-    )
-    mean, std = expected(run, states)
-    n = len(states)
-    heights = {"height_ratios": [3, 2]}
+    tracked_states = _tracked_states(run)
+    n = len(tracked_states)
     figure, axes = make_figure(
-        2.9 * max(n, 2), 4.8, 2, n, _title_of(run), sharex=True, gridspec_kw=heights
+        width=2.9 * max(n, 2),
+        height=4.8,
+        rows=2,
+        columns=n,
+        title=_title_of(run),
+        sharex=True,
+        gridspec_kw={"height_ratios": [3, 2]},
     )
-    dashed: Any = {"color": REFERENCE, "linestyle": DASHED}
-    before = None
-    for (above, below), i, predicted, deviation in zip(
-        axes.T, states, mean.T, std.T, strict=True
-    ):
-        state = run.states[:, i]
-        reference = run.references[:, i]
-        unit = units.get(f"state.{names[i]}", "")
-        if names[i] in angles:  # at the turn that is nearest to where it was
-            reference = reference + whole_turns(state - reference)
-            predicted = predicted + whole_turns(state - predicted)
-        above.plot(run.times, state, color=FLOWN, linewidth=1.6, label="flown")
-        above.plot(run.times, reference, linewidth=1.2, label="reference", **dashed)
-        above.set_title(name_of(names[i], unit, z_down))
-        below.axhline(0, linewidth=1, **dashed)
-        low = predicted - reference - 2 * deviation
-        high = predicted - reference + 2 * deviation
-        tube = {
-            "color": TUBE,
-            "alpha": 0.7,
-            "linewidth": 0,
-            "label": "expected one step before, noise included, $\\pm 2\\sigma$",
-        }
-        below.fill_between(run.times, low, high, **tube)
-        below.plot(run.times, state - reference, color=FLOWN, linewidth=1.2)
+    unit_of_last = None
+    for (above, below), state in zip(axes.T, tracked_states, strict=True):
+        _draw_path(above, run.times, state)
+        _draw_error(below, run.times, state)
         _mark_failures(run, above, below)
         below.set_xlabel("time [s]")
-        if unit != before:
-            below.set_ylabel(name_of("error", unit))
-        before = unit
+        if state.unit != unit_of_last:
+            below.set_ylabel(name_of("error", state.unit))
+        unit_of_last = state.unit
     legend_below(figure, axes.flat)
     figure.align_ylabels(axes[:, 0])
     return figure
+
+
+def _tracked_states(run: "Run") -> list[_Tracked]:
+    """Returns the tracked states and the angles of a run; all states if it names none.
+
+    Of an angle, reference and prediction stand at the turn that is nearest to where it
+    was.
+    """
+    settings = run.metadata.get("run", {})
+    units = run.metadata.get("units", {})
+    z_is_down = run.metadata.get("frames", {}).get("z axis") != "up"
+    angles = settings.get("angles", "").split()
+    tracked_names = [*settings.get("tracked", "").split(), *angles]
+    all_names = list(run.state_names)
+    # Each once, in the order in which they are named.
+    names = [name for name in dict.fromkeys(tracked_names) if name in all_names]
+    names = names or all_names
+    indices = [all_names.index(name) for name in names]
+    means, stds = expected(run, indices)
+    tracked_states = []
+    for column, (name, index) in enumerate(zip(names, indices, strict=True)):
+        flown = run.states[:, index]
+        reference = run.references[:, index]
+        mean = means[:, column]
+        if name in angles:
+            reference = reference + whole_turns(flown - reference)
+            mean = mean + whole_turns(flown - mean)
+        unit = units.get(f"state.{name}", "")
+        tracked_states.append(
+            _Tracked(
+                title=name_of(name, unit, z_is_down),
+                unit=unit,
+                flown=flown,
+                reference=reference,
+                expected=mean,
+                expected_std=stds[:, column],
+            )
+        )
+    return tracked_states
+
+
+def _draw_path(axis: Axes, times: np.ndarray, state: _Tracked) -> None:
+    """Draws a state over time against its reference."""
+    axis.plot(times, state.flown, color=FLOWN, linewidth=1.6, label="flown")
+    axis.plot(
+        times,
+        state.reference,
+        color=REFERENCE,
+        linewidth=1.2,
+        linestyle=DASHED,
+        label="reference",
+    )
+    axis.set_title(state.title)
+
+
+def _draw_error(axis: Axes, times: np.ndarray, state: _Tracked) -> None:
+    """Draws the error of a state over time, with the tube that was expected."""
+    axis.axhline(0, color=REFERENCE, linewidth=1, linestyle=DASHED)
+    expected_error = state.expected - state.reference
+    axis.fill_between(
+        times,
+        expected_error - 2 * state.expected_std,
+        expected_error + 2 * state.expected_std,
+        color=TUBE,
+        alpha=0.7,
+        linewidth=0,
+        label="expected one step before, noise included, $\\pm 2\\sigma$",
+    )
+    axis.plot(times, state.flown - state.reference, color=FLOWN, linewidth=1.2)
 
 
 @styled
@@ -116,22 +178,26 @@ def inputs_figure(run: "Run") -> Figure:
     """Draws what acted, over time, with its bounds."""
     m = len(run.input_names)
     units = run.metadata.get("units", {})
-    figure, axes = make_figure(7.2, 1.6 * m + 1.0, m, 1, _title_of(run), sharex=True)
-    for axis, name, values, bounds in zip(
-        axes.flat, run.input_names, run.inputs.T, run.input_bounds.T, strict=True
-    ):
-        until_end = np.append(
-            values, values[-1]
-        )  # the last one holds until its step ends
+    figure, axes = make_figure(
+        width=7.2,
+        height=1.6 * m + 1.0,
+        rows=m,
+        title=_title_of(run),
+        sharex=True,
+    )
+    for i, (axis, name) in enumerate(zip(axes.flat, run.input_names, strict=True)):
+        values = run.inputs[:, i]
+        # The last one holds until its step ends.
+        values_until_end = np.append(values, values[-1])
         axis.step(
             _edges(run),
-            until_end,
+            values_until_end,
             where="post",
             color=FLOWN,
             linewidth=1.4,
             label="applied",
         )
-        _draw_bounds(axis, values, bounds)
+        _draw_bounds(axis, values, run.input_bounds[:, i])
         axis.set_ylabel(name_of(name, units.get(f"input.{name}", "")))
         _mark_failures(run, axis)
     axes[-1, 0].set_xlabel("time [s]")
@@ -143,54 +209,73 @@ def inputs_figure(run: "Run") -> Figure:
 @styled
 def timing_figure(run: "Run") -> Figure:
     """Draws the parts of the time of every decision, and the totals' distribution."""
-    milliseconds = 1e3 * run.timings
-    widths = {"width_ratios": [3, 2]}
     figure, ((over_time, distribution),) = make_figure(
-        8.4, 3.6, 1, 2, _title_of(run), gridspec_kw=widths
+        width=8.4,
+        height=3.6,
+        columns=2,
+        title=_title_of(run),
+        gridspec_kw={"width_ratios": [3, 2]},
     )
-    bottom = np.zeros(len(run.times))
-    for (name, colour), stage in zip(_STAGES.items(), milliseconds.T, strict=False):
-        over_time.stairs(
-            bottom + stage,
-            _edges(run),
-            baseline=bottom,
-            fill=True,
-            color=colour,
-            label=name,
-        )
-        bottom = bottom + stage
-    total = np.sort(milliseconds[:, -1])
-    if total.any():
-        total = total[total > 0]  # a controller that was not asked took no time
-    # A first step that compiles, and those that waited for a core, would leave nothing
-    # to be seen of the others.
-    most_of_them = float(np.quantile(total, 0.98, method="inverted_cdf"))
-    ceiling = 1.15 * min(most_of_them, 5 * float(np.median(total))) or 1.0
-    over_time.set(
-        xlabel="time [s]", ylabel="time of a decision [ms]", ylim=(0, ceiling)
-    )
-    if beyond := int((total > ceiling).sum()):
-        over_time.set_title(
-            f"{beyond} of {len(total)} steps above, up to {_duration(total[-1])}",
-            fontsize="small",
-        )
-    distribution.step(
-        total, np.arange(1, len(total) + 1) / len(total), where="post", color=FLOWN
-    )
-    if total[0] > 0 and total[-1] > 5 * total[0]:
-        distribution.set_xscale("log")
-        plain_numbers(distribution.xaxis, few=total[-1] < 300 * total[0])
-    median, most = np.quantile(total, [0.5, 0.99]).tolist()
-    for value in (median, most):
-        distribution.axvline(value, color=_BOUND, linewidth=1, linestyle=DASHED)
-    distribution.set_title(
-        f"median {_duration(median)}, 99 % below {_duration(most)}", fontsize="small"
-    )
-    distribution.set(
-        ylim=(0, 1.02), xlabel="time of a decision [ms]", ylabel="share of the steps"
-    )
+    milliseconds = 1e3 * run.timings
+    totals = np.sort(milliseconds[:, -1])
+    if totals.any():
+        totals = totals[totals > 0]  # a controller that was not asked took no time
+    _draw_stages(over_time, _edges(run), milliseconds)
+    _limit_height(over_time, totals)
+    _draw_distribution(distribution, totals)
     legend_below(figure, [over_time])
     return figure
+
+
+def _draw_stages(axis: Axes, edges: np.ndarray, milliseconds: np.ndarray) -> None:
+    """Stacks the parts (K, 4) of the decisions' times over the time."""
+    bottom = np.zeros(len(milliseconds))
+    stages = zip(_STAGES.items(), milliseconds.T, strict=False)
+    for (name, colour), stage in stages:
+        top = bottom + stage
+        axis.stairs(top, edges, baseline=bottom, fill=True, color=colour, label=name)
+        bottom = top
+    axis.set(xlabel="time [s]", ylabel="time of a decision [ms]")
+
+
+def _limit_height(axis: Axes, totals: np.ndarray) -> None:
+    """Limits an axis to the usual of the sorted times, and says how many are above.
+
+    A first step that compiles, and those that waited for a core, would leave nothing to
+    be seen of the others.
+    """
+    almost_largest = float(np.quantile(totals, 0.98, method="inverted_cdf"))
+    median = float(np.median(totals))
+    ceiling = 1.15 * min(almost_largest, 5 * median) or 1.0
+    axis.set_ylim(0, ceiling)
+    count_above = int((totals > ceiling).sum())
+    if count_above:
+        axis.set_title(
+            f"{count_above} of {len(totals)} steps above, "
+            f"up to {_duration(totals[-1])}",
+            fontsize="small",
+        )
+
+
+def _draw_distribution(axis: Axes, totals: np.ndarray) -> None:
+    """Draws the cumulative distribution of sorted times, with median and 99 %."""
+    shares = np.arange(1, len(totals) + 1) / len(totals)
+    axis.step(totals, shares, where="post", color=FLOWN)
+    shortest = totals[0]
+    longest = totals[-1]
+    if shortest > 0 and longest > 5 * shortest:
+        axis.set_xscale("log")
+        plain_numbers(axis.xaxis, few=longest < 300 * shortest)
+    median, almost_all = np.quantile(totals, [0.5, 0.99]).tolist()
+    for value in (median, almost_all):
+        axis.axvline(value, color=_BOUND, linewidth=1, linestyle=DASHED)
+    axis.set_title(
+        f"median {_duration(median)}, 99 % below {_duration(almost_all)}",
+        fontsize="small",
+    )
+    axis.set(
+        ylim=(0, 1.02), xlabel="time of a decision [ms]", ylabel="share of the steps"
+    )
 
 
 def _edges(run: "Run") -> np.ndarray:
@@ -200,13 +285,14 @@ def _edges(run: "Run") -> np.ndarray:
 
 
 def _duration(milliseconds: float) -> str:
+    """Returns a time in words, with three digits."""
     if milliseconds < 999.5:
         return f"{milliseconds:.3g} ms"
     return f"{milliseconds / 1e3:.3g} s"
 
 
 def _title_of(run: "Run") -> str:
-    """Returns what was run: the command, or the file."""
+    """Returns the command that was run, or the file."""
     command = run.metadata.get("run", {}).get("command", "")
     title = command if command.startswith("gpmpc") else str(run.path)
     return textwrap.fill(title, 90, max_lines=2, placeholder=" ...")
@@ -220,37 +306,25 @@ def _draw_bounds(axis: Axes, inputs: np.ndarray, bounds: np.ndarray) -> None:
     low = float(inputs.min())
     high = float(inputs.max())
     span = max(high - low, 1e-3 * max(abs(low), abs(high), 1e-3))
-    limits = bounds[np.isfinite(bounds)]
-    near = limits[(low - 2 * span <= limits) & (limits <= high + 2 * span)]
-    for limit in near:
-        axis.axhline(limit, color=_BOUND, linestyle=DASHED, linewidth=1, label="bound")
-    low = min([low, *near])
-    high = max([high, *near])
-    axis.set_ylim(
-        low - 0.12 * max(high - low, span), high + 0.25 * max(high - low, span)
-    )
-    if len(near) < len(limits):
-        place: Any = {
-            "xycoords": "axes fraction",
-            "ha": "right",
-            "va": "top",
-            "fontsize": "small",
-            "color": _BOUND,
-        }
+    finite_bounds = bounds[np.isfinite(bounds)]
+    is_near = (low - 2 * span <= finite_bounds) & (finite_bounds <= high + 2 * span)
+    near_bounds = finite_bounds[is_near]
+    for bound in near_bounds:
+        axis.axhline(bound, color=_BOUND, linestyle=DASHED, linewidth=1, label="bound")
+    low = min([low, *near_bounds])
+    high = max([high, *near_bounds])
+    height = max(high - low, span)
+    axis.set_ylim(low - 0.12 * height, high + 0.25 * height)
+    if len(near_bounds) < len(finite_bounds):
         axis.annotate(
-            "bounds " + " and ".join(f"{limit:g}" for limit in limits),
+            "bounds " + " and ".join(f"{bound:g}" for bound in finite_bounds),
             (0.995, 0.97),
-            **place,
+            xycoords="axes fraction",
+            ha="right",
+            va="top",
+            fontsize="small",
+            color=_BOUND,
         )
-
-
-_LEVELS = {"suspicious": ORANGE, "lost": VERMILION}
-
-
-def _spans(steps: np.ndarray) -> list[tuple[int, int]]:
-    """Returns first and behind the last of every series of steps (K,) that are true."""
-    changes = np.flatnonzero(np.diff(np.concatenate([[0], steps, [0]])))
-    return [(int(first), int(end)) for first, end in changes.reshape(-1, 2)]
 
 
 def _mark_failures(run: "Run", *axes: Axes) -> None:
@@ -259,8 +333,15 @@ def _mark_failures(run: "Run", *axes: Axes) -> None:
     for axis in axes:
         for level, colour in _LEVELS.items():
             for first, end in _spans(run.judgements == level):
-                shade: Any = {"color": colour, "alpha": 0.15, "linewidth": 0}
-                axis.axvspan(edges[first], edges[end], label=level, zorder=-1, **shade)
+                axis.axvspan(
+                    edges[first],
+                    edges[end],
+                    color=colour,
+                    alpha=0.15,
+                    linewidth=0,
+                    label=level,
+                    zorder=-1,
+                )
         for time in run.times[run.failed]:
             axis.axvline(
                 time,
@@ -270,3 +351,9 @@ def _mark_failures(run: "Run", *axes: Axes) -> None:
                 label="failed solve",
                 zorder=0,
             )
+
+
+def _spans(is_true: np.ndarray) -> list[tuple[int, int]]:
+    """Returns first and behind the last of every series of steps (K,) that are true."""
+    changes = np.flatnonzero(np.diff(np.concatenate([[0], is_true, [0]])))
+    return [(int(first), int(end)) for first, end in changes.reshape(-1, 2)]

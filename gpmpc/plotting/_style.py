@@ -37,7 +37,7 @@ DASHES: tuple[Any, ...] = (
     (0, (3, 3)),
     (0, (8, 2)),
 )
-DASHED: Any = (0, (4, 3))  # of references and bounds
+DASHED = (0, (4, 3))  # of references and bounds
 _NAMES = {
     "phi": "roll",
     "theta": "pitch",
@@ -47,9 +47,8 @@ _NAMES = {
     "uy": "direction uy",
 }
 
-styled = mpl.rc_context(
-    fname=Path(__file__).with_name("gpmpc.mplstyle")
-)  # a decorator of what makes a figure
+# A decorator of functions that make a figure.
+styled = mpl.rc_context(fname=Path(__file__).with_name("gpmpc.mplstyle"))
 
 
 def make_figure(
@@ -60,7 +59,7 @@ def make_figure(
     title: str = "",
     **options: Any,
 ) -> tuple[Figure, np.ndarray]:
-    """Returns a figure of some inches and its axes (rows, columns)."""
+    """Returns a figure, its size in inches, and its axes (rows, columns)."""
     figure = Figure(figsize=(width, height), layout="constrained")
     if title:
         figure.suptitle(title)
@@ -80,9 +79,8 @@ def clipped(text: str, most: int) -> str:
 
 def plain_numbers(axis: Axis, few: bool) -> None:
     """Labels a logarithmic axis by plain numbers; over few decades by 2 and 5 too."""
-    axis.set_major_locator(
-        LogLocator(subs=(1, 2, 5)) if few else LogLocator(numticks=5)
-    )
+    locator = LogLocator(subs=(1, 2, 5)) if few else LogLocator(numticks=5)
+    axis.set_major_locator(locator)
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axis.set_minor_formatter(NullFormatter())
 
@@ -92,20 +90,22 @@ def legend_below(figure: Figure, axes: Iterable[Axes]) -> None:
 
     It has as many columns as the figure's width holds.
     """
-    found = {
-        label: handle
-        for axis in axes
-        for handle, label in zip(*axis.get_legend_handles_labels(), strict=True)
-    }
-    if found:
-        characters = 11.0 * figure.get_figwidth()  # that fit into a line
-        labels = [clipped(label, int(characters) - 6) for label in found]
-        columns = max(
-            1, min(len(labels), int(characters / (max(map(len, labels)) + 6)))
-        )
-        figure.legend(
-            [*found.values()], labels, loc="outside lower center", ncols=columns
-        )
+    handles = {}
+    for axis in axes:
+        for handle, label in zip(*axis.get_legend_handles_labels(), strict=True):
+            handles[label] = handle
+    if not handles:
+        return
+    characters = 11.0 * figure.get_figwidth()  # that fit into a line
+    labels = [clipped(label, int(characters) - 6) for label in handles]
+    longest = max(map(len, labels))
+    columns_that_fit = int(characters / (longest + 6))
+    figure.legend(
+        list(handles.values()),
+        labels,
+        loc="outside lower center",
+        ncols=max(1, min(len(labels), columns_that_fit)),
+    )
 
 
 def png(figure: Figure, dpi: int = 150) -> bytes:

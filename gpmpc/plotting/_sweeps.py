@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -24,9 +23,8 @@ class Series:
     """One line of a figure."""
 
     label: str  # in the legend
-    values: Sequence[
-        Sequence[float]
-    ]  # the runs' values by position on the axis; a position may have none
+    # The runs' values by position on the axis; a position may have none.
+    values: Sequence[Sequence[float]]
 
 
 @styled
@@ -37,7 +35,7 @@ def over_variable(
     lines: Sequence[Series],
     logarithmic: bool = False,
 ) -> Figure:
-    """Median and quartiles of a measure over the values of a variable, every run a dot.
+    """Draws median and quartiles of a measure over a variable, every run as a dot.
 
     Args:
         title: Name of the variable.
@@ -48,14 +46,14 @@ def over_variable(
         lines: What else was varied, a line each; those without a number are left out.
         logarithmic: Whether the axis is, where the values span enough for it.
     """
-    drawn = sum(any(line.values) for line in lines)
-    figure, ((axis,),) = make_figure(4.8, 3.4 + 0.11 * drawn)
+    line_count = sum(any(line.values) for line in lines)
+    figure, ((axis,),) = make_figure(width=4.8, height=3.4 + 0.11 * line_count)
     draw_quartiles(axis, lines, positions)
     axis.set_title(label, fontsize="medium")
     axis.set_xlabel(clipped(title, 50))
     if max(map(len, positions)) * len(positions) > 40:
         axis.tick_params(axis="x", labelrotation=30)
-    values = [v for line in lines for group in line.values for v in group]
+    values = [value for line in lines for group in line.values for value in group]
     low = min(values, default=0)
     high = max(values, default=0)
     if logarithmic and low > 0 and high > 3 * low:
@@ -63,7 +61,7 @@ def over_variable(
         plain_numbers(axis.yaxis, few=high < 30 * low)
     elif low >= 0:
         axis.set_ylim(0, 1.06 * high or 1)
-    if drawn > 1:
+    if line_count > 1:
         legend_below(figure, [axis])
     return figure
 
@@ -72,65 +70,68 @@ def draw_quartiles(
     axis: Axes, lines: Sequence[Series], positions: Sequence[str]
 ) -> None:
     """Draws median, quartiles and every value of each line at each position."""
-    numbers = _numbers(positions)
-    wide = numbers is not None and numbers[0] > 0 and numbers[-1] >= 10 * numbers[0]
-    if numbers is None:
-        at = np.arange(float(len(positions)))
-    elif wide:
-        at = np.log10(numbers)
-    else:
-        at = numbers
-    gap = float(np.diff(at).min(initial=np.inf)) if len(at) > 1 else 1.0
-
-    def place(x: np.ndarray) -> np.ndarray:
-        return 10**x if wide else x
-
-    width = min(0.14, 0.7 / max(len(lines), 1)) * gap
+    scale = _position_scale(positions)
+    # Lines stand side by side, so that their quartiles do not hide each other.
+    distance = min(0.14, 0.7 / max(len(lines), 1)) * scale.gap
     for i, line in enumerate(lines):
-        colour = COLOURS[i % len(COLOURS)]
-        middles = (
-            at + (i - (len(lines) - 1) / 2) * width
-        )  # side by side: their quartiles do not hide each other
-        known = [p for p, group in enumerate(line.values) if group]
-        if not known:  # a line of failed runs alone
+        if not any(line.values):  # a line of failed runs alone
             continue
-        low, middle, high = np.array(
-            [np.quantile(line.values[p], [0.25, 0.5, 0.75]) for p in known]
-        ).T
-        style: Any = {
-            "color": colour,
-            "marker": "o",
-            "markersize": 4,
-            "linestyle": "none" if numbers is None else "-",
-        }
-        axis.errorbar(
-            place(middles[known]),
-            middle,
-            np.array([middle - low, high - middle]),
-            label=line.label,
-            **style,
-        )
-        for x, group in zip(middles, line.values, strict=True):
-            aside = (
-                0.3
-                * width
-                * ((np.arange(len(group)) + 0.5) / max(len(group), 1) * 2 - 1)
-            )
-            axis.plot(
-                place(x + aside),
-                group,
-                ".",
-                color=colour,
-                alpha=0.45,
-                markersize=5,
-                mew=0,
-            )
-    if wide:
+        centres = scale.coordinates + (i - (len(lines) - 1) / 2) * distance
+        colour = COLOURS[i % len(COLOURS)]
+        _draw_medians(axis, line, centres, scale, colour)
+        _draw_values(axis, line, centres, scale, colour, width=0.3 * distance)
+    if scale.is_logarithmic:
         axis.set_xscale("log")
-    axis.set_xticks(place(at), [clipped(position, 24) for position in positions])
+    axis.set_xticks(
+        scale.to_axis(scale.coordinates),
+        [clipped(position, 24) for position in positions],
+    )
     axis.xaxis.set_minor_locator(NullLocator())
-    margin = 0.5 * gap if numbers is None else max(0.5 * gap, 0.06 * (at[-1] - at[0]))
-    axis.set_xlim(*place(np.array([at[0] - margin, at[-1] + margin])))
+    axis.set_xlim(*scale.limits())
+
+
+@dataclass(frozen=True)
+class _PositionScale:
+    """Places of the values of a variable along an axis.
+
+    Coordinates are what is evenly spread on paper: numbers, or their logarithms.
+    """
+
+    coordinates: np.ndarray
+    has_numbers: bool
+    is_logarithmic: bool
+
+    @property
+    def gap(self) -> float:
+        """Smallest distance of two coordinates."""
+        if len(self.coordinates) < 2:
+            return 1.0
+        return float(np.diff(self.coordinates).min())
+
+    def to_axis(self, coordinates: np.ndarray) -> np.ndarray:
+        """Returns coordinates in the values of the axis."""
+        return 10**coordinates if self.is_logarithmic else coordinates
+
+    def limits(self) -> np.ndarray:
+        """Returns the values of the axis between which it is drawn (2,)."""
+        first = self.coordinates[0]
+        last = self.coordinates[-1]
+        margin = 0.5 * self.gap
+        if self.has_numbers:
+            margin = max(margin, 0.06 * (last - first))
+        return self.to_axis(np.array([first - margin, last + margin]))
+
+
+def _position_scale(positions: Sequence[str]) -> _PositionScale:
+    """Places numbers where they belong, words side by side."""
+    numbers = _numbers(positions)
+    if numbers is None:
+        side_by_side = np.arange(float(len(positions)))
+        return _PositionScale(side_by_side, has_numbers=False, is_logarithmic=False)
+    if numbers[0] > 0 and numbers[-1] >= 10 * numbers[0]:
+        exponents = np.log10(numbers)
+        return _PositionScale(exponents, has_numbers=True, is_logarithmic=True)
+    return _PositionScale(numbers, has_numbers=True, is_logarithmic=False)
 
 
 def _numbers(positions: Sequence[str]) -> np.ndarray | None:
@@ -144,6 +145,49 @@ def _numbers(positions: Sequence[str]) -> np.ndarray | None:
     return numbers
 
 
+def _draw_medians(
+    axis: Axes, line: Series, centres: np.ndarray, scale: _PositionScale, colour: str
+) -> None:
+    """Draws medians with bars between the quartiles; those of numbers are joined."""
+    positions = [p for p, group in enumerate(line.values) if group]
+    low, median, high = np.transpose(
+        [np.quantile(line.values[p], [0.25, 0.5, 0.75]) for p in positions]
+    )
+    axis.errorbar(
+        scale.to_axis(centres[positions]),
+        median,
+        np.array([median - low, high - median]),
+        label=line.label,
+        color=colour,
+        marker="o",
+        markersize=4,
+        linestyle="-" if scale.has_numbers else "none",
+    )
+
+
+def _draw_values(
+    axis: Axes,
+    line: Series,
+    centres: np.ndarray,
+    scale: _PositionScale,
+    colour: str,
+    width: float,
+) -> None:
+    """Draws every value as a dot, those of a position side by side."""
+    for centre, group in zip(centres, line.values, strict=True):
+        fractions = (np.arange(len(group)) + 0.5) / max(len(group), 1)  # 0 to 1
+        offsets = width * (fractions * 2 - 1)
+        axis.plot(
+            scale.to_axis(centre + offsets),
+            group,
+            ".",
+            color=colour,
+            alpha=0.45,
+            markersize=5,
+            mew=0,
+        )
+
+
 @styled
 def search_figure(
     costs: Sequence[float], importances: Mapping[str, float], unchanged: float | None
@@ -155,48 +199,61 @@ def search_figure(
         importances: Shares by setting, the most first; may be empty.
         unchanged: Cost of the settings without the search; None leaves it out.
     """
-    figure, ((axis, *bars),) = make_figure(
-        4.4 + 4.0 * bool(importances), 3.4, columns=1 + bool(importances)
+    has_bars = bool(importances)
+    figure, axes = make_figure(
+        width=8.4 if has_bars else 4.4, height=3.4, columns=2 if has_bars else 1
     )
-    values = np.array(costs)
-    finite = np.isfinite(values)
-    best = np.minimum.accumulate(values)
+    _draw_costs(axes[0, 0], np.array(costs), unchanged)
+    legend_below(figure, [axes[0, 0]])
+    if has_bars:
+        _draw_importances(axes[0, 1], importances)
+    return figure
+
+
+def _draw_costs(axis: Axes, costs: np.ndarray, unchanged: float | None) -> None:
+    """Draws each candidate's cost, and the least so far."""
+    is_finite = np.isfinite(costs)
     axis.plot(
-        np.flatnonzero(finite),
-        values[finite],
+        np.flatnonzero(is_finite),
+        costs[is_finite],
         ".",
         color=COLOURS[0],
         alpha=0.6,
         label="candidate",
     )
-    known = np.isfinite(best)
+    least = np.minimum.accumulate(costs)
+    has_least = np.isfinite(least)
     axis.step(
-        np.flatnonzero(known),
-        best[known],
+        np.flatnonzero(has_least),
+        least[has_least],
         color=COLOURS[1],
         where="post",
         label="best so far",
     )
-    if len(lost := np.flatnonzero(~finite)):
-        top = {
-            "transform": axis.get_xaxis_transform(),
-            "color": "0.5",
-            "label": "lost or failed",
-        }
-        axis.plot(lost, np.full(len(lost), 0.98), "x", **top)
+    failed = np.flatnonzero(~is_finite)
+    if len(failed):
+        axis.plot(
+            failed,
+            np.full(len(failed), 0.98),
+            "x",
+            transform=axis.get_xaxis_transform(),
+            color="0.5",
+            label="lost or failed",
+        )
     if unchanged is not None:
         axis.axhline(
             unchanged, color="0.4", linestyle="--", label="settings as they are"
         )
-    if finite.any() and values[finite].min() > 0:
+    if is_finite.any() and costs[is_finite].min() > 0:
         axis.set_yscale("log")
     axis.set(xlabel="candidate", ylabel="closed-loop cost per step")
     axis.xaxis.set_major_locator(MaxNLocator(integer=True))
-    legend_below(figure, [axis])
-    for beside in bars:
-        names = [clipped(name, 60) for name in importances]
-        shares = [100 * share for share in importances.values()]
-        drawn = beside.barh(names[::-1], shares[::-1], color=COLOURS[0], height=0.5)
-        beside.bar_label(drawn, fmt="%.0f %%", padding=3)
-        beside.set(xlabel="importance [%]", xlim=(0, 115))
-    return figure
+
+
+def _draw_importances(axis: Axes, importances: Mapping[str, float]) -> None:
+    """Draws a bar for each setting, the most important one on top."""
+    names = [clipped(name, 60) for name in importances]
+    percentages = [100 * share for share in importances.values()]
+    bars = axis.barh(names[::-1], percentages[::-1], color=COLOURS[0], height=0.5)
+    axis.bar_label(bars, fmt="%.0f %%", padding=3)
+    axis.set(xlabel="importance [%]", xlim=(0, 115))

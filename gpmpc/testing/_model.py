@@ -1,14 +1,23 @@
 """Check of a dynamics model of your own: ``check_model``."""
 
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from gpmpc._dynamics import DynamicsModel
+from gpmpc._dynamics import Array, DynamicsModel, Linearized
 from gpmpc.gaussian import Gaussian
 from gpmpc.testing._promise import require, require_close, require_covariance
+
+
+class _Points(NamedTuple):
+    """Points at which a model is evaluated, and how exact it can be there."""
+
+    states: Tensor  # (K, n)
+    inputs: Tensor  # (K, m)
+    exact: float  # tolerance of what is the same computation
+    numeric: float  # tolerance of finite differences
 
 
 def check_model(
@@ -28,31 +37,46 @@ def check_model(
         AssertionError: The model breaks a promise; the message says which, and by how
             much.
     """
-    _check_attributes(model)
+    _check_dimensions(model)
+    _check_noise(model)
+    points = _points(model, states, inputs, seed)
+
+    batch = _check_predict(model, points)
+    _check_batches(model, points, batch)
+
+    linearized = _check_linearize(model, points)
+    _check_against_predict(model, points, linearized, batch)
+    _check_without_covariance(model, points, linearized)
+    _check_single_point(model, points, linearized)
+
+
+def _points(
+    model: DynamicsModel, states: Tensor | None, inputs: Tensor | None, seed: int
+) -> _Points:
+    """Returns a caller's points, by default standard normal ones of a seed."""
     generator = torch.Generator().manual_seed(seed)
-    like: dict[str, Any] = {"dtype": model.dtype, "device": model.device}
-    x = (
-        torch.randn(4, model.state_dim, generator=generator)
-        if states is None
-        else states
-    ).to(**like)
-    u = (
-        torch.randn(len(x), model.input_dim, generator=generator)
-        if inputs is None
-        else inputs
-    ).to(**like)
-    exact, numeric = (
-        (1e-4, 3e-2) if torch.finfo(model.dtype).eps > 1e-10 else (1e-9, 1e-5)
+    if states is None:
+        states = torch.randn(4, model.state_dim, generator=generator)
+    if inputs is None:
+        inputs = torch.randn(len(states), model.input_dim, generator=generator)
+    is_single_precision = torch.finfo(model.dtype).eps > 1e-10
+    return _Points(
+        states=states.to(dtype=model.dtype, device=model.device),
+        inputs=inputs.to(dtype=model.dtype, device=model.device),
+        exact=1e-4 if is_single_precision else 1e-9,
+        numeric=3e-2 if is_single_precision else 1e-5,
     )
-    _check_predict(model, x, u, exact)
-    _check_linearize(model, x, u, exact, numeric)
 
 
-def _check_attributes(model: DynamicsModel) -> None:
+def _check_dimensions(model: DynamicsModel) -> None:
+    """Checks the numbers of states, inputs and outputs, the type and the device."""
     for name, least in (("state_dim", 1), ("input_dim", 0), ("output_dim", 1)):
         value = getattr(model, name, None)
-        right = isinstance(value, int) and value >= least
-        require(right, f"{name} is a whole number, {least} or more", f"got {value!r}")
+        require(
+            isinstance(value, int) and value >= least,
+            f"{name} is a whole number, {least} or more",
+            f"got {value!r}",
+        )
     require(
         isinstance(getattr(model, "dtype", None), torch.dtype),
         "dtype is a torch.dtype",
@@ -61,153 +85,214 @@ def _check_attributes(model: DynamicsModel) -> None:
     require(
         hasattr(model, "device"), "device says where the model lives", "it is missing"
     )
-    noise = getattr(model, "noise_covariance", None)
+
+
+def _check_noise(model: DynamicsModel) -> None:
+    """Checks the covariance of the observations' noise."""
     k = model.output_dim
-    right = (
-        isinstance(noise, Tensor)
-        and tuple(noise.shape) == (k, k)
-        and noise.dtype == model.dtype
-    )
+    noise = getattr(model, "noise_covariance", None)
     dtype = getattr(noise, "dtype", "")
     shape = tuple(getattr(noise, "shape", ()))
-    got = f"got {type(noise).__name__} {dtype} {shape}"
+    is_covariance = (
+        isinstance(noise, Tensor) and shape == (k, k) and dtype == model.dtype
+    )
     require(
-        right, f"noise_covariance is a {model.dtype} tensor of shape ({k}, {k})", got
+        is_covariance,
+        f"noise_covariance is a {model.dtype} tensor of shape ({k}, {k})",
+        f"got {type(noise).__name__} {dtype} {shape}",
     )
     require_covariance("noise_covariance", model.noise_covariance)
 
 
-def _check_predict(model: DynamicsModel, x: Tensor, u: Tensor, exact: float) -> None:
-    before = x.clone(), u.clone()
-    together = model.predict(x, u)
-    same = torch.equal(before[0], x) and torch.equal(before[1], u)
+def _check_predict(model: DynamicsModel, points: _Points) -> Gaussian:
+    """Checks the prediction of all points at once, and returns it (K,)."""
+    states = points.states
+    inputs = points.inputs
+    states_before = states.clone()
+    inputs_before = inputs.clone()
+    batch = model.predict(states, inputs)
     require(
-        same,
+        torch.equal(states_before, states) and torch.equal(inputs_before, inputs),
         "predict: the caller's state and input are left as they are",
         "one was modified",
     )
-    _check_belief("predict at a batch", model, together, (len(x),))
-    again = model.predict(x, u)
-    same = torch.equal(again.mean, together.mean) and torch.equal(
-        again.covariance, together.covariance
-    )
+    _check_belief("predict at a batch", model, batch, (len(states),))
+    repeated = model.predict(states, inputs)
+    same_mean = torch.equal(repeated.mean, batch.mean)
+    same_covariance = torch.equal(repeated.covariance, batch.covariance)
     require(
-        same,
+        same_mean and same_covariance,
         "predict: the same arguments give the same result",
         "the second differs from the first",
     )
+    return batch
 
-    alone = [model.predict(state, input) for state, input in zip(x, u, strict=True)]
-    _check_belief("predict at one state", model, alone[0], ())
-    stacked = Gaussian(
-        torch.stack([b.mean for b in alone]), torch.stack([b.covariance for b in alone])
+
+def _check_batches(model: DynamicsModel, points: _Points, batch: Gaussian) -> None:
+    """Compares a batch with its members, other batch dimensions and other layouts."""
+    states = points.states
+    inputs = points.inputs
+    members = [model.predict(x, u) for x, u in zip(states, inputs, strict=True)]
+    _check_belief("predict at one state", model, members[0], ())
+    stacked_members = Gaussian(
+        torch.stack([member.mean for member in members]),
+        torch.stack([member.covariance for member in members]),
     )
     _check_same(
-        "predict: a batch is the loop over its members", together, stacked, exact
+        "predict: a batch is the loop over its members",
+        batch,
+        stacked_members,
+        points.exact,
     )
-    nested = model.predict(x[None, :, None], u[None, :, None])
-    _check_belief("predict at two more batch dimensions", model, nested, (1, len(x), 1))
+
+    nested = model.predict(states[None, :, None], inputs[None, :, None])
+    _check_belief(
+        "predict at two more batch dimensions", model, nested, (1, len(states), 1)
+    )
     flat = Gaussian(nested.mean[0, :, 0], nested.covariance[0, :, 0])
-    _check_same("predict: more batch dimensions change nothing", flat, together, exact)
-    strided = [torch.stack([part, part + 1], dim=-1)[..., 0] for part in (x, u)]
+    _check_same(
+        "predict: more batch dimensions change nothing", flat, batch, points.exact
+    )
+
     _check_same(
         "predict: every other element of a larger array will do",
-        model.predict(*strided),
-        together,
-        exact,
+        model.predict(_strided(states), _strided(inputs)),
+        batch,
+        points.exact,
     )
 
 
-def _check_linearize(
-    model: DynamicsModel, x: Tensor, u: Tensor, exact: float, numeric: float
-) -> None:
-    n = model.state_dim
-    m = model.input_dim
-    k = model.output_dim
-    states, inputs = (part.double().cpu().numpy().copy() for part in (x, u))
-    before = states.copy(), inputs.copy()
-    found = model.linearize(states, inputs)
-    same = np.array_equal(before[0], states) and np.array_equal(before[1], inputs)
+def _strided(tensor: Tensor) -> Tensor:
+    """Copies a tensor into every other element of a larger one."""
+    return torch.stack([tensor, tensor + 1], dim=-1)[..., 0]
+
+
+def _check_linearize(model: DynamicsModel, points: _Points) -> Linearized:
+    """Checks what ``linearize`` returns for all points, and returns it."""
+    states = _to_numpy(points.states)
+    inputs = _to_numpy(points.inputs)
+    states_before = states.copy()
+    inputs_before = inputs.copy()
+    linearized = model.linearize(states, inputs)
+    same_states = np.array_equal(states_before, states)
+    same_inputs = np.array_equal(inputs_before, inputs)
     require(
-        same,
+        same_states and same_inputs,
         "linearize: the caller's states and inputs are left as they are",
         "one was modified",
     )
-    shapes = {"mean": (k,), "A": (k, n), "B": (k, m), "covariance": (k, k)}
+    n = model.state_dim
+    m = model.input_dim
+    k = model.output_dim
+    K = len(states)
+    shapes = {"mean": (K, k), "A": (K, k, n), "B": (K, k, m), "covariance": (K, k, k)}
     for name, shape in shapes.items():
-        got = getattr(found, name)
-        expected = (len(x), *shape)
-        right = (
-            isinstance(got, np.ndarray)
-            and got.dtype == np.float64
-            and got.flags.c_contiguous
-        )
-        promise = (
-            f"linearize: {name} is a C-contiguous float64 array of shape {expected}"
+        array = getattr(linearized, name)
+        is_plain = (
+            isinstance(array, np.ndarray)
+            and array.dtype == np.float64
+            and array.flags.c_contiguous
         )
         require(
-            right and got.shape == expected,
-            promise,
-            f"got {getattr(got, 'dtype', type(got))} {np.shape(got)}",
+            is_plain and array.shape == shape,
+            f"linearize: {name} is a C-contiguous float64 array of shape {shape}",
+            f"got {getattr(array, 'dtype', type(array))} {np.shape(array)}",
         )
-    means = model.linearize(states, inputs, covariance=False)
-    require(
-        means.covariance is None,
-        "linearize: no covariance where it is not wanted",
-        f"got {means.covariance}",
-    )
-    together = model.predict(x, u)
-    mean, A, B, covariance = (torch.from_numpy(getattr(found, name)) for name in shapes)
+    return linearized
+
+
+def _check_against_predict(
+    model: DynamicsModel, points: _Points, linearized: Linearized, batch: Gaussian
+) -> None:
+    """Compares a linearisation with ``predict`` and its finite differences."""
+    assert linearized.covariance is not None
     _check_same(
         "linearize: its mean and covariance are predict's",
-        Gaussian(mean, covariance),
-        together,
-        exact,
+        Gaussian(
+            torch.from_numpy(linearized.mean), torch.from_numpy(linearized.covariance)
+        ),
+        batch,
+        points.exact,
     )
-    differences = _numeric_jacobian(model, x, u)
-    for name, got, expected in (
-        ("A", A, differences[..., :n]),
-        ("B", B, differences[..., n:]),
-    ):
+    n = model.state_dim
+    jacobian = _numeric_jacobian(model, points)
+    numeric = {"A": jacobian[..., :n], "B": jacobian[..., n:]}
+    for name, expected in numeric.items():
         require_close(
             f"linearize: {name} agrees with finite differences of predict",
-            got,
+            torch.from_numpy(getattr(linearized, name)),
             expected,
-            numeric,
+            points.numeric,
         )
-        promise = f"linearize: {name} is the same without the covariance"
-        require_close(promise, torch.from_numpy(getattr(means, name)), got, exact)
-    one = model.linearize(states[1:2], inputs[1:2])
-    for name in shapes:
-        alone = torch.from_numpy(getattr(one, name)[0])
-        among = torch.from_numpy(getattr(found, name)[1])
+
+
+def _check_without_covariance(
+    model: DynamicsModel, points: _Points, linearized: Linearized
+) -> None:
+    """Checks that the derivatives are the same where no covariance is computed."""
+    mean_only = model.linearize(
+        _to_numpy(points.states), _to_numpy(points.inputs), covariance=False
+    )
+    require(
+        mean_only.covariance is None,
+        "linearize: no covariance where it is not wanted",
+        f"got {mean_only.covariance}",
+    )
+    for name in ("A", "B"):
         require_close(
-            f"linearize: K points are the loop over them ({name})", alone, among, exact
+            f"linearize: {name} is the same without the covariance",
+            torch.from_numpy(getattr(mean_only, name)),
+            torch.from_numpy(getattr(linearized, name)),
+            points.exact,
         )
+
+
+def _check_single_point(
+    model: DynamicsModel, points: _Points, linearized: Linearized
+) -> None:
+    """Compares the linearisation at the second point alone with that among others."""
+    alone = model.linearize(
+        _to_numpy(points.states)[1:2], _to_numpy(points.inputs)[1:2]
+    )
+    for name in Linearized._fields:
+        require_close(
+            f"linearize: K points are the loop over them ({name})",
+            torch.from_numpy(getattr(alone, name)[0]),
+            torch.from_numpy(getattr(linearized, name)[1]),
+            points.exact,
+        )
+
+
+def _to_numpy(tensor: Tensor) -> Array:
+    """Copies a tensor into a float64 array."""
+    return tensor.double().cpu().numpy().copy()
 
 
 def _check_belief(
     name: str, model: DynamicsModel, belief: Gaussian, batch: tuple[int, ...]
 ) -> None:
+    """Checks the shapes, type, device and values of a predicted belief."""
     k = model.output_dim
     require(
         isinstance(belief, Gaussian),
         f"{name}: the result is a gpmpc.gaussian.Gaussian",
         f"got {type(belief)}",
     )
-    expected = (*batch, k), (*batch, k, k)
-    got = tuple(belief.mean.shape), tuple(belief.covariance.shape)
-    promise = f"{name}: mean (*batch, k) and covariance (*batch, k, k)"
-    require(got == expected, promise, f"got {got}, should be {expected}")
-    for part in (belief.mean, belief.covariance):
-        right = (
-            part.dtype == model.dtype
-            and part.device == torch.zeros(0, device=model.device).device
+    shapes = (tuple(belief.mean.shape), tuple(belief.covariance.shape))
+    expected_shapes = ((*batch, k), (*batch, k, k))
+    require(
+        shapes == expected_shapes,
+        f"{name}: mean (*batch, k) and covariance (*batch, k, k)",
+        f"got {shapes}, should be {expected_shapes}",
+    )
+    # Of a tensor there, since "cuda" and "cuda:0" differ.
+    model_device = torch.zeros(0, device=model.device).device
+    for tensor in (belief.mean, belief.covariance):
+        require(
+            tensor.dtype == model.dtype and tensor.device == model_device,
+            f"{name}: type and device are the model's, {model.dtype} on {model.device}",
+            f"got {tensor.dtype} on {tensor.device}",
         )
-        promise = (
-            f"{name}: type and device are the model's, {model.dtype} on {model.device}"
-        )
-        require(right, promise, f"got {part.dtype} on {part.device}")
     require(
         bool(torch.isfinite(belief.mean).all()),
         f"{name}: the mean is finite",
@@ -217,30 +302,36 @@ def _check_belief(
 
 
 def _check_same(
-    promise: str, got: Gaussian, expected: Gaussian, tolerance: float
+    promise: str, result: Gaussian, expected: Gaussian, tolerance: float
 ) -> None:
-    require_close(promise, got.mean, expected.mean, tolerance, "the mean")
+    """Raises unless the moments of two beliefs agree."""
+    require_close(promise, result.mean, expected.mean, tolerance, "the mean")
     floor = 1e-4 if tolerance < 1e-6 else 1.0
     require_close(
-        promise, got.covariance, expected.covariance, tolerance, "the covariance", floor
+        promise,
+        result.covariance,
+        expected.covariance,
+        tolerance,
+        "the covariance",
+        floor,
     )
 
 
-def _numeric_jacobian(model: DynamicsModel, x: Tensor, u: Tensor) -> Tensor:
-    """Central differences of the mean by (x, u) (K, k, n + m)."""
-    joint = torch.cat([x, u], dim=1)
+def _numeric_jacobian(model: DynamicsModel, points: _Points) -> Tensor:
+    """Returns central differences of the mean by states and inputs (K, k, n + m)."""
     n = model.state_dim
+    joint = torch.cat([points.states, points.inputs], dim=1)
+    directions = torch.eye(joint.shape[1], dtype=joint.dtype, device=joint.device)
+    root_of_precision = torch.finfo(model.dtype).eps ** (1 / 3)
+
+    def mean(joint: Tensor) -> Tensor:
+        return model.predict(joint[:, :n], joint[:, n:]).mean
+
     columns = []
-    for j in range(joint.shape[1]):
-        size = torch.finfo(model.dtype).eps ** (1 / 3) * max(
-            1.0, float(joint[:, j].abs().max())
-        )
-        shift = (
-            size * torch.eye(joint.shape[1], dtype=joint.dtype, device=joint.device)[j]
-        )
-        above, below = (
-            model.predict(moved[:, :n], moved[:, n:]).mean
-            for moved in (joint + shift, joint - shift)
-        )
+    for j, direction in enumerate(directions):
+        largest = float(joint[:, j].abs().max())
+        size = root_of_precision * max(1.0, largest)
+        above = mean(joint + size * direction)
+        below = mean(joint - size * direction)
         columns.append((above - below) / (2 * size))
     return torch.stack(columns, dim=-1)
