@@ -44,29 +44,39 @@ def check_quadrotor(system: System, trajectory: Trajectory | None) -> Trajectory
     """
     if system.name not in SUBSYSTEMS:
         subsystems = " and ".join(SUBSYSTEMS)
-        what = f"these data are of {subsystems} alone; data=random is of any system"
-        raise SettingError("data", f"{what}; got {system.name!r}")
+        raise SettingError(
+            "data",
+            f"these data are of {subsystems} alone; data=random is of any system; "
+            f"got {system.name!r}",
+        )
     if trajectory is None:
         raise SettingError("trajectory", "these data follow one; got none")
     return trajectory
 
 
 class DataSource(Protocol):
-    """Transitions of a system that follows a trajectory.
-
-    The trajectory is called ``name`` where files are filed under it.
-
-    ``note`` says what a reader has to know who compares results on these data with the
-    paper's. ``check`` raises a ``SettingError`` where there are no such data of the
-    system.
-    """
+    """A source of transitions of a system."""
 
     @property
-    def note(self) -> str: ...
-    def check(self, system: System, trajectory: Trajectory | None) -> None: ...
+    def note(self) -> str:
+        """Remark for readers who compare results on these data with the paper's."""
+        ...
+
+    def check(self, system: System, trajectory: Trajectory | None) -> None:
+        """Raises ``SettingError`` where there are no such data of the system."""
+        ...
+
     def transitions(
         self, system: System, trajectory: Trajectory | None, name: str = ""
-    ) -> Transitions: ...
+    ) -> Transitions:
+        """Records or reads the transitions.
+
+        Args:
+            system: The system.
+            trajectory: What it follows; None where it follows none.
+            name: Of the trajectory, under which files are filed.
+        """
+        ...
 
 
 def check_data(data: Any, **least: int) -> None:
@@ -74,8 +84,8 @@ def check_data(data: Any, **least: int) -> None:
 
     Its numbers must be whole and large enough, and its attitude known.
     """
-    for key, value in least.items():
-        check_number(f"data.{key}", getattr(data, key), least=value, whole=True)
+    for key, lowest in least.items():
+        check_number(f"data.{key}", getattr(data, key), least=lowest, whole=True)
     if getattr(data, "attitude", "exact") not in ATTITUDES:
         raise SettingError(
             "data.attitude",
@@ -85,7 +95,7 @@ def check_data(data: Any, **least: int) -> None:
 
 @dataclass(frozen=True)
 class Tracking:
-    """How one subsystem is flown.
+    """The plant and the weights with which one subsystem is flown.
 
     Raises:
         SettingError: A weight has another length than the plant's states or inputs.
@@ -101,12 +111,11 @@ class Tracking:
         check_numbers("R", self.R, len(self.plant.dynamics.input_names), least=0)
 
     def fly(self, references: np.ndarray, horizon: int, steps: int) -> Rollout:
-        """Unconstrained NMPC from rest along references (steps + horizon, n)."""
+        """Flies unconstrained NMPC from rest along references (steps + horizon, n)."""
         problem = mpc.Problem(mpc.Tracking(self.Q, self.R, penalized="inputs"))
         controller = NMPC(self.plant, problem, horizon, self.initial_input)
-        return closed_loop(
-            self.plant, controller, references, np.zeros(len(self.Q)), steps
-        )
+        at_rest = np.zeros(len(self.Q))
+        return closed_loop(self.plant, controller, references, at_rest, steps)
 
 
 @dataclass(frozen=True)
@@ -140,25 +149,34 @@ class NMPCData:
 
         The rotational subsystem flies the attitude.
         """
-        along = check_quadrotor(system, trajectory)
+        trajectory = check_quadrotor(system, trajectory)
         # Without a time step: a map goes from state to state, whatever the time is.
         signals = Signals(system.state_names, system.input_names)
-        steps = (
-            self.samples + self.horizon
-        )  # the attitude's references reach this far beyond its last step
-        references = np.zeros(
-            (steps + self.horizon, 6)
-        )  # the velocities are asked to be zero, with little weight
-        references[:, ::2] = along(
-            self.translational.plant.time_step * np.arange(len(references))
-        )  # x, y, z
-        outer = self.translational.fly(references, self.horizon, steps)
+        outer_flight = self._fly_trajectory(trajectory)
         if system.name == "translational":
-            return _transitions(outer, self.samples, signals)
-        references = np.zeros((steps, 6))  # psi and the rates are to be zero
-        references[:, [0, 2]] = _attitudes(outer, self.attitude)
-        inner = self.rotational.fly(references, self.horizon, self.samples)
-        return _transitions(inner, self.samples, signals)
+            return _transitions(outer_flight, self.samples, signals)
+        inner_flight = self._fly_attitudes(outer_flight)
+        return _transitions(inner_flight, self.samples, signals)
+
+    def _fly_trajectory(self, trajectory: Trajectory) -> Rollout:
+        """Flies the translational subsystem, as long as attitudes of it are needed.
+
+        The references of the last attitudes reach a horizon beyond the last step.
+        """
+        steps = self.samples + self.horizon
+        times = self.translational.plant.time_step * np.arange(steps + self.horizon)
+        # The velocities are asked to be zero, with little weight.
+        references = np.zeros((len(times), 6))
+        references[:, [0, 2, 4]] = trajectory(times)  # x, y, z
+        return self.translational.fly(references, self.horizon, steps)
+
+    def _fly_attitudes(self, outer_flight: Rollout) -> Rollout:
+        """Flies the rotational subsystem along the attitudes of a flight."""
+        angles = _attitudes(outer_flight, self.attitude)
+        # Yaw and the rates are to be zero.
+        references = np.zeros((len(angles), 6))
+        references[:, [0, 2]] = angles  # roll, pitch
+        return self.rotational.fly(references, self.horizon, self.samples)
 
 
 @dataclass(frozen=True)
@@ -185,11 +203,12 @@ class PaperData:
     ) -> Transitions:
         """Reads one file.
 
-        Raises ``DataError`` if it is missing, malformed, or shorter than ``samples``.
+        Raises:
+            DataError: It is missing, malformed, or shorter than ``samples``.
         """
         self.check(system, trajectory)
-        part = {"translational": "trans", "rotational": "rotate"}[system.name]
-        path = Path(self.folder) / f"ds_nmpc_{name.capitalize()}_{part}.txt"
+        suffix = {"translational": "trans", "rotational": "rotate"}[system.name]
+        path = Path(self.folder) / f"ds_nmpc_{name.capitalize()}_{suffix}.txt"
         data = Transitions.from_text(path)
         if len(data) < self.samples:
             raise DataError(
@@ -200,13 +219,10 @@ class PaperData:
 
 
 def _transitions(flight: Rollout, samples: int, signals: Signals) -> Transitions:
-    """The first transitions of a flight."""
-    return Transitions(
-        flight.states[:samples],
-        flight.inputs[:samples],
-        flight.states[1 : samples + 1],
-        signals,
-    )
+    """Returns the first transitions of a flight."""
+    states = flight.states[:samples]
+    next_states = flight.states[1 : samples + 1]
+    return Transitions(states, flight.inputs[:samples], next_states, signals)
 
 
 def _attitudes(flight: Rollout, convention: str) -> np.ndarray:
@@ -228,47 +244,35 @@ class Excitation:
 
     Q: Sequence[float]  #: state weights, the diagonal (n,)
     R: Sequence[float]  #: weights of the inputs' increments, the diagonal (m,)
-    initial_input: Sequence[
-        float
-    ]  #: first guess of the solver, and the input before the first (m,)
-    dither: Sequence[
-        float
-    ]  #: standard deviation of what is added to the inputs (m,), in their units
-    noise: Sequence[
-        float
-    ]  #: standard deviation of what is added to every next state (n,), in their units
+    #: first guess of the solver, and the input before the first (m,)
+    initial_input: Sequence[float]
+    #: standard deviation of what is added to the inputs (m,), in their units
+    dither: Sequence[float]
+    #: standard deviation of what is added to every next state (n,), in their units
+    noise: Sequence[float]
     horizon: int = 1  #: of the NMPC
 
     def __post_init__(self) -> None:
-        for key, length in (
-            ("Q", 6),
-            ("noise", 6),
-            ("R", 3),
-            ("initial_input", 3),
-            ("dither", 3),
-        ):
-            check_numbers(
-                key,
-                getattr(self, key),
-                length,
-                **({} if key == "initial_input" else {"least": 0}),
-            )
+        check_numbers("Q", self.Q, 6, least=0)
+        check_numbers("noise", self.noise, 6, least=0)
+        check_numbers("R", self.R, 3, least=0)
+        check_numbers("initial_input", self.initial_input, 3)
+        check_numbers("dither", self.dither, 3, least=0)
         check_number("horizon", self.horizon, least=1, whole=True)
 
     def fly(
         self, system: System, references: np.ndarray, steps: int, seed: int
     ) -> Rollout:
-        """From the first of the references (steps + horizon, n) on."""
+        """Flies along references (steps + horizon, n), from the first of them on."""
         problem = mpc.Problem(mpc.Tracking(self.Q, self.R))
         controller = NMPC(system, problem, self.horizon, self.initial_input)
-        noise = Noise(process=self.noise, input=self.dither)
         return closed_loop(
             system,
             controller,
             references,
             references[0],
             steps,
-            noise=noise,
+            noise=Noise(process=self.noise, input=self.dither),
             seed=seed,
             on_failure="previous_plan",
         )
@@ -289,9 +293,8 @@ class ExcitedData:
     samples: int = 189  #: transitions of either
     hold: int = 10  #: inner steps that an attitude is asked for
     response_time: float = 0.1  #: of the approach to it [s]
-    attitude: str = (
-        "exact"  #: how thrust direction becomes attitude: ``"exact"`` or ``"paper"``
-    )
+    #: how thrust direction becomes attitude: ``"exact"`` or ``"paper"``
+    attitude: str = "exact"
     seed: int = 0  #: of dither, noise and the order of the attitudes
 
     note = (
@@ -314,24 +317,36 @@ class ExcitedData:
         ``translational()``.
         """
         self.check(system, trajectory)
-        outer = system if system.name == "translational" else translational()
+        if system.name == "translational":
+            flight = self._fly_trajectory(system, trajectory)
+        else:
+            outer_flight = self._fly_trajectory(translational(), trajectory)
+            flight = self._fly_attitudes(system, outer_flight)
+        return _transitions(flight, self.samples, system.signals)
+
+    def _fly_trajectory(self, outer: System, trajectory: Trajectory | None) -> Rollout:
+        """Flies the translational subsystem along the trajectory."""
         references = outer.reference_states(
             trajectory, self.samples + self.translational.horizon
         )
-        flight = self.translational.fly(outer, references, self.samples, self.seed)
-        if system is outer:
-            return _transitions(flight, self.samples, system.signals)
-        streams = np.random.SeedSequence([self.seed, SUBSYSTEMS.index("rotational")])
-        angles = _attitudes(flight, self.attitude)
-        count = self.samples + self.rotational.horizon
-        chosen = angles[
-            np.random.default_rng(streams).integers(
-                len(angles), size=-(-count // self.hold)
-            )
-        ]
+        return self.translational.fly(outer, references, self.samples, self.seed)
+
+    def _fly_attitudes(self, inner: System, outer_flight: Rollout) -> Rollout:
+        """Flies the rotational subsystem along attitudes of a flight, drawn at random.
+
+        Their order and the flight's noise have streams of random numbers of their own.
+        """
+        seeds = np.random.SeedSequence([self.seed, SUBSYSTEMS.index("rotational")])
+        angles = _attitudes(outer_flight, self.attitude)
+        reference_count = self.samples + self.rotational.horizon
+        attitude_count = -(-reference_count // self.hold)  # rounded up
+        order = np.random.default_rng(seeds).integers(len(angles), size=attitude_count)
         references = approach_attitudes(
-            chosen, count, self.hold, system.time_step, self.response_time
+            angles[order],
+            reference_count,
+            self.hold,
+            inner.time_step,
+            self.response_time,
         )
-        seed = int(streams.generate_state(1)[0])
-        inner = self.rotational.fly(system, references, self.samples, seed)
-        return _transitions(inner, self.samples, system.signals)
+        flight_seed = int(seeds.generate_state(1)[0])
+        return self.rotational.fly(inner, references, self.samples, flight_seed)

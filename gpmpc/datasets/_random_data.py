@@ -5,6 +5,7 @@ Data of any system, without a controller.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -90,51 +91,80 @@ class RandomData:
         """
         self.check(system, trajectory)
         random = np.random.default_rng(self.seed)
-        lower = np.array(system.input_lower)
-        upper = np.array(system.input_upper)
-        middle = (
-            (lower + upper) / 2
-            if self.around == "middle"
-            else np.array(system.initial_input)
-        )
-        half = self.amplitude * (upper - lower) / 2
-        centre = 0.0
-        reach = np.finfo(float).max
-        if system.region is not None:
-            low, high = np.array(system.region)
-            centre = (low + high) / 2
-            reach = 1.5 * (high - low)
-        rows: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+        steps: list[_Step] = []
         for _ in range(100 + 2 * self.samples):
-            state = self._start(system, random)
-            input = middle
-            for k in range(min(self.episode, self.samples - len(rows))):
-                if k % self.hold == 0:
-                    input = np.clip(middle + random.uniform(-half, half), lower, upper)
-                with np.errstate(over="ignore", invalid="ignore"):
-                    after = step(system, state, input)
-                after = (
-                    after
-                    if self.noise is None
-                    else after + random.normal(0, 1, len(after)) * self.noise
+            length = min(self.episode, self.samples - len(steps))
+            steps += self._episode(system, length, random)
+            if len(steps) == self.samples:
+                return Transitions(
+                    np.array([step.state for step in steps]),
+                    np.array([step.input for step in steps]),
+                    np.array([step.next_state for step in steps]),
+                    system.signals,
                 )
-                if not (np.abs(after - centre) <= reach).all():
-                    break
-                rows.append((state, input, after))
-                if getattr(system.dynamics, "ended", False):
-                    break
-                state = after
-            if len(rows) == self.samples:
-                states, inputs, after = map(np.array, zip(*rows, strict=True))
-                return Transitions(states, inputs, after, system.signals)
         raise DataError(
-            f"{system.name}: only {len(rows)} of {self.samples} random steps "
+            f"{system.name}: only {len(steps)} of {self.samples} random steps "
             "stayed near the region"
         )
 
+    def _episode(
+        self, system: System, length: int, random: np.random.Generator
+    ) -> list["_Step"]:
+        """Steps the system from a start, until it ends or leaves the region."""
+        state = self._start(system, random)
+        input = self._middle_input(system)
+        steps: list[_Step] = []
+        for k in range(length):
+            if k % self.hold == 0:
+                input = self._random_input(system, random)
+            with np.errstate(over="ignore", invalid="ignore"):
+                next_state = step(system, state, input)
+            if self.noise is not None:
+                next_state = next_state + random.normal(0, 1, len(state)) * self.noise
+            if not _is_near_region(system, next_state):
+                break
+            steps.append(_Step(state=state, input=input, next_state=next_state))
+            if getattr(system.dynamics, "ended", False):
+                break
+            state = next_state
+        return steps
+
     def _start(self, system: System, random: np.random.Generator) -> np.ndarray:
+        """Returns the state where an episode starts (n,)."""
         if system.stateful:
             return system.dynamics.reset(int(random.integers(2**31)))
         if self.starts == "start":
             return np.array(system.goal if system.start is None else system.start)
-        return random.uniform(*system.region)
+        low, high = system.region
+        return random.uniform(low, high)
+
+    def _middle_input(self, system: System) -> np.ndarray:
+        """Returns what the inputs are drawn about (m,)."""
+        if self.around == "initial_input":
+            return np.array(system.initial_input)
+        return (np.array(system.input_lower) + np.array(system.input_upper)) / 2
+
+    def _random_input(self, system: System, random: np.random.Generator) -> np.ndarray:
+        """Draws an input (m,)."""
+        lower = np.array(system.input_lower)
+        upper = np.array(system.input_upper)
+        half_width = self.amplitude * (upper - lower) / 2
+        offset = random.uniform(-half_width, half_width)
+        return np.clip(self._middle_input(system) + offset, lower, upper)
+
+
+class _Step(NamedTuple):
+    """A transition, as it is recorded."""
+
+    state: np.ndarray  # (n,)
+    input: np.ndarray  # (m,)
+    next_state: np.ndarray  # (n,)
+
+
+def _is_near_region(system: System, state: np.ndarray) -> bool:
+    """Whether a state is finite, and at most as far outside as the region is wide."""
+    if system.region is None:
+        return bool((np.abs(state) <= np.finfo(float).max).all())
+    low, high = np.array(system.region)
+    centre = (low + high) / 2
+    return bool((np.abs(state - centre) <= 1.5 * (high - low)).all())

@@ -1,19 +1,22 @@
 """Check of a QP solver of your own: ``check_qp_solver``."""
 
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from gpmpc.qp import QPSolution, QPSolver, QuadraticProgram
 from gpmpc.status import Status
 from gpmpc.testing._promise import require
 
 _INF = np.inf
-_FIELDS = ("P", "q", "G", "h_lower", "h_upper", "lb", "ub")
+_ARRAYS = ("P", "q", "G", "h_lower", "h_upper", "lb", "ub")
+
+_WarmStart = QPSolution | np.ndarray | None
 
 
-class _Known(NamedTuple):
+class _SolvedProblem(NamedTuple):
     """A problem with its minimiser.
 
     The multipliers ``[z_box; z]`` are None if they are not unique.
@@ -21,8 +24,8 @@ class _Known(NamedTuple):
 
     name: str
     problem: QuadraticProgram
-    x: Any
-    multipliers: Any = None
+    x: ArrayLike
+    multipliers: ArrayLike | None = None
 
 
 def check_qp_solver(solver: QPSolver, tolerance: float = 1e-6) -> None:
@@ -37,133 +40,276 @@ def check_qp_solver(solver: QPSolver, tolerance: float = 1e-6) -> None:
         AssertionError: The solver breaks a promise; the message says which, on which
             problem.
     """
-    for known in (*_small(), *_constructed()):
-        solution = _solve(solver, known.name, known.problem, None)
-        _check(solution, known, tolerance)
-        first = solution.x.copy()
-        n = len(solution.x)
-        right = solution.active_set
-        solver.solve(QuadraticProgram(2.0 * np.eye(n), np.ones(n)))
-        require(
-            np.array_equal(first, solution.x),
-            known.name,
-            "a later solve changed an earlier solution",
-        )
-        starts = {
-            "its own solution": solution,
-            "the right active set": right,
-            "the opposite active set": -right,
-            "everything at the upper bounds": np.ones(len(known.problem.lower)),
-            "everything at the lower bounds": -np.ones(len(known.problem.lower)),
-        }
-        for kind, warm_start in starts.items():
-            again = _solve(solver, known.name, known.problem, warm_start)
-            _check(
-                again,
-                known._replace(name=f"{known.name}, warm-started from {kind}"),
-                tolerance,
-            )
-        awkward = _solve(solver, known.name, _awkward(known.problem), None)
-        _check(
-            awkward,
-            known._replace(name=f"{known.name}, in Fortran order and strided"),
+    for reference in (*_solved_by_hand(), *_constructed()):
+        solution = _solve(solver, reference.name, reference.problem, None)
+        _check_solution(solution, reference, tolerance)
+        _check_independence(solver, reference.name, solution)
+        _check_warm_starts(solver, reference, solution, tolerance)
+        _check_layout(solver, reference, tolerance)
+    for name, problem in _infeasible().items():
+        _check_infeasible(solver, name, problem)
+
+
+def _check_solution(
+    solution: QPSolution, reference: _SolvedProblem, tolerance: float
+) -> None:
+    """Compares a solution with the known one, and its residuals with the tolerance."""
+    require(
+        solution.status is Status.SOLVED,
+        reference.name,
+        f"expected SOLVED, got {solution.status.name}",
+    )
+    _check_array(reference.name, "x", solution.x, reference.x, tolerance)
+    if reference.multipliers is not None:
+        multipliers = np.concatenate([solution.z_box, solution.z])
+        _check_array(
+            reference.name,
+            "[z_box; z]",
+            multipliers,
+            reference.multipliers,
             tolerance,
         )
-    for name, problem in _infeasible().items():
-        for warm_start in (
-            None,
-            np.ones(len(problem.lower)),
-            -np.ones(len(problem.lower)),
-        ):
-            status = _solve(solver, name, problem, warm_start).status
-            require(
-                status is Status.INFEASIBLE,
-                name,
-                f"expected INFEASIBLE, got {status.name}",
-            )
+    for kind, residual in solution.residuals()._asdict().items():
+        require(
+            residual <= tolerance,
+            reference.name,
+            f"the {kind} residual is {residual:.1e}, above {tolerance:.1e}",
+        )
 
 
-def _small() -> list[_Known]:
-    """Returns problems that can be solved by hand.
+def _check_array(
+    problem_name: str,
+    name: str,
+    result: np.ndarray,
+    expected: ArrayLike,
+    tolerance: float,
+) -> None:
+    """Compares an array with the known one, relative to its largest entry."""
+    difference = np.abs(result - np.asarray(expected)).max()
+    error = difference / max(1.0, np.abs(expected).max())
+    require(
+        error <= tolerance, problem_name, f"{name} is {result}, should be {expected}"
+    )
 
-    Some have more active constraints than variables, or repeat rows.
-    """
+
+def _check_independence(solver: QPSolver, name: str, solution: QPSolution) -> None:
+    """Checks that another solve leaves an earlier solution as it is."""
+    before = solution.x.copy()
+    n = len(before)
+    solver.solve(QuadraticProgram(2.0 * np.eye(n), np.ones(n)))
+    require(
+        np.array_equal(before, solution.x),
+        name,
+        "a later solve changed an earlier solution",
+    )
+
+
+def _check_warm_starts(
+    solver: QPSolver,
+    reference: _SolvedProblem,
+    solution: QPSolution,
+    tolerance: float,
+) -> None:
+    """Checks that every warm start leads to the solution."""
+    active_set = solution.active_set
+    constraint_count = len(reference.problem.lower)
+    warm_starts: dict[str, _WarmStart] = {
+        "its own solution": solution,
+        "the right active set": active_set,
+        "the opposite active set": -active_set,
+        "everything at the upper bounds": np.ones(constraint_count),
+        "everything at the lower bounds": -np.ones(constraint_count),
+    }
+    for kind, warm_start in warm_starts.items():
+        warm_solution = _solve(solver, reference.name, reference.problem, warm_start)
+        name = f"{reference.name}, warm-started from {kind}"
+        _check_solution(warm_solution, reference._replace(name=name), tolerance)
+
+
+def _check_layout(
+    solver: QPSolver, reference: _SolvedProblem, tolerance: float
+) -> None:
+    """Checks that arrays that are not contiguous lead to the solution."""
+    solution = _solve(solver, reference.name, _awkward(reference.problem), None)
+    name = f"{reference.name}, in Fortran order and strided"
+    _check_solution(solution, reference._replace(name=name), tolerance)
+
+
+def _check_infeasible(solver: QPSolver, name: str, problem: QuadraticProgram) -> None:
+    """Checks that a problem without a solution is called infeasible."""
+    upper = np.ones(len(problem.lower))
+    for warm_start in (None, upper, -upper):
+        status = _solve(solver, name, problem, warm_start).status
+        require(
+            status is Status.INFEASIBLE, name, f"expected INFEASIBLE, got {status.name}"
+        )
+
+
+def _solve(
+    solver: QPSolver, name: str, problem: QuadraticProgram, warm_start: _WarmStart
+) -> QPSolution:
+    """Solves, and raises where the solver changed its arguments."""
+    arrays = _argument_arrays(problem, warm_start)
+    before = {argument: array.copy() for argument, array in arrays.items()}
+    solution = solver.solve(problem, warm_start)
+    for argument, array in _argument_arrays(problem, warm_start).items():
+        require(
+            np.array_equal(before[argument], array),
+            name,
+            f"the solver modified {argument}",
+        )
+    return solution
+
+
+def _argument_arrays(
+    problem: QuadraticProgram, warm_start: _WarmStart
+) -> dict[str, np.ndarray]:
+    """Returns the arrays that a solver is given, by their names in messages."""
+    arrays = {name: getattr(problem, name) for name in _ARRAYS}
+    if isinstance(warm_start, np.ndarray):
+        arrays["the warm start"] = warm_start
+    return arrays
+
+
+def _awkward(problem: QuadraticProgram) -> QuadraticProgram:
+    """Copies P into Fortran order, and other arrays into a part of larger ones."""
+    return QuadraticProgram(
+        P=np.asfortranarray(problem.P),
+        q=_strided(problem.q),
+        G=_strided(problem.G),
+        h_lower=_strided(problem.h_lower),
+        h_upper=_strided(problem.h_upper),
+        lb=_strided(problem.lb),
+        ub=_strided(problem.ub),
+    )
+
+
+def _strided(array: np.ndarray) -> np.ndarray:
+    """Copies an array into every other element of a larger one."""
+    return np.repeat(array, 2, axis=-1)[..., ::2]
+
+
+def _solved_by_hand() -> list[_SolvedProblem]:
+    """Returns problems that can be solved by hand."""
+    return [*_textbook_problems(), *_degenerate_problems()]
+
+
+def _textbook_problems() -> list[_SolvedProblem]:
+    """Returns problems with unique multipliers."""
     book = "Nocedal and Wright, Numerical Optimization (2006), example"
-    centre = np.array([3.0, -0.5, -7.0])
-    P = [[6.0, 2.0, 1.0], [2.0, 5.0, 2.0], [1.0, 2.0, 4.0]]
-    G = [[1.0, 0.0, 1.0], [0.0, 1.0, 1.0]]
-    equalities = QuadraticProgram(P, [-8.0, -3.0, -3.0], G, [3.0, 0.0], [3.0, 0.0])
-    rows = [[-1.0, 2.0], [1.0, 2.0], [1.0, -2.0]]
-    lower = [-_INF, -1e30, -_INF]
-    upper = [2.0, 6.0, 2.0]
-    inequalities = QuadraticProgram(
-        2.0 * np.eye(2), [-2.0, -5.0], rows, lower, upper, lb=[0.0, 0.0]
-    )
-    box = QuadraticProgram(
-        np.eye(3), -centre, lb=[-1.0, -1.0, -1.0], ub=[1.0, 1.0, 1e20]
-    )
-    redundant = QuadraticProgram(
-        [[2.0]], [-4.0], [[1.0], [2.0]], [-_INF, -_INF], [1.5, 2.0]
-    )
-    fan = np.array([[np.cos(a), np.sin(a)] for a in np.linspace(0.1, 1.4, 7)])
-    apex = np.array([1.0, 2.0])
-    lines = QuadraticProgram(
-        np.diag([1.0, 3.0]), [-9.0, -20.0], fan, np.full(7, -_INF), fan @ apex
-    )
-    rows = np.outer([1.0, 1e-4, 1e4, 1.0, -3.0], [1.0, 1.0])
-    scales = QuadraticProgram(
-        np.eye(2), [-2.0, -2.0], rows, [-_INF] * 4 + [-3.0], [1.0, 1e-4, 1e4, 1.0, _INF]
-    )
-    zero = QuadraticProgram(
-        np.eye(2),
-        [-2.0, 0.0],
-        [[0.0, 0.0], [1.0, 0.0]],
-        [0.0, -1.0],
-        [0.0, 1.0],
-        ub=[1.0, 1.0],
-    )
-    rows = [[1.0, 1.0], [1.0, -1.0], [2.0, 0.0]]
-    equal = QuadraticProgram(
-        np.eye(2), [5.0, -5.0], rows, [3.0, 1.0, 4.0], [3.0, 1.0, 4.0]
-    )
     return [
-        _Known(
-            "no constraints",
-            QuadraticProgram(np.diag([2.0, 4.0]), [-2.0, -8.0]),
-            [1.0, 2.0],
-            [0.0, 0.0],
+        _SolvedProblem(
+            name="no constraints",
+            problem=QuadraticProgram(np.diag([2.0, 4.0]), [-2.0, -8.0]),
+            x=[1.0, 2.0],
+            multipliers=[0.0, 0.0],
         ),
-        _Known("projection on a box", box, [1.0, -0.5, -1.0], [2.0, 0.0, -6.0]),
-        _Known(
-            f"{book} 16.2 (equalities)",
-            equalities,
-            [2.0, -1.0, 1.0],
-            [0.0, 0.0, 0.0, -3.0, 2.0],
+        _SolvedProblem(
+            name="projection on a box",
+            problem=QuadraticProgram(
+                np.eye(3),
+                [-3.0, 0.5, 7.0],
+                lb=[-1.0, -1.0, -1.0],
+                ub=[1.0, 1.0, 1e20],
+            ),
+            x=[1.0, -0.5, -1.0],
+            multipliers=[2.0, 0.0, -6.0],
         ),
-        _Known(
-            f"{book} 16.4 (inequalities)",
-            inequalities,
-            [1.4, 1.7],
-            [0.0, 0.0, 0.8, 0.0, 0.0],
+        _SolvedProblem(
+            name=f"{book} 16.2 (equalities)",
+            problem=QuadraticProgram(
+                [[6.0, 2.0, 1.0], [2.0, 5.0, 2.0], [1.0, 2.0, 4.0]],
+                [-8.0, -3.0, -3.0],
+                [[1.0, 0.0, 1.0], [0.0, 1.0, 1.0]],
+                h_lower=[3.0, 0.0],
+                h_upper=[3.0, 0.0],
+            ),
+            x=[2.0, -1.0, 1.0],
+            multipliers=[0.0, 0.0, 0.0, -3.0, 2.0],
         ),
-        _Known(
-            "one variable, one redundant and one active row",
-            redundant,
-            [1.0],
-            [0.0, 0.0, 1.0],
+        _SolvedProblem(
+            name=f"{book} 16.4 (inequalities)",
+            problem=QuadraticProgram(
+                2.0 * np.eye(2),
+                [-2.0, -5.0],
+                [[-1.0, 2.0], [1.0, 2.0], [1.0, -2.0]],
+                h_lower=[-_INF, -1e30, -_INF],
+                h_upper=[2.0, 6.0, 2.0],
+                lb=[0.0, 0.0],
+            ),
+            x=[1.4, 1.7],
+            multipliers=[0.0, 0.0, 0.8, 0.0, 0.0],
         ),
-        _Known("seven lines through the solution", lines, apex),
-        _Known("the same row five times, at five scales", scales, [0.5, 0.5]),
-        _Known("a zero row, and a row that repeats the box", zero, [1.0, 0.0]),
-        _Known(
-            "equalities that repeat each other and fix every variable",
-            equal,
-            [2.0, 1.0],
+        _SolvedProblem(
+            name="one variable, one redundant and one active row",
+            problem=QuadraticProgram(
+                [[2.0]],
+                [-4.0],
+                [[1.0], [2.0]],
+                h_lower=[-_INF, -_INF],
+                h_upper=[1.5, 2.0],
+            ),
+            x=[1.0],
+            multipliers=[0.0, 0.0, 1.0],
         ),
     ]
 
 
-def _constructed(count: int = 12) -> Iterator[_Known]:
+def _degenerate_problems() -> list[_SolvedProblem]:
+    """Returns problems whose active constraints depend on each other."""
+    angles = np.linspace(0.1, 1.4, 7)
+    lines = np.column_stack([np.cos(angles), np.sin(angles)])
+    apex = np.array([1.0, 2.0])
+    return [
+        _SolvedProblem(
+            name="seven lines through the solution",
+            problem=QuadraticProgram(
+                np.diag([1.0, 3.0]),
+                [-9.0, -20.0],
+                lines,
+                h_lower=np.full(7, -_INF),
+                h_upper=lines @ apex,
+            ),
+            x=apex,
+        ),
+        _SolvedProblem(
+            name="the same row five times, at five scales",
+            problem=QuadraticProgram(
+                np.eye(2),
+                [-2.0, -2.0],
+                np.outer([1.0, 1e-4, 1e4, 1.0, -3.0], [1.0, 1.0]),
+                h_lower=[-_INF, -_INF, -_INF, -_INF, -3.0],
+                h_upper=[1.0, 1e-4, 1e4, 1.0, _INF],
+            ),
+            x=[0.5, 0.5],
+        ),
+        _SolvedProblem(
+            name="a zero row, and a row that repeats the box",
+            problem=QuadraticProgram(
+                np.eye(2),
+                [-2.0, 0.0],
+                [[0.0, 0.0], [1.0, 0.0]],
+                h_lower=[0.0, -1.0],
+                h_upper=[0.0, 1.0],
+                ub=[1.0, 1.0],
+            ),
+            x=[1.0, 0.0],
+        ),
+        _SolvedProblem(
+            name="equalities that repeat each other and fix every variable",
+            problem=QuadraticProgram(
+                np.eye(2),
+                [5.0, -5.0],
+                [[1.0, 1.0], [1.0, -1.0], [2.0, 0.0]],
+                h_lower=[3.0, 1.0, 4.0],
+                h_upper=[3.0, 1.0, 4.0],
+            ),
+            x=[2.0, 1.0],
+        ),
+    ]
+
+
+def _constructed(count: int = 12) -> Iterator[_SolvedProblem]:
     """Returns random problems with a chosen minimiser, active set and multipliers.
 
     They are built backwards from these; the multipliers are unique.
@@ -176,7 +322,7 @@ def _constructed(count: int = 12) -> Iterator[_Known]:
         P = root @ root.T + np.eye(n)
         G = rng.standard_normal((m, n))
         x = rng.standard_normal(n)
-        C = np.vstack([np.eye(n), G])
+        C = np.vstack([np.eye(n), G])  # rows of the box, then those of G
         active = rng.choice(n + m, size=int(rng.integers(0, n)), replace=False)
         sides = rng.choice([-1.0, 1.0], size=len(active))
         multipliers = np.zeros(n + m)
@@ -187,89 +333,49 @@ def _constructed(count: int = 12) -> Iterator[_Known]:
         lower = C @ x - below
         upper = C @ x + above
         q = -P @ x - C.T @ multipliers
-        problem = QuadraticProgram(P, q, G, lower[n:], upper[n:], lower[:n], upper[:n])
-        yield _Known(
-            f"constructed problem {number} (n = {n}, m = {m})", problem, x, multipliers
+        yield _SolvedProblem(
+            name=f"constructed problem {number} (n = {n}, m = {m})",
+            problem=QuadraticProgram(
+                P=P,
+                q=q,
+                G=G,
+                h_lower=lower[n:],
+                h_upper=upper[n:],
+                lb=lower[:n],
+                ub=upper[:n],
+            ),
+            x=x,
+            multipliers=multipliers,
         )
 
 
 def _infeasible() -> dict[str, QuadraticProgram]:
-    """Problems that no point satisfies."""
-    eye = np.eye(2)
-    rows = [[1.0, 0.0], [0.0, 1.0], [1.0, 1.0]]
-    sides = [1.0, 1.0, 3.0]
+    """Returns problems that no point satisfies."""
     return {
         "two opposite rows": QuadraticProgram(
-            eye, [0.0, 0.0], [[1.0, 1.0], [-1.0, -1.0]], [-_INF, -_INF], [1.0, -2.0]
+            np.eye(2),
+            [0.0, 0.0],
+            [[1.0, 1.0], [-1.0, -1.0]],
+            h_lower=[-_INF, -_INF],
+            h_upper=[1.0, -2.0],
         ),
         "a row against the box": QuadraticProgram(
-            eye, [1.0, -3.0], [[1.0, 2.0]], [4.0], [_INF], [-1, -1], [1.0, 1.0]
+            np.eye(2),
+            [1.0, -3.0],
+            [[1.0, 2.0]],
+            h_lower=[4.0],
+            h_upper=[_INF],
+            lb=[-1.0, -1.0],
+            ub=[1.0, 1.0],
         ),
         "a zero row that should be one": QuadraticProgram(
-            np.eye(3), np.ones(3), np.zeros((1, 3)), [1.0], [1.0]
+            np.eye(3), np.ones(3), np.zeros((1, 3)), h_lower=[1.0], h_upper=[1.0]
         ),
         "three equalities in two variables": QuadraticProgram(
-            eye, [0.0, 0.0], rows, sides, sides
+            np.eye(2),
+            [0.0, 0.0],
+            [[1.0, 0.0], [0.0, 1.0], [1.0, 1.0]],
+            h_lower=[1.0, 1.0, 3.0],
+            h_upper=[1.0, 1.0, 3.0],
         ),
     }
-
-
-def _solve(
-    solver: QPSolver, name: str, problem: QuadraticProgram, warm_start: Any
-) -> QPSolution:
-    """Solves, and raises where the solver changed its arguments."""
-    before = {field: getattr(problem, field).copy() for field in _FIELDS}
-    guess = warm_start.copy() if isinstance(warm_start, np.ndarray) else None
-    solution = solver.solve(problem, warm_start)
-    for field, array in before.items():
-        require(
-            np.array_equal(array, getattr(problem, field)),
-            name,
-            f"the solver modified {field}",
-        )
-    require(
-        guess is None or np.array_equal(guess, warm_start),
-        name,
-        "the solver modified the warm start",
-    )
-    return solution
-
-
-def _awkward(problem: QuadraticProgram) -> QuadraticProgram:
-    """Copies a problem into every other element of larger arrays.
-
-    P is copied into Fortran order.
-    """
-
-    def strided(array: np.ndarray) -> np.ndarray:
-        return np.repeat(array, 2, axis=-1)[..., ::2]
-
-    return QuadraticProgram(
-        np.asfortranarray(problem.P),
-        *(strided(getattr(problem, field)) for field in _FIELDS[1:]),
-    )
-
-
-def _check(solution: QPSolution, known: _Known, tolerance: float) -> None:
-    require(
-        solution.status is Status.SOLVED,
-        known.name,
-        f"expected SOLVED, got {solution.status.name}",
-    )
-    parts = {"x": (solution.x, known.x)}
-    if known.multipliers is not None:
-        parts["[z_box; z]"] = (
-            np.concatenate([solution.z_box, solution.z]),
-            known.multipliers,
-        )
-    for name, (got, expected) in parts.items():
-        error = np.abs(got - expected).max() / max(1.0, np.abs(expected).max())
-        require(
-            error <= tolerance, known.name, f"{name} is {got}, should be {expected}"
-        )
-    for kind, value in solution.residuals()._asdict().items():
-        require(
-            value <= tolerance,
-            known.name,
-            f"the {kind} residual is {value:.1e}, above {tolerance:.1e}",
-        )
