@@ -25,10 +25,12 @@ from gpmpc._trust import (
 )
 from gpmpc.exceptions import DataError
 
-_LONGEST = 2**16  # characters of all settings, of which a flight's own have about 3000
-_LONGEST_TEXT = 5000  # characters of one entry
-_MOST = 4000  # entries, each a value, a list or a dictionary; a flight has about 200
-_DEEPEST = 20  # lists and dictionaries inside each other
+# Of all settings; those of a flight have about 3000.
+_MOST_CHARACTERS = 2**16
+_MOST_ENTRY_CHARACTERS = 5000
+# An entry is a value, a list or a dictionary; a flight has about 200.
+_MOST_ENTRIES = 4000
+_MOST_LEVELS = 20  # lists and dictionaries inside each other
 _MARKS = ("_target_", "_partial_", "_args_", "_recursive_", "_convert_")
 _LOOKUPS = tuple(  # code by its ``path``
     f"hydra.utils.get_{kind}" for kind in ("class", "method", "object", "static_method")
@@ -43,8 +45,8 @@ def read_settings(text: str) -> dict[str, Any]:
         DataError: They are no YAML of names and values, too long or too deep, or hold
             an alias, a tag or an interpolation.
     """
-    if len(text) > _LONGEST:
-        raise DataError(f"its settings are longer than {_LONGEST} characters")
+    if len(text) > _MOST_CHARACTERS:
+        raise DataError(f"its settings are longer than {_MOST_CHARACTERS} characters")
     try:
         _check_yaml(text)
         settings = OmegaConf.to_container(OmegaConf.create(text))
@@ -63,8 +65,8 @@ def _check_yaml(text: str) -> None:
     depth = entries = 0
     for event in yaml.parse(text, Loader=yaml.SafeLoader):
         entries += isinstance(event, yaml.NodeEvent)
-        if entries > _MOST:
-            raise DataError(f"its settings hold more than {_MOST} entries")
+        if entries > _MOST_ENTRIES:
+            raise DataError(f"its settings hold more than {_MOST_ENTRIES} entries")
         if isinstance(event, yaml.AliasEvent):
             raise DataError("its settings hold a YAML alias, which no flight's do")
         if getattr(event, "tag", None) is not None:
@@ -79,13 +81,15 @@ def _check_yaml(text: str) -> None:
                     "its settings hold an interpolation, ${...}; those of a flight are "
                     "resolved"
                 )
-            if len(event.value) > _LONGEST_TEXT:
+            if len(event.value) > _MOST_ENTRY_CHARACTERS:
                 raise DataError(
                     "its settings hold an entry of more than "
-                    f"{_LONGEST_TEXT} characters"
+                    f"{_MOST_ENTRY_CHARACTERS} characters"
                 )
-        if depth > _DEEPEST:
-            raise DataError(f"its settings are nested deeper than {_DEEPEST} levels")
+        if depth > _MOST_LEVELS:
+            raise DataError(
+                f"its settings are nested deeper than {_MOST_LEVELS} levels"
+            )
 
 
 def checked_settings(settings: Any, trusted: Sequence[str]) -> Any:
@@ -128,7 +132,7 @@ class _Call:
 
 
 def _with_trust(node: Any, trusted: Sequence[str]) -> Any:
-    """A copy of plain settings, in which saved models get a caller's trust."""
+    """Copies plain settings; saved models in them get a caller's trust."""
     if isinstance(node, list):
         return [_with_trust(entry, trusted) for entry in node]
     if not isinstance(node, dict):
@@ -140,7 +144,7 @@ def _with_trust(node: Any, trusted: Sequence[str]) -> Any:
 
 
 def _calls(node: Any, place: str) -> Iterator[_Call]:
-    """Every call in settings, at every depth."""
+    """Yields every call in settings, at every depth."""
     if isinstance(node, list):
         for index, entry in enumerate(node):
             yield from _calls(entry, f"{place}[{index}]")
@@ -150,12 +154,14 @@ def _calls(node: Any, place: str) -> Iterator[_Call]:
         yield _Call(place, node)
     for key, value in node.items():
         if str(key).startswith("_") and key not in _MARKS:
-            raise DataError(f"its settings hold {_at(place, key)}, which means nothing")
-        yield from _calls(value, _at(place, key))
+            raise DataError(
+                f"its settings hold {_dotted(place, key)}, which means nothing"
+            )
+        yield from _calls(value, _dotted(place, key))
 
 
-def _at(place: str, key: Any) -> str:
-    """The place of a key, dotted."""
+def _dotted(place: str, key: Any) -> str:
+    """Returns the place of a key, dotted."""
     dotted = f"{place}.{key}".lstrip(".")
     return dotted if dotted.isprintable() else repr(dotted)
 
@@ -165,16 +171,16 @@ def _check_form(call: _Call) -> None:
     settings = call.settings
     place = call.place
     if not isinstance(settings["_target_"], str) or not isinstance(call.code, str):
-        raise DataError(f"its settings name nothing at {_at(place, '_target_')}")
+        raise DataError(f"its settings name nothing at {_dotted(place, '_target_')}")
     if settings["_target_"] in _LOOKUPS and {*settings} != {"_target_", "path"}:
         raise DataError(f"its settings look code up in another way at {place}")
     for key in ("_partial_", "_recursive_"):
         if not isinstance(settings.get(key, True), bool):
-            raise DataError(f"{_at(place, key)}: must be true or false")
+            raise DataError(f"{_dotted(place, key)}: must be true or false")
     if settings.get("_convert_", "all") not in ("none", "partial", "object", "all"):
-        raise DataError(f"{_at(place, '_convert_')}: must be a word of Hydra's")
+        raise DataError(f"{_dotted(place, '_convert_')}: must be a word of Hydra's")
     if not isinstance(settings.get("_args_", []), list):
-        raise DataError(f"{_at(place, '_args_')}: must be a list")
+        raise DataError(f"{_dotted(place, '_args_')}: must be a list")
 
 
 def _check_name(call: _Call, trusted: Sequence[str]) -> None:
@@ -183,7 +189,7 @@ def _check_name(call: _Call, trusted: Sequence[str]) -> None:
     package = package_of(call.code)
     if name in SETTINGS_CODE or is_trusted(name, trusted):
         return
-    named = f"its settings call {name!r:.100} ({_at(call.place, '_target_')})"
+    named = f"its settings call {name!r:.100} ({_dotted(call.place, '_target_')})"
     if is_trusted(name, [package]) and may_be_trusted(package):
         raise DataError(f"{named}, {_remedy(package)}")
     raise DataError(f"{named}, which no settings in a file may call")
@@ -202,7 +208,8 @@ def _check_arguments(call: _Call, name: str | None, trusted: Sequence[str]) -> N
     if check is None:
         return
     if "_args_" in call.settings:
-        raise DataError(f"{_at(call.place, '_args_')}: give arguments by their names")
+        place = _dotted(call.place, "_args_")
+        raise DataError(f"{place}: give arguments by their names")
     check(call, trusted)
 
 
@@ -212,17 +219,16 @@ def _check_environment(call: _Call, trusted: Sequence[str]) -> None:
     It imports the module in ``module:name``; a text may be a file to be opened.
     """
     environment = call.settings.get("environment")
-    module, colon, _ = (
-        environment.partition(":") if isinstance(environment, str) else ("",) * 3
-    )
-    if colon and not is_trusted(module, trusted):
-        place = _at(call.place, "environment")
-        raise DataError(
-            f"its settings import {module!r:.100} ({place}), "
-            f"{_remedy(package_of(module))}"
-        )
+    if isinstance(environment, str) and ":" in environment:
+        module = environment.partition(":")[0]
+        if not is_trusted(module, trusted):
+            place = _dotted(call.place, "environment")
+            raise DataError(
+                f"its settings import {module!r:.100} ({place}), "
+                f"{_remedy(package_of(module))}"
+            )
     if _holds_text(call.settings.get("make")) and not is_trusted("gymnasium", trusted):
-        place = _at(call.place, "make")
+        place = _dotted(call.place, "make")
         raise DataError(
             f"its settings hand text to an environment ({place}), "
             f"{_remedy('gymnasium')}"
@@ -230,26 +236,27 @@ def _check_environment(call: _Call, trusted: Sequence[str]) -> None:
 
 
 def _check_options(call: _Call, trusted: Sequence[str]) -> None:
-    """Some options of some solvers name files to be written."""
+    """Raises where options are handed to a solver: some name files to be written."""
     if call.settings.get("options") and not is_trusted("cvxpy", trusted):
-        place = _at(call.place, "options")
+        place = _dotted(call.place, "options")
         raise DataError(
             f"its settings hand options to a solver ({place}), {_remedy('cvxpy')}"
         )
 
 
 def _check_trust(call: _Call, trusted: Sequence[str]) -> None:
-    """Whom to trust is the caller's to say, not the file's."""
-    asked = call.settings.get("trusted") or []
-    if not isinstance(asked, list) or not {*map(str, asked)} <= {*trusted}:
+    """Raises where a file says whom to trust: that is the caller's to say."""
+    packages = call.settings.get("trusted") or []
+    is_list = isinstance(packages, list)
+    if not is_list or not set(map(str, packages)) <= set(trusted):
         raise DataError(
-            f"{_at(call.place, 'trusted')}: a file cannot say what is trusted; "
+            f"{_dotted(call.place, 'trusted')}: a file cannot say what is trusted; "
             "--trust PACKAGE does"
         )
 
 
 def _holds_text(node: Any) -> bool:
-    """Whether there is text among the values of plain data, at any depth."""
+    """Tells whether there is text among the values of plain data, at any depth."""
     if isinstance(node, dict):
         return any(map(_holds_text, node.values()))
     if isinstance(node, list):

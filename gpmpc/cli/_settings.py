@@ -4,7 +4,7 @@ import difflib
 import os
 import re
 import sys
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -221,42 +221,78 @@ def _of_settings(error: Exception, name: str) -> str:
 
     A common one is said in the words of this package.
     """
-    text = str(error)
-    if unknown := re.match(r"Could not override '([^']+)'", text):
-        with settings():
-            question = nearest(unknown[1], setting_names(name))
-        return f"unknown setting {unknown[1]!r}{question}"
-    option = re.search(
-        r"Could not find '([^'/]+)/([^']+)'\s+"
-        r"Available options in '[^']+':\n((?:\t.*\n)+)",
-        text,
-    )
-    if option and (extra := _EXTRAS.get(option[2].removeprefix("launcher/"))):
-        return f"launcher: this one is not installed: pip install 'gpmpc[{extra}]'"
-    if option:
-        known = option[3].split()
-        available = f"available are {', '.join(known)}{nearest(option[2], known)}"
-        return f"{option[1]}: no such option {option[2]!r}; {available}"
     if isinstance(error, OverrideParseException):
         return (
             f"{error.override!r}: cannot be read; a setting is written SETTING=VALUE, "
             "in single quotes where the value holds brackets, braces, commas or spaces"
         )
-    if unlocated := re.match(r"Error locating target '([^']+)'", text):
-        return f"_target_: no such class or function {unlocated[1]!r}"
     if isinstance(error, MissingMandatoryValue):
         key = error.full_key
         return f"{key}: this setting has no default; give it as {key}=VALUE"
-    if ambiguous := re.match(r"Ambiguous value for argument '([^=]+)=([^']+)'", text):
-        key = ambiguous[1]
-        listed = f"{key}: a list is written in brackets, {key}=[{ambiguous[2]}]"
-        return f"{listed}; a sweep takes -m" if name == "run" else listed
-    lines = [
-        line.strip()
-        for line in text.splitlines()
-        if line.strip() and "hydra.cc" not in line
-    ]
-    return "; ".join(line.rstrip(".:;") for line in lines) or type(error).__name__
+    text = str(error)
+    for pattern, explanation in _EXPLANATIONS:
+        match = pattern.search(text)
+        if match:
+            return explanation(match, name)
+    return _joined_lines(text) or type(error).__name__
+
+
+def _unknown_setting(match: re.Match[str], name: str) -> str:
+    setting = match["setting"]
+    with settings():
+        question = nearest(setting, setting_names(name))
+    return f"unknown setting {setting!r}{question}"
+
+
+def _unknown_option(match: re.Match[str], name: str) -> str:
+    option = match["option"]
+    extra = _EXTRAS.get(option.removeprefix("launcher/"))
+    if extra:
+        return f"launcher: this one is not installed: pip install 'gpmpc[{extra}]'"
+    available = match["available"].split()
+    return (
+        f"{match['group']}: no such option {option!r}; "
+        f"available are {', '.join(available)}{nearest(option, available)}"
+    )
+
+
+def _unknown_target(match: re.Match[str], name: str) -> str:
+    return f"_target_: no such class or function {match['target']!r}"
+
+
+def _list_without_brackets(match: re.Match[str], name: str) -> str:
+    key = match["key"]
+    explanation = f"{key}: a list is written in brackets, {key}=[{match['values']}]"
+    return f"{explanation}; a sweep takes -m" if name == "run" else explanation
+
+
+# Messages of Hydra, and what says them in the words of this package: a function of the
+# match and of the command's settings.
+_EXPLANATIONS: tuple[
+    tuple[re.Pattern[str], Callable[[re.Match[str], str], str]], ...
+] = (
+    (re.compile(r"\ACould not override '(?P<setting>[^']+)'"), _unknown_setting),
+    (
+        re.compile(
+            r"Could not find '(?P<group>[^'/]+)/(?P<option>[^']+)'\s+"
+            r"Available options in '[^']+':\n(?P<available>(?:\t.*\n)+)"
+        ),
+        _unknown_option,
+    ),
+    (re.compile(r"\AError locating target '(?P<target>[^']+)'"), _unknown_target),
+    (
+        re.compile(
+            r"\AAmbiguous value for argument '(?P<key>[^=]+)=(?P<values>[^']+)'"
+        ),
+        _list_without_brackets,
+    ),
+)
+
+
+def _joined_lines(text: str) -> str:
+    """Returns a message of several lines in one, without links to Hydra's pages."""
+    lines = [line.strip() for line in text.splitlines() if "hydra.cc" not in line]
+    return "; ".join(line.rstrip(".:;") for line in lines if line)
 
 
 def own_error(error: BaseException | None) -> GpmpcError | None:

@@ -30,44 +30,44 @@ OURS = (
 
 
 class _Environment(Simulator):
-    """The dynamics of a gymnasium environment."""
+    """The dynamics of a gymnasium environment.
+
+    Args:
+        environment: The environment, or its name.
+        observe: From an observation to the state (n,); None for the observation itself.
+        state_names: Of the state; without any, x1, x2, ...
+        input_names: Of the action; without any, u1, u2, ...
+        make_settings: Further arguments of ``gymnasium.make``.
+    """
 
     def __init__(
         self,
-        name: Any,
-        observe: Any,
+        environment: Any,
+        observe: Callable[[Any], Array] | None,
         state_names: Sequence[str],
         input_names: Sequence[str],
-        settings: Any,
+        make_settings: dict[str, Any],
     ):
-        gymnasium = library("gymnasium")
-        self.environment = name
-        if isinstance(name, str):
-            try:
-                made = {"max_episode_steps": -1, "disable_env_checker": True} | settings
-                self.environment = gymnasium.make(name, **made)
-            except (gymnasium.error.Error, ImportError, TypeError) as error:
-                raise SettingError(
-                    "environment", f"{name!r}: {' '.join(str(error).split())}"
-                ) from error
-        spaces = {"action": self.environment.action_space}
-        if observe is None:
-            spaces["observation"] = self.environment.observation_space
-        for kind, space in spaces.items():
-            if not isinstance(space, gymnasium.spaces.Box) or len(space.shape) != 1:
-                remedy = (
-                    "; name a function with observe" if kind == "observation" else ""
-                )
-                what = f"the {kind} space must be a Box of one dimension"
-                raise SettingError("environment", f"{what}; got {space}{remedy}")
-        action = spaces["action"]
+        if isinstance(environment, str):
+            environment = _make(environment, make_settings)
+        self.environment = environment
         self._observe = observe
-        self.limits = (action.low.astype(float), action.high.astype(float))
+        action_space = environment.action_space
+        _check_space("action", action_space, remedy="")
+        if observe is None:
+            _check_space(
+                "observation",
+                environment.observation_space,
+                remedy="; name a function with observe",
+            )
+        lowest = action_space.low.astype(float)
+        highest = action_space.high.astype(float)
+        self.limits = (lowest, highest)
         n = len(self.reset(0))
-        m = len(action.low)
+        m = len(lowest)
         self.state_names = tuple(state_names or [f"x{i + 1}" for i in range(n)])
         self.input_names = tuple(input_names or [f"u{i + 1}" for i in range(m)])
-        if (len(self.state_names), len(self.input_names)) != (n, m):
+        if len(self.state_names) != n or len(self.input_names) != m:
             raise ShapeError(
                 f"state_names and input_names must be {n} and {m} names; "
                 f"got {len(self.state_names)} and {len(self.input_names)}"
@@ -105,6 +105,31 @@ class _Environment(Simulator):
         return state
 
 
+def _make(name: str, make_settings: dict[str, Any]) -> Any:
+    """Makes an environment without a limit of its steps.
+
+    Raises:
+        SettingError: There is no such environment, or it does not take the settings.
+    """
+    gymnasium = library("gymnasium")
+    defaults = {"max_episode_steps": -1, "disable_env_checker": True}
+    try:
+        return gymnasium.make(name, **(defaults | make_settings))
+    except (gymnasium.error.Error, ImportError, TypeError) as error:
+        reason = " ".join(str(error).split())
+        raise SettingError("environment", f"{name!r}: {reason}") from error
+
+
+def _check_space(kind: str, space: Any, remedy: str) -> None:
+    """Raises ``SettingError`` unless a space is a box of one dimension."""
+    box = library("gymnasium").spaces.Box
+    if not isinstance(space, box) or len(space.shape) != 1:
+        raise SettingError(
+            "environment",
+            f"the {kind} space must be a Box of one dimension; got {space}{remedy}",
+        )
+
+
 def gymnasium_system(
     environment: Any,
     observe: Callable[[Any], Array] | None = None,
@@ -138,12 +163,12 @@ def gymnasium_system(
     if time_step is None:
         raise SettingError("time_step", "is not known of this environment; say it [s]")
     lower, upper = dynamics.limits
-    given = {
+    defaults = {
         "name": str(environment),
         "input_lower": lower,
         "input_upper": upper,
-    } | settings
-    return System(dynamics, float(time_step), 1, **given)
+    }
+    return System(dynamics, float(time_step), 1, **(defaults | settings))
 
 
 def make_environment(system: System | str, **settings: Any) -> Any:

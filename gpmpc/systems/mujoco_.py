@@ -29,11 +29,14 @@ class _Model:
             raise DataError(
                 f"{path}: is no MJCF model ({' '.join(str(error).split())})"
             ) from error
-        self.path, self.data = path, self.mujoco.MjData(self.model)
+        self.path = path
+        self.data = self.mujoco.MjData(self.model)
         self.controls = self.indices("actuator", actuators)
         limited = self.model.actuator_ctrllimited.astype(bool)[self.controls]
         low, high = self.model.actuator_ctrlrange[self.controls].T
-        self.limits = np.where(limited, low, -np.inf), np.where(limited, high, np.inf)
+        lowest = np.where(limited, low, -np.inf)
+        highest = np.where(limited, high, np.inf)
+        self.limits = (lowest, highest)
 
     def indices(self, kind: str, names: Sequence[str]) -> list[int]:
         """Returns the indices of named parts of the model of a kind.
@@ -66,16 +69,16 @@ class _Joints(_Model):
         model = self.model
         joint = self.mujoco.mjtJoint
         kinds = {int(joint.mjJNT_SLIDE), int(joint.mjJNT_HINGE)}
-        found = self.indices("joint", joints)
-        if model.njnt != len(found) or not set(model.jnt_type.tolist()) <= kinds:
+        indices = self.indices("joint", joints)
+        if model.njnt != len(indices) or not set(model.jnt_type.tolist()) <= kinds:
             raise SettingError(
                 "joints",
                 f"must name all {model.njnt} joints of {path}, hinges and slides; "
                 f"name sensors of other models; got {list(joints)}",
             )
         self.substeps = substeps
-        q = model.jnt_qposadr[found]
-        v = model.jnt_dofadr[found]
+        q = model.jnt_qposadr[indices]
+        v = model.jnt_dofadr[indices]
         # Where the states stand in MuJoCo's own: time, qpos, qvel, act.
         self._order = np.concatenate(
             [1 + q, 1 + model.nq + v, 1 + model.nq + model.nv + np.arange(model.na)]
@@ -107,13 +110,13 @@ class _Joints(_Model):
         initial[:, self._order] = states.T
         control = np.zeros((count, self.substeps, model.nu))
         control[:, :, self.controls] = inputs.T[:, None]
-        after = np.full(states.shape, np.nan)
+        next_states = np.full(states.shape, np.nan)
         if np.isfinite(initial).all() and np.isfinite(control).all():
-            moved, _ = library("mujoco.rollout").rollout(
+            trajectories, _ = library("mujoco.rollout").rollout(
                 model, self.data, initial, control
             )
-            after = moved[:, -1, self._order].T
-        return after[:, 0] if single else after
+            next_states = trajectories[:, -1, self._order].T
+        return next_states[:, 0] if single else next_states
 
 
 class _Sensors(_Model, Simulator):
@@ -135,24 +138,23 @@ class _Sensors(_Model, Simulator):
     ):
         super().__init__(path, actuators)
         model = self.model
-        found = self.indices("sensor", sensors)
-        sizes = model.sensor_dim[found].tolist()
-        places = [
-            model.sensor_adr[i] + np.arange(d)
-            for i, d in zip(found, sizes, strict=True)
-        ]
-        self._places = np.concatenate(places)
+        indices = self.indices("sensor", sensors)
+        addresses = model.sensor_adr[indices].tolist()
+        sizes = model.sensor_dim[indices].tolist()
+        # Where the sensors' values stand in MuJoCo's own.
+        self._places = np.concatenate(
+            [
+                address + np.arange(size)
+                for address, size in zip(addresses, sizes, strict=True)
+            ]
+        )
         self._observe = observe
         self.substeps = substeps
         self._delay = input_delay
-        own = [
-            f"{name}{k + 1}" if d > 1 else name
-            for name, d in zip(sensors, sizes, strict=True)
-            for k in range(d)
-        ]
-        self.state_names = tuple(state_names or own)
+        self.state_names = tuple(state_names or _value_names(sensors, sizes))
         self.input_names = tuple(actuators)
-        if (n := len(self.reset(0))) != len(self.state_names):
+        n = len(self.reset(0))
+        if n != len(self.state_names):
             raise SettingError(
                 "state_names", f"must be {n} names; got {len(self.state_names)}"
             )
@@ -175,6 +177,17 @@ class _Sensors(_Model, Simulator):
 
     def _measure(self) -> Array:
         return np.array(self._observe(self.data.sensordata[self._places]), dtype=float)
+
+
+def _value_names(sensors: Sequence[str], sizes: Sequence[int]) -> list[str]:
+    """Returns the sensors' names, numbered where they have several values."""
+    names = []
+    for sensor, size in zip(sensors, sizes, strict=True):
+        if size > 1:
+            names += [f"{sensor}{k + 1}" for k in range(size)]
+        else:
+            names.append(sensor)
+    return names
 
 
 def mujoco_system(
@@ -212,17 +225,17 @@ def mujoco_system(
         )
     if joints:
         dynamics: _Joints | _Sensors = _Joints(path, joints, actuators, substeps)
-        settings = {
-            "rates": {f"{name}_rate": name for name in settings.get("tracked") or ()}
-        } | settings
+        tracked = settings.get("tracked") or ()
+        settings = {"rates": {f"{name}_rate": name for name in tracked}} | settings
     else:
         dynamics = _Sensors(
             path, sensors, actuators, substeps=substeps, **(observation or {})
         )
     lower, upper = dynamics.limits
-    given = {
+    defaults = {
         "name": Path(path).stem,
         "input_lower": lower,
         "input_upper": upper,
-    } | settings
-    return System(dynamics, substeps * float(dynamics.model.opt.timestep), 1, **given)
+    }
+    time_step = substeps * float(dynamics.model.opt.timestep)
+    return System(dynamics, time_step, 1, **(defaults | settings))
