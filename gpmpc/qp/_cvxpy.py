@@ -161,7 +161,7 @@ class _Compiled(NamedTuple):
 class _Transform(NamedTuple):
     """The change of variables x = free + back y."""
 
-    factor: Array  # (n, n) L' with P = L L'
+    factor: Array  # (n, n) L' with P = L L' (in the kernels P = L'L)
     back: Array  # (n, n) L^-T
     free: Array  # (n,) the free minimiser
 

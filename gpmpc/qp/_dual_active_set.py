@@ -23,7 +23,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from gpmpc._compiled import compile_for, unchecked_entry_point
 from gpmpc.qp import _record as layout
-from gpmpc.qp._dual_kernels import SIGNATURE, solve
+from gpmpc.qp._dual_kernels import SIGNATURE, solve_kernel
 from gpmpc.qp._dual_rescue import rescue
 from gpmpc.qp._problem import QuadraticProgram, check_positive, multiplier_caps
 from gpmpc.qp._solution import QPSolution, WarmStart, as_record, proves_infeasibility
@@ -35,14 +35,16 @@ Array = NDArray[np.float64]
 # own constructor.
 _NO_RECORD = layout.NO_RECORD
 _MISUSE = layout.MISUSE
+_SOLVED = layout.SOLVED
 _FLOAT = np.dtype(float)
 _empty = np.empty
 _new = tuple.__new__
-_run = solve  # until it is compiled
+_solve_unchecked = solve_kernel  # until a solver is made, which compiles it
 
-# Caps (M,), memory, the record's length, and where x is in it. A plain tuple: taking a
-# named one apart costs a fortieth of a microsecond.
-Plan = tuple[Array, Array, int, slice]
+# What solves of one shape of G work with: the caps (M,), memory, the record's length,
+# and where x is in it. A plain tuple: taking a named one apart costs a fortieth of a
+# microsecond.
+Workplace = tuple[Array, Array, int, slice]
 
 # default limit, beyond which the iteration is taken to cycle
 _ITERATIONS_PER_CONSTRAINT = 10
@@ -53,7 +55,9 @@ _ITERATIONS_PER_LOOK = 25  # iterations between two looks at the clock
 class DualActiveSet:
     """The dual active-set method.
 
-    An object holds settings only and may serve many threads.
+    An object holds settings, and memory for each shape of G that it has met. It may
+    serve many threads all the same: a solve keeps the interpreter's lock, so that no
+    two are in the same memory at once.
 
     Args:
         tolerance: Largest residual of a solution called ``SOLVED``, as a share of its
@@ -69,13 +73,15 @@ class DualActiveSet:
     tolerance: float = 1e-9
     iteration_limit: int | None = None
     time_limit: float | None = None
-    _plans: dict = field(default_factory=dict, init=False, repr=False, compare=False)
+    _workplaces: dict = field(
+        default_factory=dict, init=False, repr=False, compare=False
+    )
 
     def __post_init__(self):
         check_positive(self, "tolerance", "iteration_limit", "time_limit")
-        global _run
-        compile_for(solve, SIGNATURE)
-        _run = unchecked_entry_point(solve)
+        global _solve_unchecked
+        compile_for(solve_kernel, SIGNATURE)
+        _solve_unchecked = unchecked_entry_point(solve_kernel)
 
     def solve(
         self,
@@ -105,13 +111,17 @@ class DualActiveSet:
         began = perf_counter()
         try:
             shape = problem.G.shape
-            plan = self._plans[shape] if prices is None else self._plan(shape, prices)
+            workplace = (
+                self._workplaces[shape]
+                if prices is None
+                else self._workplace(shape, prices)
+            )
         except (AttributeError, KeyError, TypeError):
             # the first program of its shape, or an unchecked one without a shape
             problem = QuadraticProgram.from_stacked(*problem)
-            plan = self._plan(problem.G.shape, prices)
+            workplace = self._workplace(problem.G.shape, prices)
         P, q, G, lower, upper = problem
-        caps, memory, record_size, x_slice = plan
+        caps, memory, record_size, x_slice = workplace
         record = _empty(record_size)
         status = _MISUSE
         try:
@@ -119,13 +129,13 @@ class DualActiveSet:
             if warm_start is not None:
                 guess = warm_start.record  # type: ignore[union-attr]
             if P.dtype is q.dtype is G.dtype is lower.dtype is upper.dtype is _FLOAT:
-                status = _run(P, q, G, lower, upper, guess, memory, record)
+                status = _solve_unchecked(P, q, G, lower, upper, guess, memory, record)
         except (AttributeError, TypeError):
             # not contiguous float64, or a warm start that is no solution of ours
             pass
-        if status:
+        if status != _SOLVED:
             problem, record = self._solve_again(
-                problem, warm_start, plan, status, record, began
+                problem, warm_start, workplace, status, record, began
             )
         seconds = perf_counter() - began
         return _new(QPSolution, (record[x_slice], problem, caps, record, 0.0, seconds))
@@ -147,10 +157,13 @@ class DualActiveSet:
             self, QuadraticProgram(P, np.zeros(len(np.atleast_1d(P))), G), prices
         )
 
-    def _plan(
+    def _workplace(
         self, shape: tuple, prices: ArrayLike | None, prepared: bool = False
-    ) -> Plan:
-        """Returns what solves of this shape of G share; hard rows' plans are kept."""
+    ) -> Workplace:
+        """Returns what solves of this shape of G share.
+
+        That of hard rows serves the next solves, too.
+        """
         m, n = shape
         M = n + m
         caps = multiplier_caps(prices, n, m)
@@ -161,10 +174,10 @@ class DualActiveSet:
         memory = new_memory(caps, n, limit, self.tolerance, soft, prepared)
         record_size = layout.record_size(n, M, working=n if prepared else 0)
         x_slice = slice(layout.HEADER, layout.HEADER + n)
-        plan = caps, memory, record_size, x_slice
+        workplace = caps, memory, record_size, x_slice
         if prices is None and not prepared:
-            self._plans[shape] = plan
-        return plan
+            self._workplaces[shape] = workplace
+        return workplace
 
     def _limit(self, M: int) -> int:
         return self.iteration_limit or 100 + _ITERATIONS_PER_CONSTRAINT * M
@@ -173,7 +186,7 @@ class DualActiveSet:
         self,
         problem: QuadraticProgram,
         warm_start: WarmStart,
-        plan: Plan,
+        workplace: Workplace,
         status: int,
         record: Array,
         began: float,
@@ -181,7 +194,7 @@ class DualActiveSet:
         """Continues a solve that did not end as ``SOLVED``.
 
         Checks the problem, iterates on within the limits, and accepts the result or
-        tries again with a new factor, then with doubled digits.
+        tries again from its working set, then with doubled digits.
 
         Returns:
             The problem as it was solved, and the record.
@@ -189,7 +202,7 @@ class DualActiveSet:
         Raises:
             ProblemError: The problem breaks a rule of ``QuadraticProgram``.
         """
-        caps, memory, _, _ = plan
+        caps, memory, _, _ = workplace
         if status == layout.MISUSE:
             problem = QuadraticProgram.from_stacked(*problem)  # raises if it is misuse
             # a proper problem whose rows overflow, or P at the edge of definiteness,
@@ -197,7 +210,7 @@ class DualActiveSet:
             record[:] = 0.0
             record[layout.STATUS] = layout.NUMERICAL_TROUBLE
             guess = as_record(warm_start, len(problem.q), len(problem.lower))
-            status = solve(*problem, guess, memory, record)
+            status = solve_kernel(*problem, guess, memory, record)
 
         def late() -> bool:
             if self.time_limit is None:
@@ -209,7 +222,7 @@ class DualActiveSet:
         while status == layout.ITERATION_LIMIT and not late() and iterations < limit:
             guess = record  # the kernel stopped to have the clock looked at
             record = np.empty_like(record)
-            status = solve(*problem, guess, memory, record)
+            status = solve_kernel(*problem, guess, memory, record)
             iterations += record[layout.ITERATIONS]
         record[layout.ITERATIONS] = iterations
         if status == layout.ITERATION_LIMIT and late():
@@ -218,10 +231,13 @@ class DualActiveSet:
         if stopped or _is_certain(record, problem):
             return problem, record
 
+        # A second try from the last working set. Its factor is computed anew, as only
+        # a solved record hands its factor on. The kernel reads one record and writes
+        # another, which stays a copy if the kernel refuses the program again; what
+        # counts of its status is in the record.
         guess = record
         record = record.copy()
-        guess[layout.TAG] = 0.0  # the factor is computed anew
-        solve(*problem, guess, memory, record)
+        solve_kernel(*problem, guess, memory, record)
         record[layout.ITERATIONS] += iterations
         if not _is_certain(record, problem):
             record = rescue(problem, caps, record, limit, late)
@@ -234,7 +250,7 @@ class Prepared:
     Made by ``DualActiveSet.prepare``; read-only, so that it may serve many threads.
     """
 
-    __slots__ = ("_G", "_P", "_plan", "_solver")
+    __slots__ = ("_G", "_P", "_solver", "_workplace")
 
     def __init__(
         self, solver: DualActiveSet, problem: QuadraticProgram, prices: ArrayLike | None
@@ -242,12 +258,12 @@ class Prepared:
         self._P = problem.P
         self._G = problem.G
         self._solver = solver
-        self._plan = solver._plan(problem.G.shape, prices, prepared=True)
-        _, memory, record_size, _ = self._plan
+        self._workplace = solver._workplace(problem.G.shape, prices, prepared=True)
+        _, memory, record_size, _ = self._workplace
         # factorises P and measures the rows of G; where numbers overflow, every solve
         # is to find that out by itself
         record = np.empty(record_size)
-        status = solve(*problem, layout.NO_RECORD, memory, record)
+        status = solve_kernel(*problem, layout.NO_RECORD, memory, record)
         if status == layout.SOLVED:
             prepare_memory(memory, problem.G)
 
@@ -271,7 +287,7 @@ class Prepared:
         began = perf_counter()
         P = self._P
         G = self._G
-        caps, memory, record_size, x_slice = self._plan
+        caps, memory, record_size, x_slice = self._workplace
         record = _empty(record_size)
         status = _MISUSE
         try:
@@ -279,15 +295,15 @@ class Prepared:
             if warm_start is not None:
                 guess = warm_start.record  # type: ignore[union-attr]
             if q.dtype is lower.dtype is upper.dtype is _FLOAT:
-                status = _run(P, q, G, lower, upper, guess, memory, record)
+                status = _solve_unchecked(P, q, G, lower, upper, guess, memory, record)
         except (AttributeError, TypeError):
             pass
         problem = P, q, G, lower, upper
-        if status:
+        if status != _SOLVED:
             problem, record = self._solver._solve_again(
                 QuadraticProgram.unchecked(P, q, G, lower, upper),
                 warm_start,
-                self._plan,
+                self._workplace,
                 status,
                 record,
                 began,

@@ -8,7 +8,8 @@ working set W the minimiser over ``c_p'x = b_p, p in W`` is
 where x_u is the unconstrained minimiser, y = C x_u and K = C P^-1 C'. The method keeps
 every multiplier in its range and moves to the most violated constraint p until none is
 violated (algorithm 1). A multiplier at its cap, the price of a soft row, leaves with a
-constraint that stays violated; then mu_p is not zero outside the working set.
+constraint that stays violated; then mu_p is not zero outside the working set, and x_u
+is the minimiser with the multipliers at caps added to q.
 
 The functions take a workspace (``gpmpc.qp._workspace``) and the number k of its working
 constraints; those that change k return it.
@@ -44,23 +45,22 @@ from gpmpc.qp._working_set import (
     constraint_in,
     distance_to_span,
     drop_constraint,
+    is_prepared,
     write_slot,
 )
 
-UNLISTED = -1  # number of violated constraints before the working set is known
-# x, and a violation of a bound of zero, is none below this share of the length of q.
-NONE = 1e-26
 # Times that all badly violated constraints enter at once, and which are: those violated
 # by more than this share of the worst.
 BATCHES = 4
 _BADLY = 0.5
-# d below this share of K_pp: the constraint depends on the working ones.
-_DEPENDENT = 1e-12
-# d below this share of K_pp is computed again without cancellation.
-_DOUBTFUL = 1e-4
+# The squared distance d of p from the span of the working ones, as a share of K_pp:
+# below the first p depends on them, below the second d is computed again without
+# cancellation.
+_DEPENDENT_SQUARE = 1e-12
+_DOUBTFUL_SQUARE = 1e-4
 # A contradiction may be the rounding of its bounds up to this share of them.
-_ROUNDING = 1e-15
-# A dependent constraint that is violated by more is taken for a contradiction.
+_ROUNDING_OF_BOUNDS = 1e-15
+# A dependent constraint violated by more than this share of its terms contradicts.
 _HOPELESS = 1e-7
 
 
@@ -70,62 +70,69 @@ class Progress(NamedTuple):
     status: int  # ``SOLVED``, ``INFEASIBLE`` or ``ITERATION_LIMIT``
     size: int  # of the working set
     iterations: int
-    batches: int
+    batches_left: int
     violated: bool  # whether any constraint was
     passed_over: bool  # whether one contradicts others by what may be rounding
 
 
 @inline_njit
-def iterate(work, k, count, guessed, margin, iterations, batches):
+def iterate(work, k, starts, guessed, count, margin, iterations, batches_left):
     """Adds and drops constraints until none is violated by more than ``margin``.
 
-    ``count`` constraints are, and listed; their excess and the margin are in units of
-    ``norm``. ``UNLISTED`` starts from a guess instead: the first ``guessed`` candidates
-    enter before all else. ``iterations`` are the changes of the working set so far,
-    ``batches`` the times that several constraints entered at once.
+    Where ``starts``, which constraints are violated is not known yet: the first
+    ``guessed`` candidates enter before all else. Otherwise ``count`` violated ones are
+    listed; their excess and the margin are in units of ``norm``. ``iterations`` are the
+    changes of the working set so far. Up to ``batches_left`` times several constraints
+    enter at once.
     """
     p = 0
     candidates = guessed
-    starts = count == UNLISTED
+    status = SOLVED
     violated = False
     passed_over = False
-    all_listed = True
-    while count != 0:
+    all_listed = True  # whether the list was made of all constraints
+    while starts or count > 0:
+        # select the violated constraint p, or several at once: the candidates
         if not starts:
             violated = True
             if iterations >= work.limit:
-                return Progress(
-                    ITERATION_LIMIT, k, iterations, batches, True, passed_over
-                )
-            # select the violated constraint, or several at once
+                status = ITERATION_LIMIT
+                break
             p = most_violated(work, count)
             candidates = 0
-            if all_listed and batches < BATCHES:
+            if all_listed and batches_left > 0:
                 threshold = _BADLY * work.excess[p]
                 candidates = choose_badly_violated(work, threshold, count, work.n - k)
-                batches += candidates > 0
+                batches_left -= candidates > 0
+
+        # add the candidates, or move to p, which enters unless it stays violated
         size_before = k
         k = add_candidates(work, k, candidates)
         multipliers_fit = False
         single = not starts and k == size_before
-        if single:  # move to p, which enters unless it stays violated
+        if single:
             multiplier_before = work.multiplier[p]
             satisfied, k, changes = _satisfy_constraint(work, k, p)
             iterations += changes
             multipliers_fit = True
             if not satisfied:
-                if _is_contradiction(work, p):
+                terms = _terms_of_combination(work, k)
+                if _is_contradiction(work, p, terms):
                     _write_ray(work, k, p)
-                    return Progress(
-                        INFEASIBLE, k, iterations, batches, True, passed_over
-                    )
-                # what it gained on the way belongs to no working set
+                    status = INFEASIBLE
+                    break
+                # pass p over; what it gained on the way belongs to no working set
                 work.multiplier[p] = multiplier_before
+                work.negligible[p] += _ROUNDING_OF_BOUNDS * terms
                 ignore_violations(work, p)
                 passed_over = True
-                multipliers_fit = work.soft != 0.0  # where refinement has to do
+                # they do not; but where a cap has moved x_u, ``free_value`` cannot
+                # correct them: that is left to refinement
+                multipliers_fit = work.soft != 0.0
             if work.soft != 0.0:
-                batches = BATCHES  # caps may have changed x_u
+                # p may have reached its cap, which moves x_u; several at once need
+                # the ``free_value`` of before
+                batches_left = 0
         elif not starts:
             iterations += k - size_before
 
@@ -134,9 +141,10 @@ def iterate(work, k, count, guessed, margin, iterations, batches):
             k = _drop_wrong_multipliers(work, k)
         _minimise(work, k)
 
-        # first satisfy those that were seen to be violated, then look at all
-        few_listed = count == 1 or work.soft != 0.0 or iterations >= work.limit
-        all_listed = few_listed or not single
+        # first satisfy those that were seen to be violated, then look at all: at once
+        # where none of them is left, rows are soft, or it is the last look
+        look_at_all = count == 1 or work.soft != 0.0 or iterations >= work.limit
+        all_listed = look_at_all or not single
         if not all_listed:
             count = recheck_violated(work, margin, count)
             all_listed = count == 0
@@ -144,9 +152,16 @@ def iterate(work, k, count, guessed, margin, iterations, batches):
             multiply_constraints(work)
             count = list_violated(work, margin)
         starts = False
-    if violated:
+    if status == SOLVED and violated:
         _clip_multipliers(work, k)
-    return Progress(SOLVED, k, iterations, batches, violated, passed_over)
+    return Progress(
+        status=status,
+        size=k,
+        iterations=iterations,
+        batches_left=batches_left,
+        violated=violated,
+        passed_over=passed_over,
+    )
 
 
 @inline_njit
@@ -159,10 +174,13 @@ def _satisfy_constraint(work, k, p):
     """
     mu = work.multiplier
     r = work.direction
-    upper_bound_works = mu[p] > 0.0 or (mu[p] == 0.0 and work.value[p] > work.upper[p])
-    # the direction of mu_p, which comes back from a cap
-    sense = 1.0 if upper_bound_works == (mu[p] == 0.0) else -1.0
-    write_slot(work, k, p, upper_bound_works)
+    if mu[p] == 0.0:
+        above = work.value[p] > work.upper[p]
+        sense = 1.0 if above else -1.0  # the direction in which mu_p moves
+    else:  # it comes back from a cap
+        above = mu[p] > 0.0
+        sense = -1.0 if above else 1.0
+    write_slot(work, k, p, above)
     compute_factor_row(work, k, p)
     violation = (work.value[p] - work.bound[k]) * sense
     K_pp = work.diagonal[k]
@@ -173,22 +191,20 @@ def _satisfy_constraint(work, k, p):
         scale(1.0, work.forward, r, k)
         solve_transposed(work.factor, k, r)
         d = K_pp - dot(work.forward, work.forward, k)
-        if d < _DOUBTFUL * K_pp:
+        if d < _DOUBTFUL_SQUARE * K_pp:
             d = distance_to_span(work, k)
 
         # step length: t2 = violation / d makes p hold, at ``room`` its multiplier
         # reaches its cap, at t1 a working one reaches the end of its range
-        independent = d > _DEPENDENT * K_pp and k < work.n
+        independent = d > _DEPENDENT_SQUARE * K_pp and k < work.n
         step = max(0.0, violation) / d if independent else np.inf
-        end = work.most_multiplier[k] if sense > 0.0 else work.least_multiplier[k]
-        room = (end - mu[p]) * sense
+        range_end = work.most_multiplier[k] if sense > 0.0 else work.least_multiplier[k]
+        room = (range_end - mu[p]) * sense
         capped = room < step
         if capped:
             step = room
         step, blocking = _first_blocking(work, k, sense, step)
         if step == np.inf:  # (r, -1) is Farkas' proof, unless rounding violates p
-            for i in range(k):
-                work.negligible[p] += _ROUNDING * abs(r[i] * work.bound[i])
             return False, k, changes
 
         # take the step
@@ -204,7 +220,7 @@ def _satisfy_constraint(work, k, p):
             restore_limits(work, leaving)
             violation -= step * d
         elif capped:  # a soft row that stays violated
-            mu[p] = end
+            mu[p] = range_end
             restore_limits(work, p)
             return True, k, changes
         else:  # full step: add p
@@ -225,8 +241,8 @@ def _first_blocking(work, k, sense, step):
     for i in range(k):
         rate = sense * r[i]
         if abs(rate) > 1e-12 * largest:
-            end = _end_of_range(work, i, rate)
-            room = (work.multiplier[constraint_in(work, i)] - end) / rate
+            range_end = _end_of_range(work, i, rate)
+            room = (work.multiplier[constraint_in(work, i)] - range_end) / rate
             if room < step:
                 step = max(room, 0.0)
                 blocking = i
@@ -240,9 +256,25 @@ def _end_of_range(work, slot, rate):
 
 
 @inline_njit
-def _is_contradiction(work, p):
-    """Returns whether p, which depends on others, is violated by more than rounding."""
-    size = max(abs(work.value[p]), work.negligible[p] / NONE)
+def _terms_of_combination(work, k):
+    """Returns sum |r_i b_i|, of which the value of the constraint sum r_i c_i is made.
+
+    r is ``direction``.
+    """
+    terms = 0.0
+    for i in range(k):
+        terms += abs(work.direction[i] * work.bound[i])
+    return terms
+
+
+@inline_njit
+def _is_contradiction(work, p, terms):
+    """Returns whether p, which depends on others, is violated by more than rounding.
+
+    Rounding is a share of c_p'x, of the terms of the others' combination, and of the
+    longest x.
+    """
+    size = max(abs(work.value[p]), terms, work.length_of_q * work.norm[p])
     return work.excess[p] * work.norm[p] > _HOPELESS * size
 
 
@@ -317,7 +349,7 @@ def _minimise(work, k):
         scale(-1.0, work.slope, x, n)
         solve_transposed(work.L, n, x)
         solve_lower(work.L, n, x)
-    elif work.tag != 0.0:  # K = C P^-1 C' begins with P^-1
+    elif is_prepared(work):  # K = C P^-1 C' begins with P^-1
         add_multipliers(work, k)
         scale(-1.0, work.slope, work.scratch, n)
         multiply(work.K, n, work.scratch, n, x)
@@ -333,7 +365,7 @@ def _minimise(work, k):
 def multiply_constraints(work):
     """Writes the values of the rows, G x."""
     n = work.n
-    multiply_to_ends(work.G, work.end[n:], work.value, work.value[n:])
+    multiply_to_ends(work.G, work.row_end[n:], work.value, work.value[n:])
 
 
 @inline_njit
@@ -352,5 +384,5 @@ def add_multipliers(work, k):
         if p >= n and mu[p] != 0.0:
             weight = mu[p]
             row = work.G[p - n]
-            for j in range(0, int(work.end[p]), 8):
+            for j in range(0, int(work.row_end[p]), 8):
                 store(slope, j, load(slope, j) + weight * load_some(row, j))

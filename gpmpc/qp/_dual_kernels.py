@@ -9,6 +9,7 @@ bound is violated.
 """
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -26,11 +27,10 @@ from gpmpc._kernels._simd import (
 )
 from gpmpc.qp._dual_iteration import (
     BATCHES,
-    NONE,
-    UNLISTED,
     add_multipliers,
     iterate,
 )
+from gpmpc.qp._problem import ABSENT
 from gpmpc.qp._record import (
     AGE,
     CONSTRAINTS,
@@ -53,7 +53,7 @@ from gpmpc.qp._violations import (
     list_violated,
     restore_limits,
 )
-from gpmpc.qp._working_set import constraint_in, restore_working_set
+from gpmpc.qp._working_set import constraint_in, is_prepared, restore_working_set
 from gpmpc.qp._workspace_type import open_workspace
 
 _VECTOR = "f8[::1]"
@@ -63,7 +63,11 @@ SIGNATURE = (
     f"{_VECTOR}, {_MATRIX}, {_VECTOR})"
 )
 
-_PRESENT = np.nextafter(1e20, 0.0)  # the largest bound that is one
+# An x shorter than this share of the length of q counts as zero, and so does a
+# violation of a bound of zero by as little: see ``negligible_length`` and
+# ``negligible`` in ``gpmpc.qp._workspace``.
+NEGLIGIBLE = 1e-26
+_LARGEST_BOUND = np.nextafter(ABSENT, 0.0)
 # A constraint that depends on others may be left with this violation: see
 # ``worst_violation``.
 _NOISE = 2e-14
@@ -74,16 +78,19 @@ _ROUNDS = 10  # returns from the residuals to the iteration
 _FINE = 2e-10
 _FINEST = 1e-15
 # The largest residual of a solution is this multiple of the share that cancellation
-# left of the pivots; with a smaller share than the second, violations are seen of the
-# best x only.
+# left of the pivots; with a smaller share than the second, x is to be as good as can
+# be from the first round on.
 _DOUBT = 3e-7
 _ILL = 5e-4
 _OLD = 1000  # changes after which a factor is computed anew
 
 
 @compiled(allocates=False, locked=True)
-def solve(P, q, G, lower, upper, guess, memory, out):
+def solve_kernel(P, q, G, lower, upper, guess, memory, out):
     """Solves one program and returns the status.
+
+    The memory of a prepared program holds the factor of its P already, and is not to be
+    used with another P or G; that of others has P factorised at each solve.
 
     Args:
         P: (n, n) symmetric positive definite.
@@ -108,16 +115,17 @@ def solve(P, q, G, lower, upper, guess, memory, out):
     if not (shapes_match and dense and _is_dense_matrix(P) and _is_dense_matrix(G)):
         return MISUSE
     work = open_workspace(P, q, G, memory)
-    if work.tag == 0.0:
+    if not is_prepared(work):
         work.pivot_share = _measure_rows(work) if factorise(P, work.L) else 0.0
-    least = NONE * _length_of_slope(work)  # length of an x that is none
-    if work.pivot_share == 0.0 or not least < np.inf:
+    work.length_of_q = _length_of_q(work)
+    work.negligible_length = NEGLIGIBLE * work.length_of_q
+    if work.pivot_share == 0.0 or not work.length_of_q < np.inf:
         return MISUSE
-    if not _read_bounds(work, lower, upper, least):
+    if not _read_bounds(work, lower, upper):
         return MISUSE
     if not _is_record_of(guess, n, M):
         guess = guess[:0]
-    return _solve_opened(work, guess, least, out)
+    return _solve_opened(work, guess, out)
 
 
 @inline_njit
@@ -150,7 +158,9 @@ def _is_record_of(record, n, M):
 
 @inline_njit
 def _measure_rows(work):
-    """Writes norms in the metric of P's diagonal, and the ends of the rows of G.
+    """Writes the norms, and where the rows of G end.
+
+    The norm of c_p is the length of the vector of c_pj / sqrt(P_jj).
 
     Returns what cancellation left of the pivots of P, as a share of P_ii; zero if a
     norm is not finite.
@@ -167,25 +177,22 @@ def _measure_rows(work):
     for i in range(work.m):
         row = work.G[i]
         squares = zeros()
-        end = 0
+        row_end = 0
         for j in range(0, n, 8):
             values = load_some(row, j) * load(units, j)
             squares = squares + values * values
             if any_nonzero(values):
-                end = j + 8
+                row_end = j + 8
         norm = math.sqrt(total(squares))
         undefined += norm * 0.0
         work.norm[n + i] = norm if norm > 0.0 else 1.0
-        work.end[n + i] = min(end, n)
+        work.row_end[n + i] = min(row_end, n)
     return 1.0 / cancelled if undefined == 0.0 else 0.0
 
 
 @inline_njit
-def _length_of_slope(work):
-    """Returns the largest entry of q in the metric of P's diagonal.
-
-    Infinite if one is not finite.
-    """
+def _length_of_q(work):
+    """Returns the largest |q_j| / sqrt(P_jj); infinity if one is not finite."""
     longest = zeros()
     undefined = zeros()
     for j in range(0, work.n, 8):
@@ -196,7 +203,7 @@ def _length_of_slope(work):
 
 
 @inline_njit
-def _read_bounds(work, lower, upper, least):
+def _read_bounds(work, lower, upper):
     """Copies the bounds, with absent ones infinite, and clears the multipliers.
 
     Returns False if any are crossed or undefined.
@@ -207,7 +214,7 @@ def _read_bounds(work, lower, upper, least):
         high = _remove_absent(load_some(upper, p))
         # infinity less infinity is undefined, and so none of a bound
         wrong = wrong + clip(high - low, -1.0, 0.0)
-        negligible = least * load(work.norm, p)
+        negligible = work.negligible_length * load(work.norm, p)
         below = TOLERATED * larger(zeros(), low) + negligible
         above = TOLERATED * larger(zeros(), high) + negligible
         store(work.lower, p, low)
@@ -221,66 +228,115 @@ def _read_bounds(work, lower, upper, least):
 
 @inline_njit
 def _remove_absent(bounds):
-    """Returns eight bounds, those that are absent infinite."""
-    beyond = bounds - clip(bounds, -_PRESENT, _PRESENT)
+    """Returns eight bounds, those that are absent infinite.
+
+    Without a branch: what lies beyond the largest bound, zero or at least 16384 (the
+    spacing of floats there), is multiplied until it overflows, for which one factor of
+    1e300 is too small.
+    """
+    beyond = bounds - clip(bounds, -_LARGEST_BOUND, _LARGEST_BOUND)
     return bounds + (beyond * 1e300) * 1e300
 
 
 @inline_njit
-def _solve_opened(work, guess, least, out):
-    """Solves the program in the workspace, and writes the record ``out``."""
+def _solve_opened(work, guess, out):
+    """Solves the program in the workspace, and writes the record ``out``.
+
+    A round iterates, refines x on its working set, and looks for violations that are
+    left. The rounds end when the refined x has none.
+    """
+    # start from the guess
     k, guessed, age = _start(work, guess, len(out))
-    # only single steps let the dual objective rise for sure
-    interrupted = len(guess) > 0 and guess[STATUS] == ITERATION_LIMIT
-    batches = BATCHES if interrupted else 0
     iterations = 0
-    margin = _LATER / NONE * least
-    tolerance = _FINE
-    passed_over = False
-    changed = False  # whether x or the working set did, since violations were listed
+    batches_left = BATCHES
+    if len(guess) > 0 and guess[STATUS] == ITERATION_LIMIT:
+        batches_left = 0  # only single steps let the dual objective rise for sure
+
+    margin = _LATER * work.length_of_q  # small violations wait for the refined x
+    first_round = True
     rounds = 0
+    count = 0  # of the listed violated constraints
+    finest = False  # whether x is to be as good as can be
+    changed = False  # whether x or the working set did, since violations were listed
+    passed_over = False
     status = NUMERICAL_TROUBLE
-    count = UNLISTED
     while True:
-        if count != 0:
-            progress = iterate(work, k, count, guessed, margin, iterations, batches)
+        # iterate until no constraint is violated by more than the margin
+        if first_round or count > 0:
+            progress = iterate(
+                work, k, first_round, guessed, count, margin, iterations, batches_left
+            )
             k = progress.size
             iterations = progress.iterations
-            batches = progress.batches
+            batches_left = progress.batches_left
             changed = changed or progress.violated
             passed_over = passed_over or progress.passed_over
             status = progress.status
             if status != SOLVED:
                 break
-        _put_on_bounds(work, k)
-        share = min(work.pivot_share, math.sqrt(_least_pivot_share(work, k)))
-        if passed_over or share < _ILL:
-            tolerance = _FINEST
-        refined = refine(work, k, least, min(tolerance, _DOUBT * share))
-        accurate = refined.residual <= min(work.tolerance, _DOUBT * share)
-        status = SOLVED if accurate else NUMERICAL_TROUBLE
-        changed = changed or refined.moved
+        first_round = False
+
+        # refine x; it stays where the iteration saw no violation at a margin of zero
+        judgement = _refine_and_judge(work, k, finest or passed_over)
+        status = judgement.status
+        finest = judgement.finest
+        changed = changed or judgement.moved
         rounds += 1
         settled = not changed and margin == 0.0
-        if settled or rounds == _ROUNDS or refined.residual >= UNDEFINED:
+        if settled or rounds == _ROUNDS or judgement.residual >= UNDEFINED:
             break
         margin = 0.0
         changed = False
-        error = (
-            refined.residual * refined.length / share
-        )  # of x, which hides violations
-        count = list_violated(work, -error if tolerance > _FINEST else -0.0)
+
+        # list what the refined x violates. Its error may hide a violation: before x is
+        # as good as can be, those that are less than the error from it are listed, too
+        error = judgement.residual * judgement.length / judgement.pivot_share
+        count = list_violated(work, -0.0 if finest else -error)
         if count == 0:
             break
-        if tolerance > _FINEST:  # a small violation is believed of the best x only
-            tolerance = _FINEST
+        if not finest:  # refine once more before these are believed
+            finest = True
             count = 0
             changed = True
     unsure = passed_over or rounds == _ROUNDS  # of the violations that are left
-    if unsure and status == SOLVED and worst_violation(work, least) > _NOISE:
+    if unsure and status == SOLVED and worst_violation(work) > _NOISE:
         status = NUMERICAL_TROUBLE
     _write_record(work, k, status, iterations, age + iterations, out)
     return status
+
+
+class _Judgement(NamedTuple):
+    """What the residuals say of a refined x."""
+
+    status: int  # ``SOLVED`` or ``NUMERICAL_TROUBLE``
+    residual: float  # as a share of the length of x
+    length: float  # of x
+    pivot_share: float  # what cancellation left: the error of x is residual / share
+    moved: bool  # whether x did
+    finest: bool  # whether x is as good as can be
+
+
+@inline_njit
+def _refine_and_judge(work, k, finest):
+    """Refines x on its working set, and judges it by its residuals.
+
+    Where ``finest``, or where cancellation left little of the pivots, x is made as good
+    as can be; elsewhere as good as is needed.
+    """
+    _put_on_bounds(work, k)
+    share = min(work.pivot_share, math.sqrt(_least_pivot_share(work, k)))
+    finest = finest or share < _ILL
+    largest_residual = _DOUBT * share
+    refined = refine(work, k, min(_FINEST if finest else _FINE, largest_residual))
+    accurate = refined.residual <= min(work.tolerance, largest_residual)
+    return _Judgement(
+        status=SOLVED if accurate else NUMERICAL_TROUBLE,
+        residual=refined.residual,
+        length=refined.length,
+        pivot_share=share,
+        moved=refined.moved,
+        finest=finest,
+    )
 
 
 @inline_njit
@@ -299,7 +355,7 @@ def _start(work, guess, record_size):
     # for a literal number numba would compile the function once more
     add_multipliers(work, np.int64(0))
     scale(-1.0, work.slope, work.free_rhs, n)
-    if work.tag == 0.0:
+    if not is_prepared(work):
         solve_transposed(work.L, n, work.free_rhs)
     k = 0
     candidates = 0
@@ -309,7 +365,7 @@ def _start(work, guess, record_size):
         labels = guess[first_label : first_label + int(guess[WORKING])]
         candidates = choose_guessed(work, labels)
         factor_is_known = (
-            work.tag != 0.0
+            is_prepared(work)
             and guess[TAG] == work.tag
             and guess[AGE] < _OLD
             and len(guess) == record_size
@@ -372,7 +428,7 @@ def _write_record(work, k, status, iterations, age, out):
     scale(1.0, work.multiplier, out[HEADER + n :], M)
     for i in range(k):
         out[HEADER + n + M + i] = work.label[i]
-    if work.tag != 0.0:
+    if is_prepared(work):
         start = HEADER + n + 2 * M
         for i in range(k):
             scale(1.0, work.factor[i], out[start:], i + 1)

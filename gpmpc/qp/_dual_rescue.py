@@ -6,12 +6,14 @@ Rows that are parallel up to 1e-12, or a Hessian at the edge of definiteness, le
 of sixteen digits. Here the iteration of ``gpmpc.qp._dual_iteration`` is written for
 accuracy: variables and rows are scaled by powers of two, the working set has a QR
 factor computed anew at each change, and x and the multipliers are sums of two floats
-that Newton's method corrects by residuals without rounding error (iterative refinement,
-Higham, Accuracy and Stability of Numerical
+that Newton's method corrects by residuals without rounding error (iterative refinement:
+Higham, Accuracy and Stability of Numerical Algorithms, 2002, chapter 12):
 
     a = -A_W dmu - L^-1 r1,   A_W' a = -r2,   L' dx = a
 
-for the residuals r1 of stationarity and r2 of the working set.
+for the residuals r1 of stationarity and r2 of the working set. Here P = L L', other
+than in the kernels (P = L'L), and A_W = L^-1 C_W' holds the columns of the working set
+W.
 """
 
 from collections.abc import Callable
@@ -32,11 +34,14 @@ Array = NDArray[np.float64]
 NEGLIGIBLE = 1e-26
 # share of these terms by which a row may contradict others that it depends on: the
 # data's rounding
-_ROUNDING = 1e-14
+_ROUNDING_OF_DATA = 1e-14
 # Distances from the span of the others, as a share of the row, within which a row
 # depends on them. Where rows that differ by rounding only are taken for independent
 # ones, x does not converge: then the next one is tried.
-_DEPENDENT = (1e-14, 1e-13, 1e-12, 1e-10)
+_DEPENDENT_DISTANCES = (1e-14, 1e-13, 1e-12, 1e-10)
+# A guessed constraint is this many times as far from the others: if it is nearer and
+# does matter, it is found violated and enters later.
+_GUESS_MARGIN = 1e6
 _CONVERGED = 1e-12  # last correction of x, as a share of its size
 _CORRECTIONS = 12
 
@@ -63,14 +68,15 @@ def rescue(
     try:
         lower = np.where(lower <= -ABSENT, -np.inf, lower)
         upper = np.where(upper >= ABSENT, np.inf, upper)
-        for dependent in _DEPENDENT:
-            solve = _Solve((P, q, G, lower, upper), caps, dependent, late)
-            result[layout.STATUS] = solve.run(
-                layout.working_names(record, len(q), len(lower)), limit
+        labels = layout.working_labels(record, len(q), len(lower))
+        for dependent_distance in _DEPENDENT_DISTANCES:
+            solver = _AccurateSolver(
+                (P, q, G, lower, upper), caps, dependent_distance, late
             )
+            result[layout.STATUS] = solver.run(labels, limit)
             if result[layout.STATUS] != layout.NUMERICAL_TROUBLE:
                 break
-        solve.write(result)  # pyright: ignore[reportPossiblyUnboundVariable]
+        solver.write(result)  # pyright: ignore[reportPossiblyUnboundVariable]
     except TimeoutError:
         result[layout.STATUS] = layout.TIME_LIMIT
     except (ArithmeticError, ValueError, np.linalg.LinAlgError):
@@ -96,13 +102,15 @@ class _Blocking(NamedTuple):
     multiplier: float  # the end of its range
 
 
-class _Solve:
+class _AccurateSolver:
     """A scaled program and the state of the iteration.
 
     The state is the working set (+1 at an upper bound), x and the multipliers.
     """
 
-    def __init__(self, problem: tuple, caps: Array, dependent: float, late: Callable):
+    def __init__(
+        self, problem: tuple, caps: Array, dependent_distance: float, late: Callable
+    ):
         P, q, G, lower, upper = problem
         n = len(q)
         M = len(lower)
@@ -119,18 +127,21 @@ class _Solve:
         self.lower = lower * E
         self.upper = upper * E
         self.caps = caps / E
-        self.G = G
-        self.bounds = (lower, upper)
+        self.unscaled_G = G
+        self.unscaled_bounds = (lower, upper)
         self.late = late
         self.L = np.linalg.cholesky(self.P)
         self.columns = solve_triangular(self.L, self.C.T, lower=True)  # L^-1 C'
         self.norms = np.sqrt((self.columns**2).sum(axis=0))
-        self.dependent = dependent / np.diagonal(self.L).min()
+        # L^-1 magnifies the rounding of a column by up to 1 / min L_ii
+        self.dependent_distance = dependent_distance / np.diagonal(self.L).min()
         self.working: dict[int, int] = {}
+        self.Q = np.zeros((n, 0))  # A_W = Q R
+        self.R = np.zeros((0, 0))
         self.x = np.zeros((2, n))
         self.mu = np.zeros((2, M))
         self.iterations = 0
-        self.ray = None
+        self.ray: Array | None = None  # Farkas' proof, not scaled
 
     def run(self, labels: Array, limit: int) -> int:
         """Changes the working set until no constraint is violated; returns the status.
@@ -149,13 +160,16 @@ class _Solve:
                 return layout.SOLVED
             if self.iterations >= limit:
                 return layout.ITERATION_LIMIT
-            rounding = _ROUNDING * self._terms_of(violated.p, violated.side)
-            if self._satisfy_constraint(violated, rounding):
+            rounding = _ROUNDING_OF_DATA * self._terms_of(violated.p, violated.side)
+            combination = self._satisfy_constraint(violated, rounding)
+            if combination is None:
                 continue
-            if self._prove(violated):
+            if self._prove(violated, combination):
                 return layout.INFEASIBLE
             working_terms = [self._terms_of(*w) for w in self.working.items()]
-            rounding = rounding + _ROUNDING * np.abs(self.r) @ working_terms
+            rounding = rounding + (
+                _ROUNDING_OF_DATA * np.abs(combination) @ working_terms
+            )
             if violated.amount > rounding:
                 return layout.NUMERICAL_TROUBLE
             passed_over.add(violated.p)
@@ -183,9 +197,9 @@ class _Solve:
         """Returns the range of a multiplier at the upper (+1) or lower (-1) bound."""
         equality = self.lower[p] == self.upper[p]
         cap = self.caps[p]
-        return (-cap if equality or side < 0 else 0.0), (
-            cap if equality or side > 0 else 0.0
-        )
+        least = -cap if equality or side < 0 else 0.0
+        most = cap if equality or side > 0 else 0.0
+        return least, most
 
     def _guess(self, labels: Array) -> None:
         """Starts with the labelled bounds, except those that depend on others."""
@@ -199,7 +213,8 @@ class _Solve:
             return
         unit_columns = self.columns[:, present] / self.norms[present]
         R, order = qr(unit_columns, mode="r", pivoting=True)
-        independent = np.abs(np.diagonal(R)) > 1e6 * self.dependent
+        distances = np.abs(np.diagonal(R))
+        independent = distances > _GUESS_MARGIN * self.dependent_distance
         for i in order[: len(independent)][independent]:
             self.working[present[i]] = guess[present[i]]
 
@@ -219,7 +234,7 @@ class _Solve:
                 return False
             worst = 0.0
             wrong = -1
-            end = 0.0
+            multiplier = 0.0
             for p, side in self.working.items():
                 least, most = self._range(p, side)
                 outside = (
@@ -228,10 +243,10 @@ class _Solve:
                 if outside > worst:
                     worst = outside
                     wrong = p
-                    end = most if self.mu[0, p] > most else least
+                    multiplier = most if self.mu[0, p] > most else least
             if wrong < 0:
                 return True
-            self._drop(wrong, end if np.isfinite(end) else 0.0)
+            self._drop(wrong, multiplier if np.isfinite(multiplier) else 0.0)
 
     def _drop(self, p: int, multiplier: float) -> None:
         self.mu[:, p] = multiplier, 0.0
@@ -261,12 +276,11 @@ class _Solve:
                 self.q,
             )
             r2 = _sum_products([(C, x[0]), (C, x[1])], -b)
-            slope = solve_triangular(self.L, r1, lower=True)
+            scaled_r1 = solve_triangular(self.L, r1, lower=True)
             along = solve_triangular(self.R, r2, trans="T")
-            part = self.Q.T @ slope
-            dx = solve_triangular(
-                self.L, self.Q @ (part - along) - slope, trans="T", lower=True
-            )
+            part = self.Q.T @ scaled_r1
+            a = self.Q @ (part - along) - scaled_r1
+            dx = solve_triangular(self.L, a, trans="T", lower=True)
             _add(x, slice(None), dx)
             _add(mu, W, solve_triangular(self.R, along - part))
             size = max(np.abs(x[0]).max(), NEGLIGIBLE * np.abs(self.q).max())
@@ -313,13 +327,15 @@ class _Solve:
         """
         if self.C[p].any():
             return max(abs(self._bound(p, side)), np.abs(self.C[p]) @ np.abs(self.x[0]))
-        return zero_row_size(self.G, *self.bounds)
+        return zero_row_size(self.unscaled_G, *self.unscaled_bounds)
 
-    def _satisfy_constraint(self, violated: _Violated, rounding: float) -> bool:
+    def _satisfy_constraint(self, violated: _Violated, rounding: float) -> Array | None:
         """Moves multipliers until a constraint is satisfied.
 
-        Returns False if it contradicts the working ones, or depends on them and is
-        violated by no more than rounding.
+        Returns:
+            None, or the combination of working constraints that a constraint is that
+            cannot be satisfied: it contradicts them, or is violated by no more than
+            ``rounding``. ``_prove`` tells which.
         """
         p = violated.p
         sense = violated.sense
@@ -330,19 +346,18 @@ class _Solve:
             # step direction
             self._factorise()
             r, square = self._project(p)
-            independent = np.sqrt(square) > self.dependent * self.norms[p]
+            independent = np.sqrt(square) > self.dependent_distance * self.norms[p]
 
             # step length
             step = violation / square if independent else np.inf
             least, most = self._range(p, violated.side)
             room = most - mu[p] if sense > 0 else mu[p] - least
             capped = room < step
-            blocking = self._first_blocking(mu, sense * r, r, min(step, room))
+            blocking = self._first_blocking(mu, sense * r, min(step, room))
             step = blocking.step
             if step == np.inf or (not independent and violation <= rounding):
-                self.r = r
                 self.mu[:, p] = multiplier_before, 0.0
-                return False
+                return r
 
             # take the step
             mu[list(self.working)] -= sense * step * r
@@ -353,7 +368,7 @@ class _Solve:
                 self.iterations += 1
                 if not capped:
                     self.working[p] = violated.side
-                return True
+                return None
             mu[blocking.p] = blocking.multiplier
             self._drop(blocking.p, blocking.multiplier)
 
@@ -370,31 +385,36 @@ class _Solve:
             r = r + solve_triangular(self.R, part)
         return r, distance @ distance
 
-    def _first_blocking(
-        self, mu: Array, rates: Array, r: Array, step: float
-    ) -> _Blocking:
-        """Returns the longest step up to ``step``, and the constraint that ends it."""
-        noise = 1e-14 * np.abs(r * self.norms[list(self.working)]).max(initial=0.0)
+    def _first_blocking(self, mu: Array, rates: Array, step: float) -> _Blocking:
+        """Returns the longest step up to ``step``, and the constraint that ends it.
+
+        ``rates`` are those at which the working multipliers decrease.
+        """
+        noise = 1e-14 * np.abs(rates * self.norms[list(self.working)]).max(initial=0.0)
         blocking = _Blocking(-1, step, 0.0)
         for (w, side), rate in zip(self.working.items(), rates, strict=True):
             if abs(rate) * self.norms[w] > noise:
                 least, most = self._range(w, side)
-                end = least if rate > 0.0 else most
-                room = max(0.0, (mu[w] - end) / rate)
+                range_end = least if rate > 0.0 else most
+                room = max(0.0, (mu[w] - range_end) / rate)
                 if room < blocking.step:
-                    blocking = _Blocking(w, room, end)
+                    blocking = _Blocking(w, room, range_end)
         return blocking
 
-    def _prove(self, violated: _Violated) -> bool:
-        """Returns whether the last contradiction has Farkas' proof, the new ray."""
+    def _prove(self, violated: _Violated, combination: Array) -> bool:
+        """Returns whether a contradiction has Farkas' proof, which becomes the ray.
+
+        ``combination`` is that of working constraints which the violated one is.
+        """
         p = violated.p
         sense = violated.sense
         W = np.array(list(self.working), dtype=int)
         sides = np.array(list(self.working.values()), dtype=int)
-        used = np.abs(self.r) * self.norms[W] > self.dependent * self.norms[p]
+        weights = np.abs(combination) * self.norms[W]
+        used = weights > self.dependent_distance * self.norms[p]
         W = W[used]
         sides = sides[used]
-        r = self.r[used]
+        r = combination[used]
         Q, R = qr(self.columns[:, W], mode="economic")
         for _ in range(3):
             rest = _sum_products([(self.C[W].T, -r)], self.C[p])
@@ -406,8 +426,9 @@ class _Solve:
         ray = np.zeros(len(self.E))
         ray[W] = np.where(wrong, 0.0, -sense * r)
         ray[p] = sense
-        proven = proves_infeasibility(ray * self.E, self.G, *self.bounds)
-        self.ray = ray * self.E if proven else None
+        ray = ray * self.E
+        proven = proves_infeasibility(ray, self.unscaled_G, *self.unscaled_bounds)
+        self.ray = ray if proven else None
         return proven
 
 

@@ -70,8 +70,8 @@ class _Rows(NamedTuple):
     factor: Array  # (r,) and by what that constraint was multiplied
 
 
-class _End(NamedTuple):
-    """The point at which the iteration ended."""
+class _Outcome(NamedTuple):
+    """The point at which a solve ended, and how."""
 
     status: Status
     x: Array
@@ -110,17 +110,17 @@ class PrimalActiveSet:
         x, ray = _phase_1(rows, start, len(problem.lower))
         if ray is None:
             working = _guessed_rows(rows, x, labels)
-            end = self._iterate(problem, rows, x, working)
+            outcome = self._iterate(problem, rows, x, working)
         else:
             proven = proves_infeasibility(ray, problem.G, problem.lower, problem.upper)
             status = Status.INFEASIBLE if proven else Status.NUMERICAL_TROUBLE
-            end = _End(status, x, iterations=0, multipliers=ray)
-        solution = self._judge(problem, end)
+            outcome = _Outcome(status, x, iterations=0, multipliers=ray)
+        solution = self._polish_and_judge(problem, outcome)
         return solution._replace(solve_seconds=perf_counter() - began)
 
     def _iterate(
         self, problem: QuadraticProgram, rows: _Rows, x: Array, working: list[int]
-    ) -> _End:
+    ) -> _Outcome:
         """Runs Algorithm 1 from a feasible x and rows that hold with equality there."""
         limit = self.iteration_limit or 200 + 20 * len(rows.h)
         zero_steps = 0
@@ -133,9 +133,9 @@ class PrimalActiveSet:
                     problem.P, gradient, A, gap=rows.h[working] - A @ x
                 )
             except ValueError:  # from SciPy: not finite, or no longer positive definite
-                return _End(Status.NUMERICAL_TROUBLE, x, iteration)
+                return _Outcome(Status.NUMERICAL_TROUBLE, x, iteration)
             if not np.isfinite(d).all():
-                return _End(Status.NUMERICAL_TROUBLE, x, iteration)
+                return _Outcome(Status.NUMERICAL_TROUBLE, x, iteration)
 
             is_still = np.abs(d).max() <= _STILL * max(1.0, np.abs(x).max())
             if is_still or full_steps == _FULL_STEPS:
@@ -144,7 +144,7 @@ class PrimalActiveSet:
                     stacked = _stack(rows, working, multipliers, len(problem.lower))
                     active = np.zeros(len(problem.lower))
                     active[rows.stacked[working]] = np.sign(rows.factor[working])
-                    return _End(Status.SOLVED, x, iteration, stacked, active)
+                    return _Outcome(Status.SOLVED, x, iteration, stacked, active)
                 leaving = np.argmin(droppable)
                 if zero_steps > _ZERO_STEPS:  # Bland's rule
                     leaving = np.argmax(droppable < 0.0)
@@ -158,20 +158,27 @@ class PrimalActiveSet:
             full_steps = full_steps + 1 if blocking is None else 0
             if blocking is not None:
                 working = sorted([*working, blocking])
-        return _End(Status.ITERATION_LIMIT, x, limit)
+        return _Outcome(Status.ITERATION_LIMIT, x, limit)
 
-    def _judge(self, problem: QuadraticProgram, end: _End) -> QPSolution:
-        """Returns the solution, whose last digits are found and residuals checked."""
+    def _polish_and_judge(
+        self, problem: QuadraticProgram, outcome: _Outcome
+    ) -> QPSolution:
+        """Returns the solution with its last digits, once its residuals are checked.
+
+        ``rescue`` runs after every solve that found a point: from the working set of a
+        solution it changes the last digits only.
+        """
         nothing = np.zeros(len(problem.lower))
         solution = make_solution(
             problem,
-            end.status,
-            end.x,
-            nothing if end.multipliers is None else end.multipliers,
-            active_set=nothing if end.active is None else end.active,
-            iterations=end.iterations,
+            outcome.status,
+            outcome.x,
+            nothing if outcome.multipliers is None else outcome.multipliers,
+            active_set=nothing if outcome.active is None else outcome.active,
+            iterations=outcome.iterations,
         )
-        if end.status in (Status.SOLVED, Status.NUMERICAL_TROUBLE):
+        if outcome.status in (Status.SOLVED, Status.NUMERICAL_TROUBLE):
+            # in place: ``solution.x`` is a view of the record
             solution.record[:] = rescue(problem, solution.caps, solution.record)
             infeasible = solution.status is Status.INFEASIBLE
             if not infeasible and not solution.is_optimal(self.tolerance):
@@ -190,7 +197,7 @@ def _read_warm_start(record: Array, problem: QuadraticProgram) -> tuple[Array, A
     x = record[layout.HEADER : layout.HEADER + n]
     return (
         np.nan_to_num(x, posinf=0.0, neginf=0.0),
-        layout.working_names(record, n, M),
+        layout.working_labels(record, n, M),
     )
 
 
@@ -226,7 +233,7 @@ def _phase_1(rows: _Rows, start: Array, M: int) -> tuple[Array, Array | None]:
     """Finds a feasible point, which is ``start`` if that is one.
 
     Returns the point and None, or ``start`` and a ray (M,) that may prove that there is
-    none.
+    none. A ray of zeros, which proves nothing, says that the linear program failed.
     """
     A = np.vstack([rows.A, -rows.A[rows.equality]])
     h = np.concatenate([rows.h, -rows.h[rows.equality]])

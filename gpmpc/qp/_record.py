@@ -9,8 +9,8 @@ single record, which the next solve reads as its warm start:
 
 Constraints are stacked, box first: ``C = [I; G]``, M = n + m. A multiplier is positive
 at an upper and negative at a lower bound, so that ``P x + q + C' multipliers = 0``. The
-working set lists signed numbers: ``+(p + 1)`` for constraint p at its upper bound,
-``-(p + 1)`` at its lower one; what comes after them is undefined. The record of a
+working set lists labels: ``+(p + 1)`` for constraint p at its upper bound, ``-(p + 1)``
+at its lower one; what comes after them is undefined. The record of a
 prepared program ends with the factor of the working set, by rows; the tag says of which
 program it is (zero: none), the age how many constraints have entered or left since the
 factor was computed.
@@ -24,9 +24,15 @@ from gpmpc.status import Status
 STATUS, ITERATIONS, VARIABLES, CONSTRAINTS, WORKING, TAG, AGE, HEADER = range(8)
 
 SOLVED, INFEASIBLE, ITERATION_LIMIT, TIME_LIMIT, NUMERICAL_TROUBLE = range(5)
-STATUSES = tuple(Status)[:5]
-# found by a kernel: the caller constructs a QuadraticProgram, whose error says what is
-# wrong
+STATUSES = (
+    Status.SOLVED,
+    Status.INFEASIBLE,
+    Status.ITERATION_LIMIT,
+    Status.TIME_LIMIT,
+    Status.NUMERICAL_TROUBLE,
+)
+# Returned by a kernel, and in no record: the caller constructs a QuadraticProgram,
+# whose error says what is wrong.
 MISUSE = 5
 
 NO_RECORD: NDArray[np.float64] = np.zeros(0)
@@ -57,11 +63,11 @@ def warm_record(active_set: NDArray, variables: int) -> NDArray[np.float64]:
     return record
 
 
-def working_names(
+def working_labels(
     record: NDArray, variables: int, constraints: int
 ) -> NDArray[np.float64]:
     """Returns the working set of a record, without what is no bound."""
-    names = record[HEADER + variables + constraints :][
+    labels = record[HEADER + variables + constraints :][
         : int(np.clip(np.nan_to_num(record[WORKING]), 0, constraints))
     ]
-    return names[(np.abs(names) >= 1.0) & (np.abs(names) <= constraints)]
+    return labels[(np.abs(labels) >= 1.0) & (np.abs(labels) <= constraints)]

@@ -37,11 +37,10 @@ class Refinement(NamedTuple):
 
 
 @inline_njit
-def refine(work, k, least, tolerance):
+def refine(work, k, tolerance):
     """Corrects x and the multipliers on the working set.
 
     Ends when their residual is at most ``tolerance``, or does not halve any more.
-    ``least`` is the length of an x that counts as none.
     """
     residual = np.inf
     length = 0.0
@@ -49,7 +48,7 @@ def refine(work, k, least, tolerance):
     moved = False
     for step in range(_STEPS + 1):
         add_multipliers(work, k)
-        residual, length = _measure_residual(work, k, least)
+        residual, length = _measure_residual(work, k)
         halved = residual < 0.5 * best
         if residual <= tolerance or step == _STEPS or not halved:
             break
@@ -60,13 +59,14 @@ def refine(work, k, least, tolerance):
 
 
 @inline_njit
-def _measure_residual(work, k, least):
+def _measure_residual(work, k):
     """Returns the residual of a point as a share of the length of x, and this length.
 
     The residual is that of stationarity and of the working constraints. The length is
-    that in the metric of P, at least ``least``, so that neither the units of the data
-    nor a cost of another size hide an error of x. A hundredth of the error is also
-    measured by the largest entry of x, and that of a row by its bound or its own terms.
+    that in the metric of P, at least ``negligible_length``, so that neither the units
+    of the data nor a cost of another size hide an error of x. A hundredth of the error
+    is also measured by the largest entry of x, and that of a row by its bound or its
+    own terms.
     ``UNDEFINED`` where a number that it is made of is not finite: comparisons alone
     would pass over NaN.
 
@@ -76,6 +76,7 @@ def _measure_residual(work, k, least):
     x = work.value
     gradient = work.gradient
     multiply(work.P, n, x, n, gradient)
+    least = work.negligible_length
     length = math.sqrt(max(dot(gradient, x, n), least * least, _TINY))
     steps = zeros()
     shifts = zeros()
@@ -113,7 +114,7 @@ def _relative_residual(work, slot, residual, length):
     terms = max(abs(bound), 1e-6 * scaled_length)
     if p >= work.n and residual > 1e-9 * terms:
         row = work.G[p - work.n]
-        for j in range(int(work.end[p])):
+        for j in range(int(work.row_end[p])):
             terms = max(terms, abs(row[j] * work.value[j]))
     return max(residual / scaled_length, 1e-2 * residual / terms)
 
@@ -152,11 +153,12 @@ def _take_newton_step(work, k):
 
 
 @inline_njit
-def worst_violation(work, least):
+def worst_violation(work):
     """Returns the largest violation beyond what multipliers pay for.
 
     It is a share of the bound or of a thousandth of the length of x.
     """
+    least = work.negligible_length
     length = math.sqrt(max(abs(dot(work.slope, work.value, work.n)), least * least))
     worst = 0.0
     for p in range(work.M):

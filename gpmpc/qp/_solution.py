@@ -18,7 +18,7 @@ from gpmpc.status import Status
 
 Array = NDArray[np.float64]
 
-_ROUNDING = 4e-15  # share of a sum's terms that counts as rounding
+_ROUNDING_OF_SUMS = 4e-15  # share of a sum's terms that counts as rounding
 
 
 class Residuals(NamedTuple):
@@ -105,8 +105,8 @@ class QPSolution(NamedTuple):
         The entry is -1 for a lower bound, +1 for an upper bound, 0 for none.
         """
         active = np.zeros(len(self.caps), dtype=np.int8)
-        names = layout.working_names(self.record, len(self.x), len(self.caps))
-        active[np.abs(names).astype(int) - 1] = np.sign(names)
+        labels = layout.working_labels(self.record, len(self.x), len(self.caps))
+        active[np.abs(labels).astype(int) - 1] = np.sign(labels)
         return active
 
     @property
@@ -115,23 +115,22 @@ class QPSolution(NamedTuple):
 
         The price of violated soft rows is part of it.
         """
-        x, (P, q, *_), soft = self.x, self.arrays, np.isfinite(self.caps)
-        return float(0.5 * x @ P @ x + q @ x + self.caps[soft] @ self.violation()[soft])
+        P, q, *_ = self.arrays
+        x = self.x
+        soft = np.isfinite(self.caps)
+        price = self.caps[soft] @ self.violation()[soft]
+        return float(0.5 * x @ P @ x + q @ x + price)
 
     def violation(self) -> Array:
         """Returns how far each stacked constraint lies outside its bounds (M,).
 
         In the constraint's own unit; soft rows count, too.
         """
-        values, (lower, upper) = (
-            np.concatenate([self.x, self.arrays[2] @ self.x]),
-            self.arrays[3:],
-        )
-        outside = (
-            np.where(upper < ABSENT, values - upper, 0.0),
-            np.where(lower > -ABSENT, lower - values, 0.0),
-        )
-        return np.maximum(0.0, np.maximum(*outside))
+        _, _, G, lower, upper = self.arrays
+        values = np.concatenate([self.x, G @ self.x])
+        above = np.where(upper < ABSENT, values - upper, 0.0)
+        below = np.where(lower > -ABSENT, lower - values, 0.0)
+        return np.maximum(0.0, np.maximum(above, below))
 
     @np.errstate(all="ignore")  # the multipliers of a failed solve may be anything
     def residuals(self, zero: float = 1e-12) -> Residuals:
@@ -142,55 +141,63 @@ class QPSolution(NamedTuple):
         Args:
             zero: What counts as no x at all, as a share of the free minimiser.
         """
-        (P, q, G, lower, upper), caps = self.arrays, self.caps
+        P, q, _, _, _ = self.arrays
+        units = np.sqrt(np.diagonal(P))
+        length_of_q = (np.abs(q) / units).max()
+        length_of_x = (units * np.abs(self.x)).max()
+        zero = max(1e-4 * length_of_x, zero * length_of_q)
+        violation = self.violation()
+        return Residuals(
+            primal=self._primal_residual(violation, zero / units),
+            dual=self._dual_residual(zero * units),
+            gap=self._gap(violation, zero * length_of_q),
+        )
+
+    def _primal_residual(self, violation: Array, zero: Array) -> float:
+        """Returns ``Residuals.primal``; an x_j below ``zero`` (n,) counts as that."""
+        _, _, G, lower, upper = self.arrays
+        x = self.x
+        n = len(x)
+        unpaid = np.where(np.abs(self.multipliers) >= self.caps, 0.0, violation)
+        violates_upper = np.concatenate([x, G @ x]) > upper
+        bound = np.abs(np.where(violates_upper, upper, lower))
+        entries = np.maximum(np.abs(x), zero)
+        terms = np.concatenate([entries, np.abs(G) @ entries])
+        terms[n:][~G.any(axis=1)] = zero_row_size(G, lower, upper)
+        return _largest_ratio(unpaid, np.maximum(terms, bound))
+
+    def _dual_residual(self, zero: Array) -> float:
+        """Returns ``Residuals.dual``; terms below ``zero`` (n,) count as that."""
+        P, q, G, lower, upper = self.arrays
+        x = self.x
+        n = len(x)
+        sizes = np.abs(self.multipliers)
+        at_absent_upper = (self.multipliers > 0) & (upper >= ABSENT)
+        at_absent_lower = (self.multipliers < 0) & (lower <= -ABSENT)
+        beyond_cap = np.maximum(0.0, sizes - self.caps)
+        wrong = np.where(at_absent_upper | at_absent_lower, sizes, beyond_cap)
+        right = sizes - wrong
+        stationarity = np.abs(P @ x + q + G.T @ self.z + self.z_box)
+        residual = stationarity + wrong[:n] + np.abs(G).T @ wrong[n:]
+        terms = np.abs(P) @ np.abs(x) + np.abs(q) + right[:n] + np.abs(G).T @ right[n:]
+        return _largest_ratio(residual, np.maximum(terms, zero))
+
+    def _gap(self, violation: Array, zero: float) -> float:
+        """Returns ``Residuals.gap``; objectives below ``zero`` count as that."""
+        P, q, _, lower, upper = self.arrays
         x = self.x
         multipliers = self.multipliers
-        sizes = np.abs(multipliers)
         up = multipliers > 0
         down = multipliers < 0
-        rows = G @ x
-        slope = P @ x
-        n = len(x)
-        units = np.sqrt(np.diagonal(P))
-        free = (np.abs(q) / units).max()
-        zero = max(1e-4 * (units * np.abs(x)).max(), zero * free)
-
-        violation = self.violation()
-        beyond = np.where(sizes >= caps, 0.0, violation)
-        bound = np.abs(np.where(np.concatenate([x, rows]) > upper, upper, lower))
-        own = np.concatenate(
-            [
-                np.maximum(np.abs(x), zero / units),
-                np.abs(G) @ np.maximum(np.abs(x), zero / units),
-            ]
-        )
-        own[n:][~G.any(axis=1)] = zero_row_size(G, lower, upper)
-        primal = _largest_ratio(beyond, np.maximum(own, bound))
-
-        absent = (up & (upper >= ABSENT)) | (down & (lower <= -ABSENT))
-        stray = np.where(absent, sizes, np.maximum(0.0, sizes - caps))
-        rest = (
-            np.abs(slope + q + G.T @ self.z + self.z_box)
-            + stray[:n]
-            + np.abs(G).T @ stray[n:]
-        )
-        paid = sizes - stray
-        own = np.abs(P) @ np.abs(x) + np.abs(q) + paid[:n] + np.abs(G).T @ paid[n:]
-        dual = _largest_ratio(rest, np.maximum(own, zero * units))
-
-        support = multipliers[up] * upper[up], multipliers[down] * lower[down]
-        capped = (sizes >= caps) & np.isfinite(caps)
-        curvature = x @ slope
-        gain = q @ x
-        gap = abs(
-            curvature
-            + gain
-            + sum(map(np.sum, support))
-            + caps[capped] @ violation[capped]
-        )
-        own = sum(np.abs(part).sum() for part in support)
-        gap = _largest_ratio(gap, max(abs(curvature), abs(gain), own, zero * free))
-        return Residuals(primal, dual, gap)
+        at_upper = multipliers[up] * upper[up]
+        at_lower = multipliers[down] * lower[down]
+        capped = (np.abs(multipliers) >= self.caps) & np.isfinite(self.caps)
+        price = self.caps[capped] @ violation[capped]
+        quadratic = x @ (P @ x)
+        linear = q @ x
+        gap = abs(quadratic + linear + (at_upper.sum() + at_lower.sum()) + price)
+        bounds_terms = np.abs(at_upper).sum() + np.abs(at_lower).sum()
+        return _largest_ratio(gap, max(abs(quadratic), abs(linear), bounds_terms, zero))
 
     def is_optimal(self, eps: float = 1e-9) -> bool:
         """Whether the residuals, whatever the status says, are all at most ``eps``."""
@@ -220,15 +227,12 @@ class QPSolver(Protocol):
         ...
 
 
-def _largest_ratio(rest: ArrayLike, own: ArrayLike) -> float:
-    """The largest of ``rest / own``, zero where both are."""
-    return float(
-        np.max(
-            np.divide(
-                rest, own, out=np.zeros(np.shape(rest)), where=np.not_equal(rest, 0.0)
-            )
-        )
-    )
+def _largest_ratio(residuals: ArrayLike, sizes: ArrayLike) -> float:
+    """Returns the largest of ``residuals / sizes``, zero where both are."""
+    ratios = np.zeros(np.shape(residuals))
+    is_residual = np.not_equal(residuals, 0.0)
+    np.divide(residuals, sizes, out=ratios, where=is_residual)
+    return float(np.max(ratios))
 
 
 def make_solution(
@@ -311,7 +315,7 @@ def proves_infeasibility(ray: Array, G: Array, lower: Array, upper: Array) -> bo
     """
     n = G.shape[1]
     rest = ray[:n] + ray[n:] @ G
-    rounding = _ROUNDING * (np.abs(ray[:n]) + np.abs(ray[n:]) @ np.abs(G))
+    rounding = _ROUNDING_OF_SUMS * (np.abs(ray[:n]) + np.abs(ray[n:]) @ np.abs(G))
     repaired = ray.copy()
     repaired[:n] -= np.where(np.abs(rest) > rounding, rest, 0.0)
     bounds = np.where(repaired > 0, upper, lower)
@@ -322,7 +326,7 @@ def proves_infeasibility(ray: Array, G: Array, lower: Array, upper: Array) -> bo
     sizes = np.abs(products).sum() + np.abs(ray[n:])[
         ~G.any(axis=1)
     ].sum() * zero_row_size(G, lower, upper)
-    return bool(products.sum() < -_ROUNDING * sizes)
+    return bool(products.sum() < -_ROUNDING_OF_SUMS * sizes)
 
 
 def zero_row_size(G: Array, lower: Array, upper: Array) -> float:

@@ -87,7 +87,7 @@ def recheck_violated(work, margin, count):
     for i in range(count):
         p = violated[i]
         if p >= n:
-            value[p] = dot(work.G[p - n], value, int(work.end[p]))
+            value[p] = dot(work.G[p - n], value, int(work.row_end[p]))
         outside = max(value[p] - work.allowed_high[p], work.allowed_low[p] - value[p])
         excess[p] = outside / work.norm[p] - margin
         if excess[p] > 0.0:

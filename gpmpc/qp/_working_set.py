@@ -24,6 +24,12 @@ _CANDIDATE_PIVOT = 1e-9
 
 
 @inline_njit
+def is_prepared(work):
+    """Returns whether the memory holds the factor, the rows w_p and K beforehand."""
+    return work.tag != 0.0
+
+
+@inline_njit
 def constraint_in(work, slot):
     """Returns the constraint that a slot holds."""
     return abs(work.label[slot]) - 1
@@ -32,13 +38,13 @@ def constraint_in(work, slot):
 @inline_njit
 def write_slot(work, k, p, above):
     """Writes constraint p, at its upper (``above``) or lower bound, to slot k."""
-    if work.tag != 0.0:
+    if is_prepared(work):
         work.place[k] = p
         row = work.K[p]  # begins with c_p'P^-1, as ``free_rhs`` is -q
         work.diagonal[k] = row[p]
     else:
         row = work.rows[work.place[k]]
-        end = int(work.end[p])
+        end = int(work.row_end[p])
         _write_constraint(work, p, row)
         solve_transposed(work.L, end, row)  # w_p = L^-T c_p
         work.diagonal[k] = dot(row, row, end)
@@ -71,13 +77,13 @@ def compute_factor_row(work, k, p):
     """Writes L_K^-1 K_Wp, the row that p in slot k would add, to ``forward``."""
     forward = work.forward
     place = work.place
-    if work.tag != 0.0:
+    if is_prepared(work):
         column = work.K[p]
         for i in range(k):
             forward[i] = column[place[i]]
     else:
         row = work.rows[place[k]]
-        multiply_rows(work.rows, place, k, row, int(work.end[p]), forward)
+        multiply_rows(work.rows, place, k, row, int(work.row_end[p]), forward)
     solve_lower(work.factor, k, forward)
 
 
@@ -141,9 +147,9 @@ def restore_working_set(work, count, packed_factor):
 
 @inline_njit
 def drop_constraint(work, k, slot):
-    """Drops the constraint in a slot; the slots behind it, k included, move up.
+    """Drops the constraint in a slot; those behind it, up to slot k, go one slot down.
 
-    Its entry of ``forward`` goes too.
+    Its entry of ``forward`` goes too. Its place in ``rows`` becomes that of slot k.
     """
     delete_row(work.factor, k, slot, work.forward, work.cosines, work.sines)
     free_place = work.place[slot]

@@ -11,7 +11,7 @@ them: ``work.lower[p]``, ``work.factor[k]``, ``work.tolerance``. To add a vector
 its name to ``VECTORS``. A ``work`` is a handful of pointers and sizes, as a C struct
 would be, and a field becomes an array where it is read. A named tuple of these arrays
 would hand seven numbers per array to every function, which doubles the time that
-compilation takes.
+compilation takes (``gpmpc.qp._workspace_type``).
 
 A constraint p is represented by its *row* w_p = L^-T c_p with P = L'L, so that K_pq =
 c_p'P^-1 c_q = w_p . w_q. The *working set* W is a list of k *slots*: slot i holds one
@@ -20,11 +20,13 @@ at the upper bound and -(p + 1) at the lower one.
 """
 
 import zlib
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
+from gpmpc._compiled import inline_njit
 from gpmpc._kernels.linalg import aligned_rows
 
 Array = NDArray[np.float64]
@@ -33,8 +35,11 @@ SETTINGS = (
     "limit",  # changes of the working set
     "tolerance",  # largest residual of a solution
     "soft",  # whether rows may be violated at a price: zero or one
-    "tag",  # which prepared program it is; zero if it is none
+    "tag",  # which prepared program it is (a checksum); zero if it is none
+    # Of the program that is being solved.
     "pivot_share",  # what cancellation left of the pivots of P, as a share of P_ii
+    "length_of_q",  # its largest |q_j| / sqrt(P_jj), a bound of the lengths of x
+    "negligible_length",  # ``NEGLIGIBLE`` times that: an x below it counts as zero
 )
 
 VECTORS = (
@@ -43,10 +48,10 @@ VECTORS = (
     "upper",
     "allowed_low",  # outside [allowed_low, allowed_high] a constraint is violated,
     "allowed_high",  # which a working one cannot be
-    "negligible",  # violation of a bound of zero that is none
-    "norm",  # length of c_p in the metric of the inverse of P's diagonal
+    "negligible",  # violation of a bound of zero that is none: norm * negligible_length
+    "norm",  # length of the vector of c_pj / sqrt(P_jj), j < n
     "cap",  # price of a violation: the largest size of a multiplier
-    "end",  # leading entries of c_p that may not be zero, in whole registers
+    "row_end",  # leading entries of c_p that may not be zero, in whole registers
     "multiplier",
     "value",  # C x; the first n are the point x
     "excess",  # violation in units of ``norm``
@@ -69,7 +74,7 @@ VECTORS = (
 )
 
 INTEGER_VECTORS = (
-    "label",  # by slot: signed number of the constraint, see above
+    "label",  # by slot: of the constraint, see above
     "place",  # by slot: where w_p is in ``rows``; from slot k on: which are free
     "violated",  # constraints with an excess
     "candidates",  # labels of constraints to be added
@@ -80,19 +85,40 @@ MATRICES = {
     "G": ("m", "n"),
     "L": ("n", "width"),  # P = L'L, with reciprocals on the diagonal
     "factor": ("slots", "width"),  # L_K of K_WW = L_K L_K', likewise
-    "rows": ("M", "width"),  # w_p by place; by constraint if prepared
+    "rows": (
+        "M",
+        "width",
+    ),  # w_p by place; by constraint if prepared. See ``FirstRows``
     "K": ("M", "width"),  # C P^-1 C', if prepared
 }
 
 SIZES = ("n", "m", "M", "slots", "width")
 
-FIRST_MATRIX = 1 + len(VECTORS) + len(INTEGER_VECTORS)
+_FIRST_MATRIX = 1 + len(VECTORS) + len(INTEGER_VECTORS)
 _CAP = 1 + VECTORS.index("cap")
-_END = 1 + VECTORS.index("end")
+_ROW_END = 1 + VECTORS.index("row_end")
 _LIMIT = SETTINGS.index("limit")
 _TOLERANCE = SETTINGS.index("tolerance")
 _SOFT = SETTINGS.index("soft")
 _TAG = SETTINGS.index("tag")
+
+
+class FirstRows(NamedTuple):
+    """The rows of memory in which the matrices begin."""
+
+    L: int
+    factor: int
+    rows: int  # M and one: n + 1 slots need as many places, where m is zero, too
+    K: int  # the end of memory that is not prepared
+
+
+@inline_njit
+def first_rows(n, m):
+    """Returns where the matrices begin in memory for n variables and m rows of G."""
+    L = _FIRST_MATRIX
+    factor = L + n
+    rows = factor + n + 1
+    return FirstRows(L=L, factor=factor, rows=rows, K=rows + n + m + 1)
 
 
 def new_memory(
@@ -100,8 +126,7 @@ def new_memory(
 ) -> Array:
     """Returns memory for programs of n variables with these caps (M,)."""
     M = len(caps)
-    slots = n + 1
-    height = FIRST_MATRIX + n + slots + (M + 1) + (M if prepared else 0)
+    height = first_rows(n, M - n).K + (M if prepared else 0)
     # kernels write whole registers; loads across cache lines take twice the time
     width = (max(M, n + 2) + 7) // 8 * 8 + 8
     memory = aligned_rows(height, width)
@@ -111,7 +136,7 @@ def new_memory(
     memory[0, _SOFT] = soft
     memory[_CAP, :M] = caps
     registers = np.arange(n) // 8 + 1
-    memory[_END, :n] = np.minimum(n, registers * 8)
+    memory[_ROW_END, :n] = np.minimum(n, registers * 8)
     return memory
 
 
@@ -122,13 +147,13 @@ def prepare_memory(memory: Array, G: Array) -> None:
     """
     m, n = G.shape
     M = n + m
-    L = np.tril(memory[FIRST_MATRIX:][:n, :n])
+    first = first_rows(n, m)
+    L = np.tril(memory[first.L :][:n, :n])
     np.fill_diagonal(L, 1.0 / np.diagonal(L))
     C = np.vstack([np.eye(n), G])
     w = solve_triangular(L, C.T, lower=True, trans="T", check_finite=False).T
-    first_row = FIRST_MATRIX + n + (n + 1)
-    rows = memory[first_row:]
-    K = memory[first_row + M + 1 :]
+    rows = memory[first.rows :]
+    K = memory[first.K :]
     rows[:M, :n] = w
     K[:M, :M] = w @ w.T
     memory[0, _TAG] = 1.0 + zlib.crc32(w.tobytes())

@@ -1,7 +1,22 @@
 """numba's type of a workspace: fields that become arrays where they are read.
 
-A value is a handful of pointers and sizes. ``gpmpc.qp._workspace`` names the fields and
-says why they are not simply those of a named tuple.
+A value is a handful of pointers and sizes, which the kernels hand on to each other;
+``work.lower`` makes an array of them where it stands in the code. To add or rename a
+field, change the lists of ``gpmpc.qp._workspace``: nothing here names a vector.
+
+This file does what numba's features for it cannot do here:
+
+- A named tuple of the same arrays hands on seven numbers for each of them. With 35
+  arrays that took five seconds more to compile.
+- ``numba.experimental.structref`` keeps its fields on the heap and counts references to
+  them; these kernels are compiled without that (``allocates=False``).
+- A structured NumPy array has the sizes of its fields in its type, and so would be
+  compiled anew for each size of a program.
+
+A type takes four registrations, each a function or class below: how a value is laid out
+(``_WorkspaceModel``), how one is made (``_workspace``), which type each field has
+(``_FieldTypes``), and what machine code reads or writes it (``_read_field``,
+``_write_setting``).
 """
 
 from llvmlite import ir
@@ -19,23 +34,23 @@ from numba.extending import (
 
 from gpmpc._compiled import inline_njit
 from gpmpc.qp._workspace import (
-    FIRST_MATRIX,
     INTEGER_VECTORS,
     MATRICES,
     SETTINGS,
     SIZES,
     VECTORS,
+    first_rows,
 )
 
 
 @inline_njit
 def open_workspace(P, q, G, memory):
     """Returns the workspace of a program in its memory."""
-    n = len(q)
-    L = memory[FIRST_MATRIX:]
-    factor = L[n:]
-    rows = factor[n + 1 :]
-    K = rows[n + len(G) + 1 :]
+    first = first_rows(len(q), len(G))
+    L = memory[first.L :]
+    factor = memory[first.factor :]
+    rows = memory[first.rows :]
+    K = memory[first.K :]
     # numba passes the first argument
     return _workspace(P, q, G, memory, L, factor, rows, K)  # pyright: ignore
 

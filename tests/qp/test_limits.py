@@ -104,11 +104,11 @@ def test_one_solver_and_one_prepared_problem_serve_many_threads(rng):
 START = """
 import numpy as np
 from gpmpc.qp import DualActiveSet
-from gpmpc.qp._dual_kernels import solve
+from gpmpc.qp._dual_kernels import solve_kernel
 prepared = DualActiveSet().prepare(np.eye(3), np.ones((1, 3)))
 solution = prepared.solve(np.ones(3), np.full(4, -0.5), np.full(4, 0.5))
 assert solution.is_optimal(1e-12), solution
-print(sum(solve.stats.cache_misses.values()))
+print(sum(solve_kernel.stats.cache_misses.values()))
 """
 
 
@@ -165,6 +165,32 @@ def test_no_disagreement_on_ten_thousand_more_integer_problems():
     for _ in range(10000):
         problem = integer_problem(rng, True if rng.random() < 0.5 else None)
         assert solver.solve(problem).status is primal.solve(problem).status
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
+@pytest.mark.parametrize("mode", ["prepared", "changing"])
+def test_a_plain_contradiction_needs_no_doubled_digits(mode, scale, monkeypatch):
+    """x <= 1 against a row that says x >= 2."""
+
+    def rescue(*arguments):
+        raise AssertionError("solved again with doubled digits")
+
+    monkeypatch.setattr("gpmpc.qp._dual_active_set.rescue", rescue)
+    problem = QuadraticProgram(
+        np.eye(2), np.ones(2), [[1.0, 0.0]], [2.0 * scale], ub=[scale, np.inf]
+    )
+    solver = DualActiveSet()
+    prepared = solver.prepare(problem.P, problem.G)
+    solution = (
+        prepared.solve(problem.q, problem.lower, problem.upper)
+        if mode == "prepared"
+        else solver.solve(problem)
+    )
+    assert solution.status is Status.INFEASIBLE
+    assert solution.iterations <= 2
+    ray = solution.multipliers
+    np.testing.assert_allclose(ray[:2] + problem.G.T @ ray[2:], 0.0, atol=1e-14)
+    assert ray[0] > 0.0 > ray[2]
 
 
 def crowded_vertex(rng):
