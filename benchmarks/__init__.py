@@ -1,7 +1,10 @@
-"""Measurements: what control steps, predictions, programs and trainings cost, beside other packages and each other.
+"""Measures control steps, predictions, programs and trainings.
 
-Every module is a command: ``python -m benchmarks.NAME``, with ``--help``; ``make bench`` runs those whose figures
-docs/performance.md quotes. Importing this package limits all numerical libraries to one thread.
+They stand beside other packages and each other.
+
+Every module is a command: ``python -m benchmarks.NAME``, with ``--help``; ``make
+bench`` runs those whose figures docs/performance.md quotes. Importing this package
+limits all numerical libraries to one thread.
 """
 
 import os

@@ -1,12 +1,17 @@
-"""Do two roads to one answer meet? Sequential quadratic programs, solvers and forms, and a long horizon with bounds.
+"""Compares two roads to one answer.
+
+They are sequential quadratic programs, solvers and forms, and a long horizon with
+bounds.
 
     .venv/bin/python -m benchmarks.agreement [--steps 200] [--recorded 500]
 
-1. ``trajectory`` iterated to tolerance against SLSQP (``gpmpc.experiments.slsqp``) on sampled steps of flights, full
-   covariances: the nonlinear cost at the one's plan over that at the other's.
-2. The condensed program by our dual active set, the paper's primal one and Clarabel, and the state form in CVXPY, on
-   recorded steps with active bounds of inputs and increments, and half as many with state bounds at a price (dual
-   active set and state form): the largest difference of an input, in its own unit.
+1. ``trajectory`` iterated to tolerance against SLSQP (``gpmpc.experiments.slsqp``) on
+   sampled steps of flights, full covariances: the nonlinear cost at the one's plan over
+   that at the other's.
+2. The condensed program by our dual active set, the paper's primal one and Clarabel,
+   and the state form in CVXPY, on recorded steps with active bounds of inputs and
+   increments, and half as many with state bounds at a price (dual active set and state
+   form): the largest difference of an input, in its own unit.
 3. A horizon of 50 with state bounds: how many programs had no solution.
 
 One process, one thread. Writes ``outputs/benchmarks/agreement.json``.
@@ -70,7 +75,10 @@ def main() -> None:
 def optimality(
     posteriors: dict, propagation: str, arguments: argparse.Namespace
 ) -> dict:
-    """The nonlinear cost at the plan of iterated quadratic programs, relative to that at the plan of SLSQP."""
+    """Returns the cost of iterated quadratic programs relative to that of SLSQP.
+
+    Both are the nonlinear cost of a plan.
+    """
     propagator = PROPAGATIONS[propagation]
     gaps = []
     times = [[], []]

@@ -91,7 +91,7 @@ def main() -> None:
 def flights(
     cascade: Cascade, trajectory: str, case: str, arguments: argparse.Namespace
 ) -> dict:
-    """Pooled tracking error over the seeds, lost flights, failed solves, and times of a step."""
+    """Returns the pooled error over the seeds, losses, failed solves and times."""
     references = states_along(
         TRAJECTORIES[trajectory], np.arange(arguments.steps + 2.0)
     )

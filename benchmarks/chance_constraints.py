@@ -1,29 +1,40 @@
-"""How often a bound is violated that may be with probability 1 - eta, at decisions whose plan touches it.
+"""Counts how often a bound is violated that may be with probability 1 - eta.
 
-    .venv/bin/python -m benchmarks.chance_constraints [--plants ...] [--ways ...] [--allowed 10 5 1] [--seeds 20]
+Counted are decisions whose plan touches it.
 
-Each plant is learned from 200 of its rows and sent to set points beyond a bound of one of its states:
+    .venv/bin/python -m benchmarks.chance_constraints [--plants ...] [--ways ...]
+    [--allowed 10 5 1] [--seeds 20]
 
-- the pendulum of ``benchmarks.estimation`` (angle), its noise Gaussian, of heavy tails (Student's t, 3 degrees of
-  freedom) or an AR(1) process (correlation 0.6), of equal variance;
-- the same pendulum, whose noise grows with its rate, sent from side to side every second at a bounded rate;
-- gymnasium's InvertedPendulum-v5, its noise Gaussian: the cart is sent from side to side every 25 steps, and the angle
-  of the pole is bounded to both sides, which bounds how fast the cart speeds up and brakes;
-- the quadrotor of ``gpmpc/systems/quadrotor.xml`` in MuJoCo and RotorPy's Hummingbird (``pip install rotorpy``; see
-  ``benchmarks/hummingbird.py``): climbing at a bounded speed by velocity commands, which an inner controller follows,
-  in a wind that changes as an AR(1) process of 1 s. Attitude, rotors and wind are not among the states, which are the
-  three velocities.
+Each plant is learned from 200 of its rows and sent to set points beyond a bound of one
+of its states:
 
-Compared: the noise that the GP learned by its evidence; the one estimated from all rows; a noise that varies with state
-and input where these rows show that it does (``estimate_varying_noise``); the constant one with an adaptive
-conformal tube that begins with a Gaussian's quantiles, counts the predictions that touch the bound, and aims so low
-that the upper limit of all decisions is allowed (at a rate of 0.02 for the Hummingbird, whose errors on the log are
-four times those at the bound: at the default for 1 %, 0.002, the flights end before it is as near); and the true noise
-with its true quantile (of the quadrotors: those of the errors of another flight of the kind). Printed for eta = 90, 95
-and 99 %: violations per hundred decisions at an active bound, the exact upper 95 % limit of the rate (Clopper and
-Pearson, 1934; for independent decisions), the mean distance to the bound [mrad, mm/s], the mean cost of a step, and the
-decisions. Writes
-``outputs/benchmarks/chance_constraints.json`` after every cell; what it holds of other cells stays.
+- the pendulum of ``benchmarks.estimation`` (angle), its noise Gaussian, of heavy tails
+  (Student's t, 3 degrees of freedom) or an AR(1) process (correlation 0.6), of equal
+  variance;
+- the same pendulum, whose noise grows with its rate, sent from side to side every
+  second at a bounded rate;
+- gymnasium's InvertedPendulum-v5, its noise Gaussian: the cart is sent from side to
+  side every 25 steps, and the angle of the pole is bounded to both sides, which bounds
+  how fast the cart speeds up and brakes;
+- the quadrotor of ``gpmpc/systems/quadrotor.xml`` in MuJoCo and RotorPy's Hummingbird
+  (``pip install rotorpy``; see ``benchmarks/hummingbird.py``): climbing at a bounded
+  speed by velocity commands, which an inner controller follows, in a wind that changes
+  as an AR(1) process of 1 s. Attitude, rotors and wind are not among the states, which
+  are the three velocities.
+
+Compared: the noise that the GP learned by its evidence; the one estimated from all
+rows; a noise that varies with state and input where these rows show that it does
+(``estimate_varying_noise``); the constant one with an adaptive conformal tube that
+begins with a Gaussian's quantiles, counts the predictions that touch the bound, and
+aims so low that the upper limit of all decisions is allowed (at a rate of 0.02 for the
+Hummingbird, whose errors on the log are four times those at the bound: at the default
+for 1 %, 0.002, the flights end before it is as near); and the true noise with its true
+quantile (of the quadrotors: those of the errors of another flight of the kind). Printed
+for eta = 90, 95 and 99 %: violations per hundred decisions at an active bound, the
+exact upper 95 % limit of the rate (Clopper and Pearson, 1934; for independent
+decisions), the mean distance to the bound [mrad, mm/s], the mean cost of a step, and
+the decisions. Writes ``outputs/benchmarks/chance_constraints.json`` after every cell;
+what it holds of other cells stays.
 """
 
 import argparse
@@ -198,7 +209,7 @@ def cart_pole() -> Plant:
 def climbing(
     begin: Callable[[], Array], move: Callable[[Array, Array], Array]
 ) -> Plant:
-    """A quadrotor's velocities, steered by velocity commands at 5 Hz, in a changing wind."""
+    """A quadrotor steered by velocity commands at 5 Hz, in a changing wind."""
 
     def wind(steps: int, rng: np.random.Generator) -> Array:
         return correlated(steps, rng, math.exp(-0.2), np.array([1.0, 1.0, 0.5]))
@@ -221,7 +232,7 @@ def climbing(
 
 
 def mujoco_quadrotor() -> Plant:
-    """The quadrotor of the examples in MuJoCo, with a controller that follows velocities."""
+    """The examples' quadrotor in MuJoCo, with a controller of velocities."""
     import mujoco
 
     model = mujoco.MjModel.from_xml_path(str(QUADROTOR))

@@ -1,14 +1,20 @@
-"""What a control step costs beside one moment-matched Jacobian, and beside nonlinear GP-MPC on the same instances.
+"""Times a control step beside a moment-matched Jacobian and nonlinear GP-MPC.
 
-    .venv/bin/python -m benchmarks.controllers [--steps 14] [--horizons 1 10 20 50] [--rivals 1 10]
+All see the same instances.
 
-One process, one thread, process CPU time, GPs on 189 transitions. Instances are recorded on a flight with the plant in
-the loop, with the plans that the one controller made, and then put to each controller in turns, warm-started from its
-own last decision, shifted. ``nonlinear, sqp`` stops at a relative offset of 1e-6 (``gpmpc.mpc``), ``slsqp`` where a
-round lowers the cost by less than 1e-12 of it; one program of the convex ones asks for neither.
-``cold`` are the same instances without a plan, from the last input held. ``plain slsqp`` is what comes to mind first:
-SciPy's SLSQP on the inputs as they are, from hover, with the same compiled derivatives. ``jacobian`` is one call of
-``differentiate`` with moment matching. Ratios are paired. Writes ``outputs/benchmarks/controllers.json``.
+    .venv/bin/python -m benchmarks.controllers [--steps 14] [--horizons 1 10 20 50]
+    [--rivals 1 10]
+
+One process, one thread, process CPU time, GPs on 189 transitions. Instances are
+recorded on a flight with the plant in the loop, with the plans that the one controller
+made, and then put to each controller in turns, warm-started from its own last decision,
+shifted. ``nonlinear, sqp`` stops at a relative offset of 1e-6 (``gpmpc.mpc``),
+``slsqp`` where a round lowers the cost by less than 1e-12 of it; one program of the
+convex ones asks for neither. ``cold`` are the same instances without a plan, from the
+last input held. ``plain slsqp`` is what comes to mind first: SciPy's SLSQP on the
+inputs as they are, from hover, with the same compiled derivatives. ``jacobian`` is one
+call of ``differentiate`` with moment matching. Ratios are paired. Writes
+``outputs/benchmarks/controllers.json``.
 """
 
 import argparse
@@ -112,10 +118,10 @@ def ways(gp: GPPosterior, horizon: int) -> list[dict]:
 
 
 class PlainSLSQP(SLSQP):
-    """Minimises the same objective with the same derivatives as SciPy's manual shows it."""
+    """Minimises the same objective as SciPy's manual shows it."""
 
     def control(self, belief, reference, previous=None) -> Decision:
-        """From hover, until the cost changes by less than a millionth of that of hovering."""
+        """Minimises from hover, to a millionth of the cost of hovering."""
         began = time.perf_counter()
         request = Request.read(
             self.problem, self.horizon, self.initial_input, belief, reference, previous

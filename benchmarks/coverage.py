@@ -1,16 +1,22 @@
-"""How often predicted intervals hold what happens, by which noise they hold, on flights that nobody trained on.
+"""Counts how often predicted intervals hold what happens.
 
-    .venv/bin/python -m benchmarks.coverage [pendulum cart_pole ... car] [--flights 4] [--seeds 1]
+The flights are those that nobody trained on, for each kind of noise.
 
-Plants of the gallery are learned and flown with the settings that ``gpmpc run system=NAME`` has, once with a noise that
-moves the state and once with sensors that are as noisy; the car (a dynamic bicycle of 1:10, tyres that saturate) drives
-at random. From every step of every flight 20 steps are predicted, and 95 % intervals compared with what was measured:
+    .venv/bin/python -m benchmarks.coverage [pendulum cart_pole ... car] [--flights 4]
+    [--seeds 1]
 
-* latent: the noise is left to the last step, as if it were the sensors' (the default before);
+Plants of the gallery are learned and flown with the settings that ``gpmpc run
+system=NAME`` has, once with a noise that moves the state and once with sensors that are
+as noisy; the car (a dynamic bicycle of 1:10, tyres that saturate) drives at random.
+From every step of every flight 20 steps are predicted, and 95 % intervals compared with
+what was measured:
+
+* latent: the noise is left to the last step, as if it were the sensors';
 * default: it moves the state at every step;
 * separated: ``separate_noise`` says which part does what.
 
-A cell is the mean over the states, and below it the least and the largest of them. It takes four minutes of one thread.
+A cell is the mean over the states, and below it the least and the largest of them. It
+takes four minutes of one thread.
 """
 
 import argparse
@@ -64,7 +70,11 @@ class Bicycle:
     input_names = ("steer", "acceleration")
 
     def derivative(self, x: Any, u: Any) -> list[Any]:
-        """d/dt of position [m/s], yaw [rad/s], velocities of the body [m/s^2] and yaw rate [rad/s^2]."""
+        """Returns the state's derivative.
+
+        Position [m/s], yaw [rad/s], velocities of the body [m/s^2] and yaw rate
+        [rad/s^2].
+        """
         _, _, yaw, vx, vy, rate = x
         length = self.front + self.rear
         largest = self.friction * self.mass * 9.81 / length

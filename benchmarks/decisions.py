@@ -109,7 +109,10 @@ def fly(
     seed: int = 0,
     parameters: Any = None,
 ) -> Log:
-    """Flies a course; ``parameters`` of all steps (K, q) are handed over stage by stage."""
+    """Flies a course.
+
+    ``parameters`` of all steps (K, q) are handed over stage by stage.
+    """
     generator = np.random.default_rng(seed)
     problem = course.problem
     state = np.array(course.start, dtype=float)

@@ -1,12 +1,14 @@
-"""A pole that is learned, balanced and moved from side to side although its inputs act three steps late.
+"""Balances and moves a learned pole whose inputs act three steps late.
 
     .venv/bin/python -m benchmarks.delayed_pole [--seeds 20] [--steps 300]
 
-Gymnasium's InvertedPendulum-v5 (MuJoCo, 25 Hz; an episode is lost beyond 0.2 rad) is learned from 600 steps of random
-pushes. The cart follows steps of 0.6 m, or stands still; an episode begins where the environment resets it. Printed
-for each delay that the controller believes in: RMSE of cart [m] and pole [rad] over the seeds, their ratios to the loop
-without delay, and episodes lost. When the pole only stands, the first second is left out: nothing that is decided acts
-in its first three steps. Writes ``outputs/benchmarks/delayed_pole.json``.
+Gymnasium's InvertedPendulum-v5 (MuJoCo, 25 Hz; an episode is lost beyond 0.2 rad) is
+learned from 600 steps of random pushes. The cart follows steps of 0.6 m, or stands
+still; an episode begins where the environment resets it. Printed for each delay that
+the controller believes in: RMSE of cart [m] and pole [rad] over the seeds, their ratios
+to the loop without delay, and episodes lost. When the pole only stands, the first
+second is left out: nothing that is decided acts in its first three steps. Writes
+``outputs/benchmarks/delayed_pole.json``.
 """
 
 import argparse

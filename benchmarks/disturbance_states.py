@@ -1,12 +1,16 @@
-"""Disturbance states beside the observer gain of the controller, on a vehicle that is a fifth heavier than learned.
+"""Compares disturbance states with the observer gain of the controller.
+
+The vehicle is a fifth heavier than learned.
 
     .venv/bin/python -m benchmarks.disturbance_states [--steps 189] [--seeds 3]
 
-The flights of ``benchmarks.wrong_model``: GPs of 189 dithered transitions of the lighter quadrotor, H = 10, both
-trajectories, as learned and 20 % heavier, three kinds of noise. ``L`` are gains of the controller's own estimate. The
-others estimate six constants beside the six states by an extended Kalman filter that is told the noise of the
-measurements, and plan with them; the number is by how much a constant may change in a step. RMSE of the position, total
-over x, y, z [m], pooled over the seeds, and the median times of filter and controller [ms]. Writes
+The flights of ``benchmarks.wrong_model``: GPs of 189 dithered transitions of the
+lighter quadrotor, H = 10, both trajectories, as learned and 20 % heavier, three kinds
+of noise. ``L`` are gains of the controller's own estimate. The others estimate six
+constants beside the six states by an extended Kalman filter that is told the noise of
+the measurements, and plan with them; the number is by how much a constant may change in
+a step. RMSE of the position, total over x, y, z [m], pooled over the seeds, and the
+median times of filter and controller [ms]. Writes
 ``outputs/benchmarks/disturbance_states.json``.
 """
 
@@ -39,7 +43,7 @@ CONSTANTS = 1.0  # prior standard deviation
 
 
 class FilteredControl:
-    """GP-MPC of a model with disturbance states, which a filter estimates from measured states.
+    """GP-MPC of a model with disturbance states, which a filter estimates.
 
     Args:
         model: Without disturbances.

@@ -52,7 +52,10 @@ Array = np.ndarray
 
 
 def pendulum(x: Array, u: Array, substeps: int = 5) -> Array:
-    """Angle from hanging [rad] and rate [rad/s] a step later, for a torque over the inertia [1/s^2]."""
+    """Returns angle from hanging [rad] and rate [rad/s] a step later.
+
+    The input is a torque over the inertia [1/s^2].
+    """
     angle, rate = x
     for _ in range(substeps):
         rate = rate + STEP / substeps * (-9.81 * math.sin(angle) - 0.1 * rate + u[0])
@@ -129,7 +132,10 @@ def random_motion(steps: int, delay: int, seed: int = 0) -> tuple[Array, Array]:
 
 
 def learned(states: Array, inputs: Array, delay: int) -> ResidualModel:
-    """A model of the undelayed pendulum, from a log whose inputs act late, with the noise of all rows."""
+    """Returns a model of the undelayed pendulum, from a log of late inputs.
+
+    Its noise is that of all rows.
+    """
     rows = Transitions(
         states[delay:-1], inputs[: len(inputs) - delay], states[delay + 1 :]
     )

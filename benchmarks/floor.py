@@ -1,19 +1,24 @@
-"""How far one moment-matched Jacobian is from what its instructions must take, over the number of training points.
+"""Compares one moment-matched Jacobian with the time of its instructions.
+
+The comparison is over the number of training points.
 
     .venv/bin/python -m benchmarks.floor [--sizes 100 189 500 1000 2000]
 
-One process, one thread, process CPU time. The floor counts the arithmetic that ``gpmpc._kernels`` has to issue for a
-pair of points and of outputs, in registers of eight numbers, and divides it by the rate at which this machine, in the
-same process, issues independent multiply-adds from registers. Loads, stores, loops and everything that grows slower
-than N^2 are not in it: this is the arithmetic floor, to which ``ratio`` refers. ``streamed`` is what reading the two
-triangles once from memory takes, at the rate of a sum over an array of that size; at large N they no longer fit the
+One process, one thread, process CPU time. The floor counts the arithmetic that
+``gpmpc._kernels`` has to issue for a pair of points and of outputs, in registers of
+eight numbers, and divides it by the rate at which this machine, in the same process,
+issues independent multiply-adds from registers. Loads, stores, loops and everything
+that grows slower than N^2 are not in it: this is the arithmetic floor, to which
+``ratio`` refers. ``streamed`` is what reading the two triangles once from memory takes,
+at the rate of a sum over an array of that size; at large N they no longer fit the
 caches.
 
-Two beliefs are measured. Where all exponents are near zero, as they are for a belief that is narrow beside the
-length-scales, expm1 needs no reduction; ``ratio`` then refers to the floor without those instructions, and ``general``
-to the one with them, which is the floor of the wide belief. ``256 bits`` is the time over the general floor in vectors
-of four numbers, twice as many at the same rate: those that LLVM takes by itself on processors that have both. Writes
-``outputs/benchmarks/floor.json``.
+Two beliefs are measured. Where all exponents are near zero, as they are for a belief
+that is narrow beside the length-scales, expm1 needs no reduction; ``ratio`` then refers
+to the floor without those instructions, and ``general`` to the one with them, which is
+the floor of the wide belief. ``256 bits`` is the time over the general floor in vectors
+of four numbers, twice as many at the same rate: those that LLVM takes by itself on
+processors that have both. Writes ``outputs/benchmarks/floor.json``.
 """
 
 import argparse
@@ -113,7 +118,10 @@ def measured(packed: kernels.Packed, size: int, belief: str) -> dict:
 
 
 def instructions(packed: kernels.Packed, reduced: bool) -> float:
-    """Vector instructions that a Jacobian must issue over all pairs, with or without the reduction of expm1."""
+    """Counts the vector instructions that a Jacobian must issue over all pairs.
+
+    They are counted with or without the reduction of expm1.
+    """
     k = packed.output_dim
     padded = packed.arrays.points.shape[1]
     square = padded**2 / LANES

@@ -138,14 +138,11 @@ def belief() -> Gaussian:
 def linearisation_groups(
     gp: GPPosterior, belief: Gaussian, control: torch.Tensor, reverse_mode: bool
 ) -> list[Group]:
-    """Builds the calls that predict one step of the latent functions, grouped by what they compute.
+    """Builds the calls that predict one step, grouped by what they compute.
 
-    Args:
-        gp: The GPs.
-        belief: Where; points take its mean.
-        control: The input (m,).
-        reverse_mode: Includes torch's reverse mode through the closed form of the moments, which keeps all N x N
-            products of all pairs of outputs.
+    Args: gp: The GPs. belief: Where; points take its mean. control: The input (m,).
+        reverse_mode: Includes torch's reverse mode through the closed form of the
+        moments, which keeps all N x N products of all pairs of outputs.
     """
     n = gp.state_dim
     packed = gp.packed
@@ -231,7 +228,7 @@ def linearisation_groups(
 
 
 def difference(result, reference) -> float:
-    """Largest difference of two lists of arrays, relative to each array's largest entry."""
+    """Returns the largest difference of arrays, relative to their largest entries."""
     pairs = [
         (np.asarray(a), np.asarray(b)) for a, b in zip(result, reference, strict=True)
     ]

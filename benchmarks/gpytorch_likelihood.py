@@ -1,4 +1,7 @@
-"""The negative log marginal likelihood of one SE-ARD GP by GPyTorch, which the closed form is compared with."""
+"""Evaluates the marginal likelihood of one SE-ARD GP by GPyTorch.
+
+The closed form is compared with it.
+"""
 
 import gpytorch
 import numpy as np
@@ -10,7 +13,7 @@ from gpmpc.gp._kernel import centred
 
 
 class GPyTorchLikelihood:
-    """Evaluates the negative log marginal likelihood by GPyTorch, as ``NegativeLogMarginalLikelihood`` does.
+    """Evaluates as ``NegativeLogMarginalLikelihood`` does, by GPyTorch.
 
     Args:
         features: x~ (N, d).

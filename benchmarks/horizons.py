@@ -1,13 +1,14 @@
-"""The shortest horizon that holds a set point, as it is known before the flight and as flights show it.
+"""Finds the shortest horizon that holds a set point, in theory and in flight.
 
     .venv/bin/python -m benchmarks.horizons [tank pendulum cart_pole ...] [--seeds 3]
 
-``known before`` is ``GPMPC.stability(goal).shortest_horizon``. ``measured`` is found by flights: two that begin a
-millionth of a unit apart, on the plant, with the same controller; from the horizon on where they come nearer to each
-other and from there on do so, by bisection. Of the true model, and of GPs that were learned from random data (seeds).
-The tank is the quadruple tank in its setting of non-minimum phase (Johansson, 2000): each pump fills the lower tank
-that it does not seem to, and a horizon of a minute or two sees the wrong sign. Writes
-``outputs/benchmarks/horizons.json``.
+``known before`` is ``GPMPC.stability(goal).shortest_horizon``. ``measured`` is found by
+flights: two that begin a millionth of a unit apart, on the plant, with the same
+controller; from the horizon on where they come nearer to each other and from there on
+do so, by bisection. Of the true model, and of GPs that were learned from random data
+(seeds). The tank is the quadruple tank in its setting of non-minimum phase (Johansson,
+2000): each pump fills the lower tank that it does not seem to, and a horizon of a
+minute or two sees the wrong sign. Writes ``outputs/benchmarks/horizons.json``.
 """
 
 import argparse
@@ -82,7 +83,10 @@ def quadruple_tank(time_step: float = 10.0) -> System:
 
 
 def plants() -> dict[str, tuple[System, Tracking, int]]:
-    """Systems with their costs and numbers of random samples, 0 where only the true model flies."""
+    """Returns systems with their costs and numbers of random samples.
+
+    The number is 0 where only the true model flies.
+    """
     swing = {"R": [0.01], "penalized": "inputs"}
     return {
         "tank": (quadruple_tank(), Tracking([1.0, 1.0, 0.0, 0.0], [0.1, 0.1]), 200),
@@ -173,7 +177,7 @@ def parts(system: System, flown: GPMPC, state: Array) -> bool:
 def measured_horizon(
     system: System, model: DynamicsModel, cost: Tracking, longest: int
 ) -> int | None:
-    """The shortest horizon with which flights do not part, by bisection up to the longest."""
+    """Bisects for the shortest horizon with which flights do not part."""
     lost = 0
     held = longest
     state = np.array(system.goal)

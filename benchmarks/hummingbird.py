@@ -57,7 +57,7 @@ def _rotation(q):
 
 @njit(cache=True)
 def commanded_speeds(s, velocity, p):
-    """The rotors' speeds (4,) that the velocity controller commands, before they are limited."""
+    """Returns the speeds (4,) that the velocity controller commands, unlimited."""
     (k_v, k_p, k_d), v, w = p.gains, s[3:6], s[10:13]
     R = _rotation(s[6:10])
     force = p.mass * (-k_v * (v - velocity) + np.array([0.0, 0.0, GRAVITY]))
@@ -78,7 +78,10 @@ def commanded_speeds(s, velocity, p):
 
 @njit(cache=True)
 def derivative(s, commands, p):
-    """Of the state (20,): position, velocity, quaternion, rates, wind and the rotors' speeds."""
+    """Returns the parts of a state (20,).
+
+    Position, velocity, quaternion, rates, wind and the rotors' speeds.
+    """
     v, (x, y, z, c), w, wind, speeds = s[3:6], s[6:10], s[10:13], s[13:16], s[16:]
     k_eta, k_m, k_h = p.coefficients
     R = _rotation(s[6:10])
@@ -107,7 +110,7 @@ def derivative(s, commands, p):
 
 @njit(cache=True)
 def advance(s, velocity, wind, p, steps):
-    """Moves a state (20,) on by steps of 0.01 s with a velocity command, in a constant wind."""
+    """Moves a state (20,) on by steps of 0.01 s, in a constant wind."""
     s = s.copy()
     h = STEP / SUBSTEPS
     s[13:16] = wind
@@ -127,7 +130,7 @@ def advance(s, velocity, wind, p, steps):
 
 
 def compiled_hummingbird() -> tuple[Array, Callable[[Array, Array, Array, int], Array]]:
-    """Returns a state that hovers (20,), and the function that moves one on by steps of 0.01 s.
+    """Returns a state that hovers (20,), and the function that moves one on.
 
     Raises:
         RuntimeError: These are not the equations of the RotorPy that is installed.

@@ -100,9 +100,12 @@ class Late(Disturbance):
 
 @dataclass(frozen=True)
 class QuadrupleTank:
-    """Four tanks and two pumps of which each fills a lower tank, and more of the upper one across (Johansson, 2000).
+    """Four tanks and two pumps (Johansson, 2000).
 
-    Levels in cm, voltages in V; with less than half of the flow into the lower tanks it is of non-minimum phase.
+    Each pump fills a lower tank, and more of the upper one across.
+
+    Levels in cm, voltages in V; with less than half of the flow into the lower tanks it
+    is of non-minimum phase.
     """
 
     state_names = ("level_1", "level_2", "level_3", "level_4")
@@ -127,7 +130,10 @@ class QuadrupleTank:
 
 
 def tank(horizon: int, steps: int = 120, on_step: Any = None, **more: Any) -> Any:
-    """Flies the tank with its true model, five seconds a step, from rest to higher levels."""
+    """Flies the tank with its true model from rest to higher levels.
+
+    A step takes five seconds.
+    """
     rest = [12.6, 13.0, 4.8, 4.9]
     goal = [13.6, 14.0, 4.8, 4.9]
     plant = System(
@@ -377,7 +383,7 @@ def sabotages(name: str) -> list[Sabotage]:
 
 
 def first_shown(flown: Array, twin: Array, noise: Array) -> int | None:
-    """Returns the first step at which the true states of two flights differ by what can be seen; None without one."""
+    """Returns the first step at which two flights differ visibly, if there is one."""
     count = min(len(flown), len(twin))
     difference = np.abs(flown[:count] - twin[:count])
     visible = np.maximum(5.0 * noise, 0.05 * np.ptp(twin, axis=0))
@@ -386,7 +392,10 @@ def first_shown(flown: Array, twin: Array, noise: Array) -> int | None:
 
 
 def _first_farther(flown: Any, twin: Any) -> int | None:
-    """Returns the first step at which a tank is farther from its levels than its twin, by a twentieth of the way."""
+    """Returns the first step at which a tank is behind its twin.
+
+    It is farther from its levels by a twentieth of the way.
+    """
     distances = [
         np.linalg.norm((each.states - each.references)[:, :2], axis=1)
         for each in (flown, twin)

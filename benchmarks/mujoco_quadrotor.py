@@ -98,7 +98,11 @@ def fly(
     gain: float = 0.0,
     dither: float = 0.0,
 ) -> Rollout:
-    """One flight: with a rigid body and neither estimate nor dither by NMPC, else by one program a step."""
+    """Flies once.
+
+    A rigid body with neither estimate nor dither is flown by NMPC, else by one program
+    a step.
+    """
     known = isinstance(model, KnownModel)
     solved = gain == dither == 0.0
     settings = PredictionSettings(

@@ -1,16 +1,20 @@
-"""How often a point among three discs, one of them moving, touches one, where each is to be missed with a probability.
+"""Counts how often a point touches one of three discs, one of them moving.
+
+Each is to be missed with a probability.
 
     .venv/bin/python -m benchmarks.obstacles [--scenes 200] [--probability 0.95]
 
-A mass in the plane (n = 4, m = 2) with a drag that grows with its speed is learned from 250 random steps, and steered
-past random discs to a set point by ``GPMPC`` over 20 stages of 0.1 s, under process noise. Where discs will be comes
-with each call. A scene ends after 60 steps. Printed: steps inside a disc, of those whose plan touches a disc's bound at
-some stage, the exact 95 % interval of that rate (Clopper and Pearson, 1934; for independent
-decisions), scenes with any such step, the time of a decision, and how many programs had no plan that keeps all bounds
-(by HiGHS, as a linear program), which of them the decision says by its ``violation``, and which it does not.
+A mass in the plane (n = 4, m = 2) with a drag that grows with its speed is learned from
+250 random steps, and steered past random discs to a set point by ``GPMPC`` over 20
+stages of 0.1 s, under process noise. Where discs will be comes with each call. A scene
+ends after 60 steps. Printed: steps inside a disc, of those whose plan touches a disc's
+bound at some stage, the exact 95 % interval of that rate (Clopper and Pearson, 1934;
+for independent decisions), scenes with any such step, the time of a decision, and how
+many programs had no plan that keeps all bounds (by HiGHS, as a linear program), which
+of them the decision says by its ``violation``, and which it does not.
 
-Each scene is a line of ``outputs/benchmarks/obstacles.jsonl`` as soon as it is done: a run of the same code that
-stopped goes on there.
+Each scene is a line of ``outputs/benchmarks/obstacles.jsonl`` as soon as it is done: a
+run of the same code that stopped goes on there.
 """
 
 import argparse
@@ -91,7 +95,10 @@ def discs() -> casadi.Function:
 
 
 def scene(seed: int) -> tuple[Array, Array]:
-    """Places and radii of three discs (3, 3) apart from each other, and the velocity of the last one (2,) [m/s]."""
+    """Draws places and radii of three discs (3, 3) apart from each other.
+
+    The velocity of the last one (2,) [m/s] comes with them.
+    """
     rng = np.random.default_rng(seed)
     while True:
         found = rng.uniform([0.9, -0.6, 0.25], [3.1, 0.6, 0.5], (3, 3))
@@ -160,7 +167,10 @@ def margins(decision: Decision) -> Array:
 
 
 def least_violation(decision: Decision) -> float:
-    """The least possible sum of violations of the discs' rows of a decision's program, inputs within their bounds."""
+    """Returns the least possible sum of violations of a program's discs.
+
+    Inputs are within their bounds.
+    """
     program = decision.problem
     size = len(decision.problem.q)
     rows = len(program.G)

@@ -1,12 +1,16 @@
-"""What it costs to learn one more point while running, and to forget one, beside a factorisation from the start.
+"""Times learning one more point while running, and forgetting one.
+
+A factorisation from the start stands beside them.
 
     .venv/bin/python -m benchmarks.online [--repeats 31] [--sizes 100 200 500 1000]
 
-One process, one thread, process CPU time; six outputs, nine features. For every size N the posterior of N points is
-conditioned on one more, ten more, drops its oldest point, and is built from the hyperparameters on N + 1 points, in
-turns of four calls each; ratios are paired. The last call counts, as in a loop that learns at every step; "cold" is
-the first one, after other work, when the memory of the new factor has to be asked for. A step under a full budget (one
-in, one out) is timed under both rules. Writes ``outputs/benchmarks/online.json``.
+One process, one thread, process CPU time; six outputs, nine features. For every size N
+the posterior of N points is conditioned on one more, ten more, drops its oldest point,
+and is built from the hyperparameters on N + 1 points, in turns of four calls each;
+ratios are paired. The last call counts, as in a loop that learns at every step; "cold"
+is the first one, after other work, when the memory of the new factor has to be asked
+for. A step under a full budget (one in, one out) is timed under both rules. Writes
+``outputs/benchmarks/online.json``.
 """
 
 import argparse

@@ -1,12 +1,17 @@
-"""CasADi with IPOPT, with its SQP method and HPIPM, and with FATROP, on the mean of learned GPs.
+"""Solves by CasADi on the mean of learned GPs.
 
-Multiple shooting (Bock and Plitt, 1984) with the states among the unknowns, as CasADi's own examples have it. What was
-found to be the best settings here, with the time of the alternative over that chosen at N = 189, H = 10: the whole
-problem expanded to scalar expressions (IPOPT 1.5 to 2.7, the SQP method 2, FATROP 3; compiled to C by ``jit`` slower
-still, after a minute and a half of compiling), MUMPS for IPOPT, and a warm start of states, inputs and all multipliers
-from the last solution, shifted, with a small barrier parameter (cold 1.5 for IPOPT; 3 for FATROP). The Hessian is the
-exact one or, for a sum of squares, that of Gauss and Newton, which spares the second derivatives of the GPs; the SQP
-method has the latter, since HPIPM needs a convex program; FATROP takes the exact one only.
+Its solvers are IPOPT, its SQP method with HPIPM, and FATROP.
+
+Multiple shooting (Bock and Plitt, 1984) with the states among the unknowns, as CasADi's
+own examples have it. What was found to be the best settings here, with the time of the
+alternative over that chosen at N = 189, H = 10: the whole problem expanded to scalar
+expressions (IPOPT 1.5 to 2.7, the SQP method 2, FATROP 3; compiled to C by ``jit``
+slower still, after a minute and a half of compiling), MUMPS for IPOPT, and a warm start
+of states, inputs and all multipliers from the last solution, shifted, with a small
+barrier parameter (cold 1.5 for IPOPT; 3 for FATROP). The Hessian is the exact one or,
+for a sum of squares, that of Gauss and Newton, which spares the second derivatives of
+the GPs; the SQP method has the latter, since HPIPM needs a convex program; FATROP takes
+the exact one only.
 """
 
 from typing import Any, Literal, NamedTuple
@@ -55,18 +60,16 @@ class Solution(NamedTuple):
 
 
 class Casadi:
-    """Solves one tracking problem after the other on the mean of GPs by a solver of CasADi.
+    """Solves tracking problems on the mean of GPs by a solver of CasADi.
 
-    Args:
-        gp: The GPs.
-        problem: Weights of states and increments, and bounds of the inputs.
-        horizon: H.
-        method: ``"ipopt"`` or ``"ipopt, gauss-newton"``; ``"sqpmethod"`` with HPIPM; ``"fatrop"``. The last two want
-            costs that couple one stage only, so their states are (x_k, u_{k-1}).
+    Args: gp: The GPs. problem: Weights of states and increments, and bounds of the
+        inputs. horizon: H. method: ``"ipopt"`` or ``"ipopt, gauss-newton"``;
+        ``"sqpmethod"`` with HPIPM; ``"fatrop"``. The last two want costs that couple
+        one stage only, so their states are (x_k, u_{k-1}).
         tolerance: The solver's own.
 
-    Raises:
-        SettingError: The problem weighs something else than increments, or bounds more than inputs.
+    Raises: SettingError: The problem weighs something else than increments, or bounds
+        more than inputs.
     """
 
     def __init__(
@@ -126,7 +129,7 @@ class Casadi:
         self._shape = (H, n, m)
 
     def __call__(self, instance: Instance, last: Solution | None) -> Solution:
-        """Plans from a state along a reference, started from the last solution, shifted."""
+        """Plans along a reference, started from the last solution, shifted."""
         H, _, m = self._shape
         if last is None:
             inputs = np.tile(instance.last, (H, 1))
@@ -182,7 +185,7 @@ def mean_function(gp: GPPosterior) -> casadi.Function:
 
 
 def _gauss_newton(w: Any, p: Any, g: Any, cost: Any, triangle: bool) -> casadi.Function:
-    """Hessian of the cost alone, which is that of Gauss and Newton for a quadratic cost of the unknowns."""
+    """Returns the Hessian of the cost alone: Gauss and Newton's of a quadratic cost."""
     weight = casadi.SX.sym("weight")
     multipliers = casadi.SX.sym("multipliers", g.numel())
     hessian = weight * casadi.hessian(cost, w)[0]

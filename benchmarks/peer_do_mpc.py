@@ -1,7 +1,8 @@
-"""The problem in the do-mpc toolbox (Fiedler et al., 2023), as its manual would have it.
+"""Poses the problem in the do-mpc toolbox (Fiedler et al., 2023).
 
-A discrete model with the GPs' mean as its right-hand side, do-mpc's own ``MPC`` with a penalty of the increments, and
-IPOPT with MUMPS behind it. do-mpc starts from its last solution, as it stands; its internals are left alone.
+A discrete model with the GPs' mean as its right-hand side, do-mpc's own ``MPC`` with a
+penalty of the increments, and IPOPT with MUMPS behind it. do-mpc starts from its last
+solution, as it stands; its internals are left alone.
 """
 
 import importlib

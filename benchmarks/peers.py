@@ -1,21 +1,29 @@
-"""The nonlinear problem of a control step solved to one common accuracy, beside CasADi, do-mpc and GPyTorch.
+"""Solves the nonlinear problem of a control step to one common accuracy.
 
-    .venv/bin/python -m benchmarks.peers [--horizons 10 20] [--alone 50] [--seconds 20] [--starts warm cold]
+CasADi, do-mpc and GPyTorch stand beside it.
 
-The quadrotor follows the Lorenz path with the plant in the loop; GPs of 189 transitions of a dithered flight (n = 6,
-m = 3), weights of one on positions, velocities and increments of the inputs, bounds of the inputs that are active in
-half of the steps. The instances of that flight (state, reference, last input) are solved by every solver in turns, one
-instance per call, in one process on one thread; times are processor time.
+    .venv/bin/python -m benchmarks.peers [--horizons 10 20] [--alone 50] [--seconds 20]
+    [--starts warm cold]
 
-* ``converged``: a KKT point of the nonlinear problem on the GPs' mean. Every plan is judged by one function
-  (``benchmarks.kkt``); solvers stop by tests of their own, whose tolerances are the loosest powers of ten that brought
-  nine plans of ten within ``ACCURACY``; the share that is within is printed. *Warm* solvers start from their own last
-  solution, shifted where the library allows it, *cold* ones from the last input and the reference.
-* ``one program``: one quadratic program per step from the last plan (real-time iteration), with our QP solver and DAQP.
+The quadrotor follows the Lorenz path with the plant in the loop; GPs of 189 transitions
+of a dithered flight (n = 6, m = 3), weights of one on positions, velocities and
+increments of the inputs, bounds of the inputs that are active in half of the steps. The
+instances of that flight (state, reference, last input) are solved by every solver in
+turns, one instance per call, in one process on one thread; times are processor time.
 
-Every solver solves ten instances in a row, then the next one the same ten. ``times ours`` is the median ratio of paired
-calls after the first of each ten, as in a loop of its own; ``times ours, evicted`` that of the first ones, which find
-the caches as another solver left them. Writes ``outputs/benchmarks/peers.json`` and ``peers.md``.
+* ``converged``: a KKT point of the nonlinear problem on the GPs' mean. Every plan is
+  judged by one function (``benchmarks.kkt``); solvers stop by tests of their own, whose
+  tolerances are the loosest powers of ten that brought nine plans of ten within
+  ``ACCURACY``; the share that is within is printed. *Warm* solvers start from their own
+  last solution, shifted where the library allows it, *cold* ones from the last input
+  and the reference.
+* ``one program``: one quadratic program per step from the last plan (real-time
+iteration), with our QP solver and DAQP.
+
+Every solver solves ten instances in a row, then the next one the same ten. ``times
+ours`` is the median ratio of paired calls after the first of each ten, as in a loop of
+its own; ``times ours, evicted`` that of the first ones, which find the caches as
+another solver left them. Writes ``outputs/benchmarks/peers.json`` and ``peers.md``.
 """
 
 import argparse
@@ -119,7 +127,7 @@ def peers_problem() -> Problem:
 def record_instances(
     gp: GPPosterior, task: Problem, horizon: int, steps: int
 ) -> list[Instance]:
-    """Flies with one program per step and returns the optimal control problems of the flight."""
+    """Returns the optimal control problems of a flight with one program a step."""
     flown = recorded(
         GPMPC(
             gp,
@@ -234,7 +242,7 @@ def _previous(instance: Instance, last: Decision | None) -> Decision:
 
 
 class Run:
-    """Solves the next instance with every call, from its own last solution or from none.
+    """Solves the next instance with every call, warm or cold.
 
     Attributes:
         plans: Number of the instance and the plan (H, m), in the order of the calls.
@@ -248,7 +256,10 @@ class Run:
         self.plans: list[tuple[int, np.ndarray]] = []
 
     def __call__(self) -> None:
-        """Solves one instance; after the last one comes the first again, without a last solution."""
+        """Solves one instance.
+
+        After the last one comes the first again, without a last solution.
+        """
         number = len(self.plans) % len(self._instances)
         last = self._last if number and not self._cold else None
         self._last = self._solve(self._instances[number], last)

@@ -47,7 +47,10 @@ class Pendulums:
         object.__setattr__(self, "input_names", tuple(f"torque{i}" for i in every))
 
     def derivative(self, x: Any, u: Any) -> Sequence[Any]:
-        """d/dt (angle1, rate1, angle2, ...) [rad/s, rad/s^2], from torques per inertia [1/s^2]."""
+        """Returns d/dt (angle1, rate1, angle2, ...) [rad/s, rad/s^2].
+
+        Torques are per inertia [1/s^2].
+        """
         rates = []
         for i in range(self.count):
             angle = x[2 * i]
@@ -67,7 +70,7 @@ def pendulum_plant(state_dim: int) -> System:
 
 
 def pendulum_gp(state_dim: int, size: int, seed: int = 0) -> GPPosterior:
-    """GPs on ``size`` transitions from all over the region that ``pendulum_references`` crosses."""
+    """Returns GPs on ``size`` transitions from where ``pendulum_references`` goes."""
     random = np.random.default_rng([seed, state_dim, size])
     plant = pendulum_plant(state_dim)
     n = state_dim

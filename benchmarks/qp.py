@@ -123,7 +123,7 @@ def daqp_cold(first: SequenceProblem) -> Solve:
 
 
 def by_protocol(solver) -> Callable[[SequenceProblem], Solve]:
-    """Any ``QPSolver``; building the ``QuadraticProgram`` is not timed (see ``run_pass``)."""
+    """Any ``QPSolver``; building the program is not timed (see ``run_pass``)."""
 
     def begin(first: SequenceProblem) -> Solve:
         last = None
@@ -141,7 +141,7 @@ def by_protocol(solver) -> Callable[[SequenceProblem], Solve]:
 def run_pass(
     begin, problems: list[SequenceProblem], flush: bool, as_program: bool
 ) -> tuple[np.ndarray, list]:
-    """Seconds per QP of one pass over the sequence, and what the solver returned for each."""
+    """Returns seconds per QP of one pass over the sequence, and the solutions."""
     first = problems[0]
     buffer = SequenceProblem(
         *(np.array(a) for a in (first.P, first.q, first.G, first.lower, first.upper))

@@ -1,15 +1,17 @@
-"""The quadratic programs that a quadrotor's model predictive controller meets, one after the other in closed loop.
+"""Makes the quadratic programs that a quadrotor's MPC meets in closed loop.
 
-A solver that is warm-started is judged only by a sequence in which the next problem resembles the last one as it does
-in use. Here the translational subsystem of the quadrotor (thrust and two tilts in, positions and velocities out)
-follows a fast Lissajous curve under process noise. Its MPC is condensed to the inputs of the horizon: input bounds
-become the box of the QP (n = 3H), bounds on the six states of every stage its rows (6H); or, as a second family, on
-the three positions (3H). The bounds narrow and widen
-(a corridor that the vehicle passes), so that constraints come and go; they are never narrower than what a known
-feasible plan needs.
+A solver that is warm-started is judged only by a sequence in which the next problem
+resembles the last one as it does in use. Here the translational subsystem of the
+quadrotor (thrust and two tilts in, positions and velocities out) follows a fast
+Lissajous curve under process noise. Its MPC is condensed to the inputs of the horizon:
+input bounds become the box of the QP (n = 3H), bounds on the six states of every stage
+its rows (6H); or, as a second family, on the three positions (3H). The bounds narrow
+and widen (a corridor that the vehicle passes), so that constraints come and go; they
+are never narrower than what a known feasible plan needs.
 
-``constant``: the model is linearised once, at hover; P and G stay. ``changing``: it is linearised at every step around
-the thrust and tilt of the reference motion, so P and G are new in each problem.
+``constant``: the model is linearised once, at hover; P and G stay. ``changing``: it is
+linearised at every step around the thrust and tilt of the reference motion, so P and G
+are new in each problem.
 """
 
 from collections.abc import Iterator
@@ -74,7 +76,10 @@ def _reference(times: Array) -> Array:
 
 
 def _linear_model(thrust: float, tilt: Array) -> tuple[Array, Array]:
-    """Discrete A, B (explicit in velocity, exact in position) at a thrust [N] and two tilts [-]."""
+    """Returns the discrete A, B at a thrust [N] and two tilts [-].
+
+    They are explicit in velocity, exact in position.
+    """
     acceleration = np.array(
         [
             [tilt[0] / MASS, thrust / MASS, 0.0],
@@ -159,7 +164,10 @@ def quadrotor_sequence(
 def flight_sequence(
     trajectory: str, horizon: int, length: int
 ) -> list[SequenceProblem]:
-    """The QPs of a flight of the learned quadrotor with the plant in the loop, those without a solution left out."""
+    """Yields the QPs of a flight of the learned quadrotor with the plant in the loop.
+
+    Those without a solution are left out.
+    """
     states = states_along(TRAJECTORIES[trajectory], np.arange(length + horizon + 1.0))
     margin = 0.05 + 0.02 * np.ptp(
         states, axis=0

@@ -117,7 +117,10 @@ PAUSE = 10
 
 
 def state_of(x: Any) -> Array:
-    """Our state (shoulder from upright, its rate, elbow, its rate) of the league's (angles, rates), hanging at zero."""
+    """Returns our state (shoulder from upright, its rate, elbow, its rate).
+
+    The league's (angles, rates) hang at zero.
+    """
     return np.array([x[0] - np.pi, x[2], x[1], x[3]], dtype=float)
 
 
@@ -129,7 +132,7 @@ def heights(states: Array) -> Array:
 
 
 def upright(states: Array) -> Reference:
-    """Upright over the horizon of a plan (H + 1, n), in the turns that are nearest to its end."""
+    """Returns upright states (H + 1, n) in the turns nearest to a plan's end."""
     goal = np.zeros_like(states)
     goal[:, [0, 2]] = 2 * np.pi * np.round(states[-1, [0, 2]] / (2 * np.pi))
     return Reference(goal)
@@ -155,16 +158,19 @@ def fine_model(robot: str, body: list[float] | None = None) -> KnownModel:
 
 
 def wrong_system(robot: str, error: float, seed: int) -> System:
-    """The pendulum with every mass, length and inertia wrong by a share, up or down at random."""
+    """Returns the pendulum with all parameters wrong by a share, at random."""
     signs = np.random.default_rng(seed).choice([-1.0, 1.0], 7)
     return _with_parameters(robot, _parameters(double_pendulum()) * (1 + error * signs))
 
 
 def fit_body(robot: str, start: System, data: Transitions) -> System:
-    """Fits masses, lengths and inertias to transitions, by least squares on their logarithms from ``start`` on.
+    """Fits masses, lengths and inertias to transitions.
 
-    Five combinations of the seven decide the motion, and only these are found: the second moments about both joints,
-    the coupling of the links, and the weights' two moments.
+    It takes least squares on their logarithms from ``start`` on.
+
+    Five combinations of the seven decide the motion, and only these are found: the
+    second moments about both joints, the coupling of the links, and the weights' two
+    moments.
     """
     x = data.states.numpy()
     u = data.inputs.numpy()
@@ -198,10 +204,13 @@ def _with_parameters(robot: str, values: Array) -> System:
 
 @dataclass
 class Pilot:
-    """Flies a plan at 50 Hz and its feedback at 500 Hz, and searches anew when the league takes the pendulum away.
+    """Flies a plan at 50 Hz and its feedback at 500 Hz.
 
-    Where no start leads up, the motor brakes its joint before the next search: flown on, such plans spin the links
-    faster and faster, beyond what a model was learned from.
+    It searches anew when the league takes the pendulum away.
+
+    Where no start leads up, the motor brakes its joint before the next search: flown
+    on, such plans spin the links faster and faster, beyond what a model was learned
+    from.
 
     Attributes:
         controller: Of plans.
@@ -223,7 +232,7 @@ class Pilot:
     _pause: int = 0  #: decisions that are left to brake
 
     def torques(self, x: Any, t: float) -> Array:
-        """The torques of both joints (2,) at a state in the league's order and a time [s]."""
+        """Returns the torques of both joints (2,) at a state and a time [s]."""
         state = state_of(x)
         if abs(t - self._last) > 1.5 * INPUT:
             self._loop = None
@@ -277,12 +286,12 @@ class Flies(Protocol):
     """What flies the pendulum."""
 
     def torques(self, x: Any, t: float) -> Array:
-        """The torques of both joints (2,) at a state in the league's order and a time [s]."""
+        """Returns the torques of both joints (2,) at a state and a time [s]."""
         ...
 
 
 def league_controller(base: type, pilot: Flies) -> Any:
-    """A controller in the league's interface (``AbstractController`` or what stands for it) that a pilot flies."""
+    """A controller in the league's interface that a pilot flies."""
 
     class GPMPCController(base):
         def get_control_output_(self, x: Any, t: float | None = None) -> Array:
@@ -371,7 +380,10 @@ def beside(entry: Path, ending: str) -> Path:
 
 
 def play_robustness(entry: Path, robot: str, kind: str, size: int) -> str:
-    """The parts of the league's robustness board, with a number of values of each quantity, as a table."""
+    """Returns the parts of the league's robustness board as a table.
+
+    Each quantity takes a number of values.
+    """
     from double_pendulum.controller.abstract_controller import AbstractController
 
     from benchmarks.realaigym_robustness import Watchful, robustness
@@ -407,7 +419,7 @@ def play_film(entry: Path, robot: str, kind: str) -> Path:
 
 
 def play_script(entry: Path, robot: str) -> float:
-    """The score by the league's unmodified script, which draws its disturbances without a seed."""
+    """Returns the score by the league's script, which draws without a seed."""
     found = find_spec("double_pendulum")
     where = (
         Path(str(found and found.origin)).resolve().parents[3]
@@ -603,7 +615,10 @@ def play(
 
 
 def league_parameters(limits: list[float]) -> Any:
-    """The league's parameters of design C.1, model 1.1, without friction and motor inertia, from our system."""
+    """Returns the league's parameters of design C.1, model 1.1, from our system.
+
+    Friction and motor inertia are left out.
+    """
     from double_pendulum.model.model_parameters import model_parameters
 
     d = double_pendulum().dynamics
@@ -646,7 +661,10 @@ def right_hand_side() -> Callable[[float, Array, Array], Array]:
 
 
 def random_record(robot: str, seconds: float, seed: int) -> list[Play]:
-    """Records of 2 s each, hanging at first, under torques that are drawn anew every 0.1 s."""
+    """Returns records of 2 s, hanging at first, under random torques.
+
+    The torques are drawn anew every 0.1 s.
+    """
     system = replace(double_pendulum(ACTUATED[robot], time_step=INPUT), substeps=1)
     rng = np.random.default_rng(seed)
     joint = JOINTS[robot]
@@ -666,7 +684,11 @@ def random_record(robot: str, seconds: float, seed: int) -> list[Play]:
 
 
 def transitions(records: list[Play], robot: str, spread: float = 0.05) -> Transitions:
-    """Transitions over 20 ms with a torque that changed by at most ``spread`` [N m], and none on the passive joint."""
+    """Returns transitions over 20 ms.
+
+    The torque changed by at most ``spread`` [N m], and there is none on the passive
+    joint.
+    """
     joint = JOINTS[robot]
     count = round(PLAN / INPUT)
     states = []
@@ -727,7 +749,10 @@ def learn(
 def learned_model(
     robot: str, kind: str, seed: int, error: float = 0.15
 ) -> tuple[Any, list[float]]:
-    """The model, and its body, of 20 s of random torque and four times 10 s of the league's test."""
+    """Returns the model and its body.
+
+    They come from 20 s of random torque and four times 10 s of the league's test.
+    """
     nominal: Any = Affine.identity(4, 1)
     nominal.A[[0, 2], [1, 3]] = PLAN  # an angle moves by its rate
     body = wrong_system(robot, error, seed)
@@ -808,7 +833,7 @@ def board(
 
 
 def _version() -> str:
-    """What plays: the commit of the source checkout, or the version of the installed package."""
+    """Returns the commit of the checkout, or the version of the package."""
     made = provenance()
     return made["versions"]["gpmpc"] if made["git"] is None else made["git"]["commit"]
 

@@ -16,7 +16,7 @@ RATE = 20  # frames a second
 
 
 def film(flight: Play, joint: int, path: Path) -> None:
-    """Writes the flight of a pendulum with the motor at a joint (0, 1), at its own speed."""
+    """Writes the flight of a pendulum with the motor at a joint (0, 1)."""
     first, second = LENGTHS
     angle = flight.states[:, 0]
     both = flight.states[:, 0] + flight.states[:, 1]

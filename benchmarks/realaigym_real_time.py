@@ -1,10 +1,11 @@
-"""Plays the league's double pendulum as if computing took its time, which the simulation does not ask for.
+"""Plays the league's double pendulum as if computing took its time.
 
-Every decision and every search is timed (processor time, all threads), and acts as much simulated time later. One core
-gives torques every 2 ms and decides every 20 ms; a second one searches from where the pendulum is expected at the
-search's end. Until a plan is known the actuated joint is braked; then the other starts are searched for a better one,
-while the plan flies and is improved every 20 ms. One that leads nowhere is dropped, since it would be flown faster and
-faster.
+Every decision and every search is timed (processor time, all threads), and acts as much
+simulated time later. One core gives torques every 2 ms and decides every 20 ms; a
+second one searches from where the pendulum is expected at the search's end. Until a
+plan is known the actuated joint is braked; then the other starts are searched for a
+better one, while the plan flies and is improved every 20 ms. One that leads nowhere is
+dropped, since it would be flown faster and faster.
 """
 
 from collections.abc import Callable
@@ -39,7 +40,10 @@ GOOD = 1.0
 
 
 class Flight(NamedTuple):
-    """A plan and the times, in inputs of 2 ms, that it begins at and is known from, when its core is free again."""
+    """A plan and its times in inputs of 2 ms.
+
+    It begins at one and is known from the other, when its core is free again.
+    """
 
     loop: ControlLoop
     plan: Decision
@@ -50,15 +54,13 @@ class Flight(NamedTuple):
 
 @dataclass
 class RealTimePilot:
-    """Flies the best plan that is known, and knows a plan only after the time that it took.
+    """Flies the best plan that is known; a plan is known after the time it took.
 
-    Attributes:
-        step: Takes a few programs a decision.
-        search: Its starts are taken one after the other, again and again while there is no plan.
-        criterion: Of plans: predicted time below the line [s].
-        joint: With the motor: 0, 1.
-        lead: Time from a search's call to its first state, in time steps of the plan.
-        share: Of the lead, after which no further start is taken.
+    Attributes: step: Takes a few programs a decision. search: Its starts are taken one
+        after the other, again and again while there is no plan. criterion: Of plans:
+        predicted time below the line [s]. joint: With the motor: 0, 1. lead: Time from
+        a search's call to its first state, in time steps of the plan. share: Of the
+        lead, after which no further start is taken.
     """
 
     step: GPMPC
@@ -95,7 +97,7 @@ class RealTimePilot:
         )
 
     def torques(self, x: Any, t: float) -> Array:
-        """The torques of both joints (2,) at a state in the league's order and a time [s]."""
+        """Returns the torques of both joints (2,) at a state and a time [s]."""
         state = state_of(x)
         if abs(t - self._last) > 1.5 * INPUT:
             self._flight = self._decided = self._found = None
@@ -154,7 +156,10 @@ class RealTimePilot:
         return self.criterion(replace(flight.plan, means=means), upright(means))
 
     def _search(self, state: Array, now: int, flight: Flight | None) -> Flight:
-        """The best plan of as many starts as the time allows, from where the pendulum will be then."""
+        """Returns the best plan of as many starts as the time allows.
+
+        They begin where the pendulum will be then.
+        """
         begin = process_time()
         if flight is None:
             expected = self._roll_out(state[None], self._brake)[0][0, -1]

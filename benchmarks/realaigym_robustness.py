@@ -80,7 +80,10 @@ class RateFilter:
 
 
 def identify(states: list[Array], inputs: list[float]) -> tuple[int, float]:
-    """The delay [inputs] and the responsiveness of a motor that explain what inputs (T,) did to states (T, 4) best."""
+    """Returns the delay [inputs] and the responsiveness of a motor.
+
+    They explain best what inputs (T,) did to states (T, 4).
+    """
     found = []
     for response in np.linspace(0.1, 2.0, 20):
         acting = np.array(inputs)
@@ -97,7 +100,7 @@ def identify(states: list[Array], inputs: list[float]) -> tuple[int, float]:
 
 @dataclass
 class Watchful:
-    """Probes delay and responsiveness, then lets a pilot fly what it makes of the measurements.
+    """Probes delay and responsiveness, then lets a pilot fly.
 
     Attributes:
         pilot: Flies.
@@ -125,7 +128,7 @@ class Watchful:
         ).repeat(5)
 
     def torques(self, x: Any, t: float) -> Array:
-        """The torques of both joints (2,) at what is measured, in the league's order, and a time [s]."""
+        """Returns the torques of both joints (2,) at a measurement and a time [s]."""
         measured = state_of(x)
         if t < self._last:
             self._filter.restart(measured)

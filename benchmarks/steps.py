@@ -1,10 +1,12 @@
-"""What a control step costs over the number of training points, the horizon and the state's dimension.
+"""Times a control step over training points, horizon and state dimension.
 
-    .venv/bin/python -m benchmarks.steps [--states 6] [--sizes 10 189] [--horizons 1 10 50] [--caches hot flushed]
+    .venv/bin/python -m benchmarks.steps [--states 6] [--sizes 10 189] [--horizons 1 10
+    50] [--caches hot flushed]
 
-A cell is one n, N and H. A flight of coupled pendulums records the beliefs and references of its steps; the convex
-controllers then solve these problems in turns, each warm-started from its own last decision, as in a loop. Beside them
-stand single predictions with their derivatives. Processor time of one thread in one process. Writes
+A cell is one n, N and H. A flight of coupled pendulums records the beliefs and
+references of its steps; the convex controllers then solve these problems in turns, each
+warm-started from its own last decision, as in a loop. Beside them stand single
+predictions with their derivatives. Processor time of one thread in one process. Writes
 ``outputs/benchmarks/steps.json``, ``steps.md`` and ``steps.png``.
 """
 
@@ -128,7 +130,7 @@ def controllers(gp: GPPosterior, horizon: int) -> dict[str, Controller]:
 
 @dataclass
 class WarmStarted:
-    """Solves recorded steps one after the other, endlessly, each from the decision before.
+    """Solves recorded steps endlessly, each from the decision before.
 
     Attributes:
         controller: What is measured.
@@ -154,7 +156,7 @@ class WarmStarted:
 def record_steps(
     gp: GPPosterior, controller: Controller, steps: int
 ) -> list[tuple[Gaussian, Reference]]:
-    """Flies the pendulums with a controller and returns the beliefs and references of its steps."""
+    """Flies the pendulums and returns the beliefs and references of the steps."""
     n = gp.state_dim
     found = []
 

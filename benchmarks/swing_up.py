@@ -1,12 +1,16 @@
-"""Swing-ups from hanging with models that were learned from at most 60 s of random motion, over many seeds.
+"""Swings up from hanging with learned models, over many seeds.
 
-    .venv/bin/python -m benchmarks.swing_up [pendulum circle cart_pole acrobot] [--seeds 20]
+They learned from at most 60 s of random motion.
 
-Systems fly with the settings that ``gpmpc run system=NAME`` has; the seed is that of data, training and noise.
-``circle`` is the pendulum whose state is (cosine, sine, rate). A flight counts as up and held where all angles are
-within 0.2 rad of upright through its last second. ``in time`` is the share of decisions within the sampling period, on
-one thread. Each flight is a line of ``outputs/benchmarks/swing_up.jsonl``, and those of the same code that stand there
-are not flown again.
+    .venv/bin/python -m benchmarks.swing_up [pendulum circle cart_pole acrobot] [--seeds
+    20]
+
+Systems fly with the settings that ``gpmpc run system=NAME`` has; the seed is that of
+data, training and noise. ``circle`` is the pendulum whose state is (cosine, sine,
+rate). A flight counts as up and held where all angles are within 0.2 rad of upright
+through its last second. ``in time`` is the share of decisions within the sampling
+period, on one thread. Each flight is a line of ``outputs/benchmarks/swing_up.jsonl``,
+and those of the same code that stand there are not flown again.
 """
 
 import argparse

@@ -58,7 +58,7 @@ FLIGHTS = Path("outputs/benchmarks/swing_up_starts.jsonl")
 
 @dataclass(frozen=True)
 class Furuta:
-    """A pendulum at the end of an arm that a motor turns, with the numbers of a QUBE-Servo.
+    """A pendulum at the end of an arm that a motor turns, as in a QUBE-Servo.
 
     The rods are uniform; ``angle`` is the pendulum's from upright.
     """

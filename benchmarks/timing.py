@@ -1,10 +1,11 @@
-"""Interleaved timing of single calls, and the machine, tables and files that belong to the times.
+"""Times single calls in turns, and writes machine, tables and files.
 
-The calls that are compared alternate, so that a slow minute of the machine slows all of them. A time is the processor
-time of the calling thread, less what reading the clock costs; one call is one sample, as a control loop meets them.
+The calls that are compared alternate, so that a slow minute of the machine slows all of
+them. A time is the processor time of the calling thread, less what reading the clock
+costs; one call is one sample, as a control loop meets them.
 
-*Hot* calls find their data in the caches, as in a benchmark's loop; *flushed* ones come after a walk through a large
-buffer, as after other work between two control steps.
+*Hot* calls find their data in the caches, as in a benchmark's loop; *flushed* ones come
+after a walk through a large buffer, as after other work between two control steps.
 """
 
 import json
@@ -125,7 +126,11 @@ def use_one_thread() -> None:
 
 
 def machine() -> dict:
-    """Processor, cores, threads, load, and the rates of a matrix product and of reading memory, as plain data."""
+    """Describes the machine as plain data.
+
+    Processor, cores, threads, load, and the rates of a matrix product and of reading
+    memory.
+    """
     left = np.ones((MATRIX_SIDE, MATRIX_SIDE))
     numbers = np.ones(WALK_BYTES // 8)
     return {
@@ -193,7 +198,7 @@ def own_source(path: str) -> str:
 
 
 def write_results(name: str, results: Any, **meta: Any) -> Path:
-    """Writes results with what made them to ``outputs/benchmarks/NAME.json`` and prints where."""
+    """Writes results and provenance to ``outputs/benchmarks/NAME.json``."""
     path = RESULTS / f"{name}.json"
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(

@@ -1,10 +1,13 @@
-"""How long the training of six GPs takes, beside GPyTorch's automatic differentiation and the paper's seconds.
+"""Times the training of six GPs.
+
+GPyTorch's automatic differentiation and the paper's seconds stand beside it.
 
     .venv/bin/python -m benchmarks.training [--repeats 15] [--sizes 10 50 100 189]
 
-One process, one thread. For every trajectory, subsystem and size the closed-form trainer (as ``gpmpc tables`` runs it:
-four starts a GP) and GPyTorch's likelihood under the same search take turns on the same rows; the ratio is paired.
-Writes ``outputs/benchmarks/training.json``.
+One process, one thread. For every trajectory, subsystem and size the closed-form
+trainer (as ``gpmpc tables`` runs it: four starts a GP) and GPyTorch's likelihood under
+the same search take turns on the same rows; the ratio is paired. Writes
+``outputs/benchmarks/training.json``.
 """
 
 import argparse

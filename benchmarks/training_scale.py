@@ -214,7 +214,7 @@ def evaluation(route: str, x, y, inducing: int):
 
 
 def gpytorch_sparse(x, y, inducing: int, scales, sf2):
-    """GPyTorch's collapsed bound (SGPR) and its gradient, as its documentation builds it."""
+    """Builds GPyTorch's collapsed bound (SGPR) and its gradient, as documented."""
     import gpytorch
     import torch
 

@@ -130,7 +130,7 @@ def pooled(flown: list[Rollout]) -> float:
 
 
 def altitudes(shown: dict[tuple, Rollout]) -> Figure:
-    """How far the heavier vehicle is from its altitude, the first seed of the process noise."""
+    """Returns the error of the heavier vehicle's altitude, for the first seed."""
     plt.style.use("gpmpc.plotting.gpmpc")
     figure, axes = plt.subplots(1, len(TRAJECTORIES), sharey=True, figsize=(8, 3.6))
     for axis, trajectory in zip(axes, TRAJECTORIES, strict=True):

@@ -204,9 +204,10 @@ class Quality:
         experiment = self.experiments[family]
         trajectory = self.trajectories[trajectory_name]
         make_controller = experiment.controller
-        if experiment.learns:
-            controller = TimedOnModel(make_controller, horizon)
-        else:
+        controller: Callable[..., TimedController] = TimedOnModel(
+            make_controller, horizon
+        )
+        if not experiment.learns:
             controller = TimedOnPlant(make_controller, horizon)
             model = None
         flight = replace(

@@ -145,7 +145,7 @@ class SLSQP:
         cost = self.problem.cost
         # U -> u_i - u_{i-1}, without u_{-1}
         self._differences = np.kron(np.eye(H) - np.eye(H, k=-1), np.eye(m))
-        self._penalized = np.eye(H * m)
+        self._penalized: Array = np.eye(H * m)
         if cost.penalized == "increments":
             self._penalized = self._differences
         self._weights, R = cost.by_stage(H)

@@ -3,17 +3,17 @@
 The columns of the rotational one are scaled.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
 from gpmpc.exceptions import SettingError
-from gpmpc.gp import identity, min_max
+from gpmpc.gp import Scaling, identity, min_max
 from gpmpc.systems import rotational, translational
 
 SYSTEMS = {"translational": translational(), "rotational": rotational()}
 # A column that moves less is at rest; the tolerance of the NMPC solver is 1e-10.
-SCALINGS = {
+SCALINGS: dict[str, Callable[..., Scaling]] = {
     "translational": identity,
     "rotational": partial(min_max, low=0.1, high=0.9, resolution=1e-9),
 }

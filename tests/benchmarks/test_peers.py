@@ -1,4 +1,7 @@
-"""Contenders are asked the same instance and judged by the same measure, which knows an optimum when it sees one."""
+"""Contenders get the same instance and are judged by the same measure.
+
+The measure knows an optimum when it sees one.
+"""
 
 import itertools
 from dataclasses import replace

@@ -30,7 +30,10 @@ from gpmpc.systems import double_pendulum
 
 
 def leagues(robot, torque_of, count, delay=0, response=1.0, noise=0.0):
-    """States (T + 1, 4) of the league's pendulum, hanging at first, and what was asked for (T, 2)."""
+    """Returns states (T + 1, 4) of the pendulum and the torques asked for (T, 2).
+
+    It hangs at first.
+    """
     rhs = right_hand_side()
     rng = np.random.default_rng(0)
     last = np.zeros(2)
@@ -50,7 +53,7 @@ def leagues(robot, torque_of, count, delay=0, response=1.0, noise=0.0):
 
 
 def timed_pilot(monkeypatch, start, decision, value=0.1):
-    """A pilot whose clock says that every start and every decision takes a time, and every plan has a value."""
+    """A pilot whose starts and decisions take a time, and whose plans have a value."""
     clock = [0.0]
 
     def slowed(function, seconds):

@@ -306,7 +306,11 @@ def test_on_the_authors_data_the_convex_controller_tracks_within_the_printed_bou
 
 
 def test_the_nonlinear_controller_starts_from_the_references_own_inputs():
-    """From the last input held, a nearly flat direction of this GP takes it hundreds of iterations."""
+    """Starts at the reference's inputs.
+
+    From the last input held, a nearly flat direction of this GP takes it hundreds of
+    iterations.
+    """
     from gpmpc.gaussian import Gaussian
     from gpmpc.gp import Transitions
     from gpmpc.mpc import Problem, Tracking

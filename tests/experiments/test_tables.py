@@ -383,7 +383,7 @@ def test_our_rotational_flight_with_the_authors_yaw_residue_gives_the_papers_row
 def test_the_measures_of_a_fit_are_those_of_its_predictions_in_the_units_of_the_data(
     finished, subsystem
 ):
-    """Worked out anew from the posterior of all rows, by torch's own normal distribution."""
+    """Works the measures out anew, by torch's own normal distribution."""
     experiment, _, records = finished
     full = next(r for r in records if (r["subsystem"], r["size"]) == (subsystem, 25))
     cell = next(
