@@ -47,11 +47,11 @@ def experiment(**changes):
 def loops(monkeypatch):
     """What was rehearsed, and what was flown, in their order."""
     calls = []
-    monkeypatch.setattr(_flight, "rehearse", lambda *given: calls.append(given))
+    monkeypatch.setattr(_flight, "rehearse", lambda *arguments: calls.append(arguments))
     monkeypatch.setattr(
         _flight,
         "closed_loop",
-        lambda *given, **more: calls.append((given, more)) or ROLLOUT,
+        lambda *arguments, **keywords: calls.append((arguments, keywords)) or ROLLOUT,
     )
     return calls
 
@@ -66,10 +66,12 @@ def test_a_flight_has_references_for_all_that_its_last_plan_sees(loops):
     flown = run_trial(
         chosen, lambda *prepared: prepared_trials.append(prepared) or STEP
     )
-    rehearsed, (given, more) = loops
-    system, controller, reference, start, steps = given
+    rehearsed, (arguments, keywords) = loops
+    system, controller, reference, start, steps = arguments
     assert (system, steps, controller.made_of) == (heavy, 5, MODEL)
-    assert all(one is other for one, other in zip(rehearsed, given[:4], strict=True))
+    assert all(
+        one is other for one, other in zip(rehearsed, arguments[:4], strict=True)
+    )
     assert np.array_equal(
         reference.states, PLANT.reference_states(Elliptical(), 5 + 3 + 1)
     )
@@ -82,7 +84,7 @@ def test_a_flight_has_references_for_all_that_its_last_plan_sees(loops):
         "seed": 4,
         "on_step": STEP,
     }
-    assert more == settings
+    assert keywords == settings
     assert prepared_trials == [(controller, None)]
     assert (flown.rollout, flown.controller, flown.training, flown.diverged) == (
         ROLLOUT,
@@ -128,11 +130,11 @@ def test_a_model_loop_is_flown_in_the_models_own_world(propagator, loops, monkey
 
 def test_a_controller_that_learns_while_it_flies_is_wrapped(loops, monkeypatch):
     monkeypatch.setattr(
-        _flight, "LearningController", lambda *given: steering(given=given)
+        _flight, "LearningController", lambda *arguments: steering(arguments=arguments)
     )
     online = OnlineLearning()
     run_trial(experiment(learning=online))
-    inner, learning = loops[1][0][1].given
+    inner, learning = loops[1][0][1].arguments
     assert (inner.made_of, learning) == (MODEL, online)
 
 
@@ -198,7 +200,9 @@ def test_episodes_have_own_seeds_and_the_best_model_flies_last(monkeypatch):
 
 def test_a_system_with_a_nominal_or_angles_learns_a_residual(monkeypatch):
     monkeypatch.setattr(
-        _experiment, "train_residual", lambda **given: ("residual", *given.values())
+        _experiment,
+        "train_residual",
+        lambda **arguments: ("residual", *arguments.values()),
     )
     monkeypatch.setattr(
         _experiment, "successor_function", lambda known: ("after", known)
