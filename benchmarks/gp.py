@@ -61,7 +61,7 @@ def main() -> None:
     u = np.zeros(INPUTS)
     mu = at.mean.numpy()[None]
     S = at.covariance.numpy()[None]
-    kernels.linearize(gps, mu, u[None], False, np.zeros(STATES), False)
+    kernels.linearize_gps(gps, mu, u[None], False, np.zeros(STATES), False)
     kernels.point_with_jacobian(gps, mu, u[None])
     kernels.moments(gps, mu, S, u[None], derivatives=True)
     first = time.perf_counter() - began
@@ -215,7 +215,9 @@ def linearisation_groups(
         {
             "mean with Jacobian": lambda: [
                 part[0]
-                for part in kernels.linearize(packed, mu, u, False, zeros, False)[1:3]
+                for part in kernels.linearize_gps(packed, mu, u, False, zeros, False)[
+                    1:3
+                ]
             ],
             "mean with Jacobian, torch jacrev": by_jacrev,
             "mean with Jacobian, GPyTorch, frozen": by_gpytorch,

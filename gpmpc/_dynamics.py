@@ -25,11 +25,11 @@ _log = logging.getLogger(__name__)
 class Linearized(NamedTuple):
     """First-order expansions of a model at K points, as C-contiguous float64 arrays."""
 
-    mean: Array  #: next states f(x, u) (K, n)
-    A: Array  #: derivatives of the means by the state (K, n, n)
-    B: Array  #: derivatives of the means by the input (K, n, m)
-    #: of the latent next states at the points, without observation noise (K, n, n);
-    #: None where it was not computed
+    mean: Array  #: next states f(x, u), or k other outputs (K, k)
+    A: Array  #: derivatives of the means by the state (K, k, n)
+    B: Array  #: derivatives of the means by the input (K, k, m)
+    #: of the latent outputs at the points, without observation noise (K, k, k); None
+    #: where it was not computed
     covariance: Array | None
 
 
@@ -239,7 +239,7 @@ def _gradients(
     ]
 
 
-class Expansion(NamedTuple):
+class FirstOrderExpansion(NamedTuple):
     """A prediction, with the derivatives of its mean."""
 
     belief: Gaussian  # mean (*batch, k), covariance (*batch, k, k)
@@ -247,7 +247,9 @@ class Expansion(NamedTuple):
     B: Tensor  # by the input (*batch, k, m)
 
 
-def predict_with_jacobian(model: Any, state: Tensor, input: Tensor) -> Expansion:
+def predict_with_jacobian(
+    model: Any, state: Tensor, input: Tensor
+) -> FirstOrderExpansion:
     """Predicts, with the derivatives of the mean.
 
     By the model's ``linearize`` where torch follows nothing; else by its own method of
@@ -266,12 +268,12 @@ def predict_with_jacobian(model: Any, state: Tensor, input: Tensor) -> Expansion
     if method is None:
         return predict_by_autograd(model, state, input)
     belief, A, B = method(state, input)
-    return Expansion(belief, A, B)
+    return FirstOrderExpansion(belief, A, B)
 
 
 def _linearize_batch(
     model: Any, arrays: Sequence[np.ndarray], batch: torch.Size
-) -> Expansion:
+) -> FirstOrderExpansion:
     """Linearises a model at states and inputs of any batch."""
     count = batch.numel()
     points = [
@@ -282,10 +284,12 @@ def _linearize_batch(
         tensor.reshape(*batch, *tensor.shape[1:])
         for tensor in tensors_for(model, *model.linearize(*points))
     ]
-    return Expansion(Gaussian(mean, covariance), A, B)
+    return FirstOrderExpansion(Gaussian(mean, covariance), A, B)
 
 
-def predict_by_autograd(model: Any, state: Tensor, input: Tensor) -> Expansion:
+def predict_by_autograd(
+    model: Any, state: Tensor, input: Tensor
+) -> FirstOrderExpansion:
     """Predicts, with the derivatives of the mean, by torch autograd.
 
     Args:
@@ -299,7 +303,7 @@ def predict_by_autograd(model: Any, state: Tensor, input: Tensor) -> Expansion:
         return belief.mean, belief.covariance
 
     (mean, covariance), (A, B) = batched_jacobian(prediction, (state, input))
-    return Expansion(Gaussian(mean, covariance), A, B)
+    return FirstOrderExpansion(Gaussian(mean, covariance), A, B)
 
 
 def check_next_states(model: Any) -> tuple[int, int]:

@@ -43,7 +43,7 @@ def posterior(**changed):
     seen = data()
     ones = torch.ones(2, dtype=F)
     hyperparameters = {
-        "inputs": seen.features,
+        "features": seen.features,
         "targets": seen.next_states,
         "lengthscales": torch.ones(2, 3, dtype=F),
         "signal_variance": ones,
@@ -97,7 +97,7 @@ def test_a_certain_belief_of_no_vector_is_refused(value):
     [
         lambda: Gaussian([0.0], [[1.0]]),
         lambda: Gaussian(np.zeros(1), np.eye(1)),
-        lambda: posterior(inputs=data().features.tolist()),
+        lambda: posterior(features=data().features.tolist()),
         lambda: posterior(targets=data().next_states.numpy()),
         lambda: posterior(signal_variance=1.0),
         lambda: posterior().predict([0.0, 0.0], [0.0]),

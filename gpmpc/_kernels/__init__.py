@@ -34,7 +34,7 @@ __all__ = [
     "Moments",
     "Packed",
     "Window",
-    "linearize",
+    "linearize_gps",
     "moments",
     "pack",
     "point_with_jacobian",
@@ -42,7 +42,7 @@ __all__ = [
 
 
 class Expansion(NamedTuple):
-    """f at a certain point (x, u)."""
+    """f at a certain point (x, u): the mean to second order, the variance to first."""
 
     M: Array  #: the mean (k,)
     variance: Array  #: of the latent functions, not below zero (k,)
@@ -82,7 +82,7 @@ class LinearizedGPs(NamedTuple):
     covariance: Array | None  #: diagonal (K, k, k); None where it was not wanted
 
 
-def linearize(
+def linearize_gps(
     packed: Packed | Window,
     x: Array,
     u: Array,
@@ -121,9 +121,11 @@ def linearize(
         B=np.empty((K, k, m)),
         covariance=np.zeros((K if covariance else 0, k, k)),
     )
+    unused = linearized.covariance  # an array of the same type, which is not read
+    columns = packed.columns if covariance else unused
     linearize_points.unchecked(
         gp=packed.arrays,
-        columns=packed.columns if covariance else linearized.covariance,
+        columns=columns,
         offset=np.ascontiguousarray(offset, dtype=np.float64),
         adds_state=adds_state,
         x=np.ascontiguousarray(x, dtype=np.float64),

@@ -46,16 +46,29 @@ def host_arrays(*tensors: Tensor) -> list[Array] | None:
     Raises:
         SettingError: The backend is ``"compiled"``, and only torch can evaluate.
     """
-    choice = _chosen.get()
-    if choice == "torch":
+    if _chosen.get() == "torch":
         return None
     arrays = constant_arrays(*tensors)
-    if arrays is not None and all(tensor.dtype is torch.float64 for tensor in tensors):
-        return arrays
-    if choice == "compiled":
+    on_host = arrays is not None and all(
+        tensor.dtype is torch.float64 for tensor in tensors
+    )
+    return arrays if may_use_compiled(on_host) else None
+
+
+def may_use_compiled(on_host: bool) -> bool:
+    """Whether the compiled loops evaluate, and not torch.
+
+    Args:
+        on_host: Whether all numbers are float64 in host memory, and constants.
+
+    Raises:
+        SettingError: The backend is ``"compiled"``, and only torch can evaluate.
+    """
+    choice = _chosen.get()
+    if choice == "compiled" and not on_host:
         raise SettingError(
             "backend",
             "the compiled loops take float64 in host memory that is no part of a graph "
             "or a function transform",
         )
-    return None
+    return on_host and choice != "torch"

@@ -22,10 +22,11 @@ from gpmpc.gp._gpytorch_checks import (
     exact_models,
     training_features,
 )
-from gpmpc.gp._kernel import Hyperparameters, Predicts
+from gpmpc.gp._kernel import Hyperparameters
 from gpmpc.gp._posterior import GPPosterior
 from gpmpc.gp._scaling import Scaling, identity
 from gpmpc.gp._sparse import Method, sparse_posterior
+from gpmpc.gp._tensor_checks import Predicts
 from gpmpc.signals import UNKNOWN, Signals, check_signals, signals_of
 
 
@@ -102,7 +103,7 @@ def from_gpytorch(
 
     They are one model, a batch (one batch dimension, an output each), or a list. A
     sparse one (``InducingPointKernel``) becomes its pseudo-observations; see
-    ``gp.sparse``. Its method is the one by which GPyTorch would predict: FITC, unless
+    ``SparseTrainer``. Its method is the one by which GPyTorch would predict: FITC, unless
     its setting ``sgpr_diagonal_correction`` is off. (Then its means are those of SGPR;
     its variances lack kxx - qxx and vanish far from Z, ours do not.)
 

@@ -35,7 +35,7 @@ from gpmpc.gp._gpytorch_checks import (
     exact_models,
     training_features,
 )
-from gpmpc.gp._kernel import Predicts, check_columns
+from gpmpc.gp._tensor_checks import Predicts, check_columns
 from gpmpc.signals import UNKNOWN, Signals, signals_of
 
 

@@ -19,10 +19,6 @@ from scipy.linalg import blas, lapack
 
 from gpmpc.gp._kernel import centred
 
-# objective where the kernel matrix is not positive definite: finite, so that a line
-# search steps back
-FAILED = 1e12
-
 _IN_PLACE = 400  # points from which one array for everything is the faster way as well
 _BLOCK = 256  # columns at a time: a block and its mirror image fit the cache
 
@@ -62,10 +58,10 @@ class NegativeLogMarginalLikelihood:
     ) -> tuple[float, np.ndarray] | None:
         """Uses an array for each matrix; None where K is not positive definite."""
         size, d = z.shape
-        half_squares = -np.einsum("id,id->i", z, z) / 2
+        half_squares = np.einsum("id,id->i", z, z) / 2
         signal = z @ z.T
-        signal += half_squares
-        signal += half_squares[:, None]
+        signal -= half_squares
+        signal -= half_squares[:, None]
         np.exp(signal, out=signal)
         signal *= sf2
         covariance = signal.copy()
@@ -92,7 +88,8 @@ class NegativeLogMarginalLikelihood:
     ) -> tuple[float, np.ndarray] | None:
         """Uses one array; None where K is not positive definite.
 
-        Above its diagonal stands sf2 E, which stays; below it K, then L, then K^-1.
+        Above its diagonal stands sf2 E, which stays; below it K, then L, then K^-1:
+        ``factor`` and ``inverse`` are ``square`` itself, which LAPACK overwrites.
         """
         square = self._square
         assert square is not None
@@ -106,7 +103,7 @@ class NegativeLogMarginalLikelihood:
         if info:
             return None
         trace = inverse.trace() - weights @ weights  # of W
-        by_lengthscale, total = _sums(square, z, weights)
+        by_lengthscale, total = _sums(square, z, weights)  # K^-1 stands in it by now
         by_signal = 2 * total + (sf2 + sn2) * trace
         by_ratio = -sn2 * trace
         return value, np.append(by_lengthscale, [by_signal, by_ratio])
@@ -141,6 +138,11 @@ def _sums(
     square: np.ndarray, z: np.ndarray, weights: np.ndarray
 ) -> tuple[np.ndarray, float]:
     """Sums over block columns and the rows that mirror them.
+
+    Args:
+        square: K^-1 below the diagonal, sf2 E above it (N, N).
+        z: Points in units of their length-scales (N, d).
+        weights: K^-1 y (N,).
 
     Returns:
         sum_{i>j} M_ij (z_id - z_jd)^2 (d,), and sum_{i>j} M_ij.

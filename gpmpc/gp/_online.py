@@ -39,14 +39,15 @@ from gpmpc.exceptions import (
     check_number,
 )
 from gpmpc.gaussian import check_tensors
-from gpmpc.gp._kernel import check_positive_definite, check_posterior, kernel_matrix
+from gpmpc.gp._kernel import check_positive_definite, kernel_matrix
 from gpmpc.gp._posterior import GPPosterior
+from gpmpc.gp._tensor_checks import check_gp_tensors
 from gpmpc.gp._transitions import Transitions, check_transitions
 
 _log = logging.getLogger(__name__)
 # where more than this part of the points is removed, one factorisation costs less than
 # the updates
-_MANY = 0.2
+_LARGE_PART = 0.2
 
 
 def append_transitions(posterior: GPPosterior, transitions: Transitions) -> GPPosterior:
@@ -89,10 +90,10 @@ def append_points(
 
     # One pass over the factor serves the new rows and the first half of the weights.
     old_residuals = (posterior.targets - posterior.offset).mT[..., None]  # (k, N, 1)
-    right = torch.cat([cross, old_residuals], dim=-1)
-    right = torch.linalg.solve_triangular(posterior.cholesky, right, upper=False)
-    L21 = right[..., :p].mT
-    half_old = right[..., p:]
+    columns = torch.cat([cross, old_residuals], dim=-1)
+    whitened = torch.linalg.solve_triangular(posterior.cholesky, columns, upper=False)
+    L21 = whitened[..., :p].mT
+    half_old = whitened[..., p:]
     corner = corner - L21 @ L21.mT
     corner.diagonal(dim1=-2, dim2=-1).add_(posterior.noise_variance[:, None])
     L22, info = torch.linalg.cholesky_ex(corner)
@@ -128,8 +129,9 @@ def _checked_points(
             raise SettingError(key, f"must be real numbers; got {value.dtype}")
     features = features.to(posterior.features)
     targets = targets.to(posterior.features)
-    check_posterior(
-        {"features": features, "targets": targets},
+    check_gp_tensors(
+        features,
+        targets,
         posterior.input_dim,
         posterior.predicts,
         posterior.dtype,
@@ -167,7 +169,7 @@ def remove_points(
         )
     in_host_memory = posterior.device.type == "cpu"
     in_graph = posterior.cholesky.requires_grad
-    if in_host_memory and not in_graph and len(removed) <= _MANY * size:
+    if in_host_memory and not in_graph and len(removed) <= _LARGE_PART * size:
         cholesky = _drop_one_by_one(posterior.cholesky, removed)
     else:
         cholesky = _refactorize(posterior.cholesky, remaining, first=removed[0])

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from gpmpc._dynamics import (
     Array,
+    FirstOrderExpansion,
     Linearized,
     TensorModel,
     check_destination,
@@ -27,9 +28,10 @@ from gpmpc._dynamics import (
     to_array,
 )
 from gpmpc.gaussian import Gaussian, check_tensors, constant_arrays
-from gpmpc.gp._backend import host_arrays
-from gpmpc.gp._kernel import Predicts, check_posterior, factorize
+from gpmpc.gp._backend import may_use_compiled
+from gpmpc.gp._kernel import factorize, kernel_of_squares
 from gpmpc.gp._scaling import Scaling
+from gpmpc.gp._tensor_checks import Predicts, check_gp_tensors
 from gpmpc.signals import UNKNOWN, Signals, check_signals
 
 if TYPE_CHECKING:
@@ -40,7 +42,7 @@ class AffineForm(NamedTuple):
     """A model x+ = A x + G u + c + f0(x, u) + B f(x_s, u_s).
 
     Without f0 and angles moments go through it exactly. None stands for A = 0, G = 0,
-    c = 0, B = I, or a selection of everything.
+    c = 0, B = I, or a selection of everything; states and inputs come together.
     """
 
     f: "GPPosterior"  #: the latent functions
@@ -80,7 +82,7 @@ class GPPosterior(TensorModel):
     @classmethod
     def from_hyperparameters(
         cls,
-        inputs: Tensor,
+        features: Tensor,
         targets: Tensor,
         lengthscales: Tensor,
         signal_variance: Tensor,
@@ -93,13 +95,12 @@ class GPPosterior(TensorModel):
         """Factorises K + sn2 I and solves for the weights.
 
         Args:
-            inputs: The GPs' inputs x~ = (x, u) (N, d), d = n + m, float64 like all that
-                follows.
+            features: x~ = (x, u) (N, d), d = n + m, float64 like all that follows.
             targets: (N, k); k = n unless ``predicts="value"``.
             lengthscales: (k, d).
             signal_variance: (k,).
             noise_variance: (k,).
-            input_dim: m, how many of the last columns of ``inputs`` are controls.
+            input_dim: m, how many of the last features are controls.
             predicts: ``"next_state"``; ``"difference"`` for targets x[k+1] - x[k]; or
                 ``"value"`` for any function of (x, u) with k outputs, such as the
                 residual of a known model.
@@ -114,21 +115,19 @@ class GPPosterior(TensorModel):
         """
         check_tensors(targets=targets)
         offset = torch.zeros_like(targets[:1].flatten()) if offset is None else offset
-        tensors: dict[str, Tensor] = {
-            "inputs": inputs,
-            "targets": targets,
-            "lengthscales": lengthscales,
-            "signal_variance": signal_variance,
-            "noise_variance": noise_variance,
-            "offset": offset,
-        }
-        check_posterior(tensors, input_dim, predicts)
-        check_signals(signals)
-        signals.check_sizes(inputs.shape[1] - input_dim, input_dim)
-        inputs, targets, lengthscales, signal_variance, noise_variance, offset = (
-            tensor.clone() for tensor in tensors.values()
+        check_gp_tensors(
+            features,
+            targets,
+            input_dim,
+            predicts,
+            lengthscales=lengthscales,
+            signal_variance=signal_variance,
+            noise_variance=noise_variance,
+            offset=offset,
         )
-        cholesky = factorize(inputs, lengthscales, signal_variance, noise_variance)
+        check_signals(signals)
+        signals.check_sizes(features.shape[1] - input_dim, input_dim)
+        cholesky = factorize(features, lengthscales, signal_variance, noise_variance)
         residuals = (targets - offset).mT[..., None]
         # One after another: torch copies the factors it is given.
         weights = [
@@ -136,12 +135,12 @@ class GPPosterior(TensorModel):
             for residual, factor in zip(residuals, cholesky, strict=True)
         ]
         return cls(
-            features=inputs,
-            targets=targets,
-            lengthscales=lengthscales,
-            signal_variance=signal_variance,
-            noise_variance=noise_variance,
-            offset=offset,
+            features=features.clone(),
+            targets=targets.clone(),
+            lengthscales=lengthscales.clone(),
+            signal_variance=signal_variance.clone(),
+            noise_variance=noise_variance.clone(),
+            offset=offset.clone(),
             cholesky=cholesky,
             weights=torch.stack(weights),
             input_dim=input_dim,
@@ -283,20 +282,19 @@ class GPPosterior(TensorModel):
         Raises:
             ShapeError: State or input do not fit the model.
         """
-        return self._belief(self._correlations(state, input).k, state)
+        return self._belief(self._cross_covariances(state, input).k, state)
 
     def linearize(
         self, states: Array, inputs: Array, covariance: bool = True
     ) -> Linearized:
-        """Linearises the mean at K points (K, n), (K, m).
+        """Linearises the mean at P points (P, n), (P, m).
 
         The compiled kernels do it where they can, else torch.
         """
-        arrays = host_arrays() if self._on_host else host_arrays(self.weights)
-        if arrays is not None:
+        if may_use_compiled(self._on_host):
             from gpmpc import _kernels as kernels  # loads numba
 
-            gps = kernels.linearize(
+            gps = kernels.linearize_gps(
                 self.packed,
                 states,
                 inputs,
@@ -308,13 +306,13 @@ class GPPosterior(TensorModel):
                 mean=gps.mean, A=gps.A, B=gps.B, covariance=gps.covariance
             )
         x, u = tensors_for(self, states, inputs)
-        correlations = self._correlations(x, u)
-        jacobian = self._jacobian(correlations)
+        cross = self._cross_covariances(x, u)
+        jacobian = self._jacobian(cross)
         V = None
         if covariance:
-            V = to_array(self._belief(correlations.k, x).covariance)
+            V = to_array(self._belief(cross.k, x).covariance)
         return Linearized(
-            mean=to_array(self._mean(correlations.k, x)),
+            mean=to_array(self._mean(cross.k, x)),
             A=to_array(jacobian.by_state),
             B=to_array(jacobian.by_input),
             covariance=V,
@@ -322,17 +320,20 @@ class GPPosterior(TensorModel):
 
     def predict_with_jacobian(
         self, state: Tensor, input: Tensor | None = None
-    ) -> tuple[Gaussian, Tensor, Tensor]:
+    ) -> FirstOrderExpansion:
         """Predicts with the mean's derivatives, by torch.
 
         Returns:
             What ``predict`` gives, and the derivatives by state (*batch, k, n) and by
             input (*batch, k, m).
         """
-        correlations = self._correlations(state, input)
-        jacobian = self._jacobian(correlations)
-        belief = self._belief(correlations.k, state)
-        return belief, jacobian.by_state, jacobian.by_input
+        cross = self._cross_covariances(state, input)
+        jacobian = self._jacobian(cross)
+        return FirstOrderExpansion(
+            belief=self._belief(cross.k, state),
+            A=jacobian.by_state,
+            B=jacobian.by_input,
+        )
 
     def variance_reduction(
         self, k: Tensor, outputs: list[int] | slice = slice(None)
@@ -340,7 +341,7 @@ class GPPosterior(TensorModel):
         """Computes how far the data reduce the variance, |L_a^-1 k_a|^2 (*batch, k).
 
         Args:
-            k: Correlations with the points (*batch, k, N).
+            k: Covariances with the points (*batch, k, N).
             outputs: The GPs that they belong to.
         """
         # The batch goes to the right-hand side's columns: broadcast against it, L would
@@ -350,30 +351,35 @@ class GPPosterior(TensorModel):
         whitened = torch.linalg.solve_triangular(factor, columns, upper=False)
         return whitened.square().sum(-2).mT.reshape(k.shape[:-1])
 
-    def _correlations(self, state: Tensor, input: Tensor | None) -> "_Correlations":
-        """Computes the correlations of a query with the points."""
+    def _cross_covariances(
+        self, state: Tensor, input: Tensor | None
+    ) -> "_CrossCovariances":
+        """Computes the prior covariances of a query with the points."""
         input = state[..., :0] if input is None else input
         check_query(self, state, input)
         query = torch.cat([state, input], dim=-1)
         difference = self.features - query[..., None, :]  # (*batch, N, d)
-        scaled = difference[..., None, :, :] / self.lengthscales[:, None, :]
-        k = self.signal_variance[:, None] * torch.exp(-scaled.square().sum(-1) / 2)
-        return _Correlations(k=k, difference=scaled)
+        scaled_difference = difference[..., None, :, :] / self.lengthscales[:, None, :]
+        squares = scaled_difference.square().sum(-1)
+        return _CrossCovariances(
+            k=kernel_of_squares(squares, self.signal_variance[:, None]),
+            scaled_difference=scaled_difference,
+        )
 
     def _mean(self, k: Tensor, state: Tensor) -> Tensor:
-        """Computes the mean (*batch, k) from correlations (*batch, k, N)."""
+        """Computes the mean (*batch, k) from covariances (*batch, k, N)."""
         mean = (k * self.weights).sum(-1) + self.offset
         return mean + state if self._adds_state else mean
 
     def _belief(self, k: Tensor, state: Tensor) -> Gaussian:
-        """Computes mean and covariance from correlations (*batch, k, N)."""
+        """Computes mean and covariance from covariances (*batch, k, N)."""
         variance = (self.signal_variance - self.variance_reduction(k)).clamp_min(0)
         return Gaussian(self._mean(k, state), torch.diag_embed(variance))
 
-    def _jacobian(self, correlations: "_Correlations") -> "_Jacobian":
+    def _jacobian(self, cross: "_CrossCovariances") -> "_Jacobian":
         """Computes the mean's derivatives."""
-        weighted = (correlations.k * self.weights)[..., None, :]  # (*batch, k, 1, N)
-        slopes = correlations.difference / self.lengthscales[:, None, :]
+        weighted = (cross.k * self.weights)[..., None, :]  # (*batch, k, 1, N)
+        slopes = cross.scaled_difference / self.lengthscales[:, None, :]
         jacobian = (weighted @ slopes)[..., 0, :]
         by_state = jacobian[..., : self.state_dim]
         if self._adds_state:
@@ -381,11 +387,11 @@ class GPPosterior(TensorModel):
         return _Jacobian(by_state=by_state, by_input=jacobian[..., self.state_dim :])
 
 
-class _Correlations(NamedTuple):
-    """Correlations of a query x~ with the points x~_i."""
+class _CrossCovariances(NamedTuple):
+    """Prior covariances of a query x~ with the points x~_i."""
 
     k: Tensor  #: k(x~_i, x~) (*batch, k, N)
-    difference: Tensor  #: (x~_i - x~) / l (*batch, k, N, d)
+    scaled_difference: Tensor  #: (x~_i - x~) / l (*batch, k, N, d)
 
 
 class _Jacobian(NamedTuple):

@@ -25,9 +25,12 @@ from scipy.optimize import minimize
 from gpmpc.exceptions import SettingError, check_number
 from gpmpc.gp._data_checks import column_std
 from gpmpc.gp._kernel import IGNORED
-from gpmpc.gp._likelihood import FAILED, NegativeLogMarginalLikelihood
+from gpmpc.gp._likelihood import NegativeLogMarginalLikelihood
 
 _log = logging.getLogger(__name__)
+# What a line search takes for an infinite objective, where a kernel matrix is not
+# positive definite: finite, so that it steps back.
+FAILED = 1e12
 _EXPLORATION = 16  # L-BFGS iterations from every start, before ...
 _FINALISTS = 2  # ... this many of the best go on to convergence
 _ITERATIONS = 1000  # of the search to convergence, at most
@@ -35,12 +38,12 @@ _PLAIN_RATIO = 10.0  # sf / sn where the search begins
 # Mean of log l over log std(x~) at the random starts: smooth dynamics prefer long
 # length-scales.
 _LONGER = 1.0
-# Length-scale of an output that never changes, in standard deviations of its inputs.
+# Length-scale of an output that never changes, in standard deviations of its features.
 _SMOOTH = 5.0
 _REPEATED = 1e4  # sf / sn of such an output, at most: the data repeat themselves
 # Part of its magnitude: targets that vary by less vary as their magnitude.
 _SMALL = 3e-9
-# The box holds length-scales within this factor of their input's standard deviation.
+# The box holds length-scales within this factor of their feature's standard deviation.
 _LENGTHSCALE_LIMIT = 1e4
 _LOG_INTERVAL = 5.0  # [s]
 
@@ -56,7 +59,7 @@ class SoftLimits:
     (2017). Nearly flat inside, steep outside, for where the data leave them open.
     """
 
-    #: r, how far a length-scale may be from its input's standard deviation
+    #: r, how far a length-scale may be from its feature's standard deviation
     lengthscale_factor: float = 100.0
     signal_to_noise: float = 1000.0  #: s, how large sf / sn may be
     power: int = 30  #: p, even
@@ -75,7 +78,7 @@ class SoftLimits:
 
         Args:
             theta: (log l, log sf, log(sf / sn)) (d + 2,).
-            log_std: Logarithms of the inputs' standard deviations (d,).
+            log_std: Logarithms of the features' standard deviations (d,).
         """
         width = np.full(len(theta), np.log(self.lengthscale_factor))
         width[-1] = np.log(self.signal_to_noise)
@@ -100,12 +103,12 @@ class SearchSettings(Protocol):
     def time_limit(self) -> float | None: ...
 
 
-class SearchInputs(NamedTuple):
-    """The inputs of all GPs in scaled units."""
+class SearchFeatures(NamedTuple):
+    """The features of all GPs in scaled units."""
 
     points: np.ndarray  #: x~ (N, d)
     std: np.ndarray  #: standard deviations (d,); see ``column_std``
-    constant: np.ndarray  #: which inputs never move (d,)
+    constant: np.ndarray  #: which features never move (d,)
     prior_lengthscales: np.ndarray  #: of those that never move (d,)
 
 
@@ -131,7 +134,7 @@ class OutputSearch:
 
     Args:
         name: What the log calls the output.
-        inputs: Those of the GP.
+        features: Those of the GP.
         targets: (N,).
         settings: A ``Trainer``.
         deadline: Time from which on the best theta so far is taken, by the clock of
@@ -141,27 +144,32 @@ class OutputSearch:
     def __init__(
         self,
         name: str,
-        inputs: SearchInputs,
+        features: SearchFeatures,
         targets: np.ndarray,
         settings: SearchSettings,
         deadline: float,
     ):
         self._name = name
-        self._inputs = inputs.points
+        self._points = features.points
         self._targets = targets
         self._settings = settings
         self._deadline = deadline
-        self._constant = inputs.constant
-        # An input that is known to have no effect drops out of the kernel.
-        prior = inputs.prior_lengthscales
-        ignored = inputs.constant & np.isinf(prior)
-        self._log_prior = np.log(np.where(ignored, IGNORED * inputs.std, prior))
-        at_rest = inputs.constant & ~ignored
-        self._log_std = np.log(np.where(at_rest, prior, inputs.std))
+        self._constant = features.constant
+        # A feature that is known to have no effect drops out of the kernel.
+        prior = features.prior_lengthscales
+        ignored = features.constant & np.isinf(prior)
+        self._log_prior = np.log(np.where(ignored, IGNORED * features.std, prior))
+        # What length-scales are measured by: standard deviations, or the prior
+        # length-scales of features at rest.
+        at_rest = features.constant & ~ignored
+        self._log_scales = np.log(np.where(at_rest, prior, features.std))
         self._log_output = np.log(_output_std(targets))
         self._box = search_box(
-            self._log_std, self._log_output, settings.signal_to_noise_limit
+            self._log_scales, self._log_output, settings.signal_to_noise_limit
         )
+        # Of the points of the present search; ``_use_points`` sets both.
+        self._likelihood: NegativeLogMarginalLikelihood
+        self._size: int
         self.evaluations = 0
         self._last_log = time.perf_counter()
 
@@ -176,8 +184,7 @@ class OutputSearch:
         Args:
             first: theta of the first start (d + 2,); None takes l = std(x~),
                 sf = std(y), sn = std(y) / 10.
-            perturbations: Standard normal (restarts + 1, d + 2); the first row is not
-                used.
+            perturbations: Standard normal, of the further starts (restarts, d + 2).
             rows: The subset that the search begins with; None for all points from the
                 start.
         """
@@ -197,8 +204,8 @@ class OutputSearch:
                 self._name,
                 self._settings.time_limit,
             )
-        theta = best.theta
-        # The likelihood says nothing of an input that never moved: the prior does.
+        theta = best.theta.copy()
+        # The likelihood says nothing of a feature that never moved: the prior does.
         theta[:-2][self._constant] = self._log_prior[self._constant]
         explored = [optimum.objective for optimum in optima]
         explored += [math.nan] * (len(starts) - len(optima))
@@ -210,10 +217,10 @@ class OutputSearch:
         The likelihood only ever asks for less signal and longer length-scales: for
         certainty everywhere, from data that have not seen the output vary. So the
         signal has the prior's ``deviation``, and the length-scales are some standard
-        deviations of the inputs: among the data the output is known, far from them it
+        deviations of the features: among the data the output is known, far from them it
         is not. A single row leaves the noise open as well: that of the plain start.
         """
-        log_lengthscales = self._log_std + np.log(_SMOOTH)
+        log_lengthscales = self._log_scales + np.log(_SMOOTH)
         log_lengthscales[self._constant] = self._log_prior[self._constant]
         signal = max(deviation, np.abs(self._targets).max())
         ratio = min(_REPEATED, self._settings.signal_to_noise_limit)
@@ -231,10 +238,10 @@ class OutputSearch:
         self, first: np.ndarray | None, perturbations: np.ndarray
     ) -> list[np.ndarray]:
         """The points where the exploration begins."""
-        plain = np.append(self._log_std, [self._log_output, np.log(_PLAIN_RATIO)])
-        longer = np.append(np.full(len(self._log_std), _LONGER), [0.0, 0.0])
+        plain = np.append(self._log_scales, [self._log_output, np.log(_PLAIN_RATIO)])
+        longer = np.append(np.full(len(self._log_scales), _LONGER), [0.0, 0.0])
         starts = [plain if first is None else first]
-        starts += [plain + longer + shift for shift in perturbations[1:]]
+        starts += [plain + longer + shift for shift in perturbations]
         return starts
 
     def _explore(self, starts: list[np.ndarray]) -> list[Optimum]:
@@ -251,7 +258,7 @@ class OutputSearch:
         """Takes the likelihood of some of the points; of all for None."""
         chosen = slice(None) if rows is None else rows
         targets = self._targets[chosen]
-        self._likelihood = NegativeLogMarginalLikelihood(self._inputs[chosen], targets)
+        self._likelihood = NegativeLogMarginalLikelihood(self._points[chosen], targets)
         self._size = len(targets)
 
     def _minimize(self, start: np.ndarray, iterations: int) -> Optimum:
@@ -289,7 +296,7 @@ class OutputSearch:
             value = FAILED
             gradient = np.zeros_like(theta)
         elif self._settings.penalty is not None:
-            penalty, slope = self._settings.penalty(theta, self._log_std)
+            penalty, slope = self._settings.penalty(theta, self._log_scales)
             value = value + penalty
             gradient = gradient + slope
         if time.perf_counter() - self._last_log > _LOG_INTERVAL:
@@ -312,19 +319,19 @@ class SearchBox(NamedTuple):
 
 
 def search_box(
-    log_inputs: np.ndarray, log_output: float, signal_to_noise_limit: float
+    log_features: np.ndarray, log_output: float, signal_to_noise_limit: float
 ) -> SearchBox:
     """Returns bounds of theta around the logarithms of the data's standard deviations.
 
     Args:
-        log_inputs: Those of the inputs (d,).
+        log_features: Those of the features (d,).
         log_output: That of the output.
         signal_to_noise_limit: Largest sf / sn, and the inverse of the least.
     """
-    half_width = np.full(len(log_inputs) + 2, np.log(_LENGTHSCALE_LIMIT))
+    half_width = np.full(len(log_features) + 2, np.log(_LENGTHSCALE_LIMIT))
     half_width[-2] = np.log(1e6)
     half_width[-1] = np.log(signal_to_noise_limit)
-    middle = np.append(log_inputs, [log_output, 0.0])
+    middle = np.append(log_features, [log_output, 0.0])
     return SearchBox(lower=middle - half_width, upper=middle + half_width)
 
 

@@ -31,6 +31,7 @@ computed once more for the derivatives (checkpoints: Griewank and Walther, 2008,
 """
 
 import math
+from functools import partial
 from typing import Any, Literal, NamedTuple
 
 import torch
@@ -38,8 +39,9 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from gpmpc.exceptions import SettingError
-from gpmpc.gp._kernel import Hyperparameters, Predicts, check_posterior, kernel_matrix
+from gpmpc.gp._kernel import Hyperparameters, kernel_matrix, kernel_of_squares
 from gpmpc.gp._posterior import GPPosterior
+from gpmpc.gp._tensor_checks import Predicts, check_gp_tensors
 
 Method = Literal["sgpr", "fitc"]
 JITTER = 1e-8  # of Kzz, in units of sf2
@@ -84,10 +86,8 @@ def sparse_posterior(
         SettingError: Kzz is not positive definite. Further errors are those of
             ``GPPosterior.from_hyperparameters``.
     """
-    check_posterior(
-        {"features": features, "targets": targets, **hyperparameters._asdict()},
-        input_dim,
-        predicts,
+    check_gp_tensors(
+        features, targets, input_dim, predicts, **hyperparameters._asdict()
     )
     try:
         Lz = inducing_factor(inducing, hyperparameters, jitter or 0.0)
@@ -205,37 +205,16 @@ def _output_sums(
 ) -> _Sums:
     """Computes the sums of one output, whose targets are (N, 1)."""
     step = max(_ENTRIES // len(Z), 64)
-    recomputes = torch.is_grad_enabled() and step < len(x)
+    sums_of_block: Any = _block_sums
+    if torch.is_grad_enabled() and step < len(x):
+        # ``checkpoint`` passes tensors on to ``backward`` only as plain arguments.
+        sums_of_block = partial(
+            checkpoint, _block_sums, use_reentrant=True, preserve_rng_state=False
+        )
     total: _Sums | None = None
     for begin in range(0, len(x), step):
         rows = slice(begin, begin + step)
-        if recomputes:
-            # ``checkpoint`` passes tensors on to ``backward`` only as plain arguments.
-            block: Any = checkpoint(
-                _block_sums,
-                Lz,
-                Z,
-                x[rows],
-                y[rows],
-                kernel.lengthscales,
-                kernel.signal_variance,
-                kernel.noise_variance,
-                method,
-                use_reentrant=True,
-                preserve_rng_state=False,
-            )
-        else:
-            block = _block_sums(
-                Lz,
-                Z,
-                x[rows],
-                y[rows],
-                kernel.lengthscales,
-                kernel.signal_variance,
-                kernel.noise_variance,
-                method,
-            )
-        block = _Sums(*block)
+        block = _Sums(*sums_of_block(Lz, Z, x[rows], y[rows], *kernel, method))
         if total is None:
             total = block
         else:
@@ -267,7 +246,7 @@ def inducing_factor(inducing: Tensor, kernel: Hyperparameters, jitter: float) ->
         output = int(torch.nonzero(info)[0])
         raise SettingError(
             "inducing",
-            f"their kernel matrix of output {output} is not positive definite: points "
+            f"their kernel matrix of output {output + 1} is not positive definite: points "
             "too near each other for its length-scales; take fewer, or a larger jitter",
         )
     return Lz
@@ -307,5 +286,6 @@ def _cross(inducing: Tensor, features: Tensor, kernel: Hyperparameters) -> Tenso
     scales = kernel.lengthscales[:, None, :]
     z = (inducing - centre) / scales
     x = (features - centre) / scales
-    half = z.square().sum(-1)[..., :, None] / 2 + x.square().sum(-1)[..., None, :] / 2
-    return kernel.signal_variance[:, None, None] * (z @ x.mT - half).clamp_max(0).exp()
+    norms = z.square().sum(-1)[..., :, None] + x.square().sum(-1)[..., None, :]
+    squares = (norms - 2 * z @ x.mT).clamp_min(0)
+    return kernel_of_squares(squares, kernel.signal_variance[:, None, None])

@@ -12,7 +12,7 @@ import logging
 import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple, get_args
 
 import numpy as np
@@ -28,11 +28,10 @@ from gpmpc.gp._data_checks import (
     checked_targets,
     column_std,
 )
-from gpmpc.gp._kernel import Hyperparameters, Predicts, kernel_matrix
-from gpmpc.gp._likelihood import FAILED
+from gpmpc.gp._kernel import Hyperparameters, kernel_matrix
 from gpmpc.gp._prior_scales import PriorLengthscales
 from gpmpc.gp._scaling import Scaling, centre, identity
-from gpmpc.gp._search import plain_theta, search_box
+from gpmpc.gp._search import FAILED, plain_theta, search_box
 from gpmpc.gp._sparse import (
     JITTER,
     Method,
@@ -41,9 +40,11 @@ from gpmpc.gp._sparse import (
     inducing_factor,
     sparse_posterior,
 )
+from gpmpc.gp._tensor_checks import Predicts
 from gpmpc.gp._training import Trainer, Training
 from gpmpc.gp._training_data import (
     TrainingData,
+    check_data_settings,
     read_training_data,
     restored_theta,
     scaled_theta,
@@ -91,7 +92,8 @@ class SparseTrainer:
             check_number(key, getattr(self, key), least=1, whole=True)
         check_number("iterations", self.iterations, least=0, whole=True)
         check_choice("method", self.method, get_args(Method))
-        replace(self._exact_trainer(), scaling=self.scaling)  # checks the others
+        check_data_settings(self)
+        self._exact_trainer()  # checks ``predicts`` and ``restarts``
 
     def __call__(self, transitions: Transitions, seed: int = 0) -> Training:
         """Trains on transitions.
@@ -174,6 +176,7 @@ class SparseTrainer:
             gains,
             exact_gains=_noise_alone(y[rows]) - exact.objective,
             parameters=x.shape[1] + 2,
+            names=data.columns.outputs,
         )
 
         best = bound.unpack(torch.from_numpy(bound.best))
@@ -200,7 +203,6 @@ class SparseTrainer:
         """The trainer of the subset."""
         return Trainer(
             predicts=self.predicts,
-            scaling=identity,
             restarts=self.restarts,
             tolerance=_TOLERANCE,
             prior_lengthscale=self.prior_lengthscale,
@@ -248,7 +250,11 @@ class SparseTrainer:
         return np.column_stack([theta[:, :-1], (signal / noise).log().numpy() / 2])
 
     def _check_learned(
-        self, gains: np.ndarray, exact_gains: np.ndarray, parameters: int
+        self,
+        gains: np.ndarray,
+        exact_gains: np.ndarray,
+        parameters: int,
+        names: Sequence[str],
     ) -> None:
         """Raises, or warns in the log, where the GPs are no better than noise alone.
 
@@ -258,21 +264,22 @@ class SparseTrainer:
             gains: Log evidence over that of noise alone (k,).
             exact_gains: The same of the exact GPs of the subset (k,).
             parameters: Number of an output's parameters.
+            names: Of the outputs.
         """
         nothing = [a for a, gain in enumerate(gains) if -np.inf < gain < parameters]
         failed = [a for a in nothing if exact_gains[a] > parameters]
         if failed:
-            outputs = ", ".join(map(str, failed))
+            outputs = ", ".join(names[a] for a in failed)
             raise TrainingError(
                 failed,
-                f"{self.inducing} inducing points learned nothing but noise of output "
+                f"{self.inducing} inducing points learned nothing but noise of "
                 f"{outputs}, where exact GPs of {self.subset} points learned more: "
                 "raise inducing",
             )
         if nothing:
             _log.warning(
-                "sparse training: nothing but noise was found in output %s",
-                ", ".join(map(str, nothing)),
+                "sparse training: nothing but noise was found in %s",
+                ", ".join(names[a] for a in nothing),
             )
 
 

@@ -36,8 +36,8 @@ from torch import Tensor
 from gpmpc._files import existing_file, new_file, write_whole
 from gpmpc._provenance import now, versions
 from gpmpc.exceptions import DataError, SettingError, UnsupportedModel
-from gpmpc.gp._kernel import check_posterior
 from gpmpc.gp._posterior import GPPosterior
+from gpmpc.gp._tensor_checks import check_gp_tensors
 from gpmpc.signals import Signals, check_signals
 
 _FORMAT = "gpmpc model"
@@ -141,7 +141,9 @@ def posterior_of_parts(
         parts = {name: tensors[name] for name in _POSTERIOR_TENSORS}
         predicts = header["predicts"]
         m = header["input_dim"]
-        check_posterior(parts, m, predicts, parts["features"].dtype)
+        check_gp_tensors(
+            **parts, input_dim=m, predicts=predicts, dtype=parts["features"].dtype
+        )
         signals = Signals.from_header(header.get("signals"))
         signals.check_sizes(parts["features"].shape[1] - m, m)
     if not bool((parts["cholesky"].diagonal(dim1=-2, dim2=-1) > 0).all()):

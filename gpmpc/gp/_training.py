@@ -15,7 +15,6 @@ from threadpoolctl import threadpool_limits
 from torch import Tensor
 
 from gpmpc.exceptions import (
-    SettingError,
     TrainingError,
     UnsupportedModel,
     check_choice,
@@ -27,16 +26,24 @@ from gpmpc.gp._data_checks import (
     checked_targets,
     constant_columns,
 )
-from gpmpc.gp._kernel import PREDICTS, Hyperparameters, Predicts
-from gpmpc.gp._likelihood import FAILED
+from gpmpc.gp._kernel import Hyperparameters
 from gpmpc.gp._memory import check_memory
 from gpmpc.gp._online import targets_of
 from gpmpc.gp._posterior import GPPosterior
-from gpmpc.gp._prior_scales import PriorLengthscales, check_prior_settings
+from gpmpc.gp._prior_scales import PriorLengthscales
 from gpmpc.gp._scaling import Scaling, centre
-from gpmpc.gp._search import OutputSearch, Penalty, SearchInputs, SearchResult
+from gpmpc.gp._search import (
+    FAILED,
+    OutputSearch,
+    Penalty,
+    SearchFeatures,
+    SearchResult,
+)
+from gpmpc.gp._tensor_checks import PREDICTS, Predicts
 from gpmpc.gp._training_data import (
     TrainingData,
+    check_data_settings,
+    check_function,
     read_training_data,
     restored_theta,
     scaled_theta,
@@ -60,7 +67,8 @@ class Training:
     #: data
     theta: np.ndarray
     #: negative log marginal likelihood plus penalty where the search ended (k,); of a
-    #: sparse training minus the bound on the log marginal likelihood, in scaled units
+    #: sparse training minus the bound on the log marginal likelihood; both of the
+    #: scaled targets
     objective: np.ndarray
     #: of an exact training, the objective where the exploration from every start ended
     #: (k, restarts + 1), over the subset if there is one, NaN for starts that a time
@@ -126,12 +134,9 @@ class Trainer:
         check_number("restarts", self.restarts, least=0, whole=True)
         if self.subset is not None:
             check_number("subset", self.subset, least=1, whole=True)
-        _check_function("scaling", self.scaling, example="standardize")
+        check_data_settings(self)
         if self.penalty is not None:
-            _check_function("penalty", self.penalty, example="SoftLimits()")
-        check_prior_settings(
-            self.prior_lengthscale, self.prior_deviation, self.resolution
-        )
+            check_function("penalty", self.penalty, example="SoftLimits()")
         check_number("tolerance", self.tolerance, above=0)
         check_number("signal_to_noise_limit", self.signal_to_noise_limit, above=1)
         if self.time_limit is not None:
@@ -253,10 +258,11 @@ class Trainer:
         size, d = data.features.shape
         k = data.targets.shape[1]
         check_memory(size, k)
-        inputs = _search_inputs(data)
+        features = _search_features(data)
         targets = data.scaled_targets.numpy()
-        first = self._first_starts(data, inputs, start)
+        first = self._first_starts(data, features, start)
         rng = np.random.default_rng(seed)
+        # The first start has none: its numbers are drawn, and left.
         perturbations = rng.normal(size=(k, self.restarts + 1, d + 2))
         rows = self._subset_rows(size, rng, has_start=start is not None)
 
@@ -264,8 +270,8 @@ class Trainer:
         evaluations = 0
         for a in range(k):
             search = OutputSearch(
-                name=f"output {a + 1} of {k}",
-                inputs=inputs,
+                name=f"{data.columns.outputs[a]} ({a + 1} of {k})",
+                features=features,
                 targets=targets[:, a],
                 settings=self,
                 deadline=self._deadline(start_time, (a + 1) / k),
@@ -273,13 +279,13 @@ class Trainer:
             with threadpool_limits(1 if size < _ONE_THREAD else None, user_api="blas"):
                 deviation = _known_deviation(data, a)
                 if deviation is None:
-                    results.append(search(first[a], perturbations[a], rows))
+                    results.append(search(first[a], perturbations[a, 1:], rows))
                 else:
                     results.append(search.prior_result(deviation))
             evaluations += search.evaluations
 
         objective = np.array([result.objective for result in results])
-        self._check_success(objective)
+        self._check_success(objective, data.columns.outputs)
         theta = restored_theta(
             np.array([result.theta for result in results]),
             data.feature_scaling,
@@ -306,7 +312,7 @@ class Trainer:
         )
 
     def _first_starts(
-        self, data: TrainingData, inputs: SearchInputs, start: GPPosterior | None
+        self, data: TrainingData, features: SearchFeatures, start: GPPosterior | None
     ) -> list[np.ndarray | None]:
         """The first start (d + 2,) of every output; None for the plain one.
 
@@ -318,10 +324,10 @@ class Trainer:
             return [None] * data.targets.shape[1]
         _check_posterior("start", start)
         theta = scaled_theta(start, data.feature_scaling, data.target_scaling)
-        features = start.features.cpu().double().numpy()
-        was_constant = constant_columns(features, self.resolution)
+        start_features = start.features.cpu().double().numpy()
+        was_constant = constant_columns(start_features, self.resolution)
         moves_by_now = was_constant & ~data.constants.features
-        theta[:, :-2][:, moves_by_now] = np.log(inputs.std)[moves_by_now]
+        theta[:, :-2][:, moves_by_now] = np.log(features.std)[moves_by_now]
         targets = start.targets.cpu().double().numpy()
         never_changed = constant_columns(targets, self.resolution)
         return [
@@ -345,14 +351,14 @@ class Trainer:
             return np.inf
         return start_time + self.time_limit * part
 
-    def _check_success(self, objective: np.ndarray) -> None:
+    def _check_success(self, objective: np.ndarray, names: Sequence[str]) -> None:
         """Raises ``TrainingError`` where every start of an output failed (k,)."""
-        failed = np.flatnonzero(objective >= FAILED).tolist()
+        failed: list[int] = np.flatnonzero(objective >= FAILED).tolist()
         if failed:
             raise TrainingError(
                 failed,
                 f"no start of {self.restarts + 1} led to a positive definite kernel "
-                f"matrix for output {', '.join(map(str, failed))}: lower "
+                f"matrix for {', '.join(names[a] for a in failed)}: lower "
                 "signal_to_noise_limit, or remove duplicate rows",
             )
 
@@ -362,10 +368,10 @@ def train(transitions: Transitions, seed: int = 0, **settings: Any) -> Training:
     return Trainer(**settings)(transitions, seed)
 
 
-def _search_inputs(data: TrainingData) -> SearchInputs:
+def _search_features(data: TrainingData) -> SearchFeatures:
     """The features in scaled units, as the searches of all outputs take them."""
     factor = data.feature_scaling.factor.numpy()
-    return SearchInputs(
+    return SearchFeatures(
         points=data.feature_scaling.scale(data.features).numpy(),
         std=data.feature_std / factor,
         constant=data.constants.features,
@@ -385,11 +391,4 @@ def _check_posterior(key: str, posterior: Any) -> None:
     if not isinstance(posterior, GPPosterior):
         raise UnsupportedModel(
             f"{key} must be a GPPosterior; got {type(posterior).__name__}"
-        )
-
-
-def _check_function(key: str, value: Any, example: str) -> None:
-    if not callable(value):
-        raise SettingError(
-            key, f"must be a function such as {example} of gpmpc.gp; got {value!r}"
         )

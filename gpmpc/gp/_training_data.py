@@ -7,7 +7,7 @@ output, in scaled units; here they are converted to the units of the data and ba
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -17,10 +17,14 @@ from torch import Tensor
 from gpmpc.exceptions import SettingError, ShapeError
 from gpmpc.gaussian import check_tensors
 from gpmpc.gp._data_checks import Columns, Constants, column_std
-from gpmpc.gp._kernel import Predicts, check_posterior
 from gpmpc.gp._posterior import GPPosterior
-from gpmpc.gp._prior_scales import PriorLengthscales, PriorScales
+from gpmpc.gp._prior_scales import (
+    PriorLengthscales,
+    PriorScales,
+    check_prior_settings,
+)
 from gpmpc.gp._scaling import Scaling
+from gpmpc.gp._tensor_checks import Predicts, check_gp_tensors
 
 _log = logging.getLogger(__name__)
 _NAMED_COLUMNS = 6  # columns that a line of the log names; of more it says how many
@@ -37,6 +41,22 @@ class DataSettings(Protocol):
     def prior_deviation(self) -> float | None: ...
     @property
     def resolution(self) -> float: ...
+
+
+def check_data_settings(settings: DataSettings) -> None:
+    """Raises ``SettingError`` unless these settings of a trainer are in range."""
+    check_function("scaling", settings.scaling, example="standardize")
+    check_prior_settings(
+        settings.prior_lengthscale, settings.prior_deviation, settings.resolution
+    )
+
+
+def check_function(key: str, value: Any, example: str) -> None:
+    """Raises ``SettingError`` unless a setting is a function."""
+    if not callable(value):
+        raise SettingError(
+            key, f"must be a function such as {example} of gpmpc.gp; got {value!r}"
+        )
 
 
 @dataclass(frozen=True)
@@ -93,7 +113,7 @@ def read_training_data(
                 f"must be in host memory for training ({name}.cpu()); "
                 f"got {value.device}",
             )
-    check_posterior(tensors, input_dim, predicts)
+    check_gp_tensors(features, targets, input_dim, predicts)
     features = features.detach()
     targets = targets.detach()
     d = features.shape[1]

@@ -11,8 +11,7 @@ from torch import Tensor
 
 from gpmpc._angles import angles_of, state_difference
 from gpmpc._dynamics import Array, DynamicsModel, Linearized, linearize, to_array
-from gpmpc._kernels import Window
-from gpmpc._kernels import linearize as linearize_gps
+from gpmpc._kernels import Window, linearize_gps
 from gpmpc.exceptions import UnsupportedModel
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior

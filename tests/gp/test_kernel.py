@@ -30,7 +30,7 @@ def test_of_factors_made_in_place_the_output_that_fails_is_named(monkeypatch):
     points[50:] = points[:50]
     noise[2] = 1e-300
     with pytest.raises(
-        SettingError, match="the kernel matrix of output 2 is not positive definite"
+        SettingError, match="the kernel matrix of output 3 is not positive definite"
     ):
         factorize(points, scales, signal, noise)
 

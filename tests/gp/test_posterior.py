@@ -13,7 +13,7 @@ def posterior(size=30, n=2, m=1, predicts="next_state", seed=0):
         return torch.rand(*shape, generator=generator, dtype=torch.float64)
 
     return GPPosterior.from_hyperparameters(
-        inputs=3 * draw(size, n + m) - 1.5,
+        features=3 * draw(size, n + m) - 1.5,
         targets=draw(size, n) - 0.5,
         lengthscales=0.5 + draw(n, n + m),
         signal_variance=0.5 + draw(n),
@@ -102,17 +102,17 @@ def test_far_from_the_data_the_prior_returns():
         ),
         (
             {
-                "inputs": torch.zeros(10, 3),
+                "features": torch.zeros(10, 3),
                 "noise_variance": torch.tensor([1.0, 1e-18]),
             },
             SettingError,
-            "output 1 is not positive",
+            "output 2 is not positive",
         ),
     ],
 )
 def test_misuse_is_refused_with_the_rule(change, error, message):
     good = {
-        "inputs": torch.rand(10, 3),
+        "features": torch.rand(10, 3),
         "targets": torch.rand(10, 2),
         "lengthscales": torch.ones(2, 3),
         "signal_variance": torch.ones(2),
@@ -127,14 +127,14 @@ def test_misuse_is_refused_with_the_rule(change, error, message):
     ("change", "error", "message"),
     [
         (
-            {"inputs": torch.zeros(0, 3), "targets": torch.zeros(0, 2)},
+            {"features": torch.zeros(0, 3), "targets": torch.zeros(0, 2)},
             ShapeError,
             r"a row; got \(0, 3\) and \(0, 2\)",
         ),
         (
-            {"inputs": torch.full((10, 3), torch.nan)},
+            {"features": torch.full((10, 3), torch.nan)},
             DataError,
-            "inputs must be finite; got nan",
+            "features must be finite; got nan",
         ),
         (
             {"targets": torch.rand(10, 2).float()},

@@ -435,7 +435,7 @@ def test_points_that_miss_all_there_is_to_learn_are_refused():
     y = torch.sin(2 * x).prod(1, keepdim=True)
     with pytest.raises(
         TrainingError,
-        match="1 inducing points learned nothing but noise of output 1, where exact",
+        match="1 inducing points learned nothing but noise of output 2, where exact",
     ) as e:
         SparseTrainer(inducing=1).fit(x, torch.cat([x[:, :1], y], dim=1), 0, "value")
     assert e.value.outputs == [1]

@@ -181,7 +181,7 @@ def test_when_all_starts_fail_the_output_is_named():
     data = pendulum(10)
     next_states = data.next_states.clone()
     next_states[:, 1] = 1e200 * torch.arange(1, 11)
-    with pytest.raises(TrainingError, match="no start of 4 .* for output 1:") as caught:
+    with pytest.raises(TrainingError, match="no start of 4 .* for state 2:") as caught:
         train(Transitions(data.states, data.inputs, next_states))
     assert caught.value.outputs == [1]
 
@@ -446,8 +446,8 @@ def test_a_time_limit_ends_each_search_with_the_best_so_far(caplog, monkeypatch)
     with caplog.at_level(logging.INFO, "gpmpc"):
         stopped = train(data, time_limit=40.0)
     assert [r.message for r in caplog.records if "over" in r.message] == [
-        "training: output 1 of 2: its share of time_limit=40 s is over",
-        "training: output 2 of 2: its share of time_limit=40 s is over",
+        "training: state 1 (1 of 2): its share of time_limit=40 s is over",
+        "training: state 2 (2 of 2): its share of time_limit=40 s is over",
     ]
     assert 10 < stopped.evaluations < 0.3 * converged.evaluations
     assert (stopped.objective > converged.objective).all()

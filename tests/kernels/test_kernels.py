@@ -313,7 +313,7 @@ def test_the_expansion_at_a_point_agrees_with_torch(n, m, size):
         close(mine, other, 1e-10)
     offset = np.arange(float(n))
     for adds_state in (False, True):
-        M, A, B, V = kernels.linearize(
+        M, A, B, V = kernels.linearize_gps(
             packed(gp), *numbers(x[None], u[None]), True, offset, adds_state
         )
         close(M[0], point.M + offset + adds_state * x.numpy(), 1e-12)
@@ -365,7 +365,7 @@ def test_many_points_are_the_loop_over_them():
     S = np.stack([b.covariance for b in beliefs])
     u = np.linspace(-1, 1, 8).reshape(4, 2)
     together = [
-        kernels.linearize(gps, mu, u, True, np.zeros(3), False),
+        kernels.linearize_gps(gps, mu, u, True, np.zeros(3), False),
         kernels.point_with_jacobian(gps, mu, u),
         kernels.moments(gps, mu, S, u, diagonal=True),
         kernels.moments(gps, mu, S, u, derivatives=True),
@@ -374,7 +374,7 @@ def test_many_points_are_the_loop_over_them():
         alone = [
             [
                 part[0]
-                for part in kernels.linearize(
+                for part in kernels.linearize_gps(
                     gps, mu[h : h + 1], u[h : h + 1], True, np.zeros(3), False
                 )
             ],
@@ -487,7 +487,7 @@ def test_sizes_over_points_are_the_largest_ones(dims):
 
 def test_loops_over_points_may_use_the_widest_registers():
     gps = packed(model())
-    kernels.linearize(
+    kernels.linearize_gps(
         gps, np.zeros((1, 2)), np.zeros((1, 1)), False, np.zeros(2), False
     )
     anew = numba.njit(
