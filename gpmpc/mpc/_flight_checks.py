@@ -1,9 +1,9 @@
 """The checks of a flight's step, compiled.
 
-``judge_step`` takes a step into the memory of its flight, measures what several checks
-need of it, and returns the first alarm; its tuple ``alarms`` is the list of checks, in
-the order in which they are named to the user. What they are for is told in
-``_judgement``.
+``judge_step`` takes a step into the memory of its flight and returns the first alarm.
+Functions ``_follow_*`` and ``_remember_*`` write the memory, each of them once a step;
+``_check_*`` only read. The tuple ``alarms`` is the list of alarms, in the order in
+which they are named to the user. What they are for is told in ``_judgement``.
 """
 
 import math
@@ -56,7 +56,8 @@ RISING = 10
 CLIMBING = 11
 STANDING = 12
 
-# What a flight has shown so far of each state. Rings are filled in turns.
+# What a flight has shown so far of each state. Rings are filled in turns: step k writes
+# slot k modulo the length, but for those of changes, whose count stands beside them.
 STATE_MEMORY = np.dtype(
     [
         ("innovation", np.float64),  # the last one; NaN where there was none
@@ -64,8 +65,9 @@ STATE_MEMORY = np.dtype(
         ("ratio", np.float64),  # their sum
         ("deviations", np.float64, BIAS_WINDOW),  # innovations over their deviations
         ("bias", np.float64),  # their sum
-        ("changes", np.float64, _CHANGES),  # squared differences of innovations
-        ("ordered_changes", np.float64, _CHANGES),
+        ("change_count", np.int64),  # differences of successive innovations so far
+        ("changes", np.float64, _CHANGES),  # their squares
+        ("ordered_changes", np.float64, _CHANGES),  # the same, from the smallest on
         ("sensor_variance", np.float64),  # the sensors' part of the innovations
         ("motion", np.float64),  # largest squared predicted motion, forgotten slowly
         ("measured", np.float64),  # the last measurement
@@ -76,11 +78,13 @@ STATE_MEMORY = np.dtype(
         ("next_reference", np.float64),  # its value for this step
     ]
 )
-# What it has shown of all states together.
+# What it has shown of all states together. Of the rings of ``_RING`` slots, two turn
+# after that many steps; the other three only use the first ``look_ahead`` slots, and
+# turn after as many steps.
 FLIGHT_MEMORY = np.dtype(
     [
         ("step", np.int64),  # number of the step, from 0
-        ("changes", np.int64),  # differences of innovations so far
+        ("changes", np.int64),  # steps so far in which any state had a change
         ("look_ahead", np.int64),  # steps that a promise is followed for; 0 at first
         ("since_news", np.int64),  # steps since the reference's end has moved
         ("since_nearer", np.int64),  # steps since the plant came nearer to it
@@ -89,14 +93,15 @@ FLIGHT_MEMORY = np.dtype(
         ("travel", np.float64),  # from the start to the reference's end
         ("distance_when_lost", np.float64),
         ("first_violation", np.float64),
-        ("distance_at_bound", np.float64),  # when an input came to stay at its bound
         ("first_cost", np.float64),  # largest of plans while the reference was news
         ("nearest", np.float64),  # distance
         ("distances", np.float64, _RING),
         ("costs", np.float64, _RING),  # of plans
-        ("news", np.float64, _RING),  # squared moves of the reference's end
-        ("paid", np.float64, _RING),  # squared distances
-        ("promised", np.float64, _RING),  # by the plan of a step for the next steps
+        # modulo look_ahead: squared moves of the reference's end
+        ("news", np.float64, _RING),
+        ("paid", np.float64, _RING),  # modulo look_ahead: squared distances
+        # modulo look_ahead: by the plan of a step for the next look_ahead steps
+        ("promised", np.float64, _RING),
         ("far", np.float64, WINDOW),  # 1 where a plan was far from the data
         ("failed", np.float64, WINDOW),  # 1 where a decision was not applied
     ]
@@ -119,7 +124,8 @@ class Memory(NamedTuple):
 
     states: Array  # (n,) of ``STATE_MEMORY``
     flight: Array  # (1,) of ``FLIGHT_MEMORY``
-    at_bound: Array  # for how many steps an input has stayed at a bound (m,)
+    at_bound: Array  # for how many steps each input has stayed at a bound (m,)
+    distance_at_bound: Array  # when each input came to its bound (m,)
 
 
 class Reading(NamedTuple):
@@ -184,18 +190,24 @@ def judge_step(settings, memory, reading):
     if flight.look_ahead == 0 and is_applied:
         flight.look_ahead = min(horizon, _LONG)
 
-    innovation, bias = _check_innovations(settings, memory, reading)
-    frozen = _check_sensors(memory, reading.measured)
+    # The order counts: sensor variances come from the innovations, distances need these
+    # variances, and a promise is followed after the news that may withdraw it.
+    innovation, bias = _follow_innovations(settings, memory, reading)
+    frozen = _follow_sensors(memory, reading.measured)
     distance = _measure_distance(settings, memory, reading)
-    _read_news(settings, memory, reading.reference)
+    _remember_reference(settings, memory, reading.reference)
     _remember_first_cost(flight, cost)
     promise_ratio = _follow_promise(flight, distance, promised, horizon)
     course = _follow_course(flight, distance, cost, promise_ratio)
-    far_plans = _count_far_plans(flight, reading.novelty)
+    far_plans = _follow_novelty(flight, reading.novelty)
     predicts_well = (
         innovation.reason == HEALTHY and bias.reason == HEALTHY and far_plans == 0.0
     )
-    lost = _check_lost(flight, course, cost, predicts_well)
+    lost = _follow_loss(flight, course, cost, predicts_well)
+    failures = _follow_failures(flight, is_applied)
+    violation = _follow_violation(flight, reading.violation)
+    standing = _follow_approach(flight, distance, horizon)
+    saturated = _follow_bounds(settings, memory, reading.input, distance, horizon)
     alarms = (  # in the order in which they are named
         lost,
         frozen,
@@ -203,11 +215,11 @@ def judge_step(settings, memory, reading):
         bias,
         _check_climbing(course, predicts_well),
         _check_promise(course),
-        _check_failures(flight, is_applied),
+        failures,
         _check_novelty(flight, course, far_plans, reading.novelty),
-        _check_violation(flight, reading.violation),
-        _check_standing(flight, distance, horizon),
-        _check_bounds(settings, memory, reading.input, distance, horizon),
+        violation,
+        standing,
+        saturated,
     )
     flight.step += 1
     return _first(alarms)
@@ -223,7 +235,7 @@ def _first(alarms):
 
 
 @njit_noalloc
-def _check_innovations(settings, memory, reading):
+def _follow_innovations(settings, memory, reading):
     """The states whose innovations are no chance: by a window's squares, and by bias.
 
     The first alarm is that of the largest mean square in a window, the second that of
@@ -241,7 +253,7 @@ def _check_innovations(settings, memory, reading):
         innovation = _wrapped(
             reading.measured[i] - reading.last_means[1, i], settings.angles[i]
         )
-        ratio, deviation = _score_innovation(settings, flight, state, reading, i)
+        ratio, deviation = _score_innovation(settings, state, reading, i)
         slot = flight.step % WINDOW
         state.ratio += ratio - state.ratios[slot]
         state.ratios[slot] = ratio
@@ -254,23 +266,25 @@ def _check_innovations(settings, memory, reading):
         if abs(state.bias) > largest_bias:
             largest_bias = abs(state.bias)
             most_biased = Alarm(BIAS, i, largest_bias / BIAS_WINDOW)
-        if _remember_change(flight, state, innovation):
+        if _remember_change(state, innovation):
             has_change = True
     flight.changes += has_change
     return largest, most_biased
 
 
 @njit_noalloc
-def _score_innovation(settings, flight, state, reading, i):
+def _score_innovation(settings, state, reading, i):
     """A state's squared innovation over its variance, and itself over its deviation.
 
     The variance is the predicted one, the noise that the model has learned, that of
     the sensors and a share of what moves. Of an error of the model each step may have
-    all; of the sensors' noise the mean of a window has little.
+    all; of the sensors' noise the mean of a window has little. A state whose sensors'
+    noise is not known yet is not judged, such as one that is never measured in two
+    steps on end.
     """
-    is_judged = flight.changes >= _FEWEST
+    is_judged = state.change_count >= _FEWEST
     if is_judged:
-        state.sensor_variance = _sensor_variance(flight, state)
+        state.sensor_variance = _sensor_variance(state)
     expected = reading.last_means[1, i]
     innovation = _wrapped(reading.measured[i] - expected, settings.angles[i])
     if innovation != innovation:
@@ -291,41 +305,38 @@ def _score_innovation(settings, flight, state, reading, i):
 
 
 @njit_noalloc
-def _sensor_variance(flight, state):
+def _sensor_variance(state):
     """The variance of a state's sensor, by the median of its changes.
 
     Half the squared difference of white innovations is their variance; the median of
     few differences is uncertain.
     """
-    count = min(flight.changes, _CHANGES)
+    count = min(state.change_count, _CHANGES)
     scale = (1.0 + _DOUBT / max(count, 1)) / _MEDIAN / 2.0
     return scale * state.ordered_changes[count // 2]
 
 
 @njit_noalloc
-def _remember_change(flight, state, innovation):
+def _remember_change(state, innovation):
     """Remembers how an innovation differs from the last; returns whether it is known.
 
-    One that is not is taken for what the last was.
+    It is not where one of the two was not measured.
     """
     change = innovation - state.innovation
     state.innovation = innovation
     is_known = change == change
     if is_known:
-        _insert_change(flight, state, change * change)
-    elif flight.changes > 0:
-        last = state.changes[(flight.changes - 1) % _CHANGES]
-        _insert_change(flight, state, last)
+        _insert_change(state, change * change)
     return is_known
 
 
 @njit_noalloc
-def _insert_change(flight, state, value):
+def _insert_change(state, value):
     """Puts a value into the ring of a state's changes, and in its place in order."""
-    slot = flight.changes % _CHANGES
+    slot = state.change_count % _CHANGES
     ordered = state.ordered_changes
-    if flight.changes < _CHANGES:
-        j = flight.changes
+    if state.change_count < _CHANGES:
+        j = state.change_count
     else:
         j = _find(ordered, state.changes[slot])
         while j < _CHANGES - 1 and ordered[j + 1] < value:
@@ -336,6 +347,7 @@ def _insert_change(flight, state, value):
         j -= 1
     ordered[j] = value
     state.changes[slot] = value
+    state.change_count += 1
 
 
 @njit_noalloc
@@ -353,7 +365,7 @@ def _find(ordered, value):
 
 
 @njit_noalloc
-def _check_sensors(memory, measured):
+def _follow_sensors(memory, measured):
     """A state that is measured the same to the last digit while others change.
 
     A sensor that has shown the same before, and then gone on, has coarse steps: it may.
@@ -420,7 +432,7 @@ def _measure_distance(settings, memory, reading):
 
 
 @njit_noalloc
-def _read_news(settings, memory, reference):
+def _remember_reference(settings, memory, reference):
     """Remembers what a reference tells that no plan has known before."""
     flight = memory.flight[0]
     move = _move_of_end(settings, memory, reference[-1])
@@ -567,7 +579,7 @@ def _is_growing(ring, k, half):
 
 
 @njit_noalloc
-def _check_lost(flight, course, cost, predicts_well):
+def _follow_loss(flight, course, cost, predicts_well):
     """A plant that runs away, by its distance or by what its plans cost.
 
     It stays lost until it has come back by half.
@@ -607,7 +619,7 @@ def _check_promise(course):
 
 
 @njit_noalloc
-def _check_failures(flight, is_applied):
+def _follow_failures(flight, is_applied):
     """Decisions of a window that could not be applied."""
     flight.failed[flight.step % WINDOW] = 0.0 if is_applied else 1.0
     failures = _total(flight.failed)
@@ -617,7 +629,7 @@ def _check_failures(flight, is_applied):
 
 
 @njit_noalloc
-def _count_far_plans(flight, novelty):
+def _follow_novelty(flight, novelty):
     """How many plans of a window were far from the model's data."""
     flight.far[flight.step % WINDOW] = 1.0 if novelty > _FAR else 0.0
     return _total(flight.far)
@@ -634,7 +646,7 @@ def _check_novelty(flight, course, far_plans, novelty):
 
 
 @njit_noalloc
-def _check_violation(flight, violation):
+def _follow_violation(flight, violation):
     """Plans that have missed a constraint for long, the last no less than the first."""
     if not violation > _VIOLATED:
         flight.violated = 0
@@ -649,7 +661,7 @@ def _check_violation(flight, violation):
 
 
 @njit_noalloc
-def _check_standing(flight, distance, horizon):
+def _follow_approach(flight, distance, horizon):
     """No way made for long, while half of it is still ahead."""
     if distance.now < 0.9 * flight.nearest or flight.since_news == 0:
         flight.nearest = distance.now
@@ -663,22 +675,21 @@ def _check_standing(flight, distance, horizon):
 
 
 @njit_noalloc
-def _check_bounds(settings, memory, input, distance, horizon):
+def _follow_bounds(settings, memory, input, distance, horizon):
     """An input that has stayed at a bound for long while the distance did not fall."""
-    flight = memory.flight[0]
     alarm = _WELL
     for j in range(len(settings.lower)):
         size = _ROUNDING * max(1.0, abs(input[j]))
         is_low = input[j] <= settings.lower[j] + size
         if is_low or input[j] >= settings.upper[j] - size:
             if memory.at_bound[j] == 0:
-                flight.distance_at_bound = distance.now
+                memory.distance_at_bound[j] = distance.now
             memory.at_bound[j] += 1
         else:
             memory.at_bound[j] = 0
         is_long = memory.at_bound[j] > 2 * max(_LONG, horizon)
-        falls = distance.now < max(distance.least, 0.95 * flight.distance_at_bound)
-        if is_long and distance.now >= distance.least and not falls:
+        is_nearer = distance.now < 0.95 * memory.distance_at_bound[j]
+        if is_long and distance.now >= distance.least and not is_nearer:
             alarm = Alarm(SATURATED, j, float(memory.at_bound[j]))
     return alarm
 

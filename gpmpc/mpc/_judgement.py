@@ -131,6 +131,7 @@ class FlightJudge:
             states=checks.new_state_memory(n),
             flight=np.zeros(1, checks.FLIGHT_MEMORY),
             at_bound=np.zeros(m, dtype=np.int64),
+            distance_at_bound=np.zeros(m),
         )
         self._constrained = bool(problem.constraints)
         self._states = tuple(names[0]) or tuple(f"state {i}" for i in range(n))
@@ -215,6 +216,8 @@ class FlightJudge:
     def _in_words(self, alarm: checks.Alarm) -> Judgement:
         """Returns the judgement that an alarm stands for."""
         words = _WORDS[alarm.reason]
+        if alarm.reason == checks.CLIMBING and alarm.value < 1.0:
+            words = _CLIMBING_BELOW_THE_FIRST
         if alarm.reason in (checks.AWAY, checks.RISING):
             return Judgement("lost", words.format(value=alarm.value))
         names = self._inputs if alarm.reason == checks.SATURATED else self._states
@@ -256,6 +259,11 @@ def _float64(values: Any) -> Array:
     return np.ascontiguousarray(values, dtype=np.float64)
 
 
+# The words for plans that cost more again, but less than the first one still.
+_CLIMBING_BELOW_THE_FIRST = (
+    "the plans have stopped falling and rise: they cost {value:.2g} times as much as "
+    "at first, although the model predicts well"
+)
 _WORDS = {
     checks.INNOVATION: (
         "innovations of {name} are {value:.3g} standard deviations, "

@@ -188,6 +188,52 @@ def test_failed_decisions_are_suspicious_from_the_third_on():
     assert judgement == Judgement()
 
 
+def judged_at_half_rate(first_measured):
+    """Judgements of a point whose second sensor is read every second step."""
+    rng = np.random.default_rng(0)
+    judge = FlightJudge(CONTROLLER.problem)
+    judgements = []
+    for k in range(60):
+        measured = rng.normal(0.0, 0.01, 2)
+        if k % 2 != first_measured:
+            measured[1] = np.nan
+        judgements.append(judge.judge(measured, np.zeros(2), plan_of(np.zeros(2))))
+    return judgements
+
+
+@pytest.mark.parametrize("first_measured", [0, 1])
+def test_a_sensor_at_half_rate_is_no_alarm(first_measured):
+    assert set(judged_at_half_rate(first_measured)) == {Judgement()}
+
+
+def test_each_input_at_a_bound_has_its_own_yardstick():
+    box = Box([-1.0, -1.0], [1.0, 1.0])
+    judge = FlightJudge(Problem(Tracking([1.0, 0.0], [0.01, 0.01]), inputs=box))
+    for k in range(45):
+        distance = 1.2 if k == 30 else 1.0
+        second = 1.0 if k >= 30 else 0.0
+        plan = plan_of(np.array([distance, 0.0]))
+        inputs = np.tile([1.0, second], (5, 1))
+        plan = replace(plan, input=inputs[0], inputs=inputs)
+        judgement = judge.judge(plan.means[0], np.zeros(2), plan)
+    assert judgement.reason.startswith("input 0 is at its bound for 45 steps")
+
+
+def test_plans_that_cost_less_than_the_first_do_not_cost_ever_more():
+    judge = FlightJudge(CONTROLLER.problem)
+    distances = np.concatenate([np.full(10, 10.0), np.linspace(2.0, 1.0, 25)])
+    distances = np.concatenate([distances, 1.2 ** np.arange(25)])
+    reasons = []
+    for k, distance in enumerate(distances):
+        following = distances[min(k + 1, len(distances) - 1)]
+        means = np.tile([following, 0.1 * following], (6, 1))
+        means[0] = [distance, 0.1 * distance]
+        plan = replace(plan_of(np.zeros(2)), means=means)
+        reasons.append(judge.judge(means[0], np.zeros(2), plan).reason)
+    rising = [reason for reason in reasons if "although the model" in reason]
+    assert rising[0].startswith("the plans have stopped falling and rise: they cost 0.")
+
+
 def test_plans_far_from_data_are_suspicious_away_from_the_goal():
     for place, level in ([0.0, "healthy"], [1.0, "suspicious"]):
         judge = FlightJudge(CONTROLLER.problem)
