@@ -284,7 +284,7 @@ class SLSQP:
         upper = upper_sides.ravel()
         starts = [
             self.evaluate(plan.ravel().clip(lower, upper), request)
-            for plan in (request.constant_guess, request.initial_guess)
+            for plan in (request.constant_guess, request.guessed_inputs)
         ]
         current = min(starts, key=_rank)
         iterations = 0

@@ -173,7 +173,9 @@ class Decision:
     #: of these (H + 1, n, n); zero where the controller does not predict them
     covariances: Array
     status: Status  #: how the solve ended
-    iterations: int  #: of the solver
+    #: of the solver; of ``GPMPC`` its quadratic programs, of ``LQR`` the horizon, its
+    #: Riccati steps
+    iterations: int
     timing: Timing  #: of the parts
     #: that was solved last, where there is one
     problem: QuadraticProgram | None = None
@@ -291,7 +293,7 @@ class Request(NamedTuple):
     references: References
     #: inputs (H, m) within their bounds: those handed over; else the last plan's, one
     #: step on, the last one repeated; else the previous input repeated
-    initial_guess: Array
+    guessed_inputs: Array
     #: whether the belief is; one that is not is a bad measurement, not misuse
     finite: bool
     #: added to the model's mean at every stage (n,); None where nothing is estimated
@@ -301,7 +303,7 @@ class Request(NamedTuple):
     #: the last decision, where its plan may be started from and has this horizon
     previous: Decision | None = None
     #: a first guess of x_0 .. x_H (H + 1, n), where one was handed over
-    states: Array | None = None
+    guessed_states: Array | None = None
 
     @classmethod
     def read(
@@ -316,6 +318,10 @@ class Request(NamedTuple):
         signals: Signals = UNKNOWN,
     ) -> "Request":
         """Validates the arguments of ``Controller.control`` for H stages of a problem.
+
+        It needs no model. Parameters, the disturbance estimate, and the states that
+        inputs handed over lead to are left out: ``gpmpc.mpc._guess.read_request`` adds
+        them for controllers with a ``PredictionModel``.
 
         Args:
             problem: Weights and bounds.
@@ -352,7 +358,7 @@ class Request(NamedTuple):
         if plan is not None:
             guess, states = _read_plan(plan, horizon, n, m)
         elif last_decision is not None:
-            guess = _shift(_as_array(last_decision.inputs))
+            guess = one_step_on(_as_array(last_decision.inputs))
         else:
             guess = np.tile(last_input, (horizon, 1))
         if problem.cost.angles and states is None and finite:
@@ -362,29 +368,29 @@ class Request(NamedTuple):
             state=state,
             covariance=covariance,
             references=References(targets[1:], target_inputs, last_input),
-            initial_guess=np.minimum(np.maximum(guess, lower), upper),
+            guessed_inputs=np.minimum(np.maximum(guess, lower), upper),
             finite=finite,
             kappas=kappas,
             previous=last_decision,
-            states=states,
+            guessed_states=states,
         )
 
     @property
     def constant_guess(self) -> Array:
         """The previous input over the whole horizon (H, m)."""
-        return np.tile(self.references.previous_input, (len(self.initial_guess), 1))
+        return np.tile(self.references.previous_input, (len(self.guessed_inputs), 1))
 
     def failed_decision(
         self, status: Status, iterations: int = 0, timing: Timing | None = None
     ) -> Decision:
         """Returns the decision of a step without a usable solve.
 
-        It holds the initial guess, and no prediction.
+        It holds the guessed inputs, and no prediction.
         """
         H, n = self.references.states.shape
         return Decision(
-            input=self.initial_guess[0],
-            inputs=self.initial_guess,
+            input=self.guessed_inputs[0],
+            inputs=self.guessed_inputs,
             means=np.full((H + 1, n), np.nan),
             covariances=np.full((H + 1, n, n), np.nan),
             status=status,
@@ -449,12 +455,23 @@ def _read_last_input(previous: Decision | None, initial_input: Array) -> Array:
     return _as_array(initial_input)
 
 
-def _shift(inputs: Array) -> Array:
-    """Returns planned inputs (H, m), one step on, the last one repeated."""
-    shifted = np.empty_like(inputs)
-    shifted[:-1] = inputs[1:]
-    shifted[-1] = inputs[-1]
+def one_step_on(rows: Array) -> Array:
+    """Returns the rows of a plan, one step on, the last one repeated."""
+    shifted = np.empty_like(rows)
+    shifted[:-1] = rows[1:]
+    shifted[-1] = rows[-1]
     return shifted
+
+
+def continued_means(previous: Decision, state: Array, angles: Sequence[int]) -> Array:
+    """Returns the means x_1 .. x_H (H, n) of the last plan, one step on.
+
+    Their angles are in the turn of the state: a sensor may have taken a turn off.
+    """
+    means = one_step_on(previous.means[1:])
+    if len(angles):
+        means += full_turns(state - previous.means[1], angles)
+    return means
 
 
 def check_arguments(belief: Any, reference: Any) -> None:
@@ -548,7 +565,13 @@ def read_parameters(parameters: Any, horizon: int) -> Array:
 
 def _read_plan(plan: Any, horizon: int, n: int, m: int) -> tuple[Array, Array | None]:
     """Returns inputs (H, m) of a plan, and its states (H + 1, n) where it has some."""
-    inputs, states = plan if isinstance(plan, tuple) else (plan, None)
+    inputs = plan
+    states = None
+    if isinstance(plan, tuple):
+        if len(plan) != 2:
+            rule = f"a plan must be inputs ({horizon}, {m}), or a pair (inputs, states)"
+            raise ShapeError(f"{rule}; got a {type(plan).__name__} of {len(plan)}")
+        inputs, states = plan
     inputs = _as_array(inputs, "inputs of a plan")
     fits = inputs.shape == (horizon, m)
     finite = bool(np.isfinite(inputs).all())
@@ -575,8 +598,7 @@ def _unwrap(
     """
     plan = np.tile(state, (len(targets), 1))
     if previous is not None:
-        plan[1:] = np.concatenate([previous.means[2:], previous.means[-1:]])
-        plan[1:] += full_turns(state - previous.means[1], angles)
+        plan[1:] = continued_means(previous, state, angles)
     return targets + full_turns(plan - targets, angles)
 
 

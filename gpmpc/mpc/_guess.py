@@ -12,12 +12,18 @@ from typing import Any
 
 import numpy as np
 
-from gpmpc._angles import full_turns, state_difference
+from gpmpc._angles import state_difference
 from gpmpc._dynamics import linearize
 from gpmpc.exceptions import SettingError, ShapeError
 from gpmpc.gaussian import Gaussian
 from gpmpc.mpc._constraints import keep_rates
-from gpmpc.mpc._controller import Decision, Reference, Request, read_parameters
+from gpmpc.mpc._controller import (
+    Decision,
+    Reference,
+    Request,
+    continued_means,
+    read_parameters,
+)
 from gpmpc.mpc._linear_quadratic import Plan
 from gpmpc.mpc._linearization import PredictionModel
 
@@ -34,7 +40,8 @@ def read_request(
 ) -> Request:
     """Reads the arguments of a controller's ``control``; see ``GPMPC.control``.
 
-    The disturbance estimate is part of the request.
+    To ``Request.read`` it adds what needs more than the problem: parameters, the
+    disturbance estimate, and the states that inputs handed over lead to.
     """
     horizon = prediction.horizon
     request = Request.read(
@@ -55,11 +62,11 @@ def read_request(
     if prediction.settings.disturbance_gain:
         disturbance = _estimate_disturbance(prediction, request)
         request = request._replace(disturbance=disturbance)
-    if plan is not None and request.states is None:
+    if plan is not None and request.guessed_states is None:
         states = prediction.lead(
-            request.state, request.initial_guess, request.disturbance
+            request.state, request.guessed_inputs, request.disturbance
         )
-        request = request._replace(states=states)
+        request = request._replace(guessed_states=states)
     return request
 
 
@@ -107,7 +114,7 @@ def initial_guess(prediction: PredictionModel, request: Request) -> Plan:
     Inputs handed over alone lead to the model's states; where these are not finite, the
     plan's are x_0. The form ``velocity`` holds the belief and the previous input.
     """
-    if prediction.settings.form == "velocity":
+    if prediction.settings.is_held:
         return _hold_belief(prediction, request)
     means = _guess_means(prediction, request)
     inputs = _guess_inputs(prediction, request)
@@ -127,21 +134,15 @@ def _hold_belief(prediction: PredictionModel, request: Request) -> Plan:
 
 def _guess_means(prediction: PredictionModel, request: Request) -> Array:
     """Returns the means of the first plan (H + 1, n)."""
-    H = prediction.horizon
-    angles = prediction.problem.cost.angles
-    means = np.empty((H + 1, prediction.state_dim))
+    means = np.empty((prediction.horizon + 1, prediction.state_dim))
     means[0] = request.state
-    previous = request.previous
-    if request.states is not None:
-        means[1:] = request.states[1:]
-    elif previous is not None:
-        means[1:H] = previous.means[2:]
-        means[H] = previous.means[H]
-        if angles:  # a sensor may have taken a turn off
-            means[1:] += full_turns(request.state - previous.means[1], angles)
+    if request.guessed_states is not None:
+        means[1:] = request.guessed_states[1:]
+    elif request.previous is not None:
+        means[1:] = continued_means(request.previous, request.state, prediction.angles)
     else:
         targets = request.references.states
-        remaining = np.linspace(1.0, 0.0, H + 1)[1:, None]
+        remaining = np.linspace(1.0, 0.0, len(means))[1:, None]
         means[1:] = targets + remaining * (request.state - targets[0])
     return means
 
@@ -149,8 +150,8 @@ def _guess_means(prediction: PredictionModel, request: Request) -> Array:
 def _guess_inputs(prediction: PredictionModel, request: Request) -> Array:
     """Returns the inputs of the first plan (H, m), within bounds and rates."""
     problem = prediction.problem
-    inputs = request.initial_guess
-    is_first = request.previous is None and request.states is None
+    inputs = request.guessed_inputs
+    is_first = request.previous is None and request.guessed_states is None
     if is_first and problem.cost.penalized == "deviations":
         bounds = problem.inputs
         inputs = request.references.inputs.clip(bounds.lower, bounds.upper)
@@ -166,14 +167,16 @@ def _guess_covariances(
 ) -> Array:
     """Returns the covariances at which the first plan is linearised (H + 1, n, n).
 
-    They are those of the last plan, unshifted: they depend on the time since the last
-    measurement. Without a plan they are those of the stages at certain states.
+    Where linearising needs none, as by default, they are zero after Sigma_0: those that
+    tighten the rows are ``LocalProblem.covariances``. Else they are those of the last
+    plan, unshifted, since they depend on the time since the last measurement; without a
+    plan those of the stages at certain states.
     """
     n = prediction.state_dim
     covariances = np.zeros((prediction.horizon + 1, n, n))
     if prediction.settings.covariance != "none":
         covariances[0] = request.covariance
-    if prediction.linearizer.at_points:
+    if prediction.linearizer.needs_no_covariance:
         return covariances
     if request.previous is not None:
         covariances[1:] = request.previous.covariances[1:]

@@ -55,10 +55,10 @@ class LinearLoop:
     ):
         self._point = point
         self.horizon = prediction.horizon
-        velocity = prediction.settings.form == "velocity"
-        self._disturbance_gain = (
-            1.0 if velocity else prediction.settings.disturbance_gain
-        )
+        settings = prediction.settings
+        self._disturbance_gain = settings.disturbance_gain
+        if settings.is_incremental:  # an increment holds all of the last error
+            self._disturbance_gain = 1.0
         self._model: Any = plant or ahead or prediction.model
         learned = bool(to_array(self._model.noise_covariance).any())
         self._tolerance = _LEARNED if learned else _ROUNDING

@@ -35,7 +35,9 @@ class Plan(NamedTuple):
 
     states: Array  # s_0 .. s_H (H + 1, p); s_0 is the current one
     inputs: Array  # u_0 .. u_{H-1} (H, m)
-    covariances: Array  # Sigma_0 .. Sigma_H (H + 1, n, n)
+    # Sigma_0 .. Sigma_H (H + 1, n, n) at which stages are linearised; where that needs
+    # none they are zero after Sigma_0, and not what is predicted
+    covariances: Array
 
 
 class Stages(NamedTuple):
@@ -76,7 +78,7 @@ class References(NamedTuple):
 
 
 class InputBounds(NamedTuple):
-    """Bounds of u_k and of u_k - u_{k-1}."""
+    """Bounds of u_k and of u_k - u_{k-1}, for programs or for roll-outs."""
 
     lower: Array  # (H, m)
     upper: Array  # (H, m)

@@ -111,29 +111,49 @@ class PredictionSettings:
             value = getattr(self, key)
             if not isinstance(value, bool):
                 raise SettingError(key, f"must be true or false; got {value!r}")
-        velocity = self.form == "velocity"
-        if self.rolled_out and velocity:
+        if self.rolled_out and self.is_held:
             rule = "is for plans of form 'trajectory'"
             raise SettingError("rolled_out", f"{rule}; got form 'velocity'")
         gain = self.disturbance_gain
         check_number("disturbance_gain", gain, least=0)
-        if velocity and gain > 0:
+        if self.is_incremental and gain > 0:
             rule = "must be 0 for form 'velocity', which needs none"
             raise SettingError("disturbance_gain", f"{rule}; got {gain}")
         if gain > 1:
             rule = "must lie between 0 and 1"
             raise SettingError("disturbance_gain", f"{rule}; got {gain}")
 
+    @property
+    def is_held(self) -> bool:
+        """Whether one linearisation, at the belief, is held over the horizon."""
+        return self.form == "velocity"
+
+    @property
+    def is_incremental(self) -> bool:
+        """Whether stages hold for increments, in which a constant error cancels."""
+        return self.form == "velocity"
+
+    @property
+    def may_iterate(self) -> bool:
+        """Whether a step may take more than one program: new plans give new stages."""
+        return self.form == "trajectory"
+
 
 class LocalProblem(NamedTuple):
-    """The linear-quadratic problem at a plan."""
+    """The linear-quadratic problem at a plan.
 
-    # where the stages were linearised; with ``velocity`` at its first stage only
+    ``linearize`` makes all parts at one plan. A step, or a roll-out that is not worth a
+    linearisation, then replaces the plan alone: stages, covariances and rows stay those
+    of the plan before, whose program led to it.
+    """
+
     plan: Plan
-    stages: Stages
-    covariances: Array  # Sigma_0 .. Sigma_H (H + 1, n, n)
+    stages: Stages  # with ``velocity`` at the first stage only
+    # Sigma_0 .. Sigma_H (H + 1, n, n) as predicted; those of the plan, where the stages
+    # need some, are where they were linearised
+    covariances: Array
     rows: StageRows  # tightened by the covariances
-    cost: QuadraticCost  # with outputs linearised at the plan
+    cost: QuadraticCost  # with outputs linearised at a plan
 
     def stage_costs(self, references: References) -> Array:
         """Returns what each stage of the plan costs (H,)."""
@@ -173,15 +193,17 @@ class PredictionModel:
         self.input_dim = problem.input_dim
         self.horizon = horizon
         self.settings = settings
-        #: number of stage models, H or the one that is held
-        self.points = horizon if settings.form == "trajectory" else 1
+        #: K, the number of stage models: H, or the one that is held
+        self.stage_count = 1 if settings.is_held else horizon
         self._set_model(model)
         lower, upper = problem.inputs.by_stage(horizon)
         rate_lower, rate_upper = problem.input_rates.by_stage(horizon)
-        #: bounds of every stage, infinite where there are none
+        #: bounds of every stage, infinite where there are none: roll-outs read them
         self.limits = InputBounds(lower, upper, rate_lower, rate_upper)
-        rows = horizon if problem.input_rates.finite else 0
-        self.bounds = InputBounds(lower, upper, rate_lower[:rows], rate_upper[:rows])
+        #: the same for programs and violations; rates are (0, m) where none is bounded,
+        #: so that they take no rows
+        count = horizon if problem.input_rates.finite else 0
+        self.bounds = InputBounds(lower, upper, rate_lower[:count], rate_upper[:count])
         self.constraints = ConstraintRows(problem, horizon, settings.covariance)
         self.costs = StageCosts(problem, horizon, self.linearizer)
 
@@ -220,7 +242,7 @@ class PredictionModel:
 
     def linearize(self, plan: Plan, request: Request) -> LocalProblem:
         """Returns the problem at a plan, whose stages are linearised in one call."""
-        K = self.points
+        K = self.stage_count
         stages = self.linearizer(
             plan.states[:K], plan.inputs[:K], plan.covariances[:K], request.disturbance
         )
@@ -232,7 +254,7 @@ class PredictionModel:
         """Returns the problems at many plans, with all stages in one call."""
         if not requests:
             return []
-        K = self.points
+        K = self.stage_count
         T = len(requests)
         states = np.concatenate([plan.states[:K] for plan in plans])
         inputs = np.concatenate([plan.inputs[:K] for plan in plans])
@@ -253,10 +275,10 @@ class PredictionModel:
         cost = self.costs.at(plan, request.parameters)
         covariances = self._covariances_of(plan, stages, cost, request)
         previous = request.previous
-        if self.settings.form == "velocity" and previous is not None:
+        if self.settings.is_incremental and previous is not None:
             stages = self._in_increments(plan, stages, request, previous)
         rows = self.constraints.at(
-            plan, covariances, self.points, request.parameters, request.kappas
+            plan, covariances, self.stage_count, request.parameters, request.kappas
         )
         return LocalProblem(plan, stages, covariances, rows, cost)
 
@@ -267,7 +289,7 @@ class PredictionModel:
         mode = self.linearizer.covariance
         if mode == "zero_order":
             return self.predict_covariances(stages, cost, request.covariance)
-        if self.settings.form == "velocity" and mode != "none":
+        if self.settings.is_held and mode != "none":
             _, after = self.linearizer.moments(stages.next, plan.covariances)
             covariances = np.repeat(after, self.horizon + 1, axis=0)
             covariances[0] = request.covariance
@@ -342,7 +364,8 @@ class StageLinearizer:
     See ``gpmpc.mpc._linear_quadratic`` for the covariance modes.
 
     Attributes:
-        at_points: Whether the stages depend on the means and inputs alone.
+        needs_no_covariance: Whether the stages depend on means and inputs alone, so
+            that they may be linearised before any covariance is predicted.
         noise: Variances (n,) of the noise that V holds.
     """
 
@@ -355,7 +378,8 @@ class StageLinearizer:
         self._n = model.state_dim
         first_order = getattr(propagator, "first_order", False)
         zero_order = covariance == "zero_order"
-        self.at_points = covariance == "none" or (zero_order and first_order)
+        at_means = zero_order and first_order
+        self.needs_no_covariance = covariance == "none" or at_means
         noisy = zero_order and getattr(propagator, "process_noise", False)
         self._noise = to_array(model.noise_covariance) if noisy else None
         self.noise = np.zeros(self._n)
@@ -367,7 +391,7 @@ class StageLinearizer:
             "zero_order": self._linearize_moments,
         }
         self._linearize: _Linearize = self._linearize_means
-        if not self.at_points:
+        if not self.needs_no_covariance:
             self._linearize = by_mode[covariance]
 
     def __call__(

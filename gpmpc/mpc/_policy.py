@@ -5,6 +5,12 @@ that was applicable, shifted as if it had been made one step ago, with what was 
 applied as its first input. A plan that is used up holds its last input. Inputs beyond a
 bound by rounding are put onto it; others count as failed, whatever the status of a
 decision.
+
+To add a policy, such as one that holds the input for three steps and then follows an
+LQR: name it in ``OnFailure``, which ``check_policy`` and the settings of loops and
+studies read; choose its input in ``_conclude``, beside ``_continue_last_plan``; and
+tell of it in ``decide`` and ``ControlLoop``. A ``Command`` holds the last plan alone:
+what a policy counts or remembers is to be a field of it.
 """
 
 from collections.abc import Sequence
@@ -31,6 +37,7 @@ from gpmpc.mpc._controller import (
     Decision,
     Reference,
     Timing,
+    one_step_on,
     read_reference,
 )
 from gpmpc.mpc._judgement import FlightJudge, Judgement
@@ -364,19 +371,14 @@ def _continue_last_plan(
     if last is None or last.plan is None or not last.plan.applicable:
         return None
     plan = last.plan
-    inputs = _shifted(plan.inputs)
+    inputs = one_step_on(plan.inputs)
     first = last.input if on_failure == "hold" else inputs[0]
     shifted = replace(
         _with_first(plan, inputs, first),
-        means=_shifted(plan.means),
-        covariances=_shifted(plan.covariances),
+        means=one_step_on(plan.means),
+        covariances=one_step_on(plan.covariances),
     )
     return _admit(controller, shifted, last)
-
-
-def _shifted(rows: np.ndarray) -> np.ndarray:
-    """Returns rows one step on, the last one repeated."""
-    return np.concatenate([rows[1:], rows[-1:]])
 
 
 def _plan_without_prediction(

@@ -33,7 +33,7 @@ def roll_out(
         feedback: Of a program, F_k (H, m, p + m + 1).
         request: Of the decision.
     """
-    if prediction.linearizer.at_points:
+    if prediction.linearizer.needs_no_covariance:
         plan = _follow(prediction, target, local, feedback, request)
         return prediction.linearize(plan, request)
     return _roll_out_belief(prediction, target, local, feedback, request)
@@ -48,8 +48,8 @@ def close_defects(
 ) -> LocalProblem:
     """Returns a problem whose plan is rolled out towards its own, so that it obeys.
 
-    It is the problem itself where the roll-out overflows. Where dynamics are linearised
-    at points, stages and covariances stay as they are.
+    It is the problem itself where the roll-out overflows. Where linearising needs no
+    covariances, stages and covariances stay as they are.
 
     Args:
         prediction: Of the controller.
@@ -58,7 +58,7 @@ def close_defects(
         feedback: Of its program; see ``roll_out``.
         request: Of the decision.
     """
-    if not prediction.linearizer.at_points:
+    if not prediction.linearizer.needs_no_covariance:
         obeying = _roll_out_belief(prediction, ending.plan, local, feedback, request)
         return obeying if np.isfinite(obeying.plan.states).all() else ending
     plan = _follow(prediction, ending.plan, local, feedback, request)
@@ -69,7 +69,7 @@ def close_defects(
         rows = prediction.constraints.at(
             plan,
             ending.covariances,
-            prediction.points,
+            prediction.stage_count,
             request.parameters,
             request.kappas,
         )
@@ -109,7 +109,7 @@ def _follow(
     law = Feedback(
         states=target.states[None],
         inputs=target.inputs[None],
-        gains=_gains_of_means(prediction, local, feedback)[None],
+        gains=_feedback_on_means(prediction, local, feedback)[None],
         lower=limits.lower,
         upper=limits.upper,
         rate_lower=limits.rate_lower,
@@ -132,7 +132,7 @@ def _roll_out_belief(
     """Returns ``roll_out`` of a belief whose means depend on its covariances."""
     linearizer = prediction.linearizer
     n = prediction.state_dim
-    gains = _gains_of_means(prediction, local, feedback)
+    F = _feedback_on_means(prediction, local, feedback)
     limits = prediction.limits
     last_input = request.references.previous_input
     states = target.states.copy()
@@ -141,7 +141,7 @@ def _roll_out_belief(
     parts = []
     for k in range(prediction.horizon):
         off = states[k, :n] - target.states[k, :n]
-        input = target.inputs[k] + gains[k] @ off
+        input = target.inputs[k] + F[k] @ off
         lowest = last_input + limits.rate_lower[k]
         highest = last_input + limits.rate_upper[k]
         input = np.clip(input, lowest, highest)
@@ -161,15 +161,15 @@ def _roll_out_belief(
     return prediction.assemble(Plan(states, inputs, covariances), stages, request)
 
 
-def _gains_of_means(
+def _feedback_on_means(
     prediction: PredictionModel, local: LocalProblem, feedback: Array
 ) -> Array:
-    """Returns gains (H, m, n) of a feedback on the means, u = u' + gains (x - x').
+    """Returns F (H, m, n) of a feedback on the means, u = u' + F (x - x').
 
-    They are a program's, or the regulator's of the stages of a problem.
+    It is a program's, or F = -K with the gains K of the regulator of a problem's stages.
     """
-    gains = feedback
+    F = feedback
     if not len(feedback):
         stages = local.stages
-        gains = -prediction.gains(stages.A, stages.B, local.cost)
-    return np.ascontiguousarray(gains[:, :, : prediction.state_dim])
+        F = -prediction.gains(stages.A, stages.B, local.cost)
+    return np.ascontiguousarray(F[:, :, : prediction.state_dim])

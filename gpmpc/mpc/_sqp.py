@@ -79,7 +79,7 @@ class PriceTerms(NamedTuple):
 
     references: References
     prices: Array  # of violated rows (r,), infinite for hard ones
-    row_price: float  # of those
+    hard_price: float  # what a hard row counts in the merit instead
 
 
 class StepForecast(NamedTuple):
@@ -87,7 +87,7 @@ class StepForecast(NamedTuple):
 
     cost: float  # of the plan, with the price of its violated rows
     promised: float  # likewise of the proposed plan, as the program sees it
-    curvature: float  # of the step in the cost: its length, squared
+    squared_length: float  # of the step in the metric of the cost
     defect: float  # the largest of the plan, relative to the states
     merit: float  # of the plan, under the new prices of defects
     defect_prices: Array  # above the multipliers of the dynamics (p,)
@@ -97,14 +97,14 @@ class StepMeasures(NamedTuple):
     """The cost of a plan, and the length of a program's step away from it."""
 
     cost: float  # of the plan, with the price of its violated rows
-    step: float  # the step's length in the metric of the cost, squared
+    squared_length: float  # of the step in the metric of the cost
 
 
 class Continuity(NamedTuple):
     """Whether a program's step is one more along the last plan."""
 
     continues: bool
-    step: float  # its length in the metric of the cost, squared
+    squared_length: float  # of the step in the metric of the cost
 
 
 class Iterate(NamedTuple):
@@ -112,6 +112,13 @@ class Iterate(NamedTuple):
 
     local: LocalProblem
     status: Status | None  # None where it goes on
+
+
+class _Trial(NamedTuple):
+    """A problem at a length of the step to a proposed plan."""
+
+    length: float  # in (0, 1]
+    local: LocalProblem
 
 
 class Progress(NamedTuple):
@@ -170,24 +177,30 @@ def measure_continuity(
     """
     terms = PriceTerms(request.references, row_prices, 0.0)
     measures = _measure_step.unchecked(local, terms, proposed)
-    step = measures.step
-    last_steps = () if request.previous is None else request.previous.steps
-    if len(last_steps) == 0:
-        return Continuity(continues=True, step=step)
+    squared_length = measures.squared_length
+    last_lengths = () if request.previous is None else request.previous.steps
+    if len(last_lengths) == 0:
+        return Continuity(continues=True, squared_length=squared_length)
     slight = _SLIGHT * (measures.cost + smallest_cost(prediction, request))
-    continues = step <= max(slight, _FURTHER * last_steps[0])
-    return Continuity(continues=continues, step=step)
+    continues = squared_length <= max(slight, _FURTHER * last_lengths[0])
+    return Continuity(continues=continues, squared_length=squared_length)
 
 
 def smallest_cost(prediction: PredictionModel, request: Request) -> float:
     """Returns the cost of an input that is small beside the last one, the cheapest."""
     lower, upper = prediction.problem.inputs.first
     R = prediction.costs.quadratic.input[0]
-    return _smallest_cost.unchecked(R, lower, upper, request.references.previous_input)
+    return _cost_of_small_input.unchecked(
+        R, lower, upper, request.references.previous_input
+    )
 
 
 class Globalization:
     """Chooses the steps of one request's iteration, and says where it ends.
+
+    For each program the caller calls ``correct`` before it is solved, and ``take_step``
+    after. ``take_step`` remembers the gradient at the plan, from which the next
+    ``correct``, at another plan, makes an update of the Hessian.
 
     Args:
         prediction: Of the controller.
@@ -196,7 +209,7 @@ class Globalization:
         row_prices: Of violated rows (r,), infinite for hard ones.
 
     Attributes:
-        steps: Lengths of the programs' steps, squared in the metric of the cost.
+        squared_lengths: Of the programs' steps, in the metric of the cost.
     """
 
     def __init__(
@@ -209,13 +222,13 @@ class Globalization:
         self._prediction = prediction
         self._request = request
         self._tolerance = tolerance
-        self._smallest_cost = smallest_cost(prediction, request)
+        self._cost_floor = smallest_cost(prediction, request)
         self._terms = PriceTerms(request.references, row_prices, 0.0)
         weight = prediction.costs.quadratic.terminal
         self._defect_prices = np.zeros(weight[:, 0].size)
         self._curvature = CurvatureUpdates()
         self._progress = Progress()
-        self.steps: list[float] = []
+        self.squared_lengths: list[float] = []
 
     def correct(
         self, program: CondensedProgram, local: LocalProblem
@@ -223,7 +236,7 @@ class Globalization:
         """Returns a program with the curvature that the last steps showed."""
         return self._curvature.correct(program, local, self._progress)
 
-    def step(
+    def take_step(
         self,
         local: LocalProblem,
         program: CondensedProgram,
@@ -239,10 +252,15 @@ class Globalization:
             proposed: The plan that the solution means.
         """
         self._curvature.remember(program, solution, local)
-        forecast = self._forecast(local, solution, proposed)
-        self.steps.append(forecast.curvature)
-        scale = forecast.cost + self._smallest_cost
-        offset = math.sqrt(forecast.curvature / scale)
+        multipliers = _multipliers_by_stage(solution, local)
+        self._raise_hard_price(multipliers)
+        forecast = _forecast_step.unchecked(
+            local, self._terms, self._defect_prices, proposed, multipliers
+        )
+        self._defect_prices = forecast.defect_prices
+        self.squared_lengths.append(forecast.squared_length)
+        scale = forecast.cost + self._cost_floor
+        offset = math.sqrt(forecast.squared_length / scale)
         self._progress = self._progress.after(max(offset, forecast.defect))
         if self._progress.is_converged(self._tolerance):
             return Iterate(local._replace(plan=proposed), Status.SOLVED)
@@ -251,20 +269,12 @@ class Globalization:
             return Iterate(trial, None)
         return self._end_without_step(local, proposed)
 
-    def _forecast(
-        self, local: LocalProblem, solution: QPSolution, proposed: Plan
-    ) -> StepForecast:
-        """Returns the promise of a step, under prices above its multipliers."""
-        multipliers = _row_multipliers(solution, local)
+    def _raise_hard_price(self, multipliers: Array) -> None:
+        """Raises the price of hard rows above their multipliers (H, r)."""
         if multipliers.size:
             largest = float(np.abs(multipliers).max())
-            row_price = max(self._terms.row_price, 2.0 * largest)
-            self._terms = self._terms._replace(row_price=row_price)
-        forecast = _forecast_step.unchecked(
-            local, self._terms, self._defect_prices, proposed, multipliers
-        )
-        self._defect_prices = forecast.defect_prices
-        return forecast
+            hard_price = max(self._terms.hard_price, 2.0 * largest)
+            self._terms = self._terms._replace(hard_price=hard_price)
 
     def _search_line(
         self,
@@ -275,7 +285,9 @@ class Globalization:
     ) -> LocalProblem | None:
         """Returns the first trial whose merit is lower by enough; None without one."""
         progress = self._progress
-        slope = forecast.promised - forecast.curvature - forecast.merit
+        # The program's cost along the step is merit + slope t + squared_length t^2,
+        # which is what it promised at t = 1.
+        slope = forecast.promised - forecast.squared_length - forecast.merit
         # What can be gained is lost in the rounding of merits.
         invisible = progress.size**2 <= _ROUND_OFF
         for length, trial in self._trials(local, program, proposed):
@@ -297,14 +309,16 @@ class Globalization:
 
     def _trials(
         self, local: LocalProblem, program: CondensedProgram, proposed: Plan
-    ) -> Iterator[tuple[float, LocalProblem]]:
-        """Yields lengths of the step to a proposed plan, and problems there.
+    ) -> Iterator[_Trial]:
+        """Yields problems on the step to a proposed plan, the longest ones first.
 
         Each length has two: at the plan itself, and at one that obeys the dynamics.
         """
         prediction = self._prediction
         request = self._request
-        for length, obeys in product(_STEP_LENGTHS, self._order_of_trials()):
+        obeying_first = self._tries_obeying_plan_first()
+        order = (obeying_first, not obeying_first)
+        for length, obeys in product(_STEP_LENGTHS, order):
             target = _between(local.plan, proposed, length)
             try:
                 if obeys:
@@ -315,10 +329,10 @@ class Globalization:
                     trial = prediction.linearize(prediction.canonical(target), request)
             except FAILURES:  # a trial plan may lead the model out of its numbers
                 continue
-            yield length, trial
+            yield _Trial(length, trial)
 
-    def _order_of_trials(self) -> tuple[bool, bool]:
-        """Returns whether the first and the second trial of a length obey the dynamics.
+    def _tries_obeying_plan_first(self) -> bool:
+        """Returns whether the first trial of a length obeys the dynamics.
 
         Far from a solution plans that obey lead further, and where the iteration creeps
         their gradients are needed; they come first where moments are linearised, too,
@@ -327,11 +341,10 @@ class Globalization:
         """
         progress = self._progress
         request = self._request
-        continued = request.previous is not None and request.states is None
+        continued = request.previous is not None and request.guessed_states is None
         far = progress.size > _NEAR and not (progress.is_first and continued)
-        if self._prediction.linearizer.at_points and not (progress.creeps or far):
-            return False, True
-        return True, False
+        matches_moments = not self._prediction.linearizer.needs_no_covariance
+        return matches_moments or progress.creeps or far
 
     def _end_without_step(self, local: LocalProblem, proposed: Plan) -> Iterate:
         """Returns how an iteration ends whose line search found no plan."""
@@ -351,14 +364,16 @@ class LagrangianGradient(NamedTuple):
 
     inputs: Array  # of the plan (H m,)
     gradient: Array  # by the inputs (H m,)
-    row_multipliers: Array  # of the program (rows,)
+    # of the rows G (rows,); those of the box are left out: their part of the gradient is
+    # the same at every plan
+    multipliers: Array
     obeys: bool  # whether the plan obeyed the dynamics
 
 
 class HessianUpdate(NamedTuple):
-    """A step of the inputs, and the change of the gradient along it."""
+    """A change of the inputs, and how the gradient changed with it."""
 
-    step: Array  # (H m,)
+    input_change: Array  # (H m,)
     gradient_change: Array  # (H m,)
 
 
@@ -377,11 +392,15 @@ class CurvatureUpdates:
             return
         inputs = local.plan.inputs.ravel()
         gradient = program.P @ inputs + program.q
-        row_multipliers = solution.z
-        if len(row_multipliers):
-            gradient = gradient + program.G.T @ row_multipliers
-        obeys = _obeys_dynamics(local)
-        self._last = LagrangianGradient(inputs, gradient, row_multipliers, obeys)
+        multipliers = solution.z
+        if len(multipliers):
+            gradient = gradient + program.G.T @ multipliers
+        self._last = LagrangianGradient(
+            inputs=inputs,
+            gradient=gradient,
+            multipliers=multipliers,
+            obeys=_obeys_dynamics(local),
+        )
 
     def correct(
         self, program: CondensedProgram, local: LocalProblem, progress: Progress
@@ -395,13 +414,13 @@ class CurvatureUpdates:
         if last is not None and last.obeys and _obeys_dynamics(local):
             near = _NOISE < progress.size**2 < _NEAR**2
             if near and np.any(inputs != last.inputs):
-                change = gradient + program.G.T @ last.row_multipliers - last.gradient
+                change = gradient + program.G.T @ last.multipliers - last.gradient
                 self._updates.append(HessianUpdate(inputs - last.inputs, change))
         if not (self._updates and progress.creeps):
             return program
         P = program.P.copy()
         for update in self._updates:
-            _update(P, update.step, update.gradient_change)
+            _update(P, update.input_change, update.gradient_change)
         return program._replace(P=P, q=gradient - P @ inputs)
 
     def forget(self) -> bool:
@@ -424,11 +443,10 @@ def _between(plan: Plan, other: Plan, length: float) -> Plan:
     )
 
 
-def _row_multipliers(solution: QPSolution, local: LocalProblem) -> Array:
-    """Returns those of the rows of the states (H, r), a program's last ones."""
-    row_multipliers = solution.z
+def _multipliers_by_stage(solution: QPSolution, local: LocalProblem) -> Array:
+    """Returns multipliers of the state rows (H, r), which are a program's last rows."""
     count = local.rows.lower.size
-    last_rows = row_multipliers[len(row_multipliers) - count :]
+    last_rows = solution.z[len(solution.z) - count :]
     return last_rows.reshape(local.rows.lower.shape)
 
 
@@ -440,7 +458,7 @@ def _obeys_dynamics(local: LocalProblem) -> bool:
 
 
 @compiled
-def _smallest_cost(R, lower, upper, previous_input):
+def _cost_of_small_input(R, lower, upper, previous_input):
     """Returns the cost of an input that is small beside the last one, the cheapest."""
     least = np.inf
     for j in range(len(R)):
@@ -466,15 +484,15 @@ def _cost_of_step(cost, references, plan, proposed):
 def _priced_cost(cost, terms, rows, plan):
     """Returns the cost of a plan, with the price of its violated rows."""
     total = evaluate_cost(cost, plan.states, plan.inputs, terms.references, 1.0)
-    return total + price_violations(terms.prices, rows, plan, terms.row_price)
+    return total + price_violations(terms.prices, rows, plan, terms.hard_price)
 
 
 @compiled
 def _measure_step(local, terms, proposed):
     """Returns the ``StepMeasures`` of a program's step."""
     cost = _priced_cost(local.cost, terms, local.rows, local.plan)
-    step = _cost_of_step(local.cost, terms.references, local.plan, proposed)
-    return StepMeasures(cost, step)
+    squared_length = _cost_of_step(local.cost, terms.references, local.plan, proposed)
+    return StepMeasures(cost, squared_length)
 
 
 @compiled
@@ -497,7 +515,7 @@ def _forecast_step(local, terms, defect_prices, proposed, multipliers):
             largest_state = max(largest_state, abs(states[k + 1, i]))
     cost = _priced_cost(local.cost, terms, local.rows, local.plan)
     promised = _priced_cost(local.cost, terms, local.rows, proposed)
-    curvature = _cost_of_step(local.cost, terms.references, local.plan, proposed)
+    squared_length = _cost_of_step(local.cost, terms.references, local.plan, proposed)
     targets = terms.references.states
     costates = _costates(
         local.cost, local.stages.A, proposed, targets, local.rows.E, multipliers
@@ -508,7 +526,7 @@ def _forecast_step(local, terms, defect_prices, proposed, multipliers):
             prices[i] = max(prices[i], 1.5 * abs(costates[k, i]))
     merit = cost + dot(defects, prices, p)
     relative_defect = largest_defect / largest_state
-    return StepForecast(cost, promised, curvature, relative_defect, merit, prices)
+    return StepForecast(cost, promised, squared_length, relative_defect, merit, prices)
 
 
 @compiled
@@ -560,17 +578,17 @@ def _costates(cost, A, plan, targets, E, multipliers):
     return costates
 
 
-def _update(P: Array, step: Array, gradient_change: Array) -> None:
-    """Updates P towards P step = gradient_change, so that it stays positive definite.
+def _update(P: Array, input_change: Array, gradient_change: Array) -> None:
+    """Updates P towards P input_change = gradient_change; it stays positive definite.
 
     It is damped for that (Powell, 1978).
     """
-    product_with_step = P @ step
-    curvature = step @ product_with_step
-    new_curvature = step @ gradient_change
+    product_with_P = P @ input_change
+    curvature = input_change @ product_with_P
+    new_curvature = input_change @ gradient_change
     damping = 1.0
     if new_curvature < 0.2 * curvature:
         damping = 0.8 * curvature / (curvature - new_curvature)
-    damped = damping * gradient_change + (1.0 - damping) * product_with_step
-    P += np.outer(damped, damped) / (step @ damped)
-    P -= np.outer(product_with_step, product_with_step) / curvature
+    damped = damping * gradient_change + (1.0 - damping) * product_with_P
+    P += np.outer(damped, damped) / (input_change @ damped)
+    P -= np.outer(product_with_P, product_with_P) / curvature

@@ -277,7 +277,7 @@ class ManyStarts:
         self.controller = controller
         self.planner = controller if planner is None else planner
         for one in (self.controller, self.planner):
-            if one.prediction.settings.form != "trajectory":
+            if one.prediction.settings.is_held:
                 raise SettingError(
                     "controller",
                     "must be of form 'trajectory', whose plans may start anywhere",

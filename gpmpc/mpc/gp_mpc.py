@@ -61,7 +61,7 @@ from gpmpc.mpc._linear_quadratic import (
 from gpmpc.mpc._linearization import LocalProblem, PredictionModel, PredictionSettings
 from gpmpc.mpc._novelty import data_scales, later, novelty_of
 from gpmpc.mpc._roll_out import close_defects, cost_of_inputs
-from gpmpc.mpc._sqp import FAILURES, Globalization, measure_continuity
+from gpmpc.mpc._sqp import FAILURES, Globalization, Iterate, measure_continuity
 from gpmpc.mpc._stability import Stability, stability
 from gpmpc.mpc.problem import Problem
 from gpmpc.propagation import Propagator
@@ -130,8 +130,9 @@ class GPMPC:
             as solved (``gpmpc.mpc._sqp``), estimated from the slower of the last two
             rates of convergence. 1e-8 may be out of reach. By default 1e-2 where the
             number of programs is not set, and 1e-6 where it is.
-        budget: Time of a decision after which no further program is begun [s]; None for
-            no limit. Decisions then depend on the machine.
+        budget: Time of a decision after which no further program is begun [s]: it then
+            ends with ``TIME_LIMIT``, unless it was solved. None for no limit. Decisions
+            then depend on the machine.
 
     Raises:
         SettingError: A setting is unknown or out of its range, or model and problem
@@ -154,7 +155,7 @@ class GPMPC:
         self.prediction = PredictionModel(
             model, propagator, problem, horizon, initial_input, prediction
         )
-        _check_iterations(iterations, prediction.form)
+        _check_iterations(iterations, prediction)
         if tolerance is None:
             tolerance = _LOOSE if iterations is None else _TIGHT
         check_number("tolerance", tolerance, above=0)
@@ -173,8 +174,9 @@ class GPMPC:
             rule = "soft constraints need DualActiveSet (penalty=None makes them hard)"
             raise SettingError("solver", f"{rule}; got {type(self.solver).__name__}")
         self._most_programs = iterations or _MOST
-        if prediction.form == "velocity":
+        if not prediction.may_iterate:
             self._most_programs = 1
+        #: what novelty is measured by; see ``with_model``
         self._scales = data_scales(model)
 
     @property
@@ -193,8 +195,9 @@ class GPMPC:
         """Decides the input for one step; see ``Controller.control``.
 
         A belief that is not finite gives ``INVALID_MEASUREMENT``. ``iterations`` of the
-        decision counts quadratic programs; ``ITERATION_LIMIT`` says that the tolerance
-        was not reached: the plan is the best there was.
+        decision counts quadratic programs; ``ITERATION_LIMIT``, or ``TIME_LIMIT`` where
+        the budget was spent, says that the tolerance was not reached: the plan is the
+        best there was.
 
         Args:
             belief: What is known of the state.
@@ -233,10 +236,10 @@ class GPMPC:
             if local is None:
                 guess = initial_guess(self.prediction, request)
                 local = self.prediction.linearize(guess, request)
-            is_first = request.previous is None and request.states is None
-            chooses = self.iterations is None and self._most_programs > 1
+            is_first = request.previous is None and request.guessed_states is None
+            number_is_open = self.iterations is None and self._most_programs > 1
             # A curved bound lies elsewhere than one program sees it.
-            if is_first and chooses and not self.prediction.constraints.smooth:
+            if is_first and number_is_open and not self.prediction.constraints.smooth:
                 return self._decide_first(local, request, stopwatch)
             return self._improve(local, request, stopwatch, self._most_programs)
         except FAILURES as error:
@@ -265,9 +268,10 @@ class GPMPC:
         horizon shows. A swing-up that is iterated at once may lean for ever.
         """
         quick = self._improve(local, request, stopwatch, most_programs=1)
-        if not (quick.applicable and self.prediction.linearizer.at_points):
+        linearizer = self.prediction.linearizer
+        if not (quick.applicable and linearizer.needs_no_covariance):
             return quick
-        if self.budget is not None and stopwatch.elapsed > self.budget:
+        if self._is_late(stopwatch):
             return quick
         try:
             thorough = self._improve(local, request, stopwatch, self._most_programs)
@@ -281,6 +285,10 @@ class GPMPC:
             iterations=quick.iterations + thorough.iterations,
             timing=stopwatch.timing,
         )
+
+    def _is_late(self, stopwatch: Stopwatch) -> bool:
+        """Returns whether a decision has spent its budget."""
+        return self.budget is not None and stopwatch.elapsed > self.budget
 
     def control_many(
         self,
@@ -320,7 +328,10 @@ class GPMPC:
     def with_model(self, model: DynamicsModel) -> "GPMPC":
         """Returns the controller for another model of as many states and inputs.
 
-        It takes microseconds.
+        It takes microseconds: the novelty of its plans is still measured by the ranges
+        and variances of the first model's data, which would take longer to read anew.
+        So what is learned in flight does not move the scale, and a plan that has left
+        the ranges of that data counts as far from it.
         """
         other = copy(self)
         other.prediction = self.prediction.with_model(model)
@@ -401,7 +412,7 @@ class _Step(NamedTuple):
     """The problem at the plan that a program's step leads to."""
 
     local: LocalProblem
-    status: Status | None  # None where more steps are needed
+    status: Status | None  # None where the iteration goes on
     leaves_defects: bool  # whether the plan is to be rolled out before it is used
 
 
@@ -421,10 +432,9 @@ class _Attempt:
         self._stopwatch = stopwatch
         self._most_programs = most_programs
         self._programs = 0  # solved so far
-        self._is_late = False
         self._row_prices = self._prediction.constraints.prices
         self._globalization: Globalization | None = None
-        self._steps: Sequence[float] = ()
+        self._squared_lengths: Sequence[float] = ()  # of the programs' steps
         self._warm_start: QPSolution | None = None
         if request.previous is not None:
             self._warm_start = request.previous.solution
@@ -446,22 +456,49 @@ class _Attempt:
             if step.status is None and self._may_go_on:
                 local = step.local
                 continue
-            ending = step.local
-            if step.leaves_defects or self._rolls_out:
-                ending = self._close_defects(ending, local, program)
-            solved = step.status is not None and step.status.solved
-            if not solved or self._keeps_promise(ending, solution):
-                return self._conclude(ending, guess, solution, step.status)
-            if not self._may_go_on:
-                status = None if self._most_programs > 1 else step.status
-                return self._conclude(ending, guess, solution, status)
+            ending = self._end(step, local, program, solution)
+            if ending.status is not None:
+                return self._conclude(ending.local, guess, solution, ending.status)
             # A curved bound lies elsewhere than the program saw it.
-            local = self._prediction.linearize(ending.plan, self._request)
+            local = self._prediction.linearize(ending.local.plan, self._request)
+
+    def _end(
+        self,
+        step: _Step,
+        local: LocalProblem,
+        program: CondensedProgram,
+        solution: QPSolution,
+    ) -> Iterate:
+        """Returns the plan to end with, rolled out where that is due, and its status.
+
+        The iteration goes on where the plan misses a smooth constraint by more than its
+        program promised, and one more program may be solved.
+        """
+        ending = step.local
+        if step.leaves_defects or self._rolls_out:
+            ending = self._close_defects(ending, local, program)
+        if step.status is None:
+            return Iterate(ending, self._limit)
+        if not step.status.solved or self._keeps_promise(ending, solution):
+            return Iterate(ending, step.status)
+        if self._may_go_on:
+            return Iterate(ending, None)
+        # A single program was never to keep more than it promised.
+        status = step.status if self._most_programs == 1 else self._limit
+        return Iterate(ending, status)
 
     @property
     def _may_go_on(self) -> bool:
         """Whether one more program may be solved."""
-        return self._programs < self._most_programs and not self._is_late
+        is_late = self._controller._is_late(self._stopwatch)
+        return self._programs < self._most_programs and not is_late
+
+    @property
+    def _limit(self) -> Status:
+        """The limit that keeps the iteration from one more program."""
+        if self._programs < self._most_programs:
+            return Status.TIME_LIMIT
+        return Status.ITERATION_LIMIT
 
     @property
     def _rolls_out(self) -> bool:
@@ -560,10 +597,9 @@ class _Attempt:
                 self._controller.tolerance,
                 self._row_prices,
             )
-        iterate = self._globalization.step(local, program, solution, planned.plan)
-        self._steps = self._globalization.steps
-        budget = self._controller.budget
-        self._is_late = budget is not None and self._stopwatch.elapsed > budget
+        globalization = self._globalization
+        iterate = globalization.take_step(local, program, solution, planned.plan)
+        self._squared_lengths = globalization.squared_lengths
         tightly_solved = iterate.status is Status.SOLVED
         if self._controller.iterations is None:  # its tolerance is a loose one
             tightly_solved = False
@@ -578,19 +614,22 @@ class _Attempt:
             return True
         request = self._request
         follows = self._prediction.constraints.smooth or request.previous is not None
-        chooses = self._controller.iterations is None and follows
-        if not chooses or self._programs > 1:
+        may_stop_after_one = self._controller.iterations is None and follows
+        if not may_stop_after_one or self._programs > 1:
             return False
         continuity = measure_continuity(
             self._prediction, request, local, proposed, self._row_prices
         )
-        self._steps = [continuity.step]
+        self._squared_lengths = [continuity.squared_length]
         return continuity.continues
 
     def _planned(
         self, program: CondensedProgram, solution: QPSolution, local: LocalProblem
     ) -> LocalProblem:
-        """Returns a problem with the plan that the solution of its program means."""
+        """Returns a problem with the plan that the solution of its program means.
+
+        Stages and rows stay where they were linearised.
+        """
         inputs, states = expand.unchecked(
             local.stages,
             local.plan.states[0],
@@ -631,19 +670,14 @@ class _Attempt:
         local: LocalProblem,
         guess: Plan,
         solution: QPSolution,
-        status: Status | None,
+        status: Status,
     ) -> Decision:
-        """Returns the decision for a plan: failed if it is the guess or infeasible.
-
-        A status of None means that more programs were needed than were allowed.
-        """
+        """Returns the decision for a plan: failed if it is the guess or infeasible."""
         self._stopwatch.lap("model")
         request = self._request
         plan = local.plan
         timing = self._stopwatch.timing
         problem = QuadraticProgram._make(solution.arrays)
-        if status is None:
-            status = Status.ITERATION_LIMIT
         solved = status.solved
         suboptimal = not solved and plan is not guess and self._keeps_hard_rows(local)
         if not (solved or suboptimal):
@@ -671,7 +705,7 @@ class _Attempt:
             plan_novelty=self._novelty(local, means, inputs, covariances),
             stage_costs=local.stage_costs(request.references),
             violation=violation,
-            steps=tuple(self._steps),
+            steps=tuple(self._squared_lengths),
         )
 
     def _keeps_hard_rows(self, local: LocalProblem) -> bool:
@@ -697,13 +731,13 @@ class _Attempt:
         return later(self._prediction.model, means, inputs, covariances, scales)
 
 
-def _check_iterations(iterations: int | None, form: str) -> None:
+def _check_iterations(iterations: int | None, prediction: PredictionSettings) -> None:
     """Raises ``SettingError`` unless a form may take so many programs."""
     if iterations is None:
         return
     check_number("iterations", iterations, least=1, whole=True)
-    if iterations > 1 and form != "trajectory":
-        rule = f"form {form!r} is one quadratic program, so 1"
+    if iterations > 1 and not prediction.may_iterate:
+        rule = f"form {prediction.form!r} is one quadratic program, so 1"
         raise SettingError("iterations", f"{rule}; got {iterations}")
 
 
@@ -718,7 +752,9 @@ def _is_usable(program: CondensedProgram, solution: QPSolution, plan: Plan) -> b
     """Returns whether a solution leads to a plan that is no worse.
 
     It does where it was solved, or where the solver stopped at a limit at a feasible
-    point that costs no more than the plan.
+    point that costs no more than the plan. In feedback coordinates the plan has no
+    unknowns of its own: there the point is compared with v = 0, the optimum without
+    bounds, which costs least, so that it is used only where that breaks a hard row.
     """
     status = solution.status
     if status.solved:
@@ -731,9 +767,9 @@ def _is_usable(program: CondensedProgram, solution: QPSolution, plan: Plan) -> b
     unknowns = plan.inputs.ravel()
     if len(program.feedback):
         unknowns = 0.0 * solution.x
-    of_plan = solution._replace(x=unknowns)
-    plan_is_infeasible = _hard_violation(of_plan) > FEASIBLE
-    return plan_is_infeasible or solution.objective <= of_plan.objective
+    alternative = solution._replace(x=unknowns)
+    is_infeasible = _hard_violation(alternative) > FEASIBLE
+    return is_infeasible or solution.objective <= alternative.objective
 
 
 def _hard_violation(solution: QPSolution) -> float:

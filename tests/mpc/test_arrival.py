@@ -213,7 +213,7 @@ def test_the_first_plan_stands_where_later_programs_fail(monkeypatch):
     def fails(*arguments):
         raise DataError("beyond the model's numbers")
 
-    monkeypatch.setattr(Globalization, "step", fails)
+    monkeypatch.setattr(Globalization, "take_step", fails)
     decision = controller.control(at, reference)
     assert decision.status is Status.SOLVED
     assert decision.iterations == 1

@@ -3,6 +3,7 @@ reference and state."""
 
 from dataclasses import replace
 
+import casadi
 import numpy as np
 import pytest
 import torch
@@ -10,6 +11,7 @@ import torch
 from gpmpc.exceptions import SettingError
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import backend
+from gpmpc.models import CasadiFunction, KnownModel
 from gpmpc.mpc import (
     GPMPC,
     Box,
@@ -195,3 +197,32 @@ def test_with_model_gives_the_controller_made_with_that_model(iterations):
     expected = mpc_of_other.control(belief, AT_REST, plan=inputs)
     assert np.array_equal(decision.means, expected.means)
     assert np.array_equal(decision.inputs, expected.inputs)
+
+
+class TurningModel(KnownModel):
+    """A pendulum whose model says that its first state is an angle."""
+
+    angles = (0,)
+
+
+def turning_model():
+    x = casadi.SX.sym("x", 2)
+    u = casadi.SX.sym("u")
+    after = casadi.vertcat(x[0] + 0.1 * x[1], x[1] - 0.4 * casadi.sin(x[0]) + 0.1 * u)
+    return TurningModel(CasadiFunction(casadi.Function("f", [x, u], [after])), 2, 1)
+
+
+@pytest.mark.parametrize("gain", [0.0, 0.5])
+def test_a_sensor_may_take_a_turn_off_an_angle_of_the_model(gain):
+    problem = Problem(Tracking([0.0, 1.0], [0.1]), inputs=Box([-6.0], [6.0]))
+    settings = PredictionSettings(covariance="none", disturbance_gain=gain)
+    steering = GPMPC(
+        turning_model(), Linearization(), problem, H, [0.0], settings, iterations=1
+    )
+    reference = Reference(np.array([0.0, 2.0]))
+    last = steering.control(Gaussian.certain(np.array([3.0, 2.0])), reference)
+    state = last.means[1] + 0.01
+    turned = state - [2.0 * np.pi, 0.0]
+    expected = steering.control(Gaussian.certain(state), reference, last)
+    decision = steering.control(Gaussian.certain(turned), reference, last)
+    assert np.allclose(decision.inputs, expected.inputs, rtol=0, atol=1e-9)

@@ -18,10 +18,10 @@ from gpmpc.mpc._linearization import LocalProblem
 from gpmpc.mpc._sqp import (
     PriceTerms,
     _between,
+    _cost_of_small_input,
     _costates,
     _forecast_step,
     _merit,
-    _smallest_cost,
     _update,
 )
 
@@ -75,7 +75,7 @@ class Case:
         self.A = rng.normal(size=(H, P, P))
         self.after = 2 * rng.normal(size=(H, P))
         self.prices = np.array([3.0, np.inf])
-        self.row_price = 7.0
+        self.hard_price = 7.0
         self.defect_prices = rng.uniform(0, 2, P)
         self.z = rng.normal(size=(H, R))
 
@@ -93,7 +93,7 @@ class Case:
 
     @property
     def terms(self):
-        return PriceTerms(self.references, self.prices, self.row_price)
+        return PriceTerms(self.references, self.prices, self.hard_price)
 
     def cost_of(self, plan):
         return evaluate_cost(self.cost, plan.states, plan.inputs, self.references, 1.0)
@@ -122,7 +122,7 @@ def test_violated_rows_cost_their_price_hard_ones_the_given(squares, inputs, rng
     seen = set()
     for _ in range(20):
         case = Case(rng, squares, inputs)
-        price = price_violations(case.prices, case.rows, case.plan, case.row_price)
+        price = price_violations(case.prices, case.rows, case.plan, case.hard_price)
         assert price == pytest.approx(case.price_of(case.plan), rel=1e-12)
         seen.add(price > 0)
     assert True in seen
@@ -189,7 +189,7 @@ def test_the_promise_of_a_step_is_measured_by_the_plans_cost(
         assert forecast.cost == pytest.approx(
             case.cost_of(case.plan) + case.price_of(case.plan), rel=1e-12
         )
-        assert forecast.curvature == pytest.approx(
+        assert forecast.squared_length == pytest.approx(
             evaluate_cost(case.cost, *step, zero, 0.0), rel=1e-12
         )
         assert forecast.promised == pytest.approx(
@@ -250,14 +250,14 @@ def test_between_two_plans_every_part_moves_by_the_same_share(rng):
 def test_the_smallest_cost_is_of_a_thousandth_of_one_input():
     R_ = np.diag([4.0, 9.0])
     wide = np.full(2, np.inf)
-    assert _smallest_cost(R_, -wide, wide, np.zeros(2)) == pytest.approx(4e-6)
-    assert _smallest_cost(R_, -wide, wide, np.array([-10.0, 0.5])) == pytest.approx(
-        9e-6
-    )
-    assert _smallest_cost(
+    assert _cost_of_small_input(R_, -wide, wide, np.zeros(2)) == pytest.approx(4e-6)
+    assert _cost_of_small_input(
+        R_, -wide, wide, np.array([-10.0, 0.5])
+    ) == pytest.approx(9e-6)
+    assert _cost_of_small_input(
         R_, np.array([-0.25, -9.0]), np.array([0.25, 9.0]), np.zeros(2)
     ) == pytest.approx(1e-6)
-    assert _smallest_cost(0 * R_, -wide, wide, np.zeros(2)) > 0
+    assert _cost_of_small_input(0 * R_, -wide, wide, np.zeros(2)) > 0
 
 
 def test_inputs_are_clipped_to_their_rates_one_after_another(rng):

@@ -448,10 +448,10 @@ def test_a_plan_stopped_at_a_limit_is_a_warm_start_no_failed_one():
     )
     stopped = impatient.control(belief((2.0, -2.0)), swing(4))
     request = Request.read(problem, 4, np.zeros(1), belief(), swing(4), stopped)
-    assert np.array_equal(request.initial_guess, stopped.inputs[[1, 2, 3, 3]])
+    assert np.array_equal(request.guessed_inputs, stopped.inputs[[1, 2, 3, 3]])
     failed = replace(stopped, suboptimal=False)
     request = Request.read(problem, 4, np.zeros(1), belief(), swing(4), failed)
-    assert np.array_equal(request.initial_guess, request.constant_guess)
+    assert np.array_equal(request.guessed_inputs, request.constant_guess)
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -23,6 +23,7 @@ from gpmpc.mpc import (
     Reference,
     Tracking,
 )
+from gpmpc.mpc._linear_quadratic import Plan
 from gpmpc.mpc.baselines import LQR, NMPC, StateFormMPC
 from gpmpc.propagation import Linearization
 from gpmpc.status import Status
@@ -317,6 +318,12 @@ def test_mistakes_are_one_clear_error():
         controller.control(at, GOAL, plan=np.zeros((3, 2)))
     with pytest.raises(DataError, match="a plan to start from must be finite"):
         controller.control(at, GOAL, plan=np.full((7, 2), np.nan))
+    last = controller.control(at, GOAL)
+    plan = Plan(last.means, last.inputs, last.covariances)
+    with pytest.raises(
+        ShapeError, match=r"or a pair \(inputs, states\); got a Plan of 3"
+    ):
+        controller.control(at, GOAL, plan=plan)
 
 
 def test_functions_are_checked_where_a_flight_starts():

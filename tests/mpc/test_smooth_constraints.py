@@ -83,6 +83,22 @@ def test_a_disc_in_the_way_is_passed_without_touching_it(h):
     assert np.allclose(around[-1], goal, atol=1e-3)
 
 
+def inside(x, u, p):
+    """Distance out of a disc at p: plans miss it by more than programs promise."""
+    return torch.linalg.vector_norm(x - p, dim=-1) - RADIUS
+
+
+def test_a_spent_budget_ends_whole_steps_too():
+    belief = Gaussian.certain(np.array([0.6, -0.3]))
+    reference = Reference(np.array([1.3, 0.4]))
+    patient = controller(Inequality(inside)).control(belief, reference, None, CENTRE)
+    assert patient.iterations > 1
+    hurried = controller(Inequality(inside), budget=1e-9)
+    decision = hurried.control(belief, reference, None, CENTRE)
+    assert decision.iterations == 1
+    assert decision.status is Status.TIME_LIMIT
+
+
 def test_a_moving_disc_is_passed_where_it_will_be():
     goal = np.array([1.3, 0.0])
 

@@ -447,7 +447,7 @@ def test_a_guess_rests_at_the_state_where_its_inputs_overflow():
     request = read_request(
         controller.prediction, belief, reference, last, plan=np.full((12, 1), 50.0)
     )
-    assert request.states is not None
+    assert request.guessed_states is not None
     guess = initial_guess(controller.prediction, request)
     assert guess.states.ravel().tolist() == [0.5] * 13
     decision = controller.control(belief, reference, last, plan=np.full((12, 1), 50.0))

@@ -187,12 +187,12 @@ class _StateFormProgram:
         p = len(weights[0])
         self._problem = problem
         self._horizon = H
-        self._points = model.points
+        self._stage_count = model.stage_count
         self.states = cvxpy.Variable((H + 1, p))
         self.inputs = cvxpy.Variable((H, m))
-        self._A = [cvxpy.Parameter((p, p)) for _ in range(model.points)]
-        self._B = [cvxpy.Parameter((p, m)) for _ in range(model.points)]
-        self._c = [cvxpy.Parameter(p) for _ in range(model.points)]
+        self._A = [cvxpy.Parameter((p, p)) for _ in range(model.stage_count)]
+        self._B = [cvxpy.Parameter((p, m)) for _ in range(model.stage_count)]
+        self._c = [cvxpy.Parameter(p) for _ in range(model.stage_count)]
         self._start = cvxpy.Parameter(p)
         self._targets = cvxpy.Parameter((H, p), value=np.zeros((H, p)))
         self._reference_inputs = cvxpy.Parameter((H, m))
@@ -264,7 +264,7 @@ class _StateFormProgram:
 
     def _point(self, k: int) -> int:
         """Returns the point of stage k; later stages share the last one."""
-        return min(k, self._points - 1)
+        return min(k, self._stage_count - 1)
 
     def _constrain_states(self, rows: ConstraintRows) -> tuple[Any, list[Any]]:
         """Returns the price of violated soft bounds, and all bounds as constraints.
@@ -277,7 +277,7 @@ class _StateFormProgram:
         H = self._horizon
         r = rows.per_stage
         p = self.states.shape[1]
-        self._row_values = [cvxpy.Parameter((r, p)) for _ in range(self._points)]
+        self._row_values = [cvxpy.Parameter((r, p)) for _ in range(self._stage_count)]
         self._row_bounds = cvxpy.Parameter((H, r))
         hard = np.isinf(rows.prices)
         price: Any = 0.0
@@ -298,7 +298,7 @@ class _StateFormProgram:
     def set_parameters(self, prediction: LocalProblem, request: Request) -> None:
         """Gives all parameters their values of this step."""
         stages = prediction.stages
-        for point in range(self._points):
+        for point in range(self._stage_count):
             self._A[point].value = stages.A[point]
             self._B[point].value = stages.B[point]
             self._c[point].value = stages.c[point]
@@ -313,7 +313,7 @@ class _StateFormProgram:
             return
         rows = prediction.rows
         signs = self._rows.signs
-        E = np.broadcast_to(rows.E, (self._points, *rows.E.shape[1:]))
+        E = np.broadcast_to(rows.E, (self._stage_count, *rows.E.shape[1:]))
         for parameter, value in zip(self._row_values, E, strict=True):
             parameter.value = signs[:, None] * value
         bounds = np.where(signs > 0, rows.upper, -rows.lower)
