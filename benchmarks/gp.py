@@ -62,7 +62,7 @@ def main() -> None:
     mu = at.mean.numpy()[None]
     S = at.covariance.numpy()[None]
     kernels.linearize_gps(gps, mu, u[None], False, np.zeros(STATES), False)
-    kernels.point_with_jacobian(gps, mu, u[None])
+    kernels.expand_gps(gps, mu, u[None])
     kernels.moments(gps, mu, S, u[None], derivatives=True)
     first = time.perf_counter() - began
     print(
@@ -211,7 +211,7 @@ def linearisation_groups(
                 packed, *at, diagonal=True, derivatives=True
             )
         },
-        {"linearised": lambda: kernels.point_with_jacobian(packed, mu, u)},
+        {"linearised": lambda: kernels.expand_gps(packed, mu, u)},
         {
             "mean with Jacobian": lambda: [
                 part[0]

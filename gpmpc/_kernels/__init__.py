@@ -10,7 +10,7 @@
 ``_simd``        eight numbers in a register: the type ``Lanes`` and its functions
 
 ``gpmpc.propagation._moments`` states the mathematics and serves torch; here the closed
-forms and their first derivatives are evaluated for ``Packed`` arrays, on one thread.
+forms and their derivatives are evaluated for ``Packed`` arrays, on one thread.
 They belong to the k latent functions f of x~ = (x, u), with x ~ N(mu, S) and u certain;
 callers add the previous state, observation noise or a nearest semidefinite covariance.
 Every function takes H points along a first dimension, which all results have in front.
@@ -22,7 +22,12 @@ from typing import NamedTuple
 import numpy as np
 
 from gpmpc._kernels._gp_moments import evaluate_moments
-from gpmpc._kernels._gp_point import PointArrays, expand_points, linearize_points
+from gpmpc._kernels._gp_point import (
+    LinearizedGPs,
+    expand_points,
+    kernel_rows,
+    linearize_points,
+)
 from gpmpc._kernels._packed import Array, GPArrays, Packed, pack
 from gpmpc._kernels._window import Window
 from gpmpc.exceptions import ShapeError
@@ -34,10 +39,10 @@ __all__ = [
     "Moments",
     "Packed",
     "Window",
+    "expand_gps",
     "linearize_gps",
     "moments",
     "pack",
-    "point_with_jacobian",
 ]
 
 
@@ -73,15 +78,6 @@ class Moments(NamedTuple):
     dJ_du: Array  #: (k, n, m)
 
 
-class LinearizedGPs(NamedTuple):
-    """Means of GPs at K points and their derivatives."""
-
-    mean: Array  #: (K, k)
-    A: Array  #: by the state (K, k, n)
-    B: Array  #: by the input (K, k, m)
-    covariance: Array | None  #: diagonal (K, k, k); None where it was not wanted
-
-
 def linearize_gps(
     packed: Packed | Window,
     x: Array,
@@ -90,12 +86,12 @@ def linearize_gps(
     offset: Array,
     adds_state: bool,
 ) -> LinearizedGPs:
-    """Linearises k GPs at K states x (K, n) and inputs u (K, m).
+    """Linearises k GPs at H states and inputs.
 
     Args:
         packed: The GPs.
-        x: States (K, n).
-        u: Inputs (K, m).
+        x: States (H, n).
+        u: Inputs (H, m).
         covariance: Whether covariances are wanted, which take most of the time.
         offset: Prior means of the GPs (k,).
         adds_state: Whether the GPs predict differences x+ - x (k = n).
@@ -103,45 +99,41 @@ def linearize_gps(
     Raises:
         ShapeError: x or u do not fit.
     """
-    K = len(x)
+    H = len(x)
     k = len(packed.arrays.weights)
     n = packed.state_dim
     m = packed.input_dim
-    if x.shape != (K, n) or u.shape != (K, m):
+    if x.shape != (H, n) or u.shape != (H, m):
         raise ShapeError(
-            f"the model takes states (K, {n}) and inputs (K, {m}); got {x.shape} and "
+            f"the model takes states (H, {n}) and inputs (H, {m}); got {x.shape} and "
             f"{u.shape}"
         )
     padded = packed.arrays.points.shape[1]
-    solve_rows = k * (-(-K // 4) * 4) if covariance else 0  # K rounded up to fours
+    solve_rows = k * kernel_rows(H) if covariance else 0
     memory = np.empty((2 * (n + m) + 1 + solve_rows) * padded + 8)
-    linearized = PointArrays(
-        mean=np.empty((K, k)),
-        A=np.empty((K, k, n)),
-        B=np.empty((K, k, m)),
-        covariance=np.zeros((K if covariance else 0, k, k)),
+    variances = np.zeros((H if covariance else 0, k, k))
+    linearized = LinearizedGPs(
+        mean=np.empty((H, k)),
+        A=np.empty((H, k, n)),
+        B=np.empty((H, k, m)),
+        covariance=variances,
     )
-    unused = linearized.covariance  # an array of the same type, which is not read
-    columns = packed.columns if covariance else unused
+    # else an array of the same type, which is not read
+    columns = packed.columns if covariance else variances
     linearize_points.unchecked(
         gp=packed.arrays,
         columns=columns,
-        offset=np.ascontiguousarray(offset, dtype=np.float64),
+        prior_mean=np.ascontiguousarray(offset, dtype=np.float64),
         adds_state=adds_state,
         x=np.ascontiguousarray(x, dtype=np.float64),
         u=np.ascontiguousarray(u, dtype=np.float64),
         memory=memory,
         out=linearized,
     )
-    return LinearizedGPs(
-        mean=linearized.mean,
-        A=linearized.A,
-        B=linearized.B,
-        covariance=linearized.covariance if covariance else None,
-    )
+    return linearized if covariance else linearized._replace(covariance=None)
 
 
-def point_with_jacobian(packed: Packed, x: Array, u: Array) -> Expansion:
+def expand_gps(packed: Packed, x: Array, u: Array) -> Expansion:
     """Returns mean and variance at states x (H, n) and inputs u (H, m), expanded.
 
     Raises ShapeError where x or u do not fit.
@@ -201,7 +193,7 @@ def moments(
     if S.shape != (H, n, n):
         raise ShapeError(f"S must have shape {(H, n, n)}; got {S.shape}")
     d = k if derivatives else 0
-    moments = Moments(
+    evaluated = Moments(
         M=np.zeros((H, k)),
         V=np.zeros((H, k, k)),
         J=np.zeros((H, k, n)),
@@ -221,9 +213,9 @@ def moments(
         u=u,
         diagonal=bool(diagonal),
         derivatives=bool(derivatives),
-        out=moments,
+        out=evaluated,
     )
-    return moments
+    return evaluated
 
 
 def _contiguous_points(packed: Packed, x: Array, u: Array) -> tuple[Array, Array]:

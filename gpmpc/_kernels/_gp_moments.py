@@ -18,6 +18,9 @@ with U_ij = beta_ai beta_bj q_ai q_bj, or E_ij q_ai q_aj, E = beta_a beta_a' - (
 sn2_a I)^-1, for a = b. The rest of dV_aa is that of -|L_a^-1 q_a|^2: (8) with the
 weights -2 e_i, e_i = q_i [(K + sn2 I)^-1 q]_i. ``_pair_sums`` takes one pass over the
 N^2 pairs of points of a pair of outputs, from which derivatives are algebra on sums.
+
+P_ij is such a term of a pair; in shapes P is the number of points, padded. D_a is the
+matrix of the n states, D_u that of the m controls.
 """
 
 from typing import NamedTuple
@@ -30,7 +33,7 @@ from gpmpc._kernels._packed import GPArrays
 from gpmpc._kernels._pair_sums import allocate_pair_terms, sum_pairs
 from gpmpc._kernels._rows import (
     add_products,
-    multiply,
+    multiply_entries,
     project,
     reduce_variance,
     row_sum,
@@ -41,8 +44,8 @@ from gpmpc._kernels._simd import exp, load, store, use_widest_registers
 from gpmpc._kernels.linalg import (
     add_product,
     aligned_rows,
-    condition,
     congruence,
+    invert_identity_plus,
     multiply_transposed,
     product,
     symmetrize,
@@ -64,6 +67,7 @@ class _OutputTerms(NamedTuple):
     z: ndarray  # (k, n, P)
     Tz: ndarray  # T_a z_ai (k, n, P)
     q: ndarray  # (k, P)
+    precision_q: ndarray  # (K_a + sn2_a I)^-1 q_a (k, P)
     weighted: ndarray  # beta q (k, P)
     G: ndarray  # (k, n, n)
     T: ndarray  # (k, n, n)
@@ -85,7 +89,8 @@ class _Scratch(NamedTuple):
     F: ndarray  # (n, n), like those that follow
     X: ndarray
     Y: ndarray
-    H: ndarray
+    cross: ndarray
+    twice_dS: ndarray
 
 
 class _Gradient(NamedTuple):
@@ -114,6 +119,7 @@ def evaluate_moments(gp, precision, mu, S, u, diagonal, derivatives, out):
     for h in range(len(mu)):
         belief = _Belief(gp=gp, S=S[h], x=points[:n], u=points[n : n + m])
         _centre_points(gp.points, mu[h], u[h], points)
+        _clear_sums_over_e(terms)
         for a in range(k):
             _evaluate_output(belief, a, terms, scratch)
             out.M[h, a] = terms.M[a]
@@ -121,7 +127,7 @@ def evaluate_moments(gp, precision, mu, S, u, diagonal, derivatives, out):
             if derivatives:
                 _differentiate_mean(belief, a, h, terms, scratch, out)
         for a in range(k):
-            out.V[h, a, a] = _evaluate_variance(gp, precision, a, terms, scratch)
+            out.V[h, a, a] = _evaluate_variance(gp, precision, a, terms)
             if derivatives:
                 _differentiate_variance(belief, a, h, terms, scratch, out)
             for b in range(a, a + 1 if diagonal else k):
@@ -151,6 +157,7 @@ def _allocate_output_terms(k, n, padded):
         z=aligned_rows(k * n, padded).reshape(k, n, padded),
         Tz=aligned_rows(k * n, padded).reshape(k, n, padded),
         q=aligned_rows(k, padded),
+        precision_q=aligned_rows(k, padded),
         weighted=aligned_rows(k, padded),
         G=np.zeros((k, n, n)),
         T=np.zeros((k, n, n)),
@@ -164,6 +171,18 @@ def _allocate_output_terms(k, n, padded):
     )
 
 
+@njit_noalloc
+def _clear_sums_over_e(terms):
+    """Writes zeros to the sums over e, which are filled output by output.
+
+    Pairs with an output to come read them with the factor zero, which would not stop
+    NaN of the belief before.
+    """
+    terms.e[:] = 0.0
+    terms.e_first[:] = 0.0
+    terms.e_second[:] = 0.0
+
+
 @njit_inner
 def _allocate_scratch(n, padded):
     return _Scratch(
@@ -173,7 +192,8 @@ def _allocate_scratch(n, padded):
         F=np.empty((n, n)),
         X=np.empty((n, n)),
         Y=np.empty((n, n)),
-        H=np.empty((n, n)),
+        cross=np.empty((n, n)),
+        twice_dS=np.empty((n, n)),
     )
 
 
@@ -202,16 +222,17 @@ def _evaluate_output(belief, a, terms, scratch):
     whiten = scratch.X
     D = gp.inverse_squares[a, :n]
     D_u = gp.inverse_squares[a, n:]
+    whitened = terms.Tz[a]  # W (x_i - mu), until T_a z_ai takes its place
     # log q_i = log sf2 - 1/2 log|I + S D| - 1/2 |W (x_i - mu)|^2
     #           - 1/2 (u_i - u)' D_u (u_i - u)
-    terms.half_logdet[a] = condition(belief.S, D, whiten, terms.G[a])
+    terms.half_logdet[a] = invert_identity_plus(belief.S, D, whiten, terms.G[a])
     log_q[:] = gp.log_signal[a] - terms.half_logdet[a]
-    transform(whiten, belief.x, terms.Tz[a])
-    add_products(np.full(n, -0.5), terms.Tz[a], terms.Tz[a], log_q)
+    transform(whiten, belief.x, whitened)
+    add_products(np.full(n, -0.5), whitened, whitened, log_q)
     add_products(D_u * -0.5, belief.u, belief.u, log_q)
     for j in range(0, len(log_q), 8):
         store(terms.q[a], j, exp(load(log_q, j)))
-    multiply(gp.weights[a], terms.q[a], terms.weighted[a])
+    multiply_entries(gp.weights[a], terms.q[a], terms.weighted[a])
     terms.M[a] = row_sum(terms.weighted[a])
     product(terms.G[a], belief.S, terms.T[a])
     symmetrize(terms.T[a])
@@ -226,25 +247,30 @@ def _evaluate_output(belief, a, terms, scratch):
 
 @njit_inner
 def _differentiate_mean(belief, a, h, terms, scratch, out):
-    """Writes the derivatives of M_a and J_a at point h: (8) with the weights beta q."""
+    """Writes the derivatives of M_a and J_a at point h: (8) with the weights beta q.
+
+    ``first`` of the terms and J_a, which are there, are written once more, the same.
+    """
     _differentiate_sum(
-        terms.weighted[a],
-        1.0,
-        belief,
-        a,
-        terms,
-        scratch,
-        terms.first[a],
-        terms.second[a],
-        _Gradient(dmu=out.J[h, a], dS=out.dM_dS[h, a], du=out.dM_du[h, a]),
+        v=terms.weighted[a],
+        factor=1.0,
+        belief=belief,
+        a=a,
+        terms=terms,
+        scratch=scratch,
+        first=terms.first[a],
+        second=terms.second[a],
+        gradient=_Gradient(dmu=out.J[h, a], dS=out.dM_dS[h, a], du=out.dM_du[h, a]),
     )
     _differentiate_J(belief, a, terms, out.J[h, a], out.dJ_dS[h, a], out.dJ_du[h, a])
 
 
 @njit_noalloc
-def _evaluate_variance(gp, precision, a, terms, scratch):
-    """Returns sf2_a - |L_a^-1 q_a|^2 of (4); (K_a + sn2_a I)^-1 q_a is in the row."""
-    reduction = reduce_variance(precision.inverse_cholesky[a], terms.q[a], scratch.row)
+def _evaluate_variance(gp, precision, a, terms):
+    """Returns sf2_a - |L_a^-1 q_a|^2 of (4); fills ``precision_q`` of the terms."""
+    reduction = reduce_variance(
+        precision.inverse_cholesky[a], terms.q[a], terms.precision_q[a]
+    )
     return np.exp(gp.log_signal[a]) - reduction
 
 
@@ -252,17 +278,17 @@ def _evaluate_variance(gp, precision, a, terms, scratch):
 def _differentiate_variance(belief, a, h, terms, scratch, out):
     """Writes the derivatives of -|L_a^-1 q_a|^2 at point h: (8) with weights -2 e."""
     e = scratch.row
-    multiply(e, terms.q[a], e)  # from (K_a + sn2_a I)^-1 q_a
+    multiply_entries(terms.precision_q[a], terms.q[a], e)
     terms.e[a] = _differentiate_sum(
-        e,
-        -2.0,
-        belief,
-        a,
-        terms,
-        scratch,
-        terms.e_first[a],
-        terms.e_second[a],
-        _Gradient(
+        v=e,
+        factor=-2.0,
+        belief=belief,
+        a=a,
+        terms=terms,
+        scratch=scratch,
+        first=terms.e_first[a],
+        second=terms.e_second[a],
+        gradient=_Gradient(
             dmu=out.dV_dmu[h, a, a], dS=out.dV_dS[h, a, a], du=out.dV_du[h, a, a]
         ),
     )
@@ -280,7 +306,8 @@ def _differentiate_sum(v, factor, belief, a, terms, scratch, first, second, grad
     n = len(belief.S)
     v_sum = row_sum(v)
     G = terms.G[a]
-    D = belief.gp.inverse_squares[a]
+    D = belief.gp.inverse_squares[a, :n]
+    D_u = belief.gp.inverse_squares[a, n:]
     X = scratch.X  # sum_i v_i w_i w_i'
     project(v, terms.z[a], first)
     project(v, belief.u, du)
@@ -294,7 +321,7 @@ def _differentiate_sum(v, factor, belief, a, terms, scratch, first, second, grad
             value = factor * (X[c, d] + X[d, c] - v_sum * G_D) / 4
             dS[c, d] = dS[d, c] = value
     for c in range(len(du)):
-        du[c] *= factor * D[n + c]
+        du[c] *= factor * D_u[c]
     return v_sum
 
 
@@ -306,26 +333,29 @@ def _differentiate_J(belief, a, terms, J, dJ_dS, dJ_du):
     """
     n, padded = belief.x.shape
     G = terms.G[a]
-    D = belief.gp.inverse_squares[a]
+    D = belief.gp.inverse_squares[a, :n]
+    D_u = belief.gp.inverse_squares[a, n:]
     w = aligned_rows(n, padded)
     weighted_w = aligned_rows(1, padded)[0]
     weighted_ww = aligned_rows(1, padded)[0]
     sums = np.empty(n)
-    A = np.empty((n, n))  # G' D
+    G_D = np.empty((n, n))  # G' D
     for c in range(n):
         for d in range(n):
-            A[c, d] = G[d, c] * D[d]
+            G_D[c, d] = G[d, c] * D[d]
     transform(np.ascontiguousarray(G.T), terms.z[a], w)
     for c in range(n):
-        multiply(terms.weighted[a], w[c], weighted_w)
+        multiply_entries(terms.weighted[a], w[c], weighted_w)
         project(weighted_w, belief.u, dJ_du[c])
         for d in range(len(belief.u)):
-            dJ_du[c, d] *= D[n + d]
+            dJ_du[c, d] *= D_u[d]
         for d in range(c + 1):
-            multiply(weighted_w, w[d], weighted_ww)
+            multiply_entries(weighted_w, w[d], weighted_ww)
             project(weighted_ww, w, sums)
             for e in range(d + 1):
-                value = (sums[e] - A[c, d] * J[e] - A[c, e] * J[d] - A[d, e] * J[c]) / 2
+                value = (
+                    sums[e] - G_D[c, d] * J[e] - G_D[c, e] * J[d] - G_D[d, e] * J[c]
+                ) / 2
                 dJ_dS[c, d, e] = dJ_dS[c, e, d] = dJ_dS[d, c, e] = value
                 dJ_dS[d, e, c] = dJ_dS[e, c, d] = dJ_dS[e, d, c] = value
 
@@ -342,7 +372,7 @@ def _evaluate_pair(belief, a, b, terms, E, derivatives, pair, scratch):
     D_a = gp.inverse_squares[a, :n]
     D_b = gp.inverse_squares[b, :n]
     r = terms.half_logdet[a] + terms.half_logdet[b]
-    r -= condition(belief.S, D_a + D_b, scratch.X, scratch.G_ab)
+    r -= invert_identity_plus(belief.S, D_a + D_b, scratch.X, scratch.G_ab)
     product(scratch.G_ab, belief.S, T_ab)
     symmetrize(T_ab)
     pair.delta_j[:] = 0.0
@@ -355,15 +385,15 @@ def _evaluate_pair(belief, a, b, terms, E, derivatives, pair, scratch):
     weights_i = terms.q[a] if same else terms.weighted[a]
     weights_j = terms.q[b] if same else terms.weighted[b]
     return sum_pairs(
-        pair,
-        weights_i,
-        weights_j,
-        terms.z[a],
-        terms.z[b],
-        E,
-        gp.size,
-        same,
-        derivatives,
+        pair=pair,
+        weights_i=weights_i,
+        weights_j=weights_j,
+        z_a=terms.z[a],
+        z_b=terms.z[b],
+        E=E,
+        size=gp.size,
+        same=same,
+        derivatives=derivatives,
     )
 
 
@@ -378,22 +408,25 @@ def _differentiate_pair(belief, a, b, terms, P_sum, pair, scratch, gradient):
     G_ab = scratch.G_ab
     X = scratch.X
     Y = scratch.Y
-    H = scratch.H
-    D_a = belief.gp.inverse_squares[a]
-    D_b = belief.gp.inverse_squares[b]
+    cross = scratch.cross  # sum_ij R_ij z_ai z_bj', or with P_ij + U_ij for a != b
+    twice_dS = scratch.twice_dS  # twice the derivative by S, not yet symmetric
+    D_a = belief.gp.inverse_squares[a, :n]
+    D_b = belief.gp.inverse_squares[b, :n]
+    D_ua = belief.gp.inverse_squares[a, n:]
+    D_ub = belief.gp.inverse_squares[b, n:]
     sums = np.empty((2, n))
     controls = np.empty((2, len(du)))
     # Y = sum_ij P_ij (z_ai + z_bj) (z_ai + z_bj)' + U_ij (z_ai z_bj' + z_bj z_ai')
     second_moments(pair.p_i, terms.z[a], scratch.row, X)
     second_moments(pair.p_j, terms.z[b], scratch.row, Y)
     for c in range(n):
-        project(pair.g[c], terms.z[b], H[c])
+        project(pair.g[c], terms.z[b], cross[c])
         for d in range(n if not same else 0):  # in g of a = b is R, not P
-            H[c, d] += terms.first[a, c] * terms.first[b, d]
+            cross[c, d] += terms.first[a, c] * terms.first[b, d]
     for c in range(n):
         for d in range(n):
-            Y[c, d] += X[c, d] + H[c, d] + H[d, c]
-    congruence(G_ab, Y, X, H)
+            Y[c, d] += X[c, d] + cross[c, d] + cross[d, c]
+    congruence(G_ab, Y, X, twice_dS)
     # dmu: sum_ij P_ij y_ij
     project(pair.p_i, terms.z[a], sums[0])
     project(pair.p_j, terms.z[b], sums[1])
@@ -403,30 +436,55 @@ def _differentiate_pair(belief, a, b, terms, P_sum, pair, scratch, gradient):
     for c in range(n):
         dmu[c] += sums[1, c]
         for d in range(n):
-            H[c, d] -= P_sum * G_ab[d, c] * (D_a[d] + D_b[d])
+            twice_dS[c, d] -= P_sum * G_ab[d, c] * (D_a[d] + D_b[d])
     # U_ij = beta_ai beta_bj q_ai q_bj, or E_ij q_ai q_aj: F_a and F_b times the sums of
     # each output alone
     e_factor = 1.0 if same else 0.0
     U_sum = terms.M[a] * terms.M[b] - e_factor * terms.e[a]
-    _add_difference(terms, a, D_a, D_b, U_sum, terms.M[b], e_factor, scratch, dmu, H)
-    _add_difference(terms, b, D_b, D_a, U_sum, terms.M[a], e_factor, scratch, dmu, H)
+    _add_difference(
+        terms=terms,
+        a=a,
+        D=D_a,
+        D_other=D_b,
+        U_sum=U_sum,
+        M_other=terms.M[b],
+        e_factor=e_factor,
+        scratch=scratch,
+        dmu=dmu,
+        twice_dS=twice_dS,
+    )
+    _add_difference(
+        terms=terms,
+        a=b,
+        D=D_b,
+        D_other=D_a,
+        U_sum=U_sum,
+        M_other=terms.M[a],
+        e_factor=e_factor,
+        scratch=scratch,
+        dmu=dmu,
+        twice_dS=twice_dS,
+    )
     project(pair.p_i, belief.u, controls[0])
     project(pair.p_j, belief.u, controls[1])
     for c in range(len(du)):
-        du[c] += controls[0, c] * D_a[n + c] + controls[1, c] * D_b[n + c]
+        du[c] += controls[0, c] * D_ua[c] + controls[1, c] * D_ub[c]
     for c in range(n):
         for d in range(c + 1):
-            value = dS[c, d] + (H[c, d] + H[d, c]) / 4
+            value = dS[c, d] + (twice_dS[c, d] + twice_dS[d, c]) / 4
             dS[c, d] = dS[d, c] = value
 
 
 @njit_noalloc
-def _add_difference(terms, a, D, D_other, U_sum, M_other, e_factor, scratch, dmu, dS):
+def _add_difference(
+    terms, a, D, D_other, U_sum, M_other, e_factor, scratch, dmu, twice_dS
+):
     """Adds the part of output a in the second term of (11), with F = F_a of (10).
 
-    To dmu it adds sum_i U_i F z_i, to dS sum_i U_i (y_i y_i' - w_i w_i') - sum_ij U_ij
-    F D, where y_i = G_ab' z_i, w_i = G_a' z_i and U_i = sum_j U_ij = M_other beta_i q_i
-    - e_factor e_i.
+    To dmu it adds sum_i U_i F z_i, to twice dS sum_i U_i (y_i y_i' - w_i w_i') - sum_ij
+    U_ij F D, where y_i = G_ab' z_i, w_i = G_a' z_i and U_i = sum_j U_ij = M_other
+    beta_i q_i - e_factor e_i. The factor is zero for two different outputs, of which
+    the sums over e may not be there yet.
     """
     F = scratch.F
     moment = scratch.Y
@@ -446,11 +504,11 @@ def _add_difference(terms, a, D, D_other, U_sum, M_other, e_factor, scratch, dmu
         for d in range(n):
             first = M_other * terms.first[a, d] - e_factor * terms.e_first[a, d]
             dmu[c] += F[c, d] * first
-            dS[c, d] -= U_sum * F[c, d] * D[d]
+            twice_dS[c, d] -= U_sum * F[c, d] * D[d]
     # G_ab' X G_ab - G_a' X G_a = F X G_ab + (F X G_a)'
     product(F, moment, X)
-    add_product(X, G_ab, dS)
+    add_product(X, G_ab, twice_dS)
     product(X, G_a, moment)
     for c in range(n):
         for d in range(n):
-            dS[c, d] += moment[d, c]
+            twice_dS[c, d] += moment[d, c]

@@ -16,52 +16,72 @@ afterwards.
 from typing import NamedTuple
 
 import numpy as np
-from numpy import ndarray
 
 from gpmpc._compiled import compiled, njit_noalloc
-from gpmpc._kernels._rows import multiply, project, reduce_variance, reduce_variances
+from gpmpc._kernels._packed import Array
+from gpmpc._kernels._rows import (
+    multiply_entries,
+    project,
+    reduce_variance,
+    reduce_variances,
+)
 from gpmpc._kernels._simd import exp, load, store, total, use_widest_registers, zeros
 from gpmpc._kernels.linalg import aligned_rows
 
+# k_a of all points stands in rows, of which variances are solved for four at a time
+_ROWS_AT_ONCE = 4
 
-class PointArrays(NamedTuple):
-    """The arrays that ``linearize_points`` writes."""
 
-    mean: ndarray  # (K, k)
-    A: ndarray  # (K, k, n)
-    B: ndarray  # (K, k, m)
-    covariance: ndarray  # (K, k, k), or (0, k, k) where it is not wanted
+class LinearizedGPs(NamedTuple):
+    """Means of GPs at H points and their derivatives."""
+
+    mean: Array  #: (H, k)
+    A: Array  #: by the state (H, k, n)
+    B: Array  #: by the input (H, k, m)
+    #: diagonal (H, k, k); None where it was not wanted, (0, k, k) for compiled code
+    covariance: Array | None
+
+
+def kernel_rows(H: int) -> int:
+    """Returns the number of rows that hold an output's k_a at H points.
+
+    More rows than one are a multiple of four, so that none is solved for on its own;
+    a single point would pay for three that nobody asked for.
+    """
+    return H if H <= 1 else -(-H // _ROWS_AT_ONCE) * _ROWS_AT_ONCE
 
 
 @njit_noalloc
-def _write_offsets(points, x, u, offsets, squares):
+def _write_differences(points, x, u, differences, squares):
     """Writes x~_i - x~ and its squares."""
     n = len(x)
     for d in range(len(points)):
         centre = x[d] if d < n else u[d - n]
         point = points[d]
-        offset = offsets[d]
+        row = differences[d]
         square = squares[d]
         for j in range(len(point)):
             difference = point[j] - centre
-            offset[j] = difference
+            row[j] = difference
             square[j] = difference * difference
 
 
 @njit_noalloc
-def write_kernel(log_signal, D, squares, weights, k, weighted):
-    """Writes k_j = sf2 exp(-1/2 sum_d D_d (x~_j - x~)_d^2) and beta_j k_j.
+def write_kernel(log_signal, D, squares, weights, kernel_row, weighted):
+    """Writes k_j = sf2 exp(-1/2 sum_d D_d (x~_j - x~)_d^2) to ``kernel_row``.
 
-    Returns the sum of the latter.
+    Writes beta_j k_j to ``weighted`` and returns their sum, the mean less its prior.
+    The same numbers weigh z_j in the mean's derivatives, as is so for the squared
+    exponential kernel alone. Both rows may be one, which then holds beta_j k_j.
     """
     use_widest_registers()
     sums = zeros()
-    for j in range(0, len(k), 8):
+    for j in range(0, len(kernel_row), 8):
         exponent = zeros() + log_signal
         for d in range(len(D)):
             exponent = exponent - (0.5 * D[d]) * load(squares[d], j)
         value = exp(exponent)
-        store(k, j, value)
+        store(kernel_row, j, value)
         value = value * load(weights, j)
         store(weighted, j, value)
         sums = sums + value
@@ -69,13 +89,13 @@ def write_kernel(log_signal, D, squares, weights, k, weighted):
 
 
 @compiled(allocates=False)
-def linearize_points(gp, columns, offset, adds_state, x, u, memory, out):
-    """Writes ``PointArrays`` of GPs with prior means ``offset`` (k,).
+def linearize_points(gp, columns, prior_mean, adds_state, x, u, memory, out):
+    """Writes ``LinearizedGPs`` of GPs with prior means (k,) at H points.
 
     L_a by ``columns`` (k, N, N), or with more behind, is read for covariances only.
     ``memory`` is lent, since counting references to own arrays costs a third of a short
-    call: eight numbers more than 2 (n + m) + 1 rows of P, and for covariances k rows a
-    point, K rounded up to fours.
+    call: eight numbers more than 2 (n + m) + 1 rows of P, and for covariances
+    ``kernel_rows(H)`` rows for each output.
     """
     use_widest_registers()
     M = out.mean
@@ -87,23 +107,23 @@ def linearize_points(gp, columns, offset, adds_state, x, u, memory, out):
     skip = (-(memory.ctypes.data >> 3)) % 8  # rows start on cache lines
     rows = (len(memory) - 8) // padded
     memory = memory[skip : skip + rows * padded].reshape(-1, padded)
-    offsets = memory[:d]
+    differences = memory[:d]
     squares = memory[d : 2 * d]
     weighted = memory[2 * d]
-    kernels = memory[2 * d + 1 :]  # k_a of all points, for covariances
-    K = len(out.covariance)
-    # rows of k_a that each output has there
-    count = (K + 3) // 4 * 4 if K > 1 else K
+    wants_covariance = len(out.covariance) > 0
+    # k_a of all points, for covariances: ``count`` rows of each output
+    kernels = memory[2 * d + 1 :]
+    count = len(kernels) // outputs
     for h in range(len(x)):
-        _write_offsets(gp.points, x[h], u[h], offsets, squares)
+        _write_differences(gp.points, x[h], u[h], differences, squares)
         for a in range(outputs):
             D = gp.inverse_squares[a]
-            k = kernels[a * count + h] if count > 0 else weighted
-            M[h, a] = offset[a] + write_kernel(
-                gp.log_signal[a], D, squares, gp.weights[a], k, weighted
+            kernel_row = kernels[a * count + h] if wants_covariance else weighted
+            M[h, a] = prior_mean[a] + write_kernel(
+                gp.log_signal[a], D, squares, gp.weights[a], kernel_row, weighted
             )
-            project(weighted, offsets[:n], A[h, a])
-            project(weighted, offsets[n:], B[h, a])
+            project(weighted, differences[:n], A[h, a])
+            project(weighted, differences[n:], B[h, a])
             for c in range(n):
                 A[h, a, c] *= D[c]
             for c in range(d - n):
@@ -111,72 +131,74 @@ def linearize_points(gp, columns, offset, adds_state, x, u, memory, out):
             if adds_state:
                 M[h, a] += x[h, a]
                 A[h, a, a] += 1.0
-    if count > 0:
-        _write_variances(gp, columns, kernels, count, memory[0], out.covariance)
+    if wants_covariance:
+        totals = memory[0]  # the first row of differences is not read any more
+        _write_variances(gp, columns, kernels, count, totals, out.covariance)
 
 
 @njit_noalloc
 def _write_variances(gp, columns, kernels, count, totals, covariance):
-    """Writes sf2_a - |L_a^-1 k_a|^2 of K points to the diagonals (K, k, k).
+    """Writes sf2_a - |L_a^-1 k_a|^2 of H points to the diagonals (H, k, k).
 
-    ``kernels`` has ``count`` rows k_a of each output, the first K of them points'.
+    ``kernels`` has ``count`` rows k_a of each output, the first H of them points'. They
+    are overwritten; ``totals`` is a row of P, 16 or more, to work in.
     """
     use_widest_registers()
-    K = len(covariance)
+    H = len(covariance)
     for a in range(len(gp.weights)):
-        k = kernels[a * count : (a + 1) * count]
-        for h in range(K, count):
-            k[h, :] = 0.0
+        rows = kernels[a * count : (a + 1) * count]
+        for h in range(H, count):
+            rows[h, :] = 0.0
         signal = np.exp(gp.log_signal[a])
         # sixteen rows and the columns of L stay in the first cache together
         for first in range(0, count, 16):
             totals[:16] = 0.0
-            reduce_variances(columns[a], gp.size, k[first : first + 16], totals)
-            for h in range(first, min(first + 16, K)):
+            reduce_variances(columns[a], gp.size, rows[first : first + 16], totals)
+            for h in range(first, min(first + 16, H)):
                 covariance[h, a, a] = max(signal - totals[h - first], 0.0)
 
 
 @compiled
 def expand_points(gp, inverse_cholesky, x, u, out):
-    """Writes the arrays of ``gpmpc._kernels.Expansion`` at K points."""
+    """Writes the arrays of ``gpmpc._kernels.Expansion`` at H points."""
     use_widest_registers()
     d, padded = gp.points.shape
-    K, n = x.shape
-    offsets = aligned_rows(d, padded)
+    H, n = x.shape
+    differences = aligned_rows(d, padded)
     squares = aligned_rows(d, padded)
-    k = aligned_rows(1, padded)[0]
+    kernel_row = aligned_rows(1, padded)[0]
     weighted = aligned_rows(1, padded)[0]
     solution = aligned_rows(1, padded)[0]  # (K_a + sn2_a I)^-1 k_a
-    weighted_offset = aligned_rows(1, padded)[0]
+    weighted_difference = aligned_rows(1, padded)[0]
     sums = np.empty(d)
     moment = np.empty(d)
-    for h in range(K):
-        _write_offsets(gp.points, x[h], u[h], offsets, squares)
+    for h in range(H):
+        _write_differences(gp.points, x[h], u[h], differences, squares)
         for a in range(len(gp.weights)):
             D = gp.inverse_squares[a]
             out.M[h, a] = write_kernel(
-                gp.log_signal[a], D, squares, gp.weights[a], k, weighted
+                gp.log_signal[a], D, squares, gp.weights[a], kernel_row, weighted
             )
-            reduction = reduce_variance(inverse_cholesky[a], k, solution)
+            reduction = reduce_variance(inverse_cholesky[a], kernel_row, solution)
             out.variance[h, a] = max(np.exp(gp.log_signal[a]) - reduction, 0.0)
             # dvar = -2 sum_i [(K_a + sn2_a I)^-1 k_a]_i k_i z_i
-            multiply(solution, k, solution)
-            project(solution, offsets, sums)
+            multiply_entries(solution, kernel_row, solution)
+            project(solution, differences, sums)
             for c in range(d):
                 if c < n:
                     out.dvariance_dx[h, a, c] = -2 * D[c] * sums[c]
                 else:
                     out.dvariance_du[h, a, c - n] = -2 * D[c] * sums[c]
             # dM = sum beta k z
-            project(weighted, offsets, sums)
+            project(weighted, differences, sums)
             for c in range(d):
                 sums[c] *= D[c]
             out.J[h, a, :] = sums[:n]
             out.dM_du[h, a, :] = sums[n:]
             # d2M = sum beta k (z z' - D)
             for c in range(n):
-                multiply(weighted, offsets[c], weighted_offset)
-                project(weighted_offset, offsets, moment)
+                multiply_entries(weighted, differences[c], weighted_difference)
+                project(weighted_difference, differences, moment)
                 for e in range(n):
                     value = D[c] * D[e] * moment[e]
                     diagonal = D[c] * out.M[h, a] if c == e else 0.0

@@ -23,7 +23,8 @@ from typing import NamedTuple
 from numpy import ndarray
 
 from gpmpc._compiled import inline_njit, njit_inner, njit_noalloc
-from gpmpc._kernels._rows import largest_size, largest_square, multiply, row_sum
+from gpmpc._kernels._packed import COLUMNS, ROWS
+from gpmpc._kernels._rows import largest_size, largest_square, multiply_entries, row_sum
 from gpmpc._kernels._simd import (
     NEAR_ZERO,
     expm1,
@@ -67,16 +68,17 @@ def allocate_pair_terms(n, padded):
 def sum_pairs(pair, weights_i, weights_j, z_a, z_b, E, size, same, derivatives):
     """Writes the sums of ``pair``, from its other terms; returns sum_ij P_ij.
 
-    ``E`` is read for a = b (``same``); p_i and g are written with ``derivatives`` only.
+    ``E`` is read for a = b (``same``). With ``derivatives`` alone are p_i and g sums;
+    without, p_i is of no meaning.
     """
     for d in range(len(z_a)):
-        multiply(weights_i, z_a[d], pair.weighted_z[d])
+        multiply_entries(weights_i, z_a[d], pair.weighted_z[d])
     _sum_blocks(pair, weights_i, weights_j, z_b, E, size, same, derivatives)
-    multiply(pair.p_i, weights_i, pair.p_i)
-    multiply(pair.p_j, weights_j, pair.p_j)
+    multiply_entries(pair.p_i, weights_i, pair.p_i)
+    multiply_entries(pair.p_j, weights_j, pair.p_j)
     if derivatives:
         for d in range(len(z_a)):
-            multiply(pair.g[d], weights_j, pair.g[d])
+            multiply_entries(pair.g[d], weights_j, pair.g[d])
     return row_sum(pair.p_j)
 
 
@@ -103,22 +105,23 @@ def _sum_blocks(pair, weights_i, weights_j, z_b, E, size, same, derivatives):
         pair.p_i[:] = 0.0
         pair.g[:] = 0.0
     block = 0  # where E of the block starts
-    for i in range(0, size, 4):
+    for i in range(0, size, ROWS):
         w0 = weights_i[i]
         w1 = weights_i[i + 1]
         w2 = weights_i[i + 2]
         w3 = weights_i[i + 3]
         s0 = s1 = s2 = s3 = zeros()
-        for j in range(0, i // 16 * 16 + 16 if same else padded, 16):
-            P = _expm1_of_block(
+        end = i // COLUMNS * COLUMNS + COLUMNS if same else padded
+        for j in range(0, end, COLUMNS):
+            P_block = _expm1_of_block(
                 near_zero, pair.delta_i, pair.delta_j, pair.T_z, z_b, i, j
             )
             if same:
-                R, P = _multiply_block(P, E, block)
-                block += 64
+                R_block, P_block = _multiply_block(P_block, E, block)
+                block += ROWS * COLUMNS
             else:
-                R = P
-            (a0, b0), (a1, b1), (a2, b2), (a3, b3) = P
+                R_block = P_block
+            (a0, b0), (a1, b1), (a2, b2), (a3, b3) = P_block
             p_a = load(pair.p_j, j)
             p_b = load(pair.p_j, j + 8)
             store(pair.p_j, j, p_a + w0 * a0 + w1 * a1 + w2 * a2 + w3 * a3)
@@ -130,7 +133,7 @@ def _sum_blocks(pair, weights_i, weights_j, z_b, E, size, same, derivatives):
                 s1 = s1 + a1 * w_a + b1 * w_b
                 s2 = s2 + a2 * w_a + b2 * w_b
                 s3 = s3 + a3 * w_a + b3 * w_b
-                (a0, b0), (a1, b1), (a2, b2), (a3, b3) = R
+                (a0, b0), (a1, b1), (a2, b2), (a3, b3) = R_block
                 for d in range(n):
                     g = pair.g[d]
                     y = pair.weighted_z[d]
@@ -218,11 +221,11 @@ def _multiply_block(values, E, start):
     b1 = b1 * f1
     b2 = b2 * f2
     b3 = b3 * f3
-    P = (a0, b0), (a1, b1), (a2, b2), (a3, b3)
-    R = (
+    P_block = (a0, b0), (a1, b1), (a2, b2), (a3, b3)
+    R_block = (
         (a0 + e0, b0 + f0),
         (a1 + e1, b1 + f1),
         (a2 + e2, b2 + f2),
         (a3 + e3, b3 + f3),
     )
-    return R, P
+    return R_block, P_block

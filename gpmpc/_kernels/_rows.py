@@ -17,7 +17,7 @@ from gpmpc._kernels.linalg import dot
 
 
 @inline_njit
-def multiply(x, y, out):
+def multiply_entries(x, y, out):
     """Writes x y, entry by entry."""
     for j in range(len(out)):
         out[j] = x[j] * y[j]
@@ -58,7 +58,7 @@ def second_moments(weights, rows, scratch, out):
     """Writes sum_i weights[i] rows[c, i] rows[d, i] to the symmetric out[c, d]."""
     use_widest_registers()
     for c in range(len(rows)):
-        multiply(weights, rows[c], scratch)
+        multiply_entries(weights, rows[c], scratch)
         for d in range(c + 1):
             out[c, d] = out[d, c] = dot(scratch, rows[d], len(scratch))
 

@@ -194,7 +194,8 @@ def store(builder, array, index, values):
 def larger(builder, values, others):
     """Returns the larger ones of ``values`` and ``|others|``, entry by entry.
 
-    NaN in ``others`` is passed over.
+    The magnitude is that of ``others`` alone: ``values`` are a largest magnitude so
+    far, or zeros. NaN in ``others`` is passed over.
     """
     return _larger(builder, values, others)
 
@@ -247,7 +248,7 @@ def total(builder, values):
 
 @_define(types.float64, LANES)
 def largest(builder, values):
-    """Returns the largest magnitude among eight numbers."""
+    """Returns the largest of eight numbers >= 0, as ``larger`` gives them."""
     for distance in (4, 2):
         values = _larger(builder, values, _rotate(builder, values, distance))
     first, second = _first_two(builder, values)

@@ -27,10 +27,19 @@ from gpmpc._kernels._simd import load, store, use_widest_registers
 from gpmpc._kernels.linalg import aligned_rows, four_dots
 from gpmpc.exceptions import SettingError
 
+# where a column of L has 1 / L_jj and v_j
+INVERSE = -2
+V = -1
+
 
 @dataclass(frozen=True)
 class Window:
-    """k GPs over N points, as ``linearize`` takes them; begin with ``Window.empty``."""
+    """k GPs over N points, as ``linearize_gps`` takes them.
+
+    Begin with ``Window.empty``. Of its arrays, and of those that ``without`` returns,
+    only the data and the shapes count until ``append`` has written all rows: before,
+    the GPs do not predict.
+    """
 
     arrays: GPArrays  #: what predictions of the mean read
     #: of the points: x~ (d rows), targets (k rows), variances of their noise (k rows)
@@ -42,8 +51,9 @@ class Window:
     state_dim: int  #: n
     input_dim: int  #: m
     rows: int = 0  #: number of rows of L that are computed; N where the GPs predict
-    #: has an item until a later window writes to ``columns``
-    _free: list[None] = field(default_factory=lambda: [None])
+    #: whether a next window may write to ``columns``: one item, which the first takes;
+    #: a list, since to take from it is one step also where threads share the window
+    _may_extend: list[None] = field(default_factory=lambda: [None])
 
     @classmethod
     def empty(
@@ -59,7 +69,7 @@ class Window:
             points=data[:d],
             inverse_squares=lengthscales**-2.0,
             log_signal=np.log(signal_variance),
-            weights=data[:k],
+            weights=data[:k],  # of the shape alone, as N = 0
             size=0,
         )
         return cls(
@@ -94,10 +104,13 @@ class Window:
             rows: Number of rows of the factor that there are to be; all by default.
 
         Raises:
-            SettingError: The factor does not exist.
+            SettingError: The factor does not exist, or has no room for the point.
         """
         k, d = self.arrays.inverse_squares.shape
         N = self.arrays.size + 1
+        capacity = self.columns.shape[1]
+        if capacity < N:
+            raise SettingError("capacity", f"of {capacity} points is used up")
         P = -(-N // COLUMNS) * COLUMNS
         data = aligned((d + 3 * k, P))
         arrays = self.arrays._replace(points=data[:d], weights=data[-k:], size=N)
@@ -133,12 +146,12 @@ class Window:
         They are this window's own for the first that follows on it, else a copy.
         """
         try:
-            self._free.pop()
+            self._may_extend.pop()
         except IndexError:
             columns = _no_columns(*self.columns.shape[:2])
             done = slice(self.rows)
             columns[:, done, done] = self.columns[:, done, done]
-            columns[:, done, -2:] = self.columns[:, done, -2:]
+            columns[:, done, INVERSE:] = self.columns[:, done, INVERSE:]
             return columns
         return self.columns
 
@@ -214,10 +227,10 @@ def _write_factor_row(factor, i, q, noise, target):
         c1 = factor[j + 1]
         c2 = factor[j + 2]
         c3 = factor[j + 3]
-        w0 = q[j] * c0[-2]
-        w1 = (q[j + 1] - w0 * c0[j + 1]) * c1[-2]
-        w2 = (q[j + 2] - w0 * c0[j + 2] - w1 * c1[j + 2]) * c2[-2]
-        w3 = (q[j + 3] - w0 * c0[j + 3] - w1 * c1[j + 3] - w2 * c2[j + 3]) * c3[-2]
+        w0 = q[j] * c0[INVERSE]
+        w1 = (q[j + 1] - w0 * c0[j + 1]) * c1[INVERSE]
+        w2 = (q[j + 2] - w0 * c0[j + 2] - w1 * c1[j + 2]) * c2[INVERSE]
+        w3 = (q[j + 3] - w0 * c0[j + 3] - w1 * c1[j + 3] - w2 * c2[j + 3]) * c3[INVERSE]
         for m in range((j + 4) // 8 * 8, size, 8):
             product = (
                 w0 * load(c0, m)
@@ -227,7 +240,7 @@ def _write_factor_row(factor, i, q, noise, target):
             )
             store(q, m, load(q, m) - product)
         square -= w0 * w0 + w1 * w1 + w2 * w2 + w3 * w3
-        y -= w0 * c0[-1] + w1 * c1[-1] + w2 * c2[-1] + w3 * c3[-1]
+        y -= w0 * c0[V] + w1 * c1[V] + w2 * c2[V] + w3 * c3[V]
         c0[i] = w0
         c1[i] = w1
         c2[i] = w2
@@ -236,8 +249,8 @@ def _write_factor_row(factor, i, q, noise, target):
         return False
     root = np.sqrt(square)
     factor[i, i] = root
-    factor[i, -2] = 1.0 / root
-    factor[i, -1] = y / root
+    factor[i, INVERSE] = 1.0 / root
+    factor[i, V] = y / root
     return True
 
 
@@ -256,12 +269,11 @@ def _write_weights(factor, N, beta, sums):
             N - j - 4,
             sums,
         )
-        w3 = (c3[-1] - sums[3]) * c3[-2]
-        w2 = (c2[-1] - sums[2] - c2[j + 3] * w3) * c2[-2]
-        w1 = (c1[-1] - sums[1] - c1[j + 3] * w3 - c1[j + 2] * w2) * c1[-2]
-        w0 = (c0[-1] - sums[0] - c0[j + 3] * w3 - c0[j + 2] * w2 - c0[j + 1] * w1) * c0[
-            -2
-        ]
+        w3 = (c3[V] - sums[3]) * c3[INVERSE]
+        w2 = (c2[V] - sums[2] - c2[j + 3] * w3) * c2[INVERSE]
+        w1 = (c1[V] - sums[1] - c1[j + 3] * w3 - c1[j + 2] * w2) * c1[INVERSE]
+        residual = c0[V] - sums[0] - c0[j + 3] * w3 - c0[j + 2] * w2 - c0[j + 1] * w1
+        w0 = residual * c0[INVERSE]
         beta[j] = w0
         beta[j + 1] = w1
         beta[j + 2] = w2

@@ -16,7 +16,7 @@ from gpmpc._compiled import compiled, njit_noalloc
 from gpmpc._kernels._packed import Array, GPArrays
 from gpmpc._kernels._simd import exp, load, store, total, use_widest_registers, zeros
 from gpmpc._kernels.linalg import aligned_rows, copy, dot
-from gpmpc._kernels.tape import Tape, run_tape
+from gpmpc._kernels.tape import SPARE_PLACES, Tape, run_tape
 
 Indices = NDArray[np.intp]
 
@@ -34,7 +34,7 @@ class AffineGPs(NamedTuple):
     B: Array  #: (n, k)
     states: Indices  #: the state that each feature of f is a function of (d,)
     kinds: Indices  #: which function: ``PLAIN``, ``SINE`` or ``COSINE`` (d,)
-    inputs: Indices  #: the inputs that f depends on (m_s,)
+    inputs: Indices  #: the inputs that f depends on (some of the m)
     tape: Tape  #: f0; ``NO_TAPE`` for zero
 
 
@@ -52,10 +52,10 @@ class Feedback(NamedTuple):
 
 
 @njit_noalloc
-def _write_means(f, offset, point, memory, means):
+def _write_means(f, offset, point, work, means):
     """Writes the GPs' means at one point x~ (d,).
 
-    They are offset + sum_j beta_j sf2 exp(-1/2 sum_d D_d (x~_j - x~)_d^2). ``memory``
+    They are offset + sum_j beta_j sf2 exp(-1/2 sum_d D_d (x~_j - x~)_d^2). ``work``
     is lent to work in: eight numbers for each dimension and each GP.
     """
     use_widest_registers()
@@ -66,20 +66,20 @@ def _write_means(f, offset, point, memory, means):
     D = f.inverse_squares
     first = 8 * dimensions
     for a in range(outputs):
-        store(memory, first + 8 * a, zeros())
+        store(work, first + 8 * a, zeros())
     for j in range(0, count, 8):
         for d in range(dimensions):
             difference = load(points, d * count + j) - point[d]
-            store(memory, 8 * d, difference * difference)
+            store(work, 8 * d, difference * difference)
         for a in range(outputs):
             exponent = zeros() + f.log_signal[a]
             for d in range(dimensions):
-                exponent = exponent - (0.5 * D[a, d]) * load(memory, 8 * d)
+                exponent = exponent - (0.5 * D[a, d]) * load(work, 8 * d)
             place = first + 8 * a
             weighted = exp(exponent) * load(weights, a * count + j)
-            store(memory, place, load(memory, place) + weighted)
+            store(work, place, load(work, place) + weighted)
     for a in range(outputs):
-        means[a] = offset[a] + total(load(memory, first + 8 * a))
+        means[a] = offset[a] + total(load(work, first + 8 * a))
 
 
 @njit_noalloc
@@ -124,14 +124,14 @@ def roll_out_gps(model, feedback, start, disturbance, states, inputs):
     use_widest_registers()
     T, H, m = inputs.shape
     n = start.shape[1]
-    k_dim = len(model.offset)
+    outputs = len(model.offset)
     features_dim = len(model.states) + len(model.inputs)
-    features = aligned_rows(1, 8 + features_dim + k_dim)[0]
-    means = aligned_rows(1, 8 + features_dim + k_dim)[0]
-    sums = aligned_rows(features_dim + k_dim, 8).reshape(-1)
+    features = aligned_rows(1, features_dim)[0]
+    means = aligned_rows(1, outputs)[0]
+    work_of_means = aligned_rows(features_dim + outputs, 8).reshape(-1)
     points = aligned_rows(n + m, 8)  # x and u of eight roll-outs
     f0 = aligned_rows(n, 8)
-    places = aligned_rows(model.tape.work + 5, 8)
+    work_of_tape = aligned_rows(model.tape.places + SPARE_PLACES, 8)
     points[:] = 0.0
     f0[:] = 0.0
     for t in range(T):
@@ -149,19 +149,31 @@ def roll_out_gps(model, feedback, start, disturbance, states, inputs):
                 for i in range(m):
                     points[n + i, t - first] = u[i]
             if model.tape.size > 0:
-                run_tape(model.tape, points, places, f0, None)
+                run_tape(
+                    tape=model.tape,
+                    z=points,
+                    work=work_of_tape,
+                    value=f0,
+                    tangents=None,
+                )
             for t in together:
                 x = states[t, k]
                 u = inputs[t, k]
                 after = states[t, k + 1]
                 _write_features(model, x, u, features)
-                if k_dim > 0:
-                    _write_means(model.f, model.offset, features, sums, means)
+                if outputs > 0:
+                    _write_means(
+                        f=model.f,
+                        offset=model.offset,
+                        point=features,
+                        work=work_of_means,
+                        means=means,
+                    )
                 for i in range(n):
                     added = f0[i, t - first] + model.c[i] + disturbance[i]
                     after[i] = (
                         added
                         + dot(model.A[i], x, n)
                         + dot(model.G[i], u, m)
-                        + dot(model.B[i], means, k_dim)
+                        + dot(model.B[i], means, outputs)
                     )

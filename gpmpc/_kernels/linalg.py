@@ -225,13 +225,14 @@ def solve_positive(A, X):
 
 
 @njit_noalloc
-def condition(S, D, whiten, G):
-    """Returns 1/2 log|I + S D| for S >= 0, diagonal D > 0; writes (I + S D)^-1 to G.
+def invert_identity_plus(S, D, whiten, G):
+    """Writes (I + S D)^-1 to G for S >= 0, diagonal D > 0; returns 1/2 log|I + S D|.
 
     W = C^-1 D^1/2 goes to ``whiten``. With B = D^1/2 S D^1/2 and I + B = C C', well
     conditioned also where S is singular, G = D^-1/2 (I + B)^-1 D^1/2 and |W x|^2 = x'
     (S + D^-1)^-1 x. The pivots less one come without a one to cancel: a small S keeps
-    its digits.
+    its digits. For S D = 1e-12 the logarithm of a rounded 1 + S D has four digits
+    right, log1p(S D) all.
     """
     n = len(S)
     half_logdet = 0.0

@@ -18,7 +18,9 @@ from gpmpc._kernels.linalg import aligned_rows
 
 Array = NDArray[np.float64]
 
-# The operations, by CasADi's numbers for them.
+# The operations, by CasADi's numbers for them. A new one has four places: its number
+# here, ``OPERATIONS``, ``TWO_OPERANDS`` if it has two, and ``_operate`` (eight points
+# at once) or ``_operate_rarely`` (one after the other).
 (
     ASSIGN,
     ADD,
@@ -53,6 +55,10 @@ OPERATIONS = frozenset(
 )
 
 
+# rows that ``_operate`` works in, beyond those of the tape's places
+SPARE_PLACES = 5
+
+
 class Tape(NamedTuple):
     """A function of a vector z (d,)."""
 
@@ -60,19 +66,28 @@ class Tape(NamedTuple):
     #: places of up to two operands (an index into z of an ``INPUT``) (K, 4)
     code: NDArray[np.int64]
     constants: Array  #: of the operations ``CONST``, by row (K,)
-    work: int  #: number of places
+    places: int  #: number of places that its operations work on
     size: int  #: entries of the value
 
 
-NO_TAPE = Tape(np.empty((0, 4), dtype=np.int64), np.empty(0), 0, 0)
+NO_TAPE = Tape(
+    code=np.empty((0, 4), dtype=np.int64), constants=np.empty(0), places=0, size=0
+)
+
+
+class Tangents(NamedTuple):
+    """Derivatives by z at eight points, as ``run_tape`` writes them."""
+
+    value: Array  #: of the value (size, d, 8), flat
+    places: Array  #: of the places, lent to work in (places, d, 8), flat
 
 
 @njit_noalloc
-def run_tape(tape, z, work, value, slopes):
+def run_tape(tape, z, work, value, tangents):
     """Writes the values (size, 8) at eight points z (d, 8).
 
-    ``work`` (places + 5, 8) is lent to work in. ``slopes`` is None, or the derivatives
-    (size, d, 8) to be written and memory for those of the places (places, d, 8).
+    ``work`` (places + SPARE_PLACES, 8) is lent to work in. ``tangents`` are
+    ``Tangents`` to be written, or None.
     """
     use_widest_registers()
     d = len(z)
@@ -88,54 +103,54 @@ def run_tape(tape, z, work, value, slopes):
         last = 8 * tape.code[k, 3]
         if operation == OUTPUT:
             store(value, i, load(work, j))
-            if slopes is not None:
+            if tangents is not None:
                 for c in range(0, 8 * d, 8):
-                    store(slopes[0], i * d + c, load(slopes[1], j * d + c))
+                    tangent = load(tangents.places, j * d + c)
+                    store(tangents.value, i * d + c, tangent)
         elif operation in (INPUT, CONST):
             store(
                 work,
                 i,
                 load(z, j) if operation == INPUT else zeros() + tape.constants[k],
             )
-            if slopes is not None:
+            if tangents is not None:
                 for c in range(0, 8 * d, 8):
-                    store(
-                        slopes[1],
-                        i * d + c,
-                        zeros() + (1.0 if operation == INPUT and c == j else 0.0),
-                    )
+                    slope = 1.0 if operation == INPUT and c == j else 0.0
+                    store(tangents.places, i * d + c, zeros() + slope)
         else:
             result, by_first, by_second = _operate(
-                operation, load(work, j), load(work, last), work, 8 * tape.work
+                operation, load(work, j), load(work, last), work, 8 * tape.places
             )
             store(work, i, result)
-            if slopes is not None:
+            if tangents is not None:
                 both = operation in TWO_OPERANDS
                 for c in range(0, 8 * d, 8):
-                    tangent = by_first * load(slopes[1], j * d + c)
+                    tangent = by_first * load(tangents.places, j * d + c)
                     if both:
-                        tangent = tangent + by_second * load(slopes[1], last * d + c)
-                    store(slopes[1], i * d + c, tangent)
+                        second = load(tangents.places, last * d + c)
+                        tangent = tangent + by_second * second
+                    store(tangents.places, i * d + c, tangent)
 
 
 @compiled
 def linearize_tape(tape, points, values, jacobians):
-    """Writes values (K, size) and derivatives (K, size, d) at K points z (K, d)."""
+    """Writes values (H, size) and derivatives (H, size, d) at H points z (H, d)."""
     use_widest_registers()
-    K, d = points.shape
+    H, d = points.shape
     size = tape.size
     z = aligned_rows(d, 8)
-    work = aligned_rows(tape.work + 5, 8)
+    work = aligned_rows(tape.places + SPARE_PLACES, 8)
     value = aligned_rows(size, 8)
     derivative = aligned_rows(size * d, 8)
-    tangents = aligned_rows(tape.work * d, 8)
+    tangent_rows = aligned_rows(tape.places * d, 8)
     derivative[:] = 0.0
-    for first in range(0, K, 8):
+    tangents = Tangents(value=derivative.reshape(-1), places=tangent_rows.reshape(-1))
+    for first in range(0, H, 8):
         for lane in range(8):
             for c in range(d):
-                z[c, lane] = points[min(first + lane, K - 1), c]
-        run_tape(tape, z, work, value, (derivative.reshape(-1), tangents.reshape(-1)))
-        for lane in range(min(8, K - first)):
+                z[c, lane] = points[min(first + lane, H - 1), c]
+        run_tape(tape=tape, z=z, work=work, value=value, tangents=tangents)
+        for lane in range(min(8, H - first)):
             for i in range(size):
                 values[first + lane, i] = value[i, lane]
                 for c in range(d):
@@ -146,8 +161,8 @@ def linearize_tape(tape, points, values, jacobians):
 def _operate(operation, a, b, work, free):
     """Returns the values of an operation on a and b, and its derivatives by them.
 
-    b is not read where it has one operand. 40 entries of ``work`` from ``free`` on are
-    written to.
+    b is not read where it has one operand. ``SPARE_PLACES`` rows of eight of ``work``
+    are written to, from entry ``free`` on.
     """
     if operation == ADD:
         return a + b, zeros() + 1.0, zeros() + 1.0
@@ -226,4 +241,6 @@ def _operate_rarely(operation, a, b):
     if operation == FMAX:
         by_first = 1.0 if a >= b else 0.0
         return max(a, b), by_first, 1.0 - by_first
-    return a, 1.0, 0.0  # an assignment
+    if operation == ASSIGN:
+        return a, 1.0, 0.0
+    return np.nan, np.nan, np.nan  # none of ``OPERATIONS``

@@ -103,9 +103,9 @@ def from_gpytorch(
 
     They are one model, a batch (one batch dimension, an output each), or a list. A
     sparse one (``InducingPointKernel``) becomes its pseudo-observations; see
-    ``SparseTrainer``. Its method is the one by which GPyTorch would predict: FITC, unless
-    its setting ``sgpr_diagonal_correction`` is off. (Then its means are those of SGPR;
-    its variances lack kxx - qxx and vanish far from Z, ours do not.)
+    ``SparseTrainer``. Its method is the one by which GPyTorch would predict: FITC,
+    unless its setting ``sgpr_diagonal_correction`` is off. (Then its means are those of
+    SGPR; its variances lack kxx - qxx and vanish far from Z, ours do not.)
 
     Args:
         model: An ``ExactGP`` with a zero or constant mean and an ``RBFKernel``, scaled

@@ -246,8 +246,9 @@ def inducing_factor(inducing: Tensor, kernel: Hyperparameters, jitter: float) ->
         output = int(torch.nonzero(info)[0])
         raise SettingError(
             "inducing",
-            f"their kernel matrix of output {output + 1} is not positive definite: points "
-            "too near each other for its length-scales; take fewer, or a larger jitter",
+            f"their kernel matrix of output {output + 1} is not positive definite: "
+            "points too near each other for its length-scales; take fewer, or a larger "
+            "jitter",
         )
     return Lz
 

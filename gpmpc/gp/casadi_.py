@@ -200,7 +200,12 @@ def tape_of(function: casadi.Function) -> tapes.Tape | None:
         else:
             row[2 : 2 + len(operands)] = operands
             row[3] = operands[-1]
-    return tapes.Tape(code, constants, function.sz_w(), function.numel_out(0))
+    return tapes.Tape(
+        code=code,
+        constants=constants,
+        places=function.sz_w(),
+        size=function.numel_out(0),
+    )
 
 
 def function_of_tape(

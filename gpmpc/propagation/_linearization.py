@@ -16,6 +16,7 @@ from torch import Tensor
 from gpmpc._dynamics import predict_with_jacobian
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp._backend import host_arrays
+from gpmpc.gp._posterior import AffineForm
 from gpmpc.propagation._propagator import (
     NextMoments,
     NoisyPropagator,
@@ -48,7 +49,7 @@ def expand_to_second_order(
     Returns None for other models, and where those loops cannot evaluate.
     """
     form = getattr(model, "affine_form", None)
-    if form is None or form.B is not None or form.G is not None or form.c is not None:
+    if form is None or not _is_gp_alone(form):
         return None
     gp = form.f
     arrays = host_arrays(gp.weights, state, input)
@@ -60,7 +61,7 @@ def expand_to_second_order(
     _, states, inputs = arrays
     states = states.reshape(-1, gp.state_dim)
     inputs = inputs.reshape(len(states), gp.input_dim)
-    at = kernels.point_with_jacobian(gp.packed, states, inputs)
+    at = kernels.expand_gps(gp.packed, states, inputs)
 
     def tensor(rows: kernels.Array) -> Tensor:
         return torch.from_numpy(rows.reshape(*batch, *rows.shape[1:]))
@@ -81,10 +82,17 @@ def expand_to_second_order(
     )
 
 
+def _is_gp_alone(form: AffineForm) -> bool:
+    """Whether x+ = f(x, u), or A x + f(x, u), where f sees all states and inputs."""
+    further = (form.B, form.G, form.c, form.states, form.inputs, form.tape)
+    return not form.angles and all(part is None for part in further)
+
+
 class Linearization(NoisyPropagator):
     """First order, with the model's noise unless ``process_noise=False``."""
 
-    #: needs the model's mean, derivatives and variance at the belief's mean alone
+    #: needs the model's mean, derivatives and variance at the belief's mean alone, and
+    #: carries the covariance by A S A' + V
     first_order = True
 
     def differentiate(
@@ -96,7 +104,7 @@ class Linearization(NoisyPropagator):
         if expansion is None:
             return None
         A = expansion.A
-        moments = _first_order(belief, expansion.belief, A)
+        moments = _linear_moments(belief, expansion.belief, A)
         # of A S A': A changes with the mean and the input
         AS = A @ belief.covariance
         by_mean = torch.einsum("...ip,...jpc->...ijc", AS, expansion.mean_by_state2)
@@ -116,11 +124,11 @@ class Linearization(NoisyPropagator):
             + by_input.transpose(-3, -2)
             + on_diagonal(expansion.variance_by_input),
         )
-        return self._add_noise(model, moments), sensitivity
+        return self._add_noise_and_project(model, moments), sensitivity
 
     def _next_moments(self, model: Any, belief: Gaussian, input: Tensor) -> NextMoments:
         prediction, A, _ = predict_with_jacobian(model, belief.mean, input)
-        return _first_order(belief, prediction, A)
+        return _linear_moments(belief, prediction, A)
 
 
 class MeanEquivalence(NoisyPropagator):
@@ -135,8 +143,8 @@ class MeanEquivalence(NoisyPropagator):
         """Propagates with all derivatives in closed form; None where there is none."""
         input = checked_arguments(model, belief, input)
         certain = Gaussian(belief.mean, torch.zeros_like(belief.covariance))
-        first_order = Linearization(self.process_noise)
-        result = first_order.differentiate(model, certain, input)
+        linearization = Linearization(self.process_noise)
+        result = linearization.differentiate(model, certain, input)
         if result is None:
             return None
         propagation, sensitivity = result
@@ -161,7 +169,8 @@ def on_diagonal(variance: Tensor) -> Tensor:
     return torch.diag_embed(variance.mT).movedim(-3, -1)
 
 
-def _first_order(belief: Gaussian, prediction: Gaussian, A: Tensor) -> NextMoments:
+def _linear_moments(belief: Gaussian, prediction: Gaussian, A: Tensor) -> NextMoments:
+    """Returns the moments after a prediction at the belief's mean, with slope A."""
     S = belief.covariance
     return NextMoments(
         mean=prediction.mean,

@@ -69,7 +69,7 @@ class MomentMatching(NoisyPropagator):
         if self.diagonal:
             sensitivity = _of_diagonal(sensitivity)
         next_moments = _through_affine_part(form, belief, input, f)
-        return self._add_noise(model, next_moments), sensitivity
+        return self._add_noise_and_project(model, next_moments), sensitivity
 
     def _next_moments(self, model: Any, belief: Gaussian, input: Tensor) -> NextMoments:
         form = _exact_form(model)
@@ -238,9 +238,9 @@ def _derivatives(
         AS = AS[..., form.states]
     dJ_dmu = 2 * df.dM_dS  # Price's theorem
     dJ_dS = _extend_matrix(df.dJ_dS, form.states, n)
-    by_mean = _doubled(form.B, AS, _extend(dJ_dmu, form.states, n))
-    by_input = _doubled(form.B, AS, _extend(df.dJ_du, form.inputs, m))
-    by_covariance = _doubled(form.B, AS, dJ_dS.flatten(-2))
+    by_mean = _with_transpose(form.B, AS, _extend(dJ_dmu, form.states, n))
+    by_input = _with_transpose(form.B, AS, _extend(df.dJ_du, form.inputs, m))
+    by_covariance = _with_transpose(form.B, AS, dJ_dS.flatten(-2))
     by_covariance = by_covariance.unflatten(-1, dJ_dS.shape[-2:])
     # ... and, together with A S A', with S: A S (A + B J)' + B J S A', at one J
     outer = torch.einsum("ic,...jd->...ijcd", A, A + BJ)
@@ -285,7 +285,7 @@ def _derivatives_of_residual(
     )
 
 
-def _doubled(B: Tensor | None, AS: Tensor, dJ: Tensor) -> Tensor:
+def _with_transpose(B: Tensor | None, AS: Tensor, dJ: Tensor) -> Tensor:
     """Returns A S dJ' B' and its transpose, of derivatives dJ (*batch, k, n_s, j).
 
     The result is (*batch, n, n, j).

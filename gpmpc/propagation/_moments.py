@@ -34,8 +34,17 @@ A kernel is at most sf2. So Q_ij is at most sf2_b q_ai and at most sf2_a q_bj, a
 that is, Q_ij <= sf2_a sf2_b exp(-delta_ij): where delta is large the pair counts for
 nothing, and the exponent may stay where exp does not overflow.
 
-The mean and J have their derivatives in closed form, with dM/dS = 1/2 d2M/dmu2 (Price,
-1958). Those of V come from reverse mode: every pair of outputs has a copy of the belief
+The mean and J have their derivatives in closed form. With w_ai = G_a' z_ai, c_ai = D_a
+(u_i - u) of the controls, and w_c an entry of w_ai,
+
+    dM_a/dS        = 1/2 d2M_a/dmu2   (Price, 1958)
+                   = 1/2 sum_i beta_ai q_ai (w_ai w_ai' - G_a' D_a)
+    dM_a/du        = sum_i beta_ai q_ai c_ai
+    (dJ_a/dS)_cde  = 1/2 sum_i beta_ai q_ai w_c w_d w_e
+                     - 1/2 (J_c (G'D)_de + J_d (G'D)_ce + J_e (G'D)_cd)
+    dJ_a/du        = sum_i beta_ai q_ai w_ai c_ai'
+
+Those of V come from reverse mode: every pair of outputs has a copy of the belief
 of its own, so that one pass over the sum of all entries gives each entry's.
 """
 
@@ -236,7 +245,7 @@ def moments_with_jacobian(
     terms = _output_terms(model, slice(None), point)
     D = model.lengthscales[:, None, :n] ** -2
     D_u = model.lengthscales[:, None, n:] ** -2
-    A = terms.G.mT * D  # G' D, symmetric
+    G_D = terms.G.mT * D  # G' D, symmetric
     w = terms.z @ terms.G  # dlog q_ai / dmu
     c = (model.features[:, n:] - input[..., None, :])[..., None, :, :] * D_u
     weighted = model.weights * terms.q
@@ -246,18 +255,18 @@ def moments_with_jacobian(
     dJ_dS = None
     dJ_du = None
     if slope_derivatives:
-        # sum_i beta_i q_i w_i w_i w_i, less the three products of A with J
+        # sum_i beta_i q_i w_i w_i w_i, less the three products of G'D with J
         third = torch.stack(
             [(weighted_w * w[..., d, None]).mT @ w for d in range(n)], dim=-3
         )
-        third = third - J[..., :, None, None] * A[..., None, :, :]
-        third = third - A[..., :, :, None] * J[..., None, None, :]
-        third = third - A[..., :, None, :] * J[..., None, :, None]
+        third = third - J[..., :, None, None] * G_D[..., None, :, :]
+        third = third - G_D[..., :, :, None] * J[..., None, None, :]
+        third = third - G_D[..., :, None, :] * J[..., None, :, None]
         dJ_dS = third / 2
         dJ_du = weighted_w.mT @ c
     V = _covariances_with_gradient(model, belief, point, diagonal)
     latent_derivatives = LatentDerivatives(
-        dM_dS=(weighted_w.mT @ w - M[..., None, None] * A) / 2,
+        dM_dS=(weighted_w.mT @ w - M[..., None, None] * G_D) / 2,
         dM_du=(weighted[..., None, :] @ c)[..., 0, :],
         dV_dmu=V.dmu,
         dV_dS=(V.dS + V.dS.mT) / 2,

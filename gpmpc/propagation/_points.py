@@ -112,8 +112,8 @@ class Unscented(NoisyPropagator):
         if expansion is None:
             return None
         mean_by, covariance_by = self._derivatives(belief.dim, expansion)
-        by_mean = _by_covariance_of_root(mean_by, belief, r, U)
-        by_covariance = _by_covariance_of_root(covariance_by, belief, r, U)
+        by_mean = _from_root_to_covariance(mean_by, belief, r, U)
+        by_covariance = _from_root_to_covariance(covariance_by, belief, r, U)
         sensitivity = Sensitivity(
             mean_by_mean=by_mean.mean,
             mean_by_covariance=by_mean.covariance,
@@ -123,7 +123,7 @@ class Unscented(NoisyPropagator):
             covariance_by_input=by_covariance.input,
         )
         moments = self._moments(model, belief, points.steps, expansion.belief)
-        return self._add_noise(model, moments), sensitivity
+        return self._add_noise_and_project(model, moments), sensitivity
 
     def _derivatives(
         self, n: int, expansion: SecondOrderExpansion
@@ -136,8 +136,10 @@ class Unscented(NoisyPropagator):
         weights = self._weights(expansion.A, n)
         eye = torch.eye(n, dtype=expansion.A.dtype, device=expansion.A.device)
         one = math.sqrt(self._spread(n)) * eye
-        shifts = torch.cat([torch.zeros_like(one[:1]), one, -one])[:, None, None, :]
+        steps = torch.cat([torch.zeros_like(one[:1]), one, -one])
+        shifts = steps[:, None, None, :]  # (points, 1, 1, n)
 
+        # (*batch, points, k, n) and (*batch, points, k, m) to (*batch, points, k, p)
         def by_parameters(by_state: Tensor, by_input: Tensor) -> Tensor:
             by_root = by_state[..., :, None] * shifts
             return torch.cat([by_state, by_root.flatten(-2), by_input], dim=-1)
@@ -146,7 +148,7 @@ class Unscented(NoisyPropagator):
         variances_by = by_parameters(
             expansion.variance_by_state, expansion.variance_by_input
         )
-        values = expansion.belief.mean
+        values = expansion.belief.mean  # (*batch, points, k)
         mean_by = torch.einsum("i,...iap->...ap", weights.mean, values_by)
         mean = torch.einsum("i,...ia->...a", weights.mean, values)
         half = torch.einsum(
@@ -203,26 +205,30 @@ class Unscented(NoisyPropagator):
         centred = values - mean[..., None, :]
         covariance = centred.mT @ (weights.covariance[:, None] * centred)
         own = (weights.mean[:, None, None] * predictions.covariance).sum(-3)
+        # the centre's step is zero, and all other points have the one weight
+        weight = weights.mean[1]
         return NextMoments(
             mean=mean,
             covariance=covariance + own,
-            cross_covariance=steps.mT @ (weights.mean[1] * centred),
+            cross_covariance=steps.mT @ (weight * centred),
         )
 
 
-def _by_covariance_of_root(
+def _from_root_to_covariance(
     by_parameters: Tensor, belief: Gaussian, r: Tensor, U: Tensor
 ) -> _ByParameters:
     """Turns derivatives by [mu, vec(root), u] (..., p) into those by mu, Sigma, u.
 
     The root is U diag(r) U'. Its change dR = L(dSigma) is linear, and L its own adjoint
-    (``square_root_differential``).
+    (``square_root_differential``). The value that is differentiated has axes of its own
+    between those of the batch and p: one of a mean (k, p), two of a covariance.
     """
     n = belief.dim
     by_root = by_parameters[..., n : n + n * n].unflatten(-1, (n, n))
     by_root_symmetric = (by_root + by_root.mT) / 2
-    differentiated = by_root.dim() - belief.mean.dim() - 1  # dimensions of the value
-    columns = by_root_symmetric.flatten(-2 - differentiated, -3).movedim(-3, -1)
+    value_axes = by_root.dim() - belief.mean.dim() - 1
+    # (*batch, n, n, number of values)
+    columns = by_root_symmetric.flatten(-2 - value_axes, -3).movedim(-3, -1)
     by_covariance = square_root_differential(r, U, columns).movedim(-1, -3)
     return _ByParameters(
         mean=by_parameters[..., :n],

@@ -61,12 +61,15 @@ class Propagator(Protocol):
 
     A propagator with closed-form derivatives for a model has a method ``differentiate``
     with the arguments of ``propagate``, which returns the ``Propagation`` and its
-    ``Sensitivity``, or None where it has none. Two further attributes are optional, and
-    False where they are missing:
+    ``Sensitivity``, or None where it has none. Three further attributes are optional,
+    and False where they are missing:
 
     ``first_order``: it needs the model's mean, derivatives and variance at the belief's
-    mean alone; controllers and filters may then take these themselves.
+    mean alone, and carries the covariance by A S A' + V; controllers and filters may
+    then take these themselves.
     ``diagonal``: it computes only the diagonal of the predicted covariance.
+    ``process_noise``: it adds the model's noise covariance to the predicted one;
+    controllers that predict covariances by themselves then add it too.
     """
 
     def propagate(
@@ -116,14 +119,18 @@ class NoisyPropagator(Propagator):
     ) -> Propagation:
         """Propagates a belief over one step; see ``Propagator.propagate``."""
         input = checked_arguments(model, belief, input)
-        return self._add_noise(model, self._next_moments(model, belief, input))
+        moments = self._next_moments(model, belief, input)
+        return self._add_noise_and_project(model, moments)
 
     def _next_moments(self, model: Any, belief: Gaussian, input: Tensor) -> NextMoments:
         """Returns the moments of the next state, without process noise."""
         raise NotImplementedError
 
-    def _add_noise(self, model: Any, moments: NextMoments) -> Propagation:
-        """Adds the process noise, if any, and projects the covariance."""
+    def _add_noise_and_project(self, model: Any, moments: NextMoments) -> Propagation:
+        """Adds process noise, if wanted, and projects the covariance.
+
+        Of a ``diagonal`` propagator only the covariance's diagonal stays.
+        """
         covariance = moments.covariance
         if self.process_noise:
             covariance = covariance + model.noise_covariance
@@ -222,9 +229,10 @@ def by_autograd(
 
 
 def checked_arguments(model: Any, belief: Gaussian, input: Tensor | None) -> Tensor:
-    """Checks the belief and returns the control for its batch, by the rules of ``Propagator.propagate``.
+    """Checks the belief and returns the control for its batch.
 
-    Values are checked where that is free: in host memory, outside torch's transforms.
+    The rules are those of ``Propagator.propagate``. Values are checked where that is
+    free: in host memory, outside torch's transforms.
 
     Returns:
         The control (*batch, m).

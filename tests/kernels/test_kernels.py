@@ -20,7 +20,7 @@ from gpmpc._kernels._rows import (
     reduce_variances,
 )
 from gpmpc._kernels._simd import NEAR_ZERO, load, store
-from gpmpc.exceptions import ShapeError
+from gpmpc.exceptions import SettingError, ShapeError
 from gpmpc.gaussian import Gaussian
 from gpmpc.propagation._moments import moments, moments_with_jacobian
 from tests.propagation.test_moment_matching import belief, by_mpmath, model
@@ -292,7 +292,7 @@ def test_the_expansion_at_a_point_agrees_with_torch(n, m, size):
     def variance(x, u):
         return gp.predict(x, u).covariance.diagonal()
 
-    point = at_one(kernels.point_with_jacobian, packed(gp), *numbers(x, u))
+    point = at_one(kernels.expand_gps, packed(gp), *numbers(x, u))
     jacrev = torch.func.jacrev
     both = (0, 1)
     close(point.M, mean(x, u), 1e-12)
@@ -328,7 +328,7 @@ def test_without_covariance_the_moments_expand_about_the_mean(covariance):
     x = belief(3).mean
     u = control(2)
     d = differentiated(packed(gp), *numbers(x, covariance * torch.eye(3), u))
-    point = at_one(kernels.point_with_jacobian, packed(gp), *numbers(x, u))
+    point = at_one(kernels.expand_gps, packed(gp), *numbers(x, u))
     close(d.M, point.M, 1e-11)
     close(d.V, np.diag(point.variance), 1e-10)
     close(d.J, point.J, 1e-10)
@@ -366,7 +366,7 @@ def test_many_points_are_the_loop_over_them():
     u = np.linspace(-1, 1, 8).reshape(4, 2)
     together = [
         kernels.linearize_gps(gps, mu, u, True, np.zeros(3), False),
-        kernels.point_with_jacobian(gps, mu, u),
+        kernels.expand_gps(gps, mu, u),
         kernels.moments(gps, mu, S, u, diagonal=True),
         kernels.moments(gps, mu, S, u, derivatives=True),
     ]
@@ -378,7 +378,7 @@ def test_many_points_are_the_loop_over_them():
                     gps, mu[h : h + 1], u[h : h + 1], True, np.zeros(3), False
                 )
             ],
-            at_one(kernels.point_with_jacobian, gps, mu[h], u[h]),
+            at_one(kernels.expand_gps, gps, mu[h], u[h]),
             at_one(kernels.moments, gps, mu[h], S[h], u[h], diagonal=True),
             differentiated(gps, mu[h], S[h], u[h]),
         ]
@@ -497,7 +497,7 @@ def test_loops_over_points_may_use_the_widest_registers():
     u = np.zeros((1, 1))
     memory = np.empty(7 * gps.arrays.points.shape[1] + 8)
     none = np.zeros((0, 2, 2))
-    out = _gp_point.PointArrays(
+    out = _gp_point.LinearizedGPs(
         mean=np.zeros((1, 2)),
         A=np.zeros((1, 2, 2)),
         B=np.zeros((1, 2, 1)),
@@ -505,6 +505,29 @@ def test_loops_over_points_may_use_the_widest_registers():
     )
     anew(gps.arrays, none, np.zeros(2), False, x, u, memory, out)
     assert '"prefer-vector-width"="512"' in anew.inspect_llvm(anew.signatures[0])
+
+
+def test_nan_of_one_belief_does_not_reach_the_next():
+    gps = packed(model())
+    mu = np.array([[np.nan, 0.0], [0.2, -0.1]])
+    S = np.stack([0.1 * np.eye(2)] * 2)
+    u = np.zeros((2, 1))
+    both = kernels.moments(gps, mu, S, u, derivatives=True)
+    alone = kernels.moments(gps, mu[1:], S[1:], u[1:], derivatives=True)
+    assert np.isnan(both.M[0]).all()
+    for name in both._fields:
+        value = getattr(both, name)[1]
+        assert np.isfinite(value).all(), name
+        assert np.array_equal(value, getattr(alone, name)[0]), name
+
+
+def test_a_full_window_refuses_a_further_point():
+    window = kernels.Window.empty(np.ones((1, 2)), np.ones(1), 1, capacity=16)
+    for i in range(16):
+        point = np.array([float(i), 0.0])
+        window = window.append(point, np.zeros(1), np.full(1, 0.1))
+    with pytest.raises(SettingError, match="capacity: of 16 points is used up"):
+        window.append(np.array([16.0, 0.0]), np.zeros(1), np.full(1, 0.1))
 
 
 def test_the_exponentials_keep_the_limits():
@@ -529,7 +552,7 @@ def test_what_does_not_fit_is_refused():
         ShapeError,
         match=r"states \(H, 2\) and inputs \(H, 1\); got \(1, 3\) and \(1, 1\)",
     ):
-        at_one(kernels.point_with_jacobian, gps, np.zeros(3), np.zeros(1))
+        at_one(kernels.expand_gps, gps, np.zeros(3), np.zeros(1))
     with pytest.raises(ShapeError, match=r"got \(1, 2\) and \(1, 2\)"):
         valued(gps, np.zeros(2), np.eye(2), np.zeros(2))
     with pytest.raises(

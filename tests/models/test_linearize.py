@@ -152,7 +152,7 @@ def test_the_models_own_method_is_used():
 def test_points_that_do_not_fit_are_an_error():
     with pytest.raises(
         ShapeError,
-        match=r"states \(K, 3\) and inputs \(K, 2\); got \(2, 3\) and \(1, 2\)",
+        match=r"states \(H, 3\) and inputs \(H, 2\); got \(2, 3\) and \(1, 2\)",
     ):
         posterior().linearize(np.zeros((2, N)), np.zeros((1, M)))
 
