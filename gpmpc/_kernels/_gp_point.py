@@ -113,7 +113,7 @@ def linearize_points(gp, columns, prior_mean, adds_state, x, u, memory, out):
     wants_covariance = len(out.covariance) > 0
     # k_a of all points, for covariances: ``count`` rows of each output
     kernels = memory[2 * d + 1 :]
-    count = len(kernels) // outputs
+    count = len(kernels) // max(outputs, 1)
     for h in range(len(x)):
         _write_differences(gp.points, x[h], u[h], differences, squares)
         for a in range(outputs):
