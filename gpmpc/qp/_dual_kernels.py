@@ -9,7 +9,6 @@ bound is violated.
 """
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 
@@ -276,21 +275,27 @@ def _solve_opened(work, guess, out):
                 break
         first_round = False
 
-        # refine x; it stays where the iteration saw no violation at a margin of zero
-        judgement = _refine_and_judge(work, k, finest or passed_over)
-        status = judgement.status
-        finest = judgement.finest
-        changed = changed or judgement.moved
+        # refine x, as good as can be where that is in doubt, and judge it; it stays
+        # where the iteration saw no violation at a margin of zero. Written out here:
+        # a function that returns a record of all this costs 9 s of compilation
+        _put_on_bounds(work, k)
+        pivot_share = min(work.pivot_share, math.sqrt(_least_pivot_share(work, k)))
+        finest = finest or passed_over or pivot_share < _ILL
+        largest_residual = _DOUBT * pivot_share
+        refined = refine(work, k, min(_FINEST if finest else _FINE, largest_residual))
+        accurate = refined.residual <= min(work.tolerance, largest_residual)
+        status = SOLVED if accurate else NUMERICAL_TROUBLE
+        changed = changed or refined.moved
         rounds += 1
         settled = not changed and margin == 0.0
-        if settled or rounds == _ROUNDS or judgement.residual >= UNDEFINED:
+        if settled or rounds == _ROUNDS or refined.residual >= UNDEFINED:
             break
         margin = 0.0
         changed = False
 
         # list what the refined x violates. Its error may hide a violation: before x is
         # as good as can be, those that are less than the error from it are listed, too
-        error = judgement.residual * judgement.length / judgement.pivot_share
+        error = refined.residual * refined.length / pivot_share
         count = list_violated(work, -0.0 if finest else -error)
         if count == 0:
             break
@@ -303,40 +308,6 @@ def _solve_opened(work, guess, out):
         status = NUMERICAL_TROUBLE
     _write_record(work, k, status, iterations, age + iterations, out)
     return status
-
-
-class _Judgement(NamedTuple):
-    """What the residuals say of a refined x."""
-
-    status: int  # ``SOLVED`` or ``NUMERICAL_TROUBLE``
-    residual: float  # as a share of the length of x
-    length: float  # of x
-    pivot_share: float  # what cancellation left: the error of x is residual / share
-    moved: bool  # whether x did
-    finest: bool  # whether x is as good as can be
-
-
-@inline_njit
-def _refine_and_judge(work, k, finest):
-    """Refines x on its working set, and judges it by its residuals.
-
-    Where ``finest``, or where cancellation left little of the pivots, x is made as good
-    as can be; elsewhere as good as is needed.
-    """
-    _put_on_bounds(work, k)
-    share = min(work.pivot_share, math.sqrt(_least_pivot_share(work, k)))
-    finest = finest or share < _ILL
-    largest_residual = _DOUBT * share
-    refined = refine(work, k, min(_FINEST if finest else _FINE, largest_residual))
-    accurate = refined.residual <= min(work.tolerance, largest_residual)
-    return _Judgement(
-        status=SOLVED if accurate else NUMERICAL_TROUBLE,
-        residual=refined.residual,
-        length=refined.length,
-        pivot_share=share,
-        moved=refined.moved,
-        finest=finest,
-    )
 
 
 @inline_njit
