@@ -2,10 +2,10 @@
 
     python .ci/floors.py [NAME=VERSION ...] > floors.txt
 
-pip always takes the highest versions that fit. A floor has to be a release that exists: it
-is what ``make floors`` installs. Packages without a floor of their own are left to pip. A
-version that is named on the command line takes the place of a floor; for torch, whose
-lowest version cannot be had everywhere, that of ``constraints.txt`` does.
+pip always takes the highest versions that fit. A floor has to be a release that exists:
+it is what ``make floors`` installs. Packages without a floor of their own are left to
+pip. A version that is named on the command line takes the place of a floor; for torch,
+whose lowest version cannot be had everywhere, that of ``constraints.txt`` does.
 """
 
 import sys
@@ -29,8 +29,8 @@ PINNED = "torch"  # as constraints.txt has it
 def floors(project: Mapping[str, Any]) -> dict[str, str]:
     """Returns the lowest version of every package that a ``pyproject.toml`` asks for.
 
-    Where several extras ask for one package, it is the highest of their floors: they are
-    installed together.
+    Where several extras ask for one package, it is the highest of their floors: they
+    are installed together.
 
     Raises:
         ValueError: A requirement has no floor, such as ``numpy`` or ``numpy<3``.

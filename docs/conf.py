@@ -37,7 +37,7 @@ html_title = "gpmpc"
 
 
 def mark_formulas(app, what, name, obj, options, lines):
-    """Sets indented formulas of a module's text as they stand, and lets others write (*batch, n) and |x|."""
+    """Sets indented formulas as they stand, and lets texts write (*batch, n), |x|."""
     marked = []
     for line in lines:
         formula = what == "module" and line.startswith("    ")

@@ -1,11 +1,15 @@
-"""Takes the picture of the live view: a viewer in headless Chromium, connected to a running ``gpmpc run live=true``.
+"""Takes the picture of the live view.
+
+A viewer in headless Chromium, connected to a running ``gpmpc run live=true``.
 
     python docs/live_view.py [--out docs/figures/live.png] [--tab Solver] [--steps 40]
 
-The viewer is the last open release of Foxglove Studio on npm (1.48, MPL-2.0), the application that Lichtblick goes on
-with; Lichtblick itself is not on npm. The packages are installed into ``outputs/live_view`` and are no part of the
-repository. The picture is taken by Chromium (``--screenshot``) when the page has loaded, and the page has loaded when
-the server of this script has answered for its last picture: after the given number of steps.
+The viewer is the last open release of Foxglove Studio on npm (1.48, MPL-2.0), the
+application that Lichtblick goes on with; Lichtblick itself is not on npm. The packages
+are installed into ``outputs/live_view`` and are no part of the repository. The picture
+is taken by Chromium (``--screenshot``) when the page has loaded, and the page has
+loaded when the server of this script has answered for its last picture: after the given
+number of steps.
 """
 
 import argparse
@@ -28,7 +32,7 @@ TABS = ("Position", "Rates", "Inputs", "Uncertainty", "Solver")  # of the layout
 
 
 class Site(SimpleHTTPRequestHandler):
-    """Serves the page, the packages and the layout, and takes down what the page shows."""
+    """Serves the page and its parts, and takes down what the page shows."""
 
     def do_GET(self):
         """Answers with a file; ``/until`` only when the picture is to be taken."""
@@ -161,9 +165,8 @@ def main():
             flight.terminate()
     if steps < options.steps or server.seen["failures"]:
         sys.exit(f"the viewer received {steps} steps, and shows: {server.seen}")
-    print(
-        f"{options.out}: {steps} steps received, {options.out.stat().st_size / 1e3:.0f} kB"
-    )
+    kilobytes = options.out.stat().st_size / 1e3
+    print(f"{options.out}: {steps} steps received, {kilobytes:.0f} kB")
 
 
 def received(seen):

@@ -1,8 +1,9 @@
-"""A quadrotor becomes a fifth heavier in flight, and its model learns that while it flies.
+"""A quadrotor becomes heavier, and its model learns that while it flies.
 
     python examples/learning.py [FOLDER]
 
-The model was learned from a flight of the lighter vehicle. One step a second; at 20 s the mass changes.
+The model was learned from a flight of the lighter vehicle. One step a second; at 20 s
+the mass changes.
 """
 
 import sys

@@ -1,9 +1,10 @@
-"""A quadrotor in MuJoCo: flown with a data sheet's model, learned from the logs of these flights, and flown again.
+"""A quadrotor in MuJoCo is learned from the logs of its own flights.
 
-Run as `python examples/mujoco_flight.py FOLDER` (the present folder by default; needs `pip install 'gpmpc[sim]'`). The
-data sheet's mass is a fifth too small, its inertia too, and it knows neither drag nor that the rotors lag. Four flights
-with that model, excited by dithered thrusts, become CSV files; `gpmpc.logs.learn` makes a model of them, and the same
-controller flies a curve that no flight before it flew, with either model.
+Run as `python examples/mujoco_flight.py FOLDER` (the present folder by default; needs
+`pip install 'gpmpc[sim]'`). The data sheet's mass is a fifth too small, its inertia
+too, and it knows neither drag nor that the rotors lag. Four flights with that model,
+excited by dithered thrusts, become CSV files; `gpmpc.logs.learn` makes a model of them,
+and the same controller flies a curve that no flight before it flew, with either model.
 """
 
 import sys
@@ -79,7 +80,7 @@ def data_sheet() -> LogDynamics:
 
 
 def curve(frequencies: np.ndarray, steps: int) -> np.ndarray:
-    """Reference states (steps, 13) of sums of sines about a metre above the ground, from rest."""
+    """Returns states (steps, 13) of sums of sines a metre high, from rest."""
     t = STEP * np.arange(steps)[:, None]
     reference = np.zeros((steps, 13))
     reference[:, 6] = 1.0

@@ -1,7 +1,10 @@
-"""Flies a planar quadrotor among three discs, two of them moving, with forces learned from 500 random steps.
+"""Flies a planar quadrotor among three discs, two of which move.
 
-Where the discs will be comes with every call; each is to be missed with 95 % at every stage. Run as
-`python examples/obstacles.py FOLDER` (the present folder by default); it writes obstacles.png there.
+Its forces are learned from 500 random steps.
+
+Where the discs will be comes with every call; each is to be missed with 95 % at every
+stage. Run as `python examples/obstacles.py FOLDER` (the present folder by default); it
+writes obstacles.png there.
 """
 
 import sys
@@ -86,12 +89,16 @@ path = np.array(flown)
 nearest = float(np.min(gaps))
 away = float(np.linalg.norm(path[-1, [0, 2]] - GOAL[[0, 2]]))
 print(
-    f"{away:.2f} m from the goal, never nearer than {nearest:.3f} m to a disc, {loop.failures} failures"
+    f"{away:.2f} m from the goal, never nearer than {nearest:.3f} m to a disc, "
+    f"{loop.failures} failures"
 )
 
 
 def figure() -> Figure:
-    """Draws the path and the discs, which are as large as to hold the vehicle's own size, at four moments."""
+    """Draws the path and the discs at four moments.
+
+    The discs are larger by the vehicle's own size.
+    """
     plt.style.use("gpmpc.plotting.gpmpc")
     drawn, axes = plt.subplots(2, 2, sharex=True, sharey=True, figsize=(7, 5))
     for axis, k in zip(axes.flat, (10, 21, 32, STEPS), strict=True):

@@ -1,8 +1,9 @@
-"""A log of one's own: read with its gaps, a model learned and judged on a flight that it never saw, and a picture.
+"""A log of one's own becomes a model, judged on a flight that it never saw.
 
-Run as `python examples/own_log.py FOLDER` (the present folder by default). Three simulated flights of a quadrotor at
-100 Hz stand for the log: motors that a controller drives, gaps of 0.3 s, time stamps that jitter, samples of the
-position that repeat, and half a second on the ground. It writes flight_1.csv to flight_3.csv and own_log.png.
+Run as `python examples/own_log.py FOLDER` (the present folder by default). Three
+simulated flights of a quadrotor at 100 Hz stand for the log: motors that a controller
+drives, gaps of 0.3 s, time stamps that jitter, samples of the position that repeat, and
+half a second on the ground. It writes flight_1.csv to flight_3.csv and own_log.png.
 """
 
 import sys
@@ -61,7 +62,7 @@ MAPPING = {
 
 
 def simulate_flights(flights: int, rows: int, seed: int = 0) -> list[pandas.DataFrame]:
-    """Flies a quadrotor along sums of sines under white force and torque noise, all flights at once."""
+    """Flies a quadrotor along sums of sines under white force and torque noise."""
     rng = np.random.default_rng(seed)
     p, v, w = (np.zeros((flights, 3)) for _ in range(3))
     attitude = Rotation.identity(flights)
@@ -101,7 +102,10 @@ def simulate_flights(flights: int, rows: int, seed: int = 0) -> list[pandas.Data
 
 
 def spoil(table: pandas.DataFrame, rng: np.random.Generator) -> pandas.DataFrame:
-    """Makes a log of a flight: missing rows, stamps that jitter, samples that repeat, a start on the ground."""
+    """Makes a log of a flight.
+
+    Missing rows, stamps that jitter, samples that repeat, a start on the ground.
+    """
     table = table.assign(t=table["t"] + rng.uniform(-5e-4, 5e-4, len(table)) + 5)
     for row in rng.choice(len(table) - 100, 8, replace=False):
         table.loc[row + 1, ["px", "py", "pz"]] = table.loc[

@@ -1,7 +1,8 @@
-"""A system of one's own: an arm on a driven joint is learned from 200 random steps, flown, checked and drawn.
+"""A system of one's own: an arm is learned from 200 random steps and flown.
 
-It writes ``own_system.png`` into the folder that is named on the command line, or into the current one. The guide
-``docs/guide_system.md`` flies the same arm from the command line.
+It writes ``own_system.png`` into the folder that is named on the command line, or into
+the current one. The guide ``docs/guide_system.md`` flies the same arm from the command
+line.
 """
 
 import sys
@@ -39,10 +40,18 @@ class Arm:
 def arm(mass: float = 1.0) -> System:
     """Makes the system."""
     return System(
-        Arm(mass), time_step=0.05, name="arm", units={"angle": "rad", "rate": "rad/s", "torque": "N m"},
-        input_lower=[-8.0], input_upper=[8.0], start=[0.0, 0.0], region=[[-2.0, -6.0], [2.0, 6.0]],
-        angles=["angle"], rates={"rate": "angle"}, lost=1.5,
-    )  # fmt: skip
+        Arm(mass),
+        time_step=0.05,
+        name="arm",
+        units={"angle": "rad", "rate": "rad/s", "torque": "N m"},
+        input_lower=[-8.0],
+        input_upper=[8.0],
+        start=[0.0, 0.0],
+        region=[[-2.0, -6.0], [2.0, 6.0]],
+        angles=["angle"],
+        rates={"rate": "angle"},
+        lost=1.5,
+    )
 
 
 system = arm()

@@ -1,9 +1,10 @@
 """A quadrotor in MuJoCo, learned from its flights, picks up a fifth of its mass.
 
-Run as `python examples/payload.py FOLDER` (the present folder by default; needs `pip install 'gpmpc[sim]'`). It writes
-payload.png, a recording, and payload.gif where MuJoCo can render without a screen. The data sheet's mass and inertia
-are a fifth too small, and know neither drag nor that the rotors lag; GPs learn what it misses from three dithered
-flights.
+Run as `python examples/payload.py FOLDER` (the present folder by default; needs `pip
+install 'gpmpc[sim]'`). It writes payload.png, a recording, and payload.gif where MuJoCo
+can render without a screen. The data sheet's mass and inertia are a fifth too small,
+and know neither drag nor that the rotors lag; GPs learn what it misses from three
+dithered flights.
 """
 
 import sys

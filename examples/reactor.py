@@ -1,8 +1,11 @@
-"""Runs a reactor as productively as its temperature allows, on a model learned from 350 random steps.
+"""Runs a reactor as productively as its temperature allows.
 
-Its cost is economic: what is left of the feed, and the cooling that is paid for. Beside it stands the tracking of the
-reactor's operating point. Run as `python examples/reactor.py FOLDER` (the present folder by default); it writes
-reactor.png there.
+Its model is learned from 350 random steps.
+
+Its cost is economic: what is left of the feed, and the cooling that is paid for. Beside
+it stands the tracking of the reactor's operating point. Run as `python
+examples/reactor.py FOLDER` (the present folder by default); it writes reactor.png
+there.
 """
 
 import sys
@@ -80,7 +83,8 @@ for name, problem in problems.items():
     left = flight.states[STEPS // 2 :, 0].mean()
     hot = (flight.states[1:, 1] > HOTTEST).mean()
     print(
-        f"{name:16} {left:.3f} mol/L of the feed left, too hot in {hot:.1%} of the steps"
+        f"{name:16} {left:.3f} mol/L of the feed left, "
+        f"too hot in {hot:.1%} of the steps"
     )
 
 

@@ -1,8 +1,8 @@
-"""A GP for somebody else's project: from a CSV recording to a saved model and a forecast with its uncertainty.
+"""A GP for somebody else's project: from a CSV recording to a forecast.
 
-Run as `python examples/reuse_gp.py FOLDER` (the present folder by default); it writes pendulum.csv,
-pendulum.safetensors and tube.png there. The recording is a simulated damped pendulum, pushed at random and measured
-with noise.
+Run as `python examples/reuse_gp.py FOLDER` (the present folder by default); it writes
+pendulum.csv, pendulum.safetensors and tube.png there. The recording is a simulated
+damped pendulum, pushed at random and measured with noise.
 """
 
 import sys

@@ -1,4 +1,7 @@
-"""Learns a pendulum from 400 random samples, and swings it up with a torque that is too weak to lift it at once."""
+"""Learns a pendulum from 400 random samples and swings it up.
+
+Its torque is too weak to lift it at once.
+"""
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -11,7 +14,7 @@ from gpmpc.systems import System, step_many
 
 
 class Pendulum:
-    """Upright at (1, 0, 0); the torque moves the rate by 3 rad/s^2 per unit, gravity by 15."""
+    """Upright at (1, 0, 0); a unit of torque gives 3 rad/s^2, gravity up to 15."""
 
     state_names = ("cosine", "sine", "rate")
     input_names = ("torque",)

@@ -1,6 +1,7 @@
-"""Holds a cart as near to a wall as a probability of 95 % allows, on a learned model, while gusts push it.
+"""Holds a cart as near to a wall as 95 % allow, while gusts push it.
 
-Run as `python examples/wall.py FOLDER` (the present folder by default); it writes wall.png there.
+Run as `python examples/wall.py FOLDER` (the present folder by default); it writes
+wall.png there.
 """
 
 import sys

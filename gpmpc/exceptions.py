@@ -1,8 +1,9 @@
 """Errors of misuse, which name the rule that was broken and what was given instead.
 
-A numerical outcome (a solver that stops early, an infeasible problem) is no exception but a ``gpmpc.status.Status``.
-Every error of this package derives from ``GpmpcError``; its text is one line that a user can act on, and it survives
-the way back from a worker process (its constructor's arguments are its ``args``).
+A numerical outcome (a solver that stops early, an infeasible problem) is no exception
+but a ``gpmpc.status.Status``. Every error of this package derives from ``GpmpcError``;
+its text is one line that a user can act on, and it survives the way back from a worker
+process (its constructor's arguments are its ``args``).
 """
 
 import sys
@@ -30,11 +31,17 @@ class SettingError(GpmpcError, ValueError):
 
 
 class DataError(GpmpcError, ValueError):
-    """A data file or data set cannot be used; the text names the file, the row and the column."""
+    """A data file or data set cannot be used.
+
+    The text names the file, the row and the column.
+    """
 
 
 class TrainingError(GpmpcError, RuntimeError):
-    """For at least one output every start of the search failed, or sparse GPs learned nothing where exact ones do."""
+    """A training failed for at least one output.
+
+    Every start of its search did, or sparse GPs learned nothing where exact ones do.
+    """
 
     def __init__(self, outputs: list[int], message: str):
         super().__init__(outputs, message)
@@ -47,15 +54,18 @@ class TrainingError(GpmpcError, RuntimeError):
 
 
 class UnsupportedModel(GpmpcError, TypeError):
-    """A method has no formula for this kind of model; the text lists what is possible."""
+    """A method has no formula for this kind of model; the text lists others."""
 
 
 class ProblemError(GpmpcError, ValueError):
-    """An optimisation problem is malformed: shapes, symmetry, definiteness, crossed bounds, NaN."""
+    """An optimisation problem is malformed.
+
+    Its shapes, symmetry, definiteness or bounds are wrong, or it holds NaN.
+    """
 
 
 class SolverFailure(GpmpcError, RuntimeError):
-    """A controller's solver did not succeed where its caller had declared no other policy."""
+    """A controller's solver failed where its caller had declared no policy."""
 
     def __init__(self, step: int, advice: str):
         super().__init__(step, advice)
@@ -66,9 +76,10 @@ class SolverFailure(GpmpcError, RuntimeError):
 
 
 class Diverged(GpmpcError, ArithmeticError):
-    """A simulated system left the finite numbers, or its simulator ended the episode."""
+    """A simulated system left the finite numbers, or its episode ended."""
 
-    flown: Any = None  #: the ``Rollout`` of a closed loop up to there; None where that was its first step
+    #: the ``Rollout`` of a closed loop up to there; None where that was its first step
+    flown: Any = None
 
     def __init__(self, step: int, message: str):
         super().__init__(step, message)
@@ -91,9 +102,10 @@ def check_number(
     whole: bool = False,
     unit: str = "",
 ) -> None:
-    """Raises ``SettingError`` unless a setting is one finite number (not a truth value) as asked for.
+    """Raises ``SettingError`` unless a setting is one finite number.
 
-    Larger than ``above``, ``least`` or more, ``whole`` or not; the unit, such as "[kg]", is named in the message.
+    A truth value is none. It is to be larger than ``above``, ``least`` or more,
+    ``whole`` or not; the unit, such as "[kg]", is named in the message.
     """
     right_type = isinstance(value, int) if whole else isinstance(value, int | float)
     if (
@@ -126,7 +138,10 @@ def check_choice(key: str, value: Any, choices: Sequence[str]) -> None:
 
 
 def check_numbers(key: str, values: Any, length: int, **limits: Any) -> None:
-    """Raises unless a setting is a list of ``length`` numbers, each as ``check_number`` asks for."""
+    """Raises unless a setting is a list of ``length`` numbers.
+
+    Each is as ``check_number`` asks for.
+    """
     if (
         isinstance(values, str)
         or not hasattr(values, "__len__")

@@ -166,7 +166,8 @@ def _feedback_on_means(
 ) -> Array:
     """Returns F (H, m, n) of a feedback on the means, u = u' + F (x - x').
 
-    It is a program's, or F = -K with the gains K of the regulator of a problem's stages.
+    It is a program's, or F = -K with the gains K of the regulator of a problem's
+    stages.
     """
     F = feedback
     if not len(feedback):

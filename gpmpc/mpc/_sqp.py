@@ -364,8 +364,8 @@ class LagrangianGradient(NamedTuple):
 
     inputs: Array  # of the plan (H m,)
     gradient: Array  # by the inputs (H m,)
-    # of the rows G (rows,); those of the box are left out: their part of the gradient is
-    # the same at every plan
+    # of the rows G (rows,); those of the box are left out: their part of the gradient
+    # is the same at every plan
     multipliers: Array
     obeys: bool  # whether the plan obeyed the dynamics
 
