@@ -379,7 +379,8 @@ class TimedController:
         return decision
 
 
-class TimedOnModel(NamedTuple):
+@dataclass(frozen=True)
+class TimedOnModel:
     """Makes a controller on a learned model at another horizon, timed."""
 
     make: Callable[..., Controller]
@@ -390,7 +391,8 @@ class TimedOnModel(NamedTuple):
         return TimedController(self.make(model, horizon=self.horizon))
 
 
-class TimedOnPlant(NamedTuple):
+@dataclass(frozen=True)
+class TimedOnPlant:
     """Makes a controller on the true model at another horizon, timed.
 
     ``Experiment`` hands the plant to what calls its first argument so.

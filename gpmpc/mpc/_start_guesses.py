@@ -85,11 +85,9 @@ class Starts:
             distance = (state[angle] - end[angle]) / (2 * np.pi)  # in full turns
             lowest = int(np.floor(distance)) - count
             highest = int(np.ceil(distance)) + count
-            nearest = sorted(
-                range(lowest, highest + 1),
-                key=lambda turn, distance=distance: abs(turn - distance),
-            )
-            turns_by_angle.append(nearest[:count])
+            candidates = np.arange(lowest, highest + 1)
+            order = np.argsort(np.abs(candidates - distance), kind="stable")
+            turns_by_angle.append(candidates[order[:count]].tolist())
         choices = list(product(*turns_by_angle))
         turns = np.zeros((len(choices), len(state)))
         counts = np.array(choices).reshape(len(choices), len(self._angles))

@@ -168,7 +168,7 @@ class _Transform(NamedTuple):
     @classmethod
     def of(cls, problem: QuadraticProgram) -> "_Transform":
         """Returns the transform of a problem."""
-        factor = np.linalg.cholesky(problem.P).T
+        factor = np.asarray(np.linalg.cholesky(problem.P), dtype=np.float64).T
         return cls(
             factor=factor,
             back=solve_triangular(factor, np.eye(len(factor))),

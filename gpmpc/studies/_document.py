@@ -17,7 +17,7 @@ from urllib.parse import quote
 
 import pandas as pd
 from rich import box
-from rich.console import Group
+from rich.console import Group, JustifyMethod
 from rich.table import Table as TerminalTable
 from rich.text import Text
 
@@ -221,7 +221,7 @@ def _terminal_table(table: Table) -> TerminalTable:
     for i, name in enumerate(table.header[first_column:], start=first_column):
         cells = [row[i] for row in rows]
         has_words = any("\n" in cell or cell[:1].isalpha() for cell in cells)
-        justify = "left" if has_words else "right"
+        justify: JustifyMethod = "left" if has_words else "right"
         shown.add_column(Text(name), justify=justify, overflow="fold")
     section = None
     for row in rows:

@@ -88,7 +88,9 @@ def _check_array(
     difference = np.abs(result - np.asarray(expected)).max()
     error = difference / max(1.0, np.abs(expected).max())
     require(
-        error <= tolerance, problem_name, f"{name} is {result}, should be {expected}"
+        error <= tolerance,
+        problem_name,
+        f"{name} is {result!r}, should be {expected!r}",
     )
 
 

@@ -69,7 +69,8 @@ def timed_pilot(monkeypatch, start, decision, value=0.1):
     )
     who = real_time_pilot(parts, 0)
     monkeypatch.setattr(realaigym_real_time, "process_time", lambda: clock[0])
-    monkeypatch.setattr(who.search, "_try", slowed(who.search._try, start))
+    planner = who.search.planner
+    monkeypatch.setattr(planner, "control", slowed(planner.control, start))
     monkeypatch.setattr(who.step, "control", slowed(who.step.control, decision))
     return who
 

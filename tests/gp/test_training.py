@@ -428,7 +428,7 @@ def test_what_takes_long_tells_where_it_is(caplog, monkeypatch):
     with caplog.at_level(logging.INFO, "gpmpc"):
         training = train(data, restarts=0)
     text = (
-        r"training: output (\d) of 2, 12 points: evaluation (\d+), "
+        r"training: state (\d) \(\1 of 2\), 12 points: evaluation (\d+), "
         r"minus log evidence .*"
     )
     progress = [re.fullmatch(text, record.message) for record in caplog.records]
