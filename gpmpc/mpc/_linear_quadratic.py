@@ -35,8 +35,8 @@ class Plan(NamedTuple):
 
     states: Array  # s_0 .. s_H (H + 1, p); s_0 is the current one
     inputs: Array  # u_0 .. u_{H-1} (H, m)
-    # Sigma_0 .. Sigma_H (H + 1, n, n) at which stages are linearised; where that needs
-    # none they are zero after Sigma_0, and not what is predicted
+    # Sigma_0 .. Sigma_H (H + 1, n, n) at which stages are linearised: of a first guess
+    # zero after Sigma_0 where that needs none, of a program's plan those predicted
     covariances: Array
 
 

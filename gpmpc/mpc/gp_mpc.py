@@ -129,7 +129,9 @@ class GPMPC:
         tolerance: Of more iterations: relative offset and defects of a plan that counts
             as solved (``gpmpc.mpc._sqp``), estimated from the slower of the last two
             rates of convergence. 1e-8 may be out of reach. By default 1e-2 where the
-            number of programs is not set, and 1e-6 where it is.
+            number of programs is not set, and 1e-6 where it is. A step that goes on
+            along the last plan by one program is not measured by it: it is solved where
+            its program is.
         budget: Time of a decision after which no further program is begun [s]: it then
             ends with ``TIME_LIMIT``, unless it was solved. None for no limit. Decisions
             then depend on the machine.
@@ -608,7 +610,9 @@ class _Attempt:
     def _whole_step_is_enough(self, local: LocalProblem, proposed: Plan) -> bool:
         """Returns whether to take a step whole, as in the real-time iteration.
 
-        A first program of several measures whether it goes on along the last plan.
+        A first program of several measures whether it goes on along the last plan, and
+        keeps the length of its step for the next decision to compare with. Under curved
+        rows first plans may, too: a program is judged by the plan it leads to.
         """
         if self._most_programs == 1:
             return True
