@@ -676,7 +676,10 @@ class _Attempt:
         solution: QPSolution,
         status: Status,
     ) -> Decision:
-        """Returns the decision for a plan: failed if it is the guess or infeasible."""
+        """Returns the decision for a plan: failed if it is the guess or infeasible.
+
+        A guess that was rolled out obeys the dynamics and counts as a plan.
+        """
         self._stopwatch.lap("model")
         request = self._request
         plan = local.plan
