@@ -5,9 +5,12 @@
     metrics.json   the results; written last and in one piece: where it is, the run is
                    finished
     error.json     why it failed, where it did
+    .error.json    why the attempt before this one failed
+    .lock          locked while a process works on it; says which one
 
 Any number of processes can work on one tree of such folders: who works on a folder
-holds a lock on it, which the system takes back from a process that dies.
+holds a lock on it, which the system takes back from a process that dies. So the folder
+alone tells how far a run is (``CellState``), whatever the process that flew it said.
 
 A finished run is one of the code that flew it. It is not thrown away where the code has
 changed since, but whoever shows its numbers says so: ``of_other_code`` tells.
@@ -17,10 +20,13 @@ import hashlib
 import json
 import os
 import re
+import socket
+import time
 import traceback
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from enum import Enum
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +41,10 @@ ERROR = "error.json"
 CONFIG = "config.yaml"
 RECORDING = "run.mcap"
 PLAN = "sweep-"  # beginning of the names of the files that list a sweep's runs
-_LOCK = ".lock"  # locked by who works on the folder; stays, empty
+_LOCK = ".lock"  # stays, and says who worked on the folder last
+_EARLIER_ERROR = ".error.json"
+_PROBES = 5  # of a lock that may only be looked at by another process
+_PROBE_INTERVAL = 0.01  # between two of them [s]
 LONGEST_NAME = 150  # characters of a folder's name; file systems take 255 bytes
 
 
@@ -43,11 +52,64 @@ class Busy(GpmpcError):
     """Another process works on this run."""
 
 
+class CellState(Enum):
+    """How far a run is, as its folder tells."""
+
+    NOT_BEGUN = "not begun"
+    #: a living process holds the lock
+    RUNNING = "running"
+    FINISHED = "finished"
+    FAILED = "failed"
+    #: begun, and neither ended nor in anybody's hands: its process was killed
+    LOST = "lost"
+
+
 @dataclass(frozen=True)
 class RunFolder:
     """One run's folder."""
 
     path: Path  #: where it is
+
+    @property
+    def state(self) -> CellState:
+        """Reads how far the run is; a finished run stays finished.
+
+        A run that is flown again is running, whatever an earlier attempt left.
+        """
+        if self.finished:
+            return CellState.FINISHED
+        if (self.path / ERROR).exists():
+            return CellState.FAILED
+        if self._has_living_lock():
+            return CellState.RUNNING
+        # It may have ended between the looks.
+        if self.finished:
+            return CellState.FINISHED
+        if (self.path / ERROR).exists():
+            return CellState.FAILED
+        if (self.path / CONFIG).exists():
+            return CellState.LOST
+        return CellState.NOT_BEGUN
+
+    def _has_living_lock(self) -> bool:
+        """Whether a process holds the lock; takes it for a moment where none does."""
+        try:
+            file = os.open(self.path / _LOCK, os.O_RDWR)
+        except FileNotFoundError:
+            return False
+        try:
+            return not lock_descriptor(file, blocking=False)
+        finally:
+            os.close(file)
+
+    @property
+    def last_worker(self) -> str:
+        """Returns who worked on it last, "process 12 on HOST"; empty if unknown."""
+        try:
+            text = (self.path / _LOCK).read_text(encoding="utf-8", errors="replace")
+        except FileNotFoundError:
+            return ""
+        return " ".join(text.split())
 
     @property
     def finished(self) -> bool:
@@ -62,6 +124,14 @@ class RunFolder:
         except FileNotFoundError:
             return None
 
+    @property
+    def begun_at(self) -> int | None:
+        """When the last attempt began [ns]; None where none did."""
+        try:
+            return (self.path / CONFIG).stat().st_mtime_ns
+        except FileNotFoundError:
+            return None
+
     @contextmanager
     def locked(self, wait: bool = True) -> Iterator[None]:
         """Makes the folder, clears it of half-written files and holds its lock.
@@ -72,21 +142,25 @@ class RunFolder:
         self.path.mkdir(parents=True, exist_ok=True)
         file = os.open(self.path / _LOCK, os.O_RDWR | os.O_CREAT, 0o666)
         try:
-            if not lock_descriptor(file, blocking=wait):
+            if not (wait and lock_descriptor(file)) and not _lock_soon(file):
                 raise Busy(f"{self.path}: another process works on this run")
+            os.truncate(file, 0)
+            os.write(file, f"process {os.getpid()} on {socket.gethostname()}".encode())
             remove_partial(self.path)
             yield
         finally:
             os.close(file)
 
     def begin(self, config: str) -> None:
-        """Forgets an earlier failure and keeps the resolved settings."""
-        (self.path / ERROR).unlink(missing_ok=True)
+        """Puts an earlier failure aside and keeps the resolved settings."""
+        with suppress(FileNotFoundError):
+            os.replace(self.path / ERROR, self.path / _EARLIER_ERROR)
         write_whole(self.path / CONFIG, config)
 
     def finish(self, result: Mapping[str, Any]) -> None:
-        """Makes the run a finished one."""
+        """Makes the run a finished one, without a trace of earlier failures."""
         write_whole(self.path / METRICS, json.dumps(result, indent=1) + "\n")
+        (self.path / _EARLIER_ERROR).unlink(missing_ok=True)
 
     def fail(self, error: BaseException, about: Mapping[str, Any]) -> None:
         """Keeps why the run failed, with the traceback."""
@@ -98,6 +172,41 @@ class RunFolder:
             "traceback": "".join(traceback.format_exception(error)),
         }
         write_whole(self.path / ERROR, json.dumps(content, indent=1) + "\n")
+
+    def lose(self, reason: str, kind: str, about: Mapping[str, Any]) -> None:
+        """Keeps why an attempt ended that could not say so itself.
+
+        Args:
+            reason: In a line.
+            kind: Such as "time" or "memory".
+            about: What else is kept, such as the choices.
+
+        Raises:
+            Busy: A process works on the run, so that it is not lost.
+        """
+        with self.locked(wait=False):
+            if self.finished:
+                return
+            content = {
+                **about,
+                "error": " ".join(reason.split()),
+                "kind": kind,
+                "attempts": self.lost_attempts + 1,
+                "traceback": "",
+            }
+            write_whole(self.path / ERROR, json.dumps(content, indent=1) + "\n")
+
+    @property
+    def lost_attempts(self) -> int:
+        """Number of attempts that could not say themselves why they ended."""
+        for name in (ERROR, _EARLIER_ERROR):
+            try:
+                content = json.loads((self.path / name).read_text(encoding="utf-8"))
+            except (OSError, ValueError):
+                continue
+            attempts = _mapping(content).get("attempts")
+            return attempts if type(attempts) is int else 0
+        return 0
 
     def result(self, settings: Mapping[str, Any] | None = None) -> dict[str, Any]:
         """Reads the result of the finished run.
@@ -124,6 +233,15 @@ class RunFolder:
                 "choose another folder, or remove that one to fly it again",
             )
         return content
+
+
+def _lock_soon(file: int) -> bool:
+    """Takes a lock, although others may take it for a moment to look at it."""
+    for _ in range(_PROBES):
+        if lock_descriptor(file, blocking=False):
+            return True
+        time.sleep(_PROBE_INTERVAL)
+    return False
 
 
 def record(

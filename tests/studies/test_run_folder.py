@@ -1,6 +1,8 @@
 """Folders of runs have own names, and two runs' different settings are put in words."""
 
 import json
+import os
+import socket
 from itertools import combinations
 
 import pytest
@@ -10,6 +12,8 @@ from gpmpc.studies._run_folder import (
     ERROR,
     LONGEST_NAME,
     METRICS,
+    Busy,
+    CellState,
     RunFolder,
     difference,
     folder_name,
@@ -146,3 +150,49 @@ def test_a_name_is_the_choices_as_long_as_it_is_short_and_plain():
     assert len(longer) == LONGEST_NAME + 11
     assert longer.startswith("a=" + "x" * (LONGEST_NAME - 2) + "-")
     assert folder_name(["a=[1]+2-3.5@b"]) == "a=[1]+2-3.5@b"
+
+
+def test_a_folder_alone_tells_how_far_its_run_is(tmp_path):
+    folder = RunFolder(tmp_path / "run")
+    assert folder.state is CellState.NOT_BEGUN
+    assert (folder.begun_at, folder.last_worker) == (None, "")
+    with folder.locked():
+        assert folder.state is CellState.RUNNING
+        folder.begin("steps: 1\n")
+        assert folder.state is CellState.RUNNING
+        assert folder.last_worker == f"process {os.getpid()} on {socket.gethostname()}"
+        with pytest.raises(Busy):
+            folder.lose("the node failed", "node", {})
+    assert folder.state is CellState.LOST  # left as by a process that was killed
+    assert folder.begun_at == (folder.path / "config.yaml").stat().st_mtime_ns
+    with folder.locked():
+        folder.fail(ValueError("no"), {})
+    assert folder.state is CellState.FAILED
+    with folder.locked():
+        folder.begin("steps: 1\n")
+        assert folder.state is CellState.RUNNING
+        folder.finish({"settings": {}})
+    assert folder.state is CellState.FINISHED
+    folder.lose("too late", "time", {})
+    assert folder.state is CellState.FINISHED
+    assert not (folder.path / ERROR).exists()
+
+
+def test_attempts_that_were_ended_from_outside_are_counted(tmp_path):
+    folder = RunFolder(tmp_path / "run")
+    for count in (1, 2):
+        folder.lose("over its memory", "memory", {"choices": ["a=1"]})
+        content = json.loads((folder.path / ERROR).read_text())
+        assert content["choices"] == ["a=1"]
+        assert (content["error"], content["kind"]) == ("over its memory", "memory")
+        assert content["attempts"] == folder.lost_attempts == count
+        with folder.locked():
+            folder.begin("steps: 1\n")
+        assert folder.lost_attempts == count
+    with folder.locked():
+        folder.fail(ValueError("of its own"), {})
+    assert folder.lost_attempts == 0
+    with folder.locked():
+        folder.begin("steps: 1\n")
+        folder.finish({"settings": {}})
+    assert folder.lost_attempts == 0
