@@ -1,0 +1,195 @@
+"""Starts the processes that fly a sweep's runs, and tells how each of them ended.
+
+A launcher is handed chunks: runs that one process flies, one after another. It knows
+nothing of a run but its folder, and says of a chunk only how its process ended. How far
+its runs are is read from their folders, see ``_flying``.
+
+``conf/launcher/`` lists them: in this process, in processes of this machine (here), as
+jobs of Slurm (``_slurm``), and as tasks of Ray (``_ray``).
+"""
+
+import os
+import re
+import socket
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, wait
+from dataclasses import dataclass
+from enum import Enum
+from pathlib import Path
+from typing import Any, Protocol
+
+from hydra.utils import instantiate
+from joblib import effective_n_jobs
+from joblib.externals.loky import ProcessPoolExecutor
+from joblib.externals.loky.backend import resource_tracker
+from omegaconf import DictConfig
+
+from gpmpc.exceptions import SettingError, check_number
+from gpmpc.parallel import children_ignore_interrupts, end_with
+from gpmpc.studies._run_folder import RunFolder
+
+
+class Chunk(Protocol):
+    """Runs that one process flies, one after another; can be pickled."""
+
+    @property
+    def folders(self) -> Sequence[RunFolder]:
+        """Their folders, with absolute paths, in the order of flight."""
+        ...
+
+
+Work = Callable[[Any], object]  # flies a chunk; of a module, so that it can be pickled
+
+
+class Cause(Enum):
+    """Why a process did not fly its chunk to the end."""
+
+    CANCELLED = "cancelled"
+    TIME = "time"
+    MEMORY = "memory"
+    NODE = "node"
+    #: the process died, and nobody knows why
+    CRASH = "crash"
+    #: it could not begin, or an exception came out of it
+    ERROR = "error"
+
+
+@dataclass(frozen=True)
+class ChunkEnd:
+    """How the process of a chunk ended."""
+
+    chunk: Any
+    #: that it ran on, as far as known
+    host: str = ""
+    #: None where it says that it is done
+    cause: Cause | None = None
+    #: the cause in a line
+    reason: str = ""
+
+
+class Launcher(Protocol):
+    """Starts processes for chunks."""
+
+    @property
+    def workers(self) -> int | None:
+        """Processes at the same time; None where that is the cluster's business."""
+        ...
+
+    def running(self) -> Sequence[Chunk]:
+        """Returns chunks of an earlier call that are still being flown, or wait."""
+        ...
+
+    def launch(self, work: Work, chunks: Sequence[Chunk]) -> Iterator[ChunkEnd]:
+        """Starts ``chunks``, and yields how they and the running ones end."""
+        ...
+
+    def close(self) -> None:
+        """Ends the processes that only wait for more."""
+        ...
+
+
+def launcher_of(config: DictConfig, tree: Path) -> Launcher:
+    """Makes the launcher that the settings name.
+
+    Args:
+        config: The settings, with Hydra's own.
+        tree: The sweep's folder.
+    """
+    return instantiate(config.hydra.launcher, tree=tree.absolute())
+
+
+class Basic:
+    """Flies chunks in this process."""
+
+    workers = 1
+
+    def __init__(self, tree: Path):
+        self.tree = tree
+
+    def running(self) -> Sequence[Chunk]:
+        return ()
+
+    def launch(self, work: Work, chunks: Sequence[Chunk]) -> Iterator[ChunkEnd]:
+        for chunk in chunks:
+            try:
+                work(chunk)
+            except Exception as error:
+                yield _end_by(error, chunk)
+            else:
+                yield ChunkEnd(chunk, socket.gethostname())
+
+    def close(self) -> None:
+        pass
+
+
+class Joblib:
+    """Flies chunks in processes of this machine, by joblib's executors.
+
+    Each process has an executor of its own: where one dies, the others go on.
+
+    Args:
+        tree: The sweep's folder.
+        n_jobs: Processes; negative ones count from the number of cores, as in joblib.
+    """
+
+    def __init__(self, tree: Path, n_jobs: int = -1):
+        self.tree = tree
+        key = "hydra.launcher.n_jobs"
+        check_number(key, n_jobs, whole=True)
+        if n_jobs == 0:
+            raise SettingError(key, "must be the number of processes, or -1; got 0")
+        self.workers = effective_n_jobs(n_jobs)
+        self._idle: list[ProcessPoolExecutor] = []
+
+    def running(self) -> Sequence[Chunk]:
+        return ()
+
+    def launch(self, work: Work, chunks: Sequence[Chunk]) -> Iterator[ChunkEnd]:
+        waiting = list(reversed(chunks))
+        flying: dict[Future[Any], tuple[Chunk, ProcessPoolExecutor]] = {}
+        try:
+            while waiting or flying:
+                while waiting and len(flying) < self.workers:
+                    executor = self._idle.pop() if self._idle else _new_executor()
+                    chunk = waiting.pop()
+                    with children_ignore_interrupts():
+                        flying[executor.submit(work, chunk)] = chunk, executor
+                for future in wait(flying, return_when=FIRST_COMPLETED).done:
+                    chunk, executor = flying.pop(future)
+                    error = future.exception()
+                    if isinstance(error, BrokenExecutor):
+                        executor.shutdown(wait=False, kill_workers=True)
+                    else:
+                        self._idle.append(executor)
+                    if isinstance(error, Exception):
+                        yield _end_by(error, chunk)
+                    else:
+                        yield ChunkEnd(chunk, socket.gethostname())
+        finally:
+            for _, executor in flying.values():
+                executor.shutdown(wait=False, kill_workers=True)
+
+    def close(self) -> None:
+        while self._idle:
+            self._idle.pop().shutdown(kill_workers=True)
+
+
+def _new_executor() -> ProcessPoolExecutor:
+    """Returns an executor of one process, which ends with this one."""
+    resource_tracker.ensure_running()  # as in ``children_ignore_interrupts``
+    return ProcessPoolExecutor(1, initializer=end_with, initargs=(os.getpid(),))
+
+
+def _end_by(error: Exception, chunk: Chunk) -> ChunkEnd:
+    """Returns how a chunk on this machine ended by an exception."""
+    host = socket.gethostname()
+    text = " ".join(str(error).split())
+    if not isinstance(error, BrokenExecutor):
+        reason = f"{type(error).__name__}: {text}"
+        return ChunkEnd(chunk, host, Cause.ERROR, reason)
+    codes = re.search(r"exit codes of the workers are \{(.*?)\}", text)
+    how = f" ({codes[1]})" if codes else ""
+    reason = (
+        f"its process on {host} died{how}: by a crash, for want of memory, or by hand"
+    )
+    return ChunkEnd(chunk, host, Cause.CRASH, reason)
