@@ -15,13 +15,13 @@ One that its process could not finish is a failed run with the reason in its
 
 import os
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 from gpmpc._provenance import provenance
 from gpmpc.cli._launchers import Cause, Chunk, ChunkEnd, Launcher, Work
-from gpmpc.studies._run_folder import Busy, CellState, RunFolder
+from gpmpc.studies._run_folder import Busy, RunFolder, RunState
 
 _LOOK_INTERVAL = 1.0  # between two looks at runs in other hands [s]
 _LATE = 30.0  # after which a shared file system shows what another machine wrote [s]
@@ -29,7 +29,7 @@ _REPEATED = (Cause.NODE, Cause.CRASH)
 _OF_THE_WHOLE_CHUNK = (Cause.CANCELLED, Cause.ERROR)
 
 
-class Cell(Protocol):
+class Job(Protocol):
     """One run of a sweep."""
 
     @property
@@ -43,7 +43,7 @@ class Cell(Protocol):
         ...
 
 
-OnSettled = Callable[[Any, CellState], None]  # takes a cell; it finished or failed
+OnSettled = Callable[[Any, RunState], None]  # takes a job, which finished or failed
 
 
 @dataclass
@@ -53,8 +53,8 @@ class Flying:
     Args:
         launcher: Starts the processes.
         work: Flies a chunk, there.
-        chunked: Groups cells into chunks.
-        on_settled: Called once for every cell, when it has finished or failed.
+        chunked: Groups jobs into chunks.
+        on_settled: Called once for every job, when it has finished or failed.
         retries: How often a run is flown again that was ended from outside.
     """
 
@@ -65,128 +65,143 @@ class Flying:
     retries: int
     #: runs that fly again in this call, since their process or node died; paths
     repeated: set[str] = field(default_factory=set)
-    _open: dict[str, Cell] = field(default_factory=dict)  # by path, not settled yet
+    _open: dict[str, Job] = field(default_factory=dict)  # by path, not settled yet
     _failed_before: dict[str, int | None] = field(default_factory=dict)
     _begun_before: dict[str, int | None] = field(default_factory=dict)
 
-    def fly(self, cells: Iterable[Any]) -> None:
-        """Flies cells; returns when each is settled."""
-        for cell in cells:
-            self._open[str(cell.folder.path)] = cell
-            self._failed_before[str(cell.folder.path)] = cell.folder.failed_at
+    def fly(self, jobs: Iterable[Any]) -> None:
+        """Flies jobs; returns when each is settled."""
+        for job in jobs:
+            self._open[str(job.folder.path)] = job
+            self._failed_before[str(job.folder.path)] = job.folder.failed_at
         while self._open:
             if not self._fly_once():
                 time.sleep(_LOOK_INTERVAL)
 
     def _fly_once(self) -> bool:
-        """Flies the cells that nobody works on, and settles those that have ended.
+        """Flies the jobs that nobody works on, and settles those that have ended.
 
         Returns:
             Whether any were flown. Others are in the hands of another sweep.
         """
-        in_jobs = {
-            str(folder.path)
-            for chunk in self.launcher.running()
-            for folder in chunk.folders
-        }
-        to_fly = []
-        for path, cell in [*self._open.items()]:
-            self._begun_before[path] = cell.folder.begun_at
-            if self._settle(cell) or path in in_jobs:
-                continue
-            if cell.folder.state is not CellState.RUNNING:
-                to_fly.append(cell)
-        if not to_fly and not in_jobs:
+        with self.launcher.turn():
+            running = self.launcher.running({*self._open})
+            ends = self._launch(running)
+        if ends is None:
             return False
-        unseen: list[tuple[Cell, ChunkEnd]] = []
-        chunks = self.chunked(to_fly) if to_fly else ()
-        for end in self.launcher.launch(self.work, chunks):
+        adopted = {id(chunk) for chunk in running}
+        unseen: list[tuple[Job, ChunkEnd]] = []
+        for end in ends:
+            if id(end.chunk) in adopted:
+                # It may have failed before this sweep looked.
+                self._failed_before |= dict.fromkeys(_paths(end.chunk))
             if end.cause is not None:
                 self._end_early(end)
                 continue
             left = self._unsettled(end.chunk)
             # A chunk may stop behind any of its runs, and leave the others.
             if len(left) == len(end.chunk.folders):
-                unseen += [(cell, end) for cell in left]
+                unseen += [(job, end) for job in left]
         self._judge_unseen(unseen)
         return True
 
-    def _unsettled(self, chunk: Chunk) -> list[Cell]:
-        """Settles cells of a chunk; returns those that are not."""
-        paths = [str(folder.path) for folder in chunk.folders]
-        cells = [self._open[path] for path in paths if path in self._open]
-        return [cell for cell in cells if not self._settle(cell)]
+    def _launch(self, running: Sequence[Chunk]) -> Iterator[ChunkEnd] | None:
+        """Launches the jobs that nobody works on; None where there is none."""
+        in_hand = {path for chunk in running for path in _paths(chunk)}
+        to_fly = []
+        for path, job in [*self._open.items()]:
+            # When an adopted chunk began its runs is not known.
+            self._begun_before[path] = None
+            if path in in_hand or self._settle(job):
+                continue
+            self._begun_before[path] = job.folder.begun_at
+            if job.folder.state is not RunState.RUNNING:
+                to_fly.append(job)
+        if not to_fly and not in_hand:
+            return None
+        chunks = self.chunked(to_fly) if to_fly else ()
+        return self.launcher.launch(self.work, chunks)
 
-    def _settle(self, cell: Cell) -> bool:
-        """Takes a cell off the list where it has finished, or failed in this call."""
-        path = str(cell.folder.path)
-        state = cell.folder.state
-        if state is CellState.FAILED:
-            if cell.folder.failed_at == self._failed_before[path]:
+    def _unsettled(self, chunk: Chunk) -> list[Job]:
+        """Settles jobs of a chunk; returns those that are not."""
+        jobs = [self._open[path] for path in _paths(chunk) if path in self._open]
+        return [job for job in jobs if not self._settle(job)]
+
+    def _settle(self, job: Job) -> bool:
+        """Takes a job off the list where it has finished, or failed in this call."""
+        path = str(job.folder.path)
+        state = job.folder.state
+        if state is RunState.FAILED:
+            if job.folder.failed_at == self._failed_before[path]:
                 return False
-        elif state is not CellState.FINISHED:
+        elif state is not RunState.FINISHED:
             return False
         del self._open[path]
-        self.on_settled(cell, state)
+        self.on_settled(job, state)
         return True
 
     def _end_early(self, end: ChunkEnd) -> None:
         """Settles what a process left behind that did not come to the end."""
         left = [
-            cell
-            for cell in self._unsettled(end.chunk)
-            if cell.folder.state is not CellState.RUNNING
+            job
+            for job in self._unsettled(end.chunk)
+            if job.folder.state is not RunState.RUNNING
         ]
-        begun = [cell for cell in left if self._begun_now(cell)]
+        begun = [job for job in left if self._begun_now(job)]
         concerned = begun or left
         if end.cause in _OF_THE_WHOLE_CHUNK:
             concerned = left
-        for cell in concerned:
-            self._lose(cell, end)
+        for job in concerned:
+            self._lose(job, end)
 
-    def _begun_now(self, cell: Cell) -> bool:
+    def _begun_now(self, job: Job) -> bool:
         """Whether an attempt was begun since the chunks were started."""
-        return cell.folder.begun_at != self._begun_before[str(cell.folder.path)]
+        return job.folder.begun_at != self._begun_before[str(job.folder.path)]
 
-    def _lose(self, cell: Cell, end: ChunkEnd) -> None:
-        """Makes a cell a failed one, or leaves it to be flown again."""
+    def _lose(self, job: Job, end: ChunkEnd) -> None:
+        """Makes a job a failed one, or leaves it to be flown again."""
         cause = end.cause or Cause.ERROR
         about = {
             "schema": 1,
-            "choices": [*cell.choices],
+            "choices": [*job.choices],
             "settings": {},
             "host": end.host,
             "provenance": provenance(),
         }
         try:
-            cell.folder.lose(end.reason, cause.value, about)
+            job.folder.lose(end.reason, cause.value, about)
         except Busy:  # another sweep works on it: its outcome counts
             return
-        path = str(cell.folder.path)
-        if cause in _REPEATED and cell.folder.lost_attempts <= self.retries:
+        path = str(job.folder.path)
+        if cause in _REPEATED and job.folder.lost_attempts <= self.retries:
             self.repeated.add(path)
-            self._failed_before[path] = cell.folder.failed_at
+            self._failed_before[path] = job.folder.failed_at
             return
-        self._settle(cell)
+        self._settle(job)
 
-    def _judge_unseen(self, unseen: Sequence[tuple[Cell, ChunkEnd]]) -> None:
-        """Fails the cells that a process said to be done, and that are not there."""
+    def _judge_unseen(self, unseen: Sequence[tuple[Job, ChunkEnd]]) -> None:
+        """Fails the jobs that a process said to be done, and that are not there."""
         deadline = time.monotonic() + _LATE
         while unseen and time.monotonic() < deadline:
             unseen = [
-                (cell, end)
-                for cell, end in unseen
-                if not self._settle_late(cell) and not self._begun_now(cell)
+                (job, end)
+                for job, end in unseen
+                if not self._settle_late(job) and not self._begun_now(job)
             ]
             if unseen:
                 time.sleep(_LOOK_INTERVAL)
-        for cell, end in unseen:
+        for job, end in unseen:
             host = end.host or "the process that flew it"
             reason = f"{host} says that it flew this run, and it is not in the folder; "
-            reason += f"does {host} see {cell.folder.path.parent}?"
-            self._lose(cell, ChunkEnd(end.chunk, end.host, Cause.ERROR, reason))
+            reason += f"does {host} see {job.folder.path.parent}?"
+            self._lose(job, ChunkEnd(end.chunk, end.host, Cause.ERROR, reason))
 
-    def _settle_late(self, cell: Cell) -> bool:
-        """Settles a cell after its tree was listed, which shows what others wrote."""
-        os.listdir(cell.folder.path.parent)
-        return str(cell.folder.path) not in self._open or self._settle(cell)
+    def _settle_late(self, job: Job) -> bool:
+        """Settles a job after its tree was listed, which shows what others wrote."""
+        os.listdir(job.folder.path.parent)
+        return str(job.folder.path) not in self._open or self._settle(job)
+
+
+def _paths(chunk: Chunk) -> list[str]:
+    """Returns the paths of a chunk's folders."""
+    return [str(folder.path) for folder in chunk.folders]

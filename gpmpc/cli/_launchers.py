@@ -11,8 +11,9 @@ jobs of Slurm (``_slurm``), and as tasks of Ray (``_ray``).
 import os
 import re
 import socket
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence, Set
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, wait
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
@@ -75,8 +76,15 @@ class Launcher(Protocol):
         """Processes at the same time; None where that is the cluster's business."""
         ...
 
-    def running(self) -> Sequence[Chunk]:
-        """Returns chunks of an earlier call that are still being flown, or wait."""
+    def turn(self) -> AbstractContextManager[object]:
+        """Keeps other sweeps of this tree from launching inside."""
+        ...
+
+    def running(self, paths: Set[str]) -> Sequence[Chunk]:
+        """Returns chunks of another call whose end nobody has seen yet.
+
+        Those with any of the folders ``paths``.
+        """
         ...
 
     def launch(self, work: Work, chunks: Sequence[Chunk]) -> Iterator[ChunkEnd]:
@@ -106,7 +114,10 @@ class Basic:
     def __init__(self, tree: Path):
         self.tree = tree
 
-    def running(self) -> Sequence[Chunk]:
+    def turn(self) -> AbstractContextManager[object]:
+        return nullcontext()
+
+    def running(self, paths: Set[str]) -> Sequence[Chunk]:
         return ()
 
     def launch(self, work: Work, chunks: Sequence[Chunk]) -> Iterator[ChunkEnd]:
@@ -141,7 +152,10 @@ class Joblib:
         self.workers = effective_n_jobs(n_jobs)
         self._idle: list[ProcessPoolExecutor] = []
 
-    def running(self) -> Sequence[Chunk]:
+    def turn(self) -> AbstractContextManager[object]:
+        return nullcontext()
+
+    def running(self, paths: Set[str]) -> Sequence[Chunk]:
         return ()
 
     def launch(self, work: Work, chunks: Sequence[Chunk]) -> Iterator[ChunkEnd]:

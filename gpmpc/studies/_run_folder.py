@@ -10,7 +10,7 @@
 
 Any number of processes can work on one tree of such folders: who works on a folder
 holds a lock on it, which the system takes back from a process that dies. So the folder
-alone tells how far a run is (``CellState``), whatever the process that flew it said.
+alone tells how far a run is (``RunState``), whatever the process that flew it said.
 
 A finished run is one of the code that flew it. It is not thrown away where the code has
 changed since, but whoever shows its numbers says so: ``of_other_code`` tells.
@@ -52,7 +52,7 @@ class Busy(GpmpcError):
     """Another process works on this run."""
 
 
-class CellState(Enum):
+class RunState(Enum):
     """How far a run is, as its folder tells."""
 
     NOT_BEGUN = "not begun"
@@ -71,25 +71,25 @@ class RunFolder:
     path: Path  #: where it is
 
     @property
-    def state(self) -> CellState:
+    def state(self) -> RunState:
         """Reads how far the run is; a finished run stays finished.
 
         A run that is flown again is running, whatever an earlier attempt left.
         """
         if self.finished:
-            return CellState.FINISHED
+            return RunState.FINISHED
         if (self.path / ERROR).exists():
-            return CellState.FAILED
+            return RunState.FAILED
         if self._has_living_lock():
-            return CellState.RUNNING
+            return RunState.RUNNING
         # It may have ended between the looks.
         if self.finished:
-            return CellState.FINISHED
+            return RunState.FINISHED
         if (self.path / ERROR).exists():
-            return CellState.FAILED
+            return RunState.FAILED
         if (self.path / CONFIG).exists():
-            return CellState.LOST
-        return CellState.NOT_BEGUN
+            return RunState.LOST
+        return RunState.NOT_BEGUN
 
     def _has_living_lock(self) -> bool:
         """Whether a process holds the lock; takes it for a moment where none does."""

@@ -13,7 +13,7 @@ from gpmpc.studies._run_folder import (
     LONGEST_NAME,
     METRICS,
     Busy,
-    CellState,
+    RunState,
     RunFolder,
     difference,
     folder_name,
@@ -154,27 +154,27 @@ def test_a_name_is_the_choices_as_long_as_it_is_short_and_plain():
 
 def test_a_folder_alone_tells_how_far_its_run_is(tmp_path):
     folder = RunFolder(tmp_path / "run")
-    assert folder.state is CellState.NOT_BEGUN
+    assert folder.state is RunState.NOT_BEGUN
     assert (folder.begun_at, folder.last_worker) == (None, "")
     with folder.locked():
-        assert folder.state is CellState.RUNNING
+        assert folder.state is RunState.RUNNING
         folder.begin("steps: 1\n")
-        assert folder.state is CellState.RUNNING
+        assert folder.state is RunState.RUNNING
         assert folder.last_worker == f"process {os.getpid()} on {socket.gethostname()}"
         with pytest.raises(Busy):
             folder.lose("the node failed", "node", {})
-    assert folder.state is CellState.LOST  # left as by a process that was killed
+    assert folder.state is RunState.LOST  # left as by a process that was killed
     assert folder.begun_at == (folder.path / "config.yaml").stat().st_mtime_ns
     with folder.locked():
         folder.fail(ValueError("no"), {})
-    assert folder.state is CellState.FAILED
+    assert folder.state is RunState.FAILED
     with folder.locked():
         folder.begin("steps: 1\n")
-        assert folder.state is CellState.RUNNING
+        assert folder.state is RunState.RUNNING
         folder.finish({"settings": {}})
-    assert folder.state is CellState.FINISHED
+    assert folder.state is RunState.FINISHED
     folder.lose("too late", "time", {})
-    assert folder.state is CellState.FINISHED
+    assert folder.state is RunState.FINISHED
     assert not (folder.path / ERROR).exists()
 
 

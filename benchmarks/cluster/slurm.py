@@ -1,0 +1,330 @@
+"""Starts a real Slurm of two nodes on this machine, and stops it again.
+
+Everything is in one folder and bound to loopback: configuration, keys, state and logs.
+Needs the packages slurmctld, slurmd, slurm-client and munge of Debian or Ubuntu, and
+with accounting slurmdbd and mariadb-server. It installs nothing.
+"""
+
+import getpass
+import os
+import secrets
+import shutil
+import signal
+import socket
+import subprocess
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+NODES = ("n1", "n2")
+NEEDED = ("slurmctld", "slurmd", "munged", "sbatch", "squeue", "scontrol")
+FOR_ACCOUNTING = ("slurmdbd", "mariadbd", "mariadb-install-db", "sacct")
+_PATIENCE = 60.0  # until a daemon answers [s]
+_PATH = os.pathsep.join([os.environ["PATH"], "/usr/sbin", "/sbin"])
+
+_CONFIGURATION = """
+ClusterName=here
+SlurmctldHost={host}(127.0.0.1)
+SlurmctldPort={control_port}
+SlurmUser={user}
+SlurmdUser={user}
+AuthType=auth/munge
+AuthInfo=socket={folder}/munge.socket
+CommunicationParameters=NoCtldInAddrAny,NoInAddrAny
+StateSaveLocation={folder}/state
+SlurmctldPidFile={folder}/slurmctld.pid
+SlurmctldLogFile={folder}/slurmctld.log
+SlurmdSpoolDir={folder}/spool-%n
+SlurmdPidFile={folder}/slurmd-%n.pid
+SlurmdLogFile={folder}/slurmd-%n.log
+MpiDefault=none
+ProctrackType=proctrack/linuxproc
+TaskPlugin=task/none
+SwitchType=switch/none
+SelectType=select/cons_tres
+SelectTypeParameters=CR_CPU_Memory
+JobAcctGatherType=jobacct_gather/linux
+JobAcctGatherFrequency=1
+JobAcctGatherParams=OverMemoryKill
+SlurmdTimeout=10
+KillWait=2
+ReturnToService=2
+MaxArraySize=51
+SchedulerParameters=sched_interval=5,bf_interval=5
+"""
+_ACCOUNTING = """
+AccountingStorageType=accounting_storage/slurmdbd
+AccountingStorageHost=127.0.0.1
+AccountingStoragePort={database_port}
+"""
+_NODE = """
+NodeName={name} NodeHostname={host} NodeAddr=127.0.0.1 Port={port} CPUs=2 RealMemory=8000
+"""
+_PARTITION = """
+PartitionName=cpu Nodes={nodes} Default=YES MaxTime=INFINITE State=UP
+"""
+_DATABASE = """
+AuthType=auth/munge
+AuthInfo=socket={folder}/munge.socket
+DbdHost=localhost
+DbdAddr=127.0.0.1
+DbdPort={database_port}
+SlurmUser={user}
+StorageType=accounting_storage/mysql
+StorageHost=127.0.0.1
+StoragePort={mysql_port}
+StorageUser=slurm
+StoragePass=slurm
+StorageLoc=slurm
+LogFile={folder}/slurmdbd.log
+PidFile={folder}/slurmdbd.pid
+"""
+
+
+def missing(accounting: bool) -> list[str]:
+    """Returns the programs that a cluster needs and this machine lacks."""
+    needed = [*NEEDED, *(FOR_ACCOUNTING if accounting else ())]
+    return [name for name in needed if shutil.which(name, path=_PATH) is None]
+
+
+class Slurm:
+    """A Slurm of two nodes; a context in which it runs.
+
+    Args:
+        folder: Where it keeps everything.
+        accounting: Whether a database remembers ended jobs.
+    """
+
+    def __init__(self, folder: Path, accounting: bool = False):
+        self.folder = folder
+        self.accounting = accounting
+        #: what a command needs to find this cluster
+        self.environment = os.environ | {
+            "PATH": _PATH,
+            "SLURM_CONF": str(folder / "slurm.conf"),
+        }
+        self._daemons: dict[str, subprocess.Popen] = {}
+
+    def __enter__(self) -> "Slurm":
+        self.folder.mkdir(parents=True)
+        self.folder.chmod(0o755)
+        self._write_configuration()
+        try:
+            self._start_daemons()
+        except BaseException:
+            self.stop()
+            raise
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.stop()
+
+    def ask(self, *command: str) -> str:
+        """Returns what a command of Slurm answers."""
+        return subprocess.run(
+            command,
+            env=self.environment,
+            capture_output=True,
+            text=True,
+            check=True,
+        ).stdout
+
+    def kill_node(self, name: str) -> None:
+        """Kills a node as a power cut would: its daemon, and all that it started."""
+        _kill_tree(self._daemons.pop(name).pid, among=self._processes_of(name))
+
+    def start_node(self, name: str) -> None:
+        """Starts the daemon of a node."""
+        self._start(name, ["slurmd", "-D", "-N", name])
+
+    def stop(self) -> None:
+        """Ends the jobs and every daemon."""
+        if "slurmctld" in self._daemons:
+            subprocess.run(
+                ["scancel", "--full", f"--user={getpass.getuser()}"],
+                env=self.environment,
+                capture_output=True,
+                timeout=_PATIENCE,
+                check=False,
+            )
+        for name in NODES:
+            if name in self._daemons:
+                self.kill_node(name)
+        while self._daemons:
+            _, daemon = self._daemons.popitem()
+            daemon.terminate()
+            try:
+                daemon.wait(_PATIENCE)
+            except subprocess.TimeoutExpired:
+                daemon.kill()
+                daemon.wait()
+
+    def _write_configuration(self) -> None:
+        for name in ("state", "database"):
+            (self.folder / name).mkdir()
+        ports = _free_ports(3 + len(NODES))
+        values = {
+            "host": socket.gethostname(),
+            "user": getpass.getuser(),
+            "folder": self.folder,
+            "control_port": ports[0],
+            "database_port": ports[1],
+            "mysql_port": ports[2],
+        }
+        self._mysql_port = ports[2]
+        parts = [_CONFIGURATION.format(**values)]
+        if self.accounting:
+            parts.append(_ACCOUNTING.format(**values))
+            database = self.folder / "slurmdbd.conf"
+            database.write_text(_DATABASE.format(**values))
+            database.chmod(0o600)
+        for name, port in zip(NODES, ports[3:], strict=True):
+            parts.append(_NODE.format(name=name, host=values["host"], port=port))
+        parts.append(_PARTITION.format(nodes=",".join(NODES)))
+        (self.folder / "slurm.conf").write_text("".join(parts))
+        key = self.folder / "munge.key"
+        key.write_bytes(secrets.token_bytes(128))
+        key.chmod(0o400)
+
+    def _start_daemons(self) -> None:
+        folder = self.folder
+        self._start(
+            "munged",
+            [
+                "munged",
+                "--foreground",
+                "--force",
+                f"--key-file={folder}/munge.key",
+                f"--socket={folder}/munge.socket",
+                f"--pid-file={folder}/munge.pid",
+                f"--seed-file={folder}/munge.seed",
+                f"--log-file={folder}/munge.log",
+            ],
+        )
+        _wait_for("munged", (folder / "munge.socket").exists)
+        if self.accounting:
+            self._start_database()
+        self._start("slurmctld", ["slurmctld", "-D"])
+        for name in NODES:
+            self.start_node(name)
+        _wait_for("slurm", self._is_ready)
+
+    def _start_database(self) -> None:
+        """Starts the database of ended jobs, and what writes to it."""
+        folder = self.folder
+        data = folder / "database"
+        user = getpass.getuser()
+        subprocess.run(
+            ["mariadb-install-db", "--no-defaults", f"--user={user}",
+             f"--datadir={data}", "--auth-root-authentication-method=normal"],
+            env=self.environment, capture_output=True, check=True,
+        )  # fmt: skip
+        first = folder / "first.sql"
+        first.write_text(
+            "CREATE DATABASE slurm;\n"
+            "CREATE USER 'slurm'@'%' IDENTIFIED BY 'slurm';\n"
+            "GRANT ALL ON slurm.* TO 'slurm'@'%';\n"
+        )
+        self._start(
+            "mariadbd",
+            ["mariadbd", "--no-defaults", f"--user={user}", f"--datadir={data}",
+             f"--socket={folder}/mysql.socket", f"--pid-file={folder}/mysql.pid",
+             "--bind-address=127.0.0.1", f"--port={self._mysql_port}",
+             f"--init-file={first}", "--skip-name-resolve"],
+        )  # fmt: skip
+        _wait_for("mariadbd", lambda: _answers(self._mysql_port))
+        self._start("slurmdbd", ["slurmdbd", "-D"])
+        _wait_for("slurmdbd", self._has_accounts)
+
+    def _has_accounts(self) -> bool:
+        listed = subprocess.run(
+            ["sacctmgr", "--noheader", "list", "cluster"],
+            env=self.environment,
+            capture_output=True,
+            check=False,
+        )
+        return listed.returncode == 0
+
+    def _is_ready(self) -> bool:
+        states = subprocess.run(
+            ["sinfo", "--noheader", "--Node", "--format=%T"],
+            env=self.environment,
+            capture_output=True,
+            text=True,
+            check=False,
+        ).stdout.split()
+        return states.count("idle") == len(NODES)
+
+    def _start(self, name: str, command: Sequence[str]) -> None:
+        with (self.folder / f"{name}.out").open("ab") as output:
+            self._daemons[name] = subprocess.Popen(
+                command,
+                env=self.environment,
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=output,
+                start_new_session=True,
+            )
+
+    def _processes_of(self, node: str) -> list[int]:
+        """Returns the processes of the jobs of a node."""
+        spool = str(self.folder / f"spool-{node}").encode()
+        named = f"SLURMD_NODENAME={node}".encode()
+        conf = f"SLURM_CONF={self.folder}/slurm.conf".encode()
+        found = []
+        for path in Path("/proc").glob("[0-9]*"):
+            try:
+                environment = (path / "environ").read_bytes().split(b"\0")
+                words = (path / "cmdline").read_bytes()
+            except OSError:
+                continue
+            if (named in environment and conf in environment) or spool in words:
+                found.append(int(path.name))
+        return found
+
+
+def _kill_tree(root: int, among: Sequence[int]) -> None:
+    """Kills a process, its descendants, and others that belong to it."""
+    for process in [*_descendants(root), root, *among]:
+        try:
+            os.kill(process, signal.SIGKILL)
+        except ProcessLookupError:
+            continue
+
+
+def _descendants(root: int) -> list[int]:
+    parents = {}
+    for path in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            fields = path.read_text().rpartition(")")[2].split()
+        except OSError:
+            continue
+        parents[int(path.parent.name)] = int(fields[1])
+    found = [root]
+    for process in found:
+        found += [child for child, parent in parents.items() if parent == process]
+    return found[1:]
+
+
+def _free_ports(count: int) -> list[int]:
+    sockets = [socket.create_server(("127.0.0.1", 0)) for _ in range(count)]
+    ports = [each.getsockname()[1] for each in sockets]
+    for each in sockets:
+        each.close()
+    return ports
+
+
+def _answers(port: int) -> bool:
+    try:
+        socket.create_connection(("127.0.0.1", port), 1).close()
+    except OSError:
+        return False
+    return True
+
+
+def _wait_for(what: str, ready) -> None:
+    deadline = time.monotonic() + _PATIENCE
+    while not ready():
+        if time.monotonic() > deadline:
+            raise TimeoutError(f"{what} does not answer after {_PATIENCE:.0f} s")
+        time.sleep(0.2)

@@ -1,0 +1,449 @@
+"""Flies chunks as array jobs of Slurm, and reads from its queue how they ended.
+
+    chunks -> FOLDER/.slurm/NAME/chunks -> sbatch -> squeue, until none is left
+
+The name of an array says where its chunks are, so that whoever repeats a sweep finds
+the jobs that still wait or run, and watches them instead of submitting their runs
+again. The queue forgets jobs soon after their end; then the accounting is asked, where
+there is one, and else the job's log, to which Slurm writes why it ended a job.
+"""
+
+import pickle
+import re
+import secrets
+import shlex
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Mapping, Sequence, Set
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from filelock import FileLock
+
+from gpmpc._files import write_whole
+from gpmpc.cli._launchers import Cause, Chunk, ChunkEnd, Work
+from gpmpc.cli._terminal import print_error
+from gpmpc.exceptions import GpmpcError, SettingError, check_number
+from gpmpc.parallel import THREADS
+
+CHUNKS = "chunks"  # name of the file that a job reads
+DONE = "gpmpc: done on "  # last line of a job's log, with the host
+_SUBMITTED = "submitted"  # name of the file that says that Slurm took an array
+_ENDED = "ended"  # name of the file that says that all jobs of an array have ended
+_LOGS = ".slurm"  # folder in the sweep's
+_PREFIX = "gpmpc-"  # of the names of arrays
+_MOST_TASKS = 1000  # of an array, where Slurm does not say
+_FIRST_LOOK = 0.5  # after which the queue is looked at again [s]
+_LAST_LOOK = 10.0  # at most [s]
+_SLOWER = 1.3  # each look comes later than the one before by this factor
+_SILENCE = 60.0  # of Slurm, after which that is said [s]
+_TAIL = 4000  # characters of a log that are read
+_FORMAT = "%j|%K|%F_%K|%T|%r|%N"
+
+_CAUSES = {
+    "CANCELLED": Cause.CANCELLED,
+    "REVOKED": Cause.CANCELLED,
+    "TIMEOUT": Cause.TIME,
+    "DEADLINE": Cause.TIME,
+    "OUT_OF_MEMORY": Cause.MEMORY,
+    "NODE_FAIL": Cause.NODE,
+    "BOOT_FAIL": Cause.NODE,
+    "PREEMPTED": Cause.NODE,
+}
+_ENDED_STATES = frozenset({"COMPLETED", "FAILED", *_CAUSES})
+# What Slurm writes to the log of a job that it ends. The first one counts.
+_LOGGED = (
+    (re.compile(r"memory limit|oom.kill|out.of.memory", re.IGNORECASE), Cause.MEMORY),
+    (re.compile(r"CANCELLED AT \S+ DUE TO TIME LIMIT"), Cause.TIME),
+    (re.compile(r"CANCELLED AT \S+ DUE TO NODE FAILURE"), Cause.NODE),
+    (re.compile(r"CANCELLED AT \S+ DUE TO PREEMPTION"), Cause.NODE),
+    (re.compile(r"\*\*\* (JOB|STEP) \S+ ON \S+ CANCELLED AT"), Cause.CANCELLED),
+)
+# A job that waits for a reason of these was given up by Slurm.
+_GIVEN_UP = (
+    "launch failed requeued held",
+    "JobHoldMaxRequeue",
+    "DependencyNeverSatisfied",
+)
+_OWN_ERROR = re.compile(r"^gpmpc: error: (.+)$", re.MULTILINE)  # of ``_slurm_job``
+
+
+class _Job(NamedTuple):
+    """One job of an array, as Slurm tells."""
+
+    number: str
+    state: str
+    reason: str
+    host: str
+
+
+@dataclass
+class _Array:
+    """Chunks that were submitted together; job i flies chunk i."""
+
+    name: str
+    folder: Path
+    chunks: Sequence[Chunk]
+    #: chunks whose jobs may not have ended yet
+    waiting: set[int] = field(default_factory=set)
+    #: looks at the queue without a job, by chunk
+    absences: dict[int, int] = field(default_factory=dict)
+
+
+class Slurm:
+    """Flies chunks as array jobs of Slurm.
+
+    Args:
+        tree: The sweep's folder, on a file system that all nodes see.
+        timeout_min: Wall time of a job [min].
+        mem_gb: Memory of a job [GB].
+        cpus_per_task: Processors of a job.
+        array_parallelism: Jobs at the same time, at most.
+        partition, account, qos, constraint: As for sbatch; None leaves them to Slurm.
+        setup: Lines of shell before a job's command.
+        additional_parameters: Other options of sbatch, by name.
+    """
+
+    workers = None
+
+    def __init__(
+        self,
+        tree: Path,
+        timeout_min: int = 60,
+        mem_gb: float = 4,
+        cpus_per_task: int = 1,
+        array_parallelism: int = 100,
+        partition: str | None = None,
+        account: str | None = None,
+        qos: str | None = None,
+        constraint: str | None = None,
+        setup: Sequence[str] = (),
+        additional_parameters: Mapping[str, Any] | None = None,
+    ):
+        self._timeout_min = timeout_min
+        self._mem_gb = mem_gb
+        key = "hydra.launcher."
+        check_number(key + "timeout_min", timeout_min, least=1, whole=True)
+        check_number(key + "mem_gb", mem_gb, above=0)
+        check_number(key + "cpus_per_task", cpus_per_task, least=1, whole=True)
+        check_number(key + "array_parallelism", array_parallelism, least=1, whole=True)
+        if isinstance(setup, str):
+            raise SettingError(key + "setup", f"must be a list of lines; got {setup!r}")
+        if shutil.which("sbatch") is None:
+            raise SettingError(
+                "launcher", "slurm needs sbatch; start the sweep on a login node"
+            )
+        self._at_once = array_parallelism
+        self._setup = [*setup]
+        self._logs = tree / _LOGS
+        self._adopted: list[_Array] = []
+        self._options = {
+            "time": timeout_min,
+            "mem": f"{max(1, round(1024 * mem_gb))}M",
+            "cpus-per-task": cpus_per_task,
+            "partition": partition,
+            "account": account,
+            "qos": qos,
+            "constraint": constraint,
+            **(additional_parameters or {}),
+        }
+
+    def turn(self) -> AbstractContextManager[object]:
+        """Keeps other sweeps of this tree from submitting inside."""
+        self._logs.mkdir(parents=True, exist_ok=True)
+        return FileLock(self._logs / "lock")
+
+    def running(self, paths: Set[str]) -> Sequence[Chunk]:
+        """Returns chunks of arrays whose end nobody has seen yet."""
+        self._adopted = []
+        for array in self._unended():
+            array.waiting = {
+                index
+                for index, chunk in enumerate(array.chunks)
+                if any(str(folder.path) in paths for folder in chunk.folders)
+            }
+            if array.waiting:
+                self._adopted.append(array)
+        return [
+            array.chunks[index] for array in self._adopted for index in array.waiting
+        ]
+
+    def launch(self, work: Work, chunks: Sequence[Chunk]) -> Iterator[ChunkEnd]:
+        """Submits chunks; yields how they, and the running ones, end.
+
+        Raises:
+            GpmpcError: Slurm takes no such job.
+        """
+        most = _most_tasks()
+        parts = [chunks[i : i + most] for i in range(0, len(chunks), most)]
+        at_once = max(1, self._at_once // max(1, len(parts)))
+        submitted = [self._submit(work, part, at_once) for part in parts]
+        return self._ends([*self._adopted, *submitted])
+
+    def close(self) -> None:
+        pass
+
+    def _unended(self) -> Iterator[_Array]:
+        """Yields the arrays in the sweep's folder whose end was not seen yet."""
+        folders = [
+            folder
+            for folder in sorted(self._logs.glob(f"{_PREFIX}*"))
+            if not (folder / _ENDED).exists() and (folder / CHUNKS).exists()
+        ]
+        queue = _queue() if folders else None
+        for folder in folders:
+            # Where Slurm does not know it, its sweep was killed before it submitted it.
+            in_queue = queue is None or any(name == folder.name for name, _ in queue)
+            if in_queue or (folder / _SUBMITTED).exists():
+                content = pickle.loads((folder / CHUNKS).read_bytes())
+                chunks = [pickle.loads(chunk) for chunk in content["chunks"]]
+                yield _Array(folder.name, folder, chunks, {*range(len(chunks))})
+
+    def _submit(self, work: Work, chunks: Sequence[Chunk], at_once: int) -> _Array:
+        """Submits an array of one job a chunk."""
+        name = _PREFIX + secrets.token_hex(4)
+        folder = self._logs / name
+        folder.mkdir(parents=True)
+        content = {"work": work, "chunks": [pickle.dumps(chunk) for chunk in chunks]}
+        write_whole(folder / CHUNKS, pickle.dumps(content))
+        options = self._options | {
+            "job-name": name,
+            "array": f"0-{len(chunks) - 1}%{at_once}",
+            "output": f"{folder}/%a.log",
+            "open-mode": "append",
+            "chdir": Path.cwd(),
+        }
+        words = [
+            f"--{key}={value}" for key, value in options.items() if value is not None
+        ]
+        asked = subprocess.run(
+            ["sbatch", "--parsable", *words],
+            input=self._script(folder),
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        if asked.returncode:
+            shutil.rmtree(folder)
+            raise GpmpcError(f"Slurm refuses the sweep: {_one_line(asked.stderr)}")
+        write_whole(folder / _SUBMITTED, asked.stdout)
+        return _Array(name, folder, chunks, {*range(len(chunks))})
+
+    def _script(self, folder: Path) -> str:
+        """Returns what a job runs."""
+        job = [sys.executable, "-m", "gpmpc.cli._slurm_job", str(folder)]
+        lines = [
+            "#!/bin/sh",
+            *(f"export {name}=1" for name in THREADS),
+            *self._setup,
+            f'exec {shlex.join(job)} "$SLURM_ARRAY_TASK_ID"',
+        ]
+        return "\n".join(lines) + "\n"
+
+    def _ends(self, arrays: Sequence[_Array]) -> Iterator[ChunkEnd]:
+        """Looks at the queue until it holds none of the arrays."""
+        interval = _FIRST_LOOK
+        last_answer = time.monotonic()
+        said = False
+        try:
+            while any(array.waiting for array in arrays):
+                jobs = _queue()
+                if jobs is not None:
+                    last_answer = time.monotonic()
+                    said = False
+                    ends = [*self._look(arrays, jobs)]
+                    yield from ends
+                    interval = _FIRST_LOOK if ends else interval
+                elif not said and time.monotonic() - last_answer > _SILENCE:
+                    said = True
+                    print_error("squeue has not answered for a minute; waiting for it")
+                if any(array.waiting for array in arrays):
+                    time.sleep(interval)
+                interval = min(_SLOWER * interval, _LAST_LOOK)
+        except KeyboardInterrupt:
+            for array in arrays:
+                if array.waiting:
+                    print_error(f"jobs go on; to end them: scancel -n {array.name}")
+            raise
+
+    def _look(
+        self, arrays: Sequence[_Array], jobs: Mapping[tuple[str, int], _Job]
+    ) -> Iterator[ChunkEnd]:
+        """Yields the ends that the queue tells, and notes them."""
+        for array in arrays:
+            if not array.waiting:
+                continue
+            ended = self._ended(array, jobs)
+            array.waiting -= ended.keys()
+            for index, job in ended.items():
+                yield self._end(array, index, job)
+            states = [jobs.get((array.name, i)) for i in range(len(array.chunks))]
+            some_wait = any(job and job.state not in _ENDED_STATES for job in states)
+            if not array.waiting and not some_wait:
+                write_whole(array.folder / _ENDED, "")
+
+    def _ended(
+        self, array: _Array, jobs: Mapping[tuple[str, int], _Job]
+    ) -> dict[int, _Job | None]:
+        """Returns the jobs of an array that have ended since the last look.
+
+        None stands for one that Slurm has forgotten. A job must be missing twice.
+        """
+        ended: dict[int, _Job | None] = {}
+        for index in sorted(array.waiting):
+            job = jobs.get((array.name, index))
+            if job is None:
+                array.absences[index] = array.absences.get(index, 0) + 1
+                if array.absences[index] > 1:
+                    ended[index] = None
+            elif job.state == "PENDING" and job.reason in _GIVEN_UP:
+                _cancel(job)
+                ended[index] = job
+            elif job.state in _ENDED_STATES:
+                ended[index] = job
+        if None in ended.values():
+            accounted = _accounted(array.name)
+            for index, job in ended.items():
+                ended[index] = job or accounted.get(index)
+        return ended
+
+    def _end(self, array: _Array, index: int, job: _Job | None) -> ChunkEnd:
+        """Returns how a job ended."""
+        log = _tail(array.folder / f"{index}.log")
+        cause = _cause(job, log)
+        host = job.host if job else _done_on(log or "")
+        if cause is None:
+            return ChunkEnd(array.chunks[index], host)
+        on_host = f" on {host}" if host else ""
+        reason = self._reason(cause, job, log)
+        number = job.number if job else f"{array.name}_{index}"
+        text = f"job {number}{on_host} {reason}"
+        return ChunkEnd(array.chunks[index], host, cause, text)
+
+    def _reason(self, cause: Cause, job: _Job | None, log: str | None) -> str:
+        """Returns why a job ended, and what helps, as the end of a sentence."""
+        if cause is Cause.TIME:
+            return (
+                f"reached its wall time of {self._timeout_min} min; more by "
+                "hydra.launcher.timeout_min, or fewer runs a job by chunk"
+            )
+        if cause is Cause.MEMORY:
+            return (
+                f"needed more than its {self._mem_gb:g} GB; more by "
+                "hydra.launcher.mem_gb"
+            )
+        if cause is Cause.CANCELLED:
+            return "was cancelled"
+        if cause is Cause.NODE:
+            return "was ended with its node, or preempted"
+        if log is None:
+            state = job.reason if job else "forgotten"
+            return f"left no log ({state}); does the node see {self._logs}?"
+        own = _OWN_ERROR.findall(log)
+        if own:
+            return f"failed: {own[-1]}"
+        return f"died, and nobody says why; its log ends: {_one_line(log)[-200:]!r}"
+
+
+def _cause(job: _Job | None, log: str | None) -> Cause | None:
+    """Returns why a job did not come to its end; None where it did."""
+    if log is None:
+        return _cause_without_log(job)
+    if job is None and _done_on(log):
+        return None
+    if job is not None:
+        if job.state == "COMPLETED":
+            return None
+        if job.state in _CAUSES:
+            return _CAUSES[job.state]
+    for pattern, cause in _LOGGED:
+        if pattern.search(log):
+            return cause
+    if _OWN_ERROR.search(log):
+        return Cause.ERROR
+    return Cause.CRASH
+
+
+def _cause_without_log(job: _Job | None) -> Cause | None:
+    """Returns why a job ended that left no log."""
+    if job is None:  # the queue forgets at once what is cancelled before it runs
+        return Cause.CANCELLED
+    if job.state == "COMPLETED":  # by what it says
+        return None
+    return _CAUSES.get(job.state, Cause.ERROR)
+
+
+def _done_on(log: str) -> str:
+    """Returns the host on which a job came to its end; empty if it did not."""
+    last_line = log.rstrip().rpartition("\n")[2]
+    return last_line.removeprefix(DONE) if last_line.startswith(DONE) else ""
+
+
+def _queue() -> dict[tuple[str, int], _Job] | None:
+    """Returns this user's jobs by array's name and index; None if Slurm is silent."""
+    command = ["squeue", "--me", "--array", "--noheader", "--states=all"]
+    listed = subprocess.run(
+        [*command, f"--format={_FORMAT}"], capture_output=True, text=True, check=False
+    )
+    if listed.returncode:
+        return None
+    jobs = {}
+    for line in listed.stdout.splitlines():
+        name, index, *job = line.split("|")
+        if name.startswith(_PREFIX) and index.isdecimal() and len(job) == 4:
+            jobs[name, int(index)] = _Job(*job)
+    return jobs
+
+
+def _accounted(name: str) -> dict[int, _Job]:
+    """Returns the jobs of an array that the accounting knows; empty without one."""
+    if shutil.which("sacct") is None:
+        return {}
+    command = ["sacct", "--noheader", "--allocations", "--parsable2", f"--name={name}"]
+    listed = subprocess.run(
+        [*command, "--format=JobID,State,NodeList"],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    if listed.returncode:
+        return {}
+    jobs = {}
+    for line in listed.stdout.splitlines():
+        number, state, host = line.split("|")
+        index = number.rpartition("_")[2]
+        state = state.partition(" ")[0]  # of "CANCELLED by 1000"
+        if index.isdecimal() and state in _ENDED_STATES:
+            host = "" if host == "None assigned" else host
+            jobs[int(index)] = _Job(number, state, "", host)
+    return jobs
+
+
+def _cancel(job: _Job) -> None:
+    """Takes a job that Slurm gave up out of its queue."""
+    subprocess.run(["scancel", job.number], capture_output=True, check=False)
+
+
+def _most_tasks() -> int:
+    """Returns how many jobs an array may have."""
+    asked = subprocess.run(
+        ["scontrol", "show", "config"], capture_output=True, text=True, check=False
+    )
+    match = re.search(r"^MaxArraySize\s*=\s*(\d+)", asked.stdout, re.MULTILINE)
+    return max(1, int(match[1]) - 1) if match else _MOST_TASKS
+
+
+def _tail(log: Path) -> str | None:
+    """Returns the end of a log; None where there is none."""
+    try:
+        return log.read_text(encoding="utf-8", errors="replace")[-_TAIL:]
+    except OSError:
+        return None
+
+
+def _one_line(text: str) -> str:
+    return " ".join(text.split())
