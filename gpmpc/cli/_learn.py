@@ -251,7 +251,8 @@ def _table_of_candidates(learned: IdentifiedModel, judgement: Judgement) -> Tabl
         errors = [" / ".join(map(number, column)) for column in candidate.errors.T]
         mark = "chosen" if candidate.chosen else ""
         rows.append([mark, candidate.name, *errors])
-    title = "Candidates: mean error of held-out rollouts, 10 / 50 steps ahead"
+    steps = " / ".join(map(str, learned.judged_steps))
+    title = f"Candidates: mean error of held-out rollouts, {steps} steps ahead"
     return Table(["", "model", *_groups(judgement)], rows, title)
 
 

@@ -44,7 +44,8 @@ class NominalFit:
         names = self.model.nominal.parameter_names
         values = self.model.theta.tolist()
         errors = self.standard_errors.tolist()
-        return list(zip(names, values, errors, strict=False))
+        rows = zip(names, values, errors, strict=False)
+        return [row for row in rows if row[0]]
 
 
 def fit_nominal(

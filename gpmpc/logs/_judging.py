@@ -7,7 +7,7 @@ mean variance that is claimed over the root mean squared error. Coverage alone i
 a width of one is honest.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,13 +16,12 @@ import pandas as pd
 from scipy.special import ndtri
 
 from gpmpc._dynamics import Array
-from gpmpc.logs._fitting import PAST, fit_least_squares
+from gpmpc.logs._baselines import baseline_errors
+from gpmpc.logs._fitting import PAST
 from gpmpc.logs._learning import IdentifiedModel
 from gpmpc.logs._log import Log
 from gpmpc.logs._noise import error_variances, follow_errors
-from gpmpc.logs._ridge import RidgeRegression
 from gpmpc.metrics import binomial_interval
-from gpmpc.models._kinematics import Kinematics
 from gpmpc.models._state_space import StateSpace
 from gpmpc.models._windows import Windows
 
@@ -30,7 +29,6 @@ STEPS = (1, 10, 50)
 LEVEL = 0.95
 MODEL = "model"  # name of the judged model among the predictors
 _WINDOWS = 1000
-_RIDGE_WINDOWS = 3000  # to which the ridge regression is fitted
 _LINEARIZED = 100  # windows linearised at once
 
 
@@ -110,7 +108,7 @@ def judge(
     windows = held_out.windows(max(steps), max(model.past, PAST), most=_WINDOWS)
     model_errors = windows.errors(model.rollout(windows), steps)
     errors = {MODEL: model_errors}
-    errors |= _baseline_errors(model.kinematics, train, windows, steps)
+    errors |= baseline_errors(model.kinematics, train, windows, steps)
     distances = {name: space.distances(e) for name, e in errors.items()}
     variances = _claimed_variances(learned, windows, steps)
     variances = follow_errors(windows, model_errors, variances, steps)
@@ -129,38 +127,6 @@ def judge(
         width=np.sqrt(claimed / np.maximum(actual, 1e-300)),
         windows=len(windows),
     )
-
-
-def _baseline_errors(
-    kinematics: Kinematics, train: Log, windows: Windows, steps: Sequence[int]
-) -> dict[str, Array]:
-    """Computes the errors (W, steps, e) of each baseline by its name."""
-    start = windows.states[:, windows.past]
-
-    def errors(predict: Callable[[int], Array]) -> Array:
-        columns = []
-        for k in steps:
-            measured = windows.states[:, windows.past + k]
-            columns.append(windows.space.difference(predict(k), measured))
-        return np.stack(columns, axis=1)
-
-    def coast(k: int) -> Array:
-        return kinematics.coast(start, k * windows.time_step)
-
-    def ridge(k: int) -> Array:
-        return RidgeRegression.fit(kinematics, training_windows, k).predict(windows)
-
-    training_windows = train.windows(max(steps), PAST, most=_RIDGE_WINDOWS)
-    affine = fit_least_squares(kinematics, train)
-    with np.errstate(over="ignore", invalid="ignore"):
-        affine_errors = windows.errors(affine.rollout(windows), steps)
-    inf = np.inf
-    return {
-        "constant state": errors(lambda k: start),
-        "constant velocity": errors(coast),
-        "least squares": np.nan_to_num(affine_errors, nan=inf, posinf=inf, neginf=inf),
-        "ridge regression": errors(ridge),
-    }
 
 
 def _claimed_variances(

@@ -19,6 +19,7 @@ from gpmpc._trust import trusted_packages
 from gpmpc.exceptions import DataError, SettingError
 from gpmpc.gp import load_metadata
 from gpmpc.gp._storage import consistent, read_model, write_model
+from gpmpc.logs._comparison import Comparison
 from gpmpc.logs._fitting import NominalFit
 from gpmpc.logs._learning import IdentifiedModel
 from gpmpc.logs._structures import Candidate
@@ -58,6 +59,12 @@ def save_learned(learned: IdentifiedModel, path: str | Path) -> None:
     header["candidates"] = [
         [candidate.name, candidate.errors.tolist(), candidate.chosen]
         for candidate in learned.candidates
+    ]
+    header["judged_steps"] = learned.judged_steps
+    header["folds"] = learned.folds
+    header["comparisons"] = [
+        [one.name, one.ratio.tolist(), one.low.tolist(), one.high.tolist()]
+        for one in learned.comparisons
     ]
     tensors["standard_errors"] = torch.from_numpy(learned.fit.standard_errors)
     tensors["ranges"] = torch.from_numpy(learned.ranges)
@@ -104,6 +111,12 @@ def _learned_of_parts(
         input_names=named.input_names,
         context_names=named.context_names,
         time_step=named.time_step,
+        judged_steps=tuple(header.get("judged_steps", (10, 50))),  # of older files
+        folds=str(header.get("folds", "")),
+        comparisons=tuple(
+            Comparison(str(name), np.array(ratio), np.array(low), np.array(high))
+            for name, ratio, low, high in header.get("comparisons", ())
+        ),
     )
 
 

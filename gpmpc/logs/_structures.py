@@ -16,7 +16,7 @@ To add a structure for another kind of system:
    (``_nominal_header`` and ``_nominal``).
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -25,7 +25,7 @@ import numpy as np
 from gpmpc._dynamics import Array
 from gpmpc.logs._fitting import PAST
 from gpmpc.logs._log import Log
-from gpmpc.models._kinematics import Increments, RigidBodyKinematics
+from gpmpc.models._kinematics import Increments, Kinematics, RigidBodyKinematics
 from gpmpc.models._log_model import LogModel
 from gpmpc.models._parametric import AffineNominal, MultirotorNominal
 
@@ -40,7 +40,7 @@ class Candidate:
     """A structure that was tried: its name, and the errors on held-out runs."""
 
     name: str  #: of the structure
-    errors: Array  #: mean Euclidean or geodesic error (steps, groups)
+    errors: Array  #: mean Euclidean or geodesic error (judged steps, groups)
     chosen: bool = False  #: whether it is the best one
 
 
@@ -70,41 +70,72 @@ class Structure:
     model: LogModel  #: nominal part, history and lag
     additions: tuple[Addition, ...] = ()
     gps: tuple[GroupGP, ...] = ()
+    #: structures without GPs, each with the groups of outputs that are its own; none of
+    #: a structure that is not put together
+    parts: tuple[tuple["Structure", tuple[str, ...]], ...] = ()
+    #: of the correction by the past (judged steps, groups of states); none without
+    penalties: tuple[tuple[float, ...], ...] = ()
 
     @property
     def name(self) -> str:
         """The structure in words."""
-        parts = [self.base, *(addition.words for addition in self.additions)]
+        words = [self.base, *(addition.words for addition in self.additions)]
+        if self.parts:
+            words = [f"{part.name} for {_words(groups)}" for part, groups in self.parts]
         if self.gps:
             gps = [f"{gp.group} (averaged over {gp.rows})" for gp in self.gps]
-            parts.append(f"GP on {' and '.join(gps)}")
-        return ", ".join(parts)
+            words.append(f"GP on {_words(gps)}")
+        if self.penalties:
+            words.append("corrected by the past")
+        return ", ".join(words)
 
     @property
     def key(self) -> str:
         """The structure in the memory of a search."""
-        parts = [self.base, *(addition.key for addition in self.additions)]
-        parts += [f"gp:{gp.group}:{gp.rows}" for gp in self.gps]
-        return "/".join(parts)
+        words = [self.base, *sorted(addition.key for addition in self.additions)]
+        for part, groups in self.parts:
+            words.append(f"({part.key}:{'+'.join(groups)})")
+        words += sorted(f"gp:{gp.group}:{gp.rows}" for gp in self.gps)
+        if self.penalties:
+            words.append("corrected")
+        return "/".join(words)
+
+    @property
+    def size(self) -> int:
+        """Number of the pieces that it is made of, to prefer what is simpler."""
+        parts = sum(part.size for part, _ in self.parts)
+        return len(self.additions) + len(self.gps) + parts + bool(self.penalties)
+
+    @property
+    def nominal(self) -> "Structure":
+        """The structure without GPs and correction."""
+        return replace(self, gps=(), penalties=())
 
     def extended(self, addition: Addition) -> "Structure | None":
         """Returns the structure with an addition; None where that makes no sense."""
+        if self.parts or addition in self.additions:
+            return None
         model = addition.extend(self.model)
         if model is None:
             return None
         return replace(self, model=model, additions=(*self.additions, addition))
 
-    def with_gp(self, gp: GroupGP) -> "Structure":
-        """Returns the structure with a GP on a group; it replaces an earlier one."""
-        others = [other for other in self.gps if other.group != gp.group]
-        return replace(self, gps=(*others, gp))
+    def with_gps(self, gps: Iterable[GroupGP]) -> "Structure":
+        """Returns the structure with other GPs, in the order of their groups."""
+        return replace(self, gps=tuple(sorted(gps)))
+
+
+def _words(names: Sequence[str]) -> str:
+    """Returns names as words: "a, b and c"."""
+    *first, last = names
+    return f"{', '.join(first)} and {last}" if first else last
 
 
 def bases(log: Log) -> list[Structure]:
     """Returns the structures that a search begins with, all of which are tried."""
     if log.mapping.model == "rigid_body":
-        return [_multirotor_base(log)]
-    return [_increments_base(log)]
+        return [_multirotor_base(log), *_affine_bases(RigidBodyKinematics(log.space))]
+    return _affine_bases(Increments(log.space))
 
 
 def _multirotor_base(log: Log) -> Structure:
@@ -122,22 +153,32 @@ def _multirotor_base(log: Log) -> Structure:
     return Structure("rigid body", model)
 
 
-def _increments_base(log: Log) -> Structure:
-    increments = Increments(log.space)
-    model = LogModel(
-        kinematics=increments,
-        nominal=AffineNominal(increments, fitted=False),
-        theta=np.empty(0),
-        history=(0,) * log.space.error_dim,
-    )
-    return Structure("increments", model)
+def _affine_bases(kinematics: Kinematics) -> list[Structure]:
+    """Returns outputs of zero, and outputs that are affine in the features."""
+    names = {False: "constant state", True: "least squares"}
+    if isinstance(kinematics, RigidBodyKinematics):
+        names[False] = "free fall"
+    return [
+        Structure(
+            name,
+            LogModel(
+                kinematics=kinematics,
+                nominal=AffineNominal(kinematics, fitted=fitted),
+                theta=np.empty(0),
+                history=(0,) * len(kinematics.output_names),
+            ),
+        )
+        for fitted, name in names.items()
+    ]
 
 
-def additions(base: Structure) -> tuple[Addition, ...]:
-    """Returns what a base may grow by, in the order in which it is tried."""
-    if isinstance(base.model.nominal, MultirotorNominal):
+def additions(structure: Structure) -> tuple[Addition, ...]:
+    """Returns what a structure may grow by; each is tried on what did best so far."""
+    if structure.parts:
+        return ()
+    if isinstance(structure.model.nominal, MultirotorNominal):
         return _MULTIROTOR_ADDITIONS
-    return _INCREMENT_ADDITIONS
+    return _AFFINE_ADDITIONS
 
 
 def _median_voltage(log: Log) -> float:
@@ -148,18 +189,11 @@ def _median_voltage(log: Log) -> float:
     return float(np.median(np.concatenate([run.context[:, 0] for run in log])))
 
 
-def _with_affine_nominal(model: LogModel) -> LogModel:
-    return replace(model, nominal=AffineNominal(model.kinematics))
-
-
 def _with_disturbance(model: LogModel) -> LogModel:
     return replace(model, history=(DISTURBANCE_ROWS,) * len(model.history))
 
 
-_INCREMENT_ADDITIONS = (
-    Addition("least_squares", "least squares", _with_affine_nominal),
-    Addition("disturbance", "disturbance", _with_disturbance),
-)
+_AFFINE_ADDITIONS = (Addition("disturbance", "disturbance", _with_disturbance),)
 
 
 def _with_force_disturbance(model: LogModel) -> LogModel:

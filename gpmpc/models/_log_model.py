@@ -3,6 +3,7 @@
     y[k] = nominal(theta; x[k], u[k - lag], c) + gp(x[k], u[k - lag], c) + d
     x[k+1] = kinematics.step(x[k], y[k])
 
+A correction may add to the states that were rolled out what the past says of them.
 Many windows, many steps and many parameter vectors are rolled out in one batch. The
 disturbance d of an output is the mean, over the last rows before a prediction, of the
 measured output minus the model's; it is held through the prediction. So is the context
@@ -18,6 +19,7 @@ import numpy as np
 from gpmpc._dynamics import Array
 from gpmpc.exceptions import SettingError
 from gpmpc.gp import GPPosterior
+from gpmpc.models._correction import LAGS, Correction
 from gpmpc.models._kinematics import Kinematics
 from gpmpc.models._parametric import ParametricNominal
 from gpmpc.models._roll_out import iterate
@@ -57,6 +59,8 @@ class LogModel:
     history: tuple[int, ...]
     lag: int = 0  #: rows by which the inputs act late
     gps: tuple[OutputGP, ...] = ()  #: on the residual of the nominal part
+    #: of rollouts, by the past before their starts; none by default
+    correction: Correction | None = None
 
     def __post_init__(self) -> None:
         o = len(self.kinematics.output_names)
@@ -66,7 +70,8 @@ class LogModel:
     @property
     def past(self) -> int:
         """Number of rows that a prediction needs before its start."""
-        return max(self.history) + self.lag
+        past = max(self.history) + self.lag
+        return past if self.correction is None else max(past, *LAGS)
 
     def outputs(
         self, states: Array, inputs: Array, context: Array, theta: Any = None
@@ -129,8 +134,8 @@ class LogModel:
         Args:
             windows: With ``past`` rows or more before their starts.
             steps: Number of states; by default as many as the windows hold.
-            theta: Parameter vectors (T, P) that are rolled out beside each other; the
-                model's own by default.
+            theta: Parameter vectors (T, P) that are rolled out beside each other,
+                without the correction; the model's own by default.
 
         Returns:
             The states after the start (W, steps, n), or (T, W, steps, n).
@@ -156,7 +161,10 @@ class LogModel:
             outputs = self.outputs(states, inputs, context, parameters) + disturbance
             return self.kinematics.step(states, outputs, windows.time_step)
 
-        return iterate(step, start, steps)[..., 1:, :]
+        predicted = iterate(step, start, steps)[..., 1:, :]
+        if self.correction is None or theta is not None:
+            return predicted
+        return self.correction(windows, predicted)
 
     def rollout_errors(
         self, windows: Windows, steps: Sequence[int] | np.ndarray | None = None

@@ -1,10 +1,12 @@
 """Models of logs in files: their layout, and its checks.
 
 The header has ``groups``, ``kinematics``, ``nominal``, ``history``, ``lag``, ``gps``,
-``names`` and ``time_step``; the tensors are ``theta``, ``noise/...`` and those of the
-GPs, ``gp0/...``. ``gpmpc.logs`` adds the record of the identification.
+``names``, ``time_step`` and, where the model has one, the steps of its ``correction``;
+the tensors are ``theta``, ``noise/...``, ``correction/...`` and those of the GPs,
+``gp0/...``. ``gpmpc.logs`` adds the record of the identification.
 """
 
+import itertools
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
@@ -22,6 +24,8 @@ from gpmpc.gp._storage import (
     posterior_parts,
     read_model,
 )
+from gpmpc.models._correction import BINS, LAGS, Correction
+from gpmpc.models._grouped import GroupedNominal
 from gpmpc.models._kinematics import Increments, Kinematics, RigidBodyKinematics
 from gpmpc.models._log_dynamics import TIME_CONSTANTS, LogDynamics, OutputNoise
 from gpmpc.models._log_model import LogModel, OutputGP
@@ -36,6 +40,8 @@ _RIGID_BODY = "RigidBody"  # as files call its kinematics
 _INCREMENTS = "Increments"
 _AFFINE_NAMES = ("AffineNominal", STILL)  # as files call that nominal model
 _MULTIROTOR_NAME = "MultirotorNominal"
+_GROUPED_NAME = "GroupedNominal"
+_CORRECTION_TENSORS = ("mean", "deviation", "weights")
 _KINDS_OF_GROUPS = ("vector", "angle", "quaternion")
 _LONGEST = 10_000  # rows that a model from a file looks back
 _SLOWEST = 1e9  # time step of a model from a file [s]
@@ -85,6 +91,11 @@ def log_model_parts(
         "names": [named.state_names, named.input_names, named.context_names],
         "time_step": named.time_step,
     }
+    if model.correction is not None:
+        header["correction"] = model.correction.steps
+        for key in _CORRECTION_TENSORS:
+            values = getattr(model.correction, key)
+            tensors[f"correction/{key}"] = torch.from_numpy(values)
     return header, tensors
 
 
@@ -95,6 +106,13 @@ def _nominal_header(nominal: Any) -> list[Any]:
         return [name, asdict(nominal)]
     if isinstance(nominal, AffineNominal):
         return [name, {"fitted": nominal.fitted}]
+    if isinstance(nominal, GroupedNominal):
+        settings = {
+            "parts": [_nominal_header(part) for part in nominal.parts],
+            "outputs_of": nominal.outputs_of,
+            "sizes": nominal.sizes,
+        }
+        return [name, settings]
     rule = "only nominal models of gpmpc.models can be saved"
     raise SettingError("nominal", f"{rule}; got {name}")
 
@@ -153,6 +171,7 @@ def log_model_of_parts(
         history=tuple(header["history"]),
         lag=header["lag"],
         gps=tuple(gps),
+        correction=_correction(header, tensors, kinematics, input_names, feature_count),
     )
     noise = OutputNoise(
         outputs=tensors["noise/outputs"].numpy(),
@@ -208,7 +227,7 @@ def _nominal(
     kinematics: Kinematics,
     input_names: tuple[str, ...],
     context_names: tuple[str, ...],
-) -> MultirotorNominal | AffineNominal:
+) -> MultirotorNominal | AffineNominal | GroupedNominal:
     """Makes a nominal model of its name and settings.
 
     Raises:
@@ -217,8 +236,17 @@ def _nominal(
     name, settings = name_and_settings
     if name in _AFFINE_NAMES:
         return AffineNominal(kinematics, settings.get("fitted", name != STILL))
+    if name == _GROUPED_NAME:
+        return GroupedNominal(
+            parts=tuple(
+                _nominal(part, kinematics, input_names, context_names)
+                for part in settings["parts"]
+            ),
+            outputs_of=tuple(tuple(outputs) for outputs in settings["outputs_of"]),
+            sizes=tuple(settings["sizes"]),
+        )
     if name != _MULTIROTOR_NAME:
-        names = ", ".join((*_AFFINE_NAMES, _MULTIROTOR_NAME))
+        names = ", ".join((*_AFFINE_NAMES, _MULTIROTOR_NAME, _GROUPED_NAME))
         raise DataError(f"unknown nominal model {name!r:.80}; known are {names}")
     motors = settings["motors"]
     inputs = len(input_names)
@@ -231,6 +259,54 @@ def _nominal(
     if not isinstance(kinematics, RigidBodyKinematics):
         raise DataError("a multirotor is a rigid body")
     return MultirotorNominal(**settings)
+
+
+def _correction(
+    header: Mapping[str, Any],
+    tensors: Mapping[str, Tensor],
+    kinematics: Kinematics,
+    input_names: tuple[str, ...],
+    feature_count: int,
+) -> Correction | None:
+    """Makes the correction by the past of a file's parts; None where it has none."""
+    steps = header.get("correction")
+    if steps is None:
+        return None
+    for before, after in itertools.pairwise([0, *steps]):
+        check_number("correction", after, above=before, whole=True, unit="[steps]")
+    arrays = {key: tensors[f"correction/{key}"].numpy() for key in _CORRECTION_TENSORS}
+    e = kinematics.space.error_dim
+    m = len(input_names)
+    r = feature_count + len(LAGS) * (e + m) + BINS * m + e
+    check_shape("correction/mean", arrays["mean"], (len(steps), r))
+    check_shape("correction/deviation", arrays["deviation"], (len(steps), r))
+    check_shape("correction/weights", arrays["weights"], (len(steps), 1 + r, e))
+    if not all(np.isfinite(array).all() for array in arrays.values()):
+        raise DataError("the correction must be finite")
+    if not (arrays["deviation"] > 0).all():
+        raise DataError("the deviations of the correction must be positive")
+    return Correction(kinematics, tuple(steps), **arrays)
+
+
+def _parameter_count(nominal: Any, outputs: int, feature_count: int) -> int:
+    """Returns the number of parameters of a nominal model.
+
+    Raises:
+        DataError: It is put together of parts whose sizes are not theirs.
+    """
+    if isinstance(nominal, GroupedNominal):
+        sizes = [
+            _parameter_count(part, outputs, feature_count) for part in nominal.parts
+        ]
+        indices = [i for own in nominal.outputs_of for i in own]
+        if nominal.sizes != tuple(sizes) or len(indices) != outputs:
+            raise DataError(
+                f"the parts of a nominal model must have {sizes} parameters"
+            )
+        return sum(sizes)
+    if not isinstance(nominal, AffineNominal):
+        return len(nominal.parameter_names)
+    return outputs * (feature_count + 1) if nominal.fitted else 0
 
 
 def _check_gp(gp: OutputGP, feature_count: int) -> None:
@@ -261,10 +337,8 @@ def _check_model(model: LogModel, feature_count: int) -> None:
     for rows in model.history:
         _check_rows("history", rows)
     outputs = len(model.kinematics.output_names)
-    if not isinstance(model.nominal, AffineNominal):
-        check_shape("theta", model.theta, (len(model.nominal.parameter_names),))
-    elif model.nominal.fitted:
-        check_shape("theta", model.theta, (outputs * (feature_count + 1),))
+    count = _parameter_count(model.nominal, outputs, feature_count)
+    check_shape("theta", model.theta, (count,))
     if not np.isfinite(model.theta).all():
         raise DataError("theta must be finite")
     for gp in model.gps:

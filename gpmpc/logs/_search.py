@@ -1,0 +1,645 @@
+"""Searches for the structure whose rollouts of held-out rows are best.
+
+1. Nominal structures: from every base, by one term more or less at a time; the best
+   few of each round go on.
+2. Groups of outputs: those of one nominal structure, the others of another.
+3. GPs on the groups of outputs, from none and from all at once, by the change of one
+   group at a time that helps most.
+4. A correction by the past, upon the best structures and upon a state that stays.
+
+A structure's score is the mean, over groups and steps, of the logarithm of its error
+over that of the best baseline; where it is behind, that counts twice.
+"""
+
+import itertools
+from collections.abc import Iterable, Mapping, MutableMapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from gpmpc._dynamics import Array
+from gpmpc.logs._baselines import CONSTANT_STATE, baseline_errors
+from gpmpc.logs._comparison import Comparison, compare
+from gpmpc.logs._fitting import PAST, NominalFit, fit_least_squares, fit_nominal
+from gpmpc.logs._folds import Fold
+from gpmpc.logs._log import Log
+from gpmpc.logs._noise import fit_noise
+from gpmpc.logs._output_gps import train_output_gp
+from gpmpc.logs._structures import (
+    LATE,
+    Candidate,
+    GroupGP,
+    Structure,
+    additions,
+    bases,
+)
+from gpmpc.models._correction import Correction
+from gpmpc.models._grouped import GroupedNominal
+from gpmpc.models._log_dynamics import OutputNoise
+from gpmpc.models._log_model import LogModel, OutputGP
+from gpmpc.models._parametric import AffineNominal
+from gpmpc.models._windows import Windows
+
+PAST_ROWS = PAST + LATE  # of the windows that structures are compared on
+_AVERAGES = (1, 5, 10)  # rows over which the targets of a GP are averaged
+_JUDGED = (1, 10, 50)  # steps whose errors decide
+_PIECE = 0.02  # of the score that every piece of a structure has to earn
+_BEAM = 2  # structures that go on
+_WINDOWS = 200  # of a fold, that structures are compared on
+_CORRECTED_WINDOWS = 1200  # of a fold, that a correction is fitted to
+_CHUNKS = 6  # of held-out rollouts, each corrected by what the others say
+_LARGEST = 1e6  # state of a rollout that a correction is fitted to
+_CORRECTED = 2  # structures upon which a correction is tried
+_KNOTS = (1, 2, 3, 5, 7, 10, 15, 20, 30, 50)  # steps of a correction
+_PENALTIES = (0.001, 0.01, 0.1, 1.0, 10.0, np.inf)  # tried of a correction
+_EXACT = 1e-4  # of a constant state's error: what is smaller counts as exact
+_NOTHING = 1e-9  # of the outputs: a residual that is none
+_LOSS = 2.0  # weight of being behind a baseline
+_ROUNDS = 8  # of changes of the GPs of one nominal structure, at most
+
+
+@dataclass(frozen=True)
+class _Rollouts:
+    """Windows, and what a model predicts of them."""
+
+    windows: Windows
+    predicted: Array  # (W, steps, n)
+
+    def __getitem__(self, rows: Any) -> "_Rollouts":
+        return _Rollouts(self.windows[rows], self.predicted[rows])
+
+
+class Search:
+    """A search for the structure whose rollouts of held-out rows are best.
+
+    Args:
+        log: All runs.
+        folds: Of the log.
+        points: Rows that a GP is trained on.
+        steps: Of the rollouts.
+        seed: Of every random number.
+        progress: Called with a line for each structure.
+        memory: By the key of a structure without GPs, the parameters of its nominal
+            model by fold (lists of numbers); of any other, its errors.
+        for_control: Leaves out what no controller can plan with.
+    """
+
+    def __init__(
+        self,
+        log: Log,
+        folds: Sequence[Fold],
+        points: int,
+        steps: int,
+        seed: int,
+        progress: Any,
+        memory: MutableMapping[str, Any],
+        for_control: bool,
+    ):
+        self._log = log
+        self._folds = folds
+        self._points = points
+        self._steps = steps
+        self._seed = seed
+        self._progress = progress
+        self._memory = memory
+        self._for_control = for_control
+        self._bases = bases(log)
+        self.judged_steps = tuple(sorted({min(step, steps) for step in _JUDGED}))
+        self._windows = [
+            fold.held_out.windows(steps, past=PAST_ROWS, most=_WINDOWS)
+            for fold in folds
+        ]
+        self._nominal_models: dict[str, list[LogModel]] = {}
+        self._gps: dict[tuple[str, GroupGP], list[OutputGP]] = {}
+        self._structures: dict[str, Structure] = {}
+        self._errors: dict[str, Array] = {}
+        self._baselines = self._baseline_distances()
+        still = self._baselines[CONSTANT_STATE].mean(axis=0)
+        self._exact = _EXACT * still + 1e-12
+        self._scale = self._best_baseline_errors()
+
+    @property
+    def best(self) -> Structure:
+        """The best structure so far.
+
+        Raises:
+            ValueError: None was considered.
+        """
+        if not self._structures:
+            raise ValueError("no structure was considered")
+        return self._ranked(self._structures.values())[0]
+
+    @property
+    def candidates(self) -> tuple[Candidate, ...]:
+        """All structures that were considered, in order; the best one is chosen."""
+        best = self.best
+        return tuple(
+            Candidate(structure.name, self._errors[key], structure is best)
+            for key, structure in self._structures.items()
+        )
+
+    def run(self) -> None:
+        """Considers all structures."""
+        self._search_nominals()
+        self._search_combinations()
+        for start in self._starts_of_gps():
+            self._search_gps(start)
+        if not self._for_control:
+            self._search_corrections()
+
+    def score(self, structure: Structure) -> float:
+        """Returns the score of a structure that was considered; smaller is better."""
+        errors = np.maximum(self._errors[structure.key], self._exact)
+        logarithms = np.log(errors / self._scale)
+        behind = np.maximum(logarithms, 0.0)
+        total = logarithms.mean() + (_LOSS - 1) * behind.mean()
+        return float(total) + _PIECE * structure.size
+
+    def _ranked(self, structures: Iterable[Structure]) -> list[Structure]:
+        """Returns structures that were considered, the best one first."""
+        return sorted(structures, key=self.score)
+
+    # 1. nominal structures
+
+    def _search_nominals(self) -> None:
+        """Lets nominal structures grow and shrink by one term at a time."""
+        for base in self._bases:
+            self._consider_nominal(base, parent=None)
+        previous_best = None
+        while self.best is not previous_best:
+            previous_best = self.best
+            for structure in self._ranked(self._structures.values())[:_BEAM]:
+                for neighbour in self._neighbours(structure):
+                    if neighbour.key not in self._structures:
+                        self._consider_nominal(neighbour, parent=structure)
+
+    def _neighbours(self, structure: Structure) -> list[Structure]:
+        """Returns a nominal structure with one addition more, or one less."""
+        neighbours = [
+            structure.extended(addition)
+            for addition in additions(structure)
+            if addition.for_control or not self._for_control
+        ]
+        for removed in structure.additions:
+            smaller: Structure | None = self._base_of(structure)
+            for addition in structure.additions:
+                if addition is not removed and smaller is not None:
+                    smaller = smaller.extended(addition)
+            neighbours.append(smaller)
+        return [neighbour for neighbour in neighbours if neighbour is not None]
+
+    def _base_of(self, structure: Structure) -> Structure:
+        """Returns the base that a structure grew from."""
+        return next(base for base in self._bases if base.base == structure.base)
+
+    def _consider_nominal(self, structure: Structure, parent: Structure | None) -> None:
+        """Considers a nominal structure, fitted from the parameters of another."""
+        if structure.key not in self._memory:
+            starts = [structure.model] * len(self._folds)
+            if parent is not None:
+                starts = self._nominal_models[parent.key]
+            fits = [
+                fit_from(start, structure.model, fold.train, self._steps).model
+                for start, fold in zip(starts, self._folds, strict=True)
+            ]
+            self._memory[structure.key] = [model.theta.tolist() for model in fits]
+        models = [
+            replace(structure.model, theta=np.array(theta, dtype=float))
+            for theta in self._memory[structure.key]
+        ]
+        self._nominal_models[structure.key] = models
+        self._enter(structure, self._mean_errors(models))
+
+    # 2. combinations of groups of outputs
+
+    def _search_combinations(self) -> None:
+        """Combines the best structure with the best of every other base, by group."""
+        ranked = self._ranked(self._structures.values())
+        first = ranked[0]
+        groups = tuple(first.model.kinematics.output_groups)
+        others: dict[str, Structure] = {}
+        for structure in ranked:
+            if structure.base != first.base:
+                others.setdefault(structure.base, structure)
+        for other in others.values():
+            for count in range(1, len(groups)):
+                for own in itertools.combinations(groups, count):
+                    theirs = tuple(group for group in groups if group not in own)
+                    self._consider_combination(((first, own), (other, theirs)))
+
+    def _consider_combination(
+        self, parts: tuple[tuple[Structure, tuple[str, ...]], ...]
+    ) -> None:
+        """Considers outputs of which some are of one structure, some of another."""
+        by_fold = [
+            combine_models(
+                [self._nominal_models[part.key][i] for part, _ in parts],
+                [groups for _, groups in parts],
+            )
+            for i in range(len(self._folds))
+        ]
+        models = [model for model in by_fold if model is not None]
+        if len(models) < len(by_fold):
+            return
+        structure = Structure(base="", model=models[0], parts=parts)
+        self._nominal_models[structure.key] = models
+        self._enter(structure, self._mean_errors(models))
+
+    # 3. GPs
+
+    def _starts_of_gps(self) -> list[Structure]:
+        """Returns the nominal structures that GPs are tried on.
+
+        Upon a state that stays a GP is what ``gpmpc.gp.train`` makes of the rows.
+        """
+        starts = self._ranked(self._structures.values())[:_BEAM]
+        for base in self._bases:
+            nominal = base.model.nominal
+            plain = isinstance(nominal, AffineNominal) and not nominal.fitted
+            if plain and base.base == "constant state" and base not in starts:
+                starts.append(base)
+        return starts
+
+    def _search_gps(self, start: Structure) -> None:
+        """Changes the GPs of a nominal structure by one group at a time."""
+        groups = self._groups_with_residual(start)
+        if not groups:
+            return
+        together = [
+            start.with_gps(GroupGP(group, rows) for group in groups)
+            for rows in _AVERAGES
+        ]
+        for structure in together:
+            self._consider_gps(structure)
+        for current in (start, self._ranked(together)[0]):
+            for _ in range(_ROUNDS):
+                changed = self._changed_gps(current, groups)
+                for structure in changed:
+                    self._consider_gps(structure)
+                best = self._ranked([current, *changed])[0]
+                if best is current:
+                    break
+                current = best
+
+    def _groups_with_residual(self, structure: Structure) -> tuple[str, ...]:
+        """Returns the groups of outputs that a nominal structure leaves a residual of.
+
+        Of the others, such as an angle whose rate is measured, nothing can be learned.
+        """
+        windows = self._windows[0]
+        model = self._nominal_models[structure.key][0]
+        start = windows.past
+        states = windows.states[:, start]
+        measured = model.kinematics.outputs(
+            states, windows.states[:, start + 1], windows.time_step
+        )
+        modelled = model.outputs(
+            states, windows.inputs[:, start - model.lag], windows.context[:, start]
+        )
+        residual = np.abs(measured - modelled).max(axis=0)
+        is_left = residual > _NOTHING * np.abs(measured).max(axis=0)
+        groups = model.kinematics.output_groups
+        return tuple(name for name, own in groups.items() if is_left[list(own)].any())
+
+    def _changed_gps(
+        self, structure: Structure, groups: Sequence[str]
+    ) -> list[Structure]:
+        """Returns a structure with the GP of one group changed, new or gone."""
+        changed = []
+        for group in groups:
+            others = [gp for gp in structure.gps if gp.group != group]
+            own = [gp for gp in structure.gps if gp.group == group]
+            choices = [GroupGP(group, rows) for rows in _AVERAGES]
+            changed += [
+                structure.with_gps([*others, gp]) for gp in choices if gp not in own
+            ]
+            if own:
+                changed.append(structure.with_gps(others))
+        return changed
+
+    def _consider_gps(self, structure: Structure) -> None:
+        """Considers a structure with GPs."""
+        if structure.key in self._structures:
+            return
+        if structure.key not in self._memory:
+            errors = self._mean_errors(self._models(structure))
+            self._memory[structure.key] = errors.tolist()
+        self._enter(structure, np.array(self._memory[structure.key]))
+
+    # 4. corrections by the past
+
+    def _search_corrections(self) -> None:
+        """Considers corrections upon the best structures and upon a constant state."""
+        ranked = self._ranked(self._structures.values())
+        for structure in ranked[:_CORRECTED]:
+            self._consider_correction(structure)
+
+    def _consider_correction(self, structure: Structure) -> None:
+        """Considers a correction with the penalty that is best of each group."""
+        key = replace(structure, penalties=((0.0,),)).key
+        if key not in self._memory:
+            self._memory[key] = self._choose_penalties(structure)
+        penalties = [tuple(map(float, row)) for row in self._memory[key]["penalties"]]
+        errors = np.array(self._memory[key]["errors"])
+        self._enter(replace(structure, penalties=tuple(penalties)), errors)
+
+    def _choose_penalties(self, structure: Structure) -> dict[str, list[list[float]]]:
+        """Returns the best penalties (judged steps, groups) of a correction.
+
+        The errors that it has with them come along. They are those of chunks of
+        held-out rollouts, by corrections that were fitted to the other chunks.
+        """
+        rollouts = _concatenated(self._held_out_rollouts(structure))
+        without = self._log.space.distances(
+            rollouts.windows.errors(rollouts.predicted, self.judged_steps)
+        )
+        alternatives = [np.full(self._scale.shape, one) for one in _PENALTIES]
+        distances = np.empty((len(_PENALTIES), *without.shape))
+        for chunk in _chunks(rollouts.windows, self._steps):
+            corrections = self._corrections(
+                rollouts[chunk.others], self.judged_steps, alternatives
+            )
+            own = rollouts[chunk.own]
+            for i, correction in enumerate(corrections):
+                corrected = correction(own.windows, own.predicted)
+                distances[i, chunk.own] = self._log.space.distances(
+                    own.windows.errors(corrected, self.judged_steps)
+                )
+        ratios = distances.mean(axis=1) / without.mean(axis=0)
+        best = np.argmin(ratios, axis=0)
+        errors = self._errors[structure.key] * np.min(ratios, axis=0)
+        return {
+            "penalties": np.array(_PENALTIES)[best].tolist(),
+            "errors": errors.tolist(),
+        }
+
+    def _held_out_rollouts(self, structure: Structure) -> list["_Rollouts"]:
+        """Returns rollouts of held-out rows, by the models of the other fold."""
+        rollouts = []
+        for model, fold in zip(self._models(structure), self._folds, strict=True):
+            windows = fold.held_out.windows(
+                self._steps, past=PAST_ROWS, most=_CORRECTED_WINDOWS
+            )
+            with np.errstate(over="ignore", invalid="ignore"):
+                predicted = model.rollout(windows)
+            is_finite = np.abs(predicted).max(axis=(1, 2)) < _LARGEST
+            rollouts.append(_Rollouts(windows, predicted)[is_finite])
+        return rollouts
+
+    def _corrections(
+        self,
+        rollouts: "_Rollouts",
+        knots: Sequence[int],
+        alternatives: Sequence[Array],
+    ) -> list[Correction]:
+        """Fits corrections of rollouts, with each of some penalties.
+
+        Args:
+            rollouts: That are corrected.
+            knots: Steps of the corrections.
+            alternatives: Penalties (judged steps, groups).
+        """
+        judged = np.log(self.judged_steps)
+        nearest = [np.abs(judged - np.log(knot)).argmin() for knot in knots]
+        entries = [group.error_dim for group in rollouts.windows.space.groups]
+        return Correction.fit_each(
+            kinematics=self._bases[0].model.kinematics,
+            windows=rollouts.windows,
+            predicted=rollouts.predicted,
+            steps=knots,
+            alternatives=[
+                np.repeat(penalties[nearest], entries, axis=1)
+                for penalties in alternatives
+            ],
+        )
+
+    def _chosen_correction(
+        self, structure: Structure, rollouts: "_Rollouts"
+    ) -> Correction:
+        """Fits the correction of a structure, at all of its steps."""
+        steps = {step for step in _KNOTS if step < self._steps} | {self._steps}
+        penalties = np.array(structure.penalties)
+        (correction,) = self._corrections(rollouts, sorted(steps), [penalties])
+        return correction
+
+    # what all of them need
+
+    def _enter(self, structure: Structure, errors: Array) -> None:
+        """Enters a candidate with its errors."""
+        self._structures[structure.key] = structure
+        self._errors[structure.key] = errors
+        relative = np.exp(self.score(structure) - _PIECE * structure.size)
+        best = " (best so far)" if self.best is structure else ""
+        self._progress(
+            f"{structure.name}: {relative:.3f} of the best baselines' errors{best}"
+        )
+
+    def _models(self, structure: Structure) -> list[LogModel]:
+        """Returns the models of a structure, one for each fold."""
+        nominals = self._nominal_models[structure.nominal.key]
+        gps = [self._trained(structure, gp) for gp in structure.gps]
+        models = [
+            replace(nominal, gps=tuple(trained[i] for trained in gps))
+            for i, nominal in enumerate(nominals)
+        ]
+        if not structure.penalties:
+            return models
+        # What one fold holds out, the model of the other was fitted to.
+        first, second = self._held_out_rollouts(replace(structure, penalties=()))
+        return [
+            replace(model, correction=self._chosen_correction(structure, rollouts))
+            for model, rollouts in zip(models, (second, first), strict=True)
+        ]
+
+    def _trained(self, structure: Structure, gp: GroupGP) -> list[OutputGP]:
+        """Returns a GP on a group of outputs, trained on each fold."""
+        key = structure.nominal.key, gp
+        if key not in self._gps:
+            nominals = self._nominal_models[structure.nominal.key]
+            self._gps[key] = [
+                self._train(gp, model, fold.train)
+                for model, fold in zip(nominals, self._folds, strict=True)
+            ]
+        return self._gps[key]
+
+    def _train(self, gp: GroupGP, model: LogModel, log: Log) -> OutputGP:
+        """Trains a GP on a group of outputs."""
+        return train_output_gp(
+            model=model,
+            log=log,
+            outputs=model.kinematics.output_groups[gp.group],
+            rows=gp.rows,
+            points=self._points,
+            seed=self._seed,
+        )
+
+    def _distances(self, models: Sequence[LogModel]) -> Array:
+        """Computes the errors (W, judged steps, groups) of held-out rollouts."""
+        errors = [
+            model.rollout_errors(windows, self.judged_steps)
+            for windows, model in zip(self._windows, models, strict=True)
+        ]
+        return self._log.space.distances(np.concatenate(errors))
+
+    def _mean_errors(self, models: Sequence[LogModel]) -> Array:
+        """Computes the mean errors (judged steps, groups) of held-out rollouts."""
+        return self._distances(models).mean(axis=0)
+
+    def _baseline_distances(self) -> dict[str, Array]:
+        """Computes the errors (W, judged steps, groups) of the baselines."""
+        kinematics = self._bases[0].model.kinematics
+        by_fold: list[Mapping[str, Array]] = [
+            baseline_errors(kinematics, fold.train, windows, self.judged_steps)
+            for fold, windows in zip(self._folds, self._windows, strict=True)
+        ]
+        return {
+            name: self._log.space.distances(
+                np.concatenate([errors[name] for errors in by_fold])
+            )
+            for name in by_fold[0]
+        }
+
+    def _best_baseline_errors(self) -> Array:
+        """Computes the errors (judged steps, groups) of the best baselines."""
+        means = [distances.mean(axis=0) for distances in self._baselines.values()]
+        return np.maximum(np.min(means, axis=0), self._exact)
+
+    # the best structure
+
+    def comparisons(self) -> tuple[Comparison, ...]:
+        """Compares the best structure with the baselines, and with the second best."""
+        best = self.best
+        distances = self._distances(self._models(best))
+        others = dict(self._baselines)
+        ranked = self._ranked(self._structures.values())
+        if len(ranked) > 1:
+            others[ranked[1].name] = self._distances(self._models(ranked[1]))
+        block = 2 * -(-self._steps // min(w.stride for w in self._windows))
+        return tuple(
+            compare(name, distances, other, block=block, seed=self._seed)
+            for name, other in others.items()
+        )
+
+    def fit_noise(self) -> OutputNoise:
+        """Fits the noise of the best structure to the held-out runs."""
+        held_out = [fold.held_out for fold in self._folds]
+        return fit_noise(self._models(self.best), held_out, self._steps)
+
+    def fit_to_all_runs(self) -> NominalFit:
+        """Fits the best structure to all runs, its GPs and its correction as well."""
+        best = self.best
+        fit = self._fit_nominal_to_all_runs(best.nominal)
+        gps = tuple(self._train(gp, fit.model, self._log) for gp in best.gps)
+        model = replace(fit.model, gps=gps)
+        if best.penalties:
+            uncorrected = replace(best, penalties=())
+            rollouts = _concatenated(self._held_out_rollouts(uncorrected))
+            correction = self._chosen_correction(best, rollouts)
+            model = replace(model, correction=correction)
+        return replace(fit, model=model)
+
+    def _fit_nominal_to_all_runs(self, structure: Structure) -> NominalFit:
+        """Fits a nominal structure to all runs."""
+        if not structure.parts:
+            start = self._nominal_models[structure.key][0]
+            return fit_from(start, structure.model, self._log, self._steps)
+        fits = [self._fit_nominal_to_all_runs(part) for part, _ in structure.parts]
+        groups = [groups for _, groups in structure.parts]
+        model = combine_models([fit.model for fit in fits], groups)
+        assert model is not None
+        errors = [
+            fit.standard_errors
+            if len(fit.standard_errors)
+            else np.full(len(fit.model.theta), np.nan)
+            for fit in fits
+        ]
+        return NominalFit(model, np.concatenate(errors))
+
+
+class _Chunk(NamedTuple):
+    """Windows that follow each other, and others that share no row with them."""
+
+    own: np.ndarray
+    others: np.ndarray
+
+
+def _chunks(windows: Windows, steps: int) -> list[_Chunk]:
+    """Cuts windows into chunks in their order."""
+    rows = np.arange(len(windows))
+    overlap = -(-(windows.past + steps) // windows.stride)
+    chunks = []
+    for own in np.array_split(rows, min(_CHUNKS, len(windows))):
+        is_apart = (rows < own[0] - overlap) | (rows > own[-1] + overlap)
+        others = rows[is_apart]
+        if not len(others):
+            others = np.setdiff1d(rows, own)
+        chunks.append(_Chunk(own, others))
+    return chunks
+
+
+def _concatenated(parts: Sequence[_Rollouts]) -> _Rollouts:
+    """Concatenates rollouts, those of the first part first."""
+    windows = [part.windows for part in parts]
+    joined = replace(
+        windows[0],
+        stride=min(one.stride for one in windows),
+        states=np.concatenate([one.states for one in windows]),
+        inputs=np.concatenate([one.inputs for one in windows]),
+        context=np.concatenate([one.context for one in windows]),
+        runs=np.concatenate([one.runs for one in windows]),
+        times=np.concatenate([one.times for one in windows]),
+    )
+    return _Rollouts(joined, np.concatenate([part.predicted for part in parts]))
+
+
+def combine_models(
+    models: Sequence[LogModel], groups: Sequence[Sequence[str]]
+) -> LogModel | None:
+    """Combines nominal models by groups of outputs; None where they do not fit.
+
+    Args:
+        models: Without GPs, of the same kinematics.
+        groups: Names of the groups of outputs that come from each.
+    """
+    if len({model.lag for model in models}) > 1:
+        return None
+    names = models[0].kinematics.output_groups
+    outputs = [tuple(i for name in own for i in names[name]) for own in groups]
+    history = list(models[0].history)
+    for model, indices in zip(models, outputs, strict=True):
+        for i in indices:
+            history[i] = model.history[i]
+    return replace(
+        models[0],
+        nominal=GroupedNominal(
+            parts=tuple(model.nominal for model in models),
+            outputs_of=tuple(outputs),
+            sizes=tuple(len(model.theta) for model in models),
+        ),
+        theta=np.concatenate([model.theta for model in models]),
+        history=tuple(history),
+    )
+
+
+def fit_from(start_from: LogModel, model: LogModel, log: Log, steps: int) -> NominalFit:
+    """Fits the nominal part of a model.
+
+    Args:
+        start_from: The search begins at the parameters that this fitted model has in
+            common with the other.
+        model: The model, whose parameters are not known yet.
+        log: The data.
+        steps: Of the rollouts.
+    """
+    nominal = model.nominal
+    if isinstance(nominal, AffineNominal) and nominal.fitted:
+        # It is linear in its many parameters.
+        fitted = fit_least_squares(nominal.kinematics, log)
+        fitted = replace(fitted, history=model.history)
+        return NominalFit(fitted, standard_errors=np.empty(0))
+    names = start_from.nominal.parameter_names
+    fitted_values = dict(zip(names, start_from.theta, strict=False))
+    defaults = zip(nominal.parameter_names, nominal.start, strict=True)
+    theta0 = np.array([fitted_values.get(name, value) for name, value in defaults])
+    return fit_nominal(model, theta0, log, steps)

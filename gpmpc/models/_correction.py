@@ -1,0 +1,182 @@
+"""Corrections of rollouts by the past: a ridge regression for each step ahead.
+
+    x^[k] = rollout[k] (+) W_k z,
+    z = (past states, past inputs, inputs to come, rollout[k] (-) x[0])
+
+A rollout begins at a measured row, with its noise, and knows nothing of what a filter,
+an actuator or an estimator still holds of earlier rows. What of its errors is linear in
+the past is found by a regression for each step, straight from the past to the error
+that far ahead. The movement that was rolled out is among the regressors, so that it can
+be shrunk or left out. Upon a state that does not move this is the ordinary ridge
+regression.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from gpmpc._dynamics import Array
+from gpmpc.models._kinematics import Kinematics
+from gpmpc.models._windows import Windows
+
+LAGS = (1, 2, 3, 5, 8, 12, 20)  # rows of the past that it sees
+BINS = 5  # means of the inputs to come that it sees
+PENALTY = 0.01  # of squared coefficients of standardised columns, per row
+
+
+@dataclass(frozen=True)
+class Correction:
+    """Linear corrections of rollouts at some steps, and between them."""
+
+    kinematics: Kinematics  #: has the features of the start
+    steps: tuple[int, ...]  #: at which a regression stands (S,), increasing
+    mean: Array  #: of the regressors (S, r)
+    deviation: Array  #: likewise
+    weights: Array  #: (S, 1 + r, e), the constant first
+
+    @classmethod
+    def fit(
+        cls,
+        kinematics: Kinematics,
+        windows: Windows,
+        predicted: Array,
+        steps: Sequence[int],
+        penalties: Array,
+    ) -> "Correction":
+        """Fits regressions to the errors of rollouts; see ``fit_each``."""
+        (correction,) = cls.fit_each(kinematics, windows, predicted, steps, [penalties])
+        return correction
+
+    @classmethod
+    def fit_each(
+        cls,
+        kinematics: Kinematics,
+        windows: Windows,
+        predicted: Array,
+        steps: Sequence[int],
+        alternatives: Sequence[Array],
+    ) -> list["Correction"]:
+        """Fits regressions to the errors of rollouts, with each of several penalties.
+
+        Args:
+            kinematics: Has the features of the start.
+            windows: W of them, with ``max(LAGS)`` rows of past or more.
+            predicted: Rollouts (W, K, n).
+            steps: At which a regression stands.
+            alternatives: Penalties of squared coefficients, per row (S, e); infinite
+                for none.
+        """
+        moments = [
+            _moments(kinematics, windows, predicted[:, step - 1], step)
+            for step in steps
+        ]
+        corrections = []
+        for penalties in alternatives:
+            weights = [
+                _weights(one, penalty)
+                for one, penalty in zip(moments, penalties, strict=True)
+            ]
+            corrections.append(
+                cls(
+                    kinematics=kinematics,
+                    steps=tuple(steps),
+                    mean=np.array([one.mean for one in moments]),
+                    deviation=np.array([one.deviation for one in moments]),
+                    weights=np.array(weights),
+                )
+            )
+        return corrections
+
+    def __call__(self, windows: Windows, predicted: Array) -> Array:
+        """Corrects rollouts (W, K, n); linear between its steps, constant after."""
+        knots = [0]
+        corrections = [np.zeros((len(windows), self.weights.shape[-1]))]
+        for i, step in enumerate(self.steps):
+            if step <= predicted.shape[1]:
+                knots.append(step)
+                corrections.append(self._at(i, windows, predicted[:, step - 1]))
+        values = np.stack(corrections, axis=1)
+        ahead = np.arange(1, predicted.shape[1] + 1)
+        after = np.clip(np.searchsorted(knots, ahead), 1, len(knots) - 1)
+        low = np.array(knots)[after - 1]
+        high = np.array(knots)[after]
+        share = np.clip((ahead - low) / (high - low), 0, 1)[:, None]
+        between = (1 - share) * values[:, after - 1] + share * values[:, after]
+        return windows.space.displace(predicted, between)
+
+    def _at(self, i: int, windows: Windows, predicted: Array) -> Array:
+        """Computes the corrections (W, e) of states (W, n) at one of its steps."""
+        regressors = _regressors(self.kinematics, windows, predicted, self.steps[i])
+        return (
+            _standardized(regressors, self.mean[i], self.deviation[i])
+            @ (self.weights[i])
+        )
+
+
+class _Moments(NamedTuple):
+    """What a regression needs of W windows."""
+
+    mean: Array  # of the regressors (r,)
+    deviation: Array  # likewise
+    normal: Array  # z^T z of the standardised regressors (1 + r, 1 + r)
+    with_errors: Array  # z^T e (1 + r, e)
+    rows: int  # W
+
+
+def _moments(
+    kinematics: Kinematics, windows: Windows, predicted: Array, step: int
+) -> _Moments:
+    """Computes the moments of the errors of states (W, n) at a step."""
+    regressors = _regressors(kinematics, windows, predicted, step)
+    mean = regressors.mean(axis=0)
+    deviation = np.maximum(regressors.std(axis=0), 1e-12)
+    z = _standardized(regressors, mean, deviation)
+    measured = windows.states[:, windows.past + step]
+    errors = windows.space.difference(measured, predicted)
+    return _Moments(mean, deviation, z.T @ z, z.T @ errors, len(z))
+
+
+def _weights(moments: _Moments, penalties: Array) -> Array:
+    """Computes the weights (1 + r, e) with penalties (e,)."""
+    weights = np.zeros_like(moments.with_errors)
+    is_penalized = np.diag(np.r_[0.0, np.ones(len(moments.mean))])
+    for penalty in np.unique(penalties[np.isfinite(penalties)]):
+        columns = penalties == penalty
+        penalized = moments.normal + penalty * moments.rows * is_penalized
+        solution: Any = np.linalg.solve(penalized, moments.with_errors[:, columns])
+        weights[:, columns] = solution
+    return weights
+
+
+def _regressors(
+    kinematics: Kinematics, windows: Windows, predicted: Array, step: int
+) -> Array:
+    """Returns what is known of windows at their starts (W, r).
+
+    It is features, past states and inputs, means of inputs to come, and the movement
+    that is predicted. A step that is too near for as many means has zeros for the
+    others.
+    """
+    past = windows.past
+    inputs = windows.inputs
+    start = windows.states[:, past]
+    columns = [kinematics.features(start, inputs[:, past], windows.context[:, past])]
+    for lag in LAGS:
+        earlier = windows.states[:, past - lag]
+        columns.append(windows.space.difference(start, earlier))
+    for lag in LAGS:
+        columns.append(inputs[:, past - lag])
+    for rows in np.array_split(np.arange(step), min(BINS, step)):
+        columns.append(inputs[:, past + rows].mean(axis=1))
+    missing = max(BINS - step, 0) * inputs.shape[-1]
+    columns.append(np.zeros((len(windows), missing)))
+    columns.append(windows.space.difference(predicted, start))
+    return np.concatenate(columns, axis=1)
+
+
+def _standardized(regressors: Array, mean: Array, deviation: Array) -> Array:
+    """Standardises regressors, with a column of ones before them."""
+    ones = np.ones(len(regressors))
+    return np.column_stack([ones, (regressors - mean) / deviation])
