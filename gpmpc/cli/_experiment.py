@@ -25,7 +25,7 @@ from gpmpc.studies.flight import Experiment
 from gpmpc.systems import System
 
 #: settings that a result does not depend on
-ASIDE = ("launcher", "folder", "live", "tracker")
+ASIDE = ("launcher", "retries", "chunk", "folder", "live", "tracker")
 _GROUPS = (
     "data",
     "trajectory",
@@ -80,9 +80,19 @@ def plain_settings(config: DictConfig, options: Mapping[str, Any]) -> dict[str, 
     settings = plain_data(config)
     path = settings["model"].get("path")
     if path:
-        settings["model"]["sha256"] = sha256(Path(path).read_bytes()).hexdigest()
+        settings["model"]["sha256"] = model_fingerprint(path)
     kept = {key: value for key, value in settings.items() if key not in ASIDE}
-    return kept | {"options": {group: options.get(group) for group in _GROUPS}}
+    return kept | {"options": chosen_options(options)}
+
+
+def model_fingerprint(path: str) -> str:
+    """Returns digits that differ where a model's file does."""
+    return sha256(Path(path).read_bytes()).hexdigest()
+
+
+def chosen_options(options: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns the chosen option of each group that a result depends on."""
+    return {group: options.get(group) for group in _GROUPS}
 
 
 def _merged(config: DictConfig) -> DictConfig:

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
-from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import InstantiationException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -21,8 +20,9 @@ from rich.console import Console
 
 from gpmpc._compiling import report_compilation
 from gpmpc.cli._commands import Result
-from gpmpc.cli._experiment import ASIDE, experiment_of, plain_settings
+from gpmpc.cli._experiment import experiment_of, plain_settings
 from gpmpc.cli._mlflow import log_to_mlflow
+from gpmpc.cli._overrides import choices
 from gpmpc.cli._settings import folder_of, one_line, writing
 from gpmpc.cli._terminal import print_error
 from gpmpc.exceptions import DataError, SettingError, ShapeError
@@ -51,6 +51,18 @@ Warn = Callable[[str], None]
 
 
 @dataclass(frozen=True)
+class RunSettings:
+    """What is flown, and where it is kept."""
+
+    config: DictConfig
+    #: the chosen option by group
+    options: Mapping[str, Any]
+    #: what distinguishes it from other runs of the tree, ``key=value`` each
+    choices: Sequence[str]
+    folder: RunFolder
+
+
+@dataclass(frozen=True)
 class Outcome:
     """How one run ended."""
 
@@ -72,7 +84,14 @@ def run(config: DictConfig) -> Result:
     with console.status("flying"), report_compilation():
         # What a user can get wrong is found before anything is written.
         experiment_of(config)
-        outcome = run_one(config, warn=_warning_printer())
+        words = choices(HydraConfig.get().overrides.task)
+        settings = RunSettings(
+            config=config,
+            options=HydraConfig.get().runtime.choices,
+            choices=words,
+            folder=RunFolder(folder_of(config.folder) / folder_name(words)),
+        )
+        outcome = run_one(settings, warn=_warning_printer())
     if outcome.result is None:
         return _report_failure(outcome)
     return _report_result(outcome, outcome.result, console)
@@ -144,11 +163,11 @@ def _warning_printer() -> Warn:
     return warn
 
 
-def run_one(config: DictConfig, wait: bool = True, warn: Warn | None = None) -> Outcome:
+def run_one(run: RunSettings, wait: bool = True, warn: Warn | None = None) -> Outcome:
     """Flies one run unless its folder is finished; an error is kept in the folder.
 
     Args:
-        config: Its settings.
+        run: What is flown.
         wait: Whether to wait for another process that works on the folder.
         warn: Called before the flight with each line of what may go wrong in it.
 
@@ -156,19 +175,20 @@ def run_one(config: DictConfig, wait: bool = True, warn: Warn | None = None) -> 
         Busy: Another process works on the folder, and ``wait`` is false.
         SettingError: The folder holds a run of other settings, or cannot be written.
     """
-    overrides = choices(HydraConfig.get().overrides.task)
-    folder = RunFolder(folder_of(config.folder) / folder_name(overrides))
+    config = run.config
+    folder = run.folder
     with writing(folder.path), folder.locked(wait):
-        settings = plain_settings(config, HydraConfig.get().runtime.choices)
+        settings = plain_settings(config, run.options)
         if folder.finished and not config.live:
             return Outcome(folder.path, folder.result(settings), skipped=True)
-        about = record(overrides, settings, shlex.join(["gpmpc", "run", *overrides]))
+        command = shlex.join(["gpmpc", "run", *run.choices])
+        about = record(run.choices, settings, command)
         try:
-            folder.begin(OmegaConf.to_yaml(config, resolve=True))
+            text = OmegaConf.to_yaml(config, resolve=True)
+            folder.begin(text)
             # The same sums in the same order, whatever the launcher.
             with one_thread():
-                experiment = experiment_of(config)
-                result = about | _fly(experiment, folder, config, about, warn)
+                result = about | _fly(run, text, command, warn)
             folder.finish(result)
         except Exception as error:
             if _was_interrupted(error):
@@ -203,22 +223,26 @@ def _was_interrupted(error: BaseException | None) -> bool:
 
 
 def _fly(
-    experiment: Experiment,
-    folder: RunFolder,
-    config: DictConfig,
-    about: Mapping[str, Any],
-    warn: Warn | None,
+    run: RunSettings, text: str, command: str, warn: Warn | None
 ) -> dict[str, Any]:
-    """Trains, flies and records; returns the metrics."""
-    if config.recorder != "mcap":
+    """Trains, flies and records; returns the metrics.
+
+    Args:
+        run: What is flown.
+        text: Its settings in YAML, which is put into every recording.
+        command: That flies it.
+        warn: Called before the flight with each line of what may go wrong in it.
+    """
+    experiment = experiment_of(run.config)
+    if run.config.recorder != "mcap":
         return metrics(experiment, run_trial(experiment, warn=warn))
     with ExitStack() as recorders:
         recording = _Recording(
             experiment=experiment,
-            folder=folder.path,
-            settings=OmegaConf.to_yaml(config, resolve=True),
-            command=about["provenance"]["command"],
-            live=config.live,
+            folder=run.folder.path,
+            settings=text,
+            command=command,
+            live=run.config.live,
             recorders=recorders,
         )
         flown = run_trial(experiment, recording.begin, warn)
@@ -298,19 +322,3 @@ class _Recording:
             "angles": " ".join(system.angles),
             "noise_std": " ".join(map(str, noise)),
         }
-
-
-def choices(overrides: Sequence[str]) -> list[str]:
-    """Returns what distinguishes a run, ``key=value`` each in Hydra's own spelling.
-
-    Of a key given twice, the last counts.
-    """
-    by_key = {}
-    for override in OverridesParser.create().parse_overrides(list(overrides)):
-        key = override.get_key_element()
-        if key in ASIDE or key.lstrip("+~").startswith(("hydra.", "hydra/")):
-            continue
-        by_key[key] = key
-        if not override.is_delete():
-            by_key[key] += f"={override.get_value_element_as_str()}"
-    return sorted(by_key.values())

@@ -125,6 +125,14 @@ class RunFolder:
             return None
 
     @property
+    def ended_at(self) -> int | None:
+        """When the last attempt finished or failed [ns]; None where it did not."""
+        try:
+            return (self.path / METRICS).stat().st_mtime_ns
+        except FileNotFoundError:
+            return self.failed_at
+
+    @property
     def begun_at(self) -> int | None:
         """When the last attempt began [ns]; None where none did."""
         try:
@@ -207,6 +215,14 @@ class RunFolder:
             attempts = _mapping(content).get("attempts")
             return attempts if type(attempts) is int else 0
         return 0
+
+    def error(self) -> str:
+        """Returns in a line why the run failed."""
+        try:
+            content = json.loads((self.path / ERROR).read_text(encoding="utf-8"))
+            return " ".join(content["error"].split())
+        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+            return f"{ERROR} cannot be read: {type(error).__name__}: {error}"
 
     def result(self, settings: Mapping[str, Any] | None = None) -> dict[str, Any]:
         """Reads the result of the finished run.
