@@ -37,7 +37,7 @@ from gpmpc.cli._settings import folder_of, write_files
 from gpmpc.cli._terminal import print_error, progress_bar
 from gpmpc.studies._run_folder import (
     PLAN,
-    CellState,
+    RunState,
     RunFolder,
     folder_name,
     of_other_code,
@@ -119,7 +119,7 @@ class Sweep:
         chunking = Chunking(self.config.chunk, launcher.workers)
         outcomes: list[JobOutcome] = []
 
-        def settle(job: Job, state: CellState) -> None:
+        def settle(job: Job, state: RunState) -> None:
             chunking.measure(job)
             outcomes.append(self._outcome(job, state))
 
@@ -138,10 +138,10 @@ class Sweep:
             launcher.close()
         return outcomes
 
-    def _outcome(self, job: Job, state: CellState) -> JobOutcome:
+    def _outcome(self, job: Job, state: RunState) -> JobOutcome:
         """Reads how a run ended; its warning is noted."""
         folder = self.tree / job.folder.path.name
-        if state is CellState.FAILED:
+        if state is RunState.FAILED:
             return JobOutcome(str(folder), job.folder.error())
         warning = warning_of(job.folder.result())
         if warning is not None:
