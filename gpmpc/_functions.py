@@ -14,6 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from gpmpc._calls import check_call
 from gpmpc.exceptions import GpmpcError, SettingError
 
 _LOST = (TypeError, ValueError, RuntimeError, AttributeError, NotImplementedError)
@@ -56,11 +57,16 @@ def call(key: str, function: Callable[..., Any], *arguments: Tensor) -> Any:
             tensor; or its value is one that torch did not follow. Any other error of
             its own is left as it is.
     """
+    if not callable(function):
+        got = type(function).__name__
+        raise SettingError(key, f"must be a function of tensors; got {got}")
     try:
         value = function(*arguments)
     except GpmpcError:
         raise
     except _LOST as error:
+        if isinstance(error, TypeError):
+            check_call(function, key, arguments, {})
         advice = _advice(function, error)
         if advice is None:
             raise

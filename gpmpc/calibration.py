@@ -31,11 +31,13 @@ from torch import Tensor
 
 from gpmpc._angles import angles_of, whole_turns
 from gpmpc._arrays import read_array
+from gpmpc._calls import explains_arguments
 from gpmpc._dynamics import DynamicsModel
 from gpmpc.exceptions import (
     DataError,
     SettingError,
     ShapeError,
+    check_kind,
     check_number,
     check_numbers,
 )
@@ -59,6 +61,7 @@ if TYPE_CHECKING:
 CHUNK = 64
 
 
+@explains_arguments
 @dataclass(frozen=True)
 class Recording:
     """One uninterrupted run at equal time steps.
@@ -172,6 +175,7 @@ class Calibration:
         return pandas.DataFrame(columns)
 
 
+@explains_arguments
 def calibrate(
     model: DynamicsModel,
     recordings: Sequence[Recording] | Recording,
@@ -211,6 +215,10 @@ def calibrate(
             horizon, or a deviation of the sensors is negative.
     """
     recordings = [recordings] if isinstance(recordings, Recording) else list(recordings)
+    for recording in recordings:
+        check_kind("recordings", recording, Recording, "Recording(states, inputs)")
+    if not isinstance(levels, Sequence):
+        raise SettingError("levels", f"must be a list, such as [0.95]; got {levels!r}")
     propagator = best_propagator(model) if propagator is None else propagator
     names = _state_names(names, model, recordings)
     check_number("horizon", horizon, least=1, whole=True)

@@ -8,6 +8,7 @@ process (its constructor's arguments are its ``args``).
 
 import sys
 from collections.abc import Sequence
+from numbers import Integral, Real
 from typing import Any
 
 
@@ -107,11 +108,12 @@ def check_number(
     A truth value is none. It is to be larger than ``above``, ``least`` or more,
     ``whole`` or not; the unit, such as "[kg]", is named in the message.
     """
-    right_type = isinstance(value, int) if whole else isinstance(value, int | float)
+    kind_of_number: Any = Integral if whole else Real
     if (
-        right_type
+        isinstance(value, kind_of_number)
         and not isinstance(value, bool)
-        and abs(value) <= sys.float_info.max  # False of nan, and of larger integers
+        # False of nan, and of larger integers.
+        and abs(_plain(value)) <= sys.float_info.max
         and (above is None or value > above)
         and (least is None or value >= least)
     ):
@@ -127,6 +129,30 @@ def check_number(
     raise SettingError(
         key, f"must be {kind}{limit}{' ' + unit if unit else ''}; got {value!r}"
     )
+
+
+def _plain(value: Any) -> Any:
+    """Returns a scalar of NumPy as Python's number; another one itself."""
+    return value.item() if hasattr(value, "item") else value
+
+
+def check_kind(
+    key: str, value: Any, kind: type | tuple[type, ...], example: str
+) -> None:
+    """Raises ``SettingError`` unless a setting is an object of a kind.
+
+    Args:
+        key: Name of the setting.
+        value: What was got; a class of the kind is none.
+        kind: A class or several.
+        example: What it must be, such as ``"Measurement(...)"``.
+    """
+    if isinstance(value, kind):
+        return
+    got = type(value).__name__
+    if isinstance(value, type):
+        got = f"the class {value.__name__}"
+    raise SettingError(key, f"must be {example}; got {got}")
 
 
 def check_choice(key: str, value: Any, choices: Sequence[str]) -> None:

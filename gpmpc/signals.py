@@ -9,11 +9,13 @@ from dataclasses import dataclass
 from typing import Any
 
 from gpmpc._arrays import plain_names
+from gpmpc._calls import explains_arguments
 from gpmpc.exceptions import SettingError, ShapeError, check_number
 
 SAME_STEP = 1e-3  # relative difference of two time steps that are the same: a log's are
 
 
+@explains_arguments
 @dataclass(frozen=True)
 class Signals:
     """States and inputs by name, in their order, and the time between two samples.

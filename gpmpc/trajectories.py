@@ -16,6 +16,7 @@ import numpy as np
 from scipy.integrate import RK45, OdeSolution
 from scipy.interpolate import PchipInterpolator
 
+from gpmpc._calls import explains_arguments
 from gpmpc.exceptions import SettingError, check_number, check_numbers
 
 
@@ -31,6 +32,7 @@ class Trajectory(Protocol):
         ...
 
 
+@explains_arguments
 @dataclass(frozen=True)
 class Elliptical:
     """The paper's helix: x = a sin(w t), y = b cos(w t), z = z0 + c t.
@@ -65,6 +67,7 @@ class Elliptical:
         return np.stack([along_x, along_y, np.full_like(t, self.climb_rate)], axis=-1)
 
 
+@explains_arguments
 @dataclass(frozen=True)
 class Lorenz:
     """The paper's chaotic path.
@@ -173,6 +176,7 @@ class Lorenz:
         ) * spacing, spacing / self.sampling_time
 
 
+@explains_arguments
 @dataclass(frozen=True)
 class Step:
     """A jump from one position to another."""
@@ -198,6 +202,7 @@ class Step:
         return np.zeros((*np.shape(time), len(self.after)))
 
 
+@explains_arguments
 @dataclass(frozen=True)
 class Hover:
     """One position, held."""
@@ -216,6 +221,7 @@ class Hover:
         return np.zeros((*np.shape(time), len(self.position)))
 
 
+@explains_arguments
 @dataclass(frozen=True)
 class Waypoints:
     """A smooth path through given positions at given times.
@@ -269,6 +275,9 @@ def states_along(trajectory: Trajectory, time: np.ndarray) -> np.ndarray:
 
     They are those of a flight along a trajectory at times (...) [s].
     """
+    if not hasattr(trajectory, "velocity"):
+        rule = "must have positions over time and the method velocity(time)"
+        raise SettingError("trajectory", f"{rule}; got {trajectory!r}")
     positions = trajectory(time)
     return np.stack([positions, trajectory.velocity(time)], axis=-1).reshape(
         *positions.shape[:-1], 6

@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from gpmpc._calls import explains_arguments
 from gpmpc.datasets._flights import check_data
 from gpmpc.exceptions import (
     DataError,
@@ -19,9 +20,11 @@ from gpmpc.exceptions import (
 )
 from gpmpc.gp import Transitions
 from gpmpc.systems import System, step
+from gpmpc.systems._system import check_system
 from gpmpc.trajectories import Trajectory
 
 
+@explains_arguments
 @dataclass(frozen=True)
 class RandomData:
     """Transitions under inputs drawn uniformly within the system's limits.
@@ -59,6 +62,7 @@ class RandomData:
 
         It needs limits of its inputs, a region to start from, and noise of its size.
         """
+        check_system("system", system)
         for name, *limits in zip(
             system.input_names, system.input_lower, system.input_upper, strict=True
         ):

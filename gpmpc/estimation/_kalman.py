@@ -20,6 +20,7 @@ from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import dataclass
 from functools import partial
+from numbers import Integral
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -28,6 +29,7 @@ from torch import Tensor
 
 from gpmpc._angles import state_difference
 from gpmpc._arrays import read_array
+from gpmpc._calls import explains_arguments
 from gpmpc._dynamics import (
     Array,
     DynamicsModel,
@@ -44,7 +46,13 @@ from gpmpc.estimation._conditioning import (
     squared,
     unexplained,
 )
-from gpmpc.exceptions import SettingError, ShapeError, check_number, check_numbers
+from gpmpc.exceptions import (
+    SettingError,
+    ShapeError,
+    check_kind,
+    check_number,
+    check_numbers,
+)
 from gpmpc.gaussian import Gaussian, check_tensors
 from gpmpc.models._nominal import linearize_function
 from gpmpc.propagation import Linearization, Propagator, Unscented
@@ -52,6 +60,7 @@ from gpmpc.propagation._propagator import checked_arguments
 from gpmpc.signals import signals_of
 
 
+@explains_arguments
 @dataclass(frozen=True)
 class Measurement(TensorModel):
     """A measurement model that is a function of the state.
@@ -110,7 +119,10 @@ class Measurement(TensorModel):
         Raises:
             SettingError: A state is out of range, or a standard deviation is negative.
         """
-        if any(not 0 <= i < state_dim for i in states) or not len(states):
+        are_indices = all(
+            isinstance(i, Integral) and 0 <= i < state_dim for i in states
+        )
+        if not (are_indices and len(states)):
             raise SettingError(
                 "states",
                 f"must be indices from 0 to {state_dim - 1}; got {list(states)}",
@@ -205,6 +217,7 @@ def _without_noise(observer: Propagator) -> Propagator:
     return quiet
 
 
+@explains_arguments
 class KalmanFilter:
     """Estimates the state of a model from measurements.
 
@@ -229,6 +242,12 @@ class KalmanFilter:
         observer: Propagator | None = None,
     ):
         propagator = Linearization() if propagator is None else propagator
+        if isinstance(model, type) or not hasattr(model, "predict"):
+            got = type(model).__name__
+            raise SettingError(
+                "model", f"must be a DynamicsModel, such as GPPosterior; got {got}"
+            )
+        check_kind("measurement", measurement, Measurement, "Measurement(...)")
         if measurement.state_dim != model.state_dim:
             got = f"{measurement.state_dim} and {model.state_dim}"
             raise SettingError(
@@ -261,6 +280,7 @@ class KalmanFilter:
 
     def predict(self, belief: Gaussian, input: Any) -> Gaussian:
         """Moves a belief (*batch, n) on by a step with an applied input (*batch, m)."""
+        check_kind("belief", belief, Gaussian, "a Gaussian")
         belief = belief.in_order(self._names.state_names)
         acting = _like(belief, "input", input, self._names.input_names)
         return self.propagator(self.model, belief, acting)
@@ -273,6 +293,7 @@ class KalmanFilter:
         Raises:
             ShapeError: y has another number of entries.
         """
+        check_kind("belief", belief, Gaussian, "a Gaussian")
         belief = belief.in_order(self._names.state_names)
         y = _like(belief, "a measurement", measured, self._measured_names)
         R = self.measurement.noise_covariance

@@ -20,6 +20,7 @@ import torch
 from scipy.optimize import minimize
 from torch import Tensor
 
+from gpmpc._calls import explains_arguments
 from gpmpc.exceptions import SettingError, TrainingError, check_choice, check_number
 from gpmpc.gp._data_checks import (
     RESOLUTION,
@@ -60,6 +61,7 @@ _TOLERANCE = 1e-7  # relative decrease of the objective at which L-BFGS stops
 _SIGNAL_TO_NOISE = 1e4
 
 
+@explains_arguments
 @dataclass(frozen=True)
 class SparseTrainer:
     """Fits one sparse SE-ARD GP per output, over inducing points that all share.

@@ -77,6 +77,8 @@ def save_posterior(
             not be read again.
     """
     path = new_file(path)
+    if metadata is not None and not isinstance(metadata, Mapping):
+        raise SettingError("metadata", f"must be a mapping; got {metadata!r}")
     header, tensors = posterior_parts(path, posterior)
     write_model(path, "GPPosterior", header, tensors, metadata)
 

@@ -14,6 +14,7 @@ import torch
 from threadpoolctl import threadpool_limits
 from torch import Tensor
 
+from gpmpc._calls import explains_arguments
 from gpmpc.exceptions import (
     TrainingError,
     UnsupportedModel,
@@ -84,6 +85,7 @@ class Training:
         return replace(self, posterior=replace(self.posterior, signals=signals))
 
 
+@explains_arguments
 @dataclass(frozen=True)
 class Trainer:
     """Fits one SE-ARD GP per output to observed transitions.
@@ -195,6 +197,7 @@ class Trainer:
         )
         return training.with_signals(posterior.signals)
 
+    @explains_arguments
     def fit(
         self,
         features: Tensor,
@@ -363,6 +366,7 @@ class Trainer:
             )
 
 
+@explains_arguments
 def train(transitions: Transitions, seed: int = 0, **settings: Any) -> Training:
     """Fits one GP per output: ``Trainer(**settings)(transitions, seed)``."""
     return Trainer(**settings)(transitions, seed)

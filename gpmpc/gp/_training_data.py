@@ -205,6 +205,15 @@ def _warn_of_constants(data: TrainingData, resolution: float) -> None:
             deviations or "what is found",
         )
         return
+    if size < data.features.shape[1] + 2:
+        _log.warning(
+            "training: %d rows for %d columns of states and inputs: fewer than a plane "
+            "needs (%d), so that slopes and noise cannot be told apart. Predictions "
+            "stay near the prior; record more",
+            size,
+            data.features.shape[1],
+            data.features.shape[1] + 2,
+        )
     if features_at_rest.any():
         _log.warning(
             "training: never moves by more than %.1g (resolution) in the %d rows: %s. "

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from gpmpc._angles import state_difference
 from gpmpc._arrays import labels_of, names_of, order_of, read_array
+from gpmpc._calls import explains_arguments
 from gpmpc._files import existing_file, new_file, write_whole
 from gpmpc.exceptions import (
     DataError,
@@ -35,6 +36,7 @@ _NAMES = ("states", "inputs", "next_states")
 _EXPECTED = "a file of transitions"
 
 
+@explains_arguments
 @dataclass(frozen=True)
 class Transitions:
     """N observed transitions of a system with n states and m inputs, as float64.

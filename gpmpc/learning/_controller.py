@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from gpmpc._calls import explains_arguments
 from gpmpc._dynamics import Array, to_array
 from gpmpc.exceptions import DataError, SettingError
 from gpmpc.gaussian import Gaussian
@@ -19,6 +20,7 @@ from gpmpc.mpc.gp_mpc import GPMPC
 from gpmpc.status import Status
 
 
+@explains_arguments
 class LearningController:
     """Controls by the model of a controller and by what the flight says of its change.
 

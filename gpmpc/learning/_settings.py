@@ -3,10 +3,12 @@
 from dataclasses import dataclass
 from typing import Literal
 
+from gpmpc._calls import explains_arguments
 from gpmpc.exceptions import check_number
 from gpmpc.gp import SlidingWindow
 
 
+@explains_arguments
 @dataclass(frozen=True)
 class OnlineLearning:
     """How a change of the plant is learned while flying.

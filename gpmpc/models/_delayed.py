@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from gpmpc._arrays import read_array
+from gpmpc._calls import explains_arguments
 from gpmpc._dynamics import DynamicsModel, check_next_states
 from gpmpc.exceptions import ShapeError, check_number
 from gpmpc.gaussian import Gaussian
@@ -17,6 +18,7 @@ from gpmpc.models._wrapper import LinearPart, LinearWrapper
 from gpmpc.signals import signals_of
 
 
+@explains_arguments
 @dataclass(frozen=True)
 class DelayedModel(LinearWrapper):
     """A model whose input acts late, by a whole or a fractional number of steps.

@@ -5,7 +5,9 @@ from contextlib import suppress
 from functools import partial
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from gpmpc._angles import state_difference, whole_turns
@@ -19,6 +21,7 @@ from gpmpc.models._features import Features
 from gpmpc.models._nominal import linearize_function
 
 Nominal = Callable[[Tensor, Tensor], Tensor]
+Array = NDArray[np.float64]
 Effect = Tensor | Callable[[Tensor], Tensor]
 
 
@@ -171,6 +174,48 @@ def _output_names(
     return [f"output {a + 1} of the residual" for a in range(outputs)]
 
 
+def _check_slopes(
+    key: str, function: Callable[..., Tensor], x: Array, u: Array, slopes: Array
+) -> None:
+    """Raises ``SettingError`` where derivatives are not those of the values.
+
+    A part that torch could not follow (``.detach()``, NumPy, ``torch.tensor``) is
+    missing in them. Central differences say what they should be; an entry counts where
+    it differs at every point, so that a kink at one of them does not.
+
+    Args:
+        key: What the function is, for the message.
+        function: f(x, u) (K, n).
+        x: (K, n).
+        u: (K, m).
+        slopes: Its derivatives by x and u (K, n, n + m).
+    """
+    points = np.concatenate([x, u], axis=1)
+    n = x.shape[1]
+    for column in range(points.shape[1]):
+        width = 1e-5 * (1.0 + np.abs(points[:, column]))
+        values = []
+        for sign in (1.0, -1.0):
+            moved = points.copy()
+            moved[:, column] += sign * width
+            tensors = torch.as_tensor(moved)
+            with torch.no_grad():
+                values.append(to_array(function(tensors[:, :n], tensors[:, n:])))
+        difference = (values[0] - values[1]) / (2 * width[:, None])
+        excess = np.abs(difference - slopes[:, :, column])
+        is_wrong = (excess > 1e-3 * (1.0 + np.abs(difference))).all(axis=0)
+        if is_wrong.any():
+            output = int(np.flatnonzero(is_wrong)[0]) + 1
+            raise SettingError(
+                key,
+                "must be followed by torch as a whole: the derivative of its entry "
+                f"{output} by column {column + 1} of (x, u) is "
+                f"{difference[0, output - 1]:.3g}, and torch finds "
+                f"{slopes[0, output - 1, column]:.3g} (a part is lost by .detach(), "
+                "numpy or torch.tensor)",
+            )
+
+
 def check_derivatives(nominal: Nominal, B: Effect, transitions: Transitions) -> None:
     """Raises ``SettingError`` where torch cannot follow a function.
 
@@ -182,7 +227,8 @@ def check_derivatives(nominal: Nominal, B: Effect, transitions: Transitions) -> 
     with suppress(ShapeError):
         if not hasattr(nominal, "linearize"):
             checked = partial(nominal_next_state, nominal, angles=())
-            linearize_function(checked, transitions.states, x, u)
+            _, A, B_u = linearize_function(checked, transitions.states, x, u)
+            _check_slopes("nominal", checked, x, u, np.concatenate([A, B_u], axis=2))
         if callable(B) and not hasattr(B, "linearize"):
             checked_effect = partial(effect_matrix, B)
             linearize_function(checked_effect, transitions.states, x)

@@ -14,6 +14,7 @@ import numpy as np
 
 from gpmpc._angles import full_turns
 from gpmpc._arrays import names_of, read_array, sorted_columns
+from gpmpc._calls import explains_arguments
 from gpmpc._compiled import compiled
 from gpmpc.exceptions import (
     DataError,
@@ -39,6 +40,7 @@ KEPT = 1e-5  # by how much a bound may be missed that counts as kept, in its uni
 _FLOAT64 = np.dtype(np.float64)
 
 
+@explains_arguments
 @dataclass(frozen=True)
 class Reference:
     """A path for a controller to follow over its horizon H, from the current time on.
@@ -339,6 +341,9 @@ class Request(NamedTuple):
             DataError: Likewise.
         """
         check_arguments(belief, reference)
+        if not (previous is None or isinstance(previous, Decision)):
+            rule = "must be the last Decision, or None at the first step"
+            raise SettingError("previous", f"{rule}; got {previous!r}")
         if belief.names:
             belief = belief.in_order(signals.state_names)
         if reference.signals is not UNKNOWN:

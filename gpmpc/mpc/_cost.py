@@ -6,7 +6,7 @@ Z = [J, e]' W [J, e] and e = y(z') - J z' - c.
 """
 
 import inspect
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, Literal, NamedTuple
@@ -15,6 +15,7 @@ import numpy as np
 import torch
 
 from gpmpc._arrays import read_array
+from gpmpc._calls import explains_arguments
 from gpmpc._functions import call
 from gpmpc.exceptions import DataError, SettingError, ShapeError, check_choice
 from gpmpc.models._casadi_function import CasadiFunction
@@ -28,6 +29,7 @@ PENALIZED = ("inputs", "deviations", "increments")
 _WEIGHT_RULE = "must be the diagonal of a weight or a square matrix"
 
 
+@explains_arguments
 @dataclass(frozen=True)
 class Tracking:
     """Costs of the distance to a reference and of the inputs.
@@ -67,10 +69,7 @@ class Tracking:
             rule = f"must be a weight of {n} states"
             raise SettingError("terminal", f"{rule}; got {len(terminal)}")
         check_choice("penalized", self.penalized, PENALIZED)
-        angles = tuple(self.angles or ())
-        if not all(isinstance(index, int) and 0 <= index < n for index in angles):
-            rule = f"must be indices of {n} states"
-            raise SettingError("angles", f"{rule}; got {self.angles!r}")
+        angles = _read_indices("angles", self.angles, n)
         object.__setattr__(self, "Q", Q)
         object.__setattr__(self, "R", R)
         object.__setattr__(self, "terminal", terminal)
@@ -91,6 +90,7 @@ class Tracking:
         return np.concatenate([Q[:-1], self.terminal[None]]), R
 
 
+@explains_arguments
 @dataclass(frozen=True)
 class LeastSquares:
     """Costs of outputs y(x, u, p): weighed squares of the distance to references.
@@ -251,6 +251,9 @@ class _CheckedFunction:
             rule = f"{self._name} must give a tensor ({rows}, {self._count})"
             got = tuple(value.shape) if is_tensor else type(value).__name__
             raise ShapeError(f"{rule}; got {got}")
+        if not value.is_floating_point():
+            rule = f"{self._name} must give real numbers, below zero where it is kept"
+            raise ShapeError(f"{rule}; got {value.dtype}")
         return value.unsqueeze(-1) if value.dim() == 1 else value
 
 
@@ -287,6 +290,23 @@ def _count_arguments(function: Any) -> tuple[int, int]:
     takes_any = any(p.kind is p.VAR_POSITIONAL for p in parameters)
     most = 3 if takes_any else len(positional)
     return sum(p.default is p.empty for p in positional), most
+
+
+def _read_indices(key: str, indices: Any, n: int) -> tuple[int, ...]:
+    """Returns indices of n states, none for None.
+
+    Raises:
+        SettingError: They are no list of whole numbers from 0 to n - 1.
+    """
+    if indices is None:
+        return ()
+    is_list = isinstance(indices, Iterable) and not isinstance(indices, str)
+    read: tuple[Any, ...] = tuple(indices) if is_list else ()
+    are_whole = all(isinstance(one, int | np.integer) for one in read)
+    if not (is_list and are_whole and all(0 <= one < n for one in read)):
+        rule = f"must be a list of indices of {n} states"
+        raise SettingError(key, f"{rule}; got {indices!r}")
+    return tuple(int(one) for one in read)
 
 
 def _weight(key: str, value: Any) -> Array:

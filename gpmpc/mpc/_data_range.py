@@ -10,6 +10,7 @@ import numpy as np
 
 from gpmpc._angles import TURN
 from gpmpc._dynamics import DynamicsModel, to_array
+from gpmpc.exceptions import ShapeError
 from gpmpc.gp import GPPosterior
 from gpmpc.models import ResidualModel
 from gpmpc.mpc._controller import read_reference
@@ -67,6 +68,10 @@ def beyond_data(model: DynamicsModel, reference: Any) -> list[BeyondData]:
     signals = signals_of(model)
     states = np.atleast_2d(read_reference(reference).in_order(signals).states)
     states = np.asarray(states, dtype=float)
+    if states.shape[-1] != model.state_dim:
+        raise ShapeError(
+            f"reference must have {model.state_dim} states; got {states.shape[-1]}"
+        )
     beyond = []
     for column in _columns(model):
         values = states[:, column.state]

@@ -33,6 +33,7 @@ import numpy as np
 import torch
 
 from gpmpc._angles import angles_of, full_turns
+from gpmpc._calls import explains_arguments
 from gpmpc._compiled import compiled
 from gpmpc._dynamics import (
     DynamicsModel,
@@ -75,6 +76,7 @@ FORMS = ("trajectory", "velocity")
 _Linearize = Callable[[Array, Array, Array], tuple[Array, Array, Array, Array]]
 
 
+@explains_arguments
 @dataclass(frozen=True)
 class PredictionSettings:
     """How beliefs are predicted.

@@ -25,6 +25,7 @@ from scipy.interpolate import krogh_interpolate
 
 from gpmpc._angles import full_turns
 from gpmpc._arrays import read_array
+from gpmpc._calls import explains_arguments
 from gpmpc._dynamics import to_array
 from gpmpc.exceptions import (
     SettingError,
@@ -39,6 +40,7 @@ from gpmpc.mpc._controller import (
     Decision,
     Reference,
     Timing,
+    check_method,
     one_step_on,
     read_reference,
 )
@@ -161,6 +163,7 @@ def decide_many(
     return commands
 
 
+@explains_arguments
 class ControlLoop:
     """Steers a plant that is not ours, step by step.
 
@@ -188,6 +191,7 @@ class ControlLoop:
 
     def __init__(self, controller: Controller, on_failure: OnFailure = "previous_plan"):
         check_policy(on_failure)
+        check_method("controller", controller, "control", "GPMPC(...)")
         self.controller = controller
         self.on_failure: OnFailure = on_failure
         self.last: Command | None = None
@@ -305,6 +309,7 @@ class ControlLoop:
         angles = () if cost is None else cost.angles
         return error - full_turns(error, angles)
 
+    @explains_arguments
     def warm_up(self, state: Any, reference: Any, parameters: Any = None) -> None:
         """Decides twice and forgets it: everything is then compiled beforehand."""
         rehearsal = ControlLoop(self.controller, "previous_plan")

@@ -21,7 +21,8 @@ import numpy as np
 import torch
 
 from gpmpc._angles import full_turns
-from gpmpc.exceptions import SettingError, check_number
+from gpmpc._calls import explains_arguments
+from gpmpc.exceptions import SettingError, check_kind, check_number
 from gpmpc.gaussian import Gaussian
 from gpmpc.mpc._controller import (
     Array,
@@ -230,6 +231,7 @@ class _FlightSearch:
         return foresight.with_gains(best)
 
 
+@explains_arguments
 class ManyStarts:
     """Follows what a search found, and searches where that does not lead to the goal.
 
@@ -276,7 +278,8 @@ class ManyStarts:
     ):
         self.controller = controller
         self.planner = controller if planner is None else planner
-        for one in (self.controller, self.planner):
+        for key, one in (("controller", controller), ("planner", self.planner)):
+            check_kind(key, one, GPMPC, "GPMPC(...)")
             if one.prediction.settings.is_held:
                 raise SettingError(
                     "controller",

@@ -34,6 +34,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from gpmpc._calls import explains_arguments
 from gpmpc._dynamics import DynamicsModel, linearize
 from gpmpc.exceptions import SettingError, check_number
 from gpmpc.gaussian import Gaussian
@@ -109,6 +110,7 @@ class Stopwatch:
         )
 
 
+@explains_arguments
 class GPMPC:
     """GP-MPC by quadratic programs.
 
@@ -380,6 +382,7 @@ class GPMPC:
         return stability(self.prediction, reference, plant, ahead, parameters)
 
 
+@explains_arguments
 class NonlinearGPMPC(GPMPC):
     """Nonlinear GP-MPC (Cao, Lai and Alam, 2017, eq. (22)), iterated to convergence.
 

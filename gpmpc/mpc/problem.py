@@ -28,6 +28,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
+from gpmpc._calls import explains_arguments
 from gpmpc.exceptions import SettingError, check_number
 from gpmpc.mpc._cost import (
     Expansion,
@@ -117,6 +118,7 @@ class Constraint:
         return NormalDist().inv_cdf(1.0 - risk / (sides if self.joint else 1))
 
 
+@explains_arguments
 @dataclass(frozen=True)
 class Box(Constraint):
     """Bounds lower <= x <= upper of states, inputs or increments.
@@ -201,6 +203,7 @@ class Box(Constraint):
         )
 
 
+@explains_arguments
 @dataclass(frozen=True)
 class Halfspaces(Constraint):
     """Linear constraints F x <= f of the states.
@@ -237,6 +240,7 @@ class Halfspaces(Constraint):
         return ConstraintSides(self.F, np.full_like(upper, -math.inf), upper)
 
 
+@explains_arguments
 @dataclass(frozen=True)
 class Inequality(Constraint):
     """Smooth constraints h(x_i, u_{i-1}, p_i) <= 0, such as obstacles.
@@ -273,6 +277,7 @@ class Inequality(Constraint):
         return expand_function("h", self.h, self.count, states, inputs, parameters)
 
 
+@explains_arguments
 @dataclass(frozen=True)
 class Problem:
     """A cost, bounds of the inputs, and constraints of the states.

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from gpmpc._calls import explains_arguments
 from gpmpc._dynamics import predict_with_jacobian
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp._backend import host_arrays
@@ -88,6 +89,7 @@ def _is_gp_alone(form: AffineForm) -> bool:
     return not form.angles and all(part is None for part in further)
 
 
+@explains_arguments
 class Linearization(NoisyPropagator):
     """First order, with the model's noise unless ``process_noise=False``."""
 

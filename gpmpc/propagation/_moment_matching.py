@@ -20,6 +20,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from gpmpc._calls import explains_arguments
 from gpmpc.exceptions import UnsupportedModel
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp._backend import host_arrays
@@ -41,6 +42,7 @@ from gpmpc.propagation._propagator import (
 )
 
 
+@explains_arguments
 class MomentMatching(NoisyPropagator):
     """Exact moment matching through GPs, alone or around an affine nominal model.
 

@@ -24,6 +24,7 @@ import torch
 from torch import Tensor
 
 from gpmpc._angles import angles_of, whole_turns
+from gpmpc._calls import explains_arguments
 from gpmpc.exceptions import SettingError, check_number
 from gpmpc.gaussian import Gaussian, square_root, square_root_differential
 from gpmpc.propagation._linearization import (
@@ -66,6 +67,7 @@ class _ByParameters(NamedTuple):
     input: Tensor  # (..., m)
 
 
+@explains_arguments
 class Unscented(NoisyPropagator):
     """The unscented transform.
 
@@ -237,6 +239,7 @@ def _from_root_to_covariance(
     )
 
 
+@explains_arguments
 class MonteCarlo(NoisyPropagator):
     """Sampling; the same seed gives the same samples at every call.
 

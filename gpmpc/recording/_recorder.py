@@ -20,8 +20,9 @@ from foxglove.channels import LogChannel
 from foxglove.mcap import MCAPWriteOptions
 from foxglove.messages import Log, LogLevel, Timestamp
 
+from gpmpc._calls import explains_arguments
 from gpmpc._provenance import flattened, provenance
-from gpmpc.exceptions import RecordingError, check_number
+from gpmpc.exceptions import RecordingError, check_kind, check_number
 from gpmpc.recording._encoding import Encoder, StepCopy
 from gpmpc.recording._frames import LARGEST, topics_of_chunk
 from gpmpc.recording._scene import WORLD, Scene
@@ -39,6 +40,7 @@ _LEAST = 8 * 1024  # numbers [bytes] for which a chunk is worth its own entries
 _PORT = 8765  # of the live view, if it is free
 
 
+@explains_arguments
 class McapRecorder:
     """Writes the steps of one run to an MCAP file; a context manager.
 
@@ -70,6 +72,7 @@ class McapRecorder:
         live: bool = False,
     ):
         check_number("chunk_size", chunk_size, least=1, whole=True, unit="[bytes]")
+        check_kind("system", system, RecordedSystem, "RecordedSystem.of(system)")
         described = _describe(system, metadata or {})
 
         self.path = Path(path)

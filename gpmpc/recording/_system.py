@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from gpmpc._calls import explains_arguments
 from gpmpc.exceptions import SettingError, ShapeError, check_number
 from gpmpc.recording._schema import check_names, message_fields
 
@@ -16,6 +17,7 @@ POSITION = ("x", "y", "z")
 ATTITUDE = ("roll", "pitch", "yaw")
 
 
+@explains_arguments
 @dataclass(frozen=True)
 class RecordedSystem:
     """A description of the system whose steps are recorded."""
@@ -55,6 +57,9 @@ class RecordedSystem:
             system: The plant.
             input_bounds: (2, m); the system's limits by default.
         """
+        if not hasattr(system, "input_lower"):
+            rule = "must be a System(dynamics, time_step)"
+            raise SettingError("system", f"{rule}; got {type(system).__name__}")
         if input_bounds is None:
             input_bounds = [system.input_lower, system.input_upper]
         return cls(

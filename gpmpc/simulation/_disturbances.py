@@ -14,6 +14,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from gpmpc._calls import explains_arguments
 from gpmpc.exceptions import SettingError, ShapeError, UnsupportedModel, check_number
 from gpmpc.systems import System
 
@@ -49,6 +50,7 @@ class _Window(Disturbance):
         return self.start <= time < self.stop
 
 
+@explains_arguments
 @dataclass(frozen=True)
 class Gust(_Window):
     """A constant push on single states over a time window.
@@ -90,6 +92,7 @@ class Gust(_Window):
         return _pushed(plant, tuple(rates))
 
 
+@explains_arguments
 @dataclass(frozen=True)
 class Replaced(_Window):
     """Another plant over a time window: another mass, a broken arm."""
@@ -112,6 +115,7 @@ class Replaced(_Window):
         return self.plant if self.acts(time) else plant
 
 
+@explains_arguments
 @dataclass(frozen=True)
 class Dropout(_Window):
     """Nothing is measured over a time window: entries of the state are NaN."""

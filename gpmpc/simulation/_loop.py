@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from gpmpc._calls import explains_arguments
 from gpmpc.exceptions import (
     Diverged,
     GpmpcError,
@@ -36,6 +37,7 @@ from gpmpc.systems import System
 Array = np.ndarray
 
 
+@explains_arguments
 def closed_loop(
     system: System | ModelLoop,
     controller: Controller,
@@ -80,6 +82,10 @@ def closed_loop(
             nothing to fall back on.
         Diverged: The system left the finite numbers; ``flown`` holds the steps before.
     """
+    if not (on_step is None or callable(on_step)):
+        raise SettingError(
+            "on_step", f"must be a function of a Step, or None; got {on_step!r}"
+        )
     scenario = Scenario(
         system=system,
         controller=controller,
@@ -110,6 +116,7 @@ class Trial:
     error: str | None  # kind and text of its error; None where it did not fail
 
 
+@explains_arguments
 def closed_loops(
     plant: System,
     controller: Controller,

@@ -8,7 +8,7 @@ import numpy as np
 
 from gpmpc.exceptions import SettingError, ShapeError, check_number
 from gpmpc.mpc import Controller, FlightJudge, Reference
-from gpmpc.mpc._controller import read_reference
+from gpmpc.mpc._controller import check_method, read_reference
 from gpmpc.mpc._policy import OnFailure, check_policy
 from gpmpc.signals import Signals, signals_of
 from gpmpc.simulation._disturbances import Disturbance
@@ -52,6 +52,7 @@ class Scenario:
 
     def __post_init__(self) -> None:
         check_policy(self.on_failure)
+        check_method("controller", self.controller, "control", "GPMPC(...)")
         check_belongs(self.controller, self.signals, self.name)
         reference = read_references(
             self.references, self.steps, self.controller.horizon, self.signals

@@ -15,6 +15,7 @@ import torch
 
 from gpmpc._angles import angles_of
 from gpmpc._arrays import read_array
+from gpmpc._calls import explains_arguments
 from gpmpc._dynamics import DynamicsModel, to_array
 from gpmpc.exceptions import (
     Diverged,
@@ -34,6 +35,7 @@ Array = np.ndarray
 _INITIAL_DEVIATION = 0.1  # of a model loop that starts from a mean
 
 
+@explains_arguments
 @dataclass(frozen=True)
 class ModelLoop:
     """A learned model rolled on itself.
@@ -61,6 +63,7 @@ class ModelLoop:
         return replace(signals_of(self.model), time_step=self.time_step)
 
 
+@explains_arguments
 @dataclass(frozen=True)
 class Noise:
     """White Gaussian noise, as standard deviations.

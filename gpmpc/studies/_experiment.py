@@ -7,6 +7,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from gpmpc._calls import explains_arguments
 from gpmpc._dynamics import DynamicsModel
 from gpmpc.datasets import DataSource
 from gpmpc.exceptions import SettingError, ShapeError, check_number
@@ -25,6 +26,7 @@ from gpmpc.systems import System
 from gpmpc.trajectories import Trajectory
 
 
+@explains_arguments
 @dataclass(frozen=True)
 class Experiment:
     """One flight of one system, with everything that it depends on.
@@ -81,6 +83,7 @@ class Experiment:
     model: DynamicsModel | None = None
 
     def __post_init__(self) -> None:
+        self._check_functions()
         self._check_numbers()
         self._check_loop()
         self._check_plant()
@@ -177,6 +180,20 @@ class Experiment:
     def _dimensions(self) -> tuple[int, int]:
         """Numbers of states and of inputs."""
         return len(self.system.state_names), len(self.system.input_names)
+
+    def _check_functions(self) -> None:
+        """Raises unless training and controller are made when the data are there."""
+        if not callable(self.train):
+            raise SettingError(
+                "train", f"must be a function, such as Trainer(); got {self.train!r}"
+            )
+        if not callable(self.controller):
+            raise SettingError(
+                "controller",
+                "must be a function from a model to a controller, such as "
+                "functools.partial(GPMPC, propagator=..., problem=..., ...); "
+                f"got {type(self.controller).__name__}",
+            )
 
     def _check_numbers(self) -> None:
         if self.size is not None:

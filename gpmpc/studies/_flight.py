@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from gpmpc._dynamics import DynamicsModel
-from gpmpc.exceptions import Diverged
+from gpmpc.exceptions import Diverged, check_kind
 from gpmpc.gp import Training
 from gpmpc.learning import EpisodicLearning, LearningController, OnlineLearning
 from gpmpc.metrics import tracking_error
@@ -67,6 +67,7 @@ def run_trial(
             nothing to fall back on.
         Diverged: The system left the finite numbers in its first step.
     """
+    check_kind("experiment", experiment, Experiment, "Experiment(...)")
     training = None
     model = experiment.model
     episodes: list[Flown] = []

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from gpmpc._calls import explains_arguments
 from gpmpc.exceptions import check_choice, check_number, check_numbers
 from gpmpc.systems._system import GRAVITY, System, cos, sin
 from gpmpc.trajectories import Trajectory
@@ -38,6 +39,7 @@ _FOLLOWS_POSITIONS: dict[str, Any] = {
 }
 
 
+@explains_arguments
 @dataclass(frozen=True)
 class Translational:
     """Position and velocity, driven by thrust and thrust direction.
@@ -85,6 +87,7 @@ def _vertical_direction(ux: Any, uy: Any) -> Any:
     return ((squared + magnitude) / 2 + 1e-12) ** 0.5
 
 
+@explains_arguments
 @dataclass(frozen=True)
 class Rotational:
     """Attitude and body rates, driven by the moments' forces.
@@ -126,6 +129,7 @@ class Rotational:
         return [p, p_dot, q, q_dot, r, r_dot]
 
 
+@explains_arguments
 @dataclass(frozen=True)
 class Coupled:
     """Position, velocity, attitude and body rates, driven by thrust and moments.

@@ -9,6 +9,7 @@ from typing import Any, cast
 import numpy as np
 
 from gpmpc._arrays import labels_of, read_array
+from gpmpc._calls import explains_arguments
 from gpmpc._functions import call_dynamics, dynamics_advice
 from gpmpc.exceptions import (
     GpmpcError,
@@ -25,6 +26,7 @@ GRAVITY = 9.81  # [m/s^2]
 UNKNOWN = "?"  # the unit of a state or an input that has none given
 
 
+@explains_arguments
 @dataclass(frozen=True, eq=False)
 class System:
     """A discrete-time system, with all that reports, recordings and figures say of it.
@@ -111,6 +113,7 @@ class System:
 
     def _complete_units(self, names: Sequence[str]) -> None:
         """Gives every state and input a unit."""
+        _check_mapping("units", self.units)
         unknown = sorted({*self.units} - {*names})
         if unknown:
             raise SettingError(
@@ -124,6 +127,13 @@ class System:
         if not tracked:
             unit = self.units[states[0]]
             tracked = [name for name in states if self.units[name] == unit]
+        for key in ("angles", "tracked"):
+            if isinstance(getattr(self, key), str):
+                raise SettingError(
+                    key, f"must be a list of names; got {getattr(self, key)!r}"
+                )
+        _check_mapping("rates", self.rates)
+        _check_mapping("pose", self.pose)
         self._set("angles", tuple(self.angles))
         self._set("tracked", tuple(tracked))
         for key, names in (
@@ -172,14 +182,13 @@ class System:
                 "region",
                 f"must be the smallest and the largest states; got {self.region!r}",
             )
-        smallest, largest = self.region
-        self._set(
-            "region",
-            (
-                _floats("region", smallest, states),
-                _floats("region", largest, states),
-            ),
-        )
+        smallest = _floats("region", self.region[0], states)
+        largest = _floats("region", self.region[1], states)
+        if any(low > high for low, high in zip(smallest, largest, strict=True)):
+            raise SettingError(
+                "region", f"must not cross; got {smallest} and {largest}"
+            )
+        self._set("region", (smallest, largest))
 
     def _set_floats(self, key: str, names: Sequence[str], default: Any) -> None:
         """Replaces a list of numbers, one a name, by a tuple; None by the default."""
@@ -337,6 +346,7 @@ def step(plant: System, state: Array, input: Array) -> Array:
         ShapeError: State or input are of another length.
         DataError: They are no real numbers, or have other names than the plant's.
     """
+    check_system("plant", plant)
     state_names = plant.dynamics.state_names
     input_names = plant.dynamics.input_names
     state = read_array("state", state, state_names)
@@ -358,7 +368,21 @@ def step_many(plant: System, states: Array, inputs: Array) -> Array:
         plant: What is stepped.
         states: (T, n).
         inputs: (T, m).
+
+    Raises:
+        ShapeError: States or inputs are no table, or have another size.
+        DataError: They are no real numbers.
     """
+    check_system("plant", plant)
+    n = len(plant.state_names)
+    m = len(plant.input_names)
+    states = read_array("states", states, plant.state_names)
+    inputs = read_array("inputs", inputs, plant.input_names)
+    if states.shape != (len(inputs), n) or inputs.shape != (len(states), m):
+        raise ShapeError(
+            f"states and inputs must be (T, {n}) and (T, {m}); "
+            f"got {states.shape} and {inputs.shape}"
+        )
     entries = call_dynamics(plant.successor, states.T, inputs.T)
     columns = [
         np.broadcast_to(np.asarray(entry, dtype=float), len(states))
@@ -380,6 +404,19 @@ def cos(angle: Any) -> Any:
 def exp(value: Any) -> Any:
     """Exponential of a float, an array, or whatever knows its own (CasADi, torch)."""
     return value.exp() if hasattr(value, "exp") else np.exp(value)
+
+
+def check_system(key: str, value: Any) -> None:
+    """Raises ``SettingError`` unless a value is a plant with dynamics."""
+    if not hasattr(value, "dynamics"):
+        rule = "must be a plant, such as System(dynamics, time_step)"
+        raise SettingError(key, f"{rule}; got {type(value).__name__}")
+
+
+def _check_mapping(key: str, value: Any) -> None:
+    """Raises ``SettingError`` unless a value maps names."""
+    if not isinstance(value, Mapping):
+        raise SettingError(key, f"must map names, as {{name: ...}}; got {value!r}")
 
 
 def _names(dynamics: Any, key: str) -> tuple[str, ...]:

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from math import pi
 from typing import Any, Literal
 
+from gpmpc._calls import explains_arguments
 from gpmpc.exceptions import check_choice, check_number
 from gpmpc.systems._system import GRAVITY, System, cos, exp, sin
 
@@ -32,6 +33,7 @@ class _Body:
                     check_number(key, number, above=0)
 
 
+@explains_arguments
 @dataclass(frozen=True)
 class DoubleIntegrator(_Body):
     """A mass on a line that a force accelerates."""
@@ -65,6 +67,7 @@ def double_integrator(time_step: float = 0.1, **parameters: float) -> System:
     )
 
 
+@explains_arguments
 @dataclass(frozen=True)
 class Pendulum(_Body):
     """A uniform rod on a driven joint; its torque is too weak to lift it at once."""
@@ -106,6 +109,7 @@ def pendulum(time_step: float = 0.05, **parameters: float) -> System:
     )
 
 
+@explains_arguments
 @dataclass(frozen=True)
 class CartPole(_Body):
     """A pole hinged to a cart on a line (Barto, Sutton and Anderson, 1983).
@@ -162,6 +166,7 @@ def cart_pole(time_step: float = 0.05, **parameters: float) -> System:
     )
 
 
+@explains_arguments
 @dataclass(frozen=True)
 class DoublePendulum(_Body):
     """Two links in a vertical plane with a torque at one joint.
@@ -288,6 +293,7 @@ def _two_links(
     )
 
 
+@explains_arguments
 @dataclass(frozen=True)
 class PlanarQuadrotor(_Body):
     """A bar with a rotor at each end, in a vertical plane; y points upwards."""
@@ -341,6 +347,7 @@ def planar_quadrotor(time_step: float = 0.05, **parameters: float) -> System:
     )
 
 
+@explains_arguments
 @dataclass(frozen=True)
 class StirredTank(_Body):
     """A stirred tank with an exothermic reaction A -> B, steered by its coolant.

@@ -9,6 +9,7 @@ from time import perf_counter
 
 import numpy as np
 
+from gpmpc._calls import explains_arguments
 from gpmpc._dynamics import DynamicsModel, check_next_states
 from gpmpc.exceptions import SettingError
 from gpmpc.gaussian import Gaussian
@@ -30,6 +31,7 @@ from gpmpc.status import Status
 Array = np.ndarray
 
 
+@explains_arguments
 class LQR:
     """Linear-quadratic tracking on the local models of a learned mean.
 

@@ -20,6 +20,7 @@ from typing import Any, NamedTuple
 import casadi
 import numpy as np
 
+from gpmpc._calls import explains_arguments
 from gpmpc._interrupts import interrupts_after
 from gpmpc.exceptions import check_number
 from gpmpc.gaussian import Gaussian
@@ -38,6 +39,7 @@ from gpmpc.mpc.problem import Problem
 from gpmpc.signals import signals_of
 from gpmpc.status import Status
 from gpmpc.systems import System
+from gpmpc.systems._system import check_system
 
 Array = np.ndarray
 
@@ -50,6 +52,7 @@ _STATUSES = {
 }
 
 
+@explains_arguments
 class NMPC:
     """Nonlinear MPC on the true model.
 
@@ -72,6 +75,7 @@ class NMPC:
         initial_input: Sequence[float],
         tolerance: float = 1e-10,
     ):
+        check_system("plant", plant)
         self.signals = signals_of(plant)
         self.initial_input = check_controller(
             problem,

@@ -22,6 +22,7 @@ from typing import Any
 
 import numpy as np
 
+from gpmpc._calls import explains_arguments
 from gpmpc._dynamics import DynamicsModel
 from gpmpc.exceptions import DataError, SettingError
 from gpmpc.gaussian import Gaussian
@@ -53,6 +54,7 @@ Constraints = Callable[[Any, Any], list]
 _DEFAULT = PredictionSettings()
 
 
+@explains_arguments
 class StateFormMPC:
     """GP-MPC in states and inputs, one program a step.
 
