@@ -46,7 +46,7 @@ def explains_arguments(target: _Callable) -> _Callable:
         return cast(_Callable, _explained(target, target.__name__))
     constructor: Any = target
     constructor.__init__ = _explained(constructor.__init__, constructor.__name__)
-    return target
+    return constructor
 
 
 def _explained(function: Callable[..., Any], name: str) -> Callable[..., Any]:
