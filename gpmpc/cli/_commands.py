@@ -303,6 +303,20 @@ COMMANDS = {
                 type=Path,
                 help="inspect: a YAML file that says what the columns mean",
             ),
+            _argument(
+                "--time",
+                default="",
+                metavar="COLUMN",
+                help="inspect, without a mapping: the column of the times [s], by name "
+                "or number",
+            ),
+            _argument(
+                "--time-step",
+                type=float,
+                metavar="SECONDS",
+                help="inspect, without a mapping: the constant step of rows that have "
+                "no times",
+            ),
         ],
     ),
     "warmup": Subcommand(

@@ -50,7 +50,7 @@ def log(arguments: argparse.Namespace) -> Result:
         return _info(file)
     output = _output(action, file, arguments.output)
     if action == "inspect":
-        return _inspect(file, output, arguments.mapping)
+        return _inspect(arguments, output)
     if action == "recover":
         return _recover(file, output)
     if action == "layout":
@@ -225,14 +225,16 @@ def _table_file(run: Run, ending: str) -> str | bytes:
         ) from error
 
 
-def _inspect(file: Path, output: Path, mapping_file: Path | None) -> Result:
+def _inspect(arguments: argparse.Namespace, output: Path) -> Result:
     """Writes a page about a log: streams, channels, delays and excitation."""
     # Loads torch, which the other actions do without.
     from gpmpc.logs import LogMapping, inspect_log
     from gpmpc.plotting import inspection_figure, png
 
-    mapping = LogMapping.load(mapping_file) if mapping_file else None
-    inspection = inspect_log(file, mapping)
+    mapping = LogMapping.load(arguments.mapping) if arguments.mapping else None
+    inspection = inspect_log(
+        arguments.file, mapping, time=arguments.time, time_step=arguments.time_step
+    )
     channels = inspection.channels.reset_index()
     excitation = pd.DataFrame(
         [*inspection.follows.items()], columns=["input", "explained by the states"]

@@ -1,4 +1,4 @@
-"""Reads CSV files as tables; how a file is written is found out by ``_csv_text``.
+"""Reads texts of rows as tables; how one is written is found out by ``_csv_text``.
 
 The size of the text is counted before anything of it is parsed, and it is parsed part
 by part, so that the texts in its cells are counted before there are many.
@@ -7,6 +7,7 @@ by part, so that the texts in its cells are counted before there are many.
 import gzip
 import io
 import warnings
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ import pandas as pd
 
 from gpmpc._bounds import MemoryBudget
 from gpmpc.exceptions import DataError
-from gpmpc.logs._csv_text import DELIMITERS, CsvText, open_csv
+from gpmpc.logs._csv_text import DELIMITERS, WHITE_SPACE, CsvText, open_csv
 from gpmpc.logs._file import (
     NUMBER_BYTES,
     TEXT_BYTES,
@@ -44,11 +45,39 @@ def read_csv(path: Path, options: ReadOptions) -> LogFile:
         with warnings.catch_warnings():  # of rows that are longer than the header
             warnings.simplefilter("error", pd.errors.ParserWarning)
             table = _read_in_parts(csv, budget)
-    findings: tuple[Finding, ...] = ()
+    table.columns = _column_names(csv)
+    return LogFile({"": _without_empty_end(table)}, tuple(_findings(path, csv)))
+
+
+def _column_names(csv: CsvText) -> list[str]:
+    """Names the columns; those without a name by their numbers, from 1 on."""
+    names = [*csv.names, *[""] * (csv.columns - len(csv.names))]
+    return [name or str(number) for number, name in enumerate(names, start=1)]
+
+
+def _without_empty_end(table: pd.DataFrame) -> pd.DataFrame:
+    """Leaves out last columns without name and value, as behind a comma at the end."""
+    columns = len(table.columns)
+    while columns > 1:
+        is_nameless = table.columns[columns - 1] == str(columns)
+        if not is_nameless or table.iloc[:, columns - 1].notna().any():
+            break
+        columns -= 1
+    return table.iloc[:, :columns]
+
+
+def _findings(path: Path, csv: CsvText) -> Iterator[Finding]:
+    """Yields what was noticed in a text, once all of it is read."""
+    run = run_name(path)
+    if csv.skipped:
+        text = f"{csv.skipped} lines before the rows that name no column: left out"
+        yield Finding("lines before the rows", run, csv.skipped, text)
+    if not csv.names:
+        text = "no line names the columns: they are called by their numbers, 1, 2, ..."
+        yield Finding("no names", run, csv.columns, text)
     if csv.is_cut:
         text = "the last line has no end, and may be cut within a number: left out"
-        findings = (Finding("cut line", run_name(path), 1, text),)
-    return LogFile({"": table.rename(columns=str.strip)}, findings)
+        yield Finding("cut line", run, 1, text)
 
 
 def _open(path: Path) -> io.BufferedReader:
@@ -62,7 +91,7 @@ def _check_text(path: Path, budget: MemoryBudget) -> None:
     """Counts what a text file unfolds to, before anything of it is parsed."""
     with _open(path) as file:
         first_line = file.readline(LONGEST_LINE)
-        check_column_count(path, _count_delimiters(first_line) + 1)
+        check_column_count(path, _count_delimiters(b" ".join(first_line.split())) + 1)
         block = first_line
         copies = 1
         while block:
@@ -86,9 +115,11 @@ def _read_in_parts(csv: CsvText, budget: MemoryBudget) -> pd.DataFrame:
     text_columns: set[Any] = set()
     with pd.read_csv(
         csv.stream,
-        sep=csv.delimiter,
+        sep=r"\s+" if csv.delimiter == WHITE_SPACE else csv.delimiter,
         decimal=csv.decimal,
-        chunksize=max(_CELLS_PER_PART // len(csv.names), 1),
+        header=None,
+        names=range(csv.columns),
+        chunksize=max(_CELLS_PER_PART // csv.columns, 1),
         index_col=False,
         skipinitialspace=True,
         **_EXACT,

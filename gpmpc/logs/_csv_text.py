@@ -1,26 +1,32 @@
-"""Finds out how a CSV text is written, and prepares it for pandas.
+"""Finds out how a text of rows is written, and prepares it for pandas.
 
-Programs differ in the encoding, the delimiter, the decimal mark and where they put
-comments. Each is recognised by the text itself, or refused by its name; none is guessed
-from the language of the machine. The text is read line by line, so that what it takes
-is the table.
+Programs differ in the encoding, the delimiter, the decimal mark, in where they put
+comments, and in whether they name the columns. Each is recognised by the text itself,
+or refused by its name; none is guessed from the language of the machine. The text is
+read line by line, so that what it takes is the table.
 """
 
 import codecs
+import csv
 import io
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import chain, islice
 from typing import NamedTuple
 
-import pandas as pd
-
 from gpmpc.exceptions import DataError
+from gpmpc.logs._units import is_known
 
-DELIMITERS = ",;\t"
+WHITE_SPACE = " "  # as a delimiter: any number of spaces and tabs
+#: the first of those that fit equally well is taken
+DELIMITERS = (";", "\t", ",", WHITE_SPACE)
 _COMMENT = re.compile(r"\s*(#|%|//)\s*")
 _DECIMAL_COMMA = re.compile(r"\s*[+-]?\d+,\d+([eE][+-]?\d+)?\s*")
-_SAMPLE = 50  # lines that the decimal mark is looked for in
+_WIDE_SPACE = re.compile(r"\t| {2,}")
+_BRACKETS = re.compile(r"\[.*\]|\(.*\)")
+_ABSENT = frozenset(("", "NA", "N/A", "n/a", "null", "NULL", "None", "<NA>"))
+_SAMPLE = 50  # lines by which the text is recognised
+_COMMENTS = 50  # before the first line that may hold the names of the columns
 _START = 1000  # bytes that the encoding is looked for in
 _ENCODING_MARKS = (  # the longer marks first: that of UTF-32 begins as that of UTF-16
     (codecs.BOM_UTF32_LE, "utf-32"),
@@ -29,14 +35,20 @@ _ENCODING_MARKS = (  # the longer marks first: that of UTF-32 begins as that of 
     (codecs.BOM_UTF16_BE, "utf-16"),
 )
 
+Fields = list[str]
+
 
 class CsvText(NamedTuple):
-    """The text of a CSV file in the form that pandas reads, and how it is written."""
+    """The rows of a text in the form that pandas reads, and how it is written."""
 
-    stream: "_CsvStream"  #: the names of the columns and the rows, without comments
-    names: list[str]  #: of the columns
-    delimiter: str
-    decimal: str  #: the decimal mark
+    stream: "_CsvStream"  #: the rows, without names and comments
+    #: of the columns, as they stand there: a name may be empty, or come twice; none
+    #: where the text names no column
+    names: Fields
+    columns: int  #: their number
+    delimiter: str  #: ``WHITE_SPACE`` for any of it
+    decimal: str
+    skipped: int  #: lines before the rows that are neither names nor comments
 
     @property
     def is_cut(self) -> bool:
@@ -47,36 +59,47 @@ class CsvText(NamedTuple):
         return self.stream.lines.is_cut
 
 
+class _Header(NamedTuple):
+    """The names of the columns; the other lines before the rows, which are skipped."""
+
+    names: Fields
+    skipped: int
+
+
 def open_csv(where: str, file: io.BufferedReader) -> CsvText:
-    """Finds out how a CSV file is written.
+    """Finds out how a text of rows is written.
 
     Args:
         where: The file's name, for errors.
-        file: The text, unpacked. Its first line names the columns. Lines that begin
-            with #, % or // are comments; the last one before the first line names the
-            columns where that line holds numbers.
+        file: The text, unpacked. Lines that begin with #, % or // are comments. The
+            last line before the rows that has as many fields as they names the columns,
+            also in a comment; behind it may stand a line of units.
 
     Raises:
         DataError: It is no such text; the message says why.
     """
     lines = _Lines(where, file)
     head = list(islice(lines, 1 + _SAMPLE))
-    if head and lines.comment and _holds_numbers(head[0]):
-        head.insert(0, lines.comment)
     if not head:
-        raise DataError(f"{where}: holds no line with the names of the columns")
-    delimiter = max(DELIMITERS, key=lambda mark: len(_split_line(head[0], mark)))
-    names = [name.strip() for name in _split_line(head[0], delimiter)]
-    if len(set(names)) < len(names) or _holds_numbers(head[0]):
         raise DataError(
-            f"{where}: the first line must name every column differently; got "
-            f"{', '.join(names)}"
+            f"{where}: holds no line with the names of the columns, or rows"
         )
+    delimiter = _find_delimiter(head)
+    fields = [_split_line(line, delimiter) for line in head]
+    first = _first_row(fields)
+    rows = fields[first:]
+    if delimiter == ",":
+        _check_decimal_commas(where, fields[first - 1 : first], rows)
+    header = _find_header(head[:first], lines.comments, rows, delimiter)
+    columns = max([len(header.names), *map(len, rows)])
+    width = columns if delimiter == WHITE_SPACE else 0
     return CsvText(
-        stream=_CsvStream(head, lines),
-        names=names,
+        stream=_CsvStream(head[first:], lines, width),
+        names=header.names,
+        columns=columns,
         delimiter=delimiter,
-        decimal=_decimal_mark(where, names, head[1:], delimiter),
+        decimal=_decimal_mark(rows),
+        skipped=header.skipped,
     )
 
 
@@ -85,11 +108,11 @@ class _Lines(Iterator[str]):
 
     def __init__(self, where: str, file: io.BufferedReader):
         self.encoding = _find_encoding(file.peek(_START)[:_START])
-        self.comment = ""  # before the first line, the last one
+        self.comments: list[str] = []  # before the first line, the last ones
         self.is_cut = False  # the last line has no end
-        self._where = where
+        self.where = where
+        self.count = 0  # of the lines that were read
         self._stream = io.TextIOWrapper(file, encoding=self.encoding)
-        self._count = 0
         self._began = False
 
     def __next__(self) -> str:
@@ -105,26 +128,28 @@ class _Lines(Iterator[str]):
                 self._began = True
                 return line
             if comment is not None and not self._began:
-                self.comment = line[comment.end() :]
+                self.comments = [*self.comments[1 - _COMMENTS :], line[comment.end() :]]
 
     def _read_line(self) -> str:
         """Reads the next line with its end; an empty one behind the last."""
-        self._count += 1
+        self.count += 1
         try:
             return self._stream.readline()
         except UnicodeDecodeError as error:
-            byte = f"byte 0x{error.object[error.start]:02x} near line {self._count}"
+            byte = f"byte 0x{error.object[error.start]:02x} near line {self.count}"
             name = self.encoding.removesuffix("-sig").upper()
             raise DataError(
-                f"{self._where}: {byte} is no text in {name}: save the file as UTF-8"
+                f"{self.where}: {byte} is no text in {name}: save the file as UTF-8"
             ) from error
 
 
 class _CsvStream(io.TextIOBase):
-    """A text stream for pandas: the lines of the head, and those behind them."""
+    """A text stream for pandas: the rows of the head, and those behind them."""
 
-    def __init__(self, head: list[str], lines: _Lines):
+    def __init__(self, head: list[str], lines: _Lines, width: int):
         self.lines = lines
+        self._width = width  # fields that every row must have; 0 for any
+        self._rows = 0  # that were read
         self._all_lines = chain(head, lines)
         self._unread = ""  # of the line that was read last
 
@@ -136,6 +161,7 @@ class _CsvStream(io.TextIOBase):
             line = next(self._all_lines, "")
             if not line:
                 break
+            self._check_width(line)
             parts.append(line)
             length += len(line)
         text = "".join(parts)
@@ -143,6 +169,22 @@ class _CsvStream(io.TextIOBase):
             size = len(text)
         self._unread = text[size:]
         return text[:size]
+
+    def _check_width(self, line: str) -> None:
+        """Raises ``DataError`` where white space separates another number of fields.
+
+        A blank cell looks like more space: which column it is of cannot be told.
+        """
+        self._rows += 1
+        if not self._width:
+            return
+        width = len(_split_line(line, WHITE_SPACE))
+        if width != self._width:
+            raise DataError(
+                f"{self.lines.where}: row {self._rows} has {width} fields, others "
+                f"{self._width}: white space cannot mark an empty cell; separate "
+                "columns by commas"
+            )
 
 
 def _find_encoding(start: bytes) -> str:
@@ -156,46 +198,162 @@ def _find_encoding(start: bytes) -> str:
     return "utf-16-le" if start[1:2] == b"\0" else "utf-16-be"
 
 
-def _split_line(line: str, delimiter: str) -> list[str]:
-    """Returns the fields of one line, without their quotes."""
-    frame = pd.read_csv(
-        io.StringIO(line),
-        sep=delimiter,
-        header=None,
-        dtype=str,
-        keep_default_na=False,
-        skipinitialspace=True,
-    )
-    return frame.iloc[0].tolist()
+def _split_line(line: str, delimiter: str) -> Fields:
+    """Returns the fields of one line, without their quotes and the space around."""
+    if delimiter == WHITE_SPACE:
+        if '"' not in line:
+            return line.split()
+        line = " ".join(line.split())
+    fields = next(csv.reader([line], delimiter=delimiter, skipinitialspace=True))
+    return [field.strip() for field in fields]
 
 
-def _holds_numbers(line: str) -> bool:
-    """Tells whether a field of a line is a number; the name of a column is none."""
-    delimiter = max(DELIMITERS, key=line.count)
-    for field in line.split(delimiter):
-        try:
-            float(field.strip().strip('"').replace(",", "."))
-        except ValueError:
-            continue
+def _is_number(field: str) -> bool:
+    if _DECIMAL_COMMA.fullmatch(field):
         return True
-    return False
+    try:
+        float(field)
+    except ValueError:
+        return False
+    return True
 
 
-def _decimal_mark(
-    where: str, names: list[str], lines: list[str], delimiter: str
-) -> str:
-    """Returns the decimal mark of the first rows.
+def _is_text(field: str) -> bool:
+    return field not in _ABSENT and not _is_number(field)
 
-    Raises:
-        DataError: The comma is the delimiter as well as the decimal mark.
+
+def _find_delimiter(lines: Sequence[str]) -> str:
+    """Finds the delimiter that makes most numbers of some lines, and fewest texts."""
+
+    def count(delimiter: str) -> tuple[int, int]:
+        fields = [f for line in lines for f in _split_line(line, delimiter)]
+        numbers = sum(_is_number(field) for field in fields)
+        texts = sum(_is_text(field) for field in fields)
+        return numbers, -texts
+
+    counts = {delimiter: count(delimiter) for delimiter in DELIMITERS}
+    if any(numbers for numbers, _ in counts.values()):
+        return max(DELIMITERS, key=lambda delimiter: counts[delimiter])
+    return max(
+        DELIMITERS[:-1], key=lambda delimiter: len(_split_line(lines[0], delimiter))
+    )
+
+
+def _first_row(lines: Sequence[Fields]) -> int:
+    """Finds the first line of values; the one behind the first if none has a number."""
+    for index, fields in enumerate(lines):
+        is_first = index == 0 and len(lines) > 1
+        is_header = is_first and _names_numbers(fields, lines[1])
+        if any(map(_is_number, fields)) and not is_header:
+            while index > 0 and not any(lines[index - 1]):  # rows without a value
+                index -= 1
+            return index
+    return 1
+
+
+def _names_numbers(fields: Fields, below: Fields) -> bool:
+    """Tells whether a word stands above a number: ``t,1,2`` names columns."""
+    return any(
+        _is_text(upper) and any(map(str.isalpha, upper)) and _is_number(lower)
+        for upper, lower in zip(fields, below, strict=False)
+    )
+
+
+def _find_header(
+    lines: Sequence[str],
+    comments: Sequence[str],
+    rows: Sequence[Fields],
+    delimiter: str,
+) -> _Header:
+    """Finds the names of the columns before the rows.
+
+    Args:
+        lines: Those before the rows.
+        comments: Those before the first line.
+        rows: The first ones; where there is none, the first line has the names.
+        delimiter: Of the rows.
     """
-    samples = [_split_line(line, delimiter) for line in lines]
-    if any(_DECIMAL_COMMA.fullmatch(field) for fields in samples for field in fields):
-        return ","
-    width = min((len(fields) for fields in samples), default=0)
-    if delimiter == "," and width >= 2 * len(names) > 2:
+    if not rows:
+        return _Header(_split_line(lines[0], delimiter), skipped=0)
+    for separators in ((delimiter,), DELIMITERS):
+        names = _last_names(lines, rows, separators)
+        if names:
+            return _Header(names, skipped=len(lines) - 1)
+        names = _last_names(comments, rows, separators)
+        if names:
+            return _Header(names, skipped=len(lines))
+    return _Header([], skipped=len(lines))
+
+
+def _last_names(
+    lines: Sequence[str], rows: Sequence[Fields], separators: Sequence[str]
+) -> Fields:
+    """Returns the names in the last line that has some, before one of units."""
+    candidates = [_split_names(line, rows, separators) for line in lines]
+    candidates = [names for names in candidates if names]
+    if len(candidates) > 1 and _are_units(candidates[-1]):
+        return candidates[-2]
+    return candidates[-1] if candidates else []
+
+
+def _split_names(
+    line: str, rows: Sequence[Fields], separators: Sequence[str]
+) -> Fields:
+    """Splits a line into as many names as rows have fields; none if it has others.
+
+    A name at the end may be empty, as may a cell.
+    """
+    widest = max(len(fields) for fields in rows)
+    filled = max(_count_filled(fields) for fields in rows)
+    for separator in separators:
+        names = _split_line(line, separator)
+        if _count_filled(names) <= widest and len(names) >= filled:
+            is_sentence = any(name.endswith((".", ":", ",")) for name in names)
+            return [] if separator == WHITE_SPACE and is_sentence else names
+    if WHITE_SPACE in separators:  # names of several words
+        names = [name.strip() for name in _WIDE_SPACE.split(line.strip())]
+        return names if len(names) == widest else []
+    return []
+
+
+def _count_filled(fields: Fields) -> int:
+    """Counts the fields up to the last one that is not empty."""
+    filled = [index for index, field in enumerate(fields) if field]
+    return filled[-1] + 1 if filled else 0
+
+
+def _are_units(fields: Fields) -> bool:
+    """Tells whether all fields are units, such as ``[s]`` and ``N m``."""
+    return all(
+        is_known(field.strip("[]() ")) or _BRACKETS.fullmatch(field) for field in fields
+    )
+
+
+def _decimal_mark(rows: Sequence[Fields]) -> str:
+    """Returns the decimal mark of the first rows."""
+    has_commas = any(_DECIMAL_COMMA.fullmatch(f) for fields in rows for f in fields)
+    return "," if has_commas else "."
+
+
+def _check_decimal_commas(
+    where: str, above: Sequence[Fields], rows: Sequence[Fields]
+) -> None:
+    """Raises ``DataError`` where commas separate fields and seem decimal marks, too.
+
+    Args:
+        where: The file's name, for errors.
+        above: The fields of the line before the rows, if there is one.
+        rows: The first ones.
+    """
+    widths = [len(fields) for fields in rows]
+    has_points = any("." in field for fields in rows for field in fields)
+    if has_points or not widths or not above:
+        return
+    names = len(above[0])
+    is_double = names > 1 and min(widths) >= 2 * names
+    is_pair = names == 1 and " " not in above[0][0] and {*widths} == {2}
+    if is_double or is_pair:
         raise DataError(
-            f"{where}: the rows have {width} fields and the header {len(names)}: is "
+            f"{where}: the rows have {min(widths)} fields and the header {names}: is "
             "the comma the decimal mark too? separate columns by semicolons"
         )
-    return "."

@@ -13,6 +13,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from gpmpc.exceptions import DataError, GpmpcError
+from gpmpc.logs._columns import with_unique_names
 from gpmpc.logs._csv import read_csv
 from gpmpc.logs._file import (
     LogFile,
@@ -22,6 +23,7 @@ from gpmpc.logs._file import (
     first_line,
     needs_extra,
 )
+from gpmpc.logs._mat import read_mat
 from gpmpc.logs._mcap import read_mcap
 from gpmpc.logs._npz import read_npz
 from gpmpc.logs._parquet import read_parquet
@@ -33,8 +35,13 @@ READERS: dict[str, LogReader] = {
     ".csv.gz": read_csv,
     ".tsv": read_csv,
     ".tsv.gz": read_csv,
+    ".txt": read_csv,
+    ".txt.gz": read_csv,
+    ".dat": read_csv,
+    ".dat.gz": read_csv,
     ".parquet": read_parquet,
     ".npz": read_npz,
+    ".mat": read_mat,
     ".mcap": read_mcap,
     ".ulg": read_ulog,
 }
@@ -74,12 +81,12 @@ def read_file(
         reason = first_line(error)[:300]
         raise DataError(f"{path}: cannot be read ({reason})") from error
     _check_topics(path, file.tables, options.topics)
-    _check_column_names(path, file.tables)
     if not any(len(table) for table in file.tables.values()):
         reasons = "; ".join(finding.text for finding in file.findings[:2])
         because = f" ({reasons})" if reasons else ""
         raise DataError(f"{path}: holds no rows{because}")
-    return file
+    tables = {topic: with_unique_names(table) for topic, table in file.tables.items()}
+    return file._replace(tables=tables)
 
 
 def _find_reader(path: Path) -> LogReader:
@@ -100,11 +107,3 @@ def _check_topics(path: Path, tables: Tables, topics: Iterable[str]) -> None:
         )
     present = ", ".join(sorted(topic for topic in tables if topic)) or "no topics"
     raise DataError(f"{path}: topic {missing[0]!r} is missing; it has {present}")
-
-
-def _check_column_names(path: Path, tables: Tables) -> None:
-    for topic, table in tables.items():
-        if table.columns.has_duplicates:
-            duplicate = table.columns[table.columns.duplicated()][0]
-            where = f"{path}, {topic}" if topic else str(path)
-            raise DataError(f"{where}: column {duplicate!r} stands there twice")

@@ -15,7 +15,7 @@ import numpy as np
 import pandas as pd
 
 from gpmpc._dynamics import Array
-from gpmpc.exceptions import DataError
+from gpmpc.exceptions import DataError, SettingError, check_number
 from gpmpc.logs._channel_figures import (
     ChannelFigures,
     channel_table,
@@ -23,15 +23,26 @@ from gpmpc.logs._channel_figures import (
     describe_channel,
     text_warning,
 )
+from gpmpc.logs._columns import (
+    check_column,
+    column_number,
+    named_columns,
+    runs_side_by_side,
+)
 from gpmpc.logs._delays import Delay, delay_table, find_delays
-from gpmpc.logs._file import STAMP
+from gpmpc.logs._file import STAMP, Tables
 from gpmpc.logs._formats import read_file
 from gpmpc.logs._log import Log
 from gpmpc.logs._mapping import TIME_UNITS, LogMapping
 from gpmpc.logs._read_log import read_log
+from gpmpc.logs._row_times import row_times
 
 # columns that hold the time where nobody says which
-TIMES = (STAMP, "timestamp", "t", "time", "stamp", "Time", "seconds")
+TIMES = (STAMP, "timestamp", "t", "time", "stamp", "Time", "seconds", "time_s", "t_s")
+TIMES += tuple(
+    f"{name} {unit}" for name in ("t", "time", "Time") for unit in ("[s]", "(s)")
+)
+EVEN = 1e-3  # of its step: a column that rises as evenly may be the time
 DRAWN = 3000  # points of a channel's line
 MOST_DELAYS = 20  # that are listed
 FOLLOWS = 0.95  # share of an input's variance that the states explain
@@ -59,6 +70,22 @@ class Inspection:
     lines: dict[str, tuple[Array, Array]]  #: time [s] and values to draw, by channel
     gaps: tuple[tuple[float, float], ...]  #: begin and end [s] of each, of all streams
     warnings: tuple[str, ...]  #: what to beware of, in words
+
+
+class _Source(NamedTuple):
+    """The table of a stream."""
+
+    title: str  # a topic, or one of the runs that stand side by side in a file
+    topic: str
+    table: pd.DataFrame
+
+
+class _Times(NamedTuple):
+    """The times of a stream's rows."""
+
+    stamps: Array  # (K,) [s]; the numbers of the rows where nothing says more
+    column: str = ""  # that holds them
+    are_rows: bool = False
 
 
 class _Clock(NamedTuple):
@@ -100,23 +127,35 @@ class _Reading(NamedTuple):
     dependence: dict[str, float]  # by input; see ``Inspection.follows``
 
 
-def inspect_log(path: str | Path, mapping: LogMapping | None = None) -> Inspection:
+def inspect_log(
+    path: str | Path,
+    mapping: LogMapping | None = None,
+    time: str = "",
+    time_step: float | None = None,
+) -> Inspection:
     """Inspects a log file, however broken its rows are.
 
     Args:
         path: In a format of ``read_log``.
         mapping: Says which columns matter, which is the time, and what are states and
             inputs; all numbers by default.
+        time: Column of the stamps [s], where there is no mapping; by default one of
+            ``TIMES``, and where there is none, values stand over their rows.
+        time_step: The constant step of rows without stamps [s], likewise.
 
     Raises:
-        DataError: The file cannot be read, or no column holds the time.
+        DataError: The file cannot be read, or a column that is named is missing.
+        SettingError: Times are said twice.
     """
+    _check_times(mapping, time, time_step)
     topics = {signal.topic for signal in mapping.signals} if mapping else ()
     stamp = mapping.stamp if mapping else ""
     file = read_file(path, topics, partial=True, stamp=stamp)
     streams = [
-        _inspect_stream(path, topic, table, mapping)
-        for topic, table in file.tables.items()
+        _inspect_stream(
+            source, _times_of(source, path, mapping, time, time_step), mapping
+        )
+        for source in _sources(path, file.tables, mapping)
     ]
     channels: dict[str, ChannelFigures] = {}
     lines: dict[str, tuple[Array, Array]] = {}
@@ -164,14 +203,40 @@ def _read_with(mapping: LogMapping | None, path: str | Path) -> _Reading:
     return _Reading(warnings=warnings, dependence=_dependence(log))
 
 
+def _check_times(
+    mapping: LogMapping | None, time: str, time_step: float | None
+) -> None:
+    """Raises ``SettingError`` where times are said twice, or their step is none."""
+    if time_step is not None:
+        check_number("time-step", time_step, above=0)
+    if mapping is not None and (time or time_step):
+        raise SettingError("time", "must stand in the mapping where there is one")
+    if time and time_step:
+        raise SettingError(
+            "time-step", "is for rows without stamps; got --time as well"
+        )
+
+
+def _sources(
+    path: str | Path, tables: Tables, mapping: LogMapping | None
+) -> list[_Source]:
+    """Lists the tables of the streams: one for each topic, or each run side by side."""
+    if mapping is None:
+        return [_Source(topic, topic, table) for topic, table in tables.items()]
+    named = named_columns(path, tables, mapping)
+    return [
+        _Source(topic or run, topic, table)
+        for run, tables_of_run in runs_side_by_side(Path(path), named, mapping)
+        for topic, table in tables_of_run.items()
+    ]
+
+
 def _inspect_stream(
-    path: str | Path, topic: str, table: pd.DataFrame, mapping: LogMapping | None
+    source: _Source, times: _Times, mapping: LogMapping | None
 ) -> _Stream:
     """Inspects the rows of one table."""
-    time_name = _time_column(path, table, mapping)
-    stamps = pd.to_numeric(table[time_name], errors="coerce").to_numpy(float)
-    if mapping is not None:
-        stamps = stamps * TIME_UNITS[mapping.time_unit]
+    table = source.table
+    stamps = times.stamps
     clock = _read_clock(stamps)
     steps = _measure_steps(clock.time)
     rows = clock.rows
@@ -180,15 +245,16 @@ def _inspect_stream(
         rows = np.arange(len(table))
         time = rows.astype(float)
 
-    columns = _columns_of_interest(table, time_name, topic, mapping)
+    columns = _columns_of_interest(source, times.column, mapping)
     numeric = set(table.select_dtypes("number"))
-    numbers = [name for name in columns if name in numeric]
-    titles = [_title(topic, name) for name in numbers]
+    constants = _constants(table, [name for name in columns if name in numeric])
+    numbers = [name for name in columns if name in numeric and name not in constants]
+    titles = [_title(source.title, name) for name in numbers]
     values = table[numbers].to_numpy(float)[rows]
     stride = max(len(values) // DRAWN, 1)
     by_title = dict(zip(titles, values.T, strict=True))
     return _Stream(
-        summary=_summary(topic, len(table), clock, steps),
+        summary=_summary(source.title, len(table), clock, steps, times),
         channels={title: describe_channel(v) for title, v in by_title.items()},
         lines={
             title: (time[::stride], column[::stride])
@@ -196,8 +262,13 @@ def _inspect_stream(
         },
         delays=find_delays(titles, values),
         gaps=steps.gaps,
-        warnings=_stream_warnings(topic, clock, steps),
-        text_columns=[_title(topic, name) for name in columns if name not in numeric],
+        warnings=[
+            *_stream_warnings(source.title, clock, steps, times),
+            *_time_hints(source, times, constants, numbers),
+        ],
+        text_columns=[
+            _title(source.title, name) for name in columns if name not in numeric
+        ],
     )
 
 
@@ -206,32 +277,61 @@ def _title(topic: str, column: Any) -> str:
 
 
 def _columns_of_interest(
-    table: pd.DataFrame, time_name: str, topic: str, mapping: LogMapping | None
+    source: _Source, time_name: str, mapping: LogMapping | None
 ) -> list[Any]:
     """Lists the columns beside the time; with a mapping, those of its signals."""
-    columns = [name for name in table if name != time_name]
+    columns = [name for name in source.table if name != time_name]
     if mapping is None:
         return columns
-    signals = [signal for signal in mapping.signals if signal.topic == topic]
+    signals = [signal for signal in mapping.signals if signal.topic == source.topic]
     mapped = {column for signal in signals for column in signal.columns}
     return [name for name in columns if name in mapped]
 
 
-def _time_column(
-    path: str | Path, table: pd.DataFrame, mapping: LogMapping | None
-) -> str:
-    """Finds the column of the time; ``DataError`` where there is none."""
-    if mapping is not None and mapping.time:
-        candidates = [mapping.time]
-        expected = repr(mapping.time)
-    else:
-        candidates = list(TIMES)
-        expected = "of the time, such as " + ", ".join(TIMES)
-    for name in candidates:
-        if name in table:
-            return name
-    columns = ", ".join(map(str, table.columns[:12]))
-    raise DataError(f"{path}: no column {expected}; there are {columns}")
+def _constants(table: pd.DataFrame, columns: Sequence[Any]) -> dict[Any, float]:
+    """Returns the columns that hold a single number, with it, where others hold more.
+
+    Such a column says something of the whole file, such as the time step.
+    """
+    counts = table[list(columns)].count()
+    if counts.max() < 2:
+        return {}
+    single = [name for name in columns if counts[name] == 1]
+    return {name: float(table[name].dropna().iloc[0]) for name in single}
+
+
+def _times_of(
+    source: _Source,
+    path: str | Path,
+    mapping: LogMapping | None,
+    time: str,
+    time_step: float | None,
+) -> _Times:
+    """Finds the times of a stream's rows: a column, a step, or their numbers.
+
+    Raises:
+        DataError: The column that is named is missing.
+    """
+    table = source.table
+    if mapping is not None and not mapping.time:
+        stamps = row_times(str(path), table, mapping)
+        if stamps is not None:
+            return _Times(stamps)
+    if time_step is not None:
+        return _Times(np.arange(len(table), dtype=float) * time_step)
+    named = mapping.time if mapping is not None else time
+    number = column_number(table, named)
+    if number:
+        named = str(table.columns[number - 1])
+    if named:
+        check_column(str(path), table, named)
+    candidates = [named] if named else [name for name in TIMES if name in table]
+    if not candidates:
+        return _Times(np.arange(len(table), dtype=float), are_rows=True)
+    stamps = pd.to_numeric(table[candidates[0]], errors="coerce").to_numpy(float)
+    if mapping is not None:
+        stamps = stamps * TIME_UNITS[mapping.time_unit]
+    return _Times(stamps, column=candidates[0])
 
 
 def _read_clock(stamps: Array) -> _Clock:
@@ -268,12 +368,14 @@ def _measure_steps(time: Array) -> _Steps:
     )
 
 
-def _summary(topic: str, rows: int, clock: _Clock, steps: _Steps) -> dict[str, Any]:
+def _summary(
+    title: str, rows: int, clock: _Clock, steps: _Steps, times: _Times
+) -> dict[str, Any]:
     """Makes the row of a stream in ``Inspection.streams``."""
     return {
-        "stream": topic,
+        "stream": title,
         "rows": rows,
-        "rate [Hz]": steps.rate,
+        "rate [Hz]": np.nan if times.are_rows else steps.rate,
         "jitter": steps.jitter,
         "gaps": len(steps.gaps),
         "longest gap [s]": steps.longest_gap,
@@ -283,9 +385,17 @@ def _summary(topic: str, rows: int, clock: _Clock, steps: _Steps) -> dict[str, A
     }
 
 
-def _stream_warnings(topic: str, clock: _Clock, steps: _Steps) -> list[str]:
+def _stream_warnings(
+    title: str, clock: _Clock, steps: _Steps, times: _Times
+) -> list[str]:
     """Says what is wrong with the stamps of a stream."""
-    of_topic = f" of {topic}" if topic else ""
+    of_topic = f" of {title}" if title else ""
+    if times.are_rows:
+        return [
+            f"no column{of_topic} is called as times are: values stand over their rows "
+            "(--time COLUMN or --time-step SECONDS says more; in a mapping, time: NAME "
+            "or time: {step: SECONDS})"
+        ]
     warnings = []
     for count, kind in (
         (clock.missing, "missing stamps"),
@@ -306,6 +416,28 @@ def _stream_warnings(topic: str, clock: _Clock, steps: _Steps) -> list[str]:
         share = f"{steps.jitter:.0%} of the time step"
         warnings.append(f"stamps{of_topic} jitter by {share}: state a rate")
     return warnings
+
+
+def _time_hints(
+    source: _Source,
+    times: _Times,
+    constants: Mapping[Any, float],
+    numbers: Sequence[Any],
+) -> list[str]:
+    """Says which columns may be the time, and which hold a single number."""
+    of_title = f" of {source.title}" if source.title else ""
+    hints = [
+        f"{name}{of_title} holds a single number, {value:g}: if it is the time step, "
+        f"time: {{step: {name}}}"
+        for name, value in constants.items()
+    ]
+    if not times.are_rows:
+        return hints
+    for name in numbers:
+        steps = np.diff(source.table[name].to_numpy(float))
+        if len(steps) > 1 and steps[0] > 0 and np.ptp(steps) < EVEN * steps[0]:
+            hints.append(f"{name} rises evenly, by {steps[0]:.4g}: is it the time?")
+    return hints
 
 
 def _dependence_warnings(dependence: Mapping[str, float]) -> list[str]:

@@ -27,7 +27,6 @@ ROLES: tuple[Role, ...] = ("states", "inputs", "context")
 AXES = ("enu", "ned")  # of the world; the body's are then FLU or FRD
 TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 _PLAIN_KEYS = (  # whose values are taken as they are
-    "run",
     "rate",
     "max_gap",
     "held",
@@ -46,6 +45,7 @@ _SIGNAL_KEYS = (
     "scale",
     "delay",
     "resample",
+    "held",
     "topic",
 )
 
@@ -56,7 +56,8 @@ class Signal:
 
     name: str  #: such as "attitude"
     role: Role
-    columns: tuple[str, ...]  #: as they are called in the file
+    #: as they are called in the file, or their numbers in it, from "1" on
+    columns: tuple[str, ...]
     unit: str = ""  #: of the columns in the file
     #: A vector, angles, a quaternion, or Euler angles (roll, pitch, yaw; they become a
     #: quaternion).
@@ -70,19 +71,22 @@ class Signal:
     axes: str = ""
     #: The values are multiplied by it: one number, or one for each column.
     scale: float | tuple[float, ...] = 1.0
-    #: [s] by which its stamps are later than what was measured; the values are moved
-    #: back.
-    delay: float = 0.0
+    #: [s] by which its stamps are later than what was measured: one number, or one for
+    #: each column. The values are moved back.
+    delay: float | tuple[float, ...] = 0.0
     #: "hold", "linear" or "spherical"; by default states are interpolated and all else
     #: is held
     resample: str = ""
+    #: of a state, "drop" or "use" (see ``LogMapping.held``); empty takes the mapping's
+    held: str = ""
     topic: str = ""  #: the stream that holds the columns; empty where a file has one
 
     def __post_init__(self) -> None:
         self._check_choices()
         self._check_columns()
-        self._check_scale()
-        check_number(f"{self._key}.delay", self.delay)
+        self._check_number_or_numbers("scale")
+        self._check_number_or_numbers("delay")
+        self._check_delay()
         self._check_texts()
 
     def _check_choices(self) -> None:
@@ -93,6 +97,7 @@ class Signal:
             ("frame", ("", "world", "body")),
             ("axes", ("", *AXES)),
             ("resample", ("", "hold", interpolation)),
+            ("held", ("", "drop", "use") if self.role == "states" else ("",)),
         ):
             check_choice(f"{self._key}.{name}", getattr(self, name), choices)
 
@@ -105,13 +110,21 @@ class Signal:
                 f"must be {number or 1} names of columns; got {list(self.columns)}",
             )
 
-    def _check_scale(self) -> None:
-        key = f"{self._key}.scale"
-        if isinstance(self.scale, list | tuple):
-            check_numbers(key, self.scale, len(self.columns))
-            object.__setattr__(self, "scale", tuple(self.scale))
+    def _check_number_or_numbers(self, name: str) -> None:
+        """Raises ``SettingError`` of what is not one number, or one for each column."""
+        value = getattr(self, name)
+        if isinstance(value, list | tuple):
+            check_numbers(f"{self._key}.{name}", value, len(self.columns))
+            object.__setattr__(self, name, tuple(value))
         else:
-            check_number(key, self.scale)
+            check_number(f"{self._key}.{name}", value)
+
+    def _check_delay(self) -> None:
+        if self.is_attitude and len(set(self.delays)) > 1:
+            raise SettingError(
+                f"{self._key}.delay",
+                f"must be one number for an attitude; got {list(self.delays)}",
+            )
 
     def _check_texts(self) -> None:
         for name in ("unit", "topic"):
@@ -153,6 +166,22 @@ class Signal:
         return (self.scale,) * len(self.columns)
 
     @property
+    def delays(self) -> tuple[float, ...]:
+        """The delay of each column [s]."""
+        if isinstance(self.delay, tuple):
+            return self.delay
+        return (float(self.delay),) * len(self.columns)
+
+    @property
+    def entries(self) -> tuple[str, ...]:
+        """The names of its values: those of the columns, or its own for numbers."""
+        if not any(column.isdecimal() for column in self.columns):
+            return self.columns
+        if len(self.columns) == 1:
+            return (self.name,)
+        return tuple(f"{self.name}_{i + 1}" for i in range(len(self.columns)))
+
+    @property
     def factors(self) -> tuple[float, ...]:
         """The factor of each column, from its values in the file to SI units."""
         factor = self._conversion.factor
@@ -168,7 +197,7 @@ class Signal:
             )
         return StateGroup(
             name=self.name,
-            entries=self.columns,
+            entries=self.entries,
             unit=self._conversion.unit,
             kind="angle" if self.kind == "angle" else "vector",
         )
@@ -189,7 +218,15 @@ class LogMapping:
     signals: tuple[Signal, ...]  #: states, inputs and context, in this order
     time: str = ""  #: column of the stamps; empty takes the stamps of the messages
     time_unit: str = "s"  #: of that column
+    #: the constant step of rows without stamps [s], or the column that holds it as its
+    #: only number
+    time_step: float | str | None = None
+    #: names of the columns, in their order, in place of those in the file
+    names: tuple[str, ...] = ()
     run: str = ""  #: column that names the runs
+    #: runs that stand side by side in a file: which column of the file (or which
+    #: number) each name of this mapping means in a run, by the run's name
+    runs: dict[str, dict[str, str]] = field(default_factory=dict)
     #: to which rows are resampled [Hz]; None leaves them as they are
     rate: float | None = None
     #: no value is carried over a longer gap [s]; 1.5 time steps by default
@@ -211,12 +248,8 @@ class LogMapping:
     axes: str = ""
 
     def __post_init__(self) -> None:
-        if self.stamp and self.time:
-            raise SettingError("stamp", "has no effect where time names a column")
-        for key in ("time", "run"):
-            value = getattr(self, key)
-            if not isinstance(value, str):
-                raise SettingError(key, f"must be the name of a column; got {value!r}")
+        self._check_time()
+        self._check_runs()
         for key in ("rate", "max_gap"):
             if getattr(self, key) is not None:
                 check_number(key, getattr(self, key), above=0)
@@ -235,10 +268,69 @@ class LogMapping:
         check_choice("time.unit", self.time_unit, tuple(TIME_UNITS))
         if not self.of("states"):
             raise SettingError("states", "must name at least one signal; got none")
-        if len({signal.topic for signal in self.signals}) > 1 and self.rate is None:
+        self._check_topics()
+
+    def _check_time(self) -> None:
+        if not isinstance(self.time, str):
+            raise SettingError(
+                "time", f"must be the name of a column; got {self.time!r}"
+            )
+        if self.stamp and self.time:
+            raise SettingError("stamp", "has no effect where time names a column")
+        if self.time_step is None:
+            return
+        if self.time:
+            raise SettingError(
+                "time.step", f"is for rows without stamps; got a column, {self.time!r}"
+            )
+        if not isinstance(self.time_step, str):
+            check_number("time.step", self.time_step, above=0)
+
+    def _check_runs(self) -> None:
+        if not isinstance(self.run, str):
+            raise SettingError("run", f"must be the name of a column; got {self.run!r}")
+        if self.run and self.runs:
+            raise SettingError("runs", f"must stand alone; got run: {self.run} as well")
+        for run, columns in self.runs.items():
+            for name in columns:
+                if name not in self._names_used:
+                    raise SettingError(
+                        f"runs.{run}.{name}", "is no column that the mapping uses"
+                    )
+
+    def _check_topics(self) -> None:
+        topics = {signal.topic for signal in self.signals}
+        for key, value in (
+            ("time.step", self.time_step),
+            ("names", self.names),
+            ("runs", self.runs),
+        ):
+            if value and any(topics):
+                raise SettingError(
+                    key, f"needs a file of one table; got topic {max(topics)!r}"
+                )
+        if len(topics) > 1 and self.rate is None:
             raise SettingError(
                 "rate", "must be given where signals come from several topics; got none"
             )
+
+    @property
+    def signal_columns(self) -> tuple[str, ...]:
+        """The columns of all signals."""
+        return tuple(column for signal in self.signals for column in signal.columns)
+
+    @property
+    def _names_used(self) -> set[str]:
+        """The columns that the mapping uses, as it calls them."""
+        others = {self.time, self.time_step, self.run, *self.keep}
+        texts = {name for name in others if isinstance(name, str) and name}
+        return {*self.signal_columns, *texts}
+
+    @property
+    def used_columns(self) -> tuple[str, ...]:
+        """The columns that the mapping uses, as it and as its runs call them."""
+        of_runs = [name for columns in self.runs.values() for name in columns.values()]
+        return tuple(sorted({*self._names_used, *of_runs}))
 
     def of(self, role: Role) -> tuple[Signal, ...]:
         """Returns the signals of one role."""
@@ -332,23 +424,59 @@ class LogMapping:
         Raises:
             SettingError: A key or value is wrong.
         """
-        keys = ("time", "keep", *_PLAIN_KEYS, _AXES_KEY, *ROLES)
+        keys = ("time", "keep", "names", "run", "runs", *_PLAIN_KEYS, _AXES_KEY, *ROLES)
         _check_keys("mapping", content, keys)
         signals = [signal for role in ROLES for signal in _read_signals(role, content)]
         time = content.get("time") or {}
-        if isinstance(time, str):
-            time = {"column": time}
-        _check_keys("time", time, ("column", "unit"))
-        keep = _read_ranges(content.get("keep") or {})
+        if not isinstance(time, Mapping):
+            time = {"column": _as_name(time)}
+        _check_keys("time", time, ("column", "unit", "step"))
         settings = {key: content[key] for key in _PLAIN_KEYS if key in content}
         return cls(
             signals=tuple(signals),
-            time=time.get("column", ""),
+            time=_as_name(time.get("column", "")),
             time_unit=time.get("unit", "s"),
-            keep=keep,
+            time_step=time.get("step"),
+            names=_read_names("names", content.get("names") or ()),
+            run=_as_name(content.get("run", "")),
+            runs=_read_runs(content.get("runs") or {}),
+            keep=_read_ranges(content.get("keep") or {}),
             axes=content.get(_AXES_KEY, ""),
             **settings,
         )
+
+
+def _as_name(column: Any) -> Any:
+    """Returns the number of a column as a text; all else as it is."""
+    is_number = isinstance(column, int) and not isinstance(column, bool)
+    return str(column) if is_number else column
+
+
+def _read_names(key: str, names: Any) -> tuple[str, ...]:
+    """Reads different names of columns."""
+    if isinstance(names, str) or not isinstance(names, Sequence):
+        raise SettingError(key, f"must be a list of names; got {names!r:.200}")
+    texts = tuple(_as_name(name) for name in names)
+    are_texts = all(isinstance(name, str) and name for name in texts)
+    if not are_texts or len(set(texts)) < len(texts):
+        raise SettingError(key, f"must be different names; got {list(names)!r:.200}")
+    return texts
+
+
+def _read_runs(content: Any) -> dict[str, dict[str, str]]:
+    """Reads which column each name means, for each run."""
+    _check_keys("runs", content, None)
+    runs = {}
+    for run, columns in content.items():
+        _check_keys(f"runs.{run}", columns, None)
+        names = {_as_name(name): _as_name(column) for name, column in columns.items()}
+        for name, column in names.items():
+            if not isinstance(column, str):
+                raise SettingError(
+                    f"runs.{run}.{name}", f"must be a column; got {column!r:.200}"
+                )
+        runs[str(run)] = names
+    return runs
 
 
 def _read_signals(role: Role, content: Mapping[str, Any]) -> list[Signal]:
@@ -357,11 +485,13 @@ def _read_signals(role: Role, content: Mapping[str, Any]) -> list[Signal]:
     _check_keys(role, entries, None)
     signals = []
     for name, entry in entries.items():
-        if isinstance(entry, Sequence):
+        if isinstance(entry, Sequence | int):
             entry = {"columns": entry}
         _check_keys(f"{role}.{name}", entry, _SIGNAL_KEYS)
         columns = entry.get("columns") or ()
-        columns = (columns,) if isinstance(columns, str) else tuple(columns)
+        if isinstance(columns, str | int):
+            columns = (columns,)
+        columns = tuple(_as_name(column) for column in columns)
         signal = Signal(name=str(name), role=role, **{**entry, "columns": columns})
         if signal.axes and content.get("model") != "rigid_body":
             raise SettingError(
@@ -383,7 +513,7 @@ def _read_ranges(content: Any) -> dict[str, tuple[float, float]]:
         low, high = limits
         lowest = -np.inf if low is None else _read_limit(column, low)
         highest = np.inf if high is None else _read_limit(column, high)
-        ranges[column] = (lowest, highest)
+        ranges[_as_name(column)] = (lowest, highest)
     return ranges
 
 

@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import pandas as pd
 
 from gpmpc._bounds import MemoryBudget
 from gpmpc.exceptions import DataError
+from gpmpc.logs._columns import padded_table
 from gpmpc.logs._file import (
     NUMBER_BYTES,
     TEXT_BYTES,
@@ -41,7 +41,7 @@ def read_npz(path: Path, options: ReadOptions) -> LogFile:
     declared = _declared_arrays(path)
     tables = {name: array for name, array in declared.items() if array.is_table}
     _take_memory(path, tables)
-    columns: dict[str, np.ndarray] = {}  # pandas names arrays of different lengths
+    columns: dict[str, np.ndarray] = {}
     with np.load(path, allow_pickle=False) as archive:
         for name, array in tables.items():
             values = archive[name]
@@ -51,7 +51,7 @@ def read_npz(path: Path, options: ReadOptions) -> LogFile:
             for i, column in enumerate(values.T):
                 columns[f"{name}[{i}]"] = column
     unread = sorted(declared.keys() - tables.keys())
-    return LogFile({"": pd.DataFrame(columns)}, unread_columns(path, unread))
+    return LogFile({"": padded_table(columns)}, unread_columns(path, unread))
 
 
 def _take_memory(path: Path, tables: dict[str, _DeclaredArray]) -> None:

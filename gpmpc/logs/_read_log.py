@@ -8,6 +8,7 @@ import numpy as np
 
 from gpmpc._bounds import MemoryBudget
 from gpmpc.exceptions import DataError
+from gpmpc.logs._columns import check_column, named_columns, runs_side_by_side
 from gpmpc.logs._conventions import read_rigid_bodies
 from gpmpc.logs._file import Tables, run_name
 from gpmpc.logs._findings import Finding, RunFindings
@@ -16,7 +17,6 @@ from gpmpc.logs._frames import with_axes_of_files
 from gpmpc.logs._log import Log, LogRun
 from gpmpc.logs._mapping import LogMapping
 from gpmpc.logs._run_tables import RunTable, tabulate
-from gpmpc.logs._signals import check_column
 from gpmpc.logs._usable_rows import select_rows, usual_spread
 
 SHORTEST_STEP = 1e-5  # [s] of rows that are measured one by one
@@ -33,8 +33,7 @@ def read_log(
     """Reads the runs of one file or several.
 
     Args:
-        files: Each ends in .csv, .tsv (either also with .gz), .parquet, .npz, .mcap (of
-            this package or of ROS 2) or .ulg.
+        files: Of the kinds in docs/log_files.md.
         mapping: What the columns mean: a YAML file, plain data or a ``LogMapping``.
         partial: Takes what is whole of unfinished or damaged files; findings say what
             is lost.
@@ -89,12 +88,14 @@ def _read_run_tables(
         file = read_file(path, topics, partial=partial, stamp=mapping.stamp)
         findings.extend(file.findings)
         budget = MemoryBudget(path)  # of the rows; the reader had one of its own
-        for run, tables_of_run in _split_into_runs(path, file.tables, mapping):
+        named = named_columns(path, file.tables, mapping)
+        for run, tables_of_run in _split_into_runs(path, named, mapping):
             if run in tables:
                 raise DataError(
                     f"run {run!r} comes from two files: give the files different names"
                 )
-            where = f"{path}, run {run}" if mapping.run else str(path)
+            in_file = mapping.run or mapping.runs
+            where = f"{path}, run {run}" if in_file else str(path)
             run_findings = RunFindings(run, findings)
             tables[run] = tabulate(where, tables_of_run, mapping, run_findings, budget)
     if not tables:
@@ -105,9 +106,10 @@ def _read_run_tables(
 def _split_into_runs(
     path: Path, tables: Tables, mapping: LogMapping
 ) -> Iterator[tuple[str, Tables]]:
-    """Yields the runs of a file with their names: one, or those that a column names."""
+    """Yields the runs of a file with their names: one, or those of the mapping."""
     if not mapping.run:
-        yield run_name(path), tables
+        for run, tables_of_run in runs_side_by_side(path, tables, mapping):
+            yield f"{run_name(path)}:{run}" if run else run_name(path), tables_of_run
         return
     if "" not in tables:
         raise DataError(

@@ -170,6 +170,10 @@ class Samples(NamedTuple):
     time: Array  # (K,) [s]
     values: Array  # (K, c); those with a NaN are no samples
 
+    def column(self, index: int) -> "Samples":
+        """Returns the samples of one column."""
+        return Samples(self.time, self.values[:, index : index + 1])
+
 
 class Interpolation(NamedTuple):
     """How the values between samples are found."""

@@ -28,6 +28,7 @@ from gpmpc.logs._resampling import (
     grid_of_rows,
     resample,
 )
+from gpmpc.logs._row_times import row_times
 from gpmpc.logs._signals import nan_zero_dropouts, read_column, read_signal
 
 USUAL_GAP = 1.5  # time steps; a longer one is a gap where the mapping names none
@@ -130,9 +131,15 @@ def _read_time(where: str, table: pd.DataFrame, mapping: LogMapping) -> Array:
     if mapping.time:
         unit = TIME_UNITS[mapping.time_unit]
         return read_column(where, table, mapping.time) * unit
+    stamps = row_times(where, table, mapping)
+    if stamps is not None:
+        return stamps
     column = STAMP if STAMP in table else "timestamp"
-    if column not in table and mapping.rate:
-        return np.arange(len(table)) / mapping.rate  # rows at a rate that is declared
+    if column not in table:
+        raise DataError(
+            f"{where}: the mapping names no column of stamps (time: NAME) and no "
+            "constant step of the rows (time: {step: 0.1})"
+        )
     return read_column(where, table, column)
 
 
@@ -179,7 +186,7 @@ def _signal_on_grid(
     samples: Samples, grid: Grid, signal: Signal, mapping: LogMapping
 ) -> Array:
     """Resamples a signal to the rows of a grid (G, c), if there is need."""
-    if mapping.rate is None and signal.delay == 0:
+    if mapping.rate is None and not any(signal.delays):
         return samples.values  # the rows of the grid are those of the table
     usual_step = float(np.median(np.diff(samples.time)))
     if mapping.rate is not None:
@@ -190,7 +197,13 @@ def _signal_on_grid(
         angles=signal.kind == "angle",
     )
     # What was measured at a time has a stamp that is later by the delay.
-    return resample(samples, grid.time + signal.delay, interpolation)
+    if len(set(signal.delays)) == 1:
+        return resample(samples, grid.time + signal.delays[0], interpolation)
+    columns = [
+        resample(samples.column(i), grid.time + delay, interpolation)
+        for i, delay in enumerate(signal.delays)
+    ]
+    return np.concatenate(columns, axis=1)
 
 
 def _rows_outside(

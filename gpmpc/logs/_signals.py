@@ -13,11 +13,11 @@ from scipy.spatial.transform import Rotation
 
 from gpmpc._dynamics import Array
 from gpmpc.exceptions import DataError
+from gpmpc.logs._columns import check_column
 from gpmpc.logs._dropouts import sentinels, zero_dropouts
 from gpmpc.logs._findings import RunFindings
 from gpmpc.logs._mapping import Signal
 
-LISTED_COLUMNS = 12  # of a table, where one is missing
 LARGEST_ANGLE = 4 * np.pi  # [rad]; larger ones are rather degrees
 NORM_TOLERANCE = 0.05  # of unit quaternions
 
@@ -44,16 +44,6 @@ def read_column(where: str, table: pd.DataFrame, column: str) -> Array:
             "expected a number"
         )
     return numbers
-
-
-def check_column(where: str, table: pd.DataFrame, column: str) -> None:
-    """Raises ``DataError`` where a table has no such column."""
-    if column in table:
-        return
-    listed = ", ".join(map(str, table.columns[:LISTED_COLUMNS]))
-    if len(table.columns) > LISTED_COLUMNS:
-        listed += ", ..."
-    raise DataError(f"{where}: column {column!r} is missing; it has {listed}")
 
 
 def nan_zero_dropouts(

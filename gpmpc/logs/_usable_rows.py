@@ -72,10 +72,9 @@ def select_rows(
         rows.leave_out(at_rest, "at rest", "where nothing moves")
     is_missing = np.asarray(np.isnan(table.values).any(axis=1))
     rows.leave_out(is_missing, "missing value", "in a gap or without a value")
-    if mapping.held == "drop":
-        _leave_out_held_values(rows, table.name, values.states, mapping)
-        motion = _motion(values.states, spread, step)
-        _note_held_sensors(values.states, motion, mapping, findings)
+    _leave_out_held_values(rows, table.name, values.states, mapping)
+    motion = _motion(values.states, spread, step)
+    _note_held_sensors(values.states, motion, mapping, findings)
     used = np.flatnonzero(rows.usable)
     if len(used) < 2:
         text = "no row can be used: the run is left out"
@@ -115,6 +114,8 @@ def _leave_out_held_values(
     for signal, columns in zip(
         mapping.of("states"), mapping.space.columns, strict=True
     ):
+        if (signal.held or mapping.held) == "use":
+            continue
         if len(signal.columns) < 2:  # a single one may repeat by its resolution
             continue
         repeats = (states[1:, columns] == states[:-1, columns]).all(axis=1)
@@ -145,7 +146,7 @@ def _note_held_sensors(
     for signal, columns in zip(
         mapping.of("states"), mapping.space.columns, strict=True
     ):
-        if signal.is_attitude:
+        if signal.is_attitude or (signal.held or mapping.held) == "use":
             continue
         for index, name in enumerate(signal.columns, start=columns.start):
             others_move = np.any(np.delete(motion, index, axis=1), axis=1)

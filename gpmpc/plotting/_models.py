@@ -237,6 +237,7 @@ def _draw_intervals(axis: Axes, judgement: "Judgement", group: int) -> None:
 @styled
 def inspection_figure(inspection: "Inspection") -> Figure:
     """Draws each channel over the time, with its gaps, on one page."""
+    over_rows = inspection.streams["rate [Hz]"].isna().all()
     channels = list(inspection.lines.items())[:_CHANNELS_PER_PAGE]
     if not channels:
         return _empty_page(inspection.title)
@@ -252,7 +253,7 @@ def inspection_figure(inspection: "Inspection") -> Figure:
         axis.set_ylabel(name, rotation=0, ha="right", va="center", fontsize=7)
         axis.tick_params(labelsize=7)
     for axis in axes[-1]:
-        axis.set_xlabel("time [s]")
+        axis.set_xlabel("row" if over_rows else "time [s]")
     for axis in axes.T.flat[len(channels) :]:
         axis.set_visible(False)
     figure.suptitle(inspection.title, fontsize=10)

@@ -15,6 +15,7 @@ import numpy as np
 import pandas
 import pyarrow
 import pyarrow.parquet
+import scipy.io
 import zstandard
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from mcap.writer import Writer
@@ -350,3 +351,23 @@ def nested_ulog(path, depth=5, width=1000):
     formats += ulog_message(b"A", subscription)
     formats += ulog_message(b"D", struct.pack("<HQ", 7, 1))
     return ulog(path, {}, formats=formats)
+
+
+def mat_bomb(path):
+    """Zeros: a MATLAB file of 0.1 MB that unfolds to 80 MB."""
+    scipy.io.savemat(path, {"angle": np.zeros((10_000_000, 1))}, do_compression=True)
+    return path
+
+
+def mat_of_nested_cells(path, depth=100_000):
+    """A MATLAB file whose cells lie within each other, deeper than any stack."""
+    flags = struct.pack("<IIII", 6, 8, 1, 0)
+    dimensions = struct.pack("<IIii", 5, 8, 1, 1)
+    head = flags + dimensions + struct.pack("<II", 1, 0)  # and an empty name
+    cells = [
+        struct.pack("<II", 14, i * (len(head) + 8) + len(head)) + head
+        for i in range(depth)
+    ]
+    start = b"MATLAB 5.0 MAT-file".ljust(124) + b"\0\1IM"
+    path.write_bytes(start + b"".join(reversed(cells)))
+    return path

@@ -85,6 +85,8 @@ BOMBS = {  # by the name of the file
     "a head that lies.npz": strange.npz_with_a_head_that_lies,
     "ten million columns.npz": strange.npz_of_many_columns,
     "constant columns.parquet": strange.parquet_bomb,
+    "zeros.mat": strange.mat_bomb,
+    "cells within cells.mat": strange.mat_of_nested_cells,
     "rows.csv.gz": strange.csv_bomb,
     "one line.csv.gz": strange.csv_of_one_line,
     "words.csv.gz": lambda path: strange.csv_bomb(path, b"0,a,b,c\n", 20_000_000),

@@ -51,6 +51,13 @@ def parse(folder, content):
         "# flown on a Tuesday\n# " + TEXT,
         TEXT.replace("\n0.5,", "\n# a remark\n0.5,"),
         TEXT.replace(",", ", "),
+        TEXT.replace(",", " "),
+        TEXT.replace(",", "   "),
+        TEXT.replace(",", ",").replace("\n", ",\n"),
+        TEXT.replace("\n", ",\n").replace("t,x,u,", "t,x,u"),
+        TABLE.to_csv(index=False, sep=" ", decimal=","),
+        TABLE.to_string(index=False, float_format="{:.17g}".format) + "\n",
+        "% t x u\n" + TEXT.partition("\n")[2].replace(",", " "),
     ],
 )
 def test_every_way_of_writing_numbers_is_read(tmp_path, content):
@@ -82,9 +89,10 @@ def test_a_last_line_without_an_end_is_left_out_and_said(tmp_path, missing):
         ("t;x;u [°]\n0;1;2\n".encode("latin-1"), "byte 0xb0 near line 1 is no text in"),
         (b"", "no line with the names"),
         (b"\n\n# nothing\n", "no line with the names"),
-        ("t,x,x\n0,1,2\n", "must name every column differently"),
-        ("0,1,2\n0,1,2\n", "must name every column differently"),
-        ("0;1,5;2\n0;1;2\n", "must name every column differently"),
+        ("t,x,x\n0,1,2\n", r"column 'x' stands there 2 times: .* 'x \(column 3\)'"),
+        ("0,1,2\n0,1,2\n", "column 't' is missing; it has 1, 2, 3"),
+        ("x\n1,5\n2,5\n", "is the comma the decimal mark too"),
+        ("t x u\n0 1 2\n1 2\n", "row 2 has 2 fields, others 3"),
     ],
 )
 def test_what_cannot_be_read_is_refused_by_name(tmp_path, content, reason):

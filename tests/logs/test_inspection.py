@@ -10,7 +10,7 @@ import pandas
 import pytest
 
 from gpmpc.cli._learn import _FileMemory
-from gpmpc.exceptions import DataError
+from gpmpc.exceptions import DataError, SettingError
 from gpmpc.logs import LogMapping, inspect_log
 from gpmpc.plotting import inspection_figure, png
 
@@ -71,8 +71,15 @@ def test_an_input_that_follows_the_states_is_named(table, tmp_path):
     assert inspection.follows["noisy"] < 0.1
     assert any("u follows the states" in warning for warning in inspection.warnings)
     table.drop(columns="t").to_csv(tmp_path / "bare.csv", index=False)
-    with pytest.raises(DataError, match="no column of the time"):
-        inspect_log(tmp_path / "bare.csv")
+    bare = inspect_log(tmp_path / "bare.csv")
+    assert np.isnan(bare.streams.loc[0, "rate [Hz]"])
+    assert any("values stand over their rows" in text for text in bare.warnings)
+    timed = inspect_log(tmp_path / "bare.csv", time_step=0.004)
+    assert timed.streams.loc[0, "rate [Hz]"] == pytest.approx(250)
+    with pytest.raises(DataError, match="column 'clock' is missing"):
+        inspect_log(tmp_path / "bare.csv", time="clock")
+    with pytest.raises(SettingError, match="must stand in the mapping"):
+        inspect_log(tmp_path / "bare.csv", mapping, time="a")
 
 
 def test_the_command_writes_a_page(table, tmp_path):

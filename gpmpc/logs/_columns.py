@@ -1,0 +1,146 @@
+"""Finds the columns that a mapping names: by name, by number, or one set for each run.
+
+A file of one table may name no columns, name one twice, or hold runs side by side, such
+as the data for estimation and those for validation.
+"""
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pandas as pd
+
+from gpmpc.exceptions import DataError
+from gpmpc.logs._file import STAMP, Tables
+from gpmpc.logs._mapping import LogMapping
+
+LISTED_COLUMNS = 12  # of a table, where one is missing
+
+
+class TablesOfRun(NamedTuple):
+    """The tables of one of the runs that a mapping finds in a file."""
+
+    run: str  # empty where the file is the run
+    tables: Tables
+
+
+def with_unique_names(table: pd.DataFrame) -> pd.DataFrame:
+    """Adds its number to the name of each column whose name comes more than once."""
+    if not table.columns.has_duplicates:
+        return table
+    is_repeated = table.columns.duplicated(keep=False)
+    names = [
+        f"{name} (column {number})" if repeated else name
+        for number, (name, repeated) in enumerate(
+            zip(table.columns, is_repeated, strict=True), start=1
+        )
+    ]
+    return table.set_axis(names, axis=1)
+
+
+def check_column(where: str, table: pd.DataFrame, column: str) -> None:
+    """Raises ``DataError`` where a table has no such column."""
+    if column in table:
+        return
+    repeated = [name for name in table if str(name).startswith(f"{column} (column ")]
+    if repeated:
+        raise DataError(
+            f"{where}: column {column!r} stands there {len(repeated)} times: name one "
+            f"of them, {', '.join(map(repr, repeated))}"
+        )
+    listed = ", ".join(map(str, table.columns[:LISTED_COLUMNS]))
+    if len(table.columns) > LISTED_COLUMNS:
+        listed += ", ..."
+    raise DataError(f"{where}: column {column!r} is missing; it has {listed}")
+
+
+def named_columns(path: str | Path, tables: Tables, mapping: LogMapping) -> Tables:
+    """Gives the columns of a single table the names by which the mapping calls them.
+
+    Args:
+        path: Of the file, for errors.
+        tables: Of the file; those of topics stay as they are.
+        mapping: Its ``names`` replace those of the file; a number that it uses, and
+            that no column is called by, is the number of a column.
+
+    Raises:
+        DataError: The mapping has more names than the file has columns.
+    """
+    if "" not in tables:
+        return tables
+    table = tables[""]
+    if len(mapping.names) > len(table.columns):
+        raise DataError(
+            f"{path}: the mapping names {len(mapping.names)} columns; there are "
+            f"{len(table.columns)}"
+        )
+    if mapping.names:
+        others = table.columns[len(mapping.names) :]
+        table = with_unique_names(table.set_axis([*mapping.names, *others], axis=1))
+    by_number = {
+        name: table.iloc[:, number - 1]
+        for name in mapping.used_columns
+        if (number := column_number(table, name))
+    }
+    return {**tables, "": table.assign(**by_number)}
+
+
+def column_number(table: pd.DataFrame, name: str) -> int:
+    """Returns which column a number means, from 1 on; 0 of a column's name."""
+    if name in table or not (name.isascii() and name.isdecimal()):
+        return 0
+    number = int(name)
+    return number if number <= len(table.columns) else 0
+
+
+def runs_side_by_side(
+    path: str | Path, tables: Tables, mapping: LogMapping
+) -> Iterator[TablesOfRun]:
+    """Yields the runs for which the mapping has columns of their own; one without.
+
+    Rows behind the last value of a run belong to longer ones.
+
+    Raises:
+        DataError: A column is missing.
+    """
+    if not mapping.runs:
+        yield TablesOfRun("", {**tables, **_until_last_value(tables, mapping)})
+        return
+    if "" not in tables:
+        raise DataError(f"{path}: has topics, and is one run; runs needs one table")
+    table = tables[""]
+    for run, columns in mapping.runs.items():
+        for column in columns.values():
+            check_column(f"{path}, run {run}", table, column)
+        own = table.assign(**{name: table[column] for name, column in columns.items()})
+        yield TablesOfRun(run, _until_last_value({"": own}, mapping))
+
+
+def _until_last_value(tables: Tables, mapping: LogMapping) -> Tables:
+    """Cuts a single table behind the last row in which a column of the mapping has one.
+
+    Stamps count as well: rows without any other value are rows of the run.
+    """
+    if "" not in tables:
+        return {}
+    table = tables[""]
+    columns = [
+        column
+        for column in (*mapping.signal_columns, mapping.time, STAMP, "timestamp")
+        if column in table
+    ]
+    if not columns:
+        return {"": table}
+    has_value = table[columns].notna().any(axis=1).to_numpy()
+    rows = int(np.flatnonzero(has_value)[-1]) + 1 if has_value.any() else len(table)
+    return {"": table.iloc[:rows]}
+
+
+def padded_table(columns: Mapping[str, np.ndarray]) -> pd.DataFrame:
+    """Makes a table of columns (K,) of different lengths; NaN stands behind short ones.
+
+    A single number stands in the first row.
+    """
+    series = {name: pd.Series(values) for name, values in columns.items()}
+    return pd.DataFrame(series)

@@ -1,0 +1,40 @@
+"""Makes the times of rows that follow each other at a constant step, without stamps."""
+
+import numpy as np
+import pandas as pd
+
+from gpmpc._dynamics import Array
+from gpmpc.exceptions import DataError
+from gpmpc.logs._file import STAMP
+from gpmpc.logs._mapping import TIME_UNITS, LogMapping
+from gpmpc.logs._signals import read_column
+
+
+def row_times(where: str, table: pd.DataFrame, mapping: LogMapping) -> Array | None:
+    """Returns the times (K,) [s] of rows whose step the mapping says; None otherwise.
+
+    Its step is ``time.step``, or that of its ``rate`` where a table has no stamps.
+
+    Raises:
+        DataError: The column that ``time.step`` names does not hold one positive number.
+    """
+    step = mapping.time_step
+    if isinstance(step, str):
+        step = _only_number(where, table, step)
+    if step is not None:
+        return np.arange(len(table), dtype=float) * step * TIME_UNITS[mapping.time_unit]
+    if mapping.rate and STAMP not in table and "timestamp" not in table:
+        return np.arange(len(table), dtype=float) / mapping.rate
+    return None
+
+
+def _only_number(where: str, table: pd.DataFrame, column: str) -> float:
+    """Returns the number that a column holds once, or in all of its rows."""
+    values = read_column(where, table, column)
+    numbers = np.unique(values[np.isfinite(values)])
+    if len(numbers) != 1 or numbers[0] <= 0:
+        raise DataError(
+            f"{where}: column {column!r} must hold one positive number, the time step; "
+            f"it has {len(numbers)} different ones"
+        )
+    return float(numbers[0])
