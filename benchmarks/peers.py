@@ -315,7 +315,7 @@ def measure(
 def table(rows: Sequence[Mapping[str, Any]]) -> str:
     """Formats the rows of one comparison."""
     columns = {
-        "what": "", "median": "ms, median", "p99": "99 %", "evicted": "evicted", "times_ours": "times ours",
+        "what": "", "median": "ms, median", "p99": "99 %", "inside": "ms, inside", "evicted": "evicted", "times_ours": "times ours",
         "times_ours_evicted": "times ours, evicted", "kkt": "KKT, median", "kkt_worst": "worst",
         "within": f"within {ACCURACY:g}", "samples": "calls", "note": "note",
     }  # fmt: skip
