@@ -37,8 +37,8 @@ from gpmpc.cli._settings import folder_of, write_files
 from gpmpc.cli._terminal import print_error, progress_bar
 from gpmpc.studies._run_folder import (
     PLAN,
-    RunState,
     RunFolder,
+    RunState,
     folder_name,
     of_other_code,
 )

@@ -6,6 +6,7 @@ and no window opens.
 
 from gpmpc.plotting._animation import animate
 from gpmpc.plotting._film import film
+from gpmpc.plotting._flown import flight_figure
 from gpmpc.plotting._models import (
     calibration_figure,
     innovations_figure,
@@ -21,6 +22,7 @@ __all__ = [
     "animate",
     "calibration_figure",
     "film",
+    "flight_figure",
     "innovations_figure",
     "inputs_figure",
     "inspection_figure",

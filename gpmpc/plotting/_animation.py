@@ -1,9 +1,8 @@
 """Animates a flight: the path flown, the plan, and how certain the plan was.
 
 Left the whole flight from above (x, y) and its height, right what the controller saw:
-its plan with 2-sigma ellipses of the predicted positions. These are often far smaller
-than the plan is long; they are then drawn enlarged, and the factor is written into the
-picture.
+its plan with 2-sigma ellipses of the predicted positions, to scale. These are often far
+smaller than the plan is long: how wide the tube is stands below, on an axis of its own.
 """
 
 from collections.abc import Callable
@@ -17,6 +16,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import EllipseCollection
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from gpmpc.exceptions import UnsupportedModel
 from gpmpc.plotting._style import DASHED, FLOWN, PLAN, REFERENCE, TUBE, styled
@@ -29,9 +29,7 @@ Array = np.ndarray
 _MOST_FRAMES = 150  # of longer flights, steps are left out evenly
 _FRAME_RATE = 15  # frames per second
 _DPI = 80
-_MAGNIFICATIONS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
-# Half axis of an ellipse that is large enough, in widths of the view.
-_VISIBLE = 0.06
+_LENGTHS = {"m": 1.0, "cm": 1e2, "mm": 1e3, "µm": 1e6}  # units, in one metre
 
 
 def animate(run: "Run", path: str | Path) -> None:
@@ -142,12 +140,12 @@ class FlightPicture:
         self._flight = flight
         self._overview = _MapPanel(self.figure.add_subplot(grid[0, 0]), flight)
         self._height = _HeightPanel(self.figure.add_subplot(grid[1, 0]), flight)
-        self._close_up = _MapPanel(self.figure.add_subplot(grid[:, 1]), flight)
+        self._close_up = _MapPanel(self.figure.add_subplot(grid[0, 1]), flight)
         self._close_up.plan.set(marker="o", markersize=3)
         self._half_width = _half_width_of_plans(flight)
-        self._tube = _Tube(
-            self._close_up.axis, _magnification(flight, self._half_width)
-        )
+        self._close_up.axis.set_title("plan with its 2-sigma tube", fontsize="medium")
+        self._tube = _Tube(self._close_up.axis)
+        self._width = _WidthPanel(self.figure.add_subplot(grid[1, 1]), flight)
         _look_at_flight(self._overview.axis, flight)
         (self._target,) = self._close_up.axis.plot(
             [], [], "x", color=REFERENCE, markersize=8, zorder=4
@@ -171,6 +169,7 @@ class FlightPicture:
         self._follow_plan(k)
         stages = flight.is_planned[k]
         self._tube.draw(flight.plans[k][stages], flight.plan_covariances[k][stages])
+        self._width.draw(k)
         remark = "; solve failed" if flight.failed[k] else ""
         self._title.set_text(
             f"{flight.times[k]:.4g} s: "
@@ -232,17 +231,50 @@ class _HeightPanel:
         self.flown.set_data(self._flight.times[: k + 1], self._flight.heights[: k + 1])
 
 
-class _Tube:
-    """The 2-sigma ellipses of a plan's positions, magnified where they are small."""
+class _WidthPanel:
+    """Half the width of a plan's 2-sigma tube, over the steps ahead."""
 
-    def __init__(self, axis: Axes, magnification: int):
+    def __init__(self, axis: Axes, flight: _Flight):
+        widths = 2 * flight.plan_stds
+        widths[~flight.is_planned] = np.nan
+        finite = widths[np.isfinite(widths)]
+        largest = float(np.quantile(finite, 0.98)) if len(finite) else 0.0
+        unit, scale = _length_unit(largest)
+        self._widths = scale * widths  # (K, H + 1, 2)
+        self._lines = [
+            axis.plot([], [], color=colour, linestyle=dashes, label=name)[0]
+            for name, colour, dashes in (("x", FLOWN, "-"), ("y", PLAN, DASHED))
+        ]
+        axis.set(
+            xlabel="steps ahead",
+            ylabel=f"2 sigma [{unit}]",
+            xlim=(0, max(flight.plans.shape[1] - 1, 1)),
+            ylim=(0, 1.15 * scale * largest or 1.0),
+        )
+        axis.xaxis.set_major_locator(MaxNLocator(integer=True))
+        axis.legend(loc="upper left", ncols=2, fontsize="small")
+
+    def draw(self, k: int) -> None:
+        """Draws the plan of step k."""
+        stages = np.arange(self._widths.shape[1])
+        for line, widths in zip(self._lines, self._widths[k].T, strict=True):
+            line.set_data(stages, widths)
+
+
+def _length_unit(largest: float) -> tuple[str, float]:
+    """Returns the unit in which a length [m] is a number of 1 or more, and a metre."""
+    for unit, scale in _LENGTHS.items():
+        if scale * largest >= 1:
+            return unit, scale
+    return "m", 1.0
+
+
+class _Tube:
+    """The 2-sigma ellipses of a plan's positions."""
+
+    def __init__(self, axis: Axes):
         self._axis = axis
-        self._magnification = magnification
         self._ellipses: EllipseCollection | None = None
-        enlarged = ""
-        if magnification > 1:
-            enlarged = f", the tube {magnification} times enlarged"
-        axis.set_title(f"plan with its 2-sigma tube{enlarged}", fontsize="medium")
 
     def draw(self, means: Array, covariances: Array) -> None:
         """Draws ellipses of means (H, 2) and covariances (H, 2, 2) for the last ones.
@@ -256,7 +288,7 @@ class _Tube:
             return
         variances, directions = np.linalg.eigh(covariances)
         half_axes = 2 * np.sqrt(variances.clip(0))
-        minor, major = 2 * self._magnification * half_axes.T
+        minor, major = 2 * half_axes.T
         major_direction = directions[:, :, 1]
         self._ellipses = EllipseCollection(
             widths=major,
@@ -305,17 +337,3 @@ def _half_width_of_plans(flight: _Flight) -> float:
         return 1.0
     lengths = np.ptp(complete_plans, axis=1).max(axis=1)
     return max(0.62 * float(np.quantile(lengths, 0.98)), 0.5)
-
-
-def _magnification(flight: _Flight, half_width: float) -> int:
-    """Returns the least factor by which a typical ellipse can be seen in a view."""
-    stds = flight.plan_stds[flight.is_planned]
-    if not len(stds):
-        return 1
-    half_axis = 2 * float(np.median(stds.max(axis=1)))
-    if not half_axis > 0:  # so that NaN ends here too
-        return 1
-    for factor in _MAGNIFICATIONS:
-        if factor * half_axis >= _VISIBLE * 2 * half_width:
-            return factor
-    return _MAGNIFICATIONS[-1]

@@ -1,7 +1,7 @@
 """Draws one recorded flight: how it tracked, what acted, how long it took.
 
 Cao, Lai and Alam (2017), figures 2 to 4, show positions and inputs over time. The tube
-here is what the controller expected one step before, with two standard deviations.
+here is what the controller predicted one step before, with two standard deviations.
 """
 
 import textwrap
@@ -67,6 +67,7 @@ class _Tracked(NamedTuple):
 
     title: str  # its name with its unit
     unit: str
+    is_angle: bool  # its reference moves by full turns
     flown: np.ndarray  # (K,)
     reference: np.ndarray  # (K,)
     expected: np.ndarray  # (K,) mean that was predicted one step before
@@ -77,27 +78,36 @@ class _Tracked(NamedTuple):
 def tracking_figure(run: "Run") -> Figure:
     """Draws every tracked state and angle over time against its reference.
 
-    Below it stands the error with the tube.
+    Below it stand the error of tracking, and the error of the prediction one step
+    ahead with its tube, where something was predicted.
     """
     tracked_states = _tracked_states(run)
     n = len(tracked_states)
+    is_predicted = any(
+        np.isfinite(state.expected_std).any() for state in tracked_states
+    )
     figure, axes = make_figure(
         width=2.9 * max(n, 2),
-        height=4.8,
-        rows=2,
+        height=6.2 if is_predicted else 4.8,
+        rows=3 if is_predicted else 2,
         columns=n,
         title=_title_of(run),
         sharex=True,
-        gridspec_kw={"height_ratios": [3, 2]},
+        gridspec_kw={"height_ratios": [3, 2, 2] if is_predicted else [3, 2]},
     )
+    tube = "$\\pm 2\\sigma$ of the prediction, " + _noise_in_words(run)
     unit_of_last = None
-    for (above, below), state in zip(axes.T, tracked_states, strict=True):
-        _draw_path(above, run.times, state)
-        _draw_error(below, run.times, state)
-        _mark_failures(run, above, below)
-        below.set_xlabel("time [s]")
+    for column, state in zip(axes.T, tracked_states, strict=True):
+        _draw_path(column[0], run.times, state)
+        _draw_error(column[1], run.times, state)
+        if is_predicted:
+            _draw_prediction_error(column[2], run.times, state, tube)
+        _mark_failures(run, *column)
+        column[-1].set_xlabel("time [s]")
         if state.unit != unit_of_last:
-            below.set_ylabel(name_of("error", state.unit))
+            column[1].set_ylabel(name_of("tracking\nerror", state.unit))
+            if is_predicted:
+                column[2].set_ylabel(name_of("prediction\nerror", state.unit))
         unit_of_last = state.unit
     legend_below(figure, axes.flat)
     figure.align_ylabels(axes[:, 0])
@@ -134,6 +144,7 @@ def _tracked_states(run: "Run") -> list[_Tracked]:
             _Tracked(
                 title=name_of(name, unit, z_is_down),
                 unit=unit,
+                is_angle=name in angles,
                 flown=flown,
                 reference=reference,
                 expected=mean,
@@ -147,8 +158,7 @@ def _draw_path(axis: Axes, times: np.ndarray, state: _Tracked) -> None:
     """Draws a state over time against its reference."""
     axis.plot(times, state.flown, color=FLOWN, linewidth=1.6, label="flown")
     axis.plot(
-        times,
-        state.reference,
+        *_broken(times, state.reference, state),
         color=REFERENCE,
         linewidth=1.2,
         linestyle=DASHED,
@@ -158,19 +168,43 @@ def _draw_path(axis: Axes, times: np.ndarray, state: _Tracked) -> None:
 
 
 def _draw_error(axis: Axes, times: np.ndarray, state: _Tracked) -> None:
-    """Draws the error of a state over time, with the tube that was expected."""
+    """Draws how far a state is from its reference over time."""
     axis.axhline(0, color=REFERENCE, linewidth=1, linestyle=DASHED)
-    expected_error = state.expected - state.reference
+    error = state.flown - state.reference
+    axis.plot(*_broken(times, error, state), color=FLOWN, linewidth=1.2)
+
+
+def _draw_prediction_error(
+    axis: Axes, times: np.ndarray, state: _Tracked, tube: str
+) -> None:
+    """Draws how far a state is from what was predicted one step before, with a tube."""
     axis.fill_between(
         times,
-        expected_error - 2 * state.expected_std,
-        expected_error + 2 * state.expected_std,
+        -2 * state.expected_std,
+        2 * state.expected_std,
         color=TUBE,
         alpha=0.7,
         linewidth=0,
-        label="expected one step before, noise included, $\\pm 2\\sigma$",
+        label=tube,
     )
-    axis.plot(times, state.flown - state.reference, color=FLOWN, linewidth=1.2)
+    axis.plot(times, state.flown - state.expected, color=FLOWN, linewidth=1.0)
+
+
+def _broken(
+    times: np.ndarray, values: np.ndarray, state: _Tracked
+) -> tuple[np.ndarray, np.ndarray]:
+    """Returns a line, with a gap where the reference of an angle jumps by a turn."""
+    if not state.is_angle:
+        return times, values
+    jumps = np.flatnonzero(np.abs(np.diff(state.reference)) > np.pi) + 1
+    return np.insert(times, jumps, np.nan), np.insert(values, jumps, np.nan)
+
+
+def _noise_in_words(run: "Run") -> str:
+    """Returns which noise the tube of a prediction holds."""
+    if "noise_std" in run.metadata.get("run", {}):
+        return "noise included"
+    return "as planned"
 
 
 @styled

@@ -1,0 +1,153 @@
+"""Draws a closed loop as it comes back from ``closed_loop``: one panel a unit."""
+
+from typing import NamedTuple
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from gpmpc.exceptions import ShapeError, check_kind
+from gpmpc.plotting._style import (
+    COLOURS,
+    DASHED,
+    GREY,
+    ORANGE,
+    legend_below,
+    make_figure,
+    name_of,
+    styled,
+)
+from gpmpc.simulation import Rollout
+from gpmpc.systems import System
+
+
+class _Panel(NamedTuple):
+    """Signals of one unit."""
+
+    indices: list[int]
+    unit: str
+
+
+@styled
+def flight_figure(rollout: Rollout, system: System) -> Figure:
+    """Draws states against their references, and below them inputs with their bounds.
+
+    Signals of one unit share a panel; one whose unit is not known has its own.
+
+    >>> from gpmpc.plotting import flight_figure
+    >>> from gpmpc.systems import pendulum
+    >>> flight_figure([], pendulum())
+    Traceback (most recent call last):
+    gpmpc.exceptions.SettingError: rollout: must be a Rollout of closed_loop; got list
+
+    Args:
+        rollout: What ``closed_loop`` returned.
+        system: Whose names, units and bounds of inputs are drawn.
+
+    Returns:
+        A figure; ``figure.savefig("flight.png")`` writes it.
+
+    Raises:
+        SettingError: They are of another kind.
+        ShapeError: The flight is of another system.
+
+    See Also:
+        ``tracking_figure`` and ``inputs_figure``, which draw a recording.
+    """
+    check_kind("rollout", rollout, Rollout, "a Rollout of closed_loop")
+    check_kind("system", system, System, "a System")
+    n = len(system.state_names)
+    m = len(system.input_names)
+    flown = (rollout.states.shape[1], rollout.inputs.shape[1])
+    if flown != (n, m):
+        rule = f"{system.name} has {n} states and {m} inputs"
+        raise ShapeError(f"{rule}; the flight has {flown[0]} and {flown[1]}")
+    state_panels = _panels(system, system.state_names)
+    input_panels = _panels(system, system.input_names)
+    count = len(state_panels) + len(input_panels)
+    figure, axes = make_figure(
+        width=7.2,
+        height=1.5 * count + 0.9,
+        rows=count,
+        title=f"{system.name}, {len(rollout.inputs)} steps",
+        sharex=True,
+    )
+    for axis, panel in zip(axes[:, 0], state_panels, strict=False):
+        _draw_states(axis, rollout, system, panel)
+    for axis, panel in zip(axes[len(state_panels) :, 0], input_panels, strict=True):
+        _draw_inputs(axis, rollout, system, panel)
+    for axis in axes[:, 0]:
+        for step, _ in rollout.failures:
+            axis.axvline(
+                rollout.times[step],
+                color=ORANGE,
+                linewidth=1,
+                alpha=0.6,
+                label="failed solve",
+                zorder=0,
+            )
+    axes[-1, 0].set_xlabel("time [s]")
+    legend_below(figure, axes.flat)
+    figure.align_ylabels(axes[:, 0])
+    return figure
+
+
+def _panels(system: System, names: tuple[str, ...]) -> list[_Panel]:
+    """Returns the signals by unit, in the order of their names."""
+    panels: list[_Panel] = []
+    for index, name in enumerate(names):
+        unit = system.units[name]
+        same = [panel for panel in panels if panel.unit == unit and unit != "?"]
+        if same:
+            same[0].indices.append(index)
+        else:
+            panels.append(_Panel([index], unit))
+    return panels
+
+
+def _draw_states(axis: Axes, rollout: Rollout, system: System, panel: _Panel) -> None:
+    """Draws states of one unit, each with its reference in its colour."""
+    names = [system.state_names[index] for index in panel.indices]
+    for colour, index in zip(COLOURS * len(names), panel.indices, strict=False):
+        axis.plot(
+            rollout.times,
+            rollout.references[:, index],
+            color=GREY,
+            linestyle=DASHED,
+            linewidth=1,
+            label="reference or bound",
+        )
+        axis.plot(rollout.times, rollout.states[:, index], color=colour)
+    _name_lines(axis, names, panel, system.z_down)
+
+
+def _draw_inputs(axis: Axes, rollout: Rollout, system: System, panel: _Panel) -> None:
+    """Draws inputs of one unit as steps, with their finite bounds."""
+    names = [system.input_names[index] for index in panel.indices]
+    for colour, index in zip(COLOURS * len(names), panel.indices, strict=False):
+        values = rollout.inputs[:, index]
+        # The last one holds until its step ends.
+        axis.step(
+            rollout.times, np.append(values, values[-1]), where="post", color=colour
+        )
+        for bound in (system.input_lower[index], system.input_upper[index]):
+            if np.isfinite(bound):
+                axis.axhline(
+                    bound,
+                    color=GREY,
+                    linestyle=DASHED,
+                    linewidth=1,
+                    label="reference or bound",
+                )
+    _name_lines(axis, names, panel, system.z_down)
+
+
+def _name_lines(axis: Axes, names: list[str], panel: _Panel, z_down: bool) -> None:
+    """Names a panel of one line by its axis, one of several by words beside them."""
+    if len(names) == 1:
+        axis.set_ylabel(name_of(names[0], panel.unit, z_down))
+        return
+    axis.set_ylabel(f"[{panel.unit}]")
+    drawn = [line for line in axis.lines if line.get_color() != GREY]
+    legend = axis.legend(drawn, names, loc="center left", bbox_to_anchor=(1.0, 0.5))
+    legend.set_in_layout(True)
