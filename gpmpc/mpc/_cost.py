@@ -14,6 +14,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 import torch
 
+from gpmpc._angles import state_difference
 from gpmpc._arrays import read_array
 from gpmpc._calls import explains_arguments
 from gpmpc._functions import call
@@ -88,6 +89,45 @@ class Tracking:
         Q = by_stage("Q", self.Q, horizon, 2)
         R = by_stage("R", self.R, horizon, 2)
         return np.concatenate([Q[:-1], self.terminal[None]]), R
+
+    def paid(
+        self,
+        states: Array,
+        inputs: Array,
+        references: Array,
+        previous_input: Array,
+        reference_inputs: Array | None = None,
+    ) -> Array:
+        """Computes what each of K steps cost, that of x_{k+1} and u_k (K,).
+
+        Weights are those of the first stage, wherever a step stands: what is flown has
+        no end. Angles count within half a turn.
+
+        Args:
+            states: x_0 .. x_K (K + 1, n).
+            inputs: u_0 .. u_{K-1} (K, m).
+            references: r_0 .. r_K (K + 1, n).
+            previous_input: u_{-1} (m,), from which the first increment counts.
+            reference_inputs: (K, m), where deviations from them are weighed.
+
+        Raises:
+            SettingError: Deviations are weighed, and no reference inputs were handed
+                over.
+        """
+        Q = self.Q.reshape(-1, *self.Q.shape[-2:])[0]
+        R = self.R.reshape(-1, *self.R.shape[-2:])[0]
+        error = state_difference(states[1:], references[1:], self.angles)
+        weighed = inputs
+        if self.penalized == "increments":
+            weighed = np.diff(inputs, axis=0, prepend=np.atleast_2d(previous_input))
+        elif self.penalized == "deviations":
+            if reference_inputs is None:
+                rule = "must be handed over where deviations from them are weighed"
+                raise SettingError("reference_inputs", f"{rule}; got None")
+            weighed = inputs - reference_inputs
+        costs_of_states = np.einsum("ki,ij,kj->k", error, Q, error)
+        costs_of_inputs = np.einsum("ki,ij,kj->k", weighed, R, weighed)
+        return costs_of_states + costs_of_inputs
 
 
 @explains_arguments

@@ -9,11 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from gpmpc._angles import state_difference
 from gpmpc.mpc._constraints import ConstraintRows
 from gpmpc.mpc._controller import FEASIBLE
 from gpmpc.mpc._linear_quadratic import Plan
-from gpmpc.mpc._question import Question, first_weight, held, rows_over
+from gpmpc.mpc._question import Question, held, rows_over
 from gpmpc.mpc.problem import Problem
 
 Array = np.ndarray
@@ -29,8 +28,6 @@ class StageMeter:
     def __init__(self, problem: Problem, horizon: int):
         self._problem = problem
         self._horizon = horizon
-        self._Q = first_weight(problem.cost.Q)
-        self._R = first_weight(problem.cost.R)
         self._rows = ConstraintRows(problem, horizon, "none")
         self._always = self._rows.applies.all(axis=0)
 
@@ -40,18 +37,18 @@ class StageMeter:
         They are infinite beyond a hard bound. The reference is that of the question;
         beyond its end it stands still.
         """
-        cost = self._problem.cost
+        count = len(inputs)
         reference = question.reference
-        targets = held(np.asarray(reference.states)[1:], len(inputs))
-        error = state_difference(states[1:], targets, cost.angles)
-        penalized = inputs
-        if cost.penalized == "deviations":
-            penalized = inputs - held(np.asarray(reference.inputs), len(inputs))
-        elif cost.penalized == "increments":
-            before = question.previous_input[None]
-            penalized = np.diff(inputs, axis=0, prepend=before)
-        costs = np.einsum("ki,ij,kj->k", error, self._Q, error)
-        costs += np.einsum("ki,ij,kj->k", penalized, self._R, penalized)
+        reference_inputs = None
+        if reference.inputs is not None:
+            reference_inputs = held(np.asarray(reference.inputs), count)
+        costs = self._problem.cost.paid(
+            states=states,
+            inputs=inputs,
+            references=held(np.asarray(reference.states), count + 1),
+            previous_input=question.previous_input,
+            reference_inputs=reference_inputs,
+        )
         costs += self.functions(states, inputs, question.parameters)
         return costs
 

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gpmpc.mpc import FlightJudgement, Judgement, Timing
+from gpmpc.mpc import FlightJudgement, Judgement, Timing, Tracking
 from gpmpc.status import Status
 
 Array = np.ndarray
@@ -41,6 +41,27 @@ class Rollout:
     def seconds(self) -> Array:
         """Wall time of every decision (K,) [s]."""
         return np.array([timing.total for timing in self.timings])
+
+    def paid(
+        self,
+        cost: Tracking,
+        previous_input: Array,
+        reference_inputs: Array | None = None,
+    ) -> Array:
+        """Computes what each step cost (K,); see ``Tracking.paid``.
+
+        Args:
+            cost: Of the controller, or another one to compare controllers by.
+            previous_input: Before the first step (m,).
+            reference_inputs: (K, m), where deviations from them are weighed.
+        """
+        return cost.paid(
+            states=self.states,
+            inputs=self.inputs,
+            references=self.references,
+            previous_input=previous_input,
+            reference_inputs=reference_inputs,
+        )
 
     @property
     def judgement(self) -> FlightJudgement:
