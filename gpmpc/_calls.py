@@ -88,12 +88,22 @@ def check_call(
     takes = f"{name} takes {', '.join(names) or 'no arguments'}"
     for keyword in keywords:
         if keyword not in signature.parameters:
-            meant = _nearest(keyword, names)
+            meant = _nearest(keyword, names) or _home(keyword, signature)
             raise SettingError(keyword, f"is no argument{meant}; {takes}") from None
     if reason.startswith("missing"):
         missing = reason.split("'")[1]
         raise SettingError(missing, f"is missing; {takes}") from None
     raise SettingError(name, f"{reason}; {takes}") from None
+
+
+def _home(keyword: str, signature: inspect.Signature) -> str:
+    """Returns which settings object among the defaults has a field of this name."""
+    for key, parameter in signature.parameters.items():
+        settings = parameter.default
+        if settings is not inspect.Parameter.empty and hasattr(settings, keyword):
+            kind = type(settings).__name__
+            return f" (did you mean {key}={kind}({keyword}=...)?)"
+    return ""
 
 
 def _nearest(keyword: str, names: list[str]) -> str:

@@ -489,13 +489,20 @@ def check_arguments(belief: Any, reference: Any) -> None:
         )
 
 
+_LONG = 40  # characters of a value that a message still quotes
+
+
 def check_method(key: str, value: object, method: str, example: str) -> None:
     """Raises ``SettingError`` unless a setting is an object with a method.
 
     A class of such objects is none.
     """
     if isinstance(value, type) or not hasattr(value, method):
-        got = f"the class {value.__name__}" if isinstance(value, type) else repr(value)
+        got = repr(value)
+        if isinstance(value, type):
+            got = f"the class {value.__name__}"
+        elif len(got) > _LONG:
+            got = type(value).__name__
         rule = f"must be an object with the method {method!r}, such as {example}"
         raise SettingError(key, f"{rule}; got {got}")
 

@@ -95,6 +95,11 @@ class System:
     def __post_init__(self) -> None:
         check_number("time_step", self.time_step, above=0, unit="[s]")
         check_number("substeps", self.substeps, least=1, whole=True)
+        if isinstance(self.dynamics, type):
+            name = self.dynamics.__name__
+            raise SettingError(
+                "dynamics", f"must be an object, such as {name}(); got the class {name}"
+            )
         states = _names(self.dynamics, "state_names")
         inputs = _names(self.dynamics, "input_names")
         self._set("name", self.name or type(self.dynamics).__name__)
