@@ -65,7 +65,8 @@ def main() -> None:
         "trials a second (median); over alone: median of paired ratios, and its least"
     )
     print(
-        f"{'':16}{'N':>5}{'T':>5}{'alone':>10}{'together':>10}{'torch':>10}{'over alone: together':>24}{'torch':>16}"
+        f"{'':16}{'N':>5}{'T':>5}{'alone':>10}{'together':>10}{'torch':>10}"
+        f"{'over alone: together':>24}{'torch':>16}"
     )
     for name in arguments.modes:
         for size in arguments.sizes:

@@ -108,9 +108,16 @@ def flights(
     for seed in range(arguments.seeds):
         try:
             flight = cascade_loop(
-                PLANT, cascade, references, start, arguments.steps,
-                noise=NOISE, disturbances=CASES[case], on_failure="previous_plan", seed=seed,
-            )  # fmt: skip
+                PLANT,
+                cascade,
+                references,
+                start,
+                arguments.steps,
+                noise=NOISE,
+                disturbances=CASES[case],
+                on_failure="previous_plan",
+                seed=seed,
+            )
         except GpmpcError as error:
             print(f"lost: {error}")
             lost += 1

@@ -144,10 +144,19 @@ def pendulum_plant(kind: str) -> Plant:
         NormalDist().inv_cdf,
     )
     return Plant(
-        successor, noise, lambda: np.array([0.5, 0.0]), log, goal=[0.9, 0.0], bound=(0, 0.6),
-        weights=([10.0, 0.1], [1e-2]), limits=[LIMIT], noise=NOISE, angles=[0], stages=[1],
+        successor,
+        noise,
+        lambda: np.array([0.5, 0.0]),
+        log,
+        goal=[0.9, 0.0],
+        bound=(0, 0.6),
+        weights=([10.0, 0.1], [1e-2]),
+        limits=[LIMIT],
+        noise=NOISE,
+        angles=[0],
+        stages=[1],
         quantile=heavy if kind == "heavy tails" else normal,
-    )  # fmt: skip
+    )
 
 
 def pendulum_of_rate() -> Plant:
@@ -169,10 +178,23 @@ def pendulum_of_rate() -> Plant:
         )
 
     return Plant(
-        successor, noise, lambda: np.zeros(2), log, goal=[0.9, 0.0], bound=(1, 2.5), sides=(1, -1), turn=20,
-        weights=([10.0, 0.1], [1e-2]), limits=[LIMIT], noise=NOISE * math.hypot(0.5, 2.5), angles=[0], stages=[1],
-        quantile=NormalDist().inv_cdf, steps=4000, share=0.2,
-    )  # fmt: skip
+        successor,
+        noise,
+        lambda: np.zeros(2),
+        log,
+        goal=[0.9, 0.0],
+        bound=(1, 2.5),
+        sides=(1, -1),
+        turn=20,
+        weights=([10.0, 0.1], [1e-2]),
+        limits=[LIMIT],
+        noise=NOISE * math.hypot(0.5, 2.5),
+        angles=[0],
+        stages=[1],
+        quantile=NormalDist().inv_cdf,
+        steps=4000,
+        share=0.2,
+    )
 
 
 def cart_pole() -> Plant:
@@ -200,10 +222,21 @@ def cart_pole() -> Plant:
         return states, inputs, np.array(after)
 
     return Plant(
-        successor, noise, lambda: np.zeros(4), log, goal=[0.2, 0.0, 0.0, 0.0], bound=(1, 0.04), sides=(1, -1), turn=25,
-        weights=([10.0, 1.0, 0.3, 0.1], [0.03]), limits=[3.0], quantile=NormalDist().inv_cdf, noise=scale,
-        steps=3400, share=0.3,
-    )  # fmt: skip
+        successor,
+        noise,
+        lambda: np.zeros(4),
+        log,
+        goal=[0.2, 0.0, 0.0, 0.0],
+        bound=(1, 0.04),
+        sides=(1, -1),
+        turn=25,
+        weights=([10.0, 1.0, 0.3, 0.1], [0.03]),
+        limits=[3.0],
+        quantile=NormalDist().inv_cdf,
+        noise=scale,
+        steps=3400,
+        share=0.3,
+    )
 
 
 def climbing(
@@ -226,9 +259,17 @@ def climbing(
         return logged(successor, begin(), np.array(commands), wind(ROWS, rng))
 
     return Plant(
-        successor, wind, begin, log, goal=[0.0, 0.0, 0.8], bound=(2, 0.5),
-        weights=([1.0, 1.0, 1.0], [0.3] * 3), limits=[1.0] * 3, stages=[1], rate=RATE,
-    )  # fmt: skip
+        successor,
+        wind,
+        begin,
+        log,
+        goal=[0.0, 0.0, 0.8],
+        bound=(2, 0.5),
+        weights=([1.0, 1.0, 1.0], [0.3] * 3),
+        limits=[1.0] * 3,
+        stages=[1],
+        rate=RATE,
+    )
 
 
 def mujoco_quadrotor() -> Plant:
@@ -492,7 +533,8 @@ def main() -> None:
             results = [
                 row for row in results if row.items() & cell.items() != cell.items()
             ] + [cell | numbers]
-            text = f"{allowed:9g}{100 * bad / max(active, 1):9.2f}{100 * limit:9.2f}{1e3 * found.distance:9.2f}"
+            text = f"{allowed:9g}{100 * bad / max(active, 1):9.2f}"
+            text += f"{100 * limit:9.2f}{1e3 * found.distance:9.2f}"
             print(
                 f"{name:23}{way:26}{text}{numbers['cost']:9.4f}{active:9}", flush=True
             )

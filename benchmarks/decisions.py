@@ -152,10 +152,14 @@ def courses() -> Iterator[tuple[str, Course]]:
         "pendulum": (pendulum(), [1.0, 0.01], [0.01], None, 30),
         "cart-pole": (cart_pole(), [1.0, 0.01, 1.0, 0.01], [0.01], None, 30),
         "acrobot": (
-            acrobot(), [1.0, 0.1, 0.1, 0.1], [0.01], [30.0, 10.0, 30.0, 10.0], 35,
+            acrobot(),
+            [1.0, 0.1, 0.1, 0.1],
+            [0.01],
+            [30.0, 10.0, 30.0, 10.0],
+            35,
         ),
         "furuta": (furuta(), [1.0, 0.01, 10.0, 0.01], [10.0], None, 25),
-    }  # fmt: skip
+    }
     for name, (system, Q, R, last, horizon) in swings.items():
         cost = Tracking(Q, R, last, penalized="inputs", angles=system.angle_indices)
         problem = Problem(cost, Box(system.input_lower, system.input_upper))

@@ -142,7 +142,8 @@ def main() -> None:
                 len(flown) - len(kept),
             )
             print(
-                f"{task + ', ' + name:38}{cart:10.4f}{one:7.2f}{angle:12.5f}{other:7.2f}{lost:6}",
+                f"{task + ', ' + name:38}{cart:10.4f}{one:7.2f}"
+                f"{angle:12.5f}{other:7.2f}{lost:6}",
                 flush=True,
             )
             row = {

@@ -147,7 +147,8 @@ def learned(states: Array, inputs: Array, delay: int) -> ResidualModel:
     )
     noise = estimate_process_noise(model, rows)
     print(
-        f"noise of a step {noise.variance.sqrt().tolist()} (true {NOISE.tolist()}), correlation {noise.correlation}"
+        f"noise of a step {noise.variance.sqrt().tolist()} (true {NOISE.tolist()}), "
+        f"correlation {noise.correlation}"
     )
     parts = (
         model.nominal,
@@ -365,7 +366,8 @@ def main() -> None:
     found = estimate_delay(states, inputs)
     low, high = found.interval
     print(
-        f"delay found in the random motion: {found.steps:.1f} steps, 95 % interval {low:.2f} to {high:.2f}"
+        f"delay found in the random motion: {found.steps:.1f} steps, 95 % interval "
+        f"{low:.2f} to {high:.2f}"
     )
     model = learned(states, inputs, round(found.steps))
     columns = (

@@ -61,7 +61,9 @@ def main() -> None:
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     print(
-        f"{'N':>6} {'belief':8}{'ms':>10}{'p99':>10}{'ns/N^2':>9}{'floor ms':>10}{'ratio':>8}{'general':>9}"
+        f"{'N':>6} "
+        f"{'belief':8}{'ms':>10}{'p99':>10}{'ns/N^2':>9}"
+        f"{'floor ms':>10}{'ratio':>8}{'general':>9}"
         f"{'256 bits':>10}{'streamed ms':>13}{'with memory':>13}"
     )
     results = []
@@ -70,9 +72,13 @@ def main() -> None:
         for belief in BELIEFS:
             result = measured(packed, size, belief)
             print(
-                f"{size:6} {belief:8}{result['ms_median']:10.3f}{result['ms_p99']:10.3f}{result['ns_per_square']:9.2f}"
-                f"{result['floor_ms']:10.3f}{result['ratio']:8.2f}{result['ratio_to_general']:9.2f}"
-                f"{result['ratio_to_256_bits']:10.2f}{result['streamed_ms']:13.3f}{result['ratio_with_memory']:13.2f}",
+                f"{size:6} "
+                f"{belief:8}{result['ms_median']:10.3f}{result['ms_p99']:10.3f}"
+                f"{result['ns_per_square']:9.2f}"
+                f"{result['floor_ms']:10.3f}{result['ratio']:8.2f}"
+                f"{result['ratio_to_general']:9.2f}"
+                f"{result['ratio_to_256_bits']:10.2f}{result['streamed_ms']:13.3f}"
+                f"{result['ratio_with_memory']:13.2f}",
                 flush=True,
             )
             results.append(result)

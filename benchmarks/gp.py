@@ -66,7 +66,8 @@ def main() -> None:
     kernels.moments(gps, mu, S, u[None], derivatives=True)
     first = time.perf_counter() - began
     print(
-        f"{describe(here)}\nfirst calls of the three kernels: {first:.2f} s (compiled, or read from the cache)\n"
+        f"{describe(here)}\nfirst calls of the three kernels: {first:.2f} s (compiled, "
+        "or read from the cache)\n"
     )
     for size in arguments.sizes:
         gp = posterior(size)

@@ -140,12 +140,19 @@ def compiled_hummingbird() -> tuple[Array, Callable[[Array, Array, Array, int], 
 
     theirs: Any = Multirotor(quad_params, control_abstraction="cmd_vel")
     p = Parameters(
-        theirs.mass, theirs.inertia, theirs.inv_inertia, np.diag(theirs.drag_matrix).copy(),
-        np.diag(theirs.rotor_drag_matrix).copy(), np.ascontiguousarray(theirs.rotor_geometry),
-        theirs.rotor_dir.astype(float), (theirs.k_eta, theirs.k_m, theirs.k_h), np.ascontiguousarray(theirs.TM_to_f),
+        theirs.mass,
+        theirs.inertia,
+        theirs.inv_inertia,
+        np.diag(theirs.drag_matrix).copy(),
+        np.diag(theirs.rotor_drag_matrix).copy(),
+        np.ascontiguousarray(theirs.rotor_geometry),
+        theirs.rotor_dir.astype(float),
+        (theirs.k_eta, theirs.k_m, theirs.k_h),
+        np.ascontiguousarray(theirs.TM_to_f),
         (float(theirs.k_v), float(theirs.kp_att), float(theirs.kd_att)),
-        (float(theirs.rotor_speed_min), float(theirs.rotor_speed_max)), theirs.tau_m,
-    )  # fmt: skip
+        (float(theirs.rotor_speed_min), float(theirs.rotor_speed_max)),
+        theirs.tau_m,
+    )
     hover = HOVER.copy()
     rng = np.random.default_rng(0)
     hover[16:] = math.sqrt(p.mass * GRAVITY / (4 * theirs.k_eta))
@@ -168,6 +175,7 @@ def compiled_hummingbird() -> tuple[Array, Callable[[Array, Array, Array, int], 
             for one, other in pairs
         ):
             raise RuntimeError(
-                "the equations of the installed RotorPy are others than those of benchmarks/hummingbird"
+                "the equations of the installed RotorPy are others than those of "
+                "benchmarks/hummingbird"
             )
     return hover, lambda s, velocity, wind, steps: advance(s, velocity, wind, p, steps)

@@ -438,7 +438,8 @@ def good(limit: int) -> None:
                     str(judgement.suspicious),
                 ]
             )
-    title = f"{len(flights)} good flights: {alarms} lost or suspicious at their end, {suspicious} steps suspicious"
+    title = f"{len(flights)} good flights: {alarms} lost or suspicious at their end, "
+    title += f"{suspicious} steps suspicious"
     Console().print(
         terminal([Table(("flight", "seed", "judged", "suspicious steps"), rows, title)])
     )
@@ -489,7 +490,8 @@ def sabotaged() -> None:
         )
     relevant = [row for row in rows if row[3] != "-"]
     in_time = sum(row[-1] == "yes" for row in relevant)
-    title = f"{len(relevant)} sabotaged flights that show it: {in_time} called within 20 steps"
+    title = f"{len(relevant)} sabotaged flights that show it: "
+    title += f"{in_time} called within 20 steps"
     header = (
         "flight",
         "sabotage",

@@ -86,7 +86,8 @@ def kkt_residual(
     m = problem.input_dim
     if np.shape(inputs) != (H, m):
         raise ShapeError(
-            f"a plan of {H} stages and {m} inputs must have shape ({H}, {m}); got {np.shape(inputs)}"
+            f"a plan of {H} stages and {m} inputs must have shape ({H}, {m}); got "
+            f"{np.shape(inputs)}"
         )
     if not np.isfinite(inputs).all():
         return np.inf

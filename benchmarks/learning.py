@@ -164,12 +164,18 @@ def flights(
     )
     return [
         closed_loop(
-            OUTER, controller, references, references[0], STEPS,
-            noise=NOISES[noise], disturbances=(*disturbances, FaultySensor(fault, seed)),
-            on_failure="previous_plan", seed=seed,
+            OUTER,
+            controller,
+            references,
+            references[0],
+            STEPS,
+            noise=NOISES[noise],
+            disturbances=(*disturbances, FaultySensor(fault, seed)),
+            on_failure="previous_plan",
+            seed=seed,
         )
         for seed in range(seeds)
-    ]  # fmt: skip
+    ]
 
 
 def later(change: str) -> np.ndarray:
@@ -205,9 +211,12 @@ def fault_table(seeds: int) -> None:
     """Flies with faulty sensors, and prints what learning makes of that."""
     noise = "process 0.01"
     print(
-        f"{'':20}" + "".join(f"{air + ': as learned':>28}{'online':>10}{'ratio':>8}{'sound':>8}"
-                            for air in ("calm", "wind"))
-    )  # fmt: skip
+        f"{'':20}"
+        + "".join(
+            f"{air + ': as learned':>28}{'online':>10}{'ratio':>8}{'sound':>8}"
+            for air in ("calm", "wind")
+        )
+    )
     sound: dict[str, float] = {}
     rows: list[dict[str, Any]] = []
     for fault in FAULTS:
@@ -271,7 +280,8 @@ def main() -> None:
                     cell[way] = found
                 best = cell[WAYS[-1]]["rmse"]
                 text = "".join(
-                    f"{one['rmse']:10.4f} x{one['rmse'] / best:7.3f} lost {one['lost']:2}"
+                    f"{one['rmse']:10.4f} x{one['rmse'] / best:7.3f} lost "
+                    f"{one['lost']:2}"
                     for one in cell.values()
                 )
                 print(f"{trajectory:12}{noise:16}{change:18}{text}", flush=True)
@@ -283,7 +293,8 @@ def main() -> None:
     )
     more = [after - before for before, after in zip(plain, online, strict=True)]
     print(
-        f"a decision with online learning takes {more[0]:.2f} ms more (fastest), {more[1]:.2f} ms (median)"
+        f"a decision with online learning takes {more[0]:.2f} ms more (fastest), "
+        f"{more[1]:.2f} ms (median)"
     )
     arguments.figure.parent.mkdir(parents=True, exist_ok=True)
     write_whole(arguments.figure, png(figure()))

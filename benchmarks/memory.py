@@ -70,9 +70,12 @@ def main() -> None:
             )
             results.append(result)
             print(
-                f"N = {arguments.size}, H = {arguments.horizon}, {covariance}: peak {result['peak_mib']:.0f} MiB "
-                f"(libraries {result['libraries_mib']:.0f}, model {result['model_mib']:.0f}); steady state: largest "
-                f"allocations {result['steady_mib']:.2f} MiB, resident set +{result['risen_mib']:.2f} MiB"
+                f"N = {arguments.size}, H = {arguments.horizon}, {covariance}: peak "
+                f"{result['peak_mib']:.0f} MiB "
+                f"(libraries {result['libraries_mib']:.0f}, model "
+                f"{result['model_mib']:.0f}); steady state: largest "
+                f"allocations {result['steady_mib']:.2f} MiB, resident set "
+                f"+{result['risen_mib']:.2f} MiB"
             )
     from benchmarks.timing import write_results
 

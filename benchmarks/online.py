@@ -37,7 +37,8 @@ def main() -> None:
     torch.set_num_threads(1)
     results = []
     print(
-        "six outputs, one thread; medians of process time in ms; ratio: from hyperparameters over + 1 (paired)"
+        "six outputs, one thread; medians of process time in ms; ratio: from "
+        "hyperparameters over + 1 (paired)"
     )
     columns = (
         "N",

@@ -8,8 +8,8 @@ Both solvers stop by tolerances with which 99 of 100 plans are within 1e-5 of a 
 point. The acados solver has the settings that were the fastest here: the GPs' mean
 expanded to scalar operations and compiled with ``-O3 -march=native``, states
 (x_k, u_{k-1}) with the increments as residuals of a linear least-squares cost, SQP with
-the Gauss-Newton Hessian, and full condensing with HPIPM. Warm solves start from the last
-primal and dual solution, shifted by a stage.
+the Gauss-Newton Hessian, and full condensing with HPIPM. Warm solves start from the
+last primal and dual solution, shifted by a stage.
 
 Times include the calls of its Python interface, as a Python user pays them; ``inside``
 is what acados reports as its own total. The *real-time iteration* is one quadratic

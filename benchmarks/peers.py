@@ -67,7 +67,10 @@ SLOW_ABOVE = 10  # horizon above which SLSQP is left out: minutes
 OWN = "gpmpc, iterated"
 
 Solve = Callable[[Instance, Any], Any]
-"""From an instance and the last solution (None at first) to a solution, which has ``inputs`` (H, m)."""
+"""From an instance and the last solution (None at first) to a solution.
+
+A solution has ``inputs`` (H, m).
+"""
 Cases = dict[str, Callable[[], Solve] | None]
 """Solvers by name; None where the package is not installed."""
 
@@ -229,16 +232,27 @@ def _previous(instance: Instance, last: Decision | None) -> Decision:
     """
     if last is not None:  # ``dataclasses.replace`` takes as long as a program
         return Decision(
-            input=instance.last, inputs=last.inputs, means=last.means, covariances=last.covariances,
-            status=last.status, iterations=0, timing=Timing(0.0, 0.0, 0.0), solution=last.solution,
-        )  # fmt: skip
+            input=instance.last,
+            inputs=last.inputs,
+            means=last.means,
+            covariances=last.covariances,
+            status=last.status,
+            iterations=0,
+            timing=Timing(0.0, 0.0, 0.0),
+            solution=last.solution,
+        )
     H, n = instance.targets.shape
     inputs = np.tile(instance.last, (H, 1))
     nothing = np.full((H + 1, n, n), np.nan)
     return Decision(
-        input=inputs[0], inputs=inputs, means=nothing[:, 0], covariances=nothing,
-        status=Status.ITERATION_LIMIT, iterations=0, timing=Timing(0.0, 0.0, 0.0),
-    )  # fmt: skip
+        input=inputs[0],
+        inputs=inputs,
+        means=nothing[:, 0],
+        covariances=nothing,
+        status=Status.ITERATION_LIMIT,
+        iterations=0,
+        timing=Timing(0.0, 0.0, 0.0),
+    )
 
 
 class Run:
@@ -315,10 +329,19 @@ def measure(
 def table(rows: Sequence[Mapping[str, Any]]) -> str:
     """Formats the rows of one comparison."""
     columns = {
-        "what": "", "median": "ms, median", "p99": "99 %", "inside": "ms, inside", "evicted": "evicted", "times_ours": "times ours",
-        "times_ours_evicted": "times ours, evicted", "kkt": "KKT, median", "kkt_worst": "worst",
-        "within": f"within {ACCURACY:g}", "samples": "calls", "note": "note",
-    }  # fmt: skip
+        "what": "",
+        "median": "ms, median",
+        "p99": "99 %",
+        "inside": "ms, inside",
+        "evicted": "evicted",
+        "times_ours": "times ours",
+        "times_ours_evicted": "times ours, evicted",
+        "kkt": "KKT, median",
+        "kkt_worst": "worst",
+        "within": f"within {ACCURACY:g}",
+        "samples": "calls",
+        "note": "note",
+    }
     used = [key for key in columns if any(key in row for row in rows)]
     cells = [
         [

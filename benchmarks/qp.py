@@ -241,8 +241,9 @@ def measure_cell(horizon: int, mode: str, settings: argparse.Namespace) -> dict:
             some = problems[: settings.slow_solvers]
             taken, answers = run_pass(begin, some, False, True)
             cell["solvers"][name] = {
-                "residual": max(map(worst_residual, some, answers)), "hot": quantiles(taken[1:]),
-            }  # fmt: skip
+                "residual": max(map(worst_residual, some, answers)),
+                "hot": quantiles(taken[1:]),
+            }
     best = min(
         (DAQP_WARM, DAQP_COLD), key=lambda name: cell["solvers"][name]["hot"]["median"]
     )
@@ -263,13 +264,16 @@ def describe(cell: dict) -> str:
     """One line per cell for the terminal."""
     solvers = cell["solvers"]
     ratio = cell["ratio hot"]
-    text = f"{cell['mode']:10s} H = {cell['horizon']:3d}, m = {cell['m']:3d}, {cell['active rows']:4.1f} active: "
+    text = f"{cell['mode']:10s} H = {cell['horizon']:3d}, m = {cell['m']:3d}, "
+    text += f"{cell['active rows']:4.1f} active: "
     text += f"{solvers[OURS]['hot']['median']:8.2f} us, {cell['best DAQP path']} "
-    text += f"{solvers[cell['best DAQP path']]['hot']['median']:8.2f} us, ratio {ratio['median']:.3f}"
+    text += f"{solvers[cell['best DAQP path']]['hot']['median']:8.2f} us, "
+    text += f"ratio {ratio['median']:.3f}"
     text += f", p99 {ratio['p99']:.3f}, flushed {cell['ratio flushed']['median']:.3f}"
     text += f", KKT {solvers[OURS]['residual']:.0e}"
     if CVXPY in solvers:
-        text += f", CVXPY {solvers[CVXPY]['hot']['median'] / solvers[OURS]['hot']['median']:.0f} times slower"
+        times = solvers[CVXPY]["hot"]["median"] / solvers[OURS]["hot"]["median"]
+        text += f", CVXPY {times:.0f} times slower"
     return text
 
 

@@ -97,8 +97,10 @@ PUBLISHED = {
     },
 }
 INSTALL = (
-    "the league's simulator is not installed: git clone https://github.com/dfki-ric-underactuated-lab/double_pendulum, "
-    "put its src/python on PYTHONPATH, and pip install dill tabulate lxml filterpy pyyaml sympy"
+    "the league's simulator is not installed: git clone "
+    "https://github.com/dfki-ric-underactuated-lab/double_pendulum, "
+    "put its src/python on PYTHONPATH, and pip install dill tabulate lxml filterpy "
+    "pyyaml sympy"
 )
 # time steps of plans and of torques [s]
 PLAN = 0.02
@@ -768,7 +770,8 @@ def learned_model(
             who = pilot(model, robot, wild=False, gain=0.0)
             records.append(play(who, robot, 5000 + 100 * seed + round_, 10.0))
             _say(
-                f"  round {round_ + 1}: {30 + 10 * round_} s of interaction, score {records[-1].score:.3f}"
+                f"  round {round_ + 1}: {30 + 10 * round_} s of interaction, score "
+                f"{records[-1].score:.3f}"
             )
     return model, _parameters(body).tolist()
 
@@ -883,7 +886,8 @@ def table(robot: str, rows: list[dict[str, Any]]) -> str:
     """The league's board with rows of ours: a line for each model."""
     best = max(PUBLISHED[robot].values())
     lines = [
-        f"| {robot}, simulation 2025 | draws | mean | worst | above the best | decision ms (median, p99) | search ms |"
+        f"| {robot}, simulation 2025 | draws | mean | worst | above the best | "
+        "decision ms (median, p99) | search ms |"
     ]
     lines += ["|---|---|---|---|---|---|---|"]
     ours = {}
@@ -949,7 +953,8 @@ def main(arguments: list[str]) -> int:
         if given["board"] == "robustness" and kind == "gp":
             raise SettingError(
                 "model",
-                "must be true or residual for board=robustness, which predicts over 2 ms",
+                "must be true or residual for board=robustness, which predicts over 2 "
+                "ms",
             )
         if given["board"] in ("script", "film") and given["time"] == "real":
             raise SettingError("time", "must be free for board=script and board=film")

@@ -168,10 +168,14 @@ def main() -> None:
             )
             rows.append(row)
             print(
-                f"H {horizon:3d}, problems {'kept' if record_problems else 'not kept':8s}: record() median "
-                f"{row['record_median_us']:5.1f} us, mean {row['record_mean_us']:5.1f}, p99 "
-                f"{row['record_p99_us']:6.0f}; the loop {row['loop_longer_us_a_step']:+5.0f} us a step; "
-                f"{row['file_bytes_per_step'] / 1e3:.1f} kB a step; load average {row['load_average']:.1f}",
+                f"H {horizon:3d}, problems "
+                f"{'kept' if record_problems else 'not kept':8s}: record() median "
+                f"{row['record_median_us']:5.1f} us, mean "
+                f"{row['record_mean_us']:5.1f}, p99 "
+                f"{row['record_p99_us']:6.0f}; the loop "
+                f"{row['loop_longer_us_a_step']:+5.0f} us a step; "
+                f"{row['file_bytes_per_step'] / 1e3:.1f} kB a step; load average "
+                f"{row['load_average']:.1f}",
                 flush=True,
             )
     write_results("recording", rows)

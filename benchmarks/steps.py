@@ -95,7 +95,8 @@ def main() -> None:
         ]
         rows += [row | {"cache": cache} for row in found]
         sections.append(
-            f"n = {n}, m = {n // 2}, {cache} caches: median (99 %) in ms\n\n{table(found)}\n"
+            f"n = {n}, m = {n // 2}, {cache} caches: median (99 %) in "
+            f"ms\n\n{table(found)}\n"
         )
         print(sections[-1], flush=True)
     write_results("steps", rows, machine=here)

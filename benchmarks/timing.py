@@ -158,13 +158,15 @@ def _shortest(call: Callable[[], Any]) -> float:
 def describe(machine: Mapping[str, Any]) -> str:
     """Names the machine in one line."""
     return (
-        f"{machine['processor']}, {machine['cores']} cores, {machine['threads']} thread; {machine['dgemm_gflops']} "
-        f"GFlop/s in a matrix product, {machine['memory_gb_per_s']} GB/s from memory; load {machine['load']}"
+        f"{machine['processor']}, {machine['cores']} cores, {machine['threads']} "
+        f"thread; {machine['dgemm_gflops']} "
+        f"GFlop/s in a matrix product, {machine['memory_gb_per_s']} GB/s from memory; "
+        f"load {machine['load']}"
     )
 
 
 def markdown_table(header: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
-    """Formats rows as a Markdown table, aligned to the right but for the first column."""
+    """Formats rows as a Markdown table, all columns but the first to the right."""
     cells = [[_cell(value) for value in row] for row in rows]
     widths = [
         max(len(row[i]) for row in [list(header), *cells]) for i in range(len(header))

@@ -56,10 +56,12 @@ def main() -> None:
     )
     results = []
     print(
-        "six GPs, one thread; process time in seconds; ratio: GPyTorch's likelihood over the closed form"
+        "six GPs, one thread; process time in seconds; ratio: GPyTorch's likelihood "
+        "over the closed form"
     )
     print(
-        f"{'data':28}{'N':>5}{'median':>9}{'p99':>9}{'GPyTorch':>10}{'ratio':>8}{'paper':>8}"
+        f"{'data':28}{'N':>5}{'median':>9}{'p99':>9}"
+        f"{'GPyTorch':>10}{'ratio':>8}{'paper':>8}"
     )
     for trial in experiment.trials():
         everything = trial.condition.data

@@ -56,7 +56,8 @@ def main() -> None:
     left_out = []
     began = time.monotonic()
     print(
-        f"{'case':38}{'median [s]':>12}{'p99 [s]':>12}{'ratio':>8}{'memory [MB]':>13}{'test RMSE':>11}"
+        f"{'case':38}{'median [s]':>12}{'p99 [s]':>12}{'ratio':>8}"
+        f"{'memory [MB]':>13}{'test RMSE':>11}"
     )
     for case in cases(settings.quick):
         if time.monotonic() - began > 60 * settings.minutes:
@@ -88,7 +89,8 @@ def main() -> None:
     draw(results, settings.out / "training_scale.png", settings.threads)
     if left_out:
         print(
-            f"{len(left_out)} cases left out after {settings.minutes:g} minutes, the largest"
+            f"{len(left_out)} cases left out after {settings.minutes:g} minutes, the "
+            "largest"
         )
     print(f"written to {settings.out}")
 
@@ -390,7 +392,8 @@ def draw(results: list[dict], path: Path, threads: int) -> None:
     for axis in (times, memory):
         axis.set_xlabel("training points N")
     figure.suptitle(
-        "One output of nine features: the likelihood with its gradient, and whole trainings"
+        "One output of nine features: the likelihood with its gradient, and whole "
+        "trainings"
     )
     handles, labels = (
         a + b[-1:]

@@ -113,11 +113,18 @@ def flights(
     )
     return [
         closed_loop(
-            OUTER, controller, references, references[0], arguments.steps,
-            noise=NOISES[noise], disturbances=MASSES[mass], on_failure="previous_plan", seed=seed,
+            OUTER,
+            controller,
+            references,
+            references[0],
+            arguments.steps,
+            noise=NOISES[noise],
+            disturbances=MASSES[mass],
+            on_failure="previous_plan",
+            seed=seed,
         )
         for seed in range(arguments.seeds)
-    ]  # fmt: skip
+    ]
 
 
 def pooled(flown: list[Rollout]) -> float:
@@ -142,7 +149,8 @@ def altitudes(shown: dict[tuple, Rollout]) -> Figure:
         axis.set(title=trajectory, xlabel="time [s]")
     axes[0].set_ylabel("error of z, downwards [m]")
     figure.suptitle(
-        "A quadrotor a fifth heavier than its model; L: gain of the disturbance estimate"
+        "A quadrotor a fifth heavier than its model; L: gain of the disturbance "
+        "estimate"
     )
     figure.legend(
         *axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4

@@ -52,11 +52,13 @@ def run(package, **environment):
     """Returns the kernel's answer to 1 in a new process, and if its code was cached."""
     result = subprocess.run(
         [sys.executable, "-B", "-c", "import tiny.other, tiny.kernel"],
-        capture_output=True, text=True, check=True,
+        capture_output=True,
+        text=True,
+        check=True,
         env=os.environ
         | {"PYTHONPATH": f"{package.parent}{os.pathsep}{ROOT}"}
         | environment,
-    )  # fmt: skip
+    )
     answer, hits = result.stdout.split()
     return float(answer), int(hits) == 1
 
@@ -128,11 +130,17 @@ def test_a_kernel_runs_its_own_copy_of_its_callees(tmp_path):
     def run(factor, code):
         script = f"from own import *\nprint({code})"
         result = subprocess.run(
-            [sys.executable, "-B", "-c", script], capture_output=True, text=True,
+            [sys.executable, "-B", "-c", script],
+            capture_output=True,
+            text=True,
             check=True,
-            env=os.environ | {"PYTHONPATH": f"{tmp_path}{os.pathsep}{ROOT}",
-                "FACTOR": factor, "NUMBA_CACHE_DIR": ""},
-        )  # fmt: skip
+            env=os.environ
+            | {
+                "PYTHONPATH": f"{tmp_path}{os.pathsep}{ROOT}",
+                "FACTOR": factor,
+                "NUMBA_CACHE_DIR": "",
+            },
+        )
         return [float(number) for number in result.stdout.split()]
 
     assert run("2", "first(1.0)") == [2.0]

@@ -123,12 +123,18 @@ def test_lorenz_passes_the_ends_of_the_accepted_steps(samples):
 @pytest.mark.parametrize(
     ("setting", "value"),
     [
-        ("samples_per_step", 0), ("samples_per_step", 1.5), ("relative_tolerance", 0.0),
+        ("samples_per_step", 0),
+        ("samples_per_step", 1.5),
+        ("relative_tolerance", 0.0),
         ("sampling_time", -1.0),
-        ("duration", 0.0), ("sigma", np.nan), ("rho", "a"), ("beta", np.inf),
-        ("start", (1.0, 2.0)), ("scale", (1, 2)),
+        ("duration", 0.0),
+        ("sigma", np.nan),
+        ("rho", "a"),
+        ("beta", np.inf),
+        ("start", (1.0, 2.0)),
+        ("scale", (1, 2)),
     ],
-)  # fmt: skip
+)
 def test_a_senseless_setting_of_lorenz_is_refused_by_name(setting, value):
     with pytest.raises(SettingError, match=setting):
         Lorenz(**{setting: value})

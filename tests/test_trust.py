@@ -69,11 +69,17 @@ def test_a_trusted_packages_code_and_its_names_are_found(name, own_package):
 @pytest.mark.parametrize(
     "name",
     [
-        "arm.os.system", "arm.subprocess.call", "arm.np.save", "arm.save", "arm.system",
+        "arm.os.system",
+        "arm.subprocess.call",
+        "arm.np.save",
+        "arm.save",
+        "arm.system",
         "arm.keep",
-        "arm.write_whole", "arm.os.path.os.system", "arm:os.system",
+        "arm.write_whole",
+        "arm.os.path.os.system",
+        "arm:os.system",
     ],
-)  # fmt: skip
+)
 def test_what_a_trusted_package_only_imports_is_refused(name, own_package):
     path = f"{own_package}.{name}"
     with pytest.raises(DataError, match="is code of|only imports"):
@@ -106,9 +112,20 @@ def test_a_part_of_a_package_can_be_trusted_alone(own_package):
 
 @pytest.mark.parametrize(
     "names",
-    ["my_robot", 3, ["my robot"], [None], ["os"], ["subprocess"], ["gpmpc"], [""],
-              ["builtins"], ["hydra.utils"], ["../x"]]
-)  # fmt: skip
+    [
+        "my_robot",
+        3,
+        ["my robot"],
+        [None],
+        ["os"],
+        ["subprocess"],
+        ["gpmpc"],
+        [""],
+        ["builtins"],
+        ["hydra.utils"],
+        ["../x"],
+    ],
+)
 def test_what_cannot_be_trusted_is_a_setting_of_the_wrong_kind(names):
     with pytest.raises(SettingError, match=r"^trusted: "):
         _trust.trusted_packages("trusted", names)
@@ -144,10 +161,22 @@ WORDS = {"attitude", "starts", "around", "name", "solver"}
 FILES_THAT_ARE_READ = {"folder", "path"}
 GUARDED = {"trusted", "environment", "make", "options"}
 NAMES = {
-    "units", "angles", "tracked", "rates", "pose", "names", "state_names",
-    "input_names", "actuators", "joints",
-    "sensors", "observation", "known", "settings", "parameters",
-}  # fmt: skip
+    "units",
+    "angles",
+    "tracked",
+    "rates",
+    "pose",
+    "names",
+    "state_names",
+    "input_names",
+    "actuators",
+    "joints",
+    "sensors",
+    "observation",
+    "known",
+    "settings",
+    "parameters",
+}
 NUMBERS = {"lower", "upper", "F", "f", "Q", "R", "terminal", "weight", "reference"}
 NUMBERS |= {"input_lower", "input_upper", "initial_input", "start", "goal", "region"}
 CODE = {

@@ -200,9 +200,7 @@ def test_daqp_says_what_has_no_solution_and_goes_on():
 
 
 @pytest.mark.parametrize("cold", [False, True])
-def test_a_run_forgets_its_last_solution_when_the_instances_begin_again_or_at_once_when_cold(
-    cold, instances
-):
+def test_a_run_forgets_its_solution_at_the_end_or_when_cold(cold, instances):
     seen = []
 
     def solve(instance, last):

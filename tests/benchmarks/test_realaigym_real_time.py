@@ -115,9 +115,7 @@ def test_a_late_decision_leaves_the_last_plan_flying_until_it_is_known(monkeypat
 
 
 @pytest.mark.parametrize(("value", "searches"), [(0.1, 1), (1.5, 12), (10.0, 20)])
-def test_all_starts_are_taken_for_a_plan_that_is_not_good_and_again_and_again_without_one(
-    value, searches, monkeypatch
-):
+def test_all_starts_are_taken_until_there_is_a_good_plan(value, searches, monkeypatch):
     who = timed_pilot(monkeypatch, 0.05, 0.001, value)
     torques = [
         who.torques(np.array([np.pi + 0.1, 0.0, 0.0, 0.0]), INPUT * k)[0]

@@ -137,31 +137,50 @@ def run_of(document):
 
 
 NOT_CALLED = [
-    "os.system", "builtins.eval", "builtins.exec", "subprocess.run", "pickle.loads",
-    "numpy.load", "torch.load",
-    "gpmpc._files.write_whole", "gpmpc._files.os.system", "gpmpc.gp.Transitions.load",
+    "os.system",
+    "builtins.eval",
+    "builtins.exec",
+    "subprocess.run",
+    "pickle.loads",
+    "numpy.load",
+    "torch.load",
+    "gpmpc._files.write_whole",
+    "gpmpc._files.os.system",
+    "gpmpc.gp.Transitions.load",
     "gpmpc.gp.save_posterior",
-    "gpmpc.models.save_model", "gpmpc.recording.recover",
+    "gpmpc.models.save_model",
+    "gpmpc.recording.recover",
     "gpmpc.systems._simulators.library",
-    "gpmpc.systems._simulators.import_module", "gpmpc.cli._run.run_one",
+    "gpmpc.systems._simulators.import_module",
+    "gpmpc.cli._run.run_one",
     "gpmpc.cli._experiment.instantiate",
     "gpmpc.systems.gymnasium_.register_environments",
     "gpmpc.systems.gymnasium_.make_environment",
-    "gpmpc.systems.pendulum.__globals__", "gpmpc.systems.System.__init__", "gpmpc",
+    "gpmpc.systems.pendulum.__globals__",
+    "gpmpc.systems.System.__init__",
+    "gpmpc",
     "hydra.utils.instantiate",
-    "hydra.utils.call", "omegaconf.OmegaConf.load", "functools.partial",
+    "hydra.utils.call",
+    "omegaconf.OmegaConf.load",
+    "functools.partial",
     "importlib.import_module",
-    "gpmpc.systems .pendulum", "gpmpc.systems.pendulum\n", "", "gpmpc.systems:pendulum",
+    "gpmpc.systems .pendulum",
+    "gpmpc.systems.pendulum\n",
+    "",
+    "gpmpc.systems:pendulum",
     "GPMPC.systems.pendulum",
-    "_frozen_importlib.__import__", "antigravity", "webbrowser.open",
-]  # fmt: skip
+    "_frozen_importlib.__import__",
+    "antigravity",
+    "webbrowser.open",
+]
 
 
 @pytest.mark.parametrize("target", NOT_CALLED)
 @pytest.mark.parametrize(
-    "place", [lambda t: t, lambda t: {"x": [{"y": t}]}, lambda t: {"_args_": [[t]]}],
+    "place",
+    [lambda t: t, lambda t: {"x": [{"y": t}]}, lambda t: {"_args_": [[t]]}],
     ids=["here", "in a list", "in arguments"],
-)  # fmt: skip
+)
 def test_what_is_not_on_the_list_is_not_called(target, place):
     modules = {*sys.modules}
     with pytest.raises(DataError, match=r"its settings (call|name)") as refusal:
@@ -268,10 +287,14 @@ def test_settings_other_than_plain_names_and_values_are_refused(text, rule):
 
 @pytest.mark.parametrize(
     "text",
-    ["a: [" + "1," * 1990 + "1]", "a:\n" + "- -\n" * 1900, "a: [" + "[1]," * 900 + "]",
-     "a:\n" + ("- " + "[" * 18 + "1" + "]" * 18 + "\n") * 200],
+    [
+        "a: [" + "1," * 1990 + "1]",
+        "a:\n" + "- -\n" * 1900,
+        "a: [" + "[1]," * 900 + "]",
+        "a:\n" + ("- " + "[" * 18 + "1" + "]" * 18 + "\n") * 200,
+    ],
     ids=["numbers", "lists", "flow", "deep"],
-)  # fmt: skip
+)
 def test_the_largest_settings_are_read_in_a_second_or_two(text):
     began = time.process_time()
     assert read_settings(text)["a"]
@@ -285,13 +308,19 @@ def test_the_largest_settings_are_read_in_a_second_or_two(text):
         ["system=pendulum", "controller=lqr", "plant.mass=1.1"],
         ["controller=state_form", "trajectory=lorenz"],
         ["nominal={mass: 0.8}", "solver=clarabel", "learning=online"],
-        ["system=translational", "data=nmpc", "controller=nonlinear",
-         "propagation=unscented"],
-        ["disturbances=[{_target_: gpmpc.simulation.Gust, rates: {vx: 0.5}, start: "
-            "2}]"],
+        [
+            "system=translational",
+            "data=nmpc",
+            "controller=nonlinear",
+            "propagation=unscented",
+        ],
+        [
+            "disturbances=[{_target_: gpmpc.simulation.Gust, rates: {vx: 0.5}, start: "
+            "2}]"
+        ],
     ],
     ids=" ".join,
-)  # fmt: skip
+)
 def test_an_ordinary_flights_settings_describe_the_same_flight(words):
     from gpmpc.cli._experiment import experiment_of, experiment_of_file
 
@@ -353,27 +382,34 @@ def test_the_caller_says_whom_a_saved_model_may_trust():
 @pytest.mark.parametrize(
     "change",
     [
-        lambda f: put(f, "system", 5), lambda f: put(f, "system", None),
+        lambda f: put(f, "system", 5),
+        lambda f: put(f, "system", None),
         lambda f: put(f, "controller", "x"),
         lambda f: put(f, "trajectory", {"a": 1, "b": 2}),
         lambda f: put(f, "disturbances", {"a": 1}),
         lambda f: put(f, "data", {"size": None}),
         lambda f: put(f, "data", {"_target_": "gpmpc.trajectories.Hover", "size": 3}),
-        lambda f: put(f, "plant", [1]), lambda f: put(f, "nominal", 3),
+        lambda f: put(f, "plant", [1]),
+        lambda f: put(f, "nominal", 3),
         lambda f: put(f, "noise", 3),
-        lambda f: put(f, "horizon", "many"), lambda f: put(f, "controller.problem", 3),
+        lambda f: put(f, "horizon", "many"),
+        lambda f: put(f, "controller.problem", 3),
         lambda f: put(f, "system", {"_target_": "gpmpc.systems.pendulum", "mass": "x"}),
         lambda f: put(f, "system", {"_target_": "gpmpc.systems.pendulum", "weight": 1}),
         lambda f: put(f, "system", {"_target_": "gpmpc.systems.pendulum"}),
         lambda f: put(f, "data.samples", "???"),
         lambda f: put(f, "model", {"_target_": "gpmpc.qp.DualActiveSet"}),
         lambda f: {key: f[key] for key in ("system", "controller", "folder")},
-        lambda f: put(f, "controller.problem.cost",
-            {"_target_": "gpmpc.systems.pendulum", "Q": [1], "R": [1]}),
-        lambda f: put(f, "seed", [1]), lambda f: put(f, "steps", 1.5),
+        lambda f: put(
+            f,
+            "controller.problem.cost",
+            {"_target_": "gpmpc.systems.pendulum", "Q": [1], "R": [1]},
+        ),
+        lambda f: put(f, "seed", [1]),
+        lambda f: put(f, "steps", 1.5),
         lambda f: put(f, "loop", {}),
     ],
-)  # fmt: skip
+)
 def test_settings_of_no_flight_get_one_line_with_the_files_name(change):
     def learn():
         experiment = experiment_of_run(run_of(change(flight())), [])
@@ -395,13 +431,34 @@ def test_a_recording_and_its_settings_must_be_of_one_system():
 
 WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND
 ACTING = (
-    "import", "subprocess.", "socket.", "shutil.", "os.system", "os.exec", "os.fork",
-    "os.spawn", "os.posix_spawn",
-    "os.rename", "os.remove", "os.mkdir", "os.rmdir", "os.link", "os.symlink",
-    "os.truncate", "os.chmod", "os.chown",
-    "os.utime", "os.putenv", "ctypes.", "webbrowser.", "urllib.", "pickle.find_class",
-    "pty.", "signal.", "sqlite3.",
-)  # fmt: skip
+    "import",
+    "subprocess.",
+    "socket.",
+    "shutil.",
+    "os.system",
+    "os.exec",
+    "os.fork",
+    "os.spawn",
+    "os.posix_spawn",
+    "os.rename",
+    "os.remove",
+    "os.mkdir",
+    "os.rmdir",
+    "os.link",
+    "os.symlink",
+    "os.truncate",
+    "os.chmod",
+    "os.chown",
+    "os.utime",
+    "os.putenv",
+    "ctypes.",
+    "webbrowser.",
+    "urllib.",
+    "pickle.find_class",
+    "pty.",
+    "signal.",
+    "sqlite3.",
+)
 
 
 class Watch:
@@ -492,10 +549,14 @@ def test_twelve_hostile_files_are_refused_and_none_acts(folder, tmp_path_factory
 
 @pytest.mark.parametrize(
     "words",
-    [["completion", "--line", "gpmpc run sys"], ["run", "--help"], ["run", "--cfg"],
-     ["run", "data.samples=12", "horizon=-1"]],
+    [
+        ["completion", "--line", "gpmpc run sys"],
+        ["run", "--help"],
+        ["run", "--cfg"],
+        ["run", "data.samples=12", "horizon=-1"],
+    ],
     ids=" ".join,
-)  # fmt: skip
+)
 def test_a_folder_of_somebody_else_brings_no_plugin(words, tmp_path):
     plugin = tmp_path / "hydra_plugins" / "plugin.py"
     plugin.parent.mkdir()

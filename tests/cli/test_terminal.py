@@ -27,11 +27,15 @@ TINY = ["data.samples=25", "model.restarts=0", "steps=2", "horizon=1", "recorder
 def shell(line, cwd, **environment):
     """A line of the shell, in which $GPMPC is the command."""
     return subprocess.run(
-        ["bash", "-o", "pipefail", "-c", line], cwd=cwd, capture_output=True,
-        timeout=SECONDS, check=False,
-        encoding="utf-8", errors="replace",
+        ["bash", "-o", "pipefail", "-c", line],
+        cwd=cwd,
+        capture_output=True,
+        timeout=SECONDS,
+        check=False,
+        encoding="utf-8",
+        errors="replace",
         env=os.environ | {"GPMPC": PATH} | environment,
-    )  # fmt: skip
+    )
 
 
 @pytest.mark.parametrize("command", ["--help", "run --cfg", "log --help"])
@@ -268,10 +272,14 @@ class Terminal:
         self._fd, inner = pty.openpty()
         fcntl.ioctl(inner, termios.TIOCSWINSZ, struct.pack("HHHH", 40, 200, 0, 0))
         self._process = subprocess.Popen(
-            command, cwd=cwd, stdin=inner, stdout=inner, stderr=inner,
+            command,
+            cwd=cwd,
+            stdin=inner,
+            stdout=inner,
+            stderr=inner,
             start_new_session=True,
             env=os.environ | environment,
-        )  # fmt: skip
+        )
         os.close(inner)
 
     def type(self, text, until):
@@ -450,12 +458,15 @@ def test_a_killed_joblib_sweep_leaves_no_worker(tmp_path):
 def _kill_and_wait_for_the_pipe(command, cwd, begun, ended_by):
     path = os.pathsep.join(filter(None, sys.path))
     parent = subprocess.Popen(
-        command, cwd=cwd, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+        command,
+        cwd=cwd,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
         start_new_session=True,
         env=os.environ | {"PYTHONPATH": path},
         # which nohup sets to be ignored
         preexec_fn=lambda: signal.signal(signal.SIGHUP, signal.SIG_DFL),
-    )  # fmt: skip
+    )
     try:
         deadline = time.monotonic() + SECONDS
         while not list(cwd.glob(begun)) and time.monotonic() < deadline:
@@ -481,9 +492,13 @@ def test_ctrl_c_in_a_terminal_reaches_no_worker_while_it_starts(tmp_path):
         f"{starting}{POOL.replace('time.sleep(120)', 'pass')}"
     )
     done = subprocess.run(
-        [sys.executable, "pool.py"], cwd=tmp_path, capture_output=True, text=True,
-        timeout=SECONDS, check=False,
+        [sys.executable, "pool.py"],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=SECONDS,
+        check=False,
         env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
-    )  # fmt: skip
+    )
     assert (done.returncode, done.stderr) == (0, "")
     assert {"a", "b", "c"} <= {path.name for path in tmp_path.iterdir()}

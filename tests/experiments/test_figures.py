@@ -1,4 +1,4 @@
-"""The flights of section 5.2 on small settings, from the command line to the figures."""
+"""The flights of section 5.2 on small settings, from command line to figures."""
 
 import csv
 import json
@@ -120,7 +120,8 @@ def test_a_run_goes_on_where_it_stopped(finished):
         (["trialz=1"], "unknown setting 'trialz' (did you mean 'trials'?)"),
         (
             ["study=horizons"],
-            "study: no such option 'horizons'; available are confidence, flights, horizon",
+            "study: no such option 'horizons'; available are confidence, flights, "
+            "horizon",
         ),
         (["loop=plane"], "loop: must be among model, plant; got 'plane'"),
         (["trials=0"], "trials: must be a whole number, 1 or more; got 0"),
@@ -140,7 +141,8 @@ def test_a_run_goes_on_where_it_stopped(finished):
         ),
         (
             ["bounds.plant=null"],
-            "bounds: must hold lower and upper of the plant on elliptical, translational; got none",
+            "bounds: must hold lower and upper of the plant on elliptical, "
+            "translational; got none",
         ),
         (
             ["bounds.plant.lower=[5,5]"],

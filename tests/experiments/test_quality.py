@@ -1,4 +1,4 @@
-"""Quality over time: its cost, its front, and that what flies is what its words choose."""
+"""Quality over time: its cost, its front, and that its words choose what flies."""
 
 from dataclasses import replace
 from itertools import pairwise

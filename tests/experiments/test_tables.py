@@ -232,7 +232,7 @@ def test_data_of_other_columns_than_the_subsystem_has_are_refused():
         tables(data=Narrow()).trials()
 
 
-def test_the_first_prediction_gets_the_given_covariance_and_each_later_one_the_last_predicted(
+def test_each_prediction_gets_the_covariance_predicted_before_it(
     finished,
 ):
     cell = finished[0].trials()[0].condition

@@ -87,9 +87,14 @@ def noisy():
     g = posterior(n=1, m=3, predicts="value")
     parts = {name: getattr(g, name) for name in ("features", "targets")}
     log_noise = type(g).from_hyperparameters(
-        parts["features"], parts["targets"], torch.ones(1, 4, dtype=F),
-        torch.ones(1, dtype=F), torch.ones(1, dtype=F), 2, "value",
-    )  # fmt: skip
+        parts["features"],
+        parts["targets"],
+        torch.ones(1, 4, dtype=F),
+        torch.ones(1, dtype=F),
+        torch.ones(1, dtype=F),
+        2,
+        "value",
+    )
     return NoisyModel(residual_model(), log_noise, [1])
 
 
@@ -99,9 +104,14 @@ def learned(kinematics, nominal, inputs, parameters, features):
     outputs = len(kinematics.output_names)
     gp = posterior(n=1, m=features - 1, predicts="value")
     gp = type(gp).from_hyperparameters(
-        gp.features, gp.targets, torch.ones(1, features, dtype=F),
-        torch.ones(1, dtype=F), torch.ones(1, dtype=F), 0, "value",
-    )  # fmt: skip
+        gp.features,
+        gp.targets,
+        torch.ones(1, features, dtype=F),
+        torch.ones(1, dtype=F),
+        torch.ones(1, dtype=F),
+        0,
+        "value",
+    )
     theta = np.full(parameters, 0.1)
     model = LogModel(
         kinematics, nominal, theta, (20,) * outputs, 0, (OutputGP((outputs - 1,), gp),)
@@ -134,12 +144,14 @@ def of_a_pendulum_log():
 
 
 def of_a_quadrotor_log():
-    space = StateSpace((
-        StateGroup("position", ("x", "y", "z")),
-        StateGroup("attitude", ("qx", "qy", "qz", "qw"), kind="quaternion"),
-        StateGroup("velocity", ("vx", "vy", "vz")),
-        StateGroup("rate", ("p", "q", "r")),
-    ))  # fmt: skip
+    space = StateSpace(
+        (
+            StateGroup("position", ("x", "y", "z")),
+            StateGroup("attitude", ("qx", "qy", "qz", "qw"), kind="quaternion"),
+            StateGroup("velocity", ("vx", "vy", "vz")),
+            StateGroup("rate", ("p", "q", "r")),
+        )
+    )
     return learned(
         RigidBodyKinematics(space), MultirotorNominal(4, torque=True), 4, 18, 12
     )
@@ -187,18 +199,49 @@ def write(path, header, arrays):
 
 
 VALUES = [
-    None, True, -1, 0, 1, 2, 3, 10**9, 2**31, 2**63, 10**30, 10**400, 1.5, -0.5,
-    math.nan, math.inf,
-    1e308, "", "x" * 999, "value", "two\nlines", "subprocess:call", [], [0], [1],
-    [1, 1], [[0]],
-    [10**7, 1], [2**31, 2**31], [0, 0], [None], ["a"], [0] * 2000, {},
+    None,
+    True,
+    -1,
+    0,
+    1,
+    2,
+    3,
+    10**9,
+    2**31,
+    2**63,
+    10**30,
+    10**400,
+    1.5,
+    -0.5,
+    math.nan,
+    math.inf,
+    1e308,
+    "",
+    "x" * 999,
+    "value",
+    "two\nlines",
+    "subprocess:call",
+    [],
+    [0],
+    [1],
+    [1, 1],
+    [[0]],
+    [10**7, 1],
+    [2**31, 2**31],
+    [0, 0],
+    [None],
+    ["a"],
+    [0] * 2000,
+    {},
     {"kind": "ResidualModel"},
-    {"kind": []}, {"kind": "operations"},
+    {"kind": []},
+    {"kind": "operations"},
     {"kind": "operations", "sizes": [10**7, 1], "shape": [2, 1]},
     {"kind": "function", "path": "os:system", "parameters": {"command": "true"}},
     {"kind": "casadi", "path": "gpmpc.systems:sin", "parameters": {"angle": 1.0}},
-    {"kind": "GPPosterior"}, [[[]] * 50] * 50,
-]  # fmt: skip
+    {"kind": "GPPosterior"},
+    [[[]] * 50] * 50,
+]
 
 
 def places(node):
@@ -256,13 +299,21 @@ def a_shape(header, arrays, rng):
     name = rng.choice([*arrays])
     array = np.nan_to_num(arrays[name].clip(-1e30, 1e30))
     shapes = [
-        array.T, array[:0], array[None], array.ravel(), array[..., :-1],
+        array.T,
+        array[:0],
+        array[None],
+        array.ravel(),
+        array[..., :-1],
         array.astype("f4"),
-        array.clip(-9, 9).astype("i8"), np.array(1.0), np.zeros((0, 10**9)),
+        array.clip(-9, 9).astype("i8"),
+        np.array(1.0),
+        np.zeros((0, 10**9)),
         np.zeros((10**9, 0)),
-        np.concatenate([array, array]), np.zeros((2**20, 0, 3)), np.zeros((4000, 1)),
+        np.concatenate([array, array]),
+        np.zeros((2**20, 0, 3)),
+        np.zeros((4000, 1)),
         array.reshape(-1, 1),
-    ]  # fmt: skip
+    ]
     arrays[name] = rng.choice(shapes)
     if rng.random() < 0.9 and name in header.get("memory_order", {}):
         header["memory_order"][name] = [*range(arrays[name].ndim)]
@@ -282,10 +333,17 @@ def another_name(header, arrays, rng):
 
 
 MUTATIONS = [
-    a_value, a_value, a_value, a_value_left_out, a_field_added, a_model_inside_another,
-    numbers, numbers, a_shape,
+    a_value,
+    a_value,
+    a_value,
+    a_value_left_out,
+    a_field_added,
+    a_model_inside_another,
+    numbers,
+    numbers,
+    a_shape,
     another_name,
-]  # fmt: skip
+]
 
 
 def check_predicts(model):

@@ -144,10 +144,14 @@ def test_code_of_a_trusted_package_is_loaded(saved):
 
 @pytest.mark.parametrize(
     "path",
-    ["tests.models.hostile:subprocess.call", "tests.models.hostile:np.save",
-     "tests:nothing",
-     "tests.models.hostile:json.dumps", "tests.models.hostile:load_model"],
-)  # fmt: skip
+    [
+        "tests.models.hostile:subprocess.call",
+        "tests.models.hostile:np.save",
+        "tests:nothing",
+        "tests.models.hostile:json.dumps",
+        "tests.models.hostile:load_model",
+    ],
+)
 def test_what_a_trusted_package_imports_is_not_its_code(path, saved):
     path = saved(with_code(), lambda h, _: h["nominal"].update(path=path))
     with pytest.raises(DataError, match="only imports|cannot be imported here"):
@@ -197,8 +201,10 @@ def one_cell(name, row, column, value):
         (change(input_dim=10**9), "more than 2048"),
         (change(input_dim=-1), "input_dim"),
         (change(input_dim="1"), "input_dim is neither numbers nor"),
-        (change(nominal=None),
-         "nominal is neither numbers nor a part of a model: None"),
+        (
+            change(nominal=None),
+            "nominal is neither numbers nor a part of a model: None",
+        ),
         (change(nominal=[1.0]), "nominal: must be a function"),
         (change(B=2.0), "B must be a list"),
         (change(angles=""), "angles is neither"),
@@ -220,7 +226,7 @@ def one_cell(name, row, column, value):
         (cells("noise", np.full((2, 2), np.inf)), "must be finite"),
     ],
     ids=lambda value: value if isinstance(value, str) else "",
-)  # fmt: skip
+)
 def test_a_crafted_model_is_refused_at_once_in_one_line(change, rule, saved):
     path = saved(with_operations(), change)
     began = time.process_time()
@@ -266,11 +272,19 @@ def test_a_nominal_model_of_nothing_is_refused_where_it_is_made():
 
 @pytest.mark.parametrize(
     "metadata",
-    [["x"], {"states": "ab"}, {"states": [1, 2]}, {"states": {"a": 1}}, {"inputs": 3},
-     {"time_step": "0.1"}, {"time_step": float("nan")}, {"time_step": 0},
-     {"time_step": [1]}],
+    [
+        ["x"],
+        {"states": "ab"},
+        {"states": [1, 2]},
+        {"states": {"a": 1}},
+        {"inputs": 3},
+        {"time_step": "0.1"},
+        {"time_step": float("nan")},
+        {"time_step": 0},
+        {"time_step": [1]},
+    ],
     ids=str,
-)  # fmt: skip
+)
 def test_metadata_that_describe_no_model_cannot_fly(metadata, saved):
     path = saved(posterior(), change(metadata=metadata))
     with pytest.raises(DataError, match=r"model\.safetensors: its metadata do not"):
@@ -314,13 +328,18 @@ def test_a_log_model_that_does_not_fit_together_is_refused(tmp_path):
     good = parts_of(path)
     load_learned(path)
     for changed in (
-        {"lag": 2**63}, {"lag": 0.5}, {"history": [1]}, {"time_step": -1},
+        {"lag": 2**63},
+        {"lag": 0.5},
+        {"history": [1]},
+        {"time_step": -1},
         {"time_step": 1e308},
-        {"nominal": ["MultirotorNominal", {"motors": 10**9}]}, {"nominal": None},
+        {"nominal": ["MultirotorNominal", {"motors": 10**9}]},
+        {"nominal": None},
         {"gps": [[[9], {}]]},
-        {"names": [["a"], [], [], []]}, {"groups": []},
+        {"names": [["a"], [], [], []]},
+        {"groups": []},
         {"kinematics": "RigidBody", "groups": good[0]["groups"][:2]},
-    ):  # fmt: skip
+    ):
         write(path, good[0] | changed, good[1])
         with pytest.raises(DataError, match=r"^[^\n]*m\.safetensors: [^\n]*$"):
             load_learned(path)

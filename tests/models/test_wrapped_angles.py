@@ -252,9 +252,18 @@ def test_degrees_and_next_states_alone_that_wrap_are_named(caplog):
         lambda rng: rng.uniform(0, 9, 300),
         lambda rng: np.zeros(300),
     ],
-    ids=["walk", "whole turns always", "jumps of 6", "jumps of 25", "heavy tails",
-         "sawtooth of 3", "sawtooth of 9", "only upwards", "still"],
-)  # fmt: skip
+    ids=[
+        "walk",
+        "whole turns always",
+        "jumps of 6",
+        "jumps of 25",
+        "heavy tails",
+        "sawtooth of 3",
+        "sawtooth of 9",
+        "only upwards",
+        "still",
+    ],
+)
 def test_honest_large_steps_are_no_turns(steps, caplog):
     for seed in range(5):
         x = np.cumsum(steps(np.random.default_rng(seed)))[:, None]

@@ -178,9 +178,11 @@ def test_states_stand_below_each_other_in_tabs_by_what_they_are(shown):
         tab["title"]: tab["layout"] for tab in config["configById"]["Tab!plots"]["tabs"]
     }
     grouped = {
-        "translational": ["Position", "Rates"], "rotational": ["Attitude", "Rates"],
-        "whole": ["Position", "Attitude", "Rates"], "pendulum": ["States"],
-    }[flown]  # fmt: skip
+        "translational": ["Position", "Rates"],
+        "rotational": ["Attitude", "Rates"],
+        "whole": ["Position", "Attitude", "Rates"],
+        "pendulum": ["States"],
+    }[flown]
     assert [*tabs] == [*grouped, "Inputs", "Uncertainty", "Solver"]
     uncertain = [
         panel

@@ -37,11 +37,18 @@ def metrics_of(error, steps=20, failing=0, constraints=()):
     nothing = np.full((steps, 6), np.nan)
     timing = Timing(1e-3, 1e-4, 2e-3)
     rollout = Rollout(
-        states, np.zeros((steps + 1, 6, 6)), states[:-1], np.ones((steps, 3)),
-        references, nothing,
-        np.full((steps, 6, 6), np.nan), statuses, np.ones(steps, int),
-        (timing,) * steps, 1.0,
-    )  # fmt: skip
+        states,
+        np.zeros((steps + 1, 6, 6)),
+        states[:-1],
+        np.ones((steps, 3)),
+        references,
+        nothing,
+        np.full((steps, 6, 6), np.nan),
+        statuses,
+        np.ones(steps, int),
+        (timing,) * steps,
+        1.0,
+    )
     experiment = Experiment(None, None, PLANT, None, lambda plant: None, steps=steps)
     return metrics(
         experiment, Flown(rollout, SimpleNamespace(problem=problem, horizon=2), None)

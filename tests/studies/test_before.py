@@ -32,9 +32,14 @@ def experiment(horizon, controller=None, **changes):
         )
     system = pendulum()
     settings = {
-        "data": RandomData(samples=100), "trajectory": None, "system": system,
-        "train": TRAINER, "controller": controller, "steps": 2, "name": "goal",
-    }  # fmt: skip
+        "data": RandomData(samples=100),
+        "trajectory": None,
+        "system": system,
+        "train": TRAINER,
+        "controller": controller,
+        "steps": 2,
+        "name": "goal",
+    }
     return Experiment(**settings | changes)
 
 

@@ -223,13 +223,21 @@ def test_a_document_of_a_title_and_a_table_is_no_more_than_that():
 @pytest.mark.parametrize(
     ("value", "text"),
     [
-        (0.0, "0"), (1e-3, "0.001"), (9.994e-4, "9.99e-4"), (-1.23456e-3, "-0.00123"),
+        (0.0, "0"),
+        (1e-3, "0.001"),
+        (9.994e-4, "9.99e-4"),
+        (-1.23456e-3, "-0.00123"),
         (1.005e-10, "1.01e-10"),
-        (12.0, "12"), (999.4, "999"), (999.6, "1.00e3"), (1234.0, "1.23e3"),
-        (-1e4, "-1.00e4"), (1e100, "1.00e100"),
-        (float("inf"), "inf"), (float("nan"), "nan"),
+        (12.0, "12"),
+        (999.4, "999"),
+        (999.6, "1.00e3"),
+        (1234.0, "1.23e3"),
+        (-1e4, "-1.00e4"),
+        (1e100, "1.00e100"),
+        (float("inf"), "inf"),
+        (float("nan"), "nan"),
     ],
-)  # fmt: skip
+)
 def test_a_number_has_three_digits_and_a_power_that_latex_sets(value, text):
     assert number(value) == text
     if "e" in text:

@@ -73,10 +73,14 @@ def blind(law, **changes):
 
 def experiment(**changes):
     settings = {
-        "data": ExcitedData(EXCITED, EXCITED, samples=25), "trajectory": Elliptical(),
+        "data": ExcitedData(EXCITED, EXCITED, samples=25),
+        "trajectory": Elliptical(),
         "system": PLANT,
-        "train": Trainer(restarts=0), "controller": CONVEX, "size": 20, "steps": 4,
-    }  # fmt: skip
+        "train": Trainer(restarts=0),
+        "controller": CONVEX,
+        "size": 20,
+        "steps": 4,
+    }
     return Experiment(**settings | changes)
 
 
@@ -159,10 +163,13 @@ def test_the_rotational_subsystem_follows_at_its_own_rate():
         "initial_input": [0] * 3,
     }
     turning = experiment(
-        system=rotational(substeps=5), trajectory=Lorenz(),
+        system=rotational(substeps=5),
+        trajectory=Lorenz(),
         data=ExcitedData(EXCITED, excited, samples=60),
-        controller=partial(GPMPC, **settings), size=None, steps=100,
-    )  # fmt: skip
+        controller=partial(GPMPC, **settings),
+        size=None,
+        steps=100,
+    )
     flight = run_trial(turning)
     result = metrics(turning, flight)
     assert flight.rollout.time_step == 0.05
@@ -199,10 +206,12 @@ def test_an_offset_and_a_short_flight_are_no_loss(trajectory):
     heavy = translational(mass=0.888)
     problem = replace(PROBLEM, cost=Tracking([1] * 6, [1] * 3))
     sagging = experiment(
-        trajectory=trajectory, data=None,
-        controller=lambda plant: ON_THE_PLANT(PLANT, problem=problem), plant=heavy,
+        trajectory=trajectory,
+        data=None,
+        controller=lambda plant: ON_THE_PLANT(PLANT, problem=problem),
+        plant=heavy,
         steps=20,
-    )  # fmt: skip
+    )
     result = metrics(sagging, run_trial(sagging))
     assert result["rmse"]["z"] > 3
     assert result["lost"] is None

@@ -152,14 +152,36 @@ def test_a_plan_that_cannot_be_read_is_skipped(tmp_path):
 
 
 NASTY = [
-    "[/nope]", "[red]x", r"\input{/etc/passwd}", "\\", "<script>alert(1)</script>",
-    "<img src=x onerror=y>", "&amp;",
-    "a|b", "=1+1", "@SUM(A1)", "+cmd|'/C calc'!A0", "-2+3", "`rm`", "[x](javascript:y)",
-    "$x$", r"$\frac", "%",
-    "a_b^c~d#{}", "*b*", "\x1b[31mred", "two\nlines", "tab\there", "\u202eleft",
-    "\ud800", "nul\x00", "x" * 400,
-    "ünïcödé 漢字", "{unit}", "../../up",
-]  # fmt: skip
+    "[/nope]",
+    "[red]x",
+    r"\input{/etc/passwd}",
+    "\\",
+    "<script>alert(1)</script>",
+    "<img src=x onerror=y>",
+    "&amp;",
+    "a|b",
+    "=1+1",
+    "@SUM(A1)",
+    "+cmd|'/C calc'!A0",
+    "-2+3",
+    "`rm`",
+    "[x](javascript:y)",
+    "$x$",
+    r"$\frac",
+    "%",
+    "a_b^c~d#{}",
+    "*b*",
+    "\x1b[31mred",
+    "two\nlines",
+    "tab\there",
+    "\u202eleft",
+    "\ud800",
+    "nul\x00",
+    "x" * 400,
+    "ünïcödé 漢字",
+    "{unit}",
+    "../../up",
+]
 
 
 @pytest.mark.parametrize("nasty", NASTY, ids=ascii)
@@ -511,9 +533,11 @@ def test_figures_of_one_setting_have_one_curve_and_own_names(tmp_path, monkeypat
         [[pytest.approx(0.1)], [pytest.approx(0.2)]],
     )
     assert [*two] == [
-        "rmse-over-a-b.png", "decision-over-a-b.png", "rmse-over-a-b-1.png",
-        "decision-over-a-b-1.png"
-    ]  # fmt: skip
+        "rmse-over-a-b.png",
+        "decision-over-a-b.png",
+        "rmse-over-a-b-1.png",
+        "decision-over-a-b-1.png",
+    ]
 
 
 def test_a_comparison_is_told_with_every_number(tmp_path):

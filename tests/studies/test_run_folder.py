@@ -24,11 +24,23 @@ from gpmpc.studies._run_folder import (
 
 def test_other_choices_have_another_folder_ignoring_case():
     many = [
-        [], ["a=1"], ["a=1", "b=2"], ["a=1,b=2"], ["a=1,b", "2"], ["a=[1,2]"],
-        ["a=[1, 2]"], ["a=1 2"], ["a=1_2"],
-        ["A=1"], ["a=1/2"], ["a=1:2"], ["x=" + 300 * "y"], ["x=" + 301 * "y"], ["a=ä"],
+        [],
+        ["a=1"],
+        ["a=1", "b=2"],
+        ["a=1,b=2"],
+        ["a=1,b", "2"],
+        ["a=[1,2]"],
+        ["a=[1, 2]"],
+        ["a=1 2"],
+        ["a=1_2"],
+        ["A=1"],
+        ["a=1/2"],
+        ["a=1:2"],
+        ["x=" + 300 * "y"],
+        ["x=" + 301 * "y"],
+        ["a=ä"],
         ["a=ö"],
-    ]  # fmt: skip
+    ]
     names = [folder_name(choices) for choices in many]
     assert len({name.lower() for name in names}) == len(many)
     assert all(len(name) < 200 and not set(name) & set('/\\:*?"<>| ') for name in names)

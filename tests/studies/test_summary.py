@@ -178,14 +178,22 @@ def rollout_of(errors, **changes):
     states[:, ::2] += errors
     timings = tuple(Timing(0.001 * (k + 1), 0.01, 0.1) for k in range(steps))
     nothing = np.full((steps, n, n), np.nan)
-    return Rollout(**{
-        "states": states, "covariances": np.zeros((steps + 1, n, n)),
-        "measured": states[:-1],
-        "inputs": np.linspace([1, 2, 3], [10, 11, 12], steps), "references": references,
-        "predicted_means": nothing[..., 0], "predicted_covariances": nothing,
-        "statuses": (Status.SOLVED,) * steps,
-        "iterations": np.ones(steps, int), "timings": timings, "time_step": 0.2,
-    } | changes)  # fmt: skip
+    return Rollout(
+        **{
+            "states": states,
+            "covariances": np.zeros((steps + 1, n, n)),
+            "measured": states[:-1],
+            "inputs": np.linspace([1, 2, 3], [10, 11, 12], steps),
+            "references": references,
+            "predicted_means": nothing[..., 0],
+            "predicted_covariances": nothing,
+            "statuses": (Status.SOLVED,) * steps,
+            "iterations": np.ones(steps, int),
+            "timings": timings,
+            "time_step": 0.2,
+        }
+        | changes
+    )
 
 
 def measured(

@@ -92,10 +92,11 @@ def test_nothing_matters_where_there_is_nothing_to_tell_apart(space, costs):
 
 def test_numbers_are_drawn_on_a_linear_or_logarithmic_scale():
     ranges = {
-        "even": Interval(1.0, 1e4), "log": Interval(1.0, 1e4, logarithmic=True),
+        "even": Interval(1.0, 1e4),
+        "log": Interval(1.0, 1e4, logarithmic=True),
         "whole": Interval(1, 10**4, whole=True),
         "whole log": Interval(1, 10**4, logarithmic=True, whole=True),
-    }  # fmt: skip
+    }
     search = Search(ranges, 0)
     for _ in range(40):
         search.ask(1)
