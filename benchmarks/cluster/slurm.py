@@ -284,8 +284,11 @@ class Slurm:
 
 
 def _kill_tree(root: int, among: Sequence[int]) -> None:
-    """Kills a process, its descendants, and others that belong to it."""
-    for process in [*_descendants(root), root, *among]:
+    """Kills a process, its descendants, and others that belong to it.
+
+    From the top, so that none can tell what happened to those below it.
+    """
+    for process in [root, *_descendants(root), *among]:
         try:
             os.kill(process, signal.SIGKILL)
         except ProcessLookupError:

@@ -17,6 +17,7 @@ import os
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any, Protocol
 
 from gpmpc._provenance import provenance
@@ -63,8 +64,12 @@ class Flying:
     chunked: Callable[[Sequence[Any]], Sequence[Chunk]]
     on_settled: OnSettled
     retries: int
-    #: runs that fly again in this call, since their process or node died; paths
+    #: runs that flew again in this call, since their process or node died; paths
     repeated: set[str] = field(default_factory=set)
+    #: runs that were ended from outside before, and fly once more; paths
+    tried_again: list[str] = field(default_factory=list)
+    #: runs that were ended from outside too often, and do not fly; paths
+    given_up: list[str] = field(default_factory=list)
     _open: dict[str, Job] = field(default_factory=dict)  # by path, not settled yet
     _failed_before: dict[str, int | None] = field(default_factory=dict)
     _begun_before: dict[str, int | None] = field(default_factory=dict)
@@ -72,11 +77,24 @@ class Flying:
     def fly(self, jobs: Iterable[Any]) -> None:
         """Flies jobs; returns when each is settled."""
         for job in jobs:
-            self._open[str(job.folder.path)] = job
-            self._failed_before[str(job.folder.path)] = job.folder.failed_at
+            self._add(job)
         while self._open:
             if not self._fly_once():
                 time.sleep(_LOOK_INTERVAL)
+
+    def _add(self, job: Job) -> None:
+        """Takes a job on, unless it was ended from outside too often."""
+        path = str(job.folder.path)
+        failed_at = job.folder.failed_at
+        attempts = 0 if failed_at is None else job.folder.lost_attempts
+        if attempts > self.retries:
+            self.given_up.append(path)
+            self.on_settled(job, RunState.FAILED)
+            return
+        if attempts:
+            self.tried_again.append(path)
+        self._open[path] = job
+        self._failed_before[path] = failed_at
 
     def _fly_once(self) -> bool:
         """Flies the jobs that nobody works on, and settles those that have ended.
@@ -112,10 +130,11 @@ class Flying:
         for path, job in [*self._open.items()]:
             # When an adopted chunk began its runs is not known.
             self._begun_before[path] = None
-            if path in in_hand or self._settle(job):
+            if path in in_hand:
                 continue
             self._begun_before[path] = job.folder.begun_at
-            if job.folder.state is not RunState.RUNNING:
+            state = job.folder.state
+            if not self._settle(job, state) and state is not RunState.RUNNING:
                 to_fly.append(job)
         if not to_fly and not in_hand:
             return None
@@ -125,12 +144,11 @@ class Flying:
     def _unsettled(self, chunk: Chunk) -> list[Job]:
         """Settles jobs of a chunk; returns those that are not."""
         jobs = [self._open[path] for path in _paths(chunk) if path in self._open]
-        return [job for job in jobs if not self._settle(job)]
+        return [job for job in jobs if not self._settle(job, job.folder.state)]
 
-    def _settle(self, job: Job) -> bool:
+    def _settle(self, job: Job, state: RunState) -> bool:
         """Takes a job off the list where it has finished, or failed in this call."""
         path = str(job.folder.path)
-        state = job.folder.state
         if state is RunState.FAILED:
             if job.folder.failed_at == self._failed_before[path]:
                 return False
@@ -165,8 +183,8 @@ class Flying:
             "schema": 1,
             "choices": [*job.choices],
             "settings": {},
-            "host": end.host,
-            "provenance": provenance(),
+            "host": end.host or job.folder.last_worker,
+            "provenance": self._provenance,
         }
         try:
             job.folder.lose(end.reason, cause.value, about)
@@ -177,7 +195,12 @@ class Flying:
             self.repeated.add(path)
             self._failed_before[path] = job.folder.failed_at
             return
-        self._settle(job)
+        self._settle(job, job.folder.state)
+
+    @cached_property
+    def _provenance(self) -> dict[str, Any]:
+        """Of all failures that this process writes."""
+        return provenance()
 
     def _judge_unseen(self, unseen: Sequence[tuple[Job, ChunkEnd]]) -> None:
         """Fails the jobs that a process said to be done, and that are not there."""
@@ -199,7 +222,9 @@ class Flying:
     def _settle_late(self, job: Job) -> bool:
         """Settles a job after its tree was listed, which shows what others wrote."""
         os.listdir(job.folder.path.parent)
-        return str(job.folder.path) not in self._open or self._settle(job)
+        if str(job.folder.path) not in self._open:
+            return True
+        return self._settle(job, job.folder.state)
 
 
 def _paths(chunk: Chunk) -> list[str]:

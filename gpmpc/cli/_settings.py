@@ -24,8 +24,6 @@ from gpmpc.exceptions import GpmpcError, SettingError
 
 # Of files of models, quoted or not.
 _MODEL_ENDINGS = (".safetensors", ".safetensors'", '.safetensors"')
-# Extras of this package that bring a launcher.
-_EXTRAS = {"submitit_slurm": "slurm", "submitit_local": "slurm", "ray": "ray"}
 
 
 def folder_of(folder: Any) -> Path:
@@ -246,9 +244,6 @@ def _unknown_setting(match: re.Match[str], name: str) -> str:
 
 def _unknown_option(match: re.Match[str], name: str) -> str:
     option = match["option"]
-    extra = _EXTRAS.get(option.removeprefix("launcher/"))
-    if extra:
-        return f"launcher: this one is not installed: pip install 'gpmpc[{extra}]'"
     available = match["available"].split()
     return (
         f"{match['group']}: no such option {option!r}; "

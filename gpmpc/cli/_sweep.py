@@ -16,7 +16,7 @@ import itertools
 import json
 from argparse import Namespace
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
@@ -35,6 +35,7 @@ from gpmpc.cli._overrides import choices, combinations
 from gpmpc.cli._run import warning_of
 from gpmpc.cli._settings import folder_of, write_files
 from gpmpc.cli._terminal import print_error, progress_bar
+from gpmpc.exceptions import check_number
 from gpmpc.studies._run_folder import (
     PLAN,
     RunFolder,
@@ -66,10 +67,21 @@ class Sweep:
         self.console = console
         self._composer = Composer(name, self.config)
         self._examples = Examples()
+        check_number("retries", self.config.retries, least=0, whole=True)
+        self._launcher = launcher_of(self.config, self.tree)
+        self._chunking = Chunking(self.config.chunk, self._launcher.workers)
         #: folders of finished runs that other code flew, and what it was
         self.of_other_code: dict[Path, str] = {}
         #: folders of finished runs that were lost, or suspicious at their end, and why
         self.warnings: dict[Path, str] = {}
+        #: folders of runs that were flown again, since their process was ended
+        self.flown_again: set[str] = set()
+        #: folders of runs that were ended too often, and are not flown again
+        self.given_up: set[str] = set()
+
+    def close(self) -> None:
+        """Ends the processes that wait for more runs."""
+        self._launcher.close()
 
     def job(self, overrides: Sequence[str]) -> Job:
         """Returns the run of these settings."""
@@ -115,27 +127,22 @@ class Sweep:
 
         Those that another process works on are waited for at the end.
         """
-        launcher = launcher_of(self.config, self.tree)
-        chunking = Chunking(self.config.chunk, launcher.workers)
         outcomes: list[JobOutcome] = []
 
         def settle(job: Job, state: RunState) -> None:
-            chunking.measure(job)
+            self._chunking.measure(job)
             outcomes.append(self._outcome(job, state))
 
         flying = Flying(
-            launcher=launcher,
+            launcher=self._launcher,
             work=fly_chunk,
-            chunked=chunking.chunks,
+            chunked=self._chunking.chunks,
             on_settled=settle,
             retries=self.config.retries,
         )
-        try:
-            flying.fly(
-                job.with_absolute_path() for job in jobs if not job.folder.finished
-            )
-        finally:
-            launcher.close()
+        flying.fly(job.with_absolute_path() for job in jobs if not job.folder.finished)
+        self.flown_again |= {*flying.tried_again, *flying.repeated}
+        self.given_up |= {*flying.given_up}
         return outcomes
 
     def _outcome(self, job: Job, state: RunState) -> JobOutcome:
@@ -175,6 +182,22 @@ class Sweep:
             highlight=False,
         )
 
+    def print_attempts(self) -> None:
+        """Prints how many runs were flown again, and how many will not be."""
+        retries = self.config.retries
+        if self.flown_again:
+            self.console.out(
+                f"{len(self.flown_again)} of the runs were flown again, since a cluster "
+                f"or a crash had ended them; at most {retries} times each (retries)",
+                highlight=False,
+            )
+        if self.given_up:
+            print_error(
+                f"{len(self.given_up)} of the runs were ended by a cluster or a crash "
+                f"more than {retries} times, and are not flown again; "
+                f"retries={retries + 1} flies them once more"
+            )
+
     def print_warnings(self) -> None:
         """Prints the finished runs that were lost, or suspicious at their end."""
         for folder, warning in sorted(self.warnings.items()):
@@ -190,25 +213,34 @@ def sweep(arguments: Namespace) -> Result:
     console = Console()
     every_run = combinations(arguments.overrides)
     first = next(every_run)
-    runs = Sweep(arguments.config_name, first, console)
-    by_folder = {
-        job.folder.path: job
-        for job in map(runs.job, itertools.chain([first], every_run))
-    }
-    jobs = list(by_folder.values())
-    finished = sum(job.folder.finished for job in jobs)
-    runs.check(jobs)
-    _write_plan(runs.tree, jobs)
-    with runs.progress(jobs, len(jobs)):
-        outcomes = runs.fly(jobs)
-    failed = [outcome for outcome in outcomes if outcome.error is not None]
+    with closing(Sweep(arguments.config_name, first, console)) as runs:
+        by_folder = {
+            job.folder.path: job
+            for job in map(runs.job, itertools.chain([first], every_run))
+        }
+        jobs = list(by_folder.values())
+        finished = sum(job.folder.finished for job in jobs)
+        runs.check(jobs)
+        _write_plan(runs.tree, jobs)
+        with runs.progress(jobs, len(jobs)):
+            outcomes = runs.fly(jobs)
+    # What is there counts: another sweep may have flown what failed in this one.
+    there = {job.folder.path for job in jobs if job.folder.finished}
+    failed = [
+        outcome
+        for outcome in outcomes
+        if outcome.error is not None and Path(outcome.folder) not in there
+    ]
     total = "1 run" if len(jobs) == 1 else f"{len(jobs)} runs"
+    gone = len(jobs) - len(there) - len(failed)
     console.out(
-        f"{total}: {len(outcomes) - len(failed)} flown, {finished} finished before, "
-        f"{len(failed)} failed{_count_warnings(runs.warnings)}; in {runs.tree}",
+        f"{total}: {len(there) - finished} flown, {finished} finished before, "
+        f"{len(failed)} failed{f', {gone} gone' if gone else ''}"
+        f"{_count_warnings(runs.warnings)}; in {runs.tree}",
         highlight=False,
     )
     runs.print_other_code()
+    runs.print_attempts()
     runs.print_warnings()
     for outcome in failed:
         print_error(f"failed: {outcome.folder}: {outcome.error}")
@@ -221,7 +253,7 @@ def sweep(arguments: Namespace) -> Result:
             {"folder": outcome.folder, "error": outcome.error} for outcome in failed
         ],
     }
-    return Result(data, 1 if failed else 0)
+    return Result(data, 1 if failed or gone else 0)
 
 
 def _write_plan(tree: Path, jobs: Sequence[Job]) -> None:

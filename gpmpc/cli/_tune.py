@@ -11,6 +11,7 @@ import math
 import shlex
 from argparse import Namespace
 from collections.abc import Mapping, Sequence
+from contextlib import closing
 from typing import Any, cast
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -93,7 +94,7 @@ def tune(arguments: Namespace) -> Result:
     tuning = Tuning(runs, fixed, arguments.seeds)
     search = Search(space, runs.config.seed)
     total = (arguments.trials + 1) * arguments.seeds
-    with runs.progress(tuning.jobs, total) as describe:
+    with closing(runs), runs.progress(tuning.jobs, total) as describe:
         (unchanged_cost,) = tuning.costs([{}])
         for start in range(0, arguments.trials, arguments.batch):
             candidates = search.ask(min(arguments.batch, arguments.trials - start))
@@ -111,6 +112,7 @@ def tune(arguments: Namespace) -> Result:
     console.print(terminal(document.tables, document.lead))
     console.out(f"to fly the best one: {command}", written, sep="\n", highlight=False)
     runs.print_other_code()
+    runs.print_attempts()
     data = {
         "folder": str(runs.tree),
         "best": best,

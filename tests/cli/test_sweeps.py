@@ -347,7 +347,6 @@ def needs(module):
     "launcher",
     [
         "joblib",
-        pytest.param("submitit", marks=needs("submitit")),
         pytest.param("ray", marks=needs("ray")),
     ],
 )
