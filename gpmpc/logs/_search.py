@@ -11,7 +11,6 @@ A structure's score is the mean, over groups and steps, of the logarithm of its 
 over that of the best baseline; where it is behind, that counts twice.
 """
 
-import itertools
 from collections.abc import Iterable, Mapping, MutableMapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
@@ -26,6 +25,7 @@ from gpmpc.logs._folds import Fold
 from gpmpc.logs._log import Log
 from gpmpc.logs._noise import fit_noise
 from gpmpc.logs._output_gps import train_output_gp
+from gpmpc.logs._smoothing import smooth
 from gpmpc.logs._structures import (
     LATE,
     Candidate,
@@ -34,7 +34,7 @@ from gpmpc.logs._structures import (
     additions,
     bases,
 )
-from gpmpc.models._correction import Correction
+from gpmpc.models._correction import Correction, StartFilter
 from gpmpc.models._grouped import GroupedNominal
 from gpmpc.models._log_dynamics import OutputNoise
 from gpmpc.models._log_model import LogModel, OutputGP
@@ -51,12 +51,21 @@ _CORRECTED_WINDOWS = 1200  # of a fold, that a correction is fitted to
 _CHUNKS = 6  # of held-out rollouts, each corrected by what the others say
 _LARGEST = 1e6  # state of a rollout that a correction is fitted to
 _CORRECTED = 2  # structures upon which a correction is tried
+_FILTERED_WINDOWS = 4000  # that the filter of starts is fitted to
+_FILTER_PENALTY = 1e-4  # of squared coefficients of the filter of starts, per row
 _KNOTS = (1, 2, 3, 5, 7, 10, 15, 20, 30, 50)  # steps of a correction
 _PENALTIES = (0.001, 0.01, 0.1, 1.0, 10.0, np.inf)  # tried of a correction
 _EXACT = 1e-4  # of a constant state's error: what is smaller counts as exact
 _NOTHING = 1e-9  # of the outputs: a residual that is none
 _LOSS = 2.0  # weight of being behind a baseline
 _ROUNDS = 8  # of changes of the GPs of one nominal structure, at most
+
+
+class _TrainingData(NamedTuple):
+    """What models are fitted to."""
+
+    log: Log  # smoothed, where its rows are noisy
+    start_filter: StartFilter | None  # None where they are not
 
 
 @dataclass(frozen=True)
@@ -115,6 +124,8 @@ class Search:
         self._structures: dict[str, Structure] = {}
         self._errors: dict[str, Array] = {}
         self._baselines = self._baseline_distances()
+        # What models are fitted to, and how their rollouts start, by fold.
+        self._training = [self._training_data(fold.train) for fold in folds]
         still = self._baselines[CONSTANT_STATE].mean(axis=0)
         self._exact = _EXACT * still + 1e-12
         self._scale = self._best_baseline_errors()
@@ -160,6 +171,19 @@ class Search:
         """Returns structures that were considered, the best one first."""
         return sorted(structures, key=self.score)
 
+    def _training_data(self, log: Log) -> "_TrainingData":
+        """Smooths a log, and fits the filter of starts, where its rows are noisy."""
+        kinematics = self._bases[0].model.kinematics
+        smoothed = smooth(log, kinematics, self._seed)
+        if smoothed is None:
+            return _TrainingData(log, None)
+        windows = log.windows(0, past=PAST_ROWS, most=_FILTERED_WINDOWS)
+        states = smoothed.windows(0, past=PAST_ROWS, most=_FILTERED_WINDOWS).states
+        start_filter = StartFilter.fit(
+            kinematics, windows, states[:, PAST_ROWS], _FILTER_PENALTY
+        )
+        return _TrainingData(smoothed, start_filter)
+
     # 1. nominal structures
 
     def _search_nominals(self) -> None:
@@ -200,13 +224,19 @@ class Search:
             if parent is not None:
                 starts = self._nominal_models[parent.key]
             fits = [
-                fit_from(start, structure.model, fold.train, self._steps).model
-                for start, fold in zip(starts, self._folds, strict=True)
+                fit_from(start, structure.model, training.log, self._steps).model
+                for start, training in zip(starts, self._training, strict=True)
             ]
             self._memory[structure.key] = [model.theta.tolist() for model in fits]
         models = [
-            replace(structure.model, theta=np.array(theta, dtype=float))
-            for theta in self._memory[structure.key]
+            replace(
+                structure.model,
+                theta=np.array(theta, dtype=float),
+                start_filter=training.start_filter,
+            )
+            for theta, training in zip(
+                self._memory[structure.key], self._training, strict=True
+            )
         ]
         self._nominal_models[structure.key] = models
         self._enter(structure, self._mean_errors(models))
@@ -217,21 +247,43 @@ class Search:
         """Combines the best structure with the best of every other base, by group."""
         ranked = self._ranked(self._structures.values())
         first = ranked[0]
-        groups = tuple(first.model.kinematics.output_groups)
         others: dict[str, Structure] = {}
         for structure in ranked:
             if structure.base != first.base:
                 others.setdefault(structure.base, structure)
         for other in others.values():
-            for count in range(1, len(groups)):
-                for own in itertools.combinations(groups, count):
-                    theirs = tuple(group for group in groups if group not in own)
-                    self._consider_combination(((first, own), (other, theirs)))
+            self._exchange_groups(first, other)
+
+    def _exchange_groups(self, first: Structure, other: Structure) -> None:
+        """Takes groups of outputs from another structure while that helps."""
+        groups = tuple(first.model.kinematics.output_groups)
+        theirs: tuple[str, ...] = ()
+        best = first
+        while len(theirs) < len(groups) - 1:
+            tried = []
+            for group in groups:
+                if group in theirs:
+                    continue
+                taken = tuple(g for g in groups if g == group or g in theirs)
+                own = tuple(g for g in groups if g not in taken)
+                combined = self._consider_combination(((first, own), (other, taken)))
+                if combined is not None:
+                    tried.append((combined, taken))
+            if not tried:
+                return
+            combined, taken = min(tried, key=lambda pair: self.score(pair[0]))
+            if self.score(combined) >= self.score(best):
+                return
+            best = combined
+            theirs = taken
 
     def _consider_combination(
         self, parts: tuple[tuple[Structure, tuple[str, ...]], ...]
-    ) -> None:
-        """Considers outputs of which some are of one structure, some of another."""
+    ) -> Structure | None:
+        """Considers outputs of which some are of one structure, some of another.
+
+        Returns None where they do not fit.
+        """
         by_fold = [
             combine_models(
                 [self._nominal_models[part.key][i] for part, _ in parts],
@@ -241,10 +293,11 @@ class Search:
         ]
         models = [model for model in by_fold if model is not None]
         if len(models) < len(by_fold):
-            return
+            return None
         structure = Structure(base="", model=models[0], parts=parts)
         self._nominal_models[structure.key] = models
         self._enter(structure, self._mean_errors(models))
+        return structure
 
     # 3. GPs
 
@@ -272,9 +325,11 @@ class Search:
         ]
         for structure in together:
             self._consider_gps(structure)
-        for current in (start, self._ranked(together)[0]):
+        all_groups = self._ranked(together)[0]
+        rows = all_groups.gps[0].rows
+        for current in (start, all_groups):
             for _ in range(_ROUNDS):
-                changed = self._changed_gps(current, groups)
+                changed = self._changed_gps(current, groups, rows)
                 for structure in changed:
                     self._consider_gps(structure)
                 best = self._ranked([current, *changed])[0]
@@ -303,20 +358,20 @@ class Search:
         return tuple(name for name, own in groups.items() if is_left[list(own)].any())
 
     def _changed_gps(
-        self, structure: Structure, groups: Sequence[str]
+        self, structure: Structure, groups: Sequence[str], rows: int
     ) -> list[Structure]:
-        """Returns a structure with the GP of one group changed, new or gone."""
+        """Returns a structure with a GP more or less, or averaged over other rows."""
+        with_gp = {gp.group for gp in structure.gps}
         changed = []
         for group in groups:
             others = [gp for gp in structure.gps if gp.group != group]
-            own = [gp for gp in structure.gps if gp.group == group]
-            choices = [GroupGP(group, rows) for rows in _AVERAGES]
-            changed += [
-                structure.with_gps([*others, gp]) for gp in choices if gp not in own
-            ]
-            if own:
-                changed.append(structure.with_gps(others))
-        return changed
+            if group not in with_gp:
+                others.append(GroupGP(group, rows))
+            changed.append(structure.with_gps(others))
+        if len(with_gp) == 1:
+            (group,) = with_gp
+            changed += [structure.with_gps([GroupGP(group, n)]) for n in _AVERAGES]
+        return [one for one in changed if one.key != structure.key]
 
     def _consider_gps(self, structure: Structure) -> None:
         """Considers a structure with GPs."""
@@ -458,8 +513,8 @@ class Search:
         if key not in self._gps:
             nominals = self._nominal_models[structure.nominal.key]
             self._gps[key] = [
-                self._train(gp, model, fold.train)
-                for model, fold in zip(nominals, self._folds, strict=True)
+                self._train(gp, model, training.log)
+                for model, training in zip(nominals, self._training, strict=True)
             ]
         return self._gps[key]
 
@@ -529,9 +584,10 @@ class Search:
     def fit_to_all_runs(self) -> NominalFit:
         """Fits the best structure to all runs, its GPs and its correction as well."""
         best = self.best
-        fit = self._fit_nominal_to_all_runs(best.nominal)
-        gps = tuple(self._train(gp, fit.model, self._log) for gp in best.gps)
-        model = replace(fit.model, gps=gps)
+        training = self._training_data(self._log)
+        fit = self._fit_nominal_to(training.log, best.nominal)
+        gps = tuple(self._train(gp, fit.model, training.log) for gp in best.gps)
+        model = replace(fit.model, gps=gps, start_filter=training.start_filter)
         if best.penalties:
             uncorrected = replace(best, penalties=())
             rollouts = _concatenated(self._held_out_rollouts(uncorrected))
@@ -539,12 +595,12 @@ class Search:
             model = replace(model, correction=correction)
         return replace(fit, model=model)
 
-    def _fit_nominal_to_all_runs(self, structure: Structure) -> NominalFit:
-        """Fits a nominal structure to all runs."""
+    def _fit_nominal_to(self, log: Log, structure: Structure) -> NominalFit:
+        """Fits a nominal structure to a log."""
         if not structure.parts:
             start = self._nominal_models[structure.key][0]
-            return fit_from(start, structure.model, self._log, self._steps)
-        fits = [self._fit_nominal_to_all_runs(part) for part, _ in structure.parts]
+            return fit_from(start, structure.model, log, self._steps)
+        fits = [self._fit_nominal_to(log, part) for part, _ in structure.parts]
         groups = [groups for _, groups in structure.parts]
         model = combine_models([fit.model for fit in fits], groups)
         assert model is not None

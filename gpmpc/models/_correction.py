@@ -3,8 +3,9 @@
     x^[k] = rollout[k] (+) W_k z,
     z = (past states, past inputs, inputs to come, rollout[k] (-) x[0])
 
-A rollout begins at a measured row, with its noise, and knows nothing of what a filter,
-an actuator or an estimator still holds of earlier rows. What of its errors is linear in
+A rollout begins at a measured row, with its noise, unless a filter estimates the start
+from the rows before it; and it knows nothing of what an actuator or an estimator still
+holds of earlier rows. What of its errors is linear in
 the past is found by a regression for each step, straight from the past to the error
 that far ahead. The movement that was rolled out is among the regressors, so that it can
 be shrunk or left out. Upon a state that does not move this is the ordinary ridge
@@ -68,10 +69,11 @@ class Correction:
             alternatives: Penalties of squared coefficients, per row (S, e); infinite
                 for none.
         """
-        moments = [
-            _moments(kinematics, windows, predicted[:, step - 1], step)
-            for step in steps
-        ]
+        moments = []
+        for step in steps:
+            measured = windows.states[:, windows.past + step]
+            rollout = predicted[:, step - 1]
+            moments.append(_moments(kinematics, windows, rollout, step, measured))
         corrections = []
         for penalties in alternatives:
             weights = [
@@ -115,6 +117,41 @@ class Correction:
         )
 
 
+@dataclass(frozen=True)
+class StartFilter:
+    """Linear estimate of the state that a rollout begins in, from noisy rows."""
+
+    kinematics: Kinematics  #: has the features of the start
+    mean: Array  #: of the regressors (r,)
+    deviation: Array  #: likewise
+    weights: Array  #: (1 + r, e), the constant first
+
+    @classmethod
+    def fit(
+        cls, kinematics: Kinematics, windows: Windows, states: Array, penalty: float
+    ) -> "StartFilter":
+        """Fits the estimate.
+
+        Args:
+            kinematics: Has the features of the start.
+            windows: W of them, as measured.
+            states: At their starts, without the noise (W, n).
+            penalty: Of squared coefficients, per row.
+        """
+        start = windows.states[:, windows.past]
+        moments = _moments(kinematics, windows, start, 0, states)
+        penalties = np.full(windows.space.error_dim, penalty)
+        weights = _weights(moments, penalties)
+        return cls(kinematics, moments.mean, moments.deviation, weights)
+
+    def __call__(self, windows: Windows) -> Array:
+        """Estimates the states (W, n) at the starts of windows."""
+        start = windows.states[:, windows.past]
+        regressors = _regressors(self.kinematics, windows, start, 0)
+        z = _standardized(regressors, self.mean, self.deviation)
+        return windows.space.displace(start, z @ self.weights)
+
+
 class _Moments(NamedTuple):
     """What a regression needs of W windows."""
 
@@ -126,14 +163,17 @@ class _Moments(NamedTuple):
 
 
 def _moments(
-    kinematics: Kinematics, windows: Windows, predicted: Array, step: int
+    kinematics: Kinematics,
+    windows: Windows,
+    predicted: Array,
+    step: int,
+    measured: Array,
 ) -> _Moments:
     """Computes the moments of the errors of states (W, n) at a step."""
     regressors = _regressors(kinematics, windows, predicted, step)
     mean = regressors.mean(axis=0)
     deviation = np.maximum(regressors.std(axis=0), 1e-12)
     z = _standardized(regressors, mean, deviation)
-    measured = windows.states[:, windows.past + step]
     errors = windows.space.difference(measured, predicted)
     return _Moments(mean, deviation, z.T @ z, z.T @ errors, len(z))
 
@@ -168,7 +208,7 @@ def _regressors(
         columns.append(windows.space.difference(start, earlier))
     for lag in LAGS:
         columns.append(inputs[:, past - lag])
-    for rows in np.array_split(np.arange(step), min(BINS, step)):
+    for rows in np.array_split(np.arange(step), min(BINS, step)) if step else ():
         columns.append(inputs[:, past + rows].mean(axis=1))
     missing = max(BINS - step, 0) * inputs.shape[-1]
     columns.append(np.zeros((len(windows), missing)))

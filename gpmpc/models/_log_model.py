@@ -19,7 +19,7 @@ import numpy as np
 from gpmpc._dynamics import Array
 from gpmpc.exceptions import SettingError
 from gpmpc.gp import GPPosterior
-from gpmpc.models._correction import LAGS, Correction
+from gpmpc.models._correction import LAGS, Correction, StartFilter
 from gpmpc.models._kinematics import Kinematics
 from gpmpc.models._parametric import ParametricNominal
 from gpmpc.models._roll_out import iterate
@@ -61,6 +61,8 @@ class LogModel:
     gps: tuple[OutputGP, ...] = ()  #: on the residual of the nominal part
     #: of rollouts, by the past before their starts; none by default
     correction: Correction | None = None
+    #: estimates the starts of rollouts from noisy rows; none where they have no noise
+    start_filter: StartFilter | None = None
 
     def __post_init__(self) -> None:
         o = len(self.kinematics.output_names)
@@ -71,7 +73,9 @@ class LogModel:
     def past(self) -> int:
         """Number of rows that a prediction needs before its start."""
         past = max(self.history) + self.lag
-        return past if self.correction is None else max(past, *LAGS)
+        if self.correction is None and self.start_filter is None:
+            return past
+        return max(past, *LAGS)
 
     def outputs(
         self, states: Array, inputs: Array, context: Array, theta: Any = None
@@ -126,6 +130,12 @@ class LogModel:
         measured = self.kinematics.outputs(states, next_states, windows.time_step)
         return measured.mean(axis=-2) - modelled.mean(axis=-2)
 
+    def start(self, windows: Windows) -> Array:
+        """Estimates the states (W, n) at the starts of windows."""
+        if self.start_filter is None:
+            return windows.states[:, windows.past]
+        return self.start_filter(windows)
+
     def rollout(
         self, windows: Windows, steps: int | None = None, theta: Array | None = None
     ) -> Array:
@@ -148,7 +158,7 @@ class LogModel:
             raise SettingError("past", f"{rule}; got {windows.past}")
         if steps is None:
             steps = windows.ahead
-        start = windows.states[:, windows.past]
+        start = self.start(windows)
         parameters = None
         if theta is not None:
             start = np.broadcast_to(start, (len(theta), *start.shape))

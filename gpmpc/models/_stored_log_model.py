@@ -2,8 +2,8 @@
 
 The header has ``groups``, ``kinematics``, ``nominal``, ``history``, ``lag``, ``gps``,
 ``names``, ``time_step`` and, where the model has one, the steps of its ``correction``;
-the tensors are ``theta``, ``noise/...``, ``correction/...`` and those of the GPs,
-``gp0/...``. ``gpmpc.logs`` adds the record of the identification.
+the tensors are ``theta``, ``noise/...``, ``correction/...``, ``start_filter/...`` and
+those of the GPs, ``gp0/...``. ``gpmpc.logs`` adds the record of the identification.
 """
 
 import itertools
@@ -24,7 +24,7 @@ from gpmpc.gp._storage import (
     posterior_parts,
     read_model,
 )
-from gpmpc.models._correction import BINS, LAGS, Correction
+from gpmpc.models._correction import BINS, LAGS, Correction, StartFilter
 from gpmpc.models._grouped import GroupedNominal
 from gpmpc.models._kinematics import Increments, Kinematics, RigidBodyKinematics
 from gpmpc.models._log_dynamics import TIME_CONSTANTS, LogDynamics, OutputNoise
@@ -41,7 +41,7 @@ _INCREMENTS = "Increments"
 _AFFINE_NAMES = ("AffineNominal", STILL)  # as files call that nominal model
 _MULTIROTOR_NAME = "MultirotorNominal"
 _GROUPED_NAME = "GroupedNominal"
-_CORRECTION_TENSORS = ("mean", "deviation", "weights")
+_REGRESSION_TENSORS = ("mean", "deviation", "weights")
 _KINDS_OF_GROUPS = ("vector", "angle", "quaternion")
 _LONGEST = 10_000  # rows that a model from a file looks back
 _SLOWEST = 1e9  # time step of a model from a file [s]
@@ -93,10 +93,16 @@ def log_model_parts(
     }
     if model.correction is not None:
         header["correction"] = model.correction.steps
-        for key in _CORRECTION_TENSORS:
-            values = getattr(model.correction, key)
-            tensors[f"correction/{key}"] = torch.from_numpy(values)
+    for name, part in _regressions(model).items():
+        for key in _REGRESSION_TENSORS:
+            tensors[f"{name}/{key}"] = torch.from_numpy(getattr(part, key))
     return header, tensors
+
+
+def _regressions(model: LogModel) -> dict[str, Correction | StartFilter]:
+    """Returns the regressions on the past that a model has, by name."""
+    parts = {"correction": model.correction, "start_filter": model.start_filter}
+    return {name: part for name, part in parts.items() if part is not None}
 
 
 def _nominal_header(nominal: Any) -> list[Any]:
@@ -172,6 +178,7 @@ def log_model_of_parts(
         lag=header["lag"],
         gps=tuple(gps),
         correction=_correction(header, tensors, kinematics, input_names, feature_count),
+        start_filter=_start_filter(tensors, kinematics, input_names, feature_count),
     )
     noise = OutputNoise(
         outputs=tensors["noise/outputs"].numpy(),
@@ -274,18 +281,52 @@ def _correction(
         return None
     for before, after in itertools.pairwise([0, *steps]):
         check_number("correction", after, above=before, whole=True, unit="[steps]")
-    arrays = {key: tensors[f"correction/{key}"].numpy() for key in _CORRECTION_TENSORS}
+    arrays = _regression_arrays(
+        "correction", tensors, kinematics, input_names, feature_count, (len(steps),)
+    )
+    return Correction(kinematics, tuple(steps), **arrays)
+
+
+def _start_filter(
+    tensors: Mapping[str, Tensor],
+    kinematics: Kinematics,
+    input_names: tuple[str, ...],
+    feature_count: int,
+) -> StartFilter | None:
+    """Makes the filter of the start of a file's parts; None where it has none."""
+    if "start_filter/weights" not in tensors:
+        return None
+    arrays = _regression_arrays(
+        "start_filter", tensors, kinematics, input_names, feature_count, ()
+    )
+    return StartFilter(kinematics, **arrays)
+
+
+def _regression_arrays(
+    name: str,
+    tensors: Mapping[str, Tensor],
+    kinematics: Kinematics,
+    input_names: tuple[str, ...],
+    feature_count: int,
+    batch: tuple[int, ...],
+) -> dict[str, Array]:
+    """Returns the arrays of regressions on the past.
+
+    Raises:
+        DataError: They are not those of the model.
+    """
+    arrays = {key: tensors[f"{name}/{key}"].numpy() for key in _REGRESSION_TENSORS}
     e = kinematics.space.error_dim
     m = len(input_names)
     r = feature_count + len(LAGS) * (e + m) + BINS * m + e
-    check_shape("correction/mean", arrays["mean"], (len(steps), r))
-    check_shape("correction/deviation", arrays["deviation"], (len(steps), r))
-    check_shape("correction/weights", arrays["weights"], (len(steps), 1 + r, e))
+    check_shape(f"{name}/mean", arrays["mean"], (*batch, r))
+    check_shape(f"{name}/deviation", arrays["deviation"], (*batch, r))
+    check_shape(f"{name}/weights", arrays["weights"], (*batch, 1 + r, e))
     if not all(np.isfinite(array).all() for array in arrays.values()):
-        raise DataError("the correction must be finite")
+        raise DataError(f"{name} must be finite")
     if not (arrays["deviation"] > 0).all():
-        raise DataError("the deviations of the correction must be positive")
-    return Correction(kinematics, tuple(steps), **arrays)
+        raise DataError(f"the deviations of {name} must be positive")
+    return arrays
 
 
 def _parameter_count(nominal: Any, outputs: int, feature_count: int) -> int:
